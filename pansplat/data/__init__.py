@@ -1,0 +1,1 @@
+"""Reading posed panoramas from files, and writing pictures."""

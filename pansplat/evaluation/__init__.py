@@ -1,0 +1,1 @@
+"""Metrics, baselines, reports, and the pose self-check."""

@@ -1,0 +1,87 @@
+"""A set of 3D Gaussians in world axes, with the pyramid level and input view that each came from."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pansplat.geometry.pose import rotations_from_quats
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """3D Gaussians of one scene.
+
+    Source: PanSplat, section 3.3, in the field's vocabulary (3DGS, gsplat).
+
+    Attributes:
+        means: centres in the world, metres.
+        scales: standard deviations along the Gaussian's own axes, metres.
+        quats: rotation of the own axes to the world's, wxyz; normalised where it is read.
+        opacities: peak opacity, in [0, 1].
+        harmonics: real spherical-harmonics coefficients of degree 0..4 in world axes, in the 3DGS order and signs;
+            colour in direction d (camera to mean) is max(0, 0.5 + sum_k Y_k(d) c_k), RGB.
+        levels: pyramid level, 0 is the finest.
+        views: index of the context view that each Gaussian was lifted from.
+    """
+
+    means: Float[Tensor, "n 3"]
+    scales: Float[Tensor, "n 3"]
+    quats: Float[Tensor, "n 4"]
+    opacities: Float[Tensor, "n"]
+    harmonics: Float[Tensor, "n k 3"]
+    levels: Int[Tensor, "n"]
+    views: Int[Tensor, "n"]
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0]
+        needed = {"means": (n, 3), "scales": (n, 3), "quats": (n, 4), "opacities": (n,), "levels": (n,), "views": (n,)}
+        for name, shape in needed.items():
+            got = tuple(getattr(self, name).shape)
+            if got != shape:
+                raise ValueError(f"`{name}` must have shape {shape} to fit {n} means, got {got}")
+        k = self.harmonics.shape[1] if self.harmonics.ndim == 3 else -1
+        if tuple(self.harmonics.shape) != (n, k, 3) or k not in (1, 4, 9, 16, 25):
+            got = tuple(self.harmonics.shape)
+            raise ValueError(f"`harmonics` must have shape ({n}, 1|4|9|16|25, 3), got {got}")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def degree(self) -> int:
+        """Degree of the spherical harmonics, 0..4."""
+        return round(self.harmonics.shape[1] ** 0.5) - 1
+
+    @property
+    def covariances(self) -> Float[Tensor, "n 3 3"]:
+        """World covariances R diag(s^2) R', square metres."""
+        axes = rotations_from_quats(self.quats) * self.scales[:, None, :]
+        return axes @ axes.transpose(-1, -2)
+
+    def select(self, index: Tensor) -> Gaussians:
+        """The Gaussians at a boolean mask or at indices, in that order."""
+        return Gaussians(*(getattr(self, f.name)[index] for f in dataclasses.fields(self)))
+
+    def to(self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Gaussians:
+        """The same Gaussians in another floating type or on another device; labels keep their integer type."""
+        values = []
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            values.append(value.to(device=device, dtype=dtype if value.is_floating_point() else None))
+        return Gaussians(*values)
+
+    @staticmethod
+    def cat(parts: Sequence[Gaussians]) -> Gaussians:
+        """All the parts' Gaussians, one part after another; the parts must have the same SH degree."""
+        if not parts:
+            raise ValueError("`parts` must hold at least one set of Gaussians, got none")
+        degrees = sorted({part.degree for part in parts})
+        if len(degrees) > 1:
+            raise ValueError(f"`parts` must share one SH degree, got {degrees}")
+        return Gaussians(*(torch.cat([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Gaussians)))

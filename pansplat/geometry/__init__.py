@@ -1,0 +1,1 @@
+"""Pure functions of tensors: directions, panoramas, lattices, cube faces, rigid poses."""

@@ -1,0 +1,32 @@
+"""Fibonacci lattices: nearly uniform points on the sphere.
+
+Source: PanSplat, section 3.3. The original computes j * golden angle in float32, which at n = 5.3 million is off
+by half a radian; here the product is reduced to one turn in float64 (OFFICIAL.md trap T1).
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+_GOLDEN_TURN = (3 - math.sqrt(5)) / 2  # the golden angle as a fraction of a full turn
+
+
+def lattice_size(width: int) -> int:
+    """Number of points of a level whose map is `width` pixels wide: width^2 / pi, the equator's density."""
+    return int(4 * math.pi * (width / (2 * math.pi)) ** 2)
+
+
+def fibonacci_directions(count: int) -> Float[Tensor, "count 3"]:
+    """Unit directions of the lattice in camera axes, float64, from the bottom pole (+y) to the top.
+
+    Adjacent points differ by the golden angle in longitude. Pole points are exact.
+    """
+    if count < 1:
+        raise ValueError(f"`count` must be at least 1, got {count}")
+    index = torch.arange(count, dtype=torch.float64)
+    y = torch.linspace(1, -1, count, dtype=torch.float64) if count > 1 else torch.ones(1, dtype=torch.float64)
+    angle = torch.remainder(index * _GOLDEN_TURN, 1.0) * (2 * math.pi)
+    radius = torch.sqrt((1 - y * y).clamp_min(0))
+    return torch.stack((radius * torch.cos(angle), y, radius * torch.sin(angle)), dim=-1)

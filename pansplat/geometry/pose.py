@@ -1,0 +1,99 @@
+"""Rigid poses and rotations. Quaternions are wxyz; poses are cam2world, 4x4, OpenCV axes, metres."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def rotations_from_quats(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrices of quaternions (wxyz) of any length; the zero quaternion is the identity."""
+    norm = quats.norm(dim=-1, keepdim=True)
+    identity = torch.tensor((1.0, 0.0, 0.0, 0.0), dtype=quats.dtype, device=quats.device)
+    safe = torch.where(norm > 0, norm, torch.ones_like(norm))
+    w, x, y, z = torch.where(norm > 0, quats / safe, identity).unbind(-1)
+    rows = (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+    return torch.stack(rows, dim=-1).reshape(*quats.shape[:-1], 3, 3)
+
+
+def quats_from_rotations(rotations: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
+    """Unit quaternions (wxyz, w >= 0) of rotation matrices, by the largest of the four components."""
+    m = rotations
+    t = torch.stack(
+        (
+            1 + m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2],
+            1 + m[..., 0, 0] - m[..., 1, 1] - m[..., 2, 2],
+            1 - m[..., 0, 0] + m[..., 1, 1] - m[..., 2, 2],
+            1 - m[..., 0, 0] - m[..., 1, 1] + m[..., 2, 2],
+        ),
+        dim=-1,
+    )
+    a, b, c = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    d, e, f = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    candidates = torch.stack(
+        (
+            torch.stack((t[..., 0], a, b, c), dim=-1),
+            torch.stack((a, t[..., 1], d, e), dim=-1),
+            torch.stack((b, d, t[..., 2], f), dim=-1),
+            torch.stack((c, e, f, t[..., 3]), dim=-1),
+        ),
+        dim=-2,
+    )
+    best = t.argmax(dim=-1)[..., None, None].expand(*t.shape[:-1], 1, 4)
+    quats = torch.nn.functional.normalize(candidates.gather(-2, best).squeeze(-2), dim=-1)
+    return torch.where(quats[..., :1] < 0, -quats, quats)
+
+
+def multiply_quats(a: Float[Tensor, "*batch 4"], b: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Hamilton product: the rotation b followed by a."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        dim=-1,
+    )
+
+
+def invert_pose(pose: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """Inverse of rigid transforms, exactly rigid itself."""
+    rotation = pose[..., :3, :3].transpose(-1, -2)
+    inverse = torch.zeros_like(pose)
+    inverse[..., :3, :3] = rotation
+    inverse[..., :3, 3] = -(rotation @ pose[..., :3, 3:]).squeeze(-1)
+    inverse[..., 3, 3] = 1
+    return inverse
+
+
+def orthonormal_error(pose: Float[Tensor, "4 4"]) -> float:
+    """Largest entry of |R R' - 1| together with the bottom row's error: 0 for a rigid pose, inf for a mirror."""
+    rotation = pose[:3, :3].double()
+    if not torch.isfinite(pose).all() or torch.linalg.det(rotation) <= 0:
+        return float("inf")
+    gram = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
+    bottom = (pose[3].double() - torch.tensor((0.0, 0.0, 0.0, 1.0), dtype=torch.float64)).abs().max()
+    return float(torch.maximum(gram, bottom))
+
+
+def interpolate_poses(
+    start: Float[Tensor, "4 4"], end: Float[Tensor, "4 4"], fraction: float
+) -> Float[Tensor, "4 4"]:
+    """The pose at `fraction` of the way: centre on the segment, rotation on the shortest arc (slerp)."""
+    a, b = quats_from_rotations(torch.stack((start[:3, :3], end[:3, :3])).double())
+    b = torch.where((a * b).sum() < 0, -b, b)
+    angle = torch.acos((a * b).sum().clamp(-1, 1))
+    if float(angle) < 1e-6:
+        quat = (1 - fraction) * a + fraction * b
+    else:
+        quat = (torch.sin((1 - fraction) * angle) * a + torch.sin(fraction * angle) * b) / torch.sin(angle)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = rotations_from_quats(quat)
+    pose[:3, 3] = (1 - fraction) * start[:3, 3].double() + fraction * end[:3, 3].double()
+    return pose.to(start)

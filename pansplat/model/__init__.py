@@ -1,0 +1,1 @@
+"""Predictors: posed panoramas in, Gaussians out."""

@@ -1,0 +1,1 @@
+"""A predictor that needs no weights: a hierarchical spherical plane sweep."""

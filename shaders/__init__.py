@@ -1,0 +1,1 @@
+"""GLSL sources of the viewer; read with importlib.resources."""
