@@ -1,0 +1,35 @@
+"""pansplat: a few 360-degree panoramas in, a scene of spherical 3D Gaussians you can fly through out."""
+
+from importlib import import_module
+from typing import Any
+
+__version__ = "0.1.0"
+
+# Resolved on first use, so that `import pansplat` (and `pansplat --help`) does not wait for torch.
+_PUBLIC = {
+    "Gaussians": "pansplat.gaussians.gaussians",
+    "InputError": "pansplat.errors",
+    "Pair": "pansplat.data.pairs",
+    "Rendering": "pansplat.render",
+    "Scene": "pansplat.gaussians.scene",
+    "Views": "pansplat.data.views",
+    "load": "pansplat.pipeline",
+    "load_model": "pansplat.pipeline",
+    "load_pairs": "pansplat.pipeline",
+    "predict": "pansplat.pipeline",
+    "rasterize": "pansplat.render",
+    "render": "pansplat.pipeline",
+    "save": "pansplat.pipeline",
+}
+
+__all__ = sorted(_PUBLIC)
+
+
+def __getattr__(name: str) -> Any:
+    if name in _PUBLIC:
+        return getattr(import_module(_PUBLIC[name]), name)
+    raise AttributeError(f"module 'pansplat' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_PUBLIC})

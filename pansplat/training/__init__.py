@@ -1,0 +1,1 @@
+"""Training. Not here yet: `pansplat-train` says what will come."""
