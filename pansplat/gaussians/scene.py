@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
+from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
+from pansplat.geometry.pose import interpolate_poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,8 +18,8 @@ class Scene:
 
     Attributes:
         gaussians: all context views' Gaussians.
-        cam2world: poses of the context views, float64, in the order of `gaussians.views`; may hold no view when
-            the file came from elsewhere.
+        cam2world: poses of the context views, float64, in the order of `gaussians.views`; may hold no view
+            when the file came from elsewhere.
         near, far: depth range of the prediction, metres.
         names: one name a context view (its image file's name).
         model: what made it, e.g. "sweep".
@@ -31,3 +33,13 @@ class Scene:
     names: tuple[str, ...] = ()
     model: str = ""
     height: int = 512
+
+    def pose_between(self, fraction: float) -> Float[Tensor, "4 4"]:
+        """The pose at a fraction of the way from the first context camera (0) to the last (1).
+
+        Raises:
+            InputError: when the scene has no cameras, as after loading a file that came from elsewhere.
+        """
+        if not len(self.cam2world):
+            raise InputError("the scene has no input cameras to stand between; give a pose instead")
+        return interpolate_poses(self.cam2world[0], self.cam2world[-1], fraction)

@@ -1,0 +1,324 @@
+"""Scenes as .ply files that any 3D Gaussian splatting tool opens.
+
+The vertices are the original 3DGS binary layout: position, unused normals, `f_dc`, `f_rest` (channel by
+channel), logit opacity, log scales, rotation to world axes (wxyz). What that layout has no place for (input
+cameras, depth range, level and view of each Gaussian) is one header comment, `comment pansplat {json}`, which
+others skip.
+
+Source: 3D Gaussian Splatting, the file its training code writes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import torch
+
+from pansplat.errors import InputError
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Scene
+
+OPACITY_EPSILON = 1e-6  # opacities are kept this far from 0 and 1, where the logit is infinite
+SCALE_EPSILON = 1e-12  # metres; the log of a smaller scale would be infinite
+
+_MARK = "pansplat "
+_MAX_RUNS = 4096  # with more runs the header would grow to megabytes, so the Gaussians are sorted first
+_MAX_HEADER = 1 << 24
+_FOREIGN_NEAR, _FOREIGN_FAR = 0.1, 100.0  # depth range, metres, of a file that does not tell
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
+    "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
+    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+
+
+def save_ply(scene: Scene, path: str | Path) -> None:
+    """Write a scene as a 3DGS .ply file, atomically, in float32.
+
+    Gaussians with a non-finite number are left out with a warning. Their order is kept, unless levels and
+    views alternate more than a few thousand times: then they are sorted by level and view.
+
+    Raises:
+        InputError: when the folder does not exist or cannot be written.
+    """
+    path = Path(path)
+    gaussians = _ordered(_finite(scene.gaussians, path))
+    names = _property_names(gaussians.harmonics.shape[1])
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {_MARK}{_extras(scene, gaussians)}"]
+    lines += [f"element vertex {len(gaussians)}", *(f"property float {name}" for name in names), "end_header"]
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        with open(partial, "wb") as file:
+            file.write(("\n".join(lines) + "\n").encode("ascii"))
+            _columns(gaussians).tofile(file)
+        os.replace(partial, path)
+    except OSError as error:
+        raise InputError(
+            f"cannot write {path}: {error.strerror or error}; choose a writable folder"
+        ) from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load_ply(path: str | Path) -> Scene:
+    """Read a 3DGS .ply file of either byte order; properties it does not know are skipped.
+
+    A file from elsewhere gives a scene without cameras whose Gaussians are all level 0 of view 0. Gaussians
+    with a non-finite number are left out with a warning.
+
+    Raises:
+        InputError: when the file is missing, no binary .ply of Gaussians, truncated, or has no finite one.
+    """
+    path = Path(path)
+    try:
+        with open(path, "rb") as file:
+            header = _read_header(file, path)
+            vertices = _read_vertices(file, header, path)
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+    extras = _parse_extras(header.comments, path)
+    levels, views = _labels(extras, len(vertices), path)
+    gaussians = _finite(_gaussians(vertices, levels, views, path), path)
+    if len(vertices) and not len(gaussians):
+        raise InputError(f"{path}: none of its {len(vertices)} Gaussians is finite; write the file again")
+    cam2world = torch.tensor(extras.get("cam2world", []), dtype=torch.float64).reshape(-1, 4, 4)
+    return Scene(
+        gaussians,
+        cam2world,
+        near=float(extras.get("near", _FOREIGN_NEAR)),
+        far=float(extras.get("far", _FOREIGN_FAR)),
+        names=tuple(str(name) for name in extras.get("names", ())),
+        model=str(extras.get("model", "")),
+        height=int(extras.get("height", 512)),
+    )
+
+
+def _finite(gaussians: Gaussians, path: Path) -> Gaussians:
+    finite = torch.isfinite(gaussians.opacities)
+    for field in (gaussians.means, gaussians.scales, gaussians.quats, gaussians.harmonics.flatten(1)):
+        # A sum is finite only if its terms are; the rare sum that overflows is looked at term by term.
+        suspect = ~torch.isfinite(field.sum(dim=1))
+        finite[suspect] &= torch.isfinite(field[suspect]).all(dim=1)
+    lost = len(gaussians) - int(finite.sum())
+    if not lost:
+        return gaussians
+    warnings.warn(f"{path}: left out {lost} of {len(gaussians)} Gaussians that are not finite", stacklevel=3)
+    return gaussians.select(finite)
+
+
+def _ordered(gaussians: Gaussians) -> Gaussians:
+    if len(_runs(gaussians)) <= _MAX_RUNS:
+        return gaussians
+    key = gaussians.levels.long() * (int(gaussians.views.max()) + 1) + gaussians.views.long()
+    return gaussians.select(torch.sort(key, stable=True).indices)
+
+
+def _runs(gaussians: Gaussians) -> list[list[int]]:
+    """Stretches of one level and view: [level, view, count], in file order."""
+    levels, views = gaussians.levels.long().cpu(), gaussians.views.long().cpu()
+    if not len(gaussians):
+        return []
+    changes = ((levels[1:] != levels[:-1]) | (views[1:] != views[:-1])).nonzero()[:, 0] + 1
+    starts = torch.cat((changes.new_zeros(1), changes))
+    counts = torch.diff(starts, append=starts.new_tensor([len(gaussians)]))
+    return torch.stack((levels[starts], views[starts], counts), dim=1).tolist()
+
+
+def _extras(scene: Scene, gaussians: Gaussians) -> str:
+    extras = {
+        "version": 1,
+        "model": scene.model,
+        "height": scene.height,
+        "near": scene.near,
+        "far": scene.far,
+        "names": list(scene.names),
+        "cam2world": scene.cam2world.double().cpu().tolist(),
+        "runs": _runs(gaussians),
+    }
+    return json.dumps(extras, separators=(",", ":"))
+
+
+def _property_names(coefficients: int) -> list[str]:
+    rest = [f"f_rest_{i}" for i in range(3 * (coefficients - 1))]
+    scales = [f"scale_{i}" for i in range(3)]
+    return ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *rest, "opacity", *scales] + [
+        f"rot_{i}" for i in range(4)
+    ]
+
+
+def _columns(gaussians: Gaussians) -> np.ndarray:
+    """All vertices in the file's order of properties, little-endian float32."""
+    g = gaussians.to(device="cpu")
+    rest = g.harmonics[:, 1:].transpose(1, 2).flatten(1)
+    # Near 1 the logit needs more digits than float32 has.
+    logits = torch.logit(g.opacities.double(), eps=OPACITY_EPSILON)[:, None]
+    log_scales = g.scales.clamp_min(SCALE_EPSILON).log()
+    normals = torch.zeros(len(g), 3)
+    parts = (g.means, normals, g.harmonics[:, 0], rest, logits, log_scales, g.quats)
+    table = np.empty((len(g), sum(part.shape[1] for part in parts)), "<f4")
+    start = 0
+    for part in parts:
+        table[:, start : start + part.shape[1]] = part.detach().numpy()
+        start += part.shape[1]
+    return table
+
+
+@dataclass(frozen=True)
+class _Header:
+    order: str
+    skip: int  # bytes of the elements before the vertices
+    count: int
+    dtype: np.dtype
+    comments: list[str]
+
+
+def _read_header(file: BinaryIO, path: Path) -> _Header:
+    if file.readline(16).strip() != b"ply":
+        raise InputError(f"{path} is not a .ply file (it does not begin with `ply`); give a 3DGS .ply")
+    order, comments, elements = "", [], []  # elements: [name, count, fields]
+    left = _MAX_HEADER
+    while True:
+        line = file.readline(left)
+        left -= len(line)
+        words = line.decode("ascii", errors="replace").split()
+        if not line.endswith(b"\n"):
+            raise InputError(f"{path}: its header does not end; the file is cut off or no .ply")
+        if words == ["end_header"]:
+            break
+        try:
+            if words[:1] == ["format"]:
+                order = words[1]
+            elif words[:1] == ["comment"]:
+                comments.append(
+                    line.decode("utf-8", errors="replace").strip().removeprefix("comment").lstrip()
+                )
+            elif words[:1] == ["element"]:
+                elements.append((words[1], int(words[2]), []))
+            elif words[:1] == ["property"]:
+                kind = None if words[1] == "list" else _TYPES[words[1]]
+                elements[-1][2].append((words[-1], kind))
+        except (IndexError, KeyError, ValueError):
+            raise InputError(f"{path}: cannot understand the header line {line[:80]!r}") from None
+    if order not in _ORDERS:
+        raise InputError(
+            f"{path}: format {order or 'unknown'!r} is not read; save it as binary_little_endian"
+        )
+    return _vertex_header(_ORDERS[order], elements, comments, path)
+
+
+def _vertex_header(order: str, elements: list, comments: list[str], path: Path) -> _Header:
+    skip = 0
+    for name, count, fields in elements:
+        if count < 0:
+            raise InputError(f"{path}: element `{name}` has a negative count {count}")
+        names = [field for field, _ in fields]
+        lists = [field for field, kind in fields if kind is None]
+        if lists or len(set(names)) < len(names):
+            what = f"the list property `{lists[0]}`" if lists else "a property twice"
+            raise InputError(f"{path}: element `{name}` has {what}; save the file as a plain 3DGS .ply")
+        dtype = np.dtype([(field, order + kind) for field, kind in fields])
+        if name == "vertex":
+            return _Header(order, skip, count, dtype, comments)
+        skip += count * dtype.itemsize
+    raise InputError(f"{path}: it has no `vertex` element; give a 3DGS .ply")
+
+
+def _read_vertices(file: BinaryIO, header: _Header, path: Path) -> np.ndarray:
+    start = file.tell() + header.skip
+    needed = header.count * header.dtype.itemsize
+    held = file.seek(0, os.SEEK_END) - start
+    if held < needed:
+        raise InputError(
+            f"{path} is cut off: {header.count} vertices need {needed} bytes, it holds {max(held, 0)}; "
+            "copy or download it again"
+        )
+    file.seek(start)
+    if header.dtype.itemsize == 0:
+        return np.zeros(header.count, header.dtype)
+    return np.fromfile(file, header.dtype, header.count)
+
+
+def _gaussians(vertices: np.ndarray, levels: torch.Tensor, views: torch.Tensor, path: Path) -> Gaussians:
+    held = vertices.dtype.names or ()
+    rest = sum(name.startswith("f_rest_") for name in held)
+    if rest not in (0, 9, 24, 45, 72):
+        raise InputError(f"{path}: {rest} f_rest properties fit no SH degree; 0, 9, 24, 45 or 72 are needed")
+    coefficients = rest // 3 + 1
+    needed = [name for name in _property_names(coefficients) if name not in ("nx", "ny", "nz")]
+    missing = [name for name in needed if name not in held]
+    if missing:
+        hint = "a compressed .ply; uncompress it first" if "packed_position" in held else "no 3DGS .ply"
+        raise InputError(f"{path}: the vertices lack {', '.join(missing[:6])}: this is {hint}")
+
+    def columns(*names: str) -> torch.Tensor:
+        values = np.empty((len(vertices), len(names)), np.float32)
+        for index, name in enumerate(names):
+            values[:, index] = vertices[name]
+        return torch.from_numpy(values)
+
+    harmonics = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
+    if rest:
+        higher = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(-1, 3, coefficients - 1)
+        harmonics = torch.cat((harmonics, higher.transpose(1, 2)), dim=1)
+    return Gaussians(
+        means=columns("x", "y", "z"),
+        scales=columns("scale_0", "scale_1", "scale_2").exp(),
+        quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        opacities=columns("opacity").sigmoid()[:, 0],
+        harmonics=harmonics,
+        levels=levels,
+        views=views,
+    )
+
+
+def _parse_extras(comments: list[str], path: Path) -> dict:
+    """What our own comment says; empty, with a warning, when it was damaged elsewhere."""
+    for comment in comments:
+        if comment.startswith(_MARK):
+            try:
+                extras = json.loads(comment.removeprefix(_MARK))
+                poses = np.asarray(extras.get("cam2world", []), np.float64)
+                if poses.size and (poses.shape[1:] != (4, 4) or not np.isfinite(poses).all()):
+                    raise ValueError("cam2world")
+                numbers = [float(extras.get(key, 1)) for key in ("near", "far", "height")]
+                if not np.isfinite(numbers).all():
+                    raise ValueError("near, far or height")
+                if not isinstance(extras.get("names", []), list) or not isinstance(
+                    extras.get("runs", []), list
+                ):
+                    raise ValueError("names or runs")
+                return extras
+            except (ValueError, TypeError, AttributeError):
+                warnings.warn(
+                    f"{path}: its pansplat comment is damaged; cameras and labels are lost", stacklevel=3
+                )
+    return {}
+
+
+def _labels(extras: dict, count: int, path: Path) -> tuple[torch.Tensor, torch.Tensor]:
+    """Level and view of each vertex; zeros when the file tells nothing, or of another count."""
+    unlabelled = torch.zeros(count, dtype=torch.int64), torch.zeros(count, dtype=torch.int64)
+    if not extras:
+        return unlabelled
+    try:
+        runs = torch.tensor(extras.get("runs", []), dtype=torch.int64).reshape(-1, 3)
+        views = max(len(extras.get("cam2world", [])), 1)
+        sound = bool((runs >= 0).all()) and int(runs[:, 2].sum()) == count
+        sound = sound and (not len(runs) or int(runs[:, 1].max()) < views)
+    except (ValueError, TypeError, RuntimeError):
+        sound = False
+    if not sound:
+        warnings.warn(
+            f"{path}: its {count} Gaussians are not those its labels were written for (edited elsewhere?); "
+            "levels and views are lost",
+            stacklevel=3,
+        )
+        return unlabelled
+    return torch.repeat_interleave(runs[:, 0], runs[:, 2]), torch.repeat_interleave(runs[:, 1], runs[:, 2])

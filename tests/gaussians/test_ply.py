@@ -1,0 +1,297 @@
+"""What a .ply file keeps, what it may come with, and what is refused."""
+
+import contextlib
+import json
+import struct
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pansplat.errors import InputError
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.ply import OPACITY_EPSILON, SCALE_EPSILON, load_ply, save_ply
+from pansplat.gaussians.scene import Scene
+from pansplat.geometry.pose import rotations_from_quats
+
+FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
+
+
+def make_scene(count: int = 40, degree: int = 1, seed: int = 0) -> Scene:
+    random = torch.Generator().manual_seed(seed)
+    half = count // 2
+    gaussians = Gaussians(
+        means=torch.randn(count, 3, generator=random),
+        scales=torch.rand(count, 3, generator=random) * 0.1 + 1e-3,
+        quats=torch.nn.functional.normalize(torch.randn(count, 4, generator=random), dim=1),
+        opacities=torch.rand(count, generator=random) * 0.98 + 0.01,
+        harmonics=torch.randn(count, (degree + 1) ** 2, 3, generator=random),
+        levels=torch.arange(count) // 7 % 4,
+        views=torch.cat((torch.zeros(half), torch.ones(count - half))).long(),
+    )
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    poses[0, :3, :3] = rotations_from_quats(torch.tensor([0.9, 0.1, -0.3, 0.2], dtype=torch.float64))
+    poses[1, :3, 3] = torch.tensor([1 / 3, -2e-7, 12345.678901234567], dtype=torch.float64)
+    return Scene(
+        gaussians, poses, near=0.45, far=10.0, names=("à\n.jpg", "b c.png"), model="sweep", height=256
+    )
+
+
+def binary_ply(columns: dict[str, np.ndarray], *, order: str = "<", before: bytes = b"") -> bytes:
+    """A .ply made independently of the code under test, one struct.pack per value."""
+    names = list(columns)
+    word = "little" if order == "<" else "big"
+    header = f"ply\nformat binary_{word}_endian 1.0\ncomment from elsewhere\n"
+    if before:
+        header += f"element extra {len(before)}\nproperty uchar tag\n"
+    header += f"element vertex {len(columns[names[0]])}\n"
+    kinds = {name: "d" if values.dtype == np.float64 else "f" for name, values in columns.items()}
+    header += (
+        "".join(f"property {'double' if kinds[n] == 'd' else 'float'} {n}\n" for n in names) + "end_header\n"
+    )
+    rows = zip(*(columns[name] for name in names), strict=True)
+    body = b"".join(struct.pack(order + kinds[n], v) for row in rows for n, v in zip(names, row, strict=True))
+    return header.encode() + before + body
+
+
+def foreign_columns(degree: int = 1, count: int = 3) -> dict[str, np.ndarray]:
+    random = np.random.default_rng(1)
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    return {name: random.normal(size=count).astype(np.float32) for name in names}
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_reading_back_gives_the_same_scene(tmp_path: Path, degree: int) -> None:
+    scene = make_scene(degree=degree)
+    save_ply(scene, tmp_path / "scene.ply")
+    back = load_ply(tmp_path / "scene.ply")
+    for name in FIELDS:
+        torch.testing.assert_close(
+            getattr(back.gaussians, name), getattr(scene.gaussians, name), rtol=2e-6, atol=1e-7
+        )
+    assert torch.equal(back.gaussians.levels, scene.gaussians.levels)
+    assert torch.equal(back.gaussians.views, scene.gaussians.views)
+    assert torch.equal(back.cam2world, scene.cam2world)  # every bit of the poses
+    assert (back.near, back.far, back.height, back.model) == (0.45, 10.0, 256, "sweep")
+    assert back.names == scene.names
+
+
+def test_the_file_is_vanilla_3dgs(tmp_path: Path) -> None:
+    """Read by hand: the property order of the original, every one a float, channel-major f_rest."""
+    scene = make_scene(count=4, degree=1)
+    save_ply(scene, tmp_path / "scene.ply")
+    header, body = (tmp_path / "scene.ply").read_bytes().split(b"end_header\n", 1)
+    lines = header.decode("ascii").splitlines()
+    properties = [line.split()[-1] for line in lines if line.startswith("property")]
+    rest = [f"f_rest_{i}" for i in range(9)]
+    rotation = ["rot_0", "rot_1", "rot_2", "rot_3"]
+    first = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert properties == [*first, *rest, "opacity", "scale_0", "scale_1", "scale_2", *rotation]
+    assert all(line.split()[1] == "float" for line in lines if line.startswith("property"))
+    assert len([line for line in lines if line.startswith("comment")]) == 1
+    table = np.frombuffer(body, "<f4").reshape(4, len(properties))
+    row = dict(zip(properties, table[2], strict=True))
+    g = scene.gaussians
+    assert row["opacity"] == pytest.approx(float(torch.logit(g.opacities[2].double())), rel=1e-6)
+    assert row["scale_1"] == pytest.approx(float(g.scales[2, 1].log()), rel=1e-6)
+    assert row["rot_0"] == pytest.approx(float(g.quats[2, 0]))
+    # coefficient 2 of green: the second of green's three
+    assert row["f_rest_4"] == pytest.approx(float(g.harmonics[2, 2, 1]))
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_files_from_elsewhere_are_read(tmp_path: Path, order: str, degree: int) -> None:
+    columns = foreign_columns(degree)
+    columns = {
+        "confidence": np.ones(3),
+        **columns,
+        "label": np.ones(3, np.float32),
+    }  # unknown, one of them double
+    (tmp_path / "a.ply").write_bytes(binary_ply(columns, order=order, before=b"12345"))
+    scene = load_ply(tmp_path / "a.ply")
+    g = scene.gaussians
+    assert g.degree == degree
+    np.testing.assert_array_equal(g.means[:, 1], columns["y"])
+    np.testing.assert_allclose(g.opacities, 1 / (1 + np.exp(-columns["opacity"])), rtol=1e-6)
+    np.testing.assert_allclose(g.scales[:, 2], np.exp(columns["scale_2"]), rtol=1e-6)
+    if degree:
+        np.testing.assert_array_equal(g.harmonics[:, 1, 2], columns["f_rest_30"])
+    assert len(scene.cam2world) == 0
+    assert not g.levels.any() and not g.views.any()
+    with pytest.raises(InputError, match="no input cameras"):
+        scene.pose_between(0.5)
+
+
+def test_opacity_and_scale_stay_finite_at_their_ends(tmp_path: Path) -> None:
+    scene = make_scene(count=4)
+    g = scene.gaussians
+    g.opacities[0], g.opacities[1], g.scales[2, 0] = 0.0, 1.0, 0.0
+    save_ply(scene, tmp_path / "scene.ply")
+    back = load_ply(tmp_path / "scene.ply").gaussians
+    assert len(back) == 4
+    assert float(back.opacities[0]) == pytest.approx(OPACITY_EPSILON, rel=1e-3)
+    assert float(1 - back.opacities[1]) == pytest.approx(OPACITY_EPSILON, rel=0.1)  # float32 near 1
+    assert float(back.scales[2, 0]) == pytest.approx(SCALE_EPSILON, rel=1e-3)
+
+
+def test_labels_in_any_order_survive(tmp_path: Path) -> None:
+    """With alternating labels the Gaussians may be sorted, but each keeps its own labels."""
+    scene = make_scene(count=9001, degree=0)
+    g = scene.gaussians
+    g.levels[:] = torch.arange(9001) % 4
+    g.views[:] = torch.arange(9001) % 2
+    save_ply(scene, tmp_path / "scene.ply")
+    back = load_ply(tmp_path / "scene.ply").gaussians
+    order = torch.argsort(g.means[:, 0])
+    again = torch.argsort(back.means[:, 0])
+    assert torch.equal(g.levels[order], back.levels[again])
+    assert torch.equal(g.views[order], back.views[again])
+
+
+def test_an_edited_file_loses_its_labels_but_not_its_cameras(tmp_path: Path) -> None:
+    path = tmp_path / "scene.ply"
+    save_ply(make_scene(count=40, degree=0), path)
+    header, body = path.read_bytes().split(b"end_header\n", 1)
+    row = len(body) // 40
+    path.write_bytes(header.replace(b"vertex 40", b"vertex 39") + b"end_header\n" + body[row:])
+    with pytest.warns(UserWarning, match="39 Gaussians are not those"):
+        scene = load_ply(path)
+    assert len(scene.gaussians) == 39 and not scene.gaussians.levels.any()
+    assert len(scene.cam2world) == 2
+
+
+def test_a_damaged_comment_costs_only_the_comment(tmp_path: Path) -> None:
+    path = tmp_path / "scene.ply"
+    save_ply(make_scene(count=5), path)
+    path.write_bytes(path.read_bytes().replace(b'{"version"', b'["version"', 1))
+    with pytest.warns(UserWarning, match="comment is damaged"):
+        assert len(load_ply(path).gaussians) == 5
+
+
+def test_non_finite_gaussians_are_counted_and_left_out(tmp_path: Path) -> None:
+    columns = foreign_columns(0)
+    columns["scale_0"][1] = 1e4  # exp overflows
+    columns["x"][2] = np.nan
+    (tmp_path / "a.ply").write_bytes(binary_ply(columns))
+    with pytest.warns(UserWarning, match="left out 2 of 3"):
+        assert len(load_ply(tmp_path / "a.ply").gaussians) == 1
+    columns["x"][0] = np.inf
+    (tmp_path / "a.ply").write_bytes(binary_ply(columns))
+    with pytest.warns(UserWarning, match="left out 3 of 3"), pytest.raises(InputError, match="none of its 3"):
+        load_ply(tmp_path / "a.ply")
+    scene = make_scene()
+    scene.gaussians.harmonics[3, 1, 0] = np.nan
+    with pytest.warns(UserWarning, match="left out 1 of 40"):
+        save_ply(scene, tmp_path / "b.ply")
+    assert len(load_ply(tmp_path / "b.ply").gaussians) == 39
+
+
+def test_an_empty_scene_survives(tmp_path: Path) -> None:
+    scene = make_scene()
+    empty = Scene(scene.gaussians.select(torch.zeros(40, dtype=torch.bool)), scene.cam2world, 0.1, 5.0)
+    save_ply(empty, tmp_path / "empty.ply")
+    assert len(load_ply(tmp_path / "empty.ply").gaussians) == 0
+
+
+def test_saving_twice_gives_the_same_file(tmp_path: Path) -> None:
+    save_ply(make_scene(), tmp_path / "a.ply")
+    save_ply(load_ply(tmp_path / "a.ply"), tmp_path / "b.ply")
+    back = load_ply(tmp_path / "b.ply").gaussians
+    for name in FIELDS:
+        torch.testing.assert_close(getattr(back, name), getattr(load_ply(tmp_path / "a.ply").gaussians, name))
+    assert (tmp_path / "a.ply").read_bytes().split(b"end_header")[0] == (
+        tmp_path / "b.ply"
+    ).read_bytes().split(b"end_header")[0]
+
+
+def header_with(lines: str) -> bytes:
+    return f"ply\n{lines}\nend_header\n".encode()
+
+
+GOOD = "format binary_little_endian 1.0\n"
+REFUSED = [
+    (b"", "not a .ply file"),
+    (b"PK\x03\x04 something else", "not a .ply file"),
+    (b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n", "header does not end"),
+    (header_with("format ascii 1.0\nelement vertex 0"), "'ascii' is not read"),
+    (header_with("element vertex 0"), "'unknown' is not read"),
+    (header_with(GOOD + "element vertex many"), "cannot understand"),
+    (header_with(GOOD + "element vertex 1\nproperty quad x"), "cannot understand"),
+    (header_with(GOOD + "element vertex -1"), "negative"),
+    (header_with(GOOD + "element face 0\nproperty list uchar int vertex_indices"), "list property"),
+    (header_with(GOOD + "element vertex 0\nproperty float x\nproperty float x"), "property twice"),
+    (header_with(GOOD + "element face 0"), "no `vertex`"),
+    (header_with(GOOD + "element vertex 0\nproperty float x\nproperty float y"), "lack z, f_dc_0"),
+    (header_with(GOOD + "element vertex 0\nproperty uint packed_position"), "compressed .ply"),
+    (header_with(GOOD + "element vertex 0\nproperty float f_rest_0"), "1 f_rest properties fit no SH degree"),
+    (header_with(GOOD + "element vertex 999999999999\nproperty float x"), "cut off"),
+]
+
+
+@pytest.mark.parametrize(("content", "message"), REFUSED, ids=[message for _, message in REFUSED])
+def test_what_is_no_scene_is_refused_by_name(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "bad.ply"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        load_ply(path)
+    assert "bad.ply" in str(caught.value)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(cut=st.floats(0, 1), flip=st.integers(0, 10**6), value=st.integers(0, 255))
+def test_a_damaged_file_gives_a_scene_or_an_input_error(
+    tmp_path: Path, cut: float, flip: int, value: int
+) -> None:
+    """No other exception, whatever single byte is wrong or wherever the file ends."""
+    save_ply(make_scene(count=6), tmp_path / "good.ply")
+    content = bytearray((tmp_path / "good.ply").read_bytes())
+    content[flip % len(content)] = value
+    (tmp_path / "bad.ply").write_bytes(content[: int(len(content) * max(cut, 0.0) ** 0.1) + 1])
+    with warnings.catch_warnings(), contextlib.suppress(InputError):
+        warnings.simplefilter("ignore", UserWarning)
+        load_ply(tmp_path / "bad.ply")
+
+
+def test_a_missing_file_or_folder_is_an_input_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"nowhere\.ply"):
+        load_ply(tmp_path / "nowhere.ply")
+    with pytest.raises(InputError, match="choose a writable folder"):
+        save_ply(make_scene(), tmp_path / "missing" / "scene.ply")
+
+
+def test_a_failed_save_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "scene.ply"
+    save_ply(make_scene(), path)
+    before = path.read_bytes()
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pansplat.gaussians.ply._columns", full)
+    with pytest.raises(InputError, match="No space left"):
+        save_ply(make_scene(seed=1), path)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["scene.ply"]
+
+
+def test_the_header_comment_is_one_line_of_json(tmp_path: Path) -> None:
+    save_ply(make_scene(), tmp_path / "scene.ply")
+    with open(tmp_path / "scene.ply", "rb") as file:
+        comment = next(line for line in file if line.startswith(b"comment pansplat "))
+    extras = json.loads(comment.removeprefix(b"comment pansplat "))
+    assert sum(count for *_, count in extras["runs"]) == 40
+
+
+def test_pose_between_starts_and_ends_at_the_cameras() -> None:
+    scene = make_scene()
+    torch.testing.assert_close(scene.pose_between(0.0), scene.cam2world[0])
+    torch.testing.assert_close(scene.pose_between(1.0), scene.cam2world[1])
+    middle = (scene.cam2world[0, :3, 3] + scene.cam2world[1, :3, 3]) / 2
+    torch.testing.assert_close(scene.pose_between(0.5)[:3, 3], middle)
