@@ -1,0 +1,252 @@
+"""The calls a user needs: load pairs and predictors, predict, render, save, load.
+
+Every public name here is also an attribute of `pansplat` itself.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.torch
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+import pansplat.render as rendering
+from pansplat.data.atomic import replacing
+from pansplat.data.pairs import Pair, load_pairs
+from pansplat.data.views import Views
+from pansplat.errors import InputError
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.ply import load_ply, save_ply
+from pansplat.gaussians.scene import Scene
+from pansplat.model.predictor import Predictor, Progress
+from pansplat.render import Rendering, blend_weights, rasterize
+
+__all__ = ["load", "load_model", "load_pairs", "predict", "render", "save"]
+
+_CACHE_FORMAT = "1"  # changes when the file's layout does, so that older files are not taken for newer ones
+_FIELDS = ("means", "scales", "quats", "opacities", "harmonics", "levels", "views")
+
+
+def load_model(name: str = "sweep", **options: Any) -> Predictor:
+    """The predictor of that name, ready to be called with tensors; `options` go to its constructor.
+
+    Raises:
+        InputError: when no predictor has that name.
+    """
+    if name not in _MODELS:
+        raise InputError(f"`model` must be one of {', '.join(sorted(_MODELS))}, got {name!r}")
+    return _MODELS[name](**options)
+
+
+def _sweep(**options: Any) -> Predictor:
+    from pansplat.model.sweep import Sweep
+
+    return Sweep(**options)
+
+
+_MODELS: dict[str, Callable[..., Predictor]] = {"sweep": _sweep}
+
+
+def predict(
+    source: Pair | Views | str | Path,
+    model: str | Predictor = "sweep",
+    *,
+    height: int = 512,
+    cache: bool = True,
+    progress: Progress | None = None,
+) -> Scene:
+    """The scene seen by the context panoramas of a pair.
+
+    A pair's result is kept beside it (`.pansplat/` in its folder, or the user's cache folder where that is not
+    writable) under a hash of everything it depends on: pixels, masks, poses, depth range and the predictor.
+
+    Args:
+        source: a pair, the path of a folder that holds exactly one, or panoramas already loaded (never cached).
+        model: the name of a predictor, or a predictor.
+        height: panoramas are resized to (height, 2 height); loaded ones keep their size.
+        cache: whether an earlier result may be returned and this one kept.
+        progress: told what is being done and the fraction of the whole that is done.
+
+    Raises:
+        InputError: when the input cannot be used, or the path holds several pairs.
+    """
+    predictor = load_model(model) if isinstance(model, str) else model
+    pair = _only_pair(source) if isinstance(source, (str, Path)) else source
+    if isinstance(pair, Views):
+        return _predict(pair, predictor, progress)
+    views = pair.load_context(height)
+    if not cache:
+        return _predict(views, predictor, progress)
+    key = _cache_key(views, predictor)
+    stem = f"{_slug(pair.name)}-{_slug(predictor.name)}-{height}"
+    for folder in _cache_folders(pair):
+        scene = _read_cached(folder / f"{stem}-{key}.safetensors", views, predictor)
+        if scene is not None:
+            if progress is not None:
+                progress("kept from last time", 1.0)
+            return scene
+    scene = _predict(views, predictor, progress)
+    _write_cached(scene.gaussians, _cache_folders(pair), stem, key)
+    return scene
+
+
+def render(
+    scene: Scene,
+    cam2world: Float[Tensor, "4 4"] | np.ndarray,
+    *,
+    blend: str | int = "deferred",
+    size: tuple[int, int] | None = None,
+    layout: str = "equirect",
+    **raster: Any,
+) -> Rendering:
+    """The scene seen from a pose: colour, alpha and radial depth.
+
+    Args:
+        scene: what to draw.
+        cam2world: pose of the camera, OpenCV axes, metres.
+        blend: "deferred" draws each context view's Gaussians by themselves and blends the pictures by nearness;
+            "joint" draws all together; a number draws one view's only.
+        size: (height, width) in pixels; by default the scene's own height, 2:1 (16:9 for `pinhole`).
+        layout: "equirect", "cubemap" or "pinhole".
+        **raster: further options of `pansplat.render.rasterize`.
+
+    Raises:
+        InputError: when `blend` names no view of the scene.
+    """
+    pose = torch.as_tensor(cam2world, dtype=torch.float64)
+    if size is None:
+        size = (scene.height, round(scene.height * 16 / 9) if layout == "pinhole" else 2 * scene.height)
+    options = {"size": size, "layout": layout, **raster}
+    count = len(scene.cam2world)
+    if isinstance(blend, int):
+        if not 0 <= blend < max(count, 1):
+            raise InputError(f"`blend` must be a view from 0 to {max(count, 1) - 1}, got {blend}")
+        return rasterize(scene.gaussians.select(scene.gaussians.views == blend), pose, **options)
+    if blend not in ("deferred", "joint"):
+        raise InputError(f"`blend` must be deferred, joint or the number of a view, got {blend!r}")
+    if blend == "joint" or count < 2:
+        return rasterize(scene.gaussians, pose, **options)
+    weights = blend_weights(pose[:3, 3], scene.cam2world[:, :3, 3].double())
+    # A view without weight leaves no trace in the blend: at an input, one drawing does.
+    drawn = [view for view in range(count) if float(weights[view]) > 0]
+    pictures = [rasterize(scene.gaussians.select(scene.gaussians.views == v), pose, **options) for v in drawn]
+    return pictures[0] if len(drawn) == 1 else rendering.blend(pictures, weights[drawn])
+
+
+def save(scene: Scene, path: str | Path) -> None:
+    """Write a scene to a file; the suffix chooses the format (.ply: any 3DGS tool opens it)."""
+    _require_ply(path)
+    save_ply(scene, path)
+
+
+def load(path: str | Path) -> Scene:
+    """Read a scene from a file that `save`, or another 3DGS tool, has written."""
+    _require_ply(path)
+    return load_ply(path)
+
+
+def _require_ply(path: str | Path) -> None:
+    if Path(path).suffix.lower() != ".ply":
+        raise InputError(f"{path}: a scene file must end in .ply, got {Path(path).suffix or 'no suffix'!r}")
+
+
+def _only_pair(path: str | Path) -> Pair:
+    pairs = load_pairs(path)
+    if len(pairs) != 1:
+        names = ", ".join(pair.name for pair in pairs[:8]) + (", ..." if len(pairs) > 8 else "")
+        raise InputError(
+            f"{path} holds {len(pairs)} pairs ({names}); choose one: predict(load_pairs(path)[0])"
+        )
+    return pairs[0]
+
+
+def _predict(views: Views, predictor: Predictor, progress: Progress | None) -> Scene:
+    gaussians = predictor(
+        views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress
+    )
+    assert isinstance(gaussians, Gaussians)  # a list answers a batch only
+    return _scene(gaussians, views, predictor)
+
+
+def _scene(gaussians: Gaussians, views: Views, predictor: Predictor) -> Scene:
+    return Scene(
+        gaussians,
+        views.cam2world.double(),
+        near=views.near,
+        far=views.far,
+        names=views.names,
+        model=predictor.name,
+        height=views.images.shape[-2],
+    )
+
+
+# The prediction cache
+
+
+def _cache_key(views: Views, predictor: Predictor) -> str:
+    """Hash of all that a prediction depends on, as the predictor gets it.
+
+    The decoded pixels are hashed, not the files: a mask that is found in the folder's other panoramas, or a
+    decoder that changes, then changes the key as well.
+    """
+    digest = hashlib.blake2b(digest_size=16)
+    shapes = [list(views.images.shape), views.near, views.far, predictor.name, predictor.fingerprint]
+    digest.update(json.dumps([_CACHE_FORMAT, *shapes]).encode())
+    for tensor in (views.images, views.cam2world.double(), views.masks):
+        digest.update(np.ascontiguousarray(tensor.detach().cpu().numpy()).data)
+    return digest.hexdigest()
+
+
+def _cache_folders(pair: Pair) -> list[Path]:
+    """Where results may lie, best first: beside the pair, then with the user's other caches."""
+    place = hashlib.blake2b(str(pair.folder.resolve()).encode(), digest_size=8).hexdigest()
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return [pair.folder / ".pansplat", Path(home) / "pansplat" / place]
+
+
+def _slug(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_.]+", "_", name)[:60]
+
+
+def _read_cached(path: Path, views: Views, predictor: Predictor) -> Scene | None:
+    """The scene kept in a file; None when there is none or it is damaged in any way."""
+    try:
+        content = path.read_bytes()
+        body, checksum = content[:-4], int.from_bytes(content[-4:], "little")
+        if zlib.crc32(body) != checksum:
+            return None
+        tensors = safetensors.torch.load(body)
+        gaussians = Gaussians(*(tensors[name] for name in _FIELDS))
+    except (OSError, ValueError, KeyError, safetensors.SafetensorError):
+        return None
+    gaussians.levels.data, gaussians.views.data = gaussians.levels.long(), gaussians.views.long()
+    return _scene(gaussians, views, predictor)
+
+
+def _write_cached(gaussians: Gaussians, folders: list[Path], stem: str, key: str) -> None:
+    """Keep a result in the first folder that can be written; without any, do without."""
+    tensors = {name: getattr(gaussians, name).detach().cpu().contiguous() for name in _FIELDS}
+    body = safetensors.torch.save(tensors)
+    for folder in folders:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with replacing(folder / f"{stem}-{key}.safetensors") as partial, open(partial, "wb") as file:
+                file.write(body)
+                file.write(zlib.crc32(body).to_bytes(4, "little"))
+        except (OSError, InputError):
+            continue
+        # What the pair looked like before is of no use any more, and a scene takes some 50 MB.
+        for old in folder.glob("*.safetensors"):
+            if old.name.startswith(f"{stem}-") and key not in old.name:
+                old.unlink(missing_ok=True)
+        return
