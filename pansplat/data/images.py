@@ -1,0 +1,356 @@
+"""Reading panoramas, masks and depth from picture files; writing pictures.
+
+Pictures are RGB in [0, 1] with the sRGB curve, as in JPG and PNG; EXR files hold linear light and are converted.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from PIL import Image, ImageOps
+from torch import Tensor
+
+from pansplat.data.atomic import replacing
+from pansplat.errors import InputError
+
+READABLE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".exr")
+
+_PILLOW_FORMATS = ("JPEG", "PNG", "WEBP")
+_EXR_MAGIC = b"\x76\x2f\x31\x01"
+_WRAP = 16  # target pixels of wrap-around given to the resampling filter at +-180 degrees
+
+
+@dataclass(frozen=True, eq=False)
+class _Picture:
+    """Decoded pixels: `color` (H W 3) uint8, or float32 in [0, 1]; `alpha` (H W) float32 in [0, 1] or None."""
+
+    color: NDArray[Any]
+    alpha: NDArray[np.float32] | None
+
+
+def srgb_from_linear(linear: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Display values of linear light, both in [0, 1]; light outside is clipped. Source: IEC 61966-2-1."""
+    x = np.clip(linear, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055).astype(np.float32)
+
+
+def linear_from_srgb(display: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Linear light of display values, both in [0, 1]. Source: IEC 61966-2-1."""
+    x = np.clip(display, 0, 1)
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def read_panorama(
+    path: Path | str, height: int
+) -> tuple[Float[Tensor, "3 height width"], Bool[Tensor, "height width"]]:
+    """A panorama at (height, 2 height), and where it is opaque.
+
+    Resampled by Pillow's Lanczos filter with wrap-around at +-180 degrees. A warning says when transparent pixels
+    are taken as masked.
+
+    Args:
+        path: JPG, PNG (8 or 16 bit), WebP or EXR file, 2:1.
+        height: height wanted, pixels.
+
+    Raises:
+        InputError: no such file, unknown format, damaged or truncated data, not 2:1, NaN.
+    """
+    path = Path(path)
+    _check_height(height)
+    picture = _decode(path)
+    _check_two_to_one(path, picture.color.shape[1], picture.color.shape[0])
+    image = torch.from_numpy(_resize_color(picture.color, height)).permute(2, 0, 1).contiguous()
+    if picture.alpha is None or picture.alpha.min() == 1:
+        return image, torch.ones(height, 2 * height, dtype=torch.bool)
+    opaque = _resize_plane(picture.alpha, height, Image.Resampling.BOX) >= 0.5
+    warnings.warn(
+        f"{path}: {100 * (1 - opaque.mean()):.1f}% of the picture is transparent; these pixels are masked. "
+        "Remove the alpha channel if they show the scene.",
+        stacklevel=2,
+    )
+    return image, torch.from_numpy(opaque)
+
+
+def read_thumbnail(path: Path | str, height: int) -> Float[Tensor, "3 height width"]:
+    """A panorama at a small size, fast: JPEGs are decoded at reduced size; alpha is ignored."""
+    path = Path(path)
+    picture = _decode(path, at_least=height)
+    _check_two_to_one(path, picture.color.shape[1], picture.color.shape[0])
+    return torch.from_numpy(_resize_color(picture.color, height)).permute(2, 0, 1).contiguous()
+
+
+def read_mask(path: Path | str, height: int) -> Bool[Tensor, "height width"]:
+    """A mask picture at (height, 2 height): True where it is white (the scene)."""
+    path = Path(path)
+    _check_height(height)
+    color = _decode(path).color
+    _check_two_to_one(path, color.shape[1], color.shape[0])
+    scale = 255.0 if color.dtype == np.uint8 else 1.0
+    grey = color.astype(np.float32).mean(axis=2) / np.float32(scale)
+    return torch.from_numpy(_resize_plane(grey, height, Image.Resampling.BOX) >= 0.5)
+
+
+def read_depth(path: Path | str, height: int) -> Float[Tensor, "height width"]:
+    """Radial depth in metres at (height, 2 height), 0 where unknown; the nearest sample, never a mix of two surfaces.
+
+    Args:
+        path: 16-bit PNG in millimetres (0 is unknown), or EXR in metres (channel Z or Y).
+        height: height wanted, pixels.
+    """
+    path = Path(path)
+    _check_height(height)
+    data = _read_bytes(path)
+    if data.startswith(_EXR_MAGIC):
+        channels = _exr_channels(path)
+        name = next((n for n in ("Z", "Y") if n in channels), None)
+        if name is None:
+            raise InputError(
+                f"{path}: needed depth in channel Z or Y, got channels {sorted(channels)}; rename it."
+            )
+        depth = np.asarray(channels[name], dtype=np.float32)
+    else:
+        depth = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if depth is None or depth.ndim != 2 or depth.dtype != np.uint16:
+            got = "an unreadable file" if depth is None else f"{depth.dtype} with shape {depth.shape}"
+            raise InputError(
+                f"{path}: needed depth as a one-channel 16-bit PNG in millimetres or an EXR in metres, got {got}; "
+                "convert it."
+            )
+        _verify_with_pillow(path, data)  # OpenCV fills a truncated file with zeros and says nothing
+        depth = depth.astype(np.float32) / np.float32(1000)
+    _check_two_to_one(path, depth.shape[1], depth.shape[0])
+    depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+    rows = ((np.arange(height) + 0.5) * depth.shape[0] / height).astype(int)
+    columns = ((np.arange(2 * height) + 0.5) * depth.shape[1] / (2 * height)).astype(int)
+    return torch.from_numpy(np.ascontiguousarray(depth[rows[:, None], columns[None]]))
+
+
+def write_image(
+    path: Path | str,
+    image: Tensor | NDArray[Any],
+    *,
+    depth: Tensor | NDArray[Any] | None = None,
+    panorama: bool | None = None,
+) -> None:
+    """Write a picture, whole or not at all; the suffix chooses PNG, JPG, WebP (8 bit) or EXR (32-bit float, linear).
+
+    Args:
+        path: file to write.
+        image: a tensor (3 H W) or an array (H W 3), display RGB in [0, 1] (clipped); an array may be uint8.
+        depth: (H W) metres, written as channel Z of an EXR.
+        panorama: whether an EXR says that it is a latitude-longitude map; by default when it is 2:1.
+
+    Raises:
+        InputError: NaN, unknown suffix, depth for a format that cannot hold it, folder missing.
+    """
+    path = Path(path)
+    pixels = _as_pixels(path, image)
+    suffix = path.suffix.lower()
+    if suffix == ".exr":
+        _write_exr(path, pixels, depth, panorama)
+        return
+    if suffix not in READABLE_SUFFIXES:
+        raise InputError(f"cannot write {path}: needed a name ending in .png .jpg .webp or .exr; rename it.")
+    if depth is not None:
+        raise InputError(f"cannot write depth to {path}: needed an .exr, got '{suffix}'; change the suffix.")
+    eight = pixels if pixels.dtype == np.uint8 else np.rint(pixels.clip(0, 1) * 255).astype(np.uint8)
+    options: dict[str, Any] = {"quality": 95, "subsampling": 0} if suffix in (".jpg", ".jpeg") else {}
+    options = {"lossless": True} if suffix == ".webp" else options
+    with replacing(path) as temporary:
+        Image.fromarray(eight).save(temporary, **options)
+
+
+def _as_pixels(path: Path, image: Tensor | NDArray[Any]) -> NDArray[Any]:
+    """The picture as (H W 3), uint8 or float32, all finite."""
+    if isinstance(image, Tensor):
+        pixels = (
+            image.detach().cpu().movedim(0, -1).numpy() if image.ndim == 3 else image.detach().cpu().numpy()
+        )
+    else:
+        pixels = np.asarray(image)
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or 0 in pixels.shape:
+        shape = tuple(image.shape)
+        raise InputError(
+            f"cannot write {path}: needed a tensor (3 H W) or an array (H W 3), got shape {shape}."
+        )
+    if pixels.dtype == np.uint8:
+        return np.ascontiguousarray(pixels)
+    pixels = np.ascontiguousarray(pixels, dtype=np.float32)
+    bad = int((~np.isfinite(pixels)).sum())
+    if bad:
+        raise InputError(
+            f"cannot write {path}: needed finite colours, got {bad} NaN or infinite values; nothing written."
+        )
+    return pixels
+
+
+def _write_exr(
+    path: Path, pixels: NDArray[Any], depth: Tensor | NDArray[Any] | None, panorama: bool | None
+) -> None:
+    import OpenEXR
+
+    display = pixels.astype(np.float32) / np.float32(255) if pixels.dtype == np.uint8 else pixels
+    channels: dict[str, Any] = {"RGB": linear_from_srgb(display)}
+    if depth is not None:
+        plane = depth.detach().cpu().numpy() if isinstance(depth, Tensor) else np.asarray(depth)
+        plane = np.ascontiguousarray(plane, dtype=np.float32)
+        if plane.shape != pixels.shape[:2] or not np.isfinite(plane).all():
+            raise InputError(
+                f"cannot write {path}: needed finite depth of shape {pixels.shape[:2]}, got shape {plane.shape} with "
+                f"{int((~np.isfinite(plane)).sum())} NaN or infinite values; nothing written."
+            )
+        channels["Z"] = plane
+    header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    if pixels.shape[1] == 2 * pixels.shape[0] if panorama is None else panorama:
+        header["envmap"] = OpenEXR.ENVMAP_LATLONG
+    with replacing(path) as temporary, OpenEXR.File(header, channels) as file:
+        file.write(str(temporary))
+
+
+def _check_height(height: int) -> None:
+    if height < 1:
+        raise InputError(f"`height` must be at least 1 pixel, got {height}; choose one, such as 512.")
+
+
+def _check_two_to_one(path: Path, width: int, height: int) -> None:
+    if width != 2 * height:
+        raise InputError(
+            f"{path}: needed a 2:1 equirectangular panorama, got {width}x{height} (width x height); "
+            "crop or resample it first."
+        )
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"{path}: needed a readable picture file, got '{error.strerror}'; check the path."
+        ) from error
+    if not data:
+        raise InputError(f"{path}: needed a picture, got a file of 0 bytes; copy or export it again.")
+    return data
+
+
+def _decode(path: Path, at_least: int | None = None) -> _Picture:
+    """Pixels of a picture file by what it contains, not by its name; with `at_least`, maybe at reduced size."""
+    data = _read_bytes(path)
+    if data.startswith(_EXR_MAGIC):
+        return _decode_exr(path)
+    if data.startswith(b"\x89PNG") and len(data) > 24 and data[24] == 16:
+        return _decode_png16(path, data)
+    image = _open_with_pillow(path, data, at_least)
+    if "A" in image.getbands() or "transparency" in image.info:
+        array = np.asarray(image.convert("RGBA"))
+        return _Picture(
+            np.ascontiguousarray(array[..., :3]), array[..., 3].astype(np.float32) / np.float32(255)
+        )
+    return _Picture(np.asarray(image.convert("RGB")), None)
+
+
+def _open_with_pillow(path: Path, data: bytes, at_least: int | None = None) -> Image.Image:
+    """Fully decoded picture; Pillow, unlike OpenCV, refuses truncated data."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # panoramas of 100 MP are normal
+            image = Image.open(io.BytesIO(data), formats=_PILLOW_FORMATS)
+            if at_least is not None:
+                image.draft("RGB", (2 * at_least, at_least))
+            image.load()
+            return ImageOps.exif_transpose(image)
+    except Image.UnidentifiedImageError as error:
+        raise InputError(
+            f"{path}: needed a JPG, PNG, WebP or EXR picture, got an unknown format "
+            f"(it starts with {data[:8]!r}); convert it."
+        ) from error
+    except Image.DecompressionBombError as error:
+        raise InputError(
+            f"{path}: needed fewer pixels than 13000x6500 or so, got more ({error}); shrink it."
+        ) from error
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
+        raise InputError(
+            f"{path}: needed a complete picture, got damaged or truncated data ({error}); copy or export it again."
+        ) from error
+
+
+def _verify_with_pillow(path: Path, data: bytes) -> None:
+    _open_with_pillow(path, data)
+
+
+def _decode_png16(path: Path, data: bytes) -> _Picture:
+    """A 16-bit PNG at full precision: Pillow keeps 8 of its bits when it has colour, OpenCV keeps all."""
+    _verify_with_pillow(path, data)
+    array = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if array is None or array.dtype != np.uint16:
+        raise InputError(
+            f"{path}: needed a readable 16-bit PNG, got data OpenCV cannot decode; export it again."
+        )
+    values = array.astype(np.float32) / np.float32(65535)
+    if values.ndim == 2:
+        return _Picture(np.repeat(values[..., None], 3, axis=2), None)
+    color = np.ascontiguousarray(values[..., 2::-1])
+    return _Picture(color, np.ascontiguousarray(values[..., 3]) if values.shape[2] == 4 else None)
+
+
+def _exr_channels(path: Path) -> dict[str, NDArray[Any]]:
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path)) as file:
+            return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+    except Exception as error:  # OpenEXR raises its own kinds, RuntimeError and ValueError among them
+        raise InputError(
+            f"{path}: needed a complete EXR picture, got damaged or truncated data ({error}); export it again."
+        ) from error
+
+
+def _decode_exr(path: Path) -> _Picture:
+    channels = _exr_channels(path)
+    alpha = channels.get("A")
+    if "RGBA" in channels:
+        linear, alpha = channels["RGBA"][..., :3], channels["RGBA"][..., 3]
+    elif "RGB" in channels:
+        linear = channels["RGB"]
+    elif "Y" in channels:
+        linear = np.repeat(channels["Y"][..., None], 3, axis=2)
+    else:
+        raise InputError(
+            f"{path}: needed the channels R, G and B (or Y), got {sorted(channels)}; export the colour without layers."
+        )
+    linear = linear.astype(np.float32)
+    bad = int((~np.isfinite(linear)).sum())
+    if bad:
+        raise InputError(
+            f"{path}: needed finite colours, got {bad} NaN or infinite values; repair the file or render it again."
+        )
+    return _Picture(srgb_from_linear(linear), None if alpha is None else alpha.astype(np.float32).clip(0, 1))
+
+
+def _resize_color(color: NDArray[Any], height: int) -> NDArray[np.float32]:
+    """(H W 3) at (height, 2 height) as float32 in [0, 1]; the filter sees across +-180 degrees."""
+    if color.dtype == np.uint8:
+        if color.shape[0] != height:
+            color = _resize_plane(color, height, Image.Resampling.LANCZOS)
+        return color.astype(np.float32) / np.float32(255)
+    if color.shape[0] == height:
+        return color.astype(np.float32)
+    planes = [_resize_plane(color[..., c], height, Image.Resampling.LANCZOS) for c in range(3)]
+    return np.stack(planes, axis=-1).clip(0, 1)
+
+
+def _resize_plane(array: NDArray[Any], height: int, method: Image.Resampling) -> NDArray[Any]:
+    """(H W) float32 or (H W 3) uint8 at (height, 2 height)."""
+    rows, columns = array.shape[:2]
+    margin = min(columns, max(_WRAP, _WRAP * rows // height))
+    wrapped = np.concatenate((array[:, columns - margin :], array, array[:, :margin]), axis=1)
+    box = (margin, 0, margin + columns, rows)
+    return np.asarray(Image.fromarray(wrapped).resize((2 * height, height), method, box=box))
