@@ -1,1 +1,6 @@
-"""Drawing Gaussians."""
+"""Drawing Gaussians: the differentiable reference rasteriser, and blending of its pictures."""
+
+from pansplat.render.blend import blend, blend_weights
+from pansplat.render.reference import Rendering, rasterize
+
+__all__ = ["Rendering", "blend", "blend_weights", "rasterize"]
