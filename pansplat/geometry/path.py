@@ -1,0 +1,149 @@
+"""Camera paths to fly between the input panoramas.
+
+Poses are cam2world, 4x4 float64, OpenCV axes, metres. "Level" poses have no roll or pitch against the up
+direction that the cameras share.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pansplat.geometry.pose import interpolate_poses
+
+_STILL = 1e-6  # metres; a shorter step has no direction
+
+
+def ease_in_out(fraction: float) -> float:
+    """Smooth start and stop: monotonic from 0 to 1, without velocity or acceleration at either end."""
+    t = min(max(fraction, 0.0), 1.0)
+    return t * t * t * (t * (6 * t - 15) + 10)
+
+
+def up_direction(cam2world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "3"]:
+    """Unit world direction that the cameras agree is up: the mean of their -y axes; -y without cameras."""
+    up = -cam2world[:, :3, 1].double().sum(0)
+    if len(cam2world) == 0 or float(up.norm()) < 1e-3:
+        up = torch.tensor((0.0, -1.0, 0.0), dtype=torch.float64)
+    return up / up.norm()
+
+
+def look_pose(
+    position: Float[Tensor, "3"], forward: Float[Tensor, "3"], up: Float[Tensor, "3"]
+) -> Float[Tensor, "4 4"]:
+    """Pose at `position` that looks along `forward` with `up` upright in the image.
+
+    Raises:
+        ValueError: when `forward` is (nearly) parallel to `up` or has no length.
+    """
+    forward, up = forward.double(), up.double()
+    right = torch.linalg.cross(forward, up)
+    if (
+        float(right.norm()) < 1e-6 * max(float(forward.norm() * up.norm()), 1e-30)
+        or float(forward.norm()) == 0
+    ):
+        raise ValueError(f"`forward` {forward.tolist()} must not be parallel to `up` {up.tolist()}")
+    right = right / right.norm()
+    forward = forward / forward.norm()
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 0] = right
+    pose[:3, 1] = torch.linalg.cross(forward, right)
+    pose[:3, 2] = forward
+    pose[:3, 3] = position.double()
+    return pose
+
+
+def level_pose(cam2world: Float[Tensor, "4 4"], up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
+    """The same place and heading without roll or pitch; through the vertical it keeps the heading."""
+    pose = cam2world.double()
+    forward, up = pose[:3, 2], up.double() / up.double().norm()
+    flat = forward - (forward @ up) * up
+    if float(flat.norm()) < 1e-3:
+        flat = torch.sign(forward @ up) * pose[:3, 1]
+        flat = flat - (flat @ up) * up
+    return look_pose(pose[:3, 3], flat, up)
+
+
+def turn_pose(pose: Float[Tensor, "4 4"], yaw_radians: float, up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
+    """The pose turned in place about `up`; positive yaw turns the view to the right."""
+    axis = -up.double() / up.double().norm()  # down: with y down, right turns z towards x
+    x, y, z = axis.tolist()
+    cross = torch.tensor(((0, -z, y), (z, 0, -x), (-y, x, 0)), dtype=torch.float64)
+    rotation = (
+        math.cos(yaw_radians) * torch.eye(3, dtype=torch.float64)
+        + math.sin(yaw_radians) * cross
+        + (1 - math.cos(yaw_radians)) * torch.outer(axis, axis)
+    )
+    turned = pose.double().clone()
+    turned[:3, :3] = rotation @ turned[:3, :3]
+    return turned
+
+
+def way_poses(cam2world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"]:
+    """A level pose at each camera that looks along the way past it.
+
+    The way's direction at a camera is that from its predecessor to its successor. Where it has none (one
+    camera, coincident cameras, a climb straight up) the pose keeps that camera's own heading.
+    """
+    up = up_direction(cam2world)
+    positions = cam2world[:, :3, 3].double()
+    last = len(cam2world) - 1
+    poses = []
+    for view, pose in enumerate(cam2world.double()):
+        along = positions[min(view + 1, last)] - positions[max(view - 1, 0)]
+        flat = along - (along @ up) * up
+        if float(flat.norm()) < max(_STILL, 1e-3 * float(along.norm())):
+            poses.append(level_pose(pose, up))
+        else:
+            poses.append(look_pose(pose[:3, 3], flat, up))
+    return torch.stack(poses) if poses else torch.zeros((0, 4, 4), dtype=torch.float64)
+
+
+def fly_pose(
+    cam2world: Float[Tensor, "view 4 4"], fraction: float, *, turn_degrees: float = 40.0
+) -> Float[Tensor, "4 4"]:
+    """Pose at a fraction of a flight from the first camera through all of them to the last.
+
+    The camera leaves and arrives smoothly and looks along the way, sweeping slowly first to the left of it
+    and then to the right, so that parallax shows; at either end and in the middle it looks straight ahead.
+
+    Args:
+        cam2world: the cameras, in the order to visit; at least one.
+        fraction: time from 0 (first camera) to 1 (last camera); clamped.
+        turn_degrees: how far the view sweeps to each side.
+
+    Raises:
+        ValueError: without any camera.
+    """
+    if len(cam2world) == 0:
+        raise ValueError("`cam2world` must hold at least one camera to fly from, got none")
+    eased = ease_in_out(fraction)
+    up = up_direction(cam2world)
+    poses = way_poses(cam2world)
+    pose = _along(poses, eased)
+    # The sweep follows the eased way, so that the turn also starts and stops smoothly.
+    return turn_pose(pose, -math.radians(turn_degrees) * math.sin(2 * math.pi * eased), up)
+
+
+def fly_path(
+    cam2world: Float[Tensor, "view 4 4"], fractions: Sequence[float], *, turn_degrees: float = 40.0
+) -> Float[Tensor, "time 4 4"]:
+    """The poses of `fly_pose` at each of the fractions."""
+    return torch.stack([fly_pose(cam2world, fraction, turn_degrees=turn_degrees) for fraction in fractions])
+
+
+def _along(poses: Float[Tensor, "stop 4 4"], fraction: float) -> Float[Tensor, "4 4"]:
+    """Pose at a fraction of the polyline's length; where nothing moves, of the number of stops."""
+    if len(poses) == 1:
+        return poses[0]
+    steps = (poses[1:, :3, 3] - poses[:-1, :3, 3]).norm(dim=-1)
+    if float(steps.sum()) < _STILL:
+        steps = torch.ones_like(steps)
+    ends = torch.cumsum(steps, 0) / steps.sum()
+    leg = min(int(torch.searchsorted(ends, fraction)), len(steps) - 1)
+    start = float(ends[leg - 1]) if leg else 0.0
+    length = float(ends[leg]) - start
+    within = (fraction - start) / length if length > 0 else 1.0
+    return interpolate_poses(poses[leg], poses[leg + 1], min(max(within, 0.0), 1.0))
