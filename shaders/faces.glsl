@@ -1,0 +1,62 @@
+// Bilinear look-up in six cube faces kept in one texture, three tiles by two; docs/rendering.md, section 6.
+
+uniform int face_size;
+uniform bool fast_filter;   // the texture unit's own filter inside a face (coarse weights on some GPUs)
+
+const mat3 FACES[6] = mat3[6](      // columns right, down, forward: pansplat/geometry/cubemap.py
+    mat3(1, 0, 0, 0, 1, 0, 0, 0, 1), mat3(0, 0, -1, 0, 1, 0, 1, 0, 0), mat3(-1, 0, 0, 0, 1, 0, 0, 0, -1),
+    mat3(0, 0, 1, 0, 1, 0, -1, 0, 0), mat3(1, 0, 0, 0, 0, 1, 0, -1, 0), mat3(1, 0, 0, 0, 0, -1, 0, 1, 0));
+
+int face_of(vec3 d) {
+    vec3 size = abs(d);
+    if (size.z >= size.x && size.z >= size.y) return d.z >= 0.0 ? 0 : 2;
+    if (size.x >= size.y) return d.x >= 0.0 ? 1 : 3;
+    return d.y < 0.0 ? 4 : 5;
+}
+
+vec2 on_face(int face, vec3 d) {            // pixel coordinates on a face, row 0 on top
+    vec3 local = d * FACES[face];
+    return (local.xy / local.z + 1.0) * (0.5 * float(face_size));
+}
+
+ivec2 tile(int face) { return ivec2(face % 3, face / 3) * face_size; }
+
+vec4 fetch_inside(sampler2D atlas, int face, ivec2 pixel) {
+    ivec2 inside = clamp(pixel, ivec2(0), ivec2(face_size - 1));
+    return texelFetch(atlas, tile(face) + ivec2(inside.x, face_size - 1 - inside.y), 0);
+}
+
+// The pixel of the neighbour that touches this face's border: swap the roles of `axis` and forward.
+vec4 fetch_across(sampler2D atlas, int face, ivec2 pixel, int axis) {
+    vec2 place = (2.0 * vec2(clamp(pixel, ivec2(0), ivec2(face_size - 1))) + 1.0) / float(face_size) - 1.0;
+    vec3 local = vec3(place, 1.0);
+    local.z = abs(place[axis]);
+    local[axis] = pixel[axis] < 0 ? -1.0 : 1.0;
+    vec3 d = FACES[face] * local;
+    vec3 step_out = FACES[face] * vec3(axis == 0 ? local.x : 0.0, axis == 1 ? local.y : 0.0, 0.0);
+    int neighbour = face_of(step_out);
+    return fetch_inside(atlas, neighbour, ivec2(floor(on_face(neighbour, d))));
+}
+
+vec4 fetch(sampler2D atlas, int face, ivec2 pixel) {
+    bvec2 out_x_y = bvec2(pixel.x < 0 || pixel.x >= face_size, pixel.y < 0 || pixel.y >= face_size);
+    if (!any(out_x_y)) return fetch_inside(atlas, face, pixel);
+    if (!all(out_x_y)) return fetch_across(atlas, face, pixel, out_x_y.x ? 0 : 1);
+    // Beyond a corner three faces meet and no fourth pixel exists.
+    return (fetch_inside(atlas, face, pixel) + fetch_across(atlas, face, pixel, 0) +
+            fetch_across(atlas, face, pixel, 1)) / 3.0;
+}
+
+vec4 sample_faces(sampler2D atlas, vec3 d) {
+    int face = face_of(d);
+    vec2 place = on_face(face, d);
+    if (fast_filter && all(greaterThan(place, vec2(0.5))) && all(lessThan(place, vec2(float(face_size) - 0.5)))) {
+        vec2 texel = vec2(tile(face)) + vec2(place.x, float(face_size) - place.y);
+        return textureLod(atlas, texel / (float(face_size) * vec2(3.0, 2.0)), 0.0);
+    }
+    vec2 corner = floor(place - 0.5), f = place - 0.5 - corner;
+    ivec2 p = ivec2(corner);
+    vec4 top = mix(fetch(atlas, face, p), fetch(atlas, face, p + ivec2(1, 0)), f.x);
+    vec4 bottom = mix(fetch(atlas, face, p + ivec2(0, 1)), fetch(atlas, face, p + ivec2(1, 1)), f.x);
+    return mix(top, bottom, f.y);
+}

@@ -1,0 +1,86 @@
+"""GLSL programs: sources read from the package, includes resolved, compiled when first used."""
+
+from __future__ import annotations
+
+import re
+from importlib import resources
+from typing import Any
+
+import moderngl
+
+_INCLUDE = re.compile(r'^#include "([^"]+)"$', re.MULTILINE)
+
+# The members of one record, in the order of shaders/project.vert and project.comp.
+RECORD = ("quad_1", "quad_2", "response_a", "response_b", "response_l", "color")
+RECORD_BYTES = 16 * len(RECORD)
+
+
+def source(name: str, version: int) -> str:
+    """The text of a shader file with its includes and the `#version` line for GL `version` (330 or 430)."""
+    folder = resources.files("pansplat_viewer.shaders")
+    text = _INCLUDE.sub(
+        lambda match: (folder / match[1]).read_text("utf-8"), (folder / name).read_text("utf-8")
+    )
+    return f"#version {version} core\n{text}"
+
+
+def set_uniforms(program: Any, **values: Any) -> None:
+    """Set uniforms by name; those the compiler removed because nothing reads them are passed over."""
+    for name, value in values.items():
+        member = program.get(name, None)
+        if member is None:
+            continue
+        if isinstance(value, bytes):
+            member.write(value)
+        else:
+            member.value = value
+
+
+class Programs:
+    """The viewer's programs on one context."""
+
+    def __init__(self, ctx: moderngl.Context) -> None:
+        """Nothing is compiled yet."""
+        self._ctx = ctx
+        self._made: dict[str, Any] = {}
+
+    def project(self) -> moderngl.Program:
+        """Gaussians to records by transform feedback (GL 3.3)."""
+        if "project" not in self._made:
+            self._made["project"] = self._ctx.program(
+                vertex_shader=source("project.vert", 330),
+                varyings=RECORD,
+                varyings_capture_mode="interleaved",
+            )
+        return self._made["project"]
+
+    def project_compute(self) -> moderngl.ComputeShader:
+        """Gaussians to records by a compute shader (GL 4.3)."""
+        if "compute" not in self._made:
+            self._made["compute"] = self._ctx.compute_shader(source("project.comp", 430))
+        return self._made["compute"]
+
+    def splat(self) -> moderngl.Program:
+        """Records to pixels."""
+        return self._pair("splat.vert", "splat.frag")
+
+    def gather(self) -> moderngl.Program:
+        """A layer, seen directly or through cube faces, weighted."""
+        return self._pair("screen.vert", "gather.frag")
+
+    def finish(self) -> moderngl.Program:
+        """The added layers to the picture."""
+        return self._pair("screen.vert", "finish.frag")
+
+    def _pair(self, vertex: str, fragment: str) -> moderngl.Program:
+        if fragment not in self._made:
+            self._made[fragment] = self._ctx.program(
+                vertex_shader=source(vertex, 330), fragment_shader=source(fragment, 330)
+            )
+        return self._made[fragment]
+
+    def release(self) -> None:
+        """Free all programs."""
+        for program in self._made.values():
+            program.release()
+        self._made.clear()
