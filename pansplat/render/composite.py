@@ -15,11 +15,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pansplat.render.splats import ALPHA_CUT, Splats
+from pansplat.render.threads import one_thread
 from pansplat.render.tiles import TileLists
 
 _BLOCK = 32  # Gaussians a step
-# Pixel-Gaussian pairs a step. Small enough for the cache, and for torch to run each operation on one core:
-# on a busy machine, waking a second one costs more than it gives.
+# Pixel-Gaussian pairs a step, few enough for the cache.
 _PAIRS = 32768
 _LARGEST_ALPHA = 0.99
 
@@ -54,6 +54,7 @@ class _Composite(torch.autograd.Function):
     """The sums, with a backward that recomputes block by block."""
 
     @staticmethod
+    @one_thread()
     def forward(
         ctx: Any, rows: Tensor, points: Tensor, lists: TileLists, pixels: TilePixels, exact: bool
     ) -> Float[Tensor, "tile pixel 5"]:
@@ -85,6 +86,7 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
+    @one_thread()
     def backward(ctx: Any, grad_sums: Tensor) -> tuple[Tensor, Tensor, None, None, None]:  # type: ignore[override]
         rows, points = ctx.saved_tensors
         lists, pixels, exact, kept = ctx.plan
@@ -121,7 +123,7 @@ def _pad(table: Tensor) -> Tensor:
 def _groups(
     lists: TileLists, filler: int, size: int
 ) -> Iterator[tuple[Int[Tensor, "g"], Iterator[Int[Tensor, "live block"]]]]:
-    """Groups of tiles (counted from the lists' first) and each one's blocks of Gaussian indices, front to back.
+    """Groups of tiles (counted from the lists' first), and each's blocks of Gaussians, front to back.
 
     A group's tiles are sorted by falling number of Gaussians, so those still live in a block come first.
     """

@@ -1,4 +1,4 @@
-"""The pictures a camera can take: pinhole, direct panorama, cube faces, and the stitching of faces into a panorama.
+"""The pictures a camera can take: pinhole, direct panorama, cube faces; and the stitching of faces.
 
 Source: docs/rendering.md, section 6; PanSplat, section 3.4.
 """

@@ -28,6 +28,7 @@ from pansplat.render.splats import (
     ray_splats,
     sound,
 )
+from pansplat.render.threads import one_thread
 from pansplat.render.tiles import TILE, list_tiles, tile_grid
 
 Kernel = Literal["ray", "ewa"]
@@ -76,6 +77,7 @@ class Rendering:
     info: Info | None = None
 
 
+@one_thread()
 def rasterize(
     gaussians: Gaussians,
     cam2world: Float[Tensor, "4 4"],

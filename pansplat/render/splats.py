@@ -57,15 +57,11 @@ class Splats(NamedTuple):
 
 
 def sound(gaussians: Gaussians) -> Bool[Tensor, "n"]:
-    """Which Gaussians hold only numbers that can be drawn: finite, and not so large that products overflow."""
+    """Which Gaussians hold only usable numbers: finite, and not so large that products overflow."""
     fields = (gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities, gaussians.harmonics)
     keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     for field in fields:
-        keep &= (
-            (field.detach().abs().flatten(1) < _LARGEST).all(dim=1)
-            if field.ndim > 1
-            else field.detach().abs() < _LARGEST
-        )
+        keep &= (field.detach().abs() < _LARGEST).reshape(len(keep), max(1, field[:1].numel())).all(dim=1)
     return keep
 
 
