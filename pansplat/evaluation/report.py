@@ -1,0 +1,209 @@
+"""Predictions against real panoramas: pictures, figures and the table of a whole evaluation.
+
+Source: PanSplat, section 4 (metrics of the views between the inputs), beside a cross-fade without geometry.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from rich.table import Table
+from torch import Tensor
+
+from pansplat import pipeline
+from pansplat.data.atomic import replacing
+from pansplat.data.images import write_image
+from pansplat.data.pairs import Pair
+from pansplat.errors import InputError
+from pansplat.evaluation.cross_fade import cross_fade
+from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
+from pansplat.model.predictor import Predictor, Progress
+
+ERROR_SCALE = 0.25  # mean absolute error of the colours that the error picture shows brightest
+
+
+@dataclass(frozen=True)
+class Case:
+    """One target view: the figures (dB where PSNR) and where its pictures lie.
+
+    Attributes:
+        masked_ws_psnr: WS-PSNR of what the target's mask leaves, when it has one; only in the printed table.
+    """
+
+    name: str
+    model: str
+    height: int
+    ws_psnr: float
+    psnr: float
+    ssim: float
+    cross_fade_ws_psnr: float
+    predict_seconds: float
+    render_seconds: float
+    num_gaussians: int
+    prediction: Path
+    target: Path
+    masked_ws_psnr: float | None = field(default=None, compare=False)
+
+    def as_json(self) -> dict[str, object]:
+        """What results.json says of the case; numbers that are not finite become null."""
+        values = dataclasses.asdict(self)
+        del values["masked_ws_psnr"]
+        finite = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
+        return {key: str(value) if isinstance(value, Path) else value for key, value in finite.items()}
+
+
+def evaluate(
+    pairs: Sequence[Pair],
+    predictor: Predictor,
+    out: Path,
+    *,
+    height: int = 512,
+    blend: str | int = "deferred",
+    progress: Progress | None = None,
+) -> list[Case]:
+    """Evaluate every target of the pairs and write results.json and the pictures into `out`.
+
+    Each pair is predicted anew, whatever is cached, so that its time is true. results.json is written after
+    each pair: what was done before an interruption is there.
+
+    Raises:
+        InputError: when no pair has a target, or `out` cannot be written.
+    """
+    with_targets = [pair for pair in pairs if pair.targets]
+    if not with_targets:
+        raise InputError("none of the pairs has a target view to compare with; name targets in pairs.json")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out {out}: cannot make this folder: {error.strerror}") from error
+    cases: list[Case] = []
+    for index, pair in enumerate(with_targets):
+
+        def report(what: str, fraction: float, pair: Pair = pair, index: int = index) -> None:
+            if progress is not None:
+                progress(f"{pair.name}: {what}", (index + fraction) / len(with_targets))
+
+        taken = {case.prediction.parent.name for case in cases}
+        cases += _evaluate_pair(pair, predictor, out, taken, height, blend, report)
+        write_results(cases, out / "results.json")
+    return cases
+
+
+def _evaluate_pair(
+    pair: Pair,
+    predictor: Predictor,
+    out: Path,
+    taken: set[str],
+    height: int,
+    blend: str | int,
+    progress: Progress,
+) -> Iterator[Case]:
+    context, targets = pair.load_context(height), pair.load_targets(height)
+    began = time.perf_counter()
+    scene = pipeline.predict(context, predictor, progress=progress)
+    predict_seconds = time.perf_counter() - began
+    for view, target in enumerate(targets.images):
+        progress("rendering", 1.0)
+        pose = targets.cam2world[view]
+        began = time.perf_counter()
+        with torch.no_grad():
+            picture = pipeline.render(scene, pose, blend=blend, size=(height, 2 * height)).color.float()
+        render_seconds = time.perf_counter() - began
+        name = pair.name if len(targets.images) == 1 else f"{pair.name} {Path(targets.names[view]).stem}"
+        folder = out / _free_name(name, taken)
+        folder.mkdir(exist_ok=True)
+        write_image(folder / "prediction.png", picture)
+        write_image(folder / "target.png", target)
+        write_image(folder / "error.png", error_picture(picture, target))
+        mask = targets.masks[view]
+        yield Case(
+            name=folder.name,
+            model=predictor.name,
+            height=height,
+            ws_psnr=ws_psnr(picture, target),
+            psnr=psnr(picture, target),
+            ssim=ssim(picture, target),
+            cross_fade_ws_psnr=ws_psnr(cross_fade(context.images, context.cam2world, pose), target),
+            predict_seconds=predict_seconds,
+            render_seconds=render_seconds,
+            num_gaussians=len(scene.gaussians),
+            prediction=(folder / "prediction.png").resolve(),
+            target=(folder / "target.png").resolve(),
+            masked_ws_psnr=None if bool(mask.all()) else ws_psnr(picture, target, mask=mask),
+        )
+
+
+def error_picture(
+    prediction: Float[Tensor, "3 height width"], target: Float[Tensor, "3 height width"]
+) -> Float[Tensor, "3 height width"]:
+    """The mean absolute error of the colours as heat: black where equal, pale yellow from ERROR_SCALE up."""
+    from matplotlib import colormaps
+
+    error = (prediction - target).abs().mean(0).div(ERROR_SCALE).clamp(0, 1).cpu().numpy()
+    heat = np.asarray(colormaps["inferno"](error), np.float32)[..., :3]
+    return torch.from_numpy(heat).permute(2, 0, 1)
+
+
+def write_results(cases: Sequence[Case], path: Path) -> None:
+    """Write the cases as a JSON list of objects, atomically."""
+    text = json.dumps([case.as_json() for case in cases], indent=1)
+    with replacing(path) as partial:
+        partial.write_text(text + "\n", encoding="utf-8")
+
+
+def results_table(cases: Sequence[Case]) -> Table:
+    """A table of the cases with their mean, to print."""
+    masked = any(case.masked_ws_psnr is not None for case in cases)
+    table = Table(title=f"{cases[0].model}, {cases[0].height}x{2 * cases[0].height}" if cases else None)
+    table.add_column("case")
+    heads = [
+        "WS-PSNR",
+        *(["masked"] if masked else []),
+        "PSNR",
+        "SSIM",
+        "cross-fade",
+        "predict s",
+        "render s",
+    ]
+    for head in [*heads, "Gaussians"]:
+        table.add_column(head, justify="right")
+    rows = [_figures(case, masked) for case in cases]
+    for case, row in zip(cases, rows, strict=True):
+        table.add_row(case.name, *_formatted(row, masked))
+    if len(rows) > 1:
+        table.add_section()
+        table.add_row(
+            "mean", *_formatted([sum(column) / len(rows) for column in zip(*rows, strict=True)], masked)
+        )
+    return table
+
+
+def _figures(case: Case, masked: bool) -> list[float]:
+    whole = case.ws_psnr if case.masked_ws_psnr is None else case.masked_ws_psnr
+    figures = [case.ws_psnr, *([whole] if masked else []), case.psnr, case.ssim, case.cross_fade_ws_psnr]
+    return [*figures, case.predict_seconds, case.render_seconds, case.num_gaussians]
+
+
+def _formatted(figures: Sequence[float], masked: bool) -> list[str]:
+    formats = [".2f", *([".2f"] if masked else []), ".2f", ".4f", ".2f", ".1f", ".1f", ",.0f"]
+    return [format(value, how) for value, how in zip(figures, formats, strict=True)]
+
+
+def _free_name(name: str, taken: set[str]) -> str:
+    """The name as one that a folder can have, numbered when another case has it already."""
+    base = re.sub(r"[^\w.+-]+", "_", name).strip("._") or "case"
+    free, number = base, 2
+    while free in taken:
+        free, number = f"{base}-{number}", number + 1
+    taken.add(free)
+    return free
