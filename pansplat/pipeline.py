@@ -20,7 +20,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-import pansplat.render as rendering
 from pansplat.data.atomic import replacing
 from pansplat.data.pairs import Pair, load_pairs
 from pansplat.data.views import Views
@@ -30,6 +29,7 @@ from pansplat.gaussians.ply import load_ply, save_ply
 from pansplat.gaussians.scene import Scene
 from pansplat.model.predictor import Predictor, Progress
 from pansplat.render import Rendering, blend_weights, rasterize
+from pansplat.render import blend as blend_renderings
 
 __all__ = ["load", "load_model", "load_pairs", "predict", "render", "save"]
 
@@ -67,11 +67,11 @@ def predict(
 ) -> Scene:
     """The scene seen by the context panoramas of a pair.
 
-    A pair's result is kept beside it (`.pansplat/` in its folder, or the user's cache folder where that is not
-    writable) under a hash of everything it depends on: pixels, masks, poses, depth range and the predictor.
+    A pair's result is kept beside it (`.pansplat/` in its folder, or the user's cache folder where that
+    cannot be written) under a hash of everything it depends on: pixels, masks, poses, depth range, predictor.
 
     Args:
-        source: a pair, the path of a folder that holds exactly one, or panoramas already loaded (never cached).
+        source: a pair, the path of a folder that holds exactly one, or loaded panoramas (never cached).
         model: the name of a predictor, or a predictor.
         height: panoramas are resized to (height, 2 height); loaded ones keep their size.
         cache: whether an earlier result may be returned and this one kept.
@@ -90,7 +90,7 @@ def predict(
     key = _cache_key(views, predictor)
     stem = f"{_slug(pair.name)}-{_slug(predictor.name)}-{height}"
     for folder in _cache_folders(pair):
-        scene = _read_cached(folder / f"{stem}-{key}.safetensors", views, predictor)
+        scene = _read_cached(folder / f"{stem}-{key}.scene", views, predictor)
         if scene is not None:
             if progress is not None:
                 progress("kept from last time", 1.0)
@@ -114,8 +114,8 @@ def render(
     Args:
         scene: what to draw.
         cam2world: pose of the camera, OpenCV axes, metres.
-        blend: "deferred" draws each context view's Gaussians by themselves and blends the pictures by nearness;
-            "joint" draws all together; a number draws one view's only.
+        blend: "deferred" draws each context view's Gaussians by themselves and blends the pictures by
+            nearness; "joint" draws all together; a number draws one view's only.
         size: (height, width) in pixels; by default the scene's own height, 2:1 (16:9 for `pinhole`).
         layout: "equirect", "cubemap" or "pinhole".
         **raster: further options of `pansplat.render.rasterize`.
@@ -140,7 +140,7 @@ def render(
     # A view without weight leaves no trace in the blend: at an input, one drawing does.
     drawn = [view for view in range(count) if float(weights[view]) > 0]
     pictures = [rasterize(scene.gaussians.select(scene.gaussians.views == v), pose, **options) for v in drawn]
-    return pictures[0] if len(drawn) == 1 else rendering.blend(pictures, weights[drawn])
+    return pictures[0] if len(drawn) == 1 else blend_renderings(pictures, weights[drawn])
 
 
 def save(scene: Scene, path: str | Path) -> None:
@@ -229,7 +229,6 @@ def _read_cached(path: Path, views: Views, predictor: Predictor) -> Scene | None
         gaussians = Gaussians(*(tensors[name] for name in _FIELDS))
     except (OSError, ValueError, KeyError, safetensors.SafetensorError):
         return None
-    gaussians.levels.data, gaussians.views.data = gaussians.levels.long(), gaussians.views.long()
     return _scene(gaussians, views, predictor)
 
 
@@ -240,13 +239,13 @@ def _write_cached(gaussians: Gaussians, folders: list[Path], stem: str, key: str
     for folder in folders:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            with replacing(folder / f"{stem}-{key}.safetensors") as partial, open(partial, "wb") as file:
+            with replacing(folder / f"{stem}-{key}.scene") as partial, open(partial, "wb") as file:
                 file.write(body)
                 file.write(zlib.crc32(body).to_bytes(4, "little"))
         except (OSError, InputError):
             continue
         # What the pair looked like before is of no use any more, and a scene takes some 50 MB.
-        for old in folder.glob("*.safetensors"):
+        for old in folder.glob("*.scene"):
             if old.name.startswith(f"{stem}-") and key not in old.name:
                 old.unlink(missing_ok=True)
         return
