@@ -1,0 +1,206 @@
+"""The `pansplat-view` command. Imports neither torch nor OpenGL before it has to: `--help` is quick."""
+
+import re
+import sys
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from pansplat.errors import InputError
+from pansplat_viewer.library import Entry, Loader, LoadOptions, find_entries, load_entry
+from pansplat_viewer.settings import DrawSettings, Kernel, Mode, Order
+
+if TYPE_CHECKING:
+    from pansplat_viewer.window import Window
+
+
+@dataclass(frozen=True)
+class Options:
+    """Fly through the scene between two posed 360-degree panoramas.
+
+    Opens a window, or without a display writes a film, stills and a panorama.
+    """
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """A pair folder, a folder of pairs, or a scene .ply."""
+    offscreen: Path | None = None
+    """Open no window: write film and pictures to this folder."""
+    model: str = "sweep"
+    """What predicts the scene from a pair."""
+    height: int = 512
+    """Height of the panoramas that the prediction sees, pixels."""
+    cache: bool = True
+    """Keep predictions beside the pair, and use those kept."""
+    convention: str | None = None
+    """Pose convention to read the poses by, such as "world2cam opengl", instead of what the files say."""
+    near: float | None = None
+    """Nearest depth searched, metres, instead of what the files say."""
+    far: float | None = None
+    """Farthest depth searched, metres."""
+    mode: Mode = "deferred"
+    """How the input views' Gaussians come together."""
+    kernel: Kernel = "ray"
+    """Response of a Gaussian: exact on each ray, or the linearised one of 3DGS."""
+    order: Order = "radial"
+    """Sort Gaussians by distance, or by depth along the view axis."""
+    at: float | None = None
+    """Where to start between the panoramas, 0 to 1 (0); offscreen, where to take the panorama (0.5)."""
+    size: str = "1280x720"
+    """Width x height of the window or film, pixels."""
+    seconds: float = 5.0
+    """Length of the film."""
+    fps: float = 24.0
+    """Pictures a second of the film."""
+
+    @property
+    def pixels(self) -> tuple[int, int]:
+        """`size` as numbers.
+
+        Raises:
+            InputError: not WIDTHxHEIGHT, or out of range.
+        """
+        match = re.fullmatch(r"(\d{2,5})x(\d{2,5})", self.size.lower())
+        if not match or not all(16 <= int(side) <= 16384 for side in match.groups()):
+            raise InputError(f"`--size` must be WIDTHxHEIGHT in pixels, 16 to 16384, got {self.size!r}")
+        return int(match[1]), int(match[2])
+
+    @property
+    def load_options(self) -> LoadOptions:
+        """How to read and predict."""
+        return LoadOptions(self.model, self.height, self.cache, self.convention, self.near, self.far)
+
+    @property
+    def settings(self) -> DrawSettings:
+        """How to draw."""
+        return DrawSettings(kernel=self.kernel, order=self.order, mode=self.mode)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the command and exit: 0 done, 2 unusable input, 130 interrupted."""
+    sys.exit(run(args))
+
+
+def run(args: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    options = tyro.cli(
+        Options,
+        args=args,
+        prog="pansplat-view",
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+    with warnings.catch_warnings():
+        # What libraries warn of is for programmers; what we warn of is for the person.
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("always", category=UserWarning, module=r"pansplat(_viewer)?(\.|$)")
+        warnings.showwarning = lambda message, *_: print(f"note: {message}", file=sys.stderr)
+        try:
+            return _run(options)
+        except InputError as error:
+            print(f"pansplat-view: {error}", file=sys.stderr)
+            return 2
+        except KeyboardInterrupt:
+            return 130
+
+
+def _run(options: Options) -> int:
+    pixels = options.pixels
+    if options.at is not None and not 0 <= options.at <= 1:
+        raise InputError(f"`--at` must be between 0 and 1, got {options.at}")
+    entries = find_entries(options.path.expanduser(), options.load_options)
+    folder = options.offscreen
+    if folder is None:
+        problem = _try_window(options, entries, pixels)
+        if problem is None:
+            return 0
+        print(f"{problem}: writing a fly-through instead")
+    for entry in entries:
+        target = Path("renders") / entry.folder_name if folder is None else folder
+        if folder is not None and len(entries) > 1:
+            target = folder / entry.folder_name
+        _write(options, entry, target, pixels)
+    return 0
+
+
+def _try_window(options: Options, entries: list[Entry], pixels: tuple[int, int]) -> str | None:
+    """Show the window until the person leaves; the reason when there can be none."""
+    from pansplat_viewer.window import NoWindowError, Window
+
+    try:
+        window = Window("pansplat", pixels)
+    except NoWindowError as error:
+        return str(error)
+    _show(window, options, entries)
+    return None
+
+
+def _show(window: "Window", options: Options, entries: list[Entry]) -> None:
+    import moderngl
+
+    from pansplat_viewer.state import ViewerState
+    from pansplat_viewer.viewer import Viewer
+    from pansplat_viewer.window import run as run_window
+
+    load_options = options.load_options
+
+    def make_viewer(ctx: moderngl.Context, dpi_scale: float) -> Viewer:
+        viewer = Viewer(
+            ctx,
+            Loader(lambda entry, progress: load_entry(entry, load_options, progress)),
+            find=lambda path: find_entries(path, load_options),
+            state=ViewerState(settings=options.settings),
+            at=options.at or 0.0,
+            dpi_scale=dpi_scale,
+        )
+        viewer.show(entries, 0)
+        return viewer
+
+    run_window(window, make_viewer)
+
+
+def _write(options: Options, entry: Entry, folder: Path, pixels: tuple[int, int]) -> None:
+    """Predict or read one entry and write its fly-through, with progress on the terminal."""
+    from dataclasses import replace
+
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from pansplat_viewer.flythrough import Film, write_flythrough
+    from pansplat_viewer.offscreen import create_context
+    from pansplat_viewer.renderer import SplatRenderer
+
+    film = Film(pixels, options.seconds, options.fps, 0.5 if options.at is None else options.at)
+    ctx = create_context()  # before the long part: without OpenGL there is nothing to predict for
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f}%"))
+    with Progress(*columns, TimeElapsedColumn()) as bars:
+        load = bars.add_task(entry.name, total=1.0)
+        loaded = load_entry(
+            entry,
+            options.load_options,
+            lambda what, done: bars.update(load, description=f"{entry.name}: {what}", completed=done),
+            photos=False,
+        )
+        bars.update(
+            load, description=f"{entry.name}: {len(loaded.scene.gaussians):,} Gaussians", completed=1.0
+        )
+        draw = bars.add_task("fly-through", total=1.0)
+        settings = options.settings
+        if len(loaded.scene.cam2world) < 2 and settings.mode in ("deferred", "difference"):
+            settings = replace(settings, mode="joint")
+        renderer = SplatRenderer(ctx)
+        try:
+            written = write_flythrough(
+                renderer,
+                loaded.scene,
+                folder,
+                film,
+                settings,
+                lambda what, done: bars.update(draw, description=f"fly-through: {what}", completed=done),
+            )
+        finally:
+            renderer.release()
+            ctx.release()
+    for path in written:
+        print(path)

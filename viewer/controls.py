@@ -1,0 +1,196 @@
+"""Keys and mouse: what a person did in one frame, and what it does to the state.
+
+`read_input` asks imgui, so a window, synthetic events and tests take the same way. `apply` is pure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pansplat_viewer import camera as cameras
+from pansplat_viewer.state import ViewerState, jump, step_flight, toggle_play
+
+FLY_SPEED = 1.0  # metres a second
+FAST, SLOW = 4.0, 0.2
+ORBIT_KEY_PIXELS = 400.0  # a second, of a window 1000 high
+
+# Shown by H and printed in docs/viewer.md; the order is that of the help window.
+HELP = (
+    ("W A S D", "fly forward, left, back, right"),
+    ("Q E", "fly down, up"),
+    ("Shift, Alt", "faster, slower"),
+    ("drag", "look around (orbit: turn)"),
+    ("right drag", "pan"),
+    ("scroll", "field of view (orbit: distance)"),
+    ("V", "orbit or fly"),
+    ("F", "focus the point in the middle"),
+    ("1 2", "jump to panorama 1, 2"),
+    ("Space", "play the flight between them"),
+    (", .", "step along the flight"),
+    ("C", "compare with the nearest photograph"),
+    ("P, Shift P", "screenshot PNG, EXR with depth"),
+    ("R", "back to the start"),
+    ("Tab", "panels on or off"),
+    ("H", "this help"),
+    ("Esc, Ctrl Q", "leave"),
+)
+
+
+@dataclass(frozen=True)
+class Input:
+    """What happened in one frame.
+
+    Attributes:
+        seconds: since the last frame.
+        held: names of the keys that are down (lower case: "w", "shift", ...).
+        pressed: names of the keys that went down in this frame.
+        drag: pointer movement with the left button held on the picture, pixels (right, down).
+        pan: the same with the right or middle button.
+        scroll: wheel steps, positive away from the person.
+        height: of the window, pixels.
+    """
+
+    seconds: float = 1 / 60
+    held: frozenset[str] = frozenset()
+    pressed: frozenset[str] = frozenset()
+    drag: tuple[float, float] = (0.0, 0.0)
+    pan: tuple[float, float] = (0.0, 0.0)
+    scroll: float = 0.0
+    height: int = 720
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What the input asks for that is not a change of state: pictures, and the depth to focus on."""
+
+    png: bool = False
+    exr: bool = False
+    focus: bool = False
+
+
+_KEYS = {
+    **{letter: letter for letter in "wasdqevfhprc"},
+    "1": "_1",
+    "2": "_2",
+    "3": "_3",
+    "4": "_4",
+    "space": "space",
+    ",": "comma",
+    ".": "period",
+    "tab": "tab",
+    "escape": "escape",
+    "up": "up_arrow",
+    "down": "down_arrow",
+    "left": "left_arrow",
+    "right": "right_arrow",
+}
+
+
+def read_input(seconds: float) -> Input:
+    """This frame's input from imgui; nothing that a panel wants for itself."""
+    from imgui_bundle import imgui
+
+    io = imgui.get_io()
+    held: set[str] = set()
+    pressed: set[str] = set()
+    if not io.want_text_input:
+        for name, key in _KEYS.items():
+            value = getattr(imgui.Key, key)
+            if imgui.is_key_down(value):
+                held.add(name)
+            if imgui.is_key_pressed(value, repeat=name in ",."):
+                pressed.add(name)
+    for name, down in (("shift", io.key_shift), ("alt", io.key_alt), ("ctrl", io.key_ctrl)):
+        if down:
+            held.add(name)
+    drag = pan = (0.0, 0.0)
+    scroll = 0.0
+    if not io.want_capture_mouse:
+        moved = (float(io.mouse_delta.x), float(io.mouse_delta.y))
+        if imgui.is_mouse_down(0) and not imgui.is_mouse_clicked(0):
+            drag = moved
+        elif imgui.is_mouse_down(1) or imgui.is_mouse_down(2):
+            pan = moved
+        scroll = float(io.mouse_wheel)
+    return Input(seconds, frozenset(held), frozenset(pressed), drag, pan, scroll, int(io.display_size.y))
+
+
+def apply(state: ViewerState, given: Input) -> Wishes:
+    """Change the state as the input says; returns what else was asked for."""
+    if "ctrl" in given.held:
+        state.quit = state.quit or bool({"q"} & given.pressed)
+        return Wishes()
+    _press(state, given.pressed)
+    _move(state, given)
+    shift = "shift" in given.held
+    shot = "p" in given.pressed
+    return Wishes(png=shot and not shift, exr=shot and shift, focus="f" in given.pressed)
+
+
+def _press(state: ViewerState, pressed: frozenset[str]) -> None:
+    if "escape" in pressed:
+        if state.help:
+            state.help = False
+        else:
+            state.quit = True
+    if "tab" in pressed:
+        state.overlay = not state.overlay
+    if "h" in pressed:
+        state.help = not state.help
+    if "c" in pressed:
+        state.photo = not state.photo
+    if "v" in pressed:
+        state.orbiting = not state.orbiting
+    if "space" in pressed:
+        toggle_play(state)
+    if "r" in pressed:
+        state.playing, state.camera = False, state.home
+    for view in range(4):
+        if str(view + 1) in pressed:
+            jump(state, view)
+    if "," in pressed:
+        step_flight(state, -1)
+    if "." in pressed:
+        step_flight(state, 1)
+
+
+def _move(state: ViewerState, given: Input) -> None:
+    held = given.held
+    axes = np.array(
+        (
+            ("d" in held or "right" in held) - ("a" in held or "left" in held),
+            ("e" in held) - ("q" in held),
+            ("w" in held or "up" in held) - ("s" in held or "down" in held),
+        ),
+        dtype=float,
+    )
+    factor = (FAST if "shift" in held else 1.0) * (SLOW if "alt" in held else 1.0)
+    camera = state.camera
+    if state.orbiting:
+        reach = ORBIT_KEY_PIXELS * given.seconds * factor * given.height / 1000
+        if axes[0] or axes[1]:
+            camera = cameras.orbit(camera, (-axes[0] * reach, axes[1] * reach), given.height)
+        if axes[2]:
+            camera = cameras.dolly(camera, axes[2] * 6 * given.seconds * factor)
+        if any(given.drag):
+            camera = cameras.orbit(camera, given.drag, given.height)
+        if given.scroll:
+            camera = cameras.dolly(camera, given.scroll)
+    else:
+        step = axes * FLY_SPEED * state.speed * factor * given.seconds
+        if axes.any():
+            camera = cameras.fly(camera, *step)
+        if any(given.drag):
+            camera = cameras.drag_look(camera, given.drag, given.height)
+        if given.scroll:
+            camera = cameras.zoom(camera, given.scroll)
+    if any(given.pan):
+        metres = camera.distance / max(given.height, 1)
+        camera = cameras.fly(camera, -given.pan[0] * metres, given.pan[1] * metres, 0.0)
+    if camera != state.camera:
+        # The hand on the controls wins over the flight, except that a zoom does not stop it.
+        moved = replace(camera, vertical_fov_degrees=state.camera.vertical_fov_degrees) != state.camera
+        state.playing = state.playing and not moved
+        state.camera = camera

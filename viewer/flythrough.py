@@ -1,0 +1,126 @@
+"""Without a window: a film of the flight between the panoramas, stills on the way, a panorama amid it."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from pansplat.data.images import write_image
+from pansplat.data.video import write_video
+from pansplat.gaussians.scene import Scene
+from pansplat.geometry.path import fly_pose, way_poses
+from pansplat.geometry.pose import interpolate_poses
+from pansplat_viewer import camera as cameras
+from pansplat_viewer.renderer import SplatRenderer
+from pansplat_viewer.settings import DrawSettings
+from pansplat_viewer.state import ViewerState, enter
+
+STILLS = (0.0, 0.25, 0.5, 0.75, 1.0)
+
+
+@dataclass(frozen=True)
+class Film:
+    """What to make.
+
+    Attributes:
+        size: of film and stills, pixels (width, height).
+        seconds: length of the film.
+        fps: pictures a second.
+        at: fraction of the flight where the panorama is taken.
+        vertical_fov_degrees: of film and stills.
+        panorama_height: pixels; None takes the height that the scene was predicted at.
+    """
+
+    size: tuple[int, int] = (1280, 720)
+    seconds: float = 5.0
+    fps: float = 24.0
+    at: float = 0.5
+    vertical_fov_degrees: float = 75.0
+    panorama_height: int | None = None
+
+    @property
+    def frames(self) -> int:
+        """Number of pictures in the film."""
+        return max(round(self.seconds * self.fps), 2)
+
+
+def flight_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
+    """Pose at a fraction of the scene's flight; a scene without cameras is circled once."""
+    if len(scene.cam2world):
+        return fly_pose(scene.cam2world, fraction).numpy()
+    state = ViewerState()
+    enter(state, scene)
+    height = 1000
+    return cameras.pose(cameras.orbit(state.camera, (2 * height * fraction, 0.0), height))
+
+
+def panorama_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
+    """Level pose between first and last camera; the middle column of its picture looks along the way."""
+    if not len(scene.cam2world):
+        return flight_pose(scene, fraction)
+    level = way_poses(scene.cam2world)
+    return interpolate_poses(level[0], level[-1], fraction).numpy()
+
+
+def write_flythrough(
+    renderer: SplatRenderer,
+    scene: Scene,
+    folder: Path,
+    film: Film,
+    settings: DrawSettings,
+    progress: Callable[[str, float], None],
+) -> list[Path]:
+    """Render film and pictures into `folder`; returns the files, each written whole or not at all.
+
+    Args:
+        renderer: on any context; the scene is uploaded to it.
+        scene: what to show.
+        folder: made when it is not there.
+        film: sizes and times.
+        settings: how to draw; field of view and layout are the film's.
+        progress: told what is being made and the fraction done.
+
+    Raises:
+        InputError: the folder cannot be written, or the scene is empty.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    renderer.upload(scene)
+    settings = replace(
+        settings, vertical_fov_degrees=film.vertical_fov_degrees, layout="pinhole", cached=False
+    )
+    steps = film.frames + len(STILLS) + 1
+    written = []
+    for done, fraction in enumerate(STILLS):
+        progress("stills", done / steps)
+        path = folder / f"view_{round(100 * fraction):03d}.png"
+        write_image(path, _draw(renderer, flight_pose(scene, fraction), film.size, settings))
+        written.append(path)
+    progress("panorama", len(STILLS) / steps)
+    height = film.panorama_height or scene.height
+    path = folder / f"panorama_{round(100 * film.at):03d}.png"
+    around = replace(settings, layout="equirect")
+    write_image(path, _draw(renderer, panorama_pose(scene, film.at), (2 * height, height), around))
+    written.append(path)
+
+    def frames() -> Iterator[np.ndarray]:
+        for frame in range(film.frames):
+            progress("film", (len(STILLS) + 1 + frame) / steps)
+            pose = flight_pose(scene, frame / (film.frames - 1))
+            yield (_draw(renderer, pose, film.size, settings) * 255 + 0.5).astype(np.uint8)
+
+    written.append(folder / "flythrough.mp4")
+    write_video(written[-1], frames(), film.fps)
+    progress("done", 1.0)
+    return written
+
+
+def _draw(
+    renderer: SplatRenderer,
+    cam2world: Float[np.ndarray, "4 4"],
+    size: tuple[int, int],
+    settings: DrawSettings,
+) -> Float[np.ndarray, "height width 3"]:
+    renderer.render(cam2world, size, settings, wait=True)
+    return np.clip(renderer.read_color()[..., :3], 0.0, 1.0)

@@ -1,0 +1,348 @@
+"""The panels over the picture: what is shown, how, and from where. They change the state, nothing else."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, get_args
+
+from imgui_bundle import imgui
+
+from pansplat_viewer import camera as cameras
+from pansplat_viewer.controls import HELP
+from pansplat_viewer.settings import FrameStats, Kernel, Lowpass, Order
+from pansplat_viewer.state import ViewerState, fly_to, jump, toggle_play
+
+Rectangle = tuple[float, float, float, float]  # left, top, right, bottom, pixels
+
+_PANEL_WIDTH = 290.0
+_MARGIN = 10.0
+_FIXED = (
+    imgui.WindowFlags_.no_move.value
+    | imgui.WindowFlags_.no_resize.value
+    | imgui.WindowFlags_.no_saved_settings.value
+)
+_LABEL = (
+    _FIXED
+    | imgui.WindowFlags_.no_title_bar.value
+    | imgui.WindowFlags_.always_auto_resize.value
+    | imgui.WindowFlags_.no_inputs.value
+    | imgui.WindowFlags_.no_focus_on_appearing.value
+    | imgui.WindowFlags_.no_nav.value
+)
+
+
+@dataclass
+class Facts:
+    """What the panels show but do not change.
+
+    Attributes:
+        entries: names to choose from; `current` is the index of the one shown.
+        stats: of the last frame; `frame_ms` smoothed, from frame to frame.
+        size: of the picture that is drawn, pixels; smaller than the window while moving.
+        photo_name: of the nearest input photograph; None when there is none to compare with.
+        loading: name, what is being done, fraction done.
+        error: why the last thing could not be shown.
+    """
+
+    entries: list[str] = field(default_factory=list)
+    current: int = -1
+    stats: FrameStats = field(default_factory=FrameStats)
+    frame_ms: float = 0.0
+    size: tuple[int, int] = (0, 0)
+    photo_name: str | None = None
+    view_names: tuple[str, ...] = ()
+    loading: tuple[str, str, float] | None = None
+    error: str | None = None
+
+
+@dataclass
+class Requests:
+    """What a person asked for through the panels in one frame."""
+
+    choose: int | None = None
+    open: str | None = None
+    png: bool = False
+    exr: bool = False
+    panorama: bool = False
+    dismiss_error: bool = False
+
+
+class Panels:
+    """Draws the panels of one window.
+
+    Attributes:
+        items: where each widget of the last frame was, by its label; for tests that click.
+        path: text of the path field.
+    """
+
+    def __init__(self) -> None:
+        self.items: dict[str, Rectangle] = {}
+        self.path = ""
+
+    def draw(self, state: ViewerState, facts: Facts, now: float) -> Requests:
+        """Draw everything that is on, at time `now` (seconds)."""
+        self.items.clear()
+        requests = Requests()
+        if state.overlay:
+            self._panel(state, facts, requests)
+            self._stats(state, facts)
+        if state.photo and facts.photo_name is not None and 0 < state.split < 1:
+            _split_line(state.split)
+        if state.help:
+            self._help(state)
+        if facts.loading:
+            _progress(*facts.loading)
+        elif facts.error:
+            self._error(facts.error, requests)
+        if state.message and now < state.message_until:
+            _message(state.message)
+        return requests
+
+    def _mark(self, label: str) -> None:
+        low, high = imgui.get_item_rect_min(), imgui.get_item_rect_max()
+        self.items[label] = (low.x, low.y, high.x, high.y)
+
+    def _radio(self, label: str, active: bool) -> bool:
+        chosen = imgui.radio_button(label, active)
+        self._mark(label)
+        return chosen
+
+    def _check(self, label: str, value: bool) -> bool:
+        _, value = imgui.checkbox(label, value)
+        self._mark(label)
+        return value
+
+    def _button(self, label: str) -> bool:
+        pressed = imgui.button(label)
+        self._mark(label)
+        return pressed
+
+    def _slider(self, label: str, value: float, low: float, high: float, form: str) -> float:
+        _, value = imgui.slider_float(label, value, low, high, form, imgui.SliderFlags_.always_clamp.value)
+        self._mark(label)
+        return value
+
+    def _section(self, label: str, draw: Callable[[], Any]) -> None:
+        opened = imgui.collapsing_header(label, imgui.TreeNodeFlags_.default_open.value)
+        self._mark(label)
+        if opened:
+            imgui.push_id(label)
+            draw()
+            imgui.pop_id()
+
+    def _panel(self, state: ViewerState, facts: Facts, requests: Requests) -> None:
+        scale = imgui.get_style().font_scale_dpi
+        height = imgui.get_io().display_size.y
+        imgui.set_next_window_pos((_MARGIN, _MARGIN))
+        imgui.set_next_window_size_constraints(
+            (_PANEL_WIDTH * scale, 0), (_PANEL_WIDTH * scale, max(height - 2 * _MARGIN, 50))
+        )
+        flags = _FIXED | imgui.WindowFlags_.always_auto_resize.value
+        opened, _ = imgui.begin("pansplat", None, flags)
+        if opened:
+            imgui.push_item_width(-110 * scale)
+            self._section("Scene", lambda: self._scene(facts, requests))
+            self._section("Gaussians", lambda: self._gaussians(state))
+            self._section("Drawing", lambda: self._drawing(state))
+            self._section("Camera", lambda: self._camera(state))
+            self._section("Photograph", lambda: self._photograph(state, facts))
+            self._section("Screenshot", lambda: self._screenshot(requests))
+            imgui.pop_item_width()
+        imgui.end()
+
+    def _scene(self, facts: Facts, requests: Requests) -> None:
+        if facts.entries:
+            names = [f"{i + 1}. {name}" for i, name in enumerate(facts.entries)]  # names may repeat
+            imgui.set_next_item_width(-1)
+            changed, index = imgui.combo("##pair", max(facts.current, 0), names)
+            self._mark("pair")
+            if changed:
+                requests.choose = index
+        imgui.set_next_item_width(-60 * imgui.get_style().font_scale_dpi)
+        entered, self.path = imgui.input_text_with_hint(
+            "##path", "folder or .ply, or drop it here", self.path,
+            imgui.InputTextFlags_.enter_returns_true.value,
+        )  # fmt: skip
+        self._mark("path")
+        imgui.same_line()
+        if (self._button("Open") or entered) and self.path.strip():
+            requests.open = self.path.strip()
+
+    def _gaussians(self, state: ViewerState) -> None:
+        settings = state.settings
+        views = len(state.context)
+        if self._radio("joint", settings.mode == "joint"):
+            settings = replace(settings, mode="joint")
+        if views > 1:
+            imgui.same_line()
+            if self._radio("deferred", settings.mode == "deferred"):
+                settings = replace(settings, mode="deferred")
+            imgui.same_line()
+            if self._radio("difference", settings.mode == "difference"):
+                settings = replace(settings, mode="difference", view=0)
+        for view in range(views):
+            if view % 3:
+                imgui.same_line()
+            if self._radio(f"view {view + 1}", settings.mode == "view" and settings.view == view):
+                settings = replace(settings, mode="view", view=view)
+        if len(state.levels) > 1:
+            shown = set(state.levels if settings.levels is None else settings.levels)
+            imgui.align_text_to_frame_padding()
+            imgui.text_unformatted("level")
+            for level in state.levels:
+                imgui.same_line()
+                if self._check(f"{level}##level", level in shown):
+                    shown.add(level)
+                else:
+                    shown.discard(level)
+            everything = shown == set(state.levels)
+            settings = replace(settings, levels=None if everything else frozenset(shown))
+        threshold = self._slider("min. opacity", settings.opacity_threshold, 0.0, 1.0, "%.2f")
+        state.settings = replace(settings, opacity_threshold=threshold)
+
+    def _drawing(self, state: ViewerState) -> None:
+        settings = state.settings
+        for name, choices in (("kernel", Kernel), ("order", Order), ("lowpass", Lowpass)):
+            imgui.align_text_to_frame_padding()
+            imgui.text_unformatted(name)
+            for choice in get_args(choices):
+                imgui.same_line()
+                if self._radio(choice, getattr(settings, name) == choice):
+                    settings = replace(settings, **{name: choice})
+        changed, background = imgui.color_edit3(
+            "background",
+            list(settings.background),
+            imgui.ColorEditFlags_.no_inputs.value,
+        )
+        self._mark("background")
+        for name, color in (("black", 0.0), ("grey", 0.5), ("white", 1.0)):
+            imgui.same_line()
+            if imgui.small_button(name):
+                changed, background = True, [color] * 3
+            self._mark(name)
+        if changed:
+            settings = replace(settings, background=(background[0], background[1], background[2]))
+        state.settings = settings
+        state.adaptive = self._check("coarser while moving", state.adaptive)
+
+    def _camera(self, state: ViewerState) -> None:
+        if self._radio("fly", not state.orbiting):
+            state.orbiting = False
+        imgui.same_line()
+        if self._radio("orbit", state.orbiting):
+            state.orbiting = True
+        imgui.same_line()
+        if self._button("Reset"):
+            state.playing, state.camera = False, state.home
+        fov = state.camera.vertical_fov_degrees
+        low, high = cameras.MIN_FOV_DEGREES, cameras.MAX_FOV_DEGREES
+        wanted = self._slider("field of view", fov, low, high, "%.0f deg")
+        if wanted != fov:
+            state.camera = replace(state.camera, vertical_fov_degrees=wanted)
+        state.speed = self._slider("speed", state.speed, 0.1, 10.0, "%.1f m/s")
+        if not len(state.context):
+            return
+        for view in range(min(len(state.context), 4)):
+            if view:
+                imgui.same_line()
+            if self._button(f"Panorama {view + 1}"):
+                jump(state, view)
+        if self._button("Stop" if state.playing else "Fly"):
+            toggle_play(state)
+        imgui.same_line()
+        imgui.set_next_item_width(-1)
+        at = self._slider("##flight", state.flight, 0.0, 1.0, "%.2f of the way")
+        if at != state.flight:
+            state.playing = False
+            fly_to(state, at)
+
+    def _photograph(self, state: ViewerState, facts: Facts) -> None:
+        if facts.photo_name is None:
+            imgui.text_disabled("none beside this scene")
+            return
+        state.photo = self._check("nearest photograph", state.photo)
+        state.split = self._slider("split", state.split, 0.0, 1.0, "%.2f")
+
+    def _screenshot(self, requests: Requests) -> None:
+        requests.png = self._button("PNG")
+        imgui.same_line()
+        requests.exr = self._button("EXR + depth")
+        imgui.same_line()
+        requests.panorama = self._button("360 PNG")
+
+    def _stats(self, state: ViewerState, facts: Facts) -> None:
+        size, scale = imgui.get_io().display_size, imgui.get_style().font_scale_dpi
+        if size.x > 2.2 * _PANEL_WIDTH * scale:
+            imgui.set_next_window_pos((size.x - _MARGIN, _MARGIN), 0, (1.0, 0.0))
+        else:  # no room beside the panel
+            imgui.set_next_window_pos((size.x - _MARGIN, size.y - _MARGIN), 0, (1.0, 1.0))
+        imgui.set_next_window_bg_alpha(0.6)
+        imgui.begin("##stats", None, _LABEL)
+        stats = facts.stats
+        rate = f"{1000 / facts.frame_ms:.0f} fps" if facts.frame_ms > 0 else ""
+        x, y, z = state.camera.position
+        lines = [
+            f"{facts.frame_ms:.1f} ms  {rate}   draw {stats.frame_ms:.1f} ms   sort {stats.sort_ms:.0f} ms",
+            f"{stats.drawn:,} drawn of {stats.visible:,} of {stats.total:,}",
+            f"{facts.size[0]} x {facts.size[1]}   {stats.tier}" + ("   cached" if stats.cached else ""),
+            f"x {x:.2f}  y {y:.2f}  z {z:.2f} m",
+        ]
+        if state.photo and facts.photo_name is not None:
+            lines.append(f"right: {facts.photo_name}" if state.split > 0 else facts.photo_name)
+        for line in lines:
+            imgui.text_unformatted(line)
+        imgui.end()
+
+    def _help(self, state: ViewerState) -> None:
+        size = imgui.get_io().display_size
+        imgui.set_next_window_pos((size.x / 2, size.y / 2), 0, (0.5, 0.5))
+        flags = _FIXED | imgui.WindowFlags_.always_auto_resize.value | imgui.WindowFlags_.no_collapse.value
+        _, opened = imgui.begin("Keys", True, flags)
+        if imgui.begin_table("keys", 2, imgui.TableFlags_.sizing_fixed_fit.value):
+            for keys, meaning in HELP:
+                imgui.table_next_row()
+                imgui.table_next_column()
+                imgui.text_unformatted(keys)
+                imgui.table_next_column()
+                imgui.text_unformatted(meaning)
+            imgui.end_table()
+        imgui.end()
+        state.help = bool(opened)
+
+    def _error(self, error: str, requests: Requests) -> None:
+        size = imgui.get_io().display_size
+        width = min(560 * imgui.get_style().font_scale_dpi, size.x - 2 * _MARGIN)
+        imgui.set_next_window_pos((size.x / 2, size.y / 2), 0, (0.5, 0.5))
+        imgui.set_next_window_size((width, 0))
+        imgui.begin("This cannot be shown", None, _FIXED | imgui.WindowFlags_.no_collapse.value)
+        imgui.push_text_wrap_pos(0.0)
+        imgui.text_unformatted(error)
+        imgui.pop_text_wrap_pos()
+        requests.dismiss_error = self._button("OK")
+        imgui.end()
+
+
+def _split_line(split: float) -> None:
+    size = imgui.get_io().display_size
+    lines = imgui.get_background_draw_list()
+    color = imgui.color_convert_float4_to_u32((1.0, 1.0, 1.0, 0.9))
+    lines.add_line((split * size.x, 0), (split * size.x, size.y), color, 2.0)
+
+
+def _progress(name: str, what: str, fraction: float) -> None:
+    size = imgui.get_io().display_size
+    imgui.set_next_window_pos((size.x / 2, size.y / 2), 0, (0.5, 0.5))
+    imgui.set_next_window_size((min(420 * imgui.get_style().font_scale_dpi, size.x - 2 * _MARGIN), 0))
+    flags = _FIXED | imgui.WindowFlags_.no_title_bar.value | imgui.WindowFlags_.no_inputs.value
+    imgui.begin("##progress", None, flags)
+    imgui.text_unformatted(f"{name}: {what}")
+    imgui.progress_bar(fraction, (-1, 0), f"{100 * fraction:.0f}%")
+    imgui.end()
+
+
+def _message(message: str) -> None:
+    size = imgui.get_io().display_size
+    imgui.set_next_window_pos((size.x / 2, size.y - 2 * _MARGIN), 0, (0.5, 1.0))
+    imgui.set_next_window_bg_alpha(0.75)
+    imgui.begin("##message", None, _LABEL)
+    imgui.text_unformatted(message)
+    imgui.end()
