@@ -1,0 +1,164 @@
+"""An evaluation: its files, its figures, its manners."""
+
+import io
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from rich.console import Console
+from torch import Tensor
+
+from pansplat.data.pairs import load_pairs
+from pansplat.errors import InputError
+from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
+from pansplat.evaluation.report import ERROR_SCALE, error_picture, evaluate, results_table
+from pansplat.gaussians.gaussians import Gaussians
+
+HEIGHT = 16
+KEYS = [
+    *("name", "model", "height", "ws_psnr", "psnr", "ssim", "cross_fade_ws_psnr", "predict_seconds"),
+    *("render_seconds", "num_gaussians", "prediction", "target"),
+]
+
+
+class GreyBall:
+    """One large grey Gaussian in front of each camera; counts its calls."""
+
+    name, fingerprint = "ball", "1"
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(
+        self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None, progress=None
+    ):
+        self.calls += 1
+        count = len(images)
+        return Gaussians(
+            means=(cam2world[:, :3, 3] + torch.tensor([0.0, 0.0, 2.0])).float(),
+            scales=torch.full((count, 3), 0.5),
+            quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+            opacities=torch.full((count,), 0.9),
+            harmonics=torch.zeros(count, 1, 3),
+            levels=torch.zeros(count, dtype=torch.int64),
+            views=torch.arange(count),
+        )
+
+
+def write_triplet(folder: Path, *, target: bool = True) -> Path:
+    folder.mkdir(parents=True)
+    random = np.random.default_rng(0)
+    names = ["a.png", "b.png", *(["c.png"] if target else [])]
+    poses = {}
+    for index, name in enumerate(names):
+        Image.fromarray(random.integers(0, 255, (HEIGHT, 2 * HEIGHT, 3), dtype=np.uint8)).save(folder / name)
+        pose = np.eye(4)
+        pose[0, 3] = (0.0, 1.0, 0.5)[index]
+        poses[name] = pose.tolist()
+    (folder / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
+    case = {"context": names[:2]} | ({"target": "c.png"} if target else {})
+    (folder / "pairs.json").write_text(json.dumps({"pairs": [case]}))
+    return folder
+
+
+def read(path: str | Path) -> Tensor:
+    return torch.from_numpy(np.array(Image.open(path)) / np.float32(255)).permute(2, 0, 1)
+
+
+def test_results_are_exactly_the_promised_fields(tmp_path: Path) -> None:
+    evaluate(load_pairs(write_triplet(tmp_path / "room")), GreyBall(), tmp_path / "out", height=HEIGHT)
+    (result,) = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert list(result) == KEYS
+    assert (result["name"], result["model"], result["height"], result["num_gaussians"]) == (
+        "room",
+        "ball",
+        HEIGHT,
+        2,
+    )
+    assert result["predict_seconds"] > 0 and result["render_seconds"] > 0
+    assert {p.name for p in (tmp_path / "out" / "room").iterdir()} == {
+        "prediction.png",
+        "target.png",
+        "error.png",
+    }
+
+
+def test_figures_are_those_of_the_written_pictures(tmp_path: Path) -> None:
+    evaluate(load_pairs(write_triplet(tmp_path / "room")), GreyBall(), tmp_path / "out", height=HEIGHT)
+    (result,) = json.loads((tmp_path / "out" / "results.json").read_text())
+    prediction, target = read(result["prediction"]), read(result["target"])
+    torch.testing.assert_close(target, read(tmp_path / "room" / "c.png"))
+    assert result["ws_psnr"] == pytest.approx(ws_psnr(prediction, target), abs=0.01)  # 8 bits
+    assert result["psnr"] == pytest.approx(psnr(prediction, target), abs=0.01)
+    assert result["ssim"] == pytest.approx(ssim(prediction, target), abs=1e-3)
+    inputs = [read(tmp_path / "room" / name) for name in ("a.png", "b.png")]
+    assert result["cross_fade_ws_psnr"] == pytest.approx(ws_psnr(sum(inputs) / 2, target), abs=0.01)
+
+
+def test_each_evaluation_predicts_anew_and_leaves_no_cache(tmp_path: Path) -> None:
+    pairs, predictor = load_pairs(write_triplet(tmp_path / "room")), GreyBall()
+    for _ in range(2):
+        evaluate(pairs, predictor, tmp_path / "out", height=HEIGHT)
+    assert predictor.calls == 2 and not (tmp_path / "room" / ".pansplat").exists()
+
+
+def test_cases_of_one_name_do_not_overwrite_each_other(tmp_path: Path) -> None:
+    pairs = [load_pairs(write_triplet(tmp_path / place / "room"))[0] for place in ("x", "y")]
+    cases = evaluate(pairs, GreyBall(), tmp_path / "out", height=HEIGHT)
+    assert [case.name for case in cases] == ["room", "room-2"]
+    assert len({case.prediction for case in cases}) == 2
+
+
+def test_pairs_without_target_are_passed_over(tmp_path: Path) -> None:
+    alone = load_pairs(write_triplet(tmp_path / "alone", target=False))
+    with_target = load_pairs(write_triplet(tmp_path / "room"))
+    assert len(evaluate([*alone, *with_target], GreyBall(), tmp_path / "out", height=HEIGHT)) == 1
+    with pytest.raises(InputError, match="none of the pairs has a target view"):
+        evaluate(alone, GreyBall(), tmp_path / "nothing", height=HEIGHT)
+    assert not (tmp_path / "nothing").exists()
+
+
+def test_a_masked_target_gets_a_second_figure_in_the_table_only(tmp_path: Path) -> None:
+    folder = write_triplet(tmp_path / "room")
+    mask = np.full((HEIGHT, 2 * HEIGHT), 255, np.uint8)
+    mask[-4:] = 0
+    Image.fromarray(mask).save(folder / "c_mask.png")
+    (case,) = evaluate(load_pairs(folder), GreyBall(), tmp_path / "out", height=HEIGHT)
+    target, prediction = read(case.target), read(case.prediction)
+    assert case.masked_ws_psnr == pytest.approx(
+        ws_psnr(prediction, target, mask=torch.from_numpy(mask > 0)), abs=0.01
+    )
+    assert case.ws_psnr == pytest.approx(ws_psnr(prediction, target), abs=0.01)
+    assert list(json.loads((tmp_path / "out" / "results.json").read_text())[0]) == KEYS
+    assert "masked" in [str(column.header) for column in results_table([case]).columns]
+
+
+def test_the_table_ends_with_the_mean(tmp_path: Path) -> None:
+    pairs = [load_pairs(write_triplet(tmp_path / place / "room"))[0] for place in ("x", "y")]
+    cases = evaluate(pairs, GreyBall(), tmp_path / "out", height=HEIGHT)
+    console = Console(width=140, record=True, file=io.StringIO())
+    console.print(results_table(cases))
+    last = [line for line in console.export_text().splitlines() if "mean" in line]
+    assert len(last) == 1 and f"{cases[0].ws_psnr:.2f}" in last[0]
+
+
+def test_a_perfect_picture_is_null_in_json(tmp_path: Path) -> None:
+    (case,) = evaluate(
+        load_pairs(write_triplet(tmp_path / "room")), GreyBall(), tmp_path / "out", height=HEIGHT
+    )
+    object.__setattr__(case, "psnr", math.inf)
+    assert json.loads(json.dumps(case.as_json(), allow_nan=False))["psnr"] is None
+
+
+def test_error_pictures_are_dark_where_equal_and_bright_where_not() -> None:
+    target = torch.full((3, 4, 8), 0.5)
+    prediction = target.clone()
+    prediction[:, 0] += 10 * ERROR_SCALE
+    prediction[:, 1] += ERROR_SCALE / 2
+    brightness = error_picture(prediction, target).mean(dim=(0, 2))
+    assert float(brightness[2]) < 0.02
+    assert float(brightness[2]) < float(brightness[1]) < float(brightness[0])
