@@ -33,7 +33,8 @@ def replacing(path: Path | str) -> Iterator[Path]:
         os.replace(temporary, path)
     except OSError as error:
         raise InputError(
-            f"cannot write {path}: needed a writable folder with room on the disk, got '{error.strerror or error}'; "
+            f"cannot write {path}: needed a writable folder with room on the disk, got "
+            f"'{error.strerror or error}'; "
             "choose another place."
         ) from error
     finally:

@@ -1,6 +1,7 @@
 """Reading panoramas, masks and depth from picture files; writing pictures.
 
-Pictures are RGB in [0, 1] with the sRGB curve, as in JPG and PNG; EXR files hold linear light and are converted.
+Pictures are RGB in [0, 1] with the sRGB curve, as in JPG and PNG; EXR files hold linear light and are
+converted.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _WRAP = 16  # target pixels of wrap-around given to the resampling filter at +-1
 
 @dataclass(frozen=True, eq=False)
 class _Picture:
-    """Decoded pixels: `color` (H W 3) uint8, or float32 in [0, 1]; `alpha` (H W) float32 in [0, 1] or None."""
+    """Decoded pixels: `color` (H W 3) uint8 or float32 in [0, 1]; `alpha` (H W) in [0, 1] or None."""
 
     color: NDArray[Any]
     alpha: NDArray[np.float32] | None
@@ -54,8 +55,8 @@ def read_panorama(
 ) -> tuple[Float[Tensor, "3 height width"], Bool[Tensor, "height width"]]:
     """A panorama at (height, 2 height), and where it is opaque.
 
-    Resampled by Pillow's Lanczos filter with wrap-around at +-180 degrees. A warning says when transparent pixels
-    are taken as masked.
+    Resampled by Pillow's Lanczos filter with wrap-around at +-180 degrees. A warning says when transparent
+    pixels are taken as masked.
 
     Args:
         path: JPG, PNG (8 or 16 bit), WebP or EXR file, 2:1.
@@ -100,7 +101,7 @@ def read_mask(path: Path | str, height: int) -> Bool[Tensor, "height width"]:
 
 
 def read_depth(path: Path | str, height: int) -> Float[Tensor, "height width"]:
-    """Radial depth in metres at (height, 2 height), 0 where unknown; the nearest sample, never a mix of two surfaces.
+    """Radial depth in metres at (height, 2 height), 0 where unknown; nearest samples, no mix of surfaces.
 
     Args:
         path: 16-bit PNG in millimetres (0 is unknown), or EXR in metres (channel Z or Y).
@@ -122,7 +123,8 @@ def read_depth(path: Path | str, height: int) -> Float[Tensor, "height width"]:
         if depth is None or depth.ndim != 2 or depth.dtype != np.uint16:
             got = "an unreadable file" if depth is None else f"{depth.dtype} with shape {depth.shape}"
             raise InputError(
-                f"{path}: needed depth as a one-channel 16-bit PNG in millimetres or an EXR in metres, got {got}; "
+                f"{path}: needed depth as a one-channel 16-bit PNG in millimetres or an EXR in "
+                f"metres, got {got}; "
                 "convert it."
             )
         _verify_with_pillow(path, data)  # OpenCV fills a truncated file with zeros and says nothing
@@ -141,7 +143,7 @@ def write_image(
     depth: Tensor | NDArray[Any] | None = None,
     panorama: bool | None = None,
 ) -> None:
-    """Write a picture, whole or not at all; the suffix chooses PNG, JPG, WebP (8 bit) or EXR (32-bit float, linear).
+    """Write a picture, whole or not at all; the suffix chooses PNG, JPG, WebP (8 bit) or EXR (linear float).
 
     Args:
         path: file to write.
@@ -205,7 +207,8 @@ def _write_exr(
         plane = np.ascontiguousarray(plane, dtype=np.float32)
         if plane.shape != pixels.shape[:2] or not np.isfinite(plane).all():
             raise InputError(
-                f"cannot write {path}: needed finite depth of shape {pixels.shape[:2]}, got shape {plane.shape} with "
+                f"cannot write {path}: needed finite depth of shape {pixels.shape[:2]}, got shape "
+                f"{plane.shape} with "
                 f"{int((~np.isfinite(plane)).sum())} NaN or infinite values; nothing written."
             )
         channels["Z"] = plane
@@ -242,7 +245,7 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _decode(path: Path, at_least: int | None = None) -> _Picture:
-    """Pixels of a picture file by what it contains, not by its name; with `at_least`, maybe at reduced size."""
+    """Pixels of a picture file by its content, not its name; with `at_least`, maybe at reduced size."""
     data = _read_bytes(path)
     if data.startswith(_EXR_MAGIC):
         return _decode_exr(path)
@@ -278,7 +281,8 @@ def _open_with_pillow(path: Path, data: bytes, at_least: int | None = None) -> I
         ) from error
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise InputError(
-            f"{path}: needed a complete picture, got damaged or truncated data ({error}); copy or export it again."
+            f"{path}: needed a complete picture, got damaged or truncated data ({error}); copy or "
+            "export it again."
         ) from error
 
 
@@ -309,7 +313,8 @@ def _exr_channels(path: Path) -> dict[str, NDArray[Any]]:
             return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except Exception as error:  # OpenEXR raises its own kinds, RuntimeError and ValueError among them
         raise InputError(
-            f"{path}: needed a complete EXR picture, got damaged or truncated data ({error}); export it again."
+            f"{path}: needed a complete EXR picture, got damaged or truncated data ({error}); export "
+            "it again."
         ) from error
 
 
@@ -324,13 +329,15 @@ def _decode_exr(path: Path) -> _Picture:
         linear = np.repeat(channels["Y"][..., None], 3, axis=2)
     else:
         raise InputError(
-            f"{path}: needed the channels R, G and B (or Y), got {sorted(channels)}; export the colour without layers."
+            f"{path}: needed the channels R, G and B (or Y), got {sorted(channels)}; export the "
+            "colour without layers."
         )
     linear = linear.astype(np.float32)
     bad = int((~np.isfinite(linear)).sum())
     if bad:
         raise InputError(
-            f"{path}: needed finite colours, got {bad} NaN or infinite values; repair the file or render it again."
+            f"{path}: needed finite colours, got {bad} NaN or infinite values; repair the file or "
+            "render it again."
         )
     return _Picture(srgb_from_linear(linear), None if alpha is None else alpha.astype(np.float32).clip(0, 1))
 

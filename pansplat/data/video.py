@@ -19,7 +19,7 @@ _ENCODERS = ("libx264", "libopenh264", "mpeg4")  # H.264 first: every browser an
 def write_video(
     path: Path | str, frames: Iterable[NDArray[np.uint8]], fps: float, *, quality: int = 18
 ) -> int:
-    """Write an MP4 film, whole or not at all; H.264 where PyAV has an encoder for it. Returns the number of frames.
+    """Write an MP4 film, whole or not at all, and return the number of frames; H.264 where PyAV has it.
 
     Frames of odd width or height lose their last column or row: the format holds even sizes only.
 
@@ -99,11 +99,13 @@ def _check_frame(path: Path, frame: Any, number: int, size: tuple[int, int] | No
     pixels = np.asarray(frame)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or min(pixels.shape) < 2:
         raise InputError(
-            f"cannot write {path}: needed frames (H W 3) of uint8, got {pixels.dtype} {pixels.shape} as frame {number}."
+            f"cannot write {path}: needed frames (H W 3) of uint8, got {pixels.dtype} {pixels.shape} "
+            f"as frame {number}."
         )
     pixels = np.ascontiguousarray(pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2])
     if size is not None and pixels.shape[:2] != size:
         raise InputError(
-            f"cannot write {path}: needed frames of one size {size}, got {pixels.shape[:2]} as frame {number}."
+            f"cannot write {path}: needed frames of one size {size}, got {pixels.shape[:2]} as frame "
+            f"{number}."
         )
     return pixels

@@ -1,0 +1,270 @@
+"""Poses from files, each with a named convention, as cam2world in OpenCV axes (docs/conventions.md).
+
+Four conventions are known: the matrix takes camera points to the world (`cam2world`) or the world to the
+camera (`world2cam`); the camera's axes are OpenCV's (x right, y down, z forward) or OpenGL's (x right, y up,
+z backward; Habitat, Blender and NeRF data use the same). The world's own axes are left as they come.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pansplat.errors import InputError
+from pansplat.geometry.pose import invert_pose, orthonormal_error, rotations_from_quats
+
+CONVENTIONS = ("cam2world opencv", "cam2world opengl", "world2cam opencv", "world2cam opengl")
+
+_DIRECTIONS = {
+    "cam2world": r"cam(era)?[ _-]?(2|to)[ _-]?world|\bc2w\b",
+    "world2cam": r"world[ _-]?(2|to)[ _-]?cam(era)?|\bw2c\b",
+}
+_AXES = {"opencv": r"opencv|colmap", "opengl": r"opengl|habitat|blender|nerf"}
+_RIGID_TOLERANCE = (
+    1e-2  # files keep 4 to 6 decimals, some come from float32; a wrong matrix is off by far more
+)
+_OPENGL_TO_OPENCV = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=torch.float64))
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of a sequence of pictures in file order: cam2world, OpenCV axes, metres; KITTI or TUM text."""
+
+    kind: str
+    poses: tuple[Float[Tensor, "4 4"], ...]
+
+
+def parse_convention(text: str | None, source: Path | str) -> str:
+    """The one of `CONVENTIONS` that a free text names; `source` is what the message points at.
+
+    Raises:
+        InputError: no text, or not exactly one direction and one kind of axes in it.
+    """
+    names = ", ".join(f'"{name}"' for name in CONVENTIONS)
+    advice = f"write one of {names} (habitat counts as opengl); `pansplat check` tells which one fits."
+    if not isinstance(text, str) or not text.strip():
+        raise InputError(f'{source}: needed a pose "convention", got none; {advice}')
+    lowered = text.lower()
+    directions = [name for name, pattern in _DIRECTIONS.items() if re.search(pattern, lowered)]
+    axes = [name for name, pattern in _AXES.items() if re.search(pattern, lowered)]
+    if len(directions) != 1 or len(axes) != 1:
+        raise InputError(f"{source}: needed a known pose convention, got {text!r}; {advice}")
+    return f"{directions[0]} {axes[0]}"
+
+
+def rigid_matrix(values: Any, source: str) -> Float[Tensor, "4 4"]:
+    """A 4x4 rigid transform, float64, from nested lists of 3x4 or 4x4 numbers; exact where the file rounds.
+
+    Raises:
+        InputError: other shape, not numbers, NaN, mirrored, scaled, sheared, transposed.
+    """
+    if values is None:
+        raise InputError(f"{source}: needed a pose, got none; add its 4x4 matrix or leave the picture out.")
+    try:
+        matrix = torch.tensor(values, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(
+            f"{source}: needed a pose of 4x4 numbers, got {str(values)[:60]!r}; correct it."
+        ) from error
+    if tuple(matrix.shape) == (3, 4):
+        matrix = torch.cat((matrix, torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)))
+    if tuple(matrix.shape) != (4, 4):
+        raise InputError(
+            f"{source}: needed a pose of 4x4 (or 3x4) numbers, got shape {tuple(matrix.shape)}; correct it."
+        )
+    error = orthonormal_error(matrix)
+    if error > _RIGID_TOLERANCE:
+        raise InputError(
+            f"{source}: needed a rigid pose (rotation and translation), got {_what_is_wrong(matrix, error)}"
+        )
+    return _nearest_rigid(matrix) if error > 1e-9 else matrix
+
+
+def _what_is_wrong(matrix: Float[Tensor, "4 4"], error: float) -> str:
+    """In words, with what to do."""
+    if not torch.isfinite(matrix).all():
+        return "NaN or infinite numbers; leave the picture out or solve its pose again."
+    bottom = torch.tensor((0.0, 0.0, 0.0, 1.0), dtype=torch.float64)
+    if (matrix[3] - bottom).abs().max() > _RIGID_TOLERANCE:
+        row = [round(float(x), 4) for x in matrix[3]]
+        if (matrix[:, 3] - bottom).abs().max() <= _RIGID_TOLERANCE:
+            return f"a transposed one (the translation stands in the last row, {row}); transpose the matrix."
+        return f"the bottom row {row}; it must be 0 0 0 1."
+    rotation = matrix[:3, :3]
+    determinant = float(torch.linalg.det(rotation))
+    scale = abs(determinant) ** (1 / 3)
+    if determinant < 0:
+        return (
+            f"a mirrored one (determinant {determinant:.3f}): an axis points the wrong way or two are "
+            "exchanged; "
+            "flip one axis so that the system is right-handed."
+        )
+    if scale > 0 and orthonormal_error(_with_rotation(matrix, rotation / scale)) <= _RIGID_TOLERANCE:
+        return f"a rotation scaled by {scale:.4g}; divide its 3x3 part by that."
+    return f"a 3x3 part that is no rotation (R R' is off by {error:.3g}); check the order of the numbers."
+
+
+def _with_rotation(matrix: Float[Tensor, "4 4"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4 4"]:
+    changed = matrix.clone()
+    changed[:3, :3] = rotation
+    return changed
+
+
+def _nearest_rigid(matrix: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+    """The same translation with the nearest rotation, so that rounding in a file does not become a shear."""
+    u, _, vt = torch.linalg.svd(matrix[:3, :3])
+    rigid = _with_rotation(matrix, u @ vt)
+    rigid[3] = torch.tensor((0.0, 0.0, 0.0, 1.0), dtype=torch.float64)
+    return rigid
+
+
+def to_cam2world(matrix: Float[Tensor, "4 4"], convention: str) -> Float[Tensor, "4 4"]:
+    """A rigid matrix of one of `CONVENTIONS` as cam2world with OpenCV camera axes."""
+    direction, axes = convention.split()
+    cam2world = invert_pose(matrix) if direction == "world2cam" else matrix
+    return cam2world @ _OPENGL_TO_OPENCV if axes == "opengl" else cam2world
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        InputError: unreadable, or not JSON (with the line).
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise InputError(
+            f"{path}: needed a readable file, got '{error.strerror}'; check the path."
+        ) from error
+    except json.JSONDecodeError as error:
+        raise InputError(
+            f"{path}: needed JSON, got something else at line {error.lineno}, column {error.colno} "
+            f"({error.msg}); "
+            "correct it there."
+        ) from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: needed JSON text in UTF-8, got other bytes; save it as UTF-8.") from error
+
+
+def read_number(path: Path) -> float:
+    """The one positive number in a text file, such as a scale.
+
+    Raises:
+        InputError: anything else in the file.
+    """
+    text = path.read_text(errors="replace").strip()
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise InputError(
+            f"{path}: needed one positive number, got {text[:40]!r}; correct it or remove the file."
+        )
+    return number
+
+
+def read_trajectory(path: Path, convention: str | None = None, expected: str | None = None) -> Trajectory:
+    """Poses of a KITTI (12 numbers a line) or TUM (8 numbers a line) trajectory file.
+
+    KITTI: the rows of a 3x4 matrix. TUM: timestamp tx ty tz qx qy qz qw. Both are cam2world with OpenCV axes
+        unless `convention` says otherwise. Empty lines and lines that start with # are skipped.
+
+    Args:
+        path: text file; numbers separated by spaces or commas.
+        convention: one of `CONVENTIONS`.
+        expected: "kitti" or "tum" to refuse the other; None takes either, told apart by the numbers in a
+            line.
+
+    Raises:
+        InputError: neither format, the other format than expected, a pose that is not rigid.
+    """
+    convention = "cam2world opencv" if convention is None else parse_convention(convention, "`convention`")
+    rows = _number_rows(path)
+    if not rows:
+        raise InputError(f"{path}: needed one pose a line, got an empty file; export the trajectory again.")
+    count = len(rows[0][1])
+    kind = {12: "kitti", 8: "tum"}.get(count)
+    if kind is None:
+        raise InputError(
+            f"{path}, line {rows[0][0]}: needed 12 numbers (KITTI: 3x4 matrix) or 8 (TUM: timestamp, "
+            "translation, "
+            f"quaternion), got {count}; export the trajectory in one of these formats."
+        )
+    if expected is not None and kind != expected:
+        formats = {"kitti": "KITTI (12 numbers a line)", "tum": "TUM (8 numbers a line)"}
+        raise InputError(
+            f"{path}: needed {formats[expected]} as its name says, got {formats[kind]}; "
+            f"rename it to {path.stem}.{kind}, or convert it."
+        )
+    poses = []
+    for line, numbers in rows:
+        source = f"{path}, line {line}"
+        if len(numbers) != count:
+            raise InputError(
+                f"{source}: needed {count} numbers as in the lines before, got {len(numbers)}; complete it."
+            )
+        matrix = (
+            [numbers[0:4], numbers[4:8], numbers[8:12]] if kind == "kitti" else _tum_matrix(numbers, source)
+        )
+        poses.append(to_cam2world(rigid_matrix(matrix, source), convention))
+    return Trajectory(kind, tuple(poses))
+
+
+def _number_rows(path: Path) -> list[tuple[int, list[float]]]:
+    """Line numbers (from 1) and numbers of all lines that hold any."""
+    rows = []
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: needed a readable text file, got '{error}'; check it.") from error
+    for number, line in enumerate(lines, start=1):
+        words = line.replace(",", " ").split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            rows.append((number, [float(word) for word in words]))
+        except ValueError as error:
+            raise InputError(
+                f"{path}, line {number}: needed numbers, got {line[:60]!r}; correct or remove it."
+            ) from error
+    return rows
+
+
+def _tum_matrix(numbers: list[float], source: str) -> list[list[float]]:
+    """Rows of the 4x4 matrix of timestamp tx ty tz qx qy qz qw."""
+    translation, (x, y, z, w) = numbers[1:4], numbers[4:8]
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    if not abs(norm - 1) < _RIGID_TOLERANCE:
+        raise InputError(
+            f"{source}: needed a unit quaternion qx qy qz qw as the last four numbers, got length "
+            f"{norm:.4g}; "
+            "check the order of the columns."
+        )
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = rotations_from_quats(torch.tensor((w, x, y, z), dtype=torch.float64))
+    pose[:3, 3] = torch.tensor(translation, dtype=torch.float64)
+    return pose.tolist()
+
+
+def number_field(content: dict[str, Any], key: str, source: Path) -> float | None:
+    """An optional number of a JSON object.
+
+    Raises:
+        InputError: it is there and is no number.
+    """
+    value = content.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise InputError(f'{source}: needed a number of metres as "{key}", got {value!r}; correct it.')
+    return float(value)
