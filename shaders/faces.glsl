@@ -1,7 +1,8 @@
-// Bilinear look-up in six cube faces kept in one texture, three tiles by two; docs/rendering.md, section 6.
+// Bilinear look-up in six cube faces kept in one texture, three tiles by two. Two ways: `sample_faces` is exactly
+// docs/rendering.md, section 6, in float32; `place_in_atlas` is for the texture unit's filter, whose weights may be
+// coarse, on tiles that were drawn with one pixel more on each side.
 
 uniform int face_size;
-uniform bool fast_filter;   // the texture unit's own filter inside a face (coarse weights on some GPUs)
 
 const mat3 FACES[6] = mat3[6](      // columns right, down, forward: pansplat/geometry/cubemap.py
     mat3(1, 0, 0, 0, 1, 0, 0, 0, 1), mat3(0, 0, -1, 0, 1, 0, 1, 0, 0), mat3(-1, 0, 0, 0, 1, 0, 0, 0, -1),
@@ -50,13 +51,16 @@ vec4 fetch(sampler2D atlas, int face, ivec2 pixel) {
 vec4 sample_faces(sampler2D atlas, vec3 d) {
     int face = face_of(d);
     vec2 place = on_face(face, d);
-    if (fast_filter && all(greaterThan(place, vec2(0.5))) && all(lessThan(place, vec2(float(face_size) - 0.5)))) {
-        vec2 texel = vec2(tile(face)) + vec2(place.x, float(face_size) - place.y);
-        return textureLod(atlas, texel / (float(face_size) * vec2(3.0, 2.0)), 0.0);
-    }
     vec2 corner = floor(place - 0.5), f = place - 0.5 - corner;
     ivec2 p = ivec2(corner);
     vec4 top = mix(fetch(atlas, face, p), fetch(atlas, face, p + ivec2(1, 0)), f.x);
     vec4 bottom = mix(fetch(atlas, face, p + ivec2(0, 1)), fetch(atlas, face, p + ivec2(1, 1)), f.x);
     return mix(top, bottom, f.y);
+}
+
+vec2 place_in_atlas(vec3 d) {
+    int face = face_of(d);
+    float pitch = float(face_size + 2);
+    vec2 place = on_face(face, d) + 1.0;
+    return (vec2(face % 3, face / 3) + vec2(place.x, pitch - place.y) / pitch) / vec2(3.0, 2.0);
 }

@@ -1,10 +1,12 @@
 // One layer (the premultiplied picture of one set of Gaussians) at one pixel, weighted, to be added up.
-// The layer is either a picture of the same size or the six faces of faces.glsl.
+// SOURCE says how the layer is kept: 0 a picture of the same size, 1 faces seen by a pinhole, 2 faces seen by a
+// panorama. It is fixed at compile time because software GL pays for both sides of a branch.
+#if SOURCE != 0
 #include "faces.glsl"
+#endif
 
 uniform sampler2D layer_color;
 uniform sampler2D layer_depth;
-uniform int source;             // 0 picture, 1 faces seen by a pinhole, 2 faces seen by a panorama
 uniform bool with_depth;
 uniform float weight;
 uniform vec2 size;              // of the output, pixels
@@ -14,27 +16,26 @@ uniform mat3 camera_to_faces;
 layout(location = 0) out vec4 out_color;
 layout(location = 1) out vec4 out_depth;    // weighted alpha x distance, weight of layers with anything here
 
-vec3 direction() {
+void main() {
+#if SOURCE == 0
+    ivec2 place = ivec2(gl_FragCoord.xy);
+    vec4 value = texelFetch(layer_color, place, 0);
+    float depth = with_depth ? texelFetch(layer_depth, place, 0).r : 0.0;
+#else
     vec2 pixel = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
-    if (source == 1) return camera_to_faces * vec3((pixel - 0.5 * size) / focal, 1.0);
+#if SOURCE == 1
+    vec2 place = place_in_atlas(camera_to_faces * vec3((pixel - 0.5 * size) / focal, 1.0));
+    vec4 value = textureLod(layer_color, place, 0.0);
+    float depth = with_depth ? textureLod(layer_depth, place, 0.0).r : 0.0;
+#else
     const float PI = 3.14159265358979;
     float longitude = (2.0 * pixel.x / size.x - 1.0) * PI;
     float latitude = (pixel.y / size.y - 0.5) * PI;
-    return camera_to_faces * vec3(cos(latitude) * sin(longitude), sin(latitude), cos(latitude) * cos(longitude));
-}
-
-void main() {
-    vec4 value;
-    float depth = 0.0;
-    if (source == 0) {
-        ivec2 pixel = ivec2(gl_FragCoord.xy);
-        value = texelFetch(layer_color, pixel, 0);
-        if (with_depth) depth = texelFetch(layer_depth, pixel, 0).r;
-    } else {
-        vec3 ray = direction();
-        value = sample_faces(layer_color, ray);
-        if (with_depth) depth = sample_faces(layer_depth, ray).r;
-    }
+    vec3 ray = vec3(cos(latitude) * sin(longitude), sin(latitude), cos(latitude) * cos(longitude));
+    vec4 value = sample_faces(layer_color, camera_to_faces * ray);
+    float depth = with_depth ? sample_faces(layer_depth, camera_to_faces * ray).r : 0.0;
+#endif
+#endif
     out_color = weight * value;
     out_depth = vec4(weight * depth, value.a > 0.0 ? weight : 0.0, 0.0, 0.0);
 }

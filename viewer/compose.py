@@ -20,15 +20,12 @@ class Composer:
         in_use: names of the targets of the last picture.
     """
 
-    def __init__(
-        self, ctx: moderngl.Context, programs: Programs, targets: TargetStore, *, fast_filter: bool
-    ) -> None:
-        """`fast_filter` lets the texture unit interpolate, whose weights may have only 8 bits."""
+    def __init__(self, ctx: moderngl.Context, programs: Programs, targets: TargetStore) -> None:
+        """Nothing is drawn yet."""
         self._ctx = ctx
         self._programs = programs
         self._targets = targets
-        self._fast_filter = fast_filter
-        self._gather = ctx.vertex_array(programs.gather(), [])
+        self._gather: dict[int, moderngl.VertexArray] = {}
         self._finish = ctx.vertex_array(programs.finish(), [])
         self.in_use: set[Hashable] = set()
 
@@ -50,7 +47,8 @@ class Composer:
 
     def release(self) -> None:
         """Free the vertex arrays."""
-        self._gather.release()
+        for vertex_array in self._gather.values():
+            vertex_array.release()
         self._finish.release()
 
     def _add(
@@ -60,24 +58,24 @@ class Composer:
         target = self._targets.get(name, shot.size, depth_components=2)
         target.framebuffer.use()
         target.framebuffer.viewport = (0, 0, *shot.size)
-        target.framebuffer.clear(0.0, 0.0, 0.0, 0.0)
-        self._ctx.enable_only(moderngl.BLEND)
-        self._ctx.blend_func = moderngl.ONE, moderngl.ONE
-        program = self._programs.gather()
+        program = self._programs.gather(shot.source)
+        if shot.source not in self._gather:
+            self._gather[shot.source] = self._ctx.vertex_array(program, [])
         set_uniforms(
             program,
-            source=shot.source,
             with_depth=painter.with_depth,
             size=shot.size,
             focal=shot.focal,
             camera_to_faces=np.ascontiguousarray(shot.camera_to_faces.T, dtype=np.float32).tobytes(),
             face_size=shot.face_size,
-            fast_filter=self._fast_filter,
         )
+        self._ctx.enable_only(moderngl.NOTHING)  # the first layer replaces what was there
+        self._ctx.blend_func = moderngl.ONE, moderngl.ONE
         for layer, weight in layers:
             set_uniforms(program, weight=weight)
             self._bind(program, ("layer_color", "layer_depth"), (layer.color, layer.depth))
-            self._gather.render(moderngl.TRIANGLES, vertices=3)
+            self._gather[shot.source].render(moderngl.TRIANGLES, vertices=3)
+            self._ctx.enable_only(moderngl.BLEND)
         self._ctx.enable_only(moderngl.NOTHING)
         return target
 
@@ -106,8 +104,8 @@ def _terms(shot: Shot) -> list[list[tuple[int | None, float]]]:
     positions = shot.splats.view_positions
     if len(positions) != count:
         raise InputError(
-            f"mode deferred needs the camera of each context view, the scene has {len(positions)} cameras for "
-            f"{count} views; use mode joint"
+            f"mode deferred needs the camera of each context view, the scene has {len(positions)} cameras "
+            f"for {count} views; use mode joint"
         )
     import torch
 

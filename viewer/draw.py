@@ -1,6 +1,4 @@
-"""Splats to pixels: projects the visible Gaussians into records and draws the records as quads, back to front."""
-
-from __future__ import annotations
+"""Splats to pixels: visible Gaussians become records, and records quads blended back to front."""
 
 import moderngl
 import numpy as np

@@ -1,7 +1,5 @@
 """Layers: the premultiplied pictures of sets of Gaussians, drawn directly or as six cube faces, and kept."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Hashable
 from dataclasses import dataclass, field
@@ -39,7 +37,7 @@ class Shot:
     settings: DrawSettings
 
     @staticmethod
-    def make(splats: Splats, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> Shot:
+    def make(splats: Splats, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> "Shot":
         """Check the arguments of a picture."""
         if cam2world.shape != (4, 4) or not np.isfinite(cam2world).all():
             raise InputError(f"`cam2world` must be a finite 4x4 matrix, got {cam2world.tolist()}")
@@ -90,8 +88,8 @@ class LayerPainter:
         drawer: draws splats.
         targets: keeps layers.
         largest_texture: GL's limit, pixels.
-        visible, drawn, painted: Gaussians left by the toggles, splats sent, and whether anything was drawn for
-            this shot.
+        visible, drawn, painted: Gaussians left by the toggles, splats sent, and whether anything was drawn
+            for this shot.
         in_use: names of this shot's targets.
     """
 
@@ -120,12 +118,12 @@ class LayerPainter:
         self.in_use = set()
 
     def layer(self, view: int | None) -> Target:
-        """The layer of one context view's Gaussians, or of all (None), with everything the shot looks up drawn."""
+        """The layer of one view's Gaussians, or of all (None), with everything the shot looks up drawn."""
         shot = self._shot
         assert shot is not None
         keep = self._keep(view)
         self.visible += int(np.count_nonzero(keep))
-        name = ("faces" if shot.source else "picture", view)
+        name = ("picture", "turning faces", "panorama faces")[shot.source], view
         self.in_use.add(name)
         depth_components = int(self._with_depth)
         if shot.source == 0:
@@ -134,15 +132,17 @@ class LayerPainter:
             if not target.begin((*self._key(), shot.rotation.tobytes(), shot.focal)):
                 self._paint(target, camera, keep, (0, 0, *shot.size))
             return target
-        size = shot.face_size
+        # Faces for turning are read by the texture unit, which needs the pixels beyond their edges.
+        border = 1 if shot.source == 1 else 0
+        cameras = face_cameras(shot.faces_to_world, shot.position, shot.face_size, border)
+        side = cameras[0].width
         target = self.targets.get(
-            name, self._checked((3 * size, 2 * size)), depth_components=depth_components
+            name, self._checked((3 * side, 2 * side)), depth_components=depth_components
         )
-        target.begin((*self._key(), shot.faces_to_world.tobytes()))
-        cameras = face_cameras(shot.faces_to_world, shot.position, size)
+        target.begin((*self._key(), shot.faces_to_world.tobytes(), border))
         for face in self._faces():
             if face not in target.parts:
-                self._paint(target, cameras[face], keep, (face % 3 * size, face // 3 * size, size, size))
+                self._paint(target, cameras[face], keep, (face % 3 * side, face // 3 * side, side, side))
                 target.parts.add(face)
         return target
 
@@ -152,7 +152,7 @@ class LayerPainter:
         if shot.source == 2:
             return list(range(NUM_FACES))
         half = 0.5 * shot.size[0] / shot.focal, 0.5 * shot.size[1] / shot.focal
-        return faces_in_sight(shot.camera_to_faces, half, shot.face_size)
+        return faces_in_sight(shot.camera_to_faces, half)
 
     def _key(self) -> tuple[Hashable, ...]:
         """What changes a layer, except its camera."""

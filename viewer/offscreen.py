@@ -2,15 +2,116 @@
 
 from __future__ import annotations
 
-from typing import Literal
+import ctypes
+import ctypes.util
+from typing import Any, Literal
 
 import moderngl
+
+from pansplat.errors import InputError
+
+_EGL_PACKAGES = "libegl1 libgl1-mesa-dri libgl1"
+_OSMESA_PACKAGE = "libosmesa6"
+
+# Values of GL/osmesa.h, for OSMesaCreateContextAttribs.
+_OSMESA_FORMAT, _OSMESA_DEPTH_BITS, _OSMESA_STENCIL_BITS = 0x22, 0x30, 0x31
+_OSMESA_PROFILE, _OSMESA_CORE_PROFILE = 0x33, 0x34
+_OSMESA_CONTEXT_MAJOR, _OSMESA_CONTEXT_MINOR = 0x36, 0x37
+_GL_RGBA, _GL_UNSIGNED_BYTE = 0x1908, 0x1401
 
 
 def create_context(backend: Literal["auto", "egl", "osmesa"] = "auto") -> moderngl.Context:
     """A standalone context of at least OpenGL 3.3.
 
+    Args:
+        backend: `auto` tries EGL (GPU or software), then OSMesa (software only).
+
     Raises:
-        InputError: no OpenGL is installed; the message names the Debian packages.
+        InputError: no OpenGL 3.3 is there; the message says what failed and names the Debian packages.
     """
-    return moderngl.create_context(standalone=True, backend="egl", require=330)
+    makers = {"egl": _create_egl, "osmesa": _create_osmesa}
+    if backend != "auto" and backend not in makers:
+        raise InputError(f"`backend` must be auto, egl or osmesa, got {backend!r}")
+    failures = []
+    for name in makers if backend == "auto" else (backend,):
+        try:
+            return makers[name]()
+        # The libraries report failure in many ways: OSError, ValueError, moderngl.Error, plain Exception.
+        except Exception as error:
+            failures.append(f"{name}: {error}")
+    raise InputError(
+        "drawing needs OpenGL 3.3, and none could be started "
+        f"({'; '.join(failures)}); on Debian or Ubuntu install `apt-get install {_EGL_PACKAGES}`, "
+        f"or for software rendering without EGL `{_OSMESA_PACKAGE}`"
+    )
+
+
+def _create_egl() -> moderngl.Context:
+    return moderngl.create_context(require=330, standalone=True, backend="egl")
+
+
+def _create_osmesa() -> moderngl.Context:
+    return moderngl.create_context(require=330, standalone=True, context=_OsMesa())
+
+
+class _OsMesa:
+    """An OSMesa context as moderngl expects one: it is entered, left, released and asked for functions."""
+
+    def __init__(self) -> None:
+        library = _load_osmesa()
+        attributes = (
+            *(_OSMESA_FORMAT, _GL_RGBA),
+            *(_OSMESA_DEPTH_BITS, 24),
+            *(_OSMESA_STENCIL_BITS, 8),
+            *(_OSMESA_PROFILE, _OSMESA_CORE_PROFILE),
+            *(_OSMESA_CONTEXT_MAJOR, 3),
+            *(_OSMESA_CONTEXT_MINOR, 3),
+            0,
+        )
+        self._library = library
+        self._context = library.OSMesaCreateContextAttribs((ctypes.c_int * len(attributes))(*attributes), None)
+        if not self._context:
+            raise OSError("OSMesaCreateContextAttribs made no OpenGL 3.3 context")
+        # OSMesa draws into memory of ours; everything of interest goes to framebuffer objects, so 1x1 will do.
+        self._pixel = (ctypes.c_ubyte * 4)()
+        self.__enter__()
+
+    def load_opengl_function(self, name: str) -> int:
+        """Address of a GL function, 0 when there is none."""
+        return self._library.OSMesaGetProcAddress(name.encode()) or 0
+
+    load = load_opengl_function
+
+    def __enter__(self) -> None:
+        made = self._library.OSMesaMakeCurrent(self._context, self._pixel, _GL_UNSIGNED_BYTE, 1, 1)
+        if not made:
+            raise OSError("OSMesaMakeCurrent failed")
+
+    def __exit__(self, *_: object) -> None:
+        """The context stays current: there is no other one to go back to."""
+
+    def release(self) -> None:
+        """Destroy the context."""
+        if self._context:
+            self._library.OSMesaDestroyContext(self._context)
+            self._context = None
+
+
+def _load_osmesa() -> Any:
+    names = [ctypes.util.find_library("OSMesa"), "libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"]
+    for name in names:
+        if name is None:
+            continue
+        try:
+            library = ctypes.CDLL(name)
+        except OSError:
+            continue
+        library.OSMesaCreateContextAttribs.restype = ctypes.c_void_p
+        library.OSMesaCreateContextAttribs.argtypes = [ctypes.POINTER(ctypes.c_int), ctypes.c_void_p]
+        library.OSMesaMakeCurrent.restype = ctypes.c_ubyte
+        library.OSMesaMakeCurrent.argtypes = [ctypes.c_void_p, ctypes.c_void_p, *([ctypes.c_int] * 3)]
+        library.OSMesaGetProcAddress.restype = ctypes.c_void_p
+        library.OSMesaGetProcAddress.argtypes = [ctypes.c_char_p]
+        library.OSMesaDestroyContext.argtypes = [ctypes.c_void_p]
+        return library
+    raise OSError("the library libOSMesa is not installed")

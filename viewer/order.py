@@ -1,9 +1,7 @@
 """The order of splats and their colours for one camera position, made in place or by a thread.
 
-Both depend on where the camera is and not on where it looks (radial order), so turning the head needs neither.
+Both depend on where the camera is and not on where it looks (radial order), so turning needs neither.
 """
-
-from __future__ import annotations
 
 import threading
 import time
@@ -18,8 +16,8 @@ from pansplat_viewer.splats import Splats
 def radix_argsort(keys: Float[np.ndarray, "n"]) -> UInt[np.ndarray, "n"]:
     """Stable ascending order of float32 keys without NaN.
 
-    Two passes over the halves of bit patterns that sort as the numbers do; numpy's stable sort of 16-bit integers
-    is a counting sort, four times as fast as one of floats.
+    Two passes over the halves of bit patterns that sort as the numbers do; numpy's stable sort of 16-bit
+    integers is a counting sort, four times as fast as one of floats.
     """
     bits = np.ascontiguousarray(keys, dtype=np.float32).view(np.uint32)
     if (keys < 0).any():
@@ -87,7 +85,7 @@ class Sorter:
             self._condition.notify()
 
     def take(self) -> Ordering | None:
-        """The newest finished ordering, once; None when there is none. What failed in the thread is raised here."""
+        """The newest finished ordering, once, or None; what failed in the thread is raised here."""
         with self._condition:
             result, self._result = self._result, None
         if isinstance(result, BaseException):

@@ -1,7 +1,5 @@
 """Pinhole cameras as the shaders take them: what they see, and the six that make a panorama."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -50,28 +48,27 @@ def focal_of(height: int, vertical_fov_degrees: float) -> float:
 
 
 def face_cameras(
-    orientation: Float[np.ndarray, "3 3"], position: tuple[float, float, float], face_size: int
+    orientation: Float[np.ndarray, "3 3"], position: tuple[float, float, float], face_size: int, border: int
 ) -> list[Pinhole]:
-    """The six faces of a cube whose axes are `orientation` (to world), in the order of geometry/cubemap.py."""
+    """The six faces of a cube with axes `orientation` (to world), `border` pixels wider than 90 degrees."""
+    side = face_size + 2 * border
     rotations = face_rotations().numpy()
-    return [
-        Pinhole(orientation @ face, position, 0.5 * face_size, face_size, face_size) for face in rotations
-    ]
+    return [Pinhole(orientation @ face, position, 0.5 * face_size, side, side) for face in rotations]
 
 
-def faces_in_sight(
-    camera_to_faces: Float[np.ndarray, "3 3"], half_size: tuple[float, float], face_size: int
-) -> list[int]:
-    """The faces a pinhole picture looks up, neighbours of a bilinear sample at an edge included."""
+def faces_in_sight(camera_to_faces: Float[np.ndarray, "3 3"], half_size: tuple[float, float]) -> list[int]:
+    """The faces that a pinhole picture looks at."""
     x, y = (np.linspace(-half, half, 65) for half in half_size)
-    grid = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), axis=-1).reshape(-1, 3)
-    local = (grid @ camera_to_faces.T) @ face_rotations().numpy().transpose(1, 0, 2).reshape(3, -1)
-    local = local.reshape(-1, 3, NUM_FACES, 3) if local.ndim == 4 else local.reshape(-1, NUM_FACES, 3)
-    # The grid is coarse and a sample may touch the neighbour's first pixel: count a little more than the face.
-    reach = 1 + max(4 / face_size, 0.2)
-    depth = local[..., 2]
-    inside = (depth > 0) & (np.abs(local[..., :2]).max(axis=-1) <= reach * depth)
-    return [int(face) for face in np.flatnonzero(inside.any(axis=0))]
+    rays = (
+        np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), axis=-1).reshape(-1, 3) @ camera_to_faces.T
+    )
+    faces = []
+    for face, rotation in enumerate(face_rotations().numpy()):
+        local = rays @ rotation
+        # The grid is coarse, so count a little more than the face: what is seen may lie between two rays.
+        if (np.abs(local[:, :2]).max(axis=1) <= 1.1 * local[:, 2]).any():
+            faces.append(face)
+    return faces
 
 
 def in_sight(
@@ -79,8 +76,8 @@ def in_sight(
 ) -> Bool[np.ndarray, "n"]:
     """Which of the kept splats can touch the picture; may keep more than needed, never less.
 
-    A splat is a ball of its reach in standard deviations, widened by the filter. The linearised kernel `ewa` draws
-    outside that ball, so there only splats behind the camera are left out.
+    A splat is a ball of its reach in standard deviations, widened by the filter. The linearised kernel `ewa`
+    draws outside that ball, so there only splats behind the camera are left out.
     """
     means = ordering.splats.means
     if kernel == "ewa":

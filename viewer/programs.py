@@ -15,13 +15,14 @@ RECORD = ("quad_1", "quad_2", "response_a", "response_b", "response_l", "color")
 RECORD_BYTES = 16 * len(RECORD)
 
 
-def source(name: str, version: int) -> str:
-    """The text of a shader file with its includes and the `#version` line for GL `version` (330 or 430)."""
+def source(name: str, version: int, **defines: int) -> str:
+    """A shader file's text with its includes, constants and `#version` line for GL `version` (330 or 430)."""
     folder = resources.files("pansplat_viewer.shaders")
     text = _INCLUDE.sub(
         lambda match: (folder / match[1]).read_text("utf-8"), (folder / name).read_text("utf-8")
     )
-    return f"#version {version} core\n{text}"
+    constants = "".join(f"#define {key} {value}\n" for key, value in defines.items())
+    return f"#version {version} core\n{constants}{text}"
 
 
 def set_uniforms(program: Any, **values: Any) -> None:
@@ -64,20 +65,21 @@ class Programs:
         """Records to pixels."""
         return self._pair("splat.vert", "splat.frag")
 
-    def gather(self) -> moderngl.Program:
-        """A layer, seen directly or through cube faces, weighted."""
-        return self._pair("screen.vert", "gather.frag")
+    def gather(self, kept_as: int) -> moderngl.Program:
+        """A layer, weighted; `kept_as` is SOURCE of gather.frag."""
+        return self._pair("screen.vert", "gather.frag", SOURCE=kept_as)
 
     def finish(self) -> moderngl.Program:
         """The added layers to the picture."""
         return self._pair("screen.vert", "finish.frag")
 
-    def _pair(self, vertex: str, fragment: str) -> moderngl.Program:
-        if fragment not in self._made:
-            self._made[fragment] = self._ctx.program(
-                vertex_shader=source(vertex, 330), fragment_shader=source(fragment, 330)
+    def _pair(self, vertex: str, fragment: str, **defines: int) -> moderngl.Program:
+        key = f"{fragment} {defines}"
+        if key not in self._made:
+            self._made[key] = self._ctx.program(
+                vertex_shader=source(vertex, 330), fragment_shader=source(fragment, 330, **defines)
             )
-        return self._made[fragment]
+        return self._made[key]
 
     def release(self) -> None:
         """Free all programs."""

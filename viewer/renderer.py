@@ -1,8 +1,8 @@
 """Draws a scene's Gaussians with OpenGL into a texture: any pose, pinhole or panorama, any blending mode.
 
-Needs no window. GL objects belong to the context's thread: call everything from there. A picture is made in three
-steps: splats into layers (one a set of Gaussians: all, or one context view's), layers added with weights, the sum
-over the background. Layers are kept and drawn again only when something that changes them has changed.
+Needs no window. GL objects belong to the context's thread: call everything from there. A picture is made in
+three steps: splats into layers (one a set of Gaussians: all, or one context view's), layers added with
+weights, the sum over the background. Layers are kept until something that changes them has changed.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class SplatRenderer:
         self._ctx = ctx
         self._programs = Programs(ctx)
         self._targets = TargetStore(ctx, color_bits=color_bits)
-        self._composer = Composer(ctx, self._programs, self._targets, fast_filter=color_bits == 16)
+        self._composer = Composer(ctx, self._programs, self._targets)
         self._sorter = Sorter()
         self._buffers: SplatBuffers | None = None
         self._painter: LayerPainter | None = None
@@ -100,8 +100,8 @@ class SplatRenderer:
                 makes the new one (`stats.settled` is then False: render again until it is True).
 
         Returns:
-            RGBA texture, colour over the background, alpha the coverage; GL's bottom row first, so that it shows
-            upright when drawn as any texture. Its content changes with the next call.
+            RGBA texture, colour over the background, alpha the coverage; GL's bottom row first, so that it
+            shows upright when drawn as any texture. Its content changes with the next call.
 
         Raises:
             InputError: nothing is uploaded, the size or a setting does not fit the scene or the GPU.
@@ -129,7 +129,7 @@ class SplatRenderer:
     def read_depth(self) -> Float[np.ndarray, "height width"]:
         """Radial depth of the last picture in metres, float32, top row first; 0 where nothing is drawn.
 
-        Windows rarely need it, so it is drawn when asked for. In mode `difference` it is the depths' difference.
+        Windows rarely need it, so it is drawn when asked for. Mode `difference` gives the depths' difference.
         """
         if self._picture is None or self._shot is None:
             raise InputError("there is no picture to read; call `render` first")

@@ -1,4 +1,4 @@
-"""What to draw and how, and what drawing it cost: the two records between the renderer and those who use it."""
+"""What to draw and how, and what drawing it cost: the records between the renderer and its users."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class DrawSettings:
         kernel: `ray` is the exact response on each ray, `ewa` the linearised one of 3DGS.
         order: sort key, radial distance or depth along the view axis.
         lowpass: `angular` with energy compensation, or `3dgs`.
-        mode: `joint` draws all Gaussians together; `view` those of one context view; `deferred` each context view
-            by itself, blended per pixel by distance; `difference` the absolute difference of the pictures of
-            context views `view` and `view + 1` (cyclic), each over the background.
+        mode: `joint` draws all Gaussians together; `view` those of one context view; `deferred` each context
+            view by itself, blended per pixel by distance; `difference` the absolute difference of the pictures
+            of context views `view` and `view + 1` (cyclic), each over the background.
         view: the context view of mode `view` and the first of mode `difference`.
         levels: pyramid levels to draw; None draws all.
         opacity_threshold: Gaussians of lower opacity are left out.
@@ -40,8 +40,8 @@ class DrawSettings:
         near: Gaussians whose mean is nearer than this radial distance, metres, are left out.
         vertical_fov_degrees: of layout `pinhole`, in (0, 180).
         layout: `pinhole`, or `equirect` stitched from six faces.
-        face_size: side of a cube face in pixels; None takes half the height of a panorama, and for a pinhole
-            picture from cached faces the size that keeps its central resolution.
+        face_size: side of a cube face in pixels; None is as fine as the panorama's equator (2 height / pi),
+            or as the middle of a pinhole picture that is drawn from cached faces.
         cached: draw a pinhole picture from six faces kept for this position, so that turning costs a texture
             look-up a pixel. The faces in sight that are not there yet are drawn first.
     """
@@ -82,14 +82,15 @@ class FrameStats:
         total: Gaussians of the scene on the GPU.
         dropped: Gaussians left out at upload because a number in them is NaN or infinite.
         visible: those left by view, level and opacity threshold; in mode `deferred`, over all views.
-        drawn: splats sent to the GPU for this frame after culling, over all faces and views; 0 when all is cached.
+        drawn: splats sent to the GPU for this frame after culling, over all faces and views; 0 when all is
+            cached.
         sort_ms: time of the last sort (and of the colours that depend on the position), possibly in the
             background.
         frame_ms: from the call of `render` until the GPU had finished.
         tier: `gl33` or `gl43`.
         cached: True when nothing was drawn but a look-up in faces kept from before.
-        settled: False when the order or colours of an earlier position were used because the new ones are still
-            in the making; render again to get them.
+        settled: False when the order or colours of an earlier position were used because the new ones are
+            still in the making; render again to get them.
     """
 
     total: int = 0

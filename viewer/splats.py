@@ -1,7 +1,5 @@
 """A scene's Gaussians as the renderer keeps them: arrays for sorting and culling, buffers for the shaders."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -22,11 +20,11 @@ class Splats:
     """The finite Gaussians of a scene in float32, in a frame moved near the origin.
 
     Attributes:
-        origin: what was subtracted from the world's positions, metres, float64. Keeps float32 accurate when the
-            world's origin is far away.
+        origin: what was subtracted from the world's positions, metres, float64. Keeps float32 accurate when
+            the world's origin is far away.
         means: moved centres.
         opacities: peak opacities.
-        reach: sqrt(2 ln(255 opacity)), how many standard deviations of a Gaussian can be seen; 0 when none can.
+        reach: sqrt(2 ln(255 opacity)), how many standard deviations of a Gaussian can be seen; 0 when none.
         extent: reach times the largest standard deviation, metres.
         levels, views: labels.
         geometry: what the shaders read: mean, opacity; quaternion; scales, 0.
@@ -60,7 +58,7 @@ class Splats:
         return self.base_colors is None
 
     @staticmethod
-    def from_scene(scene: Scene) -> Splats:
+    def from_scene(scene: Scene) -> "Splats":
         """The scene's finite Gaussians."""
         gaussians = scene.gaussians
         finite = _finite(gaussians)

@@ -51,7 +51,7 @@ class Target:
 
 
 class TargetStore:
-    """Targets by name, reused while their shape fits; the longest unused go when they take too much memory."""
+    """Targets by name, reused while their shape fits; the longest unused go when memory runs short."""
 
     def __init__(self, ctx: moderngl.Context, *, color_bits: int, budget_bytes: int = 1 << 30) -> None:
         """Nothing is allocated yet."""
