@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from pansplat.render.splats import ALPHA_CUT, Splats
 from pansplat.render.threads import one_thread
@@ -85,9 +84,10 @@ class _Composite(torch.autograd.Function):
         return sums
 
     @staticmethod
-    @once_differentiable
     @one_thread()
     def backward(ctx: Any, grad_sums: Tensor) -> tuple[Tensor, Tensor, None, None, None]:  # type: ignore[override]
+        if torch.is_grad_enabled():  # create_graph=True
+            raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
         rows, points = ctx.saved_tensors
         lists, pixels, exact, kept = ctx.plan
         padded = _pad(rows), _pad(points)
