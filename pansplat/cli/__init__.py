@@ -1,1 +1,54 @@
 """The `pansplat` command."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Sequence
+
+from pansplat.errors import InputError
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run a command and exit: 0 done, 1 a check that failed, 2 bad input, 130 interrupted."""
+    sys.exit(run(argv))
+
+
+def run(argv: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit status; unusable arguments exit with status 2."""
+    import tyro
+
+    from pansplat.cli.commands import Command
+
+    command = tyro.cli(
+        Command,
+        args=argv,
+        prog="pansplat",
+        description="Two posed 360-degree panoramas in, a scene of 3D Gaussians you can fly through out.",
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+    with warnings.catch_warnings():
+        # What the libraries below warn of is for their users; what we warn of is for ours.
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("always", category=UserWarning, module=r"pansplat(\.|$)")
+        warnings.showwarning = _show_warning
+        try:
+            return command.run()
+        except InputError as error:
+            _say("red", "error", error)
+            return 2
+        except KeyboardInterrupt:
+            _say("red", "interrupted", "nothing half-written is left behind")
+            return 130
+
+
+def _show_warning(message: Warning | str, *_: object) -> None:
+    _say("yellow", "note", message)
+
+
+def _say(color: str, word: str, text: object) -> None:
+    from rich.console import Console
+    from rich.text import Text
+
+    line = Text.assemble((f"{word}: ", f"bold {color}"), str(text))
+    Console(stderr=True, soft_wrap=True, highlight=False).print(line)

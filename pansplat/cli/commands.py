@@ -1,0 +1,153 @@
+"""The commands' arguments: each dataclass is a subcommand, each field an argument, each docstring its help.
+
+Only names and types live here; the work is imported when a command runs, so that `--help` does not wait for
+torch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg, subcommand
+
+Out = Annotated[Path, arg(aliases=["-o"])]
+
+
+@dataclass(frozen=True)
+class PairChoice:
+    """How to read a folder of panoramas, and which of its pairs to take."""
+
+    pair: str | None = None
+    """Name or number (from 0) of the pair, where the folder holds several; the first by default."""
+    convention: str | None = None
+    """Pose convention, where the folder does not tell: "cam2world opencv", "cam2world opengl",
+    "world2cam opencv" or "world2cam opengl" (Habitat and Blender count as opengl)."""
+    near: float | None = None
+    """Nearest depth to search, metres; by default what the folder says."""
+    far: float | None = None
+    """Farthest depth to search, metres; by default what the folder says."""
+
+
+@dataclass(frozen=True)
+class Predict:
+    """Predict the 3D Gaussians of a pair of panoramas and write them as a 3DGS .ply file."""
+
+    path: Positional[Path]
+    """Folder of the pair."""
+    out: Out
+    """The .ply file to write."""
+    model: str = "sweep"
+    """Predictor; `sweep` needs no weights."""
+    height: int = 512
+    """Panoramas are resized to this height, pixels."""
+    no_cache: bool = False
+    """Predict anew even when the result is kept beside the pair."""
+    choice: PairChoice = field(default_factory=PairChoice)
+
+    def run(self) -> int:
+        from pansplat.cli.scenes import run_predict
+
+        return run_predict(self)
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render a scene, or a pair's prediction, to a picture (.png, .jpg, .webp, .exr) or a film (.mp4)."""
+
+    path: Positional[Path]
+    """A .ply scene, or the folder of a pair."""
+    out: Out
+    """The file to write; its suffix chooses the format."""
+    at: float | None = None
+    """Where to stand between the first (0) and the last (1) input camera; 0.5 by default."""
+    pose: Path | None = None
+    """File with the pose instead: a JSON matrix (cam2world, OpenCV axes, metres), 16 numbers, a KITTI or TUM
+    trajectory, whose poses a film follows."""
+    layout: Literal["equirect", "cubemap", "perspective"] | None = None
+    """Panorama with one exact ray a pixel, panorama stitched from six faces, or a plain camera.
+    By default equirect, for a film perspective."""
+    height: int | None = None
+    """Height of the picture, pixels; by default that of the input panoramas, for a film 360."""
+    blend: str = "deferred"
+    """deferred (each view's picture, weighted by nearness), joint (all at once), or view0, view1, ..."""
+    fov: float = 90.0
+    """Vertical field of view of `perspective`, degrees."""
+    seconds: float = 4.0
+    """Length of a film."""
+    fps: float = 24.0
+    """Pictures a second of a film."""
+    model: str = "sweep"
+    """Predictor, for a pair."""
+    predict_height: int = 512
+    """Height the panoramas are resized to before the prediction, for a pair."""
+    choice: PairChoice = field(default_factory=PairChoice)
+
+    def run(self) -> int:
+        from pansplat.cli.pictures import run_render
+
+        return run_render(self)
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare predictions with the real panoramas between the inputs, and with the cross-fade baseline."""
+
+    paths: Positional[tuple[Path, ...]]
+    """Folders of pairs; those without target views are passed over."""
+    out: Out
+    """Folder for results.json and, for each case, prediction.png, target.png and error.png."""
+    model: str = "sweep"
+    """Predictor; always predicts anew, so that the times are true."""
+    height: int = 512
+    """Panoramas are resized to this height, pixels."""
+    blend: str = "deferred"
+    """deferred, joint, or view0, view1, ..."""
+    convention: str | None = None
+    """Pose convention, where a folder does not tell."""
+    near: float | None = None
+    """Nearest depth to search, metres."""
+    far: float | None = None
+    """Farthest depth to search, metres."""
+
+    def run(self) -> int:
+        from pansplat.cli.reports import run_evaluate
+
+        return run_evaluate(self)
+
+
+@dataclass(frozen=True)
+class Check:
+    """Check that the poses of a pair fit its pictures; exit status 1 when a mistake is likely."""
+
+    path: Positional[Path]
+    """Folder of the pair."""
+    choice: PairChoice = field(default_factory=PairChoice)
+
+    def run(self) -> int:
+        from pansplat.cli.reports import run_check
+
+        return run_check(self)
+
+
+@dataclass(frozen=True)
+class Info:
+    """Tell what a scene file holds: Gaussians by level and view, opacities, scales, bounds, cameras."""
+
+    path: Positional[Path]
+    """The .ply file."""
+
+    def run(self) -> int:
+        from pansplat.cli.reports import run_info
+
+        return run_info(self)
+
+
+Command = (
+    Annotated[Predict, subcommand("predict")]
+    | Annotated[Render, subcommand("render")]
+    | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[Check, subcommand("check")]
+    | Annotated[Info, subcommand("info")]
+)

@@ -1,0 +1,103 @@
+"""From a command's arguments to pairs and scenes; `pansplat predict`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from pansplat import pipeline
+from pansplat.cli.commands import PairChoice, Predict
+from pansplat.errors import InputError
+
+if TYPE_CHECKING:
+    from pansplat.data.pairs import Pair
+    from pansplat.gaussians.scene import Scene
+    from pansplat.model import predictor
+
+
+def run_predict(command: Predict) -> int:
+    """Predict, save, and tell how long it took."""
+    if command.out.suffix.lower() != ".ply" or not command.out.resolve().parent.is_dir():
+        raise InputError(f"--out must be a .ply file in an existing folder, got {command.out}")
+    require_height(command.height)
+    pair = choose_pair(command.path, command.choice)
+    began = time.perf_counter()
+    scene = predict(pair, command.model, command.height, cache=not command.no_cache)
+    took = time.perf_counter() - began
+    pipeline.save(scene, command.out)
+    print(f"{command.out}: {len(scene.gaussians):,} Gaussians from {', '.join(scene.names)} in {took:.1f} s")
+    return 0
+
+
+def choose_pair(path: Path, choice: PairChoice) -> Pair:
+    """The pair of a folder that was asked for by name or number; the first, with a note, when none was."""
+    pairs = pipeline.load_pairs(path, convention=choice.convention, near=choice.near, far=choice.far)
+    names = [pair.name for pair in pairs]
+    if choice.pair is None:
+        if len(pairs) > 1:
+            listed = ", ".join(f"{i}: {name}" for i, name in enumerate(names))
+            print(
+                f"note: {path} holds {len(pairs)} pairs, this is the first (--pair takes: {listed})",
+                file=sys.stderr,
+            )
+        return pairs[0]
+    if choice.pair in names:
+        return pairs[names.index(choice.pair)]
+    if choice.pair.isdecimal() and int(choice.pair) < len(pairs):
+        return pairs[int(choice.pair)]
+    raise InputError(
+        f"--pair {choice.pair}: {path} holds {', '.join(f'{i}: {n}' for i, n in enumerate(names))}"
+    )
+
+
+def open_scene(path: Path, choice: PairChoice, model: str, height: int) -> Scene:
+    """The scene of a .ply file, or the prediction of a pair's folder."""
+    if path.suffix.lower() == ".ply":
+        return pipeline.load(path)
+    require_height(height)
+    return predict(choose_pair(path, choice), model, height, cache=True)
+
+
+def predict(pair: Pair, model: str, height: int, *, cache: bool) -> Scene:
+    """Predict behind a progress bar."""
+    with progress_bar() as progress:
+        return pipeline.predict(pair, model, height=height, cache=cache, progress=progress)
+
+
+def require_height(height: int) -> None:
+    """Refuse heights that no panorama pyramid fits."""
+    if height < 16 or height % 2:
+        raise InputError(f"--height must be an even number of at least 16 pixels, got {height}")
+
+
+def blend_mode(text: str) -> str | int:
+    """What `pipeline.render` calls the mode that a user names: deferred, joint, view0, view1, ..."""
+    if text in ("deferred", "joint"):
+        return text
+    number = text.removeprefix("view")
+    if number.isdecimal():
+        return int(number)
+    raise InputError(f"--blend must be deferred, joint or view0, view1, ..., got {text!r}")
+
+
+@contextmanager
+def progress_bar() -> Iterator[predictor.Progress]:
+    """A bar on standard error that goes when the work is done; nothing where that is no terminal."""
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %")
+    with Progress(
+        *columns, TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task("", total=1.0)
+
+        def report(what: str, fraction: float) -> None:
+            bar.update(task, description=what, completed=fraction)
+
+        yield report
