@@ -1,0 +1,274 @@
+"""Do the poses fit the pictures? Each view is warped into the other with the poses as read and as misread.
+
+The depth for the warp comes from a small plane sweep of its own, so the check needs no model: under the right
+poses some depth makes the two views alike nearly everywhere, under wrong ones it does not.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pansplat.data.pair import Pair
+from pansplat.data.views import Views
+from pansplat.geometry.equirect import pad_equirect, pixel_directions, row_weights, uv_from_directions
+from pansplat.geometry.pose import invert_pose
+
+AS_GIVEN = "as given"
+
+_HEIGHT = 64  # pixels
+_DEPTHS = 32  # inverse depths
+_AGGREGATION = 2  # pixels on each side over which differences are averaged
+_DIFFERENCE_CAP = 0.6  # per feature; what is hidden in the other view must not decide
+_CLEARLY_BETTER = 0.92  # of the error as given: below that another reading is named,
+_FITS = 0.46  # if its own error is below that; above, the views show too little in common to tell
+_SAME_POSE = 0.02  # entries of the relative pose (translation by its length) that count as equal
+
+_ADVICE = {
+    "inverse": 'the matrices look like the inverse of what was said: exchange "cam2world" and "world2cam"',
+    "opengl axes": 'the camera axes look like OpenGL\'s (y up, z backward) where OpenCV\'s were said, or the
+    other ' 'way round: exchange "opencv" and "opengl"', "inverse, opengl axes": "both the direction
+    (cam2world, world2cam) and the camera axes (opencv, opengl) look " "exchanged", "transposed rotation":
+    "the rotations look transposed (inverted) while the translations are right: transpose the " "3x3 parts, or
+    conjugate the quaternions", "swapped views": "the poses of the two views look exchanged: check which pose
+    belongs to which picture", "mirrored left-right": "the scene looks mirrored left to right: a flipped
+    picture or a left-handed world", "mirrored up-down": "the up axis looks flipped alone (a left-handed
+    system): flip a second axis with it", "mirrored front-back": "the forward axis looks flipped alone (a
+    left-handed system): flip a second axis with it", "z-up camera": "the camera axes look like x right, y
+    forward, z up: turn them into x right, y down, z forward", "x-forward camera": "the camera axes look like
+    x forward, y left, z up (robotics, ROS): turn them into x right, " "y down, z forward", "turned by 90
+    degrees": "the panoramas' centre looks along the camera's x axis: turn the poses by 90 degrees about "
+    "the vertical axis or shift the pictures by a quarter", "turned by 180 degrees": "the panoramas' centre
+    looks backward: turn the poses by 180 degrees about the vertical " "axis or shift the pictures by half",
+    "turned by -90 degrees": "the panoramas' centre looks along the camera's -x axis: turn the poses by -90
+    degrees " "about the vertical axis or shift the pictures by a quarter",
+}
+
+
+@dataclass(frozen=True)
+class PoseCheck:
+    """What `check_pair` found.
+
+    Attributes:
+        name: of the pair.
+        baseline: largest distance between context cameras, metres.
+        error: photometric error of the warp with the poses as given; 0 is perfect, about 1 is unrelated.
+        errors: the same for each reading of the poses, best first; `AS_GIVEN` is one.
+        indistinguishable: readings that make the same relative pose as given, so that pictures cannot tell.
+        likely_mistake: advice in words where another reading fits far better, else None.
+        warnings: what else is implausible.
+    """
+
+    name: str
+    baseline: float
+    error: float
+    errors: dict[str, float]
+    indistinguishable: tuple[str, ...]
+    likely_mistake: str | None
+    warnings: tuple[str, ...]
+
+    @property
+    def best(self) -> str:
+        """The reading of the poses that fits best."""
+        return next(iter(self.errors))
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing speaks against the poses."""
+        return self.likely_mistake is None and not self.warnings
+
+    def report(self) -> str:
+        """The findings as text of several lines."""
+        lines = [f"{self.name}: baseline {self.baseline:.3f} m, photometric error {self.error:.3f} with the
+        poses as given"] lines += [f"  {error:.3f}  {name}" for name, error in self.errors.items()] if
+        self.indistinguishable:
+            lines.append(f"  same as given for these views: {', '.join(self.indistinguishable)}")
+        lines += [f"  warning: {warning}" for warning in self.warnings]
+        lines.append(f"  likely mistake: {self.likely_mistake}" if self.likely_mistake else "  no other reading fits better")
+        return "\n".join(lines)
+
+
+def check_pair(pair: Pair) -> PoseCheck:
+    """Whether the poses of a pair's context views fit their pictures, and what else would; takes seconds.
+
+    Raises:
+        InputError: a picture cannot be used.
+    """
+    return check_views(pair.load_context(_HEIGHT), pair.name)
+
+
+def check_views(views: Views, name: str = "views") -> PoseCheck:
+    """The same as `check_pair` for loaded views; small ones (height about 64) are enough.
+
+    Args:
+        views: two or more; neighbours in their order are compared.
+        name: for the report.
+    """
+    features = torch.stack([_features(image) for image in views.images])
+    poses = views.cam2world
+    relatives = {reading: _relatives(poses, reading) for reading in (AS_GIVEN, *_ADVICE)}
+    given = relatives[AS_GIVEN]
+    indistinguishable = [r for r in _ADVICE if _same_motion(relatives[r], given)]
+    errors: dict[str, float] = {}
+    for reading, relative in relatives.items():
+        if reading in indistinguishable:
+            continue
+        twin = next((r for r in errors if _same_motion(relatives[r], relative)), None)
+        errors[reading] = errors[twin] if twin else _photometric_error(features, views, relative)
+    errors = dict(sorted(errors.items(), key=lambda item: item[1]))
+    centres = poses[:, :3, 3]
+    baseline = max(float((a - b).norm()) for a, b in itertools.combinations(centres, 2))
+    return PoseCheck(
+        name,
+        baseline,
+        errors[AS_GIVEN],
+        errors,
+        tuple(indistinguishable),
+        _likely_mistake(errors),
+        (*_implausible(centres, baseline, views), *_hopeless(errors)),
+    )
+
+
+def _likely_mistake(errors: dict[str, float]) -> str | None:
+    """Advice for the best reading, and those that fit just as well, if it is clearly better than as given."""
+    best = next(iter(errors.values()))
+    if best > min(_CLEARLY_BETTER * errors[AS_GIVEN], _FITS):
+        return None
+    named = [_ADVICE[r] for r, error in errors.items() if r != AS_GIVEN and error <= best * 1.001]
+    return "; or ".join(named) + f" (error {best:.3f} instead of {errors[AS_GIVEN]:.3f})."
+
+
+def _implausible(centres: Float[Tensor, "view 3"], baseline: float, views: Views) -> tuple[str, ...]:
+    """Warnings on the distances between the cameras."""
+    found = []
+    closest = min(float((a - b).norm()) for a, b in itertools.combinations(centres, 2))
+    if baseline > 0.5 * views.far:
+        found.append(
+            f"the cameras are {baseline:.3g} m apart, which is much against far = {views.far:g} m: "
+            "are the poses in "
+            "centimetres or millimetres? Convert them to metres, or set near and far to fit."
+        )
+    if closest < 0.02 * views.near:
+        degrees = math.degrees(math.atan2(closest, views.near))
+        found.append(
+            f"two cameras are only {closest:.3g} m apart: even at near = {views.near:g} m the parallax is "
+            f"{degrees:.2g} degrees, so depth cannot be measured. Check the unit of the poses, or set "
+            "near and far to fit."
+        )
+    return tuple(found)
+
+
+def _hopeless(errors: dict[str, float]) -> tuple[str, ...]:
+    """A warning when no reading of the poses makes the pictures alike."""
+    best = next(iter(errors.values()))
+    if best <= _FITS:
+        return ()
+    return (
+        f"no reading of the poses makes the views alike (best error {best:.3f}): they show too little "
+        "in common, "
+        "or the poses or the order of the pictures are wrong in another way.",
+    )
+
+
+def _relatives(cam2world: Float[Tensor, "view 4 4"], reading: str) -> Float[Tensor, "pair 4 4"]:
+    """Poses of each view in the next one's camera, if the given matrices are to be read so."""
+    poses = _read_as(cam2world, reading)
+    return torch.linalg.solve(poses[1:], poses[:-1])
+
+
+def _read_as(poses: Float[Tensor, "view 4 4"], reading: str) -> Float[Tensor, "view 4 4"]:
+    """The cam2world poses in OpenCV axes that a wrong reading turned into the given ones."""
+    opengl = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=poses.dtype))
+    if reading == "inverse":
+        return invert_pose(poses)
+    if reading == "opengl axes":
+        return poses @ opengl
+    if reading == "inverse, opengl axes":
+        return invert_pose(poses) @ opengl
+    if reading == "transposed rotation":
+        turned = poses.clone()
+        turned[:, :3, :3] = poses[:, :3, :3].transpose(-1, -2)
+        return turned
+    if reading == "swapped views":
+        return poses.flip(0)
+    if reading.startswith("mirrored"):
+        axis = ("left-right", "up-down", "front-back").index(reading.split()[1])
+        mirror = torch.eye(4, dtype=poses.dtype)
+        mirror[axis, axis] = -1
+        return mirror @ poses @ mirror
+    turns = {
+        "z-up camera": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+        "x-forward camera": ((0, 0, 1), (-1, 0, 0), (0, -1, 0)),
+        "turned by 90 degrees": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
+        "turned by 180 degrees": ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
+        "turned by -90 degrees": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
+    }
+    if reading not in turns:
+        return poses
+    turn = torch.eye(4, dtype=poses.dtype)
+    turn[:3, :3] = torch.tensor(turns[reading], dtype=poses.dtype)
+    return poses @ turn
+
+
+def _same_motion(first: Float[Tensor, "pair 4 4"], second: Float[Tensor, "pair 4 4"]) -> bool:
+    """Whether two readings move the cameras alike, up to what a small picture can show."""
+    length = second[:, :3, 3].norm(dim=-1).clamp_min(1e-9)
+    rotation = (first - second)[:, :3, :3].abs().max()
+    translation = ((first - second)[:, :3, 3].norm(dim=-1) / length).max()
+    return bool(rotation < _SAME_POSE and translation < _SAME_POSE)
+
+
+def _features(image: Float[Tensor, "3 height width"]) -> Float[Tensor, "feature height width"]:
+    """Colour and locally normalised brightness and gradients: exposure may differ from view to view."""
+    padded = pad_equirect(image.mean(dim=0), 4)
+    box = torch.nn.functional.avg_pool2d(padded[None, None], 9, stride=1)[0, 0]
+    squares = torch.nn.functional.avg_pool2d(padded[None, None] ** 2, 9, stride=1)[0, 0]
+    deviation = (squares - box * box).clamp_min(0).sqrt() + 0.03
+    dx = (padded[4:-4, 5:-3] - padded[4:-4, 3:-5]) / (2 * deviation)
+    dy = (padded[5:-3, 4:-4] - padded[3:-5, 4:-4]) / (2 * deviation)
+    normalised = (image.mean(dim=0) - box) / (2 * deviation)
+    return torch.stack((*(image * 1.5), normalised, dx, dy))
+
+
+def _photometric_error(
+    features: Float[Tensor, "view feature height width"], views: Views, relative: Float[Tensor, "pair 4 4"]
+) -> float:
+    """Mean over both directions of all neighbouring views."""
+    total = []
+    for i, motion in enumerate(relative):
+        for a, b, pose in ((i, i + 1, motion), (i + 1, i, torch.linalg.inv(motion))):
+            total.append(_sweep_error(features[a], features[b], views.masks[a], views.masks[b], pose, views))
+    return sum(total) / len(total)
+
+
+def _sweep_error(
+    reference: Float[Tensor, "feature height width"],
+    other: Float[Tensor, "feature height width"],
+    mask: Bool[Tensor, "height width"],
+    other_mask: Bool[Tensor, "height width"],
+    pose: Float[Tensor, "4 4"],
+    views: Views,
+) -> float:
+    """Mean over the sphere of the least aggregated difference over all depths, about 1 for unrelated pictures."""
+    height, width = reference.shape[-2:]
+    inverse = torch.linspace(1 / views.far, 1 / views.near, _DEPTHS)
+    rays = pixel_directions(height, width) @ pose[:3, :3].T.float()
+    points = rays + inverse[:, None, None, None] * pose[:3, 3].float()  # scaled by 1 / depth: only directions count
+    uv = uv_from_directions(points)
+    grid = torch.stack(((uv[..., 0] * width + 1) / (width + 2), (uv[..., 1] * height + 1) / (height + 2)), -1)
+    * 2 - 1 source = pad_equirect(torch.cat((other, other_mask[None].to(other.dtype))), 1) warped =
+    torch.nn.functional.grid_sample(
+        source.expand(_DEPTHS, -1, -1, -1), grid, padding_mode="border", align_corners=False
+    )
+    difference = (warped[:, :-1] - reference).abs().clamp_max(_DIFFERENCE_CAP).mean(dim=1)
+    seen = (warped[:, -1] > 0.5) & mask
+    difference = torch.where(seen, difference, torch.full_like(difference, _DIFFERENCE_CAP / 2))
+    window = 2 * _AGGREGATION + 1
+    cost = torch.nn.functional.avg_pool2d(pad_equirect(difference, _AGGREGATION)[:, None], window,
+    stride=1)[:, 0] least = cost.amin(dim=0) weights = row_weights(height, dtype=least.dtype)[:, None] * mask
+    return float((least * weights).sum() / weights.sum().clamp_min(1e-9)) / (_DIFFERENCE_CAP / 2)
