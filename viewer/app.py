@@ -29,6 +29,8 @@ class Options:
     """A pair folder, a folder of pairs, or a scene .ply."""
     offscreen: Path | None = None
     """Open no window: write film and pictures to this folder."""
+    pair: str | None = None
+    """Name or number of the pair to begin with, where the path holds several; offscreen also "all"."""
     model: str = "sweep"
     """What predicts the scene from a pair."""
     height: int = 512
@@ -106,26 +108,49 @@ def run(args: Sequence[str] | None = None) -> int:
             return 130
 
 
+def choose(entries: list[Entry], wanted: str | None) -> int:
+    """Index of the entry of that name or number (from 1); the first by default.
+
+    Raises:
+        InputError: none has that name or number.
+    """
+    if wanted is None:
+        return 0
+    for index, entry in enumerate(entries):
+        if wanted in (entry.name, str(index + 1)):
+            return index
+    names = ", ".join(entry.name for entry in entries[:12]) + (", ..." if len(entries) > 12 else "")
+    raise InputError(f"`--pair` must be a number from 1 to {len(entries)} or one of {names}, got {wanted!r}")
+
+
 def _run(options: Options) -> int:
     pixels = options.pixels
     if options.at is not None and not 0 <= options.at <= 1:
         raise InputError(f"`--at` must be between 0 and 1, got {options.at}")
     entries = find_entries(options.path.expanduser(), options.load_options)
+    everything = options.pair == "all"
+    first = 0 if everything else choose(entries, options.pair)
     folder = options.offscreen
     if folder is None:
-        problem = _try_window(options, entries, pixels)
+        problem = _try_window(options, entries, first, pixels)
         if problem is None:
             return 0
         print(f"{problem}: writing a fly-through instead")
-    for entry in entries:
-        target = Path("renders") / entry.folder_name if folder is None else folder
-        if folder is not None and len(entries) > 1:
-            target = folder / entry.folder_name
+    chosen = entries if everything else entries[first : first + 1]
+    if len(chosen) < len(entries):
+        print(
+            f"{options.path} holds {len(entries)}: showing {chosen[0].name}; choose with --pair NAME or all"
+        )
+    for entry in chosen:
+        if folder is None:
+            target = Path("renders") / entry.folder_name
+        else:
+            target = folder / entry.folder_name if everything else folder
         _write(options, entry, target, pixels)
     return 0
 
 
-def _try_window(options: Options, entries: list[Entry], pixels: tuple[int, int]) -> str | None:
+def _try_window(options: Options, entries: list[Entry], first: int, pixels: tuple[int, int]) -> str | None:
     """Show the window until the person leaves; the reason when there can be none."""
     from pansplat_viewer.window import NoWindowError, Window
 
@@ -133,11 +158,11 @@ def _try_window(options: Options, entries: list[Entry], pixels: tuple[int, int])
         window = Window("pansplat", pixels)
     except NoWindowError as error:
         return str(error)
-    _show(window, options, entries)
+    _show(window, options, entries, first)
     return None
 
 
-def _show(window: "Window", options: Options, entries: list[Entry]) -> None:
+def _show(window: "Window", options: Options, entries: list[Entry], first: int) -> None:
     import moderngl
 
     from pansplat_viewer.state import ViewerState
@@ -155,7 +180,7 @@ def _show(window: "Window", options: Options, entries: list[Entry]) -> None:
             at=options.at or 0.0,
             dpi_scale=dpi_scale,
         )
-        viewer.show(entries, 0)
+        viewer.show(entries, first)
         return viewer
 
     run_window(window, make_viewer)
@@ -204,3 +229,7 @@ def _write(options: Options, entry: Entry, folder: Path, pixels: tuple[int, int]
             ctx.release()
     for path in written:
         print(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -27,9 +27,9 @@ class Gui:
         imgui.style_colors_dark()
         style = imgui.get_style()
         style.window_rounding = style.frame_rounding = style.grab_rounding = 4.0
-        style.frame_padding = (6, 2)
-        style.item_spacing = (6, 4)
-        style.window_padding = (8, 6)
+        style.frame_padding = imgui.ImVec2(6, 2)
+        style.item_spacing = imgui.ImVec2(6, 4)
+        style.window_padding = imgui.ImVec2(8, 6)
         style.window_border_size = 0.0
         style.set_color_(imgui.Col_.window_bg.value, (0.08, 0.09, 0.1, 0.88))
         style.set_color_(imgui.Col_.frame_bg.value, (0.26, 0.29, 0.33, 0.9))

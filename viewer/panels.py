@@ -117,9 +117,10 @@ class Panels:
         return pressed
 
     def _slider(self, label: str, value: float, low: float, high: float, form: str) -> float:
-        _, value = imgui.slider_float(label, value, low, high, form, imgui.SliderFlags_.always_clamp.value)
+        clamp = imgui.SliderFlags_.always_clamp.value
+        changed, chosen = imgui.slider_float(label, value, low, high, form, clamp)
         self._mark(label)
-        return value
+        return chosen if changed else value  # untouched, imgui's float32 must not creep into the state
 
     def _section(self, label: str, draw: Callable[[], Any]) -> None:
         opened = imgui.collapsing_header(label, imgui.TreeNodeFlags_.default_open.value)

@@ -24,6 +24,16 @@ from pansplat_viewer.state import ViewerState, advance, enter
 PANORAMA_HEIGHT = 1024  # of a 360 screenshot, pixels
 
 
+def middle_depth(depth: Float[np.ndarray, "height width"]) -> float | None:
+    """Median of the depths around the middle, metres; None when there is nothing."""
+    row, column = depth.shape[0] // 2, depth.shape[1] // 2
+    for reach in (4, 16, 64):
+        middle = depth[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
+        if (middle > 0).any():
+            return float(np.median(middle[middle > 0]))
+    return None
+
+
 class Viewer:
     """Everything the window shows; tests run it on a context without a window.
 
@@ -203,14 +213,10 @@ class Viewer:
         """Turn orbits around what is in the middle of the last picture."""
         if self._picture is None:
             return
-        depth = self.renderer.read_depth()
-        row, column = depth.shape[0] // 2, depth.shape[1] // 2
-        middle = depth[max(row - 4, 0) : row + 5, max(column - 4, 0) : column + 5]
-        seen = middle[middle > 0]
-        if seen.size:
+        distance = middle_depth(self.renderer.read_depth())
+        if distance is not None:
             camera = self.state.camera
-            forward = cameras.rotation(camera)[:, 2]
-            point = np.asarray(camera.position) + float(np.median(seen)) * forward
+            point = np.asarray(camera.position) + distance * cameras.rotation(camera)[:, 2]
             self.state.camera = cameras.focus(camera, point)
             self.state.orbiting = True
 

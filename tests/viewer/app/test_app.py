@@ -1,0 +1,129 @@
+"""The command: quick help, clear errors, and a fly-through where there is no display."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pansplat.errors import InputError
+from pansplat.gaussians.ply import save_ply
+from pansplat_viewer.app import Options, choose, run
+from pansplat_viewer.flythrough import STILLS, Film, flight_pose, panorama_pose
+from pansplat_viewer.library import Entry
+
+
+@pytest.fixture
+def room(tmp_path, small_scene, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    save_ply(small_scene, tmp_path / "room.ply")
+    return tmp_path / "room.ply"
+
+
+def test_help_needs_neither_torch_nor_opengl():
+    code = (
+        "import sys\nfrom pansplat_viewer.app import run\n"
+        "try: run(['--help'])\nexcept SystemExit: pass\n"
+        "print(sorted({'torch', 'moderngl', 'glfw', 'imgui_bundle'} & set(sys.modules)))"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert result.stdout.strip().endswith("[]")
+    assert "--offscreen" in result.stdout
+
+
+@pytest.mark.gl
+def test_without_a_display_it_says_so_in_one_line_and_writes_a_fly_through(room, capsys):
+    assert run([str(room), "--size", "96x54", "--seconds", "0.25", "--fps", "12"]) == 0
+    first = capsys.readouterr().out.splitlines()[0]
+    assert "no display" in first and "fly-through" in first
+    folder = room.parent / "renders" / "room"
+    written = sorted(path.name for path in folder.iterdir())
+    stills = [f"view_{round(100 * at):03d}.png" for at in STILLS]
+    assert written == sorted([*stills, "panorama_050.png", "flythrough.mp4"])
+    with Image.open(folder / "view_050.png") as image:
+        assert image.size == (96, 54) and np.asarray(image).std() > 5
+    with Image.open(folder / "panorama_050.png") as image:
+        assert image.size == (128, 64)
+
+
+@pytest.mark.gl
+def test_the_film_begins_and_ends_with_the_first_and_last_still(room):
+    import av
+
+    assert run([str(room), "--offscreen", "out", "--size", "96x64", "--seconds", "0.5", "--fps", "12"]) == 0
+    folder = room.parent / "out"
+    with av.open(str(folder / "flythrough.mp4")) as film:
+        frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in film.decode(video=0)]
+    assert len(frames) == 6 and frames[0].shape == (64, 96, 3)
+    for frame, still in ((frames[0], "view_000.png"), (frames[-1], "view_100.png")):
+        with Image.open(folder / still) as image:
+            assert np.abs(np.asarray(image).astype(int) - frame).mean() < 6
+    with Image.open(folder / "view_050.png") as image:
+        assert np.abs(np.asarray(image).astype(int) - frames[0]).mean() > 8
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "no such file or folder"),
+        (["room.ply", "--size", "huge"], "WIDTHxHEIGHT"),
+        (["room.ply", "--size", "4x4"], "WIDTHxHEIGHT"),
+        (["room.ply", "--at", "1.5"], "between 0 and 1"),
+        (["room.ply", "--pair", "kitchen"], "number from 1 to 1 or one of room"),
+    ],
+)
+def test_bad_arguments_are_refused_in_one_line_with_status_2(room, capsys, arguments, message):
+    assert run(arguments) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err and captured.err.count("\n") == 1
+    assert not (room.parent / "renders").exists(), "nothing half-written"
+
+
+@pytest.mark.gl
+def test_a_damaged_scene_is_refused_with_status_2(room, capsys):
+    room.write_bytes(room.read_bytes()[:500])
+    assert run([str(room), "--offscreen", "out"]) == 2
+    assert "room.ply" in capsys.readouterr().err
+    assert not (room.parent / "out").exists()
+
+
+def test_pairs_are_chosen_by_name_or_number():
+    entries = [Entry("bath"), Entry("kitchen"), Entry("hall")]
+    assert choose(entries, None) == 0
+    assert choose(entries, "kitchen") == 1
+    assert choose(entries, "3") == 2
+    with pytest.raises(InputError, match="bath, kitchen, hall"):
+        choose(entries, "4")
+
+
+def test_size_is_width_by_height(tmp_path):
+    assert Options(tmp_path, size="1920X1080").pixels == (1920, 1080)
+
+
+def test_flight_and_panorama_poses_go_from_camera_to_camera(small_scene):
+    for fraction, view in ((0.0, 0), (1.0, 1)):
+        center = small_scene.cam2world[view, :3, 3].numpy()
+        assert np.allclose(flight_pose(small_scene, fraction)[:3, 3], center)
+        assert np.allclose(panorama_pose(small_scene, fraction)[:3, 3], center)
+    assert np.allclose(panorama_pose(small_scene, 0.5)[:3, :3], np.eye(3)), "looks along the way, level"
+
+
+def test_a_scene_without_cameras_is_circled(small_scene):
+    from dataclasses import replace
+
+    scene = replace(small_scene, cam2world=small_scene.cam2world[:0])
+    poses = [flight_pose(scene, fraction) for fraction in (0.0, 0.25, 0.5, 1.0)]
+    middle = np.median(scene.gaussians.means.numpy(), axis=0)
+    for pose in poses:
+        ahead = middle - pose[:3, 3]
+        assert np.allclose(pose[:3, 2], ahead / np.linalg.norm(ahead), atol=1e-6)
+    assert np.allclose(poses[0], poses[-1]) and not np.allclose(poses[0], poses[2])
+
+
+def test_a_film_has_at_least_two_pictures():
+    assert Film(seconds=0).frames == 2 and Film(seconds=2, fps=24).frames == 48

@@ -1,0 +1,113 @@
+"""The steered camera moves as a person expects, and stays level."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pansplat_viewer import camera as cameras
+from pansplat_viewer.camera import Camera
+
+# A world with z up: right, down, forward of the level camera are x, -z, y.
+Z_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+
+
+def test_the_default_camera_looks_along_z_with_y_down():
+    assert np.allclose(cameras.pose(Camera()), np.eye(4))
+
+
+@pytest.mark.parametrize("level", [Camera().level, Z_UP])
+def test_every_pose_is_rigid_and_never_rolled(level):
+    for yaw in np.linspace(-4, 4, 9):
+        for pitch in np.linspace(-2, 2, 9):
+            camera = cameras.look(replace(Camera(), level=level), yaw, pitch)
+            rotation = cameras.rotation(camera)
+            assert np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) > 0
+            down = np.asarray(level)[:, 1]
+            assert abs(rotation[:, 0] @ down) < 1e-12, "right is horizontal"
+            assert rotation[:, 1] @ down > 0, "the picture is never upside down"
+
+
+def test_looking_right_and_up_turns_the_forward_axis_there():
+    assert cameras.rotation(cameras.look(Camera(), 0.1, 0))[0, 2] > 0
+    assert cameras.rotation(cameras.look(Camera(), 0, 0.1))[1, 2] < 0
+
+
+def test_place_takes_over_a_level_pose_exactly():
+    camera = cameras.look(replace(Camera(), position=(1, 2, 3)), 2.5, -0.7)
+    again = cameras.place(Camera(), cameras.pose(camera))
+    assert np.allclose(cameras.pose(again), cameras.pose(camera))
+
+
+def test_place_drops_roll_and_nothing_else():
+    c, s = math.cos(0.2), math.sin(0.2)
+    rolled = np.eye(4)
+    rolled[:3, :3] = cameras.rotation(cameras.look(Camera(), 1, 0.3)) @ [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+    placed = cameras.place(Camera(), rolled)
+    assert (placed.yaw_radians, placed.pitch_radians) == pytest.approx((1, 0.3))
+
+
+def test_place_straight_down_keeps_the_heading():
+    down = np.eye(4)
+    down[:3, :3] = cameras.rotation(replace(Camera(), yaw_radians=0.8, pitch_radians=-math.pi / 2))
+    assert cameras.place(Camera(), down).yaw_radians == pytest.approx(0.8)
+
+
+def test_dragging_carries_the_scene_with_the_pointer():
+    camera, height = Camera(), 720
+    focal = height / 2 / math.tan(math.radians(camera.vertical_fov_degrees) / 2)
+    turned = cameras.drag_look(camera, (10.0, 0.0), height)
+    ahead = cameras.rotation(turned).T @ np.array((0.0, 0.0, 1.0))
+    assert focal * ahead[0] / ahead[2] == pytest.approx(10, rel=1e-3)
+    turned = cameras.drag_look(camera, (0.0, 10.0), height)
+    ahead = cameras.rotation(turned).T @ np.array((0.0, 0.0, 1.0))
+    assert focal * ahead[1] / ahead[2] == pytest.approx(10, rel=1e-3)
+
+
+def test_flying_follows_the_view_but_up_is_the_worlds():
+    camera = cameras.look(replace(Camera(), level=Z_UP), 0.5, 0.6)
+    forward = cameras.rotation(camera)[:, 2]
+    assert np.allclose(cameras.fly(camera, 0, 0, 2).position, 2 * forward)
+    assert np.allclose(cameras.fly(camera, 0, 1, 0).position, -np.asarray(Z_UP)[:, 1])
+
+
+def test_orbiting_keeps_the_centre_and_the_distance():
+    camera = replace(cameras.look(Camera(), 0.4, 0.1), distance=3.0, position=(1.0, 0.0, -2.0))
+    center = cameras.orbit_center(camera)
+    for pixels in ((50.0, 0.0), (0.0, 50.0), (-300.0, 400.0)):
+        turned = cameras.orbit(camera, pixels, 720)
+        assert np.allclose(cameras.orbit_center(turned), center)
+        assert turned != camera
+
+
+def test_dolly_approaches_the_centre_and_never_passes_it():
+    camera = replace(Camera(), distance=1.0)
+    near = cameras.dolly(camera, 1)
+    assert near.distance == pytest.approx(0.9) and near.position[2] == pytest.approx(0.1)
+    nearest = cameras.dolly(camera, 1000)
+    assert nearest.distance == cameras.MIN_DISTANCE
+    assert np.allclose(cameras.orbit_center(nearest), cameras.orbit_center(camera))
+
+
+def test_zoom_stays_within_its_bounds():
+    assert cameras.zoom(Camera(), 1).vertical_fov_degrees < Camera().vertical_fov_degrees
+    assert cameras.zoom(Camera(), 1e3).vertical_fov_degrees == cameras.MIN_FOV_DEGREES
+    assert cameras.zoom(Camera(), -1e3).vertical_fov_degrees == cameras.MAX_FOV_DEGREES
+
+
+def test_focus_looks_at_the_point_and_orbits_it():
+    point = np.array((2.0, -1.0, 3.0))
+    camera = cameras.focus(replace(Camera(), position=(0.5, 0, 0)), point)
+    assert np.allclose(cameras.orbit_center(camera), point)
+    assert cameras.focus(camera, np.asarray(camera.position)) == camera
+
+
+def test_the_nearest_view_is_the_nearest():
+    poses = np.stack([np.eye(4)] * 3)
+    poses[:, 0, 3] = (0, 1, 2)
+    assert [cameras.nearest_view(replace(Camera(), position=(x, 0, 0)), poses) for x in (-1, 0.9, 5)] == [
+        0,
+        1,
+        2,
+    ]

@@ -1,0 +1,174 @@
+"""The real window, in a process of its own under Xvfb, driven by synthetic mouse and keys."""
+
+import os
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pansplat.gaussians.ply import save_ply
+
+pytestmark = [pytest.mark.gl, pytest.mark.slow]
+
+PROGRAM = "from pansplat_viewer.app import main; main()"
+TITLE = "room - pansplat"
+
+
+def need(*programs: str) -> None:
+    missing = [program for program in programs if not shutil.which(program)]
+    if missing and os.environ.get("CI"):
+        pytest.fail(f"CI needs {missing}: apt-get install xvfb xdotool")
+    if missing:
+        pytest.skip(f"needs {missing} (Debian packages xvfb, xdotool)")
+
+
+def wait_until(condition: Callable[[], Any], what: str, seconds: float = 60.0) -> Any:
+    deadline = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < deadline, f"waited {seconds:.0f} s in vain for {what}"
+        time.sleep(0.05)
+    return value
+
+
+class Display:
+    """An X server without a screen, whose picture lies in a file."""
+
+    def __init__(self, folder: Path) -> None:
+        read, write = os.pipe()
+        command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1024x768x24", "-fbdir", str(folder)]
+        self._server = subprocess.Popen(
+            [*command, "-nolisten", "tcp"], pass_fds=(write,), stderr=subprocess.DEVNULL
+        )
+        os.close(write)
+        with os.fdopen(read) as answer:
+            self.name = f":{answer.readline().strip()}"
+        self._file = folder / "Xvfb_screen0"
+
+    def screen(self) -> np.ndarray:
+        """The screen's RGB pixels; the file has the XWD format."""
+        data = self._file.read_bytes()
+        header = struct.unpack(">25I", data[:100])
+        size, width, height, stride, colors = header[0], header[4], header[5], header[12], header[19]
+        start = size + 12 * colors
+        rows = np.frombuffer(data, np.uint8, height * stride, start).reshape(height, stride)
+        return rows[:, : 4 * width].reshape(height, width, 4)[..., 2::-1].astype(int)
+
+    def do(self, *command: str) -> str:
+        """Run xdotool on this display."""
+        environment = {**os.environ, "DISPLAY": self.name}
+        result = subprocess.run(
+            ["xdotool", *command], env=environment, capture_output=True, text=True, timeout=20
+        )
+        return result.stdout.strip()
+
+    def close(self) -> None:
+        self._server.terminate()
+        self._server.wait(10)
+
+
+@pytest.fixture(scope="module")
+def display(tmp_path_factory) -> Iterator[Display]:
+    need("Xvfb", "xdotool")
+    display = Display(tmp_path_factory.mktemp("display"))
+    yield display
+    display.close()
+
+
+@pytest.fixture
+def room(tmp_path, small_scene) -> Path:
+    path = tmp_path / "room.ply"
+    save_ply(small_scene, path)
+    return path
+
+
+@contextmanager
+def running(display: Display, room: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
+    """The command in a process that is gone, with its pipes, when the block ends."""
+    environment = {**os.environ, "DISPLAY": display.name, "WAYLAND_DISPLAY": ""}
+    viewer = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, str(room), *options],
+        env=environment,
+        cwd=room.parent,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    with viewer:
+        try:
+            yield viewer
+        finally:
+            viewer.kill()
+
+
+def test_the_window_can_be_driven_by_mouse_and_keys_and_leaves_cleanly(display, room):
+    with running(display, room, "--size", "640x480") as viewer:
+        find = ("search", "--name", f"^{TITLE}$")
+        window = wait_until(lambda: display.do(*find), "the window").split()[0]
+        display.do("windowmove", window, "0", "0")
+        display.do("windowfocus", window)
+        picture = (slice(10, 370), slice(320, 630))
+        wait_until(lambda: (display.screen()[picture].max(-1) > 60).mean() > 0.3, "the scene")
+        time.sleep(1.0)
+
+        before = display.screen()[picture]
+        display.do("mousemove", "450", "200", "mousedown", "1")
+        display.do("mousemove", "380", "200")
+        time.sleep(0.3)
+        display.do("mouseup", "1")
+        wait_until(lambda: np.abs(display.screen()[picture] - before).mean() > 5, "the drag to look around")
+
+        display.do("key", "Tab")
+        panel = (slice(20, 300), slice(20, 280))
+        with_panel = display.screen()[panel]
+        wait_until(lambda: np.abs(display.screen()[panel] - with_panel).mean() > 5, "the panels to go")
+
+        display.do("key", "p")
+        shot = room.parent / "renders" / "room" / "view_001.png"
+        wait_until(shot.exists, "the screenshot")
+        from PIL import Image
+
+        with Image.open(shot) as image:
+            assert image.size == (640, 480)
+
+        display.do("windowsize", window, "800", "600")
+        outside = (slice(490, 590), slice(500, 790))
+        wait_until(lambda: (display.screen()[outside].max(-1) > 60).mean() > 0.2, "the larger picture")
+
+        display.do("key", "Escape")
+        output, errors = viewer.communicate(timeout=30)
+        assert viewer.returncode == 0, errors
+        assert errors == "" and output == ""
+
+
+def test_an_interrupt_leaves_cleanly(display, room):
+    with running(display, room, "--size", "320x240") as viewer:
+        wait_until(lambda: display.do("search", "--name", f"^{TITLE}$"), "the window")
+        viewer.send_signal(signal.SIGINT)
+        _, errors = viewer.communicate(timeout=30)
+        assert viewer.returncode == 130 and "Traceback" not in errors
+
+
+def test_a_display_that_is_not_there_gives_a_fly_through(room):
+    environment = {**os.environ, "DISPLAY": ":98765", "WAYLAND_DISPLAY": ""}
+    options = ("--size", "64x32", "--seconds", "0.2")
+    result = subprocess.run(
+        [sys.executable, "-c", PROGRAM, str(room), *options],
+        env=environment,
+        cwd=room.parent,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert result.returncode == 0, result.stderr
+    assert "writing a fly-through" in result.stdout.splitlines()[0]
+    assert "98765" in result.stdout.splitlines()[0], "the reason names the display"
+    assert (room.parent / "renders" / "room" / "flythrough.mp4").exists()
