@@ -34,8 +34,7 @@ def replacing(path: Path | str) -> Iterator[Path]:
     except OSError as error:
         raise InputError(
             f"cannot write {path}: needed a writable folder with room on the disk, got "
-            f"'{error.strerror or error}'; "
-            "choose another place."
+            f"'{error.strerror or error}'; choose another place."
         ) from error
     finally:
         temporary.unlink(missing_ok=True)

@@ -124,8 +124,7 @@ def read_depth(path: Path | str, height: int) -> Float[Tensor, "height width"]:
             got = "an unreadable file" if depth is None else f"{depth.dtype} with shape {depth.shape}"
             raise InputError(
                 f"{path}: needed depth as a one-channel 16-bit PNG in millimetres or an EXR in "
-                f"metres, got {got}; "
-                "convert it."
+                f"metres, got {got}; convert it."
             )
         _verify_with_pillow(path, data)  # OpenCV fills a truncated file with zeros and says nothing
         depth = depth.astype(np.float32) / np.float32(1000)

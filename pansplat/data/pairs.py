@@ -83,13 +83,11 @@ def _nothing_found(root: Path) -> InputError:
         names = ", ".join(path.name for path in images[:3]) + (" ..." if len(images) > 3 else "")
         return InputError(
             f"{root}: needed poses for the panoramas, got pictures only ({names}); add a poses.json "
-            "or another pose "
-            "file, see docs/input.md."
+            "or another pose file, see docs/input.md."
         )
     return InputError(
         f"{root}: needed two or more panoramas with poses (poses.json, camera_pose.json, rot.txt and "
-        "tran.txt, "
-        "*.kitti or *.tum), got none of these files there or in its folders; see docs/input.md."
+        "tran.txt, *.kitti or *.tum), got none of these files there or in its folders; see docs/input.md."
     )
 
 

@@ -104,8 +104,7 @@ def _what_is_wrong(matrix: Float[Tensor, "4 4"], error: float) -> str:
     if determinant < 0:
         return (
             f"a mirrored one (determinant {determinant:.3f}): an axis points the wrong way or two are "
-            "exchanged; "
-            "flip one axis so that the system is right-handed."
+            "exchanged; flip one axis so that the system is right-handed."
         )
     if scale > 0 and orthonormal_error(_with_rotation(matrix, rotation / scale)) <= _RIGID_TOLERANCE:
         return f"a rotation scaled by {scale:.4g}; divide its 3x3 part by that."
@@ -148,8 +147,7 @@ def read_json(path: Path) -> Any:
     except json.JSONDecodeError as error:
         raise InputError(
             f"{path}: needed JSON, got something else at line {error.lineno}, column {error.colno} "
-            f"({error.msg}); "
-            "correct it there."
+            f"({error.msg}); correct it there."
         ) from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: needed JSON text in UTF-8, got other bytes; save it as UTF-8.") from error
@@ -197,8 +195,7 @@ def read_trajectory(path: Path, convention: str | None = None, expected: str | N
     if kind is None:
         raise InputError(
             f"{path}, line {rows[0][0]}: needed 12 numbers (KITTI: 3x4 matrix) or 8 (TUM: timestamp, "
-            "translation, "
-            f"quaternion), got {count}; export the trajectory in one of these formats."
+            f"translation, quaternion), got {count}; export the trajectory in one of these formats."
         )
     if expected is not None and kind != expected:
         formats = {"kitti": "KITTI (12 numbers a line)", "tum": "TUM (8 numbers a line)"}
@@ -247,8 +244,7 @@ def _tum_matrix(numbers: list[float], source: str) -> list[list[float]]:
     if not abs(norm - 1) < _RIGID_TOLERANCE:
         raise InputError(
             f"{source}: needed a unit quaternion qx qy qz qw as the last four numbers, got length "
-            f"{norm:.4g}; "
-            "check the order of the columns."
+            f"{norm:.4g}; check the order of the columns."
         )
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = rotations_from_quats(torch.tensor((w, x, y, z), dtype=torch.float64))

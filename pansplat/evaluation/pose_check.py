@@ -26,27 +26,33 @@ _DEPTHS = 32  # inverse depths
 _AGGREGATION = 2  # pixels on each side over which differences are averaged
 _DIFFERENCE_CAP = 0.6  # per feature; what is hidden in the other view must not decide
 _CLEARLY_BETTER = 0.92  # of the error as given: below that another reading is named,
-_FITS = 0.46  # if its own error is below that; above, the views show too little in common to tell
+_FITS = 0.46  # if its own error is below that
+_UNLIKE = 0.5  # least error above which the views show too little in common to tell anything
 _SAME_POSE = 0.02  # entries of the relative pose (translation by its length) that count as equal
 
 _ADVICE = {
     "inverse": 'the matrices look like the inverse of what was said: exchange "cam2world" and "world2cam"',
-    "opengl axes": 'the camera axes look like OpenGL\'s (y up, z backward) where OpenCV\'s were said, or the
-    other ' 'way round: exchange "opencv" and "opengl"', "inverse, opengl axes": "both the direction
-    (cam2world, world2cam) and the camera axes (opencv, opengl) look " "exchanged", "transposed rotation":
-    "the rotations look transposed (inverted) while the translations are right: transpose the " "3x3 parts, or
-    conjugate the quaternions", "swapped views": "the poses of the two views look exchanged: check which pose
-    belongs to which picture", "mirrored left-right": "the scene looks mirrored left to right: a flipped
-    picture or a left-handed world", "mirrored up-down": "the up axis looks flipped alone (a left-handed
-    system): flip a second axis with it", "mirrored front-back": "the forward axis looks flipped alone (a
-    left-handed system): flip a second axis with it", "z-up camera": "the camera axes look like x right, y
-    forward, z up: turn them into x right, y down, z forward", "x-forward camera": "the camera axes look like
-    x forward, y left, z up (robotics, ROS): turn them into x right, " "y down, z forward", "turned by 90
-    degrees": "the panoramas' centre looks along the camera's x axis: turn the poses by 90 degrees about "
-    "the vertical axis or shift the pictures by a quarter", "turned by 180 degrees": "the panoramas' centre
-    looks backward: turn the poses by 180 degrees about the vertical " "axis or shift the pictures by half",
-    "turned by -90 degrees": "the panoramas' centre looks along the camera's -x axis: turn the poses by -90
-    degrees " "about the vertical axis or shift the pictures by a quarter",
+    "opengl axes": "the camera axes look like OpenGL's (y up, z backward) where OpenCV's were said, or the "
+    'other way round: exchange "opencv" and "opengl"',
+    "inverse, opengl axes": "both the direction (cam2world, world2cam) and the camera axes (opencv, opengl) "
+    "look exchanged",
+    "transposed rotation": "the rotations look inverted while the translations are right: transpose the 3x3 "
+    "parts, or conjugate the quaternions",
+    "swapped views": "the poses of the two views look exchanged: check which pose belongs to which picture",
+    "mirrored left-right": "the scene looks mirrored left to right: a flipped picture or a left-handed world",
+    "mirrored up-down": "the up axis looks flipped alone (a left-handed system): flip a second axis with it",
+    "mirrored front-back": "the forward axis looks flipped alone (a left-handed system): flip a second axis "
+    "with it",
+    "z-up camera": "the camera axes look like x right, y forward, z up: turn them into x right, y down, "
+    "z forward",
+    "x-forward camera": "the camera axes look like x forward, y left, z up (robotics, ROS): turn them into "
+    "x right, y down, z forward",
+    "turned by 90 degrees": "the panoramas' centre looks along the camera's x axis: turn the poses by 90 "
+    "degrees about the vertical axis or shift the pictures by a quarter",
+    "turned by 180 degrees": "the panoramas' centre looks backward: turn the poses by 180 degrees about the "
+    "vertical axis or shift the pictures by half",
+    "turned by -90 degrees": "the panoramas' centre looks along the camera's -x axis: turn the poses by -90 "
+    "degrees about the vertical axis or shift the pictures by a quarter",
 }
 
 
@@ -84,13 +90,20 @@ class PoseCheck:
 
     def report(self) -> str:
         """The findings as text of several lines."""
-        lines = [f"{self.name}: baseline {self.baseline:.3f} m, photometric error {self.error:.3f} with the
-        poses as given"] lines += [f"  {error:.3f}  {name}" for name, error in self.errors.items()] if
-        self.indistinguishable:
+        lines = [
+            f"{self.name}: baseline {self.baseline:.3f} m, "
+            f"photometric error {self.error:.3f} with the poses as given"
+        ]
+        lines += [f"  {error:.3f}  {name}" for name, error in self.errors.items()]
+        if self.indistinguishable:
             lines.append(f"  same as given for these views: {', '.join(self.indistinguishable)}")
         lines += [f"  warning: {warning}" for warning in self.warnings]
-        lines.append(f"  likely mistake: {self.likely_mistake}" if self.likely_mistake else "  no other reading fits better")
-        return "\n".join(lines)
+        mistake = (
+            f"likely mistake: {self.likely_mistake}"
+            if self.likely_mistake
+            else "no other reading fits better"
+        )
+        return "\n".join((*lines, f"  {mistake}"))
 
 
 def check_pair(pair: Pair) -> PoseCheck:
@@ -150,8 +163,7 @@ def _implausible(centres: Float[Tensor, "view 3"], baseline: float, views: Views
     if baseline > 0.5 * views.far:
         found.append(
             f"the cameras are {baseline:.3g} m apart, which is much against far = {views.far:g} m: "
-            "are the poses in "
-            "centimetres or millimetres? Convert them to metres, or set near and far to fit."
+            "are the poses in centimetres or millimetres? Convert them to metres, or set near and far to fit."
         )
     if closest < 0.02 * views.near:
         degrees = math.degrees(math.atan2(closest, views.near))
@@ -166,12 +178,11 @@ def _implausible(centres: Float[Tensor, "view 3"], baseline: float, views: Views
 def _hopeless(errors: dict[str, float]) -> tuple[str, ...]:
     """A warning when no reading of the poses makes the pictures alike."""
     best = next(iter(errors.values()))
-    if best <= _FITS:
+    if best <= _UNLIKE:
         return ()
     return (
         f"no reading of the poses makes the views alike (best error {best:.3f}): they show too little "
-        "in common, "
-        "or the poses or the order of the pictures are wrong in another way.",
+        "in common, or the poses or the order of the pictures are wrong in another way.",
     )
 
 
@@ -254,21 +265,22 @@ def _sweep_error(
     pose: Float[Tensor, "4 4"],
     views: Views,
 ) -> float:
-    """Mean over the sphere of the least aggregated difference over all depths, about 1 for unrelated pictures."""
+    """Mean over the sphere of the least aggregated difference over all depths; about 1 when unrelated."""
     height, width = reference.shape[-2:]
     inverse = torch.linspace(1 / views.far, 1 / views.near, _DEPTHS)
     rays = pixel_directions(height, width) @ pose[:3, :3].T.float()
-    points = rays + inverse[:, None, None, None] * pose[:3, 3].float()  # scaled by 1 / depth: only directions count
-    uv = uv_from_directions(points)
-    grid = torch.stack(((uv[..., 0] * width + 1) / (width + 2), (uv[..., 1] * height + 1) / (height + 2)), -1)
-    * 2 - 1 source = pad_equirect(torch.cat((other, other_mask[None].to(other.dtype))), 1) warped =
-    torch.nn.functional.grid_sample(
+    points = rays + inverse[:, None, None, None] * pose[:3, 3].float()  # over depth: only directions count
+    size = torch.tensor((width, height), dtype=torch.float32)
+    grid = 2 * (uv_from_directions(points) * size + 1) / (size + 2) - 1
+    source = pad_equirect(torch.cat((other, other_mask[None].to(other.dtype))), 1)
+    warped = torch.nn.functional.grid_sample(
         source.expand(_DEPTHS, -1, -1, -1), grid, padding_mode="border", align_corners=False
     )
     difference = (warped[:, :-1] - reference).abs().clamp_max(_DIFFERENCE_CAP).mean(dim=1)
     seen = (warped[:, -1] > 0.5) & mask
     difference = torch.where(seen, difference, torch.full_like(difference, _DIFFERENCE_CAP / 2))
     window = 2 * _AGGREGATION + 1
-    cost = torch.nn.functional.avg_pool2d(pad_equirect(difference, _AGGREGATION)[:, None], window,
-    stride=1)[:, 0] least = cost.amin(dim=0) weights = row_weights(height, dtype=least.dtype)[:, None] * mask
+    padded = pad_equirect(difference, _AGGREGATION)[:, None]
+    least = torch.nn.functional.avg_pool2d(padded, window, stride=1)[:, 0].amin(dim=0)
+    weights = row_weights(height, dtype=least.dtype)[:, None] * mask
     return float((least * weights).sum() / weights.sum().clamp_min(1e-9)) / (_DIFFERENCE_CAP / 2)

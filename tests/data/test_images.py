@@ -1,0 +1,238 @@
+"""Pictures are read alike from every format, and whatever is wrong with a file is said."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+from PIL import Image
+
+from pansplat.data.images import (
+    linear_from_srgb,
+    read_depth,
+    read_mask,
+    read_panorama,
+    read_thumbnail,
+    srgb_from_linear,
+    write_image,
+)
+from pansplat.errors import InputError
+
+
+def _picture(height: int = 16) -> torch.Tensor:
+    """A smooth panorama, (3 height 2 height), whose columns meet at +-180 degrees."""
+    v, u = torch.meshgrid(
+        torch.linspace(0, 1, height), torch.arange(2 * height) / (2 * height), indexing="ij"
+    )
+    return torch.stack((0.5 + 0.4 * torch.sin(6.2832 * u), v, 0.5 + 0.3 * torch.cos(6.2832 * u) * v))
+
+
+def _entries(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("suffix", "tolerance"), [(".png", 2e-3), (".webp", 2e-3), (".jpg", 0.05), (".exr", 1e-5)]
+)
+def test_reading_gives_what_was_written(tmp_path: Path, suffix: str, tolerance: float) -> None:
+    image = _picture()
+    write_image(tmp_path / f"a{suffix}", image)
+    read, opaque = read_panorama(tmp_path / f"a{suffix}", 16)
+    assert read.dtype == torch.float32
+    assert (read - image).abs().max() < tolerance
+    assert opaque.all()
+    assert _entries(tmp_path) == [f"a{suffix}"]
+
+
+def test_an_array_is_written_as_the_tensor_of_the_same_picture(tmp_path: Path) -> None:
+    image = _picture()
+    write_image(tmp_path / "a.png", image)
+    write_image(tmp_path / "b.png", image.permute(1, 2, 0).numpy())
+    write_image(tmp_path / "c.png", (image.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8))
+    assert (
+        (tmp_path / "a.png").read_bytes()
+        == (tmp_path / "b.png").read_bytes()
+        == (tmp_path / "c.png").read_bytes()
+    )
+
+
+def test_format_is_told_by_content_not_by_name(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.png", _picture())
+    (tmp_path / "a.png").rename(tmp_path / "a.jpg")
+    assert (read_panorama(tmp_path / "a.jpg", 16)[0] - _picture()).abs().max() < 2e-3
+
+
+def test_sixteen_bit_png_keeps_its_precision(tmp_path: Path) -> None:
+    image = _picture()
+    values = (image.permute(1, 2, 0).numpy() * 65535).round().astype(np.uint16)
+    cv2.imwrite(str(tmp_path / "a.png"), values[..., ::-1])
+    assert (read_panorama(tmp_path / "a.png", 16)[0] - image).abs().max() < 1e-5
+
+
+def test_sixteen_bit_grey_png_is_scaled_to_one(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((8, 16), 65535, np.uint16))
+    assert torch.equal(read_panorama(tmp_path / "a.png", 8)[0], torch.ones(3, 8, 16))
+
+
+def test_exr_holds_linear_light_and_depth(tmp_path: Path) -> None:
+    depth = torch.rand(16, 32) + 1
+    write_image(tmp_path / "a.exr", torch.full((3, 16, 32), 0.5), depth=depth)
+    with OpenEXR.File(str(tmp_path / "a.exr")) as file:
+        assert np.allclose(file.channels()["RGB"].pixels, 0.21404, atol=1e-4)
+        assert file.header()["envmap"] == OpenEXR.ENVMAP_LATLONG
+    assert torch.equal(read_depth(tmp_path / "a.exr", 16), depth)
+
+
+def test_srgb_and_linear_are_inverse() -> None:
+    x = np.linspace(0, 1, 257, dtype=np.float32)
+    assert np.abs(srgb_from_linear(linear_from_srgb(x)) - x).max() < 1e-6
+
+
+@pytest.mark.parametrize("height", [8, 16, 31])
+def test_resizing_rolls_with_the_panorama(tmp_path: Path, height: int) -> None:
+    image = _picture(62)
+    write_image(tmp_path / "a.png", image)
+    write_image(tmp_path / "b.png", torch.roll(image, 62, dims=2))
+    a, b = (read_panorama(tmp_path / name, height)[0] for name in ("a.png", "b.png"))
+    assert a.shape == (3, height, 2 * height)
+    if 62 % height == 0:
+        assert (torch.roll(a, height, dims=2) - b).abs().max() < 0.005
+    assert (
+        a - torch.nn.functional.interpolate(image[None], size=(height, 2 * height), mode="area")[0]
+    ).abs().max() < 0.05
+
+
+def test_a_thumbnail_is_the_panorama_made_small(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.jpg", _picture(128))
+    thumbnail = read_thumbnail(tmp_path / "a.jpg", 16)
+    assert (thumbnail - read_panorama(tmp_path / "a.jpg", 16)[0]).abs().max() < 0.03
+
+
+def test_transparent_pixels_are_masked_with_a_warning(tmp_path: Path) -> None:
+    rgba = np.full((16, 32, 4), 255, np.uint8)
+    rgba[12:, :, 3] = 0
+    Image.fromarray(rgba).save(tmp_path / "a.png")
+    with pytest.warns(UserWarning, match=r"a\.png: 25\.0% .* transparent"):
+        _, opaque = read_panorama(tmp_path / "a.png", 16)
+    assert opaque[:12].all()
+    assert not opaque[12:].any()
+
+
+def test_an_opaque_alpha_channel_is_as_none(tmp_path: Path) -> None:
+    Image.fromarray(np.full((16, 32, 4), 255, np.uint8)).save(tmp_path / "a.png")
+    assert read_panorama(tmp_path / "a.png", 16)[1].all()  # and no warning, which would be an error here
+
+
+def test_a_mask_is_true_where_white(tmp_path: Path) -> None:
+    mask = np.full((16, 32), 255, np.uint8)
+    mask[:4] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    read = read_mask(tmp_path / "mask.png", 8)
+    assert read.shape == (8, 16)
+    assert not read[:2].any()
+    assert read[2:].all()
+
+
+def test_depth_is_metres_and_never_mixed(tmp_path: Path) -> None:
+    depth = np.full((16, 32), 1500, np.uint16)
+    depth[:, 16:] = 4000
+    depth[0] = 0
+    cv2.imwrite(str(tmp_path / "depth.png"), depth)
+    assert set(read_depth(tmp_path / "depth.png", 16).unique().tolist()) == {0.0, 1.5, 4.0}
+    assert set(read_depth(tmp_path / "depth.png", 5).unique().tolist()) == {1.5, 4.0}
+
+
+def test_eight_bit_depth_is_refused(tmp_path: Path) -> None:
+    write_image(tmp_path / "depth.png", _picture())
+    with pytest.raises(
+        InputError, match=r"depth\.png: needed depth as a one-channel 16-bit PNG .* got uint8"
+    ):
+        read_depth(tmp_path / "depth.png", 16)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".exr"])
+def test_truncated_data_is_refused(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    write_image(path, torch.rand(3, 64, 128, generator=torch.Generator().manual_seed(0)))
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) * 6 // 10])
+    with pytest.raises(InputError, match="damaged or truncated"):
+        read_panorama(path, 64)
+
+
+def test_truncated_sixteen_bit_png_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "depth.png"
+    cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 60000, (64, 128), dtype=np.uint16))
+    path.write_bytes(path.read_bytes()[:8000])
+    for read in (read_panorama, read_depth):
+        with pytest.raises(InputError, match=r"depth\.png: needed"):
+            read(path, 64)
+
+
+def test_a_file_of_no_bytes_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").touch()
+    with pytest.raises(InputError, match=r"a\.jpg: needed a picture, got a file of 0 bytes"):
+        read_panorama(tmp_path / "a.jpg", 16)
+
+
+@pytest.mark.parametrize("content", [b"GIF89a" + bytes(100), b"hello, I am a text file", bytes(50)])
+def test_an_unknown_format_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.png").write_bytes(content)
+    with pytest.raises(InputError, match="unknown format"):
+        read_panorama(tmp_path / "a.png", 16)
+
+
+def test_a_picture_that_is_not_two_to_one_is_refused(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.png", torch.zeros(3, 16, 24))
+    with pytest.raises(InputError, match=r"a\.png: needed a 2:1 equirectangular panorama, got 24x16"):
+        read_panorama(tmp_path / "a.png", 16)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_nan_in_exr_is_refused_with_the_count(tmp_path: Path, value: float) -> None:
+    pixels = np.zeros((8, 16, 3), np.float32)
+    pixels[2, 3:5, 1] = value
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"RGB": pixels}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    with pytest.raises(InputError, match=r"a\.exr: .*got 2 NaN or infinite"):
+        read_panorama(tmp_path / "a.exr", 8)
+
+
+def test_exr_without_colour_is_refused(tmp_path: Path) -> None:
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"beauty.R": np.zeros((8, 16), np.float32)}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    with pytest.raises(InputError, match="needed the channels R, G and B"):
+        read_panorama(tmp_path / "a.exr", 8)
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"gone\.png: needed a readable picture file"):
+        read_panorama(tmp_path / "gone.png", 8)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.exr"])
+def test_nan_is_never_written(tmp_path: Path, name: str) -> None:
+    image = _picture()
+    write_image(tmp_path / name, image)
+    before = (tmp_path / name).read_bytes()
+    image[0, 0, 0] = torch.nan
+    with pytest.raises(InputError, match="got 1 NaN or infinite values; nothing written"):
+        write_image(tmp_path / name, image)
+    assert (tmp_path / name).read_bytes() == before
+    assert _entries(tmp_path) == [name]
+
+
+def test_writing_refuses_what_the_format_cannot_hold(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"needed a name ending in"):
+        write_image(tmp_path / "a.gif", _picture())
+    with pytest.raises(InputError, match=r"cannot write depth to .*needed an \.exr"):
+        write_image(tmp_path / "a.png", _picture(), depth=torch.ones(16, 32))
+    with pytest.raises(InputError, match=r"needed finite depth of shape \(16, 32\), got shape \(8, 8\)"):
+        write_image(tmp_path / "a.exr", _picture(), depth=torch.ones(8, 8))
+    with pytest.raises(InputError, match="got shape"):
+        write_image(tmp_path / "a.png", torch.zeros(16, 32))
+    with pytest.raises(InputError, match="needed an existing folder"):
+        write_image(tmp_path / "none" / "a.png", _picture())
+    assert _entries(tmp_path) == []
