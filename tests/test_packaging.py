@@ -1,0 +1,151 @@
+"""The wheel holds what it must and nothing else, and works where only it is installed."""
+
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = {"pansplat": "pansplat", "pansplat_viewer": "viewer", "pansplat_viewer.shaders": "shaders"}
+
+
+def project() -> dict:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    source = tmp_path_factory.mktemp("source")
+    for folder in (*FOLDERS.values(), "tests"):
+        shutil.copytree(ROOT / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    for file in ("pyproject.toml", "README.md", "LICENSE", "setup.sh", "constraints.txt"):
+        shutil.copy(ROOT / file, source)
+    build = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "--no-deps",
+        "--no-build-isolation",
+        "-qq",
+        "-w",
+        "dist",
+        ".",
+    ]
+    done = subprocess.run(build, cwd=source, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (made,) = (source / "dist").glob("*.whl")
+    return made
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the wheel installed, as in site-packages."""
+    site = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "pip", "install", "--no-deps", "-qq", "--target", str(site), str(wheel)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return site
+
+
+def run_in(site: Path, *command: str) -> subprocess.CompletedProcess[str]:
+    """Run with the installed wheel before this checkout's editable install."""
+    environment = os.environ | {"PYTHONPATH": str(site)}
+    return subprocess.run(command, cwd=site.parent, env=environment, capture_output=True, text=True)
+
+
+def test_the_package_list_is_what_the_disk_holds() -> None:
+    on_disk = {
+        ".".join(file.parent.relative_to(ROOT).parts) for file in (ROOT / "pansplat").rglob("__init__.py")
+    } | {"pansplat_viewer", "pansplat_viewer.shaders"}
+    on_disk |= {
+        "pansplat_viewer." + ".".join(file.parent.relative_to(ROOT / "viewer").parts)
+        for file in (ROOT / "viewer").glob("*/**/__init__.py")
+    }
+    listed = project()["tool"]["setuptools"]["packages"]
+    assert sorted(listed) == sorted(on_disk)
+    assert len(set(listed)) == len(listed)
+
+
+def test_the_wheel_holds_both_packages_and_nothing_else(wheel: Path) -> None:
+    names = zipfile.ZipFile(wheel).namelist()
+    version = project()["project"]["version"]
+    assert {name.split("/")[0] for name in names} == {
+        "pansplat",
+        "pansplat_viewer",
+        f"pansplat-{version}.dist-info",
+    }
+    assert not [name for name in names if "test" in name.split("/")[-1] or "__pycache__" in name]
+
+
+def test_the_wheel_holds_every_module_and_shader(wheel: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
+    needed = {"pansplat/py.typed"}
+    for package, folder in FOLDERS.items():
+        for file in (ROOT / folder).rglob("*"):
+            if file.suffix in (".py", ".glsl", ".vert", ".frag", ".geom", ".comp"):
+                needed.add(f"{package.replace('.', '/')}/{file.relative_to(ROOT / folder).as_posix()}")
+    assert not needed - names
+    assert any(name.endswith((".frag", ".glsl")) for name in needed)
+
+
+def test_the_version_is_one(wheel: Path) -> None:
+    import pansplat
+
+    assert project()["project"]["version"] == pansplat.__version__
+
+
+def test_an_installed_wheel_is_used_and_reads_its_shaders(installed: Path) -> None:
+    program = (
+        "import pansplat, pansplat_viewer, pathlib, sys\n"
+        "from importlib.resources import files\n"
+        "site = pathlib.Path(sys.argv[1])\n"
+        "assert pathlib.Path(pansplat.__file__).is_relative_to(site), pansplat.__file__\n"
+        "assert pathlib.Path(pansplat_viewer.__file__).is_relative_to(site)\n"
+        "shaders = [f for f in files('pansplat_viewer.shaders').iterdir() if f.name.endswith(('.frag', '.glsl'))]\n"
+        "assert shaders and all(f.read_text() for f in shaders)\n"
+    )
+    done = run_in(installed, sys.executable, "-c", program, str(installed))
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "status"), [("pansplat", 0), ("pansplat-view", 0), ("pansplat-train", 1)]
+)
+def test_the_entry_points_of_an_installed_wheel_work(installed: Path, command: str, status: int) -> None:
+    arguments = ["--help"] if status == 0 else []
+    done = run_in(installed, sys.executable, str(installed / "bin" / command), *arguments)
+    assert done.returncode == status, done.stderr
+    assert command in done.stdout + done.stderr
+
+
+def test_tests_pass_against_the_installed_wheel(installed: Path) -> None:
+    """Not only against the checkout: one room's tests, with the wheel's modules."""
+    options = ["-q", "-p", "no:cacheprovider", "-c", str(ROOT / "pyproject.toml")]
+    done = run_in(
+        installed, sys.executable, "-m", "pytest", *options, str(ROOT / "tests/gaussians/test_ply.py")
+    )
+    assert done.returncode == 0, done.stdout
+    assert " passed" in done.stdout
+
+
+def test_setup_pins_torch_and_names_no_missing_file() -> None:
+    constraints = (ROOT / "constraints.txt").read_text().splitlines()
+    assert "torch==2.13.0" in constraints
+    pinned = {line.split("==")[0] for line in constraints if line and not line.startswith("#")}
+    wanted = project()["project"]
+    names = [*wanted["dependencies"], *wanted["optional-dependencies"]["dev"]]
+    bare = {
+        name.split(";")[0].split(">")[0].split("[")[0].strip().lower().replace("_", "-") for name in names
+    }
+    assert not bare - pinned  # every direct dependency is a tested version
+    assert subprocess.run(["bash", "-n", str(ROOT / "setup.sh")]).returncode == 0
