@@ -51,13 +51,13 @@ class Taste:
             return Taste()
         rng = np.random.default_rng(seed)
 
-        def near(color: f.Color) -> f.Color:
-            shuffled = rng.permutation(color) if rng.random() < 0.6 else np.array(color)
+        def near(color: f.Color, hue: bool = True) -> f.Color:
+            shuffled = rng.permutation(color) if hue and rng.random() < 0.6 else np.array(color)
             return tuple((shuffled * rng.uniform(0.7, 1.35, 3)).clip(0.01, 0.8).tolist())
 
         base = Taste()
         return Taste(
-            near(base.wall), near(base.second_wall), base.panel, near(base.floor), near(base.sofa),
+            near(base.wall), near(base.second_wall), base.panel, near(base.floor, False), near(base.sofa),
             near(base.chair), near(base.drape), rng.uniform(150, 230), 0.12,
         )  # fmt: skip
 
