@@ -9,14 +9,14 @@ uniform vec3 background;
 layout(location = 0) out vec4 out_color;    // rgb over the background, alpha the coverage
 layout(location = 1) out vec4 out_depth;
 
-// `sum` holds weighted premultiplied colour and alpha, `extra` weighted alpha x distance and the weights.
+// `sum` and `extra` are what gather.frag added up.
 void picture(vec4 sum, vec4 extra, out vec4 color, out float depth) {
     color = vec4(background, 0.0);
     depth = 0.0;
-    if (sum.a > 0.0) {
-        float alpha = min(sum.a / extra.g, 1.0);
-        color = vec4(sum.rgb / sum.a * alpha + (1.0 - alpha) * background, alpha);
-        depth = extra.r / sum.a;
+    if (extra.g > 0.0) {
+        float alpha = sum.a / extra.g;
+        color = vec4(sum.rgb / extra.g + (1.0 - alpha) * background, alpha);
+        depth = extra.r / extra.g;
     }
 }
 

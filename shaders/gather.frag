@@ -13,8 +13,8 @@ uniform vec2 size;              // of the output, pixels
 uniform float focal;            // pixels, source 1
 uniform mat3 camera_to_faces;
 
-layout(location = 0) out vec4 out_color;
-layout(location = 1) out vec4 out_depth;    // weighted alpha x distance, weight of layers with anything here
+layout(location = 0) out vec4 out_color;    // share x (premultiplied colour, alpha), share = weight x alpha
+layout(location = 1) out vec4 out_depth;    // share x distance, share
 
 void main() {
 #if SOURCE == 0
@@ -36,6 +36,7 @@ void main() {
     float depth = with_depth ? sample_faces(layer_depth, camera_to_faces * ray).r : 0.0;
 #endif
 #endif
-    out_color = weight * value;
-    out_depth = vec4(weight * depth, value.a > 0.0 ? weight : 0.0, 0.0, 0.0);
+    float share = weight * value.a;
+    out_color = share * value;
+    out_depth = vec4(weight * depth, share, 0.0, 0.0);
 }

@@ -147,7 +147,7 @@ bool project(Gaussian gaussian, out Footprint f) {
     float trace = dot(u_a, u_a) + dot(v_a, v_a);
     float sharp = dot(w2, n_e * n_e);
     float determinant = sharp + e2 * trace + e2 * e2;
-    f.opacity = min(gaussian.opacity, 1.0);
+    f.opacity = gaussian.opacity;
     if (compensate) f.opacity *= sqrt(sharp / determinant);
     if (!(f.opacity >= LEAST_ALPHA)) return false;
     if (kernel == 1) return footprint_ewa(f, axes, unit, n, w2);

@@ -125,25 +125,24 @@ class LayerPainter:
         self.visible += int(np.count_nonzero(keep))
         name = ("picture", "turning faces", "panorama faces")[shot.source], view
         self.in_use.add(name)
-        depth_components = int(self._with_depth)
         if shot.source == 0:
-            target = self.targets.get(name, self._checked(shot.size), depth_components=depth_components)
-            camera = Pinhole(shot.rotation, shot.position, shot.focal, *shot.size)
-            if not target.begin((*self._key(), shot.rotation.tobytes(), shot.focal)):
-                self._paint(target, camera, keep, (0, 0, *shot.size))
-            return target
-        # Faces for turning are read by the texture unit, which needs the pixels beyond their edges.
-        border = 1 if shot.source == 1 else 0
-        cameras = face_cameras(shot.faces_to_world, shot.position, shot.face_size, border)
-        side = cameras[0].width
-        target = self.targets.get(
-            name, self._checked((3 * side, 2 * side)), depth_components=depth_components
-        )
-        target.begin((*self._key(), shot.faces_to_world.tobytes(), border))
-        for face in self._faces():
-            if face not in target.parts:
-                self._paint(target, cameras[face], keep, (face % 3 * side, face // 3 * side, side, side))
-                target.parts.add(face)
+            size, key = shot.size, (*self._key(), shot.rotation.tobytes(), shot.focal)
+            cameras, needed = [Pinhole(shot.rotation, shot.position, shot.focal, *size)], [0]
+        else:
+            # Faces for turning are read by the texture unit, which needs the pixels beyond their edges.
+            border = 1 if shot.source == 1 else 0
+            cameras = face_cameras(shot.faces_to_world, shot.position, shot.face_size, border)
+            needed = self._faces()
+            size = 3 * cameras[0].width, 2 * cameras[0].height
+            key = (*self._key(), shot.faces_to_world.tobytes())
+        target = self.targets.get(name, self._checked(size), depth_components=int(self._with_depth), key=key)
+        for part in needed:
+            if part not in target.parts:
+                width, height = cameras[part].width, cameras[part].height
+                self._paint(
+                    target, cameras[part], keep, (part % 3 * width, part // 3 * height, width, height)
+                )
+                target.parts.add(part)
         return target
 
     def _faces(self) -> list[int]:

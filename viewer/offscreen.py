@@ -69,10 +69,12 @@ class _OsMesa:
             0,
         )
         self._library = library
-        self._context = library.OSMesaCreateContextAttribs((ctypes.c_int * len(attributes))(*attributes), None)
+        self._context = library.OSMesaCreateContextAttribs(
+            (ctypes.c_int * len(attributes))(*attributes), None
+        )
         if not self._context:
             raise OSError("OSMesaCreateContextAttribs made no OpenGL 3.3 context")
-        # OSMesa draws into memory of ours; everything of interest goes to framebuffer objects, so 1x1 will do.
+        # OSMesa draws into memory of ours; all that matters goes to framebuffer objects, so 1x1 will do.
         self._pixel = (ctypes.c_ubyte * 4)()
         self.__enter__()
 

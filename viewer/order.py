@@ -20,7 +20,7 @@ def radix_argsort(keys: Float[np.ndarray, "n"]) -> UInt[np.ndarray, "n"]:
     integers is a counting sort, four times as fast as one of floats.
     """
     bits = np.ascontiguousarray(keys, dtype=np.float32).view(np.uint32)
-    if (keys < 0).any():
+    if np.signbit(keys).any():
         bits = (keys.astype(np.float32) + np.float32(0)).view(np.uint32)  # + 0 makes -0 and 0 equal
         bits = np.where(bits >> 31, ~bits, bits | np.uint32(1 << 31))
     low = np.argsort((bits & 0xFFFF).astype(np.uint16), kind="stable").astype(np.uint32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -31,8 +32,8 @@ class DrawSettings:
         order: sort key, radial distance or depth along the view axis.
         lowpass: `angular` with energy compensation, or `3dgs`.
         mode: `joint` draws all Gaussians together; `view` those of one context view; `deferred` each context
-            view by itself, blended per pixel by distance; `difference` the absolute difference of the pictures
-            of context views `view` and `view + 1` (cyclic), each over the background.
+            view by itself, blended per pixel by distance; `difference` the absolute difference of the
+            pictures of context views `view` and `view + 1` (cyclic), each over the background.
         view: the context view of mode `view` and the first of mode `difference`.
         levels: pyramid levels to draw; None draws all.
         opacity_threshold: Gaussians of lower opacity are left out.
@@ -70,6 +71,8 @@ class DrawSettings:
                 f"`vertical_fov_degrees` must be between 0 and 180, got {self.vertical_fov_degrees}; "
                 "use layout equirect for a whole panorama"
             )
+        if not 0 < self.near < math.inf:
+            raise InputError(f"`near` must be a positive distance in metres, got {self.near}")
         if self.face_size is not None and self.face_size < 1:
             raise InputError(f"`face_size` must be at least 1 pixel, got {self.face_size}")
 

@@ -71,7 +71,7 @@ class Splats:
         means = (gaussians.means.detach().double() - torch.from_numpy(origin)).float().numpy()
         opacities = gaussians.opacities.detach().float().numpy()
         scales = gaussians.scales.detach().float().abs().numpy()
-        visible = np.maximum(np.minimum(opacities, 1.0) * 255.0, 1.0)
+        visible = np.maximum(opacities * 255.0, 1.0)
         reach = np.sqrt(2.0 * np.log(visible)).astype(np.float32)
         geometry = np.zeros((len(means), 12), np.float32)
         geometry[:, 0:3] = means

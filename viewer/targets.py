@@ -13,7 +13,7 @@ class Target:
 
     Attributes:
         key: what the content was drawn from; None when it holds nothing.
-        parts: which parts of it (cube faces) are drawn.
+        parts: which parts of it (cube faces; 0 where there is one part) are drawn.
     """
 
     def __init__(
@@ -31,13 +31,10 @@ class Target:
         self.framebuffer = ctx.framebuffer(attachments)
         self.num_bytes = size[0] * size[1] * (color_bits // 2 + 4 * depth_components)
 
-    def begin(self, key: Hashable) -> bool:
-        """Forget what was drawn from another key; True when the content was drawn from this one."""
-        if self.key == key:
-            return True
+    def begin(self, key: Hashable) -> None:
+        """Forget what was drawn; what comes now is drawn from `key`."""
         self.key = key
         self.parts.clear()
-        return False
 
     def release(self) -> None:
         """Free the textures."""
@@ -60,15 +57,25 @@ class TargetStore:
         self._budget = budget_bytes
         self._targets: OrderedDict[Hashable, Target] = OrderedDict()
 
-    def get(self, name: Hashable, size: tuple[int, int], *, depth_components: int = 0) -> Target:
-        """The target of this name and size with at least this much depth; new ones hold nothing."""
+    def get(
+        self, name: Hashable, size: tuple[int, int], *, depth_components: int = 0, key: Hashable = None
+    ) -> Target:
+        """The target of this name and size, holding either what was drawn from `key` or nothing.
+
+        Depth that was wanted once is kept as long as the content is, and costs nothing after that.
+        """
         target = self._targets.get(name)
-        components = 0 if target is None or target.depth is None else target.depth.components
-        if target is None or target.size != size or components < depth_components:
-            if target is not None:
+        if target is not None:
+            has = 0 if target.depth is None else target.depth.components
+            kept = key is not None and target.key == key
+            if target.size != size or has < depth_components or (has > depth_components and not kept):
                 target.release()
+                target = None
+        if target is None:
             target = Target(self._ctx, size, color_bits=self._color_bits, depth_components=depth_components)
             self._targets[name] = target
+        if key is None or target.key != key:
+            target.begin(key)
         self._targets.move_to_end(name)
         return target
 

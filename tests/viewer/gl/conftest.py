@@ -1,0 +1,133 @@
+"""A GL context that fails the test on any GL error, scenes, and pictures of the torch reference."""
+
+import os
+from collections.abc import Callable, Iterator
+
+import moderngl
+import numpy as np
+import pytest
+import torch
+
+from pansplat.errors import InputError
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Scene
+from pansplat.geometry.pose import rotations_from_quats
+from pansplat.render import Rendering, rasterize
+from pansplat_viewer.offscreen import create_context
+from pansplat_viewer.renderer import DrawSettings, SplatRenderer
+
+
+@pytest.fixture(scope="module")
+def _context() -> Iterator[moderngl.Context]:
+    try:
+        context = create_context()
+    except InputError as error:
+        if os.environ.get("CI"):
+            pytest.fail(str(error))
+        pytest.skip(str(error))
+    yield context
+    context.release()
+
+
+@pytest.fixture
+def ctx(_context: moderngl.Context) -> Iterator[moderngl.Context]:
+    """An OpenGL context, current, without errors before and after the test."""
+    with _context:
+        assert _context.error == "GL_NO_ERROR"
+        yield _context
+        assert _context.error == "GL_NO_ERROR"
+
+
+@pytest.fixture
+def renderer(ctx: moderngl.Context) -> Iterator[Callable[..., SplatRenderer]]:
+    """Makes renderers with 32-bit targets that are released after the test."""
+    made = []
+
+    def make(scene: Scene, tier: str = "auto", color_bits: int = 32) -> SplatRenderer:
+        made.append(SplatRenderer(ctx, tier=tier, color_bits=color_bits))
+        made[-1].upload(scene)
+        return made[-1]
+
+    yield make
+    for renderer in made:
+        renderer.release()
+
+
+def _random_scene(count: int = 300, degree: int = 1, size: float = 0.06, seed: int = 0) -> Scene:
+    random = torch.Generator().manual_seed(seed)
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=random), dim=-1)
+    radii = 1 + 3 * torch.rand(count, 1, generator=random)
+    spread = torch.exp(0.8 * torch.randn(count, 3, generator=random))
+    cam2world = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    cam2world[:, :3, 3] = torch.tensor(((0.3, 0.1, -0.2), (-0.3, 0.0, 0.25)))
+    gaussians = Gaussians(
+        means=directions * radii,
+        scales=size * radii * spread,
+        quats=torch.randn(count, 4, generator=random),
+        opacities=torch.rand(count, generator=random),
+        harmonics=0.3 * torch.randn(count, (degree + 1) ** 2, 3, generator=random),
+        levels=torch.randint(0, 4, (count,), generator=random),
+        views=torch.randint(0, 2, (count,), generator=random),
+    )
+    return Scene(gaussians, cam2world, 0.45, 10.0, ("a", "b"))
+
+
+@pytest.fixture
+def random_scene() -> Callable[..., Scene]:
+    """Makes a shell of Gaussians, 1 to 4 m from the origin, of `size` radians, elongated up to some 10:1."""
+    return _random_scene
+
+
+@pytest.fixture
+def pose() -> np.ndarray:
+    """A camera near the origin, turned by a general rotation."""
+    cam2world = np.eye(4)
+    quat = torch.tensor((0.7, 0.3, -0.5, 0.2), dtype=torch.float64)
+    cam2world[:3, :3] = rotations_from_quats(quat).numpy()
+    cam2world[:3, 3] = 0.05, -0.1, 0.08
+    return cam2world
+
+
+@pytest.fixture
+def reference() -> Callable[..., Rendering]:
+    """The torch reference's float64 picture of a scene for the same settings."""
+
+    def draw(scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> Rendering:
+        return rasterize(
+            scene.gaussians.to(dtype=torch.float64),
+            torch.from_numpy(cam2world),
+            size=size[::-1],
+            layout="pinhole" if settings.layout == "pinhole" else "cubemap",
+            vertical_fov_degrees=settings.vertical_fov_degrees,
+            kernel=settings.kernel,
+            order=settings.order,
+            lowpass=settings.lowpass,
+            background=settings.background,
+            near=settings.near,
+            face_size=settings.face_size,
+        )
+
+    return draw
+
+
+@pytest.fixture
+def assert_same() -> Callable[..., None]:
+    """Checks a renderer's last picture against a Rendering.
+
+    Bounds: mean 1e-4, max 5e-3. Where alpha stands within rounding of 1/255 one renderer may draw a splat
+    that the other leaves out; that changes a pixel by at most 1/255 of its colour, which for colours up to
+    1.25 is within the maximum, so no pixel is left out.
+    """
+
+    def check(renderer: SplatRenderer, expected: Rendering) -> None:
+        color = np.concatenate((expected.color.numpy(), expected.alpha.numpy()[None])).transpose(1, 2, 0)
+        error = np.abs(renderer.read_color() - color)
+        assert error.mean() <= 1e-4
+        assert error.max() <= 5e-3
+        depth = expected.depth.numpy()
+        relative = np.abs(renderer.read_depth() - depth) / np.maximum(depth, 1e-3)
+        # At the rim one flipped splat weighs 1/255 against little else, so the maximum is looser.
+        assert relative.mean() <= 1e-4
+        assert (relative > 5e-3).mean() <= 1e-3
+
+    return check
