@@ -31,11 +31,13 @@ _UNLIKE = 0.5  # least error above which the views show too little in common to 
 _SAME_POSE = 0.02  # entries of the relative pose (translation by its length) that count as equal
 
 _ADVICE = {
-    "inverse": 'the matrices look like the inverse of what was said: exchange "cam2world" and "world2cam"',
+    # An inverse brings the axes named in the file to the world's side, so its advice names both words.
+    "inverse": 'the matrices look like the inverse of what was said, with OpenCV axes: exchange "cam2world" and '
+    '"world2cam", and say "opencv"',
     "opengl axes": "the camera axes look like OpenGL's (y up, z backward) where OpenCV's were said, or the "
     'other way round: exchange "opencv" and "opengl"',
-    "inverse, opengl axes": "both the direction (cam2world, world2cam) and the camera axes (opencv, opengl) "
-    "look exchanged",
+    "inverse, opengl axes": "the matrices look like the inverse of what was said, with OpenGL axes: exchange "
+    '"cam2world" and "world2cam", and say "opengl"',
     "transposed rotation": "the rotations look inverted while the translations are right: transpose the 3x3 "
     "parts, or conjugate the quaternions",
     "swapped views": "the poses of the two views look exchanged: check which pose belongs to which picture",

@@ -1,0 +1,107 @@
+"""Only what stays in place round a pole while the scene moves is masked."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from pansplat.data.images import write_image
+from pansplat.data.masks import detect_static_region, static_mask_of_files
+from pansplat.data.pairs import load_pairs
+from pansplat.geometry.equirect import pixel_directions, row_weights
+
+_HEIGHT = 256
+
+
+def _room(x: float, z: float, plain: bool = False) -> torch.Tensor:
+    """A box room with smooth textures (or plain faces) seen from (x, z), 1.5 m above its floor."""
+    d = pixel_directions(_HEIGHT, 2 * _HEIGHT, dtype=torch.float64)
+    walls = torch.tensor((3.0, 1.5, 4.0), dtype=torch.float64)
+    origin = torch.tensor((x, 0.0, z), dtype=torch.float64)
+    distance = ((torch.sign(d) * walls - origin) / torch.where(d.abs() < 1e-9, 1e-9, d)).amin(dim=-1)
+    points = origin + distance[..., None] * d
+    if plain:
+        face = (points.abs() / walls).argmax(dim=-1)
+        return (0.5 + 0.1 * face).float().expand(3, -1, -1)
+    phase = torch.tensor((0.0, 1.0, 2.0), dtype=torch.float64)[:, None, None]
+    u, v, w = points.unbind(-1)
+    return (
+        0.5 + 0.2 * torch.sin(5 * u + phase) * torch.cos(4 * w - phase) + 0.2 * torch.sin(6 * v + 3 * u)
+    ).float()
+
+
+def _cap(image: torch.Tensor, degrees: float, *, top: bool) -> torch.Tensor:
+    """The image with a black disc of that radius round a pole."""
+    capped = image.clone()
+    rows = round(degrees / 180 * _HEIGHT)
+    if top:
+        capped[:, :rows] = 0
+    else:
+        capped[:, _HEIGHT - rows :] = 0
+    return capped
+
+
+_PLACES = ((0.0, 0.0), (0.9, 0.3), (-0.5, 1.1), (0.2, -1.3), (1.3, 1.5))
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+@pytest.mark.parametrize("top", [False, True])
+def test_a_cap_that_travels_with_the_camera_is_masked(count: int, top: bool) -> None:
+    images = torch.stack([_cap(_room(*place), 15, top=top) for place in _PLACES[:count]])
+    scene = detect_static_region(images)
+    rows = round(15 / 180 * _HEIGHT)
+    expected = torch.ones(_HEIGHT, 2 * _HEIGHT, dtype=torch.bool)
+    expected[slice(0, rows) if top else slice(_HEIGHT - rows, None)] = False
+    assert not scene[~expected].any()
+    area = row_weights(_HEIGHT).float()[:, None].expand_as(expected)
+    assert area[~scene].sum() < 2.2 * area[~expected].sum()
+    assert scene[_HEIGHT // 3 : 2 * _HEIGHT // 3].all()
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+@pytest.mark.parametrize("plain", [False, True])
+def test_floors_and_ceilings_are_scene(count: int, plain: bool) -> None:
+    assert detect_static_region(torch.stack([_room(*p, plain=plain) for p in _PLACES[:count]])).all()
+
+
+def test_a_camera_that_did_not_move_masks_nothing() -> None:
+    image = _cap(_room(0, 0), 15, top=False)
+    assert detect_static_region(torch.stack((image, image, image + 0.001))).all()
+
+
+def test_the_mask_rolls_with_the_panoramas() -> None:
+    images = torch.stack([_cap(_room(*place), 15, top=False) for place in _PLACES[:3]])
+    images[:, :, 220:, 100:160] = 0  # an arm to one side
+    rolled = detect_static_region(torch.roll(images, 128, dims=-1))
+    assert (torch.roll(detect_static_region(images), 128, dims=-1) != rolled).float().mean() < 0.01
+
+
+def test_one_panorama_masks_nothing() -> None:
+    assert detect_static_region(_room(0, 0)[None]).all()
+
+
+def test_files_are_masked_at_the_size_wanted(tmp_path: Path) -> None:
+    paths = []
+    for i, place in enumerate(_PLACES[:3]):
+        paths.append(tmp_path / f"{i}.png")
+        write_image(paths[-1], _cap(_room(*place), 15, top=False))
+    broken = tmp_path / "broken.png"
+    broken.write_bytes(b"no picture")
+    scene = static_mask_of_files((*paths, broken, tmp_path / "gone.png"), 90)
+    assert scene.shape == (90, 180)
+    assert not scene[-7:].any()
+    assert scene[:70].all()
+
+
+@pytest.mark.shared
+def test_zinds_tripod_is_masked_and_nothing_else(shared: Path) -> None:
+    pair = load_pairs(shared / "data" / "zind")[0]
+    scene = static_mask_of_files(pair.siblings, _HEIGHT)
+    area = (row_weights(_HEIGHT)[:, None] * ~scene).sum() / (2 * _HEIGHT * row_weights(_HEIGHT).sum())
+    assert 0.01 < float(area) < 0.04
+    assert not scene[round(_HEIGHT * (1 - 6 / 180)) :].any()  # the body, 6 degrees round the nadir
+    assert scene[: round(_HEIGHT * (1 - 35 / 180))].all()
+    assert math.isclose(
+        float(pair.load_context(64).masks.float().mean()), float(scene.float().mean()), abs_tol=0.01
+    )

@@ -1,0 +1,371 @@
+"""Pairs come out of every layout with the same cameras, and bad folders are refused with the reason."""
+
+import json
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from pansplat.data.images import write_image
+from pansplat.data.pairs import load_pairs
+from pansplat.errors import InputError
+
+OPENCV = "cam2world opencv"
+
+
+def _pose(x: float, z: float = 0.0) -> list[list[float]]:
+    return [[0, 0, 1, x], [0, 1, 0, 0], [-1, 0, 0, z], [0, 0, 0, 1]]
+
+
+def _picture(path: Path, value: float = 0.5, height: int = 16) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, torch.full((3, height, 2 * height), value))
+
+
+def _depth(path: Path, millimetres: int) -> None:
+    cv2.imwrite(str(path), np.full((16, 32), millimetres, np.uint16))
+
+
+def _folder(folder: Path, names: Sequence[str] = ("left.png", "right.png"), **content: object) -> Path:
+    """A pair folder whose i-th camera is at x = i; `content` goes into poses.json, None removes an entry."""
+    for i, name in enumerate(names):
+        _picture(folder / name, 0.1 * (i + 1))
+    poses = {"convention": OPENCV, "poses": {name: _pose(i) for i, name in enumerate(names)}} | content
+    (folder / "poses.json").write_text(json.dumps({k: v for k, v in poses.items() if v is not None}))
+    return folder
+
+
+def _centres(pair) -> list[float]:
+    return [float(panorama.cam2world[0, 3]) for panorama in pair.context]
+
+
+def test_two_pictures_with_poses_are_a_pair(tmp_path: Path) -> None:
+    (pair,) = load_pairs(_folder(tmp_path / "room"))
+    assert pair.name == "room"
+    assert [panorama.name for panorama in pair.context] == ["left", "right"]
+    assert (pair.targets, pair.near, pair.far) == ((), 0.45, 10.0)
+    views = pair.load_context(8)
+    assert views.images.shape == (2, 3, 8, 16)
+    assert views.images.mean(dim=(1, 2, 3)).tolist() == pytest.approx([0.1, 0.2], abs=3e-3)
+    assert views.cam2world.dtype == torch.float64
+    assert views.cam2world.tolist() == [_pose(0), _pose(1)]
+    assert views.masks.all()
+    assert views.names == ("left", "right")
+    assert views.depths is None
+    assert pair.load_targets(8).images.shape == (0, 3, 8, 16)
+
+
+def test_the_path_may_be_the_pose_file_or_a_text(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "room")
+    assert load_pairs(folder / "poses.json")[0].name == load_pairs(str(folder))[0].name == "room"
+
+
+def test_loading_reads_no_picture_before_it_is_asked_for(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "room")
+    (folder / "left.png").write_bytes(b"")
+    (pair,) = load_pairs(folder)
+    with pytest.raises(InputError, match="0 bytes"):
+        pair.load_context(8)
+
+
+def test_a_pair_folder_has_depth_masks_range_and_targets(tmp_path: Path) -> None:
+    names = ("left.png", "middle.png", "right.png")
+    entries = {n: {"cam2world": _pose(i), "depth": f"{n[:-4]}_depth.png"} for i, n in enumerate(names)}
+    entries["left.png"]["mask"] = "own.png"
+    folder = _folder(tmp_path / "room", names, poses=entries, near=0.2, far=30)
+    for i, name in enumerate(names):
+        _depth(folder / f"{name[:-4]}_depth.png", 1000 * (i + 1))
+    mask = torch.ones(3, 16, 32)
+    mask[:, 8:] = 0
+    write_image(folder / "own.png", mask)
+    (folder / "pairs.json").write_text(
+        json.dumps({"pairs": [{"context": [names[0], names[2]], "target": [names[1]]}]})
+    )
+    (pair,) = load_pairs(folder)
+    views, targets = pair.load_context(16), pair.load_targets(16)
+    assert (views.near, views.far) == (0.2, 30.0)
+    assert views.depths is not None
+    assert views.depths[:, 0, 0].tolist() == [1.0, 3.0]
+    assert targets.names == ("middle",)
+    assert not views.masks[0, 8:].any()
+    assert views.masks[0, :8].all()
+    assert views.masks[1].all()
+
+
+def test_masks_beside_the_pictures_are_found(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "room")
+    whole, own = torch.ones(3, 16, 32), torch.ones(3, 16, 32)
+    whole[:, :, :4], own[:, :, 20:] = 0, 0
+    write_image(folder / "mask.png", whole)
+    write_image(folder / "left_mask.png", own)
+    masks = load_pairs(folder)[0].load_context(16).masks
+    assert torch.equal(masks[0], own[0] > 0)
+    assert torch.equal(masks[1], whole[0] > 0)
+
+
+def test_transparent_pixels_are_masked(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "room")
+    rgba = np.full((16, 32, 4), 200, np.uint8)
+    rgba[..., 3] = np.where(np.arange(16) < 12, 255, 0)[:, None]
+    cv2.imwrite(str(folder / "left.png"), rgba)
+    with pytest.warns(UserWarning, match="transparent"):
+        views = load_pairs(folder)[0].load_context(16)
+    assert views.masks[0, :12].all() and not views.masks[0, 12:].any() and views.masks[1].all()
+
+
+@pytest.mark.parametrize(
+    ("file", "key"), [("cam2world opencv", "cam2world"), ("world2cam OpenGL", "world2cam")]
+)
+def test_the_argument_goes_before_the_files_convention(tmp_path: Path, file: str, key: str) -> None:
+    poses = {name: {key: _pose(i)} for i, name in enumerate(("left.png", "right.png"))}
+    folder = _folder(tmp_path / "room", convention=file, poses=poses)
+    given = load_pairs(folder, convention="world2cam opencv")[0].context[1].cam2world
+    assert torch.allclose(given, torch.linalg.inv(torch.tensor(_pose(1), dtype=torch.float64)))
+
+
+def test_near_and_far_arguments_go_before_the_files(tmp_path: Path) -> None:
+    (pair,) = load_pairs(_folder(tmp_path / "room", near=1, far=2), near=0.3, far=4)
+    assert (pair.near, pair.far) == (0.3, 4)
+
+
+def test_a_folder_of_pair_folders_gives_all_pairs_with_unique_names(tmp_path: Path) -> None:
+    for name in ("b", "a", "c"):
+        _folder(tmp_path / name / "room")
+    pairs = load_pairs(tmp_path)
+    assert [pair.folder.parent.name for pair in pairs] == ["a", "b", "c"]
+    assert len({pair.name for pair in pairs}) == 3
+
+
+def test_many_panoramas_without_pairs_file_pair_with_their_nearest(tmp_path: Path) -> None:
+    names = [f"{i}.png" for i in range(4)]
+    poses = {name: _pose(x) for name, x in zip(names, (0.0, 10.0, 1.0, 12.0), strict=True)}
+    pairs = load_pairs(_folder(tmp_path / "flat", names, poses=poses))
+    assert [pair.name for pair in pairs] == ["0-2", "1-2", "1-3"]
+
+
+def test_triplets_come_first_and_no_context_twice(tmp_path: Path) -> None:
+    names = ("a.png", "b.png", "c.png")
+    folder = _folder(tmp_path / "flat", names)
+    pairs = [{"context": ["a.png", "b.png"]}, {"context": ["a.png", "c.png"]}]
+    triplets = [{"context": ["a.png", "c.png"], "target": "b.png"}]
+    (folder / "pairs.json").write_text(json.dumps({"pairs": pairs, "triplets": triplets}))
+    loaded = load_pairs(folder)
+    assert [(pair.name, [t.name for t in pair.targets]) for pair in loaded] == [("a-c", ["b"]), ("a-b", [])]
+
+
+def test_coincident_cameras_work_with_a_warning(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "room", poses={"left.png": _pose(1), "right.png": _pose(1)})
+    (pair,) = load_pairs(folder)
+    with pytest.warns(UserWarning, match="room: cameras of the context views coincide"):
+        assert pair.load_context(8).images.shape == (2, 3, 8, 16)
+
+
+def _matterport3d(scene: Path) -> Path:
+    for i in range(3):
+        view = scene / f"{i:02d}"
+        _picture(view / "rgb.png")
+        _depth(view / "depth.png", 2500)
+        np.savetxt(view / "rot.txt", np.eye(3))
+        np.savetxt(view / "tran.txt", [0, 0.5, 0.5 * (i - 1)])
+    return scene
+
+
+def test_panogrf_scenes_are_read_from_any_of_their_folders(tmp_path: Path) -> None:
+    top = tmp_path / "mp3d"
+    scene = _matterport3d(top / "png_render_test_32x16_seq_len_3_m3d_dist_0.5" / "00000007")
+    for path in (top, scene.parent, scene):
+        (pair,) = load_pairs(path)
+        assert pair.name == "00000007"
+        assert [panorama.name for panorama in (*pair.context, *pair.targets)] == ["00", "02", "01"]
+    views = pair.load_context(16)
+    assert views.depths is not None
+    assert views.depths.unique().tolist() == [2.5]
+    # Habitat's identity, in a z-up world: right is +x, down is -z, forward is +y (OFFICIAL.md 2.1).
+    assert views.cam2world[0].tolist() == [[1, 0, 0, 0], [0, 0, 1, 0.5], [0, -1, 0, 0.5], [0, 0, 0, 1]]
+
+
+def test_game_map_triplets_are_read(tmp_path: Path) -> None:
+    for i in range(3):
+        _picture(tmp_path / f"map_0_{i}.png")
+        _depth(tmp_path / f"map_0_{i}_depth.png", 1000)
+    (tmp_path / "map_0.json").write_text(json.dumps({"c2w": [_pose(0), _pose(1), _pose(3)]}))
+    (pair,) = load_pairs(tmp_path)
+    assert pair.name == "map_0"
+    assert _centres(pair) == [0, 3]
+    assert [target.name for target in pair.targets] == ["map_0_1"]
+
+
+def _sequence(folder: Path, count: int = 3) -> list[str]:
+    names = [f"{i:04d}.png" for i in range(count)]
+    for name in names:
+        _picture(folder / "image" / name)
+    return names
+
+
+def test_360loc_sequences_pair_consecutive_frames(tmp_path: Path) -> None:
+    names = _sequence(tmp_path)
+    poses = {name: _pose(i) for i, name in enumerate(names)}
+    (tmp_path / "camera_pose.json").write_text(json.dumps(poses))
+    pairs = load_pairs(tmp_path)
+    assert [_centres(pair) for pair in pairs] == [[0, 1], [1, 2]]
+    assert pairs[0].far == 50
+    inverted = load_pairs(tmp_path, convention="world2cam opencv")[0].context[1].cam2world
+    assert torch.allclose(inverted, torch.linalg.inv(torch.tensor(_pose(1), dtype=torch.float64)))
+
+
+@pytest.mark.parametrize("name", ["poses.txt", "frame_trajectory.txt", "a.kitti"])
+def test_trajectories_belong_to_the_pictures_in_order_and_scale(tmp_path: Path, name: str) -> None:
+    _sequence(tmp_path)
+    lines = [" ".join(map(str, np.array(_pose(i))[:3].ravel())) for i in range(3)]
+    (tmp_path / name).write_text("\n".join(lines))
+    (tmp_path / "scale.txt").write_text("2.5\n")
+    assert [_centres(pair) for pair in load_pairs(tmp_path)] == [[0, 2.5], [2.5, 5]]
+
+
+def test_trajectories_of_another_length_are_refused(tmp_path: Path) -> None:
+    _sequence(tmp_path)
+    (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n" * 2)
+    with pytest.raises(
+        InputError, match=r"poses\.tum: needed one pose a picture \(3 pictures\), got 2 TUM poses"
+    ):
+        load_pairs(tmp_path)
+    (tmp_path / "poses.tum").rename(tmp_path / "poses.kitti")
+    with pytest.raises(InputError, match="needed KITTI .* as its name says, got TUM"):
+        load_pairs(tmp_path)
+    (tmp_path / "poses.kitti").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    (tmp_path / "scale.txt").write_text("two")
+    with pytest.raises(InputError, match=r"scale\.txt: needed one positive number, got 'two'"):
+        load_pairs(tmp_path)
+    (tmp_path / "poses.txt").touch()
+    with pytest.raises(InputError, match=r"needed one trajectory, got poses\.kitti, poses\.txt"):
+        load_pairs(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"convention": None}, 'needed a pose "convention", got none; write one of "cam2world opencv"'),
+        ({"convention": "mine"}, "needed a known pose convention, got 'mine'"),
+        ({"poses": None}, 'got no object "poses"'),
+        ({"poses": {"left.png": _pose(0)}}, "got 1; pictures without a pose: right.png"),
+        ({"poses": {"left.png": _pose(0), "right.png": None}}, "'right.png': needed a pose, got none"),
+        ({"poses": {"left.png": _pose(0), "gone.png": _pose(1)}}, "needed the picture .*gone.png"),
+        (
+            {"poses": {"left.png": _pose(0), "right.png": {"room": "x"}}},
+            r"needed a pose, got only \['room'\]",
+        ),
+        (
+            {"poses": {"left.png": _pose(0), "right.png": {"world2cam": _pose(1)}}},
+            'got the key "world2cam" under',
+        ),
+        (
+            {"poses": {"left.png": _pose(0), "right.png": {"pose": _pose(1), "mask": "m.png"}}},
+            "needed the mask file",
+        ),
+        (
+            {"poses": {"left.png": _pose(0), "right.png": {"pose": _pose(1), "depth": "d.png"}}},
+            "needed the depth file",
+        ),
+        ({"near": 3, "far": 3}, "needed 0 < near < far in metres, got near=3 and far=3"),
+        ({"near": 0}, "needed 0 < near < far"),
+        ({"far": "much"}, "needed a number of metres as \"far\", got 'much'"),
+    ],
+)
+def test_bad_pose_files_are_refused(tmp_path: Path, content: dict, message: str) -> None:
+    folder = _folder(tmp_path / "room", **content)
+    with pytest.raises(InputError, match=message) as caught:
+        load_pairs(folder)
+    assert "poses.json" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({}, 'got neither "pairs" nor "triplets"'),
+        ({"pairs": []}, "needed at least one pair"),
+        ({"pairs": [{"context": ["left.png"]}]}, "pairs 1: needed two or more different pictures"),
+        ({"pairs": [{"context": ["left.png", "left.png"]}]}, "needed two or more different pictures"),
+        ({"pairs": ["left.png"]}, "needed two or more different pictures"),
+        (
+            {"pairs": [{"context": ["left.png", "rigth.png"]}]},
+            r"got 'rigth.png' \(did you mean 'right.png'\?\)",
+        ),
+        (
+            {"triplets": [{"context": ["left.png", "right.png"], "target": ["no.png"]}]},
+            "triplets 1: .*got 'no.png'",
+        ),
+    ],
+)
+def test_bad_pairs_files_are_refused(tmp_path: Path, content: dict, message: str) -> None:
+    folder = _folder(tmp_path / "room")
+    (folder / "pairs.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=rf"pairs\.json.*{message}"):
+        load_pairs(folder)
+
+
+def test_broken_json_is_refused_with_the_line(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "room")
+    (folder / "poses.json").write_text('{\n "convention": "cam2world opencv",\n}')
+    with pytest.raises(InputError, match=r"poses\.json: needed JSON, got something else at line 3"):
+        load_pairs(folder)
+
+
+def test_one_panorama_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="needed poses of two or more panoramas, got 1"):
+        load_pairs(_folder(tmp_path / "room", ["only.png"]))
+
+
+def test_pictures_without_poses_are_refused(tmp_path: Path) -> None:
+    _picture(tmp_path / "left.png")
+    with pytest.raises(InputError, match=r"needed poses for the panoramas, got pictures only \(left\.png\)"):
+        load_pairs(tmp_path)
+
+
+def test_paths_without_panoramas_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="got none of these files"):
+        load_pairs(tmp_path)
+    with pytest.raises(InputError, match="got no such path"):
+        load_pairs(tmp_path / "gone")
+    _picture(tmp_path / "a.png")
+    with pytest.raises(InputError, match="needed a folder of posed panoramas, got a file"):
+        load_pairs(tmp_path / "a.png")
+
+
+def test_incomplete_panogrf_views_are_refused(tmp_path: Path) -> None:
+    scene = _matterport3d(tmp_path / "scene")
+    (scene / "01" / "tran.txt").write_text("1 2")
+    with pytest.raises(InputError, match=r"tran\.txt: needed 3 numbers, got 2"):
+        load_pairs(scene)
+    (scene / "01" / "tran.txt").unlink()
+    with pytest.raises(InputError, match=r"tran\.txt: needed the view's pose there"):
+        load_pairs(scene)
+    (scene / "01" / "rgb.png").unlink()
+    with pytest.raises(InputError, match=r"needed rgb\.png beside"):
+        load_pairs(scene)
+
+
+@pytest.mark.shared
+def test_zind_has_its_triplets_first(shared: Path) -> None:
+    pairs = load_pairs(shared / "data" / "zind")
+    assert [pair.name for pair in pairs[:3]] == ["pano_10-pano_12", "pano_07-pano_11", "pano_04-pano_10"]
+    assert [len(pair.targets) for pair in pairs] == [1] * 3 + [0] * 19
+    assert (pairs[0].near, pairs[0].far) == (0.45, 10.0)
+    baseline = (pairs[0].context[0].cam2world - pairs[0].context[1].cam2world)[:3, 3].norm()
+    assert float(baseline) == pytest.approx(2.545, abs=1e-3)
+
+
+@pytest.mark.shared
+def test_shared_samples_have_depth_and_no_tripod(shared: Path) -> None:
+    pairs = load_pairs(shared / "data" / "mp3d_sample") + load_pairs(shared / "data" / "bsp_demo")
+    assert len(pairs) == 13
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for pair in pairs:
+            views = pair.load_context(64)
+            assert views.masks.float().mean() > 0.999, pair.name
+            assert views.depths is not None
+            assert 0.05 < float(views.depths[views.depths > 0].median()) < 20

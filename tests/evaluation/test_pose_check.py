@@ -1,0 +1,165 @@
+"""The right poses win; each wrong convention is named, unless the pictures cannot tell."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from pansplat.data.pairs import load_pairs
+from pansplat.data.views import Views
+from pansplat.evaluation.pose_check import _ADVICE, AS_GIVEN, check_pair, check_views
+from pansplat.geometry.equirect import pixel_directions
+from pansplat.geometry.pose import invert_pose, rotations_from_quats
+
+_FLIP = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=torch.float64))
+_HEIGHT = 64
+
+
+def _pose(quat: tuple[float, ...], centre: tuple[float, ...]) -> torch.Tensor:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = rotations_from_quats(torch.tensor(quat, dtype=torch.float64))
+    pose[:3, 3] = torch.tensor(centre, dtype=torch.float64)
+    return pose
+
+
+def _photograph(cam2world: torch.Tensor) -> torch.Tensor:
+    """A textured box room, ray cast."""
+    d = pixel_directions(_HEIGHT, 2 * _HEIGHT, dtype=torch.float64) @ cam2world[:3, :3].T
+    walls = torch.tensor((2.5, 1.5, 3.0), dtype=torch.float64)
+    centre = cam2world[:3, 3]
+    distance = ((torch.sign(d) * walls - centre) / torch.where(d.abs() < 1e-9, 1e-9, d)).amin(dim=-1)
+    u, v, w = (centre + distance[..., None] * d).unbind(-1)
+    face = ((centre + distance[..., None] * d).abs() / walls).argmax(dim=-1)
+    red = 0.5 + 0.3 * torch.sin(3.1 * u + 1.3 * v * w) * torch.cos(2.3 * w - u)
+    green = 0.5 + 0.3 * torch.sin(2.7 * v + 1.9 * u + face) + 0.1 * torch.cos(4 * w)
+    blue = 0.2 + 0.2 * face + 0.1 * torch.sin(5 * (u + v - w))
+    return torch.stack((red, green, blue)).clamp(0, 1).float()
+
+
+def _views(*poses: torch.Tensor, near: float = 0.45, far: float = 10.0) -> Views:
+    return Views(
+        torch.stack([_photograph(pose) for pose in poses]),
+        torch.stack(poses),
+        torch.ones(len(poses), _HEIGHT, 2 * _HEIGHT, dtype=torch.bool),
+        near,
+        far,
+        tuple("abc"[: len(poses)]),
+    )
+
+
+_TILTED = (_pose((0.9, 0.1, 0.3, 0.05), (0.4, 0.2, -0.3)), _pose((0.6, -0.15, -0.6, 0.1), (-0.5, -0.2, 0.5)))
+
+
+def _wrong(poses: torch.Tensor, mistake: str) -> torch.Tensor:
+    """What a user who makes the mistake gives as OpenCV cam2world poses."""
+    turned = poses.clone()
+    turned[:, :3, :3] = poses[:, :3, :3].transpose(-1, -2)
+    robot = torch.eye(4, dtype=torch.float64)  # columns: forward, left and up in OpenCV's axes
+    robot[:3, :3] = torch.tensor(((0.0, -1.0, 0.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0)))
+    quarter = _pose((0.5**0.5, 0.0, 0.5**0.5, 0.0), (0.0, 0.0, 0.0))
+    return {
+        "inverse": invert_pose(poses),
+        "opengl axes": poses @ _FLIP,
+        "inverse, opengl axes": invert_pose(poses @ _FLIP),
+        "transposed rotation": turned,
+        "swapped views": poses.flip(0),
+        "x-forward camera": poses @ robot,
+        "turned by 90 degrees": poses @ invert_pose(quarter),
+    }[mistake]
+
+
+_MISTAKES = ("inverse", "opengl axes", "inverse, opengl axes", "transposed rotation", "swapped views",
+             "x-forward camera", "turned by 90 degrees")  # fmt: skip
+
+
+def test_right_poses_fit_best_and_nothing_is_said_against_them() -> None:
+    check = check_views(_views(*_TILTED), "box")
+    assert check.best == AS_GIVEN
+    assert check.ok
+    assert check.error < 0.8 * sorted(check.errors.values())[1]
+    assert check.baseline == pytest.approx(float((_TILTED[0] - _TILTED[1])[:3, 3].norm()))
+    assert check.report().startswith("box: baseline 1.2")
+    assert "no other reading fits better" in check.report()
+
+
+@pytest.mark.parametrize("mistake", _MISTAKES)
+def test_each_wrong_convention_is_named(mistake: str) -> None:
+    views = _views(*_TILTED)
+    check = check_views(dataclasses.replace(views, cam2world=_wrong(views.cam2world, mistake)))
+    assert check.best == mistake
+    assert check.likely_mistake is not None
+    assert check.likely_mistake.startswith(_ADVICE[mistake])
+    assert not check.ok
+
+
+def test_readings_of_the_same_motion_are_called_indistinguishable() -> None:
+    side = (_pose((1, 0, 0, 0), (0, 0, 0)), _pose((1, 0, 0, 0), (0.8, 0, 0)))
+    check = check_views(_views(*side))
+    assert check.best == AS_GIVEN
+    assert {"opengl axes", "mirrored up-down", "transposed rotation"} <= set(check.indistinguishable)
+    assert "same as given for these views: " in check.report()
+
+
+def test_mistakes_that_make_the_same_motion_are_named_together() -> None:
+    side = (_pose((1, 0, 0, 0), (0, 0, 0)), _pose((1, 0, 0, 0), (0.8, 0, 0)))
+    views = _views(*side)
+    check = check_views(dataclasses.replace(views, cam2world=invert_pose(views.cam2world)))
+    assert check.likely_mistake is not None
+    assert _ADVICE["inverse"] in check.likely_mistake
+    assert _ADVICE["swapped views"] in check.likely_mistake
+
+
+def test_three_views_are_checked_together() -> None:
+    third = _pose((0.95, 0.0, 0.2, 0.1), (0.2, 0.1, 0.6))
+    assert check_views(_views(*_TILTED, third)).best == AS_GIVEN
+
+
+def test_poses_in_millimetres_are_warned_of() -> None:
+    views = _views(*_TILTED)
+    poses = views.cam2world.clone()
+    poses[:, :3, 3] *= 1000
+    (warning, *_) = check_views(dataclasses.replace(views, cam2world=poses)).warnings
+    assert "millimetres" in warning
+
+
+def test_a_baseline_of_nothing_is_warned_of() -> None:
+    views = _views(_TILTED[0], _TILTED[0])
+    check = check_views(views)
+    assert any("parallax" in warning for warning in check.warnings)
+
+
+def test_pictures_of_different_places_are_warned_of() -> None:
+    views = _views(*_TILTED)
+    noise = torch.rand(views.images.shape, generator=torch.Generator().manual_seed(0))
+    check = check_views(dataclasses.replace(views, images=noise))
+    assert check.likely_mistake is None
+    assert any("too little in common" in warning for warning in check.warnings)
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(("data", "index"), [("mp3d_sample", 0), *(("zind", i) for i in range(4)), *(("bsp_demo", i) for i in (0, 4, 7, 10))])  # fmt: skip
+def test_shared_poses_pass(shared: Path, data: str, index: int) -> None:
+    check = check_pair(load_pairs(shared / "data" / data)[index])
+    assert check.likely_mistake is None, check.report()
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(
+    ("convention", "reading"),
+    [
+        ("cam2world opengl", "opengl axes"),
+        ("world2cam opencv", "inverse"),
+        (
+            "world2cam opengl",
+            "inverse",
+        ),  # what it says, and OpenCV axes: both words of the convention were wrong
+    ],
+)
+def test_a_real_pair_read_with_the_wrong_convention_is_caught(
+    shared: Path, convention: str, reading: str
+) -> None:
+    check = check_pair(load_pairs(shared / "data" / "zind", convention=convention)[3])
+    assert check.best == reading
+    assert check.likely_mistake is not None
+    assert check.likely_mistake.startswith(_ADVICE[reading])
