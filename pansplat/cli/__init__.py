@@ -5,8 +5,12 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from pansplat.errors import InputError
+
+if TYPE_CHECKING:
+    from pansplat.cli.commands import Command
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -16,17 +20,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def run(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status; unusable arguments exit with status 2."""
-    import tyro
-
-    from pansplat.cli.commands import Command
-
-    command = tyro.cli(
-        Command,
-        args=argv,
-        prog="pansplat",
-        description="Two posed 360-degree panoramas in, a scene of 3D Gaussians you can fly through out.",
-        config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
-    )
+    command = parse(argv)
     with warnings.catch_warnings():
         # What the libraries below warn of is for their users; what we warn of is for ours.
         warnings.simplefilter("ignore")
@@ -40,6 +34,21 @@ def run(argv: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             _say("red", "interrupted", "nothing half-written is left behind")
             return 130
+
+
+def parse(argv: Sequence[str] | None = None) -> Command:
+    """The command that the arguments ask for; else prints help or what is wrong with them, and exits."""
+    import tyro
+
+    from pansplat.cli.commands import Command
+
+    return tyro.cli(
+        Command,
+        args=argv,
+        prog="pansplat",
+        description="Two posed 360-degree panoramas in, a scene of 3D Gaussians you can fly through out.",
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
 
 
 def _show_warning(message: Warning | str, *_: object) -> None:

@@ -313,7 +313,7 @@ def _labels(extras: dict, count: int, path: Path) -> tuple[torch.Tensor, torch.T
         sound = bool((runs >= 0).all()) and int(runs[:, 2].sum()) == count
         sound = sound and (not len(runs) or int(runs[:, 1].max()) < views)
     except (ValueError, TypeError, RuntimeError):
-        sound = False
+        runs, sound = torch.zeros(0, 3, dtype=torch.int64), False
     if not sound:
         warnings.warn(
             f"{path}: its {count} Gaussians are not those its labels were written for (edited elsewhere?); "

@@ -1,0 +1,56 @@
+"""What the README says works as it says."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import pansplat
+from pansplat.cli import parse
+
+ROOT = Path(__file__).resolve().parents[2]
+README = (ROOT / "README.md").read_text()
+COMMANDS = re.findall(r"^(?:\.venv/bin/)?pansplat (.+?)(?:\s+#.*)?$", README, flags=re.MULTILINE)
+
+
+def test_the_readme_shows_every_command() -> None:
+    assert {command.split()[0] for command in COMMANDS} == {"predict", "render", "evaluate", "check", "info"}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_of_the_readme_are_understood(command: str) -> None:
+    parsed = parse(shlex.split(command))
+    assert type(parsed).__name__.lower() == command.split()[0]
+
+
+def test_calls_of_the_readme_exist() -> None:
+    calls = set(re.findall(r"pansplat\.(\w+)\(", README))
+    assert calls >= {"predict", "render", "load_model", "rasterize", "save", "load"}
+    assert calls <= set(pansplat.__all__)
+
+
+def test_links_and_pictures_of_the_readme_lead_somewhere() -> None:
+    targets = re.findall(r"\]\(([^)#]+)\)", README) + re.findall(r'src="([^"]+)"', README)
+    local = [target for target in targets if not target.startswith("http")]
+    assert local
+    assert not [target for target in local if not (ROOT / target).exists()]
+
+
+def test_the_two_commands_are_those_of_ci_and_setup() -> None:
+    assert "bash setup.sh && .venv/bin/pansplat-view assets/living_room" in README
+    assert "bash setup.sh --dev && .venv/bin/pytest" in README
+    ci = (ROOT / ".ci" / "run").read_text()
+    assert "bash setup.sh --dev" in ci and ".venv/bin/pytest" in ci
+    assert "assets/living_room" in (ROOT / "setup.sh").read_text()
+
+
+def test_setup_explains_itself_and_refuses_what_it_does_not_know() -> None:
+    if sys.platform == "win32":
+        pytest.skip("setup.sh is for Linux")
+    told = subprocess.run(["bash", ROOT / "setup.sh", "--help"], capture_output=True, text=True)
+    assert told.returncode == 0 and "--dev" in told.stdout
+    refused = subprocess.run(["bash", ROOT / "setup.sh", "--dve"], capture_output=True, text=True)
+    assert refused.returncode == 1 and "unknown option --dve" in refused.stderr
