@@ -32,8 +32,8 @@ _SAME_POSE = 0.02  # entries of the relative pose (translation by its length) th
 
 _ADVICE = {
     # An inverse brings the axes named in the file to the world's side, so its advice names both words.
-    "inverse": 'the matrices look like the inverse of what was said, with OpenCV axes: exchange "cam2world" and '
-    '"world2cam", and say "opencv"',
+    "inverse": 'the matrices look like the inverse of what was said, with OpenCV axes: exchange "cam2world" '
+    'and "world2cam", and say "opencv"',
     "opengl axes": "the camera axes look like OpenGL's (y up, z backward) where OpenCV's were said, or the "
     'other way round: exchange "opencv" and "opengl"',
     "inverse, opengl axes": "the matrices look like the inverse of what was said, with OpenGL axes: exchange "

@@ -234,7 +234,7 @@ def test_trajectories_of_another_length_are_refused(tmp_path: Path) -> None:
     ):
         load_pairs(tmp_path)
     (tmp_path / "poses.tum").rename(tmp_path / "poses.kitti")
-    with pytest.raises(InputError, match="needed KITTI .* as its name says, got TUM"):
+    with pytest.raises(InputError, match=r"needed KITTI .* as its name says, got TUM"):
         load_pairs(tmp_path)
     (tmp_path / "poses.kitti").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
     (tmp_path / "scale.txt").write_text("two")
