@@ -53,7 +53,7 @@ class Options:
     """Where to start between the panoramas, 0 to 1 (0); offscreen, where to take the panorama (0.5)."""
     size: str = "1280x720"
     """Width x height of the window or film, pixels."""
-    seconds: float = 5.0
+    seconds: float = 4.0
     """Length of the film."""
     fps: float = 24.0
     """Pictures a second of the film."""

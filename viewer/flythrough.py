@@ -34,7 +34,7 @@ class Film:
     """
 
     size: tuple[int, int] = (1280, 720)
-    seconds: float = 5.0
+    seconds: float = 4.0
     fps: float = 24.0
     at: float = 0.5
     vertical_fov_degrees: float = 75.0

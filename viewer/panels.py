@@ -36,7 +36,7 @@ class Facts:
 
     Attributes:
         entries: names to choose from; `current` is the index of the one shown.
-        stats: of the last frame; `frame_ms` smoothed, from frame to frame.
+        stats: of the last picture; `frame_ms` is a whole frame's time, smoothed.
         size: of the picture that is drawn, pixels; smaller than the window while moving.
         photo_name: of the nearest input photograph; None when there is none to compare with.
         loading: name, what is being done, fraction done.

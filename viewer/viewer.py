@@ -22,6 +22,7 @@ from pansplat_viewer.renderer import SplatRenderer
 from pansplat_viewer.state import ViewerState, advance, enter
 
 PANORAMA_HEIGHT = 1024  # of a 360 screenshot, pixels
+_LONGEST_STEP = 0.25  # seconds of movement in one frame
 
 
 def middle_depth(depth: Float[np.ndarray, "height width"]) -> float | None:
@@ -112,13 +113,15 @@ class Viewer:
 
         `new_frame` tells imgui about the window (size, pointer); without it the caller has set imgui's io.
         """
+        begun = time.perf_counter()
         now, size = self._clock(), target.viewport[2:]
         self._collect(now)
         self.gui.begin(seconds, new_frame)
-        self._update_facts(seconds)
+        self._update_facts()
         requests = self.panels.draw(self.state, self.facts, now)
-        wishes = apply(self.state, read_input(seconds))
-        advance(self.state, seconds)
+        # One slow frame must not fling the camera away, nor skip most of a flight.
+        wishes = apply(self.state, read_input(min(seconds, _LONGEST_STEP)))
+        advance(self.state, min(seconds, 2 * _LONGEST_STEP))
         requests.png, requests.exr = requests.png or wishes.png, requests.exr or wishes.exr
         target.use()
         self.ctx.clear(*self.state.settings.background)
@@ -128,6 +131,8 @@ class Viewer:
             self._draw(size, target, now)
         self.gui.end(self.ctx, target)
         self._serve(requests, size, now)
+        milliseconds = 1000 * (time.perf_counter() - begun)
+        self.facts.frame_ms += (milliseconds - self.facts.frame_ms) * (0.15 if self.facts.frame_ms else 1.0)
 
     def close(self) -> None:
         """Stop the threads and free every GL object; the context must still be current."""
@@ -163,11 +168,9 @@ class Viewer:
         self._last_camera = self.state.camera
         self.state.say(f"{loaded.entry.name}   (H shows the keys)", now)
 
-    def _update_facts(self, seconds: float) -> None:
+    def _update_facts(self) -> None:
         facts = self.facts
         facts.stats, facts.loading = self.renderer.stats, self.loader.progress
-        milliseconds = 1000 * seconds
-        facts.frame_ms += (milliseconds - facts.frame_ms) * (0.15 if facts.frame_ms else 1.0)
         facts.photo_name = None
         photos = self._loaded.photos if self._loaded else None
         if photos is not None and self.presenter.photo_count:
@@ -214,6 +217,7 @@ class Viewer:
         if self._picture is None:
             return
         distance = middle_depth(self.renderer.read_depth())
+        self._picture = None  # drawn anew for its depth; the texture is not the one we held
         if distance is not None:
             camera = self.state.camera
             point = np.asarray(camera.position) + distance * cameras.rotation(camera)[:, 2]

@@ -153,13 +153,13 @@ def _loop(window: Window, viewer: Viewer) -> None:
         busy = viewer.busy or time.perf_counter() < active_until
         before = time.perf_counter()
         window.wait(busy)
-        if time.perf_counter() - before < 0.9 * _IDLE_SECONDS:
+        if not busy and time.perf_counter() - before < 0.9 * _IDLE_SECONDS:
             active_until = time.perf_counter() + 0.25  # an event: imgui needs a few frames to answer it
         if window.dropped:
             viewer.open(window.dropped[-1])
             window.dropped.clear()
         now = time.perf_counter()
-        seconds, last = min(now - last, 0.25), now  # a long pause must not fling the camera away
+        seconds, last = now - last, now
         size = window.framebuffer_size
         if 0 in size:
             continue

@@ -44,7 +44,7 @@ class Display:
 
     def __init__(self, folder: Path) -> None:
         read, write = os.pipe()
-        command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1024x768x24", "-fbdir", str(folder)]
+        command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x800x24", "-fbdir", str(folder)]
         self._server = subprocess.Popen(
             [*command, "-nolisten", "tcp"], pass_fds=(write,), stderr=subprocess.DEVNULL
         )
