@@ -52,7 +52,19 @@ def pinhole_boxes(
             edge = focal * (middle + sign * root) / safe + 0.5 * extent
             edges.append(torch.where(crosses, torch.full_like(edge, sign * _EVERYTHING), edge))
     unseen = (level < 0) | (~crosses & (n_z < 0))
+    # Those that cross the plane through the eye have no box, but most of them lie beside the view.
+    for normal in _inward(size, focal, direction):
+        distance = direction @ normal
+        clear = distance.square() > level * (covariance @ normal @ normal)
+        unseen |= clear & (distance < 0)
     return _hide(torch.stack(edges, dim=1), unseen)
+
+
+def _inward(size: tuple[int, int], focal: float, like: Tensor) -> Float[Tensor, "4 3"]:
+    """Normals, into the view, of the planes through the eye and the picture's four sides."""
+    across, down = size[1] / (2 * focal), size[0] / (2 * focal)
+    normals = ((1, 0, across), (-1, 0, across), (0, 1, down), (0, -1, down))
+    return torch.tensor(normals, dtype=like.dtype, device=like.device)
 
 
 def ewa_boxes(

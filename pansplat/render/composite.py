@@ -85,9 +85,10 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     @one_thread()
-    def backward(ctx: Any, grad_sums: Tensor) -> tuple[Tensor, Tensor, None, None, None]:  # type: ignore[override]
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, None, None, None]:
         if torch.is_grad_enabled():  # create_graph=True
             raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
+        (grad_sums,) = grad_outputs
         rows, points = ctx.saved_tensors
         lists, pixels, exact, kept = ctx.plan
         padded = _pad(rows), _pad(points)
@@ -97,12 +98,12 @@ class _Composite(torch.autograd.Function):
             grad_through = rows.new_zeros(0, pixels.offsets.shape[-1])
             for block, through in zip(reversed(list(blocks)), reversed(before), strict=True):
                 live = tiles[: len(block)]
-                row, point, *rest = _gather(padded, block, pixels, live + lists.tiles[0])
+                row, point, centres, offsets = _gather(padded, block, pixels, live + lists.tiles[0])
                 inputs = tuple(t.detach().requires_grad_() for t in (row, point, through))
                 # Tiles that end with this block have no later block to hear from.
                 silent = rows.new_zeros(len(live) - len(grad_through), grad_through.shape[1])
                 with torch.enable_grad():
-                    outputs = _block(inputs[0], inputs[1], *rest, inputs[2], exact=exact)
+                    outputs = _block(inputs[0], inputs[1], centres, offsets, inputs[2], exact=exact)
                 grads = torch.autograd.grad(
                     outputs,
                     inputs,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pansplat.errors import InputError
@@ -221,16 +221,26 @@ def _draw(
         z = z[z > z_near]
     key = observed.radius.detach() if order == "radial" or picture.is_panorama else z
     splats, boxes = _project(observed, picture, kernel, dilation)
+    seen = torch.nonzero(_in_picture(boxes, picture))[:, 0]
+    if len(seen) < len(boxes):
+        splats, boxes, key = Splats(*(field[seen] for field in splats)), boxes[seen], key[seen]
     pixels = _tile_pixels(picture, kernel, observed.peak.dtype)
     rows, columns = tile_grid(*picture.size)
+    order_in_depth = torch.argsort(key, stable=True)
     bands, entries = [], 0
-    for lists in list_tiles(boxes, torch.argsort(key, stable=True), picture.size, wraps=picture.is_panorama):
+    for lists in list_tiles(boxes, order_in_depth, picture.size, wraps=picture.is_panorama):
         bands.append(composite(splats, lists, pixels, exact=kernel == "ray"))
         entries += len(lists.entries)
     sums = torch.cat(bands).reshape(rows, columns, TILE, TILE, 5)
     sums = sums.permute(4, 0, 2, 1, 3).reshape(5, rows * TILE, columns * TILE)
-    visible = int((boxes[:, 0] <= boxes[:, 1]).sum())
-    return sums[:, : picture.size[0], : picture.size[1]], visible, entries
+    return sums[:, : picture.size[0], : picture.size[1]], len(seen), entries
+
+
+def _in_picture(boxes: Float[Tensor, "n 4"], picture: Picture) -> Bool[Tensor, "n"]:
+    """Which boxes reach into the picture."""
+    left, right, top, bottom = boxes.unbind(1)
+    inside = (left <= right) & (bottom > 0) & (top < picture.size[0])
+    return inside if picture.is_panorama else inside & (right > 0) & (left < picture.size[1])
 
 
 def _project(

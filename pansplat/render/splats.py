@@ -4,6 +4,7 @@ Source: docs/rendering.md, sections 1 to 3. Geometry is float64 whatever the Gau
 picture's inner loop reads is in the Gaussians' own type.
 """
 
+import functools
 from typing import NamedTuple
 
 import torch
@@ -85,13 +86,14 @@ def observe(
         exact: whether to find the exact kernel's forms.
     """
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.harmonics)
+    work = functools.partial(
+        _observe_chunk, cam2world=cam2world, spread=spread, compensate=compensate, exact=exact
+    )
     parts = []
     for chunk in zip(*(field.split(_CHUNK) for field in fields), strict=True):
-        arguments = (*chunk, cam2world, spread, compensate, exact)
-        if torch.is_grad_enabled():
-            parts.append(checkpoint(_observe_chunk, *arguments, use_reentrant=False))
-        else:
-            parts.append(_observe_chunk(*arguments))
+        parts.append(
+            checkpoint(work, *chunk, use_reentrant=False) if torch.is_grad_enabled() else work(*chunk)
+        )
     return Observed(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
@@ -101,6 +103,7 @@ def _observe_chunk(
     scales: Float[Tensor, "n 3"],
     opacities: Float[Tensor, "n"],
     harmonics: Float[Tensor, "n k 3"],
+    *,
     cam2world: Float[Tensor, "4 4"],
     spread: float,
     compensate: bool,

@@ -9,7 +9,7 @@ from torch import Tensor
 
 TILE = 8  # pixels
 _MARGIN = 0.01  # pixels added around each box, far more than rounding
-_ENTRIES = 1 << 23  # entries listed at a time
+_ENTRIES = 1 << 22  # entries listed at a time
 
 
 @dataclass(frozen=True, eq=False)
