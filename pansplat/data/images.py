@@ -35,16 +35,16 @@ class _Picture:
     """Decoded pixels: `color` (H W 3) uint8 or float32 in [0, 1]; `alpha` (H W) in [0, 1] or None."""
 
     color: NDArray[Any]
-    alpha: NDArray[np.float32] | None
+    alpha: NDArray[Any] | None
 
 
-def srgb_from_linear(linear: NDArray[np.float32]) -> NDArray[np.float32]:
+def srgb_from_linear(linear: NDArray[Any]) -> NDArray[Any]:
     """Display values of linear light, both in [0, 1]; light outside is clipped. Source: IEC 61966-2-1."""
     x = np.clip(linear, 0, 1)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055).astype(np.float32)
 
 
-def linear_from_srgb(display: NDArray[np.float32]) -> NDArray[np.float32]:
+def linear_from_srgb(display: NDArray[Any]) -> NDArray[Any]:
     """Linear light of display values, both in [0, 1]. Source: IEC 61966-2-1."""
     x = np.clip(display, 0, 1)
     return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
@@ -341,7 +341,7 @@ def _decode_exr(path: Path) -> _Picture:
     return _Picture(srgb_from_linear(linear), None if alpha is None else alpha.astype(np.float32).clip(0, 1))
 
 
-def _resize_color(color: NDArray[Any], height: int) -> NDArray[np.float32]:
+def _resize_color(color: NDArray[Any], height: int) -> NDArray[Any]:
     """(H W 3) at (height, 2 height) as float32 in [0, 1]; the filter sees across +-180 degrees."""
     if color.dtype == np.uint8:
         if color.shape[0] != height:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +23,7 @@ from torch import Tensor
 from pansplat.data.images import read_thumbnail
 from pansplat.errors import InputError
 
-Array = NDArray[np.float32]
+Array = NDArray[Any]
 
 _HEIGHT = 256  # pixels; masks are found at this size
 _MOST_IMAGES = 16  # of a long sequence, evenly spread
@@ -45,6 +46,7 @@ _FITS, _FITS_AROUND = (
     0.5,
     0.6,
 )  # least correlation of a static outline; most of its surroundings, relative to that
+_PAIRS = 0.6  # of the pairs of views must show that; one view with glare on the tripod spoils two in five
 _LEGS_FROM = 4  # panoramas; with fewer, things that stay by chance are too common to follow
 _THICK, _WANDER, _GAP = 5, 5, 7  # samples: a leg's half thickness, its way from view to view, breaks in it
 _CONTRAST = 0.045  # grey levels of a leg against the floor
@@ -135,7 +137,7 @@ def _sample(grey: Array, colatitude: Array, azimuth: Array) -> Array:
     )
 
 
-def _ring_edges(grey: Array) -> NDArray[np.float32]:
+def _ring_edges(grey: Array) -> Array:
     """Outward grey differences over two degrees, (view ring sector)."""
     rings, sectors = (np.arange(_RINGS) + 0.5) * _STEP, (np.arange(_SECTORS) + 0.5) * 360 / _SECTORS
     azimuth, colatitude = np.meshgrid(sectors, rings)
@@ -198,13 +200,13 @@ def _disc(grey: Array) -> Array:
     return _sample(grey, _disc_radius(), _disc_azimuth())
 
 
-def _inside(outline: NDArray[np.intp]) -> NDArray[np.uint8]:
+def _inside(outline: NDArray[np.intp]) -> NDArray[Any]:
     """The disc samples within the outline."""
     sector = (_disc_azimuth() / 360 * _SECTORS).astype(int) % _SECTORS
     return (_disc_radius() <= (outline[sector] + 0.5) * _STEP).astype(np.uint8)
 
 
-def _round(samples: int) -> NDArray[np.uint8]:
+def _round(samples: int) -> NDArray[Any]:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * samples + 1, 2 * samples + 1))
 
 
@@ -213,8 +215,8 @@ def _gradients(disc: Array) -> Array:
     return np.stack([cv2.Scharr(disc, -1, dx, dy) / 16 for dx, dy in ((1, 0), (0, 1))])
 
 
-def _stays(discs: Array, inside: NDArray[np.uint8]) -> bool:
-    """Whether the edges of the outline stay while those around it move, in four of five pairs of views.
+def _stays(discs: Array, inside: NDArray[Any]) -> bool:
+    """Whether the edges of the outline stay while those around it move, in most pairs of views.
 
     Where little moves at all (a short baseline below a high ceiling) the surroundings fit as well as the
     outline, and nothing is known.
@@ -229,7 +231,7 @@ def _stays(discs: Array, inside: NDArray[np.uint8]) -> bool:
     for i, j in pairs:
         fit = _best_fit(gradients[i], gradients[j], outline)
         stay.append(fit > _FITS and _best_fit(gradients[i], gradients[j], around) < _FITS_AROUND * fit)
-    return float(np.mean(stay)) >= 1 - _AGREEMENT
+    return float(np.mean(stay)) >= _PAIRS
 
 
 def _best_fit(first: Array, second: Array, where: NDArray[np.bool_]) -> float:
@@ -246,7 +248,7 @@ def _best_fit(first: Array, second: Array, where: NDArray[np.bool_]) -> float:
     return best
 
 
-def _with_legs(discs: Array, region: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _with_legs(discs: Array, region: NDArray[Any]) -> NDArray[Any]:
     """The region with the thin things joined to it that nearly all views have at about one place."""
     parts = np.zeros_like(region)
     for operation in (cv2.MORPH_BLACKHAT, cv2.MORPH_TOPHAT):
@@ -260,7 +262,7 @@ def _with_legs(discs: Array, region: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return found.astype(np.uint8) | region
 
 
-def _cap_from_disc(disc: NDArray[np.uint8], height: int) -> NDArray[np.bool_]:
+def _cap_from_disc(disc: NDArray[Any], height: int) -> NDArray[np.bool_]:
     """A disc map as a panorama (height, 2 height), False beyond its reach."""
     colatitude = (np.arange(height) + 0.5) * 180 / height
     azimuth = np.radians((np.arange(2 * height) + 0.5) * 180 / height)

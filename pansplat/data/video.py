@@ -70,6 +70,7 @@ def video_encoder() -> str:
         InputError: PyAV has none of those we know.
     """
     import av
+    import av.codec
 
     for name in _ENCODERS:
         if name in av.codecs_available:
