@@ -50,9 +50,14 @@ def load_pairs(
                 f"{root}: needed a folder of posed panoramas, got a file; give the folder that holds it."
             )
         root = root.parent
-    collections = (
-        [(root, read_triplet(triplet, convention))] if triplet else _collections(root, convention, _DEPTH)
-    )
+    try:
+        collections = (
+            [(root, read_triplet(triplet, convention))] if triplet else _collections(root, convention, _DEPTH)
+        )
+    except OSError as error:
+        raise InputError(
+            f"{error.filename or root}: needed a readable folder, got '{error.strerror}'; check its permissions."
+        ) from error
     if not collections:
         raise _nothing_found(root)
     pairs = [pair for folder, collection in collections for pair in collection.pairs(folder, near, far)]
