@@ -56,7 +56,7 @@ def load_pairs(
         )
     except OSError as error:
         raise InputError(
-            f"{error.filename or root}: needed a readable folder, got '{error.strerror}'; check its permissions."
+            f"{error.filename or root}: needed a readable folder, got '{error.strerror}'; check its rights."
         ) from error
     if not collections:
         raise _nothing_found(root)
