@@ -15,6 +15,8 @@ from pansplat_viewer.settings import DrawSettings
 from pansplat_viewer.splats import Splats
 from pansplat_viewer.targets import Target, TargetStore
 
+_LARGEST_CACHED_FACE = 2048  # pixels; six of them take 200 MB at 16 bits
+
 
 @dataclass(frozen=True, eq=False)
 class Shot:
@@ -53,7 +55,7 @@ class Shot:
         """How shaders/gather.frag reads the layers: 0 picture, 1 faces by pinhole, 2 faces by panorama."""
         if self.settings.layout == "equirect":
             return 2
-        return 1 if self.settings.cached else 0
+        return 1 if self.settings.cached and self.face_size <= _LARGEST_CACHED_FACE else 0
 
     @property
     def focal(self) -> float:

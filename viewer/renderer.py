@@ -206,5 +206,5 @@ class SplatRenderer:
 
 def _bind(framebuffer: moderngl.Framebuffer | None) -> None:
     """Bind a framebuffer again unless it is gone: on a context without a window it may be one of ours."""
-    if framebuffer is not None and not isinstance(framebuffer.mglo, moderngl.mgl.InvalidObject):
+    if framebuffer is not None and hasattr(framebuffer.mglo, "use"):
         framebuffer.use()

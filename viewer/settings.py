@@ -44,7 +44,8 @@ class DrawSettings:
         face_size: side of a cube face in pixels; None is as fine as the panorama's equator (2 height / pi),
             or as the middle of a pinhole picture that is drawn from cached faces.
         cached: draw a pinhole picture from six faces kept for this position, so that turning costs a texture
-            look-up a pixel. The faces in sight that are not there yet are drawn first.
+            look-up a pixel. The faces in sight that are not there yet are drawn first. Where that needs faces
+            of more than 2048 pixels (a narrow field of view) the picture is drawn directly.
     """
 
     kernel: Kernel = "ray"

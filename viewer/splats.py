@@ -9,10 +9,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from pansplat.gaussians.gaussians import Gaussians
-from pansplat.gaussians.harmonics import evaluate
+from pansplat.gaussians.harmonics import basis
 from pansplat.gaussians.scene import Scene
 
-_CHUNK = 1 << 16  # Gaussians whose harmonics are evaluated at once: what fits the cache
+# Gaussians whose harmonics are evaluated at once: what fits the cache, and too little for torch to wake its
+# threads, which cost more than they give here.
+_CHUNK = 1 << 13
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +30,7 @@ class Splats:
         extent: reach times the largest standard deviation, metres.
         levels, views: labels.
         geometry: what the shaders read: mean, opacity; quaternion; scales, 0.
-        harmonics: coefficients on the CPU.
+        harmonics: coefficients, Gaussians innermost so that sums over coefficients run through memory in order.
         base_colors: colours when they are the same from everywhere (degree 0), else None.
         view_positions: camera centres of the context views in the world.
         num_views: context views there are Gaussians or cameras of.
@@ -43,7 +45,7 @@ class Splats:
     levels: Int[np.ndarray, "n"]
     views: Int[np.ndarray, "n"]
     geometry: Float[np.ndarray, "n 12"]
-    harmonics: torch.Tensor
+    harmonics: Float[np.ndarray, "k 3 n"]
     base_colors: Float[np.ndarray, "n 4"] | None
     view_positions: Float[np.ndarray, "view 3"]
     num_views: int
@@ -79,7 +81,7 @@ class Splats:
         geometry[:, 4:8] = gaussians.quats.detach().float().numpy()
         geometry[:, 8:11] = scales
         views = gaussians.views.detach().numpy().astype(np.int32)
-        harmonics = gaussians.harmonics.detach().float().contiguous()
+        harmonics = gaussians.harmonics.detach().float().permute(1, 2, 0).contiguous().numpy()
         splats = Splats(
             origin=origin,
             means=np.ascontiguousarray(means),
@@ -102,10 +104,15 @@ class Splats:
         colors = np.zeros((len(self), 4), np.float32)
         means = torch.from_numpy(self.means)
         centre = torch.tensor(position, dtype=torch.float32)
+        degree = math.isqrt(len(self.harmonics)) - 1
         for start in range(0, len(self), _CHUNK):
             part = slice(start, start + _CHUNK)
             directions = torch.nn.functional.normalize(means[part] - centre, dim=-1)
-            colors[part, :3] = evaluate(self.harmonics[part], directions).numpy()
+            values = np.ascontiguousarray(basis(directions, degree).numpy().T)
+            sums = np.full((3, values.shape[1]), 0.5, np.float32)
+            for value, coefficients in zip(values, self.harmonics, strict=True):
+                sums += value * coefficients[:, part]
+            colors[part, :3] = np.maximum(sums, 0).T
         return colors
 
     def kept(
@@ -136,9 +143,9 @@ def _origin(positions: np.ndarray, means: torch.Tensor) -> np.ndarray:
     return np.zeros(3)
 
 
-def _constant_colors(harmonics: torch.Tensor) -> np.ndarray:
-    colors = np.zeros((len(harmonics), 4), np.float32)
-    colors[:, :3] = (0.5 + harmonics[:, 0] / (2 * math.sqrt(math.pi))).clamp_min(0).numpy()
+def _constant_colors(harmonics: Float[np.ndarray, "1 3 n"]) -> Float[np.ndarray, "n 4"]:
+    colors = np.zeros((harmonics.shape[2], 4), np.float32)
+    colors[:, :3] = np.maximum(0.5 + harmonics[0].T / (2 * math.sqrt(math.pi)), 0)
     return colors
 
 

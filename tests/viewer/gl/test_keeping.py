@@ -60,6 +60,15 @@ def test_turning_draws_each_face_once(renderer, random_scene, pose):
     assert drawn.stats.cached  # the background lies behind the layers
 
 
+def test_narrow_views_are_drawn_directly_rather_than_from_giant_faces(renderer, random_scene, pose):
+    drawn = renderer(random_scene())
+    narrow = replace(CACHED, vertical_fov_degrees=1.0)
+    drawn.render(pose, SIZE, narrow)
+    picture = drawn.read_color()
+    drawn.render(pose, SIZE, replace(narrow, cached=False))
+    assert np.array_equal(drawn.read_color(), picture)
+
+
 @pytest.mark.parametrize(
     "change",
     [
