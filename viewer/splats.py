@@ -30,7 +30,7 @@ class Splats:
         extent: reach times the largest standard deviation, metres.
         levels, views: labels.
         geometry: what the shaders read: mean, opacity; quaternion; scales, 0.
-        harmonics: coefficients, Gaussians innermost so that sums over coefficients run through memory in order.
+        harmonics: coefficients, Gaussians innermost: sums over coefficients run through memory in order.
         base_colors: colours when they are the same from everywhere (degree 0), else None.
         view_positions: camera centres of the context views in the world.
         num_views: context views there are Gaussians or cameras of.
