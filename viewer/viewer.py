@@ -94,7 +94,7 @@ class Viewer:
         """Show what a path holds; an unusable path is said in the window and changes nothing else."""
         try:
             entries = self._find(path)
-        except InputError as error:
+        except (InputError, OSError) as error:
             self.facts.error = str(error)
             return
         self.show(entries, 0)
@@ -147,8 +147,8 @@ class Viewer:
         if isinstance(outcome, Loaded):
             try:
                 self.renderer.upload(outcome.scene)
-            except InputError as error:
-                self.facts.error = str(error)
+            except (InputError, moderngl.Error) as error:  # the latter when it does not fit the GPU
+                self.facts.error = f"{outcome.entry.name}: {error}"
                 return
             self._enter(outcome, now)
         elif isinstance(outcome, InputError):

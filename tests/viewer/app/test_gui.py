@@ -13,6 +13,10 @@ from imgui_bundle import imgui
 
 from pansplat.data.views import Views
 from pansplat.errors import InputError
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Scene
+from pansplat.geometry.equirect import sample_equirect, uv_from_directions
+from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat_viewer.library import Entry, Loaded, Loader
 from pansplat_viewer.viewer import Viewer
 
@@ -119,6 +123,31 @@ class Person:
         self.frames(1)
 
 
+def _sphere(entry: Entry, photos: np.ndarray) -> Loaded:
+    """A photograph, and the same photograph as Gaussians around its camera, in a world with z up."""
+    pose = torch.eye(4, dtype=torch.float64)
+    yaw = 0.7
+    right, forward = (np.cos(yaw), -np.sin(yaw), 0.0), (np.sin(yaw), np.cos(yaw), 0.0)
+    pose[:3, :3] = torch.tensor((right, (0.0, 0.0, -1.0), forward)).T
+    pose[:3, 3] = torch.tensor((1.0, -2.0, 0.5))
+    count = 3000
+    directions = fibonacci_directions(count)
+    image = torch.from_numpy(photos[0]).permute(2, 0, 1)
+    color = sample_equirect(image, uv_from_directions(directions).float()).T
+    gaussians = Gaussians(
+        means=(pose[:3, 3] + 3 * directions @ pose[:3, :3].T).float(),
+        scales=torch.full((count, 3), 0.2),
+        quats=torch.tensor((1.0, 0, 0, 0)).expand(count, 4),
+        opacities=torch.full((count,), 0.99),
+        harmonics=((color - 0.5) / 0.28209479177387814)[:, None],
+        levels=torch.zeros(count, dtype=torch.int64),
+        views=torch.zeros(count, dtype=torch.int64),
+    )
+    scene = Scene(gaussians, pose[None], 0.45, 10.0, ("a.png",), "synthetic", 128)
+    mask = torch.ones(1, *image.shape[1:], dtype=torch.bool)
+    return Loaded(entry, scene, Views(image[None], pose[None], mask, 0.45, 10.0, ("a.png",)))
+
+
 @pytest.fixture(scope="module")
 def session(ctx, small_scene, axis_photos, tmp_path_factory) -> Iterator[Person]:
     photos = Views(
@@ -131,6 +160,8 @@ def session(ctx, small_scene, axis_photos, tmp_path_factory) -> Iterator[Person]
     )
 
     def load(entry, progress):
+        if entry.name == "sphere":
+            return _sphere(entry, axis_photos)
         if entry.name == "damaged":
             raise InputError("damaged.ply: 100% unreadable; export it again")
         return Loaded(entry, small_scene, None if entry.name == "no photographs" else photos)
@@ -345,6 +376,7 @@ def test_a_scene_that_cannot_be_read_says_so_and_keeps_the_scene(person):
 def test_the_photograph_shows_what_lies_in_the_viewing_direction(person):
     state = person.viewer.state
     state.photo, state.split = True, 0.0
+    state.settings = replace(state.settings, levels=frozenset())  # hidden by the photograph anyway
     state.camera = replace(state.home, yaw_radians=np.pi / 2, vertical_fov_degrees=30)
     red, green, blue = person.picture()[180:200].mean((0, 1)) / 255
     assert red > 0.95 and 0.4 < green < 0.6 and 0.4 < blue < 0.6, "right is red"
@@ -355,6 +387,23 @@ def test_the_photograph_shows_what_lies_in_the_viewing_direction(person):
     assert columns[-1] > columns[0] + 20, "right is red: not mirrored"
     state.camera = replace(state.camera, position=(0.0, 0.0, 0.4))
     assert person.picture().max() < 90, "the nearest photograph is the second, dim one"
+
+
+def test_at_an_input_camera_the_rendering_looks_like_its_photograph(person):
+    person.viewer.show([Entry("sphere")], 0)
+    person.settle()
+    state = person.viewer.state
+    for yaw, pitch in ((0.0, 0.0), (2.0, 0.5), (-2.0, -0.9)):
+        state.camera = replace(state.home, yaw_radians=yaw, pitch_radians=pitch)
+        state.photo = False
+        rendered = person.picture()
+        state.photo, state.split = True, 0.0
+        photograph = person.picture()
+        assert np.abs(rendered - photograph).mean() < 4
+        assert np.abs(rendered - photograph[:, ::-1]).mean() > 8, "a mirrored one would be told apart"
+        assert np.abs(rendered - photograph[::-1]).mean() > 8, "and one upside down"
+    person.viewer.show([Entry("first"), Entry("second")], 0)
+    person.settle()
 
 
 def test_the_split_keeps_the_rendering_on_its_left(person):
@@ -380,9 +429,10 @@ def test_a_scene_without_photographs_offers_no_comparison(person):
     person.settle()
 
 
-def test_screenshots_are_the_picture_without_the_panels(person):
+def test_screenshots_are_the_picture_without_the_panels(person, monkeypatch):
     from PIL import Image
 
+    monkeypatch.setattr("pansplat_viewer.viewer.PANORAMA_HEIGHT", 128)
     picture = person.picture()
     for label in ("PNG", "360 PNG"):
         person.click(label)
@@ -393,7 +443,7 @@ def test_screenshots_are_the_picture_without_the_panels(person):
     assert np.abs(pixels[PICTURE] - picture).max() <= 3
     assert changed(pixels[20:560, 20:290], np.zeros_like(pixels[20:560, 20:290])) > 0.3
     with Image.open(panorama) as image:
-        assert image.size == (2048, 1024)
+        assert image.size == (256, 128)
     person.viewer.state.message = ""
     assert changed(picture, person.picture()) == 0, "the window shows the view again"
 

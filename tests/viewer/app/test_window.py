@@ -10,7 +10,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -147,6 +148,39 @@ def test_the_window_can_be_driven_by_mouse_and_keys_and_leaves_cleanly(display, 
         output, errors = viewer.communicate(timeout=30)
         assert viewer.returncode == 0, errors
         assert errors == "" and output == ""
+
+
+def test_what_is_dropped_on_the_window_is_opened():
+    from pansplat_viewer.window import Window, _loop
+
+    class Opener:
+        busy = True
+        state = SimpleNamespace(quit=False)
+        facts = SimpleNamespace(current=-1)
+        opened: ClassVar[list[Path]] = []
+
+        def open(self, path: Path) -> None:
+            self.opened.append(path)
+
+        def frame(self, *_: Any) -> None:
+            self.state.quit = True
+
+    class Dropped(Window):
+        ctx = SimpleNamespace(detect_framebuffer=lambda _: SimpleNamespace())
+        framebuffer_size = (64, 32)
+        closing = False
+
+        def __init__(self) -> None:
+            self.dropped = []
+            self._drop(None, ["/somewhere/a pair"])
+
+        def wait(self, busy: bool) -> None: ...
+        def set_title(self, title: str) -> None: ...
+        def swap(self) -> None: ...
+
+    window, viewer = Dropped(), Opener()
+    _loop(window, viewer)
+    assert viewer.opened == [Path("/somewhere/a pair")] and window.dropped == []
 
 
 def test_an_interrupt_leaves_cleanly(display, room):
