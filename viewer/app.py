@@ -36,7 +36,7 @@ class Options:
     height: int = 512
     """Height of the panoramas that the prediction sees, pixels."""
     cache: bool = True
-    """Keep predictions beside the pair, and use those kept."""
+    """Whether predictions are kept beside the pair, and those kept are used."""
     convention: str | None = None
     """Pose convention to read the poses by, such as "world2cam opengl", instead of what the files say."""
     near: float | None = None
@@ -214,7 +214,7 @@ def _write(options: Options, entry: Entry, folder: Path, pixels: tuple[int, int]
         settings = options.settings
         if len(loaded.scene.cam2world) < 2 and settings.mode in ("deferred", "difference"):
             settings = replace(settings, mode="joint")
-        renderer = SplatRenderer(ctx)
+        renderer = SplatRenderer(ctx, color_bits=32)
         try:
             written = write_flythrough(
                 renderer,
