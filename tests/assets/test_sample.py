@@ -1,0 +1,184 @@
+"""The shipped sample keeps what it promises: rigid poses, exact depth, a free licence for every model."""
+
+import hashlib
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pansplat.geometry.equirect import pixel_directions, row_weights, sample_equirect, uv_from_directions
+from pansplat.geometry.pose import invert_pose, orthonormal_error
+
+SAMPLE = Path(__file__).parents[2] / "assets" / "living_room"
+RECIPE = SAMPLE.parent / "recipe"
+NAMES = ("left", "middle", "right")
+INPUTS = ("left", "right")
+
+
+class View:
+    """One panorama of the sample: colour (3 H W), radial depth (H W) in metres, pose."""
+
+    def __init__(self, name: str, entry: dict) -> None:
+        color = np.asarray(Image.open(SAMPLE / f"{name}.jpg"))
+        depth = np.asarray(Image.open(SAMPLE / entry["depth"]))
+        self.color = torch.from_numpy(color.copy()).permute(2, 0, 1).double() / 255
+        self.depth = torch.from_numpy(depth.astype(np.float64)) / 1000
+        self.pose = torch.tensor(entry["cam2world"], dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def poses() -> dict:
+    return json.loads((SAMPLE / "poses.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def views(poses: dict) -> dict[str, View]:
+    return {name: View(name, poses["poses"][f"{name}.jpg"]) for name in NAMES}
+
+
+def project(
+    view: View, pose: torch.Tensor, stride: int = 3
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Where `view`'s pixels lie in a camera at `pose`: uv, distance to it, and their solid angles."""
+    height, width = view.depth.shape
+    rays = pixel_directions(height, width, dtype=torch.float64)[::stride, ::stride]
+    points = rays * view.depth[::stride, ::stride, None]
+    points = points @ view.pose[:3, :3].T + view.pose[:3, 3]
+    inverse = invert_pose(pose)
+    there = points @ inverse[:3, :3].T + inverse[:3, 3]
+    weights = row_weights(height)[::stride, None].expand(points.shape[:2])
+    return uv_from_directions(there), there.norm(dim=-1), weights
+
+
+def nearest_depth(view: View, uv: torch.Tensor) -> torch.Tensor:
+    height, width = view.depth.shape
+    row = (uv[..., 1] * height).long().clamp(0, height - 1)
+    column = (uv[..., 0] * width).long() % width
+    return view.depth[row, column]
+
+
+def weighted_median(values: torch.Tensor, weights: torch.Tensor) -> float:
+    order = values.argsort()
+    total = weights[order].cumsum(0)
+    return float(values[order][(total < total[-1] / 2).sum()])
+
+
+def photometric_error(middle: View, other: View, pose: torch.Tensor) -> float:
+    """Median absolute colour difference of the middle view and `other`, taken to stand at `pose`."""
+    uv, distance, weights = project(middle, pose)
+    seen = (nearest_depth(other, uv) / distance - 1).abs() < 0.03
+    difference = (sample_equirect(other.color, uv) - middle.color[:, ::3, ::3]).abs().mean(0)
+    return weighted_median(difference[seen], weights[seen]) if seen.float().mean() > 0.3 else 1.0
+
+
+def test_pair_lists_two_context_views_and_the_middle_target(poses: dict):
+    pairs = json.loads((SAMPLE / "pairs.json").read_text())
+    assert pairs == {"pairs": [{"context": ["left.jpg", "right.jpg"], "target": ["middle.jpg"]}]}
+    assert poses["convention"] == "cam2world opencv"
+    assert set(poses["poses"]) == {f"{name}.jpg" for name in NAMES}
+
+
+def test_poses_are_rigid_and_the_target_stands_midway(views: dict[str, View]):
+    assert max(orthonormal_error(v.pose) for v in views.values()) < 1e-12
+    left, middle, right = (views[n].pose[:3, 3] for n in NAMES)
+    torch.testing.assert_close(middle, (left + right) / 2)
+    assert float((right - left).norm()) == pytest.approx(1.0)
+
+
+def test_context_views_are_turned_apart_and_tilted(views: dict[str, View]):
+    left, right = (views[n].pose[:3, :3] for n in INPUTS)
+    angle = torch.rad2deg(torch.acos(((left.T @ right).trace() - 1) / 2))
+    assert 20 < float(angle) < 90
+    for rotation in (left, right):
+        assert 1.0 < float(torch.rad2deg(torch.acos(rotation[1, 1]))) < 5.0
+
+
+def test_images_are_equirectangular_and_the_sample_is_small(views: dict[str, View]):
+    for view in views.values():
+        height, width = view.depth.shape
+        assert width == 2 * height >= 1024
+        assert view.color.shape == (3, height, width)
+    assert sum(p.stat().st_size for p in SAMPLE.iterdir()) < 6e6
+
+
+def test_every_depth_lies_between_near_and_far(views: dict[str, View], poses: dict):
+    for view in views.values():
+        assert poses["near"] < float(view.depth.min()) and float(view.depth.max()) < poses["far"]
+
+
+def test_exposure_is_natural(views: dict[str, View]):
+    for view in views.values():
+        luma = view.color.mean(0)
+        assert 0.3 < float(luma.mean()) < 0.65
+        assert float((view.color > 0.99).all(0).double().mean()) < 0.01
+        assert float((luma < 0.02).double().mean()) < 0.03
+
+
+def test_floor_is_below_and_ceiling_above(views: dict[str, View]):
+    for view in views.values():
+        down = view.pose[:3, :3].T @ torch.tensor((0.0, 1.0, 0.0), dtype=torch.float64)
+        below = nearest_depth(view, uv_from_directions(down[None]))
+        above = nearest_depth(view, uv_from_directions(-down[None]))
+        assert float(below) == pytest.approx(1.5, abs=0.03)  # less the rug
+        assert 1.0 < float(above) < 1.25
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_warping_by_depth_and_pose_explains_the_other_view(views: dict[str, View], name: str):
+    assert photometric_error(views["middle"], views[name], views[name].pose) < 0.015
+
+
+@pytest.mark.parametrize("name", INPUTS)
+@pytest.mark.parametrize("wrong", ["baseline reversed", "rotation inverted", "not moved", "y and z flipped"])
+def test_wrong_conventions_do_not_explain_it(views: dict[str, View], name: str, wrong: str):
+    pose = views[name].pose.clone()
+    if wrong == "baseline reversed":
+        pose[:3, 3] = 2 * views["middle"].pose[:3, 3] - pose[:3, 3]
+    elif wrong == "rotation inverted":
+        pose[:3, :3] = pose[:3, :3].T
+    elif wrong == "not moved":
+        pose[:3, 3] = views["middle"].pose[:3, 3]
+    else:
+        pose[:3, :3] = pose[:3, :3] @ torch.diag(torch.tensor((1.0, -1.0, -1.0), dtype=torch.float64))
+    uv, _, weights = project(views["middle"], pose)
+    difference = (sample_equirect(views[name].color, uv) - views["middle"].color[:, ::3, ::3]).abs().mean(0)
+    right = photometric_error(views["middle"], views[name], views[name].pose)
+    assert weighted_median(difference.flatten(), weights.flatten()) > 2.5 * right
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_depths_of_two_views_agree(views: dict[str, View], name: str):
+    uv, distance, weights = project(views["middle"], views[name].pose)
+    ratio = nearest_depth(views[name], uv) / distance
+    share = weights / weights.sum()
+    assert float(share[(ratio - 1).abs() < 0.02].sum()) > 0.85
+    assert float(share[ratio > 1.02].sum()) < 0.05  # nothing is seen through, but for the edges' pixels
+    assert weighted_median((ratio - 1).abs().flatten(), weights.flatten()) < 0.002
+
+
+def test_every_model_is_credited_under_a_free_licence():
+    credits = json.loads((SAMPLE / "credits.json").read_text())
+    readme = (SAMPLE / "README.md").read_text()
+    assert len(credits) >= 20
+    for credit in credits:
+        assert credit["licence"] in ("CC0 1.0", "CC BY 3.0", "CC BY 3.0 US")
+        row = f"| {credit['model']} | {credit['title']} | {credit['author']} | {credit['licence']} |"
+        assert row in readme, row
+
+
+def test_readme_lists_the_checksum_of_every_file():
+    listed = dict(re.findall(r"^([0-9a-f]{64})  (\S+)$", (SAMPLE / "README.md").read_text(), re.MULTILINE))
+    found = {
+        hashlib.sha256(p.read_bytes()).hexdigest(): p.name for p in SAMPLE.iterdir() if p.name != "README.md"
+    }
+    assert listed == found
+
+
+def test_recipe_names_no_folder_of_any_machine():
+    for path in [*RECIPE.iterdir(), *SAMPLE.glob("*.md"), *SAMPLE.glob("*.json")]:
+        if path.is_file():
+            assert not re.search(r"/(tmp|home|work|root|Users|media)/", path.read_text()), path
