@@ -26,6 +26,8 @@ from pansplat_viewer.settings import DrawSettings, FrameStats
 from pansplat_viewer.splats import SplatBuffers, Splats
 from pansplat_viewer.targets import Target, TargetStore
 
+_SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software")
+
 __all__ = ["DrawSettings", "FrameStats", "SplatRenderer"]
 
 
@@ -45,13 +47,19 @@ class SplatRenderer:
         ctx: moderngl.Context,
         *,
         tier: Literal["auto", "gl33", "gl43"] = "auto",
-        color_bits: Literal[16, 32] = 16,
+        color_bits: Literal[16, 32] | None = None,
     ) -> None:
         """`color_bits` of the targets: 16 for a window, 32 for checks and captures.
+
+        None takes 16 on a GPU and 32 where GL runs in software, which truncates half floats so that pictures
+        darken with every layer, and for which 32 cost no more.
 
         Raises:
             InputError: `tier` is more than the context can do, or `color_bits` is neither.
         """
+        if color_bits is None:
+            software = any(name in ctx.info["GL_RENDERER"].lower() for name in _SOFTWARE)
+            color_bits = 32 if software else 16
         if color_bits not in (16, 32):
             raise InputError(f"`color_bits` must be 16 or 32, got {color_bits}")
         self.tier = choose_tier(ctx, tier)

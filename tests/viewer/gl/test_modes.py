@@ -8,7 +8,7 @@ import torch
 
 from pansplat.errors import InputError
 from pansplat.render import blend, blend_weights
-from pansplat_viewer.renderer import DrawSettings
+from pansplat_viewer.renderer import DrawSettings, SplatRenderer
 
 pytestmark = pytest.mark.gl
 
@@ -116,6 +116,23 @@ def test_half_float_targets_are_close(renderer, random_scene, pose):
     assert 0 < np.abs(exact.read_color() - half.read_color()).max() < 0.02
 
 
+def test_software_gl_gets_full_floats_by_default(ctx, random_scene, pose):
+    class Gpu:
+        """The same context under a GPU's name."""
+
+        def __init__(self):
+            self.info = {**ctx.info, "GL_RENDERER": "NVIDIA H200"}
+
+        def __getattr__(self, name):
+            return getattr(ctx, name)
+
+    for context, dtype in ((ctx, "f4" if "llvmpipe" in ctx.info["GL_RENDERER"] else "f2"), (Gpu(), "f2")):
+        drawn = SplatRenderer(context)
+        drawn.upload(random_scene(20))
+        assert drawn.render(pose, SIZE, SETTINGS).dtype == dtype
+        drawn.release()
+
+
 def test_top_row_is_up_and_right_is_right(renderer, random_scene):
     """One Gaussian ahead, up (-y) and to the right is upper right; the texture holds the bottom row first."""
     scene = only(random_scene(), torch.arange(300) < 1)
@@ -174,8 +191,6 @@ def test_settings_check_themselves(change, message):
 
 
 def test_bad_poses_sizes_and_a_missing_scene_are_refused(renderer, random_scene, pose, ctx):
-    from pansplat_viewer.renderer import SplatRenderer
-
     drawn = renderer(random_scene())
     with pytest.raises(InputError, match="finite 4x4"):
         drawn.render(np.full((4, 4), np.nan), SIZE, SETTINGS)
