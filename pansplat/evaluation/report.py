@@ -82,10 +82,7 @@ def evaluate(
     with_targets = [pair for pair in pairs if pair.targets]
     if not with_targets:
         raise InputError("none of the pairs has a target view to compare with; name targets in pairs.json")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--out {out}: cannot make this folder: {error.strerror}") from error
+    _make_folder(out)
     cases: list[Case] = []
     for index, pair in enumerate(with_targets):
 
@@ -121,7 +118,7 @@ def _evaluate_pair(
         render_seconds = time.perf_counter() - began
         name = pair.name if len(targets.images) == 1 else f"{pair.name} {Path(targets.names[view]).stem}"
         folder = out / _free_name(name, taken)
-        folder.mkdir(exist_ok=True)
+        _make_folder(folder)
         write_image(folder / "prediction.png", picture)
         write_image(folder / "target.png", target)
         write_image(folder / "error.png", error_picture(picture, target))
@@ -197,6 +194,13 @@ def _figures(case: Case, masked: bool) -> list[float]:
 def _formatted(figures: Sequence[float], masked: bool) -> list[str]:
     formats = [".2f", *([".2f"] if masked else []), ".2f", ".4f", ".2f", ".1f", ".1f", ",.0f"]
     return [format(value, how) for value, how in zip(figures, formats, strict=True)]
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make {folder} ({error.strerror}); choose another --out") from error
 
 
 def _free_name(name: str, taken: set[str]) -> str:

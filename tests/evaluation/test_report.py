@@ -122,6 +122,13 @@ def test_pairs_without_target_are_passed_over(tmp_path: Path) -> None:
     assert not (tmp_path / "nothing").exists()
 
 
+def test_a_file_in_the_folders_place_is_an_input_error(tmp_path: Path) -> None:
+    pairs = load_pairs(write_triplet(tmp_path / "room"))
+    (tmp_path / "out").write_text("")
+    with pytest.raises(InputError, match=r"cannot make .*choose another"):
+        evaluate(pairs, GreyBall(), tmp_path / "out", height=HEIGHT)
+
+
 def test_a_masked_target_gets_a_second_figure_in_the_table_only(tmp_path: Path) -> None:
     folder = write_triplet(tmp_path / "room")
     mask = np.full((HEIGHT, 2 * HEIGHT), 255, np.uint8)
