@@ -40,7 +40,14 @@ class Gaussians:
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
-        needed = {"means": (n, 3), "scales": (n, 3), "quats": (n, 4), "opacities": (n,), "levels": (n,), "views": (n,)}
+        needed = {
+            "means": (n, 3),
+            "scales": (n, 3),
+            "quats": (n, 4),
+            "opacities": (n,),
+            "levels": (n,),
+            "views": (n,),
+        }
         for name, shape in needed.items():
             got = tuple(getattr(self, name).shape)
             if got != shape:

@@ -40,10 +40,7 @@ def look_pose(
     """
     forward, up = forward.double(), up.double()
     right = torch.linalg.cross(forward, up)
-    if (
-        float(right.norm()) < 1e-6 * max(float(forward.norm() * up.norm()), 1e-30)
-        or float(forward.norm()) == 0
-    ):
+    if float(right.norm()) < 1e-6 * max(float(forward.norm() * up.norm()), 1e-30) or float(forward.norm()) == 0:
         raise ValueError(f"`forward` {forward.tolist()} must not be parallel to `up` {up.tolist()}")
     right = right / right.norm()
     forward = forward / forward.norm()

@@ -82,9 +82,7 @@ def orthonormal_error(pose: Float[Tensor, "4 4"]) -> float:
     return float(torch.maximum(gram, bottom))
 
 
-def interpolate_poses(
-    start: Float[Tensor, "4 4"], end: Float[Tensor, "4 4"], fraction: float
-) -> Float[Tensor, "4 4"]:
+def interpolate_poses(start: Float[Tensor, "4 4"], end: Float[Tensor, "4 4"], fraction: float) -> Float[Tensor, "4 4"]:
     """The pose at `fraction` of the way: centre on the segment, rotation on the shortest arc (slerp)."""
     a, b = quats_from_rotations(torch.stack((start[:3, :3], end[:3, :3])).double())
     b = torch.where((a * b).sum() < 0, -b, b)

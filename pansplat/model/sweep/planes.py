@@ -1,0 +1,78 @@
+"""Which planes a scene has: how much of the agreed surfaces lies on each plane across the scene's axes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from pansplat.model.sweep.surface import Surface, world_points
+
+_BIN = 0.05  # metres
+_LITTLE, _MUCH = 2e-4, 2e-2  # shares of all directions between which support counts
+_HORIZONTAL = 0  # axis 0 points down
+_MIN_FLOOR = 0.4  # metres from the camera
+_FLOOR_SHARE = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneSupport:
+    """Histograms (3, bins) of the planes' offsets along each axis from `origin`, as shares of all directions."""
+
+    axes: np.ndarray
+    origin: np.ndarray
+    histogram: np.ndarray
+
+    def _bin(self, offset: np.ndarray) -> np.ndarray:
+        middle = self.histogram.shape[1] // 2
+        return np.clip(np.floor(offset / _BIN).astype(np.int64) + middle, 0, self.histogram.shape[1] - 1)
+
+    def share(self, axis: int, cam2world: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+        """Support in [0, 1], (2, n), of planes at distances 1 / `inverse` on the negative and positive side."""
+        centre = self.axes[axis] @ (cam2world[:3, 3] - self.origin)
+        found = np.stack([self.histogram[axis, self._bin(centre + sign / inverse)] for sign in (-1, 1)])
+        return np.clip(np.log1p(found / _LITTLE) / np.log1p(_MUCH / _LITTLE), 0, 1)
+
+    def bounds(self, cam2world: np.ndarray) -> tuple[float, float]:
+        """How far the scene reaches down and up (negative) from a camera, metres; infinite where unknown."""
+        horizontal = self.histogram[_HORIZONTAL]
+        middle, gap = len(horizontal) // 2, int(_MIN_FLOOR / _BIN)
+        camera = self.axes[_HORIZONTAL] @ (cam2world[:3, 3] - self.origin)
+        bounds = []
+        for start, part, sign in (
+            (middle + gap, horizontal[middle + gap :], 1),
+            (0, horizontal[: middle - gap], -1),
+        ):
+            peak = start + int(part.argmax())
+            if horizontal[max(peak - 2, 0) : peak + 3].sum() > _FLOOR_SHARE:
+                reach = (peak - middle + 0.5) * _BIN - camera
+                bounds.append(1.06 * reach + sign * _BIN)
+            else:
+                bounds.append(sign * float("inf"))
+        return bounds[0], bounds[1]
+
+
+def plane_support(
+    surfaces: Sequence[Surface],
+    agreed: Sequence[np.ndarray],
+    cam2world: np.ndarray,
+    axes: np.ndarray,
+    far: float,
+) -> PlaneSupport:
+    """Collect the support of planes from the pixels (h, w) that the views agree on."""
+    bins = 2 * int((far + 5) / _BIN)
+    histogram = np.zeros((3, bins))
+    support = PlaneSupport(axes, cam2world[0, :3, 3], histogram)
+    for surface, sure, pose in zip(surfaces, agreed, cam2world, strict=True):
+        height, width = surface.inverse_depth.shape
+        area = np.repeat(np.sin((np.arange(height) + 0.5) / height * np.pi)[:, None], width, axis=1)
+        area /= area.sum() * len(surfaces)
+        points = world_points(surface, pose) - support.origin
+        for axis in range(3):
+            chosen = sure & (surface.family == axis + 1)
+            index = support._bin(points[chosen] @ axes[axis])
+            histogram[axis] += np.bincount(index, weights=area[chosen], minlength=bins)
+    histogram[:] = cv2.GaussianBlur(histogram, (9, 1), 1.0)
+    return support

@@ -1,0 +1,214 @@
+"""The hierarchical plane sweep: from posed panoramas to a surface for each of them.
+
+Three levels, as in the paper's hierarchical cost volume (PanSplat, section 3.2), at 1/4, 1/2 and 1/1 of the height.
+The coarse level searches the whole depth range among spheres and among planes along the scene's axes, twice: the
+second time every view knows the other views' surfaces (what they see through, agree with, or hide) and which
+planes the scene has. Each finer level searches a narrow range around the coarser surface.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from pansplat.model.sweep.aggregate import AggregationConfig, aggregate, best_labels
+from pansplat.model.sweep.cost import Family, MatchingConfig, View, matching_cost
+from pansplat.model.sweep.frame import main_directions, scene_axes
+from pansplat.model.sweep.planes import PlaneSupport, plane_support
+from pansplat.model.sweep.sphere import resize_sphere
+from pansplat.model.sweep.surface import Surface, agreement, guided_upsample
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """How the sweep searches."""
+
+    finest_height: int = 512
+    """Height of the finest level; larger panoramas are searched at this height."""
+    coarse_passes: int = 2
+    max_candidates: int = 256
+    """Hypotheses of one family at the coarse level, at most."""
+    near_margin: float = 0.75
+    """Surfaces are searched down to this fraction of `near`."""
+    narrow_candidates: tuple[int, int] = (24, 16)
+    """Hypotheses of one family at the two finer levels."""
+    unsure_confidence: float = 0.1
+    """What a surface that no other view agrees with may say about the other views' hypotheses."""
+    plane_prior: float = 0.3
+    """Penalty of a plane that the scene gives no support."""
+    sphere_prior: float = 0.18
+    """Penalty of hypotheses that are no plane."""
+    matching: MatchingConfig = field(default_factory=MatchingConfig)
+    aggregation: AggregationConfig = field(default_factory=AggregationConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImages:
+    """Input of the search: images (v, h, w, 3) float32, poses (v, 4, 4), masks (v, h, w) bool, depth range."""
+
+    images: np.ndarray
+    cam2world: np.ndarray
+    masks: np.ndarray
+    near: float
+    far: float
+
+    def relative_pose(self, view: int, other: int) -> np.ndarray:
+        """Pose (4, 4) from `view`'s camera to `other`'s."""
+        return np.linalg.inv(self.cam2world[other]) @ self.cam2world[view]
+
+    @property
+    def baseline(self) -> float:
+        """Largest distance between two cameras, metres."""
+        centres = self.cam2world[:, :3, 3]
+        return float(np.linalg.norm(centres[:, None] - centres[None], axis=-1).max())
+
+
+def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[str, float], None]) -> list[Surface]:
+    """The surface that each view sees, at the finest level."""
+    finest = min(posed.images.shape[1], config.finest_height)
+    small = [resize_sphere(image, max(finest // 2, 32)) for image in posed.images]
+    axes = scene_axes(small, posed.cam2world[:, :3, :3])
+    heights = [max(finest // 4, 16), max(finest // 2, 16), finest]
+    if posed.baseline < 1e-3 * posed.near:
+        return [_no_parallax(finest, posed) for _ in posed.images]
+    surfaces: list[Surface] | None = None
+    low, high = 1 / posed.far, 1 / (config.near_margin * posed.near)
+    steps = (high - low) * posed.baseline / (math.pi / heights[0])  # candidates a pixel of parallax apart
+    count = int(np.clip(math.ceil(steps), 48, config.max_candidates))
+    step = (high - low) / (count - 1)
+    for n in range(config.coarse_passes):
+        report("searching the whole depth range", 0.5 * n / config.coarse_passes)
+        level = _Level(posed, heights[0], axes, (low, high), config, surfaces)
+        surfaces = [level.search_all(view, count) for view in range(len(posed.images))]
+    for n, height in enumerate(heights[1:]):
+        report("refining the surfaces", 0.5 + 0.25 * n)
+        assert surfaces is not None
+        surfaces = [
+            guided_upsample(s, resize_sphere(image, s.height), resize_sphere(image, height))
+            for s, image in zip(surfaces, posed.images, strict=True)
+        ]
+        step /= 2
+        level = _Level(posed, height, axes, (low, high), config, surfaces)
+        surfaces = [
+            level.search_near(view, config.narrow_candidates[n], step, spread=n == 0)
+            for view in range(len(posed.images))
+        ]
+    assert surfaces is not None
+    return surfaces
+
+
+def _no_parallax(height: int, posed: PosedImages) -> Surface:
+    """Where cameras coincide nothing can be matched: the middle of the inverse depth range."""
+    inverse = np.full((height, 2 * height), 0.5 * (1 / posed.near + 1 / posed.far), np.float32)
+    return Surface(inverse, np.zeros(inverse.shape, np.uint8))
+
+
+class _Level:
+    """All views at one height, with what is known of their surfaces so far."""
+
+    def __init__(
+        self,
+        posed: PosedImages,
+        height: int,
+        axes: np.ndarray,
+        limits: tuple[float, float],
+        config: SearchConfig,
+        surfaces: list[Surface] | None,
+    ) -> None:
+        self.posed, self.height, self.limits, self.config, self.surfaces = (
+            posed,
+            height,
+            limits,
+            config,
+            surfaces,
+        )
+        self.rays = [main_directions(axes, pose[:3, :3], height) for pose in posed.cam2world]
+        self.axes = axes
+        self.support: PlaneSupport | None = None
+        masks = [
+            cv2.resize(mask.astype(np.uint8), (2 * height, height), interpolation=cv2.INTER_NEAREST) > 0
+            for mask in posed.masks
+        ]
+        confidence: list[np.ndarray | None] = [None] * len(masks)
+        if surfaces is not None:
+            agreed = [agreement(surfaces, posed.cam2world, view) & mask for view, mask in enumerate(masks)]
+            confidence = [np.where(a, 1, config.unsure_confidence).astype(np.float32) for a in agreed]
+            self.support = plane_support(surfaces, agreed, posed.cam2world, axes, posed.far)
+        self.views = [
+            View(
+                resize_sphere(image, height),
+                mask,
+                np.ascontiguousarray(rays[0], np.float32),
+                None if surfaces is None else surfaces[n].inverse_depth,
+                confidence[n],
+            )
+            for n, (image, mask, rays) in enumerate(zip(posed.images, masks, self.rays, strict=True))
+        ]
+
+    def search_all(self, view: int, count: int) -> Surface:
+        """The whole depth range, among spheres (family 0) and planes along the axes (families 1 to 3)."""
+        low, high = self.limits
+        step = (high - low) / (count - 1)
+        shape = (self.height, 2 * self.height)
+        slopes = [np.ones(shape, np.float32)] + [np.abs(r).astype(np.float32) for r in self.rays[view]]
+        sides = [np.zeros(shape, np.uint8)] + [(r > 0).astype(np.uint8) for r in self.rays[view]]
+        inverse = low + step * np.arange(count)
+        penalties = [np.zeros((2, count), np.float32) for _ in slopes]
+        if self.support is not None:
+            penalties[0] += self.config.sphere_prior
+            for axis in range(3):
+                penalties[axis + 1] = self.config.plane_prior * (
+                    1 - self.support.share(axis, self.posed.cam2world[view], inverse)
+                )
+        families = [
+            Family(low * slope, step * slope, penalty.astype(np.float32), side)
+            for slope, penalty, side in zip(slopes, penalties, sides, strict=True)
+        ]
+        slot_map = np.stack([np.stack((s, (s - 1) * low / step + 0.5), axis=-1) for s in slopes], axis=2)
+        return self._solve(view, families, slot_map.astype(np.float32), count)
+
+    def search_near(self, view: int, count: int, step: float, *, spread: bool) -> Surface:
+        """A narrow range around the surface so far; with `spread` also around its neighbours' near and far side."""
+        assert self.surfaces is not None
+        known = self.surfaces[view].inverse_depth
+        centres = [known]
+        if spread:
+            window = np.ones((5, 5), np.uint8)
+            centres += [cv2.dilate(known, window), cv2.erode(known, window)]
+        steps = np.full(known.shape, step, np.float32)
+        side = np.zeros(known.shape, np.uint8)
+        penalty = np.zeros((2, count), np.float32)
+        families = [Family((c - step * (count // 2)).astype(np.float32), steps, penalty, side) for c in centres]
+        slots = 2 * count
+        starts = np.stack([np.clip((c - known) / step, -4 * slots, 4 * slots) + count / 2 for c in centres], axis=2)
+        slot_map = np.stack((np.ones_like(starts), starts), axis=-1).astype(np.float32)
+        surface = self._solve(view, families, slot_map, slots)
+        return Surface(surface.inverse_depth, self.surfaces[view].family)
+
+    def _solve(self, view: int, families: list[Family], slot_map: np.ndarray, slots: int) -> Surface:
+        """Match against every other view, aggregate, and read the best hypothesis off."""
+        count = families[0].penalty.shape[1]
+        others = [n for n in range(len(self.views)) if n != view]
+        bounds = (math.inf, -math.inf) if self.support is None else self.support.bounds(self.posed.cam2world[view])
+        cost: np.ndarray | None = None
+        for other in others:
+            part = matching_cost(
+                self.views[view], self.views[other], self.posed.relative_pose(view, other),
+                families, self.limits, bounds, self.config.matching,
+            )  # fmt: skip
+            cost = part if cost is None else cost + part
+        assert cost is not None
+        if len(others) > 1:
+            cost /= len(others)
+        total = aggregate(cost, self.views[view].image, slot_map, slots, self.config.aggregation)
+        label, offset = best_labels(total, count)
+        family, k = label // count, label % count
+        base = np.stack([f.base for f in families], axis=-1)
+        step = np.stack([f.step for f in families], axis=-1)
+        rows, columns = np.indices(label.shape)
+        inverse = base[rows, columns, family] + (k + offset) * step[rows, columns, family]
+        return Surface(np.clip(inverse, *self.limits).astype(np.float32), family.astype(np.uint8))
