@@ -138,9 +138,7 @@ def _run(options: Options) -> int:
         print(f"{problem}: writing a fly-through instead")
     chosen = entries if everything else entries[first : first + 1]
     if len(chosen) < len(entries):
-        print(
-            f"{options.path} holds {len(entries)}: showing {chosen[0].name}; choose with --pair NAME or all"
-        )
+        print(f"{options.path} holds {len(entries)}: showing {chosen[0].name}; choose with --pair NAME or all")
     for entry in chosen:
         if folder is None:
             target = Path("renders") / entry.folder_name
@@ -207,9 +205,7 @@ def _write(options: Options, entry: Entry, folder: Path, pixels: tuple[int, int]
             lambda what, done: bars.update(load, description=f"{entry.name}: {what}", completed=done),
             photos=False,
         )
-        bars.update(
-            load, description=f"{entry.name}: {len(loaded.scene.gaussians):,} Gaussians", completed=1.0
-        )
+        bars.update(load, description=f"{entry.name}: {len(loaded.scene.gaussians):,} Gaussians", completed=1.0)
         draw = bars.add_task("fly-through", total=1.0)
         settings = options.settings
         if len(loaded.scene.cam2world) < 2 and settings.mode in ("deferred", "difference"):

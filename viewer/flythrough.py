@@ -87,9 +87,7 @@ def write_flythrough(
     """
     folder.mkdir(parents=True, exist_ok=True)
     renderer.upload(scene)
-    settings = replace(
-        settings, vertical_fov_degrees=film.vertical_fov_degrees, layout="pinhole", cached=False
-    )
+    settings = replace(settings, vertical_fov_degrees=film.vertical_fov_degrees, layout="pinhole", cached=False)
     steps = film.frames + len(STILLS) + 1
     written = []
     for done, fraction in enumerate(STILLS):

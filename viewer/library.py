@@ -71,9 +71,7 @@ def find_entries(path: Path, options: LoadOptions) -> list[Entry]:
         InputError: no such path, or nothing in it that can be shown.
     """
     if not path.exists():
-        raise InputError(
-            f"{path}: no such file or folder; give a pair folder, a folder of pairs or a scene .ply"
-        )
+        raise InputError(f"{path}: no such file or folder; give a pair folder, a folder of pairs or a scene .ply")
     if path.is_file() and path.suffix.lower() == ".ply":
         return [Entry(path.stem, file=path)]
     scenes = sorted(p for p in path.iterdir() if p.suffix.lower() == ".ply") if path.is_dir() else []

@@ -16,9 +16,7 @@ Rectangle = tuple[float, float, float, float]  # left, top, right, bottom, pixel
 _PANEL_WIDTH = 290.0
 _MARGIN = 10.0
 _FIXED = (
-    imgui.WindowFlags_.no_move.value
-    | imgui.WindowFlags_.no_resize.value
-    | imgui.WindowFlags_.no_saved_settings.value
+    imgui.WindowFlags_.no_move.value | imgui.WindowFlags_.no_resize.value | imgui.WindowFlags_.no_saved_settings.value
 )
 _LABEL = (
     _FIXED
@@ -279,10 +277,9 @@ class Panels:
         imgui.set_next_window_bg_alpha(0.6)
         imgui.begin("##stats", None, _LABEL)
         stats = facts.stats
-        rate = f"{1000 / facts.frame_ms:.0f} fps" if facts.frame_ms > 0 else ""
         x, y, z = state.camera.position
         lines = [
-            f"{facts.frame_ms:.1f} ms  {rate}   draw {stats.frame_ms:.1f} ms   sort {stats.sort_ms:.0f} ms",
+            f"frame {facts.frame_ms:.1f} ms   draw {stats.frame_ms:.1f} ms   sort {stats.sort_ms:.0f} ms",
             f"{stats.drawn:,} drawn of {stats.visible:,} of {stats.total:,}",
             f"{facts.size[0]} x {facts.size[1]}   {stats.tier}" + ("   cached" if stats.cached else ""),
             f"x {x:.2f}  y {y:.2f}  z {z:.2f} m",

@@ -86,9 +86,14 @@ class Viewer:
     @property
     def busy(self) -> bool:
         """Whether the next frame will differ without any new input."""
-        moving = self._clock() - self._pacer.last_motion < 2 * REFINE_AFTER
+        return self.moving or self.facts.loading is not None
+
+    @property
+    def moving(self) -> bool:
+        """Whether the picture is still changing: a window should draw as often as it can."""
+        recently = self._clock() - self._pacer.last_motion < 2 * REFINE_AFTER
         unsettled = self._picture is not None and not self.renderer.stats.settled
-        return self.state.playing or self.facts.loading is not None or moving or unsettled
+        return self.state.playing or recently or unsettled
 
     def open(self, path: Path) -> None:
         """Show what a path holds; an unusable path is said in the window and changes nothing else."""
@@ -106,9 +111,7 @@ class Viewer:
         self.facts.current, self.facts.error = index, None
         self.loader.request(entries[index])
 
-    def frame(
-        self, target: moderngl.Framebuffer, seconds: float, new_frame: Callable[[], None] | None = None
-    ) -> None:
+    def frame(self, target: moderngl.Framebuffer, seconds: float, new_frame: Callable[[], None] | None = None) -> None:
         """Take the input, let `seconds` pass, and draw picture and panels into `target`'s viewport.
 
         `new_frame` tells imgui about the window (size, pointer); without it the caller has set imgui's io.
@@ -197,9 +200,7 @@ class Viewer:
             vertical_fov_degrees=camera.vertical_fov_degrees,
         )
 
-    def _render(
-        self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], plan: Plan
-    ) -> moderngl.Texture:
+    def _render(self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], plan: Plan) -> moderngl.Texture:
         """The picture of this plan, drawn only when something changed since the last one."""
         drawn = (max(round(size[0] * plan.scale), 1), max(round(size[1] * plan.scale), 1))
         settings = replace(self.state.draw_settings, cached=plan.cached)

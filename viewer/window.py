@@ -15,7 +15,7 @@ from imgui_bundle import imgui
 from pansplat_viewer.viewer import Viewer
 
 _DEBIAN = "on Debian or Ubuntu: apt-get install libgl1 libegl1 libgl1-mesa-dri libgles2"
-_IDLE_SECONDS = 0.1  # between frames when nothing moves
+_IDLE_SECONDS = 0.1  # between frames when nothing moves: a prediction in its thread needs the processor
 
 
 class NoWindowError(Exception):
@@ -24,9 +24,7 @@ class NoWindowError(Exception):
 
 def display_problem() -> str | None:
     """Why there can be no window, as far as the environment tells; None when it is worth trying."""
-    if sys.platform.startswith("linux") and not (
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    ):
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         return "no display (neither DISPLAY nor WAYLAND_DISPLAY is set)"
     return None
 
@@ -104,12 +102,12 @@ class Window:
             imgui.backends.glfw_shutdown()
             self._backend = False
 
-    def wait(self, busy: bool) -> None:
-        """Take in events; when not `busy`, sleep until one comes or a moment passed."""
-        if busy:
+    def wait(self, seconds: float) -> None:
+        """Take in events; sleep until one comes, at most so long."""
+        if seconds <= 0:
             self._glfw.poll_events()
         else:
-            self._glfw.wait_events_timeout(_IDLE_SECONDS)
+            self._glfw.wait_events_timeout(seconds)
 
     @property
     def closing(self) -> bool:
@@ -150,10 +148,10 @@ def _loop(window: Window, viewer: Viewer) -> None:
     active_until = 0.0
     target = window.ctx.detect_framebuffer(0)
     while not (window.closing or viewer.state.quit):
-        busy = viewer.busy or time.perf_counter() < active_until
         before = time.perf_counter()
-        window.wait(busy)
-        if not busy and time.perf_counter() - before < 0.9 * _IDLE_SECONDS:
+        moving = viewer.moving or before < active_until
+        window.wait(0.0 if moving else _IDLE_SECONDS)
+        if not moving and time.perf_counter() - before < 0.9 * _IDLE_SECONDS:
             active_until = time.perf_counter() + 0.25  # an event: imgui needs a few frames to answer it
         if window.dropped:
             viewer.open(window.dropped[-1])

@@ -26,8 +26,7 @@ def small_scene() -> Scene:
         parts.append(
             Gaussians(
                 means=directions * radii + torch.tensor((0, 0, 0.5 * view)),
-                scales=torch.tensor((0.5, 0.3, 0.1))
-                * torch.where(torch.arange(count) % 2 > 0, 1, 0.02)[:, None],
+                scales=torch.tensor((0.5, 0.3, 0.1)) * torch.where(torch.arange(count) % 2 > 0, 1, 0.02)[:, None],
                 quats=torch.randn(count, 4, generator=random),
                 opacities=torch.rand(count, generator=random),
                 harmonics=((color - 0.5) / _Y0)[:, None, :],

@@ -29,9 +29,7 @@ def test_help_needs_neither_torch_nor_opengl():
         "try: run(['--help'])\nexcept SystemExit: pass\n"
         "print(sorted({'torch', 'moderngl', 'glfw', 'imgui_bundle'} & set(sys.modules)))"
     )
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
-    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert result.stdout.strip().endswith("[]")
     assert "--offscreen" in result.stdout
 

@@ -278,9 +278,7 @@ def test_speed_slider_changes_the_speed(person):
     left, top, _, bottom = person.viewer.panels.items["speed"]
     person.drag((left + 20, (top + bottom) / 2), (left + 80, (top + bottom) / 2))
     assert person.viewer.state.speed > before
-    assert person.viewer.state.camera == person.viewer.state.home, (
-        "a drag on a panel is not a drag on the scene"
-    )
+    assert person.viewer.state.camera == person.viewer.state.home, "a drag on a panel is not a drag on the scene"
 
 
 def test_dragging_the_picture_looks_around_and_carries_it_along(person):
@@ -289,9 +287,7 @@ def test_dragging_the_picture_looks_around_and_carries_it_along(person):
     after = person.picture()
     assert person.viewer.state.camera.yaw_radians > 0
     # The scene sticks to the pointer: shifted back by 30 pixels the pictures agree best.
-    errors = {
-        s: np.abs(before[100:380, 60:200] - after[100:380, 60 + s : 200 + s]).mean() for s in (-30, 0, 30)
-    }
+    errors = {s: np.abs(before[100:380, 60:200] - after[100:380, 60 + s : 200 + s]).mean() for s in (-30, 0, 30)}
     assert min(errors, key=errors.get) == -30
 
 

@@ -46,9 +46,7 @@ class Display:
     def __init__(self, folder: Path) -> None:
         read, write = os.pipe()
         command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x800x24", "-fbdir", str(folder)]
-        self._server = subprocess.Popen(
-            [*command, "-nolisten", "tcp"], pass_fds=(write,), stderr=subprocess.DEVNULL
-        )
+        self._server = subprocess.Popen([*command, "-nolisten", "tcp"], pass_fds=(write,), stderr=subprocess.DEVNULL)
         os.close(write)
         with os.fdopen(read) as answer:
             self.name = f":{answer.readline().strip()}"
@@ -66,9 +64,7 @@ class Display:
     def do(self, *command: str) -> str:
         """Run xdotool on this display."""
         environment = {**os.environ, "DISPLAY": self.name}
-        result = subprocess.run(
-            ["xdotool", *command], env=environment, capture_output=True, text=True, timeout=20
-        )
+        result = subprocess.run(["xdotool", *command], env=environment, capture_output=True, text=True, timeout=20)
         return result.stdout.strip()
 
     def close(self) -> None:
@@ -154,7 +150,7 @@ def test_what_is_dropped_on_the_window_is_opened():
     from pansplat_viewer.window import Window, _loop
 
     class Opener:
-        busy = True
+        moving = True
         state = SimpleNamespace(quit=False)
         facts = SimpleNamespace(current=-1)
         opened: ClassVar[list[Path]] = []
@@ -174,7 +170,7 @@ def test_what_is_dropped_on_the_window_is_opened():
             self.dropped = []
             self._drop(None, ["/somewhere/a pair"])
 
-        def wait(self, busy: bool) -> None: ...
+        def wait(self, seconds: float) -> None: ...
         def set_title(self, title: str) -> None: ...
         def swap(self) -> None: ...
 
