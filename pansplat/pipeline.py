@@ -20,15 +20,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.data.atomic import replacing
+from pansplat.atomic import replacing
 from pansplat.data.pairs import Pair, load_pairs
 from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.gaussians.ply import load_ply, save_ply
 from pansplat.gaussians.scene import Scene
+from pansplat.geometry.blending import blend_weights
 from pansplat.model.predictor import Predictor, Progress
-from pansplat.render import Rendering, blend_weights, rasterize
+from pansplat.render import Rendering, rasterize
 from pansplat.render import blend as blend_renderings
 
 __all__ = ["load", "load_model", "load_pairs", "predict", "render", "save"]
@@ -164,16 +165,12 @@ def _only_pair(path: str | Path) -> Pair:
     pairs = load_pairs(path)
     if len(pairs) != 1:
         names = ", ".join(pair.name for pair in pairs[:8]) + (", ..." if len(pairs) > 8 else "")
-        raise InputError(
-            f"{path} holds {len(pairs)} pairs ({names}); choose one: predict(load_pairs(path)[0])"
-        )
+        raise InputError(f"{path} holds {len(pairs)} pairs ({names}); choose one: predict(load_pairs(path)[0])")
     return pairs[0]
 
 
 def _predict(views: Views, predictor: Predictor, progress: Progress | None) -> Scene:
-    gaussians = predictor(
-        views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress
-    )
+    gaussians = predictor(views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress)
     assert isinstance(gaussians, Gaussians)  # a list answers a batch only
     return _scene(gaussians, views, predictor)
 

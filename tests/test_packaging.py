@@ -64,9 +64,10 @@ def run_in(site: Path, *command: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_package_list_is_what_the_disk_holds() -> None:
-    on_disk = {
-        ".".join(file.parent.relative_to(ROOT).parts) for file in (ROOT / "pansplat").rglob("__init__.py")
-    } | {"pansplat_viewer", "pansplat_viewer.shaders"}
+    on_disk = {".".join(file.parent.relative_to(ROOT).parts) for file in (ROOT / "pansplat").rglob("__init__.py")} | {
+        "pansplat_viewer",
+        "pansplat_viewer.shaders",
+    }
     on_disk |= {
         "pansplat_viewer." + ".".join(file.parent.relative_to(ROOT / "viewer").parts)
         for file in (ROOT / "viewer").glob("*/**/__init__.py")
@@ -118,9 +119,7 @@ def test_an_installed_wheel_is_used_and_reads_its_shaders(installed: Path) -> No
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize(
-    ("command", "status"), [("pansplat", 0), ("pansplat-view", 0), ("pansplat-train", 1)]
-)
+@pytest.mark.parametrize(("command", "status"), [("pansplat", 0), ("pansplat-view", 0), ("pansplat-train", 1)])
 def test_the_entry_points_of_an_installed_wheel_work(installed: Path, command: str, status: int) -> None:
     arguments = ["--help"] if status == 0 else []
     done = run_in(installed, sys.executable, str(installed / "bin" / command), *arguments)
@@ -131,9 +130,7 @@ def test_the_entry_points_of_an_installed_wheel_work(installed: Path, command: s
 def test_tests_pass_against_the_installed_wheel(installed: Path) -> None:
     """Not only against the checkout: one room's tests, with the wheel's modules."""
     options = ["-q", "-p", "no:cacheprovider", "-c", str(ROOT / "pyproject.toml")]
-    done = run_in(
-        installed, sys.executable, "-m", "pytest", *options, str(ROOT / "tests/gaussians/test_ply.py")
-    )
+    done = run_in(installed, sys.executable, "-m", "pytest", *options, str(ROOT / "tests/gaussians/test_ply.py"))
     assert done.returncode == 0, done.stdout
     assert " passed" in done.stdout
 
@@ -144,8 +141,6 @@ def test_setup_pins_torch_and_names_no_missing_file() -> None:
     pinned = {line.split("==")[0] for line in constraints if line and not line.startswith("#")}
     wanted = project()["project"]
     names = [*wanted["dependencies"], *wanted["optional-dependencies"]["dev"]]
-    bare = {
-        name.split(";")[0].split(">")[0].split("[")[0].strip().lower().replace("_", "-") for name in names
-    }
+    bare = {name.split(";")[0].split(">")[0].split("[")[0].strip().lower().replace("_", "-") for name in names}
     assert not bare - pinned  # every direct dependency is a tested version
     assert subprocess.run(["bash", "-n", str(ROOT / "setup.sh")]).returncode == 0

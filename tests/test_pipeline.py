@@ -27,9 +27,7 @@ class Sphere:
     def __init__(self, fingerprint: str = "1") -> None:
         self.name, self.fingerprint, self.calls = "sphere", fingerprint, 0
 
-    def __call__(
-        self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None, progress=None
-    ):
+    def __call__(self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None, progress=None):
         self.calls += 1
         view, _, height, width = images.shape
         directions = pixel_directions(height, width, dtype=torch.float64).reshape(-1, 3)
@@ -124,9 +122,7 @@ def add_mask(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("change", [repaint, move, set_range, add_mask])
-def test_any_change_of_the_pair_makes_a_new_prediction(
-    pair_folder: Path, change: Callable[[Path], None]
-) -> None:
+def test_any_change_of_the_pair_makes_a_new_prediction(pair_folder: Path, change: Callable[[Path], None]) -> None:
     predictor = Sphere()
     predict(pair_folder, predictor, height=HEIGHT)
     change(pair_folder)

@@ -12,6 +12,10 @@ from pansplat_viewer.layers import LayerPainter, Shot
 from pansplat_viewer.programs import Programs, set_uniforms
 from pansplat_viewer.targets import Target, TargetStore
 
+# Least weight of a view in deferred blending, by the bits of the targets: it shows a view only where the others see
+# nothing (an input's own masked tripod), and is lost in rounding elsewhere.
+_LEAST_WEIGHT = {16: 1e-4, 32: 2.0**-26}
+
 
 class Composer:
     """Adds weighted layers and finishes the sum over the background.
@@ -32,7 +36,10 @@ class Composer:
     def compose(self, shot: Shot, painter: LayerPainter) -> Target:
         """The shot's picture: RGB over the background, coverage, and depth where the layers carry it."""
         self.in_use = {"sum 0", "sum 1", "output"}
-        sums = [self._add(shot, painter, f"sum {i}", terms) for i, terms in enumerate(_terms(shot))]
+        sums = [
+            self._add(shot, painter, f"sum {i}", terms)
+            for i, terms in enumerate(_terms(shot, _LEAST_WEIGHT[self._targets.color_bits]))
+        ]
         output = self._targets.get("output", shot.size, depth_components=int(painter.with_depth))
         output.framebuffer.use()
         output.framebuffer.viewport = (0, 0, *shot.size)
@@ -51,9 +58,7 @@ class Composer:
             vertex_array.release()
         self._finish.release()
 
-    def _add(
-        self, shot: Shot, painter: LayerPainter, name: str, terms: list[tuple[int | None, float]]
-    ) -> Target:
+    def _add(self, shot: Shot, painter: LayerPainter, name: str, terms: list[tuple[int | None, float]]) -> Target:
         layers = [(painter.layer(view), weight) for view, weight in terms]
         target = self._targets.get(name, shot.size, depth_components=2)
         target.framebuffer.use()
@@ -79,16 +84,14 @@ class Composer:
         self._ctx.enable_only(moderngl.NOTHING)
         return target
 
-    def _bind(
-        self, program: object, names: tuple[str, ...], textures: tuple[moderngl.Texture | None, ...]
-    ) -> None:
+    def _bind(self, program: object, names: tuple[str, ...], textures: tuple[moderngl.Texture | None, ...]) -> None:
         for unit, (name, texture) in enumerate(zip(names, textures, strict=True)):
             # A sampler that is not read still needs a texture of its kind.
             (texture or textures[0]).use(location=unit)  # type: ignore[union-attr]
             set_uniforms(program, **{name: unit})
 
 
-def _terms(shot: Shot) -> list[list[tuple[int | None, float]]]:
+def _terms(shot: Shot, least_weight: float) -> list[list[tuple[int | None, float]]]:
     """Which layers with which weights make the picture, or the two pictures of mode `difference`."""
     settings, count = shot.settings, shot.splats.num_views
     if settings.mode == "joint":
@@ -109,8 +112,7 @@ def _terms(shot: Shot) -> list[list[tuple[int | None, float]]]:
         )
     import torch
 
-    from pansplat.render import blend_weights
+    from pansplat.geometry.blending import blend_weights
 
     weights = blend_weights(torch.from_numpy(shot.world_position.copy()), torch.from_numpy(positions))
-    # A view without weight changes nothing, so it need not be drawn.
-    return [[(view, weight) for view, weight in enumerate(weights.tolist()) if weight > 0]]
+    return [[(view, max(weight, least_weight)) for view, weight in enumerate(weights.tolist())]]

@@ -97,9 +97,7 @@ class SplatDrawer:
         program.run(min(groups, _ROW), -(-groups // _ROW))
         self._ctx.memory_barrier()
 
-    def _set_uniforms(
-        self, camera: Pinhole, settings: DrawSettings, viewport: tuple[int, int, int, int]
-    ) -> None:
+    def _set_uniforms(self, camera: Pinhole, settings: DrawSettings, viewport: tuple[int, int, int, int]) -> None:
         variance, dilation = filter_of(settings, camera.focal)
         project = self._programs.project() if self._tier == "gl33" else self._programs.project_compute()
         set_uniforms(

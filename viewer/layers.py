@@ -141,9 +141,7 @@ class LayerPainter:
         for part in needed:
             if part not in target.parts:
                 width, height = cameras[part].width, cameras[part].height
-                self._paint(
-                    target, cameras[part], keep, (part % 3 * width, part // 3 * height, width, height)
-                )
+                self._paint(target, cameras[part], keep, (part % 3 * width, part // 3 * height, width, height))
                 target.parts.add(part)
         return target
 
@@ -172,9 +170,7 @@ class LayerPainter:
             self._kept[key] = shot.splats.kept(shot.settings.levels, shot.settings.opacity_threshold, view)
         return self._kept[key]
 
-    def _paint(
-        self, target: Target, camera: Pinhole, keep: np.ndarray, viewport: tuple[int, int, int, int]
-    ) -> None:
+    def _paint(self, target: Target, camera: Pinhole, keep: np.ndarray, viewport: tuple[int, int, int, int]) -> None:
         shot = self._shot
         assert shot is not None
         indices = self._back_to_front(camera, keep)

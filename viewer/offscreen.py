@@ -69,9 +69,7 @@ class _OsMesa:
             0,
         )
         self._library = library
-        self._context = library.OSMesaCreateContextAttribs(
-            (ctypes.c_int * len(attributes))(*attributes), None
-        )
+        self._context = library.OSMesaCreateContextAttribs((ctypes.c_int * len(attributes))(*attributes), None)
         if not self._context:
             raise OSError("OSMesaCreateContextAttribs made no OpenGL 3.3 context")
         # OSMesa draws into memory of ours; all that matters goes to framebuffer objects, so 1x1 will do.

@@ -59,9 +59,7 @@ def face_cameras(
 def faces_in_sight(camera_to_faces: Float[np.ndarray, "3 3"], half_size: tuple[float, float]) -> list[int]:
     """The faces that a pinhole picture looks at."""
     x, y = (np.linspace(-half, half, 65) for half in half_size)
-    rays = (
-        np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), axis=-1).reshape(-1, 3) @ camera_to_faces.T
-    )
+    rays = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), axis=-1).reshape(-1, 3) @ camera_to_faces.T
     faces = []
     for face, rotation in enumerate(face_rotations().numpy()):
         local = rays @ rotation

@@ -18,9 +18,7 @@ RECORD_BYTES = 16 * len(RECORD)
 def source(name: str, version: int, **defines: int) -> str:
     """A shader file's text with its includes, constants and `#version` line for GL `version` (330 or 430)."""
     folder = resources.files("pansplat_viewer.shaders")
-    text = _INCLUDE.sub(
-        lambda match: (folder / match[1]).read_text("utf-8"), (folder / name).read_text("utf-8")
-    )
+    text = _INCLUDE.sub(lambda match: (folder / match[1]).read_text("utf-8"), (folder / name).read_text("utf-8"))
     constants = "".join(f"#define {key} {value}\n" for key, value in defines.items())
     return f"#version {version} core\n{constants}{text}"
 

@@ -124,9 +124,7 @@ class SplatRenderer:
         self._draw(shot, with_depth=False)
         self._ctx.finish()
         _bind(previous)
-        self.stats = dataclasses.replace(
-            self.stats, settled=settled, frame_ms=1e3 * (time.perf_counter() - start)
-        )
+        self.stats = dataclasses.replace(self.stats, settled=settled, frame_ms=1e3 * (time.perf_counter() - start))
         assert self._picture is not None
         return self._picture.color
 
@@ -197,9 +195,7 @@ class SplatRenderer:
         if self._picture is None:
             raise InputError("there is no picture to read; call `render` first")
         width, height = self._picture.size
-        data = self._picture.framebuffer.read(
-            components=components, attachment=attachment, dtype="f4", alignment=1
-        )
+        data = self._picture.framebuffer.read(components=components, attachment=attachment, dtype="f4", alignment=1)
         return np.frombuffer(data, np.float32).reshape(height, width, components)[::-1].copy()
 
     def _release_scene(self) -> None:

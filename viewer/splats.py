@@ -115,9 +115,7 @@ class Splats:
             colors[part, :3] = np.maximum(sums, 0).T
         return colors
 
-    def kept(
-        self, levels: frozenset[int] | None, threshold: float, view: int | None
-    ) -> Bool[np.ndarray, "n"]:
+    def kept(self, levels: frozenset[int] | None, threshold: float, view: int | None) -> Bool[np.ndarray, "n"]:
         """Which splats the level, opacity and view toggles leave and whose opacity can be seen at all."""
         keep = self.reach > 0
         if threshold > 0:

@@ -53,13 +53,11 @@ class TargetStore:
     def __init__(self, ctx: moderngl.Context, *, color_bits: int, budget_bytes: int = 1 << 30) -> None:
         """Nothing is allocated yet."""
         self._ctx = ctx
-        self._color_bits = color_bits
+        self.color_bits = color_bits
         self._budget = budget_bytes
         self._targets: OrderedDict[Hashable, Target] = OrderedDict()
 
-    def get(
-        self, name: Hashable, size: tuple[int, int], *, depth_components: int = 0, key: Hashable = None
-    ) -> Target:
+    def get(self, name: Hashable, size: tuple[int, int], *, depth_components: int = 0, key: Hashable = None) -> Target:
         """The target of this name and size, holding either what was drawn from `key` or nothing.
 
         Depth that was wanted once is kept as long as the content is, and costs nothing after that.
@@ -72,7 +70,7 @@ class TargetStore:
                 target.release()
                 target = None
         if target is None:
-            target = Target(self._ctx, size, color_bits=self._color_bits, depth_components=depth_components)
+            target = Target(self._ctx, size, color_bits=self.color_bits, depth_components=depth_components)
             self._targets[name] = target
         if key is None or target.key != key:
             target.begin(key)

@@ -39,15 +39,13 @@ class Graph:
 
     def stretched(self, scale: Color, turn: float = 0.0) -> bpy.types.NodeSocket:
         """Position scaled per axis, after a turn about z by `turn` radians."""
-        return self.add(
-            "ShaderNodeMapping", Vector=self.position, Scale=scale, Rotation=(0.0, 0.0, turn)
-        ).outputs["Vector"]
+        return self.add("ShaderNodeMapping", Vector=self.position, Scale=scale, Rotation=(0.0, 0.0, turn)).outputs[
+            "Vector"
+        ]
 
     def noise(self, vector: bpy.types.NodeSocket, scale: float, detail: float = 6.0) -> bpy.types.NodeSocket:
         """Fractal noise, mostly in 0.3 to 0.7."""
-        return self.add(
-            "ShaderNodeTexNoise", Vector=vector, Scale=scale, Detail=detail, Roughness=0.6
-        ).outputs["Fac"]
+        return self.add("ShaderNodeTexNoise", Vector=vector, Scale=scale, Detail=detail, Roughness=0.6).outputs["Fac"]
 
     def ramp(self, value: bpy.types.NodeSocket, stops: list[tuple[float, Color]]) -> bpy.types.NodeSocket:
         """Colours along a value, at least two stops."""
@@ -126,9 +124,7 @@ def wood(color: Color, axis: int = 0, fineness: float = 1.0) -> bpy.types.Materi
     return g.finish(color_, _scaled(color, 0.85))
 
 
-def planks(
-    color: Color, length: float = 1.35, width: float = 0.13, spread: float = 0.4
-) -> bpy.types.Material:
+def planks(color: Color, length: float = 1.35, width: float = 0.13, spread: float = 0.4) -> bpy.types.Material:
     """Long boards along x, each with its own tone (1 - `spread` to 1 + `spread` of the colour)."""
     g = Graph("planks", roughness=0.75, specular=0.12)
     low, high = (1 - spread,) * 3, (1 + spread,) * 3
@@ -138,9 +134,7 @@ def planks(
     )  # fmt: skip
     brick.offset, brick.offset_frequency = 0.37, 2
     grain = g.noise(g.stretched((1.1, 16.0, 4.0)), 2.0, 9.0)
-    tone = g.ramp(
-        grain, [(0.3, _scaled(color, 1 - spread)), (0.52, color), (0.72, _scaled(color, 1 + 0.7 * spread))]
-    )
+    tone = g.ramp(grain, [(0.3, _scaled(color, 1 - spread)), (0.52, color), (0.72, _scaled(color, 1 + 0.7 * spread))])
     stain = g.ramp(g.noise(g.position, 0.9, 5.0), [(0.35, (0.8, 0.78, 0.76)), (0.65, (1.0, 1.0, 1.0))])
     return g.finish(g.mix(g.mix(tone, brick.outputs["Color"]), stain), _scaled(color, 0.82))
 

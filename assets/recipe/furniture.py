@@ -91,12 +91,8 @@ def catalogue(folder: Path) -> dict[str, Entry]:
             if obj.suffix != ".obj" or not obj.exists():
                 continue
             size = tuple(float(f[k]) / 100 for k in ("width", "depth", "height"))
-            rotation = np.array(
-                [float(x) for x in f.get("modelRotation", "1 0 0 0 1 0 0 0 1").split()]
-            ).reshape(3, 3)
-            entries[f"{library}/{obj.stem}"] = Entry(
-                library, f["name"], f.get("creator", ""), obj, size, rotation
-            )
+            rotation = np.array([float(x) for x in f.get("modelRotation", "1 0 0 0 1 0 0 0 1").split()]).reshape(3, 3)
+            entries[f"{library}/{obj.stem}"] = Entry(library, f["name"], f.get("creator", ""), obj, size, rotation)
     return entries
 
 
@@ -112,9 +108,7 @@ class Furniture:
         """A model's meshes, scaled, turned upright, standing on z = 0 with its front towards -y."""
         entry = self.entries[key]
         before = set(bpy.data.objects)
-        bpy.ops.wm.obj_import(
-            filepath=str(entry.obj), forward_axis="NEGATIVE_Z", up_axis="Y", use_split_objects=False
-        )
+        bpy.ops.wm.obj_import(filepath=str(entry.obj), forward_axis="NEGATIVE_Z", up_axis="Y", use_split_objects=False)
         parts = [o for o in bpy.data.objects if o not in before]
         for part in parts:
             for slot in part.material_slots:
@@ -174,9 +168,7 @@ class Furniture:
             bpy.context.scene.collection.objects.link(part)
             for slot in part.material_slots:
                 name = slot.material.name.lower() if slot.material else ""
-                slot.material = finish or next(
-                    (m for k, m in (finishes or {}).items() if k in name), slot.material
-                )
+                slot.material = finish or next((m for k, m in (finishes or {}).items() if k in name), slot.material)
 
 
 def _points(part: bpy.types.Object) -> np.ndarray:
@@ -192,9 +184,7 @@ def _find_images(material: bpy.types.Material | None, folder: Path) -> None:
     tree = material.node_tree
     for node in [n for n in tree.nodes if n.type == "TEX_IMAGE" and n.image and not n.image.size[0]]:
         wanted = Path(bpy.path.abspath(node.image.filepath)).stem.lower()
-        found = [
-            p for p in sorted(folder.iterdir()) if p.suffix in (".jpg", ".png") and p.stem.lower() in wanted
-        ]
+        found = [p for p in sorted(folder.iterdir()) if p.suffix in (".jpg", ".png") and p.stem.lower() in wanted]
         if found:
             node.image = bpy.data.images.load(str(found[0]), check_existing=True)
         else:

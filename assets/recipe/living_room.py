@@ -136,9 +136,7 @@ def hang_curtains(taste: Taste) -> None:
     """Curtains left and right of each window, on a rod."""
     cloth = f.fabric(taste.drape, 0.3, 60.0)
     rod = f.wood((0.16, 0.08, 0.04), axis=0)
-    for k, (wall, o) in enumerate(
-        ((SOUTH, WINDOWS[0]), (SOUTH, WINDOWS[1]), (SOUTH2, FAR_WINDOW), (END, END_WINDOW))
-    ):
+    for k, (wall, o) in enumerate(((SOUTH, WINDOWS[0]), (SOUTH, WINDOWS[1]), (SOUTH2, FAR_WINDOW), (END, END_WINDOW))):
         for side, (a, b) in enumerate(((o.start - 0.34, o.start + 0.10), (o.end - 0.10, o.end + 0.34))):
             curtain(wall, a, b, 0.04, 2.46, cloth, 10 * k + side)
         near, far = wall.face + wall.inside * 0.085, wall.face + wall.inside * 0.115
@@ -202,9 +200,7 @@ def furnish_living(room: Furniture, taste: Taste, wiggle: Callable[[], float]) -
     room.place("BlendSwap-CC-0/bedsideTable2", -1.86, 2.28, finish=oak)
     room.place("Scopia/little_lamp1", -1.86, 2.3, 0.455, scale=1.2)
     room.place("Scopia/living_lamp", 1.25, 2.22, scale=1.12, degrees=160)
-    room.place(
-        "BlendSwap-CC-BY/piano", -0.05, -2.26, degrees=180, finishes={"material.001": oak, "klavierlack": oak}
-    )
+    room.place("BlendSwap-CC-BY/piano", -0.05, -2.26, degrees=180, finishes={"material.001": oak, "klavierlack": oak})
     room.place("BlendSwap-CC-0/pianoBench", -0.05 + wiggle(), -1.62, degrees=180)
     room.place("Scopia/calla_lily_with_roses", 0.4, -2.35, 1.385)
     books(-0.6, -2.45, 1.385, 6, 21)
@@ -213,9 +209,7 @@ def furnish_living(room: Furniture, taste: Taste, wiggle: Callable[[], float]) -
     room.place("BlendSwap-CC-BY/tulips", -1.5, -2.52, 0.72, scale=0.9)
     room.place("Scopia/ficus", 2.9, 2.15, scale=2.1)
     room.place("BlendSwap-CC-0/lamp2", -0.3, 0.95, HEIGHT - 0.65)
-    for i, (x, color) in enumerate(
-        ((-1.1, (0.5, 0.33, 0.1)), (-0.78, taste.chair), (0.35, (0.55, 0.48, 0.36)))
-    ):
+    for i, (x, color) in enumerate(((-1.1, (0.5, 0.33, 0.1)), (-0.78, taste.chair), (0.35, (0.55, 0.48, 0.36)))):
         cushion((x, 2.06, 0.66), 0.42, 0.25 * (i - 1), 0.35, f.fabric(color, 0.6, 35.0))
 
 
@@ -241,9 +235,7 @@ def furnish_dining(room: Furniture, wiggle: Callable[[], float]) -> None:
 
 def hang_pictures(folder: Path, seed: int) -> None:
     """Pictures on all walls."""
-    works = {
-        name: bpy.data.images.load(str(path)) for name, path in pictures.paint_all(folder, seed + 1).items()
-    }
+    works = {name: bpy.data.images.load(str(path)) for name, path in pictures.paint_all(folder, seed + 1).items()}
     dark, gold = f.wood((0.08, 0.04, 0.02), axis=0), f.wood((0.5, 0.33, 0.12), axis=2)
     framed(NORTH, -0.35, 1.70, (1.4, 0.84), works["evening"], gold)
     framed(NORTH, 1.3, 1.78, (0.5, 0.5), works["coast"], dark)

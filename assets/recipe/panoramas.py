@@ -137,9 +137,7 @@ def _write_json(path: Path, content: object) -> None:
     os.replace(part, path)
 
 
-def render_all(
-    out: Path, views: Sequence[str], height: int, samples: int, threads: int, scratch: Path
-) -> None:
+def render_all(out: Path, views: Sequence[str], height: int, samples: int, threads: int, scratch: Path) -> None:
     """Render the named views and write the pair folder."""
     out.mkdir(parents=True, exist_ok=True)
     _setup(height, samples, threads)
@@ -159,12 +157,8 @@ def render_all(
     for name, (place, angles) in VIEWS.items():
         pose = np.round(cam2world(place, angles), 15) + 0.0
         poses[f"{name}.jpg"] = {"cam2world": pose.tolist(), "depth": f"{name}_depth.png"}
-    _write_json(
-        out / "poses.json", {"convention": "cam2world opencv", "near": NEAR, "far": FAR, "poses": poses}
-    )
-    _write_json(
-        out / "pairs.json", {"pairs": [{"context": ["left.jpg", "right.jpg"], "target": ["middle.jpg"]}]}
-    )
+    _write_json(out / "poses.json", {"convention": "cam2world opencv", "near": NEAR, "far": FAR, "poses": poses})
+    _write_json(out / "pairs.json", {"pairs": [{"context": ["left.jpg", "right.jpg"], "target": ["middle.jpg"]}]})
 
 
 def write_credits(path: Path, credits: Iterable[Credit]) -> None:

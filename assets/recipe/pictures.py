@@ -86,16 +86,12 @@ def landscape(seed: int, width: int, height: int, palette: str = "evening") -> I
     return _stroke_over(image, rng)
 
 
-def poster(
-    width: int, height: int, title: str, lines: tuple[str, ...], paper: Tone, ink: Tone
-) -> Image.Image:
+def poster(width: int, height: int, title: str, lines: tuple[str, ...], paper: Tone, ink: Tone) -> Image.Image:
     """A printed poster: a Fibonacci lattice on a ball above words, so that a mirrored room is noticed."""
     image = Image.new("RGB", (width, height), paper)
     draw = ImageDraw.Draw(image)
     cx, cy, radius = width / 2, height * 0.36, width * 0.34
-    draw.ellipse(
-        (cx - radius, cy - radius, cx + radius, cy + radius), fill=tuple(int(0.8 * c) for c in paper)
-    )
+    draw.ellipse((cx - radius, cy - radius, cx + radius, cy + radius), fill=tuple(int(0.8 * c) for c in paper))
     count = 420
     for j in range(count):
         z = 1 - 2 * (j + 0.5) / count

@@ -165,9 +165,7 @@ class Wall:
         item = bpy.data.objects.new("portal", light)
         along, across, z = (o.start + o.end) / 2, (self.low + self.high) / 2, (o.bottom + o.top) / 2
         item.location = (along, across, z) if self.axis == 0 else (across, along, z)
-        turn = {(0, 1): 0.0, (0, -1): math.pi, (1, 1): -math.pi / 2, (1, -1): math.pi / 2}[
-            self.axis, self.inside
-        ]
+        turn = {(0, 1): 0.0, (0, -1): math.pi, (1, 1): -math.pi / 2, (1, -1): math.pi / 2}[self.axis, self.inside]
         item.rotation_euler = (math.pi / 2, 0.0, turn)
         bpy.context.scene.collection.objects.link(item)
 
@@ -184,9 +182,7 @@ def curtain(
     along = start + (end - start) * (s + 0.015 * np.sin(folds * 0.5 + 4 * t))
     across = wall.face + wall.inside * depth
     height = top + (bottom - top) * t
-    points = np.stack((along, across, height) if wall.axis == 0 else (across, along, height), -1).reshape(
-        -1, 3
-    )
+    points = np.stack((along, across, height) if wall.axis == 0 else (across, along, height), -1).reshape(-1, 3)
     faces = [
         (r * columns + c, r * columns + c + 1, (r + 1) * columns + c + 1, (r + 1) * columns + c)
         for r in range(rows - 1)

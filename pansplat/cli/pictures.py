@@ -33,9 +33,7 @@ def run_render(command: Render) -> int:
     _check(command, film)
     poses = None if command.pose is None else read_poses(command.pose)
     if poses is not None and len(poses) > 1 and not film:
-        raise InputError(
-            f"{command.pose} holds {len(poses)} poses; write an .mp4, or keep one pose in the file"
-        )
+        raise InputError(f"{command.pose} holds {len(poses)} poses; write an .mp4, or keep one pose in the file")
     scene = open_scene(command.path, command.choice, command.model, command.predict_height)
     layout = command.layout or ("perspective" if film else "equirect")
     options = _options(command, layout, command.height or (_FILM_HEIGHT if film else scene.height))
@@ -115,9 +113,7 @@ def _flight(scene: Scene, command: Render) -> list[Tensor]:
     return list(fly_path(scene.cam2world, [i / (count - 1) for i in range(count)]))
 
 
-def _frames(
-    scene: Scene, poses: list[Tensor], options: dict[str, Any], progress: Progress
-) -> Iterator[np.ndarray]:
+def _frames(scene: Scene, poses: list[Tensor], options: dict[str, Any], progress: Progress) -> Iterator[np.ndarray]:
     for index, pose in enumerate(poses):
         progress(f"picture {index + 1} of {len(poses)}", index / len(poses))
         with torch.no_grad():

@@ -67,10 +67,7 @@ def run_info(command: Info) -> int:
     ):
         print(_spread(name, values, unit, log=unit != ""))
     low, high = gaussians.means.amin(dim=0).tolist(), gaussians.means.amax(dim=0).tolist()
-    print(
-        "bounds          "
-        + ", ".join(f"{a} {x:.2f} to {y:.2f} m" for a, x, y in zip("xyz", low, high, strict=True))
-    )
+    print("bounds          " + ", ".join(f"{a} {x:.2f} to {y:.2f} m" for a, x, y in zip("xyz", low, high, strict=True)))
     for index, pose in enumerate(scene.cam2world):
         name = scene.names[index] if index < len(scene.names) else ""
         place = ", ".join(f"{x:.3f}" for x in pose[:3, 3].tolist())
@@ -87,9 +84,7 @@ def run_check(command: Check) -> int:
     table.add_column("poses read")
     table.add_column("error of the warped view", justify="right")
     for reading, error in check.errors.items():
-        style = (
-            "bold" if reading == AS_GIVEN else "green" if error < check.error and check.likely_mistake else ""
-        )
+        style = "bold" if reading == AS_GIVEN else "green" if error < check.error and check.likely_mistake else ""
         table.add_row(reading, f"{error:.3f}", style=style)
     console = _console()
     console.print(table)
@@ -98,9 +93,7 @@ def run_check(command: Check) -> int:
     for warning in check.warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
     if check.likely_mistake:
-        console.print(
-            f"likely mistake: {check.likely_mistake}", style="bold red", markup=False, soft_wrap=True
-        )
+        console.print(f"likely mistake: {check.likely_mistake}", style="bold red", markup=False, soft_wrap=True)
         return 1
     print("no other reading of the poses fits far better")
     return 0
@@ -133,6 +126,4 @@ def _spread(name: str, values: Tensor, unit: str, *, log: bool) -> str:
     span = (float(shown.min()), max(float(shown.max()), float(shown.min()) + 1e-6))
     counts = torch.histc(shown.float(), 24, *span)
     bars = "".join(_BARS[round(8 * float(count / counts.max()))] for count in counts)
-    return f"{name:<15} {low:.3g} to {high:.3g}{unit}, median {middle:.3g}{unit}  |{bars}|" + (
-        " (log)" if log else ""
-    )
+    return f"{name:<15} {low:.3g} to {high:.3g}{unit}, median {middle:.3g}{unit}  |{bars}|" + (" (log)" if log else "")

@@ -52,9 +52,7 @@ def choose_pair(path: Path, choice: PairChoice) -> Pair:
         return pairs[names.index(choice.pair)]
     if choice.pair.isdecimal() and int(choice.pair) < len(pairs):
         return pairs[int(choice.pair)]
-    raise InputError(
-        f"--pair {choice.pair}: {path} holds {', '.join(f'{i}: {n}' for i, n in enumerate(names))}"
-    )
+    raise InputError(f"--pair {choice.pair}: {path} holds {', '.join(f'{i}: {n}' for i, n in enumerate(names))}")
 
 
 def open_scene(path: Path, choice: PairChoice, model: str, height: int) -> Scene:

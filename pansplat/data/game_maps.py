@@ -29,16 +29,12 @@ def read_triplet(source: Path, convention: str | None = None) -> Collection:
     content = read_json(source)
     matrices = content.get("c2w") if isinstance(content, dict) else None
     if not isinstance(matrices, list) or len(matrices) < 2:
-        raise InputError(
-            f'{source}: needed a list of two or more 4x4 matrices as "c2w", got none; see docs/input.md.'
-        )
+        raise InputError(f'{source}: needed a list of two or more 4x4 matrices as "c2w", got none; see docs/input.md.')
     panoramas = []
     for i, matrix in enumerate(matrices):
         image = source.with_name(f"{source.stem}_{i}.png")
         if not image.is_file():
-            raise InputError(
-                f"{source}: needed the picture {image.name} for pose {i}, got no such file; add it."
-            )
+            raise InputError(f"{source}: needed the picture {image.name} for pose {i}, got no such file; add it.")
         depth = source.with_name(f"{source.stem}_{i}_depth.png")
         cam2world = to_cam2world(rigid_matrix(matrix, f"{source}, pose {i}"), convention)
         mask = mask_beside(image, source.parent)

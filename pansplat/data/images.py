@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 from torch import Tensor
 
-from pansplat.data.atomic import replacing
+from pansplat.atomic import replacing
 from pansplat.errors import InputError
 
 READABLE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".exr")
@@ -114,9 +114,7 @@ def read_depth(path: Path | str, height: int) -> Float[Tensor, "height width"]:
         channels = _exr_channels(path)
         name = next((n for n in ("Z", "Y") if n in channels), None)
         if name is None:
-            raise InputError(
-                f"{path}: needed depth in channel Z or Y, got channels {sorted(channels)}; rename it."
-            )
+            raise InputError(f"{path}: needed depth in channel Z or Y, got channels {sorted(channels)}; rename it.")
         depth = np.asarray(channels[name], dtype=np.float32)
     else:
         depth = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -173,16 +171,12 @@ def write_image(
 def _as_pixels(path: Path, image: Tensor | NDArray[Any]) -> NDArray[Any]:
     """The picture as (H W 3), uint8 or float32, all finite."""
     if isinstance(image, Tensor):
-        pixels = (
-            image.detach().cpu().movedim(0, -1).numpy() if image.ndim == 3 else image.detach().cpu().numpy()
-        )
+        pixels = image.detach().cpu().movedim(0, -1).numpy() if image.ndim == 3 else image.detach().cpu().numpy()
     else:
         pixels = np.asarray(image)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or 0 in pixels.shape:
         shape = tuple(image.shape)
-        raise InputError(
-            f"cannot write {path}: needed a tensor (3 H W) or an array (H W 3), got shape {shape}."
-        )
+        raise InputError(f"cannot write {path}: needed a tensor (3 H W) or an array (H W 3), got shape {shape}.")
     if pixels.dtype == np.uint8:
         return np.ascontiguousarray(pixels)
     pixels = np.ascontiguousarray(pixels, dtype=np.float32)
@@ -194,9 +188,7 @@ def _as_pixels(path: Path, image: Tensor | NDArray[Any]) -> NDArray[Any]:
     return pixels
 
 
-def _write_exr(
-    path: Path, pixels: NDArray[Any], depth: Tensor | NDArray[Any] | None, panorama: bool | None
-) -> None:
+def _write_exr(path: Path, pixels: NDArray[Any], depth: Tensor | NDArray[Any] | None, panorama: bool | None) -> None:
     import OpenEXR
 
     display = pixels.astype(np.float32) / np.float32(255) if pixels.dtype == np.uint8 else pixels
@@ -235,9 +227,7 @@ def _read_bytes(path: Path) -> bytes:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(
-            f"{path}: needed a readable picture file, got '{error.strerror}'; check the path."
-        ) from error
+        raise InputError(f"{path}: needed a readable picture file, got '{error.strerror}'; check the path.") from error
     if not data:
         raise InputError(f"{path}: needed a picture, got a file of 0 bytes; copy or export it again.")
     return data
@@ -253,9 +243,7 @@ def _decode(path: Path, at_least: int | None = None) -> _Picture:
     image = _open_with_pillow(path, data, at_least)
     if "A" in image.getbands() or "transparency" in image.info:
         array = np.asarray(image.convert("RGBA"))
-        return _Picture(
-            np.ascontiguousarray(array[..., :3]), array[..., 3].astype(np.float32) / np.float32(255)
-        )
+        return _Picture(np.ascontiguousarray(array[..., :3]), array[..., 3].astype(np.float32) / np.float32(255))
     return _Picture(np.asarray(image.convert("RGB")), None)
 
 
@@ -280,8 +268,7 @@ def _open_with_pillow(path: Path, data: bytes, at_least: int | None = None) -> I
         ) from error
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise InputError(
-            f"{path}: needed a complete picture, got damaged or truncated data ({error}); copy or "
-            "export it again."
+            f"{path}: needed a complete picture, got damaged or truncated data ({error}); copy or export it again."
         ) from error
 
 
@@ -294,9 +281,7 @@ def _decode_png16(path: Path, data: bytes) -> _Picture:
     _verify_with_pillow(path, data)
     array = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if array is None or array.dtype != np.uint16:
-        raise InputError(
-            f"{path}: needed a readable 16-bit PNG, got data OpenCV cannot decode; export it again."
-        )
+        raise InputError(f"{path}: needed a readable 16-bit PNG, got data OpenCV cannot decode; export it again.")
     values = array.astype(np.float32) / np.float32(65535)
     if values.ndim == 2:
         return _Picture(np.repeat(values[..., None], 3, axis=2), None)
@@ -312,8 +297,7 @@ def _exr_channels(path: Path) -> dict[str, NDArray[Any]]:
             return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except Exception as error:  # OpenEXR raises its own kinds, RuntimeError and ValueError among them
         raise InputError(
-            f"{path}: needed a complete EXR picture, got damaged or truncated data ({error}); export "
-            "it again."
+            f"{path}: needed a complete EXR picture, got damaged or truncated data ({error}); export it again."
         ) from error
 
 
@@ -328,15 +312,13 @@ def _decode_exr(path: Path) -> _Picture:
         linear = np.repeat(channels["Y"][..., None], 3, axis=2)
     else:
         raise InputError(
-            f"{path}: needed the channels R, G and B (or Y), got {sorted(channels)}; export the "
-            "colour without layers."
+            f"{path}: needed the channels R, G and B (or Y), got {sorted(channels)}; export the colour without layers."
         )
     linear = linear.astype(np.float32)
     bad = int((~np.isfinite(linear)).sum())
     if bad:
         raise InputError(
-            f"{path}: needed finite colours, got {bad} NaN or infinite values; repair the file or "
-            "render it again."
+            f"{path}: needed finite colours, got {bad} NaN or infinite values; repair the file or render it again."
         )
     return _Picture(srgb_from_linear(linear), None if alpha is None else alpha.astype(np.float32).clip(0, 1))
 

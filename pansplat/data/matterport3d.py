@@ -55,9 +55,7 @@ def _panorama(view: Path, folder: Path, convention: str) -> Panorama:
     matrix[:3, 3] = _numbers(view / "tran.txt", 3)
     cam2world = _Z_UP @ to_cam2world(rigid_matrix(matrix.tolist(), str(view / "rot.txt")), convention)
     depth = view / "depth.png"
-    return Panorama(
-        view.name, image, cam2world, mask_beside(image, folder), depth if depth.is_file() else None
-    )
+    return Panorama(view.name, image, cam2world, mask_beside(image, folder), depth if depth.is_file() else None)
 
 
 def _numbers(path: Path, count: int) -> Float[Tensor, count]:

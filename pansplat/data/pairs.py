@@ -46,14 +46,10 @@ def load_pairs(
     triplet = root if root.is_file() and root in triplet_files(root.parent) else None
     if root.is_file():
         if root.suffix.lower() not in (".json", ".kitti", ".tum", ".txt"):
-            raise InputError(
-                f"{root}: needed a folder of posed panoramas, got a file; give the folder that holds it."
-            )
+            raise InputError(f"{root}: needed a folder of posed panoramas, got a file; give the folder that holds it.")
         root = root.parent
     try:
-        collections = (
-            [(root, read_triplet(triplet, convention))] if triplet else _collections(root, convention, _DEPTH)
-        )
+        collections = [(root, read_triplet(triplet, convention))] if triplet else _collections(root, convention, _DEPTH)
     except OSError as error:
         raise InputError(
             f"{error.filename or root}: needed a readable folder, got '{error.strerror}'; check its rights."

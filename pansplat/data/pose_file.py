@@ -50,8 +50,7 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
         others = [path.name for path in pictures_in(folder) if path.name not in named]
         without = f"; pictures without a pose: {', '.join(others[:5])}" if others else ""
         raise InputError(
-            f"{source}: needed poses of two or more panoramas, got {len(panoramas)}{without}; add "
-            "what is missing."
+            f"{source}: needed poses of two or more panoramas, got {len(panoramas)}{without}; add what is missing."
         )
     near, far = number_field(content, "near", source), number_field(content, "far", source)
     cases = _cases(folder / PAIRS, list(entries)) if (folder / PAIRS).is_file() else None
@@ -61,9 +60,7 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
         cases,
         near=NEAR if near is None else near,
         far=FAR if far is None else far,
-        name=folder.resolve().name
-        if (len(cases) if cases is not None else len(panoramas) - 1) == 1
-        else None,
+        name=folder.resolve().name if (len(cases) if cases is not None else len(panoramas) - 1) == 1 else None,
     )
 
 
@@ -71,16 +68,12 @@ def _panorama(folder: Path, name: str, entry: Any, convention: str, stated: bool
     source = f"{folder / POSES}, {name!r}"
     image = folder / name
     if not image.is_file():
-        raise InputError(
-            f"{source}: needed the picture {image}, got no such file; correct the name or add the file."
-        )
+        raise InputError(f"{source}: needed the picture {image}, got no such file; correct the name or add the file.")
     matrix, mask, depth = entry, None, None
     if isinstance(entry, dict):
         key = next((key for key in _MATRIX_KEYS if key in entry), None)
         if key is None:
-            raise InputError(
-                f'{source}: needed a pose, got only {sorted(entry)}; add its 4x4 matrix as "cam2world".'
-            )
+            raise InputError(f'{source}: needed a pose, got only {sorted(entry)}; add its 4x4 matrix as "cam2world".')
         if stated and key in ("cam2world", "world2cam") and not convention.startswith(key):
             raise InputError(
                 f'{source}: needed one convention, got the key "{key}" under the convention "{convention}"; '
@@ -98,9 +91,7 @@ def _named_file(folder: Path, entry: dict[str, Any], key: str, source: str) -> P
         return None
     path = folder / str(entry[key])
     if not path.is_file():
-        raise InputError(
-            f'{source}: needed the {key} file {path}, got no such file; correct or remove "{key}".'
-        )
+        raise InputError(f'{source}: needed the {key} file {path}, got no such file; correct or remove "{key}".')
     return path
 
 
@@ -117,11 +108,7 @@ def _cases(source: Path, names: list[str]) -> tuple[Case, ...]:
         for number, entry in enumerate(content.get(key) or [], start=1):
             where = f"{source}, {key} {number}"
             context = entry.get("context") if isinstance(entry, dict) else None
-            if (
-                not isinstance(context, list)
-                or len(set(map(str, context))) < 2
-                or len(set(context)) < len(context)
-            ):
+            if not isinstance(context, list) or len(set(map(str, context))) < 2 or len(set(context)) < len(context):
                 raise InputError(
                     f'{where}: needed two or more different pictures as "context", got {context}; correct it.'
                 )
@@ -139,6 +126,4 @@ def _index(name: Any, names: list[str], where: str) -> int:
         return names.index(name)
     close = difflib.get_close_matches(str(name), names, n=1)
     meant = f" (did you mean {close[0]!r}?)" if close else ""
-    raise InputError(
-        f"{where}: needed pictures that {POSES} has a pose for, got {name!r}{meant}; add its pose."
-    )
+    raise InputError(f"{where}: needed pictures that {POSES} has a pose for, got {name!r}{meant}; add its pose.")

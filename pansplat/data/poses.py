@@ -28,9 +28,7 @@ _DIRECTIONS = {
     "world2cam": r"world[ _-]?(2|to)[ _-]?cam(era)?|\bw2c\b",
 }
 _AXES = {"opencv": r"opencv|colmap", "opengl": r"opengl|habitat|blender|nerf"}
-_RIGID_TOLERANCE = (
-    1e-2  # files keep 4 to 6 decimals, some come from float32; a wrong matrix is off by far more
-)
+_RIGID_TOLERANCE = 1e-2  # files keep 4 to 6 decimals, some come from float32; a wrong matrix is off by far more
 _OPENGL_TO_OPENCV = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=torch.float64))
 
 
@@ -71,9 +69,7 @@ def rigid_matrix(values: Any, source: str) -> Float[Tensor, "4 4"]:
     try:
         matrix = torch.tensor(values, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise InputError(
-            f"{source}: needed a pose of 4x4 numbers, got {str(values)[:60]!r}; correct it."
-        ) from error
+        raise InputError(f"{source}: needed a pose of 4x4 numbers, got {str(values)[:60]!r}; correct it.") from error
     if tuple(matrix.shape) == (3, 4):
         matrix = torch.cat((matrix, torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)))
     if tuple(matrix.shape) != (4, 4):
@@ -141,9 +137,7 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
-        raise InputError(
-            f"{path}: needed a readable file, got '{error.strerror}'; check the path."
-        ) from error
+        raise InputError(f"{path}: needed a readable file, got '{error.strerror}'; check the path.") from error
     except json.JSONDecodeError as error:
         raise InputError(
             f"{path}: needed JSON, got something else at line {error.lineno}, column {error.colno} "
@@ -165,9 +159,7 @@ def read_number(path: Path) -> float:
     except ValueError:
         number = math.nan
     if not 0 < number < math.inf:
-        raise InputError(
-            f"{path}: needed one positive number, got {text[:40]!r}; correct it or remove the file."
-        )
+        raise InputError(f"{path}: needed one positive number, got {text[:40]!r}; correct it or remove the file.")
     return number
 
 
@@ -210,9 +202,7 @@ def read_trajectory(path: Path, convention: str | None = None, expected: str | N
             raise InputError(
                 f"{source}: needed {count} numbers as in the lines before, got {len(numbers)}; complete it."
             )
-        matrix = (
-            [numbers[0:4], numbers[4:8], numbers[8:12]] if kind == "kitti" else _tum_matrix(numbers, source)
-        )
+        matrix = [numbers[0:4], numbers[4:8], numbers[8:12]] if kind == "kitti" else _tum_matrix(numbers, source)
         poses.append(to_cam2world(rigid_matrix(matrix, source), convention))
     return Trajectory(kind, tuple(poses))
 

@@ -46,13 +46,9 @@ def read_loc360_sequence(folder: Path, convention: str | None = None) -> Collect
         )
     panoramas = []
     for frame, matrix in content.items():
-        image = next(
-            (folder / sub / frame for sub in _PICTURE_FOLDERS if (folder / sub / frame).is_file()), None
-        )
+        image = next((folder / sub / frame for sub in _PICTURE_FOLDERS if (folder / sub / frame).is_file()), None)
         if image is None:
-            raise InputError(
-                f"{source}: needed the picture {folder / 'image' / frame}, got no such file; add it."
-            )
+            raise InputError(f"{source}: needed the picture {folder / 'image' / frame}, got no such file; add it.")
         cam2world = to_cam2world(rigid_matrix(matrix, f"{source}, {frame!r}"), convention)
         panoramas.append(Panorama(image.stem, image, cam2world, mask_beside(image, folder)))
     return Collection(source, tuple(panoramas), ordered=True, far=FAR_SEQUENCE)
@@ -70,16 +66,12 @@ def trajectory_file(folder: Path) -> Path | None:
         if path.is_file()
         and (
             path.suffix.lower() in (".kitti", ".tum")
-            or (
-                path.suffix.lower() == ".txt"
-                and ("trajectory" in path.stem.lower() or path.stem.lower() == "poses")
-            )
+            or (path.suffix.lower() == ".txt" and ("trajectory" in path.stem.lower() or path.stem.lower() == "poses"))
         )
     ]
     if len(found) > 1:
         raise InputError(
-            f"{folder}: needed one trajectory, got {', '.join(path.name for path in found)}; keep the "
-            "right one."
+            f"{folder}: needed one trajectory, got {', '.join(path.name for path in found)}; keep the right one."
         )
     return found[0] if found else None
 

@@ -10,15 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pansplat.data.atomic import replacing
+from pansplat.atomic import replacing
 from pansplat.errors import InputError
 
 _ENCODERS = ("libx264", "libopenh264", "mpeg4")  # H.264 first: every browser and player has it
 
 
-def write_video(
-    path: Path | str, frames: Iterable[NDArray[np.uint8]], fps: float, *, quality: int = 18
-) -> int:
+def write_video(path: Path | str, frames: Iterable[NDArray[np.uint8]], fps: float, *, quality: int = 18) -> int:
     """Write an MP4 film, whole or not at all, and return the number of frames; H.264 where PyAV has it.
 
     Frames of odd width or height lose their last column or row: the format holds even sizes only.
@@ -34,9 +32,7 @@ def write_video(
     """
     path = Path(path)
     if path.suffix.lower() != ".mp4":
-        raise InputError(
-            f"cannot write {path}: needed a name ending in .mp4, got '{path.suffix}'; rename it."
-        )
+        raise InputError(f"cannot write {path}: needed a name ending in .mp4, got '{path.suffix}'; rename it.")
     if not 0 < fps < float("inf"):
         raise InputError(f"`fps` must be positive, got {fps}; choose one, such as 30.")
     import av
@@ -46,18 +42,14 @@ def write_video(
         with av.open(str(temporary), "w", options={"movflags": "+faststart"}) as film:
             stream: Any = None
             for count, frame in enumerate(frames, start=1):
-                pixels = _check_frame(
-                    path, frame, count, None if stream is None else (stream.height, stream.width)
-                )
+                pixels = _check_frame(path, frame, count, None if stream is None else (stream.height, stream.width))
                 if stream is None:
                     stream = _add_stream(film, pixels.shape[1], pixels.shape[0], fps, quality)
                 picture = av.VideoFrame.from_ndarray(pixels, format="rgb24")
                 for packet in stream.encode(picture.reformat(format="yuv420p", dst_colorspace="ITU709")):
                     film.mux(packet)
             if stream is None:
-                raise InputError(
-                    f"cannot write {path}: needed at least one frame, got none; nothing written."
-                )
+                raise InputError(f"cannot write {path}: needed at least one frame, got none; nothing written.")
             for packet in stream.encode():
                 film.mux(packet)
     return count
@@ -100,13 +92,11 @@ def _check_frame(path: Path, frame: Any, number: int, size: tuple[int, int] | No
     pixels = np.asarray(frame)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or min(pixels.shape) < 2:
         raise InputError(
-            f"cannot write {path}: needed frames (H W 3) of uint8, got {pixels.dtype} {pixels.shape} "
-            f"as frame {number}."
+            f"cannot write {path}: needed frames (H W 3) of uint8, got {pixels.dtype} {pixels.shape} as frame {number}."
         )
     pixels = np.ascontiguousarray(pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2])
     if size is not None and pixels.shape[:2] != size:
         raise InputError(
-            f"cannot write {path}: needed frames of one size {size}, got {pixels.shape[:2]} as frame "
-            f"{number}."
+            f"cannot write {path}: needed frames of one size {size}, got {pixels.shape[:2]} as frame {number}."
         )
     return pixels

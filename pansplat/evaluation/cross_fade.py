@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pansplat.geometry.blending import blend_weights
 from pansplat.geometry.equirect import rotate_equirect
-from pansplat.render import blend_weights
 
 
 def cross_fade(

@@ -55,9 +55,7 @@ def ssim(prediction: Float[Tensor, "3 height width"], target: Float[Tensor, "3 h
     """
     _check(prediction, target, None)
     if min(prediction.shape[-2:]) <= 2 * _SSIM_RADIUS:
-        raise ValueError(
-            f"`prediction` must be larger than 10 x 10 pixels, got {tuple(prediction.shape[-2:])}"
-        )
+        raise ValueError(f"`prediction` must be larger than 10 x 10 pixels, got {tuple(prediction.shape[-2:])}")
     a, b = (image.detach().cpu().double().numpy() for image in (prediction, target))
     mean_a, mean_b = _window_mean(a), _window_mean(b)
     samples = (2 * _SSIM_RADIUS + 1) ** 2

@@ -43,10 +43,8 @@ _ADVICE = {
     "swapped views": "the poses of the two views look exchanged: check which pose belongs to which picture",
     "mirrored left-right": "the scene looks mirrored left to right: a flipped picture or a left-handed world",
     "mirrored up-down": "the up axis looks flipped alone (a left-handed system): flip a second axis with it",
-    "mirrored front-back": "the forward axis looks flipped alone (a left-handed system): flip a second axis "
-    "with it",
-    "z-up camera": "the camera axes look like x right, y forward, z up: turn them into x right, y down, "
-    "z forward",
+    "mirrored front-back": "the forward axis looks flipped alone (a left-handed system): flip a second axis with it",
+    "z-up camera": "the camera axes look like x right, y forward, z up: turn them into x right, y down, z forward",
     "x-forward camera": "the camera axes look like x forward, y left, z up (robotics, ROS): turn them into "
     "x right, y down, z forward",
     "turned by 90 degrees": "the panoramas' centre looks along the camera's x axis: turn the poses by 90 "
@@ -93,18 +91,13 @@ class PoseCheck:
     def report(self) -> str:
         """The findings as text of several lines."""
         lines = [
-            f"{self.name}: baseline {self.baseline:.3f} m, "
-            f"photometric error {self.error:.3f} with the poses as given"
+            f"{self.name}: baseline {self.baseline:.3f} m, photometric error {self.error:.3f} with the poses as given"
         ]
         lines += [f"  {error:.3f}  {name}" for name, error in self.errors.items()]
         if self.indistinguishable:
             lines.append(f"  same as given for these views: {', '.join(self.indistinguishable)}")
         lines += [f"  warning: {warning}" for warning in self.warnings]
-        mistake = (
-            f"likely mistake: {self.likely_mistake}"
-            if self.likely_mistake
-            else "no other reading fits better"
-        )
+        mistake = f"likely mistake: {self.likely_mistake}" if self.likely_mistake else "no other reading fits better"
         return "\n".join((*lines, f"  {mistake}"))
 
 

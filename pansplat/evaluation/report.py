@@ -21,7 +21,7 @@ from rich.table import Table
 from torch import Tensor
 
 from pansplat import pipeline
-from pansplat.data.atomic import replacing
+from pansplat.atomic import replacing
 from pansplat.data.images import write_image
 from pansplat.data.pairs import Pair
 from pansplat.errors import InputError
@@ -179,9 +179,7 @@ def results_table(cases: Sequence[Case]) -> Table:
         table.add_row(case.name, *_formatted(row, masked))
     if len(rows) > 1:
         table.add_section()
-        table.add_row(
-            "mean", *_formatted([sum(column) / len(rows) for column in zip(*rows, strict=True)], masked)
-        )
+        table.add_row("mean", *_formatted([sum(column) / len(rows) for column in zip(*rows, strict=True)], masked))
     return table
 
 

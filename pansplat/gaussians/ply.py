@@ -20,6 +20,7 @@ from typing import BinaryIO
 import numpy as np
 import torch
 
+from pansplat.atomic import replacing
 from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.gaussians.scene import Scene
@@ -53,18 +54,9 @@ def save_ply(scene: Scene, path: str | Path) -> None:
     names = _property_names(gaussians.harmonics.shape[1])
     lines = ["ply", "format binary_little_endian 1.0", f"comment {_MARK}{_extras(scene, gaussians)}"]
     lines += [f"element vertex {len(gaussians)}", *(f"property float {name}" for name in names), "end_header"]
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with open(partial, "wb") as file:
-            file.write(("\n".join(lines) + "\n").encode("ascii"))
-            _columns(gaussians).tofile(file)
-        os.replace(partial, path)
-    except OSError as error:
-        raise InputError(
-            f"cannot write {path}: {error.strerror or error}; choose a writable folder"
-        ) from error
-    finally:
-        partial.unlink(missing_ok=True)
+    with replacing(path) as partial, open(partial, "wb") as file:
+        file.write(("\n".join(lines) + "\n").encode("ascii"))
+        _columns(gaussians).tofile(file)
 
 
 def load_ply(path: str | Path) -> Scene:
@@ -196,9 +188,7 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
             if words[:1] == ["format"]:
                 order = words[1]
             elif words[:1] == ["comment"]:
-                comments.append(
-                    line.decode("utf-8", errors="replace").strip().removeprefix("comment").lstrip()
-                )
+                comments.append(line.decode("utf-8", errors="replace").strip().removeprefix("comment").lstrip())
             elif words[:1] == ["element"]:
                 elements.append((words[1], int(words[2]), []))
             elif words[:1] == ["property"]:
@@ -207,9 +197,7 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
         except (IndexError, KeyError, ValueError):
             raise InputError(f"{path}: cannot understand the header line {line[:80]!r}") from None
     if order not in _ORDERS:
-        raise InputError(
-            f"{path}: format {order or 'unknown'!r} is not read; save it as binary_little_endian"
-        )
+        raise InputError(f"{path}: format {order or 'unknown'!r} is not read; save it as binary_little_endian")
     return _vertex_header(_ORDERS[order], elements, comments, path)
 
 
@@ -290,15 +278,11 @@ def _parse_extras(comments: list[str], path: Path) -> dict:
                 numbers = [float(extras.get(key, 1)) for key in ("near", "far", "height")]
                 if not np.isfinite(numbers).all():
                     raise ValueError("near, far or height")
-                if not isinstance(extras.get("names", []), list) or not isinstance(
-                    extras.get("runs", []), list
-                ):
+                if not isinstance(extras.get("names", []), list) or not isinstance(extras.get("runs", []), list):
                     raise ValueError("names or runs")
                 return extras
             except (ValueError, TypeError, AttributeError):
-                warnings.warn(
-                    f"{path}: its pansplat comment is damaged; cameras and labels are lost", stacklevel=3
-                )
+                warnings.warn(f"{path}: its pansplat comment is damaged; cameras and labels are lost", stacklevel=3)
     return {}
 
 

@@ -1,6 +1,7 @@
 """Drawing Gaussians: the differentiable reference rasteriser, and blending of its pictures."""
 
-from pansplat.render.blend import blend, blend_weights
+from pansplat.geometry.blending import blend_weights
+from pansplat.render.blend import blend
 from pansplat.render.reference import Rendering, rasterize
 
 __all__ = ["Rendering", "blend", "blend_weights", "rasterize"]

@@ -12,23 +12,6 @@ from torch import Tensor
 from pansplat.render.reference import Rendering
 
 
-def blend_weights(position: Float[Tensor, "3"], positions: Float[Tensor, "view 3"]) -> Float[Tensor, "view"]:
-    """Weights of the input views at a camera position: inverse distances, normalised.
-
-    Never negative, sum to one, one-hot at an input position, equal among inputs that coincide with the
-    position.
-    """
-    if positions.shape[0] < 1:
-        raise ValueError("`positions` must hold at least one view, got none")
-    distances = torch.linalg.vector_norm(position - positions, dim=1)
-    nearest = distances.detach().amin()
-    at = distances == 0
-    # Only ratios matter, so the nearest distance serves as the unit: nothing overflows.
-    closeness = nearest / torch.where(at, torch.ones_like(distances), distances)
-    closeness = torch.where(at, torch.ones_like(distances), closeness)
-    return closeness / closeness.sum()
-
-
 def blend(renderings: Sequence[Rendering], weights: Float[Tensor, "view"]) -> Rendering:
     """Mix pictures of the same size; at each pixel a view counts by its weight times its opacity there."""
     if len(renderings) < 1 or weights.shape != (len(renderings),):
@@ -41,6 +24,7 @@ def blend(renderings: Sequence[Rendering], weights: Float[Tensor, "view"]) -> Re
     depth = torch.stack([r.depth for r in renderings])
     weights = weights.to(alpha)[:, None, None]
     share = weights * alpha
+    share = torch.where(share.sum(dim=0) > 0, share, alpha)  # where the views that count see nothing, the others do
     total = share.sum(dim=0)
     seen = total > 0
     share = torch.where(seen, share, weights) / torch.where(seen, total, torch.ones_like(total))

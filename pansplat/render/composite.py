@@ -36,16 +36,12 @@ class TilePixels:
     offsets: Float[Tensor, "tile 4 pixel"]
 
 
-def composite(
-    splats: Splats, lists: TileLists, pixels: TilePixels, *, exact: bool
-) -> Float[Tensor, "tile pixel 5"]:
+def composite(splats: Splats, lists: TileLists, pixels: TilePixels, *, exact: bool) -> Float[Tensor, "tile pixel 5"]:
     """Sums along each pixel's ray of weight * (RGB, distance, 1), for the tiles of `lists`.
 
     Differentiable once in all of `splats`.
     """
-    rows = torch.cat(
-        (splats.forms.flatten(1), splats.along[:, None], splats.peak[:, None], splats.values), dim=1
-    )
+    rows = torch.cat((splats.forms.flatten(1), splats.along[:, None], splats.peak[:, None], splats.values), dim=1)
     return _Composite.apply(rows, splats.point, lists, pixels, exact)  # type: ignore[no-any-return]
 
 
@@ -72,9 +68,7 @@ class _Composite(torch.autograd.Function):
                 through = transmittance[: len(block)]
                 if needs_grad:
                     before.append(through)
-                transmittance, added = _block(
-                    *_gather(padded, block, pixels, live + first), through, exact=exact
-                )
+                transmittance, added = _block(*_gather(padded, block, pixels, live + first), through, exact=exact)
                 sums.index_add_(0, live, added)
                 if not needs_grad and float(transmittance.max()) < torch.finfo(rows.dtype).eps:
                     break

@@ -131,9 +131,7 @@ def rasterize(
         )
     if gaussians.means.dtype not in (torch.float32, torch.float64):
         gaussians = gaussians.to(dtype=torch.float32)
-    planes = pictures(
-        layout, size, vertical_fov_degrees=vertical_fov_degrees, face_size=face_size, device=device
-    )
+    planes = pictures(layout, size, vertical_fov_degrees=vertical_fov_degrees, face_size=face_size, device=device)
     drawable, dropped, close = _drawable(gaussians, pose.detach(), near, strict)
     pixel_angle = planes[0].pixel_angle
     widens = lowpass == "angular" or kernel == "ray"
@@ -164,9 +162,7 @@ def _check(
     backend: str,
 ) -> None:
     choices = {"layout": Layout, "kernel": Kernel, "order": Order, "lowpass": Lowpass, "backend": Backend}
-    for (name, allowed), value in zip(
-        choices.items(), (layout, kernel, order, lowpass, backend), strict=True
-    ):
+    for (name, allowed), value in zip(choices.items(), (layout, kernel, order, lowpass, backend), strict=True):
         if value not in get_args(allowed):
             raise InputError(f"`{name}` must be one of {', '.join(get_args(allowed))}, got {value!r}")
     if len(size) != 2 or min(size) < 1:

@@ -86,14 +86,10 @@ def observe(
         exact: whether to find the exact kernel's forms.
     """
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.harmonics)
-    work = functools.partial(
-        _observe_chunk, cam2world=cam2world, spread=spread, compensate=compensate, exact=exact
-    )
+    work = functools.partial(_observe_chunk, cam2world=cam2world, spread=spread, compensate=compensate, exact=exact)
     parts = []
     for chunk in zip(*(field.split(_CHUNK) for field in fields), strict=True):
-        parts.append(
-            checkpoint(work, *chunk, use_reentrant=False) if torch.is_grad_enabled() else work(*chunk)
-        )
+        parts.append(checkpoint(work, *chunk, use_reentrant=False) if torch.is_grad_enabled() else work(*chunk))
     return Observed(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
@@ -115,9 +111,7 @@ def _observe_chunk(
     world_direction = offset / radius[:, None]
     direction = world_direction @ cam2world[:3, :3]
     colours = evaluate(harmonics, world_direction.to(dtype))
-    own = cam2world[:3, :3].T @ rotations_from_quats(
-        quats.double()
-    )  # columns: the Gaussian's axes, camera frame
+    own = cam2world[:3, :3].T @ rotations_from_quats(quats.double())  # columns: the Gaussian's axes, camera frame
     size = scales.double() / radius[:, None]
     axes = own * size[:, None, :]
     covariance = axes @ axes.transpose(1, 2)

@@ -40,9 +40,7 @@ def views(poses: dict) -> dict[str, View]:
     return {name: View(name, poses["poses"][f"{name}.jpg"]) for name in NAMES}
 
 
-def project(
-    view: View, pose: torch.Tensor, stride: int = 3
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def project(view: View, pose: torch.Tensor, stride: int = 3) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Where `view`'s pixels lie in a camera at `pose`: uv, distance to it, and their solid angles."""
     height, width = view.depth.shape
     rays = pixel_directions(height, width, dtype=torch.float64)[::stride, ::stride]
@@ -172,9 +170,7 @@ def test_every_model_is_credited_under_a_free_licence():
 
 def test_readme_lists_the_checksum_of_every_file():
     listed = dict(re.findall(r"^([0-9a-f]{64})  (\S+)$", (SAMPLE / "README.md").read_text(), re.MULTILINE))
-    found = {
-        hashlib.sha256(p.read_bytes()).hexdigest(): p.name for p in SAMPLE.iterdir() if p.name != "README.md"
-    }
+    found = {hashlib.sha256(p.read_bytes()).hexdigest(): p.name for p in SAMPLE.iterdir() if p.name != "README.md"}
     assert listed == found
 
 

@@ -27,9 +27,7 @@ class Sphere:
 
     name, fingerprint = "sphere", "1"
 
-    def __call__(
-        self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None, progress=None
-    ):
+    def __call__(self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None, progress=None):
         if progress is not None:
             progress("thinking", 0.5)
         view, _, height, width = images.shape
@@ -127,9 +125,7 @@ def test_predict_writes_the_scene(scene: Path) -> None:
     assert loaded.names == ("a", "b") and loaded.model == "sphere"
 
 
-def test_predict_refuses_before_the_work(
-    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_predict_refuses_before_the_work(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     start = ["predict", room, "--model", "sphere", "-o"]
     assert "--out must be a .ply" in refusal([*start, tmp_path / "scene.splat"], capsys)
     assert "existing folder" in refusal([*start, tmp_path / "no" / "scene.ply"], capsys)
@@ -144,9 +140,7 @@ def test_predict_refuses_before_the_work(
     assert not list(tmp_path.glob("*.ply"))
 
 
-def test_a_folder_of_pairs_takes_the_first_or_the_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_of_pairs_takes_the_first_or_the_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("hall", "kitchen"):
         write_room(tmp_path / "pairs" / name)
     start = [
@@ -167,9 +161,7 @@ def test_a_folder_of_pairs_takes_the_first_or_the_named(
     assert "holds 0: hall, 1: kitchen" in refusal([*start, "--pair", "attic"], capsys)
 
 
-def test_our_warnings_are_one_yellow_note(
-    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_our_warnings_are_one_yellow_note(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Coincident cameras work, with a note."""
     content = json.loads((room / "poses.json").read_text())
     content["poses"]["b.png"] = content["poses"]["a.png"]
@@ -235,9 +227,7 @@ def test_render_takes_poses_in_many_forms(scene: Path, tmp_path: Path, form: str
     (tmp_path / form).write_text(content[form])
     assert run(["render", str(scene), "--pose", str(tmp_path / form), "-o", str(tmp_path / "p.png")]) == 0
     assert run(["render", str(scene), "--at", "0.25", "-o", str(tmp_path / "q.png")]) == 0
-    difference = np.array(Image.open(tmp_path / "p.png")).astype(int) - np.array(
-        Image.open(tmp_path / "q.png")
-    )
+    difference = np.array(Image.open(tmp_path / "p.png")).astype(int) - np.array(Image.open(tmp_path / "q.png"))
     assert np.abs(difference).max() <= 1
 
 
@@ -245,18 +235,14 @@ def test_a_film_flies_between_the_cameras(scene: Path, tmp_path: Path) -> None:
     import av
 
     out = tmp_path / "x.mp4"
-    assert (
-        run(["render", str(scene), "-o", str(out), "--height", "18", "--seconds", "0.5", "--fps", "8"]) == 0
-    )
+    assert run(["render", str(scene), "-o", str(out), "--height", "18", "--seconds", "0.5", "--fps", "8"]) == 0
     with av.open(str(out)) as film:
         frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
     assert len(frames) == 4 and frames[0].shape == (18, 32, 3)
     assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 1
 
 
-def test_render_refuses_what_makes_no_sense(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_render_refuses_what_makes_no_sense(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     trajectory = tmp_path / "way.txt"
     trajectory.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
     start, png = ["render", scene, "-o"], tmp_path / "x.png"
@@ -322,9 +308,7 @@ def test_info_tells_counts_and_cameras(scene: Path, capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.shared
-def test_check_exits_with_one_when_the_convention_is_wrong(
-    shared: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_exits_with_one_when_the_convention_is_wrong(shared: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pair = str(shared / "data" / "mp3d_sample")
     assert run(["check", pair]) == 0
     assert "as given" in capsys.readouterr().out
@@ -343,10 +327,7 @@ def test_interrupting_exits_with_130_and_leaves_nothing(
 
     monkeypatch.setattr(Sphere, "__call__", interrupted)
     before = sorted(os.listdir(tmp_path))
-    assert (
-        run(["predict", str(room), "-o", str(tmp_path / "s.ply"), "--model", "sphere", "--height", "16"])
-        == 130
-    )
+    assert run(["predict", str(room), "-o", str(tmp_path / "s.ply"), "--model", "sphere", "--height", "16"]) == 130
     assert capsys.readouterr().err.startswith("interrupted")
     assert sorted(os.listdir(tmp_path)) == before
 

@@ -23,9 +23,7 @@ from pansplat.errors import InputError
 
 def _picture(height: int = 16) -> torch.Tensor:
     """A smooth panorama, (3 height 2 height), whose columns meet at +-180 degrees."""
-    v, u = torch.meshgrid(
-        torch.linspace(0, 1, height), torch.arange(2 * height) / (2 * height), indexing="ij"
-    )
+    v, u = torch.meshgrid(torch.linspace(0, 1, height), torch.arange(2 * height) / (2 * height), indexing="ij")
     return torch.stack((0.5 + 0.4 * torch.sin(6.2832 * u), v, 0.5 + 0.3 * torch.cos(6.2832 * u) * v))
 
 
@@ -33,9 +31,7 @@ def _entries(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("suffix", "tolerance"), [(".png", 2e-3), (".webp", 2e-3), (".jpg", 0.05), (".exr", 1e-5)]
-)
+@pytest.mark.parametrize(("suffix", "tolerance"), [(".png", 2e-3), (".webp", 2e-3), (".jpg", 0.05), (".exr", 1e-5)])
 def test_reading_gives_what_was_written(tmp_path: Path, suffix: str, tolerance: float) -> None:
     image = _picture()
     write_image(tmp_path / f"a{suffix}", image)
@@ -51,11 +47,7 @@ def test_an_array_is_written_as_the_tensor_of_the_same_picture(tmp_path: Path) -
     write_image(tmp_path / "a.png", image)
     write_image(tmp_path / "b.png", image.permute(1, 2, 0).numpy())
     write_image(tmp_path / "c.png", (image.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8))
-    assert (
-        (tmp_path / "a.png").read_bytes()
-        == (tmp_path / "b.png").read_bytes()
-        == (tmp_path / "c.png").read_bytes()
-    )
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes() == (tmp_path / "c.png").read_bytes()
 
 
 def test_format_is_told_by_content_not_by_name(tmp_path: Path) -> None:
@@ -146,9 +138,7 @@ def test_depth_is_metres_and_never_mixed(tmp_path: Path) -> None:
 
 def test_eight_bit_depth_is_refused(tmp_path: Path) -> None:
     write_image(tmp_path / "depth.png", _picture())
-    with pytest.raises(
-        InputError, match=r"depth\.png: needed depth as a one-channel 16-bit PNG .* got uint8"
-    ):
+    with pytest.raises(InputError, match=r"depth\.png: needed depth as a one-channel 16-bit PNG .* got uint8"):
         read_depth(tmp_path / "depth.png", 16)
 
 

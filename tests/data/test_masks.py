@@ -26,9 +26,7 @@ def _room(x: float, z: float, plain: bool = False) -> torch.Tensor:
         return (0.5 + 0.1 * face).float().expand(3, -1, -1)
     phase = torch.tensor((0.0, 1.0, 2.0), dtype=torch.float64)[:, None, None]
     u, v, w = points.unbind(-1)
-    return (
-        0.5 + 0.2 * torch.sin(5 * u + phase) * torch.cos(4 * w - phase) + 0.2 * torch.sin(6 * v + 3 * u)
-    ).float()
+    return (0.5 + 0.2 * torch.sin(5 * u + phase) * torch.cos(4 * w - phase) + 0.2 * torch.sin(6 * v + 3 * u)).float()
 
 
 def _cap(image: torch.Tensor, degrees: float, *, top: bool) -> torch.Tensor:
@@ -102,6 +100,4 @@ def test_zinds_tripod_is_masked_and_nothing_else(shared: Path) -> None:
     assert 0.01 < float(area) < 0.04
     assert not scene[round(_HEIGHT * (1 - 6 / 180)) :].any()  # the body, 6 degrees round the nadir
     assert scene[: round(_HEIGHT * (1 - 35 / 180))].all()
-    assert math.isclose(
-        float(pair.load_context(64).masks.float().mean()), float(scene.float().mean()), abs_tol=0.01
-    )
+    assert math.isclose(float(pair.load_context(64).masks.float().mean()), float(scene.float().mean()), abs_tol=0.01)

@@ -82,9 +82,7 @@ def test_a_pair_folder_has_depth_masks_range_and_targets(tmp_path: Path) -> None
     mask = torch.ones(3, 16, 32)
     mask[:, 8:] = 0
     write_image(folder / "own.png", mask)
-    (folder / "pairs.json").write_text(
-        json.dumps({"pairs": [{"context": [names[0], names[2]], "target": [names[1]]}]})
-    )
+    (folder / "pairs.json").write_text(json.dumps({"pairs": [{"context": [names[0], names[2]], "target": [names[1]]}]}))
     (pair,) = load_pairs(folder)
     views, targets = pair.load_context(16), pair.load_targets(16)
     assert (views.near, views.far) == (0.2, 30.0)
@@ -117,9 +115,7 @@ def test_transparent_pixels_are_masked(tmp_path: Path) -> None:
     assert views.masks[0, :12].all() and not views.masks[0, 12:].any() and views.masks[1].all()
 
 
-@pytest.mark.parametrize(
-    ("file", "key"), [("cam2world opencv", "cam2world"), ("world2cam OpenGL", "world2cam")]
-)
+@pytest.mark.parametrize(("file", "key"), [("cam2world opencv", "cam2world"), ("world2cam OpenGL", "world2cam")])
 def test_the_argument_goes_before_the_files_convention(tmp_path: Path, file: str, key: str) -> None:
     poses = {name: {key: _pose(i)} for i, name in enumerate(("left.png", "right.png"))}
     folder = _folder(tmp_path / "room", convention=file, poses=poses)
@@ -229,9 +225,7 @@ def test_trajectories_belong_to_the_pictures_in_order_and_scale(tmp_path: Path, 
 def test_trajectories_of_another_length_are_refused(tmp_path: Path) -> None:
     _sequence(tmp_path)
     (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n" * 2)
-    with pytest.raises(
-        InputError, match=r"poses\.tum: needed one pose a picture \(3 pictures\), got 2 TUM poses"
-    ):
+    with pytest.raises(InputError, match=r"poses\.tum: needed one pose a picture \(3 pictures\), got 2 TUM poses"):
         load_pairs(tmp_path)
     (tmp_path / "poses.tum").rename(tmp_path / "poses.kitti")
     with pytest.raises(InputError, match=r"needed KITTI .* as its name says, got TUM"):

@@ -125,9 +125,7 @@ def _tum(poses: list[torch.Tensor]) -> str:
 
 @pytest.mark.parametrize("convention", [None, *CONVENTIONS])
 @pytest.mark.parametrize(("kind", "text"), [("kitti", _kitti), ("tum", _tum)])
-def test_trajectories_hold_the_poses_written_to_them(
-    tmp_path: Path, kind: str, text, convention: str | None
-) -> None:
+def test_trajectories_hold_the_poses_written_to_them(tmp_path: Path, kind: str, text, convention: str | None) -> None:
     poses = [torch.eye(4, dtype=torch.float64), _pose()]
     (tmp_path / "a.txt").write_text(text([_written_as(pose, convention or CONVENTIONS[0]) for pose in poses]))
     read = read_trajectory(tmp_path / "a.txt", convention)

@@ -26,9 +26,7 @@ def test_a_film_plays_back_as_it_was_given(tmp_path: Path) -> None:
         frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(stream)]
     assert len(frames) == 8
     for i, (frame, given) in enumerate(zip(frames, _frames(8), strict=True)):
-        error = np.abs(frame.astype(int) - given)[
-            :, [*range(28), *range(36, 64)]
-        ]  # chroma is shared at the edge
+        error = np.abs(frame.astype(int) - given)[:, [*range(28), *range(36, 64)]]  # chroma is shared at the edge
         assert error.max() <= 8, f"frame {i}"
 
 

@@ -88,9 +88,7 @@ def test_metrics_are_symmetric(pair: tuple[torch.Tensor, torch.Tensor]) -> None:
 
 @pytest.mark.parametrize("metric", METRICS.values())
 def test_unequal_shapes_are_refused(metric) -> None:
-    with pytest.raises(
-        ValueError, match=r"must both be \(3, height, width\), got \(3, 16, 32\) and \(3, 8, 16\)"
-    ):
+    with pytest.raises(ValueError, match=r"must both be \(3, height, width\), got \(3, 16, 32\) and \(3, 8, 16\)"):
         metric(torch.zeros(3, 16, 32), torch.zeros(3, 8, 16))
 
 

@@ -158,9 +158,7 @@ def test_shared_poses_pass(shared: Path, data: str, index: int) -> None:
         ),  # what it says, and OpenCV axes: both words of the convention were wrong
     ],
 )
-def test_a_real_pair_read_with_the_wrong_convention_is_caught(
-    shared: Path, convention: str, reading: str
-) -> None:
+def test_a_real_pair_read_with_the_wrong_convention_is_caught(shared: Path, convention: str, reading: str) -> None:
     check = check_pair(load_pairs(shared / "data" / "zind", convention=convention)[3])
     assert check.best == reading
     assert check.likely_mistake is not None

@@ -33,9 +33,7 @@ class GreyBall:
     def __init__(self) -> None:
         self.calls = 0
 
-    def __call__(
-        self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None, progress=None
-    ):
+    def __call__(self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None, progress=None):
         self.calls += 1
         count = len(images)
         return Gaussians(
@@ -136,9 +134,7 @@ def test_a_masked_target_gets_a_second_figure_in_the_table_only(tmp_path: Path) 
     Image.fromarray(mask).save(folder / "c_mask.png")
     (case,) = evaluate(load_pairs(folder), GreyBall(), tmp_path / "out", height=HEIGHT)
     target, prediction = read(case.target), read(case.prediction)
-    assert case.masked_ws_psnr == pytest.approx(
-        ws_psnr(prediction, target, mask=torch.from_numpy(mask > 0)), abs=0.01
-    )
+    assert case.masked_ws_psnr == pytest.approx(ws_psnr(prediction, target, mask=torch.from_numpy(mask > 0)), abs=0.01)
     assert case.ws_psnr == pytest.approx(ws_psnr(prediction, target), abs=0.01)
     assert list(json.loads((tmp_path / "out" / "results.json").read_text())[0]) == KEYS
     assert "masked" in [str(column.header) for column in results_table([case]).columns]
@@ -154,9 +150,7 @@ def test_the_table_ends_with_the_mean(tmp_path: Path) -> None:
 
 
 def test_a_perfect_picture_is_null_in_json(tmp_path: Path) -> None:
-    (case,) = evaluate(
-        load_pairs(write_triplet(tmp_path / "room")), GreyBall(), tmp_path / "out", height=HEIGHT
-    )
+    (case,) = evaluate(load_pairs(write_triplet(tmp_path / "room")), GreyBall(), tmp_path / "out", height=HEIGHT)
     object.__setattr__(case, "psnr", math.inf)
     assert json.loads(json.dumps(case.as_json(), allow_nan=False))["psnr"] is None
 

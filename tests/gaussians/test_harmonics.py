@@ -12,9 +12,7 @@ from pansplat.gaussians.harmonics import basis, evaluate
 
 def _random_directions(count: int, seed: int = 0) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
-    return torch.nn.functional.normalize(
-        torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=-1
-    )
+    return torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=-1)
 
 
 def test_basis_is_orthonormal_on_the_sphere():
@@ -80,9 +78,7 @@ def test_colour_is_differentiable_in_coefficients_and_direction():
 
 
 def test_colour_never_is_negative_and_has_no_slope_where_it_is_off():
-    harmonics = torch.tensor(
-        [[[-9.0, -0.5 / 0.28209479177387814, 1.0]]], dtype=torch.float64, requires_grad=True
-    )
+    harmonics = torch.tensor([[[-9.0, -0.5 / 0.28209479177387814, 1.0]]], dtype=torch.float64, requires_grad=True)
     colour = evaluate(harmonics, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64))
     colour.sum().backward()
     assert colour[0, 0] == 0 and harmonics.grad is not None

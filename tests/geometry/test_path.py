@@ -46,9 +46,7 @@ def test_up_is_minus_y_of_upright_cameras_and_follows_tilted_ones():
     assert torch.allclose(up_direction(TWO), torch.tensor((0.0, -1.0, 0.0), dtype=torch.float64))
     z_up = _pose(rotation=[[1, 0, 0], [0, 0, 1], [0, -1, 0]])[None]
     assert torch.allclose(up_direction(z_up), torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64))
-    assert torch.allclose(
-        up_direction(torch.zeros(0, 4, 4)), torch.tensor((0.0, -1.0, 0.0), dtype=torch.float64)
-    )
+    assert torch.allclose(up_direction(torch.zeros(0, 4, 4)), torch.tensor((0.0, -1.0, 0.0), dtype=torch.float64))
 
 
 def test_look_pose_puts_forward_ahead_and_up_upright():
@@ -107,9 +105,7 @@ def test_flight_sweeps_left_first_then_right_by_the_given_angle():
 
 
 def test_flight_is_rigid_and_never_jumps():
-    cameras = torch.stack(
-        (_pose((0, 0, 0)), _pose((1, 0, 0), _rotation_z(3)), _pose((1, 0.1, 2)), _pose((0, 0, 4)))
-    )
+    cameras = torch.stack((_pose((0, 0, 0)), _pose((1, 0, 0), _rotation_z(3)), _pose((1, 0.1, 2)), _pose((0, 0, 4))))
     path = fly_path(cameras, [i / 300 for i in range(301)])
     assert max(orthonormal_error(pose) for pose in path) < 1e-9
     length = float((cameras[1:, :3, 3] - cameras[:-1, :3, 3]).norm(dim=-1).sum())

@@ -13,9 +13,7 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import rotations_from_quats
 
 
-def _scene(
-    count: int, *, seed: int = 0, scale: float = 0.15, spread: float = 1.5, degree: int = 2
-) -> Gaussians:
+def _scene(count: int, *, seed: int = 0, scale: float = 0.15, spread: float = 1.5, degree: int = 2) -> Gaussians:
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -101,9 +99,7 @@ def _dense(
     return sums[:3], sums[4], sums[3]
 
 
-def _classic_q(
-    mean: Tensor, s: Tensor, pixels: Tensor, focal: float, size: tuple[int, int], dilation: float
-) -> Tensor:
+def _classic_q(mean: Tensor, s: Tensor, pixels: Tensor, focal: float, size: tuple[int, int], dilation: float) -> Tensor:
     height, width = size
     x, y, z = mean
     zero = torch.zeros_like(z)

@@ -119,3 +119,13 @@ def test_blending_refuses_a_wrong_number_of_weights():
         blend([], torch.ones(0))
     with pytest.raises(ValueError, match="at least one view"):
         blend_weights(torch.zeros(3), torch.zeros(0, 3))
+
+
+def test_where_the_nearest_view_sees_nothing_the_others_fill():
+    one = torch.ones(1, 2)
+    near = Rendering(torch.zeros(3, 1, 2), torch.tensor([[1.0, 0.0]]), 2 * one)
+    other = Rendering(torch.ones(3, 1, 2), one, 5 * one)
+    mixed = blend([near, other], torch.tensor([1.0, 0.0]))
+    assert mixed.color[:, 0].tolist() == [[0.0, 1.0]] * 3
+    assert mixed.alpha.tolist() == [[1.0, 1.0]]
+    assert mixed.depth.tolist() == [[2.0, 5.0]]

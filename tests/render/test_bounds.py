@@ -29,9 +29,7 @@ def _cones(count: int, seed: int, size: float) -> tuple[torch.Tensor, torch.Tens
 def _seen(direction, covariance, level, rays):
     """Which rays reach alpha's cut, by the exact response."""
     adjugate = torch.linalg.det(covariance)[:, None, None] * torch.linalg.inv(covariance)
-    across = torch.linalg.cross(
-        rays[None].expand(len(direction), -1, 3), direction[:, None].expand(-1, len(rays), 3)
-    )
+    across = torch.linalg.cross(rays[None].expand(len(direction), -1, 3), direction[:, None].expand(-1, len(rays), 3))
     q = torch.einsum("npi,nij,npj->np", across, covariance, across)
     q = q / torch.einsum("pi,nij,pj->np", rays, adjugate, rays)
     return (q <= level[:, None]) & (torch.einsum("pi,nij,nj->np", rays, adjugate, direction) > 0)
@@ -49,9 +47,7 @@ def test_panorama_boxes_hold_every_visible_pixel_and_little_more(size):
         t[:, None] for t in equirect_boxes(direction, covariance, level, (height, width)).unbind(1)
     )
     x, y = torch.arange(width) + 0.5, torch.arange(height) + 0.5
-    across = (
-        sum(((x + k * width >= left - 1e-6) & (x + k * width <= right + 1e-6)).long() for k in (-1, 0, 1)) > 0
-    )
+    across = sum(((x + k * width >= left - 1e-6) & (x + k * width <= right + 1e-6)).long() for k in (-1, 0, 1)) > 0
     inside = ((y >= top - 1e-6) & (y <= bottom + 1e-6))[:, :, None] & across[:, None, :]
     assert not (seen & ~inside).any()
     if size < 0.1:  # ellipses in boxes cover about pi/4, less where they lie aslant or near a pole
@@ -60,9 +56,7 @@ def test_panorama_boxes_hold_every_visible_pixel_and_little_more(size):
 
 @pytest.mark.parametrize("size", [0.01, 0.05, 0.5])
 def test_pinhole_boxes_hold_every_visible_pixel_and_touch_it(size):
-    (picture,) = pictures(
-        "pinhole", (60, 80), vertical_fov_degrees=90, face_size=None, device=torch.device("cpu")
-    )
+    (picture,) = pictures("pinhole", (60, 80), vertical_fov_degrees=90, face_size=None, device=torch.device("cpu"))
     direction, covariance, level = _cones(200, 2, size)
     seen = _seen(direction, covariance, level, picture.directions().reshape(-1, 3)).reshape(-1, 60, 80)
     boxes = pinhole_boxes(direction, covariance, level, (60, 80), picture.focal)
@@ -113,10 +107,7 @@ def test_tile_lists_equal_brute_force_in_bands_of_any_size(wraps, size):
             px = x[(tile % columns) * TILE : (tile % columns + 1) * TILE]
             py = y[(tile // columns) * TILE : (tile // columns + 1) * TILE]
             across = torch.stack(
-                [
-                    ((px + k * width >= boxes[:, :1]) & (px + k * width <= boxes[:, 1:2])).any(dim=1)
-                    for k in shifts
-                ]
+                [((px + k * width >= boxes[:, :1]) & (px + k * width <= boxes[:, 1:2])).any(dim=1) for k in shifts]
             ).any(dim=0)
             down = ((py >= boxes[:, 2:3]) & (py <= boxes[:, 3:4])).any(dim=1)
             needed = set(torch.nonzero(across & down)[:, 0].tolist())

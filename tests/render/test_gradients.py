@@ -50,9 +50,7 @@ def test_gradients_equal_finite_differences_for_every_input(layout, kernel, lowp
 @pytest.mark.parametrize("kernel", ["ray", "ewa"])
 @pytest.mark.parametrize("lowpass", ["angular", "3dgs"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_gradients_through_many_blocks_equal_the_dense_renderers(
-    kernel, lowpass, dtype, make_scene, dense, pose
-):
+def test_gradients_through_many_blocks_equal_the_dense_renderers(kernel, lowpass, dtype, make_scene, dense, pose):
     scene = make_scene(150, scale=0.3, seed=5)  # several blocks in each of 2 x 3 tiles
     target = torch.rand(5, 13, 18, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     camera = pose.clone().requires_grad_()
@@ -153,9 +151,7 @@ def test_a_second_derivative_is_refused_clearly(make_scene, pose):
 def test_backward_twice_over_a_kept_graph_doubles_the_gradient(make_scene, pose):
     scene = make_scene(20)
     leaves = _leaves(scene)
-    loss = rasterize(
-        Gaussians(**leaves, levels=scene.levels, views=scene.views), pose, size=(8, 16)
-    ).color.sum()
+    loss = rasterize(Gaussians(**leaves, levels=scene.levels, views=scene.views), pose, size=(8, 16)).color.sum()
     loss.backward(retain_graph=True)
     once = {name: leaf.grad.clone() for name, leaf in leaves.items() if leaf.grad is not None}
     loss.backward()

@@ -69,9 +69,7 @@ def test_a_panorama_pixel_is_a_one_pixel_pinhole_picture(make_scene, pose):
         right = torch.linalg.cross(torch.tensor((0.0, 1.0, 0.0), dtype=torch.float64), ahead)
         right = right / right.norm()
         rotation = torch.stack((right, torch.linalg.cross(ahead, right), ahead), dim=1)
-        look = rasterize(
-            scene, _turned(pose, rotation), size=(1, 1), layout="pinhole", vertical_fov_degrees=fov
-        )
+        look = rasterize(scene, _turned(pose, rotation), size=(1, 1), layout="pinhole", vertical_fov_degrees=fov)
         assert torch.allclose(look.color[:, 0, 0], panorama.color[:, row, column], atol=1e-9)
         assert torch.allclose(look.depth[0, 0], panorama.depth[row, column], atol=1e-9)
 
@@ -102,10 +100,7 @@ def test_a_ball_at_a_pole_fills_whole_rows_evenly(side):
 @pytest.mark.parametrize("kernel", ["ray", "ewa"])
 def test_a_face_of_the_cubemap_is_a_pinhole_picture(kernel, make_scene, pose):
     scene = make_scene(80, scale=0.3)
-    faces = [
-        rasterize(scene, p, size=(16, 16), layout="pinhole", kernel=kernel, order="z")
-        for p in face_poses(pose)
-    ]
+    faces = [rasterize(scene, p, size=(16, 16), layout="pinhole", kernel=kernel, order="z") for p in face_poses(pose)]
     panorama = rasterize(scene, pose, size=(12, 24), layout="cubemap", face_size=16, kernel=kernel, order="z")
     expected = stitch_faces(torch.stack([f.color for f in faces]), (12, 24))
     assert torch.allclose(panorama.color, expected, atol=1e-9)
@@ -148,9 +143,7 @@ def test_face_rotations_equal_the_originals(shared):
 @pytest.mark.parametrize("num", [1, 2, 7, 16])
 def test_stitching_equal_faces_gives_the_same_value_everywhere(num):
     faces = torch.full((6, 2, num, num), 0.7, dtype=torch.float64)
-    assert torch.allclose(
-        stitch_faces(faces, (9, 18)), torch.full((2, 9, 18), 0.7, dtype=torch.float64), atol=1e-14
-    )
+    assert torch.allclose(stitch_faces(faces, (9, 18)), torch.full((2, 9, 18), 0.7, dtype=torch.float64), atol=1e-14)
 
 
 def _direction_faces(num: int) -> torch.Tensor:
@@ -160,10 +153,7 @@ def _direction_faces(num: int) -> torch.Tensor:
 
 def test_stitching_reproduces_the_direction_of_every_pixel_across_edges_and_corners():
     expected = pixel_directions(64, 128, dtype=torch.float64).permute(2, 0, 1)
-    errors = [
-        float((stitch_faces(_direction_faces(num), (64, 128)) - expected).norm(dim=0).max())
-        for num in (16, 64)
-    ]
+    errors = [float((stitch_faces(_direction_faces(num), (64, 128)) - expected).norm(dim=0).max()) for num in (16, 64)]
     # Bilinear within a face, and a neighbour's pixel is less than a pixel from its ideal place.
     assert errors[0] < 0.05 and errors[1] < 0.012
     uv = uv_from_directions(stitch_faces(_direction_faces(64), (64, 128)).permute(1, 2, 0))

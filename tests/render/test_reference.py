@@ -120,9 +120,7 @@ def test_white_furnace_is_white(make_scene, pose):
     scene = dataclasses.replace(scene, harmonics=harmonics)
     for layout in ("equirect", "cubemap", "pinhole"):
         for dtype, tolerance in ((torch.float32, 1e-6), (torch.float64, 1e-13)):
-            got = rasterize(
-                scene.to(dtype=dtype), pose, size=(32, 64), layout=layout, background=(0.7, 0.3, 0.5)
-            )
+            got = rasterize(scene.to(dtype=dtype), pose, size=(32, 64), layout=layout, background=(0.7, 0.3, 0.5))
             white = torch.tensor((0.7, 0.3, 0.5), dtype=torch.float64)[:, None, None]
             assert (got.color - white).abs().max() < tolerance
             assert float(got.alpha.mean()) > 0.3

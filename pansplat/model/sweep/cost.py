@@ -139,7 +139,8 @@ def _pad_in_place(padded, m):
 @nb.njit(parallel=True, fastmath=True, cache=True)
 def _family_cost(
     image, gray, mean, variance, other, rays, rotation, translation, base, step, limits, penalty, side,
-    down, floor_ceiling, usable, other_usable, other_inverse, other_confidence, informed, weights, m, cost, offset, count,
+    down, floor_ceiling, usable, other_usable, other_inverse, other_confidence, informed, weights, m,
+    cost, offset, count,
 ):  # fmt: skip
     height, width = image.shape[:2]
     low, high = limits

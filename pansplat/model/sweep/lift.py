@@ -157,7 +157,7 @@ def _sheet(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Picture and inverse depth of a sheet's level: the far side of the surface, and the far side's colours."""
     height = image.shape[0] >> level
-    reach = config.sheet_reach[level - 2]
+    reach = min(config.sheet_reach[level - 2], height // 4)
     usable = np.where(mask, inverse, np.float32(inverse.max()))
     far = usable.reshape(height, 1 << level, 2 * height, 1 << level).min(axis=(1, 3))
     far = _spread(far, reach, largest=False)
@@ -168,7 +168,7 @@ def _sheet(
     weight = resize_sphere(behind.astype(np.float32), height)
     color = resize_sphere(image * behind[..., None], height)
     filled_color, filled_weight = color.copy(), weight.copy()
-    for radius in (1, 2, 4, 8, 16):
+    for radius in (r for r in (1, 2, 4, 8, 16) if 3 * r <= height):
         margin = 3 * radius
         inside = (slice(margin, -margin), slice(margin, -margin))
         wide_color = cv2.GaussianBlur(pad_sphere(color, margin), (0, 0), radius)[inside]

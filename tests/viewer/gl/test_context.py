@@ -77,9 +77,7 @@ def draw_in_subprocess(random_scene, pose, tmp_path):
     def draw(environment: dict[str, str], backend: str = "egl") -> dict[str, np.ndarray]:
         out = tmp_path / f"{len(list(tmp_path.iterdir()))}.npz"
         command = [sys.executable, "-c", _DRAW, str(tmp_path / "scene.pt"), str(out), backend]
-        done = subprocess.run(
-            command, env={**os.environ, **environment}, capture_output=True, text=True, timeout=120
-        )
+        done = subprocess.run(command, env={**os.environ, **environment}, capture_output=True, text=True, timeout=120)
         assert done.returncode == 0, done.stderr
         with np.load(out) as pictures:
             return dict(pictures)
@@ -124,9 +122,7 @@ def test_missing_opengl_names_the_packages(monkeypatch):
 
     monkeypatch.setattr(moderngl, "create_context", fail)
     monkeypatch.setattr(offscreen, "_load_osmesa", fail_too)
-    with pytest.raises(
-        InputError, match=r"libEGL not loaded.*libOSMesa.*apt-get install libegl1.*libosmesa6"
-    ):
+    with pytest.raises(InputError, match=r"libEGL not loaded.*libOSMesa.*apt-get install libegl1.*libosmesa6"):
         offscreen.create_context()
 
 

@@ -27,9 +27,7 @@ def test_pinhole_picture_is_the_reference(
     renderer, random_scene, pose, reference, assert_same, tier, kernel, lowpass, order
 ):
     scene = random_scene()
-    settings = DrawSettings(
-        kernel=kernel, lowpass=lowpass, order=order, background=BACKGROUND, vertical_fov_degrees=65
-    )
+    settings = DrawSettings(kernel=kernel, lowpass=lowpass, order=order, background=BACKGROUND, vertical_fov_degrees=65)
     drawn = renderer(scene, tier)
     drawn.render(pose, (97, 64), settings)
     assert_same(drawn, reference(scene, pose, (97, 64), settings))
@@ -37,9 +35,7 @@ def test_pinhole_picture_is_the_reference(
 
 @TIERS
 @KERNELS
-def test_each_of_six_faces_is_the_reference(
-    renderer, random_scene, pose, reference, assert_same, tier, kernel
-):
+def test_each_of_six_faces_is_the_reference(renderer, random_scene, pose, reference, assert_same, tier, kernel):
     scene = random_scene(seed=1)
     settings = DrawSettings(kernel=kernel, background=BACKGROUND)
     drawn = renderer(scene, tier)
@@ -56,9 +52,7 @@ def test_stitched_panorama_is_the_reference(
     renderer, random_scene, pose, reference, assert_same, tier, kernel, order, face_size
 ):
     scene = random_scene(seed=2)
-    settings = DrawSettings(
-        kernel=kernel, order=order, background=BACKGROUND, layout="equirect", face_size=face_size
-    )
+    settings = DrawSettings(kernel=kernel, order=order, background=BACKGROUND, layout="equirect", face_size=face_size)
     drawn = renderer(scene, tier)
     drawn.render(pose, (96, 48), settings)
     assert_same(drawn, reference(scene, pose, (96, 48), settings))
@@ -95,9 +89,7 @@ def test_subpixel_needle_and_disc_gaussians_are_the_reference(
 
 
 @pytest.mark.parametrize("degree", [0, 2, 4])
-def test_colours_of_any_degree_follow_the_position(
-    renderer, random_scene, pose, reference, assert_same, degree
-):
+def test_colours_of_any_degree_follow_the_position(renderer, random_scene, pose, reference, assert_same, degree):
     scene = random_scene(degree=degree, seed=5)
     drawn = renderer(scene)
     for shift in (0.0, 0.5):
@@ -124,9 +116,7 @@ def test_picture_is_free_of_the_unit(renderer, random_scene, pose, unit):
     drawn = renderer(scene)
     drawn.render(pose, (64, 48), DrawSettings())
     expected = drawn.read_color()
-    gaussians = replace(
-        scene.gaussians, means=scene.gaussians.means * unit, scales=scene.gaussians.scales * unit
-    )
+    gaussians = replace(scene.gaussians, means=scene.gaussians.means * unit, scales=scene.gaussians.scales * unit)
     scene.cam2world[:, :3, 3] *= unit
     drawn.upload(replace(scene, gaussians=gaussians))
     pose[:3, 3] *= unit
@@ -141,9 +131,7 @@ def test_scene_far_from_the_origin_looks_the_same(renderer, random_scene, pose):
     drawn.render(pose, (64, 48), DrawSettings())
     expected = drawn.read_color()
     offset = torch.tensor((4e5, -2e5, 1e5), dtype=torch.float64)
-    gaussians = replace(
-        scene.gaussians.to(dtype=torch.float64), means=scene.gaussians.means.double() + offset
-    )
+    gaussians = replace(scene.gaussians.to(dtype=torch.float64), means=scene.gaussians.means.double() + offset)
     scene.cam2world[:, :3, 3] += offset
     drawn.upload(replace(scene, gaussians=gaussians))
     pose[:3, 3] += offset.numpy()
@@ -152,9 +140,7 @@ def test_scene_far_from_the_origin_looks_the_same(renderer, random_scene, pose):
 
 
 @pytest.mark.parametrize("near", [1.5, 2.5])
-def test_near_leaves_out_what_the_reference_leaves_out(
-    renderer, random_scene, pose, reference, assert_same, near
-):
+def test_near_leaves_out_what_the_reference_leaves_out(renderer, random_scene, pose, reference, assert_same, near):
     scene = random_scene(seed=9)
     settings = DrawSettings(near=near)
     drawn = renderer(scene)
@@ -162,9 +148,7 @@ def test_near_leaves_out_what_the_reference_leaves_out(
     assert_same(drawn, reference(scene, pose, (64, 48), settings))
 
 
-def test_opacities_beyond_one_and_below_the_cut_are_the_reference(
-    renderer, random_scene, pose, reference, assert_same
-):
+def test_opacities_beyond_one_and_below_the_cut_are_the_reference(renderer, random_scene, pose, reference, assert_same):
     scene = random_scene(seed=10)
     opacities = scene.gaussians.opacities * 4 - 1
     opacities[::7] = 0.99 / 255

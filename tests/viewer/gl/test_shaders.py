@@ -10,9 +10,7 @@ from pansplat.geometry.cubemap import face_rotations
 from pansplat_viewer.programs import Programs, source
 
 FOLDER = resources.files("pansplat_viewer.shaders")
-SOURCES = sorted(
-    path.name for path in FOLDER.iterdir() if path.name.endswith((".glsl", ".vert", ".frag", ".comp"))
-)
+SOURCES = sorted(path.name for path in FOLDER.iterdir() if path.name.endswith((".glsl", ".vert", ".frag", ".comp")))
 
 
 def test_readme_names_every_file_uniform_and_input():

@@ -22,9 +22,7 @@ def replacing(path: Path | str) -> Iterator[Path]:
     """
     path = Path(path)
     if not path.parent.is_dir():
-        raise InputError(
-            f"cannot write {path}: needed an existing folder, got {path.parent}; create it first."
-        )
+        raise InputError(f"cannot write {path}: needed an existing folder, got {path.parent}; create it first.")
     if path.is_dir():
         raise InputError(f"cannot write {path}: needed a file name, got a folder; give a file inside it.")
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
