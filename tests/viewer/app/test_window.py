@@ -45,8 +45,11 @@ class Display:
 
     def __init__(self, folder: Path) -> None:
         read, write = os.pipe()
+        # Without -noreset the server starts over, and refuses clients, whenever xdotool was its only one.
         command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x800x24", "-fbdir", str(folder)]
-        self._server = subprocess.Popen([*command, "-nolisten", "tcp"], pass_fds=(write,), stderr=subprocess.DEVNULL)
+        self._server = subprocess.Popen(
+            [*command, "-noreset", "-nolisten", "tcp"], pass_fds=(write,), stderr=subprocess.DEVNULL
+        )
         os.close(write)
         with os.fdopen(read) as answer:
             self.name = f":{answer.readline().strip()}"
