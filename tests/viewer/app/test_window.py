@@ -126,9 +126,9 @@ def test_the_window_can_be_driven_by_mouse_and_keys_and_leaves_cleanly(display, 
         display.do("mouseup", "1")
         wait_until(lambda: np.abs(display.screen()[picture] - before).mean() > 5, "the drag to look around")
 
-        display.do("key", "Tab")
         panel = (slice(20, 300), slice(20, 280))
         with_panel = display.screen()[panel]
+        display.do("key", "Tab")
         wait_until(lambda: np.abs(display.screen()[panel] - with_panel).mean() > 5, "the panels to go")
 
         display.do("key", "p")
