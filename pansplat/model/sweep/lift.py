@@ -26,6 +26,8 @@ from pansplat.model.sweep.surface import AGREES, SEEN_THROUGH, Surface, agreemen
 
 NUM_LEVELS = 4
 _SH_0 = 0.28209479177387814  # Y_0
+_MAX_LENGTH = 0.2  # a disc's longest standard deviation over its distance
+_FREE_SPACE = 0.5  # no Gaussian is nearer to an input camera than this fraction of `near`
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class LiftConfig:
     """Where another view agrees."""
     alone_opacity: float = 0.9
     """Where only this view sees the surface."""
-    doubted_opacity: float = 0.6
+    doubted_opacity: float = 0.8
     """Where another view sees through, but is not sure itself."""
 
 
@@ -203,7 +205,7 @@ def _opacity(
         opacity[said == AGREES] = config.sure_opacity
         through = said == SEEN_THROUGH
         opacity[through & ~certain] = config.doubted_opacity
-        kept &= ~(through & certain)
+        kept &= ~(through & certain) & (np.linalg.norm(local, axis=-1) > _FREE_SPACE * posed.near)
     return opacity, kept
 
 
@@ -230,7 +232,8 @@ def _discs(
     south = np.cross(rays, east) * -1
     # X = ray / rho, so dX / angle = (direction - ray * dlog(rho) / angle) / rho.
     steepest = np.linalg.norm(slope, axis=-1)
-    limit = config.max_stretch[level]
+    # A disc hung almost along its ray must end well before the camera.
+    limit = min(config.max_stretch[level], _MAX_LENGTH / (config.footprint * spacing))
     slope = slope * np.minimum(1, limit / np.maximum(steepest, 1e-9))[:, None]
     steepest = np.minimum(steepest, limit)
     uphill = np.where(steepest[:, None] > 1e-6, slope / np.maximum(steepest, 1e-6)[:, None], (1.0, 0.0))
