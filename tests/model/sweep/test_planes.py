@@ -1,0 +1,70 @@
+"""The planes that a scene has."""
+
+import numpy as np
+import pytest
+
+from pansplat.model.sweep.planes import PlaneSupport, plane_support
+from pansplat.model.sweep.surface import Surface, world_points
+
+_AXES = np.array(((0.0, 1, 0), (1, 0, 0), (0, 0, 1)))  # down and the room's two wall normals
+
+
+@pytest.fixture(scope="module")
+def support(empty_room) -> PlaneSupport:
+    """Of the exact surfaces, every pixel labelled with its wall's axis."""
+    room, poses = empty_room.room, empty_room.posed.cam2world
+    surfaces = []
+    for pose, depth in zip(poses, empty_room.depths, strict=True):
+        plain = Surface((1 / depth).astype(np.float32), np.zeros(depth.shape, np.uint8))
+        points = world_points(plain, pose) @ _AXES.T
+        low, high = np.array(room.low) @ _AXES.T, np.array(room.high) @ _AXES.T
+        wall = np.minimum(np.abs(points - low), np.abs(points - high)).argmin(axis=-1)
+        surfaces.append(Surface(plain.inverse_depth, (wall + 1).astype(np.uint8)))
+    return plane_support(surfaces, list(empty_room.posed.masks), poses, _AXES, empty_room.posed.far)
+
+
+def test_shares_of_all_planes_sum_to_one(support):
+    assert np.isclose(support.histogram.sum(), 1, atol=1e-3)
+
+
+@pytest.mark.parametrize("view", (0, 1))
+def test_every_wall_has_support_at_its_distance_and_none_between(support, empty_room, view):
+    pose = empty_room.posed.cam2world[view]
+    low, high = (np.array(corner) @ _AXES.T for corner in (empty_room.room.low, empty_room.room.high))
+    centre = pose[:3, 3] @ _AXES.T
+    for axis in range(3):
+        distances = np.array((centre[axis] - low[axis], high[axis] - centre[axis]))
+        share = support.share(axis, pose, 1 / distances)
+        assert share[0, 0] > 0.9 and share[1, 1] > 0.9
+        assert support.share(axis, pose, 1 / (0.7 * distances)).max() < 0.1
+
+
+@pytest.mark.parametrize("view", (0, 1))
+def test_the_floor_is_below_and_the_ceiling_above_the_camera(support, empty_room, view):
+    """Bounds leave a little room beyond, never less than the true planes."""
+    pose, room = empty_room.posed.cam2world[view], empty_room.room
+    down, up = support.bounds(pose)
+    floor, ceiling = room.high[1] - pose[1, 3], room.low[1] - pose[1, 3]
+    assert floor < down < 1.15 * floor + 0.1
+    assert 1.15 * ceiling - 0.1 < up < ceiling
+
+
+def test_without_agreement_nothing_is_known(empty_room):
+    nothing = [np.zeros_like(mask) for mask in empty_room.posed.masks]
+    support = plane_support(empty_room.surfaces, nothing, empty_room.posed.cam2world, _AXES, 8.0)
+    assert support.bounds(empty_room.posed.cam2world[0]) == (np.inf, -np.inf)
+    assert support.share(1, empty_room.posed.cam2world[0], np.linspace(0.1, 2, 20)).max() == 0
+
+
+def test_the_sweep_finds_floor_and_ceiling_by_itself(empty_room):
+    from pansplat.model.sweep.surface import agreement
+
+    poses = empty_room.posed.cam2world
+    labelled = [
+        Surface(s.inverse_depth, np.where(np.abs(world_points(s, p)[..., 1]) > 1.0, 1, 0).astype(np.uint8))
+        for s, p in zip(empty_room.surfaces, poses, strict=True)
+    ]
+    agreed = [agreement(labelled, poses, view) for view in (0, 1)]
+    down, up = plane_support(labelled, agreed, poses, _AXES, 8.0).bounds(poses[0])
+    assert down == pytest.approx(1.06 * empty_room.room.high[1] + 0.05, abs=0.1)
+    assert up == pytest.approx(1.06 * empty_room.room.low[1] - 0.05, abs=0.1)
