@@ -22,7 +22,15 @@ from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
 from pansplat.geometry.pose import quats_from_rotations
 from pansplat.model.sweep.search import PosedImages
 from pansplat.model.sweep.sphere import pad_sphere, resize_sphere
-from pansplat.model.sweep.surface import AGREES, SEEN_THROUGH, Surface, agreement, guided_upsample, relation
+from pansplat.model.sweep.surface import (
+    AGREES,
+    SEEN_THROUGH,
+    Surface,
+    agreement,
+    guided_upsample,
+    relation,
+    world_points,
+)
 
 NUM_LEVELS = 4
 _SH_0 = 0.28209479177387814  # Y_0
@@ -65,12 +73,36 @@ def lift(posed: PosedImages, surfaces: list[Surface], config: LiftConfig) -> Gau
             for s, image in zip(surfaces, posed.images, strict=True)
         ]
     sure = [agreement(surfaces, posed.cam2world, view) for view in range(len(surfaces))]
+    surfaces = [_clear_the_way(posed, surfaces, sure, view, config) for view in range(len(surfaces))]
     parts = [
         _lift_level(posed, surfaces, sure, view, level, config)
         for level in range(NUM_LEVELS)
         for view in range(len(surfaces))
     ]
     return Gaussians.cat(parts)
+
+
+def _clear_the_way(
+    posed: PosedImages, surfaces: list[Surface], sure: list[np.ndarray], view: int, config: LiftConfig
+) -> Surface:
+    """The surface with what other views surely see through moved back to the sheet behind it."""
+    surface = surfaces[view]
+    points = world_points(surface, posed.cam2world[view])
+    _, kept = _opacity(points.reshape(-1, 3), posed, surfaces, sure, view, config)
+    wrong = ~kept.reshape(surface.inverse_depth.shape)
+    far = _far_side(surface.inverse_depth, posed.masks[view], 2, config)
+    behind = np.minimum(surface.inverse_depth, resize_sphere(far, surface.height))
+    return Surface(np.where(wrong, behind, surface.inverse_depth), surface.family)
+
+
+def _far_side(inverse: np.ndarray, mask: np.ndarray, level: int, config: LiftConfig) -> np.ndarray:
+    """Inverse depth of the surface at a coarse level's size, the far side of every jump spread over it."""
+    height = inverse.shape[0] >> level
+    reach = min(config.sheet_reach[level - 2], height // 4)
+    usable = np.where(mask, inverse, np.float32(inverse.max()))
+    far = usable.reshape(height, 1 << level, 2 * height, 1 << level).min(axis=(1, 3))
+    far = pad_sphere(_spread(far, reach, largest=False), 2 * reach)
+    return cv2.GaussianBlur(far, (0, 0), reach / 2)[2 * reach : -2 * reach, 2 * reach : -2 * reach]
 
 
 def _lift_level(
@@ -159,12 +191,7 @@ def _sheet(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Picture and inverse depth of a sheet's level: the far side of the surface, and the far side's colours."""
     height = image.shape[0] >> level
-    reach = min(config.sheet_reach[level - 2], height // 4)
-    usable = np.where(mask, inverse, np.float32(inverse.max()))
-    far = usable.reshape(height, 1 << level, 2 * height, 1 << level).min(axis=(1, 3))
-    far = _spread(far, reach, largest=False)
-    far = pad_sphere(far, 2 * reach)
-    far = cv2.GaussianBlur(far, (0, 0), reach / 2)[2 * reach : -2 * reach, 2 * reach : -2 * reach]
+    far = _far_side(inverse, mask, level, config)
     # Colours of what lies at least as far as the sheet, spread over the gaps in between.
     behind = mask & (inverse <= 1.15 * resize_sphere(far, image.shape[0]))
     weight = resize_sphere(behind.astype(np.float32), height)
