@@ -13,6 +13,7 @@ from torch import Tensor
 from pansplat.data.images import read_depth, read_mask, read_panorama
 from pansplat.data.masks import static_mask_of_files
 from pansplat.data.views import Views
+from pansplat.errors import InputError
 
 _COINCIDENT = 1e-3  # metres
 
@@ -88,6 +89,11 @@ class Pair:
         for i, panorama in enumerate(panoramas):
             images[i], opaque = read_panorama(panorama.image, height)
             masks[i] = opaque & self._scene_mask(panorama, height)
+            if not masks[i].any():
+                raise InputError(
+                    f"{panorama.mask or panorama.image}: needed some pixels that show the scene (white in a mask, "
+                    "opaque in a picture), got none; invert the mask or remove the alpha channel."
+                )
         depths = [read_depth(p.depth, height) for p in panoramas if p.depth is not None]
         return Views(
             images=images,

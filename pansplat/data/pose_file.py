@@ -105,15 +105,21 @@ def _cases(source: Path, names: list[str]) -> tuple[Case, ...]:
         )
     cases = []
     for key in ("triplets", "pairs"):
-        for number, entry in enumerate(content.get(key) or [], start=1):
+        entries = content.get(key) or []
+        if not isinstance(entries, list):
+            raise InputError(f'{source}: needed a list as "{key}", got {str(entries)[:60]}; put [ ] around it.')
+        for number, entry in enumerate(entries, start=1):
             where = f"{source}, {key} {number}"
-            context = entry.get("context") if isinstance(entry, dict) else None
-            if not isinstance(context, list) or len(set(map(str, context))) < 2 or len(set(context)) < len(context):
+            context, target = (entry.get("context"), entry.get("target")) if isinstance(entry, dict) else (None, None)
+            context = _names(context)
+            if context is None or len(set(context)) < max(2, len(context)):
                 raise InputError(
-                    f'{where}: needed two or more different pictures as "context", got {context}; correct it.'
+                    f'{where}: needed two or more different pictures as "context", a list of names, '
+                    f"got {str(entry)[:60]}; correct it."
                 )
-            targets = entry.get("target") or []
-            targets = [targets] if isinstance(targets, str) else targets
+            targets = _names([target] if isinstance(target, str) else target or [])
+            if targets is None:
+                raise InputError(f'{where}: needed a picture or a list of them as "target", got {target}; correct it.')
             case = tuple(tuple(_index(name, names, where) for name in group) for group in (context, targets))
             cases.append((case[0], case[1]))
     if not cases:
@@ -121,9 +127,14 @@ def _cases(source: Path, names: list[str]) -> tuple[Case, ...]:
     return tuple(cases)
 
 
-def _index(name: Any, names: list[str], where: str) -> int:
+def _names(value: Any) -> list[str] | None:
+    """A list of strings as it is; None for anything else."""
+    return value if isinstance(value, list) and all(isinstance(name, str) for name in value) else None
+
+
+def _index(name: str, names: list[str], where: str) -> int:
     if name in names:
         return names.index(name)
-    close = difflib.get_close_matches(str(name), names, n=1)
+    close = difflib.get_close_matches(name, names, n=1)
     meant = f" (did you mean {close[0]!r}?)" if close else ""
     raise InputError(f"{where}: needed pictures that {POSES} has a pose for, got {name!r}{meant}; add its pose.")

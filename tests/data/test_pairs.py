@@ -105,6 +105,13 @@ def test_masks_beside_the_pictures_are_found(tmp_path: Path) -> None:
     assert torch.equal(masks[1], whole[0] > 0)
 
 
+def test_a_mask_that_leaves_nothing_is_refused(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "room")
+    write_image(folder / "right_mask.png", torch.zeros(3, 16, 32))
+    with pytest.raises(InputError, match=r"right_mask\.png: needed some pixels that show the scene.*invert the mask"):
+        load_pairs(folder)[0].load_context(16)
+
+
 def test_transparent_pixels_are_masked(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "room")
     rgba = np.full((16, 32, 4), 200, np.uint8)
@@ -284,6 +291,9 @@ def test_bad_pose_files_are_refused(tmp_path: Path, content: dict, message: str)
         ({"pairs": [{"context": ["left.png"]}]}, "pairs 1: needed two or more different pictures"),
         ({"pairs": [{"context": ["left.png", "left.png"]}]}, "needed two or more different pictures"),
         ({"pairs": ["left.png"]}, "needed two or more different pictures"),
+        ({"pairs": [{"context": [["left.png"], {"b": 1}]}]}, "needed two or more different pictures"),
+        ({"pairs": {"context": ["left.png", "right.png"]}}, 'needed a list as "pairs"'),
+        ({"pairs": [{"context": ["left.png", "right.png"], "target": 5}]}, 'needed a picture .* as "target", got 5'),
         (
             {"pairs": [{"context": ["left.png", "rigth.png"]}]},
             r"got 'rigth.png' \(did you mean 'right.png'\?\)",
