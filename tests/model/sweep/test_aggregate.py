@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pansplat.model.sweep.aggregate import AggregationConfig, aggregate, best_labels
+from pansplat.model.sweep.aggregate import AggregationConfig, _sweep_columns, aggregate, best_labels
 
 _AWAY_FROM_POLES = slice(4, -4)
 """Rows whose paths forget within half a turn where they began; nearer to a pole changing costs too much for that."""
@@ -67,14 +67,20 @@ def test_a_gap_over_a_pole_is_filled_as_well(pole):
     assert (total.argmin(axis=-1) == 5).all()
 
 
-def test_what_one_side_of_a_pole_knows_reaches_the_other_side():
-    height = 32
-    cost = np.zeros((height, 2 * height, 12), np.float32)
-    cost[:6, :4] = 1
-    cost[:6, :4, 5] = 0  # only here something is known
-    total = aggregate(cost, _gray(height), _slots(height), 12, AggregationConfig())
-    across = total[0, height : height + 4]  # half a turn away, the neighbours over the pole
-    assert (across.argmin(axis=-1) == 5).all() and (np.sort(across, axis=-1)[:, 1] > across[:, 5] + 0.05).all()
+@pytest.mark.parametrize("dy", (1, -1))
+def test_a_column_goes_on_over_the_pole_half_a_turn_away(dy):
+    """What a few columns know at the pole that paths come from reaches the opposite columns, and no others."""
+    height, count = 32, 12
+    cost = np.zeros((height, 2 * height, count), np.float32)
+    known = slice(0, 6) if dy > 0 else slice(-6, None)
+    cost[known, :4] = 1
+    cost[known, :4, 5] = 0
+    total = np.zeros_like(cost)
+    prices = tuple(np.float32(price) for price in (0.08, 0.15, 0.8, 0.1))
+    _sweep_columns(cost, total, _gray(height), _slots(height), 1, count, count, prices, dy, 0, height // 4)
+    first = total[0 if dy > 0 else -1]
+    knows = np.sort(first, axis=1)[:, 1] > first[:, 5] + 0.05
+    assert np.flatnonzero(knows).tolist() == [0, 1, 2, 3, 32, 33, 34, 35]
 
 
 def test_a_jump_stays_where_the_picture_has_an_edge():
