@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -13,6 +13,7 @@ from pansplat.gaussians.gaussians import Gaussians
 Progress = Callable[[str, float], None]  # what is being done, fraction of the whole in [0, 1]
 
 
+@runtime_checkable
 class Predictor(Protocol):
     """Posed panoramas in, Gaussians out.
 

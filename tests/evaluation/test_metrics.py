@@ -87,12 +87,12 @@ def test_metrics_are_symmetric(pair: tuple[torch.Tensor, torch.Tensor]) -> None:
 
 
 @pytest.mark.parametrize("metric", METRICS.values())
-def test_unequal_shapes_are_refused(metric) -> None:
+def test_unequal_shapes_are_refused(metric, unchecked: None) -> None:
     with pytest.raises(ValueError, match=r"must both be \(3, height, width\), got \(3, 16, 32\) and \(3, 8, 16\)"):
         metric(torch.zeros(3, 16, 32), torch.zeros(3, 8, 16))
 
 
-def test_a_mask_of_another_size_is_refused() -> None:
+def test_a_mask_of_another_size_is_refused(unchecked: None) -> None:
     image = torch.zeros(3, 16, 32)
     with pytest.raises(ValueError, match=r"`mask` must be \(16, 32\)"):
         psnr(image, image, mask=torch.ones(8, 16, dtype=torch.bool))

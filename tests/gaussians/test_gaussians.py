@@ -30,7 +30,7 @@ def test_the_degree_follows_from_the_number_of_coefficients(k, degree):
     assert _make(2, k).degree == degree
 
 
-def test_wrong_shapes_are_refused_by_name():
+def test_wrong_shapes_are_refused_by_name(unchecked):
     good = _make(3)
     fields = {name: getattr(good, name) for name in good.__dataclass_fields__}
     with pytest.raises(ValueError, match=r"`scales` must have shape \(3, 3\).*got \(2, 3\)"):

@@ -313,7 +313,7 @@ def test_the_number_of_threads_changes_no_bit(make_scene, pose):
     assert torch.equal(*pictures)
 
 
-def test_arguments_out_of_range_are_refused(make_scene, pose):
+def test_arguments_out_of_range_are_refused(make_scene, pose, unchecked):
     scene = make_scene(2)
     cases = [
         ({"size": (0, 4)}, r"`size` must be \(height, width\).*\(0, 4\)"),
