@@ -85,7 +85,7 @@ def test_the_wheel_holds_both_packages_and_nothing_else(wheel: Path) -> None:
         "pansplat_viewer",
         f"pansplat-{version}.dist-info",
     }
-    assert not [name for name in names if "test" in name.split("/")[-1] or "__pycache__" in name]
+    assert not [name for name in names if "test_" in name or "conftest" in name or "__pycache__" in name]
 
 
 def test_the_wheel_holds_every_module_and_shader(wheel: Path) -> None:
