@@ -31,6 +31,11 @@ def run(argv: Sequence[str] | None = None) -> int:
         except InputError as error:
             _say("red", "error", error)
             return 2
+        except (MemoryError, RuntimeError) as error:
+            if not _lacks_memory(error):
+                raise
+            _say("red", "error", "this takes more memory than the machine has free; choose a smaller height or size.")
+            return 2
         except KeyboardInterrupt:
             _say("red", "interrupted", "nothing half-written is left behind")
             return 130
@@ -53,6 +58,11 @@ def parse(argv: Sequence[str] | None = None) -> Command:
 
 def _show_warning(message: Warning | str, *_: object) -> None:
     _say("yellow", "note", message)
+
+
+def _lacks_memory(error: BaseException) -> bool:
+    """Whether Python, numpy or torch could not allocate; torch's CPU allocator says so only in words."""
+    return isinstance(error, MemoryError) or "allocate" in str(error) or "out of memory" in str(error).lower()
 
 
 def _say(color: str, word: str, text: object) -> None:

@@ -71,8 +71,8 @@ def predict(pair: Pair, model: str, height: int, *, cache: bool) -> Scene:
 
 def require_height(height: int) -> None:
     """Refuse heights that no panorama pyramid fits."""
-    if height < 16 or height % 2:
-        raise InputError(f"--height must be an even number of at least 16 pixels, got {height}")
+    if not 16 <= height <= 8192 or height % 2:
+        raise InputError(f"--height must be an even number of 16 to 8192 pixels, got {height}")
 
 
 def blend_mode(text: str) -> str | int:

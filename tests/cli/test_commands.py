@@ -332,6 +332,31 @@ def test_interrupting_exits_with_130_and_leaves_nothing(
     assert sorted(os.listdir(tmp_path)) == before
 
 
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory: ...")])
+def test_a_lack_of_memory_is_told_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception
+) -> None:
+    def lacking(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(Sphere, "__call__", lacking)
+    room = write_room(tmp_path / "room")
+    assert run(["predict", str(room), "-o", str(tmp_path / "s.ply"), "--model", "sphere", "--height", "16"]) == 2
+    told = capsys.readouterr().err
+    assert "error: this takes more memory" in told and len(told.splitlines()) == 1
+    assert not list(tmp_path.glob("*.ply"))
+
+
+def test_other_errors_of_the_program_keep_their_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise RuntimeError("a defect")
+
+    monkeypatch.setattr(Sphere, "__call__", broken)
+    room = write_room(tmp_path / "room")
+    with pytest.raises(RuntimeError, match="a defect"):
+        run(["predict", str(room), "-o", str(tmp_path / "s.ply"), "--model", "sphere", "--height", "16"])
+
+
 def test_warning_filters_are_as_before_after_a_command(scene: Path) -> None:
     import warnings
 
