@@ -39,6 +39,21 @@ def test_links_and_pictures_of_the_readme_lead_somewhere() -> None:
     assert not [target for target in local if not (ROOT / target).exists()]
 
 
+def test_the_readme_leads_to_every_document() -> None:
+    documents = {f"docs/{file.name}" for file in (ROOT / "docs").glob("*.md")}
+    assert documents and not [document for document in documents if f"]({document})" not in README]
+
+
+def test_pose_files_of_the_readme_are_read(tmp_path: Path) -> None:
+    (poses,) = re.findall(r"```json\n(.+?)```", README, flags=re.DOTALL)
+    (tmp_path / "poses.json").write_text(poses)
+    for name in ("left.jpg", "right.jpg"):
+        (tmp_path / name).touch()  # pictures are read later
+    (pair,) = pansplat.load_pairs(tmp_path)
+    assert [panorama.image.name for panorama in pair.context] == ["left.jpg", "right.jpg"]
+    assert (pair.near, pair.far) == (0.45, 10.0)
+
+
 def test_the_two_commands_are_those_of_ci_and_setup() -> None:
     assert "bash setup.sh && .venv/bin/pansplat-view assets/living_room" in README
     assert "bash setup.sh --dev && .venv/bin/pytest" in README
