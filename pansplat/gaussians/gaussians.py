@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Integer
 from torch import Tensor
 
 from pansplat.geometry.pose import rotations_from_quats
@@ -35,8 +35,8 @@ class Gaussians:
     quats: Float[Tensor, "n 4"]
     opacities: Float[Tensor, "n"]
     harmonics: Float[Tensor, "n k 3"]
-    levels: Int[Tensor, "n"]
-    views: Int[Tensor, "n"]
+    levels: Integer[Tensor, "n"]
+    views: Integer[Tensor, "n"]
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]

@@ -26,7 +26,7 @@ class AggregationConfig:
 
     step_price: float = 0.08
     crease_price: float = 0.15
-    jump_price: float = 0.8
+    jump_price: float = 1.6
     edge_scale: float = 0.1
     """Sum of absolute colour differences over which a jump's price falls by e."""
 
@@ -74,7 +74,7 @@ def _jump_price(guide, i, j, ip, jp, price, floor, scale):
 
 @nb.njit(fastmath=True, nogil=True, cache=True)
 def _sweep_rows(cost, total, guide, slot_map, families, count, slots, prices, stretch, dx):
-    """Add the costs of paths along the rows; each starts half a turn early to close the circle."""
+    """Add the costs of paths along the rows; each starts a turn early to close the circle."""
     height, width, labels = cost.shape
     step_price, crease_price, jump_price, scale = prices
     previous, current = np.empty(labels, np.float32), np.empty(labels, np.float32)
@@ -82,14 +82,14 @@ def _sweep_rows(cost, total, guide, slot_map, families, count, slots, prices, st
     for i in range(height):
         t = stretch[i]  # neighbours in a row near the pole are close: changing there costs more
         previous[:] = cost[i, 0]
-        for n in range(1, width + width // 2):
+        for n in range(1, 2 * width):
             j, jp = (dx * n) % width, (dx * (n - 1)) % width
             jump = _jump_price(guide, i, j, i, jp, jump_price, crease_price * np.float32(1.2), scale)
             _advance(
                 previous, cost[i, j], current, step_price * t, crease_price * t, jump * t,
                 families, count, slots, slot_map[i, j], a, b,
             )  # fmt: skip
-            if n >= width // 2:
+            if n >= width:
                 for k in range(labels):
                     total[i, j, k] += current[k]
             previous, current = current, previous

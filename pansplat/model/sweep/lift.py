@@ -254,9 +254,9 @@ def _discs(
     rays: np.ndarray, rho: np.ndarray, slope: np.ndarray, spacing: float, level: int, config: LiftConfig
 ) -> tuple[np.ndarray, np.ndarray]:
     """Axes (n, 3, 3) in the camera frame, as columns, and standard deviations (n, 3) of discs on the surface."""
-    flat = np.maximum(np.hypot(rays[:, 0], rays[:, 2]), 1e-9)
-    east = np.stack((rays[:, 2] / flat, np.zeros(len(rays)), -rays[:, 0] / flat), axis=-1)
-    south = np.cross(rays, east) * -1
+    longitude = np.arctan2(rays[:, 0], rays[:, 2])  # zero at the poles, where any will do
+    east = np.stack((np.cos(longitude), np.zeros(len(rays)), -np.sin(longitude)), axis=-1)
+    south = np.cross(rays, east)
     # X = ray / rho, so dX / angle = (direction - ray * dlog(rho) / angle) / rho.
     steepest = np.linalg.norm(slope, axis=-1)
     # A disc hung almost along its ray must end well before the camera.

@@ -10,24 +10,28 @@ import numpy as np
 
 from pansplat.model.sweep.surface import Surface, world_points
 
-_BIN = 0.05  # metres
+_BIN = 1 / 9  # of `near`: 5 cm indoors
 _LITTLE, _MUCH = 2e-4, 2e-2  # shares of all directions between which support counts
 _HORIZONTAL = 0  # axis 0 points down
-_MIN_FLOOR = 0.4  # metres from the camera
+_MIN_FLOOR = 0.9  # of `near`, from the camera
 _FLOOR_SHARE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class PlaneSupport:
-    """Histograms (3, bins) of the planes' offsets along each axis from `origin`, as shares of all directions."""
+    """Histograms (3, bins) of the planes' offsets along each axis from `origin`, as shares of all directions.
+
+    `bin` is a bin's width, metres.
+    """
 
     axes: np.ndarray
     origin: np.ndarray
     histogram: np.ndarray
+    bin: float
 
     def _bin(self, offset: np.ndarray) -> np.ndarray:
         middle = self.histogram.shape[1] // 2
-        return np.clip(np.floor(offset / _BIN).astype(np.int64) + middle, 0, self.histogram.shape[1] - 1)
+        return np.clip(np.floor(offset / self.bin).astype(np.int64) + middle, 0, self.histogram.shape[1] - 1)
 
     def share(self, axis: int, cam2world: np.ndarray, inverse: np.ndarray) -> np.ndarray:
         """Support in [0, 1], (2, n), of planes at distances 1 / `inverse` on the negative and positive side."""
@@ -38,7 +42,7 @@ class PlaneSupport:
     def bounds(self, cam2world: np.ndarray) -> tuple[float, float]:
         """How far the scene reaches down and up (negative) from a camera, metres; infinite where unknown."""
         horizontal = self.histogram[_HORIZONTAL]
-        middle, gap = len(horizontal) // 2, int(_MIN_FLOOR / _BIN)
+        middle, gap = len(horizontal) // 2, round(_MIN_FLOOR / _BIN)
         camera = self.axes[_HORIZONTAL] @ (cam2world[:3, 3] - self.origin)
         bounds = []
         for start, part, sign in (
@@ -47,8 +51,8 @@ class PlaneSupport:
         ):
             peak = start + int(part.argmax())
             if horizontal[max(peak - 2, 0) : peak + 3].sum() > _FLOOR_SHARE:
-                reach = (peak - middle + 0.5) * _BIN - camera
-                bounds.append(1.06 * reach + sign * _BIN)
+                reach = (peak - middle + 0.5) * self.bin - camera
+                bounds.append(1.06 * reach + sign * self.bin)
             else:
                 bounds.append(sign * float("inf"))
         return bounds[0], bounds[1]
@@ -59,12 +63,14 @@ def plane_support(
     agreed: Sequence[np.ndarray],
     cam2world: np.ndarray,
     axes: np.ndarray,
+    near: float,
     far: float,
 ) -> PlaneSupport:
     """Collect the support of planes from the pixels (h, w) that the views agree on."""
-    bins = 2 * int((far + 5) / _BIN)
+    width = near * _BIN
+    bins = 2 * int(1.5 * far / width)
     histogram = np.zeros((3, bins))
-    support = PlaneSupport(axes, cam2world[0, :3, 3], histogram)
+    support = PlaneSupport(axes, cam2world[:, :3, 3].mean(axis=0), histogram, width)
     for surface, sure, pose in zip(surfaces, agreed, cam2world, strict=True):
         height, width = surface.inverse_depth.shape
         area = np.repeat(np.sin((np.arange(height) + 0.5) / height * np.pi)[:, None], width, axis=1)

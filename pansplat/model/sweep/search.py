@@ -137,7 +137,7 @@ class _Level:
         if surfaces is not None:
             agreed = [agreement(surfaces, posed.cam2world, view) & mask for view, mask in enumerate(masks)]
             confidence = [np.where(a, 1, config.unsure_confidence).astype(np.float32) for a in agreed]
-            self.support = plane_support(surfaces, agreed, posed.cam2world, axes, posed.far)
+            self.support = plane_support(surfaces, agreed, posed.cam2world, axes, posed.near, posed.far)
         self.views = [
             View(
                 resize_sphere(image, height),

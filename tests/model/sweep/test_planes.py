@@ -20,7 +20,7 @@ def support(empty_room) -> PlaneSupport:
         low, high = np.array(room.low) @ _AXES.T, np.array(room.high) @ _AXES.T
         wall = np.minimum(np.abs(points - low), np.abs(points - high)).argmin(axis=-1)
         surfaces.append(Surface(plain.inverse_depth, (wall + 1).astype(np.uint8)))
-    return plane_support(surfaces, list(empty_room.posed.masks), poses, _AXES, empty_room.posed.far)
+    return plane_support(surfaces, list(empty_room.posed.masks), poses, _AXES, empty_room.posed.near, empty_room.posed.far)
 
 
 def test_shares_of_all_planes_sum_to_one(support):
@@ -51,7 +51,7 @@ def test_the_floor_is_below_and_the_ceiling_above_the_camera(support, empty_room
 
 def test_without_agreement_nothing_is_known(empty_room):
     nothing = [np.zeros_like(mask) for mask in empty_room.posed.masks]
-    support = plane_support(empty_room.surfaces, nothing, empty_room.posed.cam2world, _AXES, 8.0)
+    support = plane_support(empty_room.surfaces, nothing, empty_room.posed.cam2world, _AXES, 0.45, 8.0)
     assert support.bounds(empty_room.posed.cam2world[0]) == (np.inf, -np.inf)
     assert support.share(1, empty_room.posed.cam2world[0], np.linspace(0.1, 2, 20)).max() == 0
 
@@ -65,6 +65,6 @@ def test_the_sweep_finds_floor_and_ceiling_by_itself(empty_room):
         for s, p in zip(empty_room.surfaces, poses, strict=True)
     ]
     agreed = [agreement(labelled, poses, view) for view in (0, 1)]
-    down, up = plane_support(labelled, agreed, poses, _AXES, 8.0).bounds(poses[0])
+    down, up = plane_support(labelled, agreed, poses, _AXES, 0.45, 8.0).bounds(poses[0])
     assert down == pytest.approx(1.06 * empty_room.room.high[1] + 0.05, abs=0.1)
     assert up == pytest.approx(1.06 * empty_room.room.low[1] - 0.05, abs=0.1)
