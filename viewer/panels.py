@@ -181,7 +181,7 @@ class Panels:
         for view in range(views):
             if view % 3:
                 imgui.same_line()
-            if self._radio(f"view {view + 1}", settings.mode == "view" and settings.view == view):
+            if self._radio(f"view {view}", settings.mode == "view" and settings.view == view):
                 settings = replace(settings, mode="view", view=view)
         if len(state.levels) > 1:
             shown = set(state.levels if settings.levels is None else settings.levels)

@@ -20,7 +20,7 @@ class PairChoice:
     """How to read a folder of panoramas, and which of its pairs to take."""
 
     pair: str | None = None
-    """Name or number (from 0) of the pair, where the folder holds several; the first by default."""
+    """Name or number (from 1) of the pair, where the folder holds several; the first by default."""
     convention: str | None = None
     """Pose convention, where the folder does not tell: "cam2world opencv", "cam2world opengl",
     "world2cam opencv" or "world2cam opengl" (Habitat and Blender count as opengl)."""

@@ -42,7 +42,7 @@ def choose_pair(path: Path, choice: PairChoice) -> Pair:
     names = [pair.name for pair in pairs]
     if choice.pair is None:
         if len(pairs) > 1:
-            listed = ", ".join(f"{i}: {name}" for i, name in enumerate(names))
+            listed = ", ".join(f"{i}: {name}" for i, name in enumerate(names, 1))
             print(
                 f"note: {path} holds {len(pairs)} pairs, this is the first (--pair takes: {listed})",
                 file=sys.stderr,
@@ -50,9 +50,9 @@ def choose_pair(path: Path, choice: PairChoice) -> Pair:
         return pairs[0]
     if choice.pair in names:
         return pairs[names.index(choice.pair)]
-    if choice.pair.isdecimal() and int(choice.pair) < len(pairs):
-        return pairs[int(choice.pair)]
-    raise InputError(f"--pair {choice.pair}: {path} holds {', '.join(f'{i}: {n}' for i, n in enumerate(names))}")
+    if choice.pair.isdecimal() and 1 <= int(choice.pair) <= len(pairs):
+        return pairs[int(choice.pair) - 1]
+    raise InputError(f"--pair {choice.pair}: {path} holds {', '.join(f'{i}: {n}' for i, n in enumerate(names, 1))}")
 
 
 def open_scene(path: Path, choice: PairChoice, model: str, height: int) -> Scene:

@@ -154,11 +154,11 @@ def test_a_folder_of_pairs_takes_the_first_or_the_named(tmp_path: Path, capsys: 
         "16",
     ]
     assert run(start) == 0
-    assert "holds 2 pairs, this is the first (--pair takes: 0: hall, 1: kitchen)" in capsys.readouterr().err
-    for choice in ("kitchen", "1"):
+    assert "holds 2 pairs, this is the first (--pair takes: 1: hall, 2: kitchen)" in capsys.readouterr().err
+    for choice in ("kitchen", "2"):
         assert run([*start, "--pair", choice]) == 0
         assert capsys.readouterr().err == ""
-    assert "holds 0: hall, 1: kitchen" in refusal([*start, "--pair", "attic"], capsys)
+    assert "holds 1: hall, 2: kitchen" in refusal([*start, "--pair", "attic"], capsys)
 
 
 def test_our_warnings_are_one_yellow_note(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

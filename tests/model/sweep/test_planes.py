@@ -20,7 +20,9 @@ def support(empty_room) -> PlaneSupport:
         low, high = np.array(room.low) @ _AXES.T, np.array(room.high) @ _AXES.T
         wall = np.minimum(np.abs(points - low), np.abs(points - high)).argmin(axis=-1)
         surfaces.append(Surface(plain.inverse_depth, (wall + 1).astype(np.uint8)))
-    return plane_support(surfaces, list(empty_room.posed.masks), poses, _AXES, empty_room.posed.near, empty_room.posed.far)
+    return plane_support(
+        surfaces, list(empty_room.posed.masks), poses, _AXES, empty_room.posed.near, empty_room.posed.far
+    )
 
 
 def test_shares_of_all_planes_sum_to_one(support):
