@@ -21,7 +21,7 @@ from pansplat.gaussians.gaussians import Gaussians
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
 from pansplat.geometry.pose import quats_from_rotations
 from pansplat.model.sweep.search import PosedImages
-from pansplat.model.sweep.sphere import pad_sphere, resize_sphere
+from pansplat.model.sweep.sphere import nearest_pixel, pad_sphere, pixel_coordinates, resize_sphere
 from pansplat.model.sweep.surface import (
     AGREES,
     SEEN_THROUGH,
@@ -124,10 +124,10 @@ def _lift_level(
         wanted = mask
     count = lattice_size(2 * height)
     rays = fibonacci_directions(count).numpy()
-    row, column = _nearest_pixel(rays, mask.shape[0])
+    row, column = nearest_pixel(rays, mask.shape[0])
     chosen = wanted[row, column]
     rays = rays[chosen]
-    row, column = _nearest_pixel(rays, height)
+    row, column = nearest_pixel(rays, height)
     rho = np.maximum(shape[row, column].astype(np.float64), 1e-6)
     pose = posed.cam2world[view]
     points = (rays / rho[:, None]) @ pose[:3, :3].T + pose[:3, 3]
@@ -150,17 +150,9 @@ def _lift_level(
     )
 
 
-def _nearest_pixel(rays: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray]:
-    u = np.arctan2(rays[:, 0], rays[:, 2]) / (2 * math.pi) + 0.5
-    v = np.arctan2(rays[:, 1], np.hypot(rays[:, 0], rays[:, 2])) / math.pi + 0.5
-    return np.clip((v * height).astype(np.int64), 0, height - 1), (u * 2 * height).astype(np.int64) % (2 * height)
-
-
 def _bilinear(image: np.ndarray, rays: np.ndarray) -> np.ndarray:
     height, width = image.shape[:2]
-    u = np.arctan2(rays[:, 0], rays[:, 2]) / (2 * math.pi) + 0.5
-    v = np.arctan2(rays[:, 1], np.hypot(rays[:, 0], rays[:, 2])) / math.pi + 0.5
-    x, y = u * width + 0.5, v * height + 0.5
+    x, y = (c + 0.5 for c in pixel_coordinates(rays, height))  # of the padded image
     x0, y0 = np.clip(x.astype(np.int64), 0, width), np.clip(y.astype(np.int64), 0, height)
     fx, fy = (x - x0)[:, None], (y - y0)[:, None]
     padded = pad_sphere(image, 1)
@@ -227,7 +219,7 @@ def _opacity(
             continue
         said, _ = relation(points, surface, posed.cam2world[other], config.jump)
         local = (points - posed.cam2world[other, :3, 3]) @ posed.cam2world[other, :3, :3]
-        row, column = _nearest_pixel(local, surface.height)
+        row, column = nearest_pixel(local, surface.height)
         certain = sure[other][row, column] & posed.masks[other][row, column]
         opacity[said == AGREES] = config.sure_opacity
         through = said == SEEN_THROUGH

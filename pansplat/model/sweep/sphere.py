@@ -4,13 +4,26 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import torch
 
-from pansplat.geometry.equirect import pixel_directions
+from pansplat.geometry.equirect import pixel_directions, uv_from_directions
 
 
 def ray_grid(height: int) -> np.ndarray:
     """Unit rays (height, 2 height, 3), float32, of a panorama's pixels."""
     return pixel_directions(height, 2 * height).numpy()
+
+
+def pixel_coordinates(directions: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Continuous x and y of directions (..., 3) of any length in a panorama; pixel centres at half-integers."""
+    uv = uv_from_directions(torch.from_numpy(np.ascontiguousarray(directions))).numpy()
+    return uv[..., 0] * 2 * height, uv[..., 1] * height
+
+
+def nearest_pixel(directions: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of the pixel that each direction (..., 3) falls into."""
+    x, y = pixel_coordinates(directions, height)
+    return np.clip(y.astype(np.int64), 0, height - 1), x.astype(np.int64) % (2 * height)
 
 
 def pad_sphere(image: np.ndarray, margin: int) -> np.ndarray:

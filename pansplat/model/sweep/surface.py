@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from pansplat.model.sweep.sphere import ray_grid
+from pansplat.model.sweep.sphere import nearest_pixel, ray_grid
 
 AGREES, HIDDEN, SEEN_THROUGH = 0, 1, 2  # what another view says about a point
 
@@ -38,10 +38,7 @@ def relation(
     """
     local = (points - cam2world[:3, 3]) @ cam2world[:3, :3]
     distance = np.maximum(np.linalg.norm(local, axis=-1), 1e-9)
-    height, width = surface.inverse_depth.shape
-    u = (np.arctan2(local[..., 0], local[..., 2]) / (2 * math.pi) + 0.5) * width
-    v = (np.arctan2(local[..., 1], np.hypot(local[..., 0], local[..., 2])) / math.pi + 0.5) * height
-    row, column = np.clip(v.astype(np.int64), 0, height - 1), u.astype(np.int64) % width
+    row, column = nearest_pixel(local, surface.height)
     ratio = 1 / (distance * surface.inverse_depth[row, column])
     result = np.full(ratio.shape, HIDDEN, np.uint8)
     result[ratio > 1 - tolerance] = AGREES
