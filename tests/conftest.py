@@ -1,10 +1,13 @@
 """Fixtures every test may use."""
 
+import importlib.util
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import safetensors.torch
+import torch
 from jaxtyping import config, install_import_hook
 
 import pansplat.testing  # noqa: F401  # the hook names it
@@ -24,6 +27,43 @@ def shared() -> Path:
             pytest.fail("CI needs ../shared beside the checkout")
         pytest.skip("needs the ../shared folder beside the checkout")
     return _SHARED
+
+
+@pytest.fixture(scope="session")
+def recipe(shared: Path) -> Callable[[str], dict[str, torch.Tensor]]:
+    """Weights by the golden recipe for a list of keys, such as "pansplat-512", under the original's names."""
+    source = importlib.util.spec_from_file_location("make_weights", shared / "golden" / "make_weights.py")
+    assert source is not None and source.loader is not None
+    module = importlib.util.module_from_spec(source)
+    source.loader.exec_module(module)
+
+    def make(keys: str) -> dict[str, torch.Tensor]:
+        arrays = module.state_dict(shared / "golden" / f"state_dict_{keys}.tsv")
+        return {name: torch.from_numpy(array) for name, array in arrays.items()}
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def recipe_weights(recipe: Callable[[str], dict[str, torch.Tensor]]) -> dict[str, torch.Tensor]:
+    """All 993 tensors of the original PanSplat, without its prefix "encoder."; 200 MB, not to be changed."""
+    return recipe("pansplat-512")
+
+
+@pytest.fixture(scope="session")
+def mvsplat_weights(recipe: Callable[[str], dict[str, torch.Tensor]]) -> dict[str, torch.Tensor]:
+    """All 471 tensors of the original MVSplat baseline, without its prefix "encoder."; not to be changed."""
+    return recipe("mvsplat-512")
+
+
+@pytest.fixture(scope="session")
+def golden(shared: Path) -> Callable[[str], dict[str, torch.Tensor]]:
+    """What the original computed: tensors of a fixture such as "pansplat_64x128_fp32attn" or "units"."""
+
+    def load(name: str) -> dict[str, torch.Tensor]:
+        return safetensors.torch.load_file(shared / "golden" / f"{name}.safetensors")
+
+    return load
 
 
 @pytest.fixture
