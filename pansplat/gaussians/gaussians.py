@@ -25,7 +25,8 @@ class Gaussians:
         quats: rotation of the own axes to the world's, wxyz; normalised where it is read.
         opacities: peak opacity, in [0, 1].
         harmonics: real spherical-harmonics coefficients of degree 0..4 in world axes, in the 3DGS order and signs;
-            colour in direction d (camera to mean) is max(0, 0.5 + sum_k Y_k(d) c_k), RGB.
+            colour in direction d (camera to mean) is max(0, 0.5 + sum_k Y_k(d) c_k). Three channels are RGB;
+            the rasteriser draws any number.
         levels: pyramid level, 0 is the finest.
         views: index of the context view that each Gaussian was lifted from.
     """
@@ -34,7 +35,7 @@ class Gaussians:
     scales: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]
     opacities: Float[Tensor, "n"]
-    harmonics: Float[Tensor, "n k 3"]
+    harmonics: Float[Tensor, "n k channel"]
     levels: Integer[Tensor, "n"]
     views: Integer[Tensor, "n"]
 
@@ -52,9 +53,8 @@ class Gaussians:
             got = tuple(getattr(self, name).shape)
             if got != shape:
                 raise ValueError(f"`{name}` must have shape {shape} to fit {n} means, got {got}")
-        k = self.harmonics.shape[1] if self.harmonics.ndim == 3 else -1
-        if tuple(self.harmonics.shape) != (n, k, 3) or k not in (1, 4, 9, 16, 25):
-            got = tuple(self.harmonics.shape)
+        got = tuple(self.harmonics.shape)
+        if len(got) != 3 or got[0] != n or got[1] not in (1, 4, 9, 16, 25) or got[2] < 1:
             raise ValueError(f"`harmonics` must have shape ({n}, 1|4|9|16|25, 3), got {got}")
 
     def __len__(self) -> int:

@@ -79,9 +79,9 @@ def _quartic(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
 
 
 def evaluate(
-    harmonics: Float[Tensor, "*batch k 3"], directions: Float[Tensor, "*batch 3"]
-) -> Float[Tensor, "*batch 3"]:
-    """RGB seen along unit directions (camera to mean, world axes): max(0, 0.5 + sum_k Y_k c_k)."""
+    harmonics: Float[Tensor, "*batch k channel"], directions: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch channel"]:
+    """Colour seen along unit directions (camera to mean, world axes): max(0, 0.5 + sum_k Y_k c_k)."""
     degree = math.isqrt(harmonics.shape[-2]) - 1
     if (degree + 1) ** 2 != harmonics.shape[-2] or not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"`harmonics` must hold 1, 4, 9, 16 or 25 coefficients, got {harmonics.shape[-2]}")

@@ -2,6 +2,6 @@
 
 from pansplat.geometry.blending import blend_weights
 from pansplat.render.blend import blend
-from pansplat.render.reference import Rendering, rasterize
+from pansplat.render.rasterize import Rendering, rasterize
 
 __all__ = ["Rendering", "blend", "blend_weights", "rasterize"]

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.render.reference import Rendering
+from pansplat.render.rasterize import Rendering
 
 
 def blend(renderings: Sequence[Rendering], weights: Float[Tensor, "view"]) -> Rendering:

@@ -21,6 +21,7 @@ _BLOCK = 32  # Gaussians a step
 # Pixel-Gaussian pairs a step, few enough for the cache.
 _PAIRS = 32768
 _LARGEST_ALPHA = 0.99
+_VALUES = 11  # where a row's values begin, behind forms, along and peak
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +37,8 @@ class TilePixels:
     offsets: Float[Tensor, "tile 4 pixel"]
 
 
-def composite(splats: Splats, lists: TileLists, pixels: TilePixels, *, exact: bool) -> Float[Tensor, "tile pixel 5"]:
-    """Sums along each pixel's ray of weight * (RGB, distance, 1), for the tiles of `lists`.
+def composite(splats: Splats, lists: TileLists, pixels: TilePixels, *, exact: bool) -> Float[Tensor, "tile pixel sums"]:
+    """Sums along each pixel's ray of weight x (values, 1), for the tiles of `lists`.
 
     Differentiable once in all of `splats`.
     """
@@ -52,13 +53,13 @@ class _Composite(torch.autograd.Function):
     @one_thread()
     def forward(
         ctx: Any, rows: Tensor, points: Tensor, lists: TileLists, pixels: TilePixels, exact: bool
-    ) -> Float[Tensor, "tile pixel 5"]:
+    ) -> Float[Tensor, "tile pixel sums"]:
         needs_grad = any(ctx.needs_input_grad)
         padded = _pad(rows), _pad(points)
         first = lists.tiles[0]
         count = lists.tiles[1] - first
         size = pixels.offsets.shape[-1]
-        sums = rows.new_zeros(count, size, 5)
+        sums = rows.new_zeros(count, size, rows.shape[1] - _VALUES + 1)
         kept = []
         for tiles, blocks in _groups(lists, len(rows), size):
             transmittance = rows.new_ones(len(tiles), size)
@@ -153,25 +154,25 @@ def _gather(
 
 
 def _block(
-    row: Float[Tensor, "g block 15"],
+    row: Float[Tensor, "g block row"],
     point: Float[Tensor, "g block 3"],
     centres: Float[Tensor, "g 3"],
     offsets: Float[Tensor, "g 4 pixel"],
     through: Float[Tensor, "g pixel"],
     *,
     exact: bool,
-) -> tuple[Float[Tensor, "g pixel"], Float[Tensor, "g pixel 5"]]:
+) -> tuple[Float[Tensor, "g pixel"], Float[Tensor, "g pixel sums"]]:
     """Transmittance behind a block of Gaussians, and what the block adds to the sums."""
     alpha = _alphas(row, (point - centres[:, None]).to(row.dtype), offsets, exact=exact)
     behind = torch.cumprod(1 - alpha, dim=1)
     ahead = torch.cat((torch.ones_like(behind[:, :1]), behind[:, :-1]), dim=1)
     weights = alpha * ahead * through[:, None]
-    values = torch.cat((row[..., 11:], torch.ones_like(row[..., :1])), dim=2)
+    values = torch.cat((row[..., _VALUES:], torch.ones_like(row[..., :1])), dim=2)
     return through * behind[:, -1], weights.transpose(1, 2) @ values
 
 
 def _alphas(
-    row: Float[Tensor, "g block 15"],
+    row: Float[Tensor, "g block row"],
     point: Float[Tensor, "g block 3"],
     offsets: Float[Tensor, "g 4 pixel"],
     *,

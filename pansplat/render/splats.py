@@ -19,6 +19,7 @@ from pansplat.geometry.pose import rotations_from_quats
 ALPHA_CUT = 1 / 255
 _LARGEST = 1e30
 _LARGEST_RATIO = 1e12  # of scale to distance; beyond it the products of section 2 could overflow
+_NEGATIVE = 1e-3  # smallest eigenvalue over the largest variance that rounding may leave (bfloat16 has 8 bits)
 _CHUNK = 1 << 17
 
 
@@ -30,7 +31,7 @@ class Observed(NamedTuple):
         radius: distance of the mean, metres, float64.
         covariance: C' of docs/rendering.md, camera axes, float64.
         peak: opacity after the filter's compensation.
-        values: RGB seen from the camera, and the distance: what is averaged along a ray.
+        values: channels (RGB) seen from the camera, and the distance: what is averaged along a ray.
         forms: rows a, b, l of the exact kernel; no rows for `ewa`, which finds them per picture.
         along: S', the variance along the ray.
     """
@@ -39,7 +40,7 @@ class Observed(NamedTuple):
     radius: Float[Tensor, "n"]
     covariance: Float[Tensor, "n 3 3"]
     peak: Float[Tensor, "n"]
-    values: Float[Tensor, "n 4"]
+    values: Float[Tensor, "n value"]
     forms: Float[Tensor, "n f 3"]
     along: Float[Tensor, "n"]
 
@@ -54,25 +55,42 @@ class Splats(NamedTuple):
     forms: Float[Tensor, "n 3 3"]
     along: Float[Tensor, "n"]
     peak: Float[Tensor, "n"]
-    values: Float[Tensor, "n 4"]
+    values: Float[Tensor, "n value"]
 
 
-def sound(gaussians: Gaussians) -> Bool[Tensor, "n"]:
+def sound(gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None = None) -> Bool[Tensor, "n"]:
     """Which Gaussians hold only usable numbers: finite, and not so large that products overflow."""
-    fields = (gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities, gaussians.harmonics)
+    shape = (gaussians.scales, gaussians.quats) if covariances is None else (covariances,)
     keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
-    for field in fields:
+    for field in (gaussians.means, *shape, gaussians.opacities, gaussians.harmonics):
         keep &= (field.detach().abs() < _LARGEST).reshape(len(keep), max(1, field[:1].numel())).all(dim=1)
     return keep
 
 
-def near_enough(gaussians: Gaussians, radius: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
-    """Which Gaussians are not absurdly large for their distance."""
-    return gaussians.scales.detach().double().abs().amax(dim=1) <= _LARGEST_RATIO * radius
+def near_enough(
+    gaussians: Gaussians,
+    covariances: Float[Tensor, "n 3 3"] | None,
+    radius: Float[Tensor, "n"],
+) -> Bool[Tensor, "n"]:
+    """Which Gaussians are not absurdly large for their distance, and have a covariance that can be one."""
+    if covariances is None:
+        return gaussians.scales.detach().double().abs().amax(dim=1) <= _LARGEST_RATIO * radius
+    relative = covariances.detach().double() / radius.square()[:, None, None]
+    largest = relative.diagonal(dim1=1, dim2=2).amax(dim=1)
+    # Rounding to float32 or less makes a disc's smallest variance slightly negative; more than that is no covariance.
+    finite = torch.where(torch.isfinite(relative), relative, 0)
+    smallest = torch.linalg.eigvalsh(0.5 * (finite + finite.transpose(1, 2)))[:, 0]
+    return (largest <= _LARGEST_RATIO**2) & (smallest >= -_NEGATIVE * largest)
 
 
 def observe(
-    gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], *, spread: float, compensate: bool, exact: bool
+    gaussians: Gaussians,
+    covariances: Float[Tensor, "n 3 3"] | None,
+    cam2world: Float[Tensor, "4 4"],
+    *,
+    spread: float,
+    compensate: bool,
+    exact: bool,
 ) -> Observed:
     """The Gaussians as the camera sees them.
 
@@ -80,12 +98,14 @@ def observe(
 
     Args:
         gaussians: all drawable (see `sound`).
+        covariances: in place of the Gaussians' scales and quats, square metres.
         cam2world: float64.
         spread: e^2, the variance that the filter adds across the ray, radians^2.
         compensate: whether the opacity is lowered by as much as the filter widened the Gaussian.
         exact: whether to find the exact kernel's forms.
     """
-    fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.harmonics)
+    shape = (gaussians.quats, gaussians.scales) if covariances is None else (covariances,)
+    fields = (gaussians.means, gaussians.opacities, gaussians.harmonics, *shape)
     work = functools.partial(_observe_chunk, cam2world=cam2world, spread=spread, compensate=compensate, exact=exact)
     parts = []
     for chunk in zip(*(field.split(_CHUNK) for field in fields), strict=True):
@@ -95,11 +115,9 @@ def observe(
 
 def _observe_chunk(
     means: Float[Tensor, "n 3"],
-    quats: Float[Tensor, "n 4"],
-    scales: Float[Tensor, "n 3"],
     opacities: Float[Tensor, "n"],
-    harmonics: Float[Tensor, "n k 3"],
-    *,
+    harmonics: Float[Tensor, "n k channel"],
+    *shape: Tensor,
     cam2world: Float[Tensor, "4 4"],
     spread: float,
     compensate: bool,
@@ -111,45 +129,95 @@ def _observe_chunk(
     world_direction = offset / radius[:, None]
     direction = world_direction @ cam2world[:3, :3]
     colours = evaluate(harmonics, world_direction.to(dtype))
-    own = cam2world[:3, :3].T @ rotations_from_quats(quats.double())  # columns: the Gaussian's axes, camera frame
-    size = scales.double() / radius[:, None]
-    axes = own * size[:, None, :]
-    covariance = axes @ axes.transpose(1, 2)
+    world2cam = cam2world[:3, :3].T
+    frame = torch.stack((*tangent_frame(direction), direction), dim=1)
+    if len(shape) == 2:
+        body = _from_axes(world2cam @ rotations_from_quats(shape[0].double()), shape[1], radius, frame)
+    else:
+        body = _from_covariance(world2cam @ shape[0].double() @ world2cam.T, radius, frame)
     outer = direction[:, :, None] * direction[:, None, :]
-    covariance = covariance + spread * (torch.eye(3, dtype=torch.float64, device=means.device) - outer)
-
-    # Sums of squares only: no cancellation however flat or long the Gaussian is.
-    cosine2 = (direction[:, None, :] @ own)[:, 0, :].square()
-    minors2 = (size[:, (1, 2, 0)] * size[:, (2, 0, 1)]).square()
-    det_across = (minors2 * cosine2).sum(dim=1)
-    trace_across = (size.square() * (1 - cosine2)).sum(dim=1)
-    det_filtered = det_across + spread * trace_across + spread**2
+    covariance = body.covariance + spread * (torch.eye(3, dtype=torch.float64, device=means.device) - outer)
+    det_filtered = body.det_across + spread * body.trace_across + spread**2
     peak = opacities.double()
     if compensate:
         # The bound keeps the square root's slope finite; below it nothing reaches the alpha cut.
-        peak = peak * torch.sqrt((det_across / det_filtered).clamp_min(1e-12))
+        peak = peak * torch.sqrt((body.det_across / det_filtered).clamp_min(1e-12))
     forms, along = covariance.new_zeros(len(means), 0, 3), torch.zeros_like(radius)
     if exact:
-        variance_along = (size.square() * cosine2).sum(dim=1)
-        mixed = (minors2 * (1 - cosine2)).sum(dim=1)
-        along = (spread**2 * variance_along + spread * mixed + size.square().prod(dim=1)) / det_filtered
-        forms = _ray_forms(direction, axes, spread, det_filtered)
+        along = (spread**2 * body.along + spread * body.mixed + body.det) / det_filtered
+        forms = _ray_forms(frame, body.in_frame, spread, det_filtered)
     values = torch.cat((colours, radius.to(dtype)[:, None]), dim=1)
     return Observed(direction, radius, covariance, peak.to(dtype), values, forms.to(dtype), along.to(dtype))
 
 
+class _Body(NamedTuple):
+    """A Gaussian's shape before the filter, divided by its distance; section 1's minors.
+
+    Attributes:
+        covariance: C, camera axes.
+        in_frame: C in the tangent frame u, v, n.
+        det_across, trace_across: of B, the block across the ray.
+        along: g, the variance along the ray.
+        mixed: M = g tr B - |c|^2.
+        det: det C.
+    """
+
+    covariance: Float[Tensor, "n 3 3"]
+    in_frame: Float[Tensor, "n 3 3"]
+    det_across: Float[Tensor, "n"]
+    trace_across: Float[Tensor, "n"]
+    along: Float[Tensor, "n"]
+    mixed: Float[Tensor, "n"]
+    det: Float[Tensor, "n"]
+
+
+def _from_axes(
+    own: Float[Tensor, "n 3 3"], scales: Float[Tensor, "n 3"], radius: Float[Tensor, "n"], frame: Float[Tensor, "n 3 3"]
+) -> _Body:
+    """From the own axes (columns, camera frame) and scales: sums of squares only, so nothing cancels."""
+    size = scales.double() / radius[:, None]
+    axes = own * size[:, None, :]
+    turned = frame @ axes
+    cosine2 = (frame[:, 2:] @ own)[:, 0, :].square()
+    minors2 = (size[:, (1, 2, 0)] * size[:, (2, 0, 1)]).square()
+    return _Body(
+        covariance=axes @ axes.transpose(1, 2),
+        in_frame=turned @ turned.transpose(1, 2),
+        det_across=(minors2 * cosine2).sum(dim=1),
+        trace_across=(size.square() * (1 - cosine2)).sum(dim=1),
+        along=(size.square() * cosine2).sum(dim=1),
+        mixed=(minors2 * (1 - cosine2)).sum(dim=1),
+        det=size.square().prod(dim=1),
+    )
+
+
+def _from_covariance(
+    covariance: Float[Tensor, "n 3 3"], radius: Float[Tensor, "n"], frame: Float[Tensor, "n 3 3"]
+) -> _Body:
+    """From a covariance in camera axes; what rounding made negative counts as zero."""
+    c = 0.5 * (covariance + covariance.transpose(1, 2)) / radius.square()[:, None, None]
+    turned = frame @ c @ frame.transpose(1, 2)
+    uu, vv, nn = turned.diagonal(dim1=1, dim2=2).unbind(1)
+    uv, un, vn = turned[:, 0, 1], turned[:, 0, 2], turned[:, 1, 2]
+    det = uu * (vv * nn - vn * vn) - uv * (uv * nn - vn * un) + un * (uv * vn - vv * un)
+    return _Body(
+        covariance=c,
+        in_frame=turned,
+        det_across=(uu * vv - uv * uv).clamp_min(0),
+        trace_across=(uu + vv).clamp_min(0),
+        along=nn.clamp_min(0),
+        mixed=(nn * (uu + vv) - un * un - vn * vn).clamp_min(0),
+        det=det.clamp_min(0),
+    )
+
+
 def _ray_forms(
-    direction: Float[Tensor, "n 3"],
-    axes: Float[Tensor, "n 3 3"],
-    spread: float,
-    det_filtered: Float[Tensor, "n"],
+    frame: Float[Tensor, "n 3 3"], in_frame: Float[Tensor, "n 3 3"], spread: float, det_filtered: Float[Tensor, "n"]
 ) -> Float[Tensor, "n 3 3"]:
     """Rows a, b, l of section 3: whitened tangent axes, and the front form."""
-    right, down = tangent_frame(direction)
-    u, v, w = ((axis[:, None, :] @ axes)[:, 0, :] for axis in (right, down, direction))
-    b_uu = u.square().sum(dim=1) + spread
-    b_vv = v.square().sum(dim=1) + spread
-    b_uv, c_u, c_v = (u * v).sum(dim=1), (u * w).sum(dim=1), (v * w).sum(dim=1)
+    right, down, direction = frame.unbind(1)
+    b_uu, b_vv = in_frame[:, 0, 0] + spread, in_frame[:, 1, 1] + spread
+    b_uv, c_u, c_v = in_frame[:, 0, 1], in_frame[:, 0, 2], in_frame[:, 1, 2]
     first = right / torch.sqrt(b_uu)[:, None]
     second = (down - (b_uv / b_uu)[:, None] * right) * torch.sqrt(b_uu / det_filtered)[:, None]
     p_u = (b_uv * c_v - b_vv * c_u) / det_filtered
