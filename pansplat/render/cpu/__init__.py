@@ -1,0 +1,4 @@
+"""The rasteriser on the processor: numba kernels with explicit vectors, no compiler needed, differentiable.
+
+Source: docs/rendering.md; docs/rasterizer.md tells how it works.
+"""
