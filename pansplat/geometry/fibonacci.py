@@ -1,7 +1,8 @@
 """Fibonacci lattices: nearly uniform points on the sphere.
 
 Source: PanSplat, section 3.3. The original computes j * golden angle in float32, which at n = 5.3 million is off
-by half a radian; here the product is reduced to one turn in float64 (OFFICIAL.md trap T1).
+by half a radian; here the product is reduced to one turn in float64 (OFFICIAL.md trap T1). The original's points
+are there for its weights' sake.
 """
 
 import math
@@ -30,3 +31,20 @@ def fibonacci_directions(count: int) -> Float[Tensor, "count 3"]:
     angle = torch.remainder(index * _GOLDEN_TURN, 1.0) * (2 * math.pi)
     radius = torch.sqrt((1 - y * y).clamp_min(0))
     return torch.stack((radius * torch.cos(angle), y, radius * torch.sin(angle)), dim=-1)
+
+
+def original_fibonacci_uv(count: int) -> Float[Tensor, "count 2"]:
+    """The original's lattice: normalised panorama coordinates, in float64 though rounded as it rounds them.
+
+    All of it is float32: 0.25 pixel off on average at a map width of 512, 125 pixels at 4096.
+
+    Source: OFFICIAL.md, section 8 and trap T1.
+    """
+    if count < 2:
+        raise ValueError(f"`count` must be at least 2, got {count}")
+    y = torch.linspace(1, -1, count, dtype=torch.float32)
+    angle = torch.tensor(2 * math.pi * _GOLDEN_TURN) * torch.arange(count, dtype=torch.float32)
+    radius = torch.sqrt(1 - y * y)
+    longitude = torch.atan2(radius * torch.cos(angle), radius * torch.sin(angle))
+    normalised = torch.stack((longitude / math.pi, torch.asin(y) / (math.pi / 2)), dim=-1)
+    return (normalised.double() + 1) / 2

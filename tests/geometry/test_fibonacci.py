@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
+from pansplat.geometry.equirect import uv_from_directions
+from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size, original_fibonacci_uv
 
 
 def test_lattice_sizes_are_the_papers():
@@ -59,3 +60,27 @@ def test_small_lattices_are_the_originals(shared: Path):
         expected = torch.stack((lat.cos() * lon.sin(), lat.sin(), lat.cos() * lon.cos()), dim=-1)
         # The original's float32 product loses accuracy as the index grows (trap T1): 0.25 px on average at 512.
         assert float((points[1:-1] - expected).norm(dim=1).median()) < {16: 1e-5, 128: 2e-3, 512: 1e-2}[width]
+
+
+@pytest.mark.shared
+def test_the_originals_lattice_is_reproduced_with_its_rounding(shared: Path):
+    from safetensors.torch import load_file
+
+    fixtures = load_file(shared / "golden" / "units.safetensors")
+    for width in (16, 128, 512):
+        lonlat = fixtures[f"fibonacci.{width}"].double()
+        uv = original_fibonacci_uv(len(lonlat))
+        difference = (uv - 0.5) * torch.tensor((2 * math.pi, math.pi), dtype=torch.float64) - lonlat
+        difference[:, 0] -= (difference[:, 0] / (2 * math.pi)).round() * 2 * math.pi
+        assert float(difference.abs().max()) < 1e-6
+
+
+def test_the_originals_rounding_grows_with_the_count():
+    for width, pixels in ((128, 0.1), (4096, 10.0)):
+        count = lattice_size(width)
+        uv, exact = original_fibonacci_uv(count), uv_from_directions(fibonacci_directions(count))
+        error = (uv - exact)[1:-1, 0].abs()
+        error = torch.minimum(error, 1 - error).mean() * width
+        assert (float(error) < pixels) == (width == 128)
+    with pytest.raises(ValueError, match="at least 2"):
+        original_fibonacci_uv(1)
