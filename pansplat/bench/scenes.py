@@ -1,0 +1,138 @@
+"""Scenes to measure on: a furnished room on full lattices, at any size, made from nothing.
+
+Source: PanSplat, section 3.3 (lattices and levels). The counts are the paper's: 886,580 Gaussians at a height of
+512, of two views and four levels.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
+from pansplat.geometry.pose import quats_from_rotations
+
+NUM_LEVELS = 4
+_BASELINE = 1.0  # metres
+_CHUNK = 1 << 17
+
+# Corners of the room, then of what stands in it, metres; the cameras are 1.2 m above the floor (y points down).
+_ROOM = ((-3.4, -1.5, -2.6), (3.0, 1.2, 3.9))
+_FURNITURE = (
+    ((-0.9, 0.45, 1.3), (0.9, 0.5, 2.3)),  # table top
+    ((-0.1, 0.5, 1.7), (0.1, 1.2, 1.9)),  # its foot
+    ((-3.4, 0.35, -0.6), (-2.5, 1.2, 1.6)),  # sofa
+    ((2.4, -0.9, -1.9), (3.0, 1.2, -0.4)),  # cupboard
+    ((-1.2, -1.5, -2.6), (-0.8, 1.2, -2.2)),  # pillar
+    ((1.6, 0.7, 3.0), (2.6, 1.2, 3.6)),  # chest
+    ((-0.3, -1.1, 2.0), (0.3, -0.8, 2.6)),  # lamp
+)
+_FOOTPRINT = (0.5, 1.0)  # standard deviations of discs across the line of sight, in pixels of their level
+_LONGEST = 4.0  # of a disc seen from the side, times that
+_THICKNESS = 0.1
+_OPACITY = (0.3, 0.95)
+
+
+def room_cameras(views: int = 2) -> Float[Tensor, "view 4 4"]:
+    """Poses of the input cameras of `full_lattice_room`: upright, on a line a metre long."""
+    poses = torch.eye(4, dtype=torch.float64).repeat(views, 1, 1)
+    if views > 1:
+        poses[:, 0, 3] = torch.linspace(-0.5 * _BASELINE, 0.5 * _BASELINE, views, dtype=torch.float64)
+    return poses
+
+
+def full_lattice_room(height: int, *, views: int = 2, degree: int = 0, seed: int = 0) -> Gaussians:
+    """A furnished room as seen by panoramas of that height: every point of every level's lattice is a Gaussian.
+
+    Discs lie on the surfaces, 0.5 to 1 pixel of their level wide, of opacity 0.3 to 0.95: sizes and overlaps are
+    those of a predicted scene. The order is level, view, lattice point. The same arguments give the same scene.
+
+    Args:
+        height: of the panoramas, pixels; a multiple of 8.
+        views: number of input cameras.
+        degree: of the spherical harmonics, 0..4.
+        seed: of sizes, opacities and colours.
+
+    Returns:
+        float32 Gaussians, 886,580 at a height of 512.
+
+    Raises:
+        ValueError: the height does not halve three times.
+    """
+    if height < 8 or height % 8:
+        raise ValueError(f"`height` must be a positive multiple of 8, got {height}")
+    generator = torch.Generator().manual_seed(seed)
+    parts = []
+    for level in range(NUM_LEVELS):
+        rays = fibonacci_directions(lattice_size(2 * height >> level))
+        pixel_angle = math.pi / (height >> level)
+        for view, pose in enumerate(room_cameras(views)):
+            for chunk in rays.split(_CHUNK):
+                parts.append(_discs(chunk, pose[:3, 3], pixel_angle, degree, generator, level, view))
+    return Gaussians.cat(parts)
+
+
+def _discs(
+    rays: Float[Tensor, "n 3"],
+    position: Float[Tensor, "3"],
+    pixel_angle: float,
+    degree: int,
+    generator: torch.Generator,
+    level: int,
+    view: int,
+) -> Gaussians:
+    """Discs where the rays from a camera meet the room, as many as rays."""
+
+    def uniform(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(len(rays), generator=generator, dtype=torch.float64)
+
+    distance, axis, body = _trace(rays, position)
+    points = position + distance[:, None] * rays
+    normal = torch.nn.functional.one_hot(axis, 3).double()
+    facing = (rays * normal).sum(dim=1, keepdim=True)
+    long = torch.nn.functional.normalize(rays - facing * normal + 1e-9 * normal.roll(1, dims=1), dim=1)
+    axes = torch.stack((long, torch.linalg.cross(normal, long), normal), dim=2)
+    width = uniform(*_FOOTPRINT) * pixel_angle * distance
+    stretch = (1 / facing[:, 0].abs()).clamp_max(_LONGEST)
+    return Gaussians(
+        means=points.float(),
+        scales=torch.stack((width * stretch, width, width * _THICKNESS), dim=1).float(),
+        quats=quats_from_rotations(axes).float(),
+        opacities=uniform(*_OPACITY).float(),
+        harmonics=_harmonics(points, 6 * body + 2 * axis + (facing[:, 0] > 0), degree, generator),
+        levels=torch.full((len(rays),), level, dtype=torch.uint8),
+        views=torch.full((len(rays),), view, dtype=torch.uint8),
+    )
+
+
+def _trace(
+    rays: Float[Tensor, "n 3"], position: Float[Tensor, "3"]
+) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"], Int[Tensor, "n"]]:
+    """Distance to the first surface, the axis of its normal, and the number of the body it belongs to (0: room)."""
+    slope = 1 / torch.where(rays.abs() < 1e-12, torch.full_like(rays, 1e-12), rays)
+    bounds = torch.tensor(_ROOM, dtype=torch.float64) - position
+    distance, axis = torch.maximum(bounds[0] * slope, bounds[1] * slope).min(dim=1)
+    body = torch.zeros_like(axis)
+    for number, corners in enumerate(_FURNITURE, 1):
+        bounds = torch.tensor(corners, dtype=torch.float64) - position
+        first, second = bounds[0] * slope, bounds[1] * slope
+        enters, side = torch.minimum(first, second).max(dim=1)
+        leaves = torch.maximum(first, second).amin(dim=1)
+        hit = (enters > 0) & (enters < leaves) & (enters < distance)
+        distance, axis = torch.where(hit, enters, distance), torch.where(hit, side, axis)
+        body = torch.where(hit, number, body)
+    return distance, axis, body
+
+
+def _harmonics(
+    points: Float[Tensor, "n 3"], surface: Int[Tensor, "n"], degree: int, generator: torch.Generator
+) -> Float[Tensor, "n k 3"]:
+    """Stripes and grain on a plain colour a surface; higher degrees small and random, as a shine."""
+    palette = torch.rand(int(surface.max()) + 1, 3, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+    stripes = torch.sin(9 * points).prod(dim=1) + 0.5 * torch.sin(70 * points).prod(dim=1)
+    grain = 0.05 * torch.randn(len(points), 3, generator=generator, dtype=torch.float64)
+    harmonics = 0.1 * torch.randn(len(points), (degree + 1) ** 2, 3, generator=generator)
+    harmonics[:, 0] = (2.4 * (palette[surface] - 0.5) + 0.5 * stripes[:, None] + grain).float()
+    return harmonics
