@@ -37,10 +37,12 @@ def rotate_harmonics(
 ) -> Float[Tensor, "*batch k channel"]:
     """Coefficients of the same colours after the world was turned by `rotation`."""
     degree = math.isqrt(harmonics.shape[-2]) - 1
-    return rotation_matrices(rotation.double(), degree).to(harmonics) @ harmonics
+    matrix = rotation_matrices(rotation.double(), degree).to(harmonics)
+    return (harmonics.transpose(-1, -2) @ matrix.T).transpose(-1, -2)  # one product, however many Gaussians
 
 
 @functools.lru_cache
+@torch.inference_mode(False)  # kept for calls that need gradients too
 def _quadrature(degree: int) -> tuple[Tensor, Tensor]:
     """Directions (q 3) and weights (q), float64, that integrate products of two harmonics of a degree exactly."""
     z, weight = np.polynomial.legendre.leggauss(degree + 1)

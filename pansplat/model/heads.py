@@ -1,0 +1,343 @@
+"""Residual Gaussian heads: from features to Gaussians on the lattices of a pyramid, coarse to fine.
+
+Each level's small CNN reads the image, the view's features, the refined cost volume and what the coarser level
+passed on, and adds to that. A point of the level's lattice reads the sum, and a linear layer turns what it reads
+into one Gaussian. All of it runs tile by tile where memory asks for it.
+
+Source: PanSplat, sections 3.3 and 3.4, figure 3; OFFICIAL.md, section 8.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Integer
+from torch import Tensor, nn
+from torch.nn import functional
+
+from pansplat.errors import InputError
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.model.adapter import AdapterConfig, adapt
+from pansplat.model.cost_volume import Depths
+from pansplat.model.lattice import Lattice, lattice_uv, move_points
+from pansplat.model.layers import Compat
+from pansplat.model.tiles import Margins, Tile, Window, cut, sample, tile_grid
+
+Precision = Literal["float32", "bfloat16"]
+
+
+@dataclass(frozen=True)
+class HeadsConfig:
+    """Shape of the heads; the switches are the paper's ablations."""
+
+    lattice: Lattice = "fibonacci"
+    """Where Gaussians stand: evenly on the sphere, or one a pixel."""
+    levels: Literal["pyramid", "single"] = "pyramid"
+    """Heads on all four levels, or on the finest only."""
+    emitted: Literal["all", "finest"] = "all"
+    """Which levels make Gaussians; coarser ones may serve the finest only."""
+    residual: bool = True
+    """Whether a level reads, and adds to, what the coarser one passes on."""
+    depth: Literal["refined", "swept"] = "refined"
+    """Depth and opacity from the head's own logits, or the sweep's depth and confidence as they are."""
+    feature_channels: tuple[int, ...] = (128, 96, 64, 32)
+    """Channels of the feature maps, coarse to fine."""
+    candidates: int = 32
+    """Depth candidates of the finest sweep."""
+    layers: int = 3
+    """Convolutions a level."""
+    adapter: AdapterConfig = field(default_factory=AdapterConfig)
+
+    @property
+    def outputs(self) -> int:
+        """Numbers a point: 2 offset, the adapter's, and the logits of depth and opacity where they are refined."""
+        return 2 + self.adapter.num_parameters + (self.candidates + 1 if self.depth == "refined" else 0)
+
+
+@dataclass(frozen=True)
+class ViewInputs:
+    """What the heads know of one view. Maps are (channel, height, width)."""
+
+    image: Float[Tensor, "3 height width"]
+    features: list[Float[Tensor, "channel h w"]]
+    """Coarse to fine."""
+    logits: Float[Tensor, "candidate h w"]
+    candidates: Float[Tensor, "candidate h w"]
+    inverse_depth: Float[Tensor, "h w"]
+    confidence: Float[Tensor, "h w"]
+    cam2world: Float[Tensor, "4 4"]
+    near: Float[Tensor, ""]
+    far: Float[Tensor, ""]
+    view: int
+
+
+@dataclass(frozen=True)
+class TileGaussians:
+    """The Gaussians of one tile: a set a batch item, and where they stand among those of all tiles."""
+
+    gaussians: list[Gaussians]
+    index: Integer[Tensor, "n"]
+    """Place of each in the untiled order: level coarse to fine, then view, then lattice point."""
+
+
+class LevelHead(nn.Module):
+    """The CNN of one level, and the linear layer that its lattice points read it through."""
+
+    def __init__(self, inputs: int, outputs: int, layers: int, lattice: Lattice, compat: Compat) -> None:
+        super().__init__()
+        hidden = 2 * outputs
+        last = hidden if lattice == "fibonacci" else outputs
+        widths = [inputs, *[hidden] * (layers - 1), last]
+        padding = 1 if compat == "official" else 0
+        self.convs = nn.ModuleList(
+            nn.Conv2d(before, after, 3, padding=padding) for before, after in itertools.pairwise(widths)
+        )
+        # One Gaussian a pixel needs no layer of its own: the map holds its numbers.
+        self.linear = nn.Linear(hidden, outputs) if lattice == "fibonacci" else nn.Identity()
+
+    def forward(self, maps: Float[Tensor, "1 channel height width"]) -> Float[Tensor, "1 hidden h w"]:
+        for index, conv in enumerate(self.convs):
+            maps = conv(maps if index == 0 else functional.gelu(maps))
+        return maps
+
+
+class GaussianHeads(nn.Module):
+    """Heads of all levels. Any number of views: each is lifted by itself.
+
+    Args:
+        precision: number type of the convolutions; all else is in the inputs' type.
+    """
+
+    def __init__(self, config: HeadsConfig, compat: Compat, precision: Precision = "float32") -> None:
+        super().__init__()
+        self.config, self.compat, self.precision = config, compat, precision
+        chained = config.levels == "pyramid" and config.residual
+        self.margins = Margins.of(config.layers, compat, chained=chained)
+        passed_on = (2 if config.lattice == "fibonacci" else 1) * config.outputs
+        first = len(config.feature_channels) - 1 if config.levels == "single" else 0
+        self.levels = nn.ModuleList(
+            LevelHead(
+                3 + channels + config.candidates + (passed_on if chained and index > 0 else 0),
+                config.outputs,
+                config.layers,
+                config.lattice,
+                compat,
+            )
+            for index, channels in enumerate(config.feature_channels[first:])
+        )
+
+    def forward(
+        self,
+        images: Float[Tensor, "batch view 3 height width"],
+        features: Sequence[Float[Tensor, "batch view channel _ _"]],
+        depths: Depths,
+        cam2world: Float[Tensor, "batch view 4 4"],
+        near: Float[Tensor, "batch view"],
+        far: Float[Tensor, "batch view"],
+        *,
+        tiles: int = 1,
+    ) -> list[Gaussians]:
+        """The Gaussians of each batch item.
+
+        Order: level coarse to fine, then view, then lattice point. With `compat="official"` and several tiles the
+        tile comes first, as in the original.
+
+        Args:
+            images: RGB in [0, 1], at full resolution.
+            features: maps of every level, coarse to fine; resized where the images are larger than theirs.
+            tiles: tiles along each side of the panorama. With `compat="fixed"` the result is the same for any number.
+
+        Raises:
+            InputError: when the height cannot be divided into levels and tiles.
+        """
+        parts = list(self.iterate(images, features, depths, cam2world, near, far, tiles=tiles))
+        whole = [Gaussians.cat([part.gaussians[item] for part in parts]) for item in range(len(images))]
+        if len(parts) == 1 or self.compat == "official":
+            return whole
+        order = torch.argsort(torch.cat([part.index for part in parts]))
+        return [gaussians.select(order.to(gaussians.means.device)) for gaussians in whole]
+
+    def iterate(
+        self,
+        images: Float[Tensor, "batch view 3 height width"],
+        features: Sequence[Float[Tensor, "batch view channel _ _"]],
+        depths: Depths,
+        cam2world: Float[Tensor, "batch view 4 4"],
+        near: Float[Tensor, "batch view"],
+        far: Float[Tensor, "batch view"],
+        *,
+        tiles: int = 1,
+        only: Sequence[int] | None = None,
+    ) -> Iterator[TileGaussians]:
+        """One tile's Gaussians after another, so that no more than one tile's maps are in memory.
+
+        Args:
+            only: numbers of the tiles wanted, row by row from 0; by default all. A tile alone is what it is among
+                all, with gradients too: two-step backpropagation makes them one by one.
+
+        Raises:
+            InputError: when the height cannot be divided into levels and tiles.
+        """
+        height = images.shape[-2]
+        self._require_divisible(height, tiles)
+        batch, views = images.shape[:2]
+        items = [
+            [_view_inputs(images, features, depths, cam2world, near, far, item, view) for view in range(views)]
+            for item in range(batch)
+        ]
+        grid = tile_grid(tiles)
+        for tile in grid if only is None else [grid[number] for number in only]:
+            gaussians = []
+            for item in items:
+                by_view = [self._lift_view(view, tile) for view in item]
+                gaussians.append(Gaussians.cat([part for level in zip(*by_view, strict=True) for part in level]))
+            yield TileGaussians(gaussians, self._untiled_index(tile, height, views))
+
+    def heights(self, height: int) -> list[int]:
+        """Rows of each level's map, coarse to fine, for images of a height."""
+        return [height >> level for level in range(len(self.levels) - 1, -1, -1)]
+
+    def points(self, height: int) -> list[Float[Tensor, "n 2"]]:
+        """Normalised panorama coordinates of the lattice points of each emitting level, coarse to fine."""
+        heights = self.heights(height)
+        if self.config.emitted == "finest":
+            heights = heights[-1:]
+        return [lattice_uv(self.config.lattice, rows, exact=self.compat == "fixed") for rows in heights]
+
+    def _lift_view(self, view: ViewInputs, tile: Tile) -> list[Gaussians]:
+        """One view's Gaussians inside a tile, by emitting level, coarse to fine."""
+        gaussians, passed_on = [], None
+        heights = self.heights(view.image.shape[-2])
+        features = view.features[-len(heights) :]
+        for index, (head, height, feature) in enumerate(zip(self.levels, heights, features, strict=True)):
+            window = tile.window(height)
+            around, known = window.grown(self.margins.input), window.grown(self.margins.output)
+            inputs = [cut(source, height, around, self.compat) for source in (view.image, feature, view.logits)]
+            maps = torch.cat(inputs)[None]
+            if passed_on is not None:
+                passed_on = _twice_as_fine(passed_on, self.margins)
+                maps = torch.cat((maps, passed_on), dim=1)
+            with torch.autocast(maps.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
+                refined = head(maps.contiguous(memory_format=torch.channels_last))
+            if passed_on is not None:
+                lost = self.margins.input - self.margins.output
+                refined = refined + _cropped(passed_on, lost)
+            passed_on = refined if self.config.residual else None
+            finest = index == len(heights) - 1
+            if finest or self.config.emitted == "all":
+                gaussians.append(self._read_points(head, refined[0], known, height, tile, view, index))
+        return gaussians
+
+    def _read_points(
+        self,
+        head: LevelHead,
+        refined: Float[Tensor, "hidden h w"],
+        known: Window,
+        height: int,
+        tile: Tile,
+        view: ViewInputs,
+        index: int,
+    ) -> Gaussians:
+        """The Gaussians that a tile's lattice points read off a level's map."""
+        config = self.config
+        uv = lattice_uv(config.lattice, height, exact=self.compat == "fixed")
+        uv = uv[tile.holds(uv)]
+        numbers = head.linear(sample(refined, known, height, uv))
+        offsets, parameters, logits = numbers.split(
+            (2, config.adapter.num_parameters, config.outputs - 2 - config.adapter.num_parameters), dim=-1
+        )
+        if config.depth == "refined":
+            candidates = sample_map(view.candidates, uv, self.compat)
+            inverse_depths = (torch.softmax(logits[:, :-1], dim=-1) * candidates).sum(dim=-1)
+            opacities = torch.sigmoid(logits[:, -1])
+        else:
+            inverse_depths = sample_map(view.inverse_depth[None], uv, self.compat)[:, 0]
+            opacities = torch.sigmoid(sample_map(view.confidence[None], uv, self.compat)[:, 0])
+        colors = None
+        if index == 0:  # finer levels add to the colours of the coarsest
+            around = tile.window(height).grown(1)
+            colors = sample(cut(view.image, height, around, self.compat), around, height, uv)
+        return adapt(
+            parameters,
+            move_points(uv.to(offsets.device), offsets, config.lattice, height),
+            1 / inverse_depths.clamp(1 / view.far, 1 / view.near),
+            opacities,
+            view.cam2world,
+            map_height=height,
+            colors=colors,
+            level=len(self.levels) - 1 - index,
+            view=view.view,
+            config=config.adapter,
+            compat=self.compat,
+        )
+
+    def _untiled_index(self, tile: Tile, height: int, views: int) -> Integer[Tensor, "n"]:
+        """Where the tile's Gaussians stand among those of the whole panorama."""
+        places, start = [], 0
+        for uv in self.points(height):
+            inside = tile.holds(uv).nonzero()[:, 0]
+            places += [start + view * len(uv) + inside for view in range(views)]
+            start += views * len(uv)
+        return torch.cat(places)
+
+    def _require_divisible(self, height: int, tiles: int) -> None:
+        coarsest = self.heights(height)[0]
+        factor = tiles << (len(self.levels) - 1)
+        if tiles < 1 or height % factor:
+            raise InputError(
+                f"{tiles}x{tiles} tiles on {len(self.levels)} levels need a height that {factor} divides, got "
+                f"{height}; choose another height or fewer tiles"
+            )
+        if self.compat == "fixed" and coarsest < self.margins.input:
+            least = self.margins.input << (len(self.levels) - 1)
+            raise InputError(f"the heads need panoramas at least {least} pixels high, got {height}; enlarge them")
+
+
+def sample_map(
+    source: Float[Tensor, "channel h w"], uv: Float[Tensor, "n 2"], compat: Compat
+) -> Float[Tensor, "n channel"]:
+    """Bilinear samples of a whole map; the original repeats its last column at the seam (OFFICIAL.md, trap T7)."""
+    height = source.shape[-2]
+    window = Window(0, 0, height, 2 * height)
+    if compat == "fixed":
+        window = window.grown(1)
+    return sample(cut(source, height, window, compat), window, height, uv)
+
+
+def _view_inputs(
+    images: Tensor,
+    features: Sequence[Tensor],
+    depths: Depths,
+    cam2world: Tensor,
+    near: Tensor,
+    far: Tensor,
+    item: int,
+    view: int,
+) -> ViewInputs:
+    at = (item, view)
+    return ViewInputs(
+        image=images[at],
+        features=[maps[at] for maps in features],
+        logits=depths.logits[at],
+        candidates=depths.candidates[at],
+        inverse_depth=depths.inverse_depth[-1][at],
+        confidence=depths.confidence[-1][at],
+        cam2world=cam2world[at],
+        near=near[at],
+        far=far[at],
+        view=view,
+    )
+
+
+def _twice_as_fine(maps: Float[Tensor, "1 hidden height width"], margins: Margins) -> Float[Tensor, "1 hidden h w"]:
+    """A level's map and its margin on the next level's pixels, cut to the margin that the next CNN reads."""
+    raised = functional.interpolate(maps, scale_factor=2, mode="bilinear", align_corners=False)
+    return _cropped(raised, 2 * margins.output - margins.input)
+
+
+def _cropped(maps: Float[Tensor, "1 hidden height width"], margin: int) -> Float[Tensor, "1 hidden h w"]:
+    return maps[..., margin : maps.shape[-2] - margin, margin : maps.shape[-1] - margin]

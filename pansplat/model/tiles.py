@@ -1,0 +1,157 @@
+"""Tiles of a panorama: windows into maps of any level, cut with the margins that make tiling exact.
+
+A tile is one cell of an N x N grid over the panorama. On each level it is a window of whole pixels, grown by a
+margin; beyond the map's edges a window sees what is really there: columns wrap around, rows go on over the pole
+half a turn away. The original puts zeros beyond the poles and repeats the last column at the seam when it
+resizes, and its margins are too narrow (OFFICIAL.md, P6, P7, T5).
+
+Source: PanSplat, section 3.4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Integer
+from torch import Tensor
+
+from pansplat.geometry import wrap
+from pansplat.model.layers import Compat
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle of map pixels; it may reach beyond the map."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+
+    def grown(self, margin: int) -> Window:
+        """The window with a margin on all four sides."""
+        return Window(self.top - margin, self.left - margin, self.height + 2 * margin, self.width + 2 * margin)
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One cell of a `grid` x `grid` division of the panorama."""
+
+    row: int
+    column: int
+    grid: int
+
+    def window(self, height: int) -> Window:
+        """Its pixels on a map of `height` x `2 height`, without margin."""
+        rows, columns = height // self.grid, 2 * height // self.grid
+        return Window(self.row * rows, self.column * columns, rows, columns)
+
+    def holds(self, uv: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:
+        """Which points belong to it: each point of the panorama to exactly one tile."""
+        cell = (uv * self.grid).floor().clamp(0, self.grid - 1)
+        return (cell[:, 0] == self.column) & (cell[:, 1] == self.row)
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Map pixels around a tile: what a level's CNN reads, and what is known of its output.
+
+    The original's output keeps the margin of its input, spoilt from its rim inwards by the zeros each convolution
+    sees there. Ours loses a pixel a convolution; `input` = 7 and `output` = 4 are the least that let the next level
+    be read off, twice as fine, with the same margin again.
+    """
+
+    input: int
+    output: int
+
+    @staticmethod
+    def of(layers: int, compat: Compat, *, chained: bool) -> Margins:
+        """Margins for a number of convolutions; `chained` where maps are passed on to a finer level."""
+        if compat == "official":
+            return Margins(layers, layers)
+        output = layers + 1 if chained else 1
+        return Margins(output + layers, output)
+
+
+def tile_grid(grid: int) -> list[Tile]:
+    """All tiles of a grid, row by row."""
+    return [Tile(row, column, grid) for row in range(grid) for column in range(grid)]
+
+
+def cut(
+    source: Float[Tensor, "channel h w"], height: int, window: Window, compat: Compat
+) -> Float[Tensor, "channel rows columns"]:
+    """A window into a panorama map resized to `height` x `2 height` (bilinear, without antialiasing).
+
+    Only the window is resized, so that memory follows the tile, not the panorama.
+    """
+    exact = compat == "fixed"
+    rows = torch.arange(window.top, window.top + window.height)
+    columns = torch.arange(window.left, window.left + window.width)
+    if not exact:
+        columns = columns.remainder(2 * height)
+    before_y, after_y, weight_y = _neighbours(rows, source.shape[1], height, exact)
+    before_x, after_x, weight_x = _neighbours(columns, source.shape[2], 2 * height, exact)
+    if exact:
+        edges = (before_y[0], before_x[0], source.shape[1] - 1 - after_y[-1], source.shape[2] - 1 - after_x[-1])
+        margin = max(0, -min(int(edge) for edge in edges))
+        source = wrap.pad(source, margin, "sphere")
+        before_y, after_y, before_x, after_x = (i + margin for i in (before_y, after_y, before_x, after_x))
+    resized = _blend(source, before_y, after_y, weight_y, dim=1)
+    resized = _blend(resized, before_x, after_x, weight_x, dim=2)
+    if exact:
+        return resized
+    inside = (rows >= 0) & (rows < height)
+    return resized if bool(inside.all()) else resized * inside.to(resized)[:, None]
+
+
+def sample(
+    window_map: Float[Tensor, "channel rows columns"],
+    window: Window,
+    height: int,
+    uv: Float[Tensor, "n 2"],
+) -> Float[Tensor, "n channel"]:
+    """Bilinear samples of a map of `height` x `2 height`, of which only a window is at hand, at points inside it."""
+    x = uv[:, 0] * (2 * height) - 0.5 - window.left
+    y = uv[:, 1] * height - 0.5 - window.top
+    x, y = x.clamp(0, window.width - 1), y.clamp(0, window.height - 1)
+    left, top = x.floor().clamp(max=window.width - 2), y.floor().clamp(max=window.height - 2)
+    across, down = (x - left).to(window_map)[:, None], (y - top).to(window_map)[:, None]
+    corner = (top * window.width + left).long().to(window_map.device)
+    pixels = window_map.permute(1, 2, 0).reshape(window.height * window.width, -1)
+    upper = torch.lerp(pixels[corner], pixels[corner + 1], across)
+    lower = torch.lerp(pixels[corner + window.width], pixels[corner + window.width + 1], across)
+    return torch.lerp(upper, lower, down)
+
+
+def _neighbours(
+    index: Integer[Tensor, "n"], source_size: int, size: int, exact: bool
+) -> tuple[Integer[Tensor, "n"], Integer[Tensor, "n"], Float[Tensor, "n"]]:
+    """The two source pixels on either side of each target pixel's centre, and the weight of the second."""
+    position = (index.double() + 0.5) * (source_size / size) - 0.5
+    if not exact:
+        position = position.clamp(0, source_size - 1)
+    before = position.floor()
+    weight = position - before
+    after = torch.where(weight > 0, before + 1, before)
+    return before.long(), after.long(), weight
+
+
+def _blend(
+    source: Float[Tensor, "channel h w"],
+    before: Integer[Tensor, "n"],
+    after: Integer[Tensor, "n"],
+    weight: Float[Tensor, "n"],
+    dim: int,
+) -> Float[Tensor, "channel rows columns"]:
+    """Source pixels along one axis, blended; a plain slice where no weight is needed."""
+    if bool((weight == 0).all()):
+        first, last = int(before[0]), int(before[-1])
+        if last - first + 1 == len(before) and bool((before.diff() == 1).all()):
+            return source.narrow(dim, first, len(before))
+        return source.index_select(dim, before.to(source.device))
+    shape = [1, 1, 1]
+    shape[dim] = -1
+    first, second = (source.index_select(dim, i.to(source.device)) for i in (before, after))
+    return torch.lerp(first, second, weight.to(source).reshape(shape))
