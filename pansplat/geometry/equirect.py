@@ -57,8 +57,8 @@ def pad_equirect(image: Float[Tensor, "*batch height width"], margin: int) -> Fl
     width = image.shape[-1]
     if width % 2:
         raise ValueError(f"`image` must have an even width to continue over the poles, got {width}")
-    over = torch.roll(image, width // 2, dims=-1)
-    rows = torch.cat((over[..., :margin, :].flip(-2), image, over[..., -margin:, :].flip(-2)), dim=-2)
+    above, below = (rows.flip(-2).roll(width // 2, -1) for rows in (image[..., :margin, :], image[..., -margin:, :]))
+    rows = torch.cat((above, image, below), dim=-2)
     return torch.cat((rows[..., -margin:], rows, rows[..., :margin]), dim=-1)
 
 

@@ -1,0 +1,177 @@
+"""Spherical plane sweep: where the points on concentric spheres about one camera appear in another camera's panorama.
+
+A candidate is an inverse depth; a pixel's ray meets its sphere in a point, which the other camera sees somewhere. The
+warp samples the other panorama there; the correlation compares the sample with the pixel itself.
+
+Two ways of sampling: `sphere` is right (half-integer pixel centres, columns wrap, rows go on over the poles);
+`corners` is the original's (rays through half-integer centres, samples as if the corner pixels' centres lay on the
+border, zeros outside), which shifts even the identity by up to half a pixel.
+
+No gradient flows to poses and candidates.
+
+Source: PanSplat, section 3.2; OFFICIAL.md, section 6.
+"""
+
+import math
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from pansplat.geometry import wrap
+from pansplat.geometry.equirect import pixel_directions
+from pansplat.geometry.pose import invert_pose
+
+Sampling = Literal["sphere", "corners"]
+
+_CHUNK = 1 << 22
+"""Numbers in the warped features that exist at a time."""
+
+
+def relative_pose(
+    reference: Float[Tensor, "*batch 4 4"], other: Float[Tensor, "*batch 4 4"]
+) -> Float[Tensor, "*batch 4 4"]:
+    """From reference camera axes to the other's, of two cam2world poses; float64, as distances cancel."""
+    return invert_pose(other.double()) @ reference.double()
+
+
+def sweep_positions(
+    inverse_depth: Float[Tensor, "pair candidate height width"], pose: Float[Tensor, "pair 4 4"], sampling: Sampling
+) -> tuple[Float[Tensor, "pair candidate height width"], Float[Tensor, "pair candidate height width"]]:
+    """Column and row in the other panorama of each pixel at each inverse depth; 0 is the first pixel's centre.
+
+    Args:
+        inverse_depth: 1 / metres, >= 0; 0 is a point at infinity (not with `corners`).
+        pose: from reference camera axes to the other's, rigid, metres.
+
+    A point in the other camera's centre has no direction; it is given the place of some pixel, never NaN.
+    """
+    height, width = inverse_depth.shape[-2:]
+    rays = pixel_directions(height, width, dtype=inverse_depth.dtype, device=inverse_depth.device)
+    pose = pose.to(inverse_depth)
+    turned = torch.einsum("nij,hwj->inhw", pose[:, :3, :3], rays)[:, :, None]
+    translation = pose[:, :3, 3].T[:, :, None, None, None]
+    if sampling == "corners":
+        return _corner_positions(turned / inverse_depth + translation)
+    points = turned + translation * inverse_depth
+    return _sphere_positions(points, rays)
+
+
+def _sphere_positions(points: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """By the angle from each pixel's own ray to the point: exact where the camera has not moved."""
+    height, width = rays.shape[:2]
+    x, y, z = points
+    ray_x, ray_y, ray_z = rays.unbind(-1)
+    flat, ray_flat = torch.hypot(x, z), torch.hypot(ray_x, ray_z)
+    east = torch.atan2(x * ray_z - z * ray_x, z * ray_z + x * ray_x)
+    down = torch.atan2(y * ray_flat - flat * ray_y, flat * ray_flat + y * ray_y)
+    columns = torch.arange(width, dtype=x.dtype, device=x.device) + east * (width / (2 * math.pi))
+    rows = torch.arange(height, dtype=x.dtype, device=x.device)[:, None] + down * (height / math.pi)
+    return columns.remainder(width), rows.clamp(-0.5, height - 0.5)
+
+
+def _corner_positions(points: Tensor) -> tuple[Tensor, Tensor]:
+    """The original's; a sine that rounds above one is cut, where the original has NaN."""
+    height, width = points.shape[-2:]
+    x, y, z = points / points.norm(dim=0).clamp(min=1e-3)
+    u = torch.atan2(x, z) / (2 * math.pi) + 0.5
+    v = torch.asin(y.clamp(-1, 1)) / math.pi + 0.5
+    return u * (width - 1), v * (height - 1)
+
+
+def sample(
+    maps: Float[Tensor, "pair channel height width"],
+    columns: Float[Tensor, "pair candidate h w"],
+    rows: Float[Tensor, "pair candidate h w"],
+    sampling: Sampling,
+) -> Float[Tensor, "pair channel candidate h w"]:
+    """Bilinear samples of maps at columns and rows as `sweep_positions` gives them."""
+    if sampling == "sphere":
+        maps, columns, rows = wrap.pad(maps, 1, "sphere"), columns + 1, rows + 1
+    height, width = maps.shape[-2:]
+    grid = torch.stack((2 * columns / (width - 1) - 1, 2 * rows / (height - 1) - 1), dim=-1)
+    samples = functional.grid_sample(maps, grid.flatten(1, 2), padding_mode="zeros", align_corners=True)
+    return samples.unflatten(2, columns.shape[1:3])
+
+
+def warp_panorama(
+    maps: Float[Tensor, "pair channel height width"],
+    inverse_depth: Float[Tensor, "pair candidate height width"],
+    pose: Float[Tensor, "pair 4 4"],
+    sampling: Sampling = "sphere",
+) -> Float[Tensor, "pair channel candidate height width"]:
+    """The other panorama as the reference camera would see it, if its pixels had the given inverse depths.
+
+    Args:
+        maps: the other panorama.
+        inverse_depth: of the reference pixels, 1 / metres.
+        pose: from reference camera axes to the other's.
+    """
+    with torch.no_grad():
+        columns, rows = sweep_positions(inverse_depth, pose, sampling)
+    return sample(maps, columns, rows, sampling)
+
+
+def correlate(
+    reference: Float[Tensor, "pair channel height width"],
+    other: Float[Tensor, "pair channel height width"],
+    inverse_depth: Float[Tensor, "pair candidate height width"],
+    pose: Float[Tensor, "pair 4 4"],
+    sampling: Sampling = "sphere",
+) -> Float[Tensor, "pair candidate height width"]:
+    """Dot products of each pixel's features with the other panorama's, for each candidate, over sqrt(channel).
+
+    The warped features of all candidates never exist at once, neither forward nor backward. Half-precision features
+    are multiplied in float32. Gradient flows to both features.
+    """
+    return _Correlation.apply(reference, other, inverse_depth.detach(), pose.detach(), sampling)
+
+
+class _Correlation(torch.autograd.Function):
+    """Computes chunk by chunk, and again in the backward pass."""
+
+    @staticmethod
+    def forward(ctx, reference, other, inverse_depth, pose, sampling):
+        ctx.save_for_backward(reference, other, inverse_depth, pose)
+        ctx.sampling = sampling
+        scaled, other = _scaled(reference), _widened(other)
+        parts = [
+            torch.einsum("nchw,ncdhw->ndhw", scaled, warp_panorama(other, chunk, pose, sampling))
+            for chunk in _chunks(inverse_depth, reference)
+        ]
+        return torch.cat(parts, dim=1)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient):
+        reference, other, inverse_depth, pose = ctx.saved_tensors
+        scaled, widened = _scaled(reference), _widened(other)
+        to_reference, to_other = torch.zeros_like(scaled), torch.zeros_like(widened)
+        start = 0
+        for chunk in _chunks(inverse_depth, reference):
+            part = gradient[:, start : start + chunk.shape[1]]
+            start += chunk.shape[1]
+            with torch.enable_grad():
+                leaf = widened.detach().requires_grad_()
+                warped = warp_panorama(leaf, chunk, pose, ctx.sampling)
+            to_reference += torch.einsum("ndhw,ncdhw->nchw", part, warped.detach())
+            (step,) = torch.autograd.grad(warped, leaf, part[:, None] * scaled[:, :, None])
+            to_other += step
+        to_reference /= math.sqrt(reference.shape[1])
+        return to_reference.to(reference.dtype), to_other.to(other.dtype), None, None, None
+
+
+def _widened(features: Tensor) -> Tensor:
+    return features.to(torch.promote_types(features.dtype, torch.float32))
+
+
+def _scaled(reference: Tensor) -> Tensor:
+    """Scaled before the product, so that no sum grows larger than the result."""
+    return _widened(reference) / math.sqrt(reference.shape[1])
+
+
+def _chunks(inverse_depth: Tensor, reference: Tensor) -> tuple[Tensor, ...]:
+    """The candidates in groups whose warped features fit the limit."""
+    return inverse_depth.split(max(1, _CHUNK // max(1, reference.numel())), dim=1)

@@ -1,0 +1,60 @@
+"""What lies beyond a panorama's borders: padding and resizing of maps that know the sphere.
+
+`sphere` is the truth: columns wrap, and a row beyond a pole is the pole's own row half a turn away.
+`wrapped_columns` (zeros beyond the poles) and `zeros` are what the original networks were trained with.
+
+Source: PanSplat, section 3.1; the original's "panorama convolution" pads rows by zeros, then columns circularly.
+"""
+
+import math
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from pansplat.geometry.equirect import pad_equirect
+
+Border = Literal["sphere", "wrapped_columns", "zeros"]
+
+
+def pad(maps: Float[Tensor, "*batch height width"], margin: int, border: Border) -> Float[Tensor, "*batch h w"]:
+    """Maps with `margin` more rows and columns on each side.
+
+    Raises:
+        ValueError: the margin is larger than the map, or the width is odd and the border is the sphere's.
+    """
+    if margin == 0:
+        return maps
+    if border == "zeros":
+        return functional.pad(maps, (margin,) * 4)
+    height, width = maps.shape[-2:]
+    if margin > width or (border == "sphere" and margin > height):
+        raise ValueError(f"a margin of {margin} needs a map at least as large, got {height}x{width}")
+    if border == "sphere":
+        return pad_equirect(maps, margin)
+    rows = functional.pad(maps, (0, 0, margin, margin))
+    return torch.cat((rows[..., -margin:], rows, rows[..., :margin]), dim=-1)
+
+
+def resize(
+    maps: Float[Tensor, "batch channel height width"], size: tuple[int, int]
+) -> Float[Tensor, "batch channel h w"]:
+    """Maps bilinearly resized to `size` (height, width) on the sphere, pixel centres at half-integers.
+
+    Not filtered before it is made smaller: a sample is a mean of four pixels, whatever the factor.
+    """
+    height, width = maps.shape[-2:]
+    if size == (height, width):
+        return maps
+    if size[0] * width != size[1] * height:
+        raise ValueError(f"`size` must keep the shape of {height}x{width}, got {size[0]}x{size[1]}")
+    # The smallest margin that becomes a whole number of pixels, and can be cut off again.
+    divisor = math.gcd(height, size[0])
+    margin, cut = height // divisor, size[0] // divisor
+    padded = pad(maps, margin, "sphere")
+    resized = functional.interpolate(
+        padded, (size[0] + 2 * cut, size[1] + 2 * cut), mode="bilinear", align_corners=False
+    )
+    return resized[..., cut:-cut, cut:-cut]

@@ -1,0 +1,115 @@
+"""Building blocks shared by the networks: convolution over a panorama, resizing of maps, attention.
+
+`compat` runs through all of them. `official` computes what the original does, its defects included, so that its
+weights give its numbers. `fixed` puts pixel centres at half-integers and continues every map over the seam and the
+poles.
+
+Source: PanSplat, section 3.1; OFFICIAL.md, sections 4, 6 and 7.
+"""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from pansplat.errors import InputError
+from pansplat.geometry import wrap
+from pansplat.geometry.wrap import Border
+
+Compat = Literal["official", "fixed"]
+AttentionPrecision = Literal["float32", "bfloat16"]
+
+
+def border_of(compat: Compat) -> Border:
+    """What the convolutions of PanSplat see beyond the border."""
+    return "sphere" if compat == "fixed" else "wrapped_columns"
+
+
+def require_views(count: int, compat: Compat) -> None:
+    """Refuse a number of views that the networks cannot take.
+
+    Raises:
+        InputError: fewer than two, or other than two where the original's numbers are wanted.
+    """
+    if count < 2:
+        raise InputError(f"a prediction needs two or more views, got {count}; add a panorama of the same place")
+    if count > 2 and compat == "official":
+        raise InputError(
+            f'compat="official" takes exactly two views, as the original does, got {count}; use compat="fixed"'
+        )
+
+
+def require_size(height: int, width: int, multiple: int) -> None:
+    """Refuse an image size that the pyramid of maps cannot halve.
+
+    Raises:
+        InputError: the height or the width is not a multiple of `multiple`.
+    """
+    if height % multiple or width % multiple:
+        raise InputError(
+            f"the network needs a height and a width that {multiple} divides, got {height}x{width}; "
+            "choose another height"
+        )
+
+
+class PanoramaConv2d(nn.Conv2d):
+    """A convolution that keeps the size of the map (or divides it by the stride) and knows what lies beyond it."""
+
+    def __init__(
+        self, inputs: int, outputs: int, kernel: int, *, border: Border, stride: int = 1, bias: bool = True
+    ) -> None:
+        super().__init__(inputs, outputs, kernel, stride=stride, bias=bias)
+        self.border: Border = border
+        self.margin = kernel // 2
+
+    def forward(self, input: Float[Tensor, "batch channel height width"]) -> Float[Tensor, "batch c h w"]:
+        if self.border == "zeros":
+            return functional.conv2d(input, self.weight, self.bias, self.stride, self.margin)
+        padded = wrap.pad(input, self.margin, self.border)
+        return functional.conv2d(padded, self.weight, self.bias, self.stride)
+
+
+def upsample(
+    maps: Float[Tensor, "batch channel height width"], factor: int, compat: Compat
+) -> Float[Tensor, "batch channel h w"]:
+    """Maps enlarged bilinearly; the original lays corner pixels' centres on each other."""
+    if compat == "official":
+        return functional.interpolate(maps, scale_factor=factor, mode="bilinear", align_corners=True)
+    height, width = maps.shape[-2:]
+    return wrap.resize(maps, (height * factor, width * factor))
+
+
+def resize(
+    maps: Float[Tensor, "batch channel height width"], size: tuple[int, int], compat: Compat
+) -> Float[Tensor, "batch channel h w"]:
+    """Maps resized bilinearly, pixel centres at half-integers; the original repeats the border's pixels beyond it."""
+    if compat == "official":
+        return functional.interpolate(maps, size, mode="bilinear", align_corners=False)
+    return wrap.resize(maps, size)
+
+
+def attend(
+    queries: Float[Tensor, "batch head query channel"],
+    keys: Float[Tensor, "batch head key channel"],
+    values: Float[Tensor, "batch head key channel"],
+    *,
+    mask: Float[Tensor, "#batch #head query key"] | None = None,
+    precision: AttentionPrecision = "float32",
+) -> Float[Tensor, "batch head query channel"]:
+    """Scaled dot-product attention; `mask` is added to the logits.
+
+    Precision "bfloat16" rounds the inputs and the output to bfloat16, as the original's kernel does; on a CPU the
+    sums between are in float32.
+    """
+    if precision == "float32":
+        return functional.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
+    kept = queries.dtype
+    rounded = [tensor.to(torch.bfloat16) for tensor in (queries, keys, values)]
+    bias = None if mask is None else mask.to(torch.bfloat16)
+    if queries.device.type == "cpu":
+        rounded = [tensor.to(kept) for tensor in rounded]
+        bias = None if bias is None else bias.to(kept)
+    attended = functional.scaled_dot_product_attention(*rounded, attn_mask=bias)
+    return attended.to(torch.bfloat16).to(kept)
