@@ -35,8 +35,8 @@ class Options:
     """What predicts the scene from a pair."""
     height: int = 512
     """Height of the panoramas that the prediction sees, pixels."""
-    cache: bool = True
-    """Whether predictions are kept beside the pair, and those kept are used."""
+    no_cache: bool = False
+    """Predict anew even when the result is kept beside the pair."""
     convention: str | None = None
     """Pose convention to read the poses by, such as "world2cam opengl", instead of what the files say."""
     near: float | None = None
@@ -73,7 +73,7 @@ class Options:
     @property
     def load_options(self) -> LoadOptions:
         """How to read and predict."""
-        return LoadOptions(self.model, self.height, self.cache, self.convention, self.near, self.far)
+        return LoadOptions(self.model, self.height, not self.no_cache, self.convention, self.near, self.far)
 
     @property
     def settings(self) -> DrawSettings:

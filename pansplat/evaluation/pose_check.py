@@ -27,6 +27,7 @@ _AGGREGATION = 2  # pixels on each side over which differences are averaged
 _DIFFERENCE_CAP = 0.6  # per feature; what is hidden in the other view must not decide
 _CLEARLY_BETTER = 0.92  # of the error as given: below that another reading is named,
 _FITS = 0.46  # if its own error is below that
+_DIFFERENT = 0.02  # and at least so much less: among nearly perfect fits a ratio means nothing
 _UNLIKE = 0.5  # least error above which the views show too little in common to tell anything
 _SAME_POSE = 0.02  # entries of the relative pose (translation by its length) that count as equal
 
@@ -145,7 +146,7 @@ def check_views(views: Views, name: str = "views") -> PoseCheck:
 def _likely_mistake(errors: dict[str, float]) -> str | None:
     """Advice for the best reading, and those that fit just as well, if it is clearly better than as given."""
     best = next(iter(errors.values()))
-    if best > min(_CLEARLY_BETTER * errors[AS_GIVEN], _FITS):
+    if best > min(_CLEARLY_BETTER * errors[AS_GIVEN], errors[AS_GIVEN] - _DIFFERENT, _FITS):
         return None
     named = [_ADVICE[r] for r, error in errors.items() if r != AS_GIVEN and error <= best * 1.001]
     return "; or ".join(named) + f" (error {best:.3f} instead of {errors[AS_GIVEN]:.3f})."

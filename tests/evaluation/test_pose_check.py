@@ -8,7 +8,7 @@ import torch
 
 from pansplat.data.pairs import load_pairs
 from pansplat.data.views import Views
-from pansplat.evaluation.pose_check import _ADVICE, AS_GIVEN, check_pair, check_views
+from pansplat.evaluation.pose_check import _ADVICE, AS_GIVEN, _likely_mistake, check_pair, check_views
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import invert_pose, rotations_from_quats
 
@@ -91,6 +91,11 @@ def test_each_wrong_convention_is_named(mistake: str) -> None:
     assert check.likely_mistake is not None
     assert check.likely_mistake.startswith(_ADVICE[mistake])
     assert not check.ok
+
+
+def test_among_nearly_perfect_fits_none_is_called_a_mistake() -> None:
+    assert _likely_mistake({"inverse": 0.001, AS_GIVEN: 0.004}) is None
+    assert _likely_mistake({"inverse": 0.201, AS_GIVEN: 0.304}) is not None
 
 
 def test_readings_of_the_same_motion_are_called_indistinguishable() -> None:
