@@ -17,7 +17,8 @@ from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.geometry.pose import orthonormal_error
 from pansplat.render.backend import Draw, Info, Kernel, Lowpass, Options, Order
-from pansplat.render.panorama import Layout, pictures, stitch_faces
+from pansplat.render.panorama import Layout, pictures
+from pansplat.render.stitching import Stitching, stitch_faces
 
 Backend = Literal["auto", "torch", "numba", "triton"]
 
@@ -57,6 +58,7 @@ def rasterize(
     near: float = 0.05,
     strict: bool = False,
     face_size: int | None = None,
+    stitching: Stitching = "seamless",
     backend: Backend = "auto",
 ) -> Rendering:
     """Draw Gaussians as one camera sees them.
@@ -77,6 +79,7 @@ def rasterize(
         near: Gaussians whose mean is nearer are left out, metres.
         strict: refuse Gaussians that are not finite rather than leave them out.
         face_size: of the cubemap's faces, pixels; by default as fine as the panorama's equator.
+        stitching: of the cubemap's faces, "seamless", or "official" with the original's borders.
         backend: "torch" is the reference, "numba" is fast on a CPU, "triton" on CUDA; "auto" takes the fastest
             there is for the Gaussians' type and device.
 
@@ -87,7 +90,7 @@ def rasterize(
         InputError: an argument is out of range or does not fit the Gaussians, the pose is not rigid, "ewa" is
             asked for on "equirect", or `strict` and a Gaussian is not finite.
     """
-    _check(size, layout, vertical_fov_degrees, kernel, order, lowpass, near, face_size, backend)
+    _check(size, layout, vertical_fov_degrees, kernel, order, lowpass, near, face_size, stitching, backend)
     device = gaussians.means.device
     pose = torch.as_tensor(cam2world, device=device).double()
     error = orthonormal_error(pose.detach()) if pose.shape == (4, 4) else math.inf
@@ -103,7 +106,7 @@ def rasterize(
     planes = pictures(layout, size, vertical_fov_degrees=vertical_fov_degrees, face_size=face_size, device=device)
     options = Options(kernel, order, lowpass, near, strict)
     drawn = _backend(backend, gaussians)(gaussians, covariances, pose, planes, options)
-    sums = stitch_faces(drawn.sums, size) if layout == "cubemap" else drawn.sums[0]
+    sums = stitch_faces(drawn.sums, size, stitching=stitching) if layout == "cubemap" else drawn.sums[0]
     return _finish(sums, behind, drawn.info)
 
 
@@ -124,10 +127,18 @@ def _check(
     lowpass: str,
     near: float,
     face_size: int | None,
+    stitching: str,
     backend: str,
 ) -> None:
-    choices = {"layout": Layout, "kernel": Kernel, "order": Order, "lowpass": Lowpass, "backend": Backend}
-    for (name, allowed), value in zip(choices.items(), (layout, kernel, order, lowpass, backend), strict=True):
+    choices = (
+        ("layout", layout, Layout),
+        ("kernel", kernel, Kernel),
+        ("order", order, Order),
+        ("lowpass", lowpass, Lowpass),
+        ("stitching", stitching, Stitching),
+        ("backend", backend, Backend),
+    )
+    for name, value, allowed in choices:
         if value not in get_args(allowed):
             raise InputError(f"`{name}` must be one of {', '.join(get_args(allowed))}, got {value!r}")
     if len(size) != 2 or min(size) < 1:
@@ -142,6 +153,11 @@ def _check(
         raise InputError(
             "kernel 'ewa' approximates a pinhole projection and is not defined on layout 'equirect'; "
             "use layout='cubemap', or kernel='ray'"
+        )
+    if stitching == "official" and (layout != "cubemap" or size[0] % 4 or size[1] != 2 * size[0]):
+        raise InputError(
+            "stitching 'official' needs layout='cubemap' and a 2:1 panorama with a height that is a multiple of 4, "
+            f"got layout={layout!r} and size {tuple(size)}; use stitching='seamless'"
         )
 
 

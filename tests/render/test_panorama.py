@@ -5,14 +5,15 @@ import math
 
 import pytest
 import torch
-from safetensors.torch import load_file
 
+from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
-from pansplat.geometry.cubemap import face_poses, face_rotations
+from pansplat.geometry.cubemap import face_of, face_poses, face_rotations, official_faces
 from pansplat.geometry.equirect import pixel_directions, uv_from_directions
 from pansplat.geometry.pose import multiply_quats, quats_from_rotations, rotations_from_quats
 from pansplat.render import rasterize
-from pansplat.render.panorama import Picture, face_of, stitch_faces
+from pansplat.render.panorama import Picture
+from pansplat.render.stitching import stitch_faces
 
 
 def _turned(pose: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
@@ -120,23 +121,98 @@ def test_the_cubemap_tends_to_the_direct_panorama(make_scene, pose):
 
 
 @pytest.mark.shared
-def test_stitching_equals_the_originals_where_its_borders_are_right(shared):
-    fixtures = load_file(shared / "golden" / "units.safetensors")
-    expected = fixtures["cubemap.pano_out"][0]
-    got = stitch_faces(fixtures["cubemap.faces_in"][0], tuple(expected.shape[1:]))
-    face, theirs = face_of(pixel_directions(64, 128, dtype=torch.float64)), fixtures["cubemap.face"].long()
-    same = face == theirs
-    assert int((~same).sum()) <= 32  # the original rounds the up and down faces' outline to whole rows
-    # Its borders of the up and down faces are shifted (OFFICIAL.md, P9).
-    inside = torch.stack([(fixtures[f"cubemap.{axis}"] - 16).abs() <= 15.5 for axis in "xy"]).all(dim=0)
-    right = same & ((face < 4) | inside)
-    assert float((got - expected).abs().amax(dim=0)[right].max()) < 5e-5
-    assert int((right & ~inside).sum()) > 40
+def test_official_faces_are_the_originals(golden):
+    assert torch.equal(official_faces(64), golden("units")["cubemap.face"].long())
 
 
 @pytest.mark.shared
-def test_face_rotations_equal_the_originals(shared):
-    expected = load_file(shared / "golden" / "units.safetensors")["cubemap.rotations"]
+def test_official_stitching_equals_the_originals(golden):
+    fixtures = golden("units")
+    expected = fixtures["cubemap.pano_out"][0].double()
+    got = stitch_faces(fixtures["cubemap.faces_in"][0].double(), (64, 128), stitching="official")
+    # The original looks up float32 places in a strip of six padded faces, 204 pixels long, where neighbouring numbers
+    # are 1.5e-5 apart; the fixture's faces are noise, up to 1 from pixel to pixel.
+    assert float((got - expected).abs().max()) < 3e-5
+    # Rounding its places as it does leaves a sixth of the pixels, where the last bit fell otherwise.
+    rounded = _stitched_in_a_float32_strip(fixtures, got)
+    far = (rounded - expected).abs().amax(dim=0) > 5e-7
+    assert float(far.double().mean()) < 0.2
+
+
+def _stitched_in_a_float32_strip(fixtures, stitched: torch.Tensor) -> torch.Tensor:
+    """`stitched` moved by what rounding each place in a strip of padded faces to float32 moves it."""
+    face, x, y = (fixtures[f"cubemap.{name}"] for name in ("face", "x", "y"))
+    strip = _padded_official(fixtures["cubemap.faces_in"][0]).permute(1, 0, 2, 3).reshape(3, 6 * 34, 34)
+    grid = torch.stack(((x + 1) / 34 * 2 - 1, (y + 1 + 34 * face) / 204 * 2 - 1), dim=-1)
+    assert grid.dtype == torch.float32
+    return torch.nn.functional.grid_sample(strip[None], grid[None], align_corners=False)[0].to(stitched)
+
+
+def _padded_official(faces: torch.Tensor) -> torch.Tensor:
+    """Faces with the original's borders as OFFICIAL.md describes them (P9, T6), written out edge by edge."""
+    front, right, back, left, up, down = faces
+    padded = torch.zeros(6, 3, 34, 34)
+    padded[:, :, 1:-1, 1:-1] = faces
+    around = (front, right, back, left)
+    for i in range(4):
+        padded[i, :, 1:-1, 0] = around[i - 1][:, :, -1]
+        padded[i, :, 1:-1, -1] = around[(i + 1) % 4][:, :, 0]
+    over = (up[:, -1], up[:, :, -1].flip(1), up[:, 0].flip(1), up[:, :, 0])
+    under = (down[:, 0], down[:, :, -1], down[:, -1].flip(1), down[:, :, 0].flip(1))
+    for i in range(4):
+        padded[i, :, 0, 1:-1], padded[i, :, -1, 1:-1] = over[i], under[i]
+    padded[4, :, 0, 1:-1], padded[4, :, -1, 1:-1] = back[:, 0].flip(1), front[:, 0]
+    padded[5, :, 0, 1:-1], padded[5, :, -1, 1:-1] = front[:, -1], back[:, -1].flip(1)
+    # Left and right of up and down: a row too low, behind a zero; down's are its own.
+    padded[4, :, 2:, 0], padded[4, :, 2:, -1] = left[:, 0], right[:, 0].flip(1)
+    padded[5, :, 2:, 0], padded[5, :, 2:, -1] = down[:, :, 0], down[:, :, -1]
+    return padded
+
+
+@pytest.mark.shared
+def test_the_two_stitchings_differ_beside_up_and_down_only(golden):
+    faces = golden("units")["cubemap.faces_in"][0].double()
+    theirs, ours = (stitch_faces(faces, (64, 128), stitching=way) for way in ("official", "seamless"))
+    differ = (theirs - ours).abs().amax(dim=0) > 1e-12
+    assert 0 < int(differ.sum()) <= 96
+    along = face_of(pixel_directions(64, 128, dtype=torch.float64)) >= 4
+    grown = torch.nn.functional.max_pool2d(along[None].float(), 3, 1, 1)[0] > 0
+    assert not (differ & ~grown).any()
+
+
+@pytest.mark.shared
+def test_depth_along_an_axis_becomes_distance_by_the_originals_factor(golden):
+    ahead = Picture((32, 32), face_rotations()[0], 16.0).directions()[..., 2]
+    assert torch.allclose(1 / ahead, golden("units")["cubemap.depth_norm"].double(), rtol=0, atol=2e-7)
+
+
+@pytest.mark.parametrize("stitching", ["seamless", "official"])
+def test_stitching_face_by_face_adds_up_to_the_whole(stitching):
+    generator = torch.Generator().manual_seed(0)
+    faces = torch.randn(6, 2, 6, 6, generator=generator, dtype=torch.float64)
+    whole = stitch_faces(faces, (12, 24), stitching=stitching)
+    parts = torch.zeros_like(whole)
+    for face in range(6):
+        alone = torch.zeros_like(faces)
+        alone[face] = faces[face]
+        parts += stitch_faces(alone, (12, 24), stitching=stitching)
+    assert torch.allclose(parts, whole, rtol=0, atol=1e-14)
+
+
+def test_official_stitching_refuses_what_the_original_cannot_stitch(make_scene, pose):
+    scene = make_scene(3)
+    for options in ({"size": (6, 12)}, {"size": (8, 12)}, {"size": (8, 16), "layout": "equirect"}):
+        with pytest.raises(InputError, match="'official' needs layout='cubemap' and a 2:1 panorama"):
+            rasterize(scene, pose, **{"layout": "cubemap", "stitching": "official", **options})
+    with pytest.raises(ValueError, match="must be 2:1"):
+        stitch_faces(torch.zeros(6, 1, 4, 4), (8, 8), stitching="official")
+    with pytest.raises(ValueError, match="multiple of 4, got 6"):
+        stitch_faces(torch.zeros(6, 1, 4, 4), (6, 12), stitching="official")
+
+
+@pytest.mark.shared
+def test_face_rotations_equal_the_originals(golden):
+    expected = golden("units")["cubemap.rotations"]
     assert torch.allclose(face_rotations().float(), expected[:, :3, :3], atol=1e-6)
 
 
@@ -160,14 +236,15 @@ def test_stitching_reproduces_the_direction_of_every_pixel_across_edges_and_corn
     assert float((uv[..., 1] - (torch.arange(64) + 0.5)[:, None] / 64).abs().max()) < 0.005
 
 
-def test_stitching_is_the_adjoint_of_its_gradient():
+@pytest.mark.parametrize("stitching", ["seamless", "official"])
+def test_stitching_is_the_adjoint_of_its_gradient(stitching):
     generator = torch.Generator().manual_seed(0)
     faces = torch.randn(6, 3, 9, 9, generator=generator, dtype=torch.float64, requires_grad=True)
-    weights = torch.randn(3, 14, 28, generator=generator, dtype=torch.float64)
-    picture = stitch_faces(faces, (14, 28))
+    weights = torch.randn(3, 16, 32, generator=generator, dtype=torch.float64)
+    picture = stitch_faces(faces, (16, 32), stitching=stitching)
     (adjoint,) = torch.autograd.grad(picture, faces, weights)
     other = torch.randn(6, 3, 9, 9, generator=generator, dtype=torch.float64)
-    left, right = (stitch_faces(other, (14, 28)) * weights).sum(), (other * adjoint).sum()
+    left, right = (stitch_faces(other, (16, 32), stitching=stitching) * weights).sum(), (other * adjoint).sum()
     assert float((left - right).abs() / left.abs()) < 1e-12
 
 

@@ -1,0 +1,141 @@
+"""A panorama of six cube faces: sampled bilinearly, each face continued by its neighbours.
+
+Source: PanSplat, section 3.4; docs/rendering.md, section 6; OFFICIAL.md 10.2 and P9 for the original's way.
+"""
+
+import functools
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pansplat.geometry.cubemap import FACES, face_of, face_rotations, official_faces
+from pansplat.geometry.equirect import pixel_directions
+
+Stitching = Literal["seamless", "official"]
+
+_UP, _DOWN = FACES.index("up"), FACES.index("down")
+
+
+class _Lookup(NamedTuple):
+    """Where each panorama pixel looks in the padded faces.
+
+    Attributes:
+        border: the three face pixels whose mean stands at each padded pixel; 6 n n stands for zero.
+        corner: the upper left of the four padded pixels around each panorama pixel.
+        right, low: how far each panorama pixel lies from that one, 0 to 1.
+    """
+
+    border: Int[Tensor, "padded 3"]
+    corner: Int[Tensor, "pixel"]
+    right: Float[Tensor, "pixel"]
+    low: Float[Tensor, "pixel"]
+
+
+def stitch_faces(
+    faces: Float[Tensor, "face channel n n"], size: tuple[int, int], *, stitching: Stitching = "seamless"
+) -> Float[Tensor, "channel height width"]:
+    """A panorama of six cube faces. Linear in every face, so faces may also be stitched one by one and added.
+
+    Args:
+        faces: in the order of `FACES`.
+        size: height and width of the panorama, pixels.
+        stitching: "seamless" continues each face by its true neighbours; "official" keeps the original's wrong
+            borders left and right of up and down, and its outline of these faces.
+
+    Raises:
+        ValueError: "official" with a size that is not 2:1 with a height that is a multiple of 4.
+    """
+    num, channels = faces.shape[-1], faces.shape[1]
+    lookup = _Lookup(*(table.to(faces.device) for table in _lookup(num, size, stitching)))
+    flat = faces.permute(1, 0, 2, 3).reshape(channels, -1)
+    flat = torch.cat((flat, flat.new_zeros(channels, 1)), dim=1)
+    # Three pixels meet at a corner of the cube; everywhere else the three are one.
+    padded = flat[:, lookup.border].mean(dim=-1)
+    right, low = lookup.right.to(faces), lookup.low.to(faces)
+    panorama = (1 - low) * _between(padded, lookup.corner, right)
+    panorama = panorama + low * _between(padded, lookup.corner + (num + 2), right)
+    return panorama.reshape(channels, *size)
+
+
+def _between(padded: Float[Tensor, "channel padded"], left: Tensor, part: Tensor) -> Float[Tensor, "channel pixel"]:
+    return (1 - part) * padded[:, left] + part * padded[:, left + 1]
+
+
+@functools.lru_cache(maxsize=2)
+@torch.inference_mode(False)  # kept for calls that need gradients too
+def _lookup(num: int, size: tuple[int, int], stitching: Stitching) -> _Lookup:
+    rotations = face_rotations()
+    directions = pixel_directions(*size, dtype=torch.float64).reshape(-1, 3)
+    border = _border(num)
+    if stitching == "official":
+        if size[1] != 2 * size[0]:
+            raise ValueError(f"`size` must be 2:1 for the original's stitching, got {size}")
+        face = official_faces(size[0]).reshape(-1)
+        border = _official_border(border, num)
+    else:
+        face = face_of(directions)
+    local = (directions[:, None, :] @ rotations[face])[:, 0, :]
+    # Padded coordinates: pixel k of the face is at index k + 1. A direction of another face is held to the edge.
+    place = (local[:, :2] / local[:, 2:]).clamp(-1, 1)
+    x, y = ((place + 1) * (0.5 * num) + 0.5).unbind(1)
+    left, top = (t.floor().clamp(0, num) for t in (x, y))
+    corner = (face * (num + 2) + top.long()) * (num + 2) + left.long()
+    return _Lookup(border, corner.int(), x - left, y - top)
+
+
+def _border(num: int) -> Int[Tensor, "padded 3"]:
+    """The three face pixels (flat indices) whose mean stands at each pixel of the six padded faces."""
+    rotations = face_rotations()
+    index = torch.arange(-1, num + 1, dtype=torch.float64)
+    y, x = torch.meshgrid(index, index, indexing="ij")
+    inside = torch.stack((x.clamp(0, num - 1), y.clamp(0, num - 1)), dim=-1)
+    beyond_x, beyond_y = x != inside[..., 0], y != inside[..., 1]
+    own = torch.stack([_flat_index(torch.full_like(x, face), inside, num) for face in range(6)])
+    both = []
+    for beyond, axis, at in ((beyond_x, 0, x), (beyond_y, 1, y)):
+        # Step from the touching pixel to just over the edge, and ask which pixel of which face is there.
+        edge = (inside + 0.5) * (2 / num) - 1
+        edge[..., axis] = torch.where(beyond, torch.where(at < 0, -1.0, 1.0), edge[..., axis])
+        over = torch.cat((edge, torch.ones_like(x)[..., None]), dim=-1)
+        over[..., 2] = torch.where(beyond, 1 - 1e-6, 1.0)
+        world = over @ rotations.transpose(1, 2)[:, None]
+        both.append(_pixel_at(world, num))
+    first = torch.where(beyond_x, both[0], torch.where(beyond_y, both[1], own))
+    second = torch.where(beyond_y, both[1], torch.where(beyond_x, both[0], own))
+    third = torch.where(beyond_x & beyond_y, own, first)
+    return torch.stack((first, second, third), dim=-1).reshape(-1, 3)
+
+
+def _official_border(border: Int[Tensor, "padded 3"], num: int) -> Int[Tensor, "padded 3"]:
+    """The original's borders: those left and right of up and down are not what lies there.
+
+    Each is a row too low, with zero in the first; down's are its own outermost columns. Beyond a corner of a side
+    face stands the corner of up or down. (No pixel of the fixtures shows a corner.)
+    """
+    faces = border.reshape(6, num + 2, num + 2, 3).clone()
+    nothing = 6 * num * num
+    for face in range(4):
+        for row, neighbour in ((0, _UP), (-1, _DOWN)):
+            for column in (0, -1):
+                corner = faces[face, row, column]
+                faces[face, row, column] = corner[corner // (num * num) == neighbour][0]
+    for face in (_UP, _DOWN):
+        for column, own in ((0, 1), (-1, -2)):
+            beside = faces[face, 1:-1, column if face == _UP else own].clone()
+            faces[face, :2, column] = nothing
+            faces[face, 2:, column] = beside
+    return faces.reshape(-1, 3)
+
+
+def _pixel_at(directions: Float[Tensor, "*batch 3"], num: int) -> Int[Tensor, "*batch"]:
+    """Flat index of the face pixel that holds each direction."""
+    face = face_of(directions)
+    local = (directions[..., None, :] @ face_rotations()[face])[..., 0, :]
+    pixel = ((local[..., :2] / local[..., 2:] + 1) * (0.5 * num)).floor().clamp(0, num - 1)
+    return _flat_index(face, pixel, num)
+
+
+def _flat_index(face: Tensor, pixel: Float[Tensor, "*batch 2"], num: int) -> Int[Tensor, "*batch"]:
+    return ((face * num + pixel[..., 1]) * num + pixel[..., 0]).long()
