@@ -1,0 +1,153 @@
+"""What a tile needs before it is drawn: its pixels, and its Gaussians' forms relative to its middle.
+
+Forms are kept by columns (`FORMS` x `CHUNK`), for a chunk of Gaussians that fits the first cache: the set-up then works
+on eight Gaussians at once, and drawing spreads one number over eight pixels.
+"""
+
+import math
+
+import numpy as np
+
+from pansplat.render.cpu.compiling import inlined
+from pansplat.render.cpu.records import FIELDS, TILE
+from pansplat.render.cpu.simd import LANES, fill, load, multiply_add, prefetch, store, transposed
+from pansplat.render.cpu.tables import FLAT, PANORAMA
+
+BLOCK_WIDTH = 4
+BLOCK_HEIGHT = LANES // BLOCK_WIDTH
+ACROSS = TILE // BLOCK_WIDTH
+BLOCKS = TILE * TILE // LANES
+PIXELS = TILE * TILE
+CHUNK = 256  # Gaussians
+_AHEAD = 16  # Gaussians, between asking for a record and reading it
+
+# Rows of the forms: A = (x, y, z, 1).(A_X .. A_ONE) with a pixel's offset (x, y, z) from the tile's middle; B, L alike.
+A_X, A_ONE = 0, 3
+B_X, B_ONE = 4, 7
+L_X, L_ONE = 8, 11
+FRONTS = 12  # front_a, front_b
+ALONG_ROW, LEVEL_ROW = 14, 15
+MIDDLE = 16  # the Gaussian's point relative to the tile's middle: x, y, z
+FORMS = 19
+
+CUT = math.log2(1 / 255)  # of alpha
+MOST = 0.99
+CLOSED = 1e-6
+"""A pixel takes nothing more once its transmittance is at or below this."""
+
+
+@inlined
+def point_of(kind, columns, rows, rotation, x, y):  # type: ignore[no-untyped-def]
+    """The point of pixel (x, y) that Gaussians are measured against: a unit direction, or the pixel's centre."""
+    if kind == PANORAMA:
+        cosine = rows[y, 1]
+        return cosine * columns[x, 0], rows[y, 0], cosine * columns[x, 1]
+    right, down = columns[x, 0], rows[y, 0]
+    if kind == FLAT:
+        return right, down, 0.0
+    scale = 1 / math.sqrt(right * right + down * down + 1)
+    right, down = right * scale, down * scale
+    return (
+        rotation[0, 0] * right + rotation[0, 1] * down + rotation[0, 2] * scale,
+        rotation[1, 0] * right + rotation[1, 1] * down + rotation[1, 2] * scale,
+        rotation[2, 0] * right + rotation[2, 1] * down + rotation[2, 2] * scale,
+    )
+
+
+@inlined
+def place_tile(kind, columns, rows, rotation, left, top, offsets, middle, through):  # type: ignore[no-untyped-def]
+    """Fill in the tile's pixels, block by block, and its middle; pixels off the picture start out closed.
+
+    Args:
+        kind, columns, rows, rotation: of the picture's Plane.
+        left, top: pixel of the tile's corner.
+        offsets: (3 PIXELS), written: x, y, z from the middle.
+        middle: (6), written: the middle, rounded, and the rest.
+        through: (PIXELS), written: transmittances before anything is drawn.
+    """
+    width, height = len(columns), len(rows)
+    centre_x, centre_y = min(left + TILE // 2, width - 1), min(top + TILE // 2, height - 1)
+    k = point_of(kind, columns, rows, rotation, centre_x, centre_y)
+    for axis in range(3):
+        middle[axis] = np.float32(k[axis])
+        middle[3 + axis] = np.float32(k[axis] - np.float64(middle[axis]))
+    for pixel in range(PIXELS):
+        block, lane = pixel // LANES, pixel % LANES
+        x = left + (block % ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH
+        y = top + (block // ACROSS) * BLOCK_HEIGHT + lane // BLOCK_WIDTH
+        through[pixel] = np.float32(1 if x < width and y < height else 0)
+        point = point_of(kind, columns, rows, rotation, min(x, width - 1), min(y, height - 1))
+        offsets[pixel] = np.float32(point[0] - k[0])
+        offsets[PIXELS + pixel] = np.float32(point[1] - k[1])
+        offsets[2 * PIXELS + pixel] = np.float32(point[2] - k[2])
+
+
+@inlined
+def gather(records, entries, first, count, middle, exact, forms):  # type: ignore[no-untyped-def]
+    """Fill in the forms of `count` Gaussians of a tile, beginning with entry `first`.
+
+    Args:
+        records, entries: flat.
+        middle: the tile's.
+        exact: float32 1, or 0 for the classic kernel, whose L is 1.
+        forms: (FORMS CHUNK), written; past `count` the last Gaussian is repeated.
+    """
+    last = first + count - 1
+    for at in range(0, count, LANES):
+        e = first + at
+        for ahead in range(e + _AHEAD, e + _AHEAD + LANES):
+            prefetch(records, FIELDS * entries[2 * min(ahead, last)])
+        r0 = FIELDS * entries[2 * e]
+        r1 = FIELDS * entries[2 * min(e + 1, last)]
+        r2 = FIELDS * entries[2 * min(e + 2, last)]
+        r3 = FIELDS * entries[2 * min(e + 3, last)]
+        r4 = FIELDS * entries[2 * min(e + 4, last)]
+        r5 = FIELDS * entries[2 * min(e + 5, last)]
+        r6 = FIELDS * entries[2 * min(e + 6, last)]
+        r7 = FIELDS * entries[2 * min(e + 7, last)]
+        n_x, n_y, n_z, rest_x, rest_y, rest_z, a_x, a_y = transposed(
+            load(records, r0),
+            load(records, r1),
+            load(records, r2),
+            load(records, r3),
+            load(records, r4),
+            load(records, r5),
+            load(records, r6),
+            load(records, r7),
+        )
+        a_z, b_x, b_y, b_z, front_a, front_b, along, level = transposed(
+            load(records, r0 + 8),
+            load(records, r1 + 8),
+            load(records, r2 + 8),
+            load(records, r3 + 8),
+            load(records, r4 + 8),
+            load(records, r5 + 8),
+            load(records, r6 + 8),
+            load(records, r7 + 8),
+        )
+        m_x = (n_x - fill(middle[0])) + (rest_x - fill(middle[3]))
+        m_y = (n_y - fill(middle[1])) + (rest_y - fill(middle[4]))
+        m_z = (n_z - fill(middle[2])) + (rest_z - fill(middle[5]))
+        on = fill(exact)
+        l_x = on * multiply_add(front_a, a_x, multiply_add(front_b, b_x, n_x))
+        l_y = on * multiply_add(front_a, a_y, multiply_add(front_b, b_y, n_y))
+        l_z = on * multiply_add(front_a, a_z, multiply_add(front_b, b_z, n_z))
+        _store_form(forms, A_X * CHUNK + at, a_x, a_y, a_z, m_x, m_y, m_z, fill(np.float32(0)))
+        _store_form(forms, B_X * CHUNK + at, b_x, b_y, b_z, m_x, m_y, m_z, fill(np.float32(0)))
+        _store_form(forms, L_X * CHUNK + at, l_x, l_y, l_z, m_x, m_y, m_z, fill(np.float32(1)))
+        store(forms, FRONTS * CHUNK + at, front_a)
+        store(forms, (FRONTS + 1) * CHUNK + at, front_b)
+        store(forms, ALONG_ROW * CHUNK + at, along)
+        store(forms, LEVEL_ROW * CHUNK + at, level)
+        store(forms, MIDDLE * CHUNK + at, m_x)
+        store(forms, (MIDDLE + 1) * CHUNK + at, m_y)
+        store(forms, (MIDDLE + 2) * CHUNK + at, m_z)
+
+
+@inlined
+def _store_form(forms, at, x, y, z, m_x, m_y, m_z, constant):  # type: ignore[no-untyped-def]
+    product = multiply_add(x, m_x, multiply_add(y, m_y, z * m_z))
+    store(forms, at, x)
+    store(forms, at + CHUNK, y)
+    store(forms, at + 2 * CHUNK, z)
+    store(forms, at + 3 * CHUNK, constant - product)
