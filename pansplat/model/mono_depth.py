@@ -1,0 +1,189 @@
+"""UniFuse: what a single panorama tells of depth, as features for the cost volume. Frozen, always in eval mode.
+
+A panorama goes through one ResNet-18, its six cube faces through another; at five scales the faces' features are
+laid onto the panorama and fused, and a decoder brings the fused features up to 256x512, whatever the input's size.
+
+`compat`: "official" pads rows with zeros and resizes the input without knowing that its ends meet; "fixed"
+continues panoramas over seam and poles in the panorama's encoder and decoder and in the resizing. In both, the
+faces keep their zero padding, and the way from faces to panorama its border of whole rows: the weights learnt them.
+
+Source: Jiang et al., UniFuse, https://arxiv.org/abs/2102.03550; OFFICIAL.md, sections 2.4 and 5.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import elu, interpolate, max_pool2d, relu
+
+from pansplat.geometry import wrap
+from pansplat.geometry.cube_strip import equirect_from_strip, strip_from_equirect, strip_lookup
+from pansplat.geometry.wrap import Border
+from pansplat.model.feature_pyramid import normalize
+from pansplat.model.layers import Compat, PanoramaConv2d, border_of, resize
+
+HEIGHT, FACE_SIZE = 512, 256  # of what the encoders see
+SCALES = (5, 4, 3, 2, 1)  # coarse to fine: 1/32 to 1/2 of the panorama
+FEATURE_CHANNELS = 32
+_ENCODED = {5: 512, 4: 256, 3: 128, 2: 64, 1: 64}  # channels of either encoder
+_DECODED = {5: 256, 4: 128, 3: 64, 2: 32}  # channels after a scale's step up
+
+
+class MonocularDepth(nn.Module):
+    """Features of 1/2 scale for the cost volume, and the depth the network was made for."""
+
+    def __init__(self, compat: Compat = "official") -> None:
+        super().__init__()
+        self.compat: Compat = compat
+        self.panorama_encoder = ResNet18(border_of(compat))
+        self.face_encoder = ResNet18("zeros")
+        self.decoder = Decoder(border_of(compat))
+        self.register_buffer("max_depth", torch.tensor(10.0))
+        self.requires_grad_(False)
+        self.eval()
+
+    def train(self, mode: bool = True) -> MonocularDepth:
+        """Stays in eval mode: the network is frozen."""
+        return super().train(False)
+
+    @torch.no_grad()
+    def forward(self, images: Float[Tensor, "batch view 3 height width"]) -> Float[Tensor, "batch view 32 256 512"]:
+        """Features of panoramas of any size, RGB in [0, 1]."""
+        panoramas, strips = self.prepare(images.flatten(0, 1))
+        from_panorama = self.panorama_encoder(normalize(panoramas))
+        faces = strips.unflatten(-1, (6, FACE_SIZE)).permute(0, 3, 1, 2, 4).flatten(0, 1)
+        from_faces = self.face_encoder(normalize(faces))
+        laid = {scale: self._lay(from_faces[scale], scale) for scale in SCALES}
+        return self.decoder(from_panorama, laid).unflatten(0, images.shape[:2])
+
+    @torch.no_grad()
+    def depth(self, features: Float[Tensor, "batch view 32 256 512"]) -> Float[Tensor, "batch view 512 1024"]:
+        """Radial depth in metres of what `forward` gave; PanSplat does not use it."""
+        logits = self.decoder.head(features.flatten(0, 1))
+        return (self.max_depth * logits.sigmoid()).squeeze(1).unflatten(0, features.shape[:2])
+
+    def prepare(
+        self, images: Float[Tensor, "batch 3 height width"]
+    ) -> tuple[Float[Tensor, "batch 3 512 1024"], Float[Tensor, "batch 3 256 1536"]]:
+        """What the two encoders see: panoramas, by way of half their size as in training, and strips of six faces."""
+        half = resize(images, (HEIGHT // 2, HEIGHT), self.compat)
+        panoramas = resize(half, (HEIGHT, 2 * HEIGHT), self.compat)
+        strips = torch.stack([strip_from_equirect(panorama, FACE_SIZE) for panorama in panoramas])
+        return panoramas, strips
+
+    @staticmethod
+    def _lay(faces: Float[Tensor, "faces channel n n"], scale: int) -> Float[Tensor, "batch channel h w"]:
+        """Six faces' features, laid onto the panorama."""
+        strip = faces.unflatten(0, (-1, 6)).permute(0, 2, 3, 1, 4).flatten(-2)
+        return equirect_from_strip(strip, lookup(scale))
+
+
+@functools.cache
+def lookup(scale: int) -> Float[Tensor, "height width 3"]:
+    """Where the panorama of a scale finds itself on the six faces; not a weight, though the original stores it."""
+    return strip_lookup(HEIGHT >> scale)
+
+
+class ResNet18(nn.Module):
+    """The features of a ResNet-18 at 1/2, 1/4, ... 1/32.
+
+    Source: He et al., https://arxiv.org/abs/1512.03385.
+    """
+
+    def __init__(self, border: Border) -> None:
+        super().__init__()
+        self.border: Border = border
+        self.stem = PanoramaConv2d(3, 64, 7, stride=2, bias=False, border=border)
+        self.stem_norm = nn.BatchNorm2d(64)
+        channels = (64, 64, 128, 256, 512)
+        self.stages = nn.ModuleList(
+            nn.Sequential(
+                ResidualBlock(channels[i], channels[i + 1], stride=1 if i == 0 else 2, border=border),
+                ResidualBlock(channels[i + 1], channels[i + 1], stride=1, border=border),
+            )
+            for i in range(4)
+        )
+
+    def forward(self, x: Float[Tensor, "batch 3 height width"]) -> dict[int, Tensor]:
+        features = {1: relu(self.stem_norm(self.stem(x)))}
+        x = max_pool2d(wrap.pad(features[1], 1, self.border), 3, stride=2)
+        for scale, stage in enumerate(self.stages, start=2):
+            x = features[scale] = stage(x)
+        return features
+
+
+class ResidualBlock(nn.Module):
+    """relu(x + conv(relu(conv(x)))), each convolution normalised over the batch."""
+
+    def __init__(self, inputs: int, outputs: int, *, stride: int, border: Border) -> None:
+        super().__init__()
+        self.conv1 = PanoramaConv2d(inputs, outputs, 3, stride=stride, bias=False, border=border)
+        self.norm1 = nn.BatchNorm2d(outputs)
+        self.conv2 = PanoramaConv2d(outputs, outputs, 3, bias=False, border=border)
+        self.norm2 = nn.BatchNorm2d(outputs)
+        self.shortcut = nn.Identity()
+        if stride > 1:
+            narrow = nn.Conv2d(inputs, outputs, 1, stride=stride, bias=False)
+            self.shortcut = nn.Sequential(narrow, nn.BatchNorm2d(outputs))
+
+    def forward(self, x: Float[Tensor, "batch c height width"]) -> Float[Tensor, "batch d h w"]:
+        y = relu(self.norm1(self.conv1(x)))
+        return relu(self.shortcut(x) + self.norm2(self.conv2(y)))
+
+
+class Fusion(nn.Module):
+    """The faces' features, corrected by what both show, joined to the panorama's.
+
+    Source: UniFuse, section III-B ("CEE", without squeeze and excitation).
+    """
+
+    def __init__(self, channels: int, border: Border) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(2 * channels, channels, 1, bias=False)
+        self.norm1 = nn.BatchNorm2d(channels)
+        self.conv2 = PanoramaConv2d(channels, channels, 3, bias=False, border=border)
+        self.norm2 = nn.BatchNorm2d(channels)
+        self.join = nn.Conv2d(2 * channels, channels, 1, bias=False)
+
+    def forward(
+        self, panorama: Float[Tensor, "batch c height width"], faces: Float[Tensor, "batch c height width"]
+    ) -> Float[Tensor, "batch c height width"]:
+        both = torch.cat((panorama, faces), dim=1)
+        correction = self.norm2(self.conv2(relu(self.norm1(self.conv1(both)))))
+        return relu(self.join(torch.cat((panorama, faces + correction), dim=1)))
+
+
+class Decoder(nn.Module):
+    """Fused features from 1/32 up to 1/2; `head` goes on to depth at full size."""
+
+    def __init__(self, border: Border) -> None:
+        super().__init__()
+        self.fuse = nn.ModuleDict({str(s): Fusion(_ENCODED[s], border) for s in SCALES})
+        self.up = nn.ModuleDict()
+        self.merge = nn.ModuleDict()
+        width = _ENCODED[5]
+        for scale in SCALES[:-1]:
+            self.up[str(scale)] = PanoramaConv2d(width, _DECODED[scale], 3, border=border)
+            joined = _DECODED[scale] + _ENCODED[scale - 1]
+            width = FEATURE_CHANNELS if scale == 2 else _ENCODED[scale - 1]
+            self.merge[str(scale - 1)] = PanoramaConv2d(joined, width, 3, border=border)
+        self.head = nn.Sequential(
+            PanoramaConv2d(FEATURE_CHANNELS, 16, 3, border=border),
+            nn.ELU(),
+            nn.Upsample(scale_factor=2),
+            PanoramaConv2d(16, 16, 3, border=border),
+            nn.ELU(),
+            PanoramaConv2d(16, 1, 3, border=border),
+        )
+
+    def forward(self, from_panorama: dict[int, Tensor], from_faces: dict[int, Tensor]) -> Float[Tensor, "batch 32 h w"]:
+        x = self.fuse["5"](from_panorama[5], from_faces[5])
+        for scale in SCALES[:-1]:
+            fine = scale - 1
+            x = interpolate(elu(self.up[str(scale)](x)), scale_factor=2)
+            fused = self.fuse[str(fine)](from_panorama[fine], from_faces[fine])
+            x = elu(self.merge[str(fine)](torch.cat((x, fused), dim=1)))
+        return x
