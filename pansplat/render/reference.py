@@ -36,7 +36,7 @@ def draw(
     options: Options,
 ) -> Drawn:
     """Draw by torch operations; see `pansplat.render.backend.Draw`."""
-    keep, dropped, close = _drawable(gaussians, covariances, pose.detach(), options)
+    keep, dropped, close = drawable(gaussians, covariances, pose.detach(), options)
     if not bool(keep.all()):
         gaussians = gaussians.select(keep)
         covariances = None if covariances is None else covariances[keep]
@@ -54,7 +54,7 @@ def draw(
 
 
 @torch.no_grad()
-def _drawable(
+def drawable(
     gaussians: Gaussians, covariances: Tensor | None, pose: Tensor, options: Options
 ) -> tuple[Bool[Tensor, "n"], int, int]:
     """The Gaussians worth observing, and how many were dropped and how many were too near.
@@ -84,8 +84,8 @@ def _picture(
         ahead = z > EWA_NEAR * options.near
         observed, z = Observed(*(field[ahead] for field in observed)), z[ahead]
     key = observed.radius.detach() if options.order == "radial" or picture.is_panorama else z
-    splats, boxes = _project(observed, picture, options)
-    seen = torch.nonzero(_in_picture(boxes, picture))[:, 0]
+    splats, boxes = project(observed, picture, options)
+    seen = torch.nonzero(in_picture(boxes, picture))[:, 0]
     if len(seen) < len(boxes):
         splats, boxes, key = Splats(*(field[seen] for field in splats)), boxes[seen], key[seen]
     pixels = _tile_pixels(picture, options.kernel, observed.peak.dtype)
@@ -100,14 +100,14 @@ def _picture(
     return sums[:, : picture.size[0], : picture.size[1]], len(seen), entries
 
 
-def _in_picture(boxes: Float[Tensor, "n 4"], picture: Picture) -> Bool[Tensor, "n"]:
+def in_picture(boxes: Float[Tensor, "n 4"], picture: Picture) -> Bool[Tensor, "n"]:
     """Which boxes reach into the picture."""
     left, right, top, bottom = boxes.unbind(1)
     inside = (left <= right) & (bottom > 0) & (top < picture.size[0])
     return inside if picture.is_panorama else inside & (right > 0) & (left < picture.size[1])
 
 
-def _project(observed: Observed, picture: Picture, options: Options) -> tuple[Splats, Float[Tensor, "n 4"]]:
+def project(observed: Observed, picture: Picture, options: Options) -> tuple[Splats, Float[Tensor, "n 4"]]:
     """The Gaussians on a picture, and the boxes they can be seen in."""
     if options.kernel == "ewa":
         splats, variances = ewa_splats(observed, picture.rotation, picture.size, picture.focal, options.dilation)

@@ -27,9 +27,9 @@ class TileLists:
     starts: Int[Tensor, "t"]
 
 
-def tile_grid(height: int, width: int) -> tuple[int, int]:
+def tile_grid(height: int, width: int, tile: int = TILE) -> tuple[int, int]:
     """Number of rows and columns of tiles that cover a picture."""
-    return -(-height // TILE), -(-width // TILE)
+    return -(-height // tile), -(-width // tile)
 
 
 def list_tiles(
@@ -49,14 +49,14 @@ def list_tiles(
         wraps: whether column `width` is column 0 again.
     """
     rows, columns = tile_grid(*size)
-    ranges = _tile_ranges(boxes[order], size, wraps)
+    ranges = tile_ranges(boxes[order], size, wraps)
     seen = torch.nonzero((ranges[:, 1] > 0) & (ranges[:, 3] > 0))[:, 0]
     order, (first_column, num_columns, first_row, num_rows) = order[seen], ranges[seen].unbind(1)
     # Entries in each row of tiles, by differences at the boxes' ends.
     change = torch.zeros(rows + 1, dtype=torch.int64, device=boxes.device)
     change.index_add_(0, first_row, num_columns)
     change.index_add_(0, first_row + num_rows, -num_columns)
-    for low, high in _bands(change.cumsum(0)[:rows].tolist(), limit):
+    for low, high in bands(change.cumsum(0)[:rows].tolist(), limit):
         top = first_row.clamp_min(low)
         count = (torch.minimum(first_row + num_rows, torch.as_tensor(high)) - top).clamp_min(0) * num_columns
         inside = torch.repeat_interleave(torch.arange(len(order), device=boxes.device), count)
@@ -70,22 +70,24 @@ def list_tiles(
         yield TileLists((low * columns, high * columns), order[inside[place]], starts)
 
 
-def _tile_ranges(boxes: Float[Tensor, "n 4"], size: tuple[int, int], wraps: bool) -> Int[Tensor, "n 4"]:
+def tile_ranges(
+    boxes: Float[Tensor, "n 4"], size: tuple[int, int], wraps: bool, tile: int = TILE
+) -> Int[Tensor, "n 4"]:
     """First column, number of columns, first row, number of rows of the tiles that each box touches."""
     height, width = size
-    columns = tile_grid(height, width)[1]
+    columns = tile_grid(height, width, tile)[1]
     left, right, top, bottom = boxes.unbind(1)
     hidden = (left > right) | (top > bottom)
     # Pixels whose centres lie inside; limited as floats, before the cast can overflow.
     first_x, first_y = (torch.ceil(edge - 0.5 - _MARGIN) for edge in (left, top))
     last_x, last_y = (torch.floor(edge - 0.5 + _MARGIN) for edge in (right, bottom))
     hidden |= (first_y > height - 1) | (last_y < 0) | (last_y < first_y) | (last_x < first_x)
-    first_y, last_y = first_y.clamp(0, height - 1).long() // TILE, last_y.clamp(0, height - 1).long() // TILE
+    first_y, last_y = first_y.clamp(0, height - 1).long() // tile, last_y.clamp(0, height - 1).long() // tile
     if wraps:
         everywhere = last_x - first_x >= width - 1
         start = torch.remainder(first_x, width).long().clamp(0, width - 1)
         end = torch.remainder(last_x, width).long().clamp(0, width - 1)
-        first_x, last_x = start // TILE, end // TILE
+        first_x, last_x = start // tile, end // tile
         wrapped = end < start
         num_x = torch.where(wrapped, columns - first_x + last_x + 1, last_x - first_x + 1)
         everywhere |= num_x >= columns
@@ -93,13 +95,13 @@ def _tile_ranges(boxes: Float[Tensor, "n 4"], size: tuple[int, int], wraps: bool
         num_x = torch.where(everywhere, columns, num_x)
     else:
         hidden |= (first_x > width - 1) | (last_x < 0)
-        first_x = first_x.clamp(0, width - 1).long() // TILE
-        num_x = last_x.clamp(0, width - 1).long() // TILE - first_x + 1
+        first_x = first_x.clamp(0, width - 1).long() // tile
+        num_x = last_x.clamp(0, width - 1).long() // tile - first_x + 1
     ranges = torch.stack((first_x, num_x, first_y, last_y - first_y + 1), dim=1)
     return torch.where(hidden[:, None], torch.zeros_like(ranges), ranges)
 
 
-def _bands(per_row: list[int], limit: int) -> Iterator[tuple[int, int]]:
+def bands(per_row: list[int], limit: int) -> Iterator[tuple[int, int]]:
     """Split rows into runs whose entries sum to at most `limit` (a single row may hold more)."""
     low, total = 0, 0
     for row, count in enumerate(per_row):

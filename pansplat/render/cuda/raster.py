@@ -1,0 +1,134 @@
+"""Compositing of tiles, front to back: the Triton kernel and its launch.
+
+Source: docs/rendering.md, section 4.
+"""
+
+from typing import no_type_check
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pansplat.render.cuda.layout import TILE, Layout
+from pansplat.render.cuda.lists import TileLists
+from pansplat.render.cuda.pixels import TilePixels
+from pansplat.render.cuda.response import (
+    PIXELS,
+    SATURATED,
+    SIDE,
+    STEP,
+    fall_off,
+    form_values,
+    limit,
+    load_numbers,
+    load_rows,
+)
+from pansplat.render.tiles import tile_grid
+
+
+@triton.jit
+@no_type_check
+def raster_kernel(
+    records,
+    entries,
+    starts,
+    busiest,
+    centres,
+    offsets,
+    sums,
+    stops,
+    first_tile,
+    columns,
+    tiles,
+    height,
+    width,
+    TINY: tl.constexpr,
+    CHANNELS: tl.constexpr,
+    EXACT: tl.constexpr,
+):
+    """One program a tile: sums of weight x (channels, distance, 1), and the entry at which it stopped."""
+    AXES: tl.constexpr = 3 if EXACT else 2
+    ROW: tl.constexpr = (17 if EXACT else 9) + CHANNELS + 1
+    PEAK: tl.constexpr = 16 if EXACT else 8
+    local = tl.load(busiest + tl.program_id(0)).to(tl.int64)
+    tile = first_tile + local
+    pixel = tl.arange(0, PIXELS)
+    centre = load_numbers(centres + tile * 2 * AXES, 2 * AXES)
+    offset = load_rows(offsets + tile * AXES * PIXELS, PIXELS, pixel, AXES)
+    through = tl.full([PIXELS], 1, records.dtype.element_ty)
+    totals = ()
+    for _ in tl.static_range(CHANNELS + 2):
+        totals = totals + (tl.zeros([PIXELS], records.dtype.element_ty),)
+    entry = tl.load(starts + local)
+    end = tl.load(starts + local + 1)
+    while (entry < end) & (tl.max(through, axis=0) > SATURATED):
+        step_end = tl.minimum(entry + STEP, end)
+        for at in range(entry, step_end):
+            record = load_numbers(records + tl.load(entries + at).to(tl.int64) * ROW, ROW)
+            delta, forms = form_values(record, centre, offset, EXACT)
+            falloff, spread, ahead, divisor = fall_off(record, forms, TINY, EXACT)
+            weight = limit(record[PEAK] * falloff)
+            weight, through = weight * through, through - weight * through
+            added = ()
+            for c in tl.static_range(CHANNELS + 1):
+                added = added + (totals[c] + weight * record[PEAK + 1 + c],)
+            totals = added + (totals[CHANNELS + 1] + weight,)
+        entry = step_end
+    tl.store(stops + local, entry)
+    in_picture = tile % tiles
+    y = in_picture // columns * SIDE + pixel // SIDE
+    x = in_picture % columns * SIDE + pixel % SIDE
+    plane = height.to(tl.int64) * width
+    place = tile // tiles * (CHANNELS + 2) * plane + y.to(tl.int64) * width + x
+    for c in tl.static_range(CHANNELS + 2):
+        tl.store(sums + place + c * plane, totals[c], mask=(y < height) & (x < width))
+
+
+def raster(
+    records: Float[Tensor, "n record"],
+    lists: TileLists,
+    pixels: TilePixels,
+    sums: Float[Tensor, "picture sums height width"],
+    layout: Layout,
+) -> Int[Tensor, "tile"]:
+    """Draw the tiles of `lists` into `sums`, and tell at which entry each tile stopped.
+
+    Args:
+        records: see `layout`.
+        lists: of some rows of tiles.
+        pixels: of all pictures.
+        sums: of all pictures; the tiles' pixels are overwritten.
+        layout: of the records.
+    """
+    tiles = len(lists.starts) - 1
+    stops = torch.empty(tiles, dtype=torch.int32, device=records.device)
+    raster_kernel[(tiles,)](
+        records, lists.entries, lists.starts, busiest_first(lists), pixels.centres, pixels.offsets, sums, stops,
+        *place(lists, sums), TINY=tiny(records), CHANNELS=layout.channels, EXACT=layout.exact,
+        num_warps=num_warps(layout, 2),
+    )  # fmt: skip
+    return stops
+
+
+def busiest_first(lists: TileLists) -> Int[Tensor, "tile"]:
+    """The tiles by falling number of entries: the longest must not start last."""
+    return torch.argsort(lists.starts.diff(), descending=True, stable=True).int()
+
+
+def place(lists: TileLists, sums: Float[Tensor, "picture sums height width"]) -> tuple[int, int, int, int, int]:
+    """Number of the lists' first tile, columns of tiles, tiles a picture, height, width."""
+    height, width = sums.shape[2:]
+    rows, columns = tile_grid(height, width, TILE)
+    return lists.rows[0] * columns, columns, rows * columns, height, width
+
+
+def tiny(records: Float[Tensor, "n record"]) -> float:
+    """Least value of L that counts as such."""
+    return torch.finfo(records.dtype).eps ** 0.5
+
+
+def num_warps(layout: Layout, usual: int) -> int:
+    """Warps a tile: with more channels fewer pixels a thread, so that all sums stay in registers."""
+    return usual if layout.channels <= 4 else 4 if layout.channels <= 12 else 8
