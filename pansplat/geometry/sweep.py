@@ -13,6 +13,7 @@ Source: PanSplat, section 3.2; OFFICIAL.md, section 6.
 """
 
 import math
+from collections.abc import Iterator
 from typing import Literal
 
 import torch
@@ -20,14 +21,16 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from pansplat.geometry import correlation_kernel as kernel
 from pansplat.geometry import wrap
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import invert_pose
 
 Sampling = Literal["sphere", "corners"]
+Backend = Literal["auto", "torch", "kernel"]
 
 _CHUNK = 1 << 22
-"""Numbers in the warped features that exist at a time."""
+"""Numbers in the warped features, or in the positions, that exist at a time."""
 
 
 def relative_pose(
@@ -75,7 +78,8 @@ def _sphere_positions(points: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
 def _corner_positions(points: Tensor) -> tuple[Tensor, Tensor]:
     """The original's; a sine that rounds above one is cut, where the original has NaN."""
     height, width = points.shape[-2:]
-    x, y, z = points / points.norm(dim=0).clamp(min=1e-3)
+    x, y, z = points
+    y = y / (x * x + y * y + z * z).sqrt().clamp(min=1e-3)
     u = torch.atan2(x, z) / (2 * math.pi) + 0.5
     v = torch.asin(y.clamp(-1, 1)) / math.pi + 0.5
     return u * (width - 1), v * (height - 1)
@@ -120,26 +124,40 @@ def correlate(
     inverse_depth: Float[Tensor, "pair candidate height width"],
     pose: Float[Tensor, "pair 4 4"],
     sampling: Sampling = "sphere",
+    backend: Backend = "auto",
 ) -> Float[Tensor, "pair candidate height width"]:
     """Dot products of each pixel's features with the other panorama's, for each candidate, over sqrt(channel).
 
     The warped features of all candidates never exist at once, neither forward nor backward. Half-precision features
     are multiplied in float32. Gradient flows to both features.
+
+    Args:
+        reference: features at the pixels.
+        other: features that are sampled, of the same size.
+        inverse_depth: candidates of each pixel, 1 / metres.
+        pose: from reference camera axes to the other's.
+        sampling: see above.
+        backend: "kernel" runs on the CPU only, "torch" anywhere; "auto" takes the faster.
     """
-    return _Correlation.apply(reference, other, inverse_depth.detach(), pose.detach(), sampling)
+    if backend == "auto":
+        backend = "kernel" if reference.device.type == "cpu" else "torch"
+    method = _ByKernel if backend == "kernel" else _ByWarping
+    dtype = torch.promote_types(reference.dtype, torch.float32)
+    # Scaled before the product, so that no sum grows larger than the result.
+    scaled = reference.to(dtype) / math.sqrt(reference.shape[1])
+    return method.apply(scaled, other.to(dtype), inverse_depth.detach().to(dtype), pose.detach(), sampling)
 
 
-class _Correlation(torch.autograd.Function):
-    """Computes chunk by chunk, and again in the backward pass."""
+class _ByWarping(torch.autograd.Function):
+    """Warps a few candidates at a time, and again in the backward pass."""
 
     @staticmethod
     def forward(ctx, reference, other, inverse_depth, pose, sampling):
         ctx.save_for_backward(reference, other, inverse_depth, pose)
         ctx.sampling = sampling
-        scaled, other = _scaled(reference), _widened(other)
         parts = [
-            torch.einsum("nchw,ncdhw->ndhw", scaled, warp_panorama(other, chunk, pose, sampling))
-            for chunk in _chunks(inverse_depth, reference)
+            torch.einsum("nchw,ncdhw->ndhw", reference, warp_panorama(other, chunk, pose, sampling))
+            for chunk in _chunks(inverse_depth, reference.numel())
         ]
         return torch.cat(parts, dim=1)
 
@@ -147,31 +165,52 @@ class _Correlation(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):
         reference, other, inverse_depth, pose = ctx.saved_tensors
-        scaled, widened = _scaled(reference), _widened(other)
-        to_reference, to_other = torch.zeros_like(scaled), torch.zeros_like(widened)
-        start = 0
-        for chunk in _chunks(inverse_depth, reference):
-            part = gradient[:, start : start + chunk.shape[1]]
-            start += chunk.shape[1]
+        to_reference, to_other = torch.zeros_like(reference), torch.zeros_like(other)
+        chunks = _chunks(inverse_depth, reference.numel())
+        for chunk, part in zip(chunks, gradient.split([c.shape[1] for c in chunks], dim=1), strict=True):
             with torch.enable_grad():
-                leaf = widened.detach().requires_grad_()
+                leaf = other.detach().requires_grad_()
                 warped = warp_panorama(leaf, chunk, pose, ctx.sampling)
             to_reference += torch.einsum("ndhw,ncdhw->nchw", part, warped.detach())
-            (step,) = torch.autograd.grad(warped, leaf, part[:, None] * scaled[:, :, None])
-            to_other += step
-        to_reference /= math.sqrt(reference.shape[1])
-        return to_reference.to(reference.dtype), to_other.to(other.dtype), None, None, None
+            to_other += torch.autograd.grad(warped, leaf, part[:, None] * reference[:, :, None])[0]
+        return to_reference, to_other, None, None, None
 
 
-def _widened(features: Tensor) -> Tensor:
-    return features.to(torch.promote_types(features.dtype, torch.float32))
+class _ByKernel(torch.autograd.Function):
+    """Loops over pixels in compiled code; warps nothing."""
+
+    @staticmethod
+    def forward(ctx, reference, other, inverse_depth, pose, sampling):
+        ctx.save_for_backward(reference, other, inverse_depth, pose)
+        ctx.sampling = sampling
+        parts = [
+            kernel.correlate_positions(reference, other, *place, wraps=sampling == "sphere")
+            for _, place in _placed(inverse_depth, pose, sampling)
+        ]
+        return torch.cat(parts, dim=1)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient):
+        reference, other, inverse_depth, pose = ctx.saved_tensors
+        to_reference, to_other = torch.zeros_like(reference), torch.zeros_like(other)
+        for candidates, place in _placed(inverse_depth, pose, ctx.sampling):
+            steps = kernel.correlate_positions_backward(
+                gradient[:, candidates], reference, other, *place, wraps=ctx.sampling == "sphere"
+            )
+            to_reference += steps[0]
+            to_other += steps[1]
+        return to_reference, to_other, None, None, None
 
 
-def _scaled(reference: Tensor) -> Tensor:
-    """Scaled before the product, so that no sum grows larger than the result."""
-    return _widened(reference) / math.sqrt(reference.shape[1])
+def _placed(inverse_depth: Tensor, pose: Tensor, sampling: Sampling) -> Iterator[tuple[slice, tuple[Tensor, Tensor]]]:
+    """Groups of candidates with their positions in the other panorama."""
+    start = 0
+    for chunk in _chunks(inverse_depth, inverse_depth[:, :1].numel()):
+        yield slice(start, start + chunk.shape[1]), sweep_positions(chunk, pose, sampling)
+        start += chunk.shape[1]
 
 
-def _chunks(inverse_depth: Tensor, reference: Tensor) -> tuple[Tensor, ...]:
-    """The candidates in groups whose warped features fit the limit."""
-    return inverse_depth.split(max(1, _CHUNK // max(1, reference.numel())), dim=1)
+def _chunks(inverse_depth: Tensor, numbers: int) -> tuple[Tensor, ...]:
+    """The candidates in groups within the limit, when one takes so many numbers."""
+    return inverse_depth.split(max(1, _CHUNK // max(1, numbers)), dim=1)

@@ -203,9 +203,9 @@ class LevelRefinement(nn.Module):
         centre: Float[Tensor, "batch view height width"] | None,
         mono_features: Float[Tensor, "batch view mono h w"] | None,
     ) -> Float[Tensor, "batch view candidate height width"]:
-        parts = [volume, features]
+        parts = [volume.to(features.dtype), features]
         if centre is not None:
-            parts.append(centre[:, :, None])
+            parts.append(centre[:, :, None].to(features.dtype))
         if mono_features is not None:
             resized = resize(mono_features.flatten(0, 1), features.shape[-2:], self.compat)
             parts.append(resized.unflatten(0, features.shape[:2]))
