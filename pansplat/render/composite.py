@@ -5,6 +5,7 @@ and a group's Gaussians in blocks, so that memory is bounded whatever the scene;
 from block to block. Backward walks the same blocks in reverse and computes each again under autograd.
 """
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,8 @@ _BLOCK = 32  # Gaussians a step
 # Pixel-Gaussian pairs a step, few enough for the cache.
 _PAIRS = 32768
 _LARGEST_ALPHA = 0.99
+# Less light than this is none: float32 loses digits below 1e-38, and processors slow down.
+_DARK = 1e-20
 _VALUES = 11  # where a row's values begin, behind forms, along and peak
 
 
@@ -71,7 +74,7 @@ class _Composite(torch.autograd.Function):
                     before.append(through)
                 transmittance, added = _block(*_gather(padded, block, pixels, live + first), through, exact=exact)
                 sums.index_add_(0, live, added)
-                if not needs_grad and float(transmittance.max()) < torch.finfo(rows.dtype).eps:
+                if float(transmittance.max()) <= (0.0 if needs_grad else torch.finfo(rows.dtype).eps):
                     break
             kept.append(before)
         ctx.save_for_backward(rows, points)
@@ -91,7 +94,8 @@ class _Composite(torch.autograd.Function):
         groups = _groups(lists, len(rows), pixels.offsets.shape[-1])
         for (tiles, blocks), before in zip(groups, kept, strict=True):
             grad_through = rows.new_zeros(0, pixels.offsets.shape[-1])
-            for block, through in zip(reversed(list(blocks)), reversed(before), strict=True):
+            drawn = list(itertools.islice(blocks, len(before)))  # blocks in the dark were left out
+            for block, through in zip(reversed(drawn), reversed(before), strict=True):
                 live = tiles[: len(block)]
                 row, point, centres, offsets = _gather(padded, block, pixels, live + lists.tiles[0])
                 inputs = tuple(t.detach().requires_grad_() for t in (row, point, through))
@@ -164,11 +168,11 @@ def _block(
 ) -> tuple[Float[Tensor, "g pixel"], Float[Tensor, "g pixel sums"]]:
     """Transmittance behind a block of Gaussians, and what the block adds to the sums."""
     alpha = _alphas(row, (point - centres[:, None]).to(row.dtype), offsets, exact=exact)
-    behind = torch.cumprod(1 - alpha, dim=1)
+    behind = _above(torch.cumprod(1 - alpha, dim=1), _DARK)
     ahead = torch.cat((torch.ones_like(behind[:, :1]), behind[:, :-1]), dim=1)
     weights = alpha * ahead * through[:, None]
     values = torch.cat((row[..., _VALUES:], torch.ones_like(row[..., :1])), dim=2)
-    return through * behind[:, -1], weights.transpose(1, 2) @ values
+    return _above(through * behind[:, -1], _DARK), weights.transpose(1, 2) @ values
 
 
 def _alphas(
@@ -206,5 +210,9 @@ def _alphas(
 
 def _cut(alpha: Tensor) -> Tensor:
     """At most 0.99, and 0 below 1/255."""
-    below = ALPHA_CUT * (1 - 1e-7)  # `threshold` keeps what is above; the cut itself is kept
-    return torch.nn.functional.threshold(alpha.clamp_max(_LARGEST_ALPHA), below, 0.0)
+    return _above(alpha.clamp_max(_LARGEST_ALPHA), ALPHA_CUT * (1 - 1e-7))  # the cut itself is kept
+
+
+def _above(values: Tensor, floor: float) -> Tensor:
+    """The values, but 0 and without gradient where they are no more than `floor`."""
+    return torch.nn.functional.threshold(values, floor, 0.0)
