@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Literal, get_args
 
 import torch
@@ -113,7 +114,7 @@ def rasterize(
 def _backend(name: Backend, gaussians: Gaussians) -> Draw:
     """The backend of that name; "auto" chooses by the Gaussians' type and device."""
     if name == "auto":
-        name = "torch"
+        name = "triton" if gaussians.means.is_cuda and find_spec("triton") is not None else "torch"
     module = import_module(_MODULES[name])
     return module.draw  # type: ignore[no-any-return]
 

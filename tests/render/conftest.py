@@ -1,6 +1,7 @@
 """Scenes, and a dense renderer that follows docs/rendering.md's definitions as literally as it can."""
 
 import math
+import os
 from collections.abc import Callable
 
 import pytest
@@ -131,3 +132,18 @@ def pose() -> Tensor:
     pose[:3, :3] = rotations_from_quats(torch.tensor((0.9, 0.2, -0.3, 0.4), dtype=torch.float64))
     pose[:3, 3] = torch.tensor((0.1, 0.2, -0.1))
     return pose
+
+
+@pytest.fixture(scope="session")
+def triton_interpreter() -> None:
+    """Triton's interpreter, on the CPU, for the rest of the session."""
+    os.environ["TRITON_INTERPRET"] = "1"
+    import triton.language as tl
+    from triton.runtime import interpreter
+
+    assert isinstance(tl.sum, interpreter.InterpretedFunction), (
+        "triton was imported before TRITON_INTERPRET=1 was set; set it at the head of the conftest.py"
+    )
+    # It replaces its whole language again at every call of a device function; once is enough, and six times as fast.
+    interpreter._patch_lang(tl.sum.fn)
+    interpreter.InterpretedFunction.__call__ = lambda self, *args, **kwargs: self.rewrite()(*args, **kwargs)

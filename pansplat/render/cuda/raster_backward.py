@@ -131,7 +131,15 @@ def moments(slopes, delta, EXACT: tl.constexpr):
 @triton.jit
 @no_type_check
 def _reduce_kernel(
-    rows, ends, which, totals, num, GRADIENT: tl.constexpr, FIELDS: tl.constexpr, GROUP: tl.constexpr, AT_ONCE: tl.constexpr
+    rows,
+    ends,
+    which,
+    totals,
+    num,
+    GRADIENT: tl.constexpr,
+    FIELDS: tl.constexpr,
+    GROUP: tl.constexpr,
+    AT_ONCE: tl.constexpr,
 ):
     """Adds to each instance's total the rows of its tiles."""
     group = tl.program_id(0) * GROUP + tl.arange(0, GROUP)
@@ -193,9 +201,7 @@ def raster_backward(
             )  # fmt: skip
 
 
-def by_record(
-    totals: Float[Tensor, "m gradient"], instances: Instances, num: int
-) -> Float[Tensor, "n gradient"]:
+def by_record(totals: Float[Tensor, "m gradient"], instances: Instances, num: int) -> Float[Tensor, "n gradient"]:
     """Each record's gradient: the sum over the pictures it is seen on, which name it once each."""
     gradient = totals.new_zeros(num, totals.shape[1])
     for records, total in zip(
