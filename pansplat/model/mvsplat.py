@@ -1,0 +1,275 @@
+"""The MVSplat baseline on panoramas: one cost volume at 1/4 of the image, one Gaussian a pixel.
+
+The blocks are PanSplat's. With `compat="official"` nothing knows that a panorama's ends meet (as in the original);
+with "fixed" the convolutions, the resizing and the sweep do.
+
+Source: Chen et al., MVSplat, https://arxiv.org/abs/2403.14627; OFFICIAL.md, section 16.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import gelu, instance_norm, interpolate, relu
+
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.geometry.wrap import Border
+from pansplat.model.adapter import AdapterConfig, adapt
+from pansplat.model.cost_volume import (
+    Depths,
+    LevelDepth,
+    VolumeRefinement,
+    correlate_views,
+    first_candidates,
+    regress,
+)
+from pansplat.model.feature_pyramid import normalize
+from pansplat.model.lattice import lattice_uv, move_points
+from pansplat.model.layers import (
+    AttentionPrecision,
+    Compat,
+    PanoramaConv2d,
+    require_size,
+    require_views,
+    upsample,
+)
+from pansplat.model.transformer import Transformer, TransformerConfig
+from pansplat.model.unet import UNet, UNetConfig
+
+_SCALE = 4  # the sweep's map is this many times smaller than the image
+_ENCODER_CHANNELS = (64, 64, 96, 96, 128, 128)  # of the residual blocks
+
+
+@dataclass(frozen=True)
+class MVSplatConfig:
+    """Shape of the network; shipped weights fix all of it."""
+
+    channels: int = 128
+    """Of the features."""
+    candidates: int = 128
+    width: int = 128
+    """Channels of the cost volume's U-Net."""
+    refine_width: int = 32
+    """Channels of the full-size U-Net."""
+    transformer: TransformerConfig = field(default_factory=TransformerConfig)
+    adapter: AdapterConfig = field(default_factory=AdapterConfig)
+
+
+@dataclass(frozen=True)
+class MVSplatOutput:
+    """What the network makes of a batch.
+
+    Attributes:
+        gaussians: of each batch item; view by view, row by row.
+        depths: of the sweep, at 1/4 of the image.
+    """
+
+    gaussians: list[Gaussians]
+    depths: Depths
+
+
+class MVSplat(nn.Module):
+    """Features, a sweep at 1/4 scale, and pixel-aligned Gaussians."""
+
+    def __init__(
+        self,
+        config: MVSplatConfig | None = None,
+        compat: Compat = "official",
+        attention_precision: AttentionPrecision = "float32",
+    ) -> None:
+        super().__init__()
+        self.config = config = config or MVSplatConfig()
+        self.compat: Compat = compat
+        border = _border_of(compat)
+        channels, fine = config.channels, config.refine_width
+        self.features = Features(config, compat, attention_precision)
+        self.depth = SweptDepth(config, compat, attention_precision)
+        self.upsampler = PanoramaConv2d(2 * channels, channels, 3, border=border)
+        self.project = PanoramaConv2d(channels, fine, 3, border=border)
+        self.refine = FullSizeRefinement(3 + fine + 2, fine, border, attention_precision)
+        outputs = 2 + config.adapter.num_parameters
+        self.to_gaussians = nn.Sequential(
+            PanoramaConv2d(fine + 3 + channels, 2 * outputs, 3, border=border),
+            nn.GELU(),
+            PanoramaConv2d(2 * outputs, outputs, 3, border=border),
+        )
+        self.to_depth = nn.Sequential(
+            PanoramaConv2d(fine, 2 * fine, 3, border=border), nn.GELU(), PanoramaConv2d(2 * fine, 2, 3, border=border)
+        )
+
+    def forward(
+        self,
+        images: Float[Tensor, "batch view 3 height width"],
+        cam2world: Float[Tensor, "batch view 4 4"],
+        near: Float[Tensor, "batch view"],
+        far: Float[Tensor, "batch view"],
+    ) -> MVSplatOutput:
+        """Predict from RGB in [0, 1], OpenCV cam2world poses and the depth range to search, metres.
+
+        Raises:
+            InputError: too few views (or too many for the original), or a size that 64 does not divide.
+        """
+        require_views(images.shape[1], self.compat)
+        require_size(*images.shape[-2:], 64 if images.shape[-2] >= 64 else 16)
+        matched, seen = self.features(images)
+        swept = self.depth(matched, cam2world, near, far)
+        full = gelu(upsample(self.upsampler(torch.cat((matched, seen), dim=2).flatten(0, 1)), _SCALE, self.compat))
+        inverse_depth = upsample(swept.inverse_depth, _SCALE, self.compat)
+        confidence = interpolate(swept.confidence, scale_factor=_SCALE, mode="nearest")
+        flat = images.flatten(0, 1)
+        maps = (flat, self.project(full), inverse_depth.flatten(0, 1)[:, None], confidence.flatten(0, 1)[:, None])
+        refined = self.refine(torch.cat(maps, dim=1), views=images.shape[1])
+        gaussians = []
+        for item in range(len(images)):
+            by_view = []
+            for view in range(images.shape[1]):
+                index = item * images.shape[1] + view
+                at = (item, view)
+                own = slice(index, index + 1)
+                by_view.append(
+                    self._lift(
+                        flat[own], refined[own], full[own], inverse_depth[at], cam2world[at], near[at], far[at], view
+                    )
+                )
+            gaussians.append(Gaussians.cat(by_view))
+        return MVSplatOutput(gaussians, Depths((swept,)))
+
+    def _lift(
+        self,
+        image: Float[Tensor, "1 3 height width"],
+        refined: Float[Tensor, "1 fine height width"],
+        full: Float[Tensor, "1 channel height width"],
+        inverse_depth: Float[Tensor, "height width"],
+        cam2world: Float[Tensor, "4 4"],
+        near: Float[Tensor, ""],
+        far: Float[Tensor, ""],
+        view: int,
+    ) -> Gaussians:
+        """One view's Gaussians, one a pixel, row by row."""
+        height = image.shape[-2]
+        numbers = self.to_gaussians(torch.cat((refined, image, full), dim=1))[0].flatten(1).T
+        correction, opacity_logits = self.to_depth(refined)[0].flatten(1)
+        offsets, parameters = numbers.split((2, self.config.adapter.num_parameters), dim=-1)
+        uv = lattice_uv("pixel", height).to(image.device)
+        return adapt(
+            parameters,
+            move_points(uv, offsets, "pixel", height),
+            1 / (inverse_depth.flatten() + correction).clamp(1 / far, 1 / near),
+            torch.sigmoid(opacity_logits),
+            cam2world,
+            map_height=height,
+            colors=None,
+            level=0,
+            view=view,
+            config=self.config.adapter,
+            compat=self.compat,
+        )
+
+
+class Features(nn.Module):
+    """Features of all views at 1/4 scale: after attention across views, and as the encoder saw them."""
+
+    def __init__(self, config: MVSplatConfig, compat: Compat, precision: AttentionPrecision) -> None:
+        super().__init__()
+        self.encoder = Encoder(config.channels, _border_of(compat))
+        self.transformer = Transformer(config.transformer, compat, precision)
+
+    def forward(
+        self, images: Float[Tensor, "batch view 3 height width"]
+    ) -> tuple[Float[Tensor, "batch view channel h w"], Float[Tensor, "batch view channel h w"]]:
+        seen = self.encoder(normalize(images.flatten(0, 1))).unflatten(0, images.shape[:2])
+        return self.transformer(seen), seen
+
+
+class Encoder(nn.Module):
+    """A CNN down to 1/4 with instance normalisation.
+
+    Source: UniMatch, https://arxiv.org/abs/2211.05783.
+    """
+
+    def __init__(self, channels: int, border: Border) -> None:
+        super().__init__()
+        self.stem = PanoramaConv2d(3, _ENCODER_CHANNELS[0], 7, stride=2, bias=False, border=border)
+        before = (_ENCODER_CHANNELS[0], *_ENCODER_CHANNELS)
+        self.blocks = nn.ModuleList(
+            ResidualBlock(before[i], after, stride=2 if i == 2 else 1, border=border)
+            for i, after in enumerate(_ENCODER_CHANNELS)
+        )
+        self.exit = nn.Conv2d(_ENCODER_CHANNELS[-1], channels, 1)
+
+    def forward(self, images: Float[Tensor, "image 3 height width"]) -> Float[Tensor, "image channel h w"]:
+        maps = relu(instance_norm(self.stem(images)))
+        for block in self.blocks:
+            maps = block(maps)
+        return self.exit(maps)
+
+
+class ResidualBlock(nn.Module):
+    """Two convolutions, each instance-normalised, beside a shortcut."""
+
+    def __init__(self, inputs: int, outputs: int, *, stride: int, border: Border) -> None:
+        super().__init__()
+        self.conv1 = PanoramaConv2d(inputs, outputs, 3, stride=stride, bias=False, border=border)
+        self.conv2 = PanoramaConv2d(outputs, outputs, 3, bias=False, border=border)
+        self.shortcut = nn.Identity()
+        if inputs != outputs:
+            self.shortcut = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride=stride), nn.InstanceNorm2d(outputs))
+
+    def forward(self, maps: Float[Tensor, "image channel height width"]) -> Float[Tensor, "image c h w"]:
+        inner = relu(instance_norm(self.conv1(maps)))
+        inner = relu(instance_norm(self.conv2(inner)))
+        return relu(self.shortcut(maps) + inner)
+
+
+class SweptDepth(nn.Module):
+    """Inverse depth at 1/4 scale: correlate, refine, regress."""
+
+    def __init__(self, config: MVSplatConfig, compat: Compat, precision: AttentionPrecision) -> None:
+        super().__init__()
+        self.config, self.compat = config, compat
+        border = _border_of(compat)
+        inputs = config.candidates + config.channels
+        self.shortcut = nn.Conv2d(inputs, config.width, 1)
+        self.refine = VolumeRefinement(inputs, config.width, border, precision)
+        self.head = nn.Sequential(
+            PanoramaConv2d(config.width, 2 * config.width, 3, border=border),
+            nn.GELU(),
+            PanoramaConv2d(2 * config.width, config.candidates, 3, border=border),
+        )
+
+    def forward(
+        self,
+        features: Float[Tensor, "batch view channel height width"],
+        cam2world: Float[Tensor, "batch view 4 4"],
+        near: Float[Tensor, "batch view"],
+        far: Float[Tensor, "batch view"],
+    ) -> LevelDepth:
+        candidates = first_candidates((1 / far, 1 / near), self.config.candidates, features.shape[-2:])
+        volume = correlate_views(features, candidates, cam2world, self.compat)
+        inputs = torch.cat((volume, features), dim=2)
+        refined = self.shortcut(inputs.flatten(0, 1)) + self.refine(inputs).flatten(0, 1)
+        logits = self.head(refined).unflatten(0, features.shape[:2])
+        return regress(2, logits, candidates)
+
+
+class FullSizeRefinement(nn.Module):
+    """A deep, narrow U-Net at the image's size."""
+
+    def __init__(self, inputs: int, width: int, border: Border, precision: AttentionPrecision) -> None:
+        super().__init__()
+        self.entry = PanoramaConv2d(inputs, width, 3, border=border)
+        self.norm = nn.GroupNorm(4, width)
+        self.unet = UNet(UNetConfig(width, scales=5), border, precision)
+
+    def forward(
+        self, maps: Float[Tensor, "image channel height width"], views: int
+    ) -> Float[Tensor, "image width height width"]:
+        entered = gelu(self.norm(self.entry(maps)))
+        return self.unet(entered.unflatten(0, (-1, views))).flatten(0, 1)
+
+
+def _border_of(compat: Compat) -> Border:
+    return "sphere" if compat == "fixed" else "zeros"
