@@ -7,9 +7,10 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
+from pansplat.geometry.cubemap import face_of
 from pansplat.geometry.equirect import pixel_directions, row_weights
 
 _STEP = 2  # pixels: stitching blends over less than that
@@ -69,9 +70,10 @@ def seam_jump(error: Float[Tensor, "channel height width"]) -> float:
     The error is the picture minus the truth, so the truth's own edges count nothing. 0 for a picture whose error
     knows no borders.
     """
-    faces = cube_faces(*error.shape[-2:])
+    height, width = error.shape[-2:]
+    faces = face_of(pixel_directions(height, width, dtype=torch.float64).reshape(-1, 3)).reshape(height, width)
     across, beside = [], []
-    for dim, length in ((-1, error.shape[-1]), (-2, error.shape[-2] - _STEP)):  # columns wrap, rows do not
+    for dim, length in ((-1, width), (-2, height - _STEP)):  # columns wrap, rows do not
         change = (error - error.roll(-_STEP, dim)).abs().mean(dim=0).narrow(dim, 0, length)
         border = (faces != faces.roll(-_STEP, dim)).narrow(dim, 0, length)
         near = (border.roll(_STEP, dim) | border.roll(-_STEP, dim)) & ~border
@@ -81,10 +83,3 @@ def seam_jump(error: Float[Tensor, "channel height width"]) -> float:
     if not len(jumps) or not len(plain):
         return 0.0
     return max(0.0, float(jumps.mean() - plain.mean()))
-
-
-def cube_faces(height: int, width: int) -> Int[Tensor, "height width"]:
-    """Number 0..5 of the cube face that each pixel of a panorama lies on: its largest coordinate and its sign."""
-    directions = pixel_directions(height, width, dtype=torch.float64)
-    axis = directions.abs().argmax(dim=-1)
-    return 2 * axis + (directions.gather(-1, axis[..., None])[..., 0] > 0)

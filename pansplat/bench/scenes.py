@@ -43,6 +43,11 @@ def room_cameras(views: int = 2) -> Float[Tensor, "view 4 4"]:
     return poses
 
 
+def lattice_room_size(height: int, views: int = 2) -> int:
+    """Number of Gaussians of `full_lattice_room`."""
+    return views * sum(lattice_size(2 * height >> level) for level in range(NUM_LEVELS))
+
+
 def full_lattice_room(height: int, *, views: int = 2, degree: int = 0, seed: int = 0) -> Gaussians:
     """A furnished room as seen by panoramas of that height: every point of every level's lattice is a Gaussian.
 

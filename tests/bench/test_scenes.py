@@ -5,12 +5,13 @@ import math
 import pytest
 import torch
 
-from pansplat.bench.scenes import full_lattice_room, room_cameras
+from pansplat.bench.scenes import full_lattice_room, lattice_room_size, room_cameras
 from pansplat.geometry.pose import rotations_from_quats
 
 
 def test_counts_are_the_papers():
-    assert len(full_lattice_room(256)) == 221_642
+    assert len(full_lattice_room(256)) == lattice_room_size(256) == 221_642
+    assert lattice_room_size(512) == 886_580 and lattice_room_size(2048) == 14_185_312
     assert len(full_lattice_room(32, views=1)) * 2 == len(full_lattice_room(32, views=2))
 
 

@@ -1,0 +1,169 @@
+"""Which groups a run measures: quick (some minutes on two cores) or full.
+
+The quick run compares all choices at half the height, and only the main ones at the full height.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pansplat.bench.cases import Case, Group, Subject, choices, default_face_size, official
+from pansplat.bench.scenes import full_lattice_room, lattice_room_size
+from pansplat.gaussians.gaussians import Gaussians
+
+DENSE_HEIGHT = 64  # what a renderer without tiles can bear
+_BYTES = 600  # a Gaussian: the scene, its gradients, and what drawing takes, generously
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a run measures.
+
+    Attributes:
+        height: of the largest pictures of the comparison, pixels.
+        quick: some minutes instead of an hour.
+        threads: the most that are used.
+        backends: usable ones besides torch, "numba" first.
+        memory: bytes that may be used; larger scenes are left out.
+    """
+
+    height: int
+    quick: bool
+    threads: int
+    backends: tuple[str, ...]
+    memory: float
+
+    @property
+    def choice_height(self) -> int:
+        """Height of the pictures that compare every choice."""
+        return max(8, self.height // 2) if self.quick else self.height
+
+    @property
+    def face_sizes(self) -> tuple[int, ...]:
+        """Sides of cube faces to compare: the original's, the default, in the full run one as fine everywhere."""
+        height = self.choice_height
+        return (height // 2, default_face_size(height)) + (() if self.quick else (height,))
+
+    @property
+    def fastest(self) -> str:
+        """The backend that the sweeps are about."""
+        return self.backends[0] if self.backends else "torch"
+
+
+def room(height: int) -> Subject:
+    """The synthetic room, seen from between its cameras, a little off the line."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = torch.tensor((0.1, 0.05, 0.15))
+    return Subject(f"room {height}", partial(full_lattice_room, _lattice(height)), pose)
+
+
+def of_scene(name: str, load: Callable[[], Gaussians], pose: Float[Tensor, "4 4"]) -> Callable[[int], Subject]:
+    """A scene from elsewhere, the same whatever the height."""
+    return lambda height: Subject(name, load, pose)
+
+
+def groups(settings: Settings, subject: Callable[[int], Subject], *, synthetic: bool) -> list[Group]:
+    """All groups of a scene, the most telling first.
+
+    Args:
+        subject: the scene for a height.
+        synthetic: the room, which exists in every size; other scenes are thinned out for the sweep of counts.
+    """
+    height, small = settings.height, settings.choice_height
+    found = [
+        _group("headline", subject(height), _headline(settings), "exact" if settings.quick else "own"),
+        _group("choices", subject(small), _choices(settings), "own"),
+    ]
+    if synthetic:
+        dense = Case("dense", DENSE_HEIGHT)
+        others = [replace(dense, backend=name) for name in ("torch", *settings.backends)]
+        found.append(_group("dense", room(DENSE_HEIGHT), [dense, *others], "own"))
+    for index, one in enumerate(_counts(settings, subject, synthetic)):
+        found.append(_group("count", one, _sweep(settings, height, slow=index == 0), "none"))
+    for index, one_height in enumerate(_heights(settings)):
+        if not synthetic or lattice_room_size(one_height) * _BYTES < settings.memory:
+            cases = _sweep(settings, one_height, slow=index < 2)
+            found.append(_group("resolution", subject(one_height), cases, "none"))
+    return [group for group in found if group.cases]
+
+
+def sample_groups(settings: Settings, subject: Subject) -> list[Group]:
+    """A real scene's main choices, so that what the room shows can be checked on it."""
+    small = replace(settings, height=settings.choice_height)
+    cases = _main(small, settings.fastest)
+    if settings.fastest != "torch":
+        cases.append(Case("torch", small.height))
+    return [_group("scene", subject, cases, "own")]
+
+
+def _group(suite: str, subject: Subject, cases: list[Case], truths: Literal["own", "exact", "none"]) -> Group:
+    return Group(suite, subject, tuple(case for case in cases if case.possible), truths)
+
+
+def _main(settings: Settings, backend: str) -> list[Case]:
+    """The direct panorama, the stitched ones, and the original's choices."""
+    height, threads = settings.height, 1 if backend == "torch" else settings.threads
+    face_size = default_face_size(height)
+    stitched = Case(backend, height, layout="cubemap", face_size=face_size, threads=threads)
+    return [
+        Case(backend, height, threads=threads),
+        stitched,
+        replace(stitched, kernel="ewa"),
+        official(backend, height, threads),
+    ]
+
+
+def _headline(settings: Settings) -> list[Case]:
+    cases = []
+    for backend in settings.backends:
+        cases += _main(settings, backend)
+        if settings.threads > 1:
+            cases.append(Case(backend, settings.height))
+    return [*cases, Case("torch", settings.height)]
+
+
+def _choices(settings: Settings) -> list[Case]:
+    height, cases = settings.choice_height, []
+    for backend in settings.backends:
+        cases += choices(backend, height, settings.face_sizes, settings.threads)
+    if settings.quick:
+        return cases + _main(replace(settings, height=height), "torch")
+    return cases + [replace(case, backward=False) for case in choices("torch", height, settings.face_sizes, 1)]
+
+
+def _sweep(settings: Settings, height: int, *, slow: bool) -> list[Case]:
+    """The direct panorama by the fastest backend, and by torch where that is bearable."""
+    fast = [Case(name, height, threads=settings.threads) for name in settings.backends[:1]]
+    return fast + ([Case("torch", height)] if slow or not fast else [])
+
+
+def _counts(settings: Settings, subject: Callable[[int], Subject], synthetic: bool) -> list[Subject]:
+    """Scenes of about a sixteenth, an eighth, a quarter, half and all Gaussians."""
+    if synthetic:
+        return [room(_lattice(settings.height * share)) for share in (0.25, 0.354, 0.5, 0.707, 1.0)]
+    whole = subject(settings.height)
+    return [
+        Subject(f"{whole.name} 1/{part}", partial(_thinned, whole.load, part), whole.pose) for part in (16, 8, 4, 2, 1)
+    ]
+
+
+def _thinned(load: Callable[[], Gaussians], part: int) -> Gaussians:
+    gaussians = load()
+    return gaussians.select(torch.arange(0, len(gaussians), part))
+
+
+def _heights(settings: Settings) -> list[int]:
+    shares = (0.25, 0.5, 1, 2) if settings.quick else (0.25, 0.5, 1, 2, 4)
+    return [_lattice(settings.height * share) for share in shares]
+
+
+def _lattice(height: float) -> int:
+    """The nearest height that halves three times."""
+    return max(8, 8 * round(height / 8))
