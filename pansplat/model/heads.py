@@ -22,10 +22,10 @@ from torch.nn import functional
 from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.model.adapter import AdapterConfig, adapt
-from pansplat.model.cost_volume import Depths
+from pansplat.model.cost_volume import Depths, LevelDepth
 from pansplat.model.lattice import Lattice, lattice_uv, move_points
 from pansplat.model.layers import Compat
-from pansplat.model.tiles import Margins, Tile, Window, cut, sample, tile_grid
+from pansplat.model.tiles import Margins, Tile, Window, cut, sample, sample_whole, tile_grid
 
 Precision = Literal["float32", "bfloat16"]
 
@@ -155,11 +155,7 @@ class GaussianHeads(nn.Module):
             InputError: when the height cannot be divided into levels and tiles.
         """
         parts = list(self.iterate(images, features, depths, cam2world, near, far, tiles=tiles))
-        whole = [Gaussians.cat([part.gaussians[item] for part in parts]) for item in range(len(images))]
-        if len(parts) == 1 or self.compat == "official":
-            return whole
-        order = torch.argsort(torch.cat([part.index for part in parts]))
-        return [gaussians.select(order.to(gaussians.means.device)) for gaussians in whole]
+        return whole(parts, self.compat)
 
     def iterate(
         self,
@@ -184,18 +180,14 @@ class GaussianHeads(nn.Module):
         """
         height = images.shape[-2]
         self._require_divisible(height, tiles)
-        batch, views = images.shape[:2]
-        items = [
-            [_view_inputs(images, features, depths, cam2world, near, far, item, view) for view in range(views)]
-            for item in range(batch)
-        ]
+        items = views_of(images, features, depths.levels[-1], cam2world, near, far)
         grid = tile_grid(tiles)
         for tile in grid if only is None else [grid[number] for number in only]:
             gaussians = []
             for item in items:
                 by_view = [self._lift_view(view, tile) for view in item]
                 gaussians.append(Gaussians.cat([part for level in zip(*by_view, strict=True) for part in level]))
-            yield TileGaussians(gaussians, self._untiled_index(tile, height, views))
+            yield TileGaussians(gaussians, untiled_index(tile, self.points(height), images.shape[1]))
 
     def heights(self, height: int) -> list[int]:
         """Rows of each level's map, coarse to fine, for images of a height."""
@@ -222,67 +214,20 @@ class GaussianHeads(nn.Module):
                 passed_on = _twice_as_fine(passed_on, self.margins)
                 maps = torch.cat((maps, passed_on), dim=1)
             with torch.autocast(maps.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
-                refined = head(maps.contiguous(memory_format=torch.channels_last))
+                refined = head(maps.contiguous(memory_format=torch.channels_last)).to(maps.dtype)
             if passed_on is not None:
                 lost = self.margins.input - self.margins.output
                 refined = refined + _cropped(passed_on, lost)
             passed_on = refined if self.config.residual else None
-            finest = index == len(heights) - 1
-            if finest or self.config.emitted == "all":
-                gaussians.append(self._read_points(head, refined[0], known, height, tile, view, index))
+            level = len(heights) - 1 - index
+            if level == 0 or self.config.emitted == "all":
+                # Finer levels add to the colours of the coarsest.
+                read = read_points(
+                    head, refined[0], known, tile, view, height=height, level=level, colored=index == 0,
+                    config=self.config, compat=self.compat,
+                )  # fmt: skip
+                gaussians.append(read)
         return gaussians
-
-    def _read_points(
-        self,
-        head: LevelHead,
-        refined: Float[Tensor, "hidden h w"],
-        known: Window,
-        height: int,
-        tile: Tile,
-        view: ViewInputs,
-        index: int,
-    ) -> Gaussians:
-        """The Gaussians that a tile's lattice points read off a level's map."""
-        config = self.config
-        uv = lattice_uv(config.lattice, height, exact=self.compat == "fixed")
-        uv = uv[tile.holds(uv)]
-        numbers = head.linear(sample(refined, known, height, uv))
-        offsets, parameters, logits = numbers.split(
-            (2, config.adapter.num_parameters, config.outputs - 2 - config.adapter.num_parameters), dim=-1
-        )
-        if config.depth == "refined":
-            candidates = sample_map(view.candidates, uv, self.compat)
-            inverse_depths = (torch.softmax(logits[:, :-1], dim=-1) * candidates).sum(dim=-1)
-            opacities = torch.sigmoid(logits[:, -1])
-        else:
-            inverse_depths = sample_map(view.inverse_depth[None], uv, self.compat)[:, 0]
-            opacities = torch.sigmoid(sample_map(view.confidence[None], uv, self.compat)[:, 0])
-        colors = None
-        if index == 0:  # finer levels add to the colours of the coarsest
-            around = tile.window(height).grown(1)
-            colors = sample(cut(view.image, height, around, self.compat), around, height, uv)
-        return adapt(
-            parameters,
-            move_points(uv.to(offsets.device), offsets, config.lattice, height),
-            1 / inverse_depths.clamp(1 / view.far, 1 / view.near),
-            opacities,
-            view.cam2world,
-            map_height=height,
-            colors=colors,
-            level=len(self.levels) - 1 - index,
-            view=view.view,
-            config=config.adapter,
-            compat=self.compat,
-        )
-
-    def _untiled_index(self, tile: Tile, height: int, views: int) -> Integer[Tensor, "n"]:
-        """Where the tile's Gaussians stand among those of the whole panorama."""
-        places, start = [], 0
-        for uv in self.points(height):
-            inside = tile.holds(uv).nonzero()[:, 0]
-            places += [start + view * len(uv) + inside for view in range(views)]
-            start += views * len(uv)
-        return torch.cat(places)
 
     def _require_divisible(self, height: int, tiles: int) -> None:
         coarsest = self.heights(height)[0]
@@ -297,40 +242,103 @@ class GaussianHeads(nn.Module):
             raise InputError(f"the heads need panoramas at least {least} pixels high, got {height}; enlarge them")
 
 
-def sample_map(
-    source: Float[Tensor, "channel h w"], uv: Float[Tensor, "n 2"], compat: Compat
-) -> Float[Tensor, "n channel"]:
-    """Bilinear samples of a whole map; the original repeats its last column at the seam (OFFICIAL.md, trap T7)."""
-    height = source.shape[-2]
-    window = Window(0, 0, height, 2 * height)
-    if compat == "fixed":
-        window = window.grown(1)
-    return sample(cut(source, height, window, compat), window, height, uv)
+def read_points(
+    head: LevelHead,
+    refined: Float[Tensor, "hidden h w"],
+    known: Window,
+    tile: Tile,
+    view: ViewInputs,
+    *,
+    height: int,
+    level: int,
+    colored: bool,
+    config: HeadsConfig,
+    compat: Compat,
+) -> Gaussians:
+    """The Gaussians that a tile's lattice points read off a level's map.
 
+    Args:
+        refined: the map, of which the window `known` is at hand.
+        height: rows of the whole map.
+        colored: whether the harmonics add to the image's colour.
+    """
+    uv = lattice_uv(config.lattice, height, exact=compat == "fixed")
+    uv = uv[tile.holds(uv)].to(refined.device)
+    numbers = head.linear(sample(refined, known, height, uv))
+    sizes = (2, config.adapter.num_parameters, config.outputs - 2 - config.adapter.num_parameters)
+    offsets, parameters, logits = numbers.split(sizes, dim=-1)
 
-def _view_inputs(
-    images: Tensor,
-    features: Sequence[Tensor],
-    depths: Depths,
-    cam2world: Tensor,
-    near: Tensor,
-    far: Tensor,
-    item: int,
-    view: int,
-) -> ViewInputs:
-    at = (item, view)
-    return ViewInputs(
-        image=images[at],
-        features=[maps[at] for maps in features],
-        logits=depths.logits[at],
-        candidates=depths.candidates[at],
-        inverse_depth=depths.inverse_depth[-1][at],
-        confidence=depths.confidence[-1][at],
-        cam2world=cam2world[at],
-        near=near[at],
-        far=far[at],
-        view=view,
+    def resized(source: Float[Tensor, "channel _ _"]) -> Float[Tensor, "n channel"]:
+        return sample(cut(source, height, known, compat), known, height, uv)
+
+    if config.depth == "refined":
+        probabilities = torch.softmax(logits[:, :-1], dim=-1)
+        inverse_depths = (probabilities * sample_whole(view.candidates, uv, compat)).sum(dim=-1)
+        opacities = torch.sigmoid(logits[:, -1])
+    else:
+        inverse_depths = resized(view.inverse_depth[None])[:, 0]
+        opacities = torch.sigmoid(resized(view.confidence[None])[:, 0])
+    return adapt(
+        parameters,
+        move_points(uv, offsets, config.lattice, height),
+        1 / inverse_depths.clamp(1 / view.far, 1 / view.near),
+        opacities,
+        view.cam2world,
+        map_height=height,
+        colors=resized(view.image) if colored else None,
+        level=level,
+        view=view.view,
+        config=config.adapter,
+        compat=compat,
     )
+
+
+def untiled_index(tile: Tile, lattices: Sequence[Float[Tensor, "_ 2"]], views: int) -> Integer[Tensor, "n"]:
+    """Where a tile's Gaussians stand among those of the whole panorama: by level, then view, then point."""
+    places, start = [], 0
+    for uv in lattices:
+        inside = tile.holds(uv).nonzero()[:, 0]
+        places += [start + view * len(uv) + inside for view in range(views)]
+        start += views * len(uv)
+    return torch.cat(places)
+
+
+def whole(parts: Sequence[TileGaussians], compat: Compat) -> list[Gaussians]:
+    """All tiles' Gaussians of each batch item, in untiled order; in the original's, which is by tile, if official."""
+    items = [Gaussians.cat(sets) for sets in zip(*(part.gaussians for part in parts), strict=True)]
+    if len(parts) == 1 or compat == "official":
+        return items
+    order = torch.argsort(torch.cat([part.index for part in parts]))
+    return [gaussians.select(order.to(gaussians.means.device)) for gaussians in items]
+
+
+def views_of(
+    images: Float[Tensor, "batch view 3 height width"],
+    features: Sequence[Float[Tensor, "batch view channel _ _"]],
+    depth: LevelDepth,
+    cam2world: Float[Tensor, "batch view 4 4"],
+    near: Float[Tensor, "batch view"],
+    far: Float[Tensor, "batch view"],
+) -> list[list[ViewInputs]]:
+    """Each batch item's views, one by one."""
+    return [
+        [
+            ViewInputs(
+                image=images[item, view],
+                features=[maps[item, view] for maps in features],
+                logits=depth.logits[item, view],
+                candidates=depth.candidates[item, view],
+                inverse_depth=depth.inverse_depth[item, view],
+                confidence=depth.confidence[item, view],
+                cam2world=cam2world[item, view],
+                near=near[item, view],
+                far=far[item, view],
+                view=view,
+            )
+            for view in range(images.shape[1])
+        ]
+        for item in range(len(images))
+    ]
 
 
 def _twice_as_fine(maps: Float[Tensor, "1 hidden height width"], margins: Margins) -> Float[Tensor, "1 hidden h w"]:

@@ -125,6 +125,17 @@ def sample(
     return torch.lerp(upper, lower, down)
 
 
+def sample_whole(
+    source: Float[Tensor, "channel h w"], uv: Float[Tensor, "n 2"], compat: Compat
+) -> Float[Tensor, "n channel"]:
+    """Bilinear samples of a whole map; the original repeats its last column at the seam (OFFICIAL.md, trap T7)."""
+    height = source.shape[-2]
+    window = Window(0, 0, height, 2 * height)
+    if compat == "fixed":
+        window = window.grown(1)
+    return sample(cut(source, height, window, compat), window, height, uv)
+
+
 def _neighbours(
     index: Integer[Tensor, "n"], source_size: int, size: int, exact: bool
 ) -> tuple[Integer[Tensor, "n"], Integer[Tensor, "n"], Float[Tensor, "n"]]:

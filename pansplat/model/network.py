@@ -1,0 +1,250 @@
+"""A trained network as a predictor: checks of the input, tiles, masks, batches, a fingerprint of its weights."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Iterator, Sequence
+from importlib.resources import files
+from typing import Any, Protocol
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pansplat.errors import InputError
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.geometry.equirect import uv_from_directions
+from pansplat.model.cost_volume import Depths
+from pansplat.model.heads import TileGaussians, whole
+from pansplat.model.layers import Compat, require_views
+from pansplat.model.predictor import Progress
+
+_MIN_HEIGHT = 64
+_UNTILED_HEIGHT = 512  # taller panoramas get twice as many tiles along each side each time they double
+_MULTIPLE = {"official": 16, "fixed": 32}  # what halving, windows and their shifts divide a height by
+_MATCHED = 0.4  # fraction of the time that matching takes, for the progress report
+
+
+class Matched(Protocol):
+    """What a network knows before it makes Gaussians."""
+
+    @property
+    def depths(self) -> Depths: ...
+
+
+class Network(Protocol):
+    """What a predictor needs of a network, which is an nn.Module: first it matches the views, then lifts Gaussians."""
+
+    config: Any
+    compat: Compat
+
+    def match(
+        self,
+        images: Float[Tensor, "batch view 3 height width"],
+        cam2world: Float[Tensor, "batch view 4 4"],
+        near: Float[Tensor, "batch view"],
+        far: Float[Tensor, "batch view"],
+    ) -> Any:
+        """A `Matched`."""
+        ...
+
+    def lift(self, matched: Any, *, tiles: int = 1, only: Sequence[int] | None = None) -> Iterator[TileGaussians]:
+        """Gaussians tile by tile; in one part where the network knows no tiles."""
+        ...
+
+    def state_dict(self) -> dict[str, Tensor]: ...
+
+
+class NetworkPredictor:
+    """A network with its weights, to be called as any `Predictor`.
+
+    Args:
+        name: as users type it.
+        network: an nn.Module that is a `Network`; put in eval mode.
+        tiles: tiles along each side, or None for as many as the height suggests.
+    """
+
+    def __init__(self, name: str, network: Any, *, tiles: int | None = None) -> None:
+        self.name = name
+        self.network = network.eval()
+        self.tiles = tiles
+
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        """Hash of weights, settings and the code that uses them, so that a kept prediction is never stale."""
+        settings = (self.network.config, self.network.compat, getattr(self.network, "precision", None), self.tiles)
+        digest = hashlib.blake2b(repr(settings).encode(), digest_size=8)
+        for name, tensor in sorted(self.network.state_dict().items()):
+            digest.update(name.encode())
+            digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+        for package in ("pansplat.model", "pansplat.gaussians", "pansplat.geometry"):
+            for source in sorted(files(package).iterdir(), key=lambda s: s.name):
+                if source.name.endswith(".py"):
+                    digest.update(source.read_bytes())
+        return f"{self.name}-{self.network.compat}-{digest.hexdigest()}"
+
+    def __call__(
+        self,
+        images: Float[Tensor, "*batch view 3 height width"],
+        cam2world: Float[Tensor, "*batch view 4 4"],
+        near: float | Tensor,
+        far: float | Tensor,
+        *,
+        masks: Bool[Tensor, "*batch view height width"] | None = None,
+        progress: Progress | None = None,
+    ) -> Gaussians | list[Gaussians]:
+        """Predict from RGB in [0, 1] and OpenCV cam2world poses (metres); a list when there is a batch axis.
+
+        Args:
+            near, far: radial depth range, metres; numbers, or tensors with one value a batch item or a view.
+            masks: True where a pixel shows the scene; the rest makes no Gaussians.
+
+        Raises:
+            InputError: on shapes, sizes, view counts or values that the network cannot take.
+        """
+        if images.ndim == 5:
+            return [
+                self._predict(
+                    images[n],
+                    cam2world[n],
+                    _item(near, n),
+                    _item(far, n),
+                    None if masks is None else masks[n],
+                    progress,
+                )[0]
+                for n in range(len(images))
+            ]
+        return self._predict(images, cam2world, near, far, masks, progress)[0]
+
+    def predict_with_depths(
+        self,
+        images: Float[Tensor, "view 3 height width"],
+        cam2world: Float[Tensor, "view 4 4"],
+        near: float | Tensor,
+        far: float | Tensor,
+        *,
+        masks: Bool[Tensor, "view height width"] | None = None,
+        progress: Progress | None = None,
+    ) -> tuple[Gaussians, list[Float[Tensor, "view _ _"]]]:
+        """The Gaussians, and the radial depth maps on the way there, metres, coarse to fine."""
+        gaussians, depths = self._predict(images, cam2world, near, far, masks, progress)
+        return gaussians, [depth[0].to(images.device) for depth in depths.depth]
+
+    @torch.no_grad()
+    def stream(
+        self,
+        images: Float[Tensor, "view 3 height width"],
+        cam2world: Float[Tensor, "view 4 4"],
+        near: float | Tensor,
+        far: float | Tensor,
+        *,
+        masks: Bool[Tensor, "view height width"] | None = None,
+        progress: Progress | None = None,
+    ) -> Iterator[Gaussians]:
+        """The Gaussians of one tile after another: what a call gives, in the order of tiles and in bounded memory.
+
+        Raises:
+            InputError: as a call does, when the first tile is asked for.
+        """
+        matched, tiles = self._match(images, cam2world, near, far, masks, progress)
+        for part in self._lift(matched, tiles, progress):
+            gaussians = part.gaussians[0].to(device=images.device)
+            yield gaussians if masks is None else unmasked(gaussians, cam2world, masks)
+
+    @torch.no_grad()
+    def _predict(
+        self,
+        images: Tensor,
+        cam2world: Tensor,
+        near: float | Tensor,
+        far: float | Tensor,
+        masks: Tensor | None,
+        progress: Progress | None,
+    ) -> tuple[Gaussians, Depths]:
+        matched, tiles = self._match(images, cam2world, near, far, masks, progress)
+        parts = list(self._lift(matched, tiles, progress))
+        gaussians = whole(parts, self.network.compat)[0].to(device=images.device)
+        if masks is not None:
+            gaussians = unmasked(gaussians, cam2world, masks)
+        return gaussians, matched.depths
+
+    def _match(
+        self,
+        images: Tensor,
+        cam2world: Tensor,
+        near: float | Tensor,
+        far: float | Tensor,
+        masks: Tensor | None,
+        progress: Progress | None,
+    ) -> tuple[Matched, int]:
+        """What the network knows of one item before it makes Gaussians, and the tiles to make them in."""
+        views = len(images)
+        bounds = [torch.as_tensor(bound, dtype=torch.float32) for bound in (near, far)]
+        tiles = self.tiles or automatic_tiles(images.shape[-2])
+        _check(images, cam2world, *bounds, masks, self.network.compat, tiles)
+        if progress is not None:
+            progress("matching views", 0.0)
+        weight = next(self.network.parameters())
+        pose = cam2world.to(device=weight.device, dtype=weight.dtype)
+        near_views, far_views = (bound.to(weight).expand(views)[None] for bound in bounds)
+        return self.network.match(images.to(weight)[None], pose[None], near_views, far_views), tiles
+
+    def _lift(self, matched: Matched, tiles: int, progress: Progress | None) -> Iterator[TileGaussians]:
+        report = progress or (lambda what, fraction: None)
+        report("making Gaussians", _MATCHED)
+        for done, part in enumerate(self.network.lift(matched, tiles=tiles), start=1):
+            yield part
+            report("making Gaussians", _MATCHED + (1 - _MATCHED) * min(1.0, done / tiles**2))
+        report("done", 1.0)
+
+
+def automatic_tiles(height: int) -> int:
+    """Tiles along each side: 1 up to 512 rows, 2 up to 1024, 4 above, as in the paper."""
+    return 1 if height <= _UNTILED_HEIGHT else 2 if height <= 2 * _UNTILED_HEIGHT else 4
+
+
+def unmasked(
+    gaussians: Gaussians, cam2world: Float[Tensor, "view 4 4"], masks: Bool[Tensor, "view height width"]
+) -> Gaussians:
+    """The Gaussians whose means their own view sees at a pixel that its mask keeps."""
+    height, width = masks.shape[-2:]
+    view = gaussians.views.long()
+    pose = cam2world.to(gaussians.means)[view]
+    directions = (pose[:, :3, :3].transpose(-1, -2) @ (gaussians.means - pose[:, :3, 3])[..., None])[..., 0]
+    column, row = (uv_from_directions(directions) * torch.tensor((width, height)).to(directions)).long().unbind(-1)
+    kept = masks.to(view.device)[view, row.clamp(0, height - 1), column.clamp(0, width - 1)]
+    return gaussians.select(kept)
+
+
+def _item(value: float | Tensor, n: int) -> float | Tensor:
+    return value[n] if isinstance(value, Tensor) and value.ndim else value
+
+
+def _check(
+    images: Tensor, cam2world: Tensor, near: Tensor, far: Tensor, masks: Tensor | None, compat: Compat, tiles: int
+) -> None:
+    shape = tuple(images.shape)
+    if images.ndim != 4 or shape[1] != 3 or shape[3] != 2 * shape[2]:
+        raise InputError(
+            f"`images` must be (view, 3, height, 2 * height), got {shape}; stack RGB equirectangular images of one size"
+        )
+    require_views(shape[0], compat)
+    multiple = max(_MULTIPLE[compat], 8 * tiles)
+    if shape[2] < _MIN_HEIGHT or shape[2] % multiple:
+        raise InputError(
+            f"`images` must be at least {_MIN_HEIGHT} pixels high and a multiple of {multiple}, got {shape[2]}; "
+            "resize them"
+        )
+    if tuple(cam2world.shape) != (shape[0], 4, 4):
+        raise InputError(f"`cam2world` must be ({shape[0]}, 4, 4) to fit the images, got {tuple(cam2world.shape)}")
+    if masks is not None and tuple(masks.shape) != (shape[0], *shape[2:]):
+        raise InputError(f"`masks` must be {(shape[0], *shape[2:])} to fit the images, got {tuple(masks.shape)}")
+    if not (torch.isfinite(images).all() and torch.isfinite(cam2world).all()):
+        raise InputError("`images` and `cam2world` must be finite, got NaN or infinity; clean the input first")
+    if near.numel() not in (1, shape[0]) or far.numel() not in (1, shape[0]):
+        raise InputError(f"`near` and `far` must be one number, or one a view, got {near.tolist()} and {far.tolist()}")
+    if not bool((near > 0).all() and (near < far).all() and torch.isfinite(far).all()):
+        raise InputError(
+            f"`near` and `far` must satisfy 0 < near < far, got {near.tolist()} and {far.tolist()} (metres)"
+        )
