@@ -136,6 +136,7 @@ class SphericalCostVolume(nn.Module):
             self.levels[str(sweep.level)] = LevelRefinement(
                 sweep, config, first=index == 0, compat=compat, precision=attention_precision
             )
+        self.to(memory_format=torch.channels_last)  # convolves faster
 
     def forward(
         self,

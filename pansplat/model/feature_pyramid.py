@@ -46,6 +46,7 @@ class FeaturePyramid(nn.Module):
         self.encoder = Encoder(config.channels, border_of(compat))
         self.transformer = Transformer(config.transformer, compat, attention_precision)
         self.decoder = Decoder(config.channels, compat)
+        self.to(memory_format=torch.channels_last)  # convolves faster
 
     def forward(
         self, images: Float[Tensor, "batch view 3 height width"]
@@ -108,10 +109,20 @@ class Decoder(nn.Module):
         fine_to_coarse: list[Float[Tensor, "image c h w"]],
     ) -> list[Float[Tensor, "image c h w"]]:
         """Features of levels 3 to 0, coarse to fine, of the coarsest map and the encoder's maps of levels 0 to 2."""
+        if self.training:
+            return self._decode(coarsest, fine_to_coarse)
+        # Outside training no image depends on another; the widest maps are held for one at a time.
+        images = [
+            self._decode(coarsest[i : i + 1], [maps[i : i + 1] for maps in fine_to_coarse])
+            for i in range(coarsest.shape[0])
+        ]
+        return [torch.cat(level) for level in zip(*images, strict=True)]
+
+    def _decode(self, coarsest: Tensor, fine_to_coarse: list[Tensor]) -> list[Tensor]:
         flow = coarsest
         features = [self.outputs[-1](flow)]
         for level in (2, 1, 0):
-            flow = upsample(flow, 2, self.compat) + self.laterals[level](fine_to_coarse[level])
+            flow = upsample(flow, 2, self.compat).add_(self.laterals[level](fine_to_coarse[level]))
             features.append(self.outputs[level](flow))
         return features
 
