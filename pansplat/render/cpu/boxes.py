@@ -155,10 +155,10 @@ def write_boxes(rows, edges, start, count, boxes):
 
 
 @inlined
-def _arctan(t):
-    """atan within 1e-8 radians (a fit at Chebyshev nodes), infinities too."""
-    large = abs(t) > 1
-    s = -1 / t if large else t
+def _arctan2(y, x):
+    """atan2 within 1e-8 radians (a fit at Chebyshev nodes), with one division."""
+    steep = abs(y) > abs(x)
+    s = (x if steep else y) / (y if steep else x)
     z = s * s
     p = -0.00238699729962 * z + 0.0135077713532
     p = p * z - 0.0358715388503
@@ -169,37 +169,26 @@ def _arctan(t):
     p = p * z + 0.199997393298
     p = p * z - 0.333333317331
     r = s + s * z * p
-    quarter = -0.5 * math.pi if t < 0 else 0.5 * math.pi
-    return r + quarter if large else r
+    half = -math.pi if y < 0 else math.pi
+    return 0.5 * half - r if steep else r + (half if x < 0 else 0.0)
 
 
 @inlined
-def _arcsin(sine):
-    """asin within 1e-8 radians, of a sine that may have left [-1, 1]."""
-    sine = min(max(sine, -1.0), 1.0)
-    return _arctan(sine / math.sqrt(1 - sine * sine))
-
-
-@inlined
-def _tangents(mixed, side, ahead):
-    """Lower and upper slope of a cone with dual entries -mixed, -side, ahead > 0 (else 1 stands in)."""
-    ahead = ahead if ahead > 0 else 1.0
-    root = math.sqrt(max(mixed * mixed + side * ahead, 0.0))
-    return (-mixed - root) / ahead, (-mixed + root) / ahead
-
-
-@inlined
-def _highest_latitude(sine, cosine, low, high, sides):
+def _highest_latitude(sine, cosine, low, high, sides2):
     """Bound on the latitude over a box in the tangent plane at latitude asin(sine).
 
-    The box reaches `low` and `high` towards growing latitude and `sides` aside.
+    Args:
+        low, high: how far the box reaches towards growing latitude.
+        sides2: square of how far it reaches aside.
     """
-    first, second = sine + low * cosine, sine + high * cosine
-    first_aside = 0.0 if first > 0 else sides * sides
-    second_aside = 0.0 if second > 0 else sides * sides
-    highest = max(first / math.sqrt(1 + first_aside + low * low), second / math.sqrt(1 + second_aside + high * high))
+    first, second = sine + low * cosine, sine + high * cosine  # sines, but for the lengths
+    first2 = 1 + low * low + (0.0 if first > 0 else sides2)
+    second2 = 1 + high * high + (0.0 if second > 0 else sides2)
+    later = second * abs(second) * first2 > first * abs(first) * second2
+    height, length2 = (second, second2) if later else (first, first2)
+    flat = math.sqrt(max(length2 - height * height, 0.0))
     over_pole = (sine > 0) & (low * sine <= cosine) & (cosine <= high * sine)
-    return _arcsin(1.0 if over_pole else highest)
+    return _arctan2(1.0 if over_pole else height, 0.0 if over_pole else flat)
 
 
 @kernel
@@ -229,32 +218,39 @@ def _panorama_edges(rows, height, width):
         n, p, q, along, kappa = _cone(rows, i)
         flat = math.sqrt(n[0] * n[0] + n[2] * n[2])
         on_axis = flat < 1e-12
-        ahead_x, ahead_z = 0.0 if on_axis else n[0] / flat, 1.0 if on_axis else n[2] / flat
+        inverse = 0.0 if on_axis else 1 / flat
+        ahead_x, ahead_z = n[0] * inverse, 1.0 if on_axis else n[2] * inverse
         p_ahead, q_ahead = p[0] * ahead_x + p[2] * ahead_z, q[0] * ahead_x + q[2] * ahead_z
         p_east, q_east = p[0] * ahead_z - p[2] * ahead_x, q[0] * ahead_z - q[2] * ahead_x
         p_south, q_south = p[1] * flat - n[1] * p_ahead, q[1] * flat - n[1] * q_ahead
         p_n, q_n = dot(*p, *n), dot(*q, *n)
         east = kappa * (p_east * p_east + q_east * q_east)
 
-        # Longitude, from the mean's: tangents of the shadow on the horizontal plane.
+        # Longitude: tangents of the shadow on the horizontal plane.
         d_ff = flat * flat - kappa * (along * flat * flat + p_ahead * p_ahead + q_ahead * q_ahead)
-        left, right = _tangents(kappa * (p_east * p_ahead + q_east * q_ahead), east, d_ff)
-        behind = math.pi if ahead_x >= 0 else -math.pi
-        longitude = _arctan(ahead_x / ahead_z) + (behind if ahead_z < 0 else 0.0)
+        middle = -kappa * (p_east * p_ahead + q_east * q_ahead)
+        root = math.sqrt(max(middle * middle + east * d_ff, 0.0))
+        low, high = middle - root, middle + root
+        left = _arctan2(ahead_x * d_ff + ahead_z * low, ahead_z * d_ff - ahead_x * low)
+        right = _arctan2(ahead_x * d_ff + ahead_z * high, ahead_z * d_ff - ahead_x * high)
+        right += 2 * math.pi if right < left - 1e-6 else 0.0
 
         # Latitude: a box around the ellipse in the plane that touches the sphere at the mean's direction.
         d_nn = 1 - kappa * (along + p_n * p_n + q_n * q_n)
-        low, high = _tangents(kappa * (p_east * p_n + q_east * q_n), east, d_nn)
-        sides = max(abs(low), abs(high))
+        inverse = 1 / d_nn if d_nn > 0 else 1.0
+        middle = -kappa * (p_east * p_n + q_east * q_n)
+        sides = (abs(middle) + math.sqrt(max(middle * middle + east * d_nn, 0.0))) * inverse
         south = kappa * (p_south * p_south + q_south * q_south)
-        low, high = _tangents(kappa * (p_south * p_n + q_south * q_n), south, d_nn)
-        bottom = _highest_latitude(n[1], flat, low, high, sides)
-        top = -_highest_latitude(-n[1], flat, -high, -low, sides)
+        middle = -kappa * (p_south * p_n + q_south * q_n)
+        root = math.sqrt(max(middle * middle + south * d_nn, 0.0))
+        low, high = (middle - root) * inverse, (middle + root) * inverse
+        bottom = _highest_latitude(n[1], flat, low, high, sides * sides)
+        top = -_highest_latitude(-n[1], flat, -high, -low, sides * sides)
         per_column, per_row = width / (2 * math.pi), height / math.pi
         everywhere = 1e9 if d_nn <= 0 else 0.0
         around = 1e9 if d_ff <= 0 else everywhere
-        rows[EDGES, i] = (longitude + _arctan(left)) * per_column + 0.5 * width - around
-        rows[EDGES + 1, i] = (longitude + _arctan(right)) * per_column + 0.5 * width + around
+        rows[EDGES, i] = left * per_column + 0.5 * width - around
+        rows[EDGES + 1, i] = right * per_column + 0.5 * width + around
         rows[EDGES + 2, i] = top * per_row + 0.5 * height - everywhere
         rows[EDGES + 3, i] = -1e9 if kappa < 0 else bottom * per_row + 0.5 * height + everywhere
 

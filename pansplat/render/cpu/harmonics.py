@@ -160,23 +160,33 @@ def colours(harmonics, start, count, basis, values):
 
 
 @inlined
-def colour_gradients(harmonics, start, count, basis, values, grads, first, wanted, slopes, grad_harmonics):
-    """From gradients to values (columns of `grads` from `first` on) to those of coefficients and of each harmonic.
+def colour_gradients(harmonics, start, drawn, basis, values, grads, grad_harmonics, slopes):
+    """From gradients of colours, a row each, to those of coefficients (if asked for) and of each harmonic.
 
     Args:
-        wanted: whether to write the coefficients' gradient.
-        slopes: gets the gradient to each harmonic, a row each.
+        start: the block's first Gaussian.
+        drawn: for each Gaussian of the block; the gradients of others are 0 whatever their coefficients hold.
+        values: colours of the forward; where one is off, or exactly 0, it stays off.
+        grads: gradients of the colours; overwritten.
+        grad_harmonics: no rows if not asked for.
+        slopes: gets the gradient of each harmonic, a row each.
     """
-    num, channels = harmonics.shape[1], harmonics.shape[2]
-    for i in range(count):
+    num, channels, wanted = harmonics.shape[1], harmonics.shape[2], grad_harmonics.shape[0] > 0
+    for i in range(len(drawn)):
         g = start + i
-        for c in range(channels):  # a colour that is off, or exactly at 0, stays off
-            grads[i, first + c] = grads[i, first + c] if values[g, c] > 0 else np.float32(0)
+        if not drawn[i]:
+            for k in range(num):
+                slopes[k, i] = 0
+                if wanted and g < harmonics.shape[0]:
+                    for c in range(channels):
+                        grad_harmonics[g, k, c] = 0
+            continue
+        for c in range(channels):
+            grads[i, c] = grads[i, c] if values[g, c] > 0 else np.float32(0)
         for k in range(num):
-            total = np.float32(0)
-            weight = basis[k, i]
+            total, weight = np.float32(0), basis[k, i]
             for c in range(channels):
-                total += harmonics[g, k, c] * grads[i, first + c]
+                total += harmonics[g, k, c] * grads[i, c]
                 if wanted:
-                    grad_harmonics[g, k, c] = weight * grads[i, first + c]
+                    grad_harmonics[g, k, c] = weight * grads[i, c]
             slopes[k, i] = total

@@ -248,7 +248,7 @@ def _check_harmonics(harmonic_bits, size, start, count, rows):
 
 
 @inlined
-def _write_block(rows, start, count, records, values, tally):
+def _write_block(rows, start, count, records, values, radii, tally):
     radius_column = values.shape[1] - 1
     for i in range(count):
         g = start + i
@@ -263,12 +263,13 @@ def _write_block(rows, start, count, records, values, tally):
             records[g, layout.FIRST + j] = np.float32(rows[OUT + 3 + j, i])
         records[g, layout.LEVEL] = np.float32(rows[LOG, i]) if drawn else np.float32(CULLED)
         values[g, radius_column] = np.float32(rows[RADIUS, i])
+        radii[g] = rows[RADIUS, i]
 
 
 @kernel
 def _observe(
     piece, means, quats, scales, covariances, opacities, harmonics, harmonic_bits,
-    pose, spread, compensate, near, records, values, tallies,
+    pose, spread, compensate, near, records, values, radii, tallies,
 ):  # fmt: skip
     rows = np.ones((ROWS + 1, LANES))
     bits = rows.view(np.int64)
@@ -282,29 +283,42 @@ def _observe(
         _find_records(pose, spread, compensate, rows)
         find_logs(rows, bits, PEAK, LOG)
         fill_basis(rows, WORLD, harmonics.shape[1], basis)
-        _write_block(rows, start, count, records, values, tallies[piece])
+        _write_block(rows, start, count, records, values, radii, tallies[piece])
         colours(harmonics, start, count, basis, values)
 
 
-def observe(fields: Fields, camera: Camera, threads: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The records and values of all Gaussians, in their order.
+class Observed(NamedTuple):
+    """What the camera sees of each Gaussian, in their order.
 
-    Returns:
-        records and values as in records.py; level is `CULLED` for Gaussians that are not drawn. And how many were
-        dropped because a number is unusable, and how many are too near.
+    Attributes:
+        records, values: see records.py; the level is `CULLED` where a Gaussian is not drawn.
+        radii: (n,) float64, metres.
+        dropped: how many hold an unusable number.
+        near: how many are too near.
     """
+
+    records: np.ndarray
+    values: np.ndarray
+    radii: np.ndarray
+    dropped: int
+    near: int
+
+
+def observe(fields: Fields, camera: Camera, threads: int) -> Observed:
+    """The Gaussians as the camera sees them."""
     num, channels = len(fields.means), fields.harmonics.shape[2]
-    records = aligned((num, layout.FIELDS))
+    records, radii = aligned((num, layout.FIELDS)), np.empty(num)
     values = np.empty((num, channels + 1), np.float32)
     pieces = -(-num // PIECE)
     tallies = np.zeros((pieces, 2), np.int64)
     harmonic_bits = fields.harmonics.reshape(-1).view(np.uint32)
 
     def work(piece: int) -> None:
-        _observe(piece, *fields, harmonic_bits, *camera, records, values, tallies)
+        _observe(piece, *fields, harmonic_bits, *camera, records, values, radii, tallies)
 
     share(work, pieces, threads)
-    return records, values, tallies.sum(axis=0)
+    dropped, near = (int(count) for count in tallies.sum(axis=0))
+    return Observed(records, values, radii, dropped, near)
 
 
 def aligned(shape: tuple[int, int]) -> np.ndarray:

@@ -1,0 +1,371 @@
+"""Stage six: from gradients of records and values to those of the Gaussians' fields and the camera's pose.
+
+Source: docs/rendering.md, sections 1 to 3, differentiated by hand. The axes a and b may be turned about n together
+without changing a picture, so their derivative is taken in the gauge where it is symmetric. With E = C + e^2,
+p the axis dual to a and q that to b, a motion dn across n and a change dC of the covariance,
+
+    X_aa = a'dC a + 2 alpha a.dn     X_ab = a'dC b + beta a.dn + alpha b.dn     X_bb = b'dC b + 2 beta b.dn
+    da = -(X_aa a + X_ab b) / 2 - (a.dn) n
+    dalpha = -(alpha X_aa + beta X_ab) / 2 + (g + e^2) a.dn - p.dn - a'dC n
+    dS' = l'dC l - 2 (S' + e^2) (l - n).dn
+    d ln det B' = X_aa + X_bb
+
+and likewise for b. Nothing is divided by a width, so needles and discs are no worse than the forward.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pansplat.render.cpu import records as layout
+from pansplat.render.cpu.compiling import inlined, kernel
+from pansplat.render.cpu.forms import LEAST_RATIO, cross, dot, ray_forms, rotation
+from pansplat.render.cpu.harmonics import add_slopes, colour_gradients, fill_basis
+from pansplat.render.cpu.observe import (
+    CULLED,
+    LANES,
+    PIECE,
+    RADIUS,
+    ROWS,
+    SHAPE,
+    WORLD,
+    Camera,
+    Fields,
+    Observed,
+    find_directions,
+    find_shapes,
+    frame_and_shape,
+    read_block,
+)
+from pansplat.render.cpu.threads import share
+
+# Rows of a block, after those of observe.py.
+GIVEN = ROWS + 1  # gradients of the record: n, a, b (camera axes), alpha, beta, S', ln peak
+GIVEN_RADIUS = GIVEN + 13
+N_GRAD = GIVEN + 14  # of n, world axes
+C_GRAD = GIVEN + 17  # of C: xx xy xz yy yz zz
+DET_GRAD = GIVEN + 23  # of ln det B
+OUT_MEAN = GIVEN + 24
+OUT_SHAPE = GIVEN + 27  # a quaternion and three scales, or a covariance's six numbers
+ALL_ROWS = GIVEN + 34
+_POSE = 12  # sums for the pose: its rotation by rows, its centre
+
+
+class Gradients(NamedTuple):
+    """Gradients of the fields, float32 like them; no rows where not asked for. `pose` is (3, 4) float64."""
+
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    covariances: np.ndarray
+    opacities: np.ndarray
+    harmonics: np.ndarray
+    pose: np.ndarray
+
+
+@inlined
+def _read_gradients(records, grad_records, grad_values, offsets, start, count, rows, colour_grads):
+    """Sum each Gaussian's slots, in their order, in the units of docs/rendering.md; zeros where not drawn."""
+    channels = colour_grads.shape[1]
+    unit, inverse_unit = math.sqrt(layout.UNIT), 1 / math.sqrt(layout.UNIT)
+    for i in range(count):
+        for j in range(14):
+            rows[GIVEN + j, i] = 0.0
+        for c in range(channels):
+            colour_grads[i, c] = 0
+        for slot in range(offsets[start + i], offsets[start + i + 1]):
+            for axis in range(3):
+                rows[GIVEN + axis, i] += grad_records[slot, layout.DIRECTION + axis]
+            for j in range(10):
+                rows[GIVEN + 3 + j, i] += grad_records[slot, layout.FIRST + j]
+            for c in range(channels):
+                colour_grads[i, c] += grad_values[slot, c]
+            rows[GIVEN_RADIUS, i] += grad_values[slot, channels]
+    for i in range(LANES):
+        for j in range(3, 9):
+            rows[GIVEN + j, i] *= unit
+        rows[GIVEN + 9, i] *= inverse_unit
+        rows[GIVEN + 10, i] *= inverse_unit
+        rows[GIVEN + 11, i] /= layout.UNIT
+        rows[GIVEN + 12, i] /= math.log(2)
+
+
+@inlined
+def _to_world(pose, x, y, z):
+    return (
+        pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z,
+        pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z,
+        pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z,
+    )
+
+
+@inlined
+def _forms_backward(pose, spread, compensate, rows, sums):
+    """Gradients of n, C and ln det B from those of the record; adds to the sums for the pose, lane by lane."""
+    for i in range(LANES):
+        u, v, n, shape = frame_and_shape(rows, i)
+        a, b, alpha, beta, along, det_filtered = ray_forms(u, v, shape, spread)
+        n_camera = rows[GIVEN, i], rows[GIVEN + 1, i], rows[GIVEN + 2, i]
+        a_camera = rows[GIVEN + 3, i], rows[GIVEN + 4, i], rows[GIVEN + 5, i]
+        b_camera = rows[GIVEN + 6, i], rows[GIVEN + 7, i], rows[GIVEN + 8, i]
+        for axis in range(3):
+            for other in range(3):
+                sums[4 * axis + other, i] += (
+                    n[axis] * n_camera[other] + a[axis] * a_camera[other] + b[axis] * b_camera[other]
+                )
+        g_n, g_a, g_b = _to_world(pose, *n_camera), _to_world(pose, *a_camera), _to_world(pose, *b_camera)
+        g_alpha, g_beta, g_along, g_peak = (
+            rows[GIVEN + 9, i],
+            rows[GIVEN + 10, i],
+            rows[GIVEN + 11, i],
+            rows[GIVEN + 12, i],
+        )
+        counts = compensate & (shape[6] > LEAST_RATIO * det_filtered)
+        half = 0.5 * g_peak if counts else 0.0
+        g_aa = -0.5 * (dot(*g_a, *a) + alpha * g_alpha) - half
+        g_ab = -0.5 * (dot(*g_a, *b) + dot(*g_b, *a) + beta * g_alpha + alpha * g_beta)
+        g_bb = -0.5 * (dot(*g_b, *b) + beta * g_beta) - half
+        length = math.sqrt(det_filtered)
+        p, q = cross(*b, *n), cross(*n, *a)
+        ahead, back = shape[5] + spread, 2 * (along + spread) * g_along
+        by_a = 2 * alpha * g_aa + beta * g_ab - dot(*g_a, *n) + ahead * g_alpha - back * alpha
+        by_b = alpha * g_ab + 2 * beta * g_bb - dot(*g_b, *n) + ahead * g_beta - back * beta
+        by_p, by_q = -length * g_alpha, -length * g_beta
+        rows[DET_GRAD, i] = half / shape[6] if counts else 0.0
+        for axis in range(3):
+            rows[N_GRAD + axis, i] = g_n[axis] + by_a * a[axis] + by_b * b[axis] + by_p * p[axis] + by_q * q[axis]
+        # Rows of the gradient of C are combinations of a, b, n, l; symmetric once its transpose is added.
+        row_a = (
+            g_aa * a[0] + g_ab * b[0] - g_alpha * n[0],
+            g_aa * a[1] + g_ab * b[1] - g_alpha * n[1],
+            g_aa * a[2] + g_ab * b[2] - g_alpha * n[2],
+        )
+        row_b = (g_bb * b[0] - g_beta * n[0], g_bb * b[1] - g_beta * n[1], g_bb * b[2] - g_beta * n[2])
+        front = (
+            n[0] + alpha * a[0] + beta * b[0],
+            n[1] + alpha * a[1] + beta * b[1],
+            n[2] + alpha * a[2] + beta * b[2],
+        )
+        at = C_GRAD
+        for axis in range(3):
+            for other in range(axis, 3):
+                rows[at, i] = g_along * front[axis] * front[other] + 0.5 * (
+                    a[axis] * row_a[other] + a[other] * row_a[axis] + b[axis] * row_b[other] + b[other] * row_b[axis]
+                )
+                at += 1
+
+
+@inlined
+def _covariances_backward(rows):
+    """Gradients of the covariance and the distance from those of C and ln det B."""
+    for i in range(LANES):
+        u, v, _, shape = frame_and_shape(rows, i)
+        uu, uv, vv, un, vn = shape[0], shape[1], shape[2], shape[3], shape[4]
+        g = rows[DET_GRAD, i]
+        xx, xy, xz = rows[C_GRAD, i], rows[C_GRAD + 1, i], rows[C_GRAD + 2, i]
+        yy, yz, zz = rows[C_GRAD + 3, i], rows[C_GRAD + 4, i], rows[C_GRAD + 5, i]
+        # det B = uu vv - uv^2; the frame turns with n.
+        xx += g * (vv * u[0] * u[0] + uu * v[0] * v[0] - 2 * uv * u[0] * v[0])
+        yy += g * (vv * u[1] * u[1] + uu * v[1] * v[1] - 2 * uv * u[1] * v[1])
+        zz += g * (vv * u[2] * u[2] + uu * v[2] * v[2] - 2 * uv * u[2] * v[2])
+        xy += g * (vv * u[0] * u[1] + uu * v[0] * v[1] - uv * (u[0] * v[1] + u[1] * v[0]))
+        xz += g * (vv * u[0] * u[2] + uu * v[0] * v[2] - uv * (u[0] * v[2] + u[2] * v[0]))
+        yz += g * (vv * u[1] * u[2] + uu * v[1] * v[2] - uv * (u[1] * v[2] + u[2] * v[1]))
+        by_u, by_v = 2 * g * (uv * vn - vv * un), 2 * g * (uv * un - uu * vn)
+        for axis in range(3):
+            rows[N_GRAD + axis, i] += by_u * u[axis] + by_v * v[axis]
+        inverse = 1 / (rows[RADIUS, i] * rows[RADIUS, i])
+        rows[OUT_SHAPE, i], rows[OUT_SHAPE + 1, i], rows[OUT_SHAPE + 2, i] = xx * inverse, xy * inverse, xz * inverse
+        rows[OUT_SHAPE + 3, i], rows[OUT_SHAPE + 4, i], rows[OUT_SHAPE + 5, i] = (
+            yy * inverse,
+            yz * inverse,
+            zz * inverse,
+        )
+        whole = xx * rows[SHAPE, i] + yy * rows[SHAPE + 4, i] + zz * rows[SHAPE + 8, i]
+        whole += xy * (rows[SHAPE + 1, i] + rows[SHAPE + 3, i]) + xz * (rows[SHAPE + 2, i] + rows[SHAPE + 6, i])
+        whole += yz * (rows[SHAPE + 5, i] + rows[SHAPE + 7, i])
+        rows[GIVEN_RADIUS, i] -= 2 * whole * inverse / rows[RADIUS, i]
+
+
+@inlined
+def _axis_backward(rows, i, e, scale2, cosine, det_share, n):
+    """Gradient of a unit axis e of the Gaussian, and e'G e."""
+    xx, xy, xz = rows[C_GRAD, i], rows[C_GRAD + 1, i], rows[C_GRAD + 2, i]
+    yy, yz, zz = rows[C_GRAD + 3, i], rows[C_GRAD + 4, i], rows[C_GRAD + 5, i]
+    x = xx * e[0] + xy * e[1] + xz * e[2]
+    y = xy * e[0] + yy * e[1] + yz * e[2]
+    z = xz * e[0] + yz * e[1] + zz * e[2]
+    turn = 2 * det_share * cosine
+    grad = 2 * scale2 * x + turn * n[0], 2 * scale2 * y + turn * n[1], 2 * scale2 * z + turn * n[2]
+    return grad, dot(*e, x, y, z)
+
+
+@inlined
+def _axes_backward(rows):
+    """Gradients of quaternion, scales and distance from those of C and ln det B = ln sum_k w_k (n.e_k)^2."""
+    for i in range(LANES):
+        n = rows[WORLD, i], rows[WORLD + 1, i], rows[WORLD + 2, i]
+        r = rotation(rows[SHAPE, i], rows[SHAPE + 1, i], rows[SHAPE + 2, i], rows[SHAPE + 3, i])
+        inverse = 1 / rows[RADIUS, i]
+        s0, s1, s2 = rows[SHAPE + 4, i] * inverse, rows[SHAPE + 5, i] * inverse, rows[SHAPE + 6, i] * inverse
+        e0, e1, e2 = (r[0], r[3], r[6]), (r[1], r[4], r[7]), (r[2], r[5], r[8])
+        n0, n1, n2 = dot(*n, *e0), dot(*n, *e1), dot(*n, *e2)
+        a0, a1, a2 = s0 * s0, s1 * s1, s2 * s2
+        g = rows[DET_GRAD, i]
+        g0, own0 = _axis_backward(rows, i, e0, a0, n0, g * a1 * a2, n)
+        g1, own1 = _axis_backward(rows, i, e1, a1, n1, g * a2 * a0, n)
+        g2, own2 = _axis_backward(rows, i, e2, a2, n2, g * a0 * a1, n)
+        t0, t1, t2 = 2 * g * a1 * a2 * n0, 2 * g * a2 * a0 * n1, 2 * g * a0 * a1 * n2
+        for axis in range(3):
+            rows[N_GRAD + axis, i] += t0 * e0[axis] + t1 * e1[axis] + t2 * e2[axis]
+        d0 = 2 * s0 * (own0 + g * (a2 * n1 * n1 + a1 * n2 * n2))
+        d1 = 2 * s1 * (own1 + g * (a2 * n0 * n0 + a0 * n2 * n2))
+        d2 = 2 * s2 * (own2 + g * (a1 * n0 * n0 + a0 * n1 * n1))
+        rows[GIVEN_RADIUS, i] -= (d0 * s0 + d1 * s1 + d2 * s2) * inverse
+        rows[OUT_SHAPE + 4, i], rows[OUT_SHAPE + 5, i] = d0 * inverse, d1 * inverse
+        rows[OUT_SHAPE + 6, i] = d2 * inverse
+        w, x, y, z, over_norm = r[9], r[10], r[11], r[12], r[13]
+        skew_x, skew_y, skew_z = g1[2] - g2[1], g2[0] - g0[2], g0[1] - g1[0]
+        sum_x, sum_y, sum_z = g1[2] + g2[1], g2[0] + g0[2], g0[1] + g1[0]
+        q_w = 2 * (x * skew_x + y * skew_y + z * skew_z)
+        q_x = 2 * (w * skew_x - 2 * x * (g1[1] + g2[2]) + y * sum_z + z * sum_y)
+        q_y = 2 * (w * skew_y - 2 * y * (g0[0] + g2[2]) + x * sum_z + z * sum_x)
+        q_z = 2 * (w * skew_z - 2 * z * (g0[0] + g1[1]) + x * sum_y + y * sum_x)
+        outward = w * q_w + x * q_x + y * q_y + z * q_z
+        rows[OUT_SHAPE, i], rows[OUT_SHAPE + 1, i] = (q_w - outward * w) * over_norm, (q_x - outward * x) * over_norm
+        rows[OUT_SHAPE + 2, i] = (q_y - outward * y) * over_norm
+        rows[OUT_SHAPE + 3, i] = (q_z - outward * z) * over_norm
+
+
+@inlined
+def _means_backward(rows, sums):
+    """Gradient of the mean from those of direction and distance."""
+    for i in range(LANES):
+        n = rows[WORLD, i], rows[WORLD + 1, i], rows[WORLD + 2, i]
+        g = rows[N_GRAD, i], rows[N_GRAD + 1, i], rows[N_GRAD + 2, i]
+        inverse = 1 / rows[RADIUS, i]
+        outward = rows[GIVEN_RADIUS, i] - dot(*g, *n) * inverse
+        for axis in range(3):
+            grad = g[axis] * inverse + outward * n[axis]
+            rows[OUT_MEAN + axis, i] = grad
+            sums[4 * axis + 3, i] -= grad
+
+
+@inlined
+def _clear_undrawn(records, start, count, rows, drawn):
+    """Give Gaussians that are not drawn any finite shape, since their gradients are 0 and must stay so."""
+    for i in range(LANES):
+        drawn[i] = i < count and records[start + i, layout.LEVEL] > CULLED
+        if not drawn[i]:
+            rows[WORLD, i], rows[WORLD + 1, i], rows[WORLD + 2, i], rows[RADIUS, i] = 0.0, 0.0, 1.0, 1.0
+            for j in range(9):
+                rows[SHAPE + j, i] = 1.0 if j % 4 == 0 else 0.0
+            for j in range(14):
+                rows[GIVEN + j, i] = 0.0
+
+
+@kernel
+def _chain(
+    piece, means, quats, scales, covariances, opacities, harmonics, pose, spread, compensate, near,
+    records, values, grad_records, grad_values, offsets,
+    grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities, grad_harmonics, pose_sums,
+):  # fmt: skip
+    rows = np.ones((ALL_ROWS, LANES))
+    sums = np.zeros((_POSE, LANES))
+    basis, slopes = np.zeros((25, LANES), np.float32), np.zeros((25, LANES), np.float32)
+    colour_grads, drawn = np.zeros((LANES, harmonics.shape[2]), np.float32), np.zeros(LANES, np.bool_)
+    for start in range(piece * PIECE, min((piece + 1) * PIECE, means.shape[0]), LANES):
+        count = min(LANES, means.shape[0] - start)
+        read_block(means, quats, scales, covariances, opacities, start, count, rows)
+        _read_gradients(records, grad_records, grad_values, offsets, start, count, rows, colour_grads)
+        find_directions(pose, near, rows)
+        _clear_undrawn(records, start, count, rows, drawn)
+        find_shapes(covariances, rows)
+        _forms_backward(pose, spread, compensate, rows, sums)
+        if covariances.shape[0] > 0:
+            _covariances_backward(rows)
+        else:
+            _axes_backward(rows)
+        fill_basis(rows, WORLD, harmonics.shape[1], basis)
+        colour_gradients(harmonics, start, drawn, basis, values, colour_grads, grad_harmonics, slopes)
+        add_slopes(rows, WORLD, harmonics.shape[1], slopes, N_GRAD)
+        _means_backward(rows, sums)
+        _write_means(rows, opacities, drawn, start, count, grad_means, grad_opacities)
+        _write_shapes(rows, start, count, grad_quats, grad_scales, grad_covariances)
+    for j in range(_POSE):
+        total = 0.0
+        for i in range(LANES):
+            total += sums[j, i]
+        pose_sums[piece, j] = total
+
+
+@inlined
+def _write_means(rows, opacities, drawn, start, count, grad_means, grad_opacities):
+    if grad_means.shape[0] > 0:
+        for i in range(count):
+            for axis in range(3):
+                grad_means[start + i, axis] = rows[OUT_MEAN + axis, i]
+    if grad_opacities.shape[0] > 0:
+        for i in range(count):
+            grad_opacities[start + i] = rows[GIVEN + 12, i] / opacities[start + i] if drawn[i] else 0.0
+
+
+@inlined
+def _write_shapes(rows, start, count, grad_quats, grad_scales, grad_covariances):
+    if grad_quats.shape[0] > 0:
+        for i in range(count):
+            for j in range(4):
+                grad_quats[start + i, j] = rows[OUT_SHAPE + j, i]
+    if grad_scales.shape[0] > 0:
+        for i in range(count):
+            for j in range(3):
+                grad_scales[start + i, j] = rows[OUT_SHAPE + 4 + j, i]
+    if grad_covariances.shape[0] > 0:
+        for i in range(count):
+            for axis in range(3):
+                for other in range(3):
+                    j = axis + other + (1 if axis > 0 and other > 0 else 0)
+                    grad_covariances[start + i, axis, other] = rows[OUT_SHAPE + j, i]
+
+
+def chain(
+    fields: Fields,
+    camera: Camera,
+    observed: Observed,
+    grad_records: np.ndarray,
+    grad_values: np.ndarray,
+    offsets: np.ndarray,
+    wanted: Gradients,
+    threads: int,
+) -> Gradients:
+    """The fields' gradients.
+
+    Args:
+        fields, camera, observed: of the forward.
+        grad_records: (slot, FIELDS), see records.py; gradients of the camera's records.
+        grad_values: (slot, channel + 1).
+        offsets: (n + 1), where each Gaussian's slots begin.
+        wanted: arrays to fill; those without rows are left alone.
+        threads: to work on; the result does not depend on it.
+    """
+    pieces = -(-len(fields.means) // PIECE)
+    sums = np.zeros((pieces, _POSE))
+
+    def work(piece: int) -> None:
+        _chain(
+            piece, *fields, *camera, observed.records, observed.values, grad_records, grad_values, offsets,
+            *wanted[:6], sums,
+        )  # fmt: skip
+
+    share(work, pieces, threads)
+    return wanted._replace(pose=sums.sum(axis=0).reshape(3, 4))
+
+
+@kernel
+def add_slots(piece, offsets, slot_grads, totals):
+    """Add each Gaussian's slots, in their order, to its totals."""
+    for g in range(piece * PIECE, min((piece + 1) * PIECE, totals.shape[0])):
+        for slot in range(offsets[g], offsets[g + 1]):
+            for j in range(totals.shape[1]):
+                totals[g, j] += slot_grads[slot, j]
