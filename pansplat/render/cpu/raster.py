@@ -13,11 +13,15 @@ from pansplat.render.cpu.records import TILE
 from pansplat.render.cpu.simd import (
     LANES,
     choose,
+    element,
     exp2,
     fill,
     load,
+    lowest_bit,
     minimum,
     multiply_add,
+    negative,
+    put,
     some,
     spread,
     store,
@@ -37,13 +41,18 @@ from pansplat.render.cpu.tile import (
     CHUNK,
     CLOSED,
     CUT,
+    EDGES,
     FORMS,
     L_ONE,
     L_X,
     LEVEL_ROW,
     MOST,
+    NOTHING,
     PIXELS,
+    ROWS,
+    WORDS,
     gather,
+    list_blocks,
     place_tile,
 )
 
@@ -52,7 +61,7 @@ Integers = npt.NDArray[np.int32]
 Longs = npt.NDArray[np.int64]
 
 _PIECES = 8  # of work a thread
-_GROUP = 4  # values summed in one pass
+_FEW = 4  # values summed without writing the weights down: RGB and the distance
 
 
 def raster_forward(
@@ -98,16 +107,13 @@ def pieces_of(starts: Longs, threads: int) -> list[int]:
 def _draw_tiles(  # type: ignore[no-untyped-def]
     records, values, entries, starts, kind, columns, rows, rotation, sums, first_row, low, high
 ):
-    width = len(columns)
-    tiles_across = (width + TILE - 1) // TILE
+    tiles_across = (len(columns) + TILE - 1) // TILE
     num_values = values.shape[1]
-    groups = (num_values + _GROUP - 1) // _GROUP
     offsets, middle = np.empty(3 * PIXELS, np.float32), np.empty(6, np.float32)
-    through, added = np.empty(PIXELS, np.float32), np.empty(groups * _GROUP * PIXELS, np.float32)
-    forms = np.empty(FORMS * CHUNK, np.float32)
-    colours = np.zeros(groups * _GROUP * CHUNK, np.float32)
-    lists, counts = np.empty(BLOCKS * CHUNK, np.uint8), np.zeros(BLOCKS, np.int64)
-    weights = np.empty(CHUNK * LANES, np.float32)
+    through, added = np.empty(PIXELS, np.float32), np.empty(num_values * PIXELS, np.float32)
+    forms, colours = np.empty(FORMS * CHUNK, np.float32), np.empty(num_values * CHUNK, np.float32)
+    touched = np.empty(WORDS * EDGES, np.uint64)
+    powers, places = np.empty((CHUNK + 1) * LANES, np.float32), np.empty(CHUNK + 1, np.int32)
     exact = np.float32(0 if kind == FLAT else 1)
     for tile in range(low, high):
         left, top = (tile % tiles_across) * TILE, (first_row + tile // tiles_across) * TILE
@@ -115,57 +121,53 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
         added[:] = 0
         for first in range(starts[tile], starts[tile + 1], CHUNK):
             count = min(CHUNK, starts[tile + 1] - first)
-            gather(records, entries, first, count, middle, exact, forms)
-            _gather_values(values, entries, first, count, colours)
-            _list_blocks(entries, first, count, lists, counts)
+            gather(records, values, entries, first, count, middle, exact, forms, colours)
+            list_blocks(entries, first, count, touched)
             is_open = False
             for block in range(BLOCKS):
-                if groups == 1:
-                    is_open |= _draw_block(block, counts[block], lists, forms, colours, offsets, through, added)
+                if not some(load(through, block * LANES) > fill(np.float32(CLOSED))):
+                    continue
+                reached = find_powers(block, touched, forms, offsets, powers, places)
+                if num_values == _FEW:
+                    is_open |= _draw_block(block, reached, powers, places, colours, through, added)
                 else:
-                    is_open |= _weigh_block(block, counts[block], lists, forms, offsets, through, weights)
-                    _add_block(block, counts[block], lists, weights, colours, added)
-                counts[block] = 0
+                    is_open |= _weigh_block(block, reached, powers, through)
+                    _add_block(block, reached, powers, places, colours, num_values, added)
             if not is_open:
                 break
         _write_tile(through, added, sums, left, top, num_values)
 
 
 @inlined
-def _gather_values(values, entries, first, count, colours):  # type: ignore[no-untyped-def]
-    for at in range(count):
-        index = entries[2 * (first + at)]
-        for channel in range(values.shape[1]):
-            colours[channel * CHUNK + at] = values[index, channel]
+def find_powers(block, touched, forms, offsets, powers, places):  # type: ignore[no-untyped-def]
+    """Log2 of the peak times the response at a block's pixels, for the Gaussians of the chunk that reach it.
+
+    Returns:
+        How many of `powers` (LANES each) and `places` (in the chunk) were written, front to back.
+    """
+    pixel, column, row = block * LANES, block % ACROSS, ROWS + block // ACROSS
+    x, y, z = load(offsets, pixel), load(offsets, PIXELS + pixel), load(offsets, 2 * PIXELS + pixel)
+    reached = 0
+    for word in range(WORDS):
+        bits = element(touched, word * EDGES + column) & element(touched, word * EDGES + row)
+        while bits:
+            s = word * 64 + lowest_bit(bits)
+            bits &= bits - np.uint64(1)
+            a, b, front = forms_at(forms, s, x, y, z)
+            q = multiply_add(a, a, b * b)
+            below = multiply_add(front, front, spread(forms, ALONG_ROW * CHUNK + s) * q)
+            power = spread(forms, LEVEL_ROW * CHUNK + s) - q / below
+            power = choose(front > fill(np.float32(0)), power, fill(np.float32(NOTHING)))
+            store(powers, reached * LANES, power)
+            put(places, reached, np.int32(s))
+            # Boxes have corners: what no pixel sees is written over. No branch, for none could be foretold.
+            reached += np.int64(some(fill(np.float32(CUT)) <= power))
+    return reached
 
 
 @inlined
-def _list_blocks(entries, first, count, lists, counts):  # type: ignore[no-untyped-def]
-    """List for each block, in order, the Gaussians of the chunk whose boxes touch it."""
-    for at in range(count):
-        box = entries[2 * (first + at) + 1]
-        left, right = (box & 255) // BLOCK_WIDTH, ((box >> 8) & 255) // BLOCK_WIDTH
-        top, bottom = ((box >> 16) & 255) // BLOCK_HEIGHT, ((box >> 24) & 255) // BLOCK_HEIGHT
-        for y in range(top, bottom + 1):
-            for block in range(y * ACROSS + left, y * ACROSS + right + 1):
-                lists[block * CHUNK + counts[block]] = at
-                counts[block] += 1
-
-
-@inlined
-def opacity(forms, s, x, y, z, through):  # type: ignore[no-untyped-def]
-    """Alpha of Gaussian `s` of the chunk at the pixels of a block; 0 where a pixel is closed."""
-    a, b, front = _forms_at(forms, s, x, y, z)
-    q = multiply_add(a, a, b * b)
-    below = multiply_add(front, front, spread(forms, ALONG_ROW * CHUNK + s) * q)
-    power = spread(forms, LEVEL_ROW * CHUNK + s) - q / below
-    zero = fill(np.float32(0))
-    seen = (fill(np.float32(CUT)) <= power) & (front > zero) & (through > fill(np.float32(CLOSED)))
-    return choose(seen, minimum(exp2(power), fill(np.float32(MOST))), zero)
-
-
-@inlined
-def _forms_at(forms, s, x, y, z):  # type: ignore[no-untyped-def]
+def forms_at(forms, s, x, y, z):  # type: ignore[no-untyped-def]
+    """A, B, L of Gaussian `s` of the chunk at a block's pixels."""
     a = multiply_add(spread(forms, A_X * CHUNK + s), x, spread(forms, A_ONE * CHUNK + s))
     b = multiply_add(spread(forms, B_X * CHUNK + s), x, spread(forms, B_ONE * CHUNK + s))
     front = multiply_add(spread(forms, L_X * CHUNK + s), x, spread(forms, L_ONE * CHUNK + s))
@@ -179,23 +181,28 @@ def _forms_at(forms, s, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _draw_block(block, count, lists, forms, colours, offsets, through, added):  # type: ignore[no-untyped-def]
-    """Draw a block's list, four values a Gaussian; whether it stays open."""
+def opacity(power):  # type: ignore[no-untyped-def]
+    """Alpha of a power: 0 below the cut, at most MOST."""
+    alpha = minimum(exp2(power), fill(np.float32(MOST)))
+    return choose(fill(np.float32(CUT)) <= power, alpha, fill(np.float32(0)))
+
+
+@inlined
+def _draw_block(block, reached, powers, places, colours, through, added):  # type: ignore[no-untyped-def]
+    """Draw what reaches a block, four values a Gaussian; whether it stays open."""
     pixel = block * LANES
     passes = load(through, pixel)
-    if not some(passes > fill(np.float32(CLOSED))):
-        return False
-    x, y, z = load(offsets, pixel), load(offsets, PIXELS + pixel), load(offsets, 2 * PIXELS + pixel)
     sum0, sum1 = load(added, pixel), load(added, PIXELS + pixel)
     sum2, sum3 = load(added, 2 * PIXELS + pixel), load(added, 3 * PIXELS + pixel)
-    for place in range(block * CHUNK, block * CHUNK + count):
-        s = np.int64(lists[place])
-        weight = opacity(forms, s, x, y, z, passes) * passes
-        passes = passes - weight
-        sum0 = multiply_add(weight, spread(colours, s), sum0)
-        sum1 = multiply_add(weight, spread(colours, CHUNK + s), sum1)
-        sum2 = multiply_add(weight, spread(colours, 2 * CHUNK + s), sum2)
-        sum3 = multiply_add(weight, spread(colours, 3 * CHUNK + s), sum3)
+    for at in range(reached):
+        colour = _FEW * np.int64(element(places, at))
+        alpha = opacity(load(powers, at * LANES))
+        weight = alpha * passes
+        passes = multiply_add(negative(alpha), passes, passes)
+        sum0 = multiply_add(weight, spread(colours, colour), sum0)
+        sum1 = multiply_add(weight, spread(colours, colour + 1), sum1)
+        sum2 = multiply_add(weight, spread(colours, colour + 2), sum2)
+        sum3 = multiply_add(weight, spread(colours, colour + 3), sum3)
     store(through, pixel, passes)
     store(added, pixel, sum0)
     store(added, PIXELS + pixel, sum1)
@@ -205,38 +212,27 @@ def _draw_block(block, count, lists, forms, colours, offsets, through, added):  
 
 
 @inlined
-def _weigh_block(block, count, lists, forms, offsets, through, weights):  # type: ignore[no-untyped-def]
-    """The weights of a block's list at its pixels; whether the block stays open."""
-    pixel = block * LANES
-    passes = load(through, pixel)
-    x, y, z = load(offsets, pixel), load(offsets, PIXELS + pixel), load(offsets, 2 * PIXELS + pixel)
-    for at in range(count):
-        s = np.int64(lists[block * CHUNK + at])
-        weight = opacity(forms, s, x, y, z, passes) * passes
-        passes = passes - weight
-        store(weights, at * LANES, weight)
-    store(through, pixel, passes)
+def _weigh_block(block, reached, powers, through):  # type: ignore[no-untyped-def]
+    """Turn powers into weights; whether the block stays open."""
+    passes = load(through, block * LANES)
+    for at in range(reached):
+        alpha = opacity(load(powers, at * LANES))
+        store(powers, at * LANES, alpha * passes)
+        passes = multiply_add(negative(alpha), passes, passes)
+    store(through, block * LANES, passes)
     return some(passes > fill(np.float32(CLOSED)))
 
 
 @inlined
-def _add_block(block, count, lists, weights, colours, added):  # type: ignore[no-untyped-def]
-    """Add a block's weighted values to the sums, four at a time."""
-    for first in range(0, len(added) // PIXELS, _GROUP):
-        pixel, column = first * PIXELS + block * LANES, first * CHUNK
-        sum0, sum1 = load(added, pixel), load(added, PIXELS + pixel)
-        sum2, sum3 = load(added, 2 * PIXELS + pixel), load(added, 3 * PIXELS + pixel)
-        for at in range(count):
-            s = column + np.int64(lists[block * CHUNK + at])
-            weight = load(weights, at * LANES)
-            sum0 = multiply_add(weight, spread(colours, s), sum0)
-            sum1 = multiply_add(weight, spread(colours, CHUNK + s), sum1)
-            sum2 = multiply_add(weight, spread(colours, 2 * CHUNK + s), sum2)
-            sum3 = multiply_add(weight, spread(colours, 3 * CHUNK + s), sum3)
-        store(added, pixel, sum0)
-        store(added, PIXELS + pixel, sum1)
-        store(added, 2 * PIXELS + pixel, sum2)
-        store(added, 3 * PIXELS + pixel, sum3)
+def _add_block(block, reached, weights, places, colours, num_values, added):  # type: ignore[no-untyped-def]
+    """Add a block's weighted values to the sums, any number of them."""
+    for channel in range(num_values):
+        pixel = channel * PIXELS + block * LANES
+        total = load(added, pixel)
+        for at in range(reached):
+            colour = num_values * np.int64(element(places, at)) + channel
+            total = multiply_add(load(weights, at * LANES), spread(colours, colour), total)
+        store(added, pixel, total)
 
 
 @inlined

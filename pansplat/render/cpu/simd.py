@@ -220,6 +220,37 @@ def transposed(context, a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
 
 
 @_intrinsic
+def lowest_bit(context, bits):  # type: ignore[no-untyped-def]
+    """Place of the lowest bit set; `bits` is an unsigned 64-bit number other than 0."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.cttz(args[0], ir.IntType(1)(1))
+
+    return types.intp(types.uint64), generate
+
+
+@_intrinsic
+def element(context, array, index):  # type: ignore[no-untyped-def]
+    """One element; unlike array[index] it does not ask whether the index counts from the end."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.load(_pointer(context, builder, sig, args))
+
+    return array.dtype(array, types.intp), generate
+
+
+@_intrinsic
+def put(context, array, index, value):  # type: ignore[no-untyped-def]
+    """Write one element, likewise."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        builder.store(args[2], _pointer(context, builder, sig, args))
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, array.dtype), generate
+
+
+@_intrinsic
 def prefetch(context, array, index):  # type: ignore[no-untyped-def]
     """Ask for the cache line of element `index`."""
 

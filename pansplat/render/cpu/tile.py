@@ -10,15 +10,19 @@ import numpy as np
 
 from pansplat.render.cpu.compiling import inlined
 from pansplat.render.cpu.records import FIELDS, TILE
-from pansplat.render.cpu.simd import LANES, fill, load, multiply_add, prefetch, store, transposed
+from pansplat.render.cpu.simd import LANES, element, fill, load, multiply_add, prefetch, put, store, transposed
 from pansplat.render.cpu.tables import FLAT, PANORAMA
 
 BLOCK_WIDTH = 4
 BLOCK_HEIGHT = LANES // BLOCK_WIDTH
 ACROSS = TILE // BLOCK_WIDTH
-BLOCKS = TILE * TILE // LANES
+DOWN = TILE // BLOCK_HEIGHT
+BLOCKS = ACROSS * DOWN
 PIXELS = TILE * TILE
 CHUNK = 256  # Gaussians
+WORDS = CHUNK // 64
+ROWS = ACROSS + 1  # where the rows' edges begin, among a word's
+EDGES = ROWS + DOWN + 1
 _AHEAD = 16  # Gaussians, between asking for a record and reading it
 
 # Rows of the forms: A = (x, y, z, 1).(A_X .. A_ONE) with a pixel's offset (x, y, z) from the tile's middle; B, L alike.
@@ -30,7 +34,8 @@ ALONG_ROW, LEVEL_ROW = 14, 15
 MIDDLE = 16  # the Gaussian's point relative to the tile's middle: x, y, z
 FORMS = 19
 
-CUT = math.log2(1 / 255)  # of alpha
+CUT = math.log2(1 / 255)  # least power: log2 of alpha
+NOTHING = -1000.0  # a power far below
 MOST = 0.99
 CLOSED = 1e-6
 """A pixel takes nothing more once its transmittance is at or below this."""
@@ -83,28 +88,35 @@ def place_tile(kind, columns, rows, rotation, left, top, offsets, middle, throug
 
 
 @inlined
-def gather(records, entries, first, count, middle, exact, forms):  # type: ignore[no-untyped-def]
-    """Fill in the forms of `count` Gaussians of a tile, beginning with entry `first`.
+def gather(  # type: ignore[no-untyped-def]
+    records, values, entries, first, count, middle, exact, forms, colours
+):
+    """Fill in the forms and values of `count` Gaussians of a tile, beginning with entry `first`.
 
     Args:
         records, entries: flat.
+        values: (n, value).
         middle: the tile's.
         exact: float32 1, or 0 for the classic kernel, whose L is 1.
         forms: (FORMS CHUNK), written; past `count` the last Gaussian is repeated.
+        colours: (CHUNK value), written.
     """
-    last = first + count - 1
+    last, end = first + count - 1, len(entries) // 2 - 1
+    num_values = values.shape[1]
     for at in range(0, count, LANES):
         e = first + at
         for ahead in range(e + _AHEAD, e + _AHEAD + LANES):
-            prefetch(records, FIELDS * entries[2 * min(ahead, last)])
-        r0 = FIELDS * entries[2 * e]
-        r1 = FIELDS * entries[2 * min(e + 1, last)]
-        r2 = FIELDS * entries[2 * min(e + 2, last)]
-        r3 = FIELDS * entries[2 * min(e + 3, last)]
-        r4 = FIELDS * entries[2 * min(e + 4, last)]
-        r5 = FIELDS * entries[2 * min(e + 5, last)]
-        r6 = FIELDS * entries[2 * min(e + 6, last)]
-        r7 = FIELDS * entries[2 * min(e + 7, last)]
+            index = np.int64(element(entries, 2 * min(ahead, end)))
+            prefetch(records, FIELDS * index)
+            prefetch(values, num_values * index)
+        r0 = FIELDS * np.int64(element(entries, 2 * e))
+        r1 = FIELDS * np.int64(element(entries, 2 * min(e + 1, last)))
+        r2 = FIELDS * np.int64(element(entries, 2 * min(e + 2, last)))
+        r3 = FIELDS * np.int64(element(entries, 2 * min(e + 3, last)))
+        r4 = FIELDS * np.int64(element(entries, 2 * min(e + 4, last)))
+        r5 = FIELDS * np.int64(element(entries, 2 * min(e + 5, last)))
+        r6 = FIELDS * np.int64(element(entries, 2 * min(e + 6, last)))
+        r7 = FIELDS * np.int64(element(entries, 2 * min(e + 7, last)))
         n_x, n_y, n_z, rest_x, rest_y, rest_z, a_x, a_y = transposed(
             load(records, r0),
             load(records, r1),
@@ -142,6 +154,40 @@ def gather(records, entries, first, count, middle, exact, forms):  # type: ignor
         store(forms, MIDDLE * CHUNK + at, m_x)
         store(forms, (MIDDLE + 1) * CHUNK + at, m_y)
         store(forms, (MIDDLE + 2) * CHUNK + at, m_z)
+        for place in range(at, min(at + LANES, count)):
+            row = num_values * np.int64(element(entries, 2 * (first + place)))
+            for channel in range(num_values):
+                put(colours, num_values * place + channel, element(values, row + channel))
+
+
+@inlined
+def list_blocks(entries, first, count, touched):  # type: ignore[no-untyped-def]
+    """Which Gaussians of the chunk touch which columns and rows of blocks, as bits: a block's are in both.
+
+    Args:
+        entries: flat.
+        first: entry that bit 0 stands for.
+        touched: (WORDS EDGES) of uint64, written: words of ACROSS columns and one to spare, then of the rows.
+    """
+    touched[:] = 0
+    for at in range(count):
+        box = element(entries, 2 * (first + at) + 1)
+        bit, word = np.uint64(1) << np.uint64(at & 63), (at >> 6) * EDGES
+        _toggle(touched, word + (box & 255) // BLOCK_WIDTH, bit)
+        _toggle(touched, word + ((box >> 8) & 255) // BLOCK_WIDTH + 1, bit)
+        _toggle(touched, word + ROWS + ((box >> 16) & 255) // BLOCK_HEIGHT, bit)
+        _toggle(touched, word + ROWS + ((box >> 24) & 255) // BLOCK_HEIGHT + 1, bit)
+    # A bit was turned where its box begins, and behind its end: run along the blocks, it is set in between.
+    for word in range(0, WORDS * EDGES, EDGES):
+        for edge in range(word + 1, word + ACROSS):
+            _toggle(touched, edge, element(touched, edge - 1))
+        for edge in range(word + ROWS + 1, word + ROWS + DOWN):
+            _toggle(touched, edge, element(touched, edge - 1))
+
+
+@inlined
+def _toggle(words, at, bits):  # type: ignore[no-untyped-def]
+    put(words, at, element(words, at) ^ bits)
 
 
 @inlined
