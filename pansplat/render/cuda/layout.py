@@ -1,21 +1,21 @@
 """What the Triton kernels read and write for each Gaussian: the order of the fields in their tables.
 
-Source: docs/rendering.md, section 3. A picture's points have `axes` coordinates: three for the exact kernel (directions),
-two for the classic one (pixels).
+Source: docs/rendering.md, section 3. A picture's points have `axes` coordinates: three for the exact kernel
+(directions), two for the classic one (pixels). Both kernels have as many linear forms.
 
 A record is one row, everything that a tile needs:
 
     point       axes            the Gaussian's point, rounded to the rows' type
     remainder   axes            what rounding left, so that differences to a tile's centre keep their digits
-    forms       forms x axes    a, b and, if exact, l
+    forms       axes x axes     a, b and, if exact, l
     along       1 if exact      S'
     peak        1
     values      channels + 1    colours, then the distance
 
 A row of gradients holds, for one Gaussian in one tile, sums over the tile's pixels:
 
-    moments     forms x axes    of the slope by each form's value times (pixel - point)
-    slopes      forms           of the slope by each form's value
+    moments     axes x axes     of the slope by each form's value times (pixel - point)
+    slopes      axes            of the slope by each form's value
     along       1 if exact
     peak        1
     values      channels + 1
@@ -47,23 +47,23 @@ class Layout:
 
     @property
     def axes(self) -> int:
-        """Coordinates of a point."""
+        """Coordinates of a point, and linear forms of a Gaussian."""
         return 3 if self.exact else 2
 
     @property
-    def forms(self) -> int:
-        """Linear forms of a Gaussian."""
-        return 3 if self.exact else 2
+    def peak(self) -> int:
+        """Where a record's peak stands: behind S', if there is one, and before the values."""
+        return (2 + self.axes) * self.axes + int(self.exact)
 
     @property
     def record(self) -> int:
         """Numbers a record."""
-        return (2 + self.forms) * self.axes + int(self.exact) + 1 + self.channels + 1
+        return self.peak + 1 + self.channels + 1
 
     @property
     def gradient(self) -> int:
         """Numbers a row of gradients."""
-        return self.forms * (self.axes + 1) + int(self.exact) + 1 + self.channels + 1
+        return self.axes * (self.axes + 1) + int(self.exact) + 1 + self.channels + 1
 
 
 def pack(splats: Splats, layout: Layout) -> Float[Tensor, "n record"]:
@@ -71,7 +71,7 @@ def pack(splats: Splats, layout: Layout) -> Float[Tensor, "n record"]:
     dtype = splats.forms.dtype
     point = splats.point[:, : layout.axes].double()
     rounded = point.to(dtype)
-    forms = splats.forms[:, : layout.forms, : layout.axes].flatten(1)
+    forms = splats.forms[:, : layout.axes, : layout.axes].flatten(1)
     along = [splats.along[:, None]] if layout.exact else []
     parts = (rounded, (point - rounded.double()).to(dtype), forms, *along, splats.peak[:, None], splats.values)
     return torch.cat(parts, dim=1).contiguous()
@@ -84,10 +84,10 @@ def unpack(gradient: Float[Tensor, "n gradient"], forms: Float[Tensor, "n 3 3"],
         gradient: rows of gradients.
         forms: of the same Gaussians.
     """
-    num, axes, channels = layout.forms, layout.axes, layout.channels
-    moments, slopes, rest = gradient.split((num * axes, num, gradient.shape[1] - num * (axes + 1)), dim=1)
+    axes, channels = layout.axes, layout.channels
+    moments, slopes, rest = gradient.split((axes * axes, axes, gradient.shape[1] - axes * (axes + 1)), dim=1)
     by_form = torch.zeros_like(forms)
-    by_form[:, :num, :axes] = moments.view(-1, num, axes)
-    by_point = -(slopes.double()[:, :, None] * forms[:, :num].double()).sum(dim=1)
+    by_form[:, :axes, :axes] = moments.view(-1, axes, axes)
+    by_point = -(slopes.double()[:, :, None] * forms[:, :axes].double()).sum(dim=1)
     along = rest[:, 0] if layout.exact else torch.zeros_like(rest[:, 0])
     return Splats(by_point, by_form, along, rest[:, -channels - 2], rest[:, -channels - 1 :])

@@ -97,7 +97,7 @@ def list_instances(
 def list_tiles(instances: Instances, limit: int = _ENTRIES) -> Iterator[TileLists]:
     """Lists for all tiles, in bands of tile rows with about `limit` entries at most."""
     rows, columns = instances.grid
-    first_column, num_columns, first_row, num_rows = instances.ranges.long().unbind(1)
+    num_columns, first_row, num_rows = instances.ranges.long()[:, 1:].unbind(1)
     # Entries in each row of tiles, by differences at the instances' ends.
     change = torch.zeros(rows + 1, dtype=torch.int64, device=first_row.device)
     change.index_add_(0, first_row, num_columns)
@@ -112,7 +112,7 @@ def list_tiles(instances: Instances, limit: int = _ENTRIES) -> Iterator[TileList
         entries = torch.empty(total, dtype=torch.int32, device=ends.device)
         if total:
             grid = (triton.cdiv(total, _EMITTED.value),)
-            _emit_kernel[grid](
+            emit_kernel[grid](
                 ends, instances.ranges, instances.records, tiles, entries, len(ends), total, low, columns,
                 len(ends).bit_length(), num_warps=4,
             )  # fmt: skip
@@ -129,9 +129,9 @@ def _short_bands(longer: Iterator[tuple[int, int]], limit: int) -> Iterator[tupl
             yield start, min(start + limit, high)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["num", "total", "low", "columns", "steps"])
 @no_type_check
-def _emit_kernel(ends, ranges, records, tiles, entries, num, total, low, columns, steps):
+def emit_kernel(ends, ranges, records, tiles, entries, num, total, low, columns, steps):
     """Writes the tile and the record of each entry, instance after instance, each one's tiles row by row."""
     entry = tl.program_id(0).to(tl.int64) * _EMITTED + tl.arange(0, _EMITTED)
     inside = entry < total

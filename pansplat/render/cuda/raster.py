@@ -3,6 +3,8 @@
 Source: docs/rendering.md, section 4.
 """
 
+# ruff: noqa: RUF005  # Triton does not unpack into a tuple
+
 from typing import no_type_check
 
 import torch
@@ -28,7 +30,7 @@ from pansplat.render.cuda.response import (
 from pansplat.render.tiles import tile_grid
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["first_tile", "columns", "tiles", "height", "width"])
 @no_type_check
 def raster_kernel(
     records,
@@ -45,13 +47,12 @@ def raster_kernel(
     height,
     width,
     TINY: tl.constexpr,
+    AXES: tl.constexpr,
     CHANNELS: tl.constexpr,
-    EXACT: tl.constexpr,
+    RECORD: tl.constexpr,
+    PEAK: tl.constexpr,
 ):
     """One program a tile: sums of weight x (channels, distance, 1), and the entry at which it stopped."""
-    AXES: tl.constexpr = 3 if EXACT else 2
-    ROW: tl.constexpr = (17 if EXACT else 9) + CHANNELS + 1
-    PEAK: tl.constexpr = 16 if EXACT else 8
     local = tl.load(busiest + tl.program_id(0)).to(tl.int64)
     tile = first_tile + local
     pixel = tl.arange(0, PIXELS)
@@ -66,10 +67,9 @@ def raster_kernel(
     while (entry < end) & (tl.max(through, axis=0) > SATURATED):
         step_end = tl.minimum(entry + STEP, end)
         for at in range(entry, step_end):
-            record = load_numbers(records + tl.load(entries + at).to(tl.int64) * ROW, ROW)
-            delta, forms = form_values(record, centre, offset, EXACT)
-            falloff, spread, ahead, divisor = fall_off(record, forms, TINY, EXACT)
-            weight = limit(record[PEAK] * falloff)
+            record = load_numbers(records + tl.load(entries + at).to(tl.int64) * RECORD, RECORD)
+            forms = form_values(record, centre, offset, AXES)[1]
+            weight = limit(record[PEAK] * fall_off(forms, record[PEAK - 1], TINY, AXES)[0])
             weight, through = weight * through, through - weight * through
             added = ()
             for c in tl.static_range(CHANNELS + 1):
@@ -106,8 +106,7 @@ def raster(
     stops = torch.empty(tiles, dtype=torch.int32, device=records.device)
     raster_kernel[(tiles,)](
         records, lists.entries, lists.starts, busiest_first(lists), pixels.centres, pixels.offsets, sums, stops,
-        *place(lists, sums), TINY=tiny(records), CHANNELS=layout.channels, EXACT=layout.exact,
-        num_warps=num_warps(layout, 2),
+        *place(lists, sums), **sizes(records, layout), num_warps=num_warps(layout, 2),
     )  # fmt: skip
     return stops
 
@@ -124,9 +123,10 @@ def place(lists: TileLists, sums: Float[Tensor, "picture sums height width"]) ->
     return lists.rows[0] * columns, columns, rows * columns, height, width
 
 
-def tiny(records: Float[Tensor, "n record"]) -> float:
-    """Least value of L that counts as such."""
-    return torch.finfo(records.dtype).eps ** 0.5
+def sizes(records: Float[Tensor, "n record"], layout: Layout) -> dict[str, int | float]:
+    """What the kernels are compiled for; TINY is the least value of L that counts as such."""
+    tiny = torch.finfo(records.dtype).eps ** 0.5
+    return dict(TINY=tiny, AXES=layout.axes, CHANNELS=layout.channels, RECORD=layout.record, PEAK=layout.peak)
 
 
 def num_warps(layout: Layout, usual: int) -> int:

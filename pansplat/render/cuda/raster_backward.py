@@ -5,6 +5,8 @@ has been passed, so nothing is divided by a transmittance. No atomics: every ent
 Gaussian lie together and are summed in a fixed order, so that gradients repeat bit for bit.
 """
 
+# ruff: noqa: RUF005  # Triton does not unpack into a tuple
+
 from typing import no_type_check
 
 import torch
@@ -16,7 +18,7 @@ from torch import Tensor
 from pansplat.render.cuda.layout import Layout
 from pansplat.render.cuda.lists import Instances, TileLists
 from pansplat.render.cuda.pixels import TilePixels
-from pansplat.render.cuda.raster import busiest_first, num_warps, place, tiny
+from pansplat.render.cuda.raster import busiest_first, num_warps, place, sizes
 from pansplat.render.cuda.response import (
     LARGEST_ALPHA,
     PIXELS,
@@ -32,7 +34,7 @@ _MANY = 32
 """Tiles beyond which one instance's rows are summed by a program of its own."""
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["first_tile", "columns", "tiles", "height", "width"])
 @no_type_check
 def backward_kernel(
     records,
@@ -52,15 +54,14 @@ def backward_kernel(
     height,
     width,
     TINY: tl.constexpr,
+    AXES: tl.constexpr,
     CHANNELS: tl.constexpr,
-    EXACT: tl.constexpr,
+    RECORD: tl.constexpr,
+    PEAK: tl.constexpr,
+    GRADIENT: tl.constexpr,
     FIELDS: tl.constexpr,
 ):
     """One program a tile: writes the row of gradients of each of its entries."""
-    AXES: tl.constexpr = 3 if EXACT else 2
-    RECORD: tl.constexpr = (17 if EXACT else 9) + CHANNELS + 1
-    PEAK: tl.constexpr = 16 if EXACT else 8
-    GRADIENT: tl.constexpr = (14 if EXACT else 7) + CHANNELS + 1
     local = tl.load(busiest + tl.program_id(0)).to(tl.int64)
     tile = first_tile + local
     pixel = tl.arange(0, PIXELS)
@@ -82,8 +83,8 @@ def backward_kernel(
     field = tl.arange(0, FIELDS)
     for at in range(tl.load(starts + local), tl.load(stops + local)):
         record = load_numbers(records + tl.load(entries + at).to(tl.int64) * RECORD, RECORD)
-        delta, forms = form_values(record, centre, offset, EXACT)
-        falloff, spread, ahead, divisor = fall_off(record, forms, TINY, EXACT)
+        delta, forms = form_values(record, centre, offset, AXES)
+        falloff, spread, ahead, divisor = fall_off(forms, record[PEAK - 1], TINY, AXES)
         raw = record[PEAK] * falloff
         alpha = limit(raw)
         weight = alpha * through
@@ -95,16 +96,16 @@ def backward_kernel(
         through = through - weight
         by_peak = tl.where((alpha > 0) & (raw <= LARGEST_ALPHA), by_alpha * falloff, 0.0)
         by_q = -0.5 * record[PEAK] * by_peak
-        if EXACT:
+        if AXES == 3:
             by_spread = by_q / divisor  # of q = Q / D before D is seen to depend on Q
             by_divisor = -by_spread * (spread / divisor)
             bounded = tl.maximum(ahead, TINY)
             by_ahead = tl.where(ahead >= TINY, 2 * bounded * by_divisor, 0.0)
-            by_spread += record[15] * by_divisor
+            by_spread += record[PEAK - 1] * by_divisor
             by_form = (2 * by_spread * forms[0], 2 * by_spread * forms[1], by_ahead)
-            sums_of = moments(by_form, delta, EXACT) + (tl.sum(by_divisor * spread, axis=0),)
+            sums_of = moments(by_form, delta, AXES) + (tl.sum(by_divisor * spread, axis=0),)
         else:
-            sums_of = moments((2 * by_q * forms[0], 2 * by_q * forms[1]), delta, EXACT)
+            sums_of = moments((2 * by_q * forms[0], 2 * by_q * forms[1]), delta, AXES)
         sums_of = sums_of + (tl.sum(by_peak, axis=0),)
         for c in tl.static_range(CHANNELS + 1):
             sums_of = sums_of + (tl.sum(weight * grad[c], axis=0),)
@@ -116,21 +117,20 @@ def backward_kernel(
 
 @triton.jit
 @no_type_check
-def moments(slopes, delta, EXACT: tl.constexpr):
+def moments(slopes, delta, AXES: tl.constexpr):
     """Sums over pixels of slope x (pixel - point), form by form, then of the slopes."""
-    FORMS: tl.constexpr = 3 if EXACT else 2
     found = ()
-    for f in tl.static_range(FORMS):
-        for k in tl.static_range(FORMS):
+    for f in tl.static_range(AXES):
+        for k in tl.static_range(AXES):
             found = found + (tl.sum(slopes[f] * delta[k], axis=0),)
-    for f in tl.static_range(FORMS):
+    for f in tl.static_range(AXES):
         found = found + (tl.sum(slopes[f], axis=0),)
     return found
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["num"])
 @no_type_check
-def _reduce_kernel(
+def reduce_kernel(
     rows,
     ends,
     which,
@@ -186,8 +186,8 @@ def raster_backward(
     rows = records.new_zeros(len(lists.entries), num)  # tiles that stopped early leave theirs at 0
     backward_kernel[(tiles,)](
         records, lists.entries, lists.slots, lists.starts, stops, busiest_first(lists), pixels.centres, pixels.offsets,
-        sums, grad_sums, rows, *place(lists, sums), TINY=tiny(records), CHANNELS=layout.channels, EXACT=layout.exact,
-        FIELDS=fields, num_warps=num_warps(layout, 1),
+        sums, grad_sums, rows, *place(lists, sums), **sizes(records, layout), GRADIENT=num, FIELDS=fields,
+        num_warps=num_warps(layout, 1),
     )  # fmt: skip
     counts = lists.ends.diff(prepend=lists.ends.new_zeros(1))
     few = torch.nonzero((counts > 0) & (counts <= _MANY))[:, 0].int()
@@ -195,7 +195,7 @@ def raster_backward(
     for which, group, at_once in ((few, 16, 1), (many, 1, 16)):
         if len(which):
             grid = (triton.cdiv(len(which), group),)
-            _reduce_kernel[grid](
+            reduce_kernel[grid](
                 rows, lists.ends, which, totals, len(which),
                 GRADIENT=num, FIELDS=fields, GROUP=group, AT_ONCE=at_once, num_warps=2,
             )  # fmt: skip

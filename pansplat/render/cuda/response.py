@@ -8,6 +8,8 @@ times an arithmetic instruction: with four or eight pixels a thread they hide be
 saturated is asked once in 32 records, because the answer needs all its threads.
 """
 
+# ruff: noqa: RUF005  # Triton does not unpack into a tuple
+
 from typing import no_type_check
 
 import triton
@@ -50,7 +52,7 @@ def load_rows(pointer, stride, index, NUM: tl.constexpr):
 
 @triton.jit
 @no_type_check
-def form_values(record, centre, offsets, EXACT: tl.constexpr):
+def form_values(record, centre, offsets, AXES: tl.constexpr):
     """The pixels relative to a Gaussian's point, and its linear forms there.
 
     Args:
@@ -58,15 +60,13 @@ def form_values(record, centre, offsets, EXACT: tl.constexpr):
         centre: of the tile, and what rounding left of it.
         offsets: pixels relative to the centre.
     """
-    AXES: tl.constexpr = 3 if EXACT else 2
-    FORMS: tl.constexpr = 3 if EXACT else 2
     delta = ()
     for k in tl.static_range(AXES):
         # Both differences are exact or tiny: no digits of the pixel are lost.
         point = (record[k] - centre[k]) + (record[AXES + k] - centre[AXES + k])
         delta = delta + (offsets[k] - point,)
     forms = ()
-    for f in tl.static_range(FORMS):
+    for f in tl.static_range(AXES):
         value = record[(2 + f) * AXES] * delta[0]
         for k in tl.static_range(1, AXES):
             value += record[(2 + f) * AXES + k] * delta[k]
@@ -76,14 +76,14 @@ def form_values(record, centre, offsets, EXACT: tl.constexpr):
 
 @triton.jit
 @no_type_check
-def fall_off(record, forms, TINY: tl.constexpr, EXACT: tl.constexpr):
-    """exp(-q / 2) at pixels (0 behind the eye), with Q, L and Q's divisor, L being 1 + the third form."""
+def fall_off(forms, along, TINY: tl.constexpr, AXES: tl.constexpr):
+    """exp(-q / 2) at pixels (0 behind the eye); for the exact kernel also Q, L and the divisor in q = Q / divisor."""
     spread = forms[0] * forms[0] + forms[1] * forms[1]
-    if EXACT:
+    if AXES == 3:
         ahead = 1 + forms[2]
         # The bound only matters within a hair of the plane through the eye; it keeps slopes finite there.
         bounded = tl.maximum(ahead, TINY)
-        divisor = bounded * bounded + record[15] * spread
+        divisor = bounded * bounded + along * spread
         falloff = tl.where(ahead > 0, tl.exp2((spread / divisor) * _BITS), 0.0)
         return falloff, spread, ahead, divisor
     else:
