@@ -67,7 +67,8 @@ def _sphere_positions(points: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
     height, width = rays.shape[:2]
     x, y, z = points
     ray_x, ray_y, ray_z = rays.unbind(-1)
-    flat, ray_flat = torch.hypot(x, z), torch.hypot(ray_x, ray_z)
+    # Unlike a hypotenuse, these round the same way whether or not they are vectorised.
+    flat, ray_flat = (x * x + z * z).sqrt(), (ray_x * ray_x + ray_z * ray_z).sqrt()
     east = torch.atan2(x * ray_z - z * ray_x, z * ray_z + x * ray_x)
     down = torch.atan2(y * ray_flat - flat * ray_y, flat * ray_flat + y * ray_y)
     columns = torch.arange(width, dtype=x.dtype, device=x.device) + east * (width / (2 * math.pi))

@@ -1,0 +1,241 @@
+"""The spherical sweep: what another camera sees of points on spheres about this one."""
+
+import math
+
+import pytest
+import torch
+
+from pansplat.geometry import sweep
+from pansplat.geometry.correlation_kernel import correlate_positions
+from pansplat.geometry.equirect import pixel_directions, sample_equirect, uv_from_directions
+from pansplat.geometry.pose import rotations_from_quats
+from pansplat.geometry.sweep import correlate, relative_pose, sweep_positions, warp_panorama
+
+SAMPLINGS = ("sphere", "corners")
+H, W = 8, 16
+
+
+def _noise(*shape, seed=0):
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def _inverse_depth(*shape):
+    return 0.05 + 2 * torch.rand(shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+
+
+def _poses(count, baseline=0.5):
+    poses = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    poses[:, :3, :3] = rotations_from_quats(_noise(count, 4, seed=1))
+    poses[:, :3, 3] = baseline * _noise(count, 3, seed=2)
+    return poses
+
+
+def _turn_about_y(angle):
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[0, 0] = pose[2, 2] = math.cos(angle)
+    pose[0, 2], pose[2, 0] = math.sin(angle), -math.sin(angle)
+    return pose
+
+
+# Warping
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("height", [8, 30, 64])
+def test_identity_pose_warps_to_identity(height, dtype):
+    maps = _noise(1, 3, height, 2 * height).to(dtype)
+    inverse_depth = _inverse_depth(1, 4, height, 2 * height).to(dtype)
+    warped = warp_panorama(maps, inverse_depth, torch.eye(4)[None])
+    error = (warped - maps[:, :, None]).abs().max()
+    assert error < (2e-4 if dtype == torch.float32 else 1e-12)
+    columns, rows = sweep_positions(inverse_depth, torch.eye(4)[None], "sphere")
+    assert torch.equal(columns, torch.arange(2 * height).to(dtype).expand_as(columns))
+    assert torch.equal(rows, torch.arange(height).to(dtype)[:, None].expand_as(rows))
+
+
+def test_a_warp_samples_the_panorama_where_the_point_is_seen():
+    maps, inverse_depth, poses = _noise(2, 3, H, W), _inverse_depth(2, 4, H, W), _poses(2)
+    points = pixel_directions(H, W, dtype=torch.float64) / inverse_depth[..., None]
+    points = torch.einsum("nij,ndhwj->ndhwi", poses[:, :3, :3], points) + poses[:, None, None, None, :3, 3]
+    truth = torch.stack([sample_equirect(image, uv_from_directions(p)) for image, p in zip(maps, points, strict=True)])
+    assert torch.allclose(warp_panorama(maps, inverse_depth, poses), truth, atol=1e-11)
+
+
+def test_turning_by_whole_columns_rolls_the_panorama():
+    maps, inverse_depth = _noise(1, 2, H, W), _inverse_depth(1, 2, H, W)
+    for columns in (1, 5, 8):
+        pose = _turn_about_y(columns * 2 * math.pi / W)[None]
+        warped = warp_panorama(maps, inverse_depth, pose)
+        assert torch.allclose(warped, maps.roll(-columns, -1)[:, :, None].expand_as(warped), atol=1e-12)
+
+
+def test_without_a_baseline_depth_does_not_matter():
+    pose = _poses(1, baseline=0.0).float()
+    warped = warp_panorama(_noise(1, 2, H, W).float(), _inverse_depth(1, 6, H, W).float(), pose)
+    assert torch.equal(warped, warped[:, :, :1].expand_as(warped))
+
+
+def test_the_originals_warp_is_reproduced(golden):
+    units = golden("units")
+    feature, depth = units["warp.feature"], units["warp.depth"]
+    warped = warp_panorama(feature, 1 / depth, units["warp.pose"], "corners")
+    error = (warped - units["warp.out"]).abs().max() / units["warp.out"].std()
+    assert error < 2e-4
+    fixed = warp_panorama(feature, 1 / depth, units["warp.pose"], "sphere")
+    assert (fixed - units["warp.out"]).abs().max() / units["warp.out"].std() > 0.5
+
+
+def test_the_originals_identity_is_off_by_half_a_pixel_at_the_borders():
+    columns, _ = sweep_positions(torch.ones(1, 1, H, W, dtype=torch.float64), torch.eye(4)[None], "corners")
+    expected = (torch.arange(W) + 0.5) / W * (W - 1)
+    assert torch.allclose(columns[0, 0, 0], expected.double(), atol=1e-6)
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_a_point_in_the_other_camera_is_finite(sampling):
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = -2 * pixel_directions(H, W, dtype=torch.float64)[3, 5]
+    inverse_depth = torch.full((1, 1, H, W), 0.5, dtype=torch.float64)
+    assert torch.isfinite(warp_panorama(_noise(1, 2, H, W), inverse_depth, pose[None], sampling)).all()
+
+
+def test_a_point_at_infinity_turns_with_the_camera_only():
+    poses = _poses(1)
+    far, turned = torch.zeros(1, 1, H, W, dtype=torch.float64), poses.clone()
+    turned[:, :3, 3] = 0
+    maps = _noise(1, 2, H, W)
+    assert torch.allclose(warp_panorama(maps, far, poses), warp_panorama(maps, far, turned), atol=1e-12)
+
+
+def test_a_relative_pose_keeps_double_precision():
+    near_origin, shift = _poses(2), torch.tensor((1e4, -2e4, 3e4), dtype=torch.float64)
+    moved = near_origin.clone()
+    moved[:, :3, 3] += shift
+    assert torch.allclose(relative_pose(moved[0], moved[1]), relative_pose(near_origin[0], near_origin[1]), atol=1e-10)
+    assert relative_pose(moved[0].float(), moved[1].float()).dtype == torch.float64
+    point = torch.tensor((1.0, 2.0, 3.0, 1.0), dtype=torch.float64)
+    assert torch.allclose(near_origin[1] @ relative_pose(*near_origin) @ point, near_origin[0] @ point, atol=1e-12)
+
+
+# Correlation
+
+
+def _truth(reference, other, inverse_depth, pose, sampling):
+    warped = warp_panorama(other, inverse_depth, pose, sampling)
+    return (reference[:, :, None] * warped).sum(dim=1) / math.sqrt(reference.shape[1])
+
+
+def _inputs(channels=5, candidates=7, height=H):
+    return (
+        _noise(2, channels, height, 2 * height, seed=5),
+        _noise(2, channels, height, 2 * height, seed=6),
+        _inverse_depth(2, candidates, height, 2 * height),
+        _poses(2),
+    )
+
+
+@pytest.mark.parametrize("backend", ["torch", "kernel"])
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_correlation_is_the_product_with_the_warped_panorama(sampling, backend):
+    reference, other, inverse_depth, poses = _inputs()
+    reference.requires_grad_()
+    other.requires_grad_()
+    truth = _truth(reference, other, inverse_depth, poses, sampling)
+    result = correlate(reference, other, inverse_depth, poses, sampling, backend)
+    assert torch.allclose(result, truth, atol=1e-12)
+    upstream = torch.randn_like(truth)
+    expected = torch.autograd.grad(truth, (reference, other), upstream)
+    for gradient, right in zip(torch.autograd.grad(result, (reference, other), upstream), expected, strict=True):
+        assert torch.allclose(gradient, right, atol=1e-12)
+
+
+@pytest.mark.parametrize("backend", ["torch", "kernel"])
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_float32_correlation_is_within_1e_4_of_float64(sampling, backend):
+    inputs = _inputs(channels=64, candidates=16, height=32)
+    truth = correlate(*inputs, sampling, "torch")
+    single = correlate(*(tensor.float() for tensor in inputs), sampling, backend)
+    # Rounding moves a sample that is just about to leave the map across its border, where zeros begin.
+    error = (single - truth).abs().flatten().sort().values
+    assert error[int(0.999 * len(error))] < 1e-4 * truth.std()
+    assert sampling == "corners" or error[-1] < 3e-4 * truth.std()
+
+
+@pytest.mark.parametrize("backend", ["torch", "kernel"])
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_correlation_has_the_right_gradient(sampling, backend):
+    reference, other, inverse_depth, poses = _inputs(channels=2, candidates=3, height=4)
+    reference.requires_grad_()
+    other.requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda a, b: correlate(a, b, inverse_depth, poses, sampling, backend), (reference, other)
+    )
+
+
+def test_no_gradient_flows_to_candidates_and_poses():
+    inputs = [tensor.requires_grad_() for tensor in _inputs()]
+    correlate(*inputs).sum().backward()
+    assert inputs[0].grad is not None and inputs[1].grad is not None
+    assert inputs[2].grad is None and inputs[3].grad is None
+
+
+@pytest.mark.parametrize("backend", ["torch", "kernel"])
+def test_chunks_do_not_change_the_correlation(backend, monkeypatch):
+    reference, other, inverse_depth, poses = _inputs()
+
+    def run():
+        a, b = reference.clone().requires_grad_(), other.clone().requires_grad_()
+        result = correlate(a, b, inverse_depth, poses, "sphere", backend)
+        return (result, *torch.autograd.grad(result.square().sum(), (a, b)))
+
+    whole = run()
+    monkeypatch.setattr(sweep, "_CHUNK", 1)
+    for part, expected in zip(run(), whole, strict=True):
+        assert torch.allclose(part, expected, atol=1e-12)
+
+
+def test_warped_features_of_all_candidates_never_exist_at_once(monkeypatch):
+    inputs = [tensor.requires_grad_() for tensor in _inputs()]
+    limit, seen = 3 * inputs[0].numel(), []
+    monkeypatch.setattr(sweep, "_CHUNK", limit)
+
+    def spy(*args):
+        seen.append(warp_panorama(*args))
+        return seen[-1]
+
+    monkeypatch.setattr(sweep, "warp_panorama", spy)
+    correlate(*inputs, "sphere", "torch").sum().backward()
+    assert len(seen) == 2 * 3 and max(warped.numel() for warped in seen) <= limit
+
+
+def test_threads_do_not_change_the_kernels_bits():
+    reference, other, inverse_depth, poses = (tensor.float() for tensor in _inputs())
+    positions = sweep_positions(inverse_depth, poses, "sphere")
+    threads = torch.get_num_threads()
+    results = []
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            results.append(correlate_positions(reference, other, *positions, wraps=True))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_features_are_multiplied_in_float32(dtype):
+    reference, other, inverse_depth, poses = (tensor.float() for tensor in _inputs())
+    reference, other = reference.to(dtype).requires_grad_(), other.to(dtype).requires_grad_()
+    result = correlate(reference, other, inverse_depth, poses)
+    assert result.dtype == torch.float32
+    assert torch.equal(result, correlate(reference.float(), other.float(), inverse_depth, poses))
+    result.sum().backward()
+    assert reference.grad.dtype == dtype and torch.isfinite(reference.grad).all()
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_a_pose_that_is_no_number_gives_no_number(sampling):
+    reference, other, inverse_depth, poses = _inputs()
+    poses[1, 0, 3] = math.nan
+    result = correlate(reference, other, inverse_depth, poses, sampling, "kernel")
+    assert torch.isfinite(result[0]).all() and result[1].isnan().all()
