@@ -2,3 +2,7 @@
 
 Source: docs/rendering.md; docs/rasterizer.md tells how it works.
 """
+
+from pansplat.render.cpu.draw import draw
+
+__all__ = ["draw"]

@@ -1,0 +1,293 @@
+"""The stages joined into a backend: torch tensors in, sums and gradients out.
+
+Source: docs/rendering.md; docs/rasterizer.md tells what each stage costs.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pansplat.errors import InputError
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.render.backend import EWA_NEAR, Drawn, Info, Options
+from pansplat.render.cpu import bins
+from pansplat.render.cpu.bins import TileLists, list_tiles
+from pansplat.render.cpu.boxes import LARGEST_SIDE, find_boxes
+from pansplat.render.cpu.compiling import announced
+from pansplat.render.cpu.ewa import project, project_backward
+from pansplat.render.cpu.observe import PIECE, Camera, Fields, Observed, observe
+from pansplat.render.cpu.observe_backward import Gradients, add_slots, chain
+from pansplat.render.cpu.radix import front_to_back
+from pansplat.render.cpu.raster import raster_forward
+from pansplat.render.cpu.raster_backward import raster_backward
+from pansplat.render.cpu.records import FIELDS
+from pansplat.render.cpu.tables import plane_of
+from pansplat.render.cpu.threads import share, thread_count
+from pansplat.render.panorama import Picture
+from pansplat.render.splats import near_enough, sound
+
+_LEAST_SPREAD = 1e-9  # pixel^2: without a filter a disc seen edge-on would have no width to divide by
+
+
+class Projection(NamedTuple):
+    """What one picture shows: records, boxes, and the Gaussians seen, front to back."""
+
+    records: np.ndarray
+    boxes: np.ndarray
+    order: np.ndarray
+
+
+@dataclass
+class _Notes:
+    """What is told about a picture: counts, seconds by stage, and bytes of the arrays alive at once."""
+
+    dropped: int = 0
+    near: int = 0
+    visible: int = 0
+    entries: int = 0
+    bytes: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the seconds that something takes to a stage."""
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+
+@torch.compiler.disable
+def draw(
+    gaussians: Gaussians,
+    covariances: Float[Tensor, "n 3 3"] | None,
+    pose: Float[Tensor, "4 4"],
+    pictures: list[Picture],
+    options: Options,
+) -> Drawn:
+    """Draw by numba kernels, in float32; see `pansplat.render.backend.Draw`.
+
+    Raises:
+        InputError: the Gaussians are not in main memory, a picture's side is above 32767 pixels, or
+            `options.strict` and a Gaussian is not finite.
+    """
+    if gaussians.means.device.type != "cpu":
+        raise InputError(
+            f"backend 'numba' draws Gaussians in main memory, got them on {gaussians.means.device}; use "
+            "backend='auto', or move them with gaussians.to(device='cpu')"
+        )
+    if max(pictures[0].size) > LARGEST_SIDE:
+        raise InputError(
+            f"`size` must be at most {LARGEST_SIDE} pixels a side for backend 'numba', got {pictures[0].size}; "
+            "draw a smaller picture, or use backend='torch'"
+        )
+    dtype = gaussians.means.dtype
+    shape = (gaussians.quats, gaussians.scales, None) if covariances is None else (None, None, covariances)
+    fields = (gaussians.means, *shape, gaussians.opacities, gaussians.harmonics)
+    fields = tuple(None if f is None else f.to(torch.float32).contiguous() for f in fields)
+    notes = _Notes()
+    sums = _Draw.apply(*fields, pose, pictures, options, notes)
+    if options.strict and notes.dropped:
+        raise InputError(_complaint(gaussians, covariances, pose, notes.dropped))
+    info = Info(
+        len(gaussians), notes.dropped, notes.near, notes.visible, notes.entries, "numba", notes.bytes, notes.seconds
+    )
+    return Drawn(sums.to(dtype), info)
+
+
+def _complaint(gaussians: Gaussians, covariances: Tensor | None, pose: Tensor, dropped: int) -> str:
+    radius = torch.linalg.vector_norm(gaussians.means.detach().double() - pose.detach()[:3, 3], dim=1)
+    usable = sound(gaussians, covariances) & near_enough(gaussians, covariances, radius)
+    return (
+        f"`gaussians` must hold only finite numbers, got {dropped} of {len(gaussians)} that do not (the "
+        f"first is number {int(torch.nonzero(~usable)[0, 0])}); remove them, or render with strict=False to leave "
+        "them out"
+    )
+
+
+class _Draw(torch.autograd.Function):
+    """The sums of all pictures, differentiable once in the fields and the pose."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor | None,
+        scales: Tensor | None,
+        covariances: Tensor | None,
+        opacities: Tensor,
+        harmonics: Tensor,
+        pose: Tensor,
+        pictures: list[Picture],
+        options: Options,
+        notes: _Notes,
+    ) -> Tensor:
+        tensors = means, quats, scales, covariances, opacities, harmonics
+        fields, camera = _fields(*tensors), _camera(pose, pictures[0], options)
+        threads, needs_grad = thread_count(), any(ctx.needs_input_grad)
+        height, width = pictures[0].size
+        with announced():
+            with notes.timed("observe"):
+                observed = observe(fields, camera, threads)
+            sums = np.empty((len(pictures), harmonics.shape[2] + 2, height, width), np.float32)
+            kept = [
+                _draw_picture(observed, picture, options, sums[number], notes, needs_grad, threads)
+                for number, picture in enumerate(pictures)
+            ]
+        notes.dropped, notes.near = observed.dropped, observed.near
+        notes.bytes += sums.nbytes + sum(part.nbytes for part in observed[:3])
+        result = torch.from_numpy(sums)
+        if needs_grad:
+            ctx.save_for_backward(*tensors, pose, result)
+            ctx.plan = pictures, options, observed, kept, threads
+        return result
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():  # create_graph=True
+            raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
+        *tensors, pose, sums = ctx.saved_tensors
+        pictures, options, observed, kept, threads = ctx.plan
+        fields, camera = _fields(*tensors), _camera(pose, pictures[0], options)
+        grad_sums = grad_outputs[0].contiguous().numpy()
+        wanted = [
+            torch.empty_like(tensor) if needed else None
+            for tensor, needed in zip(tensors, ctx.needs_input_grad, strict=False)
+        ]
+        with announced():
+            slots = _slot_gradients(observed, pictures, options, kept, sums.numpy(), grad_sums, threads)
+            arrays = (
+                np.empty((0, *field.shape[1:]), np.float32) if grad is None else grad.numpy()
+                for field, grad in zip(fields, wanted, strict=True)
+            )
+            filled = chain(fields, camera, observed, *slots, Gradients(*arrays, pose=np.zeros((3, 4))), threads)
+        grad_pose = None
+        if ctx.needs_input_grad[6]:
+            grad_pose = torch.zeros_like(pose)
+            grad_pose[:3] = torch.from_numpy(filled.pose)
+        return (*wanted, grad_pose, None, None, None)
+
+
+def _fields(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    covariances: Tensor | None,
+    opacities: Tensor,
+    harmonics: Tensor,
+) -> Fields:
+    """The tensors as arrays, no rows for those not given."""
+    given = (means, quats, scales, covariances, opacities, harmonics)
+    shapes = ((3,), (4,), (3,), (3, 3), (), harmonics.shape[1:])
+    return Fields(
+        *(
+            np.empty((0, *shape), np.float32) if tensor is None else tensor.detach().numpy()
+            for tensor, shape in zip(given, shapes, strict=True)
+        )
+    )
+
+
+def _camera(pose: Tensor, picture: Picture, options: Options) -> Camera:
+    least = _LEAST_SPREAD * picture.pixel_angle**2
+    return Camera(
+        np.ascontiguousarray(pose.detach().numpy()),
+        max(options.spread(picture.pixel_angle), least),
+        options.lowpass == "angular",
+        options.near,
+    )
+
+
+def _draw_picture(
+    observed: Observed,
+    picture: Picture,
+    options: Options,
+    sums: np.ndarray,
+    notes: _Notes,
+    needs_grad: bool,
+    threads: int,
+) -> tuple[Projection, TileLists | None] | None:
+    """Write one picture's sums, and return what its backward needs; the lists only if they came in one band."""
+    with notes.timed("boxes"):
+        records, boxes = _place(observed, picture, options, threads)
+    with notes.timed("sort"):
+        by_depth = options.order == "z" and not picture.is_panorama
+        towards = picture.rotation[:, 2].numpy().copy() if by_depth else np.zeros(3)
+        order = front_to_back(observed.records, observed.radii, boxes, towards, threads)
+    plane = plane_of(picture, exact=options.kernel == "ray")
+    several = 0
+    with notes.timed("bin"):
+        bands = list_tiles(order, boxes, picture.size, slots=needs_grad, threads=threads, limit=bins.LIMIT)
+        lists = next(bands)
+    while True:
+        with notes.timed("raster"):
+            raster_forward(
+                records, observed.values, lists.entries, lists.starts, plane, sums,
+                first_row=lists.first_row, threads=threads,
+            )  # fmt: skip
+        notes.entries += len(lists.entries)
+        own = records.nbytes if records is not observed.records else 0
+        listed = sum(part.nbytes for part in (lists.entries, lists.starts, lists.slots, lists.offsets))
+        notes.bytes = max(notes.bytes, own + 2 * boxes.nbytes + order.nbytes + max(listed, 16 * len(order)))
+        with notes.timed("bin"):
+            following = next(bands, None)
+        if following is None:
+            break
+        lists, several = following, several + 1
+    notes.visible += len(order)
+    return (Projection(records, boxes, order), None if several else lists) if needs_grad else None
+
+
+def _place(observed: Observed, picture: Picture, options: Options, threads: int) -> tuple[np.ndarray, np.ndarray]:
+    """Records and boxes on a picture."""
+    if options.kernel == "ewa":
+        return project(observed, picture, options.dilation, EWA_NEAR * options.near, threads)
+    return observed.records, find_boxes(observed.records, picture, threads)
+
+
+def _slot_gradients(
+    observed: Observed,
+    pictures: list[Picture],
+    options: Options,
+    kept: list[tuple[Projection, TileLists | None]],
+    sums: np.ndarray,
+    grad_sums: np.ndarray,
+    threads: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gradients of the camera's records and values in slots, and where each Gaussian's slots begin."""
+    num, num_values = observed.values.shape
+    exact = options.kernel == "ray"
+    alone = exact and len(pictures) == 1 and kept[0][1] is not None
+    total_records = np.zeros((0 if alone else num, FIELDS), np.float32)
+    total_values = np.zeros((0 if alone else num, num_values), np.float32)
+    pieces = -(-num // PIECE)
+    for number, (picture, (projection, only)) in enumerate(zip(pictures, kept, strict=True)):
+        plane = plane_of(picture, exact=exact)
+        bands = [only] if only else list_tiles(
+            projection.order, projection.boxes, picture.size, slots=True, threads=threads, limit=bins.LIMIT
+        )  # fmt: skip
+        for lists in bands:
+            grad_records = np.empty((len(lists.entries), FIELDS), np.float32)
+            grad_values = np.empty((len(lists.entries), num_values), np.float32)
+            raster_backward(
+                projection.records, observed.values, lists.entries, lists.starts, lists.slots, plane, sums[number],
+                grad_sums[number], grad_records, grad_values, first_row=lists.first_row, threads=threads,
+            )  # fmt: skip
+            if alone:
+                return grad_records, grad_values, lists.offsets
+            offsets = lists.offsets
+            if exact:
+                share(_adding(offsets, grad_records, total_records), pieces, threads)
+            else:
+                project_backward(observed, picture, options.dilation, grad_records, offsets, total_records, threads)
+            share(_adding(offsets, grad_values, total_values), pieces, threads)
+    return total_records, total_values, np.arange(num + 1)
+
+
+def _adding(offsets: np.ndarray, slots: np.ndarray, totals: np.ndarray) -> Any:
+    return lambda piece: add_slots(piece, offsets, slots, totals)
