@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -38,7 +39,9 @@ def recipe(shared: Path) -> Callable[[str], dict[str, torch.Tensor]]:
     source.loader.exec_module(module)
 
     def make(keys: str) -> dict[str, torch.Tensor]:
-        arrays = module.state_dict(shared / "golden" / f"state_dict_{keys}.tsv")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ResourceWarning)  # the recipe leaves its file to the collector
+            arrays = module.state_dict(shared / "golden" / f"state_dict_{keys}.tsv")
         return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
     return make
