@@ -1,0 +1,135 @@
+"""Hard cases 10, 14, 15, 16 and 23: shapes at the limits of both kernels."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from pansplat.errors import InputError
+
+_PINHOLE = {"layout": "pinhole", "vertical_fov_degrees": 90.0}
+
+
+@pytest.mark.hard_case(10)
+@pytest.mark.parametrize("lowpass", ["angular", "3dgs"])
+def test_the_classic_kernel_clamps_what_lies_outside_the_view(lowpass, draw, balls, equals_dense):
+    means = [(14 * 0.3, 0.1, 0.3), (-0.5, 0.9, 0.21), (0.3, 1.4, 1.0), (0.1, -0.1, 2.0)]
+    scene = balls(means, sigma=[1.5, 0.4, 0.5, 0.3], colours=torch.rand(4, 3, dtype=torch.float64))
+    assert all(abs(x / z) > 1.3 or abs(y / z) > 1.3 for x, y, z in means[:3])
+    for i in range(4):
+        assert (
+            float(draw(scene.select(torch.tensor([i])), kernel="ewa", lowpass=lowpass, **_PINHOLE).alpha.max()) > 0.02
+        )
+    equals_dense(draw, scene, kernel="ewa", order="z", lowpass=lowpass, looser=4, **_PINHOLE)
+
+
+@pytest.mark.hard_case(10)
+def test_where_the_classic_kernel_clamps_only_the_centre_moves(draw, balls, leaves):
+    """The clamped projection hangs on x / z no more, so its variances' slopes there are those of the centre alone."""
+    scene = leaves(balls((2.0, 0.0, 1.0), 0.6).to(dtype=draw.dtype))
+    draw(scene, kernel="ewa", **_PINHOLE).alpha.sum().backward()
+    step, sums = 1e-3, []
+    for side in (-step, step):
+        sums.append(float(draw(balls((2.0 + side, 0.0, 1.0), 0.6), kernel="ewa", **_PINHOLE).alpha.double().sum()))
+    assert float(scene.means.grad[0, 0]) == pytest.approx((sums[1] - sums[0]) / (2 * step), rel=0.05)
+
+
+@pytest.mark.hard_case(14)
+@pytest.mark.parametrize("along", [0, 1, 2], ids=["across", "down", "along"])
+@pytest.mark.parametrize("kernel", ["ray", "ewa"])
+def test_needles_of_ten_thousand_to_one(along, kernel, draw, balls, equals_dense):
+    scene = balls([(0.1, 0.1, 2.0), (-0.6, 0.3, 1.5)], colours=torch.rand(2, 3, dtype=torch.float64))
+    scales = torch.full((2, 3), 1e-4, dtype=torch.float64)
+    scales[:, along] = 1.0
+    quats = torch.tensor([[0.95, 0.1, -0.05, 0.2], [1.0, 0, 0, 0]], dtype=torch.float64)
+    scene = dataclasses.replace(scene, scales=scales, quats=quats)
+    fields = ("means", "scales", "opacities", "harmonics")
+    equals_dense(draw, scene, kernel=kernel, lowpass="3dgs", fields=fields, looser=10, **_PINHOLE)
+
+
+@pytest.mark.hard_case(15)
+def test_a_disc_that_faces_the_camera_is_a_surfel(draw, balls):
+    size, sigma = (draw.height + 1, 2 * draw.height + 1), 0.5
+    scene = balls((0, 0, 2.0))
+    scene = dataclasses.replace(scene, scales=torch.tensor([[sigma, sigma, 0.0]], dtype=torch.float64))
+    alpha = draw(scene, size=size, lowpass="3dgs", **_PINHOLE).alpha.double()
+    focal = 0.5 * size[0]
+    x = (torch.arange(size[1], dtype=torch.float64) + 0.5 - 0.5 * size[1]) / focal
+    y = (torch.arange(size[0], dtype=torch.float64) + 0.5 - 0.5 * size[0]) / focal
+    squared = (x.square() + y[:, None].square()) / ((sigma / 2) ** 2 + 0.3 / focal**2)
+    expected = 0.8 * torch.exp(-0.5 * squared)
+    assert (alpha - torch.where(expected >= 1 / 255, expected, 0)).abs().max() < 10 * draw.image
+
+
+@pytest.mark.hard_case(15)
+@pytest.mark.parametrize("kernel", ["ray", "ewa"])
+@pytest.mark.parametrize("lowpass", ["angular", "3dgs"])
+def test_discs_on_edge_lines_and_points_vanish_or_stay_finite(kernel, lowpass, draw, balls, gradients):
+    flat = {"edge-on disc": (0.0, 0.5, 0.5), "line": (0.0, 0.0, 0.5), "line aside": (0.5, 0, 0), "point": (0, 0, 0)}
+    for name, scales in flat.items():
+        scene = balls((0, 0, 2.0))
+        scene = dataclasses.replace(scene, scales=torch.tensor([scales], dtype=torch.float64))
+        options = {"kernel": kernel, "lowpass": lowpass, **_PINHOLE}
+        alpha = draw(scene, **options).alpha
+        assert torch.isfinite(alpha).all()
+        if lowpass == "angular":
+            assert not alpha.any(), name  # nothing is left of what has no area
+        for field, gradient in gradients(draw, scene, **options).items():
+            assert torch.isfinite(gradient).all(), (name, field)
+            assert lowpass == "3dgs" or not gradient.any()
+
+
+@pytest.mark.hard_case(16)
+def test_specks_of_a_twentieth_pixel_keep_their_energy(draw, balls, equals_dense):
+    """Mass below the cut is missing by definition, and known: the share cut / peak of a Gaussian's mass."""
+    count, apart, focal = 9, 5, 1000.0
+    size = (count * apart, count * apart)
+    y, x = torch.meshgrid(torch.arange(count), torch.arange(count), indexing="ij")
+    places = torch.stack((x, y), dim=-1).double().reshape(-1, 2) * (apart + 1 / count) + 2.5  # every shift of a pixel
+    ahead = torch.cat(((places - 0.5 * size[0]) / focal, torch.ones(count**2, 1, dtype=torch.float64)), dim=1)
+    scene = balls(torch.nn.functional.normalize(ahead, dim=1), 0.05 / focal, 1.0)
+    fov = 2 * math.degrees(math.atan(0.5 * size[0] / focal))
+    energies = {}
+    for lowpass in ("angular", "3dgs"):
+        alpha = draw(scene, size=size, layout="pinhole", vertical_fov_degrees=fov, lowpass=lowpass).alpha.double()
+        energies[lowpass] = float(alpha.sum()) / (2 * math.pi * 0.05**2 * count**2)
+    peak = 0.05**2 / (0.05**2 + 0.1)
+    assert energies["angular"] / (1 - 1 / 255 / peak) == pytest.approx(1, abs=0.01)
+    assert energies["3dgs"] > 10  # what widening without lowering the opacity does
+    speck = balls((0.02, 0.01, 1.0), 0.3 * math.pi / draw.height, 1.0)
+    equals_dense(draw, speck, fields=("means", "scales", "opacities", "harmonics"), looser=2)
+
+
+@pytest.mark.hard_case(23)
+def test_matrices_that_are_no_covariance_are_dropped_and_counted(draw, balls, leaves, loss_of):
+    scene = balls([(0, 0, 2.0), (0.5, 0, 2.0), (-0.5, 0, 2.0)], 0.3)
+    good = scene.covariances
+    broken = {
+        "negative": torch.diag(torch.tensor((0.1, -0.1, 0.1), dtype=torch.float64)),
+        "indefinite": torch.tensor([[0.1, 0.3, 0], [0.3, 0.1, 0], [0, 0, 0.1]], dtype=torch.float64),
+        "not finite": torch.full((3, 3), math.nan, dtype=torch.float64),
+    }
+    others = scene.select(torch.tensor([0, 2]))
+    expected = draw(others, covariances=good[[0, 2]].to(draw.dtype))
+    for name, matrix in broken.items():
+        covariances = torch.stack((good[0], matrix, good[2])).to(draw.dtype).requires_grad_()
+        asked = leaves(scene.to(dtype=draw.dtype))
+        got = draw(asked, covariances=covariances)
+        assert got.info is not None and got.info.dropped == 1, name
+        assert torch.equal(got.color, expected.color)
+        loss_of(got).backward()
+        for gradient in (covariances.grad, asked.means.grad, asked.opacities.grad):
+            assert torch.isfinite(gradient).all() and not gradient[1].any() and gradient[0].any(), name
+        with pytest.raises(InputError, match=r"1 of 3 .*number 1"):
+            draw(scene, covariances=covariances.detach(), strict=True)
+    assert torch.equal(draw(scene, covariances=good).alpha, draw(scene, covariances=good.to(draw.dtype)).alpha)
+
+
+@pytest.mark.hard_case(23)
+def test_a_disc_rounded_to_a_slightly_negative_covariance_is_still_drawn(draw, balls):
+    scene = balls((0, 0, 2.0), 0.3)
+    flat = torch.diag(torch.tensor((0.09, 0.09, -1e-7), dtype=torch.float64))[None]
+    got = draw(scene, covariances=flat)
+    assert got.info is not None and got.info.dropped == 0 and float(got.alpha.max()) > 0.3
+    assert torch.isfinite(got.color).all()
