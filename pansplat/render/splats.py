@@ -106,14 +106,14 @@ def observe(
     """
     shape = (gaussians.quats, gaussians.scales) if covariances is None else (covariances,)
     fields = (gaussians.means, gaussians.opacities, gaussians.harmonics, *shape)
-    work = functools.partial(_observe_chunk, cam2world=cam2world, spread=spread, compensate=compensate, exact=exact)
+    work = functools.partial(observe_chunk, cam2world=cam2world, spread=spread, compensate=compensate, exact=exact)
     parts = []
     for chunk in zip(*(field.split(_CHUNK) for field in fields), strict=True):
         parts.append(checkpoint(work, *chunk, use_reentrant=False) if torch.is_grad_enabled() else work(*chunk))
     return Observed(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
-def _observe_chunk(
+def observe_chunk(
     means: Float[Tensor, "n 3"],
     opacities: Float[Tensor, "n"],
     harmonics: Float[Tensor, "n k channel"],
@@ -123,6 +123,13 @@ def _observe_chunk(
     compensate: bool,
     exact: bool,
 ) -> Observed:
+    """What `observe` finds, of Gaussians few enough to be observed at once.
+
+    Args:
+        means, opacities, harmonics: of the Gaussians.
+        shape: their quats and scales, or their covariances.
+        cam2world, spread, compensate, exact: see `observe`.
+    """
     dtype = means.dtype
     offset = means.double() - cam2world[:3, 3]
     radius = torch.linalg.vector_norm(offset, dim=1)
