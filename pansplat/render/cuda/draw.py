@@ -19,7 +19,7 @@ from pansplat.gaussians.gaussians import Gaussians
 from pansplat.render.backend import EWA_NEAR, Drawn, Info, Options
 from pansplat.render.panorama import Picture
 from pansplat.render.reference import drawable, in_picture, project
-from pansplat.render.splats import Observed, Splats, observe, ray_splats
+from pansplat.render.splats import Observed, Splats, ray_splats
 
 if TYPE_CHECKING:
     from pansplat.render.cuda.lists import Instances
@@ -38,6 +38,10 @@ def draw(
         InputError: Triton is not installed, or the Gaussians are not on a CUDA device; or as stated there.
     """
     _check(gaussians.means.device)
+    # Only now: the kernels need Triton.
+    from pansplat.render.cuda.composite import composite
+    from pansplat.render.cuda.observe import observe
+
     with _on(gaussians.means.device):
         keep, dropped, close = drawable(gaussians, covariances, pose.detach(), options)
         if not bool(keep.all()):
@@ -52,8 +56,6 @@ def draw(
             exact=options.kernel == "ray",
         )
         splats, instances = _splats(observed, pictures, options)
-        from pansplat.render.cuda.composite import composite
-
         sums, entries, size = composite(splats, instances, pictures, exact=options.kernel == "ray")
     visible = sum(instances.pictures)
     return Drawn(sums, Info(len(keep), dropped, close, visible, entries, backend="triton", bytes=size))

@@ -18,13 +18,17 @@ from triton.compiler import ASTSource
 
 from pansplat.render.cuda.layout import Layout
 from pansplat.render.cuda.lists import emit_kernel
+from pansplat.render.cuda.observe import observe_kernel
 from pansplat.render.cuda.raster import num_warps, raster_kernel
 from pansplat.render.cuda.raster_backward import backward_kernel, reduce_kernel
 
-_FLOATS = ("records", "centres", "offsets", "sums", "grad_sums", "rows", "totals")
+_FLOATS = ("means", "opacities", "harmonics", "first_shape", "second_shape", "peaks", "values", "forms", "alongs")
+_FLOATS += ("records", "centres", "offsets", "sums", "grad_sums", "rows", "totals")
 _INTEGERS = ("entries", "slots", "starts", "stops", "busiest", "which", "ranges")
-_TYPES = {"ends": "*i64", "tiles": "i32"}
+_DOUBLES = ("camera", "directions", "radii", "covariances")
+_TYPES = {"ends": "*i64", "tiles": "i32", **dict.fromkeys(_DOUBLES, "*fp64")}
 _SIZES = ("TINY", "AXES", "CHANNELS", "RECORD", "PEAK", "GRADIENT", "FIELDS", "GROUP", "AT_ONCE")
+_SIZES += ("DEGREE", "BY_AXES", "COMPENSATE", "EXACT", "BLOCK")
 
 
 def _type(kernel, name: str) -> str:
@@ -67,6 +71,10 @@ def main() -> None:
         for group, at_once in ((16, 1), (1, 16)):
             sizes = dict(GRADIENT=18, FIELDS=32, GROUP=group, AT_ONCE=at_once)
             _report(f"sum {group} x {at_once}", reduce_kernel, 2, capability, **sizes)
+        for by_axes in (True, False):
+            sizes = dict(DEGREE=4, CHANNELS=3, BY_AXES=by_axes, COMPENSATE=True, EXACT=True, BLOCK=128)
+            name = "scales" if by_axes else "covariances"
+            _report(f"observe, degree 4, {name}", observe_kernel, 4, capability, **sizes)
         _report("emit", emit_kernel, 4, capability)
 
 

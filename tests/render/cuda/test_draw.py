@@ -79,7 +79,7 @@ def test_gradients_equal_finite_differences(options, make_scene, pose):
 
     inputs = tuple(t.clone().requires_grad_() for t in (*(getattr(scene, name) for name in _FIELDS), pose))
     assert all(float(output.detach().abs().max()) > 0.1 for output in draw(*inputs))
-    assert torch.autograd.gradcheck(draw, inputs, eps=1e-6, atol=1e-6)
+    assert torch.autograd.gradcheck(draw, inputs, eps=1e-6, atol=1e-6, fast_mode=True)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 2), (5, 3), (16, 32), (17, 31)])
@@ -91,12 +91,15 @@ def test_odd_sizes_equal_float64_torch(size, make_scene, pose):
     assert float((got.color - truth.color).abs().max()) < 2e-6
 
 
-def test_a_gaussian_over_many_tiles_has_the_gradient_of_float64_torch(make_scene, pose):
+def test_a_gaussian_over_many_tiles_has_the_gradient_of_float64_torch(make_scene, pose, monkeypatch):
+    from pansplat.render.cuda import raster_backward
+
+    monkeypatch.setattr(raster_backward, "_MANY", 4)
     scene = make_scene(2, scale=1.5, spread=0.8, seed=1, degree=0)
-    options = dict(size=(90, 180), layout="equirect")
+    options = dict(size=(36, 72), layout="equirect")
     truth = _gradients(scene, pose, torch.float64, None, backend="torch", **options)
     got = _gradients(scene, pose, torch.float32, None, backend="triton", **options)
-    assert got[2].entries > 2 * 32  # so one has more tiles than are summed together with others
+    assert got[2].entries > 20 > 4 * 2  # so each sums its tiles in a program of its own, in more than one step
     for name, expected in truth[1].items():
         assert float((got[1][name] - expected).norm() / expected.norm()) < 1e-5, name
 
@@ -124,10 +127,10 @@ def test_narrow_bands_of_tiles_draw_the_same(make_scene, pose, monkeypatch):
     from pansplat.render.cuda import composite
 
     scene = make_scene(12, scale=0.3, degree=0)
-    wide = _gradients(scene, pose, torch.float64, None, backend="triton", size=(40, 80), layout="equirect")
+    wide = _gradients(scene, pose, torch.float64, None, backend="triton", size=(20, 40), layout="equirect")
     narrow_lists = functools.partial(composite.list_tiles, limit=1)
     monkeypatch.setattr(composite, "list_tiles", narrow_lists)
-    narrow = _gradients(scene, pose, torch.float64, None, backend="triton", size=(40, 80), layout="equirect")
+    narrow = _gradients(scene, pose, torch.float64, None, backend="triton", size=(20, 40), layout="equirect")
     assert torch.equal(narrow[0], wide[0]) and narrow[2].entries == wide[2].entries
     assert narrow[2].bytes < wide[2].bytes
     for name, expected in wide[1].items():

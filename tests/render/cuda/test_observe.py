@@ -1,0 +1,63 @@
+"""The observing kernel, interpreted, against the torch reference, forward and backward."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from pansplat.render.cuda.observe import observe
+from pansplat.render.splats import observe as reference
+
+_FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
+
+
+@pytest.mark.parametrize(
+    ("exact", "compensate", "by_covariance", "degree"),
+    [
+        (True, True, False, 4),
+        (True, False, True, 3),
+        (True, True, True, 2),
+        (False, True, False, 1),
+        (False, False, True, 0),
+    ],
+)
+def test_what_is_seen_equals_the_reference(exact, compensate, by_covariance, degree, make_scene, pose):
+    scene = make_scene(150, seed=degree, degree=degree)  # one program and a part
+    scene.quats[3] = 0
+    scene.scales[5, 1] = 0
+    scene.scales[6] = 0
+    covariances = scene.covariances if by_covariance else None
+    options = dict(spread=3e-4, compensate=compensate, exact=exact)
+    for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-6)):
+        same = None if covariances is None else covariances.to(dtype)
+        expected = reference(scene.to(dtype=dtype), same, pose, **options)
+        got = observe(scene.to(dtype=dtype), same, pose, **options)
+        for name, value in expected._asdict().items():
+            found = getattr(got, name)
+            assert found.dtype == value.dtype and found.shape == value.shape, name
+            if value.numel():
+                assert float((found - value).abs().max() / value.abs().max().clamp_min(1)) < tolerance, name
+
+
+@pytest.mark.parametrize("by_covariance", [True, False])
+def test_gradients_equal_the_references(by_covariance, make_scene, pose, monkeypatch):
+    from pansplat.render.cuda import observe as room
+
+    monkeypatch.setattr(room, "_CHUNK", 7)
+    scene = make_scene(20)
+    generator = torch.Generator().manual_seed(0)
+    found = []
+    for function in (reference, observe):
+        leaves = {name: getattr(scene, name).clone().requires_grad_() for name in _FIELDS}
+        covariances = scene.covariances.clone().requires_grad_() if by_covariance else None
+        camera = pose.clone().requires_grad_()
+        seen = function(
+            dataclasses.replace(scene, **leaves), covariances, camera, spread=3e-4, compensate=True, exact=True
+        )
+        generator.manual_seed(0)
+        sum((v * torch.rand(v.shape, generator=generator, dtype=v.dtype)).sum() for v in seen).backward()
+        leaves |= {"pose": camera} | ({} if covariances is None else {"covariances": covariances})
+        found.append({name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None})
+    assert found[0].keys() == found[1].keys() and len(found[0]) == (5 if by_covariance else 6)
+    for name, expected in found[0].items():
+        assert float((found[1][name] - expected).norm() / expected.norm()) < 1e-12, name
