@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from pansplat.gaussians.gaussians import Gaussians
-from pansplat.render import Rendering, rasterize
+from pansplat.render import Rendering, backend, rasterize
 
 os.environ["TRITON_INTERPRET"] = "1"  # before the kernels are imported
 
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
-_ROOM = Path(rasterize.__code__.co_filename).parent
+_ROOM = Path(backend.__file__).parent
 _BASE = 0.28209479177387814
 
 
@@ -37,6 +37,11 @@ class Renderer:
     height: int = 16
 
     @property
+    def interpreted(self) -> bool:
+        """Whether it runs under Triton's interpreter, where a second's work takes minutes."""
+        return self.name == "triton"
+
+    @property
     def size(self) -> tuple[int, int]:
         return self.height, 2 * self.height
 
@@ -50,7 +55,7 @@ _RENDERERS = {
     "torch": Renderer("torch", torch.float64, 1e-9, 1e-8),
     "torch-float32": Renderer("torch", torch.float32, 5e-6, 1e-4),
     "numba": Renderer("numba", torch.float32, 5e-6, 1e-4),
-    "triton": Renderer("triton", torch.float32, 5e-6, 1e-4, height=6),
+    "triton": Renderer("triton", torch.float32, 5e-6, 1e-4, height=8),
 }
 
 

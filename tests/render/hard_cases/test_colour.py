@@ -18,7 +18,7 @@ def _coloured(scene, colours: torch.Tensor):
 @pytest.mark.hard_case(31)
 @pytest.mark.parametrize("channels", [1, 3, 32])
 def test_a_picture_is_linear_in_its_colours(channels, draw, make_scene, pose, leaves):
-    if draw.name == "triton" and channels == 32:
+    if draw.interpreted and channels == 32:
         pytest.skip("the interpreter takes minutes")
     scene = make_scene(10, scale=0.3, degree=0)
     generator = torch.Generator().manual_seed(0)
@@ -64,7 +64,7 @@ def test_every_harmonic_up_to_degree_4_colours_as_it_should(draw, balls):
     harmonics = torch.zeros(1, 25, 25, dtype=torch.float64)
     harmonics[0] = 0.3 * torch.eye(25, dtype=torch.float64)  # channel k holds harmonic k alone
     scene = dataclasses.replace(scene, harmonics=harmonics)
-    if draw.name == "triton":
+    if draw.interpreted:
         scene = dataclasses.replace(scene, harmonics=harmonics[:, :, 12:18])
         expected = expected[12:18]
     got = draw(scene, background=(0.0,) * len(expected))

@@ -16,9 +16,9 @@ _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 @pytest.mark.parametrize("kernel", ["ray", "ewa"])
 def test_the_number_of_threads_changes_no_bit_of_picture_or_gradients(kernel, draw, make_scene, pose, gradients):
     """Vector widths are compared where there are any: tests/render/cpu."""
-    count = 12 if draw.name == "triton" else 300
+    count = 12 if draw.interpreted else 300
     scene = make_scene(count, scale=0.15, degree=1)
-    options = {"kernel": kernel, "layout": "cubemap", "face_size": 8 if draw.name == "triton" else 40}
+    options = {"kernel": kernel, "layout": "cubemap", "face_size": 8 if draw.interpreted else 40}
     before, pictures, found = torch.get_num_threads(), [], []
     try:
         for threads in (1, 2, 3):
@@ -37,6 +37,8 @@ def test_the_number_of_threads_changes_no_bit_of_picture_or_gradients(kernel, dr
 
 @pytest.mark.hard_case(37)
 def test_two_python_threads_draw_at_once(draw, make_scene, pose, gradients):
+    if draw.interpreted:
+        pytest.skip("Triton's interpreter itself runs in one thread only")
     scenes = [make_scene(8, scale=0.3, degree=0, seed=seed) for seed in range(4)]
     alone = [(draw(scene, pose).color, gradients(draw, scene, pose)["means"]) for scene in scenes]
     with ThreadPoolExecutor(2) as pool:

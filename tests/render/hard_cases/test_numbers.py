@@ -65,6 +65,8 @@ def _scaled(scene, unit: float):
 @pytest.mark.parametrize("unit", [1e-18, 1e-9, 1e-3, 1e4, 1e9, 1e18])
 @pytest.mark.parametrize("kernel", ["ray", "ewa"])
 def test_pictures_do_not_know_the_unit_of_length(unit, kernel, draw, make_scene, pose, gradients):
+    if draw.interpreted and (unit not in (1e-18, 1e18) or kernel == "ewa"):
+        pytest.skip("the interpreter takes long, and shares what changes with the unit with the reference")
     scene = make_scene(10, scale=0.5, degree=0)
     scene = scene.select((scene.means - pose[:3, 3]).norm(dim=1) > 0.2)
     camera = pose.clone()

@@ -131,5 +131,5 @@ def test_a_disc_rounded_to_a_slightly_negative_covariance_is_still_drawn(draw, b
     scene = balls((0, 0, 2.0), 0.3)
     flat = torch.diag(torch.tensor((0.09, 0.09, -1e-7), dtype=torch.float64))[None]
     got = draw(scene, covariances=flat)
-    assert got.info is not None and got.info.dropped == 0 and float(got.alpha.max()) > 0.3
+    assert got.info is not None and got.info.dropped == 0 and float(got.alpha.max()) > 0.05
     assert torch.isfinite(got.color).all()

@@ -45,7 +45,7 @@ def test_boxes_of_any_extent_are_limited_before_they_become_integers(value, wrap
 @pytest.mark.hard_case(27)
 @pytest.mark.slow
 def test_a_thousand_gaussians_over_all_of_a_large_panorama_need_bounded_memory(draw, balls):
-    if draw.name == "triton":
+    if draw.interpreted:
         pytest.skip("the interpreter takes minutes")
     generator = torch.Generator().manual_seed(0)
     count, size = 1000, (512, 1024)
@@ -60,9 +60,9 @@ def test_a_thousand_gaussians_over_all_of_a_large_panorama_need_bounded_memory(d
 
 
 @pytest.mark.hard_case(28)
-@pytest.mark.parametrize("height", [1, 2, 3, 5, 31, 33, 100])
+@pytest.mark.parametrize("height", [1, 2, 3, 5, 17, 31, 33, 100])
 def test_odd_sizes_equal_the_dense_renderer(height, draw, balls, equals_dense):
-    if draw.name == "triton" and height > 33:
+    if draw.interpreted and height > 17:
         pytest.skip("the interpreter takes minutes")
     generator = torch.Generator().manual_seed(1)
     scene = balls(2 * torch.nn.functional.normalize(torch.randn(5, 3, generator=generator), dim=1), 0.6)
@@ -74,6 +74,8 @@ def test_odd_sizes_equal_the_dense_renderer(height, draw, balls, equals_dense):
 @pytest.mark.hard_case(28)
 @pytest.mark.parametrize("face_size", [1, 2, 3, 5, 7])
 def test_faces_of_any_size_are_stitched(face_size, draw, balls, gradients):
+    if draw.interpreted and face_size not in (1, 5):
+        pytest.skip("six faces take the interpreter long")
     scene = balls([(0.5, 0.3, 1.0), (-1.0, -0.4, -0.3)], 0.5)
     for kernel in ("ray", "ewa"):
         options = {"size": (7, 15), "layout": "cubemap", "face_size": face_size, "kernel": kernel}
@@ -98,11 +100,11 @@ def test_a_picture_is_the_middle_of_a_larger_one(draw, make_scene, pose):
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_a_handful_of_gaussians_in_a_large_picture(count, draw, balls):
     height = {"torch": 256, "numba": 1024, "triton": 48}[draw.name]
-    means = [(0, 0.1, 2.0), (-1.0, 0.2, 0.5), (0.3, -0.5, -1.0)][:count]
-    got = draw(balls(means, 0.05), size=(height, 2 * height))
+    means = [(0, 0.1, 2.0), (-1.0, 0.2, 0.9), (0.3, -0.5, -1.0)][:count]
+    got = draw(balls(means, 0.1), size=(height, 2 * height))
     assert got.info is not None and got.info.visible == count
     for x, y, z in means:
         row = int((math.asin(y / math.hypot(x, y, z)) / math.pi + 0.5) * height)
         column = int((math.atan2(x, z) / (2 * math.pi) + 0.5) * 2 * height)
         assert float(got.alpha[min(row, height - 1), min(column, 2 * height - 1)]) > 0.5
-    assert float((got.alpha > 0).double().mean()) < 0.02 * count
+    assert float((got.alpha > 0).double().mean()) < 0.03 * count
