@@ -1,7 +1,6 @@
 """Time and memory of a call, on a machine that others may be using at the same moment."""
 
 import ctypes
-import gc
 import re
 import statistics
 import time
@@ -33,7 +32,6 @@ def peak_memory(call: Callable[[], Result], device: torch.device) -> tuple[float
     On the CPU it is the kernel's own high-water mark of the process's resident memory, reset before the call, after
     freed memory has been handed back; on CUDA the allocator's. None where the system tells neither (not Linux).
     """
-    gc.collect()
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
         before = torch.cuda.memory_allocated(device)

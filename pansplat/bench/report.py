@@ -1,0 +1,142 @@
+"""What a person reads: tables of the rows, and how many times faster one renderer was than another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.table import Table
+
+from pansplat.bench.rows import Row
+
+_COLUMNS = (
+    *(("renderer", "left"), ("kernel", "left"), ("order", "left"), ("filter", "left"), ("layout", "left")),
+    *(("height", "right"), ("Gaussians", "right"), ("threads", "right"), ("forward ms", "right")),
+    *(("backward ms", "right"), ("peak MB", "right"), ("PSNR dB", "right"), ("max error", "right")),
+    *(("seam", "right"), ("energy", "right"), ("own error", "right")),
+)
+
+
+def tables(rows: Sequence[Row]) -> list[Table]:
+    """One table a suite and scene, in the order they were measured; sweeps take one table for all their scenes."""
+    found: dict[str, Table] = {}
+    for row in rows:
+        title = row.suite if row.suite in ("count", "resolution") else f"{row.suite}: {row.scene}"
+        if title not in found:
+            found[title] = Table(title=title, title_justify="left", pad_edge=False)
+            for name, side in _COLUMNS:
+                found[title].add_column(name, justify=side, no_wrap=True)  # type: ignore[arg-type]
+        found[title].add_row(*cells(row))
+    return list(found.values())
+
+
+def cells(row: Row) -> tuple[str, ...]:
+    """A row's cells; what was not measured is blank."""
+    faces = f" {row.face_size}" if row.face_size else ""
+    return (
+        row.backend if row.precision == "float32" else f"{row.backend} {row.precision}",
+        row.kernel,
+        row.order,
+        row.filter,
+        f"{row.layout}{faces}{' official' if row.stitching == 'official' else ''}",
+        str(row.height),
+        f"{row.num_gaussians:,}",
+        str(row.threads),
+        _time(row.forward_ms, row.forward_spread_ms),
+        _time(row.backward_ms, row.backward_spread_ms),
+        _number(row.peak_mb, "{:,.0f}"),
+        _decibels(row),
+        _number(row.max_error, "{:.1e}"),
+        _number(row.seam_jump, "{:.1e}"),
+        _number(row.energy_error, "{:+.2%}"),
+        _number(row.own_max_error, "{:.1e}"),
+    )
+
+
+def _decibels(row: Row) -> str:
+    if row.max_error == 0:
+        return "exact"
+    return _number(row.psnr_db, "{:.1f}")
+
+
+def _time(middle: float | None, spread: float | None) -> str:
+    if middle is None:
+        return ""
+    digits = 0 if middle >= 100 else 1 if middle >= 10 else 2
+    return f"{middle:,.{digits}f}" + (f" ±{spread / 2:.{digits}f}" if spread else "")
+
+
+def _number(value: float | None, form: str) -> str:
+    return "" if value is None else form.format(value)
+
+
+def findings(rows: Sequence[Row]) -> list[str]:
+    """The headlines as sentences: speed against the peers in the same run, and the distance to the machine's peaks."""
+    return [*_against_torch(rows), *_against_dense(rows), *_to_the_peaks(rows)]
+
+
+def _direct(rows: Sequence[Row], suite: str, backend: str) -> list[Row]:
+    """Timed float32 rows of the exact direct panorama, with fewest threads first."""
+    chosen = [
+        row
+        for row in rows
+        if (row.suite, row.backend, row.layout, row.filter) == (suite, backend, "equirect", "angular")
+        and row.precision == "float32"
+        and row.forward_ms is not None
+    ]
+    return sorted(chosen, key=lambda row: row.threads)
+
+
+def _against_torch(rows: Sequence[Row]) -> list[str]:
+    told = []
+    for torch_row in _direct(rows, "headline", "torch")[:1]:
+        for row in (*_direct(rows, "headline", "numba"), *_direct(rows, "headline", "triton")):
+            told.append(
+                f"{row.backend} on {_threads(row.threads)} is {_ratio(torch_row, row)} as fast as the binned torch "
+                f"reference on one, {row.height}x{2 * row.height}, {row.num_gaussians:,} Gaussians."
+            )
+    return told
+
+
+def _against_dense(rows: Sequence[Row]) -> list[str]:
+    """At the size that the dense renderer can bear, and scaled by pixels times Gaussians to the headline's."""
+    told = []
+    for dense in _direct(rows, "dense", "dense")[:1]:
+        for row in (*_direct(rows, "dense", "torch")[:1], *_direct(rows, "dense", "numba")[:1]):
+            told.append(
+                f"{row.backend} on one thread is {_ratio(dense, row)} as fast as the dense renderer, "
+                f"{row.height}x{2 * row.height}, {row.num_gaussians:,} Gaussians."
+            )
+        for row in _direct(rows, "headline", "numba")[:1]:
+            scale = (row.height / dense.height) ** 2 * row.num_gaussians / dense.num_gaussians
+            assert dense.forward_ms is not None and row.forward_ms is not None
+            told.append(
+                f"Scaled by pixels times Gaussians (not measured), the dense renderer would take "
+                f"{dense.forward_ms * scale / 1e3:,.0f} s forward at {row.height}x{2 * row.height}, "
+                f"{dense.forward_ms * scale / row.forward_ms:,.0f} times numba's time."
+            )
+    return told
+
+
+def _to_the_peaks(rows: Sequence[Row]) -> list[str]:
+    told = []
+    for row in _direct(rows, "headline", "numba"):
+        if row.fma_fraction is None or row.bandwidth_fraction is None:
+            continue
+        backward = f", backward {row.backward_fma_fraction:.0%}" if row.backward_fma_fraction is not None else ""
+        told.append(
+            f"numba on {_threads(row.threads)} reaches {row.fma_fraction:.0%} of the multiply-add peak over the whole "
+            f"forward pass{backward}, and {row.bandwidth_fraction:.0%} of the memory bandwidth."
+        )
+    return told
+
+
+def _ratio(slow: Row, fast: Row) -> str:
+    assert slow.forward_ms is not None and fast.forward_ms is not None
+    text = f"{slow.forward_ms / fast.forward_ms:,.0f} times"
+    if slow.backward_ms is not None and fast.backward_ms is not None:
+        text += f" (backward {slow.backward_ms / fast.backward_ms:,.0f} times)"
+    return text
+
+
+def _threads(count: int) -> str:
+    return "one thread" if count == 1 else f"{count} threads"

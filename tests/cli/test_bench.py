@@ -1,0 +1,101 @@
+"""`pansplat bench` from end to end, on scenes of a few hundred Gaussians."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pansplat import pipeline
+from pansplat.bench import plan, raster, roofline
+from pansplat.bench.cases import Group
+from pansplat.bench.scenes import full_lattice_room, room_cameras
+from pansplat.cli import bench, run
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Scene
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    """Seconds instead of minutes: small peers, few repeats, no sample, no viewer."""
+    monkeypatch.setattr(plan, "DENSE_HEIGHT", 8)
+    monkeypatch.setattr(raster, "_MOST", 1)
+    monkeypatch.setattr(roofline, "_STEPS", 1 << 12)
+    monkeypatch.setattr(roofline, "_ELEMENTS", 1 << 12)
+    monkeypatch.setattr(bench, "_SAMPLE", Path("no such folder"))
+    monkeypatch.setattr(bench, "measure_viewer", _no_viewer)
+    monkeypatch.setattr(bench, "_BACKENDS", ("triton", "gsplat"))
+    monkeypatch.setattr(bench, "groups", _one_a_suite)
+
+
+def _one_a_suite(*arguments: Any, **others: Any) -> list[Group]:
+    """The first group of each suite, with its first three cases."""
+    found = {group.suite: group for group in reversed(plan.groups(*arguments, **others))}
+    return [dataclasses.replace(group, cases=group.cases[:3]) for group in reversed(found.values())]
+
+
+def _no_viewer(*arguments: object, **others: object) -> None:
+    raise InputError("there is none in this test")
+
+
+def test_quick_writes_rows_and_pictures_and_prints_the_tables(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run(["bench", "raster", "--quick", "--height", "16", "--out", str(out), "--threads", "1"]) == 0
+    content = json.loads((out / "raster.json").read_text())
+    assert {row["suite"] for row in content["rows"]} == {"headline", "choices", "dense", "count", "resolution"}
+    assert all(row["forward_ms"] > 0 for row in content["rows"])
+    assert content["machine"]["threads"] == 1
+    assert sorted(file.name for file in out.iterdir()) == ["raster.json", "raster.png", "raster_sweeps.png"]
+    printed = capsys.readouterr().out
+    for word in ("headline", "choices", "PSNR dB", "without the viewer: there is none in this test", "dense renderer"):
+        assert word in printed
+
+
+def test_a_scene_of_the_users_is_measured(tmp_path):
+    scene = Scene(full_lattice_room(16), room_cameras(2), 0.1, 10.0, ("a", "b"))
+    pipeline.save(scene, tmp_path / "mine.ply")
+    file = tmp_path / "rows.json"
+    command = ["bench", "raster", str(tmp_path / "mine.ply"), "--quick", "--height", "16", "--json", str(file)]
+    assert run(command) == 0
+    rows = json.loads(file.read_text())["rows"]
+    assert {row["scene"] for row in rows} == {"mine", "mine 1/16"}
+
+
+def test_an_interruption_prints_and_keeps_what_was_measured(tmp_path, monkeypatch, capsys):
+    original = raster.draw
+
+    def interrupted(case, *arguments):
+        if case.layout == "cubemap":
+            raise KeyboardInterrupt
+        return original(case, *arguments)
+
+    monkeypatch.setattr(raster, "draw", interrupted)
+    file = tmp_path / "rows.json"
+    assert run(["bench", "raster", "--quick", "--height", "16", "--json", str(file), "--threads", "1"]) == 130
+    assert len(json.loads(file.read_text())["rows"]) >= 2
+    printed = capsys.readouterr()
+    assert "headline: room 16" in printed.out and "interrupted" in printed.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--height", "20"], "multiple of 8"),
+        (["--height", "7"], "--height must be"),
+        (["--threads", "0"], "--threads must be at least 1"),
+        (["--json", "no/rows.json"], "create it first"),
+        (["--plot", "rows.jpg"], ".png, .svg or .pdf"),
+        (["none.ply"], "none.ply"),
+    ],
+)
+def test_unusable_arguments_are_refused_before_the_work(arguments, told, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run(["bench", "raster", *arguments]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_the_machine_is_described(capsys):
+    assert run(["bench", "machine", "--threads", "1"]) == 0
+    printed = capsys.readouterr().out
+    assert "fma_gflops" in printed and "1: " in printed
