@@ -22,6 +22,7 @@ from pansplat.model.layers import (
     Compat,
     PanoramaConv2d,
     border_of,
+    require_rigid,
     require_size,
     require_views,
     resize,
@@ -97,17 +98,17 @@ class Depths:
     levels: tuple[LevelDepth, ...]
 
     @property
-    def inverse_depth(self) -> list[Float[Tensor, "batch view h w"]]:
+    def inverse_depth(self) -> list[Float[Tensor, "batch view _ _"]]:
         """1 / metres, coarse to fine."""
         return [level.inverse_depth for level in self.levels]
 
     @property
-    def depth(self) -> list[Float[Tensor, "batch view h w"]]:
+    def depth(self) -> list[Float[Tensor, "batch view _ _"]]:
         """Radial, metres, coarse to fine."""
         return [level.depth for level in self.levels]
 
     @property
-    def confidence(self) -> list[Float[Tensor, "batch view h w"]]:
+    def confidence(self) -> list[Float[Tensor, "batch view _ _"]]:
         """Largest probability of a candidate, coarse to fine."""
         return [level.confidence for level in self.levels]
 
@@ -140,7 +141,7 @@ class SphericalCostVolume(nn.Module):
 
     def forward(
         self,
-        features: list[Float[Tensor, "batch view channel h w"]],
+        features: list[Float[Tensor, "batch view _ _ _"]],
         cam2world: Float[Tensor, "batch view 4 4"],
         near: Float[Tensor, "batch view"],
         far: Float[Tensor, "batch view"],
@@ -156,10 +157,12 @@ class SphericalCostVolume(nn.Module):
             mono_features: of the monocular network, at any size.
 
         Raises:
-            InputError: too few views (or too many for the original), or maps the U-Net cannot halve.
+            InputError: too few views (or too many for the original), a pose that is not rigid, or maps the U-Net
+                cannot halve.
             ValueError: monocular features missing or surplus.
         """
         require_views(cam2world.shape[1], self.compat)
+        require_rigid(cam2world)
         if (mono_features is None) != (self.config.mono_channels == 0):
             raise ValueError(f"mono_channels={self.config.mono_channels}, but `mono_features` say otherwise")
         bounds = (1 / far, 1 / near)
@@ -229,7 +232,7 @@ class VolumeRefinement(nn.Module):
 
     def forward(
         self, inputs: Float[Tensor, "batch view channel height width"]
-    ) -> Float[Tensor, "batch view width height width"]:
+    ) -> Float[Tensor, "batch view c height width"]:
         views = inputs.shape[:2]
         entered = functional.gelu(self.norm(self.entry(inputs.flatten(0, 1))))
         refined = self.unet(entered.unflatten(0, views))

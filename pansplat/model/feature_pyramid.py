@@ -48,9 +48,7 @@ class FeaturePyramid(nn.Module):
         self.decoder = Decoder(config.channels, compat)
         self.to(memory_format=torch.channels_last)  # convolves faster
 
-    def forward(
-        self, images: Float[Tensor, "batch view 3 height width"]
-    ) -> list[Float[Tensor, "batch view channel h w"]]:
+    def forward(self, images: Float[Tensor, "batch view 3 height width"]) -> list[Float[Tensor, "batch view _ _ _"]]:
         """Features of all views, coarse to fine, of RGB images in [0, 1].
 
         Raises:
@@ -81,7 +79,7 @@ class Encoder(nn.Module):
             )
         )
 
-    def forward(self, images: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image channel h w"]]:
+    def forward(self, images: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image _ _ _"]]:
         """Maps of levels 0 to 3, fine to coarse."""
         fine_to_coarse = []
         maps = images
@@ -106,8 +104,8 @@ class Decoder(nn.Module):
     def forward(
         self,
         coarsest: Float[Tensor, "image channel height width"],
-        fine_to_coarse: list[Float[Tensor, "image c h w"]],
-    ) -> list[Float[Tensor, "image c h w"]]:
+        fine_to_coarse: list[Float[Tensor, "image _ _ _"]],
+    ) -> list[Float[Tensor, "image _ _ _"]]:
         """Features of levels 3 to 0, coarse to fine, of the coarsest map and the encoder's maps of levels 0 to 2."""
         if self.training:
             return self._decode(coarsest, fine_to_coarse)

@@ -16,6 +16,7 @@ from torch.nn import functional
 
 from pansplat.errors import InputError
 from pansplat.geometry import wrap
+from pansplat.geometry.pose import orthonormal_error
 from pansplat.geometry.wrap import Border
 
 Compat = Literal["official", "fixed"]
@@ -52,6 +53,22 @@ def require_size(height: int, width: int, multiple: int) -> None:
             f"the network needs a height and a width that {multiple} divides, got {height}x{width}; "
             "choose another height"
         )
+
+
+def require_rigid(cam2world: Float[Tensor, "batch view 4 4"]) -> None:
+    """Refuse poses that do more than turn and move.
+
+    Raises:
+        InputError: a rotation is not orthonormal to 1e-4, mirrors, or is not finite.
+    """
+    for item, poses in enumerate(cam2world):
+        for view, pose in enumerate(poses):
+            error = orthonormal_error(pose)
+            if not error <= 1e-4:
+                raise InputError(
+                    f"`cam2world` of item {item}, view {view} must be a rigid pose, it is off by {error:.2g}; "
+                    "normalise the rotation, and keep scale out of it"
+                )
 
 
 class PanoramaConv2d(nn.Conv2d):

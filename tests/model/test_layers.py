@@ -12,6 +12,7 @@ from pansplat.model.layers import (
     PanoramaConv2d,
     attend,
     border_of,
+    require_rigid,
     require_size,
     require_views,
     resize,
@@ -126,3 +127,12 @@ def test_a_size_that_cannot_be_halved_is_refused():
     require_size(64, 128, 32)
     with pytest.raises(InputError, match="that 32 divides, got 80x160"):
         require_size(80, 160, 32)
+
+
+@pytest.mark.parametrize("spoil", [lambda r: r * 1.001, lambda r: -r, lambda r: r * math.nan])
+def test_a_pose_that_is_not_rigid_is_refused(spoil):
+    poses = torch.eye(4).repeat(2, 3, 1, 1)
+    require_rigid(poses)
+    poses[1, 2, :3, :3] = spoil(poses[1, 2, :3, :3])
+    with pytest.raises(InputError, match="of item 1, view 2 must be a rigid pose"):
+        require_rigid(poses)
