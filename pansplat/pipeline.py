@@ -12,7 +12,7 @@ import re
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import safetensors.torch
@@ -28,6 +28,7 @@ from pansplat.gaussians.gaussians import Gaussians
 from pansplat.gaussians.ply import load_ply, save_ply
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.blending import blend_weights
+from pansplat.model.checkpoint import SUFFIXES, CompatChoice
 from pansplat.model.predictor import Predictor, Progress
 from pansplat.render import Rendering, rasterize
 from pansplat.render import blend as blend_renderings
@@ -38,15 +39,34 @@ _CACHE_FORMAT = "1"  # changes when the file's layout does, so that older files 
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics", "levels", "views")
 
 
-def load_model(name: str = "sweep", **options: Any) -> Predictor:
-    """The predictor of that name, ready to be called with tensors; `options` go to its constructor.
+def load_model(name: str | Path = "sweep", *, compat: CompatChoice = "trained", **options: Any) -> Predictor:
+    """A predictor, ready to be called with tensors.
+
+    Args:
+        name: `sweep`, or a file of weights: a .safetensors that `pansplat convert` or training wrote, or an
+            original checkpoint (.ckpt).
+        compat: for networks: "official" computes what the original code does, its defects included; "fixed"
+            corrects them; "trained" is the one that the weights were trained with. Original weights were trained
+            with the defects, so for them it is "official".
+        **options: for the constructor of `sweep`.
 
     Raises:
-        InputError: when no predictor has that name.
+        InputError: when there is no such predictor, or the file cannot be used.
     """
-    if name not in _MODELS:
-        raise InputError(f"`model` must be one of {', '.join(sorted(_MODELS))}, got {name!r}")
-    return _MODELS[name](**options)
+    if compat not in get_args(CompatChoice):
+        raise InputError(f"`compat` must be one of {', '.join(get_args(CompatChoice))}, got {compat!r}")
+    if str(name) in _MODELS:
+        if compat != "trained":
+            raise InputError(f"`compat` is for networks, and {name} is none; leave it out")
+        return _MODELS[str(name)](**options)
+    if Path(name).suffix.lower() not in SUFFIXES:
+        raise InputError(
+            f"`model` must be one of {', '.join(sorted(_MODELS))}, or a file of weights ({', '.join(SUFFIXES)}), got "
+            f"{str(name)!r}"
+        )
+    from pansplat.model.loading import load_predictor
+
+    return load_predictor(Path(name).expanduser(), compat, **options)
 
 
 def _sweep(**options: Any) -> Predictor:
@@ -60,8 +80,9 @@ _MODELS: dict[str, Callable[..., Predictor]] = {"sweep": _sweep}
 
 def predict(
     source: Pair | Views | str | Path,
-    model: str | Predictor = "sweep",
+    model: str | Path | Predictor = "sweep",
     *,
+    compat: CompatChoice = "trained",
     height: int = 512,
     cache: bool = True,
     progress: Progress | None = None,
@@ -73,7 +94,8 @@ def predict(
 
     Args:
         source: a pair, the path of a folder that holds exactly one, or loaded panoramas (never cached).
-        model: the name of a predictor, or a predictor.
+        model: the name of a predictor, a file of weights, or a predictor.
+        compat: see `load_model`.
         height: panoramas are resized to (height, 2 height); loaded ones keep their size.
         cache: whether an earlier result may be returned and this one kept.
         progress: told what is being done and the fraction of the whole that is done.
@@ -81,7 +103,7 @@ def predict(
     Raises:
         InputError: when the input cannot be used, or the path holds several pairs.
     """
-    predictor = load_model(model) if isinstance(model, str) else model
+    predictor = load_model(model, compat=compat) if isinstance(model, (str, Path)) else model
     pair = _only_pair(source) if isinstance(source, (str, Path)) else source
     if isinstance(pair, Views):
         return _predict(pair, predictor, progress)

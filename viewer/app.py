@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -32,7 +32,10 @@ class Options:
     pair: str | None = None
     """Name or number of the pair to begin with, where the path holds several; offscreen also "all"."""
     model: str = "sweep"
-    """What predicts the scene from a pair."""
+    """What predicts the scene from a pair: `sweep`, or a file of weights (.safetensors, or an original .ckpt)."""
+    compat: Literal["trained", "official", "fixed"] = "trained"
+    """For a network: what the original code computes, or with its defects corrected; by default as the weights
+    were trained."""
     height: int = 512
     """Height of the panoramas that the prediction sees, pixels."""
     no_cache: bool = False
@@ -73,7 +76,9 @@ class Options:
     @property
     def load_options(self) -> LoadOptions:
         """How to read and predict."""
-        return LoadOptions(self.model, self.height, not self.no_cache, self.convention, self.near, self.far)
+        return LoadOptions(
+            self.model, self.compat, self.height, not self.no_cache, self.convention, self.near, self.far
+        )
 
     @property
     def settings(self) -> DrawSettings:

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from pansplat.errors import InputError
 
@@ -57,6 +57,7 @@ class LoadOptions:
     """How to read and predict; as `load_pairs` and `predict` take them."""
 
     model: str = "sweep"
+    compat: Literal["trained", "official", "fixed"] = "trained"
     height: int = 512
     cache: bool = True
     convention: str | None = None
@@ -102,7 +103,12 @@ def load_entry(entry: Entry, options: LoadOptions, progress: Progress, *, photos
         assert entry.file is not None
         return Loaded(entry, pipeline.load(entry.file))
     scene = pipeline.predict(
-        entry.pair, model=options.model, height=options.height, cache=options.cache, progress=progress
+        entry.pair,
+        model=options.model,
+        compat=options.compat,
+        height=options.height,
+        cache=options.cache,
+        progress=progress,
     )
     if not photos:
         return Loaded(entry, scene)

@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg, subcommand
 
 Out = Annotated[Path, arg(aliases=["-o"])]
+Compat = Literal["trained", "official", "fixed"]
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,10 @@ class Predict:
     out: Out
     """The .ply file to write."""
     model: str = "sweep"
-    """Predictor; `sweep` needs no weights."""
+    """Predictor: `sweep`, which needs no weights, or a file of weights (.safetensors, or an original .ckpt)."""
+    compat: Compat = "trained"
+    """For a network: official computes what the original code does, fixed corrects its defects; by default as
+    the weights were trained, so original ones as official."""
     height: int = 512
     """Panoramas are resized to this height, pixels."""
     no_cache: bool = False
@@ -79,7 +83,9 @@ class Render:
     fps: float = 24.0
     """Pictures a second of a film."""
     model: str = "sweep"
-    """Predictor, for a pair."""
+    """Predictor, for a pair: `sweep`, or a file of weights."""
+    compat: Compat = "trained"
+    """For a network: official, fixed, or as its weights were trained; `pansplat predict --help` has more."""
     predict_height: int = 512
     """Height the panoramas are resized to before the prediction, for a pair."""
     choice: PairChoice = field(default_factory=PairChoice)
@@ -99,7 +105,9 @@ class Evaluate:
     out: Out
     """Folder for results.json and, for each case, prediction.png, target.png and error.png."""
     model: str = "sweep"
-    """Predictor; always predicts anew, so that the times are true."""
+    """Predictor: `sweep`, or a file of weights; always predicts anew, so that the times are true."""
+    compat: Compat = "trained"
+    """For a network: official, fixed, or as its weights were trained; `pansplat predict --help` has more."""
     height: int = 512
     """Panoramas are resized to this height, pixels."""
     blend: str = "deferred"
@@ -144,10 +152,78 @@ class Info:
         return run_info(self)
 
 
+@dataclass(frozen=True)
+class Convert:
+    """Convert a checkpoint of the original PanSplat (or its MVSplat baseline) to a file of weights.
+
+    Nothing that the checkpoint holds is run. The weights are used with --model.
+    """
+
+    path: Positional[Path]
+    """The original's Lightning checkpoint (.ckpt)."""
+    out: Out
+    """The .safetensors file to write."""
+
+    def run(self) -> int:
+        from pansplat.cli.convert import run_convert
+
+        return run_convert(self)
+
+
+@dataclass(frozen=True)
+class BenchRaster:
+    """Measure the rasterisers: time and memory against error, for every choice of kernel, order, filter and faces."""
+
+    scene: Positional[Path | None] = None
+    """A .ply scene, or the folder of a pair; by default a synthetic room, and the sample where it is there."""
+    quick: bool = False
+    """Some minutes on two cores instead of an hour: all choices at half the height only."""
+    json: Path | None = None
+    """File for the rows; it is written after every picture."""
+    plot: Path | None = None
+    """Picture of time against error (.png, .svg, .pdf); how the cost grows goes beside it, to NAME_sweeps."""
+    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """Folder for raster.json, raster.png and raster_sweeps.png."""
+    height: int = 512
+    """Height of the panoramas, pixels; a multiple of 8."""
+    threads: int | None = None
+    """The most threads to use; by default what torch uses."""
+
+    def run(self) -> int:
+        from pansplat.cli.bench import run_raster
+
+        return run_raster(self)
+
+
+@dataclass(frozen=True)
+class BenchMachine:
+    """Measure what this machine could do at most: multiply-adds and memory bandwidth."""
+
+    threads: int | None = None
+    """The most threads to use; by default what torch uses."""
+
+    def run(self) -> int:
+        from pansplat.cli.bench import run_machine
+
+        return run_machine(self)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Measure speed, memory and error on this machine."""
+
+    what: Annotated[BenchRaster, subcommand("raster")] | Annotated[BenchMachine, subcommand("machine")]
+
+    def run(self) -> int:
+        return self.what.run()
+
+
 Command = (
     Annotated[Predict, subcommand("predict")]
     | Annotated[Render, subcommand("render")]
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Check, subcommand("check")]
     | Annotated[Info, subcommand("info")]
+    | Annotated[Bench, subcommand("bench")]
+    | Annotated[Convert, subcommand("convert")]
 )

@@ -40,7 +40,7 @@ def run_evaluate(command: Evaluate) -> int:
                 file=sys.stderr,
             )
         pairs += with_targets
-    predictor = pipeline.load_model(command.model)
+    predictor = pipeline.load_model(command.model, compat=command.compat)
     with progress_bar() as progress:
         cases = evaluate(pairs, predictor, command.out, height=command.height, blend=blend, progress=progress)
     _console().print(results_table(cases))

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pansplat import pipeline
-from pansplat.cli.commands import PairChoice, Predict
+from pansplat.cli.commands import Compat, PairChoice, Predict
 from pansplat.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,8 +28,9 @@ def run_predict(command: Predict) -> int:
         raise InputError(f"--out must be a .ply file in an existing folder, got {command.out}")
     require_height(command.height)
     pair = choose_pair(command.path, command.choice)
+    model = pipeline.load_model(command.model, compat=command.compat)
     began = time.perf_counter()
-    scene = predict(pair, command.model, command.height, cache=not command.no_cache)
+    scene = predict(pair, model, command.height, cache=not command.no_cache)
     took = time.perf_counter() - began
     pipeline.save(scene, command.out)
     print(f"{command.out}: {len(scene.gaussians):,} Gaussians from {', '.join(scene.names)} in {took:.1f} s")
@@ -55,15 +56,15 @@ def choose_pair(path: Path, choice: PairChoice) -> Pair:
     raise InputError(f"--pair {choice.pair}: {path} holds {', '.join(f'{i}: {n}' for i, n in enumerate(names, 1))}")
 
 
-def open_scene(path: Path, choice: PairChoice, model: str, height: int) -> Scene:
+def open_scene(path: Path, choice: PairChoice, model: str, compat: Compat, height: int) -> Scene:
     """The scene of a .ply file, or the prediction of a pair's folder."""
     if path.suffix.lower() == ".ply":
         return pipeline.load(path)
     require_height(height)
-    return predict(choose_pair(path, choice), model, height, cache=True)
+    return predict(choose_pair(path, choice), pipeline.load_model(model, compat=compat), height, cache=True)
 
 
-def predict(pair: Pair, model: str, height: int, *, cache: bool) -> Scene:
+def predict(pair: Pair, model: predictor.Predictor, height: int, *, cache: bool) -> Scene:
     """Predict behind a progress bar."""
     with progress_bar() as progress:
         return pipeline.predict(pair, model, height=height, cache=cache, progress=progress)

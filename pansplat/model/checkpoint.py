@@ -1,7 +1,7 @@
 """Weights on disk: our safetensors files in and out, and PyTorch checkpoints in, without running what they hold.
 
-A weights file is a .safetensors with three entries of metadata: `pansplat_format` (a number), `model` (which
-network) and `config` (the settings of its architecture, JSON).
+A weights file is a .safetensors with four entries of metadata: `pansplat_format` (a number), `model` (which
+network), `config` (the settings of its architecture, JSON) and `compat` (what it was trained with).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import safetensors
 import safetensors.torch
@@ -24,8 +24,14 @@ from torch import Tensor
 
 from pansplat.atomic import replacing
 from pansplat.errors import InputError
+from pansplat.model.layers import Compat
 
 FORMAT = 1  # changes when names of tensors or the meaning of the metadata do
+
+CompatChoice = Literal["trained", "official", "fixed"]
+CHECKPOINTS = (".ckpt", ".pt", ".pth")
+SUFFIXES = (".safetensors", *CHECKPOINTS)
+COMPATS: dict[str, Compat] = {"official": "official", "fixed": "fixed"}
 
 _T = TypeVar("_T")
 
@@ -37,11 +43,13 @@ class WeightsFile:
     Attributes:
         model: the network's name, such as "pansplat".
         config: settings of its architecture.
+        compat: "official" where trained with the original's defects, "fixed" where without.
         tensors: weights under our names.
     """
 
     model: str
     config: dict[str, Any]
+    compat: Compat
     tensors: dict[str, Tensor]
 
 
@@ -54,7 +62,12 @@ def save_weights(path: str | Path, weights: WeightsFile) -> None:
     path = Path(path)
     if path.suffix.lower() != ".safetensors":
         raise InputError(f"{path}: a weights file must end in .safetensors, got {path.suffix or 'no suffix'!r}")
-    metadata = {"pansplat_format": str(FORMAT), "model": weights.model, "config": json.dumps(weights.config)}
+    metadata = {
+        "pansplat_format": str(FORMAT),
+        "model": weights.model,
+        "config": json.dumps(weights.config),
+        "compat": weights.compat,
+    }
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.tensors.items()}
     with replacing(path) as partial:
         safetensors.torch.save_file(tensors, partial, metadata)
@@ -74,7 +87,7 @@ def load_weights(path: str | Path) -> WeightsFile:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # not a dict
     except (safetensors.SafetensorError, OSError, ValueError) as error:
         raise InputError(f"{path}: needed a whole .safetensors file, got '{error}'; {_guess(path)}") from error
-    if not {"pansplat_format", "model", "config"} <= metadata.keys():
+    if not {"pansplat_format", "model", "config", "compat"} <= metadata.keys():
         raise InputError(
             f"{path}: needed weights that `pansplat convert` or `pansplat-train` wrote, got a .safetensors file "
             "without their metadata; convert the original checkpoint"
@@ -84,7 +97,13 @@ def load_weights(path: str | Path) -> WeightsFile:
             f"{path}: needed format {FORMAT} of weights files, got {metadata['pansplat_format']}; "
             "use the pansplat version that wrote it, or convert the original checkpoint again"
         )
-    return WeightsFile(metadata["model"], json.loads(metadata["config"]), tensors)
+    try:
+        config, compat = json.loads(metadata["config"]), COMPATS[metadata["compat"]]
+    except (ValueError, KeyError) as error:
+        raise InputError(
+            f"{path}: needed settings in its metadata, got '{error}'; convert the checkpoint again"
+        ) from error
+    return WeightsFile(metadata["model"], config, compat, tensors)
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:

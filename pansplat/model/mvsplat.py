@@ -8,6 +8,7 @@ Source: Chen et al., MVSplat, https://arxiv.org/abs/2403.14627; OFFICIAL.md, sec
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import torch
@@ -27,6 +28,7 @@ from pansplat.model.cost_volume import (
     regress,
 )
 from pansplat.model.feature_pyramid import normalize
+from pansplat.model.heads import TileGaussians
 from pansplat.model.lattice import lattice_uv, move_points
 from pansplat.model.layers import (
     AttentionPrecision,
@@ -59,16 +61,40 @@ class MVSplatConfig:
 
 
 @dataclass(frozen=True)
-class MVSplatOutput:
-    """What the network makes of a batch.
+class Matched:
+    """What is known of the panoramas before a Gaussian is made.
 
     Attributes:
-        gaussians: of each batch item; view by view, row by row.
+        features: at 1/4 of the image, after attention across views.
+        seen: at 1/4 of the image, as the encoder saw each by itself.
         depths: of the sweep, at 1/4 of the image.
     """
 
-    gaussians: list[Gaussians]
+    images: Float[Tensor, "batch view 3 height width"]
+    features: Float[Tensor, "batch view channel h w"]
+    seen: Float[Tensor, "batch view channel h w"]
     depths: Depths
+    cam2world: Float[Tensor, "batch view 4 4"]
+    near: Float[Tensor, "batch view"]
+    far: Float[Tensor, "batch view"]
+
+
+@dataclass(frozen=True)
+class MVSplatOutput:
+    """A prediction.
+
+    Attributes:
+        gaussians: a set a batch item; view by view, row by row.
+        matched: features and depths on the way there.
+    """
+
+    gaussians: list[Gaussians]
+    matched: Matched
+
+    @property
+    def depths(self) -> Depths:
+        """Depth of each view at 1/4 of the image."""
+        return self.matched.depths
 
 
 class MVSplat(nn.Module):
@@ -77,12 +103,13 @@ class MVSplat(nn.Module):
     def __init__(
         self,
         config: MVSplatConfig | None = None,
-        compat: Compat = "official",
+        compat: Compat = "fixed",
+        *,
         attention_precision: AttentionPrecision = "float32",
     ) -> None:
         super().__init__()
-        self.config = config = config or MVSplatConfig()
-        self.compat: Compat = compat
+        config = config or MVSplatConfig()
+        self.config, self.compat = config, compat
         border = _border_of(compat)
         channels, fine = config.channels, config.refine_width
         self.features = Features(config, compat, attention_precision)
@@ -107,57 +134,79 @@ class MVSplat(nn.Module):
         near: Float[Tensor, "batch view"],
         far: Float[Tensor, "batch view"],
     ) -> MVSplatOutput:
-        """Predict from RGB in [0, 1], OpenCV cam2world poses and the depth range to search, metres.
+        """Predict from RGB in [0, 1] and OpenCV cam2world poses; `near` and `far` in metres.
 
         Raises:
-            InputError: too few views (or too many for the original), or a size that 64 does not divide.
+            InputError: too few views (or too many for the original), or a size that 16 does not divide.
         """
-        require_views(images.shape[1], self.compat)
-        require_size(*images.shape[-2:], 64 if images.shape[-2] >= 64 else 16)
-        matched, seen = self.features(images)
-        swept = self.depth(matched, cam2world, near, far)
-        full = gelu(upsample(self.upsampler(torch.cat((matched, seen), dim=2).flatten(0, 1)), _SCALE, self.compat))
-        inverse_depth = upsample(swept.inverse_depth, _SCALE, self.compat)
-        confidence = interpolate(swept.confidence, scale_factor=_SCALE, mode="nearest")
-        flat = images.flatten(0, 1)
-        maps = (flat, self.project(full), inverse_depth.flatten(0, 1)[:, None], confidence.flatten(0, 1)[:, None])
-        refined = self.refine(torch.cat(maps, dim=1), views=images.shape[1])
-        gaussians = []
-        for item in range(len(images)):
-            by_view = []
-            for view in range(images.shape[1]):
-                index = item * images.shape[1] + view
-                at = (item, view)
-                own = slice(index, index + 1)
-                by_view.append(
-                    self._lift(
-                        flat[own], refined[own], full[own], inverse_depth[at], cam2world[at], near[at], far[at], view
-                    )
-                )
-            gaussians.append(Gaussians.cat(by_view))
-        return MVSplatOutput(gaussians, Depths((swept,)))
+        matched = self.match(images, cam2world, near, far)
+        (part,) = self.lift(matched)
+        return MVSplatOutput(part.gaussians, matched)
 
-    def _lift(
+    def match(
         self,
-        image: Float[Tensor, "1 3 height width"],
-        refined: Float[Tensor, "1 fine height width"],
-        full: Float[Tensor, "1 channel height width"],
+        images: Float[Tensor, "batch view 3 height width"],
+        cam2world: Float[Tensor, "batch view 4 4"],
+        near: Float[Tensor, "batch view"],
+        far: Float[Tensor, "batch view"],
+    ) -> Matched:
+        """Features and depths of all views at 1/4 scale."""
+        require_views(images.shape[1], self.compat)
+        require_size(*images.shape[-2:], 16)
+        features, seen = self.features(images)
+        swept = self.depth(features, cam2world, near, far)
+        return Matched(images, features, seen, Depths((swept,)), cam2world, near, far)
+
+    def lift(self, matched: Matched, *, tiles: int = 1) -> Iterator[TileGaussians]:
+        """All Gaussians in one part: its U-Net sees the whole panorama, so `tiles` has no say."""
+        m, views = matched, matched.images.shape[1]
+        images, swept = m.images.flatten(0, 1), m.depths.levels[-1]
+        features = self.upsampler(torch.cat((m.features, m.seen), dim=2).flatten(0, 1))
+        features = gelu(upsample(features, _SCALE, self.compat))
+        inverse_depth = upsample(swept.inverse_depth, _SCALE, self.compat).flatten(0, 1)
+        confidence = interpolate(swept.confidence, scale_factor=_SCALE, mode="nearest").flatten(0, 1)
+        maps = (images, self.project(features), inverse_depth[:, None], confidence[:, None])
+        refined = self.refine(torch.cat(maps, dim=1), views)
+        poses, near, far = (tensor.flatten(0, 1) for tensor in (m.cam2world, m.near, m.far))
+        by_view = [
+            self._lift_view(
+                torch.cat((refined[i], images[i], features[i])),
+                self.to_depth(refined[i : i + 1])[0],
+                inverse_depth[i],
+                (1 / far[i], 1 / near[i]),
+                poses[i],
+                i % views,
+            )
+            for i in range(len(images))
+        ]
+        items = [Gaussians.cat(by_view[start : start + views]) for start in range(0, len(images), views)]
+        yield TileGaussians(items, torch.arange(len(items[0])))
+
+    def _lift_view(
+        self,
+        maps: Float[Tensor, "channel height width"],
+        corrections: Float[Tensor, "2 height width"],
         inverse_depth: Float[Tensor, "height width"],
+        bounds: tuple[Float[Tensor, ""], Float[Tensor, ""]],
         cam2world: Float[Tensor, "4 4"],
-        near: Float[Tensor, ""],
-        far: Float[Tensor, ""],
         view: int,
     ) -> Gaussians:
-        """One view's Gaussians, one a pixel, row by row."""
-        height = image.shape[-2]
-        numbers = self.to_gaussians(torch.cat((refined, image, full), dim=1))[0].flatten(1).T
-        correction, opacity_logits = self.to_depth(refined)[0].flatten(1)
+        """One view's Gaussians, one a pixel, row by row.
+
+        Args:
+            maps: what the Gaussians' numbers are read off.
+            corrections: to the inverse depth, and the opacity's logit.
+            bounds: of the inverse depth, far then near.
+        """
+        height = maps.shape[-2]
+        numbers = self.to_gaussians(maps[None])[0].flatten(1).T
         offsets, parameters = numbers.split((2, self.config.adapter.num_parameters), dim=-1)
-        uv = lattice_uv("pixel", height).to(image.device)
+        correction, opacity_logits = corrections.flatten(1)
+        uv = lattice_uv("pixel", height).to(maps.device)
         return adapt(
             parameters,
             move_points(uv, offsets, "pixel", height),
-            1 / (inverse_depth.flatten() + correction).clamp(1 / far, 1 / near),
+            1 / (inverse_depth.flatten() + correction).clamp(*bounds),
             torch.sigmoid(opacity_logits),
             cam2world,
             map_height=height,

@@ -60,8 +60,8 @@ class Report:
             )
 
 
-def convert(content: Mapping[str, object], source: object) -> tuple[dict[str, Tensor], Report]:
-    """Tensors under our names, and what became of all that an original checkpoint holds.
+def convert(content: Mapping[str, object], source: object) -> dict[str, Tensor]:
+    """The tensors of an original checkpoint under our names.
 
     Args:
         content: of the checkpoint, as `read_checkpoint` gives it.
@@ -84,7 +84,7 @@ def convert(content: Mapping[str, object], source: object) -> tuple[dict[str, Te
                 if not torch.isfinite(tensor).all():
                     raise InputError(f"{source}: needed finite numbers, got NaN or infinity in {name}; take another")
             tensors[ours] = tensor
-    return tensors, report
+    return tensors
 
 
 def match(content: Mapping[str, object], source: object) -> Report:
