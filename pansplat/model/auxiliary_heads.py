@@ -49,7 +49,7 @@ class AuxiliaryHeads(nn.Module):
     def forward(
         self,
         images: Float[Tensor, "batch view 3 height width"],
-        features: Sequence[Float[Tensor, "batch view channel _ _"]],
+        features: Sequence[Float[Tensor, "batch view _ _ _"]],
         depths: Depths,
         cam2world: Float[Tensor, "batch view 4 4"],
         near: Float[Tensor, "batch view"],

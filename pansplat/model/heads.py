@@ -63,12 +63,12 @@ class ViewInputs:
     """What the heads know of one view. Maps are (channel, height, width)."""
 
     image: Float[Tensor, "3 height width"]
-    features: list[Float[Tensor, "channel h w"]]
+    features: list[Float[Tensor, "_ _ _"]]
     """Coarse to fine."""
     logits: Float[Tensor, "candidate h w"]
     candidates: Float[Tensor, "candidate h w"]
-    inverse_depth: Float[Tensor, "h w"]
-    confidence: Float[Tensor, "h w"]
+    inverse_depth: Float[Tensor, "rows columns"]
+    confidence: Float[Tensor, "rows columns"]
     cam2world: Float[Tensor, "4 4"]
     near: Float[Tensor, ""]
     far: Float[Tensor, ""]
@@ -133,7 +133,7 @@ class GaussianHeads(nn.Module):
     def forward(
         self,
         images: Float[Tensor, "batch view 3 height width"],
-        features: Sequence[Float[Tensor, "batch view channel _ _"]],
+        features: Sequence[Float[Tensor, "batch view _ _ _"]],
         depths: Depths,
         cam2world: Float[Tensor, "batch view 4 4"],
         near: Float[Tensor, "batch view"],
@@ -160,7 +160,7 @@ class GaussianHeads(nn.Module):
     def iterate(
         self,
         images: Float[Tensor, "batch view 3 height width"],
-        features: Sequence[Float[Tensor, "batch view channel _ _"]],
+        features: Sequence[Float[Tensor, "batch view _ _ _"]],
         depths: Depths,
         cam2world: Float[Tensor, "batch view 4 4"],
         near: Float[Tensor, "batch view"],
@@ -314,7 +314,7 @@ def whole(parts: Sequence[TileGaussians], compat: Compat) -> list[Gaussians]:
 
 def views_of(
     images: Float[Tensor, "batch view 3 height width"],
-    features: Sequence[Float[Tensor, "batch view channel _ _"]],
+    features: Sequence[Float[Tensor, "batch view _ _ _"]],
     depth: LevelDepth,
     cam2world: Float[Tensor, "batch view 4 4"],
     near: Float[Tensor, "batch view"],

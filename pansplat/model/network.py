@@ -6,7 +6,7 @@ import functools
 import hashlib
 from collections.abc import Iterator, Sequence
 from importlib.resources import files
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -26,6 +26,7 @@ _MULTIPLE = {"official": 16, "fixed": 32}  # what halving, windows and their shi
 _MATCHED = 0.4  # fraction of the time that matching takes, for the progress report
 
 
+@runtime_checkable
 class Matched(Protocol):
     """What a network knows before it makes Gaussians."""
 
@@ -33,6 +34,7 @@ class Matched(Protocol):
     def depths(self) -> Depths: ...
 
 
+@runtime_checkable
 class Network(Protocol):
     """What a predictor needs of a network, which is an nn.Module: first it matches the views, then lifts Gaussians."""
 
@@ -54,6 +56,8 @@ class Network(Protocol):
         ...
 
     def state_dict(self) -> dict[str, Tensor]: ...
+    def parameters(self) -> Iterator[Tensor]: ...
+    def eval(self) -> Any: ...
 
 
 class NetworkPredictor:
@@ -65,9 +69,10 @@ class NetworkPredictor:
         tiles: tiles along each side, or None for as many as the height suggests.
     """
 
-    def __init__(self, name: str, network: Any, *, tiles: int | None = None) -> None:
+    def __init__(self, name: str, network: Network, *, tiles: int | None = None) -> None:
         self.name = name
-        self.network = network.eval()
+        network.eval()
+        self.network = network
         self.tiles = tiles
 
     @functools.cached_property

@@ -46,7 +46,7 @@ class Matched:
     """What is known of the panoramas before a Gaussian is made."""
 
     images: Float[Tensor, "batch view 3 height width"]
-    features: Sequence[Float[Tensor, "batch view channel _ _"]]
+    features: Sequence[Float[Tensor, "batch view _ _ _"]]
     """Coarse to fine."""
     depths: Depths
     cam2world: Float[Tensor, "batch view 4 4"]
