@@ -16,6 +16,7 @@ import numpy as np
 from pansplat.render.cpu import records as layout
 from pansplat.render.cpu.compiling import inlined, kernel
 from pansplat.render.cpu.forms import cross, dot
+from pansplat.render.cpu.memory import Lease
 from pansplat.render.cpu.observe import CULLED, LANES, PIECE
 from pansplat.render.cpu.threads import share
 from pansplat.render.panorama import Picture
@@ -148,10 +149,13 @@ def round_boxes(rows, edges, start, count, height, width, boxes):
 
 @inlined
 def write_boxes(rows, edges, start, count, boxes):
-    """Write four rows of whole numbers as boxes."""
+    """Write four rows of whole numbers as boxes, two numbers a word."""
+    for i in range(LANES):
+        rows[edges, i] += 65536 * rows[edges + 1, i]
+        rows[edges + 2, i] += 65536 * rows[edges + 3, i]
     for i in range(count):
-        for j in range(4):
-            boxes[start + i, j] = np.int16(rows[edges + j, i])
+        boxes[start + i, 0] = np.int32(rows[edges, i])
+        boxes[start + i, 1] = np.int32(rows[edges + 2, i])
 
 
 @inlined
@@ -255,17 +259,17 @@ def _panorama_edges(rows, height, width):
         rows[EDGES + 3, i] = -1e9 if kappa < 0 else bottom * per_row + 0.5 * height + everywhere
 
 
-def find_boxes(records: np.ndarray, picture: Picture, threads: int) -> np.ndarray:
+def find_boxes(records: np.ndarray, picture: Picture, lease: Lease, threads: int) -> np.ndarray:
     """The box of each record of the exact kernel on a picture, (n, 4) int16."""
-    boxes = np.empty((len(records), 4), np.int16)
+    words = lease.array((len(records), 2), np.int32)
     rotation = np.ascontiguousarray(picture.rotation.numpy())
     height, width = picture.size
 
     def work(piece: int) -> None:
         if picture.is_panorama:
-            _panorama(piece, records, rotation, height, width, boxes)
+            _panorama(piece, records, rotation, height, width, words)
         else:
-            _pinhole(piece, records, rotation, height, width, picture.focal, boxes)
+            _pinhole(piece, records, rotation, height, width, picture.focal, words)
 
     share(work, -(-len(records) // PIECE), threads)
-    return boxes
+    return words.view(np.int16)

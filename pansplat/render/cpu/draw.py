@@ -3,6 +3,7 @@
 Source: docs/rendering.md; docs/rasterizer.md tells what each stage costs.
 """
 
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +23,7 @@ from pansplat.render.cpu.bins import TileLists, list_tiles
 from pansplat.render.cpu.boxes import LARGEST_SIDE, find_boxes
 from pansplat.render.cpu.compiling import announced
 from pansplat.render.cpu.ewa import project, project_backward
+from pansplat.render.cpu.memory import Lease
 from pansplat.render.cpu.observe import PIECE, Camera, Fields, Observed, observe
 from pansplat.render.cpu.observe_backward import Gradients, add_slots, chain
 from pansplat.render.cpu.radix import front_to_back
@@ -130,14 +132,14 @@ class _Draw(torch.autograd.Function):
     ) -> Tensor:
         tensors = means, quats, scales, covariances, opacities, harmonics
         fields, camera = _fields(*tensors), _camera(pose, pictures[0], options)
-        threads, needs_grad = thread_count(), any(ctx.needs_input_grad)
+        threads, needs_grad, lease = thread_count(), any(ctx.needs_input_grad), Lease()
         height, width = pictures[0].size
         with announced():
             with notes.timed("observe"):
-                observed = observe(fields, camera, threads)
+                observed = observe(fields, camera, lease, threads)
             sums = np.empty((len(pictures), harmonics.shape[2] + 2, height, width), np.float32)
             kept = [
-                _draw_picture(observed, picture, options, sums[number], notes, needs_grad, threads)
+                _draw_picture(observed, picture, options, sums[number], notes, needs_grad, lease, threads)
                 for number, picture in enumerate(pictures)
             ]
         notes.dropped, notes.near = observed.dropped, observed.near
@@ -145,7 +147,7 @@ class _Draw(torch.autograd.Function):
         result = torch.from_numpy(sums)
         if needs_grad:
             ctx.save_for_backward(*tensors, pose, result)
-            ctx.plan = pictures, options, observed, kept, threads
+            ctx.plan = pictures, options, observed, kept, lease, threads
         return result
 
     @staticmethod
@@ -153,7 +155,7 @@ class _Draw(torch.autograd.Function):
         if torch.is_grad_enabled():  # create_graph=True
             raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
         *tensors, pose, sums = ctx.saved_tensors
-        pictures, options, observed, kept, threads = ctx.plan
+        pictures, options, observed, kept, _lease, threads = ctx.plan
         fields, camera = _fields(*tensors), _camera(pose, pictures[0], options)
         grad_sums = grad_outputs[0].contiguous().numpy()
         wanted = [
@@ -161,7 +163,8 @@ class _Draw(torch.autograd.Function):
             for tensor, needed in zip(tensors, ctx.needs_input_grad, strict=False)
         ]
         with announced():
-            slots = _slot_gradients(observed, pictures, options, kept, sums.numpy(), grad_sums, threads)
+            own = Lease()
+            slots = _slot_gradients(observed, pictures, options, kept, sums.numpy(), grad_sums, own, threads)
             arrays = (
                 np.empty((0, *field.shape[1:]), np.float32) if grad is None else grad.numpy()
                 for field, grad in zip(fields, wanted, strict=True)
@@ -210,21 +213,24 @@ def _draw_picture(
     sums: np.ndarray,
     notes: _Notes,
     needs_grad: bool,
+    lease: Lease,
     threads: int,
 ) -> tuple[Projection, TileLists | None] | None:
     """Write one picture's sums, and return what its backward needs; the lists only if they came in one band."""
+    lease = lease if needs_grad else Lease()
     with notes.timed("boxes"):
-        records, boxes = _place(observed, picture, options, threads)
+        records, boxes = _place(observed, picture, options, lease, threads)
     with notes.timed("sort"):
         by_depth = options.order == "z" and not picture.is_panorama
         towards = picture.rotation[:, 2].numpy().copy() if by_depth else np.zeros(3)
-        order = front_to_back(observed.records, observed.radii, boxes, towards, threads)
-    plane = plane_of(picture, exact=options.kernel == "ray")
-    several = 0
-    with notes.timed("bin"):
-        bands = list_tiles(order, boxes, picture.size, slots=needs_grad, threads=threads, limit=bins.LIMIT)
-        lists = next(bands)
+        order = front_to_back(observed.records, observed.radii, boxes, towards, lease, threads)
+    plane, whole = plane_of(picture, exact=options.kernel == "ray"), None
+    bands = list_tiles(order, boxes, picture.size, slots=needs_grad, threads=threads, limit=bins.LIMIT)
     while True:
+        with notes.timed("bin"):
+            lists = next(bands, None)
+        if lists is None:
+            break
         with notes.timed("raster"):
             raster_forward(
                 records, observed.values, lists.entries, lists.starts, plane, sums,
@@ -233,21 +239,20 @@ def _draw_picture(
         notes.entries += len(lists.entries)
         own = records.nbytes if records is not observed.records else 0
         listed = sum(part.nbytes for part in (lists.entries, lists.starts, lists.slots, lists.offsets))
-        notes.bytes = max(notes.bytes, own + 2 * boxes.nbytes + order.nbytes + max(listed, 16 * len(order)))
-        with notes.timed("bin"):
-            following = next(bands, None)
-        if following is None:
-            break
-        lists, several = following, several + 1
+        notes.bytes = max(notes.bytes, own + boxes.nbytes + order.nbytes + max(listed, 8 * len(order)) + 8 * len(order))
+        whole = lists if needs_grad and len(lists.starts) == 1 + math.prod(plane.tiles) else None
+        del lists
     notes.visible += len(order)
-    return (Projection(records, boxes, order), None if several else lists) if needs_grad else None
+    return (Projection(records, boxes, order), whole) if needs_grad else None
 
 
-def _place(observed: Observed, picture: Picture, options: Options, threads: int) -> tuple[np.ndarray, np.ndarray]:
+def _place(
+    observed: Observed, picture: Picture, options: Options, lease: Lease, threads: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Records and boxes on a picture."""
     if options.kernel == "ewa":
-        return project(observed, picture, options.dilation, EWA_NEAR * options.near, threads)
-    return observed.records, find_boxes(observed.records, picture, threads)
+        return project(observed, picture, options.dilation, EWA_NEAR * options.near, lease, threads)
+    return observed.records, find_boxes(observed.records, picture, lease, threads)
 
 
 def _slot_gradients(
@@ -257,6 +262,7 @@ def _slot_gradients(
     kept: list[tuple[Projection, TileLists | None]],
     sums: np.ndarray,
     grad_sums: np.ndarray,
+    lease: Lease,
     threads: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Gradients of the camera's records and values in slots, and where each Gaussian's slots begin."""
@@ -272,8 +278,9 @@ def _slot_gradients(
             projection.order, projection.boxes, picture.size, slots=True, threads=threads, limit=bins.LIMIT
         )  # fmt: skip
         for lists in bands:
-            grad_records = np.empty((len(lists.entries), FIELDS), np.float32)
-            grad_values = np.empty((len(lists.entries), num_values), np.float32)
+            band = lease if alone else Lease()
+            grad_records = band.array((len(lists.entries), FIELDS), np.float32)
+            grad_values = band.array((len(lists.entries), num_values), np.float32)
             raster_backward(
                 projection.records, observed.values, lists.entries, lists.starts, lists.slots, plane, sums[number],
                 grad_sums[number], grad_records, grad_values, first_row=lists.first_row, threads=threads,

@@ -13,7 +13,8 @@ from pansplat.render.cpu.boxes import ALONG, DIRECTION, EDGES, KAPPA, P, Q, read
 from pansplat.render.cpu.boxes import ROWS as CONE_ROWS
 from pansplat.render.cpu.compiling import inlined, kernel
 from pansplat.render.cpu.forms import cross, dot
-from pansplat.render.cpu.observe import LANES, PIECE, Observed, aligned
+from pansplat.render.cpu.memory import Lease
+from pansplat.render.cpu.observe import LANES, PIECE, Observed
 from pansplat.render.cpu.threads import share
 from pansplat.render.panorama import Picture
 
@@ -49,7 +50,7 @@ def _projected(rows, i, height, width, focal, dilation):
 
 
 @kernel
-def _project(piece, records, radii, rotation, height, width, focal, dilation, z_near, projected, boxes):
+def _project(piece, records, radii, rotation, height, width, focal, dilation, z_near, projected, words, boxes):
     rows = np.ones((ALL_ROWS, LANES))
     for start in range(piece * PIECE, min((piece + 1) * PIECE, records.shape[0]), LANES):
         count = min(LANES, records.shape[0] - start)
@@ -69,7 +70,7 @@ def _project(piece, records, radii, rotation, height, width, focal, dilation, z_
             reach_x, reach_y = math.sqrt(max(kappa, 0.0) * v[0]), math.sqrt(max(kappa, 0.0) * v[2])
             rows[EDGES, i], rows[EDGES + 1, i] = x - reach_x, x + reach_x
             rows[EDGES + 2, i], rows[EDGES + 3, i] = y - reach_y, y + reach_y if seen else -1e9
-        round_boxes(rows, EDGES, start, count, height, width, boxes)
+        round_boxes(rows, EDGES, start, count, height, width, words)
         _write_projected(records, rows, start, count, boxes, projected)
 
 
@@ -92,7 +93,7 @@ def _write_projected(records, rows, start, count, boxes, projected):
 
 
 def project(
-    observed: Observed, picture: Picture, dilation: float, z_near: float, threads: int
+    observed: Observed, picture: Picture, dilation: float, z_near: float, lease: Lease, threads: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Records of a pinhole picture, where there is a box, and the boxes.
 
@@ -101,16 +102,18 @@ def project(
         picture: pinhole.
         dilation: variance added on both axes, pixels^2.
         z_near: Gaussians with a smaller depth in the picture are left out, metres.
+        lease: for the arrays returned.
         threads: to work on.
     """
     num = len(observed.records)
-    projected, boxes = aligned((num, layout.FIELDS)), np.empty((num, 4), np.int16)
+    projected, words = lease.array((num, layout.FIELDS), np.float32), lease.array((num, 2), np.int32)
+    boxes = words.view(np.int16)
     rotation = np.ascontiguousarray(picture.rotation.numpy())
 
     def work(piece: int) -> None:
         _project(
             piece, observed.records, observed.radii, rotation, *picture.size, picture.focal, dilation, z_near,
-            projected, boxes,
+            projected, words, boxes,
         )  # fmt: skip
 
     share(work, -(-num // PIECE), threads)

@@ -23,6 +23,7 @@ from pansplat.render.cpu.forms import (
     tangent_frame,
 )
 from pansplat.render.cpu.harmonics import colours, fill_basis
+from pansplat.render.cpu.memory import Lease
 from pansplat.render.cpu.threads import share
 
 LANES = 64
@@ -248,22 +249,37 @@ def _check_harmonics(harmonic_bits, size, start, count, rows):
 
 
 @inlined
-def _write_block(rows, start, count, records, values, radii, tally):
+def _round(rows, singles):
+    """Round a block's records to float32, a field a row, and the directions' rest likewise."""
+    for axis in range(3):
+        for i in range(LANES):
+            head = np.float32(rows[OUT + axis, i])
+            singles[layout.DIRECTION + axis, i] = head
+            singles[layout.REST + axis, i] = np.float32(rows[OUT + axis, i] - np.float64(head))
+    for j in range(9):
+        for i in range(LANES):
+            singles[layout.FIRST + j, i] = np.float32(rows[OUT + 3 + j, i])
+    for i in range(LANES):
+        is_drawn = (rows[SOUND, i] > 0) & (rows[OPACITY, i] >= _FAINTEST)
+        singles[layout.LEVEL, i] = np.float32(rows[LOG, i] if is_drawn else CULLED)
+        singles[layout.FIELDS, i] = np.float32(rows[RADIUS, i])
+
+
+@inlined
+def _write_block(rows, singles, start, count, records, values, radii, tally):
     radius_column = values.shape[1] - 1
     for i in range(count):
         g = start + i
-        drawn = (rows[SOUND, i] > 0) & (rows[OPACITY, i] >= _FAINTEST)
-        tally[DROPPED] += rows[SOUND, i] == 0
-        tally[NEAR] += rows[SOUND, i] < 0
-        for axis in range(3):
-            head = np.float32(rows[OUT + axis, i])
-            records[g, layout.DIRECTION + axis] = head
-            records[g, layout.REST + axis] = np.float32(rows[OUT + axis, i] - np.float64(head))
-        for j in range(9):
-            records[g, layout.FIRST + j] = np.float32(rows[OUT + 3 + j, i])
-        records[g, layout.LEVEL] = np.float32(rows[LOG, i]) if drawn else np.float32(CULLED)
-        values[g, radius_column] = np.float32(rows[RADIUS, i])
-        radii[g] = rows[RADIUS, i]
+        for j in range(layout.FIELDS):
+            records[g, j] = singles[j, i]
+        values[g, radius_column] = singles[layout.FIELDS, i]
+    dropped, near = 0, 0
+    for i in range(count):
+        radii[start + i] = rows[RADIUS, i]
+        dropped += rows[SOUND, i] == 0
+        near += rows[SOUND, i] < 0
+    tally[DROPPED] += dropped
+    tally[NEAR] += near
 
 
 @kernel
@@ -273,7 +289,7 @@ def _observe(
 ):  # fmt: skip
     rows = np.ones((ROWS + 1, LANES))
     bits = rows.view(np.int64)
-    basis = np.empty((25, LANES), np.float32)
+    basis, singles = np.empty((25, LANES), np.float32), np.empty((layout.FIELDS + 1, LANES), np.float32)
     for start in range(piece * PIECE, min((piece + 1) * PIECE, means.shape[0]), LANES):
         count = min(LANES, means.shape[0] - start)
         read_block(means, quats, scales, covariances, opacities, start, count, rows)
@@ -283,7 +299,8 @@ def _observe(
         _find_records(pose, spread, compensate, rows)
         find_logs(rows, bits, PEAK, LOG)
         fill_basis(rows, WORLD, harmonics.shape[1], basis)
-        _write_block(rows, start, count, records, values, radii, tallies[piece])
+        _round(rows, singles)
+        _write_block(rows, singles, start, count, records, values, radii, tallies[piece])
         colours(harmonics, start, count, basis, values)
 
 
@@ -304,11 +321,11 @@ class Observed(NamedTuple):
     near: int
 
 
-def observe(fields: Fields, camera: Camera, threads: int) -> Observed:
-    """The Gaussians as the camera sees them."""
+def observe(fields: Fields, camera: Camera, lease: Lease, threads: int) -> Observed:
+    """The Gaussians as the camera sees them, in leased arrays."""
     num, channels = len(fields.means), fields.harmonics.shape[2]
-    records, radii = aligned((num, layout.FIELDS)), np.empty(num)
-    values = np.empty((num, channels + 1), np.float32)
+    records, radii = lease.array((num, layout.FIELDS), np.float32), lease.array(num, np.float64)
+    values = lease.array((num, channels + 1), np.float32)
     pieces = -(-num // PIECE)
     tallies = np.zeros((pieces, 2), np.int64)
     harmonic_bits = fields.harmonics.reshape(-1).view(np.uint32)
@@ -319,10 +336,3 @@ def observe(fields: Fields, camera: Camera, threads: int) -> Observed:
     share(work, pieces, threads)
     dropped, near = (int(count) for count in tallies.sum(axis=0))
     return Observed(records, values, radii, dropped, near)
-
-
-def aligned(shape: tuple[int, int]) -> np.ndarray:
-    """An uninitialised float32 array that starts on a cache line."""
-    raw = np.empty(4 * shape[0] * shape[1] + 64, np.uint8)
-    start = -raw.ctypes.data % 64
-    return raw[start : start + 4 * shape[0] * shape[1]].view(np.float32).reshape(shape)

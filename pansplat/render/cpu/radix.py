@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pansplat.render.cpu.compiling import inlined, kernel
+from pansplat.render.cpu.memory import Lease
 from pansplat.render.cpu.observe import PIECE
 from pansplat.render.cpu.threads import share
 
@@ -111,7 +112,7 @@ def _move_numbers(part, ends, words, shift, index_bits, places, order):
 
 
 def front_to_back(
-    records: np.ndarray, radii: np.ndarray, boxes: np.ndarray, towards: np.ndarray, threads: int
+    records: np.ndarray, radii: np.ndarray, boxes: np.ndarray, towards: np.ndarray, lease: Lease, threads: int
 ) -> np.ndarray:
     """The numbers (int32) of the Gaussians that have a box, nearest first.
 
@@ -119,6 +120,8 @@ def front_to_back(
         records, boxes: of one picture.
         radii: float64, metres.
         towards: the picture's z axis in the records' axes to sort by depth; zeros to sort by distance.
+        lease: for the numbers.
+        threads: to work on.
     """
     pieces = -(-len(radii) // PIECE)
     survey = np.empty((pieces, 3), np.int64)
@@ -130,22 +133,26 @@ def front_to_back(
     index_bits = max(1, (len(radii) - 1).bit_length())
     key_bits = (int(survey[:, 2].max()) - low).bit_length()
     cut = max(_CUT, key_bits + index_bits - 64)
-    words = np.empty(count, np.uint64)
+    own = Lease()
+    words, spare = own.array(count, np.uint64), own.array(count, np.uint64)
+    order = lease.array(count, np.int32)
     starts = np.cumsum(survey[:, 0]) - survey[:, 0]
     share(
         lambda piece: _write_words(piece, records, radii, boxes, towards, low, cut, index_bits, starts, words),
         pieces,
         threads,
     )
-    return _sort(words, index_bits, max(1, key_bits - cut), threads)
+    _sort(words, spare, order, index_bits, max(1, key_bits - cut), threads)
+    return order
 
 
-def _sort(words: np.ndarray, index_bits: int, key_bits: int, threads: int) -> np.ndarray:
-    """The low bits of the words, sorted by the high ones."""
+def _sort(
+    words: np.ndarray, spare: np.ndarray, order: np.ndarray, index_bits: int, key_bits: int, threads: int
+) -> None:
+    """Write the low bits of the words, sorted by the high ones; the words are lost."""
     parts = threads if len(words) > PIECE else 1
     ends = np.linspace(0, len(words), parts + 1).astype(np.int64)
     counts = np.empty((parts, 2**_DIGIT), np.int64)
-    spare, order = np.empty_like(words), np.empty(len(words), np.int32)
     passes = -(-key_bits // _DIGIT)
     for step in range(passes):
         shift = index_bits + step * _DIGIT
@@ -156,7 +163,6 @@ def _sort(words: np.ndarray, index_bits: int, key_bits: int, threads: int) -> np
         else:
             share(_bound(_move, ends, words, shift, counts, spare), parts, threads)
         words, spare = spare, words
-    return order
 
 
 def _bound(work: Callable[..., None], *arguments: object) -> Callable[[int], None]:
