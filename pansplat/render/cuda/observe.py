@@ -1,8 +1,8 @@
 """What one camera sees of each Gaussian, in one kernel.
 
-Source: docs/rendering.md, sections 1 to 3; `pansplat.render.splats.observe` is its reference, and its backward. As
-torch operations the same arithmetic moves 7 kB a Gaussian through memory, here a third of a kilobyte. Geometry is
-float64 whatever the Gaussians' type is.
+Source: docs/rendering.md, sections 1 to 3; `pansplat.render.splats.observe` is its reference. As torch
+operations the same arithmetic moves 7 kB a Gaussian through memory, here a third of a kilobyte. Geometry is float64
+whatever the Gaussians' type is.
 """
 # ruff: noqa: RUF005  # Triton does not unpack into a tuple
 
@@ -15,138 +15,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.gaussians.gaussians import Gaussians
+from pansplat.render.cuda.body import from_axes, from_covariance
+from pansplat.render.cuda.observe_backward import observe_backward
 from pansplat.render.cuda.response import load_numbers
 from pansplat.render.cuda.spherical import basis
-from pansplat.render.splats import Observed, observe_chunk
+from pansplat.render.cuda.vectors import dot, load_fields, products, store_fields, tangents, turn
+from pansplat.render.splats import Observed
 
 _BLOCK = 128
 """Gaussians a program: one a thread, which takes 90 to 120 registers in float64."""
-
-_CHUNK = 1 << 17
-"""Gaussians at once in backward, where the graph holds some 10 kB of each."""
-
-
-@triton.jit
-@no_type_check
-def load_fields(pointer, at, there, NUM: tl.constexpr):
-    """NUM numbers of each of some rows, as float64 blocks in a tuple."""
-    fields = ()
-    for k in tl.static_range(NUM):
-        fields = fields + (tl.load(pointer + at * NUM + k, mask=there, other=0.0).to(tl.float64),)
-    return fields
-
-
-@triton.jit
-@no_type_check
-def store_fields(pointer, at, there, fields, NUM: tl.constexpr):
-    """The opposite, in the table's type."""
-    for k in tl.static_range(NUM):
-        tl.store(pointer + at * NUM + k, fields[k], mask=there)
-
-
-@triton.jit
-@no_type_check
-def dot(a, b):
-    """Of two vectors."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@triton.jit
-@no_type_check
-def turn(camera, vector):
-    """A world vector in the axes of a camera (cam2world, row by row)."""
-    return (
-        camera[0] * vector[0] + camera[4] * vector[1] + camera[8] * vector[2],
-        camera[1] * vector[0] + camera[5] * vector[1] + camera[9] * vector[2],
-        camera[2] * vector[0] + camera[6] * vector[1] + camera[10] * vector[2],
-    )
-
-
-@triton.jit
-@no_type_check
-def products(c, a, b):
-    """a' C b of a symmetric matrix, given as xx, xy, xz, yy, yz, zz."""
-    return (
-        a[0] * (c[0] * b[0] + c[1] * b[1] + c[2] * b[2])
-        + a[1] * (c[1] * b[0] + c[3] * b[1] + c[4] * b[2])
-        + a[2] * (c[2] * b[0] + c[4] * b[1] + c[5] * b[2])
-    )
-
-
-@triton.jit
-@no_type_check
-def own_axes(quats, at, there):
-    """Columns of the rotation of quaternions of any length; the zero quaternion is the identity."""
-    quat = load_fields(quats, at, there, 4)
-    norm = tl.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
-    safe = tl.where(norm > 0, norm, 1.0)
-    w = tl.where(norm > 0, quat[0] / safe, 1.0)
-    x, y, z = quat[1] / safe, quat[2] / safe, quat[3] / safe
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-    )
-
-
-@triton.jit
-@no_type_check
-def from_axes(quats, scales, camera, radius, direction, at, there):
-    """C in camera axes; det B, tr B, g, M and det C of section 1: sums of squares only, so nothing cancels."""
-    axes = own_axes(quats, at, there)
-    scale = load_fields(scales, at, there, 3)
-    size = (scale[0] / radius, scale[1] / radius, scale[2] / radius)
-    zero = radius * 0
-    c = (zero, zero, zero, zero, zero, zero)
-    det_across, trace, along, mixed = zero, zero, zero, zero
-    for k in tl.static_range(3):
-        axis = turn(camera, axes[k])
-        square = size[k] * size[k]
-        cosine = dot(direction, axis)
-        minor = size[(k + 1) % 3] * size[(k + 2) % 3]
-        det_across += minor * minor * (cosine * cosine)
-        mixed += minor * minor * (1 - cosine * cosine)
-        along += square * (cosine * cosine)
-        trace += square * (1 - cosine * cosine)
-        c = (
-            c[0] + square * axis[0] * axis[0],
-            c[1] + square * axis[0] * axis[1],
-            c[2] + square * axis[0] * axis[2],
-            c[3] + square * axis[1] * axis[1],
-            c[4] + square * axis[1] * axis[2],
-            c[5] + square * axis[2] * axis[2],
-        )
-    product = size[0] * size[1] * size[2]
-    return c, (det_across, trace, along, mixed, product * product)
-
-
-@triton.jit
-@no_type_check
-def from_covariance(covariances, camera, radius, right, down, direction, at, there):
-    """The same from world covariances; what rounding made negative counts as zero."""
-    s = load_fields(covariances, at, there, 9)
-    world = (s[0], 0.5 * (s[1] + s[3]), 0.5 * (s[2] + s[6]), s[4], 0.5 * (s[5] + s[7]), s[8])
-    # Row j of cam2world' is column j of cam2world.
-    x, y, z = (camera[0], camera[4], camera[8]), (camera[1], camera[5], camera[9]), (camera[2], camera[6], camera[10])
-    square = radius * radius
-    c = (
-        products(world, x, x) / square,
-        products(world, x, y) / square,
-        products(world, x, z) / square,
-        products(world, y, y) / square,
-        products(world, y, z) / square,
-        products(world, z, z) / square,
-    )
-    uu, uv, un = products(c, right, right), products(c, right, down), products(c, right, direction)
-    vv, vn, nn = products(c, down, down), products(c, down, direction), products(c, direction, direction)
-    det = uu * (vv * nn - vn * vn) - uv * (uv * nn - vn * un) + un * (uv * vn - vv * un)
-    return c, (
-        tl.maximum(uu * vv - uv * uv, 0.0),
-        tl.maximum(uu + vv, 0.0),
-        tl.maximum(nn, 0.0),
-        tl.maximum(nn * (uu + vv) - un * un - vn * vn, 0.0),
-        tl.maximum(det, 0.0),
-    )
 
 
 @triton.jit
@@ -202,11 +79,7 @@ def observe_kernel(
     world = (offset[0] / radius, offset[1] / radius, offset[2] / radius)
     direction = turn(pose, world)
     x, y, z = direction[0], direction[1], direction[2]
-    # The tangent frame of Duff et al., as in the reference.
-    sign = tl.where(z < 0, -1.0, 1.0).to(tl.float64)
-    a = -1 / (sign + z)
-    right = (1 + sign * x * x * a, sign * x * y * a, -sign * x)
-    down = (x * y * a, sign + y * y * a, -y)
+    right, down = tangents(direction)
     if BY_AXES:
         c, body = from_axes(first_shape, second_shape, pose, radius, direction, at, there)
     else:
@@ -252,7 +125,7 @@ def observe(
 
 
 class _Observe(torch.autograd.Function):
-    """One kernel forward; backward is the reference's own, chunk by chunk."""
+    """One kernel forward, one backward."""
 
     @staticmethod
     def forward(
@@ -285,21 +158,6 @@ class _Observe(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
-        pose, *fields = (tensor.detach() for tensor in ctx.saved_tensors)
-        pose.requires_grad_()
-        by_pose, by_field = torch.zeros_like(pose), [torch.empty_like(field) for field in fields]
-        for low in range(0, len(fields[0]), _CHUNK):
-            chunk = slice(low, low + _CHUNK)
-            leaves = [field[chunk].requires_grad_() for field in fields]
-            with torch.enable_grad():
-                found = observe_chunk(*leaves, cam2world=pose, **ctx.options)
-            outputs = [
-                (value, grad[chunk]) for value, grad in zip(found, grad_outputs, strict=True) if value.requires_grad
-            ]
-            gradients = torch.autograd.grad(
-                [value for value, _ in outputs], (pose, *leaves), [grad for _, grad in outputs], materialize_grads=True
-            )
-            by_pose += gradients[0]
-            for whole, part in zip(by_field, gradients[1:], strict=True):
-                whole[chunk] = part
+        cam2world, *fields = ctx.saved_tensors
+        by_pose, *by_field = observe_backward(cam2world, fields, Observed(*grad_outputs), **ctx.options)
         return by_pose, None, None, None, *by_field
