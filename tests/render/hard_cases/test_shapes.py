@@ -102,6 +102,24 @@ def test_specks_of_a_twentieth_pixel_keep_their_energy(draw, balls, equals_dense
 
 
 @pytest.mark.hard_case(23)
+@pytest.mark.parametrize("kernel", ["ray", "ewa"])
+def test_covariances_draw_what_scales_and_quaternions_draw(kernel, draw, make_scene, pose, leaves, loss_of):
+    """Forward, and backward: the slopes of a covariance, carried on to scales and quaternions, are theirs."""
+    scene = make_scene(10, scale=0.6, degree=1).to(dtype=draw.dtype)
+    options = {"kernel": kernel, "layout": "pinhole", "vertical_fov_degrees": 110.0}
+    by_shape, by_matrix = leaves(scene), leaves(scene)
+    covariances = by_matrix.covariances
+    expected, got = draw(by_shape, pose, **options), draw(by_matrix, pose, covariances=covariances, **options)
+    assert float(expected.alpha.detach().mean()) > 0.05
+    assert (got.color - expected.color).detach().abs().max() < 4 * draw.image
+    loss_of(expected).backward()
+    loss_of(got).backward()
+    for name in ("means", "scales", "quats", "opacities", "harmonics"):
+        found, wanted = getattr(by_matrix, name).grad, getattr(by_shape, name).grad
+        assert float((found - wanted).norm()) < 4 * draw.gradient * float(wanted.norm()), name
+
+
+@pytest.mark.hard_case(23)
 def test_matrices_that_are_no_covariance_are_dropped_and_counted(draw, balls, leaves, loss_of):
     scene = balls([(0, 0, 2.0), (0.5, 0, 2.0), (-0.5, 0, 2.0)], 0.3)
     good = scene.covariances

@@ -1,0 +1,135 @@
+"""Any numbers in any field, any picture: never a NaN in it, never a crash, and gradients that are finite."""
+
+import dataclasses
+import math
+import os
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pansplat.errors import InputError
+from pansplat.gaussians.gaussians import Gaussians
+
+_FIELDS = ("means", "scales", "quats", "opacities", "harmonics", "covariances")
+_POISON = (
+    math.nan,
+    math.inf,
+    -math.inf,
+    0.0,
+    -0.0,
+    -1.0,
+    1e-45,
+    1e-38,
+    1e-20,
+    1e-6,
+    1e6,
+    1e12,
+    1e18,
+    1e29,
+    -1e29,
+    1e38,
+)
+_QUIET = settings(
+    deadline=None,
+    derandomize=bool(os.environ.get("CI")),
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+
+
+@st.composite
+def _pictures(draw_from) -> dict:
+    """Size, layout and the mathematics of a picture; some are refused."""
+    layout = draw_from(st.sampled_from(("equirect", "cubemap", "pinhole")))
+    return {
+        "layout": layout,
+        "size": (draw_from(st.integers(1, 9)), draw_from(st.integers(1, 17))),
+        "kernel": draw_from(st.sampled_from(("ray", "ewa"))),
+        "order": draw_from(st.sampled_from(("radial", "z"))),
+        "lowpass": draw_from(st.sampled_from(("angular", "3dgs"))),
+        "near": draw_from(st.sampled_from((1e-10, 0.05, 1.0, 1e10))),
+        "vertical_fov_degrees": draw_from(st.sampled_from((0.1, 60.0, 90.0, 179.0))),
+        "face_size": draw_from(st.sampled_from((None, 1, 2, 5))),
+        "stitching": draw_from(st.sampled_from(("seamless", "seamless", "official"))),
+        "strict": draw_from(st.sampled_from((False, False, False, True))),
+    }
+
+
+@st.composite
+def _scenes(draw_from) -> tuple[Gaussians, torch.Tensor | None]:
+    """A few Gaussians, perhaps with covariances, in which some numbers are poison."""
+    count, channels = draw_from(st.integers(0, 6)), draw_from(st.sampled_from((1, 3, 4)))
+    degree = draw_from(st.integers(0, 4))
+    generator = torch.Generator().manual_seed(draw_from(st.integers(0, 1000)))
+    fields = {
+        "means": torch.randn(count, 3, generator=generator),
+        "scales": 0.3 * torch.exp(torch.randn(count, 3, generator=generator)),
+        "quats": torch.randn(count, 4, generator=generator),
+        "opacities": torch.rand(count, generator=generator),
+        "harmonics": torch.randn(count, (degree + 1) ** 2, channels, generator=generator),
+    }
+    factor = torch.randn(count, 3, 3, generator=generator)
+    fields["covariances"] = 0.1 * factor @ factor.transpose(1, 2)
+    for _ in range(draw_from(st.integers(0, 4)) if count else 0):
+        flat = fields[draw_from(st.sampled_from(_FIELDS))].view(-1)
+        flat[draw_from(st.integers(0, len(flat) - 1))] = draw_from(st.sampled_from(_POISON))
+    covariances = fields.pop("covariances")
+    label = torch.zeros(count, dtype=torch.int64)
+    scene = Gaussians(**fields, levels=label, views=label)
+    return scene, covariances if draw_from(st.booleans()) else None
+
+
+def _check(draw, leaves, given_scene, options: dict) -> None:
+    scene, covariances = given_scene
+    scene = leaves(scene.to(dtype=draw.dtype))
+    if covariances is not None:
+        covariances = covariances.to(draw.dtype).requires_grad_()
+    pose = torch.eye(4, dtype=torch.float64, requires_grad=True)
+    channels = scene.harmonics.shape[2]
+    try:
+        got = draw(scene, pose, covariances=covariances, background=(0.5,) * channels, **options)
+    except InputError:
+        return
+    assert got.color.shape == (channels, *options["size"])
+    for name in ("color", "alpha", "depth"):
+        assert torch.isfinite(getattr(got, name)).all(), name
+    alpha = got.alpha.detach()
+    assert float(alpha.min()) >= 0 and float(alpha.max()) <= 1 and float(got.depth.detach().min()) >= 0
+    if not got.color.requires_grad:
+        return
+    (got.color.sum() + got.alpha.sum() + (got.depth * got.alpha).sum()).backward()
+    asked = {name: getattr(scene, name) for name in ("means", "scales", "quats", "opacities", "harmonics")}
+    asked = {**asked, "covariances": covariances, "pose": pose}
+    for name, leaf in asked.items():
+        if leaf is not None and leaf.grad is not None:
+            assert torch.isfinite(leaf.grad).all(), name
+
+
+@settings(_QUIET, max_examples=60)
+@given(scene=_scenes(), options=_pictures())
+def test_no_numbers_break_a_picture_or_its_gradients(draw, leaves, scene, options):
+    if draw.interpreted:
+        pytest.skip("the next test has fewer examples")
+    _check(draw, leaves, scene, options)
+
+
+@settings(_QUIET, max_examples=6)
+@given(scene=_scenes(), options=_pictures())
+def test_no_numbers_break_a_small_picture_of_the_interpreters(draw, leaves, scene, options):
+    if not draw.interpreted:
+        pytest.skip("the test before has more examples")
+    _check(draw, leaves, scene, {**options, "size": (3, 6), "face_size": 3})
+
+
+@settings(_QUIET, max_examples=30)
+@given(scene=_scenes(), field=st.sampled_from(_FIELDS[:-1]), index=st.integers(0, 5), value=st.floats(width=32))
+def test_any_number_at_all_in_one_place_leaves_a_picture_without_nan(draw, scene, field, index, value):
+    if draw.interpreted:
+        pytest.skip("the interpreter takes minutes")
+    gaussians, _ = scene
+    values = getattr(gaussians, field).clone()
+    if len(gaussians):
+        values[index % len(gaussians)] = value
+    got = draw(dataclasses.replace(gaussians, **{field: values}), size=(4, 8))
+    assert torch.isfinite(got.color).all() and torch.isfinite(got.depth).all()
