@@ -8,7 +8,7 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
-from pansplat.render.cuda.vectors import dot, load_fields, products, turn
+from pansplat.render.cuda.vectors import dot, load_fields, products, symmetric, turn
 
 
 @triton.jit
@@ -60,10 +60,23 @@ def from_axes(quats, scales, camera, radius, direction, at, there):
 
 @triton.jit
 @no_type_check
+def in_frame(c, u, v, n):
+    """Numbers uu, uv, un, vv, vn, nn of a symmetric matrix in a frame."""
+    return (
+        products(c, u, u),
+        products(c, u, v),
+        products(c, u, n),
+        products(c, v, v),
+        products(c, v, n),
+        products(c, n, n),
+    )
+
+
+@triton.jit
+@no_type_check
 def from_covariance(covariances, camera, radius, right, down, direction, at, there):
     """The same from world covariances; what rounding made negative counts as zero."""
-    s = load_fields(covariances, at, there, 9)
-    world = (s[0], 0.5 * (s[1] + s[3]), 0.5 * (s[2] + s[6]), s[4], 0.5 * (s[5] + s[7]), s[8])
+    world = symmetric(load_fields(covariances, at, there, 9))
     # Row j of cam2world' is column j of cam2world.
     x, y, z = (camera[0], camera[4], camera[8]), (camera[1], camera[5], camera[9]), (camera[2], camera[6], camera[10])
     square = radius * radius
@@ -75,8 +88,7 @@ def from_covariance(covariances, camera, radius, right, down, direction, at, the
         products(world, y, z) / square,
         products(world, z, z) / square,
     )
-    uu, uv, un = products(c, right, right), products(c, right, down), products(c, right, direction)
-    vv, vn, nn = products(c, down, down), products(c, down, direction), products(c, direction, direction)
+    uu, uv, un, vv, vn, nn = in_frame(c, right, down, direction)
     det = uu * (vv * nn - vn * vn) - uv * (uv * nn - vn * un) + un * (uv * vn - vv * un)
     return c, (
         tl.maximum(uu * vv - uv * uv, 0.0),

@@ -1,9 +1,9 @@
 """Gradients of what one camera sees of each Gaussian: the geometry in one kernel, the colours by torch.
 
-Source: docs/rendering.md, sections 1 to 3. Everything is differentiated as a function of C and n, whose six numbers in
-the tangent frame u, v, n are called uu, uv, ... here. A picture does not depend on how u and v turn about n, so they are
-taken to move without turning. That is right for gradients of pictures (not for those of a single form), and for
-the pose along rigid motions.
+Source: docs/rendering.md, sections 1 to 3. Everything is differentiated as a function of n and C, whose six numbers
+in the tangent frame u, v, n are called uu, uv, un, vv, vn, nn here. A picture does not depend on how u and v turn
+about n, so they are taken to move without turning. That is right for gradients of pictures (not for those of a single
+form), and for the pose along rigid motions.
 """
 
 # ruff: noqa: RUF005  # Triton does not unpack into a tuple
@@ -17,9 +17,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.gaussians.harmonics import evaluate
-from pansplat.render.cuda.body import from_axes, from_covariance, own_axes
+from pansplat.render.cuda.body import from_axes, from_covariance, in_frame, own_axes
 from pansplat.render.cuda.response import load_numbers
-from pansplat.render.cuda.vectors import dot, load_fields, products, store_fields, tangents, times, turn, unturn
+from pansplat.render.cuda.vectors import (
+    dot,
+    load_fields,
+    products,
+    store_fields,
+    symmetric,
+    tangents,
+    times,
+    turn,
+    unturn,
+)
 from pansplat.render.splats import Observed
 
 _BLOCK = 64
@@ -58,13 +68,8 @@ def forms_backward(by_forms, frame, six, spread, det):
 def minors_backward(by_minors, six, BY_AXES: tl.constexpr):
     """From slopes by det B, tr B, g, M and det C: those by uu, uv, un, vv, vn, nn."""
     uu, uv, un, vv, vn, nn = six[0], six[1], six[2], six[3], six[4], six[5]
-    by_across, by_trace, by_along, by_mixed, by_det = (
-        by_minors[0],
-        by_minors[1],
-        by_minors[2],
-        by_minors[3],
-        by_minors[4],
-    )
+    by_across, by_trace, by_along = by_minors[0], by_minors[1], by_minors[2]
+    by_mixed, by_det = by_minors[3], by_minors[4]
     across, mixed = uu * vv - uv * uv, nn * (uu + vv) - un * un - vn * vn
     if not BY_AXES:  # given covariances, what rounding made negative counted as zero
         det = uu * (vv * nn - vn * vn) - uv * (uv * nn - vn * un) + un * (uv * vn - vv * un)
@@ -104,31 +109,122 @@ def quats_backward(by_axes, quats, at, there):
     )
 
 
+@triton.jit
+@no_type_check
+def frame_backward(six, body, frame, spread, opacity, by_peak, by_forms, by_along, SIZES: tl.constexpr):
+    """Slopes by C's six numbers, by the turns of n towards u and v, and by the opacity.
+
+    Args:
+        six: C in the tangent frame, before the filter.
+        body: det B, tr B, g, M, det C.
+        frame: u, v, n.
+        spread: e^2.
+        opacity: before the filter.
+        by_peak, by_forms, by_along: slopes; the latter two only of the exact kernel.
+        SIZES: the kernel's BY_AXES, COMPENSATE, EXACT.
+    """
+    det = body[0] + spread * body[1] + spread * spread
+    zero = det * 0
+    g, by_det, turn_u, turn_v = (zero, zero, zero, zero, zero), zero, zero, zero
+    by_minors = (zero, zero, zero, zero, zero)
+    if SIZES[2]:
+        g, by_det, turn_u, turn_v = forms_backward(by_forms, frame, six, spread, det)
+        along = (spread * spread * body[2] + spread * body[3] + body[4]) / det
+        by_minors = (zero, zero, spread * spread * by_along / det, spread * by_along / det, by_along / det)
+        by_det -= by_along * along / det
+    if SIZES[1]:
+        ratio = body[0] / det
+        root = tl.sqrt(tl.maximum(ratio, 1e-12))
+        by_ratio = tl.where(ratio >= 1e-12, 0.5 * by_peak * opacity / root, 0.0)
+        by_minors = (by_ratio / det, zero, by_minors[2], by_minors[3], by_minors[4])
+        by_det -= by_ratio * ratio / det
+        by_peak = by_peak * root
+    by_minors = (by_minors[0] + by_det, spread * by_det, by_minors[2], by_minors[3], by_minors[4])
+    m = minors_backward(by_minors, six, SIZES[0])
+    uu, uv, un, vv, vn, nn = g[0] + m[0], g[1] + m[1], g[2] + m[2], g[3] + m[3], g[4] + m[4], m[5]
+    turn_u += 2 * (nn - uu) * six[2] + un * (six[0] - six[5]) + vn * six[1] - uv * six[4]
+    turn_v += 2 * (nn - vv) * six[4] + vn * (six[3] - six[5]) + un * six[1] - uv * six[2]
+    return (uu, uv, un, vv, vn, nn), turn_u, turn_v, by_peak
+
+
+@triton.jit
+@no_type_check
+def matrix_of(six, frame):
+    """The symmetric matrix S in camera axes whose sum of products with C is sum of six x (uu, uv, un, vv, vn, nn)."""
+    u, v, n = frame[0], frame[1], frame[2]
+    # Halves: what pairs of different vectors get stands on both sides of the diagonal.
+    rows = ()
+    for i in tl.static_range(3):
+        rows = rows + (
+            (
+                six[0] * u[i] + 0.5 * (six[1] * v[i] + six[2] * n[i]),
+                six[3] * v[i] + 0.5 * (six[1] * u[i] + six[4] * n[i]),
+                six[5] * n[i] + 0.5 * (six[2] * u[i] + six[4] * v[i]),
+            ),
+        )
+    return (
+        rows[0][0] * u[0] + rows[0][1] * v[0] + rows[0][2] * n[0],
+        rows[0][0] * u[1] + rows[0][1] * v[1] + rows[0][2] * n[1],
+        rows[0][0] * u[2] + rows[0][1] * v[2] + rows[0][2] * n[2],
+        rows[1][0] * u[1] + rows[1][1] * v[1] + rows[1][2] * n[1],
+        rows[1][0] * u[2] + rows[1][1] * v[2] + rows[1][2] * n[2],
+        rows[2][0] * u[2] + rows[2][1] * v[2] + rows[2][2] * n[2],
+    )
+
+
+@triton.jit
+@no_type_check
+def axes_backward(by_c, quats, scales, by_quats, by_scales, pose, radius, at, there):
+    """Writes the slopes by quaternions and scales."""
+    axes = own_axes(quats, at, there)
+    scale = load_fields(scales, at, there, 3)
+    by_axes, by_scale = (), ()
+    for k in tl.static_range(3):
+        axis = turn(pose, axes[k])
+        slope = times(by_c, axis)
+        factor = 2 * scale[k] / (radius * radius)
+        by_scale = by_scale + (factor * dot(axis, slope),)
+        slope = unturn(pose, slope)
+        factor = factor * scale[k]
+        by_axes = by_axes + ((factor * slope[0], factor * slope[1], factor * slope[2]),)
+    store_fields(by_quats, at, there, quats_backward(by_axes, quats, at, there), 4)
+    store_fields(by_scales, at, there, by_scale, 3)
+
+
+@triton.jit
+@no_type_check
+def covariances_backward(by_c, by_covariances, pose, radius, at, there):
+    """Writes the slopes by covariances."""
+    x, y, z = (pose[0], pose[1], pose[2]), (pose[4], pose[5], pose[6]), (pose[8], pose[9], pose[10])
+    square = radius * radius
+    xx, yy, zz = products(by_c, x, x) / square, products(by_c, y, y) / square, products(by_c, z, z) / square
+    xy, xz, yz = products(by_c, x, y) / square, products(by_c, x, z) / square, products(by_c, y, z) / square
+    store_fields(by_covariances, at, there, (xx, xy, xz, xy, yy, yz, xz, yz, zz), 9)
+
+
+@triton.jit
+@no_type_check
+def pose_backward(out, pose, world, c, by_n, by_c, by_offset, there):
+    """Writes a program's slopes by the pose: n = A' w and C = A' (world C) A, the offset is mean - t."""
+    rows = ((c[0], c[1], c[2]), (c[1], c[3], c[4]), (c[2], c[4], c[5]))
+    columns = ((by_c[0], by_c[1], by_c[2]), (by_c[1], by_c[3], by_c[4]), (by_c[2], by_c[4], by_c[5]))
+    for i in tl.static_range(3):
+        for j in tl.static_range(3):
+            slope = world[i] * by_n[j]
+            for k in tl.static_range(3):
+                slope += 2 * pose[4 * i + k] * dot(rows[k], columns[j])
+            tl.store(out + 4 * i + j, tl.sum(tl.where(there, slope, 0.0), axis=0))
+        tl.store(out + 4 * i + 3, -tl.sum(tl.where(there, by_offset[i], 0.0), axis=0))
+
+
+# fmt: off
 @triton.jit(do_not_specialize=["num"])
 @no_type_check
 def observe_backward_kernel(
-    means,
-    opacities,
-    first_shape,
-    second_shape,
-    camera,
-    by_worlds,
-    by_directions,
-    by_radii,
-    by_covariances,
-    by_peaks,
-    by_forms,
-    by_alongs,
-    by_means,
-    by_opacities,
-    by_first_shape,
-    by_second_shape,
-    by_camera,
-    num,
-    BY_AXES: tl.constexpr,
-    COMPENSATE: tl.constexpr,
-    EXACT: tl.constexpr,
-    BLOCK: tl.constexpr,
+    means, opacities, first_shape, second_shape, camera,
+    by_worlds, by_directions, by_radii, by_covariances, by_peaks, by_forms, by_alongs,
+    by_means, by_opacities, by_first_shape, by_second_shape, by_camera, num,
+    BY_AXES: tl.constexpr, COMPENSATE: tl.constexpr, EXACT: tl.constexpr, BLOCK: tl.constexpr,
 ):
     """Writes the gradients of the geometry. `by_worlds` are slopes by the direction in world axes, of the colours."""
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -145,127 +241,40 @@ def observe_backward_kernel(
         c, body = from_axes(first_shape, second_shape, pose, radius, n, at, there)
     else:
         c, body = from_covariance(first_shape, pose, radius, u, v, n, at, there)
-    six = (
-        products(c, u, u),
-        products(c, u, v),
-        products(c, u, n),
-        products(c, v, v),
-        products(c, v, n),
-        products(c, n, n),
-    )
-    det = body[0] + spread * body[1] + spread * spread
-    det = tl.where(there, det, 1.0)
-    zero = radius * 0
-    g, by_det, turn_u, turn_v = (zero, zero, zero, zero, zero), zero, zero, zero
-    by_minors = (zero, zero, zero, zero, zero)
-    if EXACT:
-        slopes = load_fields(by_forms, at, there, 9)
-        spread_six = (tl.where(there, six[0], 1.0), six[1], six[2], six[3], six[4])
-        g, by_det, turn_u, turn_v = forms_backward(slopes, (u, v, n), spread_six, spread, det)
-        by_along = load_fields(by_alongs, at, there, 1)[0] / det
-        along = (spread * spread * body[2] + spread * body[3] + body[4]) / det
-        by_minors = (zero, zero, spread * spread * by_along, spread * by_along, by_along)
-        by_det -= by_along * along
-    by_opacity = load_fields(by_peaks, at, there, 1)[0]
-    if COMPENSATE:
-        ratio = body[0] / det
-        root = tl.sqrt(tl.maximum(ratio, 1e-12))
-        opacity = load_fields(opacities, at, there, 1)[0]
-        by_ratio = tl.where(ratio >= 1e-12, 0.5 * by_opacity * opacity / root, 0.0)
-        by_minors = (by_ratio / det, by_minors[1], by_minors[2], by_minors[3], by_minors[4])
-        by_det -= by_ratio * ratio / det
-        by_opacity = by_opacity * root
+    six = in_frame(c, u, v, n)
+    by_shape, turn_u, turn_v, by_opacity = frame_backward(
+        six, body, (u, v, n), spread, load_fields(opacities, at, there, 1)[0], load_fields(by_peaks, at, there, 1)[0],
+        load_fields(by_forms, at, there, 9 if EXACT else 0), load_fields(by_alongs, at, there, 1)[0],
+        (BY_AXES, COMPENSATE, EXACT),
+    )  # fmt: skip
     tl.store(by_opacities + at, by_opacity, mask=there)
-    by_minors = (by_minors[0] + by_det, by_minors[1] + spread * by_det, by_minors[2], by_minors[3], by_minors[4])
-    m = minors_backward(by_minors, six, BY_AXES)
-    uu, uv, un, vv, vn, nn = g[0] + m[0], g[1] + m[1], g[2] + m[2], g[3] + m[3], g[4] + m[4], m[5]
-    turn_u += 2 * (nn - uu) * six[2] + un * (six[0] - six[5]) + vn * six[1] - uv * six[4]
-    turn_v += 2 * (nn - vv) * six[4] + vn * (six[3] - six[5]) + un * six[1] - uv * six[2]
-    # Slopes by C, in camera axes, and by n.
     by_n = load_fields(by_directions, at, there, 3)
-    full = load_fields(by_covariances, at, there, 9)
-    direct = (
-        full[0],
-        0.5 * (full[1] + full[3]),
-        0.5 * (full[2] + full[6]),
-        full[4],
-        0.5 * (full[5] + full[7]),
-        full[8],
-    )
+    by_filtered = load_fields(by_covariances, at, there, 9)
+    direct = symmetric(by_filtered)
     widened = times(direct, n)
-    by_n = (
-        by_n[0] + turn_u * u[0] + turn_v * v[0] - 2 * spread * widened[0],
-        by_n[1] + turn_u * u[1] + turn_v * v[1] - 2 * spread * widened[1],
-        by_n[2] + turn_u * u[2] + turn_v * v[2] - 2 * spread * widened[2],
-    )
-    # Each row: the sum over the frame's vectors b of (slopes' matrix in the frame) (b)_i b.
-    left = (
-        (
-            uu * u[0] + 0.5 * (uv * v[0] + un * n[0]),
-            uu * u[1] + 0.5 * (uv * v[1] + un * n[1]),
-            uu * u[2] + 0.5 * (uv * v[2] + un * n[2]),
-        ),
-        (
-            vv * v[0] + 0.5 * (uv * u[0] + vn * n[0]),
-            vv * v[1] + 0.5 * (uv * u[1] + vn * n[1]),
-            vv * v[2] + 0.5 * (uv * u[2] + vn * n[2]),
-        ),
-        (
-            nn * n[0] + 0.5 * (un * u[0] + vn * v[0]),
-            nn * n[1] + 0.5 * (un * u[1] + vn * v[1]),
-            nn * n[2] + 0.5 * (un * u[2] + vn * v[2]),
-        ),
-    )
-    by_c = (
-        direct[0] + left[0][0] * u[0] + left[1][0] * v[0] + left[2][0] * n[0],
-        direct[1] + left[0][0] * u[1] + left[1][0] * v[1] + left[2][0] * n[1],
-        direct[2] + left[0][0] * u[2] + left[1][0] * v[2] + left[2][0] * n[2],
-        direct[3] + left[0][1] * u[1] + left[1][1] * v[1] + left[2][1] * n[1],
-        direct[4] + left[0][1] * u[2] + left[1][1] * v[2] + left[2][1] * n[2],
-        direct[5] + left[0][2] * u[2] + left[1][2] * v[2] + left[2][2] * n[2],
-    )
-    square = radius * radius
+    shaped = matrix_of(by_shape, (u, v, n))
+    by_c = ()
+    for k in tl.static_range(6):
+        by_c = by_c + (direct[k] + shaped[k],)
+    by_camera_n = ()
+    for k in tl.static_range(3):
+        by_camera_n = by_camera_n + (by_n[k] + turn_u * u[k] + turn_v * v[k] - 2 * spread * widened[k],)
     if BY_AXES:
-        axes = own_axes(first_shape, at, there)
-        scale = load_fields(second_shape, at, there, 3)
-        by_axes, by_scale = (), ()
-        for k in tl.static_range(3):
-            axis = turn(pose, axes[k])
-            slope = times(by_c, axis)
-            by_scale = by_scale + (2 * scale[k] / square * dot(axis, slope),)
-            slope = unturn(pose, slope)
-            factor = 2 * scale[k] * scale[k] / square
-            by_axes = by_axes + ((factor * slope[0], factor * slope[1], factor * slope[2]),)
-        store_fields(by_first_shape, at, there, quats_backward(by_axes, first_shape, at, there), 4)
-        store_fields(by_second_shape, at, there, by_scale, 3)
+        axes_backward(by_c, first_shape, second_shape, by_first_shape, by_second_shape, pose, radius, at, there)
     else:
-        x, y, z = (pose[0], pose[1], pose[2]), (pose[4], pose[5], pose[6]), (pose[8], pose[9], pose[10])
-        xy, xz, yz = products(by_c, x, y) / square, products(by_c, x, z) / square, products(by_c, y, z) / square
-        xx, yy, zz = products(by_c, x, x) / square, products(by_c, y, y) / square, products(by_c, z, z) / square
-        store_fields(by_first_shape, at, there, (xx, xy, xz, xy, yy, yz, xz, yz, zz), 9)
-    contracted = (
-        c[0] * by_c[0] + c[3] * by_c[3] + c[5] * by_c[5] + 2 * (c[1] * by_c[1] + c[2] * by_c[2] + c[4] * by_c[4])
-    )
+        covariances_backward(by_c, by_first_shape, pose, radius, at, there)
+    contracted = c[0] * by_c[0] + c[3] * by_c[3] + c[5] * by_c[5]
+    contracted += 2 * (c[1] * by_c[1] + c[2] * by_c[2] + c[4] * by_c[4])
     by_radius = load_fields(by_radii, at, there, 1)[0] - 2 * contracted / radius
-    by_world = load_fields(by_worlds, at, there, 3)
-    turned = unturn(pose, by_n)
-    by_world = (by_world[0] + turned[0], by_world[1] + turned[1], by_world[2] + turned[2])
-    along_world = dot(by_world, world)
+    by_colour, turned = load_fields(by_worlds, at, there, 3), unturn(pose, by_camera_n)
+    by_world = (by_colour[0] + turned[0], by_colour[1] + turned[1], by_colour[2] + turned[2])
+    outward = dot(by_world, world)
     by_offset = ()
     for k in tl.static_range(3):
-        by_offset = by_offset + ((by_world[k] - along_world * world[k]) / radius + by_radius * world[k],)
+        by_offset = by_offset + ((by_world[k] - outward * world[k]) / radius + by_radius * world[k],)
     store_fields(by_means, at, there, by_offset, 3)
-    # The pose: n = A' w and C = A' (world C) A.
-    rows = ((c[0], c[1], c[2]), (c[1], c[3], c[4]), (c[2], c[4], c[5]))
-    columns = ((by_c[0], by_c[1], by_c[2]), (by_c[1], by_c[3], by_c[4]), (by_c[2], by_c[4], by_c[5]))
-    out = by_camera + tl.program_id(0) * 12
-    for i in tl.static_range(3):
-        for j in tl.static_range(3):
-            slope = world[i] * by_n[j]
-            for k in tl.static_range(3):
-                slope += 2 * pose[4 * i + k] * dot(rows[k], columns[j])
-            tl.store(out + 4 * i + j, tl.sum(tl.where(there, slope, 0.0), axis=0))
-        tl.store(out + 4 * i + 3, -tl.sum(tl.where(there, by_offset[i], 0.0), axis=0))
+    pose_backward(by_camera + tl.program_id(0) * 12, pose, world, c, by_camera_n, by_c, by_offset, there)
+# fmt: on
 
 
 def observe_backward(
@@ -321,5 +330,7 @@ def _colours_backward(
         leaves = harmonics[chunk].detach().requires_grad_(), world.requires_grad_()
         with torch.enable_grad():
             colours = evaluate(*leaves)
-        by_harmonics[chunk], by_worlds[chunk] = torch.autograd.grad(colours, leaves, slopes[chunk])
+        by_harmonics[chunk], by_worlds[chunk] = torch.autograd.grad(
+            colours, leaves, slopes[chunk], materialize_grads=True
+        )
     return by_harmonics, by_worlds

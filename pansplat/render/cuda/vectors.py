@@ -59,6 +59,13 @@ def unturn(camera, vector):
 
 @triton.jit
 @no_type_check
+def symmetric(m):
+    """The symmetric part of a matrix given row by row."""
+    return m[0], 0.5 * (m[1] + m[3]), 0.5 * (m[2] + m[6]), m[4], 0.5 * (m[5] + m[7]), m[8]
+
+
+@triton.jit
+@no_type_check
 def products(c, a, b):
     """a' C b of a symmetric matrix."""
     return (

@@ -19,13 +19,16 @@ from triton.compiler import ASTSource
 from pansplat.render.cuda.layout import Layout
 from pansplat.render.cuda.lists import emit_kernel
 from pansplat.render.cuda.observe import observe_kernel
+from pansplat.render.cuda.observe_backward import observe_backward_kernel
 from pansplat.render.cuda.raster import num_warps, raster_kernel
 from pansplat.render.cuda.raster_backward import backward_kernel, reduce_kernel
 
 _FLOATS = ("means", "opacities", "harmonics", "first_shape", "second_shape", "peaks", "values", "forms", "alongs")
 _FLOATS += ("records", "centres", "offsets", "sums", "grad_sums", "rows", "totals")
 _INTEGERS = ("entries", "slots", "starts", "stops", "busiest", "which", "ranges")
-_DOUBLES = ("camera", "directions", "radii", "covariances")
+_FLOATS += ("by_worlds", "by_peaks", "by_forms", "by_alongs")
+_FLOATS += ("by_means", "by_opacities", "by_first_shape", "by_second_shape")
+_DOUBLES = ("camera", "directions", "radii", "covariances", "by_directions", "by_radii", "by_covariances", "by_camera")
 _TYPES = {"ends": "*i64", "tiles": "i32", **dict.fromkeys(_DOUBLES, "*fp64")}
 _SIZES = ("TINY", "AXES", "CHANNELS", "RECORD", "PEAK", "GRADIENT", "FIELDS", "GROUP", "AT_ONCE")
 _SIZES += ("DEGREE", "BY_AXES", "COMPENSATE", "EXACT", "BLOCK")
@@ -59,7 +62,7 @@ def _report(label: str, kernel, warps: int, capability: int, **sizes) -> None:
 def main() -> None:
     for capability in [int(text) for text in sys.argv[1:]] or [80, 90]:
         for exact in (True, False):
-            for channels in (3, 8):
+            for channels in (3, 8) if exact else (3,):
                 layout = Layout(exact, channels)
                 sizes = dict(
                     TINY=3.5e-4, AXES=layout.axes, CHANNELS=channels, RECORD=layout.record, PEAK=layout.peak,
@@ -75,6 +78,8 @@ def main() -> None:
             sizes = dict(DEGREE=4, CHANNELS=3, BY_AXES=by_axes, COMPENSATE=True, EXACT=True, BLOCK=128)
             name = "scales" if by_axes else "covariances"
             _report(f"observe, degree 4, {name}", observe_kernel, 4, capability, **sizes)
+            sizes |= dict(BLOCK=64)
+            _report(f"observe backward, {name}", observe_backward_kernel, 2, capability, **sizes)
         _report("emit", emit_kernel, 4, capability)
 
 
