@@ -94,7 +94,7 @@ def why_not(backend: str) -> str | None:
             picture, leaves, upstream = draw_and_differentiate(case, gaussians, torch.eye(4, dtype=torch.float64))
             torch.autograd.grad(picture.color, leaves, upstream)
     except (ImportError, AttributeError, NotImplementedError, InputError) as error:
-        return str(error)
+        return str(error) or type(error).__name__
     return None
 
 
@@ -103,6 +103,14 @@ def wake(case: Case) -> None:
     with torch.no_grad():
         gaussians = _speck().to(dtype=getattr(torch, case.precision), device=device_of(case.backend))
         draw(case, gaussians, torch.eye(4, dtype=torch.float64))
+
+
+def forget(backend: str) -> None:
+    """Let go of memory that a backend keeps for its next picture, so that what one takes can be measured."""
+    if backend == "numba":
+        from pansplat.render.cpu.memory import forget_idle
+
+        forget_idle()
 
 
 def _speck() -> Gaussians:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from pansplat.bench.cases import Case, Group, Subject
-from pansplat.bench.drawing import NEAR, Picture, device_of, draw, draw_and_differentiate, wake
+from pansplat.bench.drawing import NEAR, Picture, device_of, draw, draw_and_differentiate, forget, wake
 from pansplat.bench.fidelity import fidelity
 from pansplat.bench.measure import median, peak_memory, seconds, spread
 from pansplat.bench.rows import Row, write_rows
@@ -91,8 +91,8 @@ class Bench:
         self.machine = machine
         self.rows: list[Row] = []
         self._file, self._budget, self._watch = file, budget, watch
-        self._truths: dict[Case, Tensor] = {}
-        self._work: dict[Case, Work] = {}
+        self._truths: dict[tuple[str, Case], Tensor] = {}  # by the scene's name
+        self._work: dict[tuple[str, Case], Work] = {}
         self._scene: Subject | None = None
         self._gaussians: Gaussians | None = None
 
@@ -126,8 +126,6 @@ class Bench:
             return
         self._save(f"{subject.name}: making the scene")
         if self._scene is None or subject.name != self._scene.name:
-            self._truths.clear()
-            self._work.clear()
             self._gaussians = None  # two large scenes at once might not fit
             self._gaussians = subject.load()
         self._scene = subject
@@ -152,14 +150,15 @@ class Bench:
 
     def _truth(self, group: Group, case: Case) -> Tensor:
         """A float64 picture of the scene; drawn once, and that drawing is a row as well."""
-        if case not in self._truths:
+        key = group.subject.name, case
+        if key not in self._truths:
             self._save(_told(case, "the float64 reference"))
             lane = _Lane(case, self._row(group.suite, case))
-            self._truths[case] = self._first(lane).color
-            exact = self._truths[case] if case == case.exact else self._truth(group, case.exact)
-            judge(lane.row, case, self._truths[case], exact, None)
+            self._truths[key] = self._first(lane).color
+            exact = self._truths[key] if case == case.exact else self._truth(group, case.exact)
+            judge(lane.row, case, self._truths[key], exact, None)
             self.rows.append(lane.row)
-        return self._truths[case]
+        return self._truths[key]
 
     def _row(self, suite: str, case: Case) -> Row:
         assert self._scene is not None and self._gaussians is not None
@@ -170,12 +169,14 @@ class Bench:
     def _first(self, lane: _Lane) -> Picture:
         """Draw for the first time: warms up, measures memory, decides how often to draw again."""
         case, row = lane.case, lane.row
+        forget(case.backend)
         row.peak_mb, (picture, took) = peak_memory(lambda: self._forward(case), device_of(case.backend))
         times = [took]
         row.stages_ms = {name: 1e3 * value for name, value in picture.stages.items()}
         if took > _SLOW or case.precision == "float64":
             lane.forward.append(took)
         if case.backward:
+            forget(case.backend)
             row.backward_peak_mb, took = peak_memory(lambda: self._backward(case), device_of(case.backend))
             times.append(took)
             if took > _SLOW:
@@ -222,11 +223,12 @@ class Bench:
         if not related:
             return
         assert self._scene is not None and self._gaussians is not None and row.forward_ms is not None
-        if case.truth not in self._work:
+        key = row.scene, case.truth
+        if key not in self._work:
             self._save(_told(case, "counting its work"))
             options = Options(case.kernel, case.order, case.filter, NEAR, strict=False)
-            self._work[case.truth] = panorama_work(self._gaussians, self._scene.pose, case.height, options)
-        work, threads = self._work[case.truth], str(case.threads)
+            self._work[key] = panorama_work(self._gaussians, self._scene.pose, case.height, options)
+        work, threads = self._work[key], str(case.threads)
         row.pairs = work.pairs
         flops = 1e6 * self.machine["fma_gflops"][threads]  # a millisecond
         row.fma_fraction = FORWARD_OPERATIONS * work.pairs / flops / row.forward_ms

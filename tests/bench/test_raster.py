@@ -69,6 +69,17 @@ def test_the_exact_truth_alone_is_drawn_where_that_is_asked_for():
     assert bench.rows[2].max_error is None
 
 
+def test_a_truth_is_drawn_once_a_scene():
+    bench = Bench(MACHINE, budget=0)
+    other = replace(group(DIRECT), subject=room(8))
+    bench.run([group(DIRECT), other, group(DIRECT)])
+    assert [(row.scene, row.precision) for row in bench.rows if row.precision == "float64"] == [
+        (f"room {HEIGHT}", "float64"),
+        ("room 8", "float64"),
+    ]
+    assert bench.rows[-1].own_max_error < 1e-5
+
+
 def test_cases_of_a_group_are_drawn_in_turn(monkeypatch):
     drawn = []
     original = raster.draw

@@ -47,3 +47,9 @@ def _take(size: int) -> npt.NDArray[np.uint8]:
         if fitting:
             return _idle.pop(min(fitting, key=lambda i: _idle[i].nbytes))
     return np.empty(size + _ALIGNMENT, np.uint8)
+
+
+def forget_idle() -> None:
+    """Let go of the blocks that no call holds; the next call takes fresh ones, as the first one did."""
+    with _lock:
+        _idle.clear()
