@@ -14,8 +14,6 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from pansplat.geometry.equirect import pad_equirect
-
 Border = Literal["sphere", "wrapped_columns", "zeros"]
 
 
@@ -30,12 +28,54 @@ def pad(maps: Float[Tensor, "*batch height width"], margin: int, border: Border)
     if border == "zeros":
         return functional.pad(maps, (margin,) * 4)
     height, width = maps.shape[-2:]
-    if margin > width or (border == "sphere" and margin > height):
+    over_poles = border == "sphere"
+    if margin > width or (over_poles and margin > height):
         raise ValueError(f"a margin of {margin} needs a map at least as large, got {height}x{width}")
-    if border == "sphere":
-        return pad_equirect(maps, margin)
-    rows = functional.pad(maps, (0, 0, margin, margin))
-    return torch.cat((rows[..., -margin:], rows, rows[..., :margin]), dim=-1)
+    if over_poles and width % 2:
+        raise ValueError(f"a map needs an even width to go on over the poles, got {width}")
+    return _Padded.apply(maps, margin, over_poles)
+
+
+class _Padded(torch.autograd.Function):
+    """Copies each map once, forward and backward."""
+
+    @staticmethod
+    def forward(ctx, maps, margin, over_poles):
+        ctx.margin, ctx.over_poles = margin, over_poles
+        height, width = maps.shape[-2:]
+        shape = (*maps.shape[:-2], height + 2 * margin, width + 2 * margin)
+        last = maps.dim() == 4 and maps.is_contiguous(memory_format=torch.channels_last)
+        layout = torch.channels_last if last else torch.contiguous_format
+        padded = torch.empty(shape, dtype=maps.dtype, device=maps.device, memory_format=layout)
+        within = padded[..., margin : margin + width]
+        within[..., margin:-margin, :] = maps
+        if over_poles:
+            within[..., :margin, :] = _beyond_pole(maps[..., :margin, :])
+            within[..., -margin:, :] = _beyond_pole(maps[..., -margin:, :])
+        else:
+            within[..., :margin, :] = 0
+            within[..., -margin:, :] = 0
+        padded[..., :margin] = within[..., -margin:]
+        padded[..., -margin:] = within[..., :margin]
+        return padded
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient):
+        margin = ctx.margin
+        within = gradient[..., margin:-margin].clone()
+        within[..., -margin:] += gradient[..., :margin]
+        within[..., :margin] += gradient[..., -margin:]
+        result = within[..., margin:-margin, :]
+        if ctx.over_poles:
+            result[..., :margin, :] += _beyond_pole(within[..., :margin, :])
+            result[..., -margin:, :] += _beyond_pole(within[..., -margin:, :])
+        return result, None, None
+
+
+def _beyond_pole(rows: Tensor) -> Tensor:
+    """The rows next to a pole, as they follow one another beyond it; its own inverse."""
+    return rows.flip(-2).roll(rows.shape[-1] // 2, -1)
 
 
 def resize(

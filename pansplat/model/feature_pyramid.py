@@ -15,6 +15,7 @@ from pansplat.model.layers import (
     Compat,
     PanoramaConv2d,
     border_of,
+    normalized_convolution,
     require_size,
     require_views,
     upsample,
@@ -134,7 +135,7 @@ class ConvNormAct(nn.Module):
         self.norm = nn.BatchNorm2d(outputs)
 
     def forward(self, maps: Float[Tensor, "image channel height width"]) -> Float[Tensor, "image c h w"]:
-        return nn.functional.leaky_relu(self.norm(self.conv(maps)), 0.1)
+        return nn.functional.leaky_relu(normalized_convolution(self.conv, self.norm, maps), 0.1, inplace=True)
 
 
 class LevelOutput(nn.Module):
@@ -146,7 +147,7 @@ class LevelOutput(nn.Module):
         self.norm = nn.BatchNorm2d(outputs)
 
     def forward(self, flow: Float[Tensor, "image channel height width"]) -> Float[Tensor, "image c height width"]:
-        return nn.functional.silu(self.norm(self.conv(flow)))
+        return nn.functional.silu(normalized_convolution(self.conv, self.norm, flow))
 
 
 def normalize(images: Float[Tensor, "image 3 height width"]) -> Float[Tensor, "image 3 height width"]:

@@ -82,10 +82,29 @@ class PanoramaConv2d(nn.Conv2d):
         self.margin = kernel // 2
 
     def forward(self, input: Float[Tensor, "batch channel height width"]) -> Float[Tensor, "batch c h w"]:
+        return self.convolve(input, self.weight, self.bias)
+
+    def convolve(
+        self,
+        maps: Float[Tensor, "batch channel height width"],
+        weight: Float[Tensor, "c channel kernel kernel"],
+        bias: Float[Tensor, "c"] | None,
+    ) -> Float[Tensor, "batch c h w"]:
+        """The convolution with other weights."""
         if self.border == "zeros":
-            return functional.conv2d(input, self.weight, self.bias, self.stride, self.margin)
-        padded = wrap.pad(input, self.margin, self.border)
-        return functional.conv2d(padded, self.weight, self.bias, self.stride)
+            return functional.conv2d(maps, weight, bias, self.stride, self.margin)
+        return functional.conv2d(wrap.pad(maps, self.margin, self.border), weight, bias, self.stride)
+
+
+def normalized_convolution(
+    conv: PanoramaConv2d, norm: nn.BatchNorm2d, maps: Float[Tensor, "batch channel height width"]
+) -> Float[Tensor, "batch c h w"]:
+    """Convolution and batch normalisation, which outside training are one convolution."""
+    if norm.training:
+        return norm(conv(maps))
+    scale = norm.weight / (norm.running_var + norm.eps).sqrt()
+    offset = -norm.running_mean if conv.bias is None else conv.bias - norm.running_mean
+    return conv.convolve(maps, conv.weight * scale[:, None, None, None], norm.bias + scale * offset)
 
 
 def upsample(

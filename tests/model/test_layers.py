@@ -12,6 +12,7 @@ from pansplat.model.layers import (
     PanoramaConv2d,
     attend,
     border_of,
+    normalized_convolution,
     require_rigid,
     require_size,
     require_views,
@@ -63,6 +64,19 @@ def test_a_constant_panorama_stays_constant_up_to_the_poles():
 def test_a_convolution_has_the_right_gradient(border):
     conv = PanoramaConv2d(1, 2, 3, border=border).double()
     assert torch.autograd.gradcheck(conv, _noise(1, 1, 4, 8).requires_grad_())
+
+
+@pytest.mark.parametrize("bias", [True, False])
+def test_a_normalised_convolution_is_one_convolution_outside_training(randomize, bias):
+    conv, norm = PanoramaConv2d(3, 4, 3, border="sphere", bias=bias), torch.nn.BatchNorm2d(4)
+    randomize(torch.nn.ModuleList((conv, norm)))
+    norm.running_mean.copy_(_noise(4))
+    norm.running_var.copy_(_noise(4).square())
+    maps = _noise(2, 3, 4, 8)
+    assert torch.allclose(normalized_convolution(conv, norm, maps), norm(conv(maps)), atol=1e-13)
+    norm.train()
+    result = normalized_convolution(conv, norm, maps)
+    assert torch.allclose(result.mean(dim=(0, 2, 3)), norm.bias, atol=1e-12)
 
 
 def test_upsampling_keeps_pixel_centres_at_half_integers():
