@@ -127,7 +127,7 @@ def _list(part, cuts, order, words, columns, low, width, places, sorted_offsets,
         slot = np.int64(0)
         if len(slots) > 0:  # counted from the band's first row, whoever lists what is above
             slot = sorted_offsets[j]
-        if (across == 1) & (top == bottom):  # most
+        if (across == 1) & (top == bottom) & (x1 >= x0):  # most
             box = (
                 x0 & _LAST | (x1 & _LAST) << BOX_BITS | (y0 & _LAST) << (2 * BOX_BITS) | (y1 & _LAST) << (3 * BOX_BITS)
             )
