@@ -60,6 +60,23 @@ def mvsplat_weights(recipe: Callable[[str], dict[str, torch.Tensor]]) -> dict[st
 
 
 @pytest.fixture(scope="session")
+def as_lightning() -> Callable[[dict[str, torch.Tensor]], dict[str, object]]:
+    """A network's tensors as the original's training keeps them: prefixed, beside the state of the training."""
+
+    def wrap(tensors: dict[str, torch.Tensor]) -> dict[str, object]:
+        return {
+            "epoch": 4,
+            "global_step": 9000,
+            "pytorch-lightning_version": "2.2.0",
+            "state_dict": {f"encoder.{name}": tensor for name, tensor in tensors.items()},
+            "loops": {"fit_loop": {"state_dict": {}}},
+            "optimizer_states": [{"state": {0: {"step": torch.tensor(9000.0)}}, "param_groups": []}],
+        }
+
+    return wrap
+
+
+@pytest.fixture(scope="session")
 def golden(shared: Path) -> Callable[[str], dict[str, torch.Tensor]]:
     """What the original computed: tensors of a fixture such as "pansplat_64x128_fp32attn" or "units"."""
 

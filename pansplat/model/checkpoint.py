@@ -101,7 +101,7 @@ def load_weights(path: str | Path) -> WeightsFile:
         config, compat = json.loads(metadata["config"]), COMPATS[metadata["compat"]]
     except (ValueError, KeyError) as error:
         raise InputError(
-            f"{path}: needed settings in its metadata, got '{error}'; convert the checkpoint again"
+            f"{path}: needed settings in its metadata, got {error}; convert the checkpoint again"
         ) from error
     return WeightsFile(metadata["model"], config, compat, tensors)
 
