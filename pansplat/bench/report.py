@@ -18,15 +18,34 @@ _COLUMNS = (
 
 def tables(rows: Sequence[Row]) -> list[Table]:
     """One table a suite and scene, in the order they were measured; sweeps take one table for all their scenes."""
-    found: dict[str, Table] = {}
+    found = []
+    for title, own in _sections(rows).items():
+        found.append(Table(title=title, title_justify="left", pad_edge=False))
+        for name, side in _COLUMNS:
+            found[-1].add_column(name, justify=side, no_wrap=True)  # type: ignore[arg-type]
+        for row in own:
+            found[-1].add_row(*cells(row))
+    return found
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """The same tables, and the findings, as a page's text."""
+    parts = ["\n".join(f"* {sentence}" for sentence in findings(rows))]
+    head = "| " + " | ".join(name for name, _ in _COLUMNS) + " |"
+    rule = "|" + "|".join("---:" if side == "right" else "---" for _, side in _COLUMNS) + "|"
+    for title, own in _sections(rows).items():
+        lines = ["| " + " | ".join(cells(row)) + " |" for row in own]
+        parts.append("\n".join((f"### {title[0].upper()}{title[1:]}", "", head, rule, *lines)))
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _sections(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """The rows of each table, by its title."""
+    found: dict[str, list[Row]] = {}
     for row in rows:
         title = row.suite if row.suite in ("count", "resolution") else f"{row.suite}: {row.scene}"
-        if title not in found:
-            found[title] = Table(title=title, title_justify="left", pad_edge=False)
-            for name, side in _COLUMNS:
-                found[title].add_column(name, justify=side, no_wrap=True)  # type: ignore[arg-type]
-        found[title].add_row(*cells(row))
-    return list(found.values())
+        found.setdefault(title, []).append(row)
+    return found
 
 
 def cells(row: Row) -> tuple[str, ...]:
@@ -120,13 +139,14 @@ def _against_dense(rows: Sequence[Row]) -> list[str]:
 def _to_the_peaks(rows: Sequence[Row]) -> list[str]:
     told = []
     for row in _direct(rows, "headline", "numba"):
-        if row.fma_fraction is None or row.bandwidth_fraction is None:
+        if row.fma_fraction is None or row.bandwidth_fraction is None or row.forward_ms is None:
             continue
-        backward = f", backward {row.backward_fma_fraction:.0%}" if row.backward_fma_fraction is not None else ""
-        told.append(
-            f"numba on {_threads(row.threads)} reaches {row.fma_fraction:.0%} of the multiply-add peak over the whole "
-            f"forward pass{backward}, and {row.bandwidth_fraction:.0%} of the memory bandwidth."
-        )
+        text = f"numba on {_threads(row.threads)} reaches {row.fma_fraction:.0%} of the multiply-add peak forward"
+        if row.stages_ms.get("raster"):
+            text += f" ({row.fma_fraction * row.forward_ms / row.stages_ms['raster']:.0%} while it rasters)"
+        if row.backward_fma_fraction is not None:
+            text += f", {row.backward_fma_fraction:.0%} backward"
+        told.append(f"{text}, and {row.bandwidth_fraction:.0%} of the memory bandwidth forward.")
     return told
 
 

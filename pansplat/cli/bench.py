@@ -16,6 +16,7 @@ from rich.text import Text
 
 import pansplat
 from pansplat import pipeline
+from pansplat.atomic import replacing
 from pansplat.bench.cases import Case, Group, Subject, choices, default_face_size
 from pansplat.bench.drawing import why_not
 from pansplat.bench.gl_viewer import measure_viewer
@@ -23,7 +24,7 @@ from pansplat.bench.machine import describe_machine
 from pansplat.bench.plan import Settings, groups, of_scene, room, sample_groups
 from pansplat.bench.plots import plot_choices, plot_sweeps
 from pansplat.bench.raster import Bench
-from pansplat.bench.report import findings, tables
+from pansplat.bench.report import findings, markdown, tables
 from pansplat.bench.rows import Row
 from pansplat.cli.commands import BenchMachine, BenchRaster, PairChoice
 from pansplat.cli.scenes import choose_pair, progress_bar, require_height
@@ -99,12 +100,13 @@ def _free_memory() -> float:
 
 
 def _files(command: BenchRaster) -> dict[str, Path | None]:
-    """Where the rows and the two pictures go; refused before the work when a folder is missing."""
-    files: dict[str, Path | None] = {"json": command.json, "plot": command.plot, "sweeps": None}
+    """Where the rows, the two pictures and the page of tables go; refused before the work when a folder is missing."""
+    files: dict[str, Path | None] = {"json": command.json, "plot": command.plot, "sweeps": None, "page": None}
     if command.out is not None:
         command.out.mkdir(parents=True, exist_ok=True)
         files["json"] = command.json or command.out / "raster.json"
         files["plot"] = command.plot or command.out / "raster.png"
+        files["page"] = command.out / "raster.md"
     if files["plot"] is not None:
         files["sweeps"] = files["plot"].with_name(f"{files['plot'].stem}_sweeps{files['plot'].suffix}")
     for file in files.values():
@@ -181,6 +183,10 @@ def _report(bench: Bench, files: dict[str, Path | None]) -> None:
         written.append(files["plot"])
     if files["sweeps"] is not None and plot_sweeps(bench.rows, files["sweeps"]):
         written.append(files["sweeps"])
+    if files["page"] is not None and bench.rows:
+        with replacing(files["page"]) as partial:
+            partial.write_text(markdown(bench.rows))
+        written.append(files["page"])
     for file in written:
         if file is not None:
             print(file)

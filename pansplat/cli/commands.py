@@ -183,7 +183,7 @@ class BenchRaster:
     plot: Path | None = None
     """Picture of time against error (.png, .svg, .pdf); how the cost grows goes beside it, to NAME_sweeps."""
     out: Annotated[Path | None, arg(aliases=["-o"])] = None
-    """Folder for raster.json, raster.png and raster_sweeps.png."""
+    """Folder for raster.json, raster.md, raster.png and raster_sweeps.png."""
     height: int = 512
     """Height of the panoramas, pixels; a multiple of 8."""
     threads: int | None = None

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from pansplat.bench.report import cells, findings, tables
+from pansplat.bench.report import cells, findings, markdown, tables
 from pansplat.bench.rows import Row
 
 
@@ -33,6 +33,7 @@ def row():
         fma_fraction=0.5,
         backward_fma_fraction=0.4,
         bandwidth_fraction=0.1,
+        stages_ms={"sort": 20.0, "raster": 80.0},
     )
 
 
@@ -70,8 +71,17 @@ def test_sentences_compare_like_with_like(row):
     assert any("numba on one thread is 2,000 times" in one and "64x128" in one for one in told)
     scaled = 4.0 * 8**2 * 886_580 / 13_848
     assert any(f"(not measured), the dense renderer would take {scaled:,.0f} s" in one for one in told)
-    assert any("reaches 50% of the multiply-add peak" in one and "10% of the memory bandwidth" in one for one in told)
+    peaks = "reaches 50% of the multiply-add peak forward (62% while it rasters), 40% backward, and 10% of the memory"
+    assert any(peaks in one for one in told)
 
 
 def test_nothing_measured_tells_nothing():
-    assert tables([]) == [] and findings([]) == []
+    assert tables([]) == [] and findings([]) == [] and markdown([]) == "\n"
+
+
+def test_markdown_is_the_same_table(row):
+    lines = markdown([row, replace(row, threads=2)]).splitlines()
+    start = lines.index("### Headline: room 512")
+    table = lines[start + 2 :]
+    assert len(table) == 4 and len({line.count("|") for line in table}) == 1
+    assert " | ".join(cells(row)) in table[2]

@@ -46,7 +46,9 @@ def test_quick_writes_rows_and_pictures_and_prints_the_tables(tmp_path, capsys):
     assert {row["suite"] for row in content["rows"]} == {"headline", "choices", "dense", "count", "resolution"}
     assert all(row["forward_ms"] > 0 for row in content["rows"])
     assert content["machine"]["threads"] == 1
-    assert sorted(file.name for file in out.iterdir()) == ["raster.json", "raster.png", "raster_sweeps.png"]
+    assert sorted(file.name for file in out.iterdir()) == [
+        *("raster.json", "raster.md", "raster.png", "raster_sweeps.png")
+    ]
     printed = capsys.readouterr().out
     for word in ("headline", "choices", "PSNR dB", "without the viewer: there is none in this test", "dense renderer"):
         assert word in printed
