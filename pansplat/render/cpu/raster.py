@@ -29,11 +29,9 @@ from pansplat.render.cpu.simd import (
 from pansplat.render.cpu.tables import FLAT, Plane
 from pansplat.render.cpu.threads import share
 from pansplat.render.cpu.tile import (
-    A_ONE,
     A_X,
     ACROSS,
     ALONG_ROW,
-    B_ONE,
     B_X,
     BLOCK_HEIGHT,
     BLOCK_WIDTH,
@@ -43,9 +41,9 @@ from pansplat.render.cpu.tile import (
     CUT,
     EDGES,
     FORMS,
-    L_ONE,
     L_X,
     LEVEL_ROW,
+    MIDDLE,
     MOST,
     NOTHING,
     PIXELS,
@@ -61,6 +59,7 @@ Integers = npt.NDArray[np.int32]
 Longs = npt.NDArray[np.int64]
 
 _PIECES = 8  # of work a thread
+HALF = CHUNK + 1  # room for the powers of a block, and one to be written over
 _FEW = 4  # values summed without writing the weights down: RGB and the distance
 
 
@@ -113,7 +112,7 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
     through, added = np.empty(PIXELS, np.float32), np.empty(num_values * PIXELS, np.float32)
     forms, colours = np.empty(FORMS * CHUNK, np.float32), np.empty(num_values * CHUNK, np.float32)
     touched = np.empty(WORDS * EDGES, np.uint64)
-    powers, places = np.empty((CHUNK + 1) * LANES, np.float32), np.empty(CHUNK + 1, np.int32)
+    powers, places = np.empty(2 * HALF * LANES, np.float32), np.empty(2 * HALF, np.int32)
     exact = np.float32(0 if kind == FLAT else 1)
     for tile in range(low, high):
         left, top = (tile % tiles_across) * TILE, (first_row + tile // tiles_across) * TILE
@@ -124,22 +123,26 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
             gather(records, values, entries, first, count, middle, exact, forms, colours)
             list_blocks(entries, first, count, touched)
             is_open = False
-            for block in range(BLOCKS):
-                if not some(load(through, block * LANES) > fill(np.float32(CLOSED))):
-                    continue
-                reached = find_powers(block, touched, forms, offsets, powers, places)
-                if num_values == _FEW:
-                    is_open |= _draw_block(block, reached, powers, places, colours, through, added)
-                else:
-                    is_open |= _weigh_block(block, reached, powers, through)
-                    _add_block(block, reached, powers, places, colours, num_values, added)
+            # The next block's powers are found before a block is drawn, so that their latencies hide each other.
+            drawn, reached, half = -1, 0, 0
+            for block in range(BLOCKS + 1):
+                if block < BLOCKS:
+                    if not some(load(through, block * LANES) > fill(np.float32(CLOSED))):
+                        continue
+                    following = find_powers(block, touched, forms, offsets, powers, places, half)
+                if drawn >= 0 and num_values == _FEW:
+                    is_open |= _draw_block(drawn, reached, powers, places, HALF - half, colours, through, added)
+                elif drawn >= 0:
+                    is_open |= _weigh_block(drawn, reached, powers, HALF - half, through)
+                    _add_block(drawn, reached, powers, places, HALF - half, colours, num_values, added)
+                drawn, reached, half = block, following, HALF - half
             if not is_open:
                 break
         _write_tile(through, added, sums, left, top, num_values)
 
 
 @inlined
-def find_powers(block, touched, forms, offsets, powers, places):  # type: ignore[no-untyped-def]
+def find_powers(block, touched, forms, offsets, powers, places, start):  # type: ignore[no-untyped-def]
     """Log2 of the peak times the response at a block's pixels, for the Gaussians of the chunk that reach it.
 
     Returns:
@@ -147,13 +150,13 @@ def find_powers(block, touched, forms, offsets, powers, places):  # type: ignore
     """
     pixel, column, row = block * LANES, block % ACROSS, ROWS + block // ACROSS
     x, y, z = load(offsets, pixel), load(offsets, PIXELS + pixel), load(offsets, 2 * PIXELS + pixel)
-    reached = 0
+    reached = start
     for word in range(WORDS):
         bits = element(touched, word * EDGES + column) & element(touched, word * EDGES + row)
         while bits:
             s = word * 64 + lowest_bit(bits)
             bits &= bits - np.uint64(1)
-            a, b, front = forms_at(forms, s, x, y, z)
+            a, b, front, _, _, _ = forms_at(forms, s, x, y, z)
             q = multiply_add(a, a, b * b)
             below = multiply_add(front, front, spread(forms, ALONG_ROW * CHUNK + s) * q)
             power = spread(forms, LEVEL_ROW * CHUNK + s) - q / below
@@ -162,22 +165,30 @@ def find_powers(block, touched, forms, offsets, powers, places):  # type: ignore
             put(places, reached, np.int32(s))
             # Boxes have corners: what no pixel sees is written over. No branch, for none could be foretold.
             reached += np.int64(some(fill(np.float32(CUT)) <= power))
-    return reached
+    return reached - start
 
 
 @inlined
 def forms_at(forms, s, x, y, z):  # type: ignore[no-untyped-def]
-    """A, B, L of Gaussian `s` of the chunk at a block's pixels."""
-    a = multiply_add(spread(forms, A_X * CHUNK + s), x, spread(forms, A_ONE * CHUNK + s))
-    b = multiply_add(spread(forms, B_X * CHUNK + s), x, spread(forms, B_ONE * CHUNK + s))
-    front = multiply_add(spread(forms, L_X * CHUNK + s), x, spread(forms, L_ONE * CHUNK + s))
+    """A, B, L of Gaussian `s` of the chunk at a block's pixels, and the pixels' offsets from it.
+
+    The offsets come first: small numbers, so that nothing large cancels in the sums.
+    """
+    x, y, z = (
+        x - spread(forms, MIDDLE * CHUNK + s),
+        y - spread(forms, (MIDDLE + 1) * CHUNK + s),
+        z - spread(forms, (MIDDLE + 2) * CHUNK + s),
+    )
+    a = spread(forms, A_X * CHUNK + s) * x
+    b = spread(forms, B_X * CHUNK + s) * x
+    front = multiply_add(spread(forms, L_X * CHUNK + s), x, fill(np.float32(1)))
     a = multiply_add(spread(forms, (A_X + 1) * CHUNK + s), y, a)
     b = multiply_add(spread(forms, (B_X + 1) * CHUNK + s), y, b)
     front = multiply_add(spread(forms, (L_X + 1) * CHUNK + s), y, front)
     a = multiply_add(spread(forms, (A_X + 2) * CHUNK + s), z, a)
     b = multiply_add(spread(forms, (B_X + 2) * CHUNK + s), z, b)
     front = multiply_add(spread(forms, (L_X + 2) * CHUNK + s), z, front)
-    return a, b, front
+    return a, b, front, x, y, z
 
 
 @inlined
@@ -188,13 +199,13 @@ def opacity(power):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _draw_block(block, reached, powers, places, colours, through, added):  # type: ignore[no-untyped-def]
+def _draw_block(block, reached, powers, places, start, colours, through, added):  # type: ignore[no-untyped-def]
     """Draw what reaches a block, four values a Gaussian; whether it stays open."""
     pixel = block * LANES
     passes = load(through, pixel)
     sum0, sum1 = load(added, pixel), load(added, PIXELS + pixel)
     sum2, sum3 = load(added, 2 * PIXELS + pixel), load(added, 3 * PIXELS + pixel)
-    for at in range(reached):
+    for at in range(start, start + reached):
         colour = _FEW * np.int64(element(places, at))
         alpha = opacity(load(powers, at * LANES))
         weight = alpha * passes
@@ -212,10 +223,10 @@ def _draw_block(block, reached, powers, places, colours, through, added):  # typ
 
 
 @inlined
-def _weigh_block(block, reached, powers, through):  # type: ignore[no-untyped-def]
+def _weigh_block(block, reached, powers, start, through):  # type: ignore[no-untyped-def]
     """Turn powers into weights; whether the block stays open."""
     passes = load(through, block * LANES)
-    for at in range(reached):
+    for at in range(start, start + reached):
         alpha = opacity(load(powers, at * LANES))
         store(powers, at * LANES, alpha * passes)
         passes = multiply_add(negative(alpha), passes, passes)
@@ -224,12 +235,12 @@ def _weigh_block(block, reached, powers, through):  # type: ignore[no-untyped-de
 
 
 @inlined
-def _add_block(block, reached, weights, places, colours, num_values, added):  # type: ignore[no-untyped-def]
+def _add_block(block, reached, weights, places, start, colours, num_values, added):  # type: ignore[no-untyped-def]
     """Add a block's weighted values to the sums, any number of them."""
     for channel in range(num_values):
         pixel = channel * PIXELS + block * LANES
         total = load(added, pixel)
-        for at in range(reached):
+        for at in range(start, start + reached):
             colour = num_values * np.int64(element(places, at)) + channel
             total = multiply_add(load(weights, at * LANES), spread(colours, colour), total)
         store(added, pixel, total)

@@ -160,6 +160,16 @@ def minimum(context, a, b):  # type: ignore[no-untyped-def]
 
 
 @_intrinsic
+def maximum(context, a, b):  # type: ignore[no-untyped-def]
+    """The larger of two, `b` where `a` is not a number."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.select(builder.fcmp_ordered(">", *args), *args)
+
+    return lanes(lanes, lanes), generate
+
+
+@_intrinsic
 def some(context, condition):  # type: ignore[no-untyped-def]
     """Whether any lane is true."""
 

@@ -25,14 +25,12 @@ ROWS = ACROSS + 1  # where the rows' edges begin, among a word's
 EDGES = ROWS + DOWN + 1
 _AHEAD = 16  # Gaussians, between asking for a record and reading it
 
-# Rows of the forms: A = (x, y, z, 1).(A_X .. A_ONE) with a pixel's offset (x, y, z) from the tile's middle; B, L alike.
-A_X, A_ONE = 0, 3
-B_X, B_ONE = 4, 7
-L_X, L_ONE = 8, 11
-FRONTS = 12  # front_a, front_b
-ALONG_ROW, LEVEL_ROW = 14, 15
-MIDDLE = 16  # the Gaussian's point relative to the tile's middle: x, y, z
-FORMS = 19
+# Rows of the forms.
+A_X, B_X, L_X = 0, 3, 6  # a, b, l: x, y, z each
+MIDDLE = 9  # the Gaussian's point relative to the tile's middle: x, y, z
+ALONG_ROW, LEVEL_ROW = 12, 13
+FRONTS = 14  # front_a, front_b
+FORMS = 16
 
 CUT = math.log2(1 / 255)  # least power: log2 of alpha
 NOTHING = -1000.0  # a power far below
@@ -137,23 +135,21 @@ def gather(  # type: ignore[no-untyped-def]
             load(records, r6 + 8),
             load(records, r7 + 8),
         )
-        m_x = (n_x - fill(middle[0])) + (rest_x - fill(middle[3]))
-        m_y = (n_y - fill(middle[1])) + (rest_y - fill(middle[4]))
-        m_z = (n_z - fill(middle[2])) + (rest_z - fill(middle[5]))
         on = fill(exact)
         l_x = on * multiply_add(front_a, a_x, multiply_add(front_b, b_x, n_x))
         l_y = on * multiply_add(front_a, a_y, multiply_add(front_b, b_y, n_y))
         l_z = on * multiply_add(front_a, a_z, multiply_add(front_b, b_z, n_z))
-        _store_form(forms, A_X * CHUNK + at, a_x, a_y, a_z, m_x, m_y, m_z, fill(np.float32(0)))
-        _store_form(forms, B_X * CHUNK + at, b_x, b_y, b_z, m_x, m_y, m_z, fill(np.float32(0)))
-        _store_form(forms, L_X * CHUNK + at, l_x, l_y, l_z, m_x, m_y, m_z, fill(np.float32(1)))
-        store(forms, FRONTS * CHUNK + at, front_a)
-        store(forms, (FRONTS + 1) * CHUNK + at, front_b)
+        m_x = (n_x - fill(middle[0])) + (rest_x - fill(middle[3]))
+        m_y = (n_y - fill(middle[1])) + (rest_y - fill(middle[4]))
+        m_z = (n_z - fill(middle[2])) + (rest_z - fill(middle[5]))
+        _store_vector(forms, A_X, at, a_x, a_y, a_z)
+        _store_vector(forms, B_X, at, b_x, b_y, b_z)
+        _store_vector(forms, L_X, at, l_x, l_y, l_z)
+        _store_vector(forms, MIDDLE, at, m_x, m_y, m_z)
         store(forms, ALONG_ROW * CHUNK + at, along)
         store(forms, LEVEL_ROW * CHUNK + at, level)
-        store(forms, MIDDLE * CHUNK + at, m_x)
-        store(forms, (MIDDLE + 1) * CHUNK + at, m_y)
-        store(forms, (MIDDLE + 2) * CHUNK + at, m_z)
+        store(forms, FRONTS * CHUNK + at, front_a)
+        store(forms, (FRONTS + 1) * CHUNK + at, front_b)
         for place in range(at, min(at + LANES, count)):
             row = num_values * np.int64(element(entries, 2 * (first + place)))
             for channel in range(num_values):
@@ -191,9 +187,7 @@ def _toggle(words, at, bits):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _store_form(forms, at, x, y, z, m_x, m_y, m_z, constant):  # type: ignore[no-untyped-def]
-    product = multiply_add(x, m_x, multiply_add(y, m_y, z * m_z))
-    store(forms, at, x)
-    store(forms, at + CHUNK, y)
-    store(forms, at + 2 * CHUNK, z)
-    store(forms, at + 3 * CHUNK, constant - product)
+def _store_vector(forms, row, at, x, y, z):  # type: ignore[no-untyped-def]
+    store(forms, row * CHUNK + at, x)
+    store(forms, (row + 1) * CHUNK + at, y)
+    store(forms, (row + 2) * CHUNK + at, z)
