@@ -63,8 +63,13 @@ def measure_viewer(bench: Bench, group: Group, repeats: int) -> None:
 def _settings(case: Case) -> dict[str, object]:
     """What the viewer calls the case."""
     layout = {"cubemap": "equirect", "pinhole": "pinhole"}[case.layout]
-    settings = {"kernel": case.kernel, "order": case.order, "lowpass": case.filter, "layout": layout}
-    return settings | {"face_size": case.face_size}
+    return {
+        "kernel": case.kernel,
+        "order": case.order,
+        "lowpass": case.filter,
+        "layout": layout,
+        "face_size": case.face_size,
+    }
 
 
 def _lines(job: Path, threads: int) -> Iterator[dict[str, Any]]:

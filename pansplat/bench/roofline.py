@@ -88,8 +88,8 @@ def _multiply_adds(typing: Any, factor: Any, count: Any) -> Any:
 
 
 @nb.njit(nogil=True)
-def _chains(factor: float, count: int) -> float:
-    return _multiply_adds(nb.float32(factor), nb.int64(count))
+def _chains(factor: np.float32, count: int) -> float:
+    return _multiply_adds(factor, nb.int64(count))  # type: ignore[call-arg]
 
 
 @nb.njit(nogil=True, fastmath=True)
