@@ -23,7 +23,7 @@ from pansplat.geometry import wrap
 from pansplat.geometry.cube_strip import equirect_from_strip, strip_from_equirect, strip_lookup
 from pansplat.geometry.wrap import Border
 from pansplat.model.feature_pyramid import normalize
-from pansplat.model.layers import Compat, PanoramaConv2d, border_of, resize
+from pansplat.model.layers import Compat, PanoramaConv2d, border_of, normalized_convolution, resize
 
 HEIGHT, FACE_SIZE = 512, 256  # of what the encoders see
 SCALES = (5, 4, 3, 2, 1)  # coarse to fine: 1/32 to 1/2 of the panorama
@@ -53,10 +53,10 @@ class MonocularDepth(nn.Module):
     def forward(self, images: Float[Tensor, "batch view 3 height width"]) -> Float[Tensor, "batch view 32 256 512"]:
         """Features of panoramas of any size, RGB in [0, 1]."""
         panoramas, strips = self.prepare(images.flatten(0, 1))
-        from_panorama = self.panorama_encoder(normalize(panoramas))
+        from_panorama = self.panorama_encoder(_channels_last(normalize(panoramas)))
         faces = strips.unflatten(-1, (6, FACE_SIZE)).permute(0, 3, 1, 2, 4).flatten(0, 1)
-        from_faces = self.face_encoder(normalize(faces))
-        laid = {scale: self._lay(from_faces[scale], scale) for scale in SCALES}
+        from_faces = self.face_encoder(_channels_last(normalize(faces)))
+        laid = {scale: _channels_last(self._lay(from_faces[scale], scale)) for scale in SCALES}
         return self.decoder(from_panorama, laid).unflatten(0, images.shape[:2])
 
     @torch.no_grad()
@@ -108,7 +108,7 @@ class ResNet18(nn.Module):
         )
 
     def forward(self, x: Float[Tensor, "batch 3 height width"]) -> dict[int, Tensor]:
-        features = {1: relu(self.stem_norm(self.stem(x)))}
+        features = {1: relu(normalized_convolution(self.stem, self.stem_norm, x))}
         x = max_pool2d(wrap.pad(features[1], 1, self.border), 3, stride=2)
         for scale, stage in enumerate(self.stages, start=2):
             x = features[scale] = stage(x)
@@ -124,14 +124,16 @@ class ResidualBlock(nn.Module):
         self.norm1 = nn.BatchNorm2d(outputs)
         self.conv2 = PanoramaConv2d(outputs, outputs, 3, bias=False, border=border)
         self.norm2 = nn.BatchNorm2d(outputs)
-        self.shortcut = nn.Identity()
+        self.shortcut = None
         if stride > 1:
-            narrow = nn.Conv2d(inputs, outputs, 1, stride=stride, bias=False)
-            self.shortcut = nn.Sequential(narrow, nn.BatchNorm2d(outputs))
+            narrow = PanoramaConv2d(inputs, outputs, 1, stride=stride, bias=False, border=border)
+            self.shortcut = nn.ModuleList((narrow, nn.BatchNorm2d(outputs)))
 
     def forward(self, x: Float[Tensor, "batch c height width"]) -> Float[Tensor, "batch d h w"]:
-        y = relu(self.norm1(self.conv1(x)))
-        return relu(self.shortcut(x) + self.norm2(self.conv2(y)))
+        inner = relu(normalized_convolution(self.conv1, self.norm1, x))
+        inner = normalized_convolution(self.conv2, self.norm2, inner)
+        kept = x if self.shortcut is None else normalized_convolution(*self.shortcut, x)
+        return relu(kept + inner)
 
 
 class Fusion(nn.Module):
@@ -142,7 +144,7 @@ class Fusion(nn.Module):
 
     def __init__(self, channels: int, border: Border) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(2 * channels, channels, 1, bias=False)
+        self.conv1 = PanoramaConv2d(2 * channels, channels, 1, bias=False, border=border)
         self.norm1 = nn.BatchNorm2d(channels)
         self.conv2 = PanoramaConv2d(channels, channels, 3, bias=False, border=border)
         self.norm2 = nn.BatchNorm2d(channels)
@@ -152,7 +154,8 @@ class Fusion(nn.Module):
         self, panorama: Float[Tensor, "batch c height width"], faces: Float[Tensor, "batch c height width"]
     ) -> Float[Tensor, "batch c height width"]:
         both = torch.cat((panorama, faces), dim=1)
-        correction = self.norm2(self.conv2(relu(self.norm1(self.conv1(both)))))
+        correction = relu(normalized_convolution(self.conv1, self.norm1, both))
+        correction = normalized_convolution(self.conv2, self.norm2, correction)
         return relu(self.join(torch.cat((panorama, faces + correction), dim=1)))
 
 
@@ -187,3 +190,8 @@ class Decoder(nn.Module):
             fused = self.fuse[str(fine)](from_panorama[fine], from_faces[fine])
             x = elu(self.merge[str(fine)](torch.cat((x, fused), dim=1)))
         return x
+
+
+def _channels_last(maps: Tensor) -> Tensor:
+    """The layout in which the convolutions are fastest on a CPU."""
+    return maps.contiguous(memory_format=torch.channels_last)
