@@ -11,13 +11,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.model.cost_volume import Depths, LevelDepth
-from pansplat.model.heads import HeadsConfig, LevelHead, ViewInputs, read_points, views_of
+from pansplat.model.heads import HeadsConfig, LevelHead, ViewInputs, joined, read_points, views_of
 from pansplat.model.layers import Compat
 from pansplat.model.tiles import Margins, Tile, cut
 
@@ -70,8 +69,7 @@ class AuxiliaryHeads(nn.Module):
         whole = Tile(0, 0, 1)
         around = whole.window(height).grown(self.margins.input)
         inputs = (view.image, view.features[index], view.logits)
-        maps = torch.cat([cut(source, height, around, self.compat) for source in inputs])[None]
-        refined = self.levels[index](maps.contiguous(memory_format=torch.channels_last))
+        refined = self.levels[index](joined([cut(source, height, around, self.compat) for source in inputs]))
         at = (item, view.view)
         own = dataclasses.replace(view, inverse_depth=depth.inverse_depth[at], confidence=depth.confidence[at])
         return read_points(
