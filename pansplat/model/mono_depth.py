@@ -3,9 +3,11 @@
 A panorama goes through one ResNet-18, its six cube faces through another; at five scales the faces' features are
 laid onto the panorama and fused, and a decoder brings the fused features up to 256x512, whatever the input's size.
 
-`compat`: "official" pads rows with zeros and resizes the input without knowing that its ends meet; "fixed"
-continues panoramas over seam and poles in the panorama's encoder and decoder and in the resizing. In both, the
-faces keep their zero padding, and the way from faces to panorama its border of whole rows: the weights learnt them.
+`compat`: "official" pads rows with zeros, resizes the input without knowing that its ends meet, and sees the faces up
+and down one way round. "fixed" continues panoramas over seam and poles in the panorama's encoder and decoder and in
+the resizing, and encodes up and down both ways round, so that rolling the panorama by half a turn rolls the features.
+In both, the faces keep their zero padding, and the way from faces to panorama its border of whole rows: the weights
+learnt them.
 
 Source: Jiang et al., UniFuse, https://arxiv.org/abs/2102.03550; OFFICIAL.md, sections 2.4 and 5.
 """
@@ -54,8 +56,7 @@ class MonocularDepth(nn.Module):
         """Features of panoramas of any size, RGB in [0, 1]."""
         panoramas, strips = self.prepare(images.flatten(0, 1))
         from_panorama = self.panorama_encoder(_channels_last(normalize(panoramas)))
-        faces = strips.unflatten(-1, (6, FACE_SIZE)).permute(0, 3, 1, 2, 4).flatten(0, 1)
-        from_faces = self.face_encoder(_channels_last(normalize(faces)))
+        from_faces = self._encode_faces(strips.unflatten(-1, (6, FACE_SIZE)).permute(0, 3, 1, 2, 4))
         laid = {scale: _channels_last(self._lay(from_faces[scale], scale)) for scale in SCALES}
         return self.decoder(from_panorama, laid).unflatten(0, images.shape[:2])
 
@@ -74,10 +75,23 @@ class MonocularDepth(nn.Module):
         strips = torch.stack([strip_from_equirect(panorama, FACE_SIZE) for panorama in panoramas])
         return panoramas, strips
 
+    def _encode_faces(self, faces: Float[Tensor, "batch 6 3 n n"]) -> dict[int, Float[Tensor, "batch 6 channel m m"]]:
+        """Features of the faces at each scale; "fixed" takes up and down both ways round, and the mean of both."""
+        if self.compat == "fixed":
+            faces = torch.cat((faces, _turned(faces[:, 4:])), dim=1)
+        encoded = self.face_encoder(_channels_last(normalize(faces.flatten(0, 1))))
+        by_face = {scale: maps.unflatten(0, faces.shape[:2]) for scale, maps in encoded.items()}
+        if self.compat == "official":
+            return by_face
+        return {
+            scale: torch.cat((maps[:, :4], (maps[:, 4:6] + _turned(maps[:, 6:])) / 2), dim=1)
+            for scale, maps in by_face.items()
+        }
+
     @staticmethod
-    def _lay(faces: Float[Tensor, "faces channel n n"], scale: int) -> Float[Tensor, "batch channel h w"]:
+    def _lay(faces: Float[Tensor, "batch 6 channel n n"], scale: int) -> Float[Tensor, "batch channel h w"]:
         """Six faces' features, laid onto the panorama."""
-        strip = faces.unflatten(0, (-1, 6)).permute(0, 2, 3, 1, 4).flatten(-2)
+        strip = faces.permute(0, 2, 3, 1, 4).flatten(-2)
         return equirect_from_strip(strip, lookup(scale))
 
 
@@ -190,6 +204,11 @@ class Decoder(nn.Module):
             fused = self.fuse[str(fine)](from_panorama[fine], from_faces[fine])
             x = elu(self.merge[str(fine)](torch.cat((x, fused), dim=1)))
         return x
+
+
+def _turned(faces: Float[Tensor, "batch face channel n n"]) -> Float[Tensor, "batch face channel n n"]:
+    """Faces turned by half a turn in their own plane, as up and down are when the panorama rolls by one."""
+    return faces.flip(-1, -2)
 
 
 def _channels_last(maps: Tensor) -> Tensor:

@@ -73,6 +73,16 @@ class _Only:
         self.compat = compat
 
 
+def test_rolling_the_panorama_by_half_a_turn_rolls_the_features(
+    network: MonocularDepth, expected: dict[str, Tensor]
+) -> None:
+    fixed = MonocularDepth("fixed")
+    fixed.load_state_dict(network.state_dict())
+    image = expected["in.image"][:, :1]
+    features, turned = fixed(image), fixed(image.roll(64, dims=-1))
+    assert deviation(turned, features.roll(256, dims=-1)) < 1e-3
+
+
 def test_rolling_the_panorama_rolls_its_encoding() -> None:
     encoder = seeded(ResNet18("sphere"))
     image = torch.rand(1, 3, 64, 128, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
