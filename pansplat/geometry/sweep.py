@@ -164,7 +164,7 @@ class _ByWarping(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, gradient):
+    def backward(ctx, gradient):  # pyright: ignore[reportIncompatibleMethodOverride]
         reference, other, inverse_depth, pose = ctx.saved_tensors
         to_reference, to_other = torch.zeros_like(reference), torch.zeros_like(other)
         chunks = _chunks(inverse_depth, reference.numel())
@@ -192,7 +192,7 @@ class _ByKernel(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, gradient):
+    def backward(ctx, gradient):  # pyright: ignore[reportIncompatibleMethodOverride]
         reference, other, inverse_depth, pose = ctx.saved_tensors
         to_reference, to_other = torch.zeros_like(reference), torch.zeros_like(other)
         for candidates, place in _placed(inverse_depth, pose, ctx.sampling):

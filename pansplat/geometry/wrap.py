@@ -61,7 +61,7 @@ class _Padded(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, gradient):
+    def backward(ctx, gradient):  # pyright: ignore[reportIncompatibleMethodOverride]
         margin = ctx.margin
         within = gradient[..., margin:-margin].clone()
         within[..., -margin:] += gradient[..., :margin]

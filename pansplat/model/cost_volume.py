@@ -130,14 +130,15 @@ class SphericalCostVolume(nn.Module):
         self, config: CostVolumeConfig, compat: Compat, attention_precision: AttentionPrecision = "float32"
     ) -> None:
         super().__init__()
-        self.config, self.compat = config, compat
+        self.config = config
+        self.compat: Compat = compat
         # Keys are the paper's numbers of the levels.
         self.levels = nn.ModuleDict()
         for index, sweep in enumerate(config.swept_levels):
             self.levels[str(sweep.level)] = LevelRefinement(
                 sweep, config, first=index == 0, compat=compat, precision=attention_precision
             )
-        self.to(memory_format=torch.channels_last)  # convolves faster
+        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # convolves faster
 
     def forward(
         self,
@@ -168,11 +169,12 @@ class SphericalCostVolume(nn.Module):
         bounds = (1 / far, 1 / near)
         done: list[LevelDepth] = []
         for sweep, level_features in zip(self.config.swept_levels, features, strict=False):
-            require_size(*level_features.shape[-2:], _UNET_MULTIPLE)
+            height, width = level_features.shape[-2:]
+            require_size(height, width, _UNET_MULTIPLE)
             centre = upsampled_centre(done[-1].inverse_depth, self.compat) if done else None
             first_count = self.config.swept_levels[0].candidates
             if centre is None:
-                candidates = first_candidates(bounds, first_count, level_features.shape[-2:])
+                candidates = first_candidates(bounds, first_count, (height, width))
             else:
                 step = (bounds[1] - bounds[0]) / max(1, first_count - 1) / 2 ** len(done)
                 candidates = candidates_about(centre, step, bounds, sweep.candidates)
@@ -211,7 +213,8 @@ class LevelRefinement(nn.Module):
         if centre is not None:
             parts.append(centre[:, :, None].to(features.dtype))
         if mono_features is not None:
-            resized = resize(mono_features.flatten(0, 1), features.shape[-2:], self.compat)
+            height, width = features.shape[-2:]
+            resized = resize(mono_features.flatten(0, 1), (height, width), self.compat)
             parts.append(resized.unflatten(0, features.shape[:2]))
         inputs = torch.cat(parts, dim=2)
         refined = self.shortcut(inputs.flatten(0, 1))
@@ -276,20 +279,23 @@ def correlate_views(
     compat: Compat,
 ) -> Float[Tensor, "batch view candidate height width"]:
     """Each view's correlation with the others, averaged over them."""
+    total = _correlate_round(features, candidates, cam2world, 1, compat)
+    for offset in range(2, features.shape[1]):
+        total = total + _correlate_round(features, candidates, cam2world, offset, compat)
+    return total / (features.shape[1] - 1)
+
+
+def _correlate_round(features: Tensor, candidates: Tensor, cam2world: Tensor, offset: int, compat: Compat) -> Tensor:
+    """Each view's correlation with the one that comes `offset` views later, counted round."""
     sampling: Sampling = "sphere" if compat == "fixed" else "corners"
-    views = features.shape[1]
-    total = None
-    for offset in range(1, views):
-        pose = relative_pose(cam2world, cam2world.roll(-offset, dims=1))
-        correlation = correlate(
-            features.flatten(0, 1),
-            features.roll(-offset, dims=1).flatten(0, 1),
-            candidates.flatten(0, 1),
-            pose.flatten(0, 1),
-            sampling,
-        )
-        total = correlation if total is None else total + correlation
-    return (total / (views - 1)).unflatten(0, features.shape[:2])
+    correlation = correlate(
+        features.flatten(0, 1),
+        features.roll(-offset, dims=1).flatten(0, 1),
+        candidates.flatten(0, 1),
+        relative_pose(cam2world, cam2world.roll(-offset, dims=1)).flatten(0, 1),
+        sampling,
+    )
+    return correlation.unflatten(0, features.shape[:2])
 
 
 def regress(

@@ -47,7 +47,7 @@ class FeaturePyramid(nn.Module):
         self.encoder = Encoder(config.channels, border_of(compat))
         self.transformer = Transformer(config.transformer, compat, attention_precision)
         self.decoder = Decoder(config.channels, compat)
-        self.to(memory_format=torch.channels_last)  # convolves faster
+        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # convolves faster
 
     def forward(self, images: Float[Tensor, "batch view 3 height width"]) -> list[Float[Tensor, "batch view _ _ _"]]:
         """Features of all views, coarse to fine, of RGB images in [0, 1].
@@ -57,7 +57,8 @@ class FeaturePyramid(nn.Module):
         """
         batch_and_view = images.shape[:2]
         require_views(images.shape[1], self.compat)
-        require_size(*images.shape[-2:], 32 if self.compat == "fixed" else 16)
+        height, width = images.shape[-2:]
+        require_size(height, width, 32 if self.compat == "fixed" else 16)
         fine_to_coarse = self.encoder(normalize(images.flatten(0, 1)))
         coarsest = fine_to_coarse[-1].unflatten(0, batch_and_view)
         refined = self.transformer(coarsest).flatten(0, 1)

@@ -100,10 +100,11 @@ def normalized_convolution(
     conv: PanoramaConv2d, norm: nn.BatchNorm2d, maps: Float[Tensor, "batch channel height width"]
 ) -> Float[Tensor, "batch c h w"]:
     """Convolution and batch normalisation, which outside training are one convolution."""
-    if norm.training:
+    mean, variance = norm.running_mean, norm.running_var
+    if norm.training or mean is None or variance is None:
         return norm(conv(maps))
-    scale = norm.weight / (norm.running_var + norm.eps).sqrt()
-    offset = -norm.running_mean if conv.bias is None else conv.bias - norm.running_mean
+    scale = norm.weight / (variance + norm.eps).sqrt()
+    offset = -mean if conv.bias is None else conv.bias - mean
     return conv.convolve(maps, conv.weight * scale[:, None, None, None], norm.bias + scale * offset)
 
 

@@ -36,7 +36,8 @@ class Transformer(nn.Module):
 
     def __init__(self, config: TransformerConfig, compat: Compat, precision: AttentionPrecision = "float32") -> None:
         super().__init__()
-        self.config, self.compat = config, compat
+        self.config = config
+        self.compat: Compat = compat
         self.blocks = nn.ModuleList(TransformerBlock(config, precision) for _ in range(config.blocks))
         for parameter in self.parameters():
             if parameter.dim() > 1:

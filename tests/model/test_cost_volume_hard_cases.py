@@ -150,6 +150,13 @@ def test_41_one_candidate_is_the_depth(randomize):
     assert torch.equal(level.confidence, torch.ones_like(level.confidence))
 
 
+def test_41_one_candidate_leaves_finer_levels_their_search(randomize):
+    config = CostVolumeConfig(mono_channels=0, levels=(SweepLevel(2, 8, 1, 32), SweepLevel(1, 4, 4, 32)))
+    level = randomize(SphericalCostVolume(config, "fixed"))(_features(), _poses(), *_bounds()).levels[1]
+    expected = torch.tensor((0.1, 0.1, 1.05, 2.0)).double()  # about the middle, by half the range, clamped
+    assert torch.allclose(level.candidates[0, 0, :, 3, 3], expected)
+
+
 def test_41_no_logits_lead_out_of_the_bounds(network):
     with torch.no_grad():
         for sign in (-1, 1):
@@ -171,6 +178,13 @@ def test_42_huge_logits_in_half_precision_choose_one_candidate(dtype):
     assert torch.equal(level.inverse_depth, candidates[:, :, 4])
     level.inverse_depth.sum().backward()
     assert torch.isfinite(logits.grad).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_42_the_mean_is_taken_in_float32(dtype):
+    candidates = _candidates(*(bound.float() for bound in _bounds()))
+    level = regress(2, torch.zeros(1, 2, 6, H, W, dtype=dtype), candidates)
+    assert torch.allclose(level.inverse_depth, candidates.mean(dim=2), rtol=1e-6)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])

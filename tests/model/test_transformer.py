@@ -70,6 +70,16 @@ def test_a_quarter_turn_changes_which_tokens_meet(small):
     assert not torch.allclose(small()(maps.roll(4, -1)), small()(maps).roll(4, -1), atol=1e-3)
 
 
+def test_blocks_that_say_nothing_leave_each_token_in_its_place(small):
+    network, maps = small(), _noise(1, 2, 16, 4, 8)
+    with torch.no_grad():
+        for name, parameter in network.named_parameters():
+            if "norm" in name:
+                parameter.zero_()
+    encoding = position_encoding(2, 4, 16).double().repeat(1, 2, 2)
+    assert torch.allclose(network(maps), maps + encoding, atol=1e-6)
+
+
 @pytest.mark.parametrize("views", [2, 3, 4])
 def test_the_order_of_the_views_does_not_matter(small, views):
     maps, order = _noise(1, views, 16, 4, 8), torch.arange(views).flip(0)
