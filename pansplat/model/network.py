@@ -214,11 +214,12 @@ def unmasked(
 ) -> Gaussians:
     """The Gaussians whose means their own view sees at a pixel that its mask keeps."""
     height, width = masks.shape[-2:]
-    view = gaussians.views.long()
-    pose = cam2world.to(gaussians.means)[view]
-    directions = (pose[:, :3, :3].transpose(-1, -2) @ (gaussians.means - pose[:, :3, 3])[..., None])[..., 0]
-    column, row = (uv_from_directions(directions) * torch.tensor((width, height)).to(directions)).long().unbind(-1)
-    kept = masks.to(view.device)[view, row.clamp(0, height - 1), column.clamp(0, width - 1)]
+    kept = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+    for view, (pose, mask) in enumerate(zip(cam2world.to(gaussians.means), masks, strict=True)):
+        own = gaussians.views == view
+        uv = uv_from_directions((gaussians.means[own] - pose[:3, 3]) @ pose[:3, :3])
+        column, row = (uv[:, 0] * width).long(), (uv[:, 1] * height).long()
+        kept[own] = mask.to(kept.device)[row.clamp(0, height - 1), column.clamp(0, width - 1)]
     return gaussians.select(kept)
 
 

@@ -44,7 +44,7 @@ class FastConv3x3(nn.Conv2d):
 
     def __init__(self, inputs: int, outputs: int, *, padding: int) -> None:
         super().__init__(inputs, outputs, 3, padding=padding)
-        self._transformed: tuple[Any, Tensor] | None = None
+        self._transformed: tuple[Tensor, int, Tensor] | None = None
 
     def forward(self, input: Float[Tensor, "batch channel height width"]) -> Float[Tensor, "batch c h w"]:
         if not self._is_faster_in_blocks(input):
@@ -63,10 +63,11 @@ class FastConv3x3(nn.Conv2d):
 
     def _coefficients(self) -> Float[Tensor, "36 inputs outputs"]:
         """The transformed weights, kept until the weights change."""
-        key = (self.weight.data_ptr(), self.weight._version)
-        if self._transformed is None or self._transformed[0] != key:
-            self._transformed = (key, transform_weights(self.weight))
-        return self._transformed[1]
+        weight = self.weight.detach()  # holding it keeps its memory from being given to other weights
+        kept = self._transformed
+        if kept is None or kept[0].data_ptr() != weight.data_ptr() or kept[1] != weight._version:
+            kept = self._transformed = (weight, weight._version, transform_weights(weight))
+        return kept[2]
 
 
 @torch.no_grad()
