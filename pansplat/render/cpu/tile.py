@@ -35,7 +35,7 @@ FORMS = 16
 CUT = math.log2(1 / 255)  # least power: log2 of alpha
 NOTHING = -1000.0  # a power far below
 MOST = 0.99
-CLOSED = 1e-6
+CLOSED = 1e-7
 """A pixel takes nothing more once its transmittance is at or below this."""
 
 
