@@ -111,13 +111,27 @@ def test_a_gaussian_over_many_tiles_has_the_gradient_of_float64_torch(make_scene
         assert float((got[1][name] - expected).norm() / expected.norm()) < 1e-5, name
 
 
+@pytest.mark.parametrize("layout", ["equirect", "cubemap"])
+def test_opaque_gaussians_around_the_camera_equal_float64_torch(layout, make_scene):
+    scene = make_scene(12, scale=1.5, spread=0.6, seed=2, degree=0)
+    scene = dataclasses.replace(scene, opacities=torch.linspace(0.5, 2.0, 12, dtype=torch.float64))
+    camera = torch.eye(4, dtype=torch.float64)
+    options = dict(size=(9, 18), layout=layout, face_size=6)
+    truth = _gradients(scene, camera, torch.float64, None, backend="torch", **options)
+    got = _gradients(scene, camera, torch.float64, None, backend="triton", **options)
+    assert float(truth[0][3].max()) > 0.9999  # several at the largest alpha
+    assert float((got[0] - truth[0]).abs().max()) < 2e-5  # stopped tiles
+    for name, expected in truth[1].items():
+        assert float((got[1][name] - expected).norm() / expected.norm()) < 1e-3, name
+
+
 def test_what_lies_behind_a_saturated_tile_is_left_out(make_scene, pose):
-    scene = make_scene(110, scale=3.0, spread=0.1, seed=2, degree=0)
+    scene = make_scene(130, scale=3.0, spread=0.1, seed=2, degree=0)
     ahead = torch.tensor((0.0, 0.0, 3.0), dtype=torch.float64)
     scene = dataclasses.replace(
         scene,
         means=(scene.means + ahead) @ pose[:3, :3].T + pose[:3, 3],
-        opacities=torch.full_like(scene.opacities, 0.6),
+        opacities=torch.full_like(scene.opacities, 0.2),  # so that 32 leave some
     )
     options = dict(size=(4, 4), layout="pinhole")
     truth = _gradients(scene, pose, torch.float64, None, backend="torch", **options)

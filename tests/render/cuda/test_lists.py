@@ -88,8 +88,10 @@ def test_centres_and_offsets_keep_more_digits_than_their_type():
 def test_records_and_gradients_have_the_layouts_lengths(exact):
     layout = Layout(exact, channels=5)
     splats = Splats(*(torch.rand(3, *shape) for shape in ((3,), (3, 3), (), (), (6,))))
-    splats = splats._replace(point=splats.point.double())
+    splats = splats._replace(point=torch.rand(3, 3, dtype=torch.float64))
     records = pack(splats, layout)
+    point, remainder = records.double().split((layout.axes, layout.axes, layout.record - 2 * layout.axes), dim=1)[:2]
+    assert float((point + remainder - splats.point[:, : layout.axes]).abs().max()) < 1e-14
     assert records.shape == (3, layout.record)
     assert torch.equal(records[:, layout.peak], splats.peak) and torch.equal(
         records[:, layout.peak + 1 :], splats.values

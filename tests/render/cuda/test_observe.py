@@ -27,7 +27,7 @@ def test_what_is_seen_equals_the_reference(exact, compensate, by_covariance, deg
     scene.quats[3] = 0
     scene.scales[5, 1] = 0
     scene.scales[6] = 0
-    covariances = scene.covariances if by_covariance else None
+    covariances = _rounded(scene.covariances) if by_covariance else None
     options = dict(spread=3e-4, compensate=compensate, exact=exact)
     for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-6)):
         same = None if covariances is None else covariances.to(dtype)
@@ -48,6 +48,8 @@ def test_gradients_equal_the_references(exact, by_covariance, make_scene, pose, 
     monkeypatch.setattr(room, "_CHUNK", 50)
     scene = make_scene(70)  # one program and a part
     scene.quats[3] = 0
+    scene.scales[5, 1] = 0
+    scene.scales[6] = 0
     generator = torch.Generator().manual_seed(0)
     found = []
     for function in (reference, observe):
@@ -66,6 +68,17 @@ def test_gradients_equal_the_references(exact, by_covariance, make_scene, pose, 
     assert found[0].keys() == found[1].keys() and len(found[0]) == (5 if by_covariance else 6)
     for name, expected in found[0].items():
         assert float((found[1][name] - expected).norm() / expected.norm()) < 1e-10, name
+
+
+def _rounded(covariances: torch.Tensor) -> torch.Tensor:
+    """Covariances some of which are discs and needles that rounding made slightly indefinite."""
+    rounded = covariances.clone()
+    for thin in (1, 2):
+        axes = torch.linalg.eigh(covariances[thin::7])
+        flat = axes.eigenvalues.clone()
+        flat[:, :thin] = -1e-5 * flat[:, 2:]
+        rounded[thin::7] = axes.eigenvectors @ torch.diag_embed(flat) @ axes.eigenvectors.mT
+    return rounded
 
 
 def _any_loss(seen: Observed, generator: torch.Generator) -> torch.Tensor:
