@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -42,14 +43,15 @@ def plot_choices(rows: Sequence[Row], path: Path) -> bool:
     figure = Figure(figsize=(10, 6.5), layout="constrained")
     axes = figure.subplots()
     for row, (x, y) in zip(shown, points, strict=True):
-        filled = _COLORS[row.kernel] if row.layout == "equirect" or row.filter == "angular" else "none"
+        filled = _COLORS[row.kernel] if row.filter == "angular" else "none"
         edge = _COLORS[row.kernel] if row.precision == "float32" else "#444444"
         axes.scatter(x, y, s=55, marker=_MARKERS.get(row.backend, "*"), facecolors=filled, edgecolors=edge, zorder=3)
     front = pareto_front(points)
     axes.plot(*zip(*(points[i] for i in front), strict=True), color="#2a8c4a", linewidth=1.5, zorder=2)
-    _label(axes, [(points[i], _name(shown[i])) for i in front])
     axes.set(xscale="log", yscale="log", xlabel="forward, milliseconds")
-    axes.set_ylabel("root mean square error of the colours against the exact picture")
+    axes.set_ylim(bottom=min(axes.get_ylim()[0], 0.03 * min(y for _, y in points)))
+    _label(axes, [(points[i], _name(shown[i])) for i in front])
+    axes.set_ylabel("root mean square error of the colours (the exact picture is drawn at 1e-8)")
     first = shown[0]
     axes.set_title(f"{first.scene}: {first.num_gaussians:,} Gaussians at {first.height}x{2 * first.height}", loc="left")
     decibels = axes.secondary_yaxis("right", functions=(lambda y: y, lambda y: y))
@@ -67,13 +69,16 @@ def _name(row: Row) -> str:
 
 
 def _label(axes: Axes, labels: list[tuple[tuple[float, float], str]]) -> None:
-    """Names beside the front's points; steps apart where points crowd."""
+    """Names beside the front's points, above it on the left and below on the right; apart where points crowd."""
+    low, high = (math.log(edge) for edge in axes.get_xlim())
     for index, (point, name) in enumerate(labels):
+        right = math.log(point[0]) < 0.5 * (low + high)
         axes.annotate(
             name,
             point,
-            xytext=(14, 10 + 13 * (index % 3)),
+            xytext=(14, 12 + 13 * (index % 3)) if right else (-14, -12 - 13 * (index % 3)),
             textcoords="offset points",
+            ha="left" if right else "right",
             fontsize=8,
             arrowprops={"arrowstyle": "-", "color": "#999999", "linewidth": 0.6},
         )
@@ -84,14 +89,14 @@ def _legend(axes: Axes, rows: Sequence[Row]) -> None:
         axes.scatter([], [], marker=_MARKERS.get(backend, "*"), color="#888888", label=backend)
     for kernel in dict.fromkeys(row.kernel for row in rows):
         axes.plot([], [], linewidth=4, color=_COLORS[kernel], label=f"kernel {kernel}")
-    axes.scatter([], [], marker="o", facecolors="none", edgecolors="#888888", label="hollow: filter 3dgs on faces")
+    axes.scatter([], [], marker="o", facecolors="none", edgecolors="#888888", label="hollow: filter 3dgs")
     axes.scatter([], [], marker="s", facecolors="#cccccc", edgecolors="#444444", label="dark rim: float64")
     axes.plot([], [], color="#2a8c4a", label="nothing is faster and better")
     axes.legend(fontsize=8, loc="best")
 
 
 def plot_sweeps(rows: Sequence[Row], path: Path) -> bool:
-    """Time and memory against the number of Gaussians and of pixels; False when there is nothing to show.
+    """The least time of each row against the number of Gaussians and of pixels; False when there is nothing to show.
 
     Raises:
         InputError: the file cannot be written.
@@ -104,9 +109,15 @@ def plot_sweeps(rows: Sequence[Row], path: Path) -> bool:
     _curves(left, sweeps["count"], "num_gaussians")
     heights = {row.height for row in sweeps["count"]}
     where = f" at {max(heights)}x{2 * max(heights)}" if heights else ""
-    left.set(xlabel="Gaussians" + where, ylabel="milliseconds", title="more Gaussians, same picture")
+    left.set(
+        xlabel="Gaussians" + where, ylabel="milliseconds, least of the repeats", title="more Gaussians, same picture"
+    )
     _curves(right, sweeps["resolution"], "height")
-    right.set(xlabel="height of the panorama, pixels", ylabel="milliseconds", title="larger picture, its own scene")
+    right.set(
+        xlabel="height of the panorama, pixels",
+        ylabel="milliseconds, least of the repeats",
+        title="larger picture, its own scene",
+    )
     _save(figure, path)
     return True
 
@@ -115,7 +126,7 @@ def _curves(axes: Axes, rows: Sequence[Row], x: str) -> None:
     for backend in dict.fromkeys(row.backend for row in rows):
         own = sorted((row for row in rows if row.backend == backend), key=lambda row: getattr(row, x))
         for name, style in (("forward", "-"), ("backward", "--")):
-            line = [(getattr(row, x), getattr(row, f"{name}_ms")) for row in own if getattr(row, f"{name}_ms")]
+            line = [(getattr(row, x), getattr(row, f"{name}_min_ms")) for row in own if getattr(row, f"{name}_min_ms")]
             if line:
                 threads = f", {own[0].threads} threads" if own[0].threads > 1 else ""
                 label = f"{backend} {name}{threads}"
