@@ -210,8 +210,8 @@ def _panorama(piece, records, rotation, height, width, boxes):
             around = x1 - x0 >= width - 1
             seen = (x0 <= x1) & (y0 <= y1)
             x0, x1 = x0 - width * math.floor(x0 / width), x1 - width * math.floor(x1 / width)
-            rows[EDGES, i] = 0.0 if around else x0
-            rows[EDGES + 1, i] = width - 1.0 if around else x1
+            rows[EDGES, i] = x0 if seen & ~around else 0.0
+            rows[EDGES + 1, i] = (width - 1.0 if around else x1) if seen else 0.0
             rows[EDGES + 2, i], rows[EDGES + 3, i] = y0 if seen else 1.0, y1 if seen else 0.0
         write_boxes(rows, EDGES, start, count, boxes)
 

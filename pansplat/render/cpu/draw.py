@@ -22,7 +22,7 @@ from pansplat.render.cpu import bins
 from pansplat.render.cpu.bins import TileLists, list_tiles
 from pansplat.render.cpu.boxes import LARGEST_SIDE, find_boxes
 from pansplat.render.cpu.compiling import announced
-from pansplat.render.cpu.ewa import project, project_backward
+from pansplat.render.cpu.ewa import TOTALS, project, project_backward
 from pansplat.render.cpu.memory import Lease
 from pansplat.render.cpu.observe import PIECE, Camera, Fields, Observed, observe
 from pansplat.render.cpu.observe_backward import Gradients, add_slots, chain
@@ -139,7 +139,9 @@ class _Draw(torch.autograd.Function):
                 observed = observe(fields, camera, lease, threads)
             sums = np.empty((len(pictures), harmonics.shape[2] + 2, height, width), np.float32)
             kept = [
-                _draw_picture(observed, picture, options, sums[number], notes, needs_grad, lease, threads)
+                _draw_picture(
+                    (fields, camera, observed), picture, options, sums[number], notes, needs_grad, lease, threads
+                )
                 for number, picture in enumerate(pictures)
             ]
         notes.dropped, notes.near = observed.dropped, observed.near
@@ -164,7 +166,9 @@ class _Draw(torch.autograd.Function):
         ]
         with announced():
             own = Lease()
-            slots = _slot_gradients(observed, pictures, options, kept, sums.numpy(), grad_sums, own, threads)
+            slots = _slot_gradients(
+                (fields, camera, observed), pictures, options, kept, sums.numpy(), grad_sums, own, threads
+            )
             arrays = (
                 np.empty((0, *field.shape[1:]), np.float32) if grad is None else grad.numpy()
                 for field, grad in zip(fields, wanted, strict=True)
@@ -207,7 +211,7 @@ def _camera(pose: Tensor, picture: Picture, options: Options) -> Camera:
 
 
 def _draw_picture(
-    observed: Observed,
+    scene: tuple[Fields, Camera, Observed],
     picture: Picture,
     options: Options,
     sums: np.ndarray,
@@ -217,9 +221,9 @@ def _draw_picture(
     threads: int,
 ) -> tuple[Projection, TileLists | None] | None:
     """Write one picture's sums, and return what its backward needs; the lists only if they came in one band."""
-    lease = lease if needs_grad else Lease()
+    lease, observed = lease if needs_grad else Lease(), scene[2]
     with notes.timed("boxes"):
-        records, boxes = _place(observed, picture, options, lease, threads)
+        records, boxes = _place(scene, picture, options, lease, threads)
     with notes.timed("sort"):
         by_depth = options.order == "z" and not picture.is_panorama
         towards = picture.rotation[:, 2].numpy().copy() if by_depth else np.zeros(3)
@@ -247,16 +251,16 @@ def _draw_picture(
 
 
 def _place(
-    observed: Observed, picture: Picture, options: Options, lease: Lease, threads: int
+    scene: tuple[Fields, Camera, Observed], picture: Picture, options: Options, lease: Lease, threads: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Records and boxes on a picture."""
     if options.kernel == "ewa":
-        return project(observed, picture, options.dilation, EWA_NEAR * options.near, lease, threads)
-    return observed.records, find_boxes(observed.records, picture, lease, threads)
+        return project(*scene, picture, options.dilation, EWA_NEAR * options.near, lease, threads)
+    return scene[2].records, find_boxes(scene[2].records, picture, lease, threads)
 
 
 def _slot_gradients(
-    observed: Observed,
+    scene: tuple[Fields, Camera, Observed],
     pictures: list[Picture],
     options: Options,
     kept: list[tuple[Projection, TileLists | None]],
@@ -264,12 +268,14 @@ def _slot_gradients(
     grad_sums: np.ndarray,
     lease: Lease,
     threads: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gradients of the camera's records and values in slots, and where each Gaussian's slots begin."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Gradients of the camera's records and values in slots, the classic kernel's totals, and where slots begin."""
+    fields, camera, observed = scene
     num, num_values = observed.values.shape
     exact = options.kernel == "ray"
     alone = exact and len(pictures) == 1 and kept[0][1] is not None
-    total_records = np.zeros((0 if alone else num, FIELDS), np.float32)
+    total_records = np.zeros((num if exact and not alone else 0, FIELDS), np.float32)
+    totals = np.zeros((0 if exact else num, TOTALS))
     total_values = np.zeros((0 if alone else num, num_values), np.float32)
     pieces = -(-num // PIECE)
     for number, (picture, (projection, only)) in enumerate(zip(pictures, kept, strict=True)):
@@ -286,14 +292,14 @@ def _slot_gradients(
                 grad_sums[number], grad_records, grad_values, first_row=lists.first_row, threads=threads,
             )  # fmt: skip
             if alone:
-                return grad_records, grad_values, lists.offsets
+                return grad_records, grad_values, totals, lists.offsets
             offsets = lists.offsets
             if exact:
                 share(_adding(offsets, grad_records, total_records), pieces, threads)
             else:
-                project_backward(observed, picture, options.dilation, grad_records, offsets, total_records, threads)
+                project_backward(fields, camera, picture, options.dilation, grad_records, offsets, totals, threads)
             share(_adding(offsets, grad_values, total_values), pieces, threads)
-    return total_records, total_values, np.arange(num + 1)
+    return total_records, total_values, totals, np.arange(num + 1)
 
 
 def _adding(offsets: np.ndarray, slots: np.ndarray, totals: np.ndarray) -> Any:

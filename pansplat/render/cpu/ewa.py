@@ -1,7 +1,7 @@
-"""The classic kernel: records of a pinhole picture from the camera's records, and the gradients back.
+"""The classic kernel: records of a pinhole picture from the Gaussians' shapes, and the gradients back.
 
-Source: docs/rendering.md, section 3, `ewa`. A record knows its covariance, C' = S' n n' + p p' + q q' (boxes.py), so
-V = S' (J n)(J n)' + (J p)(J p)' + (J q)(J q)'; nothing else of the Gaussian is read again.
+Source: docs/rendering.md, section 3, `ewa`. In the tangent frame F = (u, v, n) the covariance is F S F', so
+V = (J F) S' (J F)': two by two from three by three, in float64, nothing whitened in between.
 """
 
 import math
@@ -9,73 +9,161 @@ import math
 import numpy as np
 
 from pansplat.render.cpu import records as layout
-from pansplat.render.cpu.boxes import ALONG, DIRECTION, EDGES, KAPPA, P, Q, read_cones, round_boxes
-from pansplat.render.cpu.boxes import ROWS as CONE_ROWS
+from pansplat.render.cpu.boxes import round_boxes
 from pansplat.render.cpu.compiling import inlined, kernel
-from pansplat.render.cpu.forms import cross, dot
+from pansplat.render.cpu.forms import dot
 from pansplat.render.cpu.memory import Lease
-from pansplat.render.cpu.observe import LANES, PIECE, Observed
+from pansplat.render.cpu.observe import (
+    CULLED,
+    LANES,
+    PIECE,
+    ROWS,
+    Camera,
+    Fields,
+    Observed,
+    find_directions,
+    find_shapes,
+    frame_and_shape,
+    read_block,
+)
 from pansplat.render.cpu.threads import share
 from pansplat.render.panorama import Picture
 
+TOTALS = 10  # numbers that a picture passes back: gradients of n (world axes), of C (xx xy xz yy yz zz), of the level
 _NARROWEST = 1e-12  # pixel^2: rounding can leave a needle's determinant at or below zero
 _LIMIT = 0.65  # of the picture's side over the focal length: 1.3 half sides
+_LOG_CUT = math.log2(255)
+_SLACK = 1e-5  # added to kappa
 
-# Rows of a block, after those of boxes.py.
-POINT = CONE_ROWS  # and the two forms: x, y, a_x, b_x, b_y
-RADIUS = CONE_ROWS + 5
-RECORD = CONE_ROWS + 6  # the camera's record: n, a, b, front_a, front_b, along
-GIVEN = CONE_ROWS + 18  # gradients of point x, y, a_x, b_x, b_y
-OUT = CONE_ROWS + 23  # gradients of the camera's record, as RECORD
-ALL_ROWS = CONE_ROWS + 35
+# Rows of a block, after those of observe.py.
+LEVEL = ROWS + 1
+EDGES = ROWS + 2
+POINT = ROWS + 6  # and the two forms: x, y, a_x, b_x, b_y
+GIVEN = ROWS + 11  # gradients of these, and of the level
+OUT = ROWS + 17  # what is passed back
+ALL_ROWS = OUT + TOTALS
 
 
 @inlined
-def _projected(rows, i, height, width, focal, dilation):
-    """J's entries, the axes on the picture, and V; n_z must be positive."""
-    inverse = 1 / rows[DIRECTION + 2, i]
-    tan_x, tan_y = rows[DIRECTION, i] * inverse, rows[DIRECTION + 1, i] * inverse
+def _turn(turn, vector):
+    """A vector from the world's axes to the picture's."""
+    x, y, z = vector
+    return (
+        turn[0, 0] * x + turn[1, 0] * y + turn[2, 0] * z,
+        turn[0, 1] * x + turn[1, 1] * y + turn[2, 1] * z,
+        turn[0, 2] * x + turn[1, 2] * y + turn[2, 2] * z,
+    )
+
+
+@inlined
+def _turn_back(turn, vector):
+    """A vector from the picture's axes to the world's."""
+    x, y, z = vector
+    return (
+        turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z,
+        turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z,
+        turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z,
+    )
+
+
+@inlined
+def _jacobian(n, height, width, focal):
+    """Tangents, clamped tangents and scale of J at a direction with n_z > 0."""
+    inverse = 1 / n[2]
+    tan_x, tan_y = n[0] * inverse, n[1] * inverse
     limit_x, limit_y = _LIMIT * width / focal, _LIMIT * height / focal
-    clamped_x, clamped_y = min(max(tan_x, -limit_x), limit_x), min(max(tan_y, -limit_y), limit_y)
-    scale = focal * inverse
-    n_x = scale * (rows[DIRECTION, i] - clamped_x * rows[DIRECTION + 2, i])
-    n_y = scale * (rows[DIRECTION + 1, i] - clamped_y * rows[DIRECTION + 2, i])
-    p_x, p_y = scale * (rows[P, i] - clamped_x * rows[P + 2, i]), scale * (rows[P + 1, i] - clamped_y * rows[P + 2, i])
-    q_x, q_y = scale * (rows[Q, i] - clamped_x * rows[Q + 2, i]), scale * (rows[Q + 1, i] - clamped_y * rows[Q + 2, i])
-    along = rows[ALONG, i]
-    v_xx = along * n_x * n_x + p_x * p_x + q_x * q_x + dilation
-    v_xy = along * n_x * n_y + p_x * p_y + q_x * q_y
-    v_yy = along * n_y * n_y + p_y * p_y + q_y * q_y + dilation
-    return (tan_x, tan_y, clamped_x, clamped_y, scale), (n_x, n_y), (p_x, p_y), (q_x, q_y), (v_xx, v_xy, v_yy)
+    return (
+        tan_x,
+        tan_y,
+        min(max(tan_x, -limit_x), limit_x),
+        min(max(tan_y, -limit_y), limit_y),
+        focal * inverse,
+    )
+
+
+@inlined
+def _image(jacobian, vector):
+    """J times a vector."""
+    _, _, clamped_x, clamped_y, scale = jacobian
+    return scale * (vector[0] - clamped_x * vector[2]), scale * (vector[1] - clamped_y * vector[2])
+
+
+@inlined
+def _weighted(shape, spread, on_u, on_v, on_n):
+    """A row of J F times S', the filtered shape."""
+    uu, uv, vv, un, vn, nn = shape[0] + spread, shape[1], shape[2] + spread, shape[3], shape[4], shape[5]
+    return (
+        uu * on_u + uv * on_v + un * on_n,
+        uv * on_u + vv * on_v + vn * on_n,
+        un * on_u + vn * on_v + nn * on_n,
+    )
+
+
+@inlined
+def _projected(rows, i, turn, height, width, focal, spread):
+    """The frame on the picture's axes, J, its rows times F and times F S', and V before it is dilated."""
+    u, v, n, shape = frame_and_shape(rows, i)
+    u, v, n = _turn(turn, u), _turn(turn, v), _turn(turn, n)
+    jacobian = _jacobian(n, height, width, focal)
+    on_u, on_v, on_n = _image(jacobian, u), _image(jacobian, v), _image(jacobian, n)
+    x_row, y_row = (on_u[0], on_v[0], on_n[0]), (on_u[1], on_v[1], on_n[1])
+    x_weighted, y_weighted = _weighted(shape, spread, *x_row), _weighted(shape, spread, *y_row)
+    spread_out = dot(*x_row, *x_weighted), dot(*x_row, *y_weighted), dot(*y_row, *y_weighted)
+    return (u, v, n), jacobian, on_n, x_weighted, y_weighted, spread_out
+
+
+@inlined
+def _in_front(records, radii, turn, start, count, z_near, rows):
+    """Note the levels, `CULLED` for Gaussians behind; return how many may be seen."""
+    seen = 0
+    for i in range(LANES):
+        rows[LEVEL, i] = CULLED
+    for i in range(count):
+        g = start + i
+        # `turn` is from the camera's axes here.
+        z = (np.float64(records[g, 0]) + np.float64(records[g, 3])) * turn[0, 2]
+        z += (np.float64(records[g, 1]) + np.float64(records[g, 4])) * turn[1, 2]
+        z += (np.float64(records[g, 2]) + np.float64(records[g, 5])) * turn[2, 2]
+        front = (z * radii[g] > z_near) & (records[g, layout.LEVEL] > CULLED)
+        rows[LEVEL, i] = records[g, layout.LEVEL] if front else CULLED
+        seen += front
+    return seen
 
 
 @kernel
-def _project(piece, records, radii, rotation, height, width, focal, dilation, z_near, projected, words, boxes):
+def _project(
+    piece, means, quats, scales, covariances, opacities, _harmonics, pose, spread, _compensate, near,
+    records, radii, rotation, turn, height, width, focal, dilation, z_near, projected, words, boxes,
+):  # fmt: skip
     rows = np.ones((ALL_ROWS, LANES))
+    unit = math.sqrt(layout.UNIT)
     for start in range(piece * PIECE, min((piece + 1) * PIECE, records.shape[0]), LANES):
         count = min(LANES, records.shape[0] - start)
-        read_cones(records, start, count, rotation, rows)
-        for i in range(count):
-            rows[RADIUS, i] = radii[start + i]
-        unit = math.sqrt(layout.UNIT)
+        if _in_front(records, radii, rotation, start, count, z_near, rows) == 0:
+            for i in range(count):
+                words[start + i, 0], words[start + i, 1] = 0, 1
+            continue
+        read_block(means, quats, scales, covariances, opacities, start, count, rows)
+        find_directions(pose, near, rows)
+        find_shapes(covariances, rows)
         for i in range(LANES):
-            kappa = rows[KAPPA, i]
-            seen = (kappa >= 0) & (rows[DIRECTION + 2, i] * rows[RADIUS, i] > z_near)
-            jacobian, _, _, _, v = _projected(rows, i, height, width, focal, dilation)
-            first, m = 1 / math.sqrt(v[0]), -v[1] / v[0]
-            second = 1 / math.sqrt(max(v[2] + m * v[1], _NARROWEST))
+            _, jacobian, _, _, _, v = _projected(rows, i, turn, height, width, focal, spread)
+            kappa = (rows[LEVEL, i] + _LOG_CUT) / layout.UNIT + _SLACK
+            v_xx, v_yy = v[0] + dilation, v[2] + dilation
+            first, m = 1 / math.sqrt(v_xx), -v[1] / v_xx
+            second = 1 / math.sqrt(max(v_yy + m * v[1], _NARROWEST))
             x, y = focal * jacobian[0] + 0.5 * width, focal * jacobian[1] + 0.5 * height
             rows[POINT, i], rows[POINT + 1, i] = x, y
             rows[POINT + 2, i], rows[POINT + 3, i], rows[POINT + 4, i] = unit * first, unit * m * second, unit * second
-            reach_x, reach_y = math.sqrt(max(kappa, 0.0) * v[0]), math.sqrt(max(kappa, 0.0) * v[2])
+            reach_x, reach_y = math.sqrt(max(kappa, 0.0) * v_xx), math.sqrt(max(kappa, 0.0) * v_yy)
             rows[EDGES, i], rows[EDGES + 1, i] = x - reach_x, x + reach_x
-            rows[EDGES + 2, i], rows[EDGES + 3, i] = y - reach_y, y + reach_y if seen else -1e9
+            rows[EDGES + 2, i], rows[EDGES + 3, i] = y - reach_y, y + reach_y if kappa >= 0 else -1e9
         round_boxes(rows, EDGES, start, count, height, width, words)
-        _write_projected(records, rows, start, count, boxes, projected)
+        _write_projected(rows, start, count, boxes, projected)
 
 
 @inlined
-def _write_projected(records, rows, start, count, boxes, projected):
+def _write_projected(rows, start, count, boxes, projected):
     for i in range(count):
         g = start + i
         if boxes[g, 3] < boxes[g, 2]:
@@ -89,15 +177,23 @@ def _write_projected(records, rows, start, count, boxes, projected):
         projected[g, layout.FIRST] = np.float32(rows[POINT + 2, i])
         projected[g, layout.SECOND] = np.float32(rows[POINT + 3, i])
         projected[g, layout.SECOND + 1] = np.float32(rows[POINT + 4, i])
-        projected[g, layout.LEVEL] = records[g, layout.LEVEL]
+        projected[g, layout.LEVEL] = np.float32(rows[LEVEL, i])
 
 
 def project(
-    observed: Observed, picture: Picture, dilation: float, z_near: float, lease: Lease, threads: int
+    fields: Fields,
+    camera: Camera,
+    observed: Observed,
+    picture: Picture,
+    dilation: float,
+    z_near: float,
+    lease: Lease,
+    threads: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Records of a pinhole picture, where there is a box, and the boxes.
 
     Args:
+        fields, camera: what was observed, and by whom.
         observed: by the camera.
         picture: pinhole.
         dilation: variance added on both axes, pixels^2.
@@ -107,170 +203,119 @@ def project(
     """
     num = len(observed.records)
     projected, words = lease.array((num, layout.FIELDS), np.float32), lease.array((num, 2), np.int32)
-    boxes = words.view(np.int16)
-    rotation = np.ascontiguousarray(picture.rotation.numpy())
+    rotation, turn = _axes(camera, picture)
 
     def work(piece: int) -> None:
         _project(
-            piece, observed.records, observed.radii, rotation, *picture.size, picture.focal, dilation, z_near,
-            projected, words, boxes,
+            piece, *fields, *camera, observed.records, observed.radii, rotation, turn, *picture.size, picture.focal,
+            dilation, z_near, projected, words, words.view(np.int16),
         )  # fmt: skip
 
     share(work, -(-num // PIECE), threads)
-    return projected, boxes
+    return projected, words.view(np.int16)
+
+
+def _axes(camera: Camera, picture: Picture) -> tuple[np.ndarray, np.ndarray]:
+    """The picture's axes in the camera's and in the world's."""
+    rotation = np.ascontiguousarray(picture.rotation.numpy())
+    return rotation, np.ascontiguousarray(camera.pose[:3, :3] @ rotation)
 
 
 @inlined
-def _read_given(records, grads, offsets, start, count, rows):
-    """Read the camera's records and the sums of the picture's gradients; zeros where a Gaussian has no slot."""
+def _read_given(grads, offsets, start, count, rows):
+    """Sum each Gaussian's slots; return how many Gaussians of the block have any."""
+    some = 0
+    unit = math.sqrt(layout.UNIT)
     for i in range(LANES):
-        for j in range(5):
+        for j in range(6):
             rows[GIVEN + j, i] = 0.0
     for i in range(count):
         g = start + i
-        for axis in range(3):
-            head, rest = records[g, layout.DIRECTION + axis], records[g, layout.REST + axis]
-            rows[RECORD + axis, i] = np.float64(head) + np.float64(rest)
-        for j in range(9):
-            rows[RECORD + 3 + j, i] = records[g, layout.FIRST + j]
+        some += offsets[g + 1] > offsets[g]
         for slot in range(offsets[g], offsets[g + 1]):
             rows[GIVEN, i] += grads[slot, layout.DIRECTION]
             rows[GIVEN + 1, i] += grads[slot, layout.DIRECTION + 1]
-            rows[GIVEN + 2, i] += grads[slot, layout.FIRST]
-            rows[GIVEN + 3, i] += grads[slot, layout.SECOND]
-            rows[GIVEN + 4, i] += grads[slot, layout.SECOND + 1]
-        if offsets[g + 1] == offsets[g]:  # it may lie behind: any place in front will do
-            rows[DIRECTION, i], rows[DIRECTION + 1, i], rows[DIRECTION + 2, i] = 0.0, 0.0, 1.0
-            rows[P, i], rows[P + 1, i], rows[P + 2, i] = 1.0, 0.0, 0.0
-            rows[Q, i], rows[Q + 1, i], rows[Q + 2, i] = 0.0, 1.0, 0.0
+            rows[GIVEN + 2, i] += unit * grads[slot, layout.FIRST]
+            rows[GIVEN + 3, i] += unit * grads[slot, layout.SECOND]
+            rows[GIVEN + 4, i] += unit * grads[slot, layout.SECOND + 1]
+            rows[GIVEN + 5, i] += grads[slot, layout.LEVEL]
+    return some
 
 
 @inlined
-def _push(gradient_x, gradient_y, jacobian, axis):
-    """Gradients of an axis (the picture's axes) and of J's clamped tangents and scale, from that of its image."""
-    clamped_x, clamped_y, scale = jacobian[2], jacobian[3], jacobian[4]
-    back = (
-        scale * gradient_x,
-        scale * gradient_y,
-        -scale * (clamped_x * gradient_x + clamped_y * gradient_y),
-    )
-    by_scale = gradient_x * (axis[0] - clamped_x * axis[2]) + gradient_y * (axis[1] - clamped_y * axis[2])
-    return back, -scale * axis[2] * gradient_x, -scale * axis[2] * gradient_y, by_scale
-
-
-@inlined
-def _splat_backward(rows, i, height, width, focal, dilation):
-    """Gradients of n, p, q, in the picture's axes, and of S'."""
-    jacobian, n_image, p_image, q_image, v = _projected(rows, i, height, width, focal, dilation)
-    unit = math.sqrt(layout.UNIT)
-    m, first = -v[1] / v[0], 1 / math.sqrt(v[0])
-    across = v[2] + m * v[1]
-    second = 1 / math.sqrt(max(across, _NARROWEST))
-    g_first, g_bx, g_by = unit * rows[GIVEN + 2, i], unit * rows[GIVEN + 3, i], unit * rows[GIVEN + 4, i]
-    g_m = g_bx * second
-    k = -0.5 * second * second * second * (g_by + g_bx * m) if across >= _NARROWEST else 0.0
-    h_xx = -0.5 * g_first * first * first * first + m * m * k - g_m * m / v[0]
-    h_xy = m * k - 0.5 * g_m / v[0]
-    n = rows[DIRECTION, i], rows[DIRECTION + 1, i], rows[DIRECTION + 2, i]
-    p = rows[P, i], rows[P + 1, i], rows[P + 2, i]
-    q = rows[Q, i], rows[Q + 1, i], rows[Q + 2, i]
-    n_x, n_y = h_xx * n_image[0] + h_xy * n_image[1], h_xy * n_image[0] + k * n_image[1]
-    p_x, p_y = h_xx * p_image[0] + h_xy * p_image[1], h_xy * p_image[0] + k * p_image[1]
-    q_x, q_y = h_xx * q_image[0] + h_xy * q_image[1], h_xy * q_image[0] + k * q_image[1]
-    along = rows[ALONG, i]
-    g_n, n_tan_x, n_tan_y, n_scale = _push(2 * along * n_x, 2 * along * n_y, jacobian, n)
-    g_p, p_tan_x, p_tan_y, p_scale = _push(2 * p_x, 2 * p_y, jacobian, p)
-    g_q, q_tan_x, q_tan_y, q_scale = _push(2 * q_x, 2 * q_y, jacobian, q)
-    tan_x, tan_y = jacobian[0], jacobian[1]
-    free_x, free_y = tan_x == jacobian[2], tan_y == jacobian[3]
-    g_tan_x = focal * rows[GIVEN, i] + (n_tan_x + p_tan_x + q_tan_x if free_x else 0.0)
-    g_tan_y = focal * rows[GIVEN + 1, i] + (n_tan_y + p_tan_y + q_tan_y if free_y else 0.0)
-    inverse = 1 / n[2]
-    by_depth = -(g_tan_x * tan_x + g_tan_y * tan_y + (n_scale + p_scale + q_scale) * jacobian[4]) * inverse
-    g_n = g_n[0] + g_tan_x * inverse, g_n[1] + g_tan_y * inverse, g_n[2] + by_depth
-    return g_n, g_p, g_q, n_image[0] * n_x + n_image[1] * n_y
-
-
-@inlined
-def _turned(rotation, vector):
-    """A vector from the picture's axes to the camera's."""
-    x, y, z = vector
-    return (
-        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
-        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
-        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z,
-    )
-
-
-@inlined
-def _dual_backward(n, a, b, front_a, front_b, g_p, g_q):
-    """Gradients of n, a, b and both fronts from those of the dual axes p and q."""
-    inverse = 1 / dot(*cross(*a, *b), *n)
-    by_n, by_a, by_b = cross(*a, *b), cross(*b, *n), cross(*n, *a)
-    # p + front_a n = by_a / w and q + front_b n = by_b / w, with w = a.by_a
-    whole = -(dot(*g_p, *by_a) + dot(*g_q, *by_b)) * inverse * inverse
-    n_first, n_second = cross(*g_p, *b), cross(*a, *g_q)
-    a_second, b_first = cross(*g_q, *n), cross(*n, *g_p)
-    g_n = (
-        (n_first[0] + n_second[0]) * inverse + whole * by_n[0] - front_a * g_p[0] - front_b * g_q[0],
-        (n_first[1] + n_second[1]) * inverse + whole * by_n[1] - front_a * g_p[1] - front_b * g_q[1],
-        (n_first[2] + n_second[2]) * inverse + whole * by_n[2] - front_a * g_p[2] - front_b * g_q[2],
-    )
-    g_a = (
-        a_second[0] * inverse + whole * by_a[0],
-        a_second[1] * inverse + whole * by_a[1],
-        a_second[2] * inverse + whole * by_a[2],
-    )
-    g_b = (
-        b_first[0] * inverse + whole * by_b[0],
-        b_first[1] * inverse + whole * by_b[1],
-        b_first[2] * inverse + whole * by_b[2],
-    )
-    return g_n, g_a, g_b, -dot(*g_p, *n), -dot(*g_q, *n)
+def _splats_backward(rows, turn, height, width, focal, spread, dilation):
+    """Gradients of n and C, world axes, from those of point and forms."""
+    for i in range(LANES):
+        frame, jacobian, n_image, x_weighted, y_weighted, v = _projected(rows, i, turn, height, width, focal, spread)
+        tan_x, tan_y, clamped_x, clamped_y, scale = jacobian
+        v_xx, m = v[0] + dilation, -v[1] / (v[0] + dilation)
+        first, across = 1 / math.sqrt(v_xx), v[2] + dilation + m * v[1]
+        second = 1 / math.sqrt(max(across, _NARROWEST))
+        g_first, g_bx, g_by = rows[GIVEN + 2, i], rows[GIVEN + 3, i], rows[GIVEN + 4, i]
+        g_m = g_bx * second
+        h_yy = -0.5 * second * second * second * (g_by + g_bx * m) if across >= _NARROWEST else 0.0
+        h_xx = -0.5 * g_first * first * first * first + m * m * h_yy - g_m * m / v_xx
+        h_xy = m * h_yy - 0.5 * g_m / v_xx
+        # V = J C' J': to J by 2 H (J C'), to C by J' H J, to n by the filter's - e^2 n n'.
+        x_mixed = (
+            h_xx * x_weighted[0] + h_xy * y_weighted[0],
+            h_xx * x_weighted[1] + h_xy * y_weighted[1],
+            h_xx * x_weighted[2] + h_xy * y_weighted[2],
+        )
+        y_mixed = (
+            h_xy * x_weighted[0] + h_yy * y_weighted[0],
+            h_xy * x_weighted[1] + h_yy * y_weighted[1],
+            h_xy * x_weighted[2] + h_yy * y_weighted[2],
+        )
+        u, v_axis, n = frame
+        x_ahead, y_ahead = dot(*x_mixed, u[2], v_axis[2], n[2]), dot(*y_mixed, u[2], v_axis[2], n[2])
+        x_side, y_side = dot(*x_mixed, u[0], v_axis[0], n[0]), dot(*y_mixed, u[1], v_axis[1], n[1])
+        g_scale = 2 * (x_side - clamped_x * x_ahead + y_side - clamped_y * y_ahead)
+        g_tan_x = focal * rows[GIVEN, i] - (2 * scale * x_ahead if tan_x == clamped_x else 0.0)
+        g_tan_y = focal * rows[GIVEN + 1, i] - (2 * scale * y_ahead if tan_y == clamped_y else 0.0)
+        inverse = 1 / n[2]
+        by_depth = -(g_tan_x * tan_x + g_tan_y * tan_y + g_scale * scale) * inverse
+        g_n = _turn_back(turn, (g_tan_x * inverse, g_tan_y * inverse, by_depth))
+        j_x = _turn_back(turn, (scale, 0.0, -scale * clamped_x))
+        j_y = _turn_back(turn, (0.0, scale, -scale * clamped_y))
+        n_x = -2 * spread * (h_xx * n_image[0] + h_xy * n_image[1])
+        n_y = -2 * spread * (h_xy * n_image[0] + h_yy * n_image[1])
+        at = OUT + 3
+        for axis in range(3):
+            rows[OUT + axis, i] = g_n[axis] + n_x * j_x[axis] + n_y * j_y[axis]
+            for other in range(axis, 3):
+                rows[at, i] = (
+                    h_xx * j_x[axis] * j_x[other]
+                    + h_yy * j_y[axis] * j_y[other]
+                    + h_xy * (j_x[axis] * j_y[other] + j_y[axis] * j_x[other])
+                )
+                at += 1
+        rows[OUT + 9, i] = rows[GIVEN + 5, i]
 
 
 @kernel
-def _project_backward(piece, records, rotation, height, width, focal, dilation, grads, offsets, totals):
+def _project_backward(
+    piece, means, quats, scales, covariances, opacities, _harmonics, pose, spread, _compensate, near,
+    turn, height, width, focal, dilation, grads, offsets, totals,
+):  # fmt: skip
     rows = np.ones((ALL_ROWS, LANES))
-    unit = math.sqrt(layout.UNIT)
-    for start in range(piece * PIECE, min((piece + 1) * PIECE, records.shape[0]), LANES):
-        count = min(LANES, records.shape[0] - start)
-        read_cones(records, start, count, rotation, rows)
-        _read_given(records, grads, offsets, start, count, rows)
-        for i in range(LANES):
-            g_n, g_p, g_q, g_along = _splat_backward(rows, i, height, width, focal, dilation)
-            n = rows[RECORD, i], rows[RECORD + 1, i], rows[RECORD + 2, i]
-            a = rows[RECORD + 3, i], rows[RECORD + 4, i], rows[RECORD + 5, i]
-            b = rows[RECORD + 6, i], rows[RECORD + 7, i], rows[RECORD + 8, i]
-            g_p, g_q = (unit * g_p[0], unit * g_p[1], unit * g_p[2]), (unit * g_q[0], unit * g_q[1], unit * g_q[2])
-            more, g_a, g_b, g_front_a, g_front_b = _dual_backward(
-                n, a, b, rows[RECORD + 9, i], rows[RECORD + 10, i], _turned(rotation, g_p), _turned(rotation, g_q)
-            )
-            g_n = _turned(rotation, g_n)
-            rows[OUT, i], rows[OUT + 1, i], rows[OUT + 2, i] = g_n[0] + more[0], g_n[1] + more[1], g_n[2] + more[2]
-            rows[OUT + 3, i], rows[OUT + 4, i], rows[OUT + 5, i] = g_a
-            rows[OUT + 6, i], rows[OUT + 7, i], rows[OUT + 8, i] = g_b
-            rows[OUT + 9, i], rows[OUT + 10, i] = g_front_a, g_front_b
-            rows[OUT + 11, i] = layout.UNIT * g_along
-        _add_totals(rows, start, count, grads, offsets, totals)
-
-
-@inlined
-def _add_totals(rows, start, count, grads, offsets, totals):
-    for i in range(count):
-        g = start + i
-        if offsets[g + 1] == offsets[g]:
+    for start in range(piece * PIECE, min((piece + 1) * PIECE, means.shape[0]), LANES):
+        count = min(LANES, means.shape[0] - start)
+        if _read_given(grads, offsets, start, count, rows) == 0:
             continue
-        for axis in range(3):
-            totals[g, layout.DIRECTION + axis] += np.float32(rows[OUT + axis, i])
-        for j in range(9):
-            totals[g, layout.FIRST + j] += np.float32(rows[OUT + 3 + j, i])
-        for slot in range(offsets[g], offsets[g + 1]):
-            totals[g, layout.LEVEL] += grads[slot, layout.LEVEL]
+        read_block(means, quats, scales, covariances, opacities, start, count, rows)
+        find_directions(pose, near, rows)
+        find_shapes(covariances, rows)
+        _splats_backward(rows, turn, height, width, focal, spread, dilation)
+        for i in range(count):
+            if offsets[start + i + 1] > offsets[start + i]:
+                for j in range(TOTALS):
+                    totals[start + i, j] += rows[OUT + j, i]
 
 
 def project_backward(
-    observed: Observed,
+    fields: Fields,
+    camera: Camera,
     picture: Picture,
     dilation: float,
     grads: np.ndarray,
@@ -278,20 +323,18 @@ def project_backward(
     totals: np.ndarray,
     threads: int,
 ) -> None:
-    """Add to the gradients of the camera's records what a picture's records pass back.
+    """Add to the gradients of directions, shapes and levels what a picture's records pass back.
 
     Args:
-        observed, picture, dilation: of the forward.
+        fields, camera, picture, dilation: of the forward.
         grads: (slot, FIELDS), of the picture's records.
         offsets: (n + 1), where each Gaussian's slots begin.
-        totals: (n, FIELDS), added to.
+        totals: (n, TOTALS) float64, added to.
         threads: to work on; the result does not depend on it.
     """
-    rotation = np.ascontiguousarray(picture.rotation.numpy())
+    _, turn = _axes(camera, picture)
 
     def work(piece: int) -> None:
-        _project_backward(
-            piece, observed.records, rotation, *picture.size, picture.focal, dilation, grads, offsets, totals
-        )
+        _project_backward(piece, *fields, *camera, turn, *picture.size, picture.focal, dilation, grads, offsets, totals)
 
-    share(work, -(-len(observed.records) // PIECE), threads)
+    share(work, -(-len(fields.means) // PIECE), threads)

@@ -20,14 +20,13 @@ import numpy as np
 
 from pansplat.render.cpu import records as layout
 from pansplat.render.cpu.compiling import inlined, kernel
-from pansplat.render.cpu.forms import LEAST_RATIO, cross, dot, ray_forms, rotation
+from pansplat.render.cpu.forms import LEAST_RATIO, cross, dot, ray_forms
 from pansplat.render.cpu.harmonics import add_slopes, colour_gradients, fill_basis
 from pansplat.render.cpu.observe import (
     CULLED,
     LANES,
     PIECE,
     RADIUS,
-    ROWS,
     SHAPE,
     WORLD,
     Camera,
@@ -38,17 +37,20 @@ from pansplat.render.cpu.observe import (
     frame_and_shape,
     read_block,
 )
+from pansplat.render.cpu.shape_backward import (
+    ALL_ROWS,
+    C_GRAD,
+    DET_GRAD,
+    GIVEN,
+    GIVEN_RADIUS,
+    N_GRAD,
+    OUT_MEAN,
+    OUT_SHAPE,
+    axes_backward,
+    covariances_backward,
+)
 from pansplat.render.cpu.threads import share
 
-# Rows of a block, after those of observe.py.
-GIVEN = ROWS + 1  # gradients of the record: n, a, b (camera axes), alpha, beta, S', ln peak
-GIVEN_RADIUS = GIVEN + 13
-N_GRAD = GIVEN + 14  # of n, world axes
-C_GRAD = GIVEN + 17  # of C: xx xy xz yy yz zz
-DET_GRAD = GIVEN + 23  # of ln det B
-OUT_MEAN = GIVEN + 24
-OUT_SHAPE = GIVEN + 27  # a quaternion and three scales, or a covariance's six numbers
-ALL_ROWS = GIVEN + 34
 _POSE = 12  # sums for the pose: its rotation by rows, its centre
 
 
@@ -65,7 +67,7 @@ class Gradients(NamedTuple):
 
 
 @inlined
-def _read_gradients(records, grad_records, grad_values, offsets, start, count, rows, colour_grads):
+def _read_gradients(grad_records, grad_values, totals, offsets, start, count, rows, colour_grads):
     """Sum each Gaussian's slots, in their order, in the units of docs/rendering.md; zeros where not drawn."""
     channels = colour_grads.shape[1]
     unit, inverse_unit = math.sqrt(layout.UNIT), 1 / math.sqrt(layout.UNIT)
@@ -74,14 +76,18 @@ def _read_gradients(records, grad_records, grad_values, offsets, start, count, r
             rows[GIVEN + j, i] = 0.0
         for c in range(channels):
             colour_grads[i, c] = 0
+        if totals.shape[0] > 0:
+            rows[GIVEN + 12, i] = totals[start + i, 9]
         for slot in range(offsets[start + i], offsets[start + i + 1]):
+            for c in range(channels):
+                colour_grads[i, c] += grad_values[slot, c]
+            rows[GIVEN_RADIUS, i] += grad_values[slot, channels]
+            if totals.shape[0] > 0:
+                continue
             for axis in range(3):
                 rows[GIVEN + axis, i] += grad_records[slot, layout.DIRECTION + axis]
             for j in range(10):
                 rows[GIVEN + 3 + j, i] += grad_records[slot, layout.FIRST + j]
-            for c in range(channels):
-                colour_grads[i, c] += grad_values[slot, c]
-            rows[GIVEN_RADIUS, i] += grad_values[slot, channels]
     for i in range(LANES):
         for j in range(3, 9):
             rows[GIVEN + j, i] *= unit
@@ -102,19 +108,20 @@ def _to_world(pose, x, y, z):
 
 @inlined
 def _forms_backward(pose, spread, compensate, rows, sums):
-    """Gradients of n, C and ln det B from those of the record; adds to the sums for the pose, lane by lane."""
+    """Gradients of n, C and ln det B from those of the record; adds to the sums for the pose, lane by lane.
+
+    The pose's rotation A makes n_camera = A'n, so its gradient is the sum of n g_n' A, and so on; A comes last.
+    """
     for i in range(LANES):
         u, v, n, shape = frame_and_shape(rows, i)
         a, b, alpha, beta, along, det_filtered = ray_forms(u, v, shape, spread)
         n_camera = rows[GIVEN, i], rows[GIVEN + 1, i], rows[GIVEN + 2, i]
         a_camera = rows[GIVEN + 3, i], rows[GIVEN + 4, i], rows[GIVEN + 5, i]
         b_camera = rows[GIVEN + 6, i], rows[GIVEN + 7, i], rows[GIVEN + 8, i]
+        g_n, g_a, g_b = _to_world(pose, *n_camera), _to_world(pose, *a_camera), _to_world(pose, *b_camera)
         for axis in range(3):
             for other in range(3):
-                sums[4 * axis + other, i] += (
-                    n[axis] * n_camera[other] + a[axis] * a_camera[other] + b[axis] * b_camera[other]
-                )
-        g_n, g_a, g_b = _to_world(pose, *n_camera), _to_world(pose, *a_camera), _to_world(pose, *b_camera)
+                sums[4 * axis + other, i] += n[axis] * g_n[other] + a[axis] * g_a[other] + b[axis] * g_b[other]
         g_alpha, g_beta, g_along, g_peak = (
             rows[GIVEN + 9, i],
             rows[GIVEN + 10, i],
@@ -157,85 +164,32 @@ def _forms_backward(pose, spread, compensate, rows, sums):
 
 
 @inlined
-def _covariances_backward(rows):
-    """Gradients of the covariance and the distance from those of C and ln det B."""
+def _add_totals(totals, start, drawn, rows, sums):
+    """Add what the classic kernel's pictures passed back to the gradients of n and C, and to the sums for the pose."""
     for i in range(LANES):
-        u, v, _, shape = frame_and_shape(rows, i)
-        uu, uv, vv, un, vn = shape[0], shape[1], shape[2], shape[3], shape[4]
-        g = rows[DET_GRAD, i]
-        xx, xy, xz = rows[C_GRAD, i], rows[C_GRAD + 1, i], rows[C_GRAD + 2, i]
-        yy, yz, zz = rows[C_GRAD + 3, i], rows[C_GRAD + 4, i], rows[C_GRAD + 5, i]
-        # det B = uu vv - uv^2; the frame turns with n.
-        xx += g * (vv * u[0] * u[0] + uu * v[0] * v[0] - 2 * uv * u[0] * v[0])
-        yy += g * (vv * u[1] * u[1] + uu * v[1] * v[1] - 2 * uv * u[1] * v[1])
-        zz += g * (vv * u[2] * u[2] + uu * v[2] * v[2] - 2 * uv * u[2] * v[2])
-        xy += g * (vv * u[0] * u[1] + uu * v[0] * v[1] - uv * (u[0] * v[1] + u[1] * v[0]))
-        xz += g * (vv * u[0] * u[2] + uu * v[0] * v[2] - uv * (u[0] * v[2] + u[2] * v[0]))
-        yz += g * (vv * u[1] * u[2] + uu * v[1] * v[2] - uv * (u[1] * v[2] + u[2] * v[1]))
-        by_u, by_v = 2 * g * (uv * vn - vv * un), 2 * g * (uv * un - uu * vn)
-        for axis in range(3):
-            rows[N_GRAD + axis, i] += by_u * u[axis] + by_v * v[axis]
-        inverse = 1 / (rows[RADIUS, i] * rows[RADIUS, i])
-        rows[OUT_SHAPE, i], rows[OUT_SHAPE + 1, i], rows[OUT_SHAPE + 2, i] = xx * inverse, xy * inverse, xz * inverse
-        rows[OUT_SHAPE + 3, i], rows[OUT_SHAPE + 4, i], rows[OUT_SHAPE + 5, i] = (
-            yy * inverse,
-            yz * inverse,
-            zz * inverse,
-        )
-        whole = xx * rows[SHAPE, i] + yy * rows[SHAPE + 4, i] + zz * rows[SHAPE + 8, i]
-        whole += xy * (rows[SHAPE + 1, i] + rows[SHAPE + 3, i]) + xz * (rows[SHAPE + 2, i] + rows[SHAPE + 6, i])
-        whole += yz * (rows[SHAPE + 5, i] + rows[SHAPE + 7, i])
-        rows[GIVEN_RADIUS, i] -= 2 * whole * inverse / rows[RADIUS, i]
-
-
-@inlined
-def _axis_backward(rows, i, e, scale2, cosine, det_share, n):
-    """Gradient of a unit axis e of the Gaussian, and e'G e."""
-    xx, xy, xz = rows[C_GRAD, i], rows[C_GRAD + 1, i], rows[C_GRAD + 2, i]
-    yy, yz, zz = rows[C_GRAD + 3, i], rows[C_GRAD + 4, i], rows[C_GRAD + 5, i]
-    x = xx * e[0] + xy * e[1] + xz * e[2]
-    y = xy * e[0] + yy * e[1] + yz * e[2]
-    z = xz * e[0] + yz * e[1] + zz * e[2]
-    turn = 2 * det_share * cosine
-    grad = 2 * scale2 * x + turn * n[0], 2 * scale2 * y + turn * n[1], 2 * scale2 * z + turn * n[2]
-    return grad, dot(*e, x, y, z)
-
-
-@inlined
-def _axes_backward(rows):
-    """Gradients of quaternion, scales and distance from those of C and ln det B = ln sum_k w_k (n.e_k)^2."""
+        if drawn[i]:
+            for j in range(3):
+                rows[N_GRAD + j, i] += totals[start + i, j]
+                rows[OUT_MEAN + j, i] = totals[start + i, j]
+            for j in range(6):
+                rows[C_GRAD + j, i] += totals[start + i, 3 + j]
+                rows[OUT_SHAPE + j, i] = totals[start + i, 3 + j]
+        else:
+            for j in range(9):
+                rows[OUT_MEAN + j, i] = 0.0
     for i in range(LANES):
-        n = rows[WORLD, i], rows[WORLD + 1, i], rows[WORLD + 2, i]
-        r = rotation(rows[SHAPE, i], rows[SHAPE + 1, i], rows[SHAPE + 2, i], rows[SHAPE + 3, i])
-        inverse = 1 / rows[RADIUS, i]
-        s0, s1, s2 = rows[SHAPE + 4, i] * inverse, rows[SHAPE + 5, i] * inverse, rows[SHAPE + 6, i] * inverse
-        e0, e1, e2 = (r[0], r[3], r[6]), (r[1], r[4], r[7]), (r[2], r[5], r[8])
-        n0, n1, n2 = dot(*n, *e0), dot(*n, *e1), dot(*n, *e2)
-        a0, a1, a2 = s0 * s0, s1 * s1, s2 * s2
-        g = rows[DET_GRAD, i]
-        g0, own0 = _axis_backward(rows, i, e0, a0, n0, g * a1 * a2, n)
-        g1, own1 = _axis_backward(rows, i, e1, a1, n1, g * a2 * a0, n)
-        g2, own2 = _axis_backward(rows, i, e2, a2, n2, g * a0 * a1, n)
-        t0, t1, t2 = 2 * g * a1 * a2 * n0, 2 * g * a2 * a0 * n1, 2 * g * a0 * a1 * n2
-        for axis in range(3):
-            rows[N_GRAD + axis, i] += t0 * e0[axis] + t1 * e1[axis] + t2 * e2[axis]
-        d0 = 2 * s0 * (own0 + g * (a2 * n1 * n1 + a1 * n2 * n2))
-        d1 = 2 * s1 * (own1 + g * (a2 * n0 * n0 + a0 * n2 * n2))
-        d2 = 2 * s2 * (own2 + g * (a1 * n0 * n0 + a0 * n1 * n1))
-        rows[GIVEN_RADIUS, i] -= (d0 * s0 + d1 * s1 + d2 * s2) * inverse
-        rows[OUT_SHAPE + 4, i], rows[OUT_SHAPE + 5, i] = d0 * inverse, d1 * inverse
-        rows[OUT_SHAPE + 6, i] = d2 * inverse
-        w, x, y, z, over_norm = r[9], r[10], r[11], r[12], r[13]
-        skew_x, skew_y, skew_z = g1[2] - g2[1], g2[0] - g0[2], g0[1] - g1[0]
-        sum_x, sum_y, sum_z = g1[2] + g2[1], g2[0] + g0[2], g0[1] + g1[0]
-        q_w = 2 * (x * skew_x + y * skew_y + z * skew_z)
-        q_x = 2 * (w * skew_x - 2 * x * (g1[1] + g2[2]) + y * sum_z + z * sum_y)
-        q_y = 2 * (w * skew_y - 2 * y * (g0[0] + g2[2]) + x * sum_z + z * sum_x)
-        q_z = 2 * (w * skew_z - 2 * z * (g0[0] + g1[1]) + x * sum_y + y * sum_x)
-        outward = w * q_w + x * q_x + y * q_y + z * q_z
-        rows[OUT_SHAPE, i], rows[OUT_SHAPE + 1, i] = (q_w - outward * w) * over_norm, (q_x - outward * x) * over_norm
-        rows[OUT_SHAPE + 2, i] = (q_y - outward * y) * over_norm
-        rows[OUT_SHAPE + 3, i] = (q_z - outward * z) * over_norm
+        u, v, n, shape = frame_and_shape(rows, i)
+        xx, xy, xz = rows[OUT_SHAPE, i], rows[OUT_SHAPE + 1, i], rows[OUT_SHAPE + 2, i]
+        yy, yz, zz = rows[OUT_SHAPE + 3, i], rows[OUT_SHAPE + 4, i], rows[OUT_SHAPE + 5, i]
+        g_n = rows[OUT_MEAN, i], rows[OUT_MEAN + 1, i], rows[OUT_MEAN + 2, i]
+        columns = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
+        for other in range(3):
+            on_u, on_v, on_n = dot(*u, *columns[other]), dot(*v, *columns[other]), dot(*n, *columns[other])
+            by_u = 2 * (shape[0] * on_u + shape[1] * on_v + shape[3] * on_n)
+            by_v = 2 * (shape[1] * on_u + shape[2] * on_v + shape[4] * on_n)
+            by_n = 2 * (shape[3] * on_u + shape[4] * on_v + shape[5] * on_n) + g_n[other]
+            for axis in range(3):
+                sums[4 * axis + other, i] += u[axis] * by_u + v[axis] * by_v + n[axis] * by_n
 
 
 @inlined
@@ -268,7 +222,7 @@ def _clear_undrawn(records, start, count, rows, drawn):
 @kernel
 def _chain(
     piece, means, quats, scales, covariances, opacities, harmonics, pose, spread, compensate, near,
-    records, values, grad_records, grad_values, offsets,
+    records, values, grad_records, grad_values, totals, offsets,
     grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities, grad_harmonics, pose_sums,
 ):  # fmt: skip
     rows = np.ones((ALL_ROWS, LANES))
@@ -278,15 +232,17 @@ def _chain(
     for start in range(piece * PIECE, min((piece + 1) * PIECE, means.shape[0]), LANES):
         count = min(LANES, means.shape[0] - start)
         read_block(means, quats, scales, covariances, opacities, start, count, rows)
-        _read_gradients(records, grad_records, grad_values, offsets, start, count, rows, colour_grads)
+        _read_gradients(grad_records, grad_values, totals, offsets, start, count, rows, colour_grads)
         find_directions(pose, near, rows)
         _clear_undrawn(records, start, count, rows, drawn)
         find_shapes(covariances, rows)
         _forms_backward(pose, spread, compensate, rows, sums)
+        if totals.shape[0] > 0:
+            _add_totals(totals, start, drawn, rows, sums)
         if covariances.shape[0] > 0:
-            _covariances_backward(rows)
+            covariances_backward(rows)
         else:
-            _axes_backward(rows)
+            axes_backward(rows)
         fill_basis(rows, WORLD, harmonics.shape[1], basis)
         colour_gradients(harmonics, start, drawn, basis, values, colour_grads, grad_harmonics, slopes)
         add_slopes(rows, WORLD, harmonics.shape[1], slopes, N_GRAD)
@@ -335,6 +291,7 @@ def chain(
     observed: Observed,
     grad_records: np.ndarray,
     grad_values: np.ndarray,
+    totals: np.ndarray,
     offsets: np.ndarray,
     wanted: Gradients,
     threads: int,
@@ -345,6 +302,7 @@ def chain(
         fields, camera, observed: of the forward.
         grad_records: (slot, FIELDS), see records.py; gradients of the camera's records.
         grad_values: (slot, channel + 1).
+        totals: of the classic kernel (see ewa.py), in place of `grad_records`; else no rows.
         offsets: (n + 1), where each Gaussian's slots begin.
         wanted: arrays to fill; those without rows are left alone.
         threads: to work on; the result does not depend on it.
@@ -354,12 +312,14 @@ def chain(
 
     def work(piece: int) -> None:
         _chain(
-            piece, *fields, *camera, observed.records, observed.values, grad_records, grad_values, offsets,
+            piece, *fields, *camera, observed.records, observed.values, grad_records, grad_values, totals, offsets,
             *wanted[:6], sums,
         )  # fmt: skip
 
     share(work, pieces, threads)
-    return wanted._replace(pose=sums.sum(axis=0).reshape(3, 4))
+    pose = sums.sum(axis=0).reshape(3, 4)
+    pose[:, :3] = pose[:, :3] @ camera.pose[:3, :3]
+    return wanted._replace(pose=pose)
 
 
 @kernel

@@ -9,7 +9,7 @@ import torch
 
 from pansplat.render import splats
 from pansplat.render.bounds import ewa_boxes, kappa
-from pansplat.render.cpu.ewa import project, project_backward
+from pansplat.render.cpu.ewa import TOTALS, project, project_backward
 from pansplat.render.cpu.observe import Camera, observe
 from pansplat.render.cpu.observe_backward import Gradients, chain
 from pansplat.render.cpu.records import FIRST, LEVEL, REST, SECOND, UNIT
@@ -35,12 +35,11 @@ def _reference(scene, pose, lowpass, picture):
 
 
 def _ours(scene, pose, lowpass, picture, fields, lease):
-    least = 1e-9 * picture.pixel_angle**2
-    spread = 0.1 * picture.pixel_angle**2 if lowpass == "angular" else least
+    spread = (0.1 if lowpass == "angular" else 1e-9) * picture.pixel_angle**2
     camera = Camera(pose.numpy(), spread, lowpass == "angular", 0.05)
     given = fields(scene)
     observed = observe(given, camera, lease, 1)
-    records, boxes = project(observed, picture, _DILATED[lowpass], 0.01, lease, 1)
+    records, boxes = project(given, camera, observed, picture, _DILATED[lowpass], 0.01, lease, 1)
     return given, camera, observed, records, boxes
 
 
@@ -92,10 +91,20 @@ def test_gradients_through_the_projection_are_autograds(lowpass, make_scene, fie
     slots[:, :2], slots[:, FIRST], slots[:, SECOND : SECOND + 2] = weights[:, :2], weights[:, 2], weights[:, 3:5]
     slots[:, [FIRST, SECOND, SECOND + 1]] /= unit  # of the record's numbers, which are unit times the forms
     slots[:, LEVEL] = weights[:, 5] * math.log(2)
-    totals = np.zeros((400, 16), np.float32)
-    project_backward(observed, picture, _DILATED[lowpass], slots, offsets, totals, 1)
+    totals = np.zeros((400, TOTALS))
+    project_backward(given, numba_camera, picture, _DILATED[lowpass], slots, offsets, totals, 1)
     wanted = Gradients(*(np.full_like(field, np.nan) for field in given), pose=np.zeros((3, 4)))
-    found = chain(given, numba_camera, observed, totals, np.zeros((400, 4), np.float32), np.arange(401), wanted, 1)
+    found = chain(
+        given,
+        numba_camera,
+        observed,
+        np.zeros((0, 16), np.float32),
+        np.zeros((400, 4), np.float32),
+        totals,
+        np.arange(401),
+        wanted,
+        1,
+    )
     for name in _NAMES[:4]:
         expected = leaves[name].grad
         difference = torch.from_numpy(getattr(found, name)).double() - expected

@@ -12,6 +12,7 @@ from pansplat.render.cpu.observe import Camera, observe
 from pansplat.render.cpu.observe_backward import Gradients, add_slots, chain
 from pansplat.render.cpu.records import ALONG, FIRST, FRONT_A, FRONT_B, LEVEL, REST, SECOND, UNIT
 
+_NO_TOTALS = np.zeros((0, 10))
 _NAMES = ("means", "quats", "scales", "opacities", "harmonics")
 
 
@@ -77,7 +78,7 @@ def test_chained_gradients_are_autograds(degree, by_covariance, compensate, make
     given = fields(scene, None if covariances is None else covariances.detach())
     numba_camera = Camera(pose.numpy(), spread, compensate, 0.05)
     observed = observe(given, numba_camera, lease, 1)
-    slots = *_slot_gradients(observed, weights), np.arange(501)
+    slots = *_slot_gradients(observed, weights), _NO_TOTALS, np.arange(501)
     found = chain(given, numba_camera, observed, *slots, _empty(given), 1)
     expected = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
     if covariances is not None:
@@ -101,7 +102,7 @@ def test_gaussians_that_are_not_drawn_have_zero_gradients_and_spoil_no_others(ma
     # Gradients come for drawn Gaussians only: the others have no slots.
     offsets = np.cumsum([0] + [0 if 1 <= g <= 7 else 2 for g in range(130)])
     slots = [random.standard_normal((offsets[-1], size)).astype(np.float32) for size in (16, 4)]
-    found = chain(given, camera, observed, *slots, offsets, _empty(given), 1)
+    found = chain(given, camera, observed, *slots, _NO_TOTALS, offsets, _empty(given), 1)
     for name in _NAMES:
         gradient = getattr(found, name)
         assert np.isfinite(gradient).all(), name
@@ -117,7 +118,8 @@ def test_gradients_are_the_same_bits_on_any_number_of_threads(threads, make_scen
     random = np.random.default_rng(0)
     slots = [random.standard_normal((20000, size)).astype(np.float32) for size in (16, 4)]
     one, several = (
-        chain(given, camera, observed, *slots, np.arange(20001), _empty(given), count) for count in (1, threads)
+        chain(given, camera, observed, *slots, _NO_TOTALS, np.arange(20001), _empty(given), count)
+        for count in (1, threads)
     )
     for name in (*_NAMES, "pose"):
         assert np.array_equal(getattr(one, name), getattr(several, name)), name
@@ -128,7 +130,7 @@ def test_a_zero_quaternion_has_zero_gradient(make_scene, fields, lease, pose):
     scene.quats[1] = 0
     given, camera = fields(scene), Camera(pose.numpy(), 1e-4, True, 0.05)
     observed = observe(given, camera, lease, 1)
-    slots = np.ones((3, 16), np.float32), np.ones((3, 4), np.float32), np.arange(4)
+    slots = np.ones((3, 16), np.float32), np.ones((3, 4), np.float32), _NO_TOTALS, np.arange(4)
     quats = chain(given, camera, observed, *slots, _empty(given), 1).quats
     assert not quats[1].any() and quats[0].any() and quats[2].any()
     # A quaternion's length does not matter, so the gradient has no part along it.
