@@ -176,8 +176,8 @@ def _channels_last(maps: Tensor) -> np.ndarray:
 
 
 def _bands(height: int) -> list[tuple[int, int]]:
-    """Rows shared out among as many threads as torch may use."""
-    count = max(1, min(torch.get_num_threads(), _MOST_BANDS, height))
+    """Rows shared out among as many threads as torch may use; a few rows are not worth a thread."""
+    count = max(1, min(torch.get_num_threads(), _MOST_BANDS, height // 8))
     edges = [height * band // count for band in range(count + 1)]
     return list(itertools.pairwise(edges))
 
