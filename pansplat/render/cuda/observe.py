@@ -44,28 +44,13 @@ def ray_forms(c, right, down, direction, spread, det):
     return forms
 
 
+# fmt: off
 @triton.jit(do_not_specialize=["num"])
 @no_type_check
 def observe_kernel(
-    means,
-    opacities,
-    harmonics,
-    first_shape,
-    second_shape,
-    camera,
-    directions,
-    radii,
-    covariances,
-    peaks,
-    values,
-    forms,
-    alongs,
-    num,
-    DEGREE: tl.constexpr,
-    CHANNELS: tl.constexpr,
-    BY_AXES: tl.constexpr,
-    COMPENSATE: tl.constexpr,
-    EXACT: tl.constexpr,
+    means, opacities, harmonics, first_shape, second_shape, camera,
+    directions, radii, covariances, peaks, values, forms, alongs, num,
+    DEGREE: tl.constexpr, CHANNELS: tl.constexpr, BY_AXES: tl.constexpr, COMPENSATE: tl.constexpr, EXACT: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """Writes the fields of `Observed`. `camera` is cam2world, row by row, then e^2."""
@@ -107,6 +92,7 @@ def observe_kernel(
             colour += shape[k] * tl.load(harmonics + place, mask=there, other=0.0)
         tl.store(values + at * (CHANNELS + 1) + channel, tl.maximum(colour, 0.0), mask=there)
     tl.store(values + at * (CHANNELS + 1) + CHANNELS, radius, mask=there)
+# fmt: on
 
 
 def observe(

@@ -19,38 +19,23 @@ from pansplat.render.cuda.pixels import TilePixels
 from pansplat.render.cuda.response import (
     PIXELS,
     SATURATED,
-    SIDE,
     STEP,
     fall_off,
     form_values,
     limit,
     load_numbers,
     load_rows,
+    place_pixels,
 )
 from pansplat.render.tiles import tile_grid
 
 
+# fmt: off
 @triton.jit(do_not_specialize=["first_tile", "columns", "tiles", "height", "width"])
 @no_type_check
 def raster_kernel(
-    records,
-    entries,
-    starts,
-    busiest,
-    centres,
-    offsets,
-    sums,
-    stops,
-    first_tile,
-    columns,
-    tiles,
-    height,
-    width,
-    TINY: tl.constexpr,
-    AXES: tl.constexpr,
-    CHANNELS: tl.constexpr,
-    RECORD: tl.constexpr,
-    PEAK: tl.constexpr,
+    records, entries, starts, busiest, centres, offsets, sums, stops, first_tile, columns, tiles, height, width,
+    TINY: tl.constexpr, AXES: tl.constexpr, CHANNELS: tl.constexpr, RECORD: tl.constexpr, PEAK: tl.constexpr,
 ):
     """One program a tile: sums of weight x (channels, distance, 1), and the entry at which it stopped."""
     local = tl.load(busiest + tl.program_id(0)).to(tl.int64)
@@ -77,13 +62,10 @@ def raster_kernel(
             totals = added + (totals[CHANNELS + 1] + weight,)
         entry = step_end
     tl.store(stops + local, entry)
-    in_picture = tile % tiles
-    y = in_picture // columns * SIDE + pixel // SIDE
-    x = in_picture % columns * SIDE + pixel % SIDE
-    plane = height.to(tl.int64) * width
-    place = tile // tiles * (CHANNELS + 2) * plane + y.to(tl.int64) * width + x
+    place, plane, inside = place_pixels(tile, pixel, columns, tiles, height, width, CHANNELS + 2)
     for c in tl.static_range(CHANNELS + 2):
-        tl.store(sums + place + c * plane, totals[c], mask=(y < height) & (x < width))
+        tl.store(sums + place + c * plane, totals[c], mask=inside)
+# fmt: on
 
 
 def raster(

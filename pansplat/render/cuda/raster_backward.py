@@ -22,44 +22,26 @@ from pansplat.render.cuda.raster import busiest_first, num_warps, place, sizes
 from pansplat.render.cuda.response import (
     LARGEST_ALPHA,
     PIXELS,
-    SIDE,
     fall_off,
     form_values,
     limit,
     load_numbers,
     load_rows,
+    place_pixels,
 )
 
 _MANY = 32
 """Tiles beyond which one instance's rows are summed by a program of its own."""
 
 
+# fmt: off
 @triton.jit(do_not_specialize=["first_tile", "columns", "tiles", "height", "width"])
 @no_type_check
 def backward_kernel(
-    records,
-    entries,
-    slots,
-    starts,
-    stops,
-    busiest,
-    centres,
-    offsets,
-    sums,
-    grad_sums,
-    rows,
-    first_tile,
-    columns,
-    tiles,
-    height,
-    width,
-    TINY: tl.constexpr,
-    AXES: tl.constexpr,
-    CHANNELS: tl.constexpr,
-    RECORD: tl.constexpr,
-    PEAK: tl.constexpr,
-    GRADIENT: tl.constexpr,
-    FIELDS: tl.constexpr,
+    records, entries, slots, starts, stops, busiest, centres, offsets, sums, grad_sums, rows,
+    first_tile, columns, tiles, height, width,
+    TINY: tl.constexpr, AXES: tl.constexpr, CHANNELS: tl.constexpr, RECORD: tl.constexpr, PEAK: tl.constexpr,
+    GRADIENT: tl.constexpr, FIELDS: tl.constexpr,
 ):
     """One program a tile: writes the row of gradients of each of its entries."""
     local = tl.load(busiest + tl.program_id(0)).to(tl.int64)
@@ -67,12 +49,7 @@ def backward_kernel(
     pixel = tl.arange(0, PIXELS)
     centre = load_numbers(centres + tile * 2 * AXES, 2 * AXES)
     offset = load_rows(offsets + tile * AXES * PIXELS, PIXELS, pixel, AXES)
-    in_picture = tile % tiles
-    y = in_picture // columns * SIDE + pixel // SIDE
-    x = in_picture % columns * SIDE + pixel % SIDE
-    inside = (y < height) & (x < width)
-    plane = height.to(tl.int64) * width
-    at_pixel = tile // tiles * (CHANNELS + 2) * plane + y.to(tl.int64) * width + x
+    at_pixel, plane, inside = place_pixels(tile, pixel, columns, tiles, height, width, CHANNELS + 2)
     grad = ()
     behind = tl.zeros([PIXELS], records.dtype.element_ty)  # slope x all that is still behind
     for c in tl.static_range(CHANNELS + 2):
@@ -113,6 +90,7 @@ def backward_kernel(
         for k in tl.static_range(GRADIENT):
             row = tl.where(field == k, sums_of[k], row)
         tl.store(rows + tl.load(slots + at).to(tl.int64) * GRADIENT + field, row, mask=field < GRADIENT)
+# fmt: on
 
 
 @triton.jit

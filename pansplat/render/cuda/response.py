@@ -95,3 +95,19 @@ def fall_off(forms, along, TINY: tl.constexpr, AXES: tl.constexpr):
 def limit(raw):
     """An opacity at most 0.99, and 0 below 1/255."""
     return tl.where(raw >= ALPHA_CUT, tl.minimum(raw, LARGEST_ALPHA), 0.0)
+
+
+@triton.jit
+@no_type_check
+def place_pixels(tile, pixel, columns, tiles, height, width, PLANES: tl.constexpr):
+    """Where a tile's pixels are in the first of its picture's planes, a plane's size, which are in the picture.
+
+    Args:
+        tile: 64-bit, counted over pictures.
+        tiles: a picture.
+    """
+    in_picture = tile % tiles
+    y = in_picture // columns * SIDE + pixel // SIDE
+    x = in_picture % columns * SIDE + pixel % SIDE
+    plane = height.to(tl.int64) * width
+    return tile // tiles * PLANES * plane + y.to(tl.int64) * width + x, plane, (y < height) & (x < width)
