@@ -1,5 +1,7 @@
 """The counted work covers what is drawn, and little more."""
 
+from dataclasses import replace
+
 import torch
 
 from pansplat.bench.scenes import full_lattice_room
@@ -44,3 +46,13 @@ def test_gaussians_nearer_than_near_ask_for_nothing():
     room = full_lattice_room(8)
     options = Options("ray", "radial", "angular", 100.0, False)
     assert panorama_work(room, POSE, 16, options).pairs == 0
+
+
+def test_a_gaussian_all_around_asks_for_every_pixel_once():
+    room = full_lattice_room(8)
+    around = one(room, 0)
+    around = replace(around, scales=torch.full((1, 3), 50.0), opacities=torch.ones(1))
+    assert panorama_work(around, POSE, 16, OPTIONS).pairs == 16 * 32
+    below = replace(around, means=torch.tensor([[0.0, 1.2, 0.0]]), scales=torch.full((1, 3), 0.15))
+    rows = int((rasterize(below, POSE, size=(16, 32), backend="torch").alpha > 0).any(dim=1).sum())
+    assert 32 * rows <= panorama_work(below, POSE, 16, OPTIONS).pairs <= 32 * (rows + 1)
