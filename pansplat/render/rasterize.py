@@ -114,7 +114,9 @@ def rasterize(
 def _backend(name: Backend, gaussians: Gaussians) -> Draw:
     """The backend of that name; "auto" chooses by the Gaussians' type and device."""
     if name == "auto":
-        name = "triton" if gaussians.means.is_cuda and find_spec("triton") is not None else "torch"
+        fast: Backend = "numba" if gaussians.means.device.type == "cpu" else "triton"
+        there = fast == "numba" or (gaussians.means.is_cuda and find_spec("triton") is not None)
+        name = fast if there and gaussians.means.dtype == torch.float32 else "torch"
     module = import_module(_MODULES[name])
     return module.draw  # type: ignore[no-any-return]
 

@@ -19,6 +19,8 @@ _OPTIONS = {
     "fastmath": {"contract", "nsz"},  # sums keep their order: the same bits on any number of threads
 }
 
+_told = False
+
 
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile a function at its first call, without the interpreter's lock, and keep the code on disk."""
@@ -33,7 +35,7 @@ def inlined(function: Callable[..., Any]) -> Any:
 
 @contextlib.contextmanager
 def announced() -> Iterator[None]:
-    """Tell on stderr that kernels are being compiled, if it takes more than a second."""
+    """Tell on stderr, once, that kernels are being compiled, if it takes more than a second."""
     listener = _Listener()
     with event.install_listener("numba:compile", listener):
         try:
@@ -51,7 +53,7 @@ class _Listener(event.Listener):
     def on_start(self, event: event.Event) -> None:
         ours = event.data["dispatcher"].py_func.__module__.startswith(__package__)
         if ours and self._timer is None:
-            self._timer = threading.Timer(_PATIENCE, lambda: print(_NEWS, file=sys.stderr, flush=True))
+            self._timer = threading.Timer(_PATIENCE, _tell)
             self._timer.daemon = True
             self._timer.start()
 
@@ -62,3 +64,10 @@ class _Listener(event.Listener):
         """The clock stops."""
         if self._timer is not None:
             self._timer.cancel()
+
+
+def _tell() -> None:
+    global _told
+    if not _told:
+        _told = True
+        print(_NEWS, file=sys.stderr, flush=True)

@@ -51,21 +51,13 @@ def covariances_backward(rows):
 
 
 @inlined
-def _axis_backward(rows, i, e, scale2, cosine, det_share, n):
-    """Gradient of a unit axis e of the Gaussian, and e'G e."""
-    xx, xy, xz = rows[C_GRAD, i], rows[C_GRAD + 1, i], rows[C_GRAD + 2, i]
-    yy, yz, zz = rows[C_GRAD + 3, i], rows[C_GRAD + 4, i], rows[C_GRAD + 5, i]
-    x = xx * e[0] + xy * e[1] + xz * e[2]
-    y = xy * e[0] + yy * e[1] + yz * e[2]
-    z = xz * e[0] + yz * e[1] + zz * e[2]
-    turn = 2 * det_share * cosine
-    grad = 2 * scale2 * x + turn * n[0], 2 * scale2 * y + turn * n[1], 2 * scale2 * z + turn * n[2]
-    return grad, dot(*e, x, y, z)
-
-
-@inlined
 def axes_backward(rows):
-    """Gradients of quaternion, scales and distance from those of C and ln det B = ln sum_k w_k (n.e_k)^2."""
+    """Gradients of quaternion, scales and distance from those of C and ln det B = ln sum_k w_k (n.e_k)^2.
+
+    Turning the axes about one of them does nothing if the other two scales are the same, and no rounding hides it:
+    with G the gradient of C in the own axes and a_k the squared scales, the torque about axis 0 is
+    2 (a_1 - a_2) (G_12 - g a_0 n_1 n_2), and so on round.
+    """
     for i in range(LANES):
         n = rows[WORLD, i], rows[WORLD + 1, i], rows[WORLD + 2, i]
         r = rotation(rows[SHAPE, i], rows[SHAPE + 1, i], rows[SHAPE + 2, i], rows[SHAPE + 3, i])
@@ -73,28 +65,31 @@ def axes_backward(rows):
         s0, s1, s2 = rows[SHAPE + 4, i] * inverse, rows[SHAPE + 5, i] * inverse, rows[SHAPE + 6, i] * inverse
         e0, e1, e2 = (r[0], r[3], r[6]), (r[1], r[4], r[7]), (r[2], r[5], r[8])
         n0, n1, n2 = dot(*n, *e0), dot(*n, *e1), dot(*n, *e2)
-        a0, a1, a2 = s0 * s0, s1 * s1, s2 * s2
-        g = rows[DET_GRAD, i]
-        g0, own0 = _axis_backward(rows, i, e0, a0, n0, g * a1 * a2, n)
-        g1, own1 = _axis_backward(rows, i, e1, a1, n1, g * a2 * a0, n)
-        g2, own2 = _axis_backward(rows, i, e2, a2, n2, g * a0 * a1, n)
+        a0, a1, a2, g = s0 * s0, s1 * s1, s2 * s2, rows[DET_GRAD, i]
+        by_0, by_1, by_2 = _times(rows, i, e0), _times(rows, i, e1), _times(rows, i, e2)
         t0, t1, t2 = 2 * g * a1 * a2 * n0, 2 * g * a2 * a0 * n1, 2 * g * a0 * a1 * n2
         for axis in range(3):
             rows[N_GRAD + axis, i] += t0 * e0[axis] + t1 * e1[axis] + t2 * e2[axis]
-        d0 = 2 * s0 * (own0 + g * (a2 * n1 * n1 + a1 * n2 * n2))
-        d1 = 2 * s1 * (own1 + g * (a2 * n0 * n0 + a0 * n2 * n2))
-        d2 = 2 * s2 * (own2 + g * (a1 * n0 * n0 + a0 * n1 * n1))
+        d0 = 2 * s0 * (dot(*e0, *by_0) + g * (a2 * n1 * n1 + a1 * n2 * n2))
+        d1 = 2 * s1 * (dot(*e1, *by_1) + g * (a2 * n0 * n0 + a0 * n2 * n2))
+        d2 = 2 * s2 * (dot(*e2, *by_2) + g * (a1 * n0 * n0 + a0 * n1 * n1))
         rows[GIVEN_RADIUS, i] -= (d0 * s0 + d1 * s1 + d2 * s2) * inverse
         rows[OUT_SHAPE + 4, i], rows[OUT_SHAPE + 5, i] = d0 * inverse, d1 * inverse
         rows[OUT_SHAPE + 6, i] = d2 * inverse
-        w, x, y, z, over_norm = r[9], r[10], r[11], r[12], r[13]
-        skew_x, skew_y, skew_z = g1[2] - g2[1], g2[0] - g0[2], g0[1] - g1[0]
-        sum_x, sum_y, sum_z = g1[2] + g2[1], g2[0] + g0[2], g0[1] + g1[0]
-        q_w = 2 * (x * skew_x + y * skew_y + z * skew_z)
-        q_x = 2 * (w * skew_x - 2 * x * (g1[1] + g2[2]) + y * sum_z + z * sum_y)
-        q_y = 2 * (w * skew_y - 2 * y * (g0[0] + g2[2]) + x * sum_z + z * sum_x)
-        q_z = 2 * (w * skew_z - 2 * z * (g0[0] + g1[1]) + x * sum_y + y * sum_x)
-        outward = w * q_w + x * q_x + y * q_y + z * q_z
-        rows[OUT_SHAPE, i], rows[OUT_SHAPE + 1, i] = (q_w - outward * w) * over_norm, (q_x - outward * x) * over_norm
-        rows[OUT_SHAPE + 2, i] = (q_y - outward * y) * over_norm
-        rows[OUT_SHAPE + 3, i] = (q_z - outward * z) * over_norm
+        # A quaternion q that turns with the torque changes by q (0, torque) / 2.
+        twice = 4 * r[13]
+        x = twice * (a1 - a2) * (dot(*e1, *by_2) - g * a0 * n1 * n2)
+        y = twice * (a2 - a0) * (dot(*e2, *by_0) - g * a1 * n2 * n0)
+        z = twice * (a0 - a1) * (dot(*e0, *by_1) - g * a2 * n0 * n1)
+        rows[OUT_SHAPE, i] = -r[10] * x - r[11] * y - r[12] * z
+        rows[OUT_SHAPE + 1, i] = r[9] * x + r[11] * z - r[12] * y
+        rows[OUT_SHAPE + 2, i] = r[9] * y + r[12] * x - r[10] * z
+        rows[OUT_SHAPE + 3, i] = r[9] * z + r[10] * y - r[11] * x
+
+
+@inlined
+def _times(rows, i, e):
+    """The gradient of C times a vector."""
+    xx, xy, xz = rows[C_GRAD, i], rows[C_GRAD + 1, i], rows[C_GRAD + 2, i]
+    yy, yz, zz = rows[C_GRAD + 3, i], rows[C_GRAD + 4, i], rows[C_GRAD + 5, i]
+    return dot(xx, xy, xz, *e), dot(xy, yy, yz, *e), dot(xz, yz, zz, *e)
