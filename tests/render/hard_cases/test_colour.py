@@ -18,8 +18,7 @@ def _coloured(scene, colours: torch.Tensor):
 @pytest.mark.hard_case(31)
 @pytest.mark.parametrize("channels", [1, 3, 32])
 def test_a_picture_is_linear_in_its_colours(channels, draw, make_scene, pose, leaves):
-    if draw.interpreted and channels == 32:
-        pytest.skip("the interpreter takes minutes")
+    draw.spare(channels == 32)
     scene = make_scene(10, scale=0.3, degree=0)
     generator = torch.Generator().manual_seed(0)
     first, second = torch.rand(2, 10, channels, generator=generator, dtype=torch.float64)
@@ -76,6 +75,7 @@ def test_every_harmonic_up_to_degree_4_colours_as_it_should(draw, balls):
 @pytest.mark.hard_case(34)
 @pytest.mark.parametrize("degree", range(5))
 def test_gradients_of_harmonics_and_of_their_direction_are_exact(degree, draw, make_scene, pose, equals_dense):
+    draw.spare(degree not in (0, 4))
     equals_dense(draw, make_scene(5, scale=0.4, degree=degree, seed=7), pose, looser=2)
 
 

@@ -18,7 +18,8 @@ def test_the_number_of_threads_changes_no_bit_of_picture_or_gradients(kernel, dr
     """Vector widths are compared where there are any: tests/render/cpu."""
     count = 12 if draw.interpreted else 300
     scene = make_scene(count, scale=0.15, degree=1)
-    options = {"kernel": kernel, "layout": "cubemap", "face_size": 8 if draw.interpreted else 40}
+    layout = "pinhole" if draw.interpreted else "cubemap"
+    options = {"kernel": kernel, "layout": layout, "face_size": 40}
     before, pictures, found = torch.get_num_threads(), [], []
     try:
         for threads in (1, 2, 3):

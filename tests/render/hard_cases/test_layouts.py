@@ -42,6 +42,7 @@ def test_the_cubemap_has_no_seam_and_the_direct_panorama_none_at_all(draw, balls
 @pytest.mark.parametrize("stitching", ["seamless", "official"])
 def test_back_propagation_face_by_face_is_back_propagation(kernel, stitching, draw, make_scene, pose, leaves):
     """Draw without gradients, find the loss's slope in the faces' pixels, then draw each face again with them."""
+    draw.spare(stitching == "official" or kernel == "ray")
     num, size = 6, (8, 16)
     scene = make_scene(8, scale=0.4, degree=1).to(dtype=draw.dtype)
     weights = torch.rand(3, *size, generator=torch.Generator().manual_seed(0)).to(draw.dtype)
