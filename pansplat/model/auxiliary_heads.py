@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.model.cost_volume import Depths, LevelDepth
-from pansplat.model.heads import HeadsConfig, LevelHead, ViewInputs, joined, read_points, views_of
+from pansplat.model.heads import HeadsConfig, LevelHead, ViewInputs, read_points, views_of
 from pansplat.model.layers import Compat
 from pansplat.model.tiles import Margins, Tile, cut
 
@@ -69,7 +69,7 @@ class AuxiliaryHeads(nn.Module):
         whole = Tile(0, 0, 1)
         around = whole.window(height).grown(self.margins.input)
         inputs = (view.image, view.features[index], view.logits)
-        refined = self.levels[index](joined([cut(source, height, around, self.compat) for source in inputs]))
+        refined = self.levels[index]([cut(source, height, around, self.compat) for source in inputs])
         at = (item, view.view)
         own = dataclasses.replace(view, inverse_depth=depth.inverse_depth[at], confidence=depth.confidence[at])
         return read_points(

@@ -100,9 +100,12 @@ class LevelHead(nn.Module):
         # One Gaussian a pixel needs no layer of its own: the map holds its numbers.
         self.linear = nn.Linear(hidden, outputs) if lattice == "fibonacci" else nn.Identity()
 
-    def forward(self, maps: Float[Tensor, "1 channel height width"]) -> Float[Tensor, "1 hidden h w"]:
+    def forward(self, inputs: Sequence[Float[Tensor, "_ height width"]]) -> Float[Tensor, "1 hidden h w"]:
+        maps = joined(inputs)  # the largest of all maps: here, so that it goes when it has been read
         for index, conv in enumerate(self.convs):
-            maps = conv(maps if index == 0 else functional.gelu(maps))
+            if index > 0:
+                maps = functional.gelu(maps)
+            maps = conv(maps)
         return maps
 
 
@@ -213,9 +216,8 @@ class GaussianHeads(nn.Module):
             if passed_on is not None:
                 passed_on = _twice_as_fine(passed_on, self.margins)
                 inputs.append(passed_on[0])
-            maps = joined(inputs)
-            with torch.autocast(maps.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
-                refined = head(maps).to(maps.dtype)
+            with torch.autocast(feature.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
+                refined = head(inputs).to(feature.dtype)
             if passed_on is not None:
                 lost = self.margins.input - self.margins.output
                 refined = refined + _cropped(passed_on, lost)

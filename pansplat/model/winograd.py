@@ -21,7 +21,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional
 
 _BLOCK = 4  # outputs along each side of a block
 _COEFFICIENTS = 36
@@ -49,10 +48,9 @@ class FastConv3x3(nn.Conv2d):
     def forward(self, input: Float[Tensor, "batch channel height width"]) -> Float[Tensor, "batch c h w"]:
         if not self._is_faster_in_blocks(input):
             return super().forward(input)
-        margin = int(self.padding[0])
-        padded = functional.pad(input, (margin,) * 4) if margin else input
         assert self.bias is not None
-        convolved = [convolve_blocks(maps, self._coefficients(), self.bias) for maps in padded.split(1)]
+        margin = int(self.padding[0])
+        convolved = [convolve_blocks(maps, self._coefficients(), self.bias, margin) for maps in input.split(1)]
         return convolved[0] if len(convolved) == 1 else torch.cat(convolved)
 
     def _is_faster_in_blocks(self, input: Tensor) -> bool:
@@ -86,10 +84,11 @@ def convolve_blocks(
     maps: Float[Tensor, "1 channel height width"],
     coefficients: Float[Tensor, "36 inputs outputs"],
     bias: Float[Tensor, "output"],
+    margin: int = 0,
 ) -> Float[Tensor, "1 output h w"]:
-    """The convolution of a map, without padding, by transformed weights; in and out in channels-last order."""
+    """The convolution of a map, with a margin of zeros, by transformed weights; in and out in channels-last order."""
     pixels = maps[0].permute(1, 2, 0).contiguous().numpy()
-    height, width = pixels.shape[0] - 2, pixels.shape[1] - 2
+    height, width = pixels.shape[0] + 2 * margin - 2, pixels.shape[1] + 2 * margin - 2
     across = -(-width // _BLOCK)
     count = -(-height // _BLOCK) * across
     out = torch.empty(1, len(bias), height, width, memory_format=torch.channels_last)
@@ -99,14 +98,14 @@ def convolve_blocks(
     products = torch.empty(_COEFFICIENTS, _CHUNK, coefficients.shape[2])
     with ThreadPoolExecutor(threads) as pool:
 
-        def share(work: Callable[..., None], first: int, *arrays: np.ndarray) -> None:
+        def share(work: Callable[..., None], first: int, *arrays: Any) -> None:
             bounds = np.linspace(0, min(_CHUNK, count - first), threads + 1).astype(int)
             parts = [pool.submit(work, *arrays, across, first, *pair) for pair in itertools.pairwise(bounds)]
             for part in parts:
                 part.result()
 
         for first in range(0, count, _CHUNK):
-            share(_read_blocks, first, pixels, read.numpy())
+            share(_read_blocks, first, pixels, margin, read.numpy())
             torch.bmm(read, coefficients, out=products)
             share(_write_blocks, first, products.numpy(), offsets, out_pixels)
     return out
@@ -122,22 +121,28 @@ def _kernel(function: Callable[..., Any]) -> Any:
 
 
 @_kernel
-def _read_blocks(pixels, read, across, first, start, end):
+def _pixel(row, column, width, beyond):
+    return row[column] if column >= 0 and column < width else beyond[0]
+
+
+@_kernel
+def _read_blocks(pixels, margin, read, across, first, start, end):
     """Coefficients (36, block, channel) of blocks first + start .. first + end of 6x6 pixels (height, width, channel).
 
-    Blocks at the right and bottom rim read repeated pixels; what they make of them is not written.
+    Beyond the map there are zeros.
     """
     height, width, channels = pixels.shape
     half = np.empty((6, 6, channels), np.float32)
-    columns = np.empty(6, np.int64)
+    beyond = np.zeros((1, channels), np.float32)
     for block in range(start, end):
-        top, left = 4 * ((first + block) // across), 4 * ((first + block) % across)
-        for j in range(6):
-            columns[j] = min(left + j, width - 1)
+        top, left = 4 * ((first + block) // across) - margin, 4 * ((first + block) % across) - margin
         for i in range(6):
-            row = pixels[min(top + i, height - 1)]
-            d0, d1, d2 = row[columns[0]], row[columns[1]], row[columns[2]]
-            d3, d4, d5 = row[columns[3]], row[columns[4]], row[columns[5]]
+            inside = top + i >= 0 and top + i < height
+            row = pixels[top + i] if inside else beyond
+            last = width if inside else 0
+            d0, d1 = _pixel(row, left, last, beyond), _pixel(row, left + 1, last, beyond)
+            d2, d3 = _pixel(row, left + 2, last, beyond), _pixel(row, left + 3, last, beyond)
+            d4, d5 = _pixel(row, left + 4, last, beyond), _pixel(row, left + 5, last, beyond)
             for c in range(channels):
                 even, odd = d4[c] - 4 * d2[c], d3[c] - 4 * d1[c]
                 half[i, 0, c] = 4 * d0[c] - 5 * d2[c] + d4[c]

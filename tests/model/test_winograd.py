@@ -13,11 +13,12 @@ def _random(*shape: int, seed: int = 0) -> torch.Tensor:
 
 @pytest.mark.parametrize("size", [(6, 6), (7, 9), (10, 67), (21, 40), (3, 3)])
 @pytest.mark.parametrize("channels", [(3, 5), (40, 33)])
-def test_blocks_give_the_convolution(size, channels):
+@pytest.mark.parametrize("margin", [0, 1])
+def test_blocks_give_the_convolution(size, channels, margin):
     """Against float64; 5e-5 of the output's standard deviation is allowed, as its rounding in float32 gives."""
     maps, weight, bias = _random(1, channels[0], *size), _random(*channels[::-1], 3, 3, seed=1), _random(channels[1])
-    found = convolve_blocks(maps, transform_weights(weight), bias)
-    expected = functional.conv2d(maps.double(), weight.double(), bias.double())
+    found = convolve_blocks(maps, transform_weights(weight), bias, margin)
+    expected = functional.conv2d(maps.double(), weight.double(), bias.double(), padding=margin)
     assert found.shape == expected.shape and found.is_contiguous(memory_format=torch.channels_last)
     scale = (weight.double() ** 2).sum(dim=(1, 2, 3)).sqrt().mean()
     assert float((found - expected).abs().max() / scale) < 5e-5
