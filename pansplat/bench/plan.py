@@ -21,6 +21,9 @@ from pansplat.geometry.pose import rotations_from_quats
 
 DENSE_HEIGHT = 64  # what a renderer without tiles can bear
 _BYTES = 600  # a Gaussian: the scene, its gradients, and what drawing takes, generously
+_BEARABLE = 4_000_000  # Gaussians that the torch reference draws in minutes
+_LARGEST_CHOICE = 512  # pixels: every choice needs a float64 truth of its own
+_OURS = ("triton", "numba")
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,7 @@ class Settings:
         height: of the largest pictures of the comparison, pixels.
         quick: some minutes instead of an hour.
         threads: the most that are used.
-        backends: usable ones besides torch, "numba" first.
+        backends: usable ones besides torch.
         memory: bytes that may be used; larger scenes are left out.
     """
 
@@ -44,7 +47,7 @@ class Settings:
     @property
     def choice_height(self) -> int:
         """Height of the pictures that compare every choice."""
-        return max(8, self.height // 2) if self.quick else self.height
+        return min(max(8, self.height // 2) if self.quick else self.height, _LARGEST_CHOICE)
 
     @property
     def face_sizes(self) -> tuple[int, ...]:
@@ -53,9 +56,14 @@ class Settings:
         return (height // 2, default_face_size(height)) + (() if self.quick else (height,))
 
     @property
-    def fastest(self) -> str:
-        """The backend that the sweeps are about."""
-        return self.backends[0] if self.backends else "torch"
+    def fast(self) -> list[str]:
+        """Our backends that the sweeps are about, fastest first."""
+        return [name for name in _OURS if name in self.backends]
+
+    @property
+    def with_torch(self) -> bool:
+        """Whether the torch reference can draw the full height."""
+        return lattice_room_size(self.height) <= _BEARABLE
 
 
 def room(height: int) -> Subject:
@@ -83,8 +91,9 @@ def groups(settings: Settings, subject: Callable[[int], Subject], *, synthetic: 
         synthetic: the room, which exists in every size; other scenes are thinned out for the sweep of counts.
     """
     height, small = settings.height, settings.choice_height
+    truths = ("exact" if settings.quick else "own") if settings.with_torch else "none"
     found = [
-        _group("headline", subject(height), _headline(settings), "exact" if settings.quick else "own"),
+        _group("headline", subject(height), _headline(settings), truths),
         _group("choices", subject(small), _choices(settings), "own"),
     ]
     if synthetic:
@@ -103,9 +112,8 @@ def groups(settings: Settings, subject: Callable[[int], Subject], *, synthetic: 
 def sample_groups(settings: Settings, subject: Subject) -> list[Group]:
     """A real scene's main choices, so that what the room shows can be checked on it."""
     small = replace(settings, height=settings.choice_height)
-    cases = _main(small, settings.fastest)
-    if settings.fastest != "torch":
-        cases.append(Case("torch", small.height))
+    cases = [case for name in settings.fast for case in _main(small, name)]
+    cases += [Case("torch", small.height)] if cases else _main(small, "torch")
     return [_group("scene", subject, cases, "own")]
 
 
@@ -132,7 +140,7 @@ def _headline(settings: Settings) -> list[Case]:
         cases += _main(settings, backend)
         if settings.threads > 1:
             cases.append(Case(backend, settings.height))
-    return [*cases, Case("torch", settings.height)]
+    return [*cases, Case("torch", settings.height)] if settings.with_torch else cases
 
 
 def _choices(settings: Settings) -> list[Case]:
@@ -145,9 +153,9 @@ def _choices(settings: Settings) -> list[Case]:
 
 
 def _sweep(settings: Settings, height: int, *, slow: bool) -> list[Case]:
-    """The direct panorama by the fastest backend, and by torch where that is bearable."""
-    fast = [Case(name, height, threads=settings.threads) for name in settings.backends[:1]]
-    return fast + ([Case("torch", height)] if slow or not fast else [])
+    """The direct panorama by the fast backends, and by torch where that does not take long."""
+    fast = [Case(name, height, threads=settings.threads) for name in settings.fast]
+    return fast + ([Case("torch", height)] if (slow and settings.with_torch) or not fast else [])
 
 
 def _counts(settings: Settings, subject: Callable[[int], Subject], synthetic: bool) -> list[Subject]:

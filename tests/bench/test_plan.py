@@ -58,6 +58,20 @@ def test_the_dense_peer_gets_a_scene_it_can_bear():
     ]
 
 
+def test_nothing_asks_the_reference_for_more_than_it_can_bear():
+    huge = replace(FULL, height=2048, memory=1e12)
+    found = groups(huge, room, synthetic=True)
+    assert [group.truths for group in found if group.suite == "headline"] == ["none"]
+    assert max(c.height for group in found for c in group.cases if c.backend == "torch") <= 1024
+    assert {c.height for c in cases(huge, "choices")} == {512}
+    assert {c.height for c in cases(huge, "headline")} == {2048}
+
+
+def test_sweeps_are_about_all_fast_backends():
+    both = replace(QUICK, backends=("numba", "triton", "gsplat"))
+    assert {c.backend for c in cases(both, "resolution") if c.height > 256} == {"numba", "triton"}
+
+
 def test_a_scene_from_elsewhere_is_thinned_out():
     gaussians = full_lattice_room(16)
     subject = of_scene("mine", lambda: gaussians, torch.eye(4, dtype=torch.float64))
