@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from pansplat.errors import InputError
 from pansplat.model.checkpoint import (
@@ -26,7 +26,7 @@ from pansplat.model.official_names import Model
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
 from pansplat.model.weights import convert, match, require_shapes
 
-_NETWORKS: dict[str, tuple[type[nn.Module], type]] = {
+_NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {
     "pansplat": (PanSplat, PanSplatConfig),
     "mvsplat": (MVSplat, MVSplatConfig),
 }
@@ -69,7 +69,7 @@ def describe(model: Model, config: object, tensors: dict[str, Tensor], *, compat
     return WeightsFile(model, settings, compat, tensors)
 
 
-def build_network(weights: WeightsFile, compat: Compat, source: object) -> nn.Module:
+def build_network(weights: WeightsFile, compat: Compat, source: object) -> PanSplat | MVSplat:
     """The network with its weights, in eval mode.
 
     Raises:
@@ -81,7 +81,7 @@ def build_network(weights: WeightsFile, compat: Compat, source: object) -> nn.Mo
     return network.eval()
 
 
-def build_empty(weights: WeightsFile, compat: Compat, source: object) -> nn.Module:
+def build_empty(weights: WeightsFile, compat: Compat, source: object) -> PanSplat | MVSplat:
     """The network without memory for its weights; random numbers are not drawn.
 
     Raises:

@@ -138,16 +138,17 @@ class ResidualBlock(nn.Module):
         self.norm1 = nn.BatchNorm2d(outputs)
         self.conv2 = PanoramaConv2d(outputs, outputs, 3, bias=False, border=border)
         self.norm2 = nn.BatchNorm2d(outputs)
-        self.shortcut = None
+        self.shortcut_conv = self.shortcut_norm = None
         if stride > 1:
-            narrow = PanoramaConv2d(inputs, outputs, 1, stride=stride, bias=False, border=border)
-            self.shortcut = nn.ModuleList((narrow, nn.BatchNorm2d(outputs)))
+            self.shortcut_conv = PanoramaConv2d(inputs, outputs, 1, stride=stride, bias=False, border=border)
+            self.shortcut_norm = nn.BatchNorm2d(outputs)
 
     def forward(self, x: Float[Tensor, "batch c height width"]) -> Float[Tensor, "batch d h w"]:
         inner = relu(normalized_convolution(self.conv1, self.norm1, x))
         inner = normalized_convolution(self.conv2, self.norm2, inner)
-        kept = x if self.shortcut is None else normalized_convolution(*self.shortcut, x)
-        return relu(kept + inner)
+        if self.shortcut_conv is not None and self.shortcut_norm is not None:
+            x = normalized_convolution(self.shortcut_conv, self.shortcut_norm, x)
+        return relu(x + inner)
 
 
 class Fusion(nn.Module):

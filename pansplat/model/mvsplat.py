@@ -8,7 +8,7 @@ Source: Chen et al., MVSplat, https://arxiv.org/abs/2403.14627; OFFICIAL.md, sec
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -109,7 +109,8 @@ class MVSplat(nn.Module):
     ) -> None:
         super().__init__()
         config = config or MVSplatConfig()
-        self.config, self.compat = config, compat
+        self.config = config
+        self.compat: Compat = compat
         border = _border_of(compat)
         channels, fine = config.channels, config.refine_width
         self.features = Features(config, compat, attention_precision)
@@ -152,13 +153,14 @@ class MVSplat(nn.Module):
     ) -> Matched:
         """Features and depths of all views at 1/4 scale."""
         require_views(images.shape[1], self.compat)
-        require_size(*images.shape[-2:], 16)
+        height, width = images.shape[-2:]
+        require_size(height, width, 16)
         features, seen = self.features(images)
         swept = self.depth(features, cam2world, near, far)
         return Matched(images, features, seen, Depths((swept,)), cam2world, near, far)
 
-    def lift(self, matched: Matched, *, tiles: int = 1) -> Iterator[TileGaussians]:
-        """All Gaussians in one part: its U-Net sees the whole panorama, so `tiles` has no say."""
+    def lift(self, matched: Matched, *, tiles: int = 1, only: Sequence[int] | None = None) -> Iterator[TileGaussians]:
+        """All Gaussians in one part: the U-Net sees the whole panorama, so `tiles` and `only` have no say."""
         m, views = matched, matched.images.shape[1]
         images, swept = m.images.flatten(0, 1), m.depths.levels[-1]
         features = self.upsampler(torch.cat((m.features, m.seen), dim=2).flatten(0, 1))
@@ -278,7 +280,8 @@ class SweptDepth(nn.Module):
 
     def __init__(self, config: MVSplatConfig, compat: Compat, precision: AttentionPrecision) -> None:
         super().__init__()
-        self.config, self.compat = config, compat
+        self.config = config
+        self.compat: Compat = compat
         border = _border_of(compat)
         inputs = config.candidates + config.channels
         self.shortcut = nn.Conv2d(inputs, config.width, 1)
@@ -296,7 +299,8 @@ class SweptDepth(nn.Module):
         near: Float[Tensor, "batch view"],
         far: Float[Tensor, "batch view"],
     ) -> LevelDepth:
-        candidates = first_candidates((1 / far, 1 / near), self.config.candidates, features.shape[-2:])
+        height, width = features.shape[-2:]
+        candidates = first_candidates((1 / far, 1 / near), self.config.candidates, (height, width))
         volume = correlate_views(features, candidates, cam2world, self.compat)
         inputs = torch.cat((volume, features), dim=2)
         refined = self.shortcut(inputs.flatten(0, 1)) + self.refine(inputs).flatten(0, 1)

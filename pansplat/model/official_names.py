@@ -108,9 +108,9 @@ def _resnet18(theirs: str, ours: str) -> Iterator[Row]:
                 yield f"{old}.conv{layer}", f"{new}.conv{layer}", _BARE
                 yield f"{old}.bn{layer}", f"{new}.norm{layer}", _BATCH_NORM
         if stage > 0:
-            old, new = f"{theirs}.layer{stage + 1}.0.downsample", f"{ours}.stages.{stage}.0.shortcut"
-            yield f"{old}.0", f"{new}.0", _BARE
-            yield f"{old}.1", f"{new}.1", _BATCH_NORM
+            old, new = f"{theirs}.layer{stage + 1}.0.downsample", f"{ours}.stages.{stage}.0"
+            yield f"{old}.0", f"{new}.shortcut_conv", _BARE
+            yield f"{old}.1", f"{new}.shortcut_norm", _BATCH_NORM
 
 
 def _cost_volume() -> Iterator[Row]:

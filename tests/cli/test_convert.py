@@ -14,6 +14,7 @@ from torch import Tensor
 from pansplat.cli import run
 from pansplat.model.checkpoint import load_weights
 from pansplat.pipeline import load
+from pansplat_viewer.library import LoadOptions, find_entries, load_entry
 
 HEIGHT = 64
 
@@ -76,7 +77,7 @@ def test_converted_weights_say_what_they_are(converted: Path) -> None:
     assert weights.config["candidates"] == 128
 
 
-def test_converted_weights_work_in_predict_render_and_evaluate(converted: Path, room: Path) -> None:
+def test_converted_weights_work_wherever_a_model_is_named(converted: Path, room: Path) -> None:
     model = ["--model", str(converted)]
     scenes = {}
     for compat in ("trained", "official", "fixed"):
@@ -95,6 +96,10 @@ def test_converted_weights_work_in_predict_render_and_evaluate(converted: Path, 
     results = room / "results"
     assert run(["evaluate", str(room), "-o", str(results), "--height", "64", "--compat", "fixed", *model]) == 0
     assert (results / "results.json").exists()
+    options = LoadOptions(model=str(converted), compat="fixed", height=64)
+    (entry,) = (entry for entry in find_entries(room, options) if entry.pair is not None)
+    viewed = load_entry(entry, options, lambda what, done: None, photos=False).scene
+    assert torch.equal(viewed.gaussians.means, scenes["fixed"].gaussians.means)
 
 
 def test_a_mismatched_checkpoint_is_shown_before_it_is_refused(
