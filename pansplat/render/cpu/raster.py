@@ -129,7 +129,7 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
                 if block < BLOCKS:
                     if not some(load(through, block * LANES) > fill(np.float32(CLOSED))):
                         continue
-                    following = find_powers(block, touched, forms, offsets, powers, places, half)
+                    following = find_powers(block, count, touched, forms, offsets, powers, places, half)
                 if drawn >= 0 and num_values == _FEW:
                     is_open |= _draw_block(drawn, reached, powers, places, HALF - half, colours, through, added)
                 elif drawn >= 0:
@@ -142,7 +142,7 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
 
 
 @inlined
-def find_powers(block, touched, forms, offsets, powers, places, start):  # type: ignore[no-untyped-def]
+def find_powers(block, count, touched, forms, offsets, powers, places, start):  # type: ignore[no-untyped-def]
     """Log2 of the peak times the response at a block's pixels, for the Gaussians of the chunk that reach it.
 
     Returns:
@@ -151,7 +151,7 @@ def find_powers(block, touched, forms, offsets, powers, places, start):  # type:
     pixel, column, row = block * LANES, block % ACROSS, ROWS + block // ACROSS
     x, y, z = load(offsets, pixel), load(offsets, PIXELS + pixel), load(offsets, 2 * PIXELS + pixel)
     reached = start
-    for word in range(WORDS):
+    for word in range((count + 63) // 64):
         bits = element(touched, word * EDGES + column) & element(touched, word * EDGES + row)
         while bits:
             s = word * 64 + lowest_bit(bits)

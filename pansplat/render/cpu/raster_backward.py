@@ -19,6 +19,7 @@ from pansplat.render.cpu.simd import (
     choose,
     element,
     fill,
+    first_lane,
     load,
     maximum,
     multiply_add,
@@ -58,6 +59,7 @@ _GROUP = 4  # values whose gradients are summed at a time
 _MOMENTS = 16  # (x, y, z, 1) of A, of B, of L; along; level; two to spare
 _LEAST = 1e-16  # of L^2 + along Q: only reached where the slope is 0
 _LN2 = math.log(2)
+_PAIR = 2 * LANES  # numbers a pair: alphas, later slopes, and weights; one cache line
 _PAIRS = 1 << 16  # room for pairs of a segment, at least those of a chunk
 _CHUNKS = 32  # most in a segment
 
@@ -112,8 +114,8 @@ def _walk_tiles(  # type: ignore[no-untyped-def]
     upstream, behind = np.zeros((planes + 2) * PIXELS, np.float32), np.empty(PIXELS, np.float32)
     forms = np.empty((_CHUNKS, FORMS * CHUNK), np.float32)
     colours = np.empty((_CHUNKS, num_values * CHUNK), np.float32)
-    # Pairs: alphas, later slopes; weights; the block, and the same Gaussian's pair before. Where a block's pairs begin.
-    slopes, weights = np.empty(_PAIRS * LANES, np.float32), np.empty(_PAIRS * LANES, np.float32)
+    # Of each pair also its block, and the same Gaussian's pair before; where a block's pairs begin.
+    slopes = np.empty(_PAIRS * _PAIR, np.float32)
     pairs, heads = np.empty(2 * _PAIRS, np.int32), np.empty((_CHUNKS, CHUNK), np.int32)
     begins = np.empty((_CHUNKS, BLOCKS + 1), np.int64)
     touched = np.empty(WORDS * EDGES, np.uint64)
@@ -133,7 +135,7 @@ def _walk_tiles(  # type: ignore[no-untyped-def]
                 kept[segment] = through
             following, is_open = _sweep(
                 records, values, entries, begin, end, middle, exact, offsets, through, forms, colours, touched,
-                powers, places, slopes, weights, pairs, heads, begins,
+                powers, places, slopes, pairs, heads, begins,
             )  # fmt: skip
             if ahead and is_open and following < end:
                 begin, segment = following, segment + 1
@@ -146,12 +148,10 @@ def _walk_tiles(  # type: ignore[no-untyped-def]
             for chunk in range((following - begin - 1) // CHUNK, -1, -1):
                 first = begin + chunk * CHUNK
                 count = min(CHUNK, following - first)
-                _find_slopes(
-                    begins[chunk], pairs, colours[chunk], num_values, planes, upstream, behind, slopes, weights
-                )
+                _find_slopes(begins[chunk], pairs, colours[chunk], num_values, planes, upstream, behind, slopes)
                 _write_chunk(
-                    first, count, slots, heads[chunk], pairs, slopes, weights, forms[chunk], offsets, upstream, num_values,
-                    moments, shares, exact, grad_records, grad_values,
+                    first, count, slots, heads[chunk], pairs, slopes, forms[chunk], offsets, upstream,
+                    num_values, moments, shares, exact, grad_records, grad_values,
                 )  # fmt: skip
             segment -= 1
             if segment < 0:
@@ -186,7 +186,7 @@ def _read_upstream(sums, grad_sums, left, top, num_values, planes, upstream):  #
 @inlined
 def _sweep(  # type: ignore[no-untyped-def]
     records, values, entries, begin, end, middle, exact, offsets, through, forms, colours, touched,
-    powers, places, alphas, weights, pairs, heads, begins,
+    powers, places, slopes, pairs, heads, begins,
 ):  # fmt: skip
     """Keep the pairs of a segment: whole chunks from entry `begin` on, while there is room and a block is open.
 
@@ -202,13 +202,12 @@ def _sweep(  # type: ignore[no-untyped-def]
         is_open, drawn, reached, half = False, -1, 0, 0
         for block in range(BLOCKS + 1):
             following = 0
-            if block < BLOCKS:
-                if some(load(through, block * LANES) > fill(np.float32(CLOSED))):
-                    following = find_powers(block, touched, forms[chunk], offsets, powers, places, half)
+            if block < BLOCKS and some(load(through, block * LANES) > fill(np.float32(CLOSED))):
+                following = find_powers(block, count, touched, forms[chunk], offsets, powers, places, half)
             if drawn >= 0:
                 begins[chunk, drawn] = pair
                 is_open |= _keep_pairs(
-                    drawn, reached, powers, places, HALF - half, through, alphas, weights, pairs, heads[chunk], pair
+                    drawn, reached, powers, places, HALF - half, through, slopes, pairs, heads[chunk], pair
                 )
                 pair += reached
             drawn, reached, half = block, following, HALF - half
@@ -219,15 +218,15 @@ def _sweep(  # type: ignore[no-untyped-def]
 
 @inlined
 def _keep_pairs(  # type: ignore[no-untyped-def]
-    block, reached, powers, places, start, through, alphas, weights, pairs, heads, pair
+    block, reached, powers, places, start, through, slopes, pairs, heads, pair
 ):
     """Write down the alphas and weights of what reaches a block; whether it stays open."""
     passes = load(through, block * LANES)
     for at in range(start, start + reached):
         s = np.int64(element(places, at))
         alpha = opacity(load(powers, at * LANES))
-        store(alphas, pair * LANES, alpha)
-        store(weights, pair * LANES, alpha * passes)
+        store(slopes, pair * _PAIR, alpha)
+        store(slopes, pair * _PAIR + LANES, alpha * passes)
         passes = multiply_add(negative(alpha), passes, passes)
         put(pairs, 2 * pair, np.int32(s))
         put(pairs, 2 * pair + 1, element(heads, s))
@@ -239,7 +238,7 @@ def _keep_pairs(  # type: ignore[no-untyped-def]
 
 @inlined
 def _find_slopes(  # type: ignore[no-untyped-def]
-    begins, pairs, colours, num_values, planes, upstream, behind, slopes, weights
+    begins, pairs, colours, num_values, planes, upstream, behind, slopes
 ):
     """Turn the alphas of a chunk's pairs into derivatives of the loss by their powers, back to front.
 
@@ -251,13 +250,13 @@ def _find_slopes(  # type: ignore[no-untyped-def]
         beyond, base = load(behind, pixel), load(upstream, planes * PIXELS + pixel)
         for pair in range(begins[block + 1] - 1, begins[block] - 1, -1):
             colour = num_values * np.int64(element(pairs, 2 * pair))
-            alpha, weight = load(slopes, pair * LANES), load(weights, pair * LANES)
+            alpha, weight = load(slopes, pair * _PAIR), load(slopes, pair * _PAIR + LANES)
             worth = base
             for value in range(num_values):
                 worth = multiply_add(load(upstream, value * PIXELS + pixel), spread(colours, colour + value), worth)
             earned = weight * worth
             slope = multiply_add(negative(alpha / (one - alpha)), beyond, earned) * fill(np.float32(_LN2))
-            store(slopes, pair * LANES, choose(most > alpha, slope, zero))
+            store(slopes, pair * _PAIR, choose(most > alpha, slope, zero))
             beyond = beyond + earned
             put(pairs, 2 * pair, np.int32(block))
         store(behind, pixel, beyond)
@@ -265,32 +264,38 @@ def _find_slopes(  # type: ignore[no-untyped-def]
 
 @inlined
 def _write_chunk(  # type: ignore[no-untyped-def]
-    first, count, slots, heads, pairs, slopes, weights, forms, offsets, upstream, num_values, moments, shares, exact,
+    first, count, slots, heads, pairs, slopes, forms, offsets, upstream, num_values, moments, shares, exact,
     grad_records, grad_values,
 ):  # fmt: skip
     """Write the gradients of a chunk's Gaussians to their slots."""
     for s in range(count):
-        _sum_moments(s, heads, pairs, slopes, forms, offsets, moments)
+        _sum_moments(s, heads, pairs, slopes, forms, offsets, upstream, moments, shares)
         row = num_values * slots[first + s]
-        _sum_shares(s, heads, pairs, weights, upstream, num_values, shares, grad_values, row)
+        for value in range(min(_GROUP, num_values)):
+            put(grad_values, row + value, element(shares, value))
+        for value in range(_GROUP, num_values):
+            put(grad_values, row + value, _share_of(s, heads, pairs, slopes, upstream, value))
     for s in range(0, count, LANES):
         _write_records(s, first, count, slots, forms, moments, exact, grad_records)
 
 
 @inlined
-def _sum_moments(s, heads, pairs, slopes, forms, offsets, moments):  # type: ignore[no-untyped-def]
+def _sum_moments(  # type: ignore[no-untyped-def]
+    s, heads, pairs, slopes, forms, offsets, upstream, moments, shares
+):
     """Sums over a Gaussian's pixels of the derivatives by A, B, L, times the pixel's offset and 1; by along, level.
 
-    Those by A and B lack a factor -2, that by L a factor 2.
+    Those by A and B lack a factor -2, that by L a factor 2. And the sums of weight x upstream gradient of four values.
     """
     zero, one = fill(np.float32(0)), fill(np.float32(1))
     a_x = a_y = a_z = a_one = b_x = b_y = b_z = b_one = zero
     l_x = l_y = l_z = l_one = by_along = by_level = zero
+    share0 = share1 = share2 = share3 = zero
     along = spread(forms, ALONG_ROW * CHUNK + s)
     pair = np.int64(element(heads, s))
     while pair >= 0:
         pixel = LANES * np.int64(element(pairs, 2 * pair))
-        slope = load(slopes, pair * LANES)
+        slope, weight = load(slopes, pair * _PAIR), load(slopes, pair * _PAIR + LANES)
         pair = np.int64(element(pairs, 2 * pair + 1))
         x, y, z = load(offsets, pixel), load(offsets, PIXELS + pixel), load(offsets, 2 * PIXELS + pixel)
         a, b, front, x, y, z = forms_at(forms, s, x, y, z)
@@ -305,30 +310,25 @@ def _sum_moments(s, heads, pairs, slopes, forms, offsets, moments):  # type: ign
         l_x, l_y, l_z = multiply_add(front, x, l_x), multiply_add(front, y, l_y), multiply_add(front, z, l_z)
         l_one = l_one + front
         by_along, by_level = multiply_add(slope * ratio, ratio, by_along), by_level + slope
+        share0 = multiply_add(weight, load(upstream, pixel), share0)
+        share1 = multiply_add(weight, load(upstream, pixel + PIXELS), share1)
+        share2 = multiply_add(weight, load(upstream, pixel + 2 * PIXELS), share2)
+        share3 = multiply_add(weight, load(upstream, pixel + 3 * PIXELS), share3)
     store(moments, _MOMENTS * s, totals(a_x, a_y, a_z, a_one, b_x, b_y, b_z, b_one))
     store(moments, _MOMENTS * s + LANES, totals(l_x, l_y, l_z, l_one, by_along, by_level, zero, zero))
+    store(shares, 0, totals(share0, share1, share2, share3, zero, zero, zero, zero))
 
 
 @inlined
-def _sum_shares(  # type: ignore[no-untyped-def]
-    s, heads, pairs, weights, upstream, num_values, shares, grad_values, row
-):
-    """Write the gradient of a Gaussian's values: sums over its pixels of weight x upstream gradient."""
-    zero = fill(np.float32(0))
-    for channel in range(0, num_values, _GROUP):
-        sum0 = sum1 = sum2 = sum3 = zero
-        pair = np.int64(element(heads, s))
-        while pair >= 0:
-            pixel = channel * PIXELS + LANES * np.int64(element(pairs, 2 * pair))
-            weight = load(weights, pair * LANES)
-            pair = np.int64(element(pairs, 2 * pair + 1))
-            sum0 = multiply_add(weight, load(upstream, pixel), sum0)
-            sum1 = multiply_add(weight, load(upstream, pixel + PIXELS), sum1)
-            sum2 = multiply_add(weight, load(upstream, pixel + 2 * PIXELS), sum2)
-            sum3 = multiply_add(weight, load(upstream, pixel + 3 * PIXELS), sum3)
-        store(shares, 0, totals(sum0, sum1, sum2, sum3, zero, zero, zero, zero))
-        for value in range(min(_GROUP, num_values - channel)):
-            put(grad_values, row + channel + value, element(shares, value))
+def _share_of(s, heads, pairs, slopes, upstream, value):  # type: ignore[no-untyped-def]
+    """The gradient of a Gaussian's value: the sum over its pixels of weight x upstream gradient."""
+    share = zero = fill(np.float32(0))
+    pair = np.int64(element(heads, s))
+    while pair >= 0:
+        pixel = value * PIXELS + LANES * np.int64(element(pairs, 2 * pair))
+        share = multiply_add(load(slopes, pair * _PAIR + LANES), load(upstream, pixel), share)
+        pair = np.int64(element(pairs, 2 * pair + 1))
+    return first_lane(totals(share, zero, zero, zero, zero, zero, zero, zero))
 
 
 @inlined

@@ -213,6 +213,16 @@ def totals(context, a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
 
 
 @_intrinsic
+def first_lane(context, value):  # type: ignore[no-untyped-def]
+    """The first of eight numbers."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.extract_element(args[0], _INT(0))
+
+    return types.float32(lanes), generate
+
+
+@_intrinsic
 def transposed(context, a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
     """Eight vectors as the rows of a square, turned into its columns."""
 

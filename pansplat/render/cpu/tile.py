@@ -174,7 +174,7 @@ def list_blocks(entries, first, count, touched):  # type: ignore[no-untyped-def]
         _toggle(touched, word + ROWS + ((box >> 16) & 255) // BLOCK_HEIGHT, bit)
         _toggle(touched, word + ROWS + ((box >> 24) & 255) // BLOCK_HEIGHT + 1, bit)
     # A bit was turned where its box begins, and behind its end: run along the blocks, it is set in between.
-    for word in range(0, WORDS * EDGES, EDGES):
+    for word in range(0, (count + 63) // 64 * EDGES, EDGES):
         for edge in range(word + 1, word + ACROSS):
             _toggle(touched, edge, element(touched, edge - 1))
         for edge in range(word + ROWS + 1, word + ROWS + DOWN):
