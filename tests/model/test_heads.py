@@ -67,8 +67,7 @@ def _difference(a: Gaussians, b: Gaussians) -> float:
     return max(float((getattr(a, name) - getattr(b, name)).detach().abs().max()) for name in _FIELDS)
 
 
-@pytest.mark.parametrize("lattice", ["fibonacci", "pixel"])
-@pytest.mark.parametrize("tiles", [2, 4, 8])
+@pytest.mark.parametrize(("lattice", "tiles"), [("fibonacci", 2), ("pixel", 4), ("fibonacci", 8)])
 def test_tiled_heads_equal_untiled(lattice, tiles):
     heads, inputs = _heads(dataclasses.replace(SMALL, lattice=lattice)), _inputs()
     with torch.no_grad():
@@ -177,7 +176,7 @@ def test_views_and_batch_items_are_lifted_by_themselves():
     assert all(torch.equal(getattr(second, name), getattr(alone, name)) for name in _FIELDS)
 
 
-@pytest.mark.parametrize("height", [64, 128, 192])
+@pytest.mark.parametrize("height", [80, 128])
 def test_heads_run_at_other_heights(height):
     with torch.no_grad():
         gaussians = _heads()(*_inputs(height, views=1), tiles=2)[0]
