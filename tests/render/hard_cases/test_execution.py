@@ -16,10 +16,10 @@ _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 @pytest.mark.parametrize("kernel", ["ray", "ewa"])
 def test_the_number_of_threads_changes_no_bit_of_picture_or_gradients(kernel, draw, make_scene, pose, gradients):
     """Vector widths are compared where there are any: tests/render/cpu."""
-    count = 12 if draw.interpreted else 300
+    count = 12 if draw.interpreted else 100
     scene = make_scene(count, scale=0.15, degree=1)
     layout = "pinhole" if draw.interpreted else "cubemap"
-    options = {"kernel": kernel, "layout": layout, "face_size": 40}
+    options = {"kernel": kernel, "layout": layout, "face_size": 24}
     before, pictures, found = torch.get_num_threads(), [], []
     try:
         for threads in (1, 2, 3):
