@@ -201,7 +201,7 @@ class MVSplat(nn.Module):
             bounds: of the inverse depth, far then near.
         """
         height = maps.shape[-2]
-        numbers = self.to_gaussians(maps[None])[0].flatten(1).T
+        numbers = self.to_gaussians(maps[None])[0].flatten(1).T.contiguous()
         offsets, parameters = numbers.split((2, self.config.adapter.num_parameters), dim=-1)
         correction, opacity_logits = corrections.flatten(1)
         uv = lattice_uv("pixel", height).to(maps.device)
