@@ -28,7 +28,8 @@ def _ball(mean, sigma=0.1, opacity=0.8, colour=(0.9, 0.4, 0.2), dtype=torch.floa
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_ball_has_its_closed_form(mean, dtype):
     height, sigma, opacity = 64, 0.1, 0.8
-    picture = rasterize(_ball(mean, sigma, opacity, dtype=dtype), _ORIGIN, size=(height, 2 * height))
+    ball = _ball(mean, sigma, opacity, dtype=dtype)
+    picture = rasterize(ball, _ORIGIN, size=(height, 2 * height), backend="torch")
     mean = torch.tensor(mean, dtype=torch.float64)
     radius = mean.norm()
     cosine = pixel_directions(height, 2 * height, dtype=torch.float64) @ (mean / radius)
