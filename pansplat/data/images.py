@@ -89,6 +89,11 @@ def read_thumbnail(path: Path | str, height: int) -> Float[Tensor, "3 height wid
     return torch.from_numpy(_resize_color(picture.color, height)).permute(2, 0, 1).contiguous()
 
 
+def resize_panorama(pixels: NDArray[np.uint8], height: int) -> Float[Tensor, "3 height width"]:
+    """Pixels (H W 3) of a panorama as a picture at (height, 2 height), resampled as in `read_panorama`."""
+    return torch.from_numpy(_resize_color(pixels, height)).permute(2, 0, 1).contiguous()
+
+
 def read_mask(path: Path | str, height: int) -> Bool[Tensor, "height width"]:
     """A mask picture at (height, 2 height): True where it is white (the scene)."""
     path = Path(path)
