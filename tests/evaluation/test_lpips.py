@@ -1,0 +1,186 @@
+"""LPIPS is the lpips package's, by value, for all three classifiers; its files are found, or asked for by name."""
+
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from pansplat.errors import InputError
+from pansplat.evaluation.lpips import TAPS, Backbone, Lpips
+from pansplat.evaluation.lpips_files import FOLDER_VARIABLE, first_available, load_lpips
+
+# What lpips 0.1.4 (PyPI, over torchvision 0.29.2 and torch 2.13.0, float64) says of `pair()`, with `normalize=True`.
+# "recipe": its own heads, and a classifier whose layers `recipe` made, put into `LPIPS(...).net` by their names.
+RECIPE_VALUES: dict[Backbone, float] = {"vgg": 0.0729251432, "alex": 0.0334913807, "squeeze": 0.0602447220}
+# With the trained SqueezeNet 1.1 of ../shared/weights.
+TRAINED_VALUE = 0.1657151775
+TOLERANCE = 1e-7  # the package keeps the mean and deviation of its training in float32
+
+
+def pair() -> tuple[Tensor, Tensor]:
+    """Two pictures (1 3 64 96) that any program can make again; float64 of float32 values."""
+    noise = 0.1 * torch.sin(torch.arange(64 * 96 * 3).reshape(3, 64, 96).double() * 1.7).float()
+    return waves(0.0)[None].double(), (waves(0.7) + noise)[None].double()
+
+
+def waves(phase: float) -> Tensor:
+    row, column = torch.meshgrid(torch.arange(64).double(), torch.arange(96).double(), indexing="ij")
+    channels = [0.5 + 0.4 * torch.sin((c + 1) * (row / 7 + column / 11) + phase) for c in range(3)]
+    return torch.stack(channels).float()
+
+
+def recipe(name: str, shape: torch.Size) -> Tensor:
+    """Numbers for a layer of torchvision's name: normal, seeded by it."""
+    drawn = np.random.RandomState(zlib.crc32(name.encode())).standard_normal(shape)
+    scale = np.sqrt(2 / np.prod(shape[1:])) if name.endswith("weight") else 0.1
+    return torch.from_numpy(scale * drawn).float()
+
+
+def write_classifier(path: Path, backbone: Backbone) -> None:
+    layers = {n: t.shape for n, t in Lpips(backbone).state_dict().items() if n.startswith("features.")}
+    torch.save({name: recipe(name, shape) for name, shape in layers.items()}, path)
+
+
+def write_heads(path: Path, backbone: Backbone) -> None:
+    rows = enumerate(TAPS[backbone].values())
+    torch.save({f"lin{i}.model.1.weight": recipe(f"{i}.weight", (1, c, 1, 1)).abs() for i, c in rows}, path)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Lpips:
+    """Squeeze with made-up weights, as a bare clone has it; float64."""
+    folder = tmp_path_factory.mktemp("weights")
+    write_classifier(folder / "squeezenet1_1-made.pth", "squeeze")
+    write_heads(folder / "squeeze.pth", "squeeze")
+    return load_lpips("squeeze", folder).double()
+
+
+@pytest.fixture
+def nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A machine without weights; its empty torch.hub cache."""
+    monkeypatch.delenv(FOLDER_VARIABLE, raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    return tmp_path / "torch" / "hub" / "checkpoints"
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("backbone", RECIPE_VALUES)
+def test_equals_the_lpips_package(shared: Path, tmp_path: Path, backbone: Backbone) -> None:
+    file = {"vgg": "vgg16.pth", "alex": "alexnet.pth", "squeeze": "squeezenet1_1.pth"}[backbone]
+    write_classifier(tmp_path / file, backbone)
+    (tmp_path / "lpips_heads").symlink_to(shared / "weights" / "lpips_heads")
+    metric = load_lpips(backbone, tmp_path).double()
+    assert float(metric(*pair())) == pytest.approx(RECIPE_VALUES[backbone], rel=TOLERANCE)
+
+
+@pytest.mark.shared
+def test_equals_the_lpips_package_with_trained_weights(shared: Path) -> None:
+    metric = load_lpips("squeeze", shared / "weights").double()
+    assert float(metric(*pair())) == pytest.approx(TRAINED_VALUE, rel=TOLERANCE)
+
+
+def test_is_zero_for_equal_pictures_and_symmetric(made: Lpips) -> None:
+    a, b = pair()
+    assert float(made(a, a)) == 0
+    assert float(made(a, b)) == pytest.approx(float(made(b, a)), rel=1e-12)
+    assert float(made(a, b)) > 0
+
+
+def test_a_batch_is_its_items(made: Lpips) -> None:
+    a, b = pair()
+    both = made(torch.cat((a, b)), torch.cat((b, b)))
+    assert both.tolist() == pytest.approx([float(made(a, b)), 0.0], abs=1e-12)
+
+
+def test_equal_weights_change_nothing(made: Lpips) -> None:
+    a, b = pair()
+    assert float(made(a, b, torch.full((1, 64, 96), 0.3).double())) == pytest.approx(float(made(a, b)), rel=1e-12)
+
+
+def test_what_is_masked_has_no_part(made: Lpips) -> None:
+    a, b = pair()
+    weights = torch.ones(1, 64, 96, dtype=torch.float64)
+    weights[:, 40:] = 0
+    spoilt = a.clone()
+    spoilt[..., 40:, :] = 7.0
+    assert float(made(spoilt, b, weights)) == pytest.approx(float(made(a, b, weights)), rel=1e-12)
+    below = b.clone()
+    below[..., :40, :] = a[..., :40, :]
+    assert float(made(a, below, weights)) == 0
+    assert float(made(a, b, torch.zeros_like(weights))) == 0
+
+
+def test_gradients_are_those_of_finite_differences(made: Lpips) -> None:
+    a, b = pair()
+    a = a.requires_grad_()
+    (gradient,) = torch.autograd.grad(made(a, b).sum(), a)
+    direction = torch.sin(torch.arange(a.numel()).double()).reshape(a.shape)
+    step = 1e-6
+    with torch.no_grad():
+        slope = float(made(a + step * direction, b) - made(a - step * direction, b)) / (2 * step)
+    assert float((gradient * direction).sum()) == pytest.approx(slope, rel=1e-4)
+
+
+def test_gradients_are_finite_where_nothing_is_activated(made: Lpips) -> None:
+    a = torch.full((1, 3, 32, 64), -50.0, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(made(a, torch.zeros_like(a)).sum(), a)
+    assert torch.isfinite(gradient).all()
+
+
+def test_weights_do_not_learn(made: Lpips) -> None:
+    assert not any(parameter.requires_grad for parameter in made.parameters())
+    assert not made.train().training
+
+
+def test_small_pictures_are_refused(made: Lpips) -> None:
+    small = torch.zeros(1, 3, 16, 32, dtype=torch.float64)
+    with pytest.raises(InputError, match="32 pixels or more along each side, got 16x32"):
+        made(small, small)
+
+
+def test_missing_files_are_named_with_where_to_get_and_put_them(nowhere: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError) as error:
+        load_lpips("vgg", tmp_path)
+    for part in (
+        "vgg16-397923af.pth (from https://download.pytorch.org/models/vgg16-397923af.pth)",
+        "vgg.pth (from https://github.com/richzhang/PerceptualSimilarity",
+        str(tmp_path),
+        str(nowhere),
+        FOLDER_VARIABLE,
+    ):
+        assert part in str(error.value)
+    assert first_available(tmp_path) is None
+
+
+def test_only_the_missing_file_is_asked_for(nowhere: Path, tmp_path: Path) -> None:
+    write_heads(tmp_path / "alex.pth", "alex")
+    with pytest.raises(InputError) as error:
+        load_lpips("alex", tmp_path)
+    assert "alexnet-owt" in str(error.value) and "alex.pth (from" not in str(error.value)
+
+
+@pytest.mark.parametrize("place", ["folder", "variable", "hub"])
+def test_files_are_found_where_they_may_lie(
+    place: str, nowhere: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = nowhere if place == "hub" else tmp_path / "mine"
+    (folder / "lpips_heads").mkdir(parents=True)
+    write_classifier(folder / "squeezenet1_1-b8a52dc0.pth", "squeeze")
+    write_heads(folder / "lpips_heads" / "squeeze.pth", "squeeze")
+    if place == "variable":
+        monkeypatch.setenv(FOLDER_VARIABLE, str(folder))
+    given = folder if place == "folder" else None
+    assert first_available(given) == "squeeze"
+    assert load_lpips("squeeze", given).name == "lpips-squeeze"
+
+
+def test_a_file_of_another_classifier_is_refused(nowhere: Path, tmp_path: Path) -> None:
+    write_classifier(tmp_path / "vgg16.pth", "alex")
+    write_heads(tmp_path / "vgg.pth", "vgg")
+    with pytest.raises(
+        InputError, match=r"vgg16\.pth: needed a tensor features\.0\.weight of \(64, 3, 3, 3\), got one"
+    ):
+        load_lpips("vgg", tmp_path)

@@ -1,0 +1,278 @@
+"""The losses have their closed forms' values and their finite differences' gradients; what is masked has no part."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from pansplat.errors import InputError
+from pansplat.geometry.equirect import row_weights
+from pansplat.training.losses import (
+    CODE,
+    LOSS_WEIGHTS,
+    PAPER,
+    LossWeights,
+    auxiliary_loss,
+    depth_loss,
+    image_loss,
+    mean_square,
+    pixel_weights_of,
+)
+from pansplat.training.perceptual import Structure, choose_perceptual, ssim_map
+
+NEAR, FAR = 0.5, 10.0
+
+
+def pictures(height: int = 24, *, seed: int = 0, batch: int = 2) -> tuple[Tensor, Tensor]:
+    random = torch.Generator().manual_seed(seed)
+    made = torch.rand(2, batch, 3, height, 2 * height, generator=random, dtype=torch.float64)
+    return made[0], made[1]
+
+
+def depths(*heights: int, seed: int = 0) -> list[Tensor]:
+    random = torch.Generator().manual_seed(seed)
+    return [1 + 4 * torch.rand(1, 2, h, 2 * h, generator=random, dtype=torch.float64) for h in heights]
+
+
+def far_off(prediction: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
+    """A perceptual distance that anyone can compute: the absolute difference of the means."""
+    return (prediction.mean(dim=(1, 2, 3)) - target.mean(dim=(1, 2, 3))).abs()
+
+
+# Weights
+
+
+def test_presets_are_those_of_paper_and_code() -> None:
+    """OFFICIAL.md, P4 and P5: swapped weights, another form of the depth loss."""
+    assert LOSS_WEIGHTS == {"paper": PAPER, "code": CODE}
+    assert (PAPER.square, PAPER.perceptual, PAPER.depth, PAPER.depth_form, PAPER.decay) == (1, 0.1, 0.05, "depth", 0.9)
+    assert (CODE.square, CODE.perceptual, CODE.depth, CODE.depth_form, CODE.decay) == (
+        *(1, 0.05, 0.1),
+        *("inverse_depth", 0.9),
+    )
+
+
+# Pictures
+
+
+def test_an_error_of_a_tenth_squares_to_a_hundredth() -> None:
+    target = torch.full((1, 3, 8, 16), 0.5, dtype=torch.float64)
+    assert float(mean_square(target + 0.1, target)) == pytest.approx(0.01)
+
+
+def test_pictures_are_not_clamped() -> None:
+    target = torch.ones(1, 3, 8, 16, dtype=torch.float64)
+    assert float(mean_square(target + 1, target)) == pytest.approx(1.0)
+
+
+def test_the_image_loss_is_the_weighted_sum_of_its_parts() -> None:
+    target = torch.full((2, 3, 8, 16), 0.5, dtype=torch.float64)
+    loss = image_loss(target + 0.2, target, far_off, CODE)
+    assert float(loss.square) == pytest.approx(0.04)
+    assert float(loss.perceptual) == pytest.approx(0.2)
+    assert float(loss.total) == pytest.approx(0.04 + 0.05 * 0.2)
+    assert float(image_loss(target + 0.2, target, None, CODE).total) == pytest.approx(0.04)
+
+
+def test_masked_pixels_have_no_part_in_the_image_loss() -> None:
+    prediction, target = pictures()
+    masks = torch.ones(2, 24, 48, dtype=torch.bool)
+    masks[:, 16:] = False
+    spoilt = prediction.clone()
+    spoilt[..., 16:, :] = 9.0
+    weights = pixel_weights_of(masks, (2, 24, 48))
+    losses = [image_loss(p, target, Structure(), PAPER, pixel_weights=weights) for p in (prediction, spoilt)]
+    assert float(losses[0].total) == pytest.approx(float(losses[1].total), rel=1e-12)
+    inside = float((prediction - target)[..., :16, :].square().mean())
+    assert float(losses[0].square) == pytest.approx(inside)
+
+
+def test_without_any_pixel_the_loss_and_its_gradients_are_zero() -> None:
+    prediction, target = pictures()
+    prediction.requires_grad_()
+    weights = torch.zeros(2, 24, 48)
+    loss = image_loss(prediction, target, Structure(), pixel_weights=weights).total
+    loss.backward()
+    assert loss.item() == 0 and prediction.grad is not None and not prediction.grad.any()
+
+
+def test_spherical_weights_are_solid_angles_and_off_by_default() -> None:
+    assert pixel_weights_of(None, (1, 8, 16)) is None
+    weights = pixel_weights_of(None, (1, 8, 16), spherical=True)
+    assert weights is not None
+    torch.testing.assert_close(weights[0, :, 3], row_weights(8).float())
+    masks = torch.ones(1, 8, 16, dtype=torch.bool)
+    masks[0, 2] = False
+    masked = pixel_weights_of(masks, (1, 8, 16), spherical=True)
+    assert masked is not None and not masked[0, 2].any()
+    torch.testing.assert_close(masked[0, 3], weights[0, 3])
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_the_image_loss_has_the_gradients_of_finite_differences(weighted: bool) -> None:
+    prediction, target = pictures(12, batch=1)
+    weights = torch.rand(1, 12, 24, generator=torch.Generator().manual_seed(1)).double() if weighted else None
+
+    def total(p: Tensor) -> Tensor:
+        return image_loss(p, target, Structure(), pixel_weights=weights).total
+
+    assert torch.autograd.gradcheck(total, prediction.requires_grad_(), fast_mode=True)
+
+
+# What stands in for LPIPS
+
+
+def test_structure_is_zero_for_equal_pictures_and_symmetric() -> None:
+    prediction, target = pictures()
+    structure = Structure()
+    assert structure(target, target).tolist() == pytest.approx([0.0, 0.0], abs=1e-12)
+    forth, back = structure(prediction, target), structure(target, prediction)
+    torch.testing.assert_close(forth, back)
+    assert float(forth.min()) > 0.1
+
+
+def test_structure_of_constant_pictures_is_its_closed_form() -> None:
+    """Without structure only SSIM's luminance term is left, on every scale."""
+    a, b = 0.3, 0.7
+    value = Structure()(*(torch.full((1, 3, 48, 96), c, dtype=torch.float64) for c in (a, b)))
+    luminance = (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
+    assert float(value) == pytest.approx((1 - luminance) / 2, abs=1e-9)
+
+
+def test_ssim_of_the_inside_equals_the_metric_up_to_its_sample_covariance() -> None:
+    """The windows that lie inside the picture; the metric's (co)variances are 121/120 of ours."""
+    from pansplat.evaluation.metrics import ssim
+
+    prediction, target = (picture[0] for picture in pictures(32))
+    ours = float(ssim_map(prediction[None], target[None])[..., 5:-5, 5:-5].mean())
+    assert ours == pytest.approx(ssim(prediction, target), abs=2e-3)
+
+
+def test_structure_rolls_with_the_panorama() -> None:
+    prediction, target = pictures(32)
+    rolled = Structure()(prediction.roll(8, -1), target.roll(8, -1))
+    torch.testing.assert_close(rolled, Structure()(prediction, target))
+
+
+def test_structure_grows_with_blur_where_the_mean_error_is_the_same() -> None:
+    _, target = pictures(32)
+    brighter = target + 0.05
+    blurred = (target + target.roll(1, -1) + target.roll(-1, -1)) / 3
+    assert float(Structure()(blurred, target).mean()) > float(Structure()(brighter, target).mean())
+
+
+@pytest.mark.shared
+def test_auto_takes_lpips_where_its_files_are_and_structure_where_not(
+    shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("PANSPLAT_LPIPS", raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    assert choose_perceptual("auto").name == "structure"
+    assert choose_perceptual("auto", shared / "weights").name == "lpips-squeeze"
+    assert choose_perceptual("structure", shared / "weights").name == "structure"
+    with pytest.raises(InputError, match="LPIPS with vgg needed"):
+        choose_perceptual("lpips-vgg")
+
+
+# Depth
+
+
+@pytest.mark.parametrize("form", ["depth", "inverse_depth"])
+def test_the_true_depth_has_no_loss(form) -> None:
+    truth = torch.full((1, 2, 32, 64), 3.0, dtype=torch.float64)
+    levels = [torch.full((1, 2, h, 2 * h), 3.0, dtype=torch.float64) for h in (4, 8, 16)]
+    assert float(depth_loss(levels, truth, NEAR, FAR, form=form)) == pytest.approx(0, abs=1e-15)
+
+
+def test_depth_losses_are_their_closed_forms() -> None:
+    """Constant depths: metres apart in one form, inverse metres in the other; coarser levels count less."""
+    truth = torch.full((1, 2, 32, 64), 2.0, dtype=torch.float64)
+    levels = [torch.full((1, 2, h, 2 * h), d, dtype=torch.float64) for h, d in ((4, 5.0), (8, 4.0), (16, 2.5))]
+    metres = depth_loss(levels, truth, NEAR, FAR, form="depth")
+    assert float(metres) == pytest.approx(0.9**2 * 3.0 + 0.9 * 2.0 + 0.5)
+    inverse = depth_loss(levels, truth, NEAR, FAR, form="inverse_depth")
+    assert float(inverse) == pytest.approx(0.9**2 * 0.3 + 0.9 * 0.25 + 0.1)
+    halved = depth_loss(levels, truth, NEAR, FAR, form="depth", decay=0.5)
+    assert float(halved) == pytest.approx(0.25 * 3.0 + 0.5 * 2.0 + 0.5)
+
+
+@pytest.mark.parametrize("form", ["depth", "inverse_depth"])
+@pytest.mark.parametrize("unknown", [0.0, NEAR, FAR, 60.0, math.inf])
+def test_depth_outside_the_range_is_unknown(form, unknown: float) -> None:
+    (level,), (truth,) = depths(16), depths(16, seed=1)
+    expected = float(depth_loss([level[..., :8, :]], truth[..., :8, :], NEAR, FAR, form=form))
+    truth[..., 8:, :] = unknown
+    level.requires_grad_()
+    loss = depth_loss([level], truth, NEAR, FAR, form=form)
+    assert loss.item() == pytest.approx(expected)
+    loss.backward()
+    assert level.grad is not None and torch.isfinite(level.grad).all() and not level.grad[..., 8:, :].any()
+
+
+@pytest.mark.parametrize("form", ["depth", "inverse_depth"])
+def test_masked_depth_has_no_part(form) -> None:
+    (level,), (truth,) = depths(16), depths(16, seed=1)
+    masks = torch.ones(1, 2, 16, 32, dtype=torch.bool)
+    masks[..., 8:, :] = False
+    part = depth_loss([level[..., :8, :]], truth[..., :8, :], NEAR, FAR, form=form)
+    masked = depth_loss([level], truth, NEAR, FAR, form=form, masks=masks)
+    assert float(masked) == pytest.approx(float(part))
+    nothing = depth_loss([level], truth, NEAR, FAR, form=form, masks=torch.zeros_like(masks))
+    assert float(nothing) == 0
+
+
+def test_each_view_has_its_own_range() -> None:
+    (level,), (truth,) = depths(16), depths(16, seed=1)
+    far = torch.tensor([[FAR, 0.9]], dtype=torch.float64)  # nothing of the second view is nearer than that
+    near = torch.tensor([[NEAR, NEAR]], dtype=torch.float64)
+    both = depth_loss([level], truth, near, far)
+    first = depth_loss([level[:, :1]], truth[:, :1], NEAR, FAR)
+    assert float(both) == pytest.approx(float(first))
+
+
+def test_depths_are_not_mixed_when_the_truth_is_made_smaller() -> None:
+    """Columns of 2 and 6 metres: a mixture would be 4."""
+    truth = torch.full((1, 1, 16, 32), 2.0, dtype=torch.float64)
+    truth[..., 1::2] = 6.0
+    level = truth[..., ::2, 1::2]
+    assert float(depth_loss([level], truth, NEAR, FAR, form="depth")) == 0
+
+
+def test_a_spherical_depth_loss_counts_rows_by_their_solid_angle() -> None:
+    truth = torch.full((1, 1, 16, 32), 2.0, dtype=torch.float64)
+    level = truth.clone()
+    level[..., 0, :] = 3.0
+    value = depth_loss([level], truth, NEAR, FAR, spherical=True)
+    assert float(value) == pytest.approx(float(row_weights(16)[0] / row_weights(16).sum()))
+
+
+@pytest.mark.parametrize("form", ["depth", "inverse_depth"])
+def test_depth_losses_have_the_gradients_of_finite_differences(form) -> None:
+    levels, (truth,) = depths(2, 4, 8), depths(16, seed=1)
+    truth[..., 3:5, :] = 0
+
+    def loss(*levels: Tensor) -> Tensor:
+        return depth_loss(levels, truth, NEAR, FAR, form=form)
+
+    assert torch.autograd.gradcheck(loss, [level.requires_grad_() for level in levels])
+
+
+# Auxiliary heads
+
+
+def test_the_auxiliary_loss_sums_the_levels_image_losses() -> None:
+    target = torch.full((1, 3, 8, 16), 0.5, dtype=torch.float64)
+    drawn = [target + error for error in (0.4, 0.2, 0.1)]
+    weights = LossWeights(perceptual=0.5)
+    parts = [error**2 + 0.5 * error for error in (0.4, 0.2, 0.1)]
+    value = float(auxiliary_loss(drawn, target, far_off, weights))
+    assert value == pytest.approx(0.9**2 * parts[0] + 0.9 * parts[1] + parts[2])
+
+
+def test_the_auxiliary_loss_reaches_every_level() -> None:
+    _, target = pictures(12)
+    drawn = [pictures(12, seed=seed)[0].requires_grad_() for seed in (1, 2, 3)]
+    auxiliary_loss(drawn, target, Structure()).backward()
+    assert all(picture.grad is not None and bool(picture.grad.any()) for picture in drawn)
