@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -12,7 +13,21 @@ from pansplat.gaussians.gaussians import Gaussians
 from pansplat.render import splats
 from pansplat.render.cpu.memory import Lease
 from pansplat.render.cpu.observe import Camera, Fields, Observed, observe
-from pansplat.render.cpu.records import ALONG, DIRECTION, FIRST, FRONT_A, FRONT_B, LEVEL, REST, SECOND, UNIT
+from pansplat.render.cpu.records import (
+    ALONG,
+    DIRECTION,
+    FIELDS,
+    FIRST,
+    FRONT_A,
+    FRONT_B,
+    LEVEL,
+    REST,
+    SECOND,
+    TILE,
+    UNIT,
+)
+from pansplat.render.cpu.tables import FLAT, Plane, plane_of
+from pansplat.render.panorama import Picture
 
 SPREAD = 0.1 * (math.pi / 64) ** 2
 
@@ -81,3 +96,115 @@ def _decode(records: Tensor) -> dict[str, Tensor]:
 def decode() -> Callable[[Tensor], dict[str, Tensor]]:
     """What records hold, free of the choice of axes."""
     return _decode
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Records drawn at random, every one listed in every tile, and what float64 makes of them densely."""
+
+    records: np.ndarray
+    values: np.ndarray
+    entries: np.ndarray
+    starts: np.ndarray
+    slots: np.ndarray
+    plane: Plane
+    points: Tensor
+    size: tuple[int, int]
+
+    def dense(self, upstream: np.ndarray | None = None) -> tuple[Tensor, ...]:
+        """The sums; with an upstream gradient also the gradients of records and values."""
+        records = torch.from_numpy(self.records).double()
+        records[:, :REST] += records[:, REST:FIRST]
+        records.requires_grad_()
+        values = torch.from_numpy(self.values).double().requires_grad_()
+        through, weights = torch.ones(self.size, dtype=torch.float64), []
+        for n, _, a, b, (front_a, front_b, along, level) in (row.split((3, 3, 3, 3, 4)) for row in records):
+            offset = self.points - n
+            front = 1 + offset @ (n + front_a * a + front_b * b)
+            if self.plane.kind == FLAT:
+                front, along = torch.ones_like(front), 0.0
+            q = (offset @ a).square() + (offset @ b).square()
+            alpha = torch.exp2(level - q / (front.square() + along * q)).clamp_max(0.99)
+            alpha = torch.where((front > 0) & (alpha >= 1 / 255), alpha, 0)
+            weights.append(alpha * through)
+            through = through * (1 - alpha)
+        stacked = torch.stack(weights)
+        ones = torch.cat((values, torch.ones_like(values[:, :1])), dim=1)
+        sums = torch.einsum("nyx,nv->vyx", stacked, ones)
+        if upstream is None:
+            return (sums.detach(),)
+        return sums.detach(), *torch.autograd.grad(sums, (records, values), torch.from_numpy(upstream).double())
+
+    def reduce(self, slots: np.ndarray) -> np.ndarray:
+        """Each Gaussian's slots summed."""
+        return slots.astype(np.float64).reshape(len(self.records), -1, slots.shape[1]).sum(axis=1)
+
+
+def _random_records(
+    kind: str, picture: Picture, count: int, opacity: tuple[float, float], rng: np.random.Generator
+) -> Tensor:
+    """Gaussians of 0.4 to 6 pixels that point into the picture, float64."""
+    height, width = picture.size
+    deviations = np.exp(rng.uniform(math.log(0.4), math.log(6), (count, 2)))
+    turn = rng.uniform(0, math.pi, count)
+    first = np.stack((np.cos(turn), np.sin(turn)), axis=1) / deviations[:, :1]
+    second = np.stack((-np.sin(turn), np.cos(turn)), axis=1) / deviations[:, 1:]
+    records = torch.zeros(count, FIELDS, dtype=torch.float64)
+    records[:, LEVEL] = torch.from_numpy(np.log2(rng.uniform(*opacity, count)))
+    pixels = rng.uniform(-1, 1, (count, 2)) * (width / 2 + 1, height / 2 + 1)
+    if kind == "ewa":
+        records[:, DIRECTION:2] = torch.from_numpy(pixels + np.array((width, height)) / 2)
+        records[:, FIRST : FIRST + 2], records[:, SECOND : SECOND + 2] = map(torch.from_numpy, (first, second))
+        return records
+    if kind == "pinhole":
+        ahead = np.concatenate((pixels / picture.focal, np.ones((count, 1))), axis=1)
+        direction = torch.from_numpy(ahead) @ picture.rotation.T
+    else:
+        direction = torch.from_numpy(rng.standard_normal((count, 3)))
+    direction = direction / direction.norm(dim=1, keepdim=True)
+    right, down = splats.tangent_frame(direction)
+    records[:, DIRECTION:REST] = direction
+    for columns, axis in ((FIRST, first), (SECOND, second)):
+        across = torch.from_numpy(axis) / picture.pixel_angle
+        records[:, columns : columns + 3] = across[:, :1] * right + across[:, 1:] * down
+    records[:, FRONT_A : FRONT_B + 1] = torch.from_numpy(0.05 * rng.standard_normal((count, 2)))
+    records[:, ALONG] = torch.from_numpy(rng.uniform(0, 0.05, count))
+    return records
+
+
+@pytest.fixture
+def make_case(pose: Tensor) -> Callable[..., Case]:
+    """Makes cases: "equirect" or "pinhole" by the exact kernel, "ewa" by the classic one."""
+
+    def make(
+        kind: str,
+        size: tuple[int, int],
+        count: int,
+        *,
+        num_values: int = 4,
+        opacity: tuple[float, float] = (0.05, 0.95),
+    ) -> Case:
+        rng = np.random.default_rng(3)
+        picture = Picture(size, pose[:3, :3], 0.0 if kind == "equirect" else 0.6 * max(size))
+        precise = _random_records(kind, picture, count, opacity, rng)
+        records = precise.float()
+        records[:, REST:FIRST] = (precise[:, :REST] - records[:, :REST].double()).float()
+        plane = plane_of(picture, exact=kind != "ewa")
+        tiles = plane.tiles[0] * plane.tiles[1]
+        whole = (TILE - 1) << 8 | (TILE - 1) << 24
+        entries = np.empty((tiles * count, 2), np.int32)
+        entries[:, 0], entries[:, 1] = np.tile(np.arange(count), tiles), whole
+        slots = np.tile(np.arange(count) * tiles, tiles) + np.repeat(np.arange(tiles), count)
+        points = picture.coordinates() if kind == "ewa" else picture.directions()
+        return Case(
+            records.numpy(),
+            rng.uniform(-0.5, 1.5, (count, num_values)).astype(np.float32),
+            entries,
+            np.arange(0, tiles * count + 1, count) if count else np.zeros(tiles + 1, np.int64),
+            slots,
+            plane,
+            torch.nn.functional.pad(points, (0, 3 - points.shape[-1])),
+            size,
+        )
+
+    return make
