@@ -78,7 +78,8 @@ class NetworkPredictor:
     @functools.cached_property
     def fingerprint(self) -> str:
         """Hash of weights, settings and the code that uses them, so that a kept prediction is never stale."""
-        settings = (self.network.config, self.network.compat, getattr(self.network, "precision", None), self.tiles)
+        precisions = [getattr(self.network, name, None) for name in ("precision", "attention_precision")]
+        settings = (self.network.config, self.network.compat, *precisions, self.tiles)
         digest = hashlib.blake2b(repr(settings).encode(), digest_size=8)
         for name, tensor in sorted(self.network.state_dict().items()):
             digest.update(name.encode())
@@ -136,7 +137,6 @@ class NetworkPredictor:
         gaussians, depths = self._predict(images, cam2world, near, far, masks, progress)
         return gaussians, [depth[0].to(images.device) for depth in depths.depth]
 
-    @torch.no_grad()
     def stream(
         self,
         images: Float[Tensor, "view 3 height width"],
@@ -152,10 +152,17 @@ class NetworkPredictor:
         Raises:
             InputError: as a call does, when the first tile is asked for.
         """
-        matched, tiles = self._match(images, cam2world, near, far, masks, progress)
-        for part in self._lift(matched, tiles, progress):
-            gaussians = part.gaussians[0].to(device=images.device)
-            yield gaussians if masks is None else unmasked(gaussians, cam2world, masks)
+        with torch.no_grad():
+            matched, tiles = self._match(images, cam2world, near, far, masks, progress)
+        parts = self._lift(matched, tiles, progress)
+        while True:
+            with torch.no_grad():  # left before each yield, so that it does not reach the caller
+                part = next(parts, None)
+                if part is None:
+                    return
+                gaussians = part.gaussians[0].to(device=images.device)
+                gaussians = gaussians if masks is None else unmasked(gaussians, cam2world, masks)
+            yield gaussians
 
     @torch.no_grad()
     def _predict(

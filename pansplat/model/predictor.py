@@ -19,11 +19,14 @@ class Predictor(Protocol):
 
     Attributes:
         name: as users type it.
-        fingerprint: changes whenever the output for the same input could; keys the prediction cache.
     """
 
     name: str
-    fingerprint: str
+
+    @property
+    def fingerprint(self) -> str:
+        """Changes whenever the output for the same input could; keys the prediction cache."""
+        ...
 
     def __call__(
         self,
