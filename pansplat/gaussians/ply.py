@@ -19,6 +19,8 @@ from typing import BinaryIO
 
 import numpy as np
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from pansplat.atomic import replacing
 from pansplat.errors import InputError
@@ -51,12 +53,24 @@ def save_ply(scene: Scene, path: str | Path) -> None:
     """
     path = Path(path)
     gaussians = _ordered(_finite(scene.gaussians, path))
-    names = _property_names(gaussians.harmonics.shape[1])
-    lines = ["ply", "format binary_little_endian 1.0", f"comment {_MARK}{_extras(scene, gaussians)}"]
-    lines += [f"element vertex {len(gaussians)}", *(f"property float {name}" for name in names), "end_header"]
     with replacing(path) as partial, open(partial, "wb") as file:
-        file.write(("\n".join(lines) + "\n").encode("ascii"))
-        _columns(gaussians).tofile(file)
+        file.write(header(scene, runs_of(gaussians), gaussians.harmonics.shape[1]))
+        table(gaussians).tofile(file)
+
+
+def header(scene: Scene, runs: list[list[int]], coefficients: int, *, size: int = 0) -> bytes:
+    """All before the first vertex; the gaussians of `scene` are not looked at.
+
+    Args:
+        runs: stretches of one level and view in the file, see `runs_of`.
+        coefficients: of the harmonics, 1 to 25.
+        size: bytes to take at least; spaces after the comment make up what is missing.
+    """
+    begin = f"ply\nformat binary_little_endian 1.0\ncomment {_MARK}{_extras(scene, runs)}"
+    lines = [f"element vertex {sum(count for _, _, count in runs)}"]
+    lines += [*(f"property float {name}" for name in _property_names(coefficients)), "end_header\n"]
+    end = "\n" + "\n".join(lines)
+    return (begin + " " * (size - len(begin) - len(end)) + end).encode("ascii")
 
 
 def load_ply(path: str | Path) -> Scene:
@@ -93,11 +107,7 @@ def load_ply(path: str | Path) -> Scene:
 
 
 def _finite(gaussians: Gaussians, path: Path) -> Gaussians:
-    finite = torch.isfinite(gaussians.opacities)
-    for field in (gaussians.means, gaussians.scales, gaussians.quats, gaussians.harmonics.flatten(1)):
-        # A sum is finite only if its terms are; the rare sum that overflows is looked at term by term.
-        suspect = ~torch.isfinite(field.sum(dim=1))
-        finite[suspect] &= torch.isfinite(field[suspect]).all(dim=1)
+    finite = is_finite(gaussians)
     lost = len(gaussians) - int(finite.sum())
     if not lost:
         return gaussians
@@ -105,14 +115,24 @@ def _finite(gaussians: Gaussians, path: Path) -> Gaussians:
     return gaussians.select(finite)
 
 
+def is_finite(gaussians: Gaussians) -> Bool[Tensor, "n"]:
+    """Which Gaussians have no number that is NaN or infinite."""
+    finite = torch.isfinite(gaussians.opacities)
+    for field in (gaussians.means, gaussians.scales, gaussians.quats, gaussians.harmonics.flatten(1)):
+        # A sum is finite only if its terms are; the rare sum that overflows is looked at term by term.
+        suspect = ~torch.isfinite(field.sum(dim=1))
+        finite[suspect] &= torch.isfinite(field[suspect]).all(dim=1)
+    return finite
+
+
 def _ordered(gaussians: Gaussians) -> Gaussians:
-    if len(_runs(gaussians)) <= _MAX_RUNS:
+    if len(runs_of(gaussians)) <= _MAX_RUNS:
         return gaussians
     key = gaussians.levels.long() * (int(gaussians.views.max()) + 1) + gaussians.views.long()
     return gaussians.select(torch.sort(key, stable=True).indices)
 
 
-def _runs(gaussians: Gaussians) -> list[list[int]]:
+def runs_of(gaussians: Gaussians) -> list[list[int]]:
     """Stretches of one level and view: [level, view, count], in file order."""
     levels, views = gaussians.levels.long().cpu(), gaussians.views.long().cpu()
     if not len(gaussians):
@@ -123,7 +143,7 @@ def _runs(gaussians: Gaussians) -> list[list[int]]:
     return torch.stack((levels[starts], views[starts], counts), dim=1).tolist()
 
 
-def _extras(scene: Scene, gaussians: Gaussians) -> str:
+def _extras(scene: Scene, runs: list[list[int]]) -> str:
     extras = {
         "version": 1,
         "model": scene.model,
@@ -132,7 +152,7 @@ def _extras(scene: Scene, gaussians: Gaussians) -> str:
         "far": scene.far,
         "names": list(scene.names),
         "cam2world": scene.cam2world.double().cpu().tolist(),
-        "runs": _runs(gaussians),
+        "runs": runs,
     }
     return json.dumps(extras, separators=(",", ":"))
 
@@ -145,7 +165,7 @@ def _property_names(coefficients: int) -> list[str]:
     ]
 
 
-def _columns(gaussians: Gaussians) -> np.ndarray:
+def table(gaussians: Gaussians) -> np.ndarray:
     """All vertices in the file's order of properties, little-endian float32."""
     g = gaussians.to(device="cpu")
     rest = g.harmonics[:, 1:].transpose(1, 2).flatten(1)
@@ -154,12 +174,12 @@ def _columns(gaussians: Gaussians) -> np.ndarray:
     log_scales = g.scales.clamp_min(SCALE_EPSILON).log()
     normals = torch.zeros(len(g), 3)
     parts = (g.means, normals, g.harmonics[:, 0], rest, logits, log_scales, g.quats)
-    table = np.empty((len(g), sum(part.shape[1] for part in parts)), "<f4")
+    columns = np.empty((len(g), sum(part.shape[1] for part in parts)), "<f4")
     start = 0
     for part in parts:
-        table[:, start : start + part.shape[1]] = part.detach().numpy()
+        columns[:, start : start + part.shape[1]] = part.detach().numpy()
         start += part.shape[1]
-    return table
+    return columns
 
 
 @dataclass(frozen=True)
