@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -17,6 +17,7 @@ from pansplat.data.samplers import Draw
 from pansplat.data.views import Views
 
 
+@runtime_checkable
 class FrameSequence(Protocol):
     """A sequence of posed panoramas; `poses` are cam2world in OpenCV axes, metres."""
 
