@@ -27,8 +27,8 @@ from pansplat.render.backend import Options
 
 Watch = Callable[[str, "list[Row]"], None]
 
-_SLOW = 1.0  # seconds; a first drawing that takes longer counts as a measurement
-_MOST = 15  # repeats
+_SLOW = 5.0  # seconds; a first drawing that takes longer counts as the measurement
+_LEAST, _MOST = 3, 15  # repeats of the others
 
 
 @dataclass(eq=False)
@@ -181,7 +181,8 @@ class Bench:
             times.append(took)
             if took > _SLOW:
                 lane.backward.append(took)
-        lane.wanted = max(1, min(_MOST, int(self._budget / sum(times))))
+        slow = case.precision == "float64" or max(times) > _SLOW
+        lane.wanted = 1 if slow else min(_MOST, max(_LEAST, int(self._budget / sum(times))))
         lane.write_times()
         return picture
 
