@@ -97,11 +97,42 @@ class Render:
 
 
 @dataclass(frozen=True)
+class LpipsChoice:
+    """Whether to measure LPIPS, and with which weights."""
+
+    lpips: Literal["auto", "vgg", "alex", "squeeze", "none"] = "auto"
+    """Classifier that LPIPS asks; the paper's figures are vgg's. auto takes the first whose files are here, if any."""
+    lpips_weights: Path | None = None
+    """Folder of its weights; else that of the environment variable PANSPLAT_LPIPS, or the torch.hub cache."""
+
+
+@dataclass(frozen=True)
+class ProtocolChoice:
+    """The paper's evaluations, instead of folders of pairs."""
+
+    protocol: (
+        Literal["m3d", "narrow", "replica", "residential", "360loc", "insta360", "ablation", "frame-distance"] | None
+    ) = None
+    """One table (or figure) of the paper, on whatever of its data is in --data; what is missing is named."""
+    data: Path | None = None
+    """Folder that holds the data sets, for --protocol: png_render_test_* or pano_grf/, 360Loc/, insta360/."""
+    models: tuple[str, ...] = ()
+    """More predictors that get rows in the table, for --protocol: `sweep`, or files of weights."""
+    limit: int | None = None
+    """At most this many cases of each test set, evenly spread; by default all, as in the paper."""
+    pictures: int = 8
+    """Of how many cases of each test set pictures are written."""
+
+
+@dataclass(frozen=True)
 class Evaluate:
-    """Compare predictions with the real panoramas between the inputs, and with the cross-fade baseline."""
+    """Compare predictions with the real panoramas between the inputs, and with the cross-fade baseline.
+
+    With --protocol: make a table of the paper, its rows and ours.
+    """
 
     paths: Positional[tuple[Path, ...]]
-    """Folders of pairs; those without target views are passed over."""
+    """Folders of pairs; those without target views are passed over. None with --protocol."""
     out: Out
     """Folder for results.json and, for each case, prediction.png, target.png and error.png."""
     model: str = "sweep"
@@ -110,16 +141,22 @@ class Evaluate:
     """For a network: official, fixed, or as its weights were trained; `pansplat predict --help` has more."""
     height: int = 512
     """Panoramas are resized to this height, pixels."""
-    blend: str = "deferred"
-    """deferred, joint, or view0, view1, ..."""
+    blend: str | None = None
+    """deferred, joint, or view0, view1, ...; by default deferred, with --protocol what the paper's table shows."""
     convention: str | None = None
     """Pose convention, where a folder does not tell."""
     near: float | None = None
     """Nearest depth to search, metres."""
     far: float | None = None
     """Farthest depth to search, metres."""
+    lpips: LpipsChoice = field(default_factory=LpipsChoice)
+    protocol: ProtocolChoice = field(default_factory=ProtocolChoice)
 
     def run(self) -> int:
+        if self.protocol.protocol is not None:
+            from pansplat.cli.protocols import run_evaluate_protocol
+
+            return run_evaluate_protocol(self)
         from pansplat.cli.reports import run_evaluate
 
         return run_evaluate(self)

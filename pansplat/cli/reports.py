@@ -24,12 +24,14 @@ _BARS = " ▁▂▃▄▅▆▇█"
 
 def run_evaluate(command: Evaluate) -> int:
     """Evaluate all pairs with targets in the folders and print the table."""
+    from pansplat.cli.protocols import choose_lpips
     from pansplat.evaluation.report import evaluate, results_table
 
     require_height(command.height)
     if not command.paths:
-        raise InputError("`pansplat evaluate` needs at least one folder of pairs")
-    blend = blend_mode(command.blend)
+        raise InputError("`pansplat evaluate` needs at least one folder of pairs, or --protocol")
+    blend = blend_mode(command.blend or "deferred")
+    lpips = choose_lpips(command.lpips, command.height)
     pairs = []
     for path in command.paths:
         found = pipeline.load_pairs(path, convention=command.convention, near=command.near, far=command.far)
@@ -42,8 +44,12 @@ def run_evaluate(command: Evaluate) -> int:
         pairs += with_targets
     predictor = pipeline.load_model(command.model, compat=command.compat)
     with progress_bar() as progress:
-        cases = evaluate(pairs, predictor, command.out, height=command.height, blend=blend, progress=progress)
+        cases = evaluate(
+            pairs, predictor, command.out, height=command.height, blend=blend, lpips=lpips, progress=progress
+        )
     _console().print(results_table(cases))
+    if lpips is not None:
+        print(f"LPIPS is {lpips.name}")
     print(f"{command.out / 'results.json'} and the pictures beside it")
     return 0
 

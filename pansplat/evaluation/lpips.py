@@ -90,6 +90,13 @@ class Lpips(nn.Module):
             total = total + _mean(torch.einsum("bchw,c->bhw", apart, head), weights)
         return total
 
+    @torch.no_grad()
+    def of_pictures(
+        self, prediction: Float[Tensor, "3 height width"], target: Float[Tensor, "3 height width"]
+    ) -> float:
+        """The distance of two single pictures, as a figure."""
+        return float(self(prediction[None], target[None]))
+
     def _activations(self, images: Tensor) -> list[Tensor]:
         mean, deviation = (images.new_tensor(values)[:, None, None] for values in (_MEAN, _DEVIATION))
         maps = (2 * images - 1 - mean) / deviation

@@ -10,7 +10,7 @@ import json
 import math
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from pansplat.data.images import write_image
 from pansplat.data.pairs import Pair
 from pansplat.errors import InputError
 from pansplat.evaluation.cross_fade import cross_fade
+from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
 from pansplat.model.predictor import Predictor, Progress
 
@@ -38,6 +39,7 @@ class Case:
 
     Attributes:
         masked_ws_psnr: WS-PSNR of what the target's mask leaves, when it has one; only in the printed table.
+        lpips: None where it was not measured.
     """
 
     name: str
@@ -53,11 +55,14 @@ class Case:
     prediction: Path
     target: Path
     masked_ws_psnr: float | None = field(default=None, compare=False)
+    lpips: float | None = field(default=None, compare=False)
 
     def as_json(self) -> dict[str, object]:
         """What results.json says of the case; numbers that are not finite become null."""
         values = dataclasses.asdict(self)
         del values["masked_ws_psnr"]
+        if self.lpips is None:
+            del values["lpips"]
         finite = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
         return {key: str(value) if isinstance(value, Path) else value for key, value in finite.items()}
 
@@ -69,6 +74,7 @@ def evaluate(
     *,
     height: int = 512,
     blend: str | int = "deferred",
+    lpips: Lpips | None = None,
     progress: Progress | None = None,
 ) -> list[Case]:
     """Evaluate every target of the pairs and write results.json and the pictures into `out`.
@@ -92,7 +98,7 @@ def evaluate(
                 progress(f"{pair.name}: {what}", (index + fraction) / len(with_targets))
 
         taken = {case.prediction.parent.name for case in cases}
-        cases += _evaluate_pair(pair, predictor, out, taken, height, blend, report)
+        cases += _evaluate_pair(pair, predictor, out, taken, height, blend, lpips, report)
         write_results(cases, out / "results.json")
     return cases
 
@@ -112,6 +118,7 @@ def _evaluate_pair(
     taken: set[str],
     height: int,
     blend: str | int,
+    lpips: Lpips | None,
     progress: Progress,
 ) -> Iterator[Case]:
     context, targets = pair.load_context(height), pair.load_targets(height)
@@ -146,6 +153,7 @@ def _evaluate_pair(
             prediction=(folder / "prediction.png").resolve(),
             target=(folder / "target.png").resolve(),
             masked_ws_psnr=None if bool(mask.all()) else ws_psnr(picture, target, mask=mask),
+            lpips=None if lpips is None else lpips.of_pictures(picture, target),
         )
 
 
@@ -169,38 +177,37 @@ def write_results(cases: Sequence[Case], path: Path) -> None:
 
 def results_table(cases: Sequence[Case]) -> Table:
     """A table of the cases with their mean, to print."""
-    masked = any(case.masked_ws_psnr is not None for case in cases)
+    columns = _columns(cases)
     table = Table(title=f"{cases[0].model}, {cases[0].height}x{2 * cases[0].height}" if cases else None)
     table.add_column("case")
-    heads = [
-        "WS-PSNR",
-        *(["masked"] if masked else []),
-        "PSNR",
-        "SSIM",
-        "cross-fade",
-        "predict s",
-        "render s",
-    ]
-    for head in [*heads, "Gaussians"]:
+    for head in columns:
         table.add_column(head, justify="right")
-    rows = [_figures(case, masked) for case in cases]
+    rows = [[figure(case) for figure, _ in columns.values()] for case in cases]
+    formats = [how for _, how in columns.values()]
     for case, row in zip(cases, rows, strict=True):
-        table.add_row(case.name, *_formatted(row, masked))
+        table.add_row(case.name, *map(format, row, formats))
     if len(rows) > 1:
         table.add_section()
-        table.add_row("mean", *_formatted([sum(column) / len(rows) for column in zip(*rows, strict=True)], masked))
+        means = [sum(column) / len(rows) for column in zip(*rows, strict=True)]
+        table.add_row("mean", *map(format, means, formats))
     return table
 
 
-def _figures(case: Case, masked: bool) -> list[float]:
-    whole = case.ws_psnr if case.masked_ws_psnr is None else case.masked_ws_psnr
-    figures = [case.ws_psnr, *([whole] if masked else []), case.psnr, case.ssim, case.cross_fade_ws_psnr]
-    return [*figures, case.predict_seconds, case.render_seconds, case.num_gaussians]
-
-
-def _formatted(figures: Sequence[float], masked: bool) -> list[str]:
-    formats = [".2f", *([".2f"] if masked else []), ".2f", ".4f", ".2f", ".1f", ".1f", ",.0f"]
-    return [format(value, how) for value, how in zip(figures, formats, strict=True)]
+def _columns(cases: Sequence[Case]) -> dict[str, tuple[Callable[[Case], float], str]]:
+    """By head, a column's figure of a case and how it is written; columns that no case has are left out."""
+    columns: dict[str, tuple[Callable[[Case], float], str]] = {"WS-PSNR": (lambda case: case.ws_psnr, ".2f")}
+    if any(case.masked_ws_psnr is not None for case in cases):
+        columns["masked"] = (lambda case: case.ws_psnr if case.masked_ws_psnr is None else case.masked_ws_psnr, ".2f")
+    columns["PSNR"] = (lambda case: case.psnr, ".2f")
+    columns["SSIM"] = (lambda case: case.ssim, ".4f")
+    if any(case.lpips is not None for case in cases):
+        columns["LPIPS"] = (lambda case: math.nan if case.lpips is None else case.lpips, ".4f")
+    return columns | {
+        "cross-fade": (lambda case: case.cross_fade_ws_psnr, ".2f"),
+        "predict s": (lambda case: case.predict_seconds, ".1f"),
+        "render s": (lambda case: case.render_seconds, ".1f"),
+        "Gaussians": (lambda case: case.num_gaussians, ",.0f"),
+    }
 
 
 def _make_folder(folder: Path) -> None:

@@ -8,7 +8,7 @@ are on another scale (0 for equal pictures, around 0.3 for unrelated ones).
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -28,6 +28,7 @@ _C1, _C2 = 0.01**2, 0.03**2  # for pictures in [0, 1]
 _BACKBONES: dict[str, Backbone] = {"lpips-vgg": "vgg", "lpips-alex": "alex", "lpips-squeeze": "squeeze"}
 
 
+@runtime_checkable
 class Perceptual(Protocol):
     """Distances of pairs of pictures, 0 for equal ones; differentiable.
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pansplat.data.pairs import load_pairs
 from pansplat.errors import InputError
+from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
 from pansplat.evaluation.report import ERROR_SCALE, error_picture, evaluate, results_table
 from pansplat.gaussians.gaussians import Gaussians
@@ -138,6 +139,17 @@ def test_a_masked_target_gets_a_second_figure_in_the_table_only(tmp_path: Path) 
     assert case.ws_psnr == pytest.approx(ws_psnr(prediction, target), abs=0.01)
     assert list(json.loads((tmp_path / "out" / "results.json").read_text())[0]) == KEYS
     assert "masked" in [str(column.header) for column in results_table([case]).columns]
+
+
+def test_lpips_is_measured_where_it_is_given(tmp_path: Path) -> None:
+    pairs, metric = load_pairs(write_triplet(tmp_path / "room")), Lpips("squeeze")
+    for head in metric.heads:
+        head.data.fill_(0.1)
+    (case,) = evaluate(pairs, GreyBall(), tmp_path / "out", height=32, lpips=metric)
+    (result,) = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert set(result) == {*KEYS, "lpips"} and result["lpips"] == case.lpips
+    assert case.lpips == pytest.approx(metric.of_pictures(read(case.prediction), read(case.target)), abs=1e-3)
+    assert "LPIPS" in [str(column.header) for column in results_table([case]).columns]
 
 
 def test_the_table_ends_with_the_mean(tmp_path: Path) -> None:

@@ -1,0 +1,325 @@
+"""The paper's evaluations on whatever of their data is here: the sets, the figures, what is said of what is missing."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from pansplat.errors import InputError
+from pansplat.evaluation.data_sets import INSTA360, LOC360, sequence_set, sequences_of
+from pansplat.evaluation.frame_distance import curves
+from pansplat.evaluation.lpips import Lpips
+from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
+from pansplat.evaluation.protocol import ProtocolOptions, SetResult, methods_of, run_protocol, sets_of
+from pansplat.evaluation.protocol_report import layouts_of, notes, our_rows, rich_tables, write_report
+from pansplat.evaluation.score import Score
+from pansplat.evaluation.tables import LAYOUTS
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.geometry.equirect import pixel_directions
+from pansplat.model.network import NetworkPredictor
+
+HEIGHT = 32
+OPTIONS = ProtocolOptions(HEIGHT, draws=3, gaps=(2, 4))
+RADIUS = 2.0  # metres
+
+
+class Sphere:
+    """One Gaussian a pixel on a sphere round each camera; counts its calls."""
+
+    name, fingerprint = "sphere", "1"
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None, progress=None):
+        self.calls += 1
+        view, _, height, width = images.shape
+        directions = pixel_directions(height, width, dtype=torch.float64).reshape(-1, 3)
+        count = view * len(directions)
+        return Gaussians(
+            means=torch.cat([RADIUS * directions @ p[:3, :3].T + p[:3, 3] for p in cam2world]).float(),
+            scales=torch.full((count, 3), 0.1),
+            quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+            opacities=torch.full((count,), 0.95),
+            harmonics=((images.flatten(2).transpose(1, 2).reshape(-1, 1, 3) - 0.5) / 0.28209479).contiguous(),
+            levels=torch.zeros(count, dtype=torch.int64),
+            views=torch.arange(view).repeat_interleave(len(directions)),
+        )
+
+
+class Network(NetworkPredictor):
+    """The sphere as a network that also tells depths, coarse to fine; only the finest is right."""
+
+    name, fingerprint = "network", "1"
+
+    def __init__(self) -> None:
+        pass
+
+    def predict_with_depths(self, images, cam2world, near, far, *, masks=None, progress=None):
+        depths = [torch.full((len(images), rows, 2 * rows), metres) for rows, metres in ((4, 9.0), (8, RADIUS))]
+        return Sphere()(images, cam2world, near, far), depths
+
+
+def write_picture(path: Path, seed: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    blocks = np.random.default_rng(seed).integers(0, 255, (HEIGHT // 4, HEIGHT // 2, 3), dtype=np.uint8)
+    Image.fromarray(blocks.repeat(4, 0).repeat(4, 1)).save(path)
+
+
+def write_triplets(root: Path, kind: str, *, scenes: int = 2, depth_metres: float | None = None) -> Path:
+    """PanoGRF's layout: `scenes` triplets half a metre apart."""
+    folder = root / f"png_render_test_1024x512_seq_len_3_{kind}"
+    for scene in range(scenes):
+        for view in range(3):
+            place = folder / f"{scene:08d}" / f"{view:02d}"
+            write_picture(place / "rgb.png", 10 * scene + view)
+            np.savetxt(place / "rot.txt", np.eye(3))
+            np.savetxt(place / "tran.txt", [0.5 * view, 0, 0])
+            if depth_metres is not None:
+                millimetres = np.full((HEIGHT, 2 * HEIGHT), round(1000 * depth_metres), np.uint16)
+                Image.fromarray(millimetres).save(place / "depth.png")
+    return folder
+
+
+def write_loc360(root: Path, frames: int = 7) -> Path:
+    folder = root / "atrium" / "mapping" / "daytime_360_0"
+    poses = {}
+    for frame in range(frames):
+        write_picture(folder / "image" / f"{frame:04d}.png", frame)
+        pose = np.eye(4)
+        pose[0, 3] = 0.2 * frame
+        poses[f"{frame:04d}.png"] = pose.tolist()
+    (folder / "camera_pose.json").write_text(json.dumps(poses))
+    return folder
+
+
+def methods(protocol: str = "m3d", predictor: Sphere | None = None):
+    return methods_of(predictor or Sphere(), protocol)
+
+
+# The sets
+
+
+def test_a_protocols_sets_are_the_columns_of_its_table(tmp_path: Path) -> None:
+    for protocol, layout in LAYOUTS.items():
+        sets = sets_of(protocol, tmp_path, OPTIONS)
+        assert tuple(found.name for found in sets) == layout.sets
+
+
+def test_missing_data_is_named_by_its_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as error:
+        run_protocol("m3d", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
+    for distance in ("0.5", "0.75", "1.0"):
+        folder = f"png_render_test_1024x512_seq_len_3_m3d_dist_{distance}"
+        assert str(tmp_path / "pano_grf" / folder) in str(error.value)
+    for protocol, folder in (("360loc", "atrium"), ("insta360", "VID_*"), ("frame-distance", "VID_*")):
+        with pytest.raises(InputError) as error:
+            run_protocol(protocol, tmp_path, methods(), tmp_path / "out", options=OPTIONS)
+        assert folder in str(error.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_root_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="needed the folder that holds the test data"):
+        sets_of("m3d", tmp_path / "nowhere", OPTIONS)
+
+
+@pytest.mark.parametrize("inside", [".", "pano_grf", "datasets/pano_grf"])
+def test_data_is_found_where_the_original_code_keeps_it(tmp_path: Path, inside: str) -> None:
+    write_triplets(tmp_path / inside, "residential_dist_0.15", scenes=1)
+    (found,) = sets_of("residential", tmp_path, OPTIONS)
+    assert [case.name for case in found.cases] == ["00000000"]
+
+
+def test_a_taller_panorama_reads_its_own_folder(tmp_path: Path) -> None:
+    write_triplets(tmp_path, "replica_dist_0.5", scenes=1)
+    (found,) = sets_of("replica", tmp_path, ProtocolOptions(height=1024))
+    assert not found.cases and "png_render_test_2048x1024_seq_len_3_replica_dist_0.5" in found.missing
+
+
+def test_a_sequence_gives_even_pairs_with_all_frames_between_and_at_them(tmp_path: Path) -> None:
+    """OFFICIAL.md 2.5: 360Loc's inputs are three frames apart."""
+    write_loc360(tmp_path, frames=7)
+    found = sequence_set(tmp_path, LOC360, draws=3)
+    names = [case.name[-13:] for case in found.cases]
+    assert names == ["000000-000003", "000001-000004", "000003-000006"]
+    sample = found.cases[1].read(HEIGHT)
+    assert sample.context.names == ("0001", "0004")
+    assert sample.targets.names == ("0001", "0002", "0003", "0004")
+
+
+def test_the_frame_distance_takes_the_frame_in_the_middle(tmp_path: Path) -> None:
+    write_loc360(tmp_path, frames=7)
+    by_gap = sets_of("frame-distance", tmp_path, OPTIONS)
+    assert [found.name for found in by_gap] == ["2 frames", "4 frames"]
+    sample = by_gap[1].cases[0].read(HEIGHT)
+    assert sample.context.names == ("0000", "0004") and sample.targets.names == ("0002",)
+    sequences, missing = sequences_of(tmp_path, INSTA360)
+    assert not sequences and "VID_*" in missing
+
+
+# Rows
+
+
+def test_real_scenes_are_drawn_jointly_and_blended_rendered_ones_jointly() -> None:
+    network = Network()
+    assert [m.blend for m in methods_of(network, "m3d")] == ["joint"]
+    assert [m.blend for m in methods_of(network, "360loc")] == ["joint", "deferred"]
+    assert [m.blend for m in methods_of(network, "360loc", "deferred")] == ["deferred"]
+    assert [m.blend for m in methods_of(Sphere(), "m3d")] == ["deferred"]
+    assert methods_of(network, "insta360", name="mine")[1].name == "ours, mine + deferred blending"
+
+
+# Figures
+
+
+def test_figures_are_those_of_the_written_pictures(tmp_path: Path) -> None:
+    write_triplets(tmp_path, "replica_dist_0.5", scenes=1)
+    result = run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
+    folder = tmp_path / "out" / "replica_1.0_m" / "00000000"
+    pictures = sorted(path.name for path in folder.iterdir())
+    ours = "01_ours_sphere_deferred_blending"
+    assert pictures == [f"{ours}.png", f"{ours}_error.png", "01_target.png"]
+    drawn, target = (
+        torch.from_numpy(np.array(Image.open(folder / name)) / np.float32(255)).permute(2, 0, 1)
+        for name in (pictures[0], "01_target.png")
+    )
+    (score,) = result.sets[0].scores
+    assert score.psnr == pytest.approx(psnr(drawn, target), abs=0.02)  # 8 bits
+    assert score.ws_psnr == pytest.approx(ws_psnr(drawn, target), abs=0.02)
+    assert score.ssim == pytest.approx(ssim(drawn, target), abs=2e-3)
+    assert score.lpips is None and (score.case, score.target) == ("00000000", "01")
+
+
+def test_a_set_is_the_plain_mean_of_its_images(tmp_path: Path) -> None:
+    write_loc360(tmp_path)
+    result = run_protocol("360loc", tmp_path, methods("360loc"), tmp_path / "out", options=OPTIONS)
+    (row,) = result.sets
+    assert len(row.scores) == 3 * 4
+    assert row.mean("ws_psnr") == pytest.approx(sum(score.ws_psnr for score in row.scores) / 12)
+    stored = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert stored["results"][0]["ws_psnr"] == pytest.approx(row.mean("ws_psnr"))
+    assert stored["results"][0]["images"] == 12 and stored["protocol"] == "360loc"
+
+
+def test_methods_of_one_predictor_share_its_prediction(tmp_path: Path) -> None:
+    write_loc360(tmp_path)
+    predictor = Sphere()
+    both = [*methods_of(predictor, "360loc", "joint"), *methods_of(predictor, "360loc", "deferred")]
+    result = run_protocol("360loc", tmp_path, both, tmp_path / "out", options=OPTIONS)
+    assert predictor.calls == 3
+    joint, deferred = result.sets
+    assert joint.scores != deferred.scores
+
+
+def test_the_true_depth_has_no_error(tmp_path: Path) -> None:
+    """The Gaussians lie on a sphere about each input: what is drawn there is its radius."""
+    write_triplets(tmp_path, "m3d_dist_0.5", scenes=1, depth_metres=RADIUS)
+    write_triplets(tmp_path, "m3d_dist_1.0", scenes=1, depth_metres=RADIUS)
+    result = run_protocol("m3d", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
+    near, far = result.sets
+    assert near.mean("abs_rel") == pytest.approx(0, abs=0.01) and near.mean("rmse") == pytest.approx(0, abs=0.02)
+    assert far.mean("abs_rel") is None  # the paper's code measures depth at 1.0 m only
+    assert len(rich_tables(result)) == 2
+
+
+def test_a_networks_own_finest_depth_is_measured(tmp_path: Path) -> None:
+    write_triplets(tmp_path, "m3d_dist_0.5", scenes=1, depth_metres=RADIUS)
+    result = run_protocol("m3d", tmp_path, methods_of(Network(), "m3d"), tmp_path / "out", options=OPTIONS)
+    assert result.sets[0].mean("rmse") == pytest.approx(0, abs=1e-6)
+
+
+def test_lpips_is_measured_where_it_is_given(tmp_path: Path) -> None:
+    write_triplets(tmp_path, "replica_dist_0.5", scenes=1)
+    metric = Lpips("squeeze")
+    for index, head in enumerate(metric.heads):
+        head.data.fill_(0.1 * (index + 1))
+    result = run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=OPTIONS, lpips=metric)
+    value = result.sets[0].mean("lpips")
+    assert value is not None and value > 0 and result.lpips == "lpips-squeeze"
+    assert any("do not compare" in note for note in notes(result))
+
+
+# What is left out is said
+
+
+def test_unreadable_cases_are_left_out_and_named(tmp_path: Path) -> None:
+    folder = write_triplets(tmp_path, "replica_dist_0.5", scenes=2)
+    (folder / "00000001" / "02" / "tran.txt").unlink()
+    result = run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
+    assert len(result.sets[0].scores) == 1
+    (line,) = result.skipped
+    assert line.startswith("Replica 1.0 m, 00000001: ") and "tran.txt" in line
+    assert any(line in note for note in notes(result))
+    assert json.loads((tmp_path / "out" / "results.json").read_text())["skipped"] == [line]
+
+
+def test_nothing_readable_is_an_error(tmp_path: Path) -> None:
+    folder = write_triplets(tmp_path, "replica_dist_0.5", scenes=1)
+    (folder / "00000000" / "02" / "tran.txt").unlink()
+    with pytest.raises(InputError, match=r"none of the 1 cases can be used.*tran\.txt"):
+        run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
+
+
+def test_a_limit_spreads_over_the_set_and_pictures_have_their_own(tmp_path: Path) -> None:
+    write_triplets(tmp_path, "replica_dist_0.5", scenes=5)
+    options = ProtocolOptions(HEIGHT, limit=3, pictures=1)
+    result = run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=options)
+    assert [score.case for score in result.sets[0].scores] == ["00000000", "00000002", "00000004"]
+    assert [path.name for path in (tmp_path / "out" / "replica_1.0_m").iterdir()] == ["00000000"]
+
+
+def test_the_page_has_the_papers_rows_ours_and_what_is_missing(tmp_path: Path) -> None:
+    write_triplets(tmp_path, "m3d_dist_0.5", scenes=1)
+    result = run_protocol("m3d", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
+    (path,) = write_report(result, tmp_path / "out")
+    page = path.read_text()
+    assert "| PanoGRF | 27.12 |" in page and "**ours, sphere + deferred blending**" in page
+    assert f"**{result.sets[0].mean('ws_psnr'):.2f}**" in page
+    assert "m3d_dist_0.75" in page and "m3d_dist_1.0" in page and "M3D 1.0 m: 1 image" in page
+    assert f"{HEIGHT}x{2 * HEIGHT}" in page
+
+
+def test_figures_that_are_not_finite_become_null(tmp_path: Path) -> None:
+    row = SetResult("Replica 1.0 m", "ours", [Score("a", "b", math.inf, math.inf, 1.0, None)])
+    result = run_one_row(tmp_path, row)
+    assert json.loads(json.dumps(result, allow_nan=False))["results"][0]["ws_psnr"] is None
+
+
+def run_one_row(folder: Path, row: SetResult) -> dict[str, object]:
+    from pansplat.evaluation.protocol import ProtocolResult
+
+    return ProtocolResult("replica", 512, None, [row]).as_json()
+
+
+# The figure
+
+
+def test_the_figure_has_a_line_a_method_over_the_frame_distance(tmp_path: Path) -> None:
+    write_loc360(tmp_path, frames=7)
+    predictor = Sphere()
+    both = [*methods_of(predictor, "frame-distance", "joint"), *methods_of(predictor, "frame-distance", "deferred")]
+    result = run_protocol("frame-distance", tmp_path, both, tmp_path / "out", options=OPTIONS)
+    lines = curves(result.sets, "ws_psnr")
+    assert {method: [gap for gap, _ in line] for method, line in lines.items()} == {m.name: [2, 4] for m in both}
+    written = write_report(result, tmp_path / "out")
+    assert {path.name for path in written} == {"table.md", "frame_distance.png"}
+    with Image.open(tmp_path / "out" / "frame_distance.png") as figure:
+        assert figure.size[0] > 300
+    (layout,) = layouts_of(result)
+    assert layout.sets == ("2 frames", "4 frames") and all(len(row.values) == 2 for row in our_rows(result, layout))
+
+
+@pytest.mark.shared
+def test_the_original_sample_is_a_case_of_m3d(shared: Path) -> None:
+    found = sets_of("m3d", shared / "data" / "mp3d_sample", ProtocolOptions())
+    assert [len(s.cases) for s in found] == [1, 0, 0]
+    sample = found[0].cases[0].read(64)
+    assert sample.name == "00000007" and sample.targets.names == ("01",) and sample.context.depths is not None
+    centres = sample.context.cam2world[:, :3, 3]
+    assert float((centres[0] - centres[1]).norm()) == pytest.approx(1.0, abs=1e-3)
