@@ -106,7 +106,7 @@ def test_colour_changes_all_views_alike_and_exposure_each() -> None:
     assert torch.equal(alike.context.images[0], alike.context.images[1])
     assert torch.equal(alike.context.images, alike.targets.images)
     assert not torch.equal(alike.context.images.mean(), room.images.mean())
-    assert 0 <= float(alike.context.images.min()) and float(alike.context.images.max()) <= 1
+    assert float(alike.context.images.min()) >= 0 and float(alike.context.images.max()) <= 1
     each = augment(sample, Augmentation(colour=0, exposure=1), np.random.default_rng(0))
     assert not torch.equal(each.context.images[0], each.context.images[1])
 

@@ -1,0 +1,131 @@
+"""Collecting bodies, surfaces and lights into the arrays that the ray caster takes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pansplat.data.generated.patterns import NUMBERS, Pattern
+from pansplat.data.generated.raycast import BOX, CYLINDER, ELLIPSOID, build_tree
+from pansplat.data.generated.shading import LIGHT_NUMBERS, ROOM_NUMBERS, draw_panorama
+
+Array = NDArray[np.float64]
+Vector = Sequence[float]
+
+
+@dataclass(frozen=True, eq=False)
+class GeneratedScene:
+    """A scene as arrays; the world's y points down and the floor is at y = 0, metres."""
+
+    arrays: tuple[Any, ...]
+    low: Array
+    """Smallest corner of each body's box in the world, (body 3)."""
+    high: Array
+
+    def panorama(self, cam2world: Array, height: int, samples: int = 2) -> tuple[Array, Array]:
+        """Linear light (H W 3) and radial depth (H W), metres, seen from a pose."""
+        image, depth = np.zeros((height, 2 * height, 3)), np.zeros((height, 2 * height))
+        draw_panorama(self.arrays, np.ascontiguousarray(cam2world, dtype=np.float64), samples, image, depth)
+        return image, depth
+
+    def clearance(self, points: Array) -> Array:
+        """Distance in metres from points (n 3) to the nearest body's box."""
+        apart = np.maximum(np.maximum(self.low - points[:, None], points[:, None] - self.high), 0)
+        return np.linalg.norm(apart, axis=-1).min(axis=1)
+
+
+class Builder:
+    """A scene in the making; `rng` decides all that is random in it."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+        self.kinds: list[int] = []
+        self.maps: list[Array] = []
+        self.halves: list[Array] = []
+        self.faces: list[list[int]] = []
+        self.low: list[Array] = []
+        self.high: list[Array] = []
+        self.looks: list[Array] = []
+        self.rooms: list[Array] = []
+        self.lights: list[Array] = []
+
+    def look(
+        self,
+        pattern: Pattern,
+        a: Vector,
+        b: Vector | None = None,
+        c: Vector | None = None,
+        *,
+        size: tuple[float, float] = (0.5, 0.5),
+        share: float = 0.1,
+        mottle: float = 0.2,
+        glow: float = 0.0,
+    ) -> int:
+        """A new material; returns its number. Colours are shares of light given back, see `patterns`."""
+        row = np.zeros(NUMBERS)
+        row[:16] = [pattern, *a, *(b or a), *(c or a), *size, share, mottle, self.rng.integers(1 << 20), glow]
+        self.looks.append(row)
+        return len(self.looks) - 1
+
+    def box(self, centre: Vector, half: Vector, look: int | Sequence[int], yaw: float = 0, pitch: float = 0) -> None:
+        """A box; `look` is one material, or six: left right (x), up down (y), back front (z)."""
+        self._add(BOX, centre, half, look, yaw, pitch)
+
+    def ellipsoid(self, centre: Vector, half: Vector, look: int, yaw: float = 0) -> None:
+        """An ellipsoid with the given half axes."""
+        self._add(ELLIPSOID, centre, half, look, yaw, 0)
+
+    def cylinder(self, centre: Vector, radius: float, half_height: float, look: int, pitch: float = 0) -> None:
+        """An upright cylinder."""
+        self._add(CYLINDER, centre, (radius, half_height, radius), look, 0, pitch)
+
+    def light(self, position: Vector, color: Vector, size: float, *, sun: bool = False) -> None:
+        """A lamp at a position, or a sun in a direction."""
+        row = np.zeros(LIGHT_NUMBERS)
+        row[:8] = [*position, *color, size, float(sun)]
+        self.lights.append(row)
+
+    def room(self, corners: Vector, looks: Sequence[int], panel_height: float, trim_height: float, tall: float) -> None:
+        """A room x0 z0 x1 z1 with its wall, floor, ceiling, trim and panel materials."""
+        row = np.zeros(ROOM_NUMBERS)
+        row[:] = [*corners, *looks, panel_height, trim_height, tall]
+        self.rooms.append(row)
+
+    def finish(self, ambient: Vector, outside: int, sky: int) -> GeneratedScene:
+        """The scene so far; `outside` and `sky` are materials."""
+        low, high = np.array(self.low), np.array(self.high)
+        bounds, links = build_tree(low, high)
+        lights = np.array(self.lights) if self.lights else np.zeros((0, LIGHT_NUMBERS))
+        arrays = (
+            np.array(self.kinds, np.int64),
+            np.array(self.maps),
+            np.array(self.halves),
+            np.array(self.faces, np.int64),
+            bounds,
+            links,
+            np.array(self.looks),
+            np.array(self.rooms),
+            lights,
+            np.array(ambient, np.float64),
+            outside,
+            sky,
+        )
+        return GeneratedScene(arrays, low, high)
+
+    def _add(
+        self, kind: int, centre: Vector, half: Vector, look: int | Sequence[int], yaw: float, pitch: float
+    ) -> None:
+        centre, half = np.asarray(centre, np.float64), np.asarray(half, np.float64)
+        cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
+        rotation = np.array(((cy, 0, sy), (0, 1, 0), (-sy, 0, cy))) @ np.array(((1, 0, 0), (0, cp, -sp), (0, sp, cp)))
+        reach = np.abs(rotation) @ half
+        self.kinds.append(kind)
+        self.maps.append(np.concatenate((rotation.T / half[:, None], centre[:, None]), axis=1).ravel())
+        self.halves.append(half)
+        self.faces.append([look] * 6 if isinstance(look, int) else list(look))
+        self.low.append(centre - reach - 1e-6)
+        self.high.append(centre + reach + 1e-6)

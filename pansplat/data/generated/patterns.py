@@ -1,0 +1,289 @@
+"""Colours of surfaces by formula, without grain finer than the picture can show.
+
+Every pattern takes the width `w` of a pixel on the surface, in metres, and is averaged over it: steps are integrated
+exactly, noise loses the octaves that are too fine. So nearby views agree, as photographs do.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+
+import numba as nb
+
+OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
+
+
+class Pattern(IntEnum):
+    """What a surface looks like; the numbers index `color`."""
+
+    PLAIN = 0
+    PLANKS = 1
+    TILES = 2
+    STRIPES = 3
+    STONE = 4
+    PICTURE = 5
+    TEXT = 6
+    BOOKS = 7
+    RUG = 8
+    TERRAZZO = 9
+
+
+# Places in a material's row of numbers.
+KIND, COLOR_A, COLOR_B, COLOR_C = 0, 1, 4, 7
+SIZE_U, SIZE_V, SHARE, MOTTLE, SEED, GLOW, NUMBERS = 10, 11, 12, 13, 14, 15, 16
+
+
+@nb.njit(**OPTIONS)
+def hash_unit(i, j, seed):
+    """A number in [0, 1) for two whole numbers and a seed."""
+    h = (int(i) * 374761393 + int(j) * 668265263 + int(seed) * 974634721) & 0xFFFFFFFF
+    h = ((h ^ (h >> 15)) * 1274126177) & 0xFFFFFFFF
+    h = ((h ^ (h >> 13)) * 1103515245) & 0xFFFFFFFF
+    return (h ^ (h >> 16)) / 4294967296.0
+
+
+@nb.njit(**OPTIONS)
+def noise(x, y, seed):
+    """Smooth noise in [0, 1] of wavelength about 2."""
+    i, j = math.floor(x), math.floor(y)
+    fx, fy = x - i, y - j
+    fx, fy = fx * fx * (3 - 2 * fx), fy * fy * (3 - 2 * fy)
+    low = hash_unit(i, j, seed) * (1 - fx) + hash_unit(i + 1, j, seed) * fx
+    high = hash_unit(i, j + 1, seed) * (1 - fx) + hash_unit(i + 1, j + 1, seed) * fx
+    return low * (1 - fy) + high * fy
+
+
+@nb.njit(**OPTIONS)
+def fractal(u, v, size, octaves, w, seed):
+    """Noise about 0 with finer and finer octaves, the first `size` metres wide; octaves below `w` fade."""
+    total, gain = 0.0, 1.0
+    for octave in range(octaves):
+        shown = min(1.0, max(0.0, 1.5 - w / size))
+        if shown <= 0:
+            break
+        total += gain * shown * (noise(u / size + 7.3 * octave, v / size - 3.1 * octave, seed + octave) - 0.5)
+        gain *= 0.55
+        size *= 0.5
+    return total
+
+
+@nb.njit(**OPTIONS)
+def pulse(x, share, w):
+    """1 in the first `share` of each period of 1, else 0; averaged over a window `w` wide."""
+    if w >= 1:
+        return share
+    a, b = x - 0.5 * w, x + 0.5 * w
+    if w < 1e-6:
+        return 1.0 if x - math.floor(x) < share else 0.0
+    fa, fb = math.floor(a), math.floor(b)
+    return ((fb - fa) * share + min(b - fb, share) - min(a - fa, share)) / w
+
+
+@nb.njit(**OPTIONS)
+def _mix(material, first, second, t):
+    t = min(1.0, max(0.0, t))
+    return (
+        material[first] * (1 - t) + material[second] * t,
+        material[first + 1] * (1 - t) + material[second + 1] * t,
+        material[first + 2] * (1 - t) + material[second + 2] * t,
+    )
+
+
+@nb.njit(**OPTIONS)
+def _per_cell(cell, size, w):
+    """How much of a cell's own random tone is left where cells are as small as pixels; `cell` in [0, 1)."""
+    return (cell - 0.5) * min(1.0, max(0.0, 1.5 - w / size))
+
+
+@nb.njit(**OPTIONS)
+def _planks(material, u, v, w, seed):
+    wide, long = material[SIZE_U], material[SIZE_V]
+    row = math.floor(v / wide)
+    along = u / long + hash_unit(row, 3, seed)
+    tone = 0.5 + 0.8 * _per_cell(hash_unit(row, math.floor(along), seed), wide, w)
+    tone += 1.2 * fractal(u * 0.12, v + 0.3 * tone, 0.05, 4, w, seed) * 0.8
+    joint = max(pulse(v / wide, material[SHARE], w / wide), pulse(along, material[SHARE] * wide / long, w / long))
+    r, g, b = _mix(material, COLOR_A, COLOR_B, tone)
+    return r * (1 - 0.7 * joint), g * (1 - 0.7 * joint), b * (1 - 0.7 * joint)
+
+
+@nb.njit(**OPTIONS)
+def _tiles(material, u, v, w, seed):
+    size_u, size_v, share = material[SIZE_U], material[SIZE_V], material[SHARE]
+    row = math.floor(v / size_v)
+    shifted = u / size_u + (0.5 * (row % 2) if size_u > 1.5 * size_v else 0.0)  # long ones are laid as bricks
+    column = math.floor(shifted)
+    joint = 1 - (1 - pulse(shifted, share * size_v / size_u, w / size_u)) * (1 - pulse(v / size_v, share, w / size_v))
+    small = min(size_u, size_v)
+    tone = 0.3 + 0.6 * _per_cell(hash_unit(row, column, seed), small, w)
+    if material[MOTTLE] > 0.5 and hash_unit(seed, 5, 5) < 0.5:  # a chequered floor
+        tone += 0.7 * ((row + column) % 2) * min(1.0, max(0.0, 1.5 - w / small))
+    tone += 0.5 * fractal(u, v, 0.5 * small, 3, w, seed + 9)
+    r, g, b = _mix(material, COLOR_A, COLOR_B, tone)
+    return (
+        r * (1 - joint) + material[COLOR_C] * joint,
+        g * (1 - joint) + material[COLOR_C + 1] * joint,
+        b * (1 - joint) + material[COLOR_C + 2] * joint,
+    )
+
+
+@nb.njit(**OPTIONS)
+def _stripes(material, u, v, w, seed):
+    size = material[SIZE_U]
+    wide = pulse(u / size, material[SHARE], w / size)
+    narrow = pulse(u / size + 0.3, 0.12, w / size)
+    r, g, b = _mix(material, COLOR_A, COLOR_B, wide)
+    return (
+        r * (1 - narrow) + material[COLOR_C] * narrow,
+        g * (1 - narrow) + material[COLOR_C + 1] * narrow,
+        b * (1 - narrow) + material[COLOR_C + 2] * narrow,
+    )
+
+
+@nb.njit(**OPTIONS)
+def _stone(material, u, v, w, seed):
+    size = material[SIZE_U]
+    turbulent = fractal(u, v, size, 6, w, seed)
+    if material[SHARE] > 0.5:  # veins
+        vein = 1 - abs(math.sin((u + 0.7 * v) / size * 3 + 6 * turbulent))
+        return _mix(material, COLOR_A, COLOR_B, vein * vein * vein * min(1.0, max(0.0, 1.5 - 2 * w / size)))
+    return _mix(material, COLOR_A, COLOR_B, 0.5 + 1.3 * turbulent)
+
+
+@nb.njit(**OPTIONS)
+def _picture(material, u, v, w, seed, half_u, half_v):
+    """Soft ground with a dozen discs and bars on it, each with a colour of its own."""
+    x, y = u / half_u, v / half_v
+    w /= min(half_u, half_v)
+    r, g, b = _mix(material, COLOR_A, COLOR_B, 0.5 + 0.5 * y + 1.5 * fractal(x, y, 0.8, 5, w, seed))
+    for k in range(12):
+        cx, cy = 2.2 * hash_unit(k, 0, seed) - 1.1, 2.2 * hash_unit(k, 1, seed) - 1.1
+        size = 0.06 + 0.4 * hash_unit(k, 2, seed) ** 2
+        if hash_unit(k, 3, seed) < 0.5:
+            inside = size - math.hypot(x - cx, y - cy)
+        else:
+            inside = min(size - abs(x - cx), size * (0.2 + hash_unit(k, 4, seed)) - abs(y - cy))
+        cover = min(1.0, max(0.0, 0.5 + inside / max(w, 1e-4)))
+        if cover > 0:
+            shade = 1 + fractal(x, y, 0.3, 3, w, seed + k)
+            r = r * (1 - cover) + cover * shade * hash_unit(k, 5, seed) ** 1.5
+            g = g * (1 - cover) + cover * shade * hash_unit(k, 6, seed) ** 1.5
+            b = b * (1 - cover) + cover * shade * hash_unit(k, 7, seed) ** 1.5
+    return max(r, 0.0), max(g, 0.0), max(b, 0.0)
+
+
+@nb.njit(**OPTIONS)
+def _text(material, u, v, w, seed, half_u, half_v):
+    """Lines of words of random letters on a plain ground, with a margin and a short last line here and there."""
+    tall = material[SIZE_U]
+    line = math.floor(v / (1.6 * tall))
+    y = v / tall - 1.6 * line
+    letter = math.floor(u / (0.62 * tall))
+    end = half_u * (0.85 if hash_unit(line, 8, seed) < 0.8 else 0.85 * (2 * hash_unit(line, 9, seed) - 1))
+    ink = 0.0
+    if abs(v) < 0.88 * half_v and -0.88 * half_u < u < end and y < 1 and hash_unit(letter, line, seed) > 0.17:
+        if w > 0.35 * tall:
+            ink = 0.45
+        else:
+            column, row = math.floor((u / (0.62 * tall) - letter) * 6), math.floor(y * 7)
+            if column < 5:
+                ink = 1.0 if hash_unit(column + 8 * row, letter + 131 * line, seed + 1) < 0.5 else 0.0
+                ink += (0.5 - ink) * min(1.0, max(0.0, w / (0.2 * tall) - 0.3))
+    ink *= min(1.0, max(0.0, 2.0 - 1.2 * w / tall)) if w > tall else 1.0
+    return _mix(material, COLOR_A, COLOR_B, ink)
+
+
+@nb.njit(**OPTIONS)
+def _books(material, u, v, w, seed):
+    """Backs of books of several widths side by side, most with a title band."""
+    size = material[SIZE_U]
+    x = u / size + 0.6 * noise(1.3 * u / size, 0.5, seed)
+    book = math.floor(x)
+    shown = min(1.0, max(0.0, 1.6 - w / size))
+    hue, light = hash_unit(book, 0, seed), 0.15 + 0.6 * hash_unit(book, 1, seed) ** 2
+    gap = 1.0 - 0.6 * shown * pulse(x, 0.12, w / size)
+    band = pulse(v / 0.11 + hash_unit(book, 2, seed), 0.25, w / 0.11) if hash_unit(book, 3, seed) < 0.7 else 0.0
+    r = light * (1 + shown * math.sin(6.28 * hue)) * (1 - 0.4 * band) + 0.25 * band
+    g = light * (1 + shown * math.sin(6.28 * hue + 2.1)) * (1 - 0.4 * band) + 0.25 * band
+    b = light * (1 + shown * math.sin(6.28 * hue + 4.2)) * (1 - 0.4 * band) + 0.2 * band
+    return r * gap, g * gap, b * gap
+
+
+@nb.njit(**OPTIONS)
+def _rug(material, u, v, w, seed, half_u, half_v):
+    """Borders inside one another round a field of diamonds."""
+    edge = min(half_u - abs(u), half_v - abs(v))
+    size = material[SIZE_U]
+    if edge < 3 * size:
+        t = pulse(edge / size, 0.45, w / size)
+    else:
+        t = pulse((abs(u) + abs(v)) / (2 * size), 0.35, w / size)
+        t = 0.6 * t + 0.4 * pulse((abs(u) - abs(v)) / (2 * size) + 100, 0.5, w / size)
+    t += 0.6 * fractal(u, v, 0.06, 3, w, seed)
+    r, g, b = _mix(material, COLOR_A, COLOR_B, t)
+    spot = 0.5 * pulse(edge / (4 * size), 0.2, w / (4 * size))
+    return (
+        r * (1 - spot) + material[COLOR_C] * spot,
+        g * (1 - spot) + material[COLOR_C + 1] * spot,
+        b * (1 - spot) + material[COLOR_C + 2] * spot,
+    )
+
+
+@nb.njit(**OPTIONS)
+def _terrazzo(material, u, v, w, seed):
+    """Chips of two colours in a third."""
+    size = material[SIZE_U]
+    x, y = u / size, v / size
+    i, j = math.floor(x), math.floor(y)
+    best, chip = 9.0, 0.0
+    for di in range(-1, 2):
+        for dj in range(-1, 2):
+            px = i + di + hash_unit(i + di, j + dj, seed)
+            py = j + dj + hash_unit(i + di, j + dj, seed + 1)
+            away = math.hypot(x - px, y - py) / (0.3 + 0.7 * hash_unit(i + di, j + dj, seed + 2))
+            if away < best:
+                best, chip = away, hash_unit(i + di, j + dj, seed + 3)
+    cover = min(1.0, max(0.0, 0.5 + (0.55 - best) / max(w / size, 1e-3)))
+    cover = cover + (0.4 - cover) * min(1.0, max(0.0, w / size - 0.5))
+    r, g, b = _mix(material, COLOR_B, COLOR_C, chip)
+    return (
+        material[COLOR_A] * (1 - cover) + r * cover,
+        material[COLOR_A + 1] * (1 - cover) + g * cover,
+        material[COLOR_A + 2] * (1 - cover) + b * cover,
+    )
+
+
+@nb.njit(**OPTIONS)
+def color(material, u, v, w, half_u, half_v):
+    """Share of the light (red, green, blue) that a surface gives back.
+
+    Args:
+        material: row of numbers, see the indices above.
+        u, v: place on the surface, metres; v grows downwards on upright ones.
+        w: width of a pixel there, metres.
+        half_u, half_v: half the surface's size, metres, for patterns that fill it.
+    """
+    kind, seed = int(material[KIND]), int(material[SEED])
+    if kind == 1:
+        r, g, b = _planks(material, u, v, w, seed)
+    elif kind == 2:
+        r, g, b = _tiles(material, u, v, w, seed)
+    elif kind == 3:
+        r, g, b = _stripes(material, u, v, w, seed)
+    elif kind == 4:
+        r, g, b = _stone(material, u, v, w, seed)
+    elif kind == 5:
+        r, g, b = _picture(material, u, v, w, seed, half_u, half_v)
+    elif kind == 6:
+        r, g, b = _text(material, u, v, w, seed, half_u, half_v)
+    elif kind == 7:
+        r, g, b = _books(material, u, v, w, seed)
+    elif kind == 8:
+        r, g, b = _rug(material, u, v, w, seed, half_u, half_v)
+    elif kind == 9:
+        r, g, b = _terrazzo(material, u, v, w, seed)
+    else:
+        r, g, b = material[COLOR_A], material[COLOR_A + 1], material[COLOR_A + 2]
+    worn = 1 + material[MOTTLE] * fractal(u, v, 0.9, 7, w, seed + 77)
+    return r * worn, g * worn, b * worn

@@ -1,0 +1,88 @@
+"""Rays meet bodies where formulas say, and the tree of boxes loses none."""
+
+import math
+
+import numpy as np
+import pytest
+
+from pansplat.data.generated.builder import Builder, GeneratedScene
+from pansplat.data.generated.patterns import Pattern
+from pansplat.data.generated.raycast import first_hit
+
+
+def _scene(fill) -> GeneratedScene:
+    build = Builder(np.random.default_rng(0))
+    look = build.look(Pattern.PLAIN, (0.5, 0.5, 0.5), mottle=0)
+    fill(build, look)
+    build.room((-20, -20, 20, 20), [look] * 5, 0, 0, 20)
+    return build.finish((1, 1, 1), look, look)
+
+
+def _distance(scene: GeneratedScene, origin, towards, most: float = math.inf) -> tuple[float, int]:
+    kinds, maps, _, _, bounds, links = scene.arrays[:6]
+    direction = np.asarray(towards, float) / np.linalg.norm(towards)
+    return first_hit(kinds, maps, bounds, links, *map(float, origin), *direction, most, False)
+
+
+def test_distances_to_single_bodies_are_exact() -> None:
+    turned = _scene(lambda b, look: b.box((0, 0, 4), (1, 1, 1), look, yaw=math.pi / 4))
+    assert _distance(turned, (0, 0, 0), (1e-9, 1e-9, 1)) == (pytest.approx(4 - math.sqrt(2)), 0)
+    ball = _scene(lambda b, look: b.ellipsoid((3, 0, 0), (2, 1, 0.5), look))
+    assert _distance(ball, (0, 0, 0), (1, 0, 0))[0] == pytest.approx(1)
+    drum = _scene(lambda b, look: b.cylinder((0, 3, 0), 1, 0.5, look))
+    assert _distance(drum, (0.9, 0, 0), (1e-9, 1, 1e-9))[0] == pytest.approx(2.5)
+    assert _distance(drum, (-3, 3.2, 0), (1, 1e-9, 1e-9))[0] == pytest.approx(2)
+    assert _distance(drum, (0, 0, 1.1), (1e-9, 1, 1e-9)) == (math.inf, -1)
+
+
+def test_the_tree_finds_what_a_search_of_all_bodies_finds() -> None:
+    rng = np.random.default_rng(5)
+
+    def fill(build: Builder, look: int) -> None:
+        for _ in range(60):
+            centre, half = rng.uniform(-5, 5, size=3), rng.uniform(0.1, 0.8, size=3)
+            kind = rng.integers(3)
+            if kind == 0:
+                build.box(centre, half, look, *rng.uniform(0, 3, size=2))
+            elif kind == 1:
+                build.ellipsoid(centre, half, look, rng.uniform(0, 3))
+            else:
+                build.cylinder(centre, half[0], half[1], look, rng.uniform(0, 3))
+
+    scene = _scene(fill)
+    kinds, maps, _, _, bounds, links = scene.arrays[:6]
+    everything = np.tile([-99.0, -99, -99, 99, 99, 99], (60, 1))
+    hits = 0
+    for _ in range(500):
+        origin, direction = rng.uniform(-6, 6, size=3), rng.normal(size=3)
+        direction /= np.linalg.norm(direction)
+        found = first_hit(kinds, maps, bounds, links, *origin, *direction, math.inf, False)
+        best = (math.inf, -1)
+        for k in range(60):
+            single = np.array([[0, 1, k]], np.int64)
+            best = min(best, first_hit(kinds, maps, everything, single, *origin, *direction, math.inf, False))
+        hits += found[1] >= 0
+        assert found[0] == best[0]
+        assert found[1] == best[1] or found[1] < 0
+        blocked = first_hit(kinds, maps, bounds, links, *origin, *direction, 3.0, True)[1] >= 0
+        assert blocked == (found[0] < 3)
+    assert 50 < hits < 450
+
+
+def test_shadows_fall_behind_things() -> None:
+    def fill(build: Builder, look: int) -> None:
+        build.box((0, 1.1, 0), (5, 0.1, 5), look)
+        build.box((0, -0.5, 0), (0.3, 0.02, 0.3), look)
+        build.light((0, -2, 0), (20, 20, 20), 0.0)
+
+    image, _ = _scene(fill).panorama(np.eye(4) + _at(1.2, 0, 0), 64, 1)
+    row = 32 + round(math.degrees(math.atan(1 / 1.2)) / 180 * 64)
+    under_the_plate, on_the_other_side = image[row, 32, 0], image[row, 96, 0]
+    assert under_the_plate == pytest.approx(0.5, abs=0.03)  # of the surrounding light, floors get all
+    assert on_the_other_side > under_the_plate + 0.3
+
+
+def _at(x: float, y: float, z: float) -> np.ndarray:
+    offset = np.zeros((4, 4))
+    offset[:3, 3] = x, y, z
+    return offset

@@ -1,0 +1,100 @@
+"""Generated triplets are exact, free, repeatable and all different."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from pansplat.data.generated.rooms import build_home
+from pansplat.data.synthetic import GeneratedScenes
+from pansplat.geometry.equirect import pixel_directions
+from pansplat.geometry.sweep import relative_pose, warp_panorama
+
+HEIGHT = 64
+
+
+@pytest.fixture(scope="module")
+def scenes() -> GeneratedScenes:
+    return GeneratedScenes(seed=3, samples=1)
+
+
+def test_number_and_seed_decide_the_picture(scenes: GeneratedScenes) -> None:
+    first, again, other = scenes.sample(4, 16), scenes.sample(4, 16, 99), scenes.sample(5, 16)
+    assert torch.equal(first.context.images, again.context.images)
+    assert torch.equal(first.targets.cam2world, again.targets.cam2world)
+    assert not torch.equal(first.context.images, other.context.images)
+    assert not torch.equal(first.context.images, GeneratedScenes(seed=4, samples=1).sample(4, 16).context.images)
+
+
+def test_samples_are_triplets_with_depth_and_free_cameras(scenes: GeneratedScenes) -> None:
+    baselines = []
+    for index in range(8):
+        sample = scenes.sample(index, 16)
+        views, target = sample.context, sample.targets
+        assert views.images.shape == (2, 3, 16, 32) and target.images.shape == (1, 3, 16, 32)
+        assert float(views.images.min()) >= 0 and float(views.images.max()) <= 1
+        assert 0.2 < float(views.images.median()) < 0.8
+        assert views.depths is not None and float(views.depths.min()) > 0.44 and torch.isfinite(views.depths).all()
+        centres = views.cam2world[:, :3, 3]
+        baselines.append(float((centres[0] - centres[1]).norm()))
+        ways = [float((target.cam2world[0, :3, 3] - centre).norm()) for centre in centres]
+        assert max(ways) < baselines[-1]
+    assert all(0.3 <= baseline <= 2.0 for baseline in baselines)
+    assert max(baselines) - min(baselines) > 0.3
+
+
+def test_depth_takes_one_view_into_the_other(scenes: GeneratedScenes) -> None:
+    """Both depths agree except behind things, and colours with them; not so with the baseline reversed."""
+    for index in range(3):
+        views = scenes.sample(index, HEIGHT).context
+        assert views.depths is not None
+        poses = views.cam2world.clone()
+        seen, difference = _agreement(views.images, views.depths, poses)
+        assert seen > 0.4
+        assert difference < 0.05
+        poses[:, :3, 3] = poses[:, :3, 3].flip(0)
+        assert _agreement(views.images, views.depths, poses)[0] < 0.5 * seen
+
+
+def _agreement(images: torch.Tensor, depths: torch.Tensor, cam2world: torch.Tensor) -> tuple[float, float]:
+    """Share of view 0 where view 1's own depth is as expected, and the mean difference of their colours there."""
+    pose = relative_pose(cam2world[:1], cam2world[1:])
+    inverse = 1 / depths[:1, None]
+    warped = warp_panorama(images[1:], inverse, pose.float())[0, :, 0]
+    seen = warp_panorama(depths[1:, None], inverse, pose.float())[0, 0, 0]
+    points = pixel_directions(HEIGHT, 2 * HEIGHT) * depths[0][..., None]
+    there = (points @ pose[0, :3, :3].T.float() + pose[0, :3, 3].float()).norm(dim=-1)
+    visible = (seen - there).abs() < 0.02 * there
+    return float(visible.float().mean()), float((warped - images[0]).abs().mean(dim=0)[visible].mean())
+
+
+def test_depth_is_exact_at_pixel_centres() -> None:
+    """On the floor seen from above: height over the sine of the angle below the horizon."""
+    scenes = GeneratedScenes(seed=3, samples=1)
+    sample = scenes.sample(0, HEIGHT)
+    assert sample.context.depths is not None
+    height = -float(sample.context.cam2world[0, 1, 3])
+    expected = height / torch.sin((torch.arange(HEIGHT) + 0.5) * math.pi / HEIGHT - math.pi / 2)
+    on_floor = (sample.context.depths[0] - expected[:, None]).abs() < 1e-5
+    assert on_floor[HEIGHT // 2 :].float().mean() > 0.1
+
+
+def test_more_rays_a_pixel_smooth_the_picture_only() -> None:
+    coarse, fine = (GeneratedScenes(seed=3, samples=samples).sample(1, 32) for samples in (1, 3))
+    assert torch.equal(coarse.context.depths, fine.context.depths)
+    difference = (coarse.context.images - fine.context.images).abs().mean()
+    assert 1e-4 < float(difference) < 0.06
+
+
+def test_no_ray_leaves_a_home_but_through_its_openings() -> None:
+    """Plans close: looked at from inside, most of the view is within the house."""
+    for index in range(6):
+        scene, plan = build_home(np.random.default_rng((11, index)))
+        x0, z0, x1, z1 = plan.rooms[0]
+        pose = np.eye(4)
+        pose[:3, 3] = (x0 + x1) / 2, -2.0, (z0 + z1) / 2
+        _, depth = scene.panorama(pose, 24, 1)
+        weight = np.cos((np.arange(24) + 0.5) * np.pi / 24 - np.pi / 2)[:, None]
+        assert ((depth < 15) * weight).sum() / (weight.sum() * 48) > 0.8
+        assert (depth[0] < 5).all() and (depth[-1] < 3).all()
