@@ -24,6 +24,7 @@ from pansplat.render.cpu.simd import (
     maximum,
     multiply_add,
     negative,
+    prefetch_to_write,
     put,
     some,
     spread,
@@ -62,6 +63,7 @@ _LN2 = math.log(2)
 _PAIR = 2 * LANES  # numbers a pair: alphas, later slopes, and weights; one cache line
 _PAIRS = 1 << 16  # room for pairs of a segment, at least those of a chunk
 _CHUNKS = 32  # most in a segment
+_AHEAD = 24  # Gaussians, between asking for a slot and writing it
 
 
 def raster_backward(
@@ -268,7 +270,11 @@ def _write_chunk(  # type: ignore[no-untyped-def]
     grad_records, grad_values,
 ):  # fmt: skip
     """Write the gradients of a chunk's Gaussians to their slots."""
+    last = first + count - 1
     for s in range(count):
+        ahead = element(slots, min(first + s + _AHEAD, last))
+        prefetch_to_write(grad_records, FIELDS * ahead)
+        prefetch_to_write(grad_values, num_values * ahead)
         _sum_moments(s, heads, pairs, slopes, forms, offsets, upstream, moments, shares)
         row = num_values * slots[first + s]
         for value in range(min(_GROUP, num_values)):

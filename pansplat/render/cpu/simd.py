@@ -272,16 +272,30 @@ def put(context, array, index, value):  # type: ignore[no-untyped-def]
 
 @_intrinsic
 def prefetch(context, array, index):  # type: ignore[no-untyped-def]
-    """Ask for the cache line of element `index`."""
+    """Ask for the cache line of element `index`, to be read."""
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        pointer = builder.bitcast(_pointer(context, builder, sig, args), ir.IntType(8).as_pointer())
-        kind = ir.FunctionType(ir.VoidType(), [pointer.type, _INT, _INT, _INT])
-        function = get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        builder.call(function, [pointer, _INT(0), _INT(3), _INT(1)])
-        return context.get_dummy_value()
+        return _prefetch(context, builder, sig, args, 0)
 
     return types.void(array, types.intp), generate
+
+
+@_intrinsic
+def prefetch_to_write(context, array, index):  # type: ignore[no-untyped-def]
+    """Ask for the cache line of element `index`, to be written."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return _prefetch(context, builder, sig, args, 1)
+
+    return types.void(array, types.intp), generate
+
+
+def _prefetch(context: Any, builder: Any, sig: Any, args: Any, writes: int) -> Any:
+    pointer = builder.bitcast(_pointer(context, builder, sig, args), ir.IntType(8).as_pointer())
+    kind = ir.FunctionType(ir.VoidType(), [pointer.type, _INT, _INT, _INT])
+    function = get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+    builder.call(function, [pointer, _INT(writes), _INT(3), _INT(1)])
+    return context.get_dummy_value()
 
 
 def _pointer(context: Any, builder: Any, sig: Any, args: Any) -> Any:
