@@ -29,7 +29,7 @@ from pansplat.evaluation.data_sets import (
 )
 from pansplat.evaluation.depth_metrics import DepthErrors
 from pansplat.evaluation.lpips import Lpips
-from pansplat.evaluation.report import error_picture
+from pansplat.evaluation.report import error_picture, warm_up
 from pansplat.evaluation.score import (
     Blend,
     Drawn,
@@ -216,6 +216,8 @@ def run_protocol(
         )
     chosen = [(found, _spread(found.cases, options.limit)) for found in sets if found.cases]
     total = sum(len(cases) for _, cases in chosen)
+    for predictor in {id(method.predictor): method.predictor for method in methods}.values():
+        warm_up(predictor)
     done = 0
     for found, cases in chosen:
         rows = [SetResult(found.name, method.name) for method in methods]

@@ -89,7 +89,7 @@ def evaluate(
     if not with_targets:
         raise InputError("none of the pairs has a target view to compare with; name targets in pairs.json")
     _make_folder(out)
-    _warm_up(predictor)
+    warm_up(predictor)
     cases: list[Case] = []
     for index, pair in enumerate(with_targets):
 
@@ -103,7 +103,7 @@ def evaluate(
     return cases
 
 
-def _warm_up(predictor: Predictor) -> None:
+def warm_up(predictor: Predictor) -> None:
     """Predict from small noise once: kernels compiled on first use are not part of a prediction's time."""
     images = torch.rand(2, 3, 64, 128, generator=torch.Generator().manual_seed(0))
     poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)

@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from pansplat.data.video import write_video
 from pansplat.errors import InputError
 from pansplat.evaluation.data_sets import INSTA360, LOC360, sequence_set, sequences_of
 from pansplat.evaluation.frame_distance import curves
@@ -60,9 +61,12 @@ class Network(NetworkPredictor):
     def __init__(self) -> None:
         pass
 
+    def __call__(self, images, cam2world, near, far, *, masks=None, progress=None):
+        return Sphere()(images, cam2world, near, far)
+
     def predict_with_depths(self, images, cam2world, near, far, *, masks=None, progress=None):
         depths = [torch.full((len(images), rows, 2 * rows), metres) for rows, metres in ((4, 9.0), (8, RADIUS))]
-        return Sphere()(images, cam2world, near, far), depths
+        return self(images, cam2world, near, far), depths
 
 
 def write_picture(path: Path, seed: int) -> None:
@@ -95,6 +99,17 @@ def write_loc360(root: Path, frames: int = 7) -> Path:
         pose[0, 3] = 0.2 * frame
         poses[f"{frame:04d}.png"] = pose.tolist()
     (folder / "camera_pose.json").write_text(json.dumps(poses))
+    return folder
+
+
+def write_insta360(root: Path, frames: int) -> Path:
+    folder = root / "insta360" / "VID_0001"
+    folder.mkdir(parents=True)
+    pictures = (np.full((HEIGHT, 2 * HEIGHT, 3), 5 * frame + 20, np.uint8) for frame in range(frames))
+    write_video(folder / "video.mp4", pictures, 24.0)
+    lines = [f"1 0 0 {0.1 * frame} 0 1 0 0 0 0 1 0" for frame in range(frames)]
+    (folder / "frame_trajectory.txt").write_text("\n".join(lines))
+    (folder / "scale.txt").write_text("2.0")
     return folder
 
 
@@ -151,6 +166,17 @@ def test_a_sequence_gives_even_pairs_with_all_frames_between_and_at_them(tmp_pat
     sample = found.cases[1].read(HEIGHT)
     assert sample.context.names == ("0001", "0004")
     assert sample.targets.names == ("0001", "0002", "0003", "0004")
+
+
+def test_a_films_inputs_are_sixteen_frames_apart(tmp_path: Path) -> None:
+    """OFFICIAL.md 2.5: all 17 frames from the left input to the right one are targets."""
+    write_insta360(tmp_path, frames=20)
+    (found,) = sets_of("insta360", tmp_path, OPTIONS)
+    assert [case.name for case in found.cases] == [f"VID_0001-{i:06d}-{i + 16:06d}" for i in (0, 1, 3)]
+    sample = found.cases[2].read(HEIGHT)
+    assert len(sample.targets.images) == 17
+    assert float(sample.targets.cam2world[16, 0, 3]) == pytest.approx(2 * 0.1 * 19)
+    assert float(sample.targets.images[16].mean()) == pytest.approx((5 * 19 + 20) / 255, abs=0.02)
 
 
 def test_the_frame_distance_takes_the_frame_in_the_middle(tmp_path: Path) -> None:
@@ -212,7 +238,7 @@ def test_methods_of_one_predictor_share_its_prediction(tmp_path: Path) -> None:
     predictor = Sphere()
     both = [*methods_of(predictor, "360loc", "joint"), *methods_of(predictor, "360loc", "deferred")]
     result = run_protocol("360loc", tmp_path, both, tmp_path / "out", options=OPTIONS)
-    assert predictor.calls == 3
+    assert predictor.calls == 1 + 3  # once to warm up
     joint, deferred = result.sets
     assert joint.scores != deferred.scores
 
