@@ -19,6 +19,7 @@ _PUBLIC = {
     "load_model": "pansplat.pipeline",
     "load_pairs": "pansplat.pipeline",
     "predict": "pansplat.pipeline",
+    "predict_to_file": "pansplat.pipeline",
     "rasterize": "pansplat.render",
     "render": "pansplat.pipeline",
     "save": "pansplat.pipeline",

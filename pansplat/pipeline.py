@@ -10,7 +10,7 @@ import json
 import os
 import re
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, get_args
 
@@ -24,22 +24,31 @@ from pansplat.atomic import replacing
 from pansplat.data.pairs import Pair, load_pairs
 from pansplat.data.views import Views
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.gaussians import Gaussians, no_gaussians
 from pansplat.gaussians.ply import load_ply, save_ply
+from pansplat.gaussians.ply_stream import save_ply_parts
+from pansplat.gaussians.prune import prune
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.blending import blend_weights
 from pansplat.model.checkpoint import SUFFIXES, CompatChoice
+from pansplat.model.layers import Precision
 from pansplat.model.predictor import Predictor, Progress
 from pansplat.render import Rendering, rasterize
 from pansplat.render import blend as blend_renderings
 
-__all__ = ["load", "load_model", "load_pairs", "predict", "render", "save"]
+__all__ = ["load", "load_model", "load_pairs", "predict", "predict_to_file", "render", "save"]
 
 _CACHE_FORMAT = "1"  # changes when the file's layout does, so that older files are not taken for newer ones
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics", "levels", "views")
 
 
-def load_model(name: str | Path = "sweep", *, compat: CompatChoice = "trained", **options: Any) -> Predictor:
+def load_model(
+    name: str | Path = "sweep",
+    *,
+    compat: CompatChoice = "trained",
+    precision: Precision = "float32",
+    **options: Any,
+) -> Predictor:
     """A predictor, ready to be called with tensors.
 
     Args:
@@ -48,16 +57,19 @@ def load_model(name: str | Path = "sweep", *, compat: CompatChoice = "trained", 
         compat: for networks: "official" computes what the original code does, its defects included; "fixed"
             corrects them; "trained" is the one that the weights were trained with. Original weights were trained
             with the defects, so for them it is "official".
+        precision: for networks: number type of the convolutions; docs/bench_model.md has what bfloat16 gains and costs.
         **options: for the constructor of `sweep`.
 
     Raises:
-        InputError: when there is no such predictor, or the file cannot be used.
+        InputError: when there is no such predictor, the processor lacks the precision, or the file cannot be used.
     """
     if compat not in get_args(CompatChoice):
         raise InputError(f"`compat` must be one of {', '.join(get_args(CompatChoice))}, got {compat!r}")
     if str(name) in _MODELS:
         if compat != "trained":
             raise InputError(f"`compat` is for networks, and {name} is none; leave it out")
+        if precision != "float32":
+            raise InputError(f"`precision` is for networks, and {name} is none; leave it out")
         return _MODELS[str(name)](**options)
     if Path(name).suffix.lower() not in SUFFIXES:
         raise InputError(
@@ -66,7 +78,7 @@ def load_model(name: str | Path = "sweep", *, compat: CompatChoice = "trained", 
         )
     from pansplat.model.loading import load_predictor
 
-    return load_predictor(Path(name).expanduser(), compat, **options)
+    return load_predictor(Path(name).expanduser(), compat, precision=precision, **options)
 
 
 def _sweep(**options: Any) -> Predictor:
@@ -121,6 +133,51 @@ def predict(
     scene = _predict(views, predictor, progress)
     _write_cached(scene.gaussians, _cache_folders(pair), stem, key)
     return scene
+
+
+def predict_to_file(
+    source: Pair | Views | str | Path,
+    path: str | Path,
+    model: str | Path | Predictor,
+    *,
+    compat: CompatChoice = "trained",
+    height: int = 512,
+    degree: int | None = None,
+    min_opacity: float = 0.0,
+    progress: Progress | None = None,
+) -> int:
+    """Predict into a .ply file, tile by tile: for panoramas whose Gaussians do not fit in memory. Nothing is cached.
+
+    The file holds what `predict` gives, in the order of tiles.
+
+    Args:
+        source, compat, height, progress: as in `predict`.
+        model: a network: a file of weights, or its predictor.
+        degree: highest degree of harmonics to keep; None keeps all.
+        min_opacity: Gaussians of less are left out.
+
+    Returns:
+        How many Gaussians the file holds.
+
+    Raises:
+        InputError: as `predict`; when the predictor is no network, or the file cannot be written.
+    """
+    _require_ply(path)
+    predictor = load_model(model, compat=compat) if isinstance(model, (str, Path)) else model
+    if not streams(predictor):
+        raise InputError(f"{predictor.name} makes all Gaussians at once; use `predict` and `save`, or a network")
+    pair = _only_pair(source) if isinstance(source, (str, Path)) else source
+    views = pair if isinstance(pair, Views) else pair.load_context(height)
+    parts: Iterator[Gaussians] = predictor.stream(  # pyright: ignore[reportAttributeAccessIssue]
+        views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress
+    )
+    pruned = (prune(part, degree=degree, min_opacity=min_opacity) for part in parts)
+    return save_ply_parts(_scene(no_gaussians(), views, predictor), pruned, path)
+
+
+def streams(predictor: Predictor) -> bool:
+    """Whether `predict_to_file` can use the predictor."""
+    return hasattr(predictor, "stream")
 
 
 def render(

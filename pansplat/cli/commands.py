@@ -14,6 +14,7 @@ from tyro.conf import Positional, arg, subcommand
 
 Out = Annotated[Path, arg(aliases=["-o"])]
 Compat = Literal["trained", "official", "fixed"]
+Precision = Literal["float32", "bfloat16"]
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,16 @@ class Predict:
     compat: Compat = "trained"
     """For a network: official computes what the original code does, fixed corrects its defects; by default as
     the weights were trained, so original ones as official."""
+    precision: Precision = "float32"
+    """Number type of a network's convolutions; bfloat16 is faster where the processor has it, and less exact."""
     height: int = 512
-    """Panoramas are resized to this height, pixels."""
+    """Panoramas are resized to this height, pixels. A network writes taller ones than 512 tile by tile, in
+    bounded memory, and keeps none beside the pair."""
+    degree: int | None = None
+    """Highest degree of spherical harmonics to write, 0 to 4; by default all. The file of 4K panoramas is 5 GB with
+    degree 4, 1 GB with 0."""
+    min_opacity: float = 0.0
+    """Leave out Gaussians of less opacity; below 0.004 they cannot be seen."""
     no_cache: bool = False
     """Predict anew even when the result is kept beside the pair."""
     choice: PairChoice = field(default_factory=PairChoice)

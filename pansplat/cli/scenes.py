@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import time
 from collections.abc import Iterator
@@ -15,11 +16,14 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from pansplat import pipeline
 from pansplat.cli.commands import Compat, PairChoice, Predict
 from pansplat.errors import InputError
+from pansplat.gaussians.prune import prune
 
 if TYPE_CHECKING:
     from pansplat.data.pairs import Pair
     from pansplat.gaussians.scene import Scene
     from pansplat.model import predictor
+
+_HELD_HEIGHT = 512  # networks write taller predictions tile by tile, and keep none
 
 
 def run_predict(command: Predict) -> int:
@@ -28,13 +32,36 @@ def run_predict(command: Predict) -> int:
         raise InputError(f"--out must be a .ply file in an existing folder, got {command.out}")
     require_height(command.height)
     pair = choose_pair(command.path, command.choice)
-    model = pipeline.load_model(command.model, compat=command.compat)
+    if command.degree is not None and not 0 <= command.degree <= 4:
+        raise InputError(f"--degree must be 0 to 4, got {command.degree}")
+    if not 0 <= command.min_opacity < 1:
+        raise InputError(f"--min-opacity must be at least 0 and less than 1, got {command.min_opacity}")
+    model = pipeline.load_model(command.model, compat=command.compat, precision=command.precision)
     began = time.perf_counter()
-    scene = predict(pair, model, command.height, cache=not command.no_cache)
+    count = _predict_to_file(command, pair, model)
     took = time.perf_counter() - began
-    pipeline.save(scene, command.out)
-    print(f"{command.out}: {len(scene.gaussians):,} Gaussians from {', '.join(scene.names)} in {took:.1f} s")
+    names = ", ".join(panorama.name for panorama in pair.context)
+    print(f"{command.out}: {count:,} Gaussians from {names} in {took:.1f} s")
     return 0
+
+
+def _predict_to_file(command: Predict, pair: Pair, model: predictor.Predictor) -> int:
+    """Write the prediction, tile by tile where it is large; how many Gaussians it has."""
+    if command.height > _HELD_HEIGHT and pipeline.streams(model):
+        with progress_bar() as progress:
+            return pipeline.predict_to_file(
+                pair,
+                command.out,
+                model,
+                height=command.height,
+                degree=command.degree,
+                min_opacity=command.min_opacity,
+                progress=progress,
+            )
+    scene = predict(pair, model, command.height, cache=not command.no_cache)
+    gaussians = prune(scene.gaussians, degree=command.degree, min_opacity=command.min_opacity)
+    pipeline.save(dataclasses.replace(scene, gaussians=gaussians), command.out)
+    return len(gaussians)
 
 
 def choose_pair(path: Path, choice: PairChoice) -> Pair:

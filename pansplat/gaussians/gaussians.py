@@ -92,3 +92,11 @@ class Gaussians:
         if len(degrees) > 1:
             raise ValueError(f"`parts` must share one SH degree, got {degrees}")
         return Gaussians(*(torch.cat([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Gaussians)))
+
+
+def no_gaussians(degree: int = 0) -> Gaussians:
+    """An empty set."""
+    labels = torch.zeros(0, dtype=torch.uint8)
+    harmonics = torch.zeros(0, (degree + 1) ** 2, 3)
+    rows = torch.zeros(0, 3)
+    return Gaussians(rows, rows, torch.zeros(0, 4), torch.zeros(0), harmonics, labels, labels)

@@ -21,7 +21,9 @@ from pansplat.model.layers import (
     AttentionPrecision,
     Compat,
     PanoramaConv2d,
+    Precision,
     border_of,
+    convolving,
     require_rigid,
     require_size,
     require_views,
@@ -127,10 +129,15 @@ class SphericalCostVolume(nn.Module):
     """Inverse depth of every view, coarse to fine."""
 
     def __init__(
-        self, config: CostVolumeConfig, compat: Compat, attention_precision: AttentionPrecision = "float32"
+        self,
+        config: CostVolumeConfig,
+        compat: Compat,
+        attention_precision: AttentionPrecision = "float32",
+        precision: Precision = "float32",
     ) -> None:
         super().__init__()
         self.config = config
+        self.precision: Precision = precision
         self.compat: Compat = compat
         # Keys are the paper's numbers of the levels.
         self.levels = nn.ModuleDict()
@@ -179,8 +186,9 @@ class SphericalCostVolume(nn.Module):
                 step = (bounds[1] - bounds[0]) / max(1, first_count - 1) / 2 ** len(done)
                 candidates = candidates_about(centre, step, bounds, sweep.candidates)
             volume = correlate_views(level_features, candidates, cam2world, self.compat)
-            logits = self.levels[str(sweep.level)](volume, level_features, centre, mono_features)
-            done.append(regress(sweep.level, logits, candidates))
+            with convolving(self.precision, volume.device):
+                logits = self.levels[str(sweep.level)](volume, level_features, centre, mono_features)
+            done.append(regress(sweep.level, logits.to(level_features.dtype), candidates))
         return Depths(tuple(done))
 
 

@@ -14,7 +14,9 @@ from pansplat.model.layers import (
     AttentionPrecision,
     Compat,
     PanoramaConv2d,
+    Precision,
     border_of,
+    convolving,
     normalized_convolution,
     require_size,
     require_views,
@@ -40,10 +42,15 @@ class FeaturePyramid(nn.Module):
     """Features of levels 3 to 0, at 1/8 to 1/1 of the image; paper's F^l."""
 
     def __init__(
-        self, config: FeaturePyramidConfig, compat: Compat, attention_precision: AttentionPrecision = "float32"
+        self,
+        config: FeaturePyramidConfig,
+        compat: Compat,
+        attention_precision: AttentionPrecision = "float32",
+        precision: Precision = "float32",
     ) -> None:
         super().__init__()
         self.compat: Compat = compat
+        self.precision: Precision = precision
         self.encoder = Encoder(config.channels, border_of(compat))
         self.transformer = Transformer(config.transformer, compat, attention_precision)
         self.decoder = Decoder(config.channels, compat)
@@ -59,11 +66,12 @@ class FeaturePyramid(nn.Module):
         require_views(images.shape[1], self.compat)
         height, width = images.shape[-2:]
         require_size(height, width, 32 if self.compat == "fixed" else 16)
-        fine_to_coarse = self.encoder(normalize(images.flatten(0, 1)))
-        coarsest = fine_to_coarse[-1].unflatten(0, batch_and_view)
-        refined = self.transformer(coarsest).flatten(0, 1)
-        coarse_to_fine = self.decoder(refined, fine_to_coarse[:-1])
-        return [features.unflatten(0, batch_and_view) for features in coarse_to_fine]
+        with convolving(self.precision, images.device):
+            fine_to_coarse = self.encoder(normalize(images.flatten(0, 1)))
+            coarsest = fine_to_coarse[-1].unflatten(0, batch_and_view).to(images.dtype)
+            refined = self.transformer(coarsest).flatten(0, 1)
+            coarse_to_fine = self.decoder(refined, fine_to_coarse[:-1])
+        return [features.unflatten(0, batch_and_view).to(images.dtype) for features in coarse_to_fine]
 
 
 class Encoder(nn.Module):

@@ -24,11 +24,9 @@ from pansplat.gaussians.gaussians import Gaussians
 from pansplat.model.adapter import AdapterConfig, adapt
 from pansplat.model.cost_volume import Depths, LevelDepth
 from pansplat.model.lattice import Lattice, lattice_uv, move_points
-from pansplat.model.layers import Compat
+from pansplat.model.layers import Compat, Precision, convolving
 from pansplat.model.tiles import Margins, Tile, Window, cut, sample, sample_whole, tile_grid
 from pansplat.model.winograd import FastConv3x3
-
-Precision = Literal["float32", "bfloat16"]
 
 
 @dataclass(frozen=True)
@@ -101,7 +99,9 @@ class LevelHead(nn.Module):
         self.linear = nn.Linear(hidden, outputs) if lattice == "fibonacci" else nn.Identity()
 
     def forward(self, inputs: Sequence[Float[Tensor, "_ height width"]]) -> Float[Tensor, "1 hidden h w"]:
-        maps = joined(inputs)  # the largest of all maps: here, so that it goes when it has been read
+        kind = inputs[0].device.type
+        dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else inputs[0].dtype
+        maps = joined(inputs, dtype)  # the largest of all maps: here, so that it goes when it has been read
         for index, conv in enumerate(self.convs):
             if index > 0:
                 maps = functional.gelu(maps)
@@ -216,7 +216,7 @@ class GaussianHeads(nn.Module):
             if passed_on is not None:
                 passed_on = _twice_as_fine(passed_on, self.margins)
                 inputs.append(passed_on[0])
-            with torch.autocast(feature.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
+            with convolving(self.precision, feature.device):
                 refined = head(inputs).to(feature.dtype)
             if passed_on is not None:
                 lost = self.margins.input - self.margins.output
@@ -315,11 +315,13 @@ def whole(parts: Sequence[TileGaussians], compat: Compat) -> list[Gaussians]:
     return [gaussians.select(order.to(gaussians.means.device)) for gaussians in items]
 
 
-def joined(maps: Sequence[Float[Tensor, "_ height width"]]) -> Float[Tensor, "1 channel height width"]:
+def joined(
+    maps: Sequence[Float[Tensor, "_ height width"]], dtype: torch.dtype
+) -> Float[Tensor, "1 channel height width"]:
     """Maps as channels of one, channels last: a fifth of the time of `torch.cat` and a change of layout."""
     channels = [len(part) for part in maps]
     shape = (1, sum(channels), *maps[0].shape[1:])
-    whole = torch.empty(shape, dtype=maps[0].dtype, device=maps[0].device, memory_format=torch.channels_last)
+    whole = torch.empty(shape, dtype=dtype, device=maps[0].device, memory_format=torch.channels_last)
     for start, part in zip(itertools.accumulate([0, *channels]), maps, strict=False):
         whole[0, start : start + len(part)] = part
     return whole

@@ -20,7 +20,16 @@ from pansplat.geometry.pose import orthonormal_error
 from pansplat.geometry.wrap import Border
 
 Compat = Literal["official", "fixed"]
+Precision = Literal["float32", "bfloat16"]
 AttentionPrecision = Literal["float32", "bfloat16"]
+
+
+def convolving(precision: Precision, device: torch.device) -> torch.autocast:
+    """Within it, "bfloat16" rounds what convolutions and linear layers read and give; their sums are in float32.
+
+    Attention keeps to its own precision, see `attend`. Normalisations sum in float32.
+    """
+    return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16")
 
 
 def border_of(compat: Compat) -> Border:
@@ -140,8 +149,16 @@ def attend(
     Precision "bfloat16" rounds the inputs and the output to bfloat16, as the original's kernel does; on a CPU the
     sums between are in float32.
     """
+    with torch.autocast(queries.device.type, enabled=False):
+        return _attend(queries, keys, values, mask, precision)
+
+
+def _attend(
+    queries: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None, precision: AttentionPrecision
+) -> Tensor:
     if precision == "float32":
-        return functional.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
+        exact = [tensor.to(torch.promote_types(tensor.dtype, torch.float32)) for tensor in (queries, keys, values)]
+        return functional.scaled_dot_product_attention(*exact, attn_mask=mask)
     kept = queries.dtype
     rounded = [tensor.to(torch.bfloat16) for tensor in (queries, keys, values)]
     bias = None if mask is None else mask.to(torch.bfloat16)

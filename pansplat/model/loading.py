@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import get_args
 
 import torch
 from torch import Tensor
@@ -19,7 +20,7 @@ from pansplat.model.checkpoint import (
     load_weights,
     read_checkpoint,
 )
-from pansplat.model.layers import Compat
+from pansplat.model.layers import AttentionPrecision, Compat, Precision
 from pansplat.model.mvsplat import MVSplat, MVSplatConfig
 from pansplat.model.network import NetworkPredictor
 from pansplat.model.official_names import Model
@@ -32,20 +33,24 @@ _NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {
 }
 
 
-def load_predictor(path: str | Path, compat: CompatChoice = "trained") -> NetworkPredictor:
+def load_predictor(
+    path: str | Path, compat: CompatChoice = "trained", *, precision: Precision = "float32"
+) -> NetworkPredictor:
     """The predictor whose weights a file holds.
 
     Args:
         path: a .safetensors of `pansplat convert` or of training, or an original Lightning checkpoint.
         compat: "official" computes what the original does, "fixed" corrects its defects, "trained" is the one that
             the weights were trained with: for original checkpoints "official".
+        precision: number type of PanSplat's convolutions; see docs/bench_model.md for what bfloat16 costs and gains.
 
     Raises:
-        InputError: when the file cannot be used.
+        InputError: when the file cannot be used, or the processor has no instructions for bfloat16.
     """
     path = Path(path)
+    require_precision(precision)
     weights = from_original(read_checkpoint(path), path) if path.suffix.lower() in CHECKPOINTS else load_weights(path)
-    network = build_network(weights, weights.compat if compat == "trained" else compat, path)
+    network = build_network(weights, weights.compat if compat == "trained" else compat, path, precision=precision)
     return NetworkPredictor(weights.model, network)
 
 
@@ -69,19 +74,57 @@ def describe(model: Model, config: object, tensors: dict[str, Tensor], *, compat
     return WeightsFile(model, settings, compat, tensors)
 
 
-def build_network(weights: WeightsFile, compat: Compat, source: object) -> PanSplat | MVSplat:
+def require_precision(precision: str) -> None:
+    """Refuse number types that this processor can only imitate, slowly.
+
+    Raises:
+        InputError: no such precision, or no instructions for it.
+    """
+    if precision not in get_args(Precision):
+        raise InputError(f"`precision` must be {' or '.join(get_args(Precision))}, got {precision!r}")
+    if precision == "bfloat16" and not has_bfloat16():
+        raise InputError(
+            "`precision` bfloat16 needs a processor with bfloat16 instructions (AVX512_BF16, AMX), this one has none "
+            "and would be slower than with float32; use float32"
+        )
+
+
+def has_bfloat16() -> bool:
+    """Whether the processor multiplies bfloat16 numbers by itself."""
+    tell = getattr(torch.cpu, "get_capabilities", None)
+    if tell is None:  # an older torch does not tell
+        return True
+    facts = tell()
+    return any(facts.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16"))
+
+
+def build_network(
+    weights: WeightsFile,
+    compat: Compat,
+    source: object,
+    *,
+    precision: Precision = "float32",
+    attention_precision: AttentionPrecision = "float32",
+) -> PanSplat | MVSplat:
     """The network with its weights, in eval mode.
 
     Raises:
         InputError: when the file's settings or tensors fit no network.
     """
-    network = build_empty(weights, compat, source)
+    network = build_empty(weights, compat, source, precision=precision, attention_precision=attention_precision)
     require_shapes(weights.tensors, network.state_dict(), source)
     network.load_state_dict(weights.tensors, strict=True, assign=True)
     return network.eval()
 
 
-def build_empty(weights: WeightsFile, compat: Compat, source: object) -> PanSplat | MVSplat:
+def build_empty(
+    weights: WeightsFile,
+    compat: Compat,
+    source: object,
+    *,
+    precision: Precision = "float32",
+    attention_precision: AttentionPrecision = "float32",
+) -> PanSplat | MVSplat:
     """The network without memory for its weights; random numbers are not drawn.
 
     Raises:
@@ -97,4 +140,8 @@ def build_empty(weights: WeightsFile, compat: Compat, source: object) -> PanSpla
     except (TypeError, ValueError) as error:
         raise InputError(f"{source}: needed settings of a {weights.model} network, got '{error}'") from error
     with torch.device("meta"):
-        return kind(config, compat)
+        if kind is PanSplat:
+            return PanSplat(config, compat, precision=precision, attention_precision=attention_precision)
+        if precision != "float32":
+            raise InputError(f"{source}: a {weights.model} network runs in float32 only, got precision {precision!r}")
+        return MVSplat(config, compat, attention_precision=attention_precision)

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.model.cost_volume import CostVolumeConfig, Depths, SphericalCostVolume
 from pansplat.model.feature_pyramid import FeaturePyramid, FeaturePyramidConfig
-from pansplat.model.heads import GaussianHeads, HeadsConfig, Precision, TileGaussians
-from pansplat.model.layers import AttentionPrecision, Compat, resize
+from pansplat.model.heads import GaussianHeads, HeadsConfig, TileGaussians
+from pansplat.model.layers import AttentionPrecision, Compat, Precision, convolving, resize
 from pansplat.model.mono_depth import MonocularDepth
 
 MATCHING_HEIGHT = 512
@@ -78,7 +78,7 @@ class PanSplat(nn.Module):
     Args:
         compat: "official" computes what the original does, its defects included, so that its weights give its
             numbers; "fixed" corrects them.
-        precision: number type of the heads' convolutions.
+        precision: number type of all convolutions; depths, correlations and positions stay as they are.
         attention_precision: what attention rounds its inputs to; the original's was bfloat16.
     """
 
@@ -93,9 +93,11 @@ class PanSplat(nn.Module):
         super().__init__()
         config = config or PanSplatConfig()
         self.config, self.compat = config, compat
-        self.features = FeaturePyramid(config.features, compat, attention_precision)
+        self.precision: Precision = precision
+        self.attention_precision: AttentionPrecision = attention_precision
+        self.features = FeaturePyramid(config.features, compat, attention_precision, precision)
         self.mono_depth = MonocularDepth(compat) if config.cost_volume.mono_channels else None
-        self.cost_volume = SphericalCostVolume(config.cost_volume, compat, attention_precision)
+        self.cost_volume = SphericalCostVolume(config.cost_volume, compat, attention_precision, precision)
         self.heads = GaussianHeads(config.heads, compat, precision)
 
     def forward(
@@ -126,7 +128,10 @@ class PanSplat(nn.Module):
         """Features and depths of all views: everything before the heads."""
         small = self._matching_size(images)
         features = self.features(small)
-        mono_features = self.mono_depth(images) if self.mono_depth is not None else None
+        mono_features = None
+        if self.mono_depth is not None:
+            with convolving(self.precision, images.device):
+                mono_features = self.mono_depth(images).to(images.dtype)
         depths = self.cost_volume(features, cam2world, near, far, mono_features)
         return Matched(images, features, depths, cam2world, near, far)
 

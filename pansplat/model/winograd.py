@@ -14,7 +14,7 @@ import inspect
 import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, Literal
 
 import numba as nb
 import numpy as np
@@ -39,10 +39,15 @@ _WEIGHT_TRANSFORM = (
 
 
 class FastConv3x3(nn.Conv2d):
-    """A 3x3 convolution that is computed in blocks where that is faster and no gradient is asked for."""
+    """A 3x3 convolution that is computed in blocks where that is faster and no gradient is asked for.
+
+    Attributes:
+        method: "direct" never takes blocks, to compare with.
+    """
 
     def __init__(self, inputs: int, outputs: int, *, padding: int) -> None:
         super().__init__(inputs, outputs, 3, padding=padding)
+        self.method: Literal["fastest", "direct"] = "fastest"
         self._transformed: tuple[Tensor, int, Tensor] | None = None
 
     def forward(self, input: Float[Tensor, "batch channel height width"]) -> Float[Tensor, "batch c h w"]:
@@ -57,7 +62,8 @@ class FastConv3x3(nn.Conv2d):
         needs_gradient = torch.is_grad_enabled() and (input.requires_grad or self.weight.requires_grad)
         plain = input.device.type == "cpu" and input.dtype == self.weight.dtype == torch.float32
         large = input.shape[-2] * input.shape[-1] >= _LEAST_OUTPUTS and min(self.weight.shape[:2]) >= _LEAST_CHANNELS
-        return plain and large and not needs_gradient and not torch.is_autocast_enabled("cpu")
+        wanted = self.method == "fastest" and not needs_gradient
+        return wanted and plain and large and not torch.is_autocast_enabled("cpu")
 
     def _coefficients(self) -> Float[Tensor, "36 inputs outputs"]:
         """The transformed weights, kept until the weights change."""
