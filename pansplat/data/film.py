@@ -51,6 +51,7 @@ class Film:
             )
         found: dict[int, NDArray[np.uint8]] = {}
         with _opened(self.path) as film:
+            film.streams.video[0].thread_type = "AUTO"
             for group in _groups(wanted):
                 found |= self._decode(film, group, self.stamps[group[0]])
                 missing = [frame for frame in group if frame not in found]
@@ -72,7 +73,6 @@ class Film:
         last = max(numbers)
         found = {}
         stream = film.streams.video[0]
-        stream.thread_type = "AUTO"
         try:
             film.seek(seek_to, stream=stream)
             for picture in film.decode(stream):

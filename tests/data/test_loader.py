@@ -1,0 +1,115 @@
+"""Batches are decided by seed and step alone; what cannot be read is left out, counted and named."""
+
+import itertools
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from pansplat.data.augment import Augmentation
+from pansplat.data.dataset import TripletSource
+from pansplat.data.images import write_image
+from pansplat.data.loader import Loader
+from pansplat.data.sample import Batch
+from pansplat.data.synthetic import GeneratedScenes
+from pansplat.data.triplets import read_game_maps
+from pansplat.errors import InputError
+
+
+def _triplets(folder: Path, count: int) -> TripletSource:
+    for k in range(count):
+        for i in range(3):
+            write_image(folder / f"{k}_{i}.png", torch.full((3, 8, 16), (3 * k + i) / 40))
+        poses = [[[1, 0, 0, i], [0, 1, 0, 0], [0, 0, 1, k], [0, 0, 0, 1]] for i in range(3)]
+        (folder / f"{k}.json").write_text(json.dumps({"c2w": poses}))
+    return TripletSource(read_game_maps(folder))
+
+
+def _take(loader: Loader, count: int, step: int = 0) -> list[Batch]:
+    return list(itertools.islice(loader.batches(step), count))
+
+
+def _equal(first: list[Batch], second: list[Batch]) -> bool:
+    return all(
+        a.names == b.names and torch.equal(a.images, b.images) and torch.equal(a.cam2world, b.cam2world)
+        for a, b in zip(first, second, strict=True)
+    )
+
+
+def test_each_epoch_is_another_order_of_all_samples(tmp_path: Path) -> None:
+    loader = Loader(_triplets(tmp_path, 6), height=8, batch_size=2)
+    assert loader.steps_per_epoch == 3
+    names = [name for batch in _take(loader, 9) for name in batch.names]
+    epochs = [names[6 * k : 6 * k + 6] for k in range(3)]
+    assert all(sorted(epoch) == [str(k) for k in range(6)] for epoch in epochs)
+    assert len(set(map(tuple, epochs))) > 1
+
+
+def test_a_run_resumed_at_a_step_goes_on_as_if_never_stopped(tmp_path: Path) -> None:
+    loader = Loader(_triplets(tmp_path, 5), height=8, batch_size=2, seed=3, augmentation=Augmentation(tilt_degrees=4))
+    whole = _take(loader, 7)
+    assert _equal(_take(loader, 3, step=4), whole[4:])
+    assert not _equal(_take(loader, 3, step=3), whole[4:])
+
+
+def test_the_number_of_workers_does_not_matter(tmp_path: Path) -> None:
+    scenes = GeneratedScenes(count=5, samples=1)
+    options = {"height": 8, "batch_size": 2, "seed": 1, "augmentation": Augmentation(exposure=0.3)}
+    alone = _take(Loader(scenes, **options), 3)
+    assert _equal(_take(Loader(scenes, workers=2, **options), 3), alone)
+    assert not _equal(_take(Loader(scenes, **(options | {"seed": 2})), 3), alone)
+
+
+def test_processes_share_each_step(tmp_path: Path) -> None:
+    source = _triplets(tmp_path, 8)
+    whole = _take(Loader(source, height=8, batch_size=4), 2)
+    parts = [_take(Loader(source, height=8, batch_size=2, rank=rank, world_size=2), 2) for rank in range(2)]
+    for batch, first, second in zip(whole, *parts, strict=True):
+        assert batch.names == first.names + second.names
+
+
+def test_unreadable_samples_are_left_out_counted_and_named(tmp_path: Path) -> None:
+    source = _triplets(tmp_path, 6)
+    (tmp_path / "2_1.png").write_bytes(b"")
+    (tmp_path / "4_0.png").write_bytes((tmp_path / "4_0.png").read_bytes()[:40])
+    loader = Loader(source, height=8, batch_size=3)
+    with pytest.warns(UserWarning, match="left out sample") as told:
+        batches = _take(loader, 4)
+    assert all(len(batch) == 3 for batch in batches)
+    assert not {"2", "4"} & {name for batch in batches for name in batch.names}
+    assert len(told) == 2 and any("2_1.png" in str(w.message) for w in told)
+    assert sorted(message.split(":")[0].rsplit("/")[-1] for message in loader.skipped) == ["2_1.png", "4_0.png"]
+    assert all(count >= 2 for count in loader.skipped.values())  # in each of the two epochs
+    with pytest.warns(UserWarning):
+        assert _equal(_take(Loader(source, height=8, batch_size=3), 2, step=2), batches[2:])
+
+
+def test_if_all_are_unreadable_the_error_names_some(tmp_path: Path) -> None:
+    source = _triplets(tmp_path, 4)
+    for path in tmp_path.glob("*_1.png"):
+        path.write_bytes(b"")
+    with (
+        pytest.warns(UserWarning, match="left out"),
+        pytest.raises(InputError, match=r"got 4 in a row that cannot \(of 4\)(.|\n)*_1\.png"),
+    ):
+        _take(Loader(source, height=8, batch_size=1), 1)
+
+
+def test_a_mistake_in_the_code_is_not_taken_for_a_bad_file() -> None:
+    class Broken:
+        def __len__(self) -> int:
+            return 3
+
+        def sample(self, index: int, height: int, seed: int):
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        _take(Loader(Broken(), height=8, batch_size=1), 1)
+
+
+def test_loaders_of_nothing_are_refused() -> None:
+    with pytest.raises(InputError, match="empty source"):
+        Loader(GeneratedScenes(count=0), height=8, batch_size=1)
+    with pytest.raises(InputError, match="batch_size >= 1"):
+        Loader(GeneratedScenes(), height=8, batch_size=0)
