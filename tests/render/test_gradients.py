@@ -1,13 +1,16 @@
 """Gradients: gradcheck for every input, equality with the dense renderer's, zero where nothing is drawn."""
 
 import dataclasses
+import functools
 import math
 
 import pytest
 import torch
 
 from pansplat.gaussians.gaussians import Gaussians
-from pansplat.render import rasterize
+from pansplat.render import rasterize as _rasterize
+
+rasterize = functools.partial(_rasterize, backend="torch")  # float32 too
 
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 

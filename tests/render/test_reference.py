@@ -1,6 +1,7 @@
 """The rasteriser against closed forms, a dense float64 renderer, and the laws that pictures obey."""
 
 import dataclasses
+import functools
 import math
 
 import pytest
@@ -9,7 +10,9 @@ import torch
 from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.render import rasterize
+from pansplat.render import rasterize as _rasterize
+
+rasterize = functools.partial(_rasterize, backend="torch")  # float32 too
 
 _ORIGIN = torch.eye(4, dtype=torch.float64)
 
