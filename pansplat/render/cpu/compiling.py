@@ -1,10 +1,13 @@
 """How the kernels are compiled: once a machine, kept on disk, and announced when it takes a while."""
 
 import contextlib
+import hashlib
 import inspect
+import re
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numba as nb
@@ -19,13 +22,37 @@ _OPTIONS = {
     "fastmath": {"contract", "nsz"},  # sums keep their order: the same bits on any number of threads
 }
 
+_IMPORTED = re.compile(rf"^(?:from|import) {re.escape(__package__)}(?:\.(\w+)| import ([\w, ]+))", re.MULTILINE)
 _told = False
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile a function at its first call, without the interpreter's lock, and keep the code on disk."""
+    """Compile a function at its first call, without the interpreter's lock, and keep the code on disk.
+
+    Where nothing can be written, it is compiled once a process.
+    """
     # The tests' check of annotations wraps every function; numba needs the bare one.
-    return nb.njit(cache=True, **_OPTIONS)(inspect.unwrap(function))
+    function = inspect.unwrap(function)
+    try:
+        compiled = nb.njit(cache=True, **_OPTIONS)(function)
+    except RuntimeError:  # no folder to keep it in
+        return nb.njit(**_OPTIONS)(function)
+    # Numba looks only at the file that a kernel stands in; what is compiled into it stands in others.
+    compiled._cache._cache_file._source_stamp = _stamp(Path(inspect.getfile(function)))
+    return compiled
+
+
+def _stamp(module: Path) -> str:
+    """A fingerprint of a module and of all those of this package that it uses, directly or not."""
+    found, waiting = {}, [module]
+    while waiting:
+        path = waiting.pop()
+        if path not in found and path.exists():
+            found[path] = path.read_bytes()
+            names = " ".join("".join(groups) for groups in _IMPORTED.findall(found[path].decode()))
+            waiting += [Path(__file__).with_name(f"{name}.py") for name in re.findall(r"\w+", names)]
+    texts = (found[path] for path in sorted(found, key=lambda path: path.name))
+    return hashlib.sha256(b"\0".join(texts)).hexdigest()
 
 
 def inlined(function: Callable[..., Any]) -> Any:

@@ -145,7 +145,7 @@ class _Draw(torch.autograd.Function):
                 for number, picture in enumerate(pictures)
             ]
         notes.dropped, notes.near = observed.dropped, observed.near
-        notes.bytes += sums.nbytes + sum(part.nbytes for part in observed[:3])
+        notes.bytes += sums.nbytes + sum(part.nbytes for part in observed[:4])
         result = torch.from_numpy(sums)
         if needs_grad:
             ctx.save_for_backward(*tensors, pose, result)

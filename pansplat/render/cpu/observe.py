@@ -266,7 +266,7 @@ def _round(rows, singles):
 
 
 @inlined
-def _write_block(rows, singles, start, count, records, values, radii, tally):
+def _write_block(rows, singles, start, count, records, values, radii, drawn, tally):
     radius_column = values.shape[1] - 1
     for i in range(count):
         g = start + i
@@ -276,6 +276,7 @@ def _write_block(rows, singles, start, count, records, values, radii, tally):
     dropped, near = 0, 0
     for i in range(count):
         radii[start + i] = rows[RADIUS, i]
+        drawn[start + i] = singles[layout.LEVEL, i] > CULLED
         dropped += rows[SOUND, i] == 0
         near += rows[SOUND, i] < 0
     tally[DROPPED] += dropped
@@ -285,7 +286,7 @@ def _write_block(rows, singles, start, count, records, values, radii, tally):
 @kernel
 def _observe(
     piece, means, quats, scales, covariances, opacities, harmonics, harmonic_bits,
-    pose, spread, compensate, near, records, values, radii, tallies,
+    pose, spread, compensate, near, records, values, radii, drawn, tallies,
 ):  # fmt: skip
     rows = np.ones((ROWS + 1, LANES))
     bits = rows.view(np.int64)
@@ -300,7 +301,7 @@ def _observe(
         find_logs(rows, bits, PEAK, LOG)
         fill_basis(rows, WORLD, harmonics.shape[1], basis)
         _round(rows, singles)
-        _write_block(rows, singles, start, count, records, values, radii, tallies[piece])
+        _write_block(rows, singles, start, count, records, values, radii, drawn, tallies[piece])
         colours(harmonics, start, count, basis, values)
 
 
@@ -310,6 +311,7 @@ class Observed(NamedTuple):
     Attributes:
         records, values: see records.py; the level is `CULLED` where a Gaussian is not drawn.
         radii: (n,) float64, metres.
+        drawn: (n,) uint8, 0 for Gaussians that are left out whatever the picture.
         dropped: how many hold an unusable number.
         near: how many are too near.
     """
@@ -317,6 +319,7 @@ class Observed(NamedTuple):
     records: np.ndarray
     values: np.ndarray
     radii: np.ndarray
+    drawn: np.ndarray
     dropped: int
     near: int
 
@@ -325,14 +328,14 @@ def observe(fields: Fields, camera: Camera, lease: Lease, threads: int) -> Obser
     """The Gaussians as the camera sees them, in leased arrays."""
     num, channels = len(fields.means), fields.harmonics.shape[2]
     records, radii = lease.array((num, layout.FIELDS), np.float32), lease.array(num, np.float64)
-    values = lease.array((num, channels + 1), np.float32)
+    values, drawn = lease.array((num, channels + 1), np.float32), lease.array(num, np.uint8)
     pieces = -(-num // PIECE)
     tallies = np.zeros((pieces, 2), np.int64)
     harmonic_bits = fields.harmonics.reshape(-1).view(np.uint32)
 
     def work(piece: int) -> None:
-        _observe(piece, *fields, harmonic_bits, *camera, records, values, radii, tallies)
+        _observe(piece, *fields, harmonic_bits, *camera, records, values, radii, drawn, tallies)
 
     share(work, pieces, threads)
     dropped, near = (int(count) for count in tallies.sum(axis=0))
-    return Observed(records, values, radii, dropped, near)
+    return Observed(records, values, radii, drawn, dropped, near)

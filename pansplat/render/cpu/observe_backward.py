@@ -23,7 +23,6 @@ from pansplat.render.cpu.compiling import inlined, kernel
 from pansplat.render.cpu.forms import LEAST_RATIO, cross, dot, ray_forms
 from pansplat.render.cpu.harmonics import add_slopes, colour_gradients, fill_basis
 from pansplat.render.cpu.observe import (
-    CULLED,
     LANES,
     PIECE,
     RADIUS,
@@ -67,27 +66,30 @@ class Gradients(NamedTuple):
 
 
 @inlined
-def _read_gradients(grad_records, grad_values, totals, offsets, start, count, rows, colour_grads):
-    """Sum each Gaussian's slots, in their order, in the units of docs/rendering.md; zeros where not drawn."""
+def _read_gradients(grad_records, grad_values, totals, offsets, start, count, rows, slot_sums, colour_grads):
+    """Sum each Gaussian's slots, in their order, in the units of docs/rendering.md; zeros where it has none."""
     channels = colour_grads.shape[1]
     unit, inverse_unit = math.sqrt(layout.UNIT), 1 / math.sqrt(layout.UNIT)
+    slot_sums[:] = 0
+    colour_grads[:] = 0
     for i in range(count):
-        for j in range(14):
-            rows[GIVEN + j, i] = 0.0
-        for c in range(channels):
-            colour_grads[i, c] = 0
-        if totals.shape[0] > 0:
-            rows[GIVEN + 12, i] = totals[start + i, 9]
-        for slot in range(offsets[start + i], offsets[start + i + 1]):
+        g, radius = start + i, 0.0
+        for slot in range(offsets[g], offsets[g + 1]):
             for c in range(channels):
                 colour_grads[i, c] += grad_values[slot, c]
-            rows[GIVEN_RADIUS, i] += grad_values[slot, channels]
-            if totals.shape[0] > 0:
-                continue
-            for axis in range(3):
-                rows[GIVEN + axis, i] += grad_records[slot, layout.DIRECTION + axis]
-            for j in range(10):
-                rows[GIVEN + 3 + j, i] += grad_records[slot, layout.FIRST + j]
+            radius += grad_values[slot, channels]
+        rows[GIVEN_RADIUS, i] = radius
+        if totals.shape[0] > 0:
+            slot_sums[i, layout.LEVEL] = totals[g, 9]
+            continue
+        for slot in range(offsets[g], offsets[g + 1]):
+            for j in range(layout.FIELDS):  # neighbours in memory: one vector
+                slot_sums[i, j] += grad_records[slot, j]
+    for i in range(LANES):
+        for axis in range(3):
+            rows[GIVEN + axis, i] = slot_sums[i, layout.DIRECTION + axis]
+        for j in range(10):
+            rows[GIVEN + 3 + j, i] = slot_sums[i, layout.FIRST + j]
     for i in range(LANES):
         for j in range(3, 9):
             rows[GIVEN + j, i] *= unit
@@ -207,10 +209,10 @@ def _means_backward(rows, sums):
 
 
 @inlined
-def _clear_undrawn(records, start, count, rows, drawn):
+def _clear_undrawn(scene_drawn, start, count, rows, drawn):
     """Give Gaussians that are not drawn any finite shape, since their gradients are 0 and must stay so."""
     for i in range(LANES):
-        drawn[i] = i < count and records[start + i, layout.LEVEL] > CULLED
+        drawn[i] = i < count and scene_drawn[start + i] != 0
         if not drawn[i]:
             rows[WORLD, i], rows[WORLD + 1, i], rows[WORLD + 2, i], rows[RADIUS, i] = 0.0, 0.0, 1.0, 1.0
             for j in range(9):
@@ -222,19 +224,19 @@ def _clear_undrawn(records, start, count, rows, drawn):
 @kernel
 def _chain(
     piece, means, quats, scales, covariances, opacities, harmonics, pose, spread, compensate, near,
-    records, values, grad_records, grad_values, totals, offsets,
+    scene_drawn, values, grad_records, grad_values, totals, offsets,
     grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities, grad_harmonics, pose_sums,
 ):  # fmt: skip
     rows = np.ones((ALL_ROWS, LANES))
-    sums = np.zeros((_POSE, LANES))
+    sums, slot_sums = np.zeros((_POSE, LANES)), np.zeros((LANES, layout.FIELDS))
     basis, slopes = np.zeros((25, LANES), np.float32), np.zeros((25, LANES), np.float32)
     colour_grads, drawn = np.zeros((LANES, harmonics.shape[2]), np.float32), np.zeros(LANES, np.bool_)
     for start in range(piece * PIECE, min((piece + 1) * PIECE, means.shape[0]), LANES):
         count = min(LANES, means.shape[0] - start)
         read_block(means, quats, scales, covariances, opacities, start, count, rows)
-        _read_gradients(grad_records, grad_values, totals, offsets, start, count, rows, colour_grads)
+        _read_gradients(grad_records, grad_values, totals, offsets, start, count, rows, slot_sums, colour_grads)
         find_directions(pose, near, rows)
-        _clear_undrawn(records, start, count, rows, drawn)
+        _clear_undrawn(scene_drawn, start, count, rows, drawn)
         find_shapes(covariances, rows)
         _forms_backward(pose, spread, compensate, rows, sums)
         if totals.shape[0] > 0:
@@ -312,7 +314,7 @@ def chain(
 
     def work(piece: int) -> None:
         _chain(
-            piece, *fields, *camera, observed.records, observed.values, grad_records, grad_values, totals, offsets,
+            piece, *fields, *camera, observed.drawn, observed.values, grad_records, grad_values, totals, offsets,
             *wanted[:6], sums,
         )  # fmt: skip
 
