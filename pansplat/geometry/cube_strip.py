@@ -6,14 +6,12 @@ a row lie on the cube's edges. The network was trained so.
 Source: OFFICIAL.md, sections 2.4 and 5; Jiang et al., UniFuse, https://arxiv.org/abs/2102.03550.
 """
 
-import math
-
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from pansplat.geometry.cubemap import face_rotations
+from pansplat.geometry.cubemap import face_rotations, official_faces
 from pansplat.geometry.equirect import pixel_directions, sample_equirect, uv_from_directions
 
 
@@ -41,7 +39,7 @@ def strip_lookup(height: int) -> Float[Tensor, "height width 3"]:
     by a rounding of rows is held to the edge.
     """
     width = 2 * height
-    face = _face_of_pixels(height)
+    face = official_faces(height)
     rays = pixel_directions(height, width, dtype=torch.float64)
     local = torch.einsum("hwi,hwij->hwj", rays, face_rotations()[face])
     place = (local[..., :2] / local[..., 2:]).clamp(-1, 1)
@@ -60,16 +58,3 @@ def equirect_from_strip(
     grid = torch.stack((2 * column / (6 * size) - 1, 2 * row / size - 1), dim=-1)
     grid = grid.to(strip.dtype).expand(len(strip), *grid.shape)
     return functional.grid_sample(strip, grid, mode="bilinear", padding_mode="border", align_corners=False)
-
-
-def _face_of_pixels(height: int) -> Int[Tensor, "height width"]:
-    """The face that each pixel of a panorama is looked up in; the border to up and down in whole rows."""
-    quarter = height // 2
-    turns = torch.linspace(-math.pi, math.pi, quarter, dtype=torch.float64) / 4
-    rows = height // 2 - torch.round(torch.arctan(torch.cos(turns)) * height / math.pi)
-    # The front face takes the columns in the middle: from 3/8 to 5/8 of the width.
-    shift = 3 * height // 4
-    side = torch.arange(4).repeat_interleave(quarter).roll(shift)
-    above = torch.arange(height)[:, None] < rows.repeat(4).roll(shift)
-    face = torch.where(above, 4, side.expand(height, -1))
-    return torch.where(above.flip(0), 5, face)
