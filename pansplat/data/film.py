@@ -67,7 +67,7 @@ class Film:
 
     def _decode(self, film: Any, frames: Sequence[int], seek_to: int) -> dict[int, NDArray[np.uint8]]:
         """Frames met on the way from the key frame at or before a time."""
-        import av
+        from av.error import FFmpegError
 
         numbers = {self.stamps[frame]: frame for frame in frames}
         last = max(numbers)
@@ -80,7 +80,7 @@ class Film:
                     found[numbers[picture.pts]] = picture.to_ndarray(format="rgb24")
                 if len(found) == len(numbers) or (picture.pts is not None and picture.pts > last):
                     break
-        except av.error.FFmpegError as error:
+        except FFmpegError as error:
             raise InputError(f"{self.path}: needed readable frames, got '{error}'; copy or encode it again.") from error
         return found
 
@@ -93,14 +93,14 @@ def open_film(path: Path | str) -> Film:
     """
     path = Path(path)
     with _opened(path) as film:
-        import av
+        from av.error import FFmpegError
 
         if not film.streams.video:
             raise InputError(f"{path}: needed a video, got a file without pictures; give another file.")
         stream = film.streams.video[0]
         try:
             packets = [packet for packet in film.demux(stream) if packet.size and not packet.is_discard]
-        except av.error.FFmpegError as error:
+        except FFmpegError as error:
             raise InputError(f"{path}: needed a complete video, got '{error}'; copy it again.") from error
         stamps = sorted({packet.pts for packet in packets if packet.pts is not None})
         if not stamps or len(stamps) != len(packets):
@@ -113,10 +113,11 @@ def open_film(path: Path | str) -> Film:
 
 def _opened(path: Path) -> Any:
     import av
+    from av.error import FFmpegError
 
     try:
         return av.open(str(path))
-    except (OSError, av.error.FFmpegError) as error:
+    except (OSError, FFmpegError) as error:
         raise InputError(f"{path}: needed a readable video file, got '{error}'; check it.") from error
 
 

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from multiprocessing.context import BaseContext
 
 import numpy as np
 from torch.utils.data import DataLoader, Dataset
@@ -162,6 +163,6 @@ def _keep(read: list[tuple[Sample | None, list[Skipped]]]) -> list[tuple[Sample 
     return read
 
 
-def _context() -> multiprocessing.context.BaseContext:
+def _context() -> BaseContext:
     """Fresh processes: a copy of this one could inherit locks that its threads hold."""
     return multiprocessing.get_context("spawn" if sys.platform == "win32" else "forkserver")

@@ -47,10 +47,7 @@ class GeneratedScenes:
     def sample(self, index: int, height: int, seed: int = 0) -> Sample:
         """The triplet of that number; `seed` has no part in it."""
         rng = np.random.default_rng((self.seed, index))
-        poses = None
-        while poses is None:
-            scene, plan = build_home(rng)
-            poses = _triplet(scene, plan, self.baseline, rng)
+        scene, poses = self._home(rng)
         pictures = [scene.panorama(pose, height, self.samples) for pose in poses]
         exposure = _exposure([light for light, _ in pictures], rng)
         images = [torch.from_numpy(srgb_from_linear(exposure * light)).permute(2, 0, 1) for light, _ in pictures]
@@ -71,18 +68,26 @@ class GeneratedScenes:
         )
         return Sample(name, context, targets)
 
+    def _home(self, rng: np.random.Generator) -> tuple[GeneratedScene, list[Array]]:
+        """A home in which there is room for the cameras, and their poses."""
+        while True:
+            scene, plan = build_home(rng)
+            poses = _triplet(scene, plan, self.baseline, rng)
+            if poses is not None:
+                return scene, poses
+
 
 def _triplet(
     scene: GeneratedScene, plan: Plan, baseline: tuple[float, float], rng: np.random.Generator
 ) -> list[Array] | None:
     """Poses of an input, the target and the other input, on a free path; None where no place was found."""
-    yaw = rng.uniform(0, 2 * np.pi)
+    yaw, length = rng.uniform(0, 2 * np.pi), rng.uniform(*baseline)
     rotation = np.array(((np.cos(yaw), 0, np.sin(yaw)), (0, 1, 0), (-np.sin(yaw), 0, np.cos(yaw))))
     for _ in range(_PLACES):
         room = plan.rooms[rng.integers(len(plan.rooms))]
         x, z = (rng.uniform(room[k] + _CLEARANCE, room[k + 2] - _CLEARANCE) for k in (0, 1))
         start = np.array((x, -rng.uniform(0.9, 1.8), z))
-        around, length = rng.uniform(0, 2 * np.pi), rng.uniform(*baseline)
+        around = rng.uniform(0, 2 * np.pi)
         way = np.array((np.sin(around), rng.normal(0, 0.05), np.cos(around)))
         end = start + length * way / np.linalg.norm(way)
         middle = start + rng.uniform(0.35, 0.65) * (end - start) + rng.normal(0, 0.04 * length, size=3)

@@ -14,7 +14,7 @@ from pansplat.data.generated.raycast import BOX, CYLINDER, ELLIPSOID, build_tree
 from pansplat.data.generated.shading import LIGHT_NUMBERS, ROOM_NUMBERS, draw_panorama
 
 Array = NDArray[np.float64]
-Vector = Sequence[float]
+Vector = Sequence[float] | Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,13 +119,13 @@ class Builder:
     def _add(
         self, kind: int, centre: Vector, half: Vector, look: int | Sequence[int], yaw: float, pitch: float
     ) -> None:
-        centre, half = np.asarray(centre, np.float64), np.asarray(half, np.float64)
+        middle, reach = np.asarray(centre, np.float64), np.asarray(half, np.float64)
         cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
         rotation = np.array(((cy, 0, sy), (0, 1, 0), (-sy, 0, cy))) @ np.array(((1, 0, 0), (0, cp, -sp), (0, sp, cp)))
-        reach = np.abs(rotation) @ half
+        extent = np.abs(rotation) @ reach
         self.kinds.append(kind)
-        self.maps.append(np.concatenate((rotation.T / half[:, None], centre[:, None]), axis=1).ravel())
-        self.halves.append(half)
+        self.maps.append(np.concatenate((rotation.T / reach[:, None], middle[:, None]), axis=1).ravel())
+        self.halves.append(reach)
         self.faces.append([look] * 6 if isinstance(look, int) else list(look))
-        self.low.append(centre - reach - 1e-6)
-        self.high.append(centre + reach + 1e-6)
+        self.low.append(middle - extent - 1e-6)
+        self.high.append(middle + extent + 1e-6)

@@ -167,9 +167,10 @@ def _picture(material, u, v, w, seed, half_u, half_v):
         cover = min(1.0, max(0.0, 0.5 + inside / max(w, 1e-4)))
         if cover > 0:
             shade = 1 + fractal(x, y, 0.3, 3, w, seed + k)
-            r = r * (1 - cover) + cover * shade * hash_unit(k, 5, seed) ** 1.5
-            g = g * (1 - cover) + cover * shade * hash_unit(k, 6, seed) ** 1.5
-            b = b * (1 - cover) + cover * shade * hash_unit(k, 7, seed) ** 1.5
+            grey = 0.5 * hash_unit(k, 8, seed) ** 2
+            r = r * (1 - cover) + cover * shade * (grey + 0.5 * hash_unit(k, 5, seed) ** 2)
+            g = g * (1 - cover) + cover * shade * (grey + 0.5 * hash_unit(k, 6, seed) ** 2)
+            b = b * (1 - cover) + cover * shade * (grey + 0.5 * hash_unit(k, 7, seed) ** 2)
     return max(r, 0.0), max(g, 0.0), max(b, 0.0)
 
 
@@ -204,9 +205,9 @@ def _books(material, u, v, w, seed):
     hue, light = hash_unit(book, 0, seed), 0.15 + 0.6 * hash_unit(book, 1, seed) ** 2
     gap = 1.0 - 0.6 * shown * pulse(x, 0.12, w / size)
     band = pulse(v / 0.11 + hash_unit(book, 2, seed), 0.25, w / 0.11) if hash_unit(book, 3, seed) < 0.7 else 0.0
-    r = light * (1 + shown * math.sin(6.28 * hue)) * (1 - 0.4 * band) + 0.25 * band
-    g = light * (1 + shown * math.sin(6.28 * hue + 2.1)) * (1 - 0.4 * band) + 0.25 * band
-    b = light * (1 + shown * math.sin(6.28 * hue + 4.2)) * (1 - 0.4 * band) + 0.2 * band
+    r = light * (1 + 0.6 * shown * math.sin(6.28 * hue)) * (1 - 0.4 * band) + 0.25 * band
+    g = light * (1 + 0.6 * shown * math.sin(6.28 * hue + 2.1)) * (1 - 0.4 * band) + 0.25 * band
+    b = light * (1 + 0.6 * shown * math.sin(6.28 * hue + 4.2)) * (1 - 0.4 * band) + 0.2 * band
     return r * gap, g * gap, b * gap
 
 

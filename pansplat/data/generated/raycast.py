@@ -93,7 +93,7 @@ def _cylinder(ox, oy, oz, dx, dy, dz):
 
 
 @nb.njit(**OPTIONS)
-def _meet(kind, m, x, y, z, dx, dy, dz):
+def meet(kind, m, x, y, z, dx, dy, dz):
     """Distance at which a ray enters a body; inf where it does not, negative behind or from within."""
     px, py, pz = x - m[3], y - m[7], z - m[11]
     ox, oy, oz = (
@@ -114,10 +114,13 @@ def _meet(kind, m, x, y, z, dx, dy, dz):
 
 
 @nb.njit(**OPTIONS)
-def first_hit(kinds, maps, bounds, links, x, y, z, dx, dy, dz, most, any_will_do):
-    """The distance to the first body nearer than `most` and its number (-1: none); or to any, for shadows."""
+def first_hit(bodies, x, y, z, dx, dy, dz, most, any_will_do):
+    """The distance to the first body nearer than `most` and its number (-1: none); or to any, for shadows.
+
+    `bodies` are kinds, maps, the tree's corners and links, and room for 64 numbers to work in.
+    """
+    kinds, maps, bounds, links, stack = bodies
     ix, iy, iz = 1 / dx, 1 / dy, 1 / dz
-    stack = np.empty(64, np.int64)
     stack[0], depth = 0, 1
     best, body = most, -1
     while depth:
@@ -148,7 +151,7 @@ def first_hit(kinds, maps, bounds, links, x, y, z, dx, dy, dz, most, any_will_do
             continue
         for place in range(first, first + count):
             k = links[place, 2]
-            t = _meet(kinds[k], maps[k], x, y, z, dx, dy, dz)
+            t = meet(kinds[k], maps[k], x, y, z, dx, dy, dz)
             if 1e-6 < t < best:
                 best, body = t, k
                 if any_will_do:

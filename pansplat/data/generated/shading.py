@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 
 import numba as nb
+import numpy as np
 
 from pansplat.data.generated.patterns import COLOR_A, COLOR_B, COLOR_C, GLOW, OPTIONS, color, fractal
-from pansplat.data.generated.raycast import first_hit
+from pansplat.data.generated.raycast import first_hit, meet
 
 SKY = 40.0  # metres to the sphere that sky and horizon are painted on
 WALL, FLOOR, CEILING = -1, -2, -3  # materials that the room decides
@@ -123,9 +124,13 @@ def _sky(looks, sky, dx, dy, dz, w):
 
 
 @nb.njit(**OPTIONS)
-def _lit(bodies, lights, x, y, z, nx, ny, nz, jitter):
-    """Light (red, green, blue) from lamps and sun at a point, with shadows; `jitter` chooses a place on a lamp."""
-    kinds, maps, bounds, links = bodies
+def _lit(bodies, lights, last, x, y, z, nx, ny, nz, jitter):
+    """Light (red, green, blue) from lamps and sun at a point, with shadows.
+
+    `jitter` chooses a place on a lamp. `last` is the body that stood before each light at the point before: most
+    often it still does.
+    """
+    kinds, maps = bodies[0], bodies[1]
     r, g, b = 0.0, 0.0, 0.0
     x, y, z = x + 1e-4 * nx, y + 1e-4 * ny, z + 1e-4 * nz
     for k in range(len(lights)):
@@ -143,8 +148,11 @@ def _lit(bodies, lights, x, y, z, nx, ny, nz, jitter):
         power = facing * fall
         if power < 0.01:
             continue
-        _, body = first_hit(kinds, maps, bounds, links, x, y, z, lx / away, ly / away, lz / away, most, True)
-        if body < 0:
+        lx, ly, lz = lx / away, ly / away, lz / away
+        if last[k] >= 0 and 1e-6 < meet(kinds[last[k]], maps[last[k]], x, y, z, lx, ly, lz) < most:
+            continue
+        _, last[k] = first_hit(bodies, x, y, z, lx, ly, lz, most, True)
+        if last[k] < 0:
             r, g, b = (
                 r + power * light[LIGHT_COLOR],
                 g + power * light[LIGHT_COLOR + 1],
@@ -154,10 +162,10 @@ def _lit(bodies, lights, x, y, z, nx, ny, nz, jitter):
 
 
 @nb.njit(**OPTIONS)
-def _seen(scene, x, y, z, dx, dy, dz, pixel, jitter):
+def _seen(scene, bodies, last, x, y, z, dx, dy, dz, pixel, jitter):
     """Colour and distance of what a ray meets; `pixel` is the angle of a pixel."""
-    kinds, maps, halves, faces, bounds, links, looks, rooms, lights, ambient, outside, sky = scene
-    t, body = first_hit(kinds, maps, bounds, links, x, y, z, dx, dy, dz, math.inf, False)
+    kinds, maps, halves, faces, _, _, looks, rooms, lights, ambient, outside, sky = scene
+    t, body = first_hit(bodies, x, y, z, dx, dy, dz, math.inf, False)
     if body < 0:
         t = _to_sky(x, y, z, dx, dy, dz)
         px, py, pz = (x + t * dx) / SKY, (y + t * dy) / SKY, (z + t * dz) / SKY
@@ -179,7 +187,7 @@ def _seen(scene, x, y, z, dx, dy, dz, pixel, jitter):
         look = _room_look(rooms, room, look, py, outside)
     r, g, b = color(looks[look], u, v, width, half_u, half_v)
     around = _openness(rooms, room, px, py, pz, nx, ny, nz) * (0.85 - 0.15 * ny)
-    lr, lg, lb = _lit((kinds, maps, bounds, links), lights, px, py, pz, nx, ny, nz, jitter)
+    lr, lg, lb = _lit(bodies, lights, last, px, py, pz, nx, ny, nz, jitter)
     glow = looks[look, GLOW]
     return (
         r * (ambient[0] * around + lr + glow),
@@ -199,7 +207,8 @@ def _to_sky(x, y, z, dx, dy, dz):
 def draw_panorama(scene, pose, samples, image, depth):
     """Fill `image` (H W 3), linear light, with the mean of samples x samples rays a pixel; `depth` (H W) in metres."""
     height, width = depth.shape
-    kinds, maps, bounds, links = scene[0], scene[1], scene[4], scene[5]
+    bodies = (scene[0], scene[1], scene[4], scene[5], np.empty(64, np.int64))
+    last = np.full(len(scene[8]), -1)
     x, y, z = pose[0, 3], pose[1, 3], pose[2, 3]
     pixel = math.pi / height
     for i in range(height):
@@ -222,10 +231,10 @@ def draw_panorama(scene, pose, samples, image, depth):
                 dy = pose[1, 0] * cx + pose[1, 1] * cy + pose[1, 2] * cz
                 dz = pose[2, 0] * cx + pose[2, 1] * cy + pose[2, 2] * cz
                 if centre:
-                    t, body = first_hit(kinds, maps, bounds, links, x, y, z, dx, dy, dz, math.inf, False)
+                    t, body = first_hit(bodies, x, y, z, dx, dy, dz, math.inf, False)
                     depth[i, j] = t if body >= 0 else _to_sky(x, y, z, dx, dy, dz)
                 else:
-                    r, g, b, _ = _seen(scene, x, y, z, dx, dy, dz, pixel, k)
+                    r, g, b, _ = _seen(scene, bodies, last, x, y, z, dx, dy, dz, pixel, k)
                     share = 1 / (samples * samples)
                     image[i, j, 0] += share * r
                     image[i, j, 1] += share * g

@@ -50,7 +50,7 @@ def plain(build: Builder, saturation: float = 0.7, dark: float = 0.15, light: fl
 def wall(build: Builder) -> int:
     """Paint, wallpaper with stripes, bricks, tiles, plaster, panels."""
     rng = build.rng
-    base = any_color(rng, 0.3, 0.5, 0.97)
+    base = any_color(rng, 0.08 if rng.random() < 0.5 else 0.28, 0.5, 0.97)
     kind = rng.choice(6, p=(0.36, 0.18, 0.12, 0.12, 0.14, 0.08))
     if kind == 0:
         return build.look(Pattern.PLAIN, base, mottle=rng.uniform(0.1, 0.5))
@@ -121,7 +121,8 @@ def fabric(build: Builder) -> int:
     if kind == 2:
         size = rng.uniform(0.05, 0.2)
         return build.look(Pattern.TILES, base, any_color(rng), any_color(rng), size=(size, size), share=0.2, mottle=0.9)
-    return build.look(Pattern.STONE, base, any_color(rng), size=(rng.uniform(0.03, 0.25),) * 2, share=0)
+    size = rng.uniform(0.03, 0.25)
+    return build.look(Pattern.STONE, base, any_color(rng), size=(size, size), share=0)
 
 
 def picture(build: Builder) -> int:

@@ -9,6 +9,8 @@ from pansplat.data.generated.builder import Builder, GeneratedScene
 from pansplat.data.generated.patterns import Pattern
 from pansplat.data.generated.raycast import first_hit
 
+STACK = np.empty(64, np.int64)
+
 
 def _scene(fill) -> GeneratedScene:
     build = Builder(np.random.default_rng(0))
@@ -21,7 +23,7 @@ def _scene(fill) -> GeneratedScene:
 def _distance(scene: GeneratedScene, origin, towards, most: float = math.inf) -> tuple[float, int]:
     kinds, maps, _, _, bounds, links = scene.arrays[:6]
     direction = np.asarray(towards, float) / np.linalg.norm(towards)
-    return first_hit(kinds, maps, bounds, links, *map(float, origin), *direction, most, False)
+    return first_hit((kinds, maps, bounds, links, STACK), *map(float, origin), *direction, most, False)
 
 
 def test_distances_to_single_bodies_are_exact() -> None:
@@ -56,15 +58,15 @@ def test_the_tree_finds_what_a_search_of_all_bodies_finds() -> None:
     for _ in range(500):
         origin, direction = rng.uniform(-6, 6, size=3), rng.normal(size=3)
         direction /= np.linalg.norm(direction)
-        found = first_hit(kinds, maps, bounds, links, *origin, *direction, math.inf, False)
+        found = first_hit((kinds, maps, bounds, links, STACK), *origin, *direction, math.inf, False)
         best = (math.inf, -1)
         for k in range(60):
             single = np.array([[0, 1, k]], np.int64)
-            best = min(best, first_hit(kinds, maps, everything, single, *origin, *direction, math.inf, False))
+            best = min(best, first_hit((kinds, maps, everything, single, STACK), *origin, *direction, math.inf, False))
         hits += found[1] >= 0
         assert found[0] == best[0]
         assert found[1] == best[1] or found[1] < 0
-        blocked = first_hit(kinds, maps, bounds, links, *origin, *direction, 3.0, True)[1] >= 0
+        blocked = first_hit((kinds, maps, bounds, links, STACK), *origin, *direction, 3.0, True)[1] >= 0
         assert blocked == (found[0] < 3)
     assert 50 < hits < 450
 
