@@ -6,7 +6,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 
@@ -15,15 +15,27 @@ Result = TypeVar("Result")
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
-def seconds(call: Callable[[], Result], device: torch.device) -> tuple[float, Result]:
+class Took(NamedTuple):
+    """Seconds of a call.
+
+    Attributes:
+        wall: on the clock.
+        cpu: of all threads of the process together; what others do on the machine touches it far less.
+    """
+
+    wall: float
+    cpu: float
+
+
+def seconds(call: Callable[[], Result], device: torch.device) -> tuple[Took, Result]:
     """How long a call takes, its work on the device included, and what it returns."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
-    began = time.perf_counter()
+    began, began_cpu = time.perf_counter(), time.process_time()
     result = call()
     if device.type == "cuda":
         torch.cuda.synchronize(device)
-    return time.perf_counter() - began, result
+    return Took(time.perf_counter() - began, time.process_time() - began_cpu), result
 
 
 def peak_memory(call: Callable[[], Result], device: torch.device) -> tuple[float | None, Result]:
@@ -37,14 +49,26 @@ def peak_memory(call: Callable[[], Result], device: torch.device) -> tuple[float
         before = torch.cuda.memory_allocated(device)
         result = call()
         return (torch.cuda.max_memory_allocated(device) - before) / 1e6, result
+    if not reset_resident_peak():
+        return None, call()
+    resident = _status("VmRSS")
+    result = call()
+    return max(0, resident_peak() - resident) / 1e6, result
+
+
+def reset_resident_peak() -> bool:
+    """Hand back freed memory and begin a new high-water mark; False where the system has none (not Linux)."""
     _give_back()
     try:
         _RESET.write_text("5")
     except OSError:
-        return None, call()
-    resident = _status("VmRSS")
-    result = call()
-    return max(0, _status("VmHWM") - resident) / 1e6, result
+        return False
+    return True
+
+
+def resident_peak() -> int:
+    """The process's largest resident memory since the last reset, bytes."""
+    return _status("VmHWM")
 
 
 def _status(field: str) -> int:

@@ -19,7 +19,7 @@ from torch import Tensor
 from pansplat.bench.cases import Case, Group, Subject
 from pansplat.bench.drawing import NEAR, Picture, device_of, draw, draw_and_differentiate, forget, wake
 from pansplat.bench.fidelity import fidelity
-from pansplat.bench.measure import median, peak_memory, seconds, spread
+from pansplat.bench.measure import Took, median, peak_memory, seconds, spread
 from pansplat.bench.rows import Row, write_rows
 from pansplat.bench.work import BACKWARD_OPERATIONS, FORWARD_OPERATIONS, Work, panorama_work
 from pansplat.gaussians.gaussians import Gaussians
@@ -38,8 +38,8 @@ class _Lane:
     case: Case
     row: Row
     wanted: int = 1
-    forward: list[float] = field(default_factory=list)
-    backward: list[float] = field(default_factory=list)
+    forward: list[Took] = field(default_factory=list)
+    backward: list[Took] = field(default_factory=list)
 
     @property
     def needs_forward(self) -> bool:
@@ -55,13 +55,14 @@ class _Lane:
 
     def write_times(self) -> None:
         """Bring the row up to date."""
-        row, row.repeats = self.row, len(self.forward)
-        if self.forward:
-            row.forward_ms, row.forward_min_ms = 1e3 * median(self.forward), 1e3 * min(self.forward)
-            row.forward_spread_ms = 1e3 * spread(self.forward)
-        if self.backward:
-            row.backward_ms, row.backward_min_ms = 1e3 * median(self.backward), 1e3 * min(self.backward)
-            row.backward_spread_ms = 1e3 * spread(self.backward)
+        self.row.repeats = len(self.forward)
+        for name, times in (("forward", self.forward), ("backward", self.backward)):
+            if times:
+                walls = [1e3 * one.wall for one in times]
+                setattr(self.row, f"{name}_ms", median(walls))
+                setattr(self.row, f"{name}_min_ms", min(walls))
+                setattr(self.row, f"{name}_spread_ms", spread(walls))
+                setattr(self.row, f"{name}_cpu_ms", 1e3 * min(one.cpu for one in times))
 
 
 class Bench:
@@ -171,26 +172,27 @@ class Bench:
         case, row = lane.case, lane.row
         forget(case.backend)
         row.peak_mb, (picture, took) = peak_memory(lambda: self._forward(case), device_of(case.backend))
-        times = [took]
+        walls = [took.wall]
         row.stages_ms = {name: 1e3 * value for name, value in picture.stages.items()}
-        if took > _SLOW or case.precision == "float64":
+        if took.wall > _SLOW or case.precision == "float64":
             lane.forward.append(took)
         if case.backward:
             forget(case.backend)
             row.backward_peak_mb, took = peak_memory(lambda: self._backward(case), device_of(case.backend))
-            times.append(took)
-            if took > _SLOW:
+            walls.append(took.wall)
+            if took.wall > _SLOW:
                 lane.backward.append(took)
-        slow = case.precision == "float64" or max(times) > _SLOW
-        lane.wanted = 1 if slow else min(_MOST, max(_LEAST, int(self._budget / sum(times))))
+        slow = case.precision == "float64" or max(walls) > _SLOW
+        lane.wanted = 1 if slow else min(_MOST, max(_LEAST, int(self._budget / sum(walls))))
         lane.write_times()
         return picture
 
     def _again(self, lane: _Lane) -> None:
         if lane.needs_forward:
             picture, took = self._forward(lane.case)
+            if not lane.forward or took.wall < min(one.wall for one in lane.forward):
+                lane.row.stages_ms = {name: 1e3 * value for name, value in picture.stages.items()}
             lane.forward.append(took)
-            lane.row.stages_ms = {name: 1e3 * value for name, value in picture.stages.items()}
         if lane.needs_backward:
             lane.backward.append(self._backward(lane.case))
         lane.write_times()
@@ -205,12 +207,12 @@ class Bench:
         ), self._scene.pose
 
     @torch.no_grad()
-    def _forward(self, case: Case) -> tuple[Picture, float]:
+    def _forward(self, case: Case) -> tuple[Picture, Took]:
         gaussians, pose = self._prepared(case)
         took, picture = seconds(lambda: draw(case, gaussians, pose), device_of(case.backend))
         return picture, took
 
-    def _backward(self, case: Case) -> float:
+    def _backward(self, case: Case) -> Took:
         """Seconds of the backward pass alone."""
         gaussians, pose = self._prepared(case)
         picture, leaves, upstream = draw_and_differentiate(case, gaussians, pose)
@@ -220,10 +222,11 @@ class Bench:
     def _relate_to_peaks(self, lane: _Lane) -> None:
         """How much of the machine's arithmetic and bandwidth a direct panorama reached."""
         case, row = lane.case, lane.row
-        related = case.layout == "equirect" and case.backend in ("torch", "numba") and row.forward_ms is not None
-        if not related:
+        if case.layout != "equirect" or case.backend not in ("torch", "numba"):
             return
-        assert self._scene is not None and self._gaussians is not None and row.forward_ms is not None
+        if not row.forward_cpu_ms or not row.forward_min_ms:  # a clock may be too coarse for the smallest pictures
+            return
+        assert self._scene is not None and self._gaussians is not None
         key = row.scene, case.truth
         if key not in self._work:
             self._save(_told(case, "counting its work"))
@@ -231,11 +234,11 @@ class Bench:
             self._work[key] = panorama_work(self._gaussians, self._scene.pose, case.height, options)
         work, threads = self._work[key], str(case.threads)
         row.pairs = work.pairs
-        flops = 1e6 * self.machine["fma_gflops"][threads]  # a millisecond
-        row.fma_fraction = FORWARD_OPERATIONS * work.pairs / flops / row.forward_ms
-        row.bandwidth_fraction = work.bytes / (1e6 * self.machine["bandwidth_gb_s"][threads]) / row.forward_ms
-        if row.backward_ms is not None:
-            row.backward_fma_fraction = BACKWARD_OPERATIONS * work.pairs / flops / row.backward_ms
+        flops = 1e6 * self.machine["fma_gflops"]["1"]  # of a thread, a millisecond
+        row.fma_fraction = FORWARD_OPERATIONS * work.pairs / flops / row.forward_cpu_ms
+        row.bandwidth_fraction = work.bytes / (1e6 * self.machine["bandwidth_gb_s"][threads]) / row.forward_min_ms
+        if row.backward_cpu_ms:
+            row.backward_fma_fraction = BACKWARD_OPERATIONS * work.pairs / flops / row.backward_cpu_ms
 
     def _save(self, doing: str) -> None:
         """Write what there is, and tell what comes next."""

@@ -33,14 +33,15 @@ class Row:
         forward_ms, forward_min_ms: median and least, without gradients.
         forward_spread_ms: range between the quartiles.
         backward_ms, backward_min_ms, backward_spread_ms: of the backward pass alone, to all fields of the Gaussians.
+        forward_cpu_ms, backward_cpu_ms: least processor time, of all threads together.
         repeats: how many times were taken.
         peak_mb: 10^6 bytes at most over what the process held before, forward without gradients.
         backward_peak_mb: likewise, of forward and backward together.
         psnr_db, max_error, seam_jump, energy_error: see `fidelity.Fidelity`.
-        stages_ms: by the backend's own clock, one forward pass.
+        stages_ms: by the backend's own clock, of the fastest forward pass.
         pairs: pixel centres in the Gaussians' boxes (see `work`).
-        fma_fraction, backward_fma_fraction: that arithmetic over the time, of the machine's peak on as many threads.
-        bandwidth_fraction: the least traffic over the time, likewise.
+        fma_fraction, backward_fma_fraction: that arithmetic over the processor time, of one thread's peak.
+        bandwidth_fraction: the least traffic over the least time, of the peak on as many threads.
         note: what else the reader should know.
     """
 
@@ -60,9 +61,11 @@ class Row:
     forward_ms: float | None = None
     forward_min_ms: float | None = None
     forward_spread_ms: float | None = None
+    forward_cpu_ms: float | None = None
     backward_ms: float | None = None
     backward_min_ms: float | None = None
     backward_spread_ms: float | None = None
+    backward_cpu_ms: float | None = None
     repeats: int = 0
     peak_mb: float | None = None
     backward_peak_mb: float | None = None

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _BACKENDS = ("numba", "triton", "gsplat")
 _SAMPLE = Path(pansplat.__file__).parents[1] / "assets" / "living_room"
 _SHOWN = 12  # rows of the running table
-_WIDTH = 190  # characters, where there is no terminal
+_WIDTH = 210  # characters, where there is no terminal
 _MEMORY = 16e9  # bytes, where the system does not tell
 
 

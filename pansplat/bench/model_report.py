@@ -1,0 +1,93 @@
+"""What a person reads of `pansplat bench model`: a table, and a picture of time and memory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from pansplat.atomic import replacing
+from pansplat.bench.model import ModelRow
+from pansplat.bench.model_case import STAGES
+
+_COLUMNS = (
+    *(("compat", "left"), ("precision", "left"), ("attention", "left"), ("convolution", "left")),
+    *(("tiles", "right"), ("threads", "right")),
+    *((f"{stage} s", "right") for stage in STAGES),
+    *(("total s", "right"), ("peak GiB", "right"), ("depth median", "right"), ("depth max", "right")),
+    ("PSNR dB", "right"),
+)
+_STAGE_COLORS = ("#1764ab", "#6aaed6", "#e0a030", "#c8501e")
+
+
+def model_table(rows: Sequence[ModelRow], title: str) -> Table:
+    """All rows, in the order they were measured."""
+    table = Table(title=title, title_justify="left", pad_edge=False)
+    for name, side in _COLUMNS:
+        table.add_column(name, justify=side, no_wrap=True)  # type: ignore[arg-type]
+    for row in rows:
+        table.add_row(*model_cells(row))
+    return table
+
+
+def model_markdown(rows: Sequence[ModelRow]) -> str:
+    """The same table as a page's text."""
+    head = "| " + " | ".join(name for name, _ in _COLUMNS) + " |"
+    rule = "|" + "|".join("---:" if side == "right" else "---" for _, side in _COLUMNS) + "|"
+    return "\n".join((head, rule, *("| " + " | ".join(model_cells(row)) + " |" for row in rows))) + "\n"
+
+
+def model_cells(row: ModelRow) -> tuple[str, ...]:
+    """A row's cells; what was not measured is blank."""
+    return (
+        *(row.compat, row.precision, row.attention, row.convolution, f"{row.tiles}x{row.tiles}", str(row.threads)),
+        *(_number(row.stages_s.get(stage), "{:.1f}") for stage in STAGES),
+        _number(row.total_s, "{:.1f}"),
+        _number(row.peak_gib, "{:.2f}"),
+        "reference" if row.is_reference else _number(row.depth_median_error, "{:.1e}"),
+        _number(row.depth_max_error, "{:.1e}"),
+        "same" if row.psnr_db is not None and math.isinf(row.psnr_db) else _number(row.psnr_db, "{:.1f}"),
+    )
+
+
+def plot_model(rows: Sequence[ModelRow], path: Path, title: str) -> bool:
+    """Bars of each row's seconds by stage and of its memory; False when there is nothing to show.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    if not rows:
+        return False
+    figure = Figure(figsize=(11, 1.5 + 0.4 * len(rows)), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(2, 1))
+    names = [_name(row) for row in rows]
+    starts = [0.0] * len(rows)
+    for stage, color in zip(STAGES, _STAGE_COLORS, strict=True):
+        widths = [row.stages_s.get(stage, 0.0) for row in rows]
+        left.barh(names, widths, left=starts, color=color, label=stage)
+        starts = [start + width for start, width in zip(starts, widths, strict=True)]
+    left.invert_yaxis()
+    left.set(xlabel="seconds")
+    left.set_title(title, loc="left")
+    left.legend(fontsize=8)
+    right.barh(names, [row.peak_gib or 0.0 for row in rows], color="#888888")
+    right.set(xlabel="largest memory of the process, GiB")
+    for axes in (left, right):
+        axes.grid(axis="x", alpha=0.25)
+    with replacing(path) as partial:
+        figure.savefig(partial, dpi=110)
+    return True
+
+
+def _name(row: ModelRow) -> str:
+    parts = [row.compat, row.precision]
+    parts += ["attention bfloat16"] * (row.attention == "bfloat16") + ["direct"] * (row.convolution == "direct")
+    parts += [f"{row.tiles}x{row.tiles} tiles"] * (row.tiles > 1)
+    return ", ".join([*parts, "1 thread" if row.threads == 1 else f"{row.threads} threads"])
+
+
+def _number(value: float | None, form: str) -> str:
+    return "" if value is None else form.format(value)
