@@ -242,6 +242,31 @@ class BenchRaster:
 
 
 @dataclass(frozen=True)
+class BenchModel:
+    """Measure the network: seconds of each part and memory against error, for each precision and way to run it."""
+
+    model: Path | None = None
+    """Weights of PanSplat (.safetensors); by default random ones, which take as long."""
+    pair: Path | None = None
+    """Folder of a pair; by default the sample, where it is there."""
+    height: int = 512
+    """Panoramas are resized to this height, pixels; a multiple of 64."""
+    quick: bool = False
+    """Precisions only, without tiles, single thread and the original's defects."""
+    json: Path | None = None
+    """File for the rows; it is written after every row."""
+    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """Folder for model.json, model.md and model.png."""
+    threads: int | None = None
+    """The most threads to use; by default what torch uses."""
+
+    def run(self) -> int:
+        from pansplat.cli.bench_model import run_model
+
+        return run_model(self)
+
+
+@dataclass(frozen=True)
 class BenchMachine:
     """Measure what this machine could do at most: multiply-adds and memory bandwidth."""
 
@@ -258,7 +283,11 @@ class BenchMachine:
 class Bench:
     """Measure speed, memory and error on this machine."""
 
-    what: Annotated[BenchRaster, subcommand("raster")] | Annotated[BenchMachine, subcommand("machine")]
+    what: (
+        Annotated[BenchRaster, subcommand("raster")]
+        | Annotated[BenchModel, subcommand("model")]
+        | Annotated[BenchMachine, subcommand("machine")]
+    )
 
     def run(self) -> int:
         return self.what.run()
