@@ -13,6 +13,7 @@ from typing import Any
 import numba as nb
 from numba.core import event
 
+_PACKAGE = __name__.rpartition(".")[0]
 _PATIENCE = 1.0  # seconds of compiling before the user is told
 _NEWS = "pansplat: compiling the rasteriser for this processor, once (about 15 seconds)"
 _OPTIONS = {
@@ -22,7 +23,7 @@ _OPTIONS = {
     "fastmath": {"contract", "nsz"},  # sums keep their order: the same bits on any number of threads
 }
 
-_IMPORTED = re.compile(rf"^(?:from|import) {re.escape(__package__)}(?:\.(\w+)| import ([\w, ]+))", re.MULTILINE)
+_IMPORTED = re.compile(rf"^(?:from|import) {re.escape(_PACKAGE)}(?:\.(\w+)| import ([\w, ]+))", re.MULTILINE)
 _told = False
 
 
@@ -34,7 +35,7 @@ def kernel(function: Callable[..., Any]) -> Any:
     # The tests' check of annotations wraps every function; numba needs the bare one.
     function = inspect.unwrap(function)
     try:
-        compiled = nb.njit(cache=True, **_OPTIONS)(function)
+        compiled: Any = nb.njit(cache=True, **_OPTIONS)(function)
     except RuntimeError:  # no folder to keep it in
         return nb.njit(**_OPTIONS)(function)
     # Numba looks only at the file that a kernel stands in; what is compiled into it stands in others.
@@ -78,7 +79,8 @@ class _Listener(event.Listener):
         self._timer: threading.Timer | None = None
 
     def on_start(self, event: event.Event) -> None:
-        ours = event.data["dispatcher"].py_func.__module__.startswith(__package__)
+        data: Any = event.data
+        ours = data["dispatcher"].py_func.__module__.startswith(_PACKAGE)
         if ours and self._timer is None:
             self._timer = threading.Timer(_PATIENCE, _tell)
             self._timer.daemon = True
