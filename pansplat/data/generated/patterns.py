@@ -202,9 +202,10 @@ def _books(material, u, v, w, seed):
     x = u / size + 0.6 * noise(1.3 * u / size, 0.5, seed)
     book = math.floor(x)
     shown = min(1.0, max(0.0, 1.6 - w / size))
-    hue, light = hash_unit(book, 0, seed), 0.15 + 0.6 * hash_unit(book, 1, seed) ** 2
+    hue, light = hash_unit(book, 0, seed), 0.35 + shown * (0.6 * hash_unit(book, 1, seed) ** 2 - 0.2)
     gap = 1.0 - 0.6 * shown * pulse(x, 0.12, w / size)
     band = pulse(v / 0.11 + hash_unit(book, 2, seed), 0.25, w / 0.11) if hash_unit(book, 3, seed) < 0.7 else 0.0
+    band = 0.18 + shown * (band - 0.18)
     r = light * (1 + 0.6 * shown * math.sin(6.28 * hue)) * (1 - 0.4 * band) + 0.25 * band
     g = light * (1 + 0.6 * shown * math.sin(6.28 * hue + 2.1)) * (1 - 0.4 * band) + 0.25 * band
     b = light * (1 + 0.6 * shown * math.sin(6.28 * hue + 4.2)) * (1 - 0.4 * band) + 0.2 * band

@@ -71,6 +71,18 @@ def test_the_tree_finds_what_a_search_of_all_bodies_finds() -> None:
     assert 50 < hits < 450
 
 
+def test_depth_is_along_the_ray_through_the_pixels_centre() -> None:
+    scene = _scene(lambda b, look: b.box((0, 1.5, 0), (30, 0.1, 30), look))
+    pose = np.eye(4)
+    pose[:3, 3] = 3, 0.2, -1
+    _, depth = scene.panorama(pose, 32, 2)
+    below = np.arange(32) >= 20  # nearer to the horizon the floor ends
+    latitude = (np.arange(32) + 0.5) * math.pi / 32 - math.pi / 2
+    assert np.allclose(depth[below], (1.2 / np.sin(latitude[below]))[:, None], rtol=1e-12)
+    assert (depth[:16] > 30).all()  # the sky
+    assert np.isfinite(depth).all()
+
+
 def test_shadows_fall_behind_things() -> None:
     def fill(build: Builder, look: int) -> None:
         build.box((0, 1.1, 0), (5, 0.1, 5), look)
