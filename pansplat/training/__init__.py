@@ -1,13 +1,10 @@
-"""Training. Not here yet: `pansplat-train` says what will come."""
+"""Training: losses, the loop, and what keeps it in little memory. `pansplat-train PRESET` runs it."""
 
 import sys
 
 
 def main() -> None:
-    """Say that training comes with a later release, and exit with status 1."""
-    print(
-        "pansplat-train: training the network is not part of this release; it comes with a later one.\n"
-        "What works today needs no trained weights: `pansplat predict PAIR -o scene.ply --model sweep`.",
-        file=sys.stderr,
-    )
-    sys.exit(1)
+    """Run `pansplat-train` and exit with its status."""
+    from pansplat.training.command import run
+
+    sys.exit(run())

@@ -373,15 +373,6 @@ def test_entry_points_are_installed(entry: str) -> None:
     assert callable(found.load())
 
 
-def test_training_says_that_it_comes_later(capsys: pytest.CaptureFixture[str]) -> None:
-    from pansplat.training import main
-
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert stop.value.code == 1
-    assert "comes with a later" in capsys.readouterr().err
-
-
 def test_main_exits_with_the_status_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     import pansplat.cli
 

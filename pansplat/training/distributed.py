@@ -1,0 +1,115 @@
+"""Several processes that train one network: each takes its share of a step, and all take the mean of the gradients.
+
+Gradients are averaged after backpropagation by our own hand and not by DistributedDataParallel, because two-step
+backpropagation goes through the heads many times a step. Batch normalisation takes its statistics from all processes,
+so that N processes learn what one would from the joint batch.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+
+import torch
+import torch.distributed
+from torch import Tensor, nn
+
+
+class Processes:
+    """This process among those that train together; one alone where torchrun did not start us.
+
+    Attributes:
+        rank, count: number of this process, and of all.
+    """
+
+    def __init__(self) -> None:
+        self.count = int(os.environ.get("WORLD_SIZE", "1"))
+        self.rank = int(os.environ.get("RANK", "0"))
+        self._joined = False
+
+    def join(self, device: torch.device) -> None:
+        """Meet the others."""
+        if self.count > 1 and not torch.distributed.is_initialized():
+            torch.distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
+            self._joined = True
+
+    def leave(self) -> None:
+        """Part from the others."""
+        if self._joined and torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()
+            self._joined = False
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this is the process that writes files."""
+        return self.rank == 0
+
+    def average_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
+        """Give every process the mean of all their gradients; one without a gradient counts as zero."""
+        if self.count == 1:
+            return
+        learning = [p for p in parameters if p.requires_grad]
+        for parameter in learning:
+            if parameter.grad is None:
+                parameter.grad = torch.zeros_like(parameter)
+        flat = torch.cat([p.grad.flatten() for p in learning if p.grad is not None])
+        torch.distributed.all_reduce(flat)
+        flat /= self.count
+        for parameter, mean in zip(learning, flat.split([p.numel() for p in learning]), strict=True):
+            parameter.grad = mean.view_as(parameter)
+
+    def mean(self, numbers: dict[str, float]) -> dict[str, float]:
+        """The means of all processes' numbers."""
+        if self.count == 1:
+            return numbers
+        values = torch.tensor(list(numbers.values()), dtype=torch.float64)
+        torch.distributed.all_reduce(values)
+        return dict(zip(numbers, (values / self.count).tolist(), strict=True))
+
+    def any(self, flag: bool) -> bool:
+        """Whether it is so in any process."""
+        if self.count == 1:
+            return flag
+        value = torch.tensor(float(flag))
+        torch.distributed.all_reduce(value, torch.distributed.ReduceOp.MAX)
+        return bool(value)
+
+    def wait(self) -> None:
+        """Go on when all have come here."""
+        if self.count > 1:
+            torch.distributed.barrier()
+
+
+class SharedBatchNorm2d(nn.BatchNorm2d):
+    """Batch normalisation by the statistics of all processes' batches; on CPUs too, unlike torch's own."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        if not self.training:
+            return super().forward(input)
+        from torch.distributed.nn.functional import all_reduce
+
+        maps = input.float() if input.dtype != torch.float64 else input
+        count = maps.numel() // maps.shape[1] * torch.distributed.get_world_size()
+        mean = all_reduce(maps.sum(dim=(0, 2, 3))) / count
+        apart = maps - mean[:, None, None]
+        variance = all_reduce(apart.square().sum(dim=(0, 2, 3))) / count
+        self._remember(mean.detach(), variance.detach() * count / max(1, count - 1))
+        scaled = apart * (variance + self.eps).rsqrt()[:, None, None]
+        return (scaled * self.weight[:, None, None] + self.bias[:, None, None]).to(input.dtype)
+
+    @torch.no_grad()
+    def _remember(self, mean: Tensor, variance: Tensor) -> None:
+        if self.running_mean is None or self.running_var is None or self.num_batches_tracked is None:
+            return
+        self.num_batches_tracked += 1
+        share = self.momentum if self.momentum is not None else 1 / float(self.num_batches_tracked)
+        self.running_mean.lerp_(mean.to(self.running_mean), share)
+        self.running_var.lerp_(variance.to(self.running_var), share)
+
+
+def share_statistics(network: nn.Module, processes: Processes) -> None:
+    """Let batch normalisation see all processes' batches, where there are several."""
+    if processes.count > 1:
+        for module in network.modules():
+            if type(module) is nn.BatchNorm2d:
+                module.__class__ = SharedBatchNorm2d

@@ -1,0 +1,150 @@
+"""The network that is trained: its shape, what it begins with, which parts learn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from pansplat.errors import InputError
+from pansplat.model.adapter import AdapterConfig
+from pansplat.model.auxiliary_heads import AUXILIARY_HEADS, AuxiliaryHeads
+from pansplat.model.checkpoint import CHECKPOINTS, WeightsFile, load_weights, read_checkpoint, save_weights
+from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
+from pansplat.model.feature_pyramid import FeaturePyramidConfig
+from pansplat.model.heads import HeadsConfig
+from pansplat.model.loading import describe, from_original, require_precision
+from pansplat.model.mvsplat import MVSplat
+from pansplat.model.pansplat import PanSplat, PanSplatConfig
+from pansplat.model.transformer import TransformerConfig
+from pansplat.model.weights import require_shapes
+from pansplat.training.checkpoint import is_training_state, weights_of
+from pansplat.training.config import NetworkConfig, NetworkShape
+
+
+def shape_of(shape: NetworkShape) -> PanSplatConfig:
+    """The paper's network, or a smaller one of the same plan without the monocular network."""
+    if shape == "paper":
+        return PanSplatConfig()
+    if shape == "small":
+        return _smaller(channels=(16, 32, 48, 64), candidates=(64, 32, 16), width=32, blocks=4, degree=1)
+    return _smaller(channels=(8, 16, 24, 32), candidates=(32, 16, 16), width=32, blocks=2, degree=0)
+
+
+def _smaller(
+    *,
+    channels: tuple[int, int, int, int],
+    candidates: tuple[int, int, int],
+    width: int,
+    blocks: int,
+    degree: int,
+) -> PanSplatConfig:
+    levels = tuple(SweepLevel(3 - i, channels[3 - i], count, width) for i, count in enumerate(candidates))
+    return PanSplatConfig(
+        features=FeaturePyramidConfig(channels, TransformerConfig(channels[-1], blocks)),
+        cost_volume=CostVolumeConfig(mono_channels=0, levels=levels),
+        heads=HeadsConfig(
+            feature_channels=channels[::-1],
+            candidates=candidates[-1],
+            layers=3,
+            adapter=AdapterConfig(degree=degree),
+        ),
+    )
+
+
+def build(config: NetworkConfig, seed: int) -> PanSplat | MVSplat:
+    """The network, with the weights of `config.init` or random ones that the seed decides, ready to learn.
+
+    Raises:
+        InputError: the weights do not fit, or the monocular network, which does not learn, would be random.
+    """
+    require_precision(config.precision)
+    given = None if config.init is None else read_weights(config.init)
+    torch.manual_seed(seed)
+    network: PanSplat | MVSplat
+    if config.shape == "mvsplat":
+        network = MVSplat(compat=config.compat, attention_precision=config.attention_precision)
+    else:
+        network = PanSplat(
+            shape_of(config.shape),
+            config.compat,
+            precision=config.precision,
+            attention_precision=config.attention_precision,
+        )
+    if given is not None:
+        require_shapes(given.tensors, network.state_dict(), config.init)
+        network.load_state_dict(given.tensors, strict=True)
+    elif isinstance(network, PanSplat) and network.mono_depth is not None:
+        raise InputError(
+            "--network.init: the paper's network has a monocular network that does not learn here and must come with "
+            "weights; give an original checkpoint or a file of `pansplat convert`, or train --network.shape small, "
+            "which has none."
+        )
+    freeze(network, config.frozen)
+    return network
+
+
+def read_weights(path: Path) -> WeightsFile:
+    """Weights of a .safetensors, an original checkpoint, or a checkpoint of training.
+
+    Raises:
+        InputError: when the file cannot be used; one that asks for code to be run is refused.
+    """
+    if path.suffix.lower() not in CHECKPOINTS:
+        return load_weights(path)
+    content = read_checkpoint(path)
+    return weights_of(content, path) if is_training_state(content) else from_original(content, path)
+
+
+def write_weights(path: Path, network: PanSplat | MVSplat, state: dict[str, torch.Tensor] | None = None) -> None:
+    """The network's weights, or another state of it, as `--model` takes them."""
+    model = "mvsplat" if isinstance(network, MVSplat) else "pansplat"
+    tensors = dict(network.state_dict() if state is None else state)
+    save_weights(path, describe(model, network.config, tensors, compat=network.compat))
+
+
+def freeze(network: nn.Module, parts: tuple[str, ...]) -> None:
+    """Keep parts from learning."""
+    for part in parts:
+        getattr(network, part).requires_grad_(False)
+
+
+def learn(network: nn.Module, parts: tuple[str, ...]) -> None:
+    """Put the network in training mode, but not its frozen parts: their normalisation statistics stay.
+
+    The original lets the statistics of frozen parts drift (OFFICIAL.md, section 11).
+    """
+    network.train()
+    for part in parts:
+        getattr(network, part).eval()
+
+
+def matching_learns(network: nn.Module) -> bool:
+    """Whether anything before the heads learns."""
+    return any(p.requires_grad for name, p in network.named_parameters() if not name.startswith("heads."))
+
+
+def learning(*modules: nn.Module | None) -> Iterator[nn.Parameter]:
+    """The parameters that learn."""
+    for module in modules:
+        if module is not None:
+            yield from (p for p in module.parameters() if p.requires_grad)
+
+
+def auxiliary_heads(network: PanSplat | MVSplat) -> AuxiliaryHeads:
+    """Heads that make each level of the cost volume draw a picture by itself; random, for training only."""
+    assert isinstance(network, PanSplat)
+    heads = network.config.heads
+    if network.config == PanSplatConfig():
+        return AuxiliaryHeads(AUXILIARY_HEADS, network.compat)
+    swept = network.config.cost_volume.swept_levels
+    config = HeadsConfig(
+        depth="swept",
+        layers=2,
+        feature_channels=tuple(level.channels for level in swept),
+        candidates=heads.candidates,
+        adapter=heads.adapter,
+    )
+    return AuxiliaryHeads(config, network.compat)

@@ -1,0 +1,124 @@
+"""What one batch teaches: its losses, and their gradients at the parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pansplat.data.sample import Batch
+from pansplat.model.auxiliary_heads import AuxiliaryHeads
+from pansplat.model.mvsplat import MVSplat
+from pansplat.model.pansplat import PanSplat
+from pansplat.training.config import MemoryConfig
+from pansplat.training.deferred import Problem, backpropagate
+from pansplat.training.drawing import Drawing
+from pansplat.training.losses import LossWeights, auxiliary_loss, depth_loss, image_loss, pixel_weights_of
+from pansplat.training.network import matching_learns
+from pansplat.training.perceptual import Perceptual
+
+PARTS = ("loss", "square", "perceptual", "depth", "auxiliary")
+"""Names of what is told of a batch's losses."""
+
+
+@dataclass
+class Teacher:
+    """Losses and gradients of batches.
+
+    Attributes:
+        auxiliary: heads for the auxiliary loss; None for none.
+        perceptual: None for none.
+    """
+
+    network: PanSplat | MVSplat
+    auxiliary: AuxiliaryHeads | None
+    perceptual: Perceptual | None
+    weights: LossWeights
+    memory: MemoryConfig
+
+    def backpropagate(self, batch: Batch, share: float = 1.0) -> dict[str, float]:
+        """Add `share` times the batch's gradients to the parameters'; returns the parts of the loss."""
+        told = dict.fromkeys(PARTS, 0.0)
+        batch = as_type(batch, next(self.network.parameters()).dtype)
+        drawing = Drawing(self.memory.style, self.memory.mixing, batch.images.shape[-2])
+
+        def picture_loss(pictures: Tensor) -> Tensor:
+            weights = _masked(batch)
+            loss = image_loss(
+                pictures.flatten(0, 1), batch.target_images.flatten(0, 1), self.perceptual, self.weights,
+                pixel_weights=weights,
+            )  # fmt: skip
+            told["square"], told["perceptual"] = loss.square.item(), loss.perceptual.item()
+            return loss.total
+
+        def map_loss(matched: Any) -> Tensor | None:
+            losses = [
+                loss
+                for loss in (self._depth(batch, matched, told), self._own(batch, matched, drawing, told))
+                if loss is not None
+            ]
+            return sum(losses[1:], losses[0]) if losses else None
+
+        problem = Problem(
+            batch.images, batch.cam2world, batch.near, batch.far, batch.target_cam2world, picture_loss, map_loss
+        )
+        told["loss"] = backpropagate(
+            problem,
+            self.network,
+            drawing,
+            method=self.memory.backpropagation,
+            tiles=self.memory.tiles,
+            matching_learns=matching_learns(self.network),
+            share=share,
+        )
+        return told
+
+    def _depth(self, batch: Batch, matched: Any, told: dict[str, float]) -> Tensor | None:
+        if batch.depths is None or not self.weights.depth:
+            return None
+        masks = None if bool(batch.masks.all()) else batch.masks
+        loss = depth_loss(
+            matched.depths.depth, batch.depths, batch.near, batch.far,
+            form=self.weights.depth_form, decay=self.weights.decay, masks=masks,
+        )  # fmt: skip
+        told["depth"] = loss.item()
+        return self.weights.depth * loss
+
+    def _own(self, batch: Batch, matched: Any, drawing: Drawing, told: dict[str, float]) -> Tensor | None:
+        """The pictures that each level of the cost volume makes by itself."""
+        if self.auxiliary is None:
+            return None
+        m = matched
+        levels = self.auxiliary(m.images, m.features, m.depths, m.cam2world, m.near, m.far)
+        pictures = [
+            torch.stack(
+                [
+                    drawing.draw(scene, pose, batch.cam2world[item])
+                    for item, scene in enumerate(scenes)
+                    for pose in batch.target_cam2world[item]
+                ]
+            )
+            for scenes in levels
+        ]
+        loss = auxiliary_loss(
+            pictures, batch.target_images.flatten(0, 1), self.perceptual, self.weights, pixel_weights=_masked(batch)
+        )
+        told["auxiliary"] = loss.item()
+        return loss
+
+
+def as_type(batch: Batch, dtype: torch.dtype) -> Batch:
+    """The batch with its numbers in the network's type."""
+    moved = {k: v.to(dtype) for k, v in vars(batch).items() if isinstance(v, Tensor) and v.is_floating_point()}
+    return replace(batch, **moved)
+
+
+def _masked(batch: Batch) -> Tensor | None:
+    """How much each pixel of the targets counts; None where all count."""
+    masks = batch.target_masks.flatten(0, 1)
+    if bool(masks.all()):
+        return None
+    weights = pixel_weights_of(masks, tuple(masks.shape))
+    return None if weights is None else weights.to(batch.images)
