@@ -12,33 +12,26 @@ import math
 import numpy as np
 
 from pansplat.render.cpu.compiling import inlined, kernel
-from pansplat.render.cpu.raster import HALF, Floats, Integers, Longs, find_powers, forms_at, opacity, pieces_of
+from pansplat.render.cpu.moments import GROUP, MOMENTS, PAIR, write_chunk
+from pansplat.render.cpu.raster import HALF, Floats, Integers, Longs, find_powers, opacity, pieces_of
 from pansplat.render.cpu.records import FIELDS, TILE
 from pansplat.render.cpu.simd import (
     LANES,
     choose,
     element,
     fill,
-    first_lane,
     load,
-    maximum,
     multiply_add,
     negative,
-    prefetch_to_write,
     put,
     some,
     spread,
     store,
-    totals,
-    transposed,
 )
 from pansplat.render.cpu.tables import FLAT, Plane
 from pansplat.render.cpu.threads import share
 from pansplat.render.cpu.tile import (
-    A_X,
     ACROSS,
-    ALONG_ROW,
-    B_X,
     BLOCK_HEIGHT,
     BLOCK_WIDTH,
     BLOCKS,
@@ -46,8 +39,6 @@ from pansplat.render.cpu.tile import (
     CLOSED,
     EDGES,
     FORMS,
-    FRONTS,
-    L_X,
     MOST,
     PIXELS,
     WORDS,
@@ -56,14 +47,9 @@ from pansplat.render.cpu.tile import (
     place_tile,
 )
 
-_GROUP = 4  # values whose gradients are summed at a time
-_MOMENTS = 16  # (x, y, z, 1) of A, of B, of L; along; level; two to spare
-_LEAST = 1e-16  # of L^2 + along Q: only reached where the slope is 0
 _LN2 = math.log(2)
-_PAIR = 2 * LANES  # numbers a pair: alphas, later slopes, and weights; one cache line
 _PAIRS = 1 << 16  # room for pairs of a segment, at least those of a chunk
 _CHUNKS = 32  # most in a segment
-_AHEAD = 24  # Gaussians, between asking for a slot and writing it
 
 
 def raster_backward(
@@ -111,18 +97,18 @@ def _walk_tiles(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     tiles_across = (len(columns) + TILE - 1) // TILE
     num_values = values.shape[1]
-    planes = (num_values + _GROUP - 1) // _GROUP * _GROUP
+    planes = (num_values + GROUP - 1) // GROUP * GROUP
     offsets, middle, through = np.empty(3 * PIXELS, np.float32), np.empty(6, np.float32), np.empty(PIXELS, np.float32)
     upstream, behind = np.zeros((planes + 2) * PIXELS, np.float32), np.empty(PIXELS, np.float32)
     forms = np.empty((_CHUNKS, FORMS * CHUNK), np.float32)
     colours = np.empty((_CHUNKS, num_values * CHUNK), np.float32)
     # Of each pair also its block, and the same Gaussian's pair before; where a block's pairs begin.
-    slopes = np.empty(_PAIRS * _PAIR, np.float32)
+    slopes = np.empty(_PAIRS * PAIR, np.float32)
     pairs, heads = np.empty(2 * _PAIRS, np.int32), np.empty((_CHUNKS, CHUNK), np.int32)
     begins = np.empty((_CHUNKS, BLOCKS + 1), np.int64)
     touched = np.empty(WORDS * EDGES, np.uint64)
     powers, places = np.empty(2 * HALF * LANES, np.float32), np.empty(2 * HALF, np.int32)
-    moments, shares = np.empty(_MOMENTS * CHUNK, np.float32), np.empty(LANES, np.float32)
+    moments, shares = np.empty(MOMENTS * CHUNK, np.float32), np.empty(LANES, np.float32)
     exact = np.float32(0 if kind == FLAT else 1)
     most = (np.max(starts[low + 1 : high + 1] - starts[low:high]) + CHUNK - 1) // CHUNK
     kept, marks = np.empty((most, PIXELS), np.float32), np.empty(most + 1, np.int64)
@@ -151,7 +137,7 @@ def _walk_tiles(  # type: ignore[no-untyped-def]
                 first = begin + chunk * CHUNK
                 count = min(CHUNK, following - first)
                 _find_slopes(begins[chunk], pairs, colours[chunk], num_values, planes, upstream, behind, slopes)
-                _write_chunk(
+                write_chunk(
                     first, count, slots, heads[chunk], pairs, slopes, forms[chunk], offsets, upstream,
                     num_values, moments, shares, exact, grad_records, grad_values,
                 )  # fmt: skip
@@ -227,8 +213,8 @@ def _keep_pairs(  # type: ignore[no-untyped-def]
     for at in range(start, start + reached):
         s = np.int64(element(places, at))
         alpha = opacity(load(powers, at * LANES))
-        store(slopes, pair * _PAIR, alpha)
-        store(slopes, pair * _PAIR + LANES, alpha * passes)
+        store(slopes, pair * PAIR, alpha)
+        store(slopes, pair * PAIR + LANES, alpha * passes)
         passes = multiply_add(negative(alpha), passes, passes)
         put(pairs, 2 * pair, np.int32(s))
         put(pairs, 2 * pair + 1, element(heads, s))
@@ -252,147 +238,16 @@ def _find_slopes(  # type: ignore[no-untyped-def]
         beyond, base = load(behind, pixel), load(upstream, planes * PIXELS + pixel)
         for pair in range(begins[block + 1] - 1, begins[block] - 1, -1):
             colour = num_values * np.int64(element(pairs, 2 * pair))
-            alpha, weight = load(slopes, pair * _PAIR), load(slopes, pair * _PAIR + LANES)
+            alpha, weight = load(slopes, pair * PAIR), load(slopes, pair * PAIR + LANES)
             worth = base
             for value in range(num_values):
                 worth = multiply_add(load(upstream, value * PIXELS + pixel), spread(colours, colour + value), worth)
             earned = weight * worth
             slope = multiply_add(negative(alpha / (one - alpha)), beyond, earned) * fill(np.float32(_LN2))
-            store(slopes, pair * _PAIR, choose(most > alpha, slope, zero))
+            store(slopes, pair * PAIR, choose(most > alpha, slope, zero))
             beyond = beyond + earned
             put(pairs, 2 * pair, np.int32(block))
         store(behind, pixel, beyond)
-
-
-@inlined
-def _write_chunk(  # type: ignore[no-untyped-def]
-    first, count, slots, heads, pairs, slopes, forms, offsets, upstream, num_values, moments, shares, exact,
-    grad_records, grad_values,
-):  # fmt: skip
-    """Write the gradients of a chunk's Gaussians to their slots."""
-    last = first + count - 1
-    for s in range(count):
-        ahead = element(slots, min(first + s + _AHEAD, last))
-        prefetch_to_write(grad_records, FIELDS * ahead)
-        prefetch_to_write(grad_values, num_values * ahead)
-        _sum_moments(s, heads, pairs, slopes, forms, offsets, upstream, moments, shares)
-        row = num_values * slots[first + s]
-        for value in range(min(_GROUP, num_values)):
-            put(grad_values, row + value, element(shares, value))
-        for value in range(_GROUP, num_values):
-            put(grad_values, row + value, _share_of(s, heads, pairs, slopes, upstream, value))
-    for s in range(0, count, LANES):
-        _write_records(s, first, count, slots, forms, moments, exact, grad_records)
-
-
-@inlined
-def _sum_moments(  # type: ignore[no-untyped-def]
-    s, heads, pairs, slopes, forms, offsets, upstream, moments, shares
-):
-    """Sums over a Gaussian's pixels of the derivatives by A, B, L, times the pixel's offset and 1; by along, level.
-
-    Those by A and B lack a factor -2, that by L a factor 2. And the sums of weight x upstream gradient of four values.
-    """
-    zero, one = fill(np.float32(0)), fill(np.float32(1))
-    a_x = a_y = a_z = a_one = b_x = b_y = b_z = b_one = zero
-    l_x = l_y = l_z = l_one = by_along = by_level = zero
-    share0 = share1 = share2 = share3 = zero
-    along = spread(forms, ALONG_ROW * CHUNK + s)
-    pair = np.int64(element(heads, s))
-    while pair >= 0:
-        pixel = LANES * np.int64(element(pairs, 2 * pair))
-        slope, weight = load(slopes, pair * _PAIR), load(slopes, pair * _PAIR + LANES)
-        pair = np.int64(element(pairs, 2 * pair + 1))
-        x, y, z = load(offsets, pixel), load(offsets, PIXELS + pixel), load(offsets, 2 * PIXELS + pixel)
-        a, b, front, x, y, z = forms_at(forms, s, x, y, z)
-        q = multiply_add(a, a, b * b)
-        inverse = one / maximum(multiply_add(front, front, along * q), fill(np.float32(_LEAST)))
-        ratio = q * inverse
-        scaled = slope * inverse
-        by_q = multiply_add(negative(scaled * along), ratio, scaled)
-        a, b, front = a * by_q, b * by_q, front * (scaled * ratio)
-        a_x, a_y, a_z, a_one = multiply_add(a, x, a_x), multiply_add(a, y, a_y), multiply_add(a, z, a_z), a_one + a
-        b_x, b_y, b_z, b_one = multiply_add(b, x, b_x), multiply_add(b, y, b_y), multiply_add(b, z, b_z), b_one + b
-        l_x, l_y, l_z = multiply_add(front, x, l_x), multiply_add(front, y, l_y), multiply_add(front, z, l_z)
-        l_one = l_one + front
-        by_along, by_level = multiply_add(slope * ratio, ratio, by_along), by_level + slope
-        share0 = multiply_add(weight, load(upstream, pixel), share0)
-        share1 = multiply_add(weight, load(upstream, pixel + PIXELS), share1)
-        share2 = multiply_add(weight, load(upstream, pixel + 2 * PIXELS), share2)
-        share3 = multiply_add(weight, load(upstream, pixel + 3 * PIXELS), share3)
-    store(moments, _MOMENTS * s, totals(a_x, a_y, a_z, a_one, b_x, b_y, b_z, b_one))
-    store(moments, _MOMENTS * s + LANES, totals(l_x, l_y, l_z, l_one, by_along, by_level, zero, zero))
-    store(shares, 0, totals(share0, share1, share2, share3, zero, zero, zero, zero))
-
-
-@inlined
-def _share_of(s, heads, pairs, slopes, upstream, value):  # type: ignore[no-untyped-def]
-    """The gradient of a Gaussian's value: the sum over its pixels of weight x upstream gradient."""
-    share = zero = fill(np.float32(0))
-    pair = np.int64(element(heads, s))
-    while pair >= 0:
-        pixel = value * PIXELS + LANES * np.int64(element(pairs, 2 * pair))
-        share = multiply_add(load(slopes, pair * _PAIR + LANES), load(upstream, pixel), share)
-        pair = np.int64(element(pairs, 2 * pair + 1))
-    return first_lane(totals(share, zero, zero, zero, zero, zero, zero, zero))
-
-
-@inlined
-def _write_records(  # type: ignore[no-untyped-def]
-    s, first, count, slots, forms, moments, exact, grad_records
-):
-    """Turn the moments of eight Gaussians into gradients of their records, and write them to their slots."""
-    at = _MOMENTS * s
-    a_x, a_y, a_z, a_one, b_x, b_y, b_z, b_one = _rows(moments, at)
-    l_x, l_y, l_z, l_one, along, level, _, _ = _rows(moments, at + LANES)
-    less, on, zero = fill(np.float32(-2)), fill(exact), fill(np.float32(0))
-    twice = on + on
-    a, b, front = _column(forms, A_X, s), _column(forms, B_X, s), _column(forms, L_X, s)
-    front_a, front_b = load(forms, FRONTS * CHUNK + s), load(forms, (FRONTS + 1) * CHUNK + s)
-    # What the moments lack: a factor -2, or 2.
-    a_x, a_y, a_z, a_one = less * a_x, less * a_y, less * a_z, less * a_one
-    b_x, b_y, b_z, b_one = less * b_x, less * b_y, less * b_z, less * b_one
-    l_x, l_y, l_z, l_one = twice * l_x, twice * l_y, twice * l_z, twice * l_one
-    n_x = l_x - multiply_add(a[0], a_one, multiply_add(b[0], b_one, front[0] * l_one))
-    n_y = l_y - multiply_add(a[1], a_one, multiply_add(b[1], b_one, front[1] * l_one))
-    n_z = l_z - multiply_add(a[2], a_one, multiply_add(b[2], b_one, front[2] * l_one))
-    by_front_a = multiply_add(a[0], l_x, multiply_add(a[1], l_y, a[2] * l_z))
-    by_front_b = multiply_add(b[0], l_x, multiply_add(b[1], l_y, b[2] * l_z))
-    a_x, a_y, a_z = multiply_add(front_a, l_x, a_x), multiply_add(front_a, l_y, a_y), multiply_add(front_a, l_z, a_z)
-    b_x, b_y, b_z = multiply_add(front_b, l_x, b_x), multiply_add(front_b, l_y, b_y), multiply_add(front_b, l_z, b_z)
-    # The moments have been read: the rows take their place.
-    _store_rows(moments, at, transposed(n_x, n_y, n_z, zero, zero, zero, a_x, a_y))
-    _store_rows(moments, at + LANES, transposed(a_z, b_x, b_y, b_z, by_front_a, by_front_b, on * along, level))
-    for place in range(s, min(s + LANES, count)):
-        row = FIELDS * slots[first + place]
-        store(grad_records, row, load(moments, _MOMENTS * place))
-        store(grad_records, row + LANES, load(moments, _MOMENTS * place + LANES))
-
-
-@inlined
-def _column(forms, row, s):  # type: ignore[no-untyped-def]
-    return load(forms, row * CHUNK + s), load(forms, (row + 1) * CHUNK + s), load(forms, (row + 2) * CHUNK + s)
-
-
-@inlined
-def _rows(moments, at):  # type: ignore[no-untyped-def]
-    """A column for each of eight numbers of eight Gaussians."""
-    return transposed(
-        load(moments, at),
-        load(moments, at + _MOMENTS),
-        load(moments, at + 2 * _MOMENTS),
-        load(moments, at + 3 * _MOMENTS),
-        load(moments, at + 4 * _MOMENTS),
-        load(moments, at + 5 * _MOMENTS),
-        load(moments, at + 6 * _MOMENTS),
-        load(moments, at + 7 * _MOMENTS),
-    )
-
-
-@inlined
-def _store_rows(moments, at, rows):  # type: ignore[no-untyped-def]
-    for row in range(LANES):
-        store(moments, at + row * _MOMENTS, rows[row])
 
 
 @inlined

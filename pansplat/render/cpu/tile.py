@@ -115,25 +115,9 @@ def gather(  # type: ignore[no-untyped-def]
         r5 = FIELDS * np.int64(element(entries, 2 * min(e + 5, last)))
         r6 = FIELDS * np.int64(element(entries, 2 * min(e + 6, last)))
         r7 = FIELDS * np.int64(element(entries, 2 * min(e + 7, last)))
-        n_x, n_y, n_z, rest_x, rest_y, rest_z, a_x, a_y = transposed(
-            load(records, r0),
-            load(records, r1),
-            load(records, r2),
-            load(records, r3),
-            load(records, r4),
-            load(records, r5),
-            load(records, r6),
-            load(records, r7),
-        )
-        a_z, b_x, b_y, b_z, front_a, front_b, along, level = transposed(
-            load(records, r0 + 8),
-            load(records, r1 + 8),
-            load(records, r2 + 8),
-            load(records, r3 + 8),
-            load(records, r4 + 8),
-            load(records, r5 + 8),
-            load(records, r6 + 8),
-            load(records, r7 + 8),
+        n_x, n_y, n_z, rest_x, rest_y, rest_z, a_x, a_y = columns_of(records, r0, r1, r2, r3, r4, r5, r6, r7)
+        a_z, b_x, b_y, b_z, front_a, front_b, along, level = columns_of(
+            records, r0 + 8, r1 + 8, r2 + 8, r3 + 8, r4 + 8, r5 + 8, r6 + 8, r7 + 8
         )
         on = fill(exact)
         l_x = on * multiply_add(front_a, a_x, multiply_add(front_b, b_x, n_x))
@@ -154,6 +138,21 @@ def gather(  # type: ignore[no-untyped-def]
             row = num_values * np.int64(element(entries, 2 * (first + place)))
             for channel in range(num_values):
                 put(colours, num_values * place + channel, element(values, row + channel))
+
+
+@inlined
+def columns_of(numbers, r0, r1, r2, r3, r4, r5, r6, r7):  # type: ignore[no-untyped-def]
+    """The columns of eight rows of eight numbers, given where the rows begin."""
+    return transposed(
+        load(numbers, r0),
+        load(numbers, r1),
+        load(numbers, r2),
+        load(numbers, r3),
+        load(numbers, r4),
+        load(numbers, r5),
+        load(numbers, r6),
+        load(numbers, r7),
+    )
 
 
 @inlined
