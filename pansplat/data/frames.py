@@ -21,7 +21,8 @@ from pansplat.data.views import Views
 class FrameSequence(Protocol):
     """A sequence of posed panoramas; `poses` are cam2world in OpenCV axes, metres."""
 
-    name: str
+    @property
+    def name(self) -> str: ...
 
     @property
     def poses(self) -> Sequence[Float[Tensor, "4 4"]]: ...

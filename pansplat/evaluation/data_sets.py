@@ -86,7 +86,7 @@ def frame_distance_set(sequences: Sequence[FrameSequence], gap: int, draws: int)
     return EvaluationSet(f"{gap} frames", cases, missing)
 
 
-def sequences_of(root: Path, name: str) -> tuple[list[FrameSequence], str]:
+def sequences_of(root: Path, name: str) -> tuple[Sequence[FrameSequence], str]:
     """The sequences of `LOC360` (its test location) or `INSTA360`, and what is missing when there are none.
 
     Raises:
@@ -95,9 +95,9 @@ def sequences_of(root: Path, name: str) -> tuple[list[FrameSequence], str]:
     for inside in _INSIDE[name]:
         folder = root / inside
         if name == LOC360 and (folder / "atrium").is_dir():
-            return list(read_loc360(folder, "test")), ""
+            return read_loc360(folder, "test"), ""
         if name == INSTA360 and _has_videos(folder):
-            return list(read_insta360(folder)), ""
+            return read_insta360(folder), ""
     if name == LOC360:
         return [], f"{name}: needed {root / '360Loc' / 'atrium'} (mapping/*360*/camera_pose.json with image/ beside it)"
     return [], f"{name}: needed {root / 'insta360' / 'VID_*'} (video.mp4 with frame_trajectory.txt beside it)"

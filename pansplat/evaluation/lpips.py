@@ -119,7 +119,7 @@ def _mean(
     """Mean over the pixels of a layer, each counting as much as the pixels it stands for."""
     if weights is None:
         return maps.mean(dim=(1, 2))
-    counted = functional.adaptive_avg_pool2d(weights[:, None].to(maps), maps.shape[-2:])[:, 0]
+    counted = functional.adaptive_avg_pool2d(weights[:, None].to(maps), (maps.shape[-2], maps.shape[-1]))[:, 0]
     return (maps * counted).sum(dim=(1, 2)) / counted.sum(dim=(1, 2)).clamp_min(torch.finfo(maps.dtype).tiny)
 
 

@@ -136,15 +136,14 @@ class ProtocolResult:
 
     def as_json(self) -> dict[str, object]:
         """What results.json holds; numbers that are not finite become null."""
-        found = {
+        return {
             "protocol": self.protocol,
             "height": self.height,
             "lpips": self.lpips,
-            "results": [result.as_json() for result in self.sets],
+            "results": _finite([result.as_json() for result in self.sets]),
             "missing": self.missing,
             "skipped": self.skipped,
         }
-        return _finite(found)
 
 
 def methods_of(

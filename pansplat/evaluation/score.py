@@ -104,7 +104,7 @@ def draw_targets(sample: Sample, prediction: Prediction, blend: Blend, lpips: Lp
     for index, target in enumerate(sample.targets.images):
         began = time.perf_counter()
         with torch.no_grad():
-            pose, size = sample.targets.cam2world[index], tuple(target.shape[-2:])
+            pose, size = sample.targets.cam2world[index], (target.shape[-2], target.shape[-1])
             picture = pipeline.render(prediction.scene, pose, blend=blend, size=size).color.float()
         seconds = time.perf_counter() - began
         score = Score(
@@ -127,7 +127,7 @@ def measure_depth(context: Views, prediction: Prediction) -> DepthErrors | None:
         return None
     depth = prediction.depth
     if depth is None:
-        size = tuple(context.images.shape[-2:])
+        size = (context.images.shape[-2], context.images.shape[-1])
         with torch.no_grad():
             drawn = [
                 pipeline.render(prediction.scene, pose, blend=view, size=size).depth
