@@ -15,7 +15,7 @@ from numba.core import event
 
 _PACKAGE = __name__.rpartition(".")[0]
 _PATIENCE = 1.0  # seconds of compiling before the user is told
-_NEWS = "pansplat: compiling the rasteriser for this processor, once (about 15 seconds)"
+_NEWS = "pansplat: compiling the rasteriser for this processor, once (about half a minute)"
 _OPTIONS = {
     "nogil": True,
     "error_model": "numpy",  # divide without asking whether by zero
