@@ -32,6 +32,7 @@ class ModelRow:
         height: of the panoramas, pixels.
         stages_s: seconds of each part.
         total_s: their sum.
+        processor_s: of all threads together: what to look at where others use the machine too.
         peak_gib: the process's largest resident memory, 2^30 bytes.
         num_gaussians: that were predicted.
         depth_median_error, depth_max_error: |depth - reference| / reference of the finest sweep.
@@ -48,6 +49,7 @@ class ModelRow:
     height: int
     stages_s: dict[str, float] = field(default_factory=dict)
     total_s: float | None = None
+    processor_s: float | None = None
     peak_gib: float | None = None
     num_gaussians: int | None = None
     depth_median_error: float | None = None
@@ -129,6 +131,7 @@ def _row(case: ModelCase, measured: Measured, reference: Measured) -> ModelRow:
         height=measured.picture.shape[-2],
         stages_s=measured.stages_s,
         total_s=sum(measured.stages_s.values()),
+        processor_s=measured.processor_s,
         peak_gib=measured.peak_gib,
         num_gaussians=measured.num_gaussians,
         is_reference=measured is reference,

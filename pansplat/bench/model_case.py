@@ -70,12 +70,14 @@ class Measured:
 
     Attributes:
         stages_s: seconds of each of `STAGES`.
+        processor_s: of all threads together; over the number of threads, what an idle machine would take at least.
         peak_gib: the process's largest resident memory, 2^30 bytes; None where the system does not tell.
         depth: of the finest sweep, metres.
         picture: at the middle pose, drawn by numba.
     """
 
     stages_s: dict[str, float]
+    processor_s: float
     peak_gib: float | None
     num_gaussians: int
     depth: Tensor
@@ -106,7 +108,7 @@ def measure_case(case: ModelCase, weights: Path, views: Path, *, near: float, fa
             said = (child.stderr.strip() or f"status {child.returncode}").splitlines()[-1]
             raise InputError(f"a row of the bench failed ({said}); try a smaller --height, or more tiles")
         told, tensors = json.loads(child.stdout.splitlines()[-1]), safetensors.torch.load_file(out)
-    return Measured(told["stages_s"], told["peak_gib"], told["num_gaussians"], tensors["depth"], tensors["picture"])
+    return Measured(**told, depth=tensors["depth"], picture=tensors["picture"])
 
 
 def _run(job: Path) -> None:
@@ -129,7 +131,7 @@ def _run(job: Path) -> None:
         measured = _measure(network, case, views["images"], views["cam2world"], told["near"], told["far"])
     tensors = {"depth": measured.depth.contiguous(), "picture": measured.picture.contiguous()}
     safetensors.torch.save_file(tensors, told["out"])
-    numbers = {name: getattr(measured, name) for name in ("stages_s", "peak_gib", "num_gaussians")}
+    numbers = {name: getattr(measured, name) for name in ("stages_s", "processor_s", "peak_gib", "num_gaussians")}
     print(json.dumps(numbers))
 
 
@@ -154,18 +156,19 @@ def _measure(
     views = len(images)
     bounds = [torch.full((1, views), bound) for bound in (near, far)]
     stages: dict[str, float] = {}
-    can_tell = reset_resident_peak()
+    can_tell, before = reset_resident_peak(), time.process_time()
     with _watched(network, stages):
         matched = network.match(images[None], cam2world[None].float(), *bounds)
     began = time.perf_counter()
     (gaussians,) = whole(list(network.lift(matched, tiles=case.tiles)), case.compat)
     stages["heads"] = time.perf_counter() - began
+    processor = time.process_time() - before
     peak = resident_peak() / 2**30 if can_tell else None
     depth = matched.depths.depth[-1][0]
     del matched
     scene = Scene(gaussians, cam2world.double(), near, far, height=images.shape[-2])
     picture = render(scene, scene.pose_between(0.5), backend="numba").color
-    return Measured(stages, peak, len(gaussians), depth, picture)
+    return Measured(stages, processor, peak, len(gaussians), depth, picture)
 
 
 @contextmanager

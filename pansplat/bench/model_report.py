@@ -17,7 +17,13 @@ _COLUMNS = (
     *(("compat", "left"), ("precision", "left"), ("attention", "left"), ("convolution", "left")),
     *(("tiles", "right"), ("threads", "right")),
     *((f"{stage} s", "right") for stage in STAGES),
-    *(("total s", "right"), ("peak GiB", "right"), ("depth median", "right"), ("depth max", "right")),
+    *(
+        ("total s", "right"),
+        ("processor s", "right"),
+        ("peak GiB", "right"),
+        ("depth median", "right"),
+        ("depth max", "right"),
+    ),
     ("PSNR dB", "right"),
 )
 _STAGE_COLORS = ("#1764ab", "#6aaed6", "#e0a030", "#c8501e")
@@ -46,6 +52,7 @@ def model_cells(row: ModelRow) -> tuple[str, ...]:
         *(row.compat, row.precision, row.attention, row.convolution, f"{row.tiles}x{row.tiles}", str(row.threads)),
         *(_number(row.stages_s.get(stage), "{:.1f}") for stage in STAGES),
         _number(row.total_s, "{:.1f}"),
+        _number(row.processor_s, "{:.1f}"),
         _number(row.peak_gib, "{:.2f}"),
         "reference" if row.is_reference else _number(row.depth_median_error, "{:.1e}"),
         _number(row.depth_max_error, "{:.1e}"),

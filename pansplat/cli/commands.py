@@ -148,6 +148,8 @@ class Evaluate:
     """Predictor: `sweep`, or a file of weights; always predicts anew, so that the times are true."""
     compat: Compat = "trained"
     """For a network: official, fixed, or as its weights were trained; `pansplat predict --help` has more."""
+    precision: Precision = "float32"
+    """Number type of a network's convolutions."""
     height: int = 512
     """Panoramas are resized to this height, pixels."""
     blend: str | None = None

@@ -65,7 +65,8 @@ def _methods(command: Evaluate, protocol: str) -> list[Method]:
     methods: list[Method] = []
     for index, model in enumerate((command.model, *command.protocol.models)):
         with_compat = index == 0 or Path(model).suffix.lower() in SUFFIXES  # sweep among the others has none
-        predictor = pipeline.load_model(model, compat=command.compat if with_compat else "trained")
+        compat, precision = (command.compat, command.precision) if with_compat else ("trained", "float32")
+        predictor = pipeline.load_model(model, compat=compat, precision=precision)
         methods += methods_of(predictor, protocol, blend, Path(model).stem)
     names = [method.name for method in methods]
     if len(set(names)) < len(names):

@@ -42,7 +42,7 @@ def run_evaluate(command: Evaluate) -> int:
                 file=sys.stderr,
             )
         pairs += with_targets
-    predictor = pipeline.load_model(command.model, compat=command.compat)
+    predictor = pipeline.load_model(command.model, compat=command.compat, precision=command.precision)
     with progress_bar() as progress:
         cases = evaluate(
             pairs, predictor, command.out, height=command.height, blend=blend, lpips=lpips, progress=progress

@@ -53,7 +53,7 @@ def no_children(monkeypatch: pytest.MonkeyPatch) -> list[ModelCase]:
         asked.append(case)
         off = 0.001 * (len(asked) - 1)
         depth, picture = torch.full((2, 32, 64), 2.0 + 2 * off), torch.full((3, 64, 128), 0.5 + off)
-        return Measured({"features": 1.0, "mono": 2.0, "cost volume": 3.0, "heads": 4.0}, 1.5, 10, depth, picture)
+        return Measured({"features": 1.0, "mono": 2.0, "cost volume": 3.0, "heads": 4.0}, 17.0, 1.5, 10, depth, picture)
 
     monkeypatch.setattr(bench_model, "measure_case", answer)
     monkeypatch.setattr(command, "save_random_weights", _small_weights)
@@ -70,7 +70,7 @@ def test_the_command_writes_and_prints_what_was_measured(no_children, tmp_path, 
     rows = json.loads((out / "model.json").read_text())["rows"]
     assert len(rows) == len(no_children) == 4
     assert rows[0]["is_reference"] and rows[0]["psnr_db"] is None
-    assert rows[1]["total_s"] == 10.0 and rows[1]["height"] == 64
+    assert (rows[1]["total_s"], rows[1]["processor_s"]) == (10.0, 17.0) and rows[1]["height"] == 64
     assert rows[1]["depth_max_error"] == pytest.approx(0.001, rel=1e-3)
     assert rows[1]["psnr_db"] == pytest.approx(60, abs=0.01)
     assert {row["precision"] for row in rows} == {"float32", "bfloat16"}
@@ -188,7 +188,7 @@ def test_errors_are_relative_to_the_reference():
 
 def test_what_was_not_measured_is_blank():
     row = ModelRow("fixed", "float32", "float32", "direct", 1, 1, 64)
-    assert model_cells(row)[6:] == ("",) * 9
+    assert model_cells(row)[6:] == ("",) * 10
     same = dataclasses.replace(row, psnr_db=math.inf, depth_median_error=0.0, depth_max_error=0.0)
     assert model_cells(same)[-3:] == ("0.0e+00", "0.0e+00", "same")
     assert model_markdown([row]).count("\n") == 3
