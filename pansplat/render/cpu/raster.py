@@ -124,7 +124,7 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
             list_blocks(entries, first, count, touched)
             is_open = False
             # The next block's powers are found before a block is drawn, so that their latencies hide each other.
-            drawn, reached, half = -1, 0, 0
+            drawn, reached, following, half = -1, 0, 0, 0
             for block in range(BLOCKS + 1):
                 if block < BLOCKS:
                     if not some(load(through, block * LANES) > fill(np.float32(CLOSED))):

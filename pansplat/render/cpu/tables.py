@@ -1,6 +1,6 @@
 """The pixels of one picture as the tile kernels read them: two short tables and a rotation."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -41,7 +41,7 @@ def plane_of(picture: Picture, *, exact: bool) -> Plane:
     Source: docs/rendering.md, section 6.
     """
     height, width = picture.size
-    x, y = (np.arange(extent) + 0.5 for extent in (width, height))
+    x, y = (np.arange(extent, dtype=np.float64) + 0.5 for extent in (width, height))
     rotation = np.ascontiguousarray(picture.rotation.to("cpu", torch.float64).numpy())
     if not exact:
         return Plane(FLAT, _table(x, np.zeros(width)), _table(y, np.zeros(height)), rotation)
@@ -53,5 +53,5 @@ def plane_of(picture: Picture, *, exact: bool) -> Plane:
     return Plane(PINHOLE, _table(x, np.zeros(width)), _table(y, np.zeros(height)), rotation)
 
 
-def _table(first: npt.NDArray[np.float64], second: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _table(first: npt.NDArray[Any], second: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
     return np.stack((first, second), axis=1)
