@@ -1,0 +1,98 @@
+"""Deferred gradients are the plain path's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from pansplat.data.sample import Batch
+from pansplat.model.auxiliary_heads import AuxiliaryHeads
+from pansplat.model.pansplat import PanSplat
+from pansplat.training.config import MemoryConfig
+from pansplat.training.losses import LossWeights
+from pansplat.training.network import auxiliary_heads, freeze, learn
+from pansplat.training.perceptual import Structure
+from pansplat.training.step import Teacher
+
+
+def gradients(
+    network: PanSplat, batch: Batch, memory: MemoryConfig, auxiliary: AuxiliaryHeads | None = None, share: float = 1.0
+) -> tuple[dict[str, torch.Tensor], dict[str, float]]:
+    """Of every parameter that gets one, and the parts of the loss."""
+    network.zero_grad()
+    told = Teacher(network, auxiliary, Structure(), LossWeights(), memory).backpropagate(batch, share)
+    return {name: p.grad.clone() for name, p in network.named_parameters() if p.grad is not None}, told
+
+
+def assert_equal_gradients(found: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> None:
+    assert found.keys() == wanted.keys()
+    for name, gradient in wanted.items():
+        scale = float(gradient.abs().max())
+        torch.testing.assert_close(found[name], gradient, rtol=1e-6, atol=1e-6 * scale + 1e-14, msg=name)
+
+
+@pytest.mark.parametrize("style", ["panorama", "cubemap", "original"])
+@pytest.mark.parametrize("method", ["one-step", "two-step"])
+def test_deferred_gradients_equal_plain_ones(
+    style: str, method: str, micro: Callable[..., PanSplat], make_batch: Callable[..., Batch]
+) -> None:
+    network, batch = micro(), make_batch()
+    learn(network, ())
+    wanted, loss = gradients(network, batch, MemoryConfig("plain", 1, style))
+    found, deferred_loss = gradients(network, batch, MemoryConfig(method, 2, style))
+    assert loss["depth"] > 0 and loss["square"] > 0
+    assert deferred_loss == pytest.approx(loss, rel=1e-9)
+    assert any(name.startswith("features.") for name in wanted)
+    assert_equal_gradients(found, wanted)
+
+
+def test_deferred_gradients_equal_plain_ones_when_views_are_mixed(
+    micro: Callable[..., PanSplat], make_batch: Callable[..., Batch]
+) -> None:
+    network, batch = micro(), make_batch()
+    learn(network, ())
+    wanted, _ = gradients(network, batch, MemoryConfig("plain", 1, "cubemap", "by_view"))
+    found, _ = gradients(network, batch, MemoryConfig("two-step", 2, "cubemap", "by_view"))
+    assert_equal_gradients(found, wanted)
+
+
+def test_deferred_gradients_equal_plain_ones_with_auxiliary_heads(
+    micro: Callable[..., PanSplat], make_batch: Callable[..., Batch]
+) -> None:
+    network, batch = micro(), make_batch()
+    learn(network, ())
+    extra = auxiliary_heads(network).double()
+    wanted, plain = gradients(network, batch, MemoryConfig("plain"), extra)
+    own = [p.grad.clone() for p in extra.parameters() if p.grad is not None]
+    extra.zero_grad()
+    found, _ = gradients(network, batch, MemoryConfig("two-step", 2), extra)
+    assert plain["auxiliary"] > 0
+    assert_equal_gradients(found, wanted)
+    for parameter, gradient in zip(extra.parameters(), own, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient)
+
+
+def test_a_frozen_part_gets_no_gradient_and_keeps_its_statistics(
+    micro: Callable[..., PanSplat], make_batch: Callable[..., Batch]
+) -> None:
+    network, batch, frozen = micro(), make_batch(), ("features", "cost_volume")
+    freeze(network, frozen)
+    learn(network, frozen)
+    before = {name: tensor.clone() for name, tensor in network.features.state_dict().items()}
+    wanted, _ = gradients(network, batch, MemoryConfig("plain", 1, "cubemap"))
+    found, _ = gradients(network, batch, MemoryConfig("two-step", 2, "cubemap"))
+    assert wanted and all(name.startswith("heads.") for name in wanted)
+    assert_equal_gradients(found, wanted)
+    for name, tensor in network.features.state_dict().items():
+        assert torch.equal(tensor, before[name]), name
+
+
+def test_gradients_of_two_items_are_the_mean_of_each_by_itself(
+    micro: Callable[..., PanSplat], make_batch: Callable[..., Batch]
+) -> None:
+    network = micro().eval()
+    both, _ = gradients(network, make_batch(0, 1), MemoryConfig("two-step", 1, "cubemap"))
+    parts = [gradients(network, make_batch(n), MemoryConfig("two-step", 1, "cubemap"), share=0.5)[0] for n in (0, 1)]
+    assert_equal_gradients({name: parts[0][name] + parts[1][name] for name in both}, both)
