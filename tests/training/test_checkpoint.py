@@ -1,0 +1,121 @@
+"""Checkpoints appear whole or not at all, and never run what they hold."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from pansplat.errors import InputError
+from pansplat.training.checkpoint import checkpoints, load_checkpoint, load_latest, save_checkpoint
+
+_WRITER = """
+import sys, torch
+from pathlib import Path
+from pansplat.training.checkpoint import save_checkpoint
+state = {"network": {"weight": torch.zeros(500_000)}}
+step = int(sys.argv[2])
+while True:
+    step += 1
+    state["network"]["weight"].fill_(step)
+    save_checkpoint(Path(sys.argv[1]), step, state, keep=2)
+    print(step, flush=True)
+"""
+
+
+def state(value: float = 1.0, count: int = 4) -> dict[str, object]:
+    return {"network": {"weight": torch.full((count,), value)}}
+
+
+def test_a_kill_at_any_moment_leaves_a_checkpoint_that_can_be_read(tmp_path: Path) -> None:
+    first = 0
+    for number in range(4):
+        command = [sys.executable, "-c", _WRITER, str(tmp_path), str(first)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
+            assert child.stdout is not None
+            written = int(child.stdout.readline())
+            time.sleep(0.01 + 0.013 * number)
+            child.send_signal(signal.SIGKILL)
+            written = max([written, *map(int, child.stdout.read().split())])
+        found = load_latest(tmp_path)
+        assert found is not None
+        first = found[1]["step"]
+        assert first >= written
+        assert found[1]["network"]["weight"].eq(first).all()
+        assert {path.suffix for path in tmp_path.iterdir()} == {".pt"}
+        assert not list(tmp_path.glob(".step_*"))
+
+
+def test_a_full_disk_is_an_error_and_keeps_the_checkpoint_before(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, 1, state(), keep=1)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with pytest.raises(InputError, match=r"step_00000002.pt.*room on the disk"):
+            save_checkpoint(tmp_path, 2, state(count=1_000_000), keep=1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    found = load_latest(tmp_path)
+    assert found is not None and found[1]["step"] == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["step_00000001.pt"]
+
+
+def test_a_damaged_checkpoint_is_passed_over_with_a_warning(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, 1, state(), keep=2)
+    newest = save_checkpoint(tmp_path, 2, state(), keep=2)
+    newest.write_bytes(newest.read_bytes()[:300])
+    with pytest.warns(UserWarning, match=r"passed over a checkpoint.*step_00000002.pt"):
+        found = load_latest(tmp_path)
+    assert found is not None and found[1]["step"] == 1
+
+
+def test_when_none_can_be_read_it_is_an_error(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, 1, state(), keep=1).write_bytes(b"nothing")
+    with pytest.warns(UserWarning, match="passed over"), pytest.raises(InputError, match="got none"):
+        load_latest(tmp_path)
+    assert load_latest(tmp_path / "nowhere") is None
+
+
+class Poison:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __reduce__(self) -> tuple:
+        return os.mkdir, (str(self.folder),)
+
+
+@pytest.mark.parametrize("kind", ["zip", "pickle"])
+def test_a_poisoned_checkpoint_is_refused_and_not_run(kind: str, tmp_path: Path) -> None:
+    sign, path = tmp_path / "ran", tmp_path / "step_00000001.pt"
+    content = {"kind": "pansplat-training", "network": Poison(sign)}
+    if kind == "zip":
+        torch.save(content, path)
+    else:
+        path.write_bytes(pickle.dumps(content, protocol=2))
+    with pytest.raises(InputError, match="asks to run"):
+        load_checkpoint(path)
+    with pytest.raises(InputError, match="asks to run"):
+        load_latest(tmp_path)
+    assert not sign.exists()
+
+
+def test_only_the_newest_are_kept(tmp_path: Path) -> None:
+    for step in range(5):
+        save_checkpoint(tmp_path, step, state(), keep=2)
+    assert [path.name for path in checkpoints(tmp_path)] == ["step_00000003.pt", "step_00000004.pt"]
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    torch.save({"state_dict": {}}, tmp_path / "other.pt")
+    with pytest.raises(InputError, match="needed a checkpoint of pansplat-train"):
+        load_checkpoint(tmp_path / "other.pt")
