@@ -1,0 +1,136 @@
+"""A run learns, is gone on with exactly, and stops when it must."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from pansplat.errors import InputError
+from pansplat.model.checkpoint import load_weights
+from pansplat.training import loop
+from pansplat.training.config import CheckpointConfig, OptimizerConfig, TrainConfig, ValidationConfig
+from pansplat.training.loop import Run
+from pansplat.training.network import read_weights
+
+
+def curve(folder: Path) -> list[tuple[str, str, str]]:
+    """Step, loss and norm of the gradient of every row, to all digits that are written."""
+    with open(folder / "log.csv") as file:
+        return [(row["step"], row["loss"], row["gradient_norm"]) for row in csv.DictReader(file)]
+
+
+def trained(config: TrainConfig) -> dict[str, torch.Tensor]:
+    Run(config, silent=True).train()
+    return load_weights(config.out / "model.safetensors").tensors
+
+
+def test_a_run_learns(micro_run: Callable[..., TrainConfig]) -> None:
+    config = micro_run(steps=14, optimizer=OptimizerConfig(steps=14, batch_size=1, rate=5e-3))
+    trained(config)
+    losses = [float(loss) for _, loss, _ in curve(config.out)]
+    assert sum(losses[-4:]) < 0.9 * sum(losses[:4])
+
+
+class Killed(BaseException):
+    """As if the process were killed."""
+
+
+@pytest.mark.parametrize("accumulate", [1, 2])
+def test_a_killed_run_goes_on_as_if_nothing_had_happened(
+    accumulate: int, micro_run: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    optimizer = OptimizerConfig(steps=6, batch_size=1, accumulate=accumulate, rate=1e-3, ema=0.9)
+    whole, broken = micro_run("whole", optimizer=optimizer), micro_run("broken", optimizer=optimizer)
+    wanted = trained(whole)
+    learn = Run._learn
+
+    def killed(self: Run, batches: list) -> dict[str, float]:
+        if self.step == 5:  # the last checkpoint is of step 4, and a row of step 4 has been written since
+            raise Killed
+        return learn(self, batches)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Run, "_learn", killed)
+        with pytest.raises(Killed):
+            Run(broken, silent=True).train()
+    assert [row[0] for row in curve(broken.out)] == list("01234")
+    found = trained(broken)
+    assert curve(broken.out) == curve(whole.out)
+    assert len(curve(whole.out)) == 6
+    for name, tensor in wanted.items():
+        assert torch.equal(found[name], tensor), name
+
+
+def test_settings_may_not_change_under_way(micro_run: Callable[..., TrainConfig]) -> None:
+    trained(micro_run(steps=1))
+    with pytest.raises(InputError, match=r"optimizer.steps was 1, now 2"):
+        Run(micro_run(steps=2), silent=True)
+
+
+def test_ctrl_c_saves_and_the_same_command_goes_on(
+    micro_run: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = micro_run(steps=4, checkpoint=CheckpointConfig(every=0))
+    learn = Run._learn
+
+    def interrupted(self: Run, batches: list) -> dict[str, float]:
+        if self.step == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+        return learn(self, batches)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Run, "_learn", interrupted)
+        assert not Run(config, silent=True).train()
+    again = Run(config, silent=True)
+    assert again.step == 2
+    assert again.train()
+    assert len(curve(config.out)) == 4
+
+
+def test_a_loss_that_is_no_number_stops_the_run_and_keeps_the_batch(
+    micro_run: Callable[..., TrainConfig], sphere: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = sphere(8, broken=frozenset(range(8)))
+    monkeypatch.setattr(loop, "sources", lambda *_: (source, source))
+    config = micro_run()
+    with pytest.raises(InputError, match="step 0: needed finite numbers.*sphere_"):
+        Run(config, silent=True).train()
+    (kept,) = config.out.glob("not_finite_*.pt")
+    content = torch.load(kept, weights_only=True)
+    assert content["batches"][0]["names"][0].startswith("sphere_")
+    assert not torch.isfinite(content["batches"][0]["images"]).all()
+    assert not list(config.out.glob("model.safetensors"))
+
+
+def test_validation_writes_numbers_and_pictures(micro_run: Callable[..., TrainConfig]) -> None:
+    config = micro_run(steps=2, validation=ValidationConfig(every=1, samples=2, pictures=1))
+    trained(config)
+    rows = list(csv.DictReader((config.out / "validation.csv").read_text().splitlines()))
+    assert [row["step"] for row in rows] == ["1", "2"]
+    assert all(float(row["psnr"]) > 0 and float(row["depth_error"]) > 0 for row in rows)
+    assert len(list((config.out / "pictures").glob("*.png"))) == 2
+
+
+def test_the_height_grows_while_training(micro_run: Callable[..., TrainConfig]) -> None:
+    config = micro_run(steps=2, heights=(32, 64), validation=ValidationConfig(every=1, samples=1, pictures=0))
+    trained(config)
+    rows = csv.DictReader((config.out / "validation.csv").read_text().splitlines())
+    assert [row["height"] for row in rows] == ["32", "64"]
+
+
+def test_a_run_begins_with_the_weights_of_another(micro_run: Callable[..., TrainConfig]) -> None:
+    config = micro_run(steps=2)
+    final = trained(config)
+    checkpoint = read_weights(config.out / "checkpoints" / "step_00000002.pt")
+    assert all(torch.equal(checkpoint.tensors[name], tensor) for name, tensor in final.items())
+
+    other = micro_run("other", network=replace(config.network, init=config.out / "model.safetensors"))
+    begun = Run(other, silent=True).network.state_dict()
+    assert all(torch.equal(begun[name], tensor) for name, tensor in final.items())
