@@ -100,7 +100,7 @@ def test_a_loss_that_is_no_number_stops_the_run_and_keeps_the_batch(
     source = sphere(8, broken=frozenset(range(8)))
     monkeypatch.setattr(loop, "sources", lambda *_: (source, source))
     config = micro_run()
-    with pytest.raises(InputError, match="step 0: needed finite numbers.*sphere_"):
+    with pytest.raises(InputError, match=r"step 0: needed finite numbers.*sphere_"):
         Run(config, silent=True).train()
     (kept,) = config.out.glob("not_finite_*.pt")
     content = torch.load(kept, weights_only=True)
