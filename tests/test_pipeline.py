@@ -206,7 +206,7 @@ def test_a_path_of_several_pairs_asks_for_one(tmp_path: Path) -> None:
 
 
 def test_an_unknown_model_names_those_there_are() -> None:
-    with pytest.raises(InputError, match="must be one of sweep, or a file of weights .*, got 'swepe'"):
+    with pytest.raises(InputError, match=r"must be one of sweep, or a file of weights .*, got 'swepe'"):
         load_model("swepe")
 
 
