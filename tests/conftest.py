@@ -1,5 +1,6 @@
 """Fixtures every test may use."""
 
+import contextlib
 import importlib.util
 import os
 import warnings
@@ -12,6 +13,13 @@ import torch
 from jaxtyping import config, install_import_hook
 
 import pansplat.testing  # noqa: F401  # the hook names it
+
+# Triton reads this when it is first imported, which torch does by itself sooner or later; and its LLVM must be in
+# the process before Mesa's.
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")
+with contextlib.suppress(ImportError):
+    import triton  # noqa: F401
 
 # Annotated shapes and types are checked at every call; the hook must come before the rooms are imported.
 _CHECKED = ("geometry", "gaussians", "model", "render", "evaluation", "pipeline")

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import moderngl
 
 from pansplat.errors import InputError
+from pansplat_viewer.llvm import load_before_mesa
 
 _EGL_PACKAGES = "libegl1 libgl1-mesa-dri libgl1"
 _OSMESA_PACKAGE = "libosmesa6"
@@ -32,6 +33,7 @@ def create_context(backend: Literal["auto", "egl", "osmesa"] = "auto") -> modern
     makers = {"egl": _create_egl, "osmesa": _create_osmesa}
     if backend != "auto" and backend not in makers:
         raise InputError(f"`backend` must be auto, egl or osmesa, got {backend!r}")
+    load_before_mesa()
     failures = []
     for name in makers if backend == "auto" else (backend,):
         try:

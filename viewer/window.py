@@ -12,6 +12,7 @@ from typing import Any
 import moderngl
 from imgui_bundle import imgui
 
+from pansplat_viewer.llvm import load_before_mesa
 from pansplat_viewer.viewer import Viewer
 
 _DEBIAN = "on Debian or Ubuntu: apt-get install libgl1 libegl1 libgl1-mesa-dri libgles2"
@@ -46,6 +47,7 @@ class Window:
         problem = display_problem()
         if problem:
             raise NoWindowError(problem)
+        load_before_mesa()
         self._glfw = _import_glfw()
         self.dropped: list[Path] = []
         self._handle = self._create(title, size)

@@ -107,9 +107,10 @@ def observe(
     shape = (gaussians.quats, gaussians.scales) if covariances is None else (covariances,)
     fields = (gaussians.means, gaussians.opacities, gaussians.harmonics, *shape)
     work = functools.partial(observe_chunk, cam2world=cam2world, spread=spread, compensate=compensate, exact=exact)
+    needs_grad = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (*fields, cam2world))
     parts = []
     for chunk in zip(*(field.split(_CHUNK) for field in fields), strict=True):
-        parts.append(checkpoint(work, *chunk, use_reentrant=False) if torch.is_grad_enabled() else work(*chunk))
+        parts.append(checkpoint(work, *chunk, use_reentrant=False) if needs_grad else work(*chunk))
     return Observed(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 

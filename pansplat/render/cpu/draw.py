@@ -65,7 +65,6 @@ class _Notes:
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
 
-@torch.compiler.disable
 def draw(
     gaussians: Gaussians,
     covariances: Float[Tensor, "n 3 3"] | None,

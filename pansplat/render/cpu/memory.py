@@ -35,7 +35,7 @@ class Lease:
 
     def __del__(self) -> None:
         with _lock:
-            _idle.extend(self._blocks)
+            _idle.extend(getattr(self, "_blocks", ()))  # torch.compile makes objects that were never initialised
             while sum(block.nbytes for block in _idle) > _KEPT:
                 _idle.pop(0)
 

@@ -1,5 +1,6 @@
 """Contexts without a window, and the same picture on every version of OpenGL."""
 
+import importlib.util
 import os
 import subprocess
 import sys
@@ -145,3 +146,10 @@ def test_tier_follows_the_context():
     assert choose_tier(New(), "gl33") == "gl33"
     with pytest.raises(InputError, match=r"needs OpenGL 4.3, this context has 4.1; use tier gl33"):
         choose_tier(Old(), "gl43")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="needs Triton, which is not for this system")
+def test_triton_can_be_loaded_after_a_context():
+    """Where Mesa's LLVM was first, loading Triton's used to end the process."""
+    code = "from pansplat_viewer.offscreen import create_context; create_context(); import torch._dynamo"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
