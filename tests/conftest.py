@@ -22,7 +22,7 @@ with contextlib.suppress(ImportError):
     import triton  # noqa: F401
 
 # Annotated shapes and types are checked at every call; the hook must come before the rooms are imported.
-_CHECKED = ("geometry", "gaussians", "model", "render", "evaluation", "pipeline")
+_CHECKED = ("geometry", "gaussians", "render", "evaluation", "pipeline")
 install_import_hook([f"pansplat.{room}" for room in _CHECKED], "pansplat.testing.check_types")
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared"

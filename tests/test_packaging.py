@@ -119,11 +119,10 @@ def test_an_installed_wheel_is_used_and_reads_its_shaders(installed: Path) -> No
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize(("command", "status"), [("pansplat", 0), ("pansplat-view", 0), ("pansplat-train", 1)])
-def test_the_entry_points_of_an_installed_wheel_work(installed: Path, command: str, status: int) -> None:
-    arguments = ["--help"] if status == 0 else []
-    done = run_in(installed, sys.executable, str(installed / "bin" / command), *arguments)
-    assert done.returncode == status, done.stderr
+@pytest.mark.parametrize("command", ["pansplat", "pansplat-view", "pansplat-train"])
+def test_the_entry_points_of_an_installed_wheel_work(installed: Path, command: str) -> None:
+    done = run_in(installed, sys.executable, str(installed / "bin" / command), "--help")
+    assert done.returncode == 0, done.stderr
     assert command in done.stdout + done.stderr
 
 
