@@ -319,7 +319,7 @@ class FullSizeRefinement(nn.Module):
 
     def forward(
         self, maps: Float[Tensor, "image channel height width"], views: int
-    ) -> Float[Tensor, "image width height width"]:
+    ) -> Float[Tensor, "image c height width"]:
         entered = gelu(self.norm(self.entry(maps)))
         return self.unet(entered.unflatten(0, (-1, views))).flatten(0, 1)
 
