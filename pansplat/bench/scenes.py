@@ -89,24 +89,51 @@ def _discs(
     view: int,
 ) -> Gaussians:
     """Discs where the rays from a camera meet the room, as many as rays."""
-
-    def uniform(low: float, high: float) -> Tensor:
-        return low + (high - low) * torch.rand(len(rays), generator=generator, dtype=torch.float64)
-
     distance, axis, body = _trace(rays, position)
     points = position + distance[:, None] * rays
-    normal = torch.nn.functional.one_hot(axis, 3).double()
-    facing = (rays * normal).sum(dim=1, keepdim=True)
-    long = torch.nn.functional.normalize(rays - facing * normal + 1e-9 * normal.roll(1, dims=1), dim=1)
-    axes = torch.stack((long, torch.linalg.cross(normal, long), normal), dim=2)
-    width = uniform(*_FOOTPRINT) * pixel_angle * distance
+    normals = torch.nn.functional.one_hot(axis, 3).double()
+    facing = (rays * normals).sum(dim=1)
+    size = disc_sizes(len(rays), generator)
+    harmonics = _harmonics(points, 6 * body + 2 * axis + (facing > 0), degree, generator)
+    return flat_discs(rays, points, normals, size, distance * pixel_angle, harmonics, level, view)
+
+
+def disc_sizes(count: int, generator: torch.Generator) -> Float[Tensor, "n 2"]:
+    """Random standard deviations, in pixels of the level, and opacities, in the ranges of a predicted scene."""
+    low, high = torch.tensor((_FOOTPRINT, _OPACITY), dtype=torch.float64).T
+    return low + (high - low) * torch.rand(2, count, generator=generator, dtype=torch.float64).T
+
+
+def flat_discs(
+    rays: Float[Tensor, "n 3"],
+    points: Float[Tensor, "n 3"],
+    normals: Float[Tensor, "n 3"],
+    sizes: Float[Tensor, "n 2"],
+    pixel: Float[Tensor, "n"],
+    harmonics: Float[Tensor, "n k 3"],
+    level: int,
+    view: int,
+) -> Gaussians:
+    """Discs that lie on surfaces: round as seen along their rays, so long on a slant, four times at most.
+
+    Args:
+        rays: unit directions from the camera to the points.
+        normals: of the surfaces, of unit length.
+        sizes: as `disc_sizes` makes them.
+        pixel: width of a pixel of the level at the points, metres.
+    """
+    facing = (rays * normals).sum(dim=1, keepdim=True)
+    across = torch.linalg.cross(normals, rays + 1e-9 * rays.roll(1, dims=1))
+    across = torch.nn.functional.normalize(across, dim=1)
+    axes = torch.stack((torch.linalg.cross(across, normals), across, normals), dim=2)
+    width = sizes[:, 0] * pixel
     stretch = (1 / facing[:, 0].abs()).clamp_max(_LONGEST)
     return Gaussians(
         means=points.float(),
         scales=torch.stack((width * stretch, width, width * _THICKNESS), dim=1).float(),
         quats=quats_from_rotations(axes).float(),
-        opacities=uniform(*_OPACITY).float(),
-        harmonics=_harmonics(points, 6 * body + 2 * axis + (facing[:, 0] > 0), degree, generator),
+        opacities=sizes[:, 1].float(),
+        harmonics=harmonics.float(),
         levels=torch.full((len(rays),), level, dtype=torch.uint8),
         views=torch.full((len(rays),), view, dtype=torch.uint8),
     )

@@ -20,13 +20,14 @@ from pansplat.atomic import replacing
 from pansplat.bench.cases import Case, Group, Subject, choices, default_face_size
 from pansplat.bench.drawing import why_not
 from pansplat.bench.gl_viewer import measure_viewer
+from pansplat.bench.lifted import lift_depth
 from pansplat.bench.machine import describe_machine
 from pansplat.bench.plan import Settings, groups, of_scene, room, sample_groups
 from pansplat.bench.plots import plot_choices, plot_sweeps
 from pansplat.bench.raster import Bench
 from pansplat.bench.report import findings, markdown, tables
 from pansplat.bench.rows import Row
-from pansplat.cli.commands import BenchMachine, BenchRaster, PairChoice
+from pansplat.cli.commands import BenchMachine, BenchRaster, PairChoice, SceneSource
 from pansplat.cli.scenes import choose_pair, progress_bar, require_height
 from pansplat.errors import InputError
 
@@ -54,7 +55,7 @@ def run_raster(command: BenchRaster) -> int:
     if command.height % 8:
         raise InputError(f"--height must be a multiple of 8 pixels, got {command.height}")
     settings = _settings(command)
-    subject = room if command.scene is None else _scene(command.scene, command.height)
+    subject = room if command.scene is None else _scene(command.scene, command.height, command.scene_from)
     machine = describe_machine(settings.threads)
     with _live() as live:
         watch = partial(_show, live)
@@ -117,19 +118,24 @@ def _files(command: BenchRaster) -> dict[str, Path | None]:
     return files
 
 
-def _scene(path: Path, height: int) -> Callable[[int], Subject]:
-    """A .ply file's scene or a pair's prediction, seen from between its cameras (from the origin if it has none)."""
-    scene = _read(path, height)
+def _scene(path: Path, height: int, source: SceneSource = "prediction") -> Callable[[int], Subject]:
+    """A .ply file's scene or a pair's, seen from between its cameras (from the origin if it has none)."""
+    scene = _read(path, height, source)
     pose = scene.pose_between(0.5) if len(scene.cam2world) else torch.eye(4, dtype=torch.float64)
     return of_scene(path.stem, lambda: scene.gaussians, pose)
 
 
-def _read(path: Path, height: int) -> Scene:
-    """The scene of a .ply file, or what `sweep` predicts of a pair's folder."""
+def _read(path: Path, height: int, source: SceneSource) -> Scene:
+    """The scene of a .ply file; of a pair's folder what `sweep` predicts, or what its depth maps show."""
     if path.suffix.lower() == ".ply":
+        if source == "depth":
+            raise InputError(f"--scene-from depth needs a pair's folder with depth maps, got {path}; leave it out")
         return pipeline.load(path)
+    pair = choose_pair(path, PairChoice())
+    if source == "depth":
+        return lift_depth(pair.load_context(height))
     with progress_bar() as progress:
-        return pipeline.predict(choose_pair(path, PairChoice()), "sweep", height=height, progress=progress)
+        return pipeline.predict(pair, "sweep", height=height, progress=progress)
 
 
 def _add_viewer(bench: Bench, settings: Settings, subject: Callable[[int], Subject]) -> None:

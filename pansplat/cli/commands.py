@@ -218,12 +218,17 @@ class Convert:
         return run_convert(self)
 
 
+SceneSource = Literal["prediction", "depth"]
+
+
 @dataclass(frozen=True)
 class BenchRaster:
     """Measure the rasterisers: time and memory against error, for every choice of kernel, order, filter and faces."""
 
     scene: Positional[Path | None] = None
     """A .ply scene, or the folder of a pair; by default a synthetic room, and the sample where it is there."""
+    scene_from: SceneSource = "prediction"
+    """How a pair becomes a scene: as `sweep` predicts it, or its depth maps with a Gaussian at every lattice point."""
     quick: bool = False
     """Some minutes on two cores instead of an hour: all choices at half the height only."""
     json: Path | None = None

@@ -10,7 +10,7 @@ import pytest
 from pansplat import pipeline
 from pansplat.bench import plan, raster, roofline
 from pansplat.bench.cases import Group
-from pansplat.bench.scenes import full_lattice_room, room_cameras
+from pansplat.bench.scenes import full_lattice_room, lattice_room_size, room_cameras
 from pansplat.cli import bench, run
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
@@ -64,6 +64,14 @@ def test_a_scene_of_the_users_is_measured(tmp_path):
     assert {row["scene"] for row in rows} == {"mine", "mine 1/16"}
 
 
+def test_a_pairs_depth_is_measured_with_a_gaussian_at_every_lattice_point(tmp_path):
+    sample, file = Path(__file__).parents[2] / "assets" / "living_room", tmp_path / "rows.json"
+    command = ["bench", "raster", str(sample), "--scene-from", "depth", "--quick", "--height", "16"]
+    assert run([*command, "--json", str(file)]) == 0
+    headline = [row for row in json.loads(file.read_text())["rows"] if row["suite"] == "headline"]
+    assert {(row["scene"], row["num_gaussians"]) for row in headline} == {("living_room", lattice_room_size(16))}
+
+
 def test_an_interruption_prints_and_keeps_what_was_measured(tmp_path, monkeypatch, capsys):
     original = raster.draw
 
@@ -89,6 +97,7 @@ def test_an_interruption_prints_and_keeps_what_was_measured(tmp_path, monkeypatc
         (["--json", "no/rows.json"], "create it first"),
         (["--plot", "rows.jpg"], ".png, .svg or .pdf"),
         (["none.ply"], "none.ply"),
+        (["none.ply", "--scene-from", "depth"], "needs a pair's folder"),
     ],
 )
 def test_unusable_arguments_are_refused_before_the_work(arguments, told, capsys, tmp_path, monkeypatch):
