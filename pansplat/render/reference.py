@@ -7,21 +7,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.render.backend import EWA_NEAR, Drawn, Info, Kernel, Options
 from pansplat.render.bounds import equirect_boxes, ewa_boxes, kappa, pinhole_boxes
 from pansplat.render.composite import TilePixels, composite
 from pansplat.render.panorama import Picture
+from pansplat.render.selection import select_drawable
 from pansplat.render.splats import (
-    ALPHA_CUT,
     Observed,
     Splats,
     ewa_splats,
-    near_enough,
     observe,
     ray_splats,
-    sound,
 )
 from pansplat.render.threads import one_thread
 from pansplat.render.tiles import TILE, list_tiles, tile_grid
@@ -36,13 +33,10 @@ def draw(
     options: Options,
 ) -> Drawn:
     """Draw by torch operations; see `pansplat.render.backend.Draw`."""
-    keep, dropped, close = drawable(gaussians, covariances, pose.detach(), options)
-    if not bool(keep.all()):
-        gaussians = gaussians.select(keep)
-        covariances = None if covariances is None else covariances[keep]
+    chosen = select_drawable(gaussians, covariances, pose.detach(), options)
     observed = observe(
-        gaussians,
-        covariances,
+        chosen.gaussians,
+        chosen.covariances,
         pose,
         spread=options.spread(pictures[0].pixel_angle),
         compensate=options.lowpass == "angular",
@@ -50,29 +44,8 @@ def draw(
     )
     drawn = [_picture(observed, picture, options) for picture in pictures]
     sums = torch.stack([picture for picture, _, _ in drawn])
-    return Drawn(sums, Info(len(keep), dropped, close, sum(d[1] for d in drawn), sum(d[2] for d in drawn)))
-
-
-@torch.no_grad()
-def drawable(
-    gaussians: Gaussians, covariances: Tensor | None, pose: Tensor, options: Options
-) -> tuple[Bool[Tensor, "n"], int, int]:
-    """The Gaussians worth observing, and how many were dropped and how many were too near.
-
-    Selecting before any arithmetic is what keeps the others' gradients exactly zero.
-    """
-    radius = torch.linalg.vector_norm(gaussians.means.double() - pose[:3, 3], dim=1)
-    close = radius < options.near
-    usable = sound(gaussians, covariances) & (close | near_enough(gaussians, covariances, radius))
-    dropped = len(gaussians) - int(usable.sum())
-    if options.strict and dropped:
-        first = int(torch.nonzero(~usable)[0, 0])
-        raise InputError(
-            f"`gaussians` must hold only finite numbers, got {dropped} of {len(gaussians)} that do not (the "
-            f"first is number {first}); remove them, or render with strict=False to leave them out"
-        )
-    close &= usable
-    return usable & ~close & (gaussians.opacities >= ALPHA_CUT * (1 - 1e-6)), dropped, int(close.sum())
+    visible, entries = sum(d[1] for d in drawn), sum(d[2] for d in drawn)
+    return Drawn(sums, Info(chosen.total, chosen.dropped, chosen.near, visible, entries))
 
 
 def _picture(

@@ -106,7 +106,7 @@ def observe(
     """
     shape = (gaussians.quats, gaussians.scales) if covariances is None else (covariances,)
     fields = (gaussians.means, gaussians.opacities, gaussians.harmonics, *shape)
-    work = functools.partial(observe_chunk, cam2world=cam2world, spread=spread, compensate=compensate, exact=exact)
+    work = functools.partial(_observe_chunk, cam2world=cam2world, spread=spread, compensate=compensate, exact=exact)
     needs_grad = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (*fields, cam2world))
     parts = []
     for chunk in zip(*(field.split(_CHUNK) for field in fields), strict=True):
@@ -114,7 +114,7 @@ def observe(
     return Observed(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
-def observe_chunk(
+def _observe_chunk(
     means: Float[Tensor, "n 3"],
     opacities: Float[Tensor, "n"],
     harmonics: Float[Tensor, "n k channel"],

@@ -18,7 +18,8 @@ from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.render.backend import EWA_NEAR, Drawn, Info, Options
 from pansplat.render.panorama import Picture
-from pansplat.render.reference import drawable, in_picture, project
+from pansplat.render.reference import in_picture, project
+from pansplat.render.selection import select_drawable
 from pansplat.render.splats import Observed, Splats, ray_splats
 
 if TYPE_CHECKING:
@@ -43,13 +44,10 @@ def draw(
     from pansplat.render.cuda.observe import observe
 
     with _on(gaussians.means.device):
-        keep, dropped, close = drawable(gaussians, covariances, pose.detach(), options)
-        if not bool(keep.all()):
-            gaussians = gaussians.select(keep)
-            covariances = None if covariances is None else covariances[keep]
+        chosen = select_drawable(gaussians, covariances, pose.detach(), options)
         observed = observe(
-            gaussians,
-            covariances,
+            chosen.gaussians,
+            chosen.covariances,
             pose,
             spread=options.spread(pictures[0].pixel_angle),
             compensate=options.lowpass == "angular",
@@ -58,7 +56,7 @@ def draw(
         splats, instances = _splats(observed, pictures, options)
         sums, entries, size = composite(splats, instances, pictures, exact=options.kernel == "ray")
     visible = sum(instances.pictures)
-    return Drawn(sums, Info(len(keep), dropped, close, visible, entries, backend="triton", bytes=size))
+    return Drawn(sums, Info(chosen.total, chosen.dropped, chosen.near, visible, entries, backend="triton", bytes=size))
 
 
 def _check(device: torch.device) -> None:
