@@ -4,12 +4,12 @@ A picture depends on the network by way of few numbers: the maps before the head
 these is a place to cut the graph. Forward, nothing is kept but the numbers at the cuts. Backward, one piece at a time
 is computed again, with a graph, and gets the gradient that was left at the cut behind it:
 
-    views -> match ->| maps ->| lift, tile by tile ->| Gaussians ->| draw, face by face ->| layers -> picture -> loss
+    views -> match ->| maps ->| lift, tile by tile ->| Gaussians ->| draw, part by part ->| layers -> picture -> loss
                     cut 1                           cut 2                               cut 3
 
     plain     no cuts
     one-step  cuts 1 and 2: the heads, which are the largest, tile by tile; the picture in one graph
-    two-step  cuts 1, 2 and 3: and the picture face by face
+    two-step  cuts 1, 2 and 3: and the picture face by face, or strip by strip
 
 The gradients are those of the plain path: every piece is a function of the numbers at its cut alone.
 
@@ -29,10 +29,9 @@ from torch import Tensor
 
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.model.heads import TileGaussians, whole
-from pansplat.model.layers import Compat
 from pansplat.model.network import Network
 from pansplat.training.config import Backpropagation
-from pansplat.training.drawing import Drawing
+from pansplat.training.drawing import Drawing, Layer
 
 _T = TypeVar("_T")
 
@@ -88,21 +87,21 @@ def backpropagate(
 
     maps = Cut.of(matched)
     with torch.no_grad():
-        parts = list(network.lift(maps.copy, tiles=tiles))
-        scenes = Cut.of(whole(parts, network.compat), everything=True)
-    places = _places(parts, network.compat)
-    del parts
+        tiled = [Cut.of(part, everything=True).copy for part in network.lift(maps.copy, tiles=tiles)]
     if method == "one-step":
-        loss = problem.picture_loss(_draw(scenes.copy, problem, drawing))
+        loss = problem.picture_loss(_draw(whole(tiled, network.compat), problem, drawing))
         (share * loss).backward()
     else:
-        loss = _draw_in_two_steps(scenes.copy, problem, drawing, share)
+        ordered = network.compat == "fixed"
+        scenes = [Scattered(tiled, item, ordered=ordered) for item in range(len(problem.images))]
+        loss = _draw_in_two_steps(scenes, problem, drawing, share)
     map_loss = problem.map_loss(maps.copy)
     if map_loss is not None and map_loss.requires_grad:
         (share * map_loss).backward()
-    for number, index in enumerate(places):
-        (part,) = network.lift(maps.copy, tiles=tiles, only=[number]) if tiles > 1 else network.lift(maps.copy)
-        _hand_back(part, scenes.copy, index)
+    for number in range(len(tiled)):
+        (again,) = network.lift(maps.copy, tiles=tiles, only=[number]) if tiles > 1 else network.lift(maps.copy)
+        _hand_back(again, tiled[number])
+        tiled[number] = None  # type: ignore[call-overload]  # its memory is wanted for the next
     maps.backward()
     return loss.item() + _number(map_loss).item()
 
@@ -114,50 +113,118 @@ def _draw(scenes: list[Gaussians], problem: Problem, drawing: Drawing) -> Float[
     )
 
 
-def _draw_in_two_steps(scenes: list[Gaussians], problem: Problem, drawing: Drawing, share: float) -> Tensor:
+@dataclass(frozen=True)
+class _Job:
+    """A picture to draw layer by layer.
+
+    Attributes:
+        rows: for each layer, the Gaussians it is drawn of, tile by tile.
+    """
+
+    scene: Scattered
+    pose: Float[Tensor, "4 4"]
+    context: Float[Tensor, "view 4 4"]
+    layers: list[Layer]
+    rows: list[list[Integer[Tensor, "_"]]]
+
+
+def _draw_in_two_steps(scenes: list[Scattered], problem: Problem, drawing: Drawing, share: float) -> Tensor:
     """Leave the gradient of the picture's loss at the Gaussians, one layer's graph at a time; returns the loss."""
-    jobs = [
-        (scene, pose, context, drawing.layers(len(context)))
-        for scene, poses, context in zip(scenes, problem.targets, problem.cam2world, strict=True)
-        for pose in poses
-    ]
+    jobs = []
+    for scene, poses, context in zip(scenes, problem.targets, problem.cam2world, strict=True):
+        layers = drawing.layers(len(context))
+        jobs += [_Job(scene, pose, context, layers, scene.shown(drawing, pose, layers)) for pose in poses]
+    cuts = []
     with torch.no_grad():
-        drawn = [[drawing.draw_layer(scene, pose, layer) for layer in layers] for scene, pose, _, layers in jobs]
-    cuts = [[layer.requires_grad_() for layer in layers] for layers in drawn]
-    pictures = [drawing.compose(cut, pose, context) for cut, (_, pose, context, _) in zip(cuts, jobs, strict=True)]
+        for job in jobs:
+            picked = (job.scene.picked(rows) for rows in job.rows)
+            cuts.append([drawing.draw_layer(own, job.pose, at) for own, at in zip(picked, job.layers, strict=True)])
+    for layer in (layer for cut in cuts for layer in cut):
+        layer.requires_grad_()
+    loss = _picture_loss(cuts, jobs, problem, drawing, share)
+    for cut, job in zip(cuts, jobs, strict=True):
+        for kept, layer, rows in zip(cut, job.layers, job.rows, strict=True):
+            leaf = Cut.of(job.scene.picked(rows), everything=True).copy
+            again = drawing.draw_layer(leaf, job.pose, layer)
+            if again.requires_grad and kept.grad is not None:
+                again.backward(kept.grad)
+                job.scene.add_gradients(leaf, rows)
+            kept.grad = None
+    return loss
+
+
+def _picture_loss(
+    cuts: list[list[Tensor]], jobs: list[_Job], problem: Problem, drawing: Drawing, share: float
+) -> Float[Tensor, ""]:
+    """The loss, its gradient left at the layers; its graph is gone when this returns."""
+    pictures = [drawing.compose(cut, job.pose, job.context) for cut, job in zip(cuts, jobs, strict=True)]
     loss = problem.picture_loss(torch.stack(pictures).unflatten(0, problem.targets.shape[:2]))
     (share * loss).backward()
-    for cut, (scene, pose, _, layers) in zip(cuts, jobs, strict=True):
-        for kept, layer in zip(cut, layers, strict=True):
-            again = drawing.draw_layer(scene, pose, layer)
-            if again.requires_grad:
-                again.backward(kept.grad)
-            kept.grad = None
     return loss.detach()
 
 
-def _hand_back(part: TileGaussians, scenes: list[Gaussians], index: Integer[Tensor, "n"]) -> None:
+class Scattered:
+    """One item's Gaussians, tile by tile as they were made: never all in one place, which would take as much again.
+
+    Args:
+        tiled: leaves that gather gradients.
+        item: of the batch.
+        ordered: whether the order of all is the untiled one; else tile by tile, as in the original.
+    """
+
+    def __init__(self, tiled: list[TileGaussians], item: int, *, ordered: bool) -> None:
+        self._tiles = [part.gaussians[item] for part in tiled]
+        self._places = [part.index for part in tiled] if ordered and len(tiled) > 1 else None
+
+    def shown(self, drawing: Drawing, pose: Float[Tensor, "4 4"], layers: list[Layer]) -> list[list[Tensor]]:
+        """For each layer, the numbers of the Gaussians it is drawn of, tile by tile."""
+        by_tile = [[mask.nonzero()[:, 0] for mask in drawing.shown(tile, pose, layers)] for tile in self._tiles]
+        return [list(rows) for rows in zip(*by_tile, strict=True)]
+
+    @torch.no_grad()
+    def picked(self, rows: list[Integer[Tensor, "_"]]) -> Gaussians:
+        """Those Gaussians, in the order of all."""
+        picked = Gaussians.cat([tile.select(own) for tile, own in zip(self._tiles, rows, strict=True)])
+        order = self._order(rows)
+        return picked if order is None else picked.select(order)
+
+    @torch.no_grad()
+    def add_gradients(self, picked: Gaussians, rows: list[Integer[Tensor, "_"]]) -> None:
+        """Add the gradients of what `picked` gave to the tiles' own."""
+        order, counts = self._order(rows), [len(own) for own in rows]
+        for name in _floating(picked):
+            gradient = getattr(picked, name).grad
+            if gradient is None:
+                continue
+            if order is not None:
+                gradient = torch.empty_like(gradient).index_copy_(0, order, gradient)
+            for tile, own, part in zip(self._tiles, rows, gradient.split(counts), strict=True):
+                leaf = getattr(tile, name)
+                if leaf.grad is None:
+                    leaf.grad = torch.zeros_like(leaf)
+                leaf.grad.index_add_(0, own, part)
+
+    def _order(self, rows: list[Integer[Tensor, "_"]]) -> Integer[Tensor, "_"] | None:
+        if self._places is None:
+            return None
+        places = [index.to(own.device)[own] for index, own in zip(self._places, rows, strict=True)]
+        return torch.argsort(torch.cat(places))
+
+
+def _hand_back(again: TileGaussians, kept: TileGaussians) -> None:
     """Send the gradients left at a tile's Gaussians through the heads that made them again."""
     tensors, gradients = [], []
-    for made, scene in zip(part.gaussians, scenes, strict=True):
+    for made, leaf in zip(again.gaussians, kept.gaussians, strict=True):
         for name in _floating(made):
-            left = getattr(scene, name).grad
+            left = getattr(leaf, name).grad
             if left is not None and getattr(made, name).requires_grad:
                 tensors.append(getattr(made, name))
-                gradients.append(left[index])
+                gradients.append(left)
     torch.autograd.backward(tensors, gradients)
 
 
 def _floating(gaussians: Gaussians) -> list[str]:
     return [f.name for f in dataclasses.fields(gaussians) if getattr(gaussians, f.name).is_floating_point()]
-
-
-def _places(parts: list[TileGaussians], compat: Compat) -> list[Integer[Tensor, "n"]]:
-    """Where each tile's Gaussians stand in what `whole` makes of all tiles."""
-    if len(parts) > 1 and compat == "official":
-        counts = [len(part.gaussians[0]) for part in parts]
-        return list(torch.arange(sum(counts)).split(counts))
-    return [part.index for part in parts] if len(parts) > 1 else [torch.arange(len(parts[0].gaussians[0]))]
 
 
 def _number(loss: Tensor | None) -> Tensor:

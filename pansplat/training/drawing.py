@@ -1,27 +1,38 @@
 """How training draws its pictures: whole, or part by part for two-step backpropagation.
 
+A part is a face of the cube, or a strip of a panorama's rows. Each is drawn of the Gaussians that it can show alone:
+that bounds the memory of its graph. The rasteriser knows no strips, so a strip is cut from a panorama of its own
+Gaussians; what they paint on other rows is thrown away.
+
 Source: PanSplat, sections 3.4 and 3.6; OFFICIAL.md, section 10.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.gaussians.harmonics_official import as_the_original_draws
 from pansplat.geometry.blending import blend_weights
 from pansplat.geometry.cubemap import face_poses
+from pansplat.render.backend import Options
 from pansplat.render.blend import blend
+from pansplat.render.panorama import pictures
 from pansplat.render.rasterize import Rendering, rasterize
 from pansplat.render.stitching import stitch_faces
 from pansplat.training.config import Mixing, Style
+from pansplat.training.visibility import Region, visible
 
 _FACES = 6
+_STRIPS = 6  # as many as faces, each as much of the sphere
+_NEAR = 0.05  # metres, the rasteriser's own
 
 
 @dataclass(frozen=True)
@@ -30,11 +41,11 @@ class Layer:
 
     Attributes:
         view: whose Gaussians it shows; None for all views'.
-        face: number of the cube's face; None for the whole panorama.
+        part: number of the cube's face, or of the strip of rows from the top.
     """
 
     view: int | None
-    face: int | None
+    part: int
 
 
 @dataclass(frozen=True)
@@ -61,10 +72,20 @@ class Drawing:
         return self.height // 2
 
     def layers(self, views: int) -> list[Layer]:
-        """All parts of a picture: view by view if they are mixed, face by face if there are faces."""
+        """All parts of a picture: view by view if they are mixed, each face by face or strip by strip."""
         shown = [None] if self.mixing == "joint" else list(range(views))
-        faces = [None] if self.style == "panorama" else list(range(_FACES))
-        return [Layer(view, face) for view in shown for face in faces]
+        return [Layer(view, part) for view in shown for part in range(self._parts)]
+
+    def shown(
+        self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], layers: Sequence[Layer]
+    ) -> list[Bool[Tensor, "n"]]:
+        """For each layer, the Gaussians that it is to be drawn of."""
+        options = Options(**self._kernel(), near=_NEAR, strict=False)
+        seen = visible(gaussians, cam2world, self._regions(gaussians.means.device), options)
+        return [
+            seen[layer.part] if layer.view is None else seen[layer.part] & (gaussians.views == layer.view)
+            for layer in layers
+        ]
 
     def draw(
         self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], context: Float[Tensor, "view 4 4"]
@@ -76,19 +97,24 @@ class Drawing:
             context: of the input views, for how they are mixed.
         """
         shown = [None] if self.mixing == "joint" else list(range(len(context)))
-        pictures = [self._whole(self._of(gaussians, view), cam2world) for view in shown]
-        return self._mixed(pictures, cam2world, context)
+        panoramas = [self._whole(self._of(gaussians, view), cam2world) for view in shown]
+        return self._mixed(panoramas, cam2world, context)
 
     def draw_layer(
         self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], layer: Layer
     ) -> Float[Tensor, "4 rows columns"]:
-        """Colour and opacity of one part."""
-        shown = self._of(gaussians, layer.view)
-        if layer.face is None:
-            picture = self._whole(shown, cam2world)
-        else:
-            pose = face_poses(cam2world.double())[layer.face]
-            picture = rasterize(shown, pose, size=(self.face_size,) * 2, layout="pinhole", **self._kernel())
+        """Colour and opacity of one part.
+
+        Args:
+            gaussians: those that `shown` tells of, in the order of all.
+        """
+        if self.style == "panorama":
+            first, end = self._rows(layer.part)
+            picture = self._whole(gaussians, cam2world)
+            return torch.cat((picture.color, picture.alpha[None]))[:, first:end]
+        pose = face_poses(cam2world.double())[layer.part]
+        gaussians = self._of(gaussians, None)
+        picture = rasterize(gaussians, pose, size=(self.face_size,) * 2, layout="pinhole", near=_NEAR, **self._kernel())
         return torch.cat((picture.color, picture.alpha[None]))
 
     def compose(
@@ -98,21 +124,41 @@ class Drawing:
         context: Float[Tensor, "view 4 4"],
     ) -> Float[Tensor, "3 height width"]:
         """The panorama of all parts, in the order of `layers`."""
-        each = 1 if self.style == "panorama" else _FACES
-        pictures = []
-        for start in range(0, len(layers), each):
-            sums = layers[start]
-            if self.style != "panorama":
+        panoramas = []
+        for start in range(0, len(layers), self._parts):
+            own = list(layers[start : start + self._parts])
+            if self.style == "panorama":
+                sums = torch.cat(own, dim=1)
+            else:
                 stitching = "official" if self.style == "original" else "seamless"
-                sums = stitch_faces(torch.stack(list(layers[start : start + each])), self.size, stitching=stitching)
-            pictures.append(Rendering(sums[:3], sums[3], torch.zeros_like(sums[3])))
-        return self._mixed(pictures, cam2world, context)
+                sums = stitch_faces(torch.stack(own), self.size, stitching=stitching)
+            panoramas.append(Rendering(sums[:3], sums[3], torch.zeros_like(sums[3])))
+        return self._mixed(panoramas, cam2world, context)
 
-    def _mixed(self, pictures: list[Rendering], cam2world: Tensor, context: Tensor) -> Float[Tensor, "3 height width"]:
+    @property
+    def _parts(self) -> int:
+        return _STRIPS if self.style == "panorama" else _FACES
+
+    def _rows(self, strip: int) -> tuple[int, int]:
+        """The first row of a strip, and the first after it: strips have one area on the sphere."""
+        first, end = (
+            round(self.height * (0.5 + math.asin(2 * edge / _STRIPS - 1) / math.pi)) for edge in (strip, strip + 1)
+        )
+        return first, end
+
+    def _regions(self, device: torch.device) -> list[Region]:
+        """What the parts show."""
+        layout = "equirect" if self.style == "panorama" else "cubemap"
+        planes = pictures(layout, self.size, vertical_fov_degrees=90.0, face_size=self.face_size, device=device)
+        if self.style == "panorama":
+            return [Region(planes[0], *self._rows(strip)) for strip in range(_STRIPS)]
+        return [Region(plane, 0, self.face_size) for plane in planes]
+
+    def _mixed(self, panoramas: list[Rendering], cam2world: Tensor, context: Tensor) -> Float[Tensor, "3 height width"]:
         if self.mixing == "joint":
-            return pictures[0].color
+            return panoramas[0].color
         weights = blend_weights(cam2world[:3, 3].double(), context[:, :3, 3].double())
-        return blend(pictures, weights.to(pictures[0].color)).color
+        return blend(panoramas, weights.to(panoramas[0].color)).color
 
     def _of(self, gaussians: Gaussians, view: int | None) -> Gaussians:
         if self.style == "original":
@@ -121,7 +167,7 @@ class Drawing:
 
     def _whole(self, gaussians: Gaussians, cam2world: Tensor) -> Rendering:
         if self.style == "panorama":
-            return rasterize(gaussians, cam2world, size=self.size)
+            return rasterize(gaussians, cam2world, size=self.size, near=_NEAR)
         stitching = "official" if self.style == "original" else "seamless"
         return rasterize(
             gaussians,
@@ -130,10 +176,11 @@ class Drawing:
             layout="cubemap",
             face_size=self.face_size,
             stitching=stitching,
+            near=_NEAR,
             **self._kernel(),
         )
 
-    def _kernel(self) -> dict[str, str]:
+    def _kernel(self) -> dict[str, Any]:
         if self.style == "original":
             return {"kernel": "ewa", "order": "z", "lowpass": "3dgs"}
         return {"kernel": "ray", "order": "radial", "lowpass": "angular"}
