@@ -9,7 +9,7 @@ from __future__ import annotations
 import bisect
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -128,12 +128,6 @@ class Joined:
         number = bisect.bisect_right(self.ends, index)
         start = self.ends[number - 1] if number else 0
         return self.sources[number].sample(index - start, height, seed)
-
-
-def in_order(source: Source, height: int) -> Iterator[Sample]:
-    """All samples of a source once, for evaluation."""
-    for index in range(len(source)):
-        yield source.sample(index, height, 0)
 
 
 def _check_targets(pair: Pair, least: int) -> None:

@@ -77,11 +77,6 @@ class Loader:
         self.batch_size, self.workers, self.rank, self.world_size = batch_size, workers, rank, world_size
         self.skipped: Counter[str] = Counter()
 
-    @property
-    def steps_per_epoch(self) -> int:
-        """Batches after which each sample was drawn once, rounded up."""
-        return -(-len(self.reader.source) // (self.batch_size * self.world_size))
-
     def batches(self, step: int = 0) -> Iterator[Batch]:
         """Batches from that step on, without end.
 

@@ -14,7 +14,6 @@ from pansplat.data.dataset import (
     SequenceEvaluation,
     SequenceTraining,
     TripletSource,
-    in_order,
 )
 from pansplat.data.images import write_image
 from pansplat.data.loc360 import read_loc360
@@ -63,7 +62,7 @@ def test_game_map_triplets_are_samples_with_depth(tmp_path: Path) -> None:
     _game_map(tmp_path, "a")
     _game_map(tmp_path, "b")
     source = TripletSource(read_game_maps(tmp_path))
-    samples = list(in_order(source, 8))
+    samples = [source.sample(index, 8, 0) for index in range(len(source))]
     assert [sample.name for sample in samples] == ["a", "b"]
     batch = collate(samples)
     assert len(batch) == 2 and batch.names == ("a", "b")
@@ -82,7 +81,8 @@ def test_samples_with_and_without_depth_share_a_batch(tmp_path: Path) -> None:
     _game_map(tmp_path, "b")
     for depth in tmp_path.glob("b_*_depth.png"):
         depth.unlink()
-    batch = collate(list(in_order(TripletSource(read_game_maps(tmp_path)), 8)))
+    source = TripletSource(read_game_maps(tmp_path))
+    batch = collate([source.sample(index, 8, 0) for index in range(len(source))])
     assert batch.depths is not None
     assert (batch.depths[0] > 0).all() and (batch.depths[1] == 0).all()
 
