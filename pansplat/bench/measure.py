@@ -71,6 +71,11 @@ def resident_peak() -> int:
     return _status("VmHWM")
 
 
+def resident() -> int:
+    """The process's memory that is resident now, bytes."""
+    return _status("VmRSS")
+
+
 def _status(field: str) -> int:
     """Bytes that the kernel tells of this process."""
     found = re.search(rf"{field}:\s+(\d+) kB", _STATUS.read_text())

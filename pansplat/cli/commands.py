@@ -274,6 +274,38 @@ class BenchModel:
 
 
 @dataclass(frozen=True)
+class BenchMemory:
+    """Measure the memory of a training step and of a prediction over resolutions, for each way of backpropagation.
+
+    Every row runs in a process of its own. With --out, the same command goes on with a run that was stopped.
+    """
+
+    preset: Literal["tiny", "small", "paper"] = "small"
+    """Size of the network; weights are random."""
+    heights: tuple[int, ...] = (128, 256, 512, 1024)
+    """Of the panoramas, pixels; multiples of 32. Above 512 only the heads learn, as in the paper's stages."""
+    quick: bool = False
+    """Without one-step and 4 tiles."""
+    limit_gb: float = 8.0
+    """The most memory of a row, 10^9 bytes: one that would need more is not tried, one that takes more is ended."""
+    style: Literal["panorama", "cubemap", "original"] = "cubemap"
+    """How pictures are drawn; as in training's --memory.style."""
+    perceptual: Literal["structure", "lpips-vgg", "lpips-alex", "lpips-squeeze"] = "structure"
+    """Part of the loss; LPIPS needs its weights."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """auto: a GPU where there is one, whose allocator then tells the memory."""
+    threads: int | None = None
+    """Threads to use; by default what torch uses."""
+    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """Folder for memory.json, memory.md and memory.png."""
+
+    def run(self) -> int:
+        from pansplat.cli.bench_memory import run_memory
+
+        return run_memory(self)
+
+
+@dataclass(frozen=True)
 class BenchMachine:
     """Measure what this machine could do at most: multiply-adds and memory bandwidth."""
 
@@ -293,6 +325,7 @@ class Bench:
     what: (
         Annotated[BenchRaster, subcommand("raster")]
         | Annotated[BenchModel, subcommand("model")]
+        | Annotated[BenchMemory, subcommand("memory")]
         | Annotated[BenchMachine, subcommand("machine")]
     )
 
