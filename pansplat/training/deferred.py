@@ -8,7 +8,7 @@ is computed again, with a graph, and gets the gradient that was left at the cut 
                     cut 1                           cut 2                               cut 3
 
     plain     no cuts
-    one-step  cuts 1 and 2: the heads, which are the largest, tile by tile; the picture in one graph
+    one-step  cuts 1 and 2: the heads, which are the largest, tile by tile and view by view; the picture in one graph
     two-step  cuts 1, 2 and 3: and the picture face by face, or strip by strip
 
 The gradients are those of the plain path: every piece is a function of the numbers at its cut alone.
@@ -30,10 +30,12 @@ from torch import Tensor
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.model.heads import TileGaussians, whole
 from pansplat.model.network import Network
+from pansplat.model.pansplat import PanSplat
 from pansplat.training.config import Backpropagation
 from pansplat.training.drawing import Drawing, Layer
 
 _T = TypeVar("_T")
+_ItemView = tuple[int, "int | None"]
 
 PictureLoss = Callable[[Tensor], Tensor]
 """From pictures (batch target 3 height width) to a number."""
@@ -98,10 +100,11 @@ def backpropagate(
     map_loss = problem.map_loss(maps.copy)
     if map_loss is not None and map_loss.requires_grad:
         (share * map_loss).backward()
-    for number in range(len(tiled)):
-        (again,) = network.lift(maps.copy, tiles=tiles, only=[number]) if tiles > 1 else network.lift(maps.copy)
-        _hand_back(again, tiled[number])
-        tiled[number] = None  # type: ignore[call-overload]  # its memory is wanted for the next
+    for number, kept in enumerate(tiled):
+        for item, view in _lifted_at_a_time(network, problem.images):
+            again = _lift_again(network, maps.copy, item, view, tiles, number)
+            _hand_back(again, kept.gaussians[item], view)
+        kept.gaussians.clear()  # their memory is wanted for the next
     maps.backward()
     return loss.item() + _number(map_loss).item()
 
@@ -211,15 +214,29 @@ class Scattered:
         return torch.argsort(torch.cat(places))
 
 
-def _hand_back(again: TileGaussians, kept: TileGaussians) -> None:
+def _lifted_at_a_time(network: Network, images: Float[Tensor, "batch view 3 height width"]) -> list[_ItemView]:
+    """The heads see each view by itself; in the baseline an item's views see each other (None for all of them)."""
+    views = range(images.shape[1]) if isinstance(network, PanSplat) else [None]
+    return [(item, view) for item in range(len(images)) for view in views]
+
+
+def _lift_again(network: Network, matched: Any, item: int, view: int | None, tiles: int, number: int) -> Gaussians:
+    """A tile's Gaussians of one item and view, in the order that they have among the tile's."""
+    views = slice(None) if view is None else slice(view, view + 1)
+    own = _mapped(matched, lambda maps: maps[item : item + 1, views])
+    (part,) = network.lift(own, tiles=tiles, only=[number] if tiles > 1 else None)
+    return part.gaussians[0]
+
+
+def _hand_back(again: Gaussians, kept: Gaussians, view: int | None) -> None:
     """Send the gradients left at a tile's Gaussians through the heads that made them again."""
+    rows = slice(None) if view is None else kept.views == view
     tensors, gradients = [], []
-    for made, leaf in zip(again.gaussians, kept.gaussians, strict=True):
-        for name in _floating(made):
-            left = getattr(leaf, name).grad
-            if left is not None and getattr(made, name).requires_grad:
-                tensors.append(getattr(made, name))
-                gradients.append(left)
+    for name in _floating(again):
+        left = getattr(kept, name).grad
+        if left is not None and getattr(again, name).requires_grad:
+            tensors.append(getattr(again, name))
+            gradients.append(left[rows])
     torch.autograd.backward(tensors, gradients)
 
 
