@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from pansplat.data.dataset import Joined, PairSource, SequenceEvaluation, SequenceTraining, Source, TripletSource
@@ -13,6 +14,7 @@ from pansplat.data.samplers import BoundedSampler
 from pansplat.data.synthetic import GeneratedScenes
 from pansplat.data.triplets import read_game_maps, read_panogrf
 from pansplat.training.config import DataConfig
+from pansplat.training.reserved import without_reserved
 
 _OTHER_HOMES = 1_000_003  # apart from the seeds of training
 _FEW_DRAWS = 4  # pairs of each sequence to compare with
@@ -20,6 +22,8 @@ _FEW_DRAWS = 4  # pairs of each sequence to compare with
 
 def sources(config: DataConfig, height: int, seed: int) -> tuple[Source, Source]:
     """What is trained on, and what is compared with on the way; the latter has one target a sample.
+
+    Triplets of maps that are reserved for evaluation are in neither.
 
     Args:
         height: of the panoramas, which decides on the folder of some data sets.
@@ -55,16 +59,24 @@ def _insta360(config: DataConfig, root: Path, height: int) -> tuple[Source, Sour
 
 
 def _pairs(config: DataConfig, root: Path, height: int) -> tuple[Source, Source]:
-    training, validation = (
-        PairSource([pair for pair in load_pairs(folder) if pair.targets], targets=1)
-        for folder in (root, config.validation_root or root)
-    )
+    training, validation = (_pairs_of(folder) for folder in (root, config.validation_root or root))
     return training, validation
+
+
+def _pairs_of(folder: Path) -> PairSource:
+    pairs = [pair for pair in load_pairs(folder) if pair.targets]
+    return PairSource(without_reserved(pairs, lambda pair: pair.name, folder), targets=1)
 
 
 def _triplets(config: DataConfig, root: Path, height: int) -> tuple[Source, Source]:
-    training, validation = (TripletSource(read_game_maps(folder)) for folder in (root, config.validation_root or root))
+    training, validation = (_game_maps(folder) for folder in (root, config.validation_root or root))
     return training, validation
+
+
+def _game_maps(folder: Path) -> TripletSource:
+    triplets = read_game_maps(folder)
+    kept = without_reserved(triplets.sources, lambda source: source.stem, folder)
+    return TripletSource(replace(triplets, sources=tuple(kept)))
 
 
 _READERS: dict[str, Callable[[DataConfig, Path, int], tuple[Source, Source]]] = {
