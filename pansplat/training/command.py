@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from pansplat.errors import InputError
@@ -15,25 +16,45 @@ if TYPE_CHECKING:
 
 def run(argv: Sequence[str] | None = None) -> int:
     """Train and return the exit status: 0 done, 2 bad input, 130 stopped and saved."""
-    config = parse(argv)
+    try:
+        return _train(parse(argv))
+    except InputError as error:
+        _say("error", error)
+        return 2
+    except (MemoryError, RuntimeError) as error:
+        if not _lacks_memory(error):
+            raise
+        _say(
+            "error",
+            f"this takes more memory than there is ({str(error).splitlines()[0][:120]}); choose lower --heights, a "
+            "smaller --optimizer.batch-size, or --memory.backpropagation two-step with more --memory.tiles.",
+        )
+        return 2
+    except KeyboardInterrupt:
+        _say("interrupted", "steps after the last checkpoint are lost; the same command goes on from it")
+        return 130
+
+
+def _train(config: TrainConfig) -> int:
     from pansplat.training.distributed import Processes
     from pansplat.training.loop import Run
 
     processes = Processes()
+    with _our_warnings():
+        try:
+            return 0 if Run(config, processes).train() else 130
+        finally:
+            processes.leave()
+
+
+@contextlib.contextmanager
+def _our_warnings() -> Iterator[None]:
+    """What the libraries below warn of is for their users; what we warn of is for ours."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.filterwarnings("always", category=UserWarning, module=r"pansplat(\.|$)")
         warnings.showwarning = lambda message, *_: _say("note", message)
-        try:
-            return 0 if Run(config, processes).train() else 130
-        except InputError as error:
-            _say("error", error)
-            return 2
-        except KeyboardInterrupt:
-            _say("interrupted", "steps after the last checkpoint are lost; the same command goes on from it")
-            return 130
-        finally:
-            processes.leave()
+        yield
 
 
 def parse(argv: Sequence[str] | None = None) -> TrainConfig:
@@ -49,6 +70,11 @@ def parse(argv: Sequence[str] | None = None) -> TrainConfig:
         description="Train a network. A run that was stopped goes on with the same command.",
         config=(tyro.conf.FlagCreatePairsOff,),
     )
+
+
+def _lacks_memory(error: BaseException) -> bool:
+    """Whether Python, numpy or torch could not allocate; torch's CPU allocator says so only in words."""
+    return isinstance(error, MemoryError) or "allocate" in str(error) or "out of memory" in str(error).lower()
 
 
 def _say(word: str, text: object) -> None:

@@ -9,10 +9,30 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from datetime import timedelta
 
 import torch
 import torch.distributed
 from torch import Tensor, nn
+
+from pansplat.errors import InputError
+
+_PATIENCE = timedelta(hours=2)  # the first process may validate for long while the others wait
+
+
+def _number(name: str, otherwise: int | None) -> int:
+    """A number that torchrun puts into the environment.
+
+    Raises:
+        InputError: it is none, or missing without anything in its place.
+    """
+    text = os.environ.get(name, "" if otherwise is None else str(otherwise))
+    try:
+        return int(text)
+    except ValueError:
+        raise InputError(
+            f"needed a number in the environment's {name}, got {text!r}; start the processes with torchrun."
+        ) from None
 
 
 class Processes:
@@ -20,18 +40,64 @@ class Processes:
 
     Attributes:
         rank, count: number of this process, and of all.
+        place: its number on its own machine.
+
+    Raises:
+        InputError: the environment contradicts itself.
     """
 
     def __init__(self) -> None:
-        self.count = int(os.environ.get("WORLD_SIZE", "1"))
-        self.rank = int(os.environ.get("RANK", "0"))
+        self.count = _number("WORLD_SIZE", 1)
+        self.rank = _number("RANK", 0 if self.count == 1 else None)
+        self.place = _number("LOCAL_RANK", 0 if self.count == 1 else None)
+        if self.count < 1 or not 0 <= self.rank < self.count:
+            raise InputError(
+                f"RANK must be below WORLD_SIZE, got {self.rank} of {self.count}; start the processes with torchrun."
+            )
         self._joined = False
+        self._device = torch.device("cpu")
+
+    def device(self, name: str) -> torch.device:
+        """This process's own: with CUDA the device of its number on this machine.
+
+        Args:
+            name: "auto", "cpu" or "cuda".
+
+        Raises:
+            InputError: CUDA is asked for and is not there, or there are more processes than devices.
+        """
+        if name == "cpu" or not torch.cuda.is_available():
+            if name == "cuda":
+                raise InputError("--device cuda needs a CUDA device that torch can use, got none; use --device cpu.")
+            return torch.device("cpu")
+        there = torch.cuda.device_count()
+        if self.place >= there:
+            raise InputError(
+                f"needed a CUDA device for each process on this machine, got {there} for process {self.place + 1}; "
+                f"start {there} with --nproc-per-node, or use --device cpu."
+            )
+        return torch.device("cuda", self.place)
 
     def join(self, device: torch.device) -> None:
-        """Meet the others."""
-        if self.count > 1 and not torch.distributed.is_initialized():
-            torch.distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
-            self._joined = True
+        """Meet the others: by NCCL where they compute with CUDA, else by gloo.
+
+        Raises:
+            InputError: they could not meet.
+        """
+        self._device = device
+        if device.type == "cuda":
+            torch.cuda.set_device(device)
+        if self.count == 1 or torch.distributed.is_initialized():
+            return
+        kind = "nccl" if device.type == "cuda" else "gloo"
+        try:
+            torch.distributed.init_process_group(kind, timeout=_PATIENCE)
+        except (ValueError, RuntimeError) as error:
+            raise InputError(
+                f"process {self.rank} of {self.count} could not meet the others by {kind} "
+                f"({str(error).splitlines()[0]}); start all with torchrun, or give MASTER_ADDR and MASTER_PORT."
+            ) from error
+        self._joined = True
 
     def leave(self) -> None:
         """Part from the others."""
@@ -62,7 +128,7 @@ class Processes:
         """The means of all processes' numbers."""
         if self.count == 1:
             return numbers
-        values = torch.tensor(list(numbers.values()), dtype=torch.float64)
+        values = torch.tensor(list(numbers.values()), dtype=torch.float64, device=self._device)
         torch.distributed.all_reduce(values)
         return dict(zip(numbers, (values / self.count).tolist(), strict=True))
 
@@ -70,7 +136,7 @@ class Processes:
         """Whether it is so in any process."""
         if self.count == 1:
             return flag
-        value = torch.tensor(float(flag))
+        value = torch.tensor(float(flag), device=self._device)
         torch.distributed.all_reduce(value, torch.distributed.ReduceOp.MAX)
         return bool(value)
 

@@ -55,7 +55,7 @@ class Run:
         config.check()
         self.config, self.processes = config, processes or Processes()
         self.silent = silent or not self.processes.is_first
-        self.device = _device(config.device)
+        self.device = self.processes.device(config.device)
         self.processes.join(self.device)
         self.folder = config.out / "checkpoints"
         kept = load_latest(self.folder)
@@ -69,9 +69,10 @@ class Run:
         self.teacher = Teacher(
             self.network, self.auxiliary, choose_perceptual(config.perceptual), config.loss, config.memory
         )
-        self.step = 0
+        self.step, self.source = 0, None
         if kept is not None:
             self._restore(kept[1])
+            self.source = kept[0]
         self._stop = False
 
     def train(self) -> bool:
@@ -93,6 +94,8 @@ class Run:
         try:
             with Watch(self.step, total, silent=self.silent) as watch, self._asked_to_stop(watch):
                 watch.say(self._introduction())
+                if self.source is not None:
+                    watch.say(f"going on from {self.source}")
                 for batches in self._batches():
                     began = time.perf_counter()
                     told = self._learn(batches)
@@ -281,9 +284,3 @@ class Run:
         finally:
             for kind, handler in zip(kinds, before, strict=False):
                 signal.signal(kind, handler)
-
-
-def _device(name: str) -> torch.device:
-    if name == "cuda" and not torch.cuda.is_available():
-        raise InputError("--device cuda needs a CUDA device that torch can use, got none; use --device cpu.")
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
