@@ -1,13 +1,20 @@
-"""Two processes learn what one does from the joint batch."""
+"""Two processes learn what one does from the joint batch; each has its device, and one writes."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 import torch
+
+from pansplat.errors import InputError
+from pansplat.training.config import TrainConfig
+from pansplat.training.distributed import Processes
+from pansplat.training.loop import Run
 
 _PROGRAM = Path(__file__).parent / "two_processes.py"
 
@@ -27,3 +34,91 @@ def test_two_processes_have_the_gradients_of_one_with_the_joint_batch(tmp_path: 
         scale = float(wanted.abs().max())
         torch.testing.assert_close(first[name], wanted, rtol=1e-7, atol=1e-9 * scale + 1e-15, msg=name)
         torch.testing.assert_close(second[name], first[name], rtol=0, atol=0)
+
+
+def test_torchrun_trains_and_only_the_first_process_writes(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    settings = ("--optimizer.steps", "2", "--optimizer.batch-size", "1", "--data.workers", "0", "--device", "cpu")
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    done = subprocess.run(
+        [*launch, "-m", "pansplat.training", "tiny", "--out", str(out), "--validation.every", "0", *settings],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stderr.count("2 process(es), from step 0 of 2") == 1
+    rows = (out / "log.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in rows] == ["step", "0", "1"]
+    written = {
+        str(path.relative_to(out)) for path in out.rglob("*") if path.is_file() and "tensorboard" not in str(path)
+    }
+    assert written == {
+        *("config.json", "log.csv", "validation.csv", "model.safetensors"), "checkpoints/step_00000002.pt"
+    }  # fmt: skip
+
+
+def test_the_first_process_alone_writes_a_checkpoint(
+    micro_run: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, second = micro_run(), Processes()
+    second.rank = 1
+    Run(config, second, silent=True).save()
+    assert not list(config.out.rglob("*"))
+    Run(config, silent=True).save()
+    assert [path.name for path in config.out.rglob("*.pt")] == ["step_00000000.pt"]
+
+
+def test_each_process_of_a_machine_has_its_own_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    for rank, place in ((0, 0), (3, 1)):
+        _started(monkeypatch, WORLD_SIZE="4", RANK=str(rank), LOCAL_RANK=str(place))
+        assert Processes().device("auto") == torch.device("cuda", place)
+        assert Processes().device("cpu") == torch.device("cpu")
+    _started(monkeypatch, WORLD_SIZE="4", RANK="2", LOCAL_RANK="2")
+    with pytest.raises(InputError, match=r"got 2 for process 3; start 2 with --nproc-per-node"):
+        Processes().device("auto")
+
+
+def test_processes_with_cuda_meet_by_nccl_on_their_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[object] = []
+    monkeypatch.setattr(torch.cuda, "set_device", asked.append)
+    monkeypatch.setattr(torch.distributed, "init_process_group", lambda kind, timeout: asked.append(kind))
+    _started(monkeypatch, WORLD_SIZE="2", RANK="1", LOCAL_RANK="1")
+    Processes().join(torch.device("cuda", 1))
+    Processes().join(torch.device("cpu"))
+    assert asked == [torch.device("cuda", 1), "nccl", "gloo"]
+
+
+@pytest.mark.parametrize(
+    ("environment", "told"),
+    [
+        ({"WORLD_SIZE": "two"}, "needed a number in the environment's WORLD_SIZE, got 'two'"),
+        ({"WORLD_SIZE": "2"}, "needed a number in the environment's RANK, got ''"),
+        ({"WORLD_SIZE": "2", "RANK": "2", "LOCAL_RANK": "0"}, "RANK must be below WORLD_SIZE, got 2 of 2"),
+    ],
+)
+def test_an_environment_that_contradicts_itself_is_refused(
+    environment: dict[str, str], told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _started(monkeypatch, **environment)
+    with pytest.raises(InputError, match=told):
+        Processes()
+
+
+def test_processes_that_cannot_meet_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    _started(monkeypatch, WORLD_SIZE="2", RANK="0", LOCAL_RANK="0")
+    for name in ("MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(InputError, match=r"process 0 of 2 could not meet the others by gloo .*MASTER_ADDR"):
+        Processes().join(torch.device("cpu"))
+
+
+def _started(monkeypatch: pytest.MonkeyPatch, **environment: str) -> None:
+    """The environment as a launcher left it."""
+    for name in ("WORLD_SIZE", "RANK", "LOCAL_RANK"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
