@@ -1,0 +1,88 @@
+"""A picture drawn part by part, each of the Gaussians that it can show, is the picture."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+import torch
+
+from pansplat.bench.scenes import full_lattice_room
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.training.config import Mixing, Style
+from pansplat.training.drawing import Drawing
+
+HEIGHT = 32
+STYLES: tuple[Style, ...] = ("panorama", "cubemap", "original")
+POSE = torch.eye(4, dtype=torch.float64)
+POSE[:3, 3] = torch.tensor([0.2, -0.1, 0.3])
+CONTEXT = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+CONTEXT[1, 0, 3] = 0.5
+
+
+def cloud(count: int = 400, dtype: torch.dtype = torch.float64) -> Gaussians:
+    """Gaussians all around, from needles to some that hold the camera; also faint, too near and not finite ones."""
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    directions = torch.nn.functional.normalize(normal(count, 3), dim=1)
+    radii = 0.5 + 3 * torch.rand(count, 1, generator=generator, dtype=torch.float64)
+    means = directions * radii
+    means[:3] = POSE[:3, 3] + 0.01
+    scales = 0.1 * torch.exp(1.2 * normal(count, 3) - 1)
+    scales[3:6] = 2.0
+    opacities = torch.rand(count, generator=generator, dtype=torch.float64)
+    opacities[6:9] = 1e-4
+    means[9] = torch.nan
+    views = torch.arange(count) % 2
+    return Gaussians(means, scales, normal(count, 4), opacities, 0.3 * normal(count, 4, 3), views * 0, views).to(
+        dtype=dtype
+    )
+
+
+@pytest.mark.parametrize(("style", "mixing"), list(itertools.product(STYLES, ("joint", "by_view"))))
+def test_the_parts_together_are_the_picture(style: Style, mixing: Mixing) -> None:
+    drawing, gaussians = Drawing(style, mixing, HEIGHT), cloud()
+    layers = drawing.layers(len(CONTEXT))
+    masks = drawing.shown(gaussians, POSE, layers)
+    drawn = [drawing.draw_layer(gaussians.select(mask), POSE, layer) for mask, layer in zip(masks, layers, strict=True)]
+    whole = drawing.draw(gaussians, POSE, CONTEXT)
+    assert float(whole.std()) > 0.05
+    torch.testing.assert_close(drawing.compose(drawn, POSE, CONTEXT), whole, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_what_a_part_leaves_out_cannot_be_seen_in_it(style: Style) -> None:
+    drawing, gaussians = Drawing(style, "joint", HEIGHT), cloud()
+    layers = drawing.layers(2)
+    for mask, layer in zip(drawing.shown(gaussians, POSE, layers), layers, strict=True):
+        assert not drawing.draw_layer(gaussians.select(~mask), POSE, layer)[3].any()
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_a_part_is_drawn_of_few_gaussians(style: Style) -> None:
+    drawing = Drawing(style, "joint", 128)
+    masks = drawing.shown(full_lattice_room(128), POSE, drawing.layers(2))
+    assert max(float(mask.double().mean()) for mask in masks) < 0.3
+    assert sum(float(mask.double().mean()) for mask in masks) < 1.5
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_parts_of_no_gaussians_are_empty(style: Style) -> None:
+    drawing, none = Drawing(style, "joint", HEIGHT), cloud().select(torch.zeros(400, dtype=torch.bool))
+    layers = drawing.layers(2)
+    for mask, layer in zip(drawing.shown(none, POSE, layers), layers, strict=True):
+        assert len(mask) == 0 and not drawing.draw_layer(none, POSE, layer).any()
+
+
+@pytest.mark.parametrize("height", [32, 64, 512, 2048])
+def test_strips_cover_every_row_once_and_have_one_area(height: int) -> None:
+    drawing = Drawing("panorama", "joint", height)
+    rows = [drawing._rows(layer.part) for layer in drawing.layers(2)]
+    assert rows[0][0] == 0 and rows[-1][1] == height
+    assert all(before[1] == after[0] for before, after in itertools.pairwise(rows))
+    areas = [math.cos(math.pi * first / height) - math.cos(math.pi * end / height) for first, end in rows]
+    assert max(areas) - min(areas) < 4 * math.pi / height
