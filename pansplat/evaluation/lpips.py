@@ -9,6 +9,7 @@ version 0.1 of its weights. OFFICIAL.md, sections 11 and 13: the paper's figures
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal
 
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from pansplat.errors import InputError
+from pansplat.evaluation.lpips_bands import banded_distances, distances
 
 Backbone = Literal["vgg", "alex", "squeeze"]
 
@@ -26,7 +28,8 @@ SMALLEST = 32
 # What the classifiers were trained on, for pictures in [-1, 1].
 _MEAN = (-0.030, -0.088, -0.188)
 _DEVIATION = (0.458, 0.448, 0.450)
-_FLOOR = 1e-20  # squared length of a pixel's activations: none at all has a direction of zeros, and a gradient
+# Pictures of more pixels are looked at in bands of so many by VGG, whose activations are the largest.
+_WHOLE, _BAND = 1 << 19, 1 << 18
 
 _VGG = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512)  # outputs; 0 is a pooling
 # inputs, squeezed, expanded by each of two; 0 is a pooling
@@ -85,9 +88,8 @@ class Lpips(nn.Module):
         if weights is not None:
             prediction = torch.where(weights[:, None] > 0, prediction, target)
         total = target.new_zeros(len(target))
-        for head, a, b in zip(self.heads, self._activations(prediction), self._activations(target), strict=True):
-            apart = (_directions(a) - _directions(b)).square()
-            total = total + _mean(torch.einsum("bchw,c->bhw", apart, head), weights)
+        for apart in self._distances(self._normalized(prediction), self._normalized(target)):
+            total = total + _mean(apart, weights)
         return total
 
     @torch.no_grad()
@@ -97,20 +99,24 @@ class Lpips(nn.Module):
         """The distance of two single pictures, as a figure."""
         return float(self(prediction[None], target[None]))
 
-    def _activations(self, images: Tensor) -> list[Tensor]:
+    def _distances(self, a: Tensor, b: Tensor) -> Iterator[Float[Tensor, "batch _ _"]]:
+        """One map a layer that is compared."""
+        if self.backbone == "vgg" and a.shape[-2] * a.shape[-1] > _WHOLE:
+            return banded_distances(a, b, self.features, self.heads, _BAND)
+        activations = (self._activations(maps) for maps in (a, b))
+        return (distances(*pair, head) for head, *pair in zip(self.heads, *activations, strict=True))
+
+    def _normalized(self, images: Tensor) -> Tensor:
         mean, deviation = (images.new_tensor(values)[:, None, None] for values in (_MEAN, _DEVIATION))
-        maps = (2 * images - 1 - mean) / deviation
+        return (2 * images - 1 - mean) / deviation
+
+    def _activations(self, maps: Tensor) -> list[Tensor]:
         kept = []
         for index, layer in enumerate(self.features):
             maps = layer(maps)
             if index in TAPS[self.backbone]:
                 kept.append(maps)
         return kept
-
-
-def _directions(maps: Float[Tensor, "batch channel height width"]) -> Float[Tensor, "batch channel height width"]:
-    """Activations divided by their length over the channels."""
-    return maps * (maps.square().sum(1, keepdim=True) + _FLOOR).rsqrt()
 
 
 def _mean(
