@@ -58,7 +58,7 @@ def load_model(
             corrects them; "trained" is the one that the weights were trained with. Original weights were trained
             with the defects, so for them it is "official".
         precision: for networks: number type of the convolutions; docs/bench_model.md has what bfloat16 gains and costs.
-        **options: for the constructor of `sweep`.
+        **options: for the constructor of `sweep`; for networks, see `pansplat.model.loading.load_predictor`.
 
     Raises:
         InputError: when there is no such predictor, the processor lacks the precision, or the file cannot be used.

@@ -11,12 +11,14 @@ from torch import Tensor, nn
 
 from pansplat.geometry.wrap import Border
 from pansplat.model.layers import (
+    Arithmetic,
     AttentionPrecision,
     Compat,
     PanoramaConv2d,
     Precision,
     border_of,
     convolving,
+    laid_out,
     normalized_convolution,
     require_size,
     require_views,
@@ -40,6 +42,8 @@ class FeaturePyramidConfig:
 
 class FeaturePyramid(nn.Module):
     """Features of levels 3 to 0, at 1/8 to 1/1 of the image; paper's F^l."""
+
+    arithmetic: Arithmetic = "fast"
 
     def __init__(
         self,
@@ -69,7 +73,7 @@ class FeaturePyramid(nn.Module):
         with convolving(self.precision, images.device):
             fine_to_coarse = self.encoder(normalize(images.flatten(0, 1)))
             coarsest = fine_to_coarse[-1].unflatten(0, batch_and_view).to(images.dtype)
-            refined = self.transformer(coarsest).flatten(0, 1)
+            refined = laid_out(self.transformer(coarsest).flatten(0, 1), self.arithmetic)
             coarse_to_fine = self.decoder(refined, fine_to_coarse[:-1])
         return [features.unflatten(0, batch_and_view).to(images.dtype) for features in coarse_to_fine]
 
@@ -156,7 +160,8 @@ class LevelOutput(nn.Module):
         self.norm = nn.BatchNorm2d(outputs)
 
     def forward(self, flow: Float[Tensor, "image channel height width"]) -> Float[Tensor, "image c height width"]:
-        return nn.functional.silu(normalized_convolution(self.conv, self.norm, flow))
+        made = normalized_convolution(self.conv, self.norm, flow)
+        return made * made.sigmoid()  # as the original writes SiLU: torch's own rounds otherwise
 
 
 def normalize(images: Float[Tensor, "image 3 height width"]) -> Float[Tensor, "image 3 height width"]:

@@ -20,7 +20,7 @@ from pansplat.model.checkpoint import (
     load_weights,
     read_checkpoint,
 )
-from pansplat.model.layers import AttentionPrecision, Compat, Precision
+from pansplat.model.layers import Arithmetic, AttentionPrecision, Compat, Precision
 from pansplat.model.mvsplat import MVSplat, MVSplatConfig
 from pansplat.model.network import NetworkPredictor
 from pansplat.model.official_names import Model
@@ -34,7 +34,12 @@ _NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {
 
 
 def load_predictor(
-    path: str | Path, compat: CompatChoice = "trained", *, precision: Precision = "float32"
+    path: str | Path,
+    compat: CompatChoice = "trained",
+    *,
+    precision: Precision = "float32",
+    attention_precision: AttentionPrecision = "float32",
+    arithmetic: Arithmetic | None = None,
 ) -> NetworkPredictor:
     """The predictor whose weights a file holds.
 
@@ -43,14 +48,24 @@ def load_predictor(
         compat: "official" computes what the original does, "fixed" corrects its defects, "trained" is the one that
             the weights were trained with: for original checkpoints "official".
         precision: number type of PanSplat's convolutions; see docs/bench_model.md for what bfloat16 costs and gains.
+        attention_precision: what attention rounds its inputs to; the original's was bfloat16.
+        arithmetic: of PanSplat; "original" gives the original's bits, see docs/paper.md.
 
     Raises:
-        InputError: when the file cannot be used, or the processor has no instructions for bfloat16.
+        InputError: when the file cannot be used, the processor has no instructions for bfloat16, or the network has
+            no such arithmetic.
     """
     path = Path(path)
     require_precision(precision)
     weights = from_original(read_checkpoint(path), path) if path.suffix.lower() in CHECKPOINTS else load_weights(path)
-    network = build_network(weights, weights.compat if compat == "trained" else compat, path, precision=precision)
+    network = build_network(
+        weights,
+        weights.compat if compat == "trained" else compat,
+        path,
+        precision=precision,
+        attention_precision=attention_precision,
+        arithmetic=arithmetic,
+    )
     return NetworkPredictor(weights.model, network)
 
 
@@ -105,13 +120,21 @@ def build_network(
     *,
     precision: Precision = "float32",
     attention_precision: AttentionPrecision = "float32",
+    arithmetic: Arithmetic | None = None,
 ) -> PanSplat | MVSplat:
     """The network with its weights, in eval mode.
 
     Raises:
         InputError: when the file's settings or tensors fit no network.
     """
-    network = build_empty(weights, compat, source, precision=precision, attention_precision=attention_precision)
+    network = build_empty(
+        weights,
+        compat,
+        source,
+        precision=precision,
+        attention_precision=attention_precision,
+        arithmetic=arithmetic,
+    )
     require_shapes(weights.tensors, network.state_dict(), source)
     network.load_state_dict(weights.tensors, strict=True, assign=True)
     return network.eval()
@@ -124,6 +147,7 @@ def build_empty(
     *,
     precision: Precision = "float32",
     attention_precision: AttentionPrecision = "float32",
+    arithmetic: Arithmetic | None = None,
 ) -> PanSplat | MVSplat:
     """The network without memory for its weights; random numbers are not drawn.
 
@@ -139,9 +163,20 @@ def build_empty(
         raise
     except (TypeError, ValueError) as error:
         raise InputError(f"{source}: needed settings of a {weights.model} network, got '{error}'") from error
+    if arithmetic == "original" and (kind is not PanSplat or compat != "official"):
+        raise InputError(
+            f'{source}: `arithmetic` "original" is for pansplat networks with compat "official", got {weights.model} '
+            f"with {compat}; leave it out"
+        )
     with torch.device("meta"):
         if kind is PanSplat:
-            return PanSplat(config, compat, precision=precision, attention_precision=attention_precision)
+            return PanSplat(
+                config,
+                compat,
+                precision=precision,
+                attention_precision=attention_precision,
+                arithmetic=arithmetic,
+            )
         if precision != "float32":
             raise InputError(f"{source}: a {weights.model} network runs in float32 only, got precision {precision!r}")
         return MVSplat(config, compat, attention_precision=attention_precision)

@@ -15,7 +15,15 @@ from pansplat.gaussians.gaussians import Gaussians
 from pansplat.model.cost_volume import CostVolumeConfig, Depths, SphericalCostVolume
 from pansplat.model.feature_pyramid import FeaturePyramid, FeaturePyramidConfig
 from pansplat.model.heads import GaussianHeads, HeadsConfig, TileGaussians
-from pansplat.model.layers import AttentionPrecision, Compat, Precision, convolving, resize
+from pansplat.model.layers import (
+    Arithmetic,
+    AttentionPrecision,
+    Compat,
+    Precision,
+    convolving,
+    follow_the_original,
+    resize,
+)
 from pansplat.model.mono_depth import MonocularDepth
 
 MATCHING_HEIGHT = 512
@@ -80,6 +88,12 @@ class PanSplat(nn.Module):
             numbers; "fixed" corrects them.
         precision: number type of all convolutions; depths, correlations and positions stay as they are.
         attention_precision: what attention rounds its inputs to; the original's was bfloat16.
+        arithmetic: "original" does every operation before the heads as the original does, so that on the same
+            processor, with one thread, every bit is its own; slower. By default where that decides what comes out:
+            with `compat="official"` and bfloat16 attention, where a last bit decides which way an input is rounded.
+
+    Raises:
+        ValueError: the original's arithmetic without `compat="official"`.
     """
 
     def __init__(
@@ -89,8 +103,11 @@ class PanSplat(nn.Module):
         *,
         precision: Precision = "float32",
         attention_precision: AttentionPrecision = "float32",
+        arithmetic: Arithmetic | None = None,
     ) -> None:
         super().__init__()
+        if arithmetic == "original" and compat != "official":
+            raise ValueError(f'arithmetic="original" needs compat="official", got {compat!r}')
         config = config or PanSplatConfig()
         self.config, self.compat = config, compat
         self.precision: Precision = precision
@@ -99,6 +116,12 @@ class PanSplat(nn.Module):
         self.mono_depth = MonocularDepth(compat) if config.cost_volume.mono_channels else None
         self.cost_volume = SphericalCostVolume(config.cost_volume, compat, attention_precision, precision)
         self.heads = GaussianHeads(config.heads, compat, precision)
+        if arithmetic is None:
+            delicate = compat == "official" and (precision, attention_precision) == ("float32", "bfloat16")
+            arithmetic = "original" if delicate else "fast"
+        self.arithmetic: Arithmetic = arithmetic
+        if arithmetic == "original":
+            follow_the_original(self)
 
     def forward(
         self,

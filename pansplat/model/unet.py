@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from pansplat.geometry.wrap import Border
-from pansplat.model.layers import AttentionPrecision, PanoramaConv2d, attend
+from pansplat.model.layers import Arithmetic, AttentionPrecision, PanoramaConv2d, attend, laid_out
 
 _GROUPS = 8  # of every normalisation
 _HEAD_CHANNELS = 32
@@ -137,6 +137,8 @@ class ResBlock(nn.Module):
 class JointAttention(nn.Module):
     """Attention among the positions of all views at once, added to the map; before training it adds nothing."""
 
+    arithmetic: Arithmetic = "fast"
+
     def __init__(self, channels: int, precision: AttentionPrecision) -> None:
         super().__init__()
         self.precision: AttentionPrecision = precision
@@ -150,10 +152,17 @@ class JointAttention(nn.Module):
         self, maps: Float[Tensor, "image channel height width"], views: int
     ) -> Float[Tensor, "image channel height width"]:
         count, channels, height, width = maps.shape
-        tokens = maps.movedim(1, -1).reshape(count // views, views * height * width, channels)
+        projected = _at_each_pixel(self.project_in, maps).movedim(1, -1)
+        tokens = projected.reshape(count // views, views * height * width, 3 * channels)
         # Each head's query, key and value lie one after another.
-        parts = self.project_in(tokens).unflatten(-1, (self.heads, 3, _HEAD_CHANNELS))
-        queries, keys, values = parts.permute(3, 0, 2, 1, 4)
-        attended = attend(queries, keys, values, precision=self.precision)
-        tokens = self.project_out(attended.transpose(1, 2).flatten(2))
-        return maps + self.norm(tokens.reshape(count, height, width, channels).movedim(-1, 1))
+        queries, keys, values = tokens.unflatten(-1, (self.heads, 3, _HEAD_CHANNELS)).permute(3, 0, 2, 1, 4)
+        attended = attend(queries, keys, values, precision=self.precision, arithmetic=self.arithmetic)
+        merged = attended.transpose(1, 2).reshape(count, height, width, channels).movedim(-1, 1)
+        return maps + self.norm(_at_each_pixel(self.project_out, laid_out(merged, self.arithmetic)))
+
+
+def _at_each_pixel(
+    linear: nn.Linear, maps: Float[Tensor, "image channel height width"]
+) -> Float[Tensor, "image c height width"]:
+    """A linear layer across the channels, as the convolution that it is in the original."""
+    return functional.conv2d(maps, linear.weight[:, :, None, None], linear.bias)
