@@ -8,7 +8,6 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -46,7 +45,13 @@ def run_memory(command: BenchMemory) -> int:
         task = bar.add_task("", total=len(cases))
         try:
             with _weights(setting) as weights, Live(bar, console=console, transient=True) as live:
-                watch = partial(_watch, live, bar, task, partial(write_memory_rows, file, machine, setting))
+
+                def watch(doing: str, rows: list[MemoryRow]) -> None:
+                    bar.update(task, completed=len(cases) - _missing(cases, rows), description=doing)
+                    _show(live, bar, doing, rows)
+                    if rows:
+                        write_memory_rows(file, machine, setting, rows)
+
                 references = folder / "references"
                 references.mkdir(exist_ok=True)
                 Measuring(setting, weights, references, watch).run(cases, rows)
@@ -102,15 +107,17 @@ def _weights(setting: MemorySetting) -> Iterator[Path]:
         yield path
 
 
-def _watch(live: Live, bar: Progress, task: object, write: partial[None], doing: str, rows: list[MemoryRow]) -> None:
-    """Show the rows so far and keep them."""
-    bar.update(task, completed=len(rows), description=doing)  # type: ignore[arg-type]
+def _missing(cases: list[MemoryCase], rows: list[MemoryRow]) -> int:
+    """How many of the cases have no row."""
+    return len(set(cases) - {row.case for row in rows})
+
+
+def _show(live: Live, bar: Progress, doing: str, rows: list[MemoryRow]) -> None:
+    """The rows so far, and what is being done; one line a row where there is no terminal."""
     if live.console.is_terminal:
         live.update(Group(memory_table(rows[-_SHOWN:], "memory"), bar))
     elif doing:
         live.console.print(doing, highlight=False, soft_wrap=True)
-    if rows:
-        write(rows)
 
 
 def _report(
@@ -131,8 +138,9 @@ def _report(
     where = machine["gpu"] if setting.device == "cuda" else machine["cpu"]
     title = f"{setting.network} network, batch 1, {setting.style} pictures, {setting.perceptual} loss; {where}"
     console.print(memory_table(rows, title))
-    if len(rows) < len(cases):
-        print(f"{len(cases) - len(rows)} of {len(cases)} rows are still to be measured")
+    missing = _missing(cases, rows)
+    if missing:
+        print(f"{missing} of {len(cases)} rows are still to be measured")
     if written:
         plot_memory(rows, folder / "memory.png", title)
         with replacing(folder / "memory.md") as partial_file:
