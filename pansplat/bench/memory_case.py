@@ -35,7 +35,7 @@ from pansplat.training.config import MemoryConfig, NetworkShape, Style
 from pansplat.training.drawing import Drawing
 from pansplat.training.losses import LossWeights
 from pansplat.training.network import freeze, learn, learning, read_weights, shape_of
-from pansplat.training.perceptual import PerceptualName, choose_perceptual
+from pansplat.training.perceptual import Perceptual, PerceptualName, choose_perceptual
 from pansplat.training.step import Teacher
 
 Work = Literal["inference", "plain", "one-step", "two-step"]
@@ -202,12 +202,14 @@ class _Worker:
 
     Attributes:
         optimizer: None for inference.
+        perceptual: part of the loss.
     """
 
     case: MemoryCase
     setting: MemorySetting
     network: PanSplat
     optimizer: torch.optim.Optimizer | None
+    perceptual: Perceptual
 
     def work(self, batch: Batch) -> tuple[int, dict[str, Tensor]]:
         """The number of Gaussians, and the result by name."""
@@ -229,7 +231,7 @@ class _Worker:
         optimizer.zero_grad()
         memory = MemoryConfig(case.work, case.tiles, self.setting.style)
         weights = LossWeights(depth=0.0) if batch.images.shape[-2] > MATCHED_HEIGHT else LossWeights()
-        Teacher(network, None, choose_perceptual(self.setting.perceptual), weights, memory).backpropagate(batch)
+        Teacher(network, None, self.perceptual, weights, memory).backpropagate(batch)
         found = {name: p.grad for name, p in network.named_parameters() if p.grad is not None}
         optimizer.step()
         views, heights = batch.images.shape[1], batch.images.shape[-2]
@@ -249,7 +251,8 @@ def _run(job: Path) -> None:
     if device.type == "cuda":
         whole_memory = torch.cuda.get_device_properties(device).total_memory
         torch.cuda.set_per_process_memory_fraction(min(1.0, setting.limit_gib * 2**30 / whole_memory))
-    worker = _Worker(case, setting, *_network(case, setting, Path(told["weights"]), device))
+    perceptual = choose_perceptual(setting.perceptual, device=device)
+    worker = _Worker(case, setting, *_network(case, setting, Path(told["weights"]), device), perceptual)
     worker.work(painted_sphere(_WARM_HEIGHT).to(device))  # compiles and loads what will be needed
     batch = painted_sphere(case.height).to(device)
     gc.collect()

@@ -66,9 +66,8 @@ class Run:
         self.auxiliary = auxiliary_heads(self.network).to(self.device) if config.network.auxiliary else None
         self.optimizer = torch.optim.Adam(list(learning(self.network, self.auxiliary)), lr=config.optimizer.rate)
         self.mean = RunningMean(self.network, config.optimizer.ema) if config.optimizer.ema else None
-        self.teacher = Teacher(
-            self.network, self.auxiliary, choose_perceptual(config.perceptual), config.loss, config.memory
-        )
+        perceptual = choose_perceptual(config.perceptual, device=self.device)
+        self.teacher = Teacher(self.network, self.auxiliary, perceptual, config.loss, config.memory)
         self.step, self.source = 0, None
         if kept is not None:
             self._restore(kept[1])

@@ -48,22 +48,25 @@ class Perceptual(Protocol):
         ...
 
 
-def choose_perceptual(name: PerceptualName = "auto", folder: Path | None = None) -> Perceptual:
+def choose_perceptual(
+    name: PerceptualName = "auto", folder: Path | None = None, device: torch.device | None = None
+) -> Perceptual:
     """The measure of that name; "auto" takes LPIPS with vgg, alex or squeeze, whose files are here, else "structure".
 
     Args:
         folder: of LPIPS's weights; see `load_lpips`.
+        device: for its weights; by default the processor's memory.
 
     Raises:
         InputError: no such name, or LPIPS is asked for by name and its files are missing.
     """
     if name in _BACKBONES:
-        return load_lpips(_BACKBONES[name], folder)
+        return load_lpips(_BACKBONES[name], folder).to(device)
     if name == "structure":
         return Structure()
     if name == "auto":
         backbone = first_available(folder)
-        return load_lpips(backbone, folder) if backbone else Structure()
+        return load_lpips(backbone, folder).to(device) if backbone else Structure()
     raise InputError(f"`perceptual` must be auto, structure or one of {', '.join(_BACKBONES)}, got {name!r}")
 
 
