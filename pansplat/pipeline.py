@@ -95,6 +95,7 @@ def predict(
     model: str | Path | Predictor = "sweep",
     *,
     compat: CompatChoice = "trained",
+    precision: Precision = "float32",
     height: int = 512,
     cache: bool = True,
     progress: Progress | None = None,
@@ -107,7 +108,7 @@ def predict(
     Args:
         source: a pair, the path of a folder that holds exactly one, or loaded panoramas (never cached).
         model: the name of a predictor, a file of weights, or a predictor.
-        compat: see `load_model`.
+        compat, precision: see `load_model`; a predictor keeps its own.
         height: panoramas are resized to (height, 2 height); loaded ones keep their size.
         cache: whether an earlier result may be returned and this one kept.
         progress: told what is being done and the fraction of the whole that is done.
@@ -115,7 +116,7 @@ def predict(
     Raises:
         InputError: when the input cannot be used, or the path holds several pairs.
     """
-    predictor = load_model(model, compat=compat) if isinstance(model, (str, Path)) else model
+    predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
     pair = _only_pair(source) if isinstance(source, (str, Path)) else source
     if isinstance(pair, Views):
         return _predict(pair, predictor, progress)
@@ -141,6 +142,7 @@ def predict_to_file(
     model: str | Path | Predictor,
     *,
     compat: CompatChoice = "trained",
+    precision: Precision = "float32",
     height: int = 512,
     degree: int | None = None,
     min_opacity: float = 0.0,
@@ -151,7 +153,7 @@ def predict_to_file(
     The file holds what `predict` gives, in the order of tiles.
 
     Args:
-        source, compat, height, progress: as in `predict`.
+        source, compat, precision, height, progress: as in `predict`.
         model: a network: a file of weights, or its predictor.
         degree: highest degree of harmonics to keep; None keeps all.
         min_opacity: Gaussians of less are left out.
@@ -163,7 +165,7 @@ def predict_to_file(
         InputError: as `predict`; when the predictor is no network, or the file cannot be written.
     """
     _require_ply(path)
-    predictor = load_model(model, compat=compat) if isinstance(model, (str, Path)) else model
+    predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
     if not streams(predictor):
         raise InputError(f"{predictor.name} makes all Gaussians at once; use `predict` and `save`, or a network")
     pair = _only_pair(source) if isinstance(source, (str, Path)) else source

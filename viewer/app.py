@@ -36,6 +36,8 @@ class Options:
     compat: Literal["trained", "official", "fixed"] = "trained"
     """For a network: what the original code computes, or with its defects corrected; by default as the weights
     were trained."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Number type of a network's convolutions; bfloat16 is faster where the processor has it, and less exact."""
     height: int = 512
     """Height of the panoramas that the prediction sees, pixels."""
     no_cache: bool = False
@@ -77,7 +79,14 @@ class Options:
     def load_options(self) -> LoadOptions:
         """How to read and predict."""
         return LoadOptions(
-            self.model, self.compat, self.height, not self.no_cache, self.convention, self.near, self.far
+            self.model,
+            self.compat,
+            self.precision,
+            self.height,
+            not self.no_cache,
+            self.convention,
+            self.near,
+            self.far,
         )
 
     @property

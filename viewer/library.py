@@ -58,6 +58,7 @@ class LoadOptions:
 
     model: str = "sweep"
     compat: Literal["trained", "official", "fixed"] = "trained"
+    precision: Literal["float32", "bfloat16"] = "float32"
     height: int = 512
     cache: bool = True
     convention: str | None = None
@@ -106,6 +107,7 @@ def load_entry(entry: Entry, options: LoadOptions, progress: Progress, *, photos
         entry.pair,
         model=options.model,
         compat=options.compat,
+        precision=options.precision,
         height=options.height,
         cache=options.cache,
         progress=progress,

@@ -95,6 +95,8 @@ class Render:
     """Predictor, for a pair: `sweep`, or a file of weights."""
     compat: Compat = "trained"
     """For a network: official, fixed, or as its weights were trained; `pansplat predict --help` has more."""
+    precision: Precision = "float32"
+    """Number type of a network's convolutions."""
     predict_height: int = 512
     """Height the panoramas are resized to before the prediction, for a pair."""
     choice: PairChoice = field(default_factory=PairChoice)

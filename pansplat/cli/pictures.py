@@ -34,7 +34,7 @@ def run_render(command: Render) -> int:
     poses = None if command.pose is None else read_poses(command.pose)
     if poses is not None and len(poses) > 1 and not film:
         raise InputError(f"{command.pose} holds {len(poses)} poses; write an .mp4, or keep one pose in the file")
-    scene = open_scene(command.path, command.choice, command.model, command.compat, command.predict_height)
+    scene = open_scene(command)
     layout = command.layout or ("perspective" if film else "equirect")
     options = _options(command, layout, command.height or (_FILM_HEIGHT if film else scene.height))
     if film:

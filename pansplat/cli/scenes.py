@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pansplat import pipeline
-from pansplat.cli.commands import Compat, PairChoice, Predict
+from pansplat.cli.commands import PairChoice, Predict, Render
 from pansplat.errors import InputError
 from pansplat.gaussians.prune import prune
 
@@ -83,12 +83,14 @@ def choose_pair(path: Path, choice: PairChoice) -> Pair:
     raise InputError(f"--pair {choice.pair}: {path} holds {', '.join(f'{i}: {n}' for i, n in enumerate(names, 1))}")
 
 
-def open_scene(path: Path, choice: PairChoice, model: str, compat: Compat, height: int) -> Scene:
+def open_scene(command: Render) -> Scene:
     """The scene of a .ply file, or the prediction of a pair's folder."""
-    if path.suffix.lower() == ".ply":
-        return pipeline.load(path)
-    require_height(height)
-    return predict(choose_pair(path, choice), pipeline.load_model(model, compat=compat), height, cache=True)
+    if command.path.suffix.lower() == ".ply":
+        return pipeline.load(command.path)
+    require_height(command.predict_height)
+    pair = choose_pair(command.path, command.choice)
+    model = pipeline.load_model(command.model, compat=command.compat, precision=command.precision)
+    return predict(pair, model, command.predict_height, cache=True)
 
 
 def predict(pair: Pair, model: predictor.Predictor, height: int, *, cache: bool) -> Scene:

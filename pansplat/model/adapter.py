@@ -112,7 +112,9 @@ def _world_harmonics(
         base = 2 * (colors - 0.5)
         harmonics = torch.cat((harmonics[..., :1] + base[..., None], harmonics[..., 1:]), dim=-1)
     turn = rotation_matrices(world_harmonics_rotation(camera, compat), degree).to(raw)
-    return (harmonics @ turn.T).transpose(-1, -2)
+    # One product of two matrices: of strided harmonics, torch would make one for each Gaussian.
+    turned = harmonics.reshape(-1, harmonics.shape[-1]) @ turn.T
+    return turned.view(harmonics.shape).transpose(-1, -2)
 
 
 def _damping(degree: int) -> Float[Tensor, "k"]:

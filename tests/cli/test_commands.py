@@ -264,6 +264,15 @@ def test_render_refuses_what_makes_no_sense(scene: Path, tmp_path: Path, capsys:
 # evaluate
 
 
+def test_a_precision_reaches_the_model_wherever_one_predicts(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--model", "sphere", "--precision", "bfloat16"]
+    for command, out in (("predict", "x.ply"), ("render", "x.png")):
+        assert run([command, str(room), "-o", str(tmp_path / out), *arguments]) == 2
+        assert "`precision` is for networks, and sphere is none" in capsys.readouterr().err
+
+
 def test_evaluate_writes_results_and_prints_the_table(
     room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

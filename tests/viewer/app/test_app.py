@@ -11,7 +11,7 @@ from pansplat.errors import InputError
 from pansplat.gaussians.ply import save_ply
 from pansplat_viewer.app import Options, choose, run
 from pansplat_viewer.flythrough import STILLS, Film, flight_pose, panorama_pose
-from pansplat_viewer.library import Entry
+from pansplat_viewer.library import Entry, LoadOptions
 
 
 @pytest.fixture
@@ -97,6 +97,12 @@ def test_pairs_are_chosen_by_name_or_number():
     assert choose(entries, "3") == 2
     with pytest.raises(InputError, match="bath, kitchen, hall"):
         choose(entries, "4")
+
+
+def test_what_is_said_of_the_prediction_reaches_it(tmp_path):
+    said = {"model": "w.safetensors", "compat": "fixed", "precision": "bfloat16", "height": 256}
+    said |= {"convention": "world2cam opengl", "near": 0.3, "far": 9.0}
+    assert Options(tmp_path, no_cache=True, **said).load_options == LoadOptions(cache=False, **said)
 
 
 def test_size_is_width_by_height(tmp_path):
