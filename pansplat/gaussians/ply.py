@@ -13,7 +13,8 @@ from __future__ import annotations
 import json
 import os
 import warnings
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -33,6 +34,7 @@ SCALE_EPSILON = 1e-12  # metres; the log of a smaller scale would be infinite
 _MARK = "pansplat "
 _MAX_RUNS = 4096  # with more runs the header would grow to megabytes, so the Gaussians are sorted first
 _MAX_HEADER = 1 << 24
+_PIECE = 1 << 17  # vertices read at once
 _FOREIGN_NEAR, _FOREIGN_FAR = 0.1, 100.0  # depth range, metres, of a file that does not tell
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
@@ -86,14 +88,15 @@ def load_ply(path: str | Path) -> Scene:
     try:
         with open(path, "rb") as file:
             header = _read_header(file, path)
-            vertices = _read_vertices(file, header, path)
+            _seek_vertices(file, header, path)
+            gaussians = _read_gaussians(file, header, path)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
     extras = _parse_extras(header.comments, path)
-    levels, views = _labels(extras, len(vertices), path)
-    gaussians = _finite(_gaussians(vertices, levels, views, path), path)
-    if len(vertices) and not len(gaussians):
-        raise InputError(f"{path}: none of its {len(vertices)} Gaussians is finite; write the file again")
+    levels, views = _labels(extras, header.count, path)
+    gaussians = _finite(replace(gaussians, levels=levels, views=views), path)
+    if header.count and not len(gaussians):
+        raise InputError(f"{path}: none of its {header.count} Gaussians is finite; write the file again")
     cam2world = torch.tensor(extras.get("cam2world", []), dtype=torch.float64).reshape(-1, 4, 4)
     return Scene(
         gaussians,
@@ -238,7 +241,7 @@ def _vertex_header(order: str, elements: list, comments: list[str], path: Path) 
     raise InputError(f"{path}: it has no `vertex` element; give a 3DGS .ply")
 
 
-def _read_vertices(file: BinaryIO, header: _Header, path: Path) -> np.ndarray:
+def _seek_vertices(file: BinaryIO, header: _Header, path: Path) -> None:
     start = file.tell() + header.skip
     needed = header.count * header.dtype.itemsize
     held = file.seek(0, os.SEEK_END) - start
@@ -248,42 +251,57 @@ def _read_vertices(file: BinaryIO, header: _Header, path: Path) -> np.ndarray:
             "copy or download it again"
         )
     file.seek(start)
-    if header.dtype.itemsize == 0:
-        return np.zeros(header.count, header.dtype)
-    return np.fromfile(file, header.dtype, header.count)
 
 
-def _gaussians(vertices: np.ndarray, levels: torch.Tensor, views: torch.Tensor, path: Path) -> Gaussians:
-    held = vertices.dtype.names or ()
+def _read_gaussians(file: BinaryIO, header: _Header, path: Path) -> Gaussians:
+    """The vertices from where the file stands, all labelled level 0 of view 0.
+
+    Read piece by piece, so that a scene of gigabytes takes hardly more memory than it has to.
+    """
+    coefficients = _coefficients(header.dtype.names or (), path)
+    n, zeros = header.count, torch.zeros(header.count, dtype=torch.int64)
+    gaussians = Gaussians(
+        means=torch.empty(n, 3),
+        scales=torch.empty(n, 3),
+        quats=torch.empty(n, 4),
+        opacities=torch.empty(n),
+        harmonics=torch.empty(n, coefficients, 3),
+        levels=zeros,
+        views=zeros,
+    )
+    for start in range(0, n, _PIECE):
+        rows = slice(start, min(start + _PIECE, n))
+        vertices = np.fromfile(file, header.dtype, rows.stop - start)
+        if len(vertices) < rows.stop - start:
+            raise InputError(f"{path} became shorter while it was read; read it again when it is whole")
+        gaussians.means[rows] = _columns(vertices, "x", "y", "z")
+        gaussians.scales[rows] = _columns(vertices, "scale_0", "scale_1", "scale_2").exp()
+        gaussians.quats[rows] = _columns(vertices, "rot_0", "rot_1", "rot_2", "rot_3")
+        gaussians.opacities[rows] = _columns(vertices, "opacity").sigmoid()[:, 0]
+        gaussians.harmonics[rows, 0] = _columns(vertices, "f_dc_0", "f_dc_1", "f_dc_2")
+        rest = _columns(vertices, *(f"f_rest_{i}" for i in range(3 * (coefficients - 1))))
+        gaussians.harmonics[rows, 1:] = rest.reshape(len(vertices), 3, coefficients - 1).transpose(1, 2)
+    return gaussians
+
+
+def _columns(vertices: np.ndarray, *names: str) -> torch.Tensor:
+    values = np.empty((len(vertices), len(names)), np.float32)
+    for index, name in enumerate(names):
+        values[:, index] = vertices[name]
+    return torch.from_numpy(values)
+
+
+def _coefficients(held: Sequence[str], path: Path) -> int:
+    """Number of the harmonics' coefficients of vertices with those properties, 1 to 25."""
     rest = sum(name.startswith("f_rest_") for name in held)
     if rest not in (0, 9, 24, 45, 72):
         raise InputError(f"{path}: {rest} f_rest properties fit no SH degree; 0, 9, 24, 45 or 72 are needed")
-    coefficients = rest // 3 + 1
-    needed = [name for name in _property_names(coefficients) if name not in ("nx", "ny", "nz")]
+    needed = [name for name in _property_names(rest // 3 + 1) if name not in ("nx", "ny", "nz")]
     missing = [name for name in needed if name not in held]
     if missing:
         hint = "a compressed .ply; uncompress it first" if "packed_position" in held else "no 3DGS .ply"
         raise InputError(f"{path}: the vertices lack {', '.join(missing[:6])}: this is {hint}")
-
-    def columns(*names: str) -> torch.Tensor:
-        values = np.empty((len(vertices), len(names)), np.float32)
-        for index, name in enumerate(names):
-            values[:, index] = vertices[name]
-        return torch.from_numpy(values)
-
-    harmonics = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
-    if rest:
-        higher = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(-1, 3, coefficients - 1)
-        harmonics = torch.cat((harmonics, higher.transpose(1, 2)), dim=1)
-    return Gaussians(
-        means=columns("x", "y", "z"),
-        scales=columns("scale_0", "scale_1", "scale_2").exp(),
-        quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        opacities=columns("opacity").sigmoid()[:, 0],
-        harmonics=harmonics,
-        levels=levels,
-        views=views,
-    )
+    return rest // 3 + 1
 
 
 def _parse_extras(comments: list[str], path: Path) -> dict:

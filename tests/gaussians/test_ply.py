@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pansplat.errors import InputError
+from pansplat.gaussians import ply
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.gaussians.ply import OPACITY_EPSILON, SCALE_EPSILON, load_ply, save_ply
 from pansplat.gaussians.scene import Scene
@@ -287,3 +288,12 @@ def test_pose_between_starts_and_ends_at_the_cameras() -> None:
     torch.testing.assert_close(scene.pose_between(1.0), scene.cam2world[1])
     middle = (scene.cam2world[0, :3, 3] + scene.cam2world[1, :3, 3]) / 2
     torch.testing.assert_close(scene.pose_between(0.5)[:3, 3], middle)
+
+
+@pytest.mark.parametrize("piece", [1, 7, 40])
+def test_reading_piece_by_piece_gives_the_same_scene(piece, tmp_path, monkeypatch):
+    save_ply(make_scene(degree=2), tmp_path / "scene.ply")
+    whole = load_ply(tmp_path / "scene.ply").gaussians
+    monkeypatch.setattr(ply, "_PIECE", piece)
+    again = load_ply(tmp_path / "scene.ply").gaussians
+    assert all(torch.equal(getattr(whole, name), getattr(again, name)) for name in (*FIELDS, "levels", "views"))
