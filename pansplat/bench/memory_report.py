@@ -13,16 +13,16 @@ from pansplat.atomic import replacing
 from pansplat.bench.memory import MemoryRow
 from pansplat.bench.memory_case import Work
 
-PAPER_POINTS: tuple[tuple[str, int, int, float], ...] = (
-    ("training", 1, 512, 36.0),
-    ("training", 4, 2048, 42.0),
-    ("inference", 1, 512, 7.5),
-    ("inference", 4, 512, 5.0),
-    ("inference", 2, 2048, 40.0),
-    ("inference", 4, 2048, 23.0),
+PAPER_POINTS: tuple[tuple[str, str, int, float], ...] = (
+    ("training", "untiled", 512, 36.0),
+    ("training", "16 tiles", 2048, 42.0),
+    ("inference", "untiled", 512, 7.5),
+    ("inference", "tiled", 512, 5.0),
+    ("inference", "4 tiles", 2048, 40.0),
+    ("inference", "16 tiles", 2048, 23.0),
 )
-"""Kind, tiles along each side, height, GB of a GPU. Source: the paper's figure of memory, read off by eye; which tiles
-the 5 GB have is not said there. Training's batch is 2 at 512 and 1 at 2048; with 4 tiles 2048 ran out of memory."""
+"""Kind, tiles, height, GB of a GPU. Source: the paper's figure of memory, read off by eye. Training's batch is 2 at 512
+and 1 at 2048; with 4 tiles 2048 ran out of memory."""
 
 _COLUMNS = (
     ("height", "right"),
@@ -114,13 +114,15 @@ def _draw(axes: Axes, rows: Sequence[MemoryRow], kind: str) -> None:
             markersize=4,
             label=f"{name}, {_tiles(tiles)}",
         )
-    for _, tiles, height, gigabytes in (point for point in PAPER_POINTS if point[0] == kind):
+    for _, words, height, gigabytes in (point for point in PAPER_POINTS if point[0] == kind):
         axes.plot(height, gigabytes * 1e9 / 2**30, "*", color="#2a8c4a", markersize=13, markerfacecolor="none")
         axes.annotate(
-            _tiles(tiles), (height, gigabytes), xytext=(-8, 0), textcoords="offset points",
+            words, (height, gigabytes * 1e9 / 2**30), xytext=(-8, 0), textcoords="offset points",
             ha="right", va="center", fontsize=8, color="#2a8c4a",
         )  # fmt: skip
-    axes.plot([], [], "*", color="#2a8c4a", markersize=13, markerfacecolor="none", label="the paper, all of a GPU's")
+    axes.plot(
+        [], [], "*", color="#2a8c4a", markersize=13, markerfacecolor="none", label="the paper: its network, a GPU"
+    )
     axes.set_title(kind, loc="left")
     axes.set_xlabel("panorama, pixels")
     axes.legend(fontsize=8, loc="upper left")
