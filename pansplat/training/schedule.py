@@ -21,7 +21,7 @@ def one_cycle(step: int, total: int, peak: float, *, rise: float = 0.01) -> floa
     """
     start, last = peak / _START, total - 1
     top = rise * total - 1
-    if step <= top:
+    if step < top:
         return _cosine(start, peak, step / top)
     return _cosine(peak, start / _END, min(1.0, (step - max(top, 0.0)) / max(1e-9, last - max(top, 0.0))))
 
