@@ -17,7 +17,16 @@ import safetensors.torch
 from torch import Tensor
 
 from pansplat.atomic import replacing
-from pansplat.bench.memory_case import MemoryCase, MemorySetting, OverLimit, RowFailed, Taken, Work, take
+from pansplat.bench.memory_case import (
+    MATCHED_HEIGHT,
+    MemoryCase,
+    MemorySetting,
+    OverLimit,
+    RowFailed,
+    Taken,
+    Work,
+    take,
+)
 from pansplat.errors import InputError
 
 Status = Literal["measured", "not tried", "over the limit", "died"]
@@ -147,8 +156,13 @@ class Measuring:
 
 
 def expected_gib(case: MemoryCase, rows: Sequence[MemoryRow]) -> float:
-    """The memory a case may need, from the same work at the next lower height; 0 where nothing is known."""
+    """The memory a case may need, from the same work at the next lower height; 0 where nothing is known.
+
+    Nothing is known of training above the height up to which all of the network learns.
+    """
     lower = [r for r in rows if (r.work, r.tiles) == (case.work, case.tiles) and r.height < case.height]
+    if case.kind == "training" and case.height > MATCHED_HEIGHT:
+        lower = [row for row in lower if row.height > MATCHED_HEIGHT]
     if not lower:
         return 0.0
     row = max(lower, key=lambda r: r.height)

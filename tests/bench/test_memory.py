@@ -150,6 +150,9 @@ def test_memory_is_expected_to_grow_with_the_number_of_pixels():
     assert expected_gib(case, [row]) == pytest.approx(0.5 + 16 * 0.25)
     assert expected_gib(case, [dataclasses.replace(row, tiles=1), dataclasses.replace(row, height=512)]) == 0
     assert expected_gib(case, [MemoryRow("two-step", 2, 128, "died"), row]) == math.inf
+    assert expected_gib(MemoryCase("two-step", 2, 1024), [row]) == 0  # only the heads learn there
+    tall = dataclasses.replace(row, height=1024)
+    assert expected_gib(MemoryCase("two-step", 2, 2048), [tall, row]) == pytest.approx(0.5 + 4 * 0.25)
 
 
 def test_deviations_are_relative_to_the_reference():
