@@ -1,7 +1,8 @@
 """A predictor that needs no weights: a hierarchical spherical plane sweep.
 
 Read it top to bottom: `predictor` (the call), `search` (three levels), `frame` (the scene's axes), `cost`
-(matching), `aggregate` (smoothing), `planes` and `surface` (what views tell each other), `lift` (Gaussians).
+(matching), `votes` and `planes` (the scene's planes), `aggregate` (smoothing), `surface` (what views tell each other),
+`lift` (Gaussians).
 """
 
 from pansplat.model.sweep.predictor import Sweep, SweepConfig

@@ -40,13 +40,24 @@ class MatchingConfig:
     """For a hypothesis behind the other view's surface, where pictures cannot tell."""
     tolerance: float = 0.08
     """Relative inverse depth within which two views agree."""
-    outside_penalty: float = 0.4
+    outside_penalty: float = 1.0
     """For a hypothesis below the floor or above the ceiling."""
+    flat_weight: float = 0.3
+    """What pictures may say of a window without texture; a bare wall fits wherever it is not contradicted."""
+    flat_cost: float = 0.4
+    """What a hypothesis costs as far as pictures may not say."""
+    texture_variance: float = 4e-4
+    """Variance of a window that is half way from flat to textured."""
+    distance_ratio: float = 4.0
+    """A point this many times nearer to one camera than to the other is still compared like any other ..."""
+    distance_penalty: float = 0.5
+    """... and one infinitely nearer costs this: half the view shrinks to a few pixels, which fit anything."""
 
 
 _WEIGHTS = (
     "correlation_weight", "color_weight", "color_limit", "variance_floor", "visible_penalty",
     "agreement_bonus", "occluded_cost", "tolerance", "outside_penalty",
+    "flat_weight", "flat_cost", "texture_variance", "distance_ratio", "distance_penalty",
 )  # fmt: skip  # the order in which the kernel unpacks them
 
 
@@ -144,7 +155,8 @@ def _family_cost(
 ):  # fmt: skip
     height, width = image.shape[:2]
     low, high = limits
-    correlation_weight, color_weight, color_limit, epsilon, visible, bonus, occluded, tolerance, outside = weights
+    correlation_weight, color_weight, color_limit, epsilon, visible, bonus, occluded, tolerance, outside = weights[:9]
+    flat_weight, flat_cost, texture_variance, distance_ratio, distance_penalty = weights[9:]
     neutral = np.float32(0.5) * (correlation_weight + color_weight)
     impossible = np.float32(2) * (correlation_weight + color_weight)
     area = np.float32(1.0 / ((2 * m + 1) * (2 * m + 1)))
@@ -154,6 +166,7 @@ def _family_cost(
         state = np.empty((height, width), np.uint8)  # 0 matched, 1 out of range, 2 unseen or masked
         ratio = np.empty((height, width), np.float32)
         trust = np.empty((height, width), np.float32)
+        unlike = np.empty((height, width), np.float32)
         sum_b, sum_bb, sum_ab = (
             np.empty((height, width), np.float32),
             np.empty((height, width), np.float32),
@@ -189,6 +202,7 @@ def _family_cost(
                     qj = int(u[j] - np.float32(0.5)) % width
                     state[i, j] = 1 if inverse[j] < low or inverse[j] > high else (0 if other_usable[qi, qj] else 2)
                     ratio[i, j] = inverse[j] * scale[j] / other_inverse[qi, qj] if informed else np.float32(1)
+                    unlike[i, j] = max(1 - distance_ratio * min(scale[j], 1 / scale[j]), np.float32(0))
                     trust[i, j] = other_confidence[qi, qj] if informed else np.float32(0)
             _pad_in_place(warped, m)
             _window_sums(gray, warped, m, column[0], column[1], column[2], sum_b, sum_bb, sum_ab)
@@ -199,7 +213,10 @@ def _family_cost(
                     covariance = sum_ab[i, j] * area - mean[i, j] * mean_b
                     score = (covariance + epsilon) / math.sqrt((variance[i, j] + epsilon) * (var_b + epsilon))
                     c = correlation_weight * min(1 - score, np.float32(1)) + color_weight * difference[i, j]
-                    extra = penalty[side[i, j], k]
+                    said = variance[i, j] / (variance[i, j] + texture_variance)
+                    said = flat_weight + (1 - flat_weight) * said
+                    c = said * c + (1 - said) * flat_cost
+                    extra = penalty[side[i, j], k] + unlike[i, j] * distance_penalty
                     t = trust[i, j]
                     if ratio[i, j] > 1 + tolerance:
                         extra += visible * t

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -54,7 +55,8 @@ class Sweep:
         Args:
             near, far: radial depth range, metres; numbers, or tensors with one value a batch item (or a view, of
                 which the nearest and farthest count).
-            masks: True where a pixel shows the scene; the rest matches nothing and makes no Gaussians.
+            masks: True where a pixel shows the scene; the rest matches nothing and makes no Gaussians, nor do
+                patches of exact black (0, 0, 0), the holes of scans.
 
         Raises:
             ValueError: on wrong shapes, fewer than two views, non-finite values, or near >= far.
@@ -84,11 +86,10 @@ class Sweep:
     ) -> Gaussians:
         low, high = float(torch.as_tensor(near).min()), float(torch.as_tensor(far).max())
         _check(images, cam2world, low, high, masks)
-        height, width = images.shape[-2:]
         posed = PosedImages(
             images=np.ascontiguousarray(images.detach().cpu().float().permute(0, 2, 3, 1).numpy()),
             cam2world=cam2world.detach().cpu().double().numpy(),
-            masks=np.ones((len(images), height, width), bool) if masks is None else masks.cpu().numpy(),
+            masks=_shows_something(images) & (True if masks is None else masks.cpu().numpy()),
             near=low,
             far=high,
         )
@@ -98,6 +99,16 @@ class Sweep:
         gaussians = lift(posed, surfaces, self.config.lift)
         report("done", 1.0)
         return gaussians.to(device=images.device)
+
+
+def _shows_something(images: Tensor) -> np.ndarray:
+    """Pixels (view, h, w) outside patches of exact black, which photographs do not have: there a scan has a hole."""
+    shows = np.empty((len(images), *images.shape[-2:]), bool)
+    for view, image in enumerate(images.detach().cpu().numpy()):
+        black = (image.max(axis=0) <= 0).astype(np.uint8)
+        patches = cv2.morphologyEx(black, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        shows[view] = cv2.dilate(patches, np.ones((5, 5), np.uint8)) == 0
+    return shows
 
 
 def _item(value: float | Tensor, n: int) -> float | Tensor:

@@ -1,6 +1,7 @@
 """The hierarchical plane sweep: from posed panoramas to a surface for each of them.
 
-Three levels, as in the paper's hierarchical cost volume (PanSplat, section 3.2), at 1/4, 1/2 and 1/1 of the height.
+First pixels vote for the planes that the scene has. Then come three levels, as in the paper's hierarchical cost
+volume (PanSplat, section 3.2), at 1/4, 1/2 and 1/1 of the height.
 The coarse level searches the whole depth range among spheres and among planes along the scene's axes, twice: the
 second time every view knows the other views' surfaces (what they see through, agree with, or hide) and which
 planes the scene has. Each finer level searches a narrow range around the coarser surface.
@@ -18,9 +19,12 @@ import numpy as np
 from pansplat.model.sweep.aggregate import AggregationConfig, aggregate, best_labels
 from pansplat.model.sweep.cost import Family, MatchingConfig, View, matching_cost
 from pansplat.model.sweep.frame import main_directions, scene_axes
-from pansplat.model.sweep.planes import PlaneSupport, plane_support
+from pansplat.model.sweep.planes import MIN_FLOOR, PlaneSupport, no_support, plane_support
 from pansplat.model.sweep.sphere import resize_sphere
 from pansplat.model.sweep.surface import Surface, agreement, guided_upsample
+from pansplat.model.sweep.votes import vote_for_planes
+
+_VOTING_HEIGHT = 128
 
 
 @dataclass(frozen=True)
@@ -80,9 +84,12 @@ def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[
     steps = (high - low) * posed.baseline / (math.pi / heights[0])  # candidates a pixel of parallax apart
     count = int(np.clip(math.ceil(steps), 48, config.max_candidates))
     step = (high - low) / (count - 1)
+    report("finding floor, ceiling and walls", 0.0)
+    support = no_support(posed.cam2world, axes, posed.near, posed.far)
+    support = _Level(posed, min(finest, _VOTING_HEIGHT), support, (low, high), config, None).vote()
     for n in range(config.coarse_passes):
-        report("searching the whole depth range", 0.5 * n / config.coarse_passes)
-        level = _Level(posed, heights[0], axes, (low, high), config, surfaces)
+        report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
+        level = _Level(posed, heights[0], support, (low, high), config, surfaces)
         surfaces = [level.search_all(view, count) for view in range(len(posed.images))]
     for n, height in enumerate(heights[1:]):
         report("refining the surfaces", 0.5 + 0.25 * n)
@@ -92,7 +99,7 @@ def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[
             for s, image in zip(surfaces, posed.images, strict=True)
         ]
         step /= 2
-        level = _Level(posed, height, axes, (low, high), config, surfaces)
+        level = _Level(posed, height, support, (low, high), config, surfaces)
         surfaces = [
             level.search_near(view, config.narrow_candidates[n], step, spread=n == 0)
             for view in range(len(posed.images))
@@ -114,7 +121,7 @@ class _Level:
         self,
         posed: PosedImages,
         height: int,
-        axes: np.ndarray,
+        support: PlaneSupport,
         limits: tuple[float, float],
         config: SearchConfig,
         surfaces: list[Surface] | None,
@@ -126,9 +133,8 @@ class _Level:
             config,
             surfaces,
         )
-        self.rays = [main_directions(axes, pose[:3, :3], height) for pose in posed.cam2world]
-        self.axes = axes
-        self.support: PlaneSupport | None = None
+        self.rays = [main_directions(support.axes, pose[:3, :3], height) for pose in posed.cam2world]
+        self.support = support
         masks = [
             cv2.resize(mask.astype(np.uint8), (2 * height, height), interpolation=cv2.INTER_NEAREST) > 0
             for mask in posed.masks
@@ -137,7 +143,7 @@ class _Level:
         if surfaces is not None:
             agreed = [agreement(surfaces, posed.cam2world, view) & mask for view, mask in enumerate(masks)]
             confidence = [np.where(a, 1, config.unsure_confidence).astype(np.float32) for a in agreed]
-            self.support = plane_support(surfaces, agreed, posed.cam2world, axes, posed.near, posed.far)
+            self.support = plane_support(surfaces, agreed, posed.cam2world, support)
         self.views = [
             View(
                 resize_sphere(image, height),
@@ -149,6 +155,13 @@ class _Level:
             for n, (image, mask, rays) in enumerate(zip(posed.images, masks, self.rays, strict=True))
         ]
 
+    def vote(self) -> PlaneSupport:
+        """What the pixels of all views say about the scene's planes."""
+        return vote_for_planes(
+            self.views, self.rays, self.posed.cam2world, self.support, self.limits,
+            MIN_FLOOR * self.posed.near, self.config.matching,
+        )  # fmt: skip
+
     def search_all(self, view: int, count: int) -> Surface:
         """The whole depth range, among spheres (family 0) and planes along the axes (families 1 to 3)."""
         low, high = self.limits
@@ -158,12 +171,11 @@ class _Level:
         sides = [np.zeros(shape, np.uint8)] + [(r > 0).astype(np.uint8) for r in self.rays[view]]
         inverse = low + step * np.arange(count)
         penalties = [np.zeros((2, count), np.float32) for _ in slopes]
-        if self.support is not None:
-            penalties[0] += self.config.sphere_prior
-            for axis in range(3):
-                penalties[axis + 1] = self.config.plane_prior * (
-                    1 - self.support.share(axis, self.posed.cam2world[view], inverse)
-                )
+        penalties[0] += self.config.sphere_prior
+        for axis in range(3):
+            penalties[axis + 1] = self.config.plane_prior * (
+                1 - self.support.share(axis, self.posed.cam2world[view], inverse)
+            )
         families = [
             Family(low * slope, step * slope, penalty.astype(np.float32), side)
             for slope, penalty, side in zip(slopes, penalties, sides, strict=True)
@@ -193,7 +205,7 @@ class _Level:
         """Match against every other view, aggregate, and read the best hypothesis off."""
         count = families[0].penalty.shape[1]
         others = [n for n in range(len(self.views)) if n != view]
-        bounds = (math.inf, -math.inf) if self.support is None else self.support.bounds(self.posed.cam2world[view])
+        bounds = self.support.bounds(self.posed.cam2world[view])
         cost: np.ndarray | None = None
         for other in others:
             part = matching_cost(

@@ -1,5 +1,6 @@
 """The matching cost of hypotheses."""
 
+import dataclasses
 import math
 
 import numba as nb
@@ -10,7 +11,7 @@ from pansplat.model.sweep.cost import Family, MatchingConfig, View, _fast_atan2,
 from pansplat.model.sweep.sphere import ray_grid
 
 _ANYWHERE = (math.inf, -math.inf)
-_PLAIN = MatchingConfig()
+_PLAIN = MatchingConfig(flat_weight=1.0, distance_penalty=0.0)
 _IMPOSSIBLE = 2 * (_PLAIN.correlation_weight + _PLAIN.color_weight)
 _NEUTRAL = 0.5 * (_PLAIN.correlation_weight + _PLAIN.color_weight)
 
@@ -162,6 +163,32 @@ def test_a_penalty_is_paid_on_its_side_only(empty_room):
     cost = matching_cost(view, view, np.eye(4), [family], (0.1, 2.0), _ANYWHERE, _PLAIN)
     assert np.allclose(cost[:, :96], (0.0, 0.3), atol=0.02)
     assert np.allclose(cost[:, 96:], (0.7, 0.0), atol=0.02)
+
+
+def test_a_window_without_texture_says_little():
+    """White against grey: the colours differ by more than the limit, the correlation says nothing."""
+    white, gray = np.ones((32, 64, 3)), np.full((32, 64, 3), 0.5)
+    family = _family(32, np.array((0.25, 0.5), np.float32))
+    config = MatchingConfig()
+    cost = matching_cost(_view(white), _view(gray), np.eye(4), [family], (0.1, 2.0), _ANYWHERE, config)
+    expected = config.flat_weight * config.color_weight + (1 - config.flat_weight) * config.flat_cost
+    assert np.allclose(cost, expected, atol=1e-3)
+
+
+def test_points_much_nearer_to_one_camera_than_to_the_other_cost_more(empty_room):
+    views, pose = [_view(image) for image in empty_room.posed.images], np.eye(4)
+    pose[0, 3] = 2.0
+    inverses = np.array((0.25, 2.0, 3.75), np.float32)
+    priced = dataclasses.replace(_PLAIN, distance_penalty=0.5)
+    plain, dear = (
+        matching_cost(*views, pose, [_family(96, inverses)], (0.1, 4.0), _ANYWHERE, config)
+        for config in (_PLAIN, priced)
+    )
+    points = ray_grid(96)[..., None, :] / inverses[:, None]
+    ratio = np.linalg.norm(points + np.array((2.0, 0, 0)), axis=-1) * inverses
+    expected = 0.5 * np.maximum(1 - priced.distance_ratio * np.minimum(ratio, 1 / ratio), 0)
+    assert np.allclose(dear - plain, expected, atol=1e-4)
+    assert (expected[..., 0] == 0).all() and (expected[..., 2] > 0).all()
 
 
 @nb.njit

@@ -1,9 +1,11 @@
 """The planes that a scene has."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
-from pansplat.model.sweep.planes import PlaneSupport, plane_support
+from pansplat.model.sweep.planes import PlaneSupport, no_support, plane_support
 from pansplat.model.sweep.surface import Surface, world_points
 
 _AXES = np.array(((0.0, 1, 0), (1, 0, 0), (0, 0, 1)))  # down and the room's two wall normals
@@ -20,9 +22,7 @@ def support(empty_room) -> PlaneSupport:
         low, high = np.array(room.low) @ _AXES.T, np.array(room.high) @ _AXES.T
         wall = np.minimum(np.abs(points - low), np.abs(points - high)).argmin(axis=-1)
         surfaces.append(Surface(plain.inverse_depth, (wall + 1).astype(np.uint8)))
-    return plane_support(
-        surfaces, list(empty_room.posed.masks), poses, _AXES, empty_room.posed.near, empty_room.posed.far
-    )
+    return plane_support(surfaces, list(empty_room.posed.masks), poses, no_support(poses, _AXES, 0.5, 8.0))
 
 
 def test_shares_of_all_planes_sum_to_one(support):
@@ -53,7 +53,8 @@ def test_the_floor_is_below_and_the_ceiling_above_the_camera(support, empty_room
 
 def test_without_agreement_nothing_is_known(empty_room):
     nothing = [np.zeros_like(mask) for mask in empty_room.posed.masks]
-    support = plane_support(empty_room.surfaces, nothing, empty_room.posed.cam2world, _AXES, 0.45, 8.0)
+    poses = empty_room.posed.cam2world
+    support = plane_support(empty_room.surfaces, nothing, poses, no_support(poses, _AXES, 0.45, 8.0))
     assert support.bounds(empty_room.posed.cam2world[0]) == (np.inf, -np.inf)
     assert support.share(1, empty_room.posed.cam2world[0], np.linspace(0.1, 2, 20)).max() == 0
 
@@ -67,6 +68,25 @@ def test_the_sweep_finds_floor_and_ceiling_by_itself(empty_room):
         for s, p in zip(empty_room.surfaces, poses, strict=True)
     ]
     agreed = [agreement(labelled, poses, view) for view in (0, 1)]
-    down, up = plane_support(labelled, agreed, poses, _AXES, 0.45, 8.0).bounds(poses[0])
+    down, up = plane_support(labelled, agreed, poses, no_support(poses, _AXES, 0.45, 8.0)).bounds(poses[0])
     assert down == pytest.approx(1.06 * empty_room.room.high[1] + 0.05, abs=0.1)
     assert up == pytest.approx(1.06 * empty_room.room.low[1] - 0.05, abs=0.1)
+
+
+def test_a_plane_that_pixels_voted_for_is_supported_without_any_surface(empty_room):
+    poses = empty_room.posed.cam2world
+    nothing = no_support(poses, _AXES, 0.45, 8.0)
+    votes = np.zeros_like(nothing.votes)
+    votes[0, nothing.offsets.searchsorted(1.2)] = 0.7
+    voted = dataclasses.replace(nothing, votes=votes)
+    distance = voted.offsets[voted.votes[0].argmax()] - poses[0][1, 3] + voted.origin[1]
+    assert voted.share(0, poses[0], np.array((1 / distance,)))[1, 0] == pytest.approx(0.7)
+    assert nothing.share(0, poses[0], np.array((1 / distance,))).max() == 0
+
+
+def test_floor_and_ceiling_that_pixels_voted_for_come_before_those_of_surfaces(support, empty_room):
+    pose = empty_room.posed.cam2world[0]
+    voted = dataclasses.replace(support, floor_ceiling=(2.0, -np.inf)).bounds(pose)
+    below = 2.0 - (pose[1, 3] - support.origin[1])
+    assert voted[0] == pytest.approx(1.06 * below + support.bin)
+    assert voted[1] == support.bounds(pose)[1]

@@ -90,8 +90,26 @@ def test_full_masks_are_no_masks(small, predicted):
 
 def test_the_input_is_left_as_it_was(small):
     images, poses = (t.clone() for t in small)
-    Sweep()(*small, 0.5, 8.0)
-    assert torch.equal(images, small[0]) and torch.equal(poses, small[1])
+    masks = torch.ones(2, 64, 128, dtype=torch.bool)
+    images[0, :, 20:30, 40:60] = 0  # a hole
+    before = images.clone()
+    Sweep()(images, poses, 0.5, 8.0, masks=masks)
+    assert torch.equal(images, before) and torch.equal(poses, small[1]) and masks.all()
+
+
+def test_holes_of_a_scan_show_nothing(small):
+    """A patch of exact black is as good as masked; single black pixels and very dark ones are seen."""
+    holed = small[0].clone()
+    holed[0, :, 20:30, 40:60] = 0
+    masks = torch.ones(2, 64, 128, dtype=torch.bool)
+    masks[0, 18:32, 38:62] = False  # the patch, and what resizing mixes with it
+    assert _same(Sweep()(holed, small[1], 0.5, 8.0), Sweep()(holed, small[1], 0.5, 8.0, masks=masks))
+    dark = small[0].clone()
+    dark[0, :, 20:30, 40:60] = 1e-3
+    dark[0, :, 5, 5] = 0
+    unmasked = dark.clamp_min(1e-4)
+    seen, expected = (len(Sweep()(images, small[1], 0.5, 8.0)) for images in (dark, unmasked))
+    assert seen == pytest.approx(expected, rel=2e-3)  # a masked patch would be 2 % of the panorama
 
 
 def test_predictions_are_plain_float32_without_gradients(small, predicted):
