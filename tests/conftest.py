@@ -22,7 +22,12 @@ with contextlib.suppress(ImportError):
     import triton  # noqa: F401
 
 # Annotated shapes and types are checked at every call; the hook must come before the rooms are imported.
-_CHECKED = ("geometry", "gaussians", "render", "evaluation", "pipeline")
+# Of the model not all are: numba cannot keep the compiled kernels of wrapped modules.
+_NETWORK = (
+    *("adapter", "auxiliary_heads", "checkpoint", "cost_volume", "feature_pyramid", "heads", "lattice", "layers"),
+    *("loading", "mono_depth", "mvsplat", "network", "pansplat", "tiles", "transformer", "unet", "weights"),
+)
+_CHECKED = ("geometry", "gaussians", "render", "evaluation", "pipeline", *(f"model.{part}" for part in _NETWORK))
 install_import_hook([f"pansplat.{room}" for room in _CHECKED], "pansplat.testing.check_types")
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared"

@@ -112,7 +112,7 @@ def test_every_switch_of_a_config_comes_back(tmp_path: Path) -> None:
     assert isinstance(network, PanSplat) and network.config == config
 
 
-def test_files_that_fit_no_network_are_refused(file: Path) -> None:
+def test_files_that_fit_no_network_are_refused(file: Path, unchecked: None) -> None:
     tensors = MVSplat(SMALL).state_dict()
     good = describe("mvsplat", SMALL, tensors, compat="fixed")
     odd: list[tuple[WeightsFile, str]] = [
