@@ -20,6 +20,7 @@ _OPTIONS = {
     "nogil": True,
     "error_model": "numpy",  # divide without asking whether by zero
     "boundscheck": False,
+    "no_cfunc_wrapper": True,  # nobody calls them from C
     "fastmath": {"contract", "nsz"},  # sums keep their order: the same bits on any number of threads
 }
 
@@ -58,7 +59,7 @@ def _stamp(module: Path) -> str:
 
 def inlined(function: Callable[..., Any]) -> Any:
     """Compile a function into each kernel that calls it."""
-    return nb.njit(forceinline=True, **_OPTIONS)(inspect.unwrap(function))
+    return nb.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)(inspect.unwrap(function))
 
 
 @contextlib.contextmanager

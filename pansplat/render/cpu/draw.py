@@ -27,7 +27,7 @@ from pansplat.render.cpu.memory import Lease
 from pansplat.render.cpu.observe import PIECE, Camera, Fields, Observed, observe
 from pansplat.render.cpu.observe_backward import Gradients, add_slots, chain
 from pansplat.render.cpu.radix import front_to_back
-from pansplat.render.cpu.raster import raster_forward
+from pansplat.render.cpu.raster import Kept, raster_forward, room_to_keep
 from pansplat.render.cpu.raster_backward import raster_backward
 from pansplat.render.cpu.records import FIELDS
 from pansplat.render.cpu.tables import plane_of
@@ -39,11 +39,16 @@ _LEAST_SPREAD = 1e-9  # pixel^2: without a filter a disc seen edge-on would have
 
 
 class Projection(NamedTuple):
-    """What one picture shows: records, boxes, and the Gaussians seen, front to back."""
+    """What one picture shows: records, boxes, and the Gaussians seen, front to back.
+
+    And, if its tile lists came in one band, these and what its forward kept.
+    """
 
     records: np.ndarray
     boxes: np.ndarray
     order: np.ndarray
+    lists: TileLists | None = None
+    kept: Kept | None = None
 
 
 @dataclass
@@ -218,8 +223,8 @@ def _draw_picture(
     needs_grad: bool,
     lease: Lease,
     threads: int,
-) -> tuple[Projection, TileLists | None] | None:
-    """Write one picture's sums, and return what its backward needs; the lists only if they came in one band."""
+) -> Projection | None:
+    """Write one picture's sums, and return what its backward needs."""
     lease, observed = lease if needs_grad else Lease(), scene[2]
     with notes.timed("boxes"):
         records, boxes = _place(scene, picture, options, lease, threads)
@@ -227,26 +232,29 @@ def _draw_picture(
         by_depth = options.order == "z" and not picture.is_panorama
         towards = picture.rotation[:, 2].numpy().copy() if by_depth else np.zeros(3)
         order = front_to_back(observed.records, observed.radii, boxes, towards, lease, threads)
-    plane, whole = plane_of(picture, exact=options.kernel == "ray"), None
+    plane, shown = plane_of(picture, exact=options.kernel == "ray"), Projection(records, boxes, order)
     bands = list_tiles(order, boxes, picture.size, slots=needs_grad, threads=threads, limit=bins.LIMIT)
     while True:
         with notes.timed("bin"):
             lists = next(bands, None)
         if lists is None:
             break
+        whole = needs_grad and len(lists.starts) == 1 + math.prod(plane.tiles)
         with notes.timed("raster"):
+            room = room_to_keep(lists.starts, lists.lease) if whole else None
             raster_forward(
                 records, observed.values, lists.entries, lists.starts, plane, sums,
-                first_row=lists.first_row, threads=threads,
+                first_row=lists.first_row, kept=room, threads=threads,
             )  # fmt: skip
         notes.entries += len(lists.entries)
         own = records.nbytes if records is not observed.records else 0
-        listed = sum(part.nbytes for part in (lists.entries, lists.starts, lists.slots, lists.offsets))
+        listed = sum(part.nbytes for part in (lists.entries, lists.starts, lists.slots, lists.offsets, *(room or ())))
         notes.bytes = max(notes.bytes, own + boxes.nbytes + order.nbytes + max(listed, 8 * len(order)) + 8 * len(order))
-        whole = lists if needs_grad and len(lists.starts) == 1 + math.prod(plane.tiles) else None
+        if whole:
+            shown = shown._replace(lists=lists, kept=room)
         del lists
     notes.visible += len(order)
-    return (Projection(records, boxes, order), whole) if needs_grad else None
+    return shown if needs_grad else None
 
 
 def _place(
@@ -262,7 +270,7 @@ def _slot_gradients(
     scene: tuple[Fields, Camera, Observed],
     pictures: list[Picture],
     options: Options,
-    kept: list[tuple[Projection, TileLists | None]],
+    projections: list[Projection],
     sums: np.ndarray,
     grad_sums: np.ndarray,
     lease: Lease,
@@ -272,23 +280,30 @@ def _slot_gradients(
     fields, camera, observed = scene
     num, num_values = observed.values.shape
     exact = options.kernel == "ray"
-    alone = exact and len(pictures) == 1 and kept[0][1] is not None
+    alone = exact and len(pictures) == 1 and projections[0].lists is not None
     total_records = np.zeros((num if exact and not alone else 0, FIELDS), np.float32)
     totals = np.zeros((0 if exact else num, TOTALS))
     total_values = np.zeros((0 if alone else num, num_values), np.float32)
     pieces = -(-num // PIECE)
-    for number, (picture, (projection, only)) in enumerate(zip(pictures, kept, strict=True)):
+    for number, (picture, projection) in enumerate(zip(pictures, projections, strict=True)):
         plane = plane_of(picture, exact=exact)
-        bands = [only] if only else list_tiles(
+        bands = [projection.lists] if projection.lists else list_tiles(
             projection.order, projection.boxes, picture.size, slots=True, threads=threads, limit=bins.LIMIT
         )  # fmt: skip
         for lists in bands:
+            room = projection.kept
+            if room is None:  # drawn once more: what many bands would have to keep is too much
+                room = room_to_keep(lists.starts, lists.lease)
+                raster_forward(
+                    projection.records, observed.values, lists.entries, lists.starts, plane, sums[number],
+                    first_row=lists.first_row, kept=room, threads=threads,
+                )  # fmt: skip
             band = lease if alone else Lease()
             grad_records = band.array((len(lists.entries), FIELDS), np.float32)
             grad_values = band.array((len(lists.entries), num_values), np.float32)
             raster_backward(
                 projection.records, observed.values, lists.entries, lists.starts, lists.slots, plane, sums[number],
-                grad_sums[number], grad_records, grad_values, first_row=lists.first_row, threads=threads,
+                room, grad_sums[number], grad_records, grad_values, first_row=lists.first_row, threads=threads,
             )  # fmt: skip
             if alone:
                 return grad_records, grad_values, totals, lists.offsets

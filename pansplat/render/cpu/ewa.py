@@ -207,8 +207,8 @@ def project(
 
     def work(piece: int) -> None:
         _project(
-            piece, *fields, *camera, observed.records, observed.radii, rotation, turn, *picture.size, picture.focal,
-            dilation, z_near, projected, words, words.view(np.int16),
+            piece, *fields.given, *camera, observed.records, observed.radii, rotation, turn, *picture.size,
+            picture.focal, dilation, z_near, projected, words, words.view(np.int16),
         )  # fmt: skip
 
     share(work, -(-num // PIECE), threads)
@@ -335,6 +335,8 @@ def project_backward(
     _, turn = _axes(camera, picture)
 
     def work(piece: int) -> None:
-        _project_backward(piece, *fields, *camera, turn, *picture.size, picture.focal, dilation, grads, offsets, totals)
+        _project_backward(
+            piece, *fields.given, *camera, turn, *picture.size, picture.focal, dilation, grads, offsets, totals
+        )
 
     share(work, -(-len(fields.means) // PIECE), threads)

@@ -21,11 +21,21 @@ _C4_ZONAL = 0.1875 / math.sqrt(math.pi)
 
 
 @inlined
-def fill_basis(rows, x_row, num, basis):
-    """Write the `num` harmonics of the directions in three rows from `x_row` on, a row each."""
-    lanes = basis.shape[1]
-    for i in range(lanes):
+def fill_basis(rows, x_row, num, bends, basis):
+    """Write the `num` harmonics of the directions in three rows from `x_row` on, a row each.
+
+    Args:
+        bends: None if `num` is 1; then the rest is not even compiled.
+    """
+    for i in range(basis.shape[1]):
         basis[0, i] = _C0
+    if bends is not None:
+        _fill_others(rows, x_row, num, basis)
+
+
+@inlined
+def _fill_others(rows, x_row, num, basis):
+    lanes = basis.shape[1]
     if num >= 4:
         for i in range(lanes):
             x, y, z = rows[x_row, i], rows[x_row + 1, i], rows[x_row + 2, i]
@@ -59,11 +69,20 @@ def fill_basis(rows, x_row, num, basis):
 
 
 @inlined
-def add_slopes(rows, x_row, num, slopes, g_row):
+def add_slopes(rows, x_row, num, bends, slopes, g_row):
     """Add to three rows from `g_row` on the gradient to the direction, given that to each harmonic in `slopes`.
 
     It holds along the sphere; what it says across means nothing, as in the torch reference.
+
+    Args:
+        bends: None if `num` is 1; then there is nothing to compile.
     """
+    if bends is not None:
+        _add_others(rows, x_row, num, slopes, g_row)
+
+
+@inlined
+def _add_others(rows, x_row, num, slopes, g_row):
     lanes = slopes.shape[1]
     if num >= 4:
         for i in range(lanes):

@@ -6,6 +6,7 @@ them, summed alone and times the offset, are all that the pixels have to say.
 
 import numpy as np
 
+from pansplat.render.cpu.columns import columns_of
 from pansplat.render.cpu.compiling import inlined
 from pansplat.render.cpu.raster import forms_at
 from pansplat.render.cpu.records import FIELDS
@@ -25,7 +26,7 @@ from pansplat.render.cpu.simd import (
     totals,
     transposed,
 )
-from pansplat.render.cpu.tile import A_X, ALONG_ROW, B_X, CHUNK, FRONTS, L_X, PIXELS, columns_of
+from pansplat.render.cpu.tile import A_X, ALONG_ROW, B_X, CHUNK, FRONTS, L_X, PIXELS
 
 GROUP = 4  # values whose gradients are summed at a time
 MOMENTS = 16  # (x, y, z, 1) of A, of B, of L; along; level; two to spare

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pansplat.render.cpu import records as layout
+from pansplat.render.cpu.columns import write_columns
 from pansplat.render.cpu.compiling import inlined, kernel
 from pansplat.render.cpu.forms import (
     LARGEST_RATIO,
@@ -62,6 +63,18 @@ class Fields(NamedTuple):
     opacities: np.ndarray
     harmonics: np.ndarray
 
+    @property
+    def given(self) -> tuple[np.ndarray | None, ...]:
+        """The arrays as kernels take them, None for what is not given: what is not needed is not compiled."""
+        by_covariance = len(self.covariances) > 0
+        shape = (None, None, self.covariances) if by_covariance else (self.quats, self.scales, None)
+        return self.means, *shape, self.opacities, self.harmonics
+
+    @property
+    def bends(self) -> bool | None:
+        """True if colours depend on the direction, else None."""
+        return True if self.harmonics.shape[1] > 1 else None
+
 
 class Camera(NamedTuple):
     """The observing camera and what depends on the picture's size.
@@ -86,19 +99,20 @@ def read_block(means, quats, scales, covariances, opacities, start, count, rows)
         g = start + i
         rows[MEAN, i], rows[MEAN + 1, i], rows[MEAN + 2, i] = means[g, 0], means[g, 1], means[g, 2]
         rows[OPACITY, i] = opacities[g]
-    if covariances.shape[0] > 0:
+    # Two questions: numba leaves out what depends on a None, but not the other branch.
+    if covariances is not None:
         for i in range(count):
             g = start + i
             for axis in range(3):
                 for other in range(3):
                     rows[SHAPE + 3 * axis + other, i] = covariances[g, axis, other]
-        return
-    for i in range(count):
-        g = start + i
-        for axis in range(4):
-            rows[SHAPE + axis, i] = quats[g, axis]
-        for axis in range(3):
-            rows[SHAPE + 4 + axis, i] = scales[g, axis]
+    if quats is not None:
+        for i in range(count):
+            g = start + i
+            for axis in range(4):
+                rows[SHAPE + axis, i] = quats[g, axis]
+            for axis in range(3):
+                rows[SHAPE + 4 + axis, i] = scales[g, axis]
 
 
 @inlined
@@ -119,7 +133,7 @@ def find_directions(pose, near, rows):
 @inlined
 def find_shapes(covariances, rows):
     """Find the shapes in the tangent frame of each direction, and which of them are sound."""
-    if covariances.shape[0] > 0:
+    if covariances is not None:
         _shapes_of_covariances(rows)
     else:
         _shapes_of_axes(rows)
@@ -268,11 +282,9 @@ def _round(rows, singles):
 @inlined
 def _write_block(rows, singles, start, count, records, values, radii, drawn, tally):
     radius_column = values.shape[1] - 1
+    write_columns(singles.reshape(-1), LANES, start, count, records)
     for i in range(count):
-        g = start + i
-        for j in range(layout.FIELDS):
-            records[g, j] = singles[j, i]
-        values[g, radius_column] = singles[layout.FIELDS, i]
+        values[start + i, radius_column] = singles[layout.FIELDS, i]
     dropped, near = 0, 0
     for i in range(count):
         radii[start + i] = rows[RADIUS, i]
@@ -286,7 +298,7 @@ def _write_block(rows, singles, start, count, records, values, radii, drawn, tal
 @kernel
 def _observe(
     piece, means, quats, scales, covariances, opacities, harmonics, harmonic_bits,
-    pose, spread, compensate, near, records, values, radii, drawn, tallies,
+    pose, spread, compensate, near, bends, records, values, radii, drawn, tallies,
 ):  # fmt: skip
     rows = np.ones((ROWS + 1, LANES))
     bits = rows.view(np.int64)
@@ -299,7 +311,7 @@ def _observe(
         _check_harmonics(harmonic_bits, harmonics.shape[1] * harmonics.shape[2], start, count, rows)
         _find_records(pose, spread, compensate, rows)
         find_logs(rows, bits, PEAK, LOG)
-        fill_basis(rows, WORLD, harmonics.shape[1], basis)
+        fill_basis(rows, WORLD, harmonics.shape[1], bends, basis)
         _round(rows, singles)
         _write_block(rows, singles, start, count, records, values, radii, drawn, tallies[piece])
         colours(harmonics, start, count, basis, values)
@@ -334,7 +346,18 @@ def observe(fields: Fields, camera: Camera, lease: Lease, threads: int) -> Obser
     harmonic_bits = fields.harmonics.reshape(-1).view(np.uint32)
 
     def work(piece: int) -> None:
-        _observe(piece, *fields, harmonic_bits, *camera, records, values, radii, drawn, tallies)
+        _observe(
+            piece,
+            *fields.given,
+            harmonic_bits,
+            *camera,
+            fields.bends,
+            records.reshape(-1),
+            values,
+            radii,
+            drawn,
+            tallies,
+        )
 
     share(work, pieces, threads)
     dropped, near = (int(count) for count in tallies.sum(axis=0))

@@ -79,7 +79,7 @@ def _read_gradients(grad_records, grad_values, totals, offsets, start, count, ro
                 colour_grads[i, c] += grad_values[slot, c]
             radius += grad_values[slot, channels]
         rows[GIVEN_RADIUS, i] = radius
-        if totals.shape[0] > 0:
+        if totals is not None:
             slot_sums[i, layout.LEVEL] = totals[g, 9]
             continue
         for slot in range(offsets[g], offsets[g + 1]):
@@ -223,7 +223,7 @@ def _clear_undrawn(scene_drawn, start, count, rows, drawn):
 
 @kernel
 def _chain(
-    piece, means, quats, scales, covariances, opacities, harmonics, pose, spread, compensate, near,
+    piece, means, quats, scales, covariances, opacities, harmonics, pose, spread, compensate, near, bends,
     scene_drawn, values, grad_records, grad_values, totals, offsets,
     grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities, grad_harmonics, pose_sums,
 ):  # fmt: skip
@@ -239,15 +239,15 @@ def _chain(
         _clear_undrawn(scene_drawn, start, count, rows, drawn)
         find_shapes(covariances, rows)
         _forms_backward(pose, spread, compensate, rows, sums)
-        if totals.shape[0] > 0:
+        if totals is not None:
             _add_totals(totals, start, drawn, rows, sums)
-        if covariances.shape[0] > 0:
+        if covariances is not None:
             covariances_backward(rows)
         else:
             axes_backward(rows)
-        fill_basis(rows, WORLD, harmonics.shape[1], basis)
+        fill_basis(rows, WORLD, harmonics.shape[1], bends, basis)
         colour_gradients(harmonics, start, drawn, basis, values, colour_grads, grad_harmonics, slopes)
-        add_slopes(rows, WORLD, harmonics.shape[1], slopes, N_GRAD)
+        add_slopes(rows, WORLD, harmonics.shape[1], bends, slopes, N_GRAD)
         _means_backward(rows, sums)
         _write_means(rows, opacities, drawn, start, count, grad_means, grad_opacities)
         _write_shapes(rows, start, count, grad_quats, grad_scales, grad_covariances)
@@ -314,7 +314,8 @@ def chain(
 
     def work(piece: int) -> None:
         _chain(
-            piece, *fields, *camera, observed.drawn, observed.values, grad_records, grad_values, totals, offsets,
+            piece, *fields.given, *camera, fields.bends, observed.drawn, observed.values, grad_records, grad_values,
+            totals if len(totals) > 0 else None, offsets,
             *wanted[:6], sums,
         )  # fmt: skip
 

@@ -5,10 +5,13 @@ Source: docs/rendering.md, section 4. A tile is drawn in chunks of Gaussians. Ea
 registers. That leaves no branch inside that the processor could mistake.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
 from pansplat.render.cpu.compiling import inlined, kernel
+from pansplat.render.cpu.memory import Lease
 from pansplat.render.cpu.records import TILE
 from pansplat.render.cpu.simd import (
     LANES,
@@ -63,6 +66,27 @@ HALF = CHUNK + 1  # room for the powers of a block, and one to be written over
 _FEW = 4  # values summed without writing the weights down: RGB and the distance
 
 
+class Kept(NamedTuple):
+    """What the forward leaves for the backward: how much passed before each chunk of a tile.
+
+    Attributes:
+        through: (row, PIXELS) float32, transmittances before each chunk drawn, and behind the last.
+        rows: (tile + 1), where each tile's rows begin.
+        drawn: (tile), how many chunks were drawn before the tile closed.
+    """
+
+    through: Floats
+    rows: Longs
+    drawn: Longs
+
+
+def room_to_keep(starts: Longs, lease: Lease) -> Kept:
+    """Room for what the backward of these tile lists needs."""
+    chunks = -(-np.diff(starts) // CHUNK)
+    rows = np.concatenate((np.zeros(1, np.int64), np.cumsum(chunks + 1)))
+    return Kept(lease.array((int(rows[-1]), PIXELS), np.float32), rows, np.zeros(len(chunks), np.int64))
+
+
 def raster_forward(
     records: Floats,
     values: Floats,
@@ -72,6 +96,7 @@ def raster_forward(
     sums: Floats,
     *,
     first_row: int = 0,
+    kept: Kept | None = None,
     threads: int = 1,
 ) -> None:
     """Write the sums of weight x (values, 1) of a band of tile rows.
@@ -81,14 +106,16 @@ def raster_forward(
         plane: the picture's pixels.
         sums: (channel + 2, height, width), written where the band lies.
         first_row: of tiles, the band's first.
+        kept: filled in if given, for the backward.
         threads: to work on; the result does not depend on it.
     """
     pieces = pieces_of(starts, threads)
     flat = records.reshape(-1), values, entries.reshape(-1), starts
     table = plane.kind, plane.columns, plane.rows, plane.rotation
+    room = kept or Kept(np.empty((0, PIXELS), np.float32), starts, starts)
 
     def draw(piece: int) -> None:
-        _draw_tiles(*flat, *table, sums, first_row, pieces[piece], pieces[piece + 1])
+        _draw_tiles(*flat, *table, sums, *room, first_row, pieces[piece], pieces[piece + 1])
 
     share(draw, len(pieces) - 1, threads)
 
@@ -104,8 +131,9 @@ def pieces_of(starts: Longs, threads: int) -> list[int]:
 
 @kernel
 def _draw_tiles(  # type: ignore[no-untyped-def]
-    records, values, entries, starts, kind, columns, rows, rotation, sums, first_row, low, high
-):
+    records, values, entries, starts, kind, columns, rows, rotation, sums, kept, kept_rows, drawn_chunks, first_row,
+    low, high,
+):  # fmt: skip
     tiles_across = (len(columns) + TILE - 1) // TILE
     num_values = values.shape[1]
     offsets, middle = np.empty(3 * PIXELS, np.float32), np.empty(6, np.float32)
@@ -118,8 +146,12 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
         left, top = (tile % tiles_across) * TILE, (first_row + tile // tiles_across) * TILE
         place_tile(kind, columns, rows, rotation, left, top, offsets, middle, through)
         added[:] = 0
+        chunks = 0
         for first in range(starts[tile], starts[tile + 1], CHUNK):
             count = min(CHUNK, starts[tile + 1] - first)
+            if len(kept) > 0:
+                _keep(through, kept, kept_rows[tile] + chunks)
+            chunks += 1
             gather(records, values, entries, first, count, middle, exact, forms, colours)
             list_blocks(entries, first, count, touched)
             is_open = False
@@ -138,7 +170,16 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
                 drawn, reached, half = block, following, HALF - half
             if not is_open:
                 break
+        if len(kept) > 0:
+            _keep(through, kept, kept_rows[tile] + chunks)
+            drawn_chunks[tile] = chunks
         _write_tile(through, added, sums, left, top, num_values)
+
+
+@inlined
+def _keep(through, kept, row):  # type: ignore[no-untyped-def]
+    for pixel in range(PIXELS):
+        kept[row, pixel] = through[pixel]
 
 
 @inlined

@@ -100,6 +100,19 @@ def store(context, array, index, value):  # type: ignore[no-untyped-def]
 
 
 @_intrinsic
+def store_past_cache(context, array, index, value):  # type: ignore[no-untyped-def]
+    """Write eight elements that nobody reads soon; their place must be a multiple of 32 bytes."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        written = builder.store(args[2], _vector_pointer(context, builder, sig, args))
+        written.align = 4 * LANES
+        written.set_metadata("nontemporal", builder.module.add_metadata([_INT(1)]))
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, lanes), generate
+
+
+@_intrinsic
 def spread(context, array, index):  # type: ignore[no-untyped-def]
     """Element `index` in every lane."""
 

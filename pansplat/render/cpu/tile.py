@@ -8,9 +8,10 @@ import math
 
 import numpy as np
 
+from pansplat.render.cpu.columns import columns_of
 from pansplat.render.cpu.compiling import inlined
 from pansplat.render.cpu.records import FIELDS, TILE
-from pansplat.render.cpu.simd import LANES, element, fill, load, multiply_add, prefetch, put, store, transposed
+from pansplat.render.cpu.simd import LANES, element, fill, multiply_add, prefetch, put, store
 from pansplat.render.cpu.tables import FLAT, PANORAMA
 
 BLOCK_WIDTH = 4
@@ -138,21 +139,6 @@ def gather(  # type: ignore[no-untyped-def]
             row = num_values * np.int64(element(entries, 2 * (first + place)))
             for channel in range(num_values):
                 put(colours, num_values * place + channel, element(values, row + channel))
-
-
-@inlined
-def columns_of(numbers, r0, r1, r2, r3, r4, r5, r6, r7):  # type: ignore[no-untyped-def]
-    """The columns of eight rows of eight numbers, given where the rows begin."""
-    return transposed(
-        load(numbers, r0),
-        load(numbers, r1),
-        load(numbers, r2),
-        load(numbers, r3),
-        load(numbers, r4),
-        load(numbers, r5),
-        load(numbers, r6),
-        load(numbers, r7),
-    )
 
 
 @inlined

@@ -88,16 +88,19 @@ def test_weights_and_what_passes_sum_to_one_however_many_overlap(make_case):
 _CHILD = """
 import sys
 import numpy as np
-from pansplat.render.cpu.raster import raster_forward
+from pansplat.render.cpu.memory import Lease
+from pansplat.render.cpu.raster import raster_forward, room_to_keep
 from pansplat.render.cpu.raster_backward import raster_backward
 from pansplat.render.cpu.tables import Plane
 given = np.load(sys.argv[1])
 plane = Plane(int(given["kind"]), given["columns"], given["rows"], given["rotation"])
 drawn = [given[name] for name in ("records", "values", "entries", "starts")]
 sums = np.zeros_like(given["grad_sums"])
-raster_forward(*drawn, plane, sums)
+lease = Lease()
+kept = room_to_keep(given["starts"], lease)
+raster_forward(*drawn, plane, sums, kept=kept)
 grads = np.empty((len(drawn[2]), 16), np.float32), np.empty((len(drawn[2]), 4), np.float32)
-raster_backward(*drawn, given["slots"], plane, sums, given["grad_sums"], *grads)
+raster_backward(*drawn, given["slots"], plane, sums, kept, given["grad_sums"], *grads)
 np.savez(sys.argv[2], sums=sums, records=grads[0], values=grads[1])
 """
 

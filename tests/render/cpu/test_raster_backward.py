@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from pansplat.render.cpu import records as layout
-from pansplat.render.cpu.raster import raster_forward
+from pansplat.render.cpu.memory import Lease
+from pansplat.render.cpu.raster import raster_forward, room_to_keep
 from pansplat.render.cpu.raster_backward import raster_backward
 
 FIELDS = {
@@ -23,10 +24,12 @@ def _upstream(case):
 def _slots(case, upstream, *, threads=1):
     sums = np.empty_like(upstream)
     drawn = case.records, case.values, case.entries, case.starts
-    raster_forward(*drawn, case.plane, sums)
+    kept = room_to_keep(case.starts, lease := Lease())
+    raster_forward(*drawn, case.plane, sums, kept=kept)
     grad_records = np.full((len(case.entries), layout.FIELDS), np.nan, np.float32)
     grad_values = np.full((len(case.entries), case.values.shape[1]), np.nan, np.float32)
-    raster_backward(*drawn, case.slots, case.plane, sums, upstream, grad_records, grad_values, threads=threads)
+    raster_backward(*drawn, case.slots, case.plane, sums, kept, upstream, grad_records, grad_values, threads=threads)
+    del lease
     return grad_records, grad_values
 
 
@@ -63,8 +66,8 @@ def test_opacities_at_the_limit_have_no_gradient(make_case):
     assert grad_values.any()
 
 
-def test_more_pairs_than_a_segment_holds_change_nothing(make_case):
-    # 128 blocks of 1100 Gaussians are more than twice 65,536 pairs; thin enough for all to be seen.
+def test_many_chunks_of_gaussians_that_fill_a_tile_change_nothing(make_case):
+    # Five chunks, each with as many pairs as there is room for; thin enough for all to be seen.
     case = make_case("ewa", (32, 32), 1100, opacity=(0.006, 0.012))
     case.records[:, 6:12] = 0.05 * case.records[:, 6:12]
     _compare(case)
