@@ -33,16 +33,9 @@ class AuxiliaryHeads(nn.Module):
     def __init__(self, config: HeadsConfig, compat: Compat) -> None:
         super().__init__()
         self.config, self.compat = config, compat
-        self.margins = Margins.of(self.config.layers, compat, chained=False)
+        self.margins = Margins.of(config.layers, compat, chained=False)
         self.levels = nn.ModuleList(
-            LevelHead(
-                3 + channels + self.config.candidates,
-                self.config.outputs,
-                self.config.layers,
-                self.config.lattice,
-                compat,
-            )
-            for channels in self.config.feature_channels
+            LevelHead(3 + channels + config.candidates, config, compat) for channels in config.feature_channels
         )
 
     def forward(

@@ -86,17 +86,17 @@ class TileGaussians:
 class LevelHead(nn.Module):
     """The CNN of one level, and the linear layer that its lattice points read it through."""
 
-    def __init__(self, inputs: int, outputs: int, layers: int, lattice: Lattice, compat: Compat) -> None:
+    def __init__(self, inputs: int, config: HeadsConfig, compat: Compat) -> None:
         super().__init__()
-        hidden = 2 * outputs
-        last = hidden if lattice == "fibonacci" else outputs
-        widths = [inputs, *[hidden] * (layers - 1), last]
+        hidden = 2 * config.outputs
+        last = hidden if config.lattice == "fibonacci" else config.outputs
+        widths = [inputs, *[hidden] * (config.layers - 1), last]
         padding = 1 if compat == "official" else 0
         self.convs = nn.ModuleList(
             FastConv3x3(before, after, padding=padding) for before, after in itertools.pairwise(widths)
         )
         # One Gaussian a pixel needs no layer of its own: the map holds its numbers.
-        self.linear = nn.Linear(hidden, outputs) if lattice == "fibonacci" else nn.Identity()
+        self.linear = nn.Linear(hidden, config.outputs) if config.lattice == "fibonacci" else nn.Identity()
 
     def forward(self, inputs: Sequence[Float[Tensor, "_ height width"]]) -> Float[Tensor, "1 hidden h w"]:
         kind = inputs[0].device.type
@@ -124,13 +124,7 @@ class GaussianHeads(nn.Module):
         passed_on = (2 if config.lattice == "fibonacci" else 1) * config.outputs
         first = len(config.feature_channels) - 1 if config.levels == "single" else 0
         self.levels = nn.ModuleList(
-            LevelHead(
-                3 + channels + config.candidates + (passed_on if chained and index > 0 else 0),
-                config.outputs,
-                config.layers,
-                config.lattice,
-                compat,
-            )
+            LevelHead(3 + channels + config.candidates + (passed_on if chained and index > 0 else 0), config, compat)
             for index, channels in enumerate(config.feature_channels[first:])
         )
 

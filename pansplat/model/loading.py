@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
@@ -113,28 +113,16 @@ def has_bfloat16() -> bool:
     return any(facts.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16"))
 
 
-def build_network(
-    weights: WeightsFile,
-    compat: Compat,
-    source: object,
-    *,
-    precision: Precision = "float32",
-    attention_precision: AttentionPrecision = "float32",
-    arithmetic: Arithmetic | None = None,
-) -> PanSplat | MVSplat:
+def build_network(weights: WeightsFile, compat: Compat, source: object, **choices: Any) -> PanSplat | MVSplat:
     """The network with its weights, in eval mode.
+
+    Args:
+        choices: the precisions and the arithmetic, as `load_predictor` takes them.
 
     Raises:
         InputError: when the file's settings or tensors fit no network.
     """
-    network = build_empty(
-        weights,
-        compat,
-        source,
-        precision=precision,
-        attention_precision=attention_precision,
-        arithmetic=arithmetic,
-    )
+    network = build_empty(weights, compat, source, **choices)
     require_shapes(weights.tensors, network.state_dict(), source)
     network.load_state_dict(weights.tensors, strict=True, assign=True)
     return network.eval()

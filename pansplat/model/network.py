@@ -110,19 +110,17 @@ class NetworkPredictor:
             InputError: on shapes, sizes, view counts or values that the network cannot take.
         """
         if images.ndim == 5:
+            items = range(len(images))
+            own_masks = [None if masks is None else masks[n] for n in items]
             return [
-                self._predict(
-                    images[n],
-                    cam2world[n],
-                    _item(near, n),
-                    _item(far, n),
-                    None if masks is None else masks[n],
-                    progress,
+                self.predict_with_depths(
+                    images[n], cam2world[n], _item(near, n), _item(far, n), masks=own_masks[n], progress=progress
                 )[0]
-                for n in range(len(images))
+                for n in items
             ]
-        return self._predict(images, cam2world, near, far, masks, progress)[0]
+        return self.predict_with_depths(images, cam2world, near, far, masks=masks, progress=progress)[0]
 
+    @torch.no_grad()
     def predict_with_depths(
         self,
         images: Float[Tensor, "view 3 height width"],
@@ -133,9 +131,17 @@ class NetworkPredictor:
         masks: Bool[Tensor, "view height width"] | None = None,
         progress: Progress | None = None,
     ) -> tuple[Gaussians, list[Float[Tensor, "view _ _"]]]:
-        """The Gaussians, and the radial depth maps on the way there, metres, coarse to fine."""
-        gaussians, depths = self._predict(images, cam2world, near, far, masks, progress)
-        return gaussians, [depth[0].to(images.device) for depth in depths.depth]
+        """The Gaussians, and the radial depth maps on the way there, metres, coarse to fine.
+
+        Raises:
+            InputError: as a call does.
+        """
+        matched, tiles = self._match(images, cam2world, near, far, masks, progress)
+        parts = list(self._lift(matched, tiles, progress))
+        gaussians = whole(parts, self.network.compat)[0].to(device=images.device)
+        if masks is not None:
+            gaussians = unmasked(gaussians, cam2world, masks)
+        return gaussians, [depth[0].to(images.device) for depth in matched.depths.depth]
 
     def stream(
         self,
@@ -163,23 +169,6 @@ class NetworkPredictor:
                 gaussians = part.gaussians[0].to(device=images.device)
                 gaussians = gaussians if masks is None else unmasked(gaussians, cam2world, masks)
             yield gaussians
-
-    @torch.no_grad()
-    def _predict(
-        self,
-        images: Tensor,
-        cam2world: Tensor,
-        near: float | Tensor,
-        far: float | Tensor,
-        masks: Tensor | None,
-        progress: Progress | None,
-    ) -> tuple[Gaussians, Depths]:
-        matched, tiles = self._match(images, cam2world, near, far, masks, progress)
-        parts = list(self._lift(matched, tiles, progress))
-        gaussians = whole(parts, self.network.compat)[0].to(device=images.device)
-        if masks is not None:
-            gaussians = unmasked(gaussians, cam2world, masks)
-        return gaussians, matched.depths
 
     def _match(
         self,
