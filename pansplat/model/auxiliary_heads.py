@@ -32,7 +32,8 @@ class AuxiliaryHeads(nn.Module):
 
     def __init__(self, config: HeadsConfig, compat: Compat) -> None:
         super().__init__()
-        self.config, self.compat = config, compat
+        self.config = config
+        self.compat: Compat = compat
         self.margins = Margins.of(config.layers, compat, chained=False)
         self.levels = nn.ModuleList(
             LevelHead(3 + channels + config.candidates, config, compat) for channels in config.feature_channels

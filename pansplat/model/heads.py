@@ -118,7 +118,9 @@ class GaussianHeads(nn.Module):
 
     def __init__(self, config: HeadsConfig, compat: Compat, precision: Precision = "float32") -> None:
         super().__init__()
-        self.config, self.compat, self.precision = config, compat, precision
+        self.config = config
+        self.compat: Compat = compat
+        self.precision: Precision = precision
         chained = config.levels == "pyramid" and config.residual
         self.margins = Margins.of(config.layers, compat, chained=chained)
         passed_on = (2 if config.lattice == "fibonacci" else 1) * config.outputs

@@ -40,7 +40,7 @@ def follow_the_original(network: nn.Module) -> None:
     """Have every part of a network that has the choice compute with the arithmetic "original" from now on."""
     for module in network.modules():
         if hasattr(module, "arithmetic"):
-            module.arithmetic = "original"
+            module.arithmetic = "original"  # pyright: ignore[reportArgumentType]
     for parameter in network.parameters():
         parameter.data = parameter.data.clone(memory_format=torch.contiguous_format)
 

@@ -181,14 +181,14 @@ class NetworkPredictor:
     ) -> tuple[Matched, int]:
         """What the network knows of one item before it makes Gaussians, and the tiles to make them in."""
         views = len(images)
-        bounds = [torch.as_tensor(bound, dtype=torch.float32) for bound in (near, far)]
+        low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (near, far))
         tiles = self.tiles or automatic_tiles(images.shape[-2])
-        _check(images, cam2world, *bounds, masks, self.network.compat, tiles)
+        _check(images, cam2world, low, high, masks, self.network.compat, tiles)
         if progress is not None:
             progress("matching views", 0.0)
         weight = next(self.network.parameters())
         pose = cam2world.to(device=weight.device, dtype=weight.dtype)
-        near_views, far_views = (bound.to(weight).expand(views)[None] for bound in bounds)
+        near_views, far_views = (bound.to(weight).expand(views)[None] for bound in (low, high))
         return self.network.match(images.to(weight)[None], pose[None], near_views, far_views), tiles
 
     def _lift(self, matched: Matched, tiles: int, progress: Progress | None) -> Iterator[TileGaussians]:

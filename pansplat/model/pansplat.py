@@ -109,7 +109,8 @@ class PanSplat(nn.Module):
         if arithmetic == "original" and compat != "official":
             raise ValueError(f'arithmetic="original" needs compat="official", got {compat!r}')
         config = config or PanSplatConfig()
-        self.config, self.compat = config, compat
+        self.config = config
+        self.compat: Compat = compat
         self.precision: Precision = precision
         self.attention_precision: AttentionPrecision = attention_precision
         self.features = FeaturePyramid(config.features, compat, attention_precision, precision)

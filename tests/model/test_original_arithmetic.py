@@ -41,8 +41,10 @@ def adds_alike(golden: Golden, recipe_weights: dict[str, Tensor], one_thread: No
         }
         padded = functional.pad(functional.pad(maps, (0, 0, margin, margin)), (margin, margin, 0, 0), mode="circular")
         maps = functional.conv2d(padded, own["conv.weight"])
-        norm = (own[f"bn.{part}"] for part in ("running_mean", "running_var", "weight", "bias"))
-        maps = functional.leaky_relu(functional.batch_norm(maps, *norm), 0.1)
+        mean, variance, scale, offset = (
+            own[f"bn.{part}"] for part in ("running_mean", "running_var", "weight", "bias")
+        )
+        maps = functional.leaky_relu(functional.batch_norm(maps, mean, variance, scale, offset), 0.1)
     return torch.equal(maps, truth["backbone.cnn.3"][0])
 
 
