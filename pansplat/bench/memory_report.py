@@ -117,8 +117,8 @@ def _draw(axes: Axes, rows: Sequence[MemoryRow], kind: str) -> None:
     for _, words, height, gigabytes in (point for point in PAPER_POINTS if point[0] == kind):
         axes.plot(height, gigabytes * 1e9 / 2**30, "*", color="#2a8c4a", markersize=13, markerfacecolor="none")
         axes.annotate(
-            words, (height, gigabytes * 1e9 / 2**30), xytext=(0, -8), textcoords="offset points",
-            ha="center", va="top", fontsize=8, color="#2a8c4a",
+            words, (height, gigabytes * 1e9 / 2**30), xytext=(-8, 0), textcoords="offset points",
+            ha="right", va="center", fontsize=8, color="#2a8c4a",
         )  # fmt: skip
     axes.plot(
         [], [], "*", color="#2a8c4a", markersize=13, markerfacecolor="none", label="the paper: its network, a GPU"
