@@ -171,11 +171,12 @@ class _Level:
         sides = [np.zeros(shape, np.uint8)] + [(r > 0).astype(np.uint8) for r in self.rays[view]]
         inverse = low + step * np.arange(count)
         penalties = [np.zeros((2, count), np.float32) for _ in slopes]
-        penalties[0] += self.config.sphere_prior
-        for axis in range(3):
-            penalties[axis + 1] = self.config.plane_prior * (
-                1 - self.support.share(axis, self.posed.cam2world[view], inverse)
-            )
+        if self.surfaces is not None:  # the first pass is to find what is no plane, too
+            penalties[0] += self.config.sphere_prior
+            for axis in range(3):
+                penalties[axis + 1] = self.config.plane_prior * (
+                    1 - self.support.share(axis, self.posed.cam2world[view], inverse)
+                )
         families = [
             Family(low * slope, step * slope, penalty.astype(np.float32), side)
             for slope, penalty, side in zip(slopes, penalties, sides, strict=True)

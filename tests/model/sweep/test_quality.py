@@ -28,8 +28,8 @@ def _decibels(pair: Pair, height: int) -> tuple[float, float]:
 def test_a_scanned_room_is_seen_from_between_its_views(shared: Path):
     (pair,) = (pair for pair in pansplat.load_pairs(shared / "data/mp3d_sample") if pair.targets)
     reached, faded = _decibels(pair, 256)
-    assert reached >= 22.1  # 22.8 measured
-    assert reached >= faded + 5  # 6.7 measured
+    assert reached >= 23.6  # 24.3 measured
+    assert reached >= faded + 6.5
 
 
 @pytest.mark.slow
