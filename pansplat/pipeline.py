@@ -11,8 +11,9 @@ import os
 import re
 import zlib
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import safetensors.torch
@@ -35,8 +36,11 @@ from pansplat.model.layers import Precision
 from pansplat.model.predictor import Predictor, Progress
 from pansplat.render import Rendering, rasterize
 from pansplat.render import blend as blend_renderings
+from pansplat.render.original import rasterize_as_original
 
 __all__ = ["load", "load_model", "load_pairs", "predict", "predict_to_file", "render", "save"]
+
+Drawing = Literal["exact", "original"]
 
 _CACHE_FORMAT = "1"  # changes when the file's layout does, so that older files are not taken for newer ones
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics", "levels", "views")
@@ -189,6 +193,7 @@ def render(
     blend: str | int = "deferred",
     size: tuple[int, int] | None = None,
     layout: str = "equirect",
+    drawing: Drawing = "exact",
     **raster: Any,
 ) -> Rendering:
     """The scene seen from a pose: colour, alpha and radial depth.
@@ -200,29 +205,45 @@ def render(
             nearness; "joint" draws all together; a number draws one view's only.
         size: (height, width) in pixels; by default the scene's own height, 2:1 (16:9 for `pinhole`).
         layout: "equirect", "cubemap" or "pinhole".
-        **raster: further options of `pansplat.render.rasterize`.
+        drawing: "exact", or "original": a panorama as the original program draws it, its defects included, for the
+            figures that were published of its weights (docs/paper.md).
+        **raster: further options of `pansplat.render.rasterize`, with "exact".
 
     Raises:
-        InputError: when `blend` names no view of the scene.
+        InputError: when `blend` names no view of the scene, or `drawing` does not go with the other options.
     """
     pose = torch.as_tensor(cam2world, dtype=torch.float64)
     if size is None:
         size = (scene.height, round(scene.height * 16 / 9) if layout == "pinhole" else 2 * scene.height)
-    options = {"size": size, "layout": layout, **raster}
+    draw = _drawing(drawing, scene, size, layout, raster)
     count = len(scene.cam2world)
     if isinstance(blend, int):
         if not 0 <= blend < max(count, 1):
             raise InputError(f"`blend` must be a view from 0 to {max(count, 1) - 1}, got {blend}")
-        return rasterize(scene.gaussians.select(scene.gaussians.views == blend), pose, **options)
+        return draw(scene.gaussians.select(scene.gaussians.views == blend), pose)
     if blend not in ("deferred", "joint"):
         raise InputError(f"`blend` must be deferred, joint or the number of a view, got {blend!r}")
     if blend == "joint" or count < 2:
-        return rasterize(scene.gaussians, pose, **options)
+        return draw(scene.gaussians, pose)
     weights = blend_weights(pose[:3, 3], scene.cam2world[:, :3, 3].double())
     # A view without weight leaves no trace in the blend: at an input, one drawing does.
     drawn = [view for view in range(count) if float(weights[view]) > 0]
-    pictures = [rasterize(scene.gaussians.select(scene.gaussians.views == v), pose, **options) for v in drawn]
+    pictures = [draw(scene.gaussians.select(scene.gaussians.views == v), pose) for v in drawn]
     return pictures[0] if len(drawn) == 1 else blend_renderings(pictures, weights[drawn])
+
+
+def _drawing(
+    drawing: Drawing, scene: Scene, size: tuple[int, int], layout: str, raster: dict[str, Any]
+) -> Callable[[Gaussians, Tensor], Rendering]:
+    """How Gaussians become a picture of that size."""
+    if drawing == "exact":
+        return partial(rasterize, size=size, layout=layout, **raster)
+    if drawing != "original":
+        raise InputError(f"`drawing` must be exact or original, got {drawing!r}")
+    if layout != "equirect" or set(raster) - {"backend"}:
+        given = ", ".join([*sorted(raster), *(["layout"] if layout != "equirect" else [])])
+        raise InputError(f"drawing='original' chooses all but size and backend itself, got {given}; leave them out")
+    return partial(rasterize_as_original, size=size, near=scene.near, **raster)
 
 
 def save(scene: Scene, path: str | Path) -> None:
@@ -317,7 +338,7 @@ def _write_cached(gaussians: Gaussians, folders: list[Path], stem: str, key: str
     for folder in folders:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            with replacing(folder / f"{stem}-{key}.scene") as partial, open(partial, "wb") as file:
+            with replacing(folder / f"{stem}-{key}.scene") as unfinished, open(unfinished, "wb") as file:
                 file.write(body)
                 file.write(zlib.crc32(body).to_bytes(4, "little"))
         except (OSError, InputError):

@@ -3,7 +3,9 @@
 import json
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from torch import Tensor
 
 from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.harmonics_official import as_the_original_draws
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.pipeline import _cache_folders, load, load_model, load_pairs, predict, render, save
@@ -251,6 +254,25 @@ def test_render_takes_sizes_layouts_and_numpy_poses(scene: Scene) -> None:
     assert render(scene, pose).color.shape == (3, HEIGHT, 2 * HEIGHT)
     assert render(scene, pose, layout="pinhole", size=(8, 12)).color.shape == (3, 8, 12)
     assert render(scene, pose, layout="cubemap", size=(8, 16)).depth.shape == (8, 16)
+
+
+def test_drawing_as_the_original_is_its_kernel_its_stitching_and_its_harmonics(scene: Scene) -> None:
+    pose = scene.pose_between(0.5)
+    drawn = render(scene, pose, blend="joint", size=(32, 64), drawing="original").color
+    bent = replace(scene.gaussians, harmonics=as_the_original_draws(scene.gaussians.harmonics))
+    choices = {"kernel": "ewa", "order": "z", "lowpass": "3dgs", "stitching": "official", "face_size": 16}
+    expected = rasterize(bent, pose, size=(32, 64), layout="cubemap", near=0.2 * scene.near, **choices).color
+    assert torch.equal(drawn, expected)
+    assert not torch.allclose(drawn, render(scene, pose, blend="joint", size=(32, 64)).color, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"drawing": "fast"}, {"drawing": "original", "kernel": "ray"}, {"drawing": "original", "layout": "pinhole"}],
+)
+def test_a_drawing_that_cannot_be_is_refused(scene: Scene, options: dict[str, Any], unchecked: None) -> None:
+    with pytest.raises(InputError, match=r"`drawing` must be|chooses all but size"):
+        render(scene, scene.pose_between(0.5), size=(32, 64), **options)
 
 
 @pytest.mark.parametrize("blend", [2, -1, "view0", "mixed"])

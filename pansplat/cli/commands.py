@@ -15,6 +15,7 @@ from tyro.conf import Positional, arg, subcommand
 Out = Annotated[Path, arg(aliases=["-o"])]
 Compat = Literal["trained", "official", "fixed"]
 Precision = Literal["float32", "bfloat16"]
+Drawing = Literal["exact", "original"]
 
 
 @dataclass(frozen=True)
@@ -156,6 +157,8 @@ class Evaluate:
     """Panoramas are resized to this height, pixels."""
     blend: str | None = None
     """deferred, joint, or view0, view1, ...; by default deferred, with --protocol what the paper's table shows."""
+    drawing: Drawing = "exact"
+    """exact, or original: as the original program draws, for the figures that were published of its weights."""
     convention: str | None = None
     """Pose convention, where a folder does not tell."""
     near: float | None = None

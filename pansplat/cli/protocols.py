@@ -67,7 +67,7 @@ def _methods(command: Evaluate, protocol: str) -> list[Method]:
         with_compat = index == 0 or Path(model).suffix.lower() in SUFFIXES  # sweep among the others has none
         compat, precision = (command.compat, command.precision) if with_compat else ("trained", "float32")
         predictor = pipeline.load_model(model, compat=compat, precision=precision)
-        methods += methods_of(predictor, protocol, blend, Path(model).stem)
+        methods += methods_of(predictor, protocol, blend, Path(model).stem, command.drawing)
     names = [method.name for method in methods]
     if len(set(names)) < len(names):
         raise InputError(f"--model and --models must have names of their own, got {', '.join(names)}; rename a file")

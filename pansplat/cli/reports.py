@@ -45,7 +45,14 @@ def run_evaluate(command: Evaluate) -> int:
     predictor = pipeline.load_model(command.model, compat=command.compat, precision=command.precision)
     with progress_bar() as progress:
         cases = evaluate(
-            pairs, predictor, command.out, height=command.height, blend=blend, lpips=lpips, progress=progress
+            pairs,
+            predictor,
+            command.out,
+            height=command.height,
+            blend=blend,
+            drawing=command.drawing,
+            lpips=lpips,
+            progress=progress,
         )
     _console().print(results_table(cases))
     if lpips is not None:

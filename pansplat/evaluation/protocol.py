@@ -42,6 +42,7 @@ from pansplat.evaluation.score import (
 )
 from pansplat.model.network import NetworkPredictor
 from pansplat.model.predictor import Predictor, Progress
+from pansplat.pipeline import Drawing
 
 ProtocolName = Literal["m3d", "narrow", "replica", "residential", "360loc", "insta360", "ablation", "frame-distance"]
 
@@ -147,7 +148,11 @@ class ProtocolResult:
 
 
 def methods_of(
-    predictor: Predictor, protocol: str, blend: Blend | None = None, name: str | None = None
+    predictor: Predictor,
+    protocol: str,
+    blend: Blend | None = None,
+    name: str | None = None,
+    drawing: Drawing = "exact",
 ) -> list[Method]:
     """The rows a predictor gets in a protocol's table.
 
@@ -157,6 +162,7 @@ def methods_of(
     Args:
         blend: this one only.
         name: what to call the predictor; its own name by default.
+        drawing: see `pipeline.render`.
     """
     blends: tuple[Blend, ...] = ("joint", "deferred") if protocol not in _PANOGRF else ("joint",)
     if blend is not None:
@@ -164,7 +170,8 @@ def methods_of(
     elif not isinstance(predictor, NetworkPredictor):
         blends = ("deferred",)
     words = {"joint": "", "deferred": " + deferred blending"}
-    return [Method(f"ours, {name or predictor.name}{words[b]}", predictor, b) for b in blends]
+    called = f"ours, {name or predictor.name}" + (", drawn as the original" if drawing == "original" else "")
+    return [Method(f"{called}{words[b]}", predictor, b, drawing) for b in blends]
 
 
 def sets_of(protocol: ProtocolName, root: Path, options: ProtocolOptions) -> list[EvaluationSet]:
@@ -268,7 +275,7 @@ def _run_case(
         if row.set == _DEPTH_SET:
             errors = measure_depth(sample.context, prediction)
             row.depth += [errors] if errors is not None and math.isfinite(errors.rmse) else []
-        for drawn in draw_targets(sample, prediction, method.blend, lpips):
+        for drawn in draw_targets(sample, prediction, method.blend, lpips, method.drawing):
             row.scores.append(drawn.score)
             row.render_seconds.append(drawn.seconds)
             if folder is not None:

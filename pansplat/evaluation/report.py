@@ -12,6 +12,7 @@ import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,10 @@ from pansplat.errors import InputError
 from pansplat.evaluation.cross_fade import cross_fade
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
+from pansplat.gaussians.scene import Scene
 from pansplat.model.predictor import Predictor, Progress
+from pansplat.pipeline import Drawing
+from pansplat.render import Rendering
 
 ERROR_SCALE = 0.25  # mean absolute error of the colours that the error picture shows brightest
 
@@ -74,6 +78,7 @@ def evaluate(
     *,
     height: int = 512,
     blend: str | int = "deferred",
+    drawing: Drawing = "exact",
     lpips: Lpips | None = None,
     progress: Progress | None = None,
 ) -> list[Case]:
@@ -81,6 +86,9 @@ def evaluate(
 
     Each pair is predicted anew, whatever is cached, and the predictor has compiled what it compiles on first use, so
     that the times are true. results.json is written after each pair: what was done before an interruption is there.
+
+    Args:
+        blend, drawing: see `pipeline.render`.
 
     Raises:
         InputError: when no pair has a target, or `out` cannot be written.
@@ -90,6 +98,7 @@ def evaluate(
         raise InputError("none of the pairs has a target view to compare with; name targets in pairs.json")
     _make_folder(out)
     warm_up(predictor)
+    draw = partial(pipeline.render, blend=blend, size=(height, 2 * height), drawing=drawing)
     cases: list[Case] = []
     for index, pair in enumerate(with_targets):
 
@@ -98,7 +107,7 @@ def evaluate(
                 progress(f"{pair.name}: {what}", (index + fraction) / len(with_targets))
 
         taken = {case.prediction.parent.name for case in cases}
-        cases += _evaluate_pair(pair, predictor, out, taken, height, blend, lpips, report)
+        cases += _evaluate_pair(pair, predictor, out, taken, height, draw, lpips, report)
         write_results(cases, out / "results.json")
     return cases
 
@@ -117,7 +126,7 @@ def _evaluate_pair(
     out: Path,
     taken: set[str],
     height: int,
-    blend: str | int,
+    draw: Callable[[Scene, Tensor], Rendering],
     lpips: Lpips | None,
     progress: Progress,
 ) -> Iterator[Case]:
@@ -130,7 +139,7 @@ def _evaluate_pair(
         pose = targets.cam2world[view]
         began = time.perf_counter()
         with torch.no_grad():
-            picture = pipeline.render(scene, pose, blend=blend, size=(height, 2 * height)).color.float()
+            picture = draw(scene, pose).color.float()
         render_seconds = time.perf_counter() - began
         name = pair.name if len(targets.images) == 1 else f"{pair.name} {Path(targets.names[view]).stem}"
         folder = out / _free_name(name, taken)
@@ -171,8 +180,8 @@ def error_picture(
 def write_results(cases: Sequence[Case], path: Path) -> None:
     """Write the cases as a JSON list of objects, atomically."""
     text = json.dumps([case.as_json() for case in cases], indent=1)
-    with replacing(path) as partial:
-        partial.write_text(text + "\n", encoding="utf-8")
+    with replacing(path) as unfinished:
+        unfinished.write_text(text + "\n", encoding="utf-8")
 
 
 def results_table(cases: Sequence[Case]) -> Table:

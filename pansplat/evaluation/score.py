@@ -25,17 +25,24 @@ from pansplat.gaussians.gaussians import Gaussians
 from pansplat.gaussians.scene import Scene
 from pansplat.model.network import NetworkPredictor
 from pansplat.model.predictor import Predictor
+from pansplat.pipeline import Drawing
 
 Blend = Literal["joint", "deferred"]
 
 
 @dataclass(frozen=True)
 class Method:
-    """A predictor with the way its views' Gaussians are brought together: a row of a table."""
+    """A predictor with the way its Gaussians are drawn: a row of a table.
+
+    Attributes:
+        blend: how the views' Gaussians are brought together.
+        drawing: see `pipeline.render`.
+    """
 
     name: str
     predictor: Predictor
     blend: Blend
+    drawing: Drawing = "exact"
 
 
 @dataclass(frozen=True)
@@ -99,13 +106,16 @@ def predict_case(context: Views, predictor: Predictor) -> Prediction:
     return Prediction(scene, depth, seconds)
 
 
-def draw_targets(sample: Sample, prediction: Prediction, blend: Blend, lpips: Lpips | None) -> Iterator[Drawn]:
+def draw_targets(
+    sample: Sample, prediction: Prediction, blend: Blend, lpips: Lpips | None, drawing: Drawing = "exact"
+) -> Iterator[Drawn]:
     """Each target of the case, drawn and measured; nothing is clamped but for PSNR, nothing masked."""
     for index, target in enumerate(sample.targets.images):
         began = time.perf_counter()
         with torch.no_grad():
             pose, size = sample.targets.cam2world[index], (target.shape[-2], target.shape[-1])
-            picture = pipeline.render(prediction.scene, pose, blend=blend, size=size).color.float()
+            drawn = pipeline.render(prediction.scene, pose, blend=blend, size=size, drawing=drawing)
+            picture = drawn.color.float()
         seconds = time.perf_counter() - began
         score = Score(
             case=sample.name,

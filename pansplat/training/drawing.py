@@ -22,6 +22,7 @@ from pansplat.gaussians.gaussians import Gaussians
 from pansplat.gaussians.harmonics_official import as_the_original_draws
 from pansplat.geometry.blending import blend_weights
 from pansplat.geometry.cubemap import face_poses
+from pansplat.render import original
 from pansplat.render.backend import Options
 from pansplat.render.blend import blend
 from pansplat.render.panorama import pictures
@@ -182,5 +183,5 @@ class Drawing:
 
     def _kernel(self) -> dict[str, Any]:
         if self.style == "original":
-            return {"kernel": "ewa", "order": "z", "lowpass": "3dgs"}
+            return original.KERNEL
         return {"kernel": "ray", "order": "radial", "lowpass": "angular"}
