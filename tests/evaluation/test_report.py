@@ -98,6 +98,14 @@ def test_figures_are_those_of_the_written_pictures(tmp_path: Path) -> None:
     assert result["cross_fade_ws_psnr"] == pytest.approx(ws_psnr(sum(inputs) / 2, target), abs=0.01)
 
 
+def test_pictures_are_drawn_as_asked(tmp_path: Path) -> None:
+    pairs = load_pairs(write_triplet(tmp_path / "room"))
+    exact, original = (
+        evaluate(pairs, GreyBall(), tmp_path / name, height=HEIGHT, drawing=name)[0] for name in ("exact", "original")
+    )
+    assert original.psnr != exact.psnr and abs(original.psnr - exact.psnr) < 3
+
+
 def test_each_evaluation_predicts_anew_and_leaves_no_cache(tmp_path: Path) -> None:
     pairs, predictor = load_pairs(write_triplet(tmp_path / "room")), GreyBall()
     for _ in range(2):
