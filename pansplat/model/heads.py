@@ -9,6 +9,7 @@ Source: PanSplat, sections 3.3 and 3.4, figure 3; OFFICIAL.md, section 8.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -304,11 +305,23 @@ def untiled_index(tile: Tile, lattices: Sequence[Float[Tensor, "_ 2"]], views: i
 
 def whole(parts: Sequence[TileGaussians], compat: Compat) -> list[Gaussians]:
     """All tiles' Gaussians of each batch item, in untiled order; in the original's, which is by tile, if official."""
-    items = [Gaussians.cat(sets) for sets in zip(*(part.gaussians for part in parts), strict=True)]
-    if len(parts) == 1 or compat == "official":
-        return items
-    order = torch.argsort(torch.cat([part.index for part in parts]))
-    return [gaussians.select(order.to(gaussians.means.device)) for gaussians in items]
+    if len(parts) == 1:
+        return parts[0].gaussians
+    places = [part.index for part in parts]
+    if compat == "official":
+        places = list(torch.arange(sum(map(len, places))).split([len(index) for index in places]))
+    return [_put(sets, places) for sets in zip(*(part.gaussians for part in parts), strict=True)]
+
+
+def _put(sets: Sequence[Gaussians], places: Sequence[Integer[Tensor, "_"]]) -> Gaussians:
+    """Sets in one, each at its places; written there at once, since all of them are gigabytes in 4K."""
+    fields = {}
+    for name in (f.name for f in dataclasses.fields(Gaussians)):
+        example = getattr(sets[0], name)
+        fields[name] = torch.empty(sum(map(len, sets)), *example.shape[1:], dtype=example.dtype, device=example.device)
+        for part, index in zip(sets, places, strict=True):
+            fields[name].index_copy_(0, index.to(example.device), getattr(part, name))
+    return Gaussians(**fields)
 
 
 def joined(
