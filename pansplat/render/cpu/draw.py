@@ -33,7 +33,7 @@ from pansplat.render.cpu.records import FIELDS
 from pansplat.render.cpu.tables import plane_of
 from pansplat.render.cpu.threads import share, thread_count
 from pansplat.render.panorama import Picture
-from pansplat.render.splats import near_enough, sound
+from pansplat.render.selection import not_finite
 
 _LEAST_SPREAD = 1e-9  # pixel^2: without a filter a disc seen edge-on would have no width to divide by
 
@@ -100,21 +100,11 @@ def draw(
     notes = _Notes()
     sums = _Draw.apply(*fields, pose, pictures, options, notes)
     if options.strict and notes.dropped:
-        raise InputError(_complaint(gaussians, covariances, pose, notes.dropped))
+        raise InputError(not_finite(gaussians, covariances, pose, options))
     info = Info(
         len(gaussians), notes.dropped, notes.near, notes.visible, notes.entries, "numba", notes.bytes, notes.seconds
     )
     return Drawn(sums.to(dtype), info)
-
-
-def _complaint(gaussians: Gaussians, covariances: Tensor | None, pose: Tensor, dropped: int) -> str:
-    radius = torch.linalg.vector_norm(gaussians.means.detach().double() - pose.detach()[:3, 3], dim=1)
-    usable = sound(gaussians, covariances) & near_enough(gaussians, covariances, radius)
-    return (
-        f"`gaussians` must hold only finite numbers, got {dropped} of {len(gaussians)} that do not (the "
-        f"first is number {int(torch.nonzero(~usable)[0, 0])}); remove them, or render with strict=False to leave "
-        "them out"
-    )
 
 
 class _Draw(torch.autograd.Function):

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pansplat.render.cpu import records as layout
+from pansplat.render.cpu.columns import read_columns
 from pansplat.render.cpu.compiling import inlined, kernel
 from pansplat.render.cpu.forms import LEAST_RATIO, cross, dot, ray_forms
 from pansplat.render.cpu.harmonics import add_slopes, colour_gradients, fill_basis
@@ -48,6 +49,8 @@ from pansplat.render.cpu.shape_backward import (
     axes_backward,
     covariances_backward,
 )
+from pansplat.render.cpu.simd import LANES as WIDTH
+from pansplat.render.cpu.simd import element, fill, load, store
 from pansplat.render.cpu.threads import share
 
 _POSE = 12  # sums for the pose: its rotation by rows, its centre
@@ -66,37 +69,63 @@ class Gradients(NamedTuple):
 
 
 @inlined
-def _read_gradients(grad_records, grad_values, totals, offsets, start, count, rows, slot_sums, colour_grads):
-    """Sum each Gaussian's slots, in their order, in the units of docs/rendering.md; zeros where it has none."""
-    channels = colour_grads.shape[1]
-    unit, inverse_unit = math.sqrt(layout.UNIT), 1 / math.sqrt(layout.UNIT)
-    slot_sums[:] = 0
-    colour_grads[:] = 0
+def _sum_slots(grad_records, grad_values, totals, offsets, start, count, sums, colour_grads, rows):
+    """Sum the slots of each Gaussian of a block, in their order; zeros where it has none.
+
+    Args:
+        grad_records, grad_values: flat.
+        sums: (LANES FIELDS), flat.
+    """
+    channels, none, zero = colour_grads.shape[1], fill(np.float32(0)), np.float32(0)
     for i in range(count):
-        g, radius = start + i, 0.0
-        for slot in range(offsets[g], offsets[g + 1]):
-            for c in range(channels):
-                colour_grads[i, c] += grad_values[slot, c]
-            radius += grad_values[slot, channels]
+        first, end = element(offsets, start + i), element(offsets, start + i + 1)
+        low, high, radius = none, none, zero
+        if channels == 3:  # most; one loop, whose end the processor mistakes once
+            red, green, blue = zero, zero, zero
+            for slot in range(first, end):
+                if totals is None:
+                    low = low + load(grad_records, layout.FIELDS * slot)
+                    high = high + load(grad_records, layout.FIELDS * slot + WIDTH)
+                red, green = red + element(grad_values, 4 * slot), green + element(grad_values, 4 * slot + 1)
+                blue, radius = blue + element(grad_values, 4 * slot + 2), radius + element(grad_values, 4 * slot + 3)
+            colour_grads[i, 0], colour_grads[i, 1], colour_grads[i, 2] = red, green, blue
+        else:
+            colour_grads[i] = 0
+            for slot in range(first, end):
+                if totals is None:
+                    low = low + load(grad_records, layout.FIELDS * slot)
+                    high = high + load(grad_records, layout.FIELDS * slot + WIDTH)
+                for c in range(channels):
+                    colour_grads[i, c] += element(grad_values, (channels + 1) * slot + c)
+                radius += element(grad_values, (channels + 1) * slot + channels)
         rows[GIVEN_RADIUS, i] = radius
-        if totals is not None:
-            slot_sums[i, layout.LEVEL] = totals[g, 9]
-            continue
-        for slot in range(offsets[g], offsets[g + 1]):
-            for j in range(layout.FIELDS):  # neighbours in memory: one vector
-                slot_sums[i, j] += grad_records[slot, j]
+        store(sums, layout.FIELDS * i, low)
+        store(sums, layout.FIELDS * i + WIDTH, high)
+
+
+@inlined
+def _read_gradients(sums, totals, start, count, singles, rows):
+    """Turn the sums of a block's slots into rows, in the units of docs/rendering.md."""
+    unit, inverse_unit = math.sqrt(layout.UNIT), 1 / math.sqrt(layout.UNIT)
+    if totals is not None:
+        for j in range(12):
+            for i in range(LANES):
+                rows[GIVEN + j, i] = 0.0
+        for i in range(count):
+            rows[GIVEN + 12, i] = totals[start + i, 9] / math.log(2)
+        return
+    read_columns(sums, 0, count, singles.reshape(-1), LANES)
+    for j in range(3):
+        for i in range(LANES):
+            rows[GIVEN + j, i] = singles[layout.DIRECTION + j, i]
+    for j in range(6):
+        for i in range(LANES):
+            rows[GIVEN + 3 + j, i] = unit * singles[layout.FIRST + j, i]
     for i in range(LANES):
-        for axis in range(3):
-            rows[GIVEN + axis, i] = slot_sums[i, layout.DIRECTION + axis]
-        for j in range(10):
-            rows[GIVEN + 3 + j, i] = slot_sums[i, layout.FIRST + j]
-    for i in range(LANES):
-        for j in range(3, 9):
-            rows[GIVEN + j, i] *= unit
-        rows[GIVEN + 9, i] *= inverse_unit
-        rows[GIVEN + 10, i] *= inverse_unit
-        rows[GIVEN + 11, i] /= layout.UNIT
-        rows[GIVEN + 12, i] /= math.log(2)
+        rows[GIVEN + 9, i] = inverse_unit * singles[layout.FRONT_A, i]
+        rows[GIVEN + 10, i] = inverse_unit * singles[layout.FRONT_B, i]
+        rows[GIVEN + 11, i] = singles[layout.ALONG, i] * (1 / layout.UNIT)
+        rows[GIVEN + 12, i] = singles[layout.LEVEL, i] * (1 / math.log(2))
 
 
 @inlined
@@ -228,13 +257,15 @@ def _chain(
     grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities, grad_harmonics, pose_sums,
 ):  # fmt: skip
     rows = np.ones((ALL_ROWS, LANES))
-    sums, slot_sums = np.zeros((_POSE, LANES)), np.zeros((LANES, layout.FIELDS))
+    sums, slot_sums = np.zeros((_POSE, LANES)), np.zeros(LANES * layout.FIELDS, np.float32)
+    singles = np.zeros((layout.FIELDS, LANES), np.float32)
     basis, slopes = np.zeros((25, LANES), np.float32), np.zeros((25, LANES), np.float32)
     colour_grads, drawn = np.zeros((LANES, harmonics.shape[2]), np.float32), np.zeros(LANES, np.bool_)
     for start in range(piece * PIECE, min((piece + 1) * PIECE, means.shape[0]), LANES):
         count = min(LANES, means.shape[0] - start)
         read_block(means, quats, scales, covariances, opacities, start, count, rows)
-        _read_gradients(grad_records, grad_values, totals, offsets, start, count, rows, slot_sums, colour_grads)
+        _sum_slots(grad_records, grad_values, totals, offsets, start, count, slot_sums, colour_grads, rows)
+        _read_gradients(slot_sums, totals, start, count, singles, rows)
         find_directions(pose, near, rows)
         _clear_undrawn(scene_drawn, start, count, rows, drawn)
         find_shapes(covariances, rows)
@@ -314,8 +345,8 @@ def chain(
 
     def work(piece: int) -> None:
         _chain(
-            piece, *fields.given, *camera, fields.bends, observed.drawn, observed.values, grad_records, grad_values,
-            totals if len(totals) > 0 else None, offsets,
+            piece, *fields.given, *camera, fields.bends, observed.drawn, observed.values,
+            grad_records.reshape(-1), grad_values.reshape(-1), totals if len(totals) > 0 else None, offsets,
             *wanted[:6], sums,
         )  # fmt: skip
 

@@ -111,6 +111,25 @@ def test_gaussians_that_are_not_drawn_have_zero_gradients_and_spoil_no_others(ma
     assert np.isfinite(found.pose).all()
 
 
+@pytest.mark.parametrize("channels", [1, 3, 5])
+def test_a_gaussian_s_slots_count_as_their_sum(channels, make_scene, fields, lease, pose):
+    scene = make_scene(75, degree=1)  # more than a block, and no multiple of a vector
+    coefficients = torch.randn(75, 4, channels, generator=torch.Generator().manual_seed(1)).double()
+    given = fields(dataclasses.replace(scene, harmonics=coefficients))
+    camera = Camera(pose.numpy(), 1e-4, True, 0.05)
+    observed, random = observe(given, camera, lease, 1), np.random.default_rng(0)
+    counts = np.arange(75) % 5
+    offsets, owner = np.cumsum([0, *counts]), np.repeat(np.arange(75), counts)
+    slots = [random.standard_normal((len(owner), size)).astype(np.float32) for size in (16, channels + 1)]
+    summed = [np.zeros((75, part.shape[1]), np.float32) for part in slots]
+    for part, total in zip(slots, summed, strict=True):
+        np.add.at(total, owner, part)
+    found = chain(given, camera, observed, *slots, _NO_TOTALS, offsets, _empty(given), 1)
+    expected = chain(given, camera, observed, *summed, _NO_TOTALS, np.arange(76), _empty(given), 1)
+    for name in (*_NAMES, "pose"):
+        assert np.array_equal(getattr(found, name), getattr(expected, name)), name
+
+
 @pytest.mark.parametrize("threads", [2, 3, 5])
 def test_gradients_are_the_same_bits_on_any_number_of_threads(threads, make_scene, fields, lease, pose):
     given, camera = fields(make_scene(20000, degree=1)), Camera(pose.numpy(), 1e-4, True, 0.05)
