@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import multiprocessing
+import signal
 import sys
 import warnings
 from collections import Counter
@@ -88,6 +89,7 @@ class Loader:
             batch_sampler=self._positions(step),
             num_workers=self.workers,
             collate_fn=_keep,
+            worker_init_fn=_leave_interrupts_to_the_trainer,
             multiprocessing_context=_context() if self.workers else None,
         )
         for read in loader:
@@ -119,6 +121,11 @@ class Loader:
             f"needed samples that can be read, got {len(worst)} in a row that cannot (of "
             f"{len(self.reader.source)}); check the first of them:\n  {examples}"
         )
+
+
+def _leave_interrupts_to_the_trainer(_: int) -> None:
+    """Ctrl-C in a terminal reaches the workers too; the step that is under way still needs them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 class _Reader(Dataset[tuple[Sample | None, list[Skipped]]]):

@@ -25,6 +25,7 @@ from pansplat.model.mvsplat import MVSplat
 from pansplat.training import validation
 from pansplat.training.checkpoint import load_latest, save_checkpoint
 from pansplat.training.config import TrainConfig, as_json, require_same
+from pansplat.training.curves import plot_run
 from pansplat.training.distributed import Processes, share_statistics
 from pansplat.training.drawing import Drawing
 from pansplat.training.ema import RunningMean
@@ -87,7 +88,8 @@ class Run:
             with replacing(out / "config.json") as partial:
                 partial.write_text(as_json(self.config) + "\n")
             table = Table(out / "log.csv", _COLUMNS, self.step)
-            scores = Table(out / "validation.csv", ("height", *validation.MEASURES), self.step + 1)
+            validated = 0 if self.source is None else self.step + 1
+            scores = Table(out / "validation.csv", ("height", *validation.MEASURES), validated)
             board = Board(out / "tensorboard")
         saved_at = time.monotonic()
         try:
@@ -95,6 +97,8 @@ class Run:
                 watch.say(self._introduction())
                 if self.source is not None:
                     watch.say(f"going on from {self.source}")
+                elif self.config.validation.every and first:
+                    self._validate(scores, board, watch)  # what the rest is to be better than
                 for batches in self._batches():
                     began = time.perf_counter()
                     told = self._learn(batches)
@@ -186,7 +190,7 @@ class Run:
         )
 
     def _validate(self, scores: Table | None, board: Board | None, watch: Watch) -> None:
-        settings, height = self.config.validation, self.config.height_at(self.step - 1)
+        settings, height = self.config.validation, self.config.height_at(max(self.step - 1, 0))
         _, source = sources(self.config.data, height, self.config.seed)
         with self._averaged():
             found = validation.validate(
@@ -202,6 +206,7 @@ class Run:
         if scores is not None and board is not None:
             scores.add(self.step, {"height": height, **found})
             board.add(self.step, found, "validation")
+            plot_run(self.config.out)
         watch.say(
             f"step {self.step}: PSNR {found['psnr']:.2f} dB, SSIM {found['ssim']:.3f}, "
             f"depth off by {100 * found['depth_error']:.1f} %, over {settings.samples} samples"

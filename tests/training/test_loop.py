@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from pansplat.errors import InputError
 from pansplat.model.checkpoint import load_weights
@@ -113,16 +114,18 @@ def test_validation_writes_numbers_and_pictures(micro_run: Callable[..., TrainCo
     config = micro_run(steps=2, validation=ValidationConfig(every=1, samples=2, pictures=1))
     trained(config)
     rows = list(csv.DictReader((config.out / "validation.csv").read_text().splitlines()))
-    assert [row["step"] for row in rows] == ["1", "2"]
+    assert [row["step"] for row in rows] == ["0", "1", "2"]
     assert all(float(row["psnr"]) > 0 and float(row["depth_error"]) > 0 for row in rows)
-    assert len(list((config.out / "pictures").glob("*.png"))) == 2
+    assert len(list((config.out / "pictures").glob("*.png"))) == 3
+    with Image.open(config.out / "curves.png") as curves:
+        assert min(curves.size) > 300
 
 
 def test_the_height_grows_while_training(micro_run: Callable[..., TrainConfig]) -> None:
     config = micro_run(steps=2, heights=(32, 64), validation=ValidationConfig(every=1, samples=1, pictures=0))
     trained(config)
     rows = csv.DictReader((config.out / "validation.csv").read_text().splitlines())
-    assert [row["height"] for row in rows] == ["32", "64"]
+    assert [row["height"] for row in rows] == ["32", "32", "64"]
 
 
 def test_a_run_begins_with_the_weights_of_another(micro_run: Callable[..., TrainConfig]) -> None:
