@@ -5,6 +5,7 @@ Source: Zhang et al., PanSplat: 4K panorama synthesis with feed-forward Gaussian
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -25,6 +26,7 @@ from pansplat.model.layers import (
     resize,
 )
 from pansplat.model.mono_depth import MonocularDepth
+from pansplat.threads import one_thread
 
 MATCHING_HEIGHT = 512
 """Features are matched at this height at most; the heads see the panoramas as they are."""
@@ -89,8 +91,8 @@ class PanSplat(nn.Module):
         precision: number type of all convolutions; depths, correlations and positions stay as they are.
         attention_precision: what attention rounds its inputs to; the original's was bfloat16.
         arithmetic: "original" does every operation before the heads as the original does, so that on the same
-            processor, with one thread, every bit is its own; slower. By default where that decides what comes out:
-            with `compat="official"` and bfloat16 attention, where a last bit decides which way an input is rounded.
+            processor every bit is its own; slower, on one thread. By default where that decides what comes out: with
+            `compat="official"` and bfloat16 attention, where a last bit decides which way an input is rounded.
 
     Raises:
         ValueError: the original's arithmetic without `compat="official"`.
@@ -150,13 +152,15 @@ class PanSplat(nn.Module):
         far: Float[Tensor, "batch view"],
     ) -> Matched:
         """Features and depths of all views: everything before the heads."""
-        small = self._matching_size(images)
-        features = self.features(small)
-        mono_features = None
-        if self.mono_depth is not None:
-            with convolving(self.precision, images.device):
-                mono_features = self.mono_depth(images).to(images.dtype)
-        depths = self.cost_volume(features, cam2world, near, far, mono_features)
+        # With more threads a sum is split elsewhere, and its last bits differ.
+        with one_thread() if self.arithmetic == "original" else contextlib.nullcontext():
+            small = self._matching_size(images)
+            features = self.features(small)
+            mono_features = None
+            if self.mono_depth is not None:
+                with convolving(self.precision, images.device):
+                    mono_features = self.mono_depth(images).to(images.dtype)
+            depths = self.cost_volume(features, cam2world, near, far, mono_features)
         return Matched(images, features, depths, cam2world, near, far)
 
     def lift(self, matched: Matched, *, tiles: int = 1, only: Sequence[int] | None = None) -> Iterator[TileGaussians]:

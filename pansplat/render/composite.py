@@ -15,8 +15,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pansplat.render.splats import ALPHA_CUT, Splats
-from pansplat.render.threads import one_thread
 from pansplat.render.tiles import TileLists
+from pansplat.threads import one_thread
 
 _BLOCK = 32  # Gaussians a step
 # Pixel-Gaussian pairs a step, few enough for the cache.

@@ -20,8 +20,8 @@ from pansplat.render.splats import (
     observe,
     ray_splats,
 )
-from pansplat.render.threads import one_thread
 from pansplat.render.tiles import TILE, list_tiles, tile_grid
+from pansplat.threads import one_thread
 
 
 @one_thread()

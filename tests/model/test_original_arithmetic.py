@@ -14,21 +14,23 @@ from pansplat.model.layers import AttentionPrecision, attend, follow_the_origina
 from pansplat.model.pansplat import PanSplat, PanSplatOutput
 from pansplat.model.unet import UNet, UNetConfig
 from pansplat.model.weights import official_names
+from pansplat.threads import one_thread
 
 Golden = Callable[[str], dict[str, Tensor]]
 
 
-@pytest.fixture(scope="module")
-def one_thread() -> Iterator[None]:
-    """The fixtures were made with one; with more, a sum may be split in another place."""
+@pytest.fixture(scope="module", autouse=True)
+def two_threads() -> Iterator[None]:
+    """The fixtures were made with one; with more, a sum is split in another place unless that is prevented."""
     before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    torch.set_num_threads(2)
     yield
     torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
-def adds_alike(golden: Golden, recipe_weights: dict[str, Tensor], one_thread: None) -> bool:
+@one_thread()
+def adds_alike(golden: Golden, recipe_weights: dict[str, Tensor]) -> bool:
     """Whether torch's convolutions add up here as where the fixtures were made: the original's first two, plainly."""
     truth = golden("pansplat_64x128_fp32attn")
     mean, std = (torch.tensor(rgb)[:, None, None] for rgb in ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)))
