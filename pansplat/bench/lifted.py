@@ -39,12 +39,12 @@ def lift_depth(views: Views, *, seed: int = 0) -> Scene:
         )
     height = views.images.shape[-2]
     generator = torch.Generator().manual_seed(seed)
-    parts = []
-    for level in range(NUM_LEVELS):
-        for view in range(len(views.images)):
-            known = views.depths[view].double()
-            depth = torch.where(known > 0, known, known[known > 0].median())
-            parts.append(_lift_level(views.images[view], depth, views.cam2world[view], level, view, generator))
+    depths = [torch.where(known > 0, known, known[known > 0].median()) for known in views.depths.double()]
+    parts = [
+        _lift_level(views.images[view], depth, views.cam2world[view], level, view, generator)
+        for level in range(NUM_LEVELS)
+        for view, depth in enumerate(depths)
+    ]
     return Scene(Gaussians.cat(parts), views.cam2world, views.near, views.far, views.names, "depth", height)
 
 

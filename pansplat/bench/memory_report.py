@@ -12,6 +12,7 @@ from rich.table import Table
 from pansplat.atomic import replacing
 from pansplat.bench.memory import MemoryRow
 from pansplat.bench.memory_case import Work
+from pansplat.bench.tabulate import Column, number, page_table, terminal_table
 
 PAPER_POINTS: tuple[tuple[str, str, int, float], ...] = (
     ("training", "untiled", 512, 36.0),
@@ -24,7 +25,7 @@ PAPER_POINTS: tuple[tuple[str, str, int, float], ...] = (
 """Kind, tiles, height, GB of a GPU. Source: the paper's figure of memory, read off by eye. Training's batch is 2 at 512
 and 1 at 2048; with 4 tiles 2048 ran out of memory."""
 
-_COLUMNS = (
+_COLUMNS: tuple[Column, ...] = (
     ("height", "right"),
     ("work", "left"),
     ("tiles", "right"),
@@ -45,29 +46,22 @@ _MARKERS = {1: "o", 2: "s", 4: "D"}
 
 def memory_table(rows: Sequence[MemoryRow], title: str) -> Table:
     """All rows, in order."""
-    table = Table(title=title, title_justify="left", pad_edge=False)
-    for name, side in _COLUMNS:
-        table.add_column(name, justify=side, no_wrap=bool(name))  # type: ignore[arg-type]
-    for row in rows:
-        table.add_row(*memory_cells(row))
-    return table
+    return terminal_table(_COLUMNS, map(memory_cells, rows), title)
 
 
 def memory_markdown(rows: Sequence[MemoryRow]) -> str:
     """The same table as a page's text."""
-    head = "| " + " | ".join(name for name, _ in _COLUMNS) + " |"
-    rule = "|" + "|".join("---:" if side == "right" else "---" for _, side in _COLUMNS) + "|"
-    return "\n".join((head, rule, *("| " + " | ".join(memory_cells(row)) + " |" for row in rows))) + "\n"
+    return page_table(_COLUMNS, map(memory_cells, rows)) + "\n"
 
 
 def memory_cells(row: MemoryRow) -> tuple[str, ...]:
     """A row's cells; what was not measured is blank, and the last cell says why."""
-    error = "reference" if row.reference else _number(row.deviation, "{:.1e}")
+    error = "reference" if row.reference else number(row.deviation, "{:.1e}")
     why = "" if row.status == "measured" else f"{row.status}: {row.note}"
     return (
         *(str(row.height), row.work, str(row.tiles**2)),
-        *(_number(value, "{:.2f}") for value in (row.base_gib, row.peak_gib, row.taken_gib)),
-        *(_number(value, "{:.1f}") for value in (row.wall_s, row.processor_s)),
+        *(number(value, "{:.2f}") for value in (row.base_gib, row.peak_gib, row.taken_gib)),
+        *(number(value, "{:.1f}") for value in (row.wall_s, row.processor_s)),
         *(error, why),
     )
 
@@ -130,7 +124,3 @@ def _draw(axes: Axes, rows: Sequence[MemoryRow], kind: str) -> None:
 
 def _tiles(tiles: int) -> str:
     return "untiled" if tiles == 1 else f"{tiles**2} tiles"
-
-
-def _number(value: float | None, form: str) -> str:
-    return "" if value is None else form.format(value)

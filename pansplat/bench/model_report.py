@@ -12,8 +12,9 @@ from rich.table import Table
 from pansplat.atomic import replacing
 from pansplat.bench.model import ModelRow
 from pansplat.bench.model_case import STAGES
+from pansplat.bench.tabulate import Column, number, page_table, terminal_table
 
-_COLUMNS = (
+_COLUMNS: tuple[Column, ...] = (
     *(("compat", "left"), ("precision", "left"), ("attention", "left"), ("convolution", "left")),
     *(("tiles", "right"), ("threads", "right")),
     *((f"{stage} s", "right") for stage in STAGES),
@@ -31,32 +32,25 @@ _STAGE_COLORS = ("#1764ab", "#6aaed6", "#e0a030", "#c8501e")
 
 def model_table(rows: Sequence[ModelRow], title: str) -> Table:
     """All rows, in the order they were measured."""
-    table = Table(title=title, title_justify="left", pad_edge=False)
-    for name, side in _COLUMNS:
-        table.add_column(name, justify=side, no_wrap=True)  # type: ignore[arg-type]
-    for row in rows:
-        table.add_row(*model_cells(row))
-    return table
+    return terminal_table(_COLUMNS, map(model_cells, rows), title)
 
 
 def model_markdown(rows: Sequence[ModelRow]) -> str:
     """The same table as a page's text."""
-    head = "| " + " | ".join(name for name, _ in _COLUMNS) + " |"
-    rule = "|" + "|".join("---:" if side == "right" else "---" for _, side in _COLUMNS) + "|"
-    return "\n".join((head, rule, *("| " + " | ".join(model_cells(row)) + " |" for row in rows))) + "\n"
+    return page_table(_COLUMNS, map(model_cells, rows)) + "\n"
 
 
 def model_cells(row: ModelRow) -> tuple[str, ...]:
     """A row's cells; what was not measured is blank."""
     return (
         *(row.compat, row.precision, row.attention, row.convolution, f"{row.tiles}x{row.tiles}", str(row.threads)),
-        *(_number(row.stages_s.get(stage), "{:.1f}") for stage in STAGES),
-        _number(row.total_s, "{:.1f}"),
-        _number(row.processor_s, "{:.1f}"),
-        _number(row.peak_gib, "{:.2f}"),
-        "reference" if row.is_reference else _number(row.depth_median_error, "{:.1e}"),
-        _number(row.depth_max_error, "{:.1e}"),
-        "same" if row.psnr_db is not None and math.isinf(row.psnr_db) else _number(row.psnr_db, "{:.1f}"),
+        *(number(row.stages_s.get(stage), "{:.1f}") for stage in STAGES),
+        number(row.total_s, "{:.1f}"),
+        number(row.processor_s, "{:.1f}"),
+        number(row.peak_gib, "{:.2f}"),
+        "reference" if row.is_reference else number(row.depth_median_error, "{:.1e}"),
+        number(row.depth_max_error, "{:.1e}"),
+        "same" if row.psnr_db is not None and math.isinf(row.psnr_db) else number(row.psnr_db, "{:.1f}"),
     )
 
 
@@ -94,7 +88,3 @@ def _name(row: ModelRow) -> str:
     parts += ["attention bfloat16"] * (row.attention == "bfloat16") + ["direct"] * (row.convolution == "direct")
     parts += [f"{row.tiles}x{row.tiles} tiles"] * (row.tiles > 1)
     return ", ".join([*parts, "1 thread" if row.threads == 1 else f"{row.threads} threads"])
-
-
-def _number(value: float | None, form: str) -> str:
-    return "" if value is None else form.format(value)

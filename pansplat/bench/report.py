@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from rich.table import Table
 
 from pansplat.bench.rows import Row
+from pansplat.bench.tabulate import Column, number, page_table, terminal_table
 
-_COLUMNS = (
+_COLUMNS: tuple[Column, ...] = (
     *(("renderer", "left"), ("kernel", "left"), ("order", "left"), ("filter", "left"), ("layout", "left")),
     *(("height", "right"), ("Gaussians", "right"), ("threads", "right"), ("forward ms", "right"), ("CPU", "right")),
     *(("backward ms", "right"), ("CPU", "right"), ("peak MB", "right"), ("PSNR dB", "right"), ("max error", "right")),
@@ -18,24 +19,14 @@ _COLUMNS = (
 
 def tables(rows: Sequence[Row]) -> list[Table]:
     """One table a suite and scene, in the order they were measured; sweeps take one table for all their scenes."""
-    found = []
-    for title, own in _sections(rows).items():
-        found.append(Table(title=title, title_justify="left", pad_edge=False))
-        for name, side in _COLUMNS:
-            found[-1].add_column(name, justify=side, no_wrap=True)  # type: ignore[arg-type]
-        for row in own:
-            found[-1].add_row(*cells(row))
-    return found
+    return [terminal_table(_COLUMNS, map(cells, own), title) for title, own in _sections(rows).items()]
 
 
 def markdown(rows: Sequence[Row]) -> str:
     """The same tables, and the findings, as a page's text."""
     parts = ["\n".join(f"* {sentence}" for sentence in findings(rows))]
-    head = "| " + " | ".join(name for name, _ in _COLUMNS) + " |"
-    rule = "|" + "|".join("---:" if side == "right" else "---" for _, side in _COLUMNS) + "|"
     for title, own in _sections(rows).items():
-        lines = ["| " + " | ".join(cells(row)) + " |" for row in own]
-        parts.append("\n".join((f"### {title[0].upper()}{title[1:]}", "", head, rule, *lines)))
+        parts.append(f"### {title[0].upper()}{title[1:]}\n\n{page_table(_COLUMNS, map(cells, own))}")
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -64,19 +55,19 @@ def cells(row: Row) -> tuple[str, ...]:
         _time(row.forward_cpu_ms, None),
         _time(row.backward_ms, row.backward_spread_ms),
         _time(row.backward_cpu_ms, None),
-        _number(row.peak_mb, "{:,.0f}"),
+        number(row.peak_mb, "{:,.0f}"),
         _decibels(row),
-        _number(row.max_error, "{:.1e}"),
-        _number(row.seam_jump, "{:.1e}"),
-        _number(row.energy_error, "{:+.2%}"),
-        _number(row.own_max_error, "{:.1e}"),
+        number(row.max_error, "{:.1e}"),
+        number(row.seam_jump, "{:.1e}"),
+        number(row.energy_error, "{:+.2%}"),
+        number(row.own_max_error, "{:.1e}"),
     )
 
 
 def _decibels(row: Row) -> str:
     if row.max_error == 0:
         return "exact"
-    return _number(row.psnr_db, "{:.1f}")
+    return number(row.psnr_db, "{:.1f}")
 
 
 def _time(middle: float | None, spread: float | None) -> str:
@@ -84,10 +75,6 @@ def _time(middle: float | None, spread: float | None) -> str:
         return ""
     digits = 0 if middle >= 100 else 1 if middle >= 10 else 2
     return f"{middle:,.{digits}f}" + (f" ±{spread / 2:.{digits}f}" if spread else "")
-
-
-def _number(value: float | None, form: str) -> str:
-    return "" if value is None else form.format(value)
 
 
 def findings(rows: Sequence[Row]) -> list[str]:

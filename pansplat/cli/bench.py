@@ -28,6 +28,7 @@ from pansplat.bench.raster import Bench
 from pansplat.bench.report import findings, markdown, tables
 from pansplat.bench.rows import Row
 from pansplat.cli.commands import BenchMachine, BenchRaster, PairChoice, SceneSource
+from pansplat.cli.printing import table_console
 from pansplat.cli.scenes import choose_pair, progress_bar, require_height
 from pansplat.errors import InputError
 
@@ -174,9 +175,7 @@ def _show(live: Live, doing: str, rows: list[Row]) -> None:
 
 def _report(bench: Bench, files: dict[str, Path | None]) -> None:
     """Print the tables and the headlines, and write the pictures, of whatever was measured."""
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=_WIDTH)
+    console = table_console(_WIDTH)
     machine = bench.machine
     for name in ("cpu", "threads", "gpu", "fma_gflops", "bandwidth_gb_s"):
         print(f"{name:<15} {_facts(machine[name])}")

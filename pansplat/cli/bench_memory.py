@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import shutil
 import tempfile
@@ -22,6 +21,7 @@ from pansplat.bench.memory_case import MemoryCase, MemorySetting
 from pansplat.bench.memory_report import memory_markdown, memory_table, plot_memory
 from pansplat.bench.model_weights import save_random_weights
 from pansplat.cli.commands import BenchMemory
+from pansplat.cli.printing import table_console
 from pansplat.errors import InputError
 from pansplat.training.network import shape_of
 
@@ -132,9 +132,7 @@ def _report(
     """Print the table, and write the picture and the page, of whatever was measured."""
     if not rows:
         return
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=_WIDTH)
+    console = table_console(_WIDTH)
     where = machine["gpu"] if setting.device == "cuda" else machine["cpu"]
     title = f"{setting.network} network, batch 1, {setting.style} pictures, {setting.perceptual} loss; {where}"
     console.print(memory_table(rows, title))
@@ -145,7 +143,6 @@ def _report(
         plot_memory(rows, folder / "memory.png", title)
         with replacing(folder / "memory.md") as partial_file:
             partial_file.write_text(memory_markdown(rows))
-        for name in ("memory.json", "memory.md", "memory.png"):
-            with contextlib.suppress(FileNotFoundError):
-                (folder / name).stat()
-                print(folder / name)
+        for file in (folder / name for name in ("memory.json", "memory.md", "memory.png")):
+            if file.is_file():
+                print(file)

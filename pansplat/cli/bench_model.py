@@ -22,6 +22,7 @@ from pansplat.bench.model import ModelRow, measure_model, model_cases, write_mod
 from pansplat.bench.model_report import model_markdown, model_table, plot_model
 from pansplat.bench.model_weights import save_random_weights
 from pansplat.cli.commands import BenchModel, PairChoice
+from pansplat.cli.printing import table_console
 from pansplat.cli.scenes import choose_pair, require_height
 from pansplat.errors import InputError
 from pansplat.model.checkpoint import load_weights
@@ -114,9 +115,7 @@ def _report(rows: list[ModelRow], files: dict[str, Path | None], machine: dict[s
     """Print the table, and write the picture and the page, of whatever was measured."""
     if not rows:
         return
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=_WIDTH)
+    console = table_console(_WIDTH)
     for name in ("cpu", "threads", "fma_gflops"):
         print(f"{name:<12} {machine[name]}")
     height = rows[0].height

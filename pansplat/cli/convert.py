@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from rich.console import Console
 from rich.table import Table
 
 from pansplat.cli.commands import Convert
+from pansplat.cli.printing import table_console
 from pansplat.errors import InputError
 from pansplat.model.checkpoint import read_checkpoint, save_weights
 from pansplat.model.loading import from_original
@@ -20,8 +20,7 @@ def run_convert(command: Convert) -> int:
         raise InputError(f"--out must be a .safetensors file in an existing folder, got {command.out}")
     content = read_checkpoint(command.path)
     report = match(content, command.path)
-    console = Console(highlight=False)
-    (console if console.is_terminal else Console(highlight=False, width=140)).print(_table(report))
+    table_console().print(_table(report))
     weights = from_original(content, command.path)
     save_weights(command.out, weights)
     numbers = sum(tensor.numel() for tensor in weights.tensors.values())

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import cast
 
-from rich.console import Console
-
 from pansplat import pipeline
 from pansplat.cli.commands import Evaluate, LpipsChoice
+from pansplat.cli.printing import table_console
 from pansplat.cli.scenes import progress_bar, require_height
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import SMALLEST, Backbone, Lpips
@@ -35,8 +34,7 @@ def run_evaluate_protocol(command: Evaluate) -> int:
             protocol, choice.data.expanduser(), methods, command.out, options=options, lpips=lpips, progress=progress
         )
     written = write_report(result, command.out)
-    console = Console(highlight=False)
-    console = console if console.is_terminal else Console(highlight=False, width=_WIDTH)
+    console = table_console(_WIDTH)
     for table in rich_tables(result):
         console.print(table)
     for note in notes(result):

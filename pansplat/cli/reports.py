@@ -6,11 +6,11 @@ import sys
 from typing import TYPE_CHECKING
 
 import torch
-from rich.console import Console
 from rich.table import Table
 
 from pansplat import pipeline
 from pansplat.cli.commands import Check, Evaluate, Info
+from pansplat.cli.printing import table_console
 from pansplat.cli.scenes import blend_mode, choose_pair, progress_bar, require_height
 from pansplat.errors import InputError
 
@@ -54,7 +54,7 @@ def run_evaluate(command: Evaluate) -> int:
             lpips=lpips,
             progress=progress,
         )
-    _console().print(results_table(cases))
+    table_console().print(results_table(cases))
     if lpips is not None:
         print(f"LPIPS is {lpips.name}")
     print(f"{command.out / 'results.json'} and the pictures beside it")
@@ -65,7 +65,7 @@ def run_info(command: Info) -> int:
     """Print what a scene holds."""
     scene = pipeline.load(command.path)
     gaussians = scene.gaussians
-    console = _console()
+    console = table_console()
     print(f"{command.path}: {len(gaussians):,} Gaussians, SH degree {gaussians.degree}")
     if scene.model:
         made = f"made by {scene.model} at {scene.height}x{2 * scene.height}"
@@ -99,7 +99,7 @@ def run_check(command: Check) -> int:
     for reading, error in check.errors.items():
         style = "bold" if reading == AS_GIVEN else "green" if error < check.error and check.likely_mistake else ""
         table.add_row(reading, f"{error:.3f}", style=style)
-    console = _console()
+    console = table_console()
     console.print(table)
     if check.indistinguishable:
         print(f"these views cannot tell from {AS_GIVEN}: {', '.join(check.indistinguishable)}")
@@ -110,12 +110,6 @@ def run_check(command: Check) -> int:
         return 1
     print("no other reading of the poses fits far better")
     return 0
-
-
-def _console() -> Console:
-    """Standard output; wide enough for the tables where it is no terminal."""
-    console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=140)
 
 
 def _counts(scene: Scene) -> Table:

@@ -73,10 +73,15 @@ def _picture(
     return sums[:, : picture.size[0], : picture.size[1]], len(seen), entries
 
 
-def in_picture(boxes: Float[Tensor, "n 4"], picture: Picture) -> Bool[Tensor, "n"]:
-    """Which boxes reach into the picture."""
+def in_picture(boxes: Float[Tensor, "n 4"], picture: Picture, rows: tuple[int, int] | None = None) -> Bool[Tensor, "n"]:
+    """Which boxes (left, right, top, bottom; pixels) reach into the picture.
+
+    Args:
+        rows: the first that count, and the first after them; by default all.
+    """
+    first, end = rows or (0, picture.size[0])
     left, right, top, bottom = boxes.unbind(1)
-    inside = (left <= right) & (bottom > 0) & (top < picture.size[0])
+    inside = (left <= right) & (bottom > first) & (top < end)
     return inside if picture.is_panorama else inside & (right > 0) & (left < picture.size[1])
 
 

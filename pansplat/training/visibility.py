@@ -15,7 +15,7 @@ from torch import Tensor
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.render.backend import Options
 from pansplat.render.panorama import Picture
-from pansplat.render.reference import project
+from pansplat.render.reference import in_picture, project
 from pansplat.render.splats import Observed, observe
 
 _CHUNK = 1 << 16  # Gaussians at a time: their geometry is float64
@@ -70,17 +70,11 @@ def _piece(gaussians: Gaussians, rows: slice) -> Gaussians:
 
 
 def _in_region(observed: Observed, region: Region, options: Options) -> Bool[Tensor, "n"]:
-    picture = region.picture
+    picture, rows = region.picture, (region.first, region.end)
     if options.kernel == "ewa":  # has no box behind the camera
         ahead = observed.direction @ picture.rotation[:, 2] > 0
         seen = torch.zeros_like(ahead)
-        seen[ahead] = _meets(project(Observed(*(part[ahead] for part in observed)), picture, options)[1], region)
+        boxes = project(Observed(*(part[ahead] for part in observed)), picture, options)[1]
+        seen[ahead] = in_picture(boxes, picture, rows)
         return seen
-    return _meets(project(observed, picture, options)[1], region)
-
-
-def _meets(boxes: Float[Tensor, "n 4"], region: Region) -> Bool[Tensor, "n"]:
-    """Which boxes (left, right, top, bottom; pixels) reach into a region."""
-    left, right, top, bottom = boxes.unbind(1)
-    inside = (left <= right) & (bottom > region.first) & (top < region.end)
-    return inside if region.picture.is_panorama else inside & (right > 0) & (left < region.picture.size[1])
+    return in_picture(project(observed, picture, options)[1], picture, rows)
