@@ -106,12 +106,18 @@ class Measuring:
     watch: Watch
 
     def run(self, cases: Sequence[MemoryCase], rows: list[MemoryRow]) -> None:
-        """Measure the cases that `rows` lacks, one after another; `rows` grows, in the order of `memory_cases`."""
+        """Measure the cases that `rows` has not measured, one after another.
+
+        Args:
+            rows: of earlier runs, too; grows, in the order of `memory_cases`. Those of other cases stay.
+        """
+        rows[:] = [row for row in rows if row.status == "measured" or row.case not in cases]
         self._forget_lost_references(cases, rows)
         for number, case in enumerate(cases, start=1):
             if case not in [row.case for row in rows]:
                 self.watch(f"{number} of {len(cases)}: {describe(case)}", rows)
-                rows.append(self._measured(case, rows))
+                known = [row for row in rows if row.status == "measured" or row.case in cases]
+                rows.append(self._measured(case, known))  # what failed before may have had a lower limit
                 rows.sort(key=lambda row: (row.height, get_args(Work).index(row.work), row.tiles))
             self.watch("", rows)
 
@@ -214,7 +220,7 @@ def write_memory_rows(
 
 
 def kept_rows(path: Path, setting: MemorySetting) -> list[MemoryRow]:
-    """The rows of an earlier run with the same settings, without those that were not measured: they are tried again.
+    """The rows of an earlier run with the same settings, with those that could not be measured.
 
     Raises:
         InputError: the file is of other settings, or no such file at all.
@@ -233,4 +239,4 @@ def kept_rows(path: Path, setting: MemorySetting) -> list[MemoryRow]:
     changed = [words for words in changed if not words.startswith("limit_gib")]
     if changed:
         raise InputError(f"{path}: measured otherwise ({'; '.join(changed)}); give another --out, or delete the file.")
-    return [row for row in rows if row.status == "measured"]
+    return rows

@@ -128,6 +128,35 @@ def test_rows_that_fail_are_told_of_and_higher_ones_not_tried(asked, tmp_path, m
     assert reference["reference"]  # the first that came to an end
 
 
+def test_what_failed_is_tried_again_where_it_is_asked_for_and_kept_elsewhere(asked, tmp_path, monkeypatch):
+    def failing(case: MemoryCase, *_) -> Taken:
+        asked.append(case)
+        if case.height == 64 and case.work == "plain":
+            raise OverLimit("ended at 2 GiB")
+        return taken(case)
+
+    def run_at(height: int, answer) -> list[dict]:
+        asked.clear()
+        monkeypatch.setattr(bench_memory, "take", answer)
+        heights = ["--heights", str(height)]
+        assert run([*ARGUMENTS[:4], *heights, *ARGUMENTS[7:], "--out", str(tmp_path)]) == 0
+        return rows_in(tmp_path)
+
+    def succeeding(case: MemoryCase, *_) -> Taken:
+        asked.append(case)
+        return taken(case)
+
+    low = run_at(64, failing)
+    failure = next(row for row in low if row["work"] == "plain")
+    assert failure["status"] == "over the limit"
+    both = run_at(128, failing)
+    assert [row for row in both if row["height"] == 64] == low  # the failure too
+    assert asked == memory_cases([128], quick=False)  # nothing is concluded from it: the limit may be another now
+    again = run_at(64, succeeding)
+    assert MemoryCase("plain", 1, 64) in asked and MemoryCase("inference", 1, 64) not in asked
+    assert {row["status"] for row in again} == {"measured"} and len(again) == len(both)
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
