@@ -36,7 +36,7 @@ from pansplat.training.drawing import Drawing
 from pansplat.training.losses import LossWeights
 from pansplat.training.network import freeze, learn, learning, read_weights, shape_of
 from pansplat.training.perceptual import Perceptual, PerceptualName, choose_perceptual
-from pansplat.training.step import Teacher
+from pansplat.training.step import Teacher, teach
 
 Work = Literal["inference", "plain", "one-step", "two-step"]
 MATCHED_HEIGHT = 512  # above it only the heads learn, as in the paper's stages
@@ -231,7 +231,7 @@ class _Worker:
         optimizer.zero_grad()
         memory = MemoryConfig(case.work, case.tiles, self.setting.style)
         weights = LossWeights(depth=0.0) if batch.images.shape[-2] > MATCHED_HEIGHT else LossWeights()
-        Teacher(network, None, self.perceptual, weights, memory).backpropagate(batch)
+        teach(Teacher(network, None, self.perceptual, weights, memory), [batch])
         found = {name: p.grad for name, p in network.named_parameters() if p.grad is not None}
         optimizer.step()
         views, heights = batch.images.shape[1], batch.images.shape[-2]

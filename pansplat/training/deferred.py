@@ -7,7 +7,7 @@ is computed again, with a graph, and gets the gradient that was left at the cut 
     views -> match ->| maps ->| lift, tile by tile ->| Gaussians ->| draw, part by part ->| layers -> picture -> loss
                     cut 1                           cut 2                               cut 3
 
-    plain     no cuts
+    plain     no cuts: `whole_loss`, and its backward()
     one-step  cuts 1 and 2: the heads, which are the largest, tile by tile and view by view; the picture in one graph
     two-step  cuts 1, 2 and 3: and the picture face by face, or strip by strip
 
@@ -21,7 +21,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import torch
 from jaxtyping import Float, Integer
@@ -31,7 +31,6 @@ from pansplat.gaussians.gaussians import Gaussians
 from pansplat.model.heads import TileGaussians, whole
 from pansplat.model.network import Network
 from pansplat.model.pansplat import PanSplat
-from pansplat.training.config import Backpropagation
 from pansplat.training.drawing import Drawing, Layer
 
 _T = TypeVar("_T")
@@ -62,32 +61,37 @@ class Problem:
     map_loss: MapLoss
 
 
+def whole_loss(
+    problem: Problem, network: Network, drawing: Drawing, *, tiles: int = 1, matching_learns: bool = True
+) -> Float[Tensor, ""]:
+    """The loss with the graph of everything it is made of.
+
+    Args:
+        tiles, matching_learns: as in `backpropagate`.
+    """
+    matched = _match(problem, network, matching_learns)
+    scenes = whole(list(network.lift(matched, tiles=tiles)), network.compat)
+    loss = problem.picture_loss(_draw(scenes, problem, drawing))
+    return loss + _number(problem.map_loss(matched))
+
+
 def backpropagate(
     problem: Problem,
     network: Network,
     drawing: Drawing,
     *,
-    method: Backpropagation = "plain",
+    method: Literal["one-step", "two-step"],
     tiles: int = 1,
     matching_learns: bool = True,
     share: float = 1.0,
-) -> float:
-    """Add `share` times the gradient of the loss to every parameter's; returns the loss.
+) -> Float[Tensor, ""]:
+    """Add `share` times the gradient of the loss to every parameter's; returns the loss, without a graph.
 
     Args:
         tiles: tiles along each side of the panorama.
         matching_learns: whether anything before the heads has parameters that learn; else no graph is made for it.
     """
-    with torch.set_grad_enabled(matching_learns):
-        matched = network.match(problem.images, problem.cam2world, problem.near, problem.far)
-    if method == "plain":
-        scenes = whole(list(network.lift(matched, tiles=tiles)), network.compat)
-        pictures = _draw(scenes, problem, drawing)
-        loss = problem.picture_loss(pictures) + _number(problem.map_loss(matched))
-        (share * loss).backward()
-        return loss.item()
-
-    maps = Cut.of(matched)
+    maps = Cut.of(_match(problem, network, matching_learns))
     with torch.no_grad():
         tiled = [Cut.of(part, everything=True).copy for part in network.lift(maps.copy, tiles=tiles)]
     if method == "one-step":
@@ -106,7 +110,12 @@ def backpropagate(
             _hand_back(again, kept.gaussians[item], view)
         kept.gaussians.clear()  # their memory is wanted for the next
     maps.backward()
-    return loss.item() + _number(map_loss).item()
+    return (loss + _number(map_loss)).detach()
+
+
+def _match(problem: Problem, network: Network, matching_learns: bool) -> Any:
+    with torch.set_grad_enabled(matching_learns):
+        return network.match(problem.images, problem.cam2world, problem.near, problem.far)
 
 
 def _draw(scenes: list[Gaussians], problem: Problem, drawing: Drawing) -> Float[Tensor, "batch target 3 h w"]:

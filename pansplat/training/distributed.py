@@ -1,19 +1,21 @@
 """Several processes that train one network: each takes its share of a step, and all take the mean of the gradients.
 
-Gradients are averaged after backpropagation by our own hand and not by DistributedDataParallel, because two-step
-backpropagation goes through the heads many times a step. Batch normalisation takes its statistics from all processes,
-so that N processes learn what one would from the joint batch.
+DistributedDataParallel averages the gradients. Batch normalisation takes its statistics from all processes, so that N
+processes learn what one would from the joint batch.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+import warnings
+from contextlib import AbstractContextManager, nullcontext
 from datetime import timedelta
+from typing import Any
 
 import torch
 import torch.distributed
 from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 
 from pansplat.errors import InputError
 
@@ -110,20 +112,6 @@ class Processes:
         """Whether this is the process that writes files."""
         return self.rank == 0
 
-    def average_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
-        """Give every process the mean of all their gradients; one without a gradient counts as zero."""
-        if self.count == 1:
-            return
-        learning = [p for p in parameters if p.requires_grad]
-        for parameter in learning:
-            if parameter.grad is None:
-                parameter.grad = torch.zeros_like(parameter)
-        flat = torch.cat([p.grad.flatten() for p in learning if p.grad is not None])
-        torch.distributed.all_reduce(flat)
-        flat /= self.count
-        for parameter, mean in zip(learning, flat.split([p.numel() for p in learning]), strict=True):
-            parameter.grad = mean.view_as(parameter)
-
     def mean(self, numbers: dict[str, float]) -> dict[str, float]:
         """The means of all processes' numbers."""
         if self.count == 1:
@@ -146,19 +134,31 @@ class Processes:
             torch.distributed.barrier()
 
 
+class _SumOfAll(torch.autograd.Function):
+    """The sum of all processes' tensors, differentiable in each."""
+
+    @staticmethod
+    def forward(ctx: Any, own: Tensor) -> Tensor:
+        total = own.clone(memory_format=torch.contiguous_format)
+        torch.distributed.all_reduce(total)
+        return total
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        return _SumOfAll.apply(gradients[0])
+
+
 class SharedBatchNorm2d(nn.BatchNorm2d):
     """Batch normalisation by the statistics of all processes' batches; on CPUs too, unlike torch's own."""
 
     def forward(self, input: Tensor) -> Tensor:
         if not self.training:
             return super().forward(input)
-        from torch.distributed.nn.functional import all_reduce
-
         maps = input.float() if input.dtype != torch.float64 else input
         count = maps.numel() // maps.shape[1] * torch.distributed.get_world_size()
-        mean = all_reduce(maps.sum(dim=(0, 2, 3))) / count
+        mean = _SumOfAll.apply(maps.sum(dim=(0, 2, 3))) / count
         apart = maps - mean[:, None, None]
-        variance = all_reduce(apart.square().sum(dim=(0, 2, 3))) / count
+        variance = _SumOfAll.apply(apart.square().sum(dim=(0, 2, 3))) / count
         self._remember(mean.detach(), variance.detach() * count / max(1, count - 1))
         scaled = apart * (variance + self.eps).rsqrt()[:, None, None]
         return (scaled * self.weight[:, None, None] + self.bias[:, None, None]).to(input.dtype)
@@ -179,3 +179,59 @@ def share_statistics(network: nn.Module, processes: Processes) -> None:
         for module in network.modules():
             if type(module) is nn.BatchNorm2d:
                 module.__class__ = SharedBatchNorm2d
+
+
+def together(lessons: nn.Module, processes: Processes) -> nn.Module:
+    """The module, with the mean of all processes' gradients at its parameters after `backward()` of its loss.
+
+    Args:
+        lessons: called, gives (loss, anything else); its gradients may come while it is called, or by `backward()`.
+        processes: itself comes back where there is only one.
+    """
+    if processes.count == 1:
+        return lessons
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # torch 2.4 knows `broadcast_buffers` by no other name
+        wrapped = DistributedDataParallel(_ReachingAll(lessons), broadcast_buffers=False)
+    # It orders its buckets anew after its first step, and a sum of three or more depends on its place in a bucket. So
+    # that a run goes on to the bit from any step, that first step is this one.
+    loss, _ = wrapped()
+    loss.backward()
+    wrapped.zero_grad()
+    return wrapped
+
+
+def keeping_apart(lessons: nn.Module) -> AbstractContextManager[None]:
+    """While in it, gradients gather in each process by itself; the next ones outside take these along."""
+    return lessons.no_sync() if isinstance(lessons, DistributedDataParallel) else nullcontext()
+
+
+class _ReachingAll(nn.Module):
+    """Lessons with a loss that depends on every parameter that learns, as DistributedDataParallel needs it.
+
+    It averages a parameter's gradient when `backward()` reaches the parameter, and waits for all of them. Gradients
+    that came before, while the lessons were called, it takes as they are: it does not look until the call is over.
+    """
+
+    def __init__(self, lessons: nn.Module) -> None:
+        super().__init__()
+        self.lessons = lessons
+
+    def forward(self, *given: Any) -> tuple[Tensor, Any]:
+        learning = [p for p in self.parameters() if p.requires_grad]
+        loss, told = self.lessons(*given) if given else (learning[0].new_zeros(()), None)
+        for parameter in learning:  # reached from the last to the first, as in backpropagation
+            loss = _Reach.apply(loss, parameter)
+        return loss, told
+
+
+class _Reach(torch.autograd.Function):
+    """A number that depends on a parameter too; nothing is added to the parameter's gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, number: Tensor, parameter: Tensor) -> Tensor:
+        return number.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        return gradients[0], None

@@ -26,7 +26,7 @@ from pansplat.training import validation
 from pansplat.training.checkpoint import load_latest, save_checkpoint
 from pansplat.training.config import TrainConfig, as_json, require_same
 from pansplat.training.curves import plot_run
-from pansplat.training.distributed import Processes, share_statistics
+from pansplat.training.distributed import Processes, share_statistics, together
 from pansplat.training.drawing import Drawing
 from pansplat.training.ema import RunningMean
 from pansplat.training.logs import Board, Table, Watch
@@ -34,7 +34,7 @@ from pansplat.training.network import auxiliary_heads, build, learn, learning, w
 from pansplat.training.perceptual import choose_perceptual
 from pansplat.training.schedule import one_cycle
 from pansplat.training.sources import sources
-from pansplat.training.step import PARTS, Teacher
+from pansplat.training.step import PARTS, Teacher, teach
 
 _BEYOND = 10  # steps that the schedule is longer than the training, as in the original
 _COLUMNS = (*PARTS, "rate", "gradient_norm", "seconds")
@@ -73,6 +73,7 @@ class Run:
         if kept is not None:
             self._restore(kept[1])
             self.source = kept[0]
+        self._lessons = together(self.teacher, self.processes)
         self._stop = False
 
     def train(self) -> bool:
@@ -161,21 +162,17 @@ class Run:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad()
-        sums = dict.fromkeys(PARTS, 0.0)
-        for batch in batches:
-            told = self.teacher.backpropagate(batch.to(self.device), 1 / len(batches))
-            sums = {name: sums[name] + told[name] / len(batches) for name in PARTS}
+        told = teach(self._lessons, batches)
         parameters = list(learning(self.network, self.auxiliary))
-        self.processes.average_gradients(parameters)
         norm = float(torch.nn.utils.clip_grad_norm_(parameters, settings.clip))
-        if self.processes.any(not (math.isfinite(sums["loss"]) and math.isfinite(norm))):
-            self._refuse(batches, sums, norm)
+        if self.processes.any(not (math.isfinite(told["loss"]) and math.isfinite(norm))):
+            self._refuse(batches, told, norm)
         self.optimizer.step()
         if self.mean is not None:
             self.mean.update(self.network, self.step)
-        return {**self.processes.mean(sums), "rate": rate, "gradient_norm": norm}
+        return {**self.processes.mean(told), "rate": rate, "gradient_norm": norm}
 
-    def _refuse(self, batches: list[Batch], sums: dict[str, float], norm: float) -> None:
+    def _refuse(self, batches: list[Batch], told: dict[str, float], norm: float) -> None:
         """Keep what made a loss that is no number, and stop."""
         path = self.config.out / f"not_finite_{self.step:08d}_{self.processes.rank}.pt"
         self.config.out.mkdir(parents=True, exist_ok=True)
@@ -184,7 +181,7 @@ class Run:
             torch.save({"step": self.step, "batches": fields, "network": self.network.state_dict()}, partial)
         names = ", ".join(name for batch in batches for name in batch.names)
         raise InputError(
-            f"step {self.step}: needed finite numbers, got a loss of {sums['loss']} and a gradient of norm {norm} from "
+            f"step {self.step}: needed finite numbers, got a loss of {told['loss']} and a gradient of norm {norm} from "
             f"{names}; the batch and the weights before the step are in {path}. Look at the data, lower "
             "--optimizer.rate, and go on from the last checkpoint."
         )

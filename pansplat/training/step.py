@@ -2,46 +2,76 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import replace
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from pansplat.data.sample import Batch
 from pansplat.model.auxiliary_heads import AuxiliaryHeads
 from pansplat.model.mvsplat import MVSplat
 from pansplat.model.pansplat import PanSplat
 from pansplat.training.config import MemoryConfig
-from pansplat.training.deferred import Problem, backpropagate
+from pansplat.training.deferred import Problem, backpropagate, whole_loss
+from pansplat.training.distributed import keeping_apart
 from pansplat.training.drawing import Drawing
 from pansplat.training.losses import LossWeights, auxiliary_loss, depth_loss, image_loss, pixel_weights_of
 from pansplat.training.network import matching_learns
 from pansplat.training.perceptual import Perceptual
 
-PARTS = ("loss", "square", "perceptual", "depth", "auxiliary")
+PARTS: tuple[str, ...] = ("loss", "square", "perceptual", "depth", "auxiliary")
 """Names of what is told of a batch's losses."""
 
 
-@dataclass
-class Teacher:
-    """Losses and gradients of batches.
+def teach(teacher: nn.Module, batches: Sequence[Batch]) -> dict[str, float]:
+    """Add the gradients of the batches' mean loss to the parameters'; returns the means of the parts of the loss.
 
-    Attributes:
+    Args:
+        teacher: a `Teacher`, or one that several processes have `together`: then what is added is the mean of theirs.
+        batches: of one step, one after another.
+    """
+    sums, share = dict.fromkeys(PARTS, 0.0), 1 / len(batches)
+    for number, batch in enumerate(batches, start=1):
+        with keeping_apart(teacher) if number < len(batches) else nullcontext():
+            loss, told = teacher(batch, share)
+            if loss.requires_grad:
+                loss.backward()
+        sums = {name: sums[name] + told[name] / len(batches) for name in PARTS}
+    return sums
+
+
+class Teacher(nn.Module):
+    """Losses of batches, and their gradients.
+
+    Args:
         auxiliary: heads for the auxiliary loss; None for none.
         perceptual: None for none.
     """
 
-    network: PanSplat | MVSplat
-    auxiliary: AuxiliaryHeads | None
-    perceptual: Perceptual | None
-    weights: LossWeights
-    memory: MemoryConfig
+    def __init__(
+        self,
+        network: PanSplat | MVSplat,
+        auxiliary: AuxiliaryHeads | None,
+        perceptual: Perceptual | None,
+        weights: LossWeights,
+        memory: MemoryConfig,
+    ) -> None:
+        super().__init__()
+        self.network, self.auxiliary, self.perceptual = network, auxiliary, perceptual
+        self.weights, self.memory = weights, memory
 
-    def backpropagate(self, batch: Batch, share: float = 1.0) -> dict[str, float]:
-        """Add `share` times the batch's gradients to the parameters'; returns the parts of the loss."""
+    def forward(self, batch: Batch, share: float = 1.0) -> tuple[Tensor, dict[str, float]]:
+        """`share` times the loss, and the parts of the loss.
+
+        Backpropagated plainly, the loss has its graph and wants `backward()`. Otherwise it has none: its gradients are
+        at the parameters already, because they are found piece by piece.
+        """
         told = dict.fromkeys(PARTS, 0.0)
-        batch = as_type(batch, next(self.network.parameters()).dtype)
+        weight = next(self.network.parameters())
+        batch = as_type(batch, weight.dtype).to(weight.device)
         drawing = Drawing(self.memory.style, self.memory.mixing, batch.images.shape[-2])
 
         def picture_loss(pictures: Tensor) -> Tensor:
@@ -64,16 +94,15 @@ class Teacher:
         problem = Problem(
             batch.images, batch.cam2world, batch.near, batch.far, batch.target_cam2world, picture_loss, map_loss
         )
-        told["loss"] = backpropagate(
-            problem,
-            self.network,
-            drawing,
-            method=self.memory.backpropagation,
-            tiles=self.memory.tiles,
-            matching_learns=matching_learns(self.network),
-            share=share,
-        )
-        return told
+        method, tiles, matching = self.memory.backpropagation, self.memory.tiles, matching_learns(self.network)
+        if method == "plain":
+            loss = whole_loss(problem, self.network, drawing, tiles=tiles, matching_learns=matching)
+        else:
+            loss = backpropagate(
+                problem, self.network, drawing, method=method, tiles=tiles, matching_learns=matching, share=share
+            )
+        told["loss"] = loss.item()
+        return share * loss, told
 
     def _depth(self, batch: Batch, matched: Any, told: dict[str, float]) -> Tensor | None:
         if batch.depths is None or not self.weights.depth:

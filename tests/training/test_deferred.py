@@ -8,21 +8,24 @@ import pytest
 import torch
 
 from pansplat.data.sample import Batch
+from pansplat.model.adapter import AdapterConfig
 from pansplat.model.auxiliary_heads import AuxiliaryHeads
+from pansplat.model.mvsplat import MVSplat, MVSplatConfig
 from pansplat.model.pansplat import PanSplat
+from pansplat.model.transformer import TransformerConfig
 from pansplat.training.config import MemoryConfig
 from pansplat.training.losses import LossWeights
 from pansplat.training.network import auxiliary_heads, freeze, learn
 from pansplat.training.perceptual import Structure
-from pansplat.training.step import Teacher
+from pansplat.training.step import Teacher, teach
 
 
 def gradients(
-    network: PanSplat, batch: Batch, memory: MemoryConfig, auxiliary: AuxiliaryHeads | None = None, share: float = 1.0
+    network: PanSplat | MVSplat, memory: MemoryConfig, *batches: Batch, auxiliary: AuxiliaryHeads | None = None
 ) -> tuple[dict[str, torch.Tensor], dict[str, float]]:
     """Of every parameter that gets one, and the parts of the loss."""
     network.zero_grad()
-    told = Teacher(network, auxiliary, Structure(), LossWeights(), memory).backpropagate(batch, share)
+    told = teach(Teacher(network, auxiliary, Structure(), LossWeights(), memory), batches)
     return {name: p.grad.clone() for name, p in network.named_parameters() if p.grad is not None}, told
 
 
@@ -40,8 +43,8 @@ def test_deferred_gradients_equal_plain_ones(
 ) -> None:
     network, batch = micro(), make_batch()
     learn(network, ())
-    wanted, loss = gradients(network, batch, MemoryConfig("plain", 1, style))
-    found, deferred_loss = gradients(network, batch, MemoryConfig(method, 2, style))
+    wanted, loss = gradients(network, MemoryConfig("plain", 1, style), batch)
+    found, deferred_loss = gradients(network, MemoryConfig(method, 2, style), batch)
     assert loss["depth"] > 0 and loss["square"] > 0
     assert deferred_loss == pytest.approx(loss, rel=1e-9)
     assert any(name.startswith("features.") for name in wanted)
@@ -53,8 +56,8 @@ def test_deferred_gradients_equal_plain_ones_when_views_are_mixed(
 ) -> None:
     network, batch = micro(), make_batch()
     learn(network, ())
-    wanted, _ = gradients(network, batch, MemoryConfig("plain", 1, "cubemap", "by_view"))
-    found, _ = gradients(network, batch, MemoryConfig("two-step", 2, "cubemap", "by_view"))
+    wanted, _ = gradients(network, MemoryConfig("plain", 1, "cubemap", "by_view"), batch)
+    found, _ = gradients(network, MemoryConfig("two-step", 2, "cubemap", "by_view"), batch)
     assert_equal_gradients(found, wanted)
 
 
@@ -64,10 +67,10 @@ def test_deferred_gradients_equal_plain_ones_with_auxiliary_heads(
     network, batch = micro(), make_batch()
     learn(network, ())
     extra = auxiliary_heads(network).double()
-    wanted, plain = gradients(network, batch, MemoryConfig("plain"), extra)
+    wanted, plain = gradients(network, MemoryConfig("plain"), batch, auxiliary=extra)
     own = [p.grad.clone() for p in extra.parameters() if p.grad is not None]
     extra.zero_grad()
-    found, _ = gradients(network, batch, MemoryConfig("two-step", 2), extra)
+    found, _ = gradients(network, MemoryConfig("two-step", 2), batch, auxiliary=extra)
     assert plain["auxiliary"] > 0
     assert_equal_gradients(found, wanted)
     for parameter, gradient in zip(extra.parameters(), own, strict=True):
@@ -81,18 +84,36 @@ def test_a_frozen_part_gets_no_gradient_and_keeps_its_statistics(
     freeze(network, frozen)
     learn(network, frozen)
     before = {name: tensor.clone() for name, tensor in network.features.state_dict().items()}
-    wanted, _ = gradients(network, batch, MemoryConfig("plain", 1, "cubemap"))
-    found, _ = gradients(network, batch, MemoryConfig("two-step", 2, "cubemap"))
+    wanted, _ = gradients(network, MemoryConfig("plain", 1, "cubemap"), batch)
+    found, _ = gradients(network, MemoryConfig("two-step", 2, "cubemap"), batch)
     assert wanted and all(name.startswith("heads.") for name in wanted)
     assert_equal_gradients(found, wanted)
     for name, tensor in network.features.state_dict().items():
         assert torch.equal(tensor, before[name]), name
 
 
-def test_gradients_of_two_items_are_the_mean_of_each_by_itself(
+def test_gradients_of_two_items_are_those_of_two_batches_of_one(
     micro: Callable[..., PanSplat], make_batch: Callable[..., Batch]
 ) -> None:
-    network = micro().eval()
-    both, _ = gradients(network, make_batch(0, 1), MemoryConfig("two-step", 1, "cubemap"))
-    parts = [gradients(network, make_batch(n), MemoryConfig("two-step", 1, "cubemap"), share=0.5)[0] for n in (0, 1)]
-    assert_equal_gradients({name: parts[0][name] + parts[1][name] for name in both}, both)
+    network, memory = micro().eval(), MemoryConfig("two-step", 1, "cubemap")
+    both, joint = gradients(network, memory, make_batch(0, 1))
+    found, apart = gradients(network, memory, make_batch(0), make_batch(1))
+    assert_equal_gradients(found, both)
+    assert apart == pytest.approx(joint, rel=1e-9)
+
+
+def test_deferred_gradients_of_the_baseline_equal_plain_ones(make_batch: Callable[..., Batch]) -> None:
+    network, batch = micro_mvsplat(), make_batch(0, 1)
+    wanted, loss = gradients(network, MemoryConfig("plain", 1, "cubemap"), batch)
+    assert wanted.keys() == {name for name, _ in network.named_parameters()}
+    for method in ("one-step", "two-step"):
+        found, deferred_loss = gradients(network, MemoryConfig(method, 2, "cubemap"), batch)  # it has one tile only
+        assert deferred_loss == pytest.approx(loss, rel=1e-9)
+        assert_equal_gradients(found, wanted)
+
+
+def micro_mvsplat() -> MVSplat:
+    torch.manual_seed(3)
+    transformer = TransformerConfig(8, 1)
+    config = MVSplatConfig(8, candidates=4, width=32, transformer=transformer, adapter=AdapterConfig(degree=0))
+    return MVSplat(config).double()

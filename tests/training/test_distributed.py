@@ -13,22 +13,33 @@ import torch
 
 from pansplat.errors import InputError
 from pansplat.training.config import TrainConfig
-from pansplat.training.distributed import Processes
+from pansplat.training.distributed import Processes, keeping_apart, together
 from pansplat.training.loop import Run
 
-_PROGRAM = Path(__file__).parent / "two_processes.py"
+_FOLDER = Path(__file__).parent
+
+
+def _launch(count: int, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a program in that many processes, which torchrun starts if there is more than one."""
+    torchrun = ("-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}")
+    done = subprocess.run(
+        [sys.executable, *(torchrun if count > 1 else ()), *arguments],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done
 
 
 def test_two_processes_have_the_gradients_of_one_with_the_joint_batch(tmp_path: Path) -> None:
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-    for command in ([sys.executable], launch):
-        done = subprocess.run(
-            [*command, str(_PROGRAM), str(tmp_path)], env=environment, capture_output=True, text=True, timeout=300
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
+    for count in (1, 2):
+        _launch(count, str(_FOLDER / "two_processes.py"), str(tmp_path))
     whole, first, second = (torch.load(tmp_path / f"{name}.pt") for name in ("1_0", "2_0", "2_1"))
     assert any("norm" in name and "running" in name for name in whole)
+    for way in ("plain 1", "plain 2", "two-step 1", "two-step 2"):
+        assert {f"{way} features.", f"{way} heads."} <= {name[: name.find(".") + 1] for name in whole}
     assert whole.keys() == first.keys() == second.keys()
     for name, wanted in whole.items():
         scale = float(wanted.abs().max())
@@ -36,18 +47,36 @@ def test_two_processes_have_the_gradients_of_one_with_the_joint_batch(tmp_path: 
         torch.testing.assert_close(second[name], first[name], rtol=0, atol=0)
 
 
+def test_each_step_sums_alike_however_its_gradients_come(tmp_path: Path) -> None:
+    _launch(3, str(_FOLDER / "three_processes.py"), str(tmp_path))
+    read = {path.stem: torch.load(path) for path in tmp_path.iterdir()}
+    for name, wanted in read["joint"].items():
+        scale = float(wanted.abs().max())
+        for step in ("0_0", "2_0"):
+            torch.testing.assert_close(read[step][name], wanted, rtol=1e-5, atol=1e-6 * scale)
+        apart = torch.stack([read[f"apart_{rank}"][name] for rank in range(3)])
+        assert not torch.equal(apart[0], apart[1])
+        torch.testing.assert_close(apart.mean(0), wanted, rtol=1e-5, atol=1e-6 * scale)
+        # The first step after a start is a later one of the run that goes on: they must agree to the bit.
+        assert torch.equal(read["0_0"][name], read["1_0"][name])
+        for rank in (1, 2):
+            for step in range(3):
+                assert torch.equal(read[f"{step}_{rank}"][name], read[f"{step}_0"][name])
+    assert not read["0_0"]["idle.weight"].any()
+
+
+def test_one_process_learns_without_the_others() -> None:
+    lessons, alone = torch.nn.Linear(2, 2), Processes()
+    assert together(lessons, alone) is lessons
+    with keeping_apart(lessons):
+        lessons(torch.ones(2)).sum().backward()
+    assert lessons.weight.grad is not None and not torch.distributed.is_initialized()
+
+
 def test_torchrun_trains_and_only_the_first_process_writes(tmp_path: Path) -> None:
     out = tmp_path / "run"
     settings = ("--optimizer.steps", "2", "--optimizer.batch-size", "1", "--data.workers", "0", "--device", "cpu")
-    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-    done = subprocess.run(
-        [*launch, "-m", "pansplat.training", "tiny", "--out", str(out), "--validation.every", "0", *settings],
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    done = _launch(2, "-m", "pansplat.training", "tiny", "--out", str(out), "--validation.every", "0", *settings)
     assert done.stderr.count("2 process(es), from step 0 of 2") == 1
     rows = (out / "log.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in rows] == ["step", "0", "1"]

@@ -1,4 +1,4 @@
-"""One of two processes: gradients of its half of a batch, averaged with the other's, written to a file."""
+"""One of two processes: gradients of its half of each batch, averaged with the other's, written to a file."""
 
 from __future__ import annotations
 
@@ -7,35 +7,46 @@ from pathlib import Path
 
 import torch
 
-from pansplat.data.sample import collate
+from pansplat.data.sample import Batch, collate
+from pansplat.model.pansplat import PanSplat
 from pansplat.training.config import MemoryConfig
-from pansplat.training.distributed import Processes, share_statistics
+from pansplat.training.distributed import Processes, share_statistics, together
 from pansplat.training.losses import LossWeights
 from pansplat.training.network import learn
-from pansplat.training.step import Teacher
+from pansplat.training.step import Teacher, teach
 
 sys.path.insert(0, str(Path(__file__).parent))
 from conftest import PaintedSphere, micro_config
 
-from pansplat.model.pansplat import PanSplat
+WAYS = (("plain", 1), ("plain", 2), ("two-step", 1), ("two-step", 2))
+"""How gradients are made, and the number of batches they are gathered of."""
 
 
-def main(folder: Path, dtype: torch.dtype = torch.float64) -> None:
+def main(folder: Path) -> None:
     processes = Processes()
     processes.join(torch.device("cpu"))
     torch.manual_seed(3)
-    network = PanSplat(micro_config(), "fixed").to(dtype)
+    network = PanSplat(micro_config(), "fixed").double()
     share_statistics(network, processes)
     learn(network, ())
-    own = [0, 1] if processes.count == 1 else [processes.rank]
-    batch = collate([PaintedSphere().sample(n, 32, 0) for n in own])
-    Teacher(network, None, None, LossWeights(), MemoryConfig()).backpropagate(batch)
-    parameters = list(network.parameters())
-    processes.average_gradients(parameters)
-    found = {name: p.grad for name, p in network.named_parameters() if p.grad is not None}
+    teacher = Teacher(network, None, None, LossWeights(), MemoryConfig())
+    lessons = together(teacher, processes)
+    found = {}
+    for method, rounds in WAYS:
+        teacher.memory = MemoryConfig(method, 1 if method == "plain" else 2, "original")
+        teacher.zero_grad()
+        teach(lessons, [batch_of(processes, n) for n in range(rounds)])
+        found |= {f"{method} {rounds} {name}": p.grad for name, p in network.named_parameters() if p.grad is not None}
     buffers = {name: tensor for name, tensor in network.named_buffers() if tensor.is_floating_point()}
     torch.save({**found, **buffers}, folder / f"{processes.count}_{processes.rank}.pt")
     processes.leave()
+
+
+def batch_of(processes: Processes, number: int) -> Batch:
+    """Two paintings, or the one of them that is this process's."""
+    both = [2 * number, 2 * number + 1]
+    own = both if processes.count == 1 else both[processes.rank : processes.rank + 1]
+    return collate([PaintedSphere().sample(n, 32, 0) for n in own])
 
 
 if __name__ == "__main__":
