@@ -23,6 +23,7 @@ from pansplat.render.cpu.simd import (
     put,
     spread,
     store,
+    store_past_cache,
     totals,
     transposed,
 )
@@ -44,7 +45,6 @@ def write_chunk(  # type: ignore[no-untyped-def]
     last = first + count - 1
     for s in range(count):
         ahead = element(slots, min(first + s + _AHEAD, last))
-        prefetch_to_write(grad_records, FIELDS * ahead)
         prefetch_to_write(grad_values, num_values * ahead)
         _sum_moments(s, heads, pairs, slopes, forms, offsets, upstream, moments, shares)
         row = num_values * slots[first + s]
@@ -136,8 +136,8 @@ def _write_records(  # type: ignore[no-untyped-def]
     _store_rows(moments, at + LANES, transposed(a_z, b_x, b_y, b_z, by_front_a, by_front_b, on * along, level))
     for place in range(s, min(s + LANES, count)):
         row = FIELDS * slots[first + place]
-        store(grad_records, row, load(moments, MOMENTS * place))
-        store(grad_records, row + LANES, load(moments, MOMENTS * place + LANES))
+        store_past_cache(grad_records, row, load(moments, MOMENTS * place))
+        store_past_cache(grad_records, row + LANES, load(moments, MOMENTS * place + LANES))
 
 
 @inlined

@@ -52,6 +52,7 @@ from pansplat.render.cpu.tile import (
     PIXELS,
     ROWS,
     WORDS,
+    ask_ahead,
     gather,
     list_blocks,
     place_tile,
@@ -62,8 +63,8 @@ Integers = npt.NDArray[np.int32]
 Longs = npt.NDArray[np.int64]
 
 _PIECES = 8  # of work a thread
-HALF = CHUNK + 1  # room for the powers of a block, and one to be written over
-_FEW = 4  # values summed without writing the weights down: RGB and the distance
+HALF = CHUNK  # room for the powers of a block
+FEW = 4  # values summed without writing the weights down: RGB and the distance
 
 
 class Kept(NamedTuple):
@@ -159,10 +160,11 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
             drawn, reached, following, half = -1, 0, 0, 0
             for block in range(BLOCKS + 1):
                 if block < BLOCKS:
+                    ask_ahead(records, values, entries, block, first + CHUNK)
                     if not some(load(through, block * LANES) > fill(np.float32(CLOSED))):
                         continue
                     following = find_powers(block, count, touched, forms, offsets, powers, places, half)
-                if drawn >= 0 and num_values == _FEW:
+                if drawn >= 0 and num_values == FEW:
                     is_open |= _draw_block(drawn, reached, powers, places, HALF - half, colours, through, added)
                 elif drawn >= 0:
                     is_open |= _weigh_block(drawn, reached, powers, HALF - half, through)
@@ -187,7 +189,8 @@ def find_powers(block, count, touched, forms, offsets, powers, places, start):  
     """Log2 of the peak times the response at a block's pixels, for the Gaussians of the chunk that reach it.
 
     Returns:
-        How many of `powers` (LANES each) and `places` (in the chunk) were written, front to back.
+        How many of `powers` (LANES each) and `places` (in the chunk) were written, front to back. Boxes have corners:
+        some of them no pixel sees. Leaving those out would make each wait for the one before.
     """
     pixel, column, row = block * LANES, block % ACROSS, ROWS + block // ACROSS
     x, y, z = load(offsets, pixel), load(offsets, PIXELS + pixel), load(offsets, 2 * PIXELS + pixel)
@@ -204,8 +207,7 @@ def find_powers(block, count, touched, forms, offsets, powers, places, start):  
             power = choose(front > fill(np.float32(0)), power, fill(np.float32(NOTHING)))
             store(powers, reached * LANES, power)
             put(places, reached, np.int32(s))
-            # Boxes have corners: what no pixel sees is written over. No branch, for none could be foretold.
-            reached += np.int64(some(fill(np.float32(CUT)) <= power))
+            reached += 1
     return reached - start
 
 
@@ -247,7 +249,7 @@ def _draw_block(block, reached, powers, places, start, colours, through, added):
     sum0, sum1 = load(added, pixel), load(added, PIXELS + pixel)
     sum2, sum3 = load(added, 2 * PIXELS + pixel), load(added, 3 * PIXELS + pixel)
     for at in range(start, start + reached):
-        colour = _FEW * np.int64(element(places, at))
+        colour = FEW * np.int64(element(places, at))
         alpha = opacity(load(powers, at * LANES))
         weight = alpha * passes
         passes = multiply_add(negative(alpha), passes, passes)

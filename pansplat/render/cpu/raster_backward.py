@@ -13,7 +13,7 @@ import numpy as np
 
 from pansplat.render.cpu.compiling import inlined, kernel
 from pansplat.render.cpu.moments import GROUP, MOMENTS, PAIR, write_chunk
-from pansplat.render.cpu.raster import HALF, Floats, Integers, Kept, Longs, find_powers, opacity, pieces_of
+from pansplat.render.cpu.raster import FEW, HALF, Floats, Integers, Kept, Longs, find_powers, opacity, pieces_of
 from pansplat.render.cpu.records import FIELDS, TILE
 from pansplat.render.cpu.simd import (
     LANES,
@@ -42,6 +42,7 @@ from pansplat.render.cpu.tile import (
     MOST,
     PIXELS,
     WORDS,
+    ask_ahead,
     gather,
     list_blocks,
     place_tile,
@@ -75,10 +76,12 @@ def raster_backward(
         sums, kept: what `raster_forward` wrote.
         grad_sums: gradient of the sums, the same shape.
         grad_records: (slot, FIELDS), written at the entries' slots; directions in the columns DIRECTION, zeros in REST.
+            Starts on a multiple of 32 bytes: nobody reads it soon, so it is written past the caches.
         grad_values: (slot, channel + 1), written likewise.
         first_row: of tiles, the band's first.
         threads: to work on; the result does not depend on it.
     """
+    assert grad_records.ctypes.data % (4 * LANES) == 0
     pieces = pieces_of(starts, threads)
     drawn = records.reshape(-1), values, entries.reshape(-1), starts, slots
     table = plane.kind, plane.columns, plane.rows, plane.rotation
@@ -122,9 +125,13 @@ def _walk_tiles(  # type: ignore[no-untyped-def]
             count = min(CHUNK, end - first)
             gather(records, values, entries, first, count, middle, exact, forms, colours)
             list_blocks(entries, first, count, touched)
+            following = first - CHUNK
+            if chunk == 0:  # the next tile's last
+                following = end + CHUNK * (drawn_chunks[min(tile + 1, high - 1)] - 1)
             _find_slopes(
-                count, forms, colours, touched, offsets, kept[kept_rows[tile] + chunk], num_values, planes, upstream,
-                behind, powers, places, weights, slopes, pairs, heads,
+                records, values, entries, following, count, forms, colours, touched, offsets,
+                kept[kept_rows[tile] + chunk], num_values, planes, upstream, behind, powers, places, weights, slopes,
+                pairs, heads,
             )  # fmt: skip
             write_chunk(
                 first, count, slots, heads, pairs, slopes, forms, offsets, upstream, num_values, moments, shares,
@@ -157,8 +164,8 @@ def _read_upstream(sums, grad_sums, left, top, num_values, planes, upstream):  #
 
 @inlined
 def _find_slopes(  # type: ignore[no-untyped-def]
-    count, forms, colours, touched, offsets, through, num_values, planes, upstream, behind, powers, places, weights,
-    slopes, pairs, heads,
+    records, values, entries, next_first, count, forms, colours, touched, offsets, through, num_values, planes,
+    upstream, behind, powers, places, weights, slopes, pairs, heads,
 ):  # fmt: skip
     """Find the derivatives of the loss by the powers of a chunk's Gaussians, block by block, and their weights."""
     heads[:] = -1
@@ -166,12 +173,13 @@ def _find_slopes(  # type: ignore[no-untyped-def]
     taken, reached, following, half, pair = -1, 0, 0, 0, 0
     for block in range(BLOCKS + 1):
         if block < BLOCKS:
+            ask_ahead(records, values, entries, block, next_first)
             if not some(load(through, block * LANES) > fill(np.float32(CLOSED))):
                 continue
             following = find_powers(block, count, touched, forms, offsets, powers, places, half)
         if taken >= 0:
             start = HALF - half
-            _weigh_block(taken, reached, powers, start, through, weights)
+            reached = _weigh_block(taken, reached, powers, places, start, through, weights)
             _slope_block(
                 taken, reached, powers, places, start, weights, colours, num_values, planes, upstream, behind, slopes,
                 pairs, heads, pair,
@@ -181,14 +189,22 @@ def _find_slopes(  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _weigh_block(block, reached, powers, start, through, weights):  # type: ignore[no-untyped-def]
-    """Turn the powers of what reaches a block into alphas, and find its weights."""
-    passes = load(through, block * LANES)
+def _weigh_block(block, reached, powers, places, start, through, weights):  # type: ignore[no-untyped-def]
+    """Turn the powers of what reaches a block into alphas, and find its weights; what no pixel sees is left out.
+
+    Returns:
+        How many are left.
+    """
+    passes, left = load(through, block * LANES), 0
     for at in range(reached):
         alpha = opacity(load(powers, (start + at) * LANES))
-        store(powers, (start + at) * LANES, alpha)
-        store(weights, at * LANES, alpha * passes)
+        store(powers, (start + left) * LANES, alpha)
+        store(weights, left * LANES, alpha * passes)
+        put(places, start + left, element(places, start + at))
         passes = multiply_add(negative(alpha), passes, passes)
+        # Written over by the next if nobody sees it: no branch, for none could be foretold.
+        left += np.int64(some(alpha > fill(np.float32(0))))
+    return left
 
 
 @inlined
@@ -200,12 +216,18 @@ def _slope_block(  # type: ignore[no-untyped-def]
     most, one, zero = fill(np.float32(MOST)), fill(np.float32(1)), fill(np.float32(0))
     pixel = block * LANES
     beyond, base = load(behind, pixel), load(upstream, planes * PIXELS + pixel)
+    of0, of1 = load(upstream, pixel), load(upstream, PIXELS + pixel)
+    of2, of3 = load(upstream, 2 * PIXELS + pixel), load(upstream, 3 * PIXELS + pixel)
     for at in range(reached - 1, -1, -1):
         s = np.int64(element(places, start + at))
         alpha, weight = load(alphas, (start + at) * LANES), load(weights, at * LANES)
-        worth = base
-        for value in range(num_values):
-            worth = multiply_add(load(upstream, value * PIXELS + pixel), spread(colours, num_values * s + value), worth)
+        if num_values == FEW:
+            worth = multiply_add(of0, spread(colours, FEW * s), base)
+            worth = multiply_add(of1, spread(colours, FEW * s + 1), worth)
+            worth = multiply_add(of2, spread(colours, FEW * s + 2), worth)
+            worth = multiply_add(of3, spread(colours, FEW * s + 3), worth)
+        else:
+            worth = _worth_of(s, pixel, base, upstream, colours, num_values)
         earned = weight * worth
         slope = multiply_add(negative(alpha / (one - alpha)), beyond, earned) * fill(np.float32(_LN2))
         store(slopes, pair * PAIR, choose(most > alpha, slope, zero))
@@ -216,6 +238,14 @@ def _slope_block(  # type: ignore[no-untyped-def]
         put(heads, s, np.int32(pair))
         pair += 1
     store(behind, pixel, beyond)
+
+
+@inlined
+def _worth_of(s, pixel, worth, upstream, colours, num_values):  # type: ignore[no-untyped-def]
+    """What a Gaussian's values, any number of them, add to what a weight is worth."""
+    for value in range(num_values):
+        worth = multiply_add(load(upstream, value * PIXELS + pixel), spread(colours, num_values * s + value), worth)
+    return worth
 
 
 @inlined

@@ -24,6 +24,7 @@ CHUNK = 256  # Gaussians
 WORDS = CHUNK // 64
 ROWS = ACROSS + 1  # where the rows' edges begin, among a word's
 EDGES = ROWS + DOWN + 1
+_SHARE = CHUNK // BLOCKS  # Gaussians of the next chunk that are asked for at each block
 _AHEAD = 16  # Gaussians, between asking for a record and reading it
 
 # Rows of the forms.
@@ -84,6 +85,16 @@ def place_tile(kind, columns, rows, rotation, left, top, offsets, middle, throug
         offsets[pixel] = np.float32(point[0] - k[0])
         offsets[PIXELS + pixel] = np.float32(point[1] - k[1])
         offsets[2 * PIXELS + pixel] = np.float32(point[2] - k[2])
+
+
+@inlined
+def ask_ahead(records, values, entries, block, first):  # type: ignore[no-untyped-def]
+    """Ask for a block's share of the chunk that begins at entry `first`: memory works while blocks are drawn."""
+    num_values, end = values.shape[1], len(entries) // 2 - 1
+    for e in range(first + block * _SHARE, first + (block + 1) * _SHARE):
+        index = np.int64(element(entries, 2 * max(min(e, end), 0)))
+        prefetch(records, FIELDS * index)
+        prefetch(values, num_values * index)
 
 
 @inlined

@@ -18,9 +18,8 @@ def _draw(case):
     kept = raster.room_to_keep(case.starts, lease := Lease())
     drawn = case.records, case.values, case.entries, case.starts
     raster.raster_forward(*drawn, case.plane, sums, kept=kept)
-    grads = np.empty((len(case.entries), FIELDS), np.float32), np.empty((len(case.entries), 4), np.float32)
+    grads = lease.array((len(case.entries), FIELDS), np.float32), np.empty((len(case.entries), 4), np.float32)
     raster_backward.raster_backward(*drawn, case.slots, case.plane, sums, kept, sums, *grads)
-    del lease
 
 
 def _assembly(text):

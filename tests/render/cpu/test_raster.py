@@ -99,7 +99,7 @@ sums = np.zeros_like(given["grad_sums"])
 lease = Lease()
 kept = room_to_keep(given["starts"], lease)
 raster_forward(*drawn, plane, sums, kept=kept)
-grads = np.empty((len(drawn[2]), 16), np.float32), np.empty((len(drawn[2]), 4), np.float32)
+grads = lease.array((len(drawn[2]), 16), np.float32), np.empty((len(drawn[2]), 4), np.float32)
 raster_backward(*drawn, given["slots"], plane, sums, kept, given["grad_sums"], *grads)
 np.savez(sys.argv[2], sums=sums, records=grads[0], values=grads[1])
 """

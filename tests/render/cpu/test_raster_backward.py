@@ -26,11 +26,11 @@ def _slots(case, upstream, *, threads=1):
     drawn = case.records, case.values, case.entries, case.starts
     kept = room_to_keep(case.starts, lease := Lease())
     raster_forward(*drawn, case.plane, sums, kept=kept)
-    grad_records = np.full((len(case.entries), layout.FIELDS), np.nan, np.float32)
+    grad_records = lease.array((len(case.entries), layout.FIELDS), np.float32)
+    grad_records[:] = np.nan
     grad_values = np.full((len(case.entries), case.values.shape[1]), np.nan, np.float32)
     raster_backward(*drawn, case.slots, case.plane, sums, kept, upstream, grad_records, grad_values, threads=threads)
-    del lease
-    return grad_records, grad_values
+    return grad_records.copy(), grad_values
 
 
 def _compare(case, tolerance=1e-5):
