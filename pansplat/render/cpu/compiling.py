@@ -1,6 +1,11 @@
-"""How the kernels are compiled: once a machine, kept on disk, and announced when it takes a while."""
+"""How the kernels are compiled: once a machine, kept on disk, and announced when it takes a while.
+
+The first time a second process lends a hand (`beside.py`).
+"""
 
 import contextlib
+import functools
+import gc
 import hashlib
 import inspect
 import re
@@ -11,11 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import numba as nb
-from numba.core import event
+from numba.core import event, types
+
+from pansplat.render.cpu import beside
 
 _PACKAGE = __name__.rpartition(".")[0]
 _PATIENCE = 1.0  # seconds of compiling before the user is told
-_NEWS = "pansplat: compiling the rasteriser for this processor, once (about half a minute)"
+_NEWS = "pansplat: compiling the rasteriser for this processor, once (15 to 30 seconds)"
 _OPTIONS = {
     "nogil": True,
     "error_model": "numpy",  # divide without asking whether by zero
@@ -25,7 +32,10 @@ _OPTIONS = {
 }
 
 _IMPORTED = re.compile(rf"^(?:from|import) {re.escape(_PACKAGE)}(?:\.(\w+)| import ([\w, ]+))", re.MULTILINE)
+_FIRST = "observe", "_observe"  # the kernel that every picture needs first
 _told = False
+_gradients: bool | None = None  # whether those of the picture being drawn are wanted; None if none is drawn
+_second: beside.Beside | None = None
 
 
 def kernel(function: Callable[..., Any]) -> Any:
@@ -40,8 +50,22 @@ def kernel(function: Callable[..., Any]) -> Any:
     except RuntimeError:  # no folder to keep it in
         return nb.njit(**_OPTIONS)(function)
     # Numba looks only at the file that a kernel stands in; what is compiled into it stands in others.
-    compiled._cache._cache_file._source_stamp = _stamp(Path(inspect.getfile(function)))
+    cache, path = compiled._cache, Path(inspect.getfile(function))
+    cache._cache_file._source_stamp = _stamp(path)
+    cache.load_overload = functools.partial(_load, (path.stem, function.__name__), cache.load_overload)
     return compiled
+
+
+def _load(name: tuple[str, str], look: Callable[..., Any], signature: Any, context: Any) -> Any:
+    """What is on disk of a kernel, waited for if the second process compiles it; its first kernel starts that one."""
+    global _second
+    found = look(signature, context)
+    if found is None and _second is not None and name in _second.kernels:
+        return _second.wait(lambda: look(signature, context))
+    if found is None and name == _FIRST and _gradients is not None and _second is None and beside.possible():
+        with contextlib.suppress(OSError):  # no process to be had
+            _second = beside.Beside(beside.tasks(signature, gradients=_gradients))
+    return found
 
 
 def _stamp(module: Path) -> str:
@@ -59,25 +83,41 @@ def _stamp(module: Path) -> str:
 
 def inlined(function: Callable[..., Any]) -> Any:
     """Compile a function into each kernel that calls it."""
-    return nb.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)(inspect.unwrap(function))
+    compiled: Any = nb.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)(inspect.unwrap(function))
+    # Numba would compile it once more for each number written in a call; LLVM puts that number in anyway.
+    resolve = compiled.get_call_template
+    compiled.get_call_template = lambda args, kws: resolve(
+        tuple(types.unliteral(kind) for kind in args), {name: types.unliteral(kind) for name, kind in kws.items()}
+    )
+    return compiled
 
 
 @contextlib.contextmanager
-def announced() -> Iterator[None]:
-    """Tell on stderr, once, that kernels are being compiled, if it takes more than a second."""
-    listener = _Listener()
+def announced(*, gradients: bool = False) -> Iterator[None]:
+    """Tell on stderr, once, that kernels are being compiled, if it takes more than a second.
+
+    Args:
+        gradients: whether the exact kernel's backward will follow, and had better be compiled at once.
+    """
+    global _gradients
+    listener, _gradients = _Listener(), gradients
     with event.install_listener("numba:compile", listener):
         try:
             yield
         finally:
+            _gradients = None
             listener.stop()
 
 
 class _Listener(event.Listener):
-    """Starts the clock when the first of our kernels has to be compiled."""
+    """Starts the clock when the first of our kernels has to be compiled, and stops the collector of garbage.
+
+    Compiling makes millions of objects and no garbage to speak of; looking for it takes a tenth of the time.
+    """
 
     def __init__(self) -> None:
         self._timer: threading.Timer | None = None
+        self._collects = False
 
     def on_start(self, event: event.Event) -> None:
         data: Any = event.data
@@ -86,14 +126,18 @@ class _Listener(event.Listener):
             self._timer = threading.Timer(_PATIENCE, _tell)
             self._timer.daemon = True
             self._timer.start()
+            self._collects = gc.isenabled()
+            gc.disable()
 
     def on_end(self, event: event.Event) -> None:
         """Kernels follow one another: the clock runs on until all are there."""
 
     def stop(self) -> None:
-        """The clock stops."""
+        """The clock stops, and garbage is collected again."""
         if self._timer is not None:
             self._timer.cancel()
+        if self._collects:
+            gc.enable()
 
 
 def _tell() -> None:

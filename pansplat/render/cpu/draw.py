@@ -128,7 +128,7 @@ class _Draw(torch.autograd.Function):
         fields, camera = _fields(*tensors), _camera(pose, pictures[0], options)
         threads, needs_grad, lease = thread_count(), any(ctx.needs_input_grad), Lease()
         height, width = pictures[0].size
-        with announced():
+        with announced(gradients=needs_grad and options.kernel == "ray"):
             with notes.timed("observe"):
                 observed = observe(fields, camera, lease, threads)
             sums = np.empty((len(pictures), harmonics.shape[2] + 2, height, width), np.float32)

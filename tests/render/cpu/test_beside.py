@@ -1,0 +1,183 @@
+"""The second process brings kernels that the first one then finds, and nothing depends on it."""
+
+import contextlib
+import dataclasses
+import importlib
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from numba import int64
+
+from pansplat.render import rasterize
+from pansplat.render.cpu import beside, compiling, observe
+from pansplat.render.cpu.beside import Beside, Task, possible, tasks
+
+_PLACES = Task("radix", "_places", (int64[:, ::1],))
+_FIND = """
+import numpy as np
+from numba import int64
+from pansplat.render.cpu import compiling, radix
+from pansplat.render.cpu.beside import Beside, Task
+wrong = Task("radix", "_move", (int64,))
+compiling._second = Beside([wrong, Task("radix", "_places", (int64[:, ::1],))])
+radix._places(np.zeros((1, 4), np.int64))
+print(sum(radix._places.stats.cache_hits.values()), sum(radix._places.stats.cache_misses.values()))
+"""
+_ABANDON = """
+import os, signal
+from pansplat.render.cpu import beside
+beside._SERVE = "import time; from pansplat.render.cpu import beside; beside._end_with_parent()"
+print(beside.Beside([])._process.pid, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def _signatures(module, name):
+    return list(getattr(importlib.import_module(f"pansplat.render.cpu.{module}"), name).overloads)
+
+
+def _brings(monkeypatch, code):
+    monkeypatch.setattr(beside, "_SERVE", code)
+    return Beside([_PLACES])
+
+
+def test_a_kernel_that_the_second_process_compiled_is_not_compiled_again(tmp_path):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    child = subprocess.run(
+        [sys.executable, "-W", "error", "-c", _FIND], env=environment, check=True, capture_output=True, text=True
+    )
+    assert child.stdout.split() == ["1", "0"] and child.stderr == ""
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+@pytest.mark.parametrize("covariances", [False, True])
+def test_what_the_second_process_compiles_is_what_drawing_asks_for(degree, covariances, make_scene, pose):
+    scene = make_scene(20, scale=0.15, degree=degree, seed=1).to(dtype=torch.float32)
+    means = scene.means.clone().requires_grad_()
+    drawn = rasterize(
+        dataclasses.replace(scene, means=means),
+        pose,
+        size=(16, 32),
+        backend="numba",
+        covariances=scene.covariances if covariances else None,
+    )
+    drawn.color.sum().backward()
+    for signature in _signatures("observe", "_observe"):
+        for task in tasks(signature, gradients=False):
+            assert task.arguments in _signatures(task.module, task.name), task.name
+    ours = [
+        signature
+        for signature in _signatures("observe", "_observe")
+        if (str(signature[4]) != "none") == covariances and (str(signature[12]) != "none") == (degree > 0)
+    ]
+    chains = _signatures("observe_backward", "_chain")
+    assert len(ours) == 1 and tasks(ours[0], gradients=True)[-1].arguments in chains
+
+
+def test_a_second_process_that_fails_is_not_waited_for(monkeypatch):
+    failing = _brings(monkeypatch, "raise SystemExit(3)")
+    assert failing.wait(lambda: None) is None
+    assert not failing.running
+    failing.stop()
+
+
+def test_a_second_process_that_hangs_is_ended(monkeypatch):
+    monkeypatch.setattr(beside, "_LONGEST", 0.1)
+    hanging = _brings(monkeypatch, "import time; time.sleep(600)")
+    assert hanging.wait(lambda: None) is None
+    assert not hanging.running
+
+
+def test_waiting_ends_when_the_kernel_is_there_though_the_process_goes_on(monkeypatch):
+    busy, looks = _brings(monkeypatch, "import time; time.sleep(600)"), iter([None, None, "code"])
+    assert busy.wait(lambda: next(looks)) == "code"
+    assert busy.running
+    busy.stop()
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="this system has no /proc")
+def test_the_second_process_ends_with_the_first():
+    parent = subprocess.run([sys.executable, "-c", _ABANDON], stdout=subprocess.PIPE, text=True)
+    state, deadline = Path("/proc", parent.stdout.strip(), "status"), time.monotonic() + 60
+    assert parent.returncode == -signal.SIGKILL and parent.stdout.strip()
+    with contextlib.suppress(OSError):  # it has gone
+        while "State:\tZ" not in state.read_text():  # or waits for somebody to clear it away
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+
+
+@pytest.mark.parametrize(
+    ("threads", "executable", "frozen", "expected"),
+    [
+        (2, "/usr/bin/python3", False, True),
+        (1, "/usr/bin/python3", False, False),
+        (2, "/usr/bin/python3", True, False),
+        (2, "/opt/editor/bin/editor", False, False),
+        (2, None, False, False),
+    ],
+)
+def test_a_second_process_needs_a_second_thread_and_an_interpreter(threads, executable, frozen, expected, monkeypatch):
+    monkeypatch.setattr(beside, "thread_count", lambda: threads)
+    monkeypatch.setattr(sys, "executable", executable)
+    monkeypatch.setattr(sys, "frozen", frozen, raising=False)
+    assert possible() is expected
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """The lists of tasks that second processes were started for."""
+    lists = []
+
+    def start(work):
+        lists.append([task.name for task in work])
+        return SimpleNamespace(kernels=frozenset((task.module, task.name) for task in work), wait=lambda look: "waited")
+
+    monkeypatch.setattr(beside, "Beside", start)
+    monkeypatch.setattr(beside, "thread_count", lambda: 2)
+    monkeypatch.setattr(compiling, "_second", None)
+    return lists
+
+
+_OBSERVED = tuple(range(18))  # in place of the types
+
+
+@pytest.mark.parametrize("gradients", [False, True])
+def test_the_first_kernel_that_is_missing_starts_the_second_process_once(gradients, started):
+    with compiling.announced(gradients=gradients):
+        assert compiling._load(("observe", "_observe"), lambda *_: None, _OBSERVED, None) is None
+        assert compiling._load(("observe", "_observe"), lambda *_: None, _OBSERVED, None) is None
+        assert compiling._load(("raster", "_draw_tiles"), lambda *_: None, (), None) == "waited"
+        assert compiling._load(("boxes", "_panorama"), lambda *_: None, (), None) is None
+    assert started == [["_survey", "_count_digits", "_list", "_draw_tiles", *(["_chain"] if gradients else [])]]
+
+
+def test_no_second_process_is_started_for_kernels_on_disk_nor_outside_a_picture(started):
+    with compiling.announced():
+        assert compiling._load(("observe", "_observe"), lambda *_: "code", _OBSERVED, None) == "code"
+        assert compiling._load(("boxes", "_panorama"), lambda *_: None, (), None) is None
+    assert compiling._load(("observe", "_observe"), lambda *_: None, _OBSERVED, None) is None
+    assert started == []
+
+
+def test_where_no_process_can_be_had_everything_is_compiled_here(started, monkeypatch):
+    def refuse(work):
+        raise BlockingIOError("no more processes")
+
+    monkeypatch.setattr(beside, "Beside", refuse)
+    with compiling.announced():
+        assert compiling._load(("observe", "_observe"), lambda *_: None, _OBSERVED, None) is None
+    assert compiling._second is None
+
+
+def test_tasks_can_be_told_to_another_process():
+    (signature, *_) = list(observe._observe.overloads) or [_OBSERVED]
+    work = tasks(signature, gradients=True)
+    assert pickle.loads(pickle.dumps(work)) == work
