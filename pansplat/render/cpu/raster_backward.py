@@ -13,7 +13,7 @@ import numpy as np
 
 from pansplat.render.cpu.compiling import inlined, kernel
 from pansplat.render.cpu.moments import GROUP, MOMENTS, PAIR, write_chunk
-from pansplat.render.cpu.raster import FEW, HALF, Floats, Integers, Kept, Longs, find_powers, opacity, pieces_of
+from pansplat.render.cpu.raster import HALF, Floats, Integers, Kept, Longs, find_powers, opacity, pieces_of
 from pansplat.render.cpu.records import FIELDS, TILE
 from pansplat.render.cpu.simd import (
     LANES,
@@ -103,7 +103,7 @@ def _walk_tiles(  # type: ignore[no-untyped-def]
     planes = (num_values + GROUP - 1) // GROUP * GROUP
     offsets, middle, through = np.empty(3 * PIXELS, np.float32), np.empty(6, np.float32), np.empty(PIXELS, np.float32)
     upstream, behind = np.zeros((planes + 2) * PIXELS, np.float32), np.empty(PIXELS, np.float32)
-    forms, colours = np.empty(FORMS * CHUNK, np.float32), np.empty(num_values * CHUNK, np.float32)
+    forms, colours = np.empty(FORMS * CHUNK, np.float32), np.zeros(num_values * CHUNK + GROUP, np.float32)
     # Of each pair also its block, and the same Gaussian's pair before.
     slopes, pairs = np.empty(_PAIRS * PAIR, np.float32), np.empty(2 * _PAIRS, np.int32)
     heads, touched = np.empty(CHUNK, np.int32), np.empty(WORDS * EDGES, np.uint64)
@@ -216,18 +216,16 @@ def _slope_block(  # type: ignore[no-untyped-def]
     most, one, zero = fill(np.float32(MOST)), fill(np.float32(1)), fill(np.float32(0))
     pixel = block * LANES
     beyond, base = load(behind, pixel), load(upstream, planes * PIXELS + pixel)
-    of0, of1 = load(upstream, pixel), load(upstream, PIXELS + pixel)
-    of2, of3 = load(upstream, 2 * PIXELS + pixel), load(upstream, 3 * PIXELS + pixel)
     for at in range(reached - 1, -1, -1):
         s = np.int64(element(places, start + at))
         alpha, weight = load(alphas, (start + at) * LANES), load(weights, at * LANES)
-        if num_values == FEW:
-            worth = multiply_add(of0, spread(colours, FEW * s), base)
-            worth = multiply_add(of1, spread(colours, FEW * s + 1), worth)
-            worth = multiply_add(of2, spread(colours, FEW * s + 2), worth)
-            worth = multiply_add(of3, spread(colours, FEW * s + 3), worth)
-        else:
-            worth = _worth_of(s, pixel, base, upstream, colours, num_values)
+        worth = base
+        for value in range(0, planes, GROUP):  # beyond the last stand other finite numbers, times 0
+            own, colour = value * PIXELS + pixel, num_values * s + value
+            worth = multiply_add(load(upstream, own), spread(colours, colour), worth)
+            worth = multiply_add(load(upstream, own + PIXELS), spread(colours, colour + 1), worth)
+            worth = multiply_add(load(upstream, own + 2 * PIXELS), spread(colours, colour + 2), worth)
+            worth = multiply_add(load(upstream, own + 3 * PIXELS), spread(colours, colour + 3), worth)
         earned = weight * worth
         slope = multiply_add(negative(alpha / (one - alpha)), beyond, earned) * fill(np.float32(_LN2))
         store(slopes, pair * PAIR, choose(most > alpha, slope, zero))
@@ -238,14 +236,6 @@ def _slope_block(  # type: ignore[no-untyped-def]
         put(heads, s, np.int32(pair))
         pair += 1
     store(behind, pixel, beyond)
-
-
-@inlined
-def _worth_of(s, pixel, worth, upstream, colours, num_values):  # type: ignore[no-untyped-def]
-    """What a Gaussian's values, any number of them, add to what a weight is worth."""
-    for value in range(num_values):
-        worth = multiply_add(load(upstream, value * PIXELS + pixel), spread(colours, num_values * s + value), worth)
-    return worth
 
 
 @inlined
