@@ -18,6 +18,7 @@ import numpy as np
 from pansplat.model.sweep.sphere import pad_sphere, ray_grid
 
 _LUMA = np.array((0.299, 0.587, 0.114), np.float32)
+_OPPOSED = (np.float32(0.2), np.float32(-0.5))  # cosine between rays from which it costs, and from which in full
 _BLOCK = 8  # hypotheses that a thread holds at a time
 
 
@@ -36,8 +37,10 @@ class MatchingConfig:
     visible_penalty: float = 0.5
     """For a hypothesis in front of what the other view sees through it."""
     agreement_bonus: float = 0.15
-    occluded_cost: float = 0.5
+    occluded_cost: float = 0.6
     """For a hypothesis behind the other view's surface, where pictures cannot tell."""
+    unseen_cost: float = 0.8
+    """For a plane between the two cameras, of which each would see another face: pictures cannot tell."""
     tolerance: float = 0.08
     """Relative inverse depth within which two views agree."""
     outside_penalty: float = 1.0
@@ -52,12 +55,16 @@ class MatchingConfig:
     """A point this many times nearer to one camera than to the other is still compared like any other ..."""
     distance_penalty: float = 0.5
     """... and one infinitely nearer costs this: half the view shrinks to a few pixels, which fit anything."""
+    opposed_penalty: float = 0.5
+    """For a sphere where the rays to a point meet at 120 degrees or more, falling to none at 78: nobody sees a
+    surface from both its sides, and few surfaces lie so flat to both."""
 
 
 _WEIGHTS = (
     "correlation_weight", "color_weight", "color_limit", "variance_floor", "visible_penalty",
     "agreement_bonus", "occluded_cost", "tolerance", "outside_penalty",
     "flat_weight", "flat_cost", "texture_variance", "distance_ratio", "distance_penalty",
+    "opposed_penalty", "unseen_cost",
 )  # fmt: skip  # the order in which the kernel unpacks them
 
 
@@ -79,8 +86,9 @@ def _fast_atan2(y, x):
 
 
 @nb.njit(fastmath=True, nogil=True, cache=True)
-def _project_row(rays, rotation, translation, inverse, height, width, u, v, scale):
-    """Padded pixel coordinates in the other view of one row's hypotheses, and their inverse depth's ratio there."""
+def _project_row(rays, rotation, translation, inverse, height, width, u, v, scale, cosine):
+    """Of one row's hypotheses: padded pixel coordinates in the other view, their inverse depth's ratio there, and the
+    cosine between the two views' rays."""
     for j in range(rays.shape[0]):
         dx, dy, dz = rays[j, 0], rays[j, 1], rays[j, 2]
         rho = inverse[j]
@@ -91,6 +99,8 @@ def _project_row(rays, rotation, translation, inverse, height, width, u, v, scal
         u[j] = (_fast_atan2(x, z) * np.float32(0.5 / math.pi) + np.float32(0.5)) * width + np.float32(0.5)
         v[j] = (_fast_atan2(y, math.sqrt(flat)) * np.float32(1 / math.pi) + np.float32(0.5)) * height + np.float32(0.5)
         scale[j] = np.float32(1) / math.sqrt(max(flat + y * y, np.float32(1e-12)))
+        along = rho * (x * translation[0] + y * translation[1] + z * translation[2])
+        cosine[j] = (flat + y * y - along) * scale[j]
 
 
 @nb.njit(fastmath=True, nogil=True, cache=True)
@@ -149,14 +159,18 @@ def _pad_in_place(padded, m):
 
 @nb.njit(parallel=True, fastmath=True, cache=True)
 def _family_cost(
-    image, gray, mean, variance, other, rays, rotation, translation, base, step, limits, penalty, side,
+    image, gray, mean, variance, other, rays, rotation, translation, base, step, limits, penalty, unseen, sphere, side,
     down, floor_ceiling, usable, other_usable, other_inverse, other_confidence, informed, weights, m,
     cost, offset, count,
 ):  # fmt: skip
     height, width = image.shape[:2]
     low, high = limits
     correlation_weight, color_weight, color_limit, epsilon, visible, bonus, occluded, tolerance, outside = weights[:9]
-    flat_weight, flat_cost, texture_variance, distance_ratio, distance_penalty = weights[9:]
+    flat_weight, flat_cost, texture_variance, distance_ratio, distance_penalty = weights[9:14]
+    opposed_penalty, unseen_cost = weights[14:]
+    opposed_from, opposed_to = _OPPOSED
+    if not sphere:
+        opposed_penalty = np.float32(0)
     neutral = np.float32(0.5) * (correlation_weight + color_weight)
     impossible = np.float32(2) * (correlation_weight + color_weight)
     area = np.float32(1.0 / ((2 * m + 1) * (2 * m + 1)))
@@ -174,7 +188,7 @@ def _family_cost(
         )
         column = np.empty((3, width + 2 * m), np.float32)
         u, v, scale = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
-        inverse = np.empty(width, np.float32)
+        inverse, cosine = np.empty(width, np.float32), np.empty(width, np.float32)
         result = np.empty((height, width, _BLOCK), np.float32)
         first = block * _BLOCK
         last = min(first + _BLOCK, count)
@@ -182,7 +196,7 @@ def _family_cost(
             for i in range(height):
                 for j in range(width):
                     inverse[j] = base[i, j] + np.float32(k) * step[i, j]
-                _project_row(rays[i], rotation, translation, inverse, height, width, u, v, scale)
+                _project_row(rays[i], rotation, translation, inverse, height, width, u, v, scale, cosine)
                 for j in range(width):
                     iu = min(max(int(u[j]), 0), width)
                     iv = min(max(int(v[j]), 0), height)
@@ -202,7 +216,11 @@ def _family_cost(
                     qj = int(u[j] - np.float32(0.5)) % width
                     state[i, j] = 1 if inverse[j] < low or inverse[j] > high else (0 if other_usable[qi, qj] else 2)
                     ratio[i, j] = inverse[j] * scale[j] / other_inverse[qi, qj] if informed else np.float32(1)
-                    unlike[i, j] = max(1 - distance_ratio * min(scale[j], 1 / scale[j]), np.float32(0))
+                    unlike[i, j] = distance_penalty * max(
+                        1 - distance_ratio * min(scale[j], 1 / scale[j]), np.float32(0)
+                    )
+                    opposed = (opposed_from - cosine[j]) / (opposed_from - opposed_to)
+                    unlike[i, j] += opposed_penalty * min(max(opposed, np.float32(0)), np.float32(1))
                     trust[i, j] = other_confidence[qi, qj] if informed else np.float32(0)
             _pad_in_place(warped, m)
             _window_sums(gray, warped, m, column[0], column[1], column[2], sum_b, sum_bb, sum_ab)
@@ -216,7 +234,7 @@ def _family_cost(
                     said = variance[i, j] / (variance[i, j] + texture_variance)
                     said = flat_weight + (1 - flat_weight) * said
                     c = said * c + (1 - said) * flat_cost
-                    extra = penalty[side[i, j], k] + unlike[i, j] * distance_penalty
+                    extra = penalty[side[i, j], k] + unlike[i, j]
                     t = trust[i, j]
                     if ratio[i, j] > 1 + tolerance:
                         extra += visible * t
@@ -224,6 +242,8 @@ def _family_cost(
                         extra -= bonus * t
                     else:
                         c = (1 - t) * c + t * occluded
+                    if unseen[side[i, j], k]:
+                        c = unseen_cost
                     if state[i, j] == 2 or not usable[i, j]:
                         c = neutral
                     below = down[i, j] / max(base[i, j] + np.float32(k) * step[i, j], low)
@@ -240,13 +260,17 @@ def _family_cost(
 class Family:
     """Hypotheses that belong together; see the module's description. Maps are (h, w) float32.
 
-    `penalty` (2, count) is added to a hypothesis' cost by the side of its planes that a pixel looks at (`side`).
+    `penalty` (2, count) is added to a hypothesis' cost by the side of its planes that a pixel looks at (`side`), and
+    `unseen` (2, count), none unless given, are those that the other view sees from behind. `sphere` tells that the
+    hypotheses are spheres around the camera.
     """
 
     base: np.ndarray
     step: np.ndarray
     penalty: np.ndarray
     side: np.ndarray
+    unseen: np.ndarray | None = None
+    sphere: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,9 +318,10 @@ def matching_cost(
     rotation = np.ascontiguousarray(pose[:3, :3], np.float32)
     translation = np.ascontiguousarray(pose[:3, 3], np.float32)
     for n, family in enumerate(families):
+        unseen = np.zeros((2, count), bool) if family.unseen is None else family.unseen
         _family_cost(
-            view.image, gray, mean, variance, other_image, rays, rotation, translation,
-            family.base, family.step, (np.float32(limits[0]), np.float32(limits[1])), family.penalty, family.side,
+            view.image, gray, mean, variance, other_image, rays, rotation, translation, family.base, family.step,
+            (np.float32(limits[0]), np.float32(limits[1])), family.penalty, unseen, family.sphere, family.side,
             view.down, (np.float32(floor_ceiling[0]), np.float32(floor_ceiling[1])), view.usable, other.usable,
             other_inverse, other_confidence, informed, weights, m, cost, n * count, count,
         )  # fmt: skip

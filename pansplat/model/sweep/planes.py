@@ -54,6 +54,18 @@ class PlaneSupport:
         found = np.log1p(self.histogram[axis, index] / _LITTLE) / np.log1p(_MUCH / _LITTLE)
         return np.clip(np.maximum(found, self.votes[axis, index]), 0, 1)
 
+    def backs(self, axis: int, cam2world: np.ndarray, other: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+        """Which planes at distances 1 / `inverse` on the negative and positive side, (2, n), stand between two cameras.
+
+        Each camera would see a face of its own.
+        """
+        here, there = (self.axes[axis] @ pose[:3, 3] for pose in (cam2world, other))
+        return np.stack([sign * (here - there) + 1 / inverse <= 0 for sign in (-1, 1)])
+
+    def floor_below(self, cam2world: np.ndarray) -> float:
+        """How far below a camera the floor is that pixels voted for, metres; infinite where there is none."""
+        return self.floor_ceiling[0] - float(self.axes[_HORIZONTAL] @ (cam2world[:3, 3] - self.origin))
+
     def bounds(self, cam2world: np.ndarray) -> tuple[float, float]:
         """How far the scene reaches down and up (negative) from a camera, metres; infinite where unknown."""
         horizontal = self.histogram[_HORIZONTAL]

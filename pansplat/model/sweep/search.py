@@ -1,7 +1,7 @@
 """The hierarchical plane sweep: from posed panoramas to a surface for each of them.
 
-First pixels vote for the planes that the scene has. Then come three levels, as in the paper's hierarchical cost
-volume (PanSplat, section 3.2), at 1/4, 1/2 and 1/1 of the height.
+First pixels vote for the planes that the scene has, and each picture shows where its floor ends. Then come three
+levels, as in the paper's hierarchical cost volume (PanSplat, section 3.2), at 1/4, 1/2 and 1/1 of the height.
 The coarse level searches the whole depth range among spheres and among planes along the scene's axes, twice: the
 second time every view knows the other views' surfaces (what they see through, agree with, or hide) and which
 planes the scene has. Each finer level searches a narrow range around the coarser surface.
@@ -9,6 +9,7 @@ planes the scene has. Each finer level searches a narrow range around the coarse
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,13 +19,15 @@ import numpy as np
 
 from pansplat.model.sweep.aggregate import AggregationConfig, aggregate, best_labels
 from pansplat.model.sweep.cost import Family, MatchingConfig, View, matching_cost
+from pansplat.model.sweep.floor import FloorClues, FloorConfig, add_clues, find_floor
 from pansplat.model.sweep.frame import main_directions, scene_axes
 from pansplat.model.sweep.planes import MIN_FLOOR, PlaneSupport, no_support, plane_support
 from pansplat.model.sweep.sphere import resize_sphere
 from pansplat.model.sweep.surface import Surface, agreement, guided_upsample
 from pansplat.model.sweep.votes import vote_for_planes
 
-_VOTING_HEIGHT = 128
+_FIRST_HEIGHT = 128
+_FLOOR_THICKNESS = 2.5  # bins of the planes' offsets
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,7 @@ class SearchConfig:
     """Penalty of hypotheses that are no plane."""
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     aggregation: AggregationConfig = field(default_factory=AggregationConfig)
+    floor: FloorConfig = field(default_factory=FloorConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,11 +90,13 @@ def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[
     step = (high - low) / (count - 1)
     report("finding floor, ceiling and walls", 0.0)
     support = no_support(posed.cam2world, axes, posed.near, posed.far)
-    support = _Level(posed, min(finest, _VOTING_HEIGHT), support, (low, high), config, None).vote()
+    first = _Level(posed, min(finest, _FIRST_HEIGHT), support, (low, high), config, None)
+    support = first.vote()
+    clues = first.find_floor(support)
     for n in range(config.coarse_passes):
         report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
         level = _Level(posed, heights[0], support, (low, high), config, surfaces)
-        surfaces = [level.search_all(view, count) for view in range(len(posed.images))]
+        surfaces = [level.search_all(view, count, clues and clues[view]) for view in range(len(posed.images))]
     for n, height in enumerate(heights[1:]):
         report("refining the surfaces", 0.5 + 0.25 * n)
         assert surfaces is not None
@@ -162,7 +168,11 @@ class _Level:
             MIN_FLOOR * self.posed.near, self.config.matching,
         )  # fmt: skip
 
-    def search_all(self, view: int, count: int) -> Surface:
+    def find_floor(self, support: PlaneSupport) -> list[FloorClues] | None:
+        """What each picture says of the floor."""
+        return find_floor(self.views, self.rays, self.posed.cam2world, support, self.config.matching)
+
+    def search_all(self, view: int, count: int, clues: FloorClues | None) -> Surface:
         """The whole depth range, among spheres (family 0) and planes along the axes (families 1 to 3)."""
         low, high = self.limits
         step = (high - low) / (count - 1)
@@ -182,7 +192,18 @@ class _Level:
             for slope, penalty, side in zip(slopes, penalties, sides, strict=True)
         ]
         slot_map = np.stack([np.stack((s, (s - 1) * low / step + 0.5), axis=-1) for s in slopes], axis=2)
-        return self._solve(view, families, slot_map.astype(np.float32), count)
+        cost = self._matched(view, lambda other: self._faces(view, other, families, inverse))
+        if clues is not None:
+            below = self.support.floor_below(self.posed.cam2world[view])
+            is_floor = np.abs(1 / inverse - below) < _FLOOR_THICKNESS * self.support.bin
+            add_clues(cost, clues, families, is_floor, self.rays[view], self.config.floor)
+        return self._solve(view, families, cost, slot_map.astype(np.float32), count)
+
+    def _faces(self, view: int, other: int, families: list[Family], inverse: np.ndarray) -> list[Family]:
+        """The families, with which of their planes the other view would see from behind."""
+        pose, there = self.posed.cam2world[[view, other]]
+        unseen = [None] + [self.support.backs(axis, pose, there, inverse) for axis in range(3)]
+        return [dataclasses.replace(f, unseen=u, sphere=u is None) for f, u in zip(families, unseen, strict=True)]
 
     def search_near(self, view: int, count: int, step: float, *, spread: bool) -> Surface:
         """A narrow range around the surface so far; with `spread` also around its neighbours' near and far side."""
@@ -199,24 +220,29 @@ class _Level:
         slots = 2 * count
         starts = np.stack([np.clip((c - known) / step, -4 * slots, 4 * slots) + count / 2 for c in centres], axis=2)
         slot_map = np.stack((np.ones_like(starts), starts), axis=-1).astype(np.float32)
-        surface = self._solve(view, families, slot_map, slots)
+        cost = self._matched(view, lambda other: families)
+        surface = self._solve(view, families, cost, slot_map, slots)
         return Surface(surface.inverse_depth, self.surfaces[view].family)
 
-    def _solve(self, view: int, families: list[Family], slot_map: np.ndarray, slots: int) -> Surface:
-        """Match against every other view, aggregate, and read the best hypothesis off."""
-        count = families[0].penalty.shape[1]
+    def _matched(self, view: int, families: Callable[[int], list[Family]]) -> np.ndarray:
+        """Mean cost (h, w, families * count) against every other view; `families` are those to compare it by."""
         others = [n for n in range(len(self.views)) if n != view]
         bounds = self.support.bounds(self.posed.cam2world[view])
         cost: np.ndarray | None = None
         for other in others:
             part = matching_cost(
                 self.views[view], self.views[other], self.posed.relative_pose(view, other),
-                families, self.limits, bounds, self.config.matching,
+                families(other), self.limits, bounds, self.config.matching,
             )  # fmt: skip
             cost = part if cost is None else cost + part
         assert cost is not None
         if len(others) > 1:
             cost /= len(others)
+        return cost
+
+    def _solve(self, view: int, families: list[Family], cost: np.ndarray, slot_map: np.ndarray, slots: int) -> Surface:
+        """Aggregate, and read the best hypothesis off."""
+        count = families[0].penalty.shape[1]
         total = aggregate(cost, self.views[view].image, slot_map, slots, self.config.aggregation)
         label, offset = best_labels(total, count)
         family, k = label // count, label % count

@@ -46,8 +46,8 @@ def vote_for_planes(
     for view in range(len(views)):
         for other in range(len(views)):
             if other != view:
-                pose = np.linalg.inv(cam2world[other]) @ cam2world[view]
-                votes += _votes(views[view], views[other], rays[view], pose, cam2world[view], support, limits, config)
+                poses = (cam2world[view], cam2world[other])
+                votes += _votes(views[view], views[other], rays[view], poses, support, limits, config)
     shares = np.log1p(votes / (_LITTLE * votes.max() + 1e-9)) / math.log1p(1 / _LITTLE)
     offsets = support.offsets
     reach = []
@@ -62,27 +62,30 @@ def _votes(
     view: View,
     other: View,
     rays: np.ndarray,
-    pose: np.ndarray,
-    cam2world: np.ndarray,
+    poses: tuple[np.ndarray, np.ndarray],
     support: PlaneSupport,
     limits: tuple[float, float],
     config: MatchingConfig,
 ) -> np.ndarray:
     """Votes (3, bins) of one view's pixels, matched against one other."""
+    here, there = poses
     low, high = limits
     step = (high - low) / (_CANDIDATES - 1)
     inverse = low + step * np.arange(_CANDIDATES)
-    nothing, side = np.zeros((2, _CANDIDATES), np.float32), np.zeros(rays.shape[1:], np.uint8)
+    nothing = np.zeros((2, _CANDIDATES), np.float32)
     families = [
-        Family((low * slope).astype(np.float32), (step * slope).astype(np.float32), nothing, side)
-        for slope in np.abs(rays)
-    ]
-    cost = matching_cost(view, other, pose, families, limits, (math.inf, -math.inf), config)
+        Family(
+            (low * slope).astype(np.float32), (step * slope).astype(np.float32), nothing, side,
+            support.backs(axis, here, there, inverse),
+        )
+        for axis, (slope, side) in enumerate(zip(np.abs(rays), (rays > 0).astype(np.uint8), strict=True))
+    ]  # fmt: skip
+    cost = matching_cost(view, other, np.linalg.inv(there) @ here, families, limits, (math.inf, -math.inf), config)
     fit = np.exp(-cost / _SOFTNESS)
     fit *= (_texture(view) / fit.sum(axis=-1))[..., None] * np.maximum(_POOR - cost, 0)
     votes = np.zeros_like(support.histogram)
     for axis in range(3):
-        centre = support.axes[axis] @ (cam2world[:3, 3] - support.origin)
+        centre = support.axes[axis] @ (here[:3, 3] - support.origin)
         for sign in (-1, 1):
             facing = sign * rays[axis] > _MIN_SLANT
             found = fit[facing][:, axis * _CANDIDATES : (axis + 1) * _CANDIDATES].sum(axis=0)

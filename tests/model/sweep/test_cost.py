@@ -210,3 +210,30 @@ def test_fast_atan2_is_right_on_the_axes():
     y = np.array((0, 0, 1, -1, 0), np.float32)
     x = np.array((1, -1, 0, 0, 0), np.float32)
     assert np.allclose(_all_atan2(y, x), np.arctan2(y, x), atol=2e-6)
+
+
+def test_a_plane_that_the_other_view_sees_from_behind_is_not_compared(empty_room):
+    views = [_view(image) for image in empty_room.posed.images]
+    plain = _family(96, np.array((0.25, 0.5), np.float32))
+    hidden = dataclasses.replace(plain, unseen=np.array(((False, True), (False, False))))
+    pose = empty_room.posed.relative_pose(0, 1)
+    before, cost = (matching_cost(*views, pose, [f], (0.1, 2.0), _ANYWHERE, _PLAIN) for f in (plain, hidden))
+    assert np.array_equal(cost[..., 0], before[..., 0])
+    assert np.allclose(cost[..., 1], _PLAIN.unseen_cost) and not np.allclose(before[..., 1], _PLAIN.unseen_cost)
+
+
+def test_spheres_seen_from_opposite_directions_cost_more_and_planes_do_not(empty_room):
+    views, pose = [_view(image) for image in empty_room.posed.images], np.eye(4)
+    pose[0, 3] = 2.0
+    inverses = np.array((0.5, 1.25, 2.0), np.float32)
+    family = _family(96, inverses)
+    plain, sphere = (
+        matching_cost(*views, pose, [dataclasses.replace(family, sphere=s)], (0.1, 4.0), _ANYWHERE, _PLAIN)
+        for s in (False, True)
+    )
+    rays = ray_grid(96)[..., None, :]
+    there = rays / inverses[:, None] + np.array((2.0, 0, 0))
+    cosine = (rays * there).sum(axis=-1) / np.linalg.norm(there, axis=-1)
+    expected = _PLAIN.opposed_penalty * ((0.2 - cosine) / 0.7).clip(0, 1)
+    assert expected.max() == _PLAIN.opposed_penalty and (expected == 0).mean() > 0.3
+    assert np.allclose(sphere - plain, expected, atol=1e-4)

@@ -90,3 +90,22 @@ def test_floor_and_ceiling_that_pixels_voted_for_come_before_those_of_surfaces(s
     below = 2.0 - (pose[1, 3] - support.origin[1])
     assert voted[0] == pytest.approx(1.06 * below + support.bin)
     assert voted[1] == support.bounds(pose)[1]
+
+
+def test_planes_between_two_cameras_show_them_different_faces():
+    """Cameras at x = 0 and x = 1, planes across x."""
+    here, there = np.eye(4), np.eye(4)
+    there[0, 3] = 1.0
+    nothing = no_support(np.stack((here, there)), _AXES, 0.5, 8.0)
+    distance = np.array((0.5, 0.9, 1.1, 3.0))
+    assert np.array_equal(nothing.backs(1, here, there, 1 / distance), ((False,) * 4, (True, True, False, False)))
+    assert np.array_equal(nothing.backs(1, there, here, 1 / distance), ((True, True, False, False), (False,) * 4))
+    assert not nothing.backs(0, here, there, 1 / distance).any()
+
+
+def test_the_floor_is_below_each_camera_by_its_own_height():
+    poses = np.stack((np.eye(4), np.eye(4)))
+    poses[1, 1, 3] = 0.4  # lower by that
+    floor = dataclasses.replace(no_support(poses, _AXES, 0.5, 8.0), floor_ceiling=(1.0, -np.inf))
+    assert floor.floor_below(poses[0]) == pytest.approx(1.2)
+    assert floor.floor_below(poses[1]) == pytest.approx(0.8)

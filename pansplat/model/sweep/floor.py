@@ -1,0 +1,221 @@
+"""What one picture says by itself: what looks like the floor, and how far away the things are that stand on it.
+
+Where only one view sees a wall nothing can be matched, but the wall's foot shows where it stands. What the floor looks
+like the scene tells itself: what lies steeply below the cameras and matches as floor does, what is above the
+horizon does not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy import ndimage
+
+from pansplat.model.sweep.cost import Family, MatchingConfig, View, matching_cost
+from pansplat.model.sweep.planes import PlaneSupport
+from pansplat.model.sweep.sphere import nearest_pixel, pad_sphere, resize_sphere
+
+_BINS = (5, 8, 32, 32)  # texture, lightness and the two colour axes of CIELAB
+_BLUR = (0.7, 0.5, 1.0, 1.0)  # of the histogram, bins
+_UNKNOWN = 2e-5  # density of a bin below which nothing is known of it
+_STEEP = 0.4  # sine of the angle below the horizon of what may teach the floor
+_FLOOR_MATCH = 0.5  # cost up to which a pixel matches as floor
+_SMOOTHING, _EDGE = 50.0, 6.0  # of the likeness, between the picture's edges: lambda, sigma of 8 bit values
+_FLOOR_LIKE = 0.2  # likeness before an end, at least
+_MIN_DROP, _SURE_DROP = 0.35, 0.8  # of the likeness where the floor ends
+_BAD_FLOOR, _SLACK = 1.0, 0.2  # cost at which what lies before a foot is no floor after all
+_FOOT_TOLERANCE = 0.12  # of the logarithm of a foot's distance
+_ANY_DEPTH = (1e-6, 1e6)  # inverse, 1/m
+
+
+@dataclass(frozen=True)
+class FloorConfig:
+    """How much is made of the floor's look, in the matching cost's unit."""
+
+    unlike_penalty: float = 0.5
+    """For the floor where the picture surely does not look like it."""
+    like_penalty: float = 0.3
+    """For anything but the floor where the picture surely looks like it."""
+    foot_bonus: float = 0.6
+    """For standing on the floor where the floor ends ..."""
+    foot_reach: float = 0.6
+    """... falling by e this many radians above the foot."""
+
+
+@dataclass(frozen=True, eq=False)
+class FloorClues:
+    """What one view's picture says.
+
+    Attributes:
+        likeness: (h, w) from -1, surely no floor, to 1.
+        foot_angle: (azimuths) angle below the horizon where the floor ends, radians; below it there is floor.
+        foot_distance: (azimuths) from the camera to there along the floor, metres.
+        foot_strength: (azimuths) in [0, 1]; 0 where no end was found.
+    """
+
+    likeness: np.ndarray
+    foot_angle: np.ndarray
+    foot_distance: np.ndarray
+    foot_strength: np.ndarray
+
+
+def find_floor(
+    views: Sequence[View],
+    rays: Sequence[np.ndarray],
+    cam2world: np.ndarray,
+    support: PlaneSupport,
+    config: MatchingConfig,
+) -> list[FloorClues] | None:
+    """What each view's picture says of the floor; None where pixels voted for none.
+
+    Args:
+        rays: (3, h, w) for each view, components of its rays along the scene's axes.
+    """
+    below = [support.floor_below(pose) for pose in cam2world]
+    if not all(support.bin < depth < math.inf for depth in below):
+        return None
+    costs = [
+        np.mean(
+            [
+                _cost_of_floor(view, other, ray[0], depth, np.linalg.inv(pose_of_other) @ pose, config)
+                for other, pose_of_other in zip(views, cam2world, strict=True)
+                if other is not view
+            ],
+            axis=0,
+        )
+        for view, ray, depth, pose in zip(views, rays, below, cam2world, strict=True)
+    ]
+    likeness = _likeness(views, rays, costs)
+    return [
+        FloorClues(like, *_feet(like, cost, view.usable, depth, support.axes @ pose[:3, :3]))
+        for like, cost, view, depth, pose in zip(likeness, costs, views, below, cam2world, strict=True)
+    ]
+
+
+def _cost_of_floor(
+    view: View, other: View, down: np.ndarray, below: float, pose: np.ndarray, config: MatchingConfig
+) -> np.ndarray:
+    """Matching cost (h, w) of the floor, `below` metres under the camera."""
+    base = np.maximum(down, 1e-3).astype(np.float32) / np.float32(below)
+    family = Family(base, np.zeros_like(base), np.zeros((2, 1), np.float32), np.zeros(base.shape, np.uint8))
+    return matching_cost(view, other, pose, [family], _ANY_DEPTH, (math.inf, -math.inf), config)[..., 0]
+
+
+def _likeness(views: Sequence[View], rays: Sequence[np.ndarray], costs: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """From -1 to 1: how much more often a pixel's colour and texture are found on the floor than above the horizon."""
+    floor, other = np.zeros(_BINS), np.zeros(_BINS)
+    looks = [_look(view.image) for view in views]
+    for view, ray, cost, look in zip(views, rays, costs, looks, strict=True):
+        height = len(view.image)
+        area = np.sin((np.arange(height) + 0.5) / height * math.pi)[:, None] * view.usable
+        np.add.at(floor, look, area * ((ray[0] > _STEEP) & (cost < _FLOOR_MATCH)))
+        np.add.at(other, look, area * (ray[0] < 0))
+    floor, other = (ndimage.gaussian_filter(h / max(h.sum(), 1e-9), _BLUR) + _UNKNOWN for h in (floor, other))
+    ratio = ((floor - other) / (floor + other)).astype(np.float32)
+    margin = 8
+    inside = (slice(margin, -margin), slice(margin, -margin))
+    return [
+        cv2.ximgproc.fastGlobalSmootherFilter(
+            (pad_sphere(view.image, margin) * 255).astype(np.uint8), pad_sphere(ratio[look], margin), _SMOOTHING, _EDGE
+        )[inside]
+        for view, look in zip(views, looks, strict=True)
+    ]
+
+
+def _look(image: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Bins of texture and colour, four maps (h, w)."""
+    padded = pad_sphere(image, 2)
+    inside = (slice(2, -2), slice(2, -2))
+    gray = padded.mean(axis=2)
+    variance = cv2.blur(gray * gray, (5, 5)) - cv2.blur(gray, (5, 5)) ** 2
+    texture = np.log2(np.sqrt(np.maximum(variance[inside], 1e-9)) / 0.006) + 1
+    lab = cv2.cvtColor(cv2.blur(padded, (3, 3)), cv2.COLOR_RGB2LAB)[inside]
+    values = (texture, lab[..., 0] / 12.5, lab[..., 1] / 4 + 16, lab[..., 2] / 4 + 16)
+    return tuple(np.clip(v, 0, bins - 1).astype(np.int64) for v, bins in zip(values, _BINS, strict=True))
+
+
+def _feet(
+    likeness: np.ndarray, cost: np.ndarray, usable: np.ndarray, below: float, down_first: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Angle, distance and strength of where the floor ends, by azimuth; see `FloorClues`.
+
+    Args:
+        cost: (h, w) of the floor.
+        down_first: (3, 3) the scene's axes, down first, in the camera's frame, as rows.
+    """
+    height, width = likeness.shape
+    angle = ((np.arange(height) + 0.5) / height - 0.5) * math.pi
+    row, column = nearest_pixel(_directions(angle, width) @ down_first, height)
+    like, cost, usable = likeness[row, column], cost[row, column], usable[row, column]
+    before = _mean_of_rows(like, 1, 4)
+    drop = before - _mean_of_rows(like, -2, 1)
+    ends = (drop > _MIN_DROP) & (before > _FLOOR_LIKE) & usable & np.roll(usable, -3, axis=0)
+    ends &= drop >= ndimage.maximum_filter1d(drop, 5, axis=0)
+    ends &= (angle > 0)[:, None]
+    ends[-4:] = False
+    lowest = height - 1 - ends[::-1].argmax(axis=0)
+    azimuth = np.arange(width)
+    is_floor = np.clip((_BAD_FLOOR - _mean_of_rows(cost, 2, 7)) / _SLACK, 0, 1)
+    strength = np.where(ends.any(axis=0), np.clip(drop / _SURE_DROP, 0, 1)[lowest, azimuth], 0)
+    foot = angle[lowest] + 0.5 * math.pi / height
+    return foot, below / np.tan(foot), strength * is_floor[lowest, azimuth]
+
+
+def _directions(angle: np.ndarray, width: int) -> np.ndarray:
+    """Unit vectors (angles, width, 3) along the scene's axes, down first, by angle below the horizon and azimuth."""
+    azimuth = (np.arange(width) + 0.5) / width * 2 * math.pi
+    along, down = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    return np.stack(np.broadcast_arrays(down, along * np.cos(azimuth), along * np.sin(azimuth)), axis=-1)
+
+
+def _mean_of_rows(values: np.ndarray, first: int, end: int) -> np.ndarray:
+    """For each row the mean of the rows from `first` up to `end` below it; the last ones stand for those beyond."""
+    margin = max(-first, end)
+    padded = np.pad(values, ((margin, margin), (0, 0)), mode="edge").astype(np.float64)
+    return sum(padded[margin + n : margin + n + len(values)] for n in range(first, end)) / (end - first)
+
+
+def add_clues(
+    cost: np.ndarray,
+    clues: FloorClues,
+    families: Sequence[Family],
+    is_floor: np.ndarray,
+    rays: np.ndarray,
+    config: FloorConfig,
+) -> None:
+    """Make hypotheses dearer or cheaper, in place, by what the picture says.
+
+    Args:
+        cost: (h, w, families * count).
+        families: spheres, then planes across the down axis, then upright planes.
+        is_floor: (count) the down axis' planes below the camera that are the floor.
+        rays: (3, h, w) components of the rays along the scene's axes.
+    """
+    count = families[0].penalty.shape[1]
+    below = rays[0] > 0
+    likeness = resize_sphere(clues.likeness, len(cost))
+    unlike = config.unlike_penalty * np.maximum(-likeness, 0) * below
+    like = (config.like_penalty * np.maximum(likeness, 0) * below).astype(np.float32)
+    cost += like[..., None]
+    for floor in np.flatnonzero(is_floor):
+        cost[..., count + floor] += unlike - like
+    width = len(clues.foot_angle)
+    azimuth = np.arctan2(rays[2], rays[1]) % (2 * math.pi)
+    column = np.minimum((azimuth * (width / (2 * math.pi))).astype(np.int64), width - 1)
+    above = clues.foot_angle[column] - np.arcsin(np.clip(rays[0], -1, 1))
+    weight = config.foot_bonus * clues.foot_strength[column] * np.exp(-np.maximum(above, 0) / config.foot_reach)
+    weight *= above > 0
+    upright = clues.foot_distance[column] / np.sqrt(np.maximum(1 - rays[0] ** 2, 1e-6))  # depth of what stands there
+    rows, columns = np.nonzero(weight > 1e-3)
+    k = np.arange(count, dtype=np.float32)
+    for n, family in enumerate(families):
+        if n == 1:  # what is level does not stand
+            continue
+        inverse = family.base[rows, columns, None] + k * family.step[rows, columns, None]
+        away = np.abs(np.log(np.maximum(inverse * upright[rows, columns, None], 1e-6))) / _FOOT_TOLERANCE
+        bonus = weight[rows, columns, None] * np.maximum(1 - away, 0)
+        cost[rows, columns, n * count : (n + 1) * count] -= bonus.astype(np.float32)
