@@ -40,42 +40,64 @@ class Task(NamedTuple):
     arguments: tuple[Any, ...]
 
 
-def tasks(observe: Sequence[Any], *, gradients: bool) -> list[Task]:
-    """About half of what a first picture needs, in the order it is needed.
+def theirs(*, gradients: bool) -> list[Task]:
+    """About half of what a first picture needs, for the second process, in the order it is needed.
 
-    Left to the first process are what it needs at once, and what not every picture needs.
+    Kernels that share helpers stay together, for each process compiles the helpers it needs.
+
+    Args:
+        gradients: whether a backward will follow.
+    """
+    singles, doubles, longs, plane = float32[:, ::1], float64[::1], int64[::1], (int64, *(float64[:, ::1],) * 3)
+    table, words, boxes, order = int64[:, ::1], uint64[::1], int16[:, ::1], int32[::1]
+    lists, picture, kept = (float32[::1], singles, order, longs), float32[:, :, ::1], (singles, longs, longs)
+    found = [
+        Task("radix", "_survey", (int64, singles, doubles, boxes, doubles, table)),
+        Task("radix", "_write_words", (int64, singles, doubles, boxes, doubles, int64, int64, int64, longs, words)),
+        Task("radix", "_count_digits", (int64, longs, words, int64, table)),
+        Task("bins", "_fetch", (int64, longs, order, longs, int64, longs, table)),
+        Task("bins", "_list", (int64, longs, order, longs, *(int64,) * 4, table, longs, longs, longs)),
+        Task("raster", "_draw_tiles", (*lists, *plane, picture, *kept, int64, int64, int64)),
+    ]
+    if gradients:
+        rest = picture, *kept, picture, float32[::1], float32[::1], int64, int64, int64
+        found.append(Task("raster_backward", "_walk_tiles", (*lists, longs, *plane, *rest)))
+    return found
+
+
+def ours(observe: Sequence[Any], *, gradients: bool) -> list[Task]:
+    """What the first process compiles before it waits for the second.
 
     Args:
         observe: the types that `_observe` is called with, whose variants (shapes, colours) are those of `_chain`.
         gradients: whether the exact kernel's backward will follow.
     """
-    singles, doubles, longs, plane = float32[:, ::1], float64[::1], int64[::1], (int64, *(float64[:, ::1],) * 3)
-    lists = float32[::1], singles, int32[::1], longs
-    picture, kept = float32[:, :, ::1], (singles, longs, longs)
-    found = [
-        Task("radix", "_survey", (int64, singles, doubles, int16[:, ::1], doubles, int64[:, ::1])),
-        Task("radix", "_count_digits", (int64, longs, uint64[::1], int64, int64[:, ::1])),
-        Task(
-            "bins",
-            "_list",
-            (int64, longs, int32[::1], longs, int64, int64, int64, int64, int64[:, ::1], longs, longs, longs),
-        ),
-        Task("raster", "_draw_tiles", (*lists, *plane, picture, *kept, int64, int64, int64)),
-    ]
-    if gradients:
-        fields, bends = tuple(observe[1:7]), observe[12]
-        camera, slots = (float64[:, ::1], float64, boolean, float64), (float32[::1], float32[::1], none, longs)
-        wanted = singles, singles, singles, picture, float32[::1], picture, float64[:, ::1]
-        found.append(
-            Task("observe_backward", "_chain", (int64, *fields, *camera, bends, uint8[::1], singles, *slots, *wanted))
-        )
-    return found
+    if not gradients:
+        return []
+    singles, picture = float32[:, ::1], float32[:, :, ::1]
+    camera, slots = (float64[:, ::1], float64, boolean, float64), (float32[::1], float32[::1], none, int64[::1])
+    wanted = singles, singles, singles, picture, float32[::1], picture, float64[:, ::1]
+    kinds = int64, *observe[1:7], *camera, observe[12], uint8[::1], singles, *slots, *wanted
+    return [Task("observe_backward", "_chain", kinds)]
+
+
+def compile_all(work: Sequence[Task]) -> None:
+    """Compile kernels, but for those that cannot be: whoever needs these will be told."""
+    for module, name, arguments in work:
+        with contextlib.suppress(Exception):
+            getattr(importlib.import_module(f"{_PACKAGE}.{module}"), name).compile(arguments)
 
 
 class Beside:
-    """A second process at work on some kernels; it ends when they are done, or when this one does."""
+    """A second process at work on some kernels; it ends when they are done, or when this one does.
 
-    def __init__(self, work: list[Task]) -> None:
+    Args:
+        work: for the second process.
+        meanwhile: for this one, when it would have to wait.
+    """
+
+    def __init__(self, work: list[Task], meanwhile: Sequence[Task] = ()) -> None:
+        self._meanwhile = meanwhile
         self.kernels = frozenset((task.module, task.name) for task in work)
         self._process = subprocess.Popen(
             [sys.executable, "-c", _PATH + _SERVE, *sys.path],
@@ -91,6 +113,8 @@ class Beside:
 
     def wait(self, look: Callable[[], _Code | None]) -> _Code | None:
         """What `look` finds before the process ends, or None; a process that takes absurdly long is ended."""
+        work, self._meanwhile = self._meanwhile, ()
+        compile_all(work)
         deadline = time.monotonic() + _LONGEST
         while self.running:
             if (found := look()) is not None:
@@ -127,9 +151,7 @@ def serve() -> None:
     work = pickle.load(sys.stdin.buffer)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     gc.disable()
-    for module, name, arguments in work:
-        with contextlib.suppress(Exception):  # whatever it is: the first process compiles this one
-            getattr(importlib.import_module(f"{_PACKAGE}.{module}"), name).compile(arguments)
+    compile_all(work)
 
 
 def _end_with_parent() -> None:

@@ -64,7 +64,8 @@ def _load(name: tuple[str, str], look: Callable[..., Any], signature: Any, conte
         return _second.wait(lambda: look(signature, context))
     if found is None and name == _FIRST and _gradients is not None and _second is None and beside.possible():
         with contextlib.suppress(OSError):  # no process to be had
-            _second = beside.Beside(beside.tasks(signature, gradients=_gradients))
+            mine = beside.ours(signature, gradients=_gradients)
+            _second = beside.Beside(beside.theirs(gradients=_gradients), meanwhile=mine)
     return found
 
 

@@ -17,8 +17,8 @@ import torch
 from numba import int64
 
 from pansplat.render import rasterize
-from pansplat.render.cpu import beside, compiling, observe
-from pansplat.render.cpu.beside import Beside, Task, possible, tasks
+from pansplat.render.cpu import beside, compiling
+from pansplat.render.cpu.beside import Beside, Task, ours, possible, theirs
 
 _PLACES = Task("radix", "_places", (int64[:, ::1],))
 _FIND = """
@@ -44,9 +44,9 @@ def _signatures(module, name):
     return list(getattr(importlib.import_module(f"pansplat.render.cpu.{module}"), name).overloads)
 
 
-def _brings(monkeypatch, code):
+def _brings(monkeypatch, code, **options):
     monkeypatch.setattr(beside, "_SERVE", code)
-    return Beside([_PLACES])
+    return Beside([_PLACES], **options)
 
 
 def test_a_kernel_that_the_second_process_compiled_is_not_compiled_again(tmp_path):
@@ -59,7 +59,7 @@ def test_a_kernel_that_the_second_process_compiled_is_not_compiled_again(tmp_pat
 
 @pytest.mark.parametrize("degree", [0, 1])
 @pytest.mark.parametrize("covariances", [False, True])
-def test_what_the_second_process_compiles_is_what_drawing_asks_for(degree, covariances, make_scene, pose):
+def test_what_is_compiled_ahead_is_what_drawing_asks_for(degree, covariances, make_scene, pose):
     scene = make_scene(20, scale=0.15, degree=degree, seed=1).to(dtype=torch.float32)
     means = scene.means.clone().requires_grad_()
     drawn = rasterize(
@@ -70,16 +70,15 @@ def test_what_the_second_process_compiles_is_what_drawing_asks_for(degree, covar
         covariances=scene.covariances if covariances else None,
     )
     drawn.color.sum().backward()
-    for signature in _signatures("observe", "_observe"):
-        for task in tasks(signature, gradients=False):
-            assert task.arguments in _signatures(task.module, task.name), task.name
-    ours = [
+    for task in theirs(gradients=True):
+        assert task.arguments in _signatures(task.module, task.name), task.name
+    observed = [
         signature
         for signature in _signatures("observe", "_observe")
         if (str(signature[4]) != "none") == covariances and (str(signature[12]) != "none") == (degree > 0)
     ]
-    chains = _signatures("observe_backward", "_chain")
-    assert len(ours) == 1 and tasks(ours[0], gradients=True)[-1].arguments in chains
+    (chain,) = ours(observed[0], gradients=True)
+    assert len(observed) == 1 and chain.arguments in _signatures("observe_backward", "_chain")
 
 
 def test_a_second_process_that_fails_is_not_waited_for(monkeypatch):
@@ -101,6 +100,18 @@ def test_waiting_ends_when_the_kernel_is_there_though_the_process_goes_on(monkey
     assert busy.wait(lambda: next(looks)) == "code"
     assert busy.running
     busy.stop()
+
+
+def test_what_is_left_to_the_first_process_is_compiled_once_before_it_waits(monkeypatch):
+    done = []
+    monkeypatch.setattr(beside, "compile_all", lambda work: done.extend(work))
+    failing = _brings(monkeypatch, "raise SystemExit(3)", meanwhile=[_PLACES])
+    assert done == []
+    failing.wait(lambda: done.append("look"))
+    assert done[0] == _PLACES and set(done[1:]) == {"look"}
+    failing.wait(lambda: None)
+    assert done.count(_PLACES) == 1
+    failing.stop()
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="this system has no /proc")
@@ -136,8 +147,8 @@ def started(monkeypatch):
     """The lists of tasks that second processes were started for."""
     lists = []
 
-    def start(work):
-        lists.append([task.name for task in work])
+    def start(work, meanwhile):
+        lists.append([[task.name for task in part] for part in (work, meanwhile)])
         return SimpleNamespace(kernels=frozenset((task.module, task.name) for task in work), wait=lambda look: "waited")
 
     monkeypatch.setattr(beside, "Beside", start)
@@ -156,7 +167,8 @@ def test_the_first_kernel_that_is_missing_starts_the_second_process_once(gradien
         assert compiling._load(("observe", "_observe"), lambda *_: None, _OBSERVED, None) is None
         assert compiling._load(("raster", "_draw_tiles"), lambda *_: None, (), None) == "waited"
         assert compiling._load(("boxes", "_panorama"), lambda *_: None, (), None) is None
-    assert started == [["_survey", "_count_digits", "_list", "_draw_tiles", *(["_chain"] if gradients else [])]]
+    forward = ["_survey", "_write_words", "_count_digits", "_fetch", "_list", "_draw_tiles"]
+    assert started == [[[*forward, "_walk_tiles"], ["_chain"]] if gradients else [forward, []]]
 
 
 def test_no_second_process_is_started_for_kernels_on_disk_nor_outside_a_picture(started):
@@ -168,7 +180,7 @@ def test_no_second_process_is_started_for_kernels_on_disk_nor_outside_a_picture(
 
 
 def test_where_no_process_can_be_had_everything_is_compiled_here(started, monkeypatch):
-    def refuse(work):
+    def refuse(work, meanwhile):
         raise BlockingIOError("no more processes")
 
     monkeypatch.setattr(beside, "Beside", refuse)
@@ -178,6 +190,5 @@ def test_where_no_process_can_be_had_everything_is_compiled_here(started, monkey
 
 
 def test_tasks_can_be_told_to_another_process():
-    (signature, *_) = list(observe._observe.overloads) or [_OBSERVED]
-    work = tasks(signature, gradients=True)
+    work = theirs(gradients=True)
     assert pickle.loads(pickle.dumps(work)) == work
