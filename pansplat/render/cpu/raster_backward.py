@@ -81,7 +81,7 @@ def raster_backward(
         first_row: of tiles, the band's first.
         threads: to work on; the result does not depend on it.
     """
-    assert grad_records.ctypes.data % (4 * LANES) == 0
+    assert grad_records.size == 0 or grad_records.ctypes.data % (4 * LANES) == 0
     pieces = pieces_of(starts, threads)
     drawn = records.reshape(-1), values, entries.reshape(-1), starts, slots
     table = plane.kind, plane.columns, plane.rows, plane.rotation
