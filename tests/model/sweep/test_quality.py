@@ -28,8 +28,8 @@ def _decibels(pair: Pair, height: int) -> tuple[float, float]:
 def test_a_scanned_room_is_seen_from_between_its_views(shared: Path):
     (pair,) = (pair for pair in pansplat.load_pairs(shared / "data/mp3d_sample") if pair.targets)
     reached, faded = _decibels(pair, 256)
-    assert reached >= 23.6  # 24.3 measured
-    assert reached >= faded + 6.5
+    assert reached >= 24.0  # 24.6 measured
+    assert reached >= faded + 7.0
 
 
 @pytest.mark.slow
@@ -38,4 +38,4 @@ def test_photographed_homes_are_seen_better_than_by_fading(shared: Path):
     figures = torch.tensor([_decibels(pair, 128) for pair in pairs])
     assert len(pairs) == 3
     assert (figures[:, 0] > figures[:, 1]).all()
-    assert float((figures[:, 0] - figures[:, 1]).mean()) >= 1.5
+    assert float((figures[:, 0] - figures[:, 1]).mean()) >= 3.0
