@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from pansplat.model.sweep.cost import Family, MatchingConfig, View, matching_cost
 from pansplat.model.sweep.planes import PlaneSupport
-from pansplat.model.sweep.sphere import nearest_pixel, pad_sphere, resize_sphere
+from pansplat.model.sweep.sphere import nearest_pixel, pad_sphere, ray_grid, resize_sphere
 
 _BINS = (5, 8, 32, 32)  # texture, lightness and the two colour axes of CIELAB
 _BLUR = (0.7, 0.5, 1.0, 1.0)  # of the histogram, bins
@@ -30,6 +30,8 @@ _MIN_DROP, _SURE_DROP = 0.35, 0.8  # of the likeness where the floor ends
 _BAD_FLOOR, _SLACK = 1.0, 0.2  # cost at which what lies before a foot is no floor after all
 _FOOT_TOLERANCE = 0.12  # of the logarithm of a foot's distance
 _ANY_DEPTH = (1e-6, 1e6)  # inverse, 1/m
+# Between the scene's axes, down first, and those of a panorama that stands along them: x the third, z the second.
+_DOWN_FIRST, _LEVELLED = [1, 2, 0], [2, 0, 1]
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,8 @@ class FloorClues:
 
     Attributes:
         likeness: (h, w) from -1, surely no floor, to 1.
-        foot_angle: (azimuths) angle below the horizon where the floor ends, radians; below it there is floor.
+        foot_angle: (azimuths) angle below the horizon where the floor ends, radians; below it there is floor. Azimuths
+            are columns of a panorama that stands along the scene's axes.
         foot_distance: (azimuths) from the camera to there along the floor, metres.
         foot_strength: (azimuths) in [0, 1]; 0 where no end was found.
     """
@@ -149,7 +152,7 @@ def _feet(
     """
     height, width = likeness.shape
     angle = ((np.arange(height) + 0.5) / height - 0.5) * math.pi
-    row, column = nearest_pixel(_directions(angle, width) @ down_first, height)
+    row, column = nearest_pixel(ray_grid(height)[..., _DOWN_FIRST] @ down_first, height)
     like, cost, usable = likeness[row, column], cost[row, column], usable[row, column]
     before = _mean_of_rows(like, 1, 4)
     drop = before - _mean_of_rows(like, -2, 1)
@@ -163,13 +166,6 @@ def _feet(
     strength = np.where(ends.any(axis=0), np.clip(drop / _SURE_DROP, 0, 1)[lowest, azimuth], 0)
     foot = angle[lowest] + 0.5 * math.pi / height
     return foot, below / np.tan(foot), strength * is_floor[lowest, azimuth]
-
-
-def _directions(angle: np.ndarray, width: int) -> np.ndarray:
-    """Unit vectors (angles, width, 3) along the scene's axes, down first, by angle below the horizon and azimuth."""
-    azimuth = (np.arange(width) + 0.5) / width * 2 * math.pi
-    along, down = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    return np.stack(np.broadcast_arrays(down, along * np.cos(azimuth), along * np.sin(azimuth)), axis=-1)
 
 
 def _mean_of_rows(values: np.ndarray, first: int, end: int) -> np.ndarray:
@@ -203,9 +199,7 @@ def add_clues(
     cost += like[..., None]
     for floor in np.flatnonzero(is_floor):
         cost[..., count + floor] += unlike - like
-    width = len(clues.foot_angle)
-    azimuth = np.arctan2(rays[2], rays[1]) % (2 * math.pi)
-    column = np.minimum((azimuth * (width / (2 * math.pi))).astype(np.int64), width - 1)
+    column = nearest_pixel(np.moveaxis(rays, 0, -1)[..., _LEVELLED], len(clues.foot_angle) // 2)[1]
     above = clues.foot_angle[column] - np.arcsin(np.clip(rays[0], -1, 1))
     weight = config.foot_bonus * clues.foot_strength[column] * np.exp(-np.maximum(above, 0) / config.foot_reach)
     weight *= above > 0

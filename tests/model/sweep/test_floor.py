@@ -55,7 +55,7 @@ def test_what_is_painted_like_the_floor_looks_like_it(two_coloured, empty_room, 
 def test_the_floor_ends_where_the_walls_stand(two_coloured, empty_room, view):
     clue, room = two_coloured[0][view], empty_room.room
     centre = empty_room.posed.cam2world[view][:3, 3] @ _AXES.T
-    azimuth = (np.arange(2 * _HEIGHT) + 0.5) / (2 * _HEIGHT) * 2 * math.pi
+    azimuth = ((np.arange(2 * _HEIGHT) + 0.5) / (2 * _HEIGHT) * 2 - 1) * math.pi  # of a panorama's columns
     low, high = (np.array(corner) @ _AXES.T - centre for corner in (room.low, room.high))
     along = np.stack((np.cos(azimuth), np.sin(azimuth)))
     walls = np.where(along > 0, high[1:, None], low[1:, None]) / along
