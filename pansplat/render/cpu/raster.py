@@ -19,12 +19,14 @@ from pansplat.render.cpu.simd import (
     element,
     exp2,
     fill,
+    how_many,
     load,
     lowest_bit,
     minimum,
     multiply_add,
     negative,
     put,
+    side_by_side,
     some,
     spread,
     store,
@@ -140,7 +142,7 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
     offsets, middle = np.empty(3 * PIXELS, np.float32), np.empty(6, np.float32)
     through, added = np.empty(PIXELS, np.float32), np.empty(num_values * PIXELS, np.float32)
     forms, colours = np.empty(FORMS * CHUNK, np.float32), np.empty(num_values * CHUNK, np.float32)
-    touched = np.empty(WORDS * EDGES, np.uint64)
+    touched, found = np.empty(WORDS * EDGES, np.uint64), np.zeros(WORDS + 2, np.uint64)
     powers, places = np.empty(2 * HALF * LANES, np.float32), np.empty(2 * HALF, np.int32)
     exact = np.float32(0 if kind == FLAT else 1)
     for tile in range(low, high):
@@ -163,7 +165,7 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
                     ask_ahead(records, values, entries, block, first + CHUNK)
                     if not some(load(through, block * LANES) > fill(np.float32(CLOSED))):
                         continue
-                    following = find_powers(block, count, touched, forms, offsets, powers, places, half)
+                    following = find_powers(block, touched, forms, offsets, found, powers, places, half)
                 if drawn >= 0 and num_values == FEW:
                     is_open |= _draw_block(drawn, reached, powers, places, HALF - half, colours, through, added)
                 elif drawn >= 0:
@@ -185,7 +187,7 @@ def _keep(through, kept, row):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def find_powers(block, count, touched, forms, offsets, powers, places, start):  # type: ignore[no-untyped-def]
+def find_powers(block, touched, forms, offsets, found, powers, places, start):  # type: ignore[no-untyped-def]
     """Log2 of the peak times the response at a block's pixels, for the Gaussians of the chunk that reach it.
 
     Returns:
@@ -194,21 +196,31 @@ def find_powers(block, count, touched, forms, offsets, powers, places, start):  
     """
     pixel, column, row = block * LANES, block % ACROSS, ROWS + block // ACROSS
     x, y, z = load(offsets, pixel), load(offsets, PIXELS + pixel), load(offsets, 2 * PIXELS + pixel)
-    reached = start
-    for word in range((count + 63) // 64):
+    total = 0
+    for word in range(WORDS):
         bits = element(touched, word * EDGES + column) & element(touched, word * EDGES + row)
-        while bits:
-            s = word * 64 + lowest_bit(bits)
-            bits &= bits - np.uint64(1)
-            a, b, front, _, _, _ = forms_at(forms, s, x, y, z)
-            q = multiply_add(a, a, b * b)
-            below = multiply_add(front, front, spread(forms, ALONG_ROW * CHUNK + s) * q)
-            power = spread(forms, LEVEL_ROW * CHUNK + s) - q / below
-            power = choose(front > fill(np.float32(0)), power, fill(np.float32(NOTHING)))
-            store(powers, reached * LANES, power)
-            put(places, reached, np.int32(s))
-            reached += 1
-    return reached - start
+        put(found, word, bits)
+        total += how_many(bits)
+    # From word to word without a branch: the processor could not foretell where one ends.
+    word, bits, following = 0, element(found, 0), element(found, 1)
+    for at in range(start, start + total):
+        while bits == 0:  # a word with none: few are
+            word += 1
+            bits, following = element(found, word), element(found, word + 1)
+        s = word * 64 + lowest_bit(bits)
+        bits &= bits - np.uint64(1)
+        done = bits == 0
+        bits = following if done else bits
+        word += np.int64(done)
+        following = element(found, word + 1)
+        a, b, front, _, _, _ = forms_at(forms, s, x, y, z)
+        q = multiply_add(a, a, b * b)
+        below = multiply_add(front, front, spread(forms, ALONG_ROW * CHUNK + s) * q)
+        power = spread(forms, LEVEL_ROW * CHUNK + s) - q / below
+        power = choose(front > fill(np.float32(0)), power, fill(np.float32(NOTHING)))
+        store(powers, at * LANES, power)
+        put(places, at, np.int32(s))
+    return total
 
 
 @inlined
@@ -292,6 +304,27 @@ def _add_block(block, reached, weights, places, start, colours, num_values, adde
 @inlined
 def _write_tile(through, added, sums, left, top, num_values):  # type: ignore[no-untyped-def]
     """Copy a tile's sums into the picture; the weights of a ray and what passes sum to 1."""
+    width, height = sums.shape[2], sums.shape[1]
+    if left + TILE > width or top + TILE > height:
+        _write_part(through, added, sums, left, top, num_values)
+        return
+    picture, one = sums.reshape(-1), fill(np.float32(1))
+    for block in range(0, BLOCKS, 2):
+        pixel = block * LANES
+        at = (top + block // ACROSS * BLOCK_HEIGHT) * width + left + block % ACROSS * BLOCK_WIDTH
+        for channel in range(num_values):
+            plane, place = channel * PIXELS + pixel, channel * height * width + at
+            upper, lower = side_by_side(load(added, plane), load(added, plane + LANES))
+            store(picture, place, upper)
+            store(picture, place + width, lower)
+        place = num_values * height * width + at
+        upper, lower = side_by_side(one - load(through, pixel), one - load(through, pixel + LANES))
+        store(picture, place, upper)
+        store(picture, place + width, lower)
+
+
+@inlined
+def _write_part(through, added, sums, left, top, num_values):  # type: ignore[no-untyped-def]
     for pixel in range(PIXELS):
         block, lane = pixel // LANES, pixel % LANES
         x = left + (block % ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH

@@ -24,6 +24,7 @@ from pansplat.render.cpu.simd import (
     multiply_add,
     negative,
     put,
+    side_by_side,
     some,
     spread,
     store,
@@ -106,7 +107,11 @@ def _walk_tiles(  # type: ignore[no-untyped-def]
     forms, colours = np.empty(FORMS * CHUNK, np.float32), np.zeros(num_values * CHUNK + GROUP, np.float32)
     # Of each pair also its block, and the same Gaussian's pair before.
     slopes, pairs = np.empty(_PAIRS * PAIR, np.float32), np.empty(2 * _PAIRS, np.int32)
-    heads, touched = np.empty(CHUNK, np.int32), np.empty(WORDS * EDGES, np.uint64)
+    heads, touched, found = (
+        np.empty(CHUNK, np.int32),
+        np.empty(WORDS * EDGES, np.uint64),
+        np.zeros(WORDS + 2, np.uint64),
+    )
     powers, places = np.empty(2 * HALF * LANES, np.float32), np.empty(2 * HALF, np.int32)
     weights = np.empty(HALF * LANES, np.float32)
     moments, shares = np.empty(MOMENTS * CHUNK, np.float32), np.empty(LANES, np.float32)
@@ -129,7 +134,7 @@ def _walk_tiles(  # type: ignore[no-untyped-def]
             if chunk == 0:  # the next tile's last
                 following = end + CHUNK * (drawn_chunks[min(tile + 1, high - 1)] - 1)
             _find_slopes(
-                records, values, entries, following, count, forms, colours, touched, offsets,
+                records, values, entries, following, forms, colours, touched, found, offsets,
                 kept[kept_rows[tile] + chunk], num_values, planes, upstream, behind, powers, places, weights, slopes,
                 pairs, heads,
             )  # fmt: skip
@@ -146,6 +151,32 @@ def _read_upstream(sums, grad_sums, left, top, num_values, planes, upstream):  #
     The weights and what passes sum to 1. So a constant may be taken off what all that a ray meets is worth, and off
     what lies beyond: about the mean, which leaves small numbers to subtract.
     """
+    height, width = grad_sums.shape[1], grad_sums.shape[2]
+    if left + TILE > width or top + TILE > height:
+        _read_part(sums, grad_sums, left, top, num_values, planes, upstream)
+        return
+    given, drawn = grad_sums.reshape(-1), sums.reshape(-1)
+    for block in range(0, BLOCKS, 2):
+        pixel, first, second = block * LANES, fill(np.float32(0)), fill(np.float32(0))
+        at = (top + block // ACROSS * BLOCK_HEIGHT) * width + left + block % ACROSS * BLOCK_WIDTH
+        for channel in range(num_values + 1):
+            place = channel * height * width + at
+            gradient, other_gradient = side_by_side(load(given, place), load(given, place + width))
+            value, other_value = side_by_side(load(drawn, place), load(drawn, place + width))
+            first = multiply_add(gradient, value, first)
+            second = multiply_add(other_gradient, other_value, second)
+            own = (channel if channel < num_values else planes) * PIXELS + pixel
+            store(upstream, own, gradient)
+            store(upstream, own + LANES, other_gradient)
+        own = planes * PIXELS + pixel
+        store(upstream, own, load(upstream, own) - first)
+        store(upstream, own + LANES, load(upstream, own + LANES) - second)
+        store(upstream, own + PIXELS, first)
+        store(upstream, own + PIXELS + LANES, second)
+
+
+@inlined
+def _read_part(sums, grad_sums, left, top, num_values, planes, upstream):  # type: ignore[no-untyped-def]
     height, width = grad_sums.shape[1], grad_sums.shape[2]
     for pixel in range(PIXELS):
         block, lane = pixel // LANES, pixel % LANES
@@ -164,7 +195,7 @@ def _read_upstream(sums, grad_sums, left, top, num_values, planes, upstream):  #
 
 @inlined
 def _find_slopes(  # type: ignore[no-untyped-def]
-    records, values, entries, next_first, count, forms, colours, touched, offsets, through, num_values, planes,
+    records, values, entries, next_first, forms, colours, touched, found, offsets, through, num_values, planes,
     upstream, behind, powers, places, weights, slopes, pairs, heads,
 ):  # fmt: skip
     """Find the derivatives of the loss by the powers of a chunk's Gaussians, block by block, and their weights."""
@@ -176,7 +207,7 @@ def _find_slopes(  # type: ignore[no-untyped-def]
             ask_ahead(records, values, entries, block, next_first)
             if not some(load(through, block * LANES) > fill(np.float32(CLOSED))):
                 continue
-            following = find_powers(block, count, touched, forms, offsets, powers, places, half)
+            following = find_powers(block, touched, forms, offsets, found, powers, places, half)
         if taken >= 0:
             start = HALF - half
             reached = _weigh_block(taken, reached, powers, places, start, through, weights)

@@ -253,11 +253,31 @@ def transposed(context, a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
 
 
 @_intrinsic
+def side_by_side(context, a, b):  # type: ignore[no-untyped-def]
+    """Two vectors of two rows of four each, as two rows of eight; and back, for it is its own inverse."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return context.make_tuple(builder, sig.return_type, _halves(builder, *args, LANES // 2))
+
+    return types.UniTuple(lanes, 2)(lanes, lanes), generate
+
+
+@_intrinsic
 def lowest_bit(context, bits):  # type: ignore[no-untyped-def]
     """Place of the lowest bit set; `bits` is an unsigned 64-bit number other than 0."""
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
         return builder.cttz(args[0], ir.IntType(1)(1))
+
+    return types.intp(types.uint64), generate
+
+
+@_intrinsic
+def how_many(context, bits):  # type: ignore[no-untyped-def]
+    """How many bits of an unsigned 64-bit number are set."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.ctpop(args[0])
 
     return types.intp(types.uint64), generate
 
