@@ -95,6 +95,34 @@ def test_a_square_is_transposed_and_its_columns_summed():
 
 
 @numba.njit
+def _side_by_side(square, out):
+    upper, lower = simd.side_by_side(simd.load(square, 0), simd.load(square, 8))
+    again, other = simd.side_by_side(upper, lower)
+    simd.store(out, 0, upper)
+    simd.store(out, 8, lower)
+    simd.store(out, 16, again)
+    simd.store(out, 24, other)
+
+
+def test_two_blocks_of_pixels_become_two_rows_and_rows_become_blocks():
+    out = np.empty((4, 8), np.float32)
+    _side_by_side(SQUARE.reshape(-1), out.reshape(-1))
+    left, right = SQUARE[0].reshape(2, 4), SQUARE[1].reshape(2, 4)
+    assert np.array_equal(out[:2], np.concatenate((left, right), axis=1))
+    assert np.array_equal(out[2:], SQUARE[:2])
+
+
+@numba.njit
+def _count_bits(words):
+    return [simd.how_many(word) for word in words]
+
+
+def test_bits_are_counted_in_all_of_a_word():
+    words = np.array((0, 1, 0b1011, 1 << 63, 2**64 - 1), dtype=np.uint64)
+    assert _count_bits(words) == [0, 1, 3, 1, 64]
+
+
+@numba.njit
 def _powers(values, out):
     for at in range(0, len(values), 8):
         simd.store(out, at, simd.exp2(simd.load(values, at)))
