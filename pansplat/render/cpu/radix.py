@@ -13,6 +13,7 @@ import numpy as np
 from pansplat.render.cpu.compiling import inlined, kernel
 from pansplat.render.cpu.memory import Lease
 from pansplat.render.cpu.observe import PIECE
+from pansplat.render.cpu.simd import element, put
 from pansplat.render.cpu.threads import share
 
 _DIGIT = 11  # bits sorted by at a time: 2048 counters stay in the first cache
@@ -70,13 +71,20 @@ def _write_words(piece, records, radii, boxes, towards, low, cut, index_bits, st
                 at += 1
 
 
+@inlined
+def _digit(word, shift):
+    """The digit of a word that begins at bit `shift`."""
+    return np.int64(word >> np.uint64(shift) & np.uint64(2**_DIGIT - 1))
+
+
 @kernel
 def _count_digits(part, ends, words, shift, counts):
     """Count the digits of one part of the words."""
     row = counts[part]
     row[:] = 0
     for j in range(ends[part], ends[part + 1]):
-        row[(words[j] >> np.uint64(shift)) & np.uint64(2**_DIGIT - 1)] += 1
+        digit = _digit(element(words, j), shift)
+        put(row, digit, element(row, digit) + 1)
 
 
 @kernel
@@ -95,9 +103,11 @@ def _move(part, ends, words, shift, places, sorted_words):
     """Move one part's words to their places."""
     row = places[part]
     for j in range(ends[part], ends[part + 1]):
-        digit = (words[j] >> np.uint64(shift)) & np.uint64(2**_DIGIT - 1)
-        sorted_words[row[digit]] = words[j]
-        row[digit] += 1
+        word = element(words, j)
+        digit = _digit(word, shift)
+        place = element(row, digit)
+        put(sorted_words, place, word)
+        put(row, digit, place + 1)
 
 
 @kernel
@@ -106,9 +116,11 @@ def _move_numbers(part, ends, words, shift, index_bits, places, order):
     row = places[part]
     mask = (np.uint64(1) << np.uint64(index_bits)) - np.uint64(1)
     for j in range(ends[part], ends[part + 1]):
-        digit = (words[j] >> np.uint64(shift)) & np.uint64(2**_DIGIT - 1)
-        order[row[digit]] = np.int32(words[j] & mask)
-        row[digit] += 1
+        word = element(words, j)
+        digit = _digit(word, shift)
+        place = element(row, digit)
+        put(order, place, np.int32(word & mask))
+        put(row, digit, place + 1)
 
 
 def front_to_back(
