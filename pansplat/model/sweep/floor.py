@@ -2,7 +2,7 @@
 
 Where only one view sees a wall nothing can be matched, but the wall's foot shows where it stands. What the floor looks
 like the scene tells itself: what lies steeply below the cameras and matches as floor does, what is above the
-horizon does not.
+horizon does not. (`walls` makes straight walls of the feet.)
 """
 
 from __future__ import annotations
@@ -22,13 +22,17 @@ from pansplat.model.sweep.sphere import nearest_pixel, pad_sphere, ray_grid, res
 _BINS = (5, 8, 32, 32)  # texture, lightness and the two colour axes of CIELAB
 _BLUR = (0.7, 0.5, 1.0, 1.0)  # of the histogram, bins
 _UNKNOWN = 2e-5  # density of a bin below which nothing is known of it
-_STEEP = 0.4  # sine of the angle below the horizon of what may teach the floor
-_FLOOR_MATCH = 0.5  # cost up to which a pixel matches as floor
+# Rounds of learning. Sine of the angle below the horizon of what may teach the floor, and the cost up to which it must
+# match as floor: first what lies under the cameras, where little else stands, then all that looks like that, too.
+_ROUNDS = ((0.8, 0.8), (0.4, 0.5))
+_UNLIKE = -0.01  # likeness up to which a pixel teaches nothing about the floor
 _SMOOTHING, _EDGE = 50.0, 6.0  # of the likeness, between the picture's edges: lambda, sigma of 8 bit values
 _FLOOR_LIKE = 0.2  # likeness before an end, at least
 _MIN_DROP, _SURE_DROP = 0.35, 0.8  # of the likeness where the floor ends
 _BAD_FLOOR, _SLACK = 1.0, 0.2  # cost at which what lies before a foot is no floor after all
 _FOOT_TOLERANCE = 0.12  # of the logarithm of a foot's distance
+_NOISE, _CHANGE = 1.0, 30.0  # of CIELAB from row to row: what counts for nothing, and what makes a foot count less by e
+_FAINT_DROP, _LEFT = 0.15, 0.65  # of the likeness: the least that may be an end, and how much more makes it sure
 _ANY_DEPTH = (1e-6, 1e6)  # inverse, 1/m
 # Between the scene's axes, down first, and those of a panorama that stands along them: x the third, z the second.
 _DOWN_FIRST, _LEVELLED = [1, 2, 0], [2, 0, 1]
@@ -42,10 +46,12 @@ class FloorConfig:
     """For the floor where the picture surely does not look like it."""
     like_penalty: float = 0.3
     """For anything but the floor where the picture surely looks like it."""
-    foot_bonus: float = 0.6
+    foot_bonus: float = 0.8
     """For standing on the floor where the floor ends ..."""
-    foot_reach: float = 0.6
-    """... falling by e this many radians above the foot."""
+    foot_reach: float = 1.5
+    """... falling by e this many radians above the foot, and faster where the picture changes on the way up."""
+    wall_bonus: float = 2.0
+    """For lying on the wall that stands there, if no other view contradicts it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +64,34 @@ class FloorClues:
             are columns of a panorama that stands along the scene's axes.
         foot_distance: (azimuths) from the camera to there along the floor, metres.
         foot_strength: (azimuths) in [0, 1]; 0 where no end was found.
+        ends: (rows, azimuths) of that panorama, up to 1, how surely the floor ends at a pixel's lower edge.
+        change: (rows, azimuths) how much the picture changes from the bottom up to a row, in units that make
+            a foot count less by e each.
     """
 
     likeness: np.ndarray
     foot_angle: np.ndarray
     foot_distance: np.ndarray
     foot_strength: np.ndarray
+    ends: np.ndarray
+    change: np.ndarray
+
+    def locate(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Row and azimuth (h, w) of rays (3, h, w) given along the scene's axes."""
+        return nearest_pixel(np.moveaxis(rays, 0, -1)[..., _LEVELLED], len(self.change))
+
+    def fading(self, foot_angle: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        """What is left (h, w), in [0, 1], of a foot (azimuths) at a ray above it; 0 for rays below.
+
+        It fades where the picture changes between the two, for there something else may begin.
+        """
+        height, (row, azimuth) = len(self.change), self.locate(rays)
+        start = (
+            np.rint((foot_angle / math.pi + 0.5) * height - 0.5).astype(np.int64) - 2
+        )  # clear of the foot's own edge
+        at_foot = self.change[np.clip(start, 0, height - 1), np.arange(len(foot_angle))]
+        left = np.exp(-np.maximum(self.change[row, azimuth] - at_foot[azimuth], 0))
+        return np.where(_above(foot_angle[azimuth], rays) > 0, left, 0)
 
 
 def find_floor(
@@ -94,7 +122,7 @@ def find_floor(
     ]
     likeness = _likeness(views, rays, costs)
     return [
-        FloorClues(like, *_feet(like, cost, view.usable, depth, support.axes @ pose[:3, :3]))
+        _clues(like, cost, view, depth, support.axes @ pose[:3, :3])
         for like, cost, view, depth, pose in zip(likeness, costs, views, below, cam2world, strict=True)
     ]
 
@@ -108,25 +136,35 @@ def _cost_of_floor(
     return matching_cost(view, other, pose, [family], _ANY_DEPTH, (math.inf, -math.inf), config)[..., 0]
 
 
+def _above(foot_angle: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """How far above a foot rays (3, h, w) are, radians."""
+    return foot_angle - np.arcsin(np.clip(rays[0], -1, 1))
+
+
 def _likeness(views: Sequence[View], rays: Sequence[np.ndarray], costs: Sequence[np.ndarray]) -> list[np.ndarray]:
     """From -1 to 1: how much more often a pixel's colour and texture are found on the floor than above the horizon."""
-    floor, other = np.zeros(_BINS), np.zeros(_BINS)
     looks = [_look(view.image) for view in views]
-    for view, ray, cost, look in zip(views, rays, costs, looks, strict=True):
-        height = len(view.image)
-        area = np.sin((np.arange(height) + 0.5) / height * math.pi)[:, None] * view.usable
-        np.add.at(floor, look, area * ((ray[0] > _STEEP) & (cost < _FLOOR_MATCH)))
-        np.add.at(other, look, area * (ray[0] < 0))
-    floor, other = (ndimage.gaussian_filter(h / max(h.sum(), 1e-9), _BLUR) + _UNKNOWN for h in (floor, other))
-    ratio = ((floor - other) / (floor + other)).astype(np.float32)
+    areas = [np.maximum(np.cos(np.arcsin(ray_grid(len(v.image))[..., 1])), 0) * v.usable for v in views]
+    likeness = [np.zeros(cost.shape, np.float32) for cost in costs]
+    for steep, match in _ROUNDS:
+        floor, other = np.zeros(_BINS), np.zeros(_BINS)
+        for ray, cost, look, area, like in zip(rays, costs, looks, areas, likeness, strict=True):
+            np.add.at(floor, look, area * ((ray[0] > steep) & (cost < match) & (like > _UNLIKE)))
+            np.add.at(other, look, area * (ray[0] < 0))
+        if not floor.any():
+            break
+        floor, other = (ndimage.gaussian_filter(h / max(h.sum(), 1e-9), _BLUR) + _UNKNOWN for h in (floor, other))
+        ratio = ((floor - other) / (floor + other)).astype(np.float32)
+        likeness = [_smooth(ratio[look], view.image) for look, view in zip(looks, views, strict=True)]
+    return likeness
+
+
+def _smooth(values: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """Values (h, w) smoothed between the picture's edges."""
     margin = 8
-    inside = (slice(margin, -margin), slice(margin, -margin))
-    return [
-        cv2.ximgproc.fastGlobalSmootherFilter(
-            (pad_sphere(view.image, margin) * 255).astype(np.uint8), pad_sphere(ratio[look], margin), _SMOOTHING, _EDGE
-        )[inside]
-        for view, look in zip(views, looks, strict=True)
-    ]
+    guide = (pad_sphere(image, margin) * 255).astype(np.uint8)
+    padded = cv2.ximgproc.fastGlobalSmootherFilter(guide, pad_sphere(values, margin), _SMOOTHING, _EDGE)
+    return padded[margin:-margin, margin:-margin]
 
 
 def _look(image: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -141,10 +179,8 @@ def _look(image: np.ndarray) -> tuple[np.ndarray, ...]:
     return tuple(np.clip(v, 0, bins - 1).astype(np.int64) for v, bins in zip(values, _BINS, strict=True))
 
 
-def _feet(
-    likeness: np.ndarray, cost: np.ndarray, usable: np.ndarray, below: float, down_first: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Angle, distance and strength of where the floor ends, by azimuth; see `FloorClues`.
+def _clues(likeness: np.ndarray, cost: np.ndarray, view: View, below: float, down_first: np.ndarray) -> FloorClues:
+    """Where the floor ends, by azimuth; see `FloorClues`.
 
     Args:
         cost: (h, w) of the floor.
@@ -153,10 +189,11 @@ def _feet(
     height, width = likeness.shape
     angle = ((np.arange(height) + 0.5) / height - 0.5) * math.pi
     row, column = nearest_pixel(ray_grid(height)[..., _DOWN_FIRST] @ down_first, height)
-    like, cost, usable = likeness[row, column], cost[row, column], usable[row, column]
+    like, cost, usable = likeness[row, column], cost[row, column], view.usable[row, column]
+    usable &= np.roll(usable, -3, axis=0)
     before = _mean_of_rows(like, 1, 4)
     drop = before - _mean_of_rows(like, -2, 1)
-    ends = (drop > _MIN_DROP) & (before > _FLOOR_LIKE) & usable & np.roll(usable, -3, axis=0)
+    ends = (drop > _MIN_DROP) & (before > _FLOOR_LIKE) & usable
     ends &= drop >= ndimage.maximum_filter1d(drop, 5, axis=0)
     ends &= (angle > 0)[:, None]
     ends[-4:] = False
@@ -165,7 +202,27 @@ def _feet(
     is_floor = np.clip((_BAD_FLOOR - _mean_of_rows(cost, 2, 7)) / _SLACK, 0, 1)
     strength = np.where(ends.any(axis=0), np.clip(drop / _SURE_DROP, 0, 1)[lowest, azimuth], 0)
     foot = angle[lowest] + 0.5 * math.pi / height
-    return foot, below / np.tan(foot), strength * is_floor[lowest, azimuth]
+    strength *= is_floor[lowest, azimuth]
+    return FloorClues(
+        likeness, foot, below / np.tan(foot), strength,
+        ends=_soft_ends(like, drop, before, usable),
+        change=_change(cv2.blur(view.image, (3, 3))[row, column]),
+    )  # fmt: skip
+
+
+def _soft_ends(like: np.ndarray, drop: np.ndarray, before: np.ndarray, usable: np.ndarray) -> np.ndarray:
+    """How surely the floor ends at a row, (h, azimuths): a drop after floor, with nothing but floor below."""
+    unlike = np.cumsum((np.maximum(-like, 0) * usable)[::-1], axis=0)[::-1]
+    unlike /= np.maximum(np.cumsum(usable[::-1], axis=0)[::-1], 1)
+    sure = np.clip((drop - _FAINT_DROP) / _LEFT, 0, 1) * np.clip((before + _FLOOR_LIKE) / (2 * _FLOOR_LIKE), 0, 1)
+    return sure * usable - np.roll(unlike, -2, axis=0)
+
+
+def _change(image: np.ndarray) -> np.ndarray:
+    """How much a picture (h, w, 3) changes from its bottom up to each row; see `FloorClues`."""
+    lab = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2LAB)
+    step = np.abs(np.diff(lab, axis=0, append=lab[-1:])).sum(axis=2)
+    return np.cumsum((np.maximum(step - _NOISE, 0) / _CHANGE)[::-1], axis=0)[::-1]
 
 
 def _mean_of_rows(values: np.ndarray, first: int, end: int) -> np.ndarray:
@@ -199,10 +256,9 @@ def add_clues(
     cost += like[..., None]
     for floor in np.flatnonzero(is_floor):
         cost[..., count + floor] += unlike - like
-    column = nearest_pixel(np.moveaxis(rays, 0, -1)[..., _LEVELLED], len(clues.foot_angle) // 2)[1]
-    above = clues.foot_angle[column] - np.arcsin(np.clip(rays[0], -1, 1))
-    weight = config.foot_bonus * clues.foot_strength[column] * np.exp(-np.maximum(above, 0) / config.foot_reach)
-    weight *= above > 0
+    _, column = clues.locate(rays)
+    weight = config.foot_bonus * clues.foot_strength[column] * clues.fading(clues.foot_angle, rays)
+    weight *= np.exp(-np.maximum(_above(clues.foot_angle[column], rays), 0) / config.foot_reach)
     upright = clues.foot_distance[column] / np.sqrt(np.maximum(1 - rays[0] ** 2, 1e-6))  # depth of what stands there
     rows, columns = np.nonzero(weight > 1e-3)
     k = np.arange(count, dtype=np.float32)

@@ -1,7 +1,8 @@
 """The hierarchical plane sweep: from posed panoramas to a surface for each of them.
 
-First pixels vote for the planes that the scene has, and each picture shows where its floor ends. Then come three
-levels, as in the paper's hierarchical cost volume (PanSplat, section 3.2), at 1/4, 1/2 and 1/1 of the height.
+First pixels vote for the planes that the scene has, and each picture shows where its floor ends and walls stand.
+Then come three levels, as in the paper's hierarchical cost volume (PanSplat, section 3.2), at 1/4, 1/2 and 1/1 of
+the height.
 The coarse level searches the whole depth range among spheres and among planes along the scene's axes, twice: the
 second time every view knows the other views' surfaces (what they see through, agree with, or hide) and which
 planes the scene has. Each finer level searches a narrow range around the coarser surface.
@@ -25,6 +26,7 @@ from pansplat.model.sweep.planes import MIN_FLOOR, PlaneSupport, no_support, pla
 from pansplat.model.sweep.sphere import resize_sphere
 from pansplat.model.sweep.surface import Surface, agreement, guided_upsample
 from pansplat.model.sweep.votes import vote_for_planes
+from pansplat.model.sweep.walls import Walls, add_walls, believe, find_walls
 
 _FIRST_HEIGHT = 128
 _FLOOR_THICKNESS = 2.5  # bins of the planes' offsets
@@ -93,10 +95,17 @@ def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[
     first = _Level(posed, min(finest, _FIRST_HEIGHT), support, (low, high), config, None)
     support = first.vote()
     clues = first.find_floor(support)
+    walls = clues and [
+        find_walls(clue, support.floor_below(pose), support.bin / 3, posed.far)
+        for clue, pose in zip(clues, posed.cam2world, strict=True)
+    ]
     for n in range(config.coarse_passes):
         report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
         level = _Level(posed, heights[0], support, (low, high), config, surfaces)
-        surfaces = [level.search_all(view, count, clues and clues[view]) for view in range(len(posed.images))]
+        surfaces = [
+            level.search_all(view, count, clues and walls and (clues[view], walls[view]))
+            for view in range(len(posed.images))
+        ]
     for n, height in enumerate(heights[1:]):
         report("refining the surfaces", 0.5 + 0.25 * n)
         assert surfaces is not None
@@ -172,7 +181,7 @@ class _Level:
         """What each picture says of the floor."""
         return find_floor(self.views, self.rays, self.posed.cam2world, support, self.config.matching)
 
-    def search_all(self, view: int, count: int, clues: FloorClues | None) -> Surface:
+    def search_all(self, view: int, count: int, clues: tuple[FloorClues, Walls] | None) -> Surface:
         """The whole depth range, among spheres (family 0) and planes along the axes (families 1 to 3)."""
         low, high = self.limits
         step = (high - low) / (count - 1)
@@ -196,8 +205,18 @@ class _Level:
         if clues is not None:
             below = self.support.floor_below(self.posed.cam2world[view])
             is_floor = np.abs(1 / inverse - below) < _FLOOR_THICKNESS * self.support.bin
-            add_clues(cost, clues, families, is_floor, self.rays[view], self.config.floor)
+            add_clues(cost, clues[0], families, is_floor, self.rays[view], self.config.floor)
+            if self.surfaces is not None:
+                self._add_walls(view, *clues, families, cost)
         return self._solve(view, families, cost, slot_map.astype(np.float32), count)
+
+    def _add_walls(self, view: int, clues: FloorClues, walls: Walls, families: list[Family], cost: np.ndarray) -> None:
+        """Make the walls cheaper that the picture shows and the surfaces so far do not contradict."""
+        known, agreed = self.views[view].inverse_depth, self.views[view].confidence
+        assert known is not None and agreed is not None
+        walls = believe(walls, clues, self.rays[view], known, agreed == 1)
+        _, ceiling = self.support.bounds(self.posed.cam2world[view])
+        add_walls(cost, walls, clues, families, self.rays[view], ceiling, self.config.floor.wall_bonus)
 
     def _faces(self, view: int, other: int, families: list[Family], inverse: np.ndarray) -> list[Family]:
         """The families, with which of their planes the other view would see from behind."""
