@@ -32,6 +32,7 @@ _MIN_DROP, _SURE_DROP = 0.35, 0.8  # of the likeness where the floor ends
 _BAD_FLOOR, _SLACK = 1.0, 0.2  # cost at which what lies before a foot is no floor after all
 _FOOT_TOLERANCE = 0.12  # of the logarithm of a foot's distance
 _NOISE, _CHANGE = 1.0, 30.0  # of CIELAB from row to row: what counts for nothing, and what makes a foot count less by e
+_STANDS = 2.0  # how many times sooner an edge ends what stands from the horizon down
 _FAINT_DROP, _LEFT = 0.15, 0.65  # of the likeness: the least that may be an end, and how much more makes it sure
 _ANY_DEPTH = (1e-6, 1e6)  # inverse, 1/m
 # Between the scene's axes, down first, and those of a panorama that stands along them: x the third, z the second.
@@ -172,7 +173,7 @@ def _look(image: np.ndarray) -> tuple[np.ndarray, ...]:
     padded = pad_sphere(image, 2)
     inside = (slice(2, -2), slice(2, -2))
     gray = padded.mean(axis=2)
-    variance = cv2.blur(gray * gray, (5, 5)) - cv2.blur(gray, (5, 5)) ** 2
+    variance = cv2.blur(gray * gray, (3, 3)) - cv2.blur(gray, (3, 3)) ** 2
     texture = np.log2(np.sqrt(np.maximum(variance[inside], 1e-9)) / 0.006) + 1
     lab = cv2.cvtColor(cv2.blur(padded, (3, 3)), cv2.COLOR_RGB2LAB)[inside]
     values = (texture, lab[..., 0] / 12.5, lab[..., 1] / 4 + 16, lab[..., 2] / 4 + 16)
@@ -191,6 +192,10 @@ def _clues(likeness: np.ndarray, cost: np.ndarray, view: View, below: float, dow
     row, column = nearest_pixel(ray_grid(height)[..., _DOWN_FIRST] @ down_first, height)
     like, cost, usable = likeness[row, column], cost[row, column], view.usable[row, column]
     usable &= np.roll(usable, -3, axis=0)
+    change = _change(cv2.blur(view.image, (3, 3))[row, column])
+    # What goes on below the horizon as it is above, without an edge, is no floor whatever its colour.
+    stands = np.exp(-_STANDS * np.maximum(change[height // 2] - change, 0)) * (angle > 0)[:, None]
+    like = like * (1 - stands) - stands
     before = _mean_of_rows(like, 1, 4)
     drop = before - _mean_of_rows(like, -2, 1)
     ends = (drop > _MIN_DROP) & (before > _FLOOR_LIKE) & usable
@@ -206,7 +211,7 @@ def _clues(likeness: np.ndarray, cost: np.ndarray, view: View, below: float, dow
     return FloorClues(
         likeness, foot, below / np.tan(foot), strength,
         ends=_soft_ends(like, drop, before, usable),
-        change=_change(cv2.blur(view.image, (3, 3))[row, column]),
+        change=change,
     )  # fmt: skip
 
 

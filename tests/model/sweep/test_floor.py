@@ -37,6 +37,29 @@ def test_the_floor_ends_where_the_walls_stand(two_coloured, empty_room, room_axe
     assert np.allclose(np.tan(clue.foot_angle) * clue.foot_distance, room.high[1] - centre[0], atol=1e-6)
 
 
+def test_a_wall_in_the_floors_colours_stands_where_its_edge_is(empty_room, find_clues, room_axes):
+    """One wall is painted like the floor, a little darker."""
+    posed, room, images = empty_room.posed, empty_room.room, []
+    wall = np.array(room.high)[2]
+    for pose, depth, image in zip(posed.cam2world, empty_room.depths, posed.images, strict=True):
+        rays = main_directions(room_axes, pose[:3, :3], image.shape[0])
+        height, across = rays[0] * depth + pose[1, 3], rays[2] * depth + pose[2, 3]
+        on_floor, on_wall = np.abs(height - room.high[1]) < 1e-3, np.abs(across - wall) < 1e-3
+        dapples = (0.8 + 0.4 * image.mean(axis=2))[..., None]
+        paint = np.where(on_floor[..., None], np.array((0.45, 0.3, 0.15)) * dapples, 0.85 * dapples)
+        images.append(np.where(on_wall[..., None], np.array((0.345, 0.23, 0.115)) * dapples, paint))
+    clues, rays = find_clues(posed, np.stack(images).clip(0, 1).astype(np.float32), room.high[1])
+    assert clues is not None
+    for clue, pose in zip(clues, posed.cam2world, strict=True):
+        azimuth = ((np.arange(len(clue.foot_angle)) + 0.5) / len(clue.foot_angle) * 2 - 1) * math.pi
+        facing = np.sin(azimuth) > 0.85  # the wall is across the third axis
+        true = (wall - pose[2, 3]) / np.sin(azimuth[facing])
+        right = np.abs(clue.foot_distance[facing] / true - 1) < 0.15
+        sure = clue.foot_strength[facing] > 0.3
+        assert sure.mean() > 0.3
+        assert right[sure].mean() > 0.9
+
+
 def test_without_a_floor_nothing_is_said(empty_room, find_clues):
     assert find_clues(empty_room.posed, empty_room.posed.images, math.inf)[0] is None
 
