@@ -28,11 +28,11 @@ _ROUNDS = ((0.8, 0.8), (0.4, 0.5))
 _UNLIKE = -0.01  # likeness up to which a pixel teaches nothing about the floor
 _SMOOTHING, _EDGE = 50.0, 6.0  # of the likeness, between the picture's edges: lambda, sigma of 8 bit values
 _FLOOR_LIKE = 0.2  # likeness before an end, at least
-_MIN_DROP, _SURE_DROP = 0.35, 0.8  # of the likeness where the floor ends
+_MIN_DROP, _SURE_DROP = 0.25, 0.8  # of the likeness where the floor ends
 _BAD_FLOOR, _SLACK = 1.0, 0.2  # cost at which what lies before a foot is no floor after all
 _FOOT_TOLERANCE = 0.12  # of the logarithm of a foot's distance
-_NOISE, _CHANGE = 1.0, 30.0  # of CIELAB from row to row: what counts for nothing, and what makes a foot count less by e
-_STANDS = 2.0  # how many times sooner an edge ends what stands from the horizon down
+_NOISE, _CHANGE = 2.0, 30.0  # of CIELAB from row to row: what counts for nothing, and what makes a foot count less by e
+_STANDS = 3.0  # how many times sooner an edge ends what stands from the horizon down
 _FAINT_DROP, _LEFT = 0.15, 0.65  # of the likeness: the least that may be an end, and how much more makes it sure
 _ANY_DEPTH = (1e-6, 1e6)  # inverse, 1/m
 # Between the scene's axes, down first, and those of a panorama that stands along them: x the third, z the second.
@@ -205,7 +205,9 @@ def _clues(likeness: np.ndarray, cost: np.ndarray, view: View, below: float, dow
     lowest = height - 1 - ends[::-1].argmax(axis=0)
     azimuth = np.arange(width)
     is_floor = np.clip((_BAD_FLOOR - _mean_of_rows(cost, 2, 7)) / _SLACK, 0, 1)
-    strength = np.where(ends.any(axis=0), np.clip(drop / _SURE_DROP, 0, 1)[lowest, azimuth], 0)
+    strength = np.where(
+        ends.any(axis=0), np.clip((drop - _MIN_DROP) / (_SURE_DROP - _MIN_DROP), 0, 1)[lowest, azimuth], 0
+    )
     foot = angle[lowest] + 0.5 * math.pi / height
     strength *= is_floor[lowest, azimuth]
     return FloorClues(

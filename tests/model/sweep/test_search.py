@@ -91,7 +91,7 @@ def test_turning_the_world_changes_no_surface(empty_room, turn, tilt):
     motion[:3, :3] = turn("y", 71) @ turn("x", tilt) @ turn("z", -0.6 * tilt)
     inverse = _search(dataclasses.replace(empty_room.posed, cam2world=motion @ empty_room.posed.cam2world))
     for view, surface in enumerate(empty_room.surfaces):
-        assert (np.abs(inverse[view] / surface.inverse_depth - 1) < 0.01).mean() > (0.97 if tilt == 0 else 0.94)
+        assert (np.abs(inverse[view] / surface.inverse_depth - 1) < 0.01).mean() > (0.97 if tilt == 0 else 0.95)
 
 
 def test_swapping_the_views_swaps_the_surfaces(empty_room):
