@@ -87,9 +87,7 @@ class FloorClues:
         It fades where the picture changes between the two, for there something else may begin.
         """
         height, (row, azimuth) = len(self.change), self.locate(rays)
-        start = (
-            np.rint((foot_angle / math.pi + 0.5) * height - 0.5).astype(np.int64) - 2
-        )  # clear of the foot's own edge
+        start = np.rint((foot_angle / math.pi + 0.5) * height - 2.5).astype(np.int64)  # clear of the foot's own edge
         at_foot = self.change[np.clip(start, 0, height - 1), np.arange(len(foot_angle))]
         left = np.exp(-np.maximum(self.change[row, azimuth] - at_foot[azimuth], 0))
         return np.where(_above(foot_angle[azimuth], rays) > 0, left, 0)
@@ -205,11 +203,9 @@ def _clues(likeness: np.ndarray, cost: np.ndarray, view: View, below: float, dow
     lowest = height - 1 - ends[::-1].argmax(axis=0)
     azimuth = np.arange(width)
     is_floor = np.clip((_BAD_FLOOR - _mean_of_rows(cost, 2, 7)) / _SLACK, 0, 1)
-    strength = np.where(
-        ends.any(axis=0), np.clip((drop - _MIN_DROP) / (_SURE_DROP - _MIN_DROP), 0, 1)[lowest, azimuth], 0
-    )
+    sure = np.clip((drop - _MIN_DROP) / (_SURE_DROP - _MIN_DROP), 0, 1) * is_floor
+    strength = np.where(ends.any(axis=0), sure[lowest, azimuth], 0)
     foot = angle[lowest] + 0.5 * math.pi / height
-    strength *= is_floor[lowest, azimuth]
     return FloorClues(
         likeness, foot, below / np.tan(foot), strength,
         ends=_soft_ends(like, drop, before, usable),

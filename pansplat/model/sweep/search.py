@@ -96,7 +96,7 @@ def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[
     support = first.vote()
     clues = first.find_floor(support)
     walls = clues and [
-        find_walls(clue, support.floor_below(pose), support.bin / 3, posed.far)
+        find_walls(clue, support.floor_below(pose), posed.far)
         for clue, pose in zip(clues, posed.cam2world, strict=True)
     ]
     for n in range(config.coarse_passes):

@@ -18,7 +18,8 @@ from scipy import ndimage
 from pansplat.model.sweep.cost import Family
 from pansplat.model.sweep.floor import FloorClues
 
-_NEAREST = 0.2  # metres along the floor
+# Of the camera's height over the floor: the nearest and the farthest foot of a wall, and between planes that are tried.
+_NEAREST, _FARTHEST, _STEP = 1 / 7, 20.0, 1 / 85
 _NEIGHBOUR = 0.8  # what an end says of the rows next to it
 _NO_WALL = 0.3  # what a direction without a wall counts for, where 1 is a sure end of the floor
 _BEGIN = 0.75  # what beginning or leaving a wall costs, likewise
@@ -49,21 +50,22 @@ class Walls:
     foot_angle: np.ndarray
 
 
-def find_walls(clues: FloorClues, below: float, step: float, far: float) -> Walls:
+def find_walls(clues: FloorClues, below: float, far: float) -> Walls:
     """The walls that follow a picture's ends of the floor.
 
     Args:
-        below: of the floor under the camera, metres.
-        step: between the planes that are tried, metres.
-        far: to the farthest, metres.
+        below: how far under the camera the floor is, metres.
+        far: how far the scene reaches, metres.
     """
     height, width = clues.ends.shape
     azimuth = ((np.arange(width) + 0.5) / width * 2 - 1) * math.pi
-    along = np.repeat(np.stack((np.cos(azimuth), np.sin(azimuth))), 2 * int(far / step), axis=0).T
-    offsets = np.tile((np.arange(-int(far / step), int(far / step)) + 0.5) * step, 2)
+    far, step = min(far, _FARTHEST * below), _STEP * below
+    planes = int(far / step)
+    along = np.repeat(np.stack((np.cos(azimuth), np.sin(azimuth))), 2 * planes, axis=0).T
+    offsets = np.tile((np.arange(-planes, planes) + 0.5) * step, 2)
     with np.errstate(divide="ignore"):
         distance = offsets / along
-    there = (distance > _NEAREST) & (distance < far)
+    there = (distance > _NEAREST * below) & (distance < far)
     angle = np.arctan(below / np.where(there, distance, 1))
     row = np.clip((angle / math.pi + 0.5) * height - 1, 0, height - 1.001)  # of the pixel whose lower edge is there
     ends = np.maximum(clues.ends, _NEIGHBOUR * ndimage.maximum_filter1d(clues.ends, 3, axis=0))

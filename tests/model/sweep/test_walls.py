@@ -36,7 +36,7 @@ def _square(half: float) -> np.ndarray:
 
 @pytest.fixture
 def square_walls() -> Walls:
-    return find_walls(_clues(_ends_of(_square(1.5))), _BELOW, 0.02, _FAR)
+    return find_walls(_clues(_ends_of(_square(1.5))), _BELOW, _FAR)
 
 
 def _true_axis() -> np.ndarray:
@@ -48,7 +48,7 @@ def test_a_rooms_four_walls_are_found(two_coloured, empty_room, room_axes, view)
     clue, room = two_coloured[0][view], empty_room.room
     centre = empty_room.posed.cam2world[view][:3, 3] @ room_axes.T
     low, high = (np.array(corner) @ room_axes.T - centre for corner in (room.low, room.high))
-    walls = find_walls(clue, float(high[0]), 0.02, empty_room.posed.far)
+    walls = find_walls(clue, float(high[0]), empty_room.posed.far)
     azimuth = ((np.arange(len(walls.axis)) + 0.5) / len(walls.axis) * 2 - 1) * math.pi
     along = np.stack((np.cos(azimuth), np.sin(azimuth)))
     reach = np.where(along > 0, high[1:, None], low[1:, None]) / along
@@ -63,7 +63,7 @@ def test_a_rooms_four_walls_are_found(two_coloured, empty_room, room_axes, view)
 def test_a_wall_bridges_what_no_end_shows(square_walls):
     ends = _ends_of(_square(1.5))
     ends[:, 120:124] = 0  # in the middle of a wall
-    bridged = find_walls(_clues(ends), _BELOW, 0.02, _FAR)
+    bridged = find_walls(_clues(ends), _BELOW, _FAR)
     assert len(np.unique(bridged.number[112:140])) == 1
     assert np.abs(bridged.offset[120:124] / 1.5 - 1).max() < 0.05
     assert (square_walls.axis == _true_axis()).mean() > 0.95
@@ -74,12 +74,19 @@ def test_walls_do_not_end_where_the_panorama_does(square_walls):
     """The wall behind the camera begins at the last columns and goes on at the first."""
     assert square_walls.number[0] == square_walls.number[-1]
     assert square_walls.strength[0] == square_walls.strength[-1] > 0.9
-    turned = find_walls(_clues(np.roll(_ends_of(_square(1.5)), _HEIGHT, axis=1)), _BELOW, 0.02, _FAR)
+    turned = find_walls(_clues(np.roll(_ends_of(_square(1.5)), _HEIGHT, axis=1)), _BELOW, _FAR)
     assert np.allclose(turned.offset, -np.roll(square_walls.offset, _HEIGHT))
 
 
+@pytest.mark.parametrize("scale", (0.1, 10.0))
+def test_a_larger_world_has_larger_walls(square_walls, scale):
+    walls = find_walls(_clues(_ends_of(_square(1.5))), scale * _BELOW, scale * _FAR)
+    assert (walls.axis == square_walls.axis).all()
+    assert np.allclose(walls.offset[walls.axis > 0], scale * square_walls.offset[walls.axis > 0])
+
+
 def test_without_ends_there_are_no_walls():
-    walls = find_walls(_clues(np.zeros((_HEIGHT, 2 * _HEIGHT))), _BELOW, 0.02, _FAR)
+    walls = find_walls(_clues(np.zeros((_HEIGHT, 2 * _HEIGHT))), _BELOW, _FAR)
     assert (walls.axis == 0).all() and (walls.number == -1).all() and (walls.strength == 0).all()
 
 
@@ -87,7 +94,7 @@ def test_narrow_walls_are_hardly_believed(square_walls):
     """A post 6 degrees wide in front of a wall."""
     distance = _square(1.5)
     distance[126:130] = 0.7
-    posted = find_walls(_clues(_ends_of(distance)), _BELOW, 0.02, _FAR)
+    posted = find_walls(_clues(_ends_of(distance)), _BELOW, _FAR)
     assert np.abs(posted.offset[128] / 0.7 - 1) < 0.1
     assert 0.3 < posted.strength[128] < 0.8 < square_walls.strength[128]
 
@@ -108,7 +115,7 @@ def test_a_wall_is_believed_unless_views_agree_on_another_surface(square_walls, 
 
 def test_without_walls_nothing_is_believed_or_added(square_walls, room_axes):
     clues = _clues(np.zeros((_HEIGHT, 2 * _HEIGHT)))
-    none = find_walls(clues, _BELOW, 0.02, _FAR)
+    none = find_walls(clues, _BELOW, _FAR)
     rays = main_directions(room_axes, np.eye(3), _HEIGHT)
     shape = rays[0].shape
     assert (believe(none, clues, rays, np.ones(shape), np.ones(shape, bool)).strength == 0).all()
