@@ -17,6 +17,8 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
+from pansplat.geometry.equirect import row_weights
+
 _DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
@@ -146,7 +148,7 @@ def aggregate(
     """
     height, _, labels = cost.shape
     families = slot_map.shape[2]
-    stretch = np.minimum(1 / np.sin((np.arange(height) + 0.5) / height * math.pi), 8).astype(np.float32)
+    stretch = np.minimum(1 / row_weights(height).numpy(), 8).astype(np.float32)
     prices = tuple(
         np.float32(v) for v in (config.step_price, config.crease_price, config.jump_price, config.edge_scale)
     )

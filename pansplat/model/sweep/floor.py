@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
+from pansplat.geometry.equirect import row_weights
 from pansplat.model.sweep.cost import Family, MatchingConfig, View, matching_cost
 from pansplat.model.sweep.planes import PlaneSupport
 from pansplat.model.sweep.sphere import nearest_pixel, pad_sphere, ray_grid, resize_sphere
@@ -143,19 +144,28 @@ def _above(foot_angle: np.ndarray, rays: np.ndarray) -> np.ndarray:
 def _likeness(views: Sequence[View], rays: Sequence[np.ndarray], costs: Sequence[np.ndarray]) -> list[np.ndarray]:
     """From -1 to 1: how much more often a pixel's colour and texture are found on the floor than above the horizon."""
     looks = [_look(view.image) for view in views]
-    areas = [np.maximum(np.cos(np.arcsin(ray_grid(len(v.image))[..., 1])), 0) * v.usable for v in views]
+    areas = [row_weights(len(view.image)).numpy()[:, None] * view.usable for view in views]
+    above = _density(looks, [area * (ray[0] < 0) for area, ray in zip(areas, rays, strict=True)])
     likeness = [np.zeros(cost.shape, np.float32) for cost in costs]
     for steep, match in _ROUNDS:
-        floor, other = np.zeros(_BINS), np.zeros(_BINS)
-        for ray, cost, look, area, like in zip(rays, costs, looks, areas, likeness, strict=True):
-            np.add.at(floor, look, area * ((ray[0] > steep) & (cost < match) & (like > _UNLIKE)))
-            np.add.at(other, look, area * (ray[0] < 0))
-        if not floor.any():
+        taught = [
+            area * ((ray[0] > steep) & (cost < match) & (like > _UNLIKE))
+            for area, ray, cost, like in zip(areas, rays, costs, likeness, strict=True)
+        ]
+        if not any(weight.any() for weight in taught):
             break
-        floor, other = (ndimage.gaussian_filter(h / max(h.sum(), 1e-9), _BLUR) + _UNKNOWN for h in (floor, other))
-        ratio = ((floor - other) / (floor + other)).astype(np.float32)
+        floor = _density(looks, taught)
+        ratio = ((floor - above) / (floor + above)).astype(np.float32)
         likeness = [_smooth(ratio[look], view.image) for look, view in zip(looks, views, strict=True)]
     return likeness
+
+
+def _density(looks: Sequence[tuple[np.ndarray, ...]], weights: Sequence[np.ndarray]) -> np.ndarray:
+    """How often each colour and texture is met, by weights (h, w) for each view."""
+    histogram = np.zeros(_BINS)
+    for look, weight in zip(looks, weights, strict=True):
+        np.add.at(histogram, look, weight)
+    return ndimage.gaussian_filter(histogram / max(histogram.sum(), 1e-9), _BLUR) + _UNKNOWN
 
 
 def _smooth(values: np.ndarray, image: np.ndarray) -> np.ndarray:

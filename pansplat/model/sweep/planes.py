@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from pansplat.geometry.equirect import row_weights
 from pansplat.model.sweep.surface import Surface, world_points
 
 _BIN = 1 / 9  # of `near`: 5 cm indoors
@@ -99,7 +100,7 @@ def plane_support(
     bins = histogram.shape[1]
     for surface, sure, pose in zip(surfaces, agreed, cam2world, strict=True):
         height, width = surface.inverse_depth.shape
-        area = np.repeat(np.sin((np.arange(height) + 0.5) / height * np.pi)[:, None], width, axis=1)
+        area = np.repeat(row_weights(height).numpy()[:, None], width, axis=1)
         area /= area.sum() * len(surfaces)
         points = world_points(surface, pose) - known.origin
         for axis in range(3):

@@ -94,18 +94,15 @@ def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[
     support = no_support(posed.cam2world, axes, posed.near, posed.far)
     first = _Level(posed, min(finest, _FIRST_HEIGHT), support, (low, high), config, None)
     support = first.vote()
-    clues = first.find_floor(support)
-    walls = clues and [
-        find_walls(clue, support.floor_below(pose), posed.far)
-        for clue, pose in zip(clues, posed.cam2world, strict=True)
+    floors = first.find_floor(support)
+    clues = floors and [
+        (floor, find_walls(floor, support.floor_below(pose), posed.far))
+        for floor, pose in zip(floors, posed.cam2world, strict=True)
     ]
     for n in range(config.coarse_passes):
         report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
         level = _Level(posed, heights[0], support, (low, high), config, surfaces)
-        surfaces = [
-            level.search_all(view, count, clues and walls and (clues[view], walls[view]))
-            for view in range(len(posed.images))
-        ]
+        surfaces = [level.search_all(view, count, clues and clues[view]) for view in range(len(posed.images))]
     for n, height in enumerate(heights[1:]):
         report("refining the surfaces", 0.5 + 0.25 * n)
         assert surfaces is not None

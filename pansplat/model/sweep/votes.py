@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from pansplat.geometry.equirect import row_weights
 from pansplat.model.sweep.cost import Family, MatchingConfig, View, matching_cost
 from pansplat.model.sweep.planes import PlaneSupport
 
@@ -97,9 +98,8 @@ def _votes(
 
 def _texture(view: View) -> np.ndarray:
     """Weight (h, w) of the pixels' votes by texture and solid angle; the weights sum to one, or are all zero."""
-    height = view.image.shape[0]
     gray = view.image.mean(axis=2)
     variance = cv2.boxFilter(gray * gray, -1, (5, 5)) - cv2.boxFilter(gray, -1, (5, 5)) ** 2
-    area = np.sin((np.arange(height) + 0.5) / height * math.pi)[:, None]
+    area = row_weights(len(view.image)).numpy()[:, None]
     weight = np.clip(variance, 0, _MAX_VARIANCE) * view.usable * area
     return (weight / max(float(weight.sum()), 1e-9)).astype(np.float32)

@@ -113,12 +113,17 @@ def test_a_wall_is_believed_unless_views_agree_on_another_surface(square_walls, 
     assert np.allclose(believed.strength, left * square_walls.strength, atol=1e-6)
 
 
-def test_without_walls_nothing_is_believed_or_added(square_walls, room_axes):
+def test_without_walls_nothing_is_believed_or_added(room_axes):
     clues = _clues(np.zeros((_HEIGHT, 2 * _HEIGHT)))
     none = find_walls(clues, _BELOW, _FAR)
     rays = main_directions(room_axes, np.eye(3), _HEIGHT)
     shape = rays[0].shape
     assert (believe(none, clues, rays, np.ones(shape), np.ones(shape, bool)).strength == 0).all()
+    slopes, nothing = np.abs(rays).astype(np.float32), np.zeros((2, 1), np.float32)
+    families = [Family(slope, slope, nothing, np.zeros(shape, np.uint8)) for slope in (slopes[0], *slopes)]
+    cost = np.zeros((*shape, 4), np.float32)
+    add_walls(cost, none, clues, families, rays, -1.0, 2.0)
+    assert (cost == 0).all()
 
 
 def test_the_wall_is_cheapest_between_the_floor_and_the_ceiling(square_walls, room_axes):
