@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from numba import boolean, float32, float64, int16, int32, int64, none, uint8, uint64
+from numba import boolean, float32, float64, int32, int64, none, uint8
 
 from pansplat.render.cpu.threads import thread_count
 
@@ -48,26 +48,18 @@ def theirs(*, gradients: bool) -> list[Task]:
     Args:
         gradients: whether a backward will follow.
     """
-    singles, doubles, longs, plane = float32[:, ::1], float64[::1], int64[::1], (int64, *(float64[:, ::1],) * 3)
-    table, words, boxes, order = int64[:, ::1], uint64[::1], int16[:, ::1], int32[::1]
-    lists, picture, kept = (float32[::1], singles, order, longs), float32[:, :, ::1], (singles, longs, longs)
-    number = Task("bins", "_number", (int64, longs, longs, int64, int64, int64, longs))
-    gather = Task("bins", "_gather", (int64, longs, order, longs, longs))
+    singles, longs, plane = float32[:, ::1], int64[::1], (int64, *(float64[:, ::1],) * 3)
+    table, slots = int64[:, ::1], int32[::1]
+    lists, picture, kept = (float32[::1], singles, int32[::1], longs), float32[:, :, ::1], (singles, longs, longs)
     found = [
-        Task("radix", "_survey", (int64, singles, doubles, boxes, doubles, table)),
-        Task("radix", "_write_words", (int64, singles, doubles, boxes, doubles, int64, int64, int64, longs, words)),
-        Task("radix", "_count_digits", (int64, longs, words, int64, table)),
-        Task("radix", "_places", (table,)),
-        Task("radix", "_move", (int64, longs, words, int64, table, words)),
-        Task("radix", "_move_numbers", (int64, longs, words, int64, int64, table, order)),
-        Task("bins", "_fetch", (int64, longs, order, longs, int64, longs, table)),
-        *([number, gather] if gradients else []),
-        Task("bins", "_list", (int64, longs, order, longs, *(int64,) * 4, table, longs, longs, longs)),
+        Task("bins", "_count", (int64, longs, longs, int64, int64, table)),
+        Task("bins", "_list", (int64, longs, longs, *(int64,) * 4, table, longs, longs, slots, longs)),
+        Task("sort", "_sort_tiles", (longs, slots, longs, longs, int64, int64)),
         Task("raster", "_draw_tiles", (*lists, *plane, picture, *kept, int64, int64, int64)),
     ]
     if gradients:
         rest = picture, *kept, picture, float32[::1], float32[::1], int64, int64, int64
-        found.append(Task("raster_backward", "_walk_tiles", (*lists, longs, *plane, *rest)))
+        found.append(Task("raster_backward", "_walk_tiles", (*lists, slots, *plane, *rest)))
     return found
 
 

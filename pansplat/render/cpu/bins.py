@@ -1,4 +1,4 @@
-"""Stage three: for each tile of a picture, the Gaussians that touch it, front to back.
+"""Stage three: for each tile of a picture, the Gaussians that touch it, in the order of their numbers.
 
 A counting sort of (Gaussian, tile) pairs, in bands of tile rows so that memory is bounded whatever the scene. For the
 backward every pair has a slot of its own, and one Gaussian's slots follow one another: tiles write their gradients
@@ -13,16 +13,15 @@ import numpy as np
 from pansplat.render.cpu.compiling import inlined, kernel
 from pansplat.render.cpu.memory import Lease
 from pansplat.render.cpu.records import BOX_BITS, TILE
-from pansplat.render.cpu.simd import element, prefetch, put
+from pansplat.render.cpu.simd import element, put
 from pansplat.render.cpu.threads import share
 
 LIMIT = 1 << 26  # pairs listed at a time: 512 MB
 _SHIFT = TILE.bit_length() - 1
 _LAST = TILE - 1
-_SPARE = 8  # places: threads must not share a cache line
-_AHEAD = 32  # Gaussians, between asking for what stands scattered and reading it
+_HELD = 512  # pairs noted before they are entered: two small loops take half as long as one large
 _SIDE = np.int64(0xFFFF)  # a box as one word: x0, x1, y0, y1 from the lowest bits up
-_NOWHERE = np.int64(1 << 32)  # the empty box of boxes.py: first row 1, last row 0
+NOWHERE = np.int64(1 << 32)  # a box as one word, the empty one of boxes.py: first row 1, last row 0
 
 
 class TileLists(NamedTuple):
@@ -74,136 +73,132 @@ def _tiles_of(word):
     return (word & _SIDE) >> shift, (word >> 16 & _SIDE) >> shift, (word >> 32 & _SIDE) >> shift, word >> 48 >> shift
 
 
-@inlined
-def _rows_of(word, low, high):
-    """First row of tiles of a band that a packed box touches, and how many of them; 0 or less for none."""
-    _, _, top, bottom = _tiles_of(word)
-    top = max(top, low)
-    return top, min(bottom, high - 1) - top + 1
-
-
 @kernel
-def _number(part, ends, words, columns, low, high, offsets):
-    """Number the slots of one part of the scene, from 0 on: where each Gaussian's end."""
-    total = np.int64(0)
+def _count(part, ends, words, rows, columns, counts):
+    """Count the Gaussians of one part of the scene in each tile.
+
+    Args:
+        rows, columns: of tiles.
+        counts: (part, tile), written.
+    """
+    # As steps up and down between neighbouring tiles: the places of a box are apart, whatever its size.
+    across, row = columns + 1, counts[part]
+    steps = np.zeros((rows + 1) * across, np.int64)
     for g in range(ends[part], ends[part + 1]):
-        _, down = _rows_of(words[g], low, high)
-        total += _across(words[g], columns) * max(down, 0) if words[g] != _NOWHERE else 0
-        offsets[g + 1] = total
-
-
-@kernel
-def _fetch(part, ends, order, words, columns, sorted_words, counts):
-    """Copy the boxes of one part of the Gaussians in drawing order, and count those in each tile."""
-    row = counts[part]
-    row[:] = 0
-    last = ends[part + 1] - 1
-    for j in range(ends[part], ends[part + 1]):
-        prefetch(words, np.int64(element(order, min(j + _AHEAD, last))))
-        word = element(words, np.int64(element(order, j)))
-        sorted_words[j] = word
-        first, _, top, bottom = _tiles_of(word)
-        across, down = _across(word, columns), bottom - top + 1
-        if (across <= 2) & (down <= 2):  # most; with no branch that the processor could mistake
-            corner, aside = top * columns + first, np.int64(across > 1)
-            beyond = corner + (aside if first + 1 < columns else aside * (1 - columns))
-            below = columns * (down - 1)
-            put(row, corner, element(row, corner) + 1)
-            put(row, beyond, element(row, beyond) + aside)
-            put(row, corner + below, element(row, corner + below) + (down - 1))
-            put(row, beyond + below, element(row, beyond + below) + aside * (down - 1))
-            continue
-        for i in range(top, bottom + 1):
-            for k in range(first, first + across):
-                row[i * columns + (k if k < columns else k - columns)] += 1
-
-
-@kernel
-def _gather(part, ends, order, numbers, sorted_numbers):
-    """Copy numbers into drawing order: alone, so that the processor waits for many of them at once."""
-    for j in range(ends[part], ends[part + 1]):
-        sorted_numbers[j] = element(numbers, np.int64(element(order, j)))
+        word = element(words, g)
+        first, last, top, bottom = _tiles_of(word)
+        upper, lower = top * across, (bottom + 1 if word != NOWHERE else top) * across
+        if (word >> 16 & _SIDE) < (word & _SIDE):  # goes on at the left
+            if last < first:
+                _add(steps, upper, 1)
+                _add(steps, lower, -1)
+            else:
+                first, last = np.int64(0), columns - 1
+        _add(steps, upper + first, 1)
+        _add(steps, upper + last + 1, -1)
+        _add(steps, lower + first, -1)
+        _add(steps, lower + last + 1, 1)
+    for i in range(rows):
+        total = np.int64(0)
+        for k in range(columns):
+            total += steps[i * across + k]
+            row[i * columns + k] = total + (row[(i - 1) * columns + k] if i > 0 else 0)
 
 
 @inlined
-def _enter(number, box, tile, slot, places, entries, slots):
-    """Write a tile's next entry."""
-    _enter_if(np.int64(1), np.int64(0), number, box, tile, slot, places, entries, slots)
+def _add(numbers, at, step):
+    """Add to one element."""
+    put(numbers, at, element(numbers, at) + step)
 
 
 @inlined
-def _enter_if(really, spare, number, box, tile, slot, places, entries, slots):
-    """Write a tile's next entry if `really` is 1; if it is 0, something at the spare place."""
-    at = element(places, tile)
-    put(places, tile, at + really)
-    at = at if really else spare
-    put(entries, at, number | box << 32)
-    if len(slots) > 0:
-        put(slots, at, slot)
+def _note(tile, number, box, at, tiles, pairs):
+    """Write down a pair of a Gaussian and a tile."""
+    put(tiles, at, tile)
+    put(pairs, at, number | box << 32)
 
 
 @inlined
-def _enter_corners(spare, number, word, slot, low, columns, width, places, entries, slots):
-    """Enter a Gaussian that touches at most two columns and two rows of tiles, with no branch to be mistaken."""
+def _note_corners(number, word, low, columns, width, held, tiles, pairs):
+    """Note a Gaussian that touches at most two columns and two rows of tiles, with no branch to be mistaken.
+
+    Returns:
+        How many pairs are held then; each is written over by the next unless it counts.
+    """
     first, last, top, bottom = _tiles_of(word)
     x0, x1, y0, y1 = word & _LAST, word >> 16 & _LAST, word >> 32 & _LAST, word >> 48 & _LAST
     aside, down = np.int64(first != last), bottom - top
-    tile = (top - low) * columns + first
-    beyond, below = tile + last - first, columns * down
     end = min(np.int64(_LAST), width - 1 - (first << _SHIFT))
     left, right = x0 | (end if aside else x1) << BOX_BITS, x1 << BOX_BITS
     upper, lower = (y0 | (np.int64(_LAST) if down else y1) << BOX_BITS) << (2 * BOX_BITS), y1 << (3 * BOX_BITS)
-    _enter(number, left | upper, tile, slot, places, entries, slots)
-    _enter_if(aside, spare, number, right | upper, beyond, slot + 1, places, entries, slots)
-    slot += 1 + aside
-    _enter_if(down, spare, number, left | lower, tile + below, slot, places, entries, slots)
-    _enter_if(aside * down, spare, number, right | lower, beyond + below, slot + 1, places, entries, slots)
+    above, below = (top - low) * columns, (bottom - low) * columns
+    _note(above + first, number, left | upper, held, tiles, pairs)
+    _note(above + last, number, right | upper, held + 1, tiles, pairs)
+    held += 1 + aside
+    _note(below + first, number, left | lower, held, tiles, pairs)
+    held += down
+    _note(below + last, number, right | lower, held, tiles, pairs)
+    return held + (aside & down)
+
+
+@inlined
+def _note_all(number, word, low, high, columns, width, held, tiles, pairs):
+    """Note a Gaussian that touches any tiles of a band; how many pairs are held then."""
+    first, _, top, bottom = _tiles_of(word)
+    x0, x1, y0, y1 = word & _SIDE, word >> 16 & _SIDE, word >> 32 & _SIDE, word >> 48
+    for i in range(max(top, low), min(bottom + 1, high) if word != NOWHERE else low):
+        corner = i << _SHIFT
+        rows = max(y0 - corner, 0) << (2 * BOX_BITS) | min(y1 - corner, _LAST) << (3 * BOX_BITS)
+        for k in range(first, first + _across(word, columns)):
+            column = k if k < columns else k - columns
+            left, right = _columns_in_tile(x0, x1, column, width)
+            _note((i - low) * columns + column, number, left | right << BOX_BITS | rows, held, tiles, pairs)
+            held += 1
+    return held
 
 
 @kernel
-def _list(part, ends, order, words, columns, low, high, width, all_places, sorted_offsets, entries, slots):
-    """Enter one part of the Gaussians, in drawing order, in the lists of the tiles of a band.
+def _list(part, ends, words, columns, low, high, width, all_places, first_slots, entries, slots, offsets):
+    """Enter one part of the Gaussians in the lists of the tiles of a band.
 
     Args:
-        entries, slots: with `_SPARE` to spare for each part.
+        low, high: rows of tiles.
+        all_places: (part, tile of the band), where each part's entries begin.
+        first_slots: of each part.
+        entries: words of 64 bits.
+        slots: if there are any, each entry's is written.
+        offsets: likewise, where each Gaussian's slots end.
     """
-    places, spare = all_places[part], len(entries) - _SPARE * (part + 1)
-    for j in range(ends[part], ends[part + 1]):
-        word, number, slot = element(words, j), np.int64(element(order, j)), np.int64(0)
-        if len(slots) > 0:
-            slot = element(sorted_offsets, j)
+    places, slot, held = all_places[part], first_slots[part], np.int64(0)
+    room = _HELD + len(places) + 4
+    tiles, pairs = np.empty(room, np.int64), np.empty(room, np.int64)
+    for g in range(ends[part], ends[part + 1]):
+        word = element(words, g)
         first, last, top, bottom = _tiles_of(word)
-        x0, x1, y0, y1 = word & _SIDE, word >> 16 & _SIDE, word >> 32 & _SIDE, word >> 48
-        across = _across(word, columns)
-        small = (across <= 2) & (bottom - top <= 1) & ((x1 >= x0) | (first > last))
-        if small & (top >= low) & (bottom < high):
-            _enter_corners(spare, number, word, slot, low, columns, width, places, entries, slots)
-            continue
-        for i in range(max(top, low), min(bottom + 1, high)):
-            corner = i << _SHIFT
-            rows = max(y0 - corner, 0) << (2 * BOX_BITS) | min(y1 - corner, _LAST) << (3 * BOX_BITS)
-            for k in range(first, first + across):
-                column = k if k < columns else k - columns
-                left, right = _columns_in_tile(x0, x1, column, width)
-                _enter(
-                    number, left | right << BOX_BITS | rows, (i - low) * columns + column, slot, places, entries, slots
-                )
-                slot += 1
+        small = (last - first <= 1) & (bottom - top <= 1) & ((word >> 16 & _SIDE) >= (word & _SIDE))
+        if small & (top >= low) & (bottom < high) & (word != NOWHERE):
+            held = _note_corners(g, word, low, columns, width, held, tiles, pairs)
+        else:
+            held = _note_all(g, word, low, high, columns, width, held, tiles, pairs)
+        if len(offsets) > 0:
+            put(offsets, g + 1, slot + held)
+        if held >= _HELD or g == ends[part + 1] - 1:
+            for k in range(held):
+                tile = element(tiles, k)
+                place = element(places, tile)
+                put(places, tile, place + 1)
+                put(entries, place, element(pairs, k))
+                if len(slots) > 0:
+                    put(slots, place, slots.dtype.type(slot + k))
+            slot, held = slot + held, np.int64(0)
 
 
 def list_tiles(
-    order: np.ndarray,
-    boxes: np.ndarray,
-    size: tuple[int, int],
-    *,
-    slots: bool,
-    threads: int,
-    limit: int = LIMIT,
+    boxes: np.ndarray, size: tuple[int, int], *, slots: bool, threads: int, limit: int = LIMIT
 ) -> Iterator[TileLists]:
     """Lists for all tiles, in bands of tile rows with at most `limit` pairs (a single row may hold more).
 
     Args:
-        order: Gaussians front to back, int32.
         boxes: (n, 4) int16, see boxes.py.
         size: height and width, pixels.
         slots: whether to number the pairs for the backward.
@@ -211,37 +206,23 @@ def list_tiles(
         limit: number of pairs.
     """
     rows, columns = (-(-side // TILE) for side in size)
-    words, own = boxes.view(np.int64)[:, 0], Lease()
-    ends = np.linspace(0, len(order), threads + 1).astype(np.int64)
-    sorted_words, counts = own.array(len(order), np.int64), np.empty((threads, rows * columns), np.int64)
-    share(lambda part: _fetch(part, ends, order, words, columns, sorted_words, counts), threads, threads)
-    per_row = counts.sum(axis=0).reshape(rows, columns).sum(axis=1)
-    for low, high in _bands(per_row.tolist(), limit):
-        lease, band = Lease(), counts[:, low * columns : high * columns]
-        offsets = _numbered(words, columns, low, high, lease, threads) if slots else np.empty(0, np.int64)
-        sorted_offsets = own.array(len(order) if slots else 0, np.int64)
-        if slots:
-            share(_bound(_gather, ends, order, offsets, sorted_offsets), threads, threads)
-        totals = band.sum(axis=0)
-        starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(totals)))
-        places = starts[:-1] + np.cumsum(band, axis=0) - band
-        count = int(starts[-1])
-        entries = lease.array(count + _SPARE * threads, np.int64)
-        numbers = lease.array(len(entries) if slots else 0, np.int64)
-        band_list = columns, low, high, size[1], places, sorted_offsets, entries, numbers
-        share(_bound(_list, ends, order, sorted_words, *band_list), threads, threads)
-        yield TileLists(low, entries[:count].view(np.int32).reshape(-1, 2), starts, numbers[:count], offsets, lease)
-
-
-def _numbered(words: np.ndarray, columns: int, low: int, high: int, lease: Lease, threads: int) -> np.ndarray:
-    """Where each Gaussian's slots in a band begin."""
+    words = boxes.view(np.int64)[:, 0]
     ends = np.linspace(0, len(words), threads + 1).astype(np.int64)
-    offsets = lease.array(len(words) + 1, np.int64)
-    offsets[0] = 0
-    share(_bound(_number, ends, words, columns, low, high, offsets), threads, threads)
-    for part in range(1, threads):
-        offsets[ends[part] + 1 : ends[part + 1] + 1] += offsets[ends[part]]
-    return offsets
+    all_counts = np.empty((threads, rows * columns), np.int64)
+    share(lambda part: _count(part, ends, words, rows, columns, all_counts), threads, threads)
+    per_row = all_counts.sum(axis=0).reshape(rows, columns).sum(axis=1)
+    for low, high in _bands(per_row.tolist(), limit):
+        counts, lease = all_counts[:, low * columns : high * columns], Lease()
+        starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts.sum(axis=0))))
+        places, per_part = starts[:-1] + np.cumsum(counts, axis=0) - counts, counts.sum(axis=1)
+        count = int(starts[-1])
+        entries = lease.array(count, np.int64)
+        numbers = lease.array(count if slots else 0, np.int32 if count < 2**31 else np.int64)
+        offsets = lease.array(len(words) + 1 if slots else 0, np.int64)
+        offsets[:1] = 0
+        lists = places, np.cumsum(per_part) - per_part, entries, numbers, offsets
+        share(_bound(_list, ends, words, columns, low, high, size[1], *lists), threads, threads)
+        yield TileLists(low, entries.view(np.int32).reshape(-1, 2), starts, numbers, offsets, lease)
 
 
 def _bands(per_row: list[int], limit: int) -> Iterator[tuple[int, int]]:

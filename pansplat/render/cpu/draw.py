@@ -26,10 +26,10 @@ from pansplat.render.cpu.ewa import TOTALS, project, project_backward
 from pansplat.render.cpu.memory import Lease
 from pansplat.render.cpu.observe import PIECE, Camera, Fields, Observed, observe
 from pansplat.render.cpu.observe_backward import Gradients, add_slots, chain
-from pansplat.render.cpu.radix import front_to_back
 from pansplat.render.cpu.raster import Kept, raster_forward, room_to_keep
 from pansplat.render.cpu.raster_backward import raster_backward
 from pansplat.render.cpu.records import FIELDS
+from pansplat.render.cpu.sort import depths_along, sort_front_to_back
 from pansplat.render.cpu.tables import plane_of
 from pansplat.render.cpu.threads import share, thread_count
 from pansplat.render.panorama import Picture
@@ -39,14 +39,14 @@ _LEAST_SPREAD = 1e-9  # pixel^2: without a filter a disc seen edge-on would have
 
 
 class Projection(NamedTuple):
-    """What one picture shows: records, boxes, and the Gaussians seen, front to back.
+    """What one picture shows: records, boxes, and the distances that it is drawn in order of.
 
     And, if its tile lists came in one band, these and what its forward kept.
     """
 
     records: np.ndarray
     boxes: np.ndarray
-    order: np.ndarray
+    distances: np.ndarray
     lists: TileLists | None = None
     kept: Kept | None = None
 
@@ -218,17 +218,20 @@ def _draw_picture(
     lease, observed = lease if needs_grad else Lease(), scene[2]
     with notes.timed("boxes"):
         records, boxes = _place(scene, picture, options, lease, threads)
-    with notes.timed("sort"):
-        by_depth = options.order == "z" and not picture.is_panorama
-        towards = picture.rotation[:, 2].numpy().copy() if by_depth else np.zeros(3)
-        order = front_to_back(observed.records, observed.radii, boxes, towards, lease, threads)
-    plane, shown = plane_of(picture, exact=options.kernel == "ray"), Projection(records, boxes, order)
-    bands = list_tiles(order, boxes, picture.size, slots=needs_grad, threads=threads, limit=bins.LIMIT)
+    distances = observed.radii
+    if options.order == "z" and not picture.is_panorama:
+        with notes.timed("sort"):
+            towards = picture.rotation[:, 2].numpy().copy()
+            distances = depths_along(observed.records, observed.radii, towards, lease, threads)
+    plane, shown = plane_of(picture, exact=options.kernel == "ray"), Projection(records, boxes, distances)
+    bands = list_tiles(boxes, picture.size, slots=needs_grad, threads=threads, limit=bins.LIMIT)
     while True:
         with notes.timed("bin"):
             lists = next(bands, None)
         if lists is None:
             break
+        with notes.timed("sort"):
+            sort_front_to_back(lists, distances, threads)
         whole = needs_grad and len(lists.starts) == 1 + math.prod(plane.tiles)
         with notes.timed("raster"):
             room = room_to_keep(lists.starts, lists.lease) if whole else None
@@ -237,13 +240,14 @@ def _draw_picture(
                 first_row=lists.first_row, kept=room, threads=threads,
             )  # fmt: skip
         notes.entries += len(lists.entries)
-        own = records.nbytes if records is not observed.records else 0
+        given = observed.records, observed.radii
+        own = sum(part.nbytes for part in (records, distances) if not any(part is other for other in given))
         listed = sum(part.nbytes for part in (lists.entries, lists.starts, lists.slots, lists.offsets, *(room or ())))
-        notes.bytes = max(notes.bytes, own + boxes.nbytes + order.nbytes + max(listed, 8 * len(order)) + 8 * len(order))
+        notes.bytes = max(notes.bytes, own + boxes.nbytes + listed)
         if whole:
             shown = shown._replace(lists=lists, kept=room)
         del lists
-    notes.visible += len(order)
+    notes.visible += int(np.count_nonzero(boxes.view(np.int64) != bins.NOWHERE))
     return shown if needs_grad else None
 
 
@@ -278,11 +282,12 @@ def _slot_gradients(
     for number, (picture, projection) in enumerate(zip(pictures, projections, strict=True)):
         plane = plane_of(picture, exact=exact)
         bands = [projection.lists] if projection.lists else list_tiles(
-            projection.order, projection.boxes, picture.size, slots=True, threads=threads, limit=bins.LIMIT
+            projection.boxes, picture.size, slots=True, threads=threads, limit=bins.LIMIT
         )  # fmt: skip
         for lists in bands:
             room = projection.kept
             if room is None:  # drawn once more: what many bands would have to keep is too much
+                sort_front_to_back(lists, projection.distances, threads)
                 room = room_to_keep(lists.starts, lists.lease)
                 raster_forward(
                     projection.records, observed.values, lists.entries, lists.starts, plane, sums[number],

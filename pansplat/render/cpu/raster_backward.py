@@ -58,7 +58,7 @@ def raster_backward(
     values: Floats,
     entries: Integers,
     starts: Longs,
-    slots: Longs,
+    slots: Integers | Longs,
     plane: Plane,
     sums: Floats,
     kept: Kept,

@@ -194,7 +194,7 @@ def make_case(pose: Tensor) -> Callable[..., Case]:
         whole = (TILE - 1) << 8 | (TILE - 1) << 24
         entries = np.empty((tiles * count, 2), np.int32)
         entries[:, 0], entries[:, 1] = np.tile(np.arange(count), tiles), whole
-        slots = np.tile(np.arange(count) * tiles, tiles) + np.repeat(np.arange(tiles), count)
+        slots = (np.tile(np.arange(count) * tiles, tiles) + np.repeat(np.arange(tiles), count)).astype(np.int32)
         points = picture.coordinates() if kind == "ewa" else picture.directions()
         return Case(
             records.numpy(),

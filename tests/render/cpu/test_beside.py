@@ -14,22 +14,22 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from numba import int64
+from numba import float32, float64, int64
 
 from pansplat.render import rasterize
 from pansplat.render.cpu import beside, compiling
 from pansplat.render.cpu.beside import Beside, Task, ours, possible, theirs
 
-_PLACES = Task("radix", "_places", (int64[:, ::1],))
+_DEPTHS = Task("sort", "_measure", (int64, float32[:, ::1], float64[::1], float64[::1], float64[::1]))
 _FIND = """
 import numpy as np
-from numba import int64
-from pansplat.render.cpu import compiling, radix
+from numba import float32, float64, int64
+from pansplat.render.cpu import compiling, sort
 from pansplat.render.cpu.beside import Beside, Task
-wrong = Task("radix", "_move", (int64,))
-compiling._second = Beside([wrong, Task("radix", "_places", (int64[:, ::1],))])
-radix._places(np.zeros((1, 4), np.int64))
-print(sum(radix._places.stats.cache_hits.values()), sum(radix._places.stats.cache_misses.values()))
+wrong, kinds = Task("sort", "_sort_tiles", (int64,)), (int64, float32[:, ::1], *(float64[::1],) * 3)
+compiling._second = Beside([wrong, Task("sort", "_measure", kinds)])
+sort._measure(0, np.zeros((1, 16), np.float32), *np.zeros((3, 3)))
+print(sum(sort._measure.stats.cache_hits.values()), sum(sort._measure.stats.cache_misses.values()))
 """
 _ABANDON = """
 import os, signal
@@ -46,7 +46,7 @@ def _signatures(module, name):
 
 def _brings(monkeypatch, code, **options):
     monkeypatch.setattr(beside, "_SERVE", code)
-    return Beside([_PLACES], **options)
+    return Beside([_DEPTHS], **options)
 
 
 def test_a_kernel_that_the_second_process_compiled_is_not_compiled_again(tmp_path):
@@ -105,12 +105,12 @@ def test_waiting_ends_when_the_kernel_is_there_though_the_process_goes_on(monkey
 def test_what_is_left_to_the_first_process_is_compiled_once_before_it_waits(monkeypatch):
     done = []
     monkeypatch.setattr(beside, "compile_all", lambda work: done.extend(work))
-    failing = _brings(monkeypatch, "raise SystemExit(3)", meanwhile=[_PLACES])
+    failing = _brings(monkeypatch, "raise SystemExit(3)", meanwhile=[_DEPTHS])
     assert done == []
     failing.wait(lambda: done.append("look"))
-    assert done[0] == _PLACES and set(done[1:]) == {"look"}
+    assert done[0] == _DEPTHS and set(done[1:]) == {"look"}
     failing.wait(lambda: None)
-    assert done.count(_PLACES) == 1
+    assert done.count(_DEPTHS) == 1
     failing.stop()
 
 
@@ -168,8 +168,8 @@ def test_the_first_kernel_that_is_missing_starts_the_second_process_once(gradien
         assert compiling._load(("raster", "_draw_tiles"), lambda *_: None, (), None) == "waited"
         assert compiling._load(("boxes", "_panorama"), lambda *_: None, (), None) is None
     ((work, meanwhile),) = started
-    assert {"_survey", "_list", "_draw_tiles"} < set(work)
-    assert ("_walk_tiles" in work) == ("_gather" in work) == gradients
+    assert {"_list", "_sort_tiles", "_draw_tiles"} < set(work)
+    assert ("_walk_tiles" in work) == gradients
     assert meanwhile == (["_chain"] if gradients else [])
 
 
