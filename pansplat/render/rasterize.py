@@ -107,7 +107,7 @@ def rasterize(
     planes = pictures(layout, size, vertical_fov_degrees=vertical_fov_degrees, face_size=face_size, device=device)
     options = Options(kernel, order, lowpass, near, strict)
     drawn = _backend(backend, gaussians)(gaussians, covariances, pose, planes, options)
-    sums = stitch_faces(drawn.sums, size, stitching=stitching) if layout == "cubemap" else drawn.sums[0]
+    sums = stitch_faces(drawn.sums, size, stitching=stitching) if layout == "cubemap" else drawn.sums.squeeze(0)
     return _finish(sums, behind, drawn.info)
 
 
@@ -175,8 +175,10 @@ def _covariances(given: Tensor | None, gaussians: Gaussians) -> Tensor | None:
     return given.to(gaussians.means)
 
 
-def _background(given: Sequence[float] | Tensor, gaussians: Gaussians) -> Float[Tensor, "channel"]:
-    """The background in the Gaussians' type and number of channels."""
+def _background(given: Sequence[float] | Tensor, gaussians: Gaussians) -> Float[Tensor, "channel"] | None:
+    """The background in the Gaussians' type and number of channels; None if it is black and stays so."""
+    if not isinstance(given, Tensor) and not any(given):
+        return None
     behind = torch.as_tensor(given, dtype=gaussians.means.dtype, device=gaussians.means.device)
     channels = gaussians.harmonics.shape[2]
     if behind.shape != (channels,) and not behind.any():
@@ -189,11 +191,15 @@ def _background(given: Sequence[float] | Tensor, gaussians: Gaussians) -> Float[
     return behind
 
 
-def _finish(sums: Float[Tensor, "sums height width"], background: Float[Tensor, "channel"], info: Info) -> Rendering:
+def _finish(
+    sums: Float[Tensor, "sums height width"], background: Float[Tensor, "channel"] | None, info: Info
+) -> Rendering:
     """Composite over the background, and turn the sum of distances into their mean."""
-    channels, distance, weight = sums[:-2], sums[-2], sums[-1]
+    # Split, not indexed: going back, three pieces are put together once instead of added as three whole pictures.
+    channels, distance, weight = sums.split((len(sums) - 2, 1, 1))
+    distance, weight = distance.squeeze(0), weight.squeeze(0)
     alpha = weight.clamp_max(1)
-    color = channels + (1 - alpha) * background[:, None, None]
+    color = channels.clone() if background is None else channels + (1 - alpha) * background[:, None, None]
     seen = weight > 0
     depth = torch.where(seen, distance / torch.where(seen, weight, torch.ones_like(weight)), 0)
     return Rendering(color, alpha, depth, info)
