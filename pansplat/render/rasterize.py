@@ -3,12 +3,13 @@
 Source: docs/rendering.md; PanSplat, section 3.4.
 """
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Literal, get_args
+from typing import Literal, ParamSpec, TypeVar, get_args
 
 import torch
 from jaxtyping import Float
@@ -25,6 +26,20 @@ Backend = Literal["auto", "torch", "numba", "triton"]
 
 _MODULES = {"torch": "pansplat.render.reference", "numba": "pansplat.render.cpu", "triton": "pansplat.render.cuda"}
 _RIGID = 1e-4
+
+_Arguments, _Result = ParamSpec("_Arguments"), TypeVar("_Result")
+
+
+def _untraced(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Have torch.compile call a function as it is: what is inside is not made of torch, and it would try every line."""
+
+    @functools.wraps(function)
+    def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        if torch.compiler.is_compiling():  # only then: to disable it sooner would import the compiler, for a second
+            return torch.compiler.disable(function)(*args, **kwargs)
+        return function(*args, **kwargs)
+
+    return call
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +59,7 @@ class Rendering:
     info: Info | None = None
 
 
+@_untraced
 def rasterize(
     gaussians: Gaussians,
     cam2world: Float[Tensor, "4 4"],
