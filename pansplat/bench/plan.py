@@ -47,13 +47,14 @@ class Settings:
     @property
     def choice_height(self) -> int:
         """Height of the pictures that compare every choice."""
-        return min(max(8, self.height // 2) if self.quick else self.height, _LARGEST_CHOICE)
+        return min(_lattice(0.375 * self.height) if self.quick else self.height, _LARGEST_CHOICE)
 
     @property
     def face_sizes(self) -> tuple[int, ...]:
-        """Sides of cube faces to compare: the original's, the default, in the full run one as fine everywhere."""
+        """Sides of cube faces: the default; in the full run the original's, too, and one as fine everywhere."""
         height = self.choice_height
-        return (height // 2, default_face_size(height)) + (() if self.quick else (height,))
+        usual = default_face_size(height)
+        return (usual,) if self.quick else (height // 2, usual, height)
 
     @property
     def fast(self) -> list[str]:
@@ -101,7 +102,7 @@ def groups(settings: Settings, subject: Callable[[int], Subject], *, synthetic: 
         others = [replace(dense, backend=name) for name in ("torch", *settings.backends)]
         found.append(_group("dense", room(DENSE_HEIGHT), [dense, *others], "own"))
     for index, one in enumerate(_counts(settings, subject, synthetic)):
-        found.append(_group("count", one, _sweep(settings, height, slow=index == 0), "none"))
+        found.append(_group("count", one, _sweep(settings, height, slow=index == 0 and not settings.quick), "none"))
     for index, one_height in enumerate(_heights(settings)):
         if not synthetic or lattice_room_size(one_height) * _BYTES < settings.memory:
             cases = _sweep(settings, one_height, slow=index < 2)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from pansplat.bench.cases import Case, choices, default_face_size, official
+from pansplat.bench.cases import Case, choices, official
 from pansplat.bench.plan import Settings, groups, of_scene, room, sample_groups
 from pansplat.bench.scenes import full_lattice_room
 
@@ -17,15 +17,15 @@ def cases(settings: Settings, suite: str) -> list[Case]:
     return [case for group in groups(settings, room, synthetic=True) if group.suite == suite for case in group.cases]
 
 
-@pytest.mark.parametrize("settings", [QUICK, FULL])
-def test_every_choice_of_the_fast_backend_is_measured(settings):
+@pytest.mark.parametrize(("settings", "sizes"), [(QUICK, (122,)), (FULL, (256, 326, 512))])
+def test_every_choice_of_the_fast_backend_is_measured(settings, sizes):
     found = {
         (c.kernel, c.order, c.filter, c.face_size)
         for c in cases(settings, "choices")
         if (c.backend, c.layout, c.stitching) == ("numba", "cubemap", "seamless")
     }
-    height = settings.choice_height
-    for size in (height // 2, default_face_size(height)):
+    assert settings.choice_height == (192 if settings.quick else 512)
+    for size in sizes:
         for kernel in ("ray", "ewa"):
             for order in ("radial", "z"):
                 for lowpass in ("angular", "3dgs"):
