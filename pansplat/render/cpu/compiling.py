@@ -84,7 +84,17 @@ def _stamp(module: Path) -> str:
 
 def inlined(function: Callable[..., Any]) -> Any:
     """Compile a function into each kernel that calls it."""
-    compiled: Any = nb.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)(inspect.unwrap(function))
+    return _inlined(function)
+
+
+def borrowing(function: Callable[..., Any]) -> Any:
+    """Likewise, without counting references to the arrays it is given, in inmost loops too: it must return none."""
+    return _inlined(function, _nrt=False)
+
+
+def _inlined(function: Callable[..., Any], **options: Any) -> Any:
+    options = {"forceinline": True, "no_cpython_wrapper": True, **options, **_OPTIONS}
+    compiled: Any = nb.njit(**options)(inspect.unwrap(function))
     # Numba would compile it once more for each number written in a call; LLVM puts that number in anyway.
     resolve = compiled.get_call_template
     compiled.get_call_template = lambda args, kws: resolve(

@@ -4,10 +4,12 @@ Source: docs/rendering.md, section 3. The forms are linear in a pixel's offset f
 them, summed alone and times the offset, are all that the pixels have to say.
 """
 
+import math
+
 import numpy as np
 
 from pansplat.render.cpu.columns import columns_of
-from pansplat.render.cpu.compiling import inlined
+from pansplat.render.cpu.compiling import borrowing
 from pansplat.render.cpu.raster import forms_at
 from pansplat.render.cpu.records import FIELDS
 from pansplat.render.cpu.simd import (
@@ -27,46 +29,49 @@ from pansplat.render.cpu.simd import (
     totals,
     transposed,
 )
-from pansplat.render.cpu.tile import A_X, ALONG_ROW, B_X, CHUNK, FRONTS, L_X, PIXELS
+from pansplat.render.cpu.tile import ALONG_ROW, CHUNK, PIXELS
 
 GROUP = 4  # values whose gradients are summed at a time
-MOMENTS = 16  # (x, y, z, 1) of A, of B, of L; along; level; two to spare
+MOMENTS = 16  # see `_sum_moments`
+SHARES = 9  # where the sums of weight x upstream gradient begin
+_LN2 = math.log(2)
 PAIR = 2 * LANES  # numbers a pair of a Gaussian and a block: slopes and weights; one cache line
 _LEAST = 1e-16  # of L^2 + along Q: only reached where the slope is 0
 _AHEAD = 24  # Gaussians, between asking for a slot and writing it
 
 
-@inlined
+@borrowing
 def write_chunk(  # type: ignore[no-untyped-def]
-    first, count, slots, heads, pairs, slopes, forms, offsets, upstream, num_values, moments, shares, exact,
-    grad_records, grad_values,
+    records, entries, first, count, slots, heads, pairs, slopes, wide, forms, offsets, upstream, num_values, moments,
+    exact, grad_records, grad_values,
 ):  # fmt: skip
     """Write the gradients of a chunk's Gaussians to their slots."""
     last = first + count - 1
     for s in range(count):
         ahead = element(slots, min(first + s + _AHEAD, last))
         prefetch_to_write(grad_values, num_values * ahead)
-        _sum_moments(s, heads, pairs, slopes, forms, offsets, upstream, moments, shares)
+        _sum_moments(s, heads, pairs, slopes, wide, forms, offsets, upstream, moments)
         row = num_values * slots[first + s]
         for value in range(min(GROUP, num_values)):
-            put(grad_values, row + value, element(shares, value))
+            put(grad_values, row + value, element(moments, MOMENTS * s + SHARES + value))
         for value in range(GROUP, num_values):
             put(grad_values, row + value, _share_of(s, heads, pairs, slopes, upstream, value))
     for s in range(0, count, LANES):
-        _write_records(s, first, count, slots, forms, moments, exact, grad_records)
+        _write_records(s, records, entries, first, count, slots, moments, exact, grad_records)
 
 
-@inlined
+@borrowing
 def _sum_moments(  # type: ignore[no-untyped-def]
-    s, heads, pairs, slopes, forms, offsets, upstream, moments, shares
+    s, heads, pairs, slopes, wide, forms, offsets, upstream, moments
 ):
-    """Sums over a Gaussian's pixels of the derivatives by A, B, L, times the pixel's offset and 1; by along, level.
+    """Sums over a Gaussian's pixels, with x = A / L, y = B / L, q = x^2 + y^2 and h = slope / (1 + along q)^2.
+    All lack a factor log 2, for slopes are those by log alpha.
 
-    Those by A and B lack a factor -2, that by L a factor 2. And the sums of weight x upstream gradient of four values.
+    They are those of h times x^2, x y, y^2, x, y, q x, q y, q^2, that of the slopes, and those of weight x upstream
+    gradient of four values.
     """
     zero, one = fill(np.float32(0)), fill(np.float32(1))
-    a_x = a_y = a_z = a_one = b_x = b_y = b_z = b_one = zero
-    l_x = l_y = l_z = l_one = by_along = by_level = zero
+    xx = xy = yy = by_x = by_y = q_x = q_y = by_along = by_level = zero
     share0 = share1 = share2 = share3 = zero
     along = spread(forms, ALONG_ROW * CHUNK + s)
     pair = np.int64(element(heads, s))
@@ -75,28 +80,26 @@ def _sum_moments(  # type: ignore[no-untyped-def]
         slope, weight = load(slopes, pair * PAIR), load(slopes, pair * PAIR + LANES)
         pair = np.int64(element(pairs, 2 * pair + 1))
         x, y, z = load(offsets, pixel), load(offsets, PIXELS + pixel), load(offsets, 2 * PIXELS + pixel)
-        a, b, front, x, y, z = forms_at(forms, s, x, y, z)
+        a, b, front = forms_at(wide, forms, s, x, y, z)
         q = multiply_add(a, a, b * b)
         inverse = one / maximum(multiply_add(front, front, along * q), fill(np.float32(_LEAST)))
-        ratio = q * inverse
-        scaled = slope * inverse
-        by_q = multiply_add(negative(scaled * along), ratio, scaled)
-        a, b, front = a * by_q, b * by_q, front * (scaled * ratio)
-        a_x, a_y, a_z, a_one = multiply_add(a, x, a_x), multiply_add(a, y, a_y), multiply_add(a, z, a_z), a_one + a
-        b_x, b_y, b_z, b_one = multiply_add(b, x, b_x), multiply_add(b, y, b_y), multiply_add(b, z, b_z), b_one + b
-        l_x, l_y, l_z = multiply_add(front, x, l_x), multiply_add(front, y, l_y), multiply_add(front, z, l_z)
-        l_one = l_one + front
-        by_along, by_level = multiply_add(slope * ratio, ratio, by_along), by_level + slope
+        scaled = slope * inverse * inverse  # h / L^4
+        ahead, across = scaled * front, scaled * q
+        by_along, by_level = multiply_add(across, q, by_along), by_level + slope
+        across, ahead = ahead * q, ahead * front
+        q_x, q_y = multiply_add(across, a, q_x), multiply_add(across, b, q_y)
+        x, y = ahead * a, ahead * b
+        xx, xy, yy = multiply_add(x, a, xx), multiply_add(x, b, xy), multiply_add(y, b, yy)
+        by_x, by_y = multiply_add(x, front, by_x), multiply_add(y, front, by_y)
         share0 = multiply_add(weight, load(upstream, pixel), share0)
         share1 = multiply_add(weight, load(upstream, pixel + PIXELS), share1)
         share2 = multiply_add(weight, load(upstream, pixel + 2 * PIXELS), share2)
         share3 = multiply_add(weight, load(upstream, pixel + 3 * PIXELS), share3)
-    store(moments, MOMENTS * s, totals(a_x, a_y, a_z, a_one, b_x, b_y, b_z, b_one))
-    store(moments, MOMENTS * s + LANES, totals(l_x, l_y, l_z, l_one, by_along, by_level, zero, zero))
-    store(shares, 0, totals(share0, share1, share2, share3, zero, zero, zero, zero))
+    store(moments, MOMENTS * s, totals(xx, xy, yy, by_x, by_y, q_x, q_y, by_along))
+    store(moments, MOMENTS * s + LANES, totals(by_level, share0, share1, share2, share3, zero, zero, zero))
 
 
-@inlined
+@borrowing
 def _share_of(s, heads, pairs, slopes, upstream, value):  # type: ignore[no-untyped-def]
     """The gradient of a Gaussian's value: the sum over its pixels of weight x upstream gradient."""
     share = zero = fill(np.float32(0))
@@ -108,44 +111,87 @@ def _share_of(s, heads, pairs, slopes, upstream, value):  # type: ignore[no-unty
     return first_lane(totals(share, zero, zero, zero, zero, zero, zero, zero))
 
 
-@inlined
+@borrowing
 def _write_records(  # type: ignore[no-untyped-def]
-    s, first, count, slots, forms, moments, exact, grad_records
+    s, records, entries, first, count, slots, moments, exact, grad_records
 ):
-    """Turn the moments of eight Gaussians into gradients of their records, and write them to their slots."""
+    """Turn the moments of eight Gaussians into gradients of their records, and write them to their slots.
+
+    The ray's length is free: with L = 1, d - n = x p + y q, where p and q are such that a.p = b.q = 1 and
+    a.q = b.p = l.p = l.q = 0. So x and y tell what the offset was.
+    """
     at = MOMENTS * s
-    a_x, a_y, a_z, a_one, b_x, b_y, b_z, b_one = _rows(moments, at)
-    l_x, l_y, l_z, l_one, along, level, _, _ = _rows(moments, at + LANES)
-    less, on, zero = fill(np.float32(-2)), fill(exact), fill(np.float32(0))
-    twice = on + on
-    a, b, front = _column(forms, A_X, s), _column(forms, B_X, s), _column(forms, L_X, s)
-    front_a, front_b = load(forms, FRONTS * CHUNK + s), load(forms, (FRONTS + 1) * CHUNK + s)
-    # What the moments lack: a factor -2, or 2.
-    a_x, a_y, a_z, a_one = less * a_x, less * a_y, less * a_z, less * a_one
-    b_x, b_y, b_z, b_one = less * b_x, less * b_y, less * b_z, less * b_one
-    l_x, l_y, l_z, l_one = twice * l_x, twice * l_y, twice * l_z, twice * l_one
-    n_x = l_x - multiply_add(a[0], a_one, multiply_add(b[0], b_one, front[0] * l_one))
-    n_y = l_y - multiply_add(a[1], a_one, multiply_add(b[1], b_one, front[1] * l_one))
-    n_z = l_z - multiply_add(a[2], a_one, multiply_add(b[2], b_one, front[2] * l_one))
-    by_front_a = multiply_add(a[0], l_x, multiply_add(a[1], l_y, a[2] * l_z))
-    by_front_b = multiply_add(b[0], l_x, multiply_add(b[1], l_y, b[2] * l_z))
-    a_x, a_y, a_z = multiply_add(front_a, l_x, a_x), multiply_add(front_a, l_y, a_y), multiply_add(front_a, l_z, a_z)
-    b_x, b_y, b_z = multiply_add(front_b, l_x, b_x), multiply_add(front_b, l_y, b_y), multiply_add(front_b, l_z, b_z)
+    xx, xy, yy, x, y, q_x, q_y, along = _rows(moments, at)
+    level, _, _, _, _, _, _, _ = _rows(moments, at + LANES)
+    n, a, b, front_a, front_b = _record(records, entries, first + s, first + count - 1)
+    zero, one, two, on = fill(np.float32(0)), fill(np.float32(1)), fill(np.float32(2 * _LN2)), fill(exact)
+    twice, half = two * on, fill(np.float32(_LN2))
+    ahead = on * n[0], on * n[1], multiply_add(on, n[2], one - on)
+    p, q = _cross(b, ahead), _cross(ahead, a)
+    inverse = one / _dot(a, p)
+    p = _combined(inverse, p, negative(front_a), n)
+    q = _combined(inverse, q, negative(front_b), n)
+    front = _combined(front_a, a, front_b, b)
+    front = n[0] + front[0], n[1] + front[1], n[2] + front[2]
+    by_front = _combined(twice * q_x, p, twice * q_y, q)
+    by_a = _combined(two * (front_a * q_x - xx), p, two * (front_a * q_y - xy), q)
+    by_b = _combined(two * (front_b * q_x - xy), p, two * (front_b * q_y - yy), q)
+    by_n, back = _combined(two * x, a, two * y, b), negative(twice * (xx + yy))
+    n_x = by_front[0] + multiply_add(back, front[0], by_n[0])
+    n_y = by_front[1] + multiply_add(back, front[1], by_n[1])
+    n_z = by_front[2] + multiply_add(back, front[2], by_n[2])
     # The moments have been read: the rows take their place.
-    _store_rows(moments, at, transposed(n_x, n_y, n_z, zero, zero, zero, a_x, a_y))
-    _store_rows(moments, at + LANES, transposed(a_z, b_x, b_y, b_z, by_front_a, by_front_b, on * along, level))
+    _store_rows(moments, at, transposed(n_x, n_y, n_z, zero, zero, zero, by_a[0], by_a[1]))
+    _store_rows(
+        moments,
+        at + LANES,
+        transposed(by_a[2], by_b[0], by_b[1], by_b[2], twice * q_x, twice * q_y, half * on * along, half * level),
+    )
     for place in range(s, min(s + LANES, count)):
         row = FIELDS * slots[first + place]
         store_past_cache(grad_records, row, load(moments, MOMENTS * place))
         store_past_cache(grad_records, row + LANES, load(moments, MOMENTS * place + LANES))
 
 
-@inlined
-def _column(forms, row, s):  # type: ignore[no-untyped-def]
-    return load(forms, row * CHUNK + s), load(forms, (row + 1) * CHUNK + s), load(forms, (row + 2) * CHUNK + s)
+@borrowing
+def _record(records, entries, e, last):  # type: ignore[no-untyped-def]
+    """n, a, b, front_a and front_b of eight Gaussians."""
+    r0 = FIELDS * np.int64(element(entries, 2 * e))
+    r1 = FIELDS * np.int64(element(entries, 2 * min(e + 1, last)))
+    r2 = FIELDS * np.int64(element(entries, 2 * min(e + 2, last)))
+    r3 = FIELDS * np.int64(element(entries, 2 * min(e + 3, last)))
+    r4 = FIELDS * np.int64(element(entries, 2 * min(e + 4, last)))
+    r5 = FIELDS * np.int64(element(entries, 2 * min(e + 5, last)))
+    r6 = FIELDS * np.int64(element(entries, 2 * min(e + 6, last)))
+    r7 = FIELDS * np.int64(element(entries, 2 * min(e + 7, last)))
+    n_x, n_y, n_z, _, _, _, a_x, a_y = columns_of(records, r0, r1, r2, r3, r4, r5, r6, r7)
+    a_z, b_x, b_y, b_z, front_a, front_b, _, _ = columns_of(
+        records, r0 + 8, r1 + 8, r2 + 8, r3 + 8, r4 + 8, r5 + 8, r6 + 8, r7 + 8
+    )
+    return (n_x, n_y, n_z), (a_x, a_y, a_z), (b_x, b_y, b_z), front_a, front_b
 
 
-@inlined
+@borrowing
+def _cross(a, b):  # type: ignore[no-untyped-def]
+    return (
+        multiply_add(a[1], b[2], negative(a[2] * b[1])),
+        multiply_add(a[2], b[0], negative(a[0] * b[2])),
+        multiply_add(a[0], b[1], negative(a[1] * b[0])),
+    )
+
+
+@borrowing
+def _dot(a, b):  # type: ignore[no-untyped-def]
+    return multiply_add(a[0], b[0], multiply_add(a[1], b[1], a[2] * b[2]))
+
+
+@borrowing
+def _combined(s, a, t, b):  # type: ignore[no-untyped-def]
+    """s a + t b"""
+    return multiply_add(s, a[0], t * b[0]), multiply_add(s, a[1], t * b[1]), multiply_add(s, a[2], t * b[2])
+
+
+@borrowing
 def _rows(moments, at):  # type: ignore[no-untyped-def]
     """A column for each of eight numbers of eight Gaussians."""
     step = MOMENTS
@@ -154,7 +200,7 @@ def _rows(moments, at):  # type: ignore[no-untyped-def]
     )
 
 
-@inlined
+@borrowing
 def _store_rows(moments, at, rows):  # type: ignore[no-untyped-def]
     for row in range(LANES):
         store(moments, at + row * MOMENTS, rows[row])

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pansplat.render.cpu.compiling import inlined, kernel
+from pansplat.render.cpu.compiling import borrowing, kernel
 from pansplat.render.cpu.memory import Lease
 from pansplat.render.cpu.records import TILE
 from pansplat.render.cpu.simd import (
@@ -22,6 +22,7 @@ from pansplat.render.cpu.simd import (
     how_many,
     load,
     lowest_bit,
+    maximum,
     minimum,
     multiply_add,
     negative,
@@ -34,10 +35,8 @@ from pansplat.render.cpu.simd import (
 from pansplat.render.cpu.tables import FLAT, Plane
 from pansplat.render.cpu.threads import share
 from pansplat.render.cpu.tile import (
-    A_X,
     ACROSS,
     ALONG_ROW,
-    B_X,
     BLOCK_HEIGHT,
     BLOCK_WIDTH,
     BLOCKS,
@@ -45,18 +44,25 @@ from pansplat.render.cpu.tile import (
     CLOSED,
     CUT,
     EDGES,
+    FEW,
     FORMS,
-    L_X,
     LEVEL_ROW,
     MIDDLE,
     MOST,
     NOTHING,
     PIXELS,
+    PLACE,
     ROWS,
+    THIRD,
     WORDS,
+    A,
+    B,
+    L,
     ask_ahead,
     gather,
     list_blocks,
+    open_pixels,
+    place_pixels,
     place_tile,
 )
 
@@ -65,8 +71,8 @@ Integers = npt.NDArray[np.int32]
 Longs = npt.NDArray[np.int64]
 
 _PIECES = 8  # of work a thread
-HALF = CHUNK  # room for the powers of a block
-FEW = 4  # values summed without writing the weights down: RGB and the distance
+_FIRST = 6
+HALF = CHUNK + _FIRST  # room for the powers of a block, and some to write over
 
 
 class Kept(NamedTuple):
@@ -139,15 +145,16 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     tiles_across = (len(columns) + TILE - 1) // TILE
     num_values = values.shape[1]
-    offsets, middle = np.empty(3 * PIXELS, np.float32), np.empty(6, np.float32)
+    offsets, centre, place = np.empty(3 * PIXELS, np.float32), np.empty(3), np.empty(PLACE, np.float32)
     through, added = np.empty(PIXELS, np.float32), np.empty(num_values * PIXELS, np.float32)
     forms, colours = np.empty(FORMS * CHUNK, np.float32), np.empty(num_values * CHUNK, np.float32)
-    touched, found = np.empty(WORDS * EDGES, np.uint64), np.zeros(WORDS + 2, np.uint64)
+    touched = np.empty(WORDS * EDGES, np.uint64)
     powers, places = np.empty(2 * HALF * LANES, np.float32), np.empty(2 * HALF, np.int32)
     exact = np.float32(0 if kind == FLAT else 1)
     for tile in range(low, high):
         left, top = (tile % tiles_across) * TILE, (first_row + tile // tiles_across) * TILE
-        place_tile(kind, columns, rows, rotation, left, top, offsets, middle, through)
+        tile_is_wide, placed = place_tile(kind, columns, rows, rotation, left, top, centre, place), -1
+        open_pixels(columns, rows, left, top, through)
         added[:] = 0
         chunks = 0
         for first in range(starts[tile], starts[tile + 1], CHUNK):
@@ -155,7 +162,12 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
             if len(kept) > 0:
                 _keep(through, kept, kept_rows[tile] + chunks)
             chunks += 1
-            gather(records, values, entries, first, count, middle, exact, forms, colours)
+            wide = tile_is_wide
+            while gather(records, values, entries, first, count, place, exact, wide, forms, colours):
+                wide = True
+            if placed != wide:
+                place_pixels(kind, columns, rows, rotation, left, top, centre, place, wide, offsets)
+                placed = np.int64(wide)
             list_blocks(entries, first, count, touched)
             is_open = False
             # The next block's powers are found before a block is drawn, so that their latencies hide each other.
@@ -165,7 +177,7 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
                     ask_ahead(records, values, entries, block, first + CHUNK)
                     if not some(load(through, block * LANES) > fill(np.float32(CLOSED))):
                         continue
-                    following = find_powers(block, touched, forms, offsets, found, powers, places, half)
+                    following = find_powers(block, touched, wide, forms, offsets, powers, places, half)
                 if drawn >= 0 and num_values == FEW:
                     is_open |= _draw_block(drawn, reached, powers, places, HALF - half, colours, through, added)
                 elif drawn >= 0:
@@ -180,95 +192,113 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
         _write_tile(through, added, sums, left, top, num_values)
 
 
-@inlined
+@borrowing
 def _keep(through, kept, row):  # type: ignore[no-untyped-def]
     for pixel in range(PIXELS):
         kept[row, pixel] = through[pixel]
 
 
-@inlined
-def find_powers(block, touched, forms, offsets, found, powers, places, start):  # type: ignore[no-untyped-def]
+@borrowing
+def find_powers(block, touched, wide, forms, offsets, powers, places, start):  # type: ignore[no-untyped-def]
     """Log2 of the peak times the response at a block's pixels, for the Gaussians of the chunk that reach it.
 
     Returns:
-        How many of `powers` (LANES each) and `places` (in the chunk) were written, front to back. Boxes have corners:
-        some of them no pixel sees. Leaving those out would make each wait for the one before.
+        How many of `powers` (LANES each) and `places` (in the chunk) were written, front to back; one more that is
+        nothing follows. Boxes have corners: some of them no pixel sees. Leaving those out would make each wait for the
+        one before.
     """
-    pixel, column, row = block * LANES, block % ACROSS, ROWS + block // ACROSS
+    pixel = block * LANES
     x, y, z = load(offsets, pixel), load(offsets, PIXELS + pixel), load(offsets, 2 * PIXELS + pixel)
-    total = 0
-    for word in range(WORDS):
-        bits = element(touched, word * EDGES + column) & element(touched, word * EDGES + row)
-        put(found, word, bits)
-        total += how_many(bits)
-    # From word to word without a branch: the processor could not foretell where one ends.
-    word, bits, following = 0, element(found, 0), element(found, 1)
-    for at in range(start, start + total):
-        while bits == 0:  # a word with none: few are
-            word += 1
-            bits, following = element(found, word), element(found, word + 1)
-        s = word * 64 + lowest_bit(bits)
-        bits &= bits - np.uint64(1)
-        done = bits == 0
-        bits = following if done else bits
-        word += np.int64(done)
-        following = element(found, word + 1)
-        a, b, front, _, _, _ = forms_at(forms, s, x, y, z)
-        q = multiply_add(a, a, b * b)
-        below = multiply_add(front, front, spread(forms, ALONG_ROW * CHUNK + s) * q)
-        power = spread(forms, LEVEL_ROW * CHUNK + s) - q / below
-        power = choose(front > fill(np.float32(0)), power, fill(np.float32(NOTHING)))
-        store(powers, at * LANES, power)
-        put(places, at, np.int32(s))
+    total = _list_places(block, touched, places, start)
+    zero = fill(np.float32(0))
+    for at in range(start, start + total, 2):
+        for turn in range(2):
+            s = np.int64(element(places, at + turn))
+            a, b, front = forms_at(wide, forms, s, x, y, z)
+            if wide:
+                front = choose(front > zero, front, fill(np.float32(np.nan)))
+            q = multiply_add(a, a, b * b)
+            below = multiply_add(maximum(zero, front), front, spread(forms, ALONG_ROW * CHUNK + s) * q)
+            power = spread(forms, LEVEL_ROW * CHUNK + s) - q / below
+            store(powers, (at + turn) * LANES, power)
+    store(powers, (start + total) * LANES, fill(np.float32(NOTHING)))
     return total
 
 
-@inlined
-def forms_at(forms, s, x, y, z):  # type: ignore[no-untyped-def]
-    """A, B, L of Gaussian `s` of the chunk at a block's pixels, and the pixels' offsets from it.
+@borrowing
+def _list_places(block, touched, places, start):  # type: ignore[no-untyped-def]
+    """Write down which Gaussians of the chunk reach a block, and one more; how many do.
 
-    The offsets come first: small numbers, so that nothing large cancels in the sums.
+    _FIRST of a word of bits are written whether they are there or not, and the next word's over what was not: the
+    processor could not foretell where a word ends.
     """
-    x, y, z = (
-        x - spread(forms, MIDDLE * CHUNK + s),
-        y - spread(forms, (MIDDLE + 1) * CHUNK + s),
-        z - spread(forms, (MIDDLE + 2) * CHUNK + s),
-    )
-    a = spread(forms, A_X * CHUNK + s) * x
-    b = spread(forms, B_X * CHUNK + s) * x
-    front = multiply_add(spread(forms, L_X * CHUNK + s), x, fill(np.float32(1)))
-    a = multiply_add(spread(forms, (A_X + 1) * CHUNK + s), y, a)
-    b = multiply_add(spread(forms, (B_X + 1) * CHUNK + s), y, b)
-    front = multiply_add(spread(forms, (L_X + 1) * CHUNK + s), y, front)
-    a = multiply_add(spread(forms, (A_X + 2) * CHUNK + s), z, a)
-    b = multiply_add(spread(forms, (B_X + 2) * CHUNK + s), z, b)
-    front = multiply_add(spread(forms, (L_X + 2) * CHUNK + s), z, front)
-    return a, b, front, x, y, z
+    at, column, row = start, block % ACROSS, ROWS + block // ACROSS
+    for word in range(WORDS):
+        bits = element(touched, word * EDGES + column) & element(touched, word * EDGES + row)
+        end = at + how_many(bits)
+        for _ in range(_FIRST):
+            put(places, at, np.int32(word * 64 + lowest_bit(bits)))
+            bits &= bits - np.uint64(1)
+            at += 1
+        while bits != 0:
+            put(places, at, np.int32(word * 64 + lowest_bit(bits)))
+            bits &= bits - np.uint64(1)
+            at += 1
+        at = end
+    put(places, at, np.int32(0))
+    return at - start
 
 
-@inlined
+@borrowing
+def forms_at(wide, forms, s, x, y, z):  # type: ignore[no-untyped-def]
+    """A, B, L of Gaussian `s` of the chunk at a block's pixels, up to a factor a pixel, which powers do not see.
+
+    The offsets from the Gaussian come first: small numbers, so that nothing large cancels in the sums.
+    """
+    x, y = x - spread(forms, MIDDLE * CHUNK + s), y - spread(forms, (MIDDLE + 1) * CHUNK + s)
+    a = spread(forms, A * CHUNK + s) * x
+    b = spread(forms, B * CHUNK + s) * x
+    front = multiply_add(spread(forms, L * CHUNK + s), x, fill(np.float32(1)))
+    a = multiply_add(spread(forms, (A + 1) * CHUNK + s), y, a)
+    b = multiply_add(spread(forms, (B + 1) * CHUNK + s), y, b)
+    front = multiply_add(spread(forms, (L + 1) * CHUNK + s), y, front)
+    if wide:
+        z = z - spread(forms, (THIRD + 3) * CHUNK + s)
+        a = multiply_add(spread(forms, THIRD * CHUNK + s), z, a)
+        b = multiply_add(spread(forms, (THIRD + 1) * CHUNK + s), z, b)
+        front = multiply_add(spread(forms, (THIRD + 2) * CHUNK + s), z, front)
+    return a, b, front
+
+
+@borrowing
 def opacity(power):  # type: ignore[no-untyped-def]
     """Alpha of a power: 0 below the cut, at most MOST."""
     alpha = minimum(exp2(power), fill(np.float32(MOST)))
     return choose(fill(np.float32(CUT)) <= power, alpha, fill(np.float32(0)))
 
 
-@inlined
+@borrowing
 def _draw_block(block, reached, powers, places, start, colours, through, added):  # type: ignore[no-untyped-def]
     """Draw what reaches a block, four values a Gaussian; whether it stays open."""
     pixel = block * LANES
     passes = load(through, pixel)
     sum0, sum1 = load(added, pixel), load(added, PIXELS + pixel)
     sum2, sum3 = load(added, 2 * PIXELS + pixel), load(added, 3 * PIXELS + pixel)
-    for at in range(start, start + reached):
-        colour = FEW * np.int64(element(places, at))
-        alpha = opacity(load(powers, at * LANES))
+    for at in range(start, start + reached, 2):  # a half-full last turn adds nothing
+        colour, other = FEW * np.int64(element(places, at)), FEW * np.int64(element(places, at + 1))
+        alpha, beta = opacity(load(powers, at * LANES)), opacity(load(powers, at * LANES + LANES))
         weight = alpha * passes
         passes = multiply_add(negative(alpha), passes, passes)
         sum0 = multiply_add(weight, spread(colours, colour), sum0)
         sum1 = multiply_add(weight, spread(colours, colour + 1), sum1)
         sum2 = multiply_add(weight, spread(colours, colour + 2), sum2)
         sum3 = multiply_add(weight, spread(colours, colour + 3), sum3)
+        weight = beta * passes
+        passes = multiply_add(negative(beta), passes, passes)
+        sum0 = multiply_add(weight, spread(colours, other), sum0)
+        sum1 = multiply_add(weight, spread(colours, other + 1), sum1)
+        sum2 = multiply_add(weight, spread(colours, other + 2), sum2)
+        sum3 = multiply_add(weight, spread(colours, other + 3), sum3)
     store(through, pixel, passes)
     store(added, pixel, sum0)
     store(added, PIXELS + pixel, sum1)
@@ -277,7 +307,7 @@ def _draw_block(block, reached, powers, places, start, colours, through, added):
     return some(passes > fill(np.float32(CLOSED)))
 
 
-@inlined
+@borrowing
 def _weigh_block(block, reached, powers, start, through):  # type: ignore[no-untyped-def]
     """Turn powers into weights; whether the block stays open."""
     passes = load(through, block * LANES)
@@ -289,7 +319,7 @@ def _weigh_block(block, reached, powers, start, through):  # type: ignore[no-unt
     return some(passes > fill(np.float32(CLOSED)))
 
 
-@inlined
+@borrowing
 def _add_block(block, reached, weights, places, start, colours, num_values, added):  # type: ignore[no-untyped-def]
     """Add a block's weighted values to the sums, any number of them."""
     for channel in range(num_values):
@@ -301,7 +331,7 @@ def _add_block(block, reached, weights, places, start, colours, num_values, adde
         store(added, pixel, total)
 
 
-@inlined
+@borrowing
 def _write_tile(through, added, sums, left, top, num_values):  # type: ignore[no-untyped-def]
     """Copy a tile's sums into the picture; the weights of a ray and what passes sum to 1."""
     width, height = sums.shape[2], sums.shape[1]
@@ -323,7 +353,7 @@ def _write_tile(through, added, sums, left, top, num_values):  # type: ignore[no
         store(picture, place + width, lower)
 
 
-@inlined
+@borrowing
 def _write_part(through, added, sums, left, top, num_values):  # type: ignore[no-untyped-def]
     for pixel in range(PIXELS):
         block, lane = pixel // LANES, pixel % LANES

@@ -7,11 +7,9 @@ that nothing cancels and nothing is divided by a transmittance. Last Gaussian by
 blocks stay in registers, and become the gradient of the record. Each entry writes a slot of its own.
 """
 
-import math
-
 import numpy as np
 
-from pansplat.render.cpu.compiling import inlined, kernel
+from pansplat.render.cpu.compiling import borrowing, kernel
 from pansplat.render.cpu.moments import GROUP, MOMENTS, PAIR, write_chunk
 from pansplat.render.cpu.raster import HALF, Floats, Integers, Kept, Longs, find_powers, opacity, pieces_of
 from pansplat.render.cpu.records import FIELDS, TILE
@@ -42,14 +40,15 @@ from pansplat.render.cpu.tile import (
     FORMS,
     MOST,
     PIXELS,
+    PLACE,
     WORDS,
     ask_ahead,
     gather,
     list_blocks,
+    place_pixels,
     place_tile,
 )
 
-_LN2 = math.log(2)
 _PAIRS = BLOCKS * CHUNK  # of a Gaussian and a block, the most a chunk can have
 
 
@@ -102,49 +101,50 @@ def _walk_tiles(  # type: ignore[no-untyped-def]
     tiles_across = (len(columns) + TILE - 1) // TILE
     num_values = values.shape[1]
     planes = (num_values + GROUP - 1) // GROUP * GROUP
-    offsets, middle, through = np.empty(3 * PIXELS, np.float32), np.empty(6, np.float32), np.empty(PIXELS, np.float32)
+    offsets, centre, place = np.empty(3 * PIXELS, np.float32), np.empty(3), np.empty(PLACE, np.float32)
     upstream, behind = np.zeros((planes + 2) * PIXELS, np.float32), np.empty(PIXELS, np.float32)
     forms, colours = np.empty(FORMS * CHUNK, np.float32), np.zeros(num_values * CHUNK + GROUP, np.float32)
     # Of each pair also its block, and the same Gaussian's pair before.
     slopes, pairs = np.empty(_PAIRS * PAIR, np.float32), np.empty(2 * _PAIRS, np.int32)
-    heads, touched, found = (
-        np.empty(CHUNK, np.int32),
-        np.empty(WORDS * EDGES, np.uint64),
-        np.zeros(WORDS + 2, np.uint64),
-    )
+    heads, touched = np.empty(CHUNK, np.int32), np.empty(WORDS * EDGES, np.uint64)
     powers, places = np.empty(2 * HALF * LANES, np.float32), np.empty(2 * HALF, np.int32)
-    weights = np.empty(HALF * LANES, np.float32)
-    moments, shares = np.empty(MOMENTS * CHUNK, np.float32), np.empty(LANES, np.float32)
+    alphas, weights = np.empty(2 * HALF * LANES, np.float32), np.empty(2 * HALF * LANES, np.float32)
+    seen = np.empty(2 * HALF, np.int32)
+    moments = np.empty(MOMENTS * CHUNK, np.float32)
     exact = np.float32(0 if kind == FLAT else 1)
     for tile in range(low, high):
         left, top = (tile % tiles_across) * TILE, (first_row + tile // tiles_across) * TILE
-        place_tile(kind, columns, rows, rotation, left, top, offsets, middle, through)
+        tile_is_wide, placed = place_tile(kind, columns, rows, rotation, left, top, centre, place), -1
         _read_upstream(sums, grad_sums, left, top, num_values, planes, upstream)
         begin, end, chunks = starts[tile], starts[tile + 1], drawn_chunks[tile]
         _write_nothing(slots, begin + CHUNK * chunks, end, num_values, grad_records, grad_values)
-        last = kept[kept_rows[tile] + chunks]
         for pixel in range(PIXELS):
-            behind[pixel] = -upstream[(planes + 1) * PIXELS + pixel] * last[pixel]
+            behind[pixel] = -upstream[(planes + 1) * PIXELS + pixel]
         for chunk in range(chunks - 1, -1, -1):
             first = begin + chunk * CHUNK
             count = min(CHUNK, end - first)
-            gather(records, values, entries, first, count, middle, exact, forms, colours)
+            wide = tile_is_wide
+            while gather(records, values, entries, first, count, place, exact, wide, forms, colours):
+                wide = True
+            if placed != wide:
+                place_pixels(kind, columns, rows, rotation, left, top, centre, place, wide, offsets)
+                placed = np.int64(wide)
             list_blocks(entries, first, count, touched)
             following = first - CHUNK
             if chunk == 0:  # the next tile's last
                 following = end + CHUNK * (drawn_chunks[min(tile + 1, high - 1)] - 1)
             _find_slopes(
-                records, values, entries, following, forms, colours, touched, found, offsets,
-                kept[kept_rows[tile] + chunk], num_values, planes, upstream, behind, powers, places, weights, slopes,
-                pairs, heads,
+                records, values, entries, following, wide, forms, colours, touched, offsets,
+                kept[kept_rows[tile] + chunk], num_values, planes, upstream, behind, powers, places, alphas, weights,
+                seen, slopes, pairs, heads,
             )  # fmt: skip
             write_chunk(
-                first, count, slots, heads, pairs, slopes, forms, offsets, upstream, num_values, moments, shares,
-                exact, grad_records, grad_values,
+                records, entries, first, count, slots, heads, pairs, slopes, wide, forms, offsets, upstream,
+                num_values, moments, exact, grad_records, grad_values,
             )  # fmt: skip
 
 
-@inlined
+@borrowing
 def _read_upstream(sums, grad_sums, left, top, num_values, planes, upstream):  # type: ignore[no-untyped-def]
     """The tile's gradients by blocks, 0 off the picture; last that of the weights' sum, less the ray's total.
 
@@ -175,7 +175,7 @@ def _read_upstream(sums, grad_sums, left, top, num_values, planes, upstream):  #
         store(upstream, own + PIXELS + LANES, second)
 
 
-@inlined
+@borrowing
 def _read_part(sums, grad_sums, left, top, num_values, planes, upstream):  # type: ignore[no-untyped-def]
     height, width = grad_sums.shape[1], grad_sums.shape[2]
     for pixel in range(PIXELS):
@@ -193,63 +193,69 @@ def _read_part(sums, grad_sums, left, top, num_values, planes, upstream):  # typ
         upstream[(planes + 1) * PIXELS + pixel] = total
 
 
-@inlined
+@borrowing
 def _find_slopes(  # type: ignore[no-untyped-def]
-    records, values, entries, next_first, forms, colours, touched, found, offsets, through, num_values, planes,
-    upstream, behind, powers, places, weights, slopes, pairs, heads,
+    records, values, entries, next_first, wide, forms, colours, touched, offsets, through, num_values, planes,
+    upstream, behind, powers, places, alphas, weights, seen, slopes, pairs, heads,
 ):  # fmt: skip
     """Find the derivatives of the loss by the powers of a chunk's Gaussians, block by block, and their weights."""
     heads[:] = -1
-    # As in the forward, the next block's powers are found before a block is taken.
-    taken, reached, following, half, pair = -1, 0, 0, 0, 0
-    for block in range(BLOCKS + 1):
+    # Three blocks are at work at a time, so that their latencies hide each other, and what is counted in one is long
+    # known when it is needed: the powers of one, the weights of the one before, the slopes of the one before that.
+    weighed, left, taken, reached, half, pair = -1, 0, -1, 0, 0, 0
+    for block in range(BLOCKS + 2):
+        following, is_open = 0, False
         if block < BLOCKS:
             ask_ahead(records, values, entries, block, next_first)
-            if not some(load(through, block * LANES) > fill(np.float32(CLOSED))):
+            is_open = some(load(through, block * LANES) > fill(np.float32(CLOSED)))
+            if not is_open:
                 continue
-            following = find_powers(block, touched, forms, offsets, found, powers, places, half)
+            following = find_powers(block, touched, wide, forms, offsets, powers, places, half)
+        kept = 0
         if taken >= 0:
-            start = HALF - half
-            reached = _weigh_block(taken, reached, powers, places, start, through, weights)
+            kept = _weigh_block(taken, reached, powers, places, HALF - half, through, half, alphas, weights, seen)
+        if weighed >= 0:
             _slope_block(
-                taken, reached, powers, places, start, weights, colours, num_values, planes, upstream, behind, slopes,
-                pairs, heads, pair,
+                weighed, left, alphas, weights, seen, HALF - half, colours, num_values, planes, upstream, behind,
+                slopes, pairs, heads, pair,
             )  # fmt: skip
-            pair += reached
-        taken, reached, half = block, following, HALF - half
+            pair += left
+        weighed, left, taken, reached, half = taken, kept, block if is_open else -1, following, HALF - half
 
 
-@inlined
-def _weigh_block(block, reached, powers, places, start, through, weights):  # type: ignore[no-untyped-def]
-    """Turn the powers of what reaches a block into alphas, and find its weights; what no pixel sees is left out.
+@borrowing
+def _weigh_block(  # type: ignore[no-untyped-def]
+    block, reached, powers, places, start, through, begin, alphas, weights, seen
+):
+    """Find alphas and weights of what reaches a block; what no pixel sees is left out.
 
     Returns:
-        How many are left.
+        How many are written, from `begin` on.
     """
-    passes, left = load(through, block * LANES), 0
-    for at in range(reached):
-        alpha = opacity(load(powers, (start + at) * LANES))
-        store(powers, (start + left) * LANES, alpha)
-        store(weights, left * LANES, alpha * passes)
-        put(places, start + left, element(places, start + at))
+    passes, to = load(through, block * LANES), begin
+    for at in range(start, start + reached):
+        alpha = opacity(load(powers, at * LANES))
+        store(alphas, to * LANES, alpha)
+        store(weights, to * LANES, alpha * passes)
+        put(seen, to, element(places, at))
         passes = multiply_add(negative(alpha), passes, passes)
         # Written over by the next if nobody sees it: no branch, for none could be foretold.
-        left += np.int64(some(alpha > fill(np.float32(0))))
-    return left
+        to += np.int64(some(alpha > fill(np.float32(0))))
+    return to - begin
 
 
-@inlined
+@borrowing
 def _slope_block(  # type: ignore[no-untyped-def]
-    block, reached, alphas, places, start, weights, colours, num_values, planes, upstream, behind, slopes, pairs,
-    heads, pair,
+    block, left, alphas, weights, seen, begin, colours, num_values, planes, upstream, behind, slopes, pairs, heads,
+    pair,
 ):  # fmt: skip
     """Write down the pairs of a block, back to front: slopes, weights, the block, the same Gaussian's pair before."""
-    most, one, zero = fill(np.float32(MOST)), fill(np.float32(1)), fill(np.float32(0))
+    most, zero = fill(np.float32(MOST)), fill(np.float32(0))
     pixel = block * LANES
     beyond, base = load(behind, pixel), load(upstream, planes * PIXELS + pixel)
-    for at in range(reached - 1, -1, -1):
-        s = np.int64(element(places, start + at))
-        alpha, weight = load(alphas, (start + at) * LANES), load(weights, at * LANES)
+    for at in range(begin + left - 1, begin - 1, -1):
+        s = np.int64(element(seen, at))
+        alpha, weight = load(alphas, at * LANES), load(weights, at * LANES)
         worth = base
         for value in range(0, planes, GROUP):  # beyond the last stand other finite numbers, times 0
             own, colour = value * PIXELS + pixel, num_values * s + value
@@ -257,11 +263,10 @@ def _slope_block(  # type: ignore[no-untyped-def]
             worth = multiply_add(load(upstream, own + PIXELS), spread(colours, colour + 1), worth)
             worth = multiply_add(load(upstream, own + 2 * PIXELS), spread(colours, colour + 2), worth)
             worth = multiply_add(load(upstream, own + 3 * PIXELS), spread(colours, colour + 3), worth)
-        earned = weight * worth
-        slope = multiply_add(negative(alpha / (one - alpha)), beyond, earned) * fill(np.float32(_LN2))
-        store(slopes, pair * PAIR, choose(most > alpha, slope, zero))
+        gained = worth - beyond
+        store(slopes, pair * PAIR, choose(most > alpha, weight * gained, zero))
         store(slopes, pair * PAIR + LANES, weight)
-        beyond = beyond + earned
+        beyond = multiply_add(alpha, gained, beyond)
         put(pairs, 2 * pair, np.int32(block))
         put(pairs, 2 * pair + 1, element(heads, s))
         put(heads, s, np.int32(pair))
@@ -269,7 +274,7 @@ def _slope_block(  # type: ignore[no-untyped-def]
     store(behind, pixel, beyond)
 
 
-@inlined
+@borrowing
 def _write_nothing(slots, first, end, num_values, grad_records, grad_values):  # type: ignore[no-untyped-def]
     """Zeros for Gaussians behind a closed tile."""
     for entry in range(first, end):

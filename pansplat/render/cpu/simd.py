@@ -304,6 +304,23 @@ def put(context, array, index, value):  # type: ignore[no-untyped-def]
 
 
 @_intrinsic
+def copy_four(context, target, at, source, index):  # type: ignore[no-untyped-def]
+    """Copy four float32 from `index` of one array on to `at` of another."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        four = ir.VectorType(_FLOAT, 4).as_pointer()
+        places = [
+            builder.gep(context.make_array(sig.args[i])(context, builder, args[i]).data, [args[i + 1]]) for i in (0, 2)
+        ]
+        found = builder.load(builder.bitcast(places[1], four))
+        found.align = _ALIGN
+        builder.store(found, builder.bitcast(places[0], four)).align = _ALIGN
+        return context.get_dummy_value()
+
+    return types.void(target, types.intp, source, types.intp), generate
+
+
+@_intrinsic
 def prefetch(context, array, index):  # type: ignore[no-untyped-def]
     """Ask for the cache line of element `index`, to be read."""
 
@@ -327,7 +344,7 @@ def _prefetch(context: Any, builder: Any, sig: Any, args: Any, writes: int) -> A
     pointer = builder.bitcast(_pointer(context, builder, sig, args), ir.IntType(8).as_pointer())
     kind = ir.FunctionType(ir.VoidType(), [pointer.type, _INT, _INT, _INT])
     function = get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-    builder.call(function, [pointer, _INT(writes), _INT(3), _INT(1)])
+    builder.call(function, [pointer, _INT(writes), _INT(3 if writes else 2), _INT(1)])
     return context.get_dummy_value()
 
 

@@ -9,9 +9,22 @@ import math
 import numpy as np
 
 from pansplat.render.cpu.columns import columns_of
-from pansplat.render.cpu.compiling import inlined
+from pansplat.render.cpu.compiling import borrowing
+from pansplat.render.cpu.forms import dot, tangent_frame
 from pansplat.render.cpu.records import FIELDS, TILE
-from pansplat.render.cpu.simd import LANES, element, fill, multiply_add, prefetch, put, store
+from pansplat.render.cpu.simd import (
+    LANES,
+    copy_four,
+    element,
+    fill,
+    maximum,
+    minimum,
+    multiply_add,
+    prefetch,
+    put,
+    some,
+    store,
+)
 from pansplat.render.cpu.tables import FLAT, PANORAMA
 
 BLOCK_WIDTH = 4
@@ -25,23 +38,26 @@ WORDS = CHUNK // 64
 ROWS = ACROSS + 1  # where the rows' edges begin, among a word's
 EDGES = ROWS + DOWN + 1
 _SHARE = CHUNK // BLOCKS  # Gaussians of the next chunk that are asked for at each block
-_AHEAD = 16  # Gaussians, between asking for a record and reading it
 
 # Rows of the forms.
-A_X, B_X, L_X = 0, 3, 6  # a, b, l: x, y, z each
-MIDDLE = 9  # the Gaussian's point relative to the tile's middle: x, y, z
-ALONG_ROW, LEVEL_ROW = 12, 13
-FRONTS = 14  # front_a, front_b
-FORMS = 16
+A, B, L = 0, 2, 4  # a, b, l: two components each
+MIDDLE = 6  # the Gaussian's point: two components
+ALONG_ROW, LEVEL_ROW = 8, 9
+THIRD = 10  # third components of a, b, l and the point; only written and read where a tile or a Gaussian is wide
+FORMS = 14
 
 CUT = math.log2(1 / 255)  # least power: log2 of alpha
 NOTHING = -1000.0  # a power far below
 MOST = 0.99
 CLOSED = 1e-7
 """A pixel takes nothing more once its transmittance is at or below this."""
+_MARGIN = 0.1
+NARROW = 0.5  # least cosine of the angle from a tile's middle at which forms have two components
+FEW = 4  # values, handled together: RGB and the distance
+PLACE = 15  # numbers that place a tile: see `place_tile`
 
 
-@inlined
+@borrowing
 def point_of(kind, columns, rows, rotation, x, y):  # type: ignore[no-untyped-def]
     """The point of pixel (x, y) that Gaussians are measured against: a unit direction, or the pixel's centre."""
     if kind == PANORAMA:
@@ -59,35 +75,79 @@ def point_of(kind, columns, rows, rotation, x, y):  # type: ignore[no-untyped-de
     )
 
 
-@inlined
-def place_tile(kind, columns, rows, rotation, left, top, offsets, middle, through):  # type: ignore[no-untyped-def]
-    """Fill in the tile's pixels, block by block, and its middle; pixels off the picture start out closed.
+@borrowing
+def place_tile(kind, columns, rows, rotation, left, top, centre, place):  # type: ignore[no-untyped-def]
+    """Find a tile's middle and axes.
 
     Args:
         kind, columns, rows, rotation: of the picture's Plane.
         left, top: pixel of the tile's corner.
-        offsets: (3 PIXELS), written: x, y, z from the middle.
-        middle: (6), written: the middle, rounded, and the rest.
-        through: (PIXELS), written: transmittances before anything is drawn.
+        centre: (3) float64, written: the middle.
+        place: (PLACE), written: the middle, rounded, and the rest; two axes across, and the middle once more or, for
+            the classic kernel, zeros.
+
+    Returns:
+        Whether some of its pixels are too far from the middle for two components.
+    """
+    right, bottom = len(columns) - 1, len(rows) - 1
+    k = point_of(kind, columns, rows, rotation, min(left + TILE // 2, right), min(top + TILE // 2, bottom))
+    axes = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+    if kind != FLAT:
+        axes = tangent_frame(*k)
+    for axis in range(3):
+        centre[axis] = k[axis]
+        place[axis] = np.float32(k[axis])
+        place[3 + axis] = np.float32(k[axis] - np.float64(place[axis]))
+        place[12 + axis] = np.float32(0 if kind == FLAT else k[axis])
+    for axis in range(6):
+        place[6 + axis] = np.float32(axes[axis])
+    if kind == FLAT:
+        return False
+    least = 1.0  # of the pixels, those in the corners are the farthest
+    for corner in range(4):
+        x, y = min(left + corner % 2 * (TILE - 1), right), min(top + corner // 2 * (TILE - 1), bottom)
+        least = min(least, dot(*k, *point_of(kind, columns, rows, rotation, x, y)))
+    return least < NARROW
+
+
+@borrowing
+def place_pixels(  # type: ignore[no-untyped-def]
+    kind, columns, rows, rotation, left, top, centre, place, wide, offsets
+):
+    """Fill in a tile's pixels as the forms take them, block by block.
+
+    Args:
+        kind, columns, rows, rotation, left, top, centre, place: as in `place_tile`.
+        wide: whether in three components, offsets from the middle along the axes; else where the pixels' rays meet the
+            plane that touches the sphere in the middle.
+        offsets: (3 PIXELS), written.
     """
     width, height = len(columns), len(rows)
-    centre_x, centre_y = min(left + TILE // 2, width - 1), min(top + TILE // 2, height - 1)
-    k = point_of(kind, columns, rows, rotation, centre_x, centre_y)
-    for axis in range(3):
-        middle[axis] = np.float32(k[axis])
-        middle[3 + axis] = np.float32(k[axis] - np.float64(middle[axis]))
+    for pixel in range(PIXELS):
+        block, lane = pixel // LANES, pixel % LANES
+        x = left + (block % ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH
+        y = top + (block // ACROSS) * BLOCK_HEIGHT + lane // BLOCK_WIDTH
+        d_x, d_y, d_z = point_of(kind, columns, rows, rotation, min(x, width - 1), min(y, height - 1))
+        d_x, d_y, d_z = d_x - centre[0], d_y - centre[1], d_z - centre[2]
+        ahead = place[12] * d_x + place[13] * d_y + place[14] * d_z
+        scale = 1.0 if wide else 1 / (1 + ahead)
+        offsets[pixel] = np.float32((place[6] * d_x + place[7] * d_y + place[8] * d_z) * scale)
+        offsets[PIXELS + pixel] = np.float32((place[9] * d_x + place[10] * d_y + place[11] * d_z) * scale)
+        offsets[2 * PIXELS + pixel] = np.float32(ahead)
+
+
+@borrowing
+def open_pixels(columns, rows, left, top, through):  # type: ignore[no-untyped-def]
+    """Transmittances before anything is drawn: pixels off the picture start out closed."""
+    width, height = len(columns), len(rows)
     for pixel in range(PIXELS):
         block, lane = pixel // LANES, pixel % LANES
         x = left + (block % ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH
         y = top + (block // ACROSS) * BLOCK_HEIGHT + lane // BLOCK_WIDTH
         through[pixel] = np.float32(1 if x < width and y < height else 0)
-        point = point_of(kind, columns, rows, rotation, min(x, width - 1), min(y, height - 1))
-        offsets[pixel] = np.float32(point[0] - k[0])
-        offsets[PIXELS + pixel] = np.float32(point[1] - k[1])
-        offsets[2 * PIXELS + pixel] = np.float32(point[2] - k[2])
 
 
-@inlined
+@borrowing
 def ask_ahead(records, values, entries, block, first):  # type: ignore[no-untyped-def]
     """Ask for a block's share of the chunk that begins at entry `first`: memory works while blocks are drawn."""
     num_values, end = values.shape[1], len(entries) // 2 - 1
@@ -97,28 +157,29 @@ def ask_ahead(records, values, entries, block, first):  # type: ignore[no-untype
         prefetch(values, num_values * index)
 
 
-@inlined
+@borrowing
 def gather(  # type: ignore[no-untyped-def]
-    records, values, entries, first, count, middle, exact, forms, colours
+    records, values, entries, first, count, place, exact, wide, forms, colours
 ):
     """Fill in the forms and values of `count` Gaussians of a tile, beginning with entry `first`.
 
     Args:
         records, entries: flat.
         values: (n, value).
-        middle: the tile's.
+        place: the tile's.
         exact: float32 1, or 0 for the classic kernel, whose L is 1.
+        wide: whether in three components.
         forms: (FORMS CHUNK), written; past `count` the last Gaussian is repeated.
         colours: (CHUNK value), written.
+
+    Returns:
+        Whether they have to be taken once more, in three components: some point is too far from the tile's middle.
     """
-    last, end = first + count - 1, len(entries) // 2 - 1
-    num_values = values.shape[1]
+    last, num_values = first + count - 1, values.shape[1]
+    on, one = fill(exact), fill(np.float32(1))
+    least, most = one, fill(np.float32(0))
     for at in range(0, count, LANES):
         e = first + at
-        for ahead in range(e + _AHEAD, e + _AHEAD + LANES):
-            index = np.int64(element(entries, 2 * min(ahead, end)))
-            prefetch(records, FIELDS * index)
-            prefetch(values, num_values * index)
         r0 = FIELDS * np.int64(element(entries, 2 * e))
         r1 = FIELDS * np.int64(element(entries, 2 * min(e + 1, last)))
         r2 = FIELDS * np.int64(element(entries, 2 * min(e + 2, last)))
@@ -131,28 +192,57 @@ def gather(  # type: ignore[no-untyped-def]
         a_z, b_x, b_y, b_z, front_a, front_b, along, level = columns_of(
             records, r0 + 8, r1 + 8, r2 + 8, r3 + 8, r4 + 8, r5 + 8, r6 + 8, r7 + 8
         )
-        on = fill(exact)
-        l_x = on * multiply_add(front_a, a_x, multiply_add(front_b, b_x, n_x))
-        l_y = on * multiply_add(front_a, a_y, multiply_add(front_b, b_y, n_y))
-        l_z = on * multiply_add(front_a, a_z, multiply_add(front_b, b_z, n_z))
-        m_x = (n_x - fill(middle[0])) + (rest_x - fill(middle[3]))
-        m_y = (n_y - fill(middle[1])) + (rest_y - fill(middle[4]))
-        m_z = (n_z - fill(middle[2])) + (rest_z - fill(middle[5]))
-        _store_vector(forms, A_X, at, a_x, a_y, a_z)
-        _store_vector(forms, B_X, at, b_x, b_y, b_z)
-        _store_vector(forms, L_X, at, l_x, l_y, l_z)
-        _store_vector(forms, MIDDLE, at, m_x, m_y, m_z)
+        m_x = (n_x - fill(place[0])) + (rest_x - fill(place[3]))
+        m_y = (n_y - fill(place[1])) + (rest_y - fill(place[4]))
+        m_z = (n_z - fill(place[2])) + (rest_z - fill(place[5]))
+        m_x, m_y, m_z = _along_axes(place, m_x, m_y, m_z)
+        a_x, a_y, a_z = _along_axes(place, a_x, a_y, a_z)
+        b_x, b_y, b_z = _along_axes(place, b_x, b_y, b_z)
+        l_x = on * multiply_add(front_a, a_x, multiply_add(front_b, b_x, m_x))
+        l_y = on * multiply_add(front_a, a_y, multiply_add(front_b, b_y, m_y))
+        ahead = one + m_z
+        if wide:
+            store(forms, THIRD * CHUNK + at, a_z)
+            store(forms, (THIRD + 1) * CHUNK + at, b_z)
+            store(forms, (THIRD + 2) * CHUNK + at, on * multiply_add(front_a, a_z, multiply_add(front_b, b_z, ahead)))
+            store(forms, (THIRD + 3) * CHUNK + at, m_z)
+            ahead = one
+        # Below 1 no pixel behind a Gaussian's horizon, where L < 0, can see it: its power is level - 1 / along at most.
+        reach = along * (level + fill(np.float32(_MARGIN - CUT)))
+        least, inverse = minimum(least, ahead), one / ahead
+        most = maximum(most, reach)
+        store(forms, A * CHUNK + at, ahead * a_x)
+        store(forms, (A + 1) * CHUNK + at, ahead * a_y)
+        store(forms, B * CHUNK + at, ahead * b_x)
+        store(forms, (B + 1) * CHUNK + at, ahead * b_y)
+        store(forms, L * CHUNK + at, ahead * l_x)
+        store(forms, (L + 1) * CHUNK + at, ahead * l_y)
+        store(forms, MIDDLE * CHUNK + at, inverse * m_x)
+        store(forms, (MIDDLE + 1) * CHUNK + at, inverse * m_y)
         store(forms, ALONG_ROW * CHUNK + at, along)
         store(forms, LEVEL_ROW * CHUNK + at, level)
-        store(forms, FRONTS * CHUNK + at, front_a)
-        store(forms, (FRONTS + 1) * CHUNK + at, front_b)
-        for place in range(at, min(at + LANES, count)):
-            row = num_values * np.int64(element(entries, 2 * (first + place)))
+    if num_values == FEW:
+        for s in range(count):
+            copy_four(colours, FEW * s, values, FEW * np.int64(element(entries, 2 * (first + s))))
+    else:
+        for s in range(count):
+            row = num_values * np.int64(element(entries, 2 * (first + s)))
             for channel in range(num_values):
-                put(colours, num_values * place + channel, element(values, row + channel))
+                put(colours, num_values * s + channel, element(values, row + channel))
+    return not wide and (some(fill(np.float32(NARROW)) > least) or some(most > one))
 
 
-@inlined
+@borrowing
+def _along_axes(place, x, y, z):  # type: ignore[no-untyped-def]
+    """Vectors' components along a tile's axes, and towards its middle."""
+    return (
+        multiply_add(fill(place[6]), x, multiply_add(fill(place[7]), y, fill(place[8]) * z)),
+        multiply_add(fill(place[9]), x, multiply_add(fill(place[10]), y, fill(place[11]) * z)),
+        multiply_add(fill(place[12]), x, multiply_add(fill(place[13]), y, fill(place[14]) * z)),
+    )
+
+
+@borrowing
 def list_blocks(entries, first, count, touched):  # type: ignore[no-untyped-def]
     """Which Gaussians of the chunk touch which columns and rows of blocks, as bits: a block's are in both.
 
@@ -177,13 +267,6 @@ def list_blocks(entries, first, count, touched):  # type: ignore[no-untyped-def]
             _toggle(touched, edge, element(touched, edge - 1))
 
 
-@inlined
+@borrowing
 def _toggle(words, at, bits):  # type: ignore[no-untyped-def]
     put(words, at, element(words, at) ^ bits)
-
-
-@inlined
-def _store_vector(forms, row, at, x, y, z):  # type: ignore[no-untyped-def]
-    store(forms, row * CHUNK + at, x)
-    store(forms, (row + 1) * CHUNK + at, y)
-    store(forms, (row + 2) * CHUNK + at, z)

@@ -119,8 +119,14 @@ class Case:
         values = torch.from_numpy(self.values).double().requires_grad_()
         through, weights = torch.ones(self.size, dtype=torch.float64), []
         for n, _, a, b, (front_a, front_b, along, level) in (row.split((3, 3, 3, 3, 4)) for row in records):
+            ahead = n + front_a * a + front_b * b
             offset = self.points - n
-            front = 1 + offset @ (n + front_a * a + front_b * b)
+            if self.plane.kind != FLAT:
+                # A ray's length is free, and with it the gradients of what would turn a and b out of their plane.
+                # The kernel's are those at L = 1.
+                length = (1 + offset @ ahead).detach()
+                offset = self.points / torch.where(length > 0, length, 1)[..., None] - n
+            front = 1 + offset @ ahead
             if self.plane.kind == FLAT:
                 front, along = torch.ones_like(front), 0.0
             q = (offset @ a).square() + (offset @ b).square()
