@@ -23,7 +23,7 @@ from pansplat.render.cpu.bins import TileLists, list_tiles
 from pansplat.render.cpu.boxes import LARGEST_SIDE, find_boxes
 from pansplat.render.cpu.compiling import announced
 from pansplat.render.cpu.ewa import TOTALS, project, project_backward
-from pansplat.render.cpu.memory import Lease
+from pansplat.render.cpu.memory import Lease, array_to_give
 from pansplat.render.cpu.observe import PIECE, Camera, Fields, Observed, observe
 from pansplat.render.cpu.observe_backward import Gradients, add_slots, chain
 from pansplat.render.cpu.raster import Kept, raster_forward, room_to_keep
@@ -131,7 +131,7 @@ class _Draw(torch.autograd.Function):
         with announced(gradients=needs_grad and options.kernel == "ray"):
             with notes.timed("observe"):
                 observed = observe(fields, camera, lease, threads)
-            sums = np.empty((len(pictures), harmonics.shape[2] + 2, height, width), np.float32)
+            sums = array_to_give((len(pictures), harmonics.shape[2] + 2, height, width), np.float32)
             kept = [
                 _draw_picture(
                     (fields, camera, observed), picture, options, sums[number], notes, needs_grad, lease, threads
@@ -155,7 +155,7 @@ class _Draw(torch.autograd.Function):
         fields, camera = _fields(*tensors), _camera(pose, pictures[0], options)
         grad_sums = grad_outputs[0].contiguous().numpy()
         wanted = [
-            torch.empty_like(tensor) if needed else None
+            torch.from_numpy(array_to_give(tuple(tensor.shape), np.float32)) if needed else None
             for tensor, needed in zip(tensors, ctx.needs_input_grad, strict=False)
         ]
         with announced():
