@@ -13,13 +13,15 @@ import numpy as np
 from pansplat.render.cpu.compiling import inlined, kernel
 from pansplat.render.cpu.memory import Lease
 from pansplat.render.cpu.records import BOX_BITS, TILE
-from pansplat.render.cpu.simd import element, put
+from pansplat.render.cpu.simd import element, prefetch_to_write, put
 from pansplat.render.cpu.threads import share
 
 LIMIT = 1 << 26  # pairs listed at a time: 512 MB
 _SHIFT = TILE.bit_length() - 1
 _LAST = TILE - 1
+_PARTS = 4  # of the scene a thread: some processors are slower than others
 _HELD = 512  # pairs noted before they are entered: two small loops take half as long as one large
+_AHEAD = 16  # entries of a tile, between asking for their place and writing it
 _SIDE = np.int64(0xFFFF)  # a box as one word: x0, x1, y0, y1 from the lowest bits up
 NOWHERE = np.int64(1 << 32)  # a box as one word, the empty one of boxes.py: first row 1, last row 0
 
@@ -188,8 +190,10 @@ def _list(part, ends, words, columns, low, high, width, all_places, first_slots,
                 place = element(places, tile)
                 put(places, tile, place + 1)
                 put(entries, place, element(pairs, k))
+                prefetch_to_write(entries, place + _AHEAD)
                 if len(slots) > 0:
                     put(slots, place, slots.dtype.type(slot + k))
+                    prefetch_to_write(slots, place + _AHEAD)
             slot, held = slot + held, np.int64(0)
 
 
@@ -207,9 +211,10 @@ def list_tiles(
     """
     rows, columns = (-(-side // TILE) for side in size)
     words = boxes.view(np.int64)[:, 0]
-    ends = np.linspace(0, len(words), threads + 1).astype(np.int64)
-    all_counts = np.empty((threads, rows * columns), np.int64)
-    share(lambda part: _count(part, ends, words, rows, columns, all_counts), threads, threads)
+    parts = _PARTS * threads if threads > 1 else 1
+    ends = np.linspace(0, len(words), parts + 1).astype(np.int64)
+    all_counts = np.empty((parts, rows * columns), np.int64)
+    share(lambda part: _count(part, ends, words, rows, columns, all_counts), parts, threads)
     per_row = all_counts.sum(axis=0).reshape(rows, columns).sum(axis=1)
     for low, high in _bands(per_row.tolist(), limit):
         counts, lease = all_counts[:, low * columns : high * columns], Lease()
@@ -221,7 +226,7 @@ def list_tiles(
         offsets = lease.array(len(words) + 1 if slots else 0, np.int64)
         offsets[:1] = 0
         lists = places, np.cumsum(per_part) - per_part, entries, numbers, offsets
-        share(_bound(_list, ends, words, columns, low, high, size[1], *lists), threads, threads)
+        share(_bound(_list, ends, words, columns, low, high, size[1], *lists), parts, threads)
         yield TileLists(low, entries.view(np.int32).reshape(-1, 2), starts, numbers, offsets, lease)
 
 
