@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from pansplat.render.cpu.bits import list_bits
 from pansplat.render.cpu.compiling import borrowing, kernel
 from pansplat.render.cpu.memory import Lease
 from pansplat.render.cpu.records import TILE
@@ -21,7 +22,6 @@ from pansplat.render.cpu.simd import (
     fill,
     how_many,
     load,
-    lowest_bit,
     maximum,
     minimum,
     multiply_add,
@@ -71,8 +71,7 @@ Integers = npt.NDArray[np.int32]
 Longs = npt.NDArray[np.int64]
 
 _PIECES = 8  # of work a thread
-_FIRST = 6
-HALF = CHUNK + _FIRST  # room for the powers of a block, and some to write over
+HALF = CHUNK + 64  # room for the powers of a block, and for what `list_bits` writes over
 
 
 class Kept(NamedTuple):
@@ -149,7 +148,7 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
     through, added = np.empty(PIXELS, np.float32), np.empty(num_values * PIXELS, np.float32)
     forms, colours = np.empty(FORMS * CHUNK, np.float32), np.empty(num_values * CHUNK, np.float32)
     touched = np.empty(WORDS * EDGES, np.uint64)
-    powers, places = np.empty(2 * HALF * LANES, np.float32), np.empty(2 * HALF, np.int32)
+    powers, places = np.empty(2 * HALF * LANES, np.float32), np.empty(2 * HALF, np.uint8)
     exact = np.float32(0 if kind == FLAT else 1)
     for tile in range(low, high):
         left, top = (tile % tiles_across) * TILE, (first_row + tile // tiles_across) * TILE
@@ -211,41 +210,27 @@ def find_powers(block, touched, wide, forms, offsets, powers, places, start):  #
     x, y, z = load(offsets, pixel), load(offsets, PIXELS + pixel), load(offsets, 2 * PIXELS + pixel)
     total = _list_places(block, touched, places, start)
     zero = fill(np.float32(0))
-    for at in range(start, start + total, 2):
-        for turn in range(2):
-            s = np.int64(element(places, at + turn))
-            a, b, front = forms_at(wide, forms, s, x, y, z)
-            if wide:
-                front = choose(front > zero, front, fill(np.float32(np.nan)))
-            q = multiply_add(a, a, b * b)
-            below = multiply_add(maximum(zero, front), front, spread(forms, ALONG_ROW * CHUNK + s) * q)
-            power = spread(forms, LEVEL_ROW * CHUNK + s) - q / below
-            store(powers, (at + turn) * LANES, power)
+    for at in range(start, start + total):
+        s = np.int64(element(places, at))
+        a, b, front = forms_at(wide, forms, s, x, y, z)
+        if wide:
+            front = choose(front > zero, front, fill(np.float32(np.nan)))
+        q = multiply_add(a, a, b * b)
+        below = multiply_add(maximum(zero, front), front, spread(forms, ALONG_ROW * CHUNK + s) * q)
+        store(powers, at * LANES, spread(forms, LEVEL_ROW * CHUNK + s) - q / below)
     store(powers, (start + total) * LANES, fill(np.float32(NOTHING)))
     return total
 
 
 @borrowing
 def _list_places(block, touched, places, start):  # type: ignore[no-untyped-def]
-    """Write down which Gaussians of the chunk reach a block, and one more; how many do.
-
-    _FIRST of a word of bits are written whether they are there or not, and the next word's over what was not: the
-    processor could not foretell where a word ends.
-    """
+    """Write down which Gaussians of the chunk reach a block, and one more; how many do."""
     at, column, row = start, block % ACROSS, ROWS + block // ACROSS
     for word in range(WORDS):
         bits = element(touched, word * EDGES + column) & element(touched, word * EDGES + row)
-        end = at + how_many(bits)
-        for _ in range(_FIRST):
-            put(places, at, np.int32(word * 64 + lowest_bit(bits)))
-            bits &= bits - np.uint64(1)
-            at += 1
-        while bits != 0:
-            put(places, at, np.int32(word * 64 + lowest_bit(bits)))
-            bits &= bits - np.uint64(1)
-            at += 1
-        at = end
-    put(places, at, np.int32(0))
+        list_bits(places, at, bits, word * 64)
+        at += how_many(bits)
+    put(places, at, np.uint8(0))
     return at - start
 
 

@@ -107,7 +107,7 @@ def _walk_tiles(  # type: ignore[no-untyped-def]
     # Of each pair also its block, and the same Gaussian's pair before.
     slopes, pairs = np.empty(_PAIRS * PAIR, np.float32), np.empty(2 * _PAIRS, np.int32)
     heads, touched = np.empty(CHUNK, np.int32), np.empty(WORDS * EDGES, np.uint64)
-    powers, places = np.empty(2 * HALF * LANES, np.float32), np.empty(2 * HALF, np.int32)
+    powers, places = np.empty(2 * HALF * LANES, np.float32), np.empty(2 * HALF, np.uint8)
     alphas, weights = np.empty(2 * HALF * LANES, np.float32), np.empty(2 * HALF * LANES, np.float32)
     seen = np.empty(2 * HALF, np.int32)
     moments = np.empty(MOMENTS * CHUNK, np.float32)
@@ -237,7 +237,7 @@ def _weigh_block(  # type: ignore[no-untyped-def]
         alpha = opacity(load(powers, at * LANES))
         store(alphas, to * LANES, alpha)
         store(weights, to * LANES, alpha * passes)
-        put(seen, to, element(places, at))
+        put(seen, to, np.int32(element(places, at)))
         passes = multiply_add(negative(alpha), passes, passes)
         # Written over by the next if nobody sees it: no branch, for none could be foretold.
         to += np.int64(some(alpha > fill(np.float32(0))))

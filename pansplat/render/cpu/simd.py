@@ -263,16 +263,6 @@ def side_by_side(context, a, b):  # type: ignore[no-untyped-def]
 
 
 @_intrinsic
-def lowest_bit(context, bits):  # type: ignore[no-untyped-def]
-    """Place of the lowest bit set; `bits` is an unsigned 64-bit number other than 0."""
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return builder.cttz(args[0], ir.IntType(1)(1))
-
-    return types.intp(types.uint64), generate
-
-
-@_intrinsic
 def how_many(context, bits):  # type: ignore[no-untyped-def]
     """How many bits of an unsigned 64-bit number are set."""
 
