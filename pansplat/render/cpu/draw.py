@@ -167,7 +167,8 @@ class _Draw(torch.autograd.Function):
                 np.empty((0, *field.shape[1:]), np.float32) if grad is None else grad.numpy()
                 for field, grad in zip(fields, wanted, strict=True)
             )
-            filled = chain(fields, camera, observed, *slots, Gradients(*arrays, pose=np.zeros((3, 4))), threads)
+            own_pose = np.empty((3 if ctx.needs_input_grad[6] else 0, 4))
+            filled = chain(fields, camera, observed, *slots, Gradients(*arrays, pose=own_pose), threads)
         grad_pose = None
         if ctx.needs_input_grad[6]:
             grad_pose = torch.zeros_like(pose)

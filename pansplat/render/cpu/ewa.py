@@ -21,7 +21,6 @@ from pansplat.render.cpu.observe import (
     Camera,
     Fields,
     Observed,
-    find_directions,
     find_shapes,
     frame_and_shape,
     read_block,
@@ -144,8 +143,7 @@ def _project(
                 words[start + i, 0], words[start + i, 1] = 0, 1
             continue
         read_block(means, quats, scales, covariances, opacities, start, count, rows)
-        find_directions(pose, near, rows)
-        find_shapes(covariances, rows)
+        find_shapes(covariances, pose, near, rows)
         for i in range(LANES):
             _, jacobian, _, _, _, v = _projected(rows, i, turn, height, width, focal, spread)
             kappa = (rows[LEVEL, i] + _LOG_CUT) / layout.UNIT + _SLACK
@@ -304,8 +302,7 @@ def _project_backward(
         if _read_given(grads, offsets, start, count, rows) == 0:
             continue
         read_block(means, quats, scales, covariances, opacities, start, count, rows)
-        find_directions(pose, near, rows)
-        find_shapes(covariances, rows)
+        find_shapes(covariances, pose, near, rows)
         _splats_backward(rows, turn, height, width, focal, spread, dilation)
         for i in range(count):
             if offsets[start + i + 1] > offsets[start + i]:

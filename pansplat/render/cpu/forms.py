@@ -1,4 +1,4 @@
-"""The kernel's forms of one Gaussian from its shape, as scalar functions that vectorise inside loops over Gaussians.
+"""The kernel's forms of Gaussians from their shapes; numbers here are vectors of eight float64 (see wide.py).
 
 Source: docs/rendering.md, sections 1 to 3. Everything is float64 and divided by the distance. A shape is its
 covariance in the tangent frame u, v, n together with the minors that float arithmetic cannot take from it:
@@ -12,6 +12,7 @@ covariance in the tangent frame u, v, n together with the minors that float arit
 import math
 
 from pansplat.render.cpu.compiling import inlined
+from pansplat.render.cpu.wide import either, fill_wide
 
 LEAST_RATIO = 1e-12  # of det B to det B': below it the compensated opacity never reaches the alpha cut
 _NEGATIVE = 1e-3  # smallest eigenvalue over the largest variance that rounding may leave
@@ -36,35 +37,36 @@ def tangent_frame(x, y, z):
 
     Source: Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 6(1), 2017.
     """
-    sign = -1.0 if z < 0 else 1.0
+    sign = math.copysign(1.0, z)
     a = -1.0 / (sign + z)
-    b = x * y * a
-    return 1 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y
+    b, c = x * y * a, sign * x
+    return 1 + c * x * a, sign * b, -c, b, sign + y * y * a, -y
 
 
 @inlined
 def rotation(w, x, y, z):
-    """Rows of the rotation matrix of a quaternion of any length, and one over its length; zero is the identity."""
+    """Rows of the rotation matrix of a quaternion of any length, and one over its square; zero is the identity."""
     norm2 = w * w + x * x + y * y + z * z
-    there = norm2 > 0
-    inverse = 1 / math.sqrt(norm2) if there else 0.0
-    w = w * inverse if there else 1.0
-    x, y, z = x * inverse, y * inverse, z * inverse
+    inverse = either(norm2 > 0, 1 / norm2, fill_wide(0.0))
+    twice = 2 * inverse
+    x2, y2, z2 = twice * x, twice * y, twice * z
     return (
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-        w, x, y, z, inverse,
+        1 - (y * y2 + z * z2), x * y2 - w * z2, x * z2 + w * y2,
+        x * y2 + w * z2, 1 - (x * x2 + z * z2), y * z2 - w * x2,
+        x * z2 - w * y2, y * z2 + w * x2, 1 - (x * x2 + y * y2),
+        inverse,
     )  # fmt: skip
 
 
 @inlined
-def shape_of_axes(u, v, n, e0, e1, e2, s0, s1, s2):
-    """A shape from unit axes e_k and scales over distance: sums of squares only, so nothing cancels."""
-    s0, s1, s2 = s0 * s0, s1 * s1, s2 * s2
+def shape_of_axes(u, n, e0, e1, e2, s0, s1, s2):
+    """A shape from unit axes e_k, right-handed, and squares of scales over distance.
+
+    Sums of squares only, so nothing cancels.
+    """
     u0, u1, u2 = dot(*u, *e0), dot(*u, *e1), dot(*u, *e2)
-    v0, v1, v2 = dot(*v, *e0), dot(*v, *e1), dot(*v, *e2)
     n0, n1, n2 = dot(*n, *e0), dot(*n, *e1), dot(*n, *e2)
+    v0, v1, v2 = cross(n0, n1, n2, u0, u1, u2)
     w0, w1, w2 = s1 * s2, s2 * s0, s0 * s1
     return (
         s0 * u0 * u0 + s1 * u1 * u1 + s2 * u2 * u2,
@@ -96,7 +98,8 @@ def shape_of_covariance(u, v, n, xx, xy, xz, yy, yz, zz):
 def is_covariance(xx, xy, xz, yy, yz, zz):
     """Whether a symmetric matrix over squared distance has no eigenvalue below what rounding explains."""
     largest = max(max(xx, yy), zz)
-    bound = ((1 + _NEGATIVE) * largest) ** 2
+    bound = (1 + _NEGATIVE) * largest
+    bound = bound * bound
     xx, yy, zz = xx + _NEGATIVE * largest, yy + _NEGATIVE * largest, zz + _NEGATIVE * largest
     minor = xx * yy - xy * xy
     det = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
@@ -105,15 +108,20 @@ def is_covariance(xx, xy, xz, yy, yz, zz):
 
 
 @inlined
-def ray_forms(u, v, shape, spread):
-    """Whitened tangent axes a and b, the front form's share of each, S', and det B'."""
-    uu, uv, vv, un, vn, nn, det_across, mixed, det = shape
-    det_filtered = det_across + spread * (uu + vv) + spread * spread
-    b_uu = uu + spread
-    first = 1 / math.sqrt(b_uu)
-    second = math.sqrt(b_uu / det_filtered)
-    mix = uv / b_uu
+def whitening(shape, spread):
+    """How tangent axes are whitened, the front form's share of each, S', det B' and one over it."""
+    _, uv, _, un, vn, nn, det_across, mixed, det = shape
+    b_uu, trace = shape[0] + spread, shape[0] + shape[2]
+    det_filtered = det_across + spread * trace + spread * spread
+    inverse = 1 / det_filtered
+    first, second = 1 / math.sqrt(b_uu), math.sqrt(b_uu * inverse)
+    mix = uv * first * first
+    along = (spread * spread * nn + spread * mixed + det) * inverse
+    return (first, mix, second), -un * first, (mix * un - vn) * second, along, det_filtered, inverse
+
+
+@inlined
+def whitened(u, v, first, mix, second):
+    """The whitened axes a and b."""
     a = u[0] * first, u[1] * first, u[2] * first
-    b = (v[0] - mix * u[0]) * second, (v[1] - mix * u[1]) * second, (v[2] - mix * u[2]) * second
-    along = (spread * spread * nn + spread * mixed + det) / det_filtered
-    return a, b, -un * first, -(vn - mix * un) * second, along, det_filtered
+    return a, ((v[0] - mix * u[0]) * second, (v[1] - mix * u[1]) * second, (v[2] - mix * u[2]) * second)

@@ -8,6 +8,9 @@ import math
 import numpy as np
 
 from pansplat.render.cpu.compiling import inlined
+from pansplat.render.cpu.groups import apart, quarters, together
+from pansplat.render.cpu.simd import LANES, choose, element, fill, load, maximum, multiply_add, store
+from pansplat.render.cpu.wide import get, rounded
 
 _C0 = 0.5 / math.sqrt(math.pi)
 _C1 = 0.5 * math.sqrt(3 / math.pi)
@@ -151,22 +154,19 @@ def _add_quartic_slopes(rows, x_row, slopes, g_row):
 
 
 @inlined
-def colours(harmonics, start, count, basis, values):
-    """Write max(0, 0.5 + sum_k Y_k c_k) of `count` Gaussians from `start` on into their rows of values."""
-    num, channels = harmonics.shape[1], harmonics.shape[2]
-    if channels == 3:
-        for i in range(count):
-            g = start + i
-            red, green, blue = np.float32(0.5), np.float32(0.5), np.float32(0.5)
-            for k in range(num):
-                weight = basis[k, i]
-                red += weight * harmonics[g, k, 0]
-                green += weight * harmonics[g, k, 1]
-                blue += weight * harmonics[g, k, 2]
-            zero = np.float32(0)
-            values[g, 0], values[g, 1], values[g, 2] = max(red, zero), max(green, zero), max(blue, zero)
-        return
-    for i in range(count):
+def colours(harmonics, start, count, basis, bends, rows, radius_row, values):
+    """Write max(0, 0.5 + sum_k Y_k c_k) of `count` Gaussians from `start` on into values, and after it the radius.
+
+    Args:
+        bends: None if there is one harmonic.
+        rows, radius_row: the radii are a row of float64.
+    """
+    num, channels, done = harmonics.shape[1], harmonics.shape[2], 0
+    if bends is None:
+        done = _three_constants(harmonics, start, count, rows, radius_row, values)
+    if bends is not None:
+        done = _three_colours(harmonics, start, count, basis, rows, radius_row, values)
+    for i in range(done, count):
         g = start + i
         for c in range(channels):
             values[g, c] = 0.5
@@ -176,6 +176,47 @@ def colours(harmonics, start, count, basis, values):
                 values[g, c] += weight * harmonics[g, k, c]
         for c in range(channels):
             values[g, c] = max(values[g, c], np.float32(0))
+        values[g, channels] = rows[radius_row, i]
+
+
+@inlined
+def _three_constants(harmonics, start, count, rows, radius_row, values):
+    """If there are three channels: those Gaussians that make up whole vectors. Return how many are done."""
+    if harmonics.shape[2] != 3:
+        return 0
+    weight, half, zero = fill(np.float32(_C0)), fill(np.float32(0.5)), fill(np.float32(0))
+    flat, written, whole = harmonics.reshape(-1), values.reshape(-1), count // LANES * LANES
+    for i in range(0, whole, LANES):
+        first, place = 3 * (start + i), 4 * (start + i)
+        red, green, blue = apart((load(flat, first), load(flat, first + LANES), load(flat, first + 2 * LANES)))
+        red = maximum(multiply_add(weight, red, half), zero)
+        green = maximum(multiply_add(weight, green, half), zero)
+        blue = maximum(multiply_add(weight, blue, half), zero)
+        v0, v1, v2, v3 = together((red, green, blue, rounded(get(rows, radius_row, i))))
+        store(written, place, v0)
+        store(written, place + LANES, v1)
+        store(written, place + 2 * LANES, v2)
+        store(written, place + 3 * LANES, v3)
+    return whole
+
+
+@inlined
+def _three_colours(harmonics, start, count, basis, rows, radius_row, values):
+    """If there are three channels: all. Return how many are done."""
+    if harmonics.shape[2] != 3:
+        return 0
+    for i in range(count):
+        g = start + i
+        red, green, blue = np.float32(0.5), np.float32(0.5), np.float32(0.5)
+        for k in range(harmonics.shape[1]):
+            weight = basis[k, i]
+            red += weight * harmonics[g, k, 0]
+            green += weight * harmonics[g, k, 1]
+            blue += weight * harmonics[g, k, 2]
+        zero = np.float32(0)
+        values[g, 0], values[g, 1], values[g, 2] = max(red, zero), max(green, zero), max(blue, zero)
+        values[g, 3] = rows[radius_row, i]
+    return count
 
 
 @inlined
@@ -209,3 +250,40 @@ def colour_gradients(harmonics, start, drawn, basis, values, grads, grad_harmoni
                 if wanted:
                     grad_harmonics[g, k, c] = weight * grads[i, c]
             slopes[k, i] = total
+
+
+@inlined
+def constant_colour_gradients(harmonics, start, count, values, value_sums, colour_grads, grad_harmonics):
+    """From gradients of colours to those of coefficients of the first harmonic alone, if asked for.
+
+    Args:
+        values: colours of the forward; where one is off, or exactly 0, it stays off.
+        value_sums: gradients of three colours and a radius, flat; or
+        colour_grads: gradients of the colours, a row each, if they are not three.
+    """
+    channels, whole, weight = harmonics.shape[2], 0, np.float32(_C0)
+    if grad_harmonics.shape[0] == 0:
+        return
+    if channels == 3:
+        whole, factor, none = count // LANES * LANES, fill(weight), fill(np.float32(0))
+        flat, grads = values.reshape(-1), grad_harmonics.reshape(-1)
+        for i in range(0, whole, LANES):
+            red, green, blue, _ = quarters(value_sums, 4 * i)
+            is_red, is_green, is_blue, _ = quarters(flat, 4 * (start + i))
+            a, b, c = together(
+                (
+                    choose(is_red > none, factor * red, none),
+                    choose(is_green > none, factor * green, none),
+                    choose(is_blue > none, factor * blue, none),
+                )
+            )
+            store(grads, 3 * (start + i), a)
+            store(grads, 3 * (start + i) + LANES, b)
+            store(grads, 3 * (start + i) + 2 * LANES, c)
+        for i in range(whole, count):
+            for c in range(3):
+                colour_grads[i, c] = element(value_sums, 4 * i + c)
+    for i in range(whole, count):
+        for c in range(channels):
+            grad = weight * colour_grads[i, c]
+            grad_harmonics[start + i, 0, c] = grad if values[start + i, c] > 0 else np.float32(0)

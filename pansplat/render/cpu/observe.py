@@ -17,15 +17,31 @@ from pansplat.render.cpu.forms import (
     LEAST_RATIO,
     dot,
     is_covariance,
-    ray_forms,
     rotation,
     shape_of_axes,
     shape_of_covariance,
     tangent_frame,
+    whitened,
+    whitening,
 )
+from pansplat.render.cpu.groups import AHEAD, any_reaches, read_fours, read_ones, read_threes
 from pansplat.render.cpu.harmonics import colours, fill_basis
 from pansplat.render.cpu.memory import Lease
+from pansplat.render.cpu.simd import LANES as WIDTH
+from pansplat.render.cpu.simd import element, fill, how_many, prefetch, put, store
 from pansplat.render.cpu.threads import share
+from pansplat.render.cpu.wide import (
+    align_stack,
+    bits_of,
+    either,
+    fill_wide,
+    get,
+    keep,
+    mantissa_and_exponent,
+    rounded,
+    store_mask,
+    widened,
+)
 
 LANES = 64
 PIECE = 8192
@@ -38,10 +54,9 @@ _FAINTEST = (1 - 1e-6) / 255
 
 # Rows of a block: what is read, what is found, what is written.
 MEAN, SHAPE, OPACITY = 0, 3, 12  # SHAPE is a quaternion and three scales, or a covariance
-WORLD, RADIUS, SOUND = 13, 16, 17
+WORLD, RADIUS, SOUND = 13, 16, 17  # SOUND is 1, or 0 where a number is unusable
 FRAME, BODY = 18, 24
-OUT, PEAK, LOG = 33, 47, 48
-ROWS = 49
+ROWS = 33
 
 
 class Fields(NamedTuple):
@@ -94,107 +109,111 @@ class Camera(NamedTuple):
 
 @inlined
 def read_block(means, quats, scales, covariances, opacities, start, count, rows):
-    """Copy the fields of `count` Gaussians from `start` on into rows."""
-    for i in range(count):
-        g = start + i
-        rows[MEAN, i], rows[MEAN + 1, i], rows[MEAN + 2, i] = means[g, 0], means[g, 1], means[g, 2]
-        rows[OPACITY, i] = opacities[g]
+    """Copy the fields of `count` Gaussians from `start` on into rows; return whether one may be unusable."""
+    sizes = fill(np.float32(0))
+    sizes = read_threes(means.reshape(-1), start, count, rows, MEAN, sizes)
+    sizes = read_ones(opacities, start, count, rows, OPACITY, sizes)
     # Two questions: numba leaves out what depends on a None, but not the other branch.
     if covariances is not None:
         for i in range(count):
-            g = start + i
-            for axis in range(3):
-                for other in range(3):
-                    rows[SHAPE + 3 * axis + other, i] = covariances[g, axis, other]
+            for j in range(9):
+                rows[SHAPE + j, i] = element(covariances, 9 * (start + i) + j)
     if quats is not None:
-        for i in range(count):
-            g = start + i
-            for axis in range(4):
-                rows[SHAPE + axis, i] = quats[g, axis]
-            for axis in range(3):
-                rows[SHAPE + 4 + axis, i] = scales[g, axis]
+        sizes = read_fours(quats.reshape(-1), start, count, rows, SHAPE, sizes)
+        sizes = read_threes(scales.reshape(-1), start, count, rows, SHAPE + 4, sizes)
+    return covariances is not None or count % WIDTH > 0 or any_reaches(sizes, _LARGEST_BITS)
 
 
 @inlined
-def find_directions(pose, near, rows):
-    """Find distance and direction, and which distances are far enough: SOUND is 1, or 0, or -1 where too near."""
-    tx, ty, tz = pose[0, 3], pose[1, 3], pose[2, 3]
-    for i in range(LANES):
-        mx, my, mz = rows[MEAN, i], rows[MEAN + 1, i], rows[MEAN + 2, i]
-        x, y, z = mx - tx, my - ty, mz - tz
-        radius = math.sqrt(x * x + y * y + z * z)
-        inverse = 1 / radius
-        good = (abs(mx) < _LARGEST) & (abs(my) < _LARGEST) & (abs(mz) < _LARGEST) & (abs(rows[OPACITY, i]) < _LARGEST)
-        rows[SOUND, i] = (-1.0 if radius < near else 1.0) if good else 0.0
-        rows[RADIUS, i] = radius
-        rows[WORLD, i], rows[WORLD + 1, i], rows[WORLD + 2, i] = x * inverse, y * inverse, z * inverse
+def columns_of_pose(pose):
+    """The camera's axes and its centre, as numbers; the array would be read again for every eight Gaussians."""
+    return (
+        (pose[0, 0], pose[1, 0], pose[2, 0]),
+        (pose[0, 1], pose[1, 1], pose[2, 1]),
+        (pose[0, 2], pose[1, 2], pose[2, 2]),
+        (pose[0, 3], pose[1, 3], pose[2, 3]),
+    )
 
 
 @inlined
-def find_shapes(covariances, rows):
-    """Find the shapes in the tangent frame of each direction, and which of them are sound."""
+def direction_of(rows, i, pose, near):
+    """Direction and distance of eight Gaussians, one over it, and a state: 1, or -1 if too near."""
+    mx, my, mz = get(rows, MEAN, i), get(rows, MEAN + 1, i), get(rows, MEAN + 2, i)
+    x, y, z = mx - pose[3][0], my - pose[3][1], mz - pose[3][2]
+    radius = math.sqrt(x * x + y * y + z * z)
+    inverse = 1 / radius
+    state = either(radius < near, fill_wide(-1.0), fill_wide(1.0))
+    return (x * inverse, y * inverse, z * inverse), radius, inverse, state
+
+
+@inlined
+def shape_in(covariances, rows, i, n, inverse, state):
+    """Tangent axes and shapes of eight Gaussians, and their state, which an unusable shape makes 0.
+
+    Args:
+        covariances: None, or what the shapes come from in place of quaternions and scales.
+        n: directions.
+        inverse: one over the distance.
+        state: of `direction_of`.
+    """
+    frame = tangent_frame(n[0], n[1], n[2])
+    u, v = (frame[0], frame[1], frame[2]), (frame[3], frame[4], frame[5])
     if covariances is not None:
-        _shapes_of_covariances(rows)
+        shape, state = _shape_of_covariances(rows, i, u, v, n, inverse * inverse, state)
     else:
-        _shapes_of_axes(rows)
+        shape, state = _shape_of_axes(rows, i, u, n, inverse, state)
+    return u, v, shape, state
 
 
 @inlined
-def _shapes_of_axes(rows):
-    for i in range(LANES):
-        w, x, y, z = rows[SHAPE, i], rows[SHAPE + 1, i], rows[SHAPE + 2, i], rows[SHAPE + 3, i]
-        s0, s1, s2 = rows[SHAPE + 4, i], rows[SHAPE + 5, i], rows[SHAPE + 6, i]
-        largest = max(max(abs(s0), abs(s1)), abs(s2))
-        turned = max(max(abs(w), abs(x)), max(abs(y), abs(z)))
-        # Comparisons are false for NaN wherever it stands among the operands of `max`, so each is asked.
-        good = (s0 == s0) & (s1 == s1) & (s2 == s2) & (w == w) & (x == x) & (y == y) & (z == z)
-        good &= (largest < _LARGEST) & (turned < _LARGEST)
-        state = rows[SOUND, i]
-        fits = (largest <= LARGEST_RATIO * rows[RADIUS, i]) | (state < 0)
-        rows[SOUND, i] = state if good & fits else 0.0
-        inverse = 1 / rows[RADIUS, i]
-        r = rotation(w, x, y, z)
-        n = rows[WORLD, i], rows[WORLD + 1, i], rows[WORLD + 2, i]
-        frame = tangent_frame(n[0], n[1], n[2])
-        u, v = (frame[0], frame[1], frame[2]), (frame[3], frame[4], frame[5])
-        e0, e1, e2 = (r[0], r[3], r[6]), (r[1], r[4], r[7]), (r[2], r[5], r[8])
-        shape = shape_of_axes(u, v, n, e0, e1, e2, s0 * inverse, s1 * inverse, s2 * inverse)
-        _keep(rows, i, u, v, shape)
+def axes_of(rows, i):
+    """The rotation of eight Gaussians by columns, and one over the squared length of their quaternions."""
+    r = rotation(get(rows, SHAPE, i), get(rows, SHAPE + 1, i), get(rows, SHAPE + 2, i), get(rows, SHAPE + 3, i))
+    return (r[0], r[3], r[6]), (r[1], r[4], r[7]), (r[2], r[5], r[8]), r[9]
 
 
 @inlined
-def _shapes_of_covariances(rows):
-    for i in range(LANES):
-        inverse = 1 / (rows[RADIUS, i] * rows[RADIUS, i])
-        xx, yy, zz = rows[SHAPE, i], rows[SHAPE + 4, i], rows[SHAPE + 8, i]
-        xy, yx, xz, zx = rows[SHAPE + 1, i], rows[SHAPE + 3, i], rows[SHAPE + 2, i], rows[SHAPE + 6, i]
-        yz, zy = rows[SHAPE + 5, i], rows[SHAPE + 7, i]
-        good = (abs(xx) < _LARGEST) & (abs(yy) < _LARGEST) & (abs(zz) < _LARGEST) & (abs(xy) < _LARGEST)
-        good &= (abs(xz) < _LARGEST) & (abs(yz) < _LARGEST) & (abs(yx) < _LARGEST) & (abs(zx) < _LARGEST)
-        good &= abs(zy) < _LARGEST
-        xx, yy, zz = xx * inverse, yy * inverse, zz * inverse
-        xy, xz, yz = 0.5 * (xy + yx) * inverse, 0.5 * (xz + zx) * inverse, 0.5 * (yz + zy) * inverse
-        state = rows[SOUND, i]
-        fits = is_covariance(xx, xy, xz, yy, yz, zz) | (state < 0)
-        rows[SOUND, i] = state if good & fits else 0.0
-        n = rows[WORLD, i], rows[WORLD + 1, i], rows[WORLD + 2, i]
-        frame = tangent_frame(n[0], n[1], n[2])
-        u, v = (frame[0], frame[1], frame[2]), (frame[3], frame[4], frame[5])
-        _keep(rows, i, u, v, shape_of_covariance(u, v, n, xx, xy, xz, yy, yz, zz))
+def _shape_of_axes(rows, i, u, n, inverse, state):
+    s0, s1, s2 = get(rows, SHAPE + 4, i), get(rows, SHAPE + 5, i), get(rows, SHAPE + 6, i)
+    e0, e1, e2, _ = axes_of(rows, i)
+    a0, a1, a2 = s0 * inverse, s1 * inverse, s2 * inverse
+    a0, a1, a2 = a0 * a0, a1 * a1, a2 * a2
+    fits = max(max(a0, a1), a2) <= LARGEST_RATIO * LARGEST_RATIO
+    state = either(fits, state, either(state < 0, state, fill_wide(0.0)))
+    return shape_of_axes(u, n, e0, e1, e2, a0, a1, a2), state
 
 
 @inlined
-def _keep(rows, i, u, v, shape):
-    rows[FRAME, i], rows[FRAME + 1, i], rows[FRAME + 2, i] = u
-    rows[FRAME + 3, i], rows[FRAME + 4, i], rows[FRAME + 5, i] = v
-    rows[BODY, i], rows[BODY + 1, i], rows[BODY + 2, i] = shape[0], shape[1], shape[2]
-    rows[BODY + 3, i], rows[BODY + 4, i], rows[BODY + 5, i] = shape[3], shape[4], shape[5]
-    rows[BODY + 6, i], rows[BODY + 7, i], rows[BODY + 8, i] = shape[6], shape[7], shape[8]
+def _shape_of_covariances(rows, i, u, v, n, inverse, state):
+    xx, yy, zz = get(rows, SHAPE, i), get(rows, SHAPE + 4, i), get(rows, SHAPE + 8, i)
+    xy, yx, xz = get(rows, SHAPE + 1, i), get(rows, SHAPE + 3, i), get(rows, SHAPE + 2, i)
+    zx, yz, zy = get(rows, SHAPE + 6, i), get(rows, SHAPE + 5, i), get(rows, SHAPE + 7, i)
+    xx, yy, zz = xx * inverse, yy * inverse, zz * inverse
+    xy, xz, yz = 0.5 * (xy + yx) * inverse, 0.5 * (xz + zx) * inverse, 0.5 * (yz + zy) * inverse
+    fits = is_covariance(xx, xy, xz, yy, yz, zz)
+    state = either(fits, state, either(state < 0, state, fill_wide(0.0)))
+    return shape_of_covariance(u, v, n, xx, xy, xz, yy, yz, zz), state
+
+
+@inlined
+def find_shapes(covariances, pose, near, rows):
+    """Find distance, direction, tangent frame and shape of a block, a row each, for `frame_and_shape`."""
+    camera = columns_of_pose(pose)
+    for i in range(0, LANES, WIDTH):
+        n, radius, inverse, state = direction_of(rows, i, camera, near)
+        u, v, shape, _ = shape_in(covariances, rows, i, n, inverse, state)
+        keep(rows, RADIUS, i, radius)
+        for axis in range(3):
+            keep(rows, WORLD + axis, i, n[axis])
+            keep(rows, FRAME + axis, i, u[axis])
+            keep(rows, FRAME + 3 + axis, i, v[axis])
+        for j in range(9):
+            keep(rows, BODY + j, i, shape[j])
 
 
 @inlined
 def frame_and_shape(rows, i):
-    """The tangent frame and the shape that `find_shapes` kept."""
+    """The tangent frame and the shape that `find_shapes` kept, of one Gaussian."""
     u = rows[FRAME, i], rows[FRAME + 1, i], rows[FRAME + 2, i]
     v = rows[FRAME + 3, i], rows[FRAME + 4, i], rows[FRAME + 5, i]
     n = rows[WORLD, i], rows[WORLD + 1, i], rows[WORLD + 2, i]
@@ -206,51 +225,76 @@ def frame_and_shape(rows, i):
 
 
 @inlined
-def _find_records(pose, spread, compensate, rows):
-    """Find what a record holds, in its order but for the level, and the peak."""
-    right, down, ahead = (
-        (pose[0, 0], pose[1, 0], pose[2, 0]),
-        (pose[0, 1], pose[1, 1], pose[2, 1]),
-        (pose[0, 2], pose[1, 2], pose[2, 2]),
-    )
-    unit, inverse_unit = math.sqrt(layout.UNIT), 1 / math.sqrt(layout.UNIT)
-    for i in range(LANES):
-        u, v, n, shape = frame_and_shape(rows, i)
-        a, b, front_a, front_b, along, det_filtered = ray_forms(u, v, shape, spread)
-        rows[OUT, i], rows[OUT + 1, i], rows[OUT + 2, i] = dot(*right, *n), dot(*down, *n), dot(*ahead, *n)
-        rows[OUT + 3, i], rows[OUT + 4, i] = unit * dot(*right, *a), unit * dot(*down, *a)
-        rows[OUT + 5, i], rows[OUT + 6, i] = unit * dot(*ahead, *a), unit * dot(*right, *b)
-        rows[OUT + 7, i], rows[OUT + 8, i] = unit * dot(*down, *b), unit * dot(*ahead, *b)
-        rows[OUT + 9, i], rows[OUT + 10, i] = inverse_unit * front_a, inverse_unit * front_b
-        rows[OUT + 11, i] = along / layout.UNIT
-        ratio = max(shape[6] / det_filtered, LEAST_RATIO) if compensate else 1.0
-        peak = rows[OPACITY, i] * math.sqrt(ratio)
-        drawn = (rows[SOUND, i] > 0) & (rows[OPACITY, i] >= _FAINTEST)
-        rows[PEAK, i] = peak if drawn else 1.0
+def log2(value):
+    """Log2 of numbers above 0, within 1e-9."""
+    mantissa, exponent = mantissa_and_exponent(value)
+    s = (mantissa - 1) / (mantissa + 1)
+    t = s * s
+    series = 1 + t * (1 / 3 + t * (1 / 5 + t * (1 / 7 + t * (1 / 9))))
+    return exponent + (2 / math.log(2)) * s * series
 
 
 @inlined
-def find_logs(rows, bits, source, target):
-    """Write log2 of a row of positive numbers into another; absolute error below 1e-12.
+def _keep_direction(singles, axis, i, value):
+    """Keep a coordinate of the direction, rounded, and what that leaves."""
+    head = rounded(value)
+    store(singles, (layout.DIRECTION + axis) * WIDTH, head)
+    store(singles, (layout.REST + axis) * WIDTH, rounded(value - widened(head)))
 
-    Args:
-        bits: the rows as integers.
-    """
-    for i in range(LANES):
-        exponent = (bits[source, i] - 0x3FE6A09E667F3BCD) >> 52  # mantissa in [sqrt 1/2, sqrt 2)
-        bits[target, i] = bits[source, i] - (exponent << 52)
-        bits[target + 1, i] = exponent
-    for i in range(LANES):
-        s = (rows[target, i] - 1) / (rows[target, i] + 1)
-        t = s * s
-        series = 1 + t * (1 / 3 + t * (1 / 5 + t * (1 / 7 + t * (1 / 9 + t * (1 / 11 + t * (1 / 13 + t / 15))))))
-        rows[target, i] = bits[target + 1, i] + (2 / math.log(2)) * s * series
+
+@inlined
+def _find_records(covariances, pose, spread, compensate, near, rows, i, singles):
+    """Write what eight Gaussians' records hold, a field a row of `singles`; return states, and which are drawn."""
+    right, down, ahead, _ = pose
+    unit, inverse_unit = math.sqrt(layout.UNIT), 1 / math.sqrt(layout.UNIT)
+    n, radius, inverse, state = direction_of(rows, i, pose, near)
+    keep(rows, RADIUS, i, radius)
+    u, v, shape, state = shape_in(covariances, rows, i, n, inverse, state)
+    state = state * get(rows, SOUND, i)
+    (first, mix, second), front_a, front_b, along, _, inverse_det = whitening(shape, spread)
+    a, b = whitened(u, v, first, mix, second)
+    for axis in range(3):
+        keep(rows, WORLD + axis, i, n[axis])
+    _keep_direction(singles, 0, i, dot(*right, *n))
+    _keep_direction(singles, 1, i, dot(*down, *n))
+    _keep_direction(singles, 2, i, dot(*ahead, *n))
+    a_row, b_row = layout.FIRST * WIDTH, layout.SECOND * WIDTH
+    store(singles, a_row, rounded(unit * dot(*right, *a)))
+    store(singles, a_row + WIDTH, rounded(unit * dot(*down, *a)))
+    store(singles, a_row + 2 * WIDTH, rounded(unit * dot(*ahead, *a)))
+    store(singles, b_row, rounded(unit * dot(*right, *b)))
+    store(singles, b_row + WIDTH, rounded(unit * dot(*down, *b)))
+    store(singles, b_row + 2 * WIDTH, rounded(unit * dot(*ahead, *b)))
+    store(singles, layout.FRONT_A * WIDTH, rounded(inverse_unit * front_a))
+    store(singles, layout.FRONT_B * WIDTH, rounded(inverse_unit * front_b))
+    store(singles, layout.ALONG * WIDTH, rounded((1 / layout.UNIT) * along))
+    opacity = get(rows, OPACITY, i)
+    peak2 = opacity * opacity
+    if compensate:
+        peak2 = peak2 * max(shape[6] * inverse_det, LEAST_RATIO)
+    drawn = (state > 0) & (opacity >= _FAINTEST)
+    level = either(drawn, 0.5 * log2(either(drawn, peak2, fill_wide(1.0))), fill_wide(CULLED))
+    store(singles, layout.LEVEL * WIDTH, rounded(level))
+    return state, drawn
+
+
+@inlined
+def _check_numbers(rows, first, end, count):
+    """Clear SOUND of Gaussians with a number that is not finite or absurdly large among the rows."""
+    for row in range(first, end):
+        for i in range(count):
+            if not abs(rows[row, i]) < _LARGEST:
+                rows[SOUND, i] = 0.0
 
 
 @inlined
 def _check_harmonics(harmonic_bits, size, start, count, rows):
-    """Clear SOUND of Gaussians with a coefficient that is not finite or absurdly large; each has `size` of them."""
+    """Set SOUND, and clear it for Gaussians with such a coefficient; each has `size` of them."""
+    for i in range(LANES):
+        rows[SOUND, i] = 1.0
     largest = np.uint32(0)
+    for j in range(0, size * count, 2 * WIDTH):
+        prefetch(harmonic_bits, size * (start + AHEAD) + j)
     block = harmonic_bits[start * size : (start + count) * size]
     for j in range(block.shape[0]):
         bits = np.uint32(block[j] << np.uint32(1))  # without the sign
@@ -262,59 +306,36 @@ def _check_harmonics(harmonic_bits, size, start, count, rows):
             rows[SOUND, j // size] = 0.0
 
 
-@inlined
-def _round(rows, singles):
-    """Round a block's records to float32, a field a row, and the directions' rest likewise."""
-    for axis in range(3):
-        for i in range(LANES):
-            head = np.float32(rows[OUT + axis, i])
-            singles[layout.DIRECTION + axis, i] = head
-            singles[layout.REST + axis, i] = np.float32(rows[OUT + axis, i] - np.float64(head))
-    for j in range(9):
-        for i in range(LANES):
-            singles[layout.FIRST + j, i] = np.float32(rows[OUT + 3 + j, i])
-    for i in range(LANES):
-        is_drawn = (rows[SOUND, i] > 0) & (rows[OPACITY, i] >= _FAINTEST)
-        singles[layout.LEVEL, i] = np.float32(rows[LOG, i] if is_drawn else CULLED)
-        singles[layout.FIELDS, i] = np.float32(rows[RADIUS, i])
-
-
-@inlined
-def _write_block(rows, singles, start, count, records, values, radii, drawn, tally):
-    radius_column = values.shape[1] - 1
-    write_columns(singles.reshape(-1), LANES, start, count, records)
-    for i in range(count):
-        values[start + i, radius_column] = singles[layout.FIELDS, i]
-    dropped, near = 0, 0
-    for i in range(count):
-        radii[start + i] = rows[RADIUS, i]
-        drawn[start + i] = singles[layout.LEVEL, i] > CULLED
-        dropped += rows[SOUND, i] == 0
-        near += rows[SOUND, i] < 0
-    tally[DROPPED] += dropped
-    tally[NEAR] += near
-
-
 @kernel
 def _observe(
     piece, means, quats, scales, covariances, opacities, harmonics, harmonic_bits,
     pose, spread, compensate, near, bends, records, values, radii, drawn, tallies,
 ):  # fmt: skip
-    rows = np.ones((ROWS + 1, LANES))
-    bits = rows.view(np.int64)
-    basis, singles = np.empty((25, LANES), np.float32), np.empty((layout.FIELDS + 1, LANES), np.float32)
+    align_stack()
+    rows, seen = np.ones((ROWS, LANES)), np.empty(LANES, np.uint8)
+    basis, singles = np.empty((25, LANES), np.float32), np.empty(layout.FIELDS * WIDTH, np.float32)
+    dropped, too_near, camera = 0, 0, columns_of_pose(pose)
     for start in range(piece * PIECE, min((piece + 1) * PIECE, means.shape[0]), LANES):
         count = min(LANES, means.shape[0] - start)
-        read_block(means, quats, scales, covariances, opacities, start, count, rows)
-        find_directions(pose, near, rows)
-        find_shapes(covariances, rows)
+        suspect = read_block(means, quats, scales, covariances, opacities, start, count, rows)
         _check_harmonics(harmonic_bits, harmonics.shape[1] * harmonics.shape[2], start, count, rows)
-        _find_records(pose, spread, compensate, rows)
-        find_logs(rows, bits, PEAK, LOG)
+        if suspect:
+            _check_numbers(rows, MEAN, OPACITY + 1, count)
+        for i in range(0, count, WIDTH):
+            state, is_drawn = _find_records(covariances, camera, spread, compensate, near, rows, i, singles)
+            there = min(WIDTH, count - i)
+            inside = np.uint64((1 << there) - 1)
+            dropped += how_many(bits_of(state == 0.0) & inside)
+            too_near += how_many(bits_of(state < 0.0) & inside)
+            store_mask(seen, i, is_drawn)
+            write_columns(singles, WIDTH, start + i, there, records)
+        for i in range(count):
+            put(radii, start + i, rows[RADIUS, i])
+        for i in range(count):
+            put(drawn, start + i, seen[i])
         fill_basis(rows, WORLD, harmonics.shape[1], bends, basis)
-        _round(rows, singles)
-        _write_block(rows, singles, start, count, records, values, radii, drawn, tallies[piece])
-        colours(harmonics, start, count, basis, values)
+        colours(harmonics, start, count, basis, bends, rows, RADIUS, values)
+    tallies[piece, DROPPED], tallies[piece, NEAR] = dropped, too_near
 
 
 class Observed(NamedTuple):
