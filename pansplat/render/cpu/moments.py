@@ -1,7 +1,8 @@
 """Moments of a Gaussian over the pixels of a tile, and the gradient of its record that they make.
 
-Source: docs/rendering.md, section 3. The forms are linear in a pixel's offset from the Gaussian, so the derivatives by
-them, summed alone and times the offset, are all that the pixels have to say.
+Source: docs/rendering.md, section 3. A response depends on A / L and B / L alone, which a pixel has by a projection:
+eight numbers, of which one only turns A and B into each other. So seven sums, and those for `along` and `level`, are
+all that the pixels have to say, whatever tile or components the forms were found in.
 """
 
 import math

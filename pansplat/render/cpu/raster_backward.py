@@ -2,9 +2,9 @@
 
 Source: docs/rendering.md, sections 3 and 4. The forward kept how much passes before each chunk of a tile, so chunks are
 taken back to front, each with all it needs in the second cache. Block by block the weights of what reaches it are found
-front to back, then the slopes back to front: what lies behind a Gaussian is summed from the back, where it is small, so
-that nothing cancels and nothing is divided by a transmittance. Last Gaussian by Gaussian: their moments over all their
-blocks stay in registers, and become the gradient of the record. Each entry writes a slot of its own.
+front to back, then the slopes back to front: what a ray meets behind a Gaussian is blended from the back, as a mean, so
+that nothing is divided by a transmittance. Last Gaussian by Gaussian: their moments over all their blocks stay in
+registers, and become the gradient of the record. Each entry writes a slot of its own.
 """
 
 import numpy as np

@@ -10,6 +10,8 @@ so a and b are the page's times sqrt(UNIT), `along` is its S' over UNIT, and `le
 as a float32 and what that leaves, so that n - k has no cancellation. For the classic kernel n is the point in pixels
 (z = 0), d the pixel's centre, a_y = a_z = b_z = 0, along = front_a = front_b = 0, and L is 1.
 
+Only A / L and B / L count, and a.n = b.n = 0. Gradients of records are those with each ray as long as makes L = 1.
+
 Arrays, all C-contiguous numpy:
 
     records   float32 (n, FIELDS)       best aligned to 64 bytes: one cache line a Gaussian

@@ -1,5 +1,8 @@
 """What a tile needs before it is drawn: its pixels, and its Gaussians' forms relative to its middle.
 
+A ray's length is free. So a tile takes its pixels and Gaussians where their rays meet the plane that touches the sphere
+in its middle, and forms have two components. Where some are too far from the middle for that, they have three.
+
 Forms are kept by columns (`FORMS` x `CHUNK`), for a chunk of Gaussians that fits the first cache: the set-up then works
 on eight Gaussians at once, and drawing spreads one number over eight pixels.
 """
@@ -89,24 +92,26 @@ def place_tile(kind, columns, rows, rotation, left, top, centre, place):  # type
     Returns:
         Whether some of its pixels are too far from the middle for two components.
     """
-    right, bottom = len(columns) - 1, len(rows) - 1
-    k = point_of(kind, columns, rows, rotation, min(left + TILE // 2, right), min(top + TILE // 2, bottom))
+    least = 1.0  # cosine of a pixel's angle from the middle; those in the corners are the farthest
+    for corner in range(-1, 4):
+        x, y = left + TILE // 2, top + TILE // 2
+        if corner >= 0:
+            x, y = left + corner % 2 * (TILE - 1), top + corner // 2 * (TILE - 1)
+        x, y = min(x, len(columns) - 1), min(y, len(rows) - 1)
+        d_x, d_y, d_z = point_of(kind, columns, rows, rotation, x, y)
+        if corner < 0:
+            centre[0], centre[1], centre[2] = d_x, d_y, d_z
+        elif kind != FLAT:
+            least = min(least, dot(centre[0], centre[1], centre[2], d_x, d_y, d_z))
     axes = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
     if kind != FLAT:
-        axes = tangent_frame(*k)
+        axes = tangent_frame(centre[0], centre[1], centre[2])
     for axis in range(3):
-        centre[axis] = k[axis]
-        place[axis] = np.float32(k[axis])
-        place[3 + axis] = np.float32(k[axis] - np.float64(place[axis]))
-        place[12 + axis] = np.float32(0 if kind == FLAT else k[axis])
+        place[axis] = np.float32(centre[axis])
+        place[3 + axis] = np.float32(centre[axis] - np.float64(place[axis]))
+        place[12 + axis] = np.float32(0 if kind == FLAT else centre[axis])
     for axis in range(6):
         place[6 + axis] = np.float32(axes[axis])
-    if kind == FLAT:
-        return False
-    least = 1.0  # of the pixels, those in the corners are the farthest
-    for corner in range(4):
-        x, y = min(left + corner % 2 * (TILE - 1), right), min(top + corner // 2 * (TILE - 1), bottom)
-        least = min(least, dot(*k, *point_of(kind, columns, rows, rotation, x, y)))
     return least < NARROW
 
 
