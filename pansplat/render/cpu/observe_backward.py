@@ -351,7 +351,7 @@ def chain(
         )  # fmt: skip
 
     share(work, pieces, threads)
-    if len(sums) == 0:
+    if len(wanted.pose) == 0:
         return wanted
     pose = sums.sum(axis=0).reshape(3, 4)
     pose[:, :3] = pose[:, :3] @ camera.pose[:3, :3]
