@@ -27,8 +27,7 @@ from pansplat.render.backend import Options
 
 Watch = Callable[[str, "list[Row]"], None]
 
-_SLOW = 5.0  # seconds; a first drawing that takes longer counts as the measurement
-_LEAST, _MOST = 3, 15  # repeats of the others
+_LEAST, _MOST = 3, 15  # repeats of what is not slow
 
 
 @dataclass(eq=False)
@@ -79,6 +78,7 @@ class Bench:
         *,
         file: Path | None = None,
         budget: float = 2.0,
+        slow: float = 5.0,
         watch: Watch | None = None,
     ) -> None:
         """Begin a run.
@@ -87,11 +87,12 @@ class Bench:
             machine: written with the rows; its peaks are what they are compared with.
             file: JSON that is written after every picture.
             budget: seconds a case may take for its repeats.
+            slow: seconds; a first drawing that takes longer counts as the measurement.
             watch: told what is being done, and the rows.
         """
         self.machine = machine
         self.rows: list[Row] = []
-        self._file, self._budget, self._watch = file, budget, watch
+        self._file, self._budget, self._slow, self._watch = file, budget, slow, watch
         self._truths: dict[tuple[str, Case], Tensor] = {}  # by the scene's name
         self._work: dict[tuple[str, Case], Work] = {}
         self._scene: Subject | None = None
@@ -174,15 +175,15 @@ class Bench:
         row.peak_mb, (picture, took) = peak_memory(lambda: self._forward(case), device_of(case.backend))
         walls = [took.wall]
         row.stages_ms = {name: 1e3 * value for name, value in picture.stages.items()}
-        if took.wall > _SLOW or case.precision == "float64":
+        if took.wall > self._slow or case.precision == "float64":
             lane.forward.append(took)
         if case.backward:
             forget(case.backend)
             row.backward_peak_mb, took = peak_memory(lambda: self._backward(case), device_of(case.backend))
             walls.append(took.wall)
-            if took.wall > _SLOW:
+            if took.wall > self._slow:
                 lane.backward.append(took)
-        slow = case.precision == "float64" or max(walls) > _SLOW
+        slow = case.precision == "float64" or max(walls) > self._slow
         lane.wanted = 1 if slow else min(_MOST, max(_LEAST, int(self._budget / sum(walls))))
         lane.write_times()
         return picture
