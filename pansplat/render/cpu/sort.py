@@ -20,6 +20,7 @@ _DIGIT = 11  # bits sorted by at a time, at most: 2048 counters stay in the firs
 _MORE = 3  # bits of a digit beyond half of those that number a tile's entries: few are left out of order
 _PATIENCE = 4  # places an entry is moved by insertion, on average, before it is given up
 _AHEAD = 32  # entries, between asking for a distance and reading it
+_ROUNDING = 12  # lowest bits of a distance: equal ones, found in another order of steps, may differ in the last few
 _FLIP = np.int64(0x7FFFFFFFFFFFFFFF)
 
 
@@ -56,7 +57,7 @@ def _read_keys(entries, slots, keys, begin, count, words, own_entries, own_slots
         prefetch(keys, element(entries, min(begin + j + _AHEAD, end)) & np.int64(0xFFFFFFFF))
         entry = element(entries, begin + j)
         key = element(keys, entry & np.int64(0xFFFFFFFF))
-        key = key if key >= 0 else key ^ _FLIP
+        key = (key if key >= 0 else key ^ _FLIP) >> _ROUNDING
         low, high = min(low, key), max(high, key)
         put(words, j, np.uint64(key))
         put(own_entries, j, entry)
@@ -177,8 +178,8 @@ def sort_front_to_back(lists: TileLists, distances: np.ndarray, threads: int) ->
 
     Args:
         lists: of tiles, in the order of the Gaussians' numbers; sorted in place.
-        distances: of the Gaussians, float64; told apart to the last bit, unless a tile's need more than 64 with the
-            places of its entries.
+        distances: of the Gaussians, float64. Those that differ by less than a part in 2^40 count as equal; by less
+            than rather more in a tile of such a range that keys and places together exceed 64 bits.
         threads: to work on; the order does not depend on it.
     """
     pieces = pieces_of(lists.starts, threads)
