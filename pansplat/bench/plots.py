@@ -133,6 +133,10 @@ def _curves(axes: Axes, rows: Sequence[Row], x: str) -> None:
                 axes.plot(*zip(*line, strict=True), style, marker=_MARKERS.get(backend, "*"), label=label)
     axes.set(xscale="log", yscale="log")
     axes.grid(alpha=0.25, which="both")
+    low, high = axes.get_ylim()
+    if high < 10 * low:  # less than a decade would make hills of the machine's whims
+        middle = math.sqrt(low * high)
+        axes.set_ylim(middle / math.sqrt(10), middle * math.sqrt(10))
     if rows:
         axes.legend(fontsize=8)
 

@@ -60,7 +60,7 @@ def run_raster(command: BenchRaster) -> int:
     machine = describe_machine(settings.threads)
     with _live() as live:
         watch = partial(_show, live)
-        budget, slow = (1.0, 2.0) if command.quick else (8.0, 5.0)
+        budget, slow = (1.0, 3.0) if command.quick else (8.0, 5.0)
         bench = Bench(machine, file=files["json"], budget=budget, slow=slow, watch=watch)
         try:
             bench.run(groups(settings, subject, synthetic=command.scene is None))
