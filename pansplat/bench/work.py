@@ -17,12 +17,13 @@ from pansplat.render.bounds import equirect_boxes, kappa
 from pansplat.render.panorama import pictures
 from pansplat.render.splats import observe
 
-FORWARD_OPERATIONS = 55
-"""Floating-point operations a pair, of the exact kernel: 3 differences, 10 for A and B, 3 for Q, 6 for L, 4 for q,
-1 for the level, 13 for 2^x, 2 for the cuts, 3 for weight and transmittance, 10 for five sums."""
+FORWARD_OPERATIONS = 46
+"""Floating-point operations a pair, of the exact kernel in two components: 2 differences, 6 for A and B, 3 for Q, 4 for
+L, 4 for q, 1 for the level, 13 for 2^x, 2 for the cuts, 3 for weight and transmittance, 8 for four sums."""
 
-BACKWARD_OPERATIONS = 115
-"""Likewise: 42 to find alpha again, 20 for the sums' slopes, 15 from alpha to A, B and L, 38 for the moments."""
+BACKWARD_OPERATIONS = 103
+"""Likewise: 38 to find alpha and weight again, 12 for the slope, 20 for A, B, L and q, 25 for their sums, 8 for those
+of the values."""
 
 _RECORD = 80  # bytes: 16 numbers of a record, 4 values
 _ENTRY = 8  # bytes of a tile's list

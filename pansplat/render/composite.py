@@ -46,7 +46,7 @@ def composite(splats: Splats, lists: TileLists, pixels: TilePixels, *, exact: bo
     Differentiable once in all of `splats`.
     """
     rows = torch.cat((splats.forms.flatten(1), splats.along[:, None], splats.peak[:, None], splats.values), dim=1)
-    return _Composite.apply(rows, splats.point, lists, pixels, exact)  # type: ignore[no-any-return]
+    return _Composite.apply(rows, splats.point, lists, pixels, exact, torch.is_grad_enabled())  # type: ignore[no-any-return]
 
 
 class _Composite(torch.autograd.Function):
@@ -55,9 +55,9 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     @one_thread()
     def forward(
-        ctx: Any, rows: Tensor, points: Tensor, lists: TileLists, pixels: TilePixels, exact: bool
+        ctx: Any, rows: Tensor, points: Tensor, lists: TileLists, pixels: TilePixels, exact: bool, recorded: bool
     ) -> Float[Tensor, "tile pixel sums"]:
-        needs_grad = any(ctx.needs_input_grad)
+        needs_grad = recorded and any(ctx.needs_input_grad)  # which knows nothing of no_grad
         padded = _pad(rows), _pad(points)
         first = lists.tiles[0]
         count = lists.tiles[1] - first
@@ -83,7 +83,7 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     @one_thread()
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, None, None, None]:
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, None, None, None, None]:
         if torch.is_grad_enabled():  # create_graph=True
             raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
         (grad_sums,) = grad_outputs
@@ -112,7 +112,7 @@ class _Composite(torch.autograd.Function):
                 grad_rows.index_add_(0, block.reshape(-1), grads[0].flatten(0, 1))
                 grad_points.index_add_(0, block.reshape(-1), grads[1].flatten(0, 1))
                 grad_through = grads[2]
-        return grad_rows[:-1], grad_points[:-1], None, None, None
+        return grad_rows[:-1], grad_points[:-1], None, None, None, None
 
 
 def _pad(table: Tensor) -> Tensor:

@@ -98,7 +98,7 @@ def draw(
     fields = (gaussians.means, *shape, gaussians.opacities, gaussians.harmonics)
     fields = tuple(None if f is None else f.to(torch.float32).contiguous() for f in fields)
     notes = _Notes()
-    sums = _Draw.apply(*fields, pose, pictures, options, notes)
+    sums = _Draw.apply(*fields, pose, pictures, options, notes, torch.is_grad_enabled())
     if options.strict and notes.dropped:
         raise InputError(not_finite(gaussians, covariances, pose, options))
     info = Info(
@@ -123,10 +123,12 @@ class _Draw(torch.autograd.Function):
         pictures: list[Picture],
         options: Options,
         notes: _Notes,
+        recorded: bool,
     ) -> Tensor:
         tensors = means, quats, scales, covariances, opacities, harmonics
         fields, camera = _fields(*tensors), _camera(pose, pictures[0], options)
-        threads, needs_grad, lease = thread_count(), any(ctx.needs_input_grad), Lease()
+        threads, lease = thread_count(), Lease()
+        needs_grad = recorded and any(ctx.needs_input_grad)  # which knows nothing of no_grad
         height, width = pictures[0].size
         with announced(gradients=needs_grad and options.kernel == "ray"):
             with notes.timed("observe"):
@@ -173,7 +175,7 @@ class _Draw(torch.autograd.Function):
         if ctx.needs_input_grad[6]:
             grad_pose = torch.zeros_like(pose)
             grad_pose[:3] = torch.from_numpy(filled.pose)
-        return (*wanted, grad_pose, None, None, None)
+        return (*wanted, grad_pose, None, None, None, None)
 
 
 def _fields(

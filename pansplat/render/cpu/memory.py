@@ -38,8 +38,10 @@ class Lease:
     def __del__(self) -> None:
         _returned.extend(getattr(self, "_blocks", ()))  # torch.compile makes objects that were never initialised
         if _lock.acquire(blocking=False):
-            _settle()
-            _lock.release()
+            try:
+                _settle()
+            finally:
+                _lock.release()
 
 
 class _Given:

@@ -1,7 +1,7 @@
 """Stage one: the record and the values of each Gaussian that a camera sees.
 
-Source: docs/rendering.md, sections 1 to 3; records.py for the layout. Arithmetic is float64, in rows of 64
-Gaussians that the compiler turns into vectors; a piece of work is some thousands of Gaussians.
+Source: docs/rendering.md, sections 1 to 3; records.py for the layout. Arithmetic is float64, eight
+Gaussians at a time (wide.py) of blocks of 64; a piece of work is some thousands of Gaussians.
 """
 
 import math
@@ -235,7 +235,7 @@ def log2(value):
 
 
 @inlined
-def _keep_direction(singles, axis, i, value):
+def _keep_direction(singles, axis, value):
     """Keep a coordinate of the direction, rounded, and what that leaves."""
     head = rounded(value)
     store(singles, (layout.DIRECTION + axis) * WIDTH, head)
@@ -255,9 +255,9 @@ def _find_records(covariances, pose, spread, compensate, near, rows, i, singles)
     a, b = whitened(u, v, first, mix, second)
     for axis in range(3):
         keep(rows, WORLD + axis, i, n[axis])
-    _keep_direction(singles, 0, i, dot(*right, *n))
-    _keep_direction(singles, 1, i, dot(*down, *n))
-    _keep_direction(singles, 2, i, dot(*ahead, *n))
+    _keep_direction(singles, 0, dot(*right, *n))
+    _keep_direction(singles, 1, dot(*down, *n))
+    _keep_direction(singles, 2, dot(*ahead, *n))
     a_row, b_row = layout.FIRST * WIDTH, layout.SECOND * WIDTH
     store(singles, a_row, rounded(unit * dot(*right, *a)))
     store(singles, a_row + WIDTH, rounded(unit * dot(*down, *a)))

@@ -18,7 +18,7 @@ Arrays, all C-contiguous numpy:
     values    float32 (n, channel + 1)  colours, then the radius in metres
     entries   int32   (e, 2)            index of the Gaussian, and its box within the tile (see `BOX_BITS`)
     starts    int64   (tile + 1)        where each tile's entries begin, front to back; tiles row by row
-    slots     int64   (e)               for the backward: the row of gradients that the entry writes
+    slots     int32   (e)               for the backward: the row of gradients that the entry writes; int64 if it must
 """
 
 import math

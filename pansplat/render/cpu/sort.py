@@ -1,9 +1,8 @@
 """Stage four: each tile's Gaussians front to back; equal distances in the order of their numbers.
 
-A tile's few thousand are sorted in the first caches. Their distances, as integers in the same order, are dealt into
-about as many buckets as there are Gaussians, and what is left out of order within a bucket is moved by insertion. Where
-many crowd into few buckets, as when all but one stand far away, a radix sort by all the digits takes its place: it
-takes as long whatever the distances.
+A tile's few thousand are sorted in the first caches: their distances, as integers in the same order, by the two leading
+digits, and what is out of order then by insertion. Where that is too much, as when all but one stand close together, a
+sort by all the digits takes its place: it takes as long whatever the distances.
 """
 
 import numpy as np
@@ -20,7 +19,7 @@ _DIGIT = 11  # bits sorted by at a time, at most: 2048 counters stay in the firs
 _MORE = 3  # bits of a digit beyond half of those that number a tile's entries: few are left out of order
 _PATIENCE = 4  # places an entry is moved by insertion, on average, before it is given up
 _AHEAD = 32  # entries, between asking for a distance and reading it
-_ROUNDING = 12  # lowest bits of a distance: equal ones, found in another order of steps, may differ in the last few
+_ROUNDING = 12  # lowest bits of a distance: equal ones, found by other steps, may differ in the last few, so cut them
 _FLIP = np.int64(0x7FFFFFFFFFFFFFFF)
 
 
@@ -57,7 +56,7 @@ def _read_keys(entries, slots, keys, begin, count, words, own_entries, own_slots
         prefetch(keys, element(entries, min(begin + j + _AHEAD, end)) & np.int64(0xFFFFFFFF))
         entry = element(entries, begin + j)
         key = element(keys, entry & np.int64(0xFFFFFFFF))
-        key = (key if key >= 0 else key ^ _FLIP) >> _ROUNDING
+        key = (key if key >= 0 else (key ^ _FLIP) + 1) >> _ROUNDING  # -0.0 is 0.0
         low, high = min(low, key), max(high, key)
         put(words, j, np.uint64(key))
         put(own_entries, j, entry)
@@ -178,8 +177,8 @@ def sort_front_to_back(lists: TileLists, distances: np.ndarray, threads: int) ->
 
     Args:
         lists: of tiles, in the order of the Gaussians' numbers; sorted in place.
-        distances: of the Gaussians, float64. Those that differ by less than a part in 2^40 count as equal; by less
-            than rather more in a tile of such a range that keys and places together exceed 64 bits.
+        distances: of the Gaussians, float64, cut to a part in 2^40; to a little less in a tile of such a range that
+            keys and places together exceed 64 bits.
         threads: to work on; the order does not depend on it.
     """
     pieces = pieces_of(lists.starts, threads)

@@ -3,7 +3,7 @@
 import itertools
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import torch
 
@@ -33,8 +33,10 @@ def share(work: Callable[[int], object], count: int, threads: int) -> None:
         while not stopped and (piece := next(numbers)) < count:
             work(piece)
 
-    others = [_pool(threads).submit(work_off) for _ in range(threads - 1)]
+    others: list[Future[None]] = []
     try:
+        for _ in range(threads - 1):
+            others.append(_pool(threads).submit(work_off))
         work_off()
     finally:
         stopped = True

@@ -35,7 +35,8 @@ def composite(
     """
     layout = Layout(exact, splats.values.shape[1] - 1)
     pixels = tile_pixels(pictures, exact=exact, dtype=splats.forms.dtype)
-    return _Composite.apply(*splats, instances, pixels, layout, pictures[0].size)  # type: ignore[no-any-return]
+    grads = torch.is_grad_enabled()
+    return _Composite.apply(*splats, instances, pixels, layout, pictures[0].size, grads)  # type: ignore[no-any-return]
 
 
 class _Composite(torch.autograd.Function):
@@ -53,6 +54,7 @@ class _Composite(torch.autograd.Function):
         pixels: TilePixels,
         layout: Layout,
         size: tuple[int, int],
+        recorded: bool,
     ) -> tuple[Tensor, int, int]:
         records = pack(Splats(point, forms, along, peak, values), layout)
         sums = records.new_empty(len(instances.pictures), layout.channels + 2, *size)
@@ -61,7 +63,7 @@ class _Composite(torch.autograd.Function):
             stops = raster(records, lists, pixels, sums, layout)
             entries += len(lists.entries)
             largest = max(largest, _SORTING * len(lists.entries) + 8 * len(lists.ends))
-            if any(ctx.needs_input_grad):
+            if recorded and any(ctx.needs_input_grad):  # which knows nothing of no_grad
                 kept.append((lists, stops))
         ctx.save_for_backward(records, forms, sums)
         ctx.plan = instances, pixels, layout, kept
@@ -77,4 +79,4 @@ class _Composite(torch.autograd.Function):
         totals = records.new_zeros(len(instances.records), layout.gradient)
         for lists, stops in kept:
             raster_backward(records, lists, stops, pixels, sums, grad_outputs[0].contiguous(), layout, totals)
-        return *unpack(by_record(totals, instances, len(records)), forms, layout), None, None, None, None
+        return *unpack(by_record(totals, instances, len(records)), forms, layout), None, None, None, None, None

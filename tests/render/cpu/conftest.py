@@ -27,6 +27,7 @@ from pansplat.render.cpu.records import (
     UNIT,
 )
 from pansplat.render.cpu.tables import FLAT, Plane, plane_of
+from pansplat.render.cpu.tile import CUT, NARROW
 from pansplat.render.panorama import Picture
 
 SPREAD = 0.1 * (math.pi / 64) ** 2
@@ -214,3 +215,16 @@ def make_case(pose: Tensor) -> Callable[..., Case]:
         )
 
     return make
+
+
+@pytest.fixture(params=["behind", "around the eye"])
+def one_too_wide(request: pytest.FixtureRequest, make_case: Callable[..., Case]) -> Case:
+    """A tile of two chunks that two components do for, but for the last Gaussian, which nobody sees."""
+    case = make_case("pinhole", (TILE, TILE), 300, opacity=(0.02, 0.1))
+    middle = case.points[TILE // 2, TILE // 2].numpy()
+    assert (case.records[:, :REST] @ middle).min() > NARROW
+    behind = request.param == "behind"
+    case.records[-1, :FIRST] = 0
+    case.records[-1, :REST] = -middle if behind else middle
+    case.records[-1, FIRST:] = (3, 0, 0, 0, 3, 0, 0, 0, 0 if behind else 1e3, CUT - 0.05)
+    return case

@@ -123,12 +123,15 @@ def test_only_the_gradients_asked_for_are_made(make_scene, pose):
 
 
 def test_without_grad_nothing_is_kept(make_scene, pose):
-    scene = _scene(make_scene)
+    scene, options = _scene(make_scene), Options("ray", "radial", "angular", 0.05, False)
+    plain = draw(scene, None, pose, _pictures("pinhole"), options)
     scene.means.requires_grad_()
+    recorded = draw(scene, None, pose, _pictures("pinhole"), options)
     with torch.no_grad():
-        drawn = draw(scene, None, pose, _pictures("pinhole"), Options("ray", "radial", "angular", 0.05, False))
+        drawn = draw(scene, None, pose, _pictures("pinhole"), options)
     assert not drawn.sums.requires_grad
     assert set(drawn.info.seconds) == {"observe", "boxes", "sort", "bin", "raster"}
+    assert drawn.info.bytes == plain.info.bytes < recorded.info.bytes
 
 
 def test_second_derivatives_are_refused(make_scene, pose):

@@ -85,13 +85,8 @@ def test_weights_and_what_passes_sum_to_one_however_many_overlap(make_case):
     np.testing.assert_allclose(sums[-1], 1, atol=1e-6)
 
 
-@pytest.mark.parametrize("direction, along", [(1, 0.0), (-1, 0.0), (1, 1e3)])
-def test_one_gaussian_too_wide_for_two_components_changes_nothing_in_the_others(direction, along, make_case):
-    # Behind the tile, or all around the eye: its whole chunk is then drawn in three components.
-    case = make_case("pinhole", (32, 64), 150)
-    case.records[-1, :3] = direction * case.records[0, :3]
-    case.records[-1, 6:] = (3, 0, 0, 0, 3, 0, 0, 0, along, -20)  # seen by none
-    np.testing.assert_allclose(_draw(case), case.dense()[0].numpy(), rtol=0, atol=2e-6)
+def test_one_gaussian_too_wide_for_two_components_changes_nothing_in_the_others(one_too_wide):
+    np.testing.assert_allclose(_draw(one_too_wide), one_too_wide.dense()[0].numpy(), rtol=0, atol=2e-6)
 
 
 _CHILD = """

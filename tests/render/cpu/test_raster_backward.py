@@ -53,6 +53,10 @@ def test_gradients_are_autograds_of_the_dense_sums(kind, size, make_case):
     _compare(make_case(kind, size, 150))
 
 
+def test_one_gaussian_too_wide_for_two_components_changes_no_gradients(one_too_wide):
+    _compare(one_too_wide)
+
+
 @pytest.mark.parametrize("num_values", [1, 2, 5, 9])
 def test_any_number_of_values_has_gradients(num_values, make_case):
     _compare(make_case("pinhole", (24, 40), 150, num_values=num_values))

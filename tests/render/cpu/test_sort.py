@@ -64,9 +64,12 @@ def test_many_that_crowd_together_before_one_far_away_are_sorted(far, lease):
 
 
 def test_depths_of_both_signs_come_out_in_order(lease):
-    depths = np.random.default_rng(3).standard_normal(3000)
-    depths[:3] = 0.0, -0.0, 1e-300
-    assert np.array_equal(depths[_sorted(depths, lease)], np.sort(depths))
+    depths = np.random.default_rng(3).standard_normal(5000)
+    depths[:5] = 0.0, -0.0, 1e-300, -1e-300, -0.0
+    # Of 64 bits with the places: some are cut from the keys.
+    order = _sorted(depths, lease)
+    assert np.array_equal(depths[order], np.sort(depths, kind="stable"))
+    assert order.index(0) < order.index(1) < order.index(4)
 
 
 def test_depths_lie_along_the_axis(lease):
