@@ -27,7 +27,7 @@ from pansplat.render.cpu.records import (
     UNIT,
 )
 from pansplat.render.cpu.tables import FLAT, Plane, plane_of
-from pansplat.render.cpu.tile import CUT, NARROW
+from pansplat.render.cpu.tile import NARROW
 from pansplat.render.panorama import Picture
 
 SPREAD = 0.1 * (math.pi / 64) ** 2
@@ -219,12 +219,17 @@ def make_case(pose: Tensor) -> Callable[..., Case]:
 
 @pytest.fixture(params=["behind", "around the eye"])
 def one_too_wide(request: pytest.FixtureRequest, make_case: Callable[..., Case]) -> Case:
-    """A tile of two chunks that two components do for, but for the last Gaussian, which nobody sees."""
+    """A tile of two chunks, narrow but for the last Gaussian: 100 degrees away, or about the eye, and seen."""
     case = make_case("pinhole", (TILE, TILE), 300, opacity=(0.02, 0.1))
-    middle = case.points[TILE // 2, TILE // 2].numpy()
-    assert (case.records[:, :REST] @ middle).min() > NARROW
+    middle = case.points[TILE // 2, TILE // 2]
+    assert (case.records[:, :REST] @ middle.numpy()).min() > NARROW
     behind = request.param == "behind"
-    case.records[-1, :FIRST] = 0
-    case.records[-1, :REST] = -middle if behind else middle
-    case.records[-1, FIRST:] = (3, 0, 0, 0, 3, 0, 0, 0, 0 if behind else 1e3, CUT - 0.05)
+    angle = math.radians(100 if behind else 0)
+    right, down = (axis[0] for axis in splats.tangent_frame(middle[None]))
+    mean = math.cos(angle) * middle + math.sin(angle) * right
+    towards = math.sin(angle) * middle - math.cos(angle) * right
+    # Seen in part of the tile: what makes L positive there, or negative elsewhere, is that the ellipsoid is oblique.
+    size, front, along, level = (0.5, 1.5, 0.0, -1.0) if behind else (3.0, 0.7, 1e3, -3.0)
+    numbers = (mean, torch.zeros(3), size * towards, size * down, torch.tensor((front, 0, along, level)))
+    case.records[-1] = torch.cat(numbers).numpy()
     return case

@@ -85,7 +85,7 @@ def test_weights_and_what_passes_sum_to_one_however_many_overlap(make_case):
     np.testing.assert_allclose(sums[-1], 1, atol=1e-6)
 
 
-def test_one_gaussian_too_wide_for_two_components_changes_nothing_in_the_others(one_too_wide):
+def test_one_gaussian_too_wide_for_two_components_is_drawn_like_the_others(one_too_wide):
     np.testing.assert_allclose(_draw(one_too_wide), one_too_wide.dense()[0].numpy(), rtol=0, atol=2e-6)
 
 

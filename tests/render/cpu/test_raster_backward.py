@@ -53,7 +53,7 @@ def test_gradients_are_autograds_of_the_dense_sums(kind, size, make_case):
     _compare(make_case(kind, size, 150))
 
 
-def test_one_gaussian_too_wide_for_two_components_changes_no_gradients(one_too_wide):
+def test_one_gaussian_too_wide_for_two_components_has_its_gradients_too(one_too_wide):
     _compare(one_too_wide)
 
 
