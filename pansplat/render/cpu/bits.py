@@ -6,13 +6,13 @@ from llvmlite import ir
 from numba.core import types
 from numba.core.cgutils import get_or_insert_function
 
-from pansplat.render.cpu.simd import _intrinsic, _pointer
+from pansplat.render.cpu.simd import emitted, pointer_to
 
 _BYTE = ir.IntType(8)
 _INT = ir.IntType(32)
 
 
-@_intrinsic
+@emitted
 def list_bits(context, array, index, bits, base):  # type: ignore[no-untyped-def]
     """Write down the places of the bits set of an unsigned 64-bit number, plus `base`, as bytes from `index` on.
 
@@ -20,7 +20,7 @@ def list_bits(context, array, index, bits, base):  # type: ignore[no-untyped-def
     """
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        (_, _, bits, base), pointer = args, _pointer(context, builder, sig, args)
+        (_, _, bits, base), pointer = args, pointer_to(context, builder, sig, args)
         base = builder.trunc(base, _BYTE)
         if "+avx512vbmi2" in context.codegen().magic_tuple()[2].split(","):
             _pack_bits(builder, pointer, bits, base)

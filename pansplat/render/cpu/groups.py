@@ -3,7 +3,6 @@
 A row holds one number of each Gaussian of a block.
 """
 
-import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -11,10 +10,9 @@ import numpy as np
 from llvmlite import ir
 from numba.core import types
 from numba.core.cgutils import unpack_tuple
-from numba.extending import intrinsic
 
 from pansplat.render.cpu.compiling import inlined
-from pansplat.render.cpu.simd import LANES, element, lanes, load, prefetch, put, store
+from pansplat.render.cpu.simd import LANES, element, emitted, lanes, load, prefetch, put, store
 
 _FLOATS, _DOUBLES = (ir.VectorType(kind, LANES) for kind in (ir.FloatType(), ir.DoubleType()))
 _FOUR = ir.VectorType(ir.FloatType(), 4)
@@ -23,12 +21,7 @@ _INTS = ir.VectorType(_INT, LANES)
 AHEAD = 128  # Gaussians: asked for while those before them are worked on
 
 
-def _intrinsic(function: Callable[..., Any]) -> Any:
-    # The tests' check of annotations wraps every function; numba needs the bare one.
-    return intrinsic(inspect.unwrap(function))
-
-
-@_intrinsic
+@emitted
 def load_rounded(context, array, index):  # type: ignore[no-untyped-def]
     """Eight elements of a float64 array from `index` on, as float32."""
 
@@ -40,7 +33,7 @@ def load_rounded(context, array, index):  # type: ignore[no-untyped-def]
     return lanes(array, types.intp), generate
 
 
-@_intrinsic
+@emitted
 def store_widened(context, array, index, value):  # type: ignore[no-untyped-def]
     """Write eight elements of a float64 array from `index` on."""
 
@@ -52,7 +45,7 @@ def store_widened(context, array, index, value):  # type: ignore[no-untyped-def]
     return types.void(array, types.intp, lanes), generate
 
 
-@_intrinsic
+@emitted
 def larger(context, sizes, value):  # type: ignore[no-untyped-def]
     """The larger of sizes found so far and a vector's: bits without the sign, so what is no number counts too."""
 
@@ -64,7 +57,7 @@ def larger(context, sizes, value):  # type: ignore[no-untyped-def]
     return lanes(lanes, lanes), generate
 
 
-@_intrinsic
+@emitted
 def any_reaches(context, sizes, bound):  # type: ignore[no-untyped-def]
     """Whether a size of `larger` reaches a bound, given as twice its bits."""
 
@@ -78,7 +71,7 @@ def any_reaches(context, sizes, bound):  # type: ignore[no-untyped-def]
     return types.boolean(lanes, types.uint32), generate
 
 
-@_intrinsic
+@emitted
 def load_four(context, array, index):  # type: ignore[no-untyped-def]
     """Four elements of a float32 array from `index` on, and four zeros."""
 
@@ -91,7 +84,7 @@ def load_four(context, array, index):  # type: ignore[no-untyped-def]
     return lanes(array, types.intp), generate
 
 
-@_intrinsic
+@emitted
 def apart(context, vectors):  # type: ignore[no-untyped-def]
     """Of k vectors that hold eight groups of k numbers: the first of each group, the second, and so on."""
     size = len(vectors)
@@ -99,7 +92,7 @@ def apart(context, vectors):  # type: ignore[no-untyped-def]
     return vectors(vectors), _gather(places)
 
 
-@_intrinsic
+@emitted
 def together(context, vectors):  # type: ignore[no-untyped-def]
     """Undo `apart`."""
     size = len(vectors)

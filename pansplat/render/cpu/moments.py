@@ -30,7 +30,7 @@ from pansplat.render.cpu.simd import (
     totals,
     transposed,
 )
-from pansplat.render.cpu.tile import ALONG_ROW, CHUNK, PIXELS
+from pansplat.render.cpu.tile import ALONG_ROW, CHUNK, PIXELS, eight_records
 
 GROUP = 4  # values whose gradients are summed at a time
 MOMENTS = 16  # see `_sum_moments`
@@ -157,18 +157,8 @@ def _write_records(  # type: ignore[no-untyped-def]
 @borrowing
 def _record(records, entries, e, last):  # type: ignore[no-untyped-def]
     """n, a, b, front_a and front_b of eight Gaussians."""
-    r0 = FIELDS * np.int64(element(entries, 2 * e))
-    r1 = FIELDS * np.int64(element(entries, 2 * min(e + 1, last)))
-    r2 = FIELDS * np.int64(element(entries, 2 * min(e + 2, last)))
-    r3 = FIELDS * np.int64(element(entries, 2 * min(e + 3, last)))
-    r4 = FIELDS * np.int64(element(entries, 2 * min(e + 4, last)))
-    r5 = FIELDS * np.int64(element(entries, 2 * min(e + 5, last)))
-    r6 = FIELDS * np.int64(element(entries, 2 * min(e + 6, last)))
-    r7 = FIELDS * np.int64(element(entries, 2 * min(e + 7, last)))
-    n_x, n_y, n_z, _, _, _, a_x, a_y = columns_of(records, r0, r1, r2, r3, r4, r5, r6, r7)
-    a_z, b_x, b_y, b_z, front_a, front_b, _, _ = columns_of(
-        records, r0 + 8, r1 + 8, r2 + 8, r3 + 8, r4 + 8, r5 + 8, r6 + 8, r7 + 8
-    )
+    (n_x, n_y, n_z, _, _, _, a_x, a_y), rest = eight_records(records, entries, e, last)
+    a_z, b_x, b_y, b_z, front_a, front_b, _, _ = rest
     return (n_x, n_y, n_z), (a_x, a_y, a_z), (b_x, b_y, b_z), front_a, front_b
 
 

@@ -78,7 +78,7 @@ class Kept(NamedTuple):
     """What the forward leaves for the backward: how much passed before each chunk of a tile.
 
     Attributes:
-        through: (row, PIXELS) float32, transmittances before each chunk drawn, and behind the last.
+        through: (row, PIXELS) float32, transmittances before each chunk drawn.
         rows: (tile + 1), where each tile's rows begin.
         drawn: (tile), how many chunks were drawn before the tile closed.
     """
@@ -91,7 +91,7 @@ class Kept(NamedTuple):
 def room_to_keep(starts: Longs, lease: Lease) -> Kept:
     """Room for what the backward of these tile lists needs."""
     chunks = -(-np.diff(starts) // CHUNK)
-    rows = np.concatenate((np.zeros(1, np.int64), np.cumsum(chunks + 1)))
+    rows = np.concatenate((np.zeros(1, np.int64), np.cumsum(chunks)))
     return Kept(lease.array((int(rows[-1]), PIXELS), np.float32), rows, np.zeros(len(chunks), np.int64))
 
 
@@ -161,9 +161,7 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
             if len(kept) > 0:
                 _keep(through, kept, kept_rows[tile] + chunks)
             chunks += 1
-            wide = tile_is_wide
-            while gather(records, values, entries, first, count, place, exact, wide, forms, colours):
-                wide = True
+            wide = gather(records, values, entries, first, count, place, exact, tile_is_wide, forms, colours)
             if placed != wide:
                 place_pixels(kind, columns, rows, rotation, left, top, centre, place, wide, offsets)
                 placed = np.int64(wide)
@@ -186,7 +184,6 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
             if not is_open:
                 break
         if len(kept) > 0:
-            _keep(through, kept, kept_rows[tile] + chunks)
             drawn_chunks[tile] = chunks
         _write_tile(through, added, sums, left, top, num_values)
 

@@ -123,9 +123,7 @@ def _walk_tiles(  # type: ignore[no-untyped-def]
         for chunk in range(chunks - 1, -1, -1):
             first = begin + chunk * CHUNK
             count = min(CHUNK, end - first)
-            wide = tile_is_wide
-            while gather(records, values, entries, first, count, place, exact, wide, forms, colours):
-                wide = True
+            wide = gather(records, values, entries, first, count, place, exact, tile_is_wide, forms, colours)
             if placed != wide:
                 place_pixels(kind, columns, rows, rotation, left, top, centre, place, wide, offsets)
                 placed = np.int64(wide)

@@ -71,12 +71,13 @@ _register(operator.gt, mask, lanes, lambda builder, a, b: builder.fcmp_ordered("
 _register(operator.and_, mask, mask, ir.IRBuilder.and_)
 
 
-def _intrinsic(function: Callable[..., Any]) -> Any:
+def emitted(function: Callable[..., Any]) -> Any:
+    """Have numba call a function that emits LLVM's code itself."""
     # The tests' check of annotations wraps every function; numba needs the bare one.
     return intrinsic(inspect.unwrap(function))
 
 
-@_intrinsic
+@emitted
 def load(context, array, index):  # type: ignore[no-untyped-def]
     """Eight elements from `index` on."""
 
@@ -88,7 +89,7 @@ def load(context, array, index):  # type: ignore[no-untyped-def]
     return lanes(array, types.intp), generate
 
 
-@_intrinsic
+@emitted
 def store(context, array, index, value):  # type: ignore[no-untyped-def]
     """Write eight elements from `index` on."""
 
@@ -99,7 +100,7 @@ def store(context, array, index, value):  # type: ignore[no-untyped-def]
     return types.void(array, types.intp, lanes), generate
 
 
-@_intrinsic
+@emitted
 def store_past_cache(context, array, index, value):  # type: ignore[no-untyped-def]
     """Write eight elements that nobody reads soon; their place must be a multiple of 32 bytes."""
 
@@ -112,17 +113,17 @@ def store_past_cache(context, array, index, value):  # type: ignore[no-untyped-d
     return types.void(array, types.intp, lanes), generate
 
 
-@_intrinsic
+@emitted
 def spread(context, array, index):  # type: ignore[no-untyped-def]
     """Element `index` in every lane."""
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return _splat(builder, builder.load(_pointer(context, builder, sig, args)))
+        return _splat(builder, builder.load(pointer_to(context, builder, sig, args)))
 
     return lanes(array, types.intp), generate
 
 
-@_intrinsic
+@emitted
 def fill(context, number):  # type: ignore[no-untyped-def]
     """A number in every lane."""
 
@@ -132,7 +133,7 @@ def fill(context, number):  # type: ignore[no-untyped-def]
     return lanes(types.float32), generate
 
 
-@_intrinsic
+@emitted
 def multiply_add(context, a, b, c):  # type: ignore[no-untyped-def]
     """A b + c, rounded once where the processor can."""
 
@@ -142,7 +143,7 @@ def multiply_add(context, a, b, c):  # type: ignore[no-untyped-def]
     return lanes(lanes, lanes, lanes), generate
 
 
-@_intrinsic
+@emitted
 def negative(context, value):  # type: ignore[no-untyped-def]
     """The value with its sign turned."""
 
@@ -152,7 +153,7 @@ def negative(context, value):  # type: ignore[no-untyped-def]
     return lanes(lanes), generate
 
 
-@_intrinsic
+@emitted
 def choose(context, condition, yes, no):  # type: ignore[no-untyped-def]
     """`yes` where the condition holds, elsewhere `no`."""
 
@@ -162,7 +163,7 @@ def choose(context, condition, yes, no):  # type: ignore[no-untyped-def]
     return lanes(mask, lanes, lanes), generate
 
 
-@_intrinsic
+@emitted
 def minimum(context, a, b):  # type: ignore[no-untyped-def]
     """The smaller of two, `b` where `a` is not a number."""
 
@@ -172,7 +173,7 @@ def minimum(context, a, b):  # type: ignore[no-untyped-def]
     return lanes(lanes, lanes), generate
 
 
-@_intrinsic
+@emitted
 def maximum(context, a, b):  # type: ignore[no-untyped-def]
     """The larger of two, `b` where `a` is not a number."""
 
@@ -182,7 +183,7 @@ def maximum(context, a, b):  # type: ignore[no-untyped-def]
     return lanes(lanes, lanes), generate
 
 
-@_intrinsic
+@emitted
 def some(context, condition):  # type: ignore[no-untyped-def]
     """Whether any lane is true."""
 
@@ -193,7 +194,7 @@ def some(context, condition):  # type: ignore[no-untyped-def]
     return types.boolean(mask), generate
 
 
-@_intrinsic
+@emitted
 def exp2(context, value):  # type: ignore[no-untyped-def]
     """2^value within 2e-7 relative, for -126 <= value <= 127; anything elsewhere."""
 
@@ -209,7 +210,7 @@ def exp2(context, value):  # type: ignore[no-untyped-def]
     return lanes(lanes), generate
 
 
-@_intrinsic
+@emitted
 def totals(context, a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
     """The sums of the lanes of eight vectors, in order."""
 
@@ -225,7 +226,7 @@ def totals(context, a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
     return lanes(*[lanes] * LANES), generate
 
 
-@_intrinsic
+@emitted
 def first_lane(context, value):  # type: ignore[no-untyped-def]
     """The first of eight numbers."""
 
@@ -235,7 +236,7 @@ def first_lane(context, value):  # type: ignore[no-untyped-def]
     return types.float32(lanes), generate
 
 
-@_intrinsic
+@emitted
 def transposed(context, a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
     """Eight vectors as the rows of a square, turned into its columns."""
 
@@ -252,7 +253,7 @@ def transposed(context, a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
     return types.UniTuple(lanes, LANES)(*[lanes] * LANES), generate
 
 
-@_intrinsic
+@emitted
 def side_by_side(context, a, b):  # type: ignore[no-untyped-def]
     """Two vectors of two rows of four each, as two rows of eight; and back, for it is its own inverse."""
 
@@ -262,7 +263,7 @@ def side_by_side(context, a, b):  # type: ignore[no-untyped-def]
     return types.UniTuple(lanes, 2)(lanes, lanes), generate
 
 
-@_intrinsic
+@emitted
 def how_many(context, bits):  # type: ignore[no-untyped-def]
     """How many bits of an unsigned 64-bit number are set."""
 
@@ -272,28 +273,28 @@ def how_many(context, bits):  # type: ignore[no-untyped-def]
     return types.intp(types.uint64), generate
 
 
-@_intrinsic
+@emitted
 def element(context, array, index):  # type: ignore[no-untyped-def]
     """One element; unlike array[index] it does not ask whether the index counts from the end."""
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return builder.load(_pointer(context, builder, sig, args))
+        return builder.load(pointer_to(context, builder, sig, args))
 
     return array.dtype(array, types.intp), generate
 
 
-@_intrinsic
+@emitted
 def put(context, array, index, value):  # type: ignore[no-untyped-def]
     """Write one element, likewise."""
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        builder.store(args[2], _pointer(context, builder, sig, args))
+        builder.store(args[2], pointer_to(context, builder, sig, args))
         return context.get_dummy_value()
 
     return types.void(array, types.intp, array.dtype), generate
 
 
-@_intrinsic
+@emitted
 def copy_four(context, target, at, source, index):  # type: ignore[no-untyped-def]
     """Copy four float32 from `index` of one array on to `at` of another."""
 
@@ -310,7 +311,7 @@ def copy_four(context, target, at, source, index):  # type: ignore[no-untyped-de
     return types.void(target, types.intp, source, types.intp), generate
 
 
-@_intrinsic
+@emitted
 def prefetch(context, array, index):  # type: ignore[no-untyped-def]
     """Ask for the cache line of element `index`, to be read."""
 
@@ -320,7 +321,7 @@ def prefetch(context, array, index):  # type: ignore[no-untyped-def]
     return types.void(array, types.intp), generate
 
 
-@_intrinsic
+@emitted
 def prefetch_to_write(context, array, index):  # type: ignore[no-untyped-def]
     """Ask for the cache line of element `index`, to be written."""
 
@@ -331,20 +332,21 @@ def prefetch_to_write(context, array, index):  # type: ignore[no-untyped-def]
 
 
 def _prefetch(context: Any, builder: Any, sig: Any, args: Any, writes: int) -> Any:
-    pointer = builder.bitcast(_pointer(context, builder, sig, args), ir.IntType(8).as_pointer())
+    pointer = builder.bitcast(pointer_to(context, builder, sig, args), ir.IntType(8).as_pointer())
     kind = ir.FunctionType(ir.VoidType(), [pointer.type, _INT, _INT, _INT])
     function = get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
     builder.call(function, [pointer, _INT(writes), _INT(3 if writes else 2), _INT(1)])
     return context.get_dummy_value()
 
 
-def _pointer(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+def pointer_to(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Where element `args[1]` of the array `args[0]` is."""
     array = context.make_array(sig.args[0])(context, builder, args[0])
     return builder.gep(array.data, [args[1]])
 
 
 def _vector_pointer(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    return builder.bitcast(_pointer(context, builder, sig, args), _FLOATS.as_pointer())
+    return builder.bitcast(pointer_to(context, builder, sig, args), _FLOATS.as_pointer())
 
 
 def _constant(number: float) -> ir.Constant:

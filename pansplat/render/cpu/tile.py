@@ -163,6 +163,23 @@ def ask_ahead(records, values, entries, block, first):  # type: ignore[no-untype
 
 
 @borrowing
+def eight_records(records, entries, e, last):  # type: ignore[no-untyped-def]
+    """The sixteen columns of the records of eight entries from `e` on, in two groups; past `last` it is repeated."""
+    r0 = FIELDS * np.int64(element(entries, 2 * e))
+    r1 = FIELDS * np.int64(element(entries, 2 * min(e + 1, last)))
+    r2 = FIELDS * np.int64(element(entries, 2 * min(e + 2, last)))
+    r3 = FIELDS * np.int64(element(entries, 2 * min(e + 3, last)))
+    r4 = FIELDS * np.int64(element(entries, 2 * min(e + 4, last)))
+    r5 = FIELDS * np.int64(element(entries, 2 * min(e + 5, last)))
+    r6 = FIELDS * np.int64(element(entries, 2 * min(e + 6, last)))
+    r7 = FIELDS * np.int64(element(entries, 2 * min(e + 7, last)))
+    return (
+        columns_of(records, r0, r1, r2, r3, r4, r5, r6, r7),
+        columns_of(records, r0 + 8, r1 + 8, r2 + 8, r3 + 8, r4 + 8, r5 + 8, r6 + 8, r7 + 8),
+    )
+
+
+@borrowing
 def gather(  # type: ignore[no-untyped-def]
     records, values, entries, first, count, place, exact, wide, forms, colours
 ):
@@ -173,30 +190,36 @@ def gather(  # type: ignore[no-untyped-def]
         values: (n, value).
         place: the tile's.
         exact: float32 1, or 0 for the classic kernel, whose L is 1.
-        wide: whether in three components.
+        wide: whether the tile needs three components.
         forms: (FORMS CHUNK), written; past `count` the last Gaussian is repeated.
         colours: (CHUNK value), written.
 
     Returns:
-        Whether they have to be taken once more, in three components: some point is too far from the tile's middle.
+        Whether the forms are in three components: some point may be too far from the tile's middle for two.
     """
-    last, num_values = first + count - 1, values.shape[1]
+    num_values = values.shape[1]
+    while _find_forms(records, entries, first, count, place, exact, wide, forms):
+        wide = True
+    if num_values == FEW:
+        for s in range(count):
+            copy_four(colours, FEW * s, values, FEW * np.int64(element(entries, 2 * (first + s))))
+    else:
+        for s in range(count):
+            row = num_values * np.int64(element(entries, 2 * (first + s)))
+            for channel in range(num_values):
+                put(colours, num_values * s + channel, element(values, row + channel))
+    return wide
+
+
+@borrowing
+def _find_forms(records, entries, first, count, place, exact, wide, forms):  # type: ignore[no-untyped-def]
+    """Fill in forms; whether they have to be found once more, in three components."""
+    last = first + count - 1
     on, one = fill(exact), fill(np.float32(1))
     least, most = one, fill(np.float32(0))
     for at in range(0, count, LANES):
-        e = first + at
-        r0 = FIELDS * np.int64(element(entries, 2 * e))
-        r1 = FIELDS * np.int64(element(entries, 2 * min(e + 1, last)))
-        r2 = FIELDS * np.int64(element(entries, 2 * min(e + 2, last)))
-        r3 = FIELDS * np.int64(element(entries, 2 * min(e + 3, last)))
-        r4 = FIELDS * np.int64(element(entries, 2 * min(e + 4, last)))
-        r5 = FIELDS * np.int64(element(entries, 2 * min(e + 5, last)))
-        r6 = FIELDS * np.int64(element(entries, 2 * min(e + 6, last)))
-        r7 = FIELDS * np.int64(element(entries, 2 * min(e + 7, last)))
-        n_x, n_y, n_z, rest_x, rest_y, rest_z, a_x, a_y = columns_of(records, r0, r1, r2, r3, r4, r5, r6, r7)
-        a_z, b_x, b_y, b_z, front_a, front_b, along, level = columns_of(
-            records, r0 + 8, r1 + 8, r2 + 8, r3 + 8, r4 + 8, r5 + 8, r6 + 8, r7 + 8
-        )
+        (n_x, n_y, n_z, rest_x, rest_y, rest_z, a_x, a_y), rest = eight_records(records, entries, first + at, last)
+        a_z, b_x, b_y, b_z, front_a, front_b, along, level = rest
         m_x = (n_x - fill(place[0])) + (rest_x - fill(place[3]))
         m_y = (n_y - fill(place[1])) + (rest_y - fill(place[4]))
         m_z = (n_z - fill(place[2])) + (rest_z - fill(place[5]))
@@ -226,14 +249,6 @@ def gather(  # type: ignore[no-untyped-def]
         store(forms, (MIDDLE + 1) * CHUNK + at, inverse * m_y)
         store(forms, ALONG_ROW * CHUNK + at, along)
         store(forms, LEVEL_ROW * CHUNK + at, level)
-    if num_values == FEW:
-        for s in range(count):
-            copy_four(colours, FEW * s, values, FEW * np.int64(element(entries, 2 * (first + s))))
-    else:
-        for s in range(count):
-            row = num_values * np.int64(element(entries, 2 * (first + s)))
-            for channel in range(num_values):
-                put(colours, num_values * s + channel, element(values, row + channel))
     return not wide and (some(fill(np.float32(NARROW)) > least) or some(most > one))
 
 

@@ -5,7 +5,6 @@ them and numbers, so a formula written for numbers serves for vectors too. Loops
 ask each time whether their arrays overlap, and go back to memory after each step.
 """
 
-import inspect
 import math
 import operator
 from collections.abc import Callable
@@ -15,9 +14,9 @@ from llvmlite import ir
 from numba.core import types
 from numba.core.cgutils import alloca_once, get_or_insert_function
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, models, register_model
+from numba.extending import lower_builtin, models, register_model
 
-from pansplat.render.cpu.simd import LANES, lanes, mask
+from pansplat.render.cpu.simd import LANES, emitted, lanes, mask
 
 _DOUBLE, _INT, _LONG = ir.DoubleType(), ir.IntType(32), ir.IntType(64)
 _FLOATS, _DOUBLES, _LONGS = (ir.VectorType(kind, LANES) for kind in (ir.FloatType(), _DOUBLE, _LONG))
@@ -81,12 +80,7 @@ _register_alone(abs, lambda builder, a: _call(builder, "fabs", a))
 _register_alone(math.sqrt, lambda builder, a: _call(builder, "sqrt", a))
 
 
-def _intrinsic(function: Callable[..., Any]) -> Any:
-    # The tests' check of annotations wraps every function; numba needs the bare one.
-    return intrinsic(inspect.unwrap(function))
-
-
-@_intrinsic
+@emitted
 def align_stack(context):  # type: ignore[no-untyped-def]
     """At the start of a kernel: let vectors that find no register lie within cache lines, not across them."""
 
@@ -101,7 +95,7 @@ def align_stack(context):  # type: ignore[no-untyped-def]
     return types.void(), generate
 
 
-@_intrinsic
+@emitted
 def get(context, rows, row, column):  # type: ignore[no-untyped-def]
     """Eight elements of a row of a float64 array, from a column on."""
 
@@ -113,7 +107,7 @@ def get(context, rows, row, column):  # type: ignore[no-untyped-def]
     return wide(rows, types.intp, types.intp), generate
 
 
-@_intrinsic
+@emitted
 def keep(context, rows, row, column, value):  # type: ignore[no-untyped-def]
     """Write eight elements of a row of a float64 array, from a column on."""
 
@@ -124,31 +118,31 @@ def keep(context, rows, row, column, value):  # type: ignore[no-untyped-def]
     return types.void(rows, types.intp, types.intp, wide), generate
 
 
-@_intrinsic
+@emitted
 def widened(context, value):  # type: ignore[no-untyped-def]
     """Eight float32 as float64."""
     return wide(lanes), lambda context, builder, sig, args: builder.fpext(args[0], _DOUBLES)
 
 
-@_intrinsic
+@emitted
 def rounded(context, value):  # type: ignore[no-untyped-def]
     """Eight float64 rounded to float32."""
     return lanes(wide), lambda context, builder, sig, args: builder.fptrunc(args[0], _FLOATS)
 
 
-@_intrinsic
+@emitted
 def fill_wide(context, number):  # type: ignore[no-untyped-def]
     """A number in every lane."""
     return wide(types.float64), lambda context, builder, sig, args: _splat(builder, args[0])
 
 
-@_intrinsic
+@emitted
 def either(context, condition, yes, no):  # type: ignore[no-untyped-def]
     """`yes` where the condition holds, elsewhere `no`."""
     return wide(mask, wide, wide), lambda context, builder, sig, args: builder.select(*args)
 
 
-@_intrinsic
+@emitted
 def bits_of(context, condition):  # type: ignore[no-untyped-def]
     """Eight truth values as the lowest bits of a number."""
 
@@ -158,7 +152,7 @@ def bits_of(context, condition):  # type: ignore[no-untyped-def]
     return types.uint64(mask), generate
 
 
-@_intrinsic
+@emitted
 def store_mask(context, array, index, condition):  # type: ignore[no-untyped-def]
     """Write eight truth values as bytes from `index` on."""
     bytes_ = ir.VectorType(ir.IntType(8), LANES)
@@ -172,7 +166,7 @@ def store_mask(context, array, index, condition):  # type: ignore[no-untyped-def
     return types.void(array, types.intp, mask), generate
 
 
-@_intrinsic
+@emitted
 def mantissa_and_exponent(context, value):  # type: ignore[no-untyped-def]
     """m in [sqrt 1/2, sqrt 2) and a whole number e so that the value, above 0 and not subnormal, is m 2^e."""
 

@@ -4,15 +4,15 @@ import pytest
 from numba.core import types
 
 from pansplat.render.cpu import bits
-from pansplat.render.cpu.simd import _intrinsic, _pointer
+from pansplat.render.cpu.simd import emitted, pointer_to
 
 
-@_intrinsic
+@emitted
 def _list_one_by_one(context, array, index, word, base):  # type: ignore[no-untyped-def]
     """What `list_bits` does on processors without an instruction for it."""
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        pointer = _pointer(context, builder, sig, args)
+        pointer = pointer_to(context, builder, sig, args)
         bits._walk_bits(builder, pointer, args[2], builder.trunc(args[3], bits._BYTE))
         return context.get_dummy_value()
 
