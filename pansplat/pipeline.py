@@ -33,10 +33,10 @@ from pansplat.gaussians.scene import Scene
 from pansplat.geometry.blending import blend_weights
 from pansplat.model.checkpoint import SUFFIXES, CompatChoice
 from pansplat.model.layers import Precision
-from pansplat.model.predictor import Predictor, Progress
-from pansplat.render import Rendering, rasterize
-from pansplat.render import blend as blend_renderings
-from pansplat.render.original import rasterize_as_original
+from pansplat.predictor import Predictor, Progress
+from pansplat.rendering import Rendering, rasterize
+from pansplat.rendering import blend as blend_renderings
+from pansplat.rendering.original import rasterize_as_original
 
 __all__ = ["load", "load_model", "load_pairs", "predict", "predict_to_file", "render", "save"]
 
@@ -86,7 +86,7 @@ def load_model(
 
 
 def _sweep(**options: Any) -> Predictor:
-    from pansplat.model.sweep import Sweep
+    from pansplat.sweep import Sweep
 
     return Sweep(**options)
 
@@ -207,7 +207,7 @@ def render(
         layout: "equirect", "cubemap" or "pinhole".
         drawing: "exact", or "original": a panorama as the original program draws it, its defects included, for the
             figures that were published of its weights (docs/paper.md).
-        **raster: further options of `pansplat.render.rasterize`, with "exact".
+        **raster: further options of `pansplat.rendering.rasterize`, with "exact".
 
     Raises:
         InputError: when `blend` names no view of the scene, or `drawing` does not go with the other options.

@@ -27,7 +27,15 @@ _NETWORK = (
     *("adapter", "auxiliary_heads", "checkpoint", "cost_volume", "feature_pyramid", "heads", "lattice", "layers"),
     *("loading", "mono_depth", "mvsplat", "network", "pansplat", "tiles", "transformer", "unet", "weights"),
 )
-_CHECKED = ("geometry", "gaussians", "render", "evaluation", "pipeline", *(f"model.{part}" for part in _NETWORK))
+_CHECKED = (
+    "geometry",
+    "gaussians",
+    "rendering",
+    "predictor",
+    "evaluation",
+    "pipeline",
+    *(f"model.{part}" for part in _NETWORK),
+)
 install_import_hook([f"pansplat.{room}" for room in _CHECKED], "pansplat.testing.check_types")
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared"

@@ -29,11 +29,11 @@ PLANTS = [
         "pansplat.gaussians.ply -> pansplat.data.views",
     ),
     (
-        "pansplat/model/predictor.py",
-        "import pansplat.render.blend",
-        "pansplat.model.predictor -> pansplat.render.blend",
+        "pansplat/predictor.py",
+        "import pansplat.rendering.blend",
+        "pansplat.predictor -> pansplat.rendering.blend",
     ),
-    ("pansplat/render/blend.py", "import pansplat.pipeline", "pansplat.render.blend -> pansplat.pipeline"),
+    ("pansplat/rendering/blend.py", "import pansplat.pipeline", "pansplat.rendering.blend -> pansplat.pipeline"),
     (
         "pansplat/pipeline.py",
         "import pansplat.evaluation.metrics",
@@ -43,8 +43,8 @@ PLANTS = [
     ("pansplat/cli/commands.py", "import pansplat_viewer", "pansplat.cli.commands -> pansplat_viewer"),
     (
         "pansplat_viewer/app.py",
-        "import pansplat.render.blend",
-        "pansplat_viewer.app -> pansplat.render.blend",
+        "import pansplat.rendering.blend",
+        "pansplat_viewer.app -> pansplat.rendering.blend",
     ),
 ]
 
@@ -94,10 +94,9 @@ def test_importing_pansplat_does_not_import_torch() -> None:
     assert subprocess.run([sys.executable, "-c", program]).returncode == 0
 
 
-def test_public_names_are_what_they_say_whatever_is_imported_first() -> None:
-    """`pansplat.render` is the call, also after the room of the same name was imported."""
+def test_public_names_are_callables_whatever_is_imported_first() -> None:
     program = (
-        "import pansplat, pansplat.render.blend, pansplat.pipeline\n"
+        "import pansplat, pansplat.rendering.blend, pansplat.pipeline\n"
         "wrong = [name for name in pansplat.__all__ if not callable(getattr(pansplat, name))]\n"
         "assert not wrong, wrong\n"
         "assert pansplat.render is pansplat.pipeline.render\n"

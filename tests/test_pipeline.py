@@ -19,7 +19,7 @@ from pansplat.gaussians.harmonics_official import as_the_original_draws
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.pipeline import _cache_folders, load, load_model, load_pairs, predict, render, save
-from pansplat.render import blend, rasterize
+from pansplat.rendering import blend, rasterize
 
 HEIGHT = 16
 

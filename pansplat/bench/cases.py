@@ -12,9 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.gaussians.gaussians import Gaussians
-from pansplat.render.backend import Kernel, Lowpass, Order
-from pansplat.render.panorama import Layout
-from pansplat.render.stitching import Stitching
+from pansplat.rendering.backend import Kernel, Lowpass, Order
+from pansplat.rendering.panorama import Layout
+from pansplat.rendering.stitching import Stitching
 
 Precision = Literal["float32", "float64"]
 

@@ -12,7 +12,7 @@ from torch.utils.checkpoint import checkpoint
 
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.render.splats import ALPHA_CUT, observe
+from pansplat.rendering.splats import ALPHA_CUT, observe
 
 _SIDE = 16  # pixels of a block: close together, so that float32 keeps their differences
 _SPREAD = 0.1  # variance of the angular filter, pixels^2

@@ -11,7 +11,7 @@ from pansplat.bench.dense import render_dense
 from pansplat.bench.gsplat_peer import render_gsplat
 from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
-from pansplat.render import rasterize
+from pansplat.rendering import rasterize
 
 NEAR = 0.05  # metres
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
@@ -105,7 +105,7 @@ def wake(case: Case) -> None:
 def forget(backend: str) -> None:
     """Let go of memory that a backend keeps for its next picture, so that what one takes can be measured."""
     if backend == "numba":
-        from pansplat.render.cpu.memory import forget_idle
+        from pansplat.rendering.cpu.memory import forget_idle
 
         forget_idle()
 

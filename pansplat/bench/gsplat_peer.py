@@ -12,8 +12,8 @@ from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.geometry.cubemap import face_poses
 from pansplat.geometry.pose import invert_pose
-from pansplat.render.backend import SPREAD
-from pansplat.render.stitching import stitch_faces
+from pansplat.rendering.backend import SPREAD
+from pansplat.rendering.stitching import stitch_faces
 
 
 def render_gsplat(

@@ -30,7 +30,7 @@ from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.model.heads import whole
 from pansplat.model.pansplat import PanSplat
-from pansplat.render.cpu.memory import forget_idle
+from pansplat.rendering.cpu.memory import forget_idle
 from pansplat.training.config import MemoryConfig, NetworkShape, Style
 from pansplat.training.drawing import Drawing
 from pansplat.training.losses import LossWeights

@@ -12,10 +12,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.gaussians.gaussians import Gaussians
-from pansplat.render.backend import Options
-from pansplat.render.bounds import equirect_boxes, kappa
-from pansplat.render.panorama import pictures
-from pansplat.render.splats import observe
+from pansplat.rendering.backend import Options
+from pansplat.rendering.bounds import equirect_boxes, kappa
+from pansplat.rendering.panorama import pictures
+from pansplat.rendering.splats import observe
 
 FORWARD_OPERATIONS = 46
 """Floating-point operations a pair, of the exact kernel in two components: 2 differences, 6 for A and B, 3 for Q, 4 for

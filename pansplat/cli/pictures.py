@@ -21,7 +21,7 @@ from pansplat.geometry.path import fly_path
 
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
-    from pansplat.model.predictor import Progress
+    from pansplat.predictor import Progress
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".exr")
 _FILM_HEIGHT = 360

@@ -19,9 +19,9 @@ from pansplat.errors import InputError
 from pansplat.gaussians.prune import prune
 
 if TYPE_CHECKING:
+    from pansplat import predictor
     from pansplat.data.pairs import Pair
     from pansplat.gaussians.scene import Scene
-    from pansplat.model import predictor
 
 _HELD_HEIGHT = 512  # networks write taller predictions tile by tile, and keep none
 

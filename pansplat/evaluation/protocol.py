@@ -41,8 +41,8 @@ from pansplat.evaluation.score import (
     predict_case,
 )
 from pansplat.model.network import NetworkPredictor
-from pansplat.model.predictor import Predictor, Progress
 from pansplat.pipeline import Drawing
+from pansplat.predictor import Predictor, Progress
 
 ProtocolName = Literal["m3d", "narrow", "replica", "residential", "360loc", "insta360", "ablation", "frame-distance"]
 

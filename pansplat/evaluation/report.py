@@ -30,9 +30,9 @@ from pansplat.evaluation.cross_fade import cross_fade
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
 from pansplat.gaussians.scene import Scene
-from pansplat.model.predictor import Predictor, Progress
 from pansplat.pipeline import Drawing
-from pansplat.render import Rendering
+from pansplat.predictor import Predictor, Progress
+from pansplat.rendering import Rendering
 
 ERROR_SCALE = 0.25  # mean absolute error of the colours that the error picture shows brightest
 

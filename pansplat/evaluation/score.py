@@ -24,8 +24,8 @@ from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.gaussians.scene import Scene
 from pansplat.model.network import NetworkPredictor
-from pansplat.model.predictor import Predictor
 from pansplat.pipeline import Drawing
+from pansplat.predictor import Predictor
 
 Blend = Literal["joint", "deferred"]
 

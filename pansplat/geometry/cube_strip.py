@@ -1,6 +1,6 @@
 """Six cube faces side by side, front right back left up down, as the monocular network sees them.
 
-Unlike the faces that pansplat.render draws, these are sampled corner to corner: the first and the last pixel of
+Unlike the faces that pansplat.rendering draws, these are sampled corner to corner: the first and the last pixel of
 a row lie on the cube's edges. The network was trained so.
 
 Source: OFFICIAL.md, sections 2.4 and 5; Jiang et al., UniFuse, https://arxiv.org/abs/2102.03550.

@@ -18,7 +18,7 @@ from pansplat.geometry.equirect import uv_from_directions
 from pansplat.model.cost_volume import Depths
 from pansplat.model.heads import TileGaussians, whole
 from pansplat.model.layers import Compat, require_views
-from pansplat.model.predictor import Progress
+from pansplat.predictor import Progress
 
 _MIN_HEIGHT = 64
 _UNTILED_HEIGHT = 512  # taller panoramas get twice as many tiles along each side each time they double

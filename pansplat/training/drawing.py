@@ -22,12 +22,12 @@ from pansplat.gaussians.gaussians import Gaussians
 from pansplat.gaussians.harmonics_official import as_the_original_draws
 from pansplat.geometry.blending import blend_weights
 from pansplat.geometry.cubemap import face_poses
-from pansplat.render import original
-from pansplat.render.backend import Options
-from pansplat.render.blend import blend
-from pansplat.render.panorama import pictures
-from pansplat.render.rasterize import Rendering, rasterize
-from pansplat.render.stitching import stitch_faces
+from pansplat.rendering import original
+from pansplat.rendering.backend import Options
+from pansplat.rendering.blend import blend
+from pansplat.rendering.panorama import pictures
+from pansplat.rendering.rasterize import Rendering, rasterize
+from pansplat.rendering.stitching import stitch_faces
 from pansplat.training.config import Mixing, Style
 from pansplat.training.visibility import Region, visible
 

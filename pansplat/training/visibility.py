@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pansplat.gaussians.gaussians import Gaussians
-from pansplat.render.backend import Options
-from pansplat.render.panorama import Picture
-from pansplat.render.reference import in_picture, project
-from pansplat.render.splats import Observed, observe
+from pansplat.rendering.backend import Options
+from pansplat.rendering.panorama import Picture
+from pansplat.rendering.reference import in_picture, project
+from pansplat.rendering.splats import Observed, observe
 
 _CHUNK = 1 << 16  # Gaussians at a time: their geometry is float64
 

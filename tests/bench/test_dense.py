@@ -7,7 +7,7 @@ import torch
 
 from pansplat.bench.dense import render_dense
 from pansplat.bench.scenes import full_lattice_room
-from pansplat.render import rasterize
+from pansplat.rendering import rasterize
 
 HEIGHT = 16
 

@@ -11,7 +11,7 @@ from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import rotations_from_quats
-from pansplat.render import rasterize
+from pansplat.rendering import rasterize
 
 HEIGHT = 64
 

@@ -7,8 +7,8 @@ import torch
 from pansplat.bench.scenes import full_lattice_room
 from pansplat.bench.work import panorama_work
 from pansplat.gaussians.gaussians import Gaussians
-from pansplat.render import rasterize
-from pansplat.render.backend import Options
+from pansplat.rendering import rasterize
+from pansplat.rendering.backend import Options
 
 OPTIONS = Options("ray", "radial", "angular", 0.05, False)
 POSE = torch.eye(4, dtype=torch.float64)

@@ -17,8 +17,8 @@ from pansplat.model.feature_pyramid import FeaturePyramidConfig
 from pansplat.model.heads import HeadsConfig
 from pansplat.model.network import NetworkPredictor, automatic_tiles
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
-from pansplat.model.predictor import Predictor
 from pansplat.model.transformer import TransformerConfig
+from pansplat.predictor import Predictor
 
 SMALL = PanSplatConfig(
     features=FeaturePyramidConfig(channels=(4, 8, 8, 16), transformer=TransformerConfig(channels=16, blocks=1)),

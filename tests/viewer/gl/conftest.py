@@ -12,7 +12,7 @@ from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.pose import rotations_from_quats
-from pansplat.render import Rendering, rasterize
+from pansplat.rendering import Rendering, rasterize
 from pansplat_viewer.offscreen import create_context
 from pansplat_viewer.renderer import DrawSettings, SplatRenderer
 

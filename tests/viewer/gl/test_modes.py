@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.render import blend, blend_weights
+from pansplat.rendering import blend, blend_weights
 from pansplat_viewer.renderer import DrawSettings, SplatRenderer
 
 pytestmark = pytest.mark.gl

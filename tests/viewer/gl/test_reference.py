@@ -9,7 +9,7 @@ import torch
 
 from pansplat.geometry.cubemap import face_poses
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.render import rasterize
+from pansplat.rendering import rasterize
 from pansplat_viewer.renderer import DrawSettings
 
 pytestmark = pytest.mark.gl

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pansplat.gaussians.ply import save_ply
-from pansplat.render import rasterize
+from pansplat.rendering import rasterize
 
 pytestmark = pytest.mark.gl
 

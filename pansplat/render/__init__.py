@@ -1,7 +1,0 @@
-"""Drawing Gaussians: the differentiable reference rasteriser, and blending of its pictures."""
-
-from pansplat.geometry.blending import blend_weights
-from pansplat.render.blend import blend
-from pansplat.render.rasterize import Rendering, rasterize
-
-__all__ = ["Rendering", "blend", "blend_weights", "rasterize"]

@@ -1,8 +1,0 @@
-"""The rasteriser on the processor: numba kernels with explicit vectors, no compiler needed, differentiable.
-
-Source: docs/rendering.md; docs/rasterizer.md tells how it works.
-"""
-
-from pansplat.render.cpu.draw import draw
-
-__all__ = ["draw"]

@@ -1,0 +1,8 @@
+"""The rasteriser on the processor: numba kernels with explicit vectors, no compiler needed, differentiable.
+
+Source: docs/rendering.md; docs/rasterizer.md tells how it works.
+"""
+
+from pansplat.rendering.cpu.draw import draw
+
+__all__ = ["draw"]

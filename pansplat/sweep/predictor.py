@@ -1,0 +1,145 @@
+"""The `sweep` predictor: posed panoramas in, Gaussians out, no weights."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.predictor import Progress
+from pansplat.sweep.lift import LiftConfig, lift
+from pansplat.sweep.search import PosedImages, SearchConfig, search_surfaces
+
+
+@dataclass(frozen=True)
+class SweepConfig:
+    """Settings of the sweep."""
+
+    search: SearchConfig = field(default_factory=SearchConfig)
+    lift: LiftConfig = field(default_factory=LiftConfig)
+
+
+class Sweep:
+    """Hierarchical spherical plane sweep with hand-made features.
+
+    The honest baseline that a trained network must beat, and the fallback without weights. Any number of views
+    from two on; every view is matched against all others.
+    """
+
+    name = "sweep"
+
+    def __init__(self, config: SweepConfig | None = None) -> None:
+        self.config = config or SweepConfig()
+        self.fingerprint = _fingerprint(self.config)
+
+    def __call__(
+        self,
+        images: Float[Tensor, "*batch view 3 height width"],
+        cam2world: Float[Tensor, "*batch view 4 4"],
+        near: float | Tensor,
+        far: float | Tensor,
+        *,
+        masks: Bool[Tensor, "*batch view height width"] | None = None,
+        progress: Progress | None = None,
+    ) -> Gaussians | list[Gaussians]:
+        """Predict from RGB in [0, 1] and OpenCV cam2world poses (metres); a list when there is a batch axis.
+
+        Args:
+            near, far: radial depth range, metres; numbers, or tensors with one value a batch item (or a view, of
+                which the nearest and farthest count).
+            masks: True where a pixel shows the scene; the rest matches nothing and makes no Gaussians, nor do
+                patches of exact black (0, 0, 0), the holes of scans.
+
+        Raises:
+            ValueError: on wrong shapes, fewer than two views, non-finite values, or near >= far.
+        """
+        if images.ndim == 5:
+            return [
+                self._predict(
+                    images[n],
+                    cam2world[n],
+                    _item(near, n),
+                    _item(far, n),
+                    None if masks is None else masks[n],
+                    progress,
+                )
+                for n in range(len(images))
+            ]
+        return self._predict(images, cam2world, near, far, masks, progress)
+
+    def _predict(
+        self,
+        images: Tensor,
+        cam2world: Tensor,
+        near: float | Tensor,
+        far: float | Tensor,
+        masks: Tensor | None,
+        progress: Progress | None,
+    ) -> Gaussians:
+        low, high = float(torch.as_tensor(near).min()), float(torch.as_tensor(far).max())
+        _check(images, cam2world, low, high, masks)
+        posed = PosedImages(
+            images=np.ascontiguousarray(images.detach().cpu().float().permute(0, 2, 3, 1).numpy()),
+            cam2world=cam2world.detach().cpu().double().numpy(),
+            masks=_shows_something(images) & (True if masks is None else masks.cpu().numpy()),
+            near=low,
+            far=high,
+        )
+        report = progress or (lambda what, fraction: None)
+        surfaces = search_surfaces(posed, self.config.search, lambda what, f: report(what, 0.85 * f))
+        report("placing Gaussians", 0.85)
+        gaussians = lift(posed, surfaces, self.config.lift)
+        report("done", 1.0)
+        return gaussians.to(device=images.device)
+
+
+def _shows_something(images: Tensor) -> np.ndarray:
+    """Pixels (view, h, w) outside patches of exact black, which photographs do not have: there a scan has a hole."""
+    shows = np.empty((len(images), *images.shape[-2:]), bool)
+    for view, image in enumerate(images.detach().cpu().numpy()):
+        black = (image.max(axis=0) <= 0).astype(np.uint8)
+        patches = cv2.morphologyEx(black, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        shows[view] = cv2.dilate(patches, np.ones((5, 5), np.uint8)) == 0
+    return shows
+
+
+def _item(value: float | Tensor, n: int) -> float | Tensor:
+    return value[n] if isinstance(value, Tensor) and value.ndim else value
+
+
+def _check(images: Tensor, cam2world: Tensor, near: float, far: float, masks: Tensor | None) -> None:
+    shape = tuple(images.shape)
+    if images.ndim != 4 or shape[0] < 2 or shape[1] != 3 or shape[3] != 2 * shape[2]:
+        raise ValueError(
+            f"`images` must be (view, 3, height, 2 * height) of at least two panoramas, got {shape}; "
+            "stack RGB equirectangular images of one size"
+        )
+    if shape[2] < 64 or shape[2] % 8:
+        raise ValueError(f"`images` must be at least 64 pixels high and a multiple of 8, got {shape[2]}; resize them")
+    if tuple(cam2world.shape) != (shape[0], 4, 4):
+        raise ValueError(f"`cam2world` must be ({shape[0]}, 4, 4) to fit the images, got {tuple(cam2world.shape)}")
+    if masks is not None and tuple(masks.shape) != (shape[0], *shape[2:]):
+        raise ValueError(f"`masks` must be {(shape[0], *shape[2:])} to fit the images, got {tuple(masks.shape)}")
+    if not (torch.isfinite(images).all() and torch.isfinite(cam2world).all()):
+        raise ValueError("`images` and `cam2world` must be finite, got NaN or infinity; clean the input first")
+    if not 0 < near < far < float("inf"):
+        raise ValueError(f"`near` and `far` must satisfy 0 < near < far, got {near} and {far} (metres)")
+
+
+def _fingerprint(config: SweepConfig) -> str:
+    """Hash of the settings and of the code that turns input into Gaussians, so that a cache is never stale."""
+    digest = hashlib.sha256(repr(config).encode())
+    packages: Sequence[str] = ("pansplat.sweep", "pansplat.gaussians", "pansplat.geometry")
+    for package in packages:
+        for source in sorted(files(package).iterdir(), key=lambda s: s.name):
+            if source.name.endswith(".py"):
+                digest.update(source.read_bytes())
+    return f"sweep-{digest.hexdigest()[:16]}"

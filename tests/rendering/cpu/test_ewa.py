@@ -1,0 +1,115 @@
+"""Records of the classic kernel, found from the exact kernel's, are the reference's, forward and backward."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from pansplat.rendering import splats
+from pansplat.rendering.bounds import ewa_boxes, kappa
+from pansplat.rendering.cpu.ewa import TOTALS, project, project_backward
+from pansplat.rendering.cpu.observe import Camera, observe
+from pansplat.rendering.cpu.observe_backward import Gradients, chain
+from pansplat.rendering.cpu.records import FIRST, LEVEL, REST, SECOND, UNIT
+from pansplat.rendering.panorama import pictures
+
+_NAMES = ("means", "quats", "scales", "opacities", "harmonics")
+_DILATED = {"angular": 0.0, "3dgs": 0.3}
+
+
+def _picture():
+    (picture,) = pictures("pinhole", (48, 64), vertical_fov_degrees=80, face_size=None, device=torch.device("cpu"))
+    return picture
+
+
+def _reference(scene, pose, lowpass, picture):
+    """The reference's splats of Gaussians in front, and their numbers."""
+    spread = 0.1 * picture.pixel_angle**2 if lowpass == "angular" else 0.0
+    seen = splats.observe(scene, None, pose, spread=spread, compensate=lowpass == "angular", exact=False)
+    front = seen.direction[:, 2] * seen.values[:, -1] > 0.01
+    chosen = splats.Observed(*(field[front] for field in seen))
+    drawn, variances = splats.ewa_splats(chosen, picture.rotation, picture.size, picture.focal, _DILATED[lowpass])
+    return drawn, variances, front.nonzero()[:, 0].numpy()
+
+
+def _ours(scene, pose, lowpass, picture, fields, lease):
+    spread = (0.1 if lowpass == "angular" else 1e-9) * picture.pixel_angle**2
+    camera = Camera(pose.numpy(), spread, lowpass == "angular", 0.05)
+    given = fields(scene)
+    observed = observe(given, camera, lease, 1)
+    records, boxes = project(given, camera, observed, picture, _DILATED[lowpass], 0.01, lease, 1)
+    return given, camera, observed, records, boxes
+
+
+@pytest.mark.parametrize("lowpass", ["angular", "3dgs"])
+@pytest.mark.parametrize("flat", [False, True])
+def test_projected_records_and_boxes_are_the_references(flat, lowpass, make_scene, fields, lease, pose):
+    scene = make_scene(2000, scale=0.1).to(dtype=torch.float32)
+    if flat:
+        scene.scales[:, 0] = 0
+    picture = _picture()
+    expected, variances, front = _reference(scene.to(dtype=torch.float64), pose, lowpass, picture)
+    *_, records, boxes = _ours(scene, pose, lowpass, picture, fields, lease)
+    edges = ewa_boxes(expected.point, variances, kappa(expected.peak)).numpy()
+    x0, x1 = np.maximum(np.ceil(edges[:, 0] - 0.51), 0), np.minimum(np.floor(edges[:, 1] - 0.49), 63)
+    y0, y1 = np.maximum(np.ceil(edges[:, 2] - 0.51), 0), np.minimum(np.floor(edges[:, 3] - 0.49), 47)
+    seen = (x0 <= x1) & (y0 <= y1)
+    assert seen.sum() > 200
+    behind = np.setdiff1d(np.arange(2000), front)
+    assert (boxes[behind, 3] < boxes[behind, 2]).all()
+    boxes, records = boxes[front], torch.from_numpy(records[front][seen]).double()
+    assert ((boxes[:, 3] >= boxes[:, 2]) != seen).mean() < 2e-3
+    assert (boxes[seen] != np.stack((x0, x1, y0, y1), axis=1)[seen]).any(axis=1).mean() < 5e-3
+    where = records[:, :2] + records[:, REST : REST + 2]
+    torch.testing.assert_close(where, expected.point[seen][:, :2].double(), rtol=1e-12, atol=1e-9)
+    unit, tolerance = math.sqrt(UNIT), {"rtol": 2e-6, "atol": 1e-6}
+    torch.testing.assert_close(records[:, FIRST] / unit, expected.forms[seen][:, 0, 0], **tolerance)
+    torch.testing.assert_close(records[:, SECOND : SECOND + 2] / unit, expected.forms[seen][:, 1, :2], **tolerance)
+    torch.testing.assert_close(2 ** records[:, LEVEL], expected.peak[seen], **tolerance)
+
+
+@pytest.mark.parametrize("lowpass", ["angular", "3dgs"])
+def test_gradients_through_the_projection_are_autograds(lowpass, make_scene, fields, lease, pose):
+    scene = make_scene(400, scale=0.2, degree=0).to(dtype=torch.float32)
+    picture, camera = _picture(), pose.clone().requires_grad_()
+    given, numba_camera, observed, _, boxes = _ours(scene, pose, lowpass, picture, fields, lease)
+    visible = boxes[:, 3] >= boxes[:, 2]
+    weights = torch.randn(400, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    weights[~visible] = 0
+
+    leaves = {name: getattr(scene, name).double().requires_grad_() for name in _NAMES}
+    drawn, _, front = _reference(dataclasses.replace(scene, **leaves), camera, lowpass, picture)
+    a_x, (b_x, b_y) = drawn.forms[:, 0, 0], drawn.forms[:, 1, :2].unbind(1)
+    numbers = torch.stack((*drawn.point[:, :2].unbind(1), a_x, b_x, b_y, torch.log(drawn.peak)), dim=1)
+    (weights[front] * numbers).sum().backward()
+
+    offsets = np.concatenate((np.zeros(1, np.int64), np.cumsum(visible)))
+    slots, unit = np.zeros((int(offsets[-1]), 16), np.float32), math.sqrt(UNIT)
+    weights = weights[visible].numpy()
+    slots[:, :2], slots[:, FIRST], slots[:, SECOND : SECOND + 2] = weights[:, :2], weights[:, 2], weights[:, 3:5]
+    slots[:, [FIRST, SECOND, SECOND + 1]] /= unit  # of the record's numbers, which are unit times the forms
+    slots[:, LEVEL] = weights[:, 5] * math.log(2)
+    totals = np.zeros((400, TOTALS))
+    project_backward(given, numba_camera, picture, _DILATED[lowpass], slots, offsets, totals, 1)
+    wanted = Gradients(*(np.full_like(field, np.nan) for field in given), pose=np.zeros((3, 4)))
+    found = chain(
+        given,
+        numba_camera,
+        observed,
+        np.zeros((0, 16), np.float32),
+        np.zeros((400, 4), np.float32),
+        totals,
+        np.arange(401),
+        wanted,
+        1,
+    )
+    for name in _NAMES[:4]:
+        expected = leaves[name].grad
+        difference = torch.from_numpy(getattr(found, name)).double() - expected
+        assert float(difference.norm() / expected.norm()) < 2e-6, name
+    turns = [pose[:3, :3].T @ gradient[:3, :3] for gradient in (camera.grad, torch.from_numpy(found.pose))]
+    skews = [turn - turn.T for turn in turns]
+    assert float((skews[1] - skews[0]).norm() / skews[0].norm()) < 2e-6
+    torch.testing.assert_close(torch.from_numpy(found.pose[:, 3]), camera.grad[:3, 3], rtol=1e-6, atol=0)

@@ -1,0 +1,87 @@
+"""Compiles every kernel for GPUs that need not be there, and prints one JSON line each.
+
+Run: python tests/rendering/cuda/compile_for_gpu.py [COMPUTE_CAPABILITY ...]   (by default 80 90)
+Without TRITON_INTERPRET. Registers and spills are those that NVIDIA's assembler, which Triton brings, reports.
+"""
+
+import json
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import triton
+from triton import knobs
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+
+from pansplat.rendering.cuda.layout import Layout
+from pansplat.rendering.cuda.lists import emit_kernel
+from pansplat.rendering.cuda.observe import observe_kernel
+from pansplat.rendering.cuda.observe_backward import observe_backward_kernel
+from pansplat.rendering.cuda.raster import num_warps, raster_kernel
+from pansplat.rendering.cuda.raster_backward import backward_kernel, reduce_kernel
+
+_FLOATS = ("means", "opacities", "harmonics", "first_shape", "second_shape", "peaks", "values", "forms", "alongs")
+_FLOATS += ("records", "centres", "offsets", "sums", "grad_sums", "rows", "totals")
+_INTEGERS = ("entries", "slots", "starts", "stops", "busiest", "which", "ranges")
+_FLOATS += ("by_worlds", "by_peaks", "by_forms", "by_alongs")
+_FLOATS += ("by_means", "by_opacities", "by_first_shape", "by_second_shape")
+_DOUBLES = ("camera", "directions", "radii", "covariances", "by_directions", "by_radii", "by_covariances", "by_camera")
+_TYPES = {"ends": "*i64", "tiles": "i32", **dict.fromkeys(_DOUBLES, "*fp64")}
+_SIZES = ("TINY", "AXES", "CHANNELS", "RECORD", "PEAK", "GRADIENT", "FIELDS", "GROUP", "AT_ONCE")
+_SIZES += ("DEGREE", "BY_AXES", "COMPENSATE", "EXACT", "BLOCK")
+
+
+def _type(kernel, name: str) -> str:
+    if kernel is emit_kernel and name in ("records", "tiles"):
+        return {"records": "*i32", "tiles": "*i16"}[name]
+    if name in _SIZES:
+        return "constexpr"
+    return _TYPES.get(name) or ("*fp32" if name in _FLOATS else "*i32" if name in _INTEGERS else "i32")
+
+
+def _report(label: str, kernel, warps: int, capability: int, **sizes) -> None:
+    signature = {name: _type(kernel, name) for name in kernel.arg_names}
+    sizes = {name: value for name, value in sizes.items() if name in signature}
+    compiled = triton.compile(
+        ASTSource(kernel, signature, sizes), target=GPUTarget("cuda", capability, 32), options={"num_warps": warps}
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        binary = Path(folder) / "kernel.cubin"
+        binary.write_bytes(compiled.asm["cubin"])
+        usage = subprocess.run(
+            [knobs.nvidia.cuobjdump.path, "-res-usage", str(binary)], capture_output=True, text=True, check=True
+        ).stdout
+    numbers = {name: int(re.search(name + r":(\d+)", usage)[1]) for name in ("REG", "STACK", "LOCAL", "SHARED")}
+    atomics = len(re.findall(r"\b(?:atom|red)\.", compiled.asm["ptx"]))
+    print(json.dumps(dict(kernel=label, capability=capability, warps=warps, atomics=atomics, **numbers)))
+
+
+def main() -> None:
+    for capability in [int(text) for text in sys.argv[1:]] or [80, 90]:
+        for exact in (True, False):
+            for channels in (3, 8) if exact else (3,):
+                layout = Layout(exact, channels)
+                sizes = dict(
+                    TINY=3.5e-4, AXES=layout.axes, CHANNELS=channels, RECORD=layout.record, PEAK=layout.peak,
+                    GRADIENT=layout.gradient, FIELDS=triton.next_power_of_2(layout.gradient),
+                )  # fmt: skip
+                name = f"{'ray' if exact else 'ewa'}, {channels} channels"
+                _report(f"forward {name}", raster_kernel, num_warps(layout, 2), capability, **sizes)
+                _report(f"backward {name}", backward_kernel, num_warps(layout, 1), capability, **sizes)
+        for group, at_once in ((16, 1), (1, 16)):
+            sizes = dict(GRADIENT=18, FIELDS=32, GROUP=group, AT_ONCE=at_once)
+            _report(f"sum {group} x {at_once}", reduce_kernel, 2, capability, **sizes)
+        for by_axes in (True, False):
+            sizes = dict(DEGREE=4, CHANNELS=3, BY_AXES=by_axes, COMPENSATE=True, EXACT=True, BLOCK=128)
+            name = "scales" if by_axes else "covariances"
+            _report(f"observe, degree 4, {name}", observe_kernel, 4, capability, **sizes)
+            sizes |= dict(BLOCK=64)
+            _report(f"observe backward, {name}", observe_backward_kernel, 2, capability, **sizes)
+        _report("emit", emit_kernel, 4, capability)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,217 @@
+"""The Triton kernels, interpreted, against the torch reference in float64, forward and backward."""
+
+import dataclasses
+import functools
+import importlib.util
+import math
+import types
+
+import pytest
+import torch
+from torch import Tensor
+
+from pansplat.errors import InputError
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.rendering import rasterize
+
+_FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
+_CASES = [
+    dict(layout="equirect", kernel="ray", lowpass="angular"),
+    dict(layout="equirect", kernel="ray", lowpass="3dgs"),
+    dict(layout="pinhole", kernel="ray", order="z", lowpass="angular"),
+    dict(layout="pinhole", kernel="ewa", order="radial", lowpass="angular"),
+    dict(layout="pinhole", kernel="ewa", order="z", lowpass="3dgs"),
+    dict(layout="cubemap", kernel="ray", order="radial", lowpass="angular", face_size=9),
+    dict(layout="cubemap", kernel="ray", order="z", lowpass="3dgs", face_size=18),
+    dict(layout="cubemap", kernel="ewa", order="z", lowpass="3dgs", face_size=9),
+]
+
+
+def _gradients(scene: Gaussians, camera: Tensor, dtype: torch.dtype, covariances: Tensor | None, **options):
+    """A picture and the gradients of a random loss of all of it, by name; `pose` along rigid motions."""
+    leaves = {name: getattr(scene, name).detach().to(dtype).clone().requires_grad_() for name in _FIELDS}
+    if covariances is not None:
+        leaves["covariances"] = covariances.to(dtype).clone().requires_grad_()
+        options["covariances"] = leaves["covariances"]
+    leaves["pose"] = camera.clone().requires_grad_()
+    leaves["background"] = torch.linspace(0.2, 0.9, scene.harmonics.shape[2], dtype=dtype).requires_grad_()
+    drawn = dataclasses.replace(scene, **{name: leaves[name] for name in _FIELDS})
+    got = rasterize(drawn, leaves["pose"], background=leaves["background"], **options)
+    everything = torch.cat((got.color, got.alpha[None], (got.depth * got.alpha)[None]))
+    target = torch.rand(everything.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    (everything.double() * target).sum().backward()
+    gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+    turn = camera[:3, :3].T @ gradients["pose"][:3, :3]
+    gradients["pose"] = torch.cat((turn - turn.T, gradients["pose"][:3, 3:]), dim=1)
+    return everything.detach(), gradients, got.info
+
+
+@pytest.mark.parametrize("options", _CASES, ids=lambda o: "-".join(map(str, o.values())))
+@pytest.mark.parametrize(("dtype", "channels"), [(torch.float32, 3), (torch.float64, 5)])
+def test_pictures_and_gradients_equal_float64_torch(options, dtype, channels, make_scene, pose):
+    scene = make_scene(14, scale=0.25, seed=3, degree=1)
+    scene = dataclasses.replace(scene, harmonics=scene.harmonics.repeat(1, 1, 2)[:, :, :channels])
+    covariances = scene.covariances if options["lowpass"] == "3dgs" else None
+    options = {"size": (18, 36), "vertical_fov_degrees": 80.0, **options}
+    truth = _gradients(scene, pose, torch.float64, covariances, backend="torch", **options)
+    got = _gradients(scene, pose, dtype, covariances, backend="triton", **options)
+    single = dtype == torch.float32
+    assert float(truth[0][channels].mean()) > 0.02
+    assert float((got[0] - truth[0]).abs().max()) < (2e-6 if single else 1e-13)
+    assert got[1].keys() == truth[1].keys() and len(truth[1]) == (6 if covariances is not None else 7)
+    for name, expected in truth[1].items():
+        error = float((got[1][name] - expected).norm() / expected.norm())
+        assert error < (1e-5 if single else 1e-12), name
+    assert got[2].backend == "triton" and got[2].entries > 0 and got[2].bytes > 0
+
+
+@pytest.mark.parametrize("options", [_CASES[2], _CASES[4]], ids=lambda o: o["kernel"])
+def test_gradients_equal_finite_differences(options, make_scene, pose):
+    scene = make_scene(2, scale=0.5, seed=3, degree=0)
+    in_view = torch.tensor((0.3, 0.3, 0.2), dtype=torch.float64) * scene.means + torch.tensor((0.0, 0.0, 1.5))
+    scene = dataclasses.replace(scene, means=in_view @ pose[:3, :3].T + pose[:3, 3])
+
+    motions = torch.zeros(6, 4, 4, dtype=torch.float64)  # three turns, three shifts
+    for k in range(3):
+        motions[k, (k + 1) % 3, (k + 2) % 3], motions[k, (k + 2) % 3, (k + 1) % 3] = -1, 1
+        motions[3 + k, k, 3] = 1
+
+    def draw(*values):
+        *fields, twist = values
+        camera = pose @ torch.linalg.matrix_exp((twist[:, None, None] * motions).sum(dim=0))
+        changed = dataclasses.replace(scene, **dict(zip(_FIELDS, fields, strict=True)))
+        got = rasterize(changed, camera, size=(1, 2), vertical_fov_degrees=80.0, backend="triton", **options)
+        return got.color, got.alpha, got.depth
+
+    twist = torch.zeros(6, dtype=torch.float64)
+    inputs = tuple(t.clone().requires_grad_() for t in (*(getattr(scene, name) for name in _FIELDS), twist))
+    assert all(float(output.detach().abs().max()) > 0.1 for output in draw(*inputs))
+    assert torch.autograd.gradcheck(draw, inputs, eps=1e-6, atol=1e-6, fast_mode=True)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 2), (5, 3), (16, 32), (17, 31)])
+def test_odd_sizes_equal_float64_torch(size, make_scene, pose):
+    scene = make_scene(10, scale=0.6, seed=4)
+    truth = rasterize(scene, pose, size=size, layout="pinhole", backend="torch")
+    got = rasterize(scene.to(dtype=torch.float32), pose, size=size, layout="pinhole", backend="triton")
+    assert float(truth.alpha.max()) > 0.1
+    assert float((got.color - truth.color).abs().max()) < 2e-6
+
+
+def test_a_gaussian_over_many_tiles_has_the_gradient_of_float64_torch(make_scene, pose, monkeypatch):
+    from pansplat.rendering.cuda import raster_backward
+
+    monkeypatch.setattr(raster_backward, "_MANY", 4)
+    scene = make_scene(2, scale=1.5, spread=0.8, seed=1, degree=0)
+    options = dict(size=(48, 96), layout="equirect")
+    truth = _gradients(scene, pose, torch.float64, None, backend="torch", **options)
+    got = _gradients(scene, pose, torch.float32, None, backend="triton", **options)
+    assert got[2].entries > 2 * 16  # so each sums its tiles in a program of its own, in more than one step
+    for name, expected in truth[1].items():
+        assert float((got[1][name] - expected).norm() / expected.norm()) < 1e-5, name
+
+
+@pytest.mark.parametrize("layout", ["equirect", "cubemap"])
+def test_opaque_gaussians_around_the_camera_equal_float64_torch(layout, make_scene):
+    scene = make_scene(12, scale=1.5, spread=0.6, seed=2, degree=0)
+    scene = dataclasses.replace(scene, opacities=torch.linspace(0.5, 2.0, 12, dtype=torch.float64))
+    camera = torch.eye(4, dtype=torch.float64)
+    options = dict(size=(9, 18), layout=layout, face_size=6)
+    truth = _gradients(scene, camera, torch.float64, None, backend="torch", **options)
+    got = _gradients(scene, camera, torch.float64, None, backend="triton", **options)
+    assert float(truth[0][3].max()) > 0.9999  # several at the largest alpha
+    assert float((got[0] - truth[0]).abs().max()) < 2e-5  # stopped tiles
+    for name, expected in truth[1].items():
+        assert float((got[1][name] - expected).norm() / expected.norm()) < 1e-3, name
+
+
+def test_what_lies_behind_a_saturated_tile_is_left_out(make_scene, pose):
+    scene = make_scene(130, scale=3.0, spread=0.1, seed=2, degree=0)
+    ahead = torch.tensor((0.0, 0.0, 3.0), dtype=torch.float64)
+    scene = dataclasses.replace(
+        scene,
+        means=(scene.means + ahead) @ pose[:3, :3].T + pose[:3, 3],
+        opacities=torch.full_like(scene.opacities, 0.2),  # so that 32 leave some
+    )
+    options = dict(size=(4, 4), layout="pinhole")
+    truth = _gradients(scene, pose, torch.float64, None, backend="torch", **options)
+    got = _gradients(scene, pose, torch.float32, None, backend="triton", **options)
+    assert float((got[0] - truth[0]).abs().max()) < 1e-4
+    hidden = (got[1]["opacities"] == 0) & (truth[1]["opacities"] != 0)
+    assert 20 < int(hidden.sum()) < 100
+    del truth[1]["background"]  # nothing of it is seen
+    for name, expected in truth[1].items():
+        assert float((got[1][name] - expected).norm() / expected.norm()) < 1e-3, name
+
+
+def test_narrow_bands_of_tiles_draw_the_same(make_scene, pose, monkeypatch):
+    from pansplat.rendering.cuda import composite
+
+    scene = make_scene(12, scale=0.3, degree=0)
+    wide = _gradients(scene, pose, torch.float64, None, backend="triton", size=(20, 40), layout="equirect")
+    narrow_lists = functools.partial(composite.list_tiles, limit=1)
+    monkeypatch.setattr(composite, "list_tiles", narrow_lists)
+    narrow = _gradients(scene, pose, torch.float64, None, backend="triton", size=(20, 40), layout="equirect")
+    assert torch.equal(narrow[0], wide[0]) and narrow[2].entries == wide[2].entries
+    assert narrow[2].bytes < wide[2].bytes
+    for name, expected in wide[1].items():
+        assert torch.allclose(narrow[1][name], expected, rtol=1e-12, atol=1e-12), name
+
+
+@pytest.mark.parametrize("opacity", [None, 0.0])
+def test_nothing_to_draw_leaves_the_background(opacity, make_scene, pose):
+    scene = make_scene(0 if opacity is None else 3)
+    leaves = {name: getattr(scene, name).clone().requires_grad_() for name in _FIELDS}
+    if opacity is not None:
+        leaves["opacities"] = torch.full((3,), opacity, dtype=torch.float64, requires_grad=True)
+    drawn = dataclasses.replace(scene, **leaves)
+    got = rasterize(drawn, pose, size=(4, 8), background=(0.1, 0.2, 0.3), backend="triton")
+    assert torch.equal(got.color[:, 0, 0], torch.tensor((0.1, 0.2, 0.3), dtype=torch.float64))
+    assert float(got.alpha.detach().abs().max()) == 0 and got.info.entries == 0
+    got.color.sum().backward()
+    assert all(leaf.grad is None or not leaf.grad.any() for leaf in leaves.values())
+
+
+def test_gaussians_that_are_not_finite_or_too_near_are_counted_and_have_no_gradient(make_scene, pose):
+    scene = make_scene(12, scale=0.3).to(dtype=torch.float32)
+    leaves = {name: getattr(scene, name).clone().requires_grad_() for name in _FIELDS}
+    with torch.no_grad():
+        leaves["means"][0] = math.nan
+        leaves["harmonics"][1, 0, 0] = math.inf
+        leaves["means"][2] = pose[:3, 3].float()
+    drawn = Gaussians(**leaves, levels=scene.levels, views=scene.views)
+    got = rasterize(drawn, pose, size=(8, 16), backend="triton")
+    (got.color.sum() + got.depth.sum()).backward()
+    assert (got.info.dropped, got.info.near) == (2, 1)
+    for leaf in leaves.values():
+        assert torch.isfinite(leaf.grad).all()
+        assert float(leaf.grad[:3].abs().max()) == 0 and float(leaf.grad[3:].abs().max()) > 0
+
+
+def test_a_second_derivative_is_refused_clearly(make_scene, pose):
+    leaf = make_scene(3, scale=0.5).means.requires_grad_()
+    drawn = rasterize(dataclasses.replace(make_scene(3, scale=0.5), means=leaf), pose, size=(4, 8), backend="triton")
+    with pytest.raises(RuntimeError, match="second derivatives"):
+        torch.autograd.grad(drawn.color.sum(), leaf, create_graph=True)
+
+
+def test_gaussians_on_the_cpu_are_refused_unless_interpreted(make_scene, pose, monkeypatch):
+    monkeypatch.delenv("TRITON_INTERPRET")
+    with pytest.raises(InputError, match="needs Gaussians on a CUDA device, got them on 'cpu'"):
+        rasterize(make_scene(1), pose, size=(4, 8), backend="triton")
+
+
+def test_a_missing_triton_is_told(make_scene, pose, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match="needs the package triton, which is not installed"):
+        rasterize(make_scene(1), pose, size=(4, 8), backend="triton")
+
+
+def test_auto_takes_triton_on_cuda_only(unchecked):
+    from pansplat.rendering import cuda, rasterize as _  # noqa: F401, I001
+    from pansplat.rendering.rasterize import _backend
+
+    means = types.SimpleNamespace(is_cuda=True, device=torch.device("cuda"), dtype=torch.float32)
+    assert _backend("auto", types.SimpleNamespace(means=means)) is cuda.draw
+    means.is_cuda, means.device = False, torch.device("cpu")
+    assert _backend("auto", types.SimpleNamespace(means=means)) is not cuda.draw

@@ -1,0 +1,92 @@
+"""The observing kernel, interpreted, against the torch reference, forward and backward."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from pansplat.rendering.cuda.observe import observe
+from pansplat.rendering.splats import Observed
+from pansplat.rendering.splats import observe as reference
+
+_FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
+
+
+@pytest.mark.parametrize(
+    ("exact", "compensate", "by_covariance", "degree"),
+    [
+        (True, True, False, 4),
+        (True, False, True, 3),
+        (True, True, True, 2),
+        (False, True, False, 1),
+        (False, False, True, 0),
+    ],
+)
+def test_what_is_seen_equals_the_reference(exact, compensate, by_covariance, degree, make_scene, pose):
+    scene = make_scene(150, seed=degree, degree=degree)  # one program and a part
+    scene.quats[3] = 0
+    scene.scales[5, 1] = 0
+    scene.scales[6] = 0
+    covariances = _rounded(scene.covariances) if by_covariance else None
+    options = dict(spread=3e-4, compensate=compensate, exact=exact)
+    for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-6)):
+        same = None if covariances is None else covariances.to(dtype)
+        expected = reference(scene.to(dtype=dtype), same, pose, **options)
+        got = observe(scene.to(dtype=dtype), same, pose, **options)
+        for name, value in expected._asdict().items():
+            found = getattr(got, name)
+            assert found.dtype == value.dtype and found.shape == value.shape, name
+            if value.numel():
+                assert float((found - value).abs().max() / value.abs().max().clamp_min(1)) < tolerance, name
+
+
+@pytest.mark.parametrize("by_covariance", [True, False])
+@pytest.mark.parametrize("exact", [True, False])
+def test_gradients_equal_the_references(exact, by_covariance, make_scene, pose, monkeypatch):
+    from pansplat.rendering.cuda import observe_backward as room
+
+    monkeypatch.setattr(room, "_CHUNK", 50)
+    scene = make_scene(70)  # one program and a part
+    scene.quats[3] = 0
+    scene.scales[5, 1] = 0
+    scene.scales[6] = 0
+    generator = torch.Generator().manual_seed(0)
+    found = []
+    for function in (reference, observe):
+        leaves = {name: getattr(scene, name).clone().requires_grad_() for name in _FIELDS}
+        covariances = scene.covariances.clone().requires_grad_() if by_covariance else None
+        camera = pose.clone().requires_grad_()
+        seen = function(
+            dataclasses.replace(scene, **leaves), covariances, camera, spread=3e-4, compensate=True, exact=exact
+        )
+        _any_loss(seen, generator.manual_seed(0)).backward()
+        turn = pose[:3, :3].T @ camera.grad[:3, :3]
+        leaves |= {} if covariances is None else {"covariances": covariances}
+        gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+        gradients["pose"] = torch.cat((turn - turn.T, camera.grad[:3, 3:]), dim=1)
+        found.append(gradients)
+    assert found[0].keys() == found[1].keys() and len(found[0]) == (5 if by_covariance else 6)
+    for name, expected in found[0].items():
+        assert float((found[1][name] - expected).norm() / expected.norm()) < 1e-10, name
+
+
+def _rounded(covariances: torch.Tensor) -> torch.Tensor:
+    """Covariances some of which are discs and needles that rounding made slightly indefinite."""
+    rounded = covariances.clone()
+    for thin in (1, 2):
+        axes = torch.linalg.eigh(covariances[thin::7])
+        flat = axes.eigenvalues.clone()
+        flat[:, :thin] = -1e-5 * flat[:, 2:]
+        rounded[thin::7] = axes.eigenvectors @ torch.diag_embed(flat) @ axes.eigenvectors.mT
+    return rounded
+
+
+def _any_loss(seen: Observed, generator: torch.Generator) -> torch.Tensor:
+    """Depends on everything, but on the forms only through pictures: their two first may turn into each other."""
+    random = [torch.rand(value.shape, generator=generator, dtype=value.dtype) for value in seen]
+    total = sum((value * factor).sum() for value, factor in zip(seen, random, strict=True) if value is not seen.forms)
+    if seen.forms.numel():
+        pixels = seen.direction.detach() + 0.01 * torch.randn(seen.direction.shape, generator=generator).double()
+        first, second, ahead = (seen.forms @ (pixels - seen.direction)[:, :, None])[:, :, 0].unbind(1)
+        total = total + (first.square() + second.square()).sqrt().sum() + ahead.sum()
+    return total

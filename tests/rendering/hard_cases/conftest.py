@@ -1,0 +1,183 @@
+"""Every backend there is, simple scenes, and a comparison with the dense float64 renderer, forward and backward."""
+
+import dataclasses
+import os
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.rendering import Rendering, backend, rasterize
+
+os.environ["TRITON_INTERPRET"] = "1"  # before the kernels are imported
+
+_FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
+_ROOM = Path(backend.__file__).parent
+_BASE = 0.28209479177387814
+
+
+@dataclasses.dataclass(frozen=True)
+class Renderer:
+    """One backend with the type it draws in, and how near to the truth it must come.
+
+    Attributes:
+        image: largest error of a pixel, where no pixel lies within rounding of a cut.
+        gradient: relative error of a field's gradient, by norm.
+        height: of the panoramas it can draw in a moment.
+    """
+
+    name: str
+    dtype: torch.dtype
+    image: float
+    gradient: float
+    height: int = 16
+
+    @property
+    def interpreted(self) -> bool:
+        """Whether it runs under Triton's interpreter, where a second's work takes minutes."""
+        return self.name == "triton"
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.height, 2 * self.height
+
+    def spare(self, variation: bool) -> None:
+        """Leave a variation out in the interpreter, where another one shows as much in less time."""
+        if self.interpreted and variation:
+            pytest.skip("a variation that Triton's interpreter is spared")
+
+    def __call__(self, scene: Gaussians, pose: Tensor | None = None, **options) -> Rendering:
+        pose = torch.eye(4, dtype=torch.float64) if pose is None else pose
+        options = {"size": self.size, **options}
+        return rasterize(scene.to(dtype=self.dtype), pose, backend=self.name, **options)
+
+
+_RENDERERS = {
+    "torch": Renderer("torch", torch.float64, 1e-9, 1e-8),
+    "torch-float32": Renderer("torch", torch.float32, 5e-6, 1e-4),
+    "numba": Renderer("numba", torch.float32, 5e-6, 1e-4),
+    "triton": Renderer("triton", torch.float32, 5e-6, 1e-4, height=8),
+}
+
+
+def _there(name: str) -> bool:
+    """Whether a backend has been built: decided by its files, so that one that cannot be imported fails."""
+    if name.startswith("torch"):
+        return True
+    built = (_ROOM / {"numba": "cpu", "triton": "cuda"}[name] / "draw.py").exists()
+    # The kernels of the one need a package that only Linux has; CI is Linux.
+    return built and (name != "triton" or find_spec("triton") is not None or bool(os.environ.get("CI")))
+
+
+@pytest.fixture(
+    params=[
+        pytest.param(name, marks=() if _there(name) else pytest.mark.skip("issue 3: backend not there yet"))
+        for name in _RENDERERS
+    ]
+)
+def draw(request) -> Renderer:
+    """A backend."""
+    return _RENDERERS[request.param]
+
+
+def _balls(means, sigma=0.1, opacity=0.8, colours=(0.9, 0.4, 0.2)) -> Gaussians:
+    means = torch.as_tensor(means, dtype=torch.float64).reshape(-1, 3)
+    count = len(means)
+    ones = torch.ones(count, dtype=torch.float64)
+    colours = torch.as_tensor(colours, dtype=torch.float64)
+    label = torch.zeros(count, dtype=torch.int64)
+    return Gaussians(
+        means=means,
+        scales=(ones * torch.as_tensor(sigma, dtype=torch.float64))[:, None].expand(count, 3).clone(),
+        quats=torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).repeat(count, 1),
+        opacities=ones * torch.as_tensor(opacity, dtype=torch.float64),
+        harmonics=((colours - 0.5) / _BASE).expand(count, colours.shape[-1])[:, None].clone(),
+        levels=label,
+        views=label,
+    )
+
+
+@pytest.fixture
+def balls() -> Callable[..., Gaussians]:
+    """Balls of one size at some places, each with a colour; float64."""
+    return _balls
+
+
+def _leaves(scene: Gaussians) -> Gaussians:
+    fields = {name: getattr(scene, name).detach().clone().requires_grad_() for name in _FIELDS}
+    return dataclasses.replace(scene, **fields)
+
+
+@pytest.fixture
+def leaves() -> Callable[[Gaussians], Gaussians]:
+    """The same Gaussians, of which gradients can be asked."""
+    return _leaves
+
+
+def _loss(color: Tensor, alpha: Tensor, mass: Tensor) -> Tensor:
+    """Any number that hangs on every pixel's colour, alpha, and alpha x depth, each in its own way."""
+    parts = torch.cat((color.double(), alpha.double()[None], mass.double()[None]))
+    weights = torch.rand(parts.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    return (parts * weights).sum()
+
+
+@pytest.fixture
+def loss_of() -> Callable[[Rendering], Tensor]:
+    """A loss that hangs on every number of a picture."""
+    return lambda picture: _loss(picture.color, picture.alpha, picture.depth * picture.alpha)
+
+
+@pytest.fixture
+def gradients(leaves, loss_of) -> Callable[..., dict[str, Tensor]]:
+    """Gradients of that loss for every field of the scene, and for the pose."""
+
+    def find(draw: Renderer, scene: Gaussians, pose: Tensor | None = None, **options) -> dict[str, Tensor]:
+        camera = (torch.eye(4, dtype=torch.float64) if pose is None else pose).clone().requires_grad_()
+        asked = leaves(scene.to(dtype=draw.dtype))
+        loss_of(draw(asked, camera, **options)).backward()
+        found = {name: getattr(asked, name).grad for name in _FIELDS}
+        return {**found, "pose": camera.grad}
+
+    return find
+
+
+@pytest.fixture
+def equals_dense(dense, leaves, gradients) -> Callable[..., None]:
+    """Assert that a backend's picture and gradients are the dense float64 renderer's."""
+
+    def check(
+        draw: Renderer,
+        scene: Gaussians,
+        pose: Tensor | None = None,
+        *,
+        looser: float = 1.0,
+        fields: tuple[str, ...] = _FIELDS,
+        **options,
+    ) -> None:
+        pose = torch.eye(4, dtype=torch.float64) if pose is None else pose
+        pinhole = options.get("layout") == "pinhole"
+        size = options.pop("size", draw.size)
+        literal = {key: options[key] for key in ("kernel", "order", "lowpass", "near") if key in options}
+        fov = options.get("vertical_fov_degrees", 90.0) if pinhole else None
+        # What a float32 backend is given is the rounded scene, so that is what the truth is of.
+        truth = leaves(scene.to(dtype=draw.dtype).to(dtype=torch.float64))
+        color, alpha, mass = dense(truth, pose, size, fov=fov, **literal)
+        got = draw(scene, pose, size=size, **options)
+        for found, expected in ((got.color, color), (got.alpha, alpha), (got.depth * got.alpha, mass)):
+            scale = max(1.0, float(expected.detach().abs().max()))
+            error = float((found - expected.detach()).abs().max())
+            assert error <= looser * draw.image * scale, f"picture off by {error:.2g}"
+        _loss(color, alpha, mass).backward()
+        ours = gradients(draw, scene, pose, size=size, **options)
+        for name in fields:
+            expected, found = getattr(truth, name).grad, ours[name]
+            assert torch.isfinite(found).all(), name
+            norm = max(float(expected.norm()), 1e-6)  # a ball's quaternion has a slope of rounding only
+            error = float((found - expected).norm()) / norm
+            assert error <= looser * draw.gradient, f"gradient of {name} off by {error:.2g}"
+
+    return check

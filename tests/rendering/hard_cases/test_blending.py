@@ -1,0 +1,98 @@
+"""Hard cases 45 to 49: mixing the pictures of single input views."""
+
+import pytest
+import torch
+
+from pansplat.rendering import Rendering, blend, blend_weights
+
+
+def _positions(count: int) -> torch.Tensor:
+    return torch.tensor([(0.0, 0, 0), (1.0, 0, 0), (0.2, 2.0, 0.5)], dtype=torch.float64)[:count]
+
+
+def _pictures(draw, balls, count: int) -> list[Rendering]:
+    """Each view's own Gaussians, drawn alone: all see a part of the panorama, and none sees all of it."""
+    colours = torch.eye(3, dtype=torch.float64)
+    means = [(0, 0, 2.0), (0.5, 0, 2.0), (0, 0.5, 2.0)]
+    return [draw(balls(means[i], 0.5, colours=colours[i])) for i in range(count)]
+
+
+@pytest.mark.hard_case(45)
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_at_an_input_position_its_view_alone_is_shown_and_the_weights_are_flat(count, draw, balls):
+    positions = _positions(count)
+    pictures = _pictures(draw, balls, count)
+    for i in range(count):
+        position = positions[i].clone().requires_grad_()
+        weights = blend_weights(position, positions)
+        assert torch.equal(weights.detach(), torch.eye(count, dtype=torch.float64)[i])
+        (slope,) = torch.autograd.grad(weights[i], position)
+        assert not slope.any()
+        mixed = blend(pictures, weights.detach())
+        here = pictures[i].alpha > 0
+        assert here.any()
+        # One rounding: a share of exactly 1 times the colour.
+        for name in ("color", "alpha", "depth"):
+            assert torch.equal(getattr(mixed, name)[..., here], getattr(pictures[i], name)[..., here])
+
+
+@pytest.mark.hard_case(46)
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_with_all_in_one_place_every_view_weighs_the_same(count, draw, balls):
+    """The original divides 0 by 0 here, and shows nothing but NaN."""
+    place = torch.tensor((0.3, -0.2, 0.1), dtype=torch.float64)
+    positions = place.expand(count, 3).clone().requires_grad_()
+    position = place.clone().requires_grad_()
+    weights = blend_weights(position, positions)
+    assert torch.equal(weights.detach(), torch.full((count,), 1 / count, dtype=torch.float64))
+    slopes = torch.autograd.grad(weights[0], (position, positions))
+    assert not any(slope.any() for slope in slopes)
+    assert torch.isfinite(blend(_pictures(draw, balls, count), weights.detach()).color).all()
+
+
+@pytest.mark.hard_case(47)
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("distance", [1e2, 1e9, 1e150])
+def test_far_outside_weights_are_positive_sum_to_one_and_tend_to_equal(count, distance):
+    """The original's 1 - d / sum d sums to one less than the number of views."""
+    position = torch.tensor((distance, 0.3 * distance, 0), dtype=torch.float64, requires_grad=True)
+    weights = blend_weights(position, _positions(count))
+    assert (weights > 0).all() and float(weights.detach().sum()) == pytest.approx(1, abs=1e-12)
+    assert (weights - 1 / count).abs().max() < 3 / distance + 1e-12
+    (slope,) = torch.autograd.grad(weights[0], position)
+    assert torch.isfinite(slope).all()
+
+
+@pytest.mark.hard_case(48)
+def test_a_hole_in_one_view_shows_the_other_and_slopes_stay_finite(draw, balls):
+    near, other = _pictures(draw, balls, 2)
+    hole = (near.alpha == 0) & (other.alpha > 0)
+    assert hole.any()
+    for weights in ((0.9, 0.1), (1.0, 0.0)):
+        mixed = blend([near, other], torch.tensor(weights, dtype=torch.float64))
+        for name in ("color", "alpha", "depth"):
+            assert torch.allclose(getattr(mixed, name)[..., hole], getattr(other, name)[..., hole], rtol=1e-6)
+    fields = [
+        [getattr(p, name).clone().requires_grad_() for name in ("color", "alpha", "depth")] for p in (near, other)
+    ]
+    weights = torch.tensor((0.9, 0.1), dtype=torch.float64, requires_grad=True)
+    mixed = blend([Rendering(*field) for field in fields], weights)
+    (mixed.color.sum() + mixed.alpha.sum() + mixed.depth.sum()).backward()
+    assert all(torch.isfinite(leaf.grad).all() for field in fields for leaf in field)
+    assert torch.isfinite(weights.grad).all()
+
+
+@pytest.mark.hard_case(49)
+def test_where_no_view_sees_anything_there_is_the_background_and_no_slope(draw, balls):
+    scene = balls((0, 0, 2.0), 0.3)
+    background = (0.125, 0.25, 0.5)
+    pictures = [draw(scene, background=background) for _ in range(3)]
+    empty = pictures[0].alpha == 0
+    assert empty.any()
+    weights = torch.tensor((0.2, 0.3, 0.5), dtype=torch.float64, requires_grad=True)
+    mixed = blend(pictures, weights)
+    expected = torch.tensor(background, dtype=draw.dtype)[:, None]
+    assert torch.allclose(mixed.color.detach()[:, empty], expected, rtol=1e-6)
+    assert not mixed.alpha[empty].any() and not mixed.depth[empty].any()
+    (mixed.alpha[empty].sum() + mixed.depth[empty].sum()).backward()
+    assert not weights.grad.any()

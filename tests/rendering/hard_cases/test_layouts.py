@@ -1,0 +1,69 @@
+"""Hard cases 32 and 33: stitching at seams, corners and poles, and back-propagation face by face."""
+
+import pytest
+import torch
+
+from pansplat.geometry.cubemap import face_poses
+from pansplat.rendering.stitching import stitch_faces
+
+
+@pytest.mark.hard_case(32)
+@pytest.mark.parametrize("stitching", ["seamless", "official"])
+@pytest.mark.parametrize("size", [(8, 16), (32, 64)])
+def test_stitching_and_its_gradient_are_adjoint(stitching, size):
+    """<A x, y> = <x, A' y> with pixels on the seam, at corners and in the poles' rows."""
+    generator = torch.Generator().manual_seed(0)
+    faces = torch.randn(6, 2, 5, 5, generator=generator, dtype=torch.float64, requires_grad=True)
+    weights = torch.randn(2, *size, generator=generator, dtype=torch.float64)
+    (adjoint,) = torch.autograd.grad(stitch_faces(faces, size, stitching=stitching), faces, weights)
+    other = torch.randn(6, 2, 5, 5, generator=generator, dtype=torch.float64)
+    left, right = (stitch_faces(other, size, stitching=stitching) * weights).sum(), (other * adjoint).sum()
+    assert float((left - right).abs() / left.abs()) < 1e-12
+
+
+@pytest.mark.hard_case(32)
+def test_the_cubemap_has_no_seam_and_the_direct_panorama_none_at_all(draw, balls):
+    """A ball on an edge of the cube, turned into a face's middle: the same picture, up to the faces' pixels."""
+    turn = torch.eye(4, dtype=torch.float64)
+    half = 0.5**0.5
+    turn[:3, :3] = torch.tensor([[half, 0, half], [0, 1, 0], [-half, 0, half]], dtype=torch.float64)
+    size = (8, 16)
+    for mean in ((0.0, 0.0, 2.0), (0.0, 1.4, 1.4), (1.1, 1.1, 1.1)):
+        scene = balls(mean, 0.7)
+        for layout, tolerance in (("equirect", 20 * draw.image), ("cubemap", 0.06)):
+            still = draw(scene, size=size, layout=layout, face_size=12).alpha
+            turned = draw(scene, turn, size=size, layout=layout, face_size=12).alpha
+            assert float(still.max()) > 0.3
+            assert float((torch.roll(still, -2, dims=1) - turned).abs().max()) < tolerance, (mean, layout)
+
+
+@pytest.mark.hard_case(33)
+@pytest.mark.parametrize("kernel", ["ray", "ewa"])
+@pytest.mark.parametrize("stitching", ["seamless", "official"])
+def test_back_propagation_face_by_face_is_back_propagation(kernel, stitching, draw, make_scene, pose, leaves):
+    """Draw without gradients, find the loss's slope in the faces' pixels, then draw each face again with them."""
+    draw.spare(stitching == "official" or kernel == "ray")
+    num, size = 6, (8, 16)
+    scene = make_scene(8, scale=0.4, degree=1).to(dtype=draw.dtype)
+    weights = torch.rand(3, *size, generator=torch.Generator().manual_seed(0)).to(draw.dtype)
+    options = {"kernel": kernel, "order": "z", "lowpass": "3dgs"}
+    whole = leaves(scene)
+    picture = draw(whole, pose, size=size, layout="cubemap", face_size=num, stitching=stitching, **options).color
+    (picture.square() * weights).sum().backward()
+
+    def face(asked, camera):
+        return draw(asked, camera, size=(num, num), layout="pinhole", **options).color
+
+    poses = face_poses(pose)
+    with torch.no_grad():
+        faces = torch.stack([face(scene, camera) for camera in poses])
+    faces.requires_grad_()
+    stitched = stitch_faces(faces, size, stitching=stitching)
+    assert (stitched - picture).detach().abs().max() < draw.image
+    (stitched.square() * weights).sum().backward()
+    parts = leaves(scene)
+    for camera, gradient in zip(poses, faces.grad, strict=True):
+        face(parts, camera).backward(gradient)
+    for name in ("means", "scales", "quats", "opacities", "harmonics"):
+        found, expected = getattr(parts, name).grad, getattr(whole, name).grad
+        assert float((found - expected).norm() / expected.norm()) < max(1e-6, draw.gradient / 20), name

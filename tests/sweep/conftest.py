@@ -1,0 +1,203 @@
+"""Painted rooms, and what one image says of a room's floor, for the tests of the sweep."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from pansplat.sweep.cost import MatchingConfig, View
+from pansplat.sweep.floor import FloorClues, find_floor
+from pansplat.sweep.frame import main_directions
+from pansplat.sweep.planes import no_support
+from pansplat.sweep.search import PosedImages, SearchConfig, search_surfaces
+from pansplat.sweep.sphere import ray_grid, resize_sphere
+from pansplat.sweep.surface import Surface
+
+
+def _waves(points: np.ndarray) -> np.ndarray:
+    """Smooth colours (n, 3) of many wavelengths, 0.5 to 3 m, that do not repeat within a room."""
+    generator = np.random.default_rng(7)
+    color = np.full(points.shape, 0.5)
+    for _ in range(28):
+        direction = generator.normal(size=3)
+        wavelength = 0.5 * 6 ** generator.random()
+        wave = points @ (direction / np.linalg.norm(direction)) * (2 * math.pi / wavelength)
+        color += 0.07 * np.sin(wave[:, None] + generator.random(3) * 2 * math.pi)
+    return color.clip(0, 1)
+
+
+def _tiles(points: np.ndarray) -> np.ndarray:
+    """Bricks (n, 3) of one colour each, their edges along the room's axes."""
+    generator = np.random.default_rng(3)
+    table = generator.random((64, 3))
+    cell = np.floor(points / np.array((0.71, 0.53, 0.87)) + 0.37).astype(np.int64)
+    return table[(cell @ np.array((7, 19, 37))) % 64]
+
+
+def _blank(points: np.ndarray) -> np.ndarray:
+    return np.ones(points.shape)
+
+
+_PAINTS = {"waves": _waves, "tiles": _tiles, "blank": _blank}
+
+
+@dataclass(frozen=True)
+class Room:
+    """A painted box seen from inside, with or without a smaller box standing in it. Metres, room axes, y down."""
+
+    paint: str = "waves"
+    low: tuple[float, float, float] = (-2.4, -1.3, -1.9)
+    high: tuple[float, float, float] = (2.1, 1.2, 2.6)
+    box: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    placed: np.ndarray = field(default_factory=lambda: np.eye(4))
+    """Similarity (4, 4) from the room's axes to the world's."""
+    supersample: int = 2
+    """Rays a pixel, squared. Hard edges need more, or their stairs run along the camera's rows and columns."""
+
+    def cast(self, cam2world: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray]:
+        """The panorama (h, 2h, 3), averaged over each pixel, and the radial depth (h, 2h) at pixel centres."""
+        fine = ray_grid(height * self.supersample).astype(np.float64)
+        image = _PAINTS[self.paint](self._hits(fine, cam2world)[0].reshape(-1, 3)).reshape(fine.shape)
+        depth = self._hits(ray_grid(height).astype(np.float64), cam2world)[1]
+        return resize_sphere(image.astype(np.float32), height), depth
+
+    def pose(self, position: tuple[float, float, float], rotation: np.ndarray | None = None) -> np.ndarray:
+        """cam2world (4, 4) of a camera at a place in the room, its axes given in the room's."""
+        scale = np.cbrt(np.linalg.det(self.placed[:3, :3]))
+        local = np.eye(4)
+        local[:3, :3] = np.eye(3) if rotation is None else rotation
+        local[:3, 3] = position
+        pose = self.placed @ local
+        pose[:3, :3] /= scale
+        return pose
+
+    def _hits(self, rays: np.ndarray, cam2world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where rays (h, w, 3) of a camera first meet a face: points in room axes, and distances in the world."""
+        to_room = np.linalg.inv(self.placed)
+        start = to_room[:3, :3] @ cam2world[:3, 3] + to_room[:3, 3]
+        along = rays @ (to_room[:3, :3] @ cam2world[:3, :3]).T
+        with np.errstate(divide="ignore"):
+            inverse = 1 / along
+        walls = np.maximum((np.array(self.low) - start) * inverse, (np.array(self.high) - start) * inverse)
+        distance = walls.min(axis=-1)
+        if self.box is not None:
+            first, second = ((np.array(corner) - start) * inverse for corner in self.box)
+            enter, leave = np.minimum(first, second).max(axis=-1), np.maximum(first, second).min(axis=-1)
+            distance = np.where((enter > 0) & (enter < leave), enter, distance)
+        return start + distance[..., None] * along, distance
+
+
+def _turn(axis: str, degrees: float) -> np.ndarray:
+    """Rotation (3, 3) about a camera axis; positive about y turns the view to the right."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return {
+        "x": np.array(((1, 0, 0), (0, c, -s), (0, s, c))),
+        "y": np.array(((c, 0, s), (0, 1, 0), (-s, 0, c))),
+        "z": np.array(((c, -s, 0), (s, c, 0), (0, 0, 1))),
+    }[axis]
+
+
+@dataclass(frozen=True)
+class Observed:
+    """A room's panoramas, what is true of them, and what the sweep makes of them."""
+
+    room: Room
+    posed: PosedImages
+    depths: np.ndarray
+    """True radial depth (v, h, 2h)."""
+    surfaces: list[Surface] = field(default_factory=list)
+
+
+def _observe(room: Room, poses: Sequence[np.ndarray], height: int, *, search: bool = False) -> Observed:
+    images, depths = zip(*(room.cast(pose, height) for pose in poses), strict=True)
+    masks = np.ones((len(poses), height, 2 * height), bool)
+    posed = PosedImages(np.stack(images), np.stack(poses), masks, near=0.5, far=8.0)
+    surfaces = search_surfaces(posed, SearchConfig(), lambda what, fraction: None) if search else []
+    return Observed(room, posed, np.stack(depths), surfaces)
+
+
+def _two_poses(room: Room) -> list[np.ndarray]:
+    return [room.pose((-0.4, 0.0, -0.2)), room.pose((0.4, 0.05, 0.1), _turn("y", 20))]
+
+
+@pytest.fixture(scope="session")
+def make_room() -> type[Room]:
+    """The room's class, to build others."""
+    return Room
+
+
+@pytest.fixture(scope="session")
+def turn() -> Callable[[str, float], np.ndarray]:
+    """Rotation (3, 3) about "x", "y" or "z" by degrees."""
+    return _turn
+
+
+@pytest.fixture(scope="session")
+def two_poses() -> Callable[[Room], list[np.ndarray]]:
+    """Two cameras in a room, 0.86 m apart, the second turned by 20 degrees."""
+    return _two_poses
+
+
+@pytest.fixture(scope="session")
+def observe() -> Callable[..., Observed]:
+    """Panoramas of a room from poses at a height, with `search=True` also the sweep's surfaces."""
+    return _observe
+
+
+@pytest.fixture(scope="session")
+def empty_room() -> Observed:
+    """Two views of the painted room, 96 pixels high, searched."""
+    room = Room()
+    return _observe(room, _two_poses(room), 96, search=True)
+
+
+@pytest.fixture(scope="session")
+def furnished_room() -> Observed:
+    """The same with a box standing on the floor, that hides a part of the room from either view."""
+    room = Room(box=((-0.3, -0.1, 1.0), (0.4, 1.2, 1.7)))
+    return _observe(room, _two_poses(room), 96, search=True)
+
+
+_AXES = np.array(((0.0, 1, 0), (1, 0, 0), (0, 0, 1)))
+_HEIGHT = 96
+
+
+@pytest.fixture(scope="session")
+def room_axes() -> np.ndarray:
+    """Down and the room's two wall normals."""
+    return _AXES
+
+
+@pytest.fixture(scope="session")
+def find_clues():
+    """What pictures of posed views say of a floor at an offset, metres, and the rays along the room's axes."""
+    return _find_clues
+
+
+def _find_clues(posed, images, floor: float) -> tuple[list[FloorClues] | None, list[np.ndarray]]:
+    """Clues of pictures and their rays along the room's axes; the floor at an offset, metres."""
+    rays = [main_directions(_AXES, pose[:3, :3], images.shape[1]) for pose in posed.cam2world]
+    views = [
+        View(np.ascontiguousarray(image, np.float32), mask, np.ascontiguousarray(ray[0], np.float32))
+        for image, mask, ray in zip(images, posed.masks, rays, strict=True)
+    ]
+    nothing = no_support(posed.cam2world, _AXES, posed.near, posed.far)
+    support = type(nothing)(**{**vars(nothing), "floor_ceiling": (floor - nothing.origin[1], -math.inf)})
+    return find_floor(views, rays, posed.cam2world, support, MatchingConfig()), rays
+
+
+@pytest.fixture(scope="session")
+def two_coloured(empty_room):
+    """The room with a dappled brown floor and dappled white walls, its clues, and its rays."""
+    posed, floor = empty_room.posed, empty_room.room.high[1]
+    images = []
+    for pose, depth, image in zip(posed.cam2world, empty_room.depths, posed.images, strict=True):
+        rays = main_directions(_AXES, pose[:3, :3], _HEIGHT)[0]
+        on_floor = np.abs(rays * depth + pose[1, 3] - floor) < 1e-3
+        paint = np.where(on_floor[..., None], (0.45, 0.3, 0.15), (0.85, 0.85, 0.85))
+        images.append(paint * (0.8 + 0.4 * image.mean(axis=2, keepdims=True)))
+    clues, rays = _find_clues(posed, np.stack(images).clip(0, 1).astype(np.float32), floor)
+    assert clues is not None
+    return clues, rays

@@ -1,0 +1,196 @@
+"""From surfaces to Gaussians."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from pansplat.evaluation.metrics import psnr
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.geometry.fibonacci import lattice_size
+from pansplat.geometry.pose import interpolate_poses, rotations_from_quats
+from pansplat.rendering import blend, blend_weights, rasterize
+from pansplat.sweep.lift import NUM_LEVELS, LiftConfig, lift
+from pansplat.sweep.search import PosedImages
+from pansplat.sweep.surface import Surface
+
+
+def _exact(observed) -> list[Surface]:
+    return [Surface((1 / d).astype(np.float32), np.zeros(d.shape, np.uint8)) for d in observed.depths]
+
+
+@pytest.fixture(scope="module")
+def furnished(make_room, two_poses, observe):
+    """A box in a room, 64 pixels high, with the sweep's own surfaces."""
+    room = make_room(box=((-0.3, -0.1, 1.0), (0.4, 1.2, 1.7)))
+    return observe(room, two_poses(room), 64, search=True)
+
+
+@pytest.fixture(scope="module")
+def gaussians(furnished) -> Gaussians:
+    return lift(furnished.posed, furnished.surfaces, LiftConfig())
+
+
+def _picture(gaussians: Gaussians, observed, pose: np.ndarray):
+    """What is seen from a pose, the views blended by nearness."""
+    cam2world = torch.from_numpy(observed.posed.cam2world)
+    weights = blend_weights(torch.from_numpy(pose[:3, 3]), cam2world[:, :3, 3])
+    pictures = [
+        rasterize(gaussians.select(gaussians.views == view), torch.from_numpy(pose), size=(64, 128))
+        for view in range(len(cam2world))
+    ]
+    return blend(pictures, weights)
+
+
+def _middle(observed) -> np.ndarray:
+    return interpolate_poses(*torch.from_numpy(observed.posed.cam2world), 0.5).numpy()
+
+
+def test_gaussians_come_by_level_and_then_by_view(gaussians):
+    order = gaussians.levels.long() * 2 + gaussians.views.long()
+    assert (order.diff() >= 0).all()
+    assert order.unique().tolist() == list(range(2 * NUM_LEVELS))
+
+
+def test_gaussians_are_sound(gaussians):
+    for values in dataclasses.astuple(gaussians):
+        assert torch.isfinite(values.double()).all()
+    assert (gaussians.scales > 0).all()
+    assert torch.allclose(gaussians.quats.norm(dim=1), torch.ones(len(gaussians)), atol=1e-5)
+    assert (gaussians.opacities > 0).all() and (gaussians.opacities <= 1).all()
+
+
+def test_no_level_has_more_gaussians_than_its_lattice_has_points(gaussians):
+    for level in range(NUM_LEVELS):
+        for view in (0, 1):
+            count = int(((gaussians.levels == level) & (gaussians.views == view)).sum())
+            assert 0 < count <= lattice_size(128 >> level)
+
+
+def test_discs_lie_on_the_surface(furnished):
+    """Fine means in the room's planes, and the discs' thin axes along the planes' normals."""
+    surfaces = _exact(furnished)
+    fine = lift(furnished.posed, surfaces, LiftConfig())
+    fine = fine.select(fine.levels == 0)
+    points, room = fine.means.numpy(), furnished.room
+    planes = np.concatenate((np.abs(points - room.low), np.abs(points - room.high)), axis=1)
+    on_wall = planes.min(axis=1) < 0.05
+    assert on_wall.mean() > 0.7  # the rest is on the box, or beside a jump
+    axis = planes.argmin(axis=1) % 3
+    thin = rotations_from_quats(fine.quats).numpy()[:, :, 2]
+    lean = np.abs(thin[np.arange(len(axis)), axis])[on_wall]
+    assert np.median(lean) > 0.99
+    assert (lean > 0.9).mean() > 0.8
+
+
+@pytest.mark.parametrize("view", (0, 1))
+def test_the_input_is_seen_from_its_own_position(furnished, gaussians, view):
+    picture = _picture(gaussians, furnished, furnished.posed.cam2world[view])
+    image = torch.from_numpy(furnished.posed.images[view]).permute(2, 0, 1)
+    assert psnr(picture.color, image) > 22.5
+
+
+def test_the_room_is_seen_from_between_the_inputs(furnished, gaussians):
+    pose = _middle(furnished)
+    truth, depth = furnished.room.cast(pose, 64)
+    picture = _picture(gaussians, furnished, pose)
+    assert psnr(picture.color, torch.from_numpy(truth).permute(2, 0, 1)) > 22
+    assert np.median(np.abs(picture.depth.numpy() / depth - 1)) < 0.05
+
+
+@pytest.mark.parametrize("place", (0.0, 0.25, 0.5, 0.75, 1.0))
+def test_nothing_is_empty_on_the_way(furnished, gaussians, place):
+    pose = interpolate_poses(*torch.from_numpy(furnished.posed.cam2world), place).numpy()
+    assert _picture(gaussians, furnished, pose).alpha.min() > 0.9
+
+
+@pytest.mark.parametrize("searched", (True, False))
+def test_no_gaussian_holds_a_camera(furnished, gaussians, searched):
+    """Within 3.33 standard deviations a Gaussian is drawn: from inside it would cover the whole panorama."""
+    if not searched:
+        gaussians = lift(furnished.posed, _exact(furnished), LiftConfig())
+    axes = rotations_from_quats(gaussians.quats).double()
+    for pose in furnished.posed.cam2world:
+        away = torch.from_numpy(pose[:3, 3]) - gaussians.means.double()
+        local = torch.einsum("nij,ni->nj", axes, away) / gaussians.scales.double()
+        assert local.norm(dim=1).min() > 3.33
+
+
+def test_masked_pixels_make_no_gaussians(furnished):
+    masks = furnished.posed.masks.copy()
+    masks[:, -16:] = False  # the nadir, 45 degrees and steeper
+    gaussians = lift(dataclasses.replace(furnished.posed, masks=masks), furnished.surfaces, LiftConfig())
+    for view, pose in enumerate(furnished.posed.cam2world):
+        own = gaussians.means[gaussians.views == view].double().numpy() - pose[:3, 3]
+        steep = np.degrees(np.arcsin(own[:, 1] / np.linalg.norm(own, axis=1)))
+        assert steep.max() < 45.01 and steep.min() < -85
+
+
+def test_a_view_masked_throughout_makes_no_gaussians(furnished):
+    masks = furnished.posed.masks.copy()
+    masks[1] = False
+    gaussians = lift(dataclasses.replace(furnished.posed, masks=masks), furnished.surfaces, LiftConfig())
+    assert (gaussians.views == 0).all() and len(gaussians)
+
+
+def _sphere_around(image: np.ndarray) -> tuple[PosedImages, list[Surface]]:
+    """The same panorama all over a sphere of 3 m, from two coincident cameras."""
+    height = image.shape[0]
+    inverse = np.full((height, 2 * height), 1 / 3, np.float32)
+    masks = np.ones((2, height, 2 * height), bool)
+    posed = PosedImages(np.stack((image, image)), np.stack((np.eye(4), np.eye(4))), masks, 0.5, 8.0)
+    return posed, [Surface(inverse, np.zeros(inverse.shape, np.uint8))] * 2
+
+
+def test_only_detail_makes_fine_gaussians():
+    white = np.ones((64, 128, 3), np.float32)
+    noise = np.random.default_rng(0).random((64, 128, 3)).astype(np.float32)
+    half = np.where(np.arange(128)[None, :, None] < 64, white, noise)
+    fine = [int((lift(*_sphere_around(image), LiftConfig()).levels == 0).sum()) for image in (white, half, noise)]
+    assert fine[0] == 0
+    assert fine[2] == 2 * lattice_size(128)
+    assert 0.5 * fine[2] < fine[1] < 0.6 * fine[2]
+
+
+def test_points_on_a_sphere_are_at_its_radius_on_fibonacci_lattices():
+    gaussians = lift(*_sphere_around(np.ones((64, 128, 3), np.float32)), LiftConfig())
+    radius = gaussians.means.norm(dim=1)
+    for level, depth in ((1, 3.0), (2, 3.0 * LiftConfig().sheet_depth[0]), (3, 3.0 * LiftConfig().sheet_depth[1])):
+        chosen = gaussians.levels == level
+        assert int(chosen.sum()) == 2 * lattice_size(128 >> level)
+        assert torch.allclose(radius[chosen], torch.tensor(depth), rtol=1e-4)
+        size = LiftConfig().footprint * math.sqrt(4 * math.pi / lattice_size(128 >> level)) * depth
+        assert torch.allclose(gaussians.scales[chosen][:, :2], torch.tensor(size), rtol=1e-3)
+
+
+def test_colours_are_those_of_the_picture():
+    color = torch.tensor((0.2, 0.5, 0.9))
+    image = color.numpy() * np.ones((64, 128, 1), np.float32)
+    gaussians = lift(*_sphere_around(image), LiftConfig())
+    assert torch.allclose(0.5 + 0.28209479177387814 * gaussians.harmonics[:, 0], color.expand(len(gaussians), 3))
+
+
+def test_what_another_view_surely_sees_through_is_dropped(make_room, observe, two_poses):
+    room = make_room()
+    observed = observe(room, [*two_poses(room), room.pose((0.1, -0.1, -0.6))], 64)
+    surfaces = _exact(observed)
+    wrong = surfaces[0].inverse_depth.copy()
+    wrong[20:30, 50:70] *= 2.0  # a ghost halfway, that neither of the others sees
+    ghost = lift(observed.posed, [Surface(wrong, surfaces[0].family), *surfaces[1:]], LiftConfig())
+    plain = lift(observed.posed, surfaces, LiftConfig())
+    for level in (0, 1):
+        kept, all_ = (((g.views == 0) & (g.levels == level)) for g in (ghost, plain))
+        walls = np.minimum(
+            np.abs(ghost.means[kept].numpy() - room.low), np.abs(ghost.means[kept].numpy() - room.high)
+        ).min(axis=1)
+        assert (walls < 0.15).mean() > 0.97
+        assert int(all_.sum()) > 0
+
+
+def test_panoramas_taller_than_the_search_are_lifted_at_their_own_height(furnished, make_room, observe, two_poses):
+    tall = observe(furnished.room, two_poses(furnished.room), 128)
+    gaussians = lift(tall.posed, furnished.surfaces, LiftConfig())
+    count = int(((gaussians.levels == 0) & (gaussians.views == 0)).sum())
+    assert lattice_size(128) < count <= lattice_size(256)

@@ -1,0 +1,200 @@
+"""The sweep as a predictor."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.geometry.pose import rotations_from_quats
+from pansplat.sweep import Sweep, SweepConfig
+from pansplat.sweep.lift import LiftConfig
+from pansplat.sweep.search import SearchConfig
+
+
+def _tensors(observed) -> tuple[Tensor, Tensor]:
+    images = torch.from_numpy(observed.posed.images).permute(0, 3, 1, 2)
+    return images, torch.from_numpy(observed.posed.cam2world)
+
+
+def _same(a: Gaussians, b: Gaussians) -> bool:
+    return all(torch.equal(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(Gaussians))
+
+
+@pytest.fixture(scope="module")
+def small(make_room, two_poses, observe):
+    room = make_room()
+    return _tensors(observe(room, two_poses(room), 64))
+
+
+@pytest.fixture(scope="module")
+def predicted(small) -> Gaussians:
+    return Sweep()(*small, 0.5, 8.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    (
+        (lambda images, poses: (images[:1], poses[:1]), "at least two panoramas"),
+        (lambda images, poses: (images[:, :1], poses), r"must be \(view, 3, height, 2 \* height\).*\(2, 1, 64, 128\)"),
+        (lambda images, poses: (images[..., :100], poses), r"2 \* height\).*\(2, 3, 64, 100\)"),
+        (lambda images, poses: (images[0], poses), r"got \(3, 64, 128\)"),
+        (lambda images, poses: (images[:, :, :36, :72], poses), "at least 64 pixels high.*got 36; resize"),
+        (lambda images, poses: (torch.rand(2, 3, 68, 136), poses), "multiple of 8, got 68"),
+        (lambda images, poses: (images, poses[:1]), r"must be \(2, 4, 4\) to fit the images, got \(1, 4, 4\)"),
+        (lambda images, poses: (images, poses[:, :3]), r"must be \(2, 4, 4\)"),
+        (lambda images, poses: (images * math.nan, poses), "must be finite"),
+        (lambda images, poses: (images, poses * math.inf), "must be finite"),
+    ),
+)
+def test_unfit_panoramas_are_refused(small, change, message):
+    with pytest.raises(ValueError, match=message):
+        Sweep()(*change(*small), 0.5, 8.0)
+
+
+@pytest.mark.parametrize(("near", "far"), ((2.0, 2.0), (3.0, 1.0), (0.0, 5.0), (-1.0, 5.0), (1.0, math.inf)))
+def test_an_unfit_depth_range_is_refused(small, near, far):
+    with pytest.raises(ValueError, match="0 < near < far, got"):
+        Sweep()(*small, near, far)
+
+
+def test_masks_of_another_size_are_refused(small):
+    with pytest.raises(ValueError, match=r"`masks` must be \(2, 64, 128\).*got \(2, 32, 64\)"):
+        Sweep()(*small, 0.5, 8.0, masks=torch.ones(2, 32, 64, dtype=torch.bool))
+
+
+def test_two_calls_give_the_same_bits(small, predicted):
+    assert _same(Sweep()(*small, 0.5, 8.0), predicted)
+
+
+def test_a_batch_gives_a_list_of_its_items(small, predicted):
+    images, poses = small
+    batch = Sweep()(
+        torch.stack((images, images.flip(0))), torch.stack((poses, poses.flip(0))), 0.5, torch.tensor((8.0, 6.0))
+    )
+    assert isinstance(batch, list) and len(batch) == 2
+    assert _same(batch[0], predicted)
+    assert _same(batch[1], Sweep()(images.flip(0), poses.flip(0), 0.5, 6.0))
+
+
+def test_depth_ranges_of_each_view_are_searched_together(small, predicted):
+    assert _same(Sweep()(*small, torch.tensor((0.5, 0.7)), torch.tensor((5.0, 8.0))), predicted)
+
+
+def test_full_masks_are_no_masks(small, predicted):
+    assert _same(Sweep()(*small, 0.5, 8.0, masks=torch.ones(2, 64, 128, dtype=torch.bool)), predicted)
+
+
+def test_the_input_is_left_as_it_was(small):
+    images, poses = (t.clone() for t in small)
+    masks = torch.ones(2, 64, 128, dtype=torch.bool)
+    images[0, :, 20:30, 40:60] = 0  # a hole
+    before = images.clone()
+    Sweep()(images, poses, 0.5, 8.0, masks=masks)
+    assert torch.equal(images, before) and torch.equal(poses, small[1]) and masks.all()
+
+
+def test_holes_of_a_scan_show_nothing(small):
+    """A patch of exact black is as good as masked; single black pixels and very dark ones are seen."""
+    holed = small[0].clone()
+    holed[0, :, 20:30, 40:60] = 0
+    masks = torch.ones(2, 64, 128, dtype=torch.bool)
+    masks[0, 18:32, 38:62] = False  # the patch, and what resizing mixes with it
+    assert _same(Sweep()(holed, small[1], 0.5, 8.0), Sweep()(holed, small[1], 0.5, 8.0, masks=masks))
+    dark = small[0].clone()
+    dark[0, :, 20:30, 40:60] = 1e-3
+    dark[0, :, 5, 5] = 0
+    unmasked = dark.clamp_min(1e-4)
+    seen, expected = (len(Sweep()(images, small[1], 0.5, 8.0)) for images in (dark, unmasked))
+    assert seen == pytest.approx(expected, rel=2e-3)  # a masked patch would be 2 % of the panorama
+
+
+def test_predictions_are_plain_float32_without_gradients(small, predicted):
+    images = small[0].double().requires_grad_()
+    from_double = Sweep()(images, small[1].float(), 0.5, 8.0)
+    for gaussians in (predicted, from_double):
+        assert gaussians.means.dtype == torch.float32 and not gaussians.means.requires_grad
+
+
+def test_coincident_cameras_give_finite_gaussians(small):
+    images, poses = small
+    gaussians = Sweep()(images, torch.stack((poses[0], poses[0])), 0.5, 8.0)
+    assert len(gaussians) > 1000
+    for values in dataclasses.astuple(gaussians):
+        assert torch.isfinite(values.double()).all()
+
+
+def test_blank_panoramas_give_finite_gaussians(small):
+    gaussians = Sweep()(torch.ones_like(small[0]), small[1], 0.5, 8.0)
+    assert len(gaussians) > 100
+    for values in dataclasses.astuple(gaussians):
+        assert torch.isfinite(values.double()).all()
+
+
+def test_panoramas_masked_throughout_give_no_gaussians(small):
+    assert len(Sweep()(*small, 0.5, 8.0, masks=torch.zeros(2, 64, 128, dtype=torch.bool))) == 0
+
+
+def test_three_views_make_gaussians_of_three(make_room, two_poses, observe, turn):
+    room = make_room()
+    poses = [*two_poses(room), room.pose((0.1, -0.1, -0.7), turn("y", -60))]
+    gaussians = Sweep()(*_tensors(observe(room, poses, 64)), 0.5, 8.0)
+    assert gaussians.views.unique().tolist() == [0, 1, 2]
+    off = torch.minimum(
+        (gaussians.means - torch.tensor(room.low)).abs(), (gaussians.means - torch.tensor(room.high)).abs()
+    ).amin(dim=1)
+    fine = gaussians.levels == 0
+    assert off[fine].median() < 0.05
+
+
+def test_moving_the_world_moves_the_gaussians(small, predicted, turn):
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3] = torch.from_numpy(turn("y", 90.0).round())  # exact, so that only the placing can differ
+    motion[:3, 3] = torch.tensor((8.0, -4.0, 2.0))
+    moved = Sweep()(small[0], motion @ small[1], 0.5, 8.0)
+    assert len(moved) == len(predicted)
+    assert torch.equal(moved.levels, predicted.levels) and torch.equal(moved.views, predicted.views)
+    expected = predicted.means.double() @ motion[:3, :3].T + motion[:3, 3]
+    assert torch.allclose(moved.means.double(), expected, atol=1e-4)
+    assert torch.allclose(moved.scales, predicted.scales, rtol=1e-4)
+    turned = motion[:3, :3].float() @ rotations_from_quats(predicted.quats)
+    assert torch.allclose(rotations_from_quats(moved.quats), turned, atol=1e-4)
+
+
+def test_swapping_the_views_swaps_their_labels(small, predicted):
+    swapped = Sweep()(small[0].flip(0), small[1].flip(0), 0.5, 8.0)
+    for view in (0, 1):
+        before, after = predicted.select(predicted.views == view), swapped.select(swapped.views == 1 - view)
+        assert len(after) == pytest.approx(len(before), rel=0.05)
+        distance = torch.cdist(after.means[::16], before.means).amin(dim=1)
+        assert distance.median() < 0.03  # the two views' lattices lie about 0.1 m apart
+
+
+def test_progress_runs_from_zero_to_one(small):
+    told: list[tuple[str, float]] = []
+    Sweep()(*small, 0.5, 8.0, progress=lambda what, fraction: told.append((what, fraction)))
+    fractions = [fraction for _, fraction in told]
+    assert fractions == sorted(fractions) and fractions[0] == 0 and fractions[-1] == 1
+    assert len(told) >= 4 and all(what for what, _ in told)
+
+
+def test_the_fingerprint_tells_settings_apart():
+    assert Sweep().fingerprint == Sweep(SweepConfig()).fingerprint
+    others = [
+        SweepConfig(lift=LiftConfig(footprint=0.71)),
+        SweepConfig(search=SearchConfig(coarse_passes=1)),
+        SweepConfig(search=dataclasses.replace(SearchConfig(), matching=dataclasses.replace(
+            SearchConfig().matching, window=3))),
+    ]  # fmt: skip
+    assert len({Sweep().fingerprint, *(Sweep(config).fingerprint for config in others)}) == 4
+    assert Sweep().name == "sweep" and Sweep().fingerprint.startswith("sweep-")
+
+
+def test_the_settings_change_what_is_predicted(small, predicted):
+    assert np.isclose(predicted.scales.max(), predicted.scales.max())
+    smaller = Sweep(SweepConfig(lift=LiftConfig(footprint=0.35)))(*small, 0.5, 8.0)
+    sphere = predicted.scales[:, 1].median() / smaller.scales[:, 1].median()
+    assert float(sphere) == pytest.approx(2.0, rel=0.05)

@@ -1,0 +1,121 @@
+"""Surfaces, and what the views say of each other's."""
+
+import numpy as np
+import pytest
+
+from pansplat.sweep.sphere import ray_grid, resize_sphere
+from pansplat.sweep.surface import (
+    AGREES,
+    HIDDEN,
+    SEEN_THROUGH,
+    Surface,
+    agreement,
+    guided_upsample,
+    relation,
+    world_points,
+)
+
+
+def _surface(inverse: np.ndarray) -> Surface:
+    return Surface(inverse.astype(np.float32), np.zeros(inverse.shape, np.uint8))
+
+
+def _sphere(radius: float, height: int = 32) -> Surface:
+    return _surface(np.full((height, 2 * height), 1 / radius))
+
+
+def test_points_before_on_and_behind_a_surface_are_told_apart(turn):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn("y", 50) @ turn("x", 20), (3, -1, 2)
+    directions = ray_grid(8).reshape(-1, 3).astype(np.float64)
+    for distance, said in ((1.0, SEEN_THROUGH), (1.96, AGREES), (2.0, AGREES), (2.04, AGREES), (4.0, HIDDEN)):
+        result, ratio = relation(pose[:3, 3] + distance * directions, _sphere(2.0), pose, 0.06)
+        assert (result == said).all()
+        assert np.allclose(ratio, 2.0 / distance, rtol=1e-6)
+
+
+def test_a_point_is_compared_with_the_surface_in_its_own_direction():
+    inverse = np.full((32, 64), 0.5)
+    inverse[:, 32:] = 0.25  # right half: 4 m
+    points = np.array(((3.0, 0, 0), (-3.0, 0, 0)))
+    assert relation(points, _surface(inverse), np.eye(4), 0.06)[0].tolist() == [SEEN_THROUGH, HIDDEN]
+
+
+def test_a_point_at_the_camera_is_seen_through():
+    said, ratio = relation(np.zeros((1, 3)), _sphere(2.0), np.eye(4), 0.06)
+    assert said.tolist() == [SEEN_THROUGH] and np.isfinite(ratio).all()
+
+
+def test_world_points_are_where_the_rays_end(empty_room):
+    room = empty_room.room
+    for pose, depth in zip(empty_room.posed.cam2world, empty_room.depths, strict=True):
+        points = world_points(_surface(1 / depth), pose)
+        off = np.minimum(np.abs(points - room.low), np.abs(points - room.high)).min(axis=-1)
+        assert off.max() < 1e-5
+
+
+def test_exact_surfaces_agree_everywhere_in_an_empty_room(empty_room):
+    surfaces = [_surface(1 / depth) for depth in empty_room.depths]
+    for view in (0, 1):
+        assert agreement(surfaces, empty_room.posed.cam2world, view).mean() > 0.995
+
+
+def test_exact_surfaces_disagree_only_where_the_box_hides(furnished_room):
+    """The views' hidden shares belong to the same box: similar, small and not nothing."""
+    surfaces = [_surface(1 / depth) for depth in furnished_room.depths]
+    shares = [1 - agreement(surfaces, furnished_room.posed.cam2world, view).mean() for view in (0, 1)]
+    assert all(0.005 < share < 0.15 for share in shares)
+
+
+def test_agreement_is_symmetrical_in_the_order_of_the_views(furnished_room):
+    surfaces, poses = [_surface(1 / depth) for depth in furnished_room.depths], furnished_room.posed.cam2world
+    for view in (0, 1):
+        assert np.array_equal(agreement(surfaces, poses, view), agreement(surfaces[::-1], poses[::-1], 1 - view))
+
+
+def test_nothing_agrees_with_a_surface_far_off(empty_room):
+    surfaces = [_surface(1 / empty_room.depths[0]), _surface(2.5 / empty_room.depths[1])]
+    assert agreement(surfaces, empty_room.posed.cam2world, 0).mean() < 0.1
+
+
+def _smooth(height: int) -> np.ndarray:
+    rays = ray_grid(height)
+    return 0.5 + 0.07 * rays[..., 0] - 0.05 * rays[..., 1] + 0.04 * rays[..., 2] * rays[..., 0]
+
+
+@pytest.mark.parametrize("textured", (True, False))
+def test_a_smooth_surface_is_interpolated_within_a_percent(empty_room, textured):
+    fine = empty_room.posed.images[0] if textured else np.full((96, 192, 3), 0.5, np.float32)
+    large = guided_upsample(_surface(_smooth(48)), resize_sphere(fine, 48), fine)
+    assert np.abs(large.inverse_depth / _smooth(96) - 1).max() < 0.01
+
+
+@pytest.mark.parametrize("edge", (96, 101))
+def test_a_jump_stays_sharp_along_an_edge_of_the_picture(edge):
+    """Also when the edge lies within a coarse pixel (101 is odd)."""
+    fine = np.full((96, 192, 3), 0.2, np.float32)
+    fine[:, edge:] = 0.8
+    inverse = np.full((48, 96), 1.0)
+    inverse[:, (edge + 1) // 2 :] = 0.4
+    large = guided_upsample(_surface(inverse), resize_sphere(fine, 48), fine).inverse_depth
+    assert np.array_equal(large, np.where(np.arange(192) < edge, 1.0, 0.4).astype(np.float32) * np.ones((96, 1)))
+
+
+def test_upsampling_knows_no_left_and_right_edge(empty_room):
+    fine, coarse = empty_room.posed.images[0], resize_sphere(empty_room.posed.images[0], 48)
+    surface = _surface(1 / resize_sphere(empty_room.depths[0].astype(np.float32), 48))
+    plain = guided_upsample(surface, coarse, fine).inverse_depth
+    rolled = guided_upsample(
+        _surface(np.roll(surface.inverse_depth, 10, axis=1)), np.roll(coarse, 10, axis=1), np.roll(fine, 20, axis=1)
+    ).inverse_depth
+    assert np.allclose(np.roll(rolled, -20, axis=1), plain, rtol=1e-5)
+
+
+def test_upsampled_families_are_those_of_the_surface():
+    family = np.zeros((16, 32), np.uint8)
+    family[:, 16:] = 2
+    fine = np.full((32, 64, 3), 0.5, np.float32)
+    inverse = np.where(family > 0, 0.4, 1.0).astype(np.float32)
+    large = guided_upsample(Surface(inverse, family), resize_sphere(fine, 16), fine)
+    assert large.family.shape == (32, 64) and set(np.unique(large.family)) == {0, 2}
+    assert ((large.family == 2) == (large.inverse_depth < 0.7)).all()
