@@ -105,9 +105,9 @@ def wake(case: Case) -> None:
 def forget(backend: str) -> None:
     """Let go of memory that a backend keeps for its next picture, so that what one takes can be measured."""
     if backend == "numba":
-        from pansplat.rendering.cpu.memory import forget_idle
+        from pansplat.rendering.cpu.runtime import release_idle_memory
 
-        forget_idle()
+        release_idle_memory()
 
 
 def _speck() -> Gaussians:

@@ -30,7 +30,7 @@ from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.model.heads import whole
 from pansplat.model.pansplat import PanSplat
-from pansplat.rendering.cpu.memory import forget_idle
+from pansplat.rendering.cpu.runtime import release_idle_memory
 from pansplat.training.config import MemoryConfig, NetworkShape, Style
 from pansplat.training.drawing import Drawing
 from pansplat.training.losses import LossWeights
@@ -256,7 +256,7 @@ def _run(job: Path) -> None:
     worker.work(painted_sphere(_WARM_HEIGHT).to(device))  # compiles and loads what will be needed
     batch = painted_sphere(case.height).to(device)
     gc.collect()
-    forget_idle()
+    release_idle_memory()
     reset_resident_peak()
     base = torch.cuda.memory_allocated(device) if device.type == "cuda" else resident()
     more, (took, (count, result)) = peak_memory(lambda: seconds(lambda: worker.work(batch), device), device)

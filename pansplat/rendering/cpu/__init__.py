@@ -3,6 +3,6 @@
 Source: docs/rendering.md; docs/rasterizer.md tells how it works.
 """
 
-from pansplat.rendering.cpu.draw import draw
+from pansplat.rendering.cpu.backend import draw
 
 __all__ = ["draw"]

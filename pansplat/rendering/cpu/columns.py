@@ -1,11 +1,11 @@
 """Rows of eight numbers turned into columns and back: one Gaussian a row in memory, one number a row in arithmetic."""
 
-from pansplat.rendering.cpu.compiling import inlined
-from pansplat.rendering.cpu.records import FIELDS
+from pansplat.rendering.cpu.records import RECORD_SIZE
+from pansplat.rendering.cpu.runtime import inline_kernel
 from pansplat.rendering.cpu.simd import LANES, load, store, store_past_cache, transposed
 
 
-@inlined
+@inline_kernel
 def columns_of(numbers, r0, r1, r2, r3, r4, r5, r6, r7):  # type: ignore[no-untyped-def]
     """The columns of eight rows of eight numbers, given where the rows begin."""
     return transposed(
@@ -20,7 +20,7 @@ def columns_of(numbers, r0, r1, r2, r3, r4, r5, r6, r7):  # type: ignore[no-unty
     )
 
 
-@inlined
+@inline_kernel
 def read_columns(records, start, count, columns, lanes):  # type: ignore[no-untyped-def]
     """Turn `count` records into rows of `lanes` numbers, one a field; past `count` the last is repeated.
 
@@ -32,11 +32,11 @@ def read_columns(records, start, count, columns, lanes):  # type: ignore[no-unty
     last = start + count - 1
     for at in range(0, count, LANES):
         g = start + at
-        r0, r1 = FIELDS * g, FIELDS * min(g + 1, last)
-        r2, r3 = FIELDS * min(g + 2, last), FIELDS * min(g + 3, last)
-        r4, r5 = FIELDS * min(g + 4, last), FIELDS * min(g + 5, last)
-        r6, r7 = FIELDS * min(g + 6, last), FIELDS * min(g + 7, last)
-        for half in range(0, FIELDS, LANES):
+        r0, r1 = RECORD_SIZE * g, RECORD_SIZE * min(g + 1, last)
+        r2, r3 = RECORD_SIZE * min(g + 2, last), RECORD_SIZE * min(g + 3, last)
+        r4, r5 = RECORD_SIZE * min(g + 4, last), RECORD_SIZE * min(g + 5, last)
+        r6, r7 = RECORD_SIZE * min(g + 6, last), RECORD_SIZE * min(g + 7, last)
+        for half in range(0, RECORD_SIZE, LANES):
             found = columns_of(
                 records, r0 + half, r1 + half, r2 + half, r3 + half, r4 + half, r5 + half, r6 + half, r7 + half
             )
@@ -44,7 +44,7 @@ def read_columns(records, start, count, columns, lanes):  # type: ignore[no-unty
                 store(columns, (half + field) * lanes + at, found[field])
 
 
-@inlined
+@inline_kernel
 def write_columns(columns, lanes, start, count, records):  # type: ignore[no-untyped-def]
     """Turn rows of `lanes` numbers, one a field, into `count` records from `start` on.
 
@@ -64,9 +64,9 @@ def write_columns(columns, lanes, start, count, records):  # type: ignore[no-unt
             c + 7 * lanes,
         )  # fmt: skip
         for place in range(LANES):
-            row = FIELDS * (start + at + place)
+            row = RECORD_SIZE * (start + at + place)
             store_past_cache(records, row, first[place])
             store_past_cache(records, row + LANES, second[place])
     for at in range(whole, count):
-        for field in range(FIELDS):
-            records[FIELDS * (start + at) + field] = columns[field * lanes + at]
+        for field in range(RECORD_SIZE):
+            records[RECORD_SIZE * (start + at) + field] = columns[field * lanes + at]

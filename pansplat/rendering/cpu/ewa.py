@@ -9,10 +9,7 @@ import math
 import numpy as np
 
 from pansplat.rendering.cpu import records as layout
-from pansplat.rendering.cpu.boxes import round_boxes
-from pansplat.rendering.cpu.compiling import inlined, kernel
 from pansplat.rendering.cpu.forms import dot
-from pansplat.rendering.cpu.memory import Lease
 from pansplat.rendering.cpu.observe import (
     CULLED,
     LANES,
@@ -25,7 +22,8 @@ from pansplat.rendering.cpu.observe import (
     frame_and_shape,
     read_block,
 )
-from pansplat.rendering.cpu.threads import share
+from pansplat.rendering.cpu.runtime import Workspace, inline_kernel, kernel, parallel_for
+from pansplat.rendering.cpu.tiling import round_boxes
 from pansplat.rendering.panorama import Picture
 
 TOTALS = 10  # numbers that a picture passes back: gradients of n (world axes), of C (xx xy xz yy yz zz), of the level
@@ -43,7 +41,7 @@ OUT = ROWS + 17  # what is passed back
 ALL_ROWS = OUT + TOTALS
 
 
-@inlined
+@inline_kernel
 def _turn(turn, vector):
     """A vector from the world's axes to the picture's."""
     x, y, z = vector
@@ -54,7 +52,7 @@ def _turn(turn, vector):
     )
 
 
-@inlined
+@inline_kernel
 def _turn_back(turn, vector):
     """A vector from the picture's axes to the world's."""
     x, y, z = vector
@@ -65,7 +63,7 @@ def _turn_back(turn, vector):
     )
 
 
-@inlined
+@inline_kernel
 def _jacobian(n, height, width, focal):
     """Tangents, clamped tangents and scale of J at a direction with n_z > 0."""
     inverse = 1 / n[2]
@@ -80,14 +78,14 @@ def _jacobian(n, height, width, focal):
     )
 
 
-@inlined
+@inline_kernel
 def _image(jacobian, vector):
     """J times a vector."""
     _, _, clamped_x, clamped_y, scale = jacobian
     return scale * (vector[0] - clamped_x * vector[2]), scale * (vector[1] - clamped_y * vector[2])
 
 
-@inlined
+@inline_kernel
 def _weighted(shape, spread, on_u, on_v, on_n):
     """A row of J F times S', the filtered shape."""
     uu, uv, vv, un, vn, nn = shape[0] + spread, shape[1], shape[2] + spread, shape[3], shape[4], shape[5]
@@ -98,7 +96,7 @@ def _weighted(shape, spread, on_u, on_v, on_n):
     )
 
 
-@inlined
+@inline_kernel
 def _projected(rows, i, turn, height, width, focal, spread):
     """The frame on the picture's axes, J, its rows times F and times F S', and V before it is dilated."""
     u, v, n, shape = frame_and_shape(rows, i)
@@ -111,7 +109,7 @@ def _projected(rows, i, turn, height, width, focal, spread):
     return (u, v, n), jacobian, on_n, x_weighted, y_weighted, spread_out
 
 
-@inlined
+@inline_kernel
 def _in_front(records, radii, turn, start, count, z_near, rows):
     """Note the levels, `CULLED` for Gaussians behind; return how many may be seen."""
     seen = 0
@@ -123,8 +121,8 @@ def _in_front(records, radii, turn, start, count, z_near, rows):
         z = (np.float64(records[g, 0]) + np.float64(records[g, 3])) * turn[0, 2]
         z += (np.float64(records[g, 1]) + np.float64(records[g, 4])) * turn[1, 2]
         z += (np.float64(records[g, 2]) + np.float64(records[g, 5])) * turn[2, 2]
-        front = (z * radii[g] > z_near) & (records[g, layout.LEVEL] > CULLED)
-        rows[LEVEL, i] = records[g, layout.LEVEL] if front else CULLED
+        front = (z * radii[g] > z_near) & (records[g, layout.LOG2_PEAK] > CULLED)
+        rows[LEVEL, i] = records[g, layout.LOG2_PEAK] if front else CULLED
         seen += front
     return seen
 
@@ -135,7 +133,7 @@ def _project(
     records, radii, rotation, turn, height, width, focal, dilation, z_near, projected, words, boxes,
 ):  # fmt: skip
     rows = np.ones((ALL_ROWS, LANES))
-    unit = math.sqrt(layout.UNIT)
+    unit = math.sqrt(layout.HALF_LOG2_E)
     for start in range(piece * PIECE, min((piece + 1) * PIECE, records.shape[0]), LANES):
         count = min(LANES, records.shape[0] - start)
         if _in_front(records, radii, rotation, start, count, z_near, rows) == 0:
@@ -146,7 +144,7 @@ def _project(
         find_shapes(covariances, pose, near, rows)
         for i in range(LANES):
             _, jacobian, _, _, _, v = _projected(rows, i, turn, height, width, focal, spread)
-            kappa = (rows[LEVEL, i] + _LOG_CUT) / layout.UNIT + _SLACK
+            kappa = (rows[LEVEL, i] + _LOG_CUT) / layout.HALF_LOG2_E + _SLACK
             v_xx, v_yy = v[0] + dilation, v[2] + dilation
             first, m = 1 / math.sqrt(v_xx), -v[1] / v_xx
             second = 1 / math.sqrt(max(v_yy + m * v[1], _NARROWEST))
@@ -160,22 +158,22 @@ def _project(
         _write_projected(rows, start, count, boxes, projected)
 
 
-@inlined
+@inline_kernel
 def _write_projected(rows, start, count, boxes, projected):
     for i in range(count):
         g = start + i
         if boxes[g, 3] < boxes[g, 2]:
             continue
-        for j in range(layout.FIELDS):
+        for j in range(layout.RECORD_SIZE):
             projected[g, j] = 0
         for axis in range(2):
             head = np.float32(rows[POINT + axis, i])
             projected[g, layout.DIRECTION + axis] = head
-            projected[g, layout.REST + axis] = np.float32(rows[POINT + axis, i] - np.float64(head))
-        projected[g, layout.FIRST] = np.float32(rows[POINT + 2, i])
-        projected[g, layout.SECOND] = np.float32(rows[POINT + 3, i])
-        projected[g, layout.SECOND + 1] = np.float32(rows[POINT + 4, i])
-        projected[g, layout.LEVEL] = np.float32(rows[LEVEL, i])
+            projected[g, layout.DIRECTION_RESIDUAL + axis] = np.float32(rows[POINT + axis, i] - np.float64(head))
+        projected[g, layout.ROW_A] = np.float32(rows[POINT + 2, i])
+        projected[g, layout.ROW_B] = np.float32(rows[POINT + 3, i])
+        projected[g, layout.ROW_B + 1] = np.float32(rows[POINT + 4, i])
+        projected[g, layout.LOG2_PEAK] = np.float32(rows[LEVEL, i])
 
 
 def project(
@@ -185,7 +183,7 @@ def project(
     picture: Picture,
     dilation: float,
     z_near: float,
-    lease: Lease,
+    workspace: Workspace,
     threads: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Records of a pinhole picture, where there is a box, and the boxes.
@@ -196,11 +194,11 @@ def project(
         picture: pinhole.
         dilation: variance added on both axes, pixels^2.
         z_near: Gaussians with a smaller depth in the picture are left out, metres.
-        lease: for the arrays returned.
+        workspace: for the arrays returned.
         threads: to work on.
     """
     num = len(observed.records)
-    projected, words = lease.array((num, layout.FIELDS), np.float32), lease.array((num, 2), np.int32)
+    projected, words = workspace.array((num, layout.RECORD_SIZE), np.float32), workspace.array((num, 2), np.int32)
     rotation, turn = _axes(camera, picture)
 
     def work(piece: int) -> None:
@@ -209,7 +207,7 @@ def project(
             picture.focal, dilation, z_near, projected, words, words.view(np.int16),
         )  # fmt: skip
 
-    share(work, -(-num // PIECE), threads)
+    parallel_for(work, -(-num // PIECE), threads)
     return projected, words.view(np.int16)
 
 
@@ -219,11 +217,11 @@ def _axes(camera: Camera, picture: Picture) -> tuple[np.ndarray, np.ndarray]:
     return rotation, np.ascontiguousarray(camera.pose[:3, :3] @ rotation)
 
 
-@inlined
+@inline_kernel
 def _read_given(grads, offsets, start, count, rows):
     """Sum each Gaussian's slots; return how many Gaussians of the block have any."""
     some = 0
-    unit = math.sqrt(layout.UNIT)
+    unit = math.sqrt(layout.HALF_LOG2_E)
     for i in range(LANES):
         for j in range(6):
             rows[GIVEN + j, i] = 0.0
@@ -233,14 +231,14 @@ def _read_given(grads, offsets, start, count, rows):
         for slot in range(offsets[g], offsets[g + 1]):
             rows[GIVEN, i] += grads[slot, layout.DIRECTION]
             rows[GIVEN + 1, i] += grads[slot, layout.DIRECTION + 1]
-            rows[GIVEN + 2, i] += unit * grads[slot, layout.FIRST]
-            rows[GIVEN + 3, i] += unit * grads[slot, layout.SECOND]
-            rows[GIVEN + 4, i] += unit * grads[slot, layout.SECOND + 1]
-            rows[GIVEN + 5, i] += grads[slot, layout.LEVEL]
+            rows[GIVEN + 2, i] += unit * grads[slot, layout.ROW_A]
+            rows[GIVEN + 3, i] += unit * grads[slot, layout.ROW_B]
+            rows[GIVEN + 4, i] += unit * grads[slot, layout.ROW_B + 1]
+            rows[GIVEN + 5, i] += grads[slot, layout.LOG2_PEAK]
     return some
 
 
-@inlined
+@inline_kernel
 def _splats_backward(rows, turn, height, width, focal, spread, dilation):
     """Gradients of n and C, world axes, from those of point and forms."""
     for i in range(LANES):
@@ -336,4 +334,4 @@ def project_backward(
             piece, *fields.given, *camera, turn, *picture.size, picture.focal, dilation, grads, offsets, totals
         )
 
-    share(work, -(-len(fields.means) // PIECE), threads)
+    parallel_for(work, -(-len(fields.means) // PIECE), threads)

@@ -11,7 +11,7 @@ covariance in the tangent frame u, v, n together with the minors that float arit
 
 import math
 
-from pansplat.rendering.cpu.compiling import inlined
+from pansplat.rendering.cpu.runtime import inline_kernel
 from pansplat.rendering.cpu.wide import either, fill_wide
 
 LEAST_RATIO = 1e-12  # of det B to det B': below it the compensated opacity never reaches the alpha cut
@@ -19,19 +19,19 @@ _NEGATIVE = 1e-3  # smallest eigenvalue over the largest variance that rounding 
 LARGEST_RATIO = 1e12  # of scale to distance
 
 
-@inlined
+@inline_kernel
 def dot(ax, ay, az, bx, by, bz):
     """a . b"""
     return ax * bx + ay * by + az * bz
 
 
-@inlined
+@inline_kernel
 def cross(ax, ay, az, bx, by, bz):
     """a ^ b"""
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
-@inlined
+@inline_kernel
 def tangent_frame(x, y, z):
     """Two unit vectors u, v that make a right-handed frame with the unit direction.
 
@@ -43,7 +43,7 @@ def tangent_frame(x, y, z):
     return 1 + c * x * a, sign * b, -c, b, sign + y * y * a, -y
 
 
-@inlined
+@inline_kernel
 def rotation(w, x, y, z):
     """Rows of the rotation matrix of a quaternion of any length, and one over its square; zero is the identity."""
     norm2 = w * w + x * x + y * y + z * z
@@ -58,7 +58,7 @@ def rotation(w, x, y, z):
     )  # fmt: skip
 
 
-@inlined
+@inline_kernel
 def shape_of_axes(u, n, e0, e1, e2, s0, s1, s2):
     """A shape from unit axes e_k, right-handed, and squares of scales over distance.
 
@@ -81,7 +81,7 @@ def shape_of_axes(u, n, e0, e1, e2, s0, s1, s2):
     )
 
 
-@inlined
+@inline_kernel
 def shape_of_covariance(u, v, n, xx, xy, xz, yy, yz, zz):
     """A shape from a covariance over squared distance; minors that rounding made negative count as zero."""
     cu = xx * u[0] + xy * u[1] + xz * u[2], xy * u[0] + yy * u[1] + yz * u[2], xz * u[0] + yz * u[1] + zz * u[2]
@@ -94,7 +94,7 @@ def shape_of_covariance(u, v, n, xx, xy, xz, yy, yz, zz):
     return uu, uv, vv, un, vn, nn, max(uu * vv - uv * uv, 0.0), max(mixed, 0.0), max(det, 0.0)
 
 
-@inlined
+@inline_kernel
 def is_covariance(xx, xy, xz, yy, yz, zz):
     """Whether a symmetric matrix over squared distance has no eigenvalue below what rounding explains."""
     largest = max(max(xx, yy), zz)
@@ -107,7 +107,7 @@ def is_covariance(xx, xy, xz, yy, yz, zz):
     return small & (largest >= 0) & (xx >= 0) & (minor >= 0) & (det >= 0)
 
 
-@inlined
+@inline_kernel
 def whitening(shape, spread):
     """How tangent axes are whitened, the front form's share of each, S', det B' and one over it."""
     _, uv, _, un, vn, nn, det_across, mixed, det = shape
@@ -120,7 +120,7 @@ def whitening(shape, spread):
     return (first, mix, second), -un * first, (mix * un - vn) * second, along, det_filtered, inverse
 
 
-@inlined
+@inline_kernel
 def whitened(u, v, first, mix, second):
     """The whitened axes a and b."""
     a = u[0] * first, u[1] * first, u[2] * first

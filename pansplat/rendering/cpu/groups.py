@@ -11,7 +11,7 @@ from llvmlite import ir
 from numba.core import types
 from numba.core.cgutils import unpack_tuple
 
-from pansplat.rendering.cpu.compiling import inlined
+from pansplat.rendering.cpu.runtime import inline_kernel
 from pansplat.rendering.cpu.simd import LANES, element, emitted, lanes, load, prefetch, put, store
 
 _FLOATS, _DOUBLES = (ir.VectorType(kind, LANES) for kind in (ir.FloatType(), ir.DoubleType()))
@@ -132,7 +132,7 @@ def _pointer(context: Any, builder: Any, sig: Any, args: Any, kind: Any) -> Any:
     return builder.bitcast(builder.gep(array.data, [args[1]]), kind.as_pointer())
 
 
-@inlined
+@inline_kernel
 def quarters(numbers, first):
     """Eight groups of four from `first` on: the first of each group, the second, and so on."""
     return apart(
@@ -145,7 +145,7 @@ def quarters(numbers, first):
     )
 
 
-@inlined
+@inline_kernel
 def read_ones(numbers, start, count, rows, row, largest):
     """Turn `count` numbers from `start` on into a row; `numbers` is flat. Return the largest sizes, see `larger`."""
     flat, width, whole = rows.reshape(-1), rows.shape[1], count // LANES * LANES
@@ -158,7 +158,7 @@ def read_ones(numbers, start, count, rows, row, largest):
     return largest
 
 
-@inlined
+@inline_kernel
 def read_threes(numbers, start, count, rows, row, largest):
     """Turn groups of three into three rows from `row` on, likewise."""
     flat, width, whole = rows.reshape(-1), rows.shape[1], count // LANES * LANES
@@ -176,7 +176,7 @@ def read_threes(numbers, start, count, rows, row, largest):
     return largest
 
 
-@inlined
+@inline_kernel
 def read_fours(numbers, start, count, rows, row, largest):
     """Turn groups of four into rows, likewise."""
     flat, width, whole = rows.reshape(-1), rows.shape[1], count // LANES * LANES
@@ -196,14 +196,14 @@ def read_fours(numbers, start, count, rows, row, largest):
     return largest
 
 
-@inlined
+@inline_kernel
 def _read_rest(numbers, size, start, whole, count, flat, width, row):
     for i in range(whole, count):
         for j in range(size):
             put(flat, (row + j) * width + i, np.float64(element(numbers, size * (start + i) + j)))
 
 
-@inlined
+@inline_kernel
 def write_ones(rows, row, start, count, numbers):
     """Turn a row into `count` numbers from `start` on, rounded; `numbers` is flat."""
     flat, width, whole = rows.reshape(-1), rows.shape[1], count // LANES * LANES
@@ -212,7 +212,7 @@ def write_ones(rows, row, start, count, numbers):
     _write_rest(flat, width, row, 1, start, whole, count, numbers)
 
 
-@inlined
+@inline_kernel
 def write_threes(rows, row, start, count, numbers):
     """Turn three rows from `row` on into groups of three, likewise."""
     flat, width, whole = rows.reshape(-1), rows.shape[1], count // LANES * LANES
@@ -227,7 +227,7 @@ def write_threes(rows, row, start, count, numbers):
     _write_rest(flat, width, row, 3, start, whole, count, numbers)
 
 
-@inlined
+@inline_kernel
 def write_fours(rows, row, start, count, numbers):
     """Turn four rows into groups, likewise."""
     flat, width, whole = rows.reshape(-1), rows.shape[1], count // LANES * LANES
@@ -248,7 +248,7 @@ def write_fours(rows, row, start, count, numbers):
     _write_rest(flat, width, row, 4, start, whole, count, numbers)
 
 
-@inlined
+@inline_kernel
 def _write_rest(flat, width, row, size, start, whole, count, numbers):
     for i in range(whole, count):
         for j in range(size):

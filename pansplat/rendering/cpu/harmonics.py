@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 
-from pansplat.rendering.cpu.compiling import inlined
 from pansplat.rendering.cpu.groups import apart, quarters, together
+from pansplat.rendering.cpu.runtime import inline_kernel
 from pansplat.rendering.cpu.simd import LANES, choose, element, fill, load, maximum, multiply_add, store
 from pansplat.rendering.cpu.wide import get, rounded
 
@@ -23,7 +23,7 @@ _C4C, _C4D = 0.75 * math.sqrt(17.5 / math.pi), 0.75 * math.sqrt(35 / math.pi)
 _C4_ZONAL = 0.1875 / math.sqrt(math.pi)
 
 
-@inlined
+@inline_kernel
 def fill_basis(rows, x_row, num, bends, basis):
     """Write the `num` harmonics of the directions in three rows from `x_row` on, a row each.
 
@@ -36,7 +36,7 @@ def fill_basis(rows, x_row, num, bends, basis):
         _fill_others(rows, x_row, num, basis)
 
 
-@inlined
+@inline_kernel
 def _fill_others(rows, x_row, num, basis):
     lanes = basis.shape[1]
     if num >= 4:
@@ -71,7 +71,7 @@ def _fill_others(rows, x_row, num, basis):
             basis[20, i] = _C4_ZONAL * (zz * (35 * zz - 30) + 3)
 
 
-@inlined
+@inline_kernel
 def add_slopes(rows, x_row, num, bends, slopes, g_row):
     """Add to three rows from `g_row` on the gradient to the direction, given that to each harmonic in `slopes`.
 
@@ -84,7 +84,7 @@ def add_slopes(rows, x_row, num, bends, slopes, g_row):
         _add_others(rows, x_row, num, slopes, g_row)
 
 
-@inlined
+@inline_kernel
 def _add_others(rows, x_row, num, slopes, g_row):
     lanes = slopes.shape[1]
     if num >= 4:
@@ -105,7 +105,7 @@ def _add_others(rows, x_row, num, slopes, g_row):
         _add_quartic_slopes(rows, x_row, slopes, g_row)
 
 
-@inlined
+@inline_kernel
 def _add_cubic_slopes(rows, x_row, slopes, g_row):
     for i in range(slopes.shape[1]):
         x, y, z = rows[x_row, i], rows[x_row + 1, i], rows[x_row + 2, i]
@@ -128,7 +128,7 @@ def _add_cubic_slopes(rows, x_row, slopes, g_row):
         )  # fmt: skip
 
 
-@inlined
+@inline_kernel
 def _add_quartic_slopes(rows, x_row, slopes, g_row):
     for i in range(slopes.shape[1]):
         x, y, z = rows[x_row, i], rows[x_row + 1, i], rows[x_row + 2, i]
@@ -153,7 +153,7 @@ def _add_quartic_slopes(rows, x_row, slopes, g_row):
         )  # fmt: skip
 
 
-@inlined
+@inline_kernel
 def colours(harmonics, start, count, basis, bends, rows, radius_row, values):
     """Write max(0, 0.5 + sum_k Y_k c_k) of `count` Gaussians from `start` on into values, and after it the radius.
 
@@ -179,7 +179,7 @@ def colours(harmonics, start, count, basis, bends, rows, radius_row, values):
         values[g, channels] = rows[radius_row, i]
 
 
-@inlined
+@inline_kernel
 def _three_constants(harmonics, start, count, rows, radius_row, values):
     """If there are three channels: those Gaussians that make up whole vectors. Return how many are done."""
     if harmonics.shape[2] != 3:
@@ -200,7 +200,7 @@ def _three_constants(harmonics, start, count, rows, radius_row, values):
     return whole
 
 
-@inlined
+@inline_kernel
 def _three_colours(harmonics, start, count, basis, rows, radius_row, values):
     """If there are three channels: all. Return how many are done."""
     if harmonics.shape[2] != 3:
@@ -219,7 +219,7 @@ def _three_colours(harmonics, start, count, basis, rows, radius_row, values):
     return count
 
 
-@inlined
+@inline_kernel
 def colour_gradients(harmonics, start, drawn, basis, values, grads, grad_harmonics, slopes):
     """From gradients of colours, a row each, to those of coefficients (if asked for) and of each harmonic.
 
@@ -252,7 +252,7 @@ def colour_gradients(harmonics, start, drawn, basis, values, grads, grad_harmoni
             slopes[k, i] = total
 
 
-@inlined
+@inline_kernel
 def constant_colour_gradients(harmonics, start, count, values, value_sums, colour_grads, grad_harmonics):
     """From gradients of colours to those of coefficients of the first harmonic alone, if asked for.
 

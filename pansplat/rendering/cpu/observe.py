@@ -11,7 +11,6 @@ import numpy as np
 
 from pansplat.rendering.cpu import records as layout
 from pansplat.rendering.cpu.columns import write_columns
-from pansplat.rendering.cpu.compiling import inlined, kernel
 from pansplat.rendering.cpu.forms import (
     LARGEST_RATIO,
     LEAST_RATIO,
@@ -26,10 +25,9 @@ from pansplat.rendering.cpu.forms import (
 )
 from pansplat.rendering.cpu.groups import AHEAD, any_reaches, read_fours, read_ones, read_threes
 from pansplat.rendering.cpu.harmonics import colours, fill_basis
-from pansplat.rendering.cpu.memory import Lease
+from pansplat.rendering.cpu.runtime import Workspace, inline_kernel, kernel, parallel_for
 from pansplat.rendering.cpu.simd import LANES as WIDTH
 from pansplat.rendering.cpu.simd import element, fill, how_many, prefetch, put, store
-from pansplat.rendering.cpu.threads import share
 from pansplat.rendering.cpu.wide import (
     align_stack,
     bits_of,
@@ -107,7 +105,7 @@ class Camera(NamedTuple):
     near: float
 
 
-@inlined
+@inline_kernel
 def read_block(means, quats, scales, covariances, opacities, start, count, rows):
     """Copy the fields of `count` Gaussians from `start` on into rows; return whether one may be unusable."""
     sizes = fill(np.float32(0))
@@ -124,7 +122,7 @@ def read_block(means, quats, scales, covariances, opacities, start, count, rows)
     return covariances is not None or count % WIDTH > 0 or any_reaches(sizes, _LARGEST_BITS)
 
 
-@inlined
+@inline_kernel
 def columns_of_pose(pose):
     """The camera's axes and its centre, as numbers; the array would be read again for every eight Gaussians."""
     return (
@@ -135,7 +133,7 @@ def columns_of_pose(pose):
     )
 
 
-@inlined
+@inline_kernel
 def direction_of(rows, i, pose, near):
     """Direction and distance of eight Gaussians, one over it, and a state: 1, or -1 if too near."""
     mx, my, mz = get(rows, MEAN, i), get(rows, MEAN + 1, i), get(rows, MEAN + 2, i)
@@ -146,7 +144,7 @@ def direction_of(rows, i, pose, near):
     return (x * inverse, y * inverse, z * inverse), radius, inverse, state
 
 
-@inlined
+@inline_kernel
 def shape_in(covariances, rows, i, n, inverse, state):
     """Tangent axes and shapes of eight Gaussians, and their state, which an unusable shape makes 0.
 
@@ -165,14 +163,14 @@ def shape_in(covariances, rows, i, n, inverse, state):
     return u, v, shape, state
 
 
-@inlined
+@inline_kernel
 def axes_of(rows, i):
     """The rotation of eight Gaussians by columns, and one over the squared length of their quaternions."""
     r = rotation(get(rows, SHAPE, i), get(rows, SHAPE + 1, i), get(rows, SHAPE + 2, i), get(rows, SHAPE + 3, i))
     return (r[0], r[3], r[6]), (r[1], r[4], r[7]), (r[2], r[5], r[8]), r[9]
 
 
-@inlined
+@inline_kernel
 def _shape_of_axes(rows, i, u, n, inverse, state):
     s0, s1, s2 = get(rows, SHAPE + 4, i), get(rows, SHAPE + 5, i), get(rows, SHAPE + 6, i)
     e0, e1, e2, _ = axes_of(rows, i)
@@ -183,7 +181,7 @@ def _shape_of_axes(rows, i, u, n, inverse, state):
     return shape_of_axes(u, n, e0, e1, e2, a0, a1, a2), state
 
 
-@inlined
+@inline_kernel
 def _shape_of_covariances(rows, i, u, v, n, inverse, state):
     xx, yy, zz = get(rows, SHAPE, i), get(rows, SHAPE + 4, i), get(rows, SHAPE + 8, i)
     xy, yx, xz = get(rows, SHAPE + 1, i), get(rows, SHAPE + 3, i), get(rows, SHAPE + 2, i)
@@ -195,7 +193,7 @@ def _shape_of_covariances(rows, i, u, v, n, inverse, state):
     return shape_of_covariance(u, v, n, xx, xy, xz, yy, yz, zz), state
 
 
-@inlined
+@inline_kernel
 def find_shapes(covariances, pose, near, rows):
     """Find distance, direction, tangent frame and shape of a block, a row each, for `frame_and_shape`."""
     camera = columns_of_pose(pose)
@@ -211,7 +209,7 @@ def find_shapes(covariances, pose, near, rows):
             keep(rows, BODY + j, i, shape[j])
 
 
-@inlined
+@inline_kernel
 def frame_and_shape(rows, i):
     """The tangent frame and the shape that `find_shapes` kept, of one Gaussian."""
     u = rows[FRAME, i], rows[FRAME + 1, i], rows[FRAME + 2, i]
@@ -224,7 +222,7 @@ def frame_and_shape(rows, i):
     return u, v, n, shape
 
 
-@inlined
+@inline_kernel
 def log2(value):
     """Log2 of numbers above 0, within 1e-9."""
     mantissa, exponent = mantissa_and_exponent(value)
@@ -234,19 +232,19 @@ def log2(value):
     return exponent + (2 / math.log(2)) * s * series
 
 
-@inlined
+@inline_kernel
 def _keep_direction(singles, axis, value):
     """Keep a coordinate of the direction, rounded, and what that leaves."""
     head = rounded(value)
     store(singles, (layout.DIRECTION + axis) * WIDTH, head)
-    store(singles, (layout.REST + axis) * WIDTH, rounded(value - widened(head)))
+    store(singles, (layout.DIRECTION_RESIDUAL + axis) * WIDTH, rounded(value - widened(head)))
 
 
-@inlined
+@inline_kernel
 def _find_records(covariances, pose, spread, compensate, near, rows, i, singles):
     """Write what eight Gaussians' records hold, a field a row of `singles`; return states, and which are drawn."""
     right, down, ahead, _ = pose
-    unit, inverse_unit = math.sqrt(layout.UNIT), 1 / math.sqrt(layout.UNIT)
+    unit, inverse_unit = math.sqrt(layout.HALF_LOG2_E), 1 / math.sqrt(layout.HALF_LOG2_E)
     n, radius, inverse, state = direction_of(rows, i, pose, near)
     keep(rows, RADIUS, i, radius)
     u, v, shape, state = shape_in(covariances, rows, i, n, inverse, state)
@@ -258,27 +256,27 @@ def _find_records(covariances, pose, spread, compensate, near, rows, i, singles)
     _keep_direction(singles, 0, dot(*right, *n))
     _keep_direction(singles, 1, dot(*down, *n))
     _keep_direction(singles, 2, dot(*ahead, *n))
-    a_row, b_row = layout.FIRST * WIDTH, layout.SECOND * WIDTH
+    a_row, b_row = layout.ROW_A * WIDTH, layout.ROW_B * WIDTH
     store(singles, a_row, rounded(unit * dot(*right, *a)))
     store(singles, a_row + WIDTH, rounded(unit * dot(*down, *a)))
     store(singles, a_row + 2 * WIDTH, rounded(unit * dot(*ahead, *a)))
     store(singles, b_row, rounded(unit * dot(*right, *b)))
     store(singles, b_row + WIDTH, rounded(unit * dot(*down, *b)))
     store(singles, b_row + 2 * WIDTH, rounded(unit * dot(*ahead, *b)))
-    store(singles, layout.FRONT_A * WIDTH, rounded(inverse_unit * front_a))
-    store(singles, layout.FRONT_B * WIDTH, rounded(inverse_unit * front_b))
-    store(singles, layout.ALONG * WIDTH, rounded((1 / layout.UNIT) * along))
+    store(singles, layout.L_ALONG_A * WIDTH, rounded(inverse_unit * front_a))
+    store(singles, layout.L_ALONG_B * WIDTH, rounded(inverse_unit * front_b))
+    store(singles, layout.RADIAL_VARIANCE * WIDTH, rounded((1 / layout.HALF_LOG2_E) * along))
     opacity = get(rows, OPACITY, i)
     peak2 = opacity * opacity
     if compensate:
         peak2 = peak2 * max(shape[6] * inverse_det, LEAST_RATIO)
     drawn = (state > 0) & (opacity >= _FAINTEST)
     level = either(drawn, 0.5 * log2(either(drawn, peak2, fill_wide(1.0))), fill_wide(CULLED))
-    store(singles, layout.LEVEL * WIDTH, rounded(level))
+    store(singles, layout.LOG2_PEAK * WIDTH, rounded(level))
     return state, drawn
 
 
-@inlined
+@inline_kernel
 def _check_numbers(rows, first, end, count):
     """Clear SOUND of Gaussians with a number that is not finite or absurdly large among the rows."""
     for row in range(first, end):
@@ -287,7 +285,7 @@ def _check_numbers(rows, first, end, count):
                 rows[SOUND, i] = 0.0
 
 
-@inlined
+@inline_kernel
 def _check_harmonics(harmonic_bits, size, start, count, rows):
     """Set SOUND, and clear it for Gaussians with such a coefficient; each has `size` of them."""
     for i in range(LANES):
@@ -313,7 +311,7 @@ def _observe(
 ):  # fmt: skip
     align_stack()
     rows, seen = np.ones((ROWS, LANES)), np.empty(LANES, np.uint8)
-    basis, singles = np.empty((25, LANES), np.float32), np.empty(layout.FIELDS * WIDTH, np.float32)
+    basis, singles = np.empty((25, LANES), np.float32), np.empty(layout.RECORD_SIZE * WIDTH, np.float32)
     dropped, too_near, camera = 0, 0, columns_of_pose(pose)
     for start in range(piece * PIECE, min((piece + 1) * PIECE, means.shape[0]), LANES):
         count = min(LANES, means.shape[0] - start)
@@ -357,11 +355,11 @@ class Observed(NamedTuple):
     near: int
 
 
-def observe(fields: Fields, camera: Camera, lease: Lease, threads: int) -> Observed:
+def observe(fields: Fields, camera: Camera, workspace: Workspace, threads: int) -> Observed:
     """The Gaussians as the camera sees them, in leased arrays."""
     num, channels = len(fields.means), fields.harmonics.shape[2]
-    records, radii = lease.array((num, layout.FIELDS), np.float32), lease.array(num, np.float64)
-    values, drawn = lease.array((num, channels + 1), np.float32), lease.array(num, np.uint8)
+    records, radii = workspace.array((num, layout.RECORD_SIZE), np.float32), workspace.array(num, np.float64)
+    values, drawn = workspace.array((num, channels + 1), np.float32), workspace.array(num, np.uint8)
     pieces = -(-num // PIECE)
     tallies = np.zeros((pieces, 2), np.int64)
     harmonic_bits = fields.harmonics.reshape(-1).view(np.uint32)
@@ -380,6 +378,6 @@ def observe(fields: Fields, camera: Camera, lease: Lease, threads: int) -> Obser
             tallies,
         )
 
-    share(work, pieces, threads)
+    parallel_for(work, pieces, threads)
     dropped, near = (int(count) for count in tallies.sum(axis=0))
     return Observed(records, values, radii, drawn, dropped, near)

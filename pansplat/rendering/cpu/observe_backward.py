@@ -20,7 +20,6 @@ import numpy as np
 
 from pansplat.rendering.cpu import records as layout
 from pansplat.rendering.cpu.columns import read_columns
-from pansplat.rendering.cpu.compiling import inlined, kernel
 from pansplat.rendering.cpu.forms import LEAST_RATIO, dot, whitened, whitening
 from pansplat.rendering.cpu.groups import AHEAD, load_four, quarters, write_fours, write_ones, write_threes
 from pansplat.rendering.cpu.harmonics import add_slopes, colour_gradients, constant_colour_gradients, fill_basis
@@ -40,6 +39,7 @@ from pansplat.rendering.cpu.observe import (
     read_block,
     shape_in,
 )
+from pansplat.rendering.cpu.runtime import inline_kernel, kernel, parallel_for
 from pansplat.rendering.cpu.shape_backward import (
     ALL_ROWS,
     GIVEN_RADIUS,
@@ -52,7 +52,6 @@ from pansplat.rendering.cpu.shape_backward import (
 )
 from pansplat.rendering.cpu.simd import LANES as WIDTH
 from pansplat.rendering.cpu.simd import element, fill, load, prefetch, store
-from pansplat.rendering.cpu.threads import share
 from pansplat.rendering.cpu.wide import align_stack, either, fill_wide, get, keep, widened
 
 _POSE = 12  # sums for the pose: its rotation by rows, its centre
@@ -70,7 +69,7 @@ class Gradients(NamedTuple):
     pose: np.ndarray
 
 
-@inlined
+@inline_kernel
 def _sum_slots(grad_records, grad_values, totals, offsets, start, count, sums, value_sums, colour_grads, rows):
     """Sum the slots of each Gaussian of a block, in their order; zeros where it has none.
 
@@ -83,45 +82,45 @@ def _sum_slots(grad_records, grad_values, totals, offsets, start, count, sums, v
     for i in range(count):
         first, end = element(offsets, start + i), element(offsets, start + i + 1)
         low, high, values, radius = none, none, none, np.float32(0)
-        prefetch(grad_records, layout.FIELDS * (first + AHEAD // 4))
+        prefetch(grad_records, layout.RECORD_SIZE * (first + AHEAD // 4))
         prefetch(grad_values, 4 * (first + AHEAD // 4))
         if channels == 3:  # most; one loop, whose end the processor mistakes once
             for slot in range(first, end):
                 if totals is None:
-                    low = low + load(grad_records, layout.FIELDS * slot)
-                    high = high + load(grad_records, layout.FIELDS * slot + WIDTH)
+                    low = low + load(grad_records, layout.RECORD_SIZE * slot)
+                    high = high + load(grad_records, layout.RECORD_SIZE * slot + WIDTH)
                 values = values + load_four(grad_values, 4 * slot)
             store(value_sums, 4 * i, values)
         else:
             colour_grads[i] = 0
             for slot in range(first, end):
                 if totals is None:
-                    low = low + load(grad_records, layout.FIELDS * slot)
-                    high = high + load(grad_records, layout.FIELDS * slot + WIDTH)
+                    low = low + load(grad_records, layout.RECORD_SIZE * slot)
+                    high = high + load(grad_records, layout.RECORD_SIZE * slot + WIDTH)
                 for c in range(channels):
                     colour_grads[i, c] += element(grad_values, (channels + 1) * slot + c)
                 radius += element(grad_values, (channels + 1) * slot + channels)
             rows[GIVEN_RADIUS, i] = radius
-        store(sums, layout.FIELDS * i, low)
-        store(sums, layout.FIELDS * i + WIDTH, high)
+        store(sums, layout.RECORD_SIZE * i, low)
+        store(sums, layout.RECORD_SIZE * i + WIDTH, high)
     if channels == 3:
         for i in range(0, LANES, WIDTH):
             keep(rows, GIVEN_RADIUS, i, widened(quarters(value_sums, 4 * i)[3]))
 
 
-@inlined
+@inline_kernel
 def _read_gradients(sums, totals, start, count, singles, rows):
     """Turn the sums of a block's slots into rows of `singles`, or the classic kernel's totals into rows."""
     if totals is not None:
         for i in range(count):
-            singles[layout.LEVEL, i] = totals[start + i, 9]
+            singles[layout.LOG2_PEAK, i] = totals[start + i, 9]
             for j in range(9):
                 rows[TOTAL + j, i] = totals[start + i, j]
         return
     read_columns(sums, 0, count, singles.reshape(-1), LANES)
 
 
-@inlined
+@inline_kernel
 def _clear_undrawn(scene_drawn, start, count, pose, rows, singles, drawn):
     """Give Gaussians that are not drawn any finite place and shape: their gradients are 0 and must stay so."""
     missing = LANES - count
@@ -140,18 +139,18 @@ def _clear_undrawn(scene_drawn, start, count, pose, rows, singles, drawn):
         for j in range(9):
             rows[SHAPE + j, i] = 1.0 if j % 4 == 0 else 0.0
             rows[TOTAL + j, i] = 0.0
-        for j in range(layout.FIELDS):
+        for j in range(layout.RECORD_SIZE):
             singles[j, i] = 0.0
 
 
-@inlined
+@inline_kernel
 def _to_world(pose, vector):
     (xx, yx, zx), (xy, yy, zy), (xz, yz, zz), _ = pose
     x, y, z = vector
     return xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z
 
 
-@inlined
+@inline_kernel
 def _given(singles, field, i, factor):
     """The gradients of three fields of eight records."""
     return (
@@ -161,7 +160,7 @@ def _given(singles, field, i, factor):
     )
 
 
-@inlined
+@inline_kernel
 def _add_to_pose(sums, n, a, b, g_n, g_a, g_b):
     """The pose's rotation A makes n_camera = A'n, so its gradient is the sum of n g_n' A, and so on; A comes last."""
     for axis in range(3):
@@ -170,24 +169,24 @@ def _add_to_pose(sums, n, a, b, g_n, g_a, g_b):
             keep(sums, 4 * axis + other, 0, get(sums, 4 * axis + other, 0) + found)
 
 
-@inlined
+@inline_kernel
 def _forms_backward(pose, spread, compensate, u, v, n, shape, singles, i, sums):
     """From the gradients of eight records to that of n, what `quadratic` makes that of C from, and that of ln det B."""
-    unit, inverse_unit = math.sqrt(layout.UNIT), 1 / math.sqrt(layout.UNIT)
+    unit, inverse_unit = math.sqrt(layout.HALF_LOG2_E), 1 / math.sqrt(layout.HALF_LOG2_E)
     (first, mix, second), alpha, beta, along, det_filtered, _ = whitening(shape, spread)
     a, b = whitened(u, v, first, mix, second)
     g_n = _to_world(pose, _given(singles, layout.DIRECTION, i, 1.0))
-    g_a = _to_world(pose, _given(singles, layout.FIRST, i, unit))
-    g_b = _to_world(pose, _given(singles, layout.SECOND, i, unit))
+    g_a = _to_world(pose, _given(singles, layout.ROW_A, i, unit))
+    g_b = _to_world(pose, _given(singles, layout.ROW_B, i, unit))
     if sums.shape[0] > 0:
         _add_to_pose(sums, n, a, b, g_n, g_a, g_b)
-    g_alpha = inverse_unit * widened(load(singles, layout.FRONT_A * LANES + i))
-    g_beta = inverse_unit * widened(load(singles, layout.FRONT_B * LANES + i))
-    g_along = (1 / layout.UNIT) * widened(load(singles, layout.ALONG * LANES + i))
+    g_alpha = inverse_unit * widened(load(singles, layout.L_ALONG_A * LANES + i))
+    g_beta = inverse_unit * widened(load(singles, layout.L_ALONG_B * LANES + i))
+    g_along = (1 / layout.HALF_LOG2_E) * widened(load(singles, layout.RADIAL_VARIANCE * LANES + i))
     half, by_det = fill_wide(0.0), fill_wide(0.0)
     if compensate:
         counts = shape[6] > LEAST_RATIO * det_filtered
-        half = either(counts, (0.5 / math.log(2)) * widened(load(singles, layout.LEVEL * LANES + i)), half)
+        half = either(counts, (0.5 / math.log(2)) * widened(load(singles, layout.LOG2_PEAK * LANES + i)), half)
         by_det = either(counts, half / shape[6], by_det)
     g_aa = -0.5 * (dot(*g_a, *a) + alpha * g_alpha) - half
     g_ab = -0.5 * (dot(*g_a, *b) + dot(*g_b, *a) + beta * g_alpha + alpha * g_beta)
@@ -203,7 +202,7 @@ def _forms_backward(pose, spread, compensate, u, v, n, shape, singles, i, sums):
     return g_n, ((first, mix, second), (alpha, beta), g_along, halves), by_det
 
 
-@inlined
+@inline_kernel
 def _add_totals(rows, i, u, v, n, shape, g_n, sums):
     """Add what the classic kernel's pictures passed back to the gradient of n, and to the sums for the pose."""
     t_n = get(rows, TOTAL, i), get(rows, TOTAL + 1, i), get(rows, TOTAL + 2, i)
@@ -221,7 +220,7 @@ def _add_totals(rows, i, u, v, n, shape, g_n, sums):
     return g_n[0] + t_n[0], g_n[1] + t_n[1], g_n[2] + t_n[2]
 
 
-@inlined
+@inline_kernel
 def _shapes_backward(covariances, totals, pose, spread, compensate, near, rows, singles, sums, i):
     """From the gradients of eight Gaussians' records to those of shapes, opacities, directions and distances."""
     n, radius, inverse, state = direction_of(rows, i, pose, near)
@@ -234,7 +233,7 @@ def _shapes_backward(covariances, totals, pose, spread, compensate, near, rows, 
     else:
         g_n, g_radius = axes_backward(rows, i, totals, u, n, inverse, g_n, parts, g_det)
     keep(rows, GIVEN_RADIUS, i, get(rows, GIVEN_RADIUS, i) + g_radius)
-    level = (1 / math.log(2)) * widened(load(singles, layout.LEVEL * LANES + i))
+    level = (1 / math.log(2)) * widened(load(singles, layout.LOG2_PEAK * LANES + i))
     keep(rows, OPACITY, i, level / get(rows, OPACITY, i))
     keep(rows, RADIUS, i, radius)
     for axis in range(3):
@@ -242,7 +241,7 @@ def _shapes_backward(covariances, totals, pose, spread, compensate, near, rows, 
         keep(rows, WORLD + axis, i, n[axis])
 
 
-@inlined
+@inline_kernel
 def _means_backward(rows, sums):
     """Gradient of the mean from those of direction and distance."""
     for i in range(0, LANES, WIDTH):
@@ -269,8 +268,8 @@ def _chain(
         np.zeros((_POSE if pose_sums.shape[0] > 0 else 0, WIDTH)),
         columns_of_pose(pose),
     )
-    slot_sums, value_sums = np.zeros(LANES * layout.FIELDS, np.float32), np.zeros(4 * LANES + 4, np.float32)
-    singles, drawn = np.zeros((layout.FIELDS, LANES), np.float32), np.zeros(LANES, np.bool_)
+    slot_sums, value_sums = np.zeros(LANES * layout.RECORD_SIZE, np.float32), np.zeros(4 * LANES + 4, np.float32)
+    singles, drawn = np.zeros((layout.RECORD_SIZE, LANES), np.float32), np.zeros(LANES, np.bool_)
     basis, slopes = np.zeros((25, LANES), np.float32), np.zeros((25, LANES), np.float32)
     colour_grads = np.zeros((LANES, harmonics.shape[2]), np.float32)
     for start in range(piece * PIECE, min((piece + 1) * PIECE, means.shape[0]), LANES):
@@ -300,7 +299,7 @@ def _chain(
         pose_sums[piece, j] = total
 
 
-@inlined
+@inline_kernel
 def _write(rows, start, count, grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities):
     if grad_means.shape[0] > 0:
         write_threes(rows, N_GRAD, start, count, grad_means.reshape(-1))
@@ -350,7 +349,7 @@ def chain(
             *wanted[:6], sums,
         )  # fmt: skip
 
-    share(work, pieces, threads)
+    parallel_for(work, pieces, threads)
     if len(wanted.pose) == 0:
         return wanted
     pose = sums.sum(axis=0).reshape(3, 4)

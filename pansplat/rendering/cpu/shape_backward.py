@@ -3,9 +3,9 @@
 Source: docs/rendering.md, sections 1 and 2, differentiated by hand; everything is over the distance, as there.
 """
 
-from pansplat.rendering.cpu.compiling import inlined
 from pansplat.rendering.cpu.forms import cross, dot, whitened
 from pansplat.rendering.cpu.observe import ROWS, SHAPE, axes_of
+from pansplat.rendering.cpu.runtime import inline_kernel
 from pansplat.rendering.cpu.wide import get, keep
 
 # Rows of a block, after those of observe.py.
@@ -16,7 +16,7 @@ TOTAL = ROWS + 11  # what the classic kernel passes back: gradients of n and C
 ALL_ROWS = ROWS + 20
 
 
-@inlined
+@inline_kernel
 def quadratic(u, v, n, parts):
     """The gradient of C (xx xy xz yy yz zz) in the axes that u, v and n are given in, from what the forms' leave.
 
@@ -46,7 +46,7 @@ def quadratic(u, v, n, parts):
     )
 
 
-@inlined
+@inline_kernel
 def totals_of_shape(rows, i):
     """What the classic kernel passes back to C, world axes."""
     return (
@@ -55,7 +55,7 @@ def totals_of_shape(rows, i):
     )  # fmt: skip
 
 
-@inlined
+@inline_kernel
 def covariances_backward(rows, i, totals, u, v, n, shape, inverse, g_n, parts, g):
     """Write the gradients of eight covariances; return those of n and the distance.
 
@@ -89,7 +89,7 @@ def covariances_backward(rows, i, totals, u, v, n, shape, inverse, g_n, parts, g
     return g_n, -2 * whole * squared * inverse
 
 
-@inlined
+@inline_kernel
 def axes_backward(rows, i, totals, u, n, inverse, g_n, parts, g):
     """Write the gradients of eight quaternions and scales; return those of n and the distance.
 
@@ -141,7 +141,7 @@ def axes_backward(rows, i, totals, u, n, inverse, g_n, parts, g):
     return g_n, -(d0 * s0 + d1 * s1 + d2 * s2) * inverse
 
 
-@inlined
+@inline_kernel
 def _times(matrix, e):
     """A symmetric matrix times a vector."""
     xx, xy, xz, yy, yz, zz = matrix

@@ -11,23 +11,25 @@ from torch import Tensor
 
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.rendering import splats
-from pansplat.rendering.cpu.memory import Lease
 from pansplat.rendering.cpu.observe import Camera, Fields, Observed, observe
+from pansplat.rendering.cpu.rasterize import MIN_PLANAR_COSINE
 from pansplat.rendering.cpu.records import (
-    ALONG,
     DIRECTION,
-    FIELDS,
-    FIRST,
-    FRONT_A,
-    FRONT_B,
-    LEVEL,
-    REST,
-    SECOND,
-    TILE,
-    UNIT,
+    DIRECTION_RESIDUAL,
+    HALF_LOG2_E,
+    L_ALONG_A,
+    L_ALONG_B,
+    LOG2_PEAK,
+    PIXEL_CENTRES,
+    RADIAL_VARIANCE,
+    RECORD_SIZE,
+    ROW_A,
+    ROW_B,
+    TILE_SIZE,
+    PixelTables,
+    tabulate_pixels,
 )
-from pansplat.rendering.cpu.tables import FLAT, Plane, plane_of
-from pansplat.rendering.cpu.tile import NARROW
+from pansplat.rendering.cpu.runtime import Workspace
 from pansplat.rendering.panorama import Picture
 
 SPREAD = 0.1 * (math.pi / 64) ** 2
@@ -49,19 +51,19 @@ def fields() -> Callable[..., Fields]:
 
 
 @pytest.fixture
-def lease() -> Iterator[Lease]:
+def workspace() -> Iterator[Workspace]:
     """Memory for one test."""
-    lease = Lease()
-    yield lease
-    del lease
+    workspace = Workspace()
+    yield workspace
+    del workspace
 
 
 @pytest.fixture
-def seen(lease: Lease, pose: Tensor) -> Callable[..., Observed]:
+def seen(workspace: Workspace, pose: Tensor) -> Callable[..., Observed]:
     """What the numba stage sees of a scene."""
 
     def see(scene: Gaussians, covariances: Tensor | None = None, *, threads: int = 1, near: float = 0.05) -> Observed:
-        return observe(_fields(scene, covariances), Camera(pose.numpy(), SPREAD, True, near), lease, threads)
+        return observe(_fields(scene, covariances), Camera(pose.numpy(), SPREAD, True, near), workspace, threads)
 
     return see
 
@@ -80,16 +82,16 @@ def truth(pose: Tensor) -> Callable[..., splats.Observed]:
 
 def _decode(records: Tensor) -> dict[str, Tensor]:
     """The quantities of docs/rendering.md in records, those that do not depend on the choice of a and b."""
-    direction = records[:, DIRECTION:REST] + records[:, REST:FIRST]
-    first, second = records[:, FIRST:SECOND], records[:, SECOND:FRONT_A]
-    front = direction + records[:, FRONT_A, None] * first + records[:, FRONT_B, None] * second
+    direction = records[:, DIRECTION:DIRECTION_RESIDUAL] + records[:, DIRECTION_RESIDUAL:ROW_A]
+    first, second = records[:, ROW_A:ROW_B], records[:, ROW_B:L_ALONG_A]
+    front = direction + records[:, L_ALONG_A, None] * first + records[:, L_ALONG_B, None] * second
     across = first[:, :, None] * first[:, None, :] + second[:, :, None] * second[:, None, :]
     return {
         "direction": direction,
-        "across": across / UNIT,
+        "across": across / HALF_LOG2_E,
         "front": front,
-        "along": records[:, ALONG] * UNIT,
-        "peak": 2 ** records[:, LEVEL],
+        "along": records[:, RADIAL_VARIANCE] * HALF_LOG2_E,
+        "peak": 2 ** records[:, LOG2_PEAK],
     }
 
 
@@ -105,30 +107,30 @@ class Case:
 
     records: np.ndarray
     values: np.ndarray
-    entries: np.ndarray
+    intersections: np.ndarray
     starts: np.ndarray
     slots: np.ndarray
-    plane: Plane
+    tables: PixelTables
     points: Tensor
     size: tuple[int, int]
 
     def dense(self, upstream: np.ndarray | None = None) -> tuple[Tensor, ...]:
         """The sums; with an upstream gradient also the gradients of records and values."""
         records = torch.from_numpy(self.records).double()
-        records[:, :REST] += records[:, REST:FIRST]
+        records[:, :DIRECTION_RESIDUAL] += records[:, DIRECTION_RESIDUAL:ROW_A]
         records.requires_grad_()
         values = torch.from_numpy(self.values).double().requires_grad_()
         through, weights = torch.ones(self.size, dtype=torch.float64), []
         for n, _, a, b, (front_a, front_b, along, level) in (row.split((3, 3, 3, 3, 4)) for row in records):
             ahead = n + front_a * a + front_b * b
             offset = self.points - n
-            if self.plane.kind != FLAT:
+            if self.tables.kind != PIXEL_CENTRES:
                 # A ray's length is free, and with it the gradients of what would turn a and b out of their plane.
                 # The kernel's are those at L = 1.
                 length = (1 + offset @ ahead).detach()
                 offset = self.points / torch.where(length > 0, length, 1)[..., None] - n
             front = 1 + offset @ ahead
-            if self.plane.kind == FLAT:
+            if self.tables.kind == PIXEL_CENTRES:
                 front, along = torch.ones_like(front), 0.0
             q = (offset @ a).square() + (offset @ b).square()
             alpha = torch.exp2(level - q / (front.square() + along * q)).clamp_max(0.99)
@@ -156,12 +158,12 @@ def _random_records(
     turn = rng.uniform(0, math.pi, count)
     first = np.stack((np.cos(turn), np.sin(turn)), axis=1) / deviations[:, :1]
     second = np.stack((-np.sin(turn), np.cos(turn)), axis=1) / deviations[:, 1:]
-    records = torch.zeros(count, FIELDS, dtype=torch.float64)
-    records[:, LEVEL] = torch.from_numpy(np.log2(rng.uniform(*opacity, count)))
+    records = torch.zeros(count, RECORD_SIZE, dtype=torch.float64)
+    records[:, LOG2_PEAK] = torch.from_numpy(np.log2(rng.uniform(*opacity, count)))
     pixels = rng.uniform(-1, 1, (count, 2)) * (width / 2 + 1, height / 2 + 1)
     if kind == "ewa":
         records[:, DIRECTION:2] = torch.from_numpy(pixels + np.array((width, height)) / 2)
-        records[:, FIRST : FIRST + 2], records[:, SECOND : SECOND + 2] = map(torch.from_numpy, (first, second))
+        records[:, ROW_A : ROW_A + 2], records[:, ROW_B : ROW_B + 2] = map(torch.from_numpy, (first, second))
         return records
     if kind == "pinhole":
         ahead = np.concatenate((pixels / picture.focal, np.ones((count, 1))), axis=1)
@@ -170,12 +172,12 @@ def _random_records(
         direction = torch.from_numpy(rng.standard_normal((count, 3)))
     direction = direction / direction.norm(dim=1, keepdim=True)
     right, down = splats.tangent_frame(direction)
-    records[:, DIRECTION:REST] = direction
-    for columns, axis in ((FIRST, first), (SECOND, second)):
+    records[:, DIRECTION:DIRECTION_RESIDUAL] = direction
+    for columns, axis in ((ROW_A, first), (ROW_B, second)):
         across = torch.from_numpy(axis) / picture.pixel_angle
         records[:, columns : columns + 3] = across[:, :1] * right + across[:, 1:] * down
-    records[:, FRONT_A : FRONT_B + 1] = torch.from_numpy(0.05 * rng.standard_normal((count, 2)))
-    records[:, ALONG] = torch.from_numpy(rng.uniform(0, 0.05, count))
+    records[:, L_ALONG_A : L_ALONG_B + 1] = torch.from_numpy(0.05 * rng.standard_normal((count, 2)))
+    records[:, RADIAL_VARIANCE] = torch.from_numpy(rng.uniform(0, 0.05, count))
     return records
 
 
@@ -195,18 +197,20 @@ def make_case(pose: Tensor) -> Callable[..., Case]:
         picture = Picture(size, pose[:3, :3], 0.0 if kind == "equirect" else 0.6 * max(size))
         precise = _random_records(kind, picture, count, opacity, rng)
         records = precise.float()
-        records[:, REST:FIRST] = (precise[:, :REST] - records[:, :REST].double()).float()
-        plane = plane_of(picture, exact=kind != "ewa")
-        tiles = plane.tiles[0] * plane.tiles[1]
-        whole = (TILE - 1) << 8 | (TILE - 1) << 24
-        entries = np.empty((tiles * count, 2), np.int32)
-        entries[:, 0], entries[:, 1] = np.tile(np.arange(count), tiles), whole
+        records[:, DIRECTION_RESIDUAL:ROW_A] = (
+            precise[:, :DIRECTION_RESIDUAL] - records[:, :DIRECTION_RESIDUAL].double()
+        ).float()
+        tables = tabulate_pixels(picture, exact=kind != "ewa")
+        tiles = tables.tiles[0] * tables.tiles[1]
+        whole = (TILE_SIZE - 1) << 8 | (TILE_SIZE - 1) << 24
+        intersections = np.empty((tiles * count, 2), np.int32)
+        intersections[:, 0], intersections[:, 1] = np.tile(np.arange(count), tiles), whole
         slots = (np.tile(np.arange(count) * tiles, tiles) + np.repeat(np.arange(tiles), count)).astype(np.int32)
         points = picture.coordinates() if kind == "ewa" else picture.directions()
         return Case(
             records.numpy(),
             rng.uniform(-0.5, 1.5, (count, num_values)).astype(np.float32),
-            entries,
+            intersections,
             np.arange(0, tiles * count + 1, count) if count else np.zeros(tiles + 1, np.int64),
             slots,
             plane,
@@ -220,9 +224,9 @@ def make_case(pose: Tensor) -> Callable[..., Case]:
 @pytest.fixture(params=["behind", "around the eye"])
 def one_too_wide(request: pytest.FixtureRequest, make_case: Callable[..., Case]) -> Case:
     """A tile of two chunks, narrow but for the last Gaussian: 100 degrees away, or about the eye, and seen."""
-    case = make_case("pinhole", (TILE, TILE), 300, opacity=(0.02, 0.1))
-    middle = case.points[TILE // 2, TILE // 2]
-    assert (case.records[:, :REST] @ middle.numpy()).min() > NARROW
+    case = make_case("pinhole", (TILE_SIZE, TILE_SIZE), 300, opacity=(0.02, 0.1))
+    middle = case.points[TILE_SIZE // 2, TILE_SIZE // 2]
+    assert (case.records[:, :DIRECTION_RESIDUAL] @ middle.numpy()).min() > MIN_PLANAR_COSINE
     behind = request.param == "behind"
     angle = math.radians(100 if behind else 0)
     right, down = (axis[0] for axis in splats.tangent_frame(middle[None]))

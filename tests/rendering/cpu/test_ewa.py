@@ -12,7 +12,7 @@ from pansplat.rendering.bounds import ewa_boxes, kappa
 from pansplat.rendering.cpu.ewa import TOTALS, project, project_backward
 from pansplat.rendering.cpu.observe import Camera, observe
 from pansplat.rendering.cpu.observe_backward import Gradients, chain
-from pansplat.rendering.cpu.records import FIRST, LEVEL, REST, SECOND, UNIT
+from pansplat.rendering.cpu.records import DIRECTION_RESIDUAL, HALF_LOG2_E, LOG2_PEAK, ROW_A, ROW_B
 from pansplat.rendering.panorama import pictures
 
 _NAMES = ("means", "quats", "scales", "opacities", "harmonics")
@@ -34,24 +34,24 @@ def _reference(scene, pose, lowpass, picture):
     return drawn, variances, front.nonzero()[:, 0].numpy()
 
 
-def _ours(scene, pose, lowpass, picture, fields, lease):
+def _ours(scene, pose, lowpass, picture, fields, workspace):
     spread = (0.1 if lowpass == "angular" else 1e-9) * picture.pixel_angle**2
     camera = Camera(pose.numpy(), spread, lowpass == "angular", 0.05)
     given = fields(scene)
-    observed = observe(given, camera, lease, 1)
-    records, boxes = project(given, camera, observed, picture, _DILATED[lowpass], 0.01, lease, 1)
+    observed = observe(given, camera, workspace, 1)
+    records, boxes = project(given, camera, observed, picture, _DILATED[lowpass], 0.01, workspace, 1)
     return given, camera, observed, records, boxes
 
 
 @pytest.mark.parametrize("lowpass", ["angular", "3dgs"])
 @pytest.mark.parametrize("flat", [False, True])
-def test_projected_records_and_boxes_are_the_references(flat, lowpass, make_scene, fields, lease, pose):
+def test_projected_records_and_boxes_are_the_references(flat, lowpass, make_scene, fields, workspace, pose):
     scene = make_scene(2000, scale=0.1).to(dtype=torch.float32)
     if flat:
         scene.scales[:, 0] = 0
     picture = _picture()
     expected, variances, front = _reference(scene.to(dtype=torch.float64), pose, lowpass, picture)
-    *_, records, boxes = _ours(scene, pose, lowpass, picture, fields, lease)
+    *_, records, boxes = _ours(scene, pose, lowpass, picture, fields, workspace)
     edges = ewa_boxes(expected.point, variances, kappa(expected.peak)).numpy()
     x0, x1 = np.maximum(np.ceil(edges[:, 0] - 0.51), 0), np.minimum(np.floor(edges[:, 1] - 0.49), 63)
     y0, y1 = np.maximum(np.ceil(edges[:, 2] - 0.51), 0), np.minimum(np.floor(edges[:, 3] - 0.49), 47)
@@ -62,19 +62,19 @@ def test_projected_records_and_boxes_are_the_references(flat, lowpass, make_scen
     boxes, records = boxes[front], torch.from_numpy(records[front][seen]).double()
     assert ((boxes[:, 3] >= boxes[:, 2]) != seen).mean() < 2e-3
     assert (boxes[seen] != np.stack((x0, x1, y0, y1), axis=1)[seen]).any(axis=1).mean() < 5e-3
-    where = records[:, :2] + records[:, REST : REST + 2]
+    where = records[:, :2] + records[:, DIRECTION_RESIDUAL : DIRECTION_RESIDUAL + 2]
     torch.testing.assert_close(where, expected.point[seen][:, :2].double(), rtol=1e-12, atol=1e-9)
-    unit, tolerance = math.sqrt(UNIT), {"rtol": 2e-6, "atol": 1e-6}
-    torch.testing.assert_close(records[:, FIRST] / unit, expected.forms[seen][:, 0, 0], **tolerance)
-    torch.testing.assert_close(records[:, SECOND : SECOND + 2] / unit, expected.forms[seen][:, 1, :2], **tolerance)
-    torch.testing.assert_close(2 ** records[:, LEVEL], expected.peak[seen], **tolerance)
+    unit, tolerance = math.sqrt(HALF_LOG2_E), {"rtol": 2e-6, "atol": 1e-6}
+    torch.testing.assert_close(records[:, ROW_A] / unit, expected.forms[seen][:, 0, 0], **tolerance)
+    torch.testing.assert_close(records[:, ROW_B : ROW_B + 2] / unit, expected.forms[seen][:, 1, :2], **tolerance)
+    torch.testing.assert_close(2 ** records[:, LOG2_PEAK], expected.peak[seen], **tolerance)
 
 
 @pytest.mark.parametrize("lowpass", ["angular", "3dgs"])
-def test_gradients_through_the_projection_are_autograds(lowpass, make_scene, fields, lease, pose):
+def test_gradients_through_the_projection_are_autograds(lowpass, make_scene, fields, workspace, pose):
     scene = make_scene(400, scale=0.2, degree=0).to(dtype=torch.float32)
     picture, camera = _picture(), pose.clone().requires_grad_()
-    given, numba_camera, observed, _, boxes = _ours(scene, pose, lowpass, picture, fields, lease)
+    given, numba_camera, observed, _, boxes = _ours(scene, pose, lowpass, picture, fields, workspace)
     visible = boxes[:, 3] >= boxes[:, 2]
     weights = torch.randn(400, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     weights[~visible] = 0
@@ -86,11 +86,11 @@ def test_gradients_through_the_projection_are_autograds(lowpass, make_scene, fie
     (weights[front] * numbers).sum().backward()
 
     offsets = np.concatenate((np.zeros(1, np.int64), np.cumsum(visible)))
-    slots, unit = np.zeros((int(offsets[-1]), 16), np.float32), math.sqrt(UNIT)
+    slots, unit = np.zeros((int(offsets[-1]), 16), np.float32), math.sqrt(HALF_LOG2_E)
     weights = weights[visible].numpy()
-    slots[:, :2], slots[:, FIRST], slots[:, SECOND : SECOND + 2] = weights[:, :2], weights[:, 2], weights[:, 3:5]
-    slots[:, [FIRST, SECOND, SECOND + 1]] /= unit  # of the record's numbers, which are unit times the forms
-    slots[:, LEVEL] = weights[:, 5] * math.log(2)
+    slots[:, :2], slots[:, ROW_A], slots[:, ROW_B : ROW_B + 2] = weights[:, :2], weights[:, 2], weights[:, 3:5]
+    slots[:, [ROW_A, ROW_B, ROW_B + 1]] /= unit  # of the record's numbers, which are unit times the forms
+    slots[:, LOG2_PEAK] = weights[:, 5] * math.log(2)
     totals = np.zeros((400, TOTALS))
     project_backward(given, numba_camera, picture, _DILATED[lowpass], slots, offsets, totals, 1)
     wanted = Gradients(*(np.full_like(field, np.nan) for field in given), pose=np.zeros((3, 4)))

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from pansplat.rendering.cpu.compiling import kernel
 from pansplat.rendering.cpu.groups import (
     any_reaches,
     read_fours,
@@ -13,6 +12,7 @@ from pansplat.rendering.cpu.groups import (
     write_ones,
     write_threes,
 )
+from pansplat.rendering.cpu.runtime import kernel
 from pansplat.rendering.cpu.simd import fill
 
 _LANES = 16

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pansplat.rendering.cpu.observe import CULLED, Camera, observe
-from pansplat.rendering.cpu.records import LEVEL
+from pansplat.rendering.cpu.records import LOG2_PEAK
 
 
 def _relative(found, expected):
@@ -53,7 +53,7 @@ def test_unusable_numbers_drop_their_gaussian_alone(field, poison, make_scene, s
     clean, observed = seen(scene), seen(dataclasses.replace(scene, **{field: value}))
     others = np.arange(150) != 100
     assert observed.dropped == 1 and observed.near == 0
-    assert observed.records[100, LEVEL] == CULLED
+    assert observed.records[100, LOG2_PEAK] == CULLED
     assert np.array_equal(observed.records[others], clean.records[others])
     assert np.array_equal(observed.values[others], clean.values[others])
 
@@ -67,7 +67,7 @@ def test_a_matrix_with_a_negative_eigenvalue_is_dropped(make_scene, seen):
     covariances[[5, 6]] = axes @ torch.diag_embed(eigenvalues) @ axes.transpose(1, 2)
     observed = seen(scene, covariances)
     assert observed.dropped == 1
-    assert (observed.records[:, LEVEL] == CULLED).nonzero()[0].tolist() == [5]
+    assert (observed.records[:, LOG2_PEAK] == CULLED).nonzero()[0].tolist() == [5]
 
 
 def test_near_and_faint_gaussians_are_not_drawn(make_scene, seen, pose):
@@ -78,15 +78,15 @@ def test_near_and_faint_gaussians_are_not_drawn(make_scene, seen, pose):
     scene.opacities[6] = -1.0
     observed = seen(scene)
     assert (observed.dropped, observed.near) == (0, 2)
-    assert (observed.records[:, LEVEL] == CULLED).nonzero()[0].tolist() == [3, 4, 5, 6]
+    assert (observed.records[:, LOG2_PEAK] == CULLED).nonzero()[0].tolist() == [3, 4, 5, 6]
 
 
 @pytest.mark.parametrize("unit", [1e-18, 1e-3, 1e4, 1e18])
-def test_records_do_not_depend_on_the_scenes_unit(unit, make_scene, fields, lease, decode):
+def test_records_do_not_depend_on_the_scenes_unit(unit, make_scene, fields, workspace, decode):
     scene = make_scene(100)
     large = dataclasses.replace(scene, means=scene.means * unit, scales=scene.scales * unit)
-    here = observe(fields(scene), Camera(np.eye(4), 1e-4, True, 1e-30), lease, 1)
-    there = observe(fields(large), Camera(np.eye(4), 1e-4, True, 1e-30), lease, 1)
+    here = observe(fields(scene), Camera(np.eye(4), 1e-4, True, 1e-30), workspace, 1)
+    there = observe(fields(large), Camera(np.eye(4), 1e-4, True, 1e-30), workspace, 1)
     before, after = (decode(torch.from_numpy(o.records).double()) for o in (here, there))
     for name in before:
         assert _relative(after[name], before[name]) < 2e-6, name

@@ -10,7 +10,16 @@ import torch
 from pansplat.rendering import splats
 from pansplat.rendering.cpu.observe import Camera, observe
 from pansplat.rendering.cpu.observe_backward import Gradients, add_slots, chain
-from pansplat.rendering.cpu.records import ALONG, FIRST, FRONT_A, FRONT_B, LEVEL, REST, SECOND, UNIT
+from pansplat.rendering.cpu.records import (
+    DIRECTION_RESIDUAL,
+    HALF_LOG2_E,
+    L_ALONG_A,
+    L_ALONG_B,
+    LOG2_PEAK,
+    RADIAL_VARIANCE,
+    ROW_A,
+    ROW_B,
+)
 
 _NO_TOTALS = np.zeros((0, 10))
 _NAMES = ("means", "quats", "scales", "opacities", "harmonics")
@@ -37,16 +46,16 @@ def _weights(direction, channels):
 def _slot_gradients(observed, weights):
     """Gradients of records and values, as the tiles would give them, in float32."""
     records = torch.from_numpy(observed.records).double()
-    direction = (records[:, :REST] + records[:, REST:FIRST]).requires_grad_()
-    rest = records[:, FIRST:].clone().requires_grad_()
+    direction = (records[:, :DIRECTION_RESIDUAL] + records[:, DIRECTION_RESIDUAL:ROW_A]).requires_grad_()
+    rest = records[:, ROW_A:].clone().requires_grad_()
     values = torch.from_numpy(observed.values).double().requires_grad_()
-    first, second = rest[:, :3], rest[:, SECOND - FIRST : FRONT_A - FIRST]
-    front = direction + rest[:, FRONT_A - FIRST, None] * first + rest[:, FRONT_B - FIRST, None] * second
-    unit, peak = math.sqrt(UNIT), 2 ** rest[:, LEVEL - FIRST]
-    along = rest[:, ALONG - FIRST] * UNIT
+    first, second = rest[:, :3], rest[:, ROW_B - ROW_A : L_ALONG_A - ROW_A]
+    front = direction + rest[:, L_ALONG_A - ROW_A, None] * first + rest[:, L_ALONG_B - ROW_A, None] * second
+    unit, peak = math.sqrt(HALF_LOG2_E), 2 ** rest[:, LOG2_PEAK - ROW_A]
+    along = rest[:, RADIAL_VARIANCE - ROW_A] * HALF_LOG2_E
     _response(direction, first / unit, second / unit, front, along, peak, values, weights).backward()
     grad_records = np.zeros(observed.records.shape, np.float32)
-    grad_records[:, :REST], grad_records[:, FIRST:] = direction.grad, rest.grad
+    grad_records[:, :DIRECTION_RESIDUAL], grad_records[:, ROW_A:] = direction.grad, rest.grad
     return grad_records, values.grad.float().numpy()
 
 
@@ -63,7 +72,7 @@ def _empty(fields):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 @pytest.mark.parametrize("by_covariance", [False, True])
 @pytest.mark.parametrize("compensate", [False, True])
-def test_chained_gradients_are_autograds(degree, by_covariance, compensate, make_scene, fields, lease, pose):
+def test_chained_gradients_are_autograds(degree, by_covariance, compensate, make_scene, fields, workspace, pose):
     scene = make_scene(500, scale=0.3, degree=degree).to(dtype=torch.float32)
     covariances = scene.covariances.double().requires_grad_() if by_covariance else None
     leaves = {name: getattr(scene, name).double().requires_grad_() for name in _NAMES}
@@ -77,7 +86,7 @@ def test_chained_gradients_are_autograds(degree, by_covariance, compensate, make
 
     given = fields(scene, None if covariances is None else covariances.detach())
     numba_camera = Camera(pose.numpy(), spread, compensate, 0.05)
-    observed = observe(given, numba_camera, lease, 1)
+    observed = observe(given, numba_camera, workspace, 1)
     slots = *_slot_gradients(observed, weights), _NO_TOTALS, np.arange(501)
     found = chain(given, numba_camera, observed, *slots, _empty(given), 1)
     expected = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
@@ -91,13 +100,13 @@ def test_chained_gradients_are_autograds(degree, by_covariance, compensate, make
     assert float((got - wanted).norm() / wanted.norm()) < 5e-7
 
 
-def test_gaussians_that_are_not_drawn_have_zero_gradients_and_spoil_no_others(make_scene, fields, lease, pose):
+def test_gaussians_that_are_not_drawn_have_zero_gradients_and_spoil_no_others(make_scene, fields, workspace, pose):
     scene = make_scene(130, degree=2).to(dtype=torch.float32)
     scene.means[1], scene.quats[2], scene.harmonics[3] = math.nan, math.inf, math.nan
     scene.opacities[4], scene.scales[5, 0], scene.opacities[6] = 0.0, 1e30, math.nan
     scene.means[7] = pose[:3, 3]
     given, camera = fields(scene), Camera(pose.numpy(), 1e-4, True, 0.05)
-    observed = observe(given, camera, lease, 1)
+    observed = observe(given, camera, workspace, 1)
     random = np.random.default_rng(0)
     # Gradients come for drawn Gaussians only: the others have no slots.
     offsets = np.cumsum([0] + [0 if 1 <= g <= 7 else 2 for g in range(130)])
@@ -112,12 +121,12 @@ def test_gaussians_that_are_not_drawn_have_zero_gradients_and_spoil_no_others(ma
 
 
 @pytest.mark.parametrize("channels", [1, 3, 5])
-def test_a_gaussian_s_slots_count_as_their_sum(channels, make_scene, fields, lease, pose):
+def test_a_gaussian_s_slots_count_as_their_sum(channels, make_scene, fields, workspace, pose):
     scene = make_scene(75, degree=1)  # more than a block, and no multiple of a vector
     coefficients = torch.randn(75, 4, channels, generator=torch.Generator().manual_seed(1)).double()
     given = fields(dataclasses.replace(scene, harmonics=coefficients))
     camera = Camera(pose.numpy(), 1e-4, True, 0.05)
-    observed, random = observe(given, camera, lease, 1), np.random.default_rng(0)
+    observed, random = observe(given, camera, workspace, 1), np.random.default_rng(0)
     counts = np.arange(75) % 5
     offsets, owner = np.cumsum([0, *counts]), np.repeat(np.arange(75), counts)
     slots = [random.standard_normal((len(owner), size)).astype(np.float32) for size in (16, channels + 1)]
@@ -131,9 +140,9 @@ def test_a_gaussian_s_slots_count_as_their_sum(channels, make_scene, fields, lea
 
 
 @pytest.mark.parametrize("threads", [2, 3, 5])
-def test_gradients_are_the_same_bits_on_any_number_of_threads(threads, make_scene, fields, lease, pose):
+def test_gradients_are_the_same_bits_on_any_number_of_threads(threads, make_scene, fields, workspace, pose):
     given, camera = fields(make_scene(20000, degree=1)), Camera(pose.numpy(), 1e-4, True, 0.05)
-    observed = observe(given, camera, lease, 1)
+    observed = observe(given, camera, workspace, 1)
     random = np.random.default_rng(0)
     slots = [random.standard_normal((20000, size)).astype(np.float32) for size in (16, 4)]
     one, several = (
@@ -144,11 +153,11 @@ def test_gradients_are_the_same_bits_on_any_number_of_threads(threads, make_scen
         assert np.array_equal(getattr(one, name), getattr(several, name)), name
 
 
-def test_a_zero_quaternion_has_zero_gradient(make_scene, fields, lease, pose):
+def test_a_zero_quaternion_has_zero_gradient(make_scene, fields, workspace, pose):
     scene = make_scene(3)
     scene.quats[1] = 0
     given, camera = fields(scene), Camera(pose.numpy(), 1e-4, True, 0.05)
-    observed = observe(given, camera, lease, 1)
+    observed = observe(given, camera, workspace, 1)
     slots = np.ones((3, 16), np.float32), np.ones((3, 4), np.float32), _NO_TOTALS, np.arange(4)
     quats = chain(given, camera, observed, *slots, _empty(given), 1).quats
     assert not quats[1].any() and quats[0].any() and quats[2].any()

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from pansplat.rendering.cpu.compiling import kernel
+from pansplat.rendering.cpu.runtime import kernel
 from pansplat.rendering.cpu.simd import LANES
 from pansplat.rendering.cpu.wide import align_stack, bits_of, either, fill_wide, get, keep, mantissa_and_exponent
 

@@ -1,18 +1,20 @@
+"""TODO."""
+
 import numpy as np
 import pytest
 
 from pansplat.rendering.cpu import records as layout
-from pansplat.rendering.cpu.memory import Lease
-from pansplat.rendering.cpu.raster import raster_forward, room_to_keep
-from pansplat.rendering.cpu.raster_backward import raster_backward
+from pansplat.rendering.cpu.rasterize import allocate_saved, rasterize_forward
+from pansplat.rendering.cpu.rasterize_backward import rasterize_backward
+from pansplat.rendering.cpu.runtime import Workspace
 
 FIELDS = {
-    "direction": slice(layout.DIRECTION, layout.REST),
-    "first": slice(layout.FIRST, layout.SECOND),
-    "second": slice(layout.SECOND, layout.FRONT_A),
-    "fronts": slice(layout.FRONT_A, layout.ALONG),
-    "along": slice(layout.ALONG, layout.LEVEL),
-    "level": slice(layout.LEVEL, layout.FIELDS),
+    "direction": slice(layout.DIRECTION, layout.DIRECTION_RESIDUAL),
+    "first": slice(layout.ROW_A, layout.ROW_B),
+    "second": slice(layout.ROW_B, layout.L_ALONG_A),
+    "fronts": slice(layout.L_ALONG_A, layout.RADIAL_VARIANCE),
+    "along": slice(layout.RADIAL_VARIANCE, layout.LOG2_PEAK),
+    "level": slice(layout.LOG2_PEAK, layout.RECORD_SIZE),
 }
 
 
@@ -23,13 +25,15 @@ def _upstream(case):
 
 def _slots(case, upstream, *, threads=1):
     sums = np.empty_like(upstream)
-    drawn = case.records, case.values, case.entries, case.starts
-    kept = room_to_keep(case.starts, lease := Lease())
-    raster_forward(*drawn, case.plane, sums, kept=kept)
-    grad_records = lease.array((len(case.entries), layout.FIELDS), np.float32)
+    drawn = case.records, case.values, case.intersections, case.starts
+    kept = allocate_saved(case.starts, workspace := Workspace())
+    rasterize_forward(*drawn, case.tables, sums, kept=kept)
+    grad_records = workspace.array((len(case.intersections), layout.RECORD_SIZE), np.float32)
     grad_records[:] = np.nan
-    grad_values = np.full((len(case.entries), case.values.shape[1]), np.nan, np.float32)
-    raster_backward(*drawn, case.slots, case.plane, sums, kept, upstream, grad_records, grad_values, threads=threads)
+    grad_values = np.full((len(case.intersections), case.values.shape[1]), np.nan, np.float32)
+    rasterize_backward(
+        *drawn, case.slots, case.tables, sums, kept, upstream, grad_records, grad_values, threads=threads
+    )
     return grad_records.copy(), grad_values
 
 
@@ -38,7 +42,7 @@ def _compare(case, tolerance=1e-5):
     _, by_records, by_values = case.dense(upstream)
     slots = _slots(case, upstream)
     records, values = (case.reduce(part) for part in slots)
-    assert not records[:, layout.REST : layout.FIRST].any()
+    assert not records[:, layout.DIRECTION_RESIDUAL : layout.ROW_A].any()
     for name, columns in FIELDS.items():
         expected = by_records[:, columns].numpy()
         error = np.linalg.norm(records[:, columns] - expected)

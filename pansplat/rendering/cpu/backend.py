@@ -18,20 +18,22 @@ from torch import Tensor
 from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.rendering.backend import EWA_NEAR, Drawn, Info, Options
-from pansplat.rendering.cpu import bins
-from pansplat.rendering.cpu.bins import TileLists, list_tiles
-from pansplat.rendering.cpu.boxes import LARGEST_SIDE, find_boxes
-from pansplat.rendering.cpu.compiling import announced
+from pansplat.rendering.cpu import tiling
 from pansplat.rendering.cpu.ewa import TOTALS, project, project_backward
-from pansplat.rendering.cpu.memory import Lease, array_to_give
 from pansplat.rendering.cpu.observe import PIECE, Camera, Fields, Observed, observe
 from pansplat.rendering.cpu.observe_backward import Gradients, add_slots, chain
-from pansplat.rendering.cpu.raster import Kept, raster_forward, room_to_keep
-from pansplat.rendering.cpu.raster_backward import raster_backward
-from pansplat.rendering.cpu.records import FIELDS
-from pansplat.rendering.cpu.sort import depths_along, sort_front_to_back
-from pansplat.rendering.cpu.tables import plane_of
-from pansplat.rendering.cpu.threads import share, thread_count
+from pansplat.rendering.cpu.rasterize import SavedForBackward, allocate_saved, rasterize_forward
+from pansplat.rendering.cpu.rasterize_backward import rasterize_backward
+from pansplat.rendering.cpu.records import RECORD_SIZE, tabulate_pixels
+from pansplat.rendering.cpu.runtime import Workspace, announce_compilation, parallel_for, pooled_empty, thread_count
+from pansplat.rendering.cpu.tiling import (
+    LARGEST_SIDE,
+    TileIntersections,
+    compute_depths,
+    find_bounding_boxes,
+    intersect_tiles,
+    sort_front_to_back,
+)
 from pansplat.rendering.panorama import Picture
 from pansplat.rendering.selection import not_finite
 
@@ -47,8 +49,8 @@ class Projection(NamedTuple):
     records: np.ndarray
     boxes: np.ndarray
     distances: np.ndarray
-    lists: TileLists | None = None
-    kept: Kept | None = None
+    lists: TileIntersections | None = None
+    kept: SavedForBackward | None = None
 
 
 @dataclass
@@ -58,7 +60,7 @@ class _Notes:
     dropped: int = 0
     near: int = 0
     visible: int = 0
-    entries: int = 0
+    intersections: int = 0
     bytes: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -102,7 +104,14 @@ def draw(
     if options.strict and notes.dropped:
         raise InputError(not_finite(gaussians, covariances, pose, options))
     info = Info(
-        len(gaussians), notes.dropped, notes.near, notes.visible, notes.entries, "numba", notes.bytes, notes.seconds
+        len(gaussians),
+        notes.dropped,
+        notes.near,
+        notes.visible,
+        notes.intersections,
+        "numba",
+        notes.bytes,
+        notes.seconds,
     )
     return Drawn(sums.to(dtype), info)
 
@@ -127,16 +136,16 @@ class _Draw(torch.autograd.Function):
     ) -> Tensor:
         tensors = means, quats, scales, covariances, opacities, harmonics
         fields, camera = _fields(*tensors), _camera(pose, pictures[0], options)
-        threads, lease = thread_count(), Lease()
+        threads, workspace = thread_count(), Workspace()
         needs_grad = recorded and any(ctx.needs_input_grad)  # which knows nothing of no_grad
         height, width = pictures[0].size
-        with announced(gradients=needs_grad and options.kernel == "ray"):
+        with announce_compilation():
             with notes.timed("observe"):
-                observed = observe(fields, camera, lease, threads)
-            sums = array_to_give((len(pictures), harmonics.shape[2] + 2, height, width), np.float32)
+                observed = observe(fields, camera, workspace, threads)
+            sums = pooled_empty((len(pictures), harmonics.shape[2] + 2, height, width), np.float32)
             kept = [
                 _draw_picture(
-                    (fields, camera, observed), picture, options, sums[number], notes, needs_grad, lease, threads
+                    (fields, camera, observed), picture, options, sums[number], notes, needs_grad, workspace, threads
                 )
                 for number, picture in enumerate(pictures)
             ]
@@ -145,7 +154,7 @@ class _Draw(torch.autograd.Function):
         result = torch.from_numpy(sums)
         if needs_grad:
             ctx.save_for_backward(*tensors, pose, result)
-            ctx.plan = pictures, options, observed, kept, lease, threads
+            ctx.plan = pictures, options, observed, kept, workspace, threads
         return result
 
     @staticmethod
@@ -157,11 +166,11 @@ class _Draw(torch.autograd.Function):
         fields, camera = _fields(*tensors), _camera(pose, pictures[0], options)
         grad_sums = grad_outputs[0].contiguous().numpy()
         wanted = [
-            torch.from_numpy(array_to_give(tuple(tensor.shape), np.float32)) if needed else None
+            torch.from_numpy(pooled_empty(tuple(tensor.shape), np.float32)) if needed else None
             for tensor, needed in zip(tensors, ctx.needs_input_grad, strict=False)
         ]
-        with announced():
-            own = Lease()
+        with announce_compilation():
+            own = Workspace()
             slots = _slot_gradients(
                 (fields, camera, observed), pictures, options, kept, sums.numpy(), grad_sums, own, threads
             )
@@ -214,20 +223,20 @@ def _draw_picture(
     sums: np.ndarray,
     notes: _Notes,
     needs_grad: bool,
-    lease: Lease,
+    workspace: Workspace,
     threads: int,
 ) -> Projection | None:
     """Write one picture's sums, and return what its backward needs."""
-    lease, observed = lease if needs_grad else Lease(), scene[2]
+    workspace, observed = workspace if needs_grad else Workspace(), scene[2]
     with notes.timed("boxes"):
-        records, boxes = _place(scene, picture, options, lease, threads)
+        records, boxes = _place(scene, picture, options, workspace, threads)
     distances = observed.radii
     if options.order == "z" and not picture.is_panorama:
         with notes.timed("sort"):
             towards = picture.rotation[:, 2].numpy().copy()
-            distances = depths_along(observed.records, observed.radii, towards, lease, threads)
-    plane, shown = plane_of(picture, exact=options.kernel == "ray"), Projection(records, boxes, distances)
-    bands = list_tiles(boxes, picture.size, slots=needs_grad, threads=threads, limit=bins.LIMIT)
+            distances = compute_depths(observed.records, observed.radii, towards, workspace, threads)
+    plane, shown = tabulate_pixels(picture, exact=options.kernel == "ray"), Projection(records, boxes, distances)
+    bands = intersect_tiles(boxes, picture.size, slots=needs_grad, threads=threads, limit=tiling.MAX_INTERSECTIONS)
     while True:
         with notes.timed("bin"):
             lists = next(bands, None)
@@ -237,30 +246,32 @@ def _draw_picture(
             sort_front_to_back(lists, distances, threads)
         whole = needs_grad and len(lists.starts) == 1 + math.prod(plane.tiles)
         with notes.timed("raster"):
-            room = room_to_keep(lists.starts, lists.lease) if whole else None
-            raster_forward(
-                records, observed.values, lists.entries, lists.starts, plane, sums,
+            room = allocate_saved(lists.starts, lists.workspace) if whole else None
+            rasterize_forward(
+                records, observed.values, lists.intersections, lists.starts, plane, sums,
                 first_row=lists.first_row, kept=room, threads=threads,
             )  # fmt: skip
-        notes.entries += len(lists.entries)
+        notes.intersections += len(lists.intersections)
         given = observed.records, observed.radii
         own = sum(part.nbytes for part in (records, distances) if not any(part is other for other in given))
-        listed = sum(part.nbytes for part in (lists.entries, lists.starts, lists.slots, lists.offsets, *(room or ())))
+        listed = sum(
+            part.nbytes for part in (lists.intersections, lists.starts, lists.slots, lists.offsets, *(room or ()))
+        )
         notes.bytes = max(notes.bytes, own + boxes.nbytes + listed)
         if whole:
             shown = shown._replace(lists=lists, kept=room)
         del lists
-    notes.visible += int(np.count_nonzero(boxes.view(np.int64) != bins.NOWHERE))
+    notes.visible += int(np.count_nonzero(boxes.view(np.int64) != tiling.EMPTY_BOX))
     return shown if needs_grad else None
 
 
 def _place(
-    scene: tuple[Fields, Camera, Observed], picture: Picture, options: Options, lease: Lease, threads: int
+    scene: tuple[Fields, Camera, Observed], picture: Picture, options: Options, workspace: Workspace, threads: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Records and boxes on a picture."""
     if options.kernel == "ewa":
-        return project(*scene, picture, options.dilation, EWA_NEAR * options.near, lease, threads)
-    return scene[2].records, find_boxes(scene[2].records, picture, lease, threads)
+        return project(*scene, picture, options.dilation, EWA_NEAR * options.near, workspace, threads)
+    return scene[2].records, find_bounding_boxes(scene[2].records, picture, workspace, threads)
 
 
 def _slot_gradients(
@@ -270,7 +281,7 @@ def _slot_gradients(
     projections: list[Projection],
     sums: np.ndarray,
     grad_sums: np.ndarray,
-    lease: Lease,
+    workspace: Workspace,
     threads: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Gradients of the camera's records and values in slots, the classic kernel's totals, and where slots begin."""
@@ -278,39 +289,40 @@ def _slot_gradients(
     num, num_values = observed.values.shape
     exact = options.kernel == "ray"
     alone = exact and len(pictures) == 1 and projections[0].lists is not None
-    total_records = np.zeros((num if exact and not alone else 0, FIELDS), np.float32)
+    total_records = np.zeros((num if exact and not alone else 0, RECORD_SIZE), np.float32)
     totals = np.zeros((0 if exact else num, TOTALS))
     total_values = np.zeros((0 if alone else num, num_values), np.float32)
     pieces = -(-num // PIECE)
     for number, (picture, projection) in enumerate(zip(pictures, projections, strict=True)):
-        plane = plane_of(picture, exact=exact)
-        bands = [projection.lists] if projection.lists else list_tiles(
-            projection.boxes, picture.size, slots=True, threads=threads, limit=bins.LIMIT
+        plane = tabulate_pixels(picture, exact=exact)
+        bands = [projection.lists] if projection.lists else intersect_tiles(
+            projection.boxes, picture.size, slots=True, threads=threads, limit=tiling.MAX_INTERSECTIONS
         )  # fmt: skip
         for lists in bands:
             room = projection.kept
             if room is None:  # drawn once more: what many bands would have to keep is too much
                 sort_front_to_back(lists, projection.distances, threads)
-                room = room_to_keep(lists.starts, lists.lease)
-                raster_forward(
-                    projection.records, observed.values, lists.entries, lists.starts, plane, sums[number],
+                room = allocate_saved(lists.starts, lists.workspace)
+                rasterize_forward(
+                    projection.records, observed.values, lists.intersections, lists.starts, plane, sums[number],
                     first_row=lists.first_row, kept=room, threads=threads,
                 )  # fmt: skip
-            band = lease if alone else Lease()
-            grad_records = band.array((len(lists.entries), FIELDS), np.float32)
-            grad_values = band.array((len(lists.entries), num_values), np.float32)
-            raster_backward(
-                projection.records, observed.values, lists.entries, lists.starts, lists.slots, plane, sums[number],
-                room, grad_sums[number], grad_records, grad_values, first_row=lists.first_row, threads=threads,
+            band = workspace if alone else Workspace()
+            grad_records = band.array((len(lists.intersections), RECORD_SIZE), np.float32)
+            grad_values = band.array((len(lists.intersections), num_values), np.float32)
+            rasterize_backward(
+                projection.records, observed.values, lists.intersections, lists.starts, lists.slots, plane,
+                sums[number], room, grad_sums[number], grad_records, grad_values, first_row=lists.first_row,
+                threads=threads,
             )  # fmt: skip
             if alone:
                 return grad_records, grad_values, totals, lists.offsets
             offsets = lists.offsets
             if exact:
-                share(_adding(offsets, grad_records, total_records), pieces, threads)
+                parallel_for(_adding(offsets, grad_records, total_records), pieces, threads)
             else:
                 project_backward(fields, camera, picture, options.dilation, grad_records, offsets, totals, threads)
-            share(_adding(offsets, grad_values, total_values), pieces, threads)
+            parallel_for(_adding(offsets, grad_values, total_values), pieces, threads)
     return total_records, total_values, totals, np.arange(num + 1)
 
 

@@ -12,7 +12,7 @@ from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.rendering import rasterize, reference
 from pansplat.rendering.backend import Options
-from pansplat.rendering.cpu import bins, draw
+from pansplat.rendering.cpu import draw, tiling
 from pansplat.rendering.panorama import pictures
 
 _NAMES = ("means", "quats", "scales", "opacities", "harmonics")
@@ -90,7 +90,7 @@ def test_any_number_of_channels_is_drawn(channels, make_scene, pose):
 def test_bands_change_no_bit(kernel, make_scene, pose, monkeypatch):
     scene, options = _scene(make_scene), Options(kernel, "radial", "angular", 0.05, False)
     whole, gradients = _run(draw, scene, pose, "pinhole", options, torch.float32)
-    monkeypatch.setattr(bins, "LIMIT", 20)
+    monkeypatch.setattr(tiling, "MAX_INTERSECTIONS", 20)
     banded, banded_gradients = _run(draw, scene, pose, "pinhole", options, torch.float32)
     assert torch.equal(whole.sums, banded.sums)
     for name, gradient in gradients.items():  # sums of slots, here first by band

@@ -1,0 +1,264 @@
+"""What the CPU kernels run on: compilation by numba, worker threads, and working memory that is reused.
+
+Compiled code is cached on disk, in numba's cache directory, so each kernel is compiled once per machine.
+"""
+
+import contextlib
+import gc
+import hashlib
+import inspect
+import itertools
+import os
+import re
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import Any
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+import torch
+from numba.core import event, types
+
+_PACKAGE = __name__.rpartition(".")[0]
+_IMPORT = re.compile(rf"^(?:from|import) {re.escape(_PACKAGE)}(?:\.(\w+)| import ([\w, ]+))", re.MULTILINE)
+
+# --- compilation ---
+
+_OPTIONS = {
+    "nogil": True,
+    "error_model": "numpy",  # no check for division by zero
+    "boundscheck": False,
+    "no_cfunc_wrapper": True,  # the kernels are not called from C
+    "fastmath": {"contract", "nsz"},  # no reassociation: results do not depend on the number of threads
+}
+_MESSAGE = "pansplat: compiling the rasteriser for this processor, once (15 to 30 seconds)"
+_MESSAGE_DELAY = 1.0  # seconds of compilation before the message
+_message_shown = False
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compile a function at its first call, to run without the interpreter lock, and cache the code on disk.
+
+    Without a writable cache directory the function is compiled once per process.
+    """
+    function = inspect.unwrap(function)  # the tests' annotation checks wrap every function
+    try:
+        compiled: Any = nb.njit(cache=True, **_OPTIONS)(function)
+    except RuntimeError:  # no writable cache directory
+        return nb.njit(**_OPTIONS)(function)
+    # Numba invalidates by the kernel's own file; the functions inlined into it come from others.
+    compiled._cache._cache_file._source_stamp = _hash_sources(Path(inspect.getfile(function)))
+    return compiled
+
+
+def _hash_sources(module: Path) -> str:
+    """Hash of a module's source and of the modules of this package that it imports, directly or not."""
+    sources, pending = {}, [module]
+    while pending:
+        path = pending.pop()
+        if path not in sources and path.exists():
+            sources[path] = path.read_bytes()
+            names = " ".join("".join(groups) for groups in _IMPORT.findall(sources[path].decode()))
+            pending += [Path(__file__).with_name(f"{name}.py") for name in re.findall(r"\w+", names)]
+    texts = (sources[path] for path in sorted(sources, key=lambda path: path.name))
+    return hashlib.sha256(b"\0".join(texts)).hexdigest()
+
+
+def inline_kernel(function: Callable[..., Any]) -> Any:
+    """Compile a function into each kernel that calls it."""
+    return _inline(function)
+
+
+def inline_kernel_no_refcount(function: Callable[..., Any]) -> Any:
+    """Like `inline_kernel`, without reference counts on array arguments; the function must not return an array."""
+    return _inline(function, _nrt=False)
+
+
+def _inline(function: Callable[..., Any], **options: Any) -> Any:
+    options = {"forceinline": True, "no_cpython_wrapper": True, **options, **_OPTIONS}
+    compiled: Any = nb.njit(**options)(inspect.unwrap(function))
+    # Numba would compile one version per literal argument; LLVM propagates these constants anyway.
+    resolve = compiled.get_call_template
+    compiled.get_call_template = lambda args, kws: resolve(
+        tuple(types.unliteral(kind) for kind in args), {name: types.unliteral(kind) for name, kind in kws.items()}
+    )
+    return compiled
+
+
+@contextlib.contextmanager
+def announce_compilation() -> Iterator[None]:
+    """Print a message on stderr, once per process, if kernels are compiled inside for more than a second."""
+    listener = _CompileListener()
+    with event.install_listener("numba:compile", listener):
+        try:
+            yield
+        finally:
+            listener.stop()
+
+
+class _CompileListener(event.Listener):
+    """Schedules the message when the first kernel of this package is compiled, and pauses garbage collection.
+
+    Compilation makes millions of objects and little garbage; collection would take a tenth of the time.
+    """
+
+    def __init__(self) -> None:
+        self._timer: threading.Timer | None = None
+        self._collection_paused = False
+
+    def on_start(self, event: event.Event) -> None:
+        data: Any = event.data
+        is_ours = data["dispatcher"].py_func.__module__.startswith(_PACKAGE)
+        if is_ours and self._timer is None:
+            self._timer = threading.Timer(_MESSAGE_DELAY, _show_message)
+            self._timer.daemon = True
+            self._timer.start()
+            self._collection_paused = gc.isenabled()
+            gc.disable()
+
+    def on_end(self, event: event.Event) -> None:
+        """Nothing: the delay counts from the first of several kernels."""
+
+    def stop(self) -> None:
+        """Cancel the message and resume garbage collection."""
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._collection_paused:
+            gc.enable()
+
+
+def _show_message() -> None:
+    global _message_shown
+    if not _message_shown:
+        _message_shown = True
+        print(_MESSAGE, file=sys.stderr, flush=True)
+
+
+# --- worker threads ---
+
+_pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
+
+
+def thread_count() -> int:
+    """Number of threads to use: as many as torch's operations may use."""
+    return max(1, torch.get_num_threads())
+
+
+def parallel_for(work: Callable[[int], object], count: int, threads: int) -> None:
+    """Call `work` with 0 .. count - 1 on several threads, the calling thread included; each takes the next item.
+
+    Items must be independent: which thread takes which is not fixed. An exception, KeyboardInterrupt included, is
+    raised after all threads have stopped, so that no thread writes to a buffer that the caller has released.
+    """
+    threads = min(threads, count)
+    if threads <= 1:
+        for item in range(count):
+            work(item)
+        return
+    items = itertools.count()  # `next` is atomic
+    stopped = False
+
+    def run() -> None:
+        while not stopped and (item := next(items)) < count:
+            work(item)
+
+    futures: list[Future[None]] = []
+    try:
+        for _ in range(threads - 1):
+            futures.append(_pool(threads).submit(run))
+        run()
+    finally:
+        stopped = True
+        wait(futures)
+    for future in futures:
+        future.result()
+
+
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """The pool for this number of threads; a forked child makes its own, since threads do not survive a fork."""
+    key = os.getpid(), threads
+    pool = _pools.get(key)
+    if pool is None:
+        pool = _pools.setdefault(key, ThreadPoolExecutor(threads - 1, thread_name_prefix="pansplat"))
+    return pool
+
+
+# --- working memory ---
+#
+# Fresh pages cost as much time as a stage's arithmetic, because the system clears them; so blocks are reused.
+
+_MAX_BLOCK = 1 << 28  # bytes of a block that is kept for reuse
+_MAX_IDLE = 1 << 29  # bytes of all idle blocks
+_ALIGNMENT = 64  # bytes: a cache line
+
+_lock = threading.Lock()
+_idle: list[npt.NDArray[np.uint8]] = []
+_returned: deque[npt.NDArray[np.uint8]] = deque()  # not yet in `_idle`: a workspace may end while the lock is held
+
+
+class Workspace:
+    """Arrays that stay valid as long as this object lives; their memory is then reused by other workspaces."""
+
+    def __init__(self) -> None:
+        self._blocks: list[npt.NDArray[np.uint8]] = []
+
+    def array(self, shape: int | tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+        """An uninitialised array, aligned to a cache line."""
+        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+        block = _take_block(size) if size <= _MAX_BLOCK else np.empty(size + _ALIGNMENT, np.uint8)
+        if size <= _MAX_BLOCK:
+            self._blocks.append(block)
+        start = -block.ctypes.data % _ALIGNMENT
+        return block[start : start + size].view(dtype).reshape(shape)
+
+    def __del__(self) -> None:
+        _returned.extend(getattr(self, "_blocks", ()))  # torch.compile makes objects without calling __init__
+        if _lock.acquire(blocking=False):
+            try:
+                _collect_returned()
+            finally:
+                _lock.release()
+
+
+class _PooledArray:
+    """An array interface that holds its own workspace."""
+
+    def __init__(self, shape: int | tuple[int, ...], dtype: npt.DTypeLike) -> None:
+        self._workspace = Workspace()
+        self._array = self._workspace.array(shape, dtype)
+        self.__array_interface__ = self._array.__array_interface__
+
+
+def pooled_empty(shape: int | tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+    """An uninitialised array whose memory is reused after the last reference to it or to a view (torch's too)."""
+    return np.asarray(_PooledArray(shape, dtype))
+
+
+def _collect_returned() -> None:
+    """Move returned blocks to the idle ones and free the oldest beyond the limit; the caller holds the lock."""
+    while _returned:
+        _idle.append(_returned.popleft())
+    while sum(block.nbytes for block in _idle) > _MAX_IDLE:
+        _idle.pop(0)
+
+
+def _take_block(size: int) -> npt.NDArray[np.uint8]:
+    """The smallest idle block that fits without wasting more than half, or a new one."""
+    with _lock:
+        _collect_returned()
+        fitting = [i for i, block in enumerate(_idle) if size + _ALIGNMENT <= block.nbytes <= 2 * size + 4096]
+        if fitting:
+            return _idle.pop(min(fitting, key=lambda i: _idle[i].nbytes))
+    return np.empty(size + _ALIGNMENT, np.uint8)
+
+
+def release_idle_memory() -> None:
+    """Free the memory that no workspace holds."""
+    with _lock:
+        _collect_returned()
+        _idle.clear()
