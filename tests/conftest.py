@@ -2,15 +2,20 @@
 
 import contextlib
 import importlib.util
+import json
 import os
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import safetensors.torch
 import torch
 from jaxtyping import config, install_import_hook
+from PIL import Image
+from torch import Tensor
 
 import pansplat.testing  # noqa: F401  # the hook names it
 
@@ -113,3 +118,60 @@ def unchecked() -> Iterator[None]:
     config.update("jaxtyping_disable", True)
     yield
     config.update("jaxtyping_disable", False)
+
+
+class SpherePredictor:
+    """One Gaussian per pixel, on a sphere of 2 m around each camera; counts its calls."""
+
+    def __init__(self, fingerprint: str = "1") -> None:
+        self.name, self.fingerprint, self.calls = "sphere", fingerprint, 0
+
+    def __call__(self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None, progress=None) -> Any:
+        from pansplat.gaussians.gaussians import Gaussians  # after the import hook
+        from pansplat.geometry.equirect import pixel_directions
+
+        self.calls += 1
+        view, _, height, width = images.shape
+        directions = pixel_directions(height, width, dtype=torch.float64).reshape(-1, 3)
+        count = len(directions)
+        return Gaussians(
+            means=torch.cat([2 * directions @ p[:3, :3].T + p[:3, 3] for p in cam2world.double()]).float(),
+            scales=torch.full((view * count, 3), 2 * 3.2 / height),
+            quats=torch.tensor([1.0, 0, 0, 0]).repeat(view * count, 1),
+            opacities=torch.full((view * count,), 0.9),
+            harmonics=((images.flatten(2).transpose(1, 2).reshape(-1, 1, 3) - 0.5) / 0.28209479).contiguous(),
+            levels=torch.zeros(view * count, dtype=torch.int64),
+            views=torch.arange(view).repeat_interleave(count),
+        )
+
+
+def _write_pair(folder: Path, *, height: int = 16, seed: int = 0) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    random = np.random.default_rng(seed)
+    poses = {}
+    for index, name in enumerate(("left.png", "right.png")):
+        Image.fromarray(random.integers(0, 255, (height, 2 * height, 3), dtype=np.uint8)).save(folder / name)
+        pose = np.eye(4)
+        pose[0, 3] = 0.5 * index
+        poses[name] = {"cam2world": pose.tolist()}
+    (folder / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def sphere_predictor() -> type[SpherePredictor]:
+    """The class of a predictor that needs no search."""
+    return SpherePredictor
+
+
+@pytest.fixture(scope="session")
+def write_pair() -> Callable[..., Path]:
+    """Write a pair of noise panoramas, 0.5 m apart, with poses.json."""
+    return _write_pair
+
+
+@pytest.fixture
+def pair_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A pair 16 pixels high; the user's cache folder lies beside it."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return _write_pair(tmp_path / "pair")

@@ -47,7 +47,7 @@ def run_predict(command: Predict) -> int:
 
 def _predict_to_file(command: Predict, pair: Pair, model: predictor.Predictor) -> int:
     """Write the prediction, tile by tile where it is large; how many Gaussians it has."""
-    if command.height > _HELD_HEIGHT and pipeline.streams(model):
+    if command.height > _HELD_HEIGHT and pipeline.can_stream(model):
         with progress_bar() as progress:
             return pipeline.predict_to_file(
                 pair,

@@ -270,7 +270,7 @@ def test_a_precision_reaches_the_model_wherever_one_predicts(
     arguments = ["--model", "sphere", "--precision", "bfloat16"]
     for command, out in (("predict", "x.ply"), ("render", "x.png")):
         assert run([command, str(room), "-o", str(tmp_path / out), *arguments]) == 2
-        assert "`precision` is for networks, and sphere is none" in capsys.readouterr().err
+        assert "`precision` is for networks, and sphere is not one" in capsys.readouterr().err
 
 
 def test_evaluate_writes_results_and_prints_the_table(

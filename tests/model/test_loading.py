@@ -137,7 +137,7 @@ def test_settings_that_contradict_each_other_are_refused() -> None:
 def test_choices_that_make_no_sense_are_refused(file: Path, unchecked: None) -> None:
     with pytest.raises(InputError, match="`compat` must be one of trained, official, fixed, got 'broken'"):
         load_model(file, compat="broken")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="`compat` is for networks, and sweep is none"):
+    with pytest.raises(InputError, match="`compat` is for networks, and sweep is not one"):
         load_model("sweep", compat="fixed")
     with pytest.raises(InputError, match="nothing there"):
         load_model(file.with_name("other.safetensors"))

@@ -1,0 +1,94 @@
+"""Predictions on disk, under a hash of everything that they depend on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import zlib
+from pathlib import Path
+
+import numpy as np
+import safetensors.torch
+
+from pansplat.atomic import replacing
+from pansplat.data.pairs import Pair
+from pansplat.data.views import Views
+from pansplat.errors import InputError
+from pansplat.gaussians.gaussians import Gaussians
+from pansplat.predictor import Predictor
+
+_FORMAT = "1"  # version of the file's layout; part of the hash
+_FIELDS = ("means", "scales", "quats", "opacities", "harmonics", "levels", "views")
+
+
+class CachedPrediction:
+    """The file that holds one prediction: safetensors and a CRC-32.
+
+    It lies in `.pansplat/` in the pair's folder, or in the user's cache folder where that cannot be written. Its name
+    holds a hash of the decoded pixels, masks, poses, depth range and the predictor's fingerprint.
+    """
+
+    def __init__(self, pair: Pair, views: Views, predictor: Predictor, height: int) -> None:
+        self._stem = f"{_file_name(pair.name)}-{_file_name(predictor.name)}-{height}-"
+        self._name = f"{self._stem}{_hash_inputs(views, predictor)}.scene"
+        self._folders = cache_folders(pair)
+
+    def read(self) -> Gaussians | None:
+        """The Gaussians of the first folder that has them; None if no file exists or all are damaged."""
+        for folder in self._folders:
+            gaussians = _read_gaussians(folder / self._name)
+            if gaussians is not None:
+                return gaussians
+        return None
+
+    def write(self, gaussians: Gaussians) -> None:
+        """Write to the first writable folder, if there is one, and delete outdated predictions there."""
+        tensors = {name: getattr(gaussians, name).detach().cpu().contiguous() for name in _FIELDS}
+        body = safetensors.torch.save(tensors)
+        for folder in self._folders:
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+                with replacing(folder / self._name) as unfinished, open(unfinished, "wb") as file:
+                    file.write(body)
+                    file.write(zlib.crc32(body).to_bytes(4, "little"))
+            except (OSError, InputError):
+                continue
+            for old in folder.glob("*.scene"):
+                if old.name.startswith(self._stem) and old.name != self._name:
+                    old.unlink(missing_ok=True)
+            return
+
+
+def cache_folders(pair: Pair) -> list[Path]:
+    """Folders that may hold a pair's predictions, preferred first."""
+    pair_hash = hashlib.blake2b(str(pair.folder.resolve()).encode(), digest_size=8).hexdigest()
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return [pair.folder / ".pansplat", Path(home) / "pansplat" / pair_hash]
+
+
+def _hash_inputs(views: Views, predictor: Predictor) -> str:
+    # Pixels are hashed, not files: a mask may depend on the folder's other panoramas, and a decoder may change.
+    digest = hashlib.blake2b(digest_size=16)
+    settings = [_FORMAT, list(views.images.shape), views.near, views.far, predictor.name, predictor.fingerprint]
+    digest.update(json.dumps(settings).encode())
+    for tensor in (views.images, views.cam2world.double(), views.masks):
+        digest.update(np.ascontiguousarray(tensor.detach().cpu().numpy()).data)
+    return digest.hexdigest()
+
+
+def _read_gaussians(path: Path) -> Gaussians | None:
+    try:
+        content = path.read_bytes()
+        body, checksum = content[:-4], int.from_bytes(content[-4:], "little")
+        if zlib.crc32(body) != checksum:
+            return None
+        tensors = safetensors.torch.load(body)
+        return Gaussians(*(tensors[name] for name in _FIELDS))
+    except (OSError, ValueError, KeyError, safetensors.SafetensorError):
+        return None
+
+
+def _file_name(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_.]+", "_", name)[:60]

@@ -1,0 +1,144 @@
+"""The prediction cache: what invalidates it, and that damage never reaches the user."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pansplat.cache import cache_folders
+from pansplat.gaussians.scene import Scene
+from pansplat.pipeline import load_pairs, predict
+
+HEIGHT = 16
+
+
+def same(a: Scene, b: Scene) -> bool:
+    fields = ("means", "scales", "quats", "opacities", "harmonics", "levels", "views")
+    return all(torch.equal(getattr(a.gaussians, f), getattr(b.gaussians, f)) for f in fields)
+
+
+def test_a_second_prediction_is_read_from_the_cache_bit_for_bit(pair_folder: Path, sphere_predictor) -> None:
+    predictor = sphere_predictor()
+    messages: list[str] = []
+    first = predict(pair_folder, predictor, height=HEIGHT)
+    second = predict(pair_folder, predictor, height=HEIGHT, progress=lambda what, _: messages.append(what))
+    assert predictor.calls == 1
+    assert same(first, second)
+    assert (second.names, second.near, second.far, second.model) == (
+        first.names,
+        first.near,
+        first.far,
+        first.model,
+    )
+    assert torch.equal(first.cam2world, second.cam2world)
+    assert messages == ["read from the cache"]
+    assert [p.suffix for p in (pair_folder / ".pansplat").iterdir()] == [".scene"]
+
+
+def repaint(folder: Path) -> None:
+    """Change one pixel by one grey level, the smallest change of an image."""
+    pixels = np.array(Image.open(folder / "right.png"))
+    pixels[3, 5, 1] ^= 1
+    Image.fromarray(pixels).save(folder / "right.png")
+
+
+def move(folder: Path) -> None:
+    content = json.loads((folder / "poses.json").read_text())
+    content["poses"]["right.png"]["cam2world"][0][3] += 1e-9
+    (folder / "poses.json").write_text(json.dumps(content))
+
+
+def set_range(folder: Path) -> None:
+    content = json.loads((folder / "poses.json").read_text())
+    (folder / "poses.json").write_text(json.dumps(content | {"far": 10.5}))
+
+
+def add_mask(folder: Path) -> None:
+    mask = np.full((HEIGHT, 2 * HEIGHT), 255, np.uint8)
+    mask[-2:] = 0
+    Image.fromarray(mask).save(folder / "left_mask.png")
+
+
+@pytest.mark.parametrize("change", [repaint, move, set_range, add_mask])
+def test_any_change_of_the_pair_causes_a_new_prediction(
+    pair_folder: Path, change: Callable[[Path], None], sphere_predictor
+) -> None:
+    predictor = sphere_predictor()
+    predict(pair_folder, predictor, height=HEIGHT)
+    change(pair_folder)
+    predict(pair_folder, predictor, height=HEIGHT)
+    assert predictor.calls == 2
+    assert len(list((pair_folder / ".pansplat").iterdir())) == 1  # the outdated file is deleted
+
+
+def test_another_predictor_or_height_causes_a_new_prediction(pair_folder: Path, sphere_predictor) -> None:
+    old, new = sphere_predictor("1"), sphere_predictor("2")
+    predict(pair_folder, old, height=HEIGHT)
+    predict(pair_folder, new, height=HEIGHT)
+    predict(pair_folder, new, height=2 * HEIGHT)
+    assert new.calls == 2
+
+
+def test_renamed_images_keep_the_prediction_and_get_their_new_names(pair_folder: Path, sphere_predictor) -> None:
+    predictor = sphere_predictor()
+    predict(pair_folder, predictor, height=HEIGHT)
+    (pair_folder / "right.png").rename(pair_folder / "other.png")
+    poses = (pair_folder / "poses.json").read_text().replace("right.png", "other.png")
+    (pair_folder / "poses.json").write_text(poses)
+    assert predict(pair_folder, predictor, height=HEIGHT).names == ("left", "other")
+
+
+@pytest.mark.parametrize("damage", ["truncate", "flip", "empty", "nonsense"])
+def test_a_damaged_cache_file_is_replaced(pair_folder: Path, damage: str, sphere_predictor) -> None:
+    predictor = sphere_predictor()
+    first = predict(pair_folder, predictor, height=HEIGHT)
+    (file,) = (pair_folder / ".pansplat").iterdir()
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 4
+    damaged = {
+        "truncate": file.read_bytes()[:-9],
+        "flip": bytes(content),
+        "empty": b"",
+        "nonsense": b"x" * 99,
+    }
+    file.write_bytes(damaged[damage])
+    assert same(predict(pair_folder, predictor, height=HEIGHT), first)
+    predict(pair_folder, predictor, height=HEIGHT)
+    assert predictor.calls == 2
+
+
+def test_cache_false_reads_and_writes_no_file(pair_folder: Path, sphere_predictor) -> None:
+    predictor = sphere_predictor()
+    for _ in range(2):
+        predict(pair_folder, predictor, height=HEIGHT, cache=False)
+    assert predictor.calls == 2 and not (pair_folder / ".pansplat").exists()
+
+
+def test_a_read_only_pair_is_cached_in_the_users_cache_folder(
+    pair_folder: Path, tmp_path: Path, sphere_predictor
+) -> None:
+    # A file in place of the folder makes it unwritable, for root too.
+    (pair_folder / ".pansplat").write_text("")
+    predictor = sphere_predictor()
+    first = predict(pair_folder, predictor, height=HEIGHT)
+    assert same(predict(pair_folder, predictor, height=HEIGHT), first)
+    assert predictor.calls == 1
+    assert len(list((tmp_path / "cache" / "pansplat").rglob("*.scene"))) == 1
+
+
+def test_predict_works_without_a_writable_cache_folder(pair_folder, tmp_path, sphere_predictor) -> None:
+    (pair_folder / ".pansplat").write_text("")
+    (tmp_path / "cache").write_text("")
+    assert len(predict(pair_folder, sphere_predictor(), height=HEIGHT).gaussians)
+
+
+def test_loaded_views_are_not_cached(pair_folder: Path, sphere_predictor) -> None:
+    predictor = sphere_predictor()
+    pair = load_pairs(pair_folder)[0]
+    views = pair.load_context(HEIGHT)
+    assert same(predict(views, predictor), predict(pair, predictor, height=HEIGHT, cache=False))
+    assert not any(folder.exists() for folder in cache_folders(pair))
