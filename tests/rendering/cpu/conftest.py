@@ -213,7 +213,7 @@ def make_case(pose: Tensor) -> Callable[..., Case]:
             intersections,
             np.arange(0, tiles * count + 1, count) if count else np.zeros(tiles + 1, np.int64),
             slots,
-            plane,
+            tables,
             torch.nn.functional.pad(points, (0, 3 - points.shape[-1])),
             size,
         )
