@@ -1,6 +1,6 @@
 """What every backend of the rasteriser is given, and what it gives back.
 
-Source: docs/rendering.md; docs/adr/0005 tells why there are several.
+Source: docs/rendering.md; docs/adr/0005 gives the reasons.
 """
 
 from dataclasses import dataclass, field
