@@ -19,8 +19,8 @@ void main() {
     float q = p * p + r * r;
     float front = v_l.x + dot(v_l.yz, delta);
     float response = q / (front * front + v_a.w * q);
-    float alpha = min(0.99, v_l.w * exp(-0.5 * response));
-    if (!(front > 0.0) || !(alpha >= 1.0 / 255.0)) discard;
+    float alpha = min(MAX_ALPHA, v_l.w * exp(-0.5 * response));
+    if (!(front > 0.0) || !(alpha >= ALPHA_CUT)) discard;
     out_color = vec4(v_color * alpha, alpha);
     out_depth = vec4(v_b.w * alpha, 0.0, 0.0, alpha);
 }

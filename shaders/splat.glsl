@@ -11,8 +11,6 @@ uniform float dilation;          // added to the projected covariance's diagonal
 uniform vec2 half_size;          // half the picture
 uniform float margin;            // added around the bounds, for the rasteriser's own rounding
 
-const float LEAST_ALPHA = 1.0 / 255.0;
-
 struct Gaussian {
     vec3 mean;
     float opacity;
@@ -72,7 +70,7 @@ bool footprint_ray(inout Footprint f, mat3 axes, vec3 n, vec3 u, vec3 v, vec3 b2
     // Dual cone D = n n' - kappa C' (section 5): the ellipse it cuts from the image plane has centre
     // (D_xz, D_yz) / D_zz and shape matrix (D_z D_z' - D_zz D_xy) / D_zz^2, expanded around n so that the large
     // terms cancel on paper and not in float32.
-    float kappa = 2.0 * log(f.opacity / LEAST_ALPHA);
+    float kappa = 2.0 * log(f.opacity / ALPHA_CUT);
     vec3 x = vec3(axes[0].x, axes[1].x, axes[2].x);
     vec3 y = vec3(axes[0].y, axes[1].y, axes[2].y);
     vec3 z = vec3(axes[0].z, axes[1].z, axes[2].z);
@@ -103,9 +101,9 @@ bool footprint_ray(inout Footprint f, mat3 axes, vec3 n, vec3 u, vec3 v, vec3 b2
 // The projected covariance at the (clamped) mean; `w2` holds the squared products of two relative scales and
 // `unit` the rotation, for a determinant without cancellation.
 bool footprint_ewa(inout Footprint f, mat3 axes, mat3 unit, vec3 n, vec3 w2) {
-    if (n.z <= 0.0 || f.radius * n.z <= 0.2 * near) return false;
+    if (n.z <= 0.0 || f.radius * n.z <= EWA_NEAR_FACTOR * near) return false;
     f.base = n.xy / n.z;
-    vec2 t = clamp(f.base, -1.3 * half_size, 1.3 * half_size);
+    vec2 t = clamp(f.base, -EWA_CLAMP * half_size, EWA_CLAMP * half_size);
     vec3 j_x = vec3(1.0, 0.0, -t.x) / n.z, j_y = vec3(0.0, 1.0, -t.y) / n.z;
     vec3 x = j_x * axes, y = j_y * axes, normal = cross(j_x, j_y) * unit;
     float v_xx = dot(x, x), v_xy = dot(x, y), v_yy = dot(y, y);
@@ -124,7 +122,7 @@ bool footprint_ewa(inout Footprint f, mat3 axes, mat3 unit, vec3 n, vec3 w2) {
     f.l = vec3(1.0, 0.0, 0.0);
     f.thickness = 0.0;
     f.centre = f.base;
-    float kappa = 2.0 * log(f.opacity / LEAST_ALPHA);
+    float kappa = 2.0 * log(f.opacity / ALPHA_CUT);
     set_quad(f, kappa * v_xx, kappa * v_xy, kappa * v_yy);
     return true;
 }
@@ -149,7 +147,7 @@ bool project(Gaussian gaussian, out Footprint f) {
     float determinant = sharp + e2 * trace + e2 * e2;
     f.opacity = gaussian.opacity;
     if (compensate) f.opacity *= sqrt(sharp / determinant);
-    if (!(f.opacity >= LEAST_ALPHA)) return false;
+    if (!(f.opacity >= ALPHA_CUT)) return false;
     if (kernel == 1) return footprint_ewa(f, axes, unit, n, w2);
 
     float volume = k.x * k.y * k.z;

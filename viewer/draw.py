@@ -4,6 +4,7 @@ import moderngl
 import numpy as np
 from jaxtyping import UInt
 
+from pansplat.constants import FILTER_VARIANCE
 from pansplat.errors import InputError
 from pansplat_viewer.pinhole import Pinhole
 from pansplat_viewer.programs import RECORD, RECORD_BYTES, Programs, set_uniforms
@@ -33,9 +34,8 @@ def choose_tier(ctx: moderngl.Context, tier: str) -> str:
 def filter_of(settings: DrawSettings, focal: float) -> tuple[float, float]:
     """(e^2, dilation) of docs/rendering.md, section 2, in image-plane units squared."""
     pixel = 1.0 / (focal * focal)
-    if settings.lowpass == "angular":
-        return 0.1 * pixel, 0.0
-    return (0.0, 0.3 * pixel) if settings.kernel == "ewa" else (0.3 * pixel, 0.0)
+    variance = FILTER_VARIANCE[settings.lowpass] * pixel
+    return (0.0, variance) if (settings.lowpass, settings.kernel) == ("3dgs", "ewa") else (variance, 0.0)
 
 
 class SplatDrawer:

@@ -8,19 +8,28 @@ from typing import Any
 
 import moderngl
 
+from pansplat import constants
+
 _INCLUDE = re.compile(r'^#include "([^"]+)"$', re.MULTILINE)
+
+_SHARED = ("ALPHA_CUT", "MAX_ALPHA", "EWA_NEAR_FACTOR", "EWA_CLAMP")
 
 # The members of one record, in the order of shaders/project.vert and project.comp.
 RECORD = ("quad_1", "quad_2", "response_a", "response_b", "response_l", "color")
 RECORD_BYTES = 16 * len(RECORD)
 
 
-def source(name: str, version: int, **defines: int) -> str:
-    """A shader file's text with its includes, constants and `#version` line for GL `version` (330 or 430)."""
+def source(name: str, version: int, **defines: float) -> str:
+    """A shader file's text with its includes, constants and `#version` line for GL `version` (330 or 430).
+
+    Args:
+        defines: further constants, beside those of `pansplat.constants` that shaders share.
+    """
+    defines = {key: getattr(constants, key) for key in _SHARED} | defines
     folder = resources.files("pansplat_viewer.shaders")
     text = _INCLUDE.sub(lambda match: (folder / match[1]).read_text("utf-8"), (folder / name).read_text("utf-8"))
-    constants = "".join(f"#define {key} {value}\n" for key, value in defines.items())
-    return f"#version {version} core\n{constants}{text}"
+    lines = "".join(f"#define {key} {value}\n" for key, value in defines.items())
+    return f"#version {version} core\n{lines}{text}"
 
 
 def set_uniforms(program: Any, **values: Any) -> None:

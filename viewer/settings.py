@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from pansplat.constants import NEAR
 from pansplat.errors import InputError
 
 Kernel = Literal["ray", "ewa"]
@@ -56,7 +57,7 @@ class DrawSettings:
     levels: frozenset[int] | None = None
     opacity_threshold: float = 0.0
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    near: float = 0.05
+    near: float = NEAR
     vertical_fov_degrees: float = 90.0
     layout: Layout = "pinhole"
     face_size: int | None = None

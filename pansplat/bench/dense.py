@@ -10,16 +10,16 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from pansplat.constants import ALPHA_CUT, FILTER_VARIANCE, MAX_ALPHA, NEAR
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.rendering.splats import ALPHA_CUT, observe
+from pansplat.rendering.splats import observe
 
 _SIDE = 16  # pixels of a block: close together, so that float32 keeps their differences
-_SPREAD = 0.1  # variance of the angular filter, pixels^2
 
 
 def render_dense(
-    gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], height: int, *, near: float = 0.05
+    gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], height: int, *, near: float = NEAR
 ) -> Float[Tensor, "channel height width"]:
     """A panorama on black by the exact kernel, radial order and angular filter; differentiable.
 
@@ -33,7 +33,7 @@ def render_dense(
     radius = torch.linalg.vector_norm(gaussians.means.detach().double() - pose[:3, 3], dim=1)
     index = torch.argsort(radius, stable=True)
     gaussians = gaussians.select(index[radius[index] >= near])
-    spread = _SPREAD * (math.pi / height) ** 2
+    spread = FILTER_VARIANCE["angular"] * (math.pi / height) ** 2
     seen = observe(gaussians, None, pose, spread=spread, compensate=True, exact=True)
     splats = seen.forms, seen.along, seen.peak, seen.values[:, :-1]
     directions = pixel_directions(height, 2 * height, dtype=torch.float64)
@@ -66,7 +66,7 @@ def _block(
     front = 1 + front
     square = a * a + b * b
     q = square / (front.clamp_min(1e-3).square() + along[:, None] * square)
-    alpha = (peak[:, None] * torch.exp(-0.5 * q)).clamp_max(0.99)
+    alpha = (peak[:, None] * torch.exp(-0.5 * q)).clamp_max(MAX_ALPHA)
     alpha = torch.where((front > 0) & (alpha >= ALPHA_CUT), alpha, 0)
     behind = torch.cumprod(1 - alpha, dim=0)
     weights = alpha * torch.cat((torch.ones_like(behind[:1]), behind[:-1]))

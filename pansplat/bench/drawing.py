@@ -9,11 +9,11 @@ from torch import Tensor
 from pansplat.bench.cases import Case
 from pansplat.bench.dense import render_dense
 from pansplat.bench.gsplat_peer import render_gsplat
+from pansplat.constants import NEAR
 from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.rendering import rasterize
 
-NEAR = 0.05  # metres
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 _ON_CUDA = ("triton", "gsplat")
 

@@ -8,11 +8,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.bench.cases import Case
+from pansplat.constants import FILTER_VARIANCE
 from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.geometry.cubemap import face_poses
 from pansplat.geometry.pose import invert_pose
-from pansplat.rendering.backend import SPREAD
 from pansplat.rendering.stitching import stitch_faces
 
 
@@ -44,7 +44,7 @@ def render_gsplat(
         width=side,
         height=side,
         near_plane=near,
-        eps2d=SPREAD[case.filter],
+        eps2d=FILTER_VARIANCE[case.filter],
         sh_degree=gaussians.degree,
         packed=False,
         rasterize_mode="antialiased" if case.filter == "angular" else "classic",

@@ -9,15 +9,13 @@ from typing import Literal, Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
+from pansplat.constants import FILTER_VARIANCE
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.rendering.panorama import Picture
 
 Kernel = Literal["ray", "ewa"]
 Order = Literal["radial", "z"]
 Lowpass = Literal["angular", "3dgs"]
-
-SPREAD = {"angular": 0.1, "3dgs": 0.3}  # variance added by the filters, pixels^2
-EWA_NEAR = 0.2  # of `near`: where the classic renderer culls by depth
 
 
 @dataclass(frozen=True)
@@ -40,12 +38,12 @@ class Options:
 
     def spread(self, pixel_angle: float) -> float:
         """e^2 of docs/rendering.md: the variance added across the ray, radians^2."""
-        return SPREAD[self.lowpass] * pixel_angle**2 if self._widens else 0.0
+        return FILTER_VARIANCE[self.lowpass] * pixel_angle**2 if self._widens else 0.0
 
     @property
     def dilation(self) -> float:
         """Variance added to the projected covariance, pixels^2."""
-        return 0.0 if self._widens else SPREAD[self.lowpass]
+        return 0.0 if self._widens else FILTER_VARIANCE[self.lowpass]
 
     @property
     def _widens(self) -> bool:

@@ -9,14 +9,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.rendering.splats import ALPHA_CUT
+from pansplat.constants import ALPHA_CUT, KAPPA_MARGIN
 
 _EVERYTHING = 1e9  # pixels, far outside any picture
 
 
 def kappa(peak: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
     """Largest q at which alpha still reaches the cut; negative where it never does. Rounded up a little."""
-    return 2 * torch.log(peak.double().clamp_min(1e-30) / ALPHA_CUT) + 1e-5
+    return 2 * torch.log(peak.double().clamp_min(1e-30) / ALPHA_CUT) + KAPPA_MARGIN
 
 
 def pinhole_boxes(

@@ -14,14 +14,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pansplat.rendering.splats import ALPHA_CUT, Splats
+from pansplat.constants import ALPHA_CUT, ALPHA_CUT_ROUNDING, MAX_ALPHA
+from pansplat.rendering.splats import Splats
 from pansplat.rendering.tiles import TileLists
 from pansplat.threads import one_thread
 
 _BLOCK = 32  # Gaussians a step
 # Pixel-Gaussian pairs a step, few enough for the cache.
 _PAIRS = 32768
-_LARGEST_ALPHA = 0.99
 # Less light than this is none: float32 loses digits below 1e-38, and processors slow down.
 _DARK = 1e-20
 _VALUES = 11  # where a row's values begin, behind forms, along and peak
@@ -210,7 +210,7 @@ def _alphas(
 
 def _cut(alpha: Tensor) -> Tensor:
     """At most 0.99, and 0 below 1/255."""
-    return _above(alpha.clamp_max(_LARGEST_ALPHA), ALPHA_CUT * (1 - 1e-7))  # the cut itself is kept
+    return _above(alpha.clamp_max(MAX_ALPHA), ALPHA_CUT * (1 - ALPHA_CUT_ROUNDING))
 
 
 def _above(values: Tensor, floor: float) -> Tensor:

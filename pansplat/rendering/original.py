@@ -11,9 +11,9 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
+from pansplat.constants import EWA_NEAR_FACTOR
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.gaussians.harmonics_official import as_the_original_draws
-from pansplat.rendering.backend import EWA_NEAR
 from pansplat.rendering.rasterize import Backend, Rendering, rasterize
 
 KERNEL: dict[str, Any] = {"kernel": "ewa", "order": "z", "lowpass": "3dgs"}
@@ -46,7 +46,7 @@ def rasterize_as_original(
         layout="cubemap",
         face_size=size[0] // 2,
         stitching="official",
-        near=EWA_NEAR * near,
+        near=EWA_NEAR_FACTOR * near,
         backend=backend,
         **KERNEL,
     )

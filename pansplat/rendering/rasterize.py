@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pansplat.constants import NEAR
 from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.geometry.pose import orthonormal_error
@@ -76,7 +77,7 @@ def rasterize(
     lowpass: Lowpass = "angular",
     covariances: Float[Tensor, "n 3 3"] | None = None,
     background: Sequence[float] | Float[Tensor, "channel"] = (0.0, 0.0, 0.0),
-    near: float = 0.05,
+    near: float = NEAR,
     strict: bool = False,
     face_size: int | None = None,
     stitching: Stitching = "seamless",

@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pansplat.constants import EWA_NEAR_FACTOR
 from pansplat.gaussians.gaussians import Gaussians
-from pansplat.rendering.backend import EWA_NEAR, Drawn, Info, Kernel, Options
+from pansplat.rendering.backend import Drawn, Info, Kernel, Options
 from pansplat.rendering.bounds import equirect_boxes, ewa_boxes, kappa, pinhole_boxes
 from pansplat.rendering.composite import TilePixels, composite
 from pansplat.rendering.panorama import Picture
@@ -54,7 +55,7 @@ def _picture(
     """Sums of weight x (channels, distance, 1) over one picture, the number of Gaussians and of entries drawn."""
     z = (observed.direction.detach() @ picture.rotation[:, 2]) * observed.radius.detach()
     if options.kernel == "ewa":
-        ahead = z > EWA_NEAR * options.near
+        ahead = z > EWA_NEAR_FACTOR * options.near
         observed, z = Observed(*(field[ahead] for field in observed)), z[ahead]
     key = observed.radius.detach() if options.order == "radial" or picture.is_panorama else z
     splats, boxes = project(observed, picture, options)

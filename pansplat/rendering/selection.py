@@ -11,10 +11,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pansplat.constants import OPACITY_CUT
 from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.rendering.backend import Options
-from pansplat.rendering.splats import ALPHA_CUT, near_enough, sound
+from pansplat.rendering.splats import near_enough, sound
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +54,7 @@ def select_drawable(
     if options.strict and dropped:
         raise InputError(not_finite(gaussians, covariances, pose, options))
     close &= usable
-    keep = usable & ~close & (gaussians.opacities.detach() >= ALPHA_CUT * (1 - 1e-6))
+    keep = usable & ~close & (gaussians.opacities.detach() >= OPACITY_CUT)
     total, near = len(gaussians), int(close.sum())
     if not bool(keep.all()):
         gaussians = gaussians.select(keep)

@@ -12,14 +12,18 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from pansplat.constants import (
+    EWA_CLAMP,
+    MAX_MAGNITUDE,
+    MAX_SCALE_RATIO,
+    MIN_COMPENSATION,
+    MIN_EIGENVALUE_RATIO,
+    MIN_EWA_VARIANCE,
+)
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.gaussians.harmonics import evaluate
 from pansplat.geometry.pose import rotations_from_quats
 
-ALPHA_CUT = 1 / 255
-_LARGEST = 1e30
-_LARGEST_RATIO = 1e12  # of scale to distance; beyond it the products of section 2 could overflow
-_NEGATIVE = 1e-3  # smallest eigenvalue over the largest variance that rounding may leave (bfloat16 has 8 bits)
 _CHUNK = 1 << 17
 
 
@@ -63,7 +67,7 @@ def sound(gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None = Non
     shape = (gaussians.scales, gaussians.quats) if covariances is None else (covariances,)
     keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     for field in (gaussians.means, *shape, gaussians.opacities, gaussians.harmonics):
-        keep &= (field.detach().abs() < _LARGEST).reshape(len(keep), max(1, field[:1].numel())).all(dim=1)
+        keep &= (field.detach().abs() < MAX_MAGNITUDE).reshape(len(keep), max(1, field[:1].numel())).all(dim=1)
     return keep
 
 
@@ -74,13 +78,13 @@ def near_enough(
 ) -> Bool[Tensor, "n"]:
     """Which Gaussians are not absurdly large for their distance, and have a covariance that can be one."""
     if covariances is None:
-        return gaussians.scales.detach().double().abs().amax(dim=1) <= _LARGEST_RATIO * radius
+        return gaussians.scales.detach().double().abs().amax(dim=1) <= MAX_SCALE_RATIO * radius
     relative = covariances.detach().double() / radius.square()[:, None, None]
     largest = relative.diagonal(dim1=1, dim2=2).amax(dim=1)
     # Rounding to float32 or less makes a disc's smallest variance slightly negative; more than that is no covariance.
     finite = torch.where(torch.isfinite(relative), relative, 0)
     smallest = torch.linalg.eigvalsh(0.5 * (finite + finite.transpose(1, 2)))[:, 0]
-    return (largest <= _LARGEST_RATIO**2) & (smallest >= -_NEGATIVE * largest)
+    return (largest <= MAX_SCALE_RATIO**2) & (smallest >= MIN_EIGENVALUE_RATIO * largest)
 
 
 def observe(
@@ -149,7 +153,7 @@ def _observe_chunk(
     peak = opacities.double()
     if compensate:
         # The bound keeps the square root's slope finite; below it nothing reaches the alpha cut.
-        peak = peak * torch.sqrt((body.det_across / det_filtered).clamp_min(1e-12))
+        peak = peak * torch.sqrt((body.det_across / det_filtered).clamp_min(MIN_COMPENSATION))
     forms, along = covariance.new_zeros(len(means), 0, 3), torch.zeros_like(radius)
     if exact:
         along = (spread**2 * body.along + spread * body.mixed + body.det) / det_filtered
@@ -270,15 +274,15 @@ def ewa_splats(
     x, y, z = (observed.direction @ rotation).unbind(1)
     covariance = rotation.T @ observed.covariance @ rotation
     tan_x, tan_y = x / z, y / z
-    clamped_x = tan_x.clamp(-0.65 * width / focal, 0.65 * width / focal)
-    clamped_y = tan_y.clamp(-0.65 * height / focal, 0.65 * height / focal)
+    limit = 0.5 * EWA_CLAMP
+    clamped_x = tan_x.clamp(-limit * width / focal, limit * width / focal)
+    clamped_y = tan_y.clamp(-limit * height / focal, limit * height / focal)
     zero, one = torch.zeros_like(z), torch.ones_like(z)
     rows = torch.stack((one, zero, -clamped_x, zero, one, -clamped_y), dim=1).reshape(-1, 2, 3)
     jacobian = rows * (focal / z)[:, None, None]
     v = jacobian @ covariance @ jacobian.transpose(1, 2)
     v_xx, v_xy, v_yy = v[:, 0, 0] + dilation, v[:, 0, 1], v[:, 1, 1] + dilation
-    # Rounding can leave a needle's determinant at or below zero.
-    across = (v_yy - v_xy * v_xy / v_xx).clamp_min(1e-12)
+    across = (v_yy - v_xy * v_xy / v_xx).clamp_min(MIN_EWA_VARIANCE)
     first = torch.stack((1 / torch.sqrt(v_xx), zero, zero), dim=1)
     second = torch.stack((-v_xy / v_xx, one, zero), dim=1) / torch.sqrt(across)[:, None]
     forms = torch.stack((first, second, torch.zeros_like(first)), dim=1).to(dtype)

@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pansplat.constants import NEAR
 from pansplat.gaussians.gaussians import Gaussians
 from pansplat.gaussians.harmonics_official import as_the_original_draws
 from pansplat.geometry.blending import blend_weights
@@ -33,7 +34,6 @@ from pansplat.training.visibility import Region, visible
 
 _FACES = 6
 _STRIPS = 6  # as many as faces, each as much of the sphere
-_NEAR = 0.05  # metres, the rasteriser's own
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Drawing:
         self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], layers: Sequence[Layer]
     ) -> list[Bool[Tensor, "n"]]:
         """For each layer, the Gaussians that it is to be drawn of."""
-        options = Options(**self._kernel(), near=_NEAR, strict=False)
+        options = Options(**self._kernel(), near=NEAR, strict=False)
         seen = visible(gaussians, cam2world, self._regions(gaussians.means.device), options)
         return [
             seen[layer.part] if layer.view is None else seen[layer.part] & (gaussians.views == layer.view)
@@ -115,7 +115,7 @@ class Drawing:
             return torch.cat((picture.color, picture.alpha[None]))[:, first:end]
         pose = face_poses(cam2world.double())[layer.part]
         gaussians = self._of(gaussians, None)
-        picture = rasterize(gaussians, pose, size=(self.face_size,) * 2, layout="pinhole", near=_NEAR, **self._kernel())
+        picture = rasterize(gaussians, pose, size=(self.face_size,) * 2, layout="pinhole", near=NEAR, **self._kernel())
         return torch.cat((picture.color, picture.alpha[None]))
 
     def compose(
@@ -168,7 +168,7 @@ class Drawing:
 
     def _whole(self, gaussians: Gaussians, cam2world: Tensor) -> Rendering:
         if self.style == "panorama":
-            return rasterize(gaussians, cam2world, size=self.size, near=_NEAR)
+            return rasterize(gaussians, cam2world, size=self.size, near=NEAR)
         stitching = "official" if self.style == "original" else "seamless"
         return rasterize(
             gaussians,
@@ -177,7 +177,7 @@ class Drawing:
             layout="cubemap",
             face_size=self.face_size,
             stitching=stitching,
-            near=_NEAR,
+            near=NEAR,
             **self._kernel(),
         )
 

@@ -15,9 +15,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pansplat.constants import EWA_NEAR_FACTOR
 from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
-from pansplat.rendering.backend import EWA_NEAR, Drawn, Info, Options
+from pansplat.rendering.backend import Drawn, Info, Options
 from pansplat.rendering.cpu import tiling
 from pansplat.rendering.cpu.ewa import TOTALS, project, project_backward
 from pansplat.rendering.cpu.observe import PIECE, Camera, Fields, Observed, observe
@@ -270,7 +271,7 @@ def _place(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Records and boxes on a picture."""
     if options.kernel == "ewa":
-        return project(*scene, picture, options.dilation, EWA_NEAR * options.near, workspace, threads)
+        return project(*scene, picture, options.dilation, EWA_NEAR_FACTOR * options.near, workspace, threads)
     return scene[2].records, find_bounding_boxes(scene[2].records, picture, workspace, threads)
 
 

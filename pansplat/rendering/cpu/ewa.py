@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 
+from pansplat.constants import ALPHA_CUT, EWA_CLAMP, KAPPA_MARGIN, MIN_EWA_VARIANCE
 from pansplat.rendering.cpu import records as layout
 from pansplat.rendering.cpu.forms import dot
 from pansplat.rendering.cpu.observe import (
@@ -27,10 +28,10 @@ from pansplat.rendering.cpu.tiling import round_boxes
 from pansplat.rendering.panorama import Picture
 
 TOTALS = 10  # numbers that a picture passes back: gradients of n (world axes), of C (xx xy xz yy yz zz), of the level
-_NARROWEST = 1e-12  # pixel^2: rounding can leave a needle's determinant at or below zero
-_LIMIT = 0.65  # of the picture's side over the focal length: 1.3 half sides
-_LOG_CUT = math.log2(255)
-_SLACK = 1e-5  # added to kappa
+_NARROWEST = MIN_EWA_VARIANCE
+_LIMIT = 0.5 * EWA_CLAMP  # of the picture's side over the focal length: 1.3 half sides
+_LOG_CUT = math.log2(1 / ALPHA_CUT)
+_SLACK = KAPPA_MARGIN
 
 # Rows of a block, after those of observe.py.
 LEVEL = ROWS + 1

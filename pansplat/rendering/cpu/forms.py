@@ -11,12 +11,13 @@ covariance in the tangent frame u, v, n together with the minors that float arit
 
 import math
 
+from pansplat.constants import MAX_SCALE_RATIO, MIN_COMPENSATION, MIN_EIGENVALUE_RATIO
 from pansplat.rendering.cpu.runtime import inline_kernel
 from pansplat.rendering.cpu.wide import either, fill_wide
 
-LEAST_RATIO = 1e-12  # of det B to det B': below it the compensated opacity never reaches the alpha cut
-_NEGATIVE = 1e-3  # smallest eigenvalue over the largest variance that rounding may leave
-LARGEST_RATIO = 1e12  # of scale to distance
+LEAST_RATIO = MIN_COMPENSATION
+_NEGATIVE = -MIN_EIGENVALUE_RATIO
+LARGEST_RATIO = MAX_SCALE_RATIO
 
 
 @inline_kernel

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pansplat.constants import MAX_MAGNITUDE, OPACITY_CUT
 from pansplat.rendering.cpu import records as layout
 from pansplat.rendering.cpu.columns import write_columns
 from pansplat.rendering.cpu.forms import (
@@ -46,9 +47,9 @@ PIECE = 8192
 CULLED = -128.0  # the level of a Gaussian that is not drawn
 DROPPED, NEAR = 0, 1  # columns of the tally
 
-_LARGEST = 1e30
+_LARGEST = MAX_MAGNITUDE
 _LARGEST_BITS = np.uint32(2 * int(np.float32(_LARGEST).view(np.uint32)))  # without the sign
-_FAINTEST = (1 - 1e-6) / 255
+_FAINTEST = OPACITY_CUT
 
 # Rows of a block: what is read, what is found, what is written.
 MEAN, SHAPE, OPACITY = 0, 3, 12  # SHAPE is a quaternion and three scales, or a covariance

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from pansplat.constants import ALPHA_CUT, MAX_ALPHA, TRANSMITTANCE_CUT
 from pansplat.rendering.cpu.bits import list_bits
 from pansplat.rendering.cpu.columns import columns_of
 from pansplat.rendering.cpu.forms import dot, tangent_frame
@@ -66,10 +67,10 @@ ALONG_ROW, LEVEL_ROW = 8, 9
 THIRD = 10  # third components of a, b, l and the point; only written and read where a tile or a Gaussian is wide
 FORMS = 14
 
-CUT = math.log2(1 / 255)  # least power: log2 of alpha
+CUT = math.log2(ALPHA_CUT)  # least power: log2 of alpha
 NOTHING = -1000.0  # a power far below
-MOST = 0.99
-CLOSED = 1e-7
+MOST = MAX_ALPHA
+CLOSED = TRANSMITTANCE_CUT["numba"]
 """A pixel takes nothing more once its transmittance is at or below this."""
 _MARGIN = 0.1
 MIN_PLANAR_COSINE = 0.5  # least cosine of the angle from a tile's middle at which forms have two components

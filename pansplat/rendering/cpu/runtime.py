@@ -24,6 +24,8 @@ import numpy.typing as npt
 import torch
 from numba.core import event, types
 
+from pansplat import constants
+
 _PACKAGE = __name__.rpartition(".")[0]
 _IMPORT = re.compile(rf"^(?:from|import) {re.escape(_PACKAGE)}(?:\.(\w+)| import ([\w, ]+))", re.MULTILINE)
 
@@ -57,8 +59,8 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 
 def _hash_sources(module: Path) -> str:
-    """Hash of a module's source and of the modules of this package that it imports, directly or not."""
-    sources, pending = {}, [module]
+    """Hash of a module, of the modules of this package that it imports, directly or not, and of the constants."""
+    sources, pending = {}, [module, Path(constants.__file__)]
     while pending:
         path = pending.pop()
         if path not in sources and path.exists():

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pansplat.constants import ALPHA_CUT, KAPPA_MARGIN
 from pansplat.rendering.cpu import records as layout
 from pansplat.rendering.cpu.columns import read_columns
 from pansplat.rendering.cpu.forms import cross, dot
@@ -25,8 +26,8 @@ from pansplat.rendering.cpu.simd import element, prefetch, prefetch_to_write, pu
 from pansplat.rendering.panorama import Picture
 
 LARGEST_SIDE = 32767  # pixels; boxes are int16
-_SLACK = np.float32(1e-5)  # added to kappa
-_LOG_CUT = np.float32(math.log2(255))
+_SLACK = np.float32(KAPPA_MARGIN)
+_LOG_CUT = np.float32(math.log2(1 / ALPHA_CUT))
 
 # float32 is enough, for a margin covers its rounding. Bare numbers would make it float64.
 _ZERO, _ONE, _HALF, _PI = np.float32(0), np.float32(1), np.float32(0.5), np.float32(math.pi)

@@ -14,9 +14,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from pansplat.constants import EWA_NEAR_FACTOR
 from pansplat.errors import InputError
 from pansplat.gaussians.gaussians import Gaussians
-from pansplat.rendering.backend import EWA_NEAR, Drawn, Info, Options
+from pansplat.rendering.backend import Drawn, Info, Options
 from pansplat.rendering.panorama import Picture
 from pansplat.rendering.reference import in_picture, project
 from pansplat.rendering.selection import select_drawable
@@ -90,7 +91,7 @@ def _splats(observed: Observed, pictures: list[Picture], options: Options) -> tu
         if options.order == "z" and not picture.is_panorama:
             key = z
         if options.kernel == "ewa":
-            ahead = torch.nonzero(z > EWA_NEAR * options.near)[:, 0]
+            ahead = torch.nonzero(z > EWA_NEAR_FACTOR * options.near)[:, 0]
             box = _boxes(Observed(*(field[ahead] for field in fixed)), picture, options)
             touched = in_picture(box, picture)
             seen, box = ahead[touched], box[touched]

@@ -15,6 +15,7 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
+from pansplat.constants import ALPHA_CUT, ALPHA_CUT_ROUNDING, MAX_ALPHA, TRANSMITTANCE_CUT
 from pansplat.rendering.cuda.layout import TILE
 
 SIDE: tl.constexpr = tl.constexpr(TILE)
@@ -22,11 +23,11 @@ PIXELS: tl.constexpr = tl.constexpr(TILE * TILE)
 STEP: tl.constexpr = tl.constexpr(32)
 """Records between two looks at the transmittance."""
 
-SATURATED: tl.constexpr = tl.constexpr(1e-4)
+SATURATED: tl.constexpr = tl.constexpr(TRANSMITTANCE_CUT["triton"])
 """Transmittance of a tile's clearest pixel at which what lies behind is left out."""
 
-LARGEST_ALPHA: tl.constexpr = tl.constexpr(0.99)
-ALPHA_CUT: tl.constexpr = tl.constexpr((1 - 1e-7) / 255)  # the cut itself is kept
+LARGEST_ALPHA: tl.constexpr = tl.constexpr(MAX_ALPHA)
+LEAST_ALPHA: tl.constexpr = tl.constexpr(ALPHA_CUT * (1 - ALPHA_CUT_ROUNDING))
 _BITS: tl.constexpr = tl.constexpr(-0.72134752044448170368)  # exp(-q / 2) = 2^(q times this)
 
 
@@ -94,7 +95,7 @@ def fall_off(forms, along, TINY: tl.constexpr, AXES: tl.constexpr):
 @no_type_check
 def limit(raw):
     """An opacity at most 0.99, and 0 below 1/255."""
-    return tl.where(raw >= ALPHA_CUT, tl.minimum(raw, LARGEST_ALPHA), 0.0)
+    return tl.where(raw >= LEAST_ALPHA, tl.minimum(raw, LARGEST_ALPHA), 0.0)
 
 
 @triton.jit

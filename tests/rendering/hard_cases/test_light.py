@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from pansplat.rendering.splats import ALPHA_CUT
+from pansplat.constants import ALPHA_CUT
 
 _PINHOLE = {"layout": "pinhole", "lowpass": "3dgs"}
 
