@@ -5,7 +5,7 @@ from typing import Any
 
 __version__ = "0.1.0"
 
-# Resolved on first use, so that `import pansplat` (and `pansplat --help`) does not wait for torch.
+# Resolved at first use: `import pansplat` and `pansplat --help` must not import torch.
 _PUBLIC = {
     "Gaussians": "pansplat.gaussians.gaussians",
     "InputError": "pansplat.errors",

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all."""
+"""Atomic writing: a file appears complete or not at all."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from pansplat.errors import InputError
 
 @contextmanager
 def replacing(path: Path | str) -> Iterator[Path]:
-    """A temporary path beside `path`, with its suffix, that takes its place when the block ends well.
+    """Yield a temporary path that replaces `path` when the block succeeds.
 
-    When the block raises, the temporary file is removed and whatever was at `path` stays as it was.
+    The temporary file lies in the same folder and has the same suffix. If the block raises, it is removed and `path`
+    stays unchanged.
 
     Raises:
         InputError: the folder of `path` does not exist or cannot be written.

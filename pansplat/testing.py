@@ -1,4 +1,4 @@
-"""For tests: the run-time check of annotated shapes and types, switched on in tests/conftest.py."""
+"""Run-time checks of annotated shapes and types, enabled in tests/conftest.py."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 
 def check_types(function: _F) -> _F:
-    """Check a function's arguments and result against its annotations; an int will do where a float is named."""
+    """Check arguments and result of a function against its annotations; an int is accepted as a float."""
     return beartype(conf=BeartypeConf(is_pep484_tower=True))(function)

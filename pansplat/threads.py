@@ -1,4 +1,4 @@
-"""Keeping small operations on one core."""
+"""Single-threaded sections of torch code."""
 
 import contextlib
 import threading
@@ -13,10 +13,10 @@ _outside = 1
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Run torch's operations on the calling thread alone, then restore the number of threads.
+    """Run torch operations on the calling thread only, then restore the number of threads.
 
-    Operations on a few thousand numbers gain nothing from a second core, and on a busy machine each would
-    wait for it: 40 times slower was measured with three jobs on two cores. And sums are added up in one order.
+    Operations on a few thousand numbers do not benefit from a second core. On a busy machine they wait for it: three
+    jobs on two cores ran 40 times slower. One thread also fixes the order of summation.
     """
     global _inside, _outside
     with _lock:

@@ -1,4 +1,4 @@
-"""Fixtures every test may use."""
+"""Fixtures for all tests."""
 
 import contextlib
 import importlib.util
@@ -19,15 +19,14 @@ from torch import Tensor
 
 import pansplat.testing  # noqa: F401  # the hook names it
 
-# Triton reads this when it is first imported, which torch does by itself sooner or later; and its LLVM must be in
-# the process before Mesa's.
+# Triton reads this variable at its first import, and torch may import it. Its LLVM must be loaded before Mesa's.
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")
 with contextlib.suppress(ImportError):
     import triton  # noqa: F401
 
-# Annotated shapes and types are checked at every call; the hook must come before the rooms are imported.
-# Of the model not all are: numba cannot keep the compiled kernels of wrapped modules.
+# Check annotated shapes and types at every call; install the hook before the packages are imported.
+# Modules with numba kernels are left out: numba cannot cache kernels of wrapped modules.
 _NETWORK = (
     *("adapter", "auxiliary_heads", "checkpoint", "cost_volume", "feature_pyramid", "heads", "lattice", "layers"),
     *("loading", "mono_depth", "mvsplat", "network", "pansplat", "tiles", "transformer", "unet", "weights"),
@@ -48,7 +47,7 @@ _SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The ../shared folder of fixtures and data: must be there in CI, skips the test on a bare clone."""
+    """The ../shared folder of fixtures and data; without it the test fails in CI and is skipped elsewhere."""
     if not _SHARED.is_dir():
         if os.environ.get("CI"):
             pytest.fail("CI needs ../shared beside the checkout")
@@ -58,7 +57,7 @@ def shared() -> Path:
 
 @pytest.fixture(scope="session")
 def recipe(shared: Path) -> Callable[[str], dict[str, torch.Tensor]]:
-    """Weights by the golden recipe for a list of keys, such as "pansplat-512", under the original's names."""
+    """Make weights by the golden recipe for a list of keys, such as "pansplat-512", with official names."""
     source = importlib.util.spec_from_file_location("make_weights", shared / "golden" / "make_weights.py")
     assert source is not None and source.loader is not None
     module = importlib.util.module_from_spec(source)
@@ -66,7 +65,7 @@ def recipe(shared: Path) -> Callable[[str], dict[str, torch.Tensor]]:
 
     def make(keys: str) -> dict[str, torch.Tensor]:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ResourceWarning)  # the recipe leaves its file to the collector
+            warnings.simplefilter("ignore", ResourceWarning)  # the recipe does not close its file
             arrays = module.state_dict(shared / "golden" / f"state_dict_{keys}.tsv")
         return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
@@ -75,19 +74,19 @@ def recipe(shared: Path) -> Callable[[str], dict[str, torch.Tensor]]:
 
 @pytest.fixture(scope="session")
 def recipe_weights(recipe: Callable[[str], dict[str, torch.Tensor]]) -> dict[str, torch.Tensor]:
-    """All 993 tensors of the original PanSplat, without its prefix "encoder."; 200 MB, not to be changed."""
+    """The 993 tensors of the official PanSplat without the prefix "encoder."; 200 MB, read-only."""
     return recipe("pansplat-512")
 
 
 @pytest.fixture(scope="session")
 def mvsplat_weights(recipe: Callable[[str], dict[str, torch.Tensor]]) -> dict[str, torch.Tensor]:
-    """All 471 tensors of the original MVSplat baseline, without its prefix "encoder."; not to be changed."""
+    """The 471 tensors of the official MVSplat baseline without the prefix "encoder."; read-only."""
     return recipe("mvsplat-512")
 
 
 @pytest.fixture(scope="session")
 def as_lightning() -> Callable[[dict[str, torch.Tensor]], dict[str, object]]:
-    """A network's tensors as the original's training keeps them: prefixed, beside the state of the training."""
+    """Wrap tensors in a Lightning checkpoint like those of the official training."""
 
     def wrap(tensors: dict[str, torch.Tensor]) -> dict[str, object]:
         return {
@@ -104,7 +103,7 @@ def as_lightning() -> Callable[[dict[str, torch.Tensor]], dict[str, object]]:
 
 @pytest.fixture(scope="session")
 def golden(shared: Path) -> Callable[[str], dict[str, torch.Tensor]]:
-    """What the original computed: tensors of a fixture such as "pansplat_64x128_fp32attn" or "units"."""
+    """Load output of the official code: a fixture such as "pansplat_64x128_fp32attn" or "units"."""
 
     def load(name: str) -> dict[str, torch.Tensor]:
         return safetensors.torch.load_file(shared / "golden" / f"{name}.safetensors")
@@ -114,7 +113,7 @@ def golden(shared: Path) -> Callable[[str], dict[str, torch.Tensor]]:
 
 @pytest.fixture
 def unchecked() -> Iterator[None]:
-    """Without the run-time checks of annotations, as users run: for tests of what they are told."""
+    """Disable the run-time checks of annotations, for tests of error messages."""
     config.update("jaxtyping_disable", True)
     yield
     config.update("jaxtyping_disable", False)

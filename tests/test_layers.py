@@ -1,4 +1,4 @@
-"""Imports only point down (.importlinter), and the proof would notice one that does not."""
+"""Imports only point down (.importlinter), and the check detects a violation."""
 
 import os
 import shutil
@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# file, planted import, what the report must name
+# file, planted import, expected line of the report
 PLANTS = [
     ("pansplat/errors.py", "import pansplat.geometry.pose", "pansplat.errors -> pansplat.geometry.pose"),
     (

@@ -1,4 +1,4 @@
-"""The wheel holds what it must and nothing else, and works where only it is installed."""
+"""The wheel contains both packages and nothing else, and works on its own."""
 
 import os
 import shutil
@@ -29,18 +29,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copytree(ROOT / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__"))
     for file in ("pyproject.toml", "README.md", "LICENSE", "setup.sh", "constraints.txt"):
         shutil.copy(ROOT / file, source)
-    build = [
-        sys.executable,
-        "-m",
-        "pip",
-        "wheel",
-        "--no-deps",
-        "--no-build-isolation",
-        "-qq",
-        "-w",
-        "dist",
-        ".",
-    ]
+    build = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "-qq", "-w", "dist", "."]
     done = subprocess.run(build, cwd=source, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     (made,) = (source / "dist").glob("*.whl")
@@ -49,7 +38,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the wheel installed, as in site-packages."""
+    """A folder with the installed wheel, as site-packages."""
     site = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "pip", "install", "--no-deps", "-qq", "--target", str(site), str(wheel)]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -58,12 +47,12 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run_in(site: Path, *command: str) -> subprocess.CompletedProcess[str]:
-    """Run with the installed wheel before this checkout's editable install."""
+    """Run a command with the installed wheel ahead of this checkout's editable install."""
     environment = os.environ | {"PYTHONPATH": str(site)}
     return subprocess.run(command, cwd=site.parent, env=environment, capture_output=True, text=True)
 
 
-def test_the_package_list_is_what_the_disk_holds() -> None:
+def test_the_package_list_equals_the_packages_on_disk() -> None:
     on_disk = {".".join(file.parent.relative_to(ROOT).parts) for file in (ROOT / "pansplat").rglob("__init__.py")} | {
         "pansplat_viewer",
         "pansplat_viewer.shaders",
@@ -77,7 +66,7 @@ def test_the_package_list_is_what_the_disk_holds() -> None:
     assert len(set(listed)) == len(listed)
 
 
-def test_the_wheel_holds_both_packages_and_nothing_else(wheel: Path) -> None:
+def test_the_wheel_contains_both_packages_and_nothing_else(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     version = project()["project"]["version"]
     assert {name.split("/")[0] for name in names} == {
@@ -88,7 +77,7 @@ def test_the_wheel_holds_both_packages_and_nothing_else(wheel: Path) -> None:
     assert not [name for name in names if "test_" in name or "conftest" in name or "__pycache__" in name]
 
 
-def test_the_wheel_holds_every_module_and_shader(wheel: Path) -> None:
+def test_the_wheel_contains_every_module_and_shader(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     needed = {"pansplat/py.typed"}
     for package, folder in FOLDERS.items():
@@ -99,13 +88,13 @@ def test_the_wheel_holds_every_module_and_shader(wheel: Path) -> None:
     assert any(name.endswith((".frag", ".glsl")) for name in needed)
 
 
-def test_the_version_is_one(wheel: Path) -> None:
+def test_package_and_project_have_the_same_version(wheel: Path) -> None:
     import pansplat
 
     assert project()["project"]["version"] == pansplat.__version__
 
 
-def test_an_installed_wheel_is_used_and_reads_its_shaders(installed: Path) -> None:
+def test_an_installed_wheel_reads_its_own_shaders(installed: Path) -> None:
     program = (
         "import pansplat, pansplat_viewer, pathlib, sys\n"
         "from importlib.resources import files\n"
@@ -127,19 +116,19 @@ def test_the_entry_points_of_an_installed_wheel_work(installed: Path, command: s
 
 
 def test_tests_pass_against_the_installed_wheel(installed: Path) -> None:
-    """Not only against the checkout: one room's tests, with the wheel's modules."""
+    """Run the tests of one module with the wheel instead of the checkout."""
     options = ["-q", "-p", "no:cacheprovider", "-c", str(ROOT / "pyproject.toml")]
     done = run_in(installed, sys.executable, "-m", "pytest", *options, str(ROOT / "tests/gaussians/test_ply.py"))
     assert done.returncode == 0, done.stdout
     assert " passed" in done.stdout
 
 
-def test_setup_pins_torch_and_names_no_missing_file() -> None:
+def test_setup_pins_every_direct_dependency() -> None:
     constraints = (ROOT / "constraints.txt").read_text().splitlines()
     assert "torch==2.13.0" in constraints
     pinned = {line.split("==")[0] for line in constraints if line and not line.startswith("#")}
     wanted = project()["project"]
     names = [*wanted["dependencies"], *wanted["optional-dependencies"]["dev"]]
     bare = {name.split(";")[0].split(">")[0].split("[")[0].strip().lower().replace("_", "-") for name in names}
-    assert not bare - pinned  # every direct dependency is a tested version
+    assert not bare - pinned
     assert subprocess.run(["bash", "-n", str(ROOT / "setup.sh")]).returncode == 0
