@@ -7,7 +7,7 @@ __version__ = "0.1.0"
 
 # Resolved at first use: `import pansplat` and `pansplat --help` must not import torch.
 _PUBLIC = {
-    "Gaussians": "pansplat.gaussians.gaussians",
+    "Gaussians": "pansplat.gaussians.scene",
     "InputError": "pansplat.errors",
     "Pair": "pansplat.data.pairs",
     "Rendering": "pansplat.rendering",

@@ -16,7 +16,7 @@ from pansplat.atomic import replacing
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.predictor import Predictor
 
 _FORMAT = "1"  # version of the file's layout; part of the hash

@@ -19,12 +19,9 @@ from pansplat.cache import CachedPrediction
 from pansplat.data.pairs import Pair, load_pairs
 from pansplat.data.views import Views
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians, no_gaussians
-from pansplat.gaussians.ply import load_ply, save_ply
-from pansplat.gaussians.ply_stream import save_ply_parts
-from pansplat.gaussians.prune import prune
-from pansplat.gaussians.scene import Scene
-from pansplat.geometry.blending import blend_weights
+from pansplat.gaussians.ply import load_ply, save_ply, save_ply_parts
+from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians, prune
+from pansplat.geometry.pose import blend_weights
 from pansplat.model.checkpoint import SUFFIXES, CompatChoice
 from pansplat.model.layers import Precision
 from pansplat.predictor import Predictor, Progress
@@ -162,7 +159,7 @@ def predict_to_file(
         views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress
     )
     pruned = (prune(part, degree=degree, min_opacity=min_opacity) for part in parts)
-    return save_ply_parts(_make_scene(no_gaussians(), views, predictor), pruned, path)
+    return save_ply_parts(_make_scene(empty_gaussians(), views, predictor), pruned, path)
 
 
 def can_stream(predictor: Predictor) -> bool:

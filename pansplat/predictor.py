@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 
 Progress = Callable[[str, float], None]  # what is being done, fraction of the whole in [0, 1]
 

@@ -126,7 +126,7 @@ class SpherePredictor:
         self.name, self.fingerprint, self.calls = "sphere", fingerprint, 0
 
     def __call__(self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None, progress=None) -> Any:
-        from pansplat.gaussians.gaussians import Gaussians  # after the import hook
+        from pansplat.gaussians.scene import Gaussians  # after the import hook
         from pansplat.geometry.equirect import pixel_directions
 
         self.calls += 1

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.gaussians.harmonics_official import as_the_original_draws
+from pansplat.gaussians.harmonics import official_harmonics
 from pansplat.gaussians.scene import Scene
 from pansplat.pipeline import load, load_model, predict, render, save
 from pansplat.rendering import blend, rasterize
@@ -86,7 +86,7 @@ def test_render_accepts_sizes_layouts_and_numpy_poses(scene: Scene) -> None:
 def test_original_drawing_uses_the_official_kernel_stitching_and_harmonics(scene: Scene) -> None:
     pose = scene.pose_between(0.5)
     drawn = render(scene, pose, blend="joint", size=(32, 64), drawing="original").color
-    bent = replace(scene.gaussians, harmonics=as_the_original_draws(scene.gaussians.harmonics))
+    bent = replace(scene.gaussians, harmonics=official_harmonics(scene.gaussians.harmonics))
     choices = {"kernel": "ewa", "order": "z", "lowpass": "3dgs", "stitching": "official", "face_size": 16}
     expected = rasterize(bent, pose, size=(32, 64), layout="cubemap", near=0.2 * scene.near, **choices).color
     assert torch.equal(drawn, expected)

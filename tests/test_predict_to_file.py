@@ -13,7 +13,7 @@ from PIL import Image
 from pansplat import pipeline
 from pansplat.cli import run, scenes
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.model import network
 from pansplat.model.adapter import AdapterConfig
 from pansplat.model.checkpoint import save_weights

@@ -112,7 +112,7 @@ def _terms(shot: Shot, least_weight: float) -> list[list[tuple[int | None, float
         )
     import torch
 
-    from pansplat.geometry.blending import blend_weights
+    from pansplat.geometry.pose import blend_weights
 
     weights = blend_weights(torch.from_numpy(shot.world_position.copy()), torch.from_numpy(positions))
     return [[(view, max(weight, least_weight)) for view, weight in enumerate(weights.tolist())]]

@@ -8,9 +8,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from pansplat.gaussians.gaussians import Gaussians
-from pansplat.gaussians.harmonics import basis
-from pansplat.gaussians.scene import Scene
+from pansplat.gaussians.harmonics import harmonics_basis
+from pansplat.gaussians.scene import Gaussians, Scene
 
 # Gaussians whose harmonics are evaluated at once: what fits the cache, and too little for torch to wake its
 # threads, which cost more than they give here.
@@ -108,7 +107,7 @@ class Splats:
         for start in range(0, len(self), _CHUNK):
             part = slice(start, start + _CHUNK)
             directions = torch.nn.functional.normalize(means[part] - centre, dim=-1)
-            values = np.ascontiguousarray(basis(directions, degree).numpy().T)
+            values = np.ascontiguousarray(harmonics_basis(directions, degree).numpy().T)
             sums = np.full((3, values.shape[1]), 0.5, np.float32)
             for value, coefficients in zip(values, self.harmonics, strict=True):
                 sums += value * coefficients[:, part]

@@ -11,7 +11,7 @@ from typing import Literal
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.backend import Kernel, Lowpass, Order
 from pansplat.rendering.panorama import Layout
 from pansplat.rendering.stitching import Stitching

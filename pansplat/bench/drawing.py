@@ -11,7 +11,7 @@ from pansplat.bench.dense import render_dense
 from pansplat.bench.gsplat_peer import render_gsplat
 from pansplat.constants import NEAR
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import rasterize
 
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")

@@ -10,7 +10,7 @@ from torch import Tensor
 from pansplat.bench.cases import Case
 from pansplat.constants import FILTER_VARIANCE
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.cubemap import face_poses
 from pansplat.geometry.pose import invert_pose
 from pansplat.rendering.stitching import stitch_faces

@@ -9,12 +9,16 @@ from torch import Tensor
 from pansplat.bench.scenes import NUM_LEVELS, disc_sizes, flat_discs
 from pansplat.data.views import Views
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
-from pansplat.gaussians.harmonics import basis
-from pansplat.gaussians.scene import Scene
-from pansplat.geometry.equirect import pixel_directions, sample_equirect, uv_from_directions
+from pansplat.gaussians.harmonics import harmonics_basis
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.equirect import (
+    pad_equirect,
+    pixel_directions,
+    resize_equirect,
+    sample_equirect,
+    uv_from_directions,
+)
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
-from pansplat.geometry.wrap import pad, resize
 
 
 def lift_depth(views: Views, *, seed: int = 0) -> Scene:
@@ -58,7 +62,7 @@ def _lift_level(
 ) -> Gaussians:
     height = image.shape[-2] >> level
     maps = torch.cat((image.double(), 1 / depth[None]))
-    maps = resize(maps[None], (height, 2 * height))[0]
+    maps = resize_equirect(maps[None], (height, 2 * height))[0]
     maps = torch.cat((maps, _normals(1 / maps[3])))
     rays = fibonacci_directions(lattice_size(2 * height))
     picked = sample_equirect(maps, uv_from_directions(rays)).T
@@ -71,7 +75,7 @@ def _lift_level(
         normals @ turn.T,
         disc_sizes(len(rays), generator),
         distance * math.pi / height,
-        ((picked[:, :3] - 0.5) / basis(rays, 0))[:, None, :],
+        ((picked[:, :3] - 0.5) / harmonics_basis(rays, 0))[:, None, :],
         level,
         view,
     )
@@ -80,7 +84,7 @@ def _lift_level(
 def _normals(depth: Float[Tensor, "height width"]) -> Float[Tensor, "3 height width"]:
     """Unit normals of the surface, from its points in the neighbouring pixels."""
     points = (pixel_directions(*depth.shape, dtype=torch.float64) * depth[..., None]).permute(2, 0, 1)
-    around = pad(points, 1, "sphere")
+    around = pad_equirect(points, 1, "sphere")
     east = around[:, 1:-1, 2:] - around[:, 1:-1, :-2]
     south = around[:, 2:, 1:-1] - around[:, :-2, 1:-1]
     return torch.nn.functional.normalize(torch.linalg.cross(east, south, dim=0), dim=0)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pansplat.bench.cases import Case, Group, Subject, choices, default_face_size, official
 from pansplat.bench.scenes import full_lattice_room, lattice_room_size
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
 
 DENSE_HEIGHT = 64  # what a renderer without tiles can bear

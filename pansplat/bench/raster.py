@@ -22,7 +22,7 @@ from pansplat.bench.fidelity import fidelity
 from pansplat.bench.measure import Took, median, peak_memory, seconds, spread
 from pansplat.bench.rows import Row, write_rows
 from pansplat.bench.work import BACKWARD_OPERATIONS, FORWARD_OPERATIONS, Work, panorama_work
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.backend import Options
 
 Watch = Callable[[str, "list[Row]"], None]

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.backend import Options
 from pansplat.rendering.bounds import equirect_boxes, kappa
 from pansplat.rendering.panorama import pictures

@@ -10,11 +10,9 @@ from pansplat.cli.commands import Evaluate, LpipsChoice
 from pansplat.cli.printing import table_console
 from pansplat.cli.scenes import progress_bar, require_height
 from pansplat.errors import InputError
-from pansplat.evaluation.lpips import SMALLEST, Backbone, Lpips
-from pansplat.evaluation.lpips_files import first_available, load_lpips
-from pansplat.evaluation.protocol import ProtocolOptions, methods_of, run_protocol
-from pansplat.evaluation.protocol_report import notes, rich_tables, write_report
-from pansplat.evaluation.score import Blend, Method
+from pansplat.evaluation.lpips import SMALLEST, Backbone, Lpips, first_available, load_lpips
+from pansplat.evaluation.protocol import Blend, Method, ProtocolOptions, methods_of, run_protocol
+from pansplat.evaluation.tables import notes, rich_tables, write_report
 from pansplat.model.checkpoint import SUFFIXES
 
 _WIDTH = 150  # characters, where there is no terminal

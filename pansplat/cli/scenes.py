@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from pansplat import pipeline
 from pansplat.cli.commands import PairChoice, Predict, Render
 from pansplat.errors import InputError
-from pansplat.gaussians.prune import prune
+from pansplat.gaussians.scene import prune
 
 if TYPE_CHECKING:
     from pansplat import predictor

@@ -1,24 +1,34 @@
-"""LPIPS: how different two pictures look, as the activations of an image classifier tell.
+"""LPIPS: the perceptual distance of two images, from the activations of an image classifier.
 
 The classifiers (VGG-16, AlexNet, SqueezeNet 1.1) and the weights of their channels are read from the user's files;
-nothing is fetched. Layers are numbered as torchvision numbers them, so that its files fit.
+nothing is downloaded. Layers have the numbers of torchvision, so that its files fit.
+
+Large images are processed in bands of rows: the activations of a 4K image and their gradient would take 30 GB. A block
+of the classifier (the convolutions between two poolings) reads as many rows beyond a band as it has convolutions. A
+band of a block's output is therefore computed with that many additional rows, which are then cut off. The backward
+pass computes each band again.
 
 Source: Zhang et al., The unreasonable effectiveness of deep features as a perceptual metric, CVPR 2018, equation 1;
-version 0.1 of its weights. OFFICIAL.md, sections 11 and 13: the paper's figures are those of VGG.
+version 0.1 of its weights. docs/official.md, sections 11 and 13: the paper's figures are those of VGG.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Literal
+import itertools
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.utils.checkpoint import checkpoint
 
 from pansplat.errors import InputError
-from pansplat.evaluation.lpips_bands import banded_distances, distances
+from pansplat.model.checkpoint import read_checkpoint
 
 Backbone = Literal["vgg", "alex", "squeeze"]
 
@@ -173,3 +183,175 @@ def _squeeze() -> nn.Sequential:
 
 
 _LAYERS = {"vgg": _vgg, "alex": _alex, "squeeze": _squeeze}
+
+
+_FLOOR = 1e-20  # squared length of a pixel's activations: none at all has a direction of zeros, and a gradient
+
+
+def distances(
+    a: Float[Tensor, "batch channel height width"],
+    b: Float[Tensor, "batch channel height width"],
+    head: Float[Tensor, "channel"],
+) -> Float[Tensor, "batch height width"]:
+    """How far the directions of two pictures' activations are apart at each pixel, channels weighed by `head`."""
+    return torch.einsum("bchw,c->bhw", (_directions(a) - _directions(b)).square(), head)
+
+
+def banded_distances(
+    a: Float[Tensor, "batch channel height width"],
+    b: Float[Tensor, "batch channel height width"],
+    layers: nn.Sequential,
+    heads: Iterable[Float[Tensor, "_"]],
+    pixels: int,
+) -> Iterator[Float[Tensor, "batch _ _"]]:
+    """`distances` after each block of a classifier of 3x3 convolutions with a margin, rectifiers and 2x2 poolings.
+
+    Args:
+        heads: one a block.
+        pixels: of a band, at the resolution of its block.
+    """
+    needs_gradient = torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)
+    for block, head in zip(_blocks(layers), heads, strict=True):
+        height, width = a.shape[-2:]
+        rows = max(2, pixels // width // 2 * 2)  # even: a pooling's rows stay together
+        parts = []
+        for first in range(0, height, rows):
+            given = (block, a, b, head, first, min(first + rows, height))
+            parts.append(
+                checkpoint(_band, *given, use_reentrant=False, preserve_rng_state=False)
+                if needs_gradient
+                else _band(*given)
+            )
+        a, b = (torch.cat([part[i] for part in parts], dim=2) for i in (0, 1))
+        yield torch.cat([part[2] for part in parts], dim=1)
+
+
+def _blocks(layers: nn.Sequential) -> list[nn.Sequential]:
+    """The layers up to each pooling, and those after the last."""
+    ends = [index + 1 for index, layer in enumerate(layers) if isinstance(layer, nn.MaxPool2d)]
+    bounds = [0, *ends, len(layers)]
+    return [layers[start:end] for start, end in itertools.pairwise(bounds)]
+
+
+def _band(
+    block: nn.Sequential, a: Tensor, b: Tensor, head: Tensor, first: int, end: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Both pictures' rows for the next block, and the distances in this."""
+    pooling = block[-1] if isinstance(block[-1], nn.MaxPool2d) else nn.Identity()
+    convolving = block[:-1] if isinstance(block[-1], nn.MaxPool2d) else block
+    margin = sum(isinstance(layer, nn.Conv2d) for layer in convolving)
+    above, below = min(margin, first), min(margin, a.shape[2] - end)
+    a, b = (convolving(maps[:, :, first - above : end + below])[:, :, above : above + end - first] for maps in (a, b))
+    return (*(_pooled(pooling, maps) for maps in (a, b)), distances(a, b, head))
+
+
+def _pooled(pooling: nn.Module, maps: Tensor) -> Tensor:
+    """The last row of an odd number is lost, and it may be a band."""
+    is_lost = isinstance(pooling, nn.MaxPool2d) and maps.shape[2] == 1
+    return maps[:, :, :0, : maps.shape[3] // 2] if is_lost else pooling(maps)
+
+
+def _directions(maps: Float[Tensor, "batch channel height width"]) -> Float[Tensor, "batch channel height width"]:
+    """Activations divided by their length over the channels."""
+    return maps * (maps.square().sum(1, keepdim=True) + _FLOOR).rsqrt()
+
+
+FOLDER_VARIABLE = "PANSPLAT_LPIPS"
+"""Environment variable with the folder of the weights."""
+
+_CLASSIFIERS: dict[Backbone, str] = {
+    "vgg": "vgg16-397923af.pth",
+    "alex": "alexnet-owt-7be5be79.pth",
+    "squeeze": "squeezenet1_1-b8a52dc0.pth",
+}
+_PATTERNS: dict[Backbone, str] = {"vgg": "vgg16*.pth", "alex": "alexnet*.pth", "squeeze": "squeezenet1_1*.pth"}
+_CLASSIFIER_SITE = "https://download.pytorch.org/models/"
+_HEAD_FOLDERS = (".", "lpips_heads", "lpips", "v0.1")  # inside a folder of weights
+_HEAD_SITE = "https://github.com/richzhang/PerceptualSimilarity/tree/master/lpips/weights/v0.1"
+
+
+def load_lpips(backbone: Backbone, folder: Path | None = None) -> Lpips:
+    """LPIPS with its weights.
+
+    Args:
+        backbone: the paper's figures are those of "vgg".
+        folder: where to look first; then the folder that PANSPLAT_LPIPS names, the cache of torch.hub, and, for the
+            channels' weights, an installed `lpips` package.
+
+    Raises:
+        InputError: when a file is missing (it says which, where it is to be had and where it belongs) or damaged.
+    """
+    classifier, heads = find_classifier(backbone, folder), find_heads(backbone, folder)
+    if classifier is None or heads is None:
+        raise InputError(_what_to_fetch(backbone, folder, classifier, heads))
+    metric = Lpips(backbone)
+    state = {**_classifier_state(metric, classifier), **_head_state(backbone, heads)}
+    metric.load_state_dict(state)
+    return metric
+
+
+def first_available(folder: Path | None = None) -> Backbone | None:
+    """The first of vgg, alex and squeeze whose files are here; None when there are none."""
+    found = (b for b in get_args(Backbone) if find_classifier(b, folder) and find_heads(b, folder))
+    return next(found, None)
+
+
+def find_classifier(backbone: Backbone, folder: Path | None = None) -> Path | None:
+    """The file of torchvision's classifier: by its own name or one that begins alike."""
+    found = (path for place in _places(folder) for path in sorted(place.glob(_PATTERNS[backbone])))
+    return next(found, None)
+
+
+def find_heads(backbone: Backbone, folder: Path | None = None) -> Path | None:
+    """The lpips package's file of the channels' weights, such as vgg.pth."""
+    places = [place / inner for place in _places(folder) for inner in _HEAD_FOLDERS]
+    package = find_spec("lpips")
+    for root in (package.submodule_search_locations or ()) if package else ():
+        places.append(Path(root) / "weights" / "v0.1")
+    return next((path for place in places if (path := place / f"{backbone}.pth").is_file()), None)
+
+
+def _places(folder: Path | None) -> list[Path]:
+    named = os.environ.get(FOLDER_VARIABLE)
+    return [*([folder] if folder else []), *([Path(named).expanduser()] if named else []), _hub()]
+
+
+def _hub() -> Path:
+    return Path(torch.hub.get_dir()) / "checkpoints"
+
+
+def _what_to_fetch(backbone: Backbone, folder: Path | None, classifier: Path | None, heads: Path | None) -> str:
+    missing = []
+    if classifier is None:
+        missing.append(f"{_CLASSIFIERS[backbone]} (from {_CLASSIFIER_SITE}{_CLASSIFIERS[backbone]})")
+    if heads is None:
+        missing.append(f"{backbone}.pth (from {_HEAD_SITE}, or `pip install lpips`)")
+    looked = ", ".join(str(place) for place in _places(folder))
+    return (
+        f"LPIPS with {backbone} needed {' and '.join(missing)}, got no such file in {looked}; put it into {_hub()} or "
+        f"into a folder that --lpips-weights or {FOLDER_VARIABLE} names. Nothing is fetched by itself."
+    )
+
+
+def _classifier_state(metric: Lpips, path: Path) -> dict[str, Tensor]:
+    """The classifier's layers that the metric has; those that decide on a class are left."""
+    content = read_checkpoint(path)
+    wanted = {name: t for name, t in metric.state_dict().items() if name.startswith("features.")}
+    return {name: _tensor(content, name, wanted[name].shape, path) for name in wanted}
+
+
+def _head_state(backbone: Backbone, path: Path) -> dict[str, Tensor]:
+    content = read_checkpoint(path)
+    state = {}
+    for index, channels in enumerate(TAPS[backbone].values()):
+        weight = _tensor(content, f"lin{index}.model.1.weight", torch.Size((1, channels, 1, 1)), path)
+        state[f"heads.{index}"] = weight.flatten()
+    return state
+
+
+def _tensor(content: Mapping[str, object], name: str, shape: torch.Size, path: Path) -> Tensor:
+    tensor = content.get(name)
+    if not isinstance(tensor, Tensor) or tensor.shape != shape:
+        got = f"one of {tuple(tensor.shape)}" if isinstance(tensor, Tensor) else "none"
+        raise InputError(f"{path}: needed a tensor {name} of {tuple(shape)}, got {got}; fetch the file again.")
+    return tensor.float()

@@ -1,19 +1,23 @@
-"""How close a predicted panorama is to the real one.
+"""Image and depth metrics, and the cross-fade baseline.
 
-Source: PanSplat, section 4; the official implementation's protocol (OFFICIAL.md section 13), by value.
 Images are RGB; only PSNR clamps them to [0, 1]. Masks are True where a pixel counts.
+
+Source: PanSplat, section 4; the official protocol (docs/official.md, section 13), by value.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional
 
-from pansplat.geometry.equirect import row_weights
+from pansplat.geometry.equirect import rotate_equirect, row_weights
+from pansplat.geometry.pose import blend_weights
 
 _SSIM_SIGMA = 1.5  # pixels
 _SSIM_RADIUS = 5  # pixels: an 11 x 11 window
@@ -97,3 +101,55 @@ def _check(prediction: Tensor, target: Tensor, mask: Tensor | None) -> None:
         raise ValueError(f"`prediction` and `target` must both be (3, height, width), got {shapes}")
     if mask is not None and mask.shape != target.shape[1:]:
         raise ValueError(f"`mask` must be {tuple(target.shape[1:])}, got {tuple(mask.shape)}")
+
+
+@dataclass(frozen=True)
+class DepthErrors:
+    """Errors of one scene, all its views together; NaN where no pixel has a true depth.
+
+    Attributes:
+        abs_rel: mean of |error| / truth.
+        sq_rel: mean of error^2 / truth, metres.
+        rmse: root of the mean of error^2, metres.
+    """
+
+    abs_rel: float
+    sq_rel: float
+    rmse: float
+
+
+def depth_errors(
+    depth: Float[Tensor, "view h w"], true_depth: Float[Tensor, "view height width"], near: float, far: float
+) -> DepthErrors:
+    """Errors over the pixels whose true depth is strictly between `near` and `far`.
+
+    Args:
+        depth: radial, metres; made as large as the truth bilinearly, pixel centres at half-integers, not wrapping.
+        true_depth: radial, metres, 0 where unknown.
+    """
+    size = true_depth.shape[-2:]
+    large = functional.interpolate(depth[:, None].double(), size, mode="bilinear", align_corners=False)[:, 0]
+    known = (true_depth > near) & (true_depth < far)
+    if not known.any():
+        return DepthErrors(math.nan, math.nan, math.nan)
+    truth = true_depth[known].double()
+    error = large.to(truth)[known] - truth
+    return DepthErrors(
+        abs_rel=float((error.abs() / truth).mean()),
+        sq_rel=float((error.square() / truth).mean()),
+        rmse=math.sqrt(float(error.square().mean())),
+    )
+
+
+def cross_fade(
+    images: Float[Tensor, "view 3 height width"],
+    cam2world: Float[Tensor, "view 4 4"],
+    target: Float[Tensor, "4 4"],
+) -> Float[Tensor, "3 height width"]:
+    """The panorama at pose `target` as if everything were far away: inputs weighted by nearness."""
+    poses, target = cam2world.double(), target.double()
+    weights = blend_weights(target[:3, 3], poses[:, :3, 3]).to(images)
+    faded = torch.zeros_like(images[0])
+    for image, pose, weight in zip(images, poses, weights, strict=True):
+        faded += weight * rotate_equirect(image, pose[:3, :3].T @ target[:3, :3])
+    return faded

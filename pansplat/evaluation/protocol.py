@@ -1,48 +1,276 @@
-"""The evaluations of the paper, a table each, on whatever of their data is here.
+"""The paper's evaluations: test sets, the measurement of one case, and one table an evaluation.
 
-Source: PanSplat, section 4; OFFICIAL.md, section 13: figures of each target image, then their plain mean over a set.
+A test set has the name that the paper's tables give it. The figures are computed for each target image; a set's figure
+is their plain mean.
+
+Source: PanSplat, section 4; docs/official.md, sections 2.1 to 2.5 and 13.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
 import re
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pansplat import pipeline
 from pansplat.atomic import replacing
+from pansplat.data.frames import FrameSequence, read_draw
 from pansplat.data.images import write_image
+from pansplat.data.insta360 import read_insta360
+from pansplat.data.loc360 import read_loc360
+from pansplat.data.sample import Sample
+from pansplat.data.samplers import BoundedSampler, Draw
+from pansplat.data.triplets import TripletSet, panogrf_folder, read_panogrf
+from pansplat.data.views import Views
 from pansplat.errors import InputError
-from pansplat.evaluation.data_sets import (
-    INSTA360,
-    LOC360,
-    EvaluationCase,
-    EvaluationSet,
-    frame_distance_set,
-    panogrf_set,
-    sequence_set,
-    sequences_of,
-)
-from pansplat.evaluation.depth_metrics import DepthErrors
 from pansplat.evaluation.lpips import Lpips
-from pansplat.evaluation.report import error_picture, warm_up
-from pansplat.evaluation.score import (
-    Blend,
-    Drawn,
-    Method,
-    Score,
-    draw_targets,
-    mean_depth_errors,
-    measure_depth,
-    predict_case,
-)
+from pansplat.evaluation.metrics import DepthErrors, depth_errors, psnr, ssim, ws_psnr
+from pansplat.evaluation.report import error_image, warm_up
+from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.model.network import NetworkPredictor
 from pansplat.pipeline import Drawing
 from pansplat.predictor import Predictor, Progress
+
+LOC360, INSTA360 = "360Loc", "Insta360"
+
+_INSIDE = {  # where a data set may lie in the folder that is given
+    "panogrf": (".", "pano_grf", "datasets/pano_grf"),
+    LOC360: (".", "360Loc", "datasets/360Loc"),
+    INSTA360: (".", "insta360", "datasets/insta360"),
+}
+_SAMPLERS = {LOC360: BoundedSampler(2, 5), INSTA360: BoundedSampler(2, 30)}
+
+
+@dataclass(frozen=True)
+class EvaluationCase:
+    """One scene of a set: `read(height)` gives its inputs and targets."""
+
+    name: str
+    read: Callable[[int], Sample]
+
+
+@dataclass(frozen=True)
+class EvaluationSet:
+    """A test set.
+
+    Attributes:
+        name: as the paper's tables have it, such as "M3D 1.0 m".
+        cases: empty where the data is missing.
+        missing: what would have been needed, naming the folder; empty where it is here.
+    """
+
+    name: str
+    cases: tuple[EvaluationCase, ...] = ()
+    missing: str = ""
+
+
+def panogrf_set(root: Path, title: str, name: str, distance: float, height: int) -> EvaluationSet:
+    """Triplets of one kind and one distance (metres) from an input to the middle view."""
+    for inside in _INSIDE["panogrf"]:
+        try:
+            (triplets,) = read_panogrf(root / inside, "test", height, [(name, distance)])
+        except InputError:
+            continue
+        cases = [
+            EvaluationCase(source.name, functools.partial(_read_triplet, triplets, index))
+            for index, source in enumerate(triplets.sources)
+        ]
+        return EvaluationSet(title, tuple(cases))
+    wanted = panogrf_folder(root / "pano_grf", "test", name, distance, height)
+    return EvaluationSet(title, missing=f"{title}: needed PanoGRF's scenes in {wanted} (or in {root / wanted.name})")
+
+
+def _read_triplet(triplets: TripletSet, index: int, height: int) -> Sample:
+    pair = triplets.pair(index)
+    return Sample(pair.name, pair.load_context(height), pair.load_targets(height))
+
+
+def sequence_set(root: Path, name: str, draws: int = 100) -> EvaluationSet:
+    """`LOC360` or `INSTA360`: pairs spread evenly over each sequence, all frames between and at them as targets."""
+    sequences, missing = sequences_of(root, name)
+    return EvaluationSet(name, tuple(_cases(sequences, _SAMPLERS[name], draws)), missing)
+
+
+def frame_distance_set(sequences: Sequence[FrameSequence], gap: int, draws: int) -> EvaluationSet:
+    """Pairs of frames `gap` apart, spread evenly over each sequence, with the frame in the middle as target."""
+    long = [sequence for sequence in sequences if len(sequence.poses) > gap]
+    cases = tuple(_cases(long, BoundedSampler(gap, gap), draws, middle=True))
+    missing = "" if cases else f"{gap} frames apart: needed a sequence of more than {gap} frames"
+    return EvaluationSet(f"{gap} frames", cases, missing)
+
+
+def sequences_of(root: Path, name: str) -> tuple[Sequence[FrameSequence], str]:
+    """The sequences of `LOC360` (its test location) or `INSTA360`, and what is missing when there are none.
+
+    Raises:
+        InputError: when the data is there and wrong.
+    """
+    for inside in _INSIDE[name]:
+        folder = root / inside
+        if name == LOC360 and (folder / "atrium").is_dir():
+            return read_loc360(folder, "test"), ""
+        if name == INSTA360 and _has_videos(folder):
+            return read_insta360(folder), ""
+    if name == LOC360:
+        return [], f"{name}: needed {root / '360Loc' / 'atrium'} (mapping/*360*/camera_pose.json with image/ beside it)"
+    return [], f"{name}: needed {root / 'insta360' / 'VID_*'} (video.mp4 with frame_trajectory.txt beside it)"
+
+
+def _has_videos(folder: Path) -> bool:
+    return any(folder.glob("*.mp4")) or any(folder.glob("*/*.mp4"))
+
+
+def _cases(
+    sequences: Sequence[FrameSequence], sampler: BoundedSampler, draws: int, *, middle: bool = False
+) -> list[EvaluationCase]:
+    cases = []
+    for sequence in sequences:
+        for draw in sampler.evaluation(len(sequence.poses), draws):
+            if middle:
+                draw = Draw(draw.left, draw.right, (draw.targets[len(draw.targets) // 2],))
+            name = f"{sequence.name}-{draw.left:06d}-{draw.right:06d}"
+            cases.append(EvaluationCase(name, functools.partial(read_draw, sequence, draw)))
+    return cases
+
+
+Blend = Literal["joint", "deferred"]
+
+
+@dataclass(frozen=True)
+class Method:
+    """A predictor with the way its Gaussians are drawn: a row of a table.
+
+    Attributes:
+        blend: how the views' Gaussians are brought together.
+        drawing: see `pipeline.render`.
+    """
+
+    name: str
+    predictor: Predictor
+    blend: Blend
+    drawing: Drawing = "exact"
+
+
+@dataclass(frozen=True)
+class Score:
+    """Figures of one target: dB, SSIM, and LPIPS where its weights are here."""
+
+    case: str
+    target: str
+    ws_psnr: float
+    psnr: float
+    ssim: float
+    lpips: float | None
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a predictor makes of a case.
+
+    Attributes:
+        depth: radial, metres, of the inputs at the finest level that was swept; None where the predictor has none.
+        seconds: the prediction took.
+    """
+
+    scene: Scene
+    depth: Float[Tensor, "view _ _"] | None
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A target as drawn, with its figures."""
+
+    score: Score
+    picture: Float[Tensor, "3 height width"]
+    target: Float[Tensor, "3 height width"]
+    seconds: float
+
+
+def predict_case(context: Views, predictor: Predictor) -> Prediction:
+    """The scene of a case's inputs, and their depth where the predictor is a network."""
+    masks = None if bool(context.masks.all()) else context.masks
+    inputs = (context.images, context.cam2world, context.near, context.far)
+    began = time.perf_counter()
+    depth = None
+    if isinstance(predictor, NetworkPredictor):
+        gaussians, depths = predictor.predict_with_depths(*inputs, masks=masks)
+        depth = depths[-1]
+    else:
+        gaussians = predictor(*inputs, masks=masks)
+    seconds = time.perf_counter() - began
+    assert isinstance(gaussians, Gaussians)  # a list answers a batch only
+    scene = Scene(
+        gaussians,
+        context.cam2world,
+        near=context.near,
+        far=context.far,
+        names=context.names,
+        model=predictor.name,
+        height=context.images.shape[-2],
+    )
+    return Prediction(scene, depth, seconds)
+
+
+def draw_targets(
+    sample: Sample, prediction: Prediction, blend: Blend, lpips: Lpips | None, drawing: Drawing = "exact"
+) -> Iterator[Drawn]:
+    """Each target of the case, drawn and measured; nothing is clamped but for PSNR, nothing masked."""
+    for index, target in enumerate(sample.targets.images):
+        began = time.perf_counter()
+        with torch.no_grad():
+            pose, size = sample.targets.cam2world[index], (target.shape[-2], target.shape[-1])
+            drawn = pipeline.render(prediction.scene, pose, blend=blend, size=size, drawing=drawing)
+            picture = drawn.color.float()
+        seconds = time.perf_counter() - began
+        score = Score(
+            case=sample.name,
+            target=sample.targets.names[index],
+            ws_psnr=ws_psnr(picture, target),
+            psnr=psnr(picture, target),
+            ssim=ssim(picture, target),
+            lpips=None if lpips is None else lpips.of_pictures(picture, target),
+        )
+        yield Drawn(score, picture, target, seconds)
+
+
+def measure_depth(context: Views, prediction: Prediction) -> DepthErrors | None:
+    """Errors of the inputs' depth; None where there is no true depth.
+
+    A predictor without depth maps is measured by what its Gaussians draw at each input, from that input's own.
+    """
+    if context.depths is None:
+        return None
+    depth = prediction.depth
+    if depth is None:
+        size = (context.images.shape[-2], context.images.shape[-1])
+        with torch.no_grad():
+            drawn = [
+                pipeline.render(prediction.scene, pose, blend=view, size=size).depth
+                for view, pose in enumerate(context.cam2world)
+            ]
+        depth = torch.stack(drawn)
+    return depth_errors(depth, context.depths, context.near, context.far)
+
+
+def mean_depth_errors(errors: list[DepthErrors]) -> DepthErrors | None:
+    """Mean over the scenes; None where there are none."""
+    if not errors:
+        return None
+    names = [field.name for field in dataclasses.fields(DepthErrors)]
+    return DepthErrors(*(sum(getattr(error, name) for error in errors) / len(errors) for name in names))
+
 
 ProtocolName = Literal["m3d", "narrow", "replica", "residential", "360loc", "insta360", "ablation", "frame-distance"]
 
@@ -287,7 +515,7 @@ def _write_pictures(folder: Path, method: str, drawn: Drawn) -> None:
     stem = _slug(drawn.score.target)
     write_image(folder / f"{stem}_target.png", drawn.target)
     write_image(folder / f"{stem}_{_slug(method)}.png", drawn.picture)
-    write_image(folder / f"{stem}_{_slug(method)}_error.png", error_picture(drawn.picture, drawn.target))
+    write_image(folder / f"{stem}_{_slug(method)}_error.png", error_image(drawn.picture, drawn.target))
 
 
 def _spread(cases: Sequence[EvaluationCase], limit: int | None) -> Sequence[EvaluationCase]:

@@ -26,9 +26,8 @@ from pansplat.atomic import replacing
 from pansplat.data.images import write_image
 from pansplat.data.pairs import Pair
 from pansplat.errors import InputError
-from pansplat.evaluation.cross_fade import cross_fade
 from pansplat.evaluation.lpips import Lpips
-from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
+from pansplat.evaluation.metrics import cross_fade, psnr, ssim, ws_psnr
 from pansplat.gaussians.scene import Scene
 from pansplat.pipeline import Drawing
 from pansplat.predictor import Predictor, Progress
@@ -146,7 +145,7 @@ def _evaluate_pair(
         _make_folder(folder)
         write_image(folder / "prediction.png", picture)
         write_image(folder / "target.png", target)
-        write_image(folder / "error.png", error_picture(picture, target))
+        write_image(folder / "error.png", error_image(picture, target))
         mask = targets.masks[view]
         yield Case(
             name=folder.name,
@@ -166,7 +165,7 @@ def _evaluate_pair(
         )
 
 
-def error_picture(
+def error_image(
     prediction: Float[Tensor, "3 height width"], target: Float[Tensor, "3 height width"]
 ) -> Float[Tensor, "3 height width"]:
     """The mean absolute error of the colours as heat: black where equal, pale yellow from ERROR_SCALE up."""

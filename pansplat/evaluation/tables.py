@@ -1,14 +1,20 @@
-"""The paper's tables: its rows, and ours beside them.
+"""The paper's tables with our rows, the figure over the frame distance, and the files of an evaluation.
 
-Source: PanSplat, tables 1 to 4 (PAPER.md); a user's clean re-run of the released 512 checkpoint (PanSplat issue 6).
+Source: PanSplat, section 4 and tables 1 to 4; a user's re-run of the released 512 checkpoint (PanSplat issue 6). The
+code of the figure on Insta360 is not public: ours uses the middle frame of pairs spread evenly over the sequences.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+from matplotlib.figure import Figure
 from rich.table import Table
+
+from pansplat.atomic import replacing
+from pansplat.evaluation.protocol import ProtocolResult, SetResult
 
 Values = dict[tuple[str, str], float]
 """By test set and metric."""
@@ -211,3 +217,106 @@ def _cells(row: TableRow, layout: Layout) -> list[str]:
         value = row.values.get(column)
         cells.append("-" if value is None else format(value, _FORMATS.get(column[1], ".3f")))
     return cells
+
+
+def frame_distance_layout(result: ProtocolResult) -> Layout:
+    """A table of the figure's numbers; the paper gives none."""
+    sets = tuple(dict.fromkeys(row.set for row in result.sets))
+    return Layout("The frame in the middle, by frames between the inputs", sets, ("ws_psnr",), ())
+
+
+def curves(rows: Sequence[SetResult], metric: str) -> dict[str, list[tuple[int, float]]]:
+    """By method, the frame distances and what was reached there."""
+    lines: dict[str, list[tuple[int, float]]] = {}
+    for row in rows:
+        value = row.mean(metric)
+        if value is not None:
+            lines.setdefault(row.method, []).append((int(row.set.split()[0]), value))
+    return {method: sorted(line) for method, line in lines.items()}
+
+
+def plot_frame_distance(result: ProtocolResult, path: Path) -> None:
+    """Write the figure: one panel for WS-PSNR, one for LPIPS where it was measured.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    metrics = ["ws_psnr", *(["lpips"] if result.lpips else [])]
+    figure = Figure(figsize=(5.5 * len(metrics), 4), layout="constrained")
+    panels = figure.subplots(1, len(metrics), squeeze=False)[0]
+    for axes, metric in zip(panels, metrics, strict=True):
+        for method, line in curves(result.sets, metric).items():
+            axes.plot(*zip(*line, strict=True), marker="o", label=method)
+        unit = ", dB" if metric == "ws_psnr" else f" ({result.lpips}), lower is better"
+        axes.set(xlabel="frames between the inputs", ylabel=HEADS[metric] + unit)
+        axes.grid(alpha=0.25)
+    panels[0].legend(fontsize=8)
+    with replacing(path) as partial:
+        figure.savefig(partial, dpi=110)
+
+
+_PAPER_LPIPS = "lpips-vgg"
+
+
+def layouts_of(result: ProtocolResult) -> list[Layout]:
+    """The tables of the evaluation, as the paper has them."""
+    if result.protocol == "frame-distance":
+        return [frame_distance_layout(result)]
+    with_depth = result.protocol == "m3d" and any(row.depth for row in result.sets)
+    return [LAYOUTS[result.protocol], *([DEPTH_LAYOUT] if with_depth else [])]
+
+
+def our_rows(result: ProtocolResult, layout: Layout) -> list[TableRow]:
+    """A row a method with what it reached on the table's sets."""
+    rows: dict[str, TableRow] = {}
+    for reached in result.sets:
+        row = rows.setdefault(reached.method, TableRow(reached.method, {}))
+        for metric in layout.metrics:
+            value = reached.mean(metric)
+            if value is not None:
+                row.values[reached.set, metric] = value
+    return list(rows.values())
+
+
+def rich_tables(result: ProtocolResult) -> list[Table]:
+    """The tables to print."""
+    return [rich_table(layout, our_rows(result, layout), HEADS) for layout in layouts_of(result)]
+
+
+def notes(result: ProtocolResult) -> list[str]:
+    """What a reader of the tables must know: how many images, what is missing, what cannot be compared."""
+    counts = {row.set: len(row.scores) for row in result.sets}
+    lines = ["Ours: " + ", ".join(f"{name}: {_images(count)}" for name, count in counts.items()) + "."]
+    if result.height != 512:
+        lines.append(f"Ours is at {result.height}x{2 * result.height}, the paper's figures at 512x1024.")
+    if result.lpips is None:
+        lines.append("No LPIPS: its weights are not here (docs/evaluation.md says where to get them).")
+    elif result.lpips != _PAPER_LPIPS:
+        lines.append(f"LPIPS of ours is {result.lpips}, the paper's is {_PAPER_LPIPS}: do not compare them.")
+    lines += [f"Missing: {line}." for line in result.missing]
+    lines += [f"Left out: {line}" for line in result.skipped]
+    return lines
+
+
+def write_report(result: ProtocolResult, out: Path) -> list[Path]:
+    """Write table.md, and frame_distance.png where it is asked for; the paths.
+
+    Raises:
+        InputError: they cannot be written.
+    """
+    tables = [markdown_table(layout, our_rows(result, layout)) for layout in layouts_of(result)]
+    with replacing(out / "table.md") as partial:
+        partial.write_text("\n".join([*tables, *_items(notes(result))]) + "\n", encoding="utf-8")
+    written = [out / "table.md"]
+    if result.protocol == "frame-distance":
+        plot_frame_distance(result, out / "frame_distance.png")
+        written.append(out / "frame_distance.png")
+    return written
+
+
+def _items(lines: Sequence[str]) -> list[str]:
+    return [f"* {line}" for line in lines]
+
+
+def _images(count: int) -> str:
+    return f"{count} image" + ("s" if count != 1 else "")

@@ -1,4 +1,4 @@
-"""Real spherical harmonics in the order and with the signs that 3DGS files use.
+"""Real spherical harmonics in the order and with the signs of 3DGS files: evaluation and rotation.
 
 Convention: index k = l^2 + l + m, m = -l..l; the sign is (-1)^m relative to the orthonormal real harmonics
 without the Condon-Shortley phase, so k = 1, 2, 3 are -y, z, -x.
@@ -7,8 +7,10 @@ Source: PanSplat, section 3.3 (degree 4 colours). Degree 4 continues the sign ru
 implementations do.
 """
 
+import functools
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -20,7 +22,7 @@ def _norm(rational: float) -> float:
     return math.sqrt(rational / math.pi)
 
 
-def basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch k"]:
+def harmonics_basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch k"]:
     """Harmonics of degree 0..`degree` at unit directions, k = (degree + 1)^2 values each."""
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"`degree` must be 0..{MAX_DEGREE}, got {degree}")
@@ -78,7 +80,7 @@ def _quartic(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
     ]
 
 
-def evaluate(
+def evaluate_harmonics(
     harmonics: Float[Tensor, "*batch k channel"], directions: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch channel"]:
     """Colour seen along unit directions (camera to mean, world axes): max(0, 0.5 + sum_k Y_k c_k)."""
@@ -86,4 +88,77 @@ def evaluate(
     if (degree + 1) ** 2 != harmonics.shape[-2] or not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"`harmonics` must hold 1, 4, 9, 16 or 25 coefficients, got {harmonics.shape[-2]}")
     # relu, not clamp: its slope at exactly 0 is 0, so a colour that is off stays off.
-    return torch.relu((basis(directions, degree)[..., None, :] @ harmonics)[..., 0, :] + 0.5)
+    return torch.relu((harmonics_basis(directions, degree)[..., None, :] @ harmonics)[..., 0, :] + 0.5)
+
+
+def rotation_matrices(rotations: Float[Tensor, "*batch 3 3"], degree: int) -> Float[Tensor, "*batch k k"]:
+    """Matrices D(R) that turn coefficients: sum_k (D c)_k Y_k(R d) = sum_k c_k Y_k(d) in every direction d.
+
+    The integral of Y_j(R d) Y_k(d) over the sphere, by a quadrature that is exact for these products. D is
+    orthogonal, has a block a degree, and D(A B) = D(A) D(B).
+
+    Raises:
+        ValueError: when the degree is not 0..4.
+    """
+    directions, weights = _quadrature(degree)
+    directions, weights = directions.to(rotations), weights.to(rotations)
+    turned = harmonics_basis(torch.einsum("...ij,qj->...qi", rotations, directions), degree)
+    matrices = turned.transpose(-1, -2) @ (harmonics_basis(directions, degree) * weights[:, None])
+    block = torch.tensor([math.isqrt(k) for k in range((degree + 1) ** 2)], device=matrices.device)
+    return torch.where(block[:, None] == block, matrices, 0)
+
+
+def rotate_harmonics(
+    harmonics: Float[Tensor, "*batch k channel"], rotation: Float[Tensor, "3 3"]
+) -> Float[Tensor, "*batch k channel"]:
+    """Coefficients of the same colours after the world was turned by `rotation`."""
+    degree = math.isqrt(harmonics.shape[-2]) - 1
+    matrix = rotation_matrices(rotation.double(), degree).to(harmonics)
+    return (harmonics.transpose(-1, -2) @ matrix.T).transpose(-1, -2)  # one product, however many Gaussians
+
+
+@functools.lru_cache
+@torch.inference_mode(False)  # kept for calls that need gradients too
+def _quadrature(degree: int) -> tuple[Tensor, Tensor]:
+    """Directions (q 3) and weights (q), float64, that integrate products of two harmonics of a degree exactly."""
+    z, weight = np.polynomial.legendre.leggauss(degree + 1)
+    count = 2 * degree + 1
+    longitude = np.arange(count) * (2 * np.pi / count)
+    radius = np.sqrt(1 - z * z)[:, None]
+    x, y = radius * np.cos(longitude), radius * np.sin(longitude)
+    directions = np.stack((x, y, np.broadcast_to(z[:, None], x.shape)), axis=-1).reshape(-1, 3)
+    weights = np.repeat(weight * 2 * np.pi / count, count)
+    return torch.from_numpy(directions), torch.from_numpy(weights)
+
+
+_DEGREE = 3
+# The original's x, y, z axes of harmonics in the world's: z, x, y.
+_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+
+
+def official_harmonics(harmonics: Float[Tensor, "*batch k channel"]) -> Float[Tensor, "*batch drawn channel"]:
+    """Coefficients, of degree 3 at most, whose colours are those that the original's rasteriser makes of these.
+
+    In the original's axes coefficient 14 multiplies x (x^2 - y^2) in place of z (x^2 - y^2). On the unit sphere
+    that is a sum of the harmonics 3, 13 and 15, so the exact renderers can draw it. Degrees above 3 are left out.
+    """
+    drawn = harmonics[..., : (_DEGREE + 1) ** 2, :]
+    if drawn.shape[-2] < 16:
+        return drawn
+    return _trap().to(drawn) @ drawn
+
+
+@functools.lru_cache
+@torch.inference_mode(False)  # kept for calls that need gradients too
+def _trap() -> Float[Tensor, "16 16"]:
+    """What the original's rasteriser does to coefficients in world axes; float64."""
+    # With |d| = 1: x (x^2 - y^2) = 0.4 x - 0.1 x (4 z^2 - x^2 - y^2) + 0.5 x (x^2 - 3 y^2).
+    norm = math.sqrt(105 / math.pi) / 4
+    parts = {3: (0.4, math.sqrt(3 / math.pi) / 2), 13: (-0.1, math.sqrt(10.5 / math.pi) / 4),
+             15: (0.5, math.sqrt(17.5 / math.pi) / 4)}  # fmt: skip
+    own = torch.eye(16, dtype=torch.float64)
+    own[14, 14] = 0
+    for k, (share, other_norm) in parts.items():
+        own[k, 14] = -share * norm / other_norm
+    turn = rotation_matrices(torch.tensor(_AXES, dtype=torch.float64), _DEGREE)
+    return turn.T @ own @ turn

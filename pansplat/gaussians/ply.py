@@ -1,19 +1,23 @@
-"""Scenes as .ply files that any 3D Gaussian splatting tool opens.
+"""Scenes as .ply files that any 3D Gaussian splatting tool opens, written at once or part by part.
 
-The vertices are the original 3DGS binary layout: position, unused normals, `f_dc`, `f_rest` (channel by
-channel), logit opacity, log scales, rotation to world axes (wxyz). What that layout has no place for (input
-cameras, depth range, level and view of each Gaussian) is one header comment, `comment pansplat {json}`, which
-others skip.
+The vertices have the original 3DGS binary layout: position, unused normals, `f_dc`, `f_rest` (channel by
+channel), logit opacity, log scales, rotation to world axes (wxyz). Input cameras, the depth range, and the level and
+view of each Gaussian have no place in that layout. They are one header comment, `comment pansplat {json}`, which
+other tools skip.
 
-Source: 3D Gaussian Splatting, the file its training code writes.
+The header holds the number of vertices. A file that is written part by part reserves space for its header and fills
+it at the end.
+
+Source: 3D Gaussian Splatting, the file that its training code writes.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
@@ -25,8 +29,7 @@ from torch import Tensor
 
 from pansplat.atomic import replacing
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
-from pansplat.gaussians.scene import Scene
+from pansplat.gaussians.scene import Gaussians, Scene
 
 OPACITY_EPSILON = 1e-6  # opacities are kept this far from 0 and 1, where the logit is infinite
 SCALE_EPSILON = 1e-12  # metres; the log of a smaller scale would be infinite
@@ -344,3 +347,76 @@ def _labels(extras: dict, count: int, path: Path) -> tuple[torch.Tensor, torch.T
         )
         return unlabelled
     return torch.repeat_interleave(runs[:, 0], runs[:, 2]), torch.repeat_interleave(runs[:, 1], runs[:, 2])
+
+
+_ROOM = 4096  # bytes for the runs of level and view: some 300. Viewers in browsers want the header within 10,000 bytes
+
+
+def save_ply_parts(scene: Scene, parts: Iterable[Gaussians], path: str | Path) -> int:
+    """Write parts one after another, atomically; no more than one is held.
+
+    Gaussians with a non-finite number are left out with a warning.
+
+    Args:
+        scene: cameras and names for the header; its own Gaussians are not written.
+        parts: all of one degree.
+
+    Returns:
+        How many Gaussians the file holds.
+
+    Raises:
+        InputError: when the folder does not exist or cannot be written.
+        ValueError: a part has another degree than the first.
+    """
+    path = Path(path)
+    with replacing(path) as partial:
+        rest = iter(parts)
+        first = [next(rest, scene.gaussians.select(scene.gaussians.levels < 0))]
+        coefficients = first[0].harmonics.shape[1]
+        room = len(header(scene, [], coefficients)) + _ROOM
+        with open(partial, "wb") as file:
+            file.write(b" " * room)
+            runs, lost = _write_parts(_taken(first, rest), file, coefficients)
+        _fill_header(partial, header(scene, runs, coefficients, size=room), room)
+    count = sum(run[2] for run in runs)
+    if lost:
+        warnings.warn(f"{path}: left out {lost} of {count + lost} Gaussians that are not finite", stacklevel=2)
+    return count
+
+
+def _taken(first: list[Gaussians], rest: Iterator[Gaussians]) -> Iterator[Gaussians]:
+    """First and rest; parts are large, so none is held here."""
+    yield first.pop()
+    yield from rest
+
+
+def _write_parts(parts: Iterable[Gaussians], file: BinaryIO, coefficients: int) -> tuple[list[list[int]], int]:
+    """Write the vertices; stretches of one level and view, and how many Gaussians were not finite."""
+    runs: list[list[int]] = []
+    lost = 0
+    for part in parts:
+        if part.harmonics.shape[1] != coefficients:
+            raise ValueError(f"`parts` must have {coefficients} harmonics each, got {part.harmonics.shape[1]}")
+        finite = is_finite(part)
+        kept = part if bool(finite.all()) else part.select(finite)
+        lost += len(part) - len(kept)
+        for level, view, count in runs_of(kept):
+            if runs and runs[-1][:2] == [level, view]:
+                runs[-1][2] += count
+            else:
+                runs.append([level, view, count])
+        table(kept).tofile(file)
+        del part, kept
+    return runs, lost
+
+
+def _fill_header(path: Path, content: bytes, room: int) -> None:
+    """Put the header where room was left; where it needs more, the vertices are moved on, piece by piece."""
+    if len(content) == room:
+        with open(path, "r+b") as file:
+            file.write(content)
+        return
+    with replacing(path) as longer, open(path, "rb") as vertices, open(longer, "wb") as file:
+        file.write(content)
+        vertices.seek(room)
+        shutil.copyfileobj(vertices, file, 1 << 24)

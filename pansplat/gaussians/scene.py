@@ -1,15 +1,106 @@
-"""A scene: Gaussians together with the cameras they were predicted from."""
+"""3D Gaussians in world axes, and the scene that they belong to."""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Float, Integer
 from torch import Tensor
 
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
-from pansplat.geometry.pose import interpolate_poses
+from pansplat.geometry.pose import interpolate_poses, rotations_from_quats
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """3D Gaussians of one scene.
+
+    Source: PanSplat, section 3.3, in the field's vocabulary (3DGS, gsplat).
+
+    Attributes:
+        means: centres in the world, metres.
+        scales: standard deviations along the Gaussian's own axes, metres.
+        quats: rotation of the own axes to the world's, wxyz; normalised where it is read.
+        opacities: peak opacity, in [0, 1].
+        harmonics: real spherical-harmonics coefficients of degree 0..4 in world axes, in the 3DGS order and signs;
+            colour in direction d (camera to mean) is max(0, 0.5 + sum_k Y_k(d) c_k). Three channels are RGB;
+            the rasteriser draws any number.
+        levels: pyramid level, 0 is the finest.
+        views: index of the context view that each Gaussian was lifted from.
+    """
+
+    means: Float[Tensor, "n 3"]
+    scales: Float[Tensor, "n 3"]
+    quats: Float[Tensor, "n 4"]
+    opacities: Float[Tensor, "n"]
+    harmonics: Float[Tensor, "n k channel"]
+    levels: Integer[Tensor, "n"]
+    views: Integer[Tensor, "n"]
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0]
+        needed = {
+            "means": (n, 3),
+            "scales": (n, 3),
+            "quats": (n, 4),
+            "opacities": (n,),
+            "levels": (n,),
+            "views": (n,),
+        }
+        for name, shape in needed.items():
+            got = tuple(getattr(self, name).shape)
+            if got != shape:
+                raise ValueError(f"`{name}` must have shape {shape} to fit {n} means, got {got}")
+        got = tuple(self.harmonics.shape)
+        if len(got) != 3 or got[0] != n or got[1] not in (1, 4, 9, 16, 25) or got[2] < 1:
+            raise ValueError(f"`harmonics` must have shape ({n}, 1|4|9|16|25, 3), got {got}")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def degree(self) -> int:
+        """Degree of the spherical harmonics, 0..4."""
+        return round(self.harmonics.shape[1] ** 0.5) - 1
+
+    @property
+    def covariances(self) -> Float[Tensor, "n 3 3"]:
+        """World covariances R diag(s^2) R', square metres."""
+        axes = rotations_from_quats(self.quats) * self.scales[:, None, :]
+        return axes @ axes.transpose(-1, -2)
+
+    def select(self, index: Tensor) -> Gaussians:
+        """The Gaussians at a boolean mask or at indices, in that order."""
+        return Gaussians(*(getattr(self, f.name)[index] for f in dataclasses.fields(self)))
+
+    def to(self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Gaussians:
+        """The same Gaussians in another floating type or on another device; labels keep their integer type."""
+        values = []
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            values.append(value.to(device=device, dtype=dtype if value.is_floating_point() else None))
+        return Gaussians(*values)
+
+    @staticmethod
+    def cat(parts: Sequence[Gaussians]) -> Gaussians:
+        """All the parts' Gaussians, one part after another; the parts must have the same SH degree."""
+        if not parts:
+            raise ValueError("`parts` must hold at least one set of Gaussians, got none")
+        degrees = sorted({part.degree for part in parts})
+        if len(degrees) > 1:
+            raise ValueError(f"`parts` must share one SH degree, got {degrees}")
+        return Gaussians(*(torch.cat([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Gaussians)))
+
+
+def empty_gaussians(degree: int = 0) -> Gaussians:
+    """An empty set."""
+    labels = torch.zeros(0, dtype=torch.uint8)
+    harmonics = torch.zeros(0, (degree + 1) ** 2, 3)
+    rows = torch.zeros(0, 3)
+    return Gaussians(rows, rows, torch.zeros(0, 4), torch.zeros(0), harmonics, labels, labels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,3 +134,17 @@ class Scene:
         if not len(self.cam2world):
             raise InputError("the scene has no input cameras to stand between; give a pose instead")
         return interpolate_poses(self.cam2world[0], self.cam2world[-1], fraction)
+
+
+def prune(gaussians: Gaussians, *, degree: int | None = None, min_opacity: float = 0.0) -> Gaussians:
+    """The Gaussians of at least some opacity, with harmonics up to a degree.
+
+    Args:
+        degree: highest degree kept; None keeps all, as does one that is higher than what is there.
+        min_opacity: in [0, 1]; below 1/255 nothing can be seen.
+    """
+    if min_opacity > 0:
+        gaussians = gaussians.select(gaussians.opacities >= min_opacity)
+    if degree is None or degree >= gaussians.degree:
+        return gaussians
+    return dataclasses.replace(gaussians, harmonics=gaussians.harmonics[:, : (degree + 1) ** 2])

@@ -33,7 +33,7 @@ def fibonacci_directions(count: int) -> Float[Tensor, "count 3"]:
     return torch.stack((radius * torch.cos(angle), y, radius * torch.sin(angle)), dim=-1)
 
 
-def original_fibonacci_uv(count: int) -> Float[Tensor, "count 2"]:
+def official_fibonacci_uv(count: int) -> Float[Tensor, "count 2"]:
     """The original's lattice: normalised panorama coordinates, in float64 though rounded as it rounds them.
 
     All of it is float32: 0.25 pixel off on average at a map width of 512, 125 pixels at 4096.

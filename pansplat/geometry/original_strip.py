@@ -1,6 +1,6 @@
 """Six cube faces of a panorama, and back, in the original's own order of operations, so that every bit is its own.
 
-`pansplat.geometry.cube_strip` computes the same numbers from positions in float64. The original finds them with numpy
+`pansplat.geometry.cubemap` computes the same numbers from positions in float64. The original finds them with numpy
 in float32, as here: torch's sines and tangents differ in the last bit.
 
 Source: OFFICIAL.md, sections 2.4 and 5; Jiang et al., UniFuse, https://arxiv.org/abs/2102.03550.

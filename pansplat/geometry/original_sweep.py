@@ -1,6 +1,6 @@
 """The correlation of a spherical sweep in the original's own order of operations, so that every bit is its own.
 
-`pansplat.geometry.sweep` computes the same numbers but for their last bits, in a fraction of time and memory.
+`pansplat.geometry.correlation` computes the same numbers but for their last bits, in a fraction of time and memory.
 
 Source: OFFICIAL.md, section 6, steps 3 and 4.
 """

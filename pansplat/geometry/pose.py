@@ -1,4 +1,7 @@
-"""Rigid poses and rotations. Quaternions are wxyz; poses are cam2world, 4x4, OpenCV axes, metres."""
+"""Rigid poses, rotations, and the weights of views by distance.
+
+Quaternions are wxyz; poses are cam2world, 4x4, OpenCV axes, metres.
+"""
 
 import torch
 from jaxtyping import Float
@@ -95,3 +98,22 @@ def interpolate_poses(start: Float[Tensor, "4 4"], end: Float[Tensor, "4 4"], fr
     pose[:3, :3] = rotations_from_quats(quat)
     pose[:3, 3] = (1 - fraction) * start[:3, 3].double() + fraction * end[:3, 3].double()
     return pose.to(start)
+
+
+def blend_weights(position: Float[Tensor, "3"], positions: Float[Tensor, "view 3"]) -> Float[Tensor, "view"]:
+    """Weights of the input views at a camera position: normalised inverse distances.
+
+    The weights are non-negative and sum to one. At an input position they are one-hot; inputs that coincide with the
+    position share the weight equally.
+
+    Source: PanSplat, section 3.4 (deferred blending), for any number of views; docs/rendering.md, section 7.
+    """
+    if positions.shape[0] < 1:
+        raise ValueError("`positions` must hold at least one view, got none")
+    distances = torch.linalg.vector_norm(position - positions, dim=1)
+    nearest = distances.detach().amin()
+    at = distances == 0
+    # Only ratios matter, so the nearest distance serves as the unit: nothing overflows.
+    closeness = nearest / torch.where(at, torch.ones_like(distances), distances)
+    closeness = torch.where(at, torch.ones_like(distances), closeness)
+    return closeness / closeness.sum()

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.gaussians.gaussians import Gaussians
-from pansplat.gaussians.harmonics_rotation import rotation_matrices
+from pansplat.gaussians.harmonics import rotation_matrices
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import directions_from_uv
 from pansplat.geometry.pose import multiply_quats, quats_from_rotations
 from pansplat.model.layers import Compat

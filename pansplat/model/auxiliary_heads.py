@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.model.cost_volume import Depths, LevelDepth
 from pansplat.model.heads import HeadsConfig, LevelHead, ViewInputs, read_points, views_of
 from pansplat.model.layers import Compat

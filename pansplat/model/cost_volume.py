@@ -15,9 +15,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from pansplat.geometry.correlation import correlate
+from pansplat.geometry.equirect import Border
 from pansplat.geometry.original_sweep import correlate_as_the_original
-from pansplat.geometry.sweep import Sampling, correlate, relative_pose
-from pansplat.geometry.wrap import Border
+from pansplat.geometry.warp import Sampling, relative_pose
 from pansplat.model.layers import (
     Arithmetic,
     AttentionPrecision,

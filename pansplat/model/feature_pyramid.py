@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pansplat.geometry.wrap import Border
+from pansplat.geometry.equirect import Border
 from pansplat.model.layers import (
     Arithmetic,
     AttentionPrecision,

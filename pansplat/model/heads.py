@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.model.adapter import AdapterConfig, adapt
 from pansplat.model.cost_volume import Depths, LevelDepth
 from pansplat.model.lattice import Lattice, lattice_uv, move_points

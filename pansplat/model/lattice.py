@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.geometry.equirect import uv_from_directions
-from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size, original_fibonacci_uv
+from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size, official_fibonacci_uv
 
 Lattice = Literal["fibonacci", "pixel"]
 _NARROWEST = 0.01  # at the poles a pixel is taken to be at most 100 times as wide in longitude
@@ -38,7 +38,7 @@ def lattice_uv(lattice: Lattice, height: int, *, exact: bool = True) -> Float[Te
         )
         return torch.stack((u, v), dim=-1).reshape(-1, 2)
     count = lattice_size(2 * height)
-    return uv_from_directions(fibonacci_directions(count)) if exact else original_fibonacci_uv(count)
+    return uv_from_directions(fibonacci_directions(count)) if exact else official_fibonacci_uv(count)
 
 
 def move_points(

@@ -15,9 +15,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from pansplat.errors import InputError
-from pansplat.geometry import wrap
+from pansplat.geometry.equirect import Border, pad_equirect, resize_equirect
 from pansplat.geometry.pose import orthonormal_error
-from pansplat.geometry.wrap import Border
 
 Compat = Literal["official", "fixed"]
 Precision = Literal["float32", "bfloat16"]
@@ -124,7 +123,7 @@ class PanoramaConv2d(nn.Conv2d):
         """The convolution with other weights."""
         if self.border == "zeros":
             return functional.conv2d(maps, weight, bias, self.stride, self.margin)
-        return functional.conv2d(wrap.pad(maps, self.margin, self.border), weight, bias, self.stride)
+        return functional.conv2d(pad_equirect(maps, self.margin, self.border), weight, bias, self.stride)
 
 
 def normalized_convolution(
@@ -146,7 +145,7 @@ def upsample(
     if compat == "official":
         return functional.interpolate(maps, scale_factor=factor, mode="bilinear", align_corners=True)
     height, width = maps.shape[-2:]
-    return wrap.resize(maps, (height * factor, width * factor))
+    return resize_equirect(maps, (height * factor, width * factor))
 
 
 def resize(
@@ -155,7 +154,7 @@ def resize(
     """Maps resized bilinearly, pixel centres at half-integers; the original repeats the border's pixels beyond it."""
     if compat == "official":
         return functional.interpolate(maps, size, mode="bilinear", align_corners=False)
-    return wrap.resize(maps, size)
+    return resize_equirect(maps, size)
 
 
 def attend(

@@ -21,10 +21,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import elu, interpolate, max_pool2d, relu
 
-from pansplat.geometry import wrap
-from pansplat.geometry.cube_strip import equirect_from_strip, strip_from_equirect, strip_lookup
+from pansplat.geometry.cubemap import equirect_from_strip, strip_from_equirect, strip_lookup
+from pansplat.geometry.equirect import Border, pad_equirect
 from pansplat.geometry.original_strip import original_lookup, original_panorama, original_strip
-from pansplat.geometry.wrap import Border
 from pansplat.model.feature_pyramid import normalize
 from pansplat.model.layers import (
     Arithmetic,
@@ -137,7 +136,7 @@ class ResNet18(nn.Module):
 
     def forward(self, x: Float[Tensor, "batch 3 height width"]) -> dict[int, Tensor]:
         features = {1: relu(normalized_convolution(self.stem, self.stem_norm, x))}
-        x = max_pool2d(wrap.pad(features[1], 1, self.border), 3, stride=2)
+        x = max_pool2d(pad_equirect(features[1], 1, self.border), 3, stride=2)
         for scale, stage in enumerate(self.stages, start=2):
             x = features[scale] = stage(x)
         return features

@@ -16,8 +16,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import gelu, instance_norm, interpolate, relu
 
-from pansplat.gaussians.gaussians import Gaussians
-from pansplat.geometry.wrap import Border
+from pansplat.gaussians.scene import Gaussians
+from pansplat.geometry.equirect import Border
 from pansplat.model.adapter import AdapterConfig, adapt
 from pansplat.model.cost_volume import (
     Depths,

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Integer
 from torch import Tensor
 from torch.nn import functional
 
-from pansplat.geometry import wrap
+from pansplat.geometry.equirect import pad_equirect
 from pansplat.model.layers import Compat
 
 
@@ -97,7 +97,7 @@ def cut(
     if exact:
         edges = (before_y[0], before_x[0], source.shape[1] - 1 - after_y[-1], source.shape[2] - 1 - after_x[-1])
         margin = max(0, -min(int(edge) for edge in edges))
-        source = wrap.pad(source, margin, "sphere")
+        source = pad_equirect(source, margin, "sphere")
         before_y, after_y, before_x, after_x = (i + margin for i in (before_y, after_y, before_x, after_x))
     resized = _blend(source, before_y, after_y, weight_y, dim=1)
     resized = _blend(resized, before_x, after_x, weight_x, dim=2)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from pansplat.geometry.wrap import Border
+from pansplat.geometry.equirect import Border
 from pansplat.model.layers import Arithmetic, AttentionPrecision, PanoramaConv2d, attend, laid_out
 
 _GROUPS = 8  # of every normalisation

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from pansplat.errors import InputError
-from pansplat.geometry.cube_strip import strip_lookup
+from pansplat.geometry.cubemap import strip_lookup
 from pansplat.model.checkpoint import state_dict_of
 from pansplat.model.official_names import Model, rows, tensor_names
 

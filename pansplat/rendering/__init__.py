@@ -1,6 +1,6 @@
 """Drawing Gaussians: the differentiable reference rasteriser, and blending of its pictures."""
 
-from pansplat.geometry.blending import blend_weights
+from pansplat.geometry.pose import blend_weights
 from pansplat.rendering.blend import blend
 from pansplat.rendering.rasterize import Rendering, rasterize
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.constants import FILTER_VARIANCE
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.panorama import Picture
 
 Kernel = Literal["ray", "ewa"]

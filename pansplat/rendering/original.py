@@ -12,8 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.constants import EWA_NEAR_FACTOR
-from pansplat.gaussians.gaussians import Gaussians
-from pansplat.gaussians.harmonics_official import as_the_original_draws
+from pansplat.gaussians.harmonics import official_harmonics
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.rasterize import Backend, Rendering, rasterize
 
 KERNEL: dict[str, Any] = {"kernel": "ewa", "order": "z", "lowpass": "3dgs"}
@@ -38,7 +38,7 @@ def rasterize_as_original(
             a face's axis.
         backend: see `rasterize`.
     """
-    shown = replace(gaussians, harmonics=as_the_original_draws(gaussians.harmonics))
+    shown = replace(gaussians, harmonics=official_harmonics(gaussians.harmonics))
     return rasterize(
         shown,
         cam2world,

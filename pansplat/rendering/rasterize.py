@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pansplat.constants import NEAR
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import orthonormal_error
 from pansplat.rendering.backend import Draw, Info, Kernel, Lowpass, Options, Order
 from pansplat.rendering.panorama import Layout, pictures

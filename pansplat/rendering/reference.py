@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pansplat.constants import EWA_NEAR_FACTOR
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.backend import Drawn, Info, Kernel, Options
 from pansplat.rendering.bounds import equirect_boxes, ewa_boxes, kappa, pinhole_boxes
 from pansplat.rendering.composite import TilePixels, composite

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pansplat.constants import OPACITY_CUT
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.backend import Options
 from pansplat.rendering.splats import near_enough, sound
 

@@ -20,8 +20,8 @@ from pansplat.constants import (
     MIN_EIGENVALUE_RATIO,
     MIN_EWA_VARIANCE,
 )
-from pansplat.gaussians.gaussians import Gaussians
-from pansplat.gaussians.harmonics import evaluate
+from pansplat.gaussians.harmonics import evaluate_harmonics
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
 
 _CHUNK = 1 << 17
@@ -140,7 +140,7 @@ def _observe_chunk(
     radius = torch.linalg.vector_norm(offset, dim=1)
     world_direction = offset / radius[:, None]
     direction = world_direction @ cam2world[:3, :3]
-    colours = evaluate(harmonics, world_direction.to(dtype))
+    colours = evaluate_harmonics(harmonics, world_direction.to(dtype))
     world2cam = cam2world[:3, :3].T
     frame = torch.stack((*tangent_frame(direction), direction), dim=1)
     if len(shape) == 2:

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import torch
 
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
 from pansplat.geometry.pose import quats_from_rotations
 from pansplat.sweep.search import PosedImages

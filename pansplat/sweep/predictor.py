@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.predictor import Progress
 from pansplat.sweep.lift import LiftConfig, lift
 from pansplat.sweep.search import PosedImages, SearchConfig, search_surfaces

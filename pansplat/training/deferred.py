@@ -27,7 +27,7 @@ import torch
 from jaxtyping import Float, Integer
 from torch import Tensor
 
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.model.heads import TileGaussians, whole
 from pansplat.model.network import Network
 from pansplat.model.pansplat import PanSplat

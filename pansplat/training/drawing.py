@@ -19,10 +19,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pansplat.constants import NEAR
-from pansplat.gaussians.gaussians import Gaussians
-from pansplat.gaussians.harmonics_official import as_the_original_draws
-from pansplat.geometry.blending import blend_weights
+from pansplat.gaussians.harmonics import official_harmonics
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.cubemap import face_poses
+from pansplat.geometry.pose import blend_weights
 from pansplat.rendering import original
 from pansplat.rendering.backend import Options
 from pansplat.rendering.blend import blend
@@ -163,7 +163,7 @@ class Drawing:
 
     def _of(self, gaussians: Gaussians, view: int | None) -> Gaussians:
         if self.style == "original":
-            gaussians = replace(gaussians, harmonics=as_the_original_draws(gaussians.harmonics))
+            gaussians = replace(gaussians, harmonics=official_harmonics(gaussians.harmonics))
         return gaussians if view is None else gaussians.select((gaussians.views == view).nonzero()[:, 0])
 
     def _whole(self, gaussians: Gaussians, cam2world: Tensor) -> Rendering:

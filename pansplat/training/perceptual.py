@@ -16,9 +16,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from pansplat.errors import InputError
-from pansplat.evaluation.lpips import Backbone
-from pansplat.evaluation.lpips_files import first_available, load_lpips
-from pansplat.geometry.wrap import pad
+from pansplat.evaluation.lpips import Backbone, first_available, load_lpips
+from pansplat.geometry.equirect import pad_equirect
 
 PerceptualName = Literal["auto", "lpips-vgg", "lpips-alex", "lpips-squeeze", "structure"]
 
@@ -121,7 +120,7 @@ def _window_mean(maps: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "
     offsets = torch.arange(-_RADIUS, _RADIUS + 1, dtype=torch.float64)
     kernel = torch.exp(-0.5 * (offsets / _SIGMA).square())
     kernel = (kernel / kernel.sum()).to(maps)
-    padded = pad(maps.flatten(0, 1)[:, None], _RADIUS, "sphere")
+    padded = pad_equirect(maps.flatten(0, 1)[:, None], _RADIUS, "sphere")
     means = functional.conv2d(functional.conv2d(padded, kernel.reshape(1, 1, -1, 1)), kernel.reshape(1, 1, 1, -1))
     return means[:, 0].unflatten(0, maps.shape[:2])
 

@@ -6,7 +6,7 @@ import torch
 
 from pansplat.bench.scenes import full_lattice_room
 from pansplat.bench.work import panorama_work
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import rasterize
 from pansplat.rendering.backend import Options
 

@@ -16,7 +16,7 @@ from pansplat import pipeline
 from pansplat.cli import run
 from pansplat.data.images import read_depth
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import pixel_directions
 
 HEIGHT = 16

@@ -10,7 +10,7 @@ from pansplat.data.augment import Augmentation, augment, mirror_views, roll_view
 from pansplat.data.sample import Sample
 from pansplat.data.views import Views
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.geometry.sweep import relative_pose, warp_panorama
+from pansplat.geometry.warp import relative_pose, warp_panorama
 
 HEIGHT = 48
 

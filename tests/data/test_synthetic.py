@@ -7,7 +7,7 @@ import torch
 from pansplat.data.generated.rooms import build_home
 from pansplat.data.synthetic import GeneratedScenes
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.geometry.sweep import relative_pose, warp_panorama
+from pansplat.geometry.warp import relative_pose, warp_panorama
 
 HEIGHT = 64
 

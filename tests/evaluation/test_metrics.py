@@ -1,4 +1,4 @@
-"""The metrics are the official protocol's, by value, and behave as metrics should."""
+"""The metrics equal the official protocol's, by value; depth errors and the cross-fade have their closed forms."""
 
 import math
 from pathlib import Path
@@ -7,8 +7,10 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
-from pansplat.geometry.equirect import row_weights
+from pansplat.data.pairs import load_pairs
+from pansplat.evaluation.metrics import cross_fade, depth_errors, psnr, ssim, ws_psnr
+from pansplat.geometry.equirect import pixel_directions, row_weights
+from pansplat.geometry.pose import rotations_from_quats
 
 METRICS = {"psnr": psnr, "ws_psnr": ws_psnr, "ssim": ssim}
 
@@ -101,3 +103,90 @@ def test_a_mask_of_another_size_is_refused(unchecked: None) -> None:
 def test_ssim_needs_a_window() -> None:
     with pytest.raises(ValueError, match="larger than 10 x 10"):
         ssim(torch.zeros(3, 10, 20), torch.zeros(3, 10, 20))
+
+
+NEAR, FAR = 0.45, 10.0
+
+
+def test_constant_depths_have_the_closed_forms_errors() -> None:
+    truth = torch.full((2, 8, 16), 4.0)
+    errors = depth_errors(torch.full((2, 4, 8), 5.0), truth, NEAR, FAR)
+    assert (errors.abs_rel, errors.sq_rel, errors.rmse) == pytest.approx((0.25, 0.25, 1.0))
+    errors = depth_errors(torch.full((2, 4, 8), 2.0), truth, NEAR, FAR)
+    assert (errors.abs_rel, errors.sq_rel, errors.rmse) == pytest.approx((0.5, 1.0, 2.0))
+
+
+def test_pixels_of_all_views_are_one_set() -> None:
+    truth = torch.full((2, 4, 8), 2.0)
+    truth[0, :3] = 0  # the first view has a quarter of its pixels
+    depth = truth.clone()
+    depth[0], depth[1] = 3.0, 4.0
+    errors = depth_errors(depth, truth, NEAR, FAR)
+    assert errors.abs_rel == pytest.approx((8 * 0.5 + 32 * 1.0) / 40)
+    assert errors.rmse == pytest.approx(math.sqrt((8 * 1 + 32 * 4) / 40))
+
+
+@pytest.mark.parametrize("unknown", [0.0, NEAR, FAR, 30.0])
+def test_depth_at_or_beyond_the_range_is_unknown(unknown: float) -> None:
+    truth = torch.full((1, 4, 8), 2.0)
+    truth[:, 2:] = unknown
+    depth = torch.full((1, 4, 8), 2.0)
+    depth[:, 2:] = 100.0
+    errors = depth_errors(depth, truth, NEAR, FAR)
+    assert (errors.abs_rel, errors.sq_rel, errors.rmse) == (0, 0, 0)
+
+
+def test_a_smaller_map_is_made_larger_bilinearly_between_pixel_centres() -> None:
+    """Two columns of 1 and 3 metres become 1, 1.5, 2.5, 3."""
+    depth = torch.tensor([1.0, 3.0]).expand(1, 1, 2)
+    truth = torch.tensor([1.0, 1.5, 2.5, 3.0]).expand(1, 2, 4)
+    assert depth_errors(depth, truth, NEAR, FAR).rmse == pytest.approx(0, abs=1e-12)
+
+
+def test_without_a_known_pixel_errors_are_not_numbers() -> None:
+    errors = depth_errors(torch.ones(1, 4, 8), torch.zeros(1, 4, 8), NEAR, FAR)
+    assert math.isnan(errors.abs_rel) and math.isnan(errors.sq_rel) and math.isnan(errors.rmse)
+
+
+def pose_at(x: float, quat: tuple[float, ...] = (1, 0, 0, 0)) -> torch.Tensor:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = rotations_from_quats(torch.tensor(quat, dtype=torch.float64))
+    pose[0, 3] = x
+    return pose
+
+
+def sky(pose: torch.Tensor, height: int = 64) -> torch.Tensor:
+    """What a camera sees of smooth colours at infinity."""
+    directions = pixel_directions(height, 2 * height, dtype=torch.float64) @ pose[:3, :3].T
+    return (0.5 + 0.4 * torch.sin(2 * directions + directions.roll(1, -1))).permute(2, 0, 1).float()
+
+
+def test_a_far_away_world_is_reproduced_in_any_orientation() -> None:
+    poses = [pose_at(0, (0.9, 0.2, 0.4, -0.1)), pose_at(1, (0.3, -0.8, 0.1, 0.5))]
+    target = pose_at(0.3, (0.7, 0.1, -0.6, 0.3))
+    faded = cross_fade(torch.stack([sky(p) for p in poses]), torch.stack(poses), target)
+    assert float((faded - sky(target)).abs().max()) < 5e-3  # bilinear sampling
+
+
+def test_at_an_input_the_other_does_not_matter() -> None:
+    images = torch.stack((sky(pose_at(0)), torch.rand(3, 64, 128)))
+    faded = cross_fade(images, torch.stack((pose_at(0), pose_at(1))), pose_at(0))
+    torch.testing.assert_close(faded, images[0], atol=1e-5, rtol=0)
+
+
+def test_weights_follow_the_distance() -> None:
+    images = torch.stack((torch.zeros(3, 8, 16), torch.ones(3, 8, 16)))
+    faded = cross_fade(images, torch.stack((pose_at(0), pose_at(1))), pose_at(0.25))
+    torch.testing.assert_close(faded, torch.full((3, 8, 16), 0.25))
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(("folder", "expected"), [("mp3d_sample", [16.0]), ("zind", [14.1, 15.8, 17.1])])
+def test_reference_figures_of_real_rooms(shared: Path, folder: str, expected: list[float]) -> None:
+    pairs = [pair for pair in load_pairs(shared / "data" / folder) if pair.targets]
+    scores = []
+    for pair in pairs:
+        context, target = pair.load_context(512), pair.load_targets(512)
+        faded = cross_fade(context.images, context.cam2world, target.cam2world[0])
+        scores.append(ws_psnr(faded, target.images[0]))
+    assert sorted(scores) == pytest.approx(expected, abs=0.1)

@@ -12,15 +12,22 @@ from torch import Tensor
 
 from pansplat.data.video import write_video
 from pansplat.errors import InputError
-from pansplat.evaluation.data_sets import INSTA360, LOC360, sequence_set, sequences_of
-from pansplat.evaluation.frame_distance import curves
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
-from pansplat.evaluation.protocol import ProtocolOptions, SetResult, methods_of, run_protocol, sets_of
-from pansplat.evaluation.protocol_report import layouts_of, notes, our_rows, rich_tables, write_report
-from pansplat.evaluation.score import Score
-from pansplat.evaluation.tables import LAYOUTS
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.evaluation.protocol import (
+    INSTA360,
+    LOC360,
+    ProtocolOptions,
+    Score,
+    SetResult,
+    methods_of,
+    run_protocol,
+    sequence_set,
+    sequences_of,
+    sets_of,
+)
+from pansplat.evaluation.tables import LAYOUTS, curves, layouts_of, notes, our_rows, rich_tables, write_report
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.model.network import NetworkPredictor
 

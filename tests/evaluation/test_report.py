@@ -16,8 +16,8 @@ from pansplat.data.pairs import load_pairs
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
-from pansplat.evaluation.report import ERROR_SCALE, error_picture, evaluate, results_table
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.evaluation.report import ERROR_SCALE, error_image, evaluate, results_table
+from pansplat.gaussians.scene import Gaussians
 
 HEIGHT = 16
 KEYS = [
@@ -180,6 +180,6 @@ def test_error_pictures_are_dark_where_equal_and_bright_where_not() -> None:
     prediction = target.clone()
     prediction[:, 0] += 10 * ERROR_SCALE
     prediction[:, 1] += ERROR_SCALE / 2
-    brightness = error_picture(prediction, target).mean(dim=(0, 2))
+    brightness = error_image(prediction, target).mean(dim=(0, 2))
     assert float(brightness[2]) < 0.02
     assert float(brightness[2]) < float(brightness[1]) < float(brightness[0])

@@ -1,13 +1,21 @@
-"""Spherical harmonics: orthonormal, in 3DGS order and signs, differentiable."""
+"""Spherical harmonics: orthonormal, in 3DGS order and signs, differentiable, rotated, and as officially drawn."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
 from scipy.special import sph_harm_y
 
-from pansplat.gaussians.harmonics import basis, evaluate
+from pansplat.gaussians.harmonics import (
+    evaluate_harmonics,
+    harmonics_basis,
+    official_harmonics,
+    rotate_harmonics,
+    rotation_matrices,
+)
+from pansplat.geometry.pose import rotations_from_quats
 
 
 def _random_directions(count: int, seed: int = 0) -> torch.Tensor:
@@ -22,7 +30,7 @@ def test_basis_is_orthonormal_on_the_sphere():
     ring = torch.sqrt(1 - z * z)
     directions = torch.stack((ring * torch.cos(longitude), ring * torch.sin(longitude), z), dim=-1)
     area = torch.tensor(weights)[:, None].expand(12, 24) * (2 * math.pi / 24)
-    y = basis(directions, 4).reshape(-1, 25)
+    y = harmonics_basis(directions, 4).reshape(-1, 25)
     gram = y.T @ (y * area.reshape(-1, 1))
     assert torch.allclose(gram, torch.eye(25, dtype=torch.float64), atol=1e-12)
 
@@ -31,7 +39,7 @@ def test_basis_equals_scipys_with_the_sign_of_3dgs():
     directions = _random_directions(50)
     x, y, z = directions.numpy().T
     polar, azimuth = np.arccos(z), np.arctan2(y, x)
-    ours = basis(directions, 4).numpy()
+    ours = harmonics_basis(directions, 4).numpy()
     for degree in range(5):
         for order in range(-degree, degree + 1):
             complex_value = sph_harm_y(degree, abs(order), polar, azimuth)  # holds the phase (-1)^m already
@@ -53,7 +61,7 @@ def test_first_coefficients_are_those_of_3dgs_files():
         -0.4570457994644658 * x * (4 * z * z - x * x - y * y), 1.445305721320277 * z * (x * x - y * y),
         -0.5900435899266435 * x * (x * x - 3 * y * y),
     ]  # fmt: skip
-    got = basis(torch.tensor([x, y, z], dtype=torch.float64), 3)
+    got = harmonics_basis(torch.tensor([x, y, z], dtype=torch.float64), 3)
     assert torch.allclose(got, torch.tensor(expected, dtype=torch.float64), atol=1e-14)
 
 
@@ -61,12 +69,12 @@ def test_first_coefficients_are_those_of_3dgs_files():
 def test_every_coefficient_changes_the_colour(degree: int):
     direction = torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 0.7], dtype=torch.float64), dim=0)
     count = (degree + 1) ** 2
-    dark = evaluate(torch.zeros(count, 3, dtype=torch.float64), direction)
+    dark = evaluate_harmonics(torch.zeros(count, 3, dtype=torch.float64), direction)
     assert torch.equal(dark, torch.full((3,), 0.5, dtype=torch.float64))
     for k in range(count):
         one = torch.zeros(count, 3, dtype=torch.float64)
         one[k, 1] = 0.1
-        change = evaluate(one, direction) - dark
+        change = evaluate_harmonics(one, direction) - dark
         assert change[1].abs() > 1e-4 and change[0] == change[2] == 0
 
 
@@ -74,12 +82,12 @@ def test_colour_is_differentiable_in_coefficients_and_direction():
     directions = _random_directions(3, seed=1).requires_grad_()
     generator = torch.Generator().manual_seed(2)
     harmonics = (0.1 * torch.randn(3, 25, 3, generator=generator, dtype=torch.float64)).requires_grad_()
-    assert torch.autograd.gradcheck(evaluate, (harmonics, directions))
+    assert torch.autograd.gradcheck(evaluate_harmonics, (harmonics, directions))
 
 
 def test_colour_never_is_negative_and_has_no_slope_where_it_is_off():
     harmonics = torch.tensor([[[-9.0, -0.5 / 0.28209479177387814, 1.0]]], dtype=torch.float64, requires_grad=True)
-    colour = evaluate(harmonics, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64))
+    colour = evaluate_harmonics(harmonics, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64))
     colour.sum().backward()
     assert colour[0, 0] == 0 and harmonics.grad is not None
     assert harmonics.grad[0, 0, 0] == 0 and harmonics.grad[0, 0, 2] > 0
@@ -87,6 +95,101 @@ def test_colour_never_is_negative_and_has_no_slope_where_it_is_off():
 
 def test_basis_refuses_unknown_degrees():
     with pytest.raises(ValueError, match=r"`degree` must be 0\.\.4, got 5"):
-        basis(torch.ones(3), 5)
+        harmonics_basis(torch.ones(3), 5)
     with pytest.raises(ValueError, match="1, 4, 9, 16 or 25"):
-        evaluate(torch.zeros(5, 3), torch.ones(3))
+        evaluate_harmonics(torch.zeros(5, 3), torch.ones(3))
+
+
+def _random(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_a_turned_colour_seen_from_turned_directions_is_the_same(degree: int):
+    rotation = rotations_from_quats(_random(4))
+    harmonics = _random((degree + 1) ** 2, 3, seed=1)
+    directions = torch.nn.functional.normalize(_random(40, 3, seed=2), dim=-1)
+    before = harmonics_basis(directions, degree) @ harmonics
+    after = harmonics_basis(directions @ rotation.T, degree) @ rotate_harmonics(harmonics, rotation)
+    assert torch.allclose(before, after, atol=1e-13)
+
+
+def test_rotations_compose_and_keep_lengths_and_degrees_apart():
+    a, b = rotations_from_quats(_random(2, 4))
+    matrices = rotation_matrices(torch.stack((a, b, a @ b)), 4)
+    assert torch.allclose(matrices[0] @ matrices[1], matrices[2], atol=1e-13)
+    assert torch.allclose(matrices[0] @ matrices[0].T, torch.eye(25, dtype=torch.float64), atol=1e-13)
+    assert bool((matrices[:, 4:9, 9:16] == 0).all())
+    unturned = rotation_matrices(torch.eye(3, dtype=torch.float64), 4)
+    assert torch.allclose(unturned, torch.eye(25, dtype=torch.float64), atol=1e-14)
+
+
+def test_degree_one_turns_as_the_axes_do():
+    rotation = rotations_from_quats(_random(4, seed=3))
+    axes = torch.tensor(((0.0, -1, 0), (0, 0, 1), (-1, 0, 0)), dtype=torch.float64)  # Y_1..3 are -y, z, -x
+    assert torch.allclose(rotation_matrices(rotation, 1)[1:, 1:], axes @ rotation @ axes.T, atol=1e-14)
+
+
+def test_rotation_keeps_the_number_type_and_is_differentiable():
+    harmonics, rotation = _random(2, 25, 3), rotations_from_quats(_random(4))
+    assert rotate_harmonics(harmonics.float(), rotation).dtype == torch.float32
+    assert torch.autograd.gradcheck(rotate_harmonics, (harmonics.requires_grad_(), rotation.requires_grad_()))
+
+
+def test_unknown_degrees_are_refused():
+    with pytest.raises(ValueError, match=r"`degree` must be 0\.\.4, got 5"):
+        rotation_matrices(torch.eye(3, dtype=torch.float64), 5)
+
+
+@pytest.mark.shared
+def test_the_originals_rotation_is_ours_in_its_own_axes(golden: Callable[[str], dict[str, torch.Tensor]]):
+    """It turns coefficients of a basis whose polar axis is y; the colours agree in every direction."""
+    units = golden("units")
+    polar_y = torch.tensor(((0.0, 0, 1), (1, 0, 0), (0, 1, 0)), dtype=torch.float64)
+    for before, after, rotation in zip(
+        units["sh.in"].double(), units["sh.out"].double(), units["sh.rotations"].double(), strict=True
+    ):
+        flip = torch.diag(torch.tensor((-1.0, 1, -1), dtype=torch.float64))
+        turn = polar_y @ flip @ rotation @ flip @ polar_y.T
+        assert torch.allclose(rotate_harmonics(before.T, turn).T, after, atol=5e-5)  # its own float32 error is 1e-5
+
+
+_TO_WORLD = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=torch.float64)  # its x, y, z are z, x, y
+
+
+def _table(directions: torch.Tensor) -> torch.Tensor:
+    """The sixteen functions of OFFICIAL.md 10.3 in world axes, coefficient 14 as it is there."""
+    x, y, z = directions.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    return torch.stack(
+        (
+            torch.full_like(x, 0.28209479), -0.48860251 * x, 0.48860251 * y, -0.48860251 * z,
+            1.09254843 * z * x, -1.09254843 * x * y, 0.31539157 * (2 * yy - zz - xx), -1.09254843 * z * y,
+            0.54627422 * (zz - xx), -0.59004359 * x * (3 * zz - xx), 2.89061144 * z * x * y,
+            -0.45704580 * x * (4 * yy - zz - xx), 0.37317633 * y * (2 * yy - 3 * zz - 3 * xx),
+            -0.45704580 * z * (4 * yy - zz - xx), 1.44530572 * z * (zz - xx), -0.59004359 * z * (zz - 3 * xx),
+        ),
+        dim=-1,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("coefficients", [1, 4, 9, 16, 25])
+def test_colours_are_those_of_the_originals_table(coefficients):
+    generator = torch.Generator().manual_seed(0)
+    theirs = 0.3 * torch.randn(40, coefficients, 3, generator=generator, dtype=torch.float64)
+    directions = torch.nn.functional.normalize(torch.randn(40, 3, generator=generator, dtype=torch.float64), dim=1)
+    drawn = min(coefficients, 16)
+    expected = (_table(directions)[:, None, :drawn] @ theirs[:, :drawn])[:, 0] + 0.5
+    world = rotate_harmonics(theirs, _TO_WORLD)
+    got = evaluate_harmonics(official_harmonics(world), directions)
+    assert torch.allclose(got, expected.clamp_min(0), rtol=0, atol=1e-7)
+    apart = float((evaluate_harmonics(world, directions) - got).abs().max())
+    assert (apart > 0.05) == (coefficients >= 16) and (coefficients >= 16 or apart == 0)
+
+
+def test_it_is_linear_and_keeps_type():
+    harmonics = torch.randn(5, 25, 2, generator=torch.Generator().manual_seed(0), requires_grad=True)
+    drawn = official_harmonics(harmonics)
+    assert drawn.shape == (5, 16, 2) and drawn.dtype == torch.float32
+    (gradient,) = torch.autograd.grad(drawn.sum(), harmonics)
+    assert torch.isfinite(gradient).all() and float(gradient[:, 16:].abs().max()) == 0

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pansplat.geometry.equirect import uv_from_directions
-from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size, original_fibonacci_uv
+from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size, official_fibonacci_uv
 
 
 def test_lattice_sizes_are_the_papers():
@@ -69,7 +69,7 @@ def test_the_originals_lattice_is_reproduced_with_its_rounding(shared: Path):
     fixtures = load_file(shared / "golden" / "units.safetensors")
     for width in (16, 128, 512):
         lonlat = fixtures[f"fibonacci.{width}"].double()
-        uv = original_fibonacci_uv(len(lonlat))
+        uv = official_fibonacci_uv(len(lonlat))
         difference = (uv - 0.5) * torch.tensor((2 * math.pi, math.pi), dtype=torch.float64) - lonlat
         difference[:, 0] -= (difference[:, 0] / (2 * math.pi)).round() * 2 * math.pi
         assert float(difference.abs().max()) < 1e-6
@@ -78,9 +78,9 @@ def test_the_originals_lattice_is_reproduced_with_its_rounding(shared: Path):
 def test_the_originals_rounding_grows_with_the_count():
     for width, pixels in ((128, 0.1), (4096, 10.0)):
         count = lattice_size(width)
-        uv, exact = original_fibonacci_uv(count), uv_from_directions(fibonacci_directions(count))
+        uv, exact = official_fibonacci_uv(count), uv_from_directions(fibonacci_directions(count))
         error = (uv - exact)[1:-1, 0].abs()
         error = torch.minimum(error, 1 - error).mean() * width
         assert (float(error) < pixels) == (width == 128)
     with pytest.raises(ValueError, match="at least 2"):
-        original_fibonacci_uv(1)
+        official_fibonacci_uv(1)

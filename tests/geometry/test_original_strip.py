@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pansplat.geometry.cube_strip import equirect_from_strip, strip_from_equirect, strip_lookup
+from pansplat.geometry.cubemap import equirect_from_strip, strip_from_equirect, strip_lookup
 from pansplat.geometry.original_strip import original_lookup, original_panorama, original_strip
 
 

@@ -7,9 +7,10 @@ import torch
 from torch import Tensor
 
 from pansplat.geometry import original_sweep
+from pansplat.geometry.correlation import correlate
 from pansplat.geometry.original_sweep import correlate_as_the_original, original_grid
 from pansplat.geometry.pose import rotations_from_quats
-from pansplat.geometry.sweep import correlate, relative_pose
+from pansplat.geometry.warp import relative_pose
 
 
 def _inputs() -> tuple[Tensor, ...]:

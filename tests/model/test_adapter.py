@@ -6,9 +6,8 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from pansplat.gaussians.gaussians import Gaussians
-from pansplat.gaussians.harmonics import basis, evaluate
-from pansplat.gaussians.harmonics_rotation import rotate_harmonics
+from pansplat.gaussians.harmonics import evaluate_harmonics, harmonics_basis, rotate_harmonics
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import directions_from_uv, uv_from_directions
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.model.adapter import AdapterConfig, adapt
@@ -106,7 +105,9 @@ def test_every_raw_harmonic_changes_the_colour():
         parameters = torch.zeros(30, 82, dtype=torch.float64)
         parameters[:, 3] = 1
         parameters[:, 7 + 25 + k] = 1000.0  # green
-        colors = evaluate(_adapt(_pose(), parameters=parameters).harmonics, directions_from_uv(_random(30, 2)))
+        colors = evaluate_harmonics(
+            _adapt(_pose(), parameters=parameters).harmonics, directions_from_uv(_random(30, 2))
+        )
         assert float((colors[:, 1] - 0.5).abs().max()) > 0.01
         assert torch.allclose(colors[:, 0], torch.full_like(colors[:, 0], 0.5), atol=1e-9)
 
@@ -129,7 +130,7 @@ def test_the_networks_basis_has_y_as_its_polar_axis():
         parameters = torch.zeros(30, 7 + 48, dtype=torch.float64)
         parameters[:, 7 + k] = 1 / (1.0 if k == 0 else 0.1 * 0.25 ** math.isqrt(k))
         harmonics = _adapt(torch.eye(4, dtype=torch.float64), parameters=parameters, degree=3).harmonics
-        color = (basis(directions, 3)[:, None] @ harmonics)[:, 0, 0]
+        color = (harmonics_basis(directions, 3)[:, None] @ harmonics)[:, 0, 0]
         assert torch.allclose(color, function, atol=1e-7)
 
 

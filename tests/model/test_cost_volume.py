@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.geometry.sweep import warp_panorama
+from pansplat.geometry.warp import warp_panorama
 from pansplat.model.cost_volume import (
     CostVolumeConfig,
     SphericalCostVolume,

@@ -5,9 +5,10 @@ import math
 import pytest
 import torch
 
+from pansplat.geometry.correlation import correlate
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import rotations_from_quats
-from pansplat.geometry.sweep import correlate, warp_panorama
+from pansplat.geometry.warp import warp_panorama
 from pansplat.model.cost_volume import (
     CostVolumeConfig,
     SphericalCostVolume,

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
-from pansplat.gaussians.harmonics_rotation import rotate_harmonics
+from pansplat.gaussians.harmonics import rotate_harmonics
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.fibonacci import lattice_size
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.model.adapter import AdapterConfig

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from pansplat.errors import InputError
-from pansplat.gaussians.harmonics_rotation import rotate_harmonics
+from pansplat.gaussians.harmonics import rotate_harmonics
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.model.adapter import AdapterConfig, world_harmonics_rotation
 from pansplat.model.mvsplat import MVSplat, MVSplatConfig, MVSplatOutput

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import uv_from_directions
 from pansplat.geometry.fibonacci import lattice_size
 from pansplat.model.adapter import AdapterConfig

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.gaussians.harmonics_rotation import rotate_harmonics
+from pansplat.gaussians.harmonics import rotate_harmonics
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.model.adapter import AdapterConfig
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel

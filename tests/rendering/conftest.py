@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from pansplat.gaussians.gaussians import Gaussians
-from pansplat.gaussians.harmonics import evaluate
+from pansplat.gaussians.harmonics import evaluate_harmonics
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import rotations_from_quats
 
@@ -76,7 +76,7 @@ def _dense(
     if lowpass == "angular":
         ratio = _quadratic(mean, _adjugate(unfiltered)) / _quadratic(mean, _adjugate(s))
         opacity = opacity * torch.sqrt(ratio.clamp_min(1e-12))
-    colour = evaluate(gaussians.harmonics, (gaussians.means - centre) / radius[:, None])
+    colour = evaluate_harmonics(gaussians.harmonics, (gaussians.means - centre) / radius[:, None])
     key = radius if order == "radial" else mean[:, 2]
     sums, through = torch.zeros(5, len(rays), dtype=torch.float64), torch.ones(len(rays), dtype=torch.float64)
     for i in torch.argsort(key.detach(), stable=True).tolist():

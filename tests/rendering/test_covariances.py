@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import rasterize
 
 _OPTIONS = [

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import rasterize as _rasterize
 
 rasterize = functools.partial(_rasterize, backend="torch")  # float32 too

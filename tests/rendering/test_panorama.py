@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.cubemap import face_of, face_poses, face_rotations, official_faces
 from pansplat.geometry.equirect import pixel_directions, uv_from_directions
 from pansplat.geometry.pose import multiply_quats, quats_from_rotations, rotations_from_quats

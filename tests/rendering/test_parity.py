@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from pansplat.gaussians.gaussians import Gaussians
-from pansplat.gaussians.harmonics import evaluate
+from pansplat.gaussians.harmonics import evaluate_harmonics
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.cubemap import face_poses
 from pansplat.rendering import rasterize
 from pansplat.rendering.stitching import stitch_faces
@@ -36,7 +36,7 @@ def _original_face(
     flat = flat + 0.3 * torch.eye(2, dtype=torch.float64)
     conic = torch.linalg.inv(flat)
     middle = ((torch.stack((x / z, y / z), dim=1) + 1) * num - 1) / 2
-    colour = evaluate(scene.harmonics, torch.nn.functional.normalize(means - centre, dim=1))
+    colour = evaluate_harmonics(scene.harmonics, torch.nn.functional.normalize(means - centre, dim=1))
     across = torch.arange(num, dtype=torch.float64)
     pixels = torch.stack((across.repeat(num), across.repeat_interleave(num)), dim=1)
     half = 0.5 * (flat[:, 0, 0] + flat[:, 1, 1])

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.rendering import rasterize as _rasterize
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pansplat.evaluation.metrics import psnr
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.fibonacci import lattice_size
 from pansplat.geometry.pose import interpolate_poses, rotations_from_quats
 from pansplat.rendering import blend, blend_weights, rasterize

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.sweep import Sweep, SweepConfig
 from pansplat.sweep.lift import LiftConfig

@@ -7,8 +7,7 @@ import torch
 
 import pansplat
 from pansplat.data.pair import Pair
-from pansplat.evaluation.cross_fade import cross_fade
-from pansplat.evaluation.metrics import ws_psnr
+from pansplat.evaluation.metrics import cross_fade, ws_psnr
 
 pytestmark = pytest.mark.shared
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pansplat.bench.scenes import full_lattice_room
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.training.config import Mixing, Style
 from pansplat.training.drawing import Drawing
 

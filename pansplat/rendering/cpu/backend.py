@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pansplat.constants import EWA_NEAR_FACTOR
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.backend import Drawn, Info, Options
 from pansplat.rendering.cpu import tiling
 from pansplat.rendering.cpu.ewa import TOTALS, project, project_backward

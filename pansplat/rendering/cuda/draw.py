@@ -16,7 +16,7 @@ from torch.utils.checkpoint import checkpoint
 
 from pansplat.constants import EWA_NEAR_FACTOR
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.backend import Drawn, Info, Options
 from pansplat.rendering.panorama import Picture
 from pansplat.rendering.reference import in_picture, project

@@ -14,7 +14,7 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.cuda.body import from_axes, from_covariance
 from pansplat.rendering.cuda.observe_backward import observe_backward
 from pansplat.rendering.cuda.response import load_numbers

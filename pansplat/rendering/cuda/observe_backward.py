@@ -16,7 +16,7 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.gaussians.harmonics import evaluate
+from pansplat.gaussians.harmonics import evaluate_harmonics
 from pansplat.rendering.cuda.body import from_axes, from_covariance, in_frame, own_axes
 from pansplat.rendering.cuda.response import load_numbers
 from pansplat.rendering.cuda.vectors import (
@@ -329,7 +329,7 @@ def _colours_backward(
         world = torch.nn.functional.normalize(means[chunk].double() - cam2world[:3, 3], dim=1).to(means.dtype)
         leaves = harmonics[chunk].detach().requires_grad_(), world.requires_grad_()
         with torch.enable_grad():
-            colours = evaluate(*leaves)
+            colours = evaluate_harmonics(*leaves)
         by_harmonics[chunk], by_worlds[chunk] = torch.autograd.grad(
             colours, leaves, slopes[chunk], materialize_grads=True
         )

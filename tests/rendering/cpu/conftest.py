@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import splats
 from pansplat.rendering.cpu.observe import Camera, Fields, Observed, observe
 from pansplat.rendering.cpu.rasterize import MIN_PLANAR_COSINE

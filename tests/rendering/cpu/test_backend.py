@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import rasterize, reference
 from pansplat.rendering.backend import Options
 from pansplat.rendering.cpu import draw, tiling

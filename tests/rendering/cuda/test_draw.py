@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import rasterize
 
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")

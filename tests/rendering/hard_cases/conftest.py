@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import Rendering, backend, rasterize
 
 os.environ["TRITON_INTERPRET"] = "1"  # before the kernels are imported

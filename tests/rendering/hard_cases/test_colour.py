@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from pansplat.gaussians.harmonics import basis
+from pansplat.gaussians.harmonics import harmonics_basis
 
 _BASE = 0.28209479177387814
 
@@ -58,7 +58,7 @@ def test_distance_as_a_channel_is_the_depth(draw, make_scene, pose):
 def test_every_harmonic_up_to_degree_4_colours_as_it_should(draw, balls):
     """The original never evaluates coefficients 16 to 24, and takes the wrong axis for coefficient 14."""
     ahead = torch.tensor((0.48, -0.36, 0.8), dtype=torch.float64)
-    expected = basis(ahead, 4)
+    expected = harmonics_basis(ahead, 4)
     scene = balls(2 * ahead, 1.0, 1.0)
     harmonics = torch.zeros(1, 25, 25, dtype=torch.float64)
     harmonics[0] = 0.3 * torch.eye(25, dtype=torch.float64)  # channel k holds harmonic k alone
@@ -99,7 +99,7 @@ def test_a_colour_at_0_is_black_and_has_a_slope_above_only(draw, balls, leaves):
 @pytest.mark.hard_case(35)
 def test_the_slope_of_a_colour_at_exactly_0_is_0(draw, balls, leaves):
     """A colour of exactly 0: the constant harmonic of -1/2 over its own value rounds to nothing but -0.5."""
-    base = basis(torch.tensor([[0.0, 0.0, 1.0]], dtype=draw.dtype), 0)[0, 0]
+    base = harmonics_basis(torch.tensor([[0.0, 0.0, 1.0]], dtype=draw.dtype), 0)[0, 0]
     value = torch.tensor(-0.5, dtype=draw.dtype) / base
     candidates = [value, torch.nextafter(value, value - 1), torch.nextafter(value, value + 1)]
     exact = [v for v in candidates if float(base * v + 0.5) == 0]

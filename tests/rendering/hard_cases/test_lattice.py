@@ -7,7 +7,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from pansplat.geometry.equirect import directions_from_uv
-from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size, original_fibonacci_uv
+from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size, official_fibonacci_uv
 
 
 @pytest.mark.hard_case(50)
@@ -34,7 +34,7 @@ def _nearest(directions: torch.Tensor, band: slice) -> torch.Tensor:
 def test_neighbours_keep_their_distance_at_4k_where_the_originals_do_not():
     count = lattice_size(4096)
     assert count > 5_000_000
-    ours, theirs = fibonacci_directions(count), directions_from_uv(original_fibonacci_uv(count))
+    ours, theirs = fibonacci_directions(count), directions_from_uv(official_fibonacci_uv(count))
     for middle in (count // 3, count // 2, count - 200_000):
         band = slice(middle - 40_000, middle + 40_000)
         nearest = _nearest(ours, band)

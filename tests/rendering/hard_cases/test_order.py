@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
 
 _RED_GREEN = torch.tensor([[1.0, 0, 0], [0, 1.0, 0]], dtype=torch.float64)

@@ -44,7 +44,7 @@ def test_boxes_of_any_extent_are_limited_before_they_become_integers(value, wrap
 
 _CROWD = """
 import resource, torch
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import rasterize
 
 count, size, label = 1500, (512, 1024), torch.zeros(1500, dtype=torch.int64)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.gaussians.gaussians import Gaussians
-from pansplat.gaussians.scene import Scene
+from pansplat.gaussians.scene import Gaussians, Scene
 
 _Y0 = 0.28209479177387814  # the constant harmonic
 

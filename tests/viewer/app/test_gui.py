@@ -13,8 +13,7 @@ from imgui_bundle import imgui
 
 from pansplat.data.views import Views
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
-from pansplat.gaussians.scene import Scene
+from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat_viewer.library import Entry, Loaded, Loader

@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.gaussians.gaussians import Gaussians
-from pansplat.gaussians.scene import Scene
+from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.rendering import Rendering, rasterize
 from pansplat_viewer.offscreen import create_context

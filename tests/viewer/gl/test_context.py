@@ -41,7 +41,7 @@ def _emulated(version: str) -> dict[str, str]:
 _DRAW = """
 import sys
 import numpy as np, torch
-from pansplat.gaussians.gaussians import Gaussians
+from pansplat.gaussians.scene import Gaussians
 from pansplat.gaussians.scene import Scene
 from pansplat_viewer.offscreen import create_context
 from pansplat_viewer.renderer import DrawSettings, SplatRenderer

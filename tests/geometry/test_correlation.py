@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
-from pansplat.geometry import sweep
-from pansplat.geometry.correlation_kernel import correlate_positions, correlate_positions_backward
+from pansplat.geometry import correlation
+from pansplat.geometry.correlation import correlate, correlate_positions, correlate_positions_backward
 from pansplat.geometry.equirect import pixel_directions, sample_equirect, uv_from_directions
 from pansplat.geometry.pose import rotations_from_quats
-from pansplat.geometry.sweep import correlate, relative_pose, sweep_positions, warp_panorama
+from pansplat.geometry.warp import relative_pose, warp_panorama, warp_positions
 
 SAMPLINGS = ("sphere", "corners")
 H, W = 8, 16
@@ -48,7 +48,7 @@ def test_identity_pose_warps_to_identity(height, dtype):
     warped = warp_panorama(maps, inverse_depth, torch.eye(4)[None])
     error = (warped - maps[:, :, None]).abs().max()
     assert error < (2e-4 if dtype == torch.float32 else 1e-12)
-    columns, rows = sweep_positions(inverse_depth, torch.eye(4)[None], "sphere")
+    columns, rows = warp_positions(inverse_depth, torch.eye(4)[None], "sphere")
     assert torch.equal(columns, torch.arange(2 * height).to(dtype).expand_as(columns))
     assert torch.equal(rows, torch.arange(height).to(dtype)[:, None].expand_as(rows))
 
@@ -86,7 +86,7 @@ def test_the_originals_warp_is_reproduced(golden):
 
 
 def test_the_originals_identity_is_off_by_half_a_pixel_at_the_borders():
-    columns, _ = sweep_positions(torch.ones(1, 1, H, W, dtype=torch.float64), torch.eye(4)[None], "corners")
+    columns, _ = warp_positions(torch.ones(1, 1, H, W, dtype=torch.float64), torch.eye(4)[None], "corners")
     expected = (torch.arange(W) + 0.5) / W * (W - 1)
     assert torch.allclose(columns[0, 0, 0], expected.double(), atol=1e-6)
 
@@ -189,7 +189,7 @@ def test_chunks_do_not_change_the_correlation(backend, monkeypatch):
         return (result, *torch.autograd.grad(result.square().sum(), (a, b)))
 
     whole = run()
-    monkeypatch.setattr(sweep, "_CHUNK", 1)
+    monkeypatch.setattr(correlation, "_CHUNK", 1)
     for part, expected in zip(run(), whole, strict=True):
         assert torch.allclose(part, expected, atol=1e-12)
 
@@ -197,20 +197,20 @@ def test_chunks_do_not_change_the_correlation(backend, monkeypatch):
 def test_warped_features_of_all_candidates_never_exist_at_once(monkeypatch):
     inputs = [tensor.requires_grad_() for tensor in _inputs()]
     limit, seen = 3 * inputs[0].numel(), []
-    monkeypatch.setattr(sweep, "_CHUNK", limit)
+    monkeypatch.setattr(correlation, "_CHUNK", limit)
 
     def spy(*args):
         seen.append(warp_panorama(*args))
         return seen[-1]
 
-    monkeypatch.setattr(sweep, "warp_panorama", spy)
+    monkeypatch.setattr(correlation, "warp_panorama", spy)
     correlate(*inputs, "sphere", "torch").sum().backward()
     assert len(seen) == 2 * 3 and max(warped.numel() for warped in seen) <= limit
 
 
 def test_threads_do_not_change_the_correlations_bits():
     reference, other, inverse_depth, poses = (tensor.float() for tensor in _inputs(height=32))
-    positions = sweep_positions(inverse_depth, poses, "sphere")
+    positions = warp_positions(inverse_depth, poses, "sphere")
     threads = torch.get_num_threads()
     results = []
     try:

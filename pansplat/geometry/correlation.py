@@ -1,20 +1,31 @@
-"""The correlation of a spherical sweep on the processor, pixel by pixel, without ever warping a map.
+"""Correlation of each pixel's features with another panorama's features at every depth candidate.
 
-Neighbouring candidates of a pixel mostly fall among the same four pixels of the other panorama. Their four dot
-products are then taken once, and each candidate only weighs them.
+On the CPU compiled kernels loop over pixels and never materialise the warped features. Consecutive candidates of a
+pixel mostly fall between the same four pixels of the other panorama: their four dot products are computed once, and
+each candidate only interpolates them. On other devices a few candidates at a time are warped and multiplied.
+
+Source: PanSplat, section 3.2; docs/official.md, section 6.
 """
 
 import inspect
 import itertools
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, Literal
 
 import numba as nb
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from pansplat.geometry.warp import Sampling, warp_panorama, warp_positions
+
+Backend = Literal["auto", "torch", "kernel"]
+
+_CHUNK = 1 << 22
+"""Numbers in the warped features, or in the positions, that exist at a time."""
 
 _MOST_BANDS = 8
 """Each has its own sum of gradients to the other panorama."""
@@ -191,3 +202,101 @@ def _share(work: Callable[[int, int], None], pairs: int, bands: int) -> None:
     with ThreadPoolExecutor(bands) as pool:
         for done in [pool.submit(work, pair, band) for pair in range(pairs) for band in range(bands)]:
             done.result()
+
+
+def correlate(
+    reference: Float[Tensor, "pair channel height width"],
+    other: Float[Tensor, "pair channel height width"],
+    inverse_depth: Float[Tensor, "pair candidate height width"],
+    pose: Float[Tensor, "pair 4 4"],
+    sampling: Sampling = "sphere",
+    backend: Backend = "auto",
+) -> Float[Tensor, "pair candidate height width"]:
+    """Dot products of each pixel's features with the other panorama's, for each candidate, over sqrt(channel).
+
+    The warped features of all candidates never exist at once, neither forward nor backward. Half-precision features
+    are multiplied in float32. Gradient flows to both features.
+
+    Args:
+        reference: features at the pixels.
+        other: features that are sampled, of the same size.
+        inverse_depth: candidates of each pixel, 1 / metres.
+        pose: from reference camera axes to the other's.
+        sampling: see above.
+        backend: "kernel" runs on the CPU only, "torch" anywhere; "auto" takes the faster.
+    """
+    if backend == "auto":
+        backend = "kernel" if reference.device.type == "cpu" else "torch"
+    method = _ByKernel if backend == "kernel" else _ByWarping
+    dtype = torch.promote_types(reference.dtype, torch.float32)
+    # Scaled before the product, so that no sum grows larger than the result.
+    scaled = reference.to(dtype) / math.sqrt(reference.shape[1])
+    return method.apply(scaled, other.to(dtype), inverse_depth.detach().to(dtype), pose.detach(), sampling)
+
+
+class _ByWarping(torch.autograd.Function):
+    """Warps a few candidates at a time, and again in the backward pass."""
+
+    @staticmethod
+    def forward(ctx, reference, other, inverse_depth, pose, sampling):
+        ctx.save_for_backward(reference, other, inverse_depth, pose)
+        ctx.sampling = sampling
+        parts = [
+            torch.einsum("nchw,ncdhw->ndhw", reference, warp_panorama(other, chunk, pose, sampling))
+            for chunk in _chunks(inverse_depth, reference.numel())
+        ]
+        return torch.cat(parts, dim=1)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient):  # pyright: ignore[reportIncompatibleMethodOverride]
+        reference, other, inverse_depth, pose = ctx.saved_tensors
+        to_reference, to_other = torch.zeros_like(reference), torch.zeros_like(other)
+        chunks = _chunks(inverse_depth, reference.numel())
+        for chunk, part in zip(chunks, gradient.split([c.shape[1] for c in chunks], dim=1), strict=True):
+            with torch.enable_grad():
+                leaf = other.detach().requires_grad_()
+                warped = warp_panorama(leaf, chunk, pose, ctx.sampling)
+            to_reference += torch.einsum("ndhw,ncdhw->nchw", part, warped.detach())
+            to_other += torch.autograd.grad(warped, leaf, part[:, None] * reference[:, :, None])[0]
+        return to_reference, to_other, None, None, None
+
+
+class _ByKernel(torch.autograd.Function):
+    """Loops over pixels in compiled code; warps nothing."""
+
+    @staticmethod
+    def forward(ctx, reference, other, inverse_depth, pose, sampling):
+        ctx.save_for_backward(reference, other, inverse_depth, pose)
+        ctx.sampling = sampling
+        parts = [
+            correlate_positions(reference, other, *place, wraps=sampling == "sphere")
+            for _, place in _placed(inverse_depth, pose, sampling)
+        ]
+        return torch.cat(parts, dim=1)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient):  # pyright: ignore[reportIncompatibleMethodOverride]
+        reference, other, inverse_depth, pose = ctx.saved_tensors
+        to_reference, to_other = torch.zeros_like(reference), torch.zeros_like(other)
+        for candidates, place in _placed(inverse_depth, pose, ctx.sampling):
+            steps = correlate_positions_backward(
+                gradient[:, candidates], reference, other, *place, wraps=ctx.sampling == "sphere"
+            )
+            to_reference += steps[0]
+            to_other += steps[1]
+        return to_reference, to_other, None, None, None
+
+
+def _placed(inverse_depth: Tensor, pose: Tensor, sampling: Sampling) -> Iterator[tuple[slice, tuple[Tensor, Tensor]]]:
+    """Groups of candidates with their positions in the other panorama."""
+    start = 0
+    for chunk in _chunks(inverse_depth, inverse_depth[:, :1].numel()):
+        yield slice(start, start + chunk.shape[1]), warp_positions(chunk, pose, sampling)
+        start += chunk.shape[1]
+
+
+def _chunks(inverse_depth: Tensor, numbers: int) -> tuple[Tensor, ...]:
+    """The candidates in groups within the limit, when one takes so many numbers."""
+    return inverse_depth.split(max(1, _CHUNK // max(1, numbers)), dim=1)
