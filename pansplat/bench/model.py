@@ -25,10 +25,10 @@ Watch = Callable[[str, "list[ModelRow]"], None]
 class ModelRow:
     """One way to run the network, what it took, and how far it is from the first row of the same `compat`.
 
-    That row convolves in float32 without rearranging the sums, untiled. None is what was not measured.
+    That row is in float32 and untiled. None is what was not measured.
 
     Attributes:
-        compat, precision, attention, convolution, threads, tiles: see `ModelCase`.
+        compat, precision, attention, threads, tiles: see `ModelCase`.
         height: of the panoramas, pixels.
         stages_s: seconds of each part.
         total_s: their sum.
@@ -43,7 +43,6 @@ class ModelRow:
     compat: str
     precision: str
     attention: str
-    convolution: str
     threads: int
     tiles: int
     height: int
@@ -60,24 +59,23 @@ class ModelRow:
 
 def model_cases(threads: int, *, bfloat16: bool, quick: bool) -> list[ModelCase]:
     """Ways to run the network; the first of each `compat` is what the others are compared with."""
-    plain = ModelCase("fixed", "float32", "float32", "direct", threads, tiles=1)
-    fast = dataclasses.replace(plain, convolution="fastest")
-    cases = [plain, fast]
+    plain = ModelCase("fixed", "float32", "float32", threads, tiles=1)
+    cases = [plain]
     if bfloat16:
-        cases.append(dataclasses.replace(fast, precision="bfloat16"))
-        cases.append(dataclasses.replace(fast, precision="bfloat16", attention="bfloat16"))
+        cases.append(dataclasses.replace(plain, precision="bfloat16"))
+        cases.append(dataclasses.replace(plain, precision="bfloat16", attention="bfloat16"))
     if quick:
         return cases
-    cases.insert(2, dataclasses.replace(fast, attention="bfloat16"))
-    cases += [dataclasses.replace(fast, tiles=tiles) for tiles in (2, 4)]
+    cases.insert(1, dataclasses.replace(plain, attention="bfloat16"))
+    cases += [dataclasses.replace(plain, tiles=tiles) for tiles in (2, 4)]
     if bfloat16:
-        cases.append(dataclasses.replace(fast, precision="bfloat16", tiles=2))
+        cases.append(dataclasses.replace(plain, precision="bfloat16", tiles=2))
     if threads > 1:
-        cases.append(dataclasses.replace(fast, threads=1))
+        cases.append(dataclasses.replace(plain, threads=1))
     official = dataclasses.replace(plain, compat="official")
-    cases += [official, dataclasses.replace(official, convolution="fastest")]
+    cases.append(official)
     if bfloat16:
-        cases.append(dataclasses.replace(official, convolution="fastest", precision="bfloat16"))
+        cases.append(dataclasses.replace(official, precision="bfloat16"))
     return cases
 
 
@@ -107,10 +105,7 @@ def measure_model(
 def describe_case(case: ModelCase) -> str:
     """The case in words."""
     threads = "one thread" if case.threads == 1 else f"{case.threads} threads"
-    return (
-        f"{case.compat}, {case.precision}, attention {case.attention}, {case.convolution} convolutions, "
-        f"{case.tiles}x{case.tiles} tiles, {threads}"
-    )
+    return f"{case.compat}, {case.precision}, attention {case.attention}, {case.tiles}x{case.tiles} tiles, {threads}"
 
 
 def relative_errors(depth: Tensor, reference: Tensor) -> tuple[float, float]:

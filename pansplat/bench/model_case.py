@@ -16,7 +16,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import safetensors.torch
 import torch
@@ -34,7 +33,6 @@ from pansplat.model.layers import AttentionPrecision, Compat, Precision
 from pansplat.model.loading import build_network
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
 from pansplat.model.transformer import TransformerConfig
-from pansplat.model.winograd import FastConv3x3
 from pansplat.pipeline import render
 
 STAGES = ("features", "mono", "cost volume", "heads")
@@ -52,14 +50,12 @@ class ModelCase:
     """One way to run the network.
 
     Attributes:
-        convolution: "fastest" computes the heads' convolutions in blocks (winograd.py), "direct" does not.
         tiles: along each side of the panorama, for the heads.
     """
 
     compat: Compat
     precision: Precision
     attention: AttentionPrecision
-    convolution: Literal["fastest", "direct"]
     threads: int
     tiles: int
 
@@ -126,7 +122,6 @@ def _run(job: Path) -> None:
     )
     assert isinstance(network, PanSplat)
     with torch.no_grad():
-        _set_convolution(network, case)
         _wake(case)
         measured = _measure(network, case, views["images"], views["cam2world"], told["near"], told["far"])
     tensors = {"depth": measured.depth.contiguous(), "picture": measured.picture.contiguous()}
@@ -135,16 +130,9 @@ def _run(job: Path) -> None:
     print(json.dumps(numbers))
 
 
-def _set_convolution(network: nn.Module, case: ModelCase) -> None:
-    for module in network.modules():
-        if isinstance(module, FastConv3x3):
-            module.method = case.convolution
-
-
 def _wake(case: ModelCase) -> None:
     """Compile and load what the measured run will need, with a network as narrow as can be."""
     network = PanSplat(_NARROW, case.compat, precision=case.precision, attention_precision=case.attention).eval()
-    _set_convolution(network, case)
     poses = torch.eye(4).repeat(1, 2, 1, 1)
     poses[0, 1, 0, 3] = 0.1
     network(torch.zeros(1, 2, 3, 64, 128), poses, torch.full((1, 2), 0.5), torch.full((1, 2), 10.0))

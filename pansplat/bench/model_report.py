@@ -15,7 +15,7 @@ from pansplat.bench.model_case import STAGES
 from pansplat.bench.tabulate import Column, number, page_table, terminal_table
 
 _COLUMNS: tuple[Column, ...] = (
-    *(("compat", "left"), ("precision", "left"), ("attention", "left"), ("convolution", "left")),
+    *(("compat", "left"), ("precision", "left"), ("attention", "left")),
     *(("tiles", "right"), ("threads", "right")),
     *((f"{stage} s", "right") for stage in STAGES),
     *(
@@ -43,7 +43,7 @@ def model_markdown(rows: Sequence[ModelRow]) -> str:
 def model_cells(row: ModelRow) -> tuple[str, ...]:
     """A row's cells; what was not measured is blank."""
     return (
-        *(row.compat, row.precision, row.attention, row.convolution, f"{row.tiles}x{row.tiles}", str(row.threads)),
+        *(row.compat, row.precision, row.attention, f"{row.tiles}x{row.tiles}", str(row.threads)),
         *(number(row.stages_s.get(stage), "{:.1f}") for stage in STAGES),
         number(row.total_s, "{:.1f}"),
         number(row.processor_s, "{:.1f}"),
@@ -85,6 +85,6 @@ def plot_model(rows: Sequence[ModelRow], path: Path, title: str) -> bool:
 
 def _name(row: ModelRow) -> str:
     parts = [row.compat, row.precision]
-    parts += ["attention bfloat16"] * (row.attention == "bfloat16") + ["direct"] * (row.convolution == "direct")
+    parts += ["attention bfloat16"] * (row.attention == "bfloat16")
     parts += [f"{row.tiles}x{row.tiles} tiles"] * (row.tiles > 1)
     return ", ".join([*parts, "1 thread" if row.threads == 1 else f"{row.threads} threads"])

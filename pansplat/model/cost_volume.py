@@ -17,10 +17,8 @@ from torch.nn import functional
 
 from pansplat.geometry.correlation import correlate
 from pansplat.geometry.equirect import Border
-from pansplat.geometry.original_sweep import correlate_as_the_original
 from pansplat.geometry.warp import Sampling, relative_pose
 from pansplat.model.layers import (
-    Arithmetic,
     AttentionPrecision,
     Compat,
     PanoramaConv2d,
@@ -131,8 +129,6 @@ class Depths:
 class SphericalCostVolume(nn.Module):
     """Inverse depth of every view, coarse to fine."""
 
-    arithmetic: Arithmetic = "fast"
-
     def __init__(
         self,
         config: CostVolumeConfig,
@@ -190,7 +186,7 @@ class SphericalCostVolume(nn.Module):
             else:
                 step = (bounds[1] - bounds[0]) / max(1, first_count - 1) / 2 ** len(done)
                 candidates = candidates_about(centre, step, bounds, sweep.candidates)
-            volume = correlate_views(level_features, candidates, cam2world, self.compat, self.arithmetic)
+            volume = correlate_views(level_features, candidates, cam2world, self.compat)
             with convolving(self.precision, volume.device):
                 logits = self.levels[str(sweep.level)](volume, level_features, centre, mono_features)
             done.append(regress(sweep.level, logits.to(level_features.dtype), candidates))
@@ -290,12 +286,8 @@ def correlate_views(
     candidates: Float[Tensor, "batch view candidate height width"],
     cam2world: Float[Tensor, "batch view 4 4"],
     compat: Compat,
-    arithmetic: Arithmetic = "fast",
 ) -> Float[Tensor, "batch view candidate height width"]:
     """Each view's correlation with the others, averaged over them."""
-    if arithmetic == "original":
-        pairs = (maps.flatten(0, 1) for maps in (features, features.flip(1), candidates, cam2world, cam2world.flip(1)))
-        return correlate_as_the_original(*pairs).unflatten(0, features.shape[:2])
     total = _correlate_round(features, candidates, cam2world, 1, compat)
     for offset in range(2, features.shape[1]):
         total = total + _correlate_round(features, candidates, cam2world, offset, compat)

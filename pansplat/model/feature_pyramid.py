@@ -11,17 +11,16 @@ from torch import Tensor, nn
 
 from pansplat.geometry.equirect import Border
 from pansplat.model.layers import (
-    Arithmetic,
     AttentionPrecision,
     Compat,
     PanoramaConv2d,
     Precision,
     border_of,
     convolving,
-    laid_out,
     normalized_convolution,
     require_size,
     require_views,
+    to_channels_last,
     upsample,
 )
 from pansplat.model.transformer import Transformer, TransformerConfig
@@ -42,8 +41,6 @@ class FeaturePyramidConfig:
 
 class FeaturePyramid(nn.Module):
     """Features of levels 3 to 0, at 1/8 to 1/1 of the image; paper's F^l."""
-
-    arithmetic: Arithmetic = "fast"
 
     def __init__(
         self,
@@ -73,7 +70,7 @@ class FeaturePyramid(nn.Module):
         with convolving(self.precision, images.device):
             fine_to_coarse = self.encoder(normalize(images.flatten(0, 1)))
             coarsest = fine_to_coarse[-1].unflatten(0, batch_and_view).to(images.dtype)
-            refined = laid_out(self.transformer(coarsest).flatten(0, 1), self.arithmetic)
+            refined = to_channels_last(self.transformer(coarsest).flatten(0, 1))
             coarse_to_fine = self.decoder(refined, fine_to_coarse[:-1])
         return [features.unflatten(0, batch_and_view).to(images.dtype) for features in coarse_to_fine]
 

@@ -27,7 +27,6 @@ from pansplat.model.cost_volume import Depths, LevelDepth
 from pansplat.model.lattice import Lattice, lattice_uv, move_points
 from pansplat.model.layers import Compat, Precision, convolving
 from pansplat.model.tiles import Margins, Tile, Window, cut, sample, sample_whole, tile_grid
-from pansplat.model.winograd import FastConv3x3
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ class LevelHead(nn.Module):
         widths = [inputs, *[hidden] * (config.layers - 1), last]
         padding = 1 if compat == "official" else 0
         self.convs = nn.ModuleList(
-            FastConv3x3(before, after, padding=padding) for before, after in itertools.pairwise(widths)
+            nn.Conv2d(before, after, 3, padding=padding) for before, after in itertools.pairwise(widths)
         )
         # One Gaussian a pixel needs no layer of its own: the map holds its numbers.
         self.linear = nn.Linear(hidden, config.outputs) if config.lattice == "fibonacci" else nn.Identity()

@@ -21,10 +21,6 @@ from pansplat.geometry.pose import orthonormal_error
 Compat = Literal["official", "fixed"]
 Precision = Literal["float32", "bfloat16"]
 AttentionPrecision = Literal["float32", "bfloat16"]
-Arithmetic = Literal["fast", "original"]
-"""Operations joined and reordered for speed, or each as the original does it: equal to it in the last bit."""
-
-_LOGITS = 1 << 25  # of attention that exist at a time where its products are written out
 
 
 def convolving(precision: Precision, device: torch.device) -> torch.autocast:
@@ -35,20 +31,9 @@ def convolving(precision: Precision, device: torch.device) -> torch.autocast:
     return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16")
 
 
-def follow_the_original(network: nn.Module) -> None:
-    """Have every part of a network that has the choice compute with the arithmetic "original" from now on."""
-    for module in network.modules():
-        if hasattr(module, "arithmetic"):
-            module.arithmetic = "original"  # pyright: ignore[reportArgumentType]
-    for parameter in network.parameters():
-        parameter.data = parameter.data.clone(memory_format=torch.contiguous_format)
-
-
-def laid_out(
-    maps: Float[Tensor, "image channel height width"], arithmetic: Arithmetic
-) -> Float[Tensor, "image channel height width"]:
-    """Maps in the layout to convolve them in; on a CPU channels last is faster, and adds up in another order."""
-    return maps.contiguous(memory_format=torch.channels_last if arithmetic == "fast" else torch.contiguous_format)
+def to_channels_last(maps: Float[Tensor, "image channel height width"]) -> Float[Tensor, "image channel height width"]:
+    """The maps in channels-last memory layout, in which a CPU convolves faster."""
+    return maps.contiguous(memory_format=torch.channels_last)
 
 
 def border_of(compat: Compat) -> Border:
@@ -102,8 +87,6 @@ def require_rigid(cam2world: Float[Tensor, "batch view 4 4"]) -> None:
 class PanoramaConv2d(nn.Conv2d):
     """A convolution that keeps the size of the map (or divides it by the stride) and knows what lies beyond it."""
 
-    arithmetic: Arithmetic = "fast"
-
     def __init__(
         self, inputs: int, outputs: int, kernel: int, *, border: Border, stride: int = 1, bias: bool = True
     ) -> None:
@@ -129,9 +112,9 @@ class PanoramaConv2d(nn.Conv2d):
 def normalized_convolution(
     conv: PanoramaConv2d, norm: nn.BatchNorm2d, maps: Float[Tensor, "batch channel height width"]
 ) -> Float[Tensor, "batch c h w"]:
-    """Convolution and batch normalisation, which outside training are one convolution where speed is wanted."""
+    """Convolution and batch normalisation, which outside training are one convolution."""
     mean, variance = norm.running_mean, norm.running_var
-    if norm.training or mean is None or variance is None or conv.arithmetic == "original":
+    if norm.training or mean is None or variance is None:
         return norm(conv(maps))
     scale = norm.weight / (variance + norm.eps).sqrt()
     offset = -mean if conv.bias is None else conv.bias - mean
@@ -164,7 +147,6 @@ def attend(
     *,
     mask: Float[Tensor, "#batch #head query key"] | None = None,
     precision: AttentionPrecision = "float32",
-    arithmetic: Arithmetic = "fast",
 ) -> Float[Tensor, "batch head query channel"]:
     """Scaled dot-product attention; `mask` is added to the logits.
 
@@ -172,39 +154,20 @@ def attend(
     sums between are in float32.
     """
     with torch.autocast(queries.device.type, enabled=False):
-        return _attend(queries, keys, values, mask, precision, arithmetic)
+        return _attend(queries, keys, values, mask, precision)
 
 
 def _attend(
-    queries: Tensor,
-    keys: Tensor,
-    values: Tensor,
-    mask: Tensor | None,
-    precision: AttentionPrecision,
-    arithmetic: Arithmetic,
+    queries: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None, precision: AttentionPrecision
 ) -> Tensor:
-    product = functional.scaled_dot_product_attention if arithmetic == "fast" else _written_out
     if precision == "float32":
         exact = [tensor.to(torch.promote_types(tensor.dtype, torch.float32)) for tensor in (queries, keys, values)]
-        return product(*exact, attn_mask=mask)
+        return functional.scaled_dot_product_attention(*exact, attn_mask=mask)
     kept = queries.dtype
     rounded = [tensor.to(torch.bfloat16) for tensor in (queries, keys, values)]
     bias = None if mask is None else mask.to(torch.bfloat16)
     if queries.device.type == "cpu":
         rounded = [tensor.to(kept) for tensor in rounded]
         bias = None if bias is None else bias.to(kept)
-    attended = product(*rounded, attn_mask=bias)
+    attended = functional.scaled_dot_product_attention(*rounded, attn_mask=bias)
     return attended.to(torch.bfloat16).to(kept)
-
-
-def _written_out(queries: Tensor, keys: Tensor, values: Tensor, attn_mask: Tensor | None) -> Tensor:
-    """Attention as it is defined, the queries scaled before the product; a group of queries at a time."""
-    rows = max(1, _LOGITS // (keys.shape[0] * keys.shape[1] * keys.shape[2]))
-    attended = []
-    for start in range(0, queries.shape[2], rows):
-        some = slice(start, start + rows)
-        logits = (queries[:, :, some] * queries.shape[-1] ** -0.5) @ keys.transpose(-1, -2)
-        if attn_mask is not None:
-            logits = logits + attn_mask[:, :, some]
-        attended.append(torch.softmax(logits, dim=-1) @ values)
-    return torch.cat(attended, dim=2)

@@ -20,7 +20,7 @@ from pansplat.model.checkpoint import (
     load_weights,
     read_checkpoint,
 )
-from pansplat.model.layers import Arithmetic, AttentionPrecision, Compat, Precision
+from pansplat.model.layers import AttentionPrecision, Compat, Precision
 from pansplat.model.mvsplat import MVSplat, MVSplatConfig
 from pansplat.model.network import NetworkPredictor
 from pansplat.model.official_names import Model
@@ -39,7 +39,6 @@ def load_predictor(
     *,
     precision: Precision = "float32",
     attention_precision: AttentionPrecision = "float32",
-    arithmetic: Arithmetic | None = None,
 ) -> NetworkPredictor:
     """The predictor whose weights a file holds.
 
@@ -49,11 +48,9 @@ def load_predictor(
             the weights were trained with: for original checkpoints "official".
         precision: number type of PanSplat's convolutions; see docs/bench_model.md for what bfloat16 costs and gains.
         attention_precision: what attention rounds its inputs to; the original's was bfloat16.
-        arithmetic: of PanSplat; "original" gives the original's bits, see docs/paper.md.
 
     Raises:
-        InputError: when the file cannot be used, the processor has no instructions for bfloat16, or the network has
-            no such arithmetic.
+        InputError: when the file cannot be used, or the processor has no instructions for bfloat16.
     """
     path = Path(path)
     require_precision(precision)
@@ -64,7 +61,6 @@ def load_predictor(
         path,
         precision=precision,
         attention_precision=attention_precision,
-        arithmetic=arithmetic,
     )
     return NetworkPredictor(weights.model, network)
 
@@ -117,7 +113,7 @@ def build_network(weights: WeightsFile, compat: Compat, source: object, **choice
     """The network with its weights, in eval mode.
 
     Args:
-        choices: the precisions and the arithmetic, as `load_predictor` takes them.
+        choices: the precisions, as `load_predictor` takes them.
 
     Raises:
         InputError: when the file's settings or tensors fit no network.
@@ -135,7 +131,6 @@ def build_empty(
     *,
     precision: Precision = "float32",
     attention_precision: AttentionPrecision = "float32",
-    arithmetic: Arithmetic | None = None,
 ) -> PanSplat | MVSplat:
     """The network without memory for its weights; random numbers are not drawn.
 
@@ -151,20 +146,9 @@ def build_empty(
         raise
     except (TypeError, ValueError) as error:
         raise InputError(f"{source}: needed settings of a {weights.model} network, got '{error}'") from error
-    if arithmetic == "original" and (kind is not PanSplat or compat != "official"):
-        raise InputError(
-            f'{source}: `arithmetic` "original" is for pansplat networks with compat "official", got {weights.model} '
-            f"with {compat}; leave it out"
-        )
     with torch.device("meta"):
         if kind is PanSplat:
-            return PanSplat(
-                config,
-                compat,
-                precision=precision,
-                attention_precision=attention_precision,
-                arithmetic=arithmetic,
-            )
+            return PanSplat(config, compat, precision=precision, attention_precision=attention_precision)
         if precision != "float32":
             raise InputError(f"{source}: a {weights.model} network runs in float32 only, got precision {precision!r}")
         return MVSplat(config, compat, attention_precision=attention_precision)

@@ -23,16 +23,14 @@ from torch.nn.functional import elu, interpolate, max_pool2d, relu
 
 from pansplat.geometry.cubemap import equirect_from_strip, strip_from_equirect, strip_lookup
 from pansplat.geometry.equirect import Border, pad_equirect
-from pansplat.geometry.original_strip import original_lookup, original_panorama, original_strip
 from pansplat.model.feature_pyramid import normalize
 from pansplat.model.layers import (
-    Arithmetic,
     Compat,
     PanoramaConv2d,
     border_of,
-    laid_out,
     normalized_convolution,
     resize,
+    to_channels_last,
 )
 
 HEIGHT, FACE_SIZE = 512, 256  # of what the encoders see
@@ -44,8 +42,6 @@ _DECODED = {5: 256, 4: 128, 3: 64, 2: 32}  # channels after a scale's step up
 
 class MonocularDepth(nn.Module):
     """Features of 1/2 scale for the cost volume, and the depth the network was made for."""
-
-    arithmetic: Arithmetic = "fast"
 
     def __init__(self, compat: Compat = "official") -> None:
         super().__init__()
@@ -65,9 +61,9 @@ class MonocularDepth(nn.Module):
     def forward(self, images: Float[Tensor, "batch view 3 height width"]) -> Float[Tensor, "batch view 32 256 512"]:
         """Features of panoramas of any size, RGB in [0, 1]."""
         panoramas, strips = self.prepare(images.flatten(0, 1))
-        from_panorama = self.panorama_encoder(laid_out(normalize(panoramas), self.arithmetic))
+        from_panorama = self.panorama_encoder(to_channels_last(normalize(panoramas)))
         from_faces = self._encode_faces(strips.unflatten(-1, (6, FACE_SIZE)).permute(0, 3, 1, 2, 4))
-        laid = {scale: laid_out(self._lay(from_faces[scale], scale), self.arithmetic) for scale in SCALES}
+        laid = {scale: to_channels_last(self._lay(from_faces[scale], scale)) for scale in SCALES}
         return self.decoder(from_panorama, laid).unflatten(0, images.shape[:2])
 
     @torch.no_grad()
@@ -82,16 +78,14 @@ class MonocularDepth(nn.Module):
         """What the two encoders see: panoramas, by way of half their size as in training, and strips of six faces."""
         half = resize(images, (HEIGHT // 2, HEIGHT), self.compat)
         panoramas = resize(half, (HEIGHT, 2 * HEIGHT), self.compat)
-        cut = strip_from_equirect if self.arithmetic == "fast" else original_strip
-        strips = torch.stack([cut(panorama, FACE_SIZE) for panorama in panoramas])
+        strips = torch.stack([strip_from_equirect(panorama, FACE_SIZE) for panorama in panoramas])
         return panoramas, strips
 
     def _encode_faces(self, faces: Float[Tensor, "batch 6 3 n n"]) -> dict[int, Float[Tensor, "batch 6 channel m m"]]:
         """Features of the faces at each scale; "fixed" takes up and down both ways round, and the mean of both."""
         if self.compat == "fixed":
             faces = torch.cat((faces, _turned(faces[:, 4:])), dim=1)
-        # The original's faces come as arrays with channels last, and so they stay there too.
-        encoded = self.face_encoder(laid_out(normalize(faces.flatten(0, 1)), "fast"))
+        encoded = self.face_encoder(to_channels_last(normalize(faces.flatten(0, 1))))
         by_face = {scale: maps.unflatten(0, faces.shape[:2]) for scale, maps in encoded.items()}
         if self.compat == "official":
             return by_face
@@ -102,8 +96,6 @@ class MonocularDepth(nn.Module):
 
     def _lay(self, faces: Float[Tensor, "batch 6 channel n n"], scale: int) -> Float[Tensor, "batch channel h w"]:
         """Six faces' features, laid onto the panorama."""
-        if self.arithmetic == "original":
-            return original_panorama(faces, original_lookup(HEIGHT >> scale))
         strip = faces.permute(0, 2, 3, 1, 4).flatten(-2)
         return equirect_from_strip(strip, lookup(scale))
 

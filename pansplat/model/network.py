@@ -78,7 +78,7 @@ class NetworkPredictor:
     @functools.cached_property
     def fingerprint(self) -> str:
         """Hash of weights, settings and the code that uses them, so that a kept prediction is never stale."""
-        precisions = [getattr(self.network, name, None) for name in ("precision", "attention_precision", "arithmetic")]
+        precisions = [getattr(self.network, name, None) for name in ("precision", "attention_precision")]
         settings = (self.network.config, self.network.compat, *precisions, self.tiles)
         digest = hashlib.blake2b(repr(settings).encode(), digest_size=8)
         for name, tensor in sorted(self.network.state_dict().items()):

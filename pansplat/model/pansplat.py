@@ -5,7 +5,6 @@ Source: Zhang et al., PanSplat: 4K panorama synthesis with feed-forward Gaussian
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -16,17 +15,8 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.model.cost_volume import CostVolumeConfig, Depths, SphericalCostVolume
 from pansplat.model.feature_pyramid import FeaturePyramid, FeaturePyramidConfig
 from pansplat.model.heads import GaussianHeads, HeadsConfig, TileGaussians
-from pansplat.model.layers import (
-    Arithmetic,
-    AttentionPrecision,
-    Compat,
-    Precision,
-    convolving,
-    follow_the_original,
-    resize,
-)
+from pansplat.model.layers import AttentionPrecision, Compat, Precision, convolving, resize
 from pansplat.model.mono_depth import MonocularDepth
-from pansplat.threads import one_thread
 
 MATCHING_HEIGHT = 512
 """Features are matched at this height at most; the heads see the panoramas as they are."""
@@ -90,12 +80,6 @@ class PanSplat(nn.Module):
             numbers; "fixed" corrects them.
         precision: number type of all convolutions; depths, correlations and positions stay as they are.
         attention_precision: what attention rounds its inputs to; the original's was bfloat16.
-        arithmetic: "original" does every operation before the heads as the original does, so that on the same
-            processor every bit is its own; slower, on one thread. By default where that decides what comes out: with
-            `compat="official"` and bfloat16 attention, where a last bit decides which way an input is rounded.
-
-    Raises:
-        ValueError: the original's arithmetic without `compat="official"`.
     """
 
     def __init__(
@@ -105,11 +89,8 @@ class PanSplat(nn.Module):
         *,
         precision: Precision = "float32",
         attention_precision: AttentionPrecision = "float32",
-        arithmetic: Arithmetic | None = None,
     ) -> None:
         super().__init__()
-        if arithmetic == "original" and compat != "official":
-            raise ValueError(f'arithmetic="original" needs compat="official", got {compat!r}')
         config = config or PanSplatConfig()
         self.config = config
         self.compat: Compat = compat
@@ -119,12 +100,6 @@ class PanSplat(nn.Module):
         self.mono_depth = MonocularDepth(compat) if config.cost_volume.mono_channels else None
         self.cost_volume = SphericalCostVolume(config.cost_volume, compat, attention_precision, precision)
         self.heads = GaussianHeads(config.heads, compat, precision)
-        if arithmetic is None:
-            delicate = compat == "official" and (precision, attention_precision) == ("float32", "bfloat16")
-            arithmetic = "original" if delicate else "fast"
-        self.arithmetic: Arithmetic = arithmetic
-        if arithmetic == "original":
-            follow_the_original(self)
 
     def forward(
         self,
@@ -152,15 +127,12 @@ class PanSplat(nn.Module):
         far: Float[Tensor, "batch view"],
     ) -> Matched:
         """Features and depths of all views: everything before the heads."""
-        # With more threads a sum is split elsewhere, and its last bits differ.
-        with one_thread() if self.arithmetic == "original" else contextlib.nullcontext():
-            small = self._matching_size(images)
-            features = self.features(small)
-            mono_features = None
-            if self.mono_depth is not None:
-                with convolving(self.precision, images.device):
-                    mono_features = self.mono_depth(images).to(images.dtype)
-            depths = self.cost_volume(features, cam2world, near, far, mono_features)
+        features = self.features(self._matching_size(images))
+        mono_features = None
+        if self.mono_depth is not None:
+            with convolving(self.precision, images.device):
+                mono_features = self.mono_depth(images).to(images.dtype)
+        depths = self.cost_volume(features, cam2world, near, far, mono_features)
         return Matched(images, features, depths, cam2world, near, far)
 
     def lift(self, matched: Matched, *, tiles: int = 1, only: Sequence[int] | None = None) -> Iterator[TileGaussians]:

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pansplat.model.layers import Arithmetic, AttentionPrecision, Compat, attend, require_size
+from pansplat.model.layers import AttentionPrecision, Compat, attend, require_size
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,6 @@ class TransformerBlock(nn.Module):
 class WindowAttention(nn.Module):
     """One head of attention inside each window, merged and normalised."""
 
-    arithmetic: Arithmetic = "fast"
-
     def __init__(self, channels: int, precision: AttentionPrecision) -> None:
         super().__init__()
         self.precision: AttentionPrecision = precision
@@ -126,7 +124,6 @@ class WindowAttention(nn.Module):
             values.flatten(0, 1),
             mask=None if mask is None else mask[None],
             precision=self.precision,
-            arithmetic=self.arithmetic,
         )
         return self.norm(self.merge(attended.unflatten(0, queries.shape[:2])))
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from pansplat.geometry.equirect import Border
-from pansplat.model.layers import Arithmetic, AttentionPrecision, PanoramaConv2d, attend, laid_out
+from pansplat.model.layers import AttentionPrecision, PanoramaConv2d, attend, to_channels_last
 
 _GROUPS = 8  # of every normalisation
 _HEAD_CHANNELS = 32
@@ -137,8 +137,6 @@ class ResBlock(nn.Module):
 class JointAttention(nn.Module):
     """Attention among the positions of all views at once, added to the map; before training it adds nothing."""
 
-    arithmetic: Arithmetic = "fast"
-
     def __init__(self, channels: int, precision: AttentionPrecision) -> None:
         super().__init__()
         self.precision: AttentionPrecision = precision
@@ -156,9 +154,9 @@ class JointAttention(nn.Module):
         tokens = projected.reshape(count // views, views * height * width, 3 * channels)
         # Each head's query, key and value lie one after another.
         queries, keys, values = tokens.unflatten(-1, (self.heads, 3, _HEAD_CHANNELS)).permute(3, 0, 2, 1, 4)
-        attended = attend(queries, keys, values, precision=self.precision, arithmetic=self.arithmetic)
+        attended = attend(queries, keys, values, precision=self.precision)
         merged = attended.transpose(1, 2).reshape(count, height, width, channels).movedim(-1, 1)
-        return maps + self.norm(_at_each_pixel(self.project_out, laid_out(merged, self.arithmetic)))
+        return maps + self.norm(_at_each_pixel(self.project_out, to_channels_last(merged)))
 
 
 def _at_each_pixel(

@@ -72,7 +72,6 @@ def build(config: NetworkConfig, seed: int) -> PanSplat | MVSplat:
             config.compat,
             precision=config.precision,
             attention_precision=config.attention_precision,
-            arithmetic="fast",
         )
     if given is not None:
         require_shapes(given.tensors, network.state_dict(), config.init)

@@ -36,7 +36,7 @@ SMALL = PanSplatConfig(
     ),
     heads=HeadsConfig(feature_channels=(32, 16, 8, 8), candidates=8, adapter=AdapterConfig(degree=1)),
 )
-PLAIN = ModelCase("fixed", "float32", "float32", "direct", 1, 1)
+PLAIN = ModelCase("fixed", "float32", "float32", 1, 1)
 
 
 def _small_weights(path: Path) -> None:
@@ -68,7 +68,7 @@ def test_the_command_writes_and_prints_what_was_measured(no_children, tmp_path, 
     assert run(["bench", "model", "--height", "64", "--quick", "--out", str(out), "--threads", "1"]) == 0
     assert sorted(file.name for file in out.iterdir()) == ["model.json", "model.md", "model.png"]
     rows = json.loads((out / "model.json").read_text())["rows"]
-    assert len(rows) == len(no_children) == 4
+    assert len(rows) == len(no_children) == 3
     assert rows[0]["is_reference"] and rows[0]["psnr_db"] is None
     assert (rows[1]["total_s"], rows[1]["processor_s"]) == (10.0, 17.0) and rows[1]["height"] == 64
     assert rows[1]["depth_max_error"] == pytest.approx(0.001, rel=1e-3)
@@ -153,8 +153,8 @@ def test_a_child_measures_what_the_network_gives(files, plain):
     assert plain.picture.shape == (3, 64, 128) and float(plain.picture.std()) > 0.01
 
 
-def test_tiles_and_blocks_change_next_to_nothing(files, plain):
-    tiled = measure_case(dataclasses.replace(PLAIN, convolution="fastest", tiles=2), *files, near=0.5, far=10.0)
+def test_tiles_change_next_to_nothing(files, plain):
+    tiled = measure_case(dataclasses.replace(PLAIN, tiles=2), *files, near=0.5, far=10.0)
     assert torch.equal(plain.depth, tiled.depth)  # tiles are the heads' affair
     assert psnr(tiled.picture, plain.picture) > 60
 
@@ -187,8 +187,8 @@ def test_errors_are_relative_to_the_reference():
 
 
 def test_what_was_not_measured_is_blank():
-    row = ModelRow("fixed", "float32", "float32", "direct", 1, 1, 64)
-    assert model_cells(row)[6:] == ("",) * 10
+    row = ModelRow("fixed", "float32", "float32", 1, 1, 64)
+    assert model_cells(row)[5:] == ("",) * 10
     same = dataclasses.replace(row, psnr_db=math.inf, depth_median_error=0.0, depth_max_error=0.0)
     assert model_cells(same)[-3:] == ("0.0e+00", "0.0e+00", "same")
     assert model_markdown([row]).count("\n") == 3

@@ -143,13 +143,3 @@ def test_choices_that_make_no_sense_are_refused(file: Path, unchecked: None) -> 
         load_model(file.with_name("other.safetensors"))
     with pytest.raises(InputError, match=r"a file of weights \(\.safetensors, \.ckpt, \.pt, \.pth\), got .*scene\.ply"):
         load_model(file.with_name("scene.ply"))
-
-
-def test_the_originals_arithmetic_is_for_what_the_original_had(file: Path) -> None:
-    weights = describe("pansplat", PanSplatConfig(), {}, compat="official")
-    assert build_empty(weights, "official", "x", attention_precision="bfloat16").arithmetic == "original"
-    assert build_empty(weights, "official", "x", arithmetic="original").attention_precision == "float32"
-    with pytest.raises(InputError, match=r'x: `arithmetic` "original" .* got pansplat with fixed; leave it out'):
-        build_empty(weights, "fixed", "x", arithmetic="original")
-    with pytest.raises(InputError, match="got mvsplat with official"):
-        load_model(file, compat="official", arithmetic="original")

@@ -70,7 +70,7 @@ class _Only:
     """All that `prepare` asks of its network."""
 
     def __init__(self, compat: str) -> None:
-        self.compat, self.arithmetic = compat, "fast"
+        self.compat = compat
 
 
 def test_rolling_the_panorama_by_half_a_turn_rolls_the_features(
