@@ -1,24 +1,25 @@
-"""What the tiles of the CPU rasteriser read: one record and one row of values a Gaussian, one entry a tile.
+"""Layout of the arrays that the CPU rasteriser reads: records, values, tile intersections and pixel tables.
 
-Source: docs/rendering.md, section 3, in powers of two. With the vectors and numbers of a record, and
-k a unit direction near the pixel's d:
+Source: docs/rendering.md, section 3, in powers of two. With n the unit direction of the Gaussian, d the ray of a
+pixel, and a, b, l the footprint rows:
 
-    A = a.(d - n),  B = b.(d - n),  L = 1 + l.(d - n),  l = n + front_a a + front_b b
-    alpha = min(0.99, 2^(level - Q / (L^2 + along Q))),  Q = A^2 + B^2
+    A = a.(d - n),  B = b.(d - n),  L = 1 + l.(d - n),  l = n + l_along_a a + l_along_b b
+    alpha = min(0.99, 2^(log2_peak - Q / (L^2 + radial_variance Q))),  Q = A^2 + B^2
 
-so a and b are the page's times sqrt(HALF_LOG2_E), `along` is its S' over HALF_LOG2_E, and `log2_peak` is log2 of the
-peak. n is stored as a float32 and its residual, so that n - k has no cancellation. For the classic kernel n is the
-point in pixels (z = 0), d the pixel's centre, a_y = a_z = b_z = 0, along = l_along_a = l_along_b = 0, and L is 1.
+So a and b are sqrt(HALF_LOG2_E) times those of docs/rendering.md, and radial_variance is its S' over HALF_LOG2_E. n is
+stored as a float32 vector and its residual, so that n minus another direction has no cancellation. For the EWA kernel
+n is the point in pixels (z = 0), d the pixel's centre, L = 1, and all of a_y, a_z, b_z, radial_variance, l_along_a and
+l_along_b are 0.
 
-Only A / L and B / L count, and a.n = b.n = 0. Gradients of records are those with each ray as long as makes L = 1.
+Only A / L and B / L matter, and a.n = b.n = 0. Gradients of records are those for rays scaled so that L = 1.
 
 Arrays, all C-contiguous numpy:
 
-    records   float32 (n, RECORD_SIZE)       best aligned to 64 bytes: one cache line a Gaussian
-    values    float32 (n, channel + 1)  colours, then the radius in metres
-    intersections   int32   (e, 2)            index of the Gaussian, and its box within the tile (see `BOX_BITS`)
-    starts    int64   (tile + 1)        where each tile's intersections begin, front to back; tiles row by row
-    slots     int32   (e)               for the backward: the row of gradients that the entry writes; int64 if it must
+    records        float32 (n, RECORD_SIZE)  one cache line per Gaussian if aligned to 64 bytes
+    values         float32 (n, channel + 1)  colours, then the radial distance in metres
+    intersections  int32   (e, 2)            index of the Gaussian, and its box within the tile (see `BOX_BITS`)
+    starts         int64   (tile + 1)        first intersection of each tile, front to back; tiles row by row
+    slots          int32   (e)               row of the gradient arrays that an intersection writes; int64 if needed
 """
 
 import math
@@ -30,17 +31,14 @@ import torch
 
 from pansplat.rendering.panorama import Picture
 
-# The pixels of one picture as the tile kernels read them: two short tables and a rotation.
-
-
 TILE_SIZE = 32
 """Side of a tile, pixels."""
 
 RECORD_SIZE = 16
-"""Numbers a record."""
+"""Numbers in a record."""
 
-DIRECTION = 0  # n rounded to float32: x, y, z
-DIRECTION_RESIDUAL = 3  # n minus that: x, y, z
+DIRECTION = 0  # n as float32: x, y, z
+DIRECTION_RESIDUAL = 3  # n minus its float32 value: x, y, z
 ROW_A = 6  # a: x, y, z
 ROW_B = 9  # b: x, y, z
 L_ALONG_A = 12
@@ -52,24 +50,23 @@ HALF_LOG2_E = 0.5 * math.log2(math.e)
 """exp(-q / 2) = 2^(-HALF_LOG2_E q)."""
 
 BOX_BITS = 8
-"""An entry's box is x0 + (x1 << 8) + (y0 << 16) + (y1 << 24): its first and last pixel column and row counted from
-the tile's own corner, 0 to 31, both ends included. It may be larger than needed: what lies outside the ellipse has
-an alpha below the cut. A box that wraps into both ends of one tile takes the tile's full width."""
+"""A box within a tile is x0 + (x1 << 8) + (y0 << 16) + (y1 << 24): first and last pixel column and row, 0 to 31,
+inclusive. It may be larger than the footprint, whose alpha is below the cut there. A box that wraps around the panorama
+and reaches both ends of one tile takes the tile's full width."""
 
-
-EQUIRECT_RAYS = 0  # columns: sine, cosine of longitude; rows: of latitude
+EQUIRECT_RAYS = 0  # columns: sine and cosine of the longitude; rows: of the latitude
 PINHOLE_RAYS = 1  # columns: x of the ray (x, y, 1); rows: y
-PIXEL_CENTRES = 2  # columns, rows: pixel centres, for the classic kernel
+PIXEL_CENTRES = 2  # columns, rows: pixel centres, for the EWA kernel
 
 
 class PixelTables(NamedTuple):
-    """One picture's pixels; each is the outer product of a column and a row.
+    """The pixels of one image plane, each given by a column and a row.
 
     Attributes:
         kind: EQUIRECT_RAYS, PINHOLE_RAYS or PIXEL_CENTRES.
         columns: float64 (width, 2).
         rows: float64 (height, 2).
-        rotation: float64 (3, 3), the picture's axes in the camera's; used by PINHOLE_RAYS.
+        rotation: float64 (3, 3), the image plane's axes in the camera's; used by PINHOLE_RAYS.
     """
 
     kind: int
@@ -84,7 +81,7 @@ class PixelTables(NamedTuple):
 
 
 def tabulate_pixels(picture: Picture, *, exact: bool) -> PixelTables:
-    """The tables of a picture, for the exact kernel or the classic one.
+    """Pixel tables of an image plane, for the exact kernel or for EWA.
 
     Source: docs/rendering.md, section 6.
     """

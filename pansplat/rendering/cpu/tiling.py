@@ -1,16 +1,18 @@
-"""Where each record can be seen: boxes of pixels, exact on pinhole pictures, tight and conservative on panoramas.
+"""Stage two: bounding boxes on the image plane, their tile intersections, and the intersections sorted by distance.
 
-Source: docs/rendering.md, section 5. A record gives back its covariance as a sum of squares: with the dual axes
-p = (b ^ n) / w - alpha n and q = (n ^ a) / w - beta n, where w = (a ^ b).n,
+Source: docs/rendering.md, section 5. A record yields its covariance as a sum of squares. With w = (a ^ b).n and the
+dual axes p = (b ^ n) / w - l_along_a n and q = (n ^ a) / w - l_along_b n,
 
     C' = S' n n' + p p' + q q'
 
-so h' C' h never cancels. A box is int16: first and last column, first and last row, both ends included. None where
-the last row is before the first; on a panorama a box whose last column is before its first goes on at the left.
+so h' C' h has no cancellation. Boxes are exact on pinhole images, and tight and conservative on panoramas.
+
+A box is four int16: first and last column, first and last row, inclusive. It is empty if the last row is above the
+first; on a panorama it wraps around if the last column is left of the first.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -25,149 +27,153 @@ from pansplat.rendering.cpu.runtime import Workspace, inline_kernel, kernel, par
 from pansplat.rendering.cpu.simd import element, prefetch, prefetch_to_write, put
 from pansplat.rendering.panorama import Picture
 
+# --- bounding boxes ---
+
 LARGEST_SIDE = 32767  # pixels; boxes are int16
-_SLACK = np.float32(KAPPA_MARGIN)
-_LOG_CUT = np.float32(math.log2(1 / ALPHA_CUT))
+_KAPPA_MARGIN = np.float32(KAPPA_MARGIN)
+_LOG2_ALPHA_CUT = np.float32(math.log2(ALPHA_CUT))
 
-# float32 is enough, for a margin covers its rounding. Bare numbers would make it float64.
+# float32 suffices, since a margin covers its rounding. Python floats would promote to float64.
 _ZERO, _ONE, _HALF, _PI = np.float32(0), np.float32(1), np.float32(0.5), np.float32(math.pi)
-_UNIT, _ROOT_UNIT = np.float32(layout.HALF_LOG2_E), np.float32(math.sqrt(layout.HALF_LOG2_E))
-_NARROWEST = np.float32(1e-12)  # of the direction's horizontal part
-_TURN_BACK = np.float32(1e-6)
-_NOWHERE = np.float32(-1e9)  # where the last row of what is not seen lies
+_SCALE, _ROOT_SCALE = np.float32(layout.HALF_LOG2_E), np.float32(math.sqrt(layout.HALF_LOG2_E))
+_MIN_HORIZONTAL = np.float32(1e-12)  # length of a unit direction's horizontal part
+_WRAP_TOLERANCE = np.float32(1e-6)  # radians
+_ABOVE_IMAGE = np.float32(-1e9)  # last row of an empty box
 _CULLED = np.float32(CULLED)
-_EVERYWHERE = np.float32(1e9)
+_UNBOUNDED = np.float32(1e9)
 
-# Rows of a block of records: as they are in memory, then what is found from them.
-ALONG, KAPPA = layout.RADIAL_VARIANCE, layout.LOG2_PEAK
-DIRECTION, P, Q = layout.RECORD_SIZE, layout.RECORD_SIZE + 3, layout.RECORD_SIZE + 6
-EDGES = layout.RECORD_SIZE + 9
-ROWS = layout.RECORD_SIZE + 13
+# Rows of a block of records, structure of arrays: the record's numbers, then those derived from them.
+_RADIAL_VARIANCE, _KAPPA = layout.RADIAL_VARIANCE, layout.LOG2_PEAK  # overwritten in place
+_N, _P, _Q = layout.RECORD_SIZE, layout.RECORD_SIZE + 3, layout.RECORD_SIZE + 6
+_EDGES = layout.RECORD_SIZE + 9  # left, right, top, bottom, pixels
+_NUM_ROWS = layout.RECORD_SIZE + 13
 
 
 @inline_kernel
-def margin(height, width):
+def _pixel_margin(height, width):
     """Pixels added around each box, far more than rounding."""
     return np.float32(0.01 + 1e-6 * max(height, width))
 
 
 @inline_kernel
-def read_cones(records, start, count, rotation, rows):
-    """Read directions, dual axes and S' into rows, turned into a picture's axes; kappa is -1 where not drawn.
+def _load_cones(records, start, count, rotation, rows):
+    """Compute directions, dual axes, S' and kappa of a block in the image plane's axes; kappa is -1 if culled.
 
     Args:
         records: flat.
-        rotation: float32, the picture's axes in the records'.
+        rotation: float32, the image plane's axes in the records'.
     """
     read_columns(records, start, count, rows.reshape(-1), LANES)
     right = rotation[0, 0], rotation[1, 0], rotation[2, 0]
     down = rotation[0, 1], rotation[1, 1], rotation[2, 1]
     ahead = rotation[0, 2], rotation[1, 2], rotation[2, 2]
-    first, second = layout.ROW_A, layout.ROW_B
+    row_a, row_b = layout.ROW_A, layout.ROW_B
     for i in range(LANES):
         n = rows[0, i], rows[1, i], rows[2, i]
-        a = rows[first, i], rows[first + 1, i], rows[first + 2, i]
-        b = rows[second, i], rows[second + 1, i], rows[second + 2, i]
-        p, q = dual_axes(n, a, b, rows[layout.L_ALONG_A, i], rows[layout.L_ALONG_B, i])
-        rows[DIRECTION, i], rows[DIRECTION + 1, i], rows[DIRECTION + 2, i] = (
-            dot(*right, *n),
-            dot(*down, *n),
-            dot(*ahead, *n),
-        )
-        rows[P, i], rows[P + 1, i] = _ROOT_UNIT * dot(*right, *p), _ROOT_UNIT * dot(*down, *p)
-        rows[P + 2, i], rows[Q, i] = _ROOT_UNIT * dot(*ahead, *p), _ROOT_UNIT * dot(*right, *q)
-        rows[Q + 1, i], rows[Q + 2, i] = _ROOT_UNIT * dot(*down, *q), _ROOT_UNIT * dot(*ahead, *q)
-        rows[ALONG, i] *= _UNIT
-        level = rows[KAPPA, i]
-        rows[KAPPA, i] = (level + _LOG_CUT) / _UNIT + _SLACK if level > _CULLED else -_ONE
+        a = rows[row_a, i], rows[row_a + 1, i], rows[row_a + 2, i]
+        b = rows[row_b, i], rows[row_b + 1, i], rows[row_b + 2, i]
+        p, q = _dual_axes(n, a, b, rows[layout.L_ALONG_A, i], rows[layout.L_ALONG_B, i])
+        rows[_N, i], rows[_N + 1, i], rows[_N + 2, i] = dot(*right, *n), dot(*down, *n), dot(*ahead, *n)
+        rows[_P, i], rows[_P + 1, i] = _ROOT_SCALE * dot(*right, *p), _ROOT_SCALE * dot(*down, *p)
+        rows[_P + 2, i], rows[_Q, i] = _ROOT_SCALE * dot(*ahead, *p), _ROOT_SCALE * dot(*right, *q)
+        rows[_Q + 1, i], rows[_Q + 2, i] = _ROOT_SCALE * dot(*down, *q), _ROOT_SCALE * dot(*ahead, *q)
+        rows[_RADIAL_VARIANCE, i] *= _SCALE
+        log2_peak = rows[_KAPPA, i]
+        rows[_KAPPA, i] = (log2_peak - _LOG2_ALPHA_CUT) / _SCALE + _KAPPA_MARGIN if log2_peak > _CULLED else -_ONE
 
 
 @inline_kernel
-def dual_axes(n, a, b, front_a, front_b):
-    """The axes p and q of a record with these forms, in its own units: C' / UNIT = along n n' + p p' + q q'."""
+def _dual_axes(n, a, b, l_along_a, l_along_b):
+    """Axes p and q of a record, in its units: C' / HALF_LOG2_E = radial_variance n n' + p p' + q q'."""
     inverse = _ONE / dot(*cross(*a, *b), *n)
-    first, second = cross(*b, *n), cross(*n, *a)
-    p = first[0] * inverse - front_a * n[0], first[1] * inverse - front_a * n[1], first[2] * inverse - front_a * n[2]
-    q = second[0] * inverse - front_b * n[0], second[1] * inverse - front_b * n[1], second[2] * inverse - front_b * n[2]
+    bn, na = cross(*b, *n), cross(*n, *a)
+    p = bn[0] * inverse - l_along_a * n[0], bn[1] * inverse - l_along_a * n[1], bn[2] * inverse - l_along_a * n[2]
+    q = na[0] * inverse - l_along_b * n[0], na[1] * inverse - l_along_b * n[1], na[2] * inverse - l_along_b * n[2]
     return p, q
 
 
 @inline_kernel
 def _cone(rows, i):
-    n = rows[DIRECTION, i], rows[DIRECTION + 1, i], rows[DIRECTION + 2, i]
-    p = rows[P, i], rows[P + 1, i], rows[P + 2, i]
-    q = rows[Q, i], rows[Q + 1, i], rows[Q + 2, i]
-    return n, p, q, rows[ALONG, i], rows[KAPPA, i]
+    """n, p, q, S' and kappa of one Gaussian of a block."""
+    n = rows[_N, i], rows[_N + 1, i], rows[_N + 2, i]
+    p = rows[_P, i], rows[_P + 1, i], rows[_P + 2, i]
+    q = rows[_Q, i], rows[_Q + 1, i], rows[_Q + 2, i]
+    return n, p, q, rows[_RADIAL_VARIANCE, i], rows[_KAPPA, i]
 
 
 @inline_kernel
-def _pinhole_edges(n_x, n_z, p_x, p_z, q_x, q_z, along, kappa):
-    """The tangents of a cone's outermost planes through one axis, as middle, root and what divides both."""
+def _pinhole_edges(n_x, n_z, p_x, p_z, q_x, q_z, radial_variance, kappa):
+    """Tangents of a cone's bounding planes through one axis, times D_zz, as midpoint and half width."""
     p_across, q_across = p_x * n_z - p_z * n_x, q_x * n_z - q_z * n_x
     across = p_across * p_across + q_across * q_across
-    both = p_x * q_z - p_z * q_x
-    root = math.sqrt(max(kappa * across - kappa * kappa * (along * across + both * both), _ZERO))
-    return n_x * n_z - kappa * (along * n_x * n_z + p_x * p_z + q_x * q_z), root
+    minor = p_x * q_z - p_z * q_x
+    root = math.sqrt(max(kappa * across - kappa * kappa * (radial_variance * across + minor * minor), _ZERO))
+    return n_x * n_z - kappa * (radial_variance * n_x * n_z + p_x * p_z + q_x * q_z), root
 
 
 @inline_kernel
-def _beside(n, p, q, along, kappa, slope_x, slope_y, slope_z):
-    """Whether a cone lies wholly on the far side of a plane through the eye with this normal."""
-    h = slope_x, slope_y, slope_z
-    distance, first, second = dot(*n, *h), dot(*p, *h), dot(*q, *h)
-    reach = kappa * (along * distance * distance + first * first + second * second)
+def _is_outside(n, p, q, radial_variance, kappa, normal_x, normal_y, normal_z):
+    """Whether a cone lies behind a plane through the camera centre with this normal."""
+    h = normal_x, normal_y, normal_z
+    distance, on_p, on_q = dot(*n, *h), dot(*p, *h), dot(*q, *h)
+    reach = kappa * (radial_variance * distance * distance + on_p * on_p + on_q * on_q)
     return (distance * distance > reach) & (distance < _ZERO)
 
 
 @kernel
-def _pinhole(piece, records, rotation, height, width, focal, boxes):
-    rows = np.ones((ROWS, LANES), np.float32)
+def _bound_pinhole(item, records, rotation, height, width, focal, boxes):
+    rows = np.ones((_NUM_ROWS, LANES), np.float32)
     side, end = np.float32(width / (2 * focal)), np.float32(height / (2 * focal))
     middle_x, middle_y, scale = np.float32(0.5 * width), np.float32(0.5 * height), np.float32(focal)
     num = len(records) // layout.RECORD_SIZE
-    for start in range(piece * PIECE, min((piece + 1) * PIECE, num), LANES):
+    for start in range(item * PIECE, min((item + 1) * PIECE, num), LANES):
         count = min(LANES, num - start)
-        read_cones(records, start, count, rotation, rows)
+        _load_cones(records, start, count, rotation, rows)
         for i in range(LANES):
-            n, p, q, along, kappa = _cone(rows, i)
-            d_zz = n[2] * n[2] - kappa * (along * n[2] * n[2] + p[2] * p[2] + q[2] * q[2])
-            x, root_x = _pinhole_edges(n[0], n[2], p[0], p[2], q[0], q[2], along, kappa)
-            y, root_y = _pinhole_edges(n[1], n[2], p[1], p[2], q[1], q[2], along, kappa)
-            bounded = d_zz > _ZERO  # else the cone crosses the plane through the eye
-            times = scale / d_zz
+            n, p, q, radial_variance, kappa = _cone(rows, i)
+            d_zz = n[2] * n[2] - kappa * (radial_variance * n[2] * n[2] + p[2] * p[2] + q[2] * q[2])
+            x, root_x = _pinhole_edges(n[0], n[2], p[0], p[2], q[0], q[2], radial_variance, kappa)
+            y, root_y = _pinhole_edges(n[1], n[2], p[1], p[2], q[1], q[2], radial_variance, kappa)
+            bounded = d_zz > _ZERO  # otherwise the cone crosses the plane z = 0
+            to_pixels = scale / d_zz
             unseen = (kappa < _ZERO) | (bounded & (n[2] < _ZERO))
-            # Those that cross the plane through the eye have no box, but most of them lie beside the view.
-            unseen |= _beside(n, p, q, along, kappa, _ONE, _ZERO, side)
-            unseen |= _beside(n, p, q, along, kappa, -_ONE, _ZERO, side)
-            unseen |= _beside(n, p, q, along, kappa, _ZERO, _ONE, end)
-            unseen |= _beside(n, p, q, along, kappa, _ZERO, -_ONE, end)
-            rows[EDGES, i] = (x - root_x) * times + middle_x if bounded else -_EVERYWHERE
-            rows[EDGES + 1, i] = (x + root_x) * times + middle_x if bounded else _EVERYWHERE
-            rows[EDGES + 2, i] = (y - root_y) * times + middle_y if bounded else -_EVERYWHERE
-            last = (y + root_y) * times + middle_y if bounded else _EVERYWHERE
-            rows[EDGES + 3, i] = _NOWHERE if unseen else last
-        round_boxes(rows, EDGES, start, count, height, width, boxes)
+            # A cone that crosses the plane z = 0 has no box, but most of these are outside the field of view.
+            unseen |= _is_outside(n, p, q, radial_variance, kappa, _ONE, _ZERO, side)
+            unseen |= _is_outside(n, p, q, radial_variance, kappa, -_ONE, _ZERO, side)
+            unseen |= _is_outside(n, p, q, radial_variance, kappa, _ZERO, _ONE, end)
+            unseen |= _is_outside(n, p, q, radial_variance, kappa, _ZERO, -_ONE, end)
+            rows[_EDGES, i] = (x - root_x) * to_pixels + middle_x if bounded else -_UNBOUNDED
+            rows[_EDGES + 1, i] = (x + root_x) * to_pixels + middle_x if bounded else _UNBOUNDED
+            rows[_EDGES + 2, i] = (y - root_y) * to_pixels + middle_y if bounded else -_UNBOUNDED
+            bottom = (y + root_y) * to_pixels + middle_y if bounded else _UNBOUNDED
+            rows[_EDGES + 3, i] = _ABOVE_IMAGE if unseen else bottom
+        round_boxes(rows, _EDGES, start, count, height, width, boxes)
 
 
 @inline_kernel
 def round_boxes(rows, edges, start, count, height, width, boxes):
-    """Write the pixels whose centres lie between left, right, top and bottom, four rows of pixels."""
-    around = margin(height, width)
+    """Write the boxes of the pixels whose centres lie within the edges.
+
+    Args:
+        rows, edges: left, right, top and bottom in pixels, in four rows from row `edges` on.
+        boxes: (n, 2) int32, two numbers of a box in each.
+    """
+    margin = _pixel_margin(height, width)
     last_x, last_y = np.float32(width - 1), np.float32(height - 1)
     for i in range(LANES):
-        x0 = max(np.ceil(rows[edges, i] - _HALF - around), _ZERO)
-        x1 = min(np.floor(rows[edges + 1, i] - _HALF + around), last_x)
-        y0 = max(np.ceil(rows[edges + 2, i] - _HALF - around), _ZERO)
-        y1 = min(np.floor(rows[edges + 3, i] - _HALF + around), last_y)
+        x0 = max(np.ceil(rows[edges, i] - _HALF - margin), _ZERO)
+        x1 = min(np.floor(rows[edges + 1, i] - _HALF + margin), last_x)
+        y0 = max(np.ceil(rows[edges + 2, i] - _HALF - margin), _ZERO)
+        y1 = min(np.floor(rows[edges + 3, i] - _HALF + margin), last_y)
         seen = (x0 <= x1) & (y0 <= y1)
         rows[edges, i], rows[edges + 1, i] = x0 if seen else _ZERO, x1 if seen else _ZERO
         rows[edges + 2, i], rows[edges + 3, i] = y0 if seen else _ONE, y1 if seen else _ZERO
-    write_boxes(rows, edges, start, count, boxes)
+    _write_boxes(rows, edges, start, count, boxes)
 
 
 @inline_kernel
-def write_boxes(rows, edges, start, count, boxes):
-    """Write four rows of whole numbers as boxes, two numbers a word."""
+def _write_boxes(rows, edges, start, count, boxes):
+    """Write four rows of whole numbers as boxes, two numbers in each int32."""
     for i in range(count):
         boxes[start + i, 0] = np.int32(rows[edges, i]) | np.int32(rows[edges + 1, i]) << np.int32(16)
         boxes[start + i, 1] = np.int32(rows[edges + 2, i]) | np.int32(rows[edges + 3, i]) << np.int32(16)
@@ -175,7 +181,7 @@ def write_boxes(rows, edges, start, count, boxes):
 
 @inline_kernel
 def _arctan2(y, x):
-    """atan2 within 3e-7 radians (a fit at Chebyshev nodes), with one division."""
+    """atan2 within 3e-7 radians (a polynomial fit at Chebyshev nodes), with one division."""
     steep = abs(y) > abs(x)
     s = (x if steep else y) / (y if steep else x)
     z = s * s
@@ -193,59 +199,59 @@ def _arctan2(y, x):
 
 
 @inline_kernel
-def _highest_latitude(sine, cosine, low, high, sides2):
-    """Bound on the latitude over a box in the tangent plane at latitude asin(sine).
+def _max_latitude(sine, cosine, low, high, sides2):
+    """Upper bound of the latitude over a box in the tangent plane at latitude asin(sine).
 
     Args:
-        low, high: how far the box reaches towards growing latitude.
-        sides2: square of how far it reaches aside.
+        low, high: extent of the box towards growing latitude.
+        sides2: squared extent of the box to the side.
     """
-    first, second = sine + low * cosine, sine + high * cosine  # sines, but for the lengths
+    first, second = sine + low * cosine, sine + high * cosine  # sines before normalisation
     flat_first, flat_second = cosine - low * sine, cosine - high * sine
     first2 = flat_first * flat_first + (_ZERO if first > _ZERO else sides2)
     second2 = flat_second * flat_second + (_ZERO if second > _ZERO else sides2)
-    later = second * abs(second) * first2 > first * abs(first) * second2
-    over_pole = (sine > _ZERO) & (low * sine <= cosine) & (cosine <= high * sine)
+    second_is_higher = second * abs(second) * first2 > first * abs(first) * second2
+    holds_pole = (sine > _ZERO) & (low * sine <= cosine) & (cosine <= high * sine)
     return _arctan2(
-        _ONE if over_pole else (second if later else first),
-        _ZERO if over_pole else math.sqrt(second2 if later else first2),
+        _ONE if holds_pole else (second if second_is_higher else first),
+        _ZERO if holds_pole else math.sqrt(second2 if second_is_higher else first2),
     )
 
 
 @kernel
-def _panorama(piece, records, rotation, height, width, boxes):
-    rows = np.ones((ROWS, LANES), np.float32)
-    around, side, last_y = margin(height, width), np.float32(width), np.float32(height - 1)
+def _bound_equirect(item, records, rotation, height, width, boxes):
+    rows = np.ones((_NUM_ROWS, LANES), np.float32)
+    margin, side, last_y = _pixel_margin(height, width), np.float32(width), np.float32(height - 1)
     last_x, per_side = np.float32(width - 1), np.float32(1 / width)
     num = len(records) // layout.RECORD_SIZE
-    for start in range(piece * PIECE, min((piece + 1) * PIECE, num), LANES):
+    for start in range(item * PIECE, min((item + 1) * PIECE, num), LANES):
         count = min(LANES, num - start)
-        read_cones(records, start, count, rotation, rows)
-        _panorama_edges(rows, height, width)
+        _load_cones(records, start, count, rotation, rows)
+        _equirect_edges(rows, height, width)
         for i in range(LANES):
-            x0 = np.ceil(rows[EDGES, i] - _HALF - around)
-            x1 = np.floor(rows[EDGES + 1, i] - _HALF + around)
-            y0 = max(np.ceil(rows[EDGES + 2, i] - _HALF - around), _ZERO)
-            y1 = min(np.floor(rows[EDGES + 3, i] - _HALF + around), last_y)
-            whole = x1 - x0 >= last_x
+            x0 = np.ceil(rows[_EDGES, i] - _HALF - margin)
+            x1 = np.floor(rows[_EDGES + 1, i] - _HALF + margin)
+            y0 = max(np.ceil(rows[_EDGES + 2, i] - _HALF - margin), _ZERO)
+            y1 = min(np.floor(rows[_EDGES + 3, i] - _HALF + margin), last_y)
+            full_width = x1 - x0 >= last_x
             seen = (x0 <= x1) & (y0 <= y1)
-            # Half a pixel, so that rounding cannot bring a column of 0 below.
+            # Half a pixel, so that rounding cannot put a column of 0 below 0.
             x0 -= side * np.floor((x0 + _HALF) * per_side)
             x1 -= side * np.floor((x1 + _HALF) * per_side)
-            rows[EDGES, i] = _ZERO if whole | ~seen else x0
-            rows[EDGES + 1, i] = (last_x if whole else x1) if seen else _ZERO
-            rows[EDGES + 2, i], rows[EDGES + 3, i] = y0 if seen else _ONE, y1 if seen else _ZERO
-        write_boxes(rows, EDGES, start, count, boxes)
+            rows[_EDGES, i] = _ZERO if full_width | ~seen else x0
+            rows[_EDGES + 1, i] = (last_x if full_width else x1) if seen else _ZERO
+            rows[_EDGES + 2, i], rows[_EDGES + 3, i] = y0 if seen else _ONE, y1 if seen else _ZERO
+        _write_boxes(rows, _EDGES, start, count, boxes)
 
 
 @inline_kernel
-def _panorama_edges(rows, height, width):
+def _equirect_edges(rows, height, width):
     per_column, per_row = np.float32(width / (2 * math.pi)), np.float32(height / math.pi)
     middle_x, middle_y = np.float32(0.5 * width), np.float32(0.5 * height)
     for i in range(LANES):
-        n, p, q, along, kappa = _cone(rows, i)
+        n, p, q, radial_variance, kappa = _cone(rows, i)
         flat = math.sqrt(n[0] * n[0] + n[2] * n[2])
-        on_axis = flat < _NARROWEST
+        on_axis = flat < _MIN_HORIZONTAL
         inverse = _ZERO if on_axis else _ONE / flat
         ahead_x, ahead_z = n[0] * inverse, _ONE if on_axis else n[2] * inverse
         p_ahead, q_ahead = p[0] * ahead_x + p[2] * ahead_z, q[0] * ahead_x + q[2] * ahead_z
@@ -254,17 +260,17 @@ def _panorama_edges(rows, height, width):
         p_n, q_n = dot(*p, *n), dot(*q, *n)
         east = kappa * (p_east * p_east + q_east * q_east)
 
-        # Longitude: tangents of the shadow on the horizontal plane.
-        d_ff = flat * flat - kappa * (along * flat * flat + p_ahead * p_ahead + q_ahead * q_ahead)
+        # Longitude: tangents of the cone's projection on the horizontal plane.
+        d_ff = flat * flat - kappa * (radial_variance * flat * flat + p_ahead * p_ahead + q_ahead * q_ahead)
         middle = -kappa * (p_east * p_ahead + q_east * q_ahead)
         root = math.sqrt(max(middle * middle + east * d_ff, _ZERO))
         low, high = middle - root, middle + root
         left = _arctan2(ahead_x * d_ff + ahead_z * low, ahead_z * d_ff - ahead_x * low)
         right = _arctan2(ahead_x * d_ff + ahead_z * high, ahead_z * d_ff - ahead_x * high)
-        right += _PI + _PI if right < left - _TURN_BACK else _ZERO
+        right += _PI + _PI if right < left - _WRAP_TOLERANCE else _ZERO
 
-        # Latitude: a box around the ellipse in the plane that touches the sphere at the mean's direction.
-        d_nn = _ONE - kappa * (along + p_n * p_n + q_n * q_n)
+        # Latitude: a box around the ellipse in the plane tangent to the sphere at n.
+        d_nn = _ONE - kappa * (radial_variance + p_n * p_n + q_n * q_n)
         bounded = d_nn > _ZERO
         inverse = _ONE / d_nn if bounded else _ONE
         middle = -kappa * (p_east * p_n + q_east * q_n)
@@ -273,51 +279,57 @@ def _panorama_edges(rows, height, width):
         middle = -kappa * (p_south * p_n + q_south * q_n)
         root = math.sqrt(max(middle * middle + south * d_nn, _ZERO))
         low, high = (middle - root) * inverse, (middle + root) * inverse
-        bottom = _highest_latitude(n[1], flat, low, high, sides * sides)
-        top = -_highest_latitude(-n[1], flat, -high, -low, sides * sides)
-        aside = bounded & (d_ff > _ZERO)
-        rows[EDGES, i] = left * per_column + middle_x if aside else -_EVERYWHERE
-        rows[EDGES + 1, i] = right * per_column + middle_x if aside else _EVERYWHERE
-        rows[EDGES + 2, i] = top * per_row + middle_y if bounded else -_EVERYWHERE
-        last = bottom * per_row + middle_y if bounded else _EVERYWHERE
-        rows[EDGES + 3, i] = _NOWHERE if kappa < _ZERO else last
+        bottom = _max_latitude(n[1], flat, low, high, sides * sides)
+        top = -_max_latitude(-n[1], flat, -high, -low, sides * sides)
+        has_longitudes = bounded & (d_ff > _ZERO)
+        rows[_EDGES, i] = left * per_column + middle_x if has_longitudes else -_UNBOUNDED
+        rows[_EDGES + 1, i] = right * per_column + middle_x if has_longitudes else _UNBOUNDED
+        rows[_EDGES + 2, i] = top * per_row + middle_y if bounded else -_UNBOUNDED
+        bottom = bottom * per_row + middle_y if bounded else _UNBOUNDED
+        rows[_EDGES + 3, i] = _ABOVE_IMAGE if kappa < _ZERO else bottom
 
 
 def find_bounding_boxes(records: np.ndarray, picture: Picture, workspace: Workspace, threads: int) -> np.ndarray:
-    """The box of each record of the exact kernel on a picture, (n, 4) int16."""
+    """Bounding box of each record of the exact kernel on an image plane, (n, 4) int16."""
     words = workspace.array((len(records), 2), np.int32)
     rotation = np.ascontiguousarray(picture.rotation.numpy().astype(np.float32))
-    height, width, numbers = *picture.size, records.reshape(-1)
+    height, width, flat = *picture.size, records.reshape(-1)
 
-    def work(piece: int) -> None:
+    def bound(item: int) -> None:
         if picture.is_panorama:
-            _panorama(piece, numbers, rotation, height, width, words)
+            _bound_equirect(item, flat, rotation, height, width, words)
         else:
-            _pinhole(piece, numbers, rotation, height, width, picture.focal, words)
+            _bound_pinhole(item, flat, rotation, height, width, picture.focal, words)
 
-    parallel_for(work, -(-len(records) // PIECE), threads)
+    parallel_for(bound, -(-len(records) // PIECE), threads)
     return words.view(np.int16)
 
 
-MAX_INTERSECTIONS = 1 << 26  # pairs listed at a time: 512 MB
+# --- tile intersections ---
+#
+# A counting sort of (Gaussian, tile) pairs, in bands of tile rows so that memory is bounded. For the backward every
+# intersection has a slot, and the slots of one Gaussian are contiguous: tiles write gradients without conflicts, and
+# each Gaussian sums its own in a fixed order.
+
+MAX_INTERSECTIONS = 1 << 26  # in one band: 512 MB
 _SHIFT = TILE_SIZE.bit_length() - 1
 _LAST = TILE_SIZE - 1
-_PARTS = 4  # of the scene a thread: some processors are slower than others
-_HELD = 512  # pairs noted before they are entered: two small loops take half as long as one large
-_WRITE_AHEAD = 16  # intersections of a tile, between asking for their place and writing it
+_PARTS_PER_THREAD = 4  # some processors are slower than others
+_BUFFER_SIZE = 512  # pairs collected before they are written: two small loops are twice as fast as one large loop
+_WRITE_AHEAD = 16  # intersections of a tile, from the prefetch of a cache line to the write
 _SIDE = np.int64(0xFFFF)  # a box as one word: x0, x1, y0, y1 from the lowest bits up
-EMPTY_BOX = np.int64(1 << 32)  # a box as one word, the empty one of boxes.py: first row 1, last row 0
+EMPTY_BOX = np.int64(1 << 32)  # the empty box as one word: first row 1, last row 0
 
 
 class TileIntersections(NamedTuple):
-    """The Gaussians that touch each tile of some rows of tiles.
+    """Tile intersections of a band of tile rows.
 
     Attributes:
         first_row: of tiles.
         intersections, starts: see records.py.
-        slots: of each entry, counted within these lists; empty unless asked for.
-        offsets: (n + 1), where each Gaussian's slots begin; empty unless asked for.
-        workspace: of the intersections, slots and offsets.
+        slots: of each intersection, counted within the band; empty unless requested.
+        offsets: (n + 1), first slot of each Gaussian; empty unless requested.
+        workspace: holds intersections, slots and offsets.
     """
 
     first_row: int
@@ -329,9 +341,9 @@ class TileIntersections(NamedTuple):
 
 
 @inline_kernel
-def _across(word, columns):
-    """How many columns of tiles a packed box touches, going on at the left if it wraps."""
-    first, last, _, _ = _tiles_of(word)
+def _count_columns(word, columns):
+    """Number of tile columns that a packed box touches, counting around the panorama if it wraps."""
+    first, last, _, _ = _tile_range(word)
     if (word >> 16 & _SIDE) >= (word & _SIDE):
         return last - first + 1
     return min(columns - first + last + 1, columns)
@@ -339,7 +351,7 @@ def _across(word, columns):
 
 @inline_kernel
 def _columns_in_tile(x0, x1, column, width):
-    """First and last pixel column of a box within a tile, counted from the tile's corner."""
+    """First and last pixel column of a box within a tile, relative to the tile."""
     corner = column << _SHIFT
     end = min(np.int64(_LAST), width - 1 - corner)
     low, high = max(x0 - corner, 0), min(x1 - corner, end)
@@ -352,28 +364,29 @@ def _columns_in_tile(x0, x1, column, width):
 
 
 @inline_kernel
-def _tiles_of(word):
-    """First and last column and row of the tiles that a packed box touches, wherever it wraps."""
+def _tile_range(word):
+    """Tiles of a packed box's first and last column and first and last row."""
     shift = np.int64(_SHIFT)
     return (word & _SIDE) >> shift, (word >> 16 & _SIDE) >> shift, (word >> 32 & _SIDE) >> shift, word >> 48 >> shift
 
 
 @kernel
-def _count(part, ends, words, rows, columns, counts):
+def _count_intersections(part, ends, words, rows, columns, counts):
     """Count the Gaussians of one part of the scene in each tile.
 
     Args:
+        words: packed boxes.
         rows, columns: of tiles.
         counts: (part, tile), written.
     """
-    # As steps up and down between neighbouring tiles: the places of a box are apart, whatever its size.
+    # As differences between neighbouring tiles, so that a box of any size costs four updates.
     across, row = columns + 1, counts[part]
     steps = np.zeros((rows + 1) * across, np.int64)
     for g in range(ends[part], ends[part + 1]):
         word = element(words, g)
-        first, last, top, bottom = _tiles_of(word)
+        first, last, top, bottom = _tile_range(word)
         upper, lower = top * across, (bottom + 1 if word != EMPTY_BOX else top) * across
-        if (word >> 16 & _SIDE) < (word & _SIDE):  # goes on at the left
+        if (word >> 16 & _SIDE) < (word & _SIDE):  # wraps around
             if last < first:
                 _add(steps, upper, 1)
                 _add(steps, lower, -1)
@@ -391,130 +404,150 @@ def _count(part, ends, words, rows, columns, counts):
 
 
 @inline_kernel
-def _add(numbers, at, step):
-    """Add to one element."""
-    put(numbers, at, element(numbers, at) + step)
+def _add(numbers, index, step):
+    put(numbers, index, element(numbers, index) + step)
 
 
 @inline_kernel
-def _note(tile, number, box, at, tiles, pairs):
-    """Write down a pair of a Gaussian and a tile."""
-    put(tiles, at, tile)
-    put(pairs, at, number | box << 32)
+def _buffer_pair(tile, gaussian, box, index, tiles, pairs):
+    put(tiles, index, tile)
+    put(pairs, index, gaussian | box << 32)
 
 
 @inline_kernel
-def _note_corners(number, word, low, columns, width, held, tiles, pairs):
-    """Note a Gaussian that touches at most two columns and two rows of tiles, with no branch to be mistaken.
+def _buffer_corners(gaussian, word, low, columns, width, buffered, tiles, pairs):
+    """Buffer the pairs of a Gaussian that touches at most 2 x 2 tiles, without branches.
 
     Returns:
-        How many pairs are held then; each is written over by the next unless it counts.
+        The number of buffered pairs. All four are written; the next overwrites those that do not count.
     """
-    first, last, top, bottom = _tiles_of(word)
+    first, last, top, bottom = _tile_range(word)
     x0, x1, y0, y1 = word & _LAST, word >> 16 & _LAST, word >> 32 & _LAST, word >> 48 & _LAST
     aside, down = np.int64(first != last), bottom - top
     end = min(np.int64(_LAST), width - 1 - (first << _SHIFT))
     left, right = x0 | (end if aside else x1) << BOX_BITS, x1 << BOX_BITS
     upper, lower = (y0 | (np.int64(_LAST) if down else y1) << BOX_BITS) << (2 * BOX_BITS), y1 << (3 * BOX_BITS)
     above, below = (top - low) * columns, (bottom - low) * columns
-    _note(above + first, number, left | upper, held, tiles, pairs)
-    _note(above + last, number, right | upper, held + 1, tiles, pairs)
-    held += 1 + aside
-    _note(below + first, number, left | lower, held, tiles, pairs)
-    held += down
-    _note(below + last, number, right | lower, held, tiles, pairs)
-    return held + (aside & down)
+    _buffer_pair(above + first, gaussian, left | upper, buffered, tiles, pairs)
+    _buffer_pair(above + last, gaussian, right | upper, buffered + 1, tiles, pairs)
+    buffered += 1 + aside
+    _buffer_pair(below + first, gaussian, left | lower, buffered, tiles, pairs)
+    buffered += down
+    _buffer_pair(below + last, gaussian, right | lower, buffered, tiles, pairs)
+    return buffered + (aside & down)
 
 
 @inline_kernel
-def _note_all(number, word, low, high, columns, width, held, tiles, pairs):
-    """Note a Gaussian that touches any tiles of a band; how many pairs are held then."""
-    first, _, top, bottom = _tiles_of(word)
+def _buffer_all(gaussian, word, low, high, columns, width, buffered, tiles, pairs):
+    """Buffer the pairs of a Gaussian with any tiles of a band; returns the number of buffered pairs."""
+    first, _, top, bottom = _tile_range(word)
     x0, x1, y0, y1 = word & _SIDE, word >> 16 & _SIDE, word >> 32 & _SIDE, word >> 48
     for i in range(max(top, low), min(bottom + 1, high) if word != EMPTY_BOX else low):
         corner = i << _SHIFT
         rows = max(y0 - corner, 0) << (2 * BOX_BITS) | min(y1 - corner, _LAST) << (3 * BOX_BITS)
-        for k in range(first, first + _across(word, columns)):
+        for k in range(first, first + _count_columns(word, columns)):
             column = k if k < columns else k - columns
             left, right = _columns_in_tile(x0, x1, column, width)
-            _note((i - low) * columns + column, number, left | right << BOX_BITS | rows, held, tiles, pairs)
-            held += 1
-    return held
+            tile, box = (i - low) * columns + column, left | right << BOX_BITS | rows
+            _buffer_pair(tile, gaussian, box, buffered, tiles, pairs)
+            buffered += 1
+    return buffered
 
 
 @kernel
-def _list(part, ends, words, columns, low, high, width, all_places, first_slots, intersections, slots, offsets):
-    """Enter one part of the Gaussians in the lists of the tiles of a band.
+def _write_intersections(
+    part, ends, words, columns, low, high, width, all_positions, first_slots, intersections, slots, offsets
+):
+    """Write the intersections of one part of the scene with the tiles of a band.
 
     Args:
+        words: packed boxes.
         low, high: rows of tiles.
-        all_places: (part, tile of the band), where each part's intersections begin.
+        all_positions: (part, tile of the band), where each part's intersections begin.
         first_slots: of each part.
-        intersections: words of 64 bits.
-        slots: if there are any, each entry's is written.
-        offsets: likewise, where each Gaussian's slots end.
+        intersections: as 64-bit words.
+        slots: of each intersection, written unless empty.
+        offsets: end of each Gaussian's slots, written unless empty.
     """
-    places, slot, held = all_places[part], first_slots[part], np.int64(0)
-    room = _HELD + len(places) + 4
-    tiles, pairs = np.empty(room, np.int64), np.empty(room, np.int64)
+    positions, slot, buffered = all_positions[part], first_slots[part], np.int64(0)
+    capacity = _BUFFER_SIZE + len(positions) + 4
+    tiles, pairs = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
     for g in range(ends[part], ends[part + 1]):
         word = element(words, g)
-        first, last, top, bottom = _tiles_of(word)
+        first, last, top, bottom = _tile_range(word)
         small = (last - first <= 1) & (bottom - top <= 1) & ((word >> 16 & _SIDE) >= (word & _SIDE))
         if small & (top >= low) & (bottom < high) & (word != EMPTY_BOX):
-            held = _note_corners(g, word, low, columns, width, held, tiles, pairs)
+            buffered = _buffer_corners(g, word, low, columns, width, buffered, tiles, pairs)
         else:
-            held = _note_all(g, word, low, high, columns, width, held, tiles, pairs)
+            buffered = _buffer_all(g, word, low, high, columns, width, buffered, tiles, pairs)
         if len(offsets) > 0:
-            put(offsets, g + 1, slot + held)
-        if held >= _HELD or g == ends[part + 1] - 1:
-            for k in range(held):
+            put(offsets, g + 1, slot + buffered)
+        if buffered >= _BUFFER_SIZE or g == ends[part + 1] - 1:
+            for k in range(buffered):
                 tile = element(tiles, k)
-                place = element(places, tile)
-                put(places, tile, place + 1)
-                put(intersections, place, element(pairs, k))
-                prefetch_to_write(intersections, place + _WRITE_AHEAD)
+                position = element(positions, tile)
+                put(positions, tile, position + 1)
+                put(intersections, position, element(pairs, k))
+                prefetch_to_write(intersections, position + _WRITE_AHEAD)
                 if len(slots) > 0:
-                    put(slots, place, slots.dtype.type(slot + k))
-                    prefetch_to_write(slots, place + _WRITE_AHEAD)
-            slot, held = slot + held, np.int64(0)
+                    put(slots, position, slots.dtype.type(slot + k))
+                    prefetch_to_write(slots, position + _WRITE_AHEAD)
+            slot, buffered = slot + buffered, np.int64(0)
 
 
 def intersect_tiles(
     boxes: np.ndarray, size: tuple[int, int], *, slots: bool, threads: int, limit: int = MAX_INTERSECTIONS
 ) -> Iterator[TileIntersections]:
-    """Lists for all tiles, in bands of tile rows with at most `limit` pairs (a single row may hold more).
+    """Tile intersections of all tiles, Gaussians in index order, in bands of tile rows.
 
     Args:
-        boxes: (n, 4) int16, see boxes.py.
+        boxes: (n, 4) int16.
         size: height and width, pixels.
-        slots: whether to number the pairs for the backward.
-        threads: to work on; the lists do not depend on it.
-        limit: number of pairs.
+        slots: whether to number the intersections for the backward.
+        threads: number of threads; the result does not depend on it.
+        limit: largest number of intersections in a band, unless a single row has more.
     """
     rows, columns = (-(-side // TILE_SIZE) for side in size)
     words = boxes.view(np.int64)[:, 0]
-    parts = _PARTS * threads if threads > 1 else 1
+    parts = _PARTS_PER_THREAD * threads if threads > 1 else 1
     ends = np.linspace(0, len(words), parts + 1).astype(np.int64)
     all_counts = np.empty((parts, rows * columns), np.int64)
-    parallel_for(lambda part: _count(part, ends, words, rows, columns, all_counts), parts, threads)
+    parallel_for(lambda part: _count_intersections(part, ends, words, rows, columns, all_counts), parts, threads)
     per_row = all_counts.sum(axis=0).reshape(rows, columns).sum(axis=1)
-    for low, high in _bands(per_row.tolist(), limit):
-        counts, workspace = all_counts[:, low * columns : high * columns], Workspace()
-        starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts.sum(axis=0))))
-        places, per_part = starts[:-1] + np.cumsum(counts, axis=0) - counts, counts.sum(axis=1)
-        count = int(starts[-1])
-        intersections = workspace.array(count, np.int64)
-        numbers = workspace.array(count if slots else 0, np.int32 if count < 2**31 else np.int64)
-        offsets = workspace.array(len(words) + 1 if slots else 0, np.int64)
-        offsets[:1] = 0
-        lists = places, np.cumsum(per_part) - per_part, intersections, numbers, offsets
-        parallel_for(_bound(_list, ends, words, columns, low, high, size[1], *lists), parts, threads)
-        yield TileIntersections(low, intersections.view(np.int32).reshape(-1, 2), starts, numbers, offsets, workspace)
+    for low, high in _split_rows(per_row.tolist(), limit):
+        yield _intersect_band(words, ends, all_counts[:, low * columns : high * columns], low, size, slots, threads)
 
 
-def _bands(per_row: list[int], limit: int) -> Iterator[tuple[int, int]]:
-    """Split rows into runs whose pairs sum to at most `limit`, one row at least."""
+def _intersect_band(
+    words: np.ndarray,
+    ends: np.ndarray,
+    counts: np.ndarray,
+    first_row: int,
+    size: tuple[int, int],
+    needs_slots: bool,
+    threads: int,
+) -> TileIntersections:
+    """The intersections with a band of tile rows, from their counts (part, tile of the band)."""
+    width, columns, workspace = size[1], -(-size[1] // TILE_SIZE), Workspace()
+    starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts.sum(axis=0))))
+    positions, per_part = starts[:-1] + np.cumsum(counts, axis=0) - counts, counts.sum(axis=1)
+    num, end_row, first_slots = int(starts[-1]), first_row + counts.shape[1] // columns, np.cumsum(per_part) - per_part
+    intersections = workspace.array(num, np.int64)
+    slots = workspace.array(num if needs_slots else 0, np.int32 if num < 2**31 else np.int64)
+    offsets = workspace.array(len(words) + 1 if needs_slots else 0, np.int64)
+    offsets[:1] = 0
+
+    def write(part: int) -> None:
+        _write_intersections(
+            part, ends, words, columns, first_row, end_row, width, positions, first_slots, intersections, slots, offsets
+        )
+
+    parallel_for(write, len(counts), threads)
+    return TileIntersections(first_row, intersections.view(np.int32).reshape(-1, 2), starts, slots, offsets, workspace)
+
+
+def _split_rows(per_row: list[int], limit: int) -> Iterator[tuple[int, int]]:
+    """Split rows into bands with at most `limit` intersections, one row at least."""
     low, total = 0, 0
     for row, count in enumerate(per_row):
         if row > low and total + count > limit:
@@ -524,59 +557,65 @@ def _bands(per_row: list[int], limit: int) -> Iterator[tuple[int, int]]:
     yield low, len(per_row)
 
 
-def _bound(work: Callable[..., None], *arguments: object) -> Callable[[int], None]:
-    """A kernel with all its arguments but the first."""
-    return lambda part: work(part, *arguments)
+# --- sorting ---
+#
+# A tile's few thousand intersections are sorted within the L1 cache: their distances, as integers of the same order, by
+# the two leading digits, then by insertion. Where insertion would take too long, such as for all but one at nearly the
+# same distance, a radix sort by all digits replaces it; its time does not depend on the distances.
 
-
-_DIGIT = 11  # bits sorted by at a time, at most: 2048 counters stay in the first cache
-_MORE = 3  # bits of a digit beyond half of those that number a tile's intersections: few are left out of order
-_PIECES = 8  # of work a thread
-_PATIENCE = 4  # places an entry is moved by insertion, on average, before it is given up
-_READ_AHEAD = 32  # intersections, between asking for a distance and reading it
-_ROUNDING = 12  # lowest bits of a distance: equal ones, found by other steps, may differ in the last few, so cut them
-_FLIP = np.int64(0x7FFFFFFFFFFFFFFF)
+_DIGIT_BITS = 11  # at most: 2048 counters fit the L1 cache
+_EXTRA_BITS = 3  # of a digit beyond half of those that index a tile's intersections, so that few stay out of order
+_MAX_MOVES = 4  # positions that insertion moves an intersection, on average, before radix sort replaces it
+_READ_AHEAD = 32  # intersections, from the prefetch of a distance to its use
+_ROUNDING_BITS = 12  # of a distance, cut off: equal distances, computed in other steps, may differ in these
+_SIGN_MASK = np.int64(0x7FFFFFFFFFFFFFFF)
+_ITEMS_PER_THREAD = 8
+_EMPTY_TILE_COST = 32  # in intersections
 
 
 @kernel
-def _measure(piece, records, radii, towards, depths):
-    """Write the depths along an axis of a piece's Gaussians."""
-    for g in range(piece * PIECE, min((piece + 1) * PIECE, len(radii))):
+def _measure_depths(item, records, radii, axis, depths):
+    for g in range(item * PIECE, min((item + 1) * PIECE, len(radii))):
         x = np.float64(records[g, 0]) + np.float64(records[g, 3])
         y = np.float64(records[g, 1]) + np.float64(records[g, 4])
         z = np.float64(records[g, 2]) + np.float64(records[g, 5])
-        depths[g] = radii[g] * (x * towards[0] + y * towards[1] + z * towards[2])
+        depths[g] = radii[g] * (x * axis[0] + y * axis[1] + z * axis[2])
 
 
 def compute_depths(
-    records: np.ndarray, radii: np.ndarray, towards: np.ndarray, workspace: Workspace, threads: int
+    records: np.ndarray, radii: np.ndarray, axis: np.ndarray, workspace: Workspace, threads: int
 ) -> np.ndarray:
-    """How far Gaussians lie along an axis, (n,) float64, metres.
+    """Depth of each Gaussian along an axis, (n,) float64, metres.
 
     Args:
         records: of the Gaussians.
-        radii: float64, metres.
-        towards: the axis in the records' axes.
+        radii: radial distances, float64, metres.
+        axis: in the records' axes.
         workspace: for the depths.
-        threads: to work on.
+        threads: number of threads.
     """
     depths = workspace.array(len(radii), np.float64)
-    parallel_for(lambda piece: _measure(piece, records, radii, towards, depths), -(-len(radii) // PIECE), threads)
+    num_items = -(-len(radii) // PIECE)
+    parallel_for(lambda item: _measure_depths(item, records, radii, axis, depths), num_items, threads)
     return depths
 
 
 @inline_kernel
-def _read_keys(intersections, slots, keys, begin, count, words, own_entries, own_slots):
-    """Copy a tile's intersections and slots, and fetch its distances as integers; return the range."""
-    low, high, end = _FLIP, -_FLIP, len(intersections) - 1
+def _read_keys(intersections, slots, keys, begin, count, words, own_intersections, own_slots):
+    """Copy a tile's intersections and slots, and read its distances as integers of the same order.
+
+    Returns:
+        The smallest and the largest of these integers.
+    """
+    low, high, end = _SIGN_MASK, -_SIGN_MASK, len(intersections) - 1
     for j in range(count):
         prefetch(keys, element(intersections, min(begin + j + _READ_AHEAD, end)) & np.int64(0xFFFFFFFF))
-        entry = element(intersections, begin + j)
-        key = element(keys, entry & np.int64(0xFFFFFFFF))
-        key = (key if key >= 0 else (key ^ _FLIP) + 1) >> _ROUNDING  # -0.0 is 0.0
+        intersection = element(intersections, begin + j)
+        key = element(keys, intersection & np.int64(0xFFFFFFFF))
+        key = (key if key >= 0 else (key ^ _SIGN_MASK) + 1) >> _ROUNDING_BITS  # -0.0 equals 0.0
         low, high = min(low, key), max(high, key)
         put(words, j, np.uint64(key))
-        put(own_entries, j, entry)
+        put(own_intersections, j, intersection)
     if len(slots) > 0:
         for j in range(count):
             put(own_slots, j, element(slots, begin + j))
@@ -594,7 +633,7 @@ def _bit_length(number):
 
 @inline_kernel
 def _pack(words, count, least, cut, place_bits, low, high, bits, low_counters, high_counters):
-    """Put each key's place below it, and count two digits of `bits` bits, from bits `low` and `high` on."""
+    """Append each key's index in the tile to it, and count two digits of `bits` bits, from bits `low` and `high` on."""
     for digit in range(1 << bits):
         put(low_counters, digit, np.int32(0))
         put(high_counters, digit, np.int32(0))
@@ -608,8 +647,8 @@ def _pack(words, count, least, cut, place_bits, low, high, bits, low_counters, h
 
 
 @inline_kernel
-def _deal(words, count, shift, bits, counters, dealt):
-    """Move words to where a digit puts them, keeping the order of equal ones; the counters are lost."""
+def _scatter(words, count, shift, bits, counters, scattered):
+    """One stable pass of a radix sort, by the digit at bit `shift`; overwrites the counters."""
     mask, total = (np.uint64(1) << np.uint64(bits)) - np.uint64(1), np.int64(0)
     for digit in range(1 << bits):
         held = element(counters, digit)
@@ -620,12 +659,12 @@ def _deal(words, count, shift, bits, counters, dealt):
         digit = np.int64(word >> np.uint64(shift) & mask)
         place = element(counters, digit)
         put(counters, digit, np.int32(place + 1))
-        put(dealt, np.int64(place), word)
+        put(scattered, np.int64(place), word)
 
 
 @inline_kernel
-def _insert(words, count):
-    """Sort words that are nearly in order; whether they were near enough."""
+def _insertion_sort(words, count):
+    """Sort words that are nearly in order; returns False, with the words half sorted, if it takes too many moves."""
     moves = np.int64(0)
     for j in range(1, count):
         word, at = element(words, j), j
@@ -634,83 +673,82 @@ def _insert(words, count):
             at -= 1
         put(words, at, word)
         moves += j - at
-        if moves > _PATIENCE * count:
+        if moves > _MAX_MOVES * count:
             return False
     return True
 
 
 @inline_kernel
-def _sort_by_all_digits(words, spare, count, end, counters):
-    """Sort words of `end` bits, however they are spread; the two arrays, sorted first."""
-    for shift in range(0, end, _DIGIT):
+def _radix_sort(words, spare, count, end, counters):
+    """Sort words of `end` bits; returns the two arrays, the sorted one first."""
+    for shift in range(0, end, _DIGIT_BITS):
         counters[:] = 0
         for j in range(count):
-            digit = np.int64(element(words, j) >> np.uint64(shift) & np.uint64((1 << _DIGIT) - 1))
+            digit = np.int64(element(words, j) >> np.uint64(shift) & np.uint64((1 << _DIGIT_BITS) - 1))
             put(counters, digit, np.int32(element(counters, digit) + 1))
-        _deal(words, count, shift, _DIGIT, counters, spare)
+        _scatter(words, count, shift, _DIGIT_BITS, counters, spare)
         words, spare = spare, words
     return words, spare
 
 
 @kernel
 def _sort_tiles(intersections, slots, keys, starts, low, high):
-    """Sort the intersections and slots of some tiles.
+    """Sort the intersections and slots of tiles `low` to `high` - 1.
 
     Args:
-        intersections: flat words of 64 bits.
-        keys: the distances' bits, as int64.
+        intersections: as 64-bit words.
+        keys: bits of the distances, int64.
     """
     most = 1
     for tile in range(low, high):
         most = max(most, starts[tile + 1] - starts[tile])
-    words, dealt, own_entries = np.empty(most, np.uint64), np.empty(most, np.uint64), np.empty(most, np.int64)
+    words, spare, own_intersections = np.empty(most, np.uint64), np.empty(most, np.uint64), np.empty(most, np.int64)
     own_slots = np.empty(most if len(slots) > 0 else 0, slots.dtype)
-    low_counters, high_counters = np.empty(1 << _DIGIT, np.int32), np.empty(1 << _DIGIT, np.int32)
+    low_counters, high_counters = np.empty(1 << _DIGIT_BITS, np.int32), np.empty(1 << _DIGIT_BITS, np.int32)
     for tile in range(low, high):
         begin, count = starts[tile], starts[tile + 1] - starts[tile]
         if count < 2:
             continue
-        least, largest = _read_keys(intersections, slots, keys, begin, count, words, own_entries, own_slots)
+        least, largest = _read_keys(intersections, slots, keys, begin, count, words, own_intersections, own_slots)
         key_bits, place_bits = _bit_length(largest - least), _bit_length(np.uint64(count - 1))
         cut = max(0, key_bits + place_bits - 64)
         end = key_bits - cut + place_bits
-        bits = min(place_bits // 2 + _MORE, _DIGIT, end // 2)
+        bits = min(place_bits // 2 + _EXTRA_BITS, _DIGIT_BITS, end // 2)
         upper, lower = end - bits, end - 2 * bits
         _pack(words, count, least, np.uint64(cut), place_bits, lower, upper, bits, low_counters, high_counters)
-        _deal(words, count, lower, bits, low_counters, dealt)
-        _deal(dealt, count, upper, bits, high_counters, words)
-        if not _insert(words, count):
-            words, dealt = _sort_by_all_digits(words, dealt, count, end, low_counters)
+        _scatter(words, count, lower, bits, low_counters, spare)
+        _scatter(spare, count, upper, bits, high_counters, words)
+        if not _insertion_sort(words, count):
+            words, spare = _radix_sort(words, spare, count, end, low_counters)
         mask = (np.uint64(1) << np.uint64(place_bits)) - np.uint64(1)
         for j in range(count):
             place = np.int64(element(words, j) & mask)
-            put(intersections, begin + j, element(own_entries, place))
+            put(intersections, begin + j, element(own_intersections, place))
             if len(slots) > 0:
                 put(slots, begin + j, element(own_slots, place))
 
 
-def sort_front_to_back(lists: TileIntersections, distances: np.ndarray, threads: int) -> None:
-    """Sort each tile's intersections, with their slots, nearest first.
+def sort_front_to_back(tiles: TileIntersections, distances: np.ndarray, threads: int) -> None:
+    """Sort each tile's intersections, with their slots, by distance; ties stay in the order of the Gaussians.
 
     Args:
-        lists: of tiles, in the order of the Gaussians' numbers; sorted in place.
-        distances: of the Gaussians, float64, cut to a part in 2^40; to a little less in a tile of such a range that
-            keys and places together exceed 64 bits.
-        threads: to work on; the order does not depend on it.
+        tiles: in the order of the Gaussians; sorted in place.
+        distances: of the Gaussians, float64. They are compared to a part in 2^40, or a little less in a tile whose keys
+            and indices together exceed 64 bits.
+        threads: number of threads; the order does not depend on it.
     """
-    pieces = split_tiles(lists.starts, threads)
-    intersections, keys = lists.intersections.reshape(-1).view(np.int64), distances.view(np.int64)
+    cuts = split_tiles(tiles.starts, threads)
+    intersections, keys = tiles.intersections.reshape(-1).view(np.int64), distances.view(np.int64)
 
-    def work(piece: int) -> None:
-        _sort_tiles(intersections, lists.slots, keys, lists.starts, pieces[piece], pieces[piece + 1])
+    def sort(item: int) -> None:
+        _sort_tiles(intersections, tiles.slots, keys, tiles.starts, cuts[item], cuts[item + 1])
 
-    parallel_for(work, len(pieces) - 1, threads)
+    parallel_for(sort, len(cuts) - 1, threads)
 
 
 def split_tiles(starts: np.ndarray, threads: int) -> list[int]:
-    """Where to cut a band of tiles into pieces of about the same number of intersections."""
-    tiles = len(starts) - 1
-    # Empty tiles are not free: count each as some intersections.
-    cost = starts - starts[0] + 32 * np.arange(tiles + 1)
-    wanted = np.linspace(0, cost[-1], min(tiles, _PIECES * threads if threads > 1 else 1) + 1)
-    return [int(cut) for cut in np.unique(np.searchsorted(cost, wanted))]
+    """Cut a band of tiles into work items with about the same number of intersections; returns the item's limits."""
+    num_tiles = len(starts) - 1
+    cost = starts - starts[0] + _EMPTY_TILE_COST * np.arange(num_tiles + 1)
+    targets = np.linspace(0, cost[-1], min(num_tiles, _ITEMS_PER_THREAD * threads if threads > 1 else 1) + 1)
+    return [int(cut) for cut in np.unique(np.searchsorted(cost, targets))]
