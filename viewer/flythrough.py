@@ -10,7 +10,7 @@ from jaxtyping import Float
 from pansplat.data.images import write_image
 from pansplat.data.video import write_video
 from pansplat.gaussians.scene import Scene
-from pansplat.geometry.path import fly_pose, way_poses
+from pansplat.geometry.path import fly_pose, path_poses
 from pansplat.geometry.pose import interpolate_poses
 from pansplat_viewer import camera as cameras
 from pansplat_viewer.renderer import SplatRenderer
@@ -60,7 +60,7 @@ def panorama_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
     """Level pose between first and last camera; the middle column of its picture looks along the way."""
     if not len(scene.cam2world):
         return flight_pose(scene, fraction)
-    level = way_poses(scene.cam2world)
+    level = path_poses(scene.cam2world)
     return interpolate_poses(level[0], level[-1], fraction).numpy()
 
 

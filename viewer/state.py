@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
-from pansplat.geometry.path import fly_pose, level_pose, look_pose, up_direction, way_poses
+from pansplat.geometry.path import fly_pose, level_pose, look_pose, path_poses, up_direction
 from pansplat_viewer.camera import Camera, place
 from pansplat_viewer.settings import DrawSettings
 
@@ -81,7 +81,7 @@ def level_frame(scene: Scene) -> Float[np.ndarray, "3 3"]:
     """Right, down, forward of a level camera that looks along the way (columns, world axes)."""
     up = up_direction(scene.cam2world)
     if len(scene.cam2world):
-        return way_poses(scene.cam2world)[0, :3, :3].numpy()
+        return path_poses(scene.cam2world)[0, :3, :3].numpy()
     ahead = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)
     return look_pose(torch.zeros(3), ahead, up)[:3, :3].numpy()
 

@@ -10,9 +10,9 @@ from pansplat.cli.commands import Evaluate, LpipsChoice
 from pansplat.cli.printing import table_console
 from pansplat.cli.scenes import progress_bar, require_height
 from pansplat.errors import InputError
-from pansplat.evaluation.lpips import SMALLEST, Backbone, Lpips, first_available, load_lpips
-from pansplat.evaluation.protocol import Blend, Method, ProtocolOptions, methods_of, run_protocol
-from pansplat.evaluation.tables import notes, rich_tables, write_report
+from pansplat.evaluation.lpips import MIN_IMAGE_SIZE, Backbone, Lpips, find_backbone, load_lpips
+from pansplat.evaluation.protocol import Blend, Method, ProtocolOptions, list_methods, run_protocol
+from pansplat.evaluation.tables import report_notes, rich_tables, write_report
 from pansplat.model.checkpoint import SUFFIXES
 
 _WIDTH = 150  # characters, where there is no terminal
@@ -35,7 +35,7 @@ def run_evaluate_protocol(command: Evaluate) -> int:
     console = table_console(_WIDTH)
     for table in rich_tables(result):
         console.print(table)
-    for note in notes(result):
+    for note in report_notes(result):
         console.print(note, markup=False, soft_wrap=True)
     print(", ".join(str(path) for path in (command.out / "results.json", *written)))
     return 0
@@ -51,7 +51,7 @@ def choose_lpips(choice: LpipsChoice, height: int) -> Lpips | None:
         return None
     if choice.lpips != "auto":
         return load_lpips(cast(Backbone, choice.lpips), choice.lpips_weights)
-    backbone = first_available(choice.lpips_weights) if height >= SMALLEST else None
+    backbone = find_backbone(choice.lpips_weights) if height >= MIN_IMAGE_SIZE else None
     return load_lpips(backbone, choice.lpips_weights) if backbone else None
 
 
@@ -63,7 +63,7 @@ def _methods(command: Evaluate, protocol: str) -> list[Method]:
         with_compat = index == 0 or Path(model).suffix.lower() in SUFFIXES  # sweep among the others has none
         compat, precision = (command.compat, command.precision) if with_compat else ("trained", "float32")
         predictor = pipeline.load_model(model, compat=compat, precision=precision)
-        methods += methods_of(predictor, protocol, blend, Path(model).stem, command.drawing)
+        methods += list_methods(predictor, protocol, blend, Path(model).stem, command.drawing)
     names = [method.name for method in methods]
     if len(set(names)) < len(names):
         raise InputError(f"--model and --models must have names of their own, got {', '.join(names)}; rename a file")

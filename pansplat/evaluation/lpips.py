@@ -32,7 +32,7 @@ from pansplat.model.checkpoint import read_checkpoint
 
 Backbone = Literal["vgg", "alex", "squeeze"]
 
-SMALLEST = 32
+MIN_IMAGE_SIZE = 32
 """Pixels that a picture must have along each side, or nothing is left for the last layers."""
 
 # What the classifiers were trained on, for pictures in [-1, 1].
@@ -89,10 +89,10 @@ class Lpips(nn.Module):
         Raises:
             InputError: when the pictures are too small for the classifier.
         """
-        if min(target.shape[-2:]) < SMALLEST:
+        if min(target.shape[-2:]) < MIN_IMAGE_SIZE:
             size = "x".join(str(side) for side in target.shape[-2:])
             raise InputError(
-                f"LPIPS needs pictures of {SMALLEST} pixels or more along each side, got {size}; "
+                f"LPIPS needs pictures of {MIN_IMAGE_SIZE} pixels or more along each side, got {size}; "
                 "choose a larger height, or do without LPIPS"
             )
         if weights is not None:
@@ -103,9 +103,7 @@ class Lpips(nn.Module):
         return total
 
     @torch.no_grad()
-    def of_pictures(
-        self, prediction: Float[Tensor, "3 height width"], target: Float[Tensor, "3 height width"]
-    ) -> float:
+    def distance(self, prediction: Float[Tensor, "3 height width"], target: Float[Tensor, "3 height width"]) -> float:
         """The distance of two single pictures, as a figure."""
         return float(self(prediction[None], target[None]))
 
@@ -290,7 +288,7 @@ def load_lpips(backbone: Backbone, folder: Path | None = None) -> Lpips:
     return metric
 
 
-def first_available(folder: Path | None = None) -> Backbone | None:
+def find_backbone(folder: Path | None = None) -> Backbone | None:
     """The first of vgg, alex and squeeze whose files are here; None when there are none."""
     found = (b for b in get_args(Backbone) if find_classifier(b, folder) and find_heads(b, folder))
     return next(found, None)

@@ -98,7 +98,7 @@ def _read_triplet(triplets: TripletSet, index: int, height: int) -> Sample:
 
 def sequence_set(root: Path, name: str, draws: int = 100) -> EvaluationSet:
     """`LOC360` or `INSTA360`: pairs spread evenly over each sequence, all frames between and at them as targets."""
-    sequences, missing = sequences_of(root, name)
+    sequences, missing = find_sequences(root, name)
     return EvaluationSet(name, tuple(_cases(sequences, _SAMPLERS[name], draws)), missing)
 
 
@@ -110,7 +110,7 @@ def frame_distance_set(sequences: Sequence[FrameSequence], gap: int, draws: int)
     return EvaluationSet(f"{gap} frames", cases, missing)
 
 
-def sequences_of(root: Path, name: str) -> tuple[Sequence[FrameSequence], str]:
+def find_sequences(root: Path, name: str) -> tuple[Sequence[FrameSequence], str]:
     """The sequences of `LOC360` (its test location) or `INSTA360`, and what is missing when there are none.
 
     Raises:
@@ -189,7 +189,7 @@ class Prediction:
 
 
 @dataclass(frozen=True)
-class Drawn:
+class RenderedTarget:
     """A target as drawn, with its figures."""
 
     score: Score
@@ -223,9 +223,9 @@ def predict_case(context: Views, predictor: Predictor) -> Prediction:
     return Prediction(scene, depth, seconds)
 
 
-def draw_targets(
+def render_targets(
     sample: Sample, prediction: Prediction, blend: Blend, lpips: Lpips | None, drawing: Drawing = "exact"
-) -> Iterator[Drawn]:
+) -> Iterator[RenderedTarget]:
     """Each target of the case, drawn and measured; nothing is clamped but for PSNR, nothing masked."""
     for index, target in enumerate(sample.targets.images):
         began = time.perf_counter()
@@ -240,9 +240,9 @@ def draw_targets(
             ws_psnr=ws_psnr(picture, target),
             psnr=psnr(picture, target),
             ssim=ssim(picture, target),
-            lpips=None if lpips is None else lpips.of_pictures(picture, target),
+            lpips=None if lpips is None else lpips.distance(picture, target),
         )
-        yield Drawn(score, picture, target, seconds)
+        yield RenderedTarget(score, picture, target, seconds)
 
 
 def measure_depth(context: Views, prediction: Prediction) -> DepthErrors | None:
@@ -375,7 +375,7 @@ class ProtocolResult:
         }
 
 
-def methods_of(
+def list_methods(
     predictor: Predictor,
     protocol: str,
     blend: Blend | None = None,
@@ -402,7 +402,7 @@ def methods_of(
     return [Method(f"{called}{words[b]}", predictor, b, drawing) for b in blends]
 
 
-def sets_of(protocol: ProtocolName, root: Path, options: ProtocolOptions) -> list[EvaluationSet]:
+def find_sets(protocol: ProtocolName, root: Path, options: ProtocolOptions) -> list[EvaluationSet]:
     """The protocol's sets, those whose data is missing included.
 
     Raises:
@@ -414,9 +414,9 @@ def sets_of(protocol: ProtocolName, root: Path, options: ProtocolOptions) -> lis
         return [panogrf_set(root, *kind, options.height) for kind in _PANOGRF[protocol]]
     if protocol in ("360loc", "insta360"):
         return [sequence_set(root, LOC360 if protocol == "360loc" else INSTA360, options.draws)]
-    sequences, missing = sequences_of(root, INSTA360)
+    sequences, missing = find_sequences(root, INSTA360)
     if not sequences:
-        sequences, also = sequences_of(root, LOC360)
+        sequences, also = find_sequences(root, LOC360)
         missing = f"{missing}; or {also}"
     if not sequences:
         return [EvaluationSet("frame distance", missing=missing)]
@@ -440,7 +440,7 @@ def run_protocol(
             written.
     """
     options = options or ProtocolOptions()
-    sets = sets_of(protocol, root, options)
+    sets = find_sets(protocol, root, options)
     result = ProtocolResult(protocol, options.height, lpips.name if lpips else None)
     result.missing = [found.missing for found in sets if not found.cases]
     if len(result.missing) == len(sets):
@@ -503,14 +503,14 @@ def _run_case(
         if row.set == _DEPTH_SET:
             errors = measure_depth(sample.context, prediction)
             row.depth += [errors] if errors is not None and math.isfinite(errors.rmse) else []
-        for drawn in draw_targets(sample, prediction, method.blend, lpips, method.drawing):
+        for drawn in render_targets(sample, prediction, method.blend, lpips, method.drawing):
             row.scores.append(drawn.score)
             row.render_seconds.append(drawn.seconds)
             if folder is not None:
                 _write_pictures(folder, method.name, drawn)
 
 
-def _write_pictures(folder: Path, method: str, drawn: Drawn) -> None:
+def _write_pictures(folder: Path, method: str, drawn: RenderedTarget) -> None:
     _make_folder(folder)
     stem = _slug(drawn.score.target)
     write_image(folder / f"{stem}_target.png", drawn.target)

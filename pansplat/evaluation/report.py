@@ -161,7 +161,7 @@ def _evaluate_pair(
             prediction=(folder / "prediction.png").resolve(),
             target=(folder / "target.png").resolve(),
             masked_ws_psnr=None if bool(mask.all()) else ws_psnr(picture, target, mask=mask),
-            lpips=None if lpips is None else lpips.of_pictures(picture, target),
+            lpips=None if lpips is None else lpips.distance(picture, target),
         )
 
 

@@ -258,7 +258,7 @@ def plot_frame_distance(result: ProtocolResult, path: Path) -> None:
 _PAPER_LPIPS = "lpips-vgg"
 
 
-def layouts_of(result: ProtocolResult) -> list[Layout]:
+def list_layouts(result: ProtocolResult) -> list[Layout]:
     """The tables of the evaluation, as the paper has them."""
     if result.protocol == "frame-distance":
         return [frame_distance_layout(result)]
@@ -280,10 +280,10 @@ def our_rows(result: ProtocolResult, layout: Layout) -> list[TableRow]:
 
 def rich_tables(result: ProtocolResult) -> list[Table]:
     """The tables to print."""
-    return [rich_table(layout, our_rows(result, layout), HEADS) for layout in layouts_of(result)]
+    return [rich_table(layout, our_rows(result, layout), HEADS) for layout in list_layouts(result)]
 
 
-def notes(result: ProtocolResult) -> list[str]:
+def report_notes(result: ProtocolResult) -> list[str]:
     """What a reader of the tables must know: how many images, what is missing, what cannot be compared."""
     counts = {row.set: len(row.scores) for row in result.sets}
     lines = ["Ours: " + ", ".join(f"{name}: {_images(count)}" for name, count in counts.items()) + "."]
@@ -304,9 +304,9 @@ def write_report(result: ProtocolResult, out: Path) -> list[Path]:
     Raises:
         InputError: they cannot be written.
     """
-    tables = [markdown_table(layout, our_rows(result, layout)) for layout in layouts_of(result)]
+    tables = [markdown_table(layout, our_rows(result, layout)) for layout in list_layouts(result)]
     with replacing(out / "table.md") as partial:
-        partial.write_text("\n".join([*tables, *_items(notes(result))]) + "\n", encoding="utf-8")
+        partial.write_text("\n".join([*tables, *_items(report_notes(result))]) + "\n", encoding="utf-8")
     written = [out / "table.md"]
     if result.protocol == "frame-distance":
         plot_frame_distance(result, out / "frame_distance.png")

@@ -78,7 +78,7 @@ def turn_pose(pose: Float[Tensor, "4 4"], yaw_radians: float, up: Float[Tensor, 
     return turned
 
 
-def way_poses(cam2world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"]:
+def path_poses(cam2world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"]:
     """A level pose at each camera that looks along the way past it.
 
     The way's direction at a camera is that from its predecessor to its successor. Where it has none (one
@@ -118,7 +118,7 @@ def fly_pose(
         raise ValueError("`cam2world` must hold at least one camera to fly from, got none")
     eased = ease_in_out(fraction)
     up = up_direction(cam2world)
-    poses = way_poses(cam2world)
+    poses = path_poses(cam2world)
     pose = _along(poses, eased)
     # The sweep follows the eased way, so that the turn also starts and stops smoothly.
     return turn_pose(pose, -math.radians(turn_degrees) * math.sin(2 * math.pi * eased), up)

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from pansplat.errors import InputError
-from pansplat.evaluation.lpips import Backbone, first_available, load_lpips
+from pansplat.evaluation.lpips import Backbone, find_backbone, load_lpips
 from pansplat.geometry.equirect import pad_equirect
 
 PerceptualName = Literal["auto", "lpips-vgg", "lpips-alex", "lpips-squeeze", "structure"]
@@ -64,7 +64,7 @@ def choose_perceptual(
     if name == "structure":
         return Structure()
     if name == "auto":
-        backbone = first_available(folder)
+        backbone = find_backbone(folder)
         return load_lpips(backbone, folder).to(device) if backbone else Structure()
     raise InputError(f"`perceptual` must be auto, structure or one of {', '.join(_BACKBONES)}, got {name!r}")
 

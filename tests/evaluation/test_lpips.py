@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pansplat.errors import InputError
 from pansplat.evaluation import lpips
-from pansplat.evaluation.lpips import FOLDER_VARIABLE, TAPS, Backbone, Lpips, first_available, load_lpips
+from pansplat.evaluation.lpips import FOLDER_VARIABLE, TAPS, Backbone, Lpips, find_backbone, load_lpips
 
 # What lpips 0.1.4 (PyPI, over torchvision 0.29.2 and torch 2.13.0, float64) says of `pair()`, with `normalize=True`.
 # "recipe": its own heads, and a classifier whose layers `recipe` made, put into `LPIPS(...).net` by their names.
@@ -160,7 +160,7 @@ def test_missing_files_are_named_with_where_to_get_and_put_them(nowhere: Path, t
         FOLDER_VARIABLE,
     ):
         assert part in str(error.value)
-    assert first_available(tmp_path) is None
+    assert find_backbone(tmp_path) is None
 
 
 def test_only_the_missing_file_is_asked_for(nowhere: Path, tmp_path: Path) -> None:
@@ -181,7 +181,7 @@ def test_files_are_found_where_they_may_lie(
     if place == "variable":
         monkeypatch.setenv(FOLDER_VARIABLE, str(folder))
     given = folder if place == "folder" else None
-    assert first_available(given) == "squeeze"
+    assert find_backbone(given) == "squeeze"
     assert load_lpips("squeeze", given).name == "lpips-squeeze"
 
 

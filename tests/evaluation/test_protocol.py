@@ -20,13 +20,13 @@ from pansplat.evaluation.protocol import (
     ProtocolOptions,
     Score,
     SetResult,
-    methods_of,
+    find_sequences,
+    find_sets,
+    list_methods,
     run_protocol,
     sequence_set,
-    sequences_of,
-    sets_of,
 )
-from pansplat.evaluation.tables import LAYOUTS, curves, layouts_of, notes, our_rows, rich_tables, write_report
+from pansplat.evaluation.tables import LAYOUTS, curves, list_layouts, our_rows, report_notes, rich_tables, write_report
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.model.network import NetworkPredictor
@@ -121,7 +121,7 @@ def write_insta360(root: Path, frames: int) -> Path:
 
 
 def methods(protocol: str = "m3d", predictor: Sphere | None = None):
-    return methods_of(predictor or Sphere(), protocol)
+    return list_methods(predictor or Sphere(), protocol)
 
 
 # The sets
@@ -129,7 +129,7 @@ def methods(protocol: str = "m3d", predictor: Sphere | None = None):
 
 def test_a_protocols_sets_are_the_columns_of_its_table(tmp_path: Path) -> None:
     for protocol, layout in LAYOUTS.items():
-        sets = sets_of(protocol, tmp_path, OPTIONS)
+        sets = find_sets(protocol, tmp_path, OPTIONS)
         assert tuple(found.name for found in sets) == layout.sets
 
 
@@ -148,19 +148,19 @@ def test_missing_data_is_named_by_its_folder(tmp_path: Path) -> None:
 
 def test_a_missing_root_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="needed the folder that holds the test data"):
-        sets_of("m3d", tmp_path / "nowhere", OPTIONS)
+        find_sets("m3d", tmp_path / "nowhere", OPTIONS)
 
 
 @pytest.mark.parametrize("inside", [".", "pano_grf", "datasets/pano_grf"])
 def test_data_is_found_where_the_original_code_keeps_it(tmp_path: Path, inside: str) -> None:
     write_triplets(tmp_path / inside, "residential_dist_0.15", scenes=1)
-    (found,) = sets_of("residential", tmp_path, OPTIONS)
+    (found,) = find_sets("residential", tmp_path, OPTIONS)
     assert [case.name for case in found.cases] == ["00000000"]
 
 
 def test_a_taller_panorama_reads_its_own_folder(tmp_path: Path) -> None:
     write_triplets(tmp_path, "replica_dist_0.5", scenes=1)
-    (found,) = sets_of("replica", tmp_path, ProtocolOptions(height=1024))
+    (found,) = find_sets("replica", tmp_path, ProtocolOptions(height=1024))
     assert not found.cases and "png_render_test_2048x1024_seq_len_3_replica_dist_0.5" in found.missing
 
 
@@ -178,7 +178,7 @@ def test_a_sequence_gives_even_pairs_with_all_frames_between_and_at_them(tmp_pat
 def test_a_films_inputs_are_sixteen_frames_apart(tmp_path: Path) -> None:
     """OFFICIAL.md 2.5: all 17 frames from the left input to the right one are targets."""
     write_insta360(tmp_path, frames=20)
-    (found,) = sets_of("insta360", tmp_path, OPTIONS)
+    (found,) = find_sets("insta360", tmp_path, OPTIONS)
     assert [case.name for case in found.cases] == [f"VID_0001-{i:06d}-{i + 16:06d}" for i in (0, 1, 3)]
     sample = found.cases[2].read(HEIGHT)
     assert len(sample.targets.images) == 17
@@ -188,11 +188,11 @@ def test_a_films_inputs_are_sixteen_frames_apart(tmp_path: Path) -> None:
 
 def test_the_frame_distance_takes_the_frame_in_the_middle(tmp_path: Path) -> None:
     write_loc360(tmp_path, frames=7)
-    by_gap = sets_of("frame-distance", tmp_path, OPTIONS)
+    by_gap = find_sets("frame-distance", tmp_path, OPTIONS)
     assert [found.name for found in by_gap] == ["2 frames", "4 frames"]
     sample = by_gap[1].cases[0].read(HEIGHT)
     assert sample.context.names == ("0000", "0004") and sample.targets.names == ("0002",)
-    sequences, missing = sequences_of(tmp_path, INSTA360)
+    sequences, missing = find_sequences(tmp_path, INSTA360)
     assert not sequences and "VID_*" in missing
 
 
@@ -201,11 +201,11 @@ def test_the_frame_distance_takes_the_frame_in_the_middle(tmp_path: Path) -> Non
 
 def test_real_scenes_are_drawn_jointly_and_blended_rendered_ones_jointly() -> None:
     network = Network()
-    assert [m.blend for m in methods_of(network, "m3d")] == ["joint"]
-    assert [m.blend for m in methods_of(network, "360loc")] == ["joint", "deferred"]
-    assert [m.blend for m in methods_of(network, "360loc", "deferred")] == ["deferred"]
-    assert [m.blend for m in methods_of(Sphere(), "m3d")] == ["deferred"]
-    assert methods_of(network, "insta360", name="mine")[1].name == "ours, mine + deferred blending"
+    assert [m.blend for m in list_methods(network, "m3d")] == ["joint"]
+    assert [m.blend for m in list_methods(network, "360loc")] == ["joint", "deferred"]
+    assert [m.blend for m in list_methods(network, "360loc", "deferred")] == ["deferred"]
+    assert [m.blend for m in list_methods(Sphere(), "m3d")] == ["deferred"]
+    assert list_methods(network, "insta360", name="mine")[1].name == "ours, mine + deferred blending"
 
 
 # Figures
@@ -243,7 +243,7 @@ def test_a_set_is_the_plain_mean_of_its_images(tmp_path: Path) -> None:
 def test_methods_of_one_predictor_share_its_prediction(tmp_path: Path) -> None:
     write_loc360(tmp_path)
     predictor = Sphere()
-    both = [*methods_of(predictor, "360loc", "joint"), *methods_of(predictor, "360loc", "deferred")]
+    both = [*list_methods(predictor, "360loc", "joint"), *list_methods(predictor, "360loc", "deferred")]
     result = run_protocol("360loc", tmp_path, both, tmp_path / "out", options=OPTIONS)
     assert predictor.calls == 1 + 3  # once to warm up
     joint, deferred = result.sets
@@ -263,7 +263,7 @@ def test_the_true_depth_has_no_error(tmp_path: Path) -> None:
 
 def test_a_networks_own_finest_depth_is_measured(tmp_path: Path) -> None:
     write_triplets(tmp_path, "m3d_dist_0.5", scenes=1, depth_metres=RADIUS)
-    result = run_protocol("m3d", tmp_path, methods_of(Network(), "m3d"), tmp_path / "out", options=OPTIONS)
+    result = run_protocol("m3d", tmp_path, list_methods(Network(), "m3d"), tmp_path / "out", options=OPTIONS)
     assert result.sets[0].mean("rmse") == pytest.approx(0, abs=1e-6)
 
 
@@ -275,7 +275,7 @@ def test_lpips_is_measured_where_it_is_given(tmp_path: Path) -> None:
     result = run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=OPTIONS, lpips=metric)
     value = result.sets[0].mean("lpips")
     assert value is not None and value > 0 and result.lpips == "lpips-squeeze"
-    assert any("do not compare" in note for note in notes(result))
+    assert any("do not compare" in note for note in report_notes(result))
 
 
 # What is left out is said
@@ -288,7 +288,7 @@ def test_unreadable_cases_are_left_out_and_named(tmp_path: Path) -> None:
     assert len(result.sets[0].scores) == 1
     (line,) = result.skipped
     assert line.startswith("Replica 1.0 m, 00000001: ") and "tran.txt" in line
-    assert any(line in note for note in notes(result))
+    assert any(line in note for note in report_notes(result))
     assert json.loads((tmp_path / "out" / "results.json").read_text())["skipped"] == [line]
 
 
@@ -336,7 +336,7 @@ def run_one_row(folder: Path, row: SetResult) -> dict[str, object]:
 def test_the_figure_has_a_line_a_method_over_the_frame_distance(tmp_path: Path) -> None:
     write_loc360(tmp_path, frames=7)
     predictor = Sphere()
-    both = [*methods_of(predictor, "frame-distance", "joint"), *methods_of(predictor, "frame-distance", "deferred")]
+    both = [*list_methods(predictor, "frame-distance", "joint"), *list_methods(predictor, "frame-distance", "deferred")]
     result = run_protocol("frame-distance", tmp_path, both, tmp_path / "out", options=OPTIONS)
     lines = curves(result.sets, "ws_psnr")
     assert {method: [gap for gap, _ in line] for method, line in lines.items()} == {m.name: [2, 4] for m in both}
@@ -344,13 +344,13 @@ def test_the_figure_has_a_line_a_method_over_the_frame_distance(tmp_path: Path) 
     assert {path.name for path in written} == {"table.md", "frame_distance.png"}
     with Image.open(tmp_path / "out" / "frame_distance.png") as figure:
         assert figure.size[0] > 300
-    (layout,) = layouts_of(result)
+    (layout,) = list_layouts(result)
     assert layout.sets == ("2 frames", "4 frames") and all(len(row.values) == 2 for row in our_rows(result, layout))
 
 
 @pytest.mark.shared
 def test_the_original_sample_is_a_case_of_m3d(shared: Path) -> None:
-    found = sets_of("m3d", shared / "data" / "mp3d_sample", ProtocolOptions())
+    found = find_sets("m3d", shared / "data" / "mp3d_sample", ProtocolOptions())
     assert [len(s.cases) for s in found] == [1, 0, 0]
     sample = found[0].cases[0].read(64)
     assert sample.name == "00000007" and sample.targets.names == ("01",) and sample.context.depths is not None

@@ -156,7 +156,7 @@ def test_lpips_is_measured_where_it_is_given(tmp_path: Path) -> None:
     (case,) = evaluate(pairs, GreyBall(), tmp_path / "out", height=32, lpips=metric)
     (result,) = json.loads((tmp_path / "out" / "results.json").read_text())
     assert set(result) == {*KEYS, "lpips"} and result["lpips"] == case.lpips
-    assert case.lpips == pytest.approx(metric.of_pictures(read(case.prediction), read(case.target)), abs=1e-3)
+    assert case.lpips == pytest.approx(metric.distance(read(case.prediction), read(case.target)), abs=1e-3)
     assert "LPIPS" in [str(column.header) for column in results_table([case]).columns]
 
 

@@ -11,9 +11,9 @@ from pansplat.geometry.path import (
     fly_pose,
     level_pose,
     look_pose,
+    path_poses,
     turn_pose,
     up_direction,
-    way_poses,
 )
 from pansplat.geometry.pose import orthonormal_error
 
@@ -130,7 +130,7 @@ def test_coincident_cameras_fly_nowhere_and_keep_their_heading():
 
 def test_climb_straight_up_keeps_the_cameras_heading():
     cameras = torch.stack((_pose((0, 0, 0)), _pose((0, -2, 0))))
-    assert torch.allclose(way_poses(cameras)[:, :3, :3], torch.eye(3, dtype=torch.float64).expand(2, 3, 3))
+    assert torch.allclose(path_poses(cameras)[:, :3, :3], torch.eye(3, dtype=torch.float64).expand(2, 3, 3))
 
 
 def test_no_camera_is_refused():
