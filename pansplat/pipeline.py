@@ -16,7 +16,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.cache import CachedPrediction
-from pansplat.data.pairs import Pair, load_pairs
+from pansplat.data.layouts import load_pairs
+from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.gaussians.ply import load_ply, save_ply, save_ply_parts

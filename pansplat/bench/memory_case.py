@@ -24,19 +24,17 @@ import torch
 from torch import Tensor
 
 from pansplat.bench.measure import peak_memory, reset_resident_peak, resident, seconds
-from pansplat.data.sample import Batch, Sample, collate
-from pansplat.data.views import Views
+from pansplat.data.views import Batch, Sample, Views, collate
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.model.heads import whole
 from pansplat.model.pansplat import PanSplat
 from pansplat.rendering.cpu.runtime import release_idle_memory
 from pansplat.training.config import MemoryConfig, NetworkShape, Style
-from pansplat.training.drawing import Drawing
-from pansplat.training.losses import LossWeights
-from pansplat.training.network import freeze, learn, learning, read_weights, shape_of
-from pansplat.training.perceptual import Perceptual, PerceptualName, choose_perceptual
-from pansplat.training.step import Teacher, teach
+from pansplat.training.losses import LossWeights, Perceptual, PerceptualName, choose_perceptual
+from pansplat.training.network import freeze, network_config, read_weights, set_training_mode, trainable_parameters
+from pansplat.training.rendering import TargetRenderer
+from pansplat.training.step import TrainingStep, accumulate_gradients
 
 Work = Literal["inference", "plain", "one-step", "two-step"]
 MATCHED_HEIGHT = 512  # above it only the heads learn, as in the paper's stages
@@ -220,18 +218,18 @@ class _Worker:
         network = self.network
         matched = network.match(batch.images, batch.cam2world.float(), batch.near, batch.far)
         (scene,) = whole(list(network.lift(matched, tiles=self.case.tiles)), network.compat)
-        drawing = Drawing(self.setting.style, "joint", batch.images.shape[-2])
-        picture = drawing.draw(scene, batch.target_cam2world[0, 0], batch.cam2world[0])
+        renderer = TargetRenderer(self.setting.style, "joint", batch.images.shape[-2])
+        picture = renderer.render(scene, batch.target_cam2world[0, 0], batch.cam2world[0])
         return len(scene), {"means": scene.means, "opacities": scene.opacities, "picture": picture}
 
     def _learn(self, batch: Batch, optimizer: torch.optim.Optimizer) -> tuple[int, dict[str, Tensor]]:
         network, case = self.network, self.case
         assert case.work != "inference"
-        learn(network, _frozen(batch.images.shape[-2]))
+        set_training_mode(network, _frozen(batch.images.shape[-2]))
         optimizer.zero_grad()
         memory = MemoryConfig(case.work, case.tiles, self.setting.style)
         weights = LossWeights(depth=0.0) if batch.images.shape[-2] > MATCHED_HEIGHT else LossWeights()
-        teach(Teacher(network, None, self.perceptual, weights, memory), [batch])
+        accumulate_gradients(TrainingStep(network, None, self.perceptual, weights, memory), [batch])
         found = {name: p.grad for name, p in network.named_parameters() if p.grad is not None}
         optimizer.step()
         views, heights = batch.images.shape[1], batch.images.shape[-2]
@@ -275,13 +273,13 @@ def _network(
     case: MemoryCase, setting: MemorySetting, weights: Path, device: torch.device
 ) -> tuple[PanSplat, torch.optim.Optimizer | None]:
     """The network with its weights, and for training an optimizer that already has its state."""
-    network = PanSplat(shape_of(setting.network), "fixed")
+    network = PanSplat(network_config(setting.network), "fixed")
     network.load_state_dict(read_weights(weights).tensors)
     network = network.to(device)
     if case.work == "inference":
         return network.eval(), None
     freeze(network, _frozen(case.height))
-    optimizer = torch.optim.Adam(list(learning(network)), lr=0.0)
+    optimizer = torch.optim.Adam(list(trainable_parameters(network)), lr=0.0)
     return network, optimizer
 
 

@@ -23,7 +23,7 @@ from pansplat.bench.model_weights import save_random_weights
 from pansplat.cli.commands import BenchMemory
 from pansplat.cli.printing import table_console
 from pansplat.errors import InputError
-from pansplat.training.network import shape_of
+from pansplat.training.network import network_config
 
 _WIDTH = 150  # characters, where there is no terminal
 _LEAST_HEIGHT, _MULTIPLE = 64, 32  # so that 4x4 tiles fit the four levels
@@ -103,7 +103,7 @@ def _folder(out: Path | None) -> Iterator[Path]:
 def _weights(setting: MemorySetting) -> Iterator[Path]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "random.safetensors")
-        save_random_weights(path, shape_of(setting.network))
+        save_random_weights(path, network_config(setting.network))
         yield path
 
 

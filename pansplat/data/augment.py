@@ -15,8 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.data.sample import Sample
-from pansplat.data.views import Views
+from pansplat.data.views import Sample, Views
 from pansplat.geometry.equirect import pixel_directions, sample_equirect, uv_from_directions
 
 _MIRROR = torch.diag(torch.tensor((-1.0, 1.0, 1.0, 1.0), dtype=torch.float64))

@@ -21,8 +21,8 @@ import numpy as np
 from torch.utils.data import DataLoader, Dataset
 
 from pansplat.data.augment import Augmentation, augment
-from pansplat.data.dataset import Source
-from pansplat.data.sample import Batch, Sample, collate
+from pansplat.data.sources import SampleSource
+from pansplat.data.views import Batch, Sample, collate
 from pansplat.errors import InputError
 
 _MOST_FAILURES = 32  # samples in a row that cannot be read before we give up
@@ -57,7 +57,7 @@ class Loader:
 
     def __init__(
         self,
-        source: Source,
+        source: SampleSource,
         *,
         height: int,
         batch_size: int,
@@ -131,7 +131,7 @@ def _leave_interrupts_to_the_trainer(_: int) -> None:
 class _Reader(Dataset[tuple[Sample | None, list[Skipped]]]):
     """The sample at a position of the endless sequence of epochs, and those that were left out for it."""
 
-    def __init__(self, source: Source, height: int, seed: int, augmentation: Augmentation | None) -> None:
+    def __init__(self, source: SampleSource, height: int, seed: int, augmentation: Augmentation | None) -> None:
         self.source, self.height, self.seed, self.augmentation = source, height, seed, augmentation
 
     def __getitem__(self, position: int) -> tuple[Sample | None, list[Skipped]]:

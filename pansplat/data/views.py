@@ -1,11 +1,15 @@
-"""Posed panoramas as tensors."""
+"""Posed panoramas as tensors: views, samples of context and target views, and batches."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from pansplat.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,3 +32,89 @@ class Views:
     far: float
     names: tuple[str, ...]
     depths: Float[Tensor, "view height width"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One scene: `context` is the predictor's input, `targets` what its scene should look like elsewhere."""
+
+    name: str
+    context: Views
+    targets: Views
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Samples of one shape, stacked.
+
+    Attributes:
+        names: one a sample.
+        images, target_images: RGB in [0, 1], float32.
+        cam2world, target_cam2world: float64, OpenCV axes, metres.
+        masks, target_masks: True where a pixel shows the scene.
+        depths, target_depths: radial distance in metres, 0 where unknown; None where no sample has any.
+        near, far: radial depth range to search, metres, as the network takes it.
+    """
+
+    names: tuple[str, ...]
+    images: Float[Tensor, "batch view 3 height width"]
+    cam2world: Float[Tensor, "batch view 4 4"]
+    masks: Bool[Tensor, "batch view height width"]
+    depths: Float[Tensor, "batch view height width"] | None
+    target_images: Float[Tensor, "batch target 3 height width"]
+    target_cam2world: Float[Tensor, "batch target 4 4"]
+    target_masks: Bool[Tensor, "batch target height width"]
+    target_depths: Float[Tensor, "batch target height width"] | None
+    near: Float[Tensor, "batch view"]
+    far: Float[Tensor, "batch view"]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def to(self, device: torch.device | str) -> Batch:
+        """The same batch on another device."""
+        moved = {
+            name: value.to(device, non_blocking=True) for name, value in vars(self).items() if isinstance(value, Tensor)
+        }
+        return replace(self, **moved)
+
+
+def collate(samples: Sequence[Sample]) -> Batch:
+    """The samples as one batch.
+
+    Raises:
+        InputError: no sample, or another number or size of views in one of them.
+    """
+    if not samples:
+        raise InputError("needed at least one sample to make a batch of, got none.")
+    first = samples[0]
+    for sample in samples[1:]:
+        for part in ("context", "targets"):
+            wanted, got = (tuple(getattr(s, part).images.shape) for s in (first, sample))
+            if wanted != got:
+                raise InputError(
+                    f"cannot batch {sample.name} with {first.name}: needed {part} of shape {wanted} (view 3 height "
+                    f"width), got {got}; choose one number of targets for all, or a batch of one."
+                )
+    contexts, targets = [s.context for s in samples], [s.targets for s in samples]
+    views = len(first.context.images)
+    return Batch(
+        names=tuple(sample.name for sample in samples),
+        images=torch.stack([v.images for v in contexts]),
+        cam2world=torch.stack([v.cam2world for v in contexts]),
+        masks=torch.stack([v.masks for v in contexts]),
+        depths=_stacked_depths(contexts),
+        target_images=torch.stack([v.images for v in targets]),
+        target_cam2world=torch.stack([v.cam2world for v in targets]),
+        target_masks=torch.stack([v.masks for v in targets]),
+        target_depths=_stacked_depths(targets),
+        near=torch.tensor([[v.near] * views for v in contexts], dtype=torch.float32),
+        far=torch.tensor([[v.far] * views for v in contexts], dtype=torch.float32),
+    )
+
+
+def _stacked_depths(views: Sequence[Views]) -> Float[Tensor, "batch view height width"] | None:
+    """Depths, 0 (unknown) for samples without; None where all are."""
+    if all(v.depths is None for v in views):
+        return None
+    return torch.stack([torch.zeros(v.masks.shape) if v.depths is None else v.depths for v in views])

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pansplat.data.pair import Pair
+from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
 from pansplat.geometry.equirect import pad_equirect, pixel_directions, row_weights, uv_from_directions
 from pansplat.geometry.pose import invert_pose

@@ -25,14 +25,17 @@ from torch import Tensor
 
 from pansplat import pipeline
 from pansplat.atomic import replacing
-from pansplat.data.frames import FrameSequence, read_draw
 from pansplat.data.images import write_image
-from pansplat.data.insta360 import read_insta360
-from pansplat.data.loc360 import read_loc360
-from pansplat.data.sample import Sample
-from pansplat.data.samplers import BoundedSampler, Draw
-from pansplat.data.triplets import TripletSet, panogrf_folder, read_panogrf
-from pansplat.data.views import Views
+from pansplat.data.sequences import (
+    BoundedSampler,
+    FramePair,
+    FrameSequence,
+    read_frame_pair,
+    read_insta360,
+    read_loc360,
+)
+from pansplat.data.sources import TripletSet, panogrf_folder, read_panogrf
+from pansplat.data.views import Sample, Views
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import DepthErrors, depth_errors, psnr, ssim, ws_psnr
@@ -138,9 +141,9 @@ def _cases(
     for sequence in sequences:
         for draw in sampler.evaluation(len(sequence.poses), draws):
             if middle:
-                draw = Draw(draw.left, draw.right, (draw.targets[len(draw.targets) // 2],))
+                draw = FramePair(draw.left, draw.right, (draw.targets[len(draw.targets) // 2],))
             name = f"{sequence.name}-{draw.left:06d}-{draw.right:06d}"
-            cases.append(EvaluationCase(name, functools.partial(read_draw, sequence, draw)))
+            cases.append(EvaluationCase(name, functools.partial(read_frame_pair, sequence, draw)))
     return cases
 
 

@@ -5,6 +5,6 @@ import sys
 
 def main() -> None:
     """Run `pansplat-train` and exit with its status."""
-    from pansplat.training.command import run
+    from pansplat.training.__main__ import run
 
     sys.exit(run())

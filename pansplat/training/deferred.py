@@ -31,7 +31,7 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.model.heads import TileGaussians, whole
 from pansplat.model.network import Network
 from pansplat.model.pansplat import PanSplat
-from pansplat.training.drawing import Drawing, Layer
+from pansplat.training.rendering import ImagePart, TargetRenderer
 
 _T = TypeVar("_T")
 _ItemView = tuple[int, "int | None"]
@@ -62,45 +62,45 @@ class Problem:
 
 
 def whole_loss(
-    problem: Problem, network: Network, drawing: Drawing, *, tiles: int = 1, matching_learns: bool = True
+    problem: Problem, network: Network, renderer: TargetRenderer, *, tiles: int = 1, matching_is_trainable: bool = True
 ) -> Float[Tensor, ""]:
     """The loss with the graph of everything it is made of.
 
     Args:
-        tiles, matching_learns: as in `backpropagate`.
+        tiles, matching_is_trainable: as in `backpropagate`.
     """
-    matched = _match(problem, network, matching_learns)
+    matched = _match(problem, network, matching_is_trainable)
     scenes = whole(list(network.lift(matched, tiles=tiles)), network.compat)
-    loss = problem.picture_loss(_draw(scenes, problem, drawing))
+    loss = problem.picture_loss(_draw(scenes, problem, renderer))
     return loss + _number(problem.map_loss(matched))
 
 
 def backpropagate(
     problem: Problem,
     network: Network,
-    drawing: Drawing,
+    renderer: TargetRenderer,
     *,
     method: Literal["one-step", "two-step"],
     tiles: int = 1,
-    matching_learns: bool = True,
+    matching_is_trainable: bool = True,
     share: float = 1.0,
 ) -> Float[Tensor, ""]:
     """Add `share` times the gradient of the loss to every parameter's; returns the loss, without a graph.
 
     Args:
         tiles: tiles along each side of the panorama.
-        matching_learns: whether anything before the heads has parameters that learn; else no graph is made for it.
+        matching_is_trainable: whether anything before the heads is trainable; else it is computed without a graph.
     """
-    maps = Cut.of(_match(problem, network, matching_learns))
+    maps = Cut.of(_match(problem, network, matching_is_trainable))
     with torch.no_grad():
         tiled = [Cut.of(part, everything=True).copy for part in network.lift(maps.copy, tiles=tiles)]
     if method == "one-step":
-        loss = problem.picture_loss(_draw(whole(tiled, network.compat), problem, drawing))
+        loss = problem.picture_loss(_draw(whole(tiled, network.compat), problem, renderer))
         (share * loss).backward()
     else:
         ordered = network.compat == "fixed"
         scenes = [Scattered(tiled, item, ordered=ordered) for item in range(len(problem.images))]
-        loss = _draw_in_two_steps(scenes, problem, drawing, share)
+        loss = _draw_in_two_steps(scenes, problem, renderer, share)
     map_loss = problem.map_loss(maps.copy)
     if map_loss is not None and map_loss.requires_grad:
         (share * map_loss).backward()
@@ -113,15 +113,15 @@ def backpropagate(
     return (loss + _number(map_loss)).detach()
 
 
-def _match(problem: Problem, network: Network, matching_learns: bool) -> Any:
-    with torch.set_grad_enabled(matching_learns):
+def _match(problem: Problem, network: Network, matching_is_trainable: bool) -> Any:
+    with torch.set_grad_enabled(matching_is_trainable):
         return network.match(problem.images, problem.cam2world, problem.near, problem.far)
 
 
-def _draw(scenes: list[Gaussians], problem: Problem, drawing: Drawing) -> Float[Tensor, "batch target 3 h w"]:
+def _draw(scenes: list[Gaussians], problem: Problem, renderer: TargetRenderer) -> Float[Tensor, "batch target 3 h w"]:
     items = zip(scenes, problem.targets, problem.cam2world, strict=True)
     return torch.stack(
-        [torch.stack([drawing.draw(scene, pose, context) for pose in poses]) for scene, poses, context in items]
+        [torch.stack([renderer.render(scene, pose, context) for pose in poses]) for scene, poses, context in items]
     )
 
 
@@ -136,28 +136,28 @@ class _Job:
     scene: Scattered
     pose: Float[Tensor, "4 4"]
     context: Float[Tensor, "view 4 4"]
-    layers: list[Layer]
+    layers: list[ImagePart]
     rows: list[list[Integer[Tensor, "_"]]]
 
 
-def _draw_in_two_steps(scenes: list[Scattered], problem: Problem, drawing: Drawing, share: float) -> Tensor:
+def _draw_in_two_steps(scenes: list[Scattered], problem: Problem, renderer: TargetRenderer, share: float) -> Tensor:
     """Leave the gradient of the picture's loss at the Gaussians, one layer's graph at a time; returns the loss."""
     jobs = []
     for scene, poses, context in zip(scenes, problem.targets, problem.cam2world, strict=True):
-        layers = drawing.layers(len(context))
-        jobs += [_Job(scene, pose, context, layers, scene.shown(drawing, pose, layers)) for pose in poses]
+        layers = renderer.parts(len(context))
+        jobs += [_Job(scene, pose, context, layers, scene.shown(renderer, pose, layers)) for pose in poses]
     cuts = []
     with torch.no_grad():
         for job in jobs:
             picked = (job.scene.picked(rows) for rows in job.rows)
-            cuts.append([drawing.draw_layer(own, job.pose, at) for own, at in zip(picked, job.layers, strict=True)])
+            cuts.append([renderer.render_part(own, job.pose, at) for own, at in zip(picked, job.layers, strict=True)])
     for layer in (layer for cut in cuts for layer in cut):
         layer.requires_grad_()
-    loss = _picture_loss(cuts, jobs, problem, drawing, share)
+    loss = _picture_loss(cuts, jobs, problem, renderer, share)
     for cut, job in zip(cuts, jobs, strict=True):
         for kept, layer, rows in zip(cut, job.layers, job.rows, strict=True):
             leaf = Cut.of(job.scene.picked(rows), everything=True).copy
-            again = drawing.draw_layer(leaf, job.pose, layer)
+            again = renderer.render_part(leaf, job.pose, layer)
             if again.requires_grad and kept.grad is not None:
                 again.backward(kept.grad)
                 job.scene.add_gradients(leaf, rows)
@@ -166,10 +166,10 @@ def _draw_in_two_steps(scenes: list[Scattered], problem: Problem, drawing: Drawi
 
 
 def _picture_loss(
-    cuts: list[list[Tensor]], jobs: list[_Job], problem: Problem, drawing: Drawing, share: float
+    cuts: list[list[Tensor]], jobs: list[_Job], problem: Problem, renderer: TargetRenderer, share: float
 ) -> Float[Tensor, ""]:
     """The loss, its gradient left at the layers; its graph is gone when this returns."""
-    pictures = [drawing.compose(cut, job.pose, job.context) for cut, job in zip(cuts, jobs, strict=True)]
+    pictures = [renderer.compose(cut, job.pose, job.context) for cut, job in zip(cuts, jobs, strict=True)]
     loss = problem.picture_loss(torch.stack(pictures).unflatten(0, problem.targets.shape[:2]))
     (share * loss).backward()
     return loss.detach()
@@ -188,9 +188,11 @@ class Scattered:
         self._tiles = [part.gaussians[item] for part in tiled]
         self._places = [part.index for part in tiled] if ordered and len(tiled) > 1 else None
 
-    def shown(self, drawing: Drawing, pose: Float[Tensor, "4 4"], layers: list[Layer]) -> list[list[Tensor]]:
+    def shown(
+        self, renderer: TargetRenderer, pose: Float[Tensor, "4 4"], layers: list[ImagePart]
+    ) -> list[list[Tensor]]:
         """For each layer, the numbers of the Gaussians it is drawn of, tile by tile."""
-        by_tile = [[mask.nonzero()[:, 0] for mask in drawing.shown(tile, pose, layers)] for tile in self._tiles]
+        by_tile = [[mask.nonzero()[:, 0] for mask in renderer.visible(tile, pose, layers)] for tile in self._tiles]
         return [list(rows) for rows in zip(*by_tile, strict=True)]
 
     @torch.no_grad()

@@ -37,7 +37,7 @@ def _number(name: str, otherwise: int | None) -> int:
         ) from None
 
 
-class Processes:
+class ProcessGroup:
     """This process among those that train together; one alone where torchrun did not start us.
 
     Attributes:
@@ -148,7 +148,7 @@ class _SumOfAll(torch.autograd.Function):
         return _SumOfAll.apply(gradients[0])
 
 
-class SharedBatchNorm2d(nn.BatchNorm2d):
+class SyncBatchNorm2d(nn.BatchNorm2d):
     """Batch normalisation by the statistics of all processes' batches; on CPUs too, unlike torch's own."""
 
     def forward(self, input: Tensor) -> Tensor:
@@ -173,15 +173,15 @@ class SharedBatchNorm2d(nn.BatchNorm2d):
         self.running_var.lerp_(variance.to(self.running_var), share)
 
 
-def share_statistics(network: nn.Module, processes: Processes) -> None:
+def convert_sync_batch_norm(network: nn.Module, processes: ProcessGroup) -> None:
     """Let batch normalisation see all processes' batches, where there are several."""
     if processes.count > 1:
         for module in network.modules():
             if type(module) is nn.BatchNorm2d:
-                module.__class__ = SharedBatchNorm2d
+                module.__class__ = SyncBatchNorm2d
 
 
-def together(lessons: nn.Module, processes: Processes) -> nn.Module:
+def data_parallel(lessons: nn.Module, processes: ProcessGroup) -> nn.Module:
     """The module, with the mean of all processes' gradients at its parameters after `backward()` of its loss.
 
     Args:
@@ -201,7 +201,7 @@ def together(lessons: nn.Module, processes: Processes) -> nn.Module:
     return wrapped
 
 
-def keeping_apart(lessons: nn.Module) -> AbstractContextManager[None]:
+def no_sync(lessons: nn.Module) -> AbstractContextManager[None]:
     """While in it, gradients gather in each process by itself; the next ones outside take these along."""
     return lessons.no_sync() if isinstance(lessons, DistributedDataParallel) else nullcontext()
 

@@ -1,21 +1,23 @@
-"""What a run tells: rows of numbers in CSV files, TensorBoard where it is installed, and a line of progress."""
+"""Log files, curves and progress of a training run."""
 
 from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from pansplat.atomic import replacing
 
 
-class Table:
+class CsvTable:
     """A CSV file with a row a step. A run that goes on from an earlier step drops the rows after it.
 
     Args:
@@ -52,7 +54,7 @@ def read_table(path: Path) -> list[dict[str, str]]:
     return [row for row in rows if None not in row.values() and (row.get("step") or "").isdigit()]
 
 
-class Board:
+class TensorBoardLog:
     """TensorBoard's files, where the package is installed; else nothing."""
 
     def __init__(self, folder: Path) -> None:
@@ -73,7 +75,7 @@ class Board:
             self._writer.close()
 
 
-class Watch:
+class ProgressDisplay:
     """A bar with the loss and the time left; without a terminal, a line now and then."""
 
     def __init__(self, step: int, total: int, *, silent: bool) -> None:
@@ -93,7 +95,7 @@ class Watch:
         self.task = self.progress.add_task("training", total=total, completed=step, loss="")
         self._every = max(1, total // 20)
 
-    def __enter__(self) -> Watch:
+    def __enter__(self) -> ProgressDisplay:
         self.progress.start()
         return self
 
@@ -110,3 +112,48 @@ class Watch:
     def say(self, text: str) -> None:
         """A line that stays."""
         self.console.print(text, markup=False, soft_wrap=True)
+
+
+_SMOOTH = 20  # the thick line is the mean of a 20th of the steps
+
+
+def plot_run(folder: Path) -> Path | None:
+    """Draw `curves.png` of the tables in a run's folder; None where nothing is logged yet.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    log, scores = (read_table(folder / name) for name in ("log.csv", "validation.csv"))
+    if not log:
+        return None
+    figure = Figure(figsize=(9, 5.5), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    steps = [int(row["step"]) + 1 for row in log]
+    losses = [float(row["loss"]) for row in log]
+    above.plot(steps, losses, color="#b9cfe4", linewidth=1)
+    above.plot(steps, _smoothed(losses), color="#1764ab", linewidth=2)
+    above.set_ylabel("loss")
+    for measure, color, label in (("psnr", "#c8501e", "PSNR, dB"), ("ws_psnr", "#e0a030", "WS-PSNR, dB")):
+        below.plot([int(row["step"]) for row in scores], _numbers(scores, measure), "o-", color=color, label=label)
+    below.set(xlabel="step", ylabel="unseen places, dB")
+    below.legend(loc="lower right")
+    for axes in (above, below):
+        axes.grid(alpha=0.25)
+    path = folder / "curves.png"
+    with replacing(path) as unfinished:
+        figure.savefig(unfinished, dpi=110, format="png")
+    return path
+
+
+def _smoothed(values: list[float]) -> list[float]:
+    """Each value's mean with those before it, over a 20th of all."""
+    width = max(1, math.ceil(len(values) / _SMOOTH))
+    means = []
+    for end in range(1, len(values) + 1):
+        window = values[max(0, end - width) : end]
+        means.append(sum(window) / len(window))
+    return means
+
+
+def _numbers(rows: list[dict[str, str]], name: str) -> list[float]:
+    return [float(row[name]) for row in rows]

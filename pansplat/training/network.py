@@ -24,7 +24,7 @@ from pansplat.training.checkpoint import is_training_state, weights_of
 from pansplat.training.config import NetworkConfig, NetworkShape
 
 
-def shape_of(shape: NetworkShape) -> PanSplatConfig:
+def network_config(shape: NetworkShape) -> PanSplatConfig:
     """The paper's network, or a smaller one of the same plan without the monocular network."""
     if shape == "paper":
         return PanSplatConfig()
@@ -54,7 +54,7 @@ def _smaller(
     )
 
 
-def build(config: NetworkConfig, seed: int) -> PanSplat | MVSplat:
+def build_network(config: NetworkConfig, seed: int) -> PanSplat | MVSplat:
     """The network, with the weights of `config.init` or random ones that the seed decides, ready to learn.
 
     Raises:
@@ -68,7 +68,7 @@ def build(config: NetworkConfig, seed: int) -> PanSplat | MVSplat:
         network = MVSplat(compat=config.compat, attention_precision=config.attention_precision)
     else:
         network = PanSplat(
-            shape_of(config.shape),
+            network_config(config.shape),
             config.compat,
             precision=config.precision,
             attention_precision=config.attention_precision,
@@ -111,7 +111,7 @@ def freeze(network: nn.Module, parts: tuple[str, ...]) -> None:
         getattr(network, part).requires_grad_(False)
 
 
-def learn(network: nn.Module, parts: tuple[str, ...]) -> None:
+def set_training_mode(network: nn.Module, parts: tuple[str, ...]) -> None:
     """Put the network in training mode, but not its frozen parts: their normalisation statistics stay.
 
     The original lets the statistics of frozen parts drift (OFFICIAL.md, section 11).
@@ -121,19 +121,19 @@ def learn(network: nn.Module, parts: tuple[str, ...]) -> None:
         getattr(network, part).eval()
 
 
-def matching_learns(network: nn.Module) -> bool:
+def matching_is_trainable(network: nn.Module) -> bool:
     """Whether anything before the heads learns."""
     return any(p.requires_grad for name, p in network.named_parameters() if not name.startswith("heads."))
 
 
-def learning(*modules: nn.Module | None) -> Iterator[nn.Parameter]:
+def trainable_parameters(*modules: nn.Module | None) -> Iterator[nn.Parameter]:
     """The parameters that learn."""
     for module in modules:
         if module is not None:
             yield from (p for p in module.parameters() if p.requires_grad)
 
 
-def auxiliary_heads(network: PanSplat | MVSplat) -> AuxiliaryHeads:
+def build_auxiliary_heads(network: PanSplat | MVSplat) -> AuxiliaryHeads:
     """Heads that make each level of the cost volume draw a picture by itself; random, for training only."""
     assert isinstance(network, PanSplat)
     heads = network.config.heads

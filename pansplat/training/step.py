@@ -10,40 +10,39 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pansplat.data.sample import Batch
+from pansplat.data.views import Batch
 from pansplat.model.auxiliary_heads import AuxiliaryHeads
 from pansplat.model.mvsplat import MVSplat
 from pansplat.model.pansplat import PanSplat
 from pansplat.training.config import MemoryConfig
 from pansplat.training.deferred import Problem, backpropagate, whole_loss
-from pansplat.training.distributed import keeping_apart
-from pansplat.training.drawing import Drawing
-from pansplat.training.losses import LossWeights, auxiliary_loss, depth_loss, image_loss, pixel_weights_of
-from pansplat.training.network import matching_learns
-from pansplat.training.perceptual import Perceptual
+from pansplat.training.distributed import no_sync
+from pansplat.training.losses import LossWeights, Perceptual, auxiliary_loss, depth_loss, image_loss, pixel_weights_of
+from pansplat.training.network import matching_is_trainable
+from pansplat.training.rendering import TargetRenderer
 
-PARTS: tuple[str, ...] = ("loss", "square", "perceptual", "depth", "auxiliary")
+LOSS_TERMS: tuple[str, ...] = ("loss", "square", "perceptual", "depth", "auxiliary")
 """Names of what is told of a batch's losses."""
 
 
-def teach(teacher: nn.Module, batches: Sequence[Batch]) -> dict[str, float]:
+def accumulate_gradients(teacher: nn.Module, batches: Sequence[Batch]) -> dict[str, float]:
     """Add the gradients of the batches' mean loss to the parameters'; returns the means of the parts of the loss.
 
     Args:
-        teacher: a `Teacher`, or one that several processes have `together`: then what is added is the mean of theirs.
+        teacher: a `TrainingStep`, or one that `data_parallel` wraps: then the mean over the processes is added.
         batches: of one step, one after another.
     """
-    sums, share = dict.fromkeys(PARTS, 0.0), 1 / len(batches)
+    sums, share = dict.fromkeys(LOSS_TERMS, 0.0), 1 / len(batches)
     for number, batch in enumerate(batches, start=1):
-        with keeping_apart(teacher) if number < len(batches) else nullcontext():
+        with no_sync(teacher) if number < len(batches) else nullcontext():
             loss, told = teacher(batch, share)
             if loss.requires_grad:
                 loss.backward()
-        sums = {name: sums[name] + told[name] / len(batches) for name in PARTS}
+        sums = {name: sums[name] + told[name] / len(batches) for name in LOSS_TERMS}
     return sums
 
 
-class Teacher(nn.Module):
+class TrainingStep(nn.Module):
     """Losses of batches, and their gradients.
 
     Args:
@@ -69,10 +68,10 @@ class Teacher(nn.Module):
         Backpropagated plainly, the loss has its graph and wants `backward()`. Otherwise it has none: its gradients are
         at the parameters already, because they are found piece by piece.
         """
-        told = dict.fromkeys(PARTS, 0.0)
+        told = dict.fromkeys(LOSS_TERMS, 0.0)
         weight = next(self.network.parameters())
         batch = as_type(batch, weight.dtype).to(weight.device)
-        drawing = Drawing(self.memory.style, self.memory.mixing, batch.images.shape[-2])
+        renderer = TargetRenderer(self.memory.style, self.memory.mixing, batch.images.shape[-2])
 
         def picture_loss(pictures: Tensor) -> Tensor:
             weights = _masked(batch)
@@ -86,7 +85,7 @@ class Teacher(nn.Module):
         def map_loss(matched: Any) -> Tensor | None:
             losses = [
                 loss
-                for loss in (self._depth(batch, matched, told), self._own(batch, matched, drawing, told))
+                for loss in (self._depth(batch, matched, told), self._own(batch, matched, renderer, told))
                 if loss is not None
             ]
             return sum(losses[1:], losses[0]) if losses else None
@@ -94,12 +93,12 @@ class Teacher(nn.Module):
         problem = Problem(
             batch.images, batch.cam2world, batch.near, batch.far, batch.target_cam2world, picture_loss, map_loss
         )
-        method, tiles, matching = self.memory.backpropagation, self.memory.tiles, matching_learns(self.network)
+        method, tiles, matching = self.memory.backpropagation, self.memory.tiles, matching_is_trainable(self.network)
         if method == "plain":
-            loss = whole_loss(problem, self.network, drawing, tiles=tiles, matching_learns=matching)
+            loss = whole_loss(problem, self.network, renderer, tiles=tiles, matching_is_trainable=matching)
         else:
             loss = backpropagate(
-                problem, self.network, drawing, method=method, tiles=tiles, matching_learns=matching, share=share
+                problem, self.network, renderer, method=method, tiles=tiles, matching_is_trainable=matching, share=share
             )
         told["loss"] = loss.item()
         return share * loss, told
@@ -115,7 +114,7 @@ class Teacher(nn.Module):
         told["depth"] = loss.item()
         return self.weights.depth * loss
 
-    def _own(self, batch: Batch, matched: Any, drawing: Drawing, told: dict[str, float]) -> Tensor | None:
+    def _own(self, batch: Batch, matched: Any, renderer: TargetRenderer, told: dict[str, float]) -> Tensor | None:
         """The pictures that each level of the cost volume makes by itself."""
         if self.auxiliary is None:
             return None
@@ -124,7 +123,7 @@ class Teacher(nn.Module):
         pictures = [
             torch.stack(
                 [
-                    drawing.draw(scene, pose, batch.cam2world[item])
+                    renderer.render(scene, pose, batch.cam2world[item])
                     for item, scene in enumerate(scenes)
                     for pose in batch.target_cam2world[item]
                 ]

@@ -9,15 +9,15 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pansplat.data.dataset import Source
 from pansplat.data.images import write_image
-from pansplat.data.sample import Sample, collate
+from pansplat.data.sources import SampleSource
+from pansplat.data.views import Sample, collate
 from pansplat.errors import InputError
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
 from pansplat.model.heads import whole
 from pansplat.model.mvsplat import MVSplat
 from pansplat.model.pansplat import PanSplat
-from pansplat.training.drawing import Drawing
+from pansplat.training.rendering import TargetRenderer
 from pansplat.training.step import as_type
 
 MEASURES = ("psnr", "ws_psnr", "ssim", "depth_error")
@@ -27,8 +27,8 @@ MEASURES = ("psnr", "ws_psnr", "ssim", "depth_error")
 @torch.no_grad()
 def validate(
     network: PanSplat | MVSplat,
-    source: Source,
-    drawing: Drawing,
+    source: SampleSource,
+    renderer: TargetRenderer,
     *,
     samples: int,
     pictures: int,
@@ -39,7 +39,7 @@ def validate(
     """Means over the first samples of a source; leaves the network in eval mode.
 
     Args:
-        drawing: how the targets are drawn.
+        renderer: how the targets are drawn.
         pictures: how many of the samples are written as PNG: the truth above, what is drawn below.
         folder: for the pictures; None for none.
         name: of the pictures, before the sample's number.
@@ -49,8 +49,8 @@ def validate(
     """
     network.eval()
     sums, count = dict.fromkeys(MEASURES, 0.0), 0
-    for number, sample in enumerate(_readable(source, samples, drawing.height)):
-        found, drawn = _measure(network, sample, drawing, tiles)
+    for number, sample in enumerate(_readable(source, samples, renderer.height)):
+        found, drawn = _measure(network, sample, renderer, tiles)
         sums = {measure: sums[measure] + found[measure] for measure in MEASURES}
         count += 1
         if folder is not None and number < pictures:
@@ -61,14 +61,14 @@ def validate(
 
 
 def _measure(
-    network: PanSplat | MVSplat, sample: Sample, drawing: Drawing, tiles: int
+    network: PanSplat | MVSplat, sample: Sample, renderer: TargetRenderer, tiles: int
 ) -> tuple[dict[str, float], Tensor]:
     """The measures of a sample's first target, and the picture drawn of it."""
     weight = next(network.parameters())
     batch = as_type(collate([sample]), weight.dtype).to(weight.device)
     matched = network.match(batch.images, batch.cam2world, batch.near, batch.far)
     (scene,) = whole(list(network.lift(matched, tiles=tiles)), network.compat)
-    drawn = drawing.draw(scene, batch.target_cam2world[0, 0], batch.cam2world[0])
+    drawn = renderer.render(scene, batch.target_cam2world[0, 0], batch.cam2world[0])
     truth = batch.target_images[0, 0]
     error = math.nan
     if batch.depths is not None:
@@ -80,7 +80,7 @@ def _measure(
     return {**numbers, "depth_error": error}, drawn
 
 
-def _readable(source: Source, count: int, height: int) -> Iterator[Sample]:
+def _readable(source: SampleSource, count: int, height: int) -> Iterator[Sample]:
     """The first samples that can be read.
 
     Raises:

@@ -17,7 +17,7 @@ from pansplat.bench.memory_case import MemoryCase, MemorySetting, OverLimit, Row
 from pansplat.bench.memory_report import memory_cells, memory_markdown, plot_memory
 from pansplat.bench.model_weights import save_random_weights
 from pansplat.cli import run
-from pansplat.training.network import shape_of
+from pansplat.training.network import network_config
 
 SETTING = MemorySetting("tiny", "cubemap", "structure", 1, "cpu", 8.0)
 ARGUMENTS = ["bench", "memory", "--preset", "tiny", "--heights", "64", "128", "--threads", "1", "--device", "cpu"]
@@ -218,7 +218,7 @@ def test_the_end_of_a_child_is_told_in_words(status, said, kind, told):
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("memory") / "tiny.safetensors"
-    save_random_weights(path, shape_of("tiny"))
+    save_random_weights(path, network_config("tiny"))
     return path
 
 

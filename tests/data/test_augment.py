@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from pansplat.data.augment import Augmentation, augment, mirror_views, roll_views, turn_views
-from pansplat.data.sample import Sample
-from pansplat.data.views import Views
+from pansplat.data.views import Sample, Views
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.warp import relative_pose, warp_panorama
 

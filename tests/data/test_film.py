@@ -6,8 +6,7 @@ import av
 import numpy as np
 import pytest
 
-from pansplat.data.film import open_film
-from pansplat.data.video import write_video
+from pansplat.data.video import open_video, write_video
 from pansplat.errors import InputError
 
 COUNT = 70
@@ -44,7 +43,7 @@ def test_every_frame_is_the_one_asked_for(path: Path) -> None:
     with av.open(str(path)) as container:
         shown = [packet.pts for packet in container.demux(video=0) if packet.size]
     assert shown != sorted(shown), "the encoder kept the order: nothing is tested"
-    film = open_film(path)
+    film = open_video(path)
     assert (len(film.stamps), film.width, film.height) == (COUNT, 64, 32)
     assert film.seconds == pytest.approx([i / 24 for i in range(COUNT)], abs=1e-3)
     for number in (0, 1, 33, 12, COUNT - 1):
@@ -56,18 +55,18 @@ def test_colours_come_back(tmp_path: Path) -> None:
     red = np.zeros((32, 64, 3), np.uint8)
     red[..., 0], red[..., 1] = 200, 40
     write_video(tmp_path / "red.mp4", [red] * 3, 24)
-    frame = open_film(tmp_path / "red.mp4").read([1])[1]
+    frame = open_video(tmp_path / "red.mp4").read([1])[1]
     assert np.abs(frame.astype(int) - red).max() <= 4
 
 
 def test_frames_beyond_the_end_and_other_files_are_refused(path: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="needed frames 0 to 69, got 3 to 70"):
-        open_film(path).read([3, 70])
+        open_video(path).read([3, 70])
     (tmp_path / "no.mp4").write_bytes(b"nothing of the kind")
     with pytest.raises(InputError, match=r"no\.mp4: needed a readable video file"):
-        open_film(tmp_path / "no.mp4")
+        open_video(tmp_path / "no.mp4")
     with pytest.raises(InputError, match="needed a readable video file"):
-        open_film(tmp_path / "gone.mp4")
+        open_video(tmp_path / "gone.mp4")
 
 
 def test_a_damaged_film_is_refused(path: Path, tmp_path: Path) -> None:
@@ -76,4 +75,4 @@ def test_a_damaged_film_is_refused(path: Path, tmp_path: Path) -> None:
     data[start + 40 : start + 4000] = bytes(min(3960, len(data) - start - 40))
     (tmp_path / "damaged.mp4").write_bytes(data)
     with pytest.raises(InputError, match=r"damaged\.mp4: needed"):
-        open_film(tmp_path / "damaged.mp4").read(range(COUNT))
+        open_video(tmp_path / "damaged.mp4").read(range(COUNT))

@@ -8,12 +8,11 @@ import pytest
 import torch
 
 from pansplat.data.augment import Augmentation
-from pansplat.data.dataset import TripletSource
+from pansplat.data.generated.triplets import GeneratedTriplets
 from pansplat.data.images import write_image
 from pansplat.data.loader import Loader
-from pansplat.data.sample import Batch
-from pansplat.data.synthetic import GeneratedScenes
-from pansplat.data.triplets import read_game_maps
+from pansplat.data.sources import TripletSource, read_game_maps
+from pansplat.data.views import Batch
 from pansplat.errors import InputError
 
 
@@ -53,7 +52,7 @@ def test_a_run_resumed_at_a_step_goes_on_as_if_never_stopped(tmp_path: Path) -> 
 
 
 def test_the_number_of_workers_does_not_matter(tmp_path: Path) -> None:
-    scenes = GeneratedScenes(count=5, samples=1)
+    scenes = GeneratedTriplets(count=5, samples=1)
     options = {"height": 8, "batch_size": 2, "seed": 1, "augmentation": Augmentation(exposure=0.3)}
     alone = _take(Loader(scenes, **options), 3)
     assert _equal(_take(Loader(scenes, workers=2, **options), 3), alone)
@@ -109,6 +108,6 @@ def test_a_mistake_in_the_code_is_not_taken_for_a_bad_file() -> None:
 
 def test_loaders_of_nothing_are_refused() -> None:
     with pytest.raises(InputError, match="empty source"):
-        Loader(GeneratedScenes(count=0), height=8, batch_size=1)
+        Loader(GeneratedTriplets(count=0), height=8, batch_size=1)
     with pytest.raises(InputError, match="batch_size >= 1"):
-        Loader(GeneratedScenes(), height=8, batch_size=0)
+        Loader(GeneratedTriplets(), height=8, batch_size=0)

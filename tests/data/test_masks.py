@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from pansplat.data.images import write_image
+from pansplat.data.layouts import load_pairs
 from pansplat.data.masks import detect_static_region, static_mask_of_files
-from pansplat.data.pairs import load_pairs
 from pansplat.geometry.equirect import pixel_directions, row_weights
 
 _HEIGHT = 256

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.data.samplers import BoundedSampler, Draw, sequence_draws
+from pansplat.data.sequences import BoundedSampler, FramePair
 from pansplat.errors import InputError
 
 
@@ -36,19 +36,9 @@ def test_the_originals_training_gap_is_always_the_smallest() -> None:
 def test_short_sequences_are_used_as_far_as_they_go() -> None:
     sampler = BoundedSampler(2, 30)
     assert sampler.training(2, np.random.default_rng(0)).right == 1
-    assert sampler.evaluation(5, 1) == [Draw(0, 4, (0, 1, 2, 3, 4))]
+    assert sampler.evaluation(5, 1) == [FramePair(0, 4, (0, 1, 2, 3, 4))]
     with pytest.raises(InputError, match="two or more posed frames, got 1"):
         sampler.evaluation(1)
-
-
-def test_sequence_draws_follow_one_another() -> None:
-    draws = sequence_draws(11, 4, start=1, overlap=1)
-    assert [(draw.left, draw.right) for draw in draws] == [(1, 5), (4, 8)]
-    assert sequence_draws(9, 4)[-1] == Draw(4, 8, (4, 5, 6, 7, 8))
-    with pytest.raises(InputError, match="0 <= overlap < skip"):
-        sequence_draws(11, 4, overlap=4)
-    with pytest.raises(InputError, match="first pair within 4 frames"):
-        sequence_draws(4, 4)
 
 
 def test_gaps_out_of_order_are_refused() -> None:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import pansplat
-from pansplat.data.pair import Pair
+from pansplat.data.pairs import Pair
 from pansplat.evaluation.metrics import cross_fade, ws_psnr
 
 pytestmark = pytest.mark.shared

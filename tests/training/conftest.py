@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pansplat.data.sample import Batch, Sample, collate
-from pansplat.data.views import Views
+from pansplat.data.views import Batch, Sample, Views, collate
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.model.adapter import AdapterConfig
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
@@ -18,7 +17,7 @@ from pansplat.model.heads import HeadsConfig
 from pansplat.model.layers import Compat
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
 from pansplat.model.transformer import TransformerConfig
-from pansplat.training import loop, network, sources
+from pansplat.training import datasets, network, trainer
 from pansplat.training.config import CheckpointConfig, DataConfig, NetworkConfig, OptimizerConfig, TrainConfig
 from pansplat.training.config import ValidationConfig as Validation
 
@@ -91,10 +90,10 @@ def micro() -> Callable[..., PanSplat]:
 @pytest.fixture
 def micro_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., TrainConfig]:
     """Settings of a run of a micro network on painted spheres; runs made after this are of that kind."""
-    monkeypatch.setattr(network, "shape_of", lambda shape: micro_config())
-    monkeypatch.setattr(loop, "sources", lambda data, height, seed: (PaintedSphere(), PaintedSphere(2)))
+    monkeypatch.setattr(network, "network_config", lambda shape: micro_config())
+    monkeypatch.setattr(trainer, "sources", lambda data, height, seed: (PaintedSphere(), PaintedSphere(2)))
     monkeypatch.setattr(TrainConfig, "check", lambda self: None)
-    assert sources is not None
+    assert datasets is not None
 
     def make(name: str = "run", steps: int = 4, **settings: object) -> TrainConfig:
         whole: dict = {

@@ -7,17 +7,16 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from pansplat.data.sample import Batch
+from pansplat.data.views import Batch
 from pansplat.model.adapter import AdapterConfig
 from pansplat.model.auxiliary_heads import AuxiliaryHeads
 from pansplat.model.mvsplat import MVSplat, MVSplatConfig
 from pansplat.model.pansplat import PanSplat
 from pansplat.model.transformer import TransformerConfig
 from pansplat.training.config import MemoryConfig
-from pansplat.training.losses import LossWeights
-from pansplat.training.network import auxiliary_heads, freeze, learn
-from pansplat.training.perceptual import Structure
-from pansplat.training.step import Teacher, teach
+from pansplat.training.losses import LossWeights, Structure
+from pansplat.training.network import build_auxiliary_heads, freeze, set_training_mode
+from pansplat.training.step import TrainingStep, accumulate_gradients
 
 
 def gradients(
@@ -25,7 +24,7 @@ def gradients(
 ) -> tuple[dict[str, torch.Tensor], dict[str, float]]:
     """Of every parameter that gets one, and the parts of the loss."""
     network.zero_grad()
-    told = teach(Teacher(network, auxiliary, Structure(), LossWeights(), memory), batches)
+    told = accumulate_gradients(TrainingStep(network, auxiliary, Structure(), LossWeights(), memory), batches)
     return {name: p.grad.clone() for name, p in network.named_parameters() if p.grad is not None}, told
 
 
@@ -42,7 +41,7 @@ def test_deferred_gradients_equal_plain_ones(
     style: str, method: str, micro: Callable[..., PanSplat], make_batch: Callable[..., Batch]
 ) -> None:
     network, batch = micro(), make_batch()
-    learn(network, ())
+    set_training_mode(network, ())
     wanted, loss = gradients(network, MemoryConfig("plain", 1, style), batch)
     found, deferred_loss = gradients(network, MemoryConfig(method, 2, style), batch)
     assert loss["depth"] > 0 and loss["square"] > 0
@@ -55,7 +54,7 @@ def test_deferred_gradients_equal_plain_ones_when_views_are_mixed(
     micro: Callable[..., PanSplat], make_batch: Callable[..., Batch]
 ) -> None:
     network, batch = micro(), make_batch()
-    learn(network, ())
+    set_training_mode(network, ())
     wanted, _ = gradients(network, MemoryConfig("plain", 1, "cubemap", "by_view"), batch)
     found, _ = gradients(network, MemoryConfig("two-step", 2, "cubemap", "by_view"), batch)
     assert_equal_gradients(found, wanted)
@@ -65,8 +64,8 @@ def test_deferred_gradients_equal_plain_ones_with_auxiliary_heads(
     micro: Callable[..., PanSplat], make_batch: Callable[..., Batch]
 ) -> None:
     network, batch = micro(), make_batch()
-    learn(network, ())
-    extra = auxiliary_heads(network).double()
+    set_training_mode(network, ())
+    extra = build_auxiliary_heads(network).double()
     wanted, plain = gradients(network, MemoryConfig("plain"), batch, auxiliary=extra)
     own = [p.grad.clone() for p in extra.parameters() if p.grad is not None]
     extra.zero_grad()
@@ -82,7 +81,7 @@ def test_a_frozen_part_gets_no_gradient_and_keeps_its_statistics(
 ) -> None:
     network, batch, frozen = micro(), make_batch(), ("features", "cost_volume")
     freeze(network, frozen)
-    learn(network, frozen)
+    set_training_mode(network, frozen)
     before = {name: tensor.clone() for name, tensor in network.features.state_dict().items()}
     wanted, _ = gradients(network, MemoryConfig("plain", 1, "cubemap"), batch)
     found, _ = gradients(network, MemoryConfig("two-step", 2, "cubemap"), batch)

@@ -13,8 +13,8 @@ import torch
 
 from pansplat.errors import InputError
 from pansplat.training.config import TrainConfig
-from pansplat.training.distributed import Processes, keeping_apart, together
-from pansplat.training.loop import Run
+from pansplat.training.distributed import ProcessGroup, data_parallel, no_sync
+from pansplat.training.trainer import Trainer
 
 _FOLDER = Path(__file__).parent
 
@@ -66,9 +66,9 @@ def test_each_step_sums_alike_however_its_gradients_come(tmp_path: Path) -> None
 
 
 def test_one_process_learns_without_the_others() -> None:
-    lessons, alone = torch.nn.Linear(2, 2), Processes()
-    assert together(lessons, alone) is lessons
-    with keeping_apart(lessons):
+    lessons, alone = torch.nn.Linear(2, 2), ProcessGroup()
+    assert data_parallel(lessons, alone) is lessons
+    with no_sync(lessons):
         lessons(torch.ones(2)).sum().backward()
     assert lessons.weight.grad is not None and not torch.distributed.is_initialized()
 
@@ -91,11 +91,11 @@ def test_torchrun_trains_and_only_the_first_process_writes(tmp_path: Path) -> No
 def test_the_first_process_alone_writes_a_checkpoint(
     micro_run: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config, second = micro_run(), Processes()
+    config, second = micro_run(), ProcessGroup()
     second.rank = 1
-    Run(config, second, silent=True).save()
+    Trainer(config, second, silent=True).save()
     assert not list(config.out.rglob("*"))
-    Run(config, silent=True).save()
+    Trainer(config, silent=True).save()
     assert [path.name for path in config.out.rglob("*.pt")] == ["step_00000000.pt"]
 
 
@@ -104,11 +104,11 @@ def test_each_process_of_a_machine_has_its_own_device(monkeypatch: pytest.Monkey
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     for rank, place in ((0, 0), (3, 1)):
         _started(monkeypatch, WORLD_SIZE="4", RANK=str(rank), LOCAL_RANK=str(place))
-        assert Processes().device("auto") == torch.device("cuda", place)
-        assert Processes().device("cpu") == torch.device("cpu")
+        assert ProcessGroup().device("auto") == torch.device("cuda", place)
+        assert ProcessGroup().device("cpu") == torch.device("cpu")
     _started(monkeypatch, WORLD_SIZE="4", RANK="2", LOCAL_RANK="2")
     with pytest.raises(InputError, match=r"got 2 for process 3; start 2 with --nproc-per-node"):
-        Processes().device("auto")
+        ProcessGroup().device("auto")
 
 
 def test_processes_with_cuda_meet_by_nccl_on_their_device(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -116,8 +116,8 @@ def test_processes_with_cuda_meet_by_nccl_on_their_device(monkeypatch: pytest.Mo
     monkeypatch.setattr(torch.cuda, "set_device", asked.append)
     monkeypatch.setattr(torch.distributed, "init_process_group", lambda kind, timeout: asked.append(kind))
     _started(monkeypatch, WORLD_SIZE="2", RANK="1", LOCAL_RANK="1")
-    Processes().join(torch.device("cuda", 1))
-    Processes().join(torch.device("cpu"))
+    ProcessGroup().join(torch.device("cuda", 1))
+    ProcessGroup().join(torch.device("cpu"))
     assert asked == [torch.device("cuda", 1), "nccl", "gloo"]
 
 
@@ -134,7 +134,7 @@ def test_an_environment_that_contradicts_itself_is_refused(
 ) -> None:
     _started(monkeypatch, **environment)
     with pytest.raises(InputError, match=told):
-        Processes()
+        ProcessGroup()
 
 
 def test_processes_that_cannot_meet_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,7 +142,7 @@ def test_processes_that_cannot_meet_are_an_error(monkeypatch: pytest.MonkeyPatch
     for name in ("MASTER_ADDR", "MASTER_PORT"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(InputError, match=r"process 0 of 2 could not meet the others by gloo .*MASTER_ADDR"):
-        Processes().join(torch.device("cpu"))
+        ProcessGroup().join(torch.device("cpu"))
 
 
 def _started(monkeypatch: pytest.MonkeyPatch, **environment: str) -> None:

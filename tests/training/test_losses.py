@@ -14,13 +14,15 @@ from pansplat.training.losses import (
     LOSS_WEIGHTS,
     PAPER,
     LossWeights,
+    Structure,
     auxiliary_loss,
+    choose_perceptual,
     depth_loss,
     image_loss,
     mean_square,
     pixel_weights_of,
+    ssim_map,
 )
-from pansplat.training.perceptual import Structure, choose_perceptual, ssim_map
 
 NEAR, FAR = 0.5, 10.0
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from pansplat.training import step
-from pansplat.training.step import PARTS, teach
+from pansplat.training.step import LOSS_TERMS, accumulate_gradients
 
 
 class OneWeight(nn.Module):
@@ -22,7 +22,7 @@ class OneWeight(nn.Module):
 
     def forward(self, batch: float, share: float) -> tuple[Tensor, dict[str, float]]:
         loss = self.weight * batch
-        return share * loss, {**dict.fromkeys(PARTS, 0.0), "loss": loss.item()}
+        return share * loss, {**dict.fromkeys(LOSS_TERMS, 0.0), "loss": loss.item()}
 
 
 def test_all_batches_but_the_last_are_kept_apart(unchecked: None, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,8 +36,8 @@ def test_all_batches_but_the_last_are_kept_apart(unchecked: None, monkeypatch: p
         yield
         hook.remove()
 
-    monkeypatch.setattr(step, "keeping_apart", apart)
-    told = teach(teacher, [1.0, 2.0, 6.0])
+    monkeypatch.setattr(step, "no_sync", apart)
+    told = accumulate_gradients(teacher, [1.0, 2.0, 6.0])
     assert len(inside) == 2
     assert told["loss"] == pytest.approx(3.0)
     assert teacher.weight.grad is not None and float(teacher.weight.grad) == pytest.approx(3.0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from pansplat.training.distributed import Processes, keeping_apart, together
+from pansplat.training.distributed import ProcessGroup, data_parallel, no_sync
 
 
 class Lessons(nn.Module):
@@ -30,11 +30,11 @@ class Lessons(nn.Module):
 
 
 def main(folder: Path) -> None:
-    processes = Processes()
+    processes = ProcessGroup()
     processes.join(torch.device("cpu"))
     torch.manual_seed(0)
     lessons = Lessons()
-    shared = together(lessons, processes)
+    shared = data_parallel(lessons, processes)
     given = torch.randn(3, 2, 50, generator=torch.Generator().manual_seed(1))
     own = given[processes.rank]
     for step, early in enumerate((False, False, True)):
@@ -43,7 +43,7 @@ def main(folder: Path) -> None:
         loss.backward()
         _write(lessons, folder / f"{step}_{processes.rank}.pt")
     shared.zero_grad()
-    with keeping_apart(shared):
+    with no_sync(shared):
         shared(own, False)[0].backward()
     _write(lessons, folder / f"apart_{processes.rank}.pt")
     if processes.rank == 0:

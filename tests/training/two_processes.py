@@ -7,13 +7,13 @@ from pathlib import Path
 
 import torch
 
-from pansplat.data.sample import Batch, collate
+from pansplat.data.views import Batch, collate
 from pansplat.model.pansplat import PanSplat
 from pansplat.training.config import MemoryConfig
-from pansplat.training.distributed import Processes, share_statistics, together
+from pansplat.training.distributed import ProcessGroup, convert_sync_batch_norm, data_parallel
 from pansplat.training.losses import LossWeights
-from pansplat.training.network import learn
-from pansplat.training.step import Teacher, teach
+from pansplat.training.network import set_training_mode
+from pansplat.training.step import TrainingStep, accumulate_gradients
 
 sys.path.insert(0, str(Path(__file__).parent))
 from conftest import PaintedSphere, micro_config
@@ -23,26 +23,26 @@ WAYS = (("plain", 1), ("plain", 2), ("two-step", 1), ("two-step", 2))
 
 
 def main(folder: Path) -> None:
-    processes = Processes()
+    processes = ProcessGroup()
     processes.join(torch.device("cpu"))
     torch.manual_seed(3)
     network = PanSplat(micro_config(), "fixed").double()
-    share_statistics(network, processes)
-    learn(network, ())
-    teacher = Teacher(network, None, None, LossWeights(), MemoryConfig())
-    lessons = together(teacher, processes)
+    convert_sync_batch_norm(network, processes)
+    set_training_mode(network, ())
+    teacher = TrainingStep(network, None, None, LossWeights(), MemoryConfig())
+    lessons = data_parallel(teacher, processes)
     found = {}
     for method, rounds in WAYS:
         teacher.memory = MemoryConfig(method, 1 if method == "plain" else 2, "original")
         teacher.zero_grad()
-        teach(lessons, [batch_of(processes, n) for n in range(rounds)])
+        accumulate_gradients(lessons, [batch_of(processes, n) for n in range(rounds)])
         found |= {f"{method} {rounds} {name}": p.grad for name, p in network.named_parameters() if p.grad is not None}
     buffers = {name: tensor for name, tensor in network.named_buffers() if tensor.is_floating_point()}
     torch.save({**found, **buffers}, folder / f"{processes.count}_{processes.rank}.pt")
     processes.leave()
 
 
-def batch_of(processes: Processes, number: int) -> Batch:
+def batch_of(processes: ProcessGroup, number: int) -> Batch:
     """Two paintings, or the one of them that is this process's."""
     both = [2 * number, 2 * number + 1]
     own = both if processes.count == 1 else both[processes.rank : processes.rank + 1]

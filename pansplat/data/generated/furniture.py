@@ -6,15 +6,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pansplat.data.generated import surfaces
-from pansplat.data.generated.builder import Builder
-from pansplat.data.generated.patterns import Pattern
+from pansplat.data.generated import materials as surfaces
+from pansplat.data.generated.scene import SceneBuilder
+from pansplat.data.generated.textures import Pattern
 
 
 class Place:
     """A place on the floor (x, z) and a yaw; parts are given in the piece's own axes, y counted up from the floor."""
 
-    def __init__(self, build: Builder, x: float, z: float, yaw: float) -> None:
+    def __init__(self, build: SceneBuilder, x: float, z: float, yaw: float) -> None:
         self.build, self.x, self.z, self.yaw = build, x, z, yaw
         self.cos, self.sin = np.cos(yaw), np.sin(yaw)
 

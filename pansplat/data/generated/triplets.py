@@ -11,13 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pansplat.data.collection import FAR, NEAR
-from pansplat.data.generated.builder import GeneratedScene
-from pansplat.data.generated.plan import Plan
-from pansplat.data.generated.rooms import build_home
+from pansplat.data.generated.homes import Plan, build_home
+from pansplat.data.generated.scene import GeneratedScene
 from pansplat.data.images import srgb_from_linear
-from pansplat.data.sample import Sample
-from pansplat.data.views import Views
+from pansplat.data.pairs import FAR, NEAR
+from pansplat.data.views import Sample, Views
 
 Array = NDArray[np.float64]
 
@@ -26,7 +24,7 @@ _PLACES = 60  # tried in a home before another one is built
 
 
 @dataclass(frozen=True)
-class GeneratedScenes:
+class GeneratedTriplets:
     """An endless source of triplets; `count` is what counts as an epoch.
 
     Attributes:

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from pansplat.data.dataset import PairSource, TripletSource
+from pansplat.data.sources import PairSource, TripletSource
 from pansplat.errors import InputError
 from pansplat.training.config import DataConfig
-from pansplat.training.reserved import RESERVED, is_reserved
-from pansplat.training.sources import sources
+from pansplat.training.datasets import RESERVED, is_reserved, sources
 
 _FAMILIES = (
     *("oa_minia", "oa_koth1", "mictf1beta", "hydronex2", "sleekgrinder", "pul1duel-oa", "oacmpdm1", "oa_shouse"),

@@ -18,29 +18,33 @@ import torch
 
 from pansplat.atomic import replacing
 from pansplat.data.loader import Loader
-from pansplat.data.sample import Batch
+from pansplat.data.views import Batch
 from pansplat.errors import InputError
 from pansplat.model.loading import describe
 from pansplat.model.mvsplat import MVSplat
 from pansplat.training import validation
 from pansplat.training.checkpoint import load_latest, save_checkpoint
 from pansplat.training.config import TrainConfig, as_json, require_same
-from pansplat.training.curves import plot_run
-from pansplat.training.distributed import Processes, share_statistics, together
-from pansplat.training.drawing import Drawing
-from pansplat.training.ema import RunningMean
-from pansplat.training.logs import Board, Table, Watch
-from pansplat.training.network import auxiliary_heads, build, learn, learning, write_weights
-from pansplat.training.perceptual import choose_perceptual
-from pansplat.training.schedule import one_cycle
-from pansplat.training.sources import sources
-from pansplat.training.step import PARTS, Teacher, teach
+from pansplat.training.datasets import sources
+from pansplat.training.distributed import ProcessGroup, convert_sync_batch_norm, data_parallel
+from pansplat.training.logs import CsvTable, ProgressDisplay, TensorBoardLog, plot_run
+from pansplat.training.losses import choose_perceptual
+from pansplat.training.network import (
+    build_auxiliary_heads,
+    build_network,
+    set_training_mode,
+    trainable_parameters,
+    write_weights,
+)
+from pansplat.training.optimization import ExponentialMovingAverage, one_cycle_rate
+from pansplat.training.rendering import TargetRenderer
+from pansplat.training.step import LOSS_TERMS, TrainingStep, accumulate_gradients
 
 _BEYOND = 10  # steps that the schedule is longer than the training, as in the original
-_COLUMNS = (*PARTS, "rate", "gradient_norm", "seconds")
+_COLUMNS = (*LOSS_TERMS, "rate", "gradient_norm", "seconds")
 
 
-class Run:
+class Trainer:
     """A training run.
 
     Args:
@@ -52,9 +56,9 @@ class Run:
         InputError: settings, data or weights that cannot be used.
     """
 
-    def __init__(self, config: TrainConfig, processes: Processes | None = None, *, silent: bool = False) -> None:
+    def __init__(self, config: TrainConfig, processes: ProcessGroup | None = None, *, silent: bool = False) -> None:
         config.check()
-        self.config, self.processes = config, processes or Processes()
+        self.config, self.processes = config, processes or ProcessGroup()
         self.silent = silent or not self.processes.is_first
         self.device = self.processes.device(config.device)
         self.processes.join(self.device)
@@ -62,18 +66,20 @@ class Run:
         kept = load_latest(self.folder)
         if kept is not None:
             require_same(kept[1]["config"], config, kept[0])
-        self.network = build(config.network, config.seed).to(self.device)
-        share_statistics(self.network, self.processes)
-        self.auxiliary = auxiliary_heads(self.network).to(self.device) if config.network.auxiliary else None
-        self.optimizer = torch.optim.Adam(list(learning(self.network, self.auxiliary)), lr=config.optimizer.rate)
-        self.mean = RunningMean(self.network, config.optimizer.ema) if config.optimizer.ema else None
+        self.network = build_network(config.network, config.seed).to(self.device)
+        convert_sync_batch_norm(self.network, self.processes)
+        self.auxiliary = build_auxiliary_heads(self.network).to(self.device) if config.network.auxiliary else None
+        self.optimizer = torch.optim.Adam(
+            list(trainable_parameters(self.network, self.auxiliary)), lr=config.optimizer.rate
+        )
+        self.mean = ExponentialMovingAverage(self.network, config.optimizer.ema) if config.optimizer.ema else None
         perceptual = choose_perceptual(config.perceptual, device=self.device)
-        self.teacher = Teacher(self.network, self.auxiliary, perceptual, config.loss, config.memory)
+        self.teacher = TrainingStep(self.network, self.auxiliary, perceptual, config.loss, config.memory)
         self.step, self.source = 0, None
         if kept is not None:
             self._restore(kept[1])
             self.source = kept[0]
-        self._lessons = together(self.teacher, self.processes)
+        self._lessons = data_parallel(self.teacher, self.processes)
         self._stop = False
 
     def train(self) -> bool:
@@ -88,13 +94,13 @@ class Run:
         if first:
             with replacing(out / "config.json") as partial:
                 partial.write_text(as_json(self.config) + "\n")
-            table = Table(out / "log.csv", _COLUMNS, self.step)
+            table = CsvTable(out / "log.csv", _COLUMNS, self.step)
             validated = 0 if self.source is None else self.step + 1
-            scores = Table(out / "validation.csv", ("height", *validation.MEASURES), validated)
-            board = Board(out / "tensorboard")
+            scores = CsvTable(out / "validation.csv", ("height", *validation.MEASURES), validated)
+            board = TensorBoardLog(out / "tensorboard")
         saved_at = time.monotonic()
         try:
-            with Watch(self.step, total, silent=self.silent) as watch, self._asked_to_stop(watch):
+            with ProgressDisplay(self.step, total, silent=self.silent) as watch, self._asked_to_stop(watch):
                 watch.say(self._introduction())
                 if self.source is not None:
                     watch.say(f"going on from {self.source}")
@@ -157,13 +163,13 @@ class Run:
     def _learn(self, batches: list[Batch]) -> dict[str, float]:
         """One step of the optimizer; returns what is told of it."""
         settings = self.config.optimizer
-        rate = one_cycle(self.step, settings.steps + _BEYOND, settings.rate)
-        learn(self.network, self.config.network.frozen)
+        rate = one_cycle_rate(self.step, settings.steps + _BEYOND, settings.rate)
+        set_training_mode(self.network, self.config.network.frozen)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad()
-        told = teach(self._lessons, batches)
-        parameters = list(learning(self.network, self.auxiliary))
+        told = accumulate_gradients(self._lessons, batches)
+        parameters = list(trainable_parameters(self.network, self.auxiliary))
         norm = float(torch.nn.utils.clip_grad_norm_(parameters, settings.clip))
         if self.processes.any(not (math.isfinite(told["loss"]) and math.isfinite(norm))):
             self._refuse(batches, told, norm)
@@ -186,14 +192,14 @@ class Run:
             "--optimizer.rate, and go on from the last checkpoint."
         )
 
-    def _validate(self, scores: Table | None, board: Board | None, watch: Watch) -> None:
+    def _validate(self, scores: CsvTable | None, board: TensorBoardLog | None, watch: ProgressDisplay) -> None:
         settings, height = self.config.validation, self.config.height_at(max(self.step - 1, 0))
         _, source = sources(self.config.data, height, self.config.seed)
         with self._averaged():
             found = validation.validate(
                 self.network,
                 source,
-                Drawing(self.config.memory.style, self.config.memory.mixing, height),
+                TargetRenderer(self.config.memory.style, self.config.memory.mixing, height),
                 samples=settings.samples,
                 pictures=settings.pictures,
                 tiles=self.config.memory.tiles,
@@ -222,7 +228,7 @@ class Run:
         finally:
             self.network.load_state_dict(own)
 
-    def _finish(self, watch: Watch) -> None:
+    def _finish(self, watch: ProgressDisplay) -> None:
         if self.processes.is_first:
             path = self.config.out / "model.safetensors"
             write_weights(path, self.network, None if self.mean is None else self.mean.state)
@@ -257,7 +263,7 @@ class Run:
         torch.set_rng_state(state["random"])
 
     def _introduction(self) -> str:
-        learnt = sum(p.numel() for p in learning(self.network, self.auxiliary))
+        learnt = sum(p.numel() for p in trainable_parameters(self.network, self.auxiliary))
         return (
             f"{self.config.network.shape}: {learnt:,} parameters learn, "
             f"{self.config.data.kind} at {', '.join(f'{h}x{2 * h}' for h in self.config.heights)}, "
@@ -266,7 +272,7 @@ class Run:
         )
 
     @contextmanager
-    def _asked_to_stop(self, watch: Watch) -> Iterator[None]:
+    def _asked_to_stop(self, watch: ProgressDisplay) -> Iterator[None]:
         """The first Ctrl-C (or SIGTERM) ends the run after the step, saved; the second at once."""
 
         def ask(number: int, _: object) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pansplat.data.generated.patterns import NUMBERS, Pattern, color, fractal, hash_unit, pulse
+from pansplat.data.generated.textures import NUMBERS, Pattern, color, fractal, hash_unit, pulse
 
 
 @pytest.mark.parametrize(("share", "w"), [(0.3, 0.2), (0.1, 0.7), (0.5, 0.99), (0.25, 0.01)])

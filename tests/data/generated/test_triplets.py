@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.data.generated.rooms import build_home
-from pansplat.data.synthetic import GeneratedScenes
+from pansplat.data.generated.homes import build_home
+from pansplat.data.generated.triplets import GeneratedTriplets
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.warp import relative_pose, warp_panorama
 
@@ -13,19 +13,19 @@ HEIGHT = 64
 
 
 @pytest.fixture(scope="module")
-def scenes() -> GeneratedScenes:
-    return GeneratedScenes(seed=3, samples=1)
+def scenes() -> GeneratedTriplets:
+    return GeneratedTriplets(seed=3, samples=1)
 
 
-def test_number_and_seed_decide_the_picture(scenes: GeneratedScenes) -> None:
+def test_number_and_seed_decide_the_picture(scenes: GeneratedTriplets) -> None:
     first, again, other = scenes.sample(4, 16), scenes.sample(4, 16, 99), scenes.sample(5, 16)
     assert torch.equal(first.context.images, again.context.images)
     assert torch.equal(first.targets.cam2world, again.targets.cam2world)
     assert not torch.equal(first.context.images, other.context.images)
-    assert not torch.equal(first.context.images, GeneratedScenes(seed=4, samples=1).sample(4, 16).context.images)
+    assert not torch.equal(first.context.images, GeneratedTriplets(seed=4, samples=1).sample(4, 16).context.images)
 
 
-def test_samples_are_triplets_with_depth_and_free_cameras(scenes: GeneratedScenes) -> None:
+def test_samples_are_triplets_with_depth_and_free_cameras(scenes: GeneratedTriplets) -> None:
     baselines = []
     for index in range(8):
         sample = scenes.sample(index, 16)
@@ -42,7 +42,7 @@ def test_samples_are_triplets_with_depth_and_free_cameras(scenes: GeneratedScene
     assert max(baselines) - min(baselines) > 0.3
 
 
-def test_depth_takes_one_view_into_the_other(scenes: GeneratedScenes) -> None:
+def test_depth_takes_one_view_into_the_other(scenes: GeneratedTriplets) -> None:
     """Both depths agree except behind things, and colours with them; not so with the baseline reversed."""
     for index in range(3):
         views = scenes.sample(index, HEIGHT).context
@@ -68,7 +68,7 @@ def _agreement(images: torch.Tensor, depths: torch.Tensor, cam2world: torch.Tens
 
 
 def test_more_rays_a_pixel_smooth_the_picture_only() -> None:
-    coarse, fine = (GeneratedScenes(seed=3, samples=samples).sample(1, 32) for samples in (1, 3))
+    coarse, fine = (GeneratedTriplets(seed=3, samples=samples).sample(1, 32) for samples in (1, 3))
     assert torch.equal(coarse.context.depths, fine.context.depths)
     difference = (coarse.context.images - fine.context.images).abs().mean()
     assert 1e-4 < float(difference) < 0.06

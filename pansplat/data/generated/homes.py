@@ -1,22 +1,135 @@
-"""A furnished home from a seed: its plan built up, furnished and lit."""
+"""A furnished home from a seed: its floor plan, walls, rooms, furniture and lights."""
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import dataclass, field
+
 import numpy as np
 
-from pansplat.data.generated import surfaces
-from pansplat.data.generated.builder import Builder, GeneratedScene
+from pansplat.data.generated import materials as surfaces
 from pansplat.data.generated.furniture import AGAINST_WALL, STANDING, Place
-from pansplat.data.generated.patterns import Pattern
-from pansplat.data.generated.plan import INNER, OUTER, Hole, Plan, Rectangle, Wall, draw_plan, holes_of_side, sides
-from pansplat.data.generated.shading import CEILING, FLOOR, WALL
+from pansplat.data.generated.raytracer import CEILING, FLOOR, WALL
+from pansplat.data.generated.scene import GeneratedScene, SceneBuilder
+from pansplat.data.generated.textures import Pattern
+
+Rectangle = tuple[float, float, float, float]
+"""x0, z0, x1, z1, metres."""
+
+INNER, OUTER = 0.12, 0.25  # metres; thickness of walls
+_SMALLEST = 2.2  # metres; side of a room
+
+
+@dataclass(frozen=True)
+class Hole:
+    """A door or window: from `start` to `end` along its wall, from `low` to `top` above the floor, metres."""
+
+    start: float
+    end: float
+    low: float
+    top: float
+
+
+@dataclass
+class Wall:
+    """An upright wall: on the plane x = at (axis 0) or z = at (axis 2), from `start` to `end` along it."""
+
+    axis: int
+    at: float
+    start: float
+    end: float
+    outer: bool
+    holes: list[Hole] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Rooms that fill a rectangle, and the walls between and round them."""
+
+    whole: Rectangle
+    rooms: tuple[Rectangle, ...]
+    walls: tuple[Wall, ...]
+
+
+def draw_plan(rng: np.random.Generator) -> Plan:
+    """A plan of one to four rooms with a door in each inner wall and windows in the outer ones."""
+    wide, deep = rng.uniform(3.2, 9.0), rng.uniform(3.0, 8.0)
+    whole = (-wide / 2, -deep / 2, wide / 2, deep / 2)
+    rooms, walls = [whole], []
+    for _ in range(rng.integers(0, 4)):
+        rooms.sort(key=_longest)
+        x0, z0, x1, z1 = room = rooms[-1]
+        if _longest(room) < 2 * _SMALLEST + 0.2:
+            break
+        rooms.pop()
+        if x1 - x0 > z1 - z0:
+            at = rng.uniform(x0 + _SMALLEST, x1 - _SMALLEST)
+            rooms += [(x0, z0, at, z1), (at, z0, x1, z1)]
+            walls.append(Wall(0, at, z0, z1, False))
+        else:
+            at = rng.uniform(z0 + _SMALLEST, z1 - _SMALLEST)
+            rooms += [(x0, z0, x1, at), (x0, at, x1, z1)]
+            walls.append(Wall(2, at, x0, x1, False))
+    x0, z0, x1, z1 = whole
+    walls += [Wall(0, x0, z0, z1, True), Wall(0, x1, z0, z1, True)]
+    walls += [Wall(2, z0, x0, x1, True), Wall(2, z1, x0, x1, True)]
+    for wall in walls:
+        _open(wall, walls, rng)
+    return Plan(whole, tuple(rooms), tuple(walls))
+
+
+def sides(room: Rectangle) -> list[tuple[int, float, float, float, int]]:
+    """The four sides of a room: axis, place, start, end, and +1 where the wall is in the axis' direction."""
+    x0, z0, x1, z1 = room
+    return [(0, x0, z0, z1, -1), (0, x1, z0, z1, 1), (2, z0, x0, x1, -1), (2, z1, x0, x1, 1)]
+
+
+def holes_of_side(plan: Plan, side: tuple[int, float, float, float, int]) -> list[Hole]:
+    """Doors and windows in one side of a room."""
+    axis, at, start, end, _ = side
+    return [
+        hole
+        for wall in plan.walls
+        if wall.axis == axis and abs(wall.at - at) < 1e-9
+        for hole in wall.holes
+        if hole.end > start and hole.start < end
+    ]
+
+
+def _longest(room: Rectangle) -> float:
+    return max(room[2] - room[0], room[3] - room[1])
+
+
+def _open(wall: Wall, walls: list[Wall], rng: np.random.Generator) -> None:
+    """Holes between the places where other walls meet this one."""
+    meets = [
+        other.at
+        for other in walls
+        if other.axis != wall.axis
+        and wall.start < other.at < wall.end
+        and min(abs(other.start - wall.at), abs(other.end - wall.at)) < 1e-9
+    ]
+    stops = [wall.start, *sorted(meets), wall.end]
+    for start, end in itertools.pairwise(stops):
+        free = end - start - 0.4
+        if wall.outer:
+            if free > 0.7 and rng.random() < 0.55:
+                width = rng.uniform(0.6, min(2.4, free))
+                low = 0.0 if rng.random() < 0.2 else rng.uniform(0.7, 1.1)
+                left = start + 0.2 + rng.uniform(0, free - width)
+                wall.holes.append(Hole(left, left + width, low, rng.uniform(1.9, 2.2)))
+        elif free > 0.8 and (not wall.holes or rng.random() < 0.6):
+            width = rng.uniform(0.8, min(2.6 if rng.random() < 0.4 else 1.1, free))
+            left = start + 0.2 + rng.uniform(0, free - width)
+            wall.holes.append(Hole(left, left + width, 0.0, rng.uniform(2.0, 2.2)))
+
 
 _GROUND = 27.0  # metres from the middle to where the ground ends, within the sky
 
 
 def build_home(rng: np.random.Generator) -> tuple[GeneratedScene, Plan]:
     """A furnished home and its plan; the floor is at y = 0, y points down."""
-    build, plan = Builder(rng), draw_plan(rng)
+    build, plan = SceneBuilder(rng), draw_plan(rng)
     outside, sky, grass = _outside(build)
     tall = [rng.uniform(2.3, 3.3) for _ in plan.rooms]
     if rng.random() < 0.6:
@@ -41,7 +154,7 @@ def build_home(rng: np.random.Generator) -> tuple[GeneratedScene, Plan]:
     return build.finish(ambient, outside, sky), plan
 
 
-def _outside(build: Builder) -> tuple[int, int, int]:
+def _outside(build: SceneBuilder) -> tuple[int, int, int]:
     """Materials of the house's outside, the sky and the ground."""
     rng = build.rng
     outside = surfaces.wall(build)
@@ -58,7 +171,7 @@ def _outside(build: Builder) -> tuple[int, int, int]:
     return outside, sky, grass
 
 
-def _sun(build: Builder) -> None:
+def _sun(build: SceneBuilder) -> None:
     rng = build.rng
     up, around = np.radians(rng.uniform(20, 55)), rng.uniform(0, 2 * np.pi)
     power = rng.uniform(0.8, 2.0)
@@ -66,7 +179,7 @@ def _sun(build: Builder) -> None:
     build.light(direction, (power, 0.93 * power, 0.8 * power), 0.01, sun=True)
 
 
-def _wall_box(build: Builder, wall: Wall, span: tuple[float, float], rise: tuple[float, float]) -> None:
+def _wall_box(build: SceneBuilder, wall: Wall, span: tuple[float, float], rise: tuple[float, float]) -> None:
     """A piece of a wall, from and to along it and above the floor."""
     if span[1] - span[0] < 1e-6 or rise[1] - rise[0] < 1e-6:
         return
@@ -80,7 +193,7 @@ def _wall_box(build: Builder, wall: Wall, span: tuple[float, float], rise: tuple
         build.box((along, y, across), (half[0], half[1], thick / 2), WALL)
 
 
-def _build_wall(build: Builder, wall: Wall, top: float) -> None:
+def _build_wall(build: SceneBuilder, wall: Wall, top: float) -> None:
     """The wall round its holes, with frames in the windows."""
     extra = OUTER if wall.outer else 0.0  # outer walls meet in the corners
     at = wall.start - extra
@@ -94,7 +207,7 @@ def _build_wall(build: Builder, wall: Wall, top: float) -> None:
     _wall_box(build, wall, (at, wall.end + extra), (0, top))
 
 
-def _window_frame(build: Builder, wall: Wall, hole: Hole) -> None:
+def _window_frame(build: SceneBuilder, wall: Wall, hole: Hole) -> None:
     """Bars round and across a window."""
     rng = build.rng
     look, bar = surfaces.plain(build, 0.2, 0.5), rng.uniform(0.02, 0.04)
@@ -112,7 +225,7 @@ def _window_frame(build: Builder, wall: Wall, hole: Hole) -> None:
         build.box(centre, size, look)
 
 
-def _build_room(build: Builder, room: Rectangle, tall: float, top: float, trim: int) -> None:
+def _build_room(build: SceneBuilder, room: Rectangle, tall: float, top: float, trim: int) -> None:
     """Ceiling, surfaces and a lamp."""
     rng = build.rng
     x0, z0, x1, z1 = room
@@ -159,7 +272,7 @@ def _free(place: Rectangle, taken: list[Rectangle], room: Rectangle) -> bool:
     return all(x1 < t[0] or x0 > t[2] or z1 < t[1] or z0 > t[3] for t in taken)
 
 
-def _furnish(build: Builder, plan: Plan, room: Rectangle, taken: list[Rectangle]) -> None:
+def _furnish(build: SceneBuilder, plan: Plan, room: Rectangle, taken: list[Rectangle]) -> None:
     """Pieces along the walls and in the room, as many as find a place."""
     rng = build.rng
     area = (room[2] - room[0]) * (room[3] - room[1])
@@ -189,7 +302,7 @@ def _furnish(build: Builder, plan: Plan, room: Rectangle, taken: list[Rectangle]
             piece(Place(build, x, z, rng.uniform(0, 2 * np.pi)), rng, wide, deep)
 
 
-def _rug(build: Builder, room: Rectangle) -> None:
+def _rug(build: SceneBuilder, room: Rectangle) -> None:
     rng = build.rng
     wide, deep = (rng.uniform(0.3, 0.7) * (room[k + 2] - room[k]) for k in (0, 1))
     size = rng.uniform(0.04, 0.15)
@@ -199,7 +312,7 @@ def _rug(build: Builder, room: Rectangle) -> None:
     build.box((x, -0.008, z), (wide / 2, 0.008, deep / 2), look)
 
 
-def _decorate(build: Builder, plan: Plan, room: Rectangle, tall: float) -> None:
+def _decorate(build: SceneBuilder, plan: Plan, room: Rectangle, tall: float) -> None:
     """Pictures and curtains on the walls."""
     rng = build.rng
     for side in sides(room):
@@ -227,7 +340,7 @@ def _decorate(build: Builder, plan: Plan, room: Rectangle, tall: float) -> None:
 
 
 def _on_wall(
-    build: Builder, axis: int, at: float, along: float, y: float, half: tuple[float, float, float], look: int
+    build: SceneBuilder, axis: int, at: float, along: float, y: float, half: tuple[float, float, float], look: int
 ) -> None:
     """A box on a wall: half its width, height and thickness."""
     wide, high, thick = half

@@ -15,10 +15,10 @@ from PIL import Image
 
 from pansplat.errors import InputError
 from pansplat.model.checkpoint import load_weights
-from pansplat.training import loop
+from pansplat.training import trainer
 from pansplat.training.config import CheckpointConfig, OptimizerConfig, TrainConfig, ValidationConfig
-from pansplat.training.loop import Run
 from pansplat.training.network import read_weights
+from pansplat.training.trainer import Trainer
 
 
 def curve(folder: Path) -> list[tuple[str, str, str]]:
@@ -28,7 +28,7 @@ def curve(folder: Path) -> list[tuple[str, str, str]]:
 
 
 def trained(config: TrainConfig) -> dict[str, torch.Tensor]:
-    Run(config, silent=True).train()
+    Trainer(config, silent=True).train()
     return load_weights(config.out / "model.safetensors").tensors
 
 
@@ -52,15 +52,15 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(
     wanted = trained(whole)
     learn = Run._learn
 
-    def killed(self: Run, batches: list) -> dict[str, float]:
+    def killed(self: Trainer, batches: list) -> dict[str, float]:
         if self.step == 5:  # the last checkpoint is of step 4, and a row of step 4 has been written since
             raise Killed
         return learn(self, batches)
 
     with monkeypatch.context() as patched:
-        patched.setattr(Run, "_learn", killed)
+        patched.setattr(Trainer, "_learn", killed)
         with pytest.raises(Killed):
-            Run(broken, silent=True).train()
+            Trainer(broken, silent=True).train()
     assert [row[0] for row in curve(broken.out)] == list("01234")
     found = trained(broken)
     assert curve(broken.out) == curve(whole.out)
@@ -72,7 +72,7 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(
 def test_settings_may_not_change_under_way(micro_run: Callable[..., TrainConfig]) -> None:
     trained(micro_run(steps=1))
     with pytest.raises(InputError, match=r"optimizer.steps was 1, now 2"):
-        Run(micro_run(steps=2), silent=True)
+        Trainer(micro_run(steps=2), silent=True)
 
 
 def test_ctrl_c_saves_and_the_same_command_goes_on(
@@ -81,15 +81,15 @@ def test_ctrl_c_saves_and_the_same_command_goes_on(
     config = micro_run(steps=4, checkpoint=CheckpointConfig(every=0))
     learn = Run._learn
 
-    def interrupted(self: Run, batches: list) -> dict[str, float]:
+    def interrupted(self: Trainer, batches: list) -> dict[str, float]:
         if self.step == 1:
             os.kill(os.getpid(), signal.SIGINT)
         return learn(self, batches)
 
     with monkeypatch.context() as patched:
-        patched.setattr(Run, "_learn", interrupted)
-        assert not Run(config, silent=True).train()
-    again = Run(config, silent=True)
+        patched.setattr(Trainer, "_learn", interrupted)
+        assert not Trainer(config, silent=True).train()
+    again = Trainer(config, silent=True)
     assert again.step == 2
     assert again.train()
     assert len(curve(config.out)) == 4
@@ -99,10 +99,10 @@ def test_a_loss_that_is_no_number_stops_the_run_and_keeps_the_batch(
     micro_run: Callable[..., TrainConfig], sphere: type, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = sphere(8, broken=frozenset(range(8)))
-    monkeypatch.setattr(loop, "sources", lambda *_: (source, source))
+    monkeypatch.setattr(trainer, "sources", lambda *_: (source, source))
     config = micro_run()
     with pytest.raises(InputError, match=r"step 0: needed finite numbers.*sphere_"):
-        Run(config, silent=True).train()
+        Trainer(config, silent=True).train()
     (kept,) = config.out.glob("not_finite_*.pt")
     content = torch.load(kept, weights_only=True)
     assert content["batches"][0]["names"][0].startswith("sphere_")
@@ -135,5 +135,5 @@ def test_a_run_begins_with_the_weights_of_another(micro_run: Callable[..., Train
     assert all(torch.equal(checkpoint.tensors[name], tensor) for name, tensor in final.items())
 
     other = micro_run("other", network=replace(config.network, init=config.out / "model.safetensors"))
-    begun = Run(other, silent=True).network.state_dict()
+    begun = Trainer(other, silent=True).network.state_dict()
     assert all(torch.equal(begun[name], tensor) for name, tensor in final.items())

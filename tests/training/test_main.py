@@ -12,11 +12,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from pansplat.training import command
-from pansplat.training.command import parse, run
-from pansplat.training.config import TrainConfig
-from pansplat.training.loop import Run
-from pansplat.training.presets import PRESETS
+from pansplat.training import __main__ as command
+from pansplat.training.__main__ import parse, run
+from pansplat.training.config import PRESETS, TrainConfig
+from pansplat.training.trainer import Trainer
 
 _SHORT = ("--optimizer.steps", "40", "--optimizer.batch-size", "1", "--data.workers", "1", "--validation.every", "0")
 
@@ -88,10 +87,10 @@ def test_a_device_that_is_not_there_is_refused(
 def test_too_little_memory_is_told_with_what_to_do(
     micro_run: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def full(self: Run, batches: list) -> dict[str, float]:
+    def full(self: Trainer, batches: list) -> dict[str, float]:
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 10 bytes")
 
-    monkeypatch.setattr(Run, "_learn", full)
+    monkeypatch.setattr(Trainer, "_learn", full)
     monkeypatch.setattr(command, "parse", lambda argv: micro_run())
     assert run([]) == 2
     assert "--memory.backpropagation two-step" in capsys.readouterr().err
@@ -103,12 +102,12 @@ def test_the_same_command_goes_on_and_says_from_where(
     monkeypatch.setattr(command, "parse", lambda argv: micro_run(steps=2))
     learn = Run._learn
 
-    def interrupted(self: Run, batches: list) -> dict[str, float]:
+    def interrupted(self: Trainer, batches: list) -> dict[str, float]:
         os.kill(os.getpid(), signal.SIGINT)
         return learn(self, batches)
 
     with monkeypatch.context() as patched:
-        patched.setattr(Run, "_learn", interrupted)
+        patched.setattr(Trainer, "_learn", interrupted)
         assert run([]) == 130
     said = capsys.readouterr().err
     assert "stopped after step 1; the same command goes on from there" in said

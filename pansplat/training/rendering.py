@@ -26,18 +26,19 @@ from pansplat.geometry.pose import blend_weights
 from pansplat.rendering import original
 from pansplat.rendering.backend import Options
 from pansplat.rendering.blend import blend
-from pansplat.rendering.panorama import pictures
+from pansplat.rendering.panorama import Picture, pictures
 from pansplat.rendering.rasterize import Rendering, rasterize
+from pansplat.rendering.reference import in_picture, project
+from pansplat.rendering.splats import Observed, observe
 from pansplat.rendering.stitching import stitch_faces
 from pansplat.training.config import Mixing, Style
-from pansplat.training.visibility import Region, visible
 
 _FACES = 6
 _STRIPS = 6  # as many as faces, each as much of the sphere
 
 
 @dataclass(frozen=True)
-class Layer:
+class ImagePart:
     """A part of a picture that can be drawn by itself.
 
     Attributes:
@@ -50,7 +51,7 @@ class Layer:
 
 
 @dataclass(frozen=True)
-class Drawing:
+class TargetRenderer:
     """How to draw.
 
     Attributes:
@@ -72,23 +73,23 @@ class Drawing:
         """Pixels; half the height, as in the original."""
         return self.height // 2
 
-    def layers(self, views: int) -> list[Layer]:
+    def parts(self, views: int) -> list[ImagePart]:
         """All parts of a picture: view by view if they are mixed, each face by face or strip by strip."""
         shown = [None] if self.mixing == "joint" else list(range(views))
-        return [Layer(view, part) for view in shown for part in range(self._parts)]
+        return [ImagePart(view, part) for view in shown for part in range(self._parts)]
 
-    def shown(
-        self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], layers: Sequence[Layer]
+    def visible(
+        self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], layers: Sequence[ImagePart]
     ) -> list[Bool[Tensor, "n"]]:
         """For each layer, the Gaussians that it is to be drawn of."""
         options = Options(**self._kernel(), near=NEAR, strict=False)
-        seen = visible(gaussians, cam2world, self._regions(gaussians.means.device), options)
+        seen = visible_gaussians(gaussians, cam2world, self._regions(gaussians.means.device), options)
         return [
             seen[layer.part] if layer.view is None else seen[layer.part] & (gaussians.views == layer.view)
             for layer in layers
         ]
 
-    def draw(
+    def render(
         self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], context: Float[Tensor, "view 4 4"]
     ) -> Float[Tensor, "3 height width"]:
         """The panorama, in one graph.
@@ -101,8 +102,8 @@ class Drawing:
         panoramas = [self._whole(self._of(gaussians, view), cam2world) for view in shown]
         return self._mixed(panoramas, cam2world, context)
 
-    def draw_layer(
-        self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], layer: Layer
+    def render_part(
+        self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], layer: ImagePart
     ) -> Float[Tensor, "4 rows columns"]:
         """Colour and opacity of one part.
 
@@ -185,3 +186,65 @@ class Drawing:
         if self.style == "original":
             return original.KERNEL
         return {"kernel": "ray", "order": "radial", "lowpass": "angular"}
+
+
+_CHUNK = 1 << 16  # Gaussians at a time: their geometry is float64
+
+
+@dataclass(frozen=True)
+class Region:
+    """Rows of a picture.
+
+    Attributes:
+        picture: as the rasteriser draws it.
+        first, end: the rows, `end` left out.
+    """
+
+    picture: Picture
+    first: int
+    end: int
+
+
+@torch.no_grad()
+def visible_gaussians(
+    gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], regions: Sequence[Region], options: Options
+) -> list[Bool[Tensor, "n"]]:
+    """For each region, the Gaussians that may reach a pixel in it; the others have no part in its colours.
+
+    Args:
+        cam2world: of the camera that has all the regions' pictures.
+        regions: of pictures of one size and kind.
+        options: as the pictures are drawn.
+    """
+    pose = cam2world.double().to(gaussians.means.device)
+    found: list[list[Tensor]] = [[] for _ in regions]
+    for start in range(0, len(gaussians), _CHUNK):
+        observed = observe(
+            _piece(gaussians, slice(start, start + _CHUNK)),
+            None,
+            pose,
+            spread=options.spread(regions[0].picture.pixel_angle),
+            compensate=options.lowpass == "angular",
+            exact=False,
+        )
+        for region, masks in zip(regions, found, strict=True):
+            masks.append(_in_region(observed, region, options))
+    return [torch.cat(masks) if masks else torch.zeros(0, dtype=torch.bool) for masks in found]
+
+
+def _piece(gaussians: Gaussians, rows: slice) -> Gaussians:
+    """Some of the Gaussians, as views of their memory and without colours, which do not matter here."""
+    g = gaussians
+    own = (field[rows] for field in (g.means, g.scales, g.quats, g.opacities))
+    return Gaussians(*own, g.harmonics[rows, :1] * 0, g.levels[rows], g.views[rows])
+
+
+def _in_region(observed: Observed, region: Region, options: Options) -> Bool[Tensor, "n"]:
+    picture, rows = region.picture, (region.first, region.end)
+    if options.kernel == "ewa":  # has no box behind the camera
+        ahead = observed.direction @ picture.rotation[:, 2] > 0
+        seen = torch.zeros_like(ahead)
+        boxes = project(Observed(*(part[ahead] for part in observed)), picture, options)[1]
+        seen[ahead] = in_picture(boxes, picture, rows)
+        return seen
+    return in_picture(project(observed, picture, options)[1], picture, rows)

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from pansplat.data.images import write_image
-from pansplat.data.pairs import load_pairs
+from pansplat.data.layouts import load_pairs
 from pansplat.errors import InputError
 
 OPENCV = "cam2world opencv"

@@ -6,8 +6,8 @@ import colorsys
 
 import numpy as np
 
-from pansplat.data.generated.builder import Builder
-from pansplat.data.generated.patterns import Pattern
+from pansplat.data.generated.scene import SceneBuilder
+from pansplat.data.generated.textures import Pattern
 
 Color = tuple[float, float, float]
 
@@ -33,7 +33,7 @@ def wood_colors(rng: np.random.Generator) -> tuple[Color, Color]:
     return base, shade(base, rng.uniform(0.35, 0.75))
 
 
-def wood(build: Builder, size: tuple[float, float] | None = None) -> int:
+def wood(build: SceneBuilder, size: tuple[float, float] | None = None) -> int:
     """Boards with grain; furniture without joints unless a size is given."""
     light, dark = wood_colors(build.rng)
     if size is None:
@@ -41,13 +41,13 @@ def wood(build: Builder, size: tuple[float, float] | None = None) -> int:
     return build.look(Pattern.PLANKS, light, dark, size=size, share=build.rng.uniform(0.01, 0.04), mottle=0.15)
 
 
-def plain(build: Builder, saturation: float = 0.7, dark: float = 0.15, light: float = 0.9) -> int:
+def plain(build: SceneBuilder, saturation: float = 0.7, dark: float = 0.15, light: float = 0.9) -> int:
     """One colour with wear."""
     mottle = build.rng.uniform(0.05, 0.4)
     return build.look(Pattern.PLAIN, any_color(build.rng, saturation, dark, light), mottle=mottle)
 
 
-def wall(build: Builder) -> int:
+def wall(build: SceneBuilder) -> int:
     """Paint, wallpaper with stripes, bricks, tiles, plaster, panels."""
     rng = build.rng
     base = any_color(rng, 0.08 if rng.random() < 0.5 else 0.28, 0.5, 0.97)
@@ -75,7 +75,7 @@ def wall(build: Builder) -> int:
     return wood(build, (rng.uniform(0.08, 0.2), 2.6))
 
 
-def floor(build: Builder) -> int:
+def floor(build: SceneBuilder) -> int:
     """Boards, tiles, carpet, stone, terrazzo."""
     rng = build.rng
     kind = rng.choice(5, p=(0.4, 0.24, 0.16, 0.1, 0.1))
@@ -97,7 +97,7 @@ def floor(build: Builder) -> int:
     return build.look(Pattern.TERRAZZO, base, any_color(rng), any_color(rng), size=(0.06, 0.06))
 
 
-def ceiling(build: Builder) -> int:
+def ceiling(build: SceneBuilder) -> int:
     """Mostly white paint; sometimes boards or square panels."""
     rng = build.rng
     white = any_color(rng, 0.1, 0.8, 1.0)
@@ -108,7 +108,7 @@ def ceiling(build: Builder) -> int:
     return build.look(Pattern.TILES, white, shade(white, 0.9), (0.3, 0.3, 0.3), size=(0.6, 0.6), share=0.03, mottle=0.2)
 
 
-def fabric(build: Builder) -> int:
+def fabric(build: SceneBuilder) -> int:
     """Covers of seats and beds: plain, striped, checked, flecked."""
     rng = build.rng
     base = any_color(rng, 0.8, 0.15, 0.9)
@@ -125,7 +125,7 @@ def fabric(build: Builder) -> int:
     return build.look(Pattern.STONE, base, any_color(rng), size=(size, size), share=0)
 
 
-def picture(build: Builder) -> int:
+def picture(build: SceneBuilder) -> int:
     """What hangs in frames: paintings, printed pages, patterns."""
     rng = build.rng
     kind = rng.random()
@@ -137,7 +137,7 @@ def picture(build: Builder) -> int:
     return build.look(Pattern.RUG, any_color(rng), any_color(rng), any_color(rng), size=(rng.uniform(0.02, 0.06), 0.1))
 
 
-def anything(build: Builder) -> int:
+def anything(build: SceneBuilder) -> int:
     """A material for things of any kind."""
     makers = (plain, plain, fabric, picture, floor, wall)
     return makers[build.rng.integers(len(makers))](build) if build.rng.random() < 0.75 else wood(build)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pansplat.data.images import write_image
-from pansplat.data.insta360 import read_insta360
+from pansplat.data.sequences import read_insta360
 from pansplat.data.video import write_video
 from pansplat.errors import InputError
 

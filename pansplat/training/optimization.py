@@ -1,12 +1,36 @@
-"""A running mean of the weights, which makes smoother pictures than the weights of any one step."""
+"""Learning-rate schedule and moving average of the weights."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor, nn
 
+_START = 25.0  # how many times smaller than the peak the first rate is
+_END = 1e4  # how many times smaller than the first the last rate is
 
-class RunningMean:
+
+def one_cycle_rate(step: int, total: int, peak: float, *, rise: float = 0.01) -> float:
+    """The rate of a step, from peak / 25 up to the peak and down to peak / 250,000; the last beyond the end.
+
+    Args:
+        step: counted from 0.
+        total: steps of the cycle; the original takes ten more than it trains.
+        rise: part of the steps in which the rate rises.
+    """
+    start, last = peak / _START, total - 1
+    top = rise * total - 1
+    if step < top:
+        return _cosine(start, peak, step / top)
+    return _cosine(peak, start / _END, min(1.0, (step - max(top, 0.0)) / max(1e-9, last - max(top, 0.0))))
+
+
+def _cosine(first: float, last: float, part: float) -> float:
+    return last + (first - last) * (1 + math.cos(math.pi * part)) / 2
+
+
+class ExponentialMovingAverage:
     """Exponential moving average of a network's state.
 
     Args:

@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.data.dataset import (
-    Joined,
-    PairSource,
-    SequenceEvaluation,
-    SequenceTraining,
-    TripletSource,
-)
+from pansplat.data.generated.triplets import GeneratedTriplets
 from pansplat.data.images import write_image
-from pansplat.data.loc360 import read_loc360
-from pansplat.data.pairs import load_pairs
-from pansplat.data.sample import collate
-from pansplat.data.samplers import BoundedSampler
-from pansplat.data.synthetic import GeneratedScenes
-from pansplat.data.triplets import read_game_maps, read_panogrf
+from pansplat.data.layouts import load_pairs
+from pansplat.data.sequences import BoundedSampler, read_loc360
+from pansplat.data.sources import (
+    ConcatSource,
+    FixedFramePairs,
+    PairSource,
+    RandomFramePairs,
+    TripletSource,
+    read_game_maps,
+    read_panogrf,
+)
+from pansplat.data.views import collate
 from pansplat.errors import InputError
 
 
@@ -124,7 +124,7 @@ def test_360loc_trains_on_some_halls_and_tests_on_another(tmp_path: Path) -> Non
     assert names == ["concourse-daytime_360_0", "hall-daytime_360_0", "hall-night_360_1", "piatrium-daytime_360_0"]
     with pytest.raises(InputError, match=r"atrium: needed 360Loc sequences .* for test, got none"):
         read_loc360(tmp_path, "test")
-    source = SequenceTraining(sequences, BoundedSampler(2, 5), draws=10)
+    source = RandomFramePairs(sequences, BoundedSampler(2, 5), draws=10)
     assert len(source) == 40
     first, again = source.sample(3, 8, 7), source.sample(3, 8, 7)
     assert first.name == again.name and torch.equal(first.context.images, again.context.images)
@@ -136,7 +136,7 @@ def test_360loc_trains_on_some_halls_and_tests_on_another(tmp_path: Path) -> Non
 
 def test_360loc_is_evaluated_on_all_frames_between(tmp_path: Path) -> None:
     _loc360(tmp_path, "atrium", "mapping", "daytime_360_0", 9)
-    source = SequenceEvaluation(read_loc360(tmp_path, "test"), BoundedSampler(2, 5).evaluation)
+    source = FixedFramePairs(read_loc360(tmp_path, "test"), BoundedSampler(2, 5).evaluation)
     assert len(source) == 100
     last = source.sample(99, 8, 0)
     assert last.context.names == ("5", "8") and last.targets.names == ("5", "6", "7", "8")
@@ -165,8 +165,8 @@ def test_pair_folders_need_targets_and_draw_among_them(tmp_path: Path) -> None:
 def test_joined_sources_follow_one_another(tmp_path: Path) -> None:
     _game_map(tmp_path, "a")
     _game_map(tmp_path, "b")
-    maps, homes = TripletSource(read_game_maps(tmp_path)), GeneratedScenes(count=3, samples=1)
-    joined = Joined([maps, homes, maps])
+    maps, homes = TripletSource(read_game_maps(tmp_path)), GeneratedTriplets(count=3, samples=1)
+    joined = ConcatSource([maps, homes, maps])
     assert len(joined) == 7
     names = [joined.sample(i, 8, 0).name for i in range(7)]
     homes_names = [f"generated_0_{i:06d}" for i in range(3)]

@@ -5,15 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from pansplat.data.generated.builder import Builder, GeneratedScene
-from pansplat.data.generated.patterns import Pattern
-from pansplat.data.generated.raycast import first_hit
+from pansplat.data.generated.raytracer import first_hit
+from pansplat.data.generated.scene import GeneratedScene, SceneBuilder
+from pansplat.data.generated.textures import Pattern
 
 STACK = np.empty(64, np.int64)
 
 
 def _scene(fill) -> GeneratedScene:
-    build = Builder(np.random.default_rng(0))
+    build = SceneBuilder(np.random.default_rng(0))
     look = build.look(Pattern.PLAIN, (0.5, 0.5, 0.5), mottle=0)
     fill(build, look)
     build.room((-20, -20, 20, 20), [look] * 5, 0, 0, 20)
@@ -40,7 +40,7 @@ def test_distances_to_single_bodies_are_exact() -> None:
 def test_the_tree_finds_what_a_search_of_all_bodies_finds() -> None:
     rng = np.random.default_rng(5)
 
-    def fill(build: Builder, look: int) -> None:
+    def fill(build: SceneBuilder, look: int) -> None:
         for _ in range(60):
             centre, half = rng.uniform(-5, 5, size=3), rng.uniform(0.1, 0.8, size=3)
             kind = rng.integers(3)
@@ -84,7 +84,7 @@ def test_depth_is_along_the_ray_through_the_pixels_centre() -> None:
 
 
 def test_shadows_fall_behind_things() -> None:
-    def fill(build: Builder, look: int) -> None:
+    def fill(build: SceneBuilder, look: int) -> None:
         build.box((0, 1.1, 0), (5, 0.1, 5), look)
         build.box((0, -0.5, 0), (0.3, 0.02, 0.3), look)
         build.light((0, -2, 0), (20, 20, 20), 0.0)

@@ -11,7 +11,7 @@ import torch
 from pansplat.bench.scenes import full_lattice_room
 from pansplat.gaussians.scene import Gaussians
 from pansplat.training.config import Mixing, Style
-from pansplat.training.drawing import Drawing
+from pansplat.training.rendering import TargetRenderer
 
 HEIGHT = 32
 STYLES: tuple[Style, ...] = ("panorama", "cubemap", "original")
@@ -45,43 +45,43 @@ def cloud(count: int = 400, dtype: torch.dtype = torch.float64) -> Gaussians:
 
 @pytest.mark.parametrize(("style", "mixing"), list(itertools.product(STYLES, ("joint", "by_view"))))
 def test_the_parts_together_are_the_picture(style: Style, mixing: Mixing) -> None:
-    drawing, gaussians = Drawing(style, mixing, HEIGHT), cloud()
-    layers = drawing.layers(len(CONTEXT))
-    masks = drawing.shown(gaussians, POSE, layers)
-    drawn = [drawing.draw_layer(gaussians.select(mask), POSE, layer) for mask, layer in zip(masks, layers, strict=True)]
-    whole = drawing.draw(gaussians, POSE, CONTEXT)
+    renderer, gaussians = TargetRenderer(style, mixing, HEIGHT), cloud()
+    parts = renderer.parts(len(CONTEXT))
+    masks = renderer.visible(gaussians, POSE, parts)
+    drawn = [renderer.render_part(gaussians.select(mask), POSE, part) for mask, part in zip(masks, parts, strict=True)]
+    whole = renderer.render(gaussians, POSE, CONTEXT)
     assert float(whole.std()) > 0.05
-    torch.testing.assert_close(drawing.compose(drawn, POSE, CONTEXT), whole, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(renderer.compose(drawn, POSE, CONTEXT), whole, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("style", STYLES)
 def test_what_a_part_leaves_out_cannot_be_seen_in_it(style: Style) -> None:
-    drawing, gaussians = Drawing(style, "joint", HEIGHT), cloud()
-    layers = drawing.layers(2)
-    for mask, layer in zip(drawing.shown(gaussians, POSE, layers), layers, strict=True):
-        assert not drawing.draw_layer(gaussians.select(~mask), POSE, layer)[3].any()
+    renderer, gaussians = TargetRenderer(style, "joint", HEIGHT), cloud()
+    parts = renderer.parts(2)
+    for mask, part in zip(renderer.visible(gaussians, POSE, parts), parts, strict=True):
+        assert not renderer.render_part(gaussians.select(~mask), POSE, part)[3].any()
 
 
 @pytest.mark.parametrize("style", STYLES)
 def test_a_part_is_drawn_of_few_gaussians(style: Style) -> None:
-    drawing = Drawing(style, "joint", 128)
-    masks = drawing.shown(full_lattice_room(128), POSE, drawing.layers(2))
+    renderer = TargetRenderer(style, "joint", 128)
+    masks = renderer.visible(full_lattice_room(128), POSE, renderer.parts(2))
     assert max(float(mask.double().mean()) for mask in masks) < 0.3
     assert sum(float(mask.double().mean()) for mask in masks) < 1.5
 
 
 @pytest.mark.parametrize("style", STYLES)
 def test_parts_of_no_gaussians_are_empty(style: Style) -> None:
-    drawing, none = Drawing(style, "joint", HEIGHT), cloud().select(torch.zeros(400, dtype=torch.bool))
-    layers = drawing.layers(2)
-    for mask, layer in zip(drawing.shown(none, POSE, layers), layers, strict=True):
-        assert len(mask) == 0 and not drawing.draw_layer(none, POSE, layer).any()
+    renderer, none = TargetRenderer(style, "joint", HEIGHT), cloud().select(torch.zeros(400, dtype=torch.bool))
+    parts = renderer.parts(2)
+    for mask, part in zip(renderer.visible(none, POSE, parts), parts, strict=True):
+        assert len(mask) == 0 and not renderer.render_part(none, POSE, part).any()
 
 
 @pytest.mark.parametrize("height", [32, 64, 512, 2048])
 def test_strips_cover_every_row_once_and_have_one_area(height: int) -> None:
-    drawing = Drawing("panorama", "joint", height)
-    rows = [drawing._rows(layer.part) for layer in drawing.layers(2)]
+    renderer = TargetRenderer("panorama", "joint", height)
+    rows = [renderer._rows(part.part) for part in renderer.parts(2)]
     assert rows[0][0] == 0 and rows[-1][1] == height
     assert all(before[1] == after[0] for before, after in itertools.pairwise(rows))
     areas = [math.cos(math.pi * first / height) - math.cos(math.pi * end / height) for first, end in rows]

@@ -5,23 +5,23 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from pansplat.training.schedule import one_cycle
+from pansplat.training.optimization import one_cycle_rate
 
 
 def test_rates_are_the_originals(golden: Callable[[str], dict[str, torch.Tensor]]) -> None:
     wanted = golden("units")["lr.total1000"]
-    ours = torch.tensor([one_cycle(step, 1000 + 10, 2e-4) for step in range(1000)], dtype=torch.float64)
+    ours = torch.tensor([one_cycle_rate(step, 1000 + 10, 2e-4) for step in range(1000)], dtype=torch.float64)
     torch.testing.assert_close(ours, wanted, rtol=1e-9, atol=1e-16)
 
 
 @pytest.mark.parametrize("total", [11, 60, 310, 33_260])
 def test_the_rate_is_positive_and_at_most_the_peak(total: int) -> None:
-    rates = [one_cycle(step, total, 1.0) for step in range(0, total + 20, max(1, total // 500))]
+    rates = [one_cycle_rate(step, total, 1.0) for step in range(0, total + 20, max(1, total // 500))]
     assert max(rates) == pytest.approx(1.0, abs=0.02)
     assert min(rates) > 0
     assert rates[-1] == pytest.approx(1 / 25e4)
 
 
 def test_a_rise_that_ends_at_the_first_step_begins_at_the_peak() -> None:
-    assert one_cycle(0, 100, 2.0) == 2.0
-    assert one_cycle(99, 100, 2.0) == pytest.approx(2.0 / 250_000)
+    assert one_cycle_rate(0, 100, 2.0) == 2.0
+    assert one_cycle_rate(99, 100, 2.0) == pytest.approx(2.0 / 250_000)

@@ -9,9 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pansplat.data.generated.patterns import NUMBERS, Pattern
-from pansplat.data.generated.raycast import BOX, CYLINDER, ELLIPSOID, build_tree
-from pansplat.data.generated.shading import LIGHT_NUMBERS, ROOM_NUMBERS, draw_panorama
+from pansplat.data.generated.raytracer import (
+    BOX,
+    CYLINDER,
+    ELLIPSOID,
+    LIGHT_NUMBERS,
+    ROOM_NUMBERS,
+    build_tree,
+    draw_panorama,
+)
+from pansplat.data.generated.textures import NUMBERS, Pattern
 
 Array = NDArray[np.float64]
 Vector = Sequence[float] | Array
@@ -38,7 +45,7 @@ class GeneratedScene:
         return np.linalg.norm(apart, axis=-1).min(axis=1)
 
 
-class Builder:
+class SceneBuilder:
     """A scene in the making; `rng` decides all that is random in it."""
 
     def __init__(self, rng: np.random.Generator) -> None:
