@@ -100,7 +100,7 @@ def test_the_same_command_goes_on_and_says_from_where(
     micro_run: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(command, "parse", lambda argv: micro_run(steps=2))
-    learn = Run._learn
+    learn = Trainer._learn
 
     def interrupted(self: Trainer, batches: list) -> dict[str, float]:
         os.kill(os.getpid(), signal.SIGINT)
