@@ -50,7 +50,7 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(
     optimizer = OptimizerConfig(steps=6, batch_size=1, accumulate=accumulate, rate=1e-3, ema=0.9)
     whole, broken = micro_run("whole", optimizer=optimizer), micro_run("broken", optimizer=optimizer)
     wanted = trained(whole)
-    learn = Run._learn
+    learn = Trainer._learn
 
     def killed(self: Trainer, batches: list) -> dict[str, float]:
         if self.step == 5:  # the last checkpoint is of step 4, and a row of step 4 has been written since
@@ -79,7 +79,7 @@ def test_ctrl_c_saves_and_the_same_command_goes_on(
     micro_run: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = micro_run(steps=4, checkpoint=CheckpointConfig(every=0))
-    learn = Run._learn
+    learn = Trainer._learn
 
     def interrupted(self: Trainer, batches: list) -> dict[str, float]:
         if self.step == 1:
