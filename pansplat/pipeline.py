@@ -28,7 +28,7 @@ from pansplat.model.layers import Precision
 from pansplat.predictor import Predictor, Progress
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
-from pansplat.rendering.original import rasterize_as_original
+from pansplat.rendering.official import rasterize_official
 
 __all__ = ["load", "load_model", "load_pairs", "predict", "predict_to_file", "render", "save"]
 
@@ -225,7 +225,7 @@ def _choose_renderer(
     if layout != "equirect" or set(raster) - {"backend"}:
         given = ", ".join([*sorted(raster), *(["layout"] if layout != "equirect" else [])])
         raise InputError(f"drawing='original' sets all options but size and backend, got {given}; leave them out")
-    return partial(rasterize_as_original, size=size, near=scene.near, **raster)
+    return partial(rasterize_official, size=size, near=scene.near, **raster)
 
 
 def save(scene: Scene, path: str | Path) -> None:

@@ -12,9 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.gaussians.scene import Gaussians
-from pansplat.rendering.backend import Kernel, Lowpass, Order
-from pansplat.rendering.panorama import Layout
-from pansplat.rendering.stitching import Stitching
+from pansplat.rendering.image_planes import Layout, Stitching
+from pansplat.rendering.official import OFFICIAL, official_face_size
+from pansplat.rendering.rasterize import Kernel, Lowpass, Order
 
 Precision = Literal["float32", "float64"]
 
@@ -127,6 +127,7 @@ def choices(backend: str, height: int, face_sizes: tuple[int, ...], threads: int
 
 
 def official(backend: str, height: int, threads: int) -> Case:
-    """The original's choices: classic kernel, z order, 3DGS filter, faces of half the height, its own stitching."""
-    stitching: Stitching = "seamless" if height % 4 else "official"
-    return Case(backend, height, "ewa", "z", "3dgs", "cubemap", height // 2, stitching, threads=threads)
+    """The published code's options (`OFFICIAL`) on faces of half the height."""
+    o, face_size = OFFICIAL, official_face_size(height)
+    stitching = "seamless" if height % 4 else o.stitching
+    return Case(backend, height, o.kernel, o.order, o.lowpass, "cubemap", face_size, stitching, threads=threads)

@@ -13,7 +13,7 @@ from torch.utils.checkpoint import checkpoint
 from pansplat.constants import ALPHA_CUT, FILTER_VARIANCE, MAX_ALPHA, NEAR
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.rendering.splats import observe
+from pansplat.rendering.projection import project_gaussians
 
 _SIDE = 16  # pixels of a block: close together, so that float32 keeps their differences
 
@@ -33,9 +33,9 @@ def render_dense(
     radius = torch.linalg.vector_norm(gaussians.means.detach().double() - pose[:3, 3], dim=1)
     index = torch.argsort(radius, stable=True)
     gaussians = gaussians.select(index[radius[index] >= near])
-    spread = FILTER_VARIANCE["angular"] * (math.pi / height) ** 2
-    seen = observe(gaussians, None, pose, spread=spread, compensate=True, exact=True)
-    splats = seen.forms, seen.along, seen.peak, seen.values[:, :-1]
+    variance = FILTER_VARIANCE["angular"] * (math.pi / height) ** 2
+    seen = project_gaussians(gaussians, None, pose, filter_variance=variance, compensate=True, exact=True)
+    splats = seen.rows, seen.along, seen.peak, seen.values[:, :-1]
     directions = pixel_directions(height, 2 * height, dtype=torch.float64)
     rows = []
     for strip in directions.split(_SIDE):

@@ -13,7 +13,7 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.cubemap import face_poses
 from pansplat.geometry.pose import invert_pose
-from pansplat.rendering.stitching import stitch_faces
+from pansplat.rendering.image_planes import stitch_faces
 
 
 def render_gsplat(

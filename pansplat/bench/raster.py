@@ -23,7 +23,7 @@ from pansplat.bench.measure import Took, median, peak_memory, seconds, spread
 from pansplat.bench.rows import Row, write_rows
 from pansplat.bench.work import BACKWARD_OPERATIONS, FORWARD_OPERATIONS, Work, panorama_work
 from pansplat.gaussians.scene import Gaussians
-from pansplat.rendering.backend import Options
+from pansplat.rendering.rasterize import RasterOptions
 
 Watch = Callable[[str, "list[Row]"], None]
 
@@ -231,7 +231,7 @@ class Bench:
         key = row.scene, case.truth
         if key not in self._work:
             self._save(_told(case, "counting its work"))
-            options = Options(case.kernel, case.order, case.filter, NEAR, strict=False)
+            options = RasterOptions(case.kernel, case.order, case.filter, NEAR, strict=False)
             self._work[key] = panorama_work(self._gaussians, self._scene.pose, case.height, options)
         work, threads = self._work[key], str(case.threads)
         row.pairs = work.pairs

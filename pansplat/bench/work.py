@@ -12,10 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.gaussians.scene import Gaussians
-from pansplat.rendering.backend import Options
-from pansplat.rendering.bounds import equirect_boxes, kappa
-from pansplat.rendering.panorama import pictures
-from pansplat.rendering.splats import observe
+from pansplat.rendering.image_planes import image_planes
+from pansplat.rendering.projection import equirect_boxes, kappa, project_gaussians
+from pansplat.rendering.rasterize import RasterOptions
 
 FORWARD_OPERATIONS = 46
 """Floating-point operations a pair, of the exact kernel in two components: 2 differences, 6 for A and B, 3 for Q, 4 for
@@ -45,18 +44,18 @@ class Work:
 
 
 @torch.no_grad()
-def panorama_work(gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], height: int, options: Options) -> Work:
+def panorama_work(gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], height: int, options: RasterOptions) -> Work:
     """The work of drawing a panorama, by the exact kernel whatever the options' kernel is."""
     size = (height, 2 * height)
-    (picture,) = pictures("equirect", size, vertical_fov_degrees=90.0, face_size=None, device=torch.device("cpu"))
+    (picture,) = image_planes("equirect", size, vertical_fov_degrees=90.0, face_size=None, device=torch.device("cpu"))
     pairs = entries = 0
     for index in torch.arange(len(gaussians)).split(_CHUNK):
         part = gaussians.select(index)
-        seen = observe(
+        seen = project_gaussians(
             part,
             None,
             cam2world.double(),
-            spread=options.spread(picture.pixel_angle),
+            filter_variance=options.filter_variance(picture.pixel_angle),
             compensate=options.lowpass == "angular",
             exact=False,
         )

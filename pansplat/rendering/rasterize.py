@@ -1,28 +1,29 @@
-"""The call that draws Gaussians: checks its arguments, chooses a backend, finishes the picture.
+"""The call that rasterises Gaussians: options, arguments, the backends' protocol, background and normalisation.
 
-Source: docs/rendering.md; PanSplat, section 3.4.
+Source: docs/rendering.md; PanSplat, section 3.4; docs/adr/0005 for why there are several backends.
 """
 
 import functools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Literal, ParamSpec, TypeVar, get_args
+from typing import Literal, ParamSpec, Protocol, TypeVar, get_args, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.constants import NEAR
+from pansplat.constants import FILTER_VARIANCE, NEAR
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import orthonormal_error
-from pansplat.rendering.backend import Draw, Info, Kernel, Lowpass, Options, Order
-from pansplat.rendering.panorama import Layout, pictures
-from pansplat.rendering.stitching import Stitching, stitch_faces
+from pansplat.rendering.image_planes import ImagePlane, Layout, Stitching, image_planes, stitch_faces
 
+Kernel = Literal["ray", "ewa"]
+Order = Literal["radial", "z"]
+Lowpass = Literal["angular", "3dgs"]
 Backend = Literal["auto", "torch", "numba", "triton"]
 
 _MODULES = {
@@ -30,38 +31,154 @@ _MODULES = {
     "numba": "pansplat.rendering.cpu",
     "triton": "pansplat.rendering.cuda",
 }
-_RIGID = 1e-4
+_MAX_POSE_ERROR = 1e-4
 
 _Arguments, _Result = ParamSpec("_Arguments"), TypeVar("_Result")
 
 
-def _untraced(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Have torch.compile call a function as it is: what is inside is not made of torch, and it would try every line."""
+@dataclass(frozen=True)
+class RasterOptions:
+    """Everything that changes an image except the scene, the camera and the layout.
 
-    @functools.wraps(function)
-    def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        if torch.compiler.is_compiling():  # only then: to disable it sooner would import the compiler, for a second
-            return torch.compiler.disable(function)(*args, **kwargs)
-        return function(*args, **kwargs)
+    `pansplat.rendering.official.OFFICIAL` holds the options of the published code.
 
-    return call
+    Attributes:
+        kernel: "ray" is exact; "ewa" is the approximation of 3DGS, for pinhole images and cube faces.
+        order: sort by distance, or by depth along each image plane's optical axis as 3DGS does.
+        lowpass: "angular" conserves energy; "3dgs" adds 0.3 pixel^2.
+        near: Gaussians whose mean is nearer are not drawn, metres.
+        strict: raise an error for Gaussians that are not finite, instead of leaving them out.
+        stitching: of cube faces, "seamless", or "official" with the borders of the published code.
+
+    Raises:
+        InputError: a field is out of range.
+    """
+
+    kernel: Kernel = "ray"
+    order: Order = "radial"
+    lowpass: Lowpass = "angular"
+    near: float = NEAR
+    strict: bool = False
+    stitching: Stitching = "seamless"
+
+    def __post_init__(self) -> None:
+        """Validate the fields."""
+        _check_choice("kernel", self.kernel, Kernel)
+        _check_choice("order", self.order, Order)
+        _check_choice("lowpass", self.lowpass, Lowpass)
+        _check_choice("stitching", self.stitching, Stitching)
+        if not 0 < self.near < math.inf:
+            raise InputError(f"`near` must be a positive distance in metres, got {self.near}")
+
+    def filter_variance(self, pixel_angle: float) -> float:
+        """e^2 of docs/rendering.md: the variance added across the ray, radians^2."""
+        return FILTER_VARIANCE[self.lowpass] * pixel_angle**2 if self._filters_across_ray else 0.0
+
+    @property
+    def dilation(self) -> float:
+        """Variance added to the projected covariance, pixels^2."""
+        return 0.0 if self._filters_across_ray else FILTER_VARIANCE[self.lowpass]
+
+    @property
+    def _filters_across_ray(self) -> bool:
+        return self.lowpass == "angular" or self.kernel == "ray"
+
+
+@dataclass(frozen=True)
+class RasterInfo:
+    """Counts and costs of one call.
+
+    Attributes:
+        total: Gaussians given.
+        dropped: not drawn because a number is not finite or too large, or a covariance is not positive.
+        near: not drawn because they are nearer than `near`.
+        visible: could reach the alpha cut somewhere in the image (summed over the faces of a cubemap).
+        intersections: pairs of a Gaussian and a raster tile.
+        backend: its name.
+        bytes: peak working memory, where the backend counts it.
+        seconds: time of each stage, where the backend measures it.
+    """
+
+    total: int
+    dropped: int
+    near: int
+    visible: int
+    intersections: int
+    backend: str = "torch"
+    bytes: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class RasterSums:
+    """Image planes before background and normalisation.
+
+    Attributes:
+        sums: sums along each pixel's ray of weight x (channels, radial distance, 1).
+        info: counts over all the image planes.
+    """
+
+    sums: Float[Tensor, "plane sums height width"]
+    info: RasterInfo
+
+
+@runtime_checkable
+class RasterBackend(Protocol):
+    """A backend's `rasterize_planes`: Gaussians and a pose in, sums of every image plane out.
+
+    Differentiable in all floating fields, in `covariances` and in the pose.
+    """
+
+    def __call__(
+        self,
+        gaussians: Gaussians,
+        covariances: Float[Tensor, "n 3 3"] | None,
+        pose: Float[Tensor, "4 4"],
+        planes: list[ImagePlane],
+        options: RasterOptions,
+    ) -> RasterSums:
+        """Rasterise.
+
+        Args:
+            gaussians: float32 or float64.
+            covariances: world covariances in place of scales and rotations, square metres.
+            pose: cam2world, float64, rigid.
+            planes: of one size and focal length.
+            options: `stitching` is not used.
+
+        Raises:
+            InputError: `options.strict`, and a Gaussian is not finite.
+        """
+        ...
 
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """One picture.
+    """One image.
 
     Attributes:
-        color: RGB (or as many channels as the Gaussians have) over the background; not limited at 1.
+        color: RGB (or as many channels as the Gaussians have) over the background; not clamped to 1.
         alpha: opacity in [0, 1].
-        depth: mean radial distance of what is seen, metres; 0 where alpha is 0.
-        info: counts, where a rasteriser made it.
+        depth: mean radial distance, weighted as the colours are, metres; 0 where alpha is 0.
+        info: counts, if `rasterize` made the image.
     """
 
     color: Float[Tensor, "channel height width"]
     alpha: Float[Tensor, "height width"]
     depth: Float[Tensor, "height width"]
-    info: Info | None = None
+    info: RasterInfo | None = None
+
+
+def _untraced(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Exclude a function from torch.compile: its kernels are not torch operations, and tracing would try every line."""
+
+    @functools.wraps(function)
+    def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        if torch.compiler.is_compiling():  # `disable` imports the compiler, which takes a second
+            return torch.compiler.disable(function)(*args, **kwargs)
+        return function(*args, **kwargs)
+
+    return call
 
 
 @_untraced
@@ -72,51 +189,50 @@ def rasterize(
     size: tuple[int, int],
     layout: Layout = "equirect",
     vertical_fov_degrees: float = 90.0,
-    kernel: Kernel = "ray",
-    order: Order = "radial",
-    lowpass: Lowpass = "angular",
-    covariances: Float[Tensor, "n 3 3"] | None = None,
-    background: Sequence[float] | Float[Tensor, "channel"] = (0.0, 0.0, 0.0),
-    near: float = NEAR,
-    strict: bool = False,
     face_size: int | None = None,
-    stitching: Stitching = "seamless",
+    background: Sequence[float] | Float[Tensor, "channel"] = (0.0, 0.0, 0.0),
+    covariances: Float[Tensor, "n 3 3"] | None = None,
     backend: Backend = "auto",
+    options: RasterOptions | None = None,
+    kernel: Kernel | None = None,
+    order: Order | None = None,
+    lowpass: Lowpass | None = None,
+    near: float | None = None,
+    strict: bool | None = None,
+    stitching: Stitching | None = None,
 ) -> Rendering:
-    """Draw Gaussians as one camera sees them.
+    """Rasterise Gaussians as one camera sees them.
 
     Source: docs/rendering.md; PanSplat, section 3.4.
 
     Args:
         gaussians: float32 or float64 (halves are drawn in float32); differentiable in everything but labels.
         cam2world: rigid pose, metres; differentiable.
-        size: height and width of the picture, pixels.
+        size: height and width of the image, pixels.
         layout: "equirect" traces one ray a pixel; "cubemap" stitches a panorama from six faces; "pinhole".
-        vertical_fov_degrees: of the pinhole picture.
-        kernel: "ray" is exact; "ewa" is the classic approximation, for pinhole pictures and cube faces.
-        order: sort by distance, or by each picture's depth as the classic renderer does.
-        lowpass: "angular" conserves energy; "3dgs" widens by 0.3 pixel^2.
-        covariances: world covariances drawn in place of those of `scales` and `quats`, square metres.
+        vertical_fov_degrees: of a pinhole image.
+        face_size: of a cubemap's faces, pixels; by default as fine as the panorama's equator.
         background: behind the scene, a number a channel; the default is black whatever the channels.
-        near: Gaussians whose mean is nearer are left out, metres.
-        strict: refuse Gaussians that are not finite rather than leave them out.
-        face_size: of the cubemap's faces, pixels; by default as fine as the panorama's equator.
-        stitching: of the cubemap's faces, "seamless", or "official" with the original's borders.
-        backend: "torch" is the reference, "numba" is fast on a CPU, "triton" on CUDA; "auto" takes the fastest
-            there is for the Gaussians' type and device.
+        covariances: world covariances in place of those of `scales` and `quats`, square metres.
+        backend: "torch" is the reference, "numba" is fast on a CPU, "triton" on CUDA; "auto" chooses the fastest
+            available for the Gaussians' type and device.
+        options: see `RasterOptions`; by default its defaults.
+        kernel, order, lowpass, near, strict, stitching: each replaces that field of `options`.
 
     Returns:
-        The picture, in the Gaussians' type.
+        The image, in the Gaussians' type.
 
     Raises:
-        InputError: an argument is out of range or does not fit the Gaussians, the pose is not rigid, "ewa" is
-            asked for on "equirect", or `strict` and a Gaussian is not finite.
+        InputError: an argument is out of range or does not fit the Gaussians, the pose is not rigid, kernel "ewa" is
+            combined with layout "equirect", or `strict` and a Gaussian is not finite.
     """
-    _check(size, layout, vertical_fov_degrees, kernel, order, lowpass, near, face_size, stitching, backend)
+    given = dict(kernel=kernel, order=order, lowpass=lowpass, near=near, strict=strict, stitching=stitching)
+    options = replace(options or RasterOptions(), **{name: value for name, value in given.items() if value is not None})
+    _check(size, layout, vertical_fov_degrees, face_size, backend, options)
     device = gaussians.means.device
     pose = torch.as_tensor(cam2world, device=device).double()
     error = orthonormal_error(pose.detach()) if pose.shape == (4, 4) else math.inf
-    if error > _RIGID:
+    if error > _MAX_POSE_ERROR:
         raise InputError(
             f"`cam2world` must be a rigid 4x4 camera-to-world matrix, got shape {tuple(pose.shape)} with an "
             f"error of {error:.2g}; normalise its rotation, and check that it is no projection or mirror"
@@ -125,60 +241,51 @@ def rasterize(
         gaussians = gaussians.to(dtype=torch.float32)
     covariances = _covariances(covariances, gaussians)
     behind = _background(background, gaussians)
-    planes = pictures(layout, size, vertical_fov_degrees=vertical_fov_degrees, face_size=face_size, device=device)
-    options = Options(kernel, order, lowpass, near, strict)
-    drawn = _backend(backend, gaussians)(gaussians, covariances, pose, planes, options)
-    sums = stitch_faces(drawn.sums, size, stitching=stitching) if layout == "cubemap" else drawn.sums.squeeze(0)
-    return _finish(sums, behind, drawn.info)
+    planes = image_planes(layout, size, vertical_fov_degrees=vertical_fov_degrees, face_size=face_size, device=device)
+    result = _backend(backend, gaussians)(gaussians, covariances, pose, planes, options)
+    sums = result.sums.squeeze(0)
+    if layout == "cubemap":
+        sums = stitch_faces(result.sums, size, stitching=options.stitching)
+    return _finish(sums, behind, result.info)
 
 
-def _backend(name: Backend, gaussians: Gaussians) -> Draw:
+def _backend(name: Backend, gaussians: Gaussians) -> RasterBackend:
     """The backend of that name; "auto" chooses by the Gaussians' type and device."""
     if name == "auto":
         fast: Backend = "numba" if gaussians.means.device.type == "cpu" else "triton"
-        there = fast == "numba" or (gaussians.means.is_cuda and find_spec("triton") is not None)
-        name = fast if there and gaussians.means.dtype == torch.float32 else "torch"
+        available = fast == "numba" or (gaussians.means.is_cuda and find_spec("triton") is not None)
+        name = fast if available and gaussians.means.dtype == torch.float32 else "torch"
     module = import_module(_MODULES[name])
-    return module.draw  # type: ignore[no-any-return]
+    return module.rasterize_planes  # type: ignore[no-any-return]
+
+
+def _check_choice(name: str, value: str, choices: object) -> None:
+    if value not in get_args(choices):
+        raise InputError(f"`{name}` must be one of {', '.join(get_args(choices))}, got {value!r}")
 
 
 def _check(
     size: tuple[int, int],
     layout: str,
     vertical_fov_degrees: float,
-    kernel: str,
-    order: str,
-    lowpass: str,
-    near: float,
     face_size: int | None,
-    stitching: str,
     backend: str,
+    options: RasterOptions,
 ) -> None:
-    choices = (
-        ("layout", layout, Layout),
-        ("kernel", kernel, Kernel),
-        ("order", order, Order),
-        ("lowpass", lowpass, Lowpass),
-        ("stitching", stitching, Stitching),
-        ("backend", backend, Backend),
-    )
-    for name, value, allowed in choices:
-        if value not in get_args(allowed):
-            raise InputError(f"`{name}` must be one of {', '.join(get_args(allowed))}, got {value!r}")
+    _check_choice("layout", layout, Layout)
+    _check_choice("backend", backend, Backend)
     if len(size) != 2 or min(size) < 1:
         raise InputError(f"`size` must be (height, width), both at least 1 pixel, got {size}")
     if face_size is not None and face_size < 1:
         raise InputError(f"`face_size` must be at least 1 pixel, got {face_size}")
     if not 0 < vertical_fov_degrees < 180:
         raise InputError(f"`vertical_fov_degrees` must lie between 0 and 180, got {vertical_fov_degrees}")
-    if not 0 < near < math.inf:
-        raise InputError(f"`near` must be a positive distance in metres, got {near}")
-    if kernel == "ewa" and layout == "equirect":
+    if options.kernel == "ewa" and layout == "equirect":
         raise InputError(
             "kernel 'ewa' approximates a pinhole projection and is not defined on layout 'equirect'; "
             "use layout='cubemap', or kernel='ray'"
         )
-    if stitching == "official" and (layout != "cubemap" or size[0] % 4 or size[1] != 2 * size[0]):
+    if options.stitching == "official" and (layout != "cubemap" or size[0] % 4 or size[1] != 2 * size[0]):
         raise InputError(
             "stitching 'official' needs layout='cubemap' and a 2:1 panorama with a height that is a multiple of 4, "
             f"got layout={layout!r} and size {tuple(size)}; use stitching='seamless'"
@@ -186,7 +293,7 @@ def _check(
 
 
 def _covariances(given: Tensor | None, gaussians: Gaussians) -> Tensor | None:
-    """The covariances in the Gaussians' type, refused when they do not fit."""
+    """The covariances in the Gaussians' type."""
     if given is None:
         return None
     if tuple(given.shape) != (len(gaussians), 3, 3):
@@ -197,7 +304,7 @@ def _covariances(given: Tensor | None, gaussians: Gaussians) -> Tensor | None:
 
 
 def _background(given: Sequence[float] | Tensor, gaussians: Gaussians) -> Float[Tensor, "channel"] | None:
-    """The background in the Gaussians' type and number of channels; None if it is black and stays so."""
+    """The background in the Gaussians' type and number of channels; None for a black constant."""
     if not isinstance(given, Tensor) and not any(given):
         return None
     behind = torch.as_tensor(given, dtype=gaussians.means.dtype, device=gaussians.means.device)
@@ -213,10 +320,10 @@ def _background(given: Sequence[float] | Tensor, gaussians: Gaussians) -> Float[
 
 
 def _finish(
-    sums: Float[Tensor, "sums height width"], background: Float[Tensor, "channel"] | None, info: Info
+    sums: Float[Tensor, "sums height width"], background: Float[Tensor, "channel"] | None, info: RasterInfo
 ) -> Rendering:
-    """Composite over the background, and turn the sum of distances into their mean."""
-    # Split, not indexed: going back, three pieces are put together once instead of added as three whole pictures.
+    """Composite over the background, and divide the sum of distances by the sum of weights."""
+    # Split instead of indexed: backward concatenates three pieces, instead of adding three whole images.
     channels, distance, weight = sums.split((len(sums) - 2, 1, 1))
     distance, weight = distance.squeeze(0), weight.squeeze(0)
     alpha = weight.clamp_max(1)

@@ -11,26 +11,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pansplat.constants import NEAR
-from pansplat.gaussians.harmonics import official_harmonics
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.cubemap import face_poses
 from pansplat.geometry.pose import blend_weights
-from pansplat.rendering import original
-from pansplat.rendering.backend import Options
 from pansplat.rendering.blend import blend
-from pansplat.rendering.panorama import Picture, pictures
-from pansplat.rendering.rasterize import Rendering, rasterize
-from pansplat.rendering.reference import in_picture, project
-from pansplat.rendering.splats import Observed, observe
-from pansplat.rendering.stitching import stitch_faces
+from pansplat.rendering.image_planes import ImagePlane, image_planes, stitch_faces
+from pansplat.rendering.official import OFFICIAL, official_face_size, official_gaussians
+from pansplat.rendering.projection import ProjectedGaussians, compute_footprints, is_in_image, project_gaussians
+from pansplat.rendering.rasterize import RasterOptions, Rendering, rasterize
 from pansplat.training.config import Mixing, Style
 
 _FACES = 6
@@ -71,7 +65,7 @@ class TargetRenderer:
     @property
     def face_size(self) -> int:
         """Pixels; half the height, as in the original."""
-        return self.height // 2
+        return official_face_size(self.height)
 
     def parts(self, views: int) -> list[ImagePart]:
         """All parts of a picture: view by view if they are mixed, each face by face or strip by strip."""
@@ -82,8 +76,7 @@ class TargetRenderer:
         self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], layers: Sequence[ImagePart]
     ) -> list[Bool[Tensor, "n"]]:
         """For each layer, the Gaussians that it is to be drawn of."""
-        options = Options(**self._kernel(), near=NEAR, strict=False)
-        seen = visible_gaussians(gaussians, cam2world, self._regions(gaussians.means.device), options)
+        seen = visible_gaussians(gaussians, cam2world, self._regions(gaussians.means.device), self._options)
         return [
             seen[layer.part] if layer.view is None else seen[layer.part] & (gaussians.views == layer.view)
             for layer in layers
@@ -116,7 +109,8 @@ class TargetRenderer:
             return torch.cat((picture.color, picture.alpha[None]))[:, first:end]
         pose = face_poses(cam2world.double())[layer.part]
         gaussians = self._of(gaussians, None)
-        picture = rasterize(gaussians, pose, size=(self.face_size,) * 2, layout="pinhole", near=NEAR, **self._kernel())
+        size = (self.face_size, self.face_size)
+        picture = rasterize(gaussians, pose, size=size, layout="pinhole", options=self._options, stitching="seamless")
         return torch.cat((picture.color, picture.alpha[None]))
 
     def compose(
@@ -132,8 +126,7 @@ class TargetRenderer:
             if self.style == "panorama":
                 sums = torch.cat(own, dim=1)
             else:
-                stitching = "official" if self.style == "original" else "seamless"
-                sums = stitch_faces(torch.stack(own), self.size, stitching=stitching)
+                sums = stitch_faces(torch.stack(own), self.size, stitching=self._options.stitching)
             panoramas.append(Rendering(sums[:3], sums[3], torch.zeros_like(sums[3])))
         return self._mixed(panoramas, cam2world, context)
 
@@ -151,7 +144,7 @@ class TargetRenderer:
     def _regions(self, device: torch.device) -> list[Region]:
         """What the parts show."""
         layout = "equirect" if self.style == "panorama" else "cubemap"
-        planes = pictures(layout, self.size, vertical_fov_degrees=90.0, face_size=self.face_size, device=device)
+        planes = image_planes(layout, self.size, vertical_fov_degrees=90.0, face_size=self.face_size, device=device)
         if self.style == "panorama":
             return [Region(planes[0], *self._rows(strip)) for strip in range(_STRIPS)]
         return [Region(plane, 0, self.face_size) for plane in planes]
@@ -164,28 +157,24 @@ class TargetRenderer:
 
     def _of(self, gaussians: Gaussians, view: int | None) -> Gaussians:
         if self.style == "original":
-            gaussians = replace(gaussians, harmonics=official_harmonics(gaussians.harmonics))
+            gaussians = official_gaussians(gaussians)
         return gaussians if view is None else gaussians.select((gaussians.views == view).nonzero()[:, 0])
 
     def _whole(self, gaussians: Gaussians, cam2world: Tensor) -> Rendering:
         if self.style == "panorama":
-            return rasterize(gaussians, cam2world, size=self.size, near=NEAR)
-        stitching = "official" if self.style == "original" else "seamless"
+            return rasterize(gaussians, cam2world, size=self.size)
         return rasterize(
             gaussians,
             cam2world,
             size=self.size,
             layout="cubemap",
             face_size=self.face_size,
-            stitching=stitching,
-            near=NEAR,
-            **self._kernel(),
+            options=self._options,
         )
 
-    def _kernel(self) -> dict[str, Any]:
-        if self.style == "original":
-            return original.KERNEL
-        return {"kernel": "ray", "order": "radial", "lowpass": "angular"}
+    @property
+    def _options(self) -> RasterOptions:
+        return OFFICIAL if self.style == "original" else RasterOptions()
 
 
 _CHUNK = 1 << 16  # Gaussians at a time: their geometry is float64
@@ -200,14 +189,14 @@ class Region:
         first, end: the rows, `end` left out.
     """
 
-    picture: Picture
+    picture: ImagePlane
     first: int
     end: int
 
 
 @torch.no_grad()
 def visible_gaussians(
-    gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], regions: Sequence[Region], options: Options
+    gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], regions: Sequence[Region], options: RasterOptions
 ) -> list[Bool[Tensor, "n"]]:
     """For each region, the Gaussians that may reach a pixel in it; the others have no part in its colours.
 
@@ -219,11 +208,11 @@ def visible_gaussians(
     pose = cam2world.double().to(gaussians.means.device)
     found: list[list[Tensor]] = [[] for _ in regions]
     for start in range(0, len(gaussians), _CHUNK):
-        observed = observe(
+        observed = project_gaussians(
             _piece(gaussians, slice(start, start + _CHUNK)),
             None,
             pose,
-            spread=options.spread(regions[0].picture.pixel_angle),
+            filter_variance=options.filter_variance(regions[0].picture.pixel_angle),
             compensate=options.lowpass == "angular",
             exact=False,
         )
@@ -239,12 +228,12 @@ def _piece(gaussians: Gaussians, rows: slice) -> Gaussians:
     return Gaussians(*own, g.harmonics[rows, :1] * 0, g.levels[rows], g.views[rows])
 
 
-def _in_region(observed: Observed, region: Region, options: Options) -> Bool[Tensor, "n"]:
+def _in_region(observed: ProjectedGaussians, region: Region, options: RasterOptions) -> Bool[Tensor, "n"]:
     picture, rows = region.picture, (region.first, region.end)
     if options.kernel == "ewa":  # has no box behind the camera
         ahead = observed.direction @ picture.rotation[:, 2] > 0
         seen = torch.zeros_like(ahead)
-        boxes = project(Observed(*(part[ahead] for part in observed)), picture, options)[1]
-        seen[ahead] = in_picture(boxes, picture, rows)
+        boxes = compute_footprints(ProjectedGaussians(*(part[ahead] for part in observed)), picture, options)[1]
+        seen[ahead] = is_in_image(boxes, picture, rows)
         return seen
-    return in_picture(project(observed, picture, options)[1], picture, rows)
+    return is_in_image(compute_footprints(observed, picture, options)[1], picture, rows)

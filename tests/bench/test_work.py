@@ -8,9 +8,9 @@ from pansplat.bench.scenes import full_lattice_room
 from pansplat.bench.work import panorama_work
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import rasterize
-from pansplat.rendering.backend import Options
+from pansplat.rendering.rasterize import RasterOptions
 
-OPTIONS = Options("ray", "radial", "angular", 0.05, False)
+OPTIONS = RasterOptions("ray", "radial", "angular", 0.05, False)
 POSE = torch.eye(4, dtype=torch.float64)
 
 
@@ -44,7 +44,7 @@ def test_traffic_is_the_scene_its_records_and_the_picture():
 
 def test_gaussians_nearer_than_near_ask_for_nothing():
     room = full_lattice_room(8)
-    options = Options("ray", "radial", "angular", 100.0, False)
+    options = RasterOptions("ray", "radial", "angular", 100.0, False)
     assert panorama_work(room, POSE, 16, options).pairs == 0
 
 

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from pansplat.rendering.bounds import equirect_boxes, pinhole_boxes
-from pansplat.rendering.panorama import pictures
-from pansplat.rendering.tiles import TILE, list_tiles, tile_grid
+from pansplat.rendering.image_planes import image_planes
+from pansplat.rendering.projection import equirect_boxes, pinhole_boxes
+from pansplat.rendering.reference import TILE, list_tiles, tile_grid
 
 
 def _cones(count: int, seed: int, size: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -39,7 +39,7 @@ def _seen(direction, covariance, level, rays):
 def test_panorama_boxes_hold_every_visible_pixel_and_little_more(size):
     height, width = 48, 96
     direction, covariance, level = _cones(200, 1, size)
-    (picture,) = pictures(
+    (picture,) = image_planes(
         "equirect", (height, width), vertical_fov_degrees=90, face_size=None, device=torch.device("cpu")
     )
     seen = _seen(direction, covariance, level, picture.directions().reshape(-1, 3)).reshape(-1, height, width)
@@ -56,7 +56,7 @@ def test_panorama_boxes_hold_every_visible_pixel_and_little_more(size):
 
 @pytest.mark.parametrize("size", [0.01, 0.05, 0.5])
 def test_pinhole_boxes_hold_every_visible_pixel_and_touch_it(size):
-    (picture,) = pictures("pinhole", (60, 80), vertical_fov_degrees=90, face_size=None, device=torch.device("cpu"))
+    (picture,) = image_planes("pinhole", (60, 80), vertical_fov_degrees=90, face_size=None, device=torch.device("cpu"))
     direction, covariance, level = _cones(200, 2, size)
     seen = _seen(direction, covariance, level, picture.directions().reshape(-1, 3)).reshape(-1, 60, 80)
     boxes = pinhole_boxes(direction, covariance, level, (60, 80), picture.focal)

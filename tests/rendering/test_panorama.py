@@ -12,8 +12,7 @@ from pansplat.geometry.cubemap import face_of, face_poses, face_rotations, offic
 from pansplat.geometry.equirect import pixel_directions, uv_from_directions
 from pansplat.geometry.pose import multiply_quats, quats_from_rotations, rotations_from_quats
 from pansplat.rendering import rasterize
-from pansplat.rendering.panorama import Picture
-from pansplat.rendering.stitching import stitch_faces
+from pansplat.rendering.image_planes import ImagePlane, stitch_faces
 
 
 def _turned(pose: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
@@ -182,7 +181,7 @@ def test_the_two_stitchings_differ_beside_up_and_down_only(golden):
 
 @pytest.mark.shared
 def test_depth_along_an_axis_becomes_distance_by_the_originals_factor(golden):
-    ahead = Picture((32, 32), face_rotations()[0], 16.0).directions()[..., 2]
+    ahead = ImagePlane((32, 32), face_rotations()[0], 16.0).directions()[..., 2]
     assert torch.allclose(1 / ahead, golden("units")["cubemap.depth_norm"].double(), rtol=0, atol=2e-7)
 
 
@@ -223,7 +222,7 @@ def test_stitching_equal_faces_gives_the_same_value_everywhere(num):
 
 
 def _direction_faces(num: int) -> torch.Tensor:
-    pictures = [Picture((num, num), rotation, 0.5 * num) for rotation in face_rotations()]
+    pictures = [ImagePlane((num, num), rotation, 0.5 * num) for rotation in face_rotations()]
     return torch.stack([p.directions() for p in pictures]).permute(0, 3, 1, 2)
 
 

@@ -9,7 +9,7 @@ from pansplat.gaussians.harmonics import evaluate_harmonics
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.cubemap import face_poses
 from pansplat.rendering import rasterize
-from pansplat.rendering.stitching import stitch_faces
+from pansplat.rendering.image_planes import stitch_faces
 
 _PARITY = {"layout": "cubemap", "kernel": "ewa", "order": "z", "lowpass": "3dgs", "stitching": "official"}
 

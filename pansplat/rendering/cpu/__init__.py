@@ -3,6 +3,6 @@
 Source: docs/rendering.md; docs/rasterizer.md tells how it works.
 """
 
-from pansplat.rendering.cpu.backend import draw
+from pansplat.rendering.cpu.backend import rasterize_planes
 
-__all__ = ["draw"]
+__all__ = ["rasterize_planes"]

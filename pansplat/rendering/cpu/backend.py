@@ -18,7 +18,6 @@ from torch import Tensor
 from pansplat.constants import EWA_NEAR_FACTOR
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
-from pansplat.rendering.backend import Drawn, Info, Options
 from pansplat.rendering.cpu import tiling
 from pansplat.rendering.cpu.ewa import TOTALS, project, project_backward
 from pansplat.rendering.cpu.observe import PIECE, Camera, Fields, Observed, observe
@@ -35,8 +34,9 @@ from pansplat.rendering.cpu.tiling import (
     intersect_tiles,
     sort_front_to_back,
 )
-from pansplat.rendering.panorama import Picture
-from pansplat.rendering.selection import not_finite
+from pansplat.rendering.image_planes import ImagePlane
+from pansplat.rendering.projection import not_finite_message
+from pansplat.rendering.rasterize import RasterInfo, RasterOptions, RasterSums
 
 _LEAST_SPREAD = 1e-9  # pixel^2: without a filter a disc seen edge-on would have no width to divide by
 
@@ -73,14 +73,14 @@ class _Notes:
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
 
-def draw(
+def rasterize_planes(
     gaussians: Gaussians,
     covariances: Float[Tensor, "n 3 3"] | None,
     pose: Float[Tensor, "4 4"],
-    pictures: list[Picture],
-    options: Options,
-) -> Drawn:
-    """Draw by numba kernels, in float32; see `pansplat.rendering.backend.Draw`.
+    pictures: list[ImagePlane],
+    options: RasterOptions,
+) -> RasterSums:
+    """Draw by numba kernels, in float32; see `pansplat.rendering.rasterize.RasterBackend`.
 
     Raises:
         InputError: the Gaussians are not in main memory, a picture's side is above 32767 pixels, or
@@ -103,8 +103,8 @@ def draw(
     notes = _Notes()
     sums = _Draw.apply(*fields, pose, pictures, options, notes, torch.is_grad_enabled())
     if options.strict and notes.dropped:
-        raise InputError(not_finite(gaussians, covariances, pose, options))
-    info = Info(
+        raise InputError(not_finite_message(gaussians, covariances, pose, options))
+    info = RasterInfo(
         len(gaussians),
         notes.dropped,
         notes.near,
@@ -114,7 +114,7 @@ def draw(
         notes.bytes,
         notes.seconds,
     )
-    return Drawn(sums.to(dtype), info)
+    return RasterSums(sums.to(dtype), info)
 
 
 class _Draw(torch.autograd.Function):
@@ -130,8 +130,8 @@ class _Draw(torch.autograd.Function):
         opacities: Tensor,
         harmonics: Tensor,
         pose: Tensor,
-        pictures: list[Picture],
-        options: Options,
+        pictures: list[ImagePlane],
+        options: RasterOptions,
         notes: _Notes,
         recorded: bool,
     ) -> Tensor:
@@ -207,11 +207,11 @@ def _fields(
     )
 
 
-def _camera(pose: Tensor, picture: Picture, options: Options) -> Camera:
+def _camera(pose: Tensor, picture: ImagePlane, options: RasterOptions) -> Camera:
     least = _LEAST_SPREAD * picture.pixel_angle**2
     return Camera(
         np.ascontiguousarray(pose.detach().numpy()),
-        max(options.spread(picture.pixel_angle), least),
+        max(options.filter_variance(picture.pixel_angle), least),
         options.lowpass == "angular",
         options.near,
     )
@@ -219,8 +219,8 @@ def _camera(pose: Tensor, picture: Picture, options: Options) -> Camera:
 
 def _draw_picture(
     scene: tuple[Fields, Camera, Observed],
-    picture: Picture,
-    options: Options,
+    picture: ImagePlane,
+    options: RasterOptions,
     sums: np.ndarray,
     notes: _Notes,
     needs_grad: bool,
@@ -267,7 +267,11 @@ def _draw_picture(
 
 
 def _place(
-    scene: tuple[Fields, Camera, Observed], picture: Picture, options: Options, workspace: Workspace, threads: int
+    scene: tuple[Fields, Camera, Observed],
+    picture: ImagePlane,
+    options: RasterOptions,
+    workspace: Workspace,
+    threads: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Records and boxes on a picture."""
     if options.kernel == "ewa":
@@ -277,8 +281,8 @@ def _place(
 
 def _slot_gradients(
     scene: tuple[Fields, Camera, Observed],
-    pictures: list[Picture],
-    options: Options,
+    pictures: list[ImagePlane],
+    options: RasterOptions,
     projections: list[Projection],
     sums: np.ndarray,
     grad_sums: np.ndarray,

@@ -25,7 +25,7 @@ from pansplat.rendering.cpu.observe import (
 )
 from pansplat.rendering.cpu.runtime import Workspace, inline_kernel, kernel, parallel_for
 from pansplat.rendering.cpu.tiling import round_boxes
-from pansplat.rendering.panorama import Picture
+from pansplat.rendering.image_planes import ImagePlane
 
 TOTALS = 10  # numbers that a picture passes back: gradients of n (world axes), of C (xx xy xz yy yz zz), of the level
 _NARROWEST = MIN_EWA_VARIANCE
@@ -181,7 +181,7 @@ def project(
     fields: Fields,
     camera: Camera,
     observed: Observed,
-    picture: Picture,
+    picture: ImagePlane,
     dilation: float,
     z_near: float,
     workspace: Workspace,
@@ -212,7 +212,7 @@ def project(
     return projected, words.view(np.int16)
 
 
-def _axes(camera: Camera, picture: Picture) -> tuple[np.ndarray, np.ndarray]:
+def _axes(camera: Camera, picture: ImagePlane) -> tuple[np.ndarray, np.ndarray]:
     """The picture's axes in the camera's and in the world's."""
     rotation = np.ascontiguousarray(picture.rotation.numpy())
     return rotation, np.ascontiguousarray(camera.pose[:3, :3] @ rotation)
@@ -312,7 +312,7 @@ def _project_backward(
 def project_backward(
     fields: Fields,
     camera: Camera,
-    picture: Picture,
+    picture: ImagePlane,
     dilation: float,
     grads: np.ndarray,
     offsets: np.ndarray,

@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from pansplat.rendering.panorama import Picture
+from pansplat.rendering.image_planes import ImagePlane
 
 TILE_SIZE = 32
 """Side of a tile, pixels."""
@@ -80,7 +80,7 @@ class PixelTables(NamedTuple):
         return -(-len(self.rows) // TILE_SIZE), -(-len(self.columns) // TILE_SIZE)
 
 
-def tabulate_pixels(picture: Picture, *, exact: bool) -> PixelTables:
+def tabulate_pixels(picture: ImagePlane, *, exact: bool) -> PixelTables:
     """Pixel tables of an image plane, for the exact kernel or for EWA.
 
     Source: docs/rendering.md, section 6.

@@ -25,7 +25,7 @@ from pansplat.rendering.cpu.observe import CULLED, LANES, PIECE
 from pansplat.rendering.cpu.records import BOX_BITS, TILE_SIZE
 from pansplat.rendering.cpu.runtime import Workspace, inline_kernel, kernel, parallel_for
 from pansplat.rendering.cpu.simd import element, prefetch, prefetch_to_write, put
-from pansplat.rendering.panorama import Picture
+from pansplat.rendering.image_planes import ImagePlane
 
 # --- bounding boxes ---
 
@@ -289,7 +289,7 @@ def _equirect_edges(rows, height, width):
         rows[_EDGES + 3, i] = _ABOVE_IMAGE if kappa < _ZERO else bottom
 
 
-def find_bounding_boxes(records: np.ndarray, picture: Picture, workspace: Workspace, threads: int) -> np.ndarray:
+def find_bounding_boxes(records: np.ndarray, picture: ImagePlane, workspace: Workspace, threads: int) -> np.ndarray:
     """Bounding box of each record of the exact kernel on an image plane, (n, 4) int16."""
     words = workspace.array((len(records), 2), np.int32)
     rotation = np.ascontiguousarray(picture.rotation.numpy().astype(np.float32))

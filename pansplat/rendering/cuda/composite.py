@@ -14,14 +14,14 @@ from pansplat.rendering.cuda.lists import Instances, list_tiles
 from pansplat.rendering.cuda.pixels import TilePixels, tile_pixels
 from pansplat.rendering.cuda.raster import raster
 from pansplat.rendering.cuda.raster_backward import by_record, raster_backward
-from pansplat.rendering.panorama import Picture
-from pansplat.rendering.splats import Splats
+from pansplat.rendering.image_planes import ImagePlane
+from pansplat.rendering.projection import Footprints
 
 _SORTING = 40  # bytes an entry, while a band's are sorted
 
 
 def composite(
-    splats: Splats, instances: Instances, pictures: list[Picture], *, exact: bool
+    splats: Footprints, instances: Instances, pictures: list[ImagePlane], *, exact: bool
 ) -> tuple[Float[Tensor, "picture sums height width"], int, int]:
     """Sums of weight x (values, 1) over pictures, the number of entries, and bytes of working memory.
 
@@ -34,7 +34,7 @@ def composite(
         exact: which kernel.
     """
     layout = Layout(exact, splats.values.shape[1] - 1)
-    pixels = tile_pixels(pictures, exact=exact, dtype=splats.forms.dtype)
+    pixels = tile_pixels(pictures, exact=exact, dtype=splats.rows.dtype)
     grads = torch.is_grad_enabled()
     return _Composite.apply(*splats, instances, pixels, layout, pictures[0].size, grads)  # type: ignore[no-any-return]
 
@@ -56,7 +56,7 @@ class _Composite(torch.autograd.Function):
         size: tuple[int, int],
         recorded: bool,
     ) -> tuple[Tensor, int, int]:
-        records = pack(Splats(point, forms, along, peak, values), layout)
+        records = pack(Footprints(point, forms, along, peak, values), layout)
         sums = records.new_empty(len(instances.pictures), layout.channels + 2, *size)
         entries, largest, kept = 0, 0, []
         for lists in list_tiles(instances):

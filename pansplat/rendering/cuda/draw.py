@@ -17,24 +17,29 @@ from torch.utils.checkpoint import checkpoint
 from pansplat.constants import EWA_NEAR_FACTOR
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
-from pansplat.rendering.backend import Drawn, Info, Options
-from pansplat.rendering.panorama import Picture
-from pansplat.rendering.reference import in_picture, project
-from pansplat.rendering.selection import select_drawable
-from pansplat.rendering.splats import Observed, Splats, ray_splats
+from pansplat.rendering.image_planes import ImagePlane
+from pansplat.rendering.projection import (
+    Footprints,
+    ProjectedGaussians,
+    compute_footprints,
+    is_in_image,
+    ray_footprints,
+    select_drawable,
+)
+from pansplat.rendering.rasterize import RasterInfo, RasterOptions, RasterSums
 
 if TYPE_CHECKING:
     from pansplat.rendering.cuda.lists import Instances
 
 
-def draw(
+def rasterize_planes(
     gaussians: Gaussians,
     covariances: Float[Tensor, "n 3 3"] | None,
     pose: Float[Tensor, "4 4"],
-    pictures: list[Picture],
-    options: Options,
-) -> Drawn:
-    """Draw by Triton kernels; see `pansplat.rendering.backend.Draw`.
+    pictures: list[ImagePlane],
+    options: RasterOptions,
+) -> RasterSums:
+    """Draw by Triton kernels; see `pansplat.rendering.rasterize.RasterBackend`.
 
     Raises:
         InputError: Triton is not installed, or the Gaussians are not on a CUDA device; or as stated there.
@@ -42,22 +47,24 @@ def draw(
     _check(gaussians.means.device)
     # Only now: the kernels need Triton.
     from pansplat.rendering.cuda.composite import composite
-    from pansplat.rendering.cuda.observe import observe
+    from pansplat.rendering.cuda.observe import project_gaussians
 
     with _on(gaussians.means.device):
         chosen = select_drawable(gaussians, covariances, pose.detach(), options)
-        observed = observe(
+        observed = project_gaussians(
             chosen.gaussians,
             chosen.covariances,
             pose,
-            spread=options.spread(pictures[0].pixel_angle),
+            filter_variance=options.filter_variance(pictures[0].pixel_angle),
             compensate=options.lowpass == "angular",
             exact=options.kernel == "ray",
         )
         splats, instances = _splats(observed, pictures, options)
         sums, entries, size = composite(splats, instances, pictures, exact=options.kernel == "ray")
     visible = sum(instances.pictures)
-    return Drawn(sums, Info(chosen.total, chosen.dropped, chosen.near, visible, entries, backend="triton", bytes=size))
+    return RasterSums(
+        sums, RasterInfo(chosen.total, chosen.dropped, chosen.near, visible, entries, backend="triton", bytes=size)
+    )
 
 
 def _check(device: torch.device) -> None:
@@ -79,11 +86,13 @@ def _on(device: torch.device) -> contextlib.AbstractContextManager[object]:
     return torch.cuda.device(device) if device.type == "cuda" else contextlib.nullcontext()
 
 
-def _splats(observed: Observed, pictures: list[Picture], options: Options) -> tuple[Splats, "Instances"]:
+def _splats(
+    observed: ProjectedGaussians, pictures: list[ImagePlane], options: RasterOptions
+) -> tuple[Footprints, "Instances"]:
     """What is to be drawn, and where: one record a Gaussian for the exact kernel, one a picture for the classic."""
     from pansplat.rendering.cuda.lists import list_instances
 
-    fixed = Observed(*(field.detach() for field in observed))
+    fixed = ProjectedGaussians(*(field.detach() for field in observed))
     boxes, keys, bases, parts, total = [], [], [], [], 0
     for picture in pictures:
         key, seen = fixed.radius, None
@@ -92,10 +101,10 @@ def _splats(observed: Observed, pictures: list[Picture], options: Options) -> tu
             key = z
         if options.kernel == "ewa":
             ahead = torch.nonzero(z > EWA_NEAR_FACTOR * options.near)[:, 0]
-            box = _boxes(Observed(*(field[ahead] for field in fixed)), picture, options)
-            touched = in_picture(box, picture)
+            box = _boxes(ProjectedGaussians(*(field[ahead] for field in fixed)), picture, options)
+            touched = is_in_image(box, picture)
             seen, box = ahead[touched], box[touched]
-            part = Observed(*(_Take.apply(field, seen) for field in observed))
+            part = ProjectedGaussians(*(_Take.apply(field, seen) for field in observed))
             parts.append(checkpoint(project, part, picture, options, use_reentrant=False)[0])
             bases.append(total)
             total, key = total + len(seen), key[seen]
@@ -104,13 +113,15 @@ def _splats(observed: Observed, pictures: list[Picture], options: Options) -> tu
             bases.append(0)
         boxes.append(box)
         keys.append(key)
-    splats = Splats(*(torch.cat(field) for field in zip(*parts, strict=True))) if parts else ray_splats(observed)
+    splats = (
+        Footprints(*(torch.cat(field) for field in zip(*parts, strict=True))) if parts else ray_footprints(observed)
+    )
     return splats, list_instances(boxes, keys, bases, pictures[0].size, wraps=pictures[0].is_panorama)
 
 
 @torch.no_grad()
-def _boxes(observed: Observed, picture: Picture, options: Options) -> Float[Tensor, "n 4"]:
-    return project(observed, picture, options)[1]
+def _boxes(observed: ProjectedGaussians, picture: ImagePlane, options: RasterOptions) -> Float[Tensor, "n 4"]:
+    return compute_footprints(observed, picture, options)[1]
 
 
 class _Take(torch.autograd.Function):

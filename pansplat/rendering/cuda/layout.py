@@ -27,7 +27,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.rendering.splats import Splats
+from pansplat.rendering.projection import Footprints
 
 TILE = 16
 """Side of a tile, pixels."""
@@ -66,18 +66,18 @@ class Layout:
         return self.axes * (self.axes + 1) + int(self.exact) + 1 + self.channels + 1
 
 
-def pack(splats: Splats, layout: Layout) -> Float[Tensor, "n record"]:
+def pack(splats: Footprints, layout: Layout) -> Float[Tensor, "n record"]:
     """Records of Gaussians, in the type of their forms."""
-    dtype = splats.forms.dtype
+    dtype = splats.rows.dtype
     point = splats.point[:, : layout.axes].double()
     rounded = point.to(dtype)
-    forms = splats.forms[:, : layout.axes, : layout.axes].flatten(1)
+    forms = splats.rows[:, : layout.axes, : layout.axes].flatten(1)
     along = [splats.along[:, None]] if layout.exact else []
     parts = (rounded, (point - rounded.double()).to(dtype), forms, *along, splats.peak[:, None], splats.values)
     return torch.cat(parts, dim=1).contiguous()
 
 
-def unpack(gradient: Float[Tensor, "n gradient"], forms: Float[Tensor, "n 3 3"], layout: Layout) -> Splats:
+def unpack(gradient: Float[Tensor, "n gradient"], forms: Float[Tensor, "n 3 3"], layout: Layout) -> Footprints:
     """Gradients of Gaussians from their rows summed over tiles.
 
     Args:
@@ -90,4 +90,4 @@ def unpack(gradient: Float[Tensor, "n gradient"], forms: Float[Tensor, "n 3 3"],
     by_form[:, :axes, :axes] = moments.view(-1, axes, axes)
     by_point = -(slopes.double()[:, :, None] * forms[:, :axes].double()).sum(dim=1)
     along = rest[:, 0] if layout.exact else torch.zeros_like(rest[:, 0])
-    return Splats(by_point, by_form, along, rest[:, -channels - 2], rest[:, -channels - 1 :])
+    return Footprints(by_point, by_form, along, rest[:, -channels - 2], rest[:, -channels - 1 :])

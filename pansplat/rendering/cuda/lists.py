@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pansplat.rendering.cuda.layout import TILE
-from pansplat.rendering.tiles import bands, tile_grid, tile_ranges
+from pansplat.rendering.reference import bands, tile_grid, tile_ranges
 
 _ENTRIES = 1 << 24
 """Entries listed at a time: at some 40 bytes each while they are sorted, and 70 to 130 in backward."""

@@ -1,6 +1,6 @@
 """What one camera sees of each Gaussian, in one kernel.
 
-Source: docs/rendering.md, sections 1 to 3; `pansplat.rendering.splats.observe` is its reference. As torch
+Source: docs/rendering.md, sections 1 to 3; `pansplat.rendering.projection.project_gaussians` is its reference. As torch
 operations the same arithmetic moves 7 kB a Gaussian through memory, here a third of a kilobyte. Geometry is float64
 whatever the Gaussians' type is.
 """
@@ -20,7 +20,7 @@ from pansplat.rendering.cuda.observe_backward import observe_backward
 from pansplat.rendering.cuda.response import load_numbers
 from pansplat.rendering.cuda.spherical import basis
 from pansplat.rendering.cuda.vectors import dot, load_fields, products, store_fields, tangents, turn
-from pansplat.rendering.splats import Observed
+from pansplat.rendering.projection import ProjectedGaussians
 
 _BLOCK = 128
 """Gaussians a program: one a thread, which takes 90 to 120 registers in float64."""
@@ -53,7 +53,7 @@ def observe_kernel(
     DEGREE: tl.constexpr, CHANNELS: tl.constexpr, BY_AXES: tl.constexpr, COMPENSATE: tl.constexpr, EXACT: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Writes the fields of `Observed`. `camera` is cam2world, row by row, then e^2."""
+    """Writes the fields of `ProjectedGaussians`. `camera` is cam2world, row by row, then e^2."""
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     there = at < num
     pose = load_numbers(camera, 17)
@@ -95,19 +95,19 @@ def observe_kernel(
 # fmt: on
 
 
-def observe(
+def project_gaussians(
     gaussians: Gaussians,
     covariances: Float[Tensor, "n 3 3"] | None,
     cam2world: Float[Tensor, "4 4"],
     *,
-    spread: float,
+    filter_variance: float,
     compensate: bool,
     exact: bool,
-) -> Observed:
-    """The Gaussians as the camera sees them; see `pansplat.rendering.splats.observe`."""
+) -> ProjectedGaussians:
+    """The Gaussians as the camera sees them; see `pansplat.rendering.projection.project_gaussians`."""
     shape = (gaussians.quats, gaussians.scales) if covariances is None else (covariances,)
     fields = (gaussians.means, gaussians.opacities, gaussians.harmonics, *shape)
-    return Observed(*_Observe.apply(cam2world, spread, compensate, exact, *fields))
+    return ProjectedGaussians(*_Observe.apply(cam2world, filter_variance, compensate, exact, *fields))
 
 
 class _Observe(torch.autograd.Function):
@@ -115,35 +115,35 @@ class _Observe(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, cam2world: Tensor, spread: float, compensate: bool, exact: bool, *fields: Tensor
+        ctx: Any, cam2world: Tensor, filter_variance: float, compensate: bool, exact: bool, *fields: Tensor
     ) -> tuple[Tensor, ...]:
         fields = tuple(field.contiguous() for field in fields)
         means, opacities, harmonics, *shape = fields
         count, terms, channels = harmonics.shape
-        camera = torch.nn.functional.pad(cam2world.reshape(-1), (0, 1), value=spread)
+        camera = torch.nn.functional.pad(cam2world.reshape(-1), (0, 1), value=filter_variance)
         wide = dict(dtype=torch.float64, device=means.device)
-        found = Observed(
+        found = ProjectedGaussians(
             direction=torch.empty(count, 3, **wide),
             radius=torch.empty(count, **wide),
             covariance=torch.empty(count, 3, 3, **wide),
             peak=torch.empty_like(opacities),
             values=means.new_empty(count, channels + 1),
-            forms=means.new_empty(count, 3 if exact else 0, 3),
+            rows=means.new_empty(count, 3 if exact else 0, 3),
             along=torch.zeros_like(opacities),
         )
         if count:
             observe_kernel[(triton.cdiv(count, _BLOCK),)](
                 means, opacities, harmonics, shape[0], shape[-1], camera, found.direction, found.radius,
-                found.covariance, found.peak, found.values, found.forms, found.along, count,
+                found.covariance, found.peak, found.values, found.rows, found.along, count,
                 DEGREE=round(terms**0.5) - 1, CHANNELS=channels, BY_AXES=len(shape) == 2, COMPENSATE=compensate,
                 EXACT=exact, BLOCK=_BLOCK, num_warps=4,
             )  # fmt: skip
         ctx.save_for_backward(cam2world, *fields)
-        ctx.options = dict(spread=spread, compensate=compensate, exact=exact)
+        ctx.options = dict(filter_variance=filter_variance, compensate=compensate, exact=exact)
         return tuple(found)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
         cam2world, *fields = ctx.saved_tensors
-        by_pose, *by_field = observe_backward(cam2world, fields, Observed(*grad_outputs), **ctx.options)
+        by_pose, *by_field = observe_backward(cam2world, fields, ProjectedGaussians(*grad_outputs), **ctx.options)
         return by_pose, None, None, None, *by_field

@@ -30,7 +30,7 @@ from pansplat.rendering.cuda.vectors import (
     turn,
     unturn,
 )
-from pansplat.rendering.splats import Observed
+from pansplat.rendering.projection import ProjectedGaussians
 
 _BLOCK = 64
 """Gaussians a program; its gradients of the pose are summed in it, and over programs by torch."""
@@ -280,9 +280,9 @@ def observe_backward_kernel(
 def observe_backward(
     cam2world: Float[Tensor, "4 4"],
     fields: list[Tensor],
-    slopes: Observed,
+    slopes: ProjectedGaussians,
     *,
-    spread: float,
+    filter_variance: float,
     compensate: bool,
     exact: bool,
 ) -> tuple[Tensor, ...]:
@@ -292,7 +292,7 @@ def observe_backward(
         cam2world: float64.
         fields: means, opacities, harmonics, then quats and scales or covariances.
         slopes: of the loss by what is seen.
-        spread: see `pansplat.rendering.splats.observe`, as for the rest.
+        filter_variance: see `pansplat.rendering.projection.project_gaussians`, as for the rest.
     """
     means, opacities, harmonics, *shape = fields
     count = len(means)
@@ -306,9 +306,9 @@ def observe_backward(
     parts = cam2world.new_empty(programs, 3, 4)
     observe_backward_kernel[(programs,)](
         means, opacities, shape[0], shape[-1],
-        torch.nn.functional.pad(cam2world.reshape(-1), (0, 1), value=spread),
+        torch.nn.functional.pad(cam2world.reshape(-1), (0, 1), value=filter_variance),
         by_worlds, slopes.direction.contiguous(), slopes.radius + slopes.values[:, -1].double(),
-        slopes.covariance.contiguous(), slopes.peak.contiguous(), slopes.forms.contiguous(), slopes.along.contiguous(),
+        slopes.covariance.contiguous(), slopes.peak.contiguous(), slopes.rows.contiguous(), slopes.along.contiguous(),
         by_field[0], by_field[1], by_field[3], by_field[-1], parts, count,
         BY_AXES=len(shape) == 2, COMPENSATE=compensate, EXACT=exact, BLOCK=_BLOCK, num_warps=2,
     )  # fmt: skip

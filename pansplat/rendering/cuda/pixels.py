@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.rendering.cuda.layout import TILE
-from pansplat.rendering.panorama import Picture
-from pansplat.rendering.tiles import tile_grid
+from pansplat.rendering.image_planes import ImagePlane
+from pansplat.rendering.reference import tile_grid
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class TilePixels:
     offsets: Float[Tensor, "tile axis pixel"]
 
 
-def tile_pixels(pictures: list[Picture], *, exact: bool, dtype: torch.dtype) -> TilePixels:
+def tile_pixels(pictures: list[ImagePlane], *, exact: bool, dtype: torch.dtype) -> TilePixels:
     """The pixels of pictures; tiles that stick out repeat the last row and column.
 
     Args:
@@ -40,7 +40,7 @@ def tile_pixels(pictures: list[Picture], *, exact: bool, dtype: torch.dtype) -> 
 
 
 def _picture_pixels(
-    picture: Picture, exact: bool, dtype: torch.dtype
+    picture: ImagePlane, exact: bool, dtype: torch.dtype
 ) -> tuple[Float[Tensor, "tile both axis"], Float[Tensor, "tile axis pixel"]]:
     points = picture.directions() if exact else picture.coordinates()
     rows, columns = tile_grid(*picture.size, TILE)

@@ -27,7 +27,7 @@ from pansplat.rendering.cuda.response import (
     load_rows,
     place_pixels,
 )
-from pansplat.rendering.tiles import tile_grid
+from pansplat.rendering.reference import tile_grid
 
 
 # fmt: off

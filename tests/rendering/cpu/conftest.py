@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pansplat.gaussians.scene import Gaussians
-from pansplat.rendering import splats
+from pansplat.rendering import projection
 from pansplat.rendering.cpu.observe import Camera, Fields, Observed, observe
 from pansplat.rendering.cpu.rasterize import MIN_PLANAR_COSINE
 from pansplat.rendering.cpu.records import (
@@ -30,7 +30,7 @@ from pansplat.rendering.cpu.records import (
     tabulate_pixels,
 )
 from pansplat.rendering.cpu.runtime import Workspace
-from pansplat.rendering.panorama import Picture
+from pansplat.rendering.image_planes import ImagePlane
 
 SPREAD = 0.1 * (math.pi / 64) ** 2
 
@@ -69,13 +69,15 @@ def seen(workspace: Workspace, pose: Tensor) -> Callable[..., Observed]:
 
 
 @pytest.fixture
-def truth(pose: Tensor) -> Callable[..., splats.Observed]:
+def truth(pose: Tensor) -> Callable[..., projection.ProjectedGaussians]:
     """What the float64 reference sees of the same float32 numbers."""
 
-    def see(scene: Gaussians, covariances: Tensor | None = None) -> splats.Observed:
+    def see(scene: Gaussians, covariances: Tensor | None = None) -> projection.ProjectedGaussians:
         covariances = None if covariances is None else covariances.float().double()
         scene = scene.to(dtype=torch.float32).to(dtype=torch.float64)
-        return splats.observe(scene, covariances, pose, spread=SPREAD, compensate=True, exact=True)
+        return projection.project_gaussians(
+            scene, covariances, pose, filter_variance=SPREAD, compensate=True, exact=True
+        )
 
     return see
 
@@ -150,7 +152,7 @@ class Case:
 
 
 def _random_records(
-    kind: str, picture: Picture, count: int, opacity: tuple[float, float], rng: np.random.Generator
+    kind: str, picture: ImagePlane, count: int, opacity: tuple[float, float], rng: np.random.Generator
 ) -> Tensor:
     """Gaussians of 0.4 to 6 pixels that point into the picture, float64."""
     height, width = picture.size
@@ -171,7 +173,7 @@ def _random_records(
     else:
         direction = torch.from_numpy(rng.standard_normal((count, 3)))
     direction = direction / direction.norm(dim=1, keepdim=True)
-    right, down = splats.tangent_frame(direction)
+    right, down = projection.tangent_frame(direction)
     records[:, DIRECTION:DIRECTION_RESIDUAL] = direction
     for columns, axis in ((ROW_A, first), (ROW_B, second)):
         across = torch.from_numpy(axis) / picture.pixel_angle
@@ -194,7 +196,7 @@ def make_case(pose: Tensor) -> Callable[..., Case]:
         opacity: tuple[float, float] = (0.05, 0.95),
     ) -> Case:
         rng = np.random.default_rng(3)
-        picture = Picture(size, pose[:3, :3], 0.0 if kind == "equirect" else 0.6 * max(size))
+        picture = ImagePlane(size, pose[:3, :3], 0.0 if kind == "equirect" else 0.6 * max(size))
         precise = _random_records(kind, picture, count, opacity, rng)
         records = precise.float()
         records[:, DIRECTION_RESIDUAL:ROW_A] = (
@@ -229,7 +231,7 @@ def one_too_wide(request: pytest.FixtureRequest, make_case: Callable[..., Case])
     assert (case.records[:, :DIRECTION_RESIDUAL] @ middle.numpy()).min() > MIN_PLANAR_COSINE
     behind = request.param == "behind"
     angle = math.radians(100 if behind else 0)
-    right, down = (axis[0] for axis in splats.tangent_frame(middle[None]))
+    right, down = (axis[0] for axis in projection.tangent_frame(middle[None]))
     mean = math.cos(angle) * middle + math.sin(angle) * right
     towards = math.sin(angle) * middle - math.cos(angle) * right
     # Seen in part of the tile: what makes L positive there, or negative elsewhere, is that the ellipsoid is oblique.

@@ -11,9 +11,9 @@ import torch
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import rasterize, reference
-from pansplat.rendering.backend import Options
-from pansplat.rendering.cpu import draw, tiling
-from pansplat.rendering.panorama import pictures
+from pansplat.rendering.cpu import rasterize_planes, tiling
+from pansplat.rendering.image_planes import image_planes
+from pansplat.rendering.rasterize import RasterOptions
 
 _NAMES = ("means", "quats", "scales", "opacities", "harmonics")
 _SIZES = {"equirect": (40, 80), "pinhole": (50, 70), "cubemap": (40, 80)}
@@ -28,7 +28,7 @@ _CASES = [
 
 
 def _pictures(layout):
-    return pictures(layout, _SIZES[layout], vertical_fov_degrees=80.0, face_size=None, device=torch.device("cpu"))
+    return image_planes(layout, _SIZES[layout], vertical_fov_degrees=80.0, face_size=None, device=torch.device("cpu"))
 
 
 def _scene(make_scene, channels=3, count=300):
@@ -54,8 +54,8 @@ def _run(backend, scene, pose, layout, options, dtype, covariances=None):
 
 
 def _compare(scene, pose, layout, options, covariances=None):
-    expected, wanted = _run(reference.draw, scene, pose, layout, options, torch.float64, covariances)
-    found, got = _run(draw, scene, pose, layout, options, torch.float32, covariances)
+    expected, wanted = _run(reference.rasterize_planes, scene, pose, layout, options, torch.float64, covariances)
+    found, got = _run(rasterize_planes, scene, pose, layout, options, torch.float32, covariances)
     truth, ours = expected.sums.detach(), found.sums.detach()
     scale = float(truth.abs().max().clamp_min(1))
     assert float(truth[:, -1].max()) > 0.5
@@ -71,27 +71,27 @@ def _compare(scene, pose, layout, options, covariances=None):
 
 @pytest.mark.parametrize(("layout", "kernel", "order", "lowpass"), _CASES)
 def test_pictures_and_gradients_are_the_references(layout, kernel, order, lowpass, make_scene, pose):
-    _compare(_scene(make_scene), pose, layout, Options(kernel, order, lowpass, 0.05, False))
+    _compare(_scene(make_scene), pose, layout, RasterOptions(kernel, order, lowpass, 0.05, False))
 
 
 @pytest.mark.parametrize(("layout", "kernel"), [("equirect", "ray"), ("pinhole", "ewa"), ("cubemap", "ray")])
 @pytest.mark.parametrize("lowpass", ["angular", "3dgs"])
 def test_covariances_are_drawn_as_the_reference_draws_them(layout, kernel, lowpass, make_scene, pose):
     scene = _scene(make_scene)
-    _compare(scene, pose, layout, Options(kernel, "radial", lowpass, 0.05, False), scene.covariances)
+    _compare(scene, pose, layout, RasterOptions(kernel, "radial", lowpass, 0.05, False), scene.covariances)
 
 
 @pytest.mark.parametrize("channels", [1, 2, 5, 32])
 def test_any_number_of_channels_is_drawn(channels, make_scene, pose):
-    _compare(_scene(make_scene, channels), pose, "equirect", Options("ray", "radial", "angular", 0.05, False))
+    _compare(_scene(make_scene, channels), pose, "equirect", RasterOptions("ray", "radial", "angular", 0.05, False))
 
 
 @pytest.mark.parametrize("kernel", ["ray", "ewa"])
 def test_bands_change_no_bit(kernel, make_scene, pose, monkeypatch):
-    scene, options = _scene(make_scene), Options(kernel, "radial", "angular", 0.05, False)
-    whole, gradients = _run(draw, scene, pose, "pinhole", options, torch.float32)
+    scene, options = _scene(make_scene), RasterOptions(kernel, "radial", "angular", 0.05, False)
+    whole, gradients = _run(rasterize_planes, scene, pose, "pinhole", options, torch.float32)
     monkeypatch.setattr(tiling, "MAX_INTERSECTIONS", 20)
-    banded, banded_gradients = _run(draw, scene, pose, "pinhole", options, torch.float32)
+    banded, banded_gradients = _run(rasterize_planes, scene, pose, "pinhole", options, torch.float32)
     assert torch.equal(whole.sums, banded.sums)
     for name, gradient in gradients.items():  # sums of slots, here first by band
         torch.testing.assert_close(banded_gradients[name], gradient, rtol=1e-4, atol=1e-5 * float(gradient.abs().max()))
@@ -99,12 +99,12 @@ def test_bands_change_no_bit(kernel, make_scene, pose, monkeypatch):
 
 @pytest.mark.parametrize(("layout", "kernel"), [("equirect", "ray"), ("cubemap", "ewa")])
 def test_pictures_and_gradients_are_the_same_bits_on_any_number_of_threads(layout, kernel, make_scene, pose):
-    scene, options = _scene(make_scene, count=20000), Options(kernel, "radial", "angular", 0.05, False)
+    scene, options = _scene(make_scene, count=20000), RasterOptions(kernel, "radial", "angular", 0.05, False)
     before, results = torch.get_num_threads(), []
     try:
         for threads in (1, 2, 3, 5):
             torch.set_num_threads(threads)
-            results.append(_run(draw, scene, pose, layout, options, torch.float32))
+            results.append(_run(rasterize_planes, scene, pose, layout, options, torch.float32))
     finally:
         torch.set_num_threads(before)
     (first, gradients), *others = results
@@ -116,19 +116,21 @@ def test_pictures_and_gradients_are_the_same_bits_on_any_number_of_threads(layou
 def test_only_the_gradients_asked_for_are_made(make_scene, pose):
     scene = _scene(make_scene)
     scene.opacities.requires_grad_()
-    drawn = draw(scene, None, pose, _pictures("pinhole"), Options("ray", "radial", "angular", 0.05, False))
+    drawn = rasterize_planes(
+        scene, None, pose, _pictures("pinhole"), RasterOptions("ray", "radial", "angular", 0.05, False)
+    )
     drawn.sums.sum().backward()
     assert scene.opacities.grad is not None and scene.opacities.grad.any()
     assert all(getattr(scene, name).grad is None for name in _NAMES if name != "opacities")
 
 
 def test_without_grad_nothing_is_kept(make_scene, pose):
-    scene, options = _scene(make_scene), Options("ray", "radial", "angular", 0.05, False)
-    plain = draw(scene, None, pose, _pictures("pinhole"), options)
+    scene, options = _scene(make_scene), RasterOptions("ray", "radial", "angular", 0.05, False)
+    plain = rasterize_planes(scene, None, pose, _pictures("pinhole"), options)
     scene.means.requires_grad_()
-    recorded = draw(scene, None, pose, _pictures("pinhole"), options)
+    recorded = rasterize_planes(scene, None, pose, _pictures("pinhole"), options)
     with torch.no_grad():
-        drawn = draw(scene, None, pose, _pictures("pinhole"), options)
+        drawn = rasterize_planes(scene, None, pose, _pictures("pinhole"), options)
     assert not drawn.sums.requires_grad
     assert set(drawn.info.seconds) == {"observe", "boxes", "sort", "bin", "raster"}
     assert drawn.info.bytes == plain.info.bytes < recorded.info.bytes
@@ -182,13 +184,13 @@ def test_a_side_that_a_box_cannot_hold_is_refused(make_scene, pose):
 
 
 def test_two_threads_may_draw_at_once(make_scene, pose):
-    scene, options = _scene(make_scene, count=5000), Options("ray", "radial", "angular", 0.05, False)
-    alone = [_run(draw, scene, pose, layout, options, torch.float32) for layout in ("equirect", "cubemap")]
+    scene, options = _scene(make_scene, count=5000), RasterOptions("ray", "radial", "angular", 0.05, False)
+    alone = [_run(rasterize_planes, scene, pose, layout, options, torch.float32) for layout in ("equirect", "cubemap")]
     together = {}
 
     def work(layout):
         for _ in range(5):
-            together[layout] = _run(draw, scene, pose, layout, options, torch.float32)
+            together[layout] = _run(rasterize_planes, scene, pose, layout, options, torch.float32)
 
     threads = [threading.Thread(target=work, args=(layout,)) for layout in ("equirect", "cubemap")]
     for thread in threads:

@@ -7,30 +7,34 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.rendering import splats
-from pansplat.rendering.bounds import ewa_boxes, kappa
+from pansplat.rendering import projection
 from pansplat.rendering.cpu.ewa import TOTALS, project, project_backward
 from pansplat.rendering.cpu.observe import Camera, observe
 from pansplat.rendering.cpu.observe_backward import Gradients, chain
 from pansplat.rendering.cpu.records import DIRECTION_RESIDUAL, HALF_LOG2_E, LOG2_PEAK, ROW_A, ROW_B
-from pansplat.rendering.panorama import pictures
+from pansplat.rendering.image_planes import image_planes
+from pansplat.rendering.projection import ewa_boxes, kappa
 
 _NAMES = ("means", "quats", "scales", "opacities", "harmonics")
 _DILATED = {"angular": 0.0, "3dgs": 0.3}
 
 
 def _picture():
-    (picture,) = pictures("pinhole", (48, 64), vertical_fov_degrees=80, face_size=None, device=torch.device("cpu"))
+    (picture,) = image_planes("pinhole", (48, 64), vertical_fov_degrees=80, face_size=None, device=torch.device("cpu"))
     return picture
 
 
 def _reference(scene, pose, lowpass, picture):
     """The reference's splats of Gaussians in front, and their numbers."""
     spread = 0.1 * picture.pixel_angle**2 if lowpass == "angular" else 0.0
-    seen = splats.observe(scene, None, pose, spread=spread, compensate=lowpass == "angular", exact=False)
+    seen = projection.project_gaussians(
+        scene, None, pose, filter_variance=spread, compensate=lowpass == "angular", exact=False
+    )
     front = seen.direction[:, 2] * seen.values[:, -1] > 0.01
-    chosen = splats.Observed(*(field[front] for field in seen))
-    drawn, variances = splats.ewa_splats(chosen, picture.rotation, picture.size, picture.focal, _DILATED[lowpass])
+    chosen = projection.ProjectedGaussians(*(field[front] for field in seen))
+    drawn, variances = projection.ewa_footprints(
+        chosen, picture.rotation, picture.size, picture.focal, _DILATED[lowpass]
+    )
     return drawn, variances, front.nonzero()[:, 0].numpy()
 
 
@@ -65,8 +69,8 @@ def test_projected_records_and_boxes_are_the_references(flat, lowpass, make_scen
     where = records[:, :2] + records[:, DIRECTION_RESIDUAL : DIRECTION_RESIDUAL + 2]
     torch.testing.assert_close(where, expected.point[seen][:, :2].double(), rtol=1e-12, atol=1e-9)
     unit, tolerance = math.sqrt(HALF_LOG2_E), {"rtol": 2e-6, "atol": 1e-6}
-    torch.testing.assert_close(records[:, ROW_A] / unit, expected.forms[seen][:, 0, 0], **tolerance)
-    torch.testing.assert_close(records[:, ROW_B : ROW_B + 2] / unit, expected.forms[seen][:, 1, :2], **tolerance)
+    torch.testing.assert_close(records[:, ROW_A] / unit, expected.rows[seen][:, 0, 0], **tolerance)
+    torch.testing.assert_close(records[:, ROW_B : ROW_B + 2] / unit, expected.rows[seen][:, 1, :2], **tolerance)
     torch.testing.assert_close(2 ** records[:, LOG2_PEAK], expected.peak[seen], **tolerance)
 
 
@@ -81,7 +85,7 @@ def test_gradients_through_the_projection_are_autograds(lowpass, make_scene, fie
 
     leaves = {name: getattr(scene, name).double().requires_grad_() for name in _NAMES}
     drawn, _, front = _reference(dataclasses.replace(scene, **leaves), camera, lowpass, picture)
-    a_x, (b_x, b_y) = drawn.forms[:, 0, 0], drawn.forms[:, 1, :2].unbind(1)
+    a_x, (b_x, b_y) = drawn.rows[:, 0, 0], drawn.rows[:, 1, :2].unbind(1)
     numbers = torch.stack((*drawn.point[:, :2].unbind(1), a_x, b_x, b_y, torch.log(drawn.peak)), dim=1)
     (weights[front] * numbers).sum().backward()
 

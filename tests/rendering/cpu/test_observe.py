@@ -23,7 +23,7 @@ def test_records_and_values_are_the_references(degree, by_covariance, make_scene
     covariances = scene.covariances if by_covariance else None
     observed, expected = seen(scene, covariances), truth(scene, covariances)
     found = decode(torch.from_numpy(observed.records).double())
-    a, b, front = expected.forms.unbind(1)
+    a, b, front = expected.rows.unbind(1)
     across = a[:, :, None] * a[:, None, :] + b[:, :, None] * b[:, None, :]
     assert observed.dropped == observed.near == 0
     assert _relative(found["direction"], expected.direction) < 1e-14

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.rendering import splats
+from pansplat.rendering import projection
 from pansplat.rendering.cpu.observe import Camera, observe
 from pansplat.rendering.cpu.observe_backward import Gradients, add_slots, chain
 from pansplat.rendering.cpu.records import (
@@ -77,11 +77,16 @@ def test_chained_gradients_are_autograds(degree, by_covariance, compensate, make
     covariances = scene.covariances.double().requires_grad_() if by_covariance else None
     leaves = {name: getattr(scene, name).double().requires_grad_() for name in _NAMES}
     camera, spread = pose.clone().requires_grad_(), 1e-4
-    seen = splats.observe(
-        dataclasses.replace(scene, **leaves), covariances, camera, spread=spread, compensate=compensate, exact=True
+    seen = projection.project_gaussians(
+        dataclasses.replace(scene, **leaves),
+        covariances,
+        camera,
+        filter_variance=spread,
+        compensate=compensate,
+        exact=True,
     )
     weights = _weights(seen.direction.detach(), 3)
-    first, second, front = seen.forms.unbind(1)
+    first, second, front = seen.rows.unbind(1)
     _response(seen.direction, first, second, front, seen.along, seen.peak, seen.values, weights).backward()
 
     given = fields(scene, None if covariances is None else covariances.detach())

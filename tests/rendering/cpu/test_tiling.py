@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.rendering.bounds import equirect_boxes, kappa, pinhole_boxes
 from pansplat.rendering.cpu.observe import Camera, observe
 from pansplat.rendering.cpu.tiling import (
     TileIntersections,
@@ -15,7 +14,8 @@ from pansplat.rendering.cpu.tiling import (
     intersect_tiles,
     sort_front_to_back,
 )
-from pansplat.rendering.panorama import pictures
+from pansplat.rendering.image_planes import image_planes
+from pansplat.rendering.projection import equirect_boxes, kappa, pinhole_boxes
 
 # Tile lists: each tile holds the Gaussians whose box touches it, by number, with the box cut to the tile.
 
@@ -48,7 +48,7 @@ def _expected(observed, picture):
 def test_boxes_are_the_references(layout, size, scale, make_scene, seen, truth, workspace):
     scene = make_scene(2000, scale=scale)
     observed, expected = seen(scene), truth(scene)
-    for picture in pictures(layout, size, vertical_fov_degrees=90.0, face_size=None, device=torch.device("cpu")):
+    for picture in image_planes(layout, size, vertical_fov_degrees=90.0, face_size=None, device=torch.device("cpu")):
         boxes = find_bounding_boxes(observed.records, picture, workspace, 1)
         wanted, is_seen = _expected(expected, picture)
         found = boxes[:, 3] >= boxes[:, 2]
@@ -63,7 +63,9 @@ def test_a_gaussian_on_the_axis_of_the_poles_takes_whole_rows(make_scene, fields
     scene = make_scene(2, scale=0.05)
     scene.means[:] = torch.tensor(((0.0, -1.0, 0.0), (0.0, 1.0, 0.0)))
     observed = observe(fields(scene), Camera(np.eye(4), 1e-4, True, 0.05), workspace, 1)
-    (picture,) = pictures("equirect", (64, 128), vertical_fov_degrees=90, face_size=None, device=torch.device("cpu"))
+    (picture,) = image_planes(
+        "equirect", (64, 128), vertical_fov_degrees=90, face_size=None, device=torch.device("cpu")
+    )
     boxes = find_bounding_boxes(observed.records, picture, workspace, 1)
     assert boxes[:, :2].tolist() == [[0, 127], [0, 127]]
     assert boxes[0, 2] == 0 and boxes[1, 3] == 63
@@ -73,7 +75,9 @@ def test_a_box_at_the_panoramas_seam_goes_on_at_the_left(make_scene, fields, wor
     scene = make_scene(1, scale=0.05)
     scene.means[:] = torch.tensor((0.0, 0.0, -1.0))
     observed = observe(fields(scene), Camera(np.eye(4), 1e-4, True, 0.05), workspace, 1)
-    (picture,) = pictures("equirect", (64, 128), vertical_fov_degrees=90, face_size=None, device=torch.device("cpu"))
+    (picture,) = image_planes(
+        "equirect", (64, 128), vertical_fov_degrees=90, face_size=None, device=torch.device("cpu")
+    )
     x0, x1, y0, y1 = find_bounding_boxes(observed.records, picture, workspace, 1)[0]
     assert 100 < x0 < 128 and 0 <= x1 < 28
     assert math.isclose(x0 + x1, 127, abs_tol=2) and y0 < 32 <= y1

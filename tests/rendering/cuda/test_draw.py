@@ -62,7 +62,7 @@ def test_pictures_and_gradients_equal_float64_torch(options, dtype, channels, ma
     for name, expected in truth[1].items():
         error = float((got[1][name] - expected).norm() / expected.norm())
         assert error < (1e-5 if single else 1e-12), name
-    assert got[2].backend == "triton" and got[2].entries > 0 and got[2].bytes > 0
+    assert got[2].backend == "triton" and got[2].intersections > 0 and got[2].bytes > 0
 
 
 @pytest.mark.parametrize("options", [_CASES[2], _CASES[4]], ids=lambda o: o["kernel"])
@@ -106,7 +106,7 @@ def test_a_gaussian_over_many_tiles_has_the_gradient_of_float64_torch(make_scene
     options = dict(size=(48, 96), layout="equirect")
     truth = _gradients(scene, pose, torch.float64, None, backend="torch", **options)
     got = _gradients(scene, pose, torch.float32, None, backend="triton", **options)
-    assert got[2].entries > 2 * 16  # so each sums its tiles in a program of its own, in more than one step
+    assert got[2].intersections > 2 * 16  # so each sums its tiles in a program of its own, in more than one step
     for name, expected in truth[1].items():
         assert float((got[1][name] - expected).norm() / expected.norm()) < 1e-5, name
 
@@ -152,7 +152,7 @@ def test_narrow_bands_of_tiles_draw_the_same(make_scene, pose, monkeypatch):
     narrow_lists = functools.partial(composite.list_tiles, limit=1)
     monkeypatch.setattr(composite, "list_tiles", narrow_lists)
     narrow = _gradients(scene, pose, torch.float64, None, backend="triton", size=(20, 40), layout="equirect")
-    assert torch.equal(narrow[0], wide[0]) and narrow[2].entries == wide[2].entries
+    assert torch.equal(narrow[0], wide[0]) and narrow[2].intersections == wide[2].intersections
     assert narrow[2].bytes < wide[2].bytes
     for name, expected in wide[1].items():
         assert torch.allclose(narrow[1][name], expected, rtol=1e-12, atol=1e-12), name
@@ -167,7 +167,7 @@ def test_nothing_to_draw_leaves_the_background(opacity, make_scene, pose):
     drawn = dataclasses.replace(scene, **leaves)
     got = rasterize(drawn, pose, size=(4, 8), background=(0.1, 0.2, 0.3), backend="triton")
     assert torch.equal(got.color[:, 0, 0], torch.tensor((0.1, 0.2, 0.3), dtype=torch.float64))
-    assert float(got.alpha.detach().abs().max()) == 0 and got.info.entries == 0
+    assert float(got.alpha.detach().abs().max()) == 0 and got.info.intersections == 0
     got.color.sum().backward()
     assert all(leaf.grad is None or not leaf.grad.any() for leaf in leaves.values())
 
@@ -212,6 +212,6 @@ def test_auto_takes_triton_on_cuda_only(unchecked):
     from pansplat.rendering.rasterize import _backend
 
     means = types.SimpleNamespace(is_cuda=True, device=torch.device("cuda"), dtype=torch.float32)
-    assert _backend("auto", types.SimpleNamespace(means=means)) is cuda.draw
+    assert _backend("auto", types.SimpleNamespace(means=means)) is cuda.rasterize_planes
     means.is_cuda, means.device = False, torch.device("cpu")
-    assert _backend("auto", types.SimpleNamespace(means=means)) is not cuda.draw
+    assert _backend("auto", types.SimpleNamespace(means=means)) is not cuda.rasterize_planes

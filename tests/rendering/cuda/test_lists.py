@@ -6,9 +6,9 @@ import torch
 from pansplat.rendering.cuda.layout import TILE, Layout, pack, unpack
 from pansplat.rendering.cuda.lists import list_instances, list_tiles
 from pansplat.rendering.cuda.pixels import tile_pixels
-from pansplat.rendering.panorama import pictures
-from pansplat.rendering.splats import Splats
-from pansplat.rendering.tiles import tile_ranges
+from pansplat.rendering.image_planes import image_planes
+from pansplat.rendering.projection import Footprints
+from pansplat.rendering.reference import tile_ranges
 
 
 def _boxes(count: int, size: tuple[int, int], seed: int) -> torch.Tensor:
@@ -72,7 +72,7 @@ def test_more_tiles_than_16_bits_count_are_listed_in_several_bands(monkeypatch):
 
 def test_centres_and_offsets_keep_more_digits_than_their_type():
     for layout, exact in (("equirect", True), ("cubemap", True), ("pinhole", False)):
-        planes = pictures(layout, (200, 360), vertical_fov_degrees=90.0, face_size=100, device=torch.device("cpu"))
+        planes = image_planes(layout, (200, 360), vertical_fov_degrees=90.0, face_size=100, device=torch.device("cpu"))
         pixels = tile_pixels(planes, exact=exact, dtype=torch.float32)
         height, width = planes[0].size
         rows, columns = -(-height // TILE), -(-width // TILE)
@@ -87,7 +87,7 @@ def test_centres_and_offsets_keep_more_digits_than_their_type():
 @pytest.mark.parametrize("exact", [True, False])
 def test_records_and_gradients_have_the_layouts_lengths(exact):
     layout = Layout(exact, channels=5)
-    splats = Splats(*(torch.rand(3, *shape) for shape in ((3,), (3, 3), (), (), (6,))))
+    splats = Footprints(*(torch.rand(3, *shape) for shape in ((3,), (3, 3), (), (), (6,))))
     splats = splats._replace(point=torch.rand(3, 3, dtype=torch.float64))
     records = pack(splats, layout)
     point, remainder = records.double().split((layout.axes, layout.axes, layout.record - 2 * layout.axes), dim=1)[:2]
@@ -97,7 +97,7 @@ def test_records_and_gradients_have_the_layouts_lengths(exact):
         records[:, layout.peak + 1 :], splats.values
     )
     rows = torch.arange(3.0 * layout.gradient).reshape(3, -1)
-    back = unpack(rows, splats.forms, layout)
+    back = unpack(rows, splats.rows, layout)
     assert torch.equal(back.peak, rows[:, -7]) and torch.equal(back.values, rows[:, -6:])
     assert torch.equal(back.along, rows[:, -8] if exact else torch.zeros(3))
-    assert back.point.dtype == torch.float64 and back.forms.shape == (3, 3, 3)
+    assert back.point.dtype == torch.float64 and back.rows.shape == (3, 3, 3)

@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 import torch
 
-from pansplat.rendering.cuda.observe import observe
-from pansplat.rendering.splats import Observed
-from pansplat.rendering.splats import observe as reference
+from pansplat.rendering.cuda.observe import project_gaussians
+from pansplat.rendering.projection import ProjectedGaussians
+from pansplat.rendering.projection import project_gaussians as reference
 
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 
@@ -28,11 +28,11 @@ def test_what_is_seen_equals_the_reference(exact, compensate, by_covariance, deg
     scene.scales[5, 1] = 0
     scene.scales[6] = 0
     covariances = _rounded(scene.covariances) if by_covariance else None
-    options = dict(spread=3e-4, compensate=compensate, exact=exact)
+    options = dict(filter_variance=3e-4, compensate=compensate, exact=exact)
     for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-6)):
         same = None if covariances is None else covariances.to(dtype)
         expected = reference(scene.to(dtype=dtype), same, pose, **options)
-        got = observe(scene.to(dtype=dtype), same, pose, **options)
+        got = project_gaussians(scene.to(dtype=dtype), same, pose, **options)
         for name, value in expected._asdict().items():
             found = getattr(got, name)
             assert found.dtype == value.dtype and found.shape == value.shape, name
@@ -52,12 +52,17 @@ def test_gradients_equal_the_references(exact, by_covariance, make_scene, pose, 
     scene.scales[6] = 0
     generator = torch.Generator().manual_seed(0)
     found = []
-    for function in (reference, observe):
+    for function in (reference, project_gaussians):
         leaves = {name: getattr(scene, name).clone().requires_grad_() for name in _FIELDS}
         covariances = scene.covariances.clone().requires_grad_() if by_covariance else None
         camera = pose.clone().requires_grad_()
         seen = function(
-            dataclasses.replace(scene, **leaves), covariances, camera, spread=3e-4, compensate=True, exact=exact
+            dataclasses.replace(scene, **leaves),
+            covariances,
+            camera,
+            filter_variance=3e-4,
+            compensate=True,
+            exact=exact,
         )
         _any_loss(seen, generator.manual_seed(0)).backward()
         turn = pose[:3, :3].T @ camera.grad[:3, :3]
@@ -81,12 +86,12 @@ def _rounded(covariances: torch.Tensor) -> torch.Tensor:
     return rounded
 
 
-def _any_loss(seen: Observed, generator: torch.Generator) -> torch.Tensor:
+def _any_loss(seen: ProjectedGaussians, generator: torch.Generator) -> torch.Tensor:
     """Depends on everything, but on the forms only through pictures: their two first may turn into each other."""
     random = [torch.rand(value.shape, generator=generator, dtype=value.dtype) for value in seen]
-    total = sum((value * factor).sum() for value, factor in zip(seen, random, strict=True) if value is not seen.forms)
-    if seen.forms.numel():
+    total = sum((value * factor).sum() for value, factor in zip(seen, random, strict=True) if value is not seen.rows)
+    if seen.rows.numel():
         pixels = seen.direction.detach() + 0.01 * torch.randn(seen.direction.shape, generator=generator).double()
-        first, second, ahead = (seen.forms @ (pixels - seen.direction)[:, :, None])[:, :, 0].unbind(1)
+        first, second, ahead = (seen.rows @ (pixels - seen.direction)[:, :, None])[:, :, 0].unbind(1)
         total = total + (first.square() + second.square()).sqrt().sum() + ahead.sum()
     return total

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pansplat.geometry.cubemap import face_poses
-from pansplat.rendering.stitching import stitch_faces
+from pansplat.rendering.image_planes import stitch_faces
 
 
 @pytest.mark.hard_case(32)

@@ -7,7 +7,7 @@ import sys
 import pytest
 import torch
 
-from pansplat.rendering.tiles import list_tiles, tile_grid
+from pansplat.rendering.reference import list_tiles, tile_grid
 
 
 @pytest.mark.hard_case(27)
@@ -56,7 +56,7 @@ scene = Gaussians(means, torch.full((count, 3), 0.8), quats, torch.full((count,)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 picture = rasterize(scene, torch.eye(4), size=size, backend="torch")
 grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-print(picture.info.entries, float(picture.alpha.min()), grown)
+print(picture.info.intersections, float(picture.alpha.min()), grown)
 """
 
 

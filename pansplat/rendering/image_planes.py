@@ -1,9 +1,11 @@
-"""A panorama of six cube faces: sampled bilinearly, each face continued by its neighbours.
+"""The image planes of a camera (pinhole, direct panorama, cube faces), and the panorama of six faces.
 
-Source: PanSplat, section 3.4; docs/rendering.md, section 6; OFFICIAL.md 10.2 and P9 for the original's way.
+Source: docs/rendering.md, section 6; PanSplat, section 3.4.
 """
 
 import functools
+import math
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import torch
@@ -12,6 +14,70 @@ from torch import Tensor
 
 from pansplat.geometry.cubemap import FACES, face_of, face_rotations, official_faces
 from pansplat.geometry.equirect import pixel_directions
+
+Layout = Literal["equirect", "cubemap", "pinhole"]
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePlane:
+    """One image plane of a camera.
+
+    Attributes:
+        size: height and width, pixels.
+        rotation: the picture's camera axes in the camera's, float64.
+        focal: pixels; 0 for a direct panorama.
+    """
+
+    size: tuple[int, int]
+    rotation: Float[Tensor, "3 3"]
+    focal: float
+
+    @property
+    def is_panorama(self) -> bool:
+        """Whether every direction has a pixel and columns wrap."""
+        return self.focal == 0
+
+    @property
+    def pixel_angle(self) -> float:
+        """Angle of a pixel in the picture's middle, radians."""
+        return math.pi / self.size[0] if self.is_panorama else 1 / self.focal
+
+    def directions(self) -> Float[Tensor, "height width 3"]:
+        """Unit directions of the pixel centres in the camera's axes, float64."""
+        height, width = self.size
+        device = self.rotation.device
+        if self.is_panorama:
+            return pixel_directions(height, width, dtype=torch.float64, device=device)
+        x, y = self.coordinates().unbind(-1)
+        x, y = (x - 0.5 * width) / self.focal, (y - 0.5 * height) / self.focal
+        rays = torch.stack((x, y, torch.ones_like(x)), dim=-1)
+        return torch.nn.functional.normalize(rays, dim=-1) @ self.rotation.T
+
+    def coordinates(self) -> Float[Tensor, "height width 2"]:
+        """Pixel centres x, y in pixels, float64."""
+        height, width = self.size
+        y = torch.arange(height, dtype=torch.float64, device=self.rotation.device) + 0.5
+        x = torch.arange(width, dtype=torch.float64, device=self.rotation.device) + 0.5
+        return torch.stack((x.expand(height, width), y[:, None].expand(height, width)), dim=-1)
+
+
+def image_planes(
+    layout: Layout,
+    size: tuple[int, int],
+    *,
+    vertical_fov_degrees: float = 90.0,
+    face_size: int | None = None,
+    device: torch.device | None = None,
+) -> list[ImagePlane]:
+    """The pictures that make up a layout: one, or the six cube faces."""
+    upright = torch.eye(3, dtype=torch.float64, device=device)
+    if layout == "equirect":
+        return [ImagePlane(size, upright, 0.0)]
+    if layout == "pinhole":
+        return [ImagePlane(size, upright, 0.5 * size[0] / math.tan(math.radians(vertical_fov_degrees) / 2))]
+    face = face_size or max(1, round(2 * size[0] / math.pi))
+    return [ImagePlane((face, face), rotation.to(upright.device), 0.5 * face) for rotation in face_rotations()]
+
 
 Stitching = Literal["seamless", "official"]
 

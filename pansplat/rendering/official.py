@@ -1,0 +1,57 @@
+"""Images as the published code draws them, its defects included, for the figures that were published of its weights.
+
+Source: docs/official.md, section 10.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from jaxtyping import Float
+from torch import Tensor
+
+from pansplat.constants import EWA_NEAR_FACTOR
+from pansplat.gaussians.harmonics import official_harmonics
+from pansplat.gaussians.scene import Gaussians
+from pansplat.rendering.rasterize import Backend, RasterOptions, Rendering, rasterize
+
+OFFICIAL = RasterOptions(kernel="ewa", order="z", lowpass="3dgs", stitching="official")
+"""The published code's choices; a pinhole image or a single face needs stitching="seamless"."""
+
+
+def official_face_size(height: int) -> int:
+    """Side of the published code's cube faces for a panorama of that height, pixels."""
+    return height // 2
+
+
+def official_gaussians(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians with the colours that the published rasteriser gives them: harmonics of degree 3 at most."""
+    return replace(gaussians, harmonics=official_harmonics(gaussians.harmonics))
+
+
+def rasterize_official(
+    gaussians: Gaussians,
+    cam2world: Float[Tensor, "4 4"],
+    *,
+    size: tuple[int, int],
+    near: float,
+    backend: Backend = "auto",
+) -> Rendering:
+    """A panorama stitched from six faces of half its height, rasterised with `OFFICIAL`.
+
+    Args:
+        cam2world: pose of the camera, OpenCV axes, metres.
+        size: height, a multiple of 4, and width of the panorama, pixels.
+        near: of the prediction, metres; Gaussians nearer than a fifth of it are not drawn. The published code measures
+            that along a face's axis.
+        backend: see `rasterize`.
+    """
+    return rasterize(
+        official_gaussians(gaussians),
+        cam2world,
+        size=size,
+        layout="cubemap",
+        face_size=official_face_size(size[0]),
+        options=replace(OFFICIAL, near=EWA_NEAR_FACTOR * near),
+        backend=backend,
+    )
