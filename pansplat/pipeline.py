@@ -23,8 +23,8 @@ from pansplat.errors import InputError
 from pansplat.gaussians.ply import load_ply, save_ply, save_ply_parts
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians, prune
 from pansplat.geometry.pose import blend_weights
-from pansplat.model.checkpoint import SUFFIXES, CompatChoice
 from pansplat.model.layers import Precision
+from pansplat.model.weights import WEIGHTS_SUFFIXES, CompatChoice
 from pansplat.predictor import Predictor, Progress
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
@@ -50,7 +50,7 @@ def load_model(
         compat: for networks: "official" reproduces the official code with its defects; "fixed" corrects them;
             "trained" is the mode that the weights were trained in, which is "official" for official weights.
         precision: for networks: number type of the convolutions; docs/bench_model.md shows time against error.
-        **options: for the constructor of `sweep`; for networks, see `pansplat.model.loading.load_predictor`.
+        **options: for the constructor of `sweep`; for networks, see `pansplat.model.network.load_predictor`.
 
     Raises:
         InputError: the predictor does not exist, the processor lacks the precision, or the file cannot be used.
@@ -62,12 +62,12 @@ def load_model(
             if value != default:
                 raise InputError(f"`{option}` is for networks, and {name} is not one; leave it out")
         return _MODELS[str(name)](**options)
-    if Path(name).suffix.lower() not in SUFFIXES:
+    if Path(name).suffix.lower() not in WEIGHTS_SUFFIXES:
         raise InputError(
-            f"`model` must be one of {', '.join(sorted(_MODELS))}, or a file of weights ({', '.join(SUFFIXES)}), got "
-            f"{str(name)!r}"
+            f"`model` must be one of {', '.join(sorted(_MODELS))}, or a file of weights "
+            f"({', '.join(WEIGHTS_SUFFIXES)}), got {str(name)!r}"
         )
-    from pansplat.model.loading import load_predictor
+    from pansplat.model.network import load_predictor
 
     return load_predictor(Path(name).expanduser(), compat, precision=precision, **options)
 

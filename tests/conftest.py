@@ -26,20 +26,7 @@ with contextlib.suppress(ImportError):
     import triton  # noqa: F401
 
 # Check annotated shapes and types at every call; install the hook before the packages are imported.
-# Modules with numba kernels are left out: numba cannot cache kernels of wrapped modules.
-_NETWORK = (
-    *("adapter", "auxiliary_heads", "checkpoint", "cost_volume", "feature_pyramid", "heads", "lattice", "layers"),
-    *("loading", "mono_depth", "mvsplat", "network", "pansplat", "tiles", "transformer", "unet", "weights"),
-)
-_CHECKED = (
-    "geometry",
-    "gaussians",
-    "rendering",
-    "predictor",
-    "evaluation",
-    "pipeline",
-    *(f"model.{part}" for part in _NETWORK),
-)
+_CHECKED = ("geometry", "gaussians", "model", "rendering", "predictor", "evaluation", "pipeline")
 install_import_hook([f"pansplat.{room}" for room in _CHECKED], "pansplat.testing.check_types")
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared"

@@ -15,14 +15,11 @@ from pansplat.cli import run, scenes
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.model import network
-from pansplat.model.adapter import AdapterConfig
-from pansplat.model.checkpoint import save_weights
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
-from pansplat.model.feature_pyramid import FeaturePyramidConfig
-from pansplat.model.heads import HeadsConfig
-from pansplat.model.loading import describe
+from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
+from pansplat.model.heads import AdapterConfig, HeadsConfig
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
-from pansplat.model.transformer import TransformerConfig
+from pansplat.model.weights import pack_weights, save_weights
 
 HEIGHT = 64
 SMALL = PanSplatConfig(
@@ -61,7 +58,7 @@ def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(scenes, "_HELD_HEIGHT", HEIGHT // 2)
     torch.manual_seed(0)
     path = tmp_path / "small.safetensors"
-    save_weights(path, describe("pansplat", SMALL, PanSplat(SMALL).state_dict(), compat="fixed"))
+    save_weights(path, pack_weights("pansplat", SMALL, PanSplat(SMALL).state_dict(), compat="fixed"))
     return path
 
 

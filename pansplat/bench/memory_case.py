@@ -27,7 +27,7 @@ from pansplat.bench.measure import peak_memory, reset_resident_peak, resident, s
 from pansplat.data.views import Batch, Sample, Views, collate
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.model.heads import whole
+from pansplat.model.heads import merge_tiles
 from pansplat.model.pansplat import PanSplat
 from pansplat.rendering.cpu.runtime import release_idle_memory
 from pansplat.training.config import MemoryConfig, NetworkShape, Style
@@ -216,8 +216,8 @@ class _Worker:
     @torch.no_grad()
     def _predict(self, batch: Batch) -> tuple[int, dict[str, Tensor]]:
         network = self.network
-        matched = network.match(batch.images, batch.cam2world.float(), batch.near, batch.far)
-        (scene,) = whole(list(network.lift(matched, tiles=self.case.tiles)), network.compat)
+        matched = network.match_views(batch.images, batch.cam2world.float(), batch.near, batch.far)
+        (scene,) = merge_tiles(list(network.lift_gaussians(matched, tiles=self.case.tiles)), network.compat)
         renderer = TargetRenderer(self.setting.style, "joint", batch.images.shape[-2])
         picture = renderer.render(scene, batch.target_cam2world[0, 0], batch.cam2world[0])
         return len(scene), {"means": scene.means, "opacities": scene.opacities, "picture": picture}

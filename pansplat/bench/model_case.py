@@ -24,15 +24,13 @@ from torch import Tensor, nn
 from pansplat.bench.measure import reset_resident_peak, resident_peak
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
-from pansplat.model.adapter import AdapterConfig
-from pansplat.model.checkpoint import load_weights
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
-from pansplat.model.feature_pyramid import FeaturePyramidConfig
-from pansplat.model.heads import HeadsConfig, whole
+from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
+from pansplat.model.heads import AdapterConfig, HeadsConfig, merge_tiles
 from pansplat.model.layers import AttentionPrecision, Compat, Precision
-from pansplat.model.loading import build_network
+from pansplat.model.network import build_network
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
-from pansplat.model.transformer import TransformerConfig
+from pansplat.model.weights import load_weights
 from pansplat.pipeline import render
 
 STAGES = ("features", "mono", "cost volume", "heads")
@@ -146,9 +144,9 @@ def _measure(
     stages: dict[str, float] = {}
     can_tell, before = reset_resident_peak(), time.process_time()
     with _watched(network, stages):
-        matched = network.match(images[None], cam2world[None].float(), *bounds)
+        matched = network.match_views(images[None], cam2world[None].float(), *bounds)
     began = time.perf_counter()
-    (gaussians,) = whole(list(network.lift(matched, tiles=case.tiles)), case.compat)
+    (gaussians,) = merge_tiles(list(network.lift_gaussians(matched, tiles=case.tiles)), case.compat)
     stages["heads"] = time.perf_counter() - began
     processor = time.process_time() - before
     peak = resident_peak() / 2**30 if can_tell else None

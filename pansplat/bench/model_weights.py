@@ -8,9 +8,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pansplat.model.checkpoint import save_weights
-from pansplat.model.loading import describe
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
+from pansplat.model.weights import pack_weights, save_weights
 
 # Of weights of unit gain: what follows a rectifier needs more to keep its size, logits of depth need less, so that
 # a depth is the mean of several candidates, as it is after training.
@@ -24,7 +23,7 @@ def save_random_weights(path: Path, config: PanSplatConfig | None = None, seed: 
         shapes = PanSplat(config).state_dict()
     generator = torch.Generator().manual_seed(seed)
     tensors = {name: _random(name, shape, generator) for name, shape in shapes.items()}
-    save_weights(path, describe("pansplat", config, tensors, compat="fixed"))
+    save_weights(path, pack_weights("pansplat", config, tensors, compat="fixed"))
 
 
 def _random(name: str, like: Tensor, generator: torch.Generator) -> Tensor:

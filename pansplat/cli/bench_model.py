@@ -25,8 +25,8 @@ from pansplat.cli.commands import BenchModel, PairChoice
 from pansplat.cli.printing import table_console
 from pansplat.cli.scenes import choose_pair, require_height
 from pansplat.errors import InputError
-from pansplat.model.checkpoint import load_weights
-from pansplat.model.loading import has_bfloat16
+from pansplat.model.network import has_bfloat16
+from pansplat.model.weights import load_weights
 
 if TYPE_CHECKING:
     from pansplat.data.views import Views

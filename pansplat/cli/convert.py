@@ -7,9 +7,8 @@ from rich.table import Table
 from pansplat.cli.commands import Convert
 from pansplat.cli.printing import table_console
 from pansplat.errors import InputError
-from pansplat.model.checkpoint import read_checkpoint, save_weights
-from pansplat.model.loading import from_original
-from pansplat.model.weights import Report, match
+from pansplat.model.network import convert_checkpoint
+from pansplat.model.weights import ConversionReport, match_tensors, read_checkpoint, save_weights
 
 _SHOWN = 2  # names a line of the report
 
@@ -19,9 +18,9 @@ def run_convert(command: Convert) -> int:
     if command.out.suffix.lower() != ".safetensors" or not command.out.resolve().parent.is_dir():
         raise InputError(f"--out must be a .safetensors file in an existing folder, got {command.out}")
     content = read_checkpoint(command.path)
-    report = match(content, command.path)
+    report = match_tensors(content, command.path)
     table_console().print(_table(report))
-    weights = from_original(content, command.path)
+    weights = convert_checkpoint(content, command.path)
     save_weights(command.out, weights)
     numbers = sum(tensor.numel() for tensor in weights.tensors.values())
     print(
@@ -31,7 +30,7 @@ def run_convert(command: Convert) -> int:
     return 0
 
 
-def _table(report: Report) -> Table:
+def _table(report: ConversionReport) -> Table:
     """A line each for what is used, left out (by reason), unknown and missing."""
     table = Table(title=f"{report.model}: what the checkpoint holds")
     table.add_column("")

@@ -13,7 +13,7 @@ from pansplat.errors import InputError
 from pansplat.evaluation.lpips import MIN_IMAGE_SIZE, Backbone, Lpips, find_backbone, load_lpips
 from pansplat.evaluation.protocol import Blend, Method, ProtocolOptions, list_methods, run_protocol
 from pansplat.evaluation.tables import report_notes, rich_tables, write_report
-from pansplat.model.checkpoint import SUFFIXES
+from pansplat.model.weights import WEIGHTS_SUFFIXES
 
 _WIDTH = 150  # characters, where there is no terminal
 
@@ -60,7 +60,7 @@ def _methods(command: Evaluate, protocol: str) -> list[Method]:
     blend = cast("Blend | None", command.blend)
     methods: list[Method] = []
     for index, model in enumerate((command.model, *command.protocol.models)):
-        with_compat = index == 0 or Path(model).suffix.lower() in SUFFIXES  # sweep among the others has none
+        with_compat = index == 0 or Path(model).suffix.lower() in WEIGHTS_SUFFIXES  # sweep among the others has none
         compat, precision = (command.compat, command.precision) if with_compat else ("trained", "float32")
         predictor = pipeline.load_model(model, compat=compat, precision=precision)
         methods += list_methods(predictor, protocol, blend, Path(model).stem, command.drawing)

@@ -28,7 +28,7 @@ from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from pansplat.errors import InputError
-from pansplat.model.checkpoint import read_checkpoint
+from pansplat.model.weights import read_checkpoint
 
 Backbone = Literal["vgg", "alex", "squeeze"]
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -21,12 +22,41 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from pansplat.errors import InputError
+from pansplat.gaussians.harmonics import rotation_matrices
 from pansplat.gaussians.scene import Gaussians
-from pansplat.model.adapter import AdapterConfig, adapt
+from pansplat.geometry.equirect import directions_from_uv
+from pansplat.geometry.pose import multiply_quats, quats_from_rotations
 from pansplat.model.cost_volume import Depths, LevelDepth
-from pansplat.model.lattice import Lattice, lattice_uv, move_points
-from pansplat.model.layers import Compat, Precision, convolving
-from pansplat.model.tiles import Margins, Tile, Window, cut, sample, sample_whole, tile_grid
+from pansplat.model.layers import Compat, Precision, autocast_convolutions
+from pansplat.model.tiles import (
+    Lattice,
+    Margins,
+    Tile,
+    Window,
+    crop_window,
+    lattice_uv,
+    move_points,
+    sample_panorama,
+    sample_window,
+    tile_grid,
+)
+
+
+@dataclass(frozen=True)
+class AdapterConfig:
+    """Ranges of what the network may predict; shipped weights fix all of it."""
+
+    degree: int = 4
+    """Degree of the spherical harmonics."""
+    min_scale: float = 0.5
+    """Smallest standard deviation, in fifths of a map pixel's angle."""
+    max_scale: float = 15.0
+    """Largest standard deviation, in fifths of a map pixel's angle."""
+
+    @property
+    def num_parameters(self) -> int:
+        """Numbers a Gaussian: 3 scale, 4 rotation, 3 colours of (degree + 1)^2 harmonics."""
+        return 7 + 3 * (self.degree + 1) ** 2
 
 
 @dataclass(frozen=True)
@@ -101,7 +131,7 @@ class LevelHead(nn.Module):
     def forward(self, inputs: Sequence[Float[Tensor, "_ height width"]]) -> Float[Tensor, "1 hidden h w"]:
         kind = inputs[0].device.type
         dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else inputs[0].dtype
-        maps = joined(inputs, dtype)  # the largest of all maps: here, so that it goes when it has been read
+        maps = concatenate_channels(inputs, dtype)  # the largest map: freed after the first convolution
         for index, conv in enumerate(self.convs):
             if index > 0:
                 maps = functional.gelu(maps)
@@ -154,10 +184,10 @@ class GaussianHeads(nn.Module):
         Raises:
             InputError: when the height cannot be divided into levels and tiles.
         """
-        parts = list(self.iterate(images, features, depths, cam2world, near, far, tiles=tiles))
-        return whole(parts, self.compat)
+        parts = list(self.iterate_tiles(images, features, depths, cam2world, near, far, tiles=tiles))
+        return merge_tiles(parts, self.compat)
 
-    def iterate(
+    def iterate_tiles(
         self,
         images: Float[Tensor, "batch view 3 height width"],
         features: Sequence[Float[Tensor, "batch view _ _ _"]],
@@ -180,7 +210,7 @@ class GaussianHeads(nn.Module):
         """
         height = images.shape[-2]
         self._require_divisible(height, tiles)
-        items = views_of(images, features, depths.levels[-1], cam2world, near, far)
+        items = split_views(images, features, depths.levels[-1], cam2world, near, far)
         grid = tile_grid(tiles)
         for tile in grid if only is None else [grid[number] for number in only]:
             gaussians = []
@@ -207,12 +237,12 @@ class GaussianHeads(nn.Module):
         features = view.features[-len(heights) :]
         for index, (head, height, feature) in enumerate(zip(self.levels, heights, features, strict=True)):
             window = tile.window(height)
-            around, known = window.grown(self.margins.input), window.grown(self.margins.output)
-            inputs = [cut(source, height, around, self.compat) for source in (view.image, feature, view.logits)]
+            around, known = window.expand(self.margins.input), window.expand(self.margins.output)
+            inputs = [crop_window(source, height, around, self.compat) for source in (view.image, feature, view.logits)]
             if passed_on is not None:
                 passed_on = _twice_as_fine(passed_on, self.margins)
                 inputs.append(passed_on[0])
-            with convolving(self.precision, feature.device):
+            with autocast_convolutions(self.precision, feature.device):
                 refined = head(inputs).to(feature.dtype)
             if passed_on is not None:
                 lost = self.margins.input - self.margins.output
@@ -221,7 +251,7 @@ class GaussianHeads(nn.Module):
             level = len(heights) - 1 - index
             if level == 0 or self.config.emitted == "all":
                 # Finer levels add to the colours of the coarsest.
-                read = read_points(
+                read = decode_gaussians(
                     head, refined[0], known, tile, view, height=height, level=level, colored=index == 0,
                     config=self.config, compat=self.compat,
                 )  # fmt: skip
@@ -241,7 +271,7 @@ class GaussianHeads(nn.Module):
             raise InputError(f"the heads need panoramas at least {least} pixels high, got {height}; enlarge them")
 
 
-def read_points(
+def decode_gaussians(
     head: LevelHead,
     refined: Float[Tensor, "hidden h w"],
     known: Window,
@@ -262,22 +292,22 @@ def read_points(
         colored: whether the harmonics add to the image's colour.
     """
     uv = lattice_uv(config.lattice, height, exact=compat == "fixed")
-    uv = uv[tile.holds(uv)].to(refined.device)
-    numbers = head.linear(sample(refined, known, height, uv))
+    uv = uv[tile.contains(uv)].to(refined.device)
+    numbers = head.linear(sample_window(refined, known, height, uv))
     sizes = (2, config.adapter.num_parameters, config.outputs - 2 - config.adapter.num_parameters)
     offsets, parameters, logits = numbers.split(sizes, dim=-1)
 
     def resized(source: Float[Tensor, "channel _ _"]) -> Float[Tensor, "n channel"]:
-        return sample(cut(source, height, known, compat), known, height, uv)
+        return sample_window(crop_window(source, height, known, compat), known, height, uv)
 
     if config.depth == "refined":
         probabilities = torch.softmax(logits[:, :-1], dim=-1)
-        inverse_depths = (probabilities * sample_whole(view.candidates, uv, compat)).sum(dim=-1)
+        inverse_depths = (probabilities * sample_panorama(view.candidates, uv, compat)).sum(dim=-1)
         opacities = torch.sigmoid(logits[:, -1])
     else:
         inverse_depths = resized(view.inverse_depth[None])[:, 0]
         opacities = torch.sigmoid(resized(view.confidence[None])[:, 0])
-    return adapt(
+    return adapt_gaussians(
         parameters,
         move_points(uv, offsets, config.lattice, height),
         1 / inverse_depths.clamp(1 / view.far, 1 / view.near),
@@ -296,13 +326,13 @@ def untiled_index(tile: Tile, lattices: Sequence[Float[Tensor, "_ 2"]], views: i
     """Where a tile's Gaussians stand among those of the whole panorama: by level, then view, then point."""
     places, start = [], 0
     for uv in lattices:
-        inside = tile.holds(uv).nonzero()[:, 0]
+        inside = tile.contains(uv).nonzero()[:, 0]
         places += [start + view * len(uv) + inside for view in range(views)]
         start += views * len(uv)
     return torch.cat(places)
 
 
-def whole(parts: Sequence[TileGaussians], compat: Compat) -> list[Gaussians]:
+def merge_tiles(parts: Sequence[TileGaussians], compat: Compat) -> list[Gaussians]:
     """All tiles' Gaussians of each batch item, in untiled order; in the original's, which is by tile, if official."""
     if len(parts) == 1:
         return parts[0].gaussians
@@ -323,7 +353,7 @@ def _put(sets: Sequence[Gaussians], places: Sequence[Integer[Tensor, "_"]]) -> G
     return Gaussians(**fields)
 
 
-def joined(
+def concatenate_channels(
     maps: Sequence[Float[Tensor, "_ height width"]], dtype: torch.dtype
 ) -> Float[Tensor, "1 channel height width"]:
     """Maps as channels of one, channels last: a fifth of the time of `torch.cat` and a change of layout."""
@@ -335,7 +365,7 @@ def joined(
     return whole
 
 
-def views_of(
+def split_views(
     images: Float[Tensor, "batch view 3 height width"],
     features: Sequence[Float[Tensor, "batch view _ _ _"]],
     depth: LevelDepth,
@@ -372,3 +402,151 @@ def _twice_as_fine(maps: Float[Tensor, "1 hidden height width"], margins: Margin
 
 def _cropped(maps: Float[Tensor, "1 hidden height width"], margin: int) -> Float[Tensor, "1 hidden h w"]:
     return maps[..., margin : maps.shape[-2] - margin, margin : maps.shape[-1] - margin]
+
+
+_SCALE_UNIT = 0.2  # a scale of 1 spans this part of a map pixel
+# The network's colours are in harmonics whose polar axis is y, in the cyclic order y, z, x of the 3DGS axes: with
+# these camera axes in rows, its k-th function along d is the 3DGS one along _POLAR_Y d.
+_POLAR_Y = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+
+
+def adapt_gaussians(
+    parameters: Float[Tensor, "n parameter"],
+    uv: Float[Tensor, "n 2"],
+    depths: Float[Tensor, "n"],
+    opacities: Float[Tensor, "n"],
+    cam2world: Float[Tensor, "4 4"],
+    *,
+    map_height: int,
+    colors: Float[Tensor, "n 3"] | None,
+    level: int,
+    view: int,
+    config: AdapterConfig,
+    compat: Compat,
+) -> Gaussians:
+    """Gaussians of one view and level.
+
+    Args:
+        parameters: raw [3 scale | 4 rotation xyzw, camera axes | 3 x (degree + 1)^2 harmonics, colour by colour].
+        uv: where on the panorama, normalised.
+        depths: radial distance from the camera, metres.
+        opacities: in [0, 1].
+        map_height: rows of the level's map; a scale is a multiple of its pixel's angle times the depth.
+        colors: RGB in [0, 1] that the harmonics are added to, or None where a level adds to no colour.
+        level, view: labels of the Gaussians.
+    """
+    camera = cam2world[:3, :3].double()
+    directions = directions_from_uv(uv) @ camera.to(uv).T
+    scale_part, rotation_part, harmonics_part = parameters.split((3, 4, config.num_parameters - 7), dim=-1)
+    scales = config.min_scale + (config.max_scale - config.min_scale) * torch.sigmoid(scale_part)
+    pixel_radians = math.pi / map_height
+    # Divided as the original divides: a quaternion of length 0 is not made one of length 1.
+    own = rotation_part.roll(1, dims=-1)  # xyzw to wxyz
+    own = own / (own.norm(dim=-1, keepdim=True) + 1e-8)
+    turn = quats_from_rotations(camera).to(own)
+    return Gaussians(
+        means=cam2world[:3, 3].to(depths) + depths[:, None] * directions,
+        scales=scales * (_SCALE_UNIT * pixel_radians) * depths[:, None],
+        quats=multiply_quats(turn.expand_as(own), own),
+        opacities=opacities,
+        harmonics=_world_harmonics(harmonics_part, colors, camera, config.degree, compat),
+        levels=torch.full(depths.shape, level, dtype=torch.uint8, device=depths.device),
+        views=torch.full(depths.shape, view, dtype=torch.uint8, device=depths.device),
+    )
+
+
+def world_harmonics_rotation(rotation: Float[Tensor, "3 3"], compat: Compat) -> Float[Tensor, "3 3"]:
+    """Rotation from the axes in which the network's colours are 3DGS harmonics to the world's.
+
+    The original turns colours by the camera's rotation with x and z reversed, which is right only for a turn
+    about y (OFFICIAL.md, trap T3). Its rasteriser moreover reads z for y in coefficient 14 and leaves out degree 4
+    (trap T4); that is the drawing's business, not the prediction's.
+    """
+    if compat == "official":
+        reverse = torch.tensor((-1.0, 1.0, -1.0)).to(rotation)
+        rotation = reverse[:, None] * rotation * reverse
+    return rotation @ torch.tensor(_POLAR_Y).to(rotation).T
+
+
+def _world_harmonics(
+    raw: Float[Tensor, "n parameter"],
+    colors: Float[Tensor, "n 3"] | None,
+    camera: Float[Tensor, "3 3"],
+    degree: int,
+    compat: Compat,
+) -> Float[Tensor, "n k 3"]:
+    """Harmonics in the world from raw ones in camera axes: damped by degree, on a base colour."""
+    harmonics = raw.unflatten(-1, (3, -1)) * _damping(degree).to(raw)
+    if colors is not None:
+        base = 2 * (colors - 0.5)
+        harmonics = torch.cat((harmonics[..., :1] + base[..., None], harmonics[..., 1:]), dim=-1)
+    turn = rotation_matrices(world_harmonics_rotation(camera, compat), degree).to(raw)
+    # One product of two matrices: of strided harmonics, torch would make one for each Gaussian.
+    turned = harmonics.reshape(-1, harmonics.shape[-1]) @ turn.T
+    return turned.view(harmonics.shape).transpose(-1, -2)
+
+
+def _damping(degree: int) -> Float[Tensor, "k"]:
+    """Factor of each raw coefficient: higher degrees start close to nothing."""
+    factors = [1.0] + [0.1 * 0.25**band for band in range(1, degree + 1) for _ in range(2 * band + 1)]
+    return torch.tensor(factors, dtype=torch.float64)
+
+
+_MAX_HEIGHT = 512  # of the panoramas that the cost volume sees
+
+
+AUXILIARY_HEADS = HeadsConfig(depth="swept", layers=2, feature_channels=(128, 96, 64))
+"""Their shape in the original; the features are those of the swept levels, coarse to fine."""
+
+
+class AuxiliaryHeads(nn.Module):
+    """One head a level of the cost volume, each on its own, all with maps half as high as the swept images."""
+
+    def __init__(self, config: HeadsConfig, compat: Compat) -> None:
+        super().__init__()
+        self.config = config
+        self.compat: Compat = compat
+        self.margins = Margins.of(config.layers, compat, chained=False)
+        self.levels = nn.ModuleList(
+            LevelHead(3 + channels + config.candidates, config, compat) for channels in config.feature_channels
+        )
+
+    def forward(
+        self,
+        images: Float[Tensor, "batch view 3 height width"],
+        features: Sequence[Float[Tensor, "batch view _ _ _"]],
+        depths: Depths,
+        cam2world: Float[Tensor, "batch view 4 4"],
+        near: Float[Tensor, "batch view"],
+        far: Float[Tensor, "batch view"],
+    ) -> list[list[Gaussians]]:
+        """For each level of the cost volume, coarse to fine, the Gaussians of each batch item."""
+        items = split_views(images, features, depths.levels[-1], cam2world, near, far)
+        return [
+            [
+                Gaussians.cat([self._lift_view(index, item, view, depth) for view in views])
+                for item, views in enumerate(items)
+            ]
+            for index, depth in enumerate(depths.levels)
+        ]
+
+    def _lift_view(self, index: int, item: int, view: ViewInputs, depth: LevelDepth) -> Gaussians:
+        height = min(view.image.shape[-2], _MAX_HEIGHT) // 2
+        whole = Tile(0, 0, 1)
+        around = whole.window(height).expand(self.margins.input)
+        inputs = (view.image, view.features[index], view.logits)
+        refined = self.levels[index]([crop_window(source, height, around, self.compat) for source in inputs])
+        at = (item, view.view)
+        own = dataclasses.replace(view, inverse_depth=depth.inverse_depth[at], confidence=depth.confidence[at])
+        return decode_gaussians(
+            self.levels[index],
+            refined[0],
+            whole.window(height).expand(self.margins.output),
+            whole,
+            own,
+            height=height,
+            level=depth.level,
+            colored=True,
+            config=self.config,
+            compat=self.compat,
+        )

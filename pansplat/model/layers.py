@@ -23,7 +23,7 @@ Precision = Literal["float32", "bfloat16"]
 AttentionPrecision = Literal["float32", "bfloat16"]
 
 
-def convolving(precision: Precision, device: torch.device) -> torch.autocast:
+def autocast_convolutions(precision: Precision, device: torch.device) -> torch.autocast:
     """Within it, "bfloat16" rounds what convolutions and linear layers read and give; their sums are in float32.
 
     Attention keeps to its own precision, see `attend`. Normalisations sum in float32.
@@ -109,7 +109,7 @@ class PanoramaConv2d(nn.Conv2d):
         return functional.conv2d(pad_equirect(maps, self.margin, self.border), weight, bias, self.stride)
 
 
-def normalized_convolution(
+def convolve_and_normalize(
     conv: PanoramaConv2d, norm: nn.BatchNorm2d, maps: Float[Tensor, "batch channel height width"]
 ) -> Float[Tensor, "batch c h w"]:
     """Convolution and batch normalisation, which outside training are one convolution."""

@@ -28,7 +28,7 @@ from pansplat.model.layers import (
     Compat,
     PanoramaConv2d,
     border_of,
-    normalized_convolution,
+    convolve_and_normalize,
     resize,
     to_channels_last,
 )
@@ -127,7 +127,7 @@ class ResNet18(nn.Module):
         )
 
     def forward(self, x: Float[Tensor, "batch 3 height width"]) -> dict[int, Tensor]:
-        features = {1: relu(normalized_convolution(self.stem, self.stem_norm, x))}
+        features = {1: relu(convolve_and_normalize(self.stem, self.stem_norm, x))}
         x = max_pool2d(pad_equirect(features[1], 1, self.border), 3, stride=2)
         for scale, stage in enumerate(self.stages, start=2):
             x = features[scale] = stage(x)
@@ -149,10 +149,10 @@ class ResidualBlock(nn.Module):
             self.shortcut_norm = nn.BatchNorm2d(outputs)
 
     def forward(self, x: Float[Tensor, "batch c height width"]) -> Float[Tensor, "batch d h w"]:
-        inner = relu(normalized_convolution(self.conv1, self.norm1, x))
-        inner = normalized_convolution(self.conv2, self.norm2, inner)
+        inner = relu(convolve_and_normalize(self.conv1, self.norm1, x))
+        inner = convolve_and_normalize(self.conv2, self.norm2, inner)
         if self.shortcut_conv is not None and self.shortcut_norm is not None:
-            x = normalized_convolution(self.shortcut_conv, self.shortcut_norm, x)
+            x = convolve_and_normalize(self.shortcut_conv, self.shortcut_norm, x)
         return relu(x + inner)
 
 
@@ -174,8 +174,8 @@ class Fusion(nn.Module):
         self, panorama: Float[Tensor, "batch c height width"], faces: Float[Tensor, "batch c height width"]
     ) -> Float[Tensor, "batch c height width"]:
         both = torch.cat((panorama, faces), dim=1)
-        correction = relu(normalized_convolution(self.conv1, self.norm1, both))
-        correction = normalized_convolution(self.conv2, self.norm2, correction)
+        correction = relu(convolve_and_normalize(self.conv1, self.norm1, both))
+        correction = convolve_and_normalize(self.conv2, self.norm2, correction)
         return relu(self.join(torch.cat((panorama, faces + correction), dim=1)))
 
 

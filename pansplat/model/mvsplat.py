@@ -18,18 +18,18 @@ from torch.nn.functional import gelu, instance_norm, interpolate, relu
 
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import Border
-from pansplat.model.adapter import AdapterConfig, adapt
 from pansplat.model.cost_volume import (
     Depths,
     LevelDepth,
+    UNet,
+    UNetConfig,
     VolumeRefinement,
     correlate_views,
     first_candidates,
-    regress,
+    regress_depth,
 )
-from pansplat.model.feature_pyramid import normalize
-from pansplat.model.heads import TileGaussians
-from pansplat.model.lattice import lattice_uv, move_points
+from pansplat.model.feature_pyramid import Transformer, TransformerConfig, normalize
+from pansplat.model.heads import AdapterConfig, TileGaussians, adapt_gaussians
 from pansplat.model.layers import (
     AttentionPrecision,
     Compat,
@@ -38,8 +38,7 @@ from pansplat.model.layers import (
     require_views,
     upsample,
 )
-from pansplat.model.transformer import Transformer, TransformerConfig
-from pansplat.model.unet import UNet, UNetConfig
+from pansplat.model.tiles import lattice_uv, move_points
 
 _SCALE = 4  # the sweep's map is this many times smaller than the image
 _ENCODER_CHANNELS = (64, 64, 96, 96, 128, 128)  # of the residual blocks
@@ -61,7 +60,7 @@ class MVSplatConfig:
 
 
 @dataclass(frozen=True)
-class Matched:
+class MatchedViews:
     """What is known of the panoramas before a Gaussian is made.
 
     Attributes:
@@ -89,7 +88,7 @@ class MVSplatOutput:
     """
 
     gaussians: list[Gaussians]
-    matched: Matched
+    matched: MatchedViews
 
     @property
     def depths(self) -> Depths:
@@ -140,26 +139,28 @@ class MVSplat(nn.Module):
         Raises:
             InputError: too few views (or too many for the original), or a size that 16 does not divide.
         """
-        matched = self.match(images, cam2world, near, far)
-        (part,) = self.lift(matched)
+        matched = self.match_views(images, cam2world, near, far)
+        (part,) = self.lift_gaussians(matched)
         return MVSplatOutput(part.gaussians, matched)
 
-    def match(
+    def match_views(
         self,
         images: Float[Tensor, "batch view 3 height width"],
         cam2world: Float[Tensor, "batch view 4 4"],
         near: Float[Tensor, "batch view"],
         far: Float[Tensor, "batch view"],
-    ) -> Matched:
+    ) -> MatchedViews:
         """Features and depths of all views at 1/4 scale."""
         require_views(images.shape[1], self.compat)
         height, width = images.shape[-2:]
         require_size(height, width, 16)
         features, seen = self.features(images)
         swept = self.depth(features, cam2world, near, far)
-        return Matched(images, features, seen, Depths((swept,)), cam2world, near, far)
+        return MatchedViews(images, features, seen, Depths((swept,)), cam2world, near, far)
 
-    def lift(self, matched: Matched, *, tiles: int = 1, only: Sequence[int] | None = None) -> Iterator[TileGaussians]:
+    def lift_gaussians(
+        self, matched: MatchedViews, *, tiles: int = 1, only: Sequence[int] | None = None
+    ) -> Iterator[TileGaussians]:
         """All Gaussians in one part: the U-Net sees the whole panorama, so `tiles` and `only` have no say."""
         m, views = matched, matched.images.shape[1]
         images, swept = m.images.flatten(0, 1), m.depths.levels[-1]
@@ -205,7 +206,7 @@ class MVSplat(nn.Module):
         offsets, parameters = numbers.split((2, self.config.adapter.num_parameters), dim=-1)
         correction, opacity_logits = corrections.flatten(1)
         uv = lattice_uv("pixel", height).to(maps.device)
-        return adapt(
+        return adapt_gaussians(
             parameters,
             move_points(uv, offsets, "pixel", height),
             1 / (inverse_depth.flatten() + correction).clamp(*bounds),
@@ -305,7 +306,7 @@ class SweptDepth(nn.Module):
         inputs = torch.cat((volume, features), dim=2)
         refined = self.shortcut(inputs.flatten(0, 1)) + self.refine(inputs).flatten(0, 1)
         logits = self.head(refined).unflatten(0, features.shape[:2])
-        return regress(2, logits, candidates)
+        return regress_depth(2, logits, candidates)
 
 
 class FullSizeRefinement(nn.Module):

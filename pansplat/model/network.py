@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
-from typing import Any, Protocol, runtime_checkable
+from pathlib import Path
+from typing import Any, Protocol, get_args, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,8 +17,21 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import uv_from_directions
 from pansplat.model.cost_volume import Depths
-from pansplat.model.heads import TileGaussians, whole
-from pansplat.model.layers import Compat, require_views
+from pansplat.model.heads import TileGaussians, merge_tiles
+from pansplat.model.layers import AttentionPrecision, Compat, Precision, require_views
+from pansplat.model.mvsplat import MVSplat, MVSplatConfig
+from pansplat.model.pansplat import PanSplat, PanSplatConfig
+from pansplat.model.weights import (
+    CHECKPOINT_SUFFIXES,
+    CompatChoice,
+    WeightsFile,
+    config_from_dict,
+    convert_tensors,
+    load_weights,
+    match_tensors,
+    read_checkpoint,
+    require_shapes,
+)
 from pansplat.predictor import Progress
 
 _MIN_HEIGHT = 64
@@ -27,7 +41,7 @@ _MATCHED = 0.4  # fraction of the time that matching takes, for the progress rep
 
 
 @runtime_checkable
-class Matched(Protocol):
+class MatchedViews(Protocol):
     """What a network knows before it makes Gaussians."""
 
     @property
@@ -41,17 +55,19 @@ class Network(Protocol):
     config: Any
     compat: Compat
 
-    def match(
+    def match_views(
         self,
         images: Float[Tensor, "batch view 3 height width"],
         cam2world: Float[Tensor, "batch view 4 4"],
         near: Float[Tensor, "batch view"],
         far: Float[Tensor, "batch view"],
     ) -> Any:
-        """A `Matched`."""
+        """A `MatchedViews`."""
         ...
 
-    def lift(self, matched: Any, *, tiles: int = 1, only: Sequence[int] | None = None) -> Iterator[TileGaussians]:
+    def lift_gaussians(
+        self, matched: Any, *, tiles: int = 1, only: Sequence[int] | None = None
+    ) -> Iterator[TileGaussians]:
         """Gaussians tile by tile; in one part where the network knows no tiles."""
         ...
 
@@ -138,9 +154,9 @@ class NetworkPredictor:
         """
         matched, tiles = self._match(images, cam2world, near, far, masks, progress)
         parts = list(self._lift(matched, tiles, progress))
-        gaussians = whole(parts, self.network.compat)[0].to(device=images.device)
+        gaussians = merge_tiles(parts, self.network.compat)[0].to(device=images.device)
         if masks is not None:
-            gaussians = unmasked(gaussians, cam2world, masks)
+            gaussians = remove_masked_gaussians(gaussians, cam2world, masks)
         return gaussians, [depth[0].to(images.device) for depth in matched.depths.depth]
 
     def stream(
@@ -167,7 +183,7 @@ class NetworkPredictor:
                 if part is None:
                     return
                 gaussians = part.gaussians[0].to(device=images.device)
-                gaussians = gaussians if masks is None else unmasked(gaussians, cam2world, masks)
+                gaussians = gaussians if masks is None else remove_masked_gaussians(gaussians, cam2world, masks)
             yield gaussians
 
     def _match(
@@ -178,34 +194,34 @@ class NetworkPredictor:
         far: float | Tensor,
         masks: Tensor | None,
         progress: Progress | None,
-    ) -> tuple[Matched, int]:
+    ) -> tuple[MatchedViews, int]:
         """What the network knows of one item before it makes Gaussians, and the tiles to make them in."""
         views = len(images)
         low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (near, far))
-        tiles = self.tiles or automatic_tiles(images.shape[-2])
+        tiles = self.tiles or choose_tiles(images.shape[-2])
         _check(images, cam2world, low, high, masks, self.network.compat, tiles)
         if progress is not None:
             progress("matching views", 0.0)
         weight = next(self.network.parameters())
         pose = cam2world.to(device=weight.device, dtype=weight.dtype)
         near_views, far_views = (bound.to(weight).expand(views)[None] for bound in (low, high))
-        return self.network.match(images.to(weight)[None], pose[None], near_views, far_views), tiles
+        return self.network.match_views(images.to(weight)[None], pose[None], near_views, far_views), tiles
 
-    def _lift(self, matched: Matched, tiles: int, progress: Progress | None) -> Iterator[TileGaussians]:
+    def _lift(self, matched: MatchedViews, tiles: int, progress: Progress | None) -> Iterator[TileGaussians]:
         report = progress or (lambda what, fraction: None)
         report("making Gaussians", _MATCHED)
-        for done, part in enumerate(self.network.lift(matched, tiles=tiles), start=1):
+        for done, part in enumerate(self.network.lift_gaussians(matched, tiles=tiles), start=1):
             yield part
             report("making Gaussians", _MATCHED + (1 - _MATCHED) * min(1.0, done / tiles**2))
         report("done", 1.0)
 
 
-def automatic_tiles(height: int) -> int:
+def choose_tiles(height: int) -> int:
     """Tiles along each side: 1 up to 512 rows, 2 up to 1024, 4 above, as in the paper."""
     return 1 if height <= _UNTILED_HEIGHT else 2 if height <= 2 * _UNTILED_HEIGHT else 4
 
 
-def unmasked(
+def remove_masked_gaussians(
     gaussians: Gaussians, cam2world: Float[Tensor, "view 4 4"], masks: Bool[Tensor, "view height width"]
 ) -> Gaussians:
     """The Gaussians whose means their own view sees at a pixel that its mask keeps."""
@@ -250,3 +266,127 @@ def _check(
         raise InputError(
             f"`near` and `far` must satisfy 0 < near < far, got {near.tolist()} and {far.tolist()} (metres)"
         )
+
+
+_NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {
+    "pansplat": (PanSplat, PanSplatConfig),
+    "mvsplat": (MVSplat, MVSplatConfig),
+}
+
+
+def load_predictor(
+    path: str | Path,
+    compat: CompatChoice = "trained",
+    *,
+    precision: Precision = "float32",
+    attention_precision: AttentionPrecision = "float32",
+) -> NetworkPredictor:
+    """The predictor whose weights a file holds.
+
+    Args:
+        path: a .safetensors of `pansplat convert` or of training, or an original Lightning checkpoint.
+        compat: "official" computes what the original does, "fixed" corrects its defects, "trained" is the one that
+            the weights were trained with: for original checkpoints "official".
+        precision: number type of PanSplat's convolutions; see docs/bench_model.md for what bfloat16 costs and gains.
+        attention_precision: what attention rounds its inputs to; the original's was bfloat16.
+
+    Raises:
+        InputError: when the file cannot be used, or the processor has no instructions for bfloat16.
+    """
+    path = Path(path)
+    require_precision(precision)
+    weights = (
+        convert_checkpoint(read_checkpoint(path), path)
+        if path.suffix.lower() in CHECKPOINT_SUFFIXES
+        else load_weights(path)
+    )
+    network = build_network(
+        weights,
+        weights.compat if compat == "trained" else compat,
+        path,
+        precision=precision,
+        attention_precision=attention_precision,
+    )
+    return NetworkPredictor(weights.model, network)
+
+
+def convert_checkpoint(content: Mapping[str, object], source: object) -> WeightsFile:
+    """An original checkpoint's contents as a weights file.
+
+    Raises:
+        InputError: when it is not of an original, unmodified model.
+    """
+    tensors = convert_tensors(content, source)
+    model = match_tensors(content, source).model
+    weights = describe(model, _NETWORKS[model][1](), tensors, compat="official")
+    require_shapes(tensors, build_empty_network(weights, "official", source).state_dict(), source)
+    return weights
+
+
+def require_precision(precision: str) -> None:
+    """Refuse number types that this processor can only imitate, slowly.
+
+    Raises:
+        InputError: no such precision, or no instructions for it.
+    """
+    if precision not in get_args(Precision):
+        raise InputError(f"`precision` must be {' or '.join(get_args(Precision))}, got {precision!r}")
+    if precision == "bfloat16" and not has_bfloat16():
+        raise InputError(
+            "`precision` bfloat16 needs a processor with bfloat16 instructions (AVX512_BF16, AMX), this one has none "
+            "and would be slower than with float32; use float32"
+        )
+
+
+def has_bfloat16() -> bool:
+    """Whether the processor multiplies bfloat16 numbers by itself."""
+    tell = getattr(torch.cpu, "get_capabilities", None)
+    if tell is None:  # an older torch does not tell
+        return True
+    facts = tell()
+    return any(facts.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16"))
+
+
+def build_network(weights: WeightsFile, compat: Compat, source: object, **choices: Any) -> PanSplat | MVSplat:
+    """The network with its weights, in eval mode.
+
+    Args:
+        choices: the precisions, as `load_predictor` takes them.
+
+    Raises:
+        InputError: when the file's settings or tensors fit no network.
+    """
+    network = build_empty_network(weights, compat, source, **choices)
+    require_shapes(weights.tensors, network.state_dict(), source)
+    network.load_state_dict(weights.tensors, strict=True, assign=True)
+    return network.eval()
+
+
+def build_empty_network(
+    weights: WeightsFile,
+    compat: Compat,
+    source: object,
+    *,
+    precision: Precision = "float32",
+    attention_precision: AttentionPrecision = "float32",
+) -> PanSplat | MVSplat:
+    """The network without memory for its weights; random numbers are not drawn.
+
+    Raises:
+        InputError: when the file's settings fit no network.
+    """
+    if weights.model not in _NETWORKS:
+        raise InputError(f"{source}: needed weights of {' or '.join(_NETWORKS)}, got of {weights.model!r}")
+    kind, config_kind = _NETWORKS[weights.model]
+    try:
+        config = config_from_dict(config_kind, weights.config, f"{source}: config")
+    except InputError:
+        raise
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{source}: needed settings of a {weights.model} network, got '{error}'") from error
+    with torch.device("meta"):
+        if kind is PanSplat:
+            return PanSplat(config, compat, precision=precision, attention_precision=attention_precision)
+        if precision != "float32":
+            raise InputError(f"{source}: a {weights.model} network runs in float32 only, got precision {precision!r}")
+        return MVSplat(config, compat, attention_precision=attention_precision)

@@ -15,7 +15,7 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.model.cost_volume import CostVolumeConfig, Depths, SphericalCostVolume
 from pansplat.model.feature_pyramid import FeaturePyramid, FeaturePyramidConfig
 from pansplat.model.heads import GaussianHeads, HeadsConfig, TileGaussians
-from pansplat.model.layers import AttentionPrecision, Compat, Precision, convolving, resize
+from pansplat.model.layers import AttentionPrecision, Compat, Precision, autocast_convolutions, resize
 from pansplat.model.mono_depth import MonocularDepth
 
 MATCHING_HEIGHT = 512
@@ -42,7 +42,7 @@ class PanSplatConfig:
 
 
 @dataclass(frozen=True)
-class Matched:
+class MatchedViews:
     """What is known of the panoramas before a Gaussian is made."""
 
     images: Float[Tensor, "batch view 3 height width"]
@@ -64,7 +64,7 @@ class PanSplatOutput:
     """
 
     gaussians: list[Gaussians]
-    matched: Matched
+    matched: MatchedViews
 
     @property
     def depths(self) -> Depths:
@@ -115,30 +115,34 @@ class PanSplat(nn.Module):
         Raises:
             InputError: too few views (or too many for the original), or a size the pyramid cannot halve.
         """
-        matched = self.match(images, cam2world, near, far)
+        matched = self.match_views(images, cam2world, near, far)
         gaussians = self.heads(images, matched.features, matched.depths, cam2world, near, far, tiles=tiles)
         return PanSplatOutput(gaussians, matched)
 
-    def match(
+    def match_views(
         self,
         images: Float[Tensor, "batch view 3 height width"],
         cam2world: Float[Tensor, "batch view 4 4"],
         near: Float[Tensor, "batch view"],
         far: Float[Tensor, "batch view"],
-    ) -> Matched:
+    ) -> MatchedViews:
         """Features and depths of all views: everything before the heads."""
         features = self.features(self._matching_size(images))
         mono_features = None
         if self.mono_depth is not None:
-            with convolving(self.precision, images.device):
+            with autocast_convolutions(self.precision, images.device):
                 mono_features = self.mono_depth(images).to(images.dtype)
         depths = self.cost_volume(features, cam2world, near, far, mono_features)
-        return Matched(images, features, depths, cam2world, near, far)
+        return MatchedViews(images, features, depths, cam2world, near, far)
 
-    def lift(self, matched: Matched, *, tiles: int = 1, only: Sequence[int] | None = None) -> Iterator[TileGaussians]:
+    def lift_gaussians(
+        self, matched: MatchedViews, *, tiles: int = 1, only: Sequence[int] | None = None
+    ) -> Iterator[TileGaussians]:
         """Gaussians tile by tile, for bounded memory; `only` names the tiles wanted, row by row from 0."""
         m = matched
-        return self.heads.iterate(m.images, m.features, m.depths, m.cam2world, m.near, m.far, tiles=tiles, only=only)
+        return self.heads.iterate_tiles(
+            m.images, m.features, m.depths, m.cam2world, m.near, m.far, tiles=tiles, only=only
+        )
 
     def _matching_size(self, images: Float[Tensor, "batch view 3 height width"]) -> Float[Tensor, "batch view 3 h w"]:
         if images.shape[-2] <= MATCHING_HEIGHT:

@@ -10,15 +10,60 @@ Source: PanSplat, section 3.4.
 
 from __future__ import annotations
 
+import functools
+import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Integer
 from torch import Tensor
 from torch.nn import functional
 
-from pansplat.geometry.equirect import pad_equirect
+from pansplat.geometry.equirect import pad_equirect, uv_from_directions
+from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size, official_fibonacci_uv
 from pansplat.model.layers import Compat
+
+Lattice = Literal["fibonacci", "pixel"]
+_NARROWEST = 0.01  # at the poles a pixel is taken to be at most 100 times as wide in longitude
+
+
+@functools.lru_cache(maxsize=16)
+@torch.inference_mode(False)  # kept for calls that need gradients too
+def lattice_uv(lattice: Lattice, height: int, *, exact: bool = True) -> Float[Tensor, "n 2"]:
+    """Normalised panorama coordinates of the points of a level whose map is `height` x `2 height`, float64.
+
+    A Fibonacci lattice covers the sphere evenly, from the bottom pole up; pixels come row by row and crowd at the
+    poles. Not to be changed in place: calls share it.
+
+    Args:
+        exact: float64 throughout; otherwise the points of the original's float32 arithmetic.
+
+    Source: PanSplat, section 3.3.
+    """
+    if lattice == "pixel":
+        v, u = torch.meshgrid(
+            (torch.arange(height, dtype=torch.float64) + 0.5) / height,
+            (torch.arange(2 * height, dtype=torch.float64) + 0.5) / (2 * height),
+            indexing="ij",
+        )
+        return torch.stack((u, v), dim=-1).reshape(-1, 2)
+    count = lattice_size(2 * height)
+    return uv_from_directions(fibonacci_directions(count)) if exact else official_fibonacci_uv(count)
+
+
+def move_points(
+    uv: Float[Tensor, "n 2"], raw_offsets: Float[Tensor, "n 2"], lattice: Lattice, height: int
+) -> Float[Tensor, "n 2"]:
+    """Points moved by what the network says, at most half a map pixel each way; they may cross the seam or a pole.
+
+    On a Fibonacci lattice a pixel is as wide in longitude as it must be to span the same arc at every latitude.
+    """
+    width = torch.full_like(uv[:, 0], 2 * height)
+    if lattice == "fibonacci":
+        width = width * torch.sin(uv[:, 1] * math.pi).clamp_min(_NARROWEST)
+    pixel = torch.stack((1 / width, torch.full_like(width, 1 / height)), dim=-1)
+    return uv.to(raw_offsets) + (torch.sigmoid(raw_offsets) - 0.5) * pixel.to(raw_offsets)
 
 
 @dataclass(frozen=True)
@@ -30,7 +75,7 @@ class Window:
     height: int
     width: int
 
-    def grown(self, margin: int) -> Window:
+    def expand(self, margin: int) -> Window:
         """The window with a margin on all four sides."""
         return Window(self.top - margin, self.left - margin, self.height + 2 * margin, self.width + 2 * margin)
 
@@ -48,7 +93,7 @@ class Tile:
         rows, columns = height // self.grid, 2 * height // self.grid
         return Window(self.row * rows, self.column * columns, rows, columns)
 
-    def holds(self, uv: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:
+    def contains(self, uv: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:
         """Which points belong to it: each point of the panorama to exactly one tile."""
         cell = (uv * self.grid).floor().clamp(0, self.grid - 1)
         return (cell[:, 0] == self.column) & (cell[:, 1] == self.row)
@@ -80,7 +125,7 @@ def tile_grid(grid: int) -> list[Tile]:
     return [Tile(row, column, grid) for row in range(grid) for column in range(grid)]
 
 
-def cut(
+def crop_window(
     source: Float[Tensor, "channel h w"], height: int, window: Window, compat: Compat
 ) -> Float[Tensor, "channel rows columns"]:
     """A window into a panorama map resized to `height` x `2 height` (bilinear, without antialiasing).
@@ -107,7 +152,7 @@ def cut(
     return resized if bool(inside.all()) else resized * inside.to(resized)[:, None]
 
 
-def sample(
+def sample_window(
     window_map: Float[Tensor, "channel rows columns"],
     window: Window,
     height: int,
@@ -129,15 +174,15 @@ def sample(
     return functional.embedding_bag(corners.to(pixels.device), pixels, mode="sum", per_sample_weights=weights)
 
 
-def sample_whole(
+def sample_panorama(
     source: Float[Tensor, "channel h w"], uv: Float[Tensor, "n 2"], compat: Compat
 ) -> Float[Tensor, "n channel"]:
     """Bilinear samples of a whole map; the original repeats its last column at the seam (OFFICIAL.md, trap T7)."""
     height = source.shape[-2]
     window = Window(0, 0, height, 2 * height)
     if compat == "fixed":
-        window = window.grown(1)
-    return sample(cut(source, height, window, compat), window, height, uv)
+        window = window.expand(1)
+    return sample_window(crop_window(source, height, window, compat), window, height, uv)
 
 
 def _neighbours(

@@ -8,16 +8,208 @@ Source: OFFICIAL.md, section 15.
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import pickle
+import re
+import typing
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar
 
+import safetensors
+import safetensors.torch
 import torch
 from torch import Tensor
 
+from pansplat.atomic import replacing
 from pansplat.errors import InputError
 from pansplat.geometry.cubemap import strip_lookup
-from pansplat.model.checkpoint import state_dict_of
-from pansplat.model.official_names import Model, rows, tensor_names
+from pansplat.model.layers import Compat
+
+FORMAT = 1  # changes when names of tensors or the meaning of the metadata do
+
+CompatChoice = Literal["trained", "official", "fixed"]
+CHECKPOINT_SUFFIXES = (".ckpt", ".pt", ".pth")
+WEIGHTS_SUFFIXES = (".safetensors", *CHECKPOINT_SUFFIXES)
+COMPATS: dict[str, Compat] = {"official": "official", "fixed": "fixed"}
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class WeightsFile:
+    """What a weights file holds.
+
+    Attributes:
+        model: the network's name, such as "pansplat".
+        config: settings of its architecture.
+        compat: "official" where trained with the original's defects, "fixed" where without.
+        tensors: weights under our names.
+    """
+
+    model: str
+    config: dict[str, Any]
+    compat: Compat
+    tensors: dict[str, Tensor]
+
+
+def pack_weights(model: ModelName, config: object, tensors: dict[str, Tensor], *, compat: Compat) -> WeightsFile:
+    """Weights with what is needed to use them; `config` is the network's dataclass."""
+    assert dataclasses.is_dataclass(config) and not isinstance(config, type)
+    settings = json.loads(json.dumps(dataclasses.asdict(config)))  # lists for tuples, as a file gives them back
+    return WeightsFile(model, settings, compat, tensors)
+
+
+def save_weights(path: str | Path, weights: WeightsFile) -> None:
+    """Write a weights file; it appears whole or not at all.
+
+    Raises:
+        InputError: when the path does not end in .safetensors, or cannot be written.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".safetensors":
+        raise InputError(f"{path}: a weights file must end in .safetensors, got {path.suffix or 'no suffix'!r}")
+    metadata = {
+        "pansplat_format": str(FORMAT),
+        "model": weights.model,
+        "config": json.dumps(weights.config),
+        "compat": weights.compat,
+    }
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.tensors.items()}
+    with replacing(path) as partial:
+        safetensors.torch.save_file(tensors, partial, metadata)
+
+
+def load_weights(path: str | Path) -> WeightsFile:
+    """Read a weights file.
+
+    Raises:
+        InputError: when there is none, it is damaged, or it was not written by pansplat.
+    """
+    path = Path(path)
+    _require_file(path)
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # not a dict
+    except (safetensors.SafetensorError, OSError, ValueError) as error:
+        raise InputError(f"{path}: needed a whole .safetensors file, got '{error}'; {_guess(path)}") from error
+    if not {"pansplat_format", "model", "config", "compat"} <= metadata.keys():
+        raise InputError(
+            f"{path}: needed weights that `pansplat convert` or `pansplat-train` wrote, got a .safetensors file "
+            "without their metadata; convert the original checkpoint"
+        )
+    if metadata["pansplat_format"] != str(FORMAT):
+        raise InputError(
+            f"{path}: needed format {FORMAT} of weights files, got {metadata['pansplat_format']}; "
+            "use the pansplat version that wrote it, or convert the original checkpoint again"
+        )
+    try:
+        config, compat = json.loads(metadata["config"]), COMPATS[metadata["compat"]]
+    except (ValueError, KeyError) as error:
+        raise InputError(
+            f"{path}: needed settings in its metadata, got {error}; convert the checkpoint again"
+        ) from error
+    return WeightsFile(metadata["model"], config, compat, tensors)
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """The contents of a PyTorch (Lightning) checkpoint: tensors and plain values; nothing in it is run.
+
+    Raises:
+        InputError: when the file is missing, damaged, no checkpoint, or asks for code to be run.
+    """
+    path = Path(path)
+    _require_file(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of old pickle protocols
+            content = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        wanted = re.search(r"(?:GLOBAL|global|class|function) ([\w.]+\.[\w.]+)", str(error))
+        if wanted is None:
+            raise InputError(f"{path}: needed a PyTorch checkpoint, got other contents; {_guess(path)}") from error
+        raise InputError(
+            f"{path}: needed a checkpoint of tensors and plain values, got one that asks to run {wanted[1]}; nothing "
+            "was run. If you trust where it comes from, keep only its `state_dict`: "
+            "torch.save({'state_dict': torch.load(PATH, weights_only=False)['state_dict']}, NEW_PATH)"
+        ) from error
+    except MemoryError:
+        raise
+    except Exception as error:  # whatever the readers of zip and pickle stumble over in damaged bytes
+        raise InputError(f"{path}: needed a whole PyTorch checkpoint, got a damaged one; {_guess(path)}") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: needed a checkpoint with a `state_dict`, got a {type(content).__name__}")
+    return content
+
+
+def state_dict_of(content: Mapping[str, Any], path: str | Path) -> dict[str, Tensor]:
+    """The tensors by name of a Lightning checkpoint's contents.
+
+    Raises:
+        InputError: when there is no `state_dict`, or it holds anything but tensors.
+    """
+    state = content.get("state_dict")
+    if not isinstance(state, Mapping):
+        keys = ", ".join(str(key) for key in list(content)[:5])
+        raise InputError(f"{path}: needed a checkpoint with a `state_dict`, got one with {keys or 'nothing'}")
+    odd = [str(name) for name, value in state.items() if not isinstance(value, Tensor)]
+    if odd:
+        raise InputError(f"{path}: needed a `state_dict` of tensors, got others at {', '.join(odd[:3])}")
+    return {str(name): value for name, value in state.items()}
+
+
+def config_from_dict(kind: type[_T], values: Mapping[str, Any], where: str = "config") -> _T:
+    """A (nested) frozen dataclass of what `dataclasses.asdict` and JSON made of it.
+
+    Raises:
+        InputError: when a field is unknown or missing.
+    """
+    if not (dataclasses.is_dataclass(kind) and isinstance(values, Mapping)):
+        raise InputError(f"{where}: needed settings by name, got {values!r}")
+    fields = {field.name for field in dataclasses.fields(kind)}
+    if fields != values.keys():
+        unknown, missing = sorted(values.keys() - fields), sorted(fields - values.keys())
+        raise InputError(
+            f"{where}: needed the settings of this version, got unknown {unknown} and lacked {missing}; use the "
+            "pansplat version that wrote the file, or convert the original checkpoint again"
+        )
+    hints = typing.get_type_hints(kind)
+    return kind(**{name: _restore(hints[name], value, f"{where}.{name}") for name, value in values.items()})
+
+
+def _restore(hint: Any, value: Any, where: str) -> Any:
+    """A value as its field's type has it: JSON knows no dataclasses and no tuples."""
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        return config_from_dict(hint, value, where)
+    if typing.get_origin(hint) is tuple and isinstance(value, list):
+        inner = typing.get_args(hint)
+        return tuple(_restore(inner[0], item, where) for item in value)
+    if typing.get_origin(hint) is typing.Literal and value not in typing.get_args(hint):
+        raise InputError(f"{where}: needed one of {typing.get_args(hint)}, got {value!r}")
+    return value
+
+
+def _require_file(path: Path) -> None:
+    if not path.is_file():
+        raise InputError(f"{path}: needed a file of weights, got {'a folder' if path.exists() else 'nothing there'}")
+    if path.stat().st_size == 0:
+        raise InputError(f"{path}: needed a file of weights, got an empty file; download or copy it again")
+
+
+def _guess(path: Path) -> str:
+    """What the first bytes tell of a file that is not what it should be."""
+    with open(path, "rb") as file:
+        start = file.read(64).lstrip().lower()
+    if start.startswith((b"<!doctype", b"<html", b"<?xml", b"<head")):
+        return "it is a web page: download the file itself, not the page about it"
+    if start.startswith(b"version https://git-lfs"):
+        return "it is a Git LFS pointer: run `git lfs pull`"
+    return "download or copy it again"
+
 
 _PREFIX = "encoder."  # what Lightning puts before the names of the network's tensors
 _AUXILIARY = "losses.2.gaussian_head."
@@ -25,7 +217,7 @@ _SHOWN = 4  # names that an error lists
 
 
 @dataclass(frozen=True)
-class Report:
+class ConversionReport:
     """What became of a checkpoint's tensors.
 
     Attributes:
@@ -36,7 +228,7 @@ class Report:
         missing: the original's names that are not there.
     """
 
-    model: Model
+    model: ModelName
     used: dict[str, str]
     unused: dict[str, list[str]]
     surplus: list[str]
@@ -60,7 +252,7 @@ class Report:
             )
 
 
-def convert(content: Mapping[str, object], source: object) -> dict[str, Tensor]:
+def convert_tensors(content: Mapping[str, object], source: object) -> dict[str, Tensor]:
     """The tensors of an original checkpoint under our names.
 
     Args:
@@ -70,12 +262,12 @@ def convert(content: Mapping[str, object], source: object) -> dict[str, Tensor]:
     Raises:
         InputError: when tensors are missing, surplus, of wrong shape, or not finite.
     """
-    report = match(content, source)
+    report = match_tensors(content, source)
     report.require_complete(source)
     state = state_dict_of(content, str(source))
     _compare_derived(state, source)
     tensors = {}
-    for row in rows(report.model):
+    for row in name_table(report.model):
         for name, ours, squeezed in tensor_names(row):
             tensor = state[_PREFIX + name]
             tensor = tensor.squeeze(-1) if squeezed else tensor
@@ -87,7 +279,7 @@ def convert(content: Mapping[str, object], source: object) -> dict[str, Tensor]:
     return tensors
 
 
-def match(content: Mapping[str, object], source: object) -> Report:
+def match_tensors(content: Mapping[str, object], source: object) -> ConversionReport:
     """What would become of a checkpoint's tensors, problems included.
 
     Raises:
@@ -95,7 +287,7 @@ def match(content: Mapping[str, object], source: object) -> Report:
     """
     state = state_dict_of(content, str(source))
     model = _model_of(state, source)
-    expected = {_PREFIX + name: ours for row in rows(model) for name, ours, _ in tensor_names(row)}
+    expected = {_PREFIX + name: ours for row in name_table(model) for name, ours, _ in tensor_names(row)}
     derived = {_PREFIX + name for name in _derived(model)}
     auxiliary = {_AUXILIARY + name for name in _auxiliary_names()}
     unused = {
@@ -103,7 +295,7 @@ def match(content: Mapping[str, object], source: object) -> Report:
         "auxiliary heads, for training only": sorted(auxiliary & state.keys()),
         "state of the training": sorted(key for key in content if key != "state_dict"),
     }
-    return Report(
+    return ConversionReport(
         model=model,
         used={name: ours for name, ours in expected.items() if name in state},
         unused={reason: names for reason, names in unused.items() if names},
@@ -112,9 +304,9 @@ def match(content: Mapping[str, object], source: object) -> Report:
     )
 
 
-def official_names(model: Model) -> dict[str, str]:
+def official_names(model: ModelName) -> dict[str, str]:
     """Our name of each of the original's tensors (without the prefix "encoder.") that is used."""
-    return {name: ours for row in rows(model) for name, ours, _ in tensor_names(row)}
+    return {name: ours for row in name_table(model) for name, ours, _ in tensor_names(row)}
 
 
 def require_shapes(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], source: object) -> None:
@@ -142,7 +334,7 @@ def require_shapes(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor]
 # What is in checkpoints but not in the network
 
 
-def _derived(model: Model) -> dict[str, int]:
+def _derived(model: ModelName) -> dict[str, int]:
     """Stored lookup grids that are computed here: name and height of the panorama."""
     if model == "mvsplat":
         return {}
@@ -168,7 +360,7 @@ def _compare_derived(state: Mapping[str, Tensor], source: object) -> None:
             raise InputError(f"{source}: needed the original's grid in {name}, got another; the model was modified")
 
 
-def _model_of(state: Mapping[str, Tensor], source: object) -> Model:
+def _model_of(state: Mapping[str, Tensor], source: object) -> ModelName:
     if any(name.startswith("encoder.gaussian_head.") for name in state):
         return "pansplat"
     if any(name.startswith("encoder.backbone.backbone.") for name in state):
@@ -182,3 +374,198 @@ def _model_of(state: Mapping[str, Tensor], source: object) -> Model:
 def _some(names: Sequence[str] | Iterable[str]) -> str:
     names = list(names)
     return f"{len(names)} ({', '.join(names[:_SHOWN])}{', ...' if len(names) > _SHOWN else ''})"
+
+
+ModelName = Literal["pansplat", "mvsplat"]
+Row = tuple[str, str, tuple[str, ...]]  # the original's layer, our layer, its tensors
+
+_BARE = ("weight",)
+_FULL = ("weight", "bias")
+_POINTWISE = ("weight squeezed", "bias")  # a 1-D convolution over tokens there, a linear layer here
+_BATCH_NORM = ("weight", "bias", "running_mean", "running_var", "num_batches_tracked")
+
+
+def tensor_names(row: Row) -> Iterator[tuple[str, str, bool]]:
+    """The original's name, ours, and whether a last axis of 1 goes, for each tensor of a row."""
+    theirs, ours, kinds = row
+    for kind in kinds:
+        tensor, _, squeezed = kind.partition(" ")
+        yield f"{theirs}.{tensor}", f"{ours}.{tensor}", squeezed != ""
+
+
+def name_table(model: ModelName) -> Iterator[Row]:
+    """The table's rows of a network."""
+    if model == "mvsplat":
+        yield from _mvsplat()
+        return
+    yield from _feature_pyramid()
+    yield from _transformer("backbone.transformer", "features.transformer")
+    yield from _mono_depth()
+    yield from _cost_volume()
+    yield from _heads()
+
+
+def _feature_pyramid() -> Iterator[Row]:
+    encoder = (
+        ("conv00", "0.0"),
+        ("conv01", "0.1"),
+        ("downsample1", "1.0"),
+        ("conv10", "1.1"),
+        ("conv11", "1.2"),
+        ("downsample2", "2.0"),
+        ("conv20", "2.1"),
+        ("conv21", "2.2"),
+        ("downsample3", "3.0"),
+        ("conv30", "3.1"),
+        ("conv31", "3.2"),
+    )
+    for theirs, ours in encoder:
+        yield f"backbone.encoder.{theirs}.conv", f"features.encoder.levels.{ours}.conv", _BARE
+        yield f"backbone.encoder.{theirs}.bn", f"features.encoder.levels.{ours}.norm", _BATCH_NORM
+    for stage in range(4):
+        theirs, ours = f"backbone.decoder.out{stage}", f"features.decoder.outputs.{3 - stage}"
+        yield f"{theirs}.0", f"{ours}.conv", _FULL
+        yield f"{theirs}.1", f"{ours}.norm", _BATCH_NORM
+    for stage in (1, 2, 3):
+        yield f"backbone.decoder.inner{stage}", f"features.decoder.laterals.{3 - stage}", _FULL
+
+
+def _transformer(theirs: str, ours: str) -> Iterator[Row]:
+    for block in range(6):
+        old, new = f"{theirs}.layers.{block}", f"{ours}.blocks.{block}"
+        for layer, attention in (("self_attn", "within"), ("cross_attn_ffn", "across")):
+            yield f"{old}.{layer}.q_proj", f"{new}.{attention}.query", _BARE
+            yield f"{old}.{layer}.k_proj", f"{new}.{attention}.key", _BARE
+            yield f"{old}.{layer}.v_proj", f"{new}.{attention}.value", _BARE
+            yield f"{old}.{layer}.merge", f"{new}.{attention}.merge", _BARE
+            yield f"{old}.{layer}.norm1", f"{new}.{attention}.norm", _FULL
+        yield f"{old}.cross_attn_ffn.mlp.0", f"{new}.widen", _BARE
+        yield f"{old}.cross_attn_ffn.mlp.2", f"{new}.narrow", _BARE
+        yield f"{old}.cross_attn_ffn.norm2", f"{new}.norm", _FULL
+
+
+def _mono_depth() -> Iterator[Row]:
+    yield "mono_depth", "mono_depth", ("max_depth",)
+    yield from _resnet18("mono_depth.equi_encoder", "mono_depth.panorama_encoder")
+    yield from _resnet18("mono_depth.cube_encoder", "mono_depth.face_encoder")
+    theirs, ours = "mono_depth.equi_decoder", "mono_depth.decoder"
+    for scale in (5, 4, 3, 2, 1):
+        yield f"{theirs}.fusion_{scale}.res_conv1", f"{ours}.fuse.{scale}.conv1", _BARE
+        yield f"{theirs}.fusion_{scale}.res_bn1", f"{ours}.fuse.{scale}.norm1", _BATCH_NORM
+        yield f"{theirs}.fusion_{scale}.res_conv2", f"{ours}.fuse.{scale}.conv2", _BARE
+        yield f"{theirs}.fusion_{scale}.res_bn2", f"{ours}.fuse.{scale}.norm2", _BATCH_NORM
+        yield f"{theirs}.fusion_{scale}.conv", f"{ours}.fuse.{scale}.join", _BARE
+    for scale in (5, 4, 3, 2):
+        yield f"{theirs}.upconv_{scale}.conv.conv", f"{ours}.up.{scale}", _FULL
+        yield f"{theirs}.deconv_{scale - 1}.conv.conv", f"{ours}.merge.{scale - 1}", _FULL
+    yield f"{theirs}.upconv_1.conv.conv", f"{ours}.head.0", _FULL
+    yield f"{theirs}.deconv_0.conv.conv", f"{ours}.head.3", _FULL
+    yield f"{theirs}.depthconv_0.conv", f"{ours}.head.5", _FULL
+
+
+def _resnet18(theirs: str, ours: str) -> Iterator[Row]:
+    yield f"{theirs}.conv1", f"{ours}.stem", _BARE
+    yield f"{theirs}.bn1", f"{ours}.stem_norm", _BATCH_NORM
+    for stage in range(4):
+        for block in (0, 1):
+            old, new = f"{theirs}.layer{stage + 1}.{block}", f"{ours}.stages.{stage}.{block}"
+            for layer in (1, 2):
+                yield f"{old}.conv{layer}", f"{new}.conv{layer}", _BARE
+                yield f"{old}.bn{layer}", f"{new}.norm{layer}", _BATCH_NORM
+        if stage > 0:
+            old, new = f"{theirs}.layer{stage + 1}.0.downsample", f"{ours}.stages.{stage}.0"
+            yield f"{old}.0", f"{new}.shortcut_conv", _BARE
+            yield f"{old}.1", f"{new}.shortcut_norm", _BATCH_NORM
+
+
+def _cost_volume() -> Iterator[Row]:
+    for stage in range(3):
+        ours = f"cost_volume.levels.{3 - stage}"
+        yield from _refinement(f"depth_predictor.corr_refine_nets.{stage}", f"{ours}.refine", scales=3)
+        yield f"depth_predictor.regressor_residuals.{stage}", f"{ours}.shortcut", _FULL
+        yield f"depth_predictor.depth_heads.{stage}.0", f"{ours}.head.0", _FULL
+        yield f"depth_predictor.depth_heads.{stage}.2", f"{ours}.head.2", _FULL
+
+
+def _refinement(theirs: str, ours: str, scales: int) -> Iterator[Row]:
+    yield f"{theirs}.0", f"{ours}.entry", _FULL
+    yield f"{theirs}.1", f"{ours}.norm", _FULL
+    yield from _unet(f"{theirs}.3", f"{ours}.unet", scales)
+    yield f"{theirs}.4", f"{ours}.exit", _FULL
+
+
+def _unet(theirs: str, ours: str, scales: int) -> Iterator[Row]:
+    last = scales - 1
+    yield f"{theirs}.input_blocks.0.0", f"{ours}.stem", _FULL
+    for scale in range(scales):
+        yield from _res_block(f"{theirs}.input_blocks.{2 * scale + 1}.0", f"{ours}.encoder.{scale}.block")
+    for scale in range(last):
+        yield f"{theirs}.input_blocks.{2 * scale + 2}.0.op", f"{ours}.encoder.{scale}.downsample", _FULL
+    yield from _attention(f"{theirs}.input_blocks.{2 * last + 1}.1", f"{ours}.encoder.{last}.attention")
+    yield from _res_block(f"{theirs}.middle_block.0", f"{ours}.middle.0")
+    yield from _res_block(f"{theirs}.middle_block.2", f"{ours}.middle.1")
+    for scale in range(scales):
+        for block in (0, 1):
+            old = f"{theirs}.output_blocks.{2 * (last - scale) + block}"
+            new = f"{ours}.decoder.{scale}"
+            yield from _res_block(f"{old}.0", f"{new}.blocks.{block}")
+            yield f"{old}.0.skip_connection", f"{new}.blocks.{block}.shortcut", _FULL
+            if scale == last:
+                yield from _attention(f"{old}.1", f"{new}.attentions.{block}")
+        if scale > 0:
+            position = 2 if scale == last else 1
+            yield f"{old}.{position}.conv", f"{new}.upsample", _FULL
+    yield f"{theirs}.out.0", f"{ours}.exit.conv", _FULL
+    yield f"{theirs}.out.1", f"{ours}.exit.norm", _FULL
+
+
+def _res_block(theirs: str, ours: str) -> Iterator[Row]:
+    yield f"{theirs}.in_layers.0", f"{ours}.first.conv", _FULL
+    yield f"{theirs}.in_layers.1", f"{ours}.first.norm", _FULL
+    yield f"{theirs}.out_layers.0", f"{ours}.second.conv", _FULL
+    yield f"{theirs}.out_layers.1", f"{ours}.second.norm", _FULL
+
+
+def _attention(theirs: str, ours: str) -> Iterator[Row]:
+    yield f"{theirs}.qkv", f"{ours}.project_in", _POINTWISE
+    yield f"{theirs}.proj_out", f"{ours}.project_out", _POINTWISE
+    yield f"{theirs}.norm", f"{ours}.norm", _FULL
+
+
+def _heads() -> Iterator[Row]:
+    for stage in range(4):
+        for layer in range(3):
+            theirs = f"gaussian_head.to_gaussians_list.{stage}.{2 * layer}"
+            yield theirs, f"heads.levels.{stage}.convs.{layer}", _FULL
+        yield f"gaussian_head.gaussians_mlp_list.{stage}.0", f"heads.levels.{stage}.linear", _FULL
+
+
+def _mvsplat() -> Iterator[Row]:
+    yield from _mvsplat_encoder()
+    yield from _transformer("backbone.transformer", "features.transformer")
+    theirs, ours = "depth_predictor", "depth"
+    yield from _refinement(f"{theirs}.corr_refine_net", f"{ours}.refine", scales=3)
+    yield f"{theirs}.regressor_residual", f"{ours}.shortcut", _FULL
+    yield f"{theirs}.depth_head_lowres.0", f"{ours}.head.0", _FULL
+    yield f"{theirs}.depth_head_lowres.2", f"{ours}.head.2", _FULL
+    yield f"{theirs}.upsampler.0", "upsampler", _FULL
+    yield f"{theirs}.proj_feature", "project", _FULL
+    yield f"{theirs}.refine_unet.0", "refine.entry", _FULL
+    yield f"{theirs}.refine_unet.1", "refine.norm", _FULL
+    yield from _unet(f"{theirs}.refine_unet.3", "refine.unet", scales=5)
+    for layer in (0, 2):
+        yield f"{theirs}.to_gaussians.{layer}", f"to_gaussians.{layer}", _FULL
+        yield f"{theirs}.to_disparity.{layer}", f"to_depth.{layer}", _FULL
+
+
+def _mvsplat_encoder() -> Iterator[Row]:
+    theirs, ours = "backbone.backbone", "features.encoder"
+    yield f"{theirs}.conv1", f"{ours}.stem", _BARE
+    for stage in range(3):
+        for block in (0, 1):
+            for layer in (1, 2):
+                old = f"{theirs}.layer{stage + 1}.{block}.conv{layer}"
+                yield old, f"{ours}.blocks.{2 * stage + block}.conv{layer}", _BARE
+        if stage > 0:
+            yield f"{theirs}.layer{stage + 1}.0.downsample.0", f"{ours}.blocks.{2 * stage}.shortcut.0", _FULL
+    yield f"{theirs}.conv2", f"{ours}.exit", _FULL

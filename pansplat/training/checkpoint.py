@@ -18,7 +18,7 @@ import torch
 
 from pansplat.atomic import replacing
 from pansplat.errors import InputError
-from pansplat.model.checkpoint import COMPATS, WeightsFile, read_checkpoint
+from pansplat.model.weights import COMPATS, WeightsFile, read_checkpoint
 
 _KIND, _FORMAT = "pansplat-training", 1
 _NAME = re.compile(r"step_(\d{8})\.pt")

@@ -28,7 +28,7 @@ from jaxtyping import Float, Integer
 from torch import Tensor
 
 from pansplat.gaussians.scene import Gaussians
-from pansplat.model.heads import TileGaussians, whole
+from pansplat.model.heads import TileGaussians, merge_tiles
 from pansplat.model.network import Network
 from pansplat.model.pansplat import PanSplat
 from pansplat.training.rendering import ImagePart, TargetRenderer
@@ -70,7 +70,7 @@ def whole_loss(
         tiles, matching_is_trainable: as in `backpropagate`.
     """
     matched = _match(problem, network, matching_is_trainable)
-    scenes = whole(list(network.lift(matched, tiles=tiles)), network.compat)
+    scenes = merge_tiles(list(network.lift_gaussians(matched, tiles=tiles)), network.compat)
     loss = problem.picture_loss(_draw(scenes, problem, renderer))
     return loss + _number(problem.map_loss(matched))
 
@@ -93,9 +93,9 @@ def backpropagate(
     """
     maps = Cut.of(_match(problem, network, matching_is_trainable))
     with torch.no_grad():
-        tiled = [Cut.of(part, everything=True).copy for part in network.lift(maps.copy, tiles=tiles)]
+        tiled = [Cut.of(part, everything=True).copy for part in network.lift_gaussians(maps.copy, tiles=tiles)]
     if method == "one-step":
-        loss = problem.picture_loss(_draw(whole(tiled, network.compat), problem, renderer))
+        loss = problem.picture_loss(_draw(merge_tiles(tiled, network.compat), problem, renderer))
         (share * loss).backward()
     else:
         ordered = network.compat == "fixed"
@@ -115,7 +115,7 @@ def backpropagate(
 
 def _match(problem: Problem, network: Network, matching_is_trainable: bool) -> Any:
     with torch.set_grad_enabled(matching_is_trainable):
-        return network.match(problem.images, problem.cam2world, problem.near, problem.far)
+        return network.match_views(problem.images, problem.cam2world, problem.near, problem.far)
 
 
 def _draw(scenes: list[Gaussians], problem: Problem, renderer: TargetRenderer) -> Float[Tensor, "batch target 3 h w"]:
@@ -235,7 +235,7 @@ def _lift_again(network: Network, matched: Any, item: int, view: int | None, til
     """A tile's Gaussians of one item and view, in the order that they have among the tile's."""
     views = slice(None) if view is None else slice(view, view + 1)
     own = _mapped(matched, lambda maps: maps[item : item + 1, views])
-    (part,) = network.lift(own, tiles=tiles, only=[number] if tiles > 1 else None)
+    (part,) = network.lift_gaussians(own, tiles=tiles, only=[number] if tiles > 1 else None)
     return part.gaussians[0]
 
 

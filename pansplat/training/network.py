@@ -9,17 +9,21 @@ import torch
 from torch import nn
 
 from pansplat.errors import InputError
-from pansplat.model.adapter import AdapterConfig
-from pansplat.model.auxiliary_heads import AUXILIARY_HEADS, AuxiliaryHeads
-from pansplat.model.checkpoint import CHECKPOINTS, WeightsFile, load_weights, read_checkpoint, save_weights
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
-from pansplat.model.feature_pyramid import FeaturePyramidConfig
-from pansplat.model.heads import HeadsConfig
-from pansplat.model.loading import describe, from_original, require_precision
+from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
+from pansplat.model.heads import AUXILIARY_HEADS, AdapterConfig, AuxiliaryHeads, HeadsConfig
 from pansplat.model.mvsplat import MVSplat
+from pansplat.model.network import convert_checkpoint, require_precision
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
-from pansplat.model.transformer import TransformerConfig
-from pansplat.model.weights import require_shapes
+from pansplat.model.weights import (
+    CHECKPOINT_SUFFIXES,
+    WeightsFile,
+    load_weights,
+    pack_weights,
+    read_checkpoint,
+    require_shapes,
+    save_weights,
+)
 from pansplat.training.checkpoint import is_training_state, weights_of
 from pansplat.training.config import NetworkConfig, NetworkShape
 
@@ -92,17 +96,17 @@ def read_weights(path: Path) -> WeightsFile:
     Raises:
         InputError: when the file cannot be used; one that asks for code to be run is refused.
     """
-    if path.suffix.lower() not in CHECKPOINTS:
+    if path.suffix.lower() not in CHECKPOINT_SUFFIXES:
         return load_weights(path)
     content = read_checkpoint(path)
-    return weights_of(content, path) if is_training_state(content) else from_original(content, path)
+    return weights_of(content, path) if is_training_state(content) else convert_checkpoint(content, path)
 
 
 def write_weights(path: Path, network: PanSplat | MVSplat, state: dict[str, torch.Tensor] | None = None) -> None:
     """The network's weights, or another state of it, as `--model` takes them."""
     model = "mvsplat" if isinstance(network, MVSplat) else "pansplat"
     tensors = dict(network.state_dict() if state is None else state)
-    save_weights(path, describe(model, network.config, tensors, compat=network.compat))
+    save_weights(path, pack_weights(model, network.config, tensors, compat=network.compat))
 
 
 def freeze(network: nn.Module, parts: tuple[str, ...]) -> None:

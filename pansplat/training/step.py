@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from pansplat.data.views import Batch
-from pansplat.model.auxiliary_heads import AuxiliaryHeads
+from pansplat.model.heads import AuxiliaryHeads
 from pansplat.model.mvsplat import MVSplat
 from pansplat.model.pansplat import PanSplat
 from pansplat.training.config import MemoryConfig

@@ -20,8 +20,8 @@ from pansplat.atomic import replacing
 from pansplat.data.loader import Loader
 from pansplat.data.views import Batch
 from pansplat.errors import InputError
-from pansplat.model.loading import describe
 from pansplat.model.mvsplat import MVSplat
+from pansplat.model.weights import pack_weights
 from pansplat.training import validation
 from pansplat.training.checkpoint import load_latest, save_checkpoint
 from pansplat.training.config import TrainConfig, as_json, require_same
@@ -240,7 +240,7 @@ class Trainer:
 
     def _state(self) -> dict[str, Any]:
         model = "mvsplat" if isinstance(self.network, MVSplat) else "pansplat"
-        weights = describe(model, self.network.config, {}, compat=self.network.compat)
+        weights = pack_weights(model, self.network.config, {}, compat=self.network.compat)
         described = {"model": weights.model, "config": weights.config, "compat": weights.compat}
         return {
             "config": as_json(self.config),

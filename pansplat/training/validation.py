@@ -14,7 +14,7 @@ from pansplat.data.sources import SampleSource
 from pansplat.data.views import Sample, collate
 from pansplat.errors import InputError
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
-from pansplat.model.heads import whole
+from pansplat.model.heads import merge_tiles
 from pansplat.model.mvsplat import MVSplat
 from pansplat.model.pansplat import PanSplat
 from pansplat.training.rendering import TargetRenderer
@@ -66,8 +66,8 @@ def _measure(
     """The measures of a sample's first target, and the picture drawn of it."""
     weight = next(network.parameters())
     batch = as_type(collate([sample]), weight.dtype).to(weight.device)
-    matched = network.match(batch.images, batch.cam2world, batch.near, batch.far)
-    (scene,) = whole(list(network.lift(matched, tiles=tiles)), network.compat)
+    matched = network.match_views(batch.images, batch.cam2world, batch.near, batch.far)
+    (scene,) = merge_tiles(list(network.lift_gaussians(matched, tiles=tiles)), network.compat)
     drawn = renderer.render(scene, batch.target_cam2world[0, 0], batch.cam2world[0])
     truth = batch.target_images[0, 0]
     error = math.nan

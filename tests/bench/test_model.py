@@ -20,14 +20,12 @@ from pansplat.bench.model_weights import save_random_weights
 from pansplat.cli import bench_model as command
 from pansplat.cli import run
 from pansplat.errors import InputError
-from pansplat.model.adapter import AdapterConfig
-from pansplat.model.checkpoint import load_weights
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
-from pansplat.model.feature_pyramid import FeaturePyramidConfig
-from pansplat.model.heads import HeadsConfig
-from pansplat.model.loading import build_network, has_bfloat16
+from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
+from pansplat.model.heads import AdapterConfig, HeadsConfig
+from pansplat.model.network import build_network, has_bfloat16
 from pansplat.model.pansplat import PanSplatConfig
-from pansplat.model.transformer import TransformerConfig
+from pansplat.model.weights import load_weights
 
 SMALL = PanSplatConfig(
     features=FeaturePyramidConfig(channels=(8, 8, 16, 32), transformer=TransformerConfig(channels=32, blocks=2)),

@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from pansplat.cli import run
-from pansplat.model.checkpoint import load_weights
+from pansplat.model.weights import load_weights
 from pansplat.pipeline import load
 from pansplat_viewer.library import LoadOptions, find_entries, load_entry
 

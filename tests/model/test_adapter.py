@@ -10,7 +10,7 @@ from pansplat.gaussians.harmonics import evaluate_harmonics, harmonics_basis, ro
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import directions_from_uv, uv_from_directions
 from pansplat.geometry.pose import rotations_from_quats
-from pansplat.model.adapter import AdapterConfig, adapt
+from pansplat.model.heads import AdapterConfig, adapt_gaussians
 
 
 def _random(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -27,7 +27,7 @@ def _pose(seed: int = 5) -> torch.Tensor:
 def _adapt(cam2world: torch.Tensor, compat="fixed", colors=None, parameters=None, degree: int = 4) -> Gaussians:
     config = AdapterConfig(degree=degree)
     count = 30
-    return adapt(
+    return adapt_gaussians(
         _random(count, config.num_parameters) if parameters is None else parameters,
         _random(count, 2, seed=1).sigmoid(),
         _random(count, seed=2).exp(),
@@ -138,7 +138,7 @@ def test_gradients_reach_every_number():
     pose = _pose()
 
     def of(parameters: torch.Tensor, uv: torch.Tensor, depths: torch.Tensor, colors: torch.Tensor) -> tuple:
-        gaussians = adapt(
+        gaussians = adapt_gaussians(
             parameters, uv, depths, torch.ones_like(depths), pose, map_height=8, colors=colors, level=0, view=0,
             config=AdapterConfig(degree=1), compat="fixed",
         )  # fmt: skip

@@ -11,7 +11,7 @@ import safetensors.torch
 import torch
 
 from pansplat.errors import InputError
-from pansplat.model.checkpoint import (
+from pansplat.model.weights import (
     WeightsFile,
     config_from_dict,
     load_weights,

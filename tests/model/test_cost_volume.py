@@ -11,10 +11,10 @@ from pansplat.model.cost_volume import (
     CostVolumeConfig,
     SphericalCostVolume,
     SweepLevel,
-    candidates_about,
+    candidates_around,
     correlate_views,
     first_candidates,
-    regress,
+    regress_depth,
 )
 from pansplat.model.feature_pyramid import FeaturePyramid, FeaturePyramidConfig
 
@@ -116,7 +116,7 @@ def test_the_first_candidates_run_evenly_from_far_to_near():
 
 def test_later_candidates_lie_about_the_centre_within_the_bounds():
     centre = torch.tensor((0.2, 1.0)).double().expand(1, 2, 3, 2)
-    candidates = candidates_about(centre, torch.full((1, 2), 0.1).double(), _BOUNDS, 4)
+    candidates = candidates_around(centre, torch.full((1, 2), 0.1).double(), _BOUNDS, 4)
     assert torch.allclose(candidates[0, 0, :, 0, 0], torch.tensor((0.1, 0.1, 0.2, 0.3)).double())
     assert torch.allclose(candidates[0, 0, :, 0, 1], torch.tensor((0.8, 0.9, 1.0, 1.1)).double())
 
@@ -133,7 +133,7 @@ def test_a_certain_candidate_is_the_result():
     candidates = first_candidates(_BOUNDS, 5, (2, 4))
     logits = torch.full((1, 2, 5, 2, 4), -1e4).double()
     logits[:, :, 3] = 1e4
-    level = regress(1, logits, candidates)
+    level = regress_depth(1, logits, candidates)
     assert torch.equal(level.inverse_depth, candidates[:, :, 3])
     assert torch.equal(level.depth, 1 / candidates[:, :, 3])
     assert torch.equal(level.confidence, torch.ones(1, 2, 2, 4).double())

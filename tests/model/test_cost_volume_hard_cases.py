@@ -15,7 +15,7 @@ from pansplat.model.cost_volume import (
     SweepLevel,
     correlate_views,
     first_candidates,
-    regress,
+    regress_depth,
 )
 
 _CONFIG = CostVolumeConfig(mono_channels=0, levels=(SweepLevel(2, 8, 6, 32), SweepLevel(1, 4, 4, 32)))
@@ -67,7 +67,7 @@ def test_38_without_a_baseline_identical_views_match_fully():
 
 def test_38_a_constant_cost_gives_the_mean_inverse_depth():
     candidates = _candidates(*_bounds())
-    level = regress(2, torch.zeros(1, 2, 6, H, W).double(), candidates)
+    level = regress_depth(2, torch.zeros(1, 2, 6, H, W).double(), candidates)
     assert torch.allclose(level.inverse_depth, candidates.mean(dim=2), atol=1e-14)
 
 
@@ -174,7 +174,7 @@ def test_42_huge_logits_in_half_precision_choose_one_candidate(dtype):
     candidates = _candidates(*(bound.float() for bound in _bounds()))
     logits = torch.full((1, 2, 6, H, W), -1e4, dtype=dtype)
     logits[:, :, 4] = 1e4
-    level = regress(2, logits.requires_grad_(), candidates)
+    level = regress_depth(2, logits.requires_grad_(), candidates)
     assert level.inverse_depth.dtype == torch.float32
     assert torch.equal(level.inverse_depth, candidates[:, :, 4])
     level.inverse_depth.sum().backward()
@@ -184,7 +184,7 @@ def test_42_huge_logits_in_half_precision_choose_one_candidate(dtype):
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_42_the_mean_is_taken_in_float32(dtype):
     candidates = _candidates(*(bound.float() for bound in _bounds()))
-    level = regress(2, torch.zeros(1, 2, 6, H, W, dtype=dtype), candidates)
+    level = regress_depth(2, torch.zeros(1, 2, 6, H, W, dtype=dtype), candidates)
     assert torch.allclose(level.inverse_depth, candidates.mean(dim=2), rtol=1e-6)
 
 
@@ -246,7 +246,7 @@ def test_44_over_a_depth_ratio_of_10000_each_candidate_can_be_told_exactly():
     for index in (0, 1, 64, 127):
         logits = torch.full((1, 2, 128, H, W), -1e4)
         logits[:, :, index] = 1e4
-        assert torch.equal(regress(3, logits, candidates).inverse_depth, candidates[:, :, index])
+        assert torch.equal(regress_depth(3, logits, candidates).inverse_depth, candidates[:, :, index])
 
 
 def test_44_over_a_depth_ratio_of_10000_a_float32_warp_is_as_exact_as_over_10():

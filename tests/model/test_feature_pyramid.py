@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.model.feature_pyramid import FeaturePyramid, FeaturePyramidConfig
-from pansplat.model.transformer import TransformerConfig
+from pansplat.model.feature_pyramid import FeaturePyramid, FeaturePyramidConfig, TransformerConfig
 
 _SMALL = FeaturePyramidConfig(channels=(8, 8, 8, 16), transformer=TransformerConfig(16, blocks=2, expansion=1))
 

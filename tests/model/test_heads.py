@@ -11,10 +11,8 @@ from pansplat.gaussians.harmonics import rotate_harmonics
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.fibonacci import lattice_size
 from pansplat.geometry.pose import rotations_from_quats
-from pansplat.model.adapter import AdapterConfig
-from pansplat.model.auxiliary_heads import AUXILIARY_HEADS, AuxiliaryHeads
 from pansplat.model.cost_volume import Depths, LevelDepth
-from pansplat.model.heads import GaussianHeads, HeadsConfig
+from pansplat.model.heads import AUXILIARY_HEADS, AdapterConfig, AuxiliaryHeads, GaussianHeads, HeadsConfig
 from pansplat.model.weights import official_names
 
 SMALL = HeadsConfig(feature_channels=(6, 5, 4, 3), candidates=4, adapter=AdapterConfig(degree=1))
@@ -89,7 +87,7 @@ def test_the_originals_tiles_change_its_output():
     heads, inputs = _heads(compat="official"), _inputs()
     with torch.no_grad():
         whole = heads(*inputs)[0]
-        parts = list(heads.iterate(*inputs, tiles=2))
+        parts = list(heads.iterate_tiles(*inputs, tiles=2))
         tiled = Gaussians.cat([part.gaussians[0] for part in parts])
         assert _difference(heads(*inputs, tiles=2)[0], tiled) == 0  # tile by tile, as it orders them
         index = torch.cat([part.index for part in parts])
@@ -105,7 +103,7 @@ def test_one_tile_made_again_is_the_same_with_gradients():
     expected = [parameter.grad.clone() for parameter in heads.parameters()]
     heads.zero_grad()
     for number in range(4):
-        (part,) = heads.iterate(*inputs, tiles=2, only=[number])
+        (part,) = heads.iterate_tiles(*inputs, tiles=2, only=[number])
         assert _difference(part.gaussians[0], whole.select(part.index)) < 1e-12
         (part.gaussians[0].means * weights[part.index]).sum().backward()
     for parameter, gradient in zip(heads.parameters(), expected, strict=True):
@@ -115,7 +113,7 @@ def test_one_tile_made_again_is_the_same_with_gradients():
 def test_tiles_hold_every_gaussian_once():
     heads, inputs = _heads(), _inputs(views=3)
     with torch.no_grad():
-        index = torch.cat([part.index for part in heads.iterate(*inputs, tiles=4)])
+        index = torch.cat([part.index for part in heads.iterate_tiles(*inputs, tiles=4)])
     assert torch.equal(index.sort().values, torch.arange(3 * sum(lattice_size(128 >> level) for level in range(4))))
 
 

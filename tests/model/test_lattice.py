@@ -7,7 +7,7 @@ import torch
 
 from pansplat.geometry.equirect import directions_from_uv
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
-from pansplat.model.lattice import lattice_uv, move_points
+from pansplat.model.tiles import lattice_uv, move_points
 
 
 def test_fibonacci_points_are_the_geometrys():

@@ -12,7 +12,7 @@ from pansplat.model.layers import (
     PanoramaConv2d,
     attend,
     border_of,
-    normalized_convolution,
+    convolve_and_normalize,
     require_rigid,
     require_size,
     require_views,
@@ -73,9 +73,9 @@ def test_a_normalised_convolution_is_one_convolution_outside_training(randomize,
     norm.running_mean.copy_(_noise(4))
     norm.running_var.copy_(_noise(4).square())
     maps = _noise(2, 3, 4, 8)
-    assert torch.allclose(normalized_convolution(conv, norm, maps), norm(conv(maps)), atol=1e-13)
+    assert torch.allclose(convolve_and_normalize(conv, norm, maps), norm(conv(maps)), atol=1e-13)
     norm.train()
-    result = normalized_convolution(conv, norm, maps)
+    result = convolve_and_normalize(conv, norm, maps)
     assert torch.allclose(result.mean(dim=(0, 2, 3)), norm.bias, atol=1e-12)
 
 

@@ -9,12 +9,17 @@ import torch
 from torch import Tensor
 
 from pansplat.errors import InputError
-from pansplat.model.checkpoint import WeightsFile, save_weights
-from pansplat.model.loading import build_empty, build_network, describe, from_original, load_predictor
+from pansplat.model.feature_pyramid import TransformerConfig
 from pansplat.model.mvsplat import MVSplat, MVSplatConfig
-from pansplat.model.network import NetworkPredictor
+from pansplat.model.network import (
+    NetworkPredictor,
+    build_empty_network,
+    build_network,
+    convert_checkpoint,
+    load_predictor,
+)
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
-from pansplat.model.transformer import TransformerConfig
+from pansplat.model.weights import WeightsFile, pack_weights, save_weights
 from pansplat.pipeline import load_model
 
 Wrap = Callable[[dict[str, Tensor]], dict[str, object]]
@@ -26,7 +31,7 @@ def file(tmp_path: Path) -> Path:
     """Weights of a small network that was trained without the original's defects."""
     torch.manual_seed(3)
     path = tmp_path / "small.safetensors"
-    save_weights(path, describe("mvsplat", SMALL, MVSplat(SMALL).state_dict(), compat="fixed"))
+    save_weights(path, pack_weights("mvsplat", SMALL, MVSplat(SMALL).state_dict(), compat="fixed"))
     return path
 
 
@@ -79,7 +84,7 @@ def test_a_checkpoint_loads_as_the_original_and_as_what_it_converts_to(
 ) -> None:
     content = as_lightning(mvsplat_weights)
     torch.save(content, tmp_path / "original.ckpt")
-    save_weights(tmp_path / "converted.safetensors", from_original(content, "original.ckpt"))
+    save_weights(tmp_path / "converted.safetensors", convert_checkpoint(content, "original.ckpt"))
     first, second = load_model(tmp_path / "original.ckpt"), load_model(tmp_path / "converted.safetensors")
     assert network_of(first).compat == network_of(second).compat == "official"
     assert first.fingerprint == second.fingerprint
@@ -88,7 +93,7 @@ def test_a_checkpoint_loads_as_the_original_and_as_what_it_converts_to(
 def test_a_converted_pansplat_predicts_the_originals_gaussians(
     recipe_weights: dict[str, Tensor], as_lightning: Wrap, golden: Callable[[str], dict[str, Tensor]]
 ) -> None:
-    weights = from_original(as_lightning(recipe_weights), "recipe.ckpt")
+    weights = convert_checkpoint(as_lightning(recipe_weights), "recipe.ckpt")
     predictor = NetworkPredictor("pansplat", build_network(weights, weights.compat, "recipe.ckpt"))
     expected = golden("pansplat_64x128_fp32attn")
     scene = (expected["in.image"][0], expected["in.extrinsics"][0], expected["in.near"][0], expected["in.far"][0])
@@ -108,13 +113,13 @@ def test_every_switch_of_a_config_comes_back(tmp_path: Path) -> None:
     config = PanSplatConfig()
     heads = dataclasses.replace(config.heads, lattice="pixel", residual=False)
     config = dataclasses.replace(config, heads=heads)
-    network = build_empty(describe("pansplat", config, {}, compat="fixed"), "fixed", "x")
+    network = build_empty_network(pack_weights("pansplat", config, {}, compat="fixed"), "fixed", "x")
     assert isinstance(network, PanSplat) and network.config == config
 
 
 def test_files_that_fit_no_network_are_refused(file: Path, unchecked: None) -> None:
     tensors = MVSplat(SMALL).state_dict()
-    good = describe("mvsplat", SMALL, tensors, compat="fixed")
+    good = pack_weights("mvsplat", SMALL, tensors, compat="fixed")
     odd: list[tuple[WeightsFile, str]] = [
         (dataclasses.replace(good, model="splatter"), "needed weights of pansplat or mvsplat, got of 'splatter'"),
         (dataclasses.replace(good, config={"channels": 16}), r"x: config: needed the settings of this version"),
@@ -128,10 +133,10 @@ def test_files_that_fit_no_network_are_refused(file: Path, unchecked: None) -> N
 
 
 def test_settings_that_contradict_each_other_are_refused() -> None:
-    good = describe("pansplat", PanSplatConfig(), {}, compat="fixed")
+    good = pack_weights("pansplat", PanSplatConfig(), {}, compat="fixed")
     wrong = good.config | {"heads": good.config["heads"] | {"candidates": 7}}
     with pytest.raises(InputError, match=r"needed settings of a pansplat network, got .*candidates"):
-        build_empty(dataclasses.replace(good, config=wrong), "fixed", "x")
+        build_empty_network(dataclasses.replace(good, config=wrong), "fixed", "x")
 
 
 def test_choices_that_make_no_sense_are_refused(file: Path, unchecked: None) -> None:

@@ -9,11 +9,11 @@ from torch import Tensor
 from pansplat.errors import InputError
 from pansplat.gaussians.harmonics import rotate_harmonics
 from pansplat.geometry.pose import rotations_from_quats
-from pansplat.model.adapter import AdapterConfig, world_harmonics_rotation
+from pansplat.model.feature_pyramid import TransformerConfig
+from pansplat.model.heads import AdapterConfig, world_harmonics_rotation
 from pansplat.model.mvsplat import MVSplat, MVSplatConfig, MVSplatOutput
 from pansplat.model.network import NetworkPredictor
-from pansplat.model.transformer import TransformerConfig
-from pansplat.model.weights import convert
+from pansplat.model.weights import convert_tensors
 
 SMALL = MVSplatConfig(
     channels=16,
@@ -39,7 +39,7 @@ def seen(
 ) -> tuple[MVSplatOutput, dict[str, Tensor]]:
     """The output, and what went on inside: name of the module to its output."""
     network = MVSplat(compat="official").eval()
-    network.load_state_dict(convert(as_lightning(mvsplat_weights), "recipe"))
+    network.load_state_dict(convert_tensors(as_lightning(mvsplat_weights), "recipe"))
     inside: dict[str, Tensor] = {}
     for name in ("features.transformer", "depth.refine.entry", "upsampler", "refine", "to_depth"):
         module = network.get_submodule(name)

@@ -11,13 +11,11 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import uv_from_directions
 from pansplat.geometry.fibonacci import lattice_size
-from pansplat.model.adapter import AdapterConfig
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
-from pansplat.model.feature_pyramid import FeaturePyramidConfig
-from pansplat.model.heads import HeadsConfig
-from pansplat.model.network import NetworkPredictor, automatic_tiles
+from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
+from pansplat.model.heads import AdapterConfig, HeadsConfig
+from pansplat.model.network import NetworkPredictor, choose_tiles
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
-from pansplat.model.transformer import TransformerConfig
 from pansplat.predictor import Predictor
 
 SMALL = PanSplatConfig(
@@ -110,7 +108,7 @@ def test_progress_rises_to_one():
 
 
 def test_tiles_follow_the_height():
-    assert [automatic_tiles(height) for height in (256, 512, 1024, 2048)] == [1, 1, 2, 4]
+    assert [choose_tiles(height) for height in (256, 512, 1024, 2048)] == [1, 1, 2, 4]
 
 
 def test_the_fingerprint_tells_weights_settings_and_compatibility_apart():

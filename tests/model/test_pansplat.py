@@ -9,12 +9,10 @@ import torch
 from pansplat.errors import InputError
 from pansplat.gaussians.harmonics import rotate_harmonics
 from pansplat.geometry.pose import rotations_from_quats
-from pansplat.model.adapter import AdapterConfig
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
-from pansplat.model.feature_pyramid import FeaturePyramidConfig
-from pansplat.model.heads import HeadsConfig
+from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
+from pansplat.model.heads import AdapterConfig, HeadsConfig
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
-from pansplat.model.transformer import TransformerConfig
 from pansplat.model.weights import official_names
 
 SMALL = PanSplatConfig(
@@ -83,8 +81,8 @@ def test_tiled_prediction_equals_untiled():
 def test_matching_then_lifting_is_the_prediction():
     network, inputs = _network(), _inputs()
     with torch.no_grad():
-        matched = network.match(*inputs)
-        (part,) = network.lift(matched)
+        matched = network.match_views(*inputs)
+        (part,) = network.lift_gaussians(matched)
         assert torch.equal(part.gaussians[0].means, network(*inputs).gaussians[0].means)
 
 

@@ -6,13 +6,12 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.model import loading
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
-from pansplat.model.feature_pyramid import FeaturePyramidConfig
+from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
 from pansplat.model.heads import HeadsConfig
-from pansplat.model.layers import attend, convolving
+from pansplat.model.layers import attend, autocast_convolutions
+from pansplat.model.network import require_precision
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
-from pansplat.model.transformer import TransformerConfig
 
 SMALL = PanSplatConfig(
     features=FeaturePyramidConfig(channels=(8, 8, 16, 32), transformer=TransformerConfig(channels=32, blocks=2)),
@@ -52,14 +51,14 @@ def test_bfloat16_is_close_to_float32_and_gives_float32(randomize):
 
 def test_float32_leaves_other_number_types_alone():
     tensor = torch.randn(1, 4, 8, 8, dtype=torch.float64)
-    with convolving("float32", CPU):
+    with autocast_convolutions("float32", CPU):
         assert torch.nn.functional.conv2d(tensor, tensor[:, :, :3, :3]).dtype == torch.float64
 
 
 def test_convolutions_round_to_bfloat16_and_attention_does_not():
     generator = torch.Generator().manual_seed(2)
     queries, keys, values = torch.randn(3, 1, 2, 9, 4, generator=generator)
-    with convolving("bfloat16", CPU):
+    with autocast_convolutions("bfloat16", CPU):
         assert torch.nn.functional.conv2d(torch.ones(1, 1, 3, 3), torch.ones(1, 1, 1, 1)).dtype == torch.bfloat16
         inside = attend(queries, keys, values)
         coarse = attend(queries, keys, values, precision="bfloat16")
@@ -73,9 +72,9 @@ def test_convolutions_round_to_bfloat16_and_attention_does_not():
 def test_a_processor_without_bfloat16_is_told_to_use_float32(monkeypatch):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_f": True, "avx512_bf16": False})
     with pytest.raises(InputError, match=r"this one has none .* use float32"):
-        loading.require_precision("bfloat16")
-    loading.require_precision("float32")
+        require_precision("bfloat16")
+    require_precision("float32")
     with pytest.raises(InputError, match="float32 or bfloat16, got 'float16'"):
-        loading.require_precision("float16")
+        require_precision("float16")
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
-    loading.require_precision("bfloat16")
+    require_precision("bfloat16")

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.model.transformer import (
+from pansplat.model.feature_pyramid import (
     Transformer,
     TransformerConfig,
     merge_windows,

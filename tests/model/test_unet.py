@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pansplat.model.unet import JointAttention, ResBlock, UNet, UNetConfig
+from pansplat.model.cost_volume import JointAttention, ResBlock, UNet, UNetConfig
 
 
 def _noise(*shape):

@@ -9,12 +9,11 @@ from torch import Tensor
 
 from pansplat.errors import InputError
 from pansplat.model.mvsplat import MVSplat
-from pansplat.model.official_names import Model
 from pansplat.model.pansplat import PanSplat
-from pansplat.model.weights import convert, match, official_names, require_shapes
+from pansplat.model.weights import ModelName, convert_tensors, match_tensors, official_names, require_shapes
 
 Wrap = Callable[[dict[str, Tensor]], dict[str, object]]
-CASES: list[tuple[Model, int, int]] = [("pansplat", 993, 5), ("mvsplat", 471, 0)]
+CASES: list[tuple[ModelName, int, int]] = [("pansplat", 993, 5), ("mvsplat", 471, 0)]
 
 
 def listed(shared: Path, keys: str) -> list[str]:
@@ -27,7 +26,7 @@ def empty(shared: Path, keys: str) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize(("model", "count", "derived"), CASES)
-def test_every_original_tensor_is_used_or_computed(model: Model, count: int, derived: int, shared: Path) -> None:
+def test_every_original_tensor_is_used_or_computed(model: ModelName, count: int, derived: int, shared: Path) -> None:
     theirs = {name.removeprefix("encoder.") for name in listed(shared, f"{model}-512")}
     table = official_names(model)
     assert len(theirs) == count and table.keys() <= theirs
@@ -36,7 +35,7 @@ def test_every_original_tensor_is_used_or_computed(model: Model, count: int, der
 
 
 @pytest.mark.parametrize("model", ["pansplat", "mvsplat"])
-def test_every_tensor_of_ours_has_one_original(model: Model) -> None:
+def test_every_tensor_of_ours_has_one_original(model: ModelName) -> None:
     with torch.device("meta"):
         network = PanSplat() if model == "pansplat" else MVSplat()
     names = list(official_names(model).values())
@@ -45,7 +44,7 @@ def test_every_tensor_of_ours_has_one_original(model: Model) -> None:
 
 
 def test_converted_tensors_fit_the_network(recipe_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
-    tensors = convert(as_lightning(recipe_weights), "recipe")
+    tensors = convert_tensors(as_lightning(recipe_weights), "recipe")
     with torch.device("meta"):
         require_shapes(tensors, PanSplat().state_dict(), "recipe")
     assert torch.equal(
@@ -61,7 +60,7 @@ def test_a_checkpoint_with_auxiliary_heads_is_told_what_is_left_out(shared: Path
     content = as_lightning(empty(shared, "pansplat-512"))
     auxiliary = listed(shared, "pansplat-512-360loc_aux")
     content["state_dict"] |= {name: torch.zeros(1) for name in auxiliary}
-    report = match(content, "360loc")
+    report = match_tensors(content, "360loc")
     assert len(report.used) == 988 and not report.missing and not report.surplus
     left = {reason: len(names) for reason, names in report.unused.items()}
     assert left == {"computed anew": 5, "auxiliary heads, for training only": 18, "state of the training": 5}
@@ -75,7 +74,7 @@ def test_missing_and_surplus_tensors_are_named_and_counted(shared: Path, as_ligh
     for name in gone:
         del state[name]
     state["encoder.new.weight"] = state["losses.2.gaussian_head.new"] = torch.zeros(1)
-    report = match(content, "odd.ckpt")
+    report = match_tensors(content, "odd.ckpt")
     assert sorted(report.missing) == sorted(gone)
     with pytest.raises(InputError) as caught:
         report.require_complete("odd.ckpt")
@@ -88,22 +87,22 @@ def test_missing_and_surplus_tensors_are_named_and_counted(shared: Path, as_ligh
 def test_a_missing_grid_is_missing(shared: Path, as_lightning: Wrap) -> None:
     weights = empty(shared, "pansplat-512")
     del weights["mono_depth.c2e.3.sample_grid"]
-    assert match(as_lightning(weights), "x").missing == ["encoder.mono_depth.c2e.3.sample_grid"]
+    assert match_tensors(as_lightning(weights), "x").missing == ["encoder.mono_depth.c2e.3.sample_grid"]
 
 
 def test_checkpoints_of_other_models_are_refused(as_lightning: Wrap) -> None:
     with pytest.raises(InputError, match=r"original PanSplat or its MVSplat baseline, got tensors 1 \(encoder.fc\)"):
-        match(as_lightning({"fc": torch.zeros(1)}), "x")
+        match_tensors(as_lightning({"fc": torch.zeros(1)}), "x")
     with pytest.raises(InputError, match="got tensors none"):
-        match(as_lightning({}), "x")
+        match_tensors(as_lightning({}), "x")
 
 
 def test_another_grid_is_refused(recipe_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
     name = "mono_depth.c2e.2.sample_grid"
     with pytest.raises(InputError, match=f"the original's grid in {name}"):
-        convert(as_lightning(recipe_weights | {name: recipe_weights[name].flip(2)}), "x")
+        convert_tensors(as_lightning(recipe_weights | {name: recipe_weights[name].flip(2)}), "x")
     with pytest.raises(InputError, match=f"the original's grid in {name}"):
-        convert(as_lightning(recipe_weights | {name: recipe_weights[name][:, :, :4]}), "x")
+        convert_tensors(as_lightning(recipe_weights | {name: recipe_weights[name][:, :, :4]}), "x")
 
 
 def test_numbers_that_are_not_finite_are_refused(mvsplat_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
@@ -111,11 +110,11 @@ def test_numbers_that_are_not_finite_are_refused(mvsplat_weights: dict[str, Tens
     spoilt = mvsplat_weights[name].clone()
     spoilt[3] = torch.nan
     with pytest.raises(InputError, match=f"got NaN or infinity in {name}"):
-        convert(as_lightning(mvsplat_weights | {name: spoilt}), "x")
+        convert_tensors(as_lightning(mvsplat_weights | {name: spoilt}), "x")
 
 
 def test_half_precision_weights_become_float32(mvsplat_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
-    tensors = convert(as_lightning({name: tensor.half() for name, tensor in mvsplat_weights.items()}), "x")
+    tensors = convert_tensors(as_lightning({name: tensor.half() for name, tensor in mvsplat_weights.items()}), "x")
     assert {tensor.dtype for tensor in tensors.values()} == {torch.float32}
 
 

@@ -10,13 +10,11 @@ import torch
 
 from pansplat.data.views import Batch, Sample, Views, collate
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.model.adapter import AdapterConfig
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
-from pansplat.model.feature_pyramid import FeaturePyramidConfig
-from pansplat.model.heads import HeadsConfig
+from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
+from pansplat.model.heads import AdapterConfig, HeadsConfig
 from pansplat.model.layers import Compat
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
-from pansplat.model.transformer import TransformerConfig
 from pansplat.training import datasets, network, trainer
 from pansplat.training.config import CheckpointConfig, DataConfig, NetworkConfig, OptimizerConfig, TrainConfig
 from pansplat.training.config import ValidationConfig as Validation

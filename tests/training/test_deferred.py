@@ -8,11 +8,10 @@ import pytest
 import torch
 
 from pansplat.data.views import Batch
-from pansplat.model.adapter import AdapterConfig
-from pansplat.model.auxiliary_heads import AuxiliaryHeads
+from pansplat.model.feature_pyramid import TransformerConfig
+from pansplat.model.heads import AdapterConfig, AuxiliaryHeads
 from pansplat.model.mvsplat import MVSplat, MVSplatConfig
 from pansplat.model.pansplat import PanSplat
-from pansplat.model.transformer import TransformerConfig
 from pansplat.training.config import MemoryConfig
 from pansplat.training.losses import LossWeights, Structure
 from pansplat.training.network import build_auxiliary_heads, freeze, set_training_mode

@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from pansplat.errors import InputError
-from pansplat.model.checkpoint import load_weights
+from pansplat.model.weights import load_weights
 from pansplat.training import trainer
 from pansplat.training.config import CheckpointConfig, OptimizerConfig, TrainConfig, ValidationConfig
 from pansplat.training.network import read_weights
