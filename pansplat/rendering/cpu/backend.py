@@ -19,9 +19,15 @@ from pansplat.constants import EWA_NEAR_FACTOR
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.cpu import tiling
-from pansplat.rendering.cpu.ewa import TOTALS, project, project_backward
-from pansplat.rendering.cpu.observe import PIECE, Camera, Fields, Observed, observe
-from pansplat.rendering.cpu.observe_backward import Gradients, add_slots, chain
+from pansplat.rendering.cpu.ewa import EWA_GRAD_SIZE, backpropagate_ewa, project_ewa
+from pansplat.rendering.cpu.projection import (
+    GAUSSIANS_PER_ITEM,
+    Camera,
+    GaussianArrays,
+    ProjectedGaussians,
+    project_gaussians,
+)
+from pansplat.rendering.cpu.projection_backward import GaussianGradients, accumulate_slots, backpropagate_projection
 from pansplat.rendering.cpu.rasterize import SavedForBackward, allocate_saved, rasterize_forward
 from pansplat.rendering.cpu.rasterize_backward import rasterize_backward
 from pansplat.rendering.cpu.records import RECORD_SIZE, tabulate_pixels
@@ -142,7 +148,7 @@ class _Draw(torch.autograd.Function):
         height, width = pictures[0].size
         with announce_compilation():
             with notes.timed("observe"):
-                observed = observe(fields, camera, workspace, threads)
+                observed = project_gaussians(fields, camera, workspace, threads)
             sums = pooled_empty((len(pictures), harmonics.shape[2] + 2, height, width), np.float32)
             kept = [
                 _draw_picture(
@@ -180,7 +186,9 @@ class _Draw(torch.autograd.Function):
                 for field, grad in zip(fields, wanted, strict=True)
             )
             own_pose = np.empty((3 if ctx.needs_input_grad[6] else 0, 4))
-            filled = chain(fields, camera, observed, *slots, Gradients(*arrays, pose=own_pose), threads)
+            filled = backpropagate_projection(
+                fields, camera, observed, *slots, GaussianGradients(*arrays, pose=own_pose), threads
+            )
         grad_pose = None
         if ctx.needs_input_grad[6]:
             grad_pose = torch.zeros_like(pose)
@@ -195,11 +203,11 @@ def _fields(
     covariances: Tensor | None,
     opacities: Tensor,
     harmonics: Tensor,
-) -> Fields:
+) -> GaussianArrays:
     """The tensors as arrays, no rows for those not given."""
     given = (means, quats, scales, covariances, opacities, harmonics)
     shapes = ((3,), (4,), (3,), (3, 3), (), harmonics.shape[1:])
-    return Fields(
+    return GaussianArrays(
         *(
             np.empty((0, *shape), np.float32) if tensor is None else tensor.detach().numpy()
             for tensor, shape in zip(given, shapes, strict=True)
@@ -218,7 +226,7 @@ def _camera(pose: Tensor, picture: ImagePlane, options: RasterOptions) -> Camera
 
 
 def _draw_picture(
-    scene: tuple[Fields, Camera, Observed],
+    scene: tuple[GaussianArrays, Camera, ProjectedGaussians],
     picture: ImagePlane,
     options: RasterOptions,
     sums: np.ndarray,
@@ -267,7 +275,7 @@ def _draw_picture(
 
 
 def _place(
-    scene: tuple[Fields, Camera, Observed],
+    scene: tuple[GaussianArrays, Camera, ProjectedGaussians],
     picture: ImagePlane,
     options: RasterOptions,
     workspace: Workspace,
@@ -275,12 +283,12 @@ def _place(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Records and boxes on a picture."""
     if options.kernel == "ewa":
-        return project(*scene, picture, options.dilation, EWA_NEAR_FACTOR * options.near, workspace, threads)
+        return project_ewa(*scene, picture, options.dilation, EWA_NEAR_FACTOR * options.near, workspace, threads)
     return scene[2].records, find_bounding_boxes(scene[2].records, picture, workspace, threads)
 
 
 def _slot_gradients(
-    scene: tuple[Fields, Camera, Observed],
+    scene: tuple[GaussianArrays, Camera, ProjectedGaussians],
     pictures: list[ImagePlane],
     options: RasterOptions,
     projections: list[Projection],
@@ -295,9 +303,9 @@ def _slot_gradients(
     exact = options.kernel == "ray"
     alone = exact and len(pictures) == 1 and projections[0].lists is not None
     total_records = np.zeros((num if exact and not alone else 0, RECORD_SIZE), np.float32)
-    totals = np.zeros((0 if exact else num, TOTALS))
+    totals = np.zeros((0 if exact else num, EWA_GRAD_SIZE))
     total_values = np.zeros((0 if alone else num, num_values), np.float32)
-    pieces = -(-num // PIECE)
+    pieces = -(-num // GAUSSIANS_PER_ITEM)
     for number, (picture, projection) in enumerate(zip(pictures, projections, strict=True)):
         plane = tabulate_pixels(picture, exact=exact)
         bands = [projection.lists] if projection.lists else intersect_tiles(
@@ -326,10 +334,10 @@ def _slot_gradients(
             if exact:
                 parallel_for(_adding(offsets, grad_records, total_records), pieces, threads)
             else:
-                project_backward(fields, camera, picture, options.dilation, grad_records, offsets, totals, threads)
+                backpropagate_ewa(fields, camera, picture, options.dilation, grad_records, offsets, totals, threads)
             parallel_for(_adding(offsets, grad_values, total_values), pieces, threads)
     return total_records, total_values, totals, np.arange(num + 1)
 
 
 def _adding(offsets: np.ndarray, slots: np.ndarray, totals: np.ndarray) -> Any:
-    return lambda piece: add_slots(piece, offsets, slots, totals)
+    return lambda piece: accumulate_slots(piece, offsets, slots, totals)

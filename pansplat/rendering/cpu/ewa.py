@@ -1,7 +1,7 @@
-"""The classic kernel: records of a pinhole picture from the Gaussians' shapes, and the gradients back.
+"""The EWA kernel: records and boxes of a pinhole image plane, and their backward.
 
-Source: docs/rendering.md, section 3, `ewa`. In the tangent frame F = (u, v, n) the covariance is F S F', so
-V = (J F) S' (J F)': two by two from three by three, in float64, nothing whitened in between.
+Source: docs/rendering.md, section 3, `ewa`. With the tangent frame F = (u, v, n) the projected covariance is
+V = (J F) C' (J F)', in float64, from the covariances: through the records, needles would lose 5% of their gradients.
 """
 
 import math
@@ -10,57 +10,129 @@ import numpy as np
 
 from pansplat.constants import ALPHA_CUT, EWA_CLAMP, KAPPA_MARGIN, MIN_EWA_VARIANCE
 from pansplat.rendering.cpu import records as layout
-from pansplat.rendering.cpu.forms import dot
-from pansplat.rendering.cpu.observe import (
+from pansplat.rendering.cpu.projection import (
     CULLED,
-    LANES,
-    PIECE,
-    ROWS,
+    GAUSSIAN_BLOCK,
+    GAUSSIANS_PER_ITEM,
+    NUM_ROWS,
     Camera,
-    Fields,
-    Observed,
-    find_shapes,
-    frame_and_shape,
-    read_block,
+    GaussianArrays,
+    ProjectedGaussians,
+    dot,
+    load_block,
+    load_tangent_covariance,
+    store_tangent_covariances,
 )
 from pansplat.rendering.cpu.runtime import Workspace, inline_kernel, kernel, parallel_for
 from pansplat.rendering.cpu.tiling import round_boxes
 from pansplat.rendering.image_planes import ImagePlane
 
-TOTALS = 10  # numbers that a picture passes back: gradients of n (world axes), of C (xx xy xz yy yz zz), of the level
-_NARROWEST = MIN_EWA_VARIANCE
-_LIMIT = 0.5 * EWA_CLAMP  # of the picture's side over the focal length: 1.3 half sides
-_LOG_CUT = math.log2(1 / ALPHA_CUT)
-_SLACK = KAPPA_MARGIN
+EWA_GRAD_SIZE = 10  # gradients of n and C (xx xy xz yy yz zz), world axes, and of log2_peak
+_CLAMP = 0.5 * EWA_CLAMP  # of the image plane's side over the focal length
+_LOG2_CUT = math.log2(1 / ALPHA_CUT)
 
-# Rows of a block, after those of observe.py.
-LEVEL = ROWS + 1
-EDGES = ROWS + 2
-POINT = ROWS + 6  # and the two forms: x, y, a_x, b_x, b_y
-GIVEN = ROWS + 11  # gradients of these, and of the level
-OUT = ROWS + 17  # what is passed back
-ALL_ROWS = OUT + TOTALS
+# Rows of a block, after those of projection.py.
+_LOG2_PEAK_ROW = NUM_ROWS + 1
+_EDGES_ROW = NUM_ROWS + 2  # left, right, top, bottom
+_POINT_ROW = NUM_ROWS + 6  # x, y; then a_x, b_x, b_y
+_RECORD_GRAD_ROW = NUM_ROWS + 11  # gradients of these five and of log2_peak
+_EWA_GRAD_ROW = NUM_ROWS + 17
+_NUM_ROWS = _EWA_GRAD_ROW + EWA_GRAD_SIZE
+
+
+def project_ewa(
+    gaussians: GaussianArrays,
+    camera: Camera,
+    projected: ProjectedGaussians,
+    plane: ImagePlane,
+    dilation: float,
+    z_near: float,
+    workspace: Workspace,
+    threads: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The records of an image plane, written where a box is not empty, and the boxes.
+
+    Args:
+        gaussians, camera: what is drawn, and the camera.
+        projected: of the camera.
+        plane: pinhole.
+        dilation: variance added on both axes, pixels^2.
+        z_near: Gaussians at a smaller depth are not drawn, metres.
+        workspace: for the returned arrays.
+        threads: number of threads.
+    """
+    num = len(projected.records)
+    records, words = workspace.array((num, layout.RECORD_SIZE), np.float32), workspace.array((num, 2), np.int32)
+    rotation, axes = _plane_axes(camera, plane)
+
+    def work(item: int) -> None:
+        _project_ewa(
+            item, *gaussians.kernel_arguments, *camera, projected.records, projected.radii, rotation, axes,
+            *plane.size, plane.focal, dilation, z_near, records, words, words.view(np.int16),
+        )  # fmt: skip
+
+    parallel_for(work, -(-num // GAUSSIANS_PER_ITEM), threads)
+    return records, words.view(np.int16)
+
+
+def backpropagate_ewa(
+    gaussians: GaussianArrays,
+    camera: Camera,
+    plane: ImagePlane,
+    dilation: float,
+    grad_records: np.ndarray,
+    offsets: np.ndarray,
+    ewa_grads: np.ndarray,
+    threads: int,
+) -> None:
+    """Add the gradients of directions, covariances and peaks that an image plane's records have.
+
+    Args:
+        gaussians, camera, plane, dilation: of the forward.
+        grad_records: (slot, RECORD_SIZE).
+        offsets: (n + 1), where each Gaussian's slots begin.
+        ewa_grads: (n, EWA_GRAD_SIZE) float64, added to.
+        threads: number of threads; the result does not depend on it.
+    """
+    _, axes = _plane_axes(camera, plane)
+
+    def work(item: int) -> None:
+        _backpropagate_ewa(
+            item, *gaussians.kernel_arguments, *camera, axes, *plane.size, plane.focal, dilation,
+            grad_records, offsets, ewa_grads,
+        )  # fmt: skip
+
+    parallel_for(work, -(-len(gaussians.means) // GAUSSIANS_PER_ITEM), threads)
+
+
+def _plane_axes(camera: Camera, plane: ImagePlane) -> tuple[np.ndarray, np.ndarray]:
+    """The image plane's axes in the camera's and in the world's, as columns."""
+    rotation = np.ascontiguousarray(plane.rotation.numpy())
+    return rotation, np.ascontiguousarray(camera.pose[:3, :3] @ rotation)
+
+
+# Of both passes.
 
 
 @inline_kernel
-def _turn(turn, vector):
-    """A vector from the world's axes to the picture's."""
+def _to_plane(axes, vector):
+    """A vector in the image plane's axes, from the world's."""
     x, y, z = vector
     return (
-        turn[0, 0] * x + turn[1, 0] * y + turn[2, 0] * z,
-        turn[0, 1] * x + turn[1, 1] * y + turn[2, 1] * z,
-        turn[0, 2] * x + turn[1, 2] * y + turn[2, 2] * z,
+        axes[0, 0] * x + axes[1, 0] * y + axes[2, 0] * z,
+        axes[0, 1] * x + axes[1, 1] * y + axes[2, 1] * z,
+        axes[0, 2] * x + axes[1, 2] * y + axes[2, 2] * z,
     )
 
 
 @inline_kernel
-def _turn_back(turn, vector):
-    """A vector from the picture's axes to the world's."""
+def _to_world(axes, vector):
+    """A vector in the world's axes, from the image plane's."""
     x, y, z = vector
     return (
-        turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z,
-        turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z,
-        turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z,
+        axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z,
+        axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z,
+        axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z,
     )
 
 
@@ -69,7 +141,7 @@ def _jacobian(n, height, width, focal):
     """Tangents, clamped tangents and scale of J at a direction with n_z > 0."""
     inverse = 1 / n[2]
     tan_x, tan_y = n[0] * inverse, n[1] * inverse
-    limit_x, limit_y = _LIMIT * width / focal, _LIMIT * height / focal
+    limit_x, limit_y = _CLAMP * width / focal, _CLAMP * height / focal
     return (
         tan_x,
         tan_y,
@@ -80,16 +152,15 @@ def _jacobian(n, height, width, focal):
 
 
 @inline_kernel
-def _image(jacobian, vector):
-    """J times a vector."""
+def _apply_jacobian(jacobian, vector):
     _, _, clamped_x, clamped_y, scale = jacobian
     return scale * (vector[0] - clamped_x * vector[2]), scale * (vector[1] - clamped_y * vector[2])
 
 
 @inline_kernel
-def _weighted(shape, spread, on_u, on_v, on_n):
-    """A row of J F times S', the filtered shape."""
-    uu, uv, vv, un, vn, nn = shape[0] + spread, shape[1], shape[2] + spread, shape[3], shape[4], shape[5]
+def _times_covariance(cov, filter_variance, on_u, on_v, on_n):
+    """A row of J F times the filtered covariance."""
+    uu, uv, vv, un, vn, nn = cov[0] + filter_variance, cov[1], cov[2] + filter_variance, cov[3], cov[4], cov[5]
     return (
         uu * on_u + uv * on_v + un * on_n,
         uv * on_u + vv * on_v + vn * on_n,
@@ -98,162 +169,151 @@ def _weighted(shape, spread, on_u, on_v, on_n):
 
 
 @inline_kernel
-def _projected(rows, i, turn, height, width, focal, spread):
-    """The frame on the picture's axes, J, its rows times F and times F S', and V before it is dilated."""
-    u, v, n, shape = frame_and_shape(rows, i)
-    u, v, n = _turn(turn, u), _turn(turn, v), _turn(turn, n)
+def _project_covariance(rows, i, axes, height, width, focal, filter_variance):
+    """The frame in the image plane's axes, J, J n, the rows of J F times the covariance, and V before dilation."""
+    u, v, n, cov = load_tangent_covariance(rows, i)
+    u, v, n = _to_plane(axes, u), _to_plane(axes, v), _to_plane(axes, n)
     jacobian = _jacobian(n, height, width, focal)
-    on_u, on_v, on_n = _image(jacobian, u), _image(jacobian, v), _image(jacobian, n)
+    on_u, on_v, on_n = _apply_jacobian(jacobian, u), _apply_jacobian(jacobian, v), _apply_jacobian(jacobian, n)
     x_row, y_row = (on_u[0], on_v[0], on_n[0]), (on_u[1], on_v[1], on_n[1])
-    x_weighted, y_weighted = _weighted(shape, spread, *x_row), _weighted(shape, spread, *y_row)
-    spread_out = dot(*x_row, *x_weighted), dot(*x_row, *y_weighted), dot(*y_row, *y_weighted)
-    return (u, v, n), jacobian, on_n, x_weighted, y_weighted, spread_out
+    x_weighted = _times_covariance(cov, filter_variance, *x_row)
+    y_weighted = _times_covariance(cov, filter_variance, *y_row)
+    variance = dot(*x_row, *x_weighted), dot(*x_row, *y_weighted), dot(*y_row, *y_weighted)
+    return (u, v, n), jacobian, on_n, x_weighted, y_weighted, variance
 
 
-@inline_kernel
-def _in_front(records, radii, turn, start, count, z_near, rows):
-    """Note the levels, `CULLED` for Gaussians behind; return how many may be seen."""
-    seen = 0
-    for i in range(LANES):
-        rows[LEVEL, i] = CULLED
-    for i in range(count):
-        g = start + i
-        # `turn` is from the camera's axes here.
-        z = (np.float64(records[g, 0]) + np.float64(records[g, 3])) * turn[0, 2]
-        z += (np.float64(records[g, 1]) + np.float64(records[g, 4])) * turn[1, 2]
-        z += (np.float64(records[g, 2]) + np.float64(records[g, 5])) * turn[2, 2]
-        front = (z * radii[g] > z_near) & (records[g, layout.LOG2_PEAK] > CULLED)
-        rows[LEVEL, i] = records[g, layout.LOG2_PEAK] if front else CULLED
-        seen += front
-    return seen
+# Forward.
 
 
 @kernel
-def _project(
-    piece, means, quats, scales, covariances, opacities, _harmonics, pose, spread, _compensate, near,
-    records, radii, rotation, turn, height, width, focal, dilation, z_near, projected, words, boxes,
+def _project_ewa(
+    item, means, quats, scales, covariances, opacities, _harmonics, pose, filter_variance, _compensate, near,
+    camera_records, radii, rotation, axes, height, width, focal, dilation, z_near, records, words, boxes,
 ):  # fmt: skip
-    rows = np.ones((ALL_ROWS, LANES))
+    rows = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK))
     unit = math.sqrt(layout.HALF_LOG2_E)
-    for start in range(piece * PIECE, min((piece + 1) * PIECE, records.shape[0]), LANES):
-        count = min(LANES, records.shape[0] - start)
-        if _in_front(records, radii, rotation, start, count, z_near, rows) == 0:
+    num = camera_records.shape[0]
+    for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, num), GAUSSIAN_BLOCK):
+        count = min(GAUSSIAN_BLOCK, num - start)
+        if _load_peaks(camera_records, radii, rotation, start, count, z_near, rows) == 0:
             for i in range(count):
                 words[start + i, 0], words[start + i, 1] = 0, 1
             continue
-        read_block(means, quats, scales, covariances, opacities, start, count, rows)
-        find_shapes(covariances, pose, near, rows)
-        for i in range(LANES):
-            _, jacobian, _, _, _, v = _projected(rows, i, turn, height, width, focal, spread)
-            kappa = (rows[LEVEL, i] + _LOG_CUT) / layout.HALF_LOG2_E + _SLACK
+        load_block(means, quats, scales, covariances, opacities, start, count, rows)
+        store_tangent_covariances(covariances, pose, near, rows)
+        for i in range(GAUSSIAN_BLOCK):
+            _, jacobian, _, _, _, v = _project_covariance(rows, i, axes, height, width, focal, filter_variance)
+            kappa = (rows[_LOG2_PEAK_ROW, i] + _LOG2_CUT) / layout.HALF_LOG2_E + KAPPA_MARGIN
             v_xx, v_yy = v[0] + dilation, v[2] + dilation
-            first, m = 1 / math.sqrt(v_xx), -v[1] / v_xx
-            second = 1 / math.sqrt(max(v_yy + m * v[1], _NARROWEST))
+            a_x, m = 1 / math.sqrt(v_xx), -v[1] / v_xx
+            b_y = 1 / math.sqrt(max(v_yy + m * v[1], MIN_EWA_VARIANCE))
             x, y = focal * jacobian[0] + 0.5 * width, focal * jacobian[1] + 0.5 * height
-            rows[POINT, i], rows[POINT + 1, i] = x, y
-            rows[POINT + 2, i], rows[POINT + 3, i], rows[POINT + 4, i] = unit * first, unit * m * second, unit * second
+            rows[_POINT_ROW, i], rows[_POINT_ROW + 1, i] = x, y
+            rows[_POINT_ROW + 2, i] = unit * a_x
+            rows[_POINT_ROW + 3, i], rows[_POINT_ROW + 4, i] = unit * m * b_y, unit * b_y
             reach_x, reach_y = math.sqrt(max(kappa, 0.0) * v_xx), math.sqrt(max(kappa, 0.0) * v_yy)
-            rows[EDGES, i], rows[EDGES + 1, i] = x - reach_x, x + reach_x
-            rows[EDGES + 2, i], rows[EDGES + 3, i] = y - reach_y, y + reach_y if kappa >= 0 else -1e9
-        round_boxes(rows, EDGES, start, count, height, width, words)
-        _write_projected(rows, start, count, boxes, projected)
+            rows[_EDGES_ROW, i], rows[_EDGES_ROW + 1, i] = x - reach_x, x + reach_x
+            rows[_EDGES_ROW + 2, i], rows[_EDGES_ROW + 3, i] = y - reach_y, y + reach_y if kappa >= 0 else -1e9
+        round_boxes(rows, _EDGES_ROW, start, count, height, width, words)
+        _write_records(rows, start, count, boxes, records)
 
 
 @inline_kernel
-def _write_projected(rows, start, count, boxes, projected):
+def _load_peaks(camera_records, radii, rotation, start, count, z_near, rows):
+    """Load log2_peak, `CULLED` for Gaussians behind the near plane; return how many are in front."""
+    in_front = 0
+    for i in range(GAUSSIAN_BLOCK):
+        rows[_LOG2_PEAK_ROW, i] = CULLED
+    for i in range(count):
+        g = start + i
+        z = (np.float64(camera_records[g, 0]) + np.float64(camera_records[g, 3])) * rotation[0, 2]
+        z += (np.float64(camera_records[g, 1]) + np.float64(camera_records[g, 4])) * rotation[1, 2]
+        z += (np.float64(camera_records[g, 2]) + np.float64(camera_records[g, 5])) * rotation[2, 2]
+        drawn = (z * radii[g] > z_near) & (camera_records[g, layout.LOG2_PEAK] > CULLED)
+        rows[_LOG2_PEAK_ROW, i] = camera_records[g, layout.LOG2_PEAK] if drawn else CULLED
+        in_front += drawn
+    return in_front
+
+
+@inline_kernel
+def _write_records(rows, start, count, boxes, records):
     for i in range(count):
         g = start + i
         if boxes[g, 3] < boxes[g, 2]:
             continue
         for j in range(layout.RECORD_SIZE):
-            projected[g, j] = 0
+            records[g, j] = 0
         for axis in range(2):
-            head = np.float32(rows[POINT + axis, i])
-            projected[g, layout.DIRECTION + axis] = head
-            projected[g, layout.DIRECTION_RESIDUAL + axis] = np.float32(rows[POINT + axis, i] - np.float64(head))
-        projected[g, layout.ROW_A] = np.float32(rows[POINT + 2, i])
-        projected[g, layout.ROW_B] = np.float32(rows[POINT + 3, i])
-        projected[g, layout.ROW_B + 1] = np.float32(rows[POINT + 4, i])
-        projected[g, layout.LOG2_PEAK] = np.float32(rows[LEVEL, i])
+            head = np.float32(rows[_POINT_ROW + axis, i])
+            records[g, layout.DIRECTION + axis] = head
+            residual = np.float32(rows[_POINT_ROW + axis, i] - np.float64(head))
+            records[g, layout.DIRECTION_RESIDUAL + axis] = residual
+        records[g, layout.ROW_A] = np.float32(rows[_POINT_ROW + 2, i])
+        records[g, layout.ROW_B] = np.float32(rows[_POINT_ROW + 3, i])
+        records[g, layout.ROW_B + 1] = np.float32(rows[_POINT_ROW + 4, i])
+        records[g, layout.LOG2_PEAK] = np.float32(rows[_LOG2_PEAK_ROW, i])
 
 
-def project(
-    fields: Fields,
-    camera: Camera,
-    observed: Observed,
-    picture: ImagePlane,
-    dilation: float,
-    z_near: float,
-    workspace: Workspace,
-    threads: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Records of a pinhole picture, where there is a box, and the boxes.
-
-    Args:
-        fields, camera: what was observed, and by whom.
-        observed: by the camera.
-        picture: pinhole.
-        dilation: variance added on both axes, pixels^2.
-        z_near: Gaussians with a smaller depth in the picture are left out, metres.
-        workspace: for the arrays returned.
-        threads: to work on.
-    """
-    num = len(observed.records)
-    projected, words = workspace.array((num, layout.RECORD_SIZE), np.float32), workspace.array((num, 2), np.int32)
-    rotation, turn = _axes(camera, picture)
-
-    def work(piece: int) -> None:
-        _project(
-            piece, *fields.given, *camera, observed.records, observed.radii, rotation, turn, *picture.size,
-            picture.focal, dilation, z_near, projected, words, words.view(np.int16),
-        )  # fmt: skip
-
-    parallel_for(work, -(-num // PIECE), threads)
-    return projected, words.view(np.int16)
+# Backward.
 
 
-def _axes(camera: Camera, picture: ImagePlane) -> tuple[np.ndarray, np.ndarray]:
-    """The picture's axes in the camera's and in the world's."""
-    rotation = np.ascontiguousarray(picture.rotation.numpy())
-    return rotation, np.ascontiguousarray(camera.pose[:3, :3] @ rotation)
+@kernel
+def _backpropagate_ewa(
+    item, means, quats, scales, covariances, opacities, _harmonics, pose, filter_variance, _compensate, near,
+    axes, height, width, focal, dilation, grad_records, offsets, ewa_grads,
+):  # fmt: skip
+    rows = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK))
+    for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, means.shape[0]), GAUSSIAN_BLOCK):
+        count = min(GAUSSIAN_BLOCK, means.shape[0] - start)
+        if _sum_slots(grad_records, offsets, start, count, rows) == 0:
+            continue
+        load_block(means, quats, scales, covariances, opacities, start, count, rows)
+        store_tangent_covariances(covariances, pose, near, rows)
+        _backpropagate_records(rows, axes, height, width, focal, filter_variance, dilation)
+        for i in range(count):
+            if offsets[start + i + 1] > offsets[start + i]:
+                for j in range(EWA_GRAD_SIZE):
+                    ewa_grads[start + i, j] += rows[_EWA_GRAD_ROW + j, i]
 
 
 @inline_kernel
-def _read_given(grads, offsets, start, count, rows):
+def _sum_slots(grad_records, offsets, start, count, rows):
     """Sum each Gaussian's slots; return how many Gaussians of the block have any."""
-    some = 0
+    num_seen = 0
     unit = math.sqrt(layout.HALF_LOG2_E)
-    for i in range(LANES):
+    for i in range(GAUSSIAN_BLOCK):
         for j in range(6):
-            rows[GIVEN + j, i] = 0.0
+            rows[_RECORD_GRAD_ROW + j, i] = 0.0
     for i in range(count):
         g = start + i
-        some += offsets[g + 1] > offsets[g]
+        num_seen += offsets[g + 1] > offsets[g]
         for slot in range(offsets[g], offsets[g + 1]):
-            rows[GIVEN, i] += grads[slot, layout.DIRECTION]
-            rows[GIVEN + 1, i] += grads[slot, layout.DIRECTION + 1]
-            rows[GIVEN + 2, i] += unit * grads[slot, layout.ROW_A]
-            rows[GIVEN + 3, i] += unit * grads[slot, layout.ROW_B]
-            rows[GIVEN + 4, i] += unit * grads[slot, layout.ROW_B + 1]
-            rows[GIVEN + 5, i] += grads[slot, layout.LOG2_PEAK]
-    return some
+            rows[_RECORD_GRAD_ROW, i] += grad_records[slot, layout.DIRECTION]
+            rows[_RECORD_GRAD_ROW + 1, i] += grad_records[slot, layout.DIRECTION + 1]
+            rows[_RECORD_GRAD_ROW + 2, i] += unit * grad_records[slot, layout.ROW_A]
+            rows[_RECORD_GRAD_ROW + 3, i] += unit * grad_records[slot, layout.ROW_B]
+            rows[_RECORD_GRAD_ROW + 4, i] += unit * grad_records[slot, layout.ROW_B + 1]
+            rows[_RECORD_GRAD_ROW + 5, i] += grad_records[slot, layout.LOG2_PEAK]
+    return num_seen
 
 
 @inline_kernel
-def _splats_backward(rows, turn, height, width, focal, spread, dilation):
-    """Gradients of n and C, world axes, from those of point and forms."""
-    for i in range(LANES):
-        frame, jacobian, n_image, x_weighted, y_weighted, v = _projected(rows, i, turn, height, width, focal, spread)
+def _backpropagate_records(rows, axes, height, width, focal, filter_variance, dilation):
+    """Gradients of n and C in world axes, from those of the point, a and b."""
+    for i in range(GAUSSIAN_BLOCK):
+        frame, jacobian, n_image, x_weighted, y_weighted, v = _project_covariance(
+            rows, i, axes, height, width, focal, filter_variance
+        )
         tan_x, tan_y, clamped_x, clamped_y, scale = jacobian
         v_xx, m = v[0] + dilation, -v[1] / (v[0] + dilation)
-        first, across = 1 / math.sqrt(v_xx), v[2] + dilation + m * v[1]
-        second = 1 / math.sqrt(max(across, _NARROWEST))
-        g_first, g_bx, g_by = rows[GIVEN + 2, i], rows[GIVEN + 3, i], rows[GIVEN + 4, i]
-        g_m = g_bx * second
-        h_yy = -0.5 * second * second * second * (g_by + g_bx * m) if across >= _NARROWEST else 0.0
-        h_xx = -0.5 * g_first * first * first * first + m * m * h_yy - g_m * m / v_xx
+        a_x, across = 1 / math.sqrt(v_xx), v[2] + dilation + m * v[1]
+        b_y = 1 / math.sqrt(max(across, MIN_EWA_VARIANCE))
+        g_ax, g_bx, g_by = rows[_RECORD_GRAD_ROW + 2, i], rows[_RECORD_GRAD_ROW + 3, i], rows[_RECORD_GRAD_ROW + 4, i]
+        g_m = g_bx * b_y
+        h_yy = -0.5 * b_y * b_y * b_y * (g_by + g_bx * m) if across >= MIN_EWA_VARIANCE else 0.0
+        h_xx = -0.5 * g_ax * a_x * a_x * a_x + m * m * h_yy - g_m * m / v_xx
         h_xy = m * h_yy - 0.5 * g_m / v_xx
-        # V = J C' J': to J by 2 H (J C'), to C by J' H J, to n by the filter's - e^2 n n'.
+        # V = J C' J': the gradient of J is 2 H (J C'), that of C is J' H J, and n has that of the filter's - e^2 n n'.
         x_mixed = (
             h_xx * x_weighted[0] + h_xy * y_weighted[0],
             h_xx * x_weighted[1] + h_xy * y_weighted[1],
@@ -268,18 +328,18 @@ def _splats_backward(rows, turn, height, width, focal, spread, dilation):
         x_ahead, y_ahead = dot(*x_mixed, u[2], v_axis[2], n[2]), dot(*y_mixed, u[2], v_axis[2], n[2])
         x_side, y_side = dot(*x_mixed, u[0], v_axis[0], n[0]), dot(*y_mixed, u[1], v_axis[1], n[1])
         g_scale = 2 * (x_side - clamped_x * x_ahead + y_side - clamped_y * y_ahead)
-        g_tan_x = focal * rows[GIVEN, i] - (2 * scale * x_ahead if tan_x == clamped_x else 0.0)
-        g_tan_y = focal * rows[GIVEN + 1, i] - (2 * scale * y_ahead if tan_y == clamped_y else 0.0)
+        g_tan_x = focal * rows[_RECORD_GRAD_ROW, i] - (2 * scale * x_ahead if tan_x == clamped_x else 0.0)
+        g_tan_y = focal * rows[_RECORD_GRAD_ROW + 1, i] - (2 * scale * y_ahead if tan_y == clamped_y else 0.0)
         inverse = 1 / n[2]
-        by_depth = -(g_tan_x * tan_x + g_tan_y * tan_y + g_scale * scale) * inverse
-        g_n = _turn_back(turn, (g_tan_x * inverse, g_tan_y * inverse, by_depth))
-        j_x = _turn_back(turn, (scale, 0.0, -scale * clamped_x))
-        j_y = _turn_back(turn, (0.0, scale, -scale * clamped_y))
-        n_x = -2 * spread * (h_xx * n_image[0] + h_xy * n_image[1])
-        n_y = -2 * spread * (h_xy * n_image[0] + h_yy * n_image[1])
-        at = OUT + 3
+        g_z = -(g_tan_x * tan_x + g_tan_y * tan_y + g_scale * scale) * inverse
+        g_n = _to_world(axes, (g_tan_x * inverse, g_tan_y * inverse, g_z))
+        j_x = _to_world(axes, (scale, 0.0, -scale * clamped_x))
+        j_y = _to_world(axes, (0.0, scale, -scale * clamped_y))
+        n_x = -2 * filter_variance * (h_xx * n_image[0] + h_xy * n_image[1])
+        n_y = -2 * filter_variance * (h_xy * n_image[0] + h_yy * n_image[1])
+        at = _EWA_GRAD_ROW + 3
         for axis in range(3):
-            rows[OUT + axis, i] = g_n[axis] + n_x * j_x[axis] + n_y * j_y[axis]
+            rows[_EWA_GRAD_ROW + axis, i] = g_n[axis] + n_x * j_x[axis] + n_y * j_y[axis]
             for other in range(axis, 3):
                 rows[at, i] = (
                     h_xx * j_x[axis] * j_x[other]
@@ -287,52 +347,4 @@ def _splats_backward(rows, turn, height, width, focal, spread, dilation):
                     + h_xy * (j_x[axis] * j_y[other] + j_y[axis] * j_x[other])
                 )
                 at += 1
-        rows[OUT + 9, i] = rows[GIVEN + 5, i]
-
-
-@kernel
-def _project_backward(
-    piece, means, quats, scales, covariances, opacities, _harmonics, pose, spread, _compensate, near,
-    turn, height, width, focal, dilation, grads, offsets, totals,
-):  # fmt: skip
-    rows = np.ones((ALL_ROWS, LANES))
-    for start in range(piece * PIECE, min((piece + 1) * PIECE, means.shape[0]), LANES):
-        count = min(LANES, means.shape[0] - start)
-        if _read_given(grads, offsets, start, count, rows) == 0:
-            continue
-        read_block(means, quats, scales, covariances, opacities, start, count, rows)
-        find_shapes(covariances, pose, near, rows)
-        _splats_backward(rows, turn, height, width, focal, spread, dilation)
-        for i in range(count):
-            if offsets[start + i + 1] > offsets[start + i]:
-                for j in range(TOTALS):
-                    totals[start + i, j] += rows[OUT + j, i]
-
-
-def project_backward(
-    fields: Fields,
-    camera: Camera,
-    picture: ImagePlane,
-    dilation: float,
-    grads: np.ndarray,
-    offsets: np.ndarray,
-    totals: np.ndarray,
-    threads: int,
-) -> None:
-    """Add to the gradients of directions, shapes and levels what a picture's records pass back.
-
-    Args:
-        fields, camera, picture, dilation: of the forward.
-        grads: (slot, FIELDS), of the picture's records.
-        offsets: (n + 1), where each Gaussian's slots begin.
-        totals: (n, TOTALS) float64, added to.
-        threads: to work on; the result does not depend on it.
-    """
-    _, turn = _axes(camera, picture)
-
-    def work(piece: int) -> None:
-        _project_backward(
-            piece, *fields.given, *camera, turn, *picture.size, picture.focal, dilation, grads, offsets, totals
-        )
-
-    parallel_for(work, -(-len(fields.means) // PIECE), threads)
+        rows[_EWA_GRAD_ROW + 9, i] = rows[_RECORD_GRAD_ROW + 5, i]

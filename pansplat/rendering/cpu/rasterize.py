@@ -14,30 +14,27 @@ import numpy as np
 import numpy.typing as npt
 
 from pansplat.constants import ALPHA_CUT, MAX_ALPHA, TRANSMITTANCE_CUT
-from pansplat.rendering.cpu.bits import list_bits
-from pansplat.rendering.cpu.columns import columns_of
-from pansplat.rendering.cpu.forms import dot, tangent_frame
+from pansplat.rendering.cpu.projection import dot, tangent_frame
 from pansplat.rendering.cpu.records import EQUIRECT_RAYS, PIXEL_CENTRES, RECORD_SIZE, TILE_SIZE, PixelTables
 from pansplat.rendering.cpu.runtime import Workspace, inline_kernel_no_refcount, kernel, parallel_for
 from pansplat.rendering.cpu.simd import (
     LANES,
-    choose,
+    any_lane,
+    broadcast,
     copy_four,
-    element,
     exp2,
-    fill,
-    how_many,
+    join_halves,
+    list_set_bits,
     load,
-    maximum,
-    minimum,
+    load_broadcast,
+    load_scalar,
+    load_transposed,
     multiply_add,
-    negative,
+    popcount,
     prefetch,
-    put,
-    side_by_side,
-    some,
-    spread,
+    select,
     store,
+    store_scalar,
 )
 from pansplat.rendering.cpu.tiling import split_tiles
 
@@ -175,7 +172,7 @@ def ask_ahead(records, values, intersections, block, first):  # type: ignore[no-
     """Ask for a block's share of the chunk that begins at entry `first`: memory works while blocks are drawn."""
     num_values, end = values.shape[1], len(intersections) // 2 - 1
     for e in range(first + block * _SHARE, first + (block + 1) * _SHARE):
-        index = np.int64(element(intersections, 2 * max(min(e, end), 0)))
+        index = np.int64(load_scalar(intersections, 2 * max(min(e, end), 0)))
         prefetch(records, RECORD_SIZE * index)
         prefetch(values, num_values * index)
 
@@ -183,17 +180,17 @@ def ask_ahead(records, values, intersections, block, first):  # type: ignore[no-
 @inline_kernel_no_refcount
 def eight_records(records, intersections, e, last):  # type: ignore[no-untyped-def]
     """The sixteen columns of eight records, in two groups; past `last` the last is repeated."""
-    r0 = RECORD_SIZE * np.int64(element(intersections, 2 * e))
-    r1 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 1, last)))
-    r2 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 2, last)))
-    r3 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 3, last)))
-    r4 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 4, last)))
-    r5 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 5, last)))
-    r6 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 6, last)))
-    r7 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 7, last)))
+    r0 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * e))
+    r1 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 1, last)))
+    r2 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 2, last)))
+    r3 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 3, last)))
+    r4 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 4, last)))
+    r5 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 5, last)))
+    r6 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 6, last)))
+    r7 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 7, last)))
     return (
-        columns_of(records, r0, r1, r2, r3, r4, r5, r6, r7),
-        columns_of(records, r0 + 8, r1 + 8, r2 + 8, r3 + 8, r4 + 8, r5 + 8, r6 + 8, r7 + 8),
+        load_transposed(records, r0, r1, r2, r3, r4, r5, r6, r7),
+        load_transposed(records, r0 + 8, r1 + 8, r2 + 8, r3 + 8, r4 + 8, r5 + 8, r6 + 8, r7 + 8),
     )
 
 
@@ -220,12 +217,12 @@ def gather(  # type: ignore[no-untyped-def]
         wide = True
     if num_values == FEW:
         for s in range(count):
-            copy_four(colours, FEW * s, values, FEW * np.int64(element(intersections, 2 * (first + s))))
+            copy_four(colours, FEW * s, values, FEW * np.int64(load_scalar(intersections, 2 * (first + s))))
     else:
         for s in range(count):
-            row = num_values * np.int64(element(intersections, 2 * (first + s)))
+            row = num_values * np.int64(load_scalar(intersections, 2 * (first + s)))
             for channel in range(num_values):
-                put(colours, num_values * s + channel, element(values, row + channel))
+                store_scalar(colours, num_values * s + channel, load_scalar(values, row + channel))
     return wide
 
 
@@ -233,16 +230,16 @@ def gather(  # type: ignore[no-untyped-def]
 def _find_forms(records, intersections, first, count, place, exact, wide, forms):  # type: ignore[no-untyped-def]
     """Fill in forms; whether they have to be found once more, in three components."""
     last = first + count - 1
-    on, one = fill(exact), fill(np.float32(1))
-    least, most = one, fill(np.float32(0))
+    on, one = broadcast(exact), broadcast(np.float32(1))
+    least, most = one, broadcast(np.float32(0))
     for at in range(0, count, LANES):
         (n_x, n_y, n_z, rest_x, rest_y, rest_z, a_x, a_y), rest = eight_records(
             records, intersections, first + at, last
         )
         a_z, b_x, b_y, b_z, front_a, front_b, along, level = rest
-        m_x = (n_x - fill(place[0])) + (rest_x - fill(place[3]))
-        m_y = (n_y - fill(place[1])) + (rest_y - fill(place[4]))
-        m_z = (n_z - fill(place[2])) + (rest_z - fill(place[5]))
+        m_x = (n_x - broadcast(place[0])) + (rest_x - broadcast(place[3]))
+        m_y = (n_y - broadcast(place[1])) + (rest_y - broadcast(place[4]))
+        m_z = (n_z - broadcast(place[2])) + (rest_z - broadcast(place[5]))
         m_x, m_y, m_z = _along_axes(place, m_x, m_y, m_z)
         a_x, a_y, a_z = _along_axes(place, a_x, a_y, a_z)
         b_x, b_y, b_z = _along_axes(place, b_x, b_y, b_z)
@@ -258,9 +255,9 @@ def _find_forms(records, intersections, first, count, place, exact, wide, forms)
             store(forms, (THIRD + 3) * CHUNK_SIZE + at, m_z)
             ahead = one
         # Below 1 no pixel behind a Gaussian's horizon, where L < 0, can see it: its power is level - 1 / along at most.
-        reach = along * (level + fill(np.float32(_MARGIN - CUT)))
-        least, inverse = minimum(least, ahead), one / ahead
-        most = maximum(most, reach)
+        reach = along * (level + broadcast(np.float32(_MARGIN - CUT)))
+        least, inverse = min(least, ahead), one / ahead
+        most = max(most, reach)
         store(forms, A * CHUNK_SIZE + at, ahead * a_x)
         store(forms, (A + 1) * CHUNK_SIZE + at, ahead * a_y)
         store(forms, B * CHUNK_SIZE + at, ahead * b_x)
@@ -271,16 +268,16 @@ def _find_forms(records, intersections, first, count, place, exact, wide, forms)
         store(forms, (MIDDLE + 1) * CHUNK_SIZE + at, inverse * m_y)
         store(forms, ALONG_ROW * CHUNK_SIZE + at, along)
         store(forms, LEVEL_ROW * CHUNK_SIZE + at, level)
-    return not wide and (some(fill(np.float32(MIN_PLANAR_COSINE)) > least) or some(most > one))
+    return not wide and (any_lane(broadcast(np.float32(MIN_PLANAR_COSINE)) > least) or any_lane(most > one))
 
 
 @inline_kernel_no_refcount
 def _along_axes(place, x, y, z):  # type: ignore[no-untyped-def]
     """Vectors' components along a tile's axes, and towards its middle."""
     return (
-        multiply_add(fill(place[6]), x, multiply_add(fill(place[7]), y, fill(place[8]) * z)),
-        multiply_add(fill(place[9]), x, multiply_add(fill(place[10]), y, fill(place[11]) * z)),
-        multiply_add(fill(place[12]), x, multiply_add(fill(place[13]), y, fill(place[14]) * z)),
+        multiply_add(broadcast(place[6]), x, multiply_add(broadcast(place[7]), y, broadcast(place[8]) * z)),
+        multiply_add(broadcast(place[9]), x, multiply_add(broadcast(place[10]), y, broadcast(place[11]) * z)),
+        multiply_add(broadcast(place[12]), x, multiply_add(broadcast(place[13]), y, broadcast(place[14]) * z)),
     )
 
 
@@ -295,7 +292,7 @@ def list_blocks(intersections, first, count, touched):  # type: ignore[no-untype
     """
     touched[:] = 0
     for at in range(count):
-        box = element(intersections, 2 * (first + at) + 1)
+        box = load_scalar(intersections, 2 * (first + at) + 1)
         bit, word = np.uint64(1) << np.uint64(at & 63), (at >> 6) * EDGES
         _toggle(touched, word + (box & 255) // BLOCK_WIDTH, bit)
         _toggle(touched, word + ((box >> 8) & 255) // BLOCK_WIDTH + 1, bit)
@@ -304,14 +301,14 @@ def list_blocks(intersections, first, count, touched):  # type: ignore[no-untype
     # A bit was turned where its box begins, and behind its end: run along the blocks, it is set in between.
     for word in range(0, (count + 63) // 64 * EDGES, EDGES):
         for edge in range(word + 1, word + ACROSS):
-            _toggle(touched, edge, element(touched, edge - 1))
+            _toggle(touched, edge, load_scalar(touched, edge - 1))
         for edge in range(word + ROWS + 1, word + ROWS + DOWN):
-            _toggle(touched, edge, element(touched, edge - 1))
+            _toggle(touched, edge, load_scalar(touched, edge - 1))
 
 
 @inline_kernel_no_refcount
 def _toggle(words, at, bits):  # type: ignore[no-untyped-def]
-    put(words, at, element(words, at) ^ bits)
+    store_scalar(words, at, load_scalar(words, at) ^ bits)
 
 
 Floats = npt.NDArray[np.float32]
@@ -410,7 +407,7 @@ def _draw_tiles(  # type: ignore[no-untyped-def]
             for block in range(BLOCKS + 1):
                 if block < BLOCKS:
                     ask_ahead(records, values, intersections, block, first + CHUNK_SIZE)
-                    if not some(load(through, block * LANES) > fill(np.float32(CLOSED))):
+                    if not any_lane(load(through, block * LANES) > broadcast(np.float32(CLOSED))):
                         continue
                     following = find_powers(block, touched, wide, forms, offsets, powers, places, half)
                 if drawn >= 0 and num_values == FEW:
@@ -444,16 +441,16 @@ def find_powers(block, touched, wide, forms, offsets, powers, places, start):  #
     pixel = block * LANES
     x, y, z = load(offsets, pixel), load(offsets, PIXELS + pixel), load(offsets, 2 * PIXELS + pixel)
     total = _list_places(block, touched, places, start)
-    zero = fill(np.float32(0))
+    zero = broadcast(np.float32(0))
     for at in range(start, start + total):
-        s = np.int64(element(places, at))
+        s = np.int64(load_scalar(places, at))
         a, b, front = forms_at(wide, forms, s, x, y, z)
         if wide:
-            front = choose(front > zero, front, fill(np.float32(np.nan)))
+            front = select(front > zero, front, broadcast(np.float32(np.nan)))
         q = multiply_add(a, a, b * b)
-        below = multiply_add(maximum(zero, front), front, spread(forms, ALONG_ROW * CHUNK_SIZE + s) * q)
-        store(powers, at * LANES, spread(forms, LEVEL_ROW * CHUNK_SIZE + s) - q / below)
-    store(powers, (start + total) * LANES, fill(np.float32(NOTHING)))
+        below = multiply_add(max(zero, front), front, load_broadcast(forms, ALONG_ROW * CHUNK_SIZE + s) * q)
+        store(powers, at * LANES, load_broadcast(forms, LEVEL_ROW * CHUNK_SIZE + s) - q / below)
+    store(powers, (start + total) * LANES, broadcast(np.float32(NOTHING)))
     return total
 
 
@@ -462,10 +459,10 @@ def _list_places(block, touched, places, start):  # type: ignore[no-untyped-def]
     """Write down which Gaussians of the chunk reach a block, and one more; how many do."""
     at, column, row = start, block % ACROSS, ROWS + block // ACROSS
     for word in range(WORDS):
-        bits = element(touched, word * EDGES + column) & element(touched, word * EDGES + row)
-        list_bits(places, at, bits, word * 64)
-        at += how_many(bits)
-    put(places, at, np.uint8(0))
+        bits = load_scalar(touched, word * EDGES + column) & load_scalar(touched, word * EDGES + row)
+        list_set_bits(places, at, bits, word * 64)
+        at += popcount(bits)
+    store_scalar(places, at, np.uint8(0))
     return at - start
 
 
@@ -475,26 +472,26 @@ def forms_at(wide, forms, s, x, y, z):  # type: ignore[no-untyped-def]
 
     The offsets from the Gaussian come first: small numbers, so that nothing large cancels in the sums.
     """
-    x, y = x - spread(forms, MIDDLE * CHUNK_SIZE + s), y - spread(forms, (MIDDLE + 1) * CHUNK_SIZE + s)
-    a = spread(forms, A * CHUNK_SIZE + s) * x
-    b = spread(forms, B * CHUNK_SIZE + s) * x
-    front = multiply_add(spread(forms, L * CHUNK_SIZE + s), x, fill(np.float32(1)))
-    a = multiply_add(spread(forms, (A + 1) * CHUNK_SIZE + s), y, a)
-    b = multiply_add(spread(forms, (B + 1) * CHUNK_SIZE + s), y, b)
-    front = multiply_add(spread(forms, (L + 1) * CHUNK_SIZE + s), y, front)
+    x, y = x - load_broadcast(forms, MIDDLE * CHUNK_SIZE + s), y - load_broadcast(forms, (MIDDLE + 1) * CHUNK_SIZE + s)
+    a = load_broadcast(forms, A * CHUNK_SIZE + s) * x
+    b = load_broadcast(forms, B * CHUNK_SIZE + s) * x
+    front = multiply_add(load_broadcast(forms, L * CHUNK_SIZE + s), x, broadcast(np.float32(1)))
+    a = multiply_add(load_broadcast(forms, (A + 1) * CHUNK_SIZE + s), y, a)
+    b = multiply_add(load_broadcast(forms, (B + 1) * CHUNK_SIZE + s), y, b)
+    front = multiply_add(load_broadcast(forms, (L + 1) * CHUNK_SIZE + s), y, front)
     if wide:
-        z = z - spread(forms, (THIRD + 3) * CHUNK_SIZE + s)
-        a = multiply_add(spread(forms, THIRD * CHUNK_SIZE + s), z, a)
-        b = multiply_add(spread(forms, (THIRD + 1) * CHUNK_SIZE + s), z, b)
-        front = multiply_add(spread(forms, (THIRD + 2) * CHUNK_SIZE + s), z, front)
+        z = z - load_broadcast(forms, (THIRD + 3) * CHUNK_SIZE + s)
+        a = multiply_add(load_broadcast(forms, THIRD * CHUNK_SIZE + s), z, a)
+        b = multiply_add(load_broadcast(forms, (THIRD + 1) * CHUNK_SIZE + s), z, b)
+        front = multiply_add(load_broadcast(forms, (THIRD + 2) * CHUNK_SIZE + s), z, front)
     return a, b, front
 
 
 @inline_kernel_no_refcount
 def opacity(power):  # type: ignore[no-untyped-def]
     """Alpha of a power: 0 below the cut, at most MOST."""
-    alpha = minimum(exp2(power), fill(np.float32(MOST)))
-    return choose(fill(np.float32(CUT)) <= power, alpha, fill(np.float32(0)))
+    alpha = min(exp2(power), broadcast(np.float32(MOST)))
+    return select(broadcast(np.float32(CUT)) <= power, alpha, broadcast(np.float32(0)))
 
 
 @inline_kernel_no_refcount
@@ -505,26 +502,26 @@ def _draw_block(block, reached, powers, places, start, colours, through, added):
     sum0, sum1 = load(added, pixel), load(added, PIXELS + pixel)
     sum2, sum3 = load(added, 2 * PIXELS + pixel), load(added, 3 * PIXELS + pixel)
     for at in range(start, start + reached, 2):  # a half-full last turn adds nothing
-        colour, other = FEW * np.int64(element(places, at)), FEW * np.int64(element(places, at + 1))
+        colour, other = FEW * np.int64(load_scalar(places, at)), FEW * np.int64(load_scalar(places, at + 1))
         alpha, beta = opacity(load(powers, at * LANES)), opacity(load(powers, at * LANES + LANES))
         weight = alpha * passes
-        passes = multiply_add(negative(alpha), passes, passes)
-        sum0 = multiply_add(weight, spread(colours, colour), sum0)
-        sum1 = multiply_add(weight, spread(colours, colour + 1), sum1)
-        sum2 = multiply_add(weight, spread(colours, colour + 2), sum2)
-        sum3 = multiply_add(weight, spread(colours, colour + 3), sum3)
+        passes = multiply_add(-alpha, passes, passes)
+        sum0 = multiply_add(weight, load_broadcast(colours, colour), sum0)
+        sum1 = multiply_add(weight, load_broadcast(colours, colour + 1), sum1)
+        sum2 = multiply_add(weight, load_broadcast(colours, colour + 2), sum2)
+        sum3 = multiply_add(weight, load_broadcast(colours, colour + 3), sum3)
         weight = beta * passes
-        passes = multiply_add(negative(beta), passes, passes)
-        sum0 = multiply_add(weight, spread(colours, other), sum0)
-        sum1 = multiply_add(weight, spread(colours, other + 1), sum1)
-        sum2 = multiply_add(weight, spread(colours, other + 2), sum2)
-        sum3 = multiply_add(weight, spread(colours, other + 3), sum3)
+        passes = multiply_add(-beta, passes, passes)
+        sum0 = multiply_add(weight, load_broadcast(colours, other), sum0)
+        sum1 = multiply_add(weight, load_broadcast(colours, other + 1), sum1)
+        sum2 = multiply_add(weight, load_broadcast(colours, other + 2), sum2)
+        sum3 = multiply_add(weight, load_broadcast(colours, other + 3), sum3)
     store(through, pixel, passes)
     store(added, pixel, sum0)
     store(added, PIXELS + pixel, sum1)
     store(added, 2 * PIXELS + pixel, sum2)
     store(added, 3 * PIXELS + pixel, sum3)
-    return some(passes > fill(np.float32(CLOSED)))
+    return any_lane(passes > broadcast(np.float32(CLOSED)))
 
 
 @inline_kernel_no_refcount
@@ -534,9 +531,9 @@ def _weigh_block(block, reached, powers, start, through):  # type: ignore[no-unt
     for at in range(start, start + reached):
         alpha = opacity(load(powers, at * LANES))
         store(powers, at * LANES, alpha * passes)
-        passes = multiply_add(negative(alpha), passes, passes)
+        passes = multiply_add(-alpha, passes, passes)
     store(through, block * LANES, passes)
-    return some(passes > fill(np.float32(CLOSED)))
+    return any_lane(passes > broadcast(np.float32(CLOSED)))
 
 
 @inline_kernel_no_refcount
@@ -546,8 +543,8 @@ def _add_block(block, reached, weights, places, start, colours, num_values, adde
         pixel = channel * PIXELS + block * LANES
         total = load(added, pixel)
         for at in range(start, start + reached):
-            colour = num_values * np.int64(element(places, at)) + channel
-            total = multiply_add(load(weights, at * LANES), spread(colours, colour), total)
+            colour = num_values * np.int64(load_scalar(places, at)) + channel
+            total = multiply_add(load(weights, at * LANES), load_broadcast(colours, colour), total)
         store(added, pixel, total)
 
 
@@ -558,17 +555,17 @@ def _write_tile(through, added, sums, left, top, num_values):  # type: ignore[no
     if left + TILE_SIZE > width or top + TILE_SIZE > height:
         _write_part(through, added, sums, left, top, num_values)
         return
-    picture, one = sums.reshape(-1), fill(np.float32(1))
+    picture, one = sums.reshape(-1), broadcast(np.float32(1))
     for block in range(0, BLOCKS, 2):
         pixel = block * LANES
         at = (top + block // ACROSS * BLOCK_HEIGHT) * width + left + block % ACROSS * BLOCK_WIDTH
         for channel in range(num_values):
             plane, place = channel * PIXELS + pixel, channel * height * width + at
-            upper, lower = side_by_side(load(added, plane), load(added, plane + LANES))
+            upper, lower = join_halves(load(added, plane), load(added, plane + LANES))
             store(picture, place, upper)
             store(picture, place + width, lower)
         place = num_values * height * width + at
-        upper, lower = side_by_side(one - load(through, pixel), one - load(through, pixel + LANES))
+        upper, lower = join_halves(one - load(through, pixel), one - load(through, pixel + LANES))
         store(picture, place, upper)
         store(picture, place + width, lower)
 

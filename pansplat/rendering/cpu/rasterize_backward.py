@@ -11,7 +11,6 @@ import math
 
 import numpy as np
 
-from pansplat.rendering.cpu.columns import columns_of
 from pansplat.rendering.cpu.rasterize import (
     ACROSS,
     ALONG_ROW,
@@ -45,23 +44,22 @@ from pansplat.rendering.cpu.records import PIXEL_CENTRES, RECORD_SIZE, TILE_SIZE
 from pansplat.rendering.cpu.runtime import inline_kernel_no_refcount, kernel, parallel_for
 from pansplat.rendering.cpu.simd import (
     LANES,
-    choose,
-    element,
-    fill,
+    any_lane,
+    broadcast,
     first_lane,
+    join_halves,
+    lane_sums,
     load,
-    maximum,
+    load_broadcast,
+    load_scalar,
+    load_transposed,
     multiply_add,
-    negative,
-    prefetch_to_write,
-    put,
-    side_by_side,
-    some,
-    spread,
+    prefetch_for_write,
+    select,
     store,
-    store_past_cache,
-    totals,
-    transposed,
+    store_nontemporal,
+    store_scalar,
+    transpose,
 )
 from pansplat.rendering.cpu.tiling import split_tiles
 
@@ -178,12 +176,12 @@ def _read_upstream(sums, grad_sums, left, top, num_values, planes, upstream):  #
         return
     given, drawn = grad_sums.reshape(-1), sums.reshape(-1)
     for block in range(0, BLOCKS, 2):
-        pixel, first, second = block * LANES, fill(np.float32(0)), fill(np.float32(0))
+        pixel, first, second = block * LANES, broadcast(np.float32(0)), broadcast(np.float32(0))
         at = (top + block // ACROSS * BLOCK_HEIGHT) * width + left + block % ACROSS * BLOCK_WIDTH
         for channel in range(num_values + 1):
             place = channel * height * width + at
-            gradient, other_gradient = side_by_side(load(given, place), load(given, place + width))
-            value, other_value = side_by_side(load(drawn, place), load(drawn, place + width))
+            gradient, other_gradient = join_halves(load(given, place), load(given, place + width))
+            value, other_value = join_halves(load(drawn, place), load(drawn, place + width))
             first = multiply_add(gradient, value, first)
             second = multiply_add(other_gradient, other_value, second)
             own = (channel if channel < num_values else planes) * PIXELS + pixel
@@ -228,7 +226,7 @@ def _find_slopes(  # type: ignore[no-untyped-def]
         following, is_open = 0, False
         if block < BLOCKS:
             ask_ahead(records, values, intersections, block, next_first)
-            is_open = some(load(through, block * LANES) > fill(np.float32(CLOSED)))
+            is_open = any_lane(load(through, block * LANES) > broadcast(np.float32(CLOSED)))
             if not is_open:
                 continue
             following = find_powers(block, touched, wide, forms, offsets, powers, places, half)
@@ -258,10 +256,10 @@ def _weigh_block(  # type: ignore[no-untyped-def]
         alpha = opacity(load(powers, at * LANES))
         store(alphas, to * LANES, alpha)
         store(weights, to * LANES, alpha * passes)
-        put(seen, to, np.int32(element(places, at)))
-        passes = multiply_add(negative(alpha), passes, passes)
+        store_scalar(seen, to, np.int32(load_scalar(places, at)))
+        passes = multiply_add(-alpha, passes, passes)
         # Written over by the next if nobody sees it: no branch, for none could be foretold.
-        to += np.int64(some(alpha > fill(np.float32(0))))
+        to += np.int64(any_lane(alpha > broadcast(np.float32(0))))
     return to - begin
 
 
@@ -271,26 +269,26 @@ def _slope_block(  # type: ignore[no-untyped-def]
     pair,
 ):  # fmt: skip
     """Write down the pairs of a block, back to front: slopes, weights, the block, the same Gaussian's pair before."""
-    most, zero = fill(np.float32(MOST)), fill(np.float32(0))
+    most, zero = broadcast(np.float32(MOST)), broadcast(np.float32(0))
     pixel = block * LANES
     beyond, base = load(behind, pixel), load(upstream, planes * PIXELS + pixel)
     for at in range(begin + left - 1, begin - 1, -1):
-        s = np.int64(element(seen, at))
+        s = np.int64(load_scalar(seen, at))
         alpha, weight = load(alphas, at * LANES), load(weights, at * LANES)
         worth = base
         for value in range(0, planes, GROUP):  # beyond the last stand other finite numbers, times 0
             own, colour = value * PIXELS + pixel, num_values * s + value
-            worth = multiply_add(load(upstream, own), spread(colours, colour), worth)
-            worth = multiply_add(load(upstream, own + PIXELS), spread(colours, colour + 1), worth)
-            worth = multiply_add(load(upstream, own + 2 * PIXELS), spread(colours, colour + 2), worth)
-            worth = multiply_add(load(upstream, own + 3 * PIXELS), spread(colours, colour + 3), worth)
+            worth = multiply_add(load(upstream, own), load_broadcast(colours, colour), worth)
+            worth = multiply_add(load(upstream, own + PIXELS), load_broadcast(colours, colour + 1), worth)
+            worth = multiply_add(load(upstream, own + 2 * PIXELS), load_broadcast(colours, colour + 2), worth)
+            worth = multiply_add(load(upstream, own + 3 * PIXELS), load_broadcast(colours, colour + 3), worth)
         gained = worth - beyond
-        store(slopes, pair * PAIR, choose(most > alpha, weight * gained, zero))
+        store(slopes, pair * PAIR, select(most > alpha, weight * gained, zero))
         store(slopes, pair * PAIR + LANES, weight)
         beyond = multiply_add(alpha, gained, beyond)
-        put(pairs, 2 * pair, np.int32(block))
-        put(pairs, 2 * pair + 1, element(heads, s))
-        put(heads, s, np.int32(pair))
+        store_scalar(pairs, 2 * pair, np.int32(block))
+        store_scalar(pairs, 2 * pair + 1, load_scalar(heads, s))
+        store_scalar(heads, s, np.int32(pair))
         pair += 1
     store(behind, pixel, beyond)
 
@@ -300,10 +298,10 @@ def _write_nothing(slots, first, end, num_values, grad_records, grad_values):  #
     """Zeros for Gaussians behind a closed tile."""
     for entry in range(first, end):
         row = RECORD_SIZE * slots[entry]
-        store(grad_records, row, fill(np.float32(0)))
-        store(grad_records, row + LANES, fill(np.float32(0)))
+        store(grad_records, row, broadcast(np.float32(0)))
+        store(grad_records, row + LANES, broadcast(np.float32(0)))
         for value in range(num_values):
-            put(grad_values, num_values * slots[entry] + value, np.float32(0))
+            store_scalar(grad_values, num_values * slots[entry] + value, np.float32(0))
 
 
 GROUP = 4  # values whose gradients are summed at a time
@@ -323,14 +321,14 @@ def write_chunk(  # type: ignore[no-untyped-def]
     """Write the gradients of a chunk's Gaussians to their slots."""
     last = first + count - 1
     for s in range(count):
-        ahead = element(slots, min(first + s + _AHEAD, last))
-        prefetch_to_write(grad_values, num_values * ahead)
+        ahead = load_scalar(slots, min(first + s + _AHEAD, last))
+        prefetch_for_write(grad_values, num_values * ahead)
         _sum_moments(s, heads, pairs, slopes, wide, forms, offsets, upstream, moments)
         row = num_values * slots[first + s]
         for value in range(min(GROUP, num_values)):
-            put(grad_values, row + value, element(moments, MOMENTS * s + SHARES + value))
+            store_scalar(grad_values, row + value, load_scalar(moments, MOMENTS * s + SHARES + value))
         for value in range(GROUP, num_values):
-            put(grad_values, row + value, _share_of(s, heads, pairs, slopes, upstream, value))
+            store_scalar(grad_values, row + value, _share_of(s, heads, pairs, slopes, upstream, value))
     for s in range(0, count, LANES):
         _write_records(s, records, intersections, first, count, slots, moments, exact, grad_records)
 
@@ -345,19 +343,19 @@ def _sum_moments(  # type: ignore[no-untyped-def]
     They are those of h times x^2, x y, y^2, x, y, q x, q y, q^2, that of the slopes, and those of weight x upstream
     gradient of four values.
     """
-    zero, one = fill(np.float32(0)), fill(np.float32(1))
+    zero, one = broadcast(np.float32(0)), broadcast(np.float32(1))
     xx = xy = yy = by_x = by_y = q_x = q_y = by_along = by_level = zero
     share0 = share1 = share2 = share3 = zero
-    along = spread(forms, ALONG_ROW * CHUNK_SIZE + s)
-    pair = np.int64(element(heads, s))
+    along = load_broadcast(forms, ALONG_ROW * CHUNK_SIZE + s)
+    pair = np.int64(load_scalar(heads, s))
     while pair >= 0:
-        pixel = LANES * np.int64(element(pairs, 2 * pair))
+        pixel = LANES * np.int64(load_scalar(pairs, 2 * pair))
         slope, weight = load(slopes, pair * PAIR), load(slopes, pair * PAIR + LANES)
-        pair = np.int64(element(pairs, 2 * pair + 1))
+        pair = np.int64(load_scalar(pairs, 2 * pair + 1))
         x, y, z = load(offsets, pixel), load(offsets, PIXELS + pixel), load(offsets, 2 * PIXELS + pixel)
         a, b, front = forms_at(wide, forms, s, x, y, z)
         q = multiply_add(a, a, b * b)
-        inverse = one / maximum(multiply_add(front, front, along * q), fill(np.float32(_LEAST)))
+        inverse = one / max(multiply_add(front, front, along * q), broadcast(np.float32(_LEAST)))
         scaled = slope * inverse * inverse  # h / L^4
         ahead, across = scaled * front, scaled * q
         by_along, by_level = multiply_add(across, q, by_along), by_level + slope
@@ -370,20 +368,20 @@ def _sum_moments(  # type: ignore[no-untyped-def]
         share1 = multiply_add(weight, load(upstream, pixel + PIXELS), share1)
         share2 = multiply_add(weight, load(upstream, pixel + 2 * PIXELS), share2)
         share3 = multiply_add(weight, load(upstream, pixel + 3 * PIXELS), share3)
-    store(moments, MOMENTS * s, totals(xx, xy, yy, by_x, by_y, q_x, q_y, by_along))
-    store(moments, MOMENTS * s + LANES, totals(by_level, share0, share1, share2, share3, zero, zero, zero))
+    store(moments, MOMENTS * s, lane_sums(xx, xy, yy, by_x, by_y, q_x, q_y, by_along))
+    store(moments, MOMENTS * s + LANES, lane_sums(by_level, share0, share1, share2, share3, zero, zero, zero))
 
 
 @inline_kernel_no_refcount
 def _share_of(s, heads, pairs, slopes, upstream, value):  # type: ignore[no-untyped-def]
     """The gradient of a Gaussian's value: the sum over its pixels of weight x upstream gradient."""
-    share = zero = fill(np.float32(0))
-    pair = np.int64(element(heads, s))
+    share = zero = broadcast(np.float32(0))
+    pair = np.int64(load_scalar(heads, s))
     while pair >= 0:
-        pixel = value * PIXELS + LANES * np.int64(element(pairs, 2 * pair))
+        pixel = value * PIXELS + LANES * np.int64(load_scalar(pairs, 2 * pair))
         share = multiply_add(load(slopes, pair * PAIR + LANES), load(upstream, pixel), share)
-        pair = np.int64(element(pairs, 2 * pair + 1))
-    return first_lane(totals(share, zero, zero, zero, zero, zero, zero, zero))
+        pair = np.int64(load_scalar(pairs, 2 * pair + 1))
+    return first_lane(lane_sums(share, zero, zero, zero, zero, zero, zero, zero))
 
 
 @inline_kernel_no_refcount
@@ -399,33 +397,38 @@ def _write_records(  # type: ignore[no-untyped-def]
     xx, xy, yy, x, y, q_x, q_y, along = _rows(moments, at)
     level, _, _, _, _, _, _, _ = _rows(moments, at + LANES)
     n, a, b, front_a, front_b = _record(records, intersections, first + s, first + count - 1)
-    zero, one, two, on = fill(np.float32(0)), fill(np.float32(1)), fill(np.float32(2 * _LN2)), fill(exact)
-    twice, half = two * on, fill(np.float32(_LN2))
+    zero, one, two, on = (
+        broadcast(np.float32(0)),
+        broadcast(np.float32(1)),
+        broadcast(np.float32(2 * _LN2)),
+        broadcast(exact),
+    )
+    twice, half = two * on, broadcast(np.float32(_LN2))
     ahead = on * n[0], on * n[1], multiply_add(on, n[2], one - on)
     p, q = _cross(b, ahead), _cross(ahead, a)
     inverse = one / _dot(a, p)
-    p = _combined(inverse, p, negative(front_a), n)
-    q = _combined(inverse, q, negative(front_b), n)
+    p = _combined(inverse, p, -front_a, n)
+    q = _combined(inverse, q, -front_b, n)
     front = _combined(front_a, a, front_b, b)
     front = n[0] + front[0], n[1] + front[1], n[2] + front[2]
     by_front = _combined(twice * q_x, p, twice * q_y, q)
     by_a = _combined(two * (front_a * q_x - xx), p, two * (front_a * q_y - xy), q)
     by_b = _combined(two * (front_b * q_x - xy), p, two * (front_b * q_y - yy), q)
-    by_n, back = _combined(two * x, a, two * y, b), negative(twice * (xx + yy))
+    by_n, back = _combined(two * x, a, two * y, b), -(twice * (xx + yy))
     n_x = by_front[0] + multiply_add(back, front[0], by_n[0])
     n_y = by_front[1] + multiply_add(back, front[1], by_n[1])
     n_z = by_front[2] + multiply_add(back, front[2], by_n[2])
     # The moments have been read: the rows take their place.
-    _store_rows(moments, at, transposed(n_x, n_y, n_z, zero, zero, zero, by_a[0], by_a[1]))
+    _store_rows(moments, at, transpose(n_x, n_y, n_z, zero, zero, zero, by_a[0], by_a[1]))
     _store_rows(
         moments,
         at + LANES,
-        transposed(by_a[2], by_b[0], by_b[1], by_b[2], twice * q_x, twice * q_y, half * on * along, half * level),
+        transpose(by_a[2], by_b[0], by_b[1], by_b[2], twice * q_x, twice * q_y, half * on * along, half * level),
     )
     for place in range(s, min(s + LANES, count)):
         row = RECORD_SIZE * slots[first + place]
-        store_past_cache(grad_records, row, load(moments, MOMENTS * place))
-        store_past_cache(grad_records, row + LANES, load(moments, MOMENTS * place + LANES))
+        store_nontemporal(grad_records, row, load(moments, MOMENTS * place))
+        store_nontemporal(grad_records, row + LANES, load(moments, MOMENTS * place + LANES))
 
 
 @inline_kernel_no_refcount
@@ -439,9 +442,9 @@ def _record(records, intersections, e, last):  # type: ignore[no-untyped-def]
 @inline_kernel_no_refcount
 def _cross(a, b):  # type: ignore[no-untyped-def]
     return (
-        multiply_add(a[1], b[2], negative(a[2] * b[1])),
-        multiply_add(a[2], b[0], negative(a[0] * b[2])),
-        multiply_add(a[0], b[1], negative(a[1] * b[0])),
+        multiply_add(a[1], b[2], -(a[2] * b[1])),
+        multiply_add(a[2], b[0], -(a[0] * b[2])),
+        multiply_add(a[0], b[1], -(a[1] * b[0])),
     )
 
 
@@ -460,7 +463,7 @@ def _combined(s, a, t, b):  # type: ignore[no-untyped-def]
 def _rows(moments, at):  # type: ignore[no-untyped-def]
     """A column for each of eight numbers of eight Gaussians."""
     step = MOMENTS
-    return columns_of(
+    return load_transposed(
         moments, at, at + step, at + 2 * step, at + 3 * step, at + 4 * step, at + 5 * step, at + 6 * step, at + 7 * step
     )
 

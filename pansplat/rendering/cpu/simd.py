@@ -1,367 +1,707 @@
-"""Vectors of eight float32 inside numba kernels: what a register holds, and the operations on it.
+"""SIMD vectors of eight float32 or float64 inside numba kernels, and transposes between arrays and vectors.
 
-LLVM maps them to one AVX register, or to two of SSE or NEON. On processors that pass 512 bits in two halves eight
-lanes are as fast as sixteen and fit a Gaussian's outline better.
+They exist in compiled code only. `+ - * /`, unary minus, comparisons, `min` and `max` work on vectors, `&` on masks. On
+`f64x8` also `abs`, `math.sqrt` and `math.copysign` do, and one operand may be a float64, so a formula written for
+numbers serves for vectors. Loops that LLVM vectorises by itself check whether their arrays overlap and write every
+intermediate value to memory; these vectors stay in registers.
 
-Only inside compiled code: `+ - * /` and `<= > &` work on `lanes` and masks, the functions below do the rest.
-Arrays are float32 and C-contiguous, indexed flat.
+LLVM maps an `f32x8` to one AVX register, or to two of SSE or NEON. On processors that execute 512-bit operations in two
+halves, eight lanes are as fast as sixteen and fit a Gaussian's outline better.
+
+Arrays are C-contiguous. `array` and `numbers` are flat; `rows` is 2-D.
 """
 
 import inspect
+import math
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
 from numba.core import types
-from numba.core.cgutils import get_or_insert_function
+from numba.core.cgutils import alloca_once, get_or_insert_function, unpack_tuple
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
+from pansplat.rendering.cpu.records import RECORD_SIZE
+from pansplat.rendering.cpu.runtime import inline_kernel
+
 LANES = 8
+PREFETCH_DISTANCE = 128  # Gaussians between a prefetch and the read
 
-_FLOAT = ir.FloatType()
-_INT = ir.IntType(32)
-_FLOATS = ir.VectorType(_FLOAT, LANES)
-_INTS = ir.VectorType(_INT, LANES)
-_BITS = ir.VectorType(ir.IntType(1), LANES)
-_ALIGN = 4  # bytes: what float32 arrays promise
+_BYTE, _INT, _LONG, _FLOAT, _DOUBLE = ir.IntType(8), ir.IntType(32), ir.IntType(64), ir.FloatType(), ir.DoubleType()
+_BYTES, _INTS, _LONGS, _FLOATS, _DOUBLES, _BITS = (
+    ir.VectorType(kind, LANES) for kind in (_BYTE, _INT, _LONG, _FLOAT, _DOUBLE, ir.IntType(1))
+)
+_FOUR_FLOATS = ir.VectorType(_FLOAT, 4)
+_VECTOR_TYPES = {"f32x8": _FLOATS, "f64x8": _DOUBLES, "mask": _BITS}
+_ALIGNMENT = {_FLOATS: 4, _FOUR_FLOATS: 4, _DOUBLES: 8, _BYTES: 1}  # bytes: what arrays of the element type guarantee
+_CACHE_LINE = 64  # bytes
+_F64_FLAGS = ("contract", "nsz")  # as in runtime.py
 
-# 2^x on [-1/2, 1/2]: least largest relative error (9.2e-8) among polynomials of degree 5 that are 1 at 0.
+# 2^x on [-1/2, 1/2]: least maximum relative error (9.2e-8) among polynomials of degree 5 that are 1 at 0.
 _EXP2 = (1.0, 0.6931470036506653, 0.24022242426872253, 0.05550733581185341, 0.009671512991189957, 0.001326472731307149)
-_ROUND = 1.5 * 2.0**23  # added, it leaves the nearest integer in the low bits
+_ROUND_F32 = 1.5 * 2.0**23  # adding it leaves the nearest integer in the low bits
+_ROUND_F64 = 1.5 * 2.0**52
+_ROUND_F64_BITS = 0x4338000000000000
+_ROOT_HALF_BITS = 0x3FE6A09E667F3BCD  # of sqrt(1/2)
 
 
-class _Lanes(types.Type):
-    """Eight float32."""
+class _Vector(types.Type):
+    """A SIMD vector, named as in `_VECTOR_TYPES`."""
 
 
-class _Mask(types.Type):
-    """Eight truth values."""
+f32x8, f64x8, mask = (_Vector(name) for name in _VECTOR_TYPES)
 
 
-lanes = _Lanes("lanes")
-mask = _Mask("mask")
-
-
-@register_model(_Lanes)
-class _LanesModel(models.PrimitiveModel):
+@register_model(_Vector)
+class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _FLOATS)
+        super().__init__(manager, kind, _VECTOR_TYPES[kind.name])
 
 
-@register_model(_Mask)
-class _MaskModel(models.PrimitiveModel):
-    def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _BITS)
+def _register(symbol: Any, emit: Callable[..., Any], *cases: Any) -> None:
+    """Make numba apply an operator to vectors; a float64 operand is broadcast."""
+    infer_global(symbol)(type(symbol.__name__, (ConcreteTemplate,), {"cases": list(cases)}))
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        operands = (
+            _splat(builder, value, _DOUBLES) if kind == types.float64 else value
+            for value, kind in zip(args, sig.args, strict=True)
+        )
+        return emit(builder, *operands)
+
+    for case in cases:
+        lower_builtin(symbol, *case.args)(generate)
 
 
-def _register(symbol: Any, result: Any, operand: Any, emit: Callable[[ir.IRBuilder, Any, Any], Any]) -> None:
-    """Teach numba an operator on two vectors."""
-    infer_global(symbol)(type(symbol.__name__, (ConcreteTemplate,), {"cases": [signature(result, operand, operand)]}))
-    lower_builtin(symbol, operand, operand)(lambda context, builder, sig, args: emit(builder, *args))
+def _f64_cases(result: Any) -> list[Any]:
+    return [signature(result, *pair) for pair in ((f64x8, f64x8), (f64x8, types.float64), (types.float64, f64x8))]
 
 
-_register(operator.add, lanes, lanes, ir.IRBuilder.fadd)
-_register(operator.sub, lanes, lanes, ir.IRBuilder.fsub)
-_register(operator.mul, lanes, lanes, ir.IRBuilder.fmul)
-_register(operator.truediv, lanes, lanes, ir.IRBuilder.fdiv)
-_register(operator.le, mask, lanes, lambda builder, a, b: builder.fcmp_ordered("<=", a, b))
-_register(operator.gt, mask, lanes, lambda builder, a, b: builder.fcmp_ordered(">", a, b))
-_register(operator.and_, mask, mask, ir.IRBuilder.and_)
+def _compare(relation: str, builder: ir.IRBuilder, a: Any, b: Any) -> Any:
+    return builder.fcmp_ordered(relation, a, b)
 
 
-def emitted(function: Callable[..., Any]) -> Any:
-    """Have numba call a function that emits LLVM's code itself."""
+def _select_if(relation: str, builder: ir.IRBuilder, a: Any, b: Any) -> Any:
+    """`a` where the relation holds, else `b`: also where one of them is NaN."""
+    return builder.select(builder.fcmp_ordered(relation, a, b), a, b)
+
+
+def _call_f64(name: str, builder: ir.IRBuilder, *args: Any) -> Any:
+    kind = ir.FunctionType(_DOUBLES, [_DOUBLES] * len(args))
+    return builder.call(get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f64"), args)
+
+
+for _symbol, _emit in (
+    (operator.add, ir.IRBuilder.fadd),
+    (operator.sub, ir.IRBuilder.fsub),
+    (operator.mul, ir.IRBuilder.fmul),
+    (operator.truediv, ir.IRBuilder.fdiv),
+):
+    _register(_symbol, _emit, signature(f32x8, f32x8, f32x8))
+    _register(_symbol, partial(_emit, flags=_F64_FLAGS), *_f64_cases(f64x8))
+for _symbol, _relation in (
+    (operator.lt, "<"),
+    (operator.le, "<="),
+    (operator.gt, ">"),
+    (operator.ge, ">="),
+    (operator.eq, "=="),
+):
+    _register(_symbol, partial(_compare, _relation), signature(mask, f32x8, f32x8), *_f64_cases(mask))
+for _symbol, _relation in ((min, "<"), (max, ">")):
+    _register(_symbol, partial(_select_if, _relation), signature(f32x8, f32x8, f32x8), *_f64_cases(f64x8))
+_register(operator.neg, ir.IRBuilder.fneg, signature(f32x8, f32x8), signature(f64x8, f64x8))
+_register(operator.and_, ir.IRBuilder.and_, signature(mask, mask, mask))
+_register(abs, partial(_call_f64, "fabs"), signature(f64x8, f64x8))
+_register(math.sqrt, partial(_call_f64, "sqrt"), signature(f64x8, f64x8))
+_register(math.copysign, partial(_call_f64, "copysign"), *_f64_cases(f64x8))
+
+
+def llvm_intrinsic(function: Callable[..., Any]) -> Any:
+    """Make a function that emits LLVM code callable in kernels."""
     # The tests' check of annotations wraps every function; numba needs the bare one.
     return intrinsic(inspect.unwrap(function))
 
 
-@emitted
-def load(context, array, index):  # type: ignore[no-untyped-def]
-    """Eight elements from `index` on."""
+# Load, store, broadcast.
 
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        value = builder.load(_vector_pointer(context, builder, sig, args))
-        value.align = _ALIGN
-        return value
 
-    return lanes(array, types.intp), generate
+@llvm_intrinsic
+def load(context, array, index):
+    """Eight elements of a float32 array from `index` on."""
 
+    def generate(context, builder, sig, args):
+        return _load(builder, element_pointer(context, builder, sig, args), _FLOATS)
 
-@emitted
-def store(context, array, index, value):  # type: ignore[no-untyped-def]
-    """Write eight elements from `index` on."""
+    return f32x8(array, types.intp), generate
 
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        builder.store(args[2], _vector_pointer(context, builder, sig, args)).align = _ALIGN
-        return context.get_dummy_value()
 
-    return types.void(array, types.intp, lanes), generate
+@llvm_intrinsic
+def load_four(context, array, index):
+    """Four elements of a float32 array from `index` on, and four zeros."""
 
+    def generate(context, builder, sig, args):
+        four = _load(builder, element_pointer(context, builder, sig, args), _FOUR_FLOATS)
+        return _shuffle(builder, four, ir.Constant(_FOUR_FLOATS, None), range(LANES))
 
-@emitted
-def store_past_cache(context, array, index, value):  # type: ignore[no-untyped-def]
-    """Write eight elements that nobody reads soon; their place must be a multiple of 32 bytes."""
+    return f32x8(array, types.intp), generate
 
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        written = builder.store(args[2], _vector_pointer(context, builder, sig, args))
-        written.align = 4 * LANES
-        written.set_metadata("nontemporal", builder.module.add_metadata([_INT(1)]))
-        return context.get_dummy_value()
 
-    return types.void(array, types.intp, lanes), generate
+@llvm_intrinsic
+def load_row(context, rows, row, column):
+    """Eight elements of a row of a float64 array, from a column on."""
 
+    def generate(context, builder, sig, args):
+        return _load(builder, _row_pointer(context, builder, sig.args[0], *args), _DOUBLES)
 
-@emitted
-def spread(context, array, index):  # type: ignore[no-untyped-def]
-    """Element `index` in every lane."""
+    return f64x8(rows, types.intp, types.intp), generate
 
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return _splat(builder, builder.load(pointer_to(context, builder, sig, args)))
 
-    return lanes(array, types.intp), generate
+@llvm_intrinsic
+def load_broadcast(context, array, index):
+    """Element `index` of a float32 array in every lane."""
 
+    def generate(context, builder, sig, args):
+        return _splat(builder, builder.load(element_pointer(context, builder, sig, args)), _FLOATS)
 
-@emitted
-def fill(context, number):  # type: ignore[no-untyped-def]
-    """A number in every lane."""
+    return f32x8(array, types.intp), generate
 
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return _splat(builder, args[0])
 
-    return lanes(types.float32), generate
+@llvm_intrinsic
+def load_scalar(context, array, index):
+    """One element, without the check for a negative index that `array[index]` makes."""
 
-
-@emitted
-def multiply_add(context, a, b, c):  # type: ignore[no-untyped-def]
-    """A b + c, rounded once where the processor can."""
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return _multiply_add(builder, *args)
-
-    return lanes(lanes, lanes, lanes), generate
-
-
-@emitted
-def negative(context, value):  # type: ignore[no-untyped-def]
-    """The value with its sign turned."""
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return builder.fneg(args[0])
-
-    return lanes(lanes), generate
-
-
-@emitted
-def choose(context, condition, yes, no):  # type: ignore[no-untyped-def]
-    """`yes` where the condition holds, elsewhere `no`."""
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return builder.select(*args)
-
-    return lanes(mask, lanes, lanes), generate
-
-
-@emitted
-def minimum(context, a, b):  # type: ignore[no-untyped-def]
-    """The smaller of two, `b` where `a` is not a number."""
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return builder.select(builder.fcmp_ordered("<", *args), *args)
-
-    return lanes(lanes, lanes), generate
-
-
-@emitted
-def maximum(context, a, b):  # type: ignore[no-untyped-def]
-    """The larger of two, `b` where `a` is not a number."""
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return builder.select(builder.fcmp_ordered(">", *args), *args)
-
-    return lanes(lanes, lanes), generate
-
-
-@emitted
-def some(context, condition):  # type: ignore[no-untyped-def]
-    """Whether any lane is true."""
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        byte = ir.IntType(LANES)
-        return builder.icmp_unsigned("!=", builder.bitcast(args[0], byte), byte(0))
-
-    return types.boolean(mask), generate
-
-
-@emitted
-def exp2(context, value):  # type: ignore[no-untyped-def]
-    """2^value within 2e-7 relative, for -126 <= value <= 127; anything elsewhere."""
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        shifted = builder.fadd(args[0], _constant(_ROUND))
-        rest = builder.fsub(args[0], builder.fsub(shifted, _constant(_ROUND)))
-        power = _constant(_EXP2[-1])
-        for coefficient in reversed(_EXP2[:-1]):
-            power = _multiply_add(builder, power, rest, _constant(coefficient))
-        exponent = builder.shl(builder.bitcast(shifted, _INTS), _INTS([_INT(23)] * LANES))
-        return builder.bitcast(builder.add(builder.bitcast(power, _INTS), exponent), _FLOATS)
-
-    return lanes(lanes), generate
-
-
-@emitted
-def totals(context, a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
-    """The sums of the lanes of eight vectors, in order."""
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        rows, half = list(args), LANES // 2
-        while half:
-            # Pair row i with row i + half; fold the two halves of every group of 2 half lanes.
-            pairs = zip(rows[:half], rows[half:], strict=True)
-            rows = [builder.fadd(*_halves(builder, low, high, half)) for low, high in pairs]
-            half //= 2
-        return rows[0]
-
-    return lanes(*[lanes] * LANES), generate
-
-
-@emitted
-def first_lane(context, value):  # type: ignore[no-untyped-def]
-    """The first of eight numbers."""
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return builder.extract_element(args[0], _INT(0))
-
-    return types.float32(lanes), generate
-
-
-@emitted
-def transposed(context, a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
-    """Eight vectors as the rows of a square, turned into its columns."""
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        rows, half = list(args), LANES // 2
-        while half:
-            turned = list(rows)
-            for row in range(LANES):
-                if not row & half:
-                    turned[row], turned[row + half] = _halves(builder, rows[row], rows[row + half], half)
-            rows, half = turned, half // 2
-        return context.make_tuple(builder, sig.return_type, rows)
-
-    return types.UniTuple(lanes, LANES)(*[lanes] * LANES), generate
-
-
-@emitted
-def side_by_side(context, a, b):  # type: ignore[no-untyped-def]
-    """Two vectors of two rows of four each, as two rows of eight; and back, for it is its own inverse."""
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return context.make_tuple(builder, sig.return_type, _halves(builder, *args, LANES // 2))
-
-    return types.UniTuple(lanes, 2)(lanes, lanes), generate
-
-
-@emitted
-def how_many(context, bits):  # type: ignore[no-untyped-def]
-    """How many bits of an unsigned 64-bit number are set."""
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return builder.ctpop(args[0])
-
-    return types.intp(types.uint64), generate
-
-
-@emitted
-def element(context, array, index):  # type: ignore[no-untyped-def]
-    """One element; unlike array[index] it does not ask whether the index counts from the end."""
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return builder.load(pointer_to(context, builder, sig, args))
+    def generate(context, builder, sig, args):
+        return builder.load(element_pointer(context, builder, sig, args))
 
     return array.dtype(array, types.intp), generate
 
 
-@emitted
-def put(context, array, index, value):  # type: ignore[no-untyped-def]
-    """Write one element, likewise."""
+@llvm_intrinsic
+def store(context, array, index, value):
+    """Write eight elements of a float32 array from `index` on."""
 
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        builder.store(args[2], pointer_to(context, builder, sig, args))
+    def generate(context, builder, sig, args):
+        _store(builder, args[2], element_pointer(context, builder, sig, args))
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, f32x8), generate
+
+
+@llvm_intrinsic
+def store_nontemporal(context, array, index, value):
+    """Write eight elements that are not read soon; their address must be a multiple of 32 bytes."""
+
+    def generate(context, builder, sig, args):
+        stored = _store(builder, args[2], element_pointer(context, builder, sig, args))
+        stored.align = 4 * LANES
+        stored.set_metadata("nontemporal", builder.module.add_metadata([_INT(1)]))
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, f32x8), generate
+
+
+@llvm_intrinsic
+def store_row(context, rows, row, column, value):
+    """Write eight elements of a row of a float64 array, from a column on."""
+
+    def generate(context, builder, sig, args):
+        *place, value = args
+        _store(builder, value, _row_pointer(context, builder, sig.args[0], *place))
+        return context.get_dummy_value()
+
+    return types.void(rows, types.intp, types.intp, f64x8), generate
+
+
+@llvm_intrinsic
+def store_mask(context, array, index, condition):
+    """Write the lanes of a mask as bytes from `index` on."""
+
+    def generate(context, builder, sig, args):
+        _store(builder, builder.zext(args[2], _BYTES), element_pointer(context, builder, sig, args))
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, mask), generate
+
+
+@llvm_intrinsic
+def store_scalar(context, array, index, value):
+    """Write one element, without a check of the index."""
+
+    def generate(context, builder, sig, args):
+        builder.store(args[2], element_pointer(context, builder, sig, args))
         return context.get_dummy_value()
 
     return types.void(array, types.intp, array.dtype), generate
 
 
-@emitted
-def copy_four(context, target, at, source, index):  # type: ignore[no-untyped-def]
-    """Copy four float32 from `index` of one array on to `at` of another."""
+@llvm_intrinsic
+def copy_four(context, target, target_index, source, source_index):
+    """Copy four float32 from one array to another."""
 
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        four = ir.VectorType(_FLOAT, 4).as_pointer()
-        places = [
-            builder.gep(context.make_array(sig.args[i])(context, builder, args[i]).data, [args[i + 1]]) for i in (0, 2)
-        ]
-        found = builder.load(builder.bitcast(places[1], four))
-        found.align = _ALIGN
-        builder.store(found, builder.bitcast(places[0], four)).align = _ALIGN
+    def generate(context, builder, sig, args):
+        to, source = (_pointer(context, builder, sig.args[i], args[i], args[i + 1]) for i in (0, 2))
+        _store(builder, _load(builder, source, _FOUR_FLOATS), to)
         return context.get_dummy_value()
 
     return types.void(target, types.intp, source, types.intp), generate
 
 
-@emitted
-def prefetch(context, array, index):  # type: ignore[no-untyped-def]
-    """Ask for the cache line of element `index`, to be read."""
+@llvm_intrinsic
+def broadcast(context, number):
+    """A number in every lane: an `f32x8` of a float32, else an `f64x8`."""
+    single, vector = (types.float32, f32x8) if number == types.float32 else (types.float64, f64x8)
 
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return _prefetch(context, builder, sig, args, 0)
+    def generate(context, builder, sig, args):
+        return _splat(builder, args[0], _VECTOR_TYPES[vector.name])
+
+    return vector(single), generate
+
+
+@llvm_intrinsic
+def prefetch(context, array, index):
+    """Prefetch the cache line of element `index` for a read."""
+
+    def generate(context, builder, sig, args):
+        return _prefetch(context, builder, sig, args, is_write=0, locality=2)
 
     return types.void(array, types.intp), generate
 
 
-@emitted
-def prefetch_to_write(context, array, index):  # type: ignore[no-untyped-def]
-    """Ask for the cache line of element `index`, to be written."""
+@llvm_intrinsic
+def prefetch_for_write(context, array, index):
+    """Prefetch the cache line of element `index` for a write."""
 
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return _prefetch(context, builder, sig, args, 1)
+    def generate(context, builder, sig, args):
+        return _prefetch(context, builder, sig, args, is_write=1, locality=3)
 
     return types.void(array, types.intp), generate
 
 
-def _prefetch(context: Any, builder: Any, sig: Any, args: Any, writes: int) -> Any:
-    pointer = builder.bitcast(pointer_to(context, builder, sig, args), ir.IntType(8).as_pointer())
+@llvm_intrinsic
+def align_stack(context):
+    """Align the kernel's stack to cache lines; called at its start, so that no spilled vector crosses a line."""
+
+    def generate(context, builder, sig, args):
+        # LLVM fixes the alignment before it allocates registers, by what is on the stack then: here an unused vector.
+        place = alloca_once(builder, _DOUBLES)
+        place.align = _CACHE_LINE
+        kind = ir.FunctionType(ir.VoidType(), [place.type])
+        builder.asm(kind, "", "r,~{memory}", [place], side_effect=True)
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+# Arithmetic, masks, bits.
+
+
+@llvm_intrinsic
+def to_f64(context, value):
+    """Eight float32 as float64."""
+    return f64x8(f32x8), lambda context, builder, sig, args: builder.fpext(args[0], _DOUBLES)
+
+
+@llvm_intrinsic
+def to_f32(context, value):
+    """Eight float64 rounded to float32."""
+    return f32x8(f64x8), lambda context, builder, sig, args: builder.fptrunc(args[0], _FLOATS)
+
+
+@llvm_intrinsic
+def multiply_add(context, a, b, c):
+    """a b + c, rounded once where the processor can."""
+    return f32x8(f32x8, f32x8, f32x8), lambda context, builder, sig, args: _multiply_add(builder, *args)
+
+
+@llvm_intrinsic
+def exp2(context, value):
+    """2^value within 2e-7 relative, for -126 <= value <= 127; undefined elsewhere."""
+
+    def generate(context, builder, sig, args):
+        shifted = builder.fadd(args[0], _constant(_FLOATS, _ROUND_F32))
+        fraction = builder.fsub(args[0], builder.fsub(shifted, _constant(_FLOATS, _ROUND_F32)))
+        power = _constant(_FLOATS, _EXP2[-1])
+        for coefficient in reversed(_EXP2[:-1]):
+            power = _multiply_add(builder, power, fraction, _constant(_FLOATS, coefficient))
+        exponent = builder.shl(builder.bitcast(shifted, _INTS), _constant(_INTS, 23))
+        return builder.bitcast(builder.add(builder.bitcast(power, _INTS), exponent), _FLOATS)
+
+    return f32x8(f32x8), generate
+
+
+@llvm_intrinsic
+def mantissa_and_exponent(context, value):
+    """m in [sqrt 1/2, sqrt 2) and a whole number e so that the value, above 0 and not subnormal, is m 2^e."""
+
+    def generate(context, builder, sig, args):
+        bits = builder.bitcast(args[0], _LONGS)
+        exponent = builder.ashr(builder.sub(bits, _constant(_LONGS, _ROOT_HALF_BITS)), _constant(_LONGS, 52))
+        mantissa = builder.bitcast(builder.sub(bits, builder.shl(exponent, _constant(_LONGS, 52))), _DOUBLES)
+        shifted = builder.bitcast(builder.add(exponent, _constant(_LONGS, _ROUND_F64_BITS)), _DOUBLES)
+        number = builder.fsub(shifted, _constant(_DOUBLES, _ROUND_F64))
+        return context.make_tuple(builder, sig.return_type, (mantissa, number))
+
+    return types.UniTuple(f64x8, 2)(f64x8), generate
+
+
+@llvm_intrinsic
+def select(context, condition, yes, no):
+    """`yes` where the condition holds, elsewhere `no`."""
+    return yes(mask, yes, yes), lambda context, builder, sig, args: builder.select(*args)
+
+
+@llvm_intrinsic
+def any_lane(context, condition):
+    """Whether any lane of a mask is true."""
+    return types.boolean(mask), lambda context, builder, sig, args: _any(builder, args[0])
+
+
+@llvm_intrinsic
+def mask_bits(context, condition):
+    """The lanes of a mask as the lowest bits of a number."""
+
+    def generate(context, builder, sig, args):
+        return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), _LONG)
+
+    return types.uint64(mask), generate
+
+
+@llvm_intrinsic
+def popcount(context, bits):
+    """How many bits of an unsigned 64-bit number are set."""
+    return types.intp(types.uint64), lambda context, builder, sig, args: builder.ctpop(args[0])
+
+
+@llvm_intrinsic
+def list_set_bits(context, array, index, bits, base):
+    """Write the positions of an unsigned 64-bit number's set bits, plus `base`, as bytes from `index` on.
+
+    Up to 64 bytes are overwritten.
+    """
+
+    def generate(context, builder, sig, args):
+        (_, _, bits, base), pointer = args, element_pointer(context, builder, sig, args)
+        base = builder.trunc(base, _BYTE)
+        if "+avx512vbmi2" in context.codegen().magic_tuple()[2].split(","):
+            _compress_positions(builder, pointer, bits, base)
+        else:
+            loop_over_set_bits(builder, pointer, bits, base)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.uint64, types.intp), generate
+
+
+@llvm_intrinsic
+def max_magnitude(context, largest, value):
+    """The larger of two magnitudes lane by lane, as bits without the sign: NaN and infinity are the largest."""
+    return f32x8(f32x8, f32x8), lambda context, builder, sig, args: _max_magnitude(builder, *args)
+
+
+@llvm_intrinsic
+def any_magnitude_reaches(context, largest, bound):
+    """Whether a magnitude of `max_magnitude` reaches a bound, given as twice its bits."""
+
+    def generate(context, builder, sig, args):
+        reached = builder.icmp_unsigned(">=", builder.bitcast(args[0], _INTS), _splat(builder, args[1], _INTS))
+        return _any(builder, reached)
+
+    return types.boolean(f32x8, types.uint32), generate
+
+
+# Movement between lanes.
+
+
+@llvm_intrinsic
+def first_lane(context, value):
+    """The first lane."""
+    return types.float32(f32x8), lambda context, builder, sig, args: builder.extract_element(args[0], _INT(0))
+
+
+@llvm_intrinsic
+def lane_sums(context, a, b, c, d, e, f, g, h):
+    """The sums over the lanes of eight vectors, in order."""
+
+    def generate(context, builder, sig, args):
+        rows, half = list(args), LANES // 2
+        while half:
+            # Pair row i with row i + half; add the two halves of every group of 2 half lanes.
+            pairs = zip(rows[:half], rows[half:], strict=True)
+            rows = [builder.fadd(*_halves(builder, low, high, half)) for low, high in pairs]
+            half //= 2
+        return rows[0]
+
+    return f32x8(*[f32x8] * LANES), generate
+
+
+@llvm_intrinsic
+def transpose(context, a, b, c, d, e, f, g, h):
+    """The columns of the square whose rows are eight vectors."""
+
+    def generate(context, builder, sig, args):
+        rows, half = list(args), LANES // 2
+        while half:
+            swapped = list(rows)
+            for row in range(LANES):
+                if not row & half:
+                    swapped[row], swapped[row + half] = _halves(builder, rows[row], rows[row + half], half)
+            rows, half = swapped, half // 2
+        return context.make_tuple(builder, sig.return_type, rows)
+
+    return types.UniTuple(f32x8, LANES)(*[f32x8] * LANES), generate
+
+
+@llvm_intrinsic
+def join_halves(context, a, b):
+    """The lower halves of two vectors as one, and the upper halves; it is its own inverse.
+
+    Two blocks of two rows of four pixels become two rows of eight.
+    """
+
+    def generate(context, builder, sig, args):
+        return context.make_tuple(builder, sig.return_type, _halves(builder, *args, LANES // 2))
+
+    return types.UniTuple(f32x8, 2)(f32x8, f32x8), generate
+
+
+@llvm_intrinsic
+def deinterleave(context, vectors):
+    """Of k vectors that hold eight groups of k numbers: the first of each group, the second, and so on."""
+
+    def generate(context, builder, sig, args):
+        return context.make_tuple(builder, sig.return_type, _deinterleave(builder, unpack_tuple(builder, args[0])))
+
+    return vectors(vectors), generate
+
+
+@llvm_intrinsic
+def interleave(context, vectors):
+    """Undo `deinterleave`."""
+
+    def generate(context, builder, sig, args):
+        return context.make_tuple(builder, sig.return_type, _interleave(builder, unpack_tuple(builder, args[0])))
+
+    return vectors(vectors), generate
+
+
+# Arrays of structures to structures of arrays, and back.
+
+
+def _aos_to_soa(size: int) -> Any:
+    """A kernel function that reads groups of `size` float32, one a Gaussian, into rows of float64."""
+
+    @llvm_intrinsic
+    def read_eight(context, numbers, index, rows, row, column, largest):
+        def generate(context, builder, sig, args):
+            numbers, index, rows, row, column, largest = args
+            vectors = []
+            for j in range(size):
+                at = builder.add(index, index.type(LANES * j))
+                vectors.append(_load(builder, _pointer(context, builder, sig.args[0], numbers, at), _FLOATS))
+            for vector in vectors:
+                largest = _max_magnitude(builder, largest, vector)
+            for j, vector in enumerate(_deinterleave(builder, vectors)):
+                at = builder.add(row, row.type(j))
+                pointer = _row_pointer(context, builder, sig.args[2], rows, at, column)
+                _store(builder, builder.fpext(vector, _DOUBLES), pointer)
+            return largest
+
+        return f32x8(numbers, types.intp, rows, types.intp, types.intp, f32x8), generate
+
+    @inline_kernel
+    def read(numbers, start, count, rows, row, largest):
+        whole = count // LANES * LANES
+        for i in range(0, whole, LANES):
+            first = size * (start + i)
+            prefetch(numbers, first + size * PREFETCH_DISTANCE)
+            if size > 1:
+                prefetch(numbers, first + size * PREFETCH_DISTANCE + 2 * LANES)
+            largest = read_eight(numbers, first, rows, row, i, largest)
+        for i in range(whole, count):
+            for j in range(size):
+                rows[row + j, i] = load_scalar(numbers, size * (start + i) + j)
+        return largest
+
+    return read
+
+
+def _soa_to_aos(size: int) -> Any:
+    """A kernel function that writes rows of float64 as groups of `size` float32, one a Gaussian."""
+
+    @llvm_intrinsic
+    def write_eight(context, rows, row, column, numbers, index):
+        def generate(context, builder, sig, args):
+            rows, row, column, numbers, index = args
+            vectors = []
+            for j in range(size):
+                at = builder.add(row, row.type(j))
+                pointer = _row_pointer(context, builder, sig.args[0], rows, at, column)
+                vectors.append(builder.fptrunc(_load(builder, pointer, _DOUBLES), _FLOATS))
+            for j, vector in enumerate(_interleave(builder, vectors)):
+                at = builder.add(index, index.type(LANES * j))
+                _store(builder, vector, _pointer(context, builder, sig.args[3], numbers, at))
+            return context.get_dummy_value()
+
+        return types.void(rows, types.intp, types.intp, numbers, types.intp), generate
+
+    @inline_kernel
+    def write(rows, row, start, count, numbers):
+        whole = count // LANES * LANES
+        for i in range(0, whole, LANES):
+            write_eight(rows, row, i, numbers, size * (start + i))
+        for i in range(whole, count):
+            for j in range(size):
+                store_scalar(numbers, size * (start + i) + j, np.float32(rows[row + j, i]))
+
+    return write
+
+
+# read(numbers, start, count, rows, row, largest): read `count` groups from group `start` on into `size` rows from `row`
+# on; return the largest magnitudes so far, for `any_magnitude_reaches`.
+aos1_to_soa, aos3_to_soa, aos4_to_soa = (_aos_to_soa(size) for size in (1, 3, 4))
+# write(rows, row, start, count, numbers): the reverse, rounded.
+soa_to_aos1, soa_to_aos3, soa_to_aos4 = (_soa_to_aos(size) for size in (1, 3, 4))
+
+
+@inline_kernel
+def load_aos4(numbers, first):
+    """Eight groups of four float32 from `first` on: the first of each group, the second, and so on."""
+    return deinterleave(
+        (
+            load(numbers, first),
+            load(numbers, first + LANES),
+            load(numbers, first + 2 * LANES),
+            load(numbers, first + 3 * LANES),
+        )
+    )
+
+
+@inline_kernel
+def load_transposed(numbers, r0, r1, r2, r3, r4, r5, r6, r7):
+    """The columns of eight rows of eight float32, given where the rows begin."""
+    return transpose(
+        load(numbers, r0),
+        load(numbers, r1),
+        load(numbers, r2),
+        load(numbers, r3),
+        load(numbers, r4),
+        load(numbers, r5),
+        load(numbers, r6),
+        load(numbers, r7),
+    )
+
+
+@inline_kernel
+def records_to_soa(records, start, count, soa, width):
+    """Turn `count` records into rows of `width` float32, one a field; past `count` the last record is repeated.
+
+    Args:
+        records, soa: flat.
+        start: the first record.
+        count: at most `width`.
+    """
+    last = start + count - 1
+    for i in range(0, count, LANES):
+        g = start + i
+        r0, r1 = RECORD_SIZE * g, RECORD_SIZE * min(g + 1, last)
+        r2, r3 = RECORD_SIZE * min(g + 2, last), RECORD_SIZE * min(g + 3, last)
+        r4, r5 = RECORD_SIZE * min(g + 4, last), RECORD_SIZE * min(g + 5, last)
+        r6, r7 = RECORD_SIZE * min(g + 6, last), RECORD_SIZE * min(g + 7, last)
+        for half in range(0, RECORD_SIZE, LANES):
+            columns = load_transposed(
+                records, r0 + half, r1 + half, r2 + half, r3 + half, r4 + half, r5 + half, r6 + half, r7 + half
+            )
+            for field in range(LANES):
+                store(soa, (half + field) * width + i, columns[field])
+
+
+@inline_kernel
+def soa_to_records(soa, width, start, count, records):
+    """Turn rows of `width` float32, one a field, into `count` records from `start` on.
+
+    Args:
+        soa, records: flat.
+        count: at most `width`.
+    """
+    whole = count // LANES * LANES
+    for i in range(0, whole, LANES):
+        for half in range(0, RECORD_SIZE, LANES):
+            r = half * width + i
+            columns = load_transposed(
+                soa, r, r + width, r + 2 * width, r + 3 * width, r + 4 * width, r + 5 * width, r + 6 * width,
+                r + 7 * width,
+            )  # fmt: skip
+            for lane in range(LANES):
+                store_nontemporal(records, RECORD_SIZE * (start + i + lane) + half, columns[lane])
+    for i in range(whole, count):
+        for field in range(RECORD_SIZE):
+            records[RECORD_SIZE * (start + i) + field] = soa[field * width + i]
+
+
+# LLVM code that several of the above emit.
+
+
+def element_pointer(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """The address of element `args[1]` of the flat array `args[0]`."""
+    return _pointer(context, builder, sig.args[0], args[0], args[1])
+
+
+def _pointer(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
+    return builder.gep(context.make_array(kind)(context, builder, array).data, [index])
+
+
+def _row_pointer(context: Any, builder: Any, kind: Any, rows: Any, row: Any, column: Any) -> Any:
+    array = context.make_array(kind)(context, builder, rows)
+    width = builder.extract_value(array.shape, 1)
+    return builder.gep(array.data, [builder.add(builder.mul(row, width), column)])
+
+
+def _load(builder: Any, pointer: Any, kind: Any) -> Any:
+    loaded = builder.load(builder.bitcast(pointer, kind.as_pointer()))
+    loaded.align = _ALIGNMENT[kind]
+    return loaded
+
+
+def _store(builder: Any, value: Any, pointer: Any) -> Any:
+    stored = builder.store(value, builder.bitcast(pointer, value.type.as_pointer()))
+    stored.align = _ALIGNMENT[value.type]
+    return stored
+
+
+def _prefetch(context: Any, builder: Any, sig: Any, args: Any, *, is_write: int, locality: int) -> Any:
+    pointer = builder.bitcast(element_pointer(context, builder, sig, args), _BYTE.as_pointer())
     kind = ir.FunctionType(ir.VoidType(), [pointer.type, _INT, _INT, _INT])
     function = get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-    builder.call(function, [pointer, _INT(writes), _INT(3 if writes else 2), _INT(1)])
+    builder.call(function, [pointer, _INT(is_write), _INT(locality), _INT(1)])
     return context.get_dummy_value()
 
 
-def pointer_to(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Where element `args[1]` of the array `args[0]` is."""
-    array = context.make_array(sig.args[0])(context, builder, args[0])
-    return builder.gep(array.data, [args[1]])
+def _constant(kind: Any, number: float) -> ir.Constant:
+    return kind([kind.element(number)] * kind.count)
 
 
-def _vector_pointer(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    return builder.bitcast(pointer_to(context, builder, sig, args), _FLOATS.as_pointer())
-
-
-def _constant(number: float) -> ir.Constant:
-    return _FLOATS([_FLOAT(number)] * LANES)
-
-
-def _splat(builder: Any, number: Any) -> Any:
-    single = builder.insert_element(ir.Constant(_FLOATS, ir.Undefined), number, _INT(0))
-    return _shuffle(builder, single, single, [0] * LANES)
+def _splat(builder: Any, number: Any, kind: Any) -> Any:
+    single = builder.insert_element(ir.Constant(kind, ir.Undefined), number, _INT(0))
+    return _shuffle(builder, single, single, [0] * kind.count)
 
 
 def _multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
-    # Not llvm.fma, which calls a function for every lane where the processor has no such instruction.
+    # Not llvm.fma: it calls a function for every lane where the processor has no such instruction.
     kind = ir.FunctionType(_FLOATS, [_FLOATS] * 3)
     return builder.call(get_or_insert_function(builder.module, kind, f"llvm.fmuladd.v{LANES}f32"), [a, b, c])
+
+
+def _max_magnitude(builder: Any, largest: Any, value: Any) -> Any:
+    largest, size = builder.bitcast(largest, _INTS), builder.shl(builder.bitcast(value, _INTS), _constant(_INTS, 1))
+    return builder.bitcast(builder.select(builder.icmp_unsigned(">", largest, size), largest, size), _FLOATS)
+
+
+def _any(builder: Any, bits: Any) -> Any:
+    number = ir.IntType(LANES)
+    return builder.icmp_unsigned("!=", builder.bitcast(bits, number), number(0))
 
 
 def _halves(builder: Any, low: Any, high: Any, half: int) -> tuple[Any, Any]:
@@ -370,5 +710,62 @@ def _halves(builder: Any, low: Any, high: Any, half: int) -> tuple[Any, Any]:
     return _shuffle(builder, low, high, first), _shuffle(builder, low, high, [lane + half for lane in first])
 
 
-def _shuffle(builder: Any, low: Any, high: Any, chosen: list[int]) -> Any:
-    return builder.shuffle_vector(low, high, _INTS([_INT(lane) for lane in chosen]))
+def _deinterleave(builder: Any, vectors: Sequence[Any]) -> list[Any]:
+    size = len(vectors)
+    return [
+        _gather_lanes(builder, vectors, [divmod(size * lane + j, LANES) for lane in range(LANES)]) for j in range(size)
+    ]
+
+
+def _interleave(builder: Any, vectors: Sequence[Any]) -> list[Any]:
+    size = len(vectors)
+    return [
+        _gather_lanes(builder, vectors, [divmod(LANES * j + lane, size)[::-1] for lane in range(LANES)])
+        for j in range(size)
+    ]
+
+
+def _gather_lanes(builder: Any, vectors: Sequence[Any], lanes: list[tuple[int, int]]) -> Any:
+    """A vector whose lanes are lanes of others: for each, the vector's number and the lane in it."""
+    first, *others = sorted({source for source, _ in lanes})
+    gathered, chosen = vectors[first], [lane if source == first else 0 for source, lane in lanes]
+    for other in others:
+        chosen = [LANES + lane if source == other else old for (source, lane), old in zip(lanes, chosen, strict=True)]
+        gathered, chosen = _shuffle(builder, gathered, vectors[other], chosen), list(range(LANES))
+    return gathered
+
+
+def _shuffle(builder: Any, low: Any, high: Any, chosen: Iterable[int]) -> Any:
+    lanes = [_INT(lane) for lane in chosen]
+    return builder.shuffle_vector(low, high, ir.VectorType(_INT, len(lanes))(lanes))
+
+
+def _compress_positions(builder: Any, pointer: Any, bits: Any, base: Any) -> None:
+    """List set bits by AVX-512's compress instruction."""
+    kind, flags = ir.VectorType(_BYTE, 64), ir.VectorType(ir.IntType(1), 64)
+    positions = builder.add(kind([_BYTE(position) for position in range(64)]), _splat(builder, base, kind))
+    function = get_or_insert_function(
+        builder.module, ir.FunctionType(kind, [kind, kind, flags]), "llvm.x86.avx512.mask.compress.v64i8"
+    )
+    undefined = ir.Constant(kind, ir.Undefined)
+    found = builder.call(function, [positions, undefined, builder.bitcast(bits, flags)])
+    builder.store(found, builder.bitcast(pointer, kind.as_pointer())).align = 1
+
+
+def loop_over_set_bits(builder: Any, pointer: Any, bits: Any, base: Any) -> None:
+    """List set bits one by one."""
+    before, one = builder.block, bits.type(1)
+    test, body, after = (builder.append_basic_block(name) for name in ("test", "body", "after"))
+    builder.branch(test)
+    builder.position_at_end(test)
+    left, to = builder.phi(bits.type), builder.phi(pointer.type)
+    builder.cbranch(builder.icmp_unsigned("!=", left, bits.type(0)), body, after)
+    builder.position_at_end(body)
+    position = builder.trunc(builder.cttz(left, ir.IntType(1)(1)), _BYTE)
+    builder.store(builder.add(position, base), to)
+    left.add_incoming(bits, before)
+    left.add_incoming(builder.and_(left, builder.sub(left, one)), body)
+    to.add_incoming(pointer, before)
+    to.add_incoming(builder.gep(to, [_INT(1)]), body)
+    builder.branch(test)
+    builder.position_at_end(after)

@@ -19,12 +19,10 @@ import numpy as np
 
 from pansplat.constants import ALPHA_CUT, KAPPA_MARGIN
 from pansplat.rendering.cpu import records as layout
-from pansplat.rendering.cpu.columns import read_columns
-from pansplat.rendering.cpu.forms import cross, dot
-from pansplat.rendering.cpu.observe import CULLED, LANES, PIECE
+from pansplat.rendering.cpu.projection import CULLED, GAUSSIAN_BLOCK, GAUSSIANS_PER_ITEM, cross, dot
 from pansplat.rendering.cpu.records import BOX_BITS, TILE_SIZE
 from pansplat.rendering.cpu.runtime import Workspace, inline_kernel, kernel, parallel_for
-from pansplat.rendering.cpu.simd import element, prefetch, prefetch_to_write, put
+from pansplat.rendering.cpu.simd import load_scalar, prefetch, prefetch_for_write, records_to_soa, store_scalar
 from pansplat.rendering.image_planes import ImagePlane
 
 # --- bounding boxes ---
@@ -63,12 +61,12 @@ def _load_cones(records, start, count, rotation, rows):
         records: flat.
         rotation: float32, the image plane's axes in the records'.
     """
-    read_columns(records, start, count, rows.reshape(-1), LANES)
+    records_to_soa(records, start, count, rows.reshape(-1), GAUSSIAN_BLOCK)
     right = rotation[0, 0], rotation[1, 0], rotation[2, 0]
     down = rotation[0, 1], rotation[1, 1], rotation[2, 1]
     ahead = rotation[0, 2], rotation[1, 2], rotation[2, 2]
     row_a, row_b = layout.ROW_A, layout.ROW_B
-    for i in range(LANES):
+    for i in range(GAUSSIAN_BLOCK):
         n = rows[0, i], rows[1, i], rows[2, i]
         a = rows[row_a, i], rows[row_a + 1, i], rows[row_a + 2, i]
         b = rows[row_b, i], rows[row_b + 1, i], rows[row_b + 2, i]
@@ -122,14 +120,14 @@ def _is_outside(n, p, q, radial_variance, kappa, normal_x, normal_y, normal_z):
 
 @kernel
 def _bound_pinhole(item, records, rotation, height, width, focal, boxes):
-    rows = np.ones((_NUM_ROWS, LANES), np.float32)
+    rows = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK), np.float32)
     side, end = np.float32(width / (2 * focal)), np.float32(height / (2 * focal))
     middle_x, middle_y, scale = np.float32(0.5 * width), np.float32(0.5 * height), np.float32(focal)
     num = len(records) // layout.RECORD_SIZE
-    for start in range(item * PIECE, min((item + 1) * PIECE, num), LANES):
-        count = min(LANES, num - start)
+    for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, num), GAUSSIAN_BLOCK):
+        count = min(GAUSSIAN_BLOCK, num - start)
         _load_cones(records, start, count, rotation, rows)
-        for i in range(LANES):
+        for i in range(GAUSSIAN_BLOCK):
             n, p, q, radial_variance, kappa = _cone(rows, i)
             d_zz = n[2] * n[2] - kappa * (radial_variance * n[2] * n[2] + p[2] * p[2] + q[2] * q[2])
             x, root_x = _pinhole_edges(n[0], n[2], p[0], p[2], q[0], q[2], radial_variance, kappa)
@@ -160,7 +158,7 @@ def round_boxes(rows, edges, start, count, height, width, boxes):
     """
     margin = _pixel_margin(height, width)
     last_x, last_y = np.float32(width - 1), np.float32(height - 1)
-    for i in range(LANES):
+    for i in range(GAUSSIAN_BLOCK):
         x0 = max(np.ceil(rows[edges, i] - _HALF - margin), _ZERO)
         x1 = min(np.floor(rows[edges + 1, i] - _HALF + margin), last_x)
         y0 = max(np.ceil(rows[edges + 2, i] - _HALF - margin), _ZERO)
@@ -220,15 +218,15 @@ def _max_latitude(sine, cosine, low, high, sides2):
 
 @kernel
 def _bound_equirect(item, records, rotation, height, width, boxes):
-    rows = np.ones((_NUM_ROWS, LANES), np.float32)
+    rows = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK), np.float32)
     margin, side, last_y = _pixel_margin(height, width), np.float32(width), np.float32(height - 1)
     last_x, per_side = np.float32(width - 1), np.float32(1 / width)
     num = len(records) // layout.RECORD_SIZE
-    for start in range(item * PIECE, min((item + 1) * PIECE, num), LANES):
-        count = min(LANES, num - start)
+    for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, num), GAUSSIAN_BLOCK):
+        count = min(GAUSSIAN_BLOCK, num - start)
         _load_cones(records, start, count, rotation, rows)
         _equirect_edges(rows, height, width)
-        for i in range(LANES):
+        for i in range(GAUSSIAN_BLOCK):
             x0 = np.ceil(rows[_EDGES, i] - _HALF - margin)
             x1 = np.floor(rows[_EDGES + 1, i] - _HALF + margin)
             y0 = max(np.ceil(rows[_EDGES + 2, i] - _HALF - margin), _ZERO)
@@ -248,7 +246,7 @@ def _bound_equirect(item, records, rotation, height, width, boxes):
 def _equirect_edges(rows, height, width):
     per_column, per_row = np.float32(width / (2 * math.pi)), np.float32(height / math.pi)
     middle_x, middle_y = np.float32(0.5 * width), np.float32(0.5 * height)
-    for i in range(LANES):
+    for i in range(GAUSSIAN_BLOCK):
         n, p, q, radial_variance, kappa = _cone(rows, i)
         flat = math.sqrt(n[0] * n[0] + n[2] * n[2])
         on_axis = flat < _MIN_HORIZONTAL
@@ -301,7 +299,7 @@ def find_bounding_boxes(records: np.ndarray, picture: ImagePlane, workspace: Wor
         else:
             _bound_pinhole(item, flat, rotation, height, width, picture.focal, words)
 
-    parallel_for(bound, -(-len(records) // PIECE), threads)
+    parallel_for(bound, -(-len(records) // GAUSSIANS_PER_ITEM), threads)
     return words.view(np.int16)
 
 
@@ -383,7 +381,7 @@ def _count_intersections(part, ends, words, rows, columns, counts):
     across, row = columns + 1, counts[part]
     steps = np.zeros((rows + 1) * across, np.int64)
     for g in range(ends[part], ends[part + 1]):
-        word = element(words, g)
+        word = load_scalar(words, g)
         first, last, top, bottom = _tile_range(word)
         upper, lower = top * across, (bottom + 1 if word != EMPTY_BOX else top) * across
         if (word >> 16 & _SIDE) < (word & _SIDE):  # wraps around
@@ -405,13 +403,13 @@ def _count_intersections(part, ends, words, rows, columns, counts):
 
 @inline_kernel
 def _add(numbers, index, step):
-    put(numbers, index, element(numbers, index) + step)
+    store_scalar(numbers, index, load_scalar(numbers, index) + step)
 
 
 @inline_kernel
 def _buffer_pair(tile, gaussian, box, index, tiles, pairs):
-    put(tiles, index, tile)
-    put(pairs, index, gaussian | box << 32)
+    store_scalar(tiles, index, tile)
+    store_scalar(pairs, index, gaussian | box << 32)
 
 
 @inline_kernel
@@ -473,7 +471,7 @@ def _write_intersections(
     capacity = _BUFFER_SIZE + len(positions) + 4
     tiles, pairs = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
     for g in range(ends[part], ends[part + 1]):
-        word = element(words, g)
+        word = load_scalar(words, g)
         first, last, top, bottom = _tile_range(word)
         small = (last - first <= 1) & (bottom - top <= 1) & ((word >> 16 & _SIDE) >= (word & _SIDE))
         if small & (top >= low) & (bottom < high) & (word != EMPTY_BOX):
@@ -481,17 +479,17 @@ def _write_intersections(
         else:
             buffered = _buffer_all(g, word, low, high, columns, width, buffered, tiles, pairs)
         if len(offsets) > 0:
-            put(offsets, g + 1, slot + buffered)
+            store_scalar(offsets, g + 1, slot + buffered)
         if buffered >= _BUFFER_SIZE or g == ends[part + 1] - 1:
             for k in range(buffered):
-                tile = element(tiles, k)
-                position = element(positions, tile)
-                put(positions, tile, position + 1)
-                put(intersections, position, element(pairs, k))
-                prefetch_to_write(intersections, position + _WRITE_AHEAD)
+                tile = load_scalar(tiles, k)
+                position = load_scalar(positions, tile)
+                store_scalar(positions, tile, position + 1)
+                store_scalar(intersections, position, load_scalar(pairs, k))
+                prefetch_for_write(intersections, position + _WRITE_AHEAD)
                 if len(slots) > 0:
-                    put(slots, position, slots.dtype.type(slot + k))
-                    prefetch_to_write(slots, position + _WRITE_AHEAD)
+                    store_scalar(slots, position, slots.dtype.type(slot + k))
+                    prefetch_for_write(slots, position + _WRITE_AHEAD)
             slot, buffered = slot + buffered, np.int64(0)
 
 
@@ -575,7 +573,7 @@ _EMPTY_TILE_COST = 32  # in intersections
 
 @kernel
 def _measure_depths(item, records, radii, axis, depths):
-    for g in range(item * PIECE, min((item + 1) * PIECE, len(radii))):
+    for g in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, len(radii))):
         x = np.float64(records[g, 0]) + np.float64(records[g, 3])
         y = np.float64(records[g, 1]) + np.float64(records[g, 4])
         z = np.float64(records[g, 2]) + np.float64(records[g, 5])
@@ -595,7 +593,7 @@ def compute_depths(
         threads: number of threads.
     """
     depths = workspace.array(len(radii), np.float64)
-    num_items = -(-len(radii) // PIECE)
+    num_items = -(-len(radii) // GAUSSIANS_PER_ITEM)
     parallel_for(lambda item: _measure_depths(item, records, radii, axis, depths), num_items, threads)
     return depths
 
@@ -609,16 +607,16 @@ def _read_keys(intersections, slots, keys, begin, count, words, own_intersection
     """
     low, high, end = _SIGN_MASK, -_SIGN_MASK, len(intersections) - 1
     for j in range(count):
-        prefetch(keys, element(intersections, min(begin + j + _READ_AHEAD, end)) & np.int64(0xFFFFFFFF))
-        intersection = element(intersections, begin + j)
-        key = element(keys, intersection & np.int64(0xFFFFFFFF))
+        prefetch(keys, load_scalar(intersections, min(begin + j + _READ_AHEAD, end)) & np.int64(0xFFFFFFFF))
+        intersection = load_scalar(intersections, begin + j)
+        key = load_scalar(keys, intersection & np.int64(0xFFFFFFFF))
         key = (key if key >= 0 else (key ^ _SIGN_MASK) + 1) >> _ROUNDING_BITS  # -0.0 equals 0.0
         low, high = min(low, key), max(high, key)
-        put(words, j, np.uint64(key))
-        put(own_intersections, j, intersection)
+        store_scalar(words, j, np.uint64(key))
+        store_scalar(own_intersections, j, intersection)
     if len(slots) > 0:
         for j in range(count):
-            put(own_slots, j, element(slots, begin + j))
+            store_scalar(own_slots, j, load_scalar(slots, begin + j))
     return np.uint64(low), np.uint64(high)
 
 
@@ -635,15 +633,15 @@ def _bit_length(number):
 def _pack(words, count, least, cut, place_bits, low, high, bits, low_counters, high_counters):
     """Append each key's index in the tile to it, and count two digits of `bits` bits, from bits `low` and `high` on."""
     for digit in range(1 << bits):
-        put(low_counters, digit, np.int32(0))
-        put(high_counters, digit, np.int32(0))
+        store_scalar(low_counters, digit, np.int32(0))
+        store_scalar(high_counters, digit, np.int32(0))
     mask = (np.uint64(1) << np.uint64(bits)) - np.uint64(1)
     for j in range(count):
-        word = (element(words, j) - least) >> cut << np.uint64(place_bits) | np.uint64(j)
-        put(words, j, word)
+        word = (load_scalar(words, j) - least) >> cut << np.uint64(place_bits) | np.uint64(j)
+        store_scalar(words, j, word)
         first, second = np.int64(word >> np.uint64(low) & mask), np.int64(word >> np.uint64(high) & mask)
-        put(low_counters, first, np.int32(element(low_counters, first) + 1))
-        put(high_counters, second, np.int32(element(high_counters, second) + 1))
+        store_scalar(low_counters, first, np.int32(load_scalar(low_counters, first) + 1))
+        store_scalar(high_counters, second, np.int32(load_scalar(high_counters, second) + 1))
 
 
 @inline_kernel
@@ -651,15 +649,15 @@ def _scatter(words, count, shift, bits, counters, scattered):
     """One stable pass of a radix sort, by the digit at bit `shift`; overwrites the counters."""
     mask, total = (np.uint64(1) << np.uint64(bits)) - np.uint64(1), np.int64(0)
     for digit in range(1 << bits):
-        held = element(counters, digit)
-        put(counters, digit, np.int32(total))
+        held = load_scalar(counters, digit)
+        store_scalar(counters, digit, np.int32(total))
         total += np.int64(held)
     for j in range(count):
-        word = element(words, j)
+        word = load_scalar(words, j)
         digit = np.int64(word >> np.uint64(shift) & mask)
-        place = element(counters, digit)
-        put(counters, digit, np.int32(place + 1))
-        put(scattered, np.int64(place), word)
+        place = load_scalar(counters, digit)
+        store_scalar(counters, digit, np.int32(place + 1))
+        store_scalar(scattered, np.int64(place), word)
 
 
 @inline_kernel
@@ -667,11 +665,11 @@ def _insertion_sort(words, count):
     """Sort words that are nearly in order; returns False, with the words half sorted, if it takes too many moves."""
     moves = np.int64(0)
     for j in range(1, count):
-        word, at = element(words, j), j
-        while at > 0 and element(words, at - 1) > word:
-            put(words, at, element(words, at - 1))
+        word, at = load_scalar(words, j), j
+        while at > 0 and load_scalar(words, at - 1) > word:
+            store_scalar(words, at, load_scalar(words, at - 1))
             at -= 1
-        put(words, at, word)
+        store_scalar(words, at, word)
         moves += j - at
         if moves > _MAX_MOVES * count:
             return False
@@ -684,8 +682,8 @@ def _radix_sort(words, spare, count, end, counters):
     for shift in range(0, end, _DIGIT_BITS):
         counters[:] = 0
         for j in range(count):
-            digit = np.int64(element(words, j) >> np.uint64(shift) & np.uint64((1 << _DIGIT_BITS) - 1))
-            put(counters, digit, np.int32(element(counters, digit) + 1))
+            digit = np.int64(load_scalar(words, j) >> np.uint64(shift) & np.uint64((1 << _DIGIT_BITS) - 1))
+            store_scalar(counters, digit, np.int32(load_scalar(counters, digit) + 1))
         _scatter(words, count, shift, _DIGIT_BITS, counters, spare)
         words, spare = spare, words
     return words, spare
@@ -722,10 +720,10 @@ def _sort_tiles(intersections, slots, keys, starts, low, high):
             words, spare = _radix_sort(words, spare, count, end, low_counters)
         mask = (np.uint64(1) << np.uint64(place_bits)) - np.uint64(1)
         for j in range(count):
-            place = np.int64(element(words, j) & mask)
-            put(intersections, begin + j, element(own_intersections, place))
+            place = np.int64(load_scalar(words, j) & mask)
+            store_scalar(intersections, begin + j, load_scalar(own_intersections, place))
             if len(slots) > 0:
-                put(slots, begin + j, element(own_slots, place))
+                store_scalar(slots, begin + j, load_scalar(own_slots, place))
 
 
 def sort_front_to_back(tiles: TileIntersections, distances: np.ndarray, threads: int) -> None:

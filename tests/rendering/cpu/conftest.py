@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import projection
-from pansplat.rendering.cpu.observe import Camera, Fields, Observed, observe
+from pansplat.rendering.cpu.projection import Camera, GaussianArrays, ProjectedGaussians, project_gaussians
 from pansplat.rendering.cpu.rasterize import MIN_PLANAR_COSINE
 from pansplat.rendering.cpu.records import (
     DIRECTION,
@@ -35,17 +35,17 @@ from pansplat.rendering.image_planes import ImagePlane
 SPREAD = 0.1 * (math.pi / 64) ** 2
 
 
-def _fields(scene: Gaussians, covariances: Tensor | None = None) -> Fields:
+def _fields(scene: Gaussians, covariances: Tensor | None = None) -> GaussianArrays:
     scene, nothing = scene.to(dtype=torch.float32), np.empty
     if covariances is None:
         shape = scene.quats.numpy(), scene.scales.numpy(), nothing((0, 3, 3), np.float32)
     else:
         shape = nothing((0, 4), np.float32), nothing((0, 3), np.float32), covariances.float().numpy()
-    return Fields(scene.means.numpy(), *shape, scene.opacities.numpy(), scene.harmonics.numpy())
+    return GaussianArrays(scene.means.numpy(), *shape, scene.opacities.numpy(), scene.harmonics.numpy())
 
 
 @pytest.fixture
-def fields() -> Callable[..., Fields]:
+def fields() -> Callable[..., GaussianArrays]:
     """A scene as float32 arrays."""
     return _fields
 
@@ -59,11 +59,15 @@ def workspace() -> Iterator[Workspace]:
 
 
 @pytest.fixture
-def seen(workspace: Workspace, pose: Tensor) -> Callable[..., Observed]:
+def seen(workspace: Workspace, pose: Tensor) -> Callable[..., ProjectedGaussians]:
     """What the numba stage sees of a scene."""
 
-    def see(scene: Gaussians, covariances: Tensor | None = None, *, threads: int = 1, near: float = 0.05) -> Observed:
-        return observe(_fields(scene, covariances), Camera(pose.numpy(), SPREAD, True, near), workspace, threads)
+    def see(
+        scene: Gaussians, covariances: Tensor | None = None, *, threads: int = 1, near: float = 0.05
+    ) -> ProjectedGaussians:
+        return project_gaussians(
+            _fields(scene, covariances), Camera(pose.numpy(), SPREAD, True, near), workspace, threads
+        )
 
     return see
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from pansplat.rendering import projection
-from pansplat.rendering.cpu.ewa import TOTALS, project, project_backward
-from pansplat.rendering.cpu.observe import Camera, observe
-from pansplat.rendering.cpu.observe_backward import Gradients, chain
+from pansplat.rendering.cpu.ewa import EWA_GRAD_SIZE, backpropagate_ewa, project_ewa
+from pansplat.rendering.cpu.projection import Camera, project_gaussians
+from pansplat.rendering.cpu.projection_backward import GaussianGradients, backpropagate_projection
 from pansplat.rendering.cpu.records import DIRECTION_RESIDUAL, HALF_LOG2_E, LOG2_PEAK, ROW_A, ROW_B
 from pansplat.rendering.image_planes import image_planes
 from pansplat.rendering.projection import ewa_boxes, kappa
@@ -42,8 +42,8 @@ def _ours(scene, pose, lowpass, picture, fields, workspace):
     spread = (0.1 if lowpass == "angular" else 1e-9) * picture.pixel_angle**2
     camera = Camera(pose.numpy(), spread, lowpass == "angular", 0.05)
     given = fields(scene)
-    observed = observe(given, camera, workspace, 1)
-    records, boxes = project(given, camera, observed, picture, _DILATED[lowpass], 0.01, workspace, 1)
+    observed = project_gaussians(given, camera, workspace, 1)
+    records, boxes = project_ewa(given, camera, observed, picture, _DILATED[lowpass], 0.01, workspace, 1)
     return given, camera, observed, records, boxes
 
 
@@ -95,10 +95,10 @@ def test_gradients_through_the_projection_are_autograds(lowpass, make_scene, fie
     slots[:, :2], slots[:, ROW_A], slots[:, ROW_B : ROW_B + 2] = weights[:, :2], weights[:, 2], weights[:, 3:5]
     slots[:, [ROW_A, ROW_B, ROW_B + 1]] /= unit  # of the record's numbers, which are unit times the forms
     slots[:, LOG2_PEAK] = weights[:, 5] * math.log(2)
-    totals = np.zeros((400, TOTALS))
-    project_backward(given, numba_camera, picture, _DILATED[lowpass], slots, offsets, totals, 1)
-    wanted = Gradients(*(np.full_like(field, np.nan) for field in given), pose=np.zeros((3, 4)))
-    found = chain(
+    totals = np.zeros((400, EWA_GRAD_SIZE))
+    backpropagate_ewa(given, numba_camera, picture, _DILATED[lowpass], slots, offsets, totals, 1)
+    wanted = GaussianGradients(*(np.full_like(field, np.nan) for field in given), pose=np.zeros((3, 4)))
+    found = backpropagate_projection(
         given,
         numba_camera,
         observed,

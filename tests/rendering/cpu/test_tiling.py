@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.rendering.cpu.observe import Camera, observe
+from pansplat.rendering.cpu.projection import Camera, project_gaussians
 from pansplat.rendering.cpu.tiling import (
     TileIntersections,
     compute_depths,
@@ -62,7 +62,7 @@ def test_boxes_are_the_references(layout, size, scale, make_scene, seen, truth, 
 def test_a_gaussian_on_the_axis_of_the_poles_takes_whole_rows(make_scene, fields, workspace):
     scene = make_scene(2, scale=0.05)
     scene.means[:] = torch.tensor(((0.0, -1.0, 0.0), (0.0, 1.0, 0.0)))
-    observed = observe(fields(scene), Camera(np.eye(4), 1e-4, True, 0.05), workspace, 1)
+    observed = project_gaussians(fields(scene), Camera(np.eye(4), 1e-4, True, 0.05), workspace, 1)
     (picture,) = image_planes(
         "equirect", (64, 128), vertical_fov_degrees=90, face_size=None, device=torch.device("cpu")
     )
@@ -74,7 +74,7 @@ def test_a_gaussian_on_the_axis_of_the_poles_takes_whole_rows(make_scene, fields
 def test_a_box_at_the_panoramas_seam_goes_on_at_the_left(make_scene, fields, workspace):
     scene = make_scene(1, scale=0.05)
     scene.means[:] = torch.tensor((0.0, 0.0, -1.0))
-    observed = observe(fields(scene), Camera(np.eye(4), 1e-4, True, 0.05), workspace, 1)
+    observed = project_gaussians(fields(scene), Camera(np.eye(4), 1e-4, True, 0.05), workspace, 1)
     (picture,) = image_planes(
         "equirect", (64, 128), vertical_fov_degrees=90, face_size=None, device=torch.device("cpu")
     )

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from pansplat.rendering import projection
-from pansplat.rendering.cpu.observe import Camera, observe
-from pansplat.rendering.cpu.observe_backward import Gradients, add_slots, chain
+from pansplat.rendering.cpu.projection import Camera, project_gaussians
+from pansplat.rendering.cpu.projection_backward import GaussianGradients, accumulate_slots, backpropagate_projection
 from pansplat.rendering.cpu.records import (
     DIRECTION_RESIDUAL,
     HALF_LOG2_E,
@@ -66,7 +66,7 @@ def _motions(pose, gradient):
 
 
 def _empty(fields):
-    return Gradients(*(np.full_like(field, np.nan) for field in fields), pose=np.zeros((3, 4)))
+    return GaussianGradients(*(np.full_like(field, np.nan) for field in fields), pose=np.zeros((3, 4)))
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
@@ -91,9 +91,9 @@ def test_chained_gradients_are_autograds(degree, by_covariance, compensate, make
 
     given = fields(scene, None if covariances is None else covariances.detach())
     numba_camera = Camera(pose.numpy(), spread, compensate, 0.05)
-    observed = observe(given, numba_camera, workspace, 1)
+    observed = project_gaussians(given, numba_camera, workspace, 1)
     slots = *_slot_gradients(observed, weights), _NO_TOTALS, np.arange(501)
-    found = chain(given, numba_camera, observed, *slots, _empty(given), 1)
+    found = backpropagate_projection(given, numba_camera, observed, *slots, _empty(given), 1)
     expected = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
     if covariances is not None:
         expected["covariances"] = covariances.grad
@@ -111,12 +111,12 @@ def test_gaussians_that_are_not_drawn_have_zero_gradients_and_spoil_no_others(ma
     scene.opacities[4], scene.scales[5, 0], scene.opacities[6] = 0.0, 1e30, math.nan
     scene.means[7] = pose[:3, 3]
     given, camera = fields(scene), Camera(pose.numpy(), 1e-4, True, 0.05)
-    observed = observe(given, camera, workspace, 1)
+    observed = project_gaussians(given, camera, workspace, 1)
     random = np.random.default_rng(0)
     # Gradients come for drawn Gaussians only: the others have no slots.
     offsets = np.cumsum([0] + [0 if 1 <= g <= 7 else 2 for g in range(130)])
     slots = [random.standard_normal((offsets[-1], size)).astype(np.float32) for size in (16, 4)]
-    found = chain(given, camera, observed, *slots, _NO_TOTALS, offsets, _empty(given), 1)
+    found = backpropagate_projection(given, camera, observed, *slots, _NO_TOTALS, offsets, _empty(given), 1)
     for name in _NAMES:
         gradient = getattr(found, name)
         assert np.isfinite(gradient).all(), name
@@ -131,15 +131,15 @@ def test_a_gaussian_s_slots_count_as_their_sum(channels, make_scene, fields, wor
     coefficients = torch.randn(75, 4, channels, generator=torch.Generator().manual_seed(1)).double()
     given = fields(dataclasses.replace(scene, harmonics=coefficients))
     camera = Camera(pose.numpy(), 1e-4, True, 0.05)
-    observed, random = observe(given, camera, workspace, 1), np.random.default_rng(0)
+    observed, random = project_gaussians(given, camera, workspace, 1), np.random.default_rng(0)
     counts = np.arange(75) % 5
     offsets, owner = np.cumsum([0, *counts]), np.repeat(np.arange(75), counts)
     slots = [random.standard_normal((len(owner), size)).astype(np.float32) for size in (16, channels + 1)]
     summed = [np.zeros((75, part.shape[1]), np.float32) for part in slots]
     for part, total in zip(slots, summed, strict=True):
         np.add.at(total, owner, part)
-    found = chain(given, camera, observed, *slots, _NO_TOTALS, offsets, _empty(given), 1)
-    expected = chain(given, camera, observed, *summed, _NO_TOTALS, np.arange(76), _empty(given), 1)
+    found = backpropagate_projection(given, camera, observed, *slots, _NO_TOTALS, offsets, _empty(given), 1)
+    expected = backpropagate_projection(given, camera, observed, *summed, _NO_TOTALS, np.arange(76), _empty(given), 1)
     for name in (*_NAMES, "pose"):
         assert np.array_equal(getattr(found, name), getattr(expected, name)), name
 
@@ -147,11 +147,11 @@ def test_a_gaussian_s_slots_count_as_their_sum(channels, make_scene, fields, wor
 @pytest.mark.parametrize("threads", [2, 3, 5])
 def test_gradients_are_the_same_bits_on_any_number_of_threads(threads, make_scene, fields, workspace, pose):
     given, camera = fields(make_scene(20000, degree=1)), Camera(pose.numpy(), 1e-4, True, 0.05)
-    observed = observe(given, camera, workspace, 1)
+    observed = project_gaussians(given, camera, workspace, 1)
     random = np.random.default_rng(0)
     slots = [random.standard_normal((20000, size)).astype(np.float32) for size in (16, 4)]
     one, several = (
-        chain(given, camera, observed, *slots, _NO_TOTALS, np.arange(20001), _empty(given), count)
+        backpropagate_projection(given, camera, observed, *slots, _NO_TOTALS, np.arange(20001), _empty(given), count)
         for count in (1, threads)
     )
     for name in (*_NAMES, "pose"):
@@ -162,9 +162,9 @@ def test_a_zero_quaternion_has_zero_gradient(make_scene, fields, workspace, pose
     scene = make_scene(3)
     scene.quats[1] = 0
     given, camera = fields(scene), Camera(pose.numpy(), 1e-4, True, 0.05)
-    observed = observe(given, camera, workspace, 1)
+    observed = project_gaussians(given, camera, workspace, 1)
     slots = np.ones((3, 16), np.float32), np.ones((3, 4), np.float32), _NO_TOTALS, np.arange(4)
-    quats = chain(given, camera, observed, *slots, _empty(given), 1).quats
+    quats = backpropagate_projection(given, camera, observed, *slots, _empty(given), 1).quats
     assert not quats[1].any() and quats[0].any() and quats[2].any()
     # A quaternion's length does not matter, so the gradient has no part along it.
     assert abs((quats * given.quats).sum(axis=1)).max() < 1e-6 * abs(quats).max()
@@ -173,5 +173,5 @@ def test_a_zero_quaternion_has_zero_gradient(make_scene, fields, workspace, pose
 def test_slots_are_summed_by_gaussian():
     offsets, slots = np.array([0, 2, 2, 5]), np.arange(10, dtype=np.float32).reshape(5, 2)
     totals = np.ones((3, 2), np.float32)
-    add_slots(0, offsets, slots, totals)
+    accumulate_slots(0, offsets, slots, totals)
     assert totals.tolist() == [[3, 5], [1, 1], [19, 22]]

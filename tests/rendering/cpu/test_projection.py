@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.rendering.cpu.observe import CULLED, Camera, observe
+from pansplat.rendering.cpu.projection import CULLED, Camera, project_gaussians
 from pansplat.rendering.cpu.records import LOG2_PEAK
 
 
@@ -85,8 +85,8 @@ def test_near_and_faint_gaussians_are_not_drawn(make_scene, seen, pose):
 def test_records_do_not_depend_on_the_scenes_unit(unit, make_scene, fields, workspace, decode):
     scene = make_scene(100)
     large = dataclasses.replace(scene, means=scene.means * unit, scales=scene.scales * unit)
-    here = observe(fields(scene), Camera(np.eye(4), 1e-4, True, 1e-30), workspace, 1)
-    there = observe(fields(large), Camera(np.eye(4), 1e-4, True, 1e-30), workspace, 1)
+    here = project_gaussians(fields(scene), Camera(np.eye(4), 1e-4, True, 1e-30), workspace, 1)
+    there = project_gaussians(fields(large), Camera(np.eye(4), 1e-4, True, 1e-30), workspace, 1)
     before, after = (decode(torch.from_numpy(o.records).double()) for o in (here, there))
     for name in before:
         assert _relative(after[name], before[name]) < 2e-6, name

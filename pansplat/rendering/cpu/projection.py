@@ -1,0 +1,505 @@
+"""Projection: the record and the values of each Gaussian that a camera sees.
+
+Source: docs/rendering.md, sections 1 to 3; records.py for the layout. Arithmetic is float64, eight Gaussians at a time,
+in blocks of `GAUSSIAN_BLOCK`; a work item is `GAUSSIANS_PER_ITEM`. Lengths are divided by the distance.
+
+A covariance in the tangent frame (u, v, n) is a tuple, `cov`, of its entries and of the minors that float arithmetic
+cannot compute from them:
+
+    uu, uv, vv, un, vn, nn    C in the frame
+    det_across                det B
+    mixed                     M = nn (uu + vv) - un^2 - vn^2
+    det                       det C
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pansplat.constants import MAX_MAGNITUDE, MAX_SCALE_RATIO, MIN_COMPENSATION, MIN_EIGENVALUE_RATIO, OPACITY_CUT
+from pansplat.rendering.cpu import records as layout
+from pansplat.rendering.cpu.harmonics import evaluate_basis, evaluate_colors
+from pansplat.rendering.cpu.runtime import Workspace, inline_kernel, kernel, parallel_for
+from pansplat.rendering.cpu.simd import (
+    LANES,
+    PREFETCH_DISTANCE,
+    align_stack,
+    any_magnitude_reaches,
+    aos1_to_soa,
+    aos3_to_soa,
+    aos4_to_soa,
+    broadcast,
+    load_row,
+    load_scalar,
+    mantissa_and_exponent,
+    mask_bits,
+    popcount,
+    prefetch,
+    select,
+    soa_to_records,
+    store,
+    store_mask,
+    store_row,
+    store_scalar,
+    to_f32,
+    to_f64,
+)
+
+GAUSSIAN_BLOCK = 64
+GAUSSIANS_PER_ITEM = 8192
+CULLED = -128.0  # log2_peak of a Gaussian that is not drawn
+
+_MAX_MAGNITUDE_BITS = np.uint32(2 * int(np.float32(MAX_MAGNITUDE).view(np.uint32)))  # without the sign
+_ROUNDING = -MIN_EIGENVALUE_RATIO
+_DROPPED, _NEAR = 0, 1  # columns of the tallies
+
+# Rows of a block: loaded, computed, stored for the kernels that read the covariances.
+MEAN_ROW, SHAPE_ROW, OPACITY_ROW = 0, 3, 12  # the shape is a quaternion and three scales, or a covariance
+DIRECTION_ROW, RADIUS_ROW, VALID_ROW = 13, 16, 17  # world axes; metres; 1, or 0 where a number is unusable
+FRAME_ROW, COV_ROW = 18, 24
+NUM_ROWS = 33
+
+
+class GaussianArrays(NamedTuple):
+    """Gaussians as arrays; a field that is not given has no rows.
+
+    Attributes:
+        means: (n, 3), metres.
+        quats: (n, 4), wxyz, of any length.
+        scales: (n, 3), metres.
+        covariances: (n, 3, 3), square metres; in place of `quats` and `scales`.
+        opacities: (n,).
+        harmonics: (n, k, channel).
+    """
+
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    covariances: np.ndarray
+    opacities: np.ndarray
+    harmonics: np.ndarray
+
+    @property
+    def kernel_arguments(self) -> tuple[np.ndarray | None, ...]:
+        """The arrays, None for those not given: kernels leave out code that depends on a None."""
+        by_covariance = len(self.covariances) > 0
+        shape = (None, None, self.covariances) if by_covariance else (self.quats, self.scales, None)
+        return self.means, *shape, self.opacities, self.harmonics
+
+    @property
+    def view_dependent(self) -> bool | None:
+        """True if colours depend on the direction, else None."""
+        return True if self.harmonics.shape[1] > 1 else None
+
+
+class Camera(NamedTuple):
+    """A camera, and the settings that depend on the image size.
+
+    Attributes:
+        pose: cam2world, (4, 4) float64.
+        filter_variance: e^2, added across the ray, radians^2; above 0.
+        compensate: whether the opacity is lowered by as much as the filter widens the Gaussian.
+        near: metres.
+    """
+
+    pose: np.ndarray
+    filter_variance: float
+    compensate: bool
+    near: float
+
+
+class ProjectedGaussians(NamedTuple):
+    """What a camera sees of each Gaussian.
+
+    Attributes:
+        records, values: see records.py; `log2_peak` is `CULLED` where a Gaussian is not drawn.
+        radii: (n,) float64, metres.
+        drawn: (n,) uint8, 0 for Gaussians that no image plane shows.
+        dropped: number of Gaussians with an unusable number.
+        near: number of Gaussians that are too near.
+    """
+
+    records: np.ndarray
+    values: np.ndarray
+    radii: np.ndarray
+    drawn: np.ndarray
+    dropped: int
+    near: int
+
+
+def project_gaussians(
+    gaussians: GaussianArrays, camera: Camera, workspace: Workspace, threads: int
+) -> ProjectedGaussians:
+    """Project all Gaussians; the arrays belong to the workspace."""
+    num, channels = len(gaussians.means), gaussians.harmonics.shape[2]
+    records, radii = workspace.array((num, layout.RECORD_SIZE), np.float32), workspace.array(num, np.float64)
+    values, drawn = workspace.array((num, channels + 1), np.float32), workspace.array(num, np.uint8)
+    items = -(-num // GAUSSIANS_PER_ITEM)
+    tallies = np.zeros((items, 2), np.int64)
+    harmonic_bits = gaussians.harmonics.reshape(-1).view(np.uint32)
+
+    def work(item: int) -> None:
+        _project_gaussians(
+            item, *gaussians.kernel_arguments, harmonic_bits, *camera, gaussians.view_dependent,
+            records.reshape(-1), values, radii, drawn, tallies,
+        )  # fmt: skip
+
+    parallel_for(work, items, threads)
+    dropped, near = (int(count) for count in tallies.sum(axis=0))
+    return ProjectedGaussians(records, values, radii, drawn, dropped, near)
+
+
+@kernel
+def _project_gaussians(
+    item, means, quats, scales, covariances, opacities, harmonics, harmonic_bits,
+    pose, filter_variance, compensate, near, view_dependent, records, values, radii, drawn, tallies,
+):  # fmt: skip
+    align_stack()
+    rows, block_drawn = np.ones((NUM_ROWS, GAUSSIAN_BLOCK)), np.empty(GAUSSIAN_BLOCK, np.uint8)
+    basis, soa = np.empty((25, GAUSSIAN_BLOCK), np.float32), np.empty(layout.RECORD_SIZE * LANES, np.float32)
+    num_dropped, num_near, camera = 0, 0, pose_columns(pose)
+    for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, means.shape[0]), GAUSSIAN_BLOCK):
+        count = min(GAUSSIAN_BLOCK, means.shape[0] - start)
+        suspect = load_block(means, quats, scales, covariances, opacities, start, count, rows)
+        _validate_harmonics(harmonic_bits, harmonics.shape[1] * harmonics.shape[2], start, count, rows)
+        if suspect:
+            _invalidate_large_numbers(rows, MEAN_ROW, OPACITY_ROW + 1, count)
+        for i in range(0, count, LANES):
+            state, is_drawn = _compute_records(covariances, camera, filter_variance, compensate, near, rows, i, soa)
+            lanes_used = min(LANES, count - i)
+            used = np.uint64((1 << lanes_used) - 1)
+            num_dropped += popcount(mask_bits(state == 0.0) & used)
+            num_near += popcount(mask_bits(state < 0.0) & used)
+            store_mask(block_drawn, i, is_drawn)
+            soa_to_records(soa, LANES, start + i, lanes_used, records)
+        for i in range(count):
+            store_scalar(radii, start + i, rows[RADIUS_ROW, i])
+        for i in range(count):
+            store_scalar(drawn, start + i, block_drawn[i])
+        evaluate_basis(rows, DIRECTION_ROW, harmonics.shape[1], view_dependent, basis)
+        evaluate_colors(harmonics, start, count, basis, view_dependent, rows, RADIUS_ROW, values)
+    tallies[item, _DROPPED], tallies[item, _NEAR] = num_dropped, num_near
+
+
+@inline_kernel
+def _compute_records(covariances, pose, filter_variance, compensate, near, rows, i, soa):
+    """Write the records of eight Gaussians, a field a row of `soa`; return their states and which are drawn."""
+    right, down, ahead, _ = pose
+    unit, inverse_unit = math.sqrt(layout.HALF_LOG2_E), 1 / math.sqrt(layout.HALF_LOG2_E)
+    n, radius, inverse, state = compute_direction(rows, i, pose, near)
+    store_row(rows, RADIUS_ROW, i, radius)
+    u, v, cov, state = compute_tangent_covariance(covariances, rows, i, n, inverse, state)
+    state = state * load_row(rows, VALID_ROW, i)
+    factors, l_along_a, l_along_b, radial_variance, _, inverse_det = compute_whitening(cov, filter_variance)
+    a, b = whitened_axes(u, v, factors)
+    store_vector(rows, DIRECTION_ROW, i, n)
+    _store_direction(soa, 0, dot(*right, *n))
+    _store_direction(soa, 1, dot(*down, *n))
+    _store_direction(soa, 2, dot(*ahead, *n))
+    a_row, b_row = layout.ROW_A * LANES, layout.ROW_B * LANES
+    store(soa, a_row, to_f32(unit * dot(*right, *a)))
+    store(soa, a_row + LANES, to_f32(unit * dot(*down, *a)))
+    store(soa, a_row + 2 * LANES, to_f32(unit * dot(*ahead, *a)))
+    store(soa, b_row, to_f32(unit * dot(*right, *b)))
+    store(soa, b_row + LANES, to_f32(unit * dot(*down, *b)))
+    store(soa, b_row + 2 * LANES, to_f32(unit * dot(*ahead, *b)))
+    store(soa, layout.L_ALONG_A * LANES, to_f32(inverse_unit * l_along_a))
+    store(soa, layout.L_ALONG_B * LANES, to_f32(inverse_unit * l_along_b))
+    store(soa, layout.RADIAL_VARIANCE * LANES, to_f32((1 / layout.HALF_LOG2_E) * radial_variance))
+    opacity = load_row(rows, OPACITY_ROW, i)
+    squared_peak = opacity * opacity
+    if compensate:
+        squared_peak = squared_peak * max(cov[6] * inverse_det, MIN_COMPENSATION)
+    drawn = (state > 0) & (opacity >= OPACITY_CUT)
+    log2_peak = select(drawn, 0.5 * _log2(select(drawn, squared_peak, broadcast(1.0))), broadcast(CULLED))
+    store(soa, layout.LOG2_PEAK * LANES, to_f32(log2_peak))
+    return state, drawn
+
+
+@inline_kernel
+def _store_direction(soa, axis, value):
+    """Store a coordinate of the direction as its float32 value and the residual."""
+    head = to_f32(value)
+    store(soa, (layout.DIRECTION + axis) * LANES, head)
+    store(soa, (layout.DIRECTION_RESIDUAL + axis) * LANES, to_f32(value - to_f64(head)))
+
+
+@inline_kernel
+def _log2(value):
+    """Log2 of numbers above 0, within 1e-9."""
+    mantissa, exponent = mantissa_and_exponent(value)
+    s = (mantissa - 1) / (mantissa + 1)
+    t = s * s
+    series = 1 + t * (1 / 3 + t * (1 / 5 + t * (1 / 7 + t * (1 / 9))))
+    return exponent + (2 / math.log(2)) * s * series
+
+
+# Loading a block.
+
+
+@inline_kernel
+def load_block(means, quats, scales, covariances, opacities, start, count, rows):
+    """Load the fields of `count` Gaussians from `start` on into rows; return whether a number may be unusable."""
+    largest = broadcast(np.float32(0))
+    largest = aos3_to_soa(means.reshape(-1), start, count, rows, MEAN_ROW, largest)
+    largest = aos1_to_soa(opacities, start, count, rows, OPACITY_ROW, largest)
+    # Two tests: numba leaves out what depends on a None, but not the other branch.
+    if covariances is not None:
+        for i in range(count):
+            for j in range(9):
+                rows[SHAPE_ROW + j, i] = load_scalar(covariances, 9 * (start + i) + j)
+    if quats is not None:
+        largest = aos4_to_soa(quats.reshape(-1), start, count, rows, SHAPE_ROW, largest)
+        largest = aos3_to_soa(scales.reshape(-1), start, count, rows, SHAPE_ROW + 4, largest)
+    return covariances is not None or count % LANES > 0 or any_magnitude_reaches(largest, _MAX_MAGNITUDE_BITS)
+
+
+@inline_kernel
+def _invalidate_large_numbers(rows, first, end, count):
+    """Clear the validity of Gaussians with a number in these rows that is not finite or absurdly large."""
+    for row in range(first, end):
+        for i in range(count):
+            if not abs(rows[row, i]) < MAX_MAGNITUDE:
+                rows[VALID_ROW, i] = 0.0
+
+
+@inline_kernel
+def _validate_harmonics(harmonic_bits, size, start, count, rows):
+    """Set the validity of a block's Gaussians: 0 where one of `size` coefficients is not finite or absurdly large."""
+    for i in range(GAUSSIAN_BLOCK):
+        rows[VALID_ROW, i] = 1.0
+    largest = np.uint32(0)
+    for j in range(0, size * count, 2 * LANES):
+        prefetch(harmonic_bits, size * (start + PREFETCH_DISTANCE) + j)
+    block = harmonic_bits[start * size : (start + count) * size]
+    for j in range(block.shape[0]):
+        bits = np.uint32(block[j] << np.uint32(1))  # without the sign
+        largest = bits if bits > largest else largest
+    if largest < _MAX_MAGNITUDE_BITS:
+        return
+    for j in range(block.shape[0]):
+        if np.uint32(block[j] << np.uint32(1)) >= _MAX_MAGNITUDE_BITS:
+            rows[VALID_ROW, j // size] = 0.0
+
+
+# Direction, frame and covariance of eight Gaussians.
+
+
+@inline_kernel
+def load_vector(rows, row, i):
+    """Eight 3-vectors, from three rows."""
+    return load_row(rows, row, i), load_row(rows, row + 1, i), load_row(rows, row + 2, i)
+
+
+@inline_kernel
+def store_vector(rows, row, i, vector):
+    """Write eight 3-vectors to three rows."""
+    store_row(rows, row, i, vector[0])
+    store_row(rows, row + 1, i, vector[1])
+    store_row(rows, row + 2, i, vector[2])
+
+
+@inline_kernel
+def pose_columns(pose):
+    """The camera's axes and centre as numbers; an array would be read again for every eight Gaussians."""
+    return (
+        (pose[0, 0], pose[1, 0], pose[2, 0]),
+        (pose[0, 1], pose[1, 1], pose[2, 1]),
+        (pose[0, 2], pose[1, 2], pose[2, 2]),
+        (pose[0, 3], pose[1, 3], pose[2, 3]),
+    )
+
+
+@inline_kernel
+def compute_direction(rows, i, pose, near):
+    """Direction, distance, one over the distance, and a state: 1, or -1 if too near."""
+    mx, my, mz = load_vector(rows, MEAN_ROW, i)
+    x, y, z = mx - pose[3][0], my - pose[3][1], mz - pose[3][2]
+    radius = math.sqrt(x * x + y * y + z * z)
+    inverse = 1 / radius
+    state = select(radius < near, broadcast(-1.0), broadcast(1.0))
+    return (x * inverse, y * inverse, z * inverse), radius, inverse, state
+
+
+@inline_kernel
+def compute_tangent_covariance(covariances, rows, i, n, inverse, state):
+    """Tangent axes u and v, the covariance, and the state: 0 where the shape is unusable.
+
+    Args:
+        covariances: None if the shapes are quaternions and scales.
+        n: directions.
+        inverse: one over the distance.
+        state: of `compute_direction`.
+    """
+    frame = tangent_frame(n[0], n[1], n[2])
+    u, v = (frame[0], frame[1], frame[2]), (frame[3], frame[4], frame[5])
+    if covariances is not None:
+        cov, state = _covariance_of_matrices(rows, i, u, v, n, inverse * inverse, state)
+    else:
+        cov, state = _covariance_of_axes(rows, i, u, n, inverse, state)
+    return u, v, cov, state
+
+
+@inline_kernel
+def load_axes(rows, i):
+    """The columns of the rotation of eight Gaussians, and one over the squared length of their quaternions."""
+    r = _rotation(load_row(rows, SHAPE_ROW, i), *load_vector(rows, SHAPE_ROW + 1, i))
+    return (r[0], r[3], r[6]), (r[1], r[4], r[7]), (r[2], r[5], r[8]), r[9]
+
+
+@inline_kernel
+def _rotation(w, x, y, z):
+    """Rows of the rotation matrix of a quaternion of any length, and one over its square; zero is the identity."""
+    norm2 = w * w + x * x + y * y + z * z
+    inverse = select(norm2 > 0, 1 / norm2, broadcast(0.0))
+    twice = 2 * inverse
+    x2, y2, z2 = twice * x, twice * y, twice * z
+    return (
+        1 - (y * y2 + z * z2), x * y2 - w * z2, x * z2 + w * y2,
+        x * y2 + w * z2, 1 - (x * x2 + z * z2), y * z2 - w * x2,
+        x * z2 - w * y2, y * z2 + w * x2, 1 - (x * x2 + y * y2),
+        inverse,
+    )  # fmt: skip
+
+
+@inline_kernel
+def _covariance_of_axes(rows, i, u, n, inverse, state):
+    """The covariance of rotations and scales, as sums of squares: nothing cancels."""
+    s0, s1, s2 = load_vector(rows, SHAPE_ROW + 4, i)
+    e0, e1, e2, _ = load_axes(rows, i)
+    s0, s1, s2 = s0 * inverse, s1 * inverse, s2 * inverse
+    s0, s1, s2 = s0 * s0, s1 * s1, s2 * s2
+    usable = max(max(s0, s1), s2) <= MAX_SCALE_RATIO * MAX_SCALE_RATIO
+    state = select(usable, state, select(state < 0, state, broadcast(0.0)))
+    u0, u1, u2 = dot(*u, *e0), dot(*u, *e1), dot(*u, *e2)
+    n0, n1, n2 = dot(*n, *e0), dot(*n, *e1), dot(*n, *e2)
+    v0, v1, v2 = cross(n0, n1, n2, u0, u1, u2)
+    w0, w1, w2 = s1 * s2, s2 * s0, s0 * s1
+    return (
+        s0 * u0 * u0 + s1 * u1 * u1 + s2 * u2 * u2,
+        s0 * u0 * v0 + s1 * u1 * v1 + s2 * u2 * v2,
+        s0 * v0 * v0 + s1 * v1 * v1 + s2 * v2 * v2,
+        s0 * u0 * n0 + s1 * u1 * n1 + s2 * u2 * n2,
+        s0 * v0 * n0 + s1 * v1 * n1 + s2 * v2 * n2,
+        s0 * n0 * n0 + s1 * n1 * n1 + s2 * n2 * n2,
+        w0 * n0 * n0 + w1 * n1 * n1 + w2 * n2 * n2,
+        w0 * (u0 * u0 + v0 * v0) + w1 * (u1 * u1 + v1 * v1) + w2 * (u2 * u2 + v2 * v2),
+        s0 * w0,
+    ), state
+
+
+@inline_kernel
+def _covariance_of_matrices(rows, i, u, v, n, inverse, state):
+    """The covariance of matrices; minors that rounding made negative are 0.
+
+    Args:
+        inverse: one over the squared distance.
+    """
+    xx, xy, xz = load_vector(rows, SHAPE_ROW, i)
+    yx, yy, yz = load_vector(rows, SHAPE_ROW + 3, i)
+    zx, zy, zz = load_vector(rows, SHAPE_ROW + 6, i)
+    xx, yy, zz = xx * inverse, yy * inverse, zz * inverse
+    xy, xz, yz = 0.5 * (xy + yx) * inverse, 0.5 * (xz + zx) * inverse, 0.5 * (yz + zy) * inverse
+    usable = _is_covariance(xx, xy, xz, yy, yz, zz)
+    state = select(usable, state, select(state < 0, state, broadcast(0.0)))
+    cu = xx * u[0] + xy * u[1] + xz * u[2], xy * u[0] + yy * u[1] + yz * u[2], xz * u[0] + yz * u[1] + zz * u[2]
+    cv = xx * v[0] + xy * v[1] + xz * v[2], xy * v[0] + yy * v[1] + yz * v[2], xz * v[0] + yz * v[1] + zz * v[2]
+    cn = xx * n[0] + xy * n[1] + xz * n[2], xy * n[0] + yy * n[1] + yz * n[2], xz * n[0] + yz * n[1] + zz * n[2]
+    uu, uv, vv = dot(*u, *cu), dot(*u, *cv), dot(*v, *cv)
+    un, vn, nn = dot(*u, *cn), dot(*v, *cn), max(dot(*n, *cn), 0.0)
+    det = uu * (vv * nn - vn * vn) - uv * (uv * nn - vn * un) + un * (uv * vn - vv * un)
+    mixed = nn * (uu + vv) - un * un - vn * vn
+    return (uu, uv, vv, un, vn, nn, max(uu * vv - uv * uv, 0.0), max(mixed, 0.0), max(det, 0.0)), state
+
+
+@inline_kernel
+def _is_covariance(xx, xy, xz, yy, yz, zz):
+    """Whether a symmetric matrix over squared distance has no eigenvalue below what rounding explains."""
+    largest = max(max(xx, yy), zz)
+    bound = (1 + _ROUNDING) * largest
+    bound = bound * bound
+    xx, yy, zz = xx + _ROUNDING * largest, yy + _ROUNDING * largest, zz + _ROUNDING * largest
+    minor = xx * yy - xy * xy
+    det = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    small = (xy * xy <= bound) & (xz * xz <= bound) & (yz * yz <= bound) & (largest <= MAX_SCALE_RATIO**2)
+    return small & (largest >= 0) & (xx >= 0) & (minor >= 0) & (det >= 0)
+
+
+@inline_kernel
+def compute_whitening(cov, filter_variance):
+    """The factors of `whitened_axes`, the components of l along a and b, S', det B' and one over it."""
+    _, uv, _, un, vn, nn, det_across, mixed, det = cov
+    b_uu, trace = cov[0] + filter_variance, cov[0] + cov[2]
+    det_filtered = det_across + filter_variance * trace + filter_variance * filter_variance
+    inverse = 1 / det_filtered
+    a_scale, b_scale = 1 / math.sqrt(b_uu), math.sqrt(b_uu * inverse)
+    mix = uv * a_scale * a_scale
+    radial_variance = (filter_variance * filter_variance * nn + filter_variance * mixed + det) * inverse
+    return (a_scale, mix, b_scale), -un * a_scale, (mix * un - vn) * b_scale, radial_variance, det_filtered, inverse
+
+
+@inline_kernel
+def whitened_axes(u, v, factors):
+    """The footprint rows a and b."""
+    a_scale, mix, b_scale = factors
+    a = u[0] * a_scale, u[1] * a_scale, u[2] * a_scale
+    return a, ((v[0] - mix * u[0]) * b_scale, (v[1] - mix * u[1]) * b_scale, (v[2] - mix * u[2]) * b_scale)
+
+
+# Covariances of a block, for the EWA kernel.
+
+
+@inline_kernel
+def store_tangent_covariances(covariances, pose, near, rows):
+    """Store distance, direction, tangent frame and covariance of a block in its rows."""
+    camera = pose_columns(pose)
+    for i in range(0, GAUSSIAN_BLOCK, LANES):
+        n, radius, inverse, state = compute_direction(rows, i, camera, near)
+        u, v, cov, _ = compute_tangent_covariance(covariances, rows, i, n, inverse, state)
+        store_row(rows, RADIUS_ROW, i, radius)
+        store_vector(rows, DIRECTION_ROW, i, n)
+        store_vector(rows, FRAME_ROW, i, u)
+        store_vector(rows, FRAME_ROW + 3, i, v)
+        for j in range(9):
+            store_row(rows, COV_ROW + j, i, cov[j])
+
+
+@inline_kernel
+def load_tangent_covariance(rows, i):
+    """Tangent axes u and v, the direction and the covariance of one Gaussian."""
+    u = rows[FRAME_ROW, i], rows[FRAME_ROW + 1, i], rows[FRAME_ROW + 2, i]
+    v = rows[FRAME_ROW + 3, i], rows[FRAME_ROW + 4, i], rows[FRAME_ROW + 5, i]
+    n = rows[DIRECTION_ROW, i], rows[DIRECTION_ROW + 1, i], rows[DIRECTION_ROW + 2, i]
+    cov = (
+        rows[COV_ROW, i], rows[COV_ROW + 1, i], rows[COV_ROW + 2, i], rows[COV_ROW + 3, i], rows[COV_ROW + 4, i],
+        rows[COV_ROW + 5, i], rows[COV_ROW + 6, i], rows[COV_ROW + 7, i], rows[COV_ROW + 8, i],
+    )  # fmt: skip
+    return u, v, n, cov
+
+
+# Of numbers or vectors.
+
+
+@inline_kernel
+def dot(ax, ay, az, bx, by, bz):
+    """a . b"""
+    return ax * bx + ay * by + az * bz
+
+
+@inline_kernel
+def cross(ax, ay, az, bx, by, bz):
+    """a ^ b"""
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+@inline_kernel
+def tangent_frame(x, y, z):
+    """Two unit vectors u, v that make a right-handed frame with the unit direction.
+
+    Source: Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 6(1), 2017.
+    """
+    sign = math.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b, c = x * y * a, sign * x
+    return 1 + c * x * a, sign * b, -c, b, sign + y * y * a, -y

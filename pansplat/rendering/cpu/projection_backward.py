@@ -1,0 +1,542 @@
+"""Backward of the projection: from gradients of records and values to those of the Gaussians and the camera's pose.
+
+Source: docs/rendering.md, sections 1 to 3, differentiated by hand. Turning the rows a and b about n together does not
+change an image, so their derivative is taken in the gauge where it is symmetric. With E = C + e^2, p the axis dual to a
+and q that to b, a motion dn across n and a change dC of the covariance,
+
+    X_aa = a'dC a + 2 alpha a.dn     X_ab = a'dC b + beta a.dn + alpha b.dn     X_bb = b'dC b + 2 beta b.dn
+    da = -(X_aa a + X_ab b) / 2 - (a.dn) n
+    dalpha = -(alpha X_aa + beta X_ab) / 2 + (g + e^2) a.dn - p.dn - a'dC n
+    dS' = l'dC l - 2 (S' + e^2) (l - n).dn
+    d ln det B' = X_aa + X_bb
+
+and likewise for b; alpha and beta are the components of l along a and b. Nothing is divided by a width, so needles and
+discs lose no more accuracy than in the forward.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pansplat.constants import MIN_COMPENSATION
+from pansplat.rendering.cpu import records as layout
+from pansplat.rendering.cpu.harmonics import (
+    accumulate_direction_gradients,
+    backpropagate_colors,
+    backpropagate_constant_colors,
+    evaluate_basis,
+)
+from pansplat.rendering.cpu.projection import (
+    DIRECTION_ROW,
+    GAUSSIAN_BLOCK,
+    GAUSSIANS_PER_ITEM,
+    MEAN_ROW,
+    NUM_ROWS,
+    OPACITY_ROW,
+    RADIUS_ROW,
+    SHAPE_ROW,
+    Camera,
+    GaussianArrays,
+    ProjectedGaussians,
+    compute_direction,
+    compute_tangent_covariance,
+    compute_whitening,
+    cross,
+    dot,
+    load_axes,
+    load_block,
+    load_vector,
+    pose_columns,
+    store_vector,
+    whitened_axes,
+)
+from pansplat.rendering.cpu.runtime import inline_kernel, kernel, parallel_for
+from pansplat.rendering.cpu.simd import (
+    LANES,
+    PREFETCH_DISTANCE,
+    align_stack,
+    broadcast,
+    load,
+    load_aos4,
+    load_four,
+    load_row,
+    load_scalar,
+    prefetch,
+    records_to_soa,
+    select,
+    soa_to_aos1,
+    soa_to_aos3,
+    soa_to_aos4,
+    store,
+    store_row,
+    to_f64,
+)
+
+_POSE_SIZE = 12  # entries of a pose: its rotation and its centre, by rows
+
+# Rows of a block, after those of projection.py. All are gradients.
+_RADIUS_GRAD_ROW = NUM_ROWS
+_MEAN_GRAD_ROW = NUM_ROWS + 1  # of n in world axes, then of the mean
+_SHAPE_GRAD_ROW = NUM_ROWS + 4  # of a quaternion and three scales, or a covariance's xx xy xz yy yz zz
+_EWA_GRAD_ROW = NUM_ROWS + 11  # of n and C, from ewa.py
+_NUM_ROWS = NUM_ROWS + 20
+
+
+class GaussianGradients(NamedTuple):
+    """Gradients of `GaussianArrays`, float32; no rows where not needed. `pose` is (3, 4) float64."""
+
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    covariances: np.ndarray
+    opacities: np.ndarray
+    harmonics: np.ndarray
+    pose: np.ndarray
+
+
+def backpropagate_projection(
+    gaussians: GaussianArrays,
+    camera: Camera,
+    projected: ProjectedGaussians,
+    grad_records: np.ndarray,
+    grad_values: np.ndarray,
+    ewa_grads: np.ndarray,
+    offsets: np.ndarray,
+    gradients: GaussianGradients,
+    threads: int,
+) -> GaussianGradients:
+    """Fill in the gradients of the Gaussians and the pose.
+
+    Args:
+        gaussians, camera, projected: of the forward.
+        grad_records: (slot, RECORD_SIZE), of the camera's records.
+        grad_values: (slot, channel + 1).
+        ewa_grads: of `backpropagate_ewa`, in place of `grad_records`; else no rows.
+        offsets: (n + 1), where each Gaussian's slots begin.
+        gradients: arrays to fill; those without rows are left alone.
+        threads: number of threads; the result does not depend on it.
+    """
+    items = -(-len(gaussians.means) // GAUSSIANS_PER_ITEM)
+    pose_sums = np.zeros((items if len(gradients.pose) > 0 else 0, _POSE_SIZE))
+
+    def work(item: int) -> None:
+        _backpropagate_projection(
+            item, *gaussians.kernel_arguments, *camera, gaussians.view_dependent, projected.drawn, projected.values,
+            grad_records.reshape(-1), grad_values.reshape(-1), ewa_grads if len(ewa_grads) > 0 else None, offsets,
+            *gradients[:6], pose_sums,
+        )  # fmt: skip
+
+    parallel_for(work, items, threads)
+    if len(gradients.pose) == 0:
+        return gradients
+    pose = pose_sums.sum(axis=0).reshape(3, 4)
+    pose[:, :3] = pose[:, :3] @ camera.pose[:3, :3]
+    return gradients._replace(pose=pose)
+
+
+@kernel
+def accumulate_slots(item, offsets, slot_grads, totals):
+    """Add each Gaussian's slots, in their order, to its row of `totals`."""
+    for g in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, totals.shape[0])):
+        for slot in range(offsets[g], offsets[g + 1]):
+            for j in range(totals.shape[1]):
+                totals[g, j] += slot_grads[slot, j]
+
+
+@kernel
+def _backpropagate_projection(
+    item, means, quats, scales, covariances, opacities, harmonics, pose, filter_variance, compensate, near,
+    view_dependent, scene_drawn, values, grad_records, grad_values, ewa_grads, offsets,
+    grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities, grad_harmonics, pose_sums,
+):  # fmt: skip
+    align_stack()
+    rows, camera = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK)), pose_columns(pose)
+    grad_pose = np.zeros((_POSE_SIZE if pose_sums.shape[0] > 0 else 0, LANES))
+    record_sums = np.zeros(GAUSSIAN_BLOCK * layout.RECORD_SIZE, np.float32)
+    value_sums = np.zeros(4 * GAUSSIAN_BLOCK + 4, np.float32)
+    soa, drawn = np.zeros((layout.RECORD_SIZE, GAUSSIAN_BLOCK), np.float32), np.zeros(GAUSSIAN_BLOCK, np.bool_)
+    basis, grad_basis = np.zeros((25, GAUSSIAN_BLOCK), np.float32), np.zeros((25, GAUSSIAN_BLOCK), np.float32)
+    grad_colors = np.zeros((GAUSSIAN_BLOCK, harmonics.shape[2]), np.float32)
+    for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, means.shape[0]), GAUSSIAN_BLOCK):
+        count = min(GAUSSIAN_BLOCK, means.shape[0] - start)
+        load_block(means, quats, scales, covariances, opacities, start, count, rows)
+        _sum_slots(
+            grad_records, grad_values, ewa_grads, offsets, start, count, record_sums, value_sums, grad_colors, rows
+        )
+        _load_record_gradients(record_sums, ewa_grads, start, count, soa, rows)
+        _clear_undrawn(scene_drawn, start, count, pose, rows, soa, drawn)
+        for i in range(0, GAUSSIAN_BLOCK, LANES):
+            _backpropagate_records(
+                covariances, ewa_grads, camera, filter_variance, compensate, near, rows, soa.reshape(-1), grad_pose, i
+            )
+        if view_dependent is None:
+            backpropagate_constant_colors(harmonics, start, count, values, value_sums, grad_colors, grad_harmonics)
+        else:
+            if harmonics.shape[2] == 3:
+                for i in range(count):
+                    for c in range(3):
+                        grad_colors[i, c] = load_scalar(value_sums, 4 * i + c)
+            evaluate_basis(rows, DIRECTION_ROW, harmonics.shape[1], view_dependent, basis)
+            backpropagate_colors(harmonics, start, drawn, basis, values, grad_colors, grad_harmonics, grad_basis)
+            accumulate_direction_gradients(
+                rows, DIRECTION_ROW, harmonics.shape[1], view_dependent, grad_basis, _MEAN_GRAD_ROW
+            )
+        _backpropagate_means(rows, grad_pose)
+        _store_gradients(rows, start, count, grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities)
+    for j in range(grad_pose.shape[0]):
+        total = 0.0
+        for i in range(LANES):
+            total += grad_pose[j, i]
+        pose_sums[item, j] = total
+
+
+# Loading the gradients of a block.
+
+
+@inline_kernel
+def _sum_slots(
+    grad_records, grad_values, ewa_grads, offsets, start, count, record_sums, value_sums, grad_colors, rows
+):  # fmt: skip
+    """Sum the slots of each Gaussian of a block, in their order; zeros where it has none.
+
+    Args:
+        grad_records, grad_values: flat.
+        record_sums: (GAUSSIAN_BLOCK RECORD_SIZE), flat, written.
+        value_sums: (GAUSSIAN_BLOCK 4 and 4 more), flat, written if there are three channels.
+        grad_colors: (GAUSSIAN_BLOCK, channel), written if there are not.
+    """
+    channels, zero = grad_colors.shape[1], broadcast(np.float32(0))
+    for i in range(count):
+        first, end = load_scalar(offsets, start + i), load_scalar(offsets, start + i + 1)
+        low, high, values, radius = zero, zero, zero, np.float32(0)
+        prefetch(grad_records, layout.RECORD_SIZE * (first + PREFETCH_DISTANCE // 4))
+        prefetch(grad_values, 4 * (first + PREFETCH_DISTANCE // 4))
+        if channels == 3:  # the common case; one loop, so that its end is mispredicted once
+            for slot in range(first, end):
+                if ewa_grads is None:
+                    low = low + load(grad_records, layout.RECORD_SIZE * slot)
+                    high = high + load(grad_records, layout.RECORD_SIZE * slot + LANES)
+                values = values + load_four(grad_values, 4 * slot)
+            store(value_sums, 4 * i, values)
+        else:
+            grad_colors[i] = 0
+            for slot in range(first, end):
+                if ewa_grads is None:
+                    low = low + load(grad_records, layout.RECORD_SIZE * slot)
+                    high = high + load(grad_records, layout.RECORD_SIZE * slot + LANES)
+                for c in range(channels):
+                    grad_colors[i, c] += load_scalar(grad_values, (channels + 1) * slot + c)
+                radius += load_scalar(grad_values, (channels + 1) * slot + channels)
+            rows[_RADIUS_GRAD_ROW, i] = radius
+        store(record_sums, layout.RECORD_SIZE * i, low)
+        store(record_sums, layout.RECORD_SIZE * i + LANES, high)
+    if channels == 3:
+        for i in range(0, GAUSSIAN_BLOCK, LANES):
+            store_row(rows, _RADIUS_GRAD_ROW, i, to_f64(load_aos4(value_sums, 4 * i)[3]))
+
+
+@inline_kernel
+def _load_record_gradients(record_sums, ewa_grads, start, count, soa, rows):
+    """Turn a block's gradients of records into rows of `soa`, or the gradients from ewa.py into rows."""
+    if ewa_grads is not None:
+        for i in range(count):
+            soa[layout.LOG2_PEAK, i] = ewa_grads[start + i, 9]
+            for j in range(9):
+                rows[_EWA_GRAD_ROW + j, i] = ewa_grads[start + i, j]
+        return
+    records_to_soa(record_sums, 0, count, soa.reshape(-1), GAUSSIAN_BLOCK)
+
+
+@inline_kernel
+def _clear_undrawn(scene_drawn, start, count, pose, rows, soa, drawn):
+    """Replace the numbers of Gaussians that are not drawn by finite ones: their gradients are 0 and must stay so."""
+    missing = GAUSSIAN_BLOCK - count
+    for i in range(count):
+        drawn[i] = load_scalar(scene_drawn, start + i) != 0
+        missing += load_scalar(scene_drawn, start + i) == 0
+    if missing == 0:
+        return
+    for i in range(GAUSSIAN_BLOCK):
+        if i < count and drawn[i]:
+            continue
+        drawn[i] = False
+        rows[MEAN_ROW, i], rows[MEAN_ROW + 1, i], rows[MEAN_ROW + 2, i] = pose[0, 3], pose[1, 3], pose[2, 3]
+        rows[MEAN_ROW, i] += 1 + abs(pose[0, 3])
+        rows[OPACITY_ROW, i], rows[_RADIUS_GRAD_ROW, i] = 1.0, 0.0
+        for j in range(9):
+            rows[SHAPE_ROW + j, i] = 1.0 if j % 4 == 0 else 0.0
+            rows[_EWA_GRAD_ROW + j, i] = 0.0
+        for j in range(layout.RECORD_SIZE):
+            soa[j, i] = 0.0
+
+
+# Gradients of records, eight Gaussians at a time.
+
+
+@inline_kernel
+def _backpropagate_records(
+    covariances, ewa_grads, pose, filter_variance, compensate, near, rows, soa, grad_pose, i
+):  # fmt: skip
+    """Store the gradients of shapes, opacities, directions and distances, given those of records."""
+    n, radius, inverse, state = compute_direction(rows, i, pose, near)
+    u, v, cov, _ = compute_tangent_covariance(covariances, rows, i, n, inverse, state)
+    g_n, parts, g_det = _backpropagate_footprint_rows(
+        pose, filter_variance, compensate, u, v, n, cov, soa, i, grad_pose
+    )
+    if ewa_grads is not None:
+        g_n = _add_ewa_gradients(rows, i, u, v, n, cov, g_n, grad_pose)
+    if covariances is not None:
+        g_n, g_radius = _backpropagate_matrices(rows, i, ewa_grads, u, v, n, cov, inverse, g_n, parts, g_det)
+    else:
+        g_n, g_radius = _backpropagate_axes(rows, i, ewa_grads, u, n, inverse, g_n, parts, g_det)
+    store_row(rows, _RADIUS_GRAD_ROW, i, load_row(rows, _RADIUS_GRAD_ROW, i) + g_radius)
+    g_log_peak = (1 / math.log(2)) * to_f64(load(soa, layout.LOG2_PEAK * GAUSSIAN_BLOCK + i))
+    store_row(rows, OPACITY_ROW, i, g_log_peak / load_row(rows, OPACITY_ROW, i))
+    store_row(rows, RADIUS_ROW, i, radius)
+    store_vector(rows, _MEAN_GRAD_ROW, i, g_n)
+    store_vector(rows, DIRECTION_ROW, i, n)
+
+
+@inline_kernel
+def _backpropagate_footprint_rows(pose, filter_variance, compensate, u, v, n, cov, soa, i, grad_pose):
+    """The gradient of n, the parts of that of C for `_covariance_gradient`, and that of ln det B."""
+    unit, inverse_unit = math.sqrt(layout.HALF_LOG2_E), 1 / math.sqrt(layout.HALF_LOG2_E)
+    factors, alpha, beta, radial_variance, det_filtered, _ = compute_whitening(cov, filter_variance)
+    a_scale, mix, b_scale = factors
+    a, b = whitened_axes(u, v, factors)
+    g_n = _to_world(pose, _load_gradient(soa, layout.DIRECTION, i, 1.0))
+    g_a = _to_world(pose, _load_gradient(soa, layout.ROW_A, i, unit))
+    g_b = _to_world(pose, _load_gradient(soa, layout.ROW_B, i, unit))
+    if grad_pose.shape[0] > 0:
+        _add_to_pose(grad_pose, n, a, b, g_n, g_a, g_b)
+    g_alpha = inverse_unit * to_f64(load(soa, layout.L_ALONG_A * GAUSSIAN_BLOCK + i))
+    g_beta = inverse_unit * to_f64(load(soa, layout.L_ALONG_B * GAUSSIAN_BLOCK + i))
+    g_radial = (1 / layout.HALF_LOG2_E) * to_f64(load(soa, layout.RADIAL_VARIANCE * GAUSSIAN_BLOCK + i))
+    half, g_det = broadcast(0.0), broadcast(0.0)
+    if compensate:
+        counts = cov[6] > MIN_COMPENSATION * det_filtered
+        half = select(counts, (0.5 / math.log(2)) * to_f64(load(soa, layout.LOG2_PEAK * GAUSSIAN_BLOCK + i)), half)
+        g_det = select(counts, half / cov[6], g_det)
+    g_aa = -0.5 * (dot(*g_a, *a) + alpha * g_alpha) - half
+    g_ab = -0.5 * (dot(*g_a, *b) + dot(*g_b, *a) + beta * g_alpha + alpha * g_beta)
+    g_bb = -0.5 * (dot(*g_b, *b) + beta * g_beta) - half
+    length = math.sqrt(det_filtered)
+    ahead, back = cov[5] + filter_variance, 2 * (radial_variance + filter_variance) * g_radial
+    by_a = 2 * alpha * g_aa + beta * g_ab - dot(*g_a, *n) + ahead * g_alpha - back * alpha
+    by_b = b_scale * (alpha * g_ab + 2 * beta * g_bb - dot(*g_b, *n) + ahead * g_beta - back * beta)
+    by_p, by_q = b_scale * length * g_alpha, a_scale * length * g_beta
+    by_u, by_v = by_a * a_scale - by_b * mix - by_p, by_b - by_p * mix - by_q  # p = b ^ n, q = n ^ a
+    g_n = g_n[0] + by_u * u[0] + by_v * v[0], g_n[1] + by_u * u[1] + by_v * v[1], g_n[2] + by_u * u[2] + by_v * v[2]
+    halves = 0.5 * g_aa, 0.5 * g_ab, 0.5 * g_bb, 0.5 * g_alpha, 0.5 * g_beta
+    return g_n, (factors, (alpha, beta), g_radial, halves), g_det
+
+
+@inline_kernel
+def _load_gradient(soa, field, i, factor):
+    """The gradient of three fields of the records."""
+    return (
+        factor * to_f64(load(soa, field * GAUSSIAN_BLOCK + i)),
+        factor * to_f64(load(soa, (field + 1) * GAUSSIAN_BLOCK + i)),
+        factor * to_f64(load(soa, (field + 2) * GAUSSIAN_BLOCK + i)),
+    )
+
+
+@inline_kernel
+def _to_world(pose, vector):
+    (xx, yx, zx), (xy, yy, zy), (xz, yz, zz), _ = pose
+    x, y, z = vector
+    return xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z
+
+
+@inline_kernel
+def _add_to_pose(grad_pose, n, a, b, g_n, g_a, g_b):
+    """Add to the rotation's gradient: n_camera = A'n, so it is the sum of n g_n' A and the like; A is applied last."""
+    for axis in range(3):
+        for other in range(3):
+            term = n[axis] * g_n[other] + a[axis] * g_a[other] + b[axis] * g_b[other]
+            store_row(grad_pose, 4 * axis + other, 0, load_row(grad_pose, 4 * axis + other, 0) + term)
+
+
+@inline_kernel
+def _add_ewa_gradients(rows, i, u, v, n, cov, g_n, grad_pose):
+    """Add the gradients from ewa.py to that of n, which is returned, and to the pose's."""
+    ewa_n = load_vector(rows, _EWA_GRAD_ROW, i)
+    xx, xy, xz, yy, yz, zz = _ewa_covariance_gradient(rows, i)
+    columns = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
+    for other in range(3):
+        on_u, on_v, on_n = dot(*u, *columns[other]), dot(*v, *columns[other]), dot(*n, *columns[other])
+        by_u = 2 * (cov[0] * on_u + cov[1] * on_v + cov[3] * on_n)
+        by_v = 2 * (cov[1] * on_u + cov[2] * on_v + cov[4] * on_n)
+        by_n = 2 * (cov[3] * on_u + cov[4] * on_v + cov[5] * on_n) + ewa_n[other]
+        if grad_pose.shape[0] > 0:
+            for axis in range(3):
+                term = u[axis] * by_u + v[axis] * by_v + n[axis] * by_n
+                store_row(grad_pose, 4 * axis + other, 0, load_row(grad_pose, 4 * axis + other, 0) + term)
+    return g_n[0] + ewa_n[0], g_n[1] + ewa_n[1], g_n[2] + ewa_n[2]
+
+
+@inline_kernel
+def _ewa_covariance_gradient(rows, i):
+    """The gradient of C from ewa.py, world axes."""
+    return (*load_vector(rows, _EWA_GRAD_ROW + 3, i), *load_vector(rows, _EWA_GRAD_ROW + 6, i))
+
+
+@inline_kernel
+def _covariance_gradient(u, v, n, parts):
+    """The gradient of C (xx xy xz yy yz zz) in the axes of u, v and n.
+
+    Its rows are combinations of a, b, n, l; it is symmetric once its transpose is added.
+    """
+    factors, (alpha, beta), g_radial, (aa, ab, bb, by_alpha, by_beta) = parts
+    a, b = whitened_axes(u, v, factors)
+    c = (
+        aa * a[0] + ab * b[0] - by_alpha * n[0],
+        aa * a[1] + ab * b[1] - by_alpha * n[1],
+        aa * a[2] + ab * b[2] - by_alpha * n[2],
+    )
+    d = bb * b[0] - by_beta * n[0], bb * b[1] - by_beta * n[1], bb * b[2] - by_beta * n[2]
+    l = (  # noqa: E741
+        n[0] + alpha * a[0] + beta * b[0],
+        n[1] + alpha * a[1] + beta * b[1],
+        n[2] + alpha * a[2] + beta * b[2],
+    )
+    weighted = g_radial * l[0], g_radial * l[1], g_radial * l[2]
+    return (
+        weighted[0] * l[0] + 2 * (a[0] * c[0] + b[0] * d[0]),
+        weighted[0] * l[1] + a[0] * c[1] + a[1] * c[0] + b[0] * d[1] + b[1] * d[0],
+        weighted[0] * l[2] + a[0] * c[2] + a[2] * c[0] + b[0] * d[2] + b[2] * d[0],
+        weighted[1] * l[1] + 2 * (a[1] * c[1] + b[1] * d[1]),
+        weighted[1] * l[2] + a[1] * c[2] + a[2] * c[1] + b[1] * d[2] + b[2] * d[1],
+        weighted[2] * l[2] + 2 * (a[2] * c[2] + b[2] * d[2]),
+    )
+
+
+@inline_kernel
+def _backpropagate_matrices(rows, i, ewa_grads, u, v, n, cov, inverse, g_n, parts, g):
+    """Store the gradients of covariances; return those of n and the distance.
+
+    Args:
+        ewa_grads: None if there are none.
+        inverse: one over the distance.
+        g_n, parts, g: gradients of n, C (see `_covariance_gradient`) and ln det B.
+    """
+    xx, xy, xz, yy, yz, zz = _covariance_gradient(u, v, n, parts)
+    if ewa_grads is not None:
+        t = _ewa_covariance_gradient(rows, i)
+        xx, xy, xz, yy, yz, zz = xx + t[0], xy + t[1], xz + t[2], yy + t[3], yz + t[4], zz + t[5]
+    uu, uv, vv, un, vn = cov[0], cov[1], cov[2], cov[3], cov[4]
+    # det B = uu vv - uv^2; the frame turns with n.
+    xx = xx + g * (vv * u[0] * u[0] + uu * v[0] * v[0] - 2 * uv * u[0] * v[0])
+    yy = yy + g * (vv * u[1] * u[1] + uu * v[1] * v[1] - 2 * uv * u[1] * v[1])
+    zz = zz + g * (vv * u[2] * u[2] + uu * v[2] * v[2] - 2 * uv * u[2] * v[2])
+    xy = xy + g * (vv * u[0] * u[1] + uu * v[0] * v[1] - uv * (u[0] * v[1] + u[1] * v[0]))
+    xz = xz + g * (vv * u[0] * u[2] + uu * v[0] * v[2] - uv * (u[0] * v[2] + u[2] * v[0]))
+    yz = yz + g * (vv * u[1] * u[2] + uu * v[1] * v[2] - uv * (u[1] * v[2] + u[2] * v[1]))
+    by_u, by_v = 2 * g * (uv * vn - vv * un), 2 * g * (uv * un - uu * vn)
+    g_n = g_n[0] + by_u * u[0] + by_v * v[0], g_n[1] + by_u * u[1] + by_v * v[1], g_n[2] + by_u * u[2] + by_v * v[2]
+    x_row, y_row = load_vector(rows, SHAPE_ROW, i), load_vector(rows, SHAPE_ROW + 3, i)
+    z_row = load_vector(rows, SHAPE_ROW + 6, i)
+    whole = xx * x_row[0] + yy * y_row[1] + zz * z_row[2]
+    whole = whole + xy * (x_row[1] + y_row[0])
+    whole = whole + xz * (x_row[2] + z_row[0])
+    whole = whole + yz * (y_row[2] + z_row[1])
+    squared = inverse * inverse
+    grads = xx, xy, xz, yy, yz, zz
+    for j in range(6):
+        store_row(rows, _SHAPE_GRAD_ROW + j, i, grads[j] * squared)
+    return g_n, -2 * whole * squared * inverse
+
+
+@inline_kernel
+def _backpropagate_axes(rows, i, ewa_grads, u, n, inverse, g_n, parts, g):
+    """Store the gradients of quaternions and scales; return those of n and the distance.
+
+    ln det B = ln sum_k w_k (n.e_k)^2. Turning the axes about one of them changes nothing if the other two scales are
+    equal, and rounding does not hide that: with G the gradient of C in the Gaussian's own axes and a_k the squared
+    scales, the torque about axis 0 is 2 (a_1 - a_2) (G_12 - g a_0 n_1 n_2), and cyclically.
+
+    Args:
+        ewa_grads: None if there are none.
+        inverse: one over the distance.
+        g_n, parts, g: gradients of n, C (see `_covariance_gradient`) and ln det B.
+    """
+    e0, e1, e2, inverse2 = load_axes(rows, i)
+    s0, s1, s2 = load_vector(rows, SHAPE_ROW + 4, i)
+    s0, s1, s2 = s0 * inverse, s1 * inverse, s2 * inverse
+    u0, u1, u2 = dot(*u, *e0), dot(*u, *e1), dot(*u, *e2)
+    n0, n1, n2 = dot(*n, *e0), dot(*n, *e1), dot(*n, *e2)
+    v = cross(n0, n1, n2, u0, u1, u2)
+    g00, g01, g02, g11, g12, g22 = _covariance_gradient((u0, u1, u2), v, (n0, n1, n2), parts)
+    if ewa_grads is not None:
+        t = _ewa_covariance_gradient(rows, i)
+        by_0, by_1, by_2 = _symmetric_times(t, e0), _symmetric_times(t, e1), _symmetric_times(t, e2)
+        g00, g11, g22 = g00 + dot(*e0, *by_0), g11 + dot(*e1, *by_1), g22 + dot(*e2, *by_2)
+        g01, g02, g12 = g01 + dot(*e0, *by_1), g02 + dot(*e2, *by_0), g12 + dot(*e1, *by_2)
+    a0, a1, a2 = s0 * s0, s1 * s1, s2 * s2
+    gn0, gn1, gn2 = g * n0, g * n1, g * n2
+    t0, t1, t2 = 2 * a1 * a2 * gn0, 2 * a2 * a0 * gn1, 2 * a0 * a1 * gn2
+    g_n = (
+        g_n[0] + t0 * e0[0] + t1 * e1[0] + t2 * e2[0],
+        g_n[1] + t0 * e0[1] + t1 * e1[1] + t2 * e2[1],
+        g_n[2] + t0 * e0[2] + t1 * e1[2] + t2 * e2[2],
+    )
+    q0, q1, q2 = gn0 * n0, gn1 * n1, gn2 * n2
+    d0 = 2 * s0 * (g00 + a2 * q1 + a1 * q2)
+    d1 = 2 * s1 * (g11 + a2 * q0 + a0 * q2)
+    d2 = 2 * s2 * (g22 + a1 * q0 + a0 * q1)
+    store_row(rows, _SHAPE_GRAD_ROW + 4, i, d0 * inverse)
+    store_row(rows, _SHAPE_GRAD_ROW + 5, i, d1 * inverse)
+    store_row(rows, _SHAPE_GRAD_ROW + 6, i, d2 * inverse)
+    # A unit quaternion q that turns with the torque changes by q (0, torque) / 2.
+    twice = 4 * inverse2
+    x = twice * (a1 - a2) * (g12 - a0 * gn1 * n2)
+    y = twice * (a2 - a0) * (g02 - a1 * gn2 * n0)
+    z = twice * (a0 - a1) * (g01 - a2 * gn0 * n1)
+    q = (load_row(rows, SHAPE_ROW, i), *load_vector(rows, SHAPE_ROW + 1, i))
+    store_row(rows, _SHAPE_GRAD_ROW, i, -(q[1] * x + q[2] * y + q[3] * z))
+    store_row(rows, _SHAPE_GRAD_ROW + 1, i, q[0] * x + q[2] * z - q[3] * y)
+    store_row(rows, _SHAPE_GRAD_ROW + 2, i, q[0] * y + q[3] * x - q[1] * z)
+    store_row(rows, _SHAPE_GRAD_ROW + 3, i, q[0] * z + q[1] * y - q[2] * x)
+    return g_n, -(d0 * s0 + d1 * s1 + d2 * s2) * inverse
+
+
+@inline_kernel
+def _symmetric_times(matrix, e):
+    xx, xy, xz, yy, yz, zz = matrix
+    return dot(xx, xy, xz, *e), dot(xy, yy, yz, *e), dot(xz, yz, zz, *e)
+
+
+# Gradients of a block's means, and storing the gradients.
+
+
+@inline_kernel
+def _backpropagate_means(rows, grad_pose):
+    """Turn the gradients of directions into those of means, with those of distances."""
+    for i in range(0, GAUSSIAN_BLOCK, LANES):
+        n, g = load_vector(rows, DIRECTION_ROW, i), load_vector(rows, _MEAN_GRAD_ROW, i)
+        inverse = 1 / load_row(rows, RADIUS_ROW, i)
+        outward = load_row(rows, _RADIUS_GRAD_ROW, i) - dot(*g, *n) * inverse
+        for axis in range(3):
+            grad = g[axis] * inverse + outward * n[axis]
+            store_row(rows, _MEAN_GRAD_ROW + axis, i, grad)
+            if grad_pose.shape[0] > 0:
+                store_row(grad_pose, 4 * axis + 3, 0, load_row(grad_pose, 4 * axis + 3, 0) - grad)
+
+
+@inline_kernel
+def _store_gradients(rows, start, count, grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities):
+    if grad_means.shape[0] > 0:
+        soa_to_aos3(rows, _MEAN_GRAD_ROW, start, count, grad_means.reshape(-1))
+    if grad_opacities.shape[0] > 0:
+        soa_to_aos1(rows, OPACITY_ROW, start, count, grad_opacities)
+    if grad_quats.shape[0] > 0:
+        soa_to_aos4(rows, _SHAPE_GRAD_ROW, start, count, grad_quats.reshape(-1))
+    if grad_scales.shape[0] > 0:
+        soa_to_aos3(rows, _SHAPE_GRAD_ROW + 4, start, count, grad_scales.reshape(-1))
+    if grad_covariances.shape[0] > 0:
+        for i in range(count):
+            for axis in range(3):
+                for other in range(3):
+                    j = axis + other + (1 if axis > 0 and other > 0 else 0)
+                    grad_covariances[start + i, axis, other] = rows[_SHAPE_GRAD_ROW + j, i]
