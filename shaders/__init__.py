@@ -1,1 +1,1 @@
-"""GLSL sources of the viewer; read with importlib.resources."""
+"""GLSL sources of the viewer, read with importlib.resources."""

@@ -1,29 +1,29 @@
-// GL 4.3 tier: one invocation a visible Gaussian, writing the same record as project.vert.
+// GL 4.3 tier: projects one Gaussian per invocation and writes the same record as project.vert.
 layout(local_size_x = 64) in;
 
 #include "splat.glsl"
 
 uniform int count;
 
-struct Stored { vec4 mean_opacity, quat, scale; };
-struct Record { vec4 quad_1, quad_2, response_a, response_b, response_l, color; };
+struct StoredGaussian { vec4 mean_opacity, quat, scale; };
+struct Record { vec4 quad_1, quad_2, row_a, row_b, row_l, color; };
 
-layout(std430, binding = 0) readonly buffer Gaussians { Stored gaussians[]; };
+layout(std430, binding = 0) readonly buffer Gaussians { StoredGaussian gaussians[]; };
 layout(std430, binding = 1) readonly buffer Colors { vec4 colors[]; };
-layout(std430, binding = 2) readonly buffer Visible { uint visible[]; };
+layout(std430, binding = 2) readonly buffer Indices { uint indices[]; };
 layout(std430, binding = 3) writeonly buffer Records { Record records[]; };
 
 void main() {
     uint slot = gl_GlobalInvocationID.x + gl_GlobalInvocationID.y * gl_NumWorkGroups.x * gl_WorkGroupSize.x;
     if (slot >= uint(count)) return;
-    uint index = visible[slot];
-    Stored stored = gaussians[index];
+    uint index = indices[slot];
+    StoredGaussian stored = gaussians[index];
     Gaussian gaussian = Gaussian(stored.mean_opacity.xyz, stored.mean_opacity.w, stored.quat, stored.scale.xyz);
     Footprint f;
     Record record = Record(vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0));
-    if (project(gaussian, f)) {
-        record = Record(vec4(f.centre, f.axis_1), vec4(f.axis_2, f.base), vec4(f.a, f.thickness),
-                        vec4(f.b, f.radius), vec4(f.l, f.opacity), vec4(colors[index].rgb, 0.0));
+    if (project_gaussian(gaussian, f)) {
+        record = Record(vec4(f.center, f.half_axis_1), vec4(f.half_axis_2, f.base), vec4(f.a, f.thickness),
+                        vec4(f.b, f.distance), vec4(f.l, f.peak), vec4(colors[index].rgb, 0.0));
     }
     records[slot] = record;
 }

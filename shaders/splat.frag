@@ -1,15 +1,15 @@
-// One splat at one pixel: the largest response on the ray (docs/rendering.md, sections 3 and 4).
-uniform vec2 principal;     // window coordinates of the picture's centre
+// Alpha of one footprint at one pixel: docs/rendering.md, sections 3 and 4.
+uniform vec2 principal;     // window coordinates of the image centre
 uniform float focal;        // pixels
 
 flat in vec2 v_base;
 flat in vec4 v_a;           // a, thickness
-flat in vec4 v_b;           // b, radius
-flat in vec4 v_l;           // l, opacity
+flat in vec4 v_b;           // b, distance
+flat in vec4 v_l;           // l, peak
 flat in vec3 v_color;
 
 layout(location = 0) out vec4 out_color;    // premultiplied
-layout(location = 1) out vec4 out_depth;    // alpha times radial distance
+layout(location = 1) out vec4 out_depth;    // alpha x radial distance
 
 void main() {
     vec2 ray = (gl_FragCoord.xy - principal) / focal;

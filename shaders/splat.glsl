@@ -1,15 +1,15 @@
-// One Gaussian seen by one pinhole camera: docs/rendering.md, sections 1 to 3 and 5, in float32.
+// Projects one Gaussian to its footprint on a pinhole image: docs/rendering.md, sections 1 to 3 and 5, in float32.
 // Image-plane units: x right, y down, pixel coordinates divided by the focal length, z = 1.
 
 uniform mat3 world_to_camera;
-uniform vec3 position;           // camera centre, in the (shifted) world of the means
-uniform float near;              // least radial distance, metres
+uniform vec3 position;           // camera centre, in the moved frame of the means
+uniform float near;              // smallest radial distance, metres
 uniform int kernel;              // 0 ray, 1 ewa
 uniform float filter_variance;   // e^2 of section 2
-uniform bool compensate;         // scale the opacity by what the filter spreads
-uniform float dilation;          // added to the projected covariance's diagonal (ewa with the 3dgs filter)
-uniform vec2 half_size;          // half the picture
-uniform float margin;            // added around the bounds, for the rasteriser's own rounding
+uniform bool compensate;         // whether the low-pass filter lowers the opacity
+uniform float dilation;          // added to the diagonal of the projected covariance (ewa with the 3dgs filter)
+uniform vec2 half_size;          // half the image
+uniform float margin;            // added to the quad, for the rounding of the rasteriser
 
 struct Gaussian {
     vec3 mean;
@@ -18,15 +18,15 @@ struct Gaussian {
     vec3 scale;
 };
 
-// What the fragment shader needs: with d the ray and D = d.xy - base,
+// A projected Gaussian. The rows a, b, l give its response on a ray d, with D = d.xy - base:
 //   Q = (a.x + a.yz . D)^2 + (b.x + b.yz . D)^2,   L = l.x + l.yz . D,   q = Q / (L^2 + thickness Q).
 struct Footprint {
-    vec2 centre, axis_1, axis_2; // the quad: centre +- axis_1 +- axis_2
+    vec2 center, half_axis_1, half_axis_2; // the quad: center +- half_axis_1 +- half_axis_2
     vec2 base;
     vec3 a, b, l;
     float thickness;
-    float opacity;
-    float radius;                // radial distance of the mean, metres
+    float peak;                  // opacity after the low-pass filter
+    float distance;              // radial distance of the mean, metres
 };
 
 mat3 rotation_from_quat(vec4 quat) {
@@ -39,21 +39,21 @@ mat3 rotation_from_quat(vec4 quat) {
         2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
 }
 
-// Half axes of the ellipse x' E^-1 x = 1, E = [xx xy; xy yy], each lengthened by the margin.
+// Sets the quad to the half axes of the ellipse x' E^-1 x = 1, E = [xx xy; xy yy], lengthened by the margin.
 void set_quad(inout Footprint f, float xx, float xy, float yy) {
     float mean = 0.5 * (xx + yy), half_gap = 0.5 * (xx - yy);
     float gap = length(vec2(half_gap, xy));
-    // atan-free eigenvector of the larger eigenvalue, from the better conditioned of its two rows
+    // Eigenvector of the larger eigenvalue, from the better conditioned of the two rows.
     vec2 direction = half_gap >= 0.0 ? vec2(half_gap + gap, xy) : vec2(xy, gap - half_gap);
     float norm = length(direction);
     direction = norm > 0.0 ? direction / norm : vec2(1.0, 0.0);
-    f.axis_1 = direction * (sqrt(max(mean + gap, 0.0)) + margin);
-    f.axis_2 = vec2(-direction.y, direction.x) * (sqrt(max(mean - gap, 0.0)) + margin);
+    f.half_axis_1 = direction * (sqrt(max(mean + gap, 0.0)) + margin);
+    f.half_axis_2 = vec2(-direction.y, direction.x) * (sqrt(max(mean - gap, 0.0)) + margin);
 }
 
-// The exact response's coefficients and its bound; `axes` are the half axes in camera axes divided by the
-// distance, `u v` the tangent frame at the unit direction n, (b_uu b_uv b_vv) the filtered 2x2 block.
-bool footprint_ray(inout Footprint f, mat3 axes, vec3 n, vec3 u, vec3 v, vec3 b2, float determinant, vec2 c) {
+// Sets the rows of the exact response, and the quad. `axes`: the half axes in camera axes, divided by the distance;
+// `u v`: the tangent frame at the unit direction n; `b2`: the filtered block (B_uu, B_uv, B_vv).
+bool set_footprint_ray(inout Footprint f, mat3 axes, vec3 n, vec3 u, vec3 v, vec3 b2, float determinant, vec2 c) {
     float root_u = sqrt(b2.x), root_v = sqrt(determinant / b2.x);
     float shear = b2.y / b2.x;
     vec3 a = u / root_u;
@@ -67,10 +67,10 @@ bool footprint_ray(inout Footprint f, mat3 axes, vec3 n, vec3 u, vec3 v, vec3 b2
     f.b = vec3(centred ? 0.0 : b.z, b.xy);
     f.l = vec3(centred ? 1.0 / n.z : l.z, l.xy);
 
-    // Dual cone D = n n' - kappa C' (section 5): the ellipse it cuts from the image plane has centre
-    // (D_xz, D_yz) / D_zz and shape matrix (D_z D_z' - D_zz D_xy) / D_zz^2, expanded around n so that the large
-    // terms cancel on paper and not in float32.
-    float kappa = 2.0 * log(f.opacity / ALPHA_CUT);
+    // Dual cone D = n n' - kappa C' (section 5). Its section by the image plane is an ellipse with centre
+    // (D_xz, D_yz) / D_zz and shape matrix (D_z D_z' - D_zz D_xy) / D_zz^2. The expansion around n cancels the large
+    // terms symbolically instead of in float32.
+    float kappa = 2.0 * log(f.peak / ALPHA_CUT);
     vec3 x = vec3(axes[0].x, axes[1].x, axes[2].x);
     vec3 y = vec3(axes[0].y, axes[1].y, axes[2].y);
     vec3 z = vec3(axes[0].z, axes[1].z, axes[2].z);
@@ -80,11 +80,11 @@ bool footprint_ray(inout Footprint f, mat3 axes, vec3 n, vec3 u, vec3 v, vec3 b2
     float c_zz = dot(z, z) + e2 * (1.0 - n.z * n.z), c_xz = dot(x, z) - e2 * n.x * n.z;
     float d_zz = n.z * n.z - kappa * c_zz;
     if (d_zz < 1e-3) {
-        // The ellipsoid reaches the plane of the eye: any pixel may see it, unless all of it lies behind.
+        // The ellipsoid crosses the plane z = 0: any pixel may see it, unless all of it is behind the camera.
         if (n.z < 0.0 && d_zz > 1e-5) return false;
-        f.centre = vec2(0.0);
-        f.axis_1 = vec2(half_size.x + margin, 0.0);
-        f.axis_2 = vec2(0.0, half_size.y + margin);
+        f.center = vec2(0.0);
+        f.half_axis_1 = vec2(half_size.x + margin, 0.0);
+        f.half_axis_2 = vec2(0.0, half_size.y + margin);
         return true;
     }
     if (n.z < 0.0) return false;
@@ -93,15 +93,15 @@ bool footprint_ray(inout Footprint f, mat3 axes, vec3 n, vec3 u, vec3 v, vec3 b2
     float e_yy = dot(h_y, h_y) + e2 * (n.z * n.z + n.y * n.y) + kappa * (c_yz * c_yz - c_yy * c_zz);
     float e_xy = dot(h_x, h_y) + e2 * n.x * n.y + kappa * (c_xz * c_yz - c_xy * c_zz);
     float scale = kappa / (d_zz * d_zz);
-    f.centre = (n.xy * n.z - kappa * vec2(c_xz, c_yz)) / d_zz;
+    f.center = (n.xy * n.z - kappa * vec2(c_xz, c_yz)) / d_zz;
     set_quad(f, scale * e_xx, scale * e_xy, scale * e_yy);
     return true;
 }
 
-// The projected covariance at the (clamped) mean; `w2` holds the squared products of two relative scales and
-// `unit` the rotation, for a determinant without cancellation.
-bool footprint_ewa(inout Footprint f, mat3 axes, mat3 unit, vec3 n, vec3 w2) {
-    if (n.z <= 0.0 || f.radius * n.z <= EWA_NEAR_FACTOR * near) return false;
+// Sets the rows and the quad of the linearised response: the projected covariance at the (clamped) mean. `w2`: squared
+// products of two relative scales; `unit`: the rotation. Both give a determinant without cancellation.
+bool set_footprint_ewa(inout Footprint f, mat3 axes, mat3 unit, vec3 n, vec3 w2) {
+    if (n.z <= 0.0 || f.distance * n.z <= EWA_NEAR_FACTOR * near) return false;
     f.base = n.xy / n.z;
     vec2 t = clamp(f.base, -EWA_CLAMP * half_size, EWA_CLAMP * half_size);
     vec3 j_x = vec3(1.0, 0.0, -t.x) / n.z, j_y = vec3(0.0, 1.0, -t.y) / n.z;
@@ -121,18 +121,19 @@ bool footprint_ewa(inout Footprint f, mat3 axes, mat3 unit, vec3 n, vec3 w2) {
     f.b = vec3(0.0, -v_xy / v_xx / root_y, 1.0 / root_y);
     f.l = vec3(1.0, 0.0, 0.0);
     f.thickness = 0.0;
-    f.centre = f.base;
-    float kappa = 2.0 * log(f.opacity / ALPHA_CUT);
+    f.center = f.base;
+    float kappa = 2.0 * log(f.peak / ALPHA_CUT);
     set_quad(f, kappa * v_xx, kappa * v_xy, kappa * v_yy);
     return true;
 }
 
-bool project(Gaussian gaussian, out Footprint f) {
+// Returns whether the Gaussian can be visible.
+bool project_gaussian(Gaussian gaussian, out Footprint f) {
     vec3 offset = gaussian.mean - position;
-    f.radius = length(offset);
-    if (!(f.radius >= near && f.radius > 0.0)) return false;
-    vec3 n = world_to_camera * (offset / f.radius);
-    vec3 k = gaussian.scale / f.radius;
+    f.distance = length(offset);
+    if (!(f.distance >= near && f.distance > 0.0)) return false;
+    vec3 n = world_to_camera * (offset / f.distance);
+    vec3 k = gaussian.scale / f.distance;
     mat3 unit = world_to_camera * rotation_from_quat(gaussian.quat);
     mat3 axes = mat3(unit[0] * k.x, unit[1] * k.y, unit[2] * k.z);
 
@@ -145,14 +146,14 @@ bool project(Gaussian gaussian, out Footprint f) {
     float trace = dot(u_a, u_a) + dot(v_a, v_a);
     float sharp = dot(w2, n_e * n_e);
     float determinant = sharp + e2 * trace + e2 * e2;
-    f.opacity = gaussian.opacity;
-    if (compensate) f.opacity *= sqrt(sharp / determinant);
-    if (!(f.opacity >= ALPHA_CUT)) return false;
-    if (kernel == 1) return footprint_ewa(f, axes, unit, n, w2);
+    f.peak = gaussian.opacity;
+    if (compensate) f.peak *= sqrt(sharp / determinant);
+    if (!(f.peak >= ALPHA_CUT)) return false;
+    if (kernel == 1) return set_footprint_ewa(f, axes, unit, n, w2);
 
     float volume = k.x * k.y * k.z;
     float along = e2 * e2 * dot(n_a, n_a) + e2 * dot(w2, u_e * u_e + v_e * v_e) + volume * volume;
     f.thickness = along / determinant;
     vec3 b2 = vec3(dot(u_a, u_a) + e2, dot(u_a, v_a), dot(v_a, v_a) + e2);
-    return footprint_ray(f, axes, n, u, v, b2, determinant, vec2(dot(u_a, n_a), dot(v_a, n_a)));
+    return set_footprint_ray(f, axes, n, u, v, b2, determinant, vec2(dot(u_a, n_a), dot(v_a, n_a)));
 }

@@ -1,4 +1,4 @@
-"""The `pansplat-view` command. Imports neither torch nor OpenGL before it has to: `--help` is quick."""
+"""The `pansplat-view` command. Imports torch and OpenGL only when they are needed, so that `--help` is fast."""
 
 import re
 import sys
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from pansplat.errors import InputError
-from pansplat_viewer.library import Entry, Loader, LoadOptions, find_entries, load_entry
+from pansplat_viewer.loader import LoadOptions, SceneEntry, SceneLoader, find_entries, load_entry
 from pansplat_viewer.settings import DrawSettings, Kernel, Mode, Order
 
 if TYPE_CHECKING:
@@ -22,53 +22,53 @@ if TYPE_CHECKING:
 class Options:
     """Fly through the scene between two posed 360-degree panoramas.
 
-    Opens a window, or without a display writes a film, stills and a panorama.
+    Opens a window. Without a display, writes a film, stills and a panorama.
     """
 
     path: Annotated[Path, tyro.conf.Positional]
     """A pair folder, a folder of pairs, or a scene .ply."""
     offscreen: Path | None = None
-    """Open no window: write film and pictures to this folder."""
+    """Open no window; write film, stills and panorama to this folder."""
     pair: str | None = None
-    """Name or number of the pair to begin with, where the path holds several; offscreen also "all"."""
+    """Name or number of the pair to show first if the path holds several; offscreen also "all"."""
     model: str = "sweep"
-    """What predicts the scene from a pair: `sweep`, or a file of weights (.safetensors, or an original .ckpt)."""
+    """Predictor for pairs: `sweep`, or a file of weights (.safetensors, or an original .ckpt)."""
     compat: Literal["trained", "official", "fixed"] = "trained"
-    """For a network: what the original code computes, or with its defects corrected; by default as the weights
-    were trained."""
+    """For a network: compute what the original code computes (official), or with its defects fixed; by default as the
+    weights were trained."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """Number type of a network's convolutions; bfloat16 is faster where the processor has it, and less exact."""
+    """Type of a network's convolutions; bfloat16 is faster on CPUs that support it, and less accurate."""
     height: int = 512
-    """Height of the panoramas that the prediction sees, pixels."""
+    """Height of the panoramas that the prediction reads, pixels."""
     no_cache: bool = False
-    """Predict anew even when the result is kept beside the pair."""
+    """Predict even if the pair's folder has a cached result."""
     convention: str | None = None
-    """Pose convention to read the poses by, such as "world2cam opengl", instead of what the files say."""
+    """Pose convention, such as "world2cam opengl", instead of the one in the files."""
     near: float | None = None
-    """Nearest depth searched, metres, instead of what the files say."""
+    """Nearest depth of the search, metres, instead of the one in the files."""
     far: float | None = None
-    """Farthest depth searched, metres."""
+    """Farthest depth of the search, metres."""
     mode: Mode = "deferred"
-    """How the input views' Gaussians come together."""
+    """How the Gaussians of the input views are combined."""
     kernel: Kernel = "ray"
-    """Response of a Gaussian: exact on each ray, or the linearised one of 3DGS."""
+    """Response of a Gaussian: exact on each ray, or the linearisation of 3DGS."""
     order: Order = "radial"
     """Sort Gaussians by distance, or by depth along the view axis."""
     at: float | None = None
-    """Where to start between the panoramas, 0 to 1 (0); offscreen, where to take the panorama (0.5)."""
+    """Start position between the panoramas, 0 to 1 (0); offscreen, position of the panorama (0.5)."""
     size: str = "1280x720"
     """Width x height of the window or film, pixels."""
     seconds: float = 4.0
     """Length of the film."""
     fps: float = 24.0
-    """Pictures a second of the film."""
+    """Frames per second of the film."""
 
     @property
     def pixels(self) -> tuple[int, int]:
-        """`size` as numbers.
+        """`size` as (width, height).
 
         Raises:
-            InputError: not WIDTHxHEIGHT, or out of range.
+            InputError: `size` is not WIDTHxHEIGHT, or out of range.
         """
         match = re.fullmatch(r"(\d{2,5})x(\d{2,5})", self.size.lower())
         if not match or not all(16 <= int(side) <= 16384 for side in match.groups()):
@@ -77,7 +77,7 @@ class Options:
 
     @property
     def load_options(self) -> LoadOptions:
-        """How to read and predict."""
+        """Options of reading and prediction."""
         return LoadOptions(
             self.model,
             self.compat,
@@ -91,17 +91,17 @@ class Options:
 
     @property
     def settings(self) -> DrawSettings:
-        """How to draw."""
+        """Initial draw settings."""
         return DrawSettings(kernel=self.kernel, order=self.order, mode=self.mode)
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Run the command and exit: 0 done, 2 unusable input, 130 interrupted."""
+    """Run the command and exit with status 0 (done), 2 (invalid input) or 130 (interrupted)."""
     sys.exit(run(args))
 
 
 def run(args: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit status."""
+    """Run the command and return its exit status."""
     options = tyro.cli(
         Options,
         args=args,
@@ -109,7 +109,7 @@ def run(args: Sequence[str] | None = None) -> int:
         config=(tyro.conf.FlagCreatePairsOff,),
     )
     with warnings.catch_warnings():
-        # What libraries warn of is for programmers; what we warn of is for the person.
+        # Show warnings of pansplat to the user; hide those of libraries.
         warnings.simplefilter("ignore")
         warnings.filterwarnings("always", category=UserWarning, module=r"pansplat(_viewer)?(\.|$)")
         warnings.showwarning = lambda message, *_: print(f"note: {message}", file=sys.stderr)
@@ -122,19 +122,19 @@ def run(args: Sequence[str] | None = None) -> int:
             return 130
 
 
-def choose(entries: list[Entry], wanted: str | None) -> int:
-    """Index of the entry of that name or number (from 1); the first by default.
+def choose_entry(entries: list[SceneEntry], pair: str | None) -> int:
+    """Return the index of the entry with this name or number (from 1); None is the first.
 
     Raises:
-        InputError: none has that name or number.
+        InputError: no entry has this name or number.
     """
-    if wanted is None:
+    if pair is None:
         return 0
     for index, entry in enumerate(entries):
-        if wanted in (entry.name, str(index + 1)):
+        if pair in (entry.name, str(index + 1)):
             return index
     names = ", ".join(entry.name for entry in entries[:12]) + (", ..." if len(entries) > 12 else "")
-    raise InputError(f"`--pair` must be a number from 1 to {len(entries)} or one of {names}, got {wanted!r}")
+    raise InputError(f"`--pair` must be a number from 1 to {len(entries)} or one of {names}, got {pair!r}")
 
 
 def _run(options: Options) -> int:
@@ -142,39 +142,39 @@ def _run(options: Options) -> int:
     if options.at is not None and not 0 <= options.at <= 1:
         raise InputError(f"`--at` must be between 0 and 1, got {options.at}")
     entries = find_entries(options.path.expanduser(), options.load_options)
-    everything = options.pair == "all"
-    first = 0 if everything else choose(entries, options.pair)
+    show_all = options.pair == "all"
+    first = 0 if show_all else choose_entry(entries, options.pair)
     folder = options.offscreen
     if folder is None:
         problem = _try_window(options, entries, first, pixels)
         if problem is None:
             return 0
         print(f"{problem}: writing a fly-through instead")
-    chosen = entries if everything else entries[first : first + 1]
+    chosen = entries if show_all else entries[first : first + 1]
     if len(chosen) < len(entries):
-        print(f"{options.path} holds {len(entries)}: showing {chosen[0].name}; choose with --pair NAME or all")
+        print(f"{options.path} has {len(entries)} scenes: showing {chosen[0].name}; select with --pair NAME or all")
     for entry in chosen:
         if folder is None:
             target = Path("renders") / entry.folder_name
         else:
-            target = folder / entry.folder_name if everything else folder
-        _write(options, entry, target, pixels)
+            target = folder / entry.folder_name if show_all else folder
+        _write_flythrough(options, entry, target, pixels)
     return 0
 
 
-def _try_window(options: Options, entries: list[Entry], first: int, pixels: tuple[int, int]) -> str | None:
-    """Show the window until the person leaves; the reason when there can be none."""
+def _try_window(options: Options, entries: list[SceneEntry], first: int, pixels: tuple[int, int]) -> str | None:
+    """Run the viewer in a window; returns the reason if no window can be opened."""
     from pansplat_viewer.window import NoWindowError, Window
 
     try:
         window = Window("pansplat", pixels)
     except NoWindowError as error:
         return str(error)
-    _show(window, options, entries, first)
+    _run_window(window, options, entries, first)
     return None
 
 
-def _show(window: "Window", options: Options, entries: list[Entry], first: int) -> None:
+def _run_window(window: "Window", options: Options, entries: list[SceneEntry], first: int) -> None:
     import moderngl
 
     from pansplat_viewer.state import ViewerState
@@ -186,7 +186,7 @@ def _show(window: "Window", options: Options, entries: list[Entry], first: int) 
     def make_viewer(ctx: moderngl.Context, dpi_scale: float) -> Viewer:
         viewer = Viewer(
             ctx,
-            Loader(lambda entry, progress: load_entry(entry, load_options, progress)),
+            SceneLoader(lambda entry, progress: load_entry(entry, load_options, progress)),
             find=lambda path: find_entries(path, load_options),
             state=ViewerState(settings=options.settings),
             at=options.at or 0.0,
@@ -198,25 +198,25 @@ def _show(window: "Window", options: Options, entries: list[Entry], first: int) 
     run_window(window, make_viewer)
 
 
-def _write(options: Options, entry: Entry, folder: Path, pixels: tuple[int, int]) -> None:
-    """Predict or read one entry and write its fly-through, with progress on the terminal."""
+def _write_flythrough(options: Options, entry: SceneEntry, folder: Path, pixels: tuple[int, int]) -> None:
+    """Load one entry and write its fly-through, with progress bars."""
     from dataclasses import replace
 
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from pansplat_viewer.flythrough import Film, write_flythrough
+    from pansplat_viewer.capture import Film, write_flythrough
     from pansplat_viewer.offscreen import create_context
     from pansplat_viewer.renderer import SplatRenderer
 
     film = Film(pixels, options.seconds, options.fps, 0.5 if options.at is None else options.at)
-    ctx = create_context()  # before the long part: without OpenGL there is nothing to predict for
+    ctx = create_context()  # before the prediction, so that missing OpenGL is reported early
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f}%"))
     with Progress(*columns, TimeElapsedColumn()) as bars:
         load = bars.add_task(entry.name, total=1.0)
         loaded = load_entry(
             entry,
             options.load_options,
-            lambda what, done: bars.update(load, description=f"{entry.name}: {what}", completed=done),
+            lambda task, done: bars.update(load, description=f"{entry.name}: {task}", completed=done),
             photos=False,
         )
         bars.update(load, description=f"{entry.name}: {len(loaded.scene.gaussians):,} Gaussians", completed=1.0)
@@ -232,7 +232,7 @@ def _write(options: Options, entry: Entry, folder: Path, pixels: tuple[int, int]
                 folder,
                 film,
                 settings,
-                lambda what, done: bars.update(draw, description=f"fly-through: {what}", completed=done),
+                lambda task, done: bars.update(draw, description=f"fly-through: {task}", completed=done),
             )
         finally:
             renderer.release()

@@ -1,7 +1,9 @@
-"""The camera that a person steers: level flight, looking around, orbiting. Pure arithmetic, no window, no GL.
+"""The interactive camera (yaw, pitch, orbit), and the pinhole cameras of images and cube faces.
 
-Convention: poses are cam2world, OpenCV axes (x right, y down, z forward), metres. Yaw turns to the right,
-pitch up; both are relative to `level`, an upright frame of the scene.
+Pure functions without window or GL.
+
+Convention: poses are cam2world, OpenCV axes (x right, y down, z forward), metres. Positive yaw turns right, positive
+pitch turns up. Both are relative to `level`, an upright frame of the scene.
 """
 
 import math
@@ -10,22 +12,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from pansplat.geometry.cubemap import face_rotations
+
 MAX_PITCH_RADIANS = math.radians(89.9)
 MIN_FOV_DEGREES, MAX_FOV_DEGREES = 15.0, 130.0
-MIN_DISTANCE = 0.05  # metres from an orbit's centre
+MIN_DISTANCE = 0.05  # metres, from the orbit centre
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Where the camera is and where it looks.
+    """The interactive camera: position, viewing direction and field of view.
 
     Attributes:
         position: centre in the world, metres.
-        yaw_radians: heading, to the right of `level`'s forward axis.
-        pitch_radians: above the horizon.
+        yaw_radians: heading, to the right of the forward axis of `level`.
+        pitch_radians: angle above the horizon.
         vertical_fov_degrees: vertical field of view.
-        level: columns are the right, down and forward of a level camera with yaw and pitch 0, in world axes.
-        distance: how far ahead the centre of an orbit lies, metres.
+        level: columns are right, down and forward of a camera with yaw and pitch 0, in world axes.
+        distance: from the camera to the orbit centre ahead, metres.
     """
 
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -37,7 +41,7 @@ class Camera:
 
 
 def rotation(camera: Camera) -> Float[np.ndarray, "3 3"]:
-    """Camera axes in the world (columns right, down, forward); never rolled."""
+    """Return the camera axes in the world (columns right, down, forward), without roll."""
     cy, sy = math.cos(camera.yaw_radians), math.sin(camera.yaw_radians)
     cp, sp = math.cos(camera.pitch_radians), math.sin(camera.pitch_radians)
     yaw = np.array(((cy, 0, sy), (0, 1, 0), (-sy, 0, cy)))
@@ -46,7 +50,7 @@ def rotation(camera: Camera) -> Float[np.ndarray, "3 3"]:
 
 
 def pose(camera: Camera) -> Float[np.ndarray, "4 4"]:
-    """The camera's cam2world."""
+    """Return the camera's cam2world."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation(camera)
     matrix[:3, 3] = camera.position
@@ -54,13 +58,13 @@ def pose(camera: Camera) -> Float[np.ndarray, "4 4"]:
 
 
 def place(camera: Camera, cam2world: Float[np.ndarray, "4 4"]) -> Camera:
-    """The camera moved to a pose's place and viewing direction; a roll of the pose is dropped."""
+    """Move the camera to the position and viewing direction of a pose; the roll of the pose is dropped."""
     local = np.asarray(camera.level).T @ cam2world[:3, :3]
     right, forward = local[:, 0], local[:, 2]
     pitch = math.asin(min(max(-float(forward[1]), -1.0), 1.0))
     if math.hypot(forward[0], forward[2]) > 1e-6:
         yaw = math.atan2(forward[0], forward[2])
-    else:  # straight up or down: the image's right still tells the heading
+    else:  # straight up or down: the heading follows from the right axis
         yaw = math.atan2(-right[2], right[0])
     return replace(
         camera,
@@ -71,7 +75,7 @@ def place(camera: Camera, cam2world: Float[np.ndarray, "4 4"]) -> Camera:
 
 
 def look(camera: Camera, yaw_radians: float, pitch_radians: float) -> Camera:
-    """The camera turned in place: positive yaw to the right, positive pitch up (stops short of the poles)."""
+    """Turn the camera in place, right by yaw and up by pitch; the pitch is limited before the poles."""
     yaw = math.remainder(camera.yaw_radians + yaw_radians, 2 * math.pi)
     return replace(
         camera,
@@ -81,25 +85,25 @@ def look(camera: Camera, yaw_radians: float, pitch_radians: float) -> Camera:
 
 
 def drag_look(camera: Camera, pixels: tuple[float, float], height: int) -> Camera:
-    """Turn so that the scene sticks to a pointer that moved by `pixels` (right, down)."""
+    """Turn so that the scene follows a pointer that moved by `pixels` (right, down) in a window of this height."""
     radians_a_pixel = 2 * math.tan(math.radians(camera.vertical_fov_degrees) / 2) / max(height, 1)
     return look(camera, -pixels[0] * radians_a_pixel, pixels[1] * radians_a_pixel)
 
 
 def fly(camera: Camera, right: float, up: float, forward: float) -> Camera:
-    """The camera moved by metres along its own right and forward axes, and along the scene's up."""
+    """Move by metres along the camera's right and forward axes and along the scene's up axis."""
     axes = rotation(camera)
     step = right * axes[:, 0] + forward * axes[:, 2] - up * np.asarray(camera.level)[:, 1]
     return replace(camera, position=_triple(np.asarray(camera.position) + step))
 
 
 def orbit_center(camera: Camera) -> Float[np.ndarray, "3"]:
-    """The point that an orbit turns around, metres."""
+    """Return the orbit centre, metres."""
     return np.asarray(camera.position) + camera.distance * rotation(camera)[:, 2]
 
 
 def orbit(camera: Camera, pixels: tuple[float, float], height: int) -> Camera:
-    """Turn around the point ahead: half a turn for a drag over the window's height."""
+    """Turn around the orbit centre; a drag over the window's height is half a turn."""
     radians_a_pixel = math.pi / max(height, 1)
     center = orbit_center(camera)
     turned = look(camera, pixels[0] * radians_a_pixel, -pixels[1] * radians_a_pixel)
@@ -107,7 +111,7 @@ def orbit(camera: Camera, pixels: tuple[float, float], height: int) -> Camera:
 
 
 def dolly(camera: Camera, steps: float) -> Camera:
-    """Move towards (positive) or away from the orbit's centre by 10% of the distance a step."""
+    """Move towards (positive) or away from the orbit centre by 10% of the distance per step."""
     center = orbit_center(camera)
     distance = max(camera.distance * 0.9**steps, MIN_DISTANCE)
     position = center - distance * rotation(camera)[:, 2]
@@ -115,13 +119,13 @@ def dolly(camera: Camera, steps: float) -> Camera:
 
 
 def zoom(camera: Camera, steps: float) -> Camera:
-    """Narrow (positive) or widen the field of view by 8% a step."""
+    """Narrow (positive) or widen the field of view by 8% per step."""
     fov = min(max(camera.vertical_fov_degrees * 0.92**steps, MIN_FOV_DEGREES), MAX_FOV_DEGREES)
     return replace(camera, vertical_fov_degrees=fov)
 
 
 def focus(camera: Camera, point: Float[np.ndarray, "3"]) -> Camera:
-    """Look at a point and make it the centre of orbits; a point at the camera changes nothing."""
+    """Look at a point and make it the orbit centre; a point at the camera's position changes nothing."""
     offset = np.asarray(camera.level).T @ (np.asarray(point) - np.asarray(camera.position))
     distance = float(np.linalg.norm(offset))
     if distance < 1e-6:
@@ -135,7 +139,7 @@ def focus(camera: Camera, point: Float[np.ndarray, "3"]) -> Camera:
 
 
 def nearest_view(camera: Camera, cam2world: Float[np.ndarray, "view 4 4"]) -> int:
-    """Index of the input camera nearest to the camera's position; the first on ties."""
+    """Return the index of the input camera nearest to the camera's position; the first on ties."""
     offsets = cam2world[:, :3, 3] - np.asarray(camera.position)
     return int(np.argmin(np.linalg.norm(offsets, axis=1)))
 
@@ -146,3 +150,55 @@ def _clamp(value: float, limit: float) -> float:
 
 def _triple(vector: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
     return (float(vector[0]), float(vector[1]), float(vector[2]))
+
+
+@dataclass(frozen=True, eq=False)
+class Pinhole:
+    """A pinhole camera with square pixels and the principal point at the image centre.
+
+    Attributes:
+        rotation: camera to world, OpenCV axes.
+        position: camera centre in the splats' moved frame, metres.
+        focal: focal length, pixels.
+        width, height: pixels.
+    """
+
+    rotation: Float[np.ndarray, "3 3"]
+    position: tuple[float, float, float]
+    focal: float
+    width: int
+    height: int
+
+    @property
+    def half_size(self) -> tuple[float, float]:
+        """Half the image size in image-plane units (z = 1)."""
+        return 0.5 * self.width / self.focal, 0.5 * self.height / self.focal
+
+    def side_normals(self) -> Float[np.ndarray, "4 3"]:
+        """Return the inward unit normals, in world axes, of the view frustum's four sides."""
+        x, y = self.half_size
+        normals = np.array(((-1, 0, x), (1, 0, x), (0, -1, y), (0, 1, y)), dtype=np.float64)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        return normals @ self.rotation.T
+
+
+def cube_face_cameras(
+    orientation: Float[np.ndarray, "3 3"], position: tuple[float, float, float], face_size: int, border: int
+) -> list[Pinhole]:
+    """Return the six face cameras of a cube with axes `orientation` (to world), with `border` extra pixels a side."""
+    side = face_size + 2 * border
+    rotations = face_rotations().numpy()
+    return [Pinhole(orientation @ face, position, 0.5 * face_size, side, side) for face in rotations]
+
+
+def find_faces_in_view(camera_to_faces: Float[np.ndarray, "3 3"], half_size: tuple[float, float]) -> list[int]:
+    """Return the cube faces that a pinhole image with this half size (image-plane units) reads."""
+    x, y = (np.linspace(-half, half, 65) for half in half_size)
+    rays = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), axis=-1).reshape(-1, 3) @ camera_to_faces.T
+    faces = []
+    for face, rotation in enumerate(face_rotations().numpy()):
+        local = rays @ rotation
+        # A margin of 10% covers directions between the rays of this coarse grid.
+        if (np.abs(local[:, :2]).max(axis=1) <= 1.1 * local[:, 2]).any():
+            faces.append(face)
+    return faces

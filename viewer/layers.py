@@ -1,37 +1,59 @@
-"""Layers: the premultiplied pictures of sets of Gaussians, drawn directly or as six cube faces, and kept."""
+"""Layers: premultiplied images of sets of Gaussians, drawn directly or as six cube faces and kept between frames.
+
+`LayerPainter.paint` draws what a frame needs of a layer and is not there yet. `SplatRasterizer` draws splats with
+OpenGL: it projects Gaussians to records and rasterises the records as quads, back to front.
+"""
+
+from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from collections.abc import Hashable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from enum import IntEnum
 
+import moderngl
 import numpy as np
-from jaxtyping import Float, UInt
+from jaxtyping import Bool, Float, UInt
 
+from pansplat.constants import FILTER_VARIANCE
 from pansplat.errors import InputError
-from pansplat_viewer.draw import SplatDrawer, filter_of
-from pansplat_viewer.order import Ordering, radix_argsort
-from pansplat_viewer.pinhole import NUM_FACES, Pinhole, face_cameras, faces_in_sight, focal_of, in_sight
+from pansplat_viewer.camera import Pinhole, cube_face_cameras, find_faces_in_view
+from pansplat_viewer.programs import RECORD, RECORD_BYTES, Programs, set_uniforms
 from pansplat_viewer.settings import DrawSettings
-from pansplat_viewer.splats import Splats
-from pansplat_viewer.targets import Target, TargetStore
+from pansplat_viewer.splats import SortedSplats, Splats
 
-_LARGEST_CACHED_FACE = 2048  # pixels; six of them take 200 MB at 16 bits
+_MAX_CACHED_FACE_SIZE = 2048  # pixels; six faces take 200 MB at 16 bits
+_MAX_SELECTIONS = 8
+_CHUNK_SIZE = 1 << 20  # records that are made and drawn together; limits their memory to 100 MB
+_WORK_GROUP_SIZE = 64  # local size of project.comp
+_MAX_WORK_GROUPS = 1 << 14  # in one dimension, below the limit of every implementation
+
+
+class LayerStorage(IntEnum):
+    """How a layer is stored; the constant LAYER_STORAGE of shaders/accumulate.frag.
+
+    IMAGE is one image of the frame's size. PADDED_FACES are six cube faces with one extra pixel on each side, which
+    the texture unit can filter. FACES are six cube faces without border, interpolated in float32 by the shader.
+    """
+
+    IMAGE = 0
+    PADDED_FACES = 1
+    FACES = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
-    """One picture to take.
+class Frame:
+    """One image to draw: camera, size and settings, with everything that follows from them.
 
     Attributes:
-        splats: of what.
         rotation: camera to world.
         position: camera centre in the splats' moved frame.
         world_position: camera centre, metres.
         size: (width, height), pixels.
-        settings: how.
+        settings: how to draw.
     """
 
-    splats: Splats
     rotation: Float[np.ndarray, "3 3"]
     position: tuple[float, float, float]
     world_position: Float[np.ndarray, "3"]
@@ -39,8 +61,8 @@ class Shot:
     settings: DrawSettings
 
     @staticmethod
-    def make(splats: Splats, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> "Shot":
-        """Check the arguments of a picture."""
+    def create(splats: Splats, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> Frame:
+        """Check the arguments and return the frame."""
         if cam2world.shape != (4, 4) or not np.isfinite(cam2world).all():
             raise InputError(f"`cam2world` must be a finite 4x4 matrix, got {cam2world.tolist()}")
         width, height = (int(length) for length in size)
@@ -48,23 +70,25 @@ class Shot:
             raise InputError(f"`size` must be at least 1x1 pixel, got {width}x{height}")
         moved = cam2world[:3, 3] - splats.origin
         position = (float(moved[0]), float(moved[1]), float(moved[2]))
-        return Shot(splats, cam2world[:3, :3], position, cam2world[:3, 3], (width, height), settings)
+        return Frame(cam2world[:3, :3], position, cam2world[:3, 3], (width, height), settings)
 
     @property
-    def source(self) -> int:
-        """How shaders/gather.frag reads the layers: 0 picture, 1 faces by pinhole, 2 faces by panorama."""
+    def storage(self) -> LayerStorage:
+        """How this frame's layers are stored."""
         if self.settings.layout == "equirect":
-            return 2
-        return 1 if self.settings.cached and self.face_size <= _LARGEST_CACHED_FACE else 0
+            return LayerStorage.FACES
+        if self.settings.cached and self.face_size <= _MAX_CACHED_FACE_SIZE:
+            return LayerStorage.PADDED_FACES
+        return LayerStorage.IMAGE
 
     @property
     def focal(self) -> float:
-        """Focal length of a pinhole picture, pixels."""
-        return focal_of(self.size[1], self.settings.vertical_fov_degrees)
+        """Focal length of a pinhole image, pixels."""
+        return 0.5 * self.size[1] / math.tan(0.5 * math.radians(self.settings.vertical_fov_degrees))
 
     @property
     def face_size(self) -> int:
-        """Side of a cube face, pixels: asked for, or as fine as the picture's middle."""
+        """Side of a cube face without border, pixels."""
         if self.settings.face_size is not None:
             return self.settings.face_size
         if self.settings.layout == "equirect":
@@ -73,7 +97,7 @@ class Shot:
 
     @property
     def faces_to_world(self) -> Float[np.ndarray, "3 3"]:
-        """Axes of the cube: the panorama camera's own, or the world's when they serve every direction."""
+        """Axes of the cube: those of the panorama camera, or of the world for faces that serve every rotation."""
         return self.rotation if self.settings.layout == "equirect" else np.eye(3)
 
     @property
@@ -81,125 +105,310 @@ class Shot:
         """Rotation from the camera's axes to the cube's."""
         return self.faces_to_world.T @ self.rotation
 
+    def layer_cameras(self) -> list[Pinhole]:
+        """Return the cameras of a layer's parts: one, or one for each cube face."""
+        if self.storage == LayerStorage.IMAGE:
+            return [Pinhole(self.rotation, self.position, self.focal, *self.size)]
+        border = 1 if self.storage == LayerStorage.PADDED_FACES else 0
+        return cube_face_cameras(self.faces_to_world, self.position, self.face_size, border)
 
-@dataclass(eq=False)
-class LayerPainter:
-    """Draws the layers that a shot needs and does not find as they were left.
+    def parts_in_view(self) -> list[int]:
+        """Return the indices of the layer parts that the frame reads."""
+        if self.storage == LayerStorage.IMAGE:
+            return [0]
+        if self.storage == LayerStorage.FACES:
+            return list(range(6))
+        half_size = 0.5 * self.size[0] / self.focal, 0.5 * self.size[1] / self.focal
+        return find_faces_in_view(self.camera_to_faces, half_size)
+
+    def layer_key(self, splats: SortedSplats) -> tuple[Hashable, ...]:
+        """Return everything that a layer's content depends on, except its set of Gaussians."""
+        s = self.settings
+        key = (splats, self.position, s.kernel, s.order, s.lowpass, s.levels, s.opacity_threshold, s.near)
+        if self.storage == LayerStorage.IMAGE:
+            return (*key, self.rotation.tobytes(), self.focal)
+        return (*key, self.faces_to_world.tobytes())
+
+
+class Target:
+    """A render target: a framebuffer with an RGBA colour texture and an optional float32 texture for depth.
 
     Attributes:
-        drawer: draws splats.
-        targets: keeps layers.
-        largest_texture: GL's limit, pixels.
-        visible, drawn, painted: Gaussians left by the toggles, splats sent, and whether anything was drawn
-            for this shot.
-        in_use: names of this shot's targets.
+        key: what the content depends on; None if there is no valid content.
+        parts: the parts (cube faces; 0 if there is one part) whose content is valid.
     """
 
-    drawer: SplatDrawer
-    targets: TargetStore
-    largest_texture: int
-    visible: int = 0
-    drawn: int = 0
-    painted: bool = False
-    in_use: set[Hashable] = field(default_factory=set)
-    _shot: Shot | None = None
-    _ordering: Ordering | None = None
-    _with_depth: bool = False
-    _kept: dict[Hashable, np.ndarray] = field(default_factory=dict)
+    def __init__(
+        self, ctx: moderngl.Context, size: tuple[int, int], *, color_bits: int, depth_components: int = 0
+    ) -> None:
+        """Allocate the textures; their content is undefined."""
+        self._ctx = ctx
+        self.size = size
+        self.key: Hashable = None
+        self.parts: set[int] = set()
+        self.color = ctx.texture(size, 4, dtype=f"f{color_bits // 8}")
+        self.color.repeat_x = self.color.repeat_y = False
+        self.depth = ctx.texture(size, depth_components, dtype="f4") if depth_components else None
+        attachments = [self.color] if self.depth is None else [self.color, self.depth]
+        self.framebuffer = ctx.framebuffer(attachments)
+        self.num_bytes = size[0] * size[1] * (color_bits // 2 + 4 * depth_components)
 
-    @property
-    def with_depth(self) -> bool:
-        """Whether layers carry depth."""
-        return self._with_depth
+    def invalidate(self, key: Hashable) -> None:
+        """Mark the content as invalid; `key` describes what is drawn next."""
+        self.key = key
+        self.parts.clear()
 
-    def start(self, shot: Shot, ordering: Ordering, *, with_depth: bool) -> None:
-        """Begin a shot."""
-        self._shot, self._ordering, self._with_depth = shot, ordering, with_depth
-        self.visible = self.drawn = 0
-        self.painted = False
-        self.in_use = set()
+    def release(self) -> None:
+        """Free the textures."""
+        if self._ctx.fbo is self.framebuffer:
+            # When moderngl makes a framebuffer it binds the previous one again, which must then still exist.
+            (self._ctx.screen or self._ctx.detect_framebuffer(0)).use()
+        self.framebuffer.release()
+        self.color.release()
+        if self.depth is not None:
+            self.depth.release()
 
-    def layer(self, view: int | None) -> Target:
-        """The layer of one view's Gaussians, or of all (None), with everything the shot looks up drawn."""
-        shot = self._shot
-        assert shot is not None
-        keep = self._keep(view)
-        self.visible += int(np.count_nonzero(keep))
-        name = ("picture", "turning faces", "panorama faces")[shot.source], view
-        self.in_use.add(name)
-        if shot.source == 0:
-            size, key = shot.size, (*self._key(), shot.rotation.tobytes(), shot.focal)
-            cameras, needed = [Pinhole(shot.rotation, shot.position, shot.focal, *size)], [0]
-        else:
-            # Faces for turning are read by the texture unit, which needs the pixels beyond their edges.
-            border = 1 if shot.source == 1 else 0
-            cameras = face_cameras(shot.faces_to_world, shot.position, shot.face_size, border)
-            needed = self._faces()
-            size = 3 * cameras[0].width, 2 * cameras[0].height
-            key = (*self._key(), shot.faces_to_world.tobytes())
-        target = self.targets.get(name, self._checked(size), depth_components=int(self._with_depth), key=key)
-        for part in needed:
-            if part not in target.parts:
-                width, height = cameras[part].width, cameras[part].height
-                self._paint(target, cameras[part], keep, (part % 3 * width, part // 3 * height, width, height))
-                target.parts.add(part)
+
+class TargetStore:
+    """Render targets by name, reused while size and depth match; least recently used ones are freed over a budget."""
+
+    def __init__(self, ctx: moderngl.Context, *, color_bits: int, budget_bytes: int = 1 << 30) -> None:
+        """Create an empty store."""
+        self._ctx = ctx
+        self._max_size = ctx.info["GL_MAX_TEXTURE_SIZE"]
+        self.color_bits = color_bits
+        self._budget = budget_bytes
+        self._targets: OrderedDict[Hashable, Target] = OrderedDict()
+        self._in_use: set[Hashable] = set()
+
+    def get(self, name: Hashable, size: tuple[int, int], *, depth_components: int = 0, key: Hashable = None) -> Target:
+        """Return the target of this name and size, with content of the same `key` or without valid content.
+
+        A target with valid content keeps its depth texture even if the call does not need it.
+
+        Raises:
+            InputError: the size exceeds the GPU's limit.
+        """
+        if max(size) > self._max_size:
+            raise InputError(
+                f"the image needs a texture of {size[0]}x{size[1]} pixels, this GPU's limit is {self._max_size}; "
+                "use a smaller size or face_size"
+            )
+        target = self._targets.get(name)
+        if target is not None:
+            components = 0 if target.depth is None else target.depth.components
+            valid = key is not None and target.key == key
+            if target.size != size or components < depth_components or (components > depth_components and not valid):
+                target.release()
+                target = None
+        if target is None:
+            target = Target(self._ctx, size, color_bits=self.color_bits, depth_components=depth_components)
+            self._targets[name] = target
+        if key is None or target.key != key:
+            target.invalidate(key)
+        self._targets.move_to_end(name)
+        self._in_use.add(name)
         return target
 
-    def _faces(self) -> list[int]:
-        shot = self._shot
-        assert shot is not None
-        if shot.source == 2:
-            return list(range(NUM_FACES))
-        half = 0.5 * shot.size[0] / shot.focal, 0.5 * shot.size[1] / shot.focal
-        return faces_in_sight(shot.camera_to_faces, half)
+    def trim(self) -> None:
+        """Free least recently used targets over the budget, except those returned since the last call."""
+        total = sum(target.num_bytes for target in self._targets.values())
+        for name in [name for name in self._targets if name not in self._in_use]:
+            if total <= self._budget:
+                break
+            target = self._targets.pop(name)
+            total -= target.num_bytes
+            target.release()
+        self._in_use.clear()
 
-    def _key(self) -> tuple[Hashable, ...]:
-        """What changes a layer, except its camera."""
-        shot, ordering = self._shot, self._ordering
-        assert shot is not None and ordering is not None
-        s = shot.settings
-        return (ordering, shot.position, s.kernel, s.order, s.lowpass, s.levels, s.opacity_threshold, s.near)
+    def invalidate(self) -> None:
+        """Mark the content of all targets as invalid."""
+        for target in self._targets.values():
+            target.invalidate(None)
 
-    def _keep(self, view: int | None) -> np.ndarray:
-        shot = self._shot
-        assert shot is not None
-        key = (shot.splats, shot.settings.levels, shot.settings.opacity_threshold, view)
-        if key not in self._kept:
-            if len(self._kept) > 8:
-                self._kept.clear()
-            self._kept[key] = shot.splats.kept(shot.settings.levels, shot.settings.opacity_threshold, view)
-        return self._kept[key]
+    def release(self) -> None:
+        """Free all targets."""
+        for target in self._targets.values():
+            target.release()
+        self._targets.clear()
 
-    def _paint(self, target: Target, camera: Pinhole, keep: np.ndarray, viewport: tuple[int, int, int, int]) -> None:
-        shot = self._shot
-        assert shot is not None
-        indices = self._back_to_front(camera, keep)
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """The premultiplied image of one set of Gaussians, and what drawing it for this frame took.
+
+    Attributes:
+        target: the textures.
+        visible: number of Gaussians in the set.
+        drawn: number of splats drawn for this frame.
+        cached: whether nothing had to be drawn.
+    """
+
+    target: Target
+    visible: int
+    drawn: int
+    cached: bool
+
+
+class LayerPainter:
+    """Draws the layers of one scene and keeps them in a target store."""
+
+    def __init__(self, ctx: moderngl.Context, programs: Programs, targets: TargetStore, splats: Splats, tier: str):
+        """Upload the splats."""
+        self._targets = targets
+        self._splats = splats
+        self._selections: dict[Hashable, Bool[np.ndarray, "n"]] = {}
+        self.rasterizer = SplatRasterizer(ctx, programs, splats, tier)
+
+    def paint(self, frame: Frame, splats: SortedSplats, view: int | None, *, with_depth: bool) -> Layer:
+        """Return the layer of one view's Gaussians, or of all (None); draws the parts in view that are not valid."""
+        selected = self._select(frame.settings, view)
+        cameras = frame.layer_cameras()
+        width, height = cameras[0].width, cameras[0].height
+        size = (width, height) if frame.storage == LayerStorage.IMAGE else (3 * width, 2 * height)
+        target = self._targets.get(
+            (frame.storage, view), size, depth_components=int(with_depth), key=frame.layer_key(splats)
+        )
+        missing = [part for part in frame.parts_in_view() if part not in target.parts]
+        drawn = 0
+        for part in missing:
+            viewport = (part % 3 * width, part // 3 * height, width, height)
+            drawn += self._paint_part(target, cameras[part], viewport, splats, selected, frame.settings)
+            target.parts.add(part)
+        return Layer(target, int(np.count_nonzero(selected)), drawn, cached=not missing)
+
+    def release(self) -> None:
+        """Free the splats on the GPU."""
+        self.rasterizer.release()
+
+    def _paint_part(
+        self,
+        target: Target,
+        camera: Pinhole,
+        viewport: tuple[int, int, int, int],
+        splats: SortedSplats,
+        selected: Bool[np.ndarray, "n"],
+        settings: DrawSettings,
+    ) -> int:
+        variance, _ = lowpass_variances(settings, camera.focal)
+        seen = splats.cull(camera, selected, kernel=settings.kernel, filter_variance=variance)
+        indices = splats.sort_back_to_front(camera, seen, settings.order)
         framebuffer = target.framebuffer
         framebuffer.use()
         framebuffer.viewport = framebuffer.scissor = viewport
         framebuffer.clear(0.0, 0.0, 0.0, 0.0)
-        self.drawer.draw(camera, indices, shot.settings, viewport)
+        self.rasterizer.draw(camera, indices, settings, viewport)
         framebuffer.scissor = None
-        self.drawn += len(indices)
-        self.painted = True
+        return len(indices)
 
-    def _back_to_front(self, camera: Pinhole, keep: np.ndarray) -> UInt[np.ndarray, "m"]:
-        shot, ordering = self._shot, self._ordering
-        assert shot is not None and ordering is not None
-        variance, _ = filter_of(shot.settings, camera.focal)
-        seen = in_sight(camera, ordering, keep, kernel=shot.settings.kernel, filter_variance=variance)
-        if shot.settings.order == "radial":
-            return ordering.order[seen[ordering.order]][::-1]
-        indices = np.flatnonzero(seen).astype(np.uint32)
-        forward = camera.rotation[:, 2]
-        depth = shot.splats.means[indices] @ forward.astype(np.float32)
-        depth -= np.float32(forward @ np.asarray(camera.position))
-        return indices[radix_argsort(depth)][::-1]
+    def _select(self, settings: DrawSettings, view: int | None) -> Bool[np.ndarray, "n"]:
+        key = (settings.levels, settings.opacity_threshold, view)
+        if key not in self._selections:
+            if len(self._selections) > _MAX_SELECTIONS:
+                self._selections.clear()
+            self._selections[key] = self._splats.select(*key)
+        return self._selections[key]
 
-    def _checked(self, size: tuple[int, int]) -> tuple[int, int]:
-        if max(size) > self.largest_texture:
-            raise InputError(
-                f"the picture needs a texture of {size[0]}x{size[1]} pixels, this GPU's limit is "
-                f"{self.largest_texture}; use a smaller size or face_size"
+
+def lowpass_variances(settings: DrawSettings, focal: float) -> tuple[float, float]:
+    """Return (e^2, dilation) of docs/rendering.md, section 2, in image-plane units squared."""
+    pixel = 1.0 / (focal * focal)
+    variance = FILTER_VARIANCE[settings.lowpass] * pixel
+    return (0.0, variance) if (settings.lowpass, settings.kernel) == ("3dgs", "ewa") else (variance, 0.0)
+
+
+class SplatRasterizer:
+    """Draws the splats of one scene with OpenGL; the tier only decides how records are made."""
+
+    def __init__(self, ctx: moderngl.Context, programs: Programs, splats: Splats, tier: str) -> None:
+        """Upload the geometry and constant colours, and allocate buffers for indices and records."""
+        self._ctx = ctx
+        self._programs = programs
+        self._tier = tier
+        self._geometry = ctx.buffer(splats.geometry) if len(splats) else ctx.buffer(reserve=48)
+        self._colors = ctx.buffer(reserve=max(16 * len(splats), 16), dynamic=True)
+        if splats.base_colors is not None:
+            self.write_colors(splats.base_colors)
+        self._capacity = max(min(_CHUNK_SIZE, len(splats)), 1)
+        self._indices = ctx.buffer(reserve=4 * self._capacity, dynamic=True)
+        self._records = ctx.buffer(reserve=RECORD_BYTES * self._capacity, dynamic=True)
+        layout = " ".join(["4f"] * len(RECORD)) + " /i"
+        self._quads = ctx.vertex_array(programs.splat(), [(self._records, layout, *RECORD)])
+        self._points: moderngl.VertexArray | None = None
+        if tier == "gl33":
+            self._points = ctx.vertex_array(
+                programs.project(),
+                [
+                    (self._geometry, "4f 4f 4f", "in_mean_opacity", "in_quat", "in_scale"),
+                    (self._colors, "4f", "in_color"),
+                ],
+                index_buffer=self._indices,
+                index_element_size=4,
+                mode=moderngl.POINTS,
             )
-        return size
+
+    def write_colors(self, colors: Float[np.ndarray, "n 4"]) -> None:
+        """Replace the colours."""
+        if len(colors):
+            self._colors.write(colors)
+
+    def draw(
+        self,
+        camera: Pinhole,
+        back_to_front: UInt[np.ndarray, "n"],
+        settings: DrawSettings,
+        viewport: tuple[int, int, int, int],
+    ) -> None:
+        """Blend the splats with these indices into `viewport` of the bound framebuffer."""
+        self._set_uniforms(camera, settings, viewport)
+        self._ctx.enable_only(moderngl.BLEND)
+        self._ctx.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
+        for start in range(0, len(back_to_front), self._capacity):
+            indices = np.ascontiguousarray(back_to_front[start : start + self._capacity], dtype=np.uint32)
+            self._indices.write(indices)
+            self._project(len(indices))
+            self._quads.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=len(indices))
+        self._ctx.enable_only(moderngl.NOTHING)
+
+    def release(self) -> None:
+        """Free the buffers and vertex arrays."""
+        for resource in (self._quads, self._points, self._geometry, self._colors, self._indices, self._records):
+            if resource is not None:
+                resource.release()
+
+    def _project(self, count: int) -> None:
+        """Write the records of the first `count` indices."""
+        if self._points is not None:
+            self._points.transform(self._records, moderngl.POINTS, vertices=count)
+            return
+        program = self._programs.project_compute()
+        set_uniforms(program, count=count)
+        for binding, buffer in enumerate((self._geometry, self._colors, self._indices, self._records)):
+            buffer.bind_to_storage_buffer(binding)
+        groups = -(-count // _WORK_GROUP_SIZE)
+        program.run(min(groups, _MAX_WORK_GROUPS), -(-groups // _MAX_WORK_GROUPS))
+        self._ctx.memory_barrier()
+
+    def _set_uniforms(self, camera: Pinhole, settings: DrawSettings, viewport: tuple[int, int, int, int]) -> None:
+        variance, dilation = lowpass_variances(settings, camera.focal)
+        project = self._programs.project() if self._tier == "gl33" else self._programs.project_compute()
+        set_uniforms(
+            project,
+            # GLSL reads columns: the rows of camera-to-world are the columns of its inverse.
+            world_to_camera=np.ascontiguousarray(camera.rotation, dtype=np.float32).tobytes(),
+            position=camera.position,
+            near=settings.near,
+            kernel=int(settings.kernel == "ewa"),
+            filter_variance=variance,
+            compensate=settings.lowpass == "angular",
+            dilation=dilation,
+            half_size=camera.half_size,
+            margin=0.02 / camera.focal,
+        )
+        x, y, width, height = viewport
+        set_uniforms(
+            self._programs.splat(),
+            half_size=camera.half_size,
+            principal=(x + 0.5 * width, y + 0.5 * height),
+            focal=camera.focal,
+        )

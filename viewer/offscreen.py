@@ -1,7 +1,8 @@
-"""An OpenGL context without a window: EGL, or OSMesa where EGL is missing."""
+"""OpenGL contexts without a window: EGL, or OSMesa where EGL is missing."""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import ctypes.util
 from typing import Any, Literal
@@ -9,7 +10,6 @@ from typing import Any, Literal
 import moderngl
 
 from pansplat.errors import InputError
-from pansplat_viewer.llvm import load_before_mesa
 
 _EGL_PACKAGES = "libegl1 libgl1-mesa-dri libgl1"
 _OSMESA_PACKAGE = "libosmesa6"
@@ -22,23 +22,23 @@ _GL_RGBA, _GL_UNSIGNED_BYTE = 0x1908, 0x1401
 
 
 def create_context(backend: Literal["auto", "egl", "osmesa"] = "auto") -> moderngl.Context:
-    """A standalone context of at least OpenGL 3.3.
+    """Return a standalone context of OpenGL 3.3 or later.
 
     Args:
         backend: `auto` tries EGL (GPU or software), then OSMesa (software only).
 
     Raises:
-        InputError: no OpenGL 3.3 is there; the message says what failed and names the Debian packages.
+        InputError: OpenGL 3.3 is not available; the message has the reasons and the Debian packages.
     """
     makers = {"egl": _create_egl, "osmesa": _create_osmesa}
     if backend != "auto" and backend not in makers:
         raise InputError(f"`backend` must be auto, egl or osmesa, got {backend!r}")
-    load_before_mesa()
+    load_llvm_before_mesa()
     failures = []
     for name in makers if backend == "auto" else (backend,):
         try:
             return makers[name]()
-        # The libraries report failure in many ways: OSError, ValueError, moderngl.Error, plain Exception.
+        # The libraries raise OSError, ValueError, moderngl.Error or plain Exception.
         except Exception as error:
             failures.append(f"{name}: {error}")
     raise InputError(
@@ -46,6 +46,16 @@ def create_context(backend: Literal["auto", "egl", "osmesa"] = "auto") -> modern
         f"({'; '.join(failures)}); on Debian or Ubuntu install `apt-get install {_EGL_PACKAGES}`, "
         f"or for software rendering without EGL `{_OSMESA_PACKAGE}`"
     )
+
+
+def load_llvm_before_mesa() -> None:
+    """Import Triton if it is installed; call this before the first OpenGL context is created.
+
+    Torch imports Triton at some point, and Mesa's software drivers link to another LLVM. If Mesa's LLVM is loaded
+    first, loading Triton's ends the process with a segmentation fault.
+    """
+    with contextlib.suppress(ImportError):
+        import triton  # noqa: F401
 
 
 def _create_egl() -> moderngl.Context:
@@ -57,7 +67,7 @@ def _create_osmesa() -> moderngl.Context:
 
 
 class _OsMesa:
-    """An OSMesa context as moderngl expects one: it is entered, left, released and asked for functions."""
+    """An OSMesa context with the interface that moderngl expects."""
 
     def __init__(self) -> None:
         library = _load_osmesa()
@@ -74,12 +84,12 @@ class _OsMesa:
         self._context = library.OSMesaCreateContextAttribs((ctypes.c_int * len(attributes))(*attributes), None)
         if not self._context:
             raise OSError("OSMesaCreateContextAttribs made no OpenGL 3.3 context")
-        # OSMesa draws into memory of ours; all that matters goes to framebuffer objects, so 1x1 will do.
+        # OSMesa needs a default framebuffer; 1x1 suffices because the viewer draws into framebuffer objects.
         self._pixel = (ctypes.c_ubyte * 4)()
         self.__enter__()
 
     def load_opengl_function(self, name: str) -> int:
-        """Address of a GL function, 0 when there is none."""
+        """Return the address of a GL function, 0 if it does not exist."""
         return self._library.OSMesaGetProcAddress(name.encode()) or 0
 
     load = load_opengl_function
@@ -90,7 +100,7 @@ class _OsMesa:
             raise OSError("OSMesaMakeCurrent failed")
 
     def __exit__(self, *_: object) -> None:
-        """The context stays current: there is no other one to go back to."""
+        """Keep the context current; there is no previous context to restore."""
 
     def release(self) -> None:
         """Destroy the context."""

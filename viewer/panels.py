@@ -1,18 +1,22 @@
-"""The panels over the picture: what is shown, how, and from where. They change the state, nothing else."""
+"""imgui on an OpenGL context, and the panels over the image: scene, settings, camera, photograph and screenshots."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from importlib import resources
 from typing import Any, get_args
 
+import imgui_bundle
+import moderngl
 from imgui_bundle import imgui
 
 from pansplat_viewer import camera as cameras
-from pansplat_viewer.controls import HELP
+from pansplat_viewer.input import HELP, Commands
 from pansplat_viewer.settings import FrameStats, Kernel, Lowpass, Order
-from pansplat_viewer.state import ViewerState, fly_to, jump, toggle_play
+from pansplat_viewer.state import ViewerState, fly_to, jump_to_view, toggle_play
 
 Rectangle = tuple[float, float, float, float]  # left, top, right, bottom, pixels
 
+_FONT_PIXELS = 16.0
 _PANEL_WIDTH = 290.0
 _MARGIN = 10.0
 _FIXED = (
@@ -29,16 +33,16 @@ _LABEL = (
 
 
 @dataclass
-class Facts:
-    """What the panels show but do not change.
+class PanelData:
+    """What the panels show and do not change.
 
     Attributes:
-        entries: names to choose from; `current` is the index of the one shown.
-        stats: of the last picture; `frame_ms` is a whole frame's time, smoothed.
-        size: of the picture that is drawn, pixels; smaller than the window while moving.
-        photo_name: of the nearest input photograph; None when there is none to compare with.
-        loading: name, what is being done, fraction done.
-        error: why the last thing could not be shown.
+        entries: names of the scenes to choose from; `current` is the index of the scene that is shown.
+        stats: of the last image; `frame_ms` is the time of a whole frame, smoothed.
+        size: of the rendered image, pixels; smaller than the window while the camera moves.
+        photo_name: of the nearest input photograph; None if the scene has none.
+        loading: name, what is being done, fraction done; None if nothing is loading.
+        error: message of the last failure.
     """
 
     entries: list[str] = field(default_factory=list)
@@ -47,28 +51,70 @@ class Facts:
     frame_ms: float = 0.0
     size: tuple[int, int] = (0, 0)
     photo_name: str | None = None
-    view_names: tuple[str, ...] = ()
     loading: tuple[str, str, float] | None = None
     error: str | None = None
 
 
-@dataclass
-class Requests:
-    """What a person asked for through the panels in one frame."""
+class Gui:
+    """An imgui context that imgui's OpenGL 3 backend draws.
 
-    choose: int | None = None
-    open: str | None = None
-    png: bool = False
-    exr: bool = False
-    panorama: bool = False
-    dismiss_error: bool = False
+    Create it while the OpenGL context is current. A thread can have one at a time.
+    """
+
+    def __init__(self, dpi_scale: float = 1.0) -> None:
+        """Create the context; `dpi_scale` enlarges text and widgets on high-resolution screens."""
+        self._context = imgui.create_context()
+        imgui.set_current_context(self._context)
+        io = imgui.get_io()
+        io.set_ini_filename("")  # write no imgui.ini into the current folder
+        io.config_flags |= imgui.ConfigFlags_.no_mouse_cursor_change.value
+        io.config_windows_move_from_title_bar_only = True
+        imgui.style_colors_dark()
+        style = imgui.get_style()
+        style.window_rounding = style.frame_rounding = style.grab_rounding = 4.0
+        style.frame_padding = imgui.ImVec2(6, 2)
+        style.item_spacing = imgui.ImVec2(6, 4)
+        style.window_padding = imgui.ImVec2(8, 6)
+        style.window_border_size = 0.0
+        style.set_color_(imgui.Col_.window_bg.value, (0.08, 0.09, 0.1, 0.88))
+        style.set_color_(imgui.Col_.frame_bg.value, (0.26, 0.29, 0.33, 0.9))
+        style.scale_all_sizes(dpi_scale)
+        style.font_scale_dpi = dpi_scale
+        font = resources.files(imgui_bundle) / "assets/fonts/Roboto/Roboto-Regular.ttf"
+        if font.is_file():
+            io.fonts.add_font_from_file_ttf(str(font), _FONT_PIXELS)
+        imgui.backends.opengl3_init("#version 330")
+
+    def begin(self, seconds: float, new_frame: Callable[[], None] | None) -> None:
+        """Start a frame; `new_frame` starts the frame of the window's backend."""
+        imgui.set_current_context(self._context)
+        imgui.backends.opengl3_new_frame()
+        if new_frame is not None:
+            new_frame()
+        imgui.get_io().delta_time = max(seconds, 1e-4)
+        imgui.new_frame()
+
+    def end(self, ctx: moderngl.Context, target: moderngl.Framebuffer) -> None:
+        """Draw the frame's widgets over the content of `target`."""
+        imgui.render()
+        target.use()
+        imgui.backends.opengl3_render_draw_data(imgui.get_draw_data())
+        # The backend changes OpenGL state that moderngl does not track.
+        ctx.scissor = None
+        ctx.disable(moderngl.BLEND | moderngl.CULL_FACE | moderngl.DEPTH_TEST)
+
+    def close(self) -> None:
+        """Free the backend's GL objects and the imgui context."""
+        imgui.set_current_context(self._context)
+        imgui.backends.opengl3_shutdown()
+        imgui.destroy_context(self._context)
 
 
 class Panels:
-    """Draws the panels of one window.
+    """Draws the panels and applies what is changed in them to the state.
 
     Attributes:
-        items: where each widget of the last frame was, by its label; for tests that click.
+        items: rectangle of each widget of the last frame, by its label; for tests that click.
         path: text of the path field.
     """
 
@@ -76,24 +122,24 @@ class Panels:
         self.items: dict[str, Rectangle] = {}
         self.path = ""
 
-    def draw(self, state: ViewerState, facts: Facts, now: float) -> Requests:
-        """Draw everything that is on, at time `now` (seconds)."""
+    def draw(self, state: ViewerState, data: PanelData, now: float) -> Commands:
+        """Draw the panels that are shown at time `now` (seconds); returns the commands given through them."""
         self.items.clear()
-        requests = Requests()
+        commands = Commands()
         if state.overlay:
-            self._panel(state, facts, requests)
-            self._stats(state, facts)
-        if state.photo and facts.photo_name is not None and 0 < state.split < 1:
+            self._panel(state, data, commands)
+            self._stats(state, data)
+        if state.photo and data.photo_name is not None and 0 < state.split < 1:
             _split_line(state.split)
         if state.help:
             self._help(state)
-        if facts.loading:
-            _progress(*facts.loading)
-        elif facts.error:
-            self._error(facts.error, requests)
+        if data.loading:
+            _progress(*data.loading)
+        elif data.error:
+            self._error(data.error, commands)
         if state.message and now < state.message_until:
             _message(state.message)
-        return requests
+        return commands
 
     def _mark(self, label: str) -> None:
         low, high = imgui.get_item_rect_min(), imgui.get_item_rect_max()
@@ -118,7 +164,7 @@ class Panels:
         clamp = imgui.SliderFlags_.always_clamp.value
         changed, chosen = imgui.slider_float(label, value, low, high, form, clamp)
         self._mark(label)
-        return chosen if changed else value  # untouched, imgui's float32 must not creep into the state
+        return chosen if changed else value  # the returned value is rounded to float32
 
     def _section(self, label: str, draw: Callable[[], Any]) -> None:
         opened = imgui.collapsing_header(label, imgui.TreeNodeFlags_.default_open.value)
@@ -128,7 +174,7 @@ class Panels:
             draw()
             imgui.pop_id()
 
-    def _panel(self, state: ViewerState, facts: Facts, requests: Requests) -> None:
+    def _panel(self, state: ViewerState, data: PanelData, commands: Commands) -> None:
         scale = imgui.get_style().font_scale_dpi
         height = imgui.get_io().display_size.y
         imgui.set_next_window_pos((_MARGIN, _MARGIN))
@@ -139,23 +185,23 @@ class Panels:
         opened, _ = imgui.begin("pansplat", None, flags)
         if opened:
             imgui.push_item_width(-110 * scale)
-            self._section("Scene", lambda: self._scene(facts, requests))
+            self._section("Scene", lambda: self._scene(data, commands))
             self._section("Gaussians", lambda: self._gaussians(state))
             self._section("Drawing", lambda: self._drawing(state))
             self._section("Camera", lambda: self._camera(state))
-            self._section("Photograph", lambda: self._photograph(state, facts))
-            self._section("Screenshot", lambda: self._screenshot(requests))
+            self._section("Photograph", lambda: self._photograph(state, data))
+            self._section("Screenshot", lambda: self._screenshot(commands))
             imgui.pop_item_width()
         imgui.end()
 
-    def _scene(self, facts: Facts, requests: Requests) -> None:
-        if facts.entries:
-            names = [f"{i + 1}. {name}" for i, name in enumerate(facts.entries)]  # names may repeat
+    def _scene(self, data: PanelData, commands: Commands) -> None:
+        if data.entries:
+            names = [f"{i + 1}. {name}" for i, name in enumerate(data.entries)]  # numbered, because names may repeat
             imgui.set_next_item_width(-1)
-            changed, index = imgui.combo("##pair", max(facts.current, 0), names)
+            changed, index = imgui.combo("##pair", max(data.current, 0), names)
             self._mark("pair")
             if changed:
-                requests.choose = index
+                commands.choose = index
         imgui.set_next_item_width(-60 * imgui.get_style().font_scale_dpi)
         entered, self.path = imgui.input_text_with_hint(
             "##path", "folder or .ply, or drop it here", self.path,
@@ -164,7 +210,7 @@ class Panels:
         self._mark("path")
         imgui.same_line()
         if (self._button("Open") or entered) and self.path.strip():
-            requests.open = self.path.strip()
+            commands.open = self.path.strip()
 
     def _gaussians(self, state: ViewerState) -> None:
         settings = state.settings
@@ -234,9 +280,9 @@ class Panels:
             state.playing, state.camera = False, state.home
         fov = state.camera.vertical_fov_degrees
         low, high = cameras.MIN_FOV_DEGREES, cameras.MAX_FOV_DEGREES
-        wanted = self._slider("field of view", fov, low, high, "%.0f deg")
-        if wanted != fov:
-            state.camera = replace(state.camera, vertical_fov_degrees=wanted)
+        chosen = self._slider("field of view", fov, low, high, "%.0f deg")
+        if chosen != fov:
+            state.camera = replace(state.camera, vertical_fov_degrees=chosen)
         state.speed = self._slider("speed", state.speed, 0.1, 10.0, "%.1f m/s")
         if not len(state.context):
             return
@@ -244,48 +290,48 @@ class Panels:
             if view:
                 imgui.same_line()
             if self._button(f"Panorama {view + 1}"):
-                jump(state, view)
+                jump_to_view(state, view)
         if self._button("Stop" if state.playing else "Fly"):
             toggle_play(state)
         imgui.same_line()
         imgui.set_next_item_width(-1)
-        at = self._slider("##flight", state.flight, 0.0, 1.0, "%.2f of the way")
-        if at != state.flight:
+        flight = self._slider("##flight", state.flight, 0.0, 1.0, "%.2f of the way")
+        if flight != state.flight:
             state.playing = False
-            fly_to(state, at)
+            fly_to(state, flight)
 
-    def _photograph(self, state: ViewerState, facts: Facts) -> None:
-        if facts.photo_name is None:
-            imgui.text_disabled("none beside this scene")
+    def _photograph(self, state: ViewerState, data: PanelData) -> None:
+        if data.photo_name is None:
+            imgui.text_disabled("this scene has no photographs")
             return
         state.photo = self._check("nearest photograph", state.photo)
         state.split = self._slider("split", state.split, 0.0, 1.0, "%.2f")
 
-    def _screenshot(self, requests: Requests) -> None:
-        requests.png = self._button("PNG")
+    def _screenshot(self, commands: Commands) -> None:
+        commands.png = self._button("PNG")
         imgui.same_line()
-        requests.exr = self._button("EXR + depth")
+        commands.exr = self._button("EXR + depth")
         imgui.same_line()
-        requests.panorama = self._button("360 PNG")
+        commands.panorama = self._button("360 PNG")
 
-    def _stats(self, state: ViewerState, facts: Facts) -> None:
+    def _stats(self, state: ViewerState, data: PanelData) -> None:
         size, scale = imgui.get_io().display_size, imgui.get_style().font_scale_dpi
         if size.x > 2.2 * _PANEL_WIDTH * scale:
             imgui.set_next_window_pos((size.x - _MARGIN, _MARGIN), 0, (1.0, 0.0))
-        else:  # no room beside the panel
+        else:  # too narrow for both: bottom right
             imgui.set_next_window_pos((size.x - _MARGIN, size.y - _MARGIN), 0, (1.0, 1.0))
         imgui.set_next_window_bg_alpha(0.6)
         imgui.begin("##stats", None, _LABEL)
-        stats = facts.stats
+        stats = data.stats
         x, y, z = state.camera.position
         lines = [
-            f"frame {facts.frame_ms:.1f} ms   draw {stats.frame_ms:.1f} ms   sort {stats.sort_ms:.0f} ms",
+            f"frame {data.frame_ms:.1f} ms   draw {stats.frame_ms:.1f} ms   sort {stats.sort_ms:.0f} ms",
             f"{stats.drawn:,} drawn of {stats.visible:,} of {stats.total:,}",
-            f"{facts.size[0]} x {facts.size[1]}   {stats.tier}" + ("   cached" if stats.cached else ""),
+            f"{data.size[0]} x {data.size[1]}   {stats.tier}" + ("   cached" if stats.cached else ""),
             f"x {x:.2f}  y {y:.2f}  z {z:.2f} m",
         ]
-        if state.photo and facts.photo_name is not None:
-            lines.append(f"right: {facts.photo_name}" if state.split > 0 else facts.photo_name)
+        if state.photo and data.photo_name is not None:
+            lines.append(f"right: {data.photo_name}" if state.split > 0 else data.photo_name)
         for line in lines:
             imgui.text_unformatted(line)
         imgui.end()
@@ -306,16 +352,16 @@ class Panels:
         imgui.end()
         state.help = bool(opened)
 
-    def _error(self, error: str, requests: Requests) -> None:
+    def _error(self, error: str, commands: Commands) -> None:
         size = imgui.get_io().display_size
         width = min(560 * imgui.get_style().font_scale_dpi, size.x - 2 * _MARGIN)
         imgui.set_next_window_pos((size.x / 2, size.y / 2), 0, (0.5, 0.5))
         imgui.set_next_window_size((width, 0))
-        imgui.begin("This cannot be shown", None, _FIXED | imgui.WindowFlags_.no_collapse.value)
+        imgui.begin("Error", None, _FIXED | imgui.WindowFlags_.no_collapse.value)
         imgui.push_text_wrap_pos(0.0)
         imgui.text_unformatted(error)
         imgui.pop_text_wrap_pos()
-        requests.dismiss_error = self._button("OK")
+        commands.dismiss_error = self._button("OK")
         imgui.end()
 
 

@@ -1,31 +1,51 @@
-"""GLSL programs: sources read from the package, includes resolved, compiled when first used."""
+"""GLSL programs: sources are read from the package, includes resolved, and programs compiled at first use."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from importlib import resources
 from typing import Any
 
 import moderngl
 
 from pansplat import constants
+from pansplat.errors import InputError
 
 _INCLUDE = re.compile(r'^#include "([^"]+)"$', re.MULTILINE)
 
-_SHARED = ("ALPHA_CUT", "MAX_ALPHA", "EWA_NEAR_FACTOR", "EWA_CLAMP")
+# Numbers of pansplat.constants that the shaders read.
+_SHARED_CONSTANTS = ("ALPHA_CUT", "MAX_ALPHA", "EWA_NEAR_FACTOR", "EWA_CLAMP")
 
-# The members of one record, in the order of shaders/project.vert and project.comp.
-RECORD = ("quad_1", "quad_2", "response_a", "response_b", "response_l", "color")
+# Members of a record, in the order of shaders/project.vert and project.comp.
+RECORD = ("quad_1", "quad_2", "row_a", "row_b", "row_l", "color")
 RECORD_BYTES = 16 * len(RECORD)
 
 
+def choose_tier(ctx: moderngl.Context, tier: str) -> str:
+    """Return `gl43` if the context has compute shaders and `tier` allows it, else `gl33`.
+
+    Raises:
+        InputError: `tier` is unknown, or `gl43` on a context without compute shaders.
+    """
+    if tier not in ("auto", "gl33", "gl43"):
+        raise InputError(f"`tier` must be auto, gl33 or gl43, got {tier!r}")
+    has_compute = ctx.version_code >= 430
+    if tier == "gl43" and not has_compute:
+        version = f"{ctx.version_code // 100}.{ctx.version_code // 10 % 10}"
+        raise InputError(f"tier gl43 needs OpenGL 4.3, this context has {version}; use tier gl33 or auto")
+    return "gl43" if has_compute and tier != "gl33" else "gl33"
+
+
 def source(name: str, version: int, **defines: float) -> str:
-    """A shader file's text with its includes, constants and `#version` line for GL `version` (330 or 430).
+    """Return a shader's text with its includes and the `#version` line for GL `version` (330 or 430).
 
     Args:
-        defines: further constants, beside those of `pansplat.constants` that shaders share.
+        name: file in shaders/.
+        version: of the `#version` line.
+        defines: constants in addition to those that all renderers share.
     """
-    defines = {key: getattr(constants, key) for key in _SHARED} | defines
+    defines = {key: getattr(constants, key) for key in _SHARED_CONSTANTS} | defines
     folder = resources.files("pansplat_viewer.shaders")
     text = _INCLUDE.sub(lambda match: (folder / match[1]).read_text("utf-8"), (folder / name).read_text("utf-8"))
     lines = "".join(f"#define {key} {value}\n" for key, value in defines.items())
@@ -33,7 +53,7 @@ def source(name: str, version: int, **defines: float) -> str:
 
 
 def set_uniforms(program: Any, **values: Any) -> None:
-    """Set uniforms by name; those the compiler removed because nothing reads them are passed over."""
+    """Set uniforms by name, except those that the compiler removed because nothing reads them."""
     for name, value in values.items():
         member = program.get(name, None)
         if member is None:
@@ -48,48 +68,54 @@ class Programs:
     """The viewer's programs on one context."""
 
     def __init__(self, ctx: moderngl.Context) -> None:
-        """Nothing is compiled yet."""
+        """Create an empty cache."""
         self._ctx = ctx
-        self._made: dict[str, Any] = {}
+        self._compiled: dict[str, Any] = {}
 
     def project(self) -> moderngl.Program:
         """Gaussians to records by transform feedback (GL 3.3)."""
-        if "project" not in self._made:
-            self._made["project"] = self._ctx.program(
-                vertex_shader=source("project.vert", 330),
-                varyings=RECORD,
-                varyings_capture_mode="interleaved",
-            )
-        return self._made["project"]
+        return self._compile(
+            "project.vert",
+            lambda: self._ctx.program(
+                vertex_shader=source("project.vert", 330), varyings=RECORD, varyings_capture_mode="interleaved"
+            ),
+        )
 
     def project_compute(self) -> moderngl.ComputeShader:
         """Gaussians to records by a compute shader (GL 4.3)."""
-        if "compute" not in self._made:
-            self._made["compute"] = self._ctx.compute_shader(source("project.comp", 430))
-        return self._made["compute"]
+        return self._compile("project.comp", lambda: self._ctx.compute_shader(source("project.comp", 430)))
 
     def splat(self) -> moderngl.Program:
-        """Records to pixels."""
-        return self._pair("splat.vert", "splat.frag")
+        """Records to pixels of a layer."""
+        return self._compile_pair("splat.vert", "splat.frag")
 
-    def gather(self, kept_as: int) -> moderngl.Program:
-        """A layer, weighted; `kept_as` is SOURCE of gather.frag."""
-        return self._pair("screen.vert", "gather.frag", SOURCE=kept_as)
+    def accumulate(self, storage: int) -> moderngl.Program:
+        """One weighted layer to the sum of layers; `storage` is a `LayerStorage`."""
+        return self._compile_pair("screen.vert", "accumulate.frag", LAYER_STORAGE=int(storage))
 
-    def finish(self) -> moderngl.Program:
-        """The added layers to the picture."""
-        return self._pair("screen.vert", "finish.frag")
+    def resolve(self) -> moderngl.Program:
+        """The sum of layers to the image."""
+        return self._compile_pair("screen.vert", "resolve.frag")
 
-    def _pair(self, vertex: str, fragment: str, **defines: int) -> moderngl.Program:
-        key = f"{fragment} {defines}"
-        if key not in self._made:
-            self._made[key] = self._ctx.program(
-                vertex_shader=source(vertex, 330), fragment_shader=source(fragment, 330, **defines)
-            )
-        return self._made[key]
+    def present(self) -> moderngl.Program:
+        """The image, and a photograph next to it, to the screen."""
+        return self._compile_pair("present.vert", "present.frag")
 
     def release(self) -> None:
         """Free all programs."""
-        for program in self._made.values():
+        for program in self._compiled.values():
             program.release()
-        self._made.clear()
+        self._compiled.clear()
+
+    def _compile_pair(self, vertex: str, fragment: str, **defines: int) -> moderngl.Program:
+        return self._compile(
+            f"{fragment} {defines}",
+            lambda: self._ctx.program(
+                vertex_shader=source(vertex, 330), fragment_shader=source(fragment, 330, **defines)
+            ),
+        )
+
+    def _compile(self, key: str, compile_program: Callable[[], Any]) -> Any:
+        if key not in self._compiled:
+            self._compiled[key] = compile_program()
+        return self._compiled[key]

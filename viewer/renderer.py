@@ -1,32 +1,35 @@
 """Draws a scene's Gaussians with OpenGL into a texture: any pose, pinhole or panorama, any blending mode.
 
-Needs no window. GL objects belong to the context's thread: call everything from there. A picture is made in
-three steps: splats into layers (one a set of Gaussians: all, or one context view's), layers added with
-weights, the sum over the background. Layers are kept until something that changes them has changed.
+Needs no window. GL objects belong to the context's thread; call everything from there. `SplatRenderer._draw` holds the
+data flow of a frame: the splats are painted into layers (one for each set of Gaussians), and the layers are composed to
+the image. Layers are kept until something that they depend on changes.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Sequence
 from typing import Literal
 
 import moderngl
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
-from pansplat_viewer.compose import Composer
-from pansplat_viewer.draw import SplatDrawer, choose_tier
-from pansplat_viewer.layers import LayerPainter, Shot
-from pansplat_viewer.order import Ordering, Sorter, make_ordering
-from pansplat_viewer.programs import Programs
+from pansplat.geometry.pose import blend_weights
+from pansplat_viewer.layers import Frame, Layer, LayerPainter, LayerStorage, Target, TargetStore
+from pansplat_viewer.programs import Programs, choose_tier, set_uniforms
 from pansplat_viewer.settings import DrawSettings, FrameStats
-from pansplat_viewer.splats import SplatBuffers, Splats
-from pansplat_viewer.targets import Target, TargetStore
+from pansplat_viewer.splats import SortedSplats, Splats, SplatSorter, sort_splats
 
 _SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software")
+
+# Smallest weight of a view in deferred blending, by the bits of the render targets. Shows a view where the others are
+# empty (such as the masked tripod of an input) and is lost in rounding elsewhere.
+_MIN_WEIGHT = {16: 1e-4, 32: 2.0**-26}
 
 __all__ = ["DrawSettings", "FrameStats", "SplatRenderer"]
 
@@ -34,12 +37,11 @@ __all__ = ["DrawSettings", "FrameStats", "SplatRenderer"]
 class SplatRenderer:
     """Renders scenes of 3D Gaussians on an OpenGL 3.3 or 4.3 context.
 
-    Blending is off and the framebuffer bound before the call is bound again after each call.
+    Each call leaves blending disabled and restores the framebuffer binding.
 
     Attributes:
         stats: counts and times of the last frame.
-        tier: `gl33` or `gl43`, the same picture either way.
-        num_views: context views of the uploaded scene.
+        tier: `gl33` or `gl43`; both draw the same image.
     """
 
     def __init__(
@@ -49,13 +51,16 @@ class SplatRenderer:
         tier: Literal["auto", "gl33", "gl43"] = "auto",
         color_bits: Literal[16, 32] | None = None,
     ) -> None:
-        """`color_bits` of the targets: 16 for a window, 32 for checks and captures.
+        """Create the renderer without a scene.
 
-        None takes 16 on a GPU and 32 where GL runs in software, which truncates half floats so that pictures
-        darken with every layer, and for which 32 cost no more.
+        Args:
+            ctx: the current context.
+            tier: how records are made: by transform feedback (`gl33`) or by a compute shader (`gl43`).
+            color_bits: bits per channel of the render targets. None is 16 on a GPU, and 32 on software OpenGL, which
+                truncates half floats (images get darker with every layer) and is not slower with 32.
 
         Raises:
-            InputError: `tier` is more than the context can do, or `color_bits` is neither.
+            InputError: the context does not support `tier`, or `color_bits` is neither 16 nor 32.
         """
         if color_bits is None:
             software = any(name in ctx.info["GL_RENDERER"].lower() for name in _SOFTWARE)
@@ -67,27 +72,25 @@ class SplatRenderer:
         self._ctx = ctx
         self._programs = Programs(ctx)
         self._targets = TargetStore(ctx, color_bits=color_bits)
-        self._composer = Composer(ctx, self._programs, self._targets)
-        self._sorter = Sorter()
-        self._buffers: SplatBuffers | None = None
+        self._compositor = Compositor(ctx, self._programs, self._targets)
+        self._sorter = SplatSorter()
+        self._splats: Splats | None = None
         self._painter: LayerPainter | None = None
-        self._drawer: SplatDrawer | None = None
-        self._ordering: Ordering | None = None
-        self._shot: Shot | None = None
-        self._picture: Target | None = None
+        self._sorted: SortedSplats | None = None
+        self._frame: Frame | None = None
+        self._image: Target | None = None
 
     @property
     def num_views(self) -> int:
         """Context views of the uploaded scene."""
-        return self._buffers.splats.num_views if self._buffers is not None else 0
+        return self._splats.num_views if self._splats is not None else 0
 
     def upload(self, scene: Scene) -> None:
-        """Replace the scene on the GPU; Gaussians with NaN or infinity are left out and counted."""
+        """Replace the scene on the GPU; Gaussians with NaN or infinity are dropped and counted."""
         splats = Splats.from_scene(scene)
         self._release_scene()
-        self._buffers = SplatBuffers(self._ctx, splats)
-        self._drawer = SplatDrawer(self._ctx, self._programs, self._buffers, self.tier)
-        self._painter = LayerPainter(self._drawer, self._targets, self._ctx.info["GL_MAX_TEXTURE_SIZE"])
+        self._painter = LayerPainter(self._ctx, self._programs, self._targets, splats, self.tier)
+        self._splats = splats
         self.stats = FrameStats(total=len(splats), dropped=splats.dropped, tier=self.tier)
 
     def render(
@@ -98,117 +101,223 @@ class SplatRenderer:
         *,
         wait: bool = True,
     ) -> moderngl.Texture:
-        """Draw the scene and return the picture's texture.
+        """Draw the scene and return the image's texture.
 
         Args:
             cam2world: rigid pose, OpenCV axes, metres.
             size: (width, height) in pixels.
             settings: what to draw and how.
-            wait: sort for exactly this position first; False draws at once with the last order while a thread
-                makes the new one (`stats.settled` is then False: render again until it is True).
+            wait: sort for this position first. If False, draw at once with the last order while a worker thread sorts;
+                `stats.settled` is then False, and the caller renders again until it is True.
 
         Returns:
-            RGBA texture, colour over the background, alpha the coverage; GL's bottom row first, so that it
-            shows upright when drawn as any texture. Its content changes with the next call.
+            RGBA texture: colour over the background, and coverage. Row 0 is the bottom row, so the texture is upright
+            when drawn as any OpenGL texture. The next call overwrites its content.
 
         Raises:
-            InputError: nothing is uploaded, the size or a setting does not fit the scene or the GPU.
+            InputError: no scene is uploaded, or the size or a setting does not fit the scene or the GPU.
         """
         start = time.perf_counter()
-        if self._buffers is None:
+        if self._splats is None:
             raise InputError("there is no scene to draw; call `upload` first")
-        previous = self._ctx.fbo
-        shot = Shot.make(self._buffers.splats, np.asarray(cam2world, dtype=np.float64), size, settings)
-        settled = self._update_ordering(shot, wait)
-        self._shot = shot
-        self._draw(shot, with_depth=False)
+        bound = self._ctx.fbo
+        frame = Frame.create(self._splats, np.asarray(cam2world, dtype=np.float64), size, settings)
+        settled = self._update_order(frame.position, wait)
+        self._frame = frame
+        image = self._draw(frame, with_depth=False)
         self._ctx.finish()
-        _bind(previous)
+        _bind(bound)
         self.stats = dataclasses.replace(self.stats, settled=settled, frame_ms=1e3 * (time.perf_counter() - start))
-        assert self._picture is not None
-        return self._picture.color
+        return image.color
 
     def read_color(self) -> Float[np.ndarray, "height width 4"]:
-        """The last picture, float32, top row first: RGB over the background and coverage."""
-        return self._read(0, 4)
+        """Return the last image, float32, top row first: RGB over the background, and coverage."""
+        return self._read(attachment=0, components=4)
 
     def read_depth(self) -> Float[np.ndarray, "height width"]:
-        """Radial depth of the last picture in metres, float32, top row first; 0 where nothing is drawn.
+        """Return the radial depth of the last image in metres, float32, top row first; 0 where nothing is drawn.
 
-        Windows rarely need it, so it is drawn when asked for. Mode `difference` gives the depths' difference.
+        `render` draws no depth. The first call after it draws the frame again with depth. In mode `difference` this is
+        the absolute difference of the two depths.
         """
-        if self._picture is None or self._shot is None:
-            raise InputError("there is no picture to read; call `render` first")
-        if self._picture.depth is None:
-            previous, stats = self._ctx.fbo, self.stats
-            self._draw(self._shot, with_depth=True)
+        if self._image is None or self._frame is None:
+            raise InputError("there is no image to read; call `render` first")
+        if self._image.depth is None:
+            bound, stats = self._ctx.fbo, self.stats
+            self._draw(self._frame, with_depth=True)
             self.stats = stats
-            _bind(previous)
-        return self._read(1, 1)[..., 0]
+            _bind(bound)
+        return self._read(attachment=1, components=1)[..., 0]
 
     def release(self) -> None:
         """Stop the sorting thread and free every GL object."""
         self._sorter.close()
         self._release_scene()
-        self._composer.release()
+        self._compositor.release()
         self._targets.release()
         self._programs.release()
 
-    def _draw(self, shot: Shot, *, with_depth: bool) -> None:
-        painter, ordering = self._painter, self._ordering
-        assert painter is not None and ordering is not None
-        painter.start(shot, ordering, with_depth=with_depth)
-        self._picture = self._composer.compose(shot, painter)
-        self._targets.trim(painter.in_use | self._composer.in_use)
+    def _draw(self, frame: Frame, *, with_depth: bool) -> Target:
+        """Paint the layers that the frame needs and compose them to the image."""
+        splats, painter = self._sorted, self._painter
+        assert splats is not None and painter is not None
+        weights = choose_layer_weights(frame, splats.splats, _MIN_WEIGHT[self._targets.color_bits])
+        views = dict.fromkeys(view for image_weights in weights for view in image_weights)
+        layers = {view: painter.paint(frame, splats, view, with_depth=with_depth) for view in views}
+        weighted = [[(layers[view], weight) for view, weight in image_weights.items()] for image_weights in weights]
+        self._image = self._compositor.compose(frame, weighted, with_depth=with_depth)
+        self._targets.trim()
         self.stats = FrameStats(
-            total=len(ordering.splats),
-            dropped=ordering.splats.dropped,
-            visible=painter.visible,
-            drawn=painter.drawn,
-            sort_ms=ordering.milliseconds,
+            total=len(splats.splats),
+            dropped=splats.splats.dropped,
+            visible=sum(layer.visible for layer in layers.values()),
+            drawn=sum(layer.drawn for layer in layers.values()),
+            sort_ms=splats.milliseconds,
             tier=self.tier,
-            cached=not painter.painted,
+            cached=all(layer.cached for layer in layers.values()),
         )
+        return self._image
 
-    def _update_ordering(self, shot: Shot, wait: bool) -> bool:
-        """Bring the order to the shot's position or ask for it; True when it fits the position."""
-        assert self._buffers is not None
-        splats, position = self._buffers.splats, shot.position
-        if self._ordering is None or (wait and self._ordering.position != position):
-            self._adopt(make_ordering(splats, position))
-        elif self._ordering.position != position:
+    def _update_order(self, position: tuple[float, float, float], wait: bool) -> bool:
+        """Sort for this position, here or in the worker thread; returns whether the order fits the position."""
+        assert self._splats is not None
+        if self._sorted is None or (wait and self._sorted.position != position):
+            self._use(sort_splats(self._splats, position))
+        elif self._sorted.position != position:
             ready = self._sorter.take()
-            if ready is not None and ready.splats is splats:
-                self._adopt(ready)
-            if self._ordering.position != position:
-                self._sorter.request(splats, position)
-        assert self._ordering is not None
-        return self._ordering.position == position
+            if ready is not None and ready.splats is self._splats:
+                self._use(ready)
+            if self._sorted.position != position:
+                self._sorter.request(self._splats, position)
+        assert self._sorted is not None
+        return self._sorted.position == position
 
-    def _adopt(self, ordering: Ordering) -> None:
-        assert self._buffers is not None
-        if ordering.colors is not None:
-            self._buffers.write_colors(ordering.colors)
-        self._ordering = ordering
+    def _use(self, sorted_splats: SortedSplats) -> None:
+        assert self._painter is not None
+        if sorted_splats.colors is not None:
+            self._painter.rasterizer.write_colors(sorted_splats.colors)
+        self._sorted = sorted_splats
 
     def _read(self, attachment: int, components: int) -> np.ndarray:
-        if self._picture is None:
-            raise InputError("there is no picture to read; call `render` first")
-        width, height = self._picture.size
-        data = self._picture.framebuffer.read(components=components, attachment=attachment, dtype="f4", alignment=1)
+        if self._image is None:
+            raise InputError("there is no image to read; call `render` first")
+        width, height = self._image.size
+        data = self._image.framebuffer.read(components=components, attachment=attachment, dtype="f4", alignment=1)
         return np.frombuffer(data, np.float32).reshape(height, width, components)[::-1].copy()
 
     def _release_scene(self) -> None:
-        if self._drawer is not None:
-            self._drawer.release()
-        if self._buffers is not None:
-            self._buffers.release()
-        self._drawer = self._buffers = self._painter = self._ordering = None
-        self._shot = self._picture = None
-        self._targets.forget()
+        if self._painter is not None:
+            self._painter.release()
+        self._splats = self._painter = self._sorted = self._frame = self._image = None
+        self._targets.invalidate()
+
+
+def choose_layer_weights(frame: Frame, splats: Splats, min_weight: float) -> list[dict[int | None, float]]:
+    """Return each layer's weight by its view (None: all Gaussians); two images for mode `difference`, else one.
+
+    Raises:
+        InputError: the scene lacks the view, or the cameras that mode `deferred` needs.
+    """
+    settings, num_views = frame.settings, splats.num_views
+    if settings.mode == "joint":
+        return [{None: 1.0}]
+    if settings.mode in ("view", "difference") and not 0 <= settings.view < max(num_views, 1):
+        raise InputError(f"`view` must be 0..{max(num_views, 1) - 1} in this scene, got {settings.view}")
+    if settings.mode == "view":
+        return [{settings.view: 1.0}]
+    if settings.mode == "difference":
+        return [{settings.view: 1.0}, {(settings.view + 1) % max(num_views, 1): 1.0}]
+    if num_views < 2:
+        return [{None: 1.0}]
+    positions = splats.view_positions
+    if len(positions) != num_views:
+        raise InputError(
+            f"mode deferred needs the camera of each context view, the scene has {len(positions)} cameras "
+            f"for {num_views} views; use mode joint"
+        )
+    weights = blend_weights(torch.from_numpy(frame.world_position.copy()), torch.from_numpy(positions))
+    return [{view: max(weight, min_weight) for view, weight in enumerate(weights.tolist())}]
+
+
+class Compositor:
+    """Adds weighted layers, normalises the sum and puts it over the background."""
+
+    def __init__(self, ctx: moderngl.Context, programs: Programs, targets: TargetStore) -> None:
+        """Compile the program of the final pass."""
+        self._ctx = ctx
+        self._programs = programs
+        self._targets = targets
+        self._accumulate: dict[LayerStorage, moderngl.VertexArray] = {}
+        self._resolve = ctx.vertex_array(programs.resolve(), [])
+
+    def compose(self, frame: Frame, images: Sequence[Sequence[tuple[Layer, float]]], *, with_depth: bool) -> Target:
+        """Return the frame's image: RGB over the background, coverage, and depth if the layers have it.
+
+        Args:
+            frame: size, camera and background.
+            images: the weighted layers of one image, or of two whose absolute difference is returned.
+            with_depth: whether the layers have depth.
+        """
+        sums = [
+            self._add_layers(frame, weighted, self._targets.get(f"sum {i}", frame.size, depth_components=2), with_depth)
+            for i, weighted in enumerate(images)
+        ]
+        image = self._targets.get("image", frame.size, depth_components=int(with_depth))
+        image.framebuffer.use()
+        image.framebuffer.viewport = (0, 0, *frame.size)
+        program = self._programs.resolve()
+        set_uniforms(program, difference=len(sums) == 2, background=frame.settings.background)
+        first, second = sums[0], sums[-1]
+        self._bind_textures(
+            program,
+            first_color=first.color,
+            first_depth=first.depth,
+            second_color=second.color,
+            second_depth=second.depth,
+        )
+        self._ctx.enable_only(moderngl.NOTHING)
+        self._resolve.render(moderngl.TRIANGLES, vertices=3)
+        return image
+
+    def release(self) -> None:
+        """Free the vertex arrays."""
+        for vertex_array in (*self._accumulate.values(), self._resolve):
+            vertex_array.release()
+
+    def _add_layers(
+        self, frame: Frame, weighted: Sequence[tuple[Layer, float]], target: Target, with_depth: bool
+    ) -> Target:
+        target.framebuffer.use()
+        target.framebuffer.viewport = (0, 0, *frame.size)
+        program = self._programs.accumulate(frame.storage)
+        if frame.storage not in self._accumulate:
+            self._accumulate[frame.storage] = self._ctx.vertex_array(program, [])
+        set_uniforms(
+            program,
+            with_depth=with_depth,
+            size=frame.size,
+            focal=frame.focal,
+            camera_to_faces=np.ascontiguousarray(frame.camera_to_faces.T, dtype=np.float32).tobytes(),
+            face_size=frame.face_size,
+        )
+        self._ctx.enable_only(moderngl.NOTHING)  # the first layer overwrites the target, the others are added
+        self._ctx.blend_func = moderngl.ONE, moderngl.ONE
+        for layer, weight in weighted:
+            set_uniforms(program, weight=weight)
+            self._bind_textures(program, layer_color=layer.target.color, layer_depth=layer.target.depth)
+            self._accumulate[frame.storage].render(moderngl.TRIANGLES, vertices=3)
+            self._ctx.enable_only(moderngl.BLEND)
+        self._ctx.enable_only(moderngl.NOTHING)
+        return target
+
+    def _bind_textures(self, program: moderngl.Program, **textures: moderngl.Texture | None) -> None:
+        for unit, (name, texture) in enumerate(textures.items()):
+            # An unused sampler still needs a texture of its type.
+            (texture or next(iter(textures.values()))).use(location=unit)  # type: ignore[union-attr]
+            set_uniforms(program, **{name: unit})
 
 
 def _bind(framebuffer: moderngl.Framebuffer | None) -> None:
-    """Bind a framebuffer again unless it is gone: on a context without a window it may be one of ours."""
+    """Bind a framebuffer unless it is released: on a context without a window it may be a freed render target."""
     if framebuffer is not None and hasattr(framebuffer.mglo, "use"):
         framebuffer.use()

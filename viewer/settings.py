@@ -1,10 +1,10 @@
-"""What to draw and how, and what drawing it cost: the records between the renderer and its users."""
+"""Draw settings and frame statistics: the records between the renderer and its callers. Imports no torch."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from pansplat.constants import NEAR
 from pansplat.errors import InputError
@@ -15,38 +15,32 @@ Lowpass = Literal["angular", "3dgs"]
 Mode = Literal["joint", "view", "deferred", "difference"]
 Layout = Literal["pinhole", "equirect"]
 
-_CHOICES = {
-    "kernel": ("ray", "ewa"),
-    "order": ("radial", "z"),
-    "lowpass": ("angular", "3dgs"),
-    "mode": ("joint", "view", "deferred", "difference"),
-    "layout": ("pinhole", "equirect"),
-}
+_CHOICES = {"kernel": Kernel, "order": Order, "lowpass": Lowpass, "mode": Mode, "layout": Layout}
 
 
 @dataclass(frozen=True)
 class DrawSettings:
-    """Everything that changes the picture except the scene, the pose and the size.
+    """Everything that changes the image except the scene, the pose and the size.
 
     Attributes:
         kernel: `ray` is the exact response on each ray, `ewa` the linearised one of 3DGS.
         order: sort key, radial distance or depth along the view axis.
         lowpass: `angular` with energy compensation, or `3dgs`.
-        mode: `joint` draws all Gaussians together; `view` those of one context view; `deferred` each context
-            view by itself, blended per pixel by distance; `difference` the absolute difference of the
-            pictures of context views `view` and `view + 1` (cyclic), each over the background.
+        mode: `joint` draws all Gaussians together. `view` draws those of one context view. `deferred` draws each
+            context view separately and blends the images per pixel by distance. `difference` is the absolute
+            difference of the images of context views `view` and `view + 1` (cyclic), each over the background.
         view: the context view of mode `view` and the first of mode `difference`.
         levels: pyramid levels to draw; None draws all.
-        opacity_threshold: Gaussians of lower opacity are left out.
+        opacity_threshold: Gaussians of lower opacity are not drawn.
         background: RGB in [0, 1].
-        near: Gaussians whose mean is nearer than this radial distance, metres, are left out.
+        near: Gaussians whose mean is nearer than this radial distance, metres, are not drawn.
         vertical_fov_degrees: of layout `pinhole`, in (0, 180).
-        layout: `pinhole`, or `equirect` stitched from six faces.
-        face_size: side of a cube face in pixels; None is as fine as the panorama's equator (2 height / pi),
-            or as the middle of a pinhole picture that is drawn from cached faces.
-        cached: draw a pinhole picture from six faces kept for this position, so that turning costs a texture
-            look-up a pixel. The faces in sight that are not there yet are drawn first. Where that needs faces
-            of more than 2048 pixels (a narrow field of view) the picture is drawn directly.
+        layout: `pinhole`, or `equirect` stitched from six cube faces.
+        face_size: side of a cube face in pixels. None matches the resolution at the panorama's equator
+            (2 height / pi), or at the centre of a pinhole image that is drawn from cached faces.
+        cached: draw a pinhole image from six cube faces that are kept for this position, so that a rotation of the
+            camera costs one texture look-up a pixel. Missing faces in the field of view are drawn first. Where that
+            would need faces of more than 2048 pixels (a narrow field of view), the image is drawn directly.
     """
 
     kernel: Kernel = "ray"
@@ -66,8 +60,8 @@ class DrawSettings:
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
             value = getattr(self, name)
-            if value not in choices:
-                raise InputError(f"`{name}` must be one of {', '.join(choices)}, got {value!r}")
+            if value not in get_args(choices):
+                raise InputError(f"`{name}` must be one of {', '.join(get_args(choices))}, got {value!r}")
         if not 0 < self.vertical_fov_degrees < 180:
             raise InputError(
                 f"`vertical_fov_degrees` must be between 0 and 180, got {self.vertical_fov_degrees}; "
@@ -81,21 +75,20 @@ class DrawSettings:
 
 @dataclass(frozen=True)
 class FrameStats:
-    """What the last frame drew and what it took.
+    """Counts and times of the last frame.
 
     Attributes:
         total: Gaussians of the scene on the GPU.
-        dropped: Gaussians left out at upload because a number in them is NaN or infinite.
-        visible: those left by view, level and opacity threshold; in mode `deferred`, over all views.
-        drawn: splats sent to the GPU for this frame after culling, over all faces and views; 0 when all is
-            cached.
-        sort_ms: time of the last sort (and of the colours that depend on the position), possibly in the
-            background.
+        dropped: Gaussians removed at upload because a value in them is NaN or infinite.
+        visible: Gaussians selected by view, level and opacity threshold; in mode `deferred`, summed over the views.
+        drawn: splats sent to the GPU for this frame after culling, summed over faces and views; 0 if all layers
+            were cached.
+        sort_ms: time of the last sort and of the colours that depend on the position, possibly in the background.
         frame_ms: from the call of `render` until the GPU had finished.
         tier: `gl33` or `gl43`.
-        cached: True when nothing was drawn but a look-up in faces kept from before.
-        settled: False when the order or colours of an earlier position were used because the new ones are
-            still in the making; render again to get them.
+        cached: whether the frame used cached layers only.
+        settled: False if the frame used the order and colours of an earlier position because the new ones are not
+            ready; render again to get them.
     """
 
     total: int = 0

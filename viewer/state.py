@@ -1,4 +1,4 @@
-"""What the viewer shows, apart from any window: values that keys and panels change and a frame reads."""
+"""What the viewer shows, without window or GL: values that keys and panels change and that a frame reads."""
 
 from dataclasses import dataclass, field, replace
 
@@ -11,26 +11,27 @@ from pansplat.geometry.path import fly_pose, level_pose, look_pose, path_poses, 
 from pansplat_viewer.camera import Camera, place
 from pansplat_viewer.settings import DrawSettings
 
-FLY_SECONDS = 6.0
-_STEPS = 24  # of a flight, for the `,` and `.` keys
+FLIGHT_SECONDS = 6.0
+_FLIGHT_STEPS = 24  # for the `,` and `.` keys
 
 
 @dataclass
 class ViewerState:
-    """Everything a person can change, and what the scene says about itself.
+    """Everything that a user can change, and the scene's cameras and levels.
 
     Attributes:
-        camera: the camera now; `home` is where R goes back to.
-        orbiting: V toggles between flying (False) and orbiting (True).
+        camera: the current camera; `home` is the camera that R restores.
+        orbiting: whether the camera orbits (True) or flies (False).
         settings: what to draw; the field of view is the camera's.
-        flight: fraction of the flight between the panoramas in [0, 1]; `playing` while Space plays it.
-        overlay, help: shown or not.
-        photo: show the nearest input photograph, right of `split` (fraction of the width; 0: all over).
-        adaptive: lower the resolution while moving.
-        context: poses of the input cameras; empty for a file without any.
-        levels: the pyramid levels that the scene has, ascending.
+        flight: fraction of the flight between the panoramas in [0, 1]; `playing` while it is played.
+        overlay, help: whether panels and key help are shown.
+        photo: whether the nearest input photograph is shown, right of `split` (fraction of the width).
+        adaptive: whether the resolution is lowered while the camera moves.
+        speed: of flying, metres per second.
+        context: poses of the input cameras; empty for a file without cameras.
+        levels: pyramid levels of the scene, ascending.
         message: a line to show until `message_until` (seconds of the viewer's clock).
-        quit: the person asked to leave.
+        quit: whether to close the viewer.
     """
 
     camera: Camera = field(default_factory=Camera)
@@ -53,54 +54,31 @@ class ViewerState:
 
     @property
     def draw_settings(self) -> DrawSettings:
-        """The settings of the next frame."""
+        """The settings of the next frame, with the camera's field of view."""
         return replace(self.settings, vertical_fov_degrees=self.camera.vertical_fov_degrees)
 
-    def say(self, message: str, now: float, seconds: float = 4.0) -> None:
+    def show_message(self, message: str, now: float, seconds: float = 4.0) -> None:
         """Show a line for some seconds."""
         self.message, self.message_until = message, now + seconds
 
 
-def enter(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
-    """Start in a scene at a fraction of its flight; settings stay where the scene allows them."""
+def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
+    """Start in a scene at a fraction of its flight; settings that the scene does not support are reset."""
     state.context = scene.cam2world.double().numpy()
     state.levels = tuple(sorted(int(level) for level in torch.unique(scene.gaussians.levels)))
-    views = max(len(state.context), 1)
-    settings = replace(state.settings, levels=None, view=min(state.settings.view, views - 1))
-    if views < 2 and settings.mode in ("deferred", "difference"):
+    num_views = max(len(state.context), 1)
+    settings = replace(state.settings, levels=None, view=min(state.settings.view, num_views - 1))
+    if num_views < 2 and settings.mode in ("deferred", "difference"):
         settings = replace(settings, mode="joint")
     state.settings = settings
     state.playing, state.flight = False, min(max(at, 0.0), 1.0)
-    base = level_frame(scene)
-    camera = replace(state.camera, level=tuple(tuple(float(x) for x in row) for row in base))
-    camera = place(camera, start_pose(scene, state.flight))
+    level = tuple(tuple(float(x) for x in row) for row in _level_axes(scene))
+    camera = place(replace(state.camera, level=level), _start_pose(scene, state.flight))
     state.camera = state.home = replace(camera, distance=_typical_distance(scene))
 
 
-def level_frame(scene: Scene) -> Float[np.ndarray, "3 3"]:
-    """Right, down, forward of a level camera that looks along the way (columns, world axes)."""
-    up = up_direction(scene.cam2world)
-    if len(scene.cam2world):
-        return path_poses(scene.cam2world)[0, :3, :3].numpy()
-    ahead = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)
-    return look_pose(torch.zeros(3), ahead, up)[:3, :3].numpy()
-
-
-def start_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
-    """Where to stand at a fraction of the flight; in a scene without cameras, back from its middle."""
-    if len(scene.cam2world):
-        return fly_pose(scene.cam2world, fraction).numpy()
-    matrix = np.eye(4)
-    matrix[:3, :3] = level_frame(scene)
-    means = scene.gaussians.means.double().numpy()
-    if len(means):
-        middle = np.median(means, axis=0)
-        matrix[:3, 3] = middle - 2 * _spread(means, middle) * matrix[:3, 2]
-    return matrix
-
-
-def jump(state: ViewerState, view: int) -> bool:
-    """Go to an input camera's place and heading, level; False when the scene has no such camera."""
+def jump_to_view(state: ViewerState, view: int) -> bool:
+    """Move to an input camera's position and heading, level; returns False if the scene has no such camera."""
     if view >= len(state.context):
         return False
     up = up_direction(torch.from_numpy(state.context))
@@ -112,7 +90,7 @@ def jump(state: ViewerState, view: int) -> bool:
 
 
 def fly_to(state: ViewerState, fraction: float) -> None:
-    """Put the camera on the flight at a fraction of its time."""
+    """Move the camera to a fraction of the flight."""
     state.flight = min(max(fraction, 0.0), 1.0)
     if len(state.context):
         target = fly_pose(torch.from_numpy(state.context), state.flight).numpy()
@@ -120,7 +98,7 @@ def fly_to(state: ViewerState, fraction: float) -> None:
 
 
 def toggle_play(state: ViewerState) -> None:
-    """Start or stop the flight; from its end it starts again at the beginning."""
+    """Start or stop the flight; at its end, start it from the beginning."""
     if not len(state.context):
         return
     state.playing = not state.playing
@@ -129,27 +107,48 @@ def toggle_play(state: ViewerState) -> None:
 
 
 def step_flight(state: ViewerState, steps: int) -> None:
-    """Move along the flight by whole steps, stopping play."""
+    """Move along the flight by whole steps and stop playing."""
     state.playing = False
-    fly_to(state, (round(state.flight * _STEPS) + steps) / _STEPS)
+    fly_to(state, (round(state.flight * _FLIGHT_STEPS) + steps) / _FLIGHT_STEPS)
 
 
-def advance(state: ViewerState, seconds: float) -> None:
-    """Let time pass: plays the flight and stops it at its end."""
+def advance_flight(state: ViewerState, seconds: float) -> None:
+    """Move along the flight if it is playing, and stop at its end."""
     if state.playing:
-        fly_to(state, state.flight + seconds / FLY_SECONDS)
+        fly_to(state, state.flight + seconds / FLIGHT_SECONDS)
         state.playing = state.flight < 1
 
 
+def _level_axes(scene: Scene) -> Float[np.ndarray, "3 3"]:
+    """Return right, down, forward of a level camera in the direction of flight (columns, world axes)."""
+    if len(scene.cam2world):
+        return path_poses(scene.cam2world)[0, :3, :3].numpy()
+    forward = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)
+    return look_pose(torch.zeros(3), forward, up_direction(scene.cam2world))[:3, :3].numpy()
+
+
+def _start_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
+    """Return the pose at a fraction of the flight; in a scene without cameras, a pose that sees it from outside."""
+    if len(scene.cam2world):
+        return fly_pose(scene.cam2world, fraction).numpy()
+    matrix = np.eye(4)
+    matrix[:3, :3] = _level_axes(scene)
+    means = scene.gaussians.means.double().numpy()
+    if len(means):
+        middle = np.median(means, axis=0)
+        matrix[:3, 3] = middle - 2 * _median_distance(means, middle) * matrix[:3, 2]
+    return matrix
+
+
 def _typical_distance(scene: Scene) -> float:
-    """Median distance of the Gaussians from the first camera (else their middle), metres; 2 if none."""
+    """Return the median distance of the Gaussians from the first camera (else the start pose), metres; 2 if none."""
     means = scene.gaussians.means.double().numpy()
     if not len(means):
         return 2.0
     if len(scene.cam2world):
         return float(np.median(np.linalg.norm(means - scene.cam2world[0, :3, 3].double().numpy(), axis=1)))
-    return 2 * _spread(means, np.median(means, axis=0))
+    return 2 * _median_distance(means, np.median(means, axis=0))
 
 
-def _spread(means: Float[np.ndarray, "n 3"], middle: Float[np.ndarray, "3"]) -> float:
-    return float(np.median(np.linalg.norm(means - middle, axis=1))) or 1.0
+def _median_distance(means: Float[np.ndarray, "n 3"], point: Float[np.ndarray, "3"]) -> float:
+    return float(np.median(np.linalg.norm(means - point, axis=1))) or 1.0

@@ -1,17 +1,16 @@
-"""`python -m pansplat_viewer.timing JOB.json`: how long the viewer's renderer takes for pictures, and the pictures.
+"""`python -m pansplat_viewer.timing JOB.json` measures the renderer and writes its images.
 
-For programs that compare renderers, such as `pansplat bench raster`; they run it as a command, since nothing may
-import the viewer. Needs no window. A job is
+`pansplat bench raster` runs this command, because no other package may import the viewer. Needs no window. A job is
 
-    {"scene": "scene.ply", "pose": 4x4 cam2world, "size": [width, height], "repeats": 5, "folder": "pictures",
+    {"scene": "scene.ply", "pose": 4x4 cam2world, "size": [width, height], "repeats": 5, "folder": "images",
      "tiers": ["gl33", "gl43"], "settings": [{"kernel": "ray", "layout": "equirect", ...}, ...]}
 
-with the fields of `DrawSettings`. For each tier and settings one line of JSON goes to standard output:
+with the fields of `DrawSettings`. For each tier and settings, one line of JSON is printed:
 
-    {"tier": "gl33", "settings": 0, "renderer": "llvmpipe ...", "frame_ms": [...], "sort_ms": 3.1, "picture": FILE.npy}
+    {"tier": "gl33", "settings": 0, "renderer": "llvmpipe ...", "frame_ms": [...], "sort_ms": 3.1, "image": FILE.npy}
 
-`frame_ms` are frames of a moving camera, the sort included. Tiers that the context lacks are passed over. The
-picture is float32, RGB and coverage, top row first.
+`frame_ms` are times of frames of a moving camera and include the sort. Tiers that the context does not support are
+skipped. The image is float32, RGB and coverage, top row first.
 """
 
 from __future__ import annotations
@@ -27,15 +26,15 @@ import numpy as np
 from pansplat.errors import InputError
 from pansplat.gaussians.ply import load_ply
 from pansplat.gaussians.scene import Scene
-from pansplat_viewer.draw import choose_tier
 from pansplat_viewer.offscreen import create_context
+from pansplat_viewer.programs import choose_tier
 from pansplat_viewer.renderer import DrawSettings, SplatRenderer
 
-_STEP = 1e-4  # metres that the camera moves between frames, so that nothing is kept from the last one
+_STEP = 1e-4  # metres that the camera moves between frames, so that no layer is reused
 
 
 def main() -> int:
-    """Run the job named on the command line: 0 done, 2 it cannot be used or there is no OpenGL."""
+    """Run the job file named on the command line; returns 0, or 2 if the job is invalid or OpenGL is missing."""
     try:
         for line in run_job(json.loads(Path(sys.argv[1]).read_text())):
             print(json.dumps(line), flush=True)
@@ -46,10 +45,10 @@ def main() -> int:
 
 
 def run_job(job: dict[str, Any]) -> Iterator[dict[str, object]]:
-    """The lines of a job, each as soon as it is measured.
+    """Yield the result lines of a job.
 
     Raises:
-        InputError: there is no OpenGL, the scene cannot be read, or a setting is none.
+        InputError: OpenGL is missing, the scene cannot be read, or a setting is invalid.
     """
     scene, pose = load_ply(job["scene"]), np.asarray(job["pose"], np.float64)
     settings = [DrawSettings(**values) for values in job["settings"]]
@@ -81,19 +80,19 @@ def _measure(
     repeats: int,
     file: Path,
 ) -> dict[str, object]:
-    """Frames on a short walk that ends at the pose, and the picture there."""
+    """Render along a short path that ends at the pose, and write the last image."""
     if renderer.num_views == 0:
         renderer.upload(scene)
     frames, sorts = [], []
     for index in range(repeats, -1, -1):
-        place = pose.copy()
-        place[0, 3] += index * _STEP
-        renderer.render(place, size, settings)
+        moved = pose.copy()
+        moved[0, 3] += index * _STEP
+        renderer.render(moved, size, settings)
         frames.append(renderer.stats.frame_ms)
         sorts.append(renderer.stats.sort_ms)
     np.save(file, renderer.read_color())
-    # The first frame compiles shaders and allocates.
-    return {"frame_ms": frames[1:], "sort_ms": float(np.median(sorts[1:])), "picture": str(file)}
+    # The first frame compiles shaders and allocates buffers.
+    return {"frame_ms": frames[1:], "sort_ms": float(np.median(sorts[1:])), "image": str(file)}
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
-"""The viewer without its window: scene, picture and panels on any OpenGL context, one frame at a time."""
+"""The viewer without its window: scene, image and panels on any OpenGL context, one frame at a time."""
 
+import math
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import moderngl
@@ -12,130 +13,250 @@ from jaxtyping import Float
 from pansplat.errors import InputError
 from pansplat_viewer import camera as cameras
 from pansplat_viewer.capture import write_screenshot
-from pansplat_viewer.controls import apply, read_input
-from pansplat_viewer.gui import Gui
-from pansplat_viewer.library import Entry, Loaded, Loader
-from pansplat_viewer.pacing import REFINE_AFTER, Pacer, Plan
-from pansplat_viewer.panels import Facts, Panels, Requests
-from pansplat_viewer.present import Presenter
+from pansplat_viewer.input import Commands, apply_input, read_input
+from pansplat_viewer.loader import LoadedScene, SceneEntry, SceneLoader
+from pansplat_viewer.panels import Gui, PanelData, Panels
+from pansplat_viewer.programs import Programs
 from pansplat_viewer.renderer import SplatRenderer
-from pansplat_viewer.state import ViewerState, advance, enter
+from pansplat_viewer.state import ViewerState, advance_flight, enter_scene
 
-PANORAMA_HEIGHT = 1024  # of a 360 screenshot, pixels
-_LONGEST_STEP = 0.25  # seconds of movement in one frame
+PANORAMA_HEIGHT = 1024  # of a panorama screenshot, pixels
+_MAX_STEP_SECONDS = 0.25  # of camera movement in one frame
+
+SCALES = (1.0, 0.75, 0.5, 0.35, 0.25)  # few values, because a new size allocates new GL textures
+BUDGET_MS = 50.0
+REFINE_AFTER = 0.2  # seconds after the last movement
 
 
-def middle_depth(depth: Float[np.ndarray, "height width"]) -> float | None:
-    """Median of the depths around the middle, metres; None when there is nothing."""
-    row, column = depth.shape[0] // 2, depth.shape[1] // 2
-    for reach in (4, 16, 64):
-        middle = depth[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
-        if (middle > 0).any():
-            return float(np.median(middle[middle > 0]))
-    return None
+@dataclass(frozen=True)
+class ResolutionPlan:
+    """How one frame is rendered.
+
+    Attributes:
+        scale: rendered pixels over screen pixels, along each side.
+        cached: whether the image is read from cube faces that are kept for this position.
+    """
+
+    scale: float
+    cached: bool
+
+
+@dataclass
+class AdaptiveResolution:
+    """Chooses the resolution of each frame: full when the camera stands still, within a time budget when it moves.
+
+    Attributes:
+        budget_ms: time of a frame while the camera moves.
+        step: index into SCALES of the scale while the camera moves.
+        full_ms: time of the last frame at full resolution.
+        last_motion: time of the last movement, seconds.
+        translated: whether the last movement changed the position.
+    """
+
+    budget_ms: float = BUDGET_MS
+    step: int = 0
+    full_ms: float = 0.0
+    last_motion: float = -1e9
+    translated: bool = False
+
+    def plan(self, now: float, *, moved: bool, turned: bool, adaptive: bool = True) -> ResolutionPlan:
+        """Return the plan of the frame at time `now` (seconds) after the camera moved, turned or did neither."""
+        if moved or turned:
+            self.last_motion, self.translated = now, moved
+        moving = now - self.last_motion < REFINE_AFTER
+        if not adaptive or not moving:
+            return ResolutionPlan(1.0, cached=False)
+        slow = self.full_ms > self.budget_ms
+        return ResolutionPlan(SCALES[self.step], cached=slow and not self.translated)
+
+    def record(self, plan: ResolutionPlan, frame_ms: float) -> None:
+        """Record the time of a frame and adjust the scale; frames from cached faces are ignored."""
+        if plan.cached:
+            return
+        if plan.scale == 1.0:
+            self.full_ms = frame_ms
+        if frame_ms > 1.2 * self.budget_ms and plan.scale == SCALES[self.step]:
+            self.step = min(self.step + 1, len(SCALES) - 1)
+        elif self.step > 0 and plan.scale == SCALES[self.step]:
+            # Refine only if the next scale is expected to fit the budget, else the resolution would oscillate.
+            growth = (SCALES[self.step - 1] / SCALES[self.step]) ** 2
+            if frame_ms * growth < 0.9 * self.budget_ms:
+                self.step -= 1
+
+
+class Presenter:
+    """Draws the rendered image to the screen, and next to it an input photograph of the same directions."""
+
+    def __init__(self, ctx: moderngl.Context) -> None:
+        """Compile the program."""
+        self.ctx = ctx
+        self._programs = Programs(ctx)
+        self._program = self._programs.present()
+        self._triangle = ctx.vertex_array(self._program, [])
+        self._program["image"], self._program["photograph"] = 0, 1
+        self._photos: list[moderngl.Texture] = []
+        self._poses: Float[np.ndarray, "view 4 4"] = np.zeros((0, 4, 4))
+
+    @property
+    def photo_count(self) -> int:
+        """Number of uploaded photographs."""
+        return len(self._photos)
+
+    def upload_photos(
+        self, images: Float[np.ndarray, "view height width 3"] | None, cam2world: Float[np.ndarray, "view 4 4"]
+    ) -> None:
+        """Replace the photographs: panoramas, RGB in [0, 1], with their poses; None removes them."""
+        for photo in self._photos:
+            photo.release()
+        self._photos, self._poses = [], cam2world
+        for image in images if images is not None else ():
+            height, width = image.shape[:2]
+            pixels = np.ascontiguousarray((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8))
+            texture = self.ctx.texture((width, height), 3, pixels.tobytes(), alignment=1)
+            texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
+            texture.repeat_x, texture.repeat_y = True, False
+            self._photos.append(texture)
+
+    def draw(
+        self,
+        image: moderngl.Texture,
+        target: moderngl.Framebuffer,
+        *,
+        photo: int | None = None,
+        split: float = 1.0,
+        cam2world: Float[np.ndarray, "4 4"] | None = None,
+        vertical_fov_degrees: float = 90.0,
+    ) -> None:
+        """Fill `target` with the image, and right of `split` with the photograph of index `photo`.
+
+        The photograph is sampled by direction only: it has no parallax and matches exactly at its own camera.
+        """
+        target.use()
+        self.ctx.disable(moderngl.DEPTH_TEST | moderngl.BLEND | moderngl.CULL_FACE)
+        image.filter = (moderngl.LINEAR, moderngl.LINEAR)
+        image.use(0)
+        if photo is None or cam2world is None or photo >= len(self._photos):
+            self._program["split"] = 2.0
+            image.use(1)
+        else:
+            self._program["split"] = split
+            self._photos[photo].use(1)
+            rotation = self._poses[photo][:3, :3].T @ cam2world[:3, :3]
+            self._program["camera_to_photo"] = tuple(rotation.T.ravel().tolist())  # column by column
+            width, height = target.viewport[2:]
+            tangent = math.tan(math.radians(vertical_fov_degrees) / 2)
+            self._program["tangent"] = (tangent * width / height, tangent)
+        self._triangle.render(moderngl.TRIANGLES, vertices=3)
+
+    def release(self) -> None:
+        """Free the GL objects."""
+        self.upload_photos(None, np.zeros((0, 4, 4)))
+        self._triangle.release()
+        self._programs.release()
 
 
 class Viewer:
-    """Everything the window shows; tests run it on a context without a window.
+    """Everything that the window shows; tests run it on a context without a window.
 
     Attributes:
-        state: what a person can change.
-        panels: the panels, with the places of their widgets.
-        facts: what the panels showed in the last frame.
+        state: what a user can change.
+        panels: the panels, with the rectangles of their widgets.
+        panel_data: what the panels showed in the last frame.
         screenshots: files written so far.
     """
 
     def __init__(
         self,
         ctx: moderngl.Context,
-        loader: Loader,
+        loader: SceneLoader,
         *,
-        find: Callable[[Path], list[Entry]],
+        find: Callable[[Path], list[SceneEntry]],
         state: ViewerState | None = None,
         folder: Path = Path("renders"),
         at: float = 0.0,
         dpi_scale: float = 1.0,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        """Make GL objects on the current context.
+        """Create GL objects on the current context.
 
         Args:
             ctx: the context to draw with.
-            loader: makes scenes from entries; closed with the viewer.
-            find: entries of a path that a person opens or drops.
-            state: to start from.
-            folder: screenshots go to a folder in it that has the entry's name.
-            at: where on the flight to enter a scene.
+            loader: loads entries; closed with the viewer.
+            find: returns the entries of a path that a user opens or drops.
+            state: the initial state.
+            folder: screenshots are written to its subfolder with the entry's name.
+            at: fraction of the flight at which a scene is entered.
             dpi_scale: size of the panels.
-            clock: seconds.
+            clock: returns seconds.
         """
         self.ctx, self.loader, self.state = ctx, loader, state or ViewerState()
-        self.panels, self.facts = Panels(), Facts()
-        self.entries: list[Entry] = []
+        self.panels, self.panel_data = Panels(), PanelData()
+        self.entries: list[SceneEntry] = []
         self.screenshots: list[Path] = []
         self.gui = Gui(dpi_scale)
         self.renderer = SplatRenderer(ctx)
         self.presenter = Presenter(ctx)
         self._find, self._folder, self._at, self._clock = find, folder, at, clock
-        self._pacer = Pacer()
-        self._loaded: Loaded | None = None
-        self._picture: moderngl.Texture | None = None
-        self._drawn: tuple[object, ...] | None = None
+        self._resolution = AdaptiveResolution()
+        self._loaded: LoadedScene | None = None
+        self._image: moderngl.Texture | None = None
+        self._image_key: tuple[object, ...] | None = None
         self._last_camera = self.state.camera
 
     @property
     def busy(self) -> bool:
-        """Whether the next frame will differ without any new input."""
-        return self.moving or self.facts.loading is not None
+        """Whether the next frame differs without new input."""
+        return self.moving or self.panel_data.loading is not None
 
     @property
     def moving(self) -> bool:
-        """Whether the picture is still changing: a window should draw as often as it can."""
-        recently = self._clock() - self._pacer.last_motion < 2 * REFINE_AFTER
-        unsettled = self._picture is not None and not self.renderer.stats.settled
+        """Whether the image is still changing, so that a window draws as often as it can."""
+        recently = self._clock() - self._resolution.last_motion < 2 * REFINE_AFTER
+        unsettled = self._image is not None and not self.renderer.stats.settled
         return self.state.playing or recently or unsettled
 
     def open(self, path: Path) -> None:
-        """Show what a path holds; an unusable path is said in the window and changes nothing else."""
+        """Show the scenes at a path; for an invalid path, show an error and keep the current scene."""
         try:
             entries = self._find(path)
         except (InputError, OSError) as error:
-            self.facts.error = str(error)
+            self.panel_data.error = str(error)
             return
         self.show(entries, 0)
 
-    def show(self, entries: list[Entry], index: int) -> None:
-        """Offer these entries and load one of them."""
+    def show(self, entries: list[SceneEntry], index: int) -> None:
+        """List these entries and load one of them."""
         self.entries = entries
-        self.facts.entries = [entry.name for entry in entries]
-        self.facts.current, self.facts.error = index, None
+        self.panel_data.entries = [entry.name for entry in entries]
+        self.panel_data.current, self.panel_data.error = index, None
         self.loader.request(entries[index])
 
     def frame(self, target: moderngl.Framebuffer, seconds: float, new_frame: Callable[[], None] | None = None) -> None:
-        """Take the input, let `seconds` pass, and draw picture and panels into `target`'s viewport.
+        """Apply the input of a frame of `seconds`, and draw image and panels into the viewport of `target`.
 
-        `new_frame` tells imgui about the window (size, pointer); without it the caller has set imgui's io.
+        `new_frame` passes the window's size and pointer to imgui; without it the caller has set imgui's io.
         """
-        begun = time.perf_counter()
+        start = time.perf_counter()
         now, size = self._clock(), target.viewport[2:]
-        self._collect(now)
+        self._take_loaded(now)
         self.gui.begin(seconds, new_frame)
-        self._update_facts()
-        requests = self.panels.draw(self.state, self.facts, now)
-        # One slow frame must not fling the camera away, nor skip most of a flight.
-        wishes = apply(self.state, read_input(min(seconds, _LONGEST_STEP)))
-        advance(self.state, min(seconds, 2 * _LONGEST_STEP))
-        requests.png, requests.exr = requests.png or wishes.png, requests.exr or wishes.exr
+        self._update_panel_data()
+        panel_commands = self.panels.draw(self.state, self.panel_data, now)
+        # The step is limited, so that after a slow frame the camera does not move far.
+        key_commands = apply_input(self.state, read_input(min(seconds, _MAX_STEP_SECONDS)))
+        advance_flight(self.state, min(seconds, 2 * _MAX_STEP_SECONDS))
         target.use()
         self.ctx.clear(*self.state.settings.background)
         if self._loaded is not None:
-            if wishes.focus:
-                self._focus()
-            self._draw(size, target, now)
+            if key_commands.focus:
+                self._focus_centre()
+            self._draw_image(size, target, now)
         self.gui.end(self.ctx, target)
-        self._serve(requests, size, now)
-        milliseconds = 1000 * (time.perf_counter() - begun)
-        self.facts.frame_ms += (milliseconds - self.facts.frame_ms) * (0.15 if self.facts.frame_ms else 1.0)
+        for commands in (panel_commands, key_commands):
+            self._execute(commands, size, now)
+        milliseconds = 1000 * (time.perf_counter() - start)
+        data = self.panel_data
+        data.frame_ms += (milliseconds - data.frame_ms) * (0.15 if data.frame_ms else 1.0)
 
     def close(self) -> None:
         """Stop the threads and free every GL object; the context must still be current."""
@@ -144,111 +265,113 @@ class Viewer:
         self.renderer.release()
         self.gui.close()
 
-    def _collect(self, now: float) -> None:
-        """Take over what the loader has finished."""
-        outcome = self.loader.poll()
-        if isinstance(outcome, Loaded):
+    def _take_loaded(self, now: float) -> None:
+        """Show the scene, or the error, of a load that has finished."""
+        result = self.loader.poll()
+        if isinstance(result, LoadedScene):
             try:
-                self.renderer.upload(outcome.scene)
-            except (InputError, moderngl.Error) as error:  # the latter when it does not fit the GPU
-                self.facts.error = f"{outcome.entry.name}: {error}"
+                self.renderer.upload(result.scene)
+            except (InputError, moderngl.Error) as error:  # moderngl.Error: the GPU's memory is exhausted
+                self.panel_data.error = f"{result.entry.name}: {error}"
                 return
-            self._enter(outcome, now)
-        elif isinstance(outcome, InputError):
-            self.facts.error = str(outcome)
-        elif outcome is not None:
-            # Not the person's input: a fault of ours or of the machine (out of memory).
-            self.facts.error = f"{type(outcome).__name__}: {outcome}"
+            self._enter(result, now)
+        elif isinstance(result, InputError):
+            self.panel_data.error = str(result)
+        elif result is not None:  # not a user error: a defect, or out of memory
+            self.panel_data.error = f"{type(result).__name__}: {result}"
 
-    def _enter(self, loaded: Loaded, now: float) -> None:
-        self._loaded, self._drawn, self._picture = loaded, None, None
-        self._pacer = Pacer()
+    def _enter(self, loaded: LoadedScene, now: float) -> None:
+        self._loaded, self._image_key, self._image = loaded, None, None
+        self._resolution = AdaptiveResolution()
         photos = loaded.photos
         images = None if photos is None else photos.images.permute(0, 2, 3, 1).numpy()
         poses = np.zeros((0, 4, 4)) if photos is None else photos.cam2world.double().numpy()
         self.presenter.upload_photos(images, poses)
-        enter(self.state, loaded.scene, at=self._at)
+        enter_scene(self.state, loaded.scene, at=self._at)
         self._last_camera = self.state.camera
-        self.state.say(f"{loaded.entry.name}   (H shows the keys)", now)
+        self.state.show_message(f"{loaded.entry.name}   (H shows the keys)", now)
 
-    def _update_facts(self) -> None:
-        facts = self.facts
-        facts.stats, facts.loading = self.renderer.stats, self.loader.progress
-        facts.photo_name = None
+    def _update_panel_data(self) -> None:
+        data, photo = self.panel_data, self._nearest_photo()
+        data.stats, data.loading = self.renderer.stats, self.loader.progress
+        data.photo_name = None
+        if photo is not None and self._loaded and self._loaded.photos:
+            data.photo_name = self._loaded.photos.names[photo]
+
+    def _nearest_photo(self) -> int | None:
+        """Return the index of the photograph nearest to the camera; None if there is none."""
         photos = self._loaded.photos if self._loaded else None
-        if photos is not None and self.presenter.photo_count:
-            poses = photos.cam2world.double().numpy()
-            facts.photo_name = photos.names[cameras.nearest_view(self.state.camera, poses)]
+        if photos is None or not self.presenter.photo_count:
+            return None
+        return cameras.nearest_view(self.state.camera, photos.cam2world.double().numpy())
 
-    def _draw(self, size: tuple[int, int], target: moderngl.Framebuffer, now: float) -> None:
+    def _draw_image(self, size: tuple[int, int], target: moderngl.Framebuffer, now: float) -> None:
         camera = self.state.camera
         moved = camera.position != self._last_camera.position
         turned = not moved and camera != self._last_camera
         self._last_camera = camera
-        plan = self._pacer.plan(now, moved=moved, turned=turned, adaptive=self.state.adaptive)
-        picture = self._render(cameras.pose(camera), size, plan)
-        target.use()
-        photo = None
-        if self.state.photo and self.facts.photo_name is not None and self._loaded and self._loaded.photos:
-            photo = cameras.nearest_view(camera, self._loaded.photos.cam2world.double().numpy())
+        plan = self._resolution.plan(now, moved=moved, turned=turned, adaptive=self.state.adaptive)
+        image = self._render(cameras.pose(camera), size, plan)
         self.presenter.draw(
-            picture,
+            image,
             target,
-            photo=photo,
+            photo=self._nearest_photo() if self.state.photo else None,
             split=self.state.split,
             cam2world=cameras.pose(camera),
             vertical_fov_degrees=camera.vertical_fov_degrees,
         )
 
-    def _render(self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], plan: Plan) -> moderngl.Texture:
-        """The picture of this plan, drawn only when something changed since the last one."""
-        drawn = (max(round(size[0] * plan.scale), 1), max(round(size[1] * plan.scale), 1))
+    def _render(
+        self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], plan: ResolutionPlan
+    ) -> moderngl.Texture:
+        """Return the image of this plan; renders only if something changed since the last frame."""
+        scaled = (max(round(size[0] * plan.scale), 1), max(round(size[1] * plan.scale), 1))
         settings = replace(self.state.draw_settings, cached=plan.cached)
-        key = (cam2world.tobytes(), drawn, settings)
-        if self._picture is None or key != self._drawn or not self.renderer.stats.settled:
-            self._picture = self.renderer.render(cam2world, drawn, settings, wait=False)
-            self._pacer.measure(plan, self.renderer.stats.frame_ms)
-            self._drawn = key
-            self.facts.size = drawn
-        assert self._picture is not None
-        return self._picture
+        key = (cam2world.tobytes(), scaled, settings)
+        if self._image is None or key != self._image_key or not self.renderer.stats.settled:
+            self._image = self.renderer.render(cam2world, scaled, settings, wait=False)
+            self._resolution.record(plan, self.renderer.stats.frame_ms)
+            self._image_key = key
+            self.panel_data.size = scaled
+        assert self._image is not None
+        return self._image
 
-    def _focus(self) -> None:
-        """Turn orbits around what is in the middle of the last picture."""
-        if self._picture is None:
+    def _focus_centre(self) -> None:
+        """Orbit the point in the centre of the last image."""
+        if self._image is None:
             return
-        distance = middle_depth(self.renderer.read_depth())
-        self._picture = None  # drawn anew for its depth; the texture is not the one we held
+        distance = centre_depth(self.renderer.read_depth())
+        self._image = None  # `read_depth` may have replaced the texture
         if distance is not None:
             camera = self.state.camera
             point = np.asarray(camera.position) + distance * cameras.rotation(camera)[:, 2]
             self.state.camera = cameras.focus(camera, point)
             self.state.orbiting = True
 
-    def _serve(self, requests: Requests, size: tuple[int, int], now: float) -> None:
-        """Do what the panels asked for, after the frame."""
-        if requests.dismiss_error:
-            self.facts.error = None
-        if requests.choose is not None and requests.choose != self.facts.current:
-            self.show(self.entries, requests.choose)
-        elif requests.open is not None:
-            self.open(Path(requests.open).expanduser())
+    def _execute(self, commands: Commands, size: tuple[int, int], now: float) -> None:
+        """Execute the commands of the frame, except `focus`."""
+        if commands.dismiss_error:
+            self.panel_data.error = None
+        if commands.choose is not None and commands.choose != self.panel_data.current:
+            self.show(self.entries, commands.choose)
+        elif commands.open is not None:
+            self.open(Path(commands.open).expanduser())
         if self._loaded is None:
             return
-        if requests.png:
-            self._screenshot("png", size, now)
-        if requests.exr:
-            self._screenshot("exr", size, now)
-        if requests.panorama:
-            self._screenshot("png", (2 * PANORAMA_HEIGHT, PANORAMA_HEIGHT), now, panorama=True)
+        if commands.png:
+            self._write_screenshot("png", size, now)
+        if commands.exr:
+            self._write_screenshot("exr", size, now)
+        if commands.panorama:
+            self._write_screenshot("png", (2 * PANORAMA_HEIGHT, PANORAMA_HEIGHT), now, panorama=True)
 
-    def _screenshot(self, suffix: str, size: tuple[int, int], now: float, *, panorama: bool = False) -> None:
+    def _write_screenshot(self, suffix: str, size: tuple[int, int], now: float, *, panorama: bool = False) -> None:
         assert self._loaded is not None
         settings = self.state.draw_settings
         if panorama:
             settings = replace(settings, layout="equirect")
         self.renderer.render(cameras.pose(self.state.camera), size, settings, wait=True)
-        self._picture = None  # the texture now shows the screenshot
+        self._image = None  # the texture holds the screenshot
         try:
             path = write_screenshot(
                 self._folder / self._loaded.entry.folder_name,
@@ -258,7 +381,17 @@ class Viewer:
                 panorama=panorama,
             )
         except (InputError, OSError) as error:
-            self.facts.error = f"no screenshot written: {error}"
+            self.panel_data.error = f"no screenshot written: {error}"
             return
         self.screenshots.append(path)
-        self.state.say(f"wrote {path}", now)
+        self.state.show_message(f"wrote {path}", now)
+
+
+def centre_depth(depth: Float[np.ndarray, "height width"]) -> float | None:
+    """Return the median depth around the image centre, metres; None if nothing is drawn there."""
+    row, column = depth.shape[0] // 2, depth.shape[1] // 2
+    for reach in (4, 16, 64):
+        window = depth[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
+        if (window > 0).any():
+            return float(np.median(window[window > 0]))
+    return None

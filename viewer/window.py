@@ -1,4 +1,7 @@
-"""The window: glfw, the loop, files dropped on it. imgui_bundle goes before glfw, whose library it brings."""
+"""The glfw window and its event loop.
+
+imgui_bundle must be imported before glfw, because it selects the glfw library.
+"""
 
 import ctypes
 import os
@@ -12,19 +15,19 @@ from typing import Any
 import moderngl
 from imgui_bundle import imgui
 
-from pansplat_viewer.llvm import load_before_mesa
+from pansplat_viewer.offscreen import load_llvm_before_mesa
 from pansplat_viewer.viewer import Viewer
 
 _DEBIAN = "on Debian or Ubuntu: apt-get install libgl1 libegl1 libgl1-mesa-dri libgles2"
-_IDLE_SECONDS = 0.1  # between frames when nothing moves: a prediction in its thread needs the processor
+_IDLE_SECONDS = 0.1  # between frames when nothing moves; leaves the CPU to a prediction
 
 
 class NoWindowError(Exception):
-    """No window can be opened here; the message says why, in one line."""
+    """No window can be opened; the message has the reason, in one line."""
 
 
 def display_problem() -> str | None:
-    """Why there can be no window, as far as the environment tells; None when it is worth trying."""
+    """Return why no window can be opened according to the environment; None if it may be possible."""
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         return "no display (neither DISPLAY nor WAYLAND_DISPLAY is set)"
     return None
@@ -34,20 +37,20 @@ class Window:
     """A glfw window with a current OpenGL 3.3 core context.
 
     Attributes:
-        ctx: moderngl's view of the context.
-        dropped: paths dropped on the window since they were last taken.
+        ctx: the context.
+        dropped: paths that were dropped on the window and not yet opened.
     """
 
     def __init__(self, title: str, size: tuple[int, int]) -> None:
-        """Open it, `size` in screen coordinates.
+        """Open the window; `size` is in screen coordinates.
 
         Raises:
-            NoWindowError: no display, or none with OpenGL 3.3.
+            NoWindowError: there is no display, or it has no OpenGL 3.3.
         """
         problem = display_problem()
         if problem:
             raise NoWindowError(problem)
-        load_before_mesa()
+        load_llvm_before_mesa()
         self._glfw = _import_glfw()
         self.dropped: list[Path] = []
         self._handle = self._create(title, size)
@@ -56,7 +59,7 @@ class Window:
 
     def _create(self, title: str, size: tuple[int, int]) -> Any:
         glfw = self._glfw
-        with warnings.catch_warnings(record=True) as caught:  # glfw's errors arrive as warnings
+        with warnings.catch_warnings(record=True) as caught:  # glfw reports errors as warnings
             warnings.simplefilter("always")
             if not glfw.init():
                 raise NoWindowError(f"the display cannot be used ({_reason(caught)})")
@@ -73,14 +76,14 @@ class Window:
         glfw.swap_interval(1)
         try:
             self.ctx = moderngl.create_context(require=330)
-        except Exception as error:  # moderngl raises its own and plain exceptions
+        except Exception as error:  # moderngl raises moderngl.Error and plain Exception
             glfw.terminate()
             raise NoWindowError(f"the display has no OpenGL 3.3 ({error}); {_DEBIAN}") from error
         return handle
 
     @property
     def dpi_scale(self) -> float:
-        """How much larger text must be than on a plain screen, in the window's coordinates."""
+        """Scale of text relative to a standard-resolution screen, in window coordinates."""
         content = self._glfw.get_window_content_scale(self._handle)[0]
         pixels = self._glfw.get_framebuffer_size(self._handle)[0]
         points = self._glfw.get_window_size(self._handle)[0]
@@ -88,24 +91,24 @@ class Window:
 
     @property
     def framebuffer_size(self) -> tuple[int, int]:
-        """Pixels of the window's content; 0 while it is minimised."""
+        """Size of the window's content, pixels; 0 while it is minimised."""
         return self._glfw.get_framebuffer_size(self._handle)
 
     def attach_gui(self) -> None:
-        """Give imgui the window's events; after imgui's context was made."""
+        """Send the window's events to imgui; call after imgui's context is created."""
         address = ctypes.cast(self._handle, ctypes.c_void_p).value
         assert address is not None
         imgui.backends.glfw_init_for_opengl(address, True)
         self._backend = True
 
     def detach_gui(self) -> None:
-        """Take the events away again; before imgui's context goes."""
+        """Stop sending events to imgui; call before imgui's context is destroyed."""
         if self._backend:
             imgui.backends.glfw_shutdown()
             self._backend = False
 
     def wait(self, seconds: float) -> None:
-        """Take in events; sleep until one comes, at most so long."""
+        """Process events; wait up to `seconds` for the first."""
         if seconds <= 0:
             self._glfw.poll_events()
         else:
@@ -113,19 +116,19 @@ class Window:
 
     @property
     def closing(self) -> bool:
-        """Whether the person closed the window."""
+        """Whether the user closed the window."""
         return bool(self._glfw.window_should_close(self._handle))
 
     def set_title(self, title: str) -> None:
-        """Show another title."""
+        """Set the window's title."""
         self._glfw.set_window_title(self._handle, title)
 
     def swap(self) -> None:
-        """Show what was drawn."""
+        """Swap front and back buffers."""
         self._glfw.swap_buffers(self._handle)
 
     def close(self) -> None:
-        """Destroy the window and leave glfw."""
+        """Destroy the window and terminate glfw."""
         self._glfw.destroy_window(self._handle)
         self._glfw.terminate()
 
@@ -134,7 +137,7 @@ class Window:
 
 
 def run(window: Window, make_viewer: Callable[[moderngl.Context, float], Viewer]) -> None:
-    """Show a viewer until the person leaves; everything is freed, threads are joined."""
+    """Run a viewer in the window until the user quits, then free everything and join all threads."""
     viewer = make_viewer(window.ctx, window.dpi_scale)
     try:
         window.attach_gui()
@@ -154,7 +157,7 @@ def _loop(window: Window, viewer: Viewer) -> None:
         moving = viewer.moving or before < active_until
         window.wait(0.0 if moving else _IDLE_SECONDS)
         if not moving and time.perf_counter() - before < 0.9 * _IDLE_SECONDS:
-            active_until = time.perf_counter() + 0.25  # an event: imgui needs a few frames to answer it
+            active_until = time.perf_counter() + 0.25  # an event: imgui needs a few frames to process it
         if window.dropped:
             viewer.open(window.dropped[-1])
             window.dropped.clear()
@@ -171,8 +174,8 @@ def _loop(window: Window, viewer: Viewer) -> None:
 
 
 def _title(viewer: Viewer) -> str:
-    current = viewer.facts.current
-    return f"{viewer.facts.entries[current]} - pansplat" if current >= 0 else "pansplat"
+    data = viewer.panel_data
+    return f"{data.entries[data.current]} - pansplat" if data.current >= 0 else "pansplat"
 
 
 def _import_glfw() -> Any:
@@ -184,5 +187,5 @@ def _import_glfw() -> Any:
 
 
 def _reason(caught: list[warnings.WarningMessage]) -> str:
-    text = str(caught[-1].message) if caught else "no reason given"
+    text = str(caught[-1].message) if caught else "unknown reason"
     return " ".join(text.split())

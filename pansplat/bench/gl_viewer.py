@@ -55,7 +55,7 @@ def measure_viewer(bench: Bench, group: Group, repeats: int) -> None:
         for line in _lines(Path(folder) / "job.json", cases[0].threads):
             case = cases[line["settings"]]
             row = _row(group, case, len(gaussians), line)
-            color = torch.from_numpy(np.load(line["picture"])[..., :3]).permute(2, 0, 1)
+            color = torch.from_numpy(np.load(line["image"])[..., :3]).permute(2, 0, 1)
             judge(row, case, color, *truths[line["settings"]])
             bench.add([row])
 

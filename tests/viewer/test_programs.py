@@ -26,8 +26,9 @@ def test_readme_names_every_file_uniform_and_input():
 
 def test_includes_are_resolved_and_the_version_comes_first():
     for name in SOURCES:
-        lines = source(name, 330, SOURCE=2).splitlines()
-        assert lines[:2] == ["#version 330 core", "#define SOURCE 2"]
+        lines = source(name, 330, LAYER_STORAGE=2).splitlines()
+        assert lines[0] == "#version 330 core" and "#define LAYER_STORAGE 2" in lines[1:8]
+        assert f"#define ALPHA_CUT {1 / 255}" in lines[1:8]
         assert not any(line.startswith("#include") for line in lines)
 
 
@@ -42,8 +43,8 @@ def test_faces_are_those_of_the_cubemap():
 @pytest.mark.gl
 def test_every_program_compiles(ctx):
     programs = Programs(ctx)
-    made = [programs.project(), programs.project_compute(), programs.splat(), programs.finish()]
-    made += [programs.gather(kept_as) for kept_as in range(3)]
+    made = [programs.project(), programs.project_compute(), programs.splat(), programs.resolve()]
+    made += [programs.accumulate(kept_as) for kept_as in range(3)]
     assert len({program.glo for program in made}) == 7
-    assert programs.gather(1) is programs.gather(1)
+    assert programs.accumulate(1) is programs.accumulate(1)
     programs.release()

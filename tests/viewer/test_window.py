@@ -155,7 +155,7 @@ def test_what_is_dropped_on_the_window_is_opened():
     class Opener:
         moving = True
         state = SimpleNamespace(quit=False)
-        facts = SimpleNamespace(current=-1)
+        panel_data = SimpleNamespace(current=-1)
         opened: ClassVar[list[Path]] = []
 
         def open(self, path: Path) -> None:

@@ -1,6 +1,6 @@
-"""Keys and mouse: what a person did in one frame, and what it does to the state.
+"""Keys and mouse: the input of one frame, and its effect on the viewer's state.
 
-`read_input` asks imgui, so a window, synthetic events and tests take the same way. `apply` is pure.
+`read_input` reads imgui, so a window and synthetic events in tests use the same path. `apply_input` is pure.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pansplat_viewer import camera as cameras
-from pansplat_viewer.state import ViewerState, jump, step_flight, toggle_play
+from pansplat_viewer.state import ViewerState, jump_to_view, step_flight, toggle_play
 
-FLY_SPEED = 1.0  # metres a second
+FLY_SPEED = 1.0  # metres per second
 FAST, SLOW = 4.0, 0.2
-ORBIT_KEY_PIXELS = 400.0  # a second, of a window 1000 high
+ORBIT_KEY_PIXELS = 400.0  # per second, of a window 1000 pixels high
 
-# Shown by H and printed in docs/viewer.md; the order is that of the help window.
+# The key help of the window and of docs/viewer.md, in the order of the window.
 HELP = (
     ("W A S D", "fly forward, left, back, right"),
     ("Q E", "fly down, up"),
@@ -25,7 +25,7 @@ HELP = (
     ("right drag", "pan"),
     ("scroll", "field of view (orbit: distance)"),
     ("V", "orbit or fly"),
-    ("F", "focus the point in the middle"),
+    ("F", "focus the point in the centre"),
     ("1 2", "jump to panorama 1, 2"),
     ("Space", "play the flight between them"),
     (", .", "step along the flight"),
@@ -34,21 +34,21 @@ HELP = (
     ("R", "back to the start"),
     ("Tab", "panels on or off"),
     ("H", "this help"),
-    ("Esc, Ctrl Q", "leave"),
+    ("Esc, Ctrl Q", "quit"),
 )
 
 
 @dataclass(frozen=True)
 class Input:
-    """What happened in one frame.
+    """Keys and mouse in one frame.
 
     Attributes:
         seconds: since the last frame.
         held: names of the keys that are down (lower case: "w", "shift", ...).
         pressed: names of the keys that went down in this frame.
-        drag: pointer movement with the left button held on the picture, pixels (right, down).
+        drag: pointer movement over the image with the left button held, pixels (right, down).
         pan: the same with the right or middle button.
-        scroll: wheel steps, positive away from the person.
+        scroll: wheel steps; positive is scrolling up.
         height: of the window, pixels.
     """
 
@@ -61,21 +61,30 @@ class Input:
     height: int = 720
 
 
-@dataclass(frozen=True)
-class Wishes:
-    """What the input asks for that is not a change of state: pictures, and the depth to focus on."""
+@dataclass
+class Commands:
+    """Actions, given by keys or panels, that are not a change of the state.
+
+    Attributes:
+        png, exr, panorama: write a screenshot.
+        focus: orbit the point in the image centre.
+        choose: show the entry of this index.
+        open: show the scenes at this path.
+        dismiss_error: close the error message.
+    """
 
     png: bool = False
     exr: bool = False
+    panorama: bool = False
     focus: bool = False
+    choose: int | None = None
+    open: str | None = None
+    dismiss_error: bool = False
 
 
 _KEYS = {
     **{letter: letter for letter in "wasdqevfhprc"},
-    "1": "_1",
-    "2": "_2",
-    "3": "_3",
-    "4": "_4",
+    **{digit: f"_{digit}" for digit in "1234"},
     "space": "space",
     ",": "comma",
     ".": "period",
@@ -89,7 +98,7 @@ _KEYS = {
 
 
 def read_input(seconds: float) -> Input:
-    """This frame's input from imgui; nothing that a panel wants for itself."""
+    """Return this frame's input from imgui, without what a panel captures."""
     from imgui_bundle import imgui
 
     io = imgui.get_io()
@@ -117,19 +126,18 @@ def read_input(seconds: float) -> Input:
     return Input(seconds, frozenset(held), frozenset(pressed), drag, pan, scroll, int(io.display_size.y))
 
 
-def apply(state: ViewerState, given: Input) -> Wishes:
-    """Change the state as the input says; returns what else was asked for."""
+def apply_input(state: ViewerState, given: Input) -> Commands:
+    """Apply the input to the state; returns the commands in it."""
     if "ctrl" in given.held:
-        state.quit = state.quit or bool({"q"} & given.pressed)
-        return Wishes()
-    _press(state, given.pressed)
-    _move(state, given)
-    shift = "shift" in given.held
-    shot = "p" in given.pressed
-    return Wishes(png=shot and not shift, exr=shot and shift, focus="f" in given.pressed)
+        state.quit = state.quit or "q" in given.pressed
+        return Commands()
+    _apply_pressed(state, given.pressed)
+    _move_camera(state, given)
+    shift, screenshot = "shift" in given.held, "p" in given.pressed
+    return Commands(png=screenshot and not shift, exr=screenshot and shift, focus="f" in given.pressed)
 
 
-def _press(state: ViewerState, pressed: frozenset[str]) -> None:
+def _apply_pressed(state: ViewerState, pressed: frozenset[str]) -> None:
     if "escape" in pressed:
         if state.help:
             state.help = False
@@ -149,14 +157,14 @@ def _press(state: ViewerState, pressed: frozenset[str]) -> None:
         state.playing, state.camera = False, state.home
     for view in range(4):
         if str(view + 1) in pressed:
-            jump(state, view)
+            jump_to_view(state, view)
     if "," in pressed:
         step_flight(state, -1)
     if "." in pressed:
         step_flight(state, 1)
 
 
-def _move(state: ViewerState, given: Input) -> None:
+def _move_camera(state: ViewerState, given: Input) -> None:
     held = given.held
     axes = np.array(
         (
@@ -169,9 +177,9 @@ def _move(state: ViewerState, given: Input) -> None:
     factor = (FAST if "shift" in held else 1.0) * (SLOW if "alt" in held else 1.0)
     camera = state.camera
     if state.orbiting:
-        reach = ORBIT_KEY_PIXELS * given.seconds * factor * given.height / 1000
+        pixels = ORBIT_KEY_PIXELS * given.seconds * factor * given.height / 1000
         if axes[0] or axes[1]:
-            camera = cameras.orbit(camera, (-axes[0] * reach, axes[1] * reach), given.height)
+            camera = cameras.orbit(camera, (-axes[0] * pixels, axes[1] * pixels), given.height)
         if axes[2]:
             camera = cameras.dolly(camera, axes[2] * 6 * given.seconds * factor)
         if any(given.drag):
@@ -190,7 +198,7 @@ def _move(state: ViewerState, given: Input) -> None:
         metres = camera.distance / max(given.height, 1)
         camera = cameras.fly(camera, -given.pan[0] * metres, given.pan[1] * metres, 0.0)
     if camera != state.camera:
-        # The hand on the controls wins over the flight, except that a zoom does not stop it.
+        # Moving the camera stops the flight; a change of the field of view alone does not.
         moved = replace(camera, vertical_fov_degrees=state.camera.vertical_fov_degrees) != state.camera
         state.playing = state.playing and not moved
         state.camera = camera

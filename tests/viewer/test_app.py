@@ -9,9 +9,9 @@ from PIL import Image
 
 from pansplat.errors import InputError
 from pansplat.gaussians.ply import save_ply
-from pansplat_viewer.app import Options, choose, run
-from pansplat_viewer.flythrough import STILLS, Film, flight_pose, panorama_pose
-from pansplat_viewer.library import Entry, LoadOptions
+from pansplat_viewer.app import Options, choose_entry, run
+from pansplat_viewer.capture import STILLS, Film, flight_pose, panorama_pose
+from pansplat_viewer.loader import LoadOptions, SceneEntry
 
 
 @pytest.fixture
@@ -91,12 +91,12 @@ def test_a_damaged_scene_is_refused_with_status_2(room, capsys):
 
 
 def test_pairs_are_chosen_by_name_or_number():
-    entries = [Entry("bath"), Entry("kitchen"), Entry("hall")]
-    assert choose(entries, None) == 0
-    assert choose(entries, "kitchen") == 1
-    assert choose(entries, "3") == 2
+    entries = [SceneEntry("bath"), SceneEntry("kitchen"), SceneEntry("hall")]
+    assert choose_entry(entries, None) == 0
+    assert choose_entry(entries, "kitchen") == 1
+    assert choose_entry(entries, "3") == 2
     with pytest.raises(InputError, match="bath, kitchen, hall"):
-        choose(entries, "4")
+        choose_entry(entries, "4")
 
 
 def test_what_is_said_of_the_prediction_reaches_it(tmp_path):
@@ -130,4 +130,4 @@ def test_a_scene_without_cameras_is_circled(small_scene):
 
 
 def test_a_film_has_at_least_two_pictures():
-    assert Film(seconds=0).frames == 2 and Film(seconds=2, fps=24).frames == 48
+    assert Film(seconds=0).num_frames == 2 and Film(seconds=2, fps=24).num_frames == 48

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from pansplat_viewer import camera as cameras
-from pansplat_viewer.controls import FAST, FLY_SPEED, SLOW, Input, Wishes, apply
-from pansplat_viewer.state import ViewerState, advance, enter
+from pansplat_viewer.input import FAST, FLY_SPEED, SLOW, Commands, Input, apply_input
+from pansplat_viewer.state import ViewerState, advance_flight, enter_scene
 
 
 @pytest.fixture
 def state(small_scene) -> ViewerState:
     state = ViewerState()
-    enter(state, small_scene)
+    enter_scene(state, small_scene)
     return state
 
 
@@ -29,7 +29,7 @@ def press(*keys: str, held: tuple[str, ...] = ()) -> Input:
     ],
 )  # fmt: skip
 def test_fly_keys_move_at_the_flying_speed(state, key, step):
-    apply(state, Input(seconds=0.5, held=frozenset((key,))))
+    apply_input(state, Input(seconds=0.5, held=frozenset((key,))))
     assert np.allclose(state.camera.position, 0.5 * FLY_SPEED * np.array(step))
 
 
@@ -37,137 +37,137 @@ def test_shift_is_faster_and_alt_slower(state):
     moved = []
     for held in (("w",), ("w", "shift"), ("w", "alt")):
         state.camera = state.home
-        apply(state, Input(seconds=0.1, held=frozenset(held)))
+        apply_input(state, Input(seconds=0.1, held=frozenset(held)))
         moved.append(state.camera.position[2])
     assert moved == pytest.approx([0.1, 0.1 * FAST, 0.1 * SLOW])
 
 
 def test_opposite_keys_cancel(state):
-    apply(state, Input(held=frozenset("wsadqe")))
+    apply_input(state, Input(held=frozenset("wsadqe")))
     assert state.camera == state.home
 
 
 def test_drag_looks_around_without_moving(state):
-    apply(state, Input(drag=(-100.0, 0.0)))
+    apply_input(state, Input(drag=(-100.0, 0.0)))
     assert state.camera.yaw_radians > 0 and state.camera.position == state.home.position
 
 
 def test_scroll_zooms_when_flying_and_approaches_when_orbiting(state):
-    apply(state, Input(scroll=1.0))
+    apply_input(state, Input(scroll=1.0))
     assert state.camera.vertical_fov_degrees < state.home.vertical_fov_degrees
-    apply(state, press("v"))
+    apply_input(state, press("v"))
     before = state.camera
-    apply(state, Input(scroll=1.0))
+    apply_input(state, Input(scroll=1.0))
     assert state.camera.distance < before.distance
     assert state.camera.vertical_fov_degrees == before.vertical_fov_degrees
 
 
 def test_v_toggles_orbiting_and_drag_then_turns_around_the_point_ahead(state):
-    apply(state, press("v"))
+    apply_input(state, press("v"))
     assert state.orbiting
     center = cameras.orbit_center(state.camera)
-    apply(state, Input(drag=(80.0, 10.0)))
+    apply_input(state, Input(drag=(80.0, 10.0)))
     assert np.allclose(cameras.orbit_center(state.camera), center)
     assert state.camera.position != state.home.position
     for key in "wasdqe":
         before = state.camera
-        apply(state, Input(held=frozenset(key)))
+        apply_input(state, Input(held=frozenset(key)))
         assert np.allclose(cameras.orbit_center(state.camera), center) and state.camera != before
-    apply(state, press("v"))
+    apply_input(state, press("v"))
     assert not state.orbiting
 
 
 def test_pan_moves_across_the_view(state):
-    apply(state, Input(pan=(30.0, 0.0)))
+    apply_input(state, Input(pan=(30.0, 0.0)))
     assert state.camera.position[0] < 0 and state.camera.position[2] == pytest.approx(0)
 
 
 def test_numbers_jump_to_the_panoramas_and_missing_ones_do_nothing(state):
-    apply(state, press("2"))
+    apply_input(state, press("2"))
     assert np.allclose(state.camera.position, state.context[1, :3, 3]) and state.flight == 1
-    apply(state, press("1"))
+    apply_input(state, press("1"))
     assert np.allclose(state.camera.position, state.context[0, :3, 3]) and state.flight == 0
     before = state.camera
-    apply(state, press("3"))
+    apply_input(state, press("3"))
     assert state.camera == before
 
 
 def test_space_plays_the_flight_to_its_end_and_again_from_the_start(state):
-    apply(state, press("space"))
+    apply_input(state, press("space"))
     assert state.playing
     for _ in range(100):
-        advance(state, 0.1)
+        advance_flight(state, 0.1)
     assert not state.playing and state.flight == 1
     assert np.allclose(state.camera.position, state.context[1, :3, 3])
-    apply(state, press("space"))
+    apply_input(state, press("space"))
     assert state.playing and state.flight == 0
 
 
 def test_space_again_pauses(state):
-    apply(state, press("space"))
-    advance(state, 1.0)
-    apply(state, press("space"))
+    apply_input(state, press("space"))
+    advance_flight(state, 1.0)
+    apply_input(state, press("space"))
     before = state.camera
-    advance(state, 1.0)
+    advance_flight(state, 1.0)
     assert state.camera == before
 
 
 def test_flying_by_hand_stops_the_flight_but_zooming_does_not(state):
-    apply(state, press("space"))
-    apply(state, Input(scroll=1.0))
+    apply_input(state, press("space"))
+    apply_input(state, Input(scroll=1.0))
     assert state.playing
-    apply(state, Input(held=frozenset("w")))
+    apply_input(state, Input(held=frozenset("w")))
     assert not state.playing
 
 
 def test_comma_and_period_step_along_the_flight_and_stop_at_its_ends(state):
-    apply(state, press(","))
+    apply_input(state, press(","))
     assert state.flight == 0
     for _ in range(12):
-        apply(state, press("."))
+        apply_input(state, press("."))
     assert state.flight == pytest.approx(0.5)
     assert np.allclose(state.camera.position, (0, 0, 0.25))
     for _ in range(50):
-        apply(state, press("."))
+        apply_input(state, press("."))
     assert state.flight == 1
 
 
 def test_tab_h_and_c_toggle_what_is_shown(state):
     for key, name in (("tab", "overlay"), ("h", "help"), ("c", "photo")):
         before = getattr(state, name)
-        apply(state, press(key))
+        apply_input(state, press(key))
         assert getattr(state, name) is not before
-        apply(state, press(key))
+        apply_input(state, press(key))
         assert getattr(state, name) is before
 
 
 def test_r_goes_back_to_the_start(state):
-    apply(state, Input(held=frozenset("wd"), drag=(40.0, 10.0), scroll=2.0))
+    apply_input(state, Input(held=frozenset("wd"), drag=(40.0, 10.0), scroll=2.0))
     assert state.camera != state.home
-    apply(state, press("r"))
+    apply_input(state, press("r"))
     assert state.camera == state.home
 
 
 def test_p_wishes_for_a_png_and_shift_p_for_an_exr(state):
-    assert apply(state, press("p")) == Wishes(png=True)
-    assert apply(state, press("p", held=("shift",))) == Wishes(exr=True)
-    assert apply(state, press("f")) == Wishes(focus=True)
-    assert apply(state, Input()) == Wishes()
+    assert apply_input(state, press("p")) == Commands(png=True)
+    assert apply_input(state, press("p", held=("shift",))) == Commands(exr=True)
+    assert apply_input(state, press("f")) == Commands(focus=True)
+    assert apply_input(state, Input()) == Commands()
 
 
 def test_escape_closes_the_help_first_and_then_leaves(state):
     state.help = True
-    apply(state, press("escape"))
+    apply_input(state, press("escape"))
     assert not state.help and not state.quit
-    apply(state, press("escape"))
+    apply_input(state, press("escape"))
     assert state.quit
 
 
 def test_control_q_leaves_and_q_alone_does_not(state):
-    apply(state, press("q"))
+    apply_input(state, press("q"))
     assert not state.quit
     before = state.camera
-    apply(state, press("q", held=("ctrl",)))
+    apply_input(state, press("q", held=("ctrl",)))
     assert state.quit and state.camera == before
 
 
@@ -176,16 +176,16 @@ def test_entering_a_single_view_scene_leaves_the_modes_that_need_two(small_scene
     one = replace(one, cam2world=one.cam2world[:1])
     state = ViewerState()
     state.settings = replace(state.settings, mode="difference", view=1)
-    enter(state, one)
+    enter_scene(state, one)
     assert state.settings.mode == "joint" and state.settings.view == 0
     assert state.levels == (0, 1, 2, 3)
 
 
 def test_a_scene_without_cameras_is_seen_from_outside(small_scene):
     state = ViewerState()
-    enter(state, replace(small_scene, cam2world=small_scene.cam2world[:0]))
+    enter_scene(state, replace(small_scene, cam2world=small_scene.cam2world[:0]))
     means = small_scene.gaussians.means.double().numpy()
     ahead = (means - np.asarray(state.camera.position)) @ cameras.rotation(state.camera)[:, 2]
     assert (ahead > 0).mean() > 0.95
-    apply(state, press("space", "1", "."))
+    apply_input(state, press("space", "1", "."))
     assert not state.playing, "there is nowhere to fly"

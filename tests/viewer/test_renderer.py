@@ -144,7 +144,7 @@ def test_top_row_is_up_and_right_is_right(renderer, random_scene):
 
 def test_wide_and_tiled_culling_changes_nothing(renderer, random_scene, pose, monkeypatch):
     """Culling on the CPU must keep whatever the shaders would draw."""
-    from pansplat_viewer import layers
+    from pansplat_viewer.splats import SortedSplats
 
     scene = random_scene(1000, size=0.1)
     settings = [replace(SETTINGS, vertical_fov_degrees=fov) for fov in (10, 60, 150)]
@@ -154,7 +154,7 @@ def test_wide_and_tiled_culling_changes_nothing(renderer, random_scene, pose, mo
         culled.render(pose, SIZE, each)
         assert culled.stats.drawn < 1000
         pictures.append(culled.read_color())
-    monkeypatch.setattr(layers, "in_sight", lambda camera, ordering, keep, **_: keep)
+    monkeypatch.setattr(SortedSplats, "cull", lambda self, camera, selected, **_: selected)
     for each, picture in zip(settings, pictures, strict=True):
         whole.render(pose, SIZE, each)
         assert np.array_equal(whole.read_color(), picture)

@@ -16,7 +16,7 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
-from pansplat_viewer.library import Entry, Loaded, Loader
+from pansplat_viewer.loader import LoadedScene, SceneEntry, SceneLoader
 from pansplat_viewer.viewer import Viewer
 
 pytestmark = pytest.mark.gl
@@ -122,7 +122,7 @@ class Person:
         self.frames(1)
 
 
-def _sphere(entry: Entry, photos: np.ndarray) -> Loaded:
+def _sphere(entry: SceneEntry, photos: np.ndarray) -> LoadedScene:
     """A photograph, and the same photograph as Gaussians around its camera, in a world with z up."""
     pose = torch.eye(4, dtype=torch.float64)
     yaw = 0.7
@@ -144,11 +144,11 @@ def _sphere(entry: Entry, photos: np.ndarray) -> Loaded:
     )
     scene = Scene(gaussians, pose[None], 0.45, 10.0, ("a.png",), "synthetic", 128)
     mask = torch.ones(1, *image.shape[1:], dtype=torch.bool)
-    return Loaded(entry, scene, Views(image[None], pose[None], mask, 0.45, 10.0, ("a.png",)))
+    return LoadedScene(entry, scene, Views(image[None], pose[None], mask, 0.45, 10.0, ("a.png",)))
 
 
 @pytest.fixture(scope="module")
-def session(ctx, small_scene, axis_photos, tmp_path_factory) -> Iterator[Person]:
+def session(gl_context, small_scene, axis_photos, tmp_path_factory) -> Iterator[Person]:
     photos = Views(
         torch.from_numpy(axis_photos).permute(0, 3, 1, 2),
         small_scene.cam2world,
@@ -163,27 +163,29 @@ def session(ctx, small_scene, axis_photos, tmp_path_factory) -> Iterator[Person]
             return _sphere(entry, axis_photos)
         if entry.name == "damaged":
             raise InputError("damaged.ply: 100% unreadable; export it again")
-        return Loaded(entry, small_scene, None if entry.name == "no photographs" else photos)
+        return LoadedScene(entry, small_scene, None if entry.name == "no photographs" else photos)
 
-    def find(path: Path) -> list[Entry]:
+    def find(path: Path) -> list[SceneEntry]:
         if path.name == "nothing":
             raise InputError(f"{path}: no such file or folder")
-        return [Entry("opened")]
+        return [SceneEntry("opened")]
 
     clock = [0.0]
-    target = ctx.simple_framebuffer(SIZE, components=3)
+    gl_context.__enter__()
+    target = gl_context.simple_framebuffer(SIZE, components=3)
     folder = tmp_path_factory.mktemp("shots")
-    viewer = Viewer(ctx, Loader(load), find=find, folder=folder, clock=lambda: clock[0])
+    viewer = Viewer(gl_context, SceneLoader(load), find=find, folder=folder, clock=lambda: clock[0])
     imgui.get_io().display_size = SIZE
     person = Person(viewer, target, clock)
-    viewer.show([Entry("first"), Entry("second")], 0)
+    viewer.show([SceneEntry("first"), SceneEntry("second")], 0)
     person.settle()
     yield person
-    viewer.close()
+    with gl_context:
+        viewer.close()
 
 
 @pytest.fixture
-def person(session) -> Person:
+def person(session, ctx) -> Person:
     """The session with everything back to where it began."""
     state, start = session.viewer.state, type(session.viewer.state)()
     state.settings = replace(start.settings, levels=None)
@@ -201,7 +203,7 @@ def person(session) -> Person:
     ):
         setattr(state, name, getattr(start, name))
     state.camera, state.adaptive = state.home, True
-    session.viewer.facts.error = None
+    session.viewer.panel_data.error = None
     imgui.get_io().add_mouse_pos_event(SIZE[0] - 5, SIZE[1] - 5)
     session.settle()
     state.message = ""
@@ -328,8 +330,8 @@ def test_typing_a_path_does_not_fly_and_enter_opens_it(person):
     assert person.viewer.state.camera == person.viewer.state.home
     person.key(imgui.Key.enter)
     person.settle()
-    assert person.viewer.facts.entries == ["opened"]
-    person.viewer.show([Entry("first"), Entry("second")], 0)
+    assert person.viewer.panel_data.entries == ["opened"]
+    person.viewer.show([SceneEntry("first"), SceneEntry("second")], 0)
     person.settle()
 
 
@@ -344,7 +346,7 @@ def test_the_chooser_loads_the_other_pair(person):
     io.add_mouse_button_event(0, False)
     person.frames(2)
     person.settle()
-    assert person.viewer.facts.current == 1
+    assert person.viewer.panel_data.current == 1
     person.viewer.show(person.viewer.entries, 0)
     person.settle()
 
@@ -353,18 +355,18 @@ def test_opening_something_unusable_says_so_and_keeps_the_scene(person):
     before = person.picture()
     person.viewer.open(Path("nothing"))
     person.frames(2)
-    assert "no such file" in person.viewer.facts.error
+    assert "no such file" in person.viewer.panel_data.error
     assert changed(before, person.picture()) > 0.02, "the message is on the screen"
     person.click("OK")
-    assert person.viewer.facts.error is None
+    assert person.viewer.panel_data.error is None
     assert changed(before, person.picture()) == 0
 
 
 def test_a_scene_that_cannot_be_read_says_so_and_keeps_the_scene(person):
-    person.viewer.show([Entry("damaged")], 0)
+    person.viewer.show([SceneEntry("damaged")], 0)
     person.settle()
-    assert person.viewer.facts.error.startswith("damaged.ply: 100% unreadable")
-    person.viewer.show([Entry("first"), Entry("second")], 0)
+    assert person.viewer.panel_data.error.startswith("damaged.ply: 100% unreadable")
+    person.viewer.show([SceneEntry("first"), SceneEntry("second")], 0)
     person.settle()
 
 
@@ -385,7 +387,7 @@ def test_the_photograph_shows_what_lies_in_the_viewing_direction(person):
 
 
 def test_at_an_input_camera_the_rendering_looks_like_its_photograph(person):
-    person.viewer.show([Entry("sphere")], 0)
+    person.viewer.show([SceneEntry("sphere")], 0)
     person.settle()
     state = person.viewer.state
     for yaw, pitch in ((0.0, 0.0), (2.0, 0.5), (-2.0, -0.9)):
@@ -397,7 +399,7 @@ def test_at_an_input_camera_the_rendering_looks_like_its_photograph(person):
         assert np.abs(rendered - photograph).mean() < 4
         assert np.abs(rendered - photograph[:, ::-1]).mean() > 8, "a mirrored one would be told apart"
         assert np.abs(rendered - photograph[::-1]).mean() > 8, "and one upside down"
-    person.viewer.show([Entry("first"), Entry("second")], 0)
+    person.viewer.show([SceneEntry("first"), SceneEntry("second")], 0)
     person.settle()
 
 
@@ -414,13 +416,13 @@ def test_the_split_keeps_the_rendering_on_its_left(person):
 
 
 def test_a_scene_without_photographs_offers_no_comparison(person):
-    person.viewer.show([Entry("no photographs")], 0)
+    person.viewer.show([SceneEntry("no photographs")], 0)
     person.settle()
     assert "nearest photograph" not in person.viewer.panels.items
     before = person.picture()
     person.key(imgui.Key.c)
     assert changed(before, person.picture()) == 0
-    person.viewer.show([Entry("first"), Entry("second")], 0)
+    person.viewer.show([SceneEntry("first"), SceneEntry("second")], 0)
     person.settle()
 
 
@@ -465,18 +467,18 @@ def test_focus_orbits_what_is_in_the_middle(person):
 
 def test_moving_coarsens_and_standing_still_refines(person):
     viewer = person.viewer
-    viewer._pacer.budget_ms = 1e-3
+    viewer._resolution.budget_ms = 1e-3
     io = imgui.get_io()
     io.add_key_event(imgui.Key.w, True)
     person.frames(8)
-    assert viewer.facts.size[0] < SIZE[0]
+    assert viewer.panel_data.size[0] < SIZE[0]
     io.add_key_event(imgui.Key.w, False)
     person.settle()
-    assert viewer.facts.size == SIZE
+    assert viewer.panel_data.size == SIZE
     person.click("coarser while moving")
     io.add_key_event(imgui.Key.w, True)
     person.frames(4)
-    assert viewer.facts.size == SIZE
+    assert viewer.panel_data.size == SIZE
     io.add_key_event(imgui.Key.w, False)
     person.frames(1)
 
@@ -490,13 +492,13 @@ def test_the_window_stays_alive_and_shows_progress_while_loading(person, small_s
     def slow(entry, progress):
         progress("searching depth", 0.5)
         assert go.wait(20)
-        return Loaded(entry, small_scene)
+        return LoadedScene(entry, small_scene)
 
     before = person.picture()
     fast, loader._load = loader._load, slow
-    viewer.show([Entry("slow")], 0)
+    viewer.show([SceneEntry("slow")], 0)
     person.frames(5)
-    assert viewer.facts.loading == ("slow", "searching depth", 0.5)
+    assert viewer.panel_data.loading == ("slow", "searching depth", 0.5)
     pixels = np.frombuffer(person.target.read(components=3), np.uint8).reshape(SIZE[1], SIZE[0], 3)
     assert changed(before, pixels[::-1][PICTURE].astype(int)) > 0.02, "a bar is on the screen"
     person.key(imgui.Key.w, frames=3)
@@ -504,6 +506,6 @@ def test_the_window_stays_alive_and_shows_progress_while_loading(person, small_s
     go.set()
     loader._load = fast
     person.settle()
-    assert viewer.facts.loading is None
-    viewer.show([Entry("first"), Entry("second")], 0)
+    assert viewer.panel_data.loading is None
+    viewer.show([SceneEntry("first"), SceneEntry("second")], 0)
     person.settle()

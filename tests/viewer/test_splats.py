@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from pansplat_viewer import order
-from pansplat_viewer.order import Sorter, make_ordering, radix_argsort
-from pansplat_viewer.splats import Splats
+from pansplat_viewer import splats as splats_module
+from pansplat_viewer.splats import Splats, SplatSorter, radix_argsort, sort_splats
 
 _FLOATS = st.floats(width=32, allow_nan=False)
 
@@ -29,14 +28,14 @@ def test_radix_order_of_many_keys_with_ties_is_the_stable_order():
 def test_ordering_is_by_distance_from_the_position(random_scene):
     splats = Splats.from_scene(random_scene())
     position = (0.3, -0.2, 0.1)
-    ordering = make_ordering(splats, position)
+    ordering = sort_splats(splats, position)
     distance = np.linalg.norm(splats.means.astype(np.float64) - position, axis=1)
-    assert np.allclose(ordering.radius, distance, rtol=1e-6)
+    assert np.allclose(ordering.distances, distance, rtol=1e-6)
     assert np.all(np.diff(distance[ordering.order]) > -1e-6)
     assert sorted(ordering.order.tolist()) == list(range(len(splats)))
 
 
-def _wait(sorter: Sorter):
+def _wait(sorter: SplatSorter):
     for _ in range(2000):
         ordering = sorter.take()
         if ordering is not None:
@@ -53,10 +52,10 @@ def test_sorter_makes_what_was_asked_last_and_skips_what_waited(random_scene, mo
         seen.append(position)
         started.set()
         assert go.wait(10)
-        return make_ordering(splats, position)
+        return sort_splats(splats, position)
 
-    monkeypatch.setattr(order, "make_ordering", slow)
-    sorter = Sorter()
+    monkeypatch.setattr(splats_module, "sort_splats", slow)
+    sorter = SplatSorter()
     sorter.request(splats, (1.0, 0.0, 0.0))
     assert started.wait(10)
     sorter.request(splats, (2.0, 0.0, 0.0))
@@ -73,8 +72,8 @@ def test_what_fails_in_the_sorter_is_raised_where_it_is_taken(random_scene, monk
     def fail(splats, position):
         raise MemoryError("no room")
 
-    monkeypatch.setattr(order, "make_ordering", fail)
-    sorter = Sorter()
+    monkeypatch.setattr(splats_module, "sort_splats", fail)
+    sorter = SplatSorter()
     sorter.request(Splats.from_scene(random_scene(5)), (0.0, 0.0, 0.0))
     with pytest.raises(MemoryError, match="no room"):
         _wait(sorter)
@@ -83,7 +82,7 @@ def test_what_fails_in_the_sorter_is_raised_where_it_is_taken(random_scene, monk
 
 def test_closing_ends_the_thread(random_scene):
     before = threading.active_count()
-    sorter = Sorter()
+    sorter = SplatSorter()
     sorter.request(Splats.from_scene(random_scene(5)), (0.0, 0.0, 0.0))
     _wait(sorter)
     sorter.close()

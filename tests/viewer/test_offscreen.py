@@ -11,7 +11,7 @@ import pytest
 
 from pansplat.errors import InputError
 from pansplat_viewer import offscreen
-from pansplat_viewer.draw import choose_tier
+from pansplat_viewer.programs import choose_tier
 from pansplat_viewer.renderer import DrawSettings
 
 pytestmark = pytest.mark.gl

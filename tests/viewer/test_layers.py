@@ -162,12 +162,14 @@ def test_framebuffer_of_the_caller_is_bound_again(ctx, renderer, random_scene, p
 
 
 def test_targets_beyond_the_budget_are_freed_but_those_in_use(ctx):
-    from pansplat_viewer.targets import TargetStore
+    from pansplat_viewer.layers import TargetStore
 
     store = TargetStore(ctx, color_bits=32, budget_bytes=3 * 16 * 100)
     for name in "abcd":
         store.get(name, (10, 10), key=name)
-    store.trim({"a"})
+    store.trim()
+    store.get("a", (10, 10), key="a")
+    store.trim()
     assert store.get("a", (10, 10), key="a").key == "a"
     assert [store.get(name, (10, 10), key=None).key for name in "cd"] == [None, None]
     kept = store.get("a", (10, 10), key="a")

@@ -8,10 +8,10 @@ import pytest
 
 from pansplat.errors import InputError
 from pansplat.gaussians.ply import save_ply
-from pansplat_viewer.library import Entry, Loaded, Loader, LoadOptions, find_entries, load_entry
+from pansplat_viewer.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, find_entries, load_entry
 
 
-def wait_for(loader: Loader) -> object:
+def wait_for(loader: SceneLoader) -> object:
     deadline = time.monotonic() + 10
     while (outcome := loader.poll()) is None:
         assert time.monotonic() < deadline, "nothing came"
@@ -64,7 +64,7 @@ def test_a_folder_of_pairs_offers_each(shared):
     ("name", "folder"), [("a/b c", "a_b_c"), ("../x", "x"), ("...", "scene"), ("Küche 1", "Küche_1")]
 )
 def test_an_entrys_folder_name_is_one_safe_name(name, folder):
-    assert Entry(name).folder_name == folder
+    assert SceneEntry(name).folder_name == folder
 
 
 def test_loading_reports_progress_and_hands_over_the_result(small_scene):
@@ -74,11 +74,11 @@ def test_loading_reports_progress_and_hands_over_the_result(small_scene):
         progress("thinking", 0.25)
         reported.set()
         assert go.wait(10)
-        return Loaded(entry, small_scene)
+        return LoadedScene(entry, small_scene)
 
-    loader = Loader(load)
+    loader = SceneLoader(load)
     assert loader.progress is None and loader.poll() is None
-    loader.request(Entry("kitchen"))
+    loader.request(SceneEntry("kitchen"))
     assert reported.wait(10)
     assert loader.progress == ("kitchen", "thinking", 0.25) and loader.poll() is None
     go.set()
@@ -91,8 +91,8 @@ def test_a_failure_is_handed_over_instead_of_raised():
     def load(entry, progress):
         raise InputError(f"{entry.name} is damaged")
 
-    loader = Loader(load)
-    loader.request(Entry("kitchen"))
+    loader = SceneLoader(load)
+    loader.request(SceneEntry("kitchen"))
     assert str(wait_for(loader)) == "kitchen is damaged"
     loader.close()
 
@@ -108,11 +108,11 @@ def test_a_new_request_takes_the_place_of_the_one_under_way(small_scene):
                     time.sleep(0.001)
             finally:
                 first_stopped.set()
-        return Loaded(entry, small_scene)
+        return LoadedScene(entry, small_scene)
 
-    loader = Loader(load)
-    loader.request(Entry("first"))
-    loader.request(Entry("second"))
+    loader = SceneLoader(load)
+    loader.request(SceneEntry("first"))
+    loader.request(SceneEntry("second"))
     assert wait_for(loader).entry.name == "second"
     assert first_stopped.wait(10)
     loader.close()
@@ -124,8 +124,8 @@ def test_closing_stops_the_work_and_joins_its_thread():
             progress("working", 0.5)
             time.sleep(0.001)
 
-    loader = Loader(load)
-    loader.request(Entry("endless"))
+    loader = SceneLoader(load)
+    loader.request(SceneEntry("endless"))
     loader.close()
     assert not any(thread.name == "load endless" for thread in threading.enumerate())
 
@@ -146,7 +146,7 @@ def test_cached_predictions_are_asked_for_as_the_options_say(monkeypatch, small_
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
     said = []
-    entry = Entry("kitchen", pair=FakePair())
+    entry = SceneEntry("kitchen", pair=FakePair())
     options = LoadOptions(model="sweep", height=256, cache=False)
     loaded = load_entry(entry, options, lambda what, done: said.append(what))
     assert (asked["model"], asked["height"], asked["cache"]) == ("sweep", 256, False)

@@ -1,7 +1,6 @@
-"""What a path holds that can be shown, and loading it in the background.
+"""Lists the scenes at a path and loads them in a worker thread.
 
-Pairs go through the prediction pipeline (cached), .ply files are read. The window stays alive meanwhile: a
-worker thread does the work and `poll` hands over the result.
+Pairs go through the prediction pipeline with its cache, .ply files are read. Imports no torch before it loads.
 """
 
 import re
@@ -18,17 +17,17 @@ if TYPE_CHECKING:
     from pansplat.data.views import Views
     from pansplat.gaussians.scene import Scene
 
-PHOTO_HEIGHT = 1024  # of the photographs to compare with, pixels
+PHOTO_HEIGHT = 1024  # smallest height of the photographs for comparison, pixels
 
-Progress = Callable[[str, float], None]
+Progress = Callable[[str, float], None]  # what is done, fraction done
 
 
 @dataclass(frozen=True, eq=False)
-class Entry:
-    """One thing to show: a pair of panoramas to predict from, or a scene file.
+class SceneEntry:
+    """A scene that can be shown: a pair of panoramas to predict from, or a scene file.
 
     Attributes:
-        name: for the chooser and for output folders.
+        name: shown in the list of scenes and used for output folders.
         pair: the pair, or None for a scene file.
         file: the scene file, or None for a pair.
     """
@@ -39,22 +38,22 @@ class Entry:
 
     @property
     def folder_name(self) -> str:
-        """The name as one folder's name: no separators, nothing hidden."""
+        """The name as a valid folder name, without separators and leading dots."""
         return re.sub(r"[^\w.-]+", "_", self.name).strip("._") or "scene"
 
 
 @dataclass(frozen=True, eq=False)
-class Loaded:
-    """A scene ready to draw, and the photographs it was made from (None when they are not at hand)."""
+class LoadedScene:
+    """A scene, and the photographs it was predicted from (None for a scene file)."""
 
-    entry: Entry
+    entry: SceneEntry
     scene: "Scene"
     photos: "Views | None" = None
 
 
 @dataclass(frozen=True)
 class LoadOptions:
-    """How to read and predict; as `load_pairs` and `predict` take them."""
+    """Arguments of `load_pairs` and `predict`."""
 
     model: str = "sweep"
     compat: Literal["trained", "official", "fixed"] = "trained"
@@ -66,16 +65,16 @@ class LoadOptions:
     far: float | None = None
 
 
-def find_entries(path: Path, options: LoadOptions) -> list[Entry]:
-    """Everything at `path` that can be shown.
+def find_entries(path: Path, options: LoadOptions) -> list[SceneEntry]:
+    """Return all scenes at `path`: pairs first, then scene files.
 
     Raises:
-        InputError: no such path, or nothing in it that can be shown.
+        InputError: the path does not exist, or holds neither pairs nor scene files.
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; give a pair folder, a folder of pairs or a scene .ply")
     if path.is_file() and path.suffix.lower() == ".ply":
-        return [Entry(path.stem, file=path)]
+        return [SceneEntry(path.stem, file=path)]
     scenes = sorted(p for p in path.iterdir() if p.suffix.lower() == ".ply") if path.is_dir() else []
     try:
         from pansplat.pipeline import load_pairs
@@ -85,24 +84,24 @@ def find_entries(path: Path, options: LoadOptions) -> list[Entry]:
         if not scenes:
             raise
         pairs = []
-    return [Entry(pair.name, pair=pair) for pair in pairs] + [Entry(p.stem, file=p) for p in scenes]
+    return [SceneEntry(pair.name, pair=pair) for pair in pairs] + [SceneEntry(p.stem, file=p) for p in scenes]
 
 
-def load_entry(entry: Entry, options: LoadOptions, progress: Progress, *, photos: bool = True) -> Loaded:
-    """Read or predict an entry's scene, blocking; reports what is being done and the fraction done.
+def load_entry(entry: SceneEntry, options: LoadOptions, progress: Progress, *, photos: bool = True) -> LoadedScene:
+    """Read or predict an entry's scene.
 
     Args:
         entry: what to load.
-        options: how.
-        progress: told what is being done and the fraction done.
-        photos: whether to read the input photographs too.
+        options: arguments of reading and prediction.
+        progress: called with what is being done and the fraction done.
+        photos: whether to read the input photographs.
     """
     from pansplat import pipeline
 
     if entry.pair is None:
         progress("reading", 0.0)
         assert entry.file is not None
-        return Loaded(entry, pipeline.load(entry.file))
+        return LoadedScene(entry, pipeline.load(entry.file))
     scene = pipeline.predict(
         entry.pair,
         model=options.model,
@@ -113,35 +112,35 @@ def load_entry(entry: Entry, options: LoadOptions, progress: Progress, *, photos
         progress=progress,
     )
     if not photos:
-        return Loaded(entry, scene)
+        return LoadedScene(entry, scene)
     progress("reading photographs", 1.0)
-    return Loaded(entry, scene, entry.pair.load_context(max(PHOTO_HEIGHT, options.height)))
+    return LoadedScene(entry, scene, entry.pair.load_context(max(PHOTO_HEIGHT, options.height)))
 
 
 class _Cancelled(Exception):
-    """Thrown through the predictor's progress calls when nobody waits for the result any more."""
+    """Raised from the progress call to end a load that was cancelled."""
 
 
 @dataclass
 class _Job:
-    entry: Entry
-    what: str = "starting"
+    entry: SceneEntry
+    task: str = "starting"
     fraction: float = 0.0
     cancelled: threading.Event = field(default_factory=threading.Event)
     outcome: Any = None
     thread: threading.Thread | None = None
 
 
-class Loader:
-    """Loads entries one at a time in a worker thread; a new request takes the place of the one under way."""
+class SceneLoader:
+    """Loads entries in a worker thread; a new request cancels the previous one."""
 
-    def __init__(self, load: Callable[[Entry, Progress], Loaded]) -> None:
-        """`load` does the work: `load_entry` with its options, or a test's own."""
+    def __init__(self, load: Callable[[SceneEntry, Progress], LoadedScene]) -> None:
+        """`load` loads one entry, such as `load_entry` with its options."""
         self._load = load
         self._job: _Job | None = None
-        self._retired: list[threading.Thread] = []
+        self._cancelled_threads: list[threading.Thread] = []
 
-    def request(self, entry: Entry) -> None:
+    def request(self, entry: SceneEntry) -> None:
         """Start loading an entry."""
         self.cancel()
         job = _Job(entry)
@@ -151,12 +150,12 @@ class Loader:
 
     @property
     def progress(self) -> tuple[str, str, float] | None:
-        """Name of what is loading, what is being done and the fraction done; None when idle."""
+        """Name of the entry, what is being done and the fraction done; None if nothing is loading."""
         job = self._job
-        return (job.entry.name, job.what, job.fraction) if job else None
+        return (job.entry.name, job.task, job.fraction) if job else None
 
-    def poll(self) -> Loaded | Exception | None:
-        """The result or failure of the request, once; None while it is under way or when there is none."""
+    def poll(self) -> LoadedScene | Exception | None:
+        """Return the result or exception of the request once; None while it is loading or if there is no request."""
         job = self._job
         if job is None or job.outcome is None:
             return None
@@ -166,29 +165,29 @@ class Loader:
         return job.outcome
 
     def cancel(self) -> None:
-        """Forget the request under way; its thread stops at its next report of progress."""
+        """Cancel the request; its thread stops at its next progress call."""
         if self._job is not None:
             self._job.cancelled.set()
             if self._job.thread:
-                self._retired.append(self._job.thread)
+                self._cancelled_threads.append(self._job.thread)
             self._job = None
 
     def close(self) -> None:
-        """Cancel and wait for every thread."""
+        """Cancel the request and wait for all threads."""
         self.cancel()
-        for thread in self._retired:
+        for thread in self._cancelled_threads:
             thread.join()
-        self._retired.clear()
+        self._cancelled_threads.clear()
 
     def _run(self, job: _Job) -> None:
-        def progress(what: str, fraction: float) -> None:
+        def progress(task: str, fraction: float) -> None:
             if job.cancelled.is_set():
                 raise _Cancelled
-            job.what, job.fraction = what, min(max(fraction, 0.0), 1.0)
+            job.task, job.fraction = task, min(max(fraction, 0.0), 1.0)
 
         try:
             job.outcome = self._load(job.entry, progress)
         except _Cancelled:
             job.outcome = None
-        except Exception as error:  # shown in the window; a thread must not print a traceback over it
+        except Exception as error:  # shown in the window
             job.outcome = error

@@ -16,8 +16,8 @@ from pansplat_viewer.offscreen import create_context
 from pansplat_viewer.renderer import DrawSettings, SplatRenderer
 
 
-@pytest.fixture(scope="module")
-def _context() -> Iterator[moderngl.Context]:
+@pytest.fixture(scope="session")
+def gl_context() -> Iterator[moderngl.Context]:
     try:
         context = create_context()
     except InputError as error:
@@ -29,12 +29,12 @@ def _context() -> Iterator[moderngl.Context]:
 
 
 @pytest.fixture
-def ctx(_context: moderngl.Context) -> Iterator[moderngl.Context]:
+def ctx(gl_context: moderngl.Context) -> Iterator[moderngl.Context]:
     """An OpenGL context, current, without errors before and after the test."""
-    with _context:
-        assert _context.error == "GL_NO_ERROR"
-        yield _context
-        assert _context.error == "GL_NO_ERROR"
+    with gl_context:
+        assert gl_context.error == "GL_NO_ERROR"
+        yield gl_context
+        assert gl_context.error == "GL_NO_ERROR"
 
 
 @pytest.fixture
@@ -132,3 +132,42 @@ def assert_same() -> Callable[..., None]:
         assert (relative > 5e-3).mean() <= 1e-3
 
     return check
+
+
+_Y0 = 0.28209479177387814  # the constant harmonic
+
+
+@pytest.fixture(scope="session")
+def small_scene() -> Scene:
+    """1200 Gaussians, large and tiny, around two cameras 0.5 m apart along +z; the views differ in colour."""
+    random = torch.Generator().manual_seed(3)
+    count, parts = 600, []
+    for view in range(2):
+        directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=random), dim=-1)
+        radii = 2 + 2 * torch.rand(count, 1, generator=random)
+        color = 0.5 + 0.4 * directions
+        color[:, view] *= 0.3
+        parts.append(
+            Gaussians(
+                means=directions * radii + torch.tensor((0, 0, 0.5 * view)),
+                scales=torch.tensor((0.5, 0.3, 0.1)) * torch.where(torch.arange(count) % 2 > 0, 1, 0.02)[:, None],
+                quats=torch.randn(count, 4, generator=random),
+                opacities=torch.rand(count, generator=random),
+                harmonics=((color - 0.5) / _Y0)[:, None, :],
+                levels=torch.randint(0, 4, (count,), generator=random),
+                views=torch.full((count,), view),
+            )
+        )
+    cam2world = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    cam2world[1, 2, 3] = 0.5
+    return Scene(Gaussians.cat(parts), cam2world, 0.45, 10.0, ("a.png", "b.png"), "synthetic", 64)
+
+
+@pytest.fixture(scope="session")
+def axis_photos() -> np.ndarray:
+    """Two panoramas coloured by direction: red to the right, green up, blue ahead; the second is dim."""
+    from pansplat.geometry.equirect import pixel_directions
+
+    directions = pixel_directions(128, 256).numpy()
+    image = 0.5 + 0.5 * directions * np.array((1, -1, 1), dtype=np.float32)
+    return np.stack((image, 0.3 * image)).astype(np.float32)

@@ -57,7 +57,7 @@ def test_lines_hold_times_and_the_references_picture(job, pose):
         layout="cubemap",
         face_size=16,
     )
-    drawn = np.load(lines[0]["picture"])[..., :3].transpose(2, 0, 1)
+    drawn = np.load(lines[0]["image"])[..., :3].transpose(2, 0, 1)
     assert np.abs(drawn - expected.color.numpy()).max() <= 5e-3
 
 

@@ -1,0 +1,25 @@
+// The rendered image on the screen, and right of `split` a photograph of the same directions.
+uniform sampler2D image;            // bottom row first
+uniform sampler2D photograph;       // equirectangular, top row first
+uniform float split;                // fraction of the width
+uniform vec2 tangent;               // of half the horizontal and vertical field of view
+uniform mat3 camera_to_photo;       // rotation, OpenCV axes
+
+in vec2 uv;
+
+out vec4 color;
+
+const float PI = 3.14159265358979;
+
+void main() {
+    vec3 rgb;
+    if (uv.x < split) {
+        rgb = texture(image, uv).rgb;
+    } else {
+        vec2 ray = (2.0 * uv - 1.0) * tangent;
+        vec3 d = camera_to_photo * vec3(ray.x, -ray.y, 1.0);
+        vec2 photo_uv = vec2(atan(d.x, d.z) / (2.0 * PI) + 0.5, atan(d.y, length(d.xz)) / PI + 0.5);
+        rgb = textureLod(photograph, photo_uv, 0.0).rgb;  // level 0: derivatives have a seam at +-180 degrees
+    }
+    color = vec4(rgb, 1.0);
+}
