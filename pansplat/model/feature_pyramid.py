@@ -1,6 +1,11 @@
-"""Multi-level features of the panoramas: an encoder, attention across views at the coarsest level, a decoder.
+"""Feature pyramid network: an encoder, a cross-view transformer at the coarsest level, a decoder.
 
-Source: PanSplat, section 3.1 and Figure 3 (the feature pyramid network); OFFICIAL.md, section 4.
+The transformer attends within 2 x 2 windows, inside a view and across views; every second block shifts the windows by
+half a window. With two views each attends to the other; with more, to the tokens of all others jointly. Half a turn of
+the panoramas maps windows onto windows, so with `compat="fixed"` it rolls the output exactly; other rolls change which
+tokens share a window.
+
+Source: PanSplat, section 3.1 and Figure 3; OFFICIAL.md, section 4.
 """
 
 import math
@@ -26,7 +31,7 @@ from pansplat.model.layers import (
     upsample,
 )
 
-# Mean and standard deviation of ImageNet's colours.
+# Mean and standard deviation of ImageNet colours.
 _MEAN = (0.485, 0.456, 0.406)
 _STD = (0.229, 0.224, 0.225)
 
@@ -74,7 +79,7 @@ class FeaturePyramid(nn.Module):
         """Features of all views, coarse to fine, of RGB images in [0, 1].
 
         Raises:
-            InputError: too few views (or too many for the original), or a size that 16 (fixed: 32) does not divide.
+            InputError: fewer than two views ("official": not two), or a size that 32 ("official": 16) does not divide.
         """
         batch_and_view = images.shape[:2]
         require_views(images.shape[1], self.compat)
@@ -89,7 +94,7 @@ class FeaturePyramid(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Convolutions that halve the map from level to level."""
+    """Convolutions; each level's map has half the size of the finer one."""
 
     def __init__(self, channels: tuple[int, int, int, int], border: Border) -> None:
         super().__init__()
@@ -114,7 +119,7 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Coarse maps flow down to the finer levels, where the encoder's maps join them."""
+    """From coarse to fine: the coarser map, enlarged, plus the encoder's map of the level."""
 
     def __init__(self, channels: tuple[int, int, int, int], compat: Compat) -> None:
         super().__init__()
@@ -130,10 +135,15 @@ class Decoder(nn.Module):
         coarsest: Float[Tensor, "image channel height width"],
         fine_to_coarse: list[Float[Tensor, "image _ _ _"]],
     ) -> list[Float[Tensor, "image _ _ _"]]:
-        """Features of levels 3 to 0, coarse to fine, of the coarsest map and the encoder's maps of levels 0 to 2."""
+        """Features of levels 3 to 0, coarse to fine.
+
+        Args:
+            coarsest: output of the transformer, level 3.
+            fine_to_coarse: the encoder's maps of levels 0 to 2.
+        """
         if self.training:
             return self._decode(coarsest, fine_to_coarse)
-        # Outside training no image depends on another; the widest maps are held for one at a time.
+        # In eval mode images are independent: decoding one at a time keeps only one image's largest maps in memory.
         images = [
             self._decode(coarsest[i : i + 1], [maps[i : i + 1] for maps in fine_to_coarse])
             for i in range(coarsest.shape[0])
@@ -141,11 +151,11 @@ class Decoder(nn.Module):
         return [torch.cat(level) for level in zip(*images, strict=True)]
 
     def _decode(self, coarsest: Tensor, fine_to_coarse: list[Tensor]) -> list[Tensor]:
-        flow = coarsest
-        features = [self.outputs[-1](flow)]
+        maps = coarsest
+        features = [self.outputs[-1](maps)]
         for level in (2, 1, 0):
-            flow = upsample(flow, 2, self.compat).add_(self.laterals[level](fine_to_coarse[level]))
-            features.append(self.outputs[level](flow))
+            maps = upsample(maps, 2, self.compat).add_(self.laterals[level](fine_to_coarse[level]))
+            features.append(self.outputs[level](maps))
         return features
 
 
@@ -162,20 +172,20 @@ class ConvNormAct(nn.Module):
 
 
 class LevelOutput(nn.Module):
-    """Convolution, batch normalisation, SiLU: from the decoder's flow to a level's features."""
+    """Convolution, batch normalisation, SiLU: from the decoder's map to the features of a level."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, border: Border) -> None:
         super().__init__()
         self.conv = PanoramaConv2d(inputs, outputs, kernel, border=border)
         self.norm = nn.BatchNorm2d(outputs)
 
-    def forward(self, flow: Float[Tensor, "image channel height width"]) -> Float[Tensor, "image c height width"]:
-        made = convolve_and_normalize(self.conv, self.norm, flow)
-        return made * made.sigmoid()  # as the original writes SiLU: torch's own rounds otherwise
+    def forward(self, maps: Float[Tensor, "image channel height width"]) -> Float[Tensor, "image c height width"]:
+        normalized = convolve_and_normalize(self.conv, self.norm, maps)
+        return normalized * normalized.sigmoid()  # the official form of SiLU; torch's own rounds differently
 
 
 def normalize(images: Float[Tensor, "image 3 height width"]) -> Float[Tensor, "image 3 height width"]:
-    """Colours less ImageNet's mean, in its standard deviations."""
+    """Subtract ImageNet's mean colour and divide by its standard deviation."""
     mean, std = (torch.tensor(values).to(images)[:, None, None] for values in (_MEAN, _STD))
     return (images - mean) / std
 
@@ -203,7 +213,7 @@ class Transformer(nn.Module):
     def forward(
         self, maps: Float[Tensor, "batch view channel height width"]
     ) -> Float[Tensor, "batch view channel height width"]:
-        """Refine the maps of all views; the position encoding is added first.
+        """Add the position encoding and refine the maps of all views.
 
         Raises:
             InputError: the map cannot be split into windows and shifted by half a window.
@@ -229,7 +239,7 @@ class Transformer(nn.Module):
 
 
 class TransformerBlock(nn.Module):
-    """Self-attention, then attention to the other views as they entered the block, then the feed-forward part."""
+    """Self-attention, attention to the other views' tokens at the block's input, feed-forward network."""
 
     def __init__(self, config: TransformerConfig, precision: AttentionPrecision) -> None:
         super().__init__()
@@ -256,7 +266,7 @@ class TransformerBlock(nn.Module):
 
 
 class WindowAttention(nn.Module):
-    """One head of attention inside each window, merged and normalised."""
+    """Single-head attention inside each window, projected and normalised."""
 
     def __init__(self, channels: int, precision: AttentionPrecision) -> None:
         super().__init__()
@@ -274,7 +284,7 @@ class WindowAttention(nn.Module):
         mask: Float[Tensor, "window token key"] | None,
     ) -> Float[Tensor, "batch view window token channel"]:
         queries, keys, values = self.query(tokens), self.key(source), self.value(source)
-        # The windows take the place of heads: torch's fused kernels want four axes.
+        # Windows are passed as heads because torch's fused kernels need four axes.
         attended = attend(
             queries.flatten(0, 1),
             keys.flatten(0, 1),
@@ -288,7 +298,7 @@ class WindowAttention(nn.Module):
 def other_views(
     tokens: Float[Tensor, "batch view window token channel"],
 ) -> Float[Tensor, "batch view window others channel"]:
-    """For each view, the tokens of all other views one after another."""
+    """For each view, the concatenated tokens of all other views."""
     views = tokens.shape[1]
     return torch.cat([tokens.roll(-offset, dims=1) for offset in range(1, views)], dim=3)
 
@@ -296,7 +306,7 @@ def other_views(
 def split_windows(
     tokens: Float[Tensor, "batch view height width channel"], splits: int
 ) -> Float[Tensor, "batch view window token channel"]:
-    """The map as splits x splits windows, row by row, tokens of a window row by row."""
+    """Split the map into splits x splits windows; windows and their tokens are in row-major order."""
     batch, views, height, width, channels = tokens.shape
     rows, columns = height // splits, width // splits
     windows = tokens.reshape(batch, views, splits, rows, splits, columns, channels).transpose(3, 4)
@@ -315,7 +325,7 @@ def merge_windows(
 
 
 def position_encoding(height: int, width: int, channels: int) -> Float[Tensor, "channel height width"]:
-    """Sines and cosines of the row (first half of the channels) and the column in a window.
+    """Sine encoding of the row (first half of the channels) and the column in a window.
 
     Source: DETR (Carion et al. 2020), with coordinates counted from 1 and scaled to 2 pi.
     """
@@ -334,9 +344,9 @@ def position_encoding(height: int, width: int, channels: int) -> Float[Tensor, "
 
 
 def shift_mask(height: int, width: int, splits: int, compat: Compat) -> Float[Tensor, "window token token"]:
-    """What is added to the attention logits of shifted windows, so that only true neighbours meet.
+    """Additive attention mask of shifted windows: separates tokens that are not neighbours on the panorama.
 
-    Shifting wraps rows and columns around. The panorama's columns do wrap, its rows do not; the original parts both.
+    The shift wraps rows and columns around. A panorama's columns wrap, its rows do not; "official" separates both.
     """
     rows, columns = (_shifted_regions(size, size // splits) for size in (height, width))
     if compat == "fixed":
@@ -348,6 +358,6 @@ def shift_mask(height: int, width: int, splits: int, compat: Compat) -> Float[Te
 
 
 def _shifted_regions(size: int, window: int) -> Float[Tensor, "size"]:
-    """Region of each row (or column) after the shift: all windows but the last, the last's half, what came around."""
+    """Region of each row or column after the shift: 0 before the last window, 1 and 2 its halves; 2 wrapped around."""
     position = torch.arange(size)
     return (position >= size - window).float() + (position >= size - window // 2).float()

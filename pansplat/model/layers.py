@@ -1,8 +1,7 @@
-"""Building blocks shared by the networks: convolution over a panorama, resizing of maps, attention.
+"""Layers that the networks share: convolution, resizing and attention on panorama maps; checks of the input.
 
-`compat` runs through all of them. `official` computes what the original does, its defects included, so that its
-weights give its numbers. `fixed` puts pixel centres at half-integers and continues every map over the seam and the
-poles.
+`compat="official"` computes what the official code computes, its defects included. `compat="fixed"` has pixel centres
+at half-integers and continues every map across the seam and the poles.
 
 Source: PanSplat, section 3.1; OFFICIAL.md, sections 4, 6 and 7.
 """
@@ -24,9 +23,9 @@ AttentionPrecision = Literal["float32", "bfloat16"]
 
 
 def autocast_convolutions(precision: Precision, device: torch.device) -> torch.autocast:
-    """Within it, "bfloat16" rounds what convolutions and linear layers read and give; their sums are in float32.
+    """Autocast context in which "bfloat16" rounds inputs and outputs of convolutions and linear layers.
 
-    Attention keeps to its own precision, see `attend`. Normalisations sum in float32.
+    Their sums, and those of normalisations, are in float32. Attention has a precision of its own, see `attend`.
     """
     return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16")
 
@@ -37,15 +36,15 @@ def to_channels_last(maps: Float[Tensor, "image channel height width"]) -> Float
 
 
 def border_of(compat: Compat) -> Border:
-    """What the convolutions of PanSplat see beyond the border."""
+    """The border of PanSplat's convolutions."""
     return "sphere" if compat == "fixed" else "wrapped_columns"
 
 
 def require_views(count: int, compat: Compat) -> None:
-    """Refuse a number of views that the networks cannot take.
+    """Check that the networks accept this number of views.
 
     Raises:
-        InputError: fewer than two, or other than two where the original's numbers are wanted.
+        InputError: fewer than two views, or more than two with `compat="official"`.
     """
     if count < 2:
         raise InputError(f"a prediction needs two or more views, got {count}; add a panorama of the same place")
@@ -56,10 +55,10 @@ def require_views(count: int, compat: Compat) -> None:
 
 
 def require_size(height: int, width: int, multiple: int) -> None:
-    """Refuse an image size that the pyramid of maps cannot halve.
+    """Check that `multiple` divides height and width.
 
     Raises:
-        InputError: the height or the width is not a multiple of `multiple`.
+        InputError: it does not.
     """
     if height % multiple or width % multiple:
         raise InputError(
@@ -69,10 +68,10 @@ def require_size(height: int, width: int, multiple: int) -> None:
 
 
 def require_rigid(cam2world: Float[Tensor, "batch view 4 4"]) -> None:
-    """Refuse poses that do more than turn and move.
+    """Check that poses are rigid.
 
     Raises:
-        InputError: a rotation is not orthonormal to 1e-4, mirrors, or is not finite.
+        InputError: a rotation is not orthonormal within 1e-4, is a reflection, or is not finite.
     """
     for item, poses in enumerate(cam2world):
         for view, pose in enumerate(poses):
@@ -85,7 +84,7 @@ def require_rigid(cam2world: Float[Tensor, "batch view 4 4"]) -> None:
 
 
 class PanoramaConv2d(nn.Conv2d):
-    """A convolution that keeps the size of the map (or divides it by the stride) and knows what lies beyond it."""
+    """Convolution of panorama maps, padded by `border`; the output has the input's size, divided by the stride."""
 
     def __init__(
         self, inputs: int, outputs: int, kernel: int, *, border: Border, stride: int = 1, bias: bool = True
@@ -103,7 +102,7 @@ class PanoramaConv2d(nn.Conv2d):
         weight: Float[Tensor, "c channel kernel kernel"],
         bias: Float[Tensor, "c"] | None,
     ) -> Float[Tensor, "batch c h w"]:
-        """The convolution with other weights."""
+        """Convolve with the given weights and bias."""
         if self.border == "zeros":
             return functional.conv2d(maps, weight, bias, self.stride, self.margin)
         return functional.conv2d(pad_equirect(maps, self.margin, self.border), weight, bias, self.stride)
@@ -112,7 +111,7 @@ class PanoramaConv2d(nn.Conv2d):
 def convolve_and_normalize(
     conv: PanoramaConv2d, norm: nn.BatchNorm2d, maps: Float[Tensor, "batch channel height width"]
 ) -> Float[Tensor, "batch c h w"]:
-    """Convolution and batch normalisation, which outside training are one convolution."""
+    """Convolution, then batch normalisation; in eval mode one convolution with scaled weights."""
     mean, variance = norm.running_mean, norm.running_var
     if norm.training or mean is None or variance is None:
         return norm(conv(maps))
@@ -124,7 +123,7 @@ def convolve_and_normalize(
 def upsample(
     maps: Float[Tensor, "batch channel height width"], factor: int, compat: Compat
 ) -> Float[Tensor, "batch channel h w"]:
-    """Maps enlarged bilinearly; the original lays corner pixels' centres on each other."""
+    """Enlarge maps bilinearly; "official" aligns the centres of corner pixels (`align_corners=True`)."""
     if compat == "official":
         return functional.interpolate(maps, scale_factor=factor, mode="bilinear", align_corners=True)
     height, width = maps.shape[-2:]
@@ -134,7 +133,7 @@ def upsample(
 def resize(
     maps: Float[Tensor, "batch channel height width"], size: tuple[int, int], compat: Compat
 ) -> Float[Tensor, "batch channel h w"]:
-    """Maps resized bilinearly, pixel centres at half-integers; the original repeats the border's pixels beyond it."""
+    """Resize maps bilinearly with pixel centres at half-integers; "official" repeats the border pixels."""
     if compat == "official":
         return functional.interpolate(maps, size, mode="bilinear", align_corners=False)
     return resize_equirect(maps, size)
@@ -150,8 +149,8 @@ def attend(
 ) -> Float[Tensor, "batch head query channel"]:
     """Scaled dot-product attention; `mask` is added to the logits.
 
-    Precision "bfloat16" rounds the inputs and the output to bfloat16, as the original's kernel does; on a CPU the
-    sums between are in float32.
+    Precision "bfloat16" rounds inputs and output to bfloat16, as the official kernel does; on a CPU the sums are
+    in float32.
     """
     with torch.autocast(queries.device.type, enabled=False):
         return _attend(queries, keys, values, mask, precision)

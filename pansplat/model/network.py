@@ -29,6 +29,7 @@ from pansplat.model.weights import (
     convert_tensors,
     load_weights,
     match_tensors,
+    pack_weights,
     read_checkpoint,
     require_shapes,
 )
@@ -318,7 +319,7 @@ def convert_checkpoint(content: Mapping[str, object], source: object) -> Weights
     """
     tensors = convert_tensors(content, source)
     model = match_tensors(content, source).model
-    weights = describe(model, _NETWORKS[model][1](), tensors, compat="official")
+    weights = pack_weights(model, _NETWORKS[model][1](), tensors, compat="official")
     require_shapes(tensors, build_empty_network(weights, "official", source).state_dict(), source)
     return weights
 
