@@ -258,7 +258,7 @@ def _draw_picture(
             room = allocate_saved(lists.starts, lists.workspace) if whole else None
             rasterize_forward(
                 records, observed.values, lists.intersections, lists.starts, plane, sums,
-                first_row=lists.first_row, kept=room, threads=threads,
+                first_row=lists.first_row, saved=room, threads=threads,
             )  # fmt: skip
         notes.intersections += len(lists.intersections)
         given = observed.records, observed.radii
@@ -268,7 +268,7 @@ def _draw_picture(
         )
         notes.bytes = max(notes.bytes, own + boxes.nbytes + listed)
         if whole:
-            shown = shown._replace(lists=lists, kept=room)
+            shown = shown._replace(lists=lists, saved=room)
         del lists
     notes.visible += int(np.count_nonzero(boxes.view(np.int64) != tiling.EMPTY_BOX))
     return shown if needs_grad else None
@@ -318,7 +318,7 @@ def _slot_gradients(
                 room = allocate_saved(lists.starts, lists.workspace)
                 rasterize_forward(
                     projection.records, observed.values, lists.intersections, lists.starts, plane, sums[number],
-                    first_row=lists.first_row, kept=room, threads=threads,
+                    first_row=lists.first_row, saved=room, threads=threads,
                 )  # fmt: skip
             band = workspace if alone else Workspace()
             grad_records = band.array((len(lists.intersections), RECORD_SIZE), np.float32)

@@ -1,10 +1,15 @@
-"""What a tile needs before it is drawn: its pixels, and its Gaussians' forms relative to its middle.
+"""Stage three: footprints composited tile by tile, front to back.
 
-A ray's length is free. So a tile takes its pixels and Gaussians where their rays meet the plane that touches the sphere
-in its middle, and forms have two components. Where some are too far from the middle for that, they have three.
+Source: docs/rendering.md, section 4. A tile is rasterised in chunks of Gaussians. For each chunk the Gaussians that
+reach each block of 4 x 2 pixels, one SIMD vector, are listed as bits. Then each block composites its list with the
+transmittance and the sums in registers. The inner loops have no branches to mispredict.
 
-Forms are kept by columns (`FORMS` x `CHUNK_SIZE`), for a chunk of Gaussians that fits the first cache: the set-up then
-works on eight Gaussians at once, and drawing spreads one number over eight pixels.
+The length of a ray is arbitrary. So a tile takes its pixels and Gaussians where their rays meet the plane that touches
+the sphere at the tile's centre, and footprint rows have two components. Where a Gaussian or a pixel is too far from the
+centre for that, they have three ("3d" below).
+
+The footprints of a chunk are a structure of arrays (`FOOTPRINT_SIZE` x `CHUNK_SIZE`) that fits the L1 cache: setup
+computes eight Gaussians at once, and compositing broadcasts one number to eight pixels.
 """
 
 import math
@@ -14,70 +19,69 @@ import numpy as np
 import numpy.typing as npt
 
 from pansplat.constants import ALPHA_CUT, MAX_ALPHA, TRANSMITTANCE_CUT
-from pansplat.rendering.cpu.projection import dot, tangent_frame
+from pansplat.rendering.cpu.bits import list_bits
+from pansplat.rendering.cpu.columns import columns_of
+from pansplat.rendering.cpu.forms import dot, tangent_frame
 from pansplat.rendering.cpu.records import EQUIRECT_RAYS, PIXEL_CENTRES, RECORD_SIZE, TILE_SIZE, PixelTables
 from pansplat.rendering.cpu.runtime import Workspace, inline_kernel_no_refcount, kernel, parallel_for
 from pansplat.rendering.cpu.simd import (
     LANES,
-    any_lane,
-    broadcast,
+    choose,
     copy_four,
+    element,
     exp2,
-    join_halves,
-    list_set_bits,
+    fill,
+    how_many,
     load,
-    load_broadcast,
-    load_scalar,
-    load_transposed,
+    maximum,
+    minimum,
     multiply_add,
-    popcount,
+    negative,
     prefetch,
-    select,
+    put,
+    side_by_side,
+    some,
+    spread,
     store,
-    store_scalar,
 )
 from pansplat.rendering.cpu.tiling import split_tiles
 
-# Compositing of tiles on the CPU, forward.
-#
-# Source: docs/rendering.md, section 4. A tile is drawn in chunks of Gaussians. Each chunk is first listed by blocks of
-# 4x2 pixels, one vector each; then each block takes its list front to back, with the transmittance and the sums in
-# registers. That leaves no branch inside that the processor could mistake.
-
+Floats = npt.NDArray[np.float32]
+Integers = npt.NDArray[np.int32]
+Longs = npt.NDArray[np.int64]
 
 BLOCK_WIDTH = 4
 BLOCK_HEIGHT = LANES // BLOCK_WIDTH
-ACROSS = TILE_SIZE // BLOCK_WIDTH
-DOWN = TILE_SIZE // BLOCK_HEIGHT
-BLOCKS = ACROSS * DOWN
-PIXELS = TILE_SIZE * TILE_SIZE
+BLOCKS_ACROSS = TILE_SIZE // BLOCK_WIDTH
+BLOCKS_DOWN = TILE_SIZE // BLOCK_HEIGHT
+NUM_BLOCKS = BLOCKS_ACROSS * BLOCKS_DOWN
+TILE_PIXELS = TILE_SIZE * TILE_SIZE
 CHUNK_SIZE = 256  # Gaussians
-WORDS = CHUNK_SIZE // 64
-ROWS = ACROSS + 1  # where the rows' edges begin, among a word's
-EDGES = ROWS + DOWN + 1
-_SHARE = CHUNK_SIZE // BLOCKS  # Gaussians of the next chunk that are asked for at each block
+CHUNK_WORDS = CHUNK_SIZE // 64  # of 64 bits, one a Gaussian
+ROW_MASKS = BLOCKS_ACROSS + 1  # where the masks of rows begin, after those of columns; see `mark_blocks`
+NUM_MASKS = ROW_MASKS + BLOCKS_DOWN + 1  # for each word of a chunk
+BUFFER_SIZE = CHUNK_SIZE + 64  # log2 alphas of a block, and what `list_bits` overwrites
+_SLICE_SIZE = CHUNK_SIZE // NUM_BLOCKS  # Gaussians of the next chunk that each block prefetches
 
-# Rows of the forms.
-A, B, L = 0, 2, 4  # a, b, l: two components each
-MIDDLE = 6  # the Gaussian's point: two components
-ALONG_ROW, LEVEL_ROW = 8, 9
-THIRD = 10  # third components of a, b, l and the point; only written and read where a tile or a Gaussian is wide
-FORMS = 14
+# Rows of a chunk's footprints.
+ROW_A, ROW_B, ROW_L = 0, 2, 4  # two components each
+POINT = 6  # the Gaussian's point: two components
+RADIAL_VARIANCE, LOG2_PEAK = 8, 9
+THIRD = 10  # third components of a, b, l and the point; only used in 3d
+FOOTPRINT_SIZE = 14
 
-CUT = math.log2(ALPHA_CUT)  # least power: log2 of alpha
-NOTHING = -1000.0  # a power far below
-MOST = MAX_ALPHA
-CLOSED = TRANSMITTANCE_CUT["numba"]
-"""A pixel takes nothing more once its transmittance is at or below this."""
-_MARGIN = 0.1
-MIN_PLANAR_COSINE = 0.5  # least cosine of the angle from a tile's middle at which forms have two components
-FEW = 4  # values, handled together: RGB and the distance
-PLACE = 15  # numbers that place a tile: see `place_tile`
+LOG2_ALPHA_CUT = math.log2(ALPHA_CUT)
+LOG2_ZERO = -1000.0  # of an alpha that counts as zero
+MIN_TRANSMITTANCE = TRANSMITTANCE_CUT["numba"]  # a pixel is finished at this transmittance or below
+MIN_PLANAR_COSINE = 0.5  # of the angle to the tile's centre; below it footprint rows have three components
+_HORIZON_MARGIN = 0.1  # in log2 alpha
+VALUE_LANES = 4  # values that are accumulated together: RGB and the distance
+TILE_FRAME_SIZE = 15  # see `set_tile_frame`
 
 
 @inline_kernel_no_refcount
-def point_of(kind, columns, rows, rotation, x, y):  # type: ignore[no-untyped-def]
-    """The point of pixel (x, y) that Gaussians are measured against: a unit direction, or the pixel's centre."""
+def _pixel_point(kind, columns, rows, rotation, x, y):  # type: ignore[no-untyped-def]
+    """The unit direction of pixel (x, y), or its centre for the EWA kernel."""
     if kind == EQUIRECT_RAYS:
         cosine = rows[y, 1]
         return cosine * columns[x, 0], rows[y, 0], cosine * columns[x, 1]
@@ -94,26 +98,26 @@ def point_of(kind, columns, rows, rotation, x, y):  # type: ignore[no-untyped-de
 
 
 @inline_kernel_no_refcount
-def place_tile(kind, columns, rows, rotation, left, top, centre, place):  # type: ignore[no-untyped-def]
-    """Find a tile's middle and axes.
+def set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame):  # type: ignore[no-untyped-def]
+    """Set a tile's centre and axes.
 
     Args:
-        kind, columns, rows, rotation: of the picture's PixelTables.
-        left, top: pixel of the tile's corner.
-        centre: (3) float64, written: the middle.
-        place: (PLACE), written: the middle, rounded, and the rest; two axes across, and the middle once more or, for
-            the classic kernel, zeros.
+        kind, columns, rows, rotation: of the PixelTables.
+        left, top: pixel at the tile's corner.
+        centre: (3) float64, written.
+        frame: (TILE_FRAME_SIZE), written: the centre as float32, its residual, two axes across, and the third axis: the
+            centre, or zeros for the EWA kernel.
 
     Returns:
-        Whether some of its pixels are too far from the middle for two components.
+        Whether a pixel is too far from the centre for footprint rows with two components.
     """
-    least = 1.0  # cosine of a pixel's angle from the middle; those in the corners are the farthest
+    least = 1.0  # cosine of the angle from the centre to the farthest pixel, which is in a corner
     for corner in range(-1, 4):
         x, y = left + TILE_SIZE // 2, top + TILE_SIZE // 2
         if corner >= 0:
             x, y = left + corner % 2 * (TILE_SIZE - 1), top + corner // 2 * (TILE_SIZE - 1)
         x, y = min(x, len(columns) - 1), min(y, len(rows) - 1)
-        d_x, d_y, d_z = point_of(kind, columns, rows, rotation, x, y)
+        d_x, d_y, d_z = _pixel_point(kind, columns, rows, rotation, x, y)
         if corner < 0:
             centre[0], centre[1], centre[2] = d_x, d_y, d_z
         elif kind != PIXEL_CENTRES:
@@ -122,221 +126,224 @@ def place_tile(kind, columns, rows, rotation, left, top, centre, place):  # type
     if kind != PIXEL_CENTRES:
         axes = tangent_frame(centre[0], centre[1], centre[2])
     for axis in range(3):
-        place[axis] = np.float32(centre[axis])
-        place[3 + axis] = np.float32(centre[axis] - np.float64(place[axis]))
-        place[12 + axis] = np.float32(0 if kind == PIXEL_CENTRES else centre[axis])
+        frame[axis] = np.float32(centre[axis])
+        frame[3 + axis] = np.float32(centre[axis] - np.float64(frame[axis]))
+        frame[12 + axis] = np.float32(0 if kind == PIXEL_CENTRES else centre[axis])
     for axis in range(6):
-        place[6 + axis] = np.float32(axes[axis])
+        frame[6 + axis] = np.float32(axes[axis])
     return least < MIN_PLANAR_COSINE
 
 
 @inline_kernel_no_refcount
-def place_pixels(  # type: ignore[no-untyped-def]
-    kind, columns, rows, rotation, left, top, centre, place, wide, offsets
+def set_tile_pixels(  # type: ignore[no-untyped-def]
+    kind, columns, rows, rotation, left, top, centre, frame, is_3d, offsets
 ):
-    """Fill in a tile's pixels as the forms take them, block by block.
+    """Compute the offsets of a tile's pixels from its centre, block by block.
 
     Args:
-        kind, columns, rows, rotation, left, top, centre, place: as in `place_tile`.
-        wide: whether in three components, offsets from the middle along the axes; else where the pixels' rays meet the
-            plane that touches the sphere in the middle.
-        offsets: (3 PIXELS), written.
+        kind, columns, rows, rotation, left, top, centre, frame: as in `set_tile_frame`.
+        is_3d: whether along all three axes; otherwise on the plane that touches the sphere at the centre.
+        offsets: (3 TILE_PIXELS), written.
     """
     width, height = len(columns), len(rows)
-    for pixel in range(PIXELS):
+    for pixel in range(TILE_PIXELS):
         block, lane = pixel // LANES, pixel % LANES
-        x = left + (block % ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH
-        y = top + (block // ACROSS) * BLOCK_HEIGHT + lane // BLOCK_WIDTH
-        d_x, d_y, d_z = point_of(kind, columns, rows, rotation, min(x, width - 1), min(y, height - 1))
+        x = left + (block % BLOCKS_ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH
+        y = top + (block // BLOCKS_ACROSS) * BLOCK_HEIGHT + lane // BLOCK_WIDTH
+        d_x, d_y, d_z = _pixel_point(kind, columns, rows, rotation, min(x, width - 1), min(y, height - 1))
         d_x, d_y, d_z = d_x - centre[0], d_y - centre[1], d_z - centre[2]
-        ahead = place[12] * d_x + place[13] * d_y + place[14] * d_z
-        scale = 1.0 if wide else 1 / (1 + ahead)
-        offsets[pixel] = np.float32((place[6] * d_x + place[7] * d_y + place[8] * d_z) * scale)
-        offsets[PIXELS + pixel] = np.float32((place[9] * d_x + place[10] * d_y + place[11] * d_z) * scale)
-        offsets[2 * PIXELS + pixel] = np.float32(ahead)
+        ahead = frame[12] * d_x + frame[13] * d_y + frame[14] * d_z
+        scale = 1.0 if is_3d else 1 / (1 + ahead)
+        offsets[pixel] = np.float32((frame[6] * d_x + frame[7] * d_y + frame[8] * d_z) * scale)
+        offsets[TILE_PIXELS + pixel] = np.float32((frame[9] * d_x + frame[10] * d_y + frame[11] * d_z) * scale)
+        offsets[2 * TILE_PIXELS + pixel] = np.float32(ahead)
 
 
 @inline_kernel_no_refcount
-def open_pixels(columns, rows, left, top, through):  # type: ignore[no-untyped-def]
-    """Transmittances before anything is drawn: pixels off the picture start out closed."""
+def _reset_transmittance(columns, rows, left, top, transmittance):  # type: ignore[no-untyped-def]
+    """Set the transmittance to 1, and to 0 for pixels outside the image, which are then finished."""
     width, height = len(columns), len(rows)
-    for pixel in range(PIXELS):
+    for pixel in range(TILE_PIXELS):
         block, lane = pixel // LANES, pixel % LANES
-        x = left + (block % ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH
-        y = top + (block // ACROSS) * BLOCK_HEIGHT + lane // BLOCK_WIDTH
-        through[pixel] = np.float32(1 if x < width and y < height else 0)
+        x = left + (block % BLOCKS_ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH
+        y = top + (block // BLOCKS_ACROSS) * BLOCK_HEIGHT + lane // BLOCK_WIDTH
+        transmittance[pixel] = np.float32(1 if x < width and y < height else 0)
 
 
 @inline_kernel_no_refcount
-def ask_ahead(records, values, intersections, block, first):  # type: ignore[no-untyped-def]
-    """Ask for a block's share of the chunk that begins at entry `first`: memory works while blocks are drawn."""
+def prefetch_slice(records, values, intersections, block, first):  # type: ignore[no-untyped-def]
+    """Prefetch this block's slice of the chunk that begins at intersection `first`."""
     num_values, end = values.shape[1], len(intersections) // 2 - 1
-    for e in range(first + block * _SHARE, first + (block + 1) * _SHARE):
-        index = np.int64(load_scalar(intersections, 2 * max(min(e, end), 0)))
+    for e in range(first + block * _SLICE_SIZE, first + (block + 1) * _SLICE_SIZE):
+        index = np.int64(element(intersections, 2 * max(min(e, end), 0)))
         prefetch(records, RECORD_SIZE * index)
         prefetch(values, num_values * index)
 
 
 @inline_kernel_no_refcount
-def eight_records(records, intersections, e, last):  # type: ignore[no-untyped-def]
-    """The sixteen columns of eight records, in two groups; past `last` the last is repeated."""
-    r0 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * e))
-    r1 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 1, last)))
-    r2 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 2, last)))
-    r3 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 3, last)))
-    r4 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 4, last)))
-    r5 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 5, last)))
-    r6 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 6, last)))
-    r7 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 7, last)))
+def load_eight_records(records, intersections, e, last):  # type: ignore[no-untyped-def]
+    """The columns of eight records, in two groups of eight.
+
+    Args:
+        e: first intersection.
+        last: intersection that is repeated past the end.
+    """
+    r0 = RECORD_SIZE * np.int64(element(intersections, 2 * e))
+    r1 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 1, last)))
+    r2 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 2, last)))
+    r3 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 3, last)))
+    r4 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 4, last)))
+    r5 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 5, last)))
+    r6 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 6, last)))
+    r7 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 7, last)))
     return (
-        load_transposed(records, r0, r1, r2, r3, r4, r5, r6, r7),
-        load_transposed(records, r0 + 8, r1 + 8, r2 + 8, r3 + 8, r4 + 8, r5 + 8, r6 + 8, r7 + 8),
+        columns_of(records, r0, r1, r2, r3, r4, r5, r6, r7),
+        columns_of(records, r0 + 8, r1 + 8, r2 + 8, r3 + 8, r4 + 8, r5 + 8, r6 + 8, r7 + 8),
     )
 
 
 @inline_kernel_no_refcount
-def gather(  # type: ignore[no-untyped-def]
-    records, values, intersections, first, count, place, exact, wide, forms, colours
+def load_chunk(  # type: ignore[no-untyped-def]
+    records, values, intersections, first, count, frame, exact, is_3d, footprints, chunk_values
 ):
-    """Fill in the forms and values of `count` Gaussians of a tile, beginning with entry `first`.
+    """Compute the footprints and copy the values of a chunk.
 
     Args:
         records, intersections: flat.
         values: (n, value).
-        place: the tile's.
-        exact: float32 1, or 0 for the classic kernel, whose L is 1.
-        wide: whether the tile needs three components.
-        forms: (FORMS CHUNK_SIZE), written; past `count` the last Gaussian is repeated.
-        colours: (CHUNK_SIZE value), written.
+        first, count: the chunk's intersections.
+        frame: of the tile.
+        exact: float32 1, or 0 for the EWA kernel, whose L is 1.
+        is_3d: whether the tile needs three components.
+        footprints: (FOOTPRINT_SIZE CHUNK_SIZE), written; past `count` the last Gaussian is repeated.
+        chunk_values: (CHUNK_SIZE value), written.
 
     Returns:
-        Whether the forms are in three components: some point may be too far from the tile's middle for two.
+        Whether the footprints have three components, since a Gaussian may be too far from the tile's centre for two.
     """
     num_values = values.shape[1]
-    while _find_forms(records, intersections, first, count, place, exact, wide, forms):
-        wide = True
-    if num_values == FEW:
+    while _compute_footprints(records, intersections, first, count, frame, exact, is_3d, footprints):
+        is_3d = True
+    if num_values == VALUE_LANES:
         for s in range(count):
-            copy_four(colours, FEW * s, values, FEW * np.int64(load_scalar(intersections, 2 * (first + s))))
+            copy_four(
+                chunk_values, VALUE_LANES * s, values, VALUE_LANES * np.int64(element(intersections, 2 * (first + s)))
+            )
     else:
         for s in range(count):
-            row = num_values * np.int64(load_scalar(intersections, 2 * (first + s)))
+            row = num_values * np.int64(element(intersections, 2 * (first + s)))
             for channel in range(num_values):
-                store_scalar(colours, num_values * s + channel, load_scalar(values, row + channel))
-    return wide
+                put(chunk_values, num_values * s + channel, element(values, row + channel))
+    return is_3d
 
 
 @inline_kernel_no_refcount
-def _find_forms(records, intersections, first, count, place, exact, wide, forms):  # type: ignore[no-untyped-def]
-    """Fill in forms; whether they have to be found once more, in three components."""
+def _compute_footprints(  # type: ignore[no-untyped-def]
+    records, intersections, first, count, frame, exact, is_3d, footprints
+):
+    """Compute a chunk's footprints; returns whether they must be computed again in 3d."""
     last = first + count - 1
-    on, one = broadcast(exact), broadcast(np.float32(1))
-    least, most = one, broadcast(np.float32(0))
+    on, one = fill(exact), fill(np.float32(1))
+    least, most = one, fill(np.float32(0))
     for at in range(0, count, LANES):
-        (n_x, n_y, n_z, rest_x, rest_y, rest_z, a_x, a_y), rest = eight_records(
-            records, intersections, first + at, last
-        )
-        a_z, b_x, b_y, b_z, front_a, front_b, along, level = rest
-        m_x = (n_x - broadcast(place[0])) + (rest_x - broadcast(place[3]))
-        m_y = (n_y - broadcast(place[1])) + (rest_y - broadcast(place[4]))
-        m_z = (n_z - broadcast(place[2])) + (rest_z - broadcast(place[5]))
-        m_x, m_y, m_z = _along_axes(place, m_x, m_y, m_z)
-        a_x, a_y, a_z = _along_axes(place, a_x, a_y, a_z)
-        b_x, b_y, b_z = _along_axes(place, b_x, b_y, b_z)
-        l_x = on * multiply_add(front_a, a_x, multiply_add(front_b, b_x, m_x))
-        l_y = on * multiply_add(front_a, a_y, multiply_add(front_b, b_y, m_y))
+        low, high = load_eight_records(records, intersections, first + at, last)
+        n_x, n_y, n_z, residual_x, residual_y, residual_z, a_x, a_y = low
+        a_z, b_x, b_y, b_z, l_along_a, l_along_b, radial_variance, log2_peak = high
+        m_x = (n_x - fill(frame[0])) + (residual_x - fill(frame[3]))
+        m_y = (n_y - fill(frame[1])) + (residual_y - fill(frame[4]))
+        m_z = (n_z - fill(frame[2])) + (residual_z - fill(frame[5]))
+        m_x, m_y, m_z = _to_tile_frame(frame, m_x, m_y, m_z)
+        a_x, a_y, a_z = _to_tile_frame(frame, a_x, a_y, a_z)
+        b_x, b_y, b_z = _to_tile_frame(frame, b_x, b_y, b_z)
+        l_x = on * multiply_add(l_along_a, a_x, multiply_add(l_along_b, b_x, m_x))
+        l_y = on * multiply_add(l_along_a, a_y, multiply_add(l_along_b, b_y, m_y))
         ahead = one + m_z
-        if wide:
-            store(forms, THIRD * CHUNK_SIZE + at, a_z)
-            store(forms, (THIRD + 1) * CHUNK_SIZE + at, b_z)
-            store(
-                forms, (THIRD + 2) * CHUNK_SIZE + at, on * multiply_add(front_a, a_z, multiply_add(front_b, b_z, ahead))
-            )
-            store(forms, (THIRD + 3) * CHUNK_SIZE + at, m_z)
+        if is_3d:
+            l_z = on * multiply_add(l_along_a, a_z, multiply_add(l_along_b, b_z, ahead))
+            store(footprints, THIRD * CHUNK_SIZE + at, a_z)
+            store(footprints, (THIRD + 1) * CHUNK_SIZE + at, b_z)
+            store(footprints, (THIRD + 2) * CHUNK_SIZE + at, l_z)
+            store(footprints, (THIRD + 3) * CHUNK_SIZE + at, m_z)
             ahead = one
-        # Below 1 no pixel behind a Gaussian's horizon, where L < 0, can see it: its power is level - 1 / along at most.
-        reach = along * (level + broadcast(np.float32(_MARGIN - CUT)))
-        least, inverse = min(least, ahead), one / ahead
-        most = max(most, reach)
-        store(forms, A * CHUNK_SIZE + at, ahead * a_x)
-        store(forms, (A + 1) * CHUNK_SIZE + at, ahead * a_y)
-        store(forms, B * CHUNK_SIZE + at, ahead * b_x)
-        store(forms, (B + 1) * CHUNK_SIZE + at, ahead * b_y)
-        store(forms, L * CHUNK_SIZE + at, ahead * l_x)
-        store(forms, (L + 1) * CHUNK_SIZE + at, ahead * l_y)
-        store(forms, MIDDLE * CHUNK_SIZE + at, inverse * m_x)
-        store(forms, (MIDDLE + 1) * CHUNK_SIZE + at, inverse * m_y)
-        store(forms, ALONG_ROW * CHUNK_SIZE + at, along)
-        store(forms, LEVEL_ROW * CHUNK_SIZE + at, level)
-    return not wide and (any_lane(broadcast(np.float32(MIN_PLANAR_COSINE)) > least) or any_lane(most > one))
+        # If this is below 1, no pixel beyond the horizon, where L < 0, reaches the alpha cut: log2 alpha is at most
+        # log2_peak - 1 / radial_variance there.
+        horizon = radial_variance * (log2_peak + fill(np.float32(_HORIZON_MARGIN - LOG2_ALPHA_CUT)))
+        least, inverse = minimum(least, ahead), one / ahead
+        most = maximum(most, horizon)
+        store(footprints, ROW_A * CHUNK_SIZE + at, ahead * a_x)
+        store(footprints, (ROW_A + 1) * CHUNK_SIZE + at, ahead * a_y)
+        store(footprints, ROW_B * CHUNK_SIZE + at, ahead * b_x)
+        store(footprints, (ROW_B + 1) * CHUNK_SIZE + at, ahead * b_y)
+        store(footprints, ROW_L * CHUNK_SIZE + at, ahead * l_x)
+        store(footprints, (ROW_L + 1) * CHUNK_SIZE + at, ahead * l_y)
+        store(footprints, POINT * CHUNK_SIZE + at, inverse * m_x)
+        store(footprints, (POINT + 1) * CHUNK_SIZE + at, inverse * m_y)
+        store(footprints, RADIAL_VARIANCE * CHUNK_SIZE + at, radial_variance)
+        store(footprints, LOG2_PEAK * CHUNK_SIZE + at, log2_peak)
+    return not is_3d and (some(fill(np.float32(MIN_PLANAR_COSINE)) > least) or some(most > one))
 
 
 @inline_kernel_no_refcount
-def _along_axes(place, x, y, z):  # type: ignore[no-untyped-def]
-    """Vectors' components along a tile's axes, and towards its middle."""
+def _to_tile_frame(frame, x, y, z):  # type: ignore[no-untyped-def]
+    """Components of vectors along a tile's three axes."""
     return (
-        multiply_add(broadcast(place[6]), x, multiply_add(broadcast(place[7]), y, broadcast(place[8]) * z)),
-        multiply_add(broadcast(place[9]), x, multiply_add(broadcast(place[10]), y, broadcast(place[11]) * z)),
-        multiply_add(broadcast(place[12]), x, multiply_add(broadcast(place[13]), y, broadcast(place[14]) * z)),
+        multiply_add(fill(frame[6]), x, multiply_add(fill(frame[7]), y, fill(frame[8]) * z)),
+        multiply_add(fill(frame[9]), x, multiply_add(fill(frame[10]), y, fill(frame[11]) * z)),
+        multiply_add(fill(frame[12]), x, multiply_add(fill(frame[13]), y, fill(frame[14]) * z)),
     )
 
 
 @inline_kernel_no_refcount
-def list_blocks(intersections, first, count, touched):  # type: ignore[no-untyped-def]
-    """Which Gaussians of the chunk touch which columns and rows of blocks, as bits: a block's are in both.
+def mark_blocks(intersections, first, count, masks):  # type: ignore[no-untyped-def]
+    """Set the bits of the Gaussians that reach each column and each row of blocks; a block's are in both.
 
     Args:
         intersections: flat.
-        first: entry that bit 0 stands for.
-        touched: (WORDS EDGES) of uint64, written: words of ACROSS columns and one to spare, then of the rows.
+        first: intersection of bit 0.
+        masks: (CHUNK_WORDS NUM_MASKS) uint64, written: for each word BLOCKS_ACROSS columns and a spare one, then
+            BLOCKS_DOWN rows and a spare one.
     """
-    touched[:] = 0
+    masks[:] = 0
     for at in range(count):
-        box = load_scalar(intersections, 2 * (first + at) + 1)
-        bit, word = np.uint64(1) << np.uint64(at & 63), (at >> 6) * EDGES
-        _toggle(touched, word + (box & 255) // BLOCK_WIDTH, bit)
-        _toggle(touched, word + ((box >> 8) & 255) // BLOCK_WIDTH + 1, bit)
-        _toggle(touched, word + ROWS + ((box >> 16) & 255) // BLOCK_HEIGHT, bit)
-        _toggle(touched, word + ROWS + ((box >> 24) & 255) // BLOCK_HEIGHT + 1, bit)
-    # A bit was turned where its box begins, and behind its end: run along the blocks, it is set in between.
-    for word in range(0, (count + 63) // 64 * EDGES, EDGES):
-        for edge in range(word + 1, word + ACROSS):
-            _toggle(touched, edge, load_scalar(touched, edge - 1))
-        for edge in range(word + ROWS + 1, word + ROWS + DOWN):
-            _toggle(touched, edge, load_scalar(touched, edge - 1))
+        box = element(intersections, 2 * (first + at) + 1)
+        bit, word = np.uint64(1) << np.uint64(at & 63), (at >> 6) * NUM_MASKS
+        _toggle(masks, word + (box & 255) // BLOCK_WIDTH, bit)
+        _toggle(masks, word + ((box >> 8) & 255) // BLOCK_WIDTH + 1, bit)
+        _toggle(masks, word + ROW_MASKS + ((box >> 16) & 255) // BLOCK_HEIGHT, bit)
+        _toggle(masks, word + ROW_MASKS + ((box >> 24) & 255) // BLOCK_HEIGHT + 1, bit)
+    # Bits were toggled where a box begins and after its end; a running XOR sets them in between.
+    for word in range(0, (count + 63) // 64 * NUM_MASKS, NUM_MASKS):
+        for mask in range(word + 1, word + BLOCKS_ACROSS):
+            _toggle(masks, mask, element(masks, mask - 1))
+        for mask in range(word + ROW_MASKS + 1, word + ROW_MASKS + BLOCKS_DOWN):
+            _toggle(masks, mask, element(masks, mask - 1))
 
 
 @inline_kernel_no_refcount
-def _toggle(words, at, bits):  # type: ignore[no-untyped-def]
-    store_scalar(words, at, load_scalar(words, at) ^ bits)
-
-
-Floats = npt.NDArray[np.float32]
-Integers = npt.NDArray[np.int32]
-Longs = npt.NDArray[np.int64]
-
-HALF = CHUNK_SIZE + 64  # room for the powers of a block, and for what `list_bits` writes over
+def _toggle(words, index, bits):  # type: ignore[no-untyped-def]
+    put(words, index, element(words, index) ^ bits)
 
 
 class SavedForBackward(NamedTuple):
-    """What the forward leaves for the backward: how much passed before each chunk of a tile.
+    """Transmittances that the forward saves for the backward.
 
     Attributes:
-        through: (row, PIXELS) float32, transmittances before each chunk drawn.
-        rows: (tile + 1), where each tile's rows begin.
-        drawn: (tile), how many chunks were drawn before the tile closed.
+        transmittance: (row, TILE_PIXELS) float32, before each chunk that was composited.
+        rows: (tile + 1), first row of each tile.
+        num_chunks: (tile), chunks that were composited before all of the tile's pixels were finished.
     """
 
-    through: Floats
+    transmittance: Floats
     rows: Longs
-    drawn: Longs
+    num_chunks: Longs
 
 
 def allocate_saved(starts: Longs, workspace: Workspace) -> SavedForBackward:
-    """Room for what the backward of these tile lists needs."""
-    chunks = -(-np.diff(starts) // CHUNK_SIZE)
-    rows = np.concatenate((np.zeros(1, np.int64), np.cumsum(chunks)))
-    return SavedForBackward(workspace.array((int(rows[-1]), PIXELS), np.float32), rows, np.zeros(len(chunks), np.int64))
+    """Memory for what `rasterize_forward` saves of these tiles."""
+    num_chunks = -(-np.diff(starts) // CHUNK_SIZE)
+    rows = np.concatenate((np.zeros(1, np.int64), np.cumsum(num_chunks)))
+    transmittance = workspace.array((int(rows[-1]), TILE_PIXELS), np.float32)
+    return SavedForBackward(transmittance, rows, np.zeros(len(num_chunks), np.int64))
 
 
 def rasterize_forward(
@@ -344,239 +351,260 @@ def rasterize_forward(
     values: Floats,
     intersections: Integers,
     starts: Longs,
-    plane: PixelTables,
+    tables: PixelTables,
     sums: Floats,
     *,
     first_row: int = 0,
-    kept: SavedForBackward | None = None,
+    saved: SavedForBackward | None = None,
     threads: int = 1,
 ) -> None:
-    """Write the sums of weight x (values, 1) of a band of tile rows.
+    """Write the sums of weight x (values, 1) over a band of tile rows.
 
     Args:
-        records, values, intersections, starts: see `records`; `starts` covers whole rows of tiles.
-        plane: the picture's pixels.
-        sums: (channel + 2, height, width), written where the band lies.
-        first_row: of tiles, the band's first.
-        kept: filled in if given, for the backward.
-        threads: to work on; the result does not depend on it.
+        records, values, intersections, starts: see records.py; `starts` covers whole rows of tiles.
+        tables: the image plane's pixels.
+        sums: (channel + 2, height, width), written within the band.
+        first_row: first row of tiles of the band.
+        saved: written, if given, for the backward.
+        threads: number of threads; the result does not depend on it.
     """
-    pieces = split_tiles(starts, threads)
-    flat = records.reshape(-1), values, intersections.reshape(-1), starts
-    table = plane.kind, plane.columns, plane.rows, plane.rotation
-    room = kept or SavedForBackward(np.empty((0, PIXELS), np.float32), starts, starts)
+    cuts = split_tiles(starts, threads)
+    scene = records.reshape(-1), values, intersections.reshape(-1), starts
+    saved = saved or SavedForBackward(np.empty((0, TILE_PIXELS), np.float32), starts, starts)
 
-    def draw(piece: int) -> None:
-        _draw_tiles(*flat, *table, sums, *room, first_row, pieces[piece], pieces[piece + 1])
+    def rasterize(item: int) -> None:
+        _rasterize_tiles(*scene, *tables, sums, *saved, first_row, cuts[item], cuts[item + 1])
 
-    parallel_for(draw, len(pieces) - 1, threads)
+    parallel_for(rasterize, len(cuts) - 1, threads)
 
 
 @kernel
-def _draw_tiles(  # type: ignore[no-untyped-def]
-    records, values, intersections, starts, kind, columns, rows, rotation, sums, kept, kept_rows, drawn_chunks,
-    first_row, low, high,
+def _rasterize_tiles(  # type: ignore[no-untyped-def]
+    records, values, intersections, starts, kind, columns, rows, rotation, sums, saved_transmittance, saved_rows,
+    saved_num_chunks, first_row, low, high,
 ):  # fmt: skip
     tiles_across = (len(columns) + TILE_SIZE - 1) // TILE_SIZE
     num_values = values.shape[1]
-    offsets, centre, place = np.empty(3 * PIXELS, np.float32), np.empty(3), np.empty(PLACE, np.float32)
-    through, added = np.empty(PIXELS, np.float32), np.empty(num_values * PIXELS, np.float32)
-    forms, colours = np.empty(FORMS * CHUNK_SIZE, np.float32), np.empty(num_values * CHUNK_SIZE, np.float32)
-    touched = np.empty(WORDS * EDGES, np.uint64)
-    powers, places = np.empty(2 * HALF * LANES, np.float32), np.empty(2 * HALF, np.uint8)
+    offsets, centre = np.empty(3 * TILE_PIXELS, np.float32), np.empty(3)
+    frame = np.empty(TILE_FRAME_SIZE, np.float32)
+    transmittance, tile_sums = np.empty(TILE_PIXELS, np.float32), np.empty(num_values * TILE_PIXELS, np.float32)
+    footprints = np.empty(FOOTPRINT_SIZE * CHUNK_SIZE, np.float32)
+    chunk_values = np.empty(num_values * CHUNK_SIZE, np.float32)
+    masks = np.empty(CHUNK_WORDS * NUM_MASKS, np.uint64)
+    log2_alphas, indices = np.empty(2 * BUFFER_SIZE * LANES, np.float32), np.empty(2 * BUFFER_SIZE, np.uint8)
     exact = np.float32(0 if kind == PIXEL_CENTRES else 1)
     for tile in range(low, high):
         left, top = (tile % tiles_across) * TILE_SIZE, (first_row + tile // tiles_across) * TILE_SIZE
-        tile_is_wide, placed = place_tile(kind, columns, rows, rotation, left, top, centre, place), -1
-        open_pixels(columns, rows, left, top, through)
-        added[:] = 0
-        chunks = 0
+        tile_is_3d, pixels_are_3d = set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame), -1
+        _reset_transmittance(columns, rows, left, top, transmittance)
+        tile_sums[:] = 0
+        num_chunks = 0
         for first in range(starts[tile], starts[tile + 1], CHUNK_SIZE):
             count = min(CHUNK_SIZE, starts[tile + 1] - first)
-            if len(kept) > 0:
-                _keep(through, kept, kept_rows[tile] + chunks)
-            chunks += 1
-            wide = gather(records, values, intersections, first, count, place, exact, tile_is_wide, forms, colours)
-            if placed != wide:
-                place_pixels(kind, columns, rows, rotation, left, top, centre, place, wide, offsets)
-                placed = np.int64(wide)
-            list_blocks(intersections, first, count, touched)
+            if len(saved_transmittance) > 0:
+                _save_transmittance(transmittance, saved_transmittance, saved_rows[tile] + num_chunks)
+            num_chunks += 1
+            is_3d = load_chunk(
+                records, values, intersections, first, count, frame, exact, tile_is_3d, footprints, chunk_values
+            )
+            if pixels_are_3d != is_3d:
+                set_tile_pixels(kind, columns, rows, rotation, left, top, centre, frame, is_3d, offsets)
+                pixels_are_3d = np.int64(is_3d)
+            mark_blocks(intersections, first, count, masks)
             is_open = False
-            # The next block's powers are found before a block is drawn, so that their latencies hide each other.
-            drawn, reached, following, half = -1, 0, 0, 0
-            for block in range(BLOCKS + 1):
-                if block < BLOCKS:
-                    ask_ahead(records, values, intersections, block, first + CHUNK_SIZE)
-                    if not any_lane(load(through, block * LANES) > broadcast(np.float32(CLOSED))):
+            # The alphas of one block are computed before those of the previous block are composited (software
+            # pipelining), so that the latencies of both overlap. Two halves of the buffers alternate.
+            ready, num_ready, num_next, begin = -1, 0, 0, 0
+            for block in range(NUM_BLOCKS + 1):
+                if block < NUM_BLOCKS:
+                    prefetch_slice(records, values, intersections, block, first + CHUNK_SIZE)
+                    if not some(load(transmittance, block * LANES) > fill(np.float32(MIN_TRANSMITTANCE))):
                         continue
-                    following = find_powers(block, touched, wide, forms, offsets, powers, places, half)
-                if drawn >= 0 and num_values == FEW:
-                    is_open |= _draw_block(drawn, reached, powers, places, HALF - half, colours, through, added)
-                elif drawn >= 0:
-                    is_open |= _weigh_block(drawn, reached, powers, HALF - half, through)
-                    _add_block(drawn, reached, powers, places, HALF - half, colours, num_values, added)
-                drawn, reached, half = block, following, HALF - half
+                    num_next = compute_log2_alphas(
+                        block, masks, is_3d, footprints, offsets, log2_alphas, indices, begin
+                    )
+                other = BUFFER_SIZE - begin
+                if ready >= 0 and num_values == VALUE_LANES:
+                    is_open |= _blend_four_values(
+                        ready, num_ready, log2_alphas, indices, other, chunk_values, transmittance, tile_sums
+                    )
+                elif ready >= 0:
+                    is_open |= _compute_weights(ready, num_ready, log2_alphas, other, transmittance)
+                    _accumulate_values(
+                        ready, num_ready, log2_alphas, indices, other, chunk_values, num_values, tile_sums
+                    )
+                ready, num_ready, begin = block, num_next, other
             if not is_open:
                 break
-        if len(kept) > 0:
-            drawn_chunks[tile] = chunks
-        _write_tile(through, added, sums, left, top, num_values)
+        if len(saved_transmittance) > 0:
+            saved_num_chunks[tile] = num_chunks
+        _write_tile(transmittance, tile_sums, sums, left, top, num_values)
 
 
 @inline_kernel_no_refcount
-def _keep(through, kept, row):  # type: ignore[no-untyped-def]
-    for pixel in range(PIXELS):
-        kept[row, pixel] = through[pixel]
+def _save_transmittance(transmittance, saved_transmittance, row):  # type: ignore[no-untyped-def]
+    for pixel in range(TILE_PIXELS):
+        saved_transmittance[row, pixel] = transmittance[pixel]
 
 
 @inline_kernel_no_refcount
-def find_powers(block, touched, wide, forms, offsets, powers, places, start):  # type: ignore[no-untyped-def]
-    """Log2 of the peak times the response at a block's pixels, for the Gaussians of the chunk that reach it.
+def compute_log2_alphas(  # type: ignore[no-untyped-def]
+    block, masks, is_3d, footprints, offsets, log2_alphas, indices, begin
+):
+    """Compute log2 alpha, before cut and clamp, of the Gaussians that reach a block, front to back.
+
+    Args:
+        log2_alphas, indices: written from `begin` on, LANES and one number per Gaussian; indices are within the chunk.
 
     Returns:
-        How many of `powers` (LANES each) and `places` (in the chunk) were written, front to back; one more that is
-        nothing follows. Boxes have corners: some of them no pixel sees. Leaving those out would make each wait for the
-        one before.
+        The number of Gaussians. One more with alpha 0 follows them. Gaussians that no pixel of the block sees, in a
+        corner of their box, are included: to drop them would make each Gaussian depend on the previous one.
     """
     pixel = block * LANES
-    x, y, z = load(offsets, pixel), load(offsets, PIXELS + pixel), load(offsets, 2 * PIXELS + pixel)
-    total = _list_places(block, touched, places, start)
-    zero = broadcast(np.float32(0))
-    for at in range(start, start + total):
-        s = np.int64(load_scalar(places, at))
-        a, b, front = forms_at(wide, forms, s, x, y, z)
-        if wide:
-            front = select(front > zero, front, broadcast(np.float32(np.nan)))
+    x, y, z = load(offsets, pixel), load(offsets, TILE_PIXELS + pixel), load(offsets, 2 * TILE_PIXELS + pixel)
+    total = _list_gaussians(block, masks, indices, begin)
+    zero = fill(np.float32(0))
+    for at in range(begin, begin + total):
+        s = np.int64(element(indices, at))
+        a, b, front = evaluate_footprint(is_3d, footprints, s, x, y, z)
+        if is_3d:
+            front = choose(front > zero, front, fill(np.float32(np.nan)))
         q = multiply_add(a, a, b * b)
-        below = multiply_add(max(zero, front), front, load_broadcast(forms, ALONG_ROW * CHUNK_SIZE + s) * q)
-        store(powers, at * LANES, load_broadcast(forms, LEVEL_ROW * CHUNK_SIZE + s) - q / below)
-    store(powers, (start + total) * LANES, broadcast(np.float32(NOTHING)))
+        radial_variance = spread(footprints, RADIAL_VARIANCE * CHUNK_SIZE + s)
+        divisor = multiply_add(maximum(zero, front), front, radial_variance * q)
+        store(log2_alphas, at * LANES, spread(footprints, LOG2_PEAK * CHUNK_SIZE + s) - q / divisor)
+    store(log2_alphas, (begin + total) * LANES, fill(np.float32(LOG2_ZERO)))
     return total
 
 
 @inline_kernel_no_refcount
-def _list_places(block, touched, places, start):  # type: ignore[no-untyped-def]
-    """Write down which Gaussians of the chunk reach a block, and one more; how many do."""
-    at, column, row = start, block % ACROSS, ROWS + block // ACROSS
-    for word in range(WORDS):
-        bits = load_scalar(touched, word * EDGES + column) & load_scalar(touched, word * EDGES + row)
-        list_set_bits(places, at, bits, word * 64)
-        at += popcount(bits)
-    store_scalar(places, at, np.uint8(0))
-    return at - start
+def _list_gaussians(block, masks, indices, begin):  # type: ignore[no-untyped-def]
+    """Write the chunk indices of the Gaussians that reach a block, and a 0 after them; returns their number."""
+    at, column, row = begin, block % BLOCKS_ACROSS, ROW_MASKS + block // BLOCKS_ACROSS
+    for word in range(CHUNK_WORDS):
+        bits = element(masks, word * NUM_MASKS + column) & element(masks, word * NUM_MASKS + row)
+        list_bits(indices, at, bits, word * 64)
+        at += how_many(bits)
+    put(indices, at, np.uint8(0))
+    return at - begin
 
 
 @inline_kernel_no_refcount
-def forms_at(wide, forms, s, x, y, z):  # type: ignore[no-untyped-def]
-    """A, B, L of Gaussian `s` of the chunk at a block's pixels, up to a factor a pixel, which powers do not see.
+def evaluate_footprint(is_3d, footprints, s, x, y, z):  # type: ignore[no-untyped-def]
+    """A, B and L of Gaussian `s` of the chunk at a block's pixels, up to a factor per pixel that cancels in Q / L^2.
 
-    The offsets from the Gaussian come first: small numbers, so that nothing large cancels in the sums.
+    The offsets from the Gaussian are subtracted first: they are small, so that the sums have no cancellation.
     """
-    x, y = x - load_broadcast(forms, MIDDLE * CHUNK_SIZE + s), y - load_broadcast(forms, (MIDDLE + 1) * CHUNK_SIZE + s)
-    a = load_broadcast(forms, A * CHUNK_SIZE + s) * x
-    b = load_broadcast(forms, B * CHUNK_SIZE + s) * x
-    front = multiply_add(load_broadcast(forms, L * CHUNK_SIZE + s), x, broadcast(np.float32(1)))
-    a = multiply_add(load_broadcast(forms, (A + 1) * CHUNK_SIZE + s), y, a)
-    b = multiply_add(load_broadcast(forms, (B + 1) * CHUNK_SIZE + s), y, b)
-    front = multiply_add(load_broadcast(forms, (L + 1) * CHUNK_SIZE + s), y, front)
-    if wide:
-        z = z - load_broadcast(forms, (THIRD + 3) * CHUNK_SIZE + s)
-        a = multiply_add(load_broadcast(forms, THIRD * CHUNK_SIZE + s), z, a)
-        b = multiply_add(load_broadcast(forms, (THIRD + 1) * CHUNK_SIZE + s), z, b)
-        front = multiply_add(load_broadcast(forms, (THIRD + 2) * CHUNK_SIZE + s), z, front)
+    x, y = x - spread(footprints, POINT * CHUNK_SIZE + s), y - spread(footprints, (POINT + 1) * CHUNK_SIZE + s)
+    a = spread(footprints, ROW_A * CHUNK_SIZE + s) * x
+    b = spread(footprints, ROW_B * CHUNK_SIZE + s) * x
+    front = multiply_add(spread(footprints, ROW_L * CHUNK_SIZE + s), x, fill(np.float32(1)))
+    a = multiply_add(spread(footprints, (ROW_A + 1) * CHUNK_SIZE + s), y, a)
+    b = multiply_add(spread(footprints, (ROW_B + 1) * CHUNK_SIZE + s), y, b)
+    front = multiply_add(spread(footprints, (ROW_L + 1) * CHUNK_SIZE + s), y, front)
+    if is_3d:
+        z = z - spread(footprints, (THIRD + 3) * CHUNK_SIZE + s)
+        a = multiply_add(spread(footprints, THIRD * CHUNK_SIZE + s), z, a)
+        b = multiply_add(spread(footprints, (THIRD + 1) * CHUNK_SIZE + s), z, b)
+        front = multiply_add(spread(footprints, (THIRD + 2) * CHUNK_SIZE + s), z, front)
     return a, b, front
 
 
 @inline_kernel_no_refcount
-def opacity(power):  # type: ignore[no-untyped-def]
-    """Alpha of a power: 0 below the cut, at most MOST."""
-    alpha = min(exp2(power), broadcast(np.float32(MOST)))
-    return select(broadcast(np.float32(CUT)) <= power, alpha, broadcast(np.float32(0)))
+def compute_alpha(log2_alpha):  # type: ignore[no-untyped-def]
+    """Alpha: 0 below the cut, at most MAX_ALPHA."""
+    alpha = minimum(exp2(log2_alpha), fill(np.float32(MAX_ALPHA)))
+    return choose(fill(np.float32(LOG2_ALPHA_CUT)) <= log2_alpha, alpha, fill(np.float32(0)))
 
 
 @inline_kernel_no_refcount
-def _draw_block(block, reached, powers, places, start, colours, through, added):  # type: ignore[no-untyped-def]
-    """Draw what reaches a block, four values a Gaussian; whether it stays open."""
+def _blend_four_values(  # type: ignore[no-untyped-def]
+    block, count, log2_alphas, indices, begin, chunk_values, transmittance, tile_sums
+):
+    """Composite the Gaussians of a block, four values each; returns whether a pixel is unfinished."""
     pixel = block * LANES
-    passes = load(through, pixel)
-    sum0, sum1 = load(added, pixel), load(added, PIXELS + pixel)
-    sum2, sum3 = load(added, 2 * PIXELS + pixel), load(added, 3 * PIXELS + pixel)
-    for at in range(start, start + reached, 2):  # a half-full last turn adds nothing
-        colour, other = FEW * np.int64(load_scalar(places, at)), FEW * np.int64(load_scalar(places, at + 1))
-        alpha, beta = opacity(load(powers, at * LANES)), opacity(load(powers, at * LANES + LANES))
-        weight = alpha * passes
-        passes = multiply_add(-alpha, passes, passes)
-        sum0 = multiply_add(weight, load_broadcast(colours, colour), sum0)
-        sum1 = multiply_add(weight, load_broadcast(colours, colour + 1), sum1)
-        sum2 = multiply_add(weight, load_broadcast(colours, colour + 2), sum2)
-        sum3 = multiply_add(weight, load_broadcast(colours, colour + 3), sum3)
-        weight = beta * passes
-        passes = multiply_add(-beta, passes, passes)
-        sum0 = multiply_add(weight, load_broadcast(colours, other), sum0)
-        sum1 = multiply_add(weight, load_broadcast(colours, other + 1), sum1)
-        sum2 = multiply_add(weight, load_broadcast(colours, other + 2), sum2)
-        sum3 = multiply_add(weight, load_broadcast(colours, other + 3), sum3)
-    store(through, pixel, passes)
-    store(added, pixel, sum0)
-    store(added, PIXELS + pixel, sum1)
-    store(added, 2 * PIXELS + pixel, sum2)
-    store(added, 3 * PIXELS + pixel, sum3)
-    return any_lane(passes > broadcast(np.float32(CLOSED)))
+    passing = load(transmittance, pixel)
+    sum0, sum1 = load(tile_sums, pixel), load(tile_sums, TILE_PIXELS + pixel)
+    sum2, sum3 = load(tile_sums, 2 * TILE_PIXELS + pixel), load(tile_sums, 3 * TILE_PIXELS + pixel)
+    for at in range(begin, begin + count, 2):  # after an odd number the last alpha is 0
+        first, second = VALUE_LANES * np.int64(element(indices, at)), VALUE_LANES * np.int64(element(indices, at + 1))
+        alpha = compute_alpha(load(log2_alphas, at * LANES))
+        next_alpha = compute_alpha(load(log2_alphas, at * LANES + LANES))
+        weight = alpha * passing
+        passing = multiply_add(negative(alpha), passing, passing)
+        sum0 = multiply_add(weight, spread(chunk_values, first), sum0)
+        sum1 = multiply_add(weight, spread(chunk_values, first + 1), sum1)
+        sum2 = multiply_add(weight, spread(chunk_values, first + 2), sum2)
+        sum3 = multiply_add(weight, spread(chunk_values, first + 3), sum3)
+        weight = next_alpha * passing
+        passing = multiply_add(negative(next_alpha), passing, passing)
+        sum0 = multiply_add(weight, spread(chunk_values, second), sum0)
+        sum1 = multiply_add(weight, spread(chunk_values, second + 1), sum1)
+        sum2 = multiply_add(weight, spread(chunk_values, second + 2), sum2)
+        sum3 = multiply_add(weight, spread(chunk_values, second + 3), sum3)
+    store(transmittance, pixel, passing)
+    store(tile_sums, pixel, sum0)
+    store(tile_sums, TILE_PIXELS + pixel, sum1)
+    store(tile_sums, 2 * TILE_PIXELS + pixel, sum2)
+    store(tile_sums, 3 * TILE_PIXELS + pixel, sum3)
+    return some(passing > fill(np.float32(MIN_TRANSMITTANCE)))
 
 
 @inline_kernel_no_refcount
-def _weigh_block(block, reached, powers, start, through):  # type: ignore[no-untyped-def]
-    """Turn powers into weights; whether the block stays open."""
-    passes = load(through, block * LANES)
-    for at in range(start, start + reached):
-        alpha = opacity(load(powers, at * LANES))
-        store(powers, at * LANES, alpha * passes)
-        passes = multiply_add(-alpha, passes, passes)
-    store(through, block * LANES, passes)
-    return any_lane(passes > broadcast(np.float32(CLOSED)))
+def _compute_weights(block, count, log2_alphas, begin, transmittance):  # type: ignore[no-untyped-def]
+    """Replace log2 alphas by weights; returns whether a pixel is unfinished."""
+    passing = load(transmittance, block * LANES)
+    for at in range(begin, begin + count):
+        alpha = compute_alpha(load(log2_alphas, at * LANES))
+        store(log2_alphas, at * LANES, alpha * passing)
+        passing = multiply_add(negative(alpha), passing, passing)
+    store(transmittance, block * LANES, passing)
+    return some(passing > fill(np.float32(MIN_TRANSMITTANCE)))
 
 
 @inline_kernel_no_refcount
-def _add_block(block, reached, weights, places, start, colours, num_values, added):  # type: ignore[no-untyped-def]
-    """Add a block's weighted values to the sums, any number of them."""
+def _accumulate_values(  # type: ignore[no-untyped-def]
+    block, count, weights, indices, begin, chunk_values, num_values, tile_sums
+):
+    """Add a block's weighted values to the sums, any number of values."""
     for channel in range(num_values):
-        pixel = channel * PIXELS + block * LANES
-        total = load(added, pixel)
-        for at in range(start, start + reached):
-            colour = num_values * np.int64(load_scalar(places, at)) + channel
-            total = multiply_add(load(weights, at * LANES), load_broadcast(colours, colour), total)
-        store(added, pixel, total)
+        pixel = channel * TILE_PIXELS + block * LANES
+        total = load(tile_sums, pixel)
+        for at in range(begin, begin + count):
+            value = num_values * np.int64(element(indices, at)) + channel
+            total = multiply_add(load(weights, at * LANES), spread(chunk_values, value), total)
+        store(tile_sums, pixel, total)
 
 
 @inline_kernel_no_refcount
-def _write_tile(through, added, sums, left, top, num_values):  # type: ignore[no-untyped-def]
-    """Copy a tile's sums into the picture; the weights of a ray and what passes sum to 1."""
+def _write_tile(transmittance, tile_sums, sums, left, top, num_values):  # type: ignore[no-untyped-def]
+    """Copy a tile's sums into the image; the last one is the sum of the weights, 1 minus the transmittance."""
     width, height = sums.shape[2], sums.shape[1]
     if left + TILE_SIZE > width or top + TILE_SIZE > height:
-        _write_part(through, added, sums, left, top, num_values)
+        _write_partial_tile(transmittance, tile_sums, sums, left, top, num_values)
         return
-    picture, one = sums.reshape(-1), broadcast(np.float32(1))
-    for block in range(0, BLOCKS, 2):
+    image, one = sums.reshape(-1), fill(np.float32(1))
+    for block in range(0, NUM_BLOCKS, 2):
         pixel = block * LANES
-        at = (top + block // ACROSS * BLOCK_HEIGHT) * width + left + block % ACROSS * BLOCK_WIDTH
+        corner = (top + block // BLOCKS_ACROSS * BLOCK_HEIGHT) * width + left + block % BLOCKS_ACROSS * BLOCK_WIDTH
         for channel in range(num_values):
-            plane, place = channel * PIXELS + pixel, channel * height * width + at
-            upper, lower = join_halves(load(added, plane), load(added, plane + LANES))
-            store(picture, place, upper)
-            store(picture, place + width, lower)
-        place = num_values * height * width + at
-        upper, lower = join_halves(one - load(through, pixel), one - load(through, pixel + LANES))
-        store(picture, place, upper)
-        store(picture, place + width, lower)
+            source, target = channel * TILE_PIXELS + pixel, channel * height * width + corner
+            upper, lower = side_by_side(load(tile_sums, source), load(tile_sums, source + LANES))
+            store(image, target, upper)
+            store(image, target + width, lower)
+        target = num_values * height * width + corner
+        upper, lower = side_by_side(one - load(transmittance, pixel), one - load(transmittance, pixel + LANES))
+        store(image, target, upper)
+        store(image, target + width, lower)
 
 
 @inline_kernel_no_refcount
-def _write_part(through, added, sums, left, top, num_values):  # type: ignore[no-untyped-def]
-    for pixel in range(PIXELS):
+def _write_partial_tile(transmittance, tile_sums, sums, left, top, num_values):  # type: ignore[no-untyped-def]
+    for pixel in range(TILE_PIXELS):
         block, lane = pixel // LANES, pixel % LANES
-        x = left + (block % ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH
-        y = top + (block // ACROSS) * BLOCK_HEIGHT + lane // BLOCK_WIDTH
+        x = left + (block % BLOCKS_ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH
+        y = top + (block // BLOCKS_ACROSS) * BLOCK_HEIGHT + lane // BLOCK_WIDTH
         if x < sums.shape[2] and y < sums.shape[1]:
             for channel in range(num_values):
-                sums[channel, y, x] = added[channel * PIXELS + pixel]
-            sums[num_values, y, x] = np.float32(1) - through[pixel]
+                sums[channel, y, x] = tile_sums[channel * TILE_PIXELS + pixel]
+            sums[num_values, y, x] = np.float32(1) - transmittance[pixel]

@@ -1,76 +1,82 @@
-"""Compositing of tiles on the CPU, backward.
+"""Gradients of stage three: from an image's gradient to those of records and values, one slot per intersection.
 
-Source: docs/rendering.md, sections 3 and 4. The forward kept how much passes before each chunk of a tile, so chunks are
-taken back to front, each with all it needs in the second cache. Block by block the weights of what reaches it are found
-front to back, then the slopes back to front: what a ray meets behind a Gaussian is blended from the back, as a mean, so
-that nothing is divided by a transmittance. Last Gaussian by Gaussian: their moments over all their blocks stay in
-registers, and become the gradient of the record. Each entry writes a slot of its own.
+Source: docs/rendering.md, sections 3 and 4. The forward saved the transmittance before each chunk of a tile, so chunks
+are processed back to front, each with all its data in the L2 cache. In each block the weights are recomputed front to
+back, then gradients follow back to front. What a ray meets behind a Gaussian is blended from the back as a mean, so
+nothing is divided by a transmittance. Last, the gradient sums of each Gaussian over all its blocks are accumulated in
+registers and become the gradient of its record.
+
+An alpha depends on a pixel through A / L and B / L alone, which are a projective map of the pixel. This map has eight
+parameters, and a rotation of A and B into each other has no effect on the alpha. So seven sums, and two for the radial
+variance and the peak, are sufficient statistics of a tile's pixels, whatever frame the footprints are computed in.
 """
 
 import math
 
 import numpy as np
 
+from pansplat.constants import MAX_ALPHA
+from pansplat.rendering.cpu.columns import columns_of
 from pansplat.rendering.cpu.rasterize import (
-    ACROSS,
-    ALONG_ROW,
     BLOCK_HEIGHT,
     BLOCK_WIDTH,
-    BLOCKS,
+    BLOCKS_ACROSS,
+    BUFFER_SIZE,
     CHUNK_SIZE,
-    CLOSED,
-    EDGES,
-    FORMS,
-    HALF,
-    MOST,
-    PIXELS,
-    PLACE,
-    WORDS,
+    CHUNK_WORDS,
+    FOOTPRINT_SIZE,
+    MIN_TRANSMITTANCE,
+    NUM_BLOCKS,
+    NUM_MASKS,
+    RADIAL_VARIANCE,
+    TILE_FRAME_SIZE,
+    TILE_PIXELS,
+    VALUE_LANES,
     Floats,
     Integers,
     Longs,
     SavedForBackward,
-    ask_ahead,
-    eight_records,
-    find_powers,
-    forms_at,
-    gather,
-    list_blocks,
-    opacity,
-    place_pixels,
-    place_tile,
+    compute_alpha,
+    compute_log2_alphas,
+    evaluate_footprint,
+    load_chunk,
+    load_eight_records,
+    mark_blocks,
+    prefetch_slice,
+    set_tile_frame,
+    set_tile_pixels,
 )
 from pansplat.rendering.cpu.records import PIXEL_CENTRES, RECORD_SIZE, TILE_SIZE, PixelTables
 from pansplat.rendering.cpu.runtime import inline_kernel_no_refcount, kernel, parallel_for
 from pansplat.rendering.cpu.simd import (
     LANES,
-    any_lane,
-    broadcast,
+    choose,
+    element,
+    fill,
     first_lane,
-    join_halves,
-    lane_sums,
     load,
-    load_broadcast,
-    load_scalar,
-    load_transposed,
+    maximum,
     multiply_add,
-    prefetch_for_write,
-    select,
+    negative,
+    prefetch_to_write,
+    put,
+    side_by_side,
+    some,
+    spread,
     store,
-    store_nontemporal,
-    store_scalar,
-    transpose,
+    store_past_cache,
+    totals,
+    transposed,
 )
 from pansplat.rendering.cpu.tiling import split_tiles
 
-# Moments of a Gaussian over the pixels of a tile, and the gradient of its record that they make.
-#
-# Source: docs/rendering.md, section 3. A response depends on A / L and B / L alone, which a pixel has by a projection:
-# eight numbers, of which one only turns A and B into each other. So seven sums, and those for `along` and `level`, are
-# all that the pixels have to say, whatever tile or components the forms were found in.
-
-
-_PAIRS = BLOCKS * CHUNK_SIZE  # of a Gaussian and a block, the most a chunk can have
+_MAX_PAIRS = NUM_BLOCKS * CHUNK_SIZE  # pairs of a Gaussian and a block, in a chunk
+_PAIR_SIZE = 2 * LANES  # numbers in a pair: gradients by log alpha, and weights; one cache line
+_NUM_SUMS = 16  # for each Gaussian; see `_accumulate_gradient_sums`
+_VALUE_SUMS = 9  # where the sums of values begin
+_LN2 = math.log(2)
+_MIN_DIVISOR = 1e-16  # of L^2 + radial_variance Q; only reached where the gradient is 0
+_WRITE_AHEAD = 24  # Gaussians, from the prefetch of a slot to the write
 
 
 def rasterize_backward(
@@ -79,9 +85,9 @@ def rasterize_backward(
     intersections: Integers,
     starts: Longs,
     slots: Integers | Longs,
-    plane: PixelTables,
+    tables: PixelTables,
     sums: Floats,
-    kept: SavedForBackward,
+    saved: SavedForBackward,
     grad_sums: Floats,
     grad_records: Floats,
     grad_values: Floats,
@@ -89,362 +95,359 @@ def rasterize_backward(
     first_row: int = 0,
     threads: int = 1,
 ) -> None:
-    """Write each entry's gradient into its slot.
+    """Write each intersection's gradient to its slot.
 
     Args:
-        records, values, intersections, starts, slots: as in `rasterize_forward`.
-        plane: the picture's pixels.
-        sums, kept: what `rasterize_forward` wrote.
-        grad_sums: gradient of the sums, the same shape.
-        grad_records: (slot, RECORD_SIZE), written; directions in the columns DIRECTION, zeros in DIRECTION_RESIDUAL.
-            Starts on a multiple of 32 bytes: nobody reads it soon, so it is written past the caches.
-        grad_values: (slot, channel + 1), written likewise.
-        first_row: of tiles, the band's first.
-        threads: to work on; the result does not depend on it.
+        records, values, intersections, starts: as in `rasterize_forward`.
+        slots: see records.py.
+        tables: the image plane's pixels.
+        sums, saved: outputs of `rasterize_forward`.
+        grad_sums: gradient of the sums, of the same shape.
+        grad_records: (slot, RECORD_SIZE), written; zeros in DIRECTION_RESIDUAL. Aligned to 32 bytes, for non-temporal
+            stores.
+        grad_values: (slot, channel + 1), written.
+        first_row: first row of tiles of the band.
+        threads: number of threads; the result does not depend on it.
     """
     assert grad_records.size == 0 or grad_records.ctypes.data % (4 * LANES) == 0
-    pieces = split_tiles(starts, threads)
-    drawn = records.reshape(-1), values, intersections.reshape(-1), starts, slots
-    table = plane.kind, plane.columns, plane.rows, plane.rotation
-    gradients = sums, *kept, grad_sums, grad_records.reshape(-1), grad_values.reshape(-1)
+    cuts = split_tiles(starts, threads)
+    scene = records.reshape(-1), values, intersections.reshape(-1), starts, slots
+    gradients = sums, *saved, grad_sums, grad_records.reshape(-1), grad_values.reshape(-1)
 
-    def walk(piece: int) -> None:
-        _walk_tiles(*drawn, *table, *gradients, first_row, pieces[piece], pieces[piece + 1])
+    def differentiate(item: int) -> None:
+        _rasterize_tiles_backward(*scene, *tables, *gradients, first_row, cuts[item], cuts[item + 1])
 
-    parallel_for(walk, len(pieces) - 1, threads)
+    parallel_for(differentiate, len(cuts) - 1, threads)
 
 
 @kernel
-def _walk_tiles(  # type: ignore[no-untyped-def]
-    records, values, intersections, starts, slots, kind, columns, rows, rotation, sums, kept, kept_rows, drawn_chunks,
-    grad_sums, grad_records, grad_values, first_row, low, high,
+def _rasterize_tiles_backward(  # type: ignore[no-untyped-def]
+    records, values, intersections, starts, slots, kind, columns, rows, rotation, sums, saved_transmittance,
+    saved_rows, saved_num_chunks, grad_sums, grad_records, grad_values, first_row, low, high,
 ):  # fmt: skip
     tiles_across = (len(columns) + TILE_SIZE - 1) // TILE_SIZE
     num_values = values.shape[1]
-    planes = (num_values + GROUP - 1) // GROUP * GROUP
-    offsets, centre, place = np.empty(3 * PIXELS, np.float32), np.empty(3), np.empty(PLACE, np.float32)
-    upstream, behind = np.zeros((planes + 2) * PIXELS, np.float32), np.empty(PIXELS, np.float32)
-    forms, colours = np.empty(FORMS * CHUNK_SIZE, np.float32), np.zeros(num_values * CHUNK_SIZE + GROUP, np.float32)
-    # Of each pair also its block, and the same Gaussian's pair before.
-    slopes, pairs = np.empty(_PAIRS * PAIR, np.float32), np.empty(2 * _PAIRS, np.int32)
-    heads, touched = np.empty(CHUNK_SIZE, np.int32), np.empty(WORDS * EDGES, np.uint64)
-    powers, places = np.empty(2 * HALF * LANES, np.float32), np.empty(2 * HALF, np.uint8)
-    alphas, weights = np.empty(2 * HALF * LANES, np.float32), np.empty(2 * HALF * LANES, np.float32)
-    seen = np.empty(2 * HALF, np.int32)
-    moments = np.empty(MOMENTS * CHUNK_SIZE, np.float32)
+    padded_values = (num_values + VALUE_LANES - 1) // VALUE_LANES * VALUE_LANES
+    offsets, centre = np.empty(3 * TILE_PIXELS, np.float32), np.empty(3)
+    frame = np.empty(TILE_FRAME_SIZE, np.float32)
+    tile_grads, behind = np.zeros((padded_values + 2) * TILE_PIXELS, np.float32), np.empty(TILE_PIXELS, np.float32)
+    footprints = np.empty(FOOTPRINT_SIZE * CHUNK_SIZE, np.float32)
+    chunk_values = np.zeros(num_values * CHUNK_SIZE + VALUE_LANES, np.float32)
+    # Of each pair also its block, and the previous pair of the same Gaussian: a linked list from `heads` on.
+    pairs, links = np.empty(_MAX_PAIRS * _PAIR_SIZE, np.float32), np.empty(2 * _MAX_PAIRS, np.int32)
+    heads, masks = np.empty(CHUNK_SIZE, np.int32), np.empty(CHUNK_WORDS * NUM_MASKS, np.uint64)
+    log2_alphas, indices = np.empty(2 * BUFFER_SIZE * LANES, np.float32), np.empty(2 * BUFFER_SIZE, np.uint8)
+    alphas = np.empty(2 * BUFFER_SIZE * LANES, np.float32)
+    weights = np.empty(2 * BUFFER_SIZE * LANES, np.float32)
+    visible = np.empty(2 * BUFFER_SIZE, np.int32)
+    gradient_sums = np.empty(_NUM_SUMS * CHUNK_SIZE, np.float32)
     exact = np.float32(0 if kind == PIXEL_CENTRES else 1)
     for tile in range(low, high):
         left, top = (tile % tiles_across) * TILE_SIZE, (first_row + tile // tiles_across) * TILE_SIZE
-        tile_is_wide, placed = place_tile(kind, columns, rows, rotation, left, top, centre, place), -1
-        _read_upstream(sums, grad_sums, left, top, num_values, planes, upstream)
-        begin, end, chunks = starts[tile], starts[tile + 1], drawn_chunks[tile]
-        _write_nothing(slots, begin + CHUNK_SIZE * chunks, end, num_values, grad_records, grad_values)
-        for pixel in range(PIXELS):
-            behind[pixel] = -upstream[(planes + 1) * PIXELS + pixel]
-        for chunk in range(chunks - 1, -1, -1):
+        tile_is_3d, pixels_are_3d = set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame), -1
+        _load_tile_gradients(sums, grad_sums, left, top, num_values, padded_values, tile_grads)
+        begin, end, num_chunks = starts[tile], starts[tile + 1], saved_num_chunks[tile]
+        _write_zeros(slots, begin + CHUNK_SIZE * num_chunks, end, num_values, grad_records, grad_values)
+        for pixel in range(TILE_PIXELS):
+            behind[pixel] = -tile_grads[(padded_values + 1) * TILE_PIXELS + pixel]
+        for chunk in range(num_chunks - 1, -1, -1):
             first = begin + chunk * CHUNK_SIZE
             count = min(CHUNK_SIZE, end - first)
-            wide = gather(records, values, intersections, first, count, place, exact, tile_is_wide, forms, colours)
-            if placed != wide:
-                place_pixels(kind, columns, rows, rotation, left, top, centre, place, wide, offsets)
-                placed = np.int64(wide)
-            list_blocks(intersections, first, count, touched)
-            following = first - CHUNK_SIZE
-            if chunk == 0:  # the next tile's last
-                following = end + CHUNK_SIZE * (drawn_chunks[min(tile + 1, high - 1)] - 1)
-            _find_slopes(
-                records, values, intersections, following, wide, forms, colours, touched, offsets,
-                kept[kept_rows[tile] + chunk], num_values, planes, upstream, behind, powers, places, alphas, weights,
-                seen, slopes, pairs, heads,
+            is_3d = load_chunk(
+                records, values, intersections, first, count, frame, exact, tile_is_3d, footprints, chunk_values
+            )
+            if pixels_are_3d != is_3d:
+                set_tile_pixels(kind, columns, rows, rotation, left, top, centre, frame, is_3d, offsets)
+                pixels_are_3d = np.int64(is_3d)
+            mark_blocks(intersections, first, count, masks)
+            next_first = first - CHUNK_SIZE
+            if chunk == 0:  # the last chunk of the next tile
+                next_first = end + CHUNK_SIZE * (saved_num_chunks[min(tile + 1, high - 1)] - 1)
+            _differentiate_chunk(
+                records, values, intersections, next_first, is_3d, footprints, chunk_values, masks, offsets,
+                saved_transmittance[saved_rows[tile] + chunk], num_values, padded_values, tile_grads, behind,
+                log2_alphas, indices, alphas, weights, visible, pairs, links, heads,
             )  # fmt: skip
-            write_chunk(
-                records, intersections, first, count, slots, heads, pairs, slopes, wide, forms, offsets, upstream,
-                num_values, moments, exact, grad_records, grad_values,
+            _write_chunk_gradients(
+                records, intersections, first, count, slots, heads, links, pairs, is_3d, footprints, offsets,
+                tile_grads, num_values, gradient_sums, exact, grad_records, grad_values,
             )  # fmt: skip
 
 
 @inline_kernel_no_refcount
-def _read_upstream(sums, grad_sums, left, top, num_values, planes, upstream):  # type: ignore[no-untyped-def]
-    """The tile's gradients by blocks, 0 off the picture; last that of the weights' sum, less the ray's total.
+def _load_tile_gradients(  # type: ignore[no-untyped-def]
+    sums, grad_sums, left, top, num_values, padded_values, tile_grads
+):
+    """Load a tile's gradients by blocks, 0 outside the image; then two more rows.
 
-    The weights and what passes sum to 1. So a constant may be taken off what all that a ray meets is worth, and off
-    what lies beyond: about the mean, which leaves small numbers to subtract.
+    The rows are the gradient of the sum of the weights minus the dot product of gradients and sums, and this dot
+    product. The weights and the final transmittance sum to 1, so a constant may be subtracted from the value of each
+    Gaussian and of what lies behind all of them: with their mean the differences are small.
     """
     height, width = grad_sums.shape[1], grad_sums.shape[2]
     if left + TILE_SIZE > width or top + TILE_SIZE > height:
-        _read_part(sums, grad_sums, left, top, num_values, planes, upstream)
+        _load_partial_tile_gradients(sums, grad_sums, left, top, num_values, padded_values, tile_grads)
         return
-    given, drawn = grad_sums.reshape(-1), sums.reshape(-1)
-    for block in range(0, BLOCKS, 2):
-        pixel, first, second = block * LANES, broadcast(np.float32(0)), broadcast(np.float32(0))
-        at = (top + block // ACROSS * BLOCK_HEIGHT) * width + left + block % ACROSS * BLOCK_WIDTH
+    image_grads, image = grad_sums.reshape(-1), sums.reshape(-1)
+    for block in range(0, NUM_BLOCKS, 2):
+        pixel, first, second = block * LANES, fill(np.float32(0)), fill(np.float32(0))
+        corner = (top + block // BLOCKS_ACROSS * BLOCK_HEIGHT) * width + left + block % BLOCKS_ACROSS * BLOCK_WIDTH
         for channel in range(num_values + 1):
-            place = channel * height * width + at
-            gradient, other_gradient = join_halves(load(given, place), load(given, place + width))
-            value, other_value = join_halves(load(drawn, place), load(drawn, place + width))
+            at = channel * height * width + corner
+            gradient, next_gradient = side_by_side(load(image_grads, at), load(image_grads, at + width))
+            value, next_value = side_by_side(load(image, at), load(image, at + width))
             first = multiply_add(gradient, value, first)
-            second = multiply_add(other_gradient, other_value, second)
-            own = (channel if channel < num_values else planes) * PIXELS + pixel
-            store(upstream, own, gradient)
-            store(upstream, own + LANES, other_gradient)
-        own = planes * PIXELS + pixel
-        store(upstream, own, load(upstream, own) - first)
-        store(upstream, own + LANES, load(upstream, own + LANES) - second)
-        store(upstream, own + PIXELS, first)
-        store(upstream, own + PIXELS + LANES, second)
+            second = multiply_add(next_gradient, next_value, second)
+            row = (channel if channel < num_values else padded_values) * TILE_PIXELS + pixel
+            store(tile_grads, row, gradient)
+            store(tile_grads, row + LANES, next_gradient)
+        row = padded_values * TILE_PIXELS + pixel
+        store(tile_grads, row, load(tile_grads, row) - first)
+        store(tile_grads, row + LANES, load(tile_grads, row + LANES) - second)
+        store(tile_grads, row + TILE_PIXELS, first)
+        store(tile_grads, row + TILE_PIXELS + LANES, second)
 
 
 @inline_kernel_no_refcount
-def _read_part(sums, grad_sums, left, top, num_values, planes, upstream):  # type: ignore[no-untyped-def]
+def _load_partial_tile_gradients(  # type: ignore[no-untyped-def]
+    sums, grad_sums, left, top, num_values, padded_values, tile_grads
+):
     height, width = grad_sums.shape[1], grad_sums.shape[2]
-    for pixel in range(PIXELS):
+    for pixel in range(TILE_PIXELS):
         block, lane = pixel // LANES, pixel % LANES
-        x = left + (block % ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH
-        y = top + (block // ACROSS) * BLOCK_HEIGHT + lane // BLOCK_WIDTH
+        x = left + (block % BLOCKS_ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH
+        y = top + (block // BLOCKS_ACROSS) * BLOCK_HEIGHT + lane // BLOCK_WIDTH
         total = np.float32(0)
         for channel in range(num_values + 1):
             gradient = np.float32(0)
             if x < width and y < height:
                 gradient = grad_sums[channel, y, x]
                 total += gradient * sums[channel, y, x]
-            upstream[(channel if channel < num_values else planes) * PIXELS + pixel] = gradient
-        upstream[planes * PIXELS + pixel] -= total
-        upstream[(planes + 1) * PIXELS + pixel] = total
+            tile_grads[(channel if channel < num_values else padded_values) * TILE_PIXELS + pixel] = gradient
+        tile_grads[padded_values * TILE_PIXELS + pixel] -= total
+        tile_grads[(padded_values + 1) * TILE_PIXELS + pixel] = total
 
 
 @inline_kernel_no_refcount
-def _find_slopes(  # type: ignore[no-untyped-def]
-    records, values, intersections, next_first, wide, forms, colours, touched, offsets, through, num_values, planes,
-    upstream, behind, powers, places, alphas, weights, seen, slopes, pairs, heads,
+def _differentiate_chunk(  # type: ignore[no-untyped-def]
+    records, values, intersections, next_first, is_3d, footprints, chunk_values, masks, offsets, transmittance,
+    num_values, padded_values, tile_grads, behind, log2_alphas, indices, alphas, weights, visible, pairs, links, heads,
 ):  # fmt: skip
-    """Find the derivatives of the loss by the powers of a chunk's Gaussians, block by block, and their weights."""
+    """Compute weights and gradients by log alpha of a chunk's pairs, block by block."""
     heads[:] = -1
-    # Three blocks are at work at a time, so that their latencies hide each other, and what is counted in one is long
-    # known when it is needed: the powers of one, the weights of the one before, the slopes of the one before that.
-    weighed, left, taken, reached, half, pair = -1, 0, -1, 0, 0, 0
-    for block in range(BLOCKS + 2):
-        following, is_open = 0, False
-        if block < BLOCKS:
-            ask_ahead(records, values, intersections, block, next_first)
-            is_open = any_lane(load(through, block * LANES) > broadcast(np.float32(CLOSED)))
+    # Three blocks are in progress at a time (software pipelining): log2 alphas of one, weights of the previous one,
+    # gradients of the one before. Their latencies overlap, and each loop count is known long before its loop.
+    ready, num_ready, weighted, num_weighted, begin, pair = -1, 0, -1, 0, 0, 0
+    for block in range(NUM_BLOCKS + 2):
+        num_next, is_open = 0, False
+        if block < NUM_BLOCKS:
+            prefetch_slice(records, values, intersections, block, next_first)
+            is_open = some(load(transmittance, block * LANES) > fill(np.float32(MIN_TRANSMITTANCE)))
             if not is_open:
                 continue
-            following = find_powers(block, touched, wide, forms, offsets, powers, places, half)
-        kept = 0
-        if taken >= 0:
-            kept = _weigh_block(taken, reached, powers, places, HALF - half, through, half, alphas, weights, seen)
-        if weighed >= 0:
-            _slope_block(
-                weighed, left, alphas, weights, seen, HALF - half, colours, num_values, planes, upstream, behind,
-                slopes, pairs, heads, pair,
+            num_next = compute_log2_alphas(block, masks, is_3d, footprints, offsets, log2_alphas, indices, begin)
+        other, num_visible = BUFFER_SIZE - begin, 0
+        if ready >= 0:
+            num_visible = _compute_block_weights(
+                ready, num_ready, log2_alphas, indices, other, transmittance, begin, alphas, weights, visible
+            )
+        if weighted >= 0:
+            _differentiate_block(
+                weighted, num_weighted, alphas, weights, visible, other, chunk_values, num_values, padded_values,
+                tile_grads, behind, pairs, links, heads, pair,
             )  # fmt: skip
-            pair += left
-        weighed, left, taken, reached, half = taken, kept, block if is_open else -1, following, HALF - half
+            pair += num_weighted
+        weighted, num_weighted, ready, num_ready = ready, num_visible, block if is_open else -1, num_next
+        begin = other
 
 
 @inline_kernel_no_refcount
-def _weigh_block(  # type: ignore[no-untyped-def]
-    block, reached, powers, places, start, through, begin, alphas, weights, seen
+def _compute_block_weights(  # type: ignore[no-untyped-def]
+    block, count, log2_alphas, indices, begin, transmittance, output, alphas, weights, visible
 ):
-    """Find alphas and weights of what reaches a block; what no pixel sees is left out.
+    """Compute alphas and weights of the Gaussians that a pixel of the block sees; returns their number.
 
-    Returns:
-        How many are written, from `begin` on.
+    Args:
+        log2_alphas, indices: of `count` Gaussians, from `begin` on.
+        alphas, weights, visible: written from `output` on; `visible` holds indices within the chunk.
     """
-    passes, to = load(through, block * LANES), begin
-    for at in range(start, start + reached):
-        alpha = opacity(load(powers, at * LANES))
+    passing, to = load(transmittance, block * LANES), output
+    for at in range(begin, begin + count):
+        alpha = compute_alpha(load(log2_alphas, at * LANES))
         store(alphas, to * LANES, alpha)
-        store(weights, to * LANES, alpha * passes)
-        store_scalar(seen, to, np.int32(load_scalar(places, at)))
-        passes = multiply_add(-alpha, passes, passes)
-        # Written over by the next if nobody sees it: no branch, for none could be foretold.
-        to += np.int64(any_lane(alpha > broadcast(np.float32(0))))
-    return to - begin
+        store(weights, to * LANES, alpha * passing)
+        put(visible, to, np.int32(element(indices, at)))
+        passing = multiply_add(negative(alpha), passing, passing)
+        # The next Gaussian overwrites this one if no pixel sees it: a branch could not be predicted.
+        to += np.int64(some(alpha > fill(np.float32(0))))
+    return to - output
 
 
 @inline_kernel_no_refcount
-def _slope_block(  # type: ignore[no-untyped-def]
-    block, left, alphas, weights, seen, begin, colours, num_values, planes, upstream, behind, slopes, pairs, heads,
-    pair,
+def _differentiate_block(  # type: ignore[no-untyped-def]
+    block, count, alphas, weights, visible, begin, chunk_values, num_values, padded_values, tile_grads, behind, pairs,
+    links, heads, pair,
 ):  # fmt: skip
-    """Write down the pairs of a block, back to front: slopes, weights, the block, the same Gaussian's pair before."""
-    most, zero = broadcast(np.float32(MOST)), broadcast(np.float32(0))
+    """Write a block's pairs, back to front: gradients by log alpha, weights, and their links."""
+    max_alpha, zero = fill(np.float32(MAX_ALPHA)), fill(np.float32(0))
     pixel = block * LANES
-    beyond, base = load(behind, pixel), load(upstream, planes * PIXELS + pixel)
-    for at in range(begin + left - 1, begin - 1, -1):
-        s = np.int64(load_scalar(seen, at))
+    mean_behind, base = load(behind, pixel), load(tile_grads, padded_values * TILE_PIXELS + pixel)
+    for at in range(begin + count - 1, begin - 1, -1):
+        s = np.int64(element(visible, at))
         alpha, weight = load(alphas, at * LANES), load(weights, at * LANES)
         worth = base
-        for value in range(0, planes, GROUP):  # beyond the last stand other finite numbers, times 0
-            own, colour = value * PIXELS + pixel, num_values * s + value
-            worth = multiply_add(load(upstream, own), load_broadcast(colours, colour), worth)
-            worth = multiply_add(load(upstream, own + PIXELS), load_broadcast(colours, colour + 1), worth)
-            worth = multiply_add(load(upstream, own + 2 * PIXELS), load_broadcast(colours, colour + 2), worth)
-            worth = multiply_add(load(upstream, own + 3 * PIXELS), load_broadcast(colours, colour + 3), worth)
-        gained = worth - beyond
-        store(slopes, pair * PAIR, select(most > alpha, weight * gained, zero))
-        store(slopes, pair * PAIR + LANES, weight)
-        beyond = multiply_add(alpha, gained, beyond)
-        store_scalar(pairs, 2 * pair, np.int32(block))
-        store_scalar(pairs, 2 * pair + 1, load_scalar(heads, s))
-        store_scalar(heads, s, np.int32(pair))
+        for value in range(0, padded_values, VALUE_LANES):  # past the last value: finite numbers times 0
+            row, own = value * TILE_PIXELS + pixel, num_values * s + value
+            worth = multiply_add(load(tile_grads, row), spread(chunk_values, own), worth)
+            worth = multiply_add(load(tile_grads, row + TILE_PIXELS), spread(chunk_values, own + 1), worth)
+            worth = multiply_add(load(tile_grads, row + 2 * TILE_PIXELS), spread(chunk_values, own + 2), worth)
+            worth = multiply_add(load(tile_grads, row + 3 * TILE_PIXELS), spread(chunk_values, own + 3), worth)
+        difference = worth - mean_behind
+        store(pairs, pair * _PAIR_SIZE, choose(max_alpha > alpha, weight * difference, zero))
+        store(pairs, pair * _PAIR_SIZE + LANES, weight)
+        mean_behind = multiply_add(alpha, difference, mean_behind)
+        put(links, 2 * pair, np.int32(block))
+        put(links, 2 * pair + 1, element(heads, s))
+        put(heads, s, np.int32(pair))
         pair += 1
-    store(behind, pixel, beyond)
+    store(behind, pixel, mean_behind)
 
 
 @inline_kernel_no_refcount
-def _write_nothing(slots, first, end, num_values, grad_records, grad_values):  # type: ignore[no-untyped-def]
-    """Zeros for Gaussians behind a closed tile."""
-    for entry in range(first, end):
-        row = RECORD_SIZE * slots[entry]
-        store(grad_records, row, broadcast(np.float32(0)))
-        store(grad_records, row + LANES, broadcast(np.float32(0)))
+def _write_zeros(slots, first, end, num_values, grad_records, grad_values):  # type: ignore[no-untyped-def]
+    """Write zero gradients for the Gaussians behind a tile's last composited chunk."""
+    for e in range(first, end):
+        row = RECORD_SIZE * slots[e]
+        store(grad_records, row, fill(np.float32(0)))
+        store(grad_records, row + LANES, fill(np.float32(0)))
         for value in range(num_values):
-            store_scalar(grad_values, num_values * slots[entry] + value, np.float32(0))
+            put(grad_values, num_values * slots[e] + value, np.float32(0))
 
 
-GROUP = 4  # values whose gradients are summed at a time
-MOMENTS = 16  # see `_sum_moments`
-SHARES = 9  # where the sums of weight x upstream gradient begin
-_LN2 = math.log(2)
-PAIR = 2 * LANES  # numbers a pair of a Gaussian and a block: slopes and weights; one cache line
-_LEAST = 1e-16  # of L^2 + along Q: only reached where the slope is 0
-_AHEAD = 24  # Gaussians, between asking for a slot and writing it
+# --- gradient sums ---
 
 
 @inline_kernel_no_refcount
-def write_chunk(  # type: ignore[no-untyped-def]
-    records, intersections, first, count, slots, heads, pairs, slopes, wide, forms, offsets, upstream, num_values,
-    moments, exact, grad_records, grad_values,
+def _write_chunk_gradients(  # type: ignore[no-untyped-def]
+    records, intersections, first, count, slots, heads, links, pairs, is_3d, footprints, offsets, tile_grads,
+    num_values, gradient_sums, exact, grad_records, grad_values,
 ):  # fmt: skip
-    """Write the gradients of a chunk's Gaussians to their slots."""
+    """Write the gradients of a chunk's records and values to their slots."""
     last = first + count - 1
     for s in range(count):
-        ahead = load_scalar(slots, min(first + s + _AHEAD, last))
-        prefetch_for_write(grad_values, num_values * ahead)
-        _sum_moments(s, heads, pairs, slopes, wide, forms, offsets, upstream, moments)
+        prefetch_to_write(grad_values, num_values * element(slots, min(first + s + _WRITE_AHEAD, last)))
+        _accumulate_gradient_sums(s, heads, links, pairs, is_3d, footprints, offsets, tile_grads, gradient_sums)
         row = num_values * slots[first + s]
-        for value in range(min(GROUP, num_values)):
-            store_scalar(grad_values, row + value, load_scalar(moments, MOMENTS * s + SHARES + value))
-        for value in range(GROUP, num_values):
-            store_scalar(grad_values, row + value, _share_of(s, heads, pairs, slopes, upstream, value))
+        for value in range(min(VALUE_LANES, num_values)):
+            put(grad_values, row + value, element(gradient_sums, _NUM_SUMS * s + _VALUE_SUMS + value))
+        for value in range(VALUE_LANES, num_values):
+            put(grad_values, row + value, _sum_value_gradient(s, heads, links, pairs, tile_grads, value))
     for s in range(0, count, LANES):
-        _write_records(s, records, intersections, first, count, slots, moments, exact, grad_records)
+        _write_record_gradients(s, records, intersections, first, count, slots, gradient_sums, exact, grad_records)
 
 
 @inline_kernel_no_refcount
-def _sum_moments(  # type: ignore[no-untyped-def]
-    s, heads, pairs, slopes, wide, forms, offsets, upstream, moments
+def _accumulate_gradient_sums(  # type: ignore[no-untyped-def]
+    s, heads, links, pairs, is_3d, footprints, offsets, tile_grads, gradient_sums
 ):
-    """Sums over a Gaussian's pixels, with x = A / L, y = B / L, q = x^2 + y^2 and h = slope / (1 + along q)^2.
-    All lack a factor log 2, for slopes are those by log alpha.
+    """Sums over a Gaussian's pixels, without a factor log 2, since `gradient` is by log alpha.
 
-    They are those of h times x^2, x y, y^2, x, y, q x, q y, q^2, that of the slopes, and those of weight x upstream
-    gradient of four values.
+    With x = A / L, y = B / L, q = x^2 + y^2 and h = gradient / (1 + radial_variance q)^2, these are the sums of h times
+    x^2, x y, y^2, x, y, q x, q y and q^2, of the gradient, and of the weight times the gradients of four values.
     """
-    zero, one = broadcast(np.float32(0)), broadcast(np.float32(1))
-    xx = xy = yy = by_x = by_y = q_x = q_y = by_along = by_level = zero
-    share0 = share1 = share2 = share3 = zero
-    along = load_broadcast(forms, ALONG_ROW * CHUNK_SIZE + s)
-    pair = np.int64(load_scalar(heads, s))
+    zero, one = fill(np.float32(0)), fill(np.float32(1))
+    xx = xy = yy = sum_x = sum_y = qx = qy = qq = sum_gradient = zero
+    value0 = value1 = value2 = value3 = zero
+    radial_variance = spread(footprints, RADIAL_VARIANCE * CHUNK_SIZE + s)
+    pair = np.int64(element(heads, s))
     while pair >= 0:
-        pixel = LANES * np.int64(load_scalar(pairs, 2 * pair))
-        slope, weight = load(slopes, pair * PAIR), load(slopes, pair * PAIR + LANES)
-        pair = np.int64(load_scalar(pairs, 2 * pair + 1))
-        x, y, z = load(offsets, pixel), load(offsets, PIXELS + pixel), load(offsets, 2 * PIXELS + pixel)
-        a, b, front = forms_at(wide, forms, s, x, y, z)
+        pixel = LANES * np.int64(element(links, 2 * pair))
+        gradient, weight = load(pairs, pair * _PAIR_SIZE), load(pairs, pair * _PAIR_SIZE + LANES)
+        pair = np.int64(element(links, 2 * pair + 1))
+        x, y, z = load(offsets, pixel), load(offsets, TILE_PIXELS + pixel), load(offsets, 2 * TILE_PIXELS + pixel)
+        a, b, front = evaluate_footprint(is_3d, footprints, s, x, y, z)
         q = multiply_add(a, a, b * b)
-        inverse = one / max(multiply_add(front, front, along * q), broadcast(np.float32(_LEAST)))
-        scaled = slope * inverse * inverse  # h / L^4
-        ahead, across = scaled * front, scaled * q
-        by_along, by_level = multiply_add(across, q, by_along), by_level + slope
-        across, ahead = ahead * q, ahead * front
-        q_x, q_y = multiply_add(across, a, q_x), multiply_add(across, b, q_y)
-        x, y = ahead * a, ahead * b
+        inverse = one / maximum(multiply_add(front, front, radial_variance * q), fill(np.float32(_MIN_DIVISOR)))
+        scaled = gradient * inverse * inverse  # h / L^4
+        by_front, by_q = scaled * front, scaled * q
+        qq, sum_gradient = multiply_add(by_q, q, qq), sum_gradient + gradient
+        by_q, by_front = by_front * q, by_front * front
+        qx, qy = multiply_add(by_q, a, qx), multiply_add(by_q, b, qy)
+        x, y = by_front * a, by_front * b
         xx, xy, yy = multiply_add(x, a, xx), multiply_add(x, b, xy), multiply_add(y, b, yy)
-        by_x, by_y = multiply_add(x, front, by_x), multiply_add(y, front, by_y)
-        share0 = multiply_add(weight, load(upstream, pixel), share0)
-        share1 = multiply_add(weight, load(upstream, pixel + PIXELS), share1)
-        share2 = multiply_add(weight, load(upstream, pixel + 2 * PIXELS), share2)
-        share3 = multiply_add(weight, load(upstream, pixel + 3 * PIXELS), share3)
-    store(moments, MOMENTS * s, lane_sums(xx, xy, yy, by_x, by_y, q_x, q_y, by_along))
-    store(moments, MOMENTS * s + LANES, lane_sums(by_level, share0, share1, share2, share3, zero, zero, zero))
+        sum_x, sum_y = multiply_add(x, front, sum_x), multiply_add(y, front, sum_y)
+        value0 = multiply_add(weight, load(tile_grads, pixel), value0)
+        value1 = multiply_add(weight, load(tile_grads, pixel + TILE_PIXELS), value1)
+        value2 = multiply_add(weight, load(tile_grads, pixel + 2 * TILE_PIXELS), value2)
+        value3 = multiply_add(weight, load(tile_grads, pixel + 3 * TILE_PIXELS), value3)
+    at = _NUM_SUMS * s
+    store(gradient_sums, at, totals(xx, xy, yy, sum_x, sum_y, qx, qy, qq))
+    store(gradient_sums, at + LANES, totals(sum_gradient, value0, value1, value2, value3, zero, zero, zero))
 
 
 @inline_kernel_no_refcount
-def _share_of(s, heads, pairs, slopes, upstream, value):  # type: ignore[no-untyped-def]
-    """The gradient of a Gaussian's value: the sum over its pixels of weight x upstream gradient."""
-    share = zero = broadcast(np.float32(0))
-    pair = np.int64(load_scalar(heads, s))
+def _sum_value_gradient(s, heads, links, pairs, tile_grads, value):  # type: ignore[no-untyped-def]
+    """The gradient of one value of a Gaussian: the sum over its pixels of weight times gradient."""
+    total = zero = fill(np.float32(0))
+    pair = np.int64(element(heads, s))
     while pair >= 0:
-        pixel = value * PIXELS + LANES * np.int64(load_scalar(pairs, 2 * pair))
-        share = multiply_add(load(slopes, pair * PAIR + LANES), load(upstream, pixel), share)
-        pair = np.int64(load_scalar(pairs, 2 * pair + 1))
-    return first_lane(lane_sums(share, zero, zero, zero, zero, zero, zero, zero))
+        pixel = value * TILE_PIXELS + LANES * np.int64(element(links, 2 * pair))
+        total = multiply_add(load(pairs, pair * _PAIR_SIZE + LANES), load(tile_grads, pixel), total)
+        pair = np.int64(element(links, 2 * pair + 1))
+    return first_lane(totals(total, zero, zero, zero, zero, zero, zero, zero))
 
 
 @inline_kernel_no_refcount
-def _write_records(  # type: ignore[no-untyped-def]
-    s, records, intersections, first, count, slots, moments, exact, grad_records
+def _write_record_gradients(  # type: ignore[no-untyped-def]
+    s, records, intersections, first, count, slots, gradient_sums, exact, grad_records
 ):
-    """Turn the moments of eight Gaussians into gradients of their records, and write them to their slots.
+    """Convert the sums of eight Gaussians to the gradients of their records, and write these to their slots.
 
-    The ray's length is free: with L = 1, d - n = x p + y q, where p and q are such that a.p = b.q = 1 and
-    a.q = b.p = l.p = l.q = 0. So x and y tell what the offset was.
+    The length of a ray is arbitrary. With L = 1, d - n = x p + y q, where a.p = b.q = 1 and a.q = b.p = l.p = l.q = 0.
+    So x and y give the offset.
     """
-    at = MOMENTS * s
-    xx, xy, yy, x, y, q_x, q_y, along = _rows(moments, at)
-    level, _, _, _, _, _, _, _ = _rows(moments, at + LANES)
-    n, a, b, front_a, front_b = _record(records, intersections, first + s, first + count - 1)
-    zero, one, two, on = (
-        broadcast(np.float32(0)),
-        broadcast(np.float32(1)),
-        broadcast(np.float32(2 * _LN2)),
-        broadcast(exact),
-    )
-    twice, half = two * on, broadcast(np.float32(_LN2))
+    at = _NUM_SUMS * s
+    xx, xy, yy, sum_x, sum_y, qx, qy, qq = _load_columns(gradient_sums, at)
+    sum_gradient, _, _, _, _, _, _, _ = _load_columns(gradient_sums, at + LANES)
+    low, high = load_eight_records(records, intersections, first + s, first + count - 1)
+    n_x, n_y, n_z, _, _, _, a_x, a_y = low
+    a_z, b_x, b_y, b_z, l_along_a, l_along_b, _, _ = high
+    n, a, b = (n_x, n_y, n_z), (a_x, a_y, a_z), (b_x, b_y, b_z)
+    zero, one, two, on = fill(np.float32(0)), fill(np.float32(1)), fill(np.float32(2 * _LN2)), fill(exact)
+    twice, half = two * on, fill(np.float32(_LN2))
     ahead = on * n[0], on * n[1], multiply_add(on, n[2], one - on)
     p, q = _cross(b, ahead), _cross(ahead, a)
     inverse = one / _dot(a, p)
-    p = _combined(inverse, p, -front_a, n)
-    q = _combined(inverse, q, -front_b, n)
-    front = _combined(front_a, a, front_b, b)
-    front = n[0] + front[0], n[1] + front[1], n[2] + front[2]
-    by_front = _combined(twice * q_x, p, twice * q_y, q)
-    by_a = _combined(two * (front_a * q_x - xx), p, two * (front_a * q_y - xy), q)
-    by_b = _combined(two * (front_b * q_x - xy), p, two * (front_b * q_y - yy), q)
-    by_n, back = _combined(two * x, a, two * y, b), -(twice * (xx + yy))
-    n_x = by_front[0] + multiply_add(back, front[0], by_n[0])
-    n_y = by_front[1] + multiply_add(back, front[1], by_n[1])
-    n_z = by_front[2] + multiply_add(back, front[2], by_n[2])
-    # The moments have been read: the rows take their place.
-    _store_rows(moments, at, transpose(n_x, n_y, n_z, zero, zero, zero, by_a[0], by_a[1]))
-    _store_rows(
-        moments,
-        at + LANES,
-        transpose(by_a[2], by_b[0], by_b[1], by_b[2], twice * q_x, twice * q_y, half * on * along, half * level),
+    p = _combine(inverse, p, negative(l_along_a), n)
+    q = _combine(inverse, q, negative(l_along_b), n)
+    l_row = _combine(l_along_a, a, l_along_b, b)
+    l_row = n[0] + l_row[0], n[1] + l_row[1], n[2] + l_row[2]
+    grad_l = _combine(twice * qx, p, twice * qy, q)
+    grad_a = _combine(two * (l_along_a * qx - xx), p, two * (l_along_a * qy - xy), q)
+    grad_b = _combine(two * (l_along_b * qx - xy), p, two * (l_along_b * qy - yy), q)
+    across, back = _combine(two * sum_x, a, two * sum_y, b), negative(twice * (xx + yy))
+    grad_n_x = grad_l[0] + multiply_add(back, l_row[0], across[0])
+    grad_n_y = grad_l[1] + multiply_add(back, l_row[1], across[1])
+    grad_n_z = grad_l[2] + multiply_add(back, l_row[2], across[2])
+    # The sums have been read, so the rows of the gradients replace them.
+    low = transposed(grad_n_x, grad_n_y, grad_n_z, zero, zero, zero, grad_a[0], grad_a[1])
+    high = transposed(
+        grad_a[2], grad_b[0], grad_b[1], grad_b[2], twice * qx, twice * qy, half * on * qq, half * sum_gradient
     )
+    _store_rows(gradient_sums, at, low)
+    _store_rows(gradient_sums, at + LANES, high)
     for place in range(s, min(s + LANES, count)):
         row = RECORD_SIZE * slots[first + place]
-        store_nontemporal(grad_records, row, load(moments, MOMENTS * place))
-        store_nontemporal(grad_records, row + LANES, load(moments, MOMENTS * place + LANES))
-
-
-@inline_kernel_no_refcount
-def _record(records, intersections, e, last):  # type: ignore[no-untyped-def]
-    """n, a, b, front_a and front_b of eight Gaussians."""
-    (n_x, n_y, n_z, _, _, _, a_x, a_y), rest = eight_records(records, intersections, e, last)
-    a_z, b_x, b_y, b_z, front_a, front_b, _, _ = rest
-    return (n_x, n_y, n_z), (a_x, a_y, a_z), (b_x, b_y, b_z), front_a, front_b
+        store_past_cache(grad_records, row, load(gradient_sums, _NUM_SUMS * place))
+        store_past_cache(grad_records, row + LANES, load(gradient_sums, _NUM_SUMS * place + LANES))
 
 
 @inline_kernel_no_refcount
 def _cross(a, b):  # type: ignore[no-untyped-def]
     return (
-        multiply_add(a[1], b[2], -(a[2] * b[1])),
-        multiply_add(a[2], b[0], -(a[0] * b[2])),
-        multiply_add(a[0], b[1], -(a[1] * b[0])),
+        multiply_add(a[1], b[2], negative(a[2] * b[1])),
+        multiply_add(a[2], b[0], negative(a[0] * b[2])),
+        multiply_add(a[0], b[1], negative(a[1] * b[0])),
     )
 
 
@@ -454,21 +457,19 @@ def _dot(a, b):  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _combined(s, a, t, b):  # type: ignore[no-untyped-def]
+def _combine(s, a, t, b):  # type: ignore[no-untyped-def]
     """s a + t b"""
     return multiply_add(s, a[0], t * b[0]), multiply_add(s, a[1], t * b[1]), multiply_add(s, a[2], t * b[2])
 
 
 @inline_kernel_no_refcount
-def _rows(moments, at):  # type: ignore[no-untyped-def]
-    """A column for each of eight numbers of eight Gaussians."""
-    step = MOMENTS
-    return load_transposed(
-        moments, at, at + step, at + 2 * step, at + 3 * step, at + 4 * step, at + 5 * step, at + 6 * step, at + 7 * step
-    )
+def _load_columns(sums, at):  # type: ignore[no-untyped-def]
+    """Columns of eight numbers of eight Gaussians."""
+    r = _NUM_SUMS
+    return columns_of(sums, at, at + r, at + 2 * r, at + 3 * r, at + 4 * r, at + 5 * r, at + 6 * r, at + 7 * r)
 
 
 @inline_kernel_no_refcount
-def _store_rows(moments, at, rows):  # type: ignore[no-untyped-def]
+def _store_rows(sums, at, rows):  # type: ignore[no-untyped-def]
     for row in range(LANES):
-        store(moments, at + row * MOMENTS, rows[row])
+        store(sums, at + row * _NUM_SUMS, rows[row])

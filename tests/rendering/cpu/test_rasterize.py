@@ -112,7 +112,7 @@ drawn = [given[name] for name in ("records", "values", "intersections", "starts"
 sums = np.zeros_like(given["grad_sums"])
 workspace = Workspace()
 kept = allocate_saved(given["starts"], workspace)
-rasterize_forward(*drawn, plane, sums, kept=kept)
+rasterize_forward(*drawn, plane, sums, saved=kept)
 grads = workspace.array((len(drawn[2]), 16), np.float32), np.empty((len(drawn[2]), 4), np.float32)
 rasterize_backward(*drawn, given["slots"], plane, sums, kept, given["grad_sums"], *grads)
 np.savez(sys.argv[2], sums=sums, records=grads[0], values=grads[1])
@@ -176,7 +176,7 @@ def _assembly(text):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tile_kernel", [rasterize._draw_tiles, rasterize_backward._walk_tiles])
+@pytest.mark.parametrize("tile_kernel", [rasterize._rasterize_tiles, rasterize_backward._rasterize_tiles_backward])
 def test_tile_kernels_become_vector_code_on_arm(tile_kernel, make_scene, pose):
     scene = make_scene(2, scale=0.1)
     scene = dataclasses.replace(scene, means=scene.means.float().requires_grad_())

@@ -27,7 +27,7 @@ def _slots(case, upstream, *, threads=1):
     sums = np.empty_like(upstream)
     drawn = case.records, case.values, case.intersections, case.starts
     kept = allocate_saved(case.starts, workspace := Workspace())
-    rasterize_forward(*drawn, case.tables, sums, kept=kept)
+    rasterize_forward(*drawn, case.tables, sums, saved=kept)
     grad_records = workspace.array((len(case.intersections), layout.RECORD_SIZE), np.float32)
     grad_records[:] = np.nan
     grad_values = np.full((len(case.intersections), case.values.shape[1]), np.nan, np.float32)
