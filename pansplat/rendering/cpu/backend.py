@@ -1,6 +1,6 @@
-"""The stages joined into a backend: torch tensors in, sums and gradients out.
+"""The CPU backend: its stages joined, from torch tensors to sums over image planes and back to gradients.
 
-Source: docs/rendering.md; docs/rasterizer.md tells what each stage costs.
+Source: docs/rendering.md; docs/rasterizer.md describes the stages and their cost.
 """
 
 import math
@@ -19,18 +19,12 @@ from pansplat.constants import EWA_NEAR_FACTOR
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.cpu import tiling
-from pansplat.rendering.cpu.ewa import EWA_GRAD_SIZE, backpropagate_ewa, project_ewa
-from pansplat.rendering.cpu.projection import (
-    GAUSSIANS_PER_ITEM,
-    Camera,
-    GaussianArrays,
-    ProjectedGaussians,
-    project_gaussians,
-)
-from pansplat.rendering.cpu.projection_backward import GaussianGradients, accumulate_slots, backpropagate_projection
+from pansplat.rendering.cpu.ewa import TOTALS, project, project_backward
+from pansplat.rendering.cpu.observe import PIECE, Camera, Fields, Observed, observe
+from pansplat.rendering.cpu.observe_backward import Gradients, add_slots, chain
 from pansplat.rendering.cpu.rasterize import SavedForBackward, allocate_saved, rasterize_forward
 from pansplat.rendering.cpu.rasterize_backward import rasterize_backward
-from pansplat.rendering.cpu.records import RECORD_SIZE, tabulate_pixels
+from pansplat.rendering.cpu.records import RECORD_SIZE, PixelTables, tabulate_pixels
 from pansplat.rendering.cpu.runtime import Workspace, announce_compilation, parallel_for, pooled_empty, thread_count
 from pansplat.rendering.cpu.tiling import (
     LARGEST_SIDE,
@@ -44,25 +38,37 @@ from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.projection import not_finite_message
 from pansplat.rendering.rasterize import RasterInfo, RasterOptions, RasterSums
 
-_LEAST_SPREAD = 1e-9  # pixel^2: without a filter a disc seen edge-on would have no width to divide by
+_MIN_FILTER_VARIANCE = 1e-9  # pixel^2: unfiltered, a disc seen edge-on has width 0, by which stage one divides
 
 
-class Projection(NamedTuple):
-    """What one picture shows: records, boxes, and the distances that it is drawn in order of.
+class _View(NamedTuple):
+    """A scene as one camera sees it, and how to rasterise it."""
 
-    And, if its tile lists came in one band, these and what its forward kept.
-    """
+    fields: Fields
+    camera: Camera
+    observed: Observed
+    options: RasterOptions
+    threads: int
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the kernel is exact, not EWA."""
+        return self.options.kernel == "ray"
+
+
+class _PlaneState(NamedTuple):
+    """The footprints on one image plane; tiles and transmittances only if all tiles fit one band."""
 
     records: np.ndarray
     boxes: np.ndarray
-    distances: np.ndarray
-    lists: TileIntersections | None = None
-    kept: SavedForBackward | None = None
+    distances: np.ndarray  # by which intersections are sorted
+    tiles: TileIntersections | None = None
+    saved: SavedForBackward | None = None
 
 
 @dataclass
-class _Notes:
-    """What is told about a picture: counts, seconds by stage, and bytes of the arrays alive at once."""
+class _Statistics:
+    """Counts, peak bytes of arrays and seconds by stage, collected for `RasterInfo`."""
 
     dropped: int = 0
     near: int = 0
@@ -73,7 +79,7 @@ class _Notes:
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        """Add the seconds that something takes to a stage."""
+        """Add the time of the block to a stage."""
         start = time.perf_counter()
         yield
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
@@ -83,48 +89,38 @@ def rasterize_planes(
     gaussians: Gaussians,
     covariances: Float[Tensor, "n 3 3"] | None,
     pose: Float[Tensor, "4 4"],
-    pictures: list[ImagePlane],
+    planes: list[ImagePlane],
     options: RasterOptions,
 ) -> RasterSums:
-    """Draw by numba kernels, in float32; see `pansplat.rendering.rasterize.RasterBackend`.
+    """Rasterise by numba kernels, in float32; see `pansplat.rendering.rasterize.RasterBackend`.
 
     Raises:
-        InputError: the Gaussians are not in main memory, a picture's side is above 32767 pixels, or
-            `options.strict` and a Gaussian is not finite.
+        InputError: the Gaussians are not in main memory, a side is longer than 32767 pixels, or `options.strict` and a
+            Gaussian is not finite.
     """
     if gaussians.means.device.type != "cpu":
         raise InputError(
-            f"backend 'numba' draws Gaussians in main memory, got them on {gaussians.means.device}; use "
+            f"backend 'numba' needs Gaussians in main memory, got them on {gaussians.means.device}; use "
             "backend='auto', or move them with gaussians.to(device='cpu')"
         )
-    if max(pictures[0].size) > LARGEST_SIDE:
+    if max(planes[0].size) > LARGEST_SIDE:
         raise InputError(
-            f"`size` must be at most {LARGEST_SIDE} pixels a side for backend 'numba', got {pictures[0].size}; "
-            "draw a smaller picture, or use backend='torch'"
+            f"`size` must be at most {LARGEST_SIDE} pixels a side for backend 'numba', got {planes[0].size}; "
+            "choose a smaller size, or use backend='torch'"
         )
-    dtype = gaussians.means.dtype
     shape = (gaussians.quats, gaussians.scales, None) if covariances is None else (None, None, covariances)
-    fields = (gaussians.means, *shape, gaussians.opacities, gaussians.harmonics)
-    fields = tuple(None if f is None else f.to(torch.float32).contiguous() for f in fields)
-    notes = _Notes()
-    sums = _Draw.apply(*fields, pose, pictures, options, notes, torch.is_grad_enabled())
-    if options.strict and notes.dropped:
+    tensors = (gaussians.means, *shape, gaussians.opacities, gaussians.harmonics)
+    tensors = tuple(None if tensor is None else tensor.to(torch.float32).contiguous() for tensor in tensors)
+    statistics = _Statistics()
+    sums = _Rasterize.apply(*tensors, pose, planes, options, statistics, torch.is_grad_enabled())
+    if options.strict and statistics.dropped:
         raise InputError(not_finite_message(gaussians, covariances, pose, options))
-    info = RasterInfo(
-        len(gaussians),
-        notes.dropped,
-        notes.near,
-        notes.visible,
-        notes.intersections,
-        "numba",
-        notes.bytes,
-        notes.seconds,
-    )
-    return RasterSums(sums.to(dtype), info)
+    info = RasterInfo(total=len(gaussians), backend="numba", **vars(statistics))
+    return RasterSums(sums.to(gaussians.means.dtype), info)
 
 
-class _Draw(torch.autograd.Function):
-    """The sums of all pictures, differentiable once in the fields and the pose."""
+class _Rasterize(torch.autograd.Function):
+    """The sums of all image planes, differentiable once in the fields and the pose."""
 
     @staticmethod
     def forward(
@@ -136,32 +132,30 @@ class _Draw(torch.autograd.Function):
         opacities: Tensor,
         harmonics: Tensor,
         pose: Tensor,
-        pictures: list[ImagePlane],
+        planes: list[ImagePlane],
         options: RasterOptions,
-        notes: _Notes,
-        recorded: bool,
+        statistics: _Statistics,
+        grad_enabled: bool,
     ) -> Tensor:
         tensors = means, quats, scales, covariances, opacities, harmonics
-        fields, camera = _fields(*tensors), _camera(pose, pictures[0], options)
-        threads, workspace = thread_count(), Workspace()
-        needs_grad = recorded and any(ctx.needs_input_grad)  # which knows nothing of no_grad
-        height, width = pictures[0].size
+        fields, camera, threads = _fields(*tensors), _camera(pose, planes[0], options), thread_count()
+        needs_grad = grad_enabled and any(ctx.needs_input_grad)  # the latter ignores no_grad
+        workspace = Workspace()
         with announce_compilation():
-            with notes.timed("observe"):
-                observed = project_gaussians(fields, camera, workspace, threads)
-            sums = pooled_empty((len(pictures), harmonics.shape[2] + 2, height, width), np.float32)
-            kept = [
-                _draw_picture(
-                    (fields, camera, observed), picture, options, sums[number], notes, needs_grad, workspace, threads
-                )
-                for number, picture in enumerate(pictures)
+            with statistics.timed("project"):
+                observed = observe(fields, camera, workspace, threads)
+            view = _View(fields, camera, observed, options, threads)
+            sums = pooled_empty((len(planes), harmonics.shape[2] + 2, *planes[0].size), np.float32)
+            states = [
+                _rasterize_plane(view, plane, plane_sums, statistics, workspace if needs_grad else None)
+                for plane, plane_sums in zip(planes, sums, strict=True)
             ]
-        notes.dropped, notes.near = observed.dropped, observed.near
-        notes.bytes += sums.nbytes + sum(part.nbytes for part in observed[:4])
+        statistics.dropped, statistics.near = observed.dropped, observed.near
+        statistics.bytes += sums.nbytes + sum(array.nbytes for array in observed[:4])
         result = torch.from_numpy(sums)
         if needs_grad:
             ctx.save_for_backward(*tensors, pose, result)
-            ctx.plan = pictures, options, observed, kept, workspace, threads
+            ctx.saved = planes, options, observed, states, workspace, threads
         return result
 
     @staticmethod
@@ -169,31 +163,29 @@ class _Draw(torch.autograd.Function):
         if torch.is_grad_enabled():  # create_graph=True
             raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
         *tensors, pose, sums = ctx.saved_tensors
-        pictures, options, observed, kept, _lease, threads = ctx.plan
-        fields, camera = _fields(*tensors), _camera(pose, pictures[0], options)
-        grad_sums = grad_outputs[0].contiguous().numpy()
-        wanted = [
+        planes, options, observed, states, _workspace, threads = ctx.saved
+        fields, camera = _fields(*tensors), _camera(pose, planes[0], options)
+        view = _View(fields, camera, observed, options, threads)
+        needs_pose = ctx.needs_input_grad[6]
+        grads = [
             torch.from_numpy(pooled_empty(tuple(tensor.shape), np.float32)) if needed else None
             for tensor, needed in zip(tensors, ctx.needs_input_grad, strict=False)
         ]
         with announce_compilation():
-            own = Workspace()
-            slots = _slot_gradients(
-                (fields, camera, observed), pictures, options, kept, sums.numpy(), grad_sums, own, threads
-            )
-            arrays = (
+            workspace = Workspace()
+            grad_sums = grad_outputs[0].contiguous().numpy()
+            slots = _differentiate_planes(view, planes, states, sums.numpy(), grad_sums, workspace)
+            outputs = (
                 np.empty((0, *field.shape[1:]), np.float32) if grad is None else grad.numpy()
-                for field, grad in zip(fields, wanted, strict=True)
+                for field, grad in zip(fields, grads, strict=True)
             )
-            own_pose = np.empty((3 if ctx.needs_input_grad[6] else 0, 4))
-            filled = backpropagate_projection(
-                fields, camera, observed, *slots, GaussianGradients(*arrays, pose=own_pose), threads
-            )
+            wanted = Gradients(*outputs, pose=np.empty((3 if needs_pose else 0, 4)))
+            filled = chain(fields, camera, observed, *slots, wanted, threads)
         grad_pose = None
-        if ctx.needs_input_grad[6]:
+        if needs_pose:
             grad_pose = torch.zeros_like(pose)
             grad_pose[:3] = torch.from_numpy(filled.pose)
-        return (*wanted, grad_pose, None, None, None, None)
+        return (*grads, grad_pose, None, None, None, None)
 
 
 def _fields(
@@ -203,141 +195,145 @@ def _fields(
     covariances: Tensor | None,
     opacities: Tensor,
     harmonics: Tensor,
-) -> GaussianArrays:
-    """The tensors as arrays, no rows for those not given."""
-    given = (means, quats, scales, covariances, opacities, harmonics)
+) -> Fields:
+    """The tensors as arrays; None becomes an array without rows."""
+    tensors = (means, quats, scales, covariances, opacities, harmonics)
     shapes = ((3,), (4,), (3,), (3, 3), (), harmonics.shape[1:])
-    return GaussianArrays(
+    return Fields(
         *(
             np.empty((0, *shape), np.float32) if tensor is None else tensor.detach().numpy()
-            for tensor, shape in zip(given, shapes, strict=True)
+            for tensor, shape in zip(tensors, shapes, strict=True)
         )
     )
 
 
-def _camera(pose: Tensor, picture: ImagePlane, options: RasterOptions) -> Camera:
-    least = _LEAST_SPREAD * picture.pixel_angle**2
+def _camera(pose: Tensor, plane: ImagePlane, options: RasterOptions) -> Camera:
+    least = _MIN_FILTER_VARIANCE * plane.pixel_angle**2
     return Camera(
         np.ascontiguousarray(pose.detach().numpy()),
-        max(options.filter_variance(picture.pixel_angle), least),
+        max(options.filter_variance(plane.pixel_angle), least),
         options.lowpass == "angular",
         options.near,
     )
 
 
-def _draw_picture(
-    scene: tuple[GaussianArrays, Camera, ProjectedGaussians],
-    picture: ImagePlane,
-    options: RasterOptions,
-    sums: np.ndarray,
-    notes: _Notes,
-    needs_grad: bool,
-    workspace: Workspace,
-    threads: int,
-) -> Projection | None:
-    """Write one picture's sums, and return what its backward needs."""
-    workspace, observed = workspace if needs_grad else Workspace(), scene[2]
-    with notes.timed("boxes"):
-        records, boxes = _place(scene, picture, options, workspace, threads)
+def _rasterize_plane(
+    view: _View, plane: ImagePlane, sums: np.ndarray, statistics: _Statistics, saved_in: Workspace | None
+) -> _PlaneState | None:
+    """Write the sums of one image plane.
+
+    Args:
+        saved_in: memory for the state that the backward needs.
+
+    Returns:
+        This state, or None without `saved_in`.
+    """
+    observed, threads, needs_grad = view.observed, view.threads, saved_in is not None
+    workspace = saved_in or Workspace()
+    with statistics.timed("bounds"):
+        records, boxes = _find_footprints(view, plane, workspace)
     distances = observed.radii
-    if options.order == "z" and not picture.is_panorama:
-        with notes.timed("sort"):
-            towards = picture.rotation[:, 2].numpy().copy()
-            distances = compute_depths(observed.records, observed.radii, towards, workspace, threads)
-    plane, shown = tabulate_pixels(picture, exact=options.kernel == "ray"), Projection(records, boxes, distances)
-    bands = intersect_tiles(boxes, picture.size, slots=needs_grad, threads=threads, limit=tiling.MAX_INTERSECTIONS)
+    if view.options.order == "z" and not plane.is_panorama:
+        with statistics.timed("sort"):
+            axis = plane.rotation[:, 2].numpy().copy()
+            distances = compute_depths(observed.records, observed.radii, axis, workspace, threads)
+    tables, state = tabulate_pixels(plane, exact=view.is_exact), _PlaneState(records, boxes, distances)
+    bands = intersect_tiles(boxes, plane.size, slots=needs_grad, threads=threads, limit=tiling.MAX_INTERSECTIONS)
     while True:
-        with notes.timed("bin"):
-            lists = next(bands, None)
-        if lists is None:
+        with statistics.timed("intersect"):
+            tiles = next(bands, None)
+        if tiles is None:
             break
-        with notes.timed("sort"):
-            sort_front_to_back(lists, distances, threads)
-        whole = needs_grad and len(lists.starts) == 1 + math.prod(plane.tiles)
-        with notes.timed("raster"):
-            room = allocate_saved(lists.starts, lists.workspace) if whole else None
-            rasterize_forward(
-                records, observed.values, lists.intersections, lists.starts, plane, sums,
-                first_row=lists.first_row, saved=room, threads=threads,
-            )  # fmt: skip
-        notes.intersections += len(lists.intersections)
-        given = observed.records, observed.radii
-        own = sum(part.nbytes for part in (records, distances) if not any(part is other for other in given))
-        listed = sum(
-            part.nbytes for part in (lists.intersections, lists.starts, lists.slots, lists.offsets, *(room or ()))
-        )
-        notes.bytes = max(notes.bytes, own + boxes.nbytes + listed)
-        if whole:
-            shown = shown._replace(lists=lists, saved=room)
-        del lists
-    notes.visible += int(np.count_nonzero(boxes.view(np.int64) != tiling.EMPTY_BOX))
-    return shown if needs_grad else None
+        with statistics.timed("sort"):
+            sort_front_to_back(tiles, distances, threads)
+        is_whole_image = len(tiles.starts) == 1 + math.prod(tables.tiles)
+        saved = allocate_saved(tiles.starts, tiles.workspace) if needs_grad and is_whole_image else None
+        with statistics.timed("rasterize"):
+            _rasterize_band(view, records, tiles, tables, sums, saved)
+        statistics.intersections += len(tiles.intersections)
+        shared = observed.records, observed.radii
+        arrays = [array for array in (records, distances) if not any(array is other for other in shared)]
+        arrays += [boxes, tiles.intersections, tiles.starts, tiles.slots, tiles.offsets, *(saved or ())]
+        statistics.bytes = max(statistics.bytes, sum(array.nbytes for array in arrays))
+        if saved is not None:
+            state = state._replace(tiles=tiles, saved=saved)
+        del tiles, arrays  # their memory serves the next band
+    statistics.visible += int(np.count_nonzero(boxes.view(np.int64) != tiling.EMPTY_BOX))
+    return state if needs_grad else None
 
 
-def _place(
-    scene: tuple[GaussianArrays, Camera, ProjectedGaussians],
-    picture: ImagePlane,
-    options: RasterOptions,
-    workspace: Workspace,
-    threads: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Records and boxes on a picture."""
-    if options.kernel == "ewa":
-        return project_ewa(*scene, picture, options.dilation, EWA_NEAR_FACTOR * options.near, workspace, threads)
-    return scene[2].records, find_bounding_boxes(scene[2].records, picture, workspace, threads)
+def _find_footprints(view: _View, plane: ImagePlane, workspace: Workspace) -> tuple[np.ndarray, np.ndarray]:
+    """Records and boxes on an image plane."""
+    if view.is_exact:
+        records = view.observed.records
+        return records, find_bounding_boxes(records, plane, workspace, view.threads)
+    depth_cut = EWA_NEAR_FACTOR * view.options.near
+    scene = view.fields, view.camera, view.observed
+    return project(*scene, plane, view.options.dilation, depth_cut, workspace, view.threads)
 
 
-def _slot_gradients(
-    scene: tuple[GaussianArrays, Camera, ProjectedGaussians],
-    pictures: list[ImagePlane],
-    options: RasterOptions,
-    projections: list[Projection],
+def _rasterize_band(
+    view: _View,
+    records: np.ndarray,
+    tiles: TileIntersections,
+    tables: PixelTables,
+    sums: np.ndarray,
+    saved: SavedForBackward | None,
+) -> None:
+    """Write the sums of a band of tile rows."""
+    rasterize_forward(
+        records, view.observed.values, tiles.intersections, tiles.starts, tables, sums,
+        first_row=tiles.first_row, saved=saved, threads=view.threads,
+    )  # fmt: skip
+
+
+def _differentiate_planes(
+    view: _View,
+    planes: list[ImagePlane],
+    states: list[_PlaneState],
     sums: np.ndarray,
     grad_sums: np.ndarray,
     workspace: Workspace,
-    threads: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Gradients of the camera's records and values in slots, the classic kernel's totals, and where slots begin."""
-    fields, camera, observed = scene
+    """Gradients of records and values by slot, the EWA kernel's totals, and the first slot of each Gaussian.
+
+    With one image plane in one band the slots are those of its intersections; otherwise each Gaussian has one.
+    """
+    fields, camera, observed, options, threads = view
     num, num_values = observed.values.shape
-    exact = options.kernel == "ray"
-    alone = exact and len(pictures) == 1 and projections[0].lists is not None
-    total_records = np.zeros((num if exact and not alone else 0, RECORD_SIZE), np.float32)
-    totals = np.zeros((0 if exact else num, EWA_GRAD_SIZE))
-    total_values = np.zeros((0 if alone else num, num_values), np.float32)
-    pieces = -(-num // GAUSSIANS_PER_ITEM)
-    for number, (picture, projection) in enumerate(zip(pictures, projections, strict=True)):
-        plane = tabulate_pixels(picture, exact=exact)
-        bands = [projection.lists] if projection.lists else intersect_tiles(
-            projection.boxes, picture.size, slots=True, threads=threads, limit=tiling.MAX_INTERSECTIONS
+    num_items = -(-num // PIECE)
+    is_single = view.is_exact and len(planes) == 1 and states[0].tiles is not None
+    total_records = np.zeros((num if view.is_exact and not is_single else 0, RECORD_SIZE), np.float32)
+    totals = np.zeros((0 if view.is_exact else num, TOTALS))
+    total_values = np.zeros((0 if is_single else num, num_values), np.float32)
+    for plane, state, plane_sums, plane_grads in zip(planes, states, sums, grad_sums, strict=True):
+        tables = tabulate_pixels(plane, exact=view.is_exact)
+        bands = [state.tiles] if state.tiles else intersect_tiles(
+            state.boxes, plane.size, slots=True, threads=threads, limit=tiling.MAX_INTERSECTIONS
         )  # fmt: skip
-        for lists in bands:
-            room = projection.kept
-            if room is None:  # drawn once more: what many bands would have to keep is too much
-                sort_front_to_back(lists, projection.distances, threads)
-                room = allocate_saved(lists.starts, lists.workspace)
-                rasterize_forward(
-                    projection.records, observed.values, lists.intersections, lists.starts, plane, sums[number],
-                    first_row=lists.first_row, saved=room, threads=threads,
-                )  # fmt: skip
-            band = workspace if alone else Workspace()
-            grad_records = band.array((len(lists.intersections), RECORD_SIZE), np.float32)
-            grad_values = band.array((len(lists.intersections), num_values), np.float32)
+        for tiles in bands:
+            saved = state.saved
+            if saved is None:  # rasterise again: transmittances of several bands would take too much memory
+                sort_front_to_back(tiles, state.distances, threads)
+                saved = allocate_saved(tiles.starts, tiles.workspace)
+                _rasterize_band(view, state.records, tiles, tables, plane_sums, saved)
+            band_workspace = workspace if is_single else Workspace()
+            grad_records = band_workspace.array((len(tiles.intersections), RECORD_SIZE), np.float32)
+            grad_values = band_workspace.array((len(tiles.intersections), num_values), np.float32)
             rasterize_backward(
-                projection.records, observed.values, lists.intersections, lists.starts, lists.slots, plane,
-                sums[number], room, grad_sums[number], grad_records, grad_values, first_row=lists.first_row,
-                threads=threads,
+                state.records, observed.values, tiles.intersections, tiles.starts, tiles.slots, tables, plane_sums,
+                saved, plane_grads, grad_records, grad_values, first_row=tiles.first_row, threads=threads,
             )  # fmt: skip
-            if alone:
-                return grad_records, grad_values, totals, lists.offsets
-            offsets = lists.offsets
-            if exact:
-                parallel_for(_adding(offsets, grad_records, total_records), pieces, threads)
+            offsets = tiles.offsets
+            if is_single:
+                return grad_records, grad_values, totals, offsets
+            if view.is_exact:
+                _add_slots(offsets, grad_records, total_records, num_items, threads)
             else:
-                backpropagate_ewa(fields, camera, picture, options.dilation, grad_records, offsets, totals, threads)
-            parallel_for(_adding(offsets, grad_values, total_values), pieces, threads)
+                project_backward(fields, camera, plane, options.dilation, grad_records, offsets, totals, threads)
+            _add_slots(offsets, grad_values, total_values, num_items, threads)
     return total_records, total_values, totals, np.arange(num + 1)
 
 
-def _adding(offsets: np.ndarray, slots: np.ndarray, totals: np.ndarray) -> Any:
-    return lambda piece: accumulate_slots(piece, offsets, slots, totals)
+def _add_slots(offsets: np.ndarray, slots: np.ndarray, totals: np.ndarray, num_items: int, threads: int) -> None:
+    parallel_for(lambda item: add_slots(item, offsets, slots, totals), num_items, threads)

@@ -132,7 +132,7 @@ def test_without_grad_nothing_is_kept(make_scene, pose):
     with torch.no_grad():
         drawn = rasterize_planes(scene, None, pose, _pictures("pinhole"), options)
     assert not drawn.sums.requires_grad
-    assert set(drawn.info.seconds) == {"observe", "boxes", "sort", "bin", "raster"}
+    assert set(drawn.info.seconds) == {"project", "bounds", "intersect", "sort", "rasterize"}
     assert drawn.info.bytes == plain.info.bytes < recorded.info.bytes
 
 
