@@ -19,9 +19,15 @@ from pansplat.constants import EWA_NEAR_FACTOR
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.cpu import tiling
-from pansplat.rendering.cpu.ewa import TOTALS, project, project_backward
-from pansplat.rendering.cpu.observe import PIECE, Camera, Fields, Observed, observe
-from pansplat.rendering.cpu.observe_backward import Gradients, add_slots, chain
+from pansplat.rendering.cpu.ewa import EWA_GRAD_SIZE, backpropagate_ewa, project_ewa
+from pansplat.rendering.cpu.projection import (
+    GAUSSIANS_PER_ITEM,
+    Camera,
+    GaussianArrays,
+    ProjectedGaussians,
+    project_gaussians,
+)
+from pansplat.rendering.cpu.projection_backward import GaussianGradients, accumulate_slots, backpropagate_projection
 from pansplat.rendering.cpu.rasterize import SavedForBackward, allocate_saved, rasterize_forward
 from pansplat.rendering.cpu.rasterize_backward import rasterize_backward
 from pansplat.rendering.cpu.records import RECORD_SIZE, PixelTables, tabulate_pixels
@@ -44,9 +50,9 @@ _MIN_FILTER_VARIANCE = 1e-9  # pixel^2: unfiltered, a disc seen edge-on has widt
 class _View(NamedTuple):
     """A scene as one camera sees it, and how to rasterise it."""
 
-    fields: Fields
+    fields: GaussianArrays
     camera: Camera
-    observed: Observed
+    projected: ProjectedGaussians
     options: RasterOptions
     threads: int
 
@@ -143,19 +149,19 @@ class _Rasterize(torch.autograd.Function):
         workspace = Workspace()
         with announce_compilation():
             with statistics.timed("project"):
-                observed = observe(fields, camera, workspace, threads)
-            view = _View(fields, camera, observed, options, threads)
+                projected = project_gaussians(fields, camera, workspace, threads)
+            view = _View(fields, camera, projected, options, threads)
             sums = pooled_empty((len(planes), harmonics.shape[2] + 2, *planes[0].size), np.float32)
             states = [
                 _rasterize_plane(view, plane, plane_sums, statistics, workspace if needs_grad else None)
                 for plane, plane_sums in zip(planes, sums, strict=True)
             ]
-        statistics.dropped, statistics.near = observed.dropped, observed.near
-        statistics.bytes += sums.nbytes + sum(array.nbytes for array in observed[:4])
+        statistics.dropped, statistics.near = projected.dropped, projected.near
+        statistics.bytes += sums.nbytes + sum(array.nbytes for array in projected[:4])
         result = torch.from_numpy(sums)
         if needs_grad:
             ctx.save_for_backward(*tensors, pose, result)
-            ctx.saved = planes, options, observed, states, workspace, threads
+            ctx.saved = planes, options, projected, states, workspace, threads
         return result
 
     @staticmethod
@@ -163,9 +169,9 @@ class _Rasterize(torch.autograd.Function):
         if torch.is_grad_enabled():  # create_graph=True
             raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
         *tensors, pose, sums = ctx.saved_tensors
-        planes, options, observed, states, _workspace, threads = ctx.saved
+        planes, options, projected, states, _workspace, threads = ctx.saved
         fields, camera = _fields(*tensors), _camera(pose, planes[0], options)
-        view = _View(fields, camera, observed, options, threads)
+        view = _View(fields, camera, projected, options, threads)
         needs_pose = ctx.needs_input_grad[6]
         grads = [
             torch.from_numpy(pooled_empty(tuple(tensor.shape), np.float32)) if needed else None
@@ -179,8 +185,8 @@ class _Rasterize(torch.autograd.Function):
                 np.empty((0, *field.shape[1:]), np.float32) if grad is None else grad.numpy()
                 for field, grad in zip(fields, grads, strict=True)
             )
-            wanted = Gradients(*outputs, pose=np.empty((3 if needs_pose else 0, 4)))
-            filled = chain(fields, camera, observed, *slots, wanted, threads)
+            wanted = GaussianGradients(*outputs, pose=np.empty((3 if needs_pose else 0, 4)))
+            filled = backpropagate_projection(fields, camera, projected, *slots, wanted, threads)
         grad_pose = None
         if needs_pose:
             grad_pose = torch.zeros_like(pose)
@@ -195,11 +201,11 @@ def _fields(
     covariances: Tensor | None,
     opacities: Tensor,
     harmonics: Tensor,
-) -> Fields:
+) -> GaussianArrays:
     """The tensors as arrays; None becomes an array without rows."""
     tensors = (means, quats, scales, covariances, opacities, harmonics)
     shapes = ((3,), (4,), (3,), (3, 3), (), harmonics.shape[1:])
-    return Fields(
+    return GaussianArrays(
         *(
             np.empty((0, *shape), np.float32) if tensor is None else tensor.detach().numpy()
             for tensor, shape in zip(tensors, shapes, strict=True)
@@ -228,15 +234,15 @@ def _rasterize_plane(
     Returns:
         This state, or None without `saved_in`.
     """
-    observed, threads, needs_grad = view.observed, view.threads, saved_in is not None
+    projected, threads, needs_grad = view.projected, view.threads, saved_in is not None
     workspace = saved_in or Workspace()
     with statistics.timed("bounds"):
         records, boxes = _find_footprints(view, plane, workspace)
-    distances = observed.radii
+    distances = projected.radii
     if view.options.order == "z" and not plane.is_panorama:
         with statistics.timed("sort"):
             axis = plane.rotation[:, 2].numpy().copy()
-            distances = compute_depths(observed.records, observed.radii, axis, workspace, threads)
+            distances = compute_depths(projected.records, projected.radii, axis, workspace, threads)
     tables, state = tabulate_pixels(plane, exact=view.is_exact), _PlaneState(records, boxes, distances)
     bands = intersect_tiles(boxes, plane.size, slots=needs_grad, threads=threads, limit=tiling.MAX_INTERSECTIONS)
     while True:
@@ -251,7 +257,7 @@ def _rasterize_plane(
         with statistics.timed("rasterize"):
             _rasterize_band(view, records, tiles, tables, sums, saved)
         statistics.intersections += len(tiles.intersections)
-        shared = observed.records, observed.radii
+        shared = projected.records, projected.radii
         arrays = [array for array in (records, distances) if not any(array is other for other in shared)]
         arrays += [boxes, tiles.intersections, tiles.starts, tiles.slots, tiles.offsets, *(saved or ())]
         statistics.bytes = max(statistics.bytes, sum(array.nbytes for array in arrays))
@@ -265,11 +271,11 @@ def _rasterize_plane(
 def _find_footprints(view: _View, plane: ImagePlane, workspace: Workspace) -> tuple[np.ndarray, np.ndarray]:
     """Records and boxes on an image plane."""
     if view.is_exact:
-        records = view.observed.records
+        records = view.projected.records
         return records, find_bounding_boxes(records, plane, workspace, view.threads)
     depth_cut = EWA_NEAR_FACTOR * view.options.near
-    scene = view.fields, view.camera, view.observed
-    return project(*scene, plane, view.options.dilation, depth_cut, workspace, view.threads)
+    scene = view.fields, view.camera, view.projected
+    return project_ewa(*scene, plane, view.options.dilation, depth_cut, workspace, view.threads)
 
 
 def _rasterize_band(
@@ -282,7 +288,7 @@ def _rasterize_band(
 ) -> None:
     """Write the sums of a band of tile rows."""
     rasterize_forward(
-        records, view.observed.values, tiles.intersections, tiles.starts, tables, sums,
+        records, view.projected.values, tiles.intersections, tiles.starts, tables, sums,
         first_row=tiles.first_row, saved=saved, threads=view.threads,
     )  # fmt: skip
 
@@ -295,16 +301,16 @@ def _differentiate_planes(
     grad_sums: np.ndarray,
     workspace: Workspace,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Gradients of records and values by slot, the EWA kernel's totals, and the first slot of each Gaussian.
+    """GaussianGradients of records and values by slot, the EWA kernel's totals, and the first slot of each Gaussian.
 
     With one image plane in one band the slots are those of its intersections; otherwise each Gaussian has one.
     """
-    fields, camera, observed, options, threads = view
-    num, num_values = observed.values.shape
-    num_items = -(-num // PIECE)
+    fields, camera, projected, options, threads = view
+    num, num_values = projected.values.shape
+    num_items = -(-num // GAUSSIANS_PER_ITEM)
     is_single = view.is_exact and len(planes) == 1 and states[0].tiles is not None
     total_records = np.zeros((num if view.is_exact and not is_single else 0, RECORD_SIZE), np.float32)
-    totals = np.zeros((0 if view.is_exact else num, TOTALS))
+    totals = np.zeros((0 if view.is_exact else num, EWA_GRAD_SIZE))
     total_values = np.zeros((0 if is_single else num, num_values), np.float32)
     for plane, state, plane_sums, plane_grads in zip(planes, states, sums, grad_sums, strict=True):
         tables = tabulate_pixels(plane, exact=view.is_exact)
@@ -321,7 +327,7 @@ def _differentiate_planes(
             grad_records = band_workspace.array((len(tiles.intersections), RECORD_SIZE), np.float32)
             grad_values = band_workspace.array((len(tiles.intersections), num_values), np.float32)
             rasterize_backward(
-                state.records, observed.values, tiles.intersections, tiles.starts, tiles.slots, tables, plane_sums,
+                state.records, projected.values, tiles.intersections, tiles.starts, tiles.slots, tables, plane_sums,
                 saved, plane_grads, grad_records, grad_values, first_row=tiles.first_row, threads=threads,
             )  # fmt: skip
             offsets = tiles.offsets
@@ -330,10 +336,10 @@ def _differentiate_planes(
             if view.is_exact:
                 _add_slots(offsets, grad_records, total_records, num_items, threads)
             else:
-                project_backward(fields, camera, plane, options.dilation, grad_records, offsets, totals, threads)
+                backpropagate_ewa(fields, camera, plane, options.dilation, grad_records, offsets, totals, threads)
             _add_slots(offsets, grad_values, total_values, num_items, threads)
     return total_records, total_values, totals, np.arange(num + 1)
 
 
 def _add_slots(offsets: np.ndarray, slots: np.ndarray, totals: np.ndarray, num_items: int, threads: int) -> None:
-    parallel_for(lambda item: add_slots(item, offsets, slots, totals), num_items, threads)
+    parallel_for(lambda item: accumulate_slots(item, offsets, slots, totals), num_items, threads)

@@ -19,30 +19,27 @@ import numpy as np
 import numpy.typing as npt
 
 from pansplat.constants import ALPHA_CUT, MAX_ALPHA, TRANSMITTANCE_CUT
-from pansplat.rendering.cpu.bits import list_bits
-from pansplat.rendering.cpu.columns import columns_of
-from pansplat.rendering.cpu.forms import dot, tangent_frame
+from pansplat.rendering.cpu.projection import dot, tangent_frame
 from pansplat.rendering.cpu.records import EQUIRECT_RAYS, PIXEL_CENTRES, RECORD_SIZE, TILE_SIZE, PixelTables
 from pansplat.rendering.cpu.runtime import Workspace, inline_kernel_no_refcount, kernel, parallel_for
 from pansplat.rendering.cpu.simd import (
     LANES,
-    choose,
+    any_lane,
+    broadcast,
     copy_four,
-    element,
     exp2,
-    fill,
-    how_many,
+    join_halves,
+    list_set_bits,
     load,
-    maximum,
-    minimum,
+    load_broadcast,
+    load_scalar,
+    load_transposed,
     multiply_add,
-    negative,
+    popcount,
     prefetch,
-    put,
-    side_by_side,
-    some,
-    spread,
+    select,
     store,
+    store_scalar,
 )
 from pansplat.rendering.cpu.tiling import split_tiles
 
@@ -60,7 +57,7 @@ CHUNK_SIZE = 256  # Gaussians
 CHUNK_WORDS = CHUNK_SIZE // 64  # of 64 bits, one a Gaussian
 ROW_MASKS = BLOCKS_ACROSS + 1  # where the masks of rows begin, after those of columns; see `mark_blocks`
 NUM_MASKS = ROW_MASKS + BLOCKS_DOWN + 1  # for each word of a chunk
-BUFFER_SIZE = CHUNK_SIZE + 64  # log2 alphas of a block, and what `list_bits` overwrites
+BUFFER_SIZE = CHUNK_SIZE + 64  # log2 alphas of a block, and what `list_set_bits` overwrites
 _SLICE_SIZE = CHUNK_SIZE // NUM_BLOCKS  # Gaussians of the next chunk that each block prefetches
 
 # Rows of a chunk's footprints.
@@ -175,7 +172,7 @@ def prefetch_slice(records, values, intersections, block, first):  # type: ignor
     """Prefetch this block's slice of the chunk that begins at intersection `first`."""
     num_values, end = values.shape[1], len(intersections) // 2 - 1
     for e in range(first + block * _SLICE_SIZE, first + (block + 1) * _SLICE_SIZE):
-        index = np.int64(element(intersections, 2 * max(min(e, end), 0)))
+        index = np.int64(load_scalar(intersections, 2 * max(min(e, end), 0)))
         prefetch(records, RECORD_SIZE * index)
         prefetch(values, num_values * index)
 
@@ -188,17 +185,17 @@ def load_eight_records(records, intersections, e, last):  # type: ignore[no-unty
         e: first intersection.
         last: intersection that is repeated past the end.
     """
-    r0 = RECORD_SIZE * np.int64(element(intersections, 2 * e))
-    r1 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 1, last)))
-    r2 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 2, last)))
-    r3 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 3, last)))
-    r4 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 4, last)))
-    r5 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 5, last)))
-    r6 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 6, last)))
-    r7 = RECORD_SIZE * np.int64(element(intersections, 2 * min(e + 7, last)))
+    r0 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * e))
+    r1 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 1, last)))
+    r2 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 2, last)))
+    r3 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 3, last)))
+    r4 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 4, last)))
+    r5 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 5, last)))
+    r6 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 6, last)))
+    r7 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 7, last)))
     return (
-        columns_of(records, r0, r1, r2, r3, r4, r5, r6, r7),
-        columns_of(records, r0 + 8, r1 + 8, r2 + 8, r3 + 8, r4 + 8, r5 + 8, r6 + 8, r7 + 8),
+        load_transposed(records, r0, r1, r2, r3, r4, r5, r6, r7),
+        load_transposed(records, r0 + 8, r1 + 8, r2 + 8, r3 + 8, r4 + 8, r5 + 8, r6 + 8, r7 + 8),
     )
 
 
@@ -226,14 +223,13 @@ def load_chunk(  # type: ignore[no-untyped-def]
         is_3d = True
     if num_values == VALUE_LANES:
         for s in range(count):
-            copy_four(
-                chunk_values, VALUE_LANES * s, values, VALUE_LANES * np.int64(element(intersections, 2 * (first + s)))
-            )
+            g = np.int64(load_scalar(intersections, 2 * (first + s)))
+            copy_four(chunk_values, VALUE_LANES * s, values, VALUE_LANES * g)
     else:
         for s in range(count):
-            row = num_values * np.int64(element(intersections, 2 * (first + s)))
+            row = num_values * np.int64(load_scalar(intersections, 2 * (first + s)))
             for channel in range(num_values):
-                put(chunk_values, num_values * s + channel, element(values, row + channel))
+                store_scalar(chunk_values, num_values * s + channel, load_scalar(values, row + channel))
     return is_3d
 
 
@@ -243,15 +239,15 @@ def _compute_footprints(  # type: ignore[no-untyped-def]
 ):
     """Compute a chunk's footprints; returns whether they must be computed again in 3d."""
     last = first + count - 1
-    on, one = fill(exact), fill(np.float32(1))
-    least, most = one, fill(np.float32(0))
+    on, one = broadcast(exact), broadcast(np.float32(1))
+    least, most = one, broadcast(np.float32(0))
     for at in range(0, count, LANES):
         low, high = load_eight_records(records, intersections, first + at, last)
         n_x, n_y, n_z, residual_x, residual_y, residual_z, a_x, a_y = low
         a_z, b_x, b_y, b_z, l_along_a, l_along_b, radial_variance, log2_peak = high
-        m_x = (n_x - fill(frame[0])) + (residual_x - fill(frame[3]))
-        m_y = (n_y - fill(frame[1])) + (residual_y - fill(frame[4]))
-        m_z = (n_z - fill(frame[2])) + (residual_z - fill(frame[5]))
+        m_x = (n_x - broadcast(frame[0])) + (residual_x - broadcast(frame[3]))
+        m_y = (n_y - broadcast(frame[1])) + (residual_y - broadcast(frame[4]))
+        m_z = (n_z - broadcast(frame[2])) + (residual_z - broadcast(frame[5]))
         m_x, m_y, m_z = _to_tile_frame(frame, m_x, m_y, m_z)
         a_x, a_y, a_z = _to_tile_frame(frame, a_x, a_y, a_z)
         b_x, b_y, b_z = _to_tile_frame(frame, b_x, b_y, b_z)
@@ -267,9 +263,9 @@ def _compute_footprints(  # type: ignore[no-untyped-def]
             ahead = one
         # If this is below 1, no pixel beyond the horizon, where L < 0, reaches the alpha cut: log2 alpha is at most
         # log2_peak - 1 / radial_variance there.
-        horizon = radial_variance * (log2_peak + fill(np.float32(_HORIZON_MARGIN - LOG2_ALPHA_CUT)))
-        least, inverse = minimum(least, ahead), one / ahead
-        most = maximum(most, horizon)
+        horizon = radial_variance * (log2_peak + broadcast(np.float32(_HORIZON_MARGIN - LOG2_ALPHA_CUT)))
+        least, inverse = min(least, ahead), one / ahead
+        most = max(most, horizon)
         store(footprints, ROW_A * CHUNK_SIZE + at, ahead * a_x)
         store(footprints, (ROW_A + 1) * CHUNK_SIZE + at, ahead * a_y)
         store(footprints, ROW_B * CHUNK_SIZE + at, ahead * b_x)
@@ -280,16 +276,16 @@ def _compute_footprints(  # type: ignore[no-untyped-def]
         store(footprints, (POINT + 1) * CHUNK_SIZE + at, inverse * m_y)
         store(footprints, RADIAL_VARIANCE * CHUNK_SIZE + at, radial_variance)
         store(footprints, LOG2_PEAK * CHUNK_SIZE + at, log2_peak)
-    return not is_3d and (some(fill(np.float32(MIN_PLANAR_COSINE)) > least) or some(most > one))
+    return not is_3d and (any_lane(broadcast(np.float32(MIN_PLANAR_COSINE)) > least) or any_lane(most > one))
 
 
 @inline_kernel_no_refcount
 def _to_tile_frame(frame, x, y, z):  # type: ignore[no-untyped-def]
     """Components of vectors along a tile's three axes."""
     return (
-        multiply_add(fill(frame[6]), x, multiply_add(fill(frame[7]), y, fill(frame[8]) * z)),
-        multiply_add(fill(frame[9]), x, multiply_add(fill(frame[10]), y, fill(frame[11]) * z)),
-        multiply_add(fill(frame[12]), x, multiply_add(fill(frame[13]), y, fill(frame[14]) * z)),
+        multiply_add(broadcast(frame[6]), x, multiply_add(broadcast(frame[7]), y, broadcast(frame[8]) * z)),
+        multiply_add(broadcast(frame[9]), x, multiply_add(broadcast(frame[10]), y, broadcast(frame[11]) * z)),
+        multiply_add(broadcast(frame[12]), x, multiply_add(broadcast(frame[13]), y, broadcast(frame[14]) * z)),
     )
 
 
@@ -305,7 +301,7 @@ def mark_blocks(intersections, first, count, masks):  # type: ignore[no-untyped-
     """
     masks[:] = 0
     for at in range(count):
-        box = element(intersections, 2 * (first + at) + 1)
+        box = load_scalar(intersections, 2 * (first + at) + 1)
         bit, word = np.uint64(1) << np.uint64(at & 63), (at >> 6) * NUM_MASKS
         _toggle(masks, word + (box & 255) // BLOCK_WIDTH, bit)
         _toggle(masks, word + ((box >> 8) & 255) // BLOCK_WIDTH + 1, bit)
@@ -314,14 +310,14 @@ def mark_blocks(intersections, first, count, masks):  # type: ignore[no-untyped-
     # Bits were toggled where a box begins and after its end; a running XOR sets them in between.
     for word in range(0, (count + 63) // 64 * NUM_MASKS, NUM_MASKS):
         for mask in range(word + 1, word + BLOCKS_ACROSS):
-            _toggle(masks, mask, element(masks, mask - 1))
+            _toggle(masks, mask, load_scalar(masks, mask - 1))
         for mask in range(word + ROW_MASKS + 1, word + ROW_MASKS + BLOCKS_DOWN):
-            _toggle(masks, mask, element(masks, mask - 1))
+            _toggle(masks, mask, load_scalar(masks, mask - 1))
 
 
 @inline_kernel_no_refcount
 def _toggle(words, index, bits):  # type: ignore[no-untyped-def]
-    put(words, index, element(words, index) ^ bits)
+    store_scalar(words, index, load_scalar(words, index) ^ bits)
 
 
 class SavedForBackward(NamedTuple):
@@ -418,7 +414,7 @@ def _rasterize_tiles(  # type: ignore[no-untyped-def]
             for block in range(NUM_BLOCKS + 1):
                 if block < NUM_BLOCKS:
                     prefetch_slice(records, values, intersections, block, first + CHUNK_SIZE)
-                    if not some(load(transmittance, block * LANES) > fill(np.float32(MIN_TRANSMITTANCE))):
+                    if not any_lane(load(transmittance, block * LANES) > broadcast(np.float32(MIN_TRANSMITTANCE))):
                         continue
                     num_next = compute_log2_alphas(
                         block, masks, is_3d, footprints, offsets, log2_alphas, indices, begin
@@ -463,17 +459,17 @@ def compute_log2_alphas(  # type: ignore[no-untyped-def]
     pixel = block * LANES
     x, y, z = load(offsets, pixel), load(offsets, TILE_PIXELS + pixel), load(offsets, 2 * TILE_PIXELS + pixel)
     total = _list_gaussians(block, masks, indices, begin)
-    zero = fill(np.float32(0))
+    zero = broadcast(np.float32(0))
     for at in range(begin, begin + total):
-        s = np.int64(element(indices, at))
+        s = np.int64(load_scalar(indices, at))
         a, b, front = evaluate_footprint(is_3d, footprints, s, x, y, z)
         if is_3d:
-            front = choose(front > zero, front, fill(np.float32(np.nan)))
+            front = select(front > zero, front, broadcast(np.float32(np.nan)))
         q = multiply_add(a, a, b * b)
-        radial_variance = spread(footprints, RADIAL_VARIANCE * CHUNK_SIZE + s)
-        divisor = multiply_add(maximum(zero, front), front, radial_variance * q)
-        store(log2_alphas, at * LANES, spread(footprints, LOG2_PEAK * CHUNK_SIZE + s) - q / divisor)
-    store(log2_alphas, (begin + total) * LANES, fill(np.float32(LOG2_ZERO)))
+        radial_variance = load_broadcast(footprints, RADIAL_VARIANCE * CHUNK_SIZE + s)
+        divisor = multiply_add(max(zero, front), front, radial_variance * q)
+        store(log2_alphas, at * LANES, load_broadcast(footprints, LOG2_PEAK * CHUNK_SIZE + s) - q / divisor)
+    store(log2_alphas, (begin + total) * LANES, broadcast(np.float32(LOG2_ZERO)))
     return total
 
 
@@ -482,10 +478,10 @@ def _list_gaussians(block, masks, indices, begin):  # type: ignore[no-untyped-de
     """Write the chunk indices of the Gaussians that reach a block, and a 0 after them; returns their number."""
     at, column, row = begin, block % BLOCKS_ACROSS, ROW_MASKS + block // BLOCKS_ACROSS
     for word in range(CHUNK_WORDS):
-        bits = element(masks, word * NUM_MASKS + column) & element(masks, word * NUM_MASKS + row)
-        list_bits(indices, at, bits, word * 64)
-        at += how_many(bits)
-    put(indices, at, np.uint8(0))
+        bits = load_scalar(masks, word * NUM_MASKS + column) & load_scalar(masks, word * NUM_MASKS + row)
+        list_set_bits(indices, at, bits, word * 64)
+        at += popcount(bits)
+    store_scalar(indices, at, np.uint8(0))
     return at - begin
 
 
@@ -495,26 +491,27 @@ def evaluate_footprint(is_3d, footprints, s, x, y, z):  # type: ignore[no-untype
 
     The offsets from the Gaussian are subtracted first: they are small, so that the sums have no cancellation.
     """
-    x, y = x - spread(footprints, POINT * CHUNK_SIZE + s), y - spread(footprints, (POINT + 1) * CHUNK_SIZE + s)
-    a = spread(footprints, ROW_A * CHUNK_SIZE + s) * x
-    b = spread(footprints, ROW_B * CHUNK_SIZE + s) * x
-    front = multiply_add(spread(footprints, ROW_L * CHUNK_SIZE + s), x, fill(np.float32(1)))
-    a = multiply_add(spread(footprints, (ROW_A + 1) * CHUNK_SIZE + s), y, a)
-    b = multiply_add(spread(footprints, (ROW_B + 1) * CHUNK_SIZE + s), y, b)
-    front = multiply_add(spread(footprints, (ROW_L + 1) * CHUNK_SIZE + s), y, front)
+    x = x - load_broadcast(footprints, POINT * CHUNK_SIZE + s)
+    y = y - load_broadcast(footprints, (POINT + 1) * CHUNK_SIZE + s)
+    a = load_broadcast(footprints, ROW_A * CHUNK_SIZE + s) * x
+    b = load_broadcast(footprints, ROW_B * CHUNK_SIZE + s) * x
+    front = multiply_add(load_broadcast(footprints, ROW_L * CHUNK_SIZE + s), x, broadcast(np.float32(1)))
+    a = multiply_add(load_broadcast(footprints, (ROW_A + 1) * CHUNK_SIZE + s), y, a)
+    b = multiply_add(load_broadcast(footprints, (ROW_B + 1) * CHUNK_SIZE + s), y, b)
+    front = multiply_add(load_broadcast(footprints, (ROW_L + 1) * CHUNK_SIZE + s), y, front)
     if is_3d:
-        z = z - spread(footprints, (THIRD + 3) * CHUNK_SIZE + s)
-        a = multiply_add(spread(footprints, THIRD * CHUNK_SIZE + s), z, a)
-        b = multiply_add(spread(footprints, (THIRD + 1) * CHUNK_SIZE + s), z, b)
-        front = multiply_add(spread(footprints, (THIRD + 2) * CHUNK_SIZE + s), z, front)
+        z = z - load_broadcast(footprints, (THIRD + 3) * CHUNK_SIZE + s)
+        a = multiply_add(load_broadcast(footprints, THIRD * CHUNK_SIZE + s), z, a)
+        b = multiply_add(load_broadcast(footprints, (THIRD + 1) * CHUNK_SIZE + s), z, b)
+        front = multiply_add(load_broadcast(footprints, (THIRD + 2) * CHUNK_SIZE + s), z, front)
     return a, b, front
 
 
 @inline_kernel_no_refcount
 def compute_alpha(log2_alpha):  # type: ignore[no-untyped-def]
     """Alpha: 0 below the cut, at most MAX_ALPHA."""
-    alpha = minimum(exp2(log2_alpha), fill(np.float32(MAX_ALPHA)))
-    return choose(fill(np.float32(LOG2_ALPHA_CUT)) <= log2_alpha, alpha, fill(np.float32(0)))
+    alpha = min(exp2(log2_alpha), broadcast(np.float32(MAX_ALPHA)))
+    return select(broadcast(np.float32(LOG2_ALPHA_CUT)) <= log2_alpha, alpha, broadcast(np.float32(0)))
 
 
 @inline_kernel_no_refcount
@@ -527,27 +524,28 @@ def _blend_four_values(  # type: ignore[no-untyped-def]
     sum0, sum1 = load(tile_sums, pixel), load(tile_sums, TILE_PIXELS + pixel)
     sum2, sum3 = load(tile_sums, 2 * TILE_PIXELS + pixel), load(tile_sums, 3 * TILE_PIXELS + pixel)
     for at in range(begin, begin + count, 2):  # after an odd number the last alpha is 0
-        first, second = VALUE_LANES * np.int64(element(indices, at)), VALUE_LANES * np.int64(element(indices, at + 1))
+        first = VALUE_LANES * np.int64(load_scalar(indices, at))
+        second = VALUE_LANES * np.int64(load_scalar(indices, at + 1))
         alpha = compute_alpha(load(log2_alphas, at * LANES))
         next_alpha = compute_alpha(load(log2_alphas, at * LANES + LANES))
         weight = alpha * passing
-        passing = multiply_add(negative(alpha), passing, passing)
-        sum0 = multiply_add(weight, spread(chunk_values, first), sum0)
-        sum1 = multiply_add(weight, spread(chunk_values, first + 1), sum1)
-        sum2 = multiply_add(weight, spread(chunk_values, first + 2), sum2)
-        sum3 = multiply_add(weight, spread(chunk_values, first + 3), sum3)
+        passing = multiply_add(-alpha, passing, passing)
+        sum0 = multiply_add(weight, load_broadcast(chunk_values, first), sum0)
+        sum1 = multiply_add(weight, load_broadcast(chunk_values, first + 1), sum1)
+        sum2 = multiply_add(weight, load_broadcast(chunk_values, first + 2), sum2)
+        sum3 = multiply_add(weight, load_broadcast(chunk_values, first + 3), sum3)
         weight = next_alpha * passing
-        passing = multiply_add(negative(next_alpha), passing, passing)
-        sum0 = multiply_add(weight, spread(chunk_values, second), sum0)
-        sum1 = multiply_add(weight, spread(chunk_values, second + 1), sum1)
-        sum2 = multiply_add(weight, spread(chunk_values, second + 2), sum2)
-        sum3 = multiply_add(weight, spread(chunk_values, second + 3), sum3)
+        passing = multiply_add(-next_alpha, passing, passing)
+        sum0 = multiply_add(weight, load_broadcast(chunk_values, second), sum0)
+        sum1 = multiply_add(weight, load_broadcast(chunk_values, second + 1), sum1)
+        sum2 = multiply_add(weight, load_broadcast(chunk_values, second + 2), sum2)
+        sum3 = multiply_add(weight, load_broadcast(chunk_values, second + 3), sum3)
     store(transmittance, pixel, passing)
     store(tile_sums, pixel, sum0)
     store(tile_sums, TILE_PIXELS + pixel, sum1)
     store(tile_sums, 2 * TILE_PIXELS + pixel, sum2)
     store(tile_sums, 3 * TILE_PIXELS + pixel, sum3)
-    return some(passing > fill(np.float32(MIN_TRANSMITTANCE)))
+    return any_lane(passing > broadcast(np.float32(MIN_TRANSMITTANCE)))
 
 
 @inline_kernel_no_refcount
@@ -557,9 +555,9 @@ def _compute_weights(block, count, log2_alphas, begin, transmittance):  # type: 
     for at in range(begin, begin + count):
         alpha = compute_alpha(load(log2_alphas, at * LANES))
         store(log2_alphas, at * LANES, alpha * passing)
-        passing = multiply_add(negative(alpha), passing, passing)
+        passing = multiply_add(-alpha, passing, passing)
     store(transmittance, block * LANES, passing)
-    return some(passing > fill(np.float32(MIN_TRANSMITTANCE)))
+    return any_lane(passing > broadcast(np.float32(MIN_TRANSMITTANCE)))
 
 
 @inline_kernel_no_refcount
@@ -571,8 +569,8 @@ def _accumulate_values(  # type: ignore[no-untyped-def]
         pixel = channel * TILE_PIXELS + block * LANES
         total = load(tile_sums, pixel)
         for at in range(begin, begin + count):
-            value = num_values * np.int64(element(indices, at)) + channel
-            total = multiply_add(load(weights, at * LANES), spread(chunk_values, value), total)
+            value = num_values * np.int64(load_scalar(indices, at)) + channel
+            total = multiply_add(load(weights, at * LANES), load_broadcast(chunk_values, value), total)
         store(tile_sums, pixel, total)
 
 
@@ -583,17 +581,17 @@ def _write_tile(transmittance, tile_sums, sums, left, top, num_values):  # type:
     if left + TILE_SIZE > width or top + TILE_SIZE > height:
         _write_partial_tile(transmittance, tile_sums, sums, left, top, num_values)
         return
-    image, one = sums.reshape(-1), fill(np.float32(1))
+    image, one = sums.reshape(-1), broadcast(np.float32(1))
     for block in range(0, NUM_BLOCKS, 2):
         pixel = block * LANES
         corner = (top + block // BLOCKS_ACROSS * BLOCK_HEIGHT) * width + left + block % BLOCKS_ACROSS * BLOCK_WIDTH
         for channel in range(num_values):
             source, target = channel * TILE_PIXELS + pixel, channel * height * width + corner
-            upper, lower = side_by_side(load(tile_sums, source), load(tile_sums, source + LANES))
+            upper, lower = join_halves(load(tile_sums, source), load(tile_sums, source + LANES))
             store(image, target, upper)
             store(image, target + width, lower)
         target = num_values * height * width + corner
-        upper, lower = side_by_side(one - load(transmittance, pixel), one - load(transmittance, pixel + LANES))
+        upper, lower = join_halves(one - load(transmittance, pixel), one - load(transmittance, pixel + LANES))
         store(image, target, upper)
         store(image, target + width, lower)
 

@@ -16,7 +16,6 @@ import math
 import numpy as np
 
 from pansplat.constants import MAX_ALPHA
-from pansplat.rendering.cpu.columns import columns_of
 from pansplat.rendering.cpu.rasterize import (
     BLOCK_HEIGHT,
     BLOCK_WIDTH,
@@ -50,23 +49,22 @@ from pansplat.rendering.cpu.records import PIXEL_CENTRES, RECORD_SIZE, TILE_SIZE
 from pansplat.rendering.cpu.runtime import inline_kernel_no_refcount, kernel, parallel_for
 from pansplat.rendering.cpu.simd import (
     LANES,
-    choose,
-    element,
-    fill,
+    any_lane,
+    broadcast,
     first_lane,
+    join_halves,
+    lane_sums,
     load,
-    maximum,
+    load_broadcast,
+    load_scalar,
+    load_transposed,
     multiply_add,
-    negative,
-    prefetch_to_write,
-    put,
-    side_by_side,
-    some,
-    spread,
+    prefetch_for_write,
+    select,
     store,
-    store_past_cache,
-    totals,
-    transposed,
+    store_nontemporal,
+    store_scalar,
+    transpose,
 )
 from pansplat.rendering.cpu.tiling import split_tiles
 
@@ -190,12 +188,12 @@ def _load_tile_gradients(  # type: ignore[no-untyped-def]
         return
     image_grads, image = grad_sums.reshape(-1), sums.reshape(-1)
     for block in range(0, NUM_BLOCKS, 2):
-        pixel, first, second = block * LANES, fill(np.float32(0)), fill(np.float32(0))
+        pixel, first, second = block * LANES, broadcast(np.float32(0)), broadcast(np.float32(0))
         corner = (top + block // BLOCKS_ACROSS * BLOCK_HEIGHT) * width + left + block % BLOCKS_ACROSS * BLOCK_WIDTH
         for channel in range(num_values + 1):
             at = channel * height * width + corner
-            gradient, next_gradient = side_by_side(load(image_grads, at), load(image_grads, at + width))
-            value, next_value = side_by_side(load(image, at), load(image, at + width))
+            gradient, next_gradient = join_halves(load(image_grads, at), load(image_grads, at + width))
+            value, next_value = join_halves(load(image, at), load(image, at + width))
             first = multiply_add(gradient, value, first)
             second = multiply_add(next_gradient, next_value, second)
             row = (channel if channel < num_values else padded_values) * TILE_PIXELS + pixel
@@ -242,7 +240,7 @@ def _differentiate_chunk(  # type: ignore[no-untyped-def]
         num_next, is_open = 0, False
         if block < NUM_BLOCKS:
             prefetch_slice(records, values, intersections, block, next_first)
-            is_open = some(load(transmittance, block * LANES) > fill(np.float32(MIN_TRANSMITTANCE)))
+            is_open = any_lane(load(transmittance, block * LANES) > broadcast(np.float32(MIN_TRANSMITTANCE)))
             if not is_open:
                 continue
             num_next = compute_log2_alphas(block, masks, is_3d, footprints, offsets, log2_alphas, indices, begin)
@@ -276,10 +274,10 @@ def _compute_block_weights(  # type: ignore[no-untyped-def]
         alpha = compute_alpha(load(log2_alphas, at * LANES))
         store(alphas, to * LANES, alpha)
         store(weights, to * LANES, alpha * passing)
-        put(visible, to, np.int32(element(indices, at)))
-        passing = multiply_add(negative(alpha), passing, passing)
+        store_scalar(visible, to, np.int32(load_scalar(indices, at)))
+        passing = multiply_add(-alpha, passing, passing)
         # The next Gaussian overwrites this one if no pixel sees it: a branch could not be predicted.
-        to += np.int64(some(alpha > fill(np.float32(0))))
+        to += np.int64(any_lane(alpha > broadcast(np.float32(0))))
     return to - output
 
 
@@ -289,26 +287,26 @@ def _differentiate_block(  # type: ignore[no-untyped-def]
     links, heads, pair,
 ):  # fmt: skip
     """Write a block's pairs, back to front: gradients by log alpha, weights, and their links."""
-    max_alpha, zero = fill(np.float32(MAX_ALPHA)), fill(np.float32(0))
+    max_alpha, zero = broadcast(np.float32(MAX_ALPHA)), broadcast(np.float32(0))
     pixel = block * LANES
     mean_behind, base = load(behind, pixel), load(tile_grads, padded_values * TILE_PIXELS + pixel)
     for at in range(begin + count - 1, begin - 1, -1):
-        s = np.int64(element(visible, at))
+        s = np.int64(load_scalar(visible, at))
         alpha, weight = load(alphas, at * LANES), load(weights, at * LANES)
         worth = base
         for value in range(0, padded_values, VALUE_LANES):  # past the last value: finite numbers times 0
             row, own = value * TILE_PIXELS + pixel, num_values * s + value
-            worth = multiply_add(load(tile_grads, row), spread(chunk_values, own), worth)
-            worth = multiply_add(load(tile_grads, row + TILE_PIXELS), spread(chunk_values, own + 1), worth)
-            worth = multiply_add(load(tile_grads, row + 2 * TILE_PIXELS), spread(chunk_values, own + 2), worth)
-            worth = multiply_add(load(tile_grads, row + 3 * TILE_PIXELS), spread(chunk_values, own + 3), worth)
+            worth = multiply_add(load(tile_grads, row), load_broadcast(chunk_values, own), worth)
+            worth = multiply_add(load(tile_grads, row + TILE_PIXELS), load_broadcast(chunk_values, own + 1), worth)
+            worth = multiply_add(load(tile_grads, row + 2 * TILE_PIXELS), load_broadcast(chunk_values, own + 2), worth)
+            worth = multiply_add(load(tile_grads, row + 3 * TILE_PIXELS), load_broadcast(chunk_values, own + 3), worth)
         difference = worth - mean_behind
-        store(pairs, pair * _PAIR_SIZE, choose(max_alpha > alpha, weight * difference, zero))
+        store(pairs, pair * _PAIR_SIZE, select(max_alpha > alpha, weight * difference, zero))
         store(pairs, pair * _PAIR_SIZE + LANES, weight)
         mean_behind = multiply_add(alpha, difference, mean_behind)
-        put(links, 2 * pair, np.int32(block))
-        put(links, 2 * pair + 1, element(heads, s))
-        put(heads, s, np.int32(pair))
+        store_scalar(links, 2 * pair, np.int32(block))
+        store_scalar(links, 2 * pair + 1, load_scalar(heads, s))
+        store_scalar(heads, s, np.int32(pair))
         pair += 1
     store(behind, pixel, mean_behind)
 
@@ -318,10 +316,10 @@ def _write_zeros(slots, first, end, num_values, grad_records, grad_values):  # t
     """Write zero gradients for the Gaussians behind a tile's last composited chunk."""
     for e in range(first, end):
         row = RECORD_SIZE * slots[e]
-        store(grad_records, row, fill(np.float32(0)))
-        store(grad_records, row + LANES, fill(np.float32(0)))
+        store(grad_records, row, broadcast(np.float32(0)))
+        store(grad_records, row + LANES, broadcast(np.float32(0)))
         for value in range(num_values):
-            put(grad_values, num_values * slots[e] + value, np.float32(0))
+            store_scalar(grad_values, num_values * slots[e] + value, np.float32(0))
 
 
 # --- gradient sums ---
@@ -335,13 +333,13 @@ def _write_chunk_gradients(  # type: ignore[no-untyped-def]
     """Write the gradients of a chunk's records and values to their slots."""
     last = first + count - 1
     for s in range(count):
-        prefetch_to_write(grad_values, num_values * element(slots, min(first + s + _WRITE_AHEAD, last)))
+        prefetch_for_write(grad_values, num_values * load_scalar(slots, min(first + s + _WRITE_AHEAD, last)))
         _accumulate_gradient_sums(s, heads, links, pairs, is_3d, footprints, offsets, tile_grads, gradient_sums)
         row = num_values * slots[first + s]
         for value in range(min(VALUE_LANES, num_values)):
-            put(grad_values, row + value, element(gradient_sums, _NUM_SUMS * s + _VALUE_SUMS + value))
+            store_scalar(grad_values, row + value, load_scalar(gradient_sums, _NUM_SUMS * s + _VALUE_SUMS + value))
         for value in range(VALUE_LANES, num_values):
-            put(grad_values, row + value, _sum_value_gradient(s, heads, links, pairs, tile_grads, value))
+            store_scalar(grad_values, row + value, _sum_value_gradient(s, heads, links, pairs, tile_grads, value))
     for s in range(0, count, LANES):
         _write_record_gradients(s, records, intersections, first, count, slots, gradient_sums, exact, grad_records)
 
@@ -355,19 +353,19 @@ def _accumulate_gradient_sums(  # type: ignore[no-untyped-def]
     With x = A / L, y = B / L, q = x^2 + y^2 and h = gradient / (1 + radial_variance q)^2, these are the sums of h times
     x^2, x y, y^2, x, y, q x, q y and q^2, of the gradient, and of the weight times the gradients of four values.
     """
-    zero, one = fill(np.float32(0)), fill(np.float32(1))
+    zero, one = broadcast(np.float32(0)), broadcast(np.float32(1))
     xx = xy = yy = sum_x = sum_y = qx = qy = qq = sum_gradient = zero
     value0 = value1 = value2 = value3 = zero
-    radial_variance = spread(footprints, RADIAL_VARIANCE * CHUNK_SIZE + s)
-    pair = np.int64(element(heads, s))
+    radial_variance = load_broadcast(footprints, RADIAL_VARIANCE * CHUNK_SIZE + s)
+    pair = np.int64(load_scalar(heads, s))
     while pair >= 0:
-        pixel = LANES * np.int64(element(links, 2 * pair))
+        pixel = LANES * np.int64(load_scalar(links, 2 * pair))
         gradient, weight = load(pairs, pair * _PAIR_SIZE), load(pairs, pair * _PAIR_SIZE + LANES)
-        pair = np.int64(element(links, 2 * pair + 1))
+        pair = np.int64(load_scalar(links, 2 * pair + 1))
         x, y, z = load(offsets, pixel), load(offsets, TILE_PIXELS + pixel), load(offsets, 2 * TILE_PIXELS + pixel)
         a, b, front = evaluate_footprint(is_3d, footprints, s, x, y, z)
         q = multiply_add(a, a, b * b)
-        inverse = one / maximum(multiply_add(front, front, radial_variance * q), fill(np.float32(_MIN_DIVISOR)))
+        inverse = one / max(multiply_add(front, front, radial_variance * q), broadcast(np.float32(_MIN_DIVISOR)))
         scaled = gradient * inverse * inverse  # h / L^4
         by_front, by_q = scaled * front, scaled * q
         qq, sum_gradient = multiply_add(by_q, q, qq), sum_gradient + gradient
@@ -381,20 +379,20 @@ def _accumulate_gradient_sums(  # type: ignore[no-untyped-def]
         value2 = multiply_add(weight, load(tile_grads, pixel + 2 * TILE_PIXELS), value2)
         value3 = multiply_add(weight, load(tile_grads, pixel + 3 * TILE_PIXELS), value3)
     at = _NUM_SUMS * s
-    store(gradient_sums, at, totals(xx, xy, yy, sum_x, sum_y, qx, qy, qq))
-    store(gradient_sums, at + LANES, totals(sum_gradient, value0, value1, value2, value3, zero, zero, zero))
+    store(gradient_sums, at, lane_sums(xx, xy, yy, sum_x, sum_y, qx, qy, qq))
+    store(gradient_sums, at + LANES, lane_sums(sum_gradient, value0, value1, value2, value3, zero, zero, zero))
 
 
 @inline_kernel_no_refcount
 def _sum_value_gradient(s, heads, links, pairs, tile_grads, value):  # type: ignore[no-untyped-def]
     """The gradient of one value of a Gaussian: the sum over its pixels of weight times gradient."""
-    total = zero = fill(np.float32(0))
-    pair = np.int64(element(heads, s))
+    total = zero = broadcast(np.float32(0))
+    pair = np.int64(load_scalar(heads, s))
     while pair >= 0:
-        pixel = value * TILE_PIXELS + LANES * np.int64(element(links, 2 * pair))
+        pixel = value * TILE_PIXELS + LANES * np.int64(load_scalar(links, 2 * pair))
         total = multiply_add(load(pairs, pair * _PAIR_SIZE + LANES), load(tile_grads, pixel), total)
-        pair = np.int64(element(links, 2 * pair + 1))
-    return first_lane(totals(total, zero, zero, zero, zero, zero, zero, zero))
+        pair = np.int64(load_scalar(links, 2 * pair + 1))
+    return first_lane(lane_sums(total, zero, zero, zero, zero, zero, zero, zero))
 
 
 @inline_kernel_no_refcount
@@ -413,41 +411,42 @@ def _write_record_gradients(  # type: ignore[no-untyped-def]
     n_x, n_y, n_z, _, _, _, a_x, a_y = low
     a_z, b_x, b_y, b_z, l_along_a, l_along_b, _, _ = high
     n, a, b = (n_x, n_y, n_z), (a_x, a_y, a_z), (b_x, b_y, b_z)
-    zero, one, two, on = fill(np.float32(0)), fill(np.float32(1)), fill(np.float32(2 * _LN2)), fill(exact)
-    twice, half = two * on, fill(np.float32(_LN2))
+    zero, one, on = broadcast(np.float32(0)), broadcast(np.float32(1)), broadcast(exact)
+    two = broadcast(np.float32(2 * _LN2))
+    twice, half = two * on, broadcast(np.float32(_LN2))
     ahead = on * n[0], on * n[1], multiply_add(on, n[2], one - on)
     p, q = _cross(b, ahead), _cross(ahead, a)
     inverse = one / _dot(a, p)
-    p = _combine(inverse, p, negative(l_along_a), n)
-    q = _combine(inverse, q, negative(l_along_b), n)
+    p = _combine(inverse, p, -l_along_a, n)
+    q = _combine(inverse, q, -l_along_b, n)
     l_row = _combine(l_along_a, a, l_along_b, b)
     l_row = n[0] + l_row[0], n[1] + l_row[1], n[2] + l_row[2]
     grad_l = _combine(twice * qx, p, twice * qy, q)
     grad_a = _combine(two * (l_along_a * qx - xx), p, two * (l_along_a * qy - xy), q)
     grad_b = _combine(two * (l_along_b * qx - xy), p, two * (l_along_b * qy - yy), q)
-    across, back = _combine(two * sum_x, a, two * sum_y, b), negative(twice * (xx + yy))
+    across, back = _combine(two * sum_x, a, two * sum_y, b), -(twice * (xx + yy))
     grad_n_x = grad_l[0] + multiply_add(back, l_row[0], across[0])
     grad_n_y = grad_l[1] + multiply_add(back, l_row[1], across[1])
     grad_n_z = grad_l[2] + multiply_add(back, l_row[2], across[2])
     # The sums have been read, so the rows of the gradients replace them.
-    low = transposed(grad_n_x, grad_n_y, grad_n_z, zero, zero, zero, grad_a[0], grad_a[1])
-    high = transposed(
+    low = transpose(grad_n_x, grad_n_y, grad_n_z, zero, zero, zero, grad_a[0], grad_a[1])
+    high = transpose(
         grad_a[2], grad_b[0], grad_b[1], grad_b[2], twice * qx, twice * qy, half * on * qq, half * sum_gradient
     )
     _store_rows(gradient_sums, at, low)
     _store_rows(gradient_sums, at + LANES, high)
     for place in range(s, min(s + LANES, count)):
         row = RECORD_SIZE * slots[first + place]
-        store_past_cache(grad_records, row, load(gradient_sums, _NUM_SUMS * place))
-        store_past_cache(grad_records, row + LANES, load(gradient_sums, _NUM_SUMS * place + LANES))
+        store_nontemporal(grad_records, row, load(gradient_sums, _NUM_SUMS * place))
+        store_nontemporal(grad_records, row + LANES, load(gradient_sums, _NUM_SUMS * place + LANES))
 
 
 @inline_kernel_no_refcount
 def _cross(a, b):  # type: ignore[no-untyped-def]
     return (
-        multiply_add(a[1], b[2], negative(a[2] * b[1])),
-        multiply_add(a[2], b[0], negative(a[0] * b[2])),
-        multiply_add(a[0], b[1], negative(a[1] * b[0])),
+        multiply_add(a[1], b[2], -(a[2] * b[1])),
+        multiply_add(a[2], b[0], -(a[0] * b[2])),
+        multiply_add(a[0], b[1], -(a[1] * b[0])),
     )
 
 
@@ -466,7 +465,7 @@ def _combine(s, a, t, b):  # type: ignore[no-untyped-def]
 def _load_columns(sums, at):  # type: ignore[no-untyped-def]
     """Columns of eight numbers of eight Gaussians."""
     r = _NUM_SUMS
-    return columns_of(sums, at, at + r, at + 2 * r, at + 3 * r, at + 4 * r, at + 5 * r, at + 6 * r, at + 7 * r)
+    return load_transposed(sums, at, at + r, at + 2 * r, at + 3 * r, at + 4 * r, at + 5 * r, at + 6 * r, at + 7 * r)
 
 
 @inline_kernel_no_refcount
