@@ -1,7 +1,6 @@
-"""Reading panoramas, masks and depth from picture files; writing pictures.
+"""Reading panoramas, masks and depth from image files, and writing images.
 
-Pictures are RGB in [0, 1] with the sRGB curve, as in JPG and PNG; EXR files hold linear light and are
-converted.
+Images are RGB in [0, 1] with the sRGB curve, as in JPG and PNG. EXR files hold linear light and are converted.
 """
 
 from __future__ import annotations
@@ -27,54 +26,53 @@ READABLE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".exr")
 
 _PILLOW_FORMATS = ("JPEG", "PNG", "WEBP")
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
-_WRAP = 16  # target pixels of wrap-around given to the resampling filter at +-180 degrees
+_WRAP = 16  # margin of the wrap-around at +-180 degrees for the resampling filter, target pixels
 
 
 @dataclass(frozen=True, eq=False)
-class _Picture:
-    """Decoded pixels: `color` (H W 3) uint8 or float32 in [0, 1]; `alpha` (H W) in [0, 1] or None."""
+class _DecodedImage:
+    """Pixels of a file: `color` (H W 3) uint8 or float32 in [0, 1]; `alpha` (H W) in [0, 1] or None."""
 
     color: NDArray[Any]
     alpha: NDArray[Any] | None
 
 
 def srgb_from_linear(linear: NDArray[Any]) -> NDArray[Any]:
-    """Display values of linear light, both in [0, 1]; light outside is clipped. Source: IEC 61966-2-1."""
+    """sRGB values of linear light, both in [0, 1]; values outside are clipped. Source: IEC 61966-2-1."""
     x = np.clip(linear, 0, 1)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055).astype(np.float32)
 
 
-def linear_from_srgb(display: NDArray[Any]) -> NDArray[Any]:
-    """Linear light of display values, both in [0, 1]. Source: IEC 61966-2-1."""
-    x = np.clip(display, 0, 1)
+def linear_from_srgb(srgb: NDArray[Any]) -> NDArray[Any]:
+    """Linear light of sRGB values, both in [0, 1]. Source: IEC 61966-2-1."""
+    x = np.clip(srgb, 0, 1)
     return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def read_panorama(
     path: Path | str, height: int
 ) -> tuple[Float[Tensor, "3 height width"], Bool[Tensor, "height width"]]:
-    """A panorama at (height, 2 height), and where it is opaque.
+    """A panorama at (height, 2 height), and a mask of its opaque pixels. Warns when pixels are transparent.
 
-    Resampled by Pillow's Lanczos filter with wrap-around at +-180 degrees. A warning says when transparent
-    pixels are taken as masked.
+    The image is resampled by Pillow's Lanczos filter with wrap-around at +-180 degrees.
 
     Args:
         path: JPG, PNG (8 or 16 bit), WebP or EXR file, 2:1.
-        height: height wanted, pixels.
+        height: pixels.
 
     Raises:
         InputError: no such file, unknown format, damaged or truncated data, not 2:1, NaN.
     """
     path = Path(path)
     _check_height(height)
-    picture = _decode(path)
-    _check_two_to_one(path, picture.color.shape[1], picture.color.shape[0])
-    image = torch.from_numpy(_resize_color(picture.color, height)).permute(2, 0, 1).contiguous()
-    if picture.alpha is None or picture.alpha.min() == 1:
+    decoded = _decode(path)
+    _check_two_to_one(path, decoded.color.shape[1], decoded.color.shape[0])
+    image = torch.from_numpy(_resize_color(decoded.color, height)).permute(2, 0, 1).contiguous()
+    if decoded.alpha is None or decoded.alpha.min() == 1:
         return image, torch.ones(height, 2 * height, dtype=torch.bool)
-    opaque = _resize_plane(picture.alpha, height, Image.Resampling.BOX) >= 0.5
+    opaque = _resize_plane(decoded.alpha, height, Image.Resampling.BOX) >= 0.5
     warnings.warn(
-        f"{path}: {100 * (1 - opaque.mean()):.1f}% of the picture is transparent; these pixels are masked. "
+        f"{path}: {100 * (1 - opaque.mean()):.1f}% of the image is transparent; these pixels are masked. "
         "Remove the alpha channel if they show the scene.",
         stacklevel=2,
     )
@@ -82,20 +80,20 @@ def read_panorama(
 
 
 def read_thumbnail(path: Path | str, height: int) -> Float[Tensor, "3 height width"]:
-    """A panorama at a small size, fast: JPEGs are decoded at reduced size; alpha is ignored."""
+    """A panorama at a small size; faster than `read_panorama`, because JPEGs are decoded at reduced size. No alpha."""
     path = Path(path)
-    picture = _decode(path, at_least=height)
-    _check_two_to_one(path, picture.color.shape[1], picture.color.shape[0])
-    return torch.from_numpy(_resize_color(picture.color, height)).permute(2, 0, 1).contiguous()
+    decoded = _decode(path, at_least=height)
+    _check_two_to_one(path, decoded.color.shape[1], decoded.color.shape[0])
+    return torch.from_numpy(_resize_color(decoded.color, height)).permute(2, 0, 1).contiguous()
 
 
 def resize_panorama(pixels: NDArray[np.uint8], height: int) -> Float[Tensor, "3 height width"]:
-    """Pixels (H W 3) of a panorama as a picture at (height, 2 height), resampled as in `read_panorama`."""
+    """Pixels (H W 3) of a panorama, resampled to (height, 2 height) as in `read_panorama`."""
     return torch.from_numpy(_resize_color(pixels, height)).permute(2, 0, 1).contiguous()
 
 
 def read_mask(path: Path | str, height: int) -> Bool[Tensor, "height width"]:
-    """A mask picture at (height, 2 height): True where it is white (the scene)."""
+    """A mask image at (height, 2 height): True where it is white (the scene)."""
     path = Path(path)
     _check_height(height)
     color = _decode(path).color
@@ -106,11 +104,14 @@ def read_mask(path: Path | str, height: int) -> Bool[Tensor, "height width"]:
 
 
 def read_depth(path: Path | str, height: int) -> Float[Tensor, "height width"]:
-    """Radial depth in metres at (height, 2 height), 0 where unknown; nearest samples, no mix of surfaces.
+    """Radial depth in metres at (height, 2 height), 0 where unknown; nearest-neighbour samples.
 
     Args:
         path: 16-bit PNG in millimetres (0 is unknown), or EXR in metres (channel Z or Y).
-        height: height wanted, pixels.
+        height: pixels.
+
+    Raises:
+        InputError: the file is not such a depth image.
     """
     path = Path(path)
     _check_height(height)
@@ -129,7 +130,7 @@ def read_depth(path: Path | str, height: int) -> Float[Tensor, "height width"]:
                 f"{path}: needed depth as a one-channel 16-bit PNG in millimetres or an EXR in "
                 f"metres, got {got}; convert it."
             )
-        _verify_with_pillow(path, data)  # OpenCV fills a truncated file with zeros and says nothing
+        _open_with_pillow(path, data)  # refuses truncated data, which OpenCV silently fills with zeros
         depth = depth.astype(np.float32) / np.float32(1000)
     _check_two_to_one(path, depth.shape[1], depth.shape[0])
     depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
@@ -145,13 +146,13 @@ def write_image(
     depth: Tensor | NDArray[Any] | None = None,
     panorama: bool | None = None,
 ) -> None:
-    """Write a picture, whole or not at all; the suffix chooses PNG, JPG, WebP (8 bit) or EXR (linear float).
+    """Write an image atomically; the suffix selects PNG, JPG, WebP (8 bit) or EXR (linear float).
 
     Args:
         path: file to write.
-        image: a tensor (3 H W) or an array (H W 3), display RGB in [0, 1] (clipped); an array may be uint8.
+        image: a tensor (3 H W) or an array (H W 3), sRGB in [0, 1] (clipped); an array may be uint8.
         depth: (H W) metres, written as channel Z of an EXR.
-        panorama: whether an EXR says that it is a latitude-longitude map; by default when it is 2:1.
+        panorama: whether an EXR is marked as a latitude-longitude map; by default if it is 2:1.
 
     Raises:
         InputError: NaN, unknown suffix, depth for a format that cannot hold it, folder missing.
@@ -166,15 +167,15 @@ def write_image(
         raise InputError(f"cannot write {path}: needed a name ending in .png .jpg .webp or .exr; rename it.")
     if depth is not None:
         raise InputError(f"cannot write depth to {path}: needed an .exr, got '{suffix}'; change the suffix.")
-    eight = pixels if pixels.dtype == np.uint8 else np.rint(pixels.clip(0, 1) * 255).astype(np.uint8)
+    pixels = pixels if pixels.dtype == np.uint8 else np.rint(pixels.clip(0, 1) * 255).astype(np.uint8)
     options: dict[str, Any] = {"quality": 95, "subsampling": 0} if suffix in (".jpg", ".jpeg") else {}
     options = {"lossless": True} if suffix == ".webp" else options
     with replacing(path) as temporary:
-        Image.fromarray(eight).save(temporary, **options)
+        Image.fromarray(pixels).save(temporary, **options)
 
 
 def _as_pixels(path: Path, image: Tensor | NDArray[Any]) -> NDArray[Any]:
-    """The picture as (H W 3), uint8 or float32, all finite."""
+    """The image as an array (H W 3), uint8 or finite float32."""
     if isinstance(image, Tensor):
         pixels = image.detach().cpu().movedim(0, -1).numpy() if image.ndim == 3 else image.detach().cpu().numpy()
     else:
@@ -188,7 +189,7 @@ def _as_pixels(path: Path, image: Tensor | NDArray[Any]) -> NDArray[Any]:
     bad = int((~np.isfinite(pixels)).sum())
     if bad:
         raise InputError(
-            f"cannot write {path}: needed finite colours, got {bad} NaN or infinite values; nothing written."
+            f"cannot write {path}: needed finite colours, got {bad} NaN or infinite values; nothing was written."
         )
     return pixels
 
@@ -196,16 +197,15 @@ def _as_pixels(path: Path, image: Tensor | NDArray[Any]) -> NDArray[Any]:
 def _write_exr(path: Path, pixels: NDArray[Any], depth: Tensor | NDArray[Any] | None, panorama: bool | None) -> None:
     import OpenEXR
 
-    display = pixels.astype(np.float32) / np.float32(255) if pixels.dtype == np.uint8 else pixels
-    channels: dict[str, Any] = {"RGB": linear_from_srgb(display)}
+    srgb = pixels.astype(np.float32) / np.float32(255) if pixels.dtype == np.uint8 else pixels
+    channels: dict[str, Any] = {"RGB": linear_from_srgb(srgb)}
     if depth is not None:
         plane = depth.detach().cpu().numpy() if isinstance(depth, Tensor) else np.asarray(depth)
         plane = np.ascontiguousarray(plane, dtype=np.float32)
         if plane.shape != pixels.shape[:2] or not np.isfinite(plane).all():
             raise InputError(
-                f"cannot write {path}: needed finite depth of shape {pixels.shape[:2]}, got shape "
-                f"{plane.shape} with "
-                f"{int((~np.isfinite(plane)).sum())} NaN or infinite values; nothing written."
+                f"cannot write {path}: needed finite depth of shape {pixels.shape[:2]}, got shape {plane.shape} with "
+                f"{int((~np.isfinite(plane)).sum())} NaN or infinite values; nothing was written."
             )
         channels["Z"] = plane
     header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -232,14 +232,14 @@ def _read_bytes(path: Path) -> bytes:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: needed a readable picture file, got '{error.strerror}'; check the path.") from error
+        raise InputError(f"{path}: needed a readable image file, got '{error.strerror}'; check the path.") from error
     if not data:
-        raise InputError(f"{path}: needed a picture, got a file of 0 bytes; copy or export it again.")
+        raise InputError(f"{path}: needed an image, got a file of 0 bytes; copy or export it again.")
     return data
 
 
-def _decode(path: Path, at_least: int | None = None) -> _Picture:
-    """Pixels of a picture file by its content, not its name; with `at_least`, maybe at reduced size."""
+def _decode(path: Path, at_least: int | None = None) -> _DecodedImage:
+    """Pixels of an image file; the format follows from the content. `at_least`: least height of a reduced JPEG."""
     data = _read_bytes(path)
     if data.startswith(_EXR_MAGIC):
         return _decode_exr(path)
@@ -248,15 +248,15 @@ def _decode(path: Path, at_least: int | None = None) -> _Picture:
     image = _open_with_pillow(path, data, at_least)
     if "A" in image.getbands() or "transparency" in image.info:
         array = np.asarray(image.convert("RGBA"))
-        return _Picture(np.ascontiguousarray(array[..., :3]), array[..., 3].astype(np.float32) / np.float32(255))
-    return _Picture(np.asarray(image.convert("RGB")), None)
+        return _DecodedImage(np.ascontiguousarray(array[..., :3]), array[..., 3].astype(np.float32) / np.float32(255))
+    return _DecodedImage(np.asarray(image.convert("RGB")), None)
 
 
 def _open_with_pillow(path: Path, data: bytes, at_least: int | None = None) -> Image.Image:
-    """Fully decoded picture; Pillow, unlike OpenCV, refuses truncated data."""
+    """The fully decoded image. Unlike OpenCV, Pillow raises an error for truncated data."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # panoramas of 100 MP are normal
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # panoramas of 100 megapixels are normal
             image = Image.open(io.BytesIO(data), formats=_PILLOW_FORMATS)
             if at_least is not None:
                 image.draft("RGB", (2 * at_least, at_least))
@@ -264,34 +264,28 @@ def _open_with_pillow(path: Path, data: bytes, at_least: int | None = None) -> I
             return ImageOps.exif_transpose(image)
     except Image.UnidentifiedImageError as error:
         raise InputError(
-            f"{path}: needed a JPG, PNG, WebP or EXR picture, got an unknown format "
+            f"{path}: needed a JPG, PNG, WebP or EXR image, got an unknown format "
             f"(it starts with {data[:8]!r}); convert it."
         ) from error
     except Image.DecompressionBombError as error:
-        raise InputError(
-            f"{path}: needed fewer pixels than 13000x6500 or so, got more ({error}); shrink it."
-        ) from error
+        raise InputError(f"{path}: needed at most about 13000x6500 pixels, got more ({error}); shrink it.") from error
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise InputError(
-            f"{path}: needed a complete picture, got damaged or truncated data ({error}); copy or export it again."
+            f"{path}: needed a complete image, got damaged or truncated data ({error}); copy or export it again."
         ) from error
 
 
-def _verify_with_pillow(path: Path, data: bytes) -> None:
-    _open_with_pillow(path, data)
-
-
-def _decode_png16(path: Path, data: bytes) -> _Picture:
-    """A 16-bit PNG at full precision: Pillow keeps 8 of its bits when it has colour, OpenCV keeps all."""
-    _verify_with_pillow(path, data)
+def _decode_png16(path: Path, data: bytes) -> _DecodedImage:
+    """A 16-bit PNG at full precision, decoded by OpenCV; Pillow reduces colour to 8 bits."""
+    _open_with_pillow(path, data)  # refuses truncated data
     array = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if array is None or array.dtype != np.uint16:
-        raise InputError(f"{path}: needed a readable 16-bit PNG, got data OpenCV cannot decode; export it again.")
+        raise InputError(f"{path}: needed a readable 16-bit PNG, got data that OpenCV cannot decode; export it again.")
     values = array.astype(np.float32) / np.float32(65535)
     if values.ndim == 2:
-        return _Picture(np.repeat(values[..., None], 3, axis=2), None)
+        return _DecodedImage(np.repeat(values[..., None], 3, axis=2), None)
     color = np.ascontiguousarray(values[..., 2::-1])
-    return _Picture(color, np.ascontiguousarray(values[..., 3]) if values.shape[2] == 4 else None)
+    return _DecodedImage(color, np.ascontiguousarray(values[..., 3]) if values.shape[2] == 4 else None)
 
 
 def _exr_channels(path: Path) -> dict[str, NDArray[Any]]:
@@ -300,13 +294,13 @@ def _exr_channels(path: Path) -> dict[str, NDArray[Any]]:
     try:
         with OpenEXR.File(str(path)) as file:
             return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    except Exception as error:  # OpenEXR raises its own kinds, RuntimeError and ValueError among them
+    except Exception as error:  # OpenEXR has no base class of its errors
         raise InputError(
-            f"{path}: needed a complete EXR picture, got damaged or truncated data ({error}); export it again."
+            f"{path}: needed a complete EXR image, got damaged or truncated data ({error}); export it again."
         ) from error
 
 
-def _decode_exr(path: Path) -> _Picture:
+def _decode_exr(path: Path) -> _DecodedImage:
     channels = _exr_channels(path)
     alpha = channels.get("A")
     if "RGBA" in channels:
@@ -325,11 +319,11 @@ def _decode_exr(path: Path) -> _Picture:
         raise InputError(
             f"{path}: needed finite colours, got {bad} NaN or infinite values; repair the file or render it again."
         )
-    return _Picture(srgb_from_linear(linear), None if alpha is None else alpha.astype(np.float32).clip(0, 1))
+    return _DecodedImage(srgb_from_linear(linear), None if alpha is None else alpha.astype(np.float32).clip(0, 1))
 
 
 def _resize_color(color: NDArray[Any], height: int) -> NDArray[Any]:
-    """(H W 3) at (height, 2 height) as float32 in [0, 1]; the filter sees across +-180 degrees."""
+    """Resample (H W 3) to (height, 2 height) with wrap-around; float32 in [0, 1]."""
     if color.dtype == np.uint8:
         if color.shape[0] != height:
             color = _resize_plane(color, height, Image.Resampling.LANCZOS)
@@ -341,7 +335,7 @@ def _resize_color(color: NDArray[Any], height: int) -> NDArray[Any]:
 
 
 def _resize_plane(array: NDArray[Any], height: int, method: Image.Resampling) -> NDArray[Any]:
-    """(H W) float32 or (H W 3) uint8 at (height, 2 height)."""
+    """Resample (H W) float32 or (H W 3) uint8 to (height, 2 height) with wrap-around."""
     rows, columns = array.shape[:2]
     margin = min(columns, max(_WRAP, _WRAP * rows // height))
     wrapped = np.concatenate((array[:, columns - margin :], array, array[:, :margin]), axis=1)

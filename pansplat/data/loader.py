@@ -1,7 +1,7 @@
-"""Endless batches of samples, read by worker processes, the same whatever the number of workers.
+"""Infinite batches of samples, read by worker processes.
 
-What is in batch n is decided by the seed and n alone: each epoch is a permutation of the source, and what is random
-about a sample comes from (seed, epoch, index). So a stopped run goes on by asking for the batches from its step on.
+Batch n is determined by the seed and n, for any number of workers: each epoch is a permutation of the source, and the
+random numbers of a sample are seeded by (seed, epoch, index). A run can therefore be resumed at any step.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from pansplat.data.sources import SampleSource
 from pansplat.data.views import Batch, Sample, collate
 from pansplat.errors import InputError
 
-_MOST_FAILURES = 32  # samples in a row that cannot be read before we give up
+_MAX_FAILURES = 32  # consecutive unreadable samples before an error
 
 
 @dataclass(frozen=True)
 class Skipped:
-    """A sample that could not be read, and why; `message` names the file."""
+    """A sample that could not be read; `message` names the file and the reason."""
 
     index: int
     message: str
@@ -41,18 +41,18 @@ class Loader:
 
     Args:
         source: the samples; sent to the workers once.
-        height: of the panoramas, pixels.
-        batch_size: samples a batch (a process).
-        seed: of the order and of all that is random in the samples.
-        workers: processes that read; 0 to read in this one.
-        augmentation: None for none.
-        rank, world_size: number of this process and of all that train together; each gets its share of a step.
+        height: height of the panoramas, pixels.
+        batch_size: samples per batch and process.
+        seed: seed of the order and of the samples' random numbers.
+        workers: processes that read; 0 to read in this process.
+        augmentation: None for no augmentation.
+        rank, world_size: index of this process, and number of processes in distributed training.
 
     Attributes:
-        skipped: how often each unreadable sample was left out, by message. A warning says so the first time.
+        skipped: number of times each unreadable sample was skipped, by message. The first time, a warning is issued.
 
     Raises:
-        InputError: an empty source, or numbers that make no batch.
+        InputError: an empty source, or an invalid batch size, number of workers or rank.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Loader:
         world_size: int = 1,
     ) -> None:
         if len(source) == 0:
-            raise InputError("needed at least one sample to train on, got an empty source; give other data.")
+            raise InputError("needed at least one sample, got an empty source; give other data.")
         if batch_size < 1 or workers < 0 or not 0 <= rank < world_size:
             raise InputError(
                 f"needed batch_size >= 1, workers >= 0 and 0 <= rank < world_size, got {batch_size}, {workers}, {rank} "
@@ -79,30 +79,29 @@ class Loader:
         self.skipped: Counter[str] = Counter()
 
     def batches(self, step: int = 0) -> Iterator[Batch]:
-        """Batches from that step on, without end.
+        """Infinite batches, starting at a step.
 
         Raises:
-            InputError: so many samples in a row are unreadable that nothing can be wrong but all of them.
+            InputError: too many consecutive samples are unreadable.
         """
         loader = DataLoader(
             self.reader,
             batch_sampler=self._positions(step),
             num_workers=self.workers,
-            collate_fn=_keep,
-            worker_init_fn=_leave_interrupts_to_the_trainer,
-            multiprocessing_context=_context() if self.workers else None,
+            collate_fn=_identity,
+            worker_init_fn=_ignore_interrupts,
+            multiprocessing_context=_worker_context() if self.workers else None,
         )
         for read in loader:
             self._count(itertools.chain.from_iterable(skipped for _, skipped in read))
             samples = [sample for sample, _ in read if sample is not None]
             if len(samples) < len(read):
-                raise InputError(self._none_left([skipped for _, skipped in read]))
+                raise InputError(self._describe_failures([skipped for _, skipped in read]))
             yield collate(samples)
 
     def _positions(self, step: int) -> Iterable[list[int]]:
-        share = self.batch_size * self.world_size
         for number in itertools.count(step):
-            first = number * share + self.rank * self.batch_size
+            first = (number * self.world_size + self.rank) * self.batch_size
             yield list(range(first, first + self.batch_size))
 
     def _count(self, skipped: Iterable[Skipped]) -> None:
@@ -110,26 +109,26 @@ class Loader:
             self.skipped[failure.message] += 1
             if self.skipped[failure.message] == 1:
                 warnings.warn(
-                    f"left out sample {failure.index} ({len(self.skipped)} unreadable so far): {failure.message}",
+                    f"skipped sample {failure.index} ({len(self.skipped)} unreadable so far): {failure.message}",
                     stacklevel=3,
                 )
 
-    def _none_left(self, failures: list[list[Skipped]]) -> str:
+    def _describe_failures(self, failures: list[list[Skipped]]) -> str:
         worst = max(failures, key=len)
         examples = "\n  ".join(dict.fromkeys(failure.message for failure in worst[:3]))
         return (
-            f"needed samples that can be read, got {len(worst)} in a row that cannot (of "
-            f"{len(self.reader.source)}); check the first of them:\n  {examples}"
+            f"needed readable samples, got {len(worst)} consecutive unreadable ones (of {len(self.reader.source)}); "
+            f"check the first of them:\n  {examples}"
         )
 
 
-def _leave_interrupts_to_the_trainer(_: int) -> None:
-    """Ctrl-C in a terminal reaches the workers too; the step that is under way still needs them."""
+def _ignore_interrupts(_: int) -> None:
+    """Ignore Ctrl-C in a worker: a terminal sends it to all processes, but the current step needs the workers."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 class _Reader(Dataset[tuple[Sample | None, list[Skipped]]]):
-    """The sample at a position of the endless sequence of epochs, and those that were left out for it."""
+    """The sample at a position of the infinite sequence of epochs, and the samples that were skipped for it."""
 
     def __init__(self, source: SampleSource, height: int, seed: int, augmentation: Augmentation | None) -> None:
         self.source, self.height, self.seed, self.augmentation = source, height, seed, augmentation
@@ -139,7 +138,7 @@ class _Reader(Dataset[tuple[Sample | None, list[Skipped]]]):
         epoch, place = divmod(position, count)
         order = _permutation(self.seed, epoch, count)
         skipped: list[Skipped] = []
-        for k in range(min(count, _MOST_FAILURES)):  # an unreadable sample gives its place to the next in the epoch
+        for k in range(min(count, _MAX_FAILURES)):  # the next sample of the epoch replaces an unreadable one
             index = int(order[(place + k) % count])
             try:
                 return self._read(epoch, index, place), skipped
@@ -148,7 +147,7 @@ class _Reader(Dataset[tuple[Sample | None, list[Skipped]]]):
         return None, skipped
 
     def _read(self, epoch: int, index: int, place: int) -> Sample:
-        """The place counts too, so that a sample read twice for an unreadable one differs."""
+        """Seeded by the place too, so that a sample that also replaces an unreadable one differs."""
         seeds = np.random.SeedSequence((self.seed, epoch, index, place)).spawn(2)
         sample = self.source.sample(index, self.height, int(seeds[0].generate_state(1)[0]))
         if self.augmentation is None:
@@ -161,10 +160,10 @@ def _permutation(seed: int, epoch: int, count: int) -> np.ndarray:
     return np.random.default_rng((seed, epoch)).permutation(count)
 
 
-def _keep(read: list[tuple[Sample | None, list[Skipped]]]) -> list[tuple[Sample | None, list[Skipped]]]:
+def _identity(read: list[tuple[Sample | None, list[Skipped]]]) -> list[tuple[Sample | None, list[Skipped]]]:
     return read
 
 
-def _context() -> BaseContext:
-    """Fresh processes: a copy of this one could inherit locks that its threads hold."""
+def _worker_context() -> BaseContext:
+    """Start fresh processes: a fork could inherit locks that threads of this process hold."""
     return multiprocessing.get_context("spawn" if sys.platform == "win32" else "forkserver")

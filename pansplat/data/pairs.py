@@ -1,4 +1,4 @@
-"""Posed panoramas on disk, grouped into pairs of context and target views."""
+"""Posed panoramas on disk, and their grouping into pairs of context and target views."""
 
 from __future__ import annotations
 
@@ -12,9 +12,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pansplat.data.images import READABLE_SUFFIXES, read_depth, read_mask, read_panorama
-from pansplat.data.masks import static_mask_of_files
+from pansplat.data.masks import scene_mask_of_files
 from pansplat.data.views import Views
 from pansplat.errors import InputError
+
+NEAR, FAR = 0.45, 10.0  # metres; depth range of the official indoor data (docs/official.md, section 2.1)
+FAR_SEQUENCE = 50.0  # metres; for halls and outdoor videos (docs/official.md, sections 2.2 and 2.3)
 
 _COINCIDENT = 1e-3  # metres
 
@@ -24,11 +27,11 @@ class Panorama:
     """One panorama file with its pose.
 
     Attributes:
-        name: the file's stem, or the view's folder where all files have one name.
+        name: the stem of the file name, or the view's folder where all files have the same name.
         image: JPG, PNG, WebP or EXR file.
         cam2world: float64, OpenCV axes, metres.
-        mask: picture that is white where the panorama shows the scene; None to detect it.
-        depth: 16-bit PNG in millimetres or EXR in metres, radial; None where the data set has none.
+        mask: image that is white where the panorama shows the scene; None to detect static content.
+        depth: radial depth, 16-bit PNG in millimetres or EXR in metres; None when there is none.
     """
 
     name: str
@@ -40,15 +43,15 @@ class Panorama:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Panoramas to predict a scene from, and those to compare it with. Nothing is read until asked for.
+    """Context and target panoramas of one scene. Image files are read by `load_context` and `load_targets`.
 
     Attributes:
-        name: unique among the pairs loaded together; fit for a file name.
-        folder: where its files are.
-        context: two or more panoramas, the predictor's input.
-        targets: panoramas for comparison, maybe none.
+        name: unique among the pairs that were loaded together; valid as a file name.
+        folder: folder of the files.
+        context: two or more panoramas, the input of a predictor.
+        targets: panoramas for comparison; may be empty.
         near, far: radial depth range to search, metres.
-        siblings: all panoramas taken with the same camera, from which static content is detected.
+        siblings: all panoramas taken with the same camera; static content is detected in them.
     """
 
     name: str
@@ -60,27 +63,26 @@ class Pair:
     siblings: tuple[Path, ...] = field(default=(), repr=False)
 
     def load_context(self, height: int) -> Views:
-        """The context panoramas at (height, 2 height); warns when two of their cameras coincide.
+        """The context panoramas at (height, 2 height). Warns when two camera centres coincide.
 
         Raises:
-            InputError: a picture, mask or depth file cannot be used.
+            InputError: an image, mask or depth file cannot be used.
         """
         centres = torch.stack([panorama.cam2world[:3, 3] for panorama in self.context])
         if float(torch.pdist(centres).min()) < _COINCIDENT:
             warnings.warn(
-                f"{self.name}: cameras of the context views coincide (less than "
-                f"{1000 * _COINCIDENT:.0f} mm apart); "
-                "without a baseline depth cannot be measured and the scene holds for turning only. "
-                "Check the poses if the cameras did move.",
+                f"{self.name}: cameras of the context views coincide (less than {1000 * _COINCIDENT:.0f} mm apart); "
+                "depth cannot be estimated without a baseline, and only rotations of the camera will look right. "
+                "Check the poses if the camera was moved.",
                 stacklevel=2,
             )
         return self._load(self.context, height)
 
     def load_targets(self, height: int) -> Views:
-        """The target panoramas at (height, 2 height); no view when the pair has none.
+        """The target panoramas at (height, 2 height); `Views` of length 0 when the pair has no targets.
 
         Raises:
-            InputError: a picture, mask or depth file cannot be used.
+            InputError: an image, mask or depth file cannot be used.
         """
         return self._load(self.targets, height)
 
@@ -93,12 +95,13 @@ class Pair:
             if not masks[i].any():
                 raise InputError(
                     f"{panorama.mask or panorama.image}: needed some pixels that show the scene (white in a mask, "
-                    "opaque in a picture), got none; invert the mask or remove the alpha channel."
+                    "opaque in an image), got none; invert the mask or remove the alpha channel."
                 )
         depths = [read_depth(p.depth, height) for p in panoramas if p.depth is not None]
+        no_poses = torch.empty(0, 4, 4, dtype=torch.float64)
         return Views(
             images=images,
-            cam2world=torch.stack([p.cam2world for p in panoramas]) if panoramas else _no_poses(),
+            cam2world=torch.stack([p.cam2world for p in panoramas]) if panoramas else no_poses,
             masks=masks,
             near=self.near,
             far=self.far,
@@ -107,48 +110,42 @@ class Pair:
         )
 
     def _scene_mask(self, panorama: Panorama, height: int) -> Bool[Tensor, "height width"]:
-        """The user's mask, whose word is final, or else what does not travel with the camera."""
+        """The mask file if there is one, else the complement of the detected static content."""
         if panorama.mask is not None:
             return read_mask(panorama.mask, height)
-        return static_mask_of_files(self.siblings, height)
+        return scene_mask_of_files(self.siblings, height)
 
 
-def _no_poses() -> Float[Tensor, "0 4 4"]:
-    return torch.empty(0, 4, 4, dtype=torch.float64)
-
-
-NEAR, FAR = 0.45, 10.0  # metres; the depth range of the original system's indoor data (OFFICIAL.md 2.1)
-FAR_SEQUENCE = 50.0  # and of its halls and outdoor videos (OFFICIAL.md 2.2, 2.3)
-
-Case = tuple[tuple[int, ...], tuple[int, ...]]  # indices of the context and of the targets
+ViewGroup = tuple[tuple[int, ...], tuple[int, ...]]
+"""Indices of the context views, and of the target views."""
 
 
 @dataclass(frozen=True, eq=False)
 class Collection:
-    """All posed panoramas of a folder.
+    """All posed panoramas of a folder, before they are grouped into pairs.
 
     Attributes:
-        source: file or folder that messages point at.
+        source: file or folder that error messages name.
         panoramas: in file order.
-        cases: which are context and targets; None to choose by distance or order.
-        ordered: whether the order is a path, so that neighbours in it make pairs.
+        groups: given context and target views; None to pair neighbours.
+        ordered: whether the panoramas are in order along a path, so that consecutive ones are neighbours.
         near, far: metres.
-        name: of the only case; None for names made of the views'.
+        name: name of the only pair; None to join the names of the context views.
     """
 
     source: Path
     panoramas: tuple[Panorama, ...]
-    cases: tuple[Case, ...] | None = None
+    groups: tuple[ViewGroup, ...] | None = None
     ordered: bool = False
     near: float = NEAR
     far: float = FAR
     name: str | None = None
 
     def pairs(self, folder: Path, near: float | None = None, far: float | None = None) -> list[Pair]:
-        """One pair a case, those with targets first; `near` and `far` (metres) go before the folder's own.
+        """One pair per group, those with targets first. `near` and `far` (metres) override the collection's values.
 
         Raises:
-            InputError: fewer than two panoramas, or a depth range that is none.
+            InputError: fewer than two panoramas, or an invalid depth range.
         """
         if len(self.panoramas) < 2:
             raise InputError(
@@ -163,31 +160,30 @@ class Collection:
             )
         siblings = tuple(panorama.image for panorama in self.panoramas)
         pairs = []
-        for context, targets in self.chosen_cases():
-            views = [self.panoramas[i] for i in context]
-            name = self.name or "-".join(view.name for view in views)
-            chosen = tuple(self.panoramas[i] for i in targets)
-            pairs.append(Pair(name, folder, tuple(views), chosen, near, far, siblings))
+        for indices in self._select_groups():
+            context, targets = (tuple(self.panoramas[i] for i in part) for part in indices)
+            name = self.name or "-".join(view.name for view in context)
+            pairs.append(Pair(name, folder, context, targets, near, far, siblings))
         return pairs
 
-    def chosen_cases(self) -> list[Case]:
-        """The given cases, those with targets first and no context twice; else neighbours."""
-        if self.cases is None:
+    def _select_groups(self) -> list[ViewGroup]:
+        """The given groups without repeated contexts, those with targets first; else pairs of neighbours."""
+        if self.groups is None:
             return [(pair, ()) for pair in self._neighbours()]
-        with_targets = [case for case in self.cases if case[1]]
+        with_targets = [group for group in self.groups if group[1]]
         seen = {frozenset(context) for context, _ in with_targets}
-        plain = []
-        for case in self.cases:
-            key = frozenset(case[0])
-            if not case[1] and key not in seen:
+        without_targets = []
+        for group in self.groups:
+            key = frozenset(group[0])
+            if not group[1] and key not in seen:
                 seen.add(key)
-                plain.append(case)
-        return with_targets + plain
+                without_targets.append(group)
+        return with_targets + without_targets
 
     def _neighbours(self) -> list[tuple[int, int]]:
-        """Neighbours along the path, or the edges of the minimum spanning tree of the camera centres.
+        """Consecutive panoramas of a path, or the edges of the minimum spanning tree of the camera centres.
 
-        The tree pairs each panorama with a near one, uses all of them and no pair twice.
+        The tree contains every panorama, pairs each with a near one, and has no pair twice.
         """
         count = len(self.panoramas)
         if self.ordered or count == 2:
@@ -202,22 +198,22 @@ class Collection:
             new = int(torch.where(outside, distance, torch.inf).argmin())
             edges.append(tuple(sorted((int(parent[new]), new))))
             outside[new] = False
-            there = (centres - centres[new]).norm(dim=-1)
-            parent[there < distance] = new
-            distance = torch.minimum(distance, there)
+            distance_to_new = (centres - centres[new]).norm(dim=-1)
+            parent[distance_to_new < distance] = new
+            distance = torch.minimum(distance, distance_to_new)
         return sorted(edges)
 
 
-def mask_beside(image: Path, folder: Path) -> Path | None:
-    """The mask of a picture: STEM_mask.png beside it, or mask.png beside it or in the collection's folder."""
+def find_mask(image: Path, folder: Path) -> Path | None:
+    """The mask file of an image: STEM_mask.png or mask.png in the image's folder, or mask.png in `folder`."""
     for mask in (image.with_name(f"{image.stem}_mask.png"), image.with_name("mask.png"), folder / "mask.png"):
         if mask.is_file():
             return mask
     return None
 
 
-def pictures_in(folder: Path) -> list[Path]:
-    """Panorama files of a folder by name, without masks and depth."""
+def list_panorama_files(folder: Path) -> list[Path]:
+    """Panorama files of a folder, sorted by name; without mask and depth files."""
     return [
         path
         for path in sorted(folder.iterdir())

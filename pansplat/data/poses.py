@@ -1,8 +1,8 @@
-"""Poses from files, each with a named convention, as cam2world in OpenCV axes (docs/conventions.md).
+"""Reading poses in a named convention, and converting them to cam2world with OpenCV axes (docs/conventions.md).
 
-Four conventions are known: the matrix takes camera points to the world (`cam2world`) or the world to the
-camera (`world2cam`); the camera's axes are OpenCV's (x right, y down, z forward) or OpenGL's (x right, y up,
-z backward; Habitat, Blender and NeRF data use the same). The world's own axes are left as they come.
+There are four conventions: the matrix maps camera points to the world (`cam2world`) or world points to the camera
+(`world2cam`); the camera axes are those of OpenCV (x right, y down, z forward) or OpenGL (x right, y up, z backward;
+also Habitat, Blender and NeRF data). The world axes are not changed.
 """
 
 from __future__ import annotations
@@ -28,26 +28,39 @@ _DIRECTIONS = {
     "world2cam": r"world[ _-]?(2|to)[ _-]?cam(era)?|\bw2c\b",
 }
 _AXES = {"opencv": r"opencv|colmap", "opengl": r"opengl|habitat|blender|nerf"}
-_RIGID_TOLERANCE = 1e-2  # files keep 4 to 6 decimals, some come from float32; a wrong matrix is off by far more
+_RIGID_TOLERANCE = 1e-2  # for files with 4 to 6 decimals; errors of wrong matrices are far larger
 _OPENGL_TO_OPENCV = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=torch.float64))
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses of a sequence of pictures in file order: cam2world, OpenCV axes, metres; KITTI or TUM text."""
+    """Poses of a trajectory file.
+
+    Attributes:
+        kind: "kitti" or "tum".
+        poses: in file order; cam2world, OpenCV axes, in the unit of the file.
+    """
 
     kind: str
     poses: tuple[Float[Tensor, "4 4"], ...]
 
+    def scaled_poses(self, scale: float) -> tuple[Float[Tensor, "4 4"], ...]:
+        """The poses with their translations multiplied by `scale`."""
+        scaled = []
+        for pose in self.poses:
+            scaled.append(pose.clone())
+            scaled[-1][:3, 3] *= scale
+        return tuple(scaled)
+
 
 def parse_convention(text: str | None, source: Path | str) -> str:
-    """The one of `CONVENTIONS` that a free text names; `source` is what the message points at.
+    """The member of `CONVENTIONS` that a free text names. `source` is the file or argument that error messages name.
 
     Raises:
-        InputError: no text, or not exactly one direction and one kind of axes in it.
+        InputError: no text, or a text without exactly one direction and one kind of axes.
     """
     names = ", ".join(f'"{name}"' for name in CONVENTIONS)
-    advice = f"write one of {names} (habitat counts as opengl); `pansplat check` tells which one fits."
+    advice = f"write one of {names} (habitat is the same as opengl); `pansplat check` finds the one that fits."
     if not isinstance(text, str) or not text.strip():
         raise InputError(f'{source}: needed a pose "convention", got none; {advice}')
     lowered = text.lower()
@@ -59,13 +72,13 @@ def parse_convention(text: str | None, source: Path | str) -> str:
 
 
 def rigid_matrix(values: Any, source: str) -> Float[Tensor, "4 4"]:
-    """A 4x4 rigid transform, float64, from nested lists of 3x4 or 4x4 numbers; exact where the file rounds.
+    """The rigid 4x4 matrix, float64, nearest to nested lists of 3x4 or 4x4 numbers.
 
     Raises:
-        InputError: other shape, not numbers, NaN, mirrored, scaled, sheared, transposed.
+        InputError: another shape, not numbers, NaN, or a mirrored, scaled, sheared or transposed matrix.
     """
     if values is None:
-        raise InputError(f"{source}: needed a pose, got none; add its 4x4 matrix or leave the picture out.")
+        raise InputError(f"{source}: needed a pose, got none; add its 4x4 matrix or remove the image.")
     try:
         matrix = torch.tensor(values, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -79,32 +92,32 @@ def rigid_matrix(values: Any, source: str) -> Float[Tensor, "4 4"]:
     error = orthonormal_error(matrix)
     if error > _RIGID_TOLERANCE:
         raise InputError(
-            f"{source}: needed a rigid pose (rotation and translation), got {_what_is_wrong(matrix, error)}"
+            f"{source}: needed a rigid pose (rotation and translation), got {_describe_error(matrix, error)}"
         )
     return _nearest_rigid(matrix) if error > 1e-9 else matrix
 
 
-def _what_is_wrong(matrix: Float[Tensor, "4 4"], error: float) -> str:
-    """In words, with what to do."""
+def _describe_error(matrix: Float[Tensor, "4 4"], error: float) -> str:
+    """What is wrong with a matrix that is not rigid, and what to do."""
     if not torch.isfinite(matrix).all():
-        return "NaN or infinite numbers; leave the picture out or solve its pose again."
+        return "NaN or infinite numbers; remove the image or estimate its pose again."
     bottom = torch.tensor((0.0, 0.0, 0.0, 1.0), dtype=torch.float64)
     if (matrix[3] - bottom).abs().max() > _RIGID_TOLERANCE:
         row = [round(float(x), 4) for x in matrix[3]]
         if (matrix[:, 3] - bottom).abs().max() <= _RIGID_TOLERANCE:
-            return f"a transposed one (the translation stands in the last row, {row}); transpose the matrix."
+            return f"a transposed one (the translation is in the last row, {row}); transpose the matrix."
         return f"the bottom row {row}; it must be 0 0 0 1."
     rotation = matrix[:3, :3]
     determinant = float(torch.linalg.det(rotation))
     scale = abs(determinant) ** (1 / 3)
     if determinant < 0:
         return (
-            f"a mirrored one (determinant {determinant:.3f}): an axis points the wrong way or two are "
+            f"a mirrored one (determinant {determinant:.3f}): one axis is flipped or two axes are "
             "exchanged; flip one axis so that the system is right-handed."
         )
     if scale > 0 and orthonormal_error(_with_rotation(matrix, rotation / scale)) <= _RIGID_TOLERANCE:
-        return f"a rotation scaled by {scale:.4g}; divide its 3x3 part by that."
-    return f"a 3x3 part that is no rotation (R R' is off by {error:.3g}); check the order of the numbers."
+        return f"a rotation scaled by {scale:.4g}; divide its 3x3 part by this number."
+    return f"a 3x3 part that is no rotation (R R' differs from 1 by {error:.3g}); check the order of the numbers."
 
 
 def _with_rotation(matrix: Float[Tensor, "4 4"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4 4"]:
@@ -114,7 +127,7 @@ def _with_rotation(matrix: Float[Tensor, "4 4"], rotation: Float[Tensor, "3 3"])
 
 
 def _nearest_rigid(matrix: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """The same translation with the nearest rotation, so that rounding in a file does not become a shear."""
+    """The matrix with its 3x3 part replaced by the nearest rotation; removes the rounding errors of files."""
     u, _, vt = torch.linalg.svd(matrix[:3, :3])
     rigid = _with_rotation(matrix, u @ vt)
     rigid[3] = torch.tensor((0.0, 0.0, 0.0, 1.0), dtype=torch.float64)
@@ -122,7 +135,7 @@ def _nearest_rigid(matrix: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
 
 
 def to_cam2world(matrix: Float[Tensor, "4 4"], convention: str) -> Float[Tensor, "4 4"]:
-    """A rigid matrix of one of `CONVENTIONS` as cam2world with OpenCV camera axes."""
+    """Convert a rigid matrix from one of `CONVENTIONS` to cam2world with OpenCV camera axes."""
     direction, axes = convention.split()
     cam2world = invert_pose(matrix) if direction == "world2cam" else matrix
     return cam2world @ _OPENGL_TO_OPENCV if axes == "opengl" else cam2world
@@ -132,7 +145,7 @@ def read_json(path: Path) -> Any:
     """The content of a JSON file.
 
     Raises:
-        InputError: unreadable, or not JSON (with the line).
+        InputError: unreadable, or not JSON (the message gives the line).
     """
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"))
@@ -140,18 +153,18 @@ def read_json(path: Path) -> Any:
         raise InputError(f"{path}: needed a readable file, got '{error.strerror}'; check the path.") from error
     except json.JSONDecodeError as error:
         raise InputError(
-            f"{path}: needed JSON, got something else at line {error.lineno}, column {error.colno} "
+            f"{path}: needed JSON, got invalid text at line {error.lineno}, column {error.colno} "
             f"({error.msg}); correct it there."
         ) from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: needed JSON text in UTF-8, got other bytes; save it as UTF-8.") from error
+        raise InputError(f"{path}: needed JSON text in UTF-8, got another encoding; save it as UTF-8.") from error
 
 
 def read_number(path: Path) -> float:
     """The one positive number in a text file, such as a scale.
 
     Raises:
-        InputError: anything else in the file.
+        InputError: the file holds anything else.
     """
     text = path.read_text(errors="replace").strip()
     try:
@@ -164,24 +177,23 @@ def read_number(path: Path) -> float:
 
 
 def read_trajectory(path: Path, convention: str | None = None, expected: str | None = None) -> Trajectory:
-    """Poses of a KITTI (12 numbers a line) or TUM (8 numbers a line) trajectory file.
+    """Poses of a KITTI (12 numbers per line) or TUM (8 numbers per line) trajectory file.
 
-    KITTI: the rows of a 3x4 matrix. TUM: timestamp tx ty tz qx qy qz qw. Both are cam2world with OpenCV axes
-        unless `convention` says otherwise. Empty lines and lines that start with # are skipped.
+    KITTI: rows of a 3x4 matrix. TUM: timestamp tx ty tz qx qy qz qw. Both are cam2world with OpenCV axes by default.
+    Empty lines and lines that start with # are skipped.
 
     Args:
         path: text file; numbers separated by spaces or commas.
-        convention: one of `CONVENTIONS`.
-        expected: "kitti" or "tum" to refuse the other; None takes either, told apart by the numbers in a
-            line.
+        convention: one of `CONVENTIONS`; overrides the default.
+        expected: "kitti" or "tum" to refuse the other format; None to accept both.
 
     Raises:
-        InputError: neither format, the other format than expected, a pose that is not rigid.
+        InputError: neither format, another format than expected, or a pose that is not rigid.
     """
     convention = "cam2world opencv" if convention is None else parse_convention(convention, "`convention`")
     rows = _number_rows(path)
     if not rows:
-        raise InputError(f"{path}: needed one pose a line, got an empty file; export the trajectory again.")
+        raise InputError(f"{path}: needed one pose per line, got an empty file; export the trajectory again.")
     count = len(rows[0][1])
     kind = {12: "kitti", 8: "tum"}.get(count)
     if kind is None:
@@ -190,9 +202,9 @@ def read_trajectory(path: Path, convention: str | None = None, expected: str | N
             f"translation, quaternion), got {count}; export the trajectory in one of these formats."
         )
     if expected is not None and kind != expected:
-        formats = {"kitti": "KITTI (12 numbers a line)", "tum": "TUM (8 numbers a line)"}
+        formats = {"kitti": "KITTI (12 numbers per line)", "tum": "TUM (8 numbers per line)"}
         raise InputError(
-            f"{path}: needed {formats[expected]} as its name says, got {formats[kind]}; "
+            f"{path}: needed {formats[expected]} according to its name, got {formats[kind]}; "
             f"rename it to {path.stem}.{kind}, or convert it."
         )
     poses = []
@@ -200,7 +212,7 @@ def read_trajectory(path: Path, convention: str | None = None, expected: str | N
         source = f"{path}, line {line}"
         if len(numbers) != count:
             raise InputError(
-                f"{source}: needed {count} numbers as in the lines before, got {len(numbers)}; complete it."
+                f"{source}: needed {count} numbers as in the other lines, got {len(numbers)}; correct the line."
             )
         matrix = [numbers[0:4], numbers[4:8], numbers[8:12]] if kind == "kitti" else _tum_matrix(numbers, source)
         poses.append(to_cam2world(rigid_matrix(matrix, source), convention))
@@ -208,7 +220,7 @@ def read_trajectory(path: Path, convention: str | None = None, expected: str | N
 
 
 def _number_rows(path: Path) -> list[tuple[int, list[float]]]:
-    """Line numbers (from 1) and numbers of all lines that hold any."""
+    """Line number (from 1) and numbers of each line that is neither empty nor a comment."""
     rows = []
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -228,7 +240,7 @@ def _number_rows(path: Path) -> list[tuple[int, list[float]]]:
 
 
 def _tum_matrix(numbers: list[float], source: str) -> list[list[float]]:
-    """Rows of the 4x4 matrix of timestamp tx ty tz qx qy qz qw."""
+    """Rows of the 4x4 matrix of a line: timestamp tx ty tz qx qy qz qw."""
     translation, (x, y, z, w) = numbers[1:4], numbers[4:8]
     norm = math.sqrt(x * x + y * y + z * z + w * w)
     if not abs(norm - 1) < _RIGID_TOLERANCE:
@@ -246,11 +258,11 @@ def number_field(content: dict[str, Any], key: str, source: Path) -> float | Non
     """An optional number of a JSON object.
 
     Raises:
-        InputError: it is there and is no number.
+        InputError: the value is not a number.
     """
     value = content.get(key)
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(f'{source}: needed a number of metres as "{key}", got {value!r}; correct it.')
+        raise InputError(f'{source}: needed a number in metres as "{key}", got {value!r}; correct it.')
     return float(value)

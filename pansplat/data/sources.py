@@ -1,4 +1,8 @@
-"""Sources of training and evaluation samples."""
+"""Sources of samples: anything with a length and `sample(index, height, seed)`.
+
+The same three numbers give the same sample in every process. `seed` determines random choices (frames of a sequence,
+one of several targets).
+"""
 
 from __future__ import annotations
 
@@ -9,24 +13,36 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from pansplat.data.layouts import is_matterport3d_scene, read_matterport3d_scene, read_triplet, triplet_files
 from pansplat.data.pairs import Pair
-from pansplat.data.sequences import BoundedSampler, FramePair, FrameSequence, read_frame_pair
+from pansplat.data.sequences import BoundedSampler, FramePair, FrameSequence, Stage, read_frame_pair
 from pansplat.data.views import Sample
 from pansplat.errors import InputError
 
+TRAINING_SETS = (("m3d", 0.5),)
+TEST_SETS = (
+    ("m3d", 0.1),
+    ("m3d", 0.25),
+    ("m3d", 0.5),
+    ("m3d", 0.75),
+    ("m3d", 1.0),
+    ("residential", 0.15),
+    ("replica", 0.5),
+)
+"""PanoGRF's sets: data set of the scenes, metres from an input to the middle view (the baseline is twice that)."""
+
 
 class SampleSource(Protocol):
-    """Samples by number."""
+    """Samples by index."""
 
     def __len__(self) -> int: ...
 
     def sample(self, index: int, height: int, seed: int) -> Sample:
-        """The sample of that number at (height, 2 height).
+        """Sample `index` at (height, 2 height).
 
         Raises:
             InputError: one of its files cannot be used.
@@ -36,22 +52,21 @@ class SampleSource(Protocol):
 
 @dataclass(frozen=True)
 class PairSource:
-    """Pairs that have targets, each a sample.
+    """Pairs with targets; each is a sample.
 
     Attributes:
-        pairs: read when asked for.
-        targets: how many of a pair's targets a sample has, drawn at random; None for all of them.
+        pairs: files are read by `sample`.
+        targets: number of randomly chosen targets per sample; None for all.
     """
 
     pairs: Sequence[Pair]
     targets: int | None = None
 
     def __post_init__(self) -> None:
-        least = self.targets or 1
         for pair in self.pairs:
-            _check_targets(pair, least)
+            _check_targets(pair, self.targets or 1)
         if not self.pairs:
-            raise InputError("needed pairs with targets to train on or compare with, got none; see docs/input.md.")
+            raise InputError("needed pairs with targets for training or evaluation, got none; see docs/input.md.")
 
     def __len__(self) -> int:
         return len(self.pairs)
@@ -61,8 +76,36 @@ class PairSource:
 
 
 @dataclass(frozen=True)
+class TripletSet:
+    """Triplets on disk, in PanoGRF's layout or that of game maps.
+
+    Attributes:
+        name: such as "m3d_dist_0.5".
+        folder: folder of the triplets; may be missing.
+        sources: a scene folder or .json file per triplet, sorted; empty if the folder is missing.
+    """
+
+    name: str
+    folder: Path
+    sources: tuple[Path, ...]
+
+    def pair(self, index: int) -> Pair:
+        """Triplet `index` as a pair with a target; without detection of static content.
+
+        Raises:
+            InputError: a file is missing or invalid.
+        """
+        source = self.sources[index]
+        collection = read_triplet(source) if source.is_file() else read_matterport3d_scene(source)
+        (pair,) = collection.pairs(source if source.is_dir() else source.parent)
+        if not pair.targets:
+            raise InputError(f"{source}: needed three views (two inputs and a target between), got two; add one.")
+        return dataclasses.replace(pair, siblings=())
+
+
+@dataclass(frozen=True)
 class TripletSource:
-    """Triplets on disk, each a sample; `targets` as in `PairSource`."""
+    """Triplets on disk; each is a sample. `targets` as in `PairSource`."""
 
     triplets: TripletSet
     targets: int | None = None
@@ -76,9 +119,24 @@ class TripletSource:
         return _read_pair(pair, height, self.targets, seed)
 
 
+def _check_targets(pair: Pair, least: int) -> None:
+    if len(pair.targets) < least:
+        raise InputError(
+            f"{pair.name} in {pair.folder}: needed {least} target panorama(s) for comparison, got "
+            f'{len(pair.targets)}; give a "target" in pairs.json or remove the pair.'
+        )
+
+
+def _read_pair(pair: Pair, height: int, count: int | None, seed: int) -> Sample:
+    if count is not None and count < len(pair.targets):
+        chosen = np.random.default_rng(seed).choice(len(pair.targets), count, replace=False)
+        pair = dataclasses.replace(pair, targets=tuple(pair.targets[i] for i in chosen))
+    return Sample(pair.name, pair.load_context(height), pair.load_targets(height))
+
+
 @dataclass(frozen=True)
 class RandomFramePairs:
-    """Random pairs of frames, `draws` from each sequence an epoch."""
+    """Random frame pairs for training; `draws` per sequence make an epoch."""
 
     sequences: Sequence[FrameSequence]
     sampler: BoundedSampler
@@ -89,30 +147,30 @@ class RandomFramePairs:
 
     def sample(self, index: int, height: int, seed: int) -> Sample:
         sequence = self.sequences[index // self.draws]
-        draw = self.sampler.training(len(sequence.poses), np.random.default_rng((seed, index)))
-        return read_frame_pair(sequence, draw, height)
+        pair = self.sampler.training(len(sequence.poses), np.random.default_rng((seed, index)))
+        return read_frame_pair(sequence, pair, height)
 
 
 class FixedFramePairs:
-    """Chosen pairs of frames of each sequence, with all their targets.
+    """Fixed frame pairs for evaluation, with all their targets.
 
     Args:
         sequences: posed frames.
-        draws: from a number of frames to the pairs of a sequence that long, such as `BoundedSampler().evaluation`.
+        choose: from a number of frames to frame pairs, such as `BoundedSampler().evaluation`.
     """
 
-    def __init__(self, sequences: Sequence[FrameSequence], draws: Callable[[int], Sequence[FramePair]]) -> None:
-        self.cases = [(sequence, draw) for sequence in sequences for draw in draws(len(sequence.poses))]
+    def __init__(self, sequences: Sequence[FrameSequence], choose: Callable[[int], Sequence[FramePair]]) -> None:
+        self.pairs = [(sequence, pair) for sequence in sequences for pair in choose(len(sequence.poses))]
 
     def __len__(self) -> int:
-        return len(self.cases)
+        return len(self.pairs)
 
     def sample(self, index: int, height: int, seed: int) -> Sample:
-        return read_frame_pair(*self.cases[index], height)
+        return read_frame_pair(*self.pairs[index], height)
 
 
 class ConcatSource:
-    """Several sources one after another."""
+    """The samples of several sources, one source after another."""
 
     def __init__(self, sources: Sequence[SampleSource]) -> None:
         self.sources = [source for source in sources if len(source)]
@@ -127,66 +185,8 @@ class ConcatSource:
         return self.sources[number].sample(index - start, height, seed)
 
 
-def _check_targets(pair: Pair, least: int) -> None:
-    if len(pair.targets) < least:
-        raise InputError(
-            f"{pair.name} in {pair.folder}: needed {least} target panorama(s) to compare with, got "
-            f'{len(pair.targets)}; name a "target" in pairs.json or leave the pair out.'
-        )
-
-
-def _read_pair(pair: Pair, height: int, count: int | None, seed: int) -> Sample:
-    if count is not None and count < len(pair.targets):
-        chosen = np.random.default_rng(seed).choice(len(pair.targets), count, replace=False)
-        pair = dataclasses.replace(pair, targets=tuple(pair.targets[i] for i in chosen))
-    return Sample(pair.name, pair.load_context(height), pair.load_targets(height))
-
-
-Stage = Literal["train", "val", "test"]
-
-TRAINING_SETS = (("m3d", 0.5),)
-TEST_SETS = (
-    ("m3d", 0.1),
-    ("m3d", 0.25),
-    ("m3d", 0.5),
-    ("m3d", 0.75),
-    ("m3d", 1.0),
-    ("residential", 0.15),
-    ("replica", 0.5),
-)
-"""Name of the scenes' data set, metres from an input to the middle view; the baseline is twice that."""
-
-
-@dataclass(frozen=True)
-class TripletSet:
-    """Triplets of one kind.
-
-    Attributes:
-        name: such as "m3d_dist_0.5".
-        folder: where they are, or would be.
-        sources: a scene folder or a .json a triplet, sorted; none where the folder is missing.
-    """
-
-    name: str
-    folder: Path
-    sources: tuple[Path, ...]
-
-    def pair(self, index: int) -> Pair:
-        """The triplet of that number as a pair with a target; nothing that travels with the camera is looked for.
-
-        Raises:
-            InputError: a file is missing or wrong.
-        """
-        source = self.sources[index]
-        collection = read_triplet(source) if source.is_file() else read_matterport3d_scene(source)
-        (pair,) = collection.pairs(source if source.is_dir() else source.parent)
-        if not pair.targets:
-            raise InputError(f"{source}: needed three views (two inputs and a target between), got two; add one.")
-        return dataclasses.replace(pair, siblings=())
-
-
 def panogrf_folder(root: Path | str, stage: Stage, name: str, distance: float, height: int) -> Path:
-    """Where PanoGRF's triplets of that kind are; heights up to 512 read the 1024x512 folder."""
+    """Folder of one of PanoGRF's sets; heights up to 512 use the 1024x512 images."""
     rows = max(height, 512)
     return Path(root) / f"png_render_{stage}_{2 * rows}x{rows}_seq_len_3_{name}_dist_{distance}"
 
@@ -194,21 +194,21 @@ def panogrf_folder(root: Path | str, stage: Stage, name: str, distance: float, h
 def read_panogrf(
     root: Path | str, stage: Stage, height: int, sets: Sequence[tuple[str, float]] | None = None
 ) -> list[TripletSet]:
-    """PanoGRF's triplets below a folder, one set a kind; a missing kind is an empty set, and a warning says so.
+    """PanoGRF's sets in a folder. A missing set is empty, with a warning. Source: docs/official.md, section 2.1.
 
     Args:
         root: the folder that holds png_render_{stage}_... folders.
         stage: train and val have m3d at 0.5 m only.
-        height: of the panoramas wanted, pixels.
-        sets: name and distance of each kind; None for all of the stage.
+        height: height at which the panoramas will be read, pixels.
+        sets: data set and distance of each set; None for all of the stage.
 
     Raises:
-        InputError: none of them is there.
+        InputError: all sets are missing.
     """
     root = Path(root).expanduser()
-    kinds = sets if sets is not None else TEST_SETS if stage == "test" else TRAINING_SETS
+    sets = sets if sets is not None else TEST_SETS if stage == "test" else TRAINING_SETS
     found = []
-    for name, distance in kinds:
+    for name, distance in sets:
         folder = panogrf_folder(root, stage, name, distance, height)
         scenes = sorted(folder.iterdir()) if folder.is_dir() else []
         scenes = [scene for scene in scenes if scene.is_dir() and is_matterport3d_scene(scene)]
@@ -217,15 +217,15 @@ def read_panogrf(
     if len(missing) == len(found):
         raise InputError(
             f"{root}: needed PanoGRF scenes for {stage}, got none in {', '.join(missing)}; give the folder that holds "
-            "these, or fetch them."
+            "these, or download them."
         )
     if missing:
-        warnings.warn(f"no PanoGRF scenes in {', '.join(missing)}; going on without them.", stacklevel=2)
+        warnings.warn(f"no PanoGRF scenes in {', '.join(missing)}; these sets are skipped.", stacklevel=2)
     return found
 
 
 def read_game_maps(folder: Path | str) -> TripletSet:
-    """The triplets NAME.json of a folder.
+    """The game-map triplets (NAME.json) of a folder.
 
     Raises:
         InputError: there is none.
@@ -234,6 +234,6 @@ def read_game_maps(folder: Path | str) -> TripletSet:
     sources = tuple(triplet_files(folder))
     if not sources:
         raise InputError(
-            f"{folder}: needed triplets (NAME.json with NAME_0.png beside it), got none; see docs/input.md."
+            f"{folder}: needed triplets (NAME.json with NAME_0.png next to it), got none; see docs/input.md."
         )
     return TripletSet(folder.resolve().name, folder, sources)

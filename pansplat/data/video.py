@@ -1,4 +1,4 @@
-"""Reading frames of video files, and writing MP4 files."""
+"""Reading frames of video files by number, and writing MP4 files."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from pansplat.atomic import replacing
 from pansplat.errors import InputError
 
-_NEAR = 48  # frames; nearer ones are reached by decoding on, farther ones by seeking
+_MAX_SKIP = 48  # frames; nearer frames are reached by decoding on, farther ones by seeking
+_ENCODERS = ("libx264", "libopenh264", "mpeg4")  # H.264 first: every browser and player supports it
 
 
 @dataclass(frozen=True, eq=False)
 class VideoFile:
-    """A video file whose frames are counted, not yet decoded.
+    """A video file with the times of its frames. `read` decodes frames.
 
     Attributes:
         path: the file.
@@ -36,50 +37,50 @@ class VideoFile:
 
     @property
     def seconds(self) -> list[float]:
-        """Time of each frame after the first."""
+        """Time of each frame since the first frame."""
         return [float((stamp - self.stamps[0]) * self.time_base) for stamp in self.stamps]
 
     def read(self, frames: Sequence[int]) -> dict[int, NDArray[np.uint8]]:
-        """Those frames as RGB (H W 3), by number from 0 in the order in which they are shown.
+        """RGB pixels (H W 3) of frames by number; frames are numbered from 0 in presentation order.
 
         Raises:
             InputError: no such frame, or damaged data.
         """
-        wanted = sorted(set(frames))
-        if wanted and not 0 <= wanted[0] <= wanted[-1] < len(self.stamps):
+        numbers = sorted(set(frames))
+        if numbers and not 0 <= numbers[0] <= numbers[-1] < len(self.stamps):
             raise InputError(
-                f"{self.path}: needed frames 0 to {len(self.stamps) - 1}, got {wanted[0]} to {wanted[-1]}."
+                f"{self.path}: needed frames 0 to {len(self.stamps) - 1}, got {numbers[0]} to {numbers[-1]}."
             )
         found: dict[int, NDArray[np.uint8]] = {}
-        with _opened(self.path) as film:
-            film.streams.video[0].thread_type = "AUTO"
-            for group in _groups(wanted):
-                found |= self._decode(film, group, self.stamps[group[0]])
+        with _open_container(self.path) as container:
+            container.streams.video[0].thread_type = "AUTO"
+            for group in _group_near_frames(numbers):
+                found |= self._decode(container, group, self.stamps[group[0]])
                 missing = [frame for frame in group if frame not in found]
-                if missing:  # some files' key frames cannot be trusted: decode from the start
-                    found |= self._decode(film, missing, self.stamps[0])
-        missing = [frame for frame in wanted if frame not in found]
+                if missing:  # key frames of some files are wrong: decode from the start
+                    found |= self._decode(container, missing, self.stamps[0])
+        missing = [frame for frame in numbers if frame not in found]
         if missing:
             raise InputError(
-                f"{self.path}: needed {len(wanted)} frames, got none for {missing[:5]}: the file is damaged there; "
+                f"{self.path}: needed {len(numbers)} frames, got none for {missing[:5]}: the file is damaged there; "
                 "copy or encode it again."
             )
         return found
 
-    def _decode(self, film: Any, frames: Sequence[int], seek_to: int) -> dict[int, NDArray[np.uint8]]:
-        """Frames met on the way from the key frame at or before a time."""
+    def _decode(self, container: Any, frames: Sequence[int], seek_to: int) -> dict[int, NDArray[np.uint8]]:
+        """Those of `frames` that are decoded from the key frame at or before the time `seek_to` on."""
         from av.error import FFmpegError
 
         numbers = {self.stamps[frame]: frame for frame in frames}
         last = max(numbers)
         found = {}
-        stream = film.streams.video[0]
+        stream = container.streams.video[0]
         try:
-            film.seek(seek_to, stream=stream)
-            for picture in film.decode(stream):
-                if picture.pts in numbers:
-                    found[numbers[picture.pts]] = picture.to_ndarray(format="rgb24")
-                if len(found) == len(numbers) or (picture.pts is not None and picture.pts > last):
+            container.seek(seek_to, stream=stream)
+            for frame in container.decode(stream):
+                if frame.pts in numbers:
+                    found[numbers[frame.pts]] = frame.to_ndarray(format="rgb24")
+                if len(found) == len(numbers) or (frame.pts is not None and frame.pts > last):
                     break
         except FFmpegError as error:
             raise InputError(f"{self.path}: needed readable frames, got '{error}'; copy or encode it again.") from error
@@ -87,20 +88,20 @@ class VideoFile:
 
 
 def open_video(path: Path | str) -> VideoFile:
-    """A video file with the times of its frames, found without decoding.
+    """A video file with the times of its frames, which are read from packets without decoding.
 
     Raises:
-        InputError: no such file, no video in it, or frames without times.
+        InputError: no such file, no video stream, or frames without times.
     """
     path = Path(path)
-    with _opened(path) as film:
+    with _open_container(path) as container:
         from av.error import FFmpegError
 
-        if not film.streams.video:
-            raise InputError(f"{path}: needed a video, got a file without pictures; give another file.")
-        stream = film.streams.video[0]
+        if not container.streams.video:
+            raise InputError(f"{path}: needed a video, got a file without a video stream; give another file.")
+        stream = container.streams.video[0]
         try:
-            packets = [packet for packet in film.demux(stream) if packet.size and not packet.is_discard]
+            packets = [packet for packet in container.demux(stream) if packet.size and not packet.is_discard]
         except FFmpegError as error:
             raise InputError(f"{path}: needed a complete video, got '{error}'; copy it again.") from error
         stamps = sorted({packet.pts for packet in packets if packet.pts is not None})
@@ -112,7 +113,7 @@ def open_video(path: Path | str) -> VideoFile:
         return VideoFile(path, tuple(stamps), stream.time_base, stream.width, stream.height)
 
 
-def _opened(path: Path) -> Any:
+def _open_container(path: Path) -> Any:
     import av
     from av.error import FFmpegError
 
@@ -122,11 +123,11 @@ def _opened(path: Path) -> Any:
         raise InputError(f"{path}: needed a readable video file, got '{error}'; check it.") from error
 
 
-def _groups(frames: Sequence[int]) -> Iterator[list[int]]:
-    """Runs of frames near each other."""
+def _group_near_frames(frames: Sequence[int]) -> Iterator[list[int]]:
+    """Split sorted frame numbers where consecutive ones are more than `_MAX_SKIP` apart."""
     group: list[int] = []
     for frame in frames:
-        if group and frame - group[-1] > _NEAR:
+        if group and frame - group[-1] > _MAX_SKIP:
             yield group
             group = []
         group.append(frame)
@@ -134,19 +135,16 @@ def _groups(frames: Sequence[int]) -> Iterator[list[int]]:
         yield group
 
 
-_ENCODERS = ("libx264", "libopenh264", "mpeg4")  # H.264 first: every browser and player has it
-
-
 def write_video(path: Path | str, frames: Iterable[NDArray[np.uint8]], fps: float, *, quality: int = 18) -> int:
-    """Write an MP4 film, whole or not at all, and return the number of frames; H.264 where PyAV has it.
+    """Write an MP4 file atomically and return the number of frames. H.264 if PyAV supports it.
 
-    Frames of odd width or height lose their last column or row: the format holds even sizes only.
+    The format supports even sizes only: frames of odd width or height lose their last column or row.
 
     Args:
         path: file to write, ending in .mp4.
-        frames: RGB pictures (H W 3) uint8, all of one size; read one at a time.
-        fps: pictures a second.
-        quality: constant rate factor of the encoder, 0 (lossless) to 51; smaller is better and larger.
+        frames: RGB images (H W 3), uint8, all of one size; consumed one at a time.
+        fps: frames per second.
+        quality: constant rate factor of the encoder, 0 (lossless) to 51; lower is better and larger.
 
     Raises:
         InputError: not .mp4, no frame, a frame of another shape, `fps` not positive.
@@ -160,27 +158,27 @@ def write_video(path: Path | str, frames: Iterable[NDArray[np.uint8]], fps: floa
 
     with replacing(path) as temporary:
         count = 0
-        with av.open(str(temporary), "w", options={"movflags": "+faststart"}) as film:
+        with av.open(str(temporary), "w", options={"movflags": "+faststart"}) as container:
             stream: Any = None
             for count, frame in enumerate(frames, start=1):
                 pixels = _check_frame(path, frame, count, None if stream is None else (stream.height, stream.width))
                 if stream is None:
-                    stream = _add_stream(film, pixels.shape[1], pixels.shape[0], fps, quality)
-                picture = av.VideoFrame.from_ndarray(pixels, format="rgb24")
-                for packet in stream.encode(picture.reformat(format="yuv420p", dst_colorspace="ITU709")):
-                    film.mux(packet)
+                    stream = _add_stream(container, pixels.shape[1], pixels.shape[0], fps, quality)
+                video_frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+                for packet in stream.encode(video_frame.reformat(format="yuv420p", dst_colorspace="ITU709")):
+                    container.mux(packet)
             if stream is None:
-                raise InputError(f"cannot write {path}: needed at least one frame, got none; nothing written.")
+                raise InputError(f"cannot write {path}: needed at least one frame, got none; nothing was written.")
             for packet in stream.encode():
-                film.mux(packet)
+                container.mux(packet)
     return count
 
 
 def video_encoder() -> str:
-    """Name of the encoder that films are written with.
+    """Name of the encoder that `write_video` uses.
 
     Raises:
-        InputError: PyAV has none of those we know.
+        InputError: PyAV has no supported encoder.
     """
     import av
     import av.codec
@@ -190,26 +188,27 @@ def video_encoder() -> str:
             try:
                 av.codec.Codec(name, "w")
                 return name
-            except ValueError:  # listed for decoding only
+            except ValueError:  # available for decoding only
                 continue
     raise InputError(f"needed PyAV with one of the encoders {_ENCODERS}, got none of them; reinstall `av`.")
 
 
-def _add_stream(film: Any, width: int, height: int, fps: float, quality: int) -> Any:
+def _add_stream(container: Any, width: int, height: int, fps: float, quality: int) -> Any:
     encoder = video_encoder()
-    stream = film.add_stream(encoder, rate=Fraction(fps).limit_denominator(1001))
+    stream = container.add_stream(encoder, rate=Fraction(fps).limit_denominator(1001))
     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
     if encoder == "libx264":
         stream.options = {"crf": str(quality), "preset": "medium"}
     else:
         stream.bit_rate = int(width * height * fps * 0.2)
-    # Says how to turn the film back to RGB; players guess by size otherwise and shift the colours.
+    # BT.709, limited range. Without these tags players guess the colour space from the size, and colours shift.
     context = stream.codec_context
     context.color_primaries, context.color_trc, context.colorspace, context.color_range = 1, 1, 1, 1
     return stream
 
 
 def _check_frame(path: Path, frame: Any, number: int, size: tuple[int, int] | None) -> NDArray[np.uint8]:
+    """The frame cropped to an even size."""
     pixels = np.asarray(frame)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or min(pixels.shape) < 2:
         raise InputError(

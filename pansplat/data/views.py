@@ -1,4 +1,4 @@
-"""Posed panoramas as tensors: views, samples of context and target views, and batches."""
+"""Posed panoramas as tensors: views, samples of context and target views, and batches of samples."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from pansplat.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Panoramas of one place with their poses, all at one size.
+    """Panoramas of one place with their poses, all of one size.
 
     Attributes:
         images: RGB in [0, 1], float32.
         cam2world: float64, OpenCV axes, metres.
-        masks: True where a pixel shows the scene; False for what travels with the camera (tripod, caps, operator).
+        masks: True where a pixel shows the scene; False for what is fixed to the camera (tripod, caps, operator).
         near, far: radial depth range to search, metres.
-        names: one a view, for messages and file names.
-        depths: radial distance in metres, 0 where unknown; None when the data set has none.
+        names: one per view, for messages and file names.
+        depths: radial distance in metres, 0 where unknown; None when the data set has no depth.
     """
 
     images: Float[Tensor, "view 3 height width"]
@@ -34,9 +34,22 @@ class Views:
     depths: Float[Tensor, "view height width"] | None = None
 
 
+def select_views(views: Views, indices: Sequence[int]) -> Views:
+    """The views at `indices`, in that order."""
+    chosen = torch.tensor(list(indices), dtype=torch.long)
+    return replace(
+        views,
+        images=views.images[chosen],
+        cam2world=views.cam2world[chosen],
+        masks=views.masks[chosen],
+        names=tuple(views.names[i] for i in indices),
+        depths=None if views.depths is None else views.depths[chosen],
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One scene: `context` is the predictor's input, `targets` what its scene should look like elsewhere."""
+    """One scene: `context` is the input of a predictor, `targets` are compared with renderings of its prediction."""
 
     name: str
     context: Views
@@ -45,15 +58,15 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Samples of one shape, stacked.
+    """Stacked samples with equal numbers and sizes of views.
 
     Attributes:
-        names: one a sample.
+        names: one per sample.
         images, target_images: RGB in [0, 1], float32.
         cam2world, target_cam2world: float64, OpenCV axes, metres.
         masks, target_masks: True where a pixel shows the scene.
-        depths, target_depths: radial distance in metres, 0 where unknown; None where no sample has any.
-        near, far: radial depth range to search, metres, as the network takes it.
+        depths, target_depths: radial distance in metres, 0 where unknown; None when no sample has depth.
+        near, far: radial depth range to search, metres, one value per view.
     """
 
     names: tuple[str, ...]
@@ -72,29 +85,32 @@ class Batch:
         return len(self.names)
 
     def to(self, device: torch.device | str) -> Batch:
-        """The same batch on another device."""
-        moved = {
-            name: value.to(device, non_blocking=True) for name, value in vars(self).items() if isinstance(value, Tensor)
-        }
-        return replace(self, **moved)
+        """The batch on another device."""
+        tensors = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **{name: value.to(device, non_blocking=True) for name, value in tensors.items()})
+
+    def to_dtype(self, dtype: torch.dtype) -> Batch:
+        """The batch with its floating-point tensors converted."""
+        tensors = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **{name: v.to(dtype) for name, v in tensors.items() if v.is_floating_point()})
 
 
 def collate(samples: Sequence[Sample]) -> Batch:
-    """The samples as one batch.
+    """Stack samples into a batch.
 
     Raises:
-        InputError: no sample, or another number or size of views in one of them.
+        InputError: no sample, or samples with different numbers or sizes of views.
     """
     if not samples:
-        raise InputError("needed at least one sample to make a batch of, got none.")
+        raise InputError("needed at least one sample for a batch, got none.")
     first = samples[0]
     for sample in samples[1:]:
         for part in ("context", "targets"):
-            wanted, got = (tuple(getattr(s, part).images.shape) for s in (first, sample))
-            if wanted != got:
+            expected, got = (tuple(getattr(s, part).images.shape) for s in (first, sample))
+            if expected != got:
                 raise InputError(
-                    f"cannot batch {sample.name} with {first.name}: needed {part} of shape {wanted} (view 3 height "
-                    f"width), got {got}; choose one number of targets for all, or a batch of one."
+                    f"cannot batch {sample.name} with {first.name}: needed {part} of shape {expected} (view 3 height "
+                    f"width), got {got}; use the same number of targets in all samples, or a batch size of 1."
                 )
     contexts, targets = [s.context for s in samples], [s.targets for s in samples]
     views = len(first.context.images)
@@ -103,18 +119,18 @@ def collate(samples: Sequence[Sample]) -> Batch:
         images=torch.stack([v.images for v in contexts]),
         cam2world=torch.stack([v.cam2world for v in contexts]),
         masks=torch.stack([v.masks for v in contexts]),
-        depths=_stacked_depths(contexts),
+        depths=_stack_depths(contexts),
         target_images=torch.stack([v.images for v in targets]),
         target_cam2world=torch.stack([v.cam2world for v in targets]),
         target_masks=torch.stack([v.masks for v in targets]),
-        target_depths=_stacked_depths(targets),
+        target_depths=_stack_depths(targets),
         near=torch.tensor([[v.near] * views for v in contexts], dtype=torch.float32),
         far=torch.tensor([[v.far] * views for v in contexts], dtype=torch.float32),
     )
 
 
-def _stacked_depths(views: Sequence[Views]) -> Float[Tensor, "batch view height width"] | None:
-    """Depths, 0 (unknown) for samples without; None where all are."""
+def _stack_depths(views: Sequence[Views]) -> Float[Tensor, "batch view height width"] | None:
+    """Stacked depths, 0 (unknown) for samples without depth; None when no sample has depth."""
     if all(v.depths is None for v in views):
         return None
     return torch.stack([torch.zeros(v.masks.shape) if v.depths is None else v.depths for v in views])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.data.augment import Augmentation, augment, mirror_views, roll_views, turn_views
+from pansplat.data.augment import Augmentation, augment, mirror_views, roll_views, rotate_views
 from pansplat.data.views import Sample, Views
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.warp import relative_pose, warp_panorama
@@ -92,7 +92,7 @@ def test_mirroring_twice_is_the_identity() -> None:
 def test_turning_by_whole_pixels_is_rolling() -> None:
     room = _room([(0, 0, 0)])
     rolled = roll_views(room, [4])
-    turned = turn_views(room, room.cam2world[:, :3, :3].mT @ rolled.cam2world[:, :3, :3])
+    turned = rotate_views(room, room.cam2world[:, :3, :3].mT @ rolled.cam2world[:, :3, :3])
     assert torch.allclose(turned.images, rolled.images, atol=1e-5)
     assert torch.equal(turned.depths, rolled.depths)
     assert torch.allclose(turned.cam2world, rolled.cam2world)

@@ -163,7 +163,7 @@ def test_truncated_sixteen_bit_png_is_refused(tmp_path: Path) -> None:
 
 def test_a_file_of_no_bytes_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").touch()
-    with pytest.raises(InputError, match=r"a\.jpg: needed a picture, got a file of 0 bytes"):
+    with pytest.raises(InputError, match=r"a\.jpg: needed an image, got a file of 0 bytes"):
         read_panorama(tmp_path / "a.jpg", 16)
 
 
@@ -198,7 +198,7 @@ def test_exr_without_colour_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"gone\.png: needed a readable picture file"):
+    with pytest.raises(InputError, match=r"gone\.png: needed a readable image file"):
         read_panorama(tmp_path / "gone.png", 8)
 
 
@@ -208,7 +208,7 @@ def test_nan_is_never_written(tmp_path: Path, name: str) -> None:
     write_image(tmp_path / name, image)
     before = (tmp_path / name).read_bytes()
     image[0, 0, 0] = torch.nan
-    with pytest.raises(InputError, match="got 1 NaN or infinite values; nothing written"):
+    with pytest.raises(InputError, match="got 1 NaN or infinite values; nothing was written"):
         write_image(tmp_path / name, image)
     assert (tmp_path / name).read_bytes() == before
     assert _entries(tmp_path) == [name]

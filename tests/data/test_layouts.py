@@ -232,17 +232,17 @@ def test_trajectories_belong_to_the_pictures_in_order_and_scale(tmp_path: Path, 
 def test_trajectories_of_another_length_are_refused(tmp_path: Path) -> None:
     _sequence(tmp_path)
     (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n" * 2)
-    with pytest.raises(InputError, match=r"poses\.tum: needed one pose a picture \(3 pictures\), got 2 TUM poses"):
+    with pytest.raises(InputError, match=r"poses\.tum: needed one pose per image \(3 images\), got 2 TUM poses"):
         load_pairs(tmp_path)
     (tmp_path / "poses.tum").rename(tmp_path / "poses.kitti")
-    with pytest.raises(InputError, match=r"needed KITTI .* as its name says, got TUM"):
+    with pytest.raises(InputError, match=r"needed KITTI .* according to its name, got TUM"):
         load_pairs(tmp_path)
     (tmp_path / "poses.kitti").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
     (tmp_path / "scale.txt").write_text("two")
     with pytest.raises(InputError, match=r"scale\.txt: needed one positive number, got 'two'"):
         load_pairs(tmp_path)
     (tmp_path / "poses.txt").touch()
-    with pytest.raises(InputError, match=r"needed one trajectory, got poses\.kitti, poses\.txt"):
+    with pytest.raises(InputError, match=r"needed one trajectory file, got poses\.kitti, poses\.txt"):
         load_pairs(tmp_path)
 
 
@@ -252,9 +252,9 @@ def test_trajectories_of_another_length_are_refused(tmp_path: Path) -> None:
         ({"convention": None}, 'needed a pose "convention", got none; write one of "cam2world opencv"'),
         ({"convention": "mine"}, "needed a known pose convention, got 'mine'"),
         ({"poses": None}, 'got no object "poses"'),
-        ({"poses": {"left.png": _pose(0)}}, "got 1; pictures without a pose: right.png"),
+        ({"poses": {"left.png": _pose(0)}}, "got 1; images without a pose: right.png"),
         ({"poses": {"left.png": _pose(0), "right.png": None}}, "'right.png': needed a pose, got none"),
-        ({"poses": {"left.png": _pose(0), "gone.png": _pose(1)}}, "needed the picture .*gone.png"),
+        ({"poses": {"left.png": _pose(0), "gone.png": _pose(1)}}, "needed the image .*gone.png"),
         (
             {"poses": {"left.png": _pose(0), "right.png": {"room": "x"}}},
             r"needed a pose, got only \['room'\]",
@@ -273,7 +273,7 @@ def test_trajectories_of_another_length_are_refused(tmp_path: Path) -> None:
         ),
         ({"near": 3, "far": 3}, "needed 0 < near < far in metres, got near=3 and far=3"),
         ({"near": 0}, "needed 0 < near < far"),
-        ({"far": "much"}, "needed a number of metres as \"far\", got 'much'"),
+        ({"far": "much"}, "needed a number in metres as \"far\", got 'much'"),
     ],
 )
 def test_bad_pose_files_are_refused(tmp_path: Path, content: dict, message: str) -> None:
@@ -288,12 +288,12 @@ def test_bad_pose_files_are_refused(tmp_path: Path, content: dict, message: str)
     [
         ({}, 'got neither "pairs" nor "triplets"'),
         ({"pairs": []}, "needed at least one pair"),
-        ({"pairs": [{"context": ["left.png"]}]}, "pairs 1: needed two or more different pictures"),
-        ({"pairs": [{"context": ["left.png", "left.png"]}]}, "needed two or more different pictures"),
-        ({"pairs": ["left.png"]}, "needed two or more different pictures"),
-        ({"pairs": [{"context": [["left.png"], {"b": 1}]}]}, "needed two or more different pictures"),
+        ({"pairs": [{"context": ["left.png"]}]}, "pairs 1: needed two or more different images"),
+        ({"pairs": [{"context": ["left.png", "left.png"]}]}, "needed two or more different images"),
+        ({"pairs": ["left.png"]}, "needed two or more different images"),
+        ({"pairs": [{"context": [["left.png"], {"b": 1}]}]}, "needed two or more different images"),
         ({"pairs": {"context": ["left.png", "right.png"]}}, 'needed a list as "pairs"'),
-        ({"pairs": [{"context": ["left.png", "right.png"], "target": 5}]}, 'needed a picture .* as "target", got 5'),
+        ({"pairs": [{"context": ["left.png", "right.png"], "target": 5}]}, 'needed an image .* as "target", got 5'),
         (
             {"pairs": [{"context": ["left.png", "rigth.png"]}]},
             r"got 'rigth.png' \(did you mean 'right.png'\?\)",
@@ -314,7 +314,7 @@ def test_bad_pairs_files_are_refused(tmp_path: Path, content: dict, message: str
 def test_broken_json_is_refused_with_the_line(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "room")
     (folder / "poses.json").write_text('{\n "convention": "cam2world opencv",\n}')
-    with pytest.raises(InputError, match=r"poses\.json: needed JSON, got something else at line 3"):
+    with pytest.raises(InputError, match=r"poses\.json: needed JSON, got invalid text at line 3"):
         load_pairs(folder)
 
 
@@ -325,7 +325,7 @@ def test_one_panorama_is_refused(tmp_path: Path) -> None:
 
 def test_pictures_without_poses_are_refused(tmp_path: Path) -> None:
     _picture(tmp_path / "left.png")
-    with pytest.raises(InputError, match=r"needed poses for the panoramas, got pictures only \(left\.png\)"):
+    with pytest.raises(InputError, match=r"needed poses for the panoramas, got images only \(left\.png\)"):
         load_pairs(tmp_path)
 
 
@@ -345,10 +345,10 @@ def test_incomplete_panogrf_views_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"tran\.txt: needed 3 numbers, got 2"):
         load_pairs(scene)
     (scene / "01" / "tran.txt").unlink()
-    with pytest.raises(InputError, match=r"tran\.txt: needed the view's pose there"):
+    with pytest.raises(InputError, match=r"tran\.txt: needed the pose of the view"):
         load_pairs(scene)
     (scene / "01" / "rgb.png").unlink()
-    with pytest.raises(InputError, match=r"needed rgb\.png beside"):
+    with pytest.raises(InputError, match=r"needed rgb\.png next to"):
         load_pairs(scene)
 
 

@@ -72,7 +72,7 @@ def test_unreadable_samples_are_left_out_counted_and_named(tmp_path: Path) -> No
     (tmp_path / "2_1.png").write_bytes(b"")
     (tmp_path / "4_0.png").write_bytes((tmp_path / "4_0.png").read_bytes()[:40])
     loader = Loader(source, height=8, batch_size=3)
-    with pytest.warns(UserWarning, match="left out sample") as told:
+    with pytest.warns(UserWarning, match="skipped sample") as told:
         batches = _take(loader, 4)
     assert all(len(batch) == 3 for batch in batches)
     assert not {"2", "4"} & {name for batch in batches for name in batch.names}
@@ -88,8 +88,8 @@ def test_if_all_are_unreadable_the_error_names_some(tmp_path: Path) -> None:
     for path in tmp_path.glob("*_1.png"):
         path.write_bytes(b"")
     with (
-        pytest.warns(UserWarning, match="left out"),
-        pytest.raises(InputError, match=r"got 4 in a row that cannot \(of 4\)(.|\n)*_1\.png"),
+        pytest.warns(UserWarning, match="skipped"),
+        pytest.raises(InputError, match=r"got 4 consecutive unreadable ones \(of 4\)(.|\n)*_1\.png"),
     ):
         _take(Loader(source, height=8, batch_size=1), 1)
 

@@ -8,7 +8,7 @@ import torch
 
 from pansplat.data.images import write_image
 from pansplat.data.layouts import load_pairs
-from pansplat.data.masks import detect_static_region, static_mask_of_files
+from pansplat.data.masks import detect_scene_mask, scene_mask_of_files
 from pansplat.geometry.equirect import pixel_directions, row_weights
 
 _HEIGHT = 256
@@ -47,7 +47,7 @@ _PLACES = ((0.0, 0.0), (0.9, 0.3), (-0.5, 1.1), (0.2, -1.3), (1.3, 1.5))
 @pytest.mark.parametrize("top", [False, True])
 def test_a_cap_that_travels_with_the_camera_is_masked(count: int, top: bool) -> None:
     images = torch.stack([_cap(_room(*place), 15, top=top) for place in _PLACES[:count]])
-    scene = detect_static_region(images)
+    scene = detect_scene_mask(images)
     rows = round(15 / 180 * _HEIGHT)
     expected = torch.ones(_HEIGHT, 2 * _HEIGHT, dtype=torch.bool)
     expected[slice(0, rows) if top else slice(_HEIGHT - rows, None)] = False
@@ -60,23 +60,23 @@ def test_a_cap_that_travels_with_the_camera_is_masked(count: int, top: bool) -> 
 @pytest.mark.parametrize("count", [2, 3, 5])
 @pytest.mark.parametrize("plain", [False, True])
 def test_floors_and_ceilings_are_scene(count: int, plain: bool) -> None:
-    assert detect_static_region(torch.stack([_room(*p, plain=plain) for p in _PLACES[:count]])).all()
+    assert detect_scene_mask(torch.stack([_room(*p, plain=plain) for p in _PLACES[:count]])).all()
 
 
 def test_a_camera_that_did_not_move_masks_nothing() -> None:
     image = _cap(_room(0, 0), 15, top=False)
-    assert detect_static_region(torch.stack((image, image, image + 0.001))).all()
+    assert detect_scene_mask(torch.stack((image, image, image + 0.001))).all()
 
 
 def test_the_mask_rolls_with_the_panoramas() -> None:
     images = torch.stack([_cap(_room(*place), 15, top=False) for place in _PLACES[:3]])
     images[:, :, 220:, 100:160] = 0  # an arm to one side
-    rolled = detect_static_region(torch.roll(images, 128, dims=-1))
-    assert (torch.roll(detect_static_region(images), 128, dims=-1) != rolled).float().mean() < 0.01
+    rolled = detect_scene_mask(torch.roll(images, 128, dims=-1))
+    assert (torch.roll(detect_scene_mask(images), 128, dims=-1) != rolled).float().mean() < 0.01
 
 
 def test_one_panorama_masks_nothing() -> None:
-    assert detect_static_region(_room(0, 0)[None]).all()
+    assert detect_scene_mask(_room(0, 0)[None]).all()
 
 
 def test_files_are_masked_at_the_size_wanted(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_files_are_masked_at_the_size_wanted(tmp_path: Path) -> None:
         write_image(paths[-1], _cap(_room(*place), 15, top=False))
     broken = tmp_path / "broken.png"
     broken.write_bytes(b"no picture")
-    scene = static_mask_of_files((*paths, broken, tmp_path / "gone.png"), 90)
+    scene = scene_mask_of_files((*paths, broken, tmp_path / "gone.png"), 90)
     assert scene.shape == (90, 180)
     assert not scene[-7:].any()
     assert scene[:70].all()
@@ -95,7 +95,7 @@ def test_files_are_masked_at_the_size_wanted(tmp_path: Path) -> None:
 @pytest.mark.shared
 def test_zinds_tripod_is_masked_and_nothing_else(shared: Path) -> None:
     pair = load_pairs(shared / "data" / "zind")[0]
-    scene = static_mask_of_files(pair.siblings, _HEIGHT)
+    scene = scene_mask_of_files(pair.siblings, _HEIGHT)
     area = (row_weights(_HEIGHT)[:, None] * ~scene).sum() / (2 * _HEIGHT * row_weights(_HEIGHT).sum())
     assert 0.01 < float(area) < 0.04
     assert not scene[round(_HEIGHT * (1 - 6 / 180)) :].any()  # the body, 6 degrees round the nadir

@@ -40,18 +40,18 @@ def test_frame_i_has_line_i_and_the_scale(tmp_path: Path) -> None:
 
 def test_without_a_scale_the_unit_is_a_metre_and_a_note_says_so(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "mine", _kitti(), scale=None)
-    with pytest.warns(UserWarning, match=r"mine: no scale\.txt, so the trajectory's unit is taken as one metre"):
+    with pytest.warns(UserWarning, match=r"mine: no scale\.txt, so one unit of the trajectory is taken as one metre"):
         (sequence,) = read_insta360(folder)
     assert float(sequence.poses[3][0, 3]) == 3
 
 
 def test_fewer_lines_than_frames_are_used_with_a_note_and_more_are_refused(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "mine", _kitti(9))
-    with pytest.warns(UserWarning, match="9 poses for 12 frames of video.mp4; line i is taken as frame i"):
+    with pytest.warns(UserWarning, match="9 poses for 12 frames of video.mp4; line i is used for frame i"):
         (sequence,) = read_insta360(folder)
     assert sequence.frames == tuple(range(9))
     (folder / "frame_trajectory.txt").write_text("\n".join(_kitti(13)))
-    with pytest.raises(InputError, match=r"at most one pose a frame \(12 frames in video\.mp4\), got 13"):
+    with pytest.raises(InputError, match=r"at most one pose per frame \(12 frames in video\.mp4\), got 13"):
         read_insta360(folder)
 
 
@@ -79,13 +79,13 @@ def test_a_mask_counts_for_all_frames(tmp_path: Path) -> None:
 
 
 def test_folders_without_what_is_needed_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="got no video there or in its folders"):
+    with pytest.raises(InputError, match="got no video there or in its subfolders"):
         read_insta360(tmp_path)
     with pytest.raises(InputError, match="got no such folder"):
         read_insta360(tmp_path / "gone")
     folder = _folder(tmp_path / "mine", _kitti())
     (folder / "frame_trajectory.txt").unlink()
-    with pytest.raises(InputError, match="needed a trajectory beside the video"):
+    with pytest.raises(InputError, match="needed a trajectory for the video"):
         read_insta360(folder)
     (folder / "video.mp4").rename(folder / "a.mp4")
     write_video(folder / "b.mp4", [np.zeros((16, 30, 3), np.uint8)], 10)
