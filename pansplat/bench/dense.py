@@ -35,7 +35,7 @@ def render_dense(
     gaussians = gaussians.select(index[radius[index] >= near])
     variance = FILTER_VARIANCE["angular"] * (math.pi / height) ** 2
     seen = project_gaussians(gaussians, None, pose, filter_variance=variance, compensate=True, exact=True)
-    splats = seen.rows, seen.along, seen.peak, seen.values[:, :-1]
+    splats = seen.rows, seen.radial_variance, seen.peak, seen.values[:, :-1]
     directions = pixel_directions(height, 2 * height, dtype=torch.float64)
     rows = []
     for strip in directions.split(_SIDE):

@@ -1,4 +1,4 @@
-"""Drawing Gaussians: the differentiable reference rasteriser, and blending of its pictures."""
+"""Rasterising Gaussians: one call over three backends, and blending of the images of single views."""
 
 from pansplat.geometry.pose import blend_weights
 from pansplat.rendering.blend import blend

@@ -1,6 +1,7 @@
-"""The image planes of a camera (pinhole, direct panorama, cube faces), and the panorama of six faces.
+"""The image planes of a camera (pinhole image, direct panorama, cube faces), and stitching of cube faces.
 
-Source: docs/rendering.md, section 6; PanSplat, section 3.4.
+Source: PanSplat, section 3.4; docs/rendering.md, section 6; docs/official.md, section 10.2 and P9 for the published
+code's stitching.
 """
 
 import functools
@@ -16,6 +17,9 @@ from pansplat.geometry.cubemap import FACES, face_of, face_rotations, official_f
 from pansplat.geometry.equirect import pixel_directions
 
 Layout = Literal["equirect", "cubemap", "pinhole"]
+Stitching = Literal["seamless", "official"]
+
+_UP, _DOWN = FACES.index("up"), FACES.index("down")
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +28,7 @@ class ImagePlane:
 
     Attributes:
         size: height and width, pixels.
-        rotation: the picture's camera axes in the camera's, float64.
+        rotation: the plane's axes in camera axes, float64.
         focal: pixels; 0 for a direct panorama.
     """
 
@@ -39,11 +43,11 @@ class ImagePlane:
 
     @property
     def pixel_angle(self) -> float:
-        """Angle of a pixel in the picture's middle, radians."""
+        """Angle of a pixel in the middle of the image, radians."""
         return math.pi / self.size[0] if self.is_panorama else 1 / self.focal
 
     def directions(self) -> Float[Tensor, "height width 3"]:
-        """Unit directions of the pixel centres in the camera's axes, float64."""
+        """Unit directions of the pixel centres in camera axes, float64."""
         height, width = self.size
         device = self.rotation.device
         if self.is_panorama:
@@ -69,7 +73,13 @@ def image_planes(
     face_size: int | None = None,
     device: torch.device | None = None,
 ) -> list[ImagePlane]:
-    """The pictures that make up a layout: one, or the six cube faces."""
+    """The image planes of a layout: one, or the six cube faces.
+
+    Args:
+        size: height and width of the whole image, pixels.
+        vertical_fov_degrees: of a pinhole image.
+        face_size: of cube faces, pixels; by default as fine as the panorama's equator.
+    """
     upright = torch.eye(3, dtype=torch.float64, device=device)
     if layout == "equirect":
         return [ImagePlane(size, upright, 0.0)]
@@ -79,18 +89,16 @@ def image_planes(
     return [ImagePlane((face, face), rotation.to(upright.device), 0.5 * face) for rotation in face_rotations()]
 
 
-Stitching = Literal["seamless", "official"]
-
-_UP, _DOWN = FACES.index("up"), FACES.index("down")
+# --- stitching: a panorama sampled bilinearly from six faces, each padded with pixels of its neighbours ---
 
 
 class _Lookup(NamedTuple):
-    """Where each panorama pixel looks in the padded faces.
+    """Sampling positions of the panorama's pixels in the padded faces.
 
     Attributes:
-        border: the three face pixels whose mean stands at each padded pixel; 6 n n stands for zero.
+        border: the three face pixels whose mean is the value of each padded pixel; 6 n n stands for zero.
         corner: the upper left of the four padded pixels around each panorama pixel.
-        right, low: how far each panorama pixel lies from that one, 0 to 1.
+        right, low: bilinear weights of the right and lower neighbours, 0 to 1.
     """
 
     border: Int[Tensor, "padded 3"]
@@ -102,13 +110,13 @@ class _Lookup(NamedTuple):
 def stitch_faces(
     faces: Float[Tensor, "face channel n n"], size: tuple[int, int], *, stitching: Stitching = "seamless"
 ) -> Float[Tensor, "channel height width"]:
-    """A panorama of six cube faces. Linear in every face, so faces may also be stitched one by one and added.
+    """A panorama of six cube faces. It is linear in every face, so faces may be stitched one by one and added.
 
     Args:
         faces: in the order of `FACES`.
         size: height and width of the panorama, pixels.
-        stitching: "seamless" continues each face by its true neighbours; "official" keeps the original's wrong
-            borders left and right of up and down, and its outline of these faces.
+        stitching: "seamless" pads each face with its true neighbours; "official" reproduces the published code's wrong
+            padding left and right of up and down, and its outline of these faces.
 
     Raises:
         ValueError: "official" with a size that is not 2:1 with a height that is a multiple of 4.
@@ -117,33 +125,35 @@ def stitch_faces(
     lookup = _Lookup(*(table.to(faces.device) for table in _lookup(num, size, stitching)))
     flat = faces.permute(1, 0, 2, 3).reshape(channels, -1)
     flat = torch.cat((flat, flat.new_zeros(channels, 1)), dim=1)
-    # Three pixels meet at a corner of the cube; everywhere else the three are one.
+    # At the corners of the cube three pixels meet; everywhere else the three are the same pixel.
     padded = flat[:, lookup.border].mean(dim=-1)
     right, low = lookup.right.to(faces), lookup.low.to(faces)
-    panorama = (1 - low) * _between(padded, lookup.corner, right)
-    panorama = panorama + low * _between(padded, lookup.corner + (num + 2), right)
+    panorama = (1 - low) * _interpolate_row(padded, lookup.corner, right)
+    panorama = panorama + low * _interpolate_row(padded, lookup.corner + (num + 2), right)
     return panorama.reshape(channels, *size)
 
 
-def _between(padded: Float[Tensor, "channel padded"], left: Tensor, part: Tensor) -> Float[Tensor, "channel pixel"]:
-    return (1 - part) * padded[:, left] + part * padded[:, left + 1]
+def _interpolate_row(
+    padded: Float[Tensor, "channel padded"], left: Tensor, right_weight: Tensor
+) -> Float[Tensor, "channel pixel"]:
+    return (1 - right_weight) * padded[:, left] + right_weight * padded[:, left + 1]
 
 
 @functools.lru_cache(maxsize=2)
-@torch.inference_mode(False)  # kept for calls that need gradients too
+@torch.inference_mode(False)  # the cached tensors must also serve calls that need gradients
 def _lookup(num: int, size: tuple[int, int], stitching: Stitching) -> _Lookup:
     rotations = face_rotations()
     directions = pixel_directions(*size, dtype=torch.float64).reshape(-1, 3)
     border = _border(num)
     if stitching == "official":
         if size[1] != 2 * size[0]:
-            raise ValueError(f"`size` must be 2:1 for the original's stitching, got {size}")
+            raise ValueError(f"`size` must be 2:1 for stitching 'official', got {size}")
         face = official_faces(size[0]).reshape(-1)
         border = _official_border(border, num)
     else:
         face = face_of(directions)
     local = (directions[:, None, :] @ rotations[face])[:, 0, :]
-    # Padded coordinates: pixel k of the face is at index k + 1. A direction of another face is held to the edge.
+    # Padded coordinates: pixel k of the face is at index k + 1. A direction of another face is clamped to the edge.
     place = (local[:, :2] / local[:, 2:]).clamp(-1, 1)
     x, y = ((place + 1) * (0.5 * num) + 0.5).unbind(1)
     left, top = (t.floor().clamp(0, num) for t in (x, y))
@@ -152,7 +162,7 @@ def _lookup(num: int, size: tuple[int, int], stitching: Stitching) -> _Lookup:
 
 
 def _border(num: int) -> Int[Tensor, "padded 3"]:
-    """The three face pixels (flat indices) whose mean stands at each pixel of the six padded faces."""
+    """The three face pixels (flat indices) whose mean is the value of each pixel of the six padded faces."""
     rotations = face_rotations()
     index = torch.arange(-1, num + 1, dtype=torch.float64)
     y, x = torch.meshgrid(index, index, indexing="ij")
@@ -161,7 +171,7 @@ def _border(num: int) -> Int[Tensor, "padded 3"]:
     own = torch.stack([_flat_index(torch.full_like(x, face), inside, num) for face in range(6)])
     both = []
     for beyond, axis, at in ((beyond_x, 0, x), (beyond_y, 1, y)):
-        # Step from the touching pixel to just over the edge, and ask which pixel of which face is there.
+        # A point just over the edge from the nearest pixel of this face, and the pixel of the face it lies on.
         edge = (inside + 0.5) * (2 / num) - 1
         edge[..., axis] = torch.where(beyond, torch.where(at < 0, -1.0, 1.0), edge[..., axis])
         over = torch.cat((edge, torch.ones_like(x)[..., None]), dim=-1)
@@ -175,10 +185,10 @@ def _border(num: int) -> Int[Tensor, "padded 3"]:
 
 
 def _official_border(border: Int[Tensor, "padded 3"], num: int) -> Int[Tensor, "padded 3"]:
-    """The original's borders: those left and right of up and down are not what lies there.
+    """The published code's padding: left and right of up and down it is not the neighbour's pixels.
 
-    Each is a row too low, with zero in the first; down's are its own outermost columns. Beyond a corner of a side
-    face stands the corner of up or down. (No pixel of the fixtures shows a corner.)
+    These columns are shifted down by one row, with zero in the first; down's repeat its own outermost columns. Beyond
+    the corners of a side face it takes the corner of up or down. (No pixel of the fixtures shows a corner.)
     """
     faces = border.reshape(6, num + 2, num + 2, 3).clone()
     nothing = 6 * num * num
@@ -196,7 +206,7 @@ def _official_border(border: Int[Tensor, "padded 3"], num: int) -> Int[Tensor, "
 
 
 def _pixel_at(directions: Float[Tensor, "*batch 3"], num: int) -> Int[Tensor, "*batch"]:
-    """Flat index of the face pixel that holds each direction."""
+    """Flat index of the face pixel that contains each direction."""
     face = face_of(directions)
     local = (directions[..., None, :] @ face_rotations()[face])[..., 0, :]
     pixel = ((local[..., :2] / local[..., 2:] + 1) * (0.5 * num)).floor().clamp(0, num - 1)

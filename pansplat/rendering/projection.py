@@ -1,10 +1,8 @@
-"""Projection: what one camera sees of each Gaussian, its footprint on an image plane, and its bounding box there.
+"""Projection: which Gaussians are drawn, what one camera sees of them, their footprints and their bounding boxes.
 
-Source: docs/rendering.md, sections 1 to 3 and 5. Geometry is float64 whatever the Gaussians' type is; what the
-compositing reads is in the Gaussians' own type.
+Source: docs/rendering.md, sections 1 to 3 and 5. Geometry is float64 whatever the Gaussians' type is; the numbers that
+compositing reads have the Gaussians' type.
 """
-
-from __future__ import annotations
 
 import functools
 import math
@@ -34,13 +32,19 @@ from pansplat.geometry.pose import rotations_from_quats
 from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.rasterize import RasterOptions
 
+_CHUNK_SIZE = 1 << 17  # Gaussians projected at a time
+_UNBOUNDED = 1e9  # pixels, far outside any image
+
+
+# --- selection: the Gaussians that are finite, far enough and opaque enough ---
+
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The Gaussians worth observing, and what became of the others.
+    """The Gaussians to project, and how many of the others were left out.
 
     Attributes:
-        covariances: theirs, where they were given in place of scales and quats.
+        covariances: of the same Gaussians, if given in place of scales and quats.
         total: number of Gaussians given.
         dropped: not finite.
         near: nearer than `near`.
@@ -56,7 +60,7 @@ class Selection:
 def select_drawable(
     gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None, pose: Float[Tensor, "4 4"], options: RasterOptions
 ) -> Selection:
-    """Select before any arithmetic, which is what keeps the others' gradients exactly zero.
+    """Select before any arithmetic, so that the gradients of all other Gaussians are exactly zero.
 
     Args:
         pose: cam2world.
@@ -82,7 +86,7 @@ def select_drawable(
 def not_finite_message(
     gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None, pose: Float[Tensor, "4 4"], options: RasterOptions
 ) -> str:
-    """What to tell about Gaussians that cannot be drawn, at least one."""
+    """The error message for Gaussians of which at least one is not finite."""
     radius = _radius(gaussians, pose)
     wrong = torch.nonzero(~_usable(gaussians, covariances, radius, radius < options.near))[:, 0]
     return (
@@ -98,23 +102,48 @@ def _radius(gaussians: Gaussians, pose: Tensor) -> Float[Tensor, "n"]:
 
 @torch.no_grad()
 def _usable(gaussians: Gaussians, covariances: Tensor | None, radius: Tensor, close: Tensor) -> Bool[Tensor, "n"]:
-    return is_finite(gaussians, covariances) & (close | has_valid_shape(gaussians, covariances, radius))
+    return _is_finite(gaussians, covariances) & (close | _has_valid_shape(gaussians, covariances, radius))
 
 
-_CHUNK = 1 << 17
+def _is_finite(gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None) -> Bool[Tensor, "n"]:
+    """Whether all numbers of a Gaussian are finite, and so small that products do not overflow."""
+    shape = (gaussians.scales, gaussians.quats) if covariances is None else (covariances,)
+    keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+    for field in (gaussians.means, *shape, gaussians.opacities, gaussians.harmonics):
+        keep &= (field.detach().abs() < MAX_MAGNITUDE).reshape(len(keep), max(1, field[:1].numel())).all(dim=1)
+    return keep
+
+
+def _has_valid_shape(
+    gaussians: Gaussians,
+    covariances: Float[Tensor, "n 3 3"] | None,
+    radius: Float[Tensor, "n"],
+) -> Bool[Tensor, "n"]:
+    """Whether a Gaussian is not too large for its distance, and its covariance positive semidefinite."""
+    if covariances is None:
+        return gaussians.scales.detach().double().abs().amax(dim=1) <= MAX_SCALE_RATIO * radius
+    relative = covariances.detach().double() / radius.square()[:, None, None]
+    largest = relative.diagonal(dim1=1, dim2=2).amax(dim=1)
+    # Rounding to float32 or less makes the smallest variance of a disc slightly negative.
+    finite = torch.where(torch.isfinite(relative), relative, 0)
+    smallest = torch.linalg.eigvalsh(0.5 * (finite + finite.transpose(1, 2)))[:, 0]
+    return (largest <= MAX_SCALE_RATIO**2) & (smallest >= MIN_EIGENVALUE_RATIO * largest)
+
+
+# --- projection: Gaussians in the axes of one camera ---
 
 
 class ProjectedGaussians(NamedTuple):
-    """Gaussians as a camera sees them, everything but `radius` divided by their distance.
+    """Gaussians as one camera sees them; all lengths but `radius` are divided by their distance.
 
     Attributes:
         direction: unit direction from the camera to the mean, camera axes, float64.
         radius: distance of the mean, metres, float64.
         covariance: C' of docs/rendering.md, camera axes, float64.
         peak: opacity after the filter's compensation.
-        values: channels (RGB) seen from the camera, and the distance: what is averaged along a ray.
-        rows: rows a, b, l of the exact kernel; no rows for `ewa`, which finds them per picture.
-        along: S', the variance along the ray.
+        values: channels (RGB) seen from the camera, and the distance: the quantities that are averaged along a ray.
+        rows: a, b, l of the exact kernel; none for `ewa`, which computes them for each image plane.
+        radial_variance: S', the variance along the ray.
     """
 
     direction: Float[Tensor, "n 3"]
@@ -123,45 +152,7 @@ class ProjectedGaussians(NamedTuple):
     peak: Float[Tensor, "n"]
     values: Float[Tensor, "n value"]
     rows: Float[Tensor, "n f 3"]
-    along: Float[Tensor, "n"]
-
-
-class Footprints(NamedTuple):
-    """Gaussians ready to be drawn on one picture: alpha at x is peak * exp(-q(x - point) / 2).
-
-    With A, B, L = 0, 0, 1 plus the rows' products with x - point, q = Q / (L^2 + along Q), Q = A^2 + B^2.
-    """
-
-    point: Float[Tensor, "n 3"]
-    rows: Float[Tensor, "n 3 3"]
-    along: Float[Tensor, "n"]
-    peak: Float[Tensor, "n"]
-    values: Float[Tensor, "n value"]
-
-
-def is_finite(gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None = None) -> Bool[Tensor, "n"]:
-    """Which Gaussians hold only usable numbers: finite, and not so large that products overflow."""
-    shape = (gaussians.scales, gaussians.quats) if covariances is None else (covariances,)
-    keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
-    for field in (gaussians.means, *shape, gaussians.opacities, gaussians.harmonics):
-        keep &= (field.detach().abs() < MAX_MAGNITUDE).reshape(len(keep), max(1, field[:1].numel())).all(dim=1)
-    return keep
-
-
-def has_valid_shape(
-    gaussians: Gaussians,
-    covariances: Float[Tensor, "n 3 3"] | None,
-    radius: Float[Tensor, "n"],
-) -> Bool[Tensor, "n"]:
-    """Which Gaussians are not absurdly large for their distance, and have a covariance that can be one."""
-    if covariances is None:
-        return gaussians.scales.detach().double().abs().amax(dim=1) <= MAX_SCALE_RATIO * radius
-    relative = covariances.detach().double() / radius.square()[:, None, None]
-    largest = relative.diagonal(dim1=1, dim2=2).amax(dim=1)
-    # Rounding to float32 or less makes a disc's smallest variance slightly negative; more than that is no covariance.
-    finite = torch.where(torch.isfinite(relative), relative, 0)
-    smallest = torch.linalg.eigvalsh(0.5 * (finite + finite.transpose(1, 2)))[:, 0]
-    return (largest <= MAX_SCALE_RATIO**2) & (smallest >= MIN_EIGENVALUE_RATIO * largest)
+    radial_variance: Float[Tensor, "n"]
 
 
 def project_gaussians(
@@ -173,31 +164,28 @@ def project_gaussians(
     compensate: bool,
     exact: bool,
 ) -> ProjectedGaussians:
-    """The Gaussians as the camera sees them.
-
-    Works in chunks; under autograd each chunk is computed again in backward, so that memory stays bounded.
+    """Project Gaussians in chunks; under autograd, backward recomputes each chunk to bound the memory.
 
     Args:
-        gaussians: all drawable (see `is_finite`).
+        gaussians: all drawable (see `select_drawable`).
         covariances: in place of the Gaussians' scales and quats, square metres.
         cam2world: float64.
-        filter_variance: e^2, the variance that the filter adds across the ray, radians^2.
-        compensate: whether the opacity is lowered by as much as the filter widened the Gaussian.
-        exact: whether to find the exact kernel's rows.
+        filter_variance: e^2, added across the ray, radians^2.
+        compensate: scale the opacity by the loss of energy that the filter would otherwise add.
+        exact: compute the rows of the exact kernel.
     """
     shape = (gaussians.quats, gaussians.scales) if covariances is None else (covariances,)
     fields = (gaussians.means, gaussians.opacities, gaussians.harmonics, *shape)
-    work = functools.partial(
-        _observe_chunk, cam2world=cam2world, filter_variance=filter_variance, compensate=compensate, exact=exact
-    )
+    options = dict(cam2world=cam2world, filter_variance=filter_variance, compensate=compensate, exact=exact)
+    project = functools.partial(_project_chunk, **options)
     needs_grad = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (*fields, cam2world))
     parts = []
-    for chunk in zip(*(field.split(_CHUNK) for field in fields), strict=True):
-        parts.append(checkpoint(work, *chunk, use_reentrant=False) if needs_grad else work(*chunk))
+    for chunk in zip(*(field.split(_CHUNK_SIZE) for field in fields), strict=True):
+        parts.append(checkpoint(project, *chunk, use_reentrant=False) if needs_grad else project(*chunk))
     return ProjectedGaussians(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
-def _observe_chunk(
+def _project_chunk(
     means: Float[Tensor, "n 3"],
     opacities: Float[Tensor, "n"],
     harmonics: Float[Tensor, "n k channel"],
@@ -207,13 +195,7 @@ def _observe_chunk(
     compensate: bool,
     exact: bool,
 ) -> ProjectedGaussians:
-    """What `observe` finds, of Gaussians few enough to be observed at once.
-
-    Args:
-        means, opacities, harmonics: of the Gaussians.
-        shape: their quats and scales, or their covariances.
-        cam2world, filter_variance, compensate, exact: see `observe`.
-    """
+    """Project one chunk of `project_gaussians`; `shape` is the quats and scales, or the covariances."""
     dtype = means.dtype
     offset = means.double() - cam2world[:3, 3]
     radius = torch.linalg.vector_norm(offset, dim=1)
@@ -223,32 +205,34 @@ def _observe_chunk(
     world2cam = cam2world[:3, :3].T
     frame = torch.stack((*tangent_frame(direction), direction), dim=1)
     if len(shape) == 2:
-        body = _from_axes(world2cam @ rotations_from_quats(shape[0].double()), shape[1], radius, frame)
+        own = _shape_from_axes(world2cam @ rotations_from_quats(shape[0].double()), shape[1], radius, frame)
     else:
-        body = _from_covariance(world2cam @ shape[0].double() @ world2cam.T, radius, frame)
+        own = _shape_from_covariance(world2cam @ shape[0].double() @ world2cam.T, radius, frame)
     outer = direction[:, :, None] * direction[:, None, :]
-    covariance = body.covariance + filter_variance * (torch.eye(3, dtype=torch.float64, device=means.device) - outer)
-    det_filtered = body.det_across + filter_variance * body.trace_across + filter_variance**2
+    covariance = own.covariance + filter_variance * (torch.eye(3, dtype=torch.float64, device=means.device) - outer)
+    det_filtered = own.det_across + filter_variance * own.trace_across + filter_variance**2
     peak = opacities.double()
     if compensate:
-        # The bound keeps the square root's slope finite; below it nothing reaches the alpha cut.
-        peak = peak * torch.sqrt((body.det_across / det_filtered).clamp_min(MIN_COMPENSATION))
-    rows, along = covariance.new_zeros(len(means), 0, 3), torch.zeros_like(radius)
+        peak = peak * torch.sqrt((own.det_across / det_filtered).clamp_min(MIN_COMPENSATION))
+    rows, radial_variance = covariance.new_zeros(len(means), 0, 3), torch.zeros_like(radius)
     if exact:
-        along = (filter_variance**2 * body.along + filter_variance * body.mixed + body.det) / det_filtered
-        rows = _ray_rows(frame, body.in_frame, filter_variance, det_filtered)
+        radial_variance = filter_variance**2 * own.radial_variance + filter_variance * own.mixed + own.det
+        radial_variance = radial_variance / det_filtered
+        rows = _ray_rows(frame, own.in_frame, filter_variance, det_filtered)
     values = torch.cat((colours, radius.to(dtype)[:, None]), dim=1)
-    return ProjectedGaussians(direction, radius, covariance, peak.to(dtype), values, rows.to(dtype), along.to(dtype))
+    return ProjectedGaussians(
+        direction, radius, covariance, peak.to(dtype), values, rows.to(dtype), radial_variance.to(dtype)
+    )
 
 
-class _Body(NamedTuple):
-    """A Gaussian's shape before the filter, divided by its distance; section 1's minors.
+class _Shape(NamedTuple):
+    """A Gaussian's covariance before the filter, divided by its squared distance, and its minors (section 1).
 
     Attributes:
         covariance: C, camera axes.
         in_frame: C in the tangent frame u, v, n.
         det_across, trace_across: of B, the block across the ray.
-        along: g, the variance along the ray.
+        radial_variance: g, the variance along the ray.
         mixed: M = g tr B - |c|^2.
         det: det C.
     """
@@ -257,46 +241,46 @@ class _Body(NamedTuple):
     in_frame: Float[Tensor, "n 3 3"]
     det_across: Float[Tensor, "n"]
     trace_across: Float[Tensor, "n"]
-    along: Float[Tensor, "n"]
+    radial_variance: Float[Tensor, "n"]
     mixed: Float[Tensor, "n"]
     det: Float[Tensor, "n"]
 
 
-def _from_axes(
+def _shape_from_axes(
     own: Float[Tensor, "n 3 3"], scales: Float[Tensor, "n 3"], radius: Float[Tensor, "n"], frame: Float[Tensor, "n 3 3"]
-) -> _Body:
-    """From the own axes (columns, camera frame) and scales: sums of squares only, so nothing cancels."""
+) -> _Shape:
+    """From unit axes (columns, camera frame) and scales, by sums of squares, so that nothing cancels."""
     size = scales.double() / radius[:, None]
     axes = own * size[:, None, :]
     turned = frame @ axes
     cosine2 = (frame[:, 2:] @ own)[:, 0, :].square()
     minors2 = (size[:, (1, 2, 0)] * size[:, (2, 0, 1)]).square()
-    return _Body(
+    return _Shape(
         covariance=axes @ axes.transpose(1, 2),
         in_frame=turned @ turned.transpose(1, 2),
         det_across=(minors2 * cosine2).sum(dim=1),
         trace_across=(size.square() * (1 - cosine2)).sum(dim=1),
-        along=(size.square() * cosine2).sum(dim=1),
+        radial_variance=(size.square() * cosine2).sum(dim=1),
         mixed=(minors2 * (1 - cosine2)).sum(dim=1),
         det=size.square().prod(dim=1),
     )
 
 
-def _from_covariance(
+def _shape_from_covariance(
     covariance: Float[Tensor, "n 3 3"], radius: Float[Tensor, "n"], frame: Float[Tensor, "n 3 3"]
-) -> _Body:
-    """From a covariance in camera axes; what rounding made negative counts as zero."""
+) -> _Shape:
+    """From a covariance in camera axes; minors that rounding made negative are set to zero."""
     c = 0.5 * (covariance + covariance.transpose(1, 2)) / radius.square()[:, None, None]
     turned = frame @ c @ frame.transpose(1, 2)
     uu, vv, nn = turned.diagonal(dim1=1, dim2=2).unbind(1)
     uv, un, vn = turned[:, 0, 1], turned[:, 0, 2], turned[:, 1, 2]
     det = uu * (vv * nn - vn * vn) - uv * (uv * nn - vn * un) + un * (uv * vn - vv * un)
-    return _Body(
+    return _Shape(
         covariance=c,
         in_frame=turned,
         det_across=(uu * vv - uv * uv).clamp_min(0),
         trace_across=(uu + vv).clamp_min(0),
-        along=nn.clamp_min(0),
+        radial_variance=nn.clamp_min(0),
         mixed=(nn * (uu + vv) - un * un - vn * vn).clamp_min(0),
         det=det.clamp_min(0),
     )
@@ -308,7 +292,7 @@ def _ray_rows(
     filter_variance: float,
     det_filtered: Float[Tensor, "n"],
 ) -> Float[Tensor, "n 3 3"]:
-    """Rows a, b, l of section 3: whitened tangent axes, and the front form."""
+    """Rows a, b, l of section 3: whitened tangent axes, and the front row."""
     right, down, direction = frame.unbind(1)
     b_uu, b_vv = in_frame[:, 0, 0] + filter_variance, in_frame[:, 1, 1] + filter_variance
     b_uv, c_u, c_v = in_frame[:, 0, 1], in_frame[:, 0, 2], in_frame[:, 1, 2]
@@ -321,7 +305,7 @@ def _ray_rows(
 
 
 def tangent_frame(direction: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Two unit vectors that make a right-handed frame with each unit direction; smooth except at z = 0.
+    """Two unit vectors that form a right-handed frame with each unit direction; smooth except at z = 0.
 
     Source: Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 6(1), 2017.
     """
@@ -334,27 +318,60 @@ def tangent_frame(direction: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"]
     return first, second
 
 
-def ray_footprints(observed: ProjectedGaussians) -> Footprints:
-    """What the exact kernel draws, on any picture: points are directions in camera axes."""
-    return Footprints(observed.direction, observed.rows, observed.along, observed.peak, observed.values)
+# --- footprints on one image plane ---
+
+
+class Footprints(NamedTuple):
+    """Projected Gaussians on one image plane: alpha at x is peak * exp(-q(x - point) / 2).
+
+    With A, B, L = 0, 0, 1 plus the products of the rows with x - point, and Q = A^2 + B^2:
+    q = Q / (L^2 + radial_variance Q).
+    """
+
+    point: Float[Tensor, "n 3"]
+    rows: Float[Tensor, "n 3 3"]
+    radial_variance: Float[Tensor, "n"]
+    peak: Float[Tensor, "n"]
+    values: Float[Tensor, "n value"]
+
+
+def compute_footprints(
+    projected: ProjectedGaussians, plane: ImagePlane, options: RasterOptions
+) -> tuple[Footprints, Float[Tensor, "n 4"]]:
+    """Footprints on an image plane, and their bounding boxes (left, right, top, bottom; pixels)."""
+    if options.kernel == "ewa":
+        footprints, variances = ewa_footprints(projected, plane.rotation, plane.size, plane.focal, options.dilation)
+        return footprints, ewa_boxes(footprints.point.detach(), variances, kappa(projected.peak.detach()))
+    kappas, direction = kappa(projected.peak.detach()), projected.direction.detach()
+    covariance = projected.covariance.detach()
+    if plane.is_panorama:
+        return ray_footprints(projected), equirect_boxes(direction, covariance, kappas, plane.size)
+    turned = plane.rotation.T @ covariance @ plane.rotation
+    boxes = pinhole_boxes(direction @ plane.rotation, turned, kappas, plane.size, plane.focal)
+    return ray_footprints(projected), boxes
+
+
+def ray_footprints(projected: ProjectedGaussians) -> Footprints:
+    """Footprints of the exact kernel, the same on every image plane: points are directions in camera axes."""
+    return Footprints(projected.direction, projected.rows, projected.radial_variance, projected.peak, projected.values)
 
 
 def ewa_footprints(
-    observed: ProjectedGaussians, rotation: Float[Tensor, "3 3"], size: tuple[int, int], focal: float, dilation: float
+    projected: ProjectedGaussians, rotation: Float[Tensor, "3 3"], size: tuple[int, int], focal: float, dilation: float
 ) -> tuple[Footprints, Float[Tensor, "n 2"]]:
-    """What the classic kernel draws on a pinhole picture, points in pixels, and its variances in x and y.
+    """Footprints of EWA splatting on a pinhole image, points in pixels, and their variances in x and y.
 
     Args:
-        observed: all with a positive depth in the picture's camera.
-        rotation: the picture's camera axes in the observing camera's.
+        projected: all with a positive depth in the image plane's axes.
+        rotation: the image plane's axes in camera axes.
         size: height and width, pixels.
         focal: pixels.
         dilation: variance added on both axes, pixels^2.
     """
     height, width = size
-    dtype = observed.peak.dtype
-    x, y, z = (observed.direction @ rotation).unbind(1)
-    covariance = rotation.T @ observed.covariance @ rotation
+    dtype = projected.peak.dtype
+    x, y, z = (projected.direction @ rotation).unbind(1)
+    covariance = rotation.T @ projected.covariance @ rotation
     tan_x, tan_y = x / z, y / z
     limit = 0.5 * EWA_CLAMP
     clamped_x = tan_x.clamp(-limit * width / focal, limit * width / focal)
@@ -369,88 +386,97 @@ def ewa_footprints(
     second = torch.stack((-v_xy / v_xx, one, zero), dim=1) / torch.sqrt(across)[:, None]
     rows = torch.stack((first, second, torch.zeros_like(first)), dim=1).to(dtype)
     point = torch.stack((focal * tan_x + 0.5 * width, focal * tan_y + 0.5 * height, zero), dim=1)
-    splats = Footprints(point, rows, torch.zeros_like(observed.peak), observed.peak, observed.values)
-    return splats, torch.stack((v_xx, v_yy), dim=1).detach()
+    footprints = Footprints(point, rows, torch.zeros_like(projected.peak), projected.peak, projected.values)
+    return footprints, torch.stack((v_xx, v_yy), dim=1).detach()
 
 
-_EVERYTHING = 1e9  # pixels, far outside any picture
+# --- bounding boxes: exact on pinhole images, tight and conservative on panoramas; float64, without gradient ---
 
 
 def kappa(peak: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Largest q at which alpha still reaches the cut; negative where it never does. Rounded up a little."""
+    """Largest q at which alpha reaches the cut, rounded up; negative where it never does."""
     return 2 * torch.log(peak.double().clamp_min(1e-30) / ALPHA_CUT) + KAPPA_MARGIN
+
+
+def is_in_image(
+    boxes: Float[Tensor, "n 4"], plane: ImagePlane, rows: tuple[int, int] | None = None
+) -> Bool[Tensor, "n"]:
+    """Which boxes (left, right, top, bottom; pixels) intersect the image.
+
+    Args:
+        rows: only these rows of pixels: the first, and one past the last.
+    """
+    first, end = rows or (0, plane.size[0])
+    left, right, top, bottom = boxes.unbind(1)
+    inside = (left <= right) & (bottom > first) & (top < end)
+    return inside if plane.is_panorama else inside & (right > 0) & (left < plane.size[1])
 
 
 def pinhole_boxes(
     direction: Float[Tensor, "n 3"],
     covariance: Float[Tensor, "n 3 3"],
-    level: Float[Tensor, "n"],
+    kappas: Float[Tensor, "n"],
     size: tuple[int, int],
     focal: float,
 ) -> Float[Tensor, "n 4"]:
-    """Boxes (left, right, top, bottom; pixels) of the exact kernel on a pinhole picture.
-
-    Left > right where a Gaussian is not seen.
+    """Boxes (left, right, top, bottom; pixels) of the exact kernel on a pinhole image; left > right where unseen.
 
     Args:
-        direction, covariance: in the picture's camera axes.
-        level: kappa.
+        direction, covariance: in the image plane's axes.
+        kappas: see `kappa`.
         size: height and width, pixels.
         focal: pixels.
     """
     height, width = size
     n_z = direction[:, 2]
-    d_zz = n_z.square() - level * covariance[:, 2, 2]
-    crosses = d_zz <= 0  # the plane through the eye: no bound
+    d_zz = n_z.square() - kappas * covariance[:, 2, 2]
+    crosses = d_zz <= 0  # the plane z = 0: no bound
     safe = torch.where(crosses, torch.ones_like(d_zz), d_zz)
     edges = []
     for axis, extent in ((0, width), (1, height)):
         n_x = direction[:, axis]
         c_xx, c_xz, c_zz = covariance[:, axis, axis], covariance[:, axis, 2], covariance[:, 2, 2]
         across = n_z.square() * c_xx + n_x.square() * c_zz - 2 * n_x * n_z * c_xz
-        root = torch.sqrt((level * across + level.square() * (c_xz.square() - c_xx * c_zz)).clamp_min(0))
-        middle = n_x * n_z - level * c_xz
+        root = torch.sqrt((kappas * across + kappas.square() * (c_xz.square() - c_xx * c_zz)).clamp_min(0))
+        middle = n_x * n_z - kappas * c_xz
         for sign in (-1, 1):
             edge = focal * (middle + sign * root) / safe + 0.5 * extent
-            edges.append(torch.where(crosses, torch.full_like(edge, sign * _EVERYTHING), edge))
-    unseen = (level < 0) | (~crosses & (n_z < 0))
-    # Those that cross the plane through the eye have no box, but most of them lie beside the view.
-    for normal in _inward(size, focal, direction):
+            edges.append(torch.where(crosses, torch.full_like(edge, sign * _UNBOUNDED), edge))
+    unseen = (kappas < 0) | (~crosses & (n_z < 0))
+    # Gaussians that cross z = 0 have no box, but most of them lie outside the view frustum.
+    for normal in _frustum_normals(size, focal, direction):
         distance = direction @ normal
-        clear = distance.square() > level * (covariance @ normal @ normal)
+        clear = distance.square() > kappas * (covariance @ normal @ normal)
         unseen |= clear & (distance < 0)
-    return _hide(torch.stack(edges, dim=1), unseen)
+    return _mark_unseen(torch.stack(edges, dim=1), unseen)
 
 
-def _inward(size: tuple[int, int], focal: float, like: Tensor) -> Float[Tensor, "4 3"]:
-    """Normals, into the view, of the planes through the eye and the picture's four sides."""
+def _frustum_normals(size: tuple[int, int], focal: float, like: Tensor) -> Float[Tensor, "4 3"]:
+    """Inward normals of the four sides of the view frustum."""
     across, down = size[1] / (2 * focal), size[0] / (2 * focal)
     normals = ((1, 0, across), (-1, 0, across), (0, 1, down), (0, -1, down))
     return torch.tensor(normals, dtype=like.dtype, device=like.device)
 
 
 def ewa_boxes(
-    point: Float[Tensor, "n 3"], variances: Float[Tensor, "n 2"], level: Float[Tensor, "n"]
+    point: Float[Tensor, "n 3"], variances: Float[Tensor, "n 2"], kappas: Float[Tensor, "n"]
 ) -> Float[Tensor, "n 4"]:
-    """Boxes of the classic kernel (left, right, top, bottom; pixels)."""
-    reach = torch.sqrt(level.clamp_min(0)[:, None] * variances)
+    """Boxes of EWA footprints (left, right, top, bottom; pixels)."""
+    reach = torch.sqrt(kappas.clamp_min(0)[:, None] * variances)
     low, high = point[:, :2] - reach, point[:, :2] + reach
-    return _hide(torch.stack((low[:, 0], high[:, 0], low[:, 1], high[:, 1]), dim=1), level < 0)
+    return _mark_unseen(torch.stack((low[:, 0], high[:, 0], low[:, 1], high[:, 1]), dim=1), kappas < 0)
 
 
 def equirect_boxes(
     direction: Float[Tensor, "n 3"],
     covariance: Float[Tensor, "n 3 3"],
-    level: Float[Tensor, "n"],
+    kappas: Float[Tensor, "n"],
     size: tuple[int, int],
 ) -> Float[Tensor, "n 4"]:
-    """Boxes of the exact kernel on a panorama, pixels.
-
-    Left may be negative and right beyond the width: they wrap.
-    """
+    """Boxes of the exact kernel on a panorama, pixels; they wrap: left may be negative, right beyond the width."""
     height, width = size
     x, y, z = direction.unbind(1)
-    level = level[:, None]
+    kappas = kappas[:, None]
     flat = torch.hypot(x, z)
     on_axis = flat < 1e-12
     ahead_x = torch.where(on_axis, torch.zeros_like(x), x / flat.clamp_min(1e-12))
@@ -461,46 +487,46 @@ def equirect_boxes(
     south = torch.stack((-y * ahead_x, flat, -y * ahead_z), dim=1)
 
     def form(p: Tensor, q: Tensor) -> Tensor:
-        return ((p[:, None, :] @ covariance)[:, 0, :] * q).sum(dim=1, keepdim=True) * level
+        return ((p[:, None, :] @ covariance)[:, 0, :] * q).sum(dim=1, keepdim=True) * kappas
 
-    # Longitude, from the mean's: tangents of the shadow on the horizontal plane.
+    # Longitude relative to the mean's: tangents of the projection on the horizontal plane.
     d_ff = flat[:, None].square() - form(ahead, ahead)
-    slopes = _tangents(form(east, ahead), form(east, east), d_ff)
+    slopes = _cone_slopes(form(east, ahead), form(east, east), d_ff)
     longitude = torch.atan2(x, z)[:, None]
     columns = ((longitude + torch.atan(slopes)) / (2 * math.pi) + 0.5) * width
-    around = torch.tensor((-_EVERYTHING, _EVERYTHING), dtype=columns.dtype, device=columns.device)
+    around = torch.tensor((-_UNBOUNDED, _UNBOUNDED), dtype=columns.dtype, device=columns.device)
     columns = torch.where(d_ff <= 0, around, columns)
 
     # Latitude: a box around the ellipse in the plane that touches the sphere at the mean's direction.
     d_nn = 1 - form(direction, direction)
-    sides = _tangents(form(east, direction), form(east, east), d_nn).abs().amax(dim=1)
-    ends = _tangents(form(south, direction), form(south, south), d_nn)
-    bottom = torch.asin(_highest_sine(y, flat, ends, sides))
-    top = -torch.asin(_highest_sine(-y, flat, -ends.flip(1), sides))
+    sides = _cone_slopes(form(east, direction), form(east, east), d_nn).abs().amax(dim=1)
+    ends = _cone_slopes(form(south, direction), form(south, south), d_nn)
+    bottom = torch.asin(_max_sine(y, flat, ends, sides))
+    top = -torch.asin(_max_sine(-y, flat, -ends.flip(1), sides))
     rows = (torch.stack((top, bottom), dim=1) / math.pi + 0.5) * height
     rows = torch.where(d_nn <= 0, around, rows)
     columns = torch.where(d_nn <= 0, around, columns)
-    return _hide(torch.cat((columns, rows), dim=1), level[:, 0] < 0)
+    return _mark_unseen(torch.cat((columns, rows), dim=1), kappas[:, 0] < 0)
 
 
-def _tangents(mixed: Tensor, side: Tensor, ahead: Tensor) -> Float[Tensor, "n 2"]:
-    """Lower and upper slope of a cone with dual entries -mixed, -side, ahead > 0 (else 1 stands in)."""
+def _cone_slopes(mixed: Tensor, side: Tensor, ahead: Tensor) -> Float[Tensor, "n 2"]:
+    """Lower and upper slope of a cone with dual entries -mixed, -side and ahead; ahead <= 0 is replaced by 1."""
     ahead = torch.where(ahead > 0, ahead, torch.ones_like(ahead))
     root = torch.sqrt((mixed.square() + side * ahead).clamp_min(0))
     return torch.cat((-mixed - root, -mixed + root), dim=1) / ahead
 
 
-def _highest_sine(
+def _max_sine(
     sine: Float[Tensor, "n"],
     cosine: Float[Tensor, "n"],
     ends: Float[Tensor, "n 2"],
     sides: Float[Tensor, "n"],
 ) -> Float[Tensor, "n"]:
-    """Bound on the sine of latitude over a box in the tangent plane at latitude asin(sine).
+    """Upper bound of the sine of latitude over a box in the tangent plane at latitude asin(sine).
 
     Args:
-        ends: lowest and highest step towards growing latitude.
-        sides: largest step aside.
+        ends: smallest and largest offset towards growing latitude.
+        sides: largest offset along the parallel.
     """
     height = sine[:, None] + ends * cosine[:, None]
     aside = torch.where(height > 0, torch.zeros_like(height), sides[:, None].square())
@@ -509,36 +535,6 @@ def _highest_sine(
     return torch.where(over_pole, torch.ones_like(highest), highest).clamp(-1, 1)
 
 
-def _hide(boxes: Float[Tensor, "n 4"], unseen: Tensor) -> Float[Tensor, "n 4"]:
+def _mark_unseen(boxes: Float[Tensor, "n 4"], unseen: Tensor) -> Float[Tensor, "n 4"]:
     nowhere = torch.tensor((1.0, -1.0, 1.0, -1.0), dtype=boxes.dtype, device=boxes.device)
     return torch.where(unseen[:, None], nowhere, boxes)
-
-
-def is_in_image(
-    boxes: Float[Tensor, "n 4"], picture: ImagePlane, rows: tuple[int, int] | None = None
-) -> Bool[Tensor, "n"]:
-    """Which boxes (left, right, top, bottom; pixels) reach into the picture.
-
-    Args:
-        rows: the first that count, and the first after them; by default all.
-    """
-    first, end = rows or (0, picture.size[0])
-    left, right, top, bottom = boxes.unbind(1)
-    inside = (left <= right) & (bottom > first) & (top < end)
-    return inside if picture.is_panorama else inside & (right > 0) & (left < picture.size[1])
-
-
-def compute_footprints(
-    observed: ProjectedGaussians, picture: ImagePlane, options: RasterOptions
-) -> tuple[Footprints, Float[Tensor, "n 4"]]:
-    """The Gaussians on a picture, and the boxes they can be seen in."""
-    if options.kernel == "ewa":
-        splats, variances = ewa_footprints(observed, picture.rotation, picture.size, picture.focal, options.dilation)
-        return splats, ewa_boxes(splats.point.detach(), variances, kappa(observed.peak.detach()))
-    level, direction = kappa(observed.peak.detach()), observed.direction.detach()
-    covariance = observed.covariance.detach()
-    if picture.is_panorama:
-        return ray_footprints(observed), equirect_boxes(direction, covariance, level, picture.size)
-    turned = picture.rotation.T @ covariance @ picture.rotation
-    boxes = pinhole_boxes(direction @ picture.rotation, turned, level, picture.size, picture.focal)
-    return ray_footprints(observed), boxes

@@ -7,7 +7,7 @@ import torch
 
 from pansplat.rendering.image_planes import image_planes
 from pansplat.rendering.projection import equirect_boxes, pinhole_boxes
-from pansplat.rendering.reference import TILE, list_tiles, tile_grid
+from pansplat.rendering.reference import TILE_SIZE, intersect_tiles, tile_grid
 
 
 def _cones(count: int, seed: int, size: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -96,16 +96,16 @@ def test_tile_lists_equal_brute_force_in_bands_of_any_size(wraps, size):
     shifts = (-1, 0, 1) if wraps else (0,)
     for limit in (1 << 20, 100):
         found = {}
-        for lists in list_tiles(boxes, order, size, wraps=wraps, limit=limit):
+        for lists in intersect_tiles(boxes, order, size, wraps=wraps, limit=limit):
             for tile in range(*lists.tiles):
                 low, high = lists.starts[tile - lists.tiles[0]], lists.starts[tile - lists.tiles[0] + 1]
-                found[tile] = lists.entries[low:high].tolist()
+                found[tile] = lists.indices[low:high].tolist()
         assert sorted(found) == list(range(rows * columns))
         rank = {int(g): i for i, g in enumerate(order)}
         for tile, entries in found.items():
             assert [rank[g] for g in entries] == sorted({rank[g] for g in entries})
-            px = x[(tile % columns) * TILE : (tile % columns + 1) * TILE]
-            py = y[(tile // columns) * TILE : (tile // columns + 1) * TILE]
+            px = x[(tile % columns) * TILE_SIZE : (tile % columns + 1) * TILE_SIZE]
+            py = y[(tile // columns) * TILE_SIZE : (tile // columns + 1) * TILE_SIZE]
             across = torch.stack(
                 [((px + k * width >= boxes[:, :1]) & (px + k * width <= boxes[:, 1:2])).any(dim=1) for k in shifts]
             ).any(dim=0)
@@ -123,6 +123,6 @@ def test_a_picture_is_the_same_in_narrow_bands(make_scene, pose, monkeypatch):
 
     scene = make_scene(120, scale=0.3)
     whole = rasterize(scene, pose, size=(40, 80))
-    monkeypatch.setattr(reference, "list_tiles", lambda *a, **k: list_tiles(*a, **k, limit=50))
+    monkeypatch.setattr(reference, "intersect_tiles", lambda *a, **k: intersect_tiles(*a, **k, limit=50))
     assert torch.equal(rasterize(scene, pose, size=(40, 80)).color, whole.color)
     assert math.isfinite(float(whole.color.sum()))

@@ -1,3 +1,3 @@
-"""The backend for CUDA devices, in Triton. docs/triton.md tells how it works and what was checked."""
+"""The backend for CUDA devices, in Triton; docs/triton.md describes it and how it was tested."""
 
-from pansplat.rendering.cuda.draw import rasterize_planes as rasterize_planes
+from pansplat.rendering.cuda.backend import rasterize_planes as rasterize_planes

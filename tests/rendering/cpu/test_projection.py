@@ -29,7 +29,7 @@ def test_records_and_values_are_the_references(degree, by_covariance, make_scene
     assert _relative(found["direction"], expected.direction) < 1e-14
     assert _relative(found["across"], across) < 3e-7
     assert _relative(found["front"], front) < 3e-7
-    assert _relative(found["along"], expected.along) < 3e-7
+    assert _relative(found["along"], expected.radial_variance) < 3e-7
     assert _relative(found["peak"], expected.peak) < 3e-7
     torch.testing.assert_close(torch.from_numpy(observed.values).double(), expected.values, rtol=3e-7, atol=2e-6)
     assert np.abs(observed.radii / expected.values[:, -1].numpy() - 1).max() < 1e-14

@@ -87,7 +87,7 @@ def test_chained_gradients_are_autograds(degree, by_covariance, compensate, make
     )
     weights = _weights(seen.direction.detach(), 3)
     first, second, front = seen.rows.unbind(1)
-    _response(seen.direction, first, second, front, seen.along, seen.peak, seen.values, weights).backward()
+    _response(seen.direction, first, second, front, seen.radial_variance, seen.peak, seen.values, weights).backward()
 
     given = fields(scene, None if covariances is None else covariances.detach())
     numba_camera = Camera(pose.numpy(), spread, compensate, 0.05)

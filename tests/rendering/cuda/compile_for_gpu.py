@@ -16,26 +16,41 @@ from triton import knobs
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from pansplat.rendering.cuda.layout import Layout
-from pansplat.rendering.cuda.lists import emit_kernel
-from pansplat.rendering.cuda.observe import observe_kernel
-from pansplat.rendering.cuda.observe_backward import observe_backward_kernel
-from pansplat.rendering.cuda.raster import num_warps, raster_kernel
-from pansplat.rendering.cuda.raster_backward import backward_kernel, reduce_kernel
+from pansplat.rendering.cuda.projection import project_kernel
+from pansplat.rendering.cuda.projection_backward import project_backward_kernel
+from pansplat.rendering.cuda.rasterize import (
+    RecordLayout,
+    num_warps,
+    rasterize_backward_kernel,
+    rasterize_kernel,
+    sum_gradients_kernel,
+)
+from pansplat.rendering.cuda.tiling import intersect_kernel
 
-_FLOATS = ("means", "opacities", "harmonics", "first_shape", "second_shape", "peaks", "values", "forms", "alongs")
-_FLOATS += ("records", "centres", "offsets", "sums", "grad_sums", "rows", "totals")
-_INTEGERS = ("entries", "slots", "starts", "stops", "busiest", "which", "ranges")
-_FLOATS += ("by_worlds", "by_peaks", "by_forms", "by_alongs")
-_FLOATS += ("by_means", "by_opacities", "by_first_shape", "by_second_shape")
-_DOUBLES = ("camera", "directions", "radii", "covariances", "by_directions", "by_radii", "by_covariances", "by_camera")
+_FLOATS = (
+    "means",
+    "opacities",
+    "harmonics",
+    "first_shape",
+    "second_shape",
+    "peaks",
+    "values",
+    "rows",
+    "radial_variances",
+)
+_FLOATS += ("records", "centres", "offsets", "sums", "grad_sums", "gradients", "totals")
+_INTEGERS = ("record_ids", "slots", "starts", "stops", "busiest", "which", "ranges")
+_FLOATS += ("grad_world_directions", "grad_peaks", "grad_rows", "grad_radial_variances")
+_FLOATS += ("grad_means", "grad_opacities", "grad_first_shape", "grad_second_shape")
+_DOUBLES = ("camera", "directions", "radii", "covariances", "grad_directions", "grad_radii")
+_DOUBLES += ("grad_covariances", "grad_camera")
 _TYPES = {"ends": "*i64", "tiles": "i32", **dict.fromkeys(_DOUBLES, "*fp64")}
 _SIZES = ("TINY", "AXES", "CHANNELS", "RECORD", "PEAK", "GRADIENT", "FIELDS", "GROUP", "AT_ONCE")
 _SIZES += ("DEGREE", "BY_AXES", "COMPENSATE", "EXACT", "BLOCK")
 
 
 def _type(kernel, name: str) -> str:
-    if kernel is emit_kernel and name in ("records", "tiles"):
+    if kernel is intersect_kernel and name in ("records", "tiles"):
         return {"records": "*i32", "tiles": "*i16"}[name]
     if name in _SIZES:
         return "constexpr"
@@ -63,24 +78,25 @@ def main() -> None:
     for capability in [int(text) for text in sys.argv[1:]] or [80, 90]:
         for exact in (True, False):
             for channels in (3, 8) if exact else (3,):
-                layout = Layout(exact, channels)
+                layout = RecordLayout(exact, channels)
                 sizes = dict(
-                    TINY=3.5e-4, AXES=layout.axes, CHANNELS=channels, RECORD=layout.record, PEAK=layout.peak,
-                    GRADIENT=layout.gradient, FIELDS=triton.next_power_of_2(layout.gradient),
+                    TINY=3.5e-4, AXES=layout.axes, CHANNELS=channels, RECORD=layout.record_size,
+                    PEAK=layout.peak_column,
+                    GRADIENT=layout.gradient_size, FIELDS=triton.next_power_of_2(layout.gradient_size),
                 )  # fmt: skip
                 name = f"{'ray' if exact else 'ewa'}, {channels} channels"
-                _report(f"forward {name}", raster_kernel, num_warps(layout, 2), capability, **sizes)
-                _report(f"backward {name}", backward_kernel, num_warps(layout, 1), capability, **sizes)
+                _report(f"forward {name}", rasterize_kernel, num_warps(layout, 2), capability, **sizes)
+                _report(f"backward {name}", rasterize_backward_kernel, num_warps(layout, 1), capability, **sizes)
         for group, at_once in ((16, 1), (1, 16)):
             sizes = dict(GRADIENT=18, FIELDS=32, GROUP=group, AT_ONCE=at_once)
-            _report(f"sum {group} x {at_once}", reduce_kernel, 2, capability, **sizes)
+            _report(f"sum {group} x {at_once}", sum_gradients_kernel, 2, capability, **sizes)
         for by_axes in (True, False):
             sizes = dict(DEGREE=4, CHANNELS=3, BY_AXES=by_axes, COMPENSATE=True, EXACT=True, BLOCK=128)
             name = "scales" if by_axes else "covariances"
-            _report(f"observe, degree 4, {name}", observe_kernel, 4, capability, **sizes)
+            _report(f"project, degree 4, {name}", project_kernel, 4, capability, **sizes)
             sizes |= dict(BLOCK=64)
-            _report(f"observe backward, {name}", observe_backward_kernel, 2, capability, **sizes)
-        _report("emit", emit_kernel, 4, capability)
+            _report(f"project backward, {name}", project_backward_kernel, 2, capability, **sizes)
+        _report("intersect", intersect_kernel, 4, capability)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import sys
 import pytest
 import torch
 
-from pansplat.rendering.reference import list_tiles, tile_grid
+from pansplat.rendering.reference import intersect_tiles, tile_grid
 
 
 @pytest.mark.hard_case(27)
@@ -18,11 +18,11 @@ def test_entries_are_counted_in_64_bits_and_listed_in_bands():
     assert count * rows * columns > 2**31
     everywhere = torch.tensor([[-1e9, 1e9, -1e9, 1e9]], dtype=torch.float64).expand(count, 4)
     # One row of tiles alone holds 20 million entries, so a band is a row: take the first and look no further.
-    narrow = next(list_tiles(everywhere[:100], torch.arange(100), size, wraps=True, limit=limit))
+    narrow = next(intersect_tiles(everywhere[:100], torch.arange(100), size, wraps=True, limit=limit))
     assert narrow.starts.dtype == torch.int64
     assert narrow.tiles == (0, columns * (limit // (100 * columns)))
-    assert len(narrow.entries) <= limit and int(narrow.starts[-1]) == len(narrow.entries)
-    assert torch.equal(narrow.entries[:100], torch.arange(100))
+    assert len(narrow.indices) <= limit and int(narrow.starts[-1]) == len(narrow.indices)
+    assert torch.equal(narrow.indices[:100], torch.arange(100))
 
 
 @pytest.mark.hard_case(27)
@@ -35,11 +35,11 @@ def test_boxes_of_any_extent_are_limited_before_they_become_integers(value, wrap
     )
     if wraps:  # a panorama's boxes are limited to the panorama before they are listed, or go all around
         boxes = boxes[[0, 3]]
-    found = list(list_tiles(boxes, torch.arange(len(boxes)), (16, 32), wraps=wraps))
+    found = list(intersect_tiles(boxes, torch.arange(len(boxes)), (16, 32), wraps=wraps))
     assert len(found) == 1
     per_tile = found[0].starts.diff()
-    assert int(per_tile.sum()) == len(found[0].entries)
-    assert (torch.bincount(found[0].entries, minlength=len(boxes))[[0, -1]] == torch.tensor([8, 2])).all()
+    assert int(per_tile.sum()) == len(found[0].indices)
+    assert (torch.bincount(found[0].indices, minlength=len(boxes))[[0, -1]] == torch.tensor([8, 2])).all()
 
 
 _CROWD = """

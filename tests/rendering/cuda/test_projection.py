@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from pansplat.rendering.cuda.observe import project_gaussians
+from pansplat.rendering.cuda.backend import project_gaussians
 from pansplat.rendering.projection import ProjectedGaussians
 from pansplat.rendering.projection import project_gaussians as reference
 
@@ -43,9 +43,9 @@ def test_what_is_seen_equals_the_reference(exact, compensate, by_covariance, deg
 @pytest.mark.parametrize("by_covariance", [True, False])
 @pytest.mark.parametrize("exact", [True, False])
 def test_gradients_equal_the_references(exact, by_covariance, make_scene, pose, monkeypatch):
-    from pansplat.rendering.cuda import observe_backward as room
+    from pansplat.rendering.cuda import projection_backward
 
-    monkeypatch.setattr(room, "_CHUNK", 50)
+    monkeypatch.setattr(projection_backward, "_CHUNK_SIZE", 50)
     scene = make_scene(70)  # one program and a part
     scene.quats[3] = 0
     scene.scales[5, 1] = 0

@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from pansplat.rendering.cuda.layout import TILE, Layout, pack, unpack
-from pansplat.rendering.cuda.lists import list_instances, list_tiles
-from pansplat.rendering.cuda.pixels import tile_pixels
+from pansplat.rendering.cuda.rasterize import RecordLayout, pack_records, unpack_gradients
+from pansplat.rendering.cuda.tiling import TILE_SIZE, intersect_tiles, sort_instances, tile_pixels
 from pansplat.rendering.image_planes import image_planes
 from pansplat.rendering.projection import Footprints
 from pansplat.rendering.reference import tile_ranges
@@ -29,21 +28,21 @@ def test_tile_lists_equal_brute_force_in_bands_of_any_size(wraps, limit):
     boxes = [_boxes(40, size, seed) for seed in range(num)]
     keys = [torch.randint(0, 9, (40,), generator=torch.Generator().manual_seed(seed)).double() for seed in range(num)]
     bases = [0, 40, 80]
-    instances = list_instances(boxes, keys, bases, size, wraps=wraps)
+    instances = sort_instances(boxes, keys, bases, size, wraps=wraps)
     rows, columns = instances.grid
     assert (rows, columns) == (4 * num, 5)
     expected = [[] for _ in range(rows * columns)]
     for picture in range(num):
-        ranges = tile_ranges(boxes[picture], size, wraps, TILE).tolist()
+        ranges = tile_ranges(boxes[picture], size, wraps, TILE_SIZE).tolist()
         for i in sorted(range(40), key=lambda i: (float(keys[picture][i]), i)):
             left, across, top, down = ranges[i]
             for tile in ((y, (left + x) % columns) for y in range(top, top + down) for x in range(across)):
                 expected[(picture * 4 + tile[0]) * columns + tile[1]].append(bases[picture] + i)
     found, bands = [], 0
-    for lists in list_tiles(instances, limit):
+    for lists in intersect_tiles(instances, limit):
         assert lists.rows[0] * columns == len(found)
         bands += 1
-        found += [lists.entries[a:b].tolist() for a, b in zip(lists.starts[:-1], lists.starts[1:], strict=True)]
+        found += [lists.record_ids[a:b].tolist() for a, b in zip(lists.starts[:-1], lists.starts[1:], strict=True)]
     assert found == expected and sum(map(len, expected)) > 100
     assert bands == {1: 4 * num, 1 << 20: 1}.get(limit, bands)
 
@@ -51,22 +50,22 @@ def test_tile_lists_equal_brute_force_in_bands_of_any_size(wraps, limit):
 def test_slots_gather_the_entries_of_one_gaussian():
     size = (50, 70)
     box, key = _boxes(40, size, 0), torch.rand(40, generator=torch.Generator().manual_seed(1))
-    instances = list_instances([box], [key], [0], size, wraps=False)
-    (lists,) = list_tiles(instances)
-    together = torch.empty_like(lists.entries)
-    together[lists.slots.long()] = lists.entries
+    instances = sort_instances([box], [key], [0], size, wraps=False)
+    (lists,) = intersect_tiles(instances)
+    together = torch.empty_like(lists.record_ids)
+    together[lists.slots.long()] = lists.record_ids
     counts = lists.ends.diff(prepend=lists.ends.new_zeros(1))
     assert torch.equal(together, instances.records.repeat_interleave(counts))
     assert int(counts.max()) > 4 and lists.ends.dtype == torch.int64
 
 
 def test_more_tiles_than_16_bits_count_are_listed_in_several_bands(monkeypatch):
-    from pansplat.rendering.cuda import lists as room
+    from pansplat.rendering.cuda import tiling
 
-    monkeypatch.setattr(room, "_TILES", 10)
+    monkeypatch.setattr(tiling, "_MAX_TILES", 10)
     size = (50, 70)
-    instances = list_instances([_boxes(40, size, 0)], [torch.arange(40.0)], [0], size, wraps=False)
-    found = [lists.rows for lists in list_tiles(instances)]
+    instances = sort_instances([_boxes(40, size, 0)], [torch.arange(40.0)], [0], size, wraps=False)
+    found = [lists.rows for lists in intersect_tiles(instances)]
     assert found == [(0, 2), (2, 4)]
 
 
@@ -75,10 +74,10 @@ def test_centres_and_offsets_keep_more_digits_than_their_type():
         planes = image_planes(layout, (200, 360), vertical_fov_degrees=90.0, face_size=100, device=torch.device("cpu"))
         pixels = tile_pixels(planes, exact=exact, dtype=torch.float32)
         height, width = planes[0].size
-        rows, columns = -(-height // TILE), -(-width // TILE)
+        rows, columns = -(-height // TILE_SIZE), -(-width // TILE_SIZE)
         both = pixels.centres.double().sum(dim=1)[:, :, None] + pixels.offsets.double()
-        both = both.reshape(len(planes), rows, columns, -1, TILE, TILE).permute(0, 1, 4, 2, 5, 3)
-        both = both.reshape(len(planes), rows * TILE, columns * TILE, -1)[:, :height, :width]
+        both = both.reshape(len(planes), rows, columns, -1, TILE_SIZE, TILE_SIZE).permute(0, 1, 4, 2, 5, 3)
+        both = both.reshape(len(planes), rows * TILE_SIZE, columns * TILE_SIZE, -1)[:, :height, :width]
         points = torch.stack([plane.directions() if exact else plane.coordinates() for plane in planes])
         # Rounding the offsets is all that is lost.
         assert float((both - points).abs().max()) < 2**-24 * float(pixels.offsets.abs().max())
@@ -86,18 +85,20 @@ def test_centres_and_offsets_keep_more_digits_than_their_type():
 
 @pytest.mark.parametrize("exact", [True, False])
 def test_records_and_gradients_have_the_layouts_lengths(exact):
-    layout = Layout(exact, channels=5)
+    layout = RecordLayout(exact, channels=5)
     splats = Footprints(*(torch.rand(3, *shape) for shape in ((3,), (3, 3), (), (), (6,))))
     splats = splats._replace(point=torch.rand(3, 3, dtype=torch.float64))
-    records = pack(splats, layout)
-    point, remainder = records.double().split((layout.axes, layout.axes, layout.record - 2 * layout.axes), dim=1)[:2]
+    records = pack_records(splats, layout)
+    point, remainder = records.double().split((layout.axes, layout.axes, layout.record_size - 2 * layout.axes), dim=1)[
+        :2
+    ]
     assert float((point + remainder - splats.point[:, : layout.axes]).abs().max()) < 1e-14
-    assert records.shape == (3, layout.record)
-    assert torch.equal(records[:, layout.peak], splats.peak) and torch.equal(
-        records[:, layout.peak + 1 :], splats.values
+    assert records.shape == (3, layout.record_size)
+    assert torch.equal(records[:, layout.peak_column], splats.peak) and torch.equal(
+        records[:, layout.peak_column + 1 :], splats.values
     )
-    rows = torch.arange(3.0 * layout.gradient).reshape(3, -1)
-    back = unpack(rows, splats.rows, layout)
+    rows = torch.arange(3.0 * layout.gradient_size).reshape(3, -1)
+    back = unpack_gradients(rows, splats.rows, layout)
     assert torch.equal(back.peak, rows[:, -7]) and torch.equal(back.values, rows[:, -6:])
-    assert torch.equal(back.along, rows[:, -8] if exact else torch.zeros(3))
+    assert torch.equal(back.radial_variance, rows[:, -8] if exact else torch.zeros(3))
     assert back.point.dtype == torch.float64 and back.rows.shape == (3, 3, 3)

@@ -99,9 +99,9 @@ def test_odd_sizes_equal_float64_torch(size, make_scene, pose):
 
 
 def test_a_gaussian_over_many_tiles_has_the_gradient_of_float64_torch(make_scene, pose, monkeypatch):
-    from pansplat.rendering.cuda import raster_backward
+    from pansplat.rendering.cuda import rasterize as stage
 
-    monkeypatch.setattr(raster_backward, "_MANY", 4)
+    monkeypatch.setattr(stage, "_MANY_TILES", 4)
     scene = make_scene(2, scale=1.5, spread=0.8, seed=1, degree=0)
     options = dict(size=(48, 96), layout="equirect")
     truth = _gradients(scene, pose, torch.float64, None, backend="torch", **options)
@@ -145,12 +145,11 @@ def test_what_lies_behind_a_saturated_tile_is_left_out(make_scene, pose):
 
 
 def test_narrow_bands_of_tiles_draw_the_same(make_scene, pose, monkeypatch):
-    from pansplat.rendering.cuda import composite
+    from pansplat.rendering.cuda import tiling
 
     scene = make_scene(12, scale=0.3, degree=0)
     wide = _gradients(scene, pose, torch.float64, None, backend="triton", size=(20, 40), layout="equirect")
-    narrow_lists = functools.partial(composite.list_tiles, limit=1)
-    monkeypatch.setattr(composite, "list_tiles", narrow_lists)
+    monkeypatch.setattr(tiling, "intersect_tiles", functools.partial(tiling.intersect_tiles, limit=1))
     narrow = _gradients(scene, pose, torch.float64, None, backend="triton", size=(20, 40), layout="equirect")
     assert torch.equal(narrow[0], wide[0]) and narrow[2].intersections == wide[2].intersections
     assert narrow[2].bytes < wide[2].bytes

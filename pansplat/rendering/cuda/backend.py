@@ -1,0 +1,233 @@
+"""The Triton backend: the stages joined into a differentiable call, in bounded memory.
+
+Source: docs/rendering.md; docs/triton.md describes the stages. Without a GPU it runs under Triton's interpreter, for
+tests only: a thousand times slower than the other backends.
+"""
+
+import contextlib
+import importlib.util
+import os
+from typing import TYPE_CHECKING, Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from pansplat.constants import EWA_NEAR_FACTOR
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Gaussians
+from pansplat.rendering.image_planes import ImagePlane
+from pansplat.rendering.projection import (
+    Footprints,
+    ProjectedGaussians,
+    compute_footprints,
+    is_in_image,
+    ray_footprints,
+    select_drawable,
+)
+from pansplat.rendering.rasterize import RasterInfo, RasterOptions, RasterSums
+
+if TYPE_CHECKING:
+    from pansplat.rendering.cuda.tiling import Instances
+
+_SORTING_BYTES = 40  # an intersection, while a band's are sorted
+
+
+def rasterize_planes(
+    gaussians: Gaussians,
+    covariances: Float[Tensor, "n 3 3"] | None,
+    pose: Float[Tensor, "4 4"],
+    planes: list[ImagePlane],
+    options: RasterOptions,
+) -> RasterSums:
+    """Rasterise with Triton kernels; see `pansplat.rendering.rasterize.RasterBackend`.
+
+    Raises:
+        InputError: Triton is not installed, or the Gaussians are not on a CUDA device; or as stated there.
+    """
+    device = gaussians.means.device
+    _check(device)
+    # Triton launches on torch's current device, not on that of its arguments.
+    with torch.cuda.device(device) if device.type == "cuda" else contextlib.nullcontext():
+        chosen = select_drawable(gaussians, covariances, pose.detach(), options)
+        projected = project_gaussians(
+            chosen.gaussians,
+            chosen.covariances,
+            pose,
+            filter_variance=options.filter_variance(planes[0].pixel_angle),
+            compensate=options.lowpass == "angular",
+            exact=options.kernel == "ray",
+        )
+        footprints, instances = _place_footprints(projected, planes, options)
+        sums, count, size = _composite(footprints, instances, planes, exact=options.kernel == "ray")
+    visible = sum(instances.planes)
+    info = RasterInfo(chosen.total, chosen.dropped, chosen.near, visible, count, backend="triton", bytes=size)
+    return RasterSums(sums, info)
+
+
+def _check(device: torch.device) -> None:
+    """Raise an error if Triton cannot run on the device. Its kernels are imported in the functions that launch them."""
+    if importlib.util.find_spec("triton") is None:
+        raise InputError(
+            "backend 'triton' needs the package triton, which is not installed; install it (pip install triton, on "
+            "Linux), or use backend='auto'"
+        )
+    if device.type != "cuda" and os.environ.get("TRITON_INTERPRET") != "1":
+        raise InputError(
+            f"backend 'triton' needs Gaussians on a CUDA device, got them on '{device}'; move them there "
+            "(gaussians.to(device='cuda')), or use backend='auto'"
+        )
+
+
+def project_gaussians(
+    gaussians: Gaussians,
+    covariances: Float[Tensor, "n 3 3"] | None,
+    cam2world: Float[Tensor, "4 4"],
+    *,
+    filter_variance: float,
+    compensate: bool,
+    exact: bool,
+) -> ProjectedGaussians:
+    """Project Gaussians; see `pansplat.rendering.projection.project_gaussians`."""
+    shape = (gaussians.quats, gaussians.scales) if covariances is None else (covariances,)
+    fields = (gaussians.means, gaussians.opacities, gaussians.harmonics, *shape)
+    return ProjectedGaussians(*_Project.apply(cam2world, filter_variance, compensate, exact, *fields))
+
+
+class _Project(torch.autograd.Function):
+    """Projection: one kernel forward, one backward."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, cam2world: Tensor, filter_variance: float, compensate: bool, exact: bool, *fields: Tensor
+    ) -> tuple[Tensor, ...]:
+        from pansplat.rendering.cuda.projection import project_forward
+
+        fields = tuple(field.contiguous() for field in fields)
+        ctx.save_for_backward(cam2world, *fields)
+        ctx.options = dict(filter_variance=filter_variance, compensate=compensate, exact=exact)
+        return tuple(project_forward(cam2world, fields, **ctx.options))
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
+        from pansplat.rendering.cuda.projection_backward import project_backward
+
+        cam2world, *fields = ctx.saved_tensors
+        grad_pose, *grad_fields = project_backward(cam2world, fields, ProjectedGaussians(*grad_outputs), **ctx.options)
+        return grad_pose, None, None, None, *grad_fields
+
+
+def _place_footprints(
+    projected: ProjectedGaussians, planes: list[ImagePlane], options: RasterOptions
+) -> tuple[Footprints, "Instances"]:
+    """Footprints, and the image planes they are visible on; for the exact kernel, planes share footprints."""
+    from pansplat.rendering.cuda.tiling import sort_instances
+
+    fixed = ProjectedGaussians(*(field.detach() for field in projected))
+    boxes, keys, bases, parts, total = [], [], [], [], 0
+    for plane in planes:
+        key, seen = fixed.radius, None
+        z = (fixed.direction @ plane.rotation[:, 2]) * fixed.radius
+        if options.order == "z" and not plane.is_panorama:
+            key = z
+        if options.kernel == "ewa":
+            ahead = torch.nonzero(z > EWA_NEAR_FACTOR * options.near)[:, 0]
+            box = _boxes(ProjectedGaussians(*(field[ahead] for field in fixed)), plane, options)
+            touched = is_in_image(box, plane)
+            seen, box = ahead[touched], box[touched]
+            part = ProjectedGaussians(*(_TakeRows.apply(field, seen) for field in projected))
+            parts.append(checkpoint(compute_footprints, part, plane, options, use_reentrant=False)[0])
+            bases.append(total)
+            total, key = total + len(seen), key[seen]
+        else:
+            box = _boxes(fixed, plane, options)
+            bases.append(0)
+        boxes.append(box)
+        keys.append(key)
+    footprints = ray_footprints(projected)
+    if parts:
+        footprints = Footprints(*(torch.cat(field) for field in zip(*parts, strict=True)))
+    return footprints, sort_instances(boxes, keys, bases, planes[0].size, wraps=planes[0].is_panorama)
+
+
+@torch.no_grad()
+def _boxes(projected: ProjectedGaussians, plane: ImagePlane, options: RasterOptions) -> Float[Tensor, "n 4"]:
+    return compute_footprints(projected, plane, options)[1]
+
+
+class _TakeRows(torch.autograd.Function):
+    """Rows of a tensor, each at most once, so that backward needs neither a sort nor atomics."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, rows: Int[Tensor, "m"]) -> Tensor:
+        ctx.save_for_backward(rows)
+        ctx.shape = table.shape
+        return table[rows]
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None]:
+        (rows,) = ctx.saved_tensors
+        return grad_outputs[0].new_zeros(ctx.shape).index_copy_(0, rows, grad_outputs[0]), None
+
+
+def _composite(
+    footprints: Footprints, instances: "Instances", planes: list[ImagePlane], *, exact: bool
+) -> tuple[Float[Tensor, "plane sums height width"], int, int]:
+    """Sums of weight x (values, 1) over image planes, the number of intersections, and bytes of working memory.
+
+    Differentiable once in all of `footprints`.
+    """
+    from pansplat.rendering.cuda.rasterize import RecordLayout
+    from pansplat.rendering.cuda.tiling import tile_pixels
+
+    layout = RecordLayout(exact, footprints.values.shape[1] - 1)
+    pixels = tile_pixels(planes, exact=exact, dtype=footprints.rows.dtype)
+    plan = instances, pixels, layout, planes[0].size
+    return _Composite.apply(*footprints, plan, torch.is_grad_enabled())  # type: ignore[no-any-return]
+
+
+class _Composite(torch.autograd.Function):
+    """Compositing; backward reads the records, the intersections and the sums of forward."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        point: Tensor,
+        rows: Tensor,
+        radial_variance: Tensor,
+        peak: Tensor,
+        values: Tensor,
+        plan: tuple[Any, ...],
+        grad_enabled: bool,
+    ) -> tuple[Tensor, int, int]:
+        from pansplat.rendering.cuda.rasterize import pack_records, rasterize
+        from pansplat.rendering.cuda.tiling import intersect_tiles
+
+        instances, pixels, layout, size = plan
+        records = pack_records(Footprints(point, rows, radial_variance, peak, values), layout)
+        sums = records.new_empty(len(instances.planes), layout.channels + 2, *size)
+        count, largest, kept = 0, 0, []
+        for band in intersect_tiles(instances):
+            stops = rasterize(records, band, pixels, sums, layout)
+            count += len(band.record_ids)
+            largest = max(largest, _SORTING_BYTES * len(band.record_ids) + 8 * len(band.ends))
+            if grad_enabled and any(ctx.needs_input_grad):  # needs_input_grad ignores no_grad
+                kept.append((band, stops))
+        ctx.save_for_backward(records, rows, sums)
+        ctx.plan, ctx.kept = plan, kept
+        held = (records, sums, pixels.centres, pixels.offsets, instances.records, instances.ranges)
+        return sums, count, largest + sum(t.numel() * t.element_size() for t in held)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
+        from pansplat.rendering.cuda.rasterize import rasterize_backward, sum_by_record, unpack_gradients
+
+        if torch.is_grad_enabled():  # create_graph=True
+            raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
+        records, rows, sums = ctx.saved_tensors
+        instances, pixels, layout, _ = ctx.plan
+        totals = records.new_zeros(len(instances.records), layout.gradient_size)
+        for band, stops in ctx.kept:
+            rasterize_backward(records, band, stops, pixels, sums, grad_outputs[0].contiguous(), layout, totals)
+        return *unpack_gradients(sum_by_record(totals, instances, len(records)), rows, layout), None, None
