@@ -19,6 +19,11 @@ from torch import Tensor
 
 import pansplat.testing  # noqa: F401  # the hook names it
 
+# One thread per pytest-xdist worker and its child processes: workers must not compete for cores.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ["OMP_NUM_THREADS"] = "1"
+    torch.set_num_threads(1)
+
 # Triton reads this variable at its first import, and torch may import it. Its LLVM must be loaded before Mesa's.
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")
