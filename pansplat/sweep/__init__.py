@@ -1,8 +1,8 @@
-"""A predictor that needs no weights: a hierarchical spherical plane sweep.
+"""A predictor without weights: a hierarchical sphere sweep.
 
-Read it top to bottom: `predictor` (the call), `search` (three levels), `frame` (the scene's axes), `cost`
-(matching), `votes` and `planes` (the scene's planes), `aggregate` (smoothing), `surface` (what views tell each other),
-`lift` (Gaussians).
+In the order of the pipeline: `predictor` (the call), `search` (three levels), `planes` (the scene's axes and planes),
+`room_layout` (floor boundary and walls), `matching` (matching cost and its aggregation), `surface` (consistency between
+views, upsampling), `lift` (Gaussians).
 """
 
 from pansplat.sweep.predictor import Sweep, SweepConfig

@@ -1,4 +1,4 @@
-"""The `sweep` predictor: posed panoramas in, Gaussians out, no weights."""
+"""The `sweep` predictor: from posed panoramas to Gaussians, without weights."""
 
 from __future__ import annotations
 
@@ -28,10 +28,9 @@ class SweepConfig:
 
 
 class Sweep:
-    """Hierarchical spherical plane sweep with hand-made features.
+    """Hierarchical sphere sweep with a hand-crafted matching cost; see docs/sweep.md.
 
-    The honest baseline that a trained network must beat, and the fallback without weights. Any number of views
-    from two on; every view is matched against all others.
+    It takes two or more views and matches each against all others.
     """
 
     name = "sweep"
@@ -53,24 +52,18 @@ class Sweep:
         """Predict from RGB in [0, 1] and OpenCV cam2world poses (metres); a list when there is a batch axis.
 
         Args:
-            near, far: radial depth range, metres; numbers, or tensors with one value a batch item (or a view, of
-                which the nearest and farthest count).
-            masks: True where a pixel shows the scene; the rest matches nothing and makes no Gaussians, nor do
+            near, far: radial depth range, metres: numbers, or tensors with one value for each batch item or view; the
+                range then covers all views.
+            masks: True where a pixel shows the scene. Other pixels are not matched and have no Gaussians; nor have
                 patches of exact black (0, 0, 0), the holes of scans.
 
         Raises:
             ValueError: on wrong shapes, fewer than two views, non-finite values, or near >= far.
         """
         if images.ndim == 5:
+            item_masks = [None] * len(images) if masks is None else masks
             return [
-                self._predict(
-                    images[n],
-                    cam2world[n],
-                    _item(near, n),
-                    _item(far, n),
-                    None if masks is None else masks[n],
-                    progress,
-                )
+                self._predict(images[n], cam2world[n], _item(near, n), _item(far, n), item_masks[n], progress)
                 for n in range(len(images))
             ]
         return self._predict(images, cam2world, near, far, masks, progress)
@@ -89,7 +82,7 @@ class Sweep:
         posed = PosedImages(
             images=np.ascontiguousarray(images.detach().cpu().float().permute(0, 2, 3, 1).numpy()),
             cam2world=cam2world.detach().cpu().double().numpy(),
-            masks=_shows_something(images) & (True if masks is None else masks.cpu().numpy()),
+            masks=_mask_holes(images) & (True if masks is None else masks.cpu().numpy()),
             near=low,
             far=high,
         )
@@ -101,14 +94,14 @@ class Sweep:
         return gaussians.to(device=images.device)
 
 
-def _shows_something(images: Tensor) -> np.ndarray:
-    """Pixels (view, h, w) outside patches of exact black, which photographs do not have: there a scan has a hole."""
-    shows = np.empty((len(images), *images.shape[-2:]), bool)
+def _mask_holes(images: Tensor) -> np.ndarray:
+    """Pixels (view, h, w) outside patches of exact black: the holes of scans; photographs have none."""
+    visible = np.empty((len(images), *images.shape[-2:]), bool)
     for view, image in enumerate(images.detach().cpu().numpy()):
         black = (image.max(axis=0) <= 0).astype(np.uint8)
         patches = cv2.morphologyEx(black, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-        shows[view] = cv2.dilate(patches, np.ones((5, 5), np.uint8)) == 0
-    return shows
+        visible[view] = cv2.dilate(patches, np.ones((5, 5), np.uint8)) == 0
+    return visible
 
 
 def _item(value: float | Tensor, n: int) -> float | Tensor:
@@ -135,7 +128,7 @@ def _check(images: Tensor, cam2world: Tensor, near: float, far: float, masks: Te
 
 
 def _fingerprint(config: SweepConfig) -> str:
-    """Hash of the settings and of the code that turns input into Gaussians, so that a cache is never stale."""
+    """Hash of the settings and of the source code that computes the Gaussians; keys the prediction cache."""
     digest = hashlib.sha256(repr(config).encode())
     packages: Sequence[str] = ("pansplat.sweep", "pansplat.gaussians", "pansplat.geometry")
     for package in packages:

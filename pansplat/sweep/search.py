@@ -1,11 +1,10 @@
-"""The hierarchical plane sweep: from posed panoramas to a surface for each of them.
+"""The hierarchical sphere sweep: from posed panoramas to a surface for each of them.
 
-First pixels vote for the planes that the scene has, and each picture shows where its floor ends and walls stand.
-Then come three levels, as in the paper's hierarchical cost volume (PanSplat, section 3.2), at 1/4, 1/2 and 1/1 of
-the height.
-The coarse level searches the whole depth range among spheres and among planes along the scene's axes, twice: the
-second time every view knows the other views' surfaces (what they see through, agree with, or hide) and which
-planes the scene has. Each finer level searches a narrow range around the coarser surface.
+First the scene's planes are detected, and the room layout of each view. Three levels of matching follow at 1/4, 1/2 and
+1/1 of the height, as in the paper's hierarchical cost volume (PanSplat, section 3.2). The coarse level searches the
+whole depth range with spheres and with planes across the scene's axes. It runs twice: the second pass uses the surfaces
+of the first for occlusion, consistency between views, and the support of planes. Each finer level searches a narrow
+range around the coarser surface.
 """
 
 from __future__ import annotations
@@ -18,42 +17,62 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from pansplat.sweep.aggregate import AggregationConfig, aggregate, best_labels
-from pansplat.sweep.cost import Family, MatchingConfig, View, matching_cost
-from pansplat.sweep.floor import FloorClues, FloorConfig, add_clues, find_floor
-from pansplat.sweep.frame import main_directions, scene_axes
-from pansplat.sweep.planes import MIN_FLOOR, PlaneSupport, no_support, plane_support
-from pansplat.sweep.sphere import resize_sphere
-from pansplat.sweep.surface import Surface, agreement, guided_upsample
-from pansplat.sweep.votes import vote_for_planes
-from pansplat.sweep.walls import Walls, add_walls, believe, find_walls
+from pansplat.sweep.matching import (
+    AggregationConfig,
+    HypothesisSet,
+    MatchingConfig,
+    View,
+    aggregate,
+    best_labels,
+    matching_cost,
+)
+from pansplat.sweep.planes import (
+    MIN_FLOOR,
+    ScenePlanes,
+    axis_components,
+    collect_planes,
+    detect_planes,
+    estimate_axes,
+    no_planes,
+)
+from pansplat.sweep.room_layout import (
+    FloorBoundary,
+    RoomLayoutConfig,
+    Walls,
+    apply_floor_costs,
+    apply_wall_bonus,
+    detect_floor_boundaries,
+    discount_contradicted,
+    fit_walls,
+)
+from pansplat.sweep.surface import Surface, consistency_mask, guided_upsample, resize_sphere
 
-_FIRST_HEIGHT = 128
+_DETECTION_HEIGHT = 128  # of the images that planes and room layouts are detected in
 _FLOOR_THICKNESS = 2.5  # bins of the planes' offsets
 
 
 @dataclass(frozen=True)
 class SearchConfig:
-    """How the sweep searches."""
+    """Settings of the search."""
 
     finest_height: int = 512
     """Height of the finest level; larger panoramas are searched at this height."""
     coarse_passes: int = 2
     max_candidates: int = 256
-    """Hypotheses of one family at the coarse level, at most."""
+    """Largest number of hypotheses of a set at the coarse level."""
     near_margin: float = 0.75
-    """Surfaces are searched down to this fraction of `near`."""
+    """The smallest depth of the search, relative to `near`."""
     narrow_candidates: tuple[int, int] = (24, 16)
-    """Hypotheses of one family at the two finer levels."""
-    unsure_confidence: float = 0.1
-    """What a surface that no other view agrees with may say about the other views' hypotheses."""
+    """Hypotheses of a set at the two finer levels."""
+    unverified_confidence: float = 0.1
+    """Weight in other views' matching of a surface that is consistent with no other view."""
     plane_prior: float = 0.3
-    """Penalty of a plane that the scene gives no support."""
+    """Penalty of a plane without support in the scene."""
     sphere_prior: float = 0.18
-    """Penalty of hypotheses that are no plane."""
+    """Penalty of spheres, against supported planes."""
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     aggregation: AggregationConfig = field(default_factory=AggregationConfig)
-    floor: FloorConfig = field(default_factory=FloorConfig)
+    room_layout: RoomLayoutConfig = field(default_factory=RoomLayoutConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,31 +97,33 @@ class PosedImages:
 
 
 def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[str, float], None]) -> list[Surface]:
-    """The surface that each view sees, at the finest level."""
+    """The surface of each view, at the finest level."""
     finest = min(posed.images.shape[1], config.finest_height)
     small = [resize_sphere(image, max(finest // 2, 32)) for image in posed.images]
-    axes = scene_axes(small, posed.cam2world[:, :3, :3])
+    axes = estimate_axes(small, posed.cam2world[:, :3, :3])
     heights = [max(finest // 4, 16), max(finest // 2, 16), finest]
     if posed.baseline < 1e-3 * posed.near:
-        return [_no_parallax(finest, posed) for _ in posed.images]
+        return [_surface_without_parallax(finest, posed) for _ in posed.images]
     surfaces: list[Surface] | None = None
     low, high = 1 / posed.far, 1 / (config.near_margin * posed.near)
-    steps = (high - low) * posed.baseline / (math.pi / heights[0])  # candidates a pixel of parallax apart
+    steps = (high - low) * posed.baseline / (math.pi / heights[0])  # candidates are a pixel of parallax apart
     count = int(np.clip(math.ceil(steps), 48, config.max_candidates))
     step = (high - low) / (count - 1)
     report("finding floor, ceiling and walls", 0.0)
-    support = no_support(posed.cam2world, axes, posed.near, posed.far)
-    first = _Level(posed, min(finest, _FIRST_HEIGHT), support, (low, high), config, None)
-    support = first.vote()
-    floors = first.find_floor(support)
-    clues = floors and [
-        (floor, find_walls(floor, support.floor_below(pose), posed.far))
-        for floor, pose in zip(floors, posed.cam2world, strict=True)
+    planes = no_planes(posed.cam2world, axes, posed.near, posed.far)
+    detection = _Level(posed, min(finest, _DETECTION_HEIGHT), planes, (low, high), config, None)
+    planes = detection.detect_planes()
+    boundaries = detect_floor_boundaries(detection.views, detection.rays, posed.cam2world, planes, config.matching)
+    layouts = boundaries and [
+        (boundary, fit_walls(boundary, planes.camera_height(pose), posed.far))
+        for boundary, pose in zip(boundaries, posed.cam2world, strict=True)
     ]
     for n in range(config.coarse_passes):
         report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
-        level = _Level(posed, heights[0], support, (low, high), config, surfaces)
-        surfaces = [level.search_all(view, count, clues and clues[view]) for view in range(len(posed.images))]
+        level = _Level(posed, heights[0], planes, (low, high), config, surfaces)
+        surfaces = [
+            level.search_full_range(view, count, layouts and layouts[view]) for view in range(len(posed.images))
+        ]
     for n, height in enumerate(heights[1:]):
         report("refining the surfaces", 0.5 + 0.25 * n)
         assert surfaces is not None
@@ -111,51 +132,44 @@ def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[
             for s, image in zip(surfaces, posed.images, strict=True)
         ]
         step /= 2
-        level = _Level(posed, height, support, (low, high), config, surfaces)
+        level = _Level(posed, height, planes, (low, high), config, surfaces)
         surfaces = [
-            level.search_near(view, config.narrow_candidates[n], step, spread=n == 0)
-            for view in range(len(posed.images))
+            level.refine(view, config.narrow_candidates[n], step, widen=n == 0) for view in range(len(posed.images))
         ]
     assert surfaces is not None
     return surfaces
 
 
-def _no_parallax(height: int, posed: PosedImages) -> Surface:
-    """Where cameras coincide nothing can be matched: the middle of the inverse depth range."""
+def _surface_without_parallax(height: int, posed: PosedImages) -> Surface:
+    """The middle of the inverse depth range: coincident cameras cannot be matched."""
     inverse = np.full((height, 2 * height), 0.5 * (1 / posed.near + 1 / posed.far), np.float32)
     return Surface(inverse, np.zeros(inverse.shape, np.uint8))
 
 
 class _Level:
-    """All views at one height, with what is known of their surfaces so far."""
+    """All views at one height, with the surfaces found so far."""
 
     def __init__(
         self,
         posed: PosedImages,
         height: int,
-        support: PlaneSupport,
+        planes: ScenePlanes,
         limits: tuple[float, float],
         config: SearchConfig,
         surfaces: list[Surface] | None,
     ) -> None:
-        self.posed, self.height, self.limits, self.config, self.surfaces = (
-            posed,
-            height,
-            limits,
-            config,
-            surfaces,
-        )
-        self.rays = [main_directions(support.axes, pose[:3, :3], height) for pose in posed.cam2world]
-        self.support = support
+        self.posed, self.height, self.limits, self.config, self.surfaces = posed, height, limits, config, surfaces
+        self.rays = [axis_components(planes.axes, pose[:3, :3], height) for pose in posed.cam2world]
+        self.planes = planes
         masks = [
             cv2.resize(mask.astype(np.uint8), (2 * height, height), interpolation=cv2.INTER_NEAREST) > 0
             for mask in posed.masks
         ]
         confidence: list[np.ndarray | None] = [None] * len(masks)
         if surfaces is not None:
-            agreed = [agreement(surfaces, posed.cam2world, view) & mask for view, mask in enumerate(masks)]
-            confidence = [np.where(a, 1, config.unsure_confidence).astype(np.float32) for a in agreed]
-            self.support = plane_support(surfaces, agreed, posed.cam2world, support)
+            consistent = [consistency_mask(surfaces, posed.cam2world, view) & mask for view, mask in enumerate(masks)]
+            confidence = [np.where(c, 1, config.unverified_confidence).astype(np.float32) for c in consistent]
+            self.planes = collect_planes(surfaces, consistent, posed.cam2world, planes)
         self.views = [
             View(
                 resize_sphere(image, height),
@@ -167,19 +181,15 @@ class _Level:
             for n, (image, mask, rays) in enumerate(zip(posed.images, masks, self.rays, strict=True))
         ]
 
-    def vote(self) -> PlaneSupport:
-        """What the pixels of all views say about the scene's planes."""
-        return vote_for_planes(
-            self.views, self.rays, self.posed.cam2world, self.support, self.limits,
+    def detect_planes(self) -> ScenePlanes:
+        """The scene's planes by Hough voting of all views' pixels."""
+        return detect_planes(
+            self.views, self.rays, self.posed.cam2world, self.planes, self.limits,
             MIN_FLOOR * self.posed.near, self.config.matching,
         )  # fmt: skip
 
-    def find_floor(self, support: PlaneSupport) -> list[FloorClues] | None:
-        """What each picture says of the floor."""
-        return find_floor(self.views, self.rays, self.posed.cam2world, support, self.config.matching)
-
-    def search_all(self, view: int, count: int, clues: tuple[FloorClues, Walls] | None) -> Surface:
-        """The whole depth range, among spheres (family 0) and planes along the axes (families 1 to 3)."""
+    def search_full_range(self, view: int, count: int, layout: tuple[FloorBoundary, Walls] | None) -> Surface:
+        """The best hypotheses of the whole depth range: spheres (set 0) and planes across the axes (sets 1 to 3)."""
         low, high = self.limits
         step = (high - low) / (count - 1)
         shape = (self.height, 2 * self.height)
@@ -187,68 +197,70 @@ class _Level:
         sides = [np.zeros(shape, np.uint8)] + [(r > 0).astype(np.uint8) for r in self.rays[view]]
         inverse = low + step * np.arange(count)
         penalties = [np.zeros((2, count), np.float32) for _ in slopes]
-        if self.surfaces is not None:  # the first pass is to find what is no plane, too
+        if self.surfaces is not None:  # the first pass has no priors, so that other shapes are found too
             penalties[0] += self.config.sphere_prior
             for axis in range(3):
                 penalties[axis + 1] = self.config.plane_prior * (
-                    1 - self.support.share(axis, self.posed.cam2world[view], inverse)
+                    1 - self.planes.support(axis, self.posed.cam2world[view], inverse)
                 )
-        families = [
-            Family(low * slope, step * slope, penalty.astype(np.float32), side)
+        sets = [
+            HypothesisSet(low * slope, step * slope, penalty.astype(np.float32), side)
             for slope, penalty, side in zip(slopes, penalties, sides, strict=True)
         ]
         slot_map = np.stack([np.stack((s, (s - 1) * low / step + 0.5), axis=-1) for s in slopes], axis=2)
-        cost = self._matched(view, lambda other: self._faces(view, other, families, inverse))
-        if clues is not None:
-            below = self.support.floor_below(self.posed.cam2world[view])
-            is_floor = np.abs(1 / inverse - below) < _FLOOR_THICKNESS * self.support.bin
-            add_clues(cost, clues[0], families, is_floor, self.rays[view], self.config.floor)
+        cost = self._mean_cost(view, lambda other: self._against(view, other, sets, inverse))
+        if layout is not None:
+            camera_height = self.planes.camera_height(self.posed.cam2world[view])
+            is_floor = np.abs(1 / inverse - camera_height) < _FLOOR_THICKNESS * self.planes.bin
+            apply_floor_costs(cost, layout[0], sets, is_floor, self.rays[view], self.config.room_layout)
             if self.surfaces is not None:
-                self._add_walls(view, *clues, families, cost)
-        return self._solve(view, families, cost, slot_map.astype(np.float32), count)
+                self._apply_walls(view, *layout, sets, cost)
+        return self._select_hypotheses(view, sets, cost, slot_map.astype(np.float32), count)
 
-    def _add_walls(self, view: int, clues: FloorClues, walls: Walls, families: list[Family], cost: np.ndarray) -> None:
-        """Make the walls cheaper that the picture shows and the surfaces so far do not contradict."""
-        known, agreed = self.views[view].inverse_depth, self.views[view].confidence
-        assert known is not None and agreed is not None
-        walls = believe(walls, clues, self.rays[view], known, agreed == 1)
-        _, ceiling = self.support.bounds(self.posed.cam2world[view])
-        add_walls(cost, walls, clues, families, self.rays[view], ceiling, self.config.floor.wall_bonus)
+    def _apply_walls(
+        self, view: int, boundary: FloorBoundary, walls: Walls, sets: list[HypothesisSet], cost: np.ndarray
+    ) -> None:
+        """Lower the cost of the view's walls, as far as the surfaces do not contradict them."""
+        known, confidence = self.views[view].inverse_depth, self.views[view].confidence
+        assert known is not None and confidence is not None
+        walls = discount_contradicted(walls, boundary, self.rays[view], known, confidence == 1)
+        _, ceiling = self.planes.vertical_bounds(self.posed.cam2world[view])
+        apply_wall_bonus(cost, walls, boundary, sets, self.rays[view], ceiling, self.config.room_layout.wall_bonus)
 
-    def _faces(self, view: int, other: int, families: list[Family], inverse: np.ndarray) -> list[Family]:
-        """The families, with which of their planes the other view would see from behind."""
+    def _against(self, view: int, other: int, sets: list[HypothesisSet], inverse: np.ndarray) -> list[HypothesisSet]:
+        """The sets, with the planes marked that separate the view from the other view."""
         pose, there = self.posed.cam2world[[view, other]]
-        unseen = [None] + [self.support.backs(axis, pose, there, inverse) for axis in range(3)]
-        return [dataclasses.replace(f, unseen=u, sphere=u is None) for f, u in zip(families, unseen, strict=True)]
+        marks = [None] + [self.planes.separating(axis, pose, there, inverse) for axis in range(3)]
+        return [dataclasses.replace(s, back_facing=m, sphere=m is None) for s, m in zip(sets, marks, strict=True)]
 
-    def search_near(self, view: int, count: int, step: float, *, spread: bool) -> Surface:
-        """A narrow range around the surface so far; with `spread` also around its neighbours' near and far side."""
+    def refine(self, view: int, count: int, step: float, *, widen: bool) -> Surface:
+        """The best hypotheses near the surface; with `widen` also near the depths of neighbouring pixels."""
         assert self.surfaces is not None
         known = self.surfaces[view].inverse_depth
         centres = [known]
-        if spread:
+        if widen:
             window = np.ones((5, 5), np.uint8)
             centres += [cv2.dilate(known, window), cv2.erode(known, window)]
         steps = np.full(known.shape, step, np.float32)
         side = np.zeros(known.shape, np.uint8)
         penalty = np.zeros((2, count), np.float32)
-        families = [Family((c - step * (count // 2)).astype(np.float32), steps, penalty, side) for c in centres]
+        sets = [HypothesisSet((c - step * (count // 2)).astype(np.float32), steps, penalty, side) for c in centres]
         slots = 2 * count
         starts = np.stack([np.clip((c - known) / step, -4 * slots, 4 * slots) + count / 2 for c in centres], axis=2)
         slot_map = np.stack((np.ones_like(starts), starts), axis=-1).astype(np.float32)
-        cost = self._matched(view, lambda other: families)
-        surface = self._solve(view, families, cost, slot_map, slots)
-        return Surface(surface.inverse_depth, self.surfaces[view].family)
+        cost = self._mean_cost(view, lambda other: sets)
+        surface = self._select_hypotheses(view, sets, cost, slot_map, slots)
+        return Surface(surface.inverse_depth, self.surfaces[view].orientation)
 
-    def _matched(self, view: int, families: Callable[[int], list[Family]]) -> np.ndarray:
-        """Mean cost (h, w, families * count) against every other view; `families` are those to compare it by."""
+    def _mean_cost(self, view: int, sets_against: Callable[[int], list[HypothesisSet]]) -> np.ndarray:
+        """Mean matching cost (h, w, sets * count) over the other views; `sets_against(other)` are the hypotheses."""
         others = [n for n in range(len(self.views)) if n != view]
-        bounds = self.support.bounds(self.posed.cam2world[view])
+        bounds = self.planes.vertical_bounds(self.posed.cam2world[view])
         cost: np.ndarray | None = None
         for other in others:
             part = matching_cost(
                 self.views[view], self.views[other], self.posed.relative_pose(view, other),
-                families(other), self.limits, bounds, self.config.matching,
+                sets_against(other), self.limits, bounds, self.config.matching,
             )  # fmt: skip
             cost = part if cost is None else cost + part
         assert cost is not None
@@ -256,14 +268,16 @@ class _Level:
             cost /= len(others)
         return cost
 
-    def _solve(self, view: int, families: list[Family], cost: np.ndarray, slot_map: np.ndarray, slots: int) -> Surface:
-        """Aggregate, and read the best hypothesis off."""
-        count = families[0].penalty.shape[1]
+    def _select_hypotheses(
+        self, view: int, sets: list[HypothesisSet], cost: np.ndarray, slot_map: np.ndarray, slots: int
+    ) -> Surface:
+        """The surface of lowest aggregated cost."""
+        count = sets[0].penalty.shape[1]
         total = aggregate(cost, self.views[view].image, slot_map, slots, self.config.aggregation)
         label, offset = best_labels(total, count)
-        family, k = label // count, label % count
-        base = np.stack([f.base for f in families], axis=-1)
-        step = np.stack([f.step for f in families], axis=-1)
+        chosen, k = label // count, label % count
+        base = np.stack([s.base for s in sets], axis=-1)
+        step = np.stack([s.step for s in sets], axis=-1)
         rows, columns = np.indices(label.shape)
-        inverse = base[rows, columns, family] + (k + offset) * step[rows, columns, family]
-        return Surface(np.clip(inverse, *self.limits).astype(np.float32), family.astype(np.uint8))
+        inverse = base[rows, columns, chosen] + (k + offset) * step[rows, columns, chosen]
+        return Surface(np.clip(inverse, *self.limits).astype(np.float32), chosen.astype(np.uint8))

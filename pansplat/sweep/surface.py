@@ -1,4 +1,4 @@
-"""Surfaces seen by the views, and what one view's surface says about another's."""
+"""The views' surfaces: consistency between views, upsampling, and panoramas as numpy arrays."""
 
 from __future__ import annotations
 
@@ -6,78 +6,125 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numba as nb
 import numpy as np
+import torch
 
-from pansplat.sweep.sphere import nearest_pixel, ray_grid
+from pansplat.geometry.equirect import pixel_directions, uv_from_directions
 
-AGREES, HIDDEN, SEEN_THROUGH = 0, 1, 2  # what another view says about a point
+
+def ray_grid(height: int) -> np.ndarray:
+    """Unit rays (height, 2 height, 3), float32, of a panorama's pixels."""
+    return pixel_directions(height, 2 * height).numpy()
+
+
+def pixel_coordinates(directions: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Continuous x and y of directions (..., 3) of any length in a panorama; pixel centres at half-integers."""
+    uv = uv_from_directions(torch.from_numpy(np.ascontiguousarray(directions))).numpy()
+    return uv[..., 0] * 2 * height, uv[..., 1] * height
+
+
+def nearest_pixel(directions: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of the pixel that holds each direction (..., 3)."""
+    x, y = pixel_coordinates(directions, height)
+    return np.clip(y.astype(np.int64), 0, height - 1), x.astype(np.int64) % (2 * height)
+
+
+def pad_sphere(image: np.ndarray, margin: int) -> np.ndarray:
+    """A panorama (h, w) or (h, w, c) padded by its neighbours on the sphere."""
+    over = np.roll(image, image.shape[1] // 2, axis=1)
+    rows = np.concatenate((over[:margin][::-1], image, over[-margin:][::-1]))
+    return np.ascontiguousarray(np.concatenate((rows[:, -margin:], rows, rows[:, :margin]), axis=1))
+
+
+def resize_sphere(image: np.ndarray, height: int) -> np.ndarray:
+    """A panorama (h, w) or (h, w, c) at another height: area average when smaller, bilinear when larger."""
+    if image.shape[0] == height:
+        return np.ascontiguousarray(image)
+    if image.shape[0] > height:
+        return cv2.resize(image, (2 * height, height), interpolation=cv2.INTER_AREA)
+    factor = height // image.shape[0]
+    if height % image.shape[0] == 0:
+        large = cv2.resize(pad_sphere(image, 2), None, fx=factor, fy=factor, interpolation=cv2.INTER_LINEAR)
+        return np.ascontiguousarray(large[2 * factor : -2 * factor, 2 * factor : -2 * factor])
+    return cv2.resize(image, (2 * height, height), interpolation=cv2.INTER_LINEAR)
+
+
+CONSISTENT, OCCLUDED, FREE_SPACE = 0, 1, 2  # on, behind, or in front of another view's surface
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """One view's surface: inverse radial depth (h, w) in 1/m, and the family (h, w) of hypotheses that won.
+    """One view's surface.
 
-    Family 0 are spheres; 1, 2, 3 are planes across the scene's axes.
+    Attributes:
+        inverse_depth: (h, w) inverse radial depth, 1/m.
+        orientation: (h, w) 0 for a sphere around the camera; 1, 2, 3 for a plane across that axis of the scene.
     """
 
     inverse_depth: np.ndarray
-    family: np.ndarray
+    orientation: np.ndarray
 
     @property
     def height(self) -> int:
         return self.inverse_depth.shape[0]
 
 
-def relation(
+def classify_visibility(
     points: np.ndarray, surface: Surface, cam2world: np.ndarray, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What a view says about world points (..., 3): AGREES, HIDDEN behind its surface, or SEEN_THROUGH (in front).
+    """Whether world points (..., 3) are CONSISTENT with a view's surface, OCCLUDED by it, or in FREE_SPACE.
 
-    Returns the relation (uint8) and the ratio of the point's inverse depth to the surface's there.
+    Returns:
+        The class (uint8), and the ratio of the point's inverse depth to the surface's.
     """
     local = (points - cam2world[:3, 3]) @ cam2world[:3, :3]
     distance = np.maximum(np.linalg.norm(local, axis=-1), 1e-9)
     row, column = nearest_pixel(local, surface.height)
     ratio = 1 / (distance * surface.inverse_depth[row, column])
-    result = np.full(ratio.shape, HIDDEN, np.uint8)
-    result[ratio > 1 - tolerance] = AGREES
-    result[ratio > 1 + tolerance] = SEEN_THROUGH
+    result = np.full(ratio.shape, OCCLUDED, np.uint8)
+    result[ratio > 1 - tolerance] = CONSISTENT
+    result[ratio > 1 + tolerance] = FREE_SPACE
     return result, ratio
 
 
 def world_points(surface: Surface, cam2world: np.ndarray) -> np.ndarray:
-    """The surface's points (h, w, 3) in the world."""
+    """World points (h, w, 3) of the surface."""
     local = ray_grid(surface.height) / surface.inverse_depth[..., None]
     return local @ cam2world[:3, :3].T + cam2world[:3, 3]
 
 
-def agreement(surfaces: Sequence[Surface], cam2world: np.ndarray, view: int, tolerance: float = 0.06) -> np.ndarray:
-    """Pixels (h, w) of a view whose surface at least one other view's surface agrees with."""
+def consistency_mask(
+    surfaces: Sequence[Surface], cam2world: np.ndarray, view: int, tolerance: float = 0.06
+) -> np.ndarray:
+    """Pixels (h, w) of a view whose surface is consistent with at least one other view's surface."""
     points = world_points(surfaces[view], cam2world[view])
-    agreed = np.zeros(points.shape[:2], bool)
+    consistent = np.zeros(points.shape[:2], bool)
     for other, surface in enumerate(surfaces):
         if other != view:
-            agreed |= relation(points, surface, cam2world[other], tolerance)[0] == AGREES
-    return agreed
+            consistent |= classify_visibility(points, surface, cam2world[other], tolerance)[0] == CONSISTENT
+    return consistent
 
 
 def guided_upsample(surface: Surface, coarse: np.ndarray, fine: np.ndarray) -> Surface:
-    """The surface at the size of `fine`: interpolated where smooth, and at its jumps on the side that looks alike.
+    """The surface at the size of `fine`.
+
+    Smooth parts are interpolated bilinearly. At a depth discontinuity a pixel takes the weighted median of its
+    neighbourhood, with weights by colour similarity (joint bilateral upsampling).
 
     Args:
-        coarse, fine: the view's picture (h, w, 3) at the surface's size and at the new size.
+        coarse, fine: the view's image (h, w, 3) at the surface's size and at the new size.
     """
-    inverse, family = _upsample(surface.inverse_depth, surface.family, coarse, fine)
-    return Surface(inverse, family)
+    return Surface(*_upsample(surface.inverse_depth, surface.orientation, coarse, fine))
 
 
 @nb.njit(parallel=True, fastmath=True, cache=True)
-def _upsample(inverse, family, coarse, fine):
+def _upsample(inverse, orientation, coarse, fine):
     h, w = inverse.shape
     height, width = fine.shape[:2]
     result = np.empty((height, width), np.float32)
-    families = np.empty((height, width), np.uint8)
+    orientations = np.empty((height, width), np.uint8)
     for i in nb.prange(height):
         values, weights = np.empty(25, np.float32), np.empty(25, np.float32)
         kinds = np.empty(25, np.uint8)
@@ -95,7 +142,7 @@ def _upsample(inverse, family, coarse, fine):
                     for q in range(3):
                         d += abs(fine[i, j, q] - coarse[r, c, q])
                     near = (cy + di - y) ** 2 + (cx + dj - x) ** 2
-                    values[n], kinds[n] = inverse[r, c], family[r, c]
+                    values[n], kinds[n] = inverse[r, c], orientation[r, c]
                     weights[n] = math.exp(-d / 0.1 - near / 2.0) + 1e-12
                     total += weights[n]
                     n += 1
@@ -115,5 +162,5 @@ def _upsample(inverse, family, coarse, fine):
             smooth += (inverse[r1, c0] * (1 - fx) + inverse[r1, c1] * fx) * fy
             close = abs(smooth / values[median] - 1) < 0.03
             result[i, j] = smooth if close else values[median]
-            families[i, j] = kinds[median]
-    return result, families
+            orientations[i, j] = kinds[median]
+    return result, orientations

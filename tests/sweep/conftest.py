@@ -7,13 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from pansplat.sweep.cost import MatchingConfig, View
-from pansplat.sweep.floor import FloorClues, find_floor
-from pansplat.sweep.frame import main_directions
-from pansplat.sweep.planes import no_support
+from pansplat.sweep.matching import MatchingConfig, View
+from pansplat.sweep.planes import axis_components, no_planes
+from pansplat.sweep.room_layout import FloorBoundary, detect_floor_boundaries
 from pansplat.sweep.search import PosedImages, SearchConfig, search_surfaces
-from pansplat.sweep.sphere import ray_grid, resize_sphere
-from pansplat.sweep.surface import Surface
+from pansplat.sweep.surface import Surface, ray_grid, resize_sphere
 
 
 def _waves(points: np.ndarray) -> np.ndarray:
@@ -176,16 +174,16 @@ def find_clues():
     return _find_clues
 
 
-def _find_clues(posed, images, floor: float) -> tuple[list[FloorClues] | None, list[np.ndarray]]:
+def _find_clues(posed, images, floor: float) -> tuple[list[FloorBoundary] | None, list[np.ndarray]]:
     """Clues of pictures and their rays along the room's axes; the floor at an offset, metres."""
-    rays = [main_directions(_AXES, pose[:3, :3], images.shape[1]) for pose in posed.cam2world]
+    rays = [axis_components(_AXES, pose[:3, :3], images.shape[1]) for pose in posed.cam2world]
     views = [
         View(np.ascontiguousarray(image, np.float32), mask, np.ascontiguousarray(ray[0], np.float32))
         for image, mask, ray in zip(images, posed.masks, rays, strict=True)
     ]
-    nothing = no_support(posed.cam2world, _AXES, posed.near, posed.far)
+    nothing = no_planes(posed.cam2world, _AXES, posed.near, posed.far)
     support = type(nothing)(**{**vars(nothing), "floor_ceiling": (floor - nothing.origin[1], -math.inf)})
-    return find_floor(views, rays, posed.cam2world, support, MatchingConfig()), rays
+    return detect_floor_boundaries(views, rays, posed.cam2world, support, MatchingConfig()), rays
 
 
 @pytest.fixture(scope="session")
@@ -194,7 +192,7 @@ def two_coloured(empty_room):
     posed, floor = empty_room.posed, empty_room.room.high[1]
     images = []
     for pose, depth, image in zip(posed.cam2world, empty_room.depths, posed.images, strict=True):
-        rays = main_directions(_AXES, pose[:3, :3], _HEIGHT)[0]
+        rays = axis_components(_AXES, pose[:3, :3], _HEIGHT)[0]
         on_floor = np.abs(rays * depth + pose[1, 3] - floor) < 1e-3
         paint = np.where(on_floor[..., None], (0.45, 0.3, 0.15), (0.85, 0.85, 0.85))
         images.append(paint * (0.8 + 0.4 * image.mean(axis=2, keepdims=True)))

@@ -157,7 +157,11 @@ def test_only_detail_makes_fine_gaussians():
 def test_points_on_a_sphere_are_at_its_radius_on_fibonacci_lattices():
     gaussians = lift(*_sphere_around(np.ones((64, 128, 3), np.float32)), LiftConfig())
     radius = gaussians.means.norm(dim=1)
-    for level, depth in ((1, 3.0), (2, 3.0 * LiftConfig().sheet_depth[0]), (3, 3.0 * LiftConfig().sheet_depth[1])):
+    for level, depth in (
+        (1, 3.0),
+        (2, 3.0 * LiftConfig().background_depth[0]),
+        (3, 3.0 * LiftConfig().background_depth[1]),
+    ):
         chosen = gaussians.levels == level
         assert int(chosen.sum()) == 2 * lattice_size(128 >> level)
         assert torch.allclose(radius[chosen], torch.tensor(depth), rtol=1e-4)
@@ -178,7 +182,7 @@ def test_what_another_view_surely_sees_through_is_dropped(make_room, observe, tw
     surfaces = _exact(observed)
     wrong = surfaces[0].inverse_depth.copy()
     wrong[20:30, 50:70] *= 2.0  # a ghost halfway, that neither of the others sees
-    ghost = lift(observed.posed, [Surface(wrong, surfaces[0].family), *surfaces[1:]], LiftConfig())
+    ghost = lift(observed.posed, [Surface(wrong, surfaces[0].orientation), *surfaces[1:]], LiftConfig())
     plain = lift(observed.posed, surfaces, LiftConfig())
     for level in (0, 1):
         kept, all_ = (((g.views == 0) & (g.levels == level)) for g in (ghost, plain))

@@ -1,18 +1,86 @@
-"""The planes that a scene has."""
+"""The scene's axes, found in its edges.
+
+---
+The planes that a scene has.
+
+---
+What pixels say about a scene's planes before any surface is known."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 
-from pansplat.sweep.planes import PlaneSupport, no_support, plane_support
-from pansplat.sweep.surface import Surface, world_points
+from pansplat.sweep.matching import MatchingConfig, View
+from pansplat.sweep.planes import ScenePlanes, axis_components, collect_planes, detect_planes, estimate_axes, no_planes
+from pansplat.sweep.search import PosedImages
+from pansplat.sweep.surface import Surface, ray_grid, world_points
+
+
+def _degrees_off(found: np.ndarray, wanted: np.ndarray) -> float:
+    return math.degrees(math.acos(min(1.0, float(found @ wanted))))
+
+
+def _yaw_degrees_off(axes: np.ndarray, placed: np.ndarray) -> float:
+    """Smallest turn about the vertical that brings the wall normals onto the room's."""
+    in_room = axes[1] @ placed
+    turned = math.degrees(math.atan2(in_room[2], in_room[0])) % 90
+    return min(turned, 90 - turned)
+
+
+@pytest.mark.parametrize(("yaw", "pitch", "roll"), ((0, 0, 0), (31, 0, 0), (58, 6, -4), (12, -35, 50)))
+def test_a_room_of_bricks_shows_which_way_is_down_and_how_its_walls_run(make_room, observe, turn, yaw, pitch, roll):
+    placed = np.eye(4)
+    placed[:3, :3] = turn("z", roll) @ turn("x", pitch) @ turn("y", yaw)
+    room = make_room(paint="tiles", placed=placed, supersample=8)
+    posed = observe(room, [room.pose((-0.4, 0, -0.2)), room.pose((0.4, 0, 0.1), turn("y", 23))], 128).posed
+    axes = estimate_axes(posed.images, posed.cam2world[:, :3, :3])
+    assert _degrees_off(axes[0], placed[:3, 1]) < 1.0
+    assert _yaw_degrees_off(axes, placed[:3, :3]) < 1.0
+
+
+def test_tilted_cameras_do_not_tilt_the_scene(make_room, observe, turn):
+    room = make_room(paint="tiles", supersample=8)
+    tilt = turn("x", 5) @ turn("z", 4)  # both lean the same way: their mean is 6.4 degrees off
+    posed = observe(room, [room.pose((-0.4, 0, -0.2), tilt), room.pose((0.4, 0, 0.1), tilt)], 128).posed
+    assert _degrees_off(posed.cam2world[0, :3, 1], np.array((0, 1, 0))) > 6
+    axes = estimate_axes(posed.images, posed.cam2world[:, :3, :3])
+    assert _degrees_off(axes[0], np.array((0, 1, 0))) < 1.2
+    assert _yaw_degrees_off(axes, np.eye(3)) < 1.2
+
+
+@pytest.mark.parametrize("paint", ("blank", "waves", "tiles"))
+def test_axes_are_orthonormal(make_room, observe, turn, paint):
+    room = make_room(paint=paint)
+    posed = observe(room, [room.pose((0, 0, 0), turn("x", 20)), room.pose((0.5, 0, 0), turn("z", 9))], 64).posed
+    axes = estimate_axes(posed.images, posed.cam2world[:, :3, :3])
+    assert np.allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+
+
+def test_down_is_the_cameras_mean_where_nothing_shows_an_edge(turn):
+    rotations = [turn("z", 12), turn("z", -2)]
+    axes = estimate_axes([np.full((64, 128, 3), 0.5, np.float32)] * 2, rotations)
+    assert _degrees_off(axes[0], turn("z", 5)[:, 1]) < 1e-5
+
+
+def test_cameras_upside_down_to_each_other_still_give_axes(turn):
+    axes = estimate_axes([np.full((64, 128, 3), 0.5, np.float32)] * 2, [np.eye(3), turn("z", 180)])
+    assert np.isfinite(axes).all() and np.allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+
+
+def test_main_directions_are_the_rays_in_the_scenes_axes(turn):
+    rotation, axes = turn("y", 40) @ turn("x", 10), turn("z", 25)
+    directions = axis_components(axes, rotation, 32)
+    rays = ray_grid(32) @ rotation.T
+    assert np.allclose(directions, np.moveaxis(rays @ axes.T, -1, 0), atol=1e-6)
+
 
 _AXES = np.array(((0.0, 1, 0), (1, 0, 0), (0, 0, 1)))  # down and the room's two wall normals
 
 
 @pytest.fixture(scope="module")
-def support(empty_room) -> PlaneSupport:
+def support(empty_room) -> ScenePlanes:
     """Of the exact surfaces, every pixel labelled with its wall's axis."""
     room, poses = empty_room.room, empty_room.posed.cam2world
     surfaces = []
@@ -22,7 +90,7 @@ def support(empty_room) -> PlaneSupport:
         low, high = np.array(room.low) @ _AXES.T, np.array(room.high) @ _AXES.T
         wall = np.minimum(np.abs(points - low), np.abs(points - high)).argmin(axis=-1)
         surfaces.append(Surface(plain.inverse_depth, (wall + 1).astype(np.uint8)))
-    return plane_support(surfaces, list(empty_room.posed.masks), poses, no_support(poses, _AXES, 0.5, 8.0))
+    return collect_planes(surfaces, list(empty_room.posed.masks), poses, no_planes(poses, _AXES, 0.5, 8.0))
 
 
 def test_shares_of_all_planes_sum_to_one(support):
@@ -36,16 +104,16 @@ def test_every_wall_has_support_at_its_distance_and_none_between(support, empty_
     centre = pose[:3, 3] @ _AXES.T
     for axis in range(3):
         distances = np.array((centre[axis] - low[axis], high[axis] - centre[axis]))
-        share = support.share(axis, pose, 1 / distances)
+        share = support.support(axis, pose, 1 / distances)
         assert share[0, 0] > 0.9 and share[1, 1] > 0.9
-        assert support.share(axis, pose, 1 / (0.7 * distances)).max() < 0.1
+        assert support.support(axis, pose, 1 / (0.7 * distances)).max() < 0.1
 
 
 @pytest.mark.parametrize("view", (0, 1))
 def test_the_floor_is_below_and_the_ceiling_above_the_camera(support, empty_room, view):
     """Bounds leave a little room beyond, never less than the true planes."""
     pose, room = empty_room.posed.cam2world[view], empty_room.room
-    down, up = support.bounds(pose)
+    down, up = support.vertical_bounds(pose)
     floor, ceiling = room.high[1] - pose[1, 3], room.low[1] - pose[1, 3]
     assert floor < down < 1.15 * floor + 0.1
     assert 1.15 * ceiling - 0.1 < up < ceiling
@@ -54,58 +122,114 @@ def test_the_floor_is_below_and_the_ceiling_above_the_camera(support, empty_room
 def test_without_agreement_nothing_is_known(empty_room):
     nothing = [np.zeros_like(mask) for mask in empty_room.posed.masks]
     poses = empty_room.posed.cam2world
-    support = plane_support(empty_room.surfaces, nothing, poses, no_support(poses, _AXES, 0.45, 8.0))
-    assert support.bounds(empty_room.posed.cam2world[0]) == (np.inf, -np.inf)
-    assert support.share(1, empty_room.posed.cam2world[0], np.linspace(0.1, 2, 20)).max() == 0
+    support = collect_planes(empty_room.surfaces, nothing, poses, no_planes(poses, _AXES, 0.45, 8.0))
+    assert support.vertical_bounds(empty_room.posed.cam2world[0]) == (np.inf, -np.inf)
+    assert support.support(1, empty_room.posed.cam2world[0], np.linspace(0.1, 2, 20)).max() == 0
 
 
 def test_the_sweep_finds_floor_and_ceiling_by_itself(empty_room):
-    from pansplat.sweep.surface import agreement
+    from pansplat.sweep.surface import consistency_mask
 
     poses = empty_room.posed.cam2world
     labelled = [
         Surface(s.inverse_depth, np.where(np.abs(world_points(s, p)[..., 1]) > 1.0, 1, 0).astype(np.uint8))
         for s, p in zip(empty_room.surfaces, poses, strict=True)
     ]
-    agreed = [agreement(labelled, poses, view) for view in (0, 1)]
-    down, up = plane_support(labelled, agreed, poses, no_support(poses, _AXES, 0.45, 8.0)).bounds(poses[0])
+    agreed = [consistency_mask(labelled, poses, view) for view in (0, 1)]
+    down, up = collect_planes(labelled, agreed, poses, no_planes(poses, _AXES, 0.45, 8.0)).vertical_bounds(poses[0])
     assert down == pytest.approx(1.06 * empty_room.room.high[1] + 0.05, abs=0.1)
     assert up == pytest.approx(1.06 * empty_room.room.low[1] - 0.05, abs=0.1)
 
 
 def test_a_plane_that_pixels_voted_for_is_supported_without_any_surface(empty_room):
     poses = empty_room.posed.cam2world
-    nothing = no_support(poses, _AXES, 0.45, 8.0)
+    nothing = no_planes(poses, _AXES, 0.45, 8.0)
     votes = np.zeros_like(nothing.votes)
     votes[0, nothing.offsets.searchsorted(1.2)] = 0.7
     voted = dataclasses.replace(nothing, votes=votes)
     distance = voted.offsets[voted.votes[0].argmax()] - poses[0][1, 3] + voted.origin[1]
-    assert voted.share(0, poses[0], np.array((1 / distance,)))[1, 0] == pytest.approx(0.7)
-    assert nothing.share(0, poses[0], np.array((1 / distance,))).max() == 0
+    assert voted.support(0, poses[0], np.array((1 / distance,)))[1, 0] == pytest.approx(0.7)
+    assert nothing.support(0, poses[0], np.array((1 / distance,))).max() == 0
 
 
 def test_floor_and_ceiling_that_pixels_voted_for_come_before_those_of_surfaces(support, empty_room):
     pose = empty_room.posed.cam2world[0]
-    voted = dataclasses.replace(support, floor_ceiling=(2.0, -np.inf)).bounds(pose)
+    voted = dataclasses.replace(support, floor_ceiling=(2.0, -np.inf)).vertical_bounds(pose)
     below = 2.0 - (pose[1, 3] - support.origin[1])
     assert voted[0] == pytest.approx(1.06 * below + support.bin)
-    assert voted[1] == support.bounds(pose)[1]
+    assert voted[1] == support.vertical_bounds(pose)[1]
 
 
 def test_planes_between_two_cameras_show_them_different_faces():
     """Cameras at x = 0 and x = 1, planes across x."""
     here, there = np.eye(4), np.eye(4)
     there[0, 3] = 1.0
-    nothing = no_support(np.stack((here, there)), _AXES, 0.5, 8.0)
+    nothing = no_planes(np.stack((here, there)), _AXES, 0.5, 8.0)
     distance = np.array((0.5, 0.9, 1.1, 3.0))
-    assert np.array_equal(nothing.backs(1, here, there, 1 / distance), ((False,) * 4, (True, True, False, False)))
-    assert np.array_equal(nothing.backs(1, there, here, 1 / distance), ((True, True, False, False), (False,) * 4))
-    assert not nothing.backs(0, here, there, 1 / distance).any()
+    assert np.array_equal(nothing.separating(1, here, there, 1 / distance), ((False,) * 4, (True, True, False, False)))
+    assert np.array_equal(nothing.separating(1, there, here, 1 / distance), ((True, True, False, False), (False,) * 4))
+    assert not nothing.separating(0, here, there, 1 / distance).any()
 
 
 def test_the_floor_is_below_each_camera_by_its_own_height():
     poses = np.stack((np.eye(4), np.eye(4)))
     poses[1, 1, 3] = 0.4  # lower by that
-    floor = dataclasses.replace(no_support(poses, _AXES, 0.5, 8.0), floor_ceiling=(1.0, -np.inf))
-    assert floor.floor_below(poses[0]) == pytest.approx(1.2)
-    assert floor.floor_below(poses[1]) == pytest.approx(0.8)
+    floor = dataclasses.replace(no_planes(poses, _AXES, 0.5, 8.0), floor_ceiling=(1.0, -np.inf))
+    assert floor.camera_height(poses[0]) == pytest.approx(1.2)
+    assert floor.camera_height(poses[1]) == pytest.approx(0.8)
+
+
+_AXES = np.array(((0.0, 1, 0), (1, 0, 0), (0, 0, 1)))  # down and the room's two wall normals
+
+
+def _vote(posed: PosedImages, images: np.ndarray, masks: np.ndarray) -> ScenePlanes:
+    rays = [axis_components(_AXES, pose[:3, :3], images.shape[1]) for pose in posed.cam2world]
+    views = [
+        View(image, mask, np.ascontiguousarray(down[0], np.float32))
+        for image, mask, down in zip(images, masks, rays, strict=True)
+    ]
+    support = no_planes(posed.cam2world, _AXES, posed.near, posed.far)
+    return detect_planes(views, rays, posed.cam2world, support, (0.125, 2.5), 0.45, MatchingConfig())
+
+
+@pytest.fixture(scope="module")
+def voted(empty_room) -> ScenePlanes:
+    return _vote(empty_room.posed, empty_room.posed.images, empty_room.posed.masks)
+
+
+def test_every_wall_is_the_most_voted_plane_on_its_side(voted, empty_room):
+    for axis in range(3):
+        for sign, corner in ((1, empty_room.room.high), (-1, empty_room.room.low)):
+            true = (np.array(corner) - voted.origin) @ _AXES[axis]
+            side = np.where(sign * voted.offsets > 0.5, voted.votes[axis], 0)
+            assert voted.offsets[side.argmax()] == pytest.approx(true, abs=1.5 * voted.bin)
+            assert side.max() > 0.5
+
+
+def test_shares_lie_between_nothing_and_everything(voted):
+    assert voted.votes.min() >= 0
+    assert voted.votes.max() == pytest.approx(1, abs=1e-3)
+    assert np.median(voted.votes) < 0.2
+
+
+def test_the_floor_and_the_ceiling_are_found(voted, empty_room):
+    down, up = voted.floor_ceiling
+    assert down == pytest.approx(empty_room.room.high[1] - voted.origin[1], abs=1.5 * voted.bin)
+    assert up == pytest.approx(empty_room.room.low[1] - voted.origin[1], abs=1.5 * voted.bin)
+
+
+def test_a_box_standing_on_the_floor_is_not_the_floor(furnished_room):
+    down, _ = _vote(furnished_room.posed, furnished_room.posed.images, furnished_room.posed.masks).floor_ceiling
+    assert down == pytest.approx(furnished_room.room.high[1], abs=0.1)
+
+
+def test_blank_pictures_vote_for_nothing(empty_room):
+    voted = _vote(empty_room.posed, np.ones_like(empty_room.posed.images), empty_room.posed.masks)
+    assert voted.votes.max() < 1e-3
+    assert voted.floor_ceiling == (math.inf, -math.inf)
+
+
+def test_masked_pixels_vote_for_nothing(empty_room):
+    voted = _vote(empty_room.posed, empty_room.posed.images, np.zeros_like(empty_room.posed.masks))
+    assert voted.votes.max() == 0
+    assert voted.floor_ceiling == (math.inf, -math.inf)

@@ -3,15 +3,16 @@
 import numpy as np
 import pytest
 
-from pansplat.sweep.sphere import ray_grid, resize_sphere
 from pansplat.sweep.surface import (
-    AGREES,
-    HIDDEN,
-    SEEN_THROUGH,
+    CONSISTENT,
+    FREE_SPACE,
+    OCCLUDED,
     Surface,
-    agreement,
+    classify_visibility,
+    consistency_mask,
     guided_upsample,
-    relation,
+    ray_grid,
+    resize_sphere,
     world_points,
 )
 
@@ -28,8 +29,14 @@ def test_points_before_on_and_behind_a_surface_are_told_apart(turn):
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn("y", 50) @ turn("x", 20), (3, -1, 2)
     directions = ray_grid(8).reshape(-1, 3).astype(np.float64)
-    for distance, said in ((1.0, SEEN_THROUGH), (1.96, AGREES), (2.0, AGREES), (2.04, AGREES), (4.0, HIDDEN)):
-        result, ratio = relation(pose[:3, 3] + distance * directions, _sphere(2.0), pose, 0.06)
+    for distance, said in (
+        (1.0, FREE_SPACE),
+        (1.96, CONSISTENT),
+        (2.0, CONSISTENT),
+        (2.04, CONSISTENT),
+        (4.0, OCCLUDED),
+    ):
+        result, ratio = classify_visibility(pose[:3, 3] + distance * directions, _sphere(2.0), pose, 0.06)
         assert (result == said).all()
         assert np.allclose(ratio, 2.0 / distance, rtol=1e-6)
 
@@ -38,12 +45,12 @@ def test_a_point_is_compared_with_the_surface_in_its_own_direction():
     inverse = np.full((32, 64), 0.5)
     inverse[:, 32:] = 0.25  # right half: 4 m
     points = np.array(((3.0, 0, 0), (-3.0, 0, 0)))
-    assert relation(points, _surface(inverse), np.eye(4), 0.06)[0].tolist() == [SEEN_THROUGH, HIDDEN]
+    assert classify_visibility(points, _surface(inverse), np.eye(4), 0.06)[0].tolist() == [FREE_SPACE, OCCLUDED]
 
 
 def test_a_point_at_the_camera_is_seen_through():
-    said, ratio = relation(np.zeros((1, 3)), _sphere(2.0), np.eye(4), 0.06)
-    assert said.tolist() == [SEEN_THROUGH] and np.isfinite(ratio).all()
+    said, ratio = classify_visibility(np.zeros((1, 3)), _sphere(2.0), np.eye(4), 0.06)
+    assert said.tolist() == [FREE_SPACE] and np.isfinite(ratio).all()
 
 
 def test_world_points_are_where_the_rays_end(empty_room):
@@ -57,25 +64,27 @@ def test_world_points_are_where_the_rays_end(empty_room):
 def test_exact_surfaces_agree_everywhere_in_an_empty_room(empty_room):
     surfaces = [_surface(1 / depth) for depth in empty_room.depths]
     for view in (0, 1):
-        assert agreement(surfaces, empty_room.posed.cam2world, view).mean() > 0.995
+        assert consistency_mask(surfaces, empty_room.posed.cam2world, view).mean() > 0.995
 
 
 def test_exact_surfaces_disagree_only_where_the_box_hides(furnished_room):
     """The views' hidden shares belong to the same box: similar, small and not nothing."""
     surfaces = [_surface(1 / depth) for depth in furnished_room.depths]
-    shares = [1 - agreement(surfaces, furnished_room.posed.cam2world, view).mean() for view in (0, 1)]
+    shares = [1 - consistency_mask(surfaces, furnished_room.posed.cam2world, view).mean() for view in (0, 1)]
     assert all(0.005 < share < 0.15 for share in shares)
 
 
 def test_agreement_is_symmetrical_in_the_order_of_the_views(furnished_room):
     surfaces, poses = [_surface(1 / depth) for depth in furnished_room.depths], furnished_room.posed.cam2world
     for view in (0, 1):
-        assert np.array_equal(agreement(surfaces, poses, view), agreement(surfaces[::-1], poses[::-1], 1 - view))
+        assert np.array_equal(
+            consistency_mask(surfaces, poses, view), consistency_mask(surfaces[::-1], poses[::-1], 1 - view)
+        )
 
 
 def test_nothing_agrees_with_a_surface_far_off(empty_room):
     surfaces = [_surface(1 / empty_room.depths[0]), _surface(2.5 / empty_room.depths[1])]
-    assert agreement(surfaces, empty_room.posed.cam2world, 0).mean() < 0.1
+    assert consistency_mask(surfaces, empty_room.posed.cam2world, 0).mean() < 0.1
 
 
 def _smooth(height: int) -> np.ndarray:
@@ -117,5 +126,5 @@ def test_upsampled_families_are_those_of_the_surface():
     fine = np.full((32, 64, 3), 0.5, np.float32)
     inverse = np.where(family > 0, 0.4, 1.0).astype(np.float32)
     large = guided_upsample(Surface(inverse, family), resize_sphere(fine, 16), fine)
-    assert large.family.shape == (32, 64) and set(np.unique(large.family)) == {0, 2}
-    assert ((large.family == 2) == (large.inverse_depth < 0.7)).all()
+    assert large.orientation.shape == (32, 64) and set(np.unique(large.orientation)) == {0, 2}
+    assert ((large.orientation == 2) == (large.inverse_depth < 0.7)).all()

@@ -1,4 +1,7 @@
-"""The matching cost of hypotheses."""
+"""The matching cost of hypotheses.
+
+---
+Semi-global aggregation on the sphere."""
 
 import dataclasses
 import math
@@ -7,19 +10,29 @@ import numba as nb
 import numpy as np
 import pytest
 
-from pansplat.sweep.cost import Family, MatchingConfig, View, _fast_atan2, matching_cost
-from pansplat.sweep.sphere import ray_grid
+from pansplat.sweep.matching import (
+    AggregationConfig,
+    HypothesisSet,
+    MatchingConfig,
+    View,
+    _aggregate_columns,
+    _fast_atan2,
+    aggregate,
+    best_labels,
+    matching_cost,
+)
+from pansplat.sweep.surface import ray_grid
 
 _ANYWHERE = (math.inf, -math.inf)
-_PLAIN = MatchingConfig(flat_weight=1.0, distance_penalty=0.0)
+_PLAIN = MatchingConfig(textureless_weight=1.0, distance_penalty=0.0)
 _IMPOSSIBLE = 2 * (_PLAIN.correlation_weight + _PLAIN.color_weight)
 _NEUTRAL = 0.5 * (_PLAIN.correlation_weight + _PLAIN.color_weight)
 
 
-def _family(height: int, inverses: np.ndarray) -> Family:
+def _family(height: int, inverses: np.ndarray) -> HypothesisSet:
     """Spheres at equally spaced inverse depths."""
     shape = (height, 2 * height)
-    return Family(
+    return HypothesisSet(
         np.full(shape, inverses[0], np.float32),
         np.full(shape, inverses[1] - inverses[0], np.float32),
         np.zeros((2, len(inverses)), np.float32),
@@ -27,11 +40,11 @@ def _family(height: int, inverses: np.ndarray) -> Family:
     )
 
 
-def _view(image: np.ndarray, usable: np.ndarray | None = None, inverse: float | None = None, trust: float = 1) -> View:
+def _view(image: np.ndarray, valid: np.ndarray | None = None, inverse: float | None = None, trust: float = 1) -> View:
     shape = image.shape[:2]
     return View(
         np.ascontiguousarray(image, np.float32),
-        np.ones(shape, bool) if usable is None else usable,
+        np.ones(shape, bool) if valid is None else valid,
         np.ascontiguousarray(ray_grid(shape[0])[..., 1]),
         None if inverse is None else np.full(shape, inverse, np.float32),
         None if inverse is None else np.full(shape, trust, np.float32),
@@ -42,7 +55,7 @@ def _around_the_truth(observed, view: int, factors: np.ndarray) -> np.ndarray:
     """Cost (h, w, factor) of the true inverse depth times equally spaced factors."""
     posed = observed.posed
     true = (1 / observed.depths[view]).astype(np.float32)
-    family = Family(
+    family = HypothesisSet(
         factors[0] * true,
         (factors[1] - factors[0]) * true,
         np.zeros((2, len(factors)), np.float32),
@@ -107,9 +120,9 @@ def test_several_families_cost_what_they_cost_alone(empty_room):
 @pytest.mark.parametrize("whose", ("own", "other"))
 def test_masked_pixels_are_neutral(empty_room, whose):
     image, height = empty_room.posed.images[0], 96
-    usable = np.ones((height, 2 * height), bool)
-    usable[:20] = False
-    views = _view(image, usable if whose == "own" else None), _view(image, usable if whose == "other" else None)
+    valid = np.ones((height, 2 * height), bool)
+    valid[:20] = False
+    views = _view(image, valid if whose == "own" else None), _view(image, valid if whose == "other" else None)
     family = _family(height, np.linspace(0.2, 1.5, 6, dtype=np.float32))
     cost = matching_cost(*views, np.eye(4), [family], (0.1, 2.0), _ANYWHERE, _PLAIN)
     assert np.allclose(cost[:20], _NEUTRAL)
@@ -129,13 +142,13 @@ def test_hypotheses_out_of_range_are_impossible(empty_room):
 
 
 def test_what_the_other_view_knows_changes_the_cost_as_configured(empty_room):
-    """Seen through costs, agreement earns, and hidden points cost the same whatever the pictures say."""
+    """Seen through costs, consistency_mask earns, and hidden points cost the same whatever the pictures say."""
     image = empty_room.posed.images[0]
     family = _family(96, np.array((0.25, 0.5, 0.75, 1.0), np.float32))
     cost = matching_cost(
         _view(image), _view(image, inverse=0.5), np.eye(4), [family], (0.1, 2.0), _ANYWHERE, _PLAIN
     ).reshape(-1, 4)
-    expected = (_PLAIN.occluded_cost, -_PLAIN.agreement_bonus, _PLAIN.visible_penalty, _PLAIN.visible_penalty)
+    expected = (_PLAIN.occluded_cost, -_PLAIN.consistency_bonus, _PLAIN.free_space_penalty, _PLAIN.free_space_penalty)
     assert np.allclose(cost, expected, atol=0.02)
     unsure = matching_cost(
         _view(image), _view(image, inverse=0.5, trust=0), np.eye(4), [family], (0.1, 2.0), _ANYWHERE, _PLAIN
@@ -159,7 +172,7 @@ def test_a_penalty_is_paid_on_its_side_only(empty_room):
     plain = _family(96, np.array((0.25, 0.5), np.float32))
     side = np.zeros(plain.side.shape, np.uint8)
     side[:, 96:] = 1
-    family = Family(plain.base, plain.step, np.array(((0.0, 0.3), (0.7, 0.0)), np.float32), side)
+    family = HypothesisSet(plain.base, plain.step, np.array(((0.0, 0.3), (0.7, 0.0)), np.float32), side)
     cost = matching_cost(view, view, np.eye(4), [family], (0.1, 2.0), _ANYWHERE, _PLAIN)
     assert np.allclose(cost[:, :96], (0.0, 0.3), atol=0.02)
     assert np.allclose(cost[:, 96:], (0.7, 0.0), atol=0.02)
@@ -171,7 +184,9 @@ def test_a_window_without_texture_says_little():
     family = _family(32, np.array((0.25, 0.5), np.float32))
     config = MatchingConfig()
     cost = matching_cost(_view(white), _view(gray), np.eye(4), [family], (0.1, 2.0), _ANYWHERE, config)
-    expected = config.flat_weight * config.color_weight + (1 - config.flat_weight) * config.flat_cost
+    expected = (
+        config.textureless_weight * config.color_weight + (1 - config.textureless_weight) * config.textureless_cost
+    )
     assert np.allclose(cost, expected, atol=1e-3)
 
 
@@ -215,11 +230,13 @@ def test_fast_atan2_is_right_on_the_axes():
 def test_a_plane_that_the_other_view_sees_from_behind_is_not_compared(empty_room):
     views = [_view(image) for image in empty_room.posed.images]
     plain = _family(96, np.array((0.25, 0.5), np.float32))
-    hidden = dataclasses.replace(plain, unseen=np.array(((False, True), (False, False))))
+    hidden = dataclasses.replace(plain, back_facing=np.array(((False, True), (False, False))))
     pose = empty_room.posed.relative_pose(0, 1)
     before, cost = (matching_cost(*views, pose, [f], (0.1, 2.0), _ANYWHERE, _PLAIN) for f in (plain, hidden))
     assert np.array_equal(cost[..., 0], before[..., 0])
-    assert np.allclose(cost[..., 1], _PLAIN.unseen_cost) and not np.allclose(before[..., 1], _PLAIN.unseen_cost)
+    assert np.allclose(cost[..., 1], _PLAIN.back_facing_cost) and not np.allclose(
+        before[..., 1], _PLAIN.back_facing_cost
+    )
 
 
 def test_spheres_seen_from_opposite_directions_cost_more_and_planes_do_not(empty_room):
@@ -237,3 +254,154 @@ def test_spheres_seen_from_opposite_directions_cost_more_and_planes_do_not(empty
     expected = _PLAIN.opposed_penalty * ((0.2 - cosine) / 0.7).clip(0, 1)
     assert expected.max() == _PLAIN.opposed_penalty and (expected == 0).mean() > 0.3
     assert np.allclose(sphere - plain, expected, atol=1e-4)
+
+
+_AWAY_FROM_POLES = slice(4, -4)
+"""Rows whose paths forget within half a turn where they began; nearer to a pole changing costs too much for that."""
+_FREE = AggregationConfig(step_penalty=0, crease_penalty=0, jump_penalty=0)
+
+
+def _slots(height: int, families: int = 1) -> np.ndarray:
+    """Every family's hypotheses k in depth slots k."""
+    slot_map = np.zeros((height, 2 * height, families, 2), np.float32)
+    slot_map[..., 0], slot_map[..., 1] = 1, 0.5
+    return slot_map
+
+
+def _gray(height: int) -> np.ndarray:
+    return np.full((height, 2 * height, 3), 0.5, np.float32)
+
+
+def _noise(height: int, labels: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).random((height, 2 * height, labels)).astype(np.float32)
+
+
+def test_without_prices_every_direction_counts_the_cost_once():
+    cost = _noise(32, 24)
+    total = aggregate(cost, _gray(32), _slots(32, 2), 12, _FREE)
+    assert np.allclose(total, 8 * cost, atol=1e-5)
+
+
+def test_a_hypothesis_that_fits_everywhere_costs_nothing():
+    cost = 0.1 + _noise(32, 24)
+    cost[..., 17] = 0
+    total = aggregate(cost, _gray(32), _slots(32, 2), 12, AggregationConfig())
+    assert np.abs(total[..., 17]).max() < 1e-5
+    assert np.delete(total, 17, axis=2).min() > 0.1
+
+
+def test_a_plane_is_carried_on_through_a_gap_that_shows_nothing():
+    cost = _noise(32, 12) + 1
+    cost[..., 5] = 0
+    gap = (slice(10, 20), slice(20, 40))
+    cost[gap] = 0.02 * _noise(32, 12, seed=1)[gap]
+    assert (cost[gap].argmin(axis=-1) == 5).mean() < 0.3  # the gap by itself does not know
+    total = aggregate(cost, _gray(32), _slots(32), 12, AggregationConfig())
+    assert (total.argmin(axis=-1) == 5).all()
+
+
+def test_a_gap_across_the_left_and_right_edge_is_filled_as_well():
+    cost = _noise(32, 12) + 1
+    cost[..., 5] = 0
+    gap = (np.arange(10, 20)[:, None], np.arange(-10, 10)[None])
+    cost[gap] = 0.02 * _noise(32, 12, seed=1)[gap]
+    total = aggregate(cost, _gray(32), _slots(32), 12, AggregationConfig())
+    assert (total.argmin(axis=-1) == 5).all()
+
+
+@pytest.mark.parametrize("pole", (slice(0, 5), slice(-5, None)))
+def test_a_gap_over_a_pole_is_filled_as_well(pole):
+    cost = _noise(32, 12) + 1
+    cost[..., 5] = 0
+    cost[pole] = 0.004 * _noise(32, 12, seed=1)[pole]
+    total = aggregate(cost, _gray(32), _slots(32), 12, AggregationConfig())
+    assert (total.argmin(axis=-1) == 5).all()
+
+
+@pytest.mark.parametrize("dy", (1, -1))
+def test_a_column_goes_on_over_the_pole_half_a_turn_away(dy):
+    """What a few columns know at the pole that paths come from reaches the opposite columns, and no others."""
+    height, count = 32, 12
+    cost = np.zeros((height, 2 * height, count), np.float32)
+    known = slice(0, 6) if dy > 0 else slice(-6, None)
+    cost[known, :4] = 1
+    cost[known, :4, 5] = 0
+    total = np.zeros_like(cost)
+    penalties = tuple(np.float32(price) for price in (0.08, 0.15, 0.8, 0.1))
+    _aggregate_columns(cost, total, _gray(height), _slots(height), 1, count, count, penalties, dy, 0, height // 4)
+    first = total[0 if dy > 0 else -1]
+    knows = np.sort(first, axis=1)[:, 1] > first[:, 5] + 0.05
+    assert np.flatnonzero(knows).tolist() == [0, 1, 2, 3, 32, 33, 34, 35]
+
+
+def test_a_jump_stays_where_the_picture_has_an_edge():
+    """The costs leave a strip open in which the surface jumps; the picture says where."""
+    height = 32
+    guide = _gray(height)
+    guide[:, 29:] = 0.95
+    cost = 1 + _noise(height, 12)
+    cost[:, :26, 2], cost[:, 34:, 9] = 0, 0
+    cost[:, 26:34] = 0
+    total = aggregate(cost, guide, _slots(height), 12, AggregationConfig())
+    rows = slice(8, 24)
+    assert (total[rows, 10:29].argmin(axis=-1) == 2).mean() > 0.98
+    assert (total[rows, 29:54].argmin(axis=-1) == 9).mean() > 0.98
+
+
+def test_families_meet_cheaply_only_where_their_slots_do():
+    """HypothesisSet 0's hypothesis gives way to family 1's; cheap if both pass through the same depth, else a jump."""
+    height, count = 32, 12
+    cost = np.full((height, 2 * height, 2 * count), 1.0, np.float32)
+    cost[:, :32, 4] = 0
+    cost[:, 32:, count + 4] = 0
+    least = []
+    for start in (0.5, 6.5):  # family 1's hypothesis 4 lies in slot 4, or in slot 10
+        slot_map = _slots(height, 2)
+        slot_map[..., 1, 1] = start
+        total = aggregate(cost, _gray(height), slot_map, 20, AggregationConfig())
+        least.append(float(total[16, 32, count + 4]))
+    assert 0 < least[0] < 0.5 * least[1]
+
+
+def test_threads_change_no_bit():
+    cost, guide = _noise(32, 24), _noise(32, 3, seed=2)
+    one, two = (aggregate(cost, guide, _slots(32, 2), 12, AggregationConfig(), threads=n) for n in (1, 2))
+    assert np.array_equal(one, two)
+
+
+def test_rolling_the_cost_rolls_the_total():
+    cost, guide, columns = _noise(32, 12), 0.1 * _noise(32, 3, seed=2), 23
+    total = aggregate(cost, guide, _slots(32), 12, AggregationConfig())
+    rolled = aggregate(
+        np.roll(cost, columns, axis=1), np.roll(guide, columns, axis=1), _slots(32), 12, AggregationConfig()
+    )
+    assert np.allclose(np.roll(rolled, -columns, axis=1)[_AWAY_FROM_POLES], total[_AWAY_FROM_POLES], atol=1e-4)
+
+
+@pytest.mark.parametrize("axis", (0, 1))
+def test_mirroring_the_cost_mirrors_the_total(axis):
+    cost, guide = _noise(32, 12), 0.1 * _noise(32, 3, seed=2)
+    total = aggregate(cost, guide, _slots(32), 12, AggregationConfig())
+    mirrored = aggregate(
+        np.ascontiguousarray(np.flip(cost, axis)), np.ascontiguousarray(np.flip(guide, axis)),
+        _slots(32), 12, AggregationConfig(),
+    )  # fmt: skip
+    assert np.allclose(np.flip(mirrored, axis)[_AWAY_FROM_POLES], total[_AWAY_FROM_POLES], atol=1e-4)
+
+
+def test_the_best_label_lies_at_the_vertex_of_a_parabola():
+    count = 12
+    vertex = np.random.default_rng(0).uniform(1, count - 2, (16, 32, 1))
+    total = ((np.arange(count) - vertex) ** 2).astype(np.float32)
+    label, offset = best_labels(np.concatenate((total + 1, total), axis=2), count)
+    assert (label >= count).all()
+    assert np.allclose(label - count + offset, vertex[..., 0], atol=1e-3)
+
+
+def test_no_offset_leaves_a_family():
+    total = np.ones((8, 16, 24), np.float32)
+    total[:, :8, 11], total[:, :8, 12] = 0, 0.2  # the last of the first family: 12 belongs to another
+    total[:, 8:, 12], total[:, 8:, 11] = 0, 0.2
+    label, offset = best_labels(total, 12)
+    assert set(np.unique(label)) == {11, 12}
+    assert (offset == 0).all()
