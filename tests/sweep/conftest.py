@@ -1,5 +1,6 @@
-"""Painted rooms, and what one image says of a room's floor, for the tests of the sweep."""
+"""Textured rooms with known depth, searched once for all tests of the sweep."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -27,7 +28,7 @@ def _waves(points: np.ndarray) -> np.ndarray:
 
 
 def _tiles(points: np.ndarray) -> np.ndarray:
-    """Bricks (n, 3) of one colour each, their edges along the room's axes."""
+    """Bricks (n, 3) of one colour each, with edges along the room's axes."""
     generator = np.random.default_rng(3)
     table = generator.random((64, 3))
     cell = np.floor(points / np.array((0.71, 0.53, 0.87)) + 0.37).astype(np.int64)
@@ -43,7 +44,7 @@ _PAINTS = {"waves": _waves, "tiles": _tiles, "blank": _blank}
 
 @dataclass(frozen=True)
 class Room:
-    """A painted box seen from inside, with or without a smaller box standing in it. Metres, room axes, y down."""
+    """A textured room, with or without a box that stands in it. Metres, room axes, y down."""
 
     paint: str = "waves"
     low: tuple[float, float, float] = (-2.4, -1.3, -1.9)
@@ -52,7 +53,7 @@ class Room:
     placed: np.ndarray = field(default_factory=lambda: np.eye(4))
     """Similarity (4, 4) from the room's axes to the world's."""
     supersample: int = 2
-    """Rays a pixel, squared. Hard edges need more, or their stairs run along the camera's rows and columns."""
+    """Rays along each side of a pixel. Hard edges need more than smooth colours."""
 
     def cast(self, cam2world: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray]:
         """The panorama (h, 2h, 3), averaged over each pixel, and the radial depth (h, 2h) at pixel centres."""
@@ -62,7 +63,7 @@ class Room:
         return resize_sphere(image.astype(np.float32), height), depth
 
     def pose(self, position: tuple[float, float, float], rotation: np.ndarray | None = None) -> np.ndarray:
-        """cam2world (4, 4) of a camera at a place in the room, its axes given in the room's."""
+        """cam2world (4, 4) of a camera at a position in the room, with its rotation in the room's axes."""
         scale = np.cbrt(np.linalg.det(self.placed[:3, :3]))
         local = np.eye(4)
         local[:3, :3] = np.eye(3) if rotation is None else rotation
@@ -72,7 +73,7 @@ class Room:
         return pose
 
     def _hits(self, rays: np.ndarray, cam2world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where rays (h, w, 3) of a camera first meet a face: points in room axes, and distances in the world."""
+        """First intersections of a camera's rays (h, w, 3): points in room axes, and world distances."""
         to_room = np.linalg.inv(self.placed)
         start = to_room[:3, :3] @ cam2world[:3, 3] + to_room[:3, 3]
         along = rays @ (to_room[:3, :3] @ cam2world[:3, :3]).T
@@ -99,7 +100,7 @@ def _turn(axis: str, degrees: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Observed:
-    """A room's panoramas, what is true of them, and what the sweep makes of them."""
+    """A room's panoramas, their true depth, and the sweep's surfaces."""
 
     room: Room
     posed: PosedImages
@@ -114,6 +115,9 @@ def _observe(room: Room, poses: Sequence[np.ndarray], height: int, *, search: bo
     posed = PosedImages(np.stack(images), np.stack(poses), masks, near=0.5, far=8.0)
     surfaces = search_surfaces(posed, SearchConfig(), lambda what, fraction: None) if search else []
     return Observed(room, posed, np.stack(depths), surfaces)
+
+
+_FURNISHED = Room(box=((-0.3, -0.1, 1.0), (0.4, 1.2, 1.7)))
 
 
 def _two_poses(room: Room) -> list[np.ndarray]:
@@ -146,20 +150,31 @@ def observe() -> Callable[..., Observed]:
 
 @pytest.fixture(scope="session")
 def empty_room() -> Observed:
-    """Two views of the painted room, 96 pixels high, searched."""
+    """Two views of the textured room, 96 pixels high, searched."""
     room = Room()
     return _observe(room, _two_poses(room), 96, search=True)
 
 
 @pytest.fixture(scope="session")
 def furnished_room() -> Observed:
-    """The same with a box standing on the floor, that hides a part of the room from either view."""
-    room = Room(box=((-0.3, -0.1, 1.0), (0.4, 1.2, 1.7)))
-    return _observe(room, _two_poses(room), 96, search=True)
+    """The same with a box on the floor, which occludes a part of the room in either view."""
+    return _observe(_FURNISHED, _two_poses(_FURNISHED), 96, search=True)
+
+
+@pytest.fixture(scope="session")
+def small_furnished_room() -> Observed:
+    """The room with the box, 64 pixels high, searched."""
+    return _observe(_FURNISHED, _two_poses(_FURNISHED), 64, search=True)
+
+
+@pytest.fixture(scope="session")
+def three_views() -> Observed:
+    """Three views of the room with the box, 64 pixels high, searched."""
+    poses = [*_two_poses(_FURNISHED), _FURNISHED.pose((0.1, -0.1, -0.7), _turn("y", -60))]
+    return _observe(_FURNISHED, poses, 64, search=True)
 
 
 _AXES = np.array(((0.0, 1, 0), (1, 0, 0), (0, 0, 1)))
-_HEIGHT = 96
 
 
 @pytest.fixture(scope="session")
@@ -168,34 +183,54 @@ def room_axes() -> np.ndarray:
     return _AXES
 
 
-@pytest.fixture(scope="session")
-def find_clues():
-    """What pictures of posed views say of a floor at an offset, metres, and the rays along the room's axes."""
-    return _find_clues
-
-
-def _find_clues(posed, images, floor: float) -> tuple[list[FloorBoundary] | None, list[np.ndarray]]:
-    """Clues of pictures and their rays along the room's axes; the floor at an offset, metres."""
+def _views_of(posed: PosedImages, images: np.ndarray, masks: np.ndarray) -> tuple[list[View], list[np.ndarray]]:
     rays = [axis_components(_AXES, pose[:3, :3], images.shape[1]) for pose in posed.cam2world]
     views = [
         View(np.ascontiguousarray(image, np.float32), mask, np.ascontiguousarray(ray[0], np.float32))
-        for image, mask, ray in zip(images, posed.masks, rays, strict=True)
+        for image, mask, ray in zip(images, masks, rays, strict=True)
     ]
-    nothing = no_planes(posed.cam2world, _AXES, posed.near, posed.far)
-    support = type(nothing)(**{**vars(nothing), "floor_ceiling": (floor - nothing.origin[1], -math.inf)})
-    return detect_floor_boundaries(views, rays, posed.cam2world, support, MatchingConfig()), rays
+    return views, rays
 
 
 @pytest.fixture(scope="session")
-def two_coloured(empty_room):
-    """The room with a dappled brown floor and dappled white walls, its clues, and its rays."""
-    posed, floor = empty_room.posed, empty_room.room.high[1]
-    images = []
-    for pose, depth, image in zip(posed.cam2world, empty_room.depths, posed.images, strict=True):
-        rays = axis_components(_AXES, pose[:3, :3], _HEIGHT)[0]
-        on_floor = np.abs(rays * depth + pose[1, 3] - floor) < 1e-3
-        paint = np.where(on_floor[..., None], (0.45, 0.3, 0.15), (0.85, 0.85, 0.85))
-        images.append(paint * (0.8 + 0.4 * image.mean(axis=2, keepdims=True)))
-    clues, rays = _find_clues(posed, np.stack(images).clip(0, 1).astype(np.float32), floor)
-    assert clues is not None
-    return clues, rays
+def views_of() -> Callable[..., tuple[list[View], list[np.ndarray]]]:
+    """Views of images and masks at the poses of posed images, and their rays along the room's axes."""
+    return _views_of
+
+
+def _find_boundaries(posed, images, floor: float) -> tuple[list[FloorBoundary] | None, list[np.ndarray]]:
+    views, rays = _views_of(posed, images, posed.masks)
+    planes = no_planes(posed.cam2world, _AXES, posed.near, posed.far)
+    planes = dataclasses.replace(planes, floor_ceiling=(floor - planes.origin[1], -math.inf))
+    return detect_floor_boundaries(views, rays, posed.cam2world, planes, MatchingConfig()), rays
+
+
+@pytest.fixture(scope="session")
+def find_boundaries():
+    """Floor boundaries of images at the poses of posed images, for a floor at an offset (metres), and the rays."""
+    return _find_boundaries
+
+
+@pytest.fixture(scope="session")
+def paint_floor(empty_room) -> Callable[..., np.ndarray]:
+    """Images of the room with a brown floor and white surfaces; points where `wall(points)` holds get another brown."""
+
+    def paint(wall: Callable[[np.ndarray], np.ndarray] = lambda points: np.zeros(points.shape[:2], bool)) -> np.ndarray:
+        images, posed = [], empty_room.posed
+        for pose, depth, image in zip(posed.cam2world, empty_room.depths, posed.images, strict=True):
+            points = (ray_grid(len(image)) * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
+            on_floor = np.abs(points[..., 1] - empty_room.room.high[1]) < 1e-3
+            color = np.where(on_floor[..., None], (0.45, 0.3, 0.15), (0.85, 0.85, 0.85))
+            color = np.where(wall(points)[..., None], (0.345, 0.23, 0.115), color)
+            images.append(color * (0.8 + 0.4 * image.mean(axis=2, keepdims=True)))
+        return np.stack(images).clip(0, 1).astype(np.float32)
+
+    return paint
+
+
+@pytest.fixture(scope="session")
+def brown_floor(empty_room, paint_floor):
+    """Floor boundaries of the room with a brown floor and white walls, and the rays."""
+    boundaries, rays = _find_boundaries(empty_room.posed, paint_floor(), empty_room.room.high[1])
+    assert boundaries is not None
+    return boundaries, rays

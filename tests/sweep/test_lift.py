@@ -1,4 +1,4 @@
-"""From surfaces to Gaussians."""
+"""The Gaussians of surfaces."""
 
 import dataclasses
 import math
@@ -22,39 +22,32 @@ def _exact(observed) -> list[Surface]:
 
 
 @pytest.fixture(scope="module")
-def furnished(make_room, two_poses, observe):
-    """A box in a room, 64 pixels high, with the sweep's own surfaces."""
-    room = make_room(box=((-0.3, -0.1, 1.0), (0.4, 1.2, 1.7)))
-    return observe(room, two_poses(room), 64, search=True)
+def gaussians(small_furnished_room) -> Gaussians:
+    return lift(small_furnished_room.posed, small_furnished_room.surfaces, LiftConfig())
 
 
-@pytest.fixture(scope="module")
-def gaussians(furnished) -> Gaussians:
-    return lift(furnished.posed, furnished.surfaces, LiftConfig())
-
-
-def _picture(gaussians: Gaussians, observed, pose: np.ndarray):
-    """What is seen from a pose, the views blended by nearness."""
+def _render(gaussians: Gaussians, observed, pose: np.ndarray):
+    """The rendering at a pose with deferred blending."""
     cam2world = torch.from_numpy(observed.posed.cam2world)
     weights = blend_weights(torch.from_numpy(pose[:3, 3]), cam2world[:, :3, 3])
-    pictures = [
+    renderings = [
         rasterize(gaussians.select(gaussians.views == view), torch.from_numpy(pose), size=(64, 128))
         for view in range(len(cam2world))
     ]
-    return blend(pictures, weights)
+    return blend(renderings, weights)
 
 
 def _middle(observed) -> np.ndarray:
     return interpolate_poses(*torch.from_numpy(observed.posed.cam2world), 0.5).numpy()
 
 
-def test_gaussians_come_by_level_and_then_by_view(gaussians):
+def test_gaussians_are_ordered_by_level_and_then_by_view(gaussians):
     order = gaussians.levels.long() * 2 + gaussians.views.long()
     assert (order.diff() >= 0).all()
     assert order.unique().tolist() == list(range(2 * NUM_LEVELS))
 
 
-def test_gaussians_are_sound(gaussians):
+def test_gaussians_are_valid(gaussians):
     for values in dataclasses.astuple(gaussians):
         assert torch.isfinite(values.double()).all()
     assert (gaussians.scales > 0).all()
@@ -69,15 +62,15 @@ def test_no_level_has_more_gaussians_than_its_lattice_has_points(gaussians):
             assert 0 < count <= lattice_size(128 >> level)
 
 
-def test_discs_lie_on_the_surface(furnished):
+def test_discs_lie_on_the_surface(small_furnished_room):
     """Fine means in the room's planes, and the discs' thin axes along the planes' normals."""
-    surfaces = _exact(furnished)
-    fine = lift(furnished.posed, surfaces, LiftConfig())
+    surfaces = _exact(small_furnished_room)
+    fine = lift(small_furnished_room.posed, surfaces, LiftConfig())
     fine = fine.select(fine.levels == 0)
-    points, room = fine.means.numpy(), furnished.room
+    points, room = fine.means.numpy(), small_furnished_room.room
     planes = np.concatenate((np.abs(points - room.low), np.abs(points - room.high)), axis=1)
     on_wall = planes.min(axis=1) < 0.05
-    assert on_wall.mean() > 0.7  # the rest is on the box, or beside a jump
+    assert on_wall.mean() > 0.7  # the rest is on the box, or at a discontinuity
     axis = planes.argmin(axis=1) % 3
     thin = rotations_from_quats(fine.quats).numpy()[:, :, 2]
     lean = np.abs(thin[np.arange(len(axis)), axis])[on_wall]
@@ -86,57 +79,61 @@ def test_discs_lie_on_the_surface(furnished):
 
 
 @pytest.mark.parametrize("view", (0, 1))
-def test_the_input_is_seen_from_its_own_position(furnished, gaussians, view):
-    picture = _picture(gaussians, furnished, furnished.posed.cam2world[view])
-    image = torch.from_numpy(furnished.posed.images[view]).permute(2, 0, 1)
-    assert psnr(picture.color, image) > 22.5
+def test_the_input_is_rendered_at_its_own_pose(small_furnished_room, gaussians, view):
+    rendering = _render(gaussians, small_furnished_room, small_furnished_room.posed.cam2world[view])
+    image = torch.from_numpy(small_furnished_room.posed.images[view]).permute(2, 0, 1)
+    assert psnr(rendering.color, image) > 22.5
 
 
-def test_the_room_is_seen_from_between_the_inputs(furnished, gaussians):
-    pose = _middle(furnished)
-    truth, depth = furnished.room.cast(pose, 64)
-    picture = _picture(gaussians, furnished, pose)
-    assert psnr(picture.color, torch.from_numpy(truth).permute(2, 0, 1)) > 22
-    assert np.median(np.abs(picture.depth.numpy() / depth - 1)) < 0.05
+def test_the_room_is_rendered_between_the_inputs(small_furnished_room, gaussians):
+    pose = _middle(small_furnished_room)
+    truth, depth = small_furnished_room.room.cast(pose, 64)
+    rendering = _render(gaussians, small_furnished_room, pose)
+    assert psnr(rendering.color, torch.from_numpy(truth).permute(2, 0, 1)) > 22
+    assert np.median(np.abs(rendering.depth.numpy() / depth - 1)) < 0.05
 
 
 @pytest.mark.parametrize("place", (0.0, 0.25, 0.5, 0.75, 1.0))
-def test_nothing_is_empty_on_the_way(furnished, gaussians, place):
-    pose = interpolate_poses(*torch.from_numpy(furnished.posed.cam2world), place).numpy()
-    assert _picture(gaussians, furnished, pose).alpha.min() > 0.9
+def test_there_are_no_holes_between_the_inputs(small_furnished_room, gaussians, place):
+    pose = interpolate_poses(*torch.from_numpy(small_furnished_room.posed.cam2world), place).numpy()
+    assert _render(gaussians, small_furnished_room, pose).alpha.min() > 0.9
 
 
 @pytest.mark.parametrize("searched", (True, False))
-def test_no_gaussian_holds_a_camera(furnished, gaussians, searched):
-    """Within 3.33 standard deviations a Gaussian is drawn: from inside it would cover the whole panorama."""
+def test_no_gaussian_contains_a_camera(small_furnished_room, gaussians, searched):
+    """A Gaussian is drawn within 3.33 standard deviations; from inside it would cover the whole panorama."""
     if not searched:
-        gaussians = lift(furnished.posed, _exact(furnished), LiftConfig())
+        gaussians = lift(small_furnished_room.posed, _exact(small_furnished_room), LiftConfig())
     axes = rotations_from_quats(gaussians.quats).double()
-    for pose in furnished.posed.cam2world:
+    for pose in small_furnished_room.posed.cam2world:
         away = torch.from_numpy(pose[:3, 3]) - gaussians.means.double()
         local = torch.einsum("nij,ni->nj", axes, away) / gaussians.scales.double()
         assert local.norm(dim=1).min() > 3.33
 
 
-def test_masked_pixels_make_no_gaussians(furnished):
-    masks = furnished.posed.masks.copy()
+def test_masked_pixels_make_no_gaussians(small_furnished_room):
+    masks = small_furnished_room.posed.masks.copy()
     masks[:, -16:] = False  # the nadir, 45 degrees and steeper
-    gaussians = lift(dataclasses.replace(furnished.posed, masks=masks), furnished.surfaces, LiftConfig())
-    for view, pose in enumerate(furnished.posed.cam2world):
+    gaussians = lift(
+        dataclasses.replace(small_furnished_room.posed, masks=masks), small_furnished_room.surfaces, LiftConfig()
+    )
+    for view, pose in enumerate(small_furnished_room.posed.cam2world):
         own = gaussians.means[gaussians.views == view].double().numpy() - pose[:3, 3]
         steep = np.degrees(np.arcsin(own[:, 1] / np.linalg.norm(own, axis=1)))
         assert steep.max() < 45.01 and steep.min() < -85
 
 
-def test_a_view_masked_throughout_makes_no_gaussians(furnished):
-    masks = furnished.posed.masks.copy()
+def test_a_fully_masked_view_makes_no_gaussians(small_furnished_room):
+    masks = small_furnished_room.posed.masks.copy()
     masks[1] = False
-    gaussians = lift(dataclasses.replace(furnished.posed, masks=masks), furnished.surfaces, LiftConfig())
+    gaussians = lift(
+        dataclasses.replace(small_furnished_room.posed, masks=masks), small_furnished_room.surfaces, LiftConfig()
+    )
     assert (gaussians.views == 0).all() and len(gaussians)
 
 
 def _sphere_around(image: np.ndarray) -> tuple[PosedImages, list[Surface]]:
-    """The same panorama all over a sphere of 3 m, from two coincident cameras."""
+    """A panorama on a sphere of 3 m, seen by two coincident cameras."""
     height = image.shape[0]
     inverse = np.full((height, 2 * height), 1 / 3, np.float32)
     masks = np.ones((2, height, 2 * height), bool)
@@ -144,7 +141,7 @@ def _sphere_around(image: np.ndarray) -> tuple[PosedImages, list[Surface]]:
     return posed, [Surface(inverse, np.zeros(inverse.shape, np.uint8))] * 2
 
 
-def test_only_detail_makes_fine_gaussians():
+def test_only_image_detail_makes_gaussians_of_level_0():
     white = np.ones((64, 128, 3), np.float32)
     noise = np.random.default_rng(0).random((64, 128, 3)).astype(np.float32)
     half = np.where(np.arange(128)[None, :, None] < 64, white, noise)
@@ -154,7 +151,7 @@ def test_only_detail_makes_fine_gaussians():
     assert 0.5 * fine[2] < fine[1] < 0.6 * fine[2]
 
 
-def test_points_on_a_sphere_are_at_its_radius_on_fibonacci_lattices():
+def test_gaussians_of_a_sphere_lie_on_the_fibonacci_lattices_at_its_radius():
     gaussians = lift(*_sphere_around(np.ones((64, 128, 3), np.float32)), LiftConfig())
     radius = gaussians.means.norm(dim=1)
     for level, depth in (
@@ -169,19 +166,19 @@ def test_points_on_a_sphere_are_at_its_radius_on_fibonacci_lattices():
         assert torch.allclose(gaussians.scales[chosen][:, :2], torch.tensor(size), rtol=1e-3)
 
 
-def test_colours_are_those_of_the_picture():
+def test_colours_are_those_of_the_render():
     color = torch.tensor((0.2, 0.5, 0.9))
     image = color.numpy() * np.ones((64, 128, 1), np.float32)
     gaussians = lift(*_sphere_around(image), LiftConfig())
     assert torch.allclose(0.5 + 0.28209479177387814 * gaussians.harmonics[:, 0], color.expand(len(gaussians), 3))
 
 
-def test_what_another_view_surely_sees_through_is_dropped(make_room, observe, two_poses):
+def test_points_in_the_consistent_free_space_of_another_view_are_dropped(make_room, observe, two_poses):
     room = make_room()
     observed = observe(room, [*two_poses(room), room.pose((0.1, -0.1, -0.6))], 64)
     surfaces = _exact(observed)
     wrong = surfaces[0].inverse_depth.copy()
-    wrong[20:30, 50:70] *= 2.0  # a ghost halfway, that neither of the others sees
+    wrong[20:30, 50:70] *= 2.0  # a surface in the free space of the other views
     ghost = lift(observed.posed, [Surface(wrong, surfaces[0].orientation), *surfaces[1:]], LiftConfig())
     plain = lift(observed.posed, surfaces, LiftConfig())
     for level in (0, 1):
@@ -193,8 +190,18 @@ def test_what_another_view_surely_sees_through_is_dropped(make_room, observe, tw
         assert int(all_.sum()) > 0
 
 
-def test_panoramas_taller_than_the_search_are_lifted_at_their_own_height(furnished, make_room, observe, two_poses):
-    tall = observe(furnished.room, two_poses(furnished.room), 128)
-    gaussians = lift(tall.posed, furnished.surfaces, LiftConfig())
+def test_panoramas_larger_than_the_search_are_lifted_at_their_own_height(small_furnished_room, observe, two_poses):
+    tall = observe(small_furnished_room.room, two_poses(small_furnished_room.room), 128)
+    gaussians = lift(tall.posed, small_furnished_room.surfaces, LiftConfig())
     count = int(((gaussians.levels == 0) & (gaussians.views == 0)).sum())
     assert lattice_size(128) < count <= lattice_size(256)
+
+
+def test_three_views_make_gaussians_of_three(three_views):
+    gaussians = lift(three_views.posed, three_views.surfaces, LiftConfig())
+    assert gaussians.views.unique().tolist() == [0, 1, 2]
+    room = three_views.room
+    off = torch.minimum(
+        (gaussians.means - torch.tensor(room.low)).abs(), (gaussians.means - torch.tensor(room.high)).abs()
+    ).amin(dim=1)
+    assert off[gaussians.levels == 0].median() < 0.05

@@ -1,7 +1,4 @@
-"""The matching cost of hypotheses.
-
----
-Semi-global aggregation on the sphere."""
+"""The matching cost of hypotheses, and its semi-global aggregation on the sphere."""
 
 import dataclasses
 import math
@@ -29,7 +26,7 @@ _IMPOSSIBLE = 2 * (_PLAIN.correlation_weight + _PLAIN.color_weight)
 _NEUTRAL = 0.5 * (_PLAIN.correlation_weight + _PLAIN.color_weight)
 
 
-def _family(height: int, inverses: np.ndarray) -> HypothesisSet:
+def _spheres(height: int, inverses: np.ndarray) -> HypothesisSet:
     """Spheres at equally spaced inverse depths."""
     shape = (height, 2 * height)
     return HypothesisSet(
@@ -55,7 +52,7 @@ def _around_the_truth(observed, view: int, factors: np.ndarray) -> np.ndarray:
     """Cost (h, w, factor) of the true inverse depth times equally spaced factors."""
     posed = observed.posed
     true = (1 / observed.depths[view]).astype(np.float32)
-    family = HypothesisSet(
+    spheres = HypothesisSet(
         factors[0] * true,
         (factors[1] - factors[0]) * true,
         np.zeros((2, len(factors)), np.float32),
@@ -63,30 +60,30 @@ def _around_the_truth(observed, view: int, factors: np.ndarray) -> np.ndarray:
     )
     views = [_view(image) for image in posed.images]
     pose = posed.relative_pose(view, 1 - view)
-    return matching_cost(views[view], views[1 - view], pose, [family], (0.05, 8.0), _ANYWHERE, _PLAIN)
+    return matching_cost(views[view], views[1 - view], pose, [spheres], (0.05, 8.0), _ANYWHERE, _PLAIN)
 
 
-def test_the_same_picture_from_the_same_place_fits_every_hypothesis(empty_room):
+def test_an_image_matches_itself_at_every_hypothesis(empty_room):
     view = _view(empty_room.posed.images[0])
-    family = _family(96, np.linspace(0.2, 1.5, 11, dtype=np.float32))
-    cost = matching_cost(view, view, np.eye(4), [family], (0.1, 2.0), _ANYWHERE, _PLAIN)
+    spheres = _spheres(96, np.linspace(0.2, 1.5, 11, dtype=np.float32))
+    cost = matching_cost(view, view, np.eye(4), [spheres], (0.1, 2.0), _ANYWHERE, _PLAIN)
     assert cost.max() < 0.02
 
 
-def test_a_camera_turned_in_place_fits_every_hypothesis(empty_room, turn):
-    """At the edges and over the poles as well; only interpolation costs."""
+def test_a_camera_turned_in_place_matches_at_every_hypothesis(empty_room, turn):
+    """At the borders and the poles as well; the cost is that of interpolation."""
     room, pose = empty_room.room, empty_room.posed.cam2world[0]
     turned = pose.copy()
     turned[:3, :3] = pose[:3, :3] @ turn("x", 50) @ turn("y", 75)
     views = [_view(room.cast(p, 96)[0]) for p in (pose, turned)]
-    family = _family(96, np.linspace(0.2, 1.5, 3, dtype=np.float32))
-    cost = matching_cost(*views, np.linalg.inv(turned) @ pose, [family], (0.1, 2.0), _ANYWHERE, _PLAIN)
+    spheres = _spheres(96, np.linspace(0.2, 1.5, 3, dtype=np.float32))
+    cost = matching_cost(*views, np.linalg.inv(turned) @ pose, [spheres], (0.1, 2.0), _ANYWHERE, _PLAIN)
     assert np.median(cost) < 0.1 and (cost < 0.3).mean() > 0.97
     assert np.ptp(cost, axis=2).max() < 1e-5  # without a baseline all hypotheses are one
 
 
 @pytest.mark.parametrize("view", (0, 1))
-def test_the_truth_is_cheaper_than_what_is_near_it(empty_room, view):
+def test_the_true_depth_has_the_lowest_cost(empty_room, view):
     cost = _around_the_truth(empty_room, view, np.linspace(0.6, 1.4, 9, dtype=np.float32))
     assert (cost[..., 4] < cost[..., 0]).mean() > 0.9
     assert (cost[..., 4] < cost[..., 8]).mean() > 0.9
@@ -99,32 +96,32 @@ def test_rolling_both_panoramas_rolls_the_cost(empty_room, turn):
     roll = np.eye(4)
     roll[:3, :3] = turn("y", -360 * columns / 192)  # from rolled to former camera axes
     pose = posed.relative_pose(0, 1)
-    family = _family(96, np.linspace(0.2, 1.0, 5, dtype=np.float32))
-    plain = matching_cost(*(_view(i) for i in posed.images), pose, [family], (0.1, 2.0), _ANYWHERE, _PLAIN)
+    spheres = _spheres(96, np.linspace(0.2, 1.0, 5, dtype=np.float32))
+    plain = matching_cost(*(_view(i) for i in posed.images), pose, [spheres], (0.1, 2.0), _ANYWHERE, _PLAIN)
     rolled = matching_cost(
         *(_view(np.roll(i, columns, axis=1)) for i in posed.images),
-        np.linalg.inv(roll) @ pose @ roll, [family], (0.1, 2.0), _ANYWHERE, _PLAIN,
+        np.linalg.inv(roll) @ pose @ roll, [spheres], (0.1, 2.0), _ANYWHERE, _PLAIN,
     )  # fmt: skip
     assert np.allclose(np.roll(rolled, -columns, axis=1), plain, atol=2e-3)
 
 
-def test_several_families_cost_what_they_cost_alone(empty_room):
+def test_hypothesis_sets_do_not_affect_each_other(empty_room):
     posed = empty_room.posed
     views, pose = [_view(i) for i in posed.images], posed.relative_pose(0, 1)
-    families = [_family(96, np.linspace(low, 1.0, 10, dtype=np.float32)) for low in (0.2, 0.4)]
-    both = matching_cost(*views, pose, families, (0.1, 2.0), _ANYWHERE, _PLAIN)
-    alone = [matching_cost(*views, pose, [f], (0.1, 2.0), _ANYWHERE, _PLAIN) for f in families]
+    sets = [_spheres(96, np.linspace(low, 1.0, 10, dtype=np.float32)) for low in (0.2, 0.4)]
+    both = matching_cost(*views, pose, sets, (0.1, 2.0), _ANYWHERE, _PLAIN)
+    alone = [matching_cost(*views, pose, [f], (0.1, 2.0), _ANYWHERE, _PLAIN) for f in sets]
     assert np.array_equal(both, np.concatenate(alone, axis=2))
 
 
 @pytest.mark.parametrize("whose", ("own", "other"))
-def test_masked_pixels_are_neutral(empty_room, whose):
+def test_masked_pixels_have_the_same_cost_at_every_hypothesis(empty_room, whose):
     image, height = empty_room.posed.images[0], 96
     valid = np.ones((height, 2 * height), bool)
     valid[:20] = False
     views = _view(image, valid if whose == "own" else None), _view(image, valid if whose == "other" else None)
-    family = _family(height, np.linspace(0.2, 1.5, 6, dtype=np.float32))
-    cost = matching_cost(*views, np.eye(4), [family], (0.1, 2.0), _ANYWHERE, _PLAIN)
+    spheres = _spheres(height, np.linspace(0.2, 1.5, 6, dtype=np.float32))
+    cost = matching_cost(*views, np.eye(4), [spheres], (0.1, 2.0), _ANYWHERE, _PLAIN)
     assert np.allclose(cost[:20], _NEUTRAL)
     assert cost[20:].max() < 0.02
 
@@ -133,7 +130,7 @@ def test_hypotheses_out_of_range_are_impossible(empty_room):
     posed = empty_room.posed
     inverses = np.linspace(0.1, 1.1, 11, dtype=np.float32)
     cost = matching_cost(
-        *(_view(i) for i in posed.images), posed.relative_pose(0, 1), [_family(96, inverses)],
+        *(_view(i) for i in posed.images), posed.relative_pose(0, 1), [_spheres(96, inverses)],
         (0.35, 0.85), _ANYWHERE, _PLAIN,
     )  # fmt: skip
     out = (inverses < 0.35) | (inverses > 0.85)
@@ -141,25 +138,25 @@ def test_hypotheses_out_of_range_are_impossible(empty_room):
     assert cost[..., ~out].max() < _IMPOSSIBLE
 
 
-def test_what_the_other_view_knows_changes_the_cost_as_configured(empty_room):
-    """Seen through costs, consistency_mask earns, and hidden points cost the same whatever the pictures say."""
+def test_the_other_views_surface_changes_the_cost_as_configured(empty_room):
+    """A penalty in free space, a bonus when consistent, a constant cost when occluded."""
     image = empty_room.posed.images[0]
-    family = _family(96, np.array((0.25, 0.5, 0.75, 1.0), np.float32))
+    spheres = _spheres(96, np.array((0.25, 0.5, 0.75, 1.0), np.float32))
     cost = matching_cost(
-        _view(image), _view(image, inverse=0.5), np.eye(4), [family], (0.1, 2.0), _ANYWHERE, _PLAIN
+        _view(image), _view(image, inverse=0.5), np.eye(4), [spheres], (0.1, 2.0), _ANYWHERE, _PLAIN
     ).reshape(-1, 4)
     expected = (_PLAIN.occluded_cost, -_PLAIN.consistency_bonus, _PLAIN.free_space_penalty, _PLAIN.free_space_penalty)
     assert np.allclose(cost, expected, atol=0.02)
-    unsure = matching_cost(
-        _view(image), _view(image, inverse=0.5, trust=0), np.eye(4), [family], (0.1, 2.0), _ANYWHERE, _PLAIN
+    unverified = matching_cost(
+        _view(image), _view(image, inverse=0.5, trust=0), np.eye(4), [spheres], (0.1, 2.0), _ANYWHERE, _PLAIN
     )
-    assert unsure.max() < 0.02
+    assert unverified.max() < 0.02
 
 
-def test_hypotheses_below_the_floor_or_above_the_ceiling_cost_more(empty_room):
+def test_hypotheses_below_the_floor_or_above_the_ceiling_are_penalised(empty_room):
     view = _view(empty_room.posed.images[0])
-    family = _family(96, np.array((0.25, 0.5), np.float32))  # 4 and 2 metres
-    cost = matching_cost(view, view, np.eye(4), [family], (0.1, 2.0), (1.5, -1.0), _PLAIN)
+    spheres = _spheres(96, np.array((0.25, 0.5), np.float32))  # 4 and 2 metres
+    cost = matching_cost(view, view, np.eye(4), [spheres], (0.1, 2.0), (1.5, -1.0), _PLAIN)
     down = view.down[..., None] * np.array((4.0, 2.0))
     outside = (down > 1.5) | (down < -1.0)
     sure = np.minimum(np.abs(down - 1.5), np.abs(down + 1.0)) > 1e-4
@@ -167,42 +164,42 @@ def test_hypotheses_below_the_floor_or_above_the_ceiling_cost_more(empty_room):
     assert np.allclose(cost[sure], np.where(outside, _PLAIN.outside_penalty, 0)[sure], atol=0.02)
 
 
-def test_a_penalty_is_paid_on_its_side_only(empty_room):
+def test_penalties_depend_on_the_side(empty_room):
     view = _view(empty_room.posed.images[0])
-    plain = _family(96, np.array((0.25, 0.5), np.float32))
+    plain = _spheres(96, np.array((0.25, 0.5), np.float32))
     side = np.zeros(plain.side.shape, np.uint8)
     side[:, 96:] = 1
-    family = HypothesisSet(plain.base, plain.step, np.array(((0.0, 0.3), (0.7, 0.0)), np.float32), side)
-    cost = matching_cost(view, view, np.eye(4), [family], (0.1, 2.0), _ANYWHERE, _PLAIN)
+    spheres = HypothesisSet(plain.base, plain.step, np.array(((0.0, 0.3), (0.7, 0.0)), np.float32), side)
+    cost = matching_cost(view, view, np.eye(4), [spheres], (0.1, 2.0), _ANYWHERE, _PLAIN)
     assert np.allclose(cost[:, :96], (0.0, 0.3), atol=0.02)
     assert np.allclose(cost[:, 96:], (0.7, 0.0), atol=0.02)
 
 
-def test_a_window_without_texture_says_little():
-    """White against grey: the colours differ by more than the limit, the correlation says nothing."""
+def test_a_window_without_texture_has_less_weight():
+    """White against grey: the colour difference is truncated, the correlation is undefined."""
     white, gray = np.ones((32, 64, 3)), np.full((32, 64, 3), 0.5)
-    family = _family(32, np.array((0.25, 0.5), np.float32))
+    spheres = _spheres(32, np.array((0.25, 0.5), np.float32))
     config = MatchingConfig()
-    cost = matching_cost(_view(white), _view(gray), np.eye(4), [family], (0.1, 2.0), _ANYWHERE, config)
+    cost = matching_cost(_view(white), _view(gray), np.eye(4), [spheres], (0.1, 2.0), _ANYWHERE, config)
     expected = (
         config.textureless_weight * config.color_weight + (1 - config.textureless_weight) * config.textureless_cost
     )
     assert np.allclose(cost, expected, atol=1e-3)
 
 
-def test_points_much_nearer_to_one_camera_than_to_the_other_cost_more(empty_room):
+def test_points_much_nearer_to_one_camera_than_to_the_other_are_penalised(empty_room):
     views, pose = [_view(image) for image in empty_room.posed.images], np.eye(4)
     pose[0, 3] = 2.0
     inverses = np.array((0.25, 2.0, 3.75), np.float32)
-    priced = dataclasses.replace(_PLAIN, distance_penalty=0.5)
-    plain, dear = (
-        matching_cost(*views, pose, [_family(96, inverses)], (0.1, 4.0), _ANYWHERE, config)
-        for config in (_PLAIN, priced)
+    penalised = dataclasses.replace(_PLAIN, distance_penalty=0.5)
+    plain, far_apart = (
+        matching_cost(*views, pose, [_spheres(96, inverses)], (0.1, 4.0), _ANYWHERE, config)
+        for config in (_PLAIN, penalised)
     )
     points = ray_grid(96)[..., None, :] / inverses[:, None]
     ratio = np.linalg.norm(points + np.array((2.0, 0, 0)), axis=-1) * inverses
-    expected = 0.5 * np.maximum(1 - priced.distance_ratio * np.minimum(ratio, 1 / ratio), 0)
-    assert np.allclose(dear - plain, expected, atol=1e-4)
+    expected = 0.5 * np.maximum(1 - penalised.distance_ratio * np.minimum(ratio, 1 / ratio), 0)
+    assert np.allclose(far_apart - plain, expected, atol=1e-4)
     assert (expected[..., 0] == 0).all() and (expected[..., 2] > 0).all()
 
 
@@ -219,17 +216,13 @@ def test_fast_atan2_is_within_two_microradians():
     y, x = np.sin(angle).astype(np.float32), np.cos(angle).astype(np.float32)
     error = np.abs(_all_atan2(y, x) - np.arctan2(y.astype(np.float64), x.astype(np.float64)))
     assert error.max() < 2e-6 + np.pi * np.finfo(np.float32).eps
-
-
-def test_fast_atan2_is_right_on_the_axes():
-    y = np.array((0, 0, 1, -1, 0), np.float32)
-    x = np.array((1, -1, 0, 0, 0), np.float32)
+    y, x = np.array((0, 0, 1, -1, 0), np.float32), np.array((1, -1, 0, 0, 0), np.float32)  # on the axes
     assert np.allclose(_all_atan2(y, x), np.arctan2(y, x), atol=2e-6)
 
 
-def test_a_plane_that_the_other_view_sees_from_behind_is_not_compared(empty_room):
+def test_a_plane_that_separates_the_views_has_a_constant_cost(empty_room):
     views = [_view(image) for image in empty_room.posed.images]
-    plain = _family(96, np.array((0.25, 0.5), np.float32))
+    plain = _spheres(96, np.array((0.25, 0.5), np.float32))
     hidden = dataclasses.replace(plain, back_facing=np.array(((False, True), (False, False))))
     pose = empty_room.posed.relative_pose(0, 1)
     before, cost = (matching_cost(*views, pose, [f], (0.1, 2.0), _ANYWHERE, _PLAIN) for f in (plain, hidden))
@@ -239,13 +232,13 @@ def test_a_plane_that_the_other_view_sees_from_behind_is_not_compared(empty_room
     )
 
 
-def test_spheres_seen_from_opposite_directions_cost_more_and_planes_do_not(empty_room):
+def test_spheres_seen_from_opposite_directions_are_penalised_and_planes_are_not(empty_room):
     views, pose = [_view(image) for image in empty_room.posed.images], np.eye(4)
     pose[0, 3] = 2.0
     inverses = np.array((0.5, 1.25, 2.0), np.float32)
-    family = _family(96, inverses)
+    spheres = _spheres(96, inverses)
     plain, sphere = (
-        matching_cost(*views, pose, [dataclasses.replace(family, sphere=s)], (0.1, 4.0), _ANYWHERE, _PLAIN)
+        matching_cost(*views, pose, [dataclasses.replace(spheres, sphere=s)], (0.1, 4.0), _ANYWHERE, _PLAIN)
         for s in (False, True)
     )
     rays = ray_grid(96)[..., None, :]
@@ -257,13 +250,13 @@ def test_spheres_seen_from_opposite_directions_cost_more_and_planes_do_not(empty
 
 
 _AWAY_FROM_POLES = slice(4, -4)
-"""Rows whose paths forget within half a turn where they began; nearer to a pole changing costs too much for that."""
+"""Rows where the start of a path has no effect after half a turn; near a pole penalties are too high for that."""
 _FREE = AggregationConfig(step_penalty=0, crease_penalty=0, jump_penalty=0)
 
 
-def _slots(height: int, families: int = 1) -> np.ndarray:
-    """Every family's hypotheses k in depth slots k."""
-    slot_map = np.zeros((height, 2 * height, families, 2), np.float32)
+def _slots(height: int, sets: int = 1) -> np.ndarray:
+    """Hypothesis k of every set in depth slot k."""
+    slot_map = np.zeros((height, 2 * height, sets, 2), np.float32)
     slot_map[..., 0], slot_map[..., 1] = 1, 0.5
     return slot_map
 
@@ -276,13 +269,13 @@ def _noise(height: int, labels: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).random((height, 2 * height, labels)).astype(np.float32)
 
 
-def test_without_prices_every_direction_counts_the_cost_once():
+def test_without_penalties_every_direction_adds_the_cost_once():
     cost = _noise(32, 24)
     total = aggregate(cost, _gray(32), _slots(32, 2), 12, _FREE)
     assert np.allclose(total, 8 * cost, atol=1e-5)
 
 
-def test_a_hypothesis_that_fits_everywhere_costs_nothing():
+def test_a_hypothesis_that_matches_everywhere_has_cost_zero():
     cost = 0.1 + _noise(32, 24)
     cost[..., 17] = 0
     total = aggregate(cost, _gray(32), _slots(32, 2), 12, AggregationConfig())
@@ -290,37 +283,28 @@ def test_a_hypothesis_that_fits_everywhere_costs_nothing():
     assert np.delete(total, 17, axis=2).min() > 0.1
 
 
-def test_a_plane_is_carried_on_through_a_gap_that_shows_nothing():
+@pytest.mark.parametrize(
+    ("gap", "cost_in_gap"),
+    (
+        ((slice(10, 20), slice(20, 40)), 0.02),
+        ((np.arange(10, 20)[:, None], np.arange(-10, 10)[None]), 0.02),
+        (slice(0, 5), 0.004),
+        (slice(-5, None), 0.004),
+    ),
+    ids=("inside", "left and right border", "north pole", "south pole"),
+)
+def test_a_plane_continues_through_a_gap_without_evidence(gap, cost_in_gap):
     cost = _noise(32, 12) + 1
     cost[..., 5] = 0
-    gap = (slice(10, 20), slice(20, 40))
-    cost[gap] = 0.02 * _noise(32, 12, seed=1)[gap]
-    assert (cost[gap].argmin(axis=-1) == 5).mean() < 0.3  # the gap by itself does not know
-    total = aggregate(cost, _gray(32), _slots(32), 12, AggregationConfig())
-    assert (total.argmin(axis=-1) == 5).all()
-
-
-def test_a_gap_across_the_left_and_right_edge_is_filled_as_well():
-    cost = _noise(32, 12) + 1
-    cost[..., 5] = 0
-    gap = (np.arange(10, 20)[:, None], np.arange(-10, 10)[None])
-    cost[gap] = 0.02 * _noise(32, 12, seed=1)[gap]
-    total = aggregate(cost, _gray(32), _slots(32), 12, AggregationConfig())
-    assert (total.argmin(axis=-1) == 5).all()
-
-
-@pytest.mark.parametrize("pole", (slice(0, 5), slice(-5, None)))
-def test_a_gap_over_a_pole_is_filled_as_well(pole):
-    cost = _noise(32, 12) + 1
-    cost[..., 5] = 0
-    cost[pole] = 0.004 * _noise(32, 12, seed=1)[pole]
+    cost[gap] = cost_in_gap * _noise(32, 12, seed=1)[gap]
+    assert (cost[gap].argmin(axis=-1) == 5).mean() < 0.3
     total = aggregate(cost, _gray(32), _slots(32), 12, AggregationConfig())
     assert (total.argmin(axis=-1) == 5).all()
 
 
 @pytest.mark.parametrize("dy", (1, -1))
-def test_a_column_goes_on_over_the_pole_half_a_turn_away(dy):
-    """What a few columns know at the pole that paths come from reaches the opposite columns, and no others."""
+def test_a_path_continues_over_the_pole_half_a_turn_away(dy):
+    """Costs of a few columns at the pole reach these and the opposite columns only."""
     height, count = 32, 12
     cost = np.zeros((height, 2 * height, count), np.float32)
     known = slice(0, 6) if dy > 0 else slice(-6, None)
@@ -334,8 +318,8 @@ def test_a_column_goes_on_over_the_pole_half_a_turn_away(dy):
     assert np.flatnonzero(knows).tolist() == [0, 1, 2, 3, 32, 33, 34, 35]
 
 
-def test_a_jump_stays_where_the_picture_has_an_edge():
-    """The costs leave a strip open in which the surface jumps; the picture says where."""
+def test_a_discontinuity_follows_the_image_edge():
+    """The costs are zero in a strip around the discontinuity."""
     height = 32
     guide = _gray(height)
     guide[:, 29:] = 0.95
@@ -348,14 +332,14 @@ def test_a_jump_stays_where_the_picture_has_an_edge():
     assert (total[rows, 29:54].argmin(axis=-1) == 9).mean() > 0.98
 
 
-def test_families_meet_cheaply_only_where_their_slots_do():
-    """HypothesisSet 0's hypothesis gives way to family 1's; cheap if both pass through the same depth, else a jump."""
+def test_a_change_of_set_is_cheap_only_at_equal_depth():
+    """The best hypothesis changes from set 0 to set 1: a crease at the same depth, else a jump."""
     height, count = 32, 12
     cost = np.full((height, 2 * height, 2 * count), 1.0, np.float32)
     cost[:, :32, 4] = 0
     cost[:, 32:, count + 4] = 0
     least = []
-    for start in (0.5, 6.5):  # family 1's hypothesis 4 lies in slot 4, or in slot 10
+    for start in (0.5, 6.5):  # hypothesis 4 of set 1 lies in slot 4, or in slot 10
         slot_map = _slots(height, 2)
         slot_map[..., 1, 1] = start
         total = aggregate(cost, _gray(height), slot_map, 20, AggregationConfig())
@@ -363,7 +347,7 @@ def test_families_meet_cheaply_only_where_their_slots_do():
     assert 0 < least[0] < 0.5 * least[1]
 
 
-def test_threads_change_no_bit():
+def test_the_number_of_threads_changes_no_bit():
     cost, guide = _noise(32, 24), _noise(32, 3, seed=2)
     one, two = (aggregate(cost, guide, _slots(32, 2), 12, AggregationConfig(), threads=n) for n in (1, 2))
     assert np.array_equal(one, two)
@@ -398,9 +382,9 @@ def test_the_best_label_lies_at_the_vertex_of_a_parabola():
     assert np.allclose(label - count + offset, vertex[..., 0], atol=1e-3)
 
 
-def test_no_offset_leaves_a_family():
+def test_offsets_do_not_cross_hypothesis_sets():
     total = np.ones((8, 16, 24), np.float32)
-    total[:, :8, 11], total[:, :8, 12] = 0, 0.2  # the last of the first family: 12 belongs to another
+    total[:, :8, 11], total[:, :8, 12] = 0, 0.2  # 11 is the last of the first set
     total[:, 8:, 12], total[:, 8:, 11] = 0, 0.2
     label, offset = best_labels(total, 12)
     assert set(np.unique(label)) == {11, 12}

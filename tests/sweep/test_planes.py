@@ -1,10 +1,4 @@
-"""The scene's axes, found in its edges.
-
----
-The planes that a scene has.
-
----
-What pixels say about a scene's planes before any surface is known."""
+"""The scene's axes and planes."""
 
 import dataclasses
 import math
@@ -12,10 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from pansplat.sweep.matching import MatchingConfig, View
+from pansplat.sweep.matching import MatchingConfig
 from pansplat.sweep.planes import ScenePlanes, axis_components, collect_planes, detect_planes, estimate_axes, no_planes
-from pansplat.sweep.search import PosedImages
-from pansplat.sweep.surface import Surface, ray_grid, world_points
+from pansplat.sweep.surface import Surface, consistency_mask, ray_grid, world_points
 
 
 def _degrees_off(found: np.ndarray, wanted: np.ndarray) -> float:
@@ -29,8 +22,8 @@ def _yaw_degrees_off(axes: np.ndarray, placed: np.ndarray) -> float:
     return min(turned, 90 - turned)
 
 
-@pytest.mark.parametrize(("yaw", "pitch", "roll"), ((0, 0, 0), (31, 0, 0), (58, 6, -4), (12, -35, 50)))
-def test_a_room_of_bricks_shows_which_way_is_down_and_how_its_walls_run(make_room, observe, turn, yaw, pitch, roll):
+@pytest.mark.parametrize(("yaw", "pitch", "roll"), ((0, 0, 0), (58, 6, -4), (12, -35, 50)))
+def test_down_and_the_wall_normals_are_found_in_a_room_of_bricks(make_room, observe, turn, yaw, pitch, roll):
     placed = np.eye(4)
     placed[:3, :3] = turn("z", roll) @ turn("x", pitch) @ turn("y", yaw)
     room = make_room(paint="tiles", placed=placed, supersample=8)
@@ -42,7 +35,7 @@ def test_a_room_of_bricks_shows_which_way_is_down_and_how_its_walls_run(make_roo
 
 def test_tilted_cameras_do_not_tilt_the_scene(make_room, observe, turn):
     room = make_room(paint="tiles", supersample=8)
-    tilt = turn("x", 5) @ turn("z", 4)  # both lean the same way: their mean is 6.4 degrees off
+    tilt = turn("x", 5) @ turn("z", 4)  # the same for both cameras: their mean is 6.4 degrees off
     posed = observe(room, [room.pose((-0.4, 0, -0.2), tilt), room.pose((0.4, 0, 0.1), tilt)], 128).posed
     assert _degrees_off(posed.cam2world[0, :3, 1], np.array((0, 1, 0))) > 6
     axes = estimate_axes(posed.images, posed.cam2world[:, :3, :3])
@@ -58,18 +51,18 @@ def test_axes_are_orthonormal(make_room, observe, turn, paint):
     assert np.allclose(axes @ axes.T, np.eye(3), atol=1e-12)
 
 
-def test_down_is_the_cameras_mean_where_nothing_shows_an_edge(turn):
+def test_without_edges_down_is_the_mean_of_the_cameras(turn):
     rotations = [turn("z", 12), turn("z", -2)]
     axes = estimate_axes([np.full((64, 128, 3), 0.5, np.float32)] * 2, rotations)
     assert _degrees_off(axes[0], turn("z", 5)[:, 1]) < 1e-5
 
 
-def test_cameras_upside_down_to_each_other_still_give_axes(turn):
+def test_cameras_upside_down_to_each_other_give_orthonormal_axes(turn):
     axes = estimate_axes([np.full((64, 128, 3), 0.5, np.float32)] * 2, [np.eye(3), turn("z", 180)])
     assert np.isfinite(axes).all() and np.allclose(axes @ axes.T, np.eye(3), atol=1e-12)
 
 
-def test_main_directions_are_the_rays_in_the_scenes_axes(turn):
+def test_axis_components_are_the_rays_in_the_scenes_axes(turn):
     rotation, axes = turn("y", 40) @ turn("x", 10), turn("z", 25)
     directions = axis_components(axes, rotation, 32)
     rays = ray_grid(32) @ rotation.T
@@ -80,8 +73,8 @@ _AXES = np.array(((0.0, 1, 0), (1, 0, 0), (0, 0, 1)))  # down and the room's two
 
 
 @pytest.fixture(scope="module")
-def support(empty_room) -> ScenePlanes:
-    """Of the exact surfaces, every pixel labelled with its wall's axis."""
+def planes(empty_room) -> ScenePlanes:
+    """From the exact surfaces, with the true orientation of every pixel."""
     room, poses = empty_room.room, empty_room.posed.cam2world
     surfaces = []
     for pose, depth in zip(poses, empty_room.depths, strict=True):
@@ -93,43 +86,40 @@ def support(empty_room) -> ScenePlanes:
     return collect_planes(surfaces, list(empty_room.posed.masks), poses, no_planes(poses, _AXES, 0.5, 8.0))
 
 
-def test_shares_of_all_planes_sum_to_one(support):
-    assert np.isclose(support.histogram.sum(), 1, atol=1e-3)
+def test_the_histogram_sums_to_one(planes):
+    assert np.isclose(planes.histogram.sum(), 1, atol=1e-3)
 
 
 @pytest.mark.parametrize("view", (0, 1))
-def test_every_wall_has_support_at_its_distance_and_none_between(support, empty_room, view):
+def test_every_wall_has_support_at_its_distance_and_none_between(planes, empty_room, view):
     pose = empty_room.posed.cam2world[view]
     low, high = (np.array(corner) @ _AXES.T for corner in (empty_room.room.low, empty_room.room.high))
     centre = pose[:3, 3] @ _AXES.T
     for axis in range(3):
         distances = np.array((centre[axis] - low[axis], high[axis] - centre[axis]))
-        share = support.support(axis, pose, 1 / distances)
-        assert share[0, 0] > 0.9 and share[1, 1] > 0.9
-        assert support.support(axis, pose, 1 / (0.7 * distances)).max() < 0.1
+        support = planes.support(axis, pose, 1 / distances)
+        assert support[0, 0] > 0.9 and support[1, 1] > 0.9
+        assert planes.support(axis, pose, 1 / (0.7 * distances)).max() < 0.1
 
 
 @pytest.mark.parametrize("view", (0, 1))
-def test_the_floor_is_below_and_the_ceiling_above_the_camera(support, empty_room, view):
-    """Bounds leave a little room beyond, never less than the true planes."""
+def test_vertical_bounds_contain_the_floor_and_the_ceiling(planes, empty_room, view):
     pose, room = empty_room.posed.cam2world[view], empty_room.room
-    down, up = support.vertical_bounds(pose)
+    down, up = planes.vertical_bounds(pose)
     floor, ceiling = room.high[1] - pose[1, 3], room.low[1] - pose[1, 3]
     assert floor < down < 1.15 * floor + 0.1
     assert 1.15 * ceiling - 0.1 < up < ceiling
 
 
-def test_without_agreement_nothing_is_known(empty_room):
-    nothing = [np.zeros_like(mask) for mask in empty_room.posed.masks]
+def test_without_consistent_pixels_there_is_no_support(empty_room):
+    no_pixels = [np.zeros_like(mask) for mask in empty_room.posed.masks]
     poses = empty_room.posed.cam2world
-    support = collect_planes(empty_room.surfaces, nothing, poses, no_planes(poses, _AXES, 0.45, 8.0))
-    assert support.vertical_bounds(empty_room.posed.cam2world[0]) == (np.inf, -np.inf)
-    assert support.support(1, empty_room.posed.cam2world[0], np.linspace(0.1, 2, 20)).max() == 0
+    planes = collect_planes(empty_room.surfaces, no_pixels, poses, no_planes(poses, _AXES, 0.45, 8.0))
+    assert planes.vertical_bounds(empty_room.posed.cam2world[0]) == (np.inf, -np.inf)
+    assert planes.support(1, empty_room.posed.cam2world[0], np.linspace(0.1, 2, 20)).max() == 0
 
 
-def test_the_sweep_finds_floor_and_ceiling_by_itself(empty_room):
-    from pansplat.sweep.surface import consistency_mask
-
+def test_floor_and_ceiling_follow_from_the_sweeps_surfaces(empty_room):
     poses = empty_room.posed.cam2world
     labelled = [
         Surface(s.inverse_depth, np.where(np.abs(world_points(s, p)[..., 1]) > 1.0, 1, 0).astype(np.uint8))
@@ -141,7 +131,7 @@ def test_the_sweep_finds_floor_and_ceiling_by_itself(empty_room):
     assert up == pytest.approx(1.06 * empty_room.room.low[1] - 0.05, abs=0.1)
 
 
-def test_a_plane_that_pixels_voted_for_is_supported_without_any_surface(empty_room):
+def test_votes_support_a_plane_without_any_surface(empty_room):
     poses = empty_room.posed.cam2world
     nothing = no_planes(poses, _AXES, 0.45, 8.0)
     votes = np.zeros_like(nothing.votes)
@@ -152,15 +142,15 @@ def test_a_plane_that_pixels_voted_for_is_supported_without_any_surface(empty_ro
     assert nothing.support(0, poses[0], np.array((1 / distance,))).max() == 0
 
 
-def test_floor_and_ceiling_that_pixels_voted_for_come_before_those_of_surfaces(support, empty_room):
+def test_detected_floor_and_ceiling_precede_those_of_surfaces(planes, empty_room):
     pose = empty_room.posed.cam2world[0]
-    voted = dataclasses.replace(support, floor_ceiling=(2.0, -np.inf)).vertical_bounds(pose)
-    below = 2.0 - (pose[1, 3] - support.origin[1])
-    assert voted[0] == pytest.approx(1.06 * below + support.bin)
-    assert voted[1] == support.vertical_bounds(pose)[1]
+    voted = dataclasses.replace(planes, floor_ceiling=(2.0, -np.inf)).vertical_bounds(pose)
+    below = 2.0 - (pose[1, 3] - planes.origin[1])
+    assert voted[0] == pytest.approx(1.06 * below + planes.bin)
+    assert voted[1] == planes.vertical_bounds(pose)[1]
 
 
-def test_planes_between_two_cameras_show_them_different_faces():
+def test_planes_between_two_cameras_are_separating():
     """Cameras at x = 0 and x = 1, planes across x."""
     here, there = np.eye(4), np.eye(4)
     there[0, 3] = 1.0
@@ -171,33 +161,34 @@ def test_planes_between_two_cameras_show_them_different_faces():
     assert not nothing.separating(0, here, there, 1 / distance).any()
 
 
-def test_the_floor_is_below_each_camera_by_its_own_height():
+def test_each_camera_has_its_own_height_over_the_floor():
     poses = np.stack((np.eye(4), np.eye(4)))
-    poses[1, 1, 3] = 0.4  # lower by that
+    poses[1, 1, 3] = 0.4  # y points down
     floor = dataclasses.replace(no_planes(poses, _AXES, 0.5, 8.0), floor_ceiling=(1.0, -np.inf))
     assert floor.camera_height(poses[0]) == pytest.approx(1.2)
     assert floor.camera_height(poses[1]) == pytest.approx(0.8)
 
 
-_AXES = np.array(((0.0, 1, 0), (1, 0, 0), (0, 0, 1)))  # down and the room's two wall normals
+@pytest.fixture(scope="module")
+def detect(views_of):
+    """The planes that the views of posed images vote for."""
 
+    def run(posed, images=None, masks=None) -> ScenePlanes:
+        views, rays = views_of(
+            posed, posed.images if images is None else images, posed.masks if masks is None else masks
+        )
+        planes = no_planes(posed.cam2world, _AXES, posed.near, posed.far)
+        return detect_planes(views, rays, posed.cam2world, planes, (0.125, 2.5), 0.45, MatchingConfig())
 
-def _vote(posed: PosedImages, images: np.ndarray, masks: np.ndarray) -> ScenePlanes:
-    rays = [axis_components(_AXES, pose[:3, :3], images.shape[1]) for pose in posed.cam2world]
-    views = [
-        View(image, mask, np.ascontiguousarray(down[0], np.float32))
-        for image, mask, down in zip(images, masks, rays, strict=True)
-    ]
-    support = no_planes(posed.cam2world, _AXES, posed.near, posed.far)
-    return detect_planes(views, rays, posed.cam2world, support, (0.125, 2.5), 0.45, MatchingConfig())
+    return run
 
 
 @pytest.fixture(scope="module")
-def voted(empty_room) -> ScenePlanes:
-    return _vote(empty_room.posed, empty_room.posed.images, empty_room.posed.masks)
+def voted(empty_room, detect) -> ScenePlanes:
+    return detect(empty_room.posed)
 
 
-def test_every_wall_is_the_most_voted_plane_on_its_side(voted, empty_room):
+def test_every_wall_has_the_most_votes_on_its_side(voted, empty_room):
     for axis in range(3):
         for sign, corner in ((1, empty_room.room.high), (-1, empty_room.room.low)):
             true = (np.array(corner) - voted.origin) @ _AXES[axis]
@@ -206,7 +197,7 @@ def test_every_wall_is_the_most_voted_plane_on_its_side(voted, empty_room):
             assert side.max() > 0.5
 
 
-def test_shares_lie_between_nothing_and_everything(voted):
+def test_votes_are_between_zero_and_one(voted):
     assert voted.votes.min() >= 0
     assert voted.votes.max() == pytest.approx(1, abs=1e-3)
     assert np.median(voted.votes) < 0.2
@@ -218,18 +209,18 @@ def test_the_floor_and_the_ceiling_are_found(voted, empty_room):
     assert up == pytest.approx(empty_room.room.low[1] - voted.origin[1], abs=1.5 * voted.bin)
 
 
-def test_a_box_standing_on_the_floor_is_not_the_floor(furnished_room):
-    down, _ = _vote(furnished_room.posed, furnished_room.posed.images, furnished_room.posed.masks).floor_ceiling
+def test_a_box_standing_on_the_floor_is_not_the_floor(furnished_room, detect):
+    down, _ = detect(furnished_room.posed).floor_ceiling
     assert down == pytest.approx(furnished_room.room.high[1], abs=0.1)
 
 
-def test_blank_pictures_vote_for_nothing(empty_room):
-    voted = _vote(empty_room.posed, np.ones_like(empty_room.posed.images), empty_room.posed.masks)
+def test_blank_images_have_no_votes(empty_room, detect):
+    voted = detect(empty_room.posed, np.ones_like(empty_room.posed.images))
     assert voted.votes.max() < 1e-3
     assert voted.floor_ceiling == (math.inf, -math.inf)
 
 
-def test_masked_pixels_vote_for_nothing(empty_room):
-    voted = _vote(empty_room.posed, empty_room.posed.images, np.zeros_like(empty_room.posed.masks))
+def test_masked_pixels_have_no_votes(empty_room, detect):
+    voted = detect(empty_room.posed, masks=np.zeros_like(empty_room.posed.masks))
     assert voted.votes.max() == 0
     assert voted.floor_ceiling == (math.inf, -math.inf)

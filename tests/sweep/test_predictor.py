@@ -1,7 +1,4 @@
-"""The sweep as a predictor.
-
----
-What the sweep reaches on photographs and scans: a guard, well under what is measured (docs/sweep.md)."""
+"""The sweep as a predictor: a room of known depth, and lower bounds on the shared photographs and scans."""
 
 import dataclasses
 import math
@@ -19,6 +16,7 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.sweep import Sweep, SweepConfig
 from pansplat.sweep.lift import LiftConfig
+from pansplat.sweep.predictor import _mask_holes
 from pansplat.sweep.search import SearchConfig
 
 
@@ -57,13 +55,13 @@ def predicted(small) -> Gaussians:
         (lambda images, poses: (images, poses * math.inf), "must be finite"),
     ),
 )
-def test_unfit_panoramas_are_refused(small, change, message):
+def test_invalid_panoramas_are_refused(small, change, message):
     with pytest.raises(ValueError, match=message):
         Sweep()(*change(*small), 0.5, 8.0)
 
 
 @pytest.mark.parametrize(("near", "far"), ((2.0, 2.0), (3.0, 1.0), (0.0, 5.0), (-1.0, 5.0), (1.0, math.inf)))
-def test_an_unfit_depth_range_is_refused(small, near, far):
+def test_an_invalid_depth_range_is_refused(small, near, far):
     with pytest.raises(ValueError, match="0 < near < far, got"):
         Sweep()(*small, near, far)
 
@@ -73,50 +71,55 @@ def test_masks_of_another_size_are_refused(small):
         Sweep()(*small, 0.5, 8.0, masks=torch.ones(2, 32, 64, dtype=torch.bool))
 
 
-def test_two_calls_give_the_same_bits(small, predicted):
-    assert _same(Sweep()(*small, 0.5, 8.0), predicted)
+def test_full_masks_ranges_by_view_and_progress_change_no_bit(small, predicted):
+    reports: list[tuple[str, float]] = []
+    masks = torch.ones(2, 64, 128, dtype=torch.bool)
+    near, far = torch.tensor((0.5, 0.7)), torch.tensor((5.0, 8.0))  # the range covers both views
+    again = Sweep()(*small, near, far, masks=masks, progress=lambda what, fraction: reports.append((what, fraction)))
+    assert _same(again, predicted)
+    fractions = [fraction for _, fraction in reports]
+    assert fractions == sorted(fractions) and fractions[0] == 0 and fractions[-1] == 1
+    assert len(reports) >= 4 and all(what for what, _ in reports)
 
 
-def test_a_batch_gives_a_list_of_its_items(small, predicted):
-    images, poses = small
-    batch = Sweep()(
-        torch.stack((images, images.flip(0))), torch.stack((poses, poses.flip(0))), 0.5, torch.tensor((8.0, 6.0))
-    )
+@pytest.fixture(scope="module")
+def swapped(small) -> Gaussians:
+    """The prediction of the views in reverse order, up to 6 m."""
+    return Sweep()(small[0].flip(0), small[1].flip(0), 0.5, 6.0)
+
+
+def test_a_batch_gives_a_list_of_its_items(small, predicted, swapped):
+    images, poses = (torch.stack((t, t.flip(0))) for t in small)
+    batch = Sweep()(images, poses, 0.5, torch.tensor((8.0, 6.0)))
     assert isinstance(batch, list) and len(batch) == 2
     assert _same(batch[0], predicted)
-    assert _same(batch[1], Sweep()(images.flip(0), poses.flip(0), 0.5, 6.0))
+    assert _same(batch[1], swapped)
 
 
-def test_depth_ranges_of_each_view_are_searched_together(small, predicted):
-    assert _same(Sweep()(*small, torch.tensor((0.5, 0.7)), torch.tensor((5.0, 8.0))), predicted)
+def test_swapping_the_views_swaps_their_labels(predicted, swapped):
+    for view in (0, 1):
+        before, after = predicted.select(predicted.views == view), swapped.select(swapped.views == 1 - view)
+        assert len(after) == pytest.approx(len(before), rel=0.05)
+        distance = torch.cdist(after.means[::16], before.means).amin(dim=1)
+        assert distance.median() < 0.03  # the two views' lattices are about 0.1 m apart
 
 
-def test_full_masks_are_no_masks(small, predicted):
-    assert _same(Sweep()(*small, 0.5, 8.0, masks=torch.ones(2, 64, 128, dtype=torch.bool)), predicted)
-
-
-def test_the_input_is_left_as_it_was(small):
-    images, poses = (t.clone() for t in small)
-    masks = torch.ones(2, 64, 128, dtype=torch.bool)
-    images[0, :, 20:30, 40:60] = 0  # a hole
-    before = images.clone()
-    Sweep()(images, poses, 0.5, 8.0, masks=masks)
-    assert torch.equal(images, before) and torch.equal(poses, small[1]) and masks.all()
-
-
-def test_holes_of_a_scan_show_nothing(small):
-    """A patch of exact black is as good as masked; single black pixels and very dark ones are seen."""
-    holed = small[0].clone()
+def test_holes_of_a_scan_are_masked_and_the_input_is_not_changed(small):
+    holed, poses = small[0].clone(), small[1].clone()
     holed[0, :, 20:30, 40:60] = 0
     masks = torch.ones(2, 64, 128, dtype=torch.bool)
-    masks[0, 18:32, 38:62] = False  # the patch, and what resizing mixes with it
-    assert _same(Sweep()(holed, small[1], 0.5, 8.0), Sweep()(holed, small[1], 0.5, 8.0, masks=masks))
-    dark = small[0].clone()
-    dark[0, :, 20:30, 40:60] = 1e-3
-    dark[0, :, 5, 5] = 0
-    unmasked = dark.clamp_min(1e-4)
-    seen, expected = (len(Sweep()(images, small[1], 0.5, 8.0)) for images in (dark, unmasked))
-    assert seen == pytest.approx(expected, rel=2e-3)  # a masked patch would be 2 % of the panorama
+    masks[0, 18:32, 38:62] = False  # the hole, and the pixels that resizing mixes with it
+    inputs = holed.clone(), poses.clone(), masks.clone()
+    assert _same(Sweep()(holed, poses, 0.5, 8.0), Sweep()(holed, poses, 0.5, 8.0, masks=masks))
+    assert all(torch.equal(a, b) for a, b in zip(inputs, (holed, poses, masks), strict=True))
+    assert np.array_equal(_mask_holes(holed), masks.numpy())
+
+
+def test_dark_patches_and_single_black_pixels_are_no_holes(small):
+    images = small[0].clone()
+    images[0, :, 20:30, 40:60] = 1e-3
+    images[0, :, 5, 5] = 0
+    assert _mask_holes(images).all()
 
 
 def test_predictions_are_plain_float32_without_gradients(small, predicted):
@@ -141,25 +144,13 @@ def test_blank_panoramas_give_finite_gaussians(small):
         assert torch.isfinite(values.double()).all()
 
 
-def test_panoramas_masked_throughout_give_no_gaussians(small):
+def test_fully_masked_panoramas_give_no_gaussians(small):
     assert len(Sweep()(*small, 0.5, 8.0, masks=torch.zeros(2, 64, 128, dtype=torch.bool))) == 0
-
-
-def test_three_views_make_gaussians_of_three(make_room, two_poses, observe, turn):
-    room = make_room()
-    poses = [*two_poses(room), room.pose((0.1, -0.1, -0.7), turn("y", -60))]
-    gaussians = Sweep()(*_tensors(observe(room, poses, 64)), 0.5, 8.0)
-    assert gaussians.views.unique().tolist() == [0, 1, 2]
-    off = torch.minimum(
-        (gaussians.means - torch.tensor(room.low)).abs(), (gaussians.means - torch.tensor(room.high)).abs()
-    ).amin(dim=1)
-    fine = gaussians.levels == 0
-    assert off[fine].median() < 0.05
 
 
 def test_moving_the_world_moves_the_gaussians(small, predicted, turn):
     motion = torch.eye(4, dtype=torch.float64)
-    motion[:3, :3] = torch.from_numpy(turn("y", 90.0).round())  # exact, so that only the placing can differ
+    motion[:3, :3] = torch.from_numpy(turn("y", 90.0).round())  # exact, so that only the position can differ
     motion[:3, 3] = torch.tensor((8.0, -4.0, 2.0))
     moved = Sweep()(small[0], motion @ small[1], 0.5, 8.0)
     assert len(moved) == len(predicted)
@@ -171,24 +162,7 @@ def test_moving_the_world_moves_the_gaussians(small, predicted, turn):
     assert torch.allclose(rotations_from_quats(moved.quats), turned, atol=1e-4)
 
 
-def test_swapping_the_views_swaps_their_labels(small, predicted):
-    swapped = Sweep()(small[0].flip(0), small[1].flip(0), 0.5, 8.0)
-    for view in (0, 1):
-        before, after = predicted.select(predicted.views == view), swapped.select(swapped.views == 1 - view)
-        assert len(after) == pytest.approx(len(before), rel=0.05)
-        distance = torch.cdist(after.means[::16], before.means).amin(dim=1)
-        assert distance.median() < 0.03  # the two views' lattices lie about 0.1 m apart
-
-
-def test_progress_runs_from_zero_to_one(small):
-    told: list[tuple[str, float]] = []
-    Sweep()(*small, 0.5, 8.0, progress=lambda what, fraction: told.append((what, fraction)))
-    fractions = [fraction for _, fraction in told]
-    assert fractions == sorted(fractions) and fractions[0] == 0 and fractions[-1] == 1
-    assert len(told) >= 4 and all(what for what, _ in told)
-
-
-def test_the_fingerprint_tells_settings_apart():
+def test_the_fingerprint_depends_on_the_settings():
     assert Sweep().fingerprint == Sweep(SweepConfig()).fingerprint
     others = [
         SweepConfig(lift=LiftConfig(footprint=0.71)),
@@ -200,14 +174,10 @@ def test_the_fingerprint_tells_settings_apart():
     assert Sweep().name == "sweep" and Sweep().fingerprint.startswith("sweep-")
 
 
-def test_the_settings_change_what_is_predicted(small, predicted):
-    assert np.isclose(predicted.scales.max(), predicted.scales.max())
+def test_the_settings_change_the_prediction(small, predicted):
     smaller = Sweep(SweepConfig(lift=LiftConfig(footprint=0.35)))(*small, 0.5, 8.0)
-    sphere = predicted.scales[:, 1].median() / smaller.scales[:, 1].median()
-    assert float(sphere) == pytest.approx(2.0, rel=0.05)
-
-
-pytestmark = pytest.mark.shared
+    ratio = predicted.scales[:, 1].median() / smaller.scales[:, 1].median()
+    assert float(ratio) == pytest.approx(2.0, rel=0.05)
 
 
 def _decibels(pair: Pair, height: int) -> tuple[float, float]:
@@ -215,22 +185,24 @@ def _decibels(pair: Pair, height: int) -> tuple[float, float]:
     context, targets = pair.load_context(height), pair.load_targets(height)
     scene = pansplat.predict(pair, height=height, cache=False)
     with torch.no_grad():
-        picture = pansplat.render(scene, targets.cam2world[0])
+        rendering = pansplat.render(scene, targets.cam2world[0])
     faded = cross_fade(context.images, context.cam2world, targets.cam2world[0])
-    assert (picture.alpha > 0.9).float().mean() > 0.9 and picture.alpha.min() > 0.4, "holes"
-    return ws_psnr(picture.color, targets.images[0]), ws_psnr(faded, targets.images[0])
+    assert (rendering.alpha > 0.9).float().mean() > 0.9 and rendering.alpha.min() > 0.4, "holes"
+    return ws_psnr(rendering.color, targets.images[0]), ws_psnr(faded, targets.images[0])
 
 
+@pytest.mark.shared
 @pytest.mark.slow
-def test_a_scanned_room_is_seen_from_between_its_views(shared: Path):
+def test_the_middle_view_of_a_scanned_room_is_rendered(shared: Path):
     (pair,) = (pair for pair in pansplat.load_pairs(shared / "data/mp3d_sample") if pair.targets)
     reached, faded = _decibels(pair, 256)
     assert reached >= 24.0  # 24.6 measured
     assert reached >= faded + 7.0
 
 
+@pytest.mark.shared
 @pytest.mark.slow
-def test_photographed_homes_are_seen_better_than_by_fading(shared: Path):
+def test_photographed_homes_are_rendered_better_than_by_a_cross_fade(shared: Path):
     pairs = [pair for pair in pansplat.load_pairs(shared / "data/zind") if pair.targets]
     figures = torch.tensor([_decibels(pair, 128) for pair in pairs])
     assert len(pairs) == 3

@@ -1,4 +1,4 @@
-"""The surfaces that the sweep finds, against a room whose depth is known, and their symmetries."""
+"""The sweep's surfaces against a room of known depth, and their symmetries."""
 
 import dataclasses
 
@@ -19,7 +19,7 @@ def _error(observed, view: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("view", (0, 1))
-def test_surfaces_are_where_the_room_is(empty_room, view):
+def test_surfaces_have_the_rooms_depth(empty_room, view):
     error = _error(empty_room, view)
     assert np.median(error) < 0.012
     assert (error < 0.05).mean() > 0.92
@@ -27,7 +27,7 @@ def test_surfaces_are_where_the_room_is(empty_room, view):
 
 
 @pytest.mark.parametrize("view", (0, 1))
-def test_the_left_and_right_edge_are_as_right_as_the_middle(empty_room, view):
+def test_surfaces_are_accurate_at_the_left_and_right_border(empty_room, view):
     seam = np.roll(_error(empty_room, view), 3, axis=1)[:, :6]
     assert np.median(seam) < 0.015
     assert (seam < 0.10).mean() > 0.95
@@ -35,7 +35,7 @@ def test_the_left_and_right_edge_are_as_right_as_the_middle(empty_room, view):
 
 @pytest.mark.parametrize("view", (0, 1))
 @pytest.mark.parametrize("pole", ("zenith", "nadir"))
-def test_the_poles_are_as_right_as_the_middle(empty_room, view, pole):
+def test_surfaces_are_accurate_at_the_poles(empty_room, view, pole):
     error = _error(empty_room, view)
     cap = error[:8] if pole == "zenith" else error[-8:]
     assert np.median(cap) < 0.015
@@ -43,7 +43,7 @@ def test_the_poles_are_as_right_as_the_middle(empty_room, view, pole):
 
 
 @pytest.mark.parametrize("view", (0, 1))
-def test_a_box_in_the_room_stands_in_front_of_its_walls(furnished_room, empty_room, view):
+def test_a_box_is_in_front_of_the_walls(furnished_room, empty_room, view):
     truth, behind = furnished_room.depths[view], empty_room.depths[view]
     box = truth < 0.8 * behind
     found = 1 / furnished_room.surfaces[view].inverse_depth
@@ -58,8 +58,8 @@ def test_finer_panoramas_give_finer_surfaces(empty_room, two_poses, observe):
     assert np.median(_error(empty_room, 0)) < 0.8 * np.median(_error(coarse, 0))
 
 
-def test_surfaces_stay_within_the_searched_range(empty_room):
-    posed = dataclasses.replace(empty_room.posed, near=2.0, far=2.5)  # too narrow for the room
+def test_surfaces_stay_within_the_depth_range(small_furnished_room):
+    posed = dataclasses.replace(small_furnished_room.posed, near=2.0, far=2.5)  # too narrow for the room
     inverse = _search(posed)
     margin = SearchConfig().near_margin
     assert inverse.min() >= np.float32(1 / 2.5) and inverse.max() <= np.float32(1 / (2.0 * margin))
@@ -76,7 +76,7 @@ def test_rolling_the_panoramas_rolls_the_surfaces(empty_room, turn):
     assert (change < 0.02).mean() > 0.97
 
 
-def test_moving_the_world_changes_no_surface(empty_room):
+def test_translating_the_world_changes_no_surface(empty_room):
     moved = empty_room.posed.cam2world.copy()
     moved[:, :3, 3] += (31.0, -2.0, 7.5)
     inverse = _search(dataclasses.replace(empty_room.posed, cam2world=moved))
@@ -84,14 +84,13 @@ def test_moving_the_world_changes_no_surface(empty_room):
         assert (np.abs(inverse[view] / surface.inverse_depth - 1) < 1e-3).mean() > 0.99
 
 
-@pytest.mark.parametrize("tilt", (0, 35))
-def test_turning_the_world_changes_no_surface(empty_room, turn, tilt):
-    """But for what hangs on a rounding: this room's floor looks like its walls, so where it ends is a guess."""
+def test_rotating_the_world_changes_no_surface(empty_room, turn):
+    """Up to the floor boundary, which is uncertain here: the floor looks like the walls."""
     motion = np.eye(4)
-    motion[:3, :3] = turn("y", 71) @ turn("x", tilt) @ turn("z", -0.6 * tilt)
+    motion[:3, :3] = turn("y", 71) @ turn("x", 35) @ turn("z", -21)
     inverse = _search(dataclasses.replace(empty_room.posed, cam2world=motion @ empty_room.posed.cam2world))
     for view, surface in enumerate(empty_room.surfaces):
-        assert (np.abs(inverse[view] / surface.inverse_depth - 1) < 0.01).mean() > (0.97 if tilt == 0 else 0.95)
+        assert (np.abs(inverse[view] / surface.inverse_depth - 1) < 0.01).mean() > 0.95
 
 
 def test_swapping_the_views_swaps_the_surfaces(empty_room):
@@ -102,9 +101,8 @@ def test_swapping_the_views_swaps_the_surfaces(empty_room):
     assert (change < 0.05).mean() > 0.95
 
 
-@pytest.mark.parametrize("scale", (0.25, 4.0))
-def test_scaling_the_world_scales_the_surfaces(empty_room, scale):
-    posed = empty_room.posed
+def test_scaling_the_world_scales_the_surfaces(empty_room):
+    posed, scale = empty_room.posed, 0.25
     scaled = posed.cam2world.copy()
     scaled[:, :3, 3] *= scale
     inverse = _search(dataclasses.replace(posed, cam2world=scaled, near=scale * posed.near, far=scale * posed.far))
@@ -113,23 +111,20 @@ def test_scaling_the_world_scales_the_surfaces(empty_room, scale):
     assert (error < 0.10).mean() > 0.97
 
 
-def test_more_views_are_no_worse_than_two(make_room, two_poses, observe, turn):
-    room = make_room(box=((-0.3, -0.1, 1.0), (0.4, 1.2, 1.7)))
-    poses = [*two_poses(room), room.pose((0.1, -0.1, -0.7), turn("y", -60))]
-    two, three = (observe(room, poses[:count], 64, search=True) for count in (2, 3))
-    shares = [(_error(observed, 0) < 0.10).mean() for observed in (two, three)]
+def test_more_views_are_no_worse_than_two(small_furnished_room, three_views):
+    shares = [(_error(observed, 0) < 0.10).mean() for observed in (small_furnished_room, three_views)]
     assert shares[1] > shares[0] - 0.01
 
 
-def test_coincident_cameras_get_the_middle_of_the_range(empty_room):
+def test_coincident_cameras_give_the_middle_of_the_range(empty_room):
     same = np.stack([empty_room.posed.cam2world[0]] * 2)
     inverse = _search(dataclasses.replace(empty_room.posed, cam2world=same))
     assert np.allclose(inverse, 0.5 * (1 / 0.5 + 1 / 8.0))
 
 
-def test_masked_pixels_match_nothing(empty_room):
-    """What travels with the camera must not draw the surface to itself: without the mask it does."""
-    rows = slice(-14, None)  # a tripod: the same picture in both cameras' own axes
+def test_masked_pixels_are_not_matched(empty_room):
+    """A tripod moves with the camera. Without the mask its match pulls the surface away from the truth."""
+    rows = slice(-14, None)
     images = empty_room.posed.images.copy()
     images[:, rows] = np.arange(images.shape[2])[:, None] // 4 % 2
     masks = empty_room.posed.masks.copy()
@@ -140,4 +135,4 @@ def test_masked_pixels_match_nothing(empty_room):
         for m in (masks, empty_room.posed.masks)
     ]
     assert (errors[0] < 0.10).mean() > 0.9
-    assert (errors[1] < 0.10).mean() < 0.8  # 0.70 measured; the floor that the pixels vote for saves the rest
+    assert (errors[1] < 0.10).mean() < 0.8  # 0.70 measured; the detected floor explains the rest

@@ -1,4 +1,4 @@
-"""Surfaces, and what the views say of each other's."""
+"""Surfaces: consistency between views, and upsampling."""
 
 import numpy as np
 import pytest
@@ -25,11 +25,11 @@ def _sphere(radius: float, height: int = 32) -> Surface:
     return _surface(np.full((height, 2 * height), 1 / radius))
 
 
-def test_points_before_on_and_behind_a_surface_are_told_apart(turn):
+def test_points_in_front_of_on_and_behind_a_surface_are_classified(turn):
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn("y", 50) @ turn("x", 20), (3, -1, 2)
     directions = ray_grid(8).reshape(-1, 3).astype(np.float64)
-    for distance, said in (
+    for distance, expected in (
         (1.0, FREE_SPACE),
         (1.96, CONSISTENT),
         (2.0, CONSISTENT),
@@ -37,7 +37,7 @@ def test_points_before_on_and_behind_a_surface_are_told_apart(turn):
         (4.0, OCCLUDED),
     ):
         result, ratio = classify_visibility(pose[:3, 3] + distance * directions, _sphere(2.0), pose, 0.06)
-        assert (result == said).all()
+        assert (result == expected).all()
         assert np.allclose(ratio, 2.0 / distance, rtol=1e-6)
 
 
@@ -48,12 +48,12 @@ def test_a_point_is_compared_with_the_surface_in_its_own_direction():
     assert classify_visibility(points, _surface(inverse), np.eye(4), 0.06)[0].tolist() == [FREE_SPACE, OCCLUDED]
 
 
-def test_a_point_at_the_camera_is_seen_through():
-    said, ratio = classify_visibility(np.zeros((1, 3)), _sphere(2.0), np.eye(4), 0.06)
-    assert said.tolist() == [FREE_SPACE] and np.isfinite(ratio).all()
+def test_a_point_at_the_camera_is_in_free_space():
+    result, ratio = classify_visibility(np.zeros((1, 3)), _sphere(2.0), np.eye(4), 0.06)
+    assert result.tolist() == [FREE_SPACE] and np.isfinite(ratio).all()
 
 
-def test_world_points_are_where_the_rays_end(empty_room):
+def test_world_points_lie_on_the_rooms_walls(empty_room):
     room = empty_room.room
     for pose, depth in zip(empty_room.posed.cam2world, empty_room.depths, strict=True):
         points = world_points(_surface(1 / depth), pose)
@@ -61,20 +61,19 @@ def test_world_points_are_where_the_rays_end(empty_room):
         assert off.max() < 1e-5
 
 
-def test_exact_surfaces_agree_everywhere_in_an_empty_room(empty_room):
+def test_exact_surfaces_are_consistent_in_an_empty_room(empty_room):
     surfaces = [_surface(1 / depth) for depth in empty_room.depths]
     for view in (0, 1):
         assert consistency_mask(surfaces, empty_room.posed.cam2world, view).mean() > 0.995
 
 
-def test_exact_surfaces_disagree_only_where_the_box_hides(furnished_room):
-    """The views' hidden shares belong to the same box: similar, small and not nothing."""
+def test_exact_surfaces_are_inconsistent_only_at_occlusions(furnished_room):
     surfaces = [_surface(1 / depth) for depth in furnished_room.depths]
     shares = [1 - consistency_mask(surfaces, furnished_room.posed.cam2world, view).mean() for view in (0, 1)]
     assert all(0.005 < share < 0.15 for share in shares)
 
 
-def test_agreement_is_symmetrical_in_the_order_of_the_views(furnished_room):
+def test_consistency_does_not_depend_on_the_order_of_the_views(furnished_room):
     surfaces, poses = [_surface(1 / depth) for depth in furnished_room.depths], furnished_room.posed.cam2world
     for view in (0, 1):
         assert np.array_equal(
@@ -82,7 +81,7 @@ def test_agreement_is_symmetrical_in_the_order_of_the_views(furnished_room):
         )
 
 
-def test_nothing_agrees_with_a_surface_far_off(empty_room):
+def test_surfaces_at_other_depths_are_inconsistent(empty_room):
     surfaces = [_surface(1 / empty_room.depths[0]), _surface(2.5 / empty_room.depths[1])]
     assert consistency_mask(surfaces, empty_room.posed.cam2world, 0).mean() < 0.1
 
@@ -100,8 +99,8 @@ def test_a_smooth_surface_is_interpolated_within_a_percent(empty_room, textured)
 
 
 @pytest.mark.parametrize("edge", (96, 101))
-def test_a_jump_stays_sharp_along_an_edge_of_the_picture(edge):
-    """Also when the edge lies within a coarse pixel (101 is odd)."""
+def test_a_discontinuity_stays_sharp_along_an_image_edge(edge):
+    """At 101 the edge lies within a coarse pixel."""
     fine = np.full((96, 192, 3), 0.2, np.float32)
     fine[:, edge:] = 0.8
     inverse = np.full((48, 96), 1.0)
@@ -110,7 +109,7 @@ def test_a_jump_stays_sharp_along_an_edge_of_the_picture(edge):
     assert np.array_equal(large, np.where(np.arange(192) < edge, 1.0, 0.4).astype(np.float32) * np.ones((96, 1)))
 
 
-def test_upsampling_knows_no_left_and_right_edge(empty_room):
+def test_upsampling_wraps_around(empty_room):
     fine, coarse = empty_room.posed.images[0], resize_sphere(empty_room.posed.images[0], 48)
     surface = _surface(1 / resize_sphere(empty_room.depths[0].astype(np.float32), 48))
     plain = guided_upsample(surface, coarse, fine).inverse_depth
@@ -120,11 +119,11 @@ def test_upsampling_knows_no_left_and_right_edge(empty_room):
     assert np.allclose(np.roll(rolled, -20, axis=1), plain, rtol=1e-5)
 
 
-def test_upsampled_families_are_those_of_the_surface():
-    family = np.zeros((16, 32), np.uint8)
-    family[:, 16:] = 2
+def test_upsampled_orientations_are_those_of_the_surface():
+    orientation = np.zeros((16, 32), np.uint8)
+    orientation[:, 16:] = 2
     fine = np.full((32, 64, 3), 0.5, np.float32)
-    inverse = np.where(family > 0, 0.4, 1.0).astype(np.float32)
-    large = guided_upsample(Surface(inverse, family), resize_sphere(fine, 16), fine)
+    inverse = np.where(orientation > 0, 0.4, 1.0).astype(np.float32)
+    large = guided_upsample(Surface(inverse, orientation), resize_sphere(fine, 16), fine)
     assert large.orientation.shape == (32, 64) and set(np.unique(large.orientation)) == {0, 2}
     assert ((large.orientation == 2) == (large.inverse_depth < 0.7)).all()
