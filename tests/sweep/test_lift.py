@@ -166,7 +166,7 @@ def test_gaussians_of_a_sphere_lie_on_the_fibonacci_lattices_at_its_radius():
         assert torch.allclose(gaussians.scales[chosen][:, :2], torch.tensor(size), rtol=1e-3)
 
 
-def test_colours_are_those_of_the_render():
+def test_colours_are_those_of_the_image():
     color = torch.tensor((0.2, 0.5, 0.9))
     image = color.numpy() * np.ones((64, 128, 1), np.float32)
     gaussians = lift(*_sphere_around(image), LiftConfig())

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import pansplat
-from pansplat.data.pair import Pair
+from pansplat.data.pairs import Pair
 from pansplat.evaluation.metrics import cross_fade, ws_psnr
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
