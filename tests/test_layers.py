@@ -40,7 +40,7 @@ PLANTS = [
         "pansplat.pipeline -> pansplat.evaluation.metrics",
     ),
     ("pansplat/evaluation/metrics.py", "import pansplat.cli", "pansplat.evaluation.metrics -> pansplat.cli"),
-    ("pansplat/cli/commands.py", "import pansplat_viewer", "pansplat.cli.commands -> pansplat_viewer"),
+    ("pansplat/cli/render.py", "import pansplat_viewer", "pansplat.cli.render -> pansplat_viewer"),
     (
         "pansplat_viewer/app.py",
         "import pansplat.rendering.blend",

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from pansplat import pipeline
-from pansplat.cli import run, scenes
+from pansplat.cli import predict, run
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.model import network
@@ -55,7 +55,7 @@ def pair(tmp_path: Path) -> Path:
 def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A small network; panoramas of 64 pixels are cut into four tiles, and count as large."""
     monkeypatch.setattr(network, "_UNTILED_HEIGHT", HEIGHT // 2)
-    monkeypatch.setattr(scenes, "_HELD_HEIGHT", HEIGHT // 2)
+    monkeypatch.setattr(predict, "_MAX_CACHED_HEIGHT", HEIGHT // 2)
     torch.manual_seed(0)
     path = tmp_path / "small.safetensors"
     save_weights(path, pack_weights("pansplat", SMALL, PanSplat(SMALL).state_dict(), compat="fixed"))

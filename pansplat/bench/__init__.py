@@ -1,1 +1,1 @@
-"""Speed against error."""
+"""Benchmarks of speed, memory and error."""

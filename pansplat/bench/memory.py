@@ -1,4 +1,6 @@
-"""`pansplat bench memory`: peak memory of training and inference over resolutions, as in the paper's memory figure.
+"""`pansplat bench memory`: peak memory of training and prediction over resolutions, as in the paper's figure.
+
+Every case is one training step or one prediction in a process of its own, `python -m pansplat.bench.memory`.
 
 Source: PanSplat, section 3.4 and its figure of GPU memory.
 """
@@ -6,237 +8,495 @@ Source: PanSplat, section 3.4 and its figure of GPU memory.
 from __future__ import annotations
 
 import dataclasses
+import gc
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import safetensors.torch
+import torch
 from torch import Tensor
 
 from pansplat.atomic import replacing
-from pansplat.bench.memory_case import (
-    MATCHED_HEIGHT,
-    MemoryCase,
-    MemorySetting,
-    OverLimit,
-    RowFailed,
-    Taken,
-    Work,
-    take,
+from pansplat.bench.fidelity import relative_deviation
+from pansplat.bench.harness import (
+    CaseFailedError,
+    OverLimitError,
+    peak_memory,
+    reset_resident_peak,
+    resident_memory,
+    run_child,
+    serve_job,
+    time_call,
 )
+from pansplat.bench.report import Column, Report, Row, number, row_from_json, save_figure
+from pansplat.data.views import Batch, Sample, Views, collate
 from pansplat.errors import InputError
+from pansplat.geometry.equirect import pixel_directions
+from pansplat.model.heads import merge_tiles
+from pansplat.model.pansplat import PanSplat
+from pansplat.rendering.cpu.runtime import release_idle_memory
+from pansplat.training.config import MemoryConfig, NetworkShape, Style
+from pansplat.training.losses import LossWeights, PerceptualName, choose_perceptual
+from pansplat.training.network import freeze, network_config, read_weights, set_training_mode, trainable_parameters
+from pansplat.training.rendering import TargetRenderer
+from pansplat.training.step import TrainingStep, accumulate_gradients
 
-Status = Literal["measured", "not tried", "over the limit", "died"]
-Watch = Callable[[str, "list[MemoryRow]"], None]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Work = Literal["inference", "plain", "one-step", "two-step"]
 
 _TILES = (1, 2, 4)
-_GROWTH = 4.0  # of memory, at most, when the height doubles
+_MAX_GROWTH = 4.0  # of memory when the height doubles
+_MAX_MATCHING_HEIGHT = 512  # above it only the heads are trained, as in the paper's stages
+_WARM_UP_HEIGHT = 64
+_SPHERE_RADIUS = 3.0  # metres
+_SCENE = "painted sphere"
+
+PAPER_POINTS: tuple[tuple[str, str, int, float], ...] = (
+    ("training", "untiled", 512, 36.0),
+    ("training", "16 tiles", 2048, 42.0),
+    ("inference", "untiled", 512, 7.5),
+    ("inference", "tiled", 512, 5.0),
+    ("inference", "4 tiles", 2048, 40.0),
+    ("inference", "16 tiles", 2048, 23.0),
+)
+"""Kind, tiles, height, GB of a GPU. Source: the paper's figure of memory, estimated from the plot. The batch of
+training is 2 at 512 and 1 at 2048; with 4 tiles 2048 ran out of memory."""
+
+_WORK_COLORS: dict[Work, str] = {
+    "inference": "#1764ab", "plain": "#444444", "one-step": "#e0a030", "two-step": "#c8501e"
+}  # fmt: skip
+_PAPER_STYLE: dict[str, Any] = {"color": "#2a8c4a", "markersize": 13, "markerfacecolor": "none"}
+_TILE_LINES = {1: "-", 2: "--", 4: ":"}
+_TILE_MARKERS = {1: "o", 2: "s", 4: "D"}
 
 
-@dataclass
-class MemoryRow:
-    """One way to work at one height, and what it took. None is what was not measured.
+@dataclass(frozen=True)
+class MemoryCase:
+    """A prediction or a training step.
 
     Attributes:
-        work, tiles, height: see `MemoryCase`.
-        status: whether it was measured, and why not.
-        note: what happened, in words.
-        base_gib: held before: Python, libraries, weights, input. 2^30 bytes.
-        peak_gib: the most that was held at once, the base included.
-        wall_s, processor_s: seconds on the clock, and of all threads together.
-        num_gaussians: that were predicted.
-        deviation: |result - reference| / |reference|, Euclidean: of all gradients together, or the largest among the
-            prediction's means, opacities and picture.
-        reference: whether others of the same kind and height are compared with this row.
+        work: predict and render a panorama, or a training step with this kind of backpropagation.
+        tiles: along each side of the panorama, for the heads.
+        height: of the panoramas, pixels.
     """
 
     work: Work
     tiles: int
     height: int
-    status: Status
-    note: str = ""
+
+    @property
+    def kind(self) -> Literal["inference", "training"]:
+        """What its tensors are: a prediction, or gradients."""
+        return "inference" if self.work == "inference" else "training"
+
+    def __str__(self) -> str:
+        """The case as it is shown while it is measured."""
+        work = self.work if self.work == "inference" else f"training, {self.work}"
+        return f"{self.height}x{2 * self.height}, {work}, {_tile_count(self.tiles)}"
+
+
+@dataclass(frozen=True)
+class MemorySetting:
+    """What all cases have in common.
+
+    Attributes:
+        network: its size; weights are random, the same in each case.
+        style: how images are rendered.
+        perceptual: part of the loss.
+        threads: of the processor.
+        device: "cpu" or "cuda".
+        limit_gib: a process that takes more is ended, 2^30 bytes; on a GPU its allocator refuses more.
+    """
+
+    network: NetworkShape
+    style: Style
+    perceptual: PerceptualName
+    threads: int
+    device: str
+    limit_gib: float
+
+
+@dataclass
+class MemoryResult:
+    """Memory and time of a case.
+
+    Attributes:
+        base_gib: held before: Python, libraries, weights, input; on a GPU weights and input. 2^30 bytes.
+        peak_gib: largest memory, the base included.
+        taken_gib: their difference.
+        wall_s, processor_s: elapsed seconds, and those of all threads together.
+        num_gaussians: of the prediction.
+        deviation: |result - reference| / |reference|, Euclidean norms: of all gradients together, or the largest among
+            the prediction's means, opacities and image.
+    """
+
     base_gib: float | None = None
     peak_gib: float | None = None
+    taken_gib: float | None = None
     wall_s: float | None = None
     processor_s: float | None = None
     num_gaussians: int | None = None
     deviation: float | None = None
-    reference: bool = False
 
-    @property
-    def taken_gib(self) -> float | None:
-        """What the work took beyond what was held before it, 2^30 bytes."""
-        return None if self.peak_gib is None or self.base_gib is None else self.peak_gib - self.base_gib
 
-    @property
-    def case(self) -> MemoryCase:
-        """What was done."""
-        return MemoryCase(self.work, self.tiles, self.height)
+MemoryRow = Row[MemoryCase, MemoryResult]
 
 
 def memory_cases(heights: Sequence[int], *, quick: bool) -> list[MemoryCase]:
-    """By height, inference before training; of each kind the reference first, which keeps everything at once.
+    """By height, inference before training; the first of each kind keeps everything in memory and is the reference.
 
     Args:
         quick: leave out one-step, and all tiles but the fewest and the most.
     """
     tiles = (1, 4) if quick else _TILES
-    kinds = [(work, number) for work in get_args(Work) for number in (tiles if work != "plain" else (1,))]
-    kinds = [kind for kind in kinds if not (quick and kind[0] == "one-step")]
-    return [MemoryCase(work, number, height) for height in sorted(heights) for work, number in kinds]
+    works: tuple[Work, ...] = ("inference", "plain", "two-step") if quick else get_args(Work)
+    kinds: list[tuple[Work, int]] = [(work, count) for work in works for count in (tiles if work != "plain" else (1,))]
+    return [MemoryCase(work, count, height) for height in sorted(heights) for work, count in kinds]
 
 
 @dataclass(frozen=True)
-class Measuring:
-    """Where rows are measured and kept.
+class MemoryBench:
+    """Measures cases and adds their rows to a report.
 
     Attributes:
-        setting: of all rows.
-        weights: file of the network's.
-        folder: for the results that others are compared with, so that a run that was stopped goes on.
-        watch: told what is being done.
+        weights: file of the network's weights.
+        references: folder for the results of reference rows, so that an interrupted run can continue.
+        report: its rows may hold those of earlier runs.
     """
 
     setting: MemorySetting
     weights: Path
-    folder: Path
-    watch: Watch
+    references: Path
+    report: Report[MemoryRow]
 
-    def run(self, cases: Sequence[MemoryCase], rows: list[MemoryRow]) -> None:
-        """Measure the cases that `rows` has not measured, one after another.
-
-        Args:
-            rows: of earlier runs, too; grows, in the order of `memory_cases`. Those of other cases stay.
-        """
+    def run(self, cases: Sequence[MemoryCase]) -> None:
+        """Measure the cases that have no measured row. The report's rows have the order of `memory_cases`."""
+        rows = self.report.rows
         rows[:] = [row for row in rows if row.status == "measured" or row.case not in cases]
-        self._forget_lost_references(cases, rows)
-        for number, case in enumerate(cases, start=1):
+        self._drop_lost_references(cases)
+        for index, case in enumerate(cases, start=1):
             if case not in [row.case for row in rows]:
-                self.watch(f"{number} of {len(cases)}: {describe(case)}", rows)
-                known = [row for row in rows if row.status == "measured" or row.case in cases]
-                rows.append(self._measured(case, known))  # what failed before may have had a lower limit
-                rows.sort(key=lambda row: (row.height, get_args(Work).index(row.work), row.tiles))
-            self.watch("", rows)
+                self.report.update(f"{index} of {len(cases)}: {case}")
+                rows.append(self._measure(case, cases))
+                rows.sort(key=lambda row: (row.case.height, get_args(Work).index(row.case.work), row.case.tiles))
+            self.report.update()
 
-    def _forget_lost_references(self, cases: Sequence[MemoryCase], rows: list[MemoryRow]) -> None:
-        """Measure anew what is to be compared with, but left no result, as after a run that came to its end."""
-        done = {row.case for row in rows}
-        to_compare = {(case.kind, case.height) for case in cases if case not in done}
-        lost = [
-            row
-            for row in rows
-            if row.reference and (row.case.kind, row.height) in to_compare and not self._result_of(row.case).is_file()
-        ]
-        rows[:] = [row for row in rows if row not in lost]
+    def _drop_lost_references(self, cases: Sequence[MemoryCase]) -> None:
+        """Drop reference rows whose result is needed and not stored, so that they are measured again."""
+        done = {row.case for row in self.report.rows}
+        needed = {(case.kind, case.height) for case in cases if case not in done}
 
-    def _result_of(self, case: MemoryCase) -> Path:
-        return self.folder / f"{case.kind}_{case.height}.safetensors"
+        def is_lost(row: MemoryRow) -> bool:
+            is_needed = row.is_reference and (row.case.kind, row.case.height) in needed
+            return is_needed and not self._reference_file(row.case).is_file()
 
-    def _measured(self, case: MemoryCase, rows: Sequence[MemoryRow]) -> MemoryRow:
-        expected = expected_gib(case, rows)
+        self.report.rows[:] = [row for row in self.report.rows if not is_lost(row)]
+
+    def _reference_file(self, case: MemoryCase) -> Path:
+        return self.references / f"{case.kind}_{case.height}.safetensors"
+
+    def _measure(self, case: MemoryCase, cases: Sequence[MemoryCase]) -> MemoryRow:
+        row = MemoryRow("memory", _SCENE, case, MemoryResult())
+        # Failures of earlier runs do not count: their limit may have been lower.
+        known = [row for row in self.report.rows if row.status == "measured" or row.case in cases]
+        expected = expected_gib(case, known)
         if expected > self.setting.limit_gib:
-            note = f"{expected:.1f} GiB expected" if math.isfinite(expected) else "a lower panorama was too much"
-            return MemoryRow(**dataclasses.asdict(case), status="not tried", note=note)
+            row.status = "not tried"
+            row.note = f"{expected:.1f} GiB expected" if math.isfinite(expected) else "a smaller height failed"
+            return row
         try:
-            taken = take(case, self.setting, self.weights)
-        except OverLimit as error:
-            return MemoryRow(**dataclasses.asdict(case), status="over the limit", note=str(error))
-        except RowFailed as error:
-            return MemoryRow(**dataclasses.asdict(case), status="died", note=str(error))
-        return self._row(case, taken)
-
-    def _row(self, case: MemoryCase, taken: Taken) -> MemoryRow:
-        values = {f.name: getattr(taken, f.name) for f in dataclasses.fields(taken) if f.name != "result"}
-        row = MemoryRow(**dataclasses.asdict(case), status="measured", **values)
-        path = self._result_of(case)
-        if path.is_file():
-            row.deviation = deviation(taken.result, safetensors.torch.load_file(path), together=case.kind == "training")
-        else:  # the first of its kind that came to an end
-            row.reference = True
-            with replacing(path) as partial:
-                safetensors.torch.save_file(taken.result, partial)
+            row.result, tensors = measure_case(case, self.setting, self.weights)
+        except CaseFailedError as error:
+            row.status = "over the limit" if isinstance(error, OverLimitError) else "died"
+            row.note = str(error)
+            return row
+        file = self._reference_file(case)
+        row.is_reference = not file.is_file()  # the first of its kind that succeeded
+        if row.is_reference:
+            with replacing(file) as partial:
+                safetensors.torch.save_file(tensors, partial)
+        else:
+            reference = safetensors.torch.load_file(file)
+            row.result.deviation = relative_deviation(tensors, reference, together=case.kind == "training")
         return row
 
 
 def expected_gib(case: MemoryCase, rows: Sequence[MemoryRow]) -> float:
-    """The memory a case may need, from the same work at the next lower height; 0 where nothing is known.
+    """Upper bound of a case's memory from the same work at the next smaller height; 0 if that is unknown.
 
-    Nothing is known of training above the height up to which all of the network learns.
+    Rows up to the height at which all of the network is trained say nothing about training above it.
     """
-    lower = [r for r in rows if (r.work, r.tiles) == (case.work, case.tiles) and r.height < case.height]
-    if case.kind == "training" and case.height > MATCHED_HEIGHT:
-        lower = [row for row in lower if row.height > MATCHED_HEIGHT]
-    if not lower:
+    smaller = [
+        row
+        for row in rows
+        if dataclasses.replace(row.case, height=case.height) == case and row.case.height < case.height
+    ]
+    if case.kind == "training" and case.height > _MAX_MATCHING_HEIGHT:
+        smaller = [row for row in smaller if row.case.height > _MAX_MATCHING_HEIGHT]
+    if not smaller:
         return 0.0
-    row = max(lower, key=lambda r: r.height)
-    if row.taken_gib is None or row.base_gib is None:
+    row = max(smaller, key=lambda row: row.case.height)
+    if row.result.taken_gib is None or row.result.base_gib is None:
         return math.inf
-    return row.base_gib + row.taken_gib * _GROWTH ** math.log2(case.height / row.height)
+    return row.result.base_gib + row.result.taken_gib * _MAX_GROWTH ** math.log2(case.height / row.case.height)
 
 
-def deviation(result: dict[str, Tensor], reference: dict[str, Tensor], *, together: bool) -> float:
-    """|result - reference| / |reference|, Euclidean.
-
-    Args:
-        together: of all tensors as one; else the largest of each by itself.
+def read_rows(path: Path, setting: MemorySetting) -> list[MemoryRow]:
+    """The rows of an earlier run with the same setting, failed ones included; none if there is no file.
 
     Raises:
-        ValueError: they do not hold the same.
+        InputError: the file has another setting, or is not a file of rows.
     """
-    if result.keys() != reference.keys():
-        raise ValueError(f"needed {sorted(reference)}, got {sorted(result)}")
-    apart = {name: float((result[name].double() - reference[name].double()).norm()) for name in reference}
-    size = {name: float(reference[name].double().norm()) for name in reference}
-    if together:
-        return math.hypot(*apart.values()) / max(math.hypot(*size.values()), 1e-300)
-    return max(apart[name] / max(size[name], 1e-300) for name in reference)
+    if not path.is_file():
+        return []
+    try:
+        content = json.loads(path.read_text())
+        before = content["setting"]
+        rows = [row_from_json(values, MemoryCase, MemoryResult) for values in content["rows"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: needed rows of `pansplat bench memory`, got {error!r}; delete it.") from error
+    now = dataclasses.asdict(setting)
+    changed = [
+        f"{name} was {before.get(name)}, now {now[name]}"
+        for name in now
+        if name != "limit_gib" and before.get(name) != now[name]
+    ]
+    if changed:
+        raise InputError(f"{path}: has another setting ({'; '.join(changed)}); give another --out, or delete the file.")
+    return rows
 
 
-def describe(case: MemoryCase) -> str:
-    """The case in words."""
-    tiles = "untiled" if case.tiles == 1 else f"{case.tiles**2} tiles"
-    work = case.work if case.work == "inference" else f"training, {case.work}"
-    return f"{case.height}x{2 * case.height}, {work}, {tiles}"
+def measure_case(case: MemoryCase, setting: MemorySetting, weights: Path) -> tuple[MemoryResult, dict[str, Tensor]]:
+    """Measure a case in a child process.
+
+    Returns:
+        The result; gradients by name, or means, opacities and image of a prediction.
+
+    Raises:
+        OverLimitError: it took more than the limit, or than is available.
+        CaseFailedError: it failed otherwise.
+    """
+    job = {"case": dataclasses.asdict(case), "setting": dataclasses.asdict(setting), "weights": str(weights)}
+    limit = setting.limit_gib if setting.device == "cpu" else None
+    numbers, tensors = run_child("pansplat.bench.memory", job, threads=setting.threads, limit_gib=limit)
+    return MemoryResult(**numbers), tensors
 
 
-def write_memory_rows(
-    path: Path, machine: dict[str, object], setting: MemorySetting, rows: Sequence[MemoryRow]
-) -> None:
-    """Write {machine, setting, rows} as JSON; the file is whole at any moment.
+def _measure_job(job: Mapping[str, Any]) -> tuple[dict[str, object], dict[str, Tensor]]:
+    """Measure the job of a child process."""
+    case, setting = MemoryCase(**job["case"]), MemorySetting(**job["setting"])
+    device = torch.device(setting.device)
+    if device.type == "cuda":
+        total = torch.cuda.get_device_properties(device).total_memory
+        torch.cuda.set_per_process_memory_fraction(min(1.0, setting.limit_gib * 2**30 / total))
+    network = PanSplat(network_config(setting.network), "fixed")
+    network.load_state_dict(read_weights(Path(job["weights"])).tensors)
+    work = _prepare_work(case, setting, network.to(device))
+    work(painted_sphere(_WARM_UP_HEIGHT).to(device))  # compiles and loads what the measured call needs
+    batch = painted_sphere(case.height).to(device)
+    gc.collect()
+    release_idle_memory()
+    reset_resident_peak()
+    base = torch.cuda.memory_allocated(device) if device.type == "cuda" else resident_memory()
+    taken_mb, (timing, (count, tensors)) = peak_memory(lambda: time_call(lambda: work(batch), device), device)
+    if taken_mb is None:
+        raise InputError("this system does not report a process's peak memory; run the benchmark on Linux")
+    base_gib, taken_gib = base / 2**30, 1e6 * taken_mb / 2**30
+    result = MemoryResult(base_gib, base_gib + taken_gib, taken_gib, timing.wall, timing.cpu, count)
+    return dataclasses.asdict(result), tensors
+
+
+def _prepare_work(
+    case: MemoryCase, setting: MemorySetting, network: PanSplat
+) -> Callable[[Batch], tuple[int, dict[str, Tensor]]]:
+    """A function that predicts or trains on a batch; it returns the number of Gaussians and the resulting tensors."""
+    perceptual = choose_perceptual(setting.perceptual, device=torch.device(setting.device))
+    if case.work == "inference":
+        network.eval()
+        return lambda batch: _predict(network, batch, case.tiles, setting.style)
+    freeze(network, _frozen_parts(case.height))
+    optimizer = torch.optim.Adam(list(trainable_parameters(network)), lr=0.0)
+    memory = MemoryConfig(case.work, case.tiles, setting.style)
+
+    def train(batch: Batch) -> tuple[int, dict[str, Tensor]]:
+        height = batch.images.shape[-2]
+        set_training_mode(network, _frozen_parts(height))
+        optimizer.zero_grad()
+        weights = LossWeights(depth=0.0) if height > _MAX_MATCHING_HEIGHT else LossWeights()
+        accumulate_gradients(TrainingStep(network, None, perceptual, weights, memory), [batch])
+        gradients = {name: p.grad for name, p in network.named_parameters() if p.grad is not None}
+        optimizer.step()
+        return batch.images.shape[1] * sum(len(points) for points in network.heads.points(height)), gradients
+
+    return train
+
+
+@torch.no_grad()
+def _predict(network: PanSplat, batch: Batch, tiles: int, style: Style) -> tuple[int, dict[str, Tensor]]:
+    """Predict Gaussians and render one panorama."""
+    matched = network.match_views(batch.images, batch.cam2world.float(), batch.near, batch.far)
+    (scene,) = merge_tiles(list(network.lift_gaussians(matched, tiles=tiles)), network.compat)
+    renderer = TargetRenderer(style, "joint", batch.images.shape[-2])
+    image = renderer.render(scene, batch.target_cam2world[0, 0], batch.cam2world[0])
+    return len(scene), {"means": scene.means, "opacities": scene.opacities, "image": image}
+
+
+def _frozen_parts(height: int) -> tuple[str, ...]:
+    return ("features", "cost_volume") if height > _MAX_MATCHING_HEIGHT else ()
+
+
+def painted_sphere(height: int) -> Batch:
+    """Two views and one target inside a painted sphere: a scene of any size that needs no files."""
+    generator = torch.Generator().manual_seed(0)
+    waves, phases = 2 * torch.randn(3, 3, generator=generator), torch.randn(3, generator=generator)
+    rays = pixel_directions(height, 2 * height, dtype=torch.float32)
+
+    def views(positions: tuple[float, ...]) -> Views:
+        cam2world = torch.eye(4, dtype=torch.float64).repeat(len(positions), 1, 1)
+        cam2world[:, 0, 3] = torch.tensor(positions, dtype=torch.float64)
+        images, depths = [], []
+        for x in positions:
+            along = x * rays[..., 0]
+            depth = (along.square() + _SPHERE_RADIUS**2 - x * x).sqrt() - along
+            points = depth[..., None] * rays
+            points[..., 0] += x
+            images.append(0.5 + 0.4 * torch.sin((points @ waves.T + phases).permute(2, 0, 1)))
+            depths.append(depth)
+        masks = torch.ones(len(positions), height, 2 * height, dtype=torch.bool)
+        names = tuple(map(str, positions))
+        return Views(torch.stack(images), cam2world, masks, 0.45, 10.0, names, torch.stack(depths))
+
+    return collate([Sample("sphere", views((-0.5, 0.5)), views((0.1,)))])
+
+
+def memory_report(
+    machine: Mapping[str, Any], setting: MemorySetting, cases: Sequence[MemoryCase], out: Path | None
+) -> Report[MemoryRow]:
+    """The report of a run.
+
+    Args:
+        machine: from `describe_machine`.
+        cases: of the run.
+        out: folder for memory.json, memory.md and memory.png.
+    """
+    device = machine["gpu"] if setting.device == "cuda" else machine["cpu"]
+    title = f"{setting.network} network, batch 1, {setting.style} images, {setting.perceptual} loss; {device}"
+
+    def plot(rows: Sequence[MemoryRow], path: Path) -> bool:
+        return plot_memory(rows, path, title)
+
+    def missing_rows(rows: Sequence[MemoryRow]) -> list[str]:
+        missing = len(set(cases) - {row.case for row in rows})
+        return [f"{missing} of {len(cases)} rows are still to be measured"] if missing else []
+
+    return Report(
+        MEMORY_COLUMNS,
+        lambda row: title,
+        machine,
+        header={"setting": dataclasses.asdict(setting)},
+        findings=missing_rows,
+        json_file=None if out is None else out / "memory.json",
+        page=None if out is None else out / "memory.md",
+        plots={} if out is None else {out / "memory.png": plot},
+        print_steps=True,
+    )
+
+
+def _tile_count(tiles: int) -> str:
+    return "untiled" if tiles == 1 else f"{tiles**2} tiles"
+
+
+def _column(title: str, form: str, name: str) -> Column[MemoryRow]:
+    return Column(title, lambda row: number(getattr(row.result, name), form))
+
+
+def _deviation(row: MemoryRow) -> str:
+    return "reference" if row.is_reference else number(row.result.deviation, "{:.1e}")
+
+
+MEMORY_COLUMNS: tuple[Column[MemoryRow], ...] = (
+    Column("height", lambda row: str(row.case.height)),
+    Column("work", lambda row: row.case.work, "left"),
+    Column("tiles", lambda row: str(row.case.tiles**2)),
+    _column("base GiB", "{:.2f}", "base_gib"),
+    _column("peak GiB", "{:.2f}", "peak_gib"),
+    _column("taken GiB", "{:.2f}", "taken_gib"),
+    _column("seconds", "{:.1f}", "wall_s"),
+    _column("processor s", "{:.1f}", "processor_s"),
+    Column("deviation", _deviation),
+    Column("", lambda row: "" if row.status == "measured" else f"{row.status}: {row.note}", "left"),
+)
+
+
+def plot_memory(rows: Sequence[MemoryRow], path: Path, title: str) -> bool:
+    """Plot the taken memory over the height, training and inference apart; False if there is nothing to plot.
 
     Raises:
         InputError: the file cannot be written.
     """
-    content = {
-        "machine": machine,
-        "setting": dataclasses.asdict(setting),
-        "rows": [{**dataclasses.asdict(row), "taken_gib": row.taken_gib} for row in rows],
-    }
-    with replacing(path) as partial:
-        partial.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+    shown = [row for row in rows if row.result.taken_gib]
+    if not shown:
+        return False
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 5.5), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    _plot_kind(left, [row for row in shown if row.case.kind == "training"], "training")
+    _plot_kind(right, [row for row in shown if row.case.kind == "inference"], "inference")
+    left.set_ylabel("GiB beyond Python, weights and input")
+    heights = sorted({row.case.height for row in shown} | {point[2] for point in PAPER_POINTS})
+    for axes in (left, right):
+        axes.set_xscale("log", base=2)
+        axes.set_yscale("log", base=2)
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axes.set_xticks(heights, [f"{height}\nx{2 * height}" for height in heights])
+        axes.minorticks_off()
+        axes.grid(alpha=0.25)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10)
+    save_figure(figure, path)
+    return True
 
 
-def kept_rows(path: Path, setting: MemorySetting) -> list[MemoryRow]:
-    """The rows of an earlier run with the same settings, with those that could not be measured.
+def _plot_kind(axes: Axes, rows: Sequence[MemoryRow], kind: str) -> None:
+    """A curve for each kind of backpropagation and number of tiles, and the paper's points."""
+    curves: dict[tuple[Work, int], list[MemoryRow]] = {}
+    for row in sorted(rows, key=lambda row: row.case.height):
+        curves.setdefault((row.case.work, row.case.tiles), []).append(row)
+    for (work, tiles), curve in curves.items():
+        name = kind if work == "inference" else work
+        axes.plot(
+            [row.case.height for row in curve],
+            [row.result.taken_gib or 0.0 for row in curve],
+            _TILE_LINES[tiles],
+            color=_WORK_COLORS[work],
+            marker=_TILE_MARKERS[tiles],
+            markersize=4,
+            label=f"{name}, {_tile_count(tiles)}",
+        )
+    for _, text, height, gigabytes in (point for point in PAPER_POINTS if point[0] == kind):
+        point = (height, gigabytes * 1e9 / 2**30)
+        axes.plot(*point, "*", **_PAPER_STYLE)
+        axes.annotate(
+            text,
+            point,
+            xytext=(-8, 0),
+            textcoords="offset points",
+            ha="right",
+            va="center",
+            fontsize=8,
+            color=_PAPER_STYLE["color"],
+        )
+    axes.plot([], [], "*", **_PAPER_STYLE, label="the paper: its network, a GPU")
+    axes.set_title(kind, loc="left")
+    axes.set_xlabel("panorama, pixels")
+    axes.legend(fontsize=8, loc="lower right")
 
-    Raises:
-        InputError: the file is of other settings, or no such file at all.
-    """
-    if not path.is_file():
-        return []
-    names = {field.name for field in dataclasses.fields(MemoryRow)}
-    try:
-        content = json.loads(path.read_text())
-        before = content["setting"]
-        rows = [MemoryRow(**{name: row[name] for name in names}) for row in content["rows"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: needed rows of `pansplat bench memory`, got {error!r}; delete it.") from error
-    now = dataclasses.asdict(setting)
-    changed = [f"{name} was {before.get(name)}, now {now[name]}" for name in now if before.get(name) != now[name]]
-    changed = [words for words in changed if not words.startswith("limit_gib")]
-    if changed:
-        raise InputError(f"{path}: measured otherwise ({'; '.join(changed)}); give another --out, or delete the file.")
-    return rows
+
+if __name__ == "__main__":
+    serve_job(_measure_job)

@@ -1,64 +1,106 @@
-"""`pansplat bench model`: seconds, memory and error of each way to run the network."""
+"""`pansplat bench model`: time, memory and error of each way to run the network.
+
+Every case runs in a process of its own, `python -m pansplat.bench.model`.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-import json
+import math
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import safetensors.torch
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from pansplat.atomic import replacing
-from pansplat.bench.model_case import Measured, ModelCase, measure_case
+from pansplat.bench.fidelity import clamped_psnr, relative_depth_errors
+from pansplat.bench.harness import CaseFailedError, reset_resident_peak, resident_peak, run_child, serve_job
+from pansplat.bench.report import Column, Report, Row, number, save_figure
 from pansplat.data.views import Views
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Scene
+from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
+from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
+from pansplat.model.heads import AdapterConfig, HeadsConfig, merge_tiles
+from pansplat.model.layers import AttentionPrecision, Compat, Precision
+from pansplat.model.network import build_network
+from pansplat.model.pansplat import PanSplat, PanSplatConfig
+from pansplat.model.weights import load_weights, pack_weights, save_weights
+from pansplat.pipeline import render
 
-Watch = Callable[[str, "list[ModelRow]"], None]
+STAGES = ("features", "mono", "cost volume", "heads")
+_STAGE_COLORS = ("#1764ab", "#6aaed6", "#e0a030", "#c8501e")
+_WARM_UP_CONFIG = PanSplatConfig(
+    features=FeaturePyramidConfig(channels=(4, 8, 8, 16), transformer=TransformerConfig(channels=16, blocks=1)),
+    cost_volume=CostVolumeConfig(
+        mono_channels=0, levels=(SweepLevel(3, 16, 8, 32), SweepLevel(2, 8, 4, 32), SweepLevel(1, 8, 4, 32))
+    ),
+    heads=HeadsConfig(feature_channels=(16, 8, 8, 4), candidates=4, adapter=AdapterConfig(degree=1)),
+)
+
+# Standard deviations of random weights relative to unit gain. Layers before a rectifier need more to keep the size of
+# their output. Logits of depth need less, so that a depth is the mean of several candidates, as after training.
+_RECTIFIER_GAIN, _LOGIT_GAIN = math.sqrt(2), 0.2
+
+
+@dataclass(frozen=True)
+class ModelCase:
+    """A way to run the network.
+
+    Attributes:
+        compat, precision, attention: as in `pansplat.model.network.load_predictor`.
+        threads: of torch.
+        tiles: along each side of the panorama, for the heads.
+    """
+
+    compat: Compat
+    precision: Precision
+    attention: AttentionPrecision
+    threads: int
+    tiles: int
+
+    def __str__(self) -> str:
+        """The case as it is shown while it is measured."""
+        return f"{self.compat}, {self.precision}, attention {self.attention}, {_tiles(self)} tiles, {_threads(self)}"
 
 
 @dataclass
-class ModelRow:
-    """One way to run the network, what it took, and how far it is from the first row of the same `compat`.
-
-    That row is in float32 and untiled. None is what was not measured.
+class ModelResult:
+    """Time and memory of a prediction, and its errors against the reference row.
 
     Attributes:
-        compat, precision, attention, threads, tiles: see `ModelCase`.
         height: of the panoramas, pixels.
-        stages_s: seconds of each part.
+        num_gaussians: of the prediction.
+        stages_s: seconds of each of `STAGES`.
         total_s: their sum.
-        processor_s: of all threads together: what to look at where others use the machine too.
-        peak_gib: the process's largest resident memory, 2^30 bytes.
-        num_gaussians: that were predicted.
-        depth_median_error, depth_max_error: |depth - reference| / reference of the finest sweep.
-        psnr_db: between the pictures at the middle pose, drawn by numba; infinite where they are the same.
-        is_reference: whether others are compared with this row.
+        processor_s: of all threads together; other load on the machine hardly affects it.
+        peak_gib: largest resident memory of the process, 2^30 bytes; None if the system does not report it.
+        depth_median_error, depth_max_error: |depth - reference| / reference of the finest sphere sweep.
+        psnr_db: between the images at the middle pose, rendered by numba; infinite if they are equal.
     """
 
-    compat: str
-    precision: str
-    attention: str
-    threads: int
-    tiles: int
     height: int
+    num_gaussians: int | None = None
     stages_s: dict[str, float] = field(default_factory=dict)
     total_s: float | None = None
     processor_s: float | None = None
     peak_gib: float | None = None
-    num_gaussians: int | None = None
     depth_median_error: float | None = None
     depth_max_error: float | None = None
     psnr_db: float | None = None
-    is_reference: bool = False
+
+
+ModelRow = Row[ModelCase, ModelResult]
 
 
 def model_cases(threads: int, *, bfloat16: bool, quick: bool) -> list[ModelCase]:
-    """Ways to run the network; the first of each `compat` is what the others are compared with."""
+    """Ways to run the network; the first of each `compat` is the reference of the others."""
     plain = ModelCase("fixed", "float32", "float32", threads, tiles=1)
     cases = [plain]
     if bfloat16:
@@ -80,66 +122,35 @@ def model_cases(threads: int, *, bfloat16: bool, quick: bool) -> list[ModelCase]
 
 
 def measure_model(
-    cases: Sequence[ModelCase],
-    views: Views,
-    weights: Path,
-    *,
-    watch: Watch,
-    rows: list[ModelRow],
+    cases: Sequence[ModelCase], views: Views, weights: Path, report: Report[ModelRow], *, scene: str
 ) -> None:
-    """Run the cases one after another, each in a process of its own; `rows` grows as they end.
+    """Measure the cases one after another and add their rows to the report.
+
+    Args:
+        weights: file of the network's weights.
+        scene: name of the views' pair.
 
     Raises:
-        InputError: a case fails, as for want of memory.
+        InputError: a case failed, for example because of too little memory.
     """
-    references: dict[str, Measured] = {}
-    with _kept(views) as kept:
-        for number, case in enumerate(cases, start=1):
-            watch(f"{number} of {len(cases)}: {describe_case(case)}", rows)
-            measured = measure_case(case, weights, kept, near=views.near, far=views.far)
-            reference = references.setdefault(case.compat, measured)
-            rows.append(_row(case, measured, reference))
-            watch("", rows)
-
-
-def describe_case(case: ModelCase) -> str:
-    """The case in words."""
-    threads = "one thread" if case.threads == 1 else f"{case.threads} threads"
-    return f"{case.compat}, {case.precision}, attention {case.attention}, {case.tiles}x{case.tiles} tiles, {threads}"
-
-
-def relative_errors(depth: Tensor, reference: Tensor) -> tuple[float, float]:
-    """Median and largest of |depth - reference| / reference."""
-    relative = (depth.double() - reference.double()).abs() / reference.double()
-    return float(relative.median()), float(relative.max())
-
-
-def psnr(picture: Tensor, reference: Tensor) -> float:
-    """Of colours in [0, 1], decibels; infinite where the pictures are the same."""
-    error = (picture.double().clamp(0, 1) - reference.double().clamp(0, 1)).pow(2).mean()
-    return float(-10 * torch.log10(error))
-
-
-def _row(case: ModelCase, measured: Measured, reference: Measured) -> ModelRow:
-    row = ModelRow(
-        **dataclasses.asdict(case),
-        height=measured.picture.shape[-2],
-        stages_s=measured.stages_s,
-        total_s=sum(measured.stages_s.values()),
-        processor_s=measured.processor_s,
-        peak_gib=measured.peak_gib,
-        num_gaussians=measured.num_gaussians,
-        is_reference=measured is reference,
-    )
-    if not row.is_reference:
-        row.depth_median_error, row.depth_max_error = relative_errors(measured.depth, reference.depth)
-        row.psnr_db = psnr(measured.picture, reference.picture)
-    return row
+    references: dict[str, dict[str, Tensor]] = {}
+    with _views_file(views) as file:
+        for index, case in enumerate(cases, start=1):
+            report.update(f"{index} of {len(cases)}: {case}")
+            result, tensors = measure_case(case, weights, file, near=views.near, far=views.far)
+            row = ModelRow("model", scene, case, result, is_reference=case.compat not in references)
+            reference = references.setdefault(case.compat, tensors)
+            if not row.is_reference:
+                errors = relative_depth_errors(tensors["depth"], reference["depth"])
+                result.depth_median_error, result.depth_max_error = errors
+                result.psnr_db = clamped_psnr(tensors["image"], reference["image"])
+            report.rows.append(row)
+            report.update()
 
 
 @contextmanager
-def _kept(views: Views) -> Iterator[Path]:
-    """A file of the panoramas for the children."""
+def _views_file(views: Views) -> Iterator[Path]:
+    """A temporary file of the panoramas for the child processes."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "views.safetensors")
         tensors = {"images": views.images.contiguous(), "cam2world": views.cam2world.contiguous()}
@@ -147,20 +158,233 @@ def _kept(views: Views) -> Iterator[Path]:
         yield path
 
 
-def write_model_rows(path: Path, machine: dict[str, object], network: str, rows: Sequence[ModelRow]) -> None:
-    """Write {machine, network, rows} as JSON; the file is whole at any moment.
+def measure_case(
+    case: ModelCase, weights: Path, views: Path, *, near: float, far: float
+) -> tuple[ModelResult, dict[str, Tensor]]:
+    """Measure a case in a child process.
+
+    Args:
+        weights: file of the network's weights.
+        views: safetensors file with `images` (view 3 height width) and `cam2world` (view 4 4).
+
+    Returns:
+        The result without errors; the `depth` of the finest sphere sweep and the `image` at the middle pose.
+
+    Raises:
+        InputError: the child failed; with its last message.
+    """
+    job = {"case": dataclasses.asdict(case), "near": near, "far": far, "weights": str(weights), "views": str(views)}
+    try:
+        numbers, tensors = run_child("pansplat.bench.model", job, threads=case.threads)
+    except CaseFailedError as error:
+        raise InputError(f"a row of the bench failed ({error}); try a smaller --height, or more tiles") from error
+    return ModelResult(**numbers), tensors
+
+
+@torch.no_grad()
+def _measure_job(job: Mapping[str, Any]) -> tuple[dict[str, object], dict[str, Tensor]]:
+    """Measure the job of a child process."""
+    case, near, far = ModelCase(**job["case"]), job["near"], job["far"]
+    network = build_network(
+        load_weights(Path(job["weights"])),
+        case.compat,
+        job["weights"],
+        precision=case.precision,
+        attention_precision=case.attention,
+    )
+    assert isinstance(network, PanSplat)
+    _warm_up(case)
+    views = safetensors.torch.load_file(job["views"])
+    images, cam2world = views["images"], views["cam2world"]
+    bounds = [torch.full((1, len(images)), bound) for bound in (near, far)]
+    stages: dict[str, float] = {}
+    has_peak, before = reset_resident_peak(), time.process_time()
+    with _timed_stages(network, stages):
+        matched = network.match_views(images[None], cam2world[None].float(), *bounds)
+    began = time.perf_counter()
+    (gaussians,) = merge_tiles(list(network.lift_gaussians(matched, tiles=case.tiles)), case.compat)
+    stages["heads"] = time.perf_counter() - began
+    processor = time.process_time() - before
+    peak = resident_peak() / 2**30 if has_peak else None
+    depth = matched.depths.depth[-1][0]
+    del matched
+    scene = Scene(gaussians, cam2world.double(), near, far, height=images.shape[-2])
+    image = render(scene, scene.pose_between(0.5), backend="numba").color
+    result = ModelResult(scene.height, len(gaussians), stages, sum(stages.values()), processor, peak)
+    return dataclasses.asdict(result), {"depth": depth, "image": image}
+
+
+def _warm_up(case: ModelCase) -> None:
+    """Compile and load what the measured prediction needs, with a narrow network."""
+    network = PanSplat(
+        _WARM_UP_CONFIG, case.compat, precision=case.precision, attention_precision=case.attention
+    ).eval()
+    poses = torch.eye(4).repeat(1, 2, 1, 1)
+    poses[0, 1, 0, 3] = 0.1
+    network(torch.zeros(1, 2, 3, 64, 128), poses, torch.full((1, 2), 0.5), torch.full((1, 2), 10.0))
+
+
+@contextmanager
+def _timed_stages(network: PanSplat, stages: dict[str, float]) -> Iterator[None]:
+    """Add the seconds of the network's parts to `stages` while they are called."""
+    parts: dict[str, nn.Module | None] = {
+        "features": network.features,
+        "mono": network.mono_depth,
+        "cost volume": network.cost_volume,
+    }
+    handles = []
+    for name, part in parts.items():
+        stages[name] = 0.0
+        if part is None:
+            continue
+
+        def begin(*_: object, name: str = name) -> None:
+            stages[name] -= time.perf_counter()
+
+        def end(*_: object, name: str = name) -> None:
+            stages[name] += time.perf_counter()
+
+        handles += [part.register_forward_pre_hook(begin), part.register_forward_hook(end)]
+    try:
+        yield
+    finally:
+        for handle in handles:
+            handle.remove()
+
+
+def model_report(
+    machine: Mapping[str, Any], network: str, *, height: int, json: Path | None = None, out: Path | None = None
+) -> Report[ModelRow]:
+    """The report of a run.
+
+    Args:
+        machine: from `describe_machine`.
+        network: what its weights are.
+        height: of the panoramas, pixels.
+        json: file of the rows.
+        out: folder for model.md and model.png.
+    """
+    size = f"{height}x{2 * height}"
+
+    def plot(rows: Sequence[ModelRow], path: Path) -> bool:
+        return plot_model(rows, path, f"{size}, {machine['cpu']}")
+
+    return Report(
+        MODEL_COLUMNS,
+        lambda row: f"{network}, {size}, {row.result.num_gaussians or 0:,} Gaussians",
+        machine,
+        header={"network": network},
+        facts=("cpu", "threads", "fma_gflops"),
+        json_file=json,
+        page=None if out is None else out / "model.md",
+        plots={} if out is None else {out / "model.png": plot},
+        print_steps=True,
+        width=190,
+    )
+
+
+def _tiles(case: ModelCase) -> str:
+    return f"{case.tiles}x{case.tiles}"
+
+
+def _threads(case: ModelCase) -> str:
+    return "1 thread" if case.threads == 1 else f"{case.threads} threads"
+
+
+def _depth_median(row: ModelRow) -> str:
+    return "reference" if row.is_reference else number(row.result.depth_median_error, "{:.1e}")
+
+
+def _decibels(row: ModelRow) -> str:
+    return "same" if row.result.psnr_db == math.inf else number(row.result.psnr_db, "{:.1f}")
+
+
+def _stage_column(stage: str) -> Column[ModelRow]:
+    return Column(f"{stage} s", lambda row: number(row.result.stages_s.get(stage), "{:.1f}"))
+
+
+MODEL_COLUMNS: tuple[Column[ModelRow], ...] = (
+    Column("compat", lambda row: row.case.compat, "left"),
+    Column("precision", lambda row: row.case.precision, "left"),
+    Column("attention", lambda row: row.case.attention, "left"),
+    Column("tiles", lambda row: _tiles(row.case)),
+    Column("threads", lambda row: str(row.case.threads)),
+    *map(_stage_column, STAGES),
+    Column("total s", lambda row: number(row.result.total_s, "{:.1f}")),
+    Column("processor s", lambda row: number(row.result.processor_s, "{:.1f}")),
+    Column("peak GiB", lambda row: number(row.result.peak_gib, "{:.2f}")),
+    Column("depth median", _depth_median),
+    Column("depth max", lambda row: number(row.result.depth_max_error, "{:.1e}")),
+    Column("PSNR dB", _decibels),
+)
+
+
+def plot_model(rows: Sequence[ModelRow], path: Path, title: str) -> bool:
+    """Plot each row's seconds by stage and its memory as bars; False if there is nothing to plot.
 
     Raises:
         InputError: the file cannot be written.
     """
-    content = {"machine": machine, "network": network, "rows": [_as_json(row) for row in rows]}
-    with replacing(path) as partial:
-        partial.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+    if not rows:
+        return False
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 1.5 + 0.4 * len(rows)), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(2, 1))
+    names = [_bar_name(row.case) for row in rows]
+    starts = [0.0] * len(rows)
+    for stage, color in zip(STAGES, _STAGE_COLORS, strict=True):
+        widths = [row.result.stages_s.get(stage, 0.0) for row in rows]
+        left.barh(names, widths, left=starts, color=color, label=stage)
+        starts = [start + width for start, width in zip(starts, widths, strict=True)]
+    left.invert_yaxis()
+    left.set(xlabel="seconds")
+    left.set_title(title, loc="left")
+    left.legend(fontsize=8)
+    right.barh(names, [row.result.peak_gib or 0.0 for row in rows], color="#888888")
+    right.set(xlabel="largest resident memory, GiB")
+    for axes in (left, right):
+        axes.grid(axis="x", alpha=0.25)
+    save_figure(figure, path)
+    return True
 
 
-def _as_json(row: ModelRow) -> dict[str, object]:
-    """The fields; an infinite PSNR becomes null, its largest error being 0."""
-    values = dataclasses.asdict(row)
-    if row.psnr_db == float("inf"):
-        values["psnr_db"] = None
-    return values
+def _bar_name(case: ModelCase) -> str:
+    parts = [case.compat, case.precision]
+    parts += ["attention bfloat16"] * (case.attention == "bfloat16")
+    parts += [f"{_tiles(case)} tiles"] * (case.tiles > 1)
+    return ", ".join([*parts, _threads(case)])
+
+
+def save_random_weights(path: Path, config: PanSplatConfig | None = None, seed: int = 0) -> None:
+    """Write random weights for `load_model`; deterministic. They keep the variance of every layer's output."""
+    config = config or PanSplatConfig()
+    with torch.device("meta"):
+        shapes = PanSplat(config).state_dict()
+    generator = torch.Generator().manual_seed(seed)
+    tensors = {name: _random_weight(name, shape, generator) for name, shape in shapes.items()}
+    save_weights(path, pack_weights("pansplat", config, tensors, compat="fixed"))
+
+
+def _random_weight(name: str, like: Tensor, generator: torch.Generator) -> Tensor:
+    if not like.is_floating_point():
+        return torch.full(like.shape, 100, dtype=like.dtype)
+    if like.dim() == 0:
+        return torch.full((), 10.0)  # the monocular network's largest depth, metres
+    if name.endswith("running_var") or (name.endswith("weight") and like.dim() == 1):
+        return 0.5 + torch.rand(like.shape, generator=generator)
+    numbers = torch.randn(like.shape, generator=generator)
+    if like.dim() == 1:
+        return 0.1 * numbers
+    return _gain(name) * numbers / math.sqrt(like[0].numel())
+
+
+def _gain(name: str) -> float:
+    if name.startswith(("features.encoder", "features.decoder", "mono_depth.")):
+        return _RECTIFIER_GAIN
+    is_logits = name.startswith("cost_volume.levels") and name.endswith(".head.2.weight")
+    return _LOGIT_GAIN if is_logits else 1.0
+
+
+if __name__ == "__main__":
+    serve_job(_measure_job)

@@ -1,276 +1,635 @@
-"""`pansplat bench raster`: draws the groups of a plan, and keeps what each way of drawing took and how wrong it is.
+"""`pansplat bench raster`: time and memory of the rasterisers against their error.
 
-Cases of a group are drawn in turn, again and again, so that what else the machine does meets them all alike. The
-file of results is written after every picture: an interruption loses nothing that was measured.
+The cases of a group are rendered in turns, round after round, so that other load on the machine affects all of them.
+The rows are saved after every image, so that an interruption loses nothing.
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+import math
+import statistics
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
 
-from pansplat.bench.cases import Case, Group, Subject
-from pansplat.bench.drawing import NEAR, Picture, device_of, draw, draw_and_differentiate, forget, wake
-from pansplat.bench.fidelity import fidelity
-from pansplat.bench.measure import Took, median, peak_memory, seconds, spread
-from pansplat.bench.rows import Row, write_rows
-from pansplat.bench.work import BACKWARD_OPERATIONS, FORWARD_OPERATIONS, Work, panorama_work
+from pansplat.bench.fidelity import image_fidelity
+from pansplat.bench.harness import Timing, peak_memory, quartile_range, restored_threads, time_call
+from pansplat.bench.raster_cases import BenchScene, Group, RasterCase
+from pansplat.bench.renderers import (
+    RenderedImage,
+    device_of,
+    release_workspace,
+    render_case,
+    render_in_viewer,
+    render_with_graph,
+    warm_up,
+)
+from pansplat.bench.report import Column, Report, Row, number, save_figure
+from pansplat.bench.roofline import BACKWARD_OPERATIONS, FORWARD_OPERATIONS, Work, panorama_work
+from pansplat.constants import NEAR
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.rasterize import RasterOptions
 
-Watch = Callable[[str, "list[Row]"], None]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
-_LEAST, _MOST = 3, 15  # repeats of what is not slow
+_MIN_REPEATS, _MAX_REPEATS = 3, 15  # of fast cases
+_MARKERS = {"numba": "o", "torch": "s", "triton": "D", "gl33": "^", "gl43": "v", "gsplat": "P", "dense": "X"}
+_KERNEL_COLORS = {"ray": "#1764ab", "ewa": "#c8501e"}
+_FRONT_COLOR = "#2a8c4a"
+_MIN_ERROR = 1e-8  # smaller errors are plotted at this value
+
+
+@dataclass
+class RasterResult:
+    """Time, memory and errors of one way to render an image.
+
+    Errors are those of the colours against the exact image: kernel "ray", order "radial", filter "angular", one ray per
+    pixel, float64. Errors with the prefix `own` are against the float64 image of the case's own kernel, order, filter,
+    layout and faces: those of the backend alone.
+
+    Attributes:
+        num_gaussians: of the scene.
+        forward_ms, forward_min_ms: median and minimum, without gradients.
+        forward_spread_ms: range between the quartiles.
+        backward_ms, backward_min_ms, backward_spread_ms: of the backward pass alone, to all fields of the Gaussians.
+        forward_cpu_ms, backward_cpu_ms: minimum of the processor time, of all threads together.
+        repeats: number of timed images.
+        peak_mb: largest memory beyond what was held before, forward without gradients, 10^6 bytes.
+        backward_peak_mb: likewise, of forward and backward together.
+        psnr_db, max_error, seam_jump, energy_error: see `fidelity.Fidelity`.
+        stages_ms: by the backend's own clock, of the fastest forward pass.
+        pairs: pixel centres in the Gaussians' boxes, see `roofline`.
+        fma_fraction, backward_fma_fraction: their arithmetic over the processor time, of one thread's peak.
+        bandwidth_fraction: the least traffic over the minimum time, of the peak of as many threads.
+    """
+
+    num_gaussians: int
+    forward_ms: float | None = None
+    forward_min_ms: float | None = None
+    forward_spread_ms: float | None = None
+    forward_cpu_ms: float | None = None
+    backward_ms: float | None = None
+    backward_min_ms: float | None = None
+    backward_spread_ms: float | None = None
+    backward_cpu_ms: float | None = None
+    repeats: int = 0
+    peak_mb: float | None = None
+    backward_peak_mb: float | None = None
+    psnr_db: float | None = None
+    max_error: float | None = None
+    seam_jump: float | None = None
+    energy_error: float | None = None
+    own_psnr_db: float | None = None
+    own_max_error: float | None = None
+    stages_ms: dict[str, float] = field(default_factory=dict)
+    pairs: int | None = None
+    fma_fraction: float | None = None
+    backward_fma_fraction: float | None = None
+    bandwidth_fraction: float | None = None
+
+    def set_times(self, name: str, timings: Sequence[Timing]) -> None:
+        """Set the fields of the forward or backward pass from its timings."""
+        walls = [1e3 * timing.wall for timing in timings]
+        setattr(self, f"{name}_ms", statistics.median(walls))
+        setattr(self, f"{name}_min_ms", min(walls))
+        setattr(self, f"{name}_spread_ms", quartile_range(walls))
+        setattr(self, f"{name}_cpu_ms", 1e3 * min(timing.cpu for timing in timings))
+
+    def set_errors(self, case: RasterCase, color: Tensor, exact: Tensor | None, own: Tensor | None) -> None:
+        """Set the errors against the exact image and against the float64 image of the case's own choices."""
+        panorama = case.layout != "pinhole"
+        if exact is not None:
+            errors = image_fidelity(color, exact, panorama=panorama)
+            self.max_error, self.psnr_db = errors.max_error, errors.psnr_db
+            self.seam_jump, self.energy_error = errors.seam_jump, errors.energy_error
+        if own is not None:
+            errors = image_fidelity(color, own, panorama=panorama)
+            self.own_max_error, self.own_psnr_db = errors.max_error, errors.psnr_db
+
+
+RasterRow = Row[RasterCase, RasterResult]
 
 
 @dataclass(eq=False)
-class _Lane:
-    """A case, its row, and the times taken so far."""
+class _Measurement:
+    """A row and the timings taken so far."""
 
-    case: Case
-    row: Row
-    wanted: int = 1
-    forward: list[Took] = field(default_factory=list)
-    backward: list[Took] = field(default_factory=list)
+    row: RasterRow
+    repeats: int = 1
+    forward: list[Timing] = field(default_factory=list)
+    backward: list[Timing] = field(default_factory=list)
+
+    @property
+    def case(self) -> RasterCase:
+        return self.row.case
 
     @property
     def needs_forward(self) -> bool:
-        return len(self.forward) < self.wanted
+        return len(self.forward) < self.repeats
 
     @property
     def needs_backward(self) -> bool:
-        return self.case.backward and len(self.backward) < self.wanted
+        return self.case.backward and len(self.backward) < self.repeats
 
     @property
-    def done(self) -> bool:
+    def is_done(self) -> bool:
         return not self.needs_forward and not self.needs_backward
 
-    def write_times(self) -> None:
-        """Bring the row up to date."""
-        self.row.repeats = len(self.forward)
-        for name, times in (("forward", self.forward), ("backward", self.backward)):
-            if times:
-                walls = [1e3 * one.wall for one in times]
-                setattr(self.row, f"{name}_ms", median(walls))
-                setattr(self.row, f"{name}_min_ms", min(walls))
-                setattr(self.row, f"{name}_spread_ms", spread(walls))
-                setattr(self.row, f"{name}_cpu_ms", 1e3 * min(one.cpu for one in times))
+    def update_row(self) -> None:
+        self.row.result.repeats = len(self.forward)
+        for name, timings in (("forward", self.forward), ("backward", self.backward)):
+            if timings:
+                self.row.result.set_times(name, timings)
 
 
-class Bench:
-    """One run: measures groups, and holds the rows.
+class RasterBench:
+    """Measures groups of cases and adds their rows to a report."""
 
-    Attributes:
-        machine: what `machine.describe_machine` tells.
-        rows: what is measured so far.
-    """
-
-    def __init__(
-        self,
-        machine: dict[str, Any],
-        *,
-        file: Path | None = None,
-        budget: float = 2.0,
-        slow: float = 5.0,
-        watch: Watch | None = None,
-    ) -> None:
+    def __init__(self, report: Report[RasterRow], *, budget: float = 2.0, slow: float = 5.0) -> None:
         """Begin a run.
 
         Args:
-            machine: written with the rows; its peaks are what they are compared with.
-            file: JSON that is written after every picture.
-            budget: seconds a case may take for its repeats.
-            slow: seconds; a first drawing that takes longer counts as the measurement.
-            watch: told what is being done, and the rows.
+            report: gets the rows.
+            budget: seconds for the repeats of a case.
+            slow: seconds; a case whose first image takes longer is not repeated.
         """
-        self.machine = machine
-        self.rows: list[Row] = []
-        self._file, self._budget, self._slow, self._watch = file, budget, slow, watch
-        self._truths: dict[tuple[str, Case], Tensor] = {}  # by the scene's name
-        self._work: dict[tuple[str, Case], Work] = {}
-        self._scene: Subject | None = None
+        self._report, self._budget, self._slow = report, budget, slow
+        self._references: dict[tuple[str, RasterCase], Tensor] = {}  # by the name of the scene
+        self._work: dict[tuple[str, RasterCase], Work] = {}
+        self._scene: BenchScene | None = None
         self._gaussians: Gaussians | None = None
 
-    def run(self, groups: Iterable[Group]) -> list[Row]:
+    def run(self, groups: Iterable[Group]) -> None:
         """Measure all groups.
 
         Raises:
-            InputError: the file cannot be written, or a scene cannot be read.
+            InputError: the file of rows cannot be written, or a scene cannot be read.
         """
         for group in groups:
-            self._load(group.subject)
-            with _threads_restored():
+            self._load(group.scene)
+            with restored_threads():
                 self._measure(group)
-        return self.rows
 
-    def add(self, rows: Iterable[Row]) -> None:
-        """Take in rows that were measured elsewhere."""
-        self.rows += rows
-        self._save("")
+    def run_viewer(self, group: Group, repeats: int) -> None:
+        """Measure the viewer on each of its OpenGL tiers; times include the sort.
 
-    def truths(self, group: Group, case: Case) -> tuple[Tensor | None, Tensor | None]:
-        """The exact picture, and the float64 picture of a case's own choices, as far as the group asks for them."""
-        self._load(group.subject)
-        with _threads_restored():
-            exact = None if group.truths == "none" else self._truth(group, case.exact)
-            own = self._truth(group, case.truth) if group.truths == "own" else None
-        return exact, own
+        Args:
+            group: its cases have layout "cubemap" or "pinhole"; their backend is ignored.
+            repeats: frames of each case.
 
-    def _load(self, subject: Subject) -> None:
-        if subject is self._scene:
+        Raises:
+            InputError: the viewer is not installed, or there is no OpenGL.
+        """
+        self._load(group.scene)
+        with restored_threads():  # before the viewer starts, so that its times are not disturbed
+            references = [self._reference_images(group, case) for case in group.cases]
+        assert self._gaussians is not None
+        for image in render_in_viewer(group.scene, self._gaussians, group.cases, repeats):
+            case = dataclasses.replace(group.cases[image.index], backend=image.tier)
+            row = self._new_row(group, case)
+            result, frames = row.result, image.frame_ms
+            result.forward_ms, result.forward_min_ms = statistics.median(frames), min(frames)
+            result.forward_spread_ms, result.repeats = quartile_range(frames), len(frames)
+            result.stages_ms = {"sort": image.sort_ms, "draw": max(0.0, result.forward_ms - image.sort_ms)}
+            result.set_errors(case, image.color, *references[image.index])
+            row.note = f"rendered by {image.renderer}"
+            self._add(row)
+
+    def _load(self, scene: BenchScene) -> None:
+        if scene is self._scene:
             return
-        self._save(f"{subject.name}: making the scene")
-        if self._scene is None or subject.name != self._scene.name:
-            self._gaussians = None  # two large scenes at once might not fit
-            self._gaussians = subject.load()
-        self._scene = subject
+        self._report.update(f"{scene.name}: making the scene")
+        if self._scene is None or scene.name != self._scene.name:
+            self._gaussians = None  # two large scenes might not fit in memory
+            self._gaussians = scene.load()
+        self._scene = scene
 
     def _measure(self, group: Group) -> None:
-        lanes = []
+        measurements = []
         for case in group.cases:
-            truths = self.truths(group, case)
-            self._save(_told(case, "first drawing"))
-            lane = _Lane(case, self._row(group.suite, case))
-            judge(lane.row, case, self._first(lane).color, *truths)
-            self.rows.append(lane.row)
-            lanes.append(lane)
-        while not all(lane.done for lane in lanes):
-            for lane in lanes:
-                if not lane.done:
-                    self._save(_told(lane.case, f"{len(lane.forward) + 1} of {lane.wanted}"))
-                    self._again(lane)
-        for lane in lanes:
-            self._relate_to_peaks(lane)
-        self._save("")
+            references = self._reference_images(group, case)
+            self._report.update(f"{case}: first image")
+            measurement = _Measurement(self._new_row(group, case))
+            measurement.row.result.set_errors(case, self._render_first(measurement).color, *references)
+            self._add(measurement.row)
+            measurements.append(measurement)
+        while not all(measurement.is_done for measurement in measurements):
+            for measurement in measurements:
+                if not measurement.is_done:
+                    step = f"{len(measurement.forward) + 1} of {measurement.repeats}"
+                    self._report.update(f"{measurement.case}: {step}")
+                    self._render_again(measurement)
+        for measurement in measurements:
+            self._set_fractions_of_peaks(measurement)
+        self._report.update()
 
-    def _truth(self, group: Group, case: Case) -> Tensor:
-        """A float64 picture of the scene; drawn once, and that drawing is a row as well."""
-        key = group.subject.name, case
-        if key not in self._truths:
-            self._save(_told(case, "the float64 reference"))
-            lane = _Lane(case, self._row(group.suite, case))
-            self._truths[key] = self._first(lane).color
-            exact = self._truths[key] if case == case.exact else self._truth(group, case.exact)
-            judge(lane.row, case, self._truths[key], exact, None)
-            self.rows.append(lane.row)
-        return self._truths[key]
+    def _reference_images(self, group: Group, case: RasterCase) -> tuple[Tensor | None, Tensor | None]:
+        """The exact image and the float64 image of the case's own choices, as far as the group needs them."""
+        exact = None if group.references == "none" else self._reference_image(group, case.exact)
+        own = self._reference_image(group, case.reference) if group.references == "own" else None
+        return exact, own
 
-    def _row(self, suite: str, case: Case) -> Row:
-        assert self._scene is not None and self._gaussians is not None
-        values = dataclasses.asdict(case)
-        del values["backward"]
-        return Row(suite=suite, scene=self._scene.name, num_gaussians=len(self._gaussians), **values)
+    def _reference_image(self, group: Group, case: RasterCase) -> Tensor:
+        """A float64 image; rendered once for each scene, which is a row as well."""
+        key = group.scene.name, case
+        if key not in self._references:
+            self._report.update(f"{case}: float64 reference")
+            measurement = _Measurement(self._new_row(group, case))
+            color = self._references[key] = self._render_first(measurement).color
+            exact = color if case == case.exact else self._reference_image(group, case.exact)
+            measurement.row.result.set_errors(case, color, exact, None)
+            self._add(measurement.row)
+        return self._references[key]
 
-    def _first(self, lane: _Lane) -> Picture:
-        """Draw for the first time: warms up, measures memory, decides how often to draw again."""
-        case, row = lane.case, lane.row
-        forget(case.backend)
-        row.peak_mb, (picture, took) = peak_memory(lambda: self._forward(case), device_of(case.backend))
-        walls = [took.wall]
-        row.stages_ms = {name: 1e3 * value for name, value in picture.stages.items()}
-        if took.wall > self._slow or case.precision == "float64":
-            lane.forward.append(took)
+    def _new_row(self, group: Group, case: RasterCase) -> RasterRow:
+        assert self._gaussians is not None
+        return Row(group.suite, group.scene.name, case, RasterResult(len(self._gaussians)))
+
+    def _add(self, row: RasterRow) -> None:
+        self._report.rows.append(row)
+        self._report.update()
+
+    def _render_first(self, measurement: _Measurement) -> RenderedImage:
+        """Render the first image: warm up, measure the memory, choose the number of repeats."""
+        case, result = measurement.case, measurement.row.result
+        release_workspace(case.backend)
+        result.peak_mb, (image, timing) = peak_memory(lambda: self._time_forward(case), device_of(case.backend))
+        walls = [timing.wall]
+        result.stages_ms = {name: 1e3 * value for name, value in image.stages.items()}
+        if timing.wall > self._slow or case.precision == "float64":
+            measurement.forward.append(timing)
         if case.backward:
-            forget(case.backend)
-            row.backward_peak_mb, took = peak_memory(lambda: self._backward(case), device_of(case.backend))
-            walls.append(took.wall)
-            if took.wall > self._slow:
-                lane.backward.append(took)
-        slow = case.precision == "float64" or max(walls) > self._slow
-        lane.wanted = 1 if slow else min(_MOST, max(_LEAST, int(self._budget / sum(walls))))
-        lane.write_times()
-        return picture
+            release_workspace(case.backend)
+            device = device_of(case.backend)
+            result.backward_peak_mb, timing = peak_memory(lambda: self._time_backward(case), device)
+            walls.append(timing.wall)
+            if timing.wall > self._slow:
+                measurement.backward.append(timing)
+        if case.precision != "float64" and max(walls) <= self._slow:
+            measurement.repeats = min(_MAX_REPEATS, max(_MIN_REPEATS, int(self._budget / sum(walls))))
+        measurement.update_row()
+        return image
 
-    def _again(self, lane: _Lane) -> None:
-        if lane.needs_forward:
-            picture, took = self._forward(lane.case)
-            if not lane.forward or took.wall < min(one.wall for one in lane.forward):
-                lane.row.stages_ms = {name: 1e3 * value for name, value in picture.stages.items()}
-            lane.forward.append(took)
-        if lane.needs_backward:
-            lane.backward.append(self._backward(lane.case))
-        lane.write_times()
+    def _render_again(self, measurement: _Measurement) -> None:
+        if measurement.needs_forward:
+            image, timing = self._time_forward(measurement.case)
+            if not measurement.forward or timing.wall < min(other.wall for other in measurement.forward):
+                measurement.row.result.stages_ms = {name: 1e3 * value for name, value in image.stages.items()}
+            measurement.forward.append(timing)
+        if measurement.needs_backward:
+            measurement.backward.append(self._time_backward(measurement.case))
+        measurement.update_row()
 
-    def _prepared(self, case: Case) -> tuple[Gaussians, Tensor]:
-        """The scene as the case needs it, and the pose; torch may use as many threads as the case."""
+    def _prepare(self, case: RasterCase) -> tuple[Gaussians, Tensor]:
+        """Set the case's number of threads, warm up, and return the scene in its precision and the pose."""
         assert self._scene is not None and self._gaussians is not None
         torch.set_num_threads(case.threads)
-        wake(case)
-        return self._gaussians.to(
-            dtype=getattr(torch, case.precision), device=device_of(case.backend)
-        ), self._scene.pose
+        warm_up(case)
+        dtype, device = getattr(torch, case.precision), device_of(case.backend)
+        return self._gaussians.to(dtype=dtype, device=device), self._scene.pose
 
     @torch.no_grad()
-    def _forward(self, case: Case) -> tuple[Picture, Took]:
-        gaussians, pose = self._prepared(case)
-        took, picture = seconds(lambda: draw(case, gaussians, pose), device_of(case.backend))
-        return picture, took
+    def _time_forward(self, case: RasterCase) -> tuple[RenderedImage, Timing]:
+        gaussians, pose = self._prepare(case)
+        timing, image = time_call(lambda: render_case(case, gaussians, pose), device_of(case.backend))
+        return image, timing
 
-    def _backward(self, case: Case) -> Took:
-        """Seconds of the backward pass alone."""
-        gaussians, pose = self._prepared(case)
-        picture, leaves, upstream = draw_and_differentiate(case, gaussians, pose)
-        took, _ = seconds(lambda: torch.autograd.grad(picture.color, leaves, upstream), device_of(case.backend))
-        return took
+    def _time_backward(self, case: RasterCase) -> Timing:
+        gaussians, pose = self._prepare(case)
+        image, leaves, grad_color = render_with_graph(case, gaussians, pose)
+        device = device_of(case.backend)
+        timing, _ = time_call(lambda: torch.autograd.grad(image.color, leaves, grad_color), device)
+        return timing
 
-    def _relate_to_peaks(self, lane: _Lane) -> None:
-        """How much of the machine's arithmetic and bandwidth a direct panorama reached."""
-        case, row = lane.case, lane.row
+    def _set_fractions_of_peaks(self, measurement: _Measurement) -> None:
+        """Set what fraction of the machine's arithmetic and bandwidth a direct panorama reached."""
+        case, result = measurement.case, measurement.row.result
         if case.layout != "equirect" or case.backend not in ("torch", "numba"):
             return
-        if not row.forward_cpu_ms or not row.forward_min_ms:  # a clock may be too coarse for the smallest pictures
+        if not result.forward_cpu_ms or not result.forward_min_ms:  # the clock may be too coarse for small images
             return
         assert self._scene is not None and self._gaussians is not None
-        key = row.scene, case.truth
+        key = self._scene.name, case.reference
         if key not in self._work:
-            self._save(_told(case, "counting its work"))
+            self._report.update(f"{case}: counting its work")
             options = RasterOptions(case.kernel, case.order, case.filter, NEAR, strict=False)
             self._work[key] = panorama_work(self._gaussians, self._scene.pose, case.height, options)
-        work, threads = self._work[key], str(case.threads)
-        row.pairs = work.pairs
-        flops = 1e6 * self.machine["fma_gflops"]["1"]  # of a thread, a millisecond
-        row.fma_fraction = FORWARD_OPERATIONS * work.pairs / flops / row.forward_cpu_ms
-        row.bandwidth_fraction = work.bytes / (1e6 * self.machine["bandwidth_gb_s"][threads]) / row.forward_min_ms
-        if row.backward_cpu_ms:
-            row.backward_fma_fraction = BACKWARD_OPERATIONS * work.pairs / flops / row.backward_cpu_ms
-
-    def _save(self, doing: str) -> None:
-        """Write what there is, and tell what comes next."""
-        if self._file is not None:
-            write_rows(self._file, self.machine, self.rows)
-        if self._watch is not None:
-            self._watch(doing, self.rows)
+        work, machine = self._work[key], self._report.machine
+        result.pairs = work.pairs
+        flops_per_ms = 1e6 * machine["fma_gflops"]["1"]
+        result.fma_fraction = FORWARD_OPERATIONS * work.pairs / flops_per_ms / result.forward_cpu_ms
+        bytes_per_ms = 1e6 * machine["bandwidth_gb_s"][str(case.threads)]
+        result.bandwidth_fraction = work.bytes / bytes_per_ms / result.forward_min_ms
+        if result.backward_cpu_ms:
+            result.backward_fma_fraction = BACKWARD_OPERATIONS * work.pairs / flops_per_ms / result.backward_cpu_ms
 
 
-def judge(row: Row, case: Case, color: Tensor, exact: Tensor | None, own: Tensor | None) -> None:
-    """Write a picture's errors into its row: against the exact picture, and against that of its own choices."""
-    panorama = case.layout != "pinhole"
-    if exact is not None:
-        found = fidelity(color, exact, panorama=panorama)
-        row.max_error, row.psnr_db = found.max_error, found.psnr_db
-        row.seam_jump, row.energy_error = found.seam_jump, found.energy_error
-    if own is not None:
-        found = fidelity(color, own, panorama=panorama)
-        row.own_max_error, row.own_psnr_db = found.max_error, found.psnr_db
+def raster_report(
+    machine: Mapping[str, Any], *, json: Path | None = None, plot: Path | None = None, page: Path | None = None
+) -> Report[RasterRow]:
+    """The report of a run.
+
+    Args:
+        machine: from `describe_machine`; its peaks are what the rows are compared with.
+        json: file of the rows.
+        plot: time against error; the costs over counts and resolutions go to a second file, NAME_sweeps.
+        page: tables in Markdown.
+    """
+    plots = {} if plot is None else {
+        plot: plot_choices, plot.with_name(f"{plot.stem}_sweeps{plot.suffix}"): plot_sweeps
+    }  # fmt: skip
+    facts = ("cpu", "threads", "gpu", "fma_gflops", "bandwidth_gb_s")
+    return Report(
+        RASTER_COLUMNS,
+        _section,
+        machine,
+        facts=facts,
+        findings=raster_findings,
+        json_file=json,
+        page=page,
+        plots=plots,
+        width=210,
+    )
 
 
-def _told(case: Case, doing: str) -> str:
-    faces = f" {case.face_size}" if case.face_size else ""
-    choice = f"{case.backend} {case.kernel} {case.order} {case.filter} {case.layout}{faces}"
-    return f"{choice}, height {case.height}, {case.threads} threads: {doing}"
+def _section(row: RasterRow) -> str:
+    """The table of a row: one for each suite and scene; a sweep has one for all its scenes."""
+    return row.suite if row.suite in ("count", "resolution") else f"{row.suite}: {row.scene}"
 
 
-@contextlib.contextmanager
-def _threads_restored() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
+def _column(title: str, form: str, name: str) -> Column[RasterRow]:
+    return Column(title, lambda row: number(getattr(row.result, name), form))
+
+
+def _times(title: str, name: str, spread: str | None = None) -> Column[RasterRow]:
+    return Column(title, lambda row: _time(getattr(row.result, name), getattr(row.result, spread) if spread else None))
+
+
+def _time(middle: float | None, spread: float | None) -> str:
+    """Milliseconds with three digits, and half the range between the quartiles."""
+    if middle is None:
+        return ""
+    digits = 0 if middle >= 100 else 1 if middle >= 10 else 2
+    return f"{middle:,.{digits}f}" + (f" ±{spread / 2:.{digits}f}" if spread else "")
+
+
+def _renderer(row: RasterRow) -> str:
+    return row.case.backend if row.case.precision == "float32" else f"{row.case.backend} {row.case.precision}"
+
+
+def _layout(row: RasterRow) -> str:
+    faces = f" {row.case.face_size}" if row.case.face_size else ""
+    return f"{row.case.layout}{faces}{' official' if row.case.stitching == 'official' else ''}"
+
+
+def _decibels(row: RasterRow) -> str:
+    return "exact" if row.result.max_error == 0 else number(row.result.psnr_db, "{:.1f}")
+
+
+RASTER_COLUMNS: tuple[Column[RasterRow], ...] = (
+    Column("renderer", _renderer, "left"),
+    Column("kernel", lambda row: row.case.kernel, "left"),
+    Column("order", lambda row: row.case.order, "left"),
+    Column("filter", lambda row: row.case.filter, "left"),
+    Column("layout", _layout, "left"),
+    Column("height", lambda row: str(row.case.height)),
+    _column("Gaussians", "{:,}", "num_gaussians"),
+    Column("threads", lambda row: str(row.case.threads)),
+    _times("forward ms", "forward_ms", "forward_spread_ms"),
+    _times("CPU", "forward_cpu_ms"),
+    _times("backward ms", "backward_ms", "backward_spread_ms"),
+    _times("CPU", "backward_cpu_ms"),
+    _column("peak MB", "{:,.0f}", "peak_mb"),
+    Column("PSNR dB", _decibels),
+    _column("max error", "{:.1e}", "max_error"),
+    _column("seam", "{:.1e}", "seam_jump"),
+    _column("energy", "{:+.2%}", "energy_error"),
+    _column("own error", "{:.1e}", "own_max_error"),
+)
+
+
+def raster_findings(rows: Sequence[RasterRow]) -> list[str]:
+    """The main results as sentences: speed against torch and the dense renderer, and fractions of the peaks."""
+    return [*_compare_with_torch(rows), *_compare_with_dense(rows), *_compare_with_peaks(rows)]
+
+
+def _direct_rows(rows: Sequence[RasterRow], suite: str, backend: str) -> list[RasterRow]:
+    """Timed float32 rows of the exact direct panorama, by number of threads."""
+    chosen = [
+        row
+        for row in rows
+        if (row.suite, row.case.backend, row.case.layout, row.case.filter) == (suite, backend, "equirect", "angular")
+        and row.case.precision == "float32"
+        and row.result.forward_ms is not None
+    ]
+    return sorted(chosen, key=lambda row: row.case.threads)
+
+
+def _compare_with_torch(rows: Sequence[RasterRow]) -> list[str]:
+    return [
+        f"{row.case.backend} on {_threads(row)} is {_speedup(torch_row, row)} as fast as the tiled torch reference "
+        f"on one, {_size(row)}."
+        for torch_row in _direct_rows(rows, "headline", "torch")[:1]
+        for row in (*_direct_rows(rows, "headline", "numba"), *_direct_rows(rows, "headline", "triton"))
+    ]
+
+
+def _compare_with_dense(rows: Sequence[RasterRow]) -> list[str]:
+    """At the dense renderer's small size, and scaled by pixels times Gaussians to the headline's size."""
+    sentences = []
+    for dense in _direct_rows(rows, "dense", "dense")[:1]:
+        for row in (*_direct_rows(rows, "dense", "torch")[:1], *_direct_rows(rows, "dense", "numba")[:1]):
+            speedup = _speedup(dense, row)
+            sentences.append(
+                f"{row.case.backend} on one thread is {speedup} as fast as the dense renderer, {_size(row)}."
+            )
+        for row in _direct_rows(rows, "headline", "numba")[:1]:
+            scale = (row.case.height / dense.case.height) ** 2 * row.result.num_gaussians / dense.result.num_gaussians
+            dense_ms = scale * cast("float", dense.result.forward_ms)
+            sentences.append(
+                f"Scaled by pixels times Gaussians (not measured), the dense renderer would take "
+                f"{dense_ms / 1e3:,.0f} s forward at {row.case.height}x{2 * row.case.height}, "
+                f"{_quotient(dense_ms, row.result.forward_ms)} times numba's time."
+            )
+    return sentences
+
+
+def _compare_with_peaks(rows: Sequence[RasterRow]) -> list[str]:
+    """Fractions of the machine's peaks; by processor time, which other load on the machine hardly affects."""
+    sentences = []
+    for row in _direct_rows(rows, "headline", "numba"):
+        result = row.result
+        if result.fma_fraction is None or result.bandwidth_fraction is None or result.forward_cpu_ms is None:
+            continue
+        text = f"numba on {_threads(row)} reaches {result.fma_fraction:.0%} of the multiply-add peak forward"
+        if result.stages_ms.get("raster"):
+            ratio = result.forward_cpu_ms / row.case.threads / result.stages_ms["raster"]
+            text += f" ({result.fma_fraction * ratio:.0%} in the raster stage)"
+        if result.backward_fma_fraction is not None:
+            text += f", {result.backward_fma_fraction:.0%} backward"
+        sentences.append(f"{text}, and {result.bandwidth_fraction:.0%} of the memory bandwidth forward.")
+    return sentences
+
+
+def _speedup(slow: RasterRow, fast: RasterRow) -> str:
+    """How many times faster, by elapsed and by processor time."""
+    a, b = slow.result, fast.result
+    text = [f"{_quotient(a.forward_ms, b.forward_ms)} times"]
+    if a.backward_ms and b.backward_ms:
+        text.append(f"(backward {_quotient(a.backward_ms, b.backward_ms)} times)")
+    if a.forward_cpu_ms and b.forward_cpu_ms and slow.case.threads == fast.case.threads:
+        cpu = _quotient(a.forward_cpu_ms, b.forward_cpu_ms)
+        if a.backward_cpu_ms and b.backward_cpu_ms:
+            cpu += f" and {_quotient(a.backward_cpu_ms, b.backward_cpu_ms)}"
+        text.append(f"[by processor time {cpu}]")
+    return " ".join(text)
+
+
+def _quotient(slow: float | None, fast: float | None) -> str:
+    assert slow is not None and fast
+    return f"{slow / fast:,.0f}"
+
+
+def _threads(row: RasterRow) -> str:
+    return "one thread" if row.case.threads == 1 else f"{row.case.threads} threads"
+
+
+def _size(row: RasterRow) -> str:
+    return f"{row.case.height}x{2 * row.case.height}, {row.result.num_gaussians:,} Gaussians"
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Indices of the points that no other point beats in both numbers, by increasing first number.
+
+    Of equal points all or none are on the front.
+    """
+    front = []
+    for index in sorted(range(len(points)), key=lambda i: points[i]):
+        if not front or points[index][1] < points[front[-1]][1] or points[index] == points[front[-1]]:
+            front.append(index)
+    return front
+
+
+def plot_choices(rows: Sequence[RasterRow], path: Path) -> bool:
+    """Plot the root mean square error over the time, both logarithmic; False if there is nothing to plot.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    shown, points = [], []
+    for row in rows:
+        result = row.result
+        if row.suite == "choices" and row.case.layout != "pinhole" and result.forward_ms and result.psnr_db is not None:
+            shown.append(row)
+            points.append((result.forward_ms, max(_MIN_ERROR, 10 ** (-result.psnr_db / 20))))
+    if not shown:
+        return False
+    figure = Figure(figsize=(10, 6.5), layout="constrained")
+    axes = figure.subplots()
+    for row, (x, y) in zip(shown, points, strict=True):
+        color = _KERNEL_COLORS[row.case.kernel]
+        fill = color if row.case.filter == "angular" else "none"
+        edge = color if row.case.precision == "float32" else "#444444"
+        marker = _MARKERS.get(row.case.backend, "*")
+        axes.scatter(x, y, s=55, marker=marker, facecolors=fill, edgecolors=edge, zorder=3)
+    front = pareto_front(points)
+    axes.plot(*zip(*(points[i] for i in front), strict=True), color=_FRONT_COLOR, linewidth=1.5, zorder=2)
+    axes.set(xscale="log", yscale="log", xlabel="forward, milliseconds")
+    axes.set_ylim(bottom=min(axes.get_ylim()[0], 0.03 * min(y for _, y in points)))
+    _annotate(axes, [(points[i], _choice_name(shown[i])) for i in front])
+    axes.set_ylabel(f"root mean square error of the colours (the exact image is drawn at {_MIN_ERROR:.0e})")
+    axes.set_title(f"{shown[0].scene}: {_size(shown[0])}", loc="left")
+    decibels = axes.secondary_yaxis("right", functions=(lambda y: y, lambda y: y))
+    decibels.set_yticks([10.0**-k for k in range(9)], [f"{20 * k} dB" for k in range(9)])
+    _add_choice_legend(axes, shown)
+    axes.grid(alpha=0.25)
+    save_figure(figure, path)
+    return True
+
+
+def _choice_name(row: RasterRow) -> str:
+    case = row.case
+    layout = "direct" if case.layout == "equirect" else f"faces of {case.face_size}"
+    order = "" if case.layout == "equirect" else f" {case.order}"
+    return f"{case.backend} {case.kernel}{order} {case.filter}, {layout}" + (" float64" * (case.precision == "float64"))
+
+
+def _annotate(axes: Axes, labels: list[tuple[tuple[float, float], str]]) -> None:
+    """Label points: above them in the left half, below them in the right half, at three distances in turn."""
+    low, high = (math.log(edge) for edge in axes.get_xlim())
+    for index, (point, name) in enumerate(labels):
+        above = math.log(point[0]) < 0.5 * (low + high)
+        axes.annotate(
+            name,
+            point,
+            xytext=(14, 12 + 13 * (index % 3)) if above else (-14, -12 - 13 * (index % 3)),
+            textcoords="offset points",
+            ha="left" if above else "right",
+            fontsize=8,
+            arrowprops={"arrowstyle": "-", "color": "#999999", "linewidth": 0.6},
+        )
+
+
+def _add_choice_legend(axes: Axes, rows: Sequence[RasterRow]) -> None:
+    for backend in dict.fromkeys(row.case.backend for row in rows):
+        axes.scatter([], [], marker=_MARKERS.get(backend, "*"), color="#888888", label=backend)
+    for kernel in dict.fromkeys(row.case.kernel for row in rows):
+        axes.plot([], [], linewidth=4, color=_KERNEL_COLORS[kernel], label=f"kernel {kernel}")
+    axes.scatter([], [], marker="o", facecolors="none", edgecolors="#888888", label="hollow: filter 3dgs")
+    axes.scatter([], [], marker="s", facecolors="#cccccc", edgecolors="#444444", label="dark edge: float64")
+    axes.plot([], [], color=_FRONT_COLOR, label="Pareto front")
+    axes.legend(fontsize=8, loc="best")
+
+
+def plot_sweeps(rows: Sequence[RasterRow], path: Path) -> bool:
+    """Plot the minimum times over the number of Gaussians and of pixels; False if there is nothing to plot.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    timed = [row for row in rows if row.result.forward_ms]
+    sweeps = {suite: [row for row in timed if row.suite == suite] for suite in ("count", "resolution")}
+    if not any(sweeps.values()):
+        return False
+    figure = Figure(figsize=(11, 4.5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    heights = {row.case.height for row in sweeps["count"]}
+    size = f" at {max(heights)}x{2 * max(heights)}" if heights else ""
+    _plot_curves(left, sweeps["count"], lambda row: row.result.num_gaussians)
+    left.set(xlabel="Gaussians" + size, title="number of Gaussians, same image size")
+    _plot_curves(right, sweeps["resolution"], lambda row: row.case.height)
+    right.set(xlabel="height of the panorama, pixels", title="image size, scene of the same size")
+    for axes in (left, right):
+        axes.set_ylabel("milliseconds, minimum of the repeats")
+    save_figure(figure, path)
+    return True
+
+
+def _plot_curves(axes: Axes, rows: Sequence[RasterRow], x: Callable[[RasterRow], int]) -> None:
+    for backend in dict.fromkeys(row.case.backend for row in rows):
+        curve = sorted((row for row in rows if row.case.backend == backend), key=x)
+        threads = f", {curve[0].case.threads} threads" if curve[0].case.threads > 1 else ""
+        for name, style in (("forward", "-"), ("backward", "--")):
+            points = [(x(row), getattr(row.result, f"{name}_min_ms")) for row in curve]
+            points = [point for point in points if point[1]]
+            if points:
+                label = f"{backend} {name}{threads}"
+                axes.plot(*zip(*points, strict=True), style, marker=_MARKERS.get(backend, "*"), label=label)
+    axes.set(xscale="log", yscale="log")
+    axes.grid(alpha=0.25, which="both")
+    low, high = axes.get_ylim()
+    if high < 10 * low:  # less than a decade would exaggerate noise
+        middle = math.sqrt(low * high)
+        axes.set_ylim(middle / math.sqrt(10), middle * math.sqrt(10))
+    if rows:
+        axes.legend(fontsize=8)

@@ -1,163 +1,259 @@
-"""What a person reads: tables of the rows, and how many times faster one renderer was than another."""
+"""Rows of a benchmark, and what is made of them: a live table, a JSON file, tables in Markdown, plots."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
-from rich.table import Table
+from pansplat.atomic import replacing
+from pansplat.console import table_console
 
-from pansplat.bench.rows import Row
-from pansplat.bench.tabulate import Column, number, page_table, terminal_table
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from rich.table import Table
 
-_COLUMNS: tuple[Column, ...] = (
-    *(("renderer", "left"), ("kernel", "left"), ("order", "left"), ("filter", "left"), ("layout", "left")),
-    *(("height", "right"), ("Gaussians", "right"), ("threads", "right"), ("forward ms", "right"), ("CPU", "right")),
-    *(("backward ms", "right"), ("CPU", "right"), ("peak MB", "right"), ("PSNR dB", "right"), ("max error", "right")),
-    *(("seam", "right"), ("energy", "right"), ("own error", "right")),
-)
+Case = TypeVar("Case")
+Result = TypeVar("Result")
+AnyRow = TypeVar("AnyRow", bound="Row[Any, Any]")
+Status = Literal["measured", "not tried", "over the limit", "died"]
 
-
-def tables(rows: Sequence[Row]) -> list[Table]:
-    """One table a suite and scene, in the order they were measured; sweeps take one table for all their scenes."""
-    return [terminal_table(_COLUMNS, map(cells, own), title) for title, own in _sections(rows).items()]
-
-
-def markdown(rows: Sequence[Row]) -> str:
-    """The same tables, and the findings, as a page's text."""
-    parts = ["\n".join(f"* {sentence}" for sentence in findings(rows))]
-    for title, own in _sections(rows).items():
-        parts.append(f"### {title[0].upper()}{title[1:]}\n\n{page_table(_COLUMNS, map(cells, own))}")
-    return "\n\n".join(part for part in parts if part) + "\n"
+_LIVE_ROWS = 14  # of the running table
 
 
-def _sections(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """The rows of each table, by its title."""
-    found: dict[str, list[Row]] = {}
-    for row in rows:
-        title = row.suite if row.suite in ("count", "resolution") else f"{row.suite}: {row.scene}"
-        found.setdefault(title, []).append(row)
-    return found
+@dataclass
+class Row(Generic[Case, Result]):
+    """One benchmark case and its result.
+
+    Attributes:
+        suite: the question that the case belongs to.
+        scene: name of what was rendered or predicted.
+        case: the configuration.
+        result: what was measured; None in a field means not measured.
+        status: whether it was measured, or why not.
+        is_reference: whether other rows are compared with this one.
+        note: additional information.
+    """
+
+    suite: str
+    scene: str
+    case: Case
+    result: Result
+    status: Status = "measured"
+    is_reference: bool = False
+    note: str = ""
+
+    def as_json(self) -> dict[str, object]:
+        """All fields in one flat dictionary; numbers with six digits, null instead of infinite ones."""
+        values = {name: getattr(self, name) for name in ("suite", "scene", "status", "is_reference", "note")}
+        values |= dataclasses.asdict(self.case) | dataclasses.asdict(self.result)  # type: ignore[call-overload]
+        return {name: _rounded(value) for name, value in values.items()}
 
 
-def cells(row: Row) -> tuple[str, ...]:
-    """A row's cells; what was not measured is blank."""
-    faces = f" {row.face_size}" if row.face_size else ""
-    return (
-        row.backend if row.precision == "float32" else f"{row.backend} {row.precision}",
-        row.kernel,
-        row.order,
-        row.filter,
-        f"{row.layout}{faces}{' official' if row.stitching == 'official' else ''}",
-        str(row.height),
-        f"{row.num_gaussians:,}",
-        str(row.threads),
-        _time(row.forward_ms, row.forward_spread_ms),
-        _time(row.forward_cpu_ms, None),
-        _time(row.backward_ms, row.backward_spread_ms),
-        _time(row.backward_cpu_ms, None),
-        number(row.peak_mb, "{:,.0f}"),
-        _decibels(row),
-        number(row.max_error, "{:.1e}"),
-        number(row.seam_jump, "{:.1e}"),
-        number(row.energy_error, "{:+.2%}"),
-        number(row.own_max_error, "{:.1e}"),
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _rounded(item) for name, item in value.items()}
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if math.isfinite(value) else None
+    return value
+
+
+def row_from_json(values: Mapping[str, Any], case: type[Case], result: type[Result]) -> Row[Case, Result]:
+    """The row of a dictionary that `Row.as_json` made.
+
+    Raises:
+        KeyError: a field is missing.
+    """
+
+    def read(kind: type) -> Any:
+        return kind(**{field.name: values[field.name] for field in dataclasses.fields(kind)})
+
+    return Row(
+        *(values["suite"], values["scene"], read(case), read(result)),
+        *(values["status"], values["is_reference"], values["note"]),
     )
 
 
-def _decibels(row: Row) -> str:
-    if row.max_error == 0:
-        return "exact"
-    return number(row.psnr_db, "{:.1f}")
+@dataclass(frozen=True)
+class Column(Generic[AnyRow]):
+    """A column of a table.
+
+    Attributes:
+        cell: text of a row's cell; empty if the value was not measured.
+    """
+
+    title: str
+    cell: Callable[[AnyRow], str]
+    justify: Literal["left", "right"] = "right"
 
 
-def _time(middle: float | None, spread: float | None) -> str:
-    if middle is None:
-        return ""
-    digits = 0 if middle >= 100 else 1 if middle >= 10 else 2
-    return f"{middle:,.{digits}f}" + (f" ±{spread / 2:.{digits}f}" if spread else "")
+def number(value: float | None, form: str) -> str:
+    """The text of a cell; empty for None."""
+    return "" if value is None else form.format(value)
 
 
-def findings(rows: Sequence[Row]) -> list[str]:
-    """The headlines as sentences: speed against the peers in the same run, and the distance to the machine's peaks."""
-    return [*_against_torch(rows), *_against_dense(rows), *_to_the_peaks(rows)]
+def terminal_table(columns: Sequence[Column[AnyRow]], rows: Iterable[AnyRow], title: str) -> Table:
+    """A table for the terminal; only cells of columns without a title may wrap."""
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", pad_edge=False)
+    for column in columns:
+        table.add_column(column.title, justify=column.justify, no_wrap=bool(column.title))
+    for row in rows:
+        table.add_row(*(column.cell(row) for column in columns))
+    return table
 
 
-def _direct(rows: Sequence[Row], suite: str, backend: str) -> list[Row]:
-    """Timed float32 rows of the exact direct panorama, with fewest threads first."""
-    chosen = [
-        row
-        for row in rows
-        if (row.suite, row.backend, row.layout, row.filter) == (suite, backend, "equirect", "angular")
-        and row.precision == "float32"
-        and row.forward_ms is not None
-    ]
-    return sorted(chosen, key=lambda row: row.threads)
+def markdown_table(columns: Sequence[Column[AnyRow]], rows: Iterable[AnyRow]) -> str:
+    """A table in Markdown, without a line break after the last row."""
+    rule = "|" + "|".join("---:" if column.justify == "right" else "---" for column in columns) + "|"
+    cells = [[column.title for column in columns], *([column.cell(row) for column in columns] for row in rows)]
+    lines = ["| " + " | ".join(texts) + " |" for texts in cells]
+    return "\n".join((lines[0], rule, *lines[1:]))
 
 
-def _against_torch(rows: Sequence[Row]) -> list[str]:
-    told = []
-    for torch_row in _direct(rows, "headline", "torch")[:1]:
-        for row in (*_direct(rows, "headline", "numba"), *_direct(rows, "headline", "triton")):
-            told.append(
-                f"{row.backend} on {_threads(row.threads)} is {_ratio(torch_row, row)} as fast as the binned torch "
-                f"reference on one, {row.height}x{2 * row.height}, {row.num_gaussians:,} Gaussians."
-            )
-    return told
+def write_rows(path: Path, header: Mapping[str, object], rows: Iterable[Row[Any, Any]]) -> None:
+    """Write {**header, "rows": [...]} as JSON; the file is complete at any moment.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    text = json.dumps({**header, "rows": [row.as_json() for row in rows]}, indent=1, allow_nan=False)
+    with replacing(path) as partial:
+        partial.write_text(text + "\n")
 
 
-def _against_dense(rows: Sequence[Row]) -> list[str]:
-    """At the size that the dense renderer can bear, and scaled by pixels times Gaussians to the headline's."""
-    told = []
-    for dense in _direct(rows, "dense", "dense")[:1]:
-        for row in (*_direct(rows, "dense", "torch")[:1], *_direct(rows, "dense", "numba")[:1]):
-            told.append(
-                f"{row.backend} on one thread is {_ratio(dense, row)} as fast as the dense renderer, "
-                f"{row.height}x{2 * row.height}, {row.num_gaussians:,} Gaussians."
-            )
-        for row in _direct(rows, "headline", "numba")[:1]:
-            scale = (row.height / dense.height) ** 2 * row.num_gaussians / dense.num_gaussians
-            assert dense.forward_ms is not None and row.forward_ms is not None
-            told.append(
-                f"Scaled by pixels times Gaussians (not measured), the dense renderer would take "
-                f"{dense.forward_ms * scale / 1e3:,.0f} s forward at {row.height}x{2 * row.height}, "
-                f"{dense.forward_ms * scale / row.forward_ms:,.0f} times numba's time."
-            )
-    return told
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    with replacing(path) as partial:
+        figure.savefig(partial, dpi=110)
 
 
-def _to_the_peaks(rows: Sequence[Row]) -> list[str]:
-    """Distances to the peaks; by processor time, so that a busy machine does not make a renderer look lazy."""
-    told = []
-    for row in _direct(rows, "headline", "numba"):
-        if row.fma_fraction is None or row.bandwidth_fraction is None or row.forward_cpu_ms is None:
-            continue
-        text = f"numba on {_threads(row.threads)} reaches {row.fma_fraction:.0%} of the multiply-add peak forward"
-        if row.stages_ms.get("raster"):
-            share = row.forward_cpu_ms / row.threads / row.stages_ms["raster"]
-            text += f" ({row.fma_fraction * share:.0%} while it rasters)"
-        if row.backward_fma_fraction is not None:
-            text += f", {row.backward_fma_fraction:.0%} backward"
-        told.append(f"{text}, and {row.bandwidth_fraction:.0%} of the memory bandwidth forward.")
-    return told
+class Report(Generic[AnyRow]):
+    """The rows of one run: shown while they are measured, printed and written at the end.
+
+    As a context manager it prints and writes what was measured even if the run was interrupted.
+
+    Attributes:
+        rows: what was measured so far.
+        machine: description of the machine, as `describe_machine` returns it.
+    """
+
+    def __init__(
+        self,
+        columns: Sequence[Column[AnyRow]],
+        section: Callable[[AnyRow], str],
+        machine: Mapping[str, Any],
+        *,
+        header: Mapping[str, object] | None = None,
+        facts: Sequence[str] = (),
+        findings: Callable[[Sequence[AnyRow]], list[str]] = lambda rows: [],
+        json_file: Path | None = None,
+        page: Path | None = None,
+        plots: Mapping[Path, Callable[[Sequence[AnyRow], Path], bool]] | None = None,
+        print_steps: bool = False,
+        width: int = 150,
+    ) -> None:
+        """Begin a report.
+
+        Args:
+            columns: of the tables.
+            section: title of the table that a row belongs to.
+            machine: written to the JSON file.
+            header: more values of the JSON file.
+            facts: entries of `machine` to print.
+            findings: sentences about all rows, for the terminal and the page.
+            json_file: written after every step.
+            page: Markdown, written at the end.
+            plots: functions that write plots, by file; they return False if there is nothing to plot.
+            print_steps: print each step if there is no terminal.
+            width: characters of a printed line if there is no terminal.
+        """
+        self.rows: list[AnyRow] = []
+        self.machine = machine
+        self._columns, self._section, self._findings = columns, section, findings
+        self._header, self._facts, self._width = {"machine": machine, **(header or {})}, facts, width
+        self._json, self._page, self._plots = json_file, page, plots or {}
+        self._print_steps = print_steps
+        self._live: Any = None
+
+    def __enter__(self) -> Report[AnyRow]:
+        from rich.console import Console
+        from rich.live import Live
+
+        self._live = Live(console=Console(stderr=True), refresh_per_second=4, transient=True)
+        self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._live.stop()
+        self._live = None
+        self._print()
+        for file in self._write():
+            print(file)
+
+    def update(self, step: str = "") -> None:
+        """Write the JSON file and show the last rows and the step that follows."""
+        if self._json is not None and self.rows:
+            write_rows(self._json, self._header, self.rows)
+        if self._live is None:
+            return
+        if self._live.console.is_terminal:
+            from rich.console import Group
+            from rich.text import Text
+
+            self._live.update(Group(*self.tables(self.rows[-_LIVE_ROWS:]), Text(step, style="cyan")))
+        elif step and self._print_steps:
+            self._live.console.print(step, highlight=False, soft_wrap=True)
+
+    def tables(self, rows: Sequence[AnyRow]) -> list[Table]:
+        """One table for each section, in the order of the rows."""
+        return [terminal_table(self._columns, part, title) for title, part in self._sections(rows).items()]
+
+    def markdown(self) -> str:
+        """The findings and all tables as the text of a page."""
+        parts = ["\n".join(f"* {sentence}" for sentence in self._findings(self.rows))]
+        for title, part in self._sections(self.rows).items():
+            parts.append(f"### {title[:1].upper()}{title[1:]}\n\n{markdown_table(self._columns, part)}")
+        return "\n\n".join(part for part in parts if part) + "\n"
+
+    def _sections(self, rows: Sequence[AnyRow]) -> dict[str, list[AnyRow]]:
+        sections: dict[str, list[AnyRow]] = {}
+        for row in rows:
+            sections.setdefault(self._section(row), []).append(row)
+        return sections
+
+    def _print(self) -> None:
+        print_facts({name: self.machine[name] for name in self._facts})
+        console = table_console(self._width)
+        for table in self.tables(self.rows):
+            console.print(table)
+        for sentence in self._findings(self.rows):
+            print(sentence)
+
+    def _write(self) -> list[Path]:
+        """Write the files and return those that were written."""
+        if not self.rows:
+            return []
+        written = [] if self._json is None else [self._json]
+        if self._page is not None:
+            with replacing(self._page) as partial:
+                partial.write_text(self.markdown())
+            written.append(self._page)
+        return written + [path for path, plot in self._plots.items() if plot(self.rows, path)]
 
 
-def _ratio(slow: Row, fast: Row) -> str:
-    """How many times faster, on the clock and by processor time."""
-    text = [f"{_quotient(slow.forward_ms, fast.forward_ms)} times"]
-    if slow.backward_ms and fast.backward_ms:
-        text.append(f"(backward {_quotient(slow.backward_ms, fast.backward_ms)} times)")
-    if slow.forward_cpu_ms and fast.forward_cpu_ms and slow.threads == fast.threads:
-        cpu = _quotient(slow.forward_cpu_ms, fast.forward_cpu_ms)
-        if slow.backward_cpu_ms and fast.backward_cpu_ms:
-            cpu += f" and {_quotient(slow.backward_cpu_ms, fast.backward_cpu_ms)}"
-        text.append(f"[by processor time {cpu}]")
-    return " ".join(text)
-
-
-def _quotient(slow: float | None, fast: float | None) -> str:
-    assert slow is not None and fast
-    return f"{slow / fast:,.0f}"
-
-
-def _threads(count: int) -> str:
-    return "one thread" if count == 1 else f"{count} threads"
+def print_facts(facts: Mapping[str, object]) -> None:
+    """Print entries of `describe_machine`, one a line."""
+    for name, value in facts.items():
+        if isinstance(value, dict):
+            value = ", ".join(f"{key}: {item}" for key, item in value.items())
+        print(f"{name:<15} {'none' if value is None else value}")

@@ -1,4 +1,6 @@
-"""Scenes to measure on: a furnished room on full lattices, at any size, made from nothing.
+"""Scenes of the raster benchmark: a synthetic furnished room of any size, and discs on the known depth of a pair.
+
+Both have one Gaussian at every point of every level's lattice.
 
 Source: PanSplat, section 3.3 (lattices and levels). The counts are the paper's: 886,580 Gaussians at a height of
 512, of two views and four levels.
@@ -10,7 +12,17 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pansplat.gaussians.scene import Gaussians
+from pansplat.data.views import Views
+from pansplat.errors import InputError
+from pansplat.gaussians.harmonics import harmonics_basis
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.equirect import (
+    pad_equirect,
+    pixel_directions,
+    resize_equirect,
+    sample_equirect,
+    uv_from_directions,
+)
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
 from pansplat.geometry.pose import quats_from_rotations
 
@@ -18,11 +30,11 @@ NUM_LEVELS = 4
 _BASELINE = 1.0  # metres
 _CHUNK = 1 << 17
 
-# Corners of the room, then of what stands in it, metres; the cameras are 1.2 m above the floor (y points down).
+# Corners of the room, then of its furniture, metres; the cameras are 1.2 m above the floor (y points down).
 _ROOM = ((-3.4, -1.5, -2.6), (3.0, 1.2, 3.9))
 _FURNITURE = (
     ((-0.9, 0.45, 1.3), (0.9, 0.5, 2.3)),  # table top
-    ((-0.1, 0.5, 1.7), (0.1, 1.2, 1.9)),  # its foot
+    ((-0.1, 0.5, 1.7), (0.1, 1.2, 1.9)),  # table leg
     ((-3.4, 0.35, -0.6), (-2.5, 1.2, 1.6)),  # sofa
     ((2.4, -0.9, -1.9), (3.0, 1.2, -0.4)),  # cupboard
     ((-1.2, -1.5, -2.6), (-0.8, 1.2, -2.2)),  # pillar
@@ -30,8 +42,8 @@ _FURNITURE = (
     ((-0.3, -1.1, 2.0), (0.3, -0.8, 2.6)),  # lamp
 )
 _FOOTPRINT = (0.5, 1.0)  # standard deviations of discs across the line of sight, in pixels of their level
-_LONGEST = 4.0  # of a disc seen from the side, times that
-_THICKNESS = 0.1
+_MAX_STRETCH = 4.0  # of a disc seen at a slant
+_THICKNESS = 0.1  # of a disc's width
 _OPACITY = (0.3, 0.95)
 
 
@@ -49,10 +61,10 @@ def lattice_room_size(height: int, views: int = 2) -> int:
 
 
 def full_lattice_room(height: int, *, views: int = 2, degree: int = 0, seed: int = 0) -> Gaussians:
-    """A furnished room as seen by panoramas of that height: every point of every level's lattice is a Gaussian.
+    """A furnished room as panoramas of that height see it: every point of every level's lattice is a Gaussian.
 
-    Discs lie on the surfaces, 0.5 to 1 pixel of their level wide, of opacity 0.3 to 0.95: sizes and overlaps are
-    those of a predicted scene. The order is level, view, lattice point. The same arguments give the same scene.
+    The Gaussians are discs on the surfaces, 0.5 to 1 pixel of their level wide, of opacity 0.3 to 0.95, which are the
+    sizes and overlaps of a predicted scene. The order is level, view, lattice point. Deterministic.
 
     Args:
         height: of the panoramas, pixels; a multiple of 8.
@@ -64,7 +76,7 @@ def full_lattice_room(height: int, *, views: int = 2, degree: int = 0, seed: int
         float32 Gaussians, 886,580 at a height of 512.
 
     Raises:
-        ValueError: the height does not halve three times.
+        ValueError: the height is not a multiple of 8.
     """
     if height < 8 or height % 8:
         raise ValueError(f"`height` must be a positive multiple of 8, got {height}")
@@ -88,7 +100,7 @@ def _discs(
     level: int,
     view: int,
 ) -> Gaussians:
-    """Discs where the rays from a camera meet the room, as many as rays."""
+    """A disc where each ray from a camera meets the room."""
     distance, axis, body = _trace(rays, position)
     points = position + distance[:, None] * rays
     normals = torch.nn.functional.one_hot(axis, 3).double()
@@ -99,7 +111,7 @@ def _discs(
 
 
 def disc_sizes(count: int, generator: torch.Generator) -> Float[Tensor, "n 2"]:
-    """Random standard deviations, in pixels of the level, and opacities, in the ranges of a predicted scene."""
+    """Random standard deviations, in pixels of the level, and opacities."""
     low, high = torch.tensor((_FOOTPRINT, _OPACITY), dtype=torch.float64).T
     return low + (high - low) * torch.rand(2, count, generator=generator, dtype=torch.float64).T
 
@@ -114,12 +126,12 @@ def flat_discs(
     level: int,
     view: int,
 ) -> Gaussians:
-    """Discs that lie on surfaces: round as seen along their rays, so long on a slant, four times at most.
+    """Discs on surfaces that look round along their rays; on slanted surfaces they are stretched up to four times.
 
     Args:
         rays: unit directions from the camera to the points.
         normals: of the surfaces, of unit length.
-        sizes: as `disc_sizes` makes them.
+        sizes: from `disc_sizes`.
         pixel: width of a pixel of the level at the points, metres.
     """
     facing = (rays * normals).sum(dim=1, keepdim=True)
@@ -127,7 +139,7 @@ def flat_discs(
     across = torch.nn.functional.normalize(across, dim=1)
     axes = torch.stack((torch.linalg.cross(across, normals), across, normals), dim=2)
     width = sizes[:, 0] * pixel
-    stretch = (1 / facing[:, 0].abs()).clamp_max(_LONGEST)
+    stretch = (1 / facing[:, 0].abs()).clamp_max(_MAX_STRETCH)
     return Gaussians(
         means=points.float(),
         scales=torch.stack((width * stretch, width, width * _THICKNESS), dim=1).float(),
@@ -142,14 +154,14 @@ def flat_discs(
 def _trace(
     rays: Float[Tensor, "n 3"], position: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"], Int[Tensor, "n"]]:
-    """Distance to the first surface, the axis of its normal, and the number of the body it belongs to (0: room)."""
-    slope = 1 / torch.where(rays.abs() < 1e-12, torch.full_like(rays, 1e-12), rays)
+    """Distance to the first surface, the axis of its normal, and the number of its body (0: room)."""
+    inverse = 1 / torch.where(rays.abs() < 1e-12, torch.full_like(rays, 1e-12), rays)
     bounds = torch.tensor(_ROOM, dtype=torch.float64) - position
-    distance, axis = torch.maximum(bounds[0] * slope, bounds[1] * slope).min(dim=1)
+    distance, axis = torch.maximum(bounds[0] * inverse, bounds[1] * inverse).min(dim=1)
     body = torch.zeros_like(axis)
     for number, corners in enumerate(_FURNITURE, 1):
         bounds = torch.tensor(corners, dtype=torch.float64) - position
-        first, second = bounds[0] * slope, bounds[1] * slope
+        first, second = bounds[0] * inverse, bounds[1] * inverse
         enters, side = torch.minimum(first, second).max(dim=1)
         leaves = torch.maximum(first, second).amin(dim=1)
         hit = (enters > 0) & (enters < leaves) & (enters < distance)
@@ -161,10 +173,80 @@ def _trace(
 def _harmonics(
     points: Float[Tensor, "n 3"], surface: Int[Tensor, "n"], degree: int, generator: torch.Generator
 ) -> Float[Tensor, "n k 3"]:
-    """Stripes and grain on a plain colour a surface; higher degrees small and random, as a shine."""
+    """One colour per surface with stripes and noise; small random coefficients of higher degrees, like highlights."""
     palette = torch.rand(int(surface.max()) + 1, 3, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
     stripes = torch.sin(9 * points).prod(dim=1) + 0.5 * torch.sin(70 * points).prod(dim=1)
     grain = 0.05 * torch.randn(len(points), 3, generator=generator, dtype=torch.float64)
     harmonics = 0.1 * torch.randn(len(points), (degree + 1) ** 2, 3, generator=generator)
     harmonics[:, 0] = (2.4 * (palette[surface] - 0.5) + 0.5 * stripes[:, None] + grain).float()
     return harmonics
+
+
+def lift_depth(views: Views, *, seed: int = 0) -> Scene:
+    """A scene of discs on the surfaces of the views' depth maps, one for each lattice point.
+
+    Sizes and opacities are as in `full_lattice_room`, colours are those of the images. Unknown depth is replaced by
+    the view's median. The order is level, view, lattice point.
+
+    Args:
+        views: with depths; the height is a multiple of 8.
+        seed: of sizes and opacities.
+
+    Returns:
+        A scene of float32 Gaussians, 886,580 of two views at a height of 512.
+
+    Raises:
+        InputError: the views have no depth.
+    """
+    if views.depths is None:
+        raise InputError(
+            "a scene from depth needs a depth map for each panorama, got none; choose --scene-from prediction"
+        )
+    height = views.images.shape[-2]
+    generator = torch.Generator().manual_seed(seed)
+    depths = [torch.where(known > 0, known, known[known > 0].median()) for known in views.depths.double()]
+    parts = [
+        _lift_level(views.images[view], depth, views.cam2world[view], level, view, generator)
+        for level in range(NUM_LEVELS)
+        for view, depth in enumerate(depths)
+    ]
+    return Scene(Gaussians.cat(parts), views.cam2world, views.near, views.far, views.names, "depth", height)
+
+
+def _lift_level(
+    image: Float[Tensor, "3 height width"],
+    depth: Float[Tensor, "height width"],
+    pose: Float[Tensor, "4 4"],
+    level: int,
+    view: int,
+    generator: torch.Generator,
+) -> Gaussians:
+    """The discs of one view's lattice of one level."""
+    height = image.shape[-2] >> level
+    maps = torch.cat((image.double(), 1 / depth[None]))
+    maps = resize_equirect(maps[None], (height, 2 * height))[0]
+    maps = torch.cat((maps, _normals(1 / maps[3])))
+    rays = fibonacci_directions(lattice_size(2 * height))
+    samples = sample_equirect(maps, uv_from_directions(rays)).T
+    distance = 1 / samples[:, 3]
+    normals = torch.nn.functional.normalize(samples[:, 4:], dim=1)
+    rotation = pose[:3, :3]
+    return flat_discs(
+        rays @ rotation.T,
+        (distance[:, None] * rays) @ rotation.T + pose[:3, 3],
+        normals @ rotation.T,
+        disc_sizes(len(rays), generator),
+        distance * math.pi / height,
+        ((samples[:, :3] - 0.5) / harmonics_basis(rays, 0))[:, None, :],
+        level,
+        view,
+    )
+
+
+def _normals(depth: Float[Tensor, "height width"]) -> Float[Tensor, "3 height width"]:
+    """Unit normals of the surface, from the points of neighbouring pixels."""
+    points = (pixel_directions(*depth.shape, dtype=torch.float64) * depth[..., None]).permute(2, 0, 1)
+    around = pad_equirect(points, 1, "sphere")
+    east = around[:, 1:-1, 2:] - around[:, 1:-1, :-2]
+    south = around[:, 2:, 1:-1] - around[:, :-2, 1:-1]
+    return torch.nn.functional.normalize(torch.linalg.cross(east, south, dim=0), dim=0)

@@ -1,204 +1,321 @@
-"""`pansplat bench`: what the renderers take and how wrong they are, and what the machine could do at most."""
+"""`pansplat bench`: time, memory and error of the rasterisers and the network on this machine."""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable
-from functools import partial
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import rich.console
-import torch
-from rich.console import Console
-from rich.live import Live
-from rich.text import Text
+from tyro.conf import Positional, subcommand
 
 import pansplat
-from pansplat import pipeline
-from pansplat.atomic import replacing
-from pansplat.bench.cases import Case, Group, Subject, choices, default_face_size
-from pansplat.bench.drawing import why_not
-from pansplat.bench.gl_viewer import measure_viewer
-from pansplat.bench.lifted import lift_depth
-from pansplat.bench.machine import describe_machine
-from pansplat.bench.plan import Settings, groups, of_scene, room, sample_groups
-from pansplat.bench.plots import plot_choices, plot_sweeps
-from pansplat.bench.raster import Bench
-from pansplat.bench.report import findings, markdown, tables
-from pansplat.bench.rows import Row
-from pansplat.cli.commands import BenchMachine, BenchRaster, PairChoice, SceneSource
-from pansplat.cli.printing import table_console
-from pansplat.cli.scenes import choose_pair, progress_bar, require_height
+from pansplat.cli.inputs import OptionalOut, PairChoice, choose_pair, progress_bar, require_height
 from pansplat.errors import InputError
 
 if TYPE_CHECKING:
+    from pansplat.bench.memory import MemorySetting
+    from pansplat.bench.raster_cases import BenchScene, Settings
     from pansplat.gaussians.scene import Scene
 
-_BACKENDS = ("numba", "triton", "gsplat")
 _SAMPLE = Path(pansplat.__file__).parents[1] / "assets" / "living_room"
-_SHOWN = 12  # rows of the running table
-_WIDTH = 210  # characters, where there is no terminal
-_MEMORY = 16e9  # bytes, where the system does not tell
+_RASTER_BACKENDS = ("numba", "triton", "gsplat")
+_DEFAULT_MEMORY = 16e9  # bytes, if the system does not report its memory
+_RANDOM_WEIGHTS = "PanSplat with random weights (seed 0): times and memory are true, images meaningless"
 
 
-def run_machine(command: BenchMachine) -> int:
-    """Print what the machine is and can do."""
-    for name, value in describe_machine(_threads(command.threads)).items():
-        print(f"{name:<15} {_facts(value)}")
-    return 0
+@dataclass(frozen=True)
+class BenchRaster:
+    """Measure the rasterisers: time and memory against error, for every choice of kernel, order, filter and faces."""
 
+    scene: Positional[Path | None] = None
+    """A .ply scene, or the folder of a pair; by default a synthetic room, and the sample if it is there."""
+    scene_from: Literal["prediction", "depth"] = "prediction"
+    """How a pair becomes a scene: predicted by `sweep`, or from depth maps with a Gaussian at every lattice point."""
+    quick: bool = False
+    """Some minutes on two cores instead of an hour: all choices at reduced height only."""
+    json: Path | None = None
+    """File for the rows; written after every image."""
+    plot: Path | None = None
+    """Plot of time against error (.png, .svg, .pdf); the costs over counts and resolutions go to NAME_sweeps."""
+    out: OptionalOut = None
+    """Folder for raster.json, raster.md, raster.png and raster_sweeps.png."""
+    height: int = 512
+    """Height of the panoramas, pixels; a multiple of 8."""
+    threads: int | None = None
+    """The largest number of threads to use; by default torch's."""
 
-def run_raster(command: BenchRaster) -> int:
-    """Measure, print the tables and write the files; an interruption keeps and reports what was measured."""
-    files = _files(command)
-    require_height(command.height)
-    if command.height % 8:
-        raise InputError(f"--height must be a multiple of 8 pixels, got {command.height}")
-    settings = _settings(command)
-    subject = room if command.scene is None else _scene(command.scene, command.height, command.scene_from)
-    machine = describe_machine(settings.threads)
-    with _live() as live:
-        watch = partial(_show, live)
-        budget, slow = (1.0, 3.0) if command.quick else (8.0, 5.0)
-        bench = Bench(machine, file=files["json"], budget=budget, slow=slow, watch=watch)
-        try:
-            bench.run(groups(settings, subject, synthetic=command.scene is None))
-            if command.scene is None and _SAMPLE.is_dir():
+    def run(self) -> int:
+        """Measure, print the tables and write the files; an interruption keeps what was measured."""
+        from pansplat.bench.raster import RasterBench, raster_report
+        from pansplat.bench.raster_cases import raster_groups, room_scene, sample_group, viewer_group
+        from pansplat.bench.roofline import describe_machine
+
+        json, plot, page = self._files()
+        require_height(self.height)
+        if self.height % 8:
+            raise InputError(f"--height must be a multiple of 8 pixels, got {self.height}")
+        settings = self._settings()
+        scene_of = room_scene if self.scene is None else self._scene_of(self.scene, self.height)
+        budget, slow = (1.0, 3.0) if self.quick else (8.0, 5.0)
+        machine = describe_machine(settings.threads)
+        with raster_report(machine, json=json, plot=plot, page=page) as report:
+            bench = RasterBench(report, budget=budget, slow=slow)
+            bench.run(raster_groups(settings, scene_of, synthetic=self.scene is None))
+            if self.scene is None and _SAMPLE.is_dir():
                 small = settings.choice_height
-                bench.run(sample_groups(settings, _scene(_SAMPLE, small)(small)))
-            _add_viewer(bench, settings, subject)
-        finally:
-            live.stop()
-            _report(bench, files)
-    return 0
+                bench.run([sample_group(settings, self._scene_of(_SAMPLE, small)(small))])
+            try:
+                group = viewer_group(settings, scene_of(settings.choice_height))
+                bench.run_viewer(group, repeats=2 if self.quick else 5)
+            except InputError as error:
+                print(f"without the viewer: {error}")
+        return 0
+
+    def _files(self) -> tuple[Path | None, Path | None, Path | None]:
+        """The files of rows, plot and tables; refused before the work if a folder is missing."""
+        json, plot, page = self.json, self.plot, None
+        if self.out is not None:
+            self.out.mkdir(parents=True, exist_ok=True)
+            json, plot = json or self.out / "raster.json", plot or self.out / "raster.png"
+            page = self.out / "raster.md"
+        for file in (json, plot):
+            _require_folder(file)
+        if plot is not None and plot.suffix.lower() not in (".png", ".svg", ".pdf"):
+            raise InputError(f"--plot must end in .png, .svg or .pdf, got {plot}")
+        return json, plot, page
+
+    def _settings(self) -> Settings:
+        """What to measure; prints which backends are left out and why."""
+        from pansplat.bench.raster_cases import Settings
+        from pansplat.bench.renderers import unavailable_reason
+
+        threads = _choose_threads(self.threads)
+        available = []
+        for name in _RASTER_BACKENDS:
+            reason = unavailable_reason(name)
+            if reason is None:
+                available.append(name)
+            else:
+                print(f"without {name}: {reason}")
+        return Settings(self.height, self.quick, threads, tuple(available), _usable_memory())
+
+    def _scene_of(self, path: Path, height: int) -> Callable[[int], BenchScene]:
+        """The scene of a .ply file or a pair from between its cameras (from the origin if it has none)."""
+        import torch
+
+        from pansplat.bench.raster_cases import BenchScene
+
+        scene = self._read_scene(path, height)
+        pose = scene.pose_between(0.5) if len(scene.cam2world) else torch.eye(4, dtype=torch.float64)
+        return lambda _: BenchScene(path.stem, lambda: scene.gaussians, pose)
+
+    def _read_scene(self, path: Path, height: int) -> Scene:
+        """The scene of a .ply file; of a pair's folder the prediction of `sweep`, or its depth maps."""
+        from pansplat import pipeline
+        from pansplat.bench.scenes import lift_depth
+
+        if path.suffix.lower() == ".ply":
+            if self.scene_from == "depth":
+                raise InputError(f"--scene-from depth needs a pair's folder with depth maps, got {path}; leave it out")
+            return pipeline.load(path)
+        pair = choose_pair(path, PairChoice())
+        if self.scene_from == "depth":
+            return lift_depth(pair.load_context(height))
+        with progress_bar() as progress:
+            return pipeline.predict(pair, "sweep", height=height, progress=progress)
 
 
-def _settings(command: BenchRaster) -> Settings:
-    """What to measure, and with what; tells which backends are left out and why."""
-    usable = []
-    for name in _BACKENDS:
-        reason = why_not(name)
-        if reason is None:
-            usable.append(name)
-        else:
-            print(f"without {name}: {reason}")
-    return Settings(command.height, command.quick, _threads(command.threads), tuple(usable), _free_memory())
+@dataclass(frozen=True)
+class BenchModel:
+    """Measure the network: seconds of each part and memory against error, for each precision and way to run it."""
+
+    model: Path | None = None
+    """Weights of PanSplat (.safetensors); by default random ones, which take as long."""
+    pair: Path | None = None
+    """Folder of a pair; by default the sample, if it is there."""
+    height: int = 512
+    """Panoramas are resized to this height, pixels; a multiple of 64."""
+    quick: bool = False
+    """Precisions only, without tiles, a single thread and the official code's defects."""
+    json: Path | None = None
+    """File for the rows; written after every row."""
+    out: OptionalOut = None
+    """Folder for model.json, model.md and model.png."""
+    threads: int | None = None
+    """The largest number of threads to use; by default torch's."""
+
+    def run(self) -> int:
+        """Measure, print the table and write the files; an interruption keeps what was measured."""
+        from pansplat.bench.model import measure_model, model_cases, model_report
+        from pansplat.bench.roofline import describe_machine
+        from pansplat.model.network import has_bfloat16
+
+        json = self.json
+        if self.out is not None:
+            self.out.mkdir(parents=True, exist_ok=True)
+            json = json or self.out / "model.json"
+        _require_folder(json)
+        threads = _choose_threads(self.threads)
+        require_height(self.height)
+        if self.height % 64:
+            raise InputError(f"--height must be a multiple of 64 pixels, so that 4x4 tiles fit, got {self.height}")
+        folder = self.pair or _SAMPLE
+        if not folder.is_dir():
+            raise InputError(f"{folder} is not a folder; give one with --pair (the sample is in the repository only)")
+        views = choose_pair(folder, PairChoice()).load_context(self.height)
+        bfloat16 = has_bfloat16()
+        if not bfloat16:
+            print("without bfloat16: this processor has no instructions for it")
+        machine = describe_machine(threads)
+        cases = model_cases(threads, bfloat16=bfloat16, quick=self.quick)
+        with (
+            self._weights() as (weights, network),
+            model_report(machine, network, height=self.height, json=json, out=self.out) as report,
+        ):
+            measure_model(cases, views, weights, report, scene=folder.name)
+        return 0
+
+    @contextmanager
+    def _weights(self) -> Iterator[tuple[Path, str]]:
+        """The file of weights, and what they are."""
+        from pansplat.bench.model import save_random_weights
+        from pansplat.model.weights import load_weights
+
+        if self.model is not None:
+            weights = load_weights(self.model)
+            if weights.model != "pansplat":
+                raise InputError(f"{self.model}: the benchmark needs weights of PanSplat, got those of {weights.model}")
+            yield self.model, f"PanSplat with the weights of {self.model.name}"
+            return
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "random.safetensors")
+            save_random_weights(path)
+            yield path, _RANDOM_WEIGHTS
 
 
-def _threads(wanted: int | None) -> int:
-    """The number of threads asked for; by default as many as torch uses."""
-    if wanted is not None and wanted < 1:
-        raise InputError(f"--threads must be at least 1, got {wanted}")
-    return wanted or torch.get_num_threads()
+@dataclass(frozen=True)
+class BenchMemory:
+    """Measure the memory of a training step and of a prediction over resolutions, for each way of backpropagation.
+
+    Every row runs in a process of its own. With --out, the same command continues an interrupted run.
+    """
+
+    preset: Literal["tiny", "small", "paper"] = "small"
+    """Size of the network; weights are random."""
+    heights: tuple[int, ...] = (128, 256, 512, 1024)
+    """Of the panoramas, pixels; multiples of 32. Above 512 only the heads are trained, as in the paper's stages."""
+    quick: bool = False
+    """Without one-step and 4 tiles."""
+    limit_gb: float = 8.0
+    """Largest memory of a row, 10^9 bytes. Rows expected to need more are skipped, rows that take more are ended."""
+    style: Literal["panorama", "cubemap", "original"] = "cubemap"
+    """How images are rendered; as training's --memory.style."""
+    perceptual: Literal["structure", "lpips-vgg", "lpips-alex", "lpips-squeeze"] = "structure"
+    """Part of the loss; LPIPS needs its weights."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """auto: a GPU if there is one; its memory is that of torch's allocator."""
+    threads: int | None = None
+    """Threads to use; by default torch's."""
+    out: OptionalOut = None
+    """Folder for memory.json, memory.md and memory.png."""
+
+    def run(self) -> int:
+        """Measure, print the table and write the files; an interruption keeps what was measured."""
+        from pansplat.bench.memory import MemoryBench, memory_cases, memory_report, read_rows
+        from pansplat.bench.model import save_random_weights
+        from pansplat.bench.roofline import describe_machine
+        from pansplat.training.network import network_config
+
+        setting = self._setting()
+        for height in self.heights:
+            if height < 64 or height % 32:  # 4x4 tiles must fit the four levels
+                raise InputError(f"--heights must be 64 pixels or more and multiples of 32, got {height}")
+        cases = memory_cases(self.heights, quick=self.quick)
+        with tempfile.TemporaryDirectory() as temporary:
+            folder = self.out or Path(temporary)
+            folder.mkdir(parents=True, exist_ok=True)
+            rows = read_rows(folder / "memory.json", setting)
+            weights = Path(temporary, "random.safetensors")
+            save_random_weights(weights, network_config(setting.network))
+            references = folder / "references"
+            references.mkdir(exist_ok=True)
+            with memory_report(describe_machine(setting.threads), setting, cases, self.out) as report:
+                report.rows += rows
+                MemoryBench(setting, weights, references, report).run(cases)
+            shutil.rmtree(references, ignore_errors=True)  # only an interrupted run needs them
+        return 0
+
+    def _setting(self) -> MemorySetting:
+        import torch
+
+        from pansplat.bench.memory import MemorySetting
+
+        threads = _choose_threads(self.threads)
+        if not 0 < self.limit_gb < math.inf:
+            raise InputError(f"--limit-gb must be positive, got {self.limit_gb}")
+        if self.device == "cuda" and not torch.cuda.is_available():
+            raise InputError("--device cuda needs a CUDA device that torch can use, got none; use --device cpu.")
+        cuda = self.device == "cuda" or (self.device == "auto" and torch.cuda.is_available())
+        device, limit_gib = "cuda" if cuda else "cpu", self.limit_gb * 1e9 / 2**30
+        return MemorySetting(self.preset, self.style, self.perceptual, threads, device, limit_gib)
 
 
-def _free_memory() -> float:
-    """Bytes that a run may take: three quarters of what is free."""
+@dataclass(frozen=True)
+class BenchMachine:
+    """Measure the machine's peaks: multiply-adds and memory bandwidth."""
+
+    threads: int | None = None
+    """The largest number of threads to use; by default torch's."""
+
+    def run(self) -> int:
+        """Print the machine and its peaks."""
+        from pansplat.bench.report import print_facts
+        from pansplat.bench.roofline import describe_machine
+
+        print_facts(describe_machine(_choose_threads(self.threads)))
+        return 0
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Measure speed, memory and error on this machine."""
+
+    what: (
+        Annotated[BenchRaster, subcommand("raster")]
+        | Annotated[BenchModel, subcommand("model")]
+        | Annotated[BenchMemory, subcommand("memory")]
+        | Annotated[BenchMachine, subcommand("machine")]
+    )
+
+    def run(self) -> int:
+        """Run the chosen benchmark."""
+        return self.what.run()
+
+
+def _choose_threads(threads: int | None) -> int:
+    """The number of threads; by default torch's."""
+    import torch
+
+    if threads is not None and threads < 1:
+        raise InputError(f"--threads must be at least 1, got {threads}")
+    return threads or torch.get_num_threads()
+
+
+def _usable_memory() -> float:
+    """Bytes that a run may take: three quarters of the free memory."""
     try:
         pages = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (ValueError, OSError, AttributeError):
-        return _MEMORY
+        return _DEFAULT_MEMORY
     return 0.75 * pages
 
 
-def _files(command: BenchRaster) -> dict[str, Path | None]:
-    """Where the rows, the two pictures and the page of tables go; refused before the work when a folder is missing."""
-    files: dict[str, Path | None] = {"json": command.json, "plot": command.plot, "sweeps": None, "page": None}
-    if command.out is not None:
-        command.out.mkdir(parents=True, exist_ok=True)
-        files["json"] = command.json or command.out / "raster.json"
-        files["plot"] = command.plot or command.out / "raster.png"
-        files["page"] = command.out / "raster.md"
-    if files["plot"] is not None:
-        files["sweeps"] = files["plot"].with_name(f"{files['plot'].stem}_sweeps{files['plot'].suffix}")
-    for file in files.values():
-        if file is not None and not file.resolve().parent.is_dir():
-            raise InputError(f"cannot write {file}: its folder does not exist; create it first")
-    if files["plot"] is not None and files["plot"].suffix.lower() not in (".png", ".svg", ".pdf"):
-        raise InputError(f"--plot must end in .png, .svg or .pdf, got {files['plot']}")
-    return files
-
-
-def _scene(path: Path, height: int, source: SceneSource = "prediction") -> Callable[[int], Subject]:
-    """A .ply file's scene or a pair's, seen from between its cameras (from the origin if it has none)."""
-    scene = _read(path, height, source)
-    pose = scene.pose_between(0.5) if len(scene.cam2world) else torch.eye(4, dtype=torch.float64)
-    return of_scene(path.stem, lambda: scene.gaussians, pose)
-
-
-def _read(path: Path, height: int, source: SceneSource) -> Scene:
-    """The scene of a .ply file; of a pair's folder what `sweep` predicts, or what its depth maps show."""
-    if path.suffix.lower() == ".ply":
-        if source == "depth":
-            raise InputError(f"--scene-from depth needs a pair's folder with depth maps, got {path}; leave it out")
-        return pipeline.load(path)
-    pair = choose_pair(path, PairChoice())
-    if source == "depth":
-        return lift_depth(pair.load_context(height))
-    with progress_bar() as progress:
-        return pipeline.predict(pair, "sweep", height=height, progress=progress)
-
-
-def _add_viewer(bench: Bench, settings: Settings, subject: Callable[[int], Subject]) -> None:
-    """The viewer's rows among the choices; without OpenGL a note says why there are none."""
-    height = settings.choice_height
-    sizes = (default_face_size(height),) if settings.quick else settings.face_sizes
-    cases = [case for case in choices("gl", height, sizes, settings.threads) if case.layout == "cubemap"]
-    if settings.quick:
-        cases = [case for case in cases if _is_plain(case)]
-    try:
-        group = Group("choices", subject(height), tuple(cases), "own")
-        measure_viewer(bench, group, repeats=2 if settings.quick else 5)
-    except InputError as error:
-        print(f"without the viewer: {error}")
-
-
-def _is_plain(case: Case) -> bool:
-    """The exact choices, the classic kernel in their place, and all of the classic renderer's."""
-    return (case.order, case.filter) == ("radial", "angular") or (case.kernel, case.order, case.filter) == (
-        "ewa",
-        "z",
-        "3dgs",
-    )
-
-
-def _live() -> Live:
-    console = Console(stderr=True)
-    return Live(console=console, refresh_per_second=4, transient=True)
-
-
-def _show(live: Live, doing: str, rows: list[Row]) -> None:
-    """The last rows, and what is being measured; one line a step where there is no terminal."""
-    if live.console.is_terminal:
-        live.update(rich.console.Group(*tables(rows[-_SHOWN:]), Text(doing, style="cyan")))
-
-
-def _report(bench: Bench, files: dict[str, Path | None]) -> None:
-    """Print the tables and the headlines, and write the pictures, of whatever was measured."""
-    console = table_console(_WIDTH)
-    machine = bench.machine
-    for name in ("cpu", "threads", "gpu", "fma_gflops", "bandwidth_gb_s"):
-        print(f"{name:<15} {_facts(machine[name])}")
-    for table in tables(bench.rows):
-        console.print(table)
-    for sentence in findings(bench.rows):
-        print(sentence)
-    written = [files["json"]] if bench.rows else []
-    if files["plot"] is not None and plot_choices(bench.rows, files["plot"]):
-        written.append(files["plot"])
-    if files["sweeps"] is not None and plot_sweeps(bench.rows, files["sweeps"]):
-        written.append(files["sweeps"])
-    if files["page"] is not None and bench.rows:
-        with replacing(files["page"]) as partial:
-            partial.write_text(markdown(bench.rows))
-        written.append(files["page"])
-    for file in written:
-        if file is not None:
-            print(file)
-
-
-def _facts(value: object) -> str:
-    if isinstance(value, dict):
-        return ", ".join(f"{name}: {one}" for name, one in value.items())
-    return "none" if value is None else str(value)
+def _require_folder(file: Path | None) -> None:
+    if file is not None and not file.resolve().parent.is_dir():
+        raise InputError(f"cannot write {file}: its folder does not exist; create it first")

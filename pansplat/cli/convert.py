@@ -1,48 +1,71 @@
-"""`pansplat convert`: an original checkpoint to a file of weights."""
+"""`pansplat convert`: an official checkpoint to a file of weights."""
 
 from __future__ import annotations
 
-from rich.table import Table
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from pansplat.cli.commands import Convert
-from pansplat.cli.printing import table_console
+from tyro.conf import Positional
+
+from pansplat.cli.inputs import Out
+from pansplat.console import table_console
 from pansplat.errors import InputError
-from pansplat.model.network import convert_checkpoint
-from pansplat.model.weights import ConversionReport, match_tensors, read_checkpoint, save_weights
 
-_SHOWN = 2  # names a line of the report
+if TYPE_CHECKING:
+    from rich.table import Table
 
+    from pansplat.model.weights import ConversionReport
 
-def run_convert(command: Convert) -> int:
-    """Tell what becomes of every tensor, then convert and save; the table also shows why a checkpoint is refused."""
-    if command.out.suffix.lower() != ".safetensors" or not command.out.resolve().parent.is_dir():
-        raise InputError(f"--out must be a .safetensors file in an existing folder, got {command.out}")
-    content = read_checkpoint(command.path)
-    report = match_tensors(content, command.path)
-    table_console().print(_table(report))
-    weights = convert_checkpoint(content, command.path)
-    save_weights(command.out, weights)
-    numbers = sum(tensor.numel() for tensor in weights.tensors.values())
-    print(
-        f"{command.out}: {len(weights.tensors)} tensors, {numbers:,} numbers; --model {command.out} computes what the "
-        "original does (--compat official), unless told --compat fixed"
-    )
-    return 0
+_MAX_NAMES = 2  # in a row of the report
 
 
-def _table(report: ConversionReport) -> Table:
-    """A line each for what is used, left out (by reason), unknown and missing."""
-    table = Table(title=f"{report.model}: what the checkpoint holds")
+@dataclass(frozen=True)
+class Convert:
+    """Convert a checkpoint of the official PanSplat (or its MVSplat baseline) to a file of weights.
+
+    No code in the checkpoint is executed. Use the weights with --model.
+    """
+
+    path: Positional[Path]
+    """The official Lightning checkpoint (.ckpt)."""
+    out: Out
+    """The .safetensors file to write."""
+
+    def run(self) -> int:
+        """Print what becomes of every tensor, then convert and save; the table also explains a refusal."""
+        from pansplat.model.network import convert_checkpoint
+        from pansplat.model.weights import match_tensors, read_checkpoint, save_weights
+
+        if self.out.suffix.lower() != ".safetensors" or not self.out.resolve().parent.is_dir():
+            raise InputError(f"--out must be a .safetensors file in an existing folder, got {self.out}")
+        content = read_checkpoint(self.path)
+        table_console().print(_report_table(match_tensors(content, self.path)))
+        weights = convert_checkpoint(content, self.path)
+        save_weights(self.out, weights)
+        numbers = sum(tensor.numel() for tensor in weights.tensors.values())
+        print(
+            f"{self.out}: {len(weights.tensors)} tensors, {numbers:,} numbers; --model {self.out} computes what the "
+            "official code does (--compat official); --compat fixed corrects its defects"
+        )
+        return 0
+
+
+def _report_table(report: ConversionReport) -> Table:
+    """Rows of used, unused (by reason), unknown and missing tensors."""
+    from rich.table import Table
+
+    table = Table(title=f"{report.model}: tensors of the checkpoint")
     table.add_column("")
     table.add_column("count", justify="right")
     table.add_column("such as", overflow="fold")
-    table.add_row("used", str(len(report.used)), _first(list(report.used)))
+    table.add_row("used", str(len(report.used)), _first_names(list(report.used)))
     for reason, names in report.unused.items():
-        table.add_row(f"left out: {reason}", str(len(names)), _first(names))
+        table.add_row(f"left out: {reason}", str(len(names)), _first_names(names))
     for word, names in (("unknown", report.surplus), ("missing", report.missing)):
-        table.add_row(word, str(len(names)), _first(names), style="bold red" if names else "")
+        table.add_row(word, str(len(names)), _first_names(names), style="bold red" if names else "")
     return table
 
 
-def _first(names: list[str]) -> str:
-    return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
+def _first_names(names: list[str]) -> str:
+    return ", ".join(names[:_MAX_NAMES]) + (", ..." if len(names) > _MAX_NAMES else "")

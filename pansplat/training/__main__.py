@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
-import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from pansplat.errors import InputError
+from pansplat.console import own_warnings, run_command
 
 if TYPE_CHECKING:
     from pansplat.training.config import TrainConfig
@@ -16,23 +14,12 @@ if TYPE_CHECKING:
 
 def run(argv: Sequence[str] | None = None) -> int:
     """Train and return the exit status: 0 done, 2 bad input, 130 stopped and saved."""
-    try:
-        return _train(parse(argv))
-    except InputError as error:
-        _say("error", error)
-        return 2
-    except (MemoryError, RuntimeError) as error:
-        if not _lacks_memory(error):
-            raise
-        _say(
-            "error",
-            f"this takes more memory than there is ({str(error).splitlines()[0][:120]}); choose lower --heights, a "
-            "smaller --optimizer.batch-size, or --memory.backpropagation two-step with more --memory.tiles.",
-        )
-        return 2
-    except KeyboardInterrupt:
-        _say("interrupted", "steps after the last checkpoint are lost; the same command goes on from it")
-        return 130
+    return run_command(
+        lambda: _train(parse(argv)),
+        memory_advice="choose lower --heights, a smaller --optimizer.batch-size, or --memory.backpropagation two-step "
+        "with more --memory.tiles.",
+        interruption="steps after the last checkpoint are lost; the same command goes on from it",
+    )
 
 
 def _train(config: TrainConfig) -> int:
@@ -40,21 +27,11 @@ def _train(config: TrainConfig) -> int:
     from pansplat.training.trainer import Trainer
 
     processes = ProcessGroup()
-    with _our_warnings():
+    with own_warnings():
         try:
             return 0 if Trainer(config, processes).train() else 130
         finally:
             processes.leave()
-
-
-@contextlib.contextmanager
-def _our_warnings() -> Iterator[None]:
-    """What the libraries below warn of is for their users; what we warn of is for ours."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        warnings.filterwarnings("always", category=UserWarning, module=r"pansplat(\.|$)")
-        warnings.showwarning = lambda message, *_: _say("note", message)
-        yield
 
 
 def parse(argv: Sequence[str] | None = None) -> TrainConfig:
@@ -70,15 +47,6 @@ def parse(argv: Sequence[str] | None = None) -> TrainConfig:
         description="Train a network. A run that was stopped goes on with the same command.",
         config=(tyro.conf.FlagCreatePairsOff,),
     )
-
-
-def _lacks_memory(error: BaseException) -> bool:
-    """Whether Python, numpy or torch could not allocate; torch's CPU allocator says so only in words."""
-    return isinstance(error, MemoryError) or "allocate" in str(error) or "out of memory" in str(error).lower()
-
-
-def _say(word: str, text: object) -> None:
-    print(f"{word}: {text}", file=sys.stderr)
 
 
 if __name__ == "__main__":

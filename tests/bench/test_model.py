@@ -1,4 +1,4 @@
-"""The network's bench: errors against the plain float32 row, one process a row, files that a person reads."""
+"""`pansplat bench model`: errors against the float32 row, one process per row, files and tables."""
 
 from __future__ import annotations
 
@@ -12,14 +12,20 @@ import safetensors.torch
 import torch
 
 from pansplat.bench import model as bench_model
-from pansplat.bench import model_case, roofline
-from pansplat.bench.model import ModelRow, model_cases, psnr, relative_errors
-from pansplat.bench.model_case import Measured, ModelCase, measure_case
-from pansplat.bench.model_report import model_cells, model_markdown
-from pansplat.bench.model_weights import save_random_weights
-from pansplat.cli import bench_model as command
+from pansplat.bench.fidelity import clamped_psnr, relative_depth_errors
+from pansplat.bench.model import (
+    MODEL_COLUMNS,
+    STAGES,
+    ModelCase,
+    ModelResult,
+    ModelRow,
+    measure_case,
+    model_cases,
+    save_random_weights,
+)
 from pansplat.cli import run
 from pansplat.errors import InputError
+from pansplat.model import network as model_network
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
 from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
 from pansplat.model.heads import AdapterConfig, HeadsConfig
@@ -37,36 +43,34 @@ SMALL = PanSplatConfig(
 PLAIN = ModelCase("fixed", "float32", "float32", 1, 1)
 
 
-def _small_weights(path: Path) -> None:
-    save_random_weights(path, SMALL)
-
-
 @pytest.fixture
-def no_children(monkeypatch: pytest.MonkeyPatch) -> list[ModelCase]:
-    """Answers in place of the children's, each row a little further off; the cases that were asked for."""
-    asked: list[ModelCase] = []
+def measured(monkeypatch: pytest.MonkeyPatch, fast_peaks: None) -> list[ModelCase]:
+    """The measured cases; results are made up, with an error that increases from row to row."""
+    cases: list[ModelCase] = []
 
-    def answer(case: ModelCase, weights: Path, views: Path, *, near: float, far: float) -> Measured:
+    def measure(case: ModelCase, weights: Path, views: Path, *, near: float, far: float) -> tuple:
         assert weights.is_file() and views.is_file() and 0 < near < far
-        asked.append(case)
-        off = 0.001 * (len(asked) - 1)
-        depth, picture = torch.full((2, 32, 64), 2.0 + 2 * off), torch.full((3, 64, 128), 0.5 + off)
-        return Measured({"features": 1.0, "mono": 2.0, "cost volume": 3.0, "heads": 4.0}, 17.0, 1.5, 10, depth, picture)
+        cases.append(case)
+        error = 0.001 * (len(cases) - 1)
+        stages = {"features": 1.0, "mono": 2.0, "cost volume": 3.0, "heads": 4.0}
+        tensors = {
+            "depth": torch.full((2, 32, 64), 2.0 + 2 * error),
+            "image": torch.full((3, 64, 128), 0.5 + error),
+        }
+        return ModelResult(64, 10, stages, 10.0, 17.0, 1.5), tensors
 
-    monkeypatch.setattr(bench_model, "measure_case", answer)
-    monkeypatch.setattr(command, "save_random_weights", _small_weights)
-    monkeypatch.setattr(command, "has_bfloat16", lambda: True)
-    monkeypatch.setattr(roofline, "_STEPS", 1 << 12)
-    monkeypatch.setattr(roofline, "_ELEMENTS", 1 << 12)
-    return asked
+    monkeypatch.setattr(bench_model, "measure_case", measure)
+    monkeypatch.setattr(bench_model, "save_random_weights", lambda path: save_random_weights(path, SMALL))
+    monkeypatch.setattr(model_network, "has_bfloat16", lambda: True)
+    return cases
 
 
-def test_the_command_writes_and_prints_what_was_measured(no_children, tmp_path, capsys):
+def test_the_command_writes_and_prints_what_was_measured(measured, tmp_path, capsys):
     out = tmp_path / "out"
     assert run(["bench", "model", "--height", "64", "--quick", "--out", str(out), "--threads", "1"]) == 0
     assert sorted(file.name for file in out.iterdir()) == ["model.json", "model.md", "model.png"]
     rows = json.loads((out / "model.json").read_text())["rows"]
-    assert len(rows) == len(no_children) == 3
+    assert len(rows) == len(measured) == 3
     assert rows[0]["is_reference"] and rows[0]["psnr_db"] is None
     assert (rows[1]["total_s"], rows[1]["processor_s"]) == (10.0, 17.0) and rows[1]["height"] == 64
     assert rows[1]["depth_max_error"] == pytest.approx(0.001, rel=1e-3)
@@ -77,13 +81,13 @@ def test_the_command_writes_and_prints_what_was_measured(no_children, tmp_path, 
         assert word in printed
 
 
-def test_an_interruption_keeps_what_was_measured(no_children, tmp_path, monkeypatch, capsys):
-    answer = bench_model.measure_case
+def test_an_interruption_keeps_what_was_measured(measured, tmp_path, monkeypatch, capsys):
+    measure = bench_model.measure_case
 
-    def interrupted(case: ModelCase, *arguments, **others) -> Measured:
-        if len(no_children) == 2:
+    def interrupted(case: ModelCase, *arguments, **options) -> tuple:
+        if len(measured) == 2:
             raise KeyboardInterrupt
-        return answer(case, *arguments, **others)
+        return measure(case, *arguments, **options)
 
     monkeypatch.setattr(bench_model, "measure_case", interrupted)
     file = tmp_path / "rows.json"
@@ -93,23 +97,23 @@ def test_an_interruption_keeps_what_was_measured(no_children, tmp_path, monkeypa
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (["--height", "80"], "multiple of 64"),
         (["--threads", "0"], "--threads must be at least 1"),
         (["--json", "no/rows.json"], "create it first"),
-        (["--pair", "nowhere"], "nowhere is no folder"),
+        (["--pair", "nowhere"], "nowhere is not a folder"),
         (["--model", "none.safetensors"], "none.safetensors"),
     ],
 )
-def test_unusable_arguments_are_refused(no_children, arguments, told, capsys, tmp_path, monkeypatch):
+def test_invalid_arguments_are_refused(measured, arguments, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run(["bench", "model", *arguments]) == 2
-    assert told in capsys.readouterr().err
-    assert no_children == []
+    assert message in capsys.readouterr().err
+    assert measured == []
 
 
-def test_each_compat_begins_with_its_plain_row():
+def test_each_compat_begins_with_its_reference():
     cases = model_cases(2, bfloat16=True, quick=False)
     assert len(set(cases)) == len(cases)
     for compat in ("fixed", "official"):
@@ -121,9 +125,9 @@ def test_each_compat_begins_with_its_plain_row():
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> tuple[Path, Path]:
-    """Weights of a small network, and views of it."""
+    """Weights of a small network, and views for it."""
     folder = tmp_path_factory.mktemp("bench")
-    _small_weights(folder / "small.safetensors")
+    save_random_weights(folder / "small.safetensors", SMALL)
     poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     poses[1, 0, 3] = 0.5
     images = torch.rand(2, 3, 64, 128, generator=torch.Generator().manual_seed(0))
@@ -132,45 +136,47 @@ def files(tmp_path_factory) -> tuple[Path, Path]:
 
 
 @pytest.fixture(scope="module")
-def plain(files) -> Measured:
-    """What a child makes of the plain case."""
+def plain(files) -> tuple:
+    """The result and the tensors of the plain case."""
     return measure_case(PLAIN, *files, near=0.5, far=10.0)
 
 
-def test_a_child_measures_what_the_network_gives(files, plain):
-    assert list(plain.stages_s) == list(model_case.STAGES)
-    assert plain.stages_s["mono"] == 0 and all(plain.stages_s[name] > 0 for name in ("features", "heads"))
-    assert plain.peak_gib is None or 0.05 < plain.peak_gib < 2
-    network, kept = build_network(load_weights(files[0]), "fixed", files[0]), safetensors.torch.load_file(files[1])
+def test_a_child_measures_the_prediction_of_the_network(files, plain):
+    result, tensors = plain
+    assert list(result.stages_s) == list(STAGES)
+    assert result.stages_s["mono"] == 0 and all(result.stages_s[name] > 0 for name in ("features", "heads"))
+    assert result.total_s == pytest.approx(sum(result.stages_s.values()))
+    assert result.peak_gib is None or 0.05 < result.peak_gib < 2
+    network, views = build_network(load_weights(files[0]), "fixed", files[0]), safetensors.torch.load_file(files[1])
     bounds = torch.full((1, 2), 0.5), torch.full((1, 2), 10.0)
     with torch.no_grad():
-        output = network(kept["images"][None], kept["cam2world"][None].float(), *bounds)
-    assert relative_errors(plain.depth, output.depths.depth[-1][0])[1] < 1e-4
-    assert float(plain.depth.std() / plain.depth.mean()) > 0.01
-    assert plain.num_gaussians == len(output.gaussians[0])
-    assert plain.picture.shape == (3, 64, 128) and float(plain.picture.std()) > 0.01
+        output = network(views["images"][None], views["cam2world"][None].float(), *bounds)
+    assert relative_depth_errors(tensors["depth"], output.depths.depth[-1][0])[1] < 1e-4
+    assert float(tensors["depth"].std() / tensors["depth"].mean()) > 0.01
+    assert result.num_gaussians == len(output.gaussians[0]) and result.height == 64
+    assert tensors["image"].shape == (3, 64, 128) and float(tensors["image"].std()) > 0.01
 
 
-def test_tiles_change_next_to_nothing(files, plain):
-    tiled = measure_case(dataclasses.replace(PLAIN, tiles=2), *files, near=0.5, far=10.0)
-    assert torch.equal(plain.depth, tiled.depth)  # tiles are the heads' affair
-    assert psnr(tiled.picture, plain.picture) > 60
+def test_tiles_hardly_change_the_prediction(files, plain):
+    _, tiled = measure_case(dataclasses.replace(PLAIN, tiles=2), *files, near=0.5, far=10.0)
+    assert torch.equal(plain[1]["depth"], tiled["depth"])  # only the heads are tiled
+    assert clamped_psnr(tiled["image"], plain[1]["image"]) > 60
 
 
-@pytest.mark.skipif(not has_bfloat16(), reason="a processor without bfloat16 imitates it slowly")
-def test_bfloat16_changes_little(files, plain):
-    rounded = measure_case(dataclasses.replace(PLAIN, precision="bfloat16"), *files, near=0.5, far=10.0)
-    median, largest = relative_errors(rounded.depth, plain.depth)
+@pytest.mark.skipif(not has_bfloat16(), reason="emulated bfloat16 is slow")
+def test_bfloat16_changes_the_prediction_a_little(files, plain):
+    _, rounded = measure_case(dataclasses.replace(PLAIN, precision="bfloat16"), *files, near=0.5, far=10.0)
+    median, largest = relative_depth_errors(rounded["depth"], plain[1]["depth"])
     assert 0 < median < 0.02 and largest < 0.5
-    assert psnr(rounded.picture, plain.picture) > 25
+    assert clamped_psnr(rounded["image"], plain[1]["image"]) > 25
 
 
-def test_a_child_that_fails_is_an_error_that_tells_what_it_said(files, tmp_path):
+def test_the_error_of_a_child_is_passed_on(files, tmp_path):
     with pytest.raises(InputError, match=r"a row of the bench failed \(.*FileNotFoundError.*try a smaller --height"):
         measure_case(PLAIN, files[0], tmp_path / "none.safetensors", near=0.5, far=10.0)
 
 
-def test_random_weights_are_the_same_for_a_seed(tmp_path, files):
+def test_random_weights_depend_on_the_seed_only(tmp_path, files):
     for seed in (0, 1):
         save_random_weights(tmp_path / f"{seed}.safetensors", SMALL, seed=seed)
     first, same, other = (load_weights(file).tensors for file in (files[0], *sorted(tmp_path.iterdir())))
@@ -178,15 +184,8 @@ def test_random_weights_are_the_same_for_a_seed(tmp_path, files):
     assert not all(torch.equal(first[name], other[name]) for name in first)
 
 
-def test_errors_are_relative_to_the_reference():
-    reference = torch.tensor([1.0, 2.0, 4.0])
-    assert relative_errors(torch.tensor([1.0, 2.2, 3.0]), reference) == (pytest.approx(0.1), pytest.approx(0.25))
-    assert psnr(reference / 4, reference / 4) == math.inf
-
-
-def test_what_was_not_measured_is_blank():
-    row = ModelRow("fixed", "float32", "float32", 1, 1, 64)
-    assert model_cells(row)[5:] == ("",) * 10
-    same = dataclasses.replace(row, psnr_db=math.inf, depth_median_error=0.0, depth_max_error=0.0)
-    assert model_cells(same)[-3:] == ("0.0e+00", "0.0e+00", "same")
-    assert model_markdown([row]).count("\n") == 3
+def test_cells_of_unmeasured_values_are_empty():
+    row = ModelRow("model", "room", PLAIN, ModelResult(64))
+    assert [column.cell(row) for column in MODEL_COLUMNS][5:] == [""] * 10
+    row.result = ModelResult(64, depth_median_error=0.0, depth_max_error=0.0, psnr_db=math.inf)
+    assert [column.cell(row) for column in MODEL_COLUMNS][-3:] == ["0.0e+00", "0.0e+00", "same"]

@@ -1,134 +1,249 @@
-"""A run keeps what it measured, whatever happens, and tells right from wrong choices."""
+"""The raster benchmark keeps what it measured, and its findings compare like with like."""
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pansplat.bench import raster
-from pansplat.bench.cases import Case, Group, default_face_size, official
-from pansplat.bench.plan import room
-from pansplat.bench.raster import Bench
+from pansplat.bench.raster import (
+    RASTER_COLUMNS,
+    RasterBench,
+    RasterResult,
+    RasterRow,
+    pareto_front,
+    plot_choices,
+    plot_sweeps,
+    raster_findings,
+    raster_report,
+)
+from pansplat.bench.raster_cases import Group, RasterCase, default_face_size, official_choice, room_scene
+from pansplat.bench.renderers import ViewerImage
 
 HEIGHT = 16
-MACHINE = {"fma_gflops": {"1": 100.0, "2": 200.0}, "bandwidth_gb_s": {"1": 30.0, "2": 30.0}}
-DIRECT = Case("torch", HEIGHT)
+FACTS = {"cpu": "some", "threads": 2, "gpu": None}
+MACHINE = FACTS | {"fma_gflops": {"1": 100.0, "2": 200.0}, "bandwidth_gb_s": {"1": 30.0, "2": 30.0}}
+DIRECT = RasterCase("torch", HEIGHT)
 FACES = replace(DIRECT, layout="cubemap", face_size=default_face_size(HEIGHT))
+NUMBER = st.integers(1, 6).map(float)
 
 
-def group(*cases: Case, truths: str = "own", backward: bool = False) -> Group:
-    return Group("choices", room(HEIGHT), tuple(replace(case, backward=backward) for case in cases), truths)
+def group(*cases: RasterCase, references: str = "own", backward: bool = False, height: int = HEIGHT) -> Group:
+    return Group("choices", room_scene(height), tuple(replace(case, backward=backward) for case in cases), references)
 
 
-def by_case(bench: Bench) -> dict[tuple, raster.Row]:
-    return {(row.kernel, row.order, row.layout, row.precision): row for row in bench.rows}
+def measure(*groups: Group, budget: float = 0, **files) -> list[RasterRow]:
+    report = raster_report(MACHINE, **files)
+    RasterBench(report, budget=budget).run(groups)
+    return report.rows
 
 
-def test_rows_hold_times_memory_errors_and_distances_to_the_peaks():
-    bench = Bench(MACHINE, budget=0.1)
-    bench.run([group(DIRECT, backward=True)])
-    truth, row = bench.rows
-    assert (truth.precision, truth.max_error, truth.repeats) == ("float64", 0, 1)
-    assert row.forward_ms > 0 and row.backward_ms > 0 and row.forward_min_ms <= row.forward_ms
-    assert row.forward_cpu_ms > 0 and row.backward_cpu_ms > 0
-    assert row.num_gaussians == 862 and row.repeats >= 1
-    assert 0 < row.max_error < 1e-5 and row.psnr_db > 120 and row.own_max_error == row.max_error
-    assert 0 < row.fma_fraction < 1 and 0 < row.bandwidth_fraction < 1 and row.pairs > 0
-    expected = 46 * row.pairs / (1e-3 * row.forward_cpu_ms) / 100e9
-    assert row.fma_fraction == pytest.approx(expected)
+def results(rows: list[RasterRow]) -> Mapping[tuple, RasterResult]:
+    return {(row.case.kernel, row.case.order, row.case.layout, row.case.precision): row.result for row in rows}
 
 
-def test_errors_tell_the_choice_apart_from_the_backend():
-    bench = Bench(MACHINE, budget=0)
-    bench.run([group(FACES, replace(FACES, kernel="ewa"), official("torch", HEIGHT, 1))])
-    rows = by_case(bench)
-    exact, classic = rows["ray", "radial", "cubemap", "float32"], rows["ewa", "radial", "cubemap", "float32"]
-    original = rows["ewa", "z", "cubemap", "float32"]
-    assert exact.psnr_db > classic.psnr_db > original.psnr_db
-    assert exact.seam_jump < 0.01 < classic.seam_jump
-    assert all(row.own_max_error < 1e-5 for row in (exact, classic, original))
-    assert rows["ewa", "z", "cubemap", "float64"].max_error == pytest.approx(original.max_error, rel=1e-3)
+def test_rows_hold_times_memory_errors_and_fractions_of_the_peaks():
+    reference, row = measure(group(DIRECT, backward=True), budget=0.1)
+    assert (reference.case.precision, reference.result.max_error, reference.result.repeats) == ("float64", 0, 1)
+    result = row.result
+    assert result.forward_ms > 0 and result.backward_ms > 0 and result.forward_min_ms <= result.forward_ms
+    assert result.forward_cpu_ms > 0 and result.backward_cpu_ms > 0
+    assert result.num_gaussians == 862 and result.repeats >= 1
+    assert 0 < result.max_error < 1e-5 and result.psnr_db > 120 and result.own_max_error == result.max_error
+    assert 0 < result.fma_fraction < 1 and 0 < result.bandwidth_fraction < 1 and result.pairs > 0
+    assert result.fma_fraction == pytest.approx(46 * result.pairs / (1e-3 * result.forward_cpu_ms) / 100e9)
+    values = row.as_json()
+    for kind, names in (
+        (str, "suite scene backend kernel order filter layout stitching precision"),
+        (int, "height threads num_gaussians repeats"),
+        (float, "forward_ms backward_ms peak_mb psnr_db max_error seam_jump energy_error"),
+    ):
+        assert all(isinstance(values[name], kind) for name in names.split())
 
 
-def test_a_pinhole_view_is_compared_with_the_exact_view():
-    view = replace(DIRECT, layout="pinhole")
-    bench = Bench(MACHINE, budget=0)
-    bench.run([group(view, replace(view, kernel="ewa"))])
-    rows = by_case(bench)
-    assert rows["ray", "radial", "pinhole", "float32"].max_error < 1e-5
-    assert rows["ewa", "radial", "pinhole", "float32"].max_error > 1e-3
-    assert rows["ray", "radial", "pinhole", "float32"].seam_jump is None
+def test_errors_of_the_choice_are_separate_from_those_of_the_backend():
+    found = results(measure(group(FACES, replace(FACES, kernel="ewa"), official_choice("torch", HEIGHT, 1))))
+    exact, ewa = found["ray", "radial", "cubemap", "float32"], found["ewa", "radial", "cubemap", "float32"]
+    official = found["ewa", "z", "cubemap", "float32"]
+    assert exact.psnr_db > ewa.psnr_db > official.psnr_db
+    assert exact.seam_jump < 0.01 < ewa.seam_jump
+    assert all(result.own_max_error < 1e-5 for result in (exact, ewa, official))
+    assert found["ewa", "z", "cubemap", "float64"].max_error == pytest.approx(official.max_error, rel=1e-3)
 
 
-def test_the_exact_truth_alone_is_drawn_where_that_is_asked_for():
-    bench = Bench(MACHINE, budget=0)
-    bench.run([group(FACES, truths="exact"), group(DIRECT, truths="none")])
-    assert [row.precision for row in bench.rows] == ["float64", "float32", "float32"]
-    assert bench.rows[1].own_max_error is None and bench.rows[1].max_error is not None
-    assert bench.rows[2].max_error is None
+def test_pinhole_images_are_compared_with_the_exact_pinhole_image():
+    pinhole = replace(DIRECT, layout="pinhole")
+    found = results(measure(group(pinhole, replace(pinhole, kernel="ewa"))))
+    assert found["ray", "radial", "pinhole", "float32"].max_error < 1e-5
+    assert found["ewa", "radial", "pinhole", "float32"].max_error > 1e-3
+    assert found["ray", "radial", "pinhole", "float32"].seam_jump is None
 
 
-def test_a_truth_is_drawn_once_a_scene():
-    bench = Bench(MACHINE, budget=0)
-    other = replace(group(DIRECT), subject=room(8))
-    bench.run([group(DIRECT), other, group(DIRECT)])
-    assert [(row.scene, row.precision) for row in bench.rows if row.precision == "float64"] == [
-        (f"room {HEIGHT}", "float64"),
-        ("room 8", "float64"),
-    ]
-    assert bench.rows[-1].own_max_error < 1e-5
+def test_only_the_needed_references_are_rendered():
+    rows = measure(group(FACES, references="exact"), group(DIRECT, references="none"))
+    assert [row.case.precision for row in rows] == ["float64", "float32", "float32"]
+    assert rows[1].result.own_max_error is None and rows[1].result.max_error is not None
+    assert rows[2].result.max_error is None
 
 
-def test_cases_of_a_group_are_drawn_in_turn(monkeypatch):
-    drawn = []
-    original = raster.draw
-
-    def noted(case, *arguments):
-        drawn.append(case.layout)
-        return original(case, *arguments)
-
-    monkeypatch.setattr(raster, "draw", noted)
-    monkeypatch.setattr(raster, "_MOST", 3)
-    Bench(MACHINE, budget=1e6).run([group(DIRECT, FACES, truths="none")])
-    # A first drawing each, then three rounds.
-    assert drawn == ["equirect", "cubemap"] * 4
+def test_a_reference_is_rendered_once_for_each_scene():
+    rows = measure(group(DIRECT), group(DIRECT, height=8), group(DIRECT))
+    assert [row.scene for row in rows if row.case.precision == "float64"] == [f"room {HEIGHT}", "room 8"]
+    assert rows[-1].result.own_max_error < 1e-5
 
 
-def test_an_interruption_keeps_the_rows(monkeypatch, tmp_path):
-    file, original = tmp_path / "rows.json", raster.draw
+@pytest.fixture
+def rendered(monkeypatch) -> list[RasterCase]:
+    """The rendered cases, in order; a case with kernel "ewa" interrupts the run."""
+    cases, original = [], raster.render_case
 
-    def interrupted(case, *arguments):
+    def render_case(case, *arguments):
         if case.kernel == "ewa":
             raise KeyboardInterrupt
+        assert torch.get_num_threads() == case.threads
+        cases.append(case)
         return original(case, *arguments)
 
-    monkeypatch.setattr(raster, "draw", interrupted)
-    threads = torch.get_num_threads()
-    bench = Bench(MACHINE, file=file, budget=0)
+    monkeypatch.setattr(raster, "render_case", render_case)
+    return cases
+
+
+def test_cases_of_a_group_are_rendered_in_turns(rendered, monkeypatch):
+    monkeypatch.setattr(raster, "_MAX_REPEATS", 3)
+    measure(group(replace(DIRECT, threads=2), FACES, references="none"), budget=1e6)
+    assert [case.layout for case in rendered] == ["equirect", "cubemap"] * 4  # a first image each, then three rounds
+
+
+def test_an_interruption_keeps_the_rows_and_restores_the_threads(rendered, tmp_path):
+    file, threads = tmp_path / "rows.json", torch.get_num_threads()
     with pytest.raises(KeyboardInterrupt):
-        bench.run([group(DIRECT, truths="none"), group(FACES, replace(FACES, kernel="ewa"), truths="exact")])
+        groups = group(DIRECT, references="none"), group(FACES, replace(FACES, kernel="ewa"), references="exact")
+        measure(*groups, json=file)
     kept = json.loads(file.read_text())["rows"]
     assert [(row["layout"], row["precision"]) for row in kept] == [
-        ("equirect", "float32"),
-        ("equirect", "float64"),
-        ("cubemap", "float32"),
+        *(("equirect", "float32"), ("equirect", "float64"), ("cubemap", "float32"))
     ]
     assert kept[0]["forward_ms"] > 0 and math.isfinite(kept[2]["psnr_db"])
     assert torch.get_num_threads() == threads
 
 
-def test_the_watcher_hears_what_is_done_and_sees_the_rows():
-    heard = []
-    Bench(MACHINE, budget=0, watch=lambda doing, rows: heard.append((doing, len(rows)))).run([group(DIRECT)])
-    assert heard[0][0] == f"room {HEIGHT}: making the scene"
-    assert any("the float64 reference" in doing for doing, _ in heard)
-    assert heard[-1][1] == 2
+def test_rows_of_the_viewer_have_its_times_and_errors(monkeypatch):
+    def render_in_viewer(scene, gaussians, cases, repeats):
+        assert scene.name == f"room {HEIGHT}" and len(gaussians) == 862 and repeats == 3
+        for index, _ in enumerate(cases):
+            yield ViewerImage(
+                index, "gl33", torch.full((3, HEIGHT, 2 * HEIGHT), 0.1 * index), [5.0, 7.0, 6.0], 2.0, "Mesa"
+            )
+
+    monkeypatch.setattr(raster, "render_in_viewer", render_in_viewer)
+    report = raster_report(MACHINE)
+    RasterBench(report).run_viewer(group(replace(FACES, backend="gl"), replace(FACES, backend="gl", order="z")), 3)
+    rows = [row for row in report.rows if row.case.backend == "gl33"]
+    assert [row.case.order for row in rows] == ["radial", "z"]
+    for row in rows:
+        assert (row.result.forward_ms, row.result.forward_min_ms, row.result.repeats) == (6, 5, 3)
+        assert row.result.stages_ms == {"sort": 2, "draw": 4} and row.note == "rendered by Mesa"
+    assert rows[0].result.own_psnr_db != rows[1].result.own_psnr_db
 
 
-def test_threads_are_those_of_the_case(monkeypatch):
-    used, original = [], raster.draw
-    monkeypatch.setattr(raster, "draw", lambda *a: (used.append(torch.get_num_threads()), original(*a))[1])
-    Bench(MACHINE, budget=0).run([group(replace(DIRECT, threads=2), truths="none")])
-    assert set(used) == {2}
+# Findings, tables and plots of given rows.
+
+
+@pytest.fixture
+def row() -> RasterRow:
+    result = RasterResult(
+        886_580,
+        forward_ms=100.0,
+        forward_min_ms=100.0,
+        backward_ms=200.0,
+        forward_cpu_ms=90.0,
+        max_error=1e-6,
+        psnr_db=130.0,
+        fma_fraction=0.5,
+        backward_fma_fraction=0.4,
+        bandwidth_fraction=0.1,
+        stages_ms={"sort": 20.0, "raster": 80.0},
+    )
+    return RasterRow("headline", "room 512", RasterCase("numba", 512), result)
+
+
+def change(row: RasterRow, suite: str | None = None, scene: str | None = None, **values) -> RasterRow:
+    """The row with other fields of itself, its case or its result."""
+    in_case = {name: value for name, value in values.items() if hasattr(row.case, name)}
+    in_result = {name: value for name, value in values.items() if name not in in_case}
+    case, result = replace(row.case, **in_case), replace(row.result, **in_result)
+    return RasterRow(suite or row.suite, scene or row.scene, case, result)
+
+
+def cells(row: RasterRow) -> list[str]:
+    return [column.cell(row) for column in RASTER_COLUMNS]
+
+
+def test_cells_of_unmeasured_values_are_empty(row):
+    assert cells(row).count("") == 5
+    shown = cells(change(row, psnr_db=None, max_error=None, backward_ms=None))
+    assert shown.count("") == 8 and "100" in shown
+    assert "exact" in cells(change(row, max_error=0.0, psnr_db=math.inf))
+
+
+def test_a_sweep_has_one_table_for_all_scenes(row):
+    report = raster_report(MACHINE)
+    sweep = [change(row, suite="count", scene=f"room {height}") for height in (128, 256)]
+    assert [(table.title, table.row_count) for table in report.tables([row, *sweep])] == [
+        *(("headline: room 512", 1), ("count", 2))
+    ]
+
+
+def test_findings_compare_like_with_like(row):
+    rows = [
+        row,
+        change(row, threads=2, forward_ms=50.0),
+        change(row, layout="cubemap", forward_ms=1.0),
+        change(row, backend="torch", forward_ms=10_000.0, backward_ms=30_000.0, forward_cpu_ms=8100.0),
+        change(row, backend="torch", precision="float64", forward_ms=1.0),
+        change(row, suite="dense", backend="dense", height=64, num_gaussians=13_848, forward_ms=4000.0),
+        change(row, suite="dense", height=64, num_gaussians=13_848, forward_ms=2.0),
+    ]
+    text = "\n".join(raster_findings(rows))
+    assert "numba on one thread is 100 times (backward 150 times) [by processor time 90] as fast" in text
+    assert "numba on 2 threads is 200 times" in text
+    assert "numba on one thread is 2,000 times" in text and "64x128" in text
+    assert f"(not measured), the dense renderer would take {4.0 * 8**2 * 886_580 / 13_848:,.0f} s" in text
+    peaks = (
+        "reaches 50% of the multiply-add peak forward (56% in the raster stage), 40% backward, and 10% of the memory"
+    )
+    assert peaks in text
+    assert raster_findings([]) == []
+
+
+@given(st.lists(st.tuples(NUMBER, NUMBER), min_size=1, max_size=20))
+def test_the_front_is_what_no_other_point_beats(points):
+    def beats(one: tuple[float, float], other: tuple[float, float]) -> bool:
+        return one[0] <= other[0] and one[1] <= other[1] and one != other
+
+    front = pareto_front(points)
+    for index, point in enumerate(points):
+        assert (index in front) == (not any(beats(other, point) for other in points))
+    ordered = [points[i] for i in front]
+    assert ordered == sorted(ordered, key=lambda point: (point[0], -point[1]))
+
+
+def test_plots_are_written(row, tmp_path):
+    choices = [
+        change(row, suite="choices"),
+        change(row, suite="choices", backend="torch", precision="float64", psnr_db=math.inf),
+        change(row, suite="choices", backend="gl33", kernel="ewa", layout="cubemap", face_size=8, filter="3dgs"),
+    ]
+    counts = [change(row, suite="count"), change(row, suite="count", num_gaussians=20, backward_min_ms=9.0)]
+    sweeps = counts + [change(one, suite="resolution", height=16 * n) for n, one in enumerate(counts, 1)]
+    for plot, rows in ((plot_choices, choices), (plot_sweeps, sweeps)):
+        assert plot(rows, tmp_path / "plot.png")
+        assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+        (tmp_path / "plot.png").unlink()
+        assert not plot([change(row, suite="dense")], tmp_path / "none.png")
+    assert not list(tmp_path.iterdir())

@@ -1,90 +1,104 @@
-"""Tables show what was measured, and the sentences compare like with like."""
+"""Rows, their JSON file, and the tables of a report."""
 
 import io
-from dataclasses import replace
+import json
+import math
+from dataclasses import dataclass, field
 
 import pytest
 from rich.console import Console
 
-from pansplat.bench.report import cells, findings, markdown, tables
-from pansplat.bench.rows import Row
+from pansplat.bench.report import Column, Report, Row, number, row_from_json, write_rows
+from pansplat.errors import InputError
 
 
-@pytest.fixture
-def row():
-    return Row(
-        suite="headline",
-        scene="room 512",
-        backend="numba",
-        kernel="ray",
-        order="radial",
-        filter="angular",
-        layout="equirect",
-        height=512,
-        face_size=None,
-        stitching="seamless",
-        precision="float32",
-        num_gaussians=886_580,
-        threads=1,
-        forward_ms=100.0,
-        backward_ms=200.0,
-        forward_cpu_ms=90.0,
-        max_error=1e-6,
-        psnr_db=130.0,
-        fma_fraction=0.5,
-        backward_fma_fraction=0.4,
-        bandwidth_fraction=0.1,
-        stages_ms={"sort": 20.0, "raster": 80.0},
-    )
+@dataclass(frozen=True)
+class Case:
+    height: int
 
 
-def test_each_suite_and_scene_has_a_table(row):
-    rows = [row, replace(row, suite="count", scene="room 128"), replace(row, suite="count", scene="room 256")]
-    found = tables(rows)
-    assert [(table.title, table.row_count) for table in found] == [("headline: room 512", 1), ("count", 2)]
+@dataclass
+class Result:
+    seconds: float | None = None
+    stages: dict[str, float] = field(default_factory=dict)
+
+
+COLUMNS = (
+    Column("height", lambda row: str(row.case.height)),
+    Column("seconds", lambda row: number(row.result.seconds, "{:.1f}")),
+    Column("", lambda row: row.note, "left"),
+)
+
+
+def row(height: int = 16, **values) -> Row:
+    return Row("speed", "room", Case(height), Result(**values))
+
+
+def report(**options) -> Report:
+    return Report(COLUMNS, lambda row: f"{row.suite}: {row.case.height}", {"cpu": "some", "gpu": None}, **options)
+
+
+def test_rows_are_read_as_they_were_written(tmp_path):
+    rows = [row(seconds=2.0, stages={"sort": 0.5}), row(32)]
+    rows[1].status, rows[1].note, rows[0].is_reference = "died", "ended by SIGKILL", True
+    write_rows(tmp_path / "rows.json", {"machine": {"cpu": "some"}}, rows)
+    content = json.loads((tmp_path / "rows.json").read_text())
+    assert set(content) == {"machine", "rows"} and content["machine"] == {"cpu": "some"}
+    assert [row_from_json(values, Case, Result) for values in content["rows"]] == rows
+
+
+def test_numbers_have_six_digits_and_infinite_ones_are_null(tmp_path):
+    write_rows(tmp_path / "rows.json", {}, [row(seconds=1 / 3, stages={"a": math.nan}), row(seconds=math.inf)])
+    first, second = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    assert first["seconds"] == 0.333333 and first["stages"] == {"a": None} and second["seconds"] is None
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    file = tmp_path / "rows.json"
+    write_rows(file, {}, [row()])
+    before = file.read_text()
+    with pytest.raises(TypeError):
+        write_rows(file, {"cpu": object()}, [row(), row()])
+    assert file.read_text() == before
+    assert list(tmp_path.iterdir()) == [file]
+    with pytest.raises(InputError, match="create it first"):
+        write_rows(tmp_path / "no" / "rows.json", {}, [row()])
+
+
+def test_each_section_has_a_table():
+    found = report().tables([row(16), row(32), row(16, seconds=2.0)])
+    assert [(table.title, table.row_count) for table in found] == [("speed: 16", 2), ("speed: 32", 1)]
     console = Console(width=200, record=True, file=io.StringIO())
     console.print(*found)
-    assert "886,580" in console.export_text()
+    assert "2.0" in console.export_text()
 
 
-def test_cells_are_blank_where_nothing_was_measured(row):
-    shown = cells(replace(row, psnr_db=None, max_error=None, backward_ms=None))
-    assert shown.count("") == 8 and "100" in shown
-
-
-def test_the_exact_picture_is_called_exact(row):
-    assert "exact" in cells(replace(row, max_error=0.0, psnr_db=float("inf")))
-
-
-def test_sentences_compare_like_with_like(row):
-    rows = [
-        row,
-        replace(row, threads=2, forward_ms=50.0),
-        replace(row, layout="cubemap", forward_ms=1.0),
-        replace(row, backend="torch", forward_ms=10_000.0, backward_ms=30_000.0, forward_cpu_ms=8100.0),
-        replace(row, backend="torch", precision="float64", forward_ms=1.0),
-        replace(row, suite="dense", backend="dense", height=64, num_gaussians=13_848, forward_ms=4000.0),
-        replace(row, suite="dense", height=64, num_gaussians=13_848, forward_ms=2.0),
+def test_markdown_holds_the_findings_and_the_tables():
+    page = report(findings=lambda rows: [f"{len(rows)} rows."])
+    page.rows += [row(16, seconds=2.0), row(16)]
+    assert page.markdown().splitlines() == [
+        *("* 2 rows.", "", "### Speed: 16", ""),
+        *("| height | seconds |  |", "|---:|---:|---|", "| 16 | 2.0 |  |", "| 16 |  |  |"),
     ]
-    told = findings(rows)
-    assert any(
-        "numba on one thread is 100 times (backward 150 times) [by processor time 90] as fast" in one for one in told
-    )
-    assert any("numba on 2 threads is 200 times" in one for one in told)
-    assert any("numba on one thread is 2,000 times" in one and "64x128" in one for one in told)
-    scaled = 4.0 * 8**2 * 886_580 / 13_848
-    assert any(f"(not measured), the dense renderer would take {scaled:,.0f} s" in one for one in told)
-    peaks = "reaches 50% of the multiply-add peak forward (56% while it rasters), 40% backward, and 10% of the memory"
-    assert any(peaks in one for one in told)
+    assert report().markdown() == "\n"
 
 
-def test_nothing_measured_tells_nothing():
-    assert tables([]) == [] and findings([]) == [] and markdown([]) == "\n"
+def test_an_interrupted_run_is_printed_and_written(tmp_path, capsys):
+    files = {"json_file": tmp_path / "rows.json", "page": tmp_path / "page.md"}
+    plots = {tmp_path / "a.png": lambda rows, path: bool(path.write_text("plot")), tmp_path / "b.png": lambda *_: False}
+    with pytest.raises(KeyboardInterrupt), report(**files, plots=plots, facts=("cpu", "gpu")) as page:
+        page.update("the first row")
+        page.rows.append(row(16, seconds=2.0))
+        page.update()
+        raise KeyboardInterrupt
+    assert len(json.loads(files["json_file"].read_text())["rows"]) == 1
+    assert "### Speed: 16" in files["page"].read_text()
+    printed = capsys.readouterr().out
+    assert "cpu             some" in printed and "gpu             none" in printed and "speed: 16" in printed
+    assert printed.split()[-3:] == [str(tmp_path / name) for name in ("rows.json", "page.md", "a.png")]
 
 
-def test_markdown_is_the_same_table(row):
-    lines = markdown([row, replace(row, threads=2)]).splitlines()
-    start = lines.index("### Headline: room 512")
-    table = lines[start + 2 :]
-    assert len(table) == 4 and len({line.count("|") for line in table}) == 1
-    assert " | ".join(cells(row)) in table[2]
+def test_a_run_without_rows_writes_nothing(tmp_path):
+    with report(json_file=tmp_path / "rows.json", page=tmp_path / "page.md") as page:
+        page.update("nothing")
+    assert not list(tmp_path.iterdir())

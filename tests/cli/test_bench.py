@@ -8,34 +8,36 @@ from typing import Any
 import pytest
 
 from pansplat import pipeline
-from pansplat.bench import plan, raster, roofline
-from pansplat.bench.cases import Group
+from pansplat.bench import raster, raster_cases, roofline
+from pansplat.bench.raster_cases import Group
 from pansplat.bench.scenes import full_lattice_room, lattice_room_size, room_cameras
 from pansplat.cli import bench, run
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 
+_raster_groups = raster_cases.raster_groups
+
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    """Seconds instead of minutes: small peers, few repeats, no sample, no viewer."""
-    monkeypatch.setattr(plan, "DENSE_HEIGHT", 8)
-    monkeypatch.setattr(raster, "_MOST", 1)
+    """Seconds instead of minutes: a small dense image, few repeats, no sample, no viewer."""
+    monkeypatch.setattr(raster_cases, "DENSE_HEIGHT", 8)
+    monkeypatch.setattr(raster, "_MAX_REPEATS", 1)
     monkeypatch.setattr(roofline, "_STEPS", 1 << 12)
     monkeypatch.setattr(roofline, "_ELEMENTS", 1 << 12)
     monkeypatch.setattr(bench, "_SAMPLE", Path("no such folder"))
-    monkeypatch.setattr(bench, "measure_viewer", _no_viewer)
-    monkeypatch.setattr(bench, "_BACKENDS", ("triton", "gsplat"))
-    monkeypatch.setattr(bench, "groups", _one_a_suite)
+    monkeypatch.setattr(raster, "render_in_viewer", _no_viewer)
+    monkeypatch.setattr(bench, "_RASTER_BACKENDS", ("triton", "gsplat"))
+    monkeypatch.setattr(raster_cases, "raster_groups", _one_per_suite)
 
 
-def _one_a_suite(*arguments: Any, **others: Any) -> list[Group]:
+def _one_per_suite(*arguments: Any, **options: Any) -> list[Group]:
     """The first group of each suite, with its first three cases."""
-    found = {group.suite: group for group in reversed(plan.groups(*arguments, **others))}
+    found = {group.suite: group for group in reversed(_raster_groups(*arguments, **options))}
     return [dataclasses.replace(group, cases=group.cases[:3]) for group in reversed(found.values())]
 
 
-def _no_viewer(*arguments: object, **others: object) -> None:
+def _no_viewer(*_: object) -> None:
     raise InputError("there is none in this test")
 
 
@@ -73,14 +75,14 @@ def test_a_pairs_depth_is_measured_with_a_gaussian_at_every_lattice_point(tmp_pa
 
 
 def test_an_interruption_prints_and_keeps_what_was_measured(tmp_path, monkeypatch, capsys):
-    original = raster.draw
+    original = raster.render_case
 
     def interrupted(case, *arguments):
         if case.layout == "cubemap":
             raise KeyboardInterrupt
         return original(case, *arguments)
 
-    monkeypatch.setattr(raster, "draw", interrupted)
+    monkeypatch.setattr(raster, "render_case", interrupted)
     file = tmp_path / "rows.json"
     assert run(["bench", "raster", "--quick", "--height", "16", "--json", str(file), "--threads", "1"]) == 130
     assert len(json.loads(file.read_text())["rows"]) >= 2

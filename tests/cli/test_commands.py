@@ -154,7 +154,7 @@ def test_a_folder_of_pairs_takes_the_first_or_the_named(tmp_path: Path, capsys: 
         "16",
     ]
     assert run(start) == 0
-    assert "holds 2 pairs, this is the first (--pair takes: 1: hall, 2: kitchen)" in capsys.readouterr().err
+    assert "holds 2 pairs, using the first (--pair takes: 1: hall, 2: kitchen)" in capsys.readouterr().err
     for choice in ("kitchen", "2"):
         assert run([*start, "--pair", choice]) == 0
         assert capsys.readouterr().err == ""
@@ -250,7 +250,7 @@ def test_render_refuses_what_makes_no_sense(scene: Path, tmp_path: Path, capsys:
     assert "folder does not exist" in refusal([*start, tmp_path / "no" / "x.png"], capsys)
     assert "give one of them" in refusal([*start, png, "--at", 0.5, "--pose", trajectory], capsys)
     assert "holds 2 poses" in refusal([*start, png, "--pose", trajectory], capsys)
-    assert "--at is one place" in refusal([*start, tmp_path / "x.mp4", "--at", 0.5], capsys)
+    assert "--at is one position" in refusal([*start, tmp_path / "x.mp4", "--at", 0.5], capsys)
     assert "--at must be a number" in refusal([*start, png, "--at", "nan"], capsys)
     assert "--blend must be" in refusal([*start, png, "--blend", "mixed"], capsys)
     assert "from 0 to 1, got 7" in refusal([*start, png, "--blend", "view7"], capsys)
@@ -289,7 +289,7 @@ def test_evaluate_writes_results_and_prints_the_table(
     assert run([*arguments, "--height", str(HEIGHT)]) == 0
     out, err = capsys.readouterr()
     assert "WS-PSNR" in out and "cross-fade" in out and "room" in out
-    assert "alone: none of its 1 pairs has a target view; passed over" in err
+    assert "alone: none of its 1 pairs has a target view; skipped" in err
     (result,) = json.loads((tmp_path / "out" / "results.json").read_text())
     assert f"{result['ws_psnr']:.2f}" in out
     assert Path(result["prediction"]).is_file() and Path(result["target"]).is_file()

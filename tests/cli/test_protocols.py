@@ -83,10 +83,10 @@ def test_several_models_give_a_row_each(data: Path, tmp_path: Path, monkeypatch:
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (["--near", "1"], "--near is the protocol's to say"),
+        (["--near", "1"], "--near is set by the protocol"),
         (["--blend", "view0"], "--blend must be joint or deferred with --protocol"),
         (["--limit", "0"], "--limit must be at least 1"),
-        (["--models", "ball"], "must have names of their own"),
+        (["--models", "ball"], "must have distinct names"),
         (["--lpips", "vgg"], "LPIPS with vgg needed vgg16-397923af.pth"),
         (["--protocol", "360loc"], "360Loc: needed"),
     ],

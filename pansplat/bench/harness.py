@@ -1,0 +1,201 @@
+"""Time and memory of one call, in this process or in a child process.
+
+A child process measures memory without what earlier cases left behind, and has its own number of threads.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import os
+import re
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from pansplat.console import describes_out_of_memory
+
+T = TypeVar("T")
+Numbers = Mapping[str, object]
+Tensors = Mapping[str, Tensor]
+
+_STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+_POLL_INTERVAL = 0.05  # seconds between two checks of a child process
+
+
+class Timing(NamedTuple):
+    """Seconds of a call.
+
+    Attributes:
+        wall: elapsed time.
+        cpu: processor time of all threads of the process; other processes affect it far less.
+    """
+
+    wall: float
+    cpu: float
+
+
+def time_call(call: Callable[[], T], device: torch.device) -> tuple[Timing, T]:
+    """Time a call, its work on the device included, and return its result."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    began, began_cpu = time.perf_counter(), time.process_time()
+    result = call()
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return Timing(time.perf_counter() - began, time.process_time() - began_cpu), result
+
+
+def peak_memory(call: Callable[[], T], device: torch.device) -> tuple[float | None, T]:
+    """Largest memory during a call beyond what was held before it, 10^6 bytes, and the result of the call.
+
+    On the CPU it is the kernel's high-water mark of the resident memory, reset before the call; on CUDA that of
+    the allocator. None if the system has neither (not Linux).
+    """
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+        before = torch.cuda.memory_allocated(device)
+        result = call()
+        return (torch.cuda.max_memory_allocated(device) - before) / 1e6, result
+    if not reset_resident_peak():
+        return None, call()
+    before = resident_memory()
+    result = call()
+    return max(0, resident_peak() - before) / 1e6, result
+
+
+def reset_resident_peak() -> bool:
+    """Return freed memory to the system and restart the high-water mark; False if there is none (not Linux)."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc only
+    if trim is not None:
+        trim(0)
+    try:
+        _RESET.write_text("5")
+    except OSError:
+        return False
+    return True
+
+
+def resident_peak() -> int:
+    """Largest resident memory of the process since the last reset, bytes."""
+    return _status_bytes(_STATUS, "VmHWM")
+
+
+def resident_memory() -> int:
+    """Resident memory of the process, bytes."""
+    return _status_bytes(_STATUS, "VmRSS")
+
+
+def _status_bytes(status: Path, field: str) -> int:
+    found = re.search(rf"{field}:\s+(\d+) kB", status.read_text())
+    return 1024 * int(found[1]) if found else 0  # a process that has just ended has no such line
+
+
+def quartile_range(times: Sequence[float]) -> float:
+    """The range between the quartiles; the whole range of fewer than four times."""
+    if len(times) < 4:
+        return max(times) - min(times)
+    low, _, high = statistics.quantiles(times, n=4, method="inclusive")
+    return high - low
+
+
+@contextlib.contextmanager
+def restored_threads() -> Iterator[None]:
+    """Restore torch's number of threads afterwards."""
+    threads = torch.get_num_threads()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+class CaseFailedError(Exception):
+    """A child process failed; the text is its last message."""
+
+
+class OverLimitError(CaseFailedError):
+    """A child process took more memory than allowed or available."""
+
+
+def run_child(
+    module: str, job: Mapping[str, object], *, threads: int, limit_gib: float | None = None
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Run `python -m module`, which calls `serve_job`, and return what it measured.
+
+    Args:
+        module: name of the module.
+        job: JSON values that the child receives.
+        threads: of torch and OpenMP in the child.
+        limit_gib: the child is ended if its resident memory exceeds this, 2^30 bytes.
+
+    Raises:
+        OverLimitError: it took more than the limit, or than is available.
+        CaseFailedError: it failed otherwise.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "job.json").write_text(json.dumps({**job, "threads": threads}))
+        with open(folder / "log", "wb") as log:
+            child = subprocess.Popen(
+                [sys.executable, "-m", module, name],
+                env=os.environ | {"OMP_NUM_THREADS": str(threads)},
+                stdout=log,
+                stderr=log,
+            )
+        try:
+            over_limit = _exceeds_limit(child, limit_gib)
+        finally:
+            child.kill()
+            child.wait()
+        if over_limit:
+            raise OverLimitError(f"ended at {limit_gib:g} GiB")
+        if child.returncode:
+            raise _child_error(child.returncode, (folder / "log").read_text(errors="replace"))
+        numbers = json.loads((folder / "numbers.json").read_text())
+        return numbers, safetensors.torch.load_file(folder / "tensors.safetensors")
+
+
+def _exceeds_limit(child: subprocess.Popen[bytes], limit_gib: float | None) -> bool:
+    """Wait for the end of a child; True at once if its resident memory exceeds the limit."""
+    if limit_gib is None:
+        child.wait()
+        return False
+    status = Path(f"/proc/{child.pid}/status")
+    while child.poll() is None:
+        time.sleep(_POLL_INTERVAL)
+        with contextlib.suppress(OSError):  # it has just ended, or the system has no such file
+            if _status_bytes(status, "VmRSS") > limit_gib * 2**30:
+                return True
+    return False
+
+
+def _child_error(status: int, log: str) -> CaseFailedError:
+    """The error of a child with this exit status and output."""
+    message = (log.strip() or "no message").splitlines()[-1]
+    if describes_out_of_memory(message):
+        return OverLimitError(f"no memory left: {message[:120]}")
+    if status < 0:
+        return CaseFailedError(f"ended by {signal.Signals(-status).name}")
+    return CaseFailedError(message[:160])
+
+
+def serve_job(measure: Callable[[dict[str, Any]], tuple[Numbers, Tensors]]) -> None:
+    """Main function of a child process: measure its job and write the result for `run_child`."""
+    folder = Path(sys.argv[1])
+    job = json.loads((folder / "job.json").read_text())
+    torch.set_num_threads(job["threads"])
+    numbers, tensors = measure(job)
+    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    safetensors.torch.save_file(contiguous, folder / "tensors.safetensors")
+    (folder / "numbers.json").write_text(json.dumps(numbers))

@@ -1,0 +1,192 @@
+"""`pansplat evaluate`: predictions against the panoramas between the inputs, or a table of the paper."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, cast
+
+from tyro.conf import Positional
+
+from pansplat.cli.inputs import Compat, Out, Precision, blend_mode, progress_bar, require_height
+from pansplat.console import table_console
+from pansplat.errors import InputError
+
+if TYPE_CHECKING:
+    from pansplat.evaluation.lpips import Backbone, Lpips
+    from pansplat.evaluation.protocol import Blend, Method, ProtocolName
+
+_PROTOCOL_WIDTH = 150  # characters of a protocol's tables if there is no terminal
+
+
+@dataclass(frozen=True)
+class LpipsChoice:
+    """Whether to measure LPIPS, and with which weights."""
+
+    lpips: Literal["auto", "vgg", "alex", "squeeze", "none"] = "auto"
+    """Backbone of LPIPS; the paper uses vgg. auto: the first whose weights are found, if any."""
+    lpips_weights: Path | None = None
+    """Folder of its weights; by default the environment variable PANSPLAT_LPIPS, or the torch.hub cache."""
+
+
+@dataclass(frozen=True)
+class ProtocolChoice:
+    """The paper's evaluations, instead of folders of pairs."""
+
+    protocol: (
+        Literal["m3d", "narrow", "replica", "residential", "360loc", "insta360", "ablation", "frame-distance"] | None
+    ) = None
+    """One table (or figure) of the paper, on the data sets that --data holds; missing ones are listed."""
+    data: Path | None = None
+    """Folder that holds the data sets, for --protocol: png_render_test_* or pano_grf/, 360Loc/, insta360/."""
+    models: tuple[str, ...] = ()
+    """More predictors for the table of --protocol: `sweep`, or files of weights."""
+    limit: int | None = None
+    """At most this many cases of each test set, evenly spaced; by default all, as in the paper."""
+    pictures: int = 8
+    """Number of cases of each test set whose images are written."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare predictions with the real panoramas between the inputs, and with the cross-fade baseline.
+
+    With --protocol: compute a table of the paper, with the paper's rows and ours.
+    """
+
+    paths: Positional[tuple[Path, ...]]
+    """Folders of pairs; pairs without target views are skipped. None with --protocol."""
+    out: Out
+    """Folder for results.json and, for each case, prediction.png, target.png and error.png."""
+    model: str = "sweep"
+    """Predictor: `sweep`, or a file of weights. The cache is not used, so that times are true."""
+    compat: Compat = "trained"
+    """For a network: official, fixed, or as its weights were trained; see `pansplat predict --help`."""
+    precision: Precision = "float32"
+    """Number type of a network's convolutions."""
+    height: int = 512
+    """Panoramas are resized to this height, pixels."""
+    blend: str | None = None
+    """deferred, joint, or view0, view1, ...; by default deferred, with --protocol that of the paper's table."""
+    drawing: Literal["exact", "original"] = "exact"
+    """exact, or original: render as the official code does, to compare with its published figures."""
+    convention: str | None = None
+    """Pose convention, if a folder does not state it."""
+    near: float | None = None
+    """Nearest depth to search, metres."""
+    far: float | None = None
+    """Farthest depth to search, metres."""
+    lpips: LpipsChoice = field(default_factory=LpipsChoice)
+    protocol: ProtocolChoice = field(default_factory=ProtocolChoice)
+
+    def run(self) -> int:
+        """Evaluate the folders' pairs, or a protocol of the paper."""
+        return self._run_folders() if self.protocol.protocol is None else self._run_protocol(self.protocol.protocol)
+
+    def _run_folders(self) -> int:
+        """Evaluate all pairs with targets in the folders and print the table."""
+        from pansplat import pipeline
+        from pansplat.evaluation.report import evaluate, results_table
+
+        require_height(self.height)
+        if not self.paths:
+            raise InputError("`pansplat evaluate` needs at least one folder of pairs, or --protocol")
+        blend = blend_mode(self.blend or "deferred")
+        lpips = choose_lpips(self.lpips, self.height)
+        pairs = []
+        for path in self.paths:
+            found = pipeline.load_pairs(path, convention=self.convention, near=self.near, far=self.far)
+            with_targets = [pair for pair in found if pair.targets]
+            if not with_targets:
+                print(f"note: {path}: none of its {len(found)} pairs has a target view; skipped", file=sys.stderr)
+            pairs += with_targets
+        predictor = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
+        with progress_bar() as progress:
+            cases = evaluate(
+                pairs,
+                predictor,
+                self.out,
+                height=self.height,
+                blend=blend,
+                drawing=self.drawing,
+                lpips=lpips,
+                progress=progress,
+            )
+        table_console().print(results_table(cases))
+        if lpips is not None:
+            print(f"LPIPS is {lpips.name}")
+        print(f"{self.out / 'results.json'} and the images of each case")
+        return 0
+
+    def _run_protocol(self, protocol: ProtocolName) -> int:
+        """Run the protocol on the available data sets, print the tables and write the files."""
+        from pansplat.evaluation.protocol import ProtocolOptions, run_protocol
+        from pansplat.evaluation.tables import report_notes, rich_tables, write_report
+
+        data = self._protocol_data()
+        options = ProtocolOptions(self.height, self.protocol.limit, self.protocol.pictures)
+        lpips = choose_lpips(self.lpips, self.height)
+        methods = self._protocol_methods(protocol)
+        with progress_bar() as progress:
+            result = run_protocol(protocol, data, methods, self.out, options=options, lpips=lpips, progress=progress)
+        written = write_report(result, self.out)
+        console = table_console(_PROTOCOL_WIDTH)
+        for table in rich_tables(result):
+            console.print(table)
+        for note in report_notes(result):
+            console.print(note, markup=False, soft_wrap=True)
+        print(", ".join(str(path) for path in (self.out / "results.json", *written)))
+        return 0
+
+    def _protocol_data(self) -> Path:
+        """The folder of data sets; refuses arguments that a protocol does not have."""
+        require_height(self.height)
+        if self.paths:
+            raise InputError(
+                f"--protocol takes its data from --data, got the folder {self.paths[0]} as well; leave it out"
+            )
+        if self.protocol.data is None:
+            raise InputError("--protocol needs --data, the folder that holds the data sets")
+        if self.blend not in (None, "joint", "deferred"):
+            raise InputError(f"--blend must be joint or deferred with --protocol, got {self.blend!r}")
+        for name in ("near", "far", "convention"):
+            if getattr(self, name) is not None:
+                raise InputError(f"--{name} is set by the protocol; leave it out")
+        if self.protocol.limit is not None and self.protocol.limit < 1:
+            raise InputError(f"--limit must be at least 1, got {self.protocol.limit}")
+        return self.protocol.data.expanduser()
+
+    def _protocol_methods(self, protocol: ProtocolName) -> list[Method]:
+        """The methods of all predictors; those with weights have the name of the file."""
+        from pansplat import pipeline
+        from pansplat.evaluation.protocol import list_methods
+        from pansplat.model.weights import WEIGHTS_SUFFIXES
+
+        blend = cast("Blend | None", self.blend)
+        methods: list[Method] = []
+        for index, model in enumerate((self.model, *self.protocol.models)):
+            has_options = index == 0 or Path(model).suffix.lower() in WEIGHTS_SUFFIXES  # sweep has neither option
+            compat, precision = (self.compat, self.precision) if has_options else ("trained", "float32")
+            predictor = pipeline.load_model(model, compat=compat, precision=precision)
+            methods += list_methods(predictor, protocol, blend, Path(model).stem, self.drawing)
+        names = [method.name for method in methods]
+        if len(set(names)) < len(names):
+            raise InputError(f"--model and --models must have distinct names, got {', '.join(names)}; rename a file")
+        return methods
+
+
+def choose_lpips(choice: LpipsChoice, height: int) -> Lpips | None:
+    """The chosen LPIPS; None for "none", or if "auto" finds no weights or the images are too small.
+
+    Raises:
+        InputError: the weights of a named backbone are missing.
+    """
+    from pansplat.evaluation.lpips import MIN_IMAGE_SIZE, find_backbone, load_lpips
+
+    if choice.lpips == "none":
+        return None
+    if choice.lpips != "auto":
+        return load_lpips(cast("Backbone", choice.lpips), choice.lpips_weights)
+    backbone = find_backbone(choice.lpips_weights) if height >= MIN_IMAGE_SIZE else None
+    return load_lpips(backbone, choice.lpips_weights) if backbone else None

@@ -1,0 +1,83 @@
+"""`pansplat info`: the contents of a scene file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tyro.conf import Positional
+
+from pansplat.console import table_console
+
+if TYPE_CHECKING:
+    from rich.table import Table
+    from torch import Tensor
+
+    from pansplat.gaussians.scene import Scene
+
+_BARS = " ▁▂▃▄▅▆▇█"
+
+
+@dataclass(frozen=True)
+class Info:
+    """Print what a scene file holds: Gaussians by level and view, opacities, scales, bounds, cameras."""
+
+    path: Positional[Path]
+    """The .ply file."""
+
+    def run(self) -> int:
+        """Print the contents of the scene."""
+        from pansplat import pipeline
+
+        scene = pipeline.load(self.path)
+        gaussians = scene.gaussians
+        print(f"{self.path}: {len(gaussians):,} Gaussians, SH degree {gaussians.degree}")
+        if scene.model:
+            source = f"predicted by {scene.model} at {scene.height}x{2 * scene.height}"
+            print(f"{source}, near {scene.near:g} m, far {scene.far:g} m")
+        if not len(gaussians):
+            return 0
+        table_console().print(_count_table(scene))
+        for name, values, unit in (
+            ("opacity", gaussians.opacities, ""),
+            ("largest scale", gaussians.scales.amax(dim=1), " m"),
+            ("smallest scale", gaussians.scales.amin(dim=1), " m"),
+        ):
+            print(_distribution(name, values, unit, log=unit != ""))
+        low, high = gaussians.means.amin(dim=0).tolist(), gaussians.means.amax(dim=0).tolist()
+        axes = (f"{axis} {a:.2f} to {b:.2f} m" for axis, a, b in zip("xyz", low, high, strict=True))
+        print("bounds          " + ", ".join(axes))
+        for index, pose in enumerate(scene.cam2world):
+            name = scene.names[index] if index < len(scene.names) else ""
+            position = ", ".join(f"{x:.3f}" for x in pose[:3, 3].tolist())
+            print(f"camera {index}        at ({position}) m  {name}")
+        return 0
+
+
+def _count_table(scene: Scene) -> Table:
+    """Number of Gaussians by level (rows) and view (columns)."""
+    from rich.table import Table
+
+    gaussians = scene.gaussians
+    views = max(len(scene.cam2world), int(gaussians.views.max()) + 1)
+    table = Table()
+    table.add_column("level")
+    for view in range(views):
+        table.add_column(f"view {view}", justify="right")
+    for level in sorted(set(gaussians.levels.tolist())):
+        views_of_level = gaussians.views[gaussians.levels == level]
+        table.add_row(str(level), *(f"{int((views_of_level == view).sum()):,}" for view in range(views)))
+    return table
+
+
+def _distribution(name: str, values: Tensor, unit: str, *, log: bool) -> str:
+    """One line: minimum, maximum, median, and a histogram of 24 bars."""
+    import torch
+
+    low, middle, high = float(values.min()), float(values.median()), float(values.max())
+    shown = values.clamp_min(1e-12).log10() if log else values
+    bounds = (float(shown.min()), max(float(shown.max()), float(shown.min()) + 1e-6))
+    counts = torch.histc(shown.float(), 24, *bounds)
+    bars = "".join(_BARS[round(8 * float(count / counts.max()))] for count in counts)
+    return f"{name:<15} {low:.3g} to {high:.3g}{unit}, median {middle:.3g}{unit}  |{bars}|" + (" (log)" if log else "")

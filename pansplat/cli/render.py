@@ -1,0 +1,193 @@
+"""`pansplat render`: images and videos of a scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from tyro.conf import Positional
+
+from pansplat.cli.inputs import (
+    Compat,
+    Out,
+    PairChoice,
+    Precision,
+    blend_mode,
+    choose_pair,
+    predict_scene,
+    progress_bar,
+    require_height,
+)
+from pansplat.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from torch import Tensor
+
+    from pansplat.gaussians.scene import Scene
+    from pansplat.predictor import Progress
+
+_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr")
+_VIDEO_HEIGHT = 360
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render a scene, or the prediction of a pair, to an image (.png, .jpg, .webp, .exr) or a video (.mp4)."""
+
+    path: Positional[Path]
+    """A .ply scene, or the folder of a pair."""
+    out: Out
+    """The file to write; its suffix chooses the format."""
+    at: float | None = None
+    """Camera position between the first (0) and the last (1) input camera; 0.5 by default."""
+    pose: Path | None = None
+    """File with the camera pose: a JSON matrix (cam2world, OpenCV axes, metres), 16 numbers, or a KITTI or TUM
+    trajectory, which a video follows."""
+    layout: Literal["equirect", "cubemap", "perspective"] | None = None
+    """Panorama with one exact ray per pixel, panorama stitched from six cube faces, or perspective image.
+    By default equirect, for a video perspective."""
+    height: int | None = None
+    """Height of the image, pixels; by default that of the input panoramas, for a video 360."""
+    blend: str = "deferred"
+    """deferred (images of single views, weighted by nearness), joint (all Gaussians at once), or view0, view1, ..."""
+    fov: float = 90.0
+    """Vertical field of view of `perspective`, degrees."""
+    seconds: float = 4.0
+    """Length of a video."""
+    fps: float = 24.0
+    """Frames per second of a video."""
+    model: str = "sweep"
+    """Predictor, for a pair: `sweep`, or a file of weights."""
+    compat: Compat = "trained"
+    """For a network: official, fixed, or as its weights were trained; see `pansplat predict --help`."""
+    precision: Precision = "float32"
+    """Number type of a network's convolutions."""
+    predict_height: int = 512
+    """Height that the panoramas are resized to before the prediction, for a pair."""
+    choice: PairChoice = field(default_factory=PairChoice)
+
+    def run(self) -> int:
+        """Render one image, or a video along a path of cameras."""
+        import torch
+
+        from pansplat import pipeline
+        from pansplat.data.images import write_image
+        from pansplat.data.video import write_video
+
+        self._check()
+        poses = None if self.pose is None else read_poses(self.pose)
+        if poses is not None and len(poses) > 1 and not self._is_video:
+            raise InputError(f"{self.pose} holds {len(poses)} poses; write an .mp4, or keep one pose in the file")
+        scene = self._open_scene()
+        layout = self.layout or ("perspective" if self._is_video else "equirect")
+        options = self._render_options(layout, self.height or (_VIDEO_HEIGHT if self._is_video else scene.height))
+        size = f"{options['size'][1]}x{options['size'][0]}"
+        if self._is_video:
+            poses = self._path_between_cameras(scene) if poses is None else poses
+            with progress_bar() as progress:
+                count = write_video(self.out, _frames(scene, poses, options, progress), self.fps)
+            print(f"{self.out}: {count} frames of {size}, {layout}")
+            return 0
+        pose = scene.pose_between(0.5 if self.at is None else self.at) if poses is None else poses[0]
+        with torch.no_grad():
+            image = pipeline.render(scene, pose, **options)
+        depth = image.depth if self.out.suffix.lower() == ".exr" else None
+        write_image(self.out, image.color, depth=depth, panorama=layout != "perspective")
+        print(f"{self.out}: {size}, {layout}")
+        return 0
+
+    @property
+    def _is_video(self) -> bool:
+        return self.out.suffix.lower() == ".mp4"
+
+    def _check(self) -> None:
+        """Refuse invalid arguments before the prediction, which takes seconds."""
+        if not self._is_video and self.out.suffix.lower() not in _IMAGE_SUFFIXES:
+            raise InputError(f"--out must end in {', '.join(_IMAGE_SUFFIXES)} or .mp4, got {self.out}")
+        if not self.out.resolve().parent.is_dir():
+            raise InputError(f"--out {self.out}: the folder does not exist; create it first")
+        if self.at is not None and self.pose is not None:
+            raise InputError("--at and --pose both set the camera; give one of them")
+        if self.at is not None and self._is_video:
+            raise InputError("--at is one position, an .mp4 moves through all; write a .png, or leave out --at")
+        if self.at is not None and not math.isfinite(self.at):
+            raise InputError(f"--at must be a number such as 0.5, got {self.at}")
+        if self.height is not None and self.height < 2:
+            raise InputError(f"--height must be at least 2 pixels, got {self.height}")
+        if not 1 <= self.fov <= 170:
+            raise InputError(f"--fov must be 1 to 170 degrees, got {self.fov}")
+        if self._is_video and not (0 < self.seconds < 3600 and 0 < self.fps <= 240):
+            raise InputError(f"--seconds and --fps must be positive, got {self.seconds} and {self.fps}")
+        blend_mode(self.blend)
+
+    def _open_scene(self) -> Scene:
+        """The scene of a .ply file, or the prediction of a pair's folder."""
+        from pansplat import pipeline
+
+        if self.path.suffix.lower() == ".ply":
+            return pipeline.load(self.path)
+        require_height(self.predict_height)
+        pair = choose_pair(self.path, self.choice)
+        model = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
+        return predict_scene(pair, model, self.predict_height, cache=True)
+
+    def _render_options(self, layout: str, height: int) -> dict[str, Any]:
+        """Keyword arguments of `pipeline.render`."""
+        options: dict[str, Any] = {"blend": blend_mode(self.blend)}
+        if layout == "perspective":
+            return options | {
+                "layout": "pinhole",
+                "size": (height, 2 * round(height * 8 / 9)),
+                "vertical_fov_degrees": self.fov,
+            }
+        return options | {"layout": layout, "size": (height, 2 * height)}
+
+    def _path_between_cameras(self, scene: Scene) -> list[Tensor]:
+        """A pose for each frame, through all input cameras."""
+        from pansplat.geometry.path import fly_path
+
+        if not len(scene.cam2world):
+            raise InputError(f"{self.path} has no input cameras to fly between; give a trajectory with --pose")
+        count = max(2, round(self.seconds * self.fps))
+        return list(fly_path(scene.cam2world, [i / (count - 1) for i in range(count)]))
+
+
+def read_poses(path: Path) -> list[Tensor]:
+    """Poses of a file (a JSON matrix, 16 numbers, a KITTI or TUM trajectory): cam2world, OpenCV axes."""
+    from pansplat.data.poses import parse_convention, read_json, read_trajectory, rigid_matrix, to_cam2world
+
+    if path.suffix.lower() == ".json":
+        content = read_json(path)
+        convention = "cam2world opencv"
+        if isinstance(content, dict):
+            convention = parse_convention(content.get("convention", convention), path)
+            content = content.get("cam2world", content.get("pose"))
+        return [to_cam2world(rigid_matrix(content, str(path)), convention)]
+    try:
+        words = path.read_text(encoding="utf-8-sig").replace(",", " ").split()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: needed a readable file of numbers, got '{error}'") from error
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []  # comments or file names, which the trajectory reader handles
+    if len(numbers) == 16:
+        return [rigid_matrix([numbers[i : i + 4] for i in (0, 4, 8, 12)], str(path))]
+    return list(read_trajectory(path).poses)
+
+
+def _frames(scene: Scene, poses: list[Tensor], options: dict[str, Any], progress: Progress) -> Iterator[np.ndarray]:
+    """8-bit RGB images at the poses."""
+    import torch
+
+    from pansplat import pipeline
+
+    for index, pose in enumerate(poses):
+        progress(f"frame {index + 1} of {len(poses)}", index / len(poses))
+        with torch.no_grad():
+            color = pipeline.render(scene, pose, **options).color
+        yield (color.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()

@@ -1,0 +1,79 @@
+"""What the commands share on the terminal: messages on standard error, exit statuses, tables."""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+from pansplat.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+_COLORS = {"error": "red", "interrupted": "red", "note": "yellow"}
+
+
+def run_command(command: Callable[[], int], *, memory_advice: str, interruption: str) -> int:
+    """Run a command and return its exit status.
+
+    Args:
+        command: returns its own status.
+        memory_advice: what to change if the memory does not suffice.
+        interruption: printed after Ctrl+C.
+
+    Returns:
+        The command's status; 2 for bad input or too little memory, 130 for an interruption.
+    """
+    try:
+        return command()
+    except InputError as error:
+        print_message("error", error)
+        return 2
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        cause = "".join(f" ({line[:120]})" for line in str(error).splitlines()[:1])
+        print_message("error", f"this takes more memory than there is{cause}; {memory_advice}")
+        return 2
+    except KeyboardInterrupt:
+        print_message("interrupted", interruption)
+        return 130
+
+
+def print_message(kind: str, text: object) -> None:
+    """Print one line `kind: text` on standard error; `kind` is "error", "interrupted" or "note"."""
+    from rich.console import Console
+    from rich.text import Text
+
+    line = Text.assemble((f"{kind}: ", f"bold {_COLORS[kind]}"), str(text))
+    Console(stderr=True, soft_wrap=True, highlight=False).print(line)
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether Python, numpy or torch failed to allocate memory; torch's CPU allocator raises a RuntimeError."""
+    return isinstance(error, MemoryError) or describes_out_of_memory(str(error))
+
+
+def describes_out_of_memory(message: str) -> bool:
+    """Whether an error message is one of a failed allocation."""
+    return "allocate" in message or "out of memory" in message.lower() or message.startswith("MemoryError")
+
+
+@contextlib.contextmanager
+def own_warnings() -> Iterator[None]:
+    """Print warnings of pansplat as notes, and hide those of other libraries."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("always", category=UserWarning, module=r"pansplat(\.|$)")
+        warnings.showwarning = lambda message, *_: print_message("note", message)
+        yield
+
+
+def table_console(width: int = 140) -> Console:
+    """The terminal; if standard output is none, lines of `width` characters, so that tables keep their columns."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=width)

@@ -1,0 +1,101 @@
+"""The dense renderer equals the reference; unavailable renderers give a reason."""
+
+import os
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+
+from pansplat.bench import renderers
+from pansplat.bench.raster_cases import RasterCase, room_scene
+from pansplat.bench.renderers import render_case, render_dense, render_in_viewer, unavailable_reason
+from pansplat.bench.scenes import full_lattice_room
+from pansplat.errors import InputError
+from pansplat.rendering import rasterize
+
+HEIGHT = 16
+VIEWER_CASE = RasterCase("gl", HEIGHT, layout="cubemap", face_size=10, threads=2)
+
+
+@pytest.fixture
+def pose():
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = torch.tensor((0.1, -0.05, 0.2))
+    return pose
+
+
+@pytest.mark.parametrize(
+    ("dtype", "near", "tolerance"),
+    [(torch.float64, 0.05, 1e-12), (torch.float64, 2.0, 1e-12), (torch.float32, 0.05, 2e-5)],
+)
+def test_dense_equals_the_reference(pose, dtype, near, tolerance):
+    room = full_lattice_room(HEIGHT, degree=1)
+    size = (HEIGHT, 2 * HEIGHT)
+    expected = rasterize(room.to(dtype=torch.float64), pose, size=size, near=near, backend="torch").color
+    rendered = render_dense(room.to(dtype=dtype), pose, HEIGHT, near=near)
+    assert float((rendered - expected).abs().max()) < tolerance
+
+
+def test_dense_gradients_equal_those_of_the_reference(pose):
+    room = full_lattice_room(8, views=1).to(dtype=torch.float64)
+    names = ("means", "scales", "quats", "opacities", "harmonics")
+    grad_color = torch.rand(3, 8, 16, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    found = []
+    for render in (
+        lambda g: render_dense(g, pose, 8),
+        lambda g: rasterize(g, pose, size=(8, 16), backend="torch").color,
+    ):
+        leaves = {name: getattr(room, name).clone().requires_grad_() for name in names}
+        found.append(torch.autograd.grad(render(replace(room, **leaves)), list(leaves.values()), grad_color))
+    for one, other in zip(*found, strict=True):
+        assert torch.allclose(one, other, rtol=1e-9, atol=1e-12)
+
+
+def test_torch_and_dense_are_always_available_and_equal(pose):
+    assert unavailable_reason("torch") is None and unavailable_reason("dense") is None
+    room = full_lattice_room(8)
+    images = [render_case(RasterCase(backend, 8), room, pose).color for backend in ("dense", "torch")]
+    assert torch.allclose(*images, atol=1e-5)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="tests a machine without CUDA")
+@pytest.mark.parametrize("backend", ["triton", "gsplat"])
+def test_cuda_renderers_are_unavailable_without_cuda(backend):
+    assert unavailable_reason(backend) == "there is no CUDA device"
+
+
+def test_missing_gsplat_is_named(monkeypatch, pose):
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    with pytest.raises(InputError, match="needs the package gsplat"):
+        render_case(RasterCase("gsplat", 8, "ewa", "z", layout="cubemap", face_size=4), full_lattice_room(8), pose)
+
+
+@pytest.mark.gl
+def test_the_viewer_renders_each_case():
+    scene, cases = room_scene(HEIGHT), [VIEWER_CASE, replace(VIEWER_CASE, kernel="ewa")]
+    gaussians = scene.load()
+    try:
+        images = list(render_in_viewer(scene, gaussians, cases, repeats=2))
+    except InputError as error:
+        if os.environ.get("CI"):
+            raise
+        pytest.skip(str(error))
+    images = [image for image in images if image.tier == "gl33"]
+    assert [image.index for image in images] == [0, 1]
+    for image in images:
+        expected = render_case(cases[image.index].reference, gaussians.to(dtype=torch.float64), scene.pose).color
+        assert float((image.color - expected).abs().max()) < 5e-3
+        assert len(image.frame_ms) == 2 and min(image.frame_ms) > 0 and image.sort_ms >= 0 and image.renderer
+
+
+def test_a_missing_viewer_is_an_error(monkeypatch):
+    monkeypatch.setattr(renderers, "_VIEWER_PACKAGE", "no_such_viewer")
+    with pytest.raises(InputError, match="not installed"):
+        next(render_in_viewer(room_scene(8), full_lattice_room(8), [VIEWER_CASE], repeats=1))
+
+
+def test_an_error_of_the_viewer_is_passed_on(tmp_path):
+    (tmp_path / "job.json").write_text("{}")
+    with pytest.raises(InputError, match="the viewer rendered nothing: error: 'scene'"):
+        list(renderers._viewer_output(tmp_path / "job.json", 1))
