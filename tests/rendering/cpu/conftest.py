@@ -1,8 +1,9 @@
-"""Scenes as the numba stages take them, and what the float64 reference sees of them."""
+"""Projected scenes, and random records with their dense rasterisation in float64."""
 
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pansplat.gaussians.scene import Gaussians
-from pansplat.rendering import projection
+from pansplat.rendering import projection as reference
 from pansplat.rendering.cpu.projection import Camera, GaussianArrays, ProjectedGaussians, project_gaussians
 from pansplat.rendering.cpu.rasterize import MIN_PLANAR_COSINE
 from pansplat.rendering.cpu.records import (
@@ -32,22 +33,24 @@ from pansplat.rendering.cpu.records import (
 from pansplat.rendering.cpu.runtime import Workspace
 from pansplat.rendering.image_planes import ImagePlane
 
-SPREAD = 0.1 * (math.pi / 64) ** 2
+FILTER_VARIANCE = 0.1 * (math.pi / 64) ** 2
 
 
-def _fields(scene: Gaussians, covariances: Tensor | None = None) -> GaussianArrays:
-    scene, nothing = scene.to(dtype=torch.float32), np.empty
+class View(NamedTuple):
+    """Gaussians, a camera, and what it sees: the first arguments of most stages."""
+
+    gaussians: GaussianArrays
+    camera: Camera
+    projected: ProjectedGaussians
+
+
+def _to_arrays(scene: Gaussians, covariances: Tensor | None) -> GaussianArrays:
+    scene, empty = scene.to(dtype=torch.float32), np.empty
     if covariances is None:
-        shape = scene.quats.numpy(), scene.scales.numpy(), nothing((0, 3, 3), np.float32)
+        shape = scene.quats.numpy(), scene.scales.numpy(), empty((0, 3, 3), np.float32)
     else:
-        shape = nothing((0, 4), np.float32), nothing((0, 3), np.float32), covariances.float().numpy()
+        shape = empty((0, 4), np.float32), empty((0, 3), np.float32), covariances.float().numpy()
     return GaussianArrays(scene.means.numpy(), *shape, scene.opacities.numpy(), scene.harmonics.numpy())
-
-
-@pytest.fixture
-def fields() -> Callable[..., GaussianArrays]:
-    """A scene as float32 arrays."""
-    return _fields
 
 
 @pytest.fixture
@@ -59,57 +62,51 @@ def workspace() -> Iterator[Workspace]:
 
 
 @pytest.fixture
-def seen(workspace: Workspace, pose: Tensor) -> Callable[..., ProjectedGaussians]:
-    """What the numba stage sees of a scene."""
+def project(workspace: Workspace, pose: Tensor) -> Callable[..., View]:
+    """Projects a scene in float32."""
 
-    def see(
-        scene: Gaussians, covariances: Tensor | None = None, *, threads: int = 1, near: float = 0.05
-    ) -> ProjectedGaussians:
-        return project_gaussians(
-            _fields(scene, covariances), Camera(pose.numpy(), SPREAD, True, near), workspace, threads
-        )
+    def run(
+        scene: Gaussians, covariances: Tensor | None = None, *, camera: Camera | None = None, threads: int = 1
+    ) -> View:
+        camera = camera or Camera(pose.numpy(), FILTER_VARIANCE, True, 0.05)
+        gaussians = _to_arrays(scene, covariances)
+        return View(gaussians, camera, project_gaussians(gaussians, camera, workspace, threads))
 
-    return see
+    return run
 
 
 @pytest.fixture
-def truth(pose: Tensor) -> Callable[..., projection.ProjectedGaussians]:
-    """What the float64 reference sees of the same float32 numbers."""
+def project_reference(pose: Tensor) -> Callable[..., reference.ProjectedGaussians]:
+    """Projects the same float32 numbers by the float64 reference."""
 
-    def see(scene: Gaussians, covariances: Tensor | None = None) -> projection.ProjectedGaussians:
+    def run(scene: Gaussians, covariances: Tensor | None = None) -> reference.ProjectedGaussians:
         covariances = None if covariances is None else covariances.float().double()
         scene = scene.to(dtype=torch.float32).to(dtype=torch.float64)
-        return projection.project_gaussians(
-            scene, covariances, pose, filter_variance=SPREAD, compensate=True, exact=True
+        return reference.project_gaussians(
+            scene, covariances, pose, filter_variance=FILTER_VARIANCE, compensate=True, exact=True
         )
 
-    return see
+    return run
 
 
-def _decode(records: Tensor) -> dict[str, Tensor]:
-    """The quantities of docs/rendering.md in records, those that do not depend on the choice of a and b."""
+def _decode_records(records: Tensor) -> tuple[Tensor, ...]:
+    """Direction, the rows a, b and l, S' and the peak, all as in docs/rendering.md."""
     direction = records[:, DIRECTION:DIRECTION_RESIDUAL] + records[:, DIRECTION_RESIDUAL:ROW_A]
-    first, second = records[:, ROW_A:ROW_B], records[:, ROW_B:L_ALONG_A]
-    front = direction + records[:, L_ALONG_A, None] * first + records[:, L_ALONG_B, None] * second
-    across = first[:, :, None] * first[:, None, :] + second[:, :, None] * second[:, None, :]
-    return {
-        "direction": direction,
-        "across": across / HALF_LOG2_E,
-        "front": front,
-        "along": records[:, RADIAL_VARIANCE] * HALF_LOG2_E,
-        "peak": 2 ** records[:, LOG2_PEAK],
-    }
+    a, b = records[:, ROW_A:ROW_B], records[:, ROW_B:L_ALONG_A]
+    l = direction + records[:, L_ALONG_A, None] * a + records[:, L_ALONG_B, None] * b  # noqa: E741
+    unit = math.sqrt(HALF_LOG2_E)
+    return direction, a / unit, b / unit, l, records[:, RADIAL_VARIANCE] * HALF_LOG2_E, 2 ** records[:, LOG2_PEAK]
 
 
 @pytest.fixture
-def decode() -> Callable[[Tensor], dict[str, Tensor]]:
-    """What records hold, free of the choice of axes."""
-    return _decode
+def decode_records() -> Callable[[Tensor], tuple[Tensor, ...]]:
+    """Direction, the rows a, b and l, S' and the peak of records."""
+    return _decode_records
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Records drawn at random, every one listed in every tile, and what float64 makes of them densely."""
+    """Random records, each intersecting every tile, and their dense rasterisation."""
 
     records: np.ndarray
     values: np.ndarray
@@ -121,67 +118,68 @@ class Case:
     size: tuple[int, int]
 
     def dense(self, upstream: np.ndarray | None = None) -> tuple[Tensor, ...]:
-        """The sums; with an upstream gradient also the gradients of records and values."""
+        """The sums in float64; with an upstream gradient also the gradients of records and values."""
         records = torch.from_numpy(self.records).double()
         records[:, :DIRECTION_RESIDUAL] += records[:, DIRECTION_RESIDUAL:ROW_A]
         records.requires_grad_()
         values = torch.from_numpy(self.values).double().requires_grad_()
-        through, weights = torch.ones(self.size, dtype=torch.float64), []
-        for n, _, a, b, (front_a, front_b, along, level) in (row.split((3, 3, 3, 3, 4)) for row in records):
-            ahead = n + front_a * a + front_b * b
+        transmittance, weights = torch.ones(self.size, dtype=torch.float64), []
+        for n, _, a, b, (l_along_a, l_along_b, radial_variance, log2_peak) in (
+            row.split((3, 3, 3, 3, 4)) for row in records
+        ):
+            l = n + l_along_a * a + l_along_b * b  # noqa: E741
             offset = self.points - n
             if self.tables.kind != PIXEL_CENTRES:
-                # A ray's length is free, and with it the gradients of what would turn a and b out of their plane.
+                # The length of a ray is free, and so are the gradients that would turn a and b out of their plane.
                 # The kernel's are those at L = 1.
-                length = (1 + offset @ ahead).detach()
+                length = (1 + offset @ l).detach()
                 offset = self.points / torch.where(length > 0, length, 1)[..., None] - n
-            front = 1 + offset @ ahead
+            front = 1 + offset @ l
             if self.tables.kind == PIXEL_CENTRES:
-                front, along = torch.ones_like(front), 0.0
+                front, radial_variance = torch.ones_like(front), 0.0
             q = (offset @ a).square() + (offset @ b).square()
-            alpha = torch.exp2(level - q / (front.square() + along * q)).clamp_max(0.99)
+            alpha = torch.exp2(log2_peak - q / (front.square() + radial_variance * q)).clamp_max(0.99)
             alpha = torch.where((front > 0) & (alpha >= 1 / 255), alpha, 0)
-            weights.append(alpha * through)
-            through = through * (1 - alpha)
-        stacked = torch.stack(weights)
-        ones = torch.cat((values, torch.ones_like(values[:, :1])), dim=1)
-        sums = torch.einsum("nyx,nv->vyx", stacked, ones)
+            weights.append(alpha * transmittance)
+            transmittance = transmittance * (1 - alpha)
+        with_ones = torch.cat((values, torch.ones_like(values[:, :1])), dim=1)
+        sums = torch.einsum("nyx,nv->vyx", torch.stack(weights), with_ones)
         if upstream is None:
             return (sums.detach(),)
         return sums.detach(), *torch.autograd.grad(sums, (records, values), torch.from_numpy(upstream).double())
 
     def reduce(self, slots: np.ndarray) -> np.ndarray:
-        """Each Gaussian's slots summed."""
+        """The sum of each Gaussian's slots."""
         return slots.astype(np.float64).reshape(len(self.records), -1, slots.shape[1]).sum(axis=1)
 
 
 def _random_records(
-    kind: str, picture: ImagePlane, count: int, opacity: tuple[float, float], rng: np.random.Generator
+    kind: str, plane: ImagePlane, count: int, opacity: tuple[float, float], rng: np.random.Generator
 ) -> Tensor:
-    """Gaussians of 0.4 to 6 pixels that point into the picture, float64."""
-    height, width = picture.size
+    """Records of 0.4 to 6 pixels inside the image plane, float64."""
+    height, width = plane.size
     deviations = np.exp(rng.uniform(math.log(0.4), math.log(6), (count, 2)))
     turn = rng.uniform(0, math.pi, count)
-    first = np.stack((np.cos(turn), np.sin(turn)), axis=1) / deviations[:, :1]
-    second = np.stack((-np.sin(turn), np.cos(turn)), axis=1) / deviations[:, 1:]
+    a = np.stack((np.cos(turn), np.sin(turn)), axis=1) / deviations[:, :1]
+    b = np.stack((-np.sin(turn), np.cos(turn)), axis=1) / deviations[:, 1:]
     records = torch.zeros(count, RECORD_SIZE, dtype=torch.float64)
     records[:, LOG2_PEAK] = torch.from_numpy(np.log2(rng.uniform(*opacity, count)))
     pixels = rng.uniform(-1, 1, (count, 2)) * (width / 2 + 1, height / 2 + 1)
     if kind == "ewa":
         records[:, DIRECTION:2] = torch.from_numpy(pixels + np.array((width, height)) / 2)
-        records[:, ROW_A : ROW_A + 2], records[:, ROW_B : ROW_B + 2] = map(torch.from_numpy, (first, second))
+        records[:, ROW_A : ROW_A + 2], records[:, ROW_B : ROW_B + 2] = map(torch.from_numpy, (a, b))
         return records
     if kind == "pinhole":
-        ahead = np.concatenate((pixels / picture.focal, np.ones((count, 1))), axis=1)
-        direction = torch.from_numpy(ahead) @ picture.rotation.T
+        rays = np.concatenate((pixels / plane.focal, np.ones((count, 1))), axis=1)
+        direction = torch.from_numpy(rays) @ plane.rotation.T
     else:
         direction = torch.from_numpy(rng.standard_normal((count, 3)))
     direction = direction / direction.norm(dim=1, keepdim=True)
-    right, down = projection.tangent_frame(direction)
+    right, down = reference.tangent_frame(direction)
     records[:, DIRECTION:DIRECTION_RESIDUAL] = direction
-    for columns, axis in ((ROW_A, first), (ROW_B, second)):
-        across = torch.from_numpy(axis) / picture.pixel_angle
-        records[:, columns : columns + 3] = across[:, :1] * right + across[:, 1:] * down
+    for field, row in ((ROW_A, a), (ROW_B, b)):
+        across = torch.from_numpy(row) / plane.pixel_angle
+        records[:, field : field + 3] = across[:, :1] * right + across[:, 1:] * down
     records[:, L_ALONG_A : L_ALONG_B + 1] = torch.from_numpy(0.05 * rng.standard_normal((count, 2)))
     records[:, RADIAL_VARIANCE] = torch.from_numpy(rng.uniform(0, 0.05, count))
     return records
@@ -189,7 +187,7 @@ def _random_records(
 
 @pytest.fixture
 def make_case(pose: Tensor) -> Callable[..., Case]:
-    """Makes cases: "equirect" or "pinhole" by the exact kernel, "ewa" by the classic one."""
+    """Makes cases of a kind: "equirect" or "pinhole" for the exact kernel, "ewa"."""
 
     def make(
         kind: str,
@@ -200,19 +198,17 @@ def make_case(pose: Tensor) -> Callable[..., Case]:
         opacity: tuple[float, float] = (0.05, 0.95),
     ) -> Case:
         rng = np.random.default_rng(3)
-        picture = ImagePlane(size, pose[:3, :3], 0.0 if kind == "equirect" else 0.6 * max(size))
-        precise = _random_records(kind, picture, count, opacity, rng)
-        records = precise.float()
-        records[:, DIRECTION_RESIDUAL:ROW_A] = (
-            precise[:, :DIRECTION_RESIDUAL] - records[:, :DIRECTION_RESIDUAL].double()
-        ).float()
-        tables = tabulate_pixels(picture, exact=kind != "ewa")
+        plane = ImagePlane(size, pose[:3, :3], 0.0 if kind == "equirect" else 0.6 * max(size))
+        precise = _random_records(kind, plane, count, opacity, rng)
+        records, heads = precise.float(), slice(DIRECTION_RESIDUAL)
+        records[:, DIRECTION_RESIDUAL:ROW_A] = (precise[:, heads] - records[:, heads].double()).float()
+        tables = tabulate_pixels(plane, exact=kind != "ewa")
         tiles = tables.tiles[0] * tables.tiles[1]
-        whole = (TILE_SIZE - 1) << 8 | (TILE_SIZE - 1) << 24
+        whole_tile = (TILE_SIZE - 1) << 8 | (TILE_SIZE - 1) << 24
         intersections = np.empty((tiles * count, 2), np.int32)
-        intersections[:, 0], intersections[:, 1] = np.tile(np.arange(count), tiles), whole
+        intersections[:, 0], intersections[:, 1] = np.tile(np.arange(count), tiles), whole_tile
         slots = (np.tile(np.arange(count) * tiles, tiles) + np.repeat(np.arange(tiles), count)).astype(np.int32)
-        points = picture.coordinates() if kind == "ewa" else picture.directions()
+        points = plane.coordinates() if kind == "ewa" else plane.directions()
         return Case(
             records.numpy(),
             rng.uniform(-0.5, 1.5, (count, num_values)).astype(np.float32),
@@ -227,19 +223,18 @@ def make_case(pose: Tensor) -> Callable[..., Case]:
     return make
 
 
-@pytest.fixture(params=["behind", "around the eye"])
+@pytest.fixture(params=["behind", "around the camera"])
 def one_too_wide(request: pytest.FixtureRequest, make_case: Callable[..., Case]) -> Case:
-    """A tile of two chunks, narrow but for the last Gaussian: 100 degrees away, or about the eye, and seen."""
+    """A tile of two chunks whose last Gaussian needs three components: 100 degrees away, or around the camera."""
     case = make_case("pinhole", (TILE_SIZE, TILE_SIZE), 300, opacity=(0.02, 0.1))
-    middle = case.points[TILE_SIZE // 2, TILE_SIZE // 2]
-    assert (case.records[:, :DIRECTION_RESIDUAL] @ middle.numpy()).min() > MIN_PLANAR_COSINE
+    centre = case.points[TILE_SIZE // 2, TILE_SIZE // 2]
+    assert (case.records[:, :DIRECTION_RESIDUAL] @ centre.numpy()).min() > MIN_PLANAR_COSINE
     behind = request.param == "behind"
     angle = math.radians(100 if behind else 0)
-    right, down = (axis[0] for axis in projection.tangent_frame(middle[None]))
-    mean = math.cos(angle) * middle + math.sin(angle) * right
-    towards = math.sin(angle) * middle - math.cos(angle) * right
-    # Seen in part of the tile: what makes L positive there, or negative elsewhere, is that the ellipsoid is oblique.
-    size, front, along, level = (0.5, 1.5, 0.0, -1.0) if behind else (3.0, 0.7, 1e3, -3.0)
-    numbers = (mean, torch.zeros(3), size * towards, size * down, torch.tensor((front, 0, along, level)))
-    case.records[-1] = torch.cat(numbers).numpy()
+    right, down = (axis[0] for axis in reference.tangent_frame(centre[None]))
+    direction = math.cos(angle) * centre + math.sin(angle) * right
+    towards = math.sin(angle) * centre - math.cos(angle) * right
+    # It is seen in a part of the tile: the ellipsoid is oblique, which makes L positive there or negative elsewhere.
+    size, *rest = (0.5, 1.5, 0, 0.0, -1.0) if behind else (3.0, 0.7, 0, 1e3, -3.0)
+    case.records[-1] = torch.cat((direction, torch.zeros(3), size * towards, size * down, torch.tensor(rest))).numpy()
     return case

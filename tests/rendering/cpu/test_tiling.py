@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.rendering.cpu.projection import Camera, project_gaussians
+from pansplat.rendering.cpu.projection import Camera
 from pansplat.rendering.cpu.tiling import (
     TileIntersections,
     compute_depths,
@@ -45,9 +45,9 @@ def _expected(observed, picture):
 
 @pytest.mark.parametrize("scale", [0.01, 0.3, 2.0])
 @pytest.mark.parametrize(("layout", "size"), [("equirect", (64, 128)), ("pinhole", (64, 96)), ("cubemap", (64, 128))])
-def test_boxes_are_the_references(layout, size, scale, make_scene, seen, truth, workspace):
+def test_boxes_are_the_references(layout, size, scale, make_scene, project, project_reference, workspace):
     scene = make_scene(2000, scale=scale)
-    observed, expected = seen(scene), truth(scene)
+    observed, expected = project(scene).projected, project_reference(scene)
     for picture in image_planes(layout, size, vertical_fov_degrees=90.0, face_size=None, device=torch.device("cpu")):
         boxes = find_bounding_boxes(observed.records, picture, workspace, 1)
         wanted, is_seen = _expected(expected, picture)
@@ -59,10 +59,10 @@ def test_boxes_are_the_references(layout, size, scale, make_scene, seen, truth, 
         assert (boxes[both] != wanted[both]).any(axis=1).mean() < 2e-3
 
 
-def test_a_gaussian_on_the_axis_of_the_poles_takes_whole_rows(make_scene, fields, workspace):
+def test_a_gaussian_on_the_axis_of_the_poles_takes_whole_rows(make_scene, project, workspace):
     scene = make_scene(2, scale=0.05)
     scene.means[:] = torch.tensor(((0.0, -1.0, 0.0), (0.0, 1.0, 0.0)))
-    observed = project_gaussians(fields(scene), Camera(np.eye(4), 1e-4, True, 0.05), workspace, 1)
+    observed = project(scene, camera=Camera(np.eye(4), 1e-4, True, 0.05)).projected
     (picture,) = image_planes(
         "equirect", (64, 128), vertical_fov_degrees=90, face_size=None, device=torch.device("cpu")
     )
@@ -71,10 +71,10 @@ def test_a_gaussian_on_the_axis_of_the_poles_takes_whole_rows(make_scene, fields
     assert boxes[0, 2] == 0 and boxes[1, 3] == 63
 
 
-def test_a_box_at_the_panoramas_seam_goes_on_at_the_left(make_scene, fields, workspace):
+def test_a_box_at_the_panoramas_seam_goes_on_at_the_left(make_scene, project, workspace):
     scene = make_scene(1, scale=0.05)
     scene.means[:] = torch.tensor((0.0, 0.0, -1.0))
-    observed = project_gaussians(fields(scene), Camera(np.eye(4), 1e-4, True, 0.05), workspace, 1)
+    observed = project(scene, camera=Camera(np.eye(4), 1e-4, True, 0.05)).projected
     (picture,) = image_planes(
         "equirect", (64, 128), vertical_fov_degrees=90, face_size=None, device=torch.device("cpu")
     )
