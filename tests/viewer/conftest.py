@@ -1,7 +1,9 @@
-"""A GL context that fails the test on any GL error, scenes, and pictures of the torch reference."""
+"""One OpenGL context and pooled renderers for the session, scenes, and comparison with the torch reference."""
 
+import functools
 import os
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import moderngl
 import numpy as np
@@ -9,15 +11,20 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
+from pansplat.gaussians.ply import save_ply
 from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.rendering import Rendering, rasterize
 from pansplat_viewer.offscreen import create_context
 from pansplat_viewer.renderer import DrawSettings, SplatRenderer
 
+_Y0 = 0.28209479177387814  # the constant harmonic
+
 
 @pytest.fixture(scope="session")
 def gl_context() -> Iterator[moderngl.Context]:
+    """A standalone OpenGL context. Use `ctx`, which makes it current and checks for errors."""
     try:
         context = create_context()
     except InputError as error:
@@ -30,38 +37,47 @@ def gl_context() -> Iterator[moderngl.Context]:
 
 @pytest.fixture
 def ctx(gl_context: moderngl.Context) -> Iterator[moderngl.Context]:
-    """An OpenGL context, current, without errors before and after the test."""
+    """The OpenGL context, current; fails on an OpenGL error before or after the test."""
     with gl_context:
         assert gl_context.error == "GL_NO_ERROR"
         yield gl_context
         assert gl_context.error == "GL_NO_ERROR"
 
 
+@pytest.fixture(scope="session")
+def _renderers(gl_context: moderngl.Context) -> Iterator[dict[tuple[str, int, int], SplatRenderer]]:
+    renderers: dict[tuple[str, int, int], SplatRenderer] = {}
+    yield renderers
+    with gl_context:
+        for renderer in renderers.values():
+            renderer.release()
+
+
 @pytest.fixture
-def renderer(ctx: moderngl.Context) -> Iterator[Callable[..., SplatRenderer]]:
-    """Makes renderers with 32-bit targets that are released after the test."""
-    made = []
+def renderer(ctx, _renderers) -> Callable[..., SplatRenderer]:
+    """Returns a renderer with 32-bit targets and a newly uploaded scene; `slot` tells apart those of one test."""
 
-    def make(scene: Scene, tier: str = "auto", color_bits: int = 32) -> SplatRenderer:
-        made.append(SplatRenderer(ctx, tier=tier, color_bits=color_bits))
-        made[-1].upload(scene)
-        return made[-1]
+    def get(scene: Scene, tier: str = "auto", color_bits: int = 32, slot: int = 0) -> SplatRenderer:
+        key = (tier, color_bits, slot)
+        if key not in _renderers:
+            _renderers[key] = SplatRenderer(ctx, tier=tier, color_bits=color_bits)
+        _renderers[key].upload(scene)
+        return _renderers[key]
 
-    yield make
-    for renderer in made:
-        renderer.release()
+    return get
 
 
+@functools.cache
 def _random_scene(count: int = 300, degree: int = 1, size: float = 0.06, seed: int = 0) -> Scene:
     random = torch.Generator().manual_seed(seed)
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=random), dim=-1)
     radii = 1 + 3 * torch.rand(count, 1, generator=random)
-    spread = torch.exp(0.8 * torch.randn(count, 3, generator=random))
+    elongation = torch.exp(0.8 * torch.randn(count, 3, generator=random))
     cam2world = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     cam2world[:, :3, 3] = torch.tensor(((0.3, 0.1, -0.2), (-0.3, 0.0, 0.25)))
     gaussians = Gaussians(
         means=directions * radii,
-        scales=size * radii * spread,
+        scales=size * radii * elongation,
         quats=torch.randn(count, 4, generator=random),
         opacities=torch.rand(count, generator=random),
         harmonics=0.3 * torch.randn(count, (degree + 1) ** 2, 3, generator=random),
@@ -73,13 +89,13 @@ def _random_scene(count: int = 300, degree: int = 1, size: float = 0.06, seed: i
 
 @pytest.fixture
 def random_scene() -> Callable[..., Scene]:
-    """Makes a shell of Gaussians, 1 to 4 m from the origin, of `size` radians, elongated up to some 10:1."""
+    """Returns a shell of Gaussians of `size` radians, 1 to 4 m from the origin, elongated up to 10:1; do not modify."""
     return _random_scene
 
 
 @pytest.fixture
 def pose() -> np.ndarray:
-    """A camera near the origin, turned by a general rotation."""
+    """A camera near the origin with a general rotation."""
     cam2world = np.eye(4)
     quat = torch.tensor((0.7, 0.3, -0.5, 0.2), dtype=torch.float64)
     cam2world[:3, :3] = rotations_from_quats(quat).numpy()
@@ -87,35 +103,35 @@ def pose() -> np.ndarray:
     return cam2world
 
 
+def _reference(scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> Rendering:
+    return rasterize(
+        scene.gaussians.to(dtype=torch.float64),
+        torch.from_numpy(cam2world),
+        size=size[::-1],
+        layout="pinhole" if settings.layout == "pinhole" else "cubemap",
+        vertical_fov_degrees=settings.vertical_fov_degrees,
+        kernel=settings.kernel,
+        order=settings.order,
+        lowpass=settings.lowpass,
+        background=settings.background,
+        near=settings.near,
+        face_size=settings.face_size,
+    )
+
+
 @pytest.fixture
 def reference() -> Callable[..., Rendering]:
-    """The torch reference's float64 picture of a scene for the same settings."""
-
-    def draw(scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> Rendering:
-        return rasterize(
-            scene.gaussians.to(dtype=torch.float64),
-            torch.from_numpy(cam2world),
-            size=size[::-1],
-            layout="pinhole" if settings.layout == "pinhole" else "cubemap",
-            vertical_fov_degrees=settings.vertical_fov_degrees,
-            kernel=settings.kernel,
-            order=settings.order,
-            lowpass=settings.lowpass,
-            background=settings.background,
-            near=settings.near,
-            face_size=settings.face_size,
-        )
-
-    return draw
+    """Renders a scene with the float64 torch reference under the same settings."""
+    return _reference
 
 
 @pytest.fixture
-def assert_same() -> Callable[..., None]:
-    """Checks a renderer's last picture against a Rendering.
+def assert_matches() -> Callable[..., None]:
+    """Checks a renderer's last image against a Rendering, optionally at a mask of pixels.
 
-    Bounds: mean 1e-4, max 5e-3. Where alpha stands within rounding of 1/255 one renderer may draw a splat
-    that the other leaves out; that changes a pixel by at most 1/255 of its colour, which for colours up to
-    1.25 is within the maximum, so no pixel is left out.
+    Bounds: mean 1e-4, max 5e-3. Where alpha is within rounding of 1/255, one renderer may draw a splat that the other
+    leaves out. That changes a pixel by at most 1/255 of the splat's colour, which the maximum covers for colours up to
+    1.25, so no pixel is left out.
     """
 
     def check(renderer: SplatRenderer, expected: Rendering, where: np.ndarray | None = None) -> None:
@@ -125,16 +141,26 @@ def assert_same() -> Callable[..., None]:
         assert error.mean() <= 1e-4
         assert error.max() <= 5e-3
         depth = expected.depth.numpy()
-        relative = np.abs(renderer.read_depth() - depth) / np.maximum(depth, 1e-3)
-        relative = relative[where]
-        # At the rim one flipped splat weighs 1/255 against little else, so the maximum is looser.
+        relative = (np.abs(renderer.read_depth() - depth) / np.maximum(depth, 1e-3))[where]
+        # Where alpha is small, one such splat changes the mean depth more, so the maximum is looser.
         assert relative.mean() <= 1e-4
         assert (relative > 5e-3).mean() <= 1e-3
 
     return check
 
 
-_Y0 = 0.28209479177387814  # the constant harmonic
+@pytest.fixture
+def assert_reference(renderer, assert_matches) -> Callable[..., None]:
+    """Checks that both tiers render a scene as the reference does."""
+
+    def check(scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> None:
+        expected = _reference(scene, cam2world, size, settings)
+        for tier in ("gl33", "gl43"):
+            drawn = renderer(scene, tier)
+            drawn.render(cam2world, size, settings)
+            assert_matches(drawn, expected)
+
+    return check
 
 
 @pytest.fixture(scope="session")
@@ -163,11 +189,16 @@ def small_scene() -> Scene:
     return Scene(Gaussians.cat(parts), cam2world, 0.45, 10.0, ("a.png", "b.png"), "synthetic", 64)
 
 
+@pytest.fixture
+def room(tmp_path: Path, small_scene: Scene) -> Path:
+    """The small scene as a file."""
+    save_ply(small_scene, tmp_path / "room.ply")
+    return tmp_path / "room.ply"
+
+
 @pytest.fixture(scope="session")
 def axis_photos() -> np.ndarray:
     """Two panoramas coloured by direction: red to the right, green up, blue ahead; the second is dim."""
-    from pansplat.geometry.equirect import pixel_directions
-
     directions = pixel_directions(128, 256).numpy()
     image = 0.5 + 0.5 * directions * np.array((1, -1, 1), dtype=np.float32)
     return np.stack((image, 0.3 * image)).astype(np.float32)

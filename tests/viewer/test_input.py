@@ -17,8 +17,8 @@ def state(small_scene) -> ViewerState:
     return state
 
 
-def press(*keys: str, held: tuple[str, ...] = ()) -> Input:
-    return Input(pressed=frozenset(keys), held=frozenset((*keys, *held)))
+def press(state: ViewerState, *keys: str, held: tuple[str, ...] = ()) -> Commands:
+    return apply_input(state, Input(pressed=frozenset(keys), held=frozenset((*keys, *held))))
 
 
 @pytest.mark.parametrize(
@@ -33,16 +33,14 @@ def test_fly_keys_move_at_the_flying_speed(state, key, step):
     assert np.allclose(state.camera.position, 0.5 * FLY_SPEED * np.array(step))
 
 
-def test_shift_is_faster_and_alt_slower(state):
+def test_shift_is_faster_alt_is_slower_and_opposite_keys_cancel(state):
     moved = []
     for held in (("w",), ("w", "shift"), ("w", "alt")):
         state.camera = state.home
         apply_input(state, Input(seconds=0.1, held=frozenset(held)))
         moved.append(state.camera.position[2])
     assert moved == pytest.approx([0.1, 0.1 * FAST, 0.1 * SLOW])
-
-
-def test_opposite_keys_cancel(state):
+    state.camera = state.home
     apply_input(state, Input(held=frozenset("wsadqe")))
     assert state.camera == state.home
 
@@ -52,18 +50,18 @@ def test_drag_looks_around_without_moving(state):
     assert state.camera.yaw_radians > 0 and state.camera.position == state.home.position
 
 
-def test_scroll_zooms_when_flying_and_approaches_when_orbiting(state):
+def test_scroll_changes_the_field_of_view_when_flying_and_the_distance_when_orbiting(state):
     apply_input(state, Input(scroll=1.0))
     assert state.camera.vertical_fov_degrees < state.home.vertical_fov_degrees
-    apply_input(state, press("v"))
+    press(state, "v")
     before = state.camera
     apply_input(state, Input(scroll=1.0))
     assert state.camera.distance < before.distance
     assert state.camera.vertical_fov_degrees == before.vertical_fov_degrees
 
 
-def test_v_toggles_orbiting_and_drag_then_turns_around_the_point_ahead(state):
-    apply_input(state, press("v"))
+def test_v_switches_to_orbiting_which_keeps_the_centre(state):
+    press(state, "v")
     assert state.orbiting
     center = cameras.orbit_center(state.camera)
     apply_input(state, Input(drag=(80.0, 10.0)))
@@ -73,7 +71,7 @@ def test_v_toggles_orbiting_and_drag_then_turns_around_the_point_ahead(state):
         before = state.camera
         apply_input(state, Input(held=frozenset(key)))
         assert np.allclose(cameras.orbit_center(state.camera), center) and state.camera != before
-    apply_input(state, press("v"))
+    press(state, "v")
     assert not state.orbiting
 
 
@@ -82,38 +80,37 @@ def test_pan_moves_across_the_view(state):
     assert state.camera.position[0] < 0 and state.camera.position[2] == pytest.approx(0)
 
 
-def test_numbers_jump_to_the_panoramas_and_missing_ones_do_nothing(state):
-    apply_input(state, press("2"))
-    assert np.allclose(state.camera.position, state.context[1, :3, 3]) and state.flight == 1
-    apply_input(state, press("1"))
-    assert np.allclose(state.camera.position, state.context[0, :3, 3]) and state.flight == 0
+def test_digits_jump_to_the_panoramas_that_exist(state):
+    for key, view in (("2", 1), ("1", 0)):
+        press(state, key)
+        assert np.allclose(state.camera.position, state.context[view, :3, 3]) and state.flight == view
     before = state.camera
-    apply_input(state, press("3"))
+    press(state, "3")
     assert state.camera == before
 
 
 def test_space_plays_the_flight_to_its_end_and_again_from_the_start(state):
-    apply_input(state, press("space"))
+    press(state, "space")
     assert state.playing
     for _ in range(100):
         advance_flight(state, 0.1)
     assert not state.playing and state.flight == 1
     assert np.allclose(state.camera.position, state.context[1, :3, 3])
-    apply_input(state, press("space"))
+    press(state, "space")
     assert state.playing and state.flight == 0
 
 
-def test_space_again_pauses(state):
-    apply_input(state, press("space"))
+def test_space_pauses_a_playing_flight(state):
+    press(state, "space")
     advance_flight(state, 1.0)
-    apply_input(state, press("space"))
+    press(state, "space")
     before = state.camera
     advance_flight(state, 1.0)
     assert state.camera == before
 
 
-def test_flying_by_hand_stops_the_flight_but_zooming_does_not(state):
-    apply_input(state, press("space"))
+def test_moving_the_camera_stops_the_flight_and_zooming_does_not(state):
+    press(state, "space")
     apply_input(state, Input(scroll=1.0))
     assert state.playing
     apply_input(state, Input(held=frozenset("w")))
@@ -121,71 +118,70 @@ def test_flying_by_hand_stops_the_flight_but_zooming_does_not(state):
 
 
 def test_comma_and_period_step_along_the_flight_and_stop_at_its_ends(state):
-    apply_input(state, press(","))
+    press(state, ",")
     assert state.flight == 0
     for _ in range(12):
-        apply_input(state, press("."))
+        press(state, ".")
     assert state.flight == pytest.approx(0.5)
     assert np.allclose(state.camera.position, (0, 0, 0.25))
     for _ in range(50):
-        apply_input(state, press("."))
+        press(state, ".")
     assert state.flight == 1
 
 
-def test_tab_h_and_c_toggle_what_is_shown(state):
-    for key, name in (("tab", "overlay"), ("h", "help"), ("c", "photo")):
-        before = getattr(state, name)
-        apply_input(state, press(key))
-        assert getattr(state, name) is not before
-        apply_input(state, press(key))
-        assert getattr(state, name) is before
+@pytest.mark.parametrize(("key", "name"), [("tab", "overlay"), ("h", "help"), ("c", "photo")])
+def test_key_toggles_what_is_shown(state, key, name):
+    before = getattr(state, name)
+    press(state, key)
+    assert getattr(state, name) is not before
+    press(state, key)
+    assert getattr(state, name) is before
 
 
-def test_r_goes_back_to_the_start(state):
+def test_r_restores_the_start(state):
     apply_input(state, Input(held=frozenset("wd"), drag=(40.0, 10.0), scroll=2.0))
     assert state.camera != state.home
-    apply_input(state, press("r"))
+    press(state, "r")
     assert state.camera == state.home
 
 
-def test_p_wishes_for_a_png_and_shift_p_for_an_exr(state):
-    assert apply_input(state, press("p")) == Commands(png=True)
-    assert apply_input(state, press("p", held=("shift",))) == Commands(exr=True)
-    assert apply_input(state, press("f")) == Commands(focus=True)
-    assert apply_input(state, Input()) == Commands()
+def test_p_and_f_give_commands(state):
+    assert press(state, "p") == Commands(png=True)
+    assert press(state, "p", held=("shift",)) == Commands(exr=True)
+    assert press(state, "f") == Commands(focus=True)
+    assert press(state) == Commands()
 
 
-def test_escape_closes_the_help_first_and_then_leaves(state):
+def test_escape_closes_the_help_first_and_then_quits(state):
     state.help = True
-    apply_input(state, press("escape"))
+    press(state, "escape")
     assert not state.help and not state.quit
-    apply_input(state, press("escape"))
+    press(state, "escape")
     assert state.quit
 
 
-def test_control_q_leaves_and_q_alone_does_not(state):
-    apply_input(state, press("q"))
+def test_q_quits_only_with_control(state):
+    press(state, "q")
     assert not state.quit
     before = state.camera
-    apply_input(state, press("q", held=("ctrl",)))
+    press(state, "q", held=("ctrl",))
     assert state.quit and state.camera == before
 
 
-def test_entering_a_single_view_scene_leaves_the_modes_that_need_two(small_scene):
+def test_entering_a_scene_of_one_view_resets_modes_that_need_two(small_scene):
     one = replace(small_scene, gaussians=small_scene.gaussians.select(small_scene.gaussians.views == 0))
-    one = replace(one, cam2world=one.cam2world[:1])
     state = ViewerState()
     state.settings = replace(state.settings, mode="difference", view=1)
-    enter_scene(state, one)
+    enter_scene(state, replace(one, cam2world=one.cam2world[:1]))
     assert state.settings.mode == "joint" and state.settings.view == 0
     assert state.levels == (0, 1, 2, 3)
 
 
-def test_a_scene_without_cameras_is_seen_from_outside(small_scene):
+def test_a_scene_without_cameras_is_seen_from_outside_and_has_no_flight(small_scene):
     state = ViewerState()
     enter_scene(state, replace(small_scene, cam2world=small_scene.cam2world[:0]))
     means = small_scene.gaussians.means.double().numpy()
     ahead = (means - np.asarray(state.camera.position)) @ cameras.rotation(state.camera)[:, 2]
     assert (ahead > 0).mean() > 0.95
-    apply_input(state, press("space", "1", "."))
-    assert not state.playing, "there is nowhere to fly"
+    press(state, "space", "1", ".")
+    assert not state.playing

@@ -1,4 +1,4 @@
-"""What is kept between frames: layers, cached cube faces, the order from the thread."""
+"""What is kept between frames: layers, cached cube faces, and the order from the worker thread."""
 
 import time
 from dataclasses import replace
@@ -6,12 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pansplat_viewer.renderer import DrawSettings
+from pansplat_viewer.layers import TargetStore
+from pansplat_viewer.renderer import DrawSettings, SplatRenderer
 
 pytestmark = pytest.mark.gl
 
 SIZE = (80, 60)
 CACHED = DrawSettings(cached=True, background=(0.3, 0.2, 0.1))
+STORAGES = (CACHED, replace(CACHED, cached=False), replace(CACHED, cached=False, layout="equirect"))
 
 
 def turned(pose, degrees):
@@ -28,45 +30,46 @@ def smooth(scene):
     return replace(scene, gaussians=replace(scene.gaussians, scales=scene.gaussians.scales.clamp_min(0.15)))
 
 
+def image_of(drawn, pose, settings, size=SIZE):
+    drawn.render(pose, size, settings)
+    return drawn.read_color()
+
+
 @pytest.mark.parametrize("color_bits", [16, 32])
 @pytest.mark.parametrize("mode", ["joint", "deferred", "difference"])
-def test_turning_with_cached_faces_equals_drawing(renderer, random_scene, pose, mode, color_bits):
+def test_cached_faces_give_the_image_of_direct_drawing(renderer, random_scene, pose, mode, color_bits):
     scene = smooth(random_scene(150))
-    kept, direct = renderer(scene, color_bits=color_bits), renderer(scene)
+    kept, direct = renderer(scene, color_bits=color_bits, slot=1), renderer(scene)
     for degrees in (0, 40, 100, 170, 260):
         camera = turned(pose, degrees)
-        kept.render(camera, SIZE, replace(CACHED, mode=mode))
-        direct.render(camera, SIZE, replace(CACHED, mode=mode, cached=False))
-        error = np.abs(kept.read_color() - direct.read_color())
+        settings = replace(CACHED, mode=mode)
+        error = np.abs(image_of(kept, camera, settings) - image_of(direct, camera, replace(settings, cached=False)))
         assert error.mean() < 4e-3
         assert error.max() < 0.04
 
 
-def test_depth_from_cached_faces_equals_drawing(renderer, random_scene, pose):
+def test_cached_faces_give_the_depth_of_direct_drawing(renderer, random_scene, pose):
     scene = smooth(random_scene(400, size=0.2))
-    kept, direct = renderer(scene), renderer(scene)
+    kept, direct = renderer(scene), renderer(scene, slot=1)
     kept.render(pose, SIZE, CACHED)
     direct.render(pose, SIZE, replace(CACHED, cached=False))
     assert np.abs(kept.read_depth() - direct.read_depth()).mean() < 0.01
 
 
-def test_turning_draws_each_face_once(renderer, random_scene, pose):
+def test_rotation_draws_each_face_once(renderer, random_scene, pose):
     drawn = renderer(random_scene())
     for degrees in range(0, 360, 30):
         drawn.render(turned(pose, degrees), SIZE, CACHED)
     drawn.render(turned(pose, 90), SIZE, CACHED)
     assert drawn.stats.cached and drawn.stats.drawn == 0
     drawn.render(pose, SIZE, replace(CACHED, background=(1, 1, 1)))
-    assert drawn.stats.cached  # the background lies behind the layers
+    assert drawn.stats.cached, "layers do not depend on the background"
 
 
-def test_narrow_views_are_drawn_directly_rather_than_from_giant_faces(renderer, random_scene, pose):
+def test_narrow_field_of_view_is_drawn_directly(renderer, random_scene, pose):
     drawn = renderer(random_scene())
     narrow = replace(CACHED, vertical_fov_degrees=1.0)
-    drawn.render(pose, SIZE, narrow)
-    picture = drawn.read_color()
-    drawn.render(pose, SIZE, replace(narrow, cached=False))
-    assert np.array_equal(drawn.read_color(), picture)
+    assert np.array_equal(image_of(drawn, pose, narrow), image_of(drawn, pose, replace(narrow, cached=False)))
 
 
 @pytest.mark.parametrize(
@@ -83,47 +86,37 @@ def test_narrow_views_are_drawn_directly_rather_than_from_giant_faces(renderer, 
     ids=str,
 )
 def test_kept_layers_follow_every_setting(renderer, random_scene, pose, change):
-    drawn, fresh = renderer(random_scene(size=0.1)), renderer(random_scene(size=0.1))
-    for settings in (CACHED, replace(CACHED, cached=False), replace(CACHED, cached=False, layout="equirect")):
-        drawn.render(pose, SIZE, settings)
-        before = drawn.read_color()
+    scene = random_scene(size=0.1)
+    drawn, fresh = renderer(scene), renderer(scene, slot=1)
+    for settings in STORAGES:
+        before = image_of(drawn, pose, settings)
         changed = replace(settings, **change)
-        drawn.render(pose, SIZE, changed)
-        fresh.render(pose, SIZE, changed)
-        assert np.abs(drawn.read_color() - before).max() > 1e-3
-        assert np.array_equal(drawn.read_color(), fresh.read_color())
+        after = image_of(drawn, pose, changed)
+        assert np.abs(after - before).max() > 1e-3
+        assert np.array_equal(after, image_of(fresh, pose, changed))
 
 
-def test_kept_layers_follow_position_scene_and_size(renderer, random_scene, pose):
-    drawn, fresh = renderer(random_scene()), renderer(random_scene())
+def test_kept_layers_follow_position_size_and_scene(renderer, random_scene, pose):
+    drawn, fresh = renderer(random_scene()), renderer(random_scene(), slot=1)
     moved = pose.copy()
     moved[0, 3] += 0.2
-    for settings in (CACHED, replace(CACHED, cached=False)):
+    for settings in STORAGES[:2]:
         drawn.render(pose, SIZE, settings)
         drawn.render(moved, SIZE, settings)
-        fresh.render(moved, SIZE, settings)
         assert not drawn.stats.cached
-        assert np.array_equal(drawn.read_color(), fresh.read_color())
-        drawn.render(moved, (50, 30), settings)
-        fresh.render(moved, (50, 30), settings)
-        assert drawn.read_color().shape == (30, 50, 4)
-        assert np.array_equal(drawn.read_color(), fresh.read_color())
+        assert np.array_equal(drawn.read_color(), image_of(fresh, moved, settings))
+        small = image_of(drawn, moved, settings, (50, 30))
+        assert small.shape == (30, 50, 4)
+        assert np.array_equal(small, image_of(fresh, moved, settings, (50, 30)))
     other = random_scene(seed=7)
     drawn.upload(other)
-    drawn.render(moved, SIZE, CACHED)
-    assert np.array_equal(drawn.read_color(), _picture(renderer(other), moved, CACHED))
-
-
-def _picture(drawn, pose, settings):
-    drawn.render(pose, SIZE, settings)
-    return drawn.read_color()
+    assert np.array_equal(image_of(drawn, moved, CACHED), image_of(renderer(other, slot=1), moved, CACHED))
 
 
 def test_reading_depth_changes_nothing_else(renderer, random_scene, pose):
     drawn = renderer(random_scene())
-    for settings in (CACHED, replace(CACHED, cached=False), replace(CACHED, cached=False, layout="equirect")):
-        drawn.render(pose, SIZE, settings)
-        color, stats = drawn.read_color(), drawn.stats
+    for settings in STORAGES:
+        color, stats = image_of(drawn, pose, settings), drawn.stats
         first = drawn.read_depth()
         assert drawn.stats == stats
         assert np.array_equal(drawn.read_color(), color)
@@ -132,56 +125,56 @@ def test_reading_depth_changes_nothing_else(renderer, random_scene, pose):
         assert np.array_equal(drawn.read_depth(), first)
 
 
-def test_unsettled_pictures_settle_to_the_sorted_one(renderer, random_scene, pose):
+def test_unsettled_images_settle_to_the_sorted_one(renderer, random_scene, pose):
     scene = random_scene(degree=2, size=0.1)
     drawn = renderer(scene)
     drawn.render(pose, SIZE, DrawSettings(), wait=False)
-    assert drawn.stats.settled  # nothing to show before the first order
-    moved = pose.copy()
-    moved[:3, 3] += (0.5, 0.0, -0.4)
-    drawn.render(moved, SIZE, DrawSettings(), wait=False)
+    assert drawn.stats.settled, "the first frame waits for its order"
+    pose[:3, 3] += (0.5, 0.0, -0.4)
+    drawn.render(pose, SIZE, DrawSettings(), wait=False)
     assert not drawn.stats.settled
     deadline = time.monotonic() + 20
     while not drawn.stats.settled and time.monotonic() < deadline:
         time.sleep(0.002)
-        drawn.render(moved, SIZE, DrawSettings(), wait=False)
+        drawn.render(pose, SIZE, DrawSettings(), wait=False)
     assert drawn.stats.settled
-    assert np.array_equal(drawn.read_color(), _picture(renderer(scene), moved, DrawSettings()))
+    assert np.array_equal(drawn.read_color(), image_of(renderer(scene, slot=1), pose, DrawSettings()))
 
 
-def test_framebuffer_of_the_caller_is_bound_again(ctx, renderer, random_scene, pose):
+def test_framebuffer_binding_of_the_caller_is_restored(ctx, renderer, random_scene, pose):
     drawn = renderer(random_scene())
-    mine = ctx.framebuffer([ctx.texture((8, 8), 4)])
-    mine.use()
+    bound = ctx.framebuffer([ctx.texture((8, 8), 4)])
+    bound.use()
     drawn.render(pose, SIZE, DrawSettings())
-    assert ctx.fbo is mine
+    assert ctx.fbo is bound
     drawn.read_depth()
-    assert ctx.fbo is mine
-    mine.clear(0.0, 1.0, 0.0, 1.0)
-    assert mine.read(components=4)[:4] == bytes((0, 255, 0, 255))
+    assert ctx.fbo is bound
+    bound.clear(0.0, 1.0, 0.0, 1.0)
+    assert bound.read(components=4)[:4] == bytes((0, 255, 0, 255))
 
 
-def test_targets_beyond_the_budget_are_freed_but_those_in_use(ctx):
-    from pansplat_viewer.layers import TargetStore
-
+def test_unused_targets_over_the_budget_are_freed(ctx):
     store = TargetStore(ctx, color_bits=32, budget_bytes=3 * 16 * 100)
-    for name in "abcd":
-        store.get(name, (10, 10), key=name)
+    targets = {name: store.get(name, (10, 10), key=name) for name in "abcd"}
+    store.trim()
+    assert all(store.get(name, (10, 10), key=name) is targets[name] for name in "abcd"), "all targets were in use"
     store.trim()
     store.get("a", (10, 10), key="a")
     store.trim()
-    assert store.get("a", (10, 10), key="a").key == "a"
-    assert [store.get(name, (10, 10), key=None).key for name in "cd"] == [None, None]
-    kept = store.get("a", (10, 10), key="a")
-    kept.parts.add(0)
+    kept = [name for name in "acdb" if store.get(name, (10, 10), key=name) is targets[name]]
+    assert kept == ["a", "c", "d"], "the least recently used target is freed, the budget holds three"
+    store.release()
+
+
+def test_target_content_is_valid_for_its_key_only(ctx):
+    store = TargetStore(ctx, color_bits=32)
+    store.get("a", (10, 10), key="a").parts.add(0)
     assert store.get("a", (10, 10), key="a").parts == {0}
     assert store.get("a", (10, 10), key="z").parts == set()
     store.release()
 
 
-def test_release_frees_while_the_context_lives_on(ctx, random_scene, pose):
-    from pansplat_viewer.renderer import SplatRenderer
-
+def test_release_leaves_the_context_usable(ctx, random_scene, pose):
     for _ in range(2):
         drawn = SplatRenderer(ctx)
         drawn.upload(random_scene(10))

@@ -1,4 +1,4 @@
-"""What a path offers, and loading it beside a living window."""
+"""The scenes at a path, and loading them in a worker thread."""
 
 import threading
 import time
@@ -11,29 +11,34 @@ from pansplat.gaussians.ply import save_ply
 from pansplat_viewer.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, find_entries, load_entry
 
 
+def ignore(task: str, done: float) -> None: ...
+
+
 def wait_for(loader: SceneLoader) -> object:
     deadline = time.monotonic() + 10
-    while (outcome := loader.poll()) is None:
-        assert time.monotonic() < deadline, "nothing came"
+    while (result := loader.poll()) is None:
+        assert time.monotonic() < deadline, "the loader returned nothing in 10 s"
         time.sleep(0.005)
-    return outcome
+    return result
 
 
-def test_no_such_path_says_so(tmp_path):
-    with pytest.raises(InputError, match=r"nowhere.*no such file or folder.*give"):
-        find_entries(tmp_path / "nowhere", LoadOptions())
+def work_forever(entry, progress):
+    while True:
+        progress("working", 0.5)
+        time.sleep(0.001)
 
 
-def test_a_file_that_is_no_scene_is_refused(tmp_path):
-    file = tmp_path / "picture.jpg"
-    file.write_bytes(b"x")
-    with pytest.raises(InputError, match=r"picture\.jpg"):
-        find_entries(file, LoadOptions())
-
-
-def test_an_empty_folder_is_refused(tmp_path):
-    with pytest.raises(InputError):
-        find_entries(tmp_path, LoadOptions())
+def test_paths_without_scenes_are_refused(tmp_path):
+    (tmp_path / "image.jpg").write_bytes(b"x")
+    (tmp_path / "empty").mkdir()
+    for path, message in (
+        (tmp_path / "nowhere", r"nowhere.*no such file or folder.*give"),
+        (tmp_path / "image.jpg", r"image\.jpg"),
+        (tmp_path / "empty", "empty"),
+        (Path("~nobody-has-this-name"), "no such"),
+    ):
+        with pytest.raises(InputError, match=message):
+            find_entries(path, LoadOptions())
 
 
 def test_a_damaged_scene_is_refused_when_loaded(tmp_path):
@@ -41,21 +46,21 @@ def test_a_damaged_scene_is_refused_when_loaded(tmp_path):
     file.write_bytes(b"ply\nnot really")
     (entry,) = find_entries(file, LoadOptions())
     with pytest.raises(InputError, match=r"scene\.ply"):
-        load_entry(entry, LoadOptions(), lambda what, done: None)
+        load_entry(entry, LoadOptions(), ignore)
 
 
-def test_a_folder_of_scenes_offers_each(tmp_path, small_scene):
+def test_a_folder_of_scenes_has_an_entry_for_each(tmp_path, small_scene):
     for name in ("b", "a"):
         save_ply(small_scene, tmp_path / f"{name}.ply")
     entries = find_entries(tmp_path, LoadOptions())
     assert [entry.name for entry in entries] == ["a", "b"]
-    loaded = load_entry(entries[0], LoadOptions(), lambda what, done: None)
+    loaded = load_entry(entries[0], LoadOptions(), ignore)
     assert len(loaded.scene.gaussians) == len(small_scene.gaussians)
     assert loaded.photos is None
 
 
 @pytest.mark.shared
-def test_a_folder_of_pairs_offers_each(shared):
+def test_a_folder_of_pairs_has_an_entry_for_each(shared):
     entries = find_entries(shared / "data" / "zind", LoadOptions())
     assert len(entries) >= 3 and all(entry.pair is not None for entry in entries)
 
@@ -63,15 +68,15 @@ def test_a_folder_of_pairs_offers_each(shared):
 @pytest.mark.parametrize(
     ("name", "folder"), [("a/b c", "a_b_c"), ("../x", "x"), ("...", "scene"), ("Küche 1", "Küche_1")]
 )
-def test_an_entrys_folder_name_is_one_safe_name(name, folder):
+def test_folder_name_is_a_single_valid_name(name, folder):
     assert SceneEntry(name).folder_name == folder
 
 
-def test_loading_reports_progress_and_hands_over_the_result(small_scene):
+def test_loader_reports_progress_and_returns_the_result_once(small_scene):
     go, reported = threading.Event(), threading.Event()
 
     def load(entry, progress):
-        progress("thinking", 0.25)
+        progress("reading", 0.25)
         reported.set()
         assert go.wait(10)
         return LoadedScene(entry, small_scene)
@@ -80,14 +85,14 @@ def test_loading_reports_progress_and_hands_over_the_result(small_scene):
     assert loader.progress is None and loader.poll() is None
     loader.request(SceneEntry("kitchen"))
     assert reported.wait(10)
-    assert loader.progress == ("kitchen", "thinking", 0.25) and loader.poll() is None
+    assert loader.progress == ("kitchen", "reading", 0.25) and loader.poll() is None
     go.set()
     assert wait_for(loader).scene is small_scene
     assert loader.progress is None and loader.poll() is None
     loader.close()
 
 
-def test_a_failure_is_handed_over_instead_of_raised():
+def test_an_exception_is_returned(small_scene):
     def load(entry, progress):
         raise InputError(f"{entry.name} is damaged")
 
@@ -97,41 +102,27 @@ def test_a_failure_is_handed_over_instead_of_raised():
     loader.close()
 
 
-def test_a_new_request_takes_the_place_of_the_one_under_way(small_scene):
-    first_stopped = threading.Event()
-
+def test_a_new_request_cancels_the_previous_one(small_scene):
     def load(entry, progress):
-        if entry.name == "first":
-            try:
-                while True:
-                    progress("working", 0.5)
-                    time.sleep(0.001)
-            finally:
-                first_stopped.set()
-        return LoadedScene(entry, small_scene)
+        return work_forever(entry, progress) if entry.name == "first" else LoadedScene(entry, small_scene)
 
     loader = SceneLoader(load)
     loader.request(SceneEntry("first"))
     loader.request(SceneEntry("second"))
     assert wait_for(loader).entry.name == "second"
-    assert first_stopped.wait(10)
     loader.close()
+    assert not any(thread.name == "load first" for thread in threading.enumerate())
 
 
-def test_closing_stops_the_work_and_joins_its_thread():
-    def load(entry, progress):
-        while True:
-            progress("working", 0.5)
-            time.sleep(0.001)
-
-    loader = SceneLoader(load)
+def test_close_cancels_the_request_and_joins_its_thread():
+    loader = SceneLoader(work_forever)
     loader.request(SceneEntry("endless"))
     loader.close()
     assert not any(thread.name == "load endless" for thread in threading.enumerate())
 
 
-def test_cached_predictions_are_asked_for_as_the_options_say(monkeypatch, small_scene):
-    asked = {}
+def test_predictions_have_the_arguments_of_the_options(monkeypatch, small_scene):
+    arguments = {}
 
     class FakePair:
         name = "kitchen"
@@ -140,20 +131,15 @@ def test_cached_predictions_are_asked_for_as_the_options_say(monkeypatch, small_
             return f"photographs at {height}"
 
     def predict(pair, **options):
-        asked.update(options)
+        arguments.update(options)
         options["progress"]("predicting", 0.5)
         return small_scene
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
-    said = []
+    tasks = []
     entry = SceneEntry("kitchen", pair=FakePair())
     options = LoadOptions(model="sweep", height=256, cache=False)
-    loaded = load_entry(entry, options, lambda what, done: said.append(what))
-    assert (asked["model"], asked["height"], asked["cache"]) == ("sweep", 256, False)
-    assert loaded.photos == "photographs at 1024" and said[0] == "predicting"
-    assert load_entry(entry, options, lambda what, done: None, photos=False).photos is None
-
-
-def test_home_is_expanded_by_the_command_not_by_the_library(tmp_path):
-    with pytest.raises(InputError, match="no such"):
-        find_entries(Path("~nobody-has-this-name"), LoadOptions())
+    loaded = load_entry(entry, options, lambda task, done: tasks.append(task))
+    assert (arguments["model"], arguments["height"], arguments["cache"]) == ("sweep", 256, False)
+    assert loaded.photos == "photographs at 1024" and tasks[0] == "predicting"
+    assert load_entry(entry, options, ignore, photos=False).photos is None

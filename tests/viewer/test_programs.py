@@ -1,4 +1,4 @@
-"""The GLSL sources: complete, documented, and agreeing with geometry/cubemap.py."""
+"""The GLSL sources are complete, documented, and agree with geometry/cubemap.py and pansplat/constants.py."""
 
 import re
 from importlib import resources
@@ -6,6 +6,7 @@ from importlib import resources
 import pytest
 import torch
 
+from pansplat.constants import ALPHA_CUT
 from pansplat.geometry.cubemap import face_rotations
 from pansplat_viewer.programs import Programs, source
 
@@ -24,11 +25,12 @@ def test_readme_names_every_file_uniform_and_input():
         assert not missing, f"{name}: {missing} not in shaders/README.md"
 
 
-def test_includes_are_resolved_and_the_version_comes_first():
+def test_source_has_the_version_first_then_constants_and_no_includes():
     for name in SOURCES:
         lines = source(name, 330, LAYER_STORAGE=2).splitlines()
-        assert lines[0] == "#version 330 core" and "#define LAYER_STORAGE 2" in lines[1:8]
-        assert f"#define ALPHA_CUT {1 / 255}" in lines[1:8]
+        defines = [line for line in lines if line.startswith("#define")]
+        assert lines[: len(defines) + 1] == ["#version 330 core", *defines]
+        assert {f"#define ALPHA_CUT {ALPHA_CUT}", "#define LAYER_STORAGE 2"} <= set(defines)
         assert not any(line.startswith("#include") for line in lines)
 
 
@@ -41,10 +43,10 @@ def test_faces_are_those_of_the_cubemap():
 
 
 @pytest.mark.gl
-def test_every_program_compiles(ctx):
+def test_every_program_compiles_once(ctx):
     programs = Programs(ctx)
-    made = [programs.project(), programs.project_compute(), programs.splat(), programs.resolve()]
-    made += [programs.accumulate(kept_as) for kept_as in range(3)]
-    assert len({program.glo for program in made}) == 7
+    compiled = [programs.project(), programs.project_compute(), programs.splat(), programs.resolve()]
+    compiled += [programs.present(), *(programs.accumulate(storage) for storage in range(3))]
+    assert len({program.glo for program in compiled}) == 8
     assert programs.accumulate(1) is programs.accumulate(1)
     programs.release()

@@ -1,5 +1,6 @@
-"""What the settings select: views, blending, levels, thresholds, backgrounds; and what is refused."""
+"""GL images equal the torch reference (docs/rendering.md); settings select Gaussians; invalid input is refused."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -7,13 +8,17 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.rendering import blend, blend_weights
+from pansplat.geometry.cubemap import face_poses
+from pansplat.geometry.equirect import pixel_directions
+from pansplat.rendering import blend, blend_weights, rasterize
 from pansplat_viewer.renderer import DrawSettings, SplatRenderer
+from pansplat_viewer.splats import SortedSplats
 
 pytestmark = pytest.mark.gl
 
 SIZE = (64, 48)
 SETTINGS = DrawSettings(background=(0.1, 0.4, 0.7))
+KERNELS = pytest.mark.parametrize("kernel", ["ray", "ewa"])
 
 
 def only(scene, mask):
@@ -24,59 +29,169 @@ def view_of(scene, view):
     return only(scene, scene.gaussians.views == view)
 
 
+@KERNELS
+@pytest.mark.parametrize("lowpass", ["angular", "3dgs"])
+@pytest.mark.parametrize("order", ["radial", "z"])
+def test_pinhole_image_equals_the_reference(random_scene, pose, assert_reference, kernel, lowpass, order):
+    settings = replace(SETTINGS, kernel=kernel, lowpass=lowpass, order=order, vertical_fov_degrees=65)
+    assert_reference(random_scene(), pose, (97, 64), settings)
+
+
+@KERNELS
+def test_each_of_six_faces_equals_the_reference(random_scene, pose, assert_reference, kernel):
+    for face in face_poses(torch.from_numpy(pose)).numpy():
+        assert_reference(random_scene(seed=1), face, (48, 48), replace(SETTINGS, kernel=kernel))
+
+
+@KERNELS
+@pytest.mark.parametrize("order", ["radial", "z"])
+@pytest.mark.parametrize("face_size", [None, 21])
+def test_stitched_panorama_equals_the_reference(random_scene, pose, assert_reference, kernel, order, face_size):
+    settings = replace(SETTINGS, kernel=kernel, order=order, layout="equirect", face_size=face_size)
+    assert_reference(random_scene(seed=2), pose, (96, 48), settings)
+
+
+@KERNELS
+@pytest.mark.parametrize("order", ["radial", "z"])
+def test_camera_among_large_gaussians_equals_the_reference(random_scene, pose, assert_reference, kernel, order):
+    settings = replace(SETTINGS, kernel=kernel, order=order, vertical_fov_degrees=110)
+    assert_reference(random_scene(150, size=0.5, seed=3), pose, SIZE, settings)
+
+
+@KERNELS
+def test_subpixel_needle_and_disc_gaussians_equal_the_reference(random_scene, pose, assert_reference, kernel):
+    scene = random_scene(400, seed=4)
+    scales = scene.gaussians.scales.clone()
+    scales[:100] *= 0.01
+    scales[100:200, 0] *= 30
+    scales[200:300, 1] = 0
+    scene = replace(scene, gaussians=replace(scene.gaussians, scales=scales))
+    assert_reference(scene, pose, (80, 60), replace(SETTINGS, kernel=kernel))
+
+
+@pytest.mark.parametrize("degree", [0, 2, 4])
+def test_colors_of_any_degree_follow_the_position(renderer, random_scene, pose, reference, assert_matches, degree):
+    scene = random_scene(degree=degree, seed=5)
+    drawn = renderer(scene)
+    for shift in (0.0, 0.5):
+        pose[0, 3] += shift
+        drawn.render(pose, SIZE, SETTINGS)
+        assert_matches(drawn, reference(scene, pose, SIZE, SETTINGS))
+
+
+@pytest.mark.parametrize("order", ["radial", "z"])
+def test_ties_are_drawn_in_the_order_of_indices(random_scene, pose, assert_reference, order):
+    scene = random_scene(60, degree=0, size=0.15, seed=6)
+    means = scene.gaussians.means[torch.arange(60) // 6 * 6]  # six of different colour at each position
+    scene = replace(scene, gaussians=replace(scene.gaussians, means=means))
+    assert_reference(scene, pose, SIZE, replace(SETTINGS, order=order))
+
+
+def test_near_unusual_opacities_and_odd_sizes_equal_the_reference(random_scene, pose, assert_reference):
+    scene = random_scene(seed=9)
+    for near in (1.5, 2.5):
+        assert_reference(scene, pose, SIZE, DrawSettings(near=near))
+    for size in ((1, 1), (2, 1), (31, 7), (7, 31)):
+        assert_reference(scene, pose, size, SETTINGS)
+    opacities = scene.gaussians.opacities * 4 - 1
+    opacities[::7] = 0.99 / 255
+    assert_reference(replace(scene, gaussians=replace(scene.gaussians, opacities=opacities)), pose, SIZE, SETTINGS)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e4])
+def test_image_does_not_depend_on_the_unit_of_length(renderer, random_scene, pose, unit):
+    scene = random_scene(seed=7)
+    drawn = renderer(scene)
+    drawn.render(pose, SIZE, DrawSettings())
+    expected = drawn.read_color()
+    cam2world = scene.cam2world.clone()
+    cam2world[:, :3, 3] *= unit
+    gaussians = replace(scene.gaussians, means=scene.gaussians.means * unit, scales=scene.gaussians.scales * unit)
+    drawn.upload(replace(scene, gaussians=gaussians, cam2world=cam2world))
+    pose[:3, 3] *= unit
+    drawn.render(pose, SIZE, DrawSettings(near=0.05 * unit))
+    assert np.abs(drawn.read_color() - expected).max() <= 5e-3
+    assert np.abs(drawn.read_color() - expected).mean() <= 1e-5
+
+
+def test_image_does_not_depend_on_the_position_of_the_scene(renderer, random_scene, pose):
+    scene = random_scene(seed=8)
+    drawn = renderer(scene)
+    drawn.render(pose, SIZE, DrawSettings())
+    expected = drawn.read_color()
+    offset = torch.tensor((4e5, -2e5, 1e5), dtype=torch.float64)
+    cam2world = scene.cam2world.clone()
+    cam2world[:, :3, 3] += offset
+    gaussians = replace(scene.gaussians.to(dtype=torch.float64), means=scene.gaussians.means.double() + offset)
+    drawn.upload(replace(scene, gaussians=gaussians, cam2world=cam2world))
+    pose[:3, 3] += offset.numpy()
+    drawn.render(pose, SIZE, DrawSettings())
+    assert np.abs(drawn.read_color() - expected).mean() <= 1e-5
+
+
+def test_panorama_error_at_seams_is_not_larger_than_inside_faces(renderer, random_scene, pose):
+    scene = random_scene(200, degree=0, size=0.12, seed=12)
+    height, width = 64, 128
+    drawn = renderer(scene)
+    drawn.render(pose, (width, height), DrawSettings(layout="equirect", face_size=64))
+    gaussians = scene.gaussians.to(dtype=torch.float64)
+    direct = rasterize(gaussians, torch.from_numpy(pose), size=(height, width), layout="equirect")  # without faces
+    error = np.abs(drawn.read_color()[..., :3] - direct.color.permute(1, 2, 0).numpy()).mean(axis=-1)
+    largest = np.sort(np.abs(pixel_directions(height, width).numpy()), axis=-1)
+    seam = largest[..., 2] - largest[..., 1] < 3 * math.pi / height
+    assert error[seam].mean() <= 1.5 * error[~seam].mean() + 1e-4
+
+
 @pytest.mark.parametrize("view", [0, 1])
-def test_mode_view_draws_that_views_gaussians(renderer, random_scene, pose, reference, assert_same, view):
+def test_mode_view_draws_the_gaussians_of_the_view(renderer, random_scene, pose, reference, assert_matches, view):
     scene = random_scene()
     drawn = renderer(scene)
     drawn.render(pose, SIZE, replace(SETTINGS, mode="view", view=view))
-    assert_same(drawn, reference(view_of(scene, view), pose, SIZE, SETTINGS))
+    assert_matches(drawn, reference(view_of(scene, view), pose, SIZE, SETTINGS))
     assert drawn.stats.visible <= int((scene.gaussians.views == view).sum())
 
 
 @pytest.mark.parametrize("layout", ["pinhole", "equirect"])
-@pytest.mark.parametrize("place", ["between", "at view 1", "elsewhere"])
-def test_deferred_blending_is_the_references(renderer, random_scene, pose, reference, assert_same, layout, place):
-    scene = random_scene(120)  # sparse, so that there are holes in one view and in both
+@pytest.mark.parametrize("position", ["between", "at view 1", "elsewhere"])
+def test_deferred_blending_equals_the_reference(
+    renderer, random_scene, pose, reference, assert_matches, layout, position
+):
+    scene = random_scene(120)  # sparse, so that one or both views have holes
     centres = scene.cam2world[:, :3, 3].numpy()
-    pose[:3, 3] = {"between": centres.mean(0), "at view 1": centres[1], "elsewhere": (0.1, 0.2, 0.3)}[place]
+    pose[:3, 3] = {"between": centres.mean(0), "at view 1": centres[1], "elsewhere": (0.1, 0.2, 0.3)}[position]
     settings = replace(SETTINGS, mode="deferred", layout=layout)
     drawn = renderer(scene)
     drawn.render(pose, SIZE, settings)
-    pictures = [reference(view_of(scene, view), pose, SIZE, settings) for view in (0, 1)]
+    images = [reference(view_of(scene, view), pose, SIZE, settings) for view in (0, 1)]
     weights = blend_weights(torch.from_numpy(pose[:3, 3].copy()), scene.cam2world[:, :3, 3])
-    total = sum(weight * picture.alpha for weight, picture in zip(weights, pictures, strict=True))
-    band = (total > 0) & (total < 1e-3)  # where the views that count are all but empty (docs/rendering.md, section 7)
+    total = sum(weight * image.alpha for weight, image in zip(weights, images, strict=True))
+    band = (total > 0) & (total < 1e-3)  # where the weighted views are nearly empty (docs/rendering.md, section 7)
     assert band.float().mean() < 0.02
-    assert_same(drawn, blend(pictures, weights), ~band.numpy())
+    assert_matches(drawn, blend(images, weights), ~band.numpy())
 
 
-def test_difference_is_that_of_the_two_views_pictures(renderer, random_scene, pose, reference):
+def test_difference_is_that_of_the_images_of_two_views(renderer, random_scene, pose, reference):
     scene = random_scene()
     drawn = renderer(scene)
     drawn.render(pose, SIZE, replace(SETTINGS, mode="difference"))
     first, second = (reference(view_of(scene, view), pose, SIZE, SETTINGS) for view in (0, 1))
     expected = (first.color - second.color).abs().permute(1, 2, 0).numpy()
-    assert np.abs(drawn.read_color()[..., :3] - expected).max() <= 5e-3
-    assert np.abs(drawn.read_depth() - (first.depth - second.depth).abs().numpy()).mean() <= 1e-3
     forwards = drawn.read_color()
+    assert np.abs(forwards[..., :3] - expected).max() <= 5e-3
+    assert np.abs(drawn.read_depth() - (first.depth - second.depth).abs().numpy()).mean() <= 1e-3
     drawn.render(pose, SIZE, replace(SETTINGS, mode="difference", view=1))
     assert np.abs(drawn.read_color() - forwards).max() <= 1e-6
 
 
-@pytest.mark.parametrize("levels", [frozenset(), frozenset({0}), frozenset({1, 3})])
-def test_levels_select_gaussians(renderer, random_scene, pose, reference, assert_same, levels):
+def test_levels_and_opacity_threshold_select_gaussians(renderer, random_scene, pose, reference, assert_matches):
     scene = random_scene()
     drawn = renderer(scene)
-    drawn.render(pose, SIZE, replace(SETTINGS, levels=levels))
-    mask = torch.isin(scene.gaussians.levels, torch.tensor(sorted(levels), dtype=torch.int64))
-    assert_same(drawn, reference(only(scene, mask), pose, SIZE, SETTINGS))
-
-
-def test_opacity_threshold_leaves_out_the_fainter(renderer, random_scene, pose, reference, assert_same):
-    scene = random_scene()
-    drawn = renderer(scene)
+    for levels in ((), (0,), (1, 3)):
+        drawn.render(pose, SIZE, replace(SETTINGS, levels=frozenset(levels)))
+        mask = torch.isin(scene.gaussians.levels, torch.tensor(levels, dtype=torch.int64))
+        assert_matches(drawn, reference(only(scene, mask), pose, SIZE, SETTINGS))
     drawn.render(pose, SIZE, replace(SETTINGS, opacity_threshold=0.6))
-    assert_same(drawn, reference(only(scene, scene.gaussians.opacities >= 0.6), pose, SIZE, SETTINGS))
+    assert_matches(drawn, reference(only(scene, scene.gaussians.opacities >= 0.6), pose, SIZE, SETTINGS))
 
 
 def test_empty_scene_is_the_background(renderer, random_scene, pose):
@@ -88,34 +203,35 @@ def test_empty_scene_is_the_background(renderer, random_scene, pose):
         assert not drawn.read_depth().any()
 
 
-def test_gaussians_that_are_not_finite_are_left_out_and_counted(renderer, random_scene, pose, reference, assert_same):
+def test_gaussians_with_non_finite_values_are_dropped_and_counted(
+    renderer, random_scene, pose, reference, assert_matches
+):
     scene = random_scene()
-    poisoned = {name: getattr(scene.gaussians, name).clone() for name in ("means", "scales", "quats", "opacities")}
-    harmonics = scene.gaussians.harmonics.clone()
-    poisoned["means"][0, 1] = float("nan")
-    poisoned["scales"][1, 0] = float("inf")
-    poisoned["quats"][2, 3] = float("nan")
-    poisoned["opacities"][3] = float("nan")
-    harmonics[4, 2, 0] = float("-inf")
-    drawn = renderer(replace(scene, gaussians=replace(scene.gaussians, harmonics=harmonics, **poisoned)))
+    names = ("means", "scales", "quats", "opacities", "harmonics")
+    fields = {name: getattr(scene.gaussians, name).clone() for name in names}
+    fields["means"][0, 1] = float("nan")
+    fields["scales"][1, 0] = float("inf")
+    fields["quats"][2, 3] = float("nan")
+    fields["opacities"][3] = float("nan")
+    fields["harmonics"][4, 2, 0] = float("-inf")
+    drawn = renderer(replace(scene, gaussians=replace(scene.gaussians, **fields)))
     drawn.render(pose, SIZE, SETTINGS)
     assert drawn.stats.dropped == 5
     assert drawn.stats.total == len(scene.gaussians) - 5
-    healthy = only(scene, torch.arange(len(scene.gaussians)) >= 5)
-    assert_same(drawn, reference(healthy, pose, SIZE, SETTINGS))
+    finite = only(scene, torch.arange(len(scene.gaussians)) >= 5)
+    assert_matches(drawn, reference(finite, pose, SIZE, SETTINGS))
 
 
 def test_half_float_targets_are_close(renderer, random_scene, pose):
-    scene = random_scene()
-    exact, half = renderer(scene), renderer(scene, color_bits=16)
-    exact.render(pose, SIZE, SETTINGS)
-    half.render(pose, SIZE, SETTINGS)
+    exact, half = renderer(random_scene()), renderer(random_scene(), color_bits=16)
+    for drawn in (exact, half):
+        drawn.render(pose, SIZE, SETTINGS)
     assert 0 < np.abs(exact.read_color() - half.read_color()).max() < 0.02
 
 
-def test_software_gl_gets_full_floats_by_default(ctx, random_scene, pose):
+def test_software_gl_has_32_bit_targets_by_default(ctx, random_scene, pose):
     class Gpu:
-        """The same context under a GPU's name."""
+        """The same context with a GPU's name."""
 
         def __init__(self):
             self.info = {**ctx.info, "GL_RENDERER": "NVIDIA H200"}
@@ -130,47 +246,30 @@ def test_software_gl_gets_full_floats_by_default(ctx, random_scene, pose):
         drawn.release()
 
 
-def test_top_row_is_up_and_right_is_right(renderer, random_scene):
-    """One Gaussian ahead, up (-y) and to the right is upper right; the texture holds the bottom row first."""
+def test_image_is_upright_and_not_mirrored(renderer, random_scene):
     scene = only(random_scene(), torch.arange(300) < 1)
     gaussians = replace(scene.gaussians, means=torch.tensor(((0.5, -0.5, 1.0),)), opacities=torch.ones(1))
     drawn = renderer(replace(scene, gaussians=replace(gaussians, scales=torch.full((1, 3), 0.05))))
     texture = drawn.render(np.eye(4), (64, 64), DrawSettings())
     row, column = np.unravel_index(drawn.read_color()[..., 3].argmax(), (64, 64))
-    assert row < 24 and column > 40
+    assert row < 24 and column > 40, "a mean ahead, up and to the right is at the upper right"
     raw = np.frombuffer(texture.read(), np.float32).reshape(64, 64, 4)
-    assert np.array_equal(raw[::-1], drawn.read_color())
+    assert np.array_equal(raw[::-1], drawn.read_color()), "row 0 of the texture is the bottom row"
 
 
-def test_wide_and_tiled_culling_changes_nothing(renderer, random_scene, pose, monkeypatch):
-    """Culling on the CPU must keep whatever the shaders would draw."""
-    from pansplat_viewer.splats import SortedSplats
-
+def test_culling_does_not_change_the_image(renderer, random_scene, pose, monkeypatch):
     scene = random_scene(1000, size=0.1)
     settings = [replace(SETTINGS, vertical_fov_degrees=fov) for fov in (10, 60, 150)]
-    culled, whole = renderer(scene), renderer(scene)
-    pictures = []
+    culled, whole = renderer(scene), renderer(scene, slot=1)
+    images = []
     for each in settings:
         culled.render(pose, SIZE, each)
         assert culled.stats.drawn < 1000
-        pictures.append(culled.read_color())
+        images.append(culled.read_color())
     monkeypatch.setattr(SortedSplats, "cull", lambda self, camera, selected, **_: selected)
-    for each, picture in zip(settings, pictures, strict=True):
+    for each, image in zip(settings, images, strict=True):
         whole.render(pose, SIZE, each)
-        assert np.array_equal(whole.read_color(), picture)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"mode": "view", "view": 2}, "`view` must be 0..1 in this scene, got 2"),
-        ({"layout": "equirect", "face_size": 100_000}, "limit is .*; use a smaller size or face_size"),
-    ],
-)
-def test_settings_that_do_not_fit_are_refused(renderer, random_scene, pose, change, message):
-    drawn = renderer(random_scene())
-    with pytest.raises(InputError, match=message):
-        drawn.render(pose, SIZE, replace(SETTINGS, **change))
+        assert np.array_equal(whole.read_color(), image)
 
 
 @pytest.mark.parametrize(
@@ -182,30 +281,37 @@ def test_settings_that_do_not_fit_are_refused(renderer, random_scene, pose, chan
         ({"near": 0.0}, "`near` must be a positive distance"),
     ],
 )
-def test_settings_check_themselves(change, message):
+def test_invalid_settings_are_refused(change, message):
     with pytest.raises(InputError, match=message):
         DrawSettings(**change)
 
 
-def test_bad_poses_sizes_and_a_missing_scene_are_refused(renderer, random_scene, pose, ctx):
-    drawn = renderer(random_scene())
+def test_settings_poses_and_sizes_that_do_not_fit_are_refused(renderer, random_scene, pose):
+    scene = random_scene()
+    drawn = renderer(scene)
+    for change, message in (
+        ({"mode": "view", "view": 2}, "`view` must be 0..1 in this scene, got 2"),
+        ({"layout": "equirect", "face_size": 100_000}, "limit is .*; use a smaller size or face_size"),
+    ):
+        with pytest.raises(InputError, match=message):
+            drawn.render(pose, SIZE, replace(SETTINGS, **change))
     with pytest.raises(InputError, match="finite 4x4"):
         drawn.render(np.full((4, 4), np.nan), SIZE, SETTINGS)
     with pytest.raises(InputError, match="at least 1x1"):
         drawn.render(pose, (0, 10), SETTINGS)
+    drawn.upload(replace(scene, cam2world=torch.zeros(0, 4, 4, dtype=torch.float64), names=()))
+    drawn.render(pose, SIZE, SETTINGS)
+    with pytest.raises(InputError, match="0 cameras for 2 views; use mode joint"):
+        drawn.render(pose, SIZE, replace(SETTINGS, mode="deferred"))
+
+
+def test_renderer_without_a_scene_refuses_to_draw(ctx, pose):
     with pytest.raises(InputError, match="color_bits"):
         SplatRenderer(ctx, color_bits=8)
     empty = SplatRenderer(ctx)
     with pytest.raises(InputError, match="call `upload` first"):
         empty.render(pose, SIZE, SETTINGS)
-    with pytest.raises(InputError, match="call `render` first"):
-        empty.read_color()
+    for read in (empty.read_color, empty.read_depth):
+        with pytest.raises(InputError, match="call `render` first"):
+            read()
     empty.release()
-
-
-def test_deferred_without_cameras_is_refused(renderer, random_scene, pose):
-    scene = replace(random_scene(), cam2world=torch.zeros(0, 4, 4, dtype=torch.float64), names=())
-    drawn = renderer(scene)
-    drawn.render(pose, SIZE, SETTINGS)
-    with pytest.raises(InputError, match="0 cameras for 2 views; use mode joint"):
-        drawn.render(pose, SIZE, replace(SETTINGS, mode="deferred"))

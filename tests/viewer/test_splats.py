@@ -1,4 +1,4 @@
-"""Sorting and the thread that does it."""
+"""Sorting, and the worker thread that sorts."""
 
 import threading
 import time
@@ -10,13 +10,18 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from pansplat_viewer import splats as splats_module
-from pansplat_viewer.splats import Splats, SplatSorter, radix_argsort, sort_splats
+from pansplat_viewer.splats import SortedSplats, Splats, SplatSorter, radix_argsort, sort_splats
 
 _FLOATS = st.floats(width=32, allow_nan=False)
 
 
+@pytest.fixture
+def splats(random_scene) -> Splats:
+    return Splats.from_scene(random_scene(20))
+
+
 @given(hnp.arrays(np.float32, st.integers(0, 200), elements=_FLOATS))
-def test_radix_order_is_the_stable_order_of_any_floats(keys):
+def test_radix_order_of_any_floats_is_the_stable_order(keys):
     assert np.array_equal(radix_argsort(keys), np.argsort(keys, kind="stable"))
 
 
@@ -25,31 +30,29 @@ def test_radix_order_of_many_keys_with_ties_is_the_stable_order():
     assert np.array_equal(radix_argsort(keys), np.argsort(keys, kind="stable"))
 
 
-def test_ordering_is_by_distance_from_the_position(random_scene):
+def test_splats_are_sorted_by_distance_from_the_position(random_scene):
     splats = Splats.from_scene(random_scene())
     position = (0.3, -0.2, 0.1)
-    ordering = sort_splats(splats, position)
+    result = sort_splats(splats, position)
     distance = np.linalg.norm(splats.means.astype(np.float64) - position, axis=1)
-    assert np.allclose(ordering.distances, distance, rtol=1e-6)
-    assert np.all(np.diff(distance[ordering.order]) > -1e-6)
-    assert sorted(ordering.order.tolist()) == list(range(len(splats)))
+    assert np.allclose(result.distances, distance, rtol=1e-6)
+    assert np.all(np.diff(distance[result.order]) > -1e-6)
+    assert sorted(result.order.tolist()) == list(range(len(splats)))
 
 
-def _wait(sorter: SplatSorter):
-    for _ in range(2000):
-        ordering = sorter.take()
-        if ordering is not None:
-            return ordering
+def wait_for(sorter: SplatSorter) -> SortedSplats:
+    deadline = time.monotonic() + 10
+    while (result := sorter.take()) is None:
+        assert time.monotonic() < deadline, "the sorter returned nothing in 10 s"
         time.sleep(0.005)
-    raise AssertionError("the sorter made nothing in 10 s")
+    return result
 
 
-def test_sorter_makes_what_was_asked_last_and_skips_what_waited(random_scene, monkeypatch):
-    splats = Splats.from_scene(random_scene(20))
-    started, go, seen = threading.Event(), threading.Event(), []
+def test_sorter_skips_requests_that_were_replaced(splats, monkeypatch):
+    started, go, positions = threading.Event(), threading.Event(), []
 
     def slow(splats, position):
-        seen.append(position)
+        positions.append(position)
         started.set()
         assert go.wait(10)
         return sort_splats(splats, position)
@@ -62,30 +65,30 @@ def test_sorter_makes_what_was_asked_last_and_skips_what_waited(random_scene, mo
     sorter.request(splats, (3.0, 0.0, 0.0))
     assert sorter.take() is None
     go.set()
-    while _wait(sorter).position != (3.0, 0.0, 0.0):
+    while wait_for(sorter).position != (3.0, 0.0, 0.0):
         pass
     sorter.close()
-    assert seen == [(1.0, 0.0, 0.0), (3.0, 0.0, 0.0)]
+    assert positions == [(1.0, 0.0, 0.0), (3.0, 0.0, 0.0)]
 
 
-def test_what_fails_in_the_sorter_is_raised_where_it_is_taken(random_scene, monkeypatch):
+def test_exception_in_the_thread_is_raised_by_take(splats, monkeypatch):
     def fail(splats, position):
-        raise MemoryError("no room")
+        raise MemoryError("out of memory")
 
     monkeypatch.setattr(splats_module, "sort_splats", fail)
     sorter = SplatSorter()
-    sorter.request(Splats.from_scene(random_scene(5)), (0.0, 0.0, 0.0))
-    with pytest.raises(MemoryError, match="no room"):
-        _wait(sorter)
+    sorter.request(splats, (0.0, 0.0, 0.0))
+    with pytest.raises(MemoryError, match="out of memory"):
+        wait_for(sorter)
     sorter.close()
 
 
-def test_closing_ends_the_thread(random_scene):
+def test_close_ends_the_thread(splats):
     before = threading.active_count()
     sorter = SplatSorter()
-    sorter.request(Splats.from_scene(random_scene(5)), (0.0, 0.0, 0.0))
-    _wait(sorter)
+    sorter.request(splats, (0.0, 0.0, 0.0))
+    wait_for(sorter)
     sorter.close()
     assert threading.active_count() == before
     with pytest.raises(RuntimeError, match="closed"):
-        sorter.request(Splats.from_scene(random_scene(5)), (0.0, 0.0, 0.0))
+        sorter.request(splats, (0.0, 0.0, 0.0))

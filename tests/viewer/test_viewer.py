@@ -1,5 +1,6 @@
-"""Clicks and keys, sent to the real panels on a context without a window, change the real picture."""
+"""Clicks and keys that are sent to the panels on a context without a window change the rendered image."""
 
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -7,9 +8,11 @@ from pathlib import Path
 
 import moderngl
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 from imgui_bundle import imgui
+from PIL import Image
 
 from pansplat.data.views import Views
 from pansplat.errors import InputError
@@ -17,15 +20,17 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat_viewer.loader import LoadedScene, SceneEntry, SceneLoader
-from pansplat_viewer.viewer import Viewer
+from pansplat_viewer.state import ViewerState
+from pansplat_viewer.viewer import BUDGET_MS, REFINE_AFTER, SCALES, AdaptiveResolution, Viewer
 
 pytestmark = pytest.mark.gl
 
 SIZE = (560, 680)
-PICTURE = (slice(20, 560), slice(310, 560))  # free of panels
+IMAGE = (slice(20, 560), slice(310, 560))  # rows and columns without panels
+ENTRIES = [SceneEntry("first"), SceneEntry("second")]
 
-# Widgets that must change the picture, each with what to set first so that it has something to change.
-PICTURE_WIDGETS = {
+# Widgets that must change the image, each with the settings that give it something to change.
+IMAGE_WIDGETS = {
     "joint": {"mode": "deferred"},
     "deferred": {"mode": "joint"},
     "difference": {"mode": "joint"},
@@ -50,7 +55,7 @@ PICTURE_WIDGETS = {
     "##flight": {},
     "nearest photograph": {},
 }
-# Widgets whose effect is tested on its own below.
+# Widgets whose effect has its own test.
 OTHER_WIDGETS = {
     "Scene", "pair", "path", "Open", "Gaussians", "Drawing", "background", "coarser while moving", "Camera",
     "fly", "orbit", "Reset", "speed", "Panorama 1", "Fly", "Photograph", "split", "Screenshot", "PNG",
@@ -58,11 +63,53 @@ OTHER_WIDGETS = {
 }  # fmt: skip
 
 
-class Person:
-    """Sends events and looks at what comes back."""
+def run(resolution: AdaptiveResolution, full_ms: float, frames: int) -> list[float]:
+    """Move for some frames whose time is proportional to their pixels; returns the scales."""
+    scales = []
+    for frame in range(frames):
+        plan = resolution.plan(frame / 60, moved=True, turned=False)
+        resolution.record(plan, full_ms * plan.scale**2)
+        scales.append(plan.scale)
+    return scales
+
+
+def test_resolution_is_full_on_a_fast_machine_and_fits_the_budget_on_a_slow_one():
+    assert set(run(AdaptiveResolution(), BUDGET_MS / 2, 30)) == {1.0}
+    scales = run(AdaptiveResolution(), 5 * BUDGET_MS, 30)
+    assert scales[-1] < 0.6 and 5 * BUDGET_MS * scales[-1] ** 2 <= 1.2 * BUDGET_MS
+    assert run(AdaptiveResolution(), 1e6, 30)[-1] == SCALES[-1]
+
+
+def test_resolution_does_not_oscillate():
+    for full_ms in (60.0, 100.0, 150.0, 300.0, 700.0):
+        assert len(set(run(AdaptiveResolution(), full_ms, 60)[20:])) == 1
+
+
+def test_resolution_rises_when_frames_get_fast_and_when_the_camera_stops():
+    resolution = AdaptiveResolution()
+    run(resolution, 10 * BUDGET_MS, 20)
+    last = 19 / 60
+    assert resolution.plan(last + REFINE_AFTER / 2, moved=False, turned=False).scale < 1
+    assert resolution.plan(last + REFINE_AFTER * 1.01, moved=False, turned=False).scale == 1
+    assert resolution.plan(0.5, moved=True, turned=False, adaptive=False).scale == 1
+    assert run(resolution, BUDGET_MS / 10, 20)[-1] == 1.0
+
+
+def test_cached_faces_are_used_only_for_rotations_on_a_slow_machine():
+    fast, slow = AdaptiveResolution(), AdaptiveResolution()
+    fast.record(fast.plan(0, moved=False, turned=False), BUDGET_MS / 2)
+    slow.record(slow.plan(0, moved=False, turned=False), BUDGET_MS * 5)
+    assert not fast.plan(1, moved=False, turned=True).cached
+    assert slow.plan(1, moved=False, turned=True).cached
+    assert not slow.plan(1.1, moved=True, turned=False).cached
+
+
+class User:
+    """Sends events to a viewer and reads its frames."""
 
     def __init__(self, viewer: Viewer, target: moderngl.Framebuffer, clock: list[float]) -> None:
         self.viewer, self.target, self.clock = viewer, target, clock
+        self.state, self.data, self.panels = viewer.state, viewer.panel_data, viewer.panels
 
     def frames(self, count: int, seconds: float = 1 / 30) -> None:
         for _ in range(count):
@@ -70,59 +117,61 @@ class Person:
             self.viewer.frame(self.target, seconds)
 
     def settle(self) -> None:
-        """Let time pass until nothing changes by itself."""
-        self.frames(10)
+        """Draw frames until nothing changes without input."""
+        self.frames(3, REFINE_AFTER)
         deadline = time.monotonic() + 20
         while self.viewer.busy:
-            assert time.monotonic() < deadline, "the viewer never comes to rest"
+            assert time.monotonic() < deadline, "the viewer does not settle"
             self.frames(1)
             time.sleep(0.002)
         self.frames(1)
 
-    def picture(self) -> np.ndarray:
-        self.settle()
+    def screen(self) -> np.ndarray:
         pixels = np.frombuffer(self.target.read(components=3), np.uint8).reshape(SIZE[1], SIZE[0], 3)
-        return pixels[::-1][PICTURE].astype(int)
+        return pixels[::-1][IMAGE].astype(int)
+
+    def image(self) -> np.ndarray:
+        self.settle()
+        return self.screen()
+
+    def show(self, *entries: SceneEntry) -> None:
+        self.viewer.show(list(entries), 0)
+        self.settle()
 
     def click(self, label: str) -> None:
         self.frames(1)
-        left, top, right, bottom = self.viewer.panels.items[label]
-        io = imgui.get_io()
-        io.add_mouse_pos_event((left + right) / 2, (top + bottom) / 2)
+        left, top, right, bottom = self.panels.items[label]
+        x = (left + right) / 2
         if "opacity" in label or label in ("field of view", "split"):  # the label is right of the slider
-            io.add_mouse_pos_event(left + 0.4 * (right - left), (top + bottom) / 2)
+            x = left + 0.4 * (right - left)
         elif right - left > 60 and label not in ("path", "pair", "##flight"):
-            io.add_mouse_pos_event(left + 10, (top + bottom) / 2)
-        self.frames(2)
-        io.add_mouse_button_event(0, True)
-        self.frames(2)
-        io.add_mouse_button_event(0, False)
-        self.frames(2)
-        io.add_mouse_pos_event(SIZE[0] - 5, SIZE[1] - 5)
+            x = left + 10
+        self.click_at(x, (top + bottom) / 2)
+
+    def click_at(self, x: float, y: float) -> None:
+        self.drag((x, y), (x, y))
+        imgui.get_io().add_mouse_pos_event(SIZE[0] - 5, SIZE[1] - 5)
         self.frames(1)
 
-    def drag(self, start: tuple[float, float], end: tuple[float, float], button: int = 0) -> None:
+    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
         io = imgui.get_io()
         io.add_mouse_pos_event(*start)
         self.frames(2)
-        io.add_mouse_button_event(button, True)
+        io.add_mouse_button_event(0, True)
         self.frames(1)
         io.add_mouse_pos_event(*end)
         self.frames(1)
-        io.add_mouse_button_event(button, False)
-        self.frames(1)
+        io.add_mouse_button_event(0, False)
+        self.frames(2)
 
     def key(self, *keys: imgui.Key, frames: int = 1) -> None:
-        io = imgui.get_io()
-        for key in keys:
-            io.add_key_event(key, True)
-        self.frames(frames)
-        for key in keys:
-            io.add_key_event(key, False)
-        self.frames(1)
+        for down in (True, False):
+            for key in keys:
+                imgui.get_io().add_key_event(key, down)
+            self.frames(frames if down else 1)
 
 
-def _sphere(entry: SceneEntry, photos: np.ndarray) -> LoadedScene:
+def sphere(entry: SceneEntry, photos: np.ndarray) -> LoadedScene:
     """A photograph, and the same photograph as Gaussians around its camera, in a world with z up."""
     pose = torch.eye(4, dtype=torch.float64)
     yaw = 0.7
@@ -148,19 +197,14 @@ def _sphere(entry: SceneEntry, photos: np.ndarray) -> LoadedScene:
 
 
 @pytest.fixture(scope="module")
-def session(gl_context, small_scene, axis_photos, tmp_path_factory) -> Iterator[Person]:
-    photos = Views(
-        torch.from_numpy(axis_photos).permute(0, 3, 1, 2),
-        small_scene.cam2world,
-        torch.ones(2, 128, 256, dtype=torch.bool),
-        0.45,
-        10.0,
-        small_scene.names,
-    )
+def session(gl_context, small_scene, axis_photos, tmp_path_factory) -> Iterator[User]:
+    images = torch.from_numpy(axis_photos).permute(0, 3, 1, 2)
+    mask = torch.ones(2, 128, 256, dtype=torch.bool)
+    photos = Views(images, small_scene.cam2world, mask, 0.45, 10.0, small_scene.names)
 
     def load(entry, progress):
         if entry.name == "sphere":
-            return _sphere(entry, axis_photos)
+            return sphere(entry, axis_photos)
         if entry.name == "damaged":
             raise InputError("damaged.ply: 100% unreadable; export it again")
         return LoadedScene(entry, small_scene, None if entry.name == "no photographs" else photos)
@@ -171,285 +215,237 @@ def session(gl_context, small_scene, axis_photos, tmp_path_factory) -> Iterator[
         return [SceneEntry("opened")]
 
     clock = [0.0]
-    gl_context.__enter__()
-    target = gl_context.simple_framebuffer(SIZE, components=3)
-    folder = tmp_path_factory.mktemp("shots")
-    viewer = Viewer(gl_context, SceneLoader(load), find=find, folder=folder, clock=lambda: clock[0])
-    imgui.get_io().display_size = SIZE
-    person = Person(viewer, target, clock)
-    viewer.show([SceneEntry("first"), SceneEntry("second")], 0)
-    person.settle()
-    yield person
+    folder = tmp_path_factory.mktemp("screenshots")
+    with gl_context:
+        target = gl_context.simple_framebuffer(SIZE, components=3)
+        viewer = Viewer(gl_context, SceneLoader(load), find=find, folder=folder, clock=lambda: clock[0])
+        imgui.get_io().display_size = SIZE
+        user = User(viewer, target, clock)
+        user.show(*ENTRIES)
+    yield user
     with gl_context:
         viewer.close()
 
 
 @pytest.fixture
-def person(session, ctx) -> Person:
-    """The session with everything back to where it began."""
-    state, start = session.viewer.state, type(session.viewer.state)()
-    state.settings = replace(start.settings, levels=None)
-    for name in (
-        "orbiting",
-        "flight",
-        "playing",
-        "overlay",
-        "help",
-        "photo",
-        "split",
-        "speed",
-        "message",
-        "quit",
-    ):
+def user(session, ctx) -> User:
+    """The session with scene, state and camera as at the start."""
+    if session.data.entries != [entry.name for entry in ENTRIES] or session.data.current != 0:
+        session.show(*ENTRIES)
+    state, start = session.state, ViewerState()
+    for name in ("orbiting", "settings", "flight", "playing", "overlay", "help", "photo", "split", "speed", "quit"):
         setattr(state, name, getattr(start, name))
-    state.camera, state.adaptive = state.home, True
-    session.viewer.panel_data.error = None
+    state.camera, state.adaptive, state.message = state.home, True, ""
+    session.data.error, session.viewer._resolution.budget_ms = None, BUDGET_MS
     imgui.get_io().add_mouse_pos_event(SIZE[0] - 5, SIZE[1] - 5)
-    session.settle()
-    state.message = ""
+    session.frames(2, REFINE_AFTER)
     return session
 
 
 def changed(before: np.ndarray, after: np.ndarray) -> float:
-    """Share of the pixels that differ visibly."""
+    """Fraction of the pixels that differ visibly."""
     return float((np.abs(before - after).max(-1) > 2).mean())
 
 
-def test_every_widget_of_the_panel_is_covered_here(person):
-    assert set(person.viewer.panels.items) == set(PICTURE_WIDGETS) | OTHER_WIDGETS
-    bottoms = [rectangle[3] for rectangle in person.viewer.panels.items.values()]
-    assert max(bottoms) < SIZE[1], "the panel fits without scrolling"
+def test_every_widget_has_a_test_and_fits_without_scrolling(user):
+    assert set(user.panels.items) == set(IMAGE_WIDGETS) | OTHER_WIDGETS
+    assert max(rectangle[3] for rectangle in user.panels.items.values()) < SIZE[1]
 
 
-@pytest.mark.parametrize("label", PICTURE_WIDGETS)
-def test_clicking_the_widget_changes_the_picture(person, label):
-    person.viewer.state.settings = replace(person.viewer.state.settings, **PICTURE_WIDGETS[label])
-    before = person.picture()
-    person.click(label)
-    assert changed(before, person.picture()) > 0.001
-
-
-def test_nothing_changes_without_a_click(person):
-    before = person.picture()
-    person.frames(5)
-    assert changed(before, person.picture()) == 0
+@pytest.mark.parametrize("label", IMAGE_WIDGETS)
+def test_clicking_the_widget_changes_the_image(user, label):
+    user.state.settings = replace(user.state.settings, **IMAGE_WIDGETS[label])
+    before = user.image()
+    user.click(label)
+    assert changed(before, user.image()) > 0.001
 
 
 @pytest.mark.parametrize("label", ["0##level", "nearest photograph"])
-def test_clicking_a_check_box_twice_restores_the_picture(person, label):
-    before = person.picture()
-    person.click(label)
-    person.picture()
-    person.click(label)
-    assert changed(before, person.picture()) == 0
+def test_clicking_a_check_box_twice_restores_the_image(user, label):
+    before = user.image()
+    user.click(label)
+    user.image()
+    user.click(label)
+    assert changed(before, user.image()) == 0
 
 
-def test_hiding_every_level_leaves_the_background(person):
+def test_hiding_every_level_leaves_the_background(user):
     for level in range(4):
-        person.click(f"{level}##level")
-    assert person.picture().max() == 0
-    person.click("white")
-    assert person.picture().min() == 255
+        user.click(f"{level}##level")
+    assert user.image().max() == 0
+    user.click("white")
+    assert user.image().min() == 255
 
 
-def test_fly_button_plays_and_stop_pauses(person):
-    person.click("Fly")
-    assert person.viewer.state.playing
-    assert "Stop" in person.viewer.panels.items
-    person.click("Stop")
-    assert not person.viewer.state.playing and 0 < person.viewer.state.flight < 1
+def test_fly_button_plays_and_stop_pauses(user):
+    user.click("Fly")
+    assert user.state.playing
+    assert "Stop" in user.panels.items
+    user.click("Stop")
+    assert not user.state.playing and 0 < user.state.flight < 1
 
 
-def test_orbit_fly_and_reset_buttons(person):
-    person.click("orbit")
-    assert person.viewer.state.orbiting
-    person.drag((500, 400), (560, 400))
-    assert person.viewer.state.camera.position != person.viewer.state.home.position
-    person.click("fly")
-    assert not person.viewer.state.orbiting
-    person.click("Reset")
-    assert person.viewer.state.camera == person.viewer.state.home
-    person.click("Panorama 2")
-    person.click("Panorama 1")
-    assert person.viewer.state.camera.position == (0, 0, 0)
+def test_camera_buttons_switch_orbit_and_restore_the_start(user):
+    user.click("orbit")
+    assert user.state.orbiting
+    user.drag((500, 400), (560, 400))
+    assert user.state.camera.position != user.state.home.position
+    user.click("fly")
+    assert not user.state.orbiting
+    user.click("Reset")
+    assert user.state.camera == user.state.home
+    user.click("Panorama 2")
+    user.click("Panorama 1")
+    assert user.state.camera.position == (0, 0, 0)
 
 
-def test_speed_slider_changes_the_speed(person):
-    before = person.viewer.state.speed
-    left, top, _, bottom = person.viewer.panels.items["speed"]
-    person.drag((left + 20, (top + bottom) / 2), (left + 80, (top + bottom) / 2))
-    assert person.viewer.state.speed > before
-    assert person.viewer.state.camera == person.viewer.state.home, "a drag on a panel is not a drag on the scene"
+def test_dragging_a_slider_changes_its_value_and_not_the_camera(user):
+    before = user.state.speed
+    left, top, _, bottom = user.panels.items["speed"]
+    user.drag((left + 20, (top + bottom) / 2), (left + 80, (top + bottom) / 2))
+    assert user.state.speed > before
+    assert user.state.camera == user.state.home
 
 
-def test_dragging_the_picture_looks_around_and_carries_it_along(person):
-    before = person.picture()
-    person.drag((500, 400), (470, 400))
-    after = person.picture()
-    assert person.viewer.state.camera.yaw_radians > 0
-    # The scene sticks to the pointer: shifted back by 30 pixels the pictures agree best.
+def test_the_scene_follows_a_drag_on_the_image(user):
+    before = user.image()
+    user.drag((500, 400), (470, 400))
+    after = user.image()
+    assert user.state.camera.yaw_radians > 0
     errors = {s: np.abs(before[100:380, 60:200] - after[100:380, 60 + s : 200 + s]).mean() for s in (-30, 0, 30)}
-    assert min(errors, key=errors.get) == -30
+    assert min(errors, key=errors.get) == -30, "the image is shifted by the 30 pixels of the drag"
 
 
-def test_keys_move_the_camera(person):
-    person.key(imgui.Key.w, frames=5)
-    assert person.viewer.state.camera.position[2] > 0.1
-    person.key(imgui.Key.r)
-    assert person.viewer.state.camera == person.viewer.state.home
-
-
-def test_scrolling_changes_the_field_of_view(person):
-    before = person.picture()
+def test_keys_and_wheel_move_the_camera_and_r_restores_it(user):
+    before = user.image()
+    user.key(imgui.Key.w, frames=5)
+    assert user.state.camera.position[2] > 0.1
+    user.key(imgui.Key.r)
+    assert user.state.camera == user.state.home
     imgui.get_io().add_mouse_wheel_event(0, 1)
-    person.frames(2)
-    assert person.viewer.state.camera.vertical_fov_degrees < person.viewer.state.home.vertical_fov_degrees
-    assert changed(before, person.picture()) > 0.1
+    user.frames(2)
+    assert user.state.camera.vertical_fov_degrees < user.state.home.vertical_fov_degrees
+    assert changed(before, user.image()) > 0.1
 
 
-def test_tab_hides_the_panels_and_h_shows_the_keys(person):
-    person.key(imgui.Key.tab)
-    assert not person.viewer.panels.items
-    plain = person.picture()
-    person.key(imgui.Key.h)
-    assert changed(plain, person.picture()) > 0.1
-    person.key(imgui.Key.escape)
-    assert changed(plain, person.picture()) == 0 and not person.viewer.state.quit
+def test_tab_hides_the_panels_and_h_shows_the_keys(user):
+    user.key(imgui.Key.tab)
+    assert not user.panels.items
+    plain = user.image()
+    user.key(imgui.Key.h)
+    assert changed(plain, user.image()) > 0.1
+    user.key(imgui.Key.escape)
+    assert changed(plain, user.image()) == 0 and not user.state.quit
 
 
-def test_typing_a_path_does_not_fly_and_enter_opens_it(person):
-    person.click("path")
+def test_typing_a_path_does_not_fly_and_enter_opens_it(user):
+    user.click("path")
     io = imgui.get_io()
     for character in "wasd":
         io.add_key_event(getattr(imgui.Key, character), True)
         io.add_input_character(ord(character))
-        person.frames(2)
+        user.frames(2)
         io.add_key_event(getattr(imgui.Key, character), False)
-        person.frames(1)
-    assert person.viewer.panels.path == "wasd"
-    assert person.viewer.state.camera == person.viewer.state.home
-    person.key(imgui.Key.enter)
-    person.settle()
-    assert person.viewer.panel_data.entries == ["opened"]
-    person.viewer.show([SceneEntry("first"), SceneEntry("second")], 0)
-    person.settle()
+        user.frames(1)
+    assert user.panels.path == "wasd"
+    assert user.state.camera == user.state.home
+    user.key(imgui.Key.enter)
+    user.settle()
+    assert user.data.entries == ["opened"]
 
 
-def test_the_chooser_loads_the_other_pair(person):
-    person.click("pair")
-    left, _, _, bottom = person.viewer.panels.items["pair"]
-    io = imgui.get_io()
-    io.add_mouse_pos_event(left + 30, bottom + 36)
-    person.frames(2)
-    io.add_mouse_button_event(0, True)
-    person.frames(1)
-    io.add_mouse_button_event(0, False)
-    person.frames(2)
-    person.settle()
-    assert person.viewer.panel_data.current == 1
-    person.viewer.show(person.viewer.entries, 0)
-    person.settle()
+def test_the_list_of_scenes_loads_the_other_pair(user):
+    user.click("pair")
+    left, _, _, bottom = user.panels.items["pair"]
+    user.click_at(left + 30, bottom + 36)
+    user.settle()
+    assert user.data.current == 1
 
 
-def test_opening_something_unusable_says_so_and_keeps_the_scene(person):
-    before = person.picture()
-    person.viewer.open(Path("nothing"))
-    person.frames(2)
-    assert "no such file" in person.viewer.panel_data.error
-    assert changed(before, person.picture()) > 0.02, "the message is on the screen"
-    person.click("OK")
-    assert person.viewer.panel_data.error is None
-    assert changed(before, person.picture()) == 0
+def test_errors_are_shown_and_keep_the_scene(user):
+    before = user.image()
+    user.viewer.open(Path("nothing"))
+    user.frames(2)
+    assert "no such file" in user.data.error
+    assert changed(before, user.image()) > 0.02, "the message is on the screen"
+    user.click("OK")
+    assert user.data.error is None
+    assert changed(before, user.image()) == 0
+    user.show(SceneEntry("damaged"))
+    assert user.data.error.startswith("damaged.ply: 100% unreadable")
 
 
-def test_a_scene_that_cannot_be_read_says_so_and_keeps_the_scene(person):
-    person.viewer.show([SceneEntry("damaged")], 0)
-    person.settle()
-    assert person.viewer.panel_data.error.startswith("damaged.ply: 100% unreadable")
-    person.viewer.show([SceneEntry("first"), SceneEntry("second")], 0)
-    person.settle()
-
-
-def test_the_photograph_shows_what_lies_in_the_viewing_direction(person):
-    state = person.viewer.state
+def test_the_photograph_is_shown_in_the_viewing_direction(user):
+    state = user.state
     state.photo, state.split = True, 0.0
-    state.settings = replace(state.settings, levels=frozenset())  # hidden by the photograph anyway
+    state.settings = replace(state.settings, levels=frozenset())  # saves time: the photograph covers the rendering
     state.camera = replace(state.home, yaw_radians=np.pi / 2, vertical_fov_degrees=30)
-    red, green, blue = person.picture()[180:200].mean((0, 1)) / 255
+    image = user.image()
+    red, green, blue = image[180:200].mean((0, 1)) / 255
     assert red > 0.95 and 0.4 < green < 0.6 and 0.4 < blue < 0.6, "right is red"
-    rows = person.picture()[..., 1].mean(1)
+    rows = image[..., 1].mean(1)
     assert rows[0] > rows[-1] + 20, "up is green: upright"
     state.camera = replace(state.camera, yaw_radians=0.0)
-    columns = person.picture()[..., 0].mean(0)
+    columns = user.image()[..., 0].mean(0)
     assert columns[-1] > columns[0] + 20, "right is red: not mirrored"
     state.camera = replace(state.camera, position=(0.0, 0.0, 0.4))
-    assert person.picture().max() < 90, "the nearest photograph is the second, dim one"
+    assert user.image().max() < 90, "the nearest photograph is the second, dim one"
 
 
-def test_at_an_input_camera_the_rendering_looks_like_its_photograph(person):
-    person.viewer.show([SceneEntry("sphere")], 0)
-    person.settle()
-    state = person.viewer.state
+def test_rendering_at_an_input_camera_looks_like_its_photograph(user):
+    user.show(SceneEntry("sphere"))
+    state = user.state
     for yaw, pitch in ((0.0, 0.0), (2.0, 0.5), (-2.0, -0.9)):
         state.camera = replace(state.home, yaw_radians=yaw, pitch_radians=pitch)
         state.photo = False
-        rendered = person.picture()
+        rendered = user.image()
         state.photo, state.split = True, 0.0
-        photograph = person.picture()
+        photograph = user.image()
         assert np.abs(rendered - photograph).mean() < 4
-        assert np.abs(rendered - photograph[:, ::-1]).mean() > 8, "a mirrored one would be told apart"
-        assert np.abs(rendered - photograph[::-1]).mean() > 8, "and one upside down"
-    person.viewer.show([SceneEntry("first"), SceneEntry("second")], 0)
-    person.settle()
+        assert np.abs(rendered - photograph[:, ::-1]).mean() > 8, "not mirrored"
+        assert np.abs(rendered - photograph[::-1]).mean() > 8, "not upside down"
 
 
-def test_the_split_keeps_the_rendering_on_its_left(person):
-    rendered = person.picture()
-    person.click("nearest photograph")
-    person.viewer.state.split = 0.75
-    compared = person.picture()
-    middle = int(0.75 * SIZE[0]) - 310
-    assert changed(rendered[:, : middle - 2], compared[:, : middle - 2]) == 0
-    assert changed(rendered[:, middle + 2 :], compared[:, middle + 2 :]) > 0.9
-    person.click("split")
-    assert person.viewer.state.split < 0.75
+def test_the_rendering_is_left_of_the_split(user):
+    rendered = user.image()
+    user.click("nearest photograph")
+    user.state.split = 0.75
+    compared = user.image()
+    column = int(0.75 * SIZE[0]) - IMAGE[1].start
+    assert changed(rendered[:, : column - 2], compared[:, : column - 2]) == 0
+    assert changed(rendered[:, column + 2 :], compared[:, column + 2 :]) > 0.9
+    user.click("split")
+    assert user.state.split < 0.75
 
 
-def test_a_scene_without_photographs_offers_no_comparison(person):
-    person.viewer.show([SceneEntry("no photographs")], 0)
-    person.settle()
-    assert "nearest photograph" not in person.viewer.panels.items
-    before = person.picture()
-    person.key(imgui.Key.c)
-    assert changed(before, person.picture()) == 0
-    person.viewer.show([SceneEntry("first"), SceneEntry("second")], 0)
-    person.settle()
+def test_a_scene_without_photographs_has_no_comparison(user):
+    user.show(SceneEntry("no photographs"))
+    assert "nearest photograph" not in user.panels.items
+    before = user.image()
+    user.key(imgui.Key.c)
+    assert changed(before, user.image()) == 0
 
 
-def test_screenshots_are_the_picture_without_the_panels(person, monkeypatch):
-    from PIL import Image
-
+def test_screenshots_show_the_image_without_the_panels(user, monkeypatch):
     monkeypatch.setattr("pansplat_viewer.viewer.PANORAMA_HEIGHT", 128)
-    picture = person.picture()
-    for label in ("PNG", "360 PNG"):
-        person.click(label)
-    png, panorama = person.viewer.screenshots[-2:]
-    with Image.open(png) as image:
-        assert image.size == SIZE
-        pixels = np.asarray(image).astype(int)
-    assert np.abs(pixels[PICTURE] - picture).max() <= 3
+    image = user.image()
+    user.click("PNG")
+    user.click("360 PNG")
+    png, panorama = user.viewer.screenshots[-2:]
+    with Image.open(png) as file:
+        assert file.size == SIZE
+        pixels = np.asarray(file).astype(int)
+    assert np.abs(pixels[IMAGE] - image).max() <= 3
     assert changed(pixels[20:560, 20:290], np.zeros_like(pixels[20:560, 20:290])) > 0.3
-    with Image.open(panorama) as image:
-        assert image.size == (256, 128)
-    person.viewer.state.message = ""
-    assert changed(picture, person.picture()) == 0, "the window shows the view again"
+    with Image.open(panorama) as file:
+        assert file.size == (256, 128)
+    user.state.message = ""
+    assert changed(image, user.image()) == 0, "the window shows the view again"
 
 
-def test_exr_holds_colour_and_radial_depth(person):
-    import OpenEXR
-
-    person.key(imgui.Key.left_shift, imgui.Key.mod_shift, imgui.Key.p)
-    path = person.viewer.screenshots[-1]
+def test_exr_screenshot_holds_color_and_radial_depth(user):
+    user.key(imgui.Key.left_shift, imgui.Key.mod_shift, imgui.Key.p)
+    path = user.viewer.screenshots[-1]
     assert path.suffix == ".exr"
     with OpenEXR.File(str(path)) as file:
         depth = file.channels()["Z"].pixels
@@ -457,55 +453,44 @@ def test_exr_holds_colour_and_radial_depth(person):
     assert 1.5 < np.median(depth[depth > 0]) < 4.5
 
 
-def test_focus_orbits_what_is_in_the_middle(person):
-    person.settle()
-    person.key(imgui.Key.f)
-    assert person.viewer.state.orbiting
-    assert 1.5 < person.viewer.state.camera.distance < 4.5
-    assert person.viewer.state.camera.position == person.viewer.state.home.position
+def test_focus_orbits_the_point_in_the_centre(user):
+    user.settle()
+    user.key(imgui.Key.f)
+    assert user.state.orbiting
+    assert 1.5 < user.state.camera.distance < 4.5
+    assert user.state.camera.position == user.state.home.position
 
 
-def test_moving_coarsens_and_standing_still_refines(person):
-    viewer = person.viewer
-    viewer._resolution.budget_ms = 1e-3
+def test_resolution_is_lower_while_the_camera_moves(user):
+    user.viewer._resolution.budget_ms = 1e-3
     io = imgui.get_io()
     io.add_key_event(imgui.Key.w, True)
-    person.frames(8)
-    assert viewer.panel_data.size[0] < SIZE[0]
+    user.frames(8)
+    assert user.data.size[0] < SIZE[0]
     io.add_key_event(imgui.Key.w, False)
-    person.settle()
-    assert viewer.panel_data.size == SIZE
-    person.click("coarser while moving")
-    io.add_key_event(imgui.Key.w, True)
-    person.frames(4)
-    assert viewer.panel_data.size == SIZE
-    io.add_key_event(imgui.Key.w, False)
-    person.frames(1)
+    user.settle()
+    assert user.data.size == SIZE
+    user.click("coarser while moving")
+    user.key(imgui.Key.w, frames=4)
+    assert user.data.size == SIZE
 
 
-def test_the_window_stays_alive_and_shows_progress_while_loading(person, small_scene):
-    import threading
-
+def test_the_viewer_shows_progress_and_accepts_input_while_loading(user, small_scene, monkeypatch):
     go = threading.Event()
-    viewer, loader = person.viewer, person.viewer.loader
 
     def slow(entry, progress):
         progress("searching depth", 0.5)
         assert go.wait(20)
         return LoadedScene(entry, small_scene)
 
-    before = person.picture()
-    fast, loader._load = loader._load, slow
-    viewer.show([SceneEntry("slow")], 0)
-    person.frames(5)
-    assert viewer.panel_data.loading == ("slow", "searching depth", 0.5)
-    pixels = np.frombuffer(person.target.read(components=3), np.uint8).reshape(SIZE[1], SIZE[0], 3)
-    assert changed(before, pixels[::-1][PICTURE].astype(int)) > 0.02, "a bar is on the screen"
-    person.key(imgui.Key.w, frames=3)
-    assert viewer.state.camera.position[2] > 0, "one can fly meanwhile"
+    before = user.image()
+    monkeypatch.setattr(user.viewer.loader, "_load", slow)
+    user.viewer.show([SceneEntry("slow")], 0)
+    user.frames(5)
+    assert user.data.loading == ("slow", "searching depth", 0.5)
+    assert changed(before, user.screen()) > 0.02, "a progress bar is on the screen"
+    user.key(imgui.Key.w, frames=3)
+    assert user.state.camera.position[2] > 0
     go.set()
-    loader._load = fast
-    person.settle()
-    assert viewer.panel_data.loading is None
-    viewer.show([SceneEntry("first"), SceneEntry("second")], 0)
-    person.settle()
+    user.settle()
+    assert user.data.loading is None

@@ -1,4 +1,4 @@
-"""The real window, in a process of its own under Xvfb, driven by synthetic mouse and keys."""
+"""The window, in its own process under Xvfb, driven by synthetic mouse and key events."""
 
 import os
 import shutil
@@ -15,8 +15,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from pansplat.gaussians.ply import save_ply
+from pansplat_viewer.window import Window, _loop
 
 pytestmark = [pytest.mark.gl, pytest.mark.slow]
 
@@ -24,28 +25,20 @@ PROGRAM = "from pansplat_viewer.app import main; main()"
 TITLE = "room - pansplat"
 
 
-def need(*programs: str) -> None:
-    missing = [program for program in programs if not shutil.which(program)]
-    if missing and os.environ.get("CI"):
-        pytest.fail(f"CI needs {missing}: apt-get install xvfb xdotool")
-    if missing:
-        pytest.skip(f"needs {missing} (Debian packages xvfb, xdotool)")
-
-
 def wait_until(condition: Callable[[], Any], what: str, seconds: float = 60.0) -> Any:
     deadline = time.monotonic() + seconds
     while not (value := condition()):
-        assert time.monotonic() < deadline, f"waited {seconds:.0f} s in vain for {what}"
+        assert time.monotonic() < deadline, f"no {what} in {seconds:.0f} s"
         time.sleep(0.05)
     return value
 
 
 class Display:
-    """An X server without a screen, whose picture lies in a file."""
+    """An X server without a screen, whose framebuffer is a file."""
 
     def __init__(self, folder: Path) -> None:
         read, write = os.pipe()
-        # Without -noreset the server starts over, and refuses clients, whenever xdotool was its only one.
+        # -noreset: otherwise the server restarts, and refuses clients, when its last client (xdotool) disconnects.
         command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x800x24", "-fbdir", str(folder)]
         self._server = subprocess.Popen(
             [*command, "-noreset", "-nolisten", "tcp"], pass_fds=(write,), stderr=subprocess.DEVNULL
@@ -77,22 +70,19 @@ class Display:
 
 @pytest.fixture(scope="module")
 def display(tmp_path_factory) -> Iterator[Display]:
-    need("Xvfb", "xdotool")
+    missing = [program for program in ("Xvfb", "xdotool") if not shutil.which(program)]
+    if missing and os.environ.get("CI"):
+        pytest.fail(f"CI needs {missing}: apt-get install xvfb xdotool")
+    if missing:
+        pytest.skip(f"needs {missing} (Debian packages xvfb, xdotool)")
     display = Display(tmp_path_factory.mktemp("display"))
     yield display
     display.close()
 
 
-@pytest.fixture
-def room(tmp_path, small_scene) -> Path:
-    path = tmp_path / "room.ply"
-    save_ply(small_scene, path)
-    return path
-
-
 @contextmanager
 def running(display: Display, room: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
-    """The command in a process that is gone, with its pipes, when the block ends."""
+    """Runs the command in a process that is killed when the block ends."""
     environment = {**os.environ, "DISPLAY": display.name, "WAYLAND_DISPLAY": ""}
     viewer = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, str(room), *options],
@@ -109,39 +99,37 @@ def running(display: Display, room: Path, *options: str) -> Iterator[subprocess.
             viewer.kill()
 
 
-def test_the_window_can_be_driven_by_mouse_and_keys_and_leaves_cleanly(display, room):
+def test_mouse_and_keys_drive_the_window_and_escape_closes_it(display, room):
     with running(display, room, "--size", "640x480") as viewer:
         find = ("search", "--name", f"^{TITLE}$")
-        window = wait_until(lambda: display.do(*find), "the window").split()[0]
+        window = wait_until(lambda: display.do(*find), "window").split()[0]
         display.do("windowmove", window, "0", "0")
         display.do("windowfocus", window)
-        picture = (slice(10, 370), slice(320, 630))
-        wait_until(lambda: (display.screen()[picture].max(-1) > 60).mean() > 0.3, "the scene")
+        image = (slice(10, 370), slice(320, 630))
+        wait_until(lambda: (display.screen()[image].max(-1) > 60).mean() > 0.3, "scene")
         time.sleep(1.0)
 
-        before = display.screen()[picture]
+        before = display.screen()[image]
         display.do("mousemove", "450", "200", "mousedown", "1")
         display.do("mousemove", "380", "200")
         time.sleep(0.3)
         display.do("mouseup", "1")
-        wait_until(lambda: np.abs(display.screen()[picture] - before).mean() > 5, "the drag to look around")
+        wait_until(lambda: np.abs(display.screen()[image] - before).mean() > 5, "rotation of the view")
 
         panel = (slice(20, 300), slice(20, 280))
         with_panel = display.screen()[panel]
         display.do("key", "Tab")
-        wait_until(lambda: np.abs(display.screen()[panel] - with_panel).mean() > 5, "the panels to go")
+        wait_until(lambda: np.abs(display.screen()[panel] - with_panel).mean() > 5, "change of the panels")
 
         display.do("key", "p")
         shot = room.parent / "renders" / "room" / "view_001.png"
-        wait_until(shot.exists, "the screenshot")
-        from PIL import Image
-
-        with Image.open(shot) as image:
-            assert image.size == (640, 480)
+        wait_until(shot.exists, "screenshot")
+        with Image.open(shot) as file:
+            assert file.size == (640, 480)
 
         display.do("windowsize", window, "800", "600")
         outside = (slice(490, 590), slice(500, 790))
-        wait_until(lambda: (display.screen()[outside].max(-1) > 60).mean() > 0.2, "the larger picture")
+        wait_until(lambda: (display.screen()[outside].max(-1) > 60).mean() > 0.2, "larger image")
 
         display.do("key", "Escape")
         output, errors = viewer.communicate(timeout=30)
@@ -149,9 +137,7 @@ def test_the_window_can_be_driven_by_mouse_and_keys_and_leaves_cleanly(display, 
         assert errors == "" and output == ""
 
 
-def test_what_is_dropped_on_the_window_is_opened():
-    from pansplat_viewer.window import Window, _loop
-
+def test_a_dropped_path_is_opened():
     class Opener:
         moving = True
         state = SimpleNamespace(quit=False)
@@ -182,15 +168,15 @@ def test_what_is_dropped_on_the_window_is_opened():
     assert viewer.opened == [Path("/somewhere/a pair")] and window.dropped == []
 
 
-def test_an_interrupt_leaves_cleanly(display, room):
+def test_an_interrupt_ends_with_status_130(display, room):
     with running(display, room, "--size", "320x240") as viewer:
-        wait_until(lambda: display.do("search", "--name", f"^{TITLE}$"), "the window")
+        wait_until(lambda: display.do("search", "--name", f"^{TITLE}$"), "window")
         viewer.send_signal(signal.SIGINT)
         _, errors = viewer.communicate(timeout=30)
         assert viewer.returncode == 130 and "Traceback" not in errors
 
 
-def test_a_display_that_is_not_there_gives_a_fly_through(room):
+def test_a_missing_display_gives_a_fly_through(room):
     environment = {**os.environ, "DISPLAY": ":98765", "WAYLAND_DISPLAY": ""}
     options = ("--size", "64x32", "--seconds", "0.2")
     result = subprocess.run(
