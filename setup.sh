@@ -130,8 +130,16 @@ install_packages() {
     echo "$mark $extra" >"$stamp"
 }
 
+# --- kernels ---
+# Numba keeps the compiled kernels; later runs load them in a second.
+compile_kernels() {
+    say "compiling the CPU kernels (about a minute, once)"
+    .venv/bin/python -m pansplat.warm_up || say "the kernels could not be compiled; the first command compiles them"
+}
+
 find_python
 make_venv
 install_libraries
 install_packages
+compile_kernels
 say "ready: .venv/bin/pansplat --help, .venv/bin/pansplat-view assets/living_room"

@@ -1,4 +1,4 @@
-"""The numba backend whole, forward and backward, against the float64 reference; and how it behaves in a program."""
+"""The numba backend, forward and backward: its accuracy, and its behaviour in a program."""
 
 import dataclasses
 import multiprocessing
@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import rasterize, reference
 from pansplat.rendering.cpu import rasterize_planes, tiling
 from pansplat.rendering.image_planes import image_planes
@@ -18,159 +17,176 @@ from pansplat.rendering.rasterize import RasterOptions
 _NAMES = ("means", "quats", "scales", "opacities", "harmonics")
 _SIZES = {"equirect": (40, 80), "pinhole": (50, 70), "cubemap": (40, 80)}
 _CASES = [
-    (layout, kernel, order, lowpass)
+    (layout, RasterOptions(kernel=kernel, order=order, lowpass=lowpass))
     for layout in _SIZES
     for kernel in ("ray", "ewa")
     for order in ("radial", "z")
     for lowpass in ("angular", "3dgs")
     if (layout, kernel) != ("equirect", "ewa")
 ]
+_EWA = RasterOptions(kernel="ewa")
 
 
-def _pictures(layout):
-    return image_planes(layout, _SIZES[layout], vertical_fov_degrees=80.0, face_size=None, device=torch.device("cpu"))
+def _planes(layout):
+    return image_planes(layout, _SIZES[layout], vertical_fov_degrees=80.0)
 
 
-def _scene(make_scene, channels=3, count=300):
-    scene = make_scene(count, scale=0.15, degree=2, seed=1).to(dtype=torch.float32)
-    harmonics = 0.4 * torch.randn(count, 9, channels, generator=torch.Generator().manual_seed(7))
-    return dataclasses.replace(scene, harmonics=harmonics)
+@pytest.fixture
+def make_colored_scene(make_scene):
+    """Makes scenes of float32 Gaussians with harmonics of degree 2."""
+
+    def make(channels=3, count=300):
+        scene = make_scene(count, scale=0.15, degree=2, seed=1).to(dtype=torch.float32)
+        harmonics = 0.4 * torch.randn(count, 9, channels, generator=torch.Generator().manual_seed(7))
+        return dataclasses.replace(scene, harmonics=harmonics)
+
+    return make
 
 
-def _run(backend, scene, pose, layout, options, dtype, covariances=None):
+@pytest.fixture
+def scene(make_colored_scene):
+    return make_colored_scene()
+
+
+def _run(scene, pose, layout, options=None, *, backend=rasterize_planes, dtype=torch.float32, covariances=None):
     """Sums of a backend, and the gradients of a random combination of them."""
     leaves = {name: getattr(scene, name).to(dtype).requires_grad_() for name in _NAMES}
     camera = pose.clone().requires_grad_()
     if covariances is not None:
         leaves["covariances"] = covariances.to(dtype).requires_grad_()
     given = dataclasses.replace(scene, **{name: leaves[name] for name in _NAMES})
-    drawn = backend(given, leaves.get("covariances"), camera, _pictures(layout), options)
-    weights = torch.randn(drawn.sums.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    (drawn.sums.double() * weights).sum().backward()
+    result = backend(given, leaves.get("covariances"), camera, _planes(layout), options or RasterOptions())
+    weights = torch.randn(result.sums.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    (result.sums.double() * weights).sum().backward()
     gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
     turn = pose[:3, :3].T @ camera.grad[:3, :3]
     gradients["pose"] = torch.cat((turn - turn.T, camera.grad[:3, 3:]), dim=1)
-    return drawn, gradients
+    return result, gradients
 
 
-def _compare(scene, pose, layout, options, covariances=None):
-    expected, wanted = _run(reference.rasterize_planes, scene, pose, layout, options, torch.float64, covariances)
-    found, got = _run(rasterize_planes, scene, pose, layout, options, torch.float32, covariances)
-    truth, ours = expected.sums.detach(), found.sums.detach()
-    scale = float(truth.abs().max().clamp_min(1))
-    assert float(truth[:, -1].max()) > 0.5
-    assert float((ours.double() - truth).abs().max()) < 2e-6 * scale
-    assert ours.dtype == torch.float32
-    assert got.keys() == wanted.keys()
-    for name, gradient in wanted.items():
-        error = float((got[name].double() - gradient).norm() / gradient.norm())
+def _assert_same_bits(run, expected):
+    assert torch.equal(run[0].sums, expected[0].sums)
+    assert all(torch.equal(run[1][name], gradient) for name, gradient in expected[1].items())
+
+
+def _compare(scene, pose, layout, options=None, covariances=None):
+    arguments = scene, pose, layout, options
+    expected, expected_gradients = _run(
+        *arguments, backend=reference.rasterize_planes, dtype=torch.float64, covariances=covariances
+    )
+    result, gradients = _run(*arguments, covariances=covariances)
+    sums, expected_sums = result.sums.detach(), expected.sums.detach()
+    assert float(expected_sums[:, -1].max()) > 0.5
+    assert float((sums.double() - expected_sums).abs().max()) < 2e-6 * float(expected_sums.abs().max().clamp_min(1))
+    assert sums.dtype == torch.float32
+    assert gradients.keys() == expected_gradients.keys()
+    for name, gradient in expected_gradients.items():
+        error = float((gradients[name].double() - gradient).norm() / gradient.norm())
         assert error < 1e-5, f"{name}: {error}"
-    assert (found.info.total, found.info.dropped, found.info.near) == (len(scene), 0, expected.info.near)
-    assert found.info.backend == "numba" and found.info.bytes > 0
+    assert (result.info.total, result.info.dropped, result.info.near) == (len(scene), 0, expected.info.near)
+    assert result.info.backend == "numba" and result.info.bytes > 0
 
 
-@pytest.mark.parametrize(("layout", "kernel", "order", "lowpass"), _CASES)
-def test_pictures_and_gradients_are_the_references(layout, kernel, order, lowpass, make_scene, pose):
-    _compare(_scene(make_scene), pose, layout, RasterOptions(kernel, order, lowpass, 0.05, False))
+@pytest.mark.parametrize(("layout", "options"), _CASES)
+def test_sums_and_gradients_equal_the_reference(layout, options, scene, pose):
+    _compare(scene, pose, layout, options)
 
 
 @pytest.mark.parametrize(("layout", "kernel"), [("equirect", "ray"), ("pinhole", "ewa"), ("cubemap", "ray")])
 @pytest.mark.parametrize("lowpass", ["angular", "3dgs"])
-def test_covariances_are_drawn_as_the_reference_draws_them(layout, kernel, lowpass, make_scene, pose):
-    scene = _scene(make_scene)
-    _compare(scene, pose, layout, RasterOptions(kernel, "radial", lowpass, 0.05, False), scene.covariances)
+def test_covariances_equal_the_reference(layout, kernel, lowpass, scene, pose):
+    _compare(scene, pose, layout, RasterOptions(kernel=kernel, lowpass=lowpass), scene.covariances)
 
 
 @pytest.mark.parametrize("channels", [1, 2, 5, 32])
-def test_any_number_of_channels_is_drawn(channels, make_scene, pose):
-    _compare(_scene(make_scene, channels), pose, "equirect", RasterOptions("ray", "radial", "angular", 0.05, False))
+def test_any_number_of_channels_equals_the_reference(channels, make_colored_scene, pose):
+    _compare(make_colored_scene(channels), pose, "equirect")
 
 
-@pytest.mark.parametrize("kernel", ["ray", "ewa"])
-def test_bands_change_no_bit(kernel, make_scene, pose, monkeypatch):
-    scene, options = _scene(make_scene), RasterOptions(kernel, "radial", "angular", 0.05, False)
-    whole, gradients = _run(rasterize_planes, scene, pose, "pinhole", options, torch.float32)
+@pytest.mark.parametrize("options", [RasterOptions(), _EWA])
+def test_bands_change_no_bit_of_the_sums(options, scene, pose, monkeypatch):
+    whole, gradients = _run(scene, pose, "pinhole", options)
     monkeypatch.setattr(tiling, "MAX_INTERSECTIONS", 20)
-    banded, banded_gradients = _run(rasterize_planes, scene, pose, "pinhole", options, torch.float32)
+    banded, banded_gradients = _run(scene, pose, "pinhole", options)
     assert torch.equal(whole.sums, banded.sums)
-    for name, gradient in gradients.items():  # sums of slots, here first by band
+    for name, gradient in gradients.items():  # slots are added band by band, so in another order
         torch.testing.assert_close(banded_gradients[name], gradient, rtol=1e-4, atol=1e-5 * float(gradient.abs().max()))
 
 
-@pytest.mark.parametrize(("layout", "kernel"), [("equirect", "ray"), ("cubemap", "ewa")])
-def test_pictures_and_gradients_are_the_same_bits_on_any_number_of_threads(layout, kernel, make_scene, pose):
-    scene, options = _scene(make_scene, count=20000), RasterOptions(kernel, "radial", "angular", 0.05, False)
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 3, 5):
-            torch.set_num_threads(threads)
-            results.append(_run(rasterize_planes, scene, pose, layout, options, torch.float32))
-    finally:
-        torch.set_num_threads(before)
-    (first, gradients), *others = results
-    for drawn, same in others:
-        assert torch.equal(drawn.sums, first.sums)
-        assert all(torch.equal(same[name], gradients[name]) for name in gradients)
+@pytest.fixture
+def _restore_threads():
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
 
 
-def test_only_the_gradients_asked_for_are_made(make_scene, pose):
-    scene = _scene(make_scene)
+@pytest.mark.usefixtures("_restore_threads")
+@pytest.mark.parametrize(("layout", "options"), [("equirect", None), ("cubemap", _EWA)])
+def test_the_number_of_threads_changes_no_bit(layout, options, make_colored_scene, pose):
+    scene, runs = make_colored_scene(count=20000), []
+    for threads in (1, 2, 3, 5):
+        torch.set_num_threads(threads)
+        runs.append(_run(scene, pose, layout, options))
+    for run in runs[1:]:
+        _assert_same_bits(run, runs[0])
+
+
+def test_only_requested_gradients_are_computed(scene, pose):
     scene.opacities.requires_grad_()
-    drawn = rasterize_planes(
-        scene, None, pose, _pictures("pinhole"), RasterOptions("ray", "radial", "angular", 0.05, False)
-    )
-    drawn.sums.sum().backward()
-    assert scene.opacities.grad is not None and scene.opacities.grad.any()
+    rasterize_planes(scene, None, pose, _planes("pinhole"), RasterOptions()).sums.sum().backward()
+    assert scene.opacities.grad.any()
     assert all(getattr(scene, name).grad is None for name in _NAMES if name != "opacities")
 
 
-def test_without_grad_nothing_is_kept(make_scene, pose):
-    scene, options = _scene(make_scene), RasterOptions("ray", "radial", "angular", 0.05, False)
-    plain = rasterize_planes(scene, None, pose, _pictures("pinhole"), options)
+def test_without_grad_nothing_is_saved(scene, pose):
+    arguments = None, pose, _planes("pinhole"), RasterOptions()
+    plain = rasterize_planes(scene, *arguments)
     scene.means.requires_grad_()
-    recorded = rasterize_planes(scene, None, pose, _pictures("pinhole"), options)
+    recorded = rasterize_planes(scene, *arguments)
     with torch.no_grad():
-        drawn = rasterize_planes(scene, None, pose, _pictures("pinhole"), options)
-    assert not drawn.sums.requires_grad
-    assert set(drawn.info.seconds) == {"project", "bounds", "intersect", "sort", "rasterize"}
-    assert drawn.info.bytes == plain.info.bytes < recorded.info.bytes
+        unrecorded = rasterize_planes(scene, *arguments)
+    assert not unrecorded.sums.requires_grad
+    assert set(unrecorded.info.seconds) == {"project", "bounds", "intersect", "sort", "rasterize"}
+    assert unrecorded.info.bytes == plain.info.bytes < recorded.info.bytes
 
 
-def test_second_derivatives_are_refused(make_scene, pose):
-    scene = _scene(make_scene)
+def test_second_derivatives_are_refused(scene, pose):
     scene.means.requires_grad_()
-    picture = rasterize(scene, pose, size=(16, 32), backend="numba")
+    image = rasterize(scene, pose, size=(16, 32), backend="numba")
     with pytest.raises(RuntimeError, match="second derivatives of a rendering are not available"):
-        torch.autograd.grad(picture.color.sum(), scene.means, create_graph=True)
+        torch.autograd.grad(image.color.sum(), scene.means, create_graph=True)
 
 
-def test_the_backward_may_be_asked_for_twice(make_scene, pose):
-    scene = _scene(make_scene)
+def test_the_backward_may_run_twice(scene, pose):
     scene.means.requires_grad_()
     total = rasterize(scene, pose, size=(16, 32), backend="numba").color.sum()
     first = torch.autograd.grad(total, scene.means, retain_graph=True)[0]
-    rasterize(scene, pose, size=(32, 64), backend="numba")  # which must not take the memory kept for it
+    rasterize(scene, pose, size=(32, 64), backend="numba")  # must not reuse the memory that was saved
     assert torch.equal(torch.autograd.grad(total, scene.means)[0], first)
 
 
-def test_float32_in_main_memory_is_drawn_by_numba_unless_asked_otherwise(make_scene, pose):
-    scene = _scene(make_scene)
-    assert rasterize(scene, pose, size=(8, 16)).info.backend == "numba"
-    assert rasterize(scene.to(dtype=torch.bfloat16), pose, size=(8, 16)).info.backend == "numba"
-    assert rasterize(scene.to(dtype=torch.float64), pose, size=(8, 16)).info.backend == "torch"
-    assert rasterize(scene, pose, size=(8, 16), backend="torch").info.backend == "torch"
+@pytest.mark.parametrize(
+    ("dtype", "backend", "expected"),
+    [
+        (torch.float32, "auto", "numba"),
+        (torch.bfloat16, "auto", "numba"),
+        (torch.float64, "auto", "torch"),
+        (torch.float32, "torch", "torch"),
+    ],
+)
+def test_numba_is_the_default_backend_for_float32_on_a_cpu(dtype, backend, expected, scene, pose):
+    assert rasterize(scene.to(dtype=dtype), pose, size=(8, 16), backend=backend).info.backend == expected
 
 
-def test_float64_is_drawn_in_float32_and_given_back(make_scene, pose):
-    scene = _scene(make_scene).to(dtype=torch.float64)
+def test_float64_gaussians_have_float64_images_and_gradients(scene, pose):
+    scene = scene.to(dtype=torch.float64)
     scene.means.requires_grad_()
-    picture = rasterize(scene, pose, size=(8, 16), backend="numba")
-    picture.color.sum().backward()
-    assert picture.color.dtype == scene.means.grad.dtype == torch.float64
+    image = rasterize(scene, pose, size=(8, 16), backend="numba")
+    image.color.sum().backward()
+    assert image.color.dtype == scene.means.grad.dtype == torch.float64
 
 
-def test_strict_names_the_first_gaussian_that_is_not_finite(make_scene, pose):
-    scene = _scene(make_scene)
+def test_strict_reports_the_first_gaussian_that_is_not_finite(scene, pose):
     scene.scales[17, 1] = float("nan")
     options = {"size": (8, 16), "backend": "numba"}
     assert rasterize(scene, pose, **options).info.dropped == 1
@@ -178,48 +194,47 @@ def test_strict_names_the_first_gaussian_that_is_not_finite(make_scene, pose):
         rasterize(scene, pose, strict=True, **options)
 
 
-def test_a_side_that_a_box_cannot_hold_is_refused(make_scene, pose):
+def test_a_side_longer_than_a_box_can_hold_is_refused(scene, pose):
     with pytest.raises(InputError, match="at most 32767 pixels a side"):
-        rasterize(_scene(make_scene), pose, size=(1, 40000), layout="pinhole", backend="numba")
+        rasterize(scene, pose, size=(1, 40000), layout="pinhole", backend="numba")
 
 
-def test_two_threads_may_draw_at_once(make_scene, pose):
-    scene, options = _scene(make_scene, count=5000), RasterOptions("ray", "radial", "angular", 0.05, False)
-    alone = [_run(rasterize_planes, scene, pose, layout, options, torch.float32) for layout in ("equirect", "cubemap")]
-    together = {}
+def test_two_threads_may_rasterize_at_once(make_colored_scene, pose):
+    scene, results = make_colored_scene(count=5000), {}
+    expected = {layout: _run(scene, pose, layout) for layout in ("equirect", "cubemap")}
 
     def work(layout):
         for _ in range(5):
-            together[layout] = _run(rasterize_planes, scene, pose, layout, options, torch.float32)
+            results[layout] = _run(scene, pose, layout)
 
-    threads = [threading.Thread(target=work, args=(layout,)) for layout in ("equirect", "cubemap")]
+    threads = [threading.Thread(target=work, args=(layout,)) for layout in expected]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    for (drawn, gradients), layout in zip(alone, ("equirect", "cubemap"), strict=True):
-        assert torch.equal(together[layout][0].sums, drawn.sums)
-        assert all(torch.equal(together[layout][1][name], gradients[name]) for name in gradients)
+    for layout, run in results.items():
+        _assert_same_bits(run, expected[layout])
+    assert results.keys() == expected.keys()
 
 
-def _in_child(scene: Gaussians, pose, queue):
-    queue.put(rasterize(scene, pose, size=(16, 32), backend="numba").color.double().sum().item())
+def _sum_colors(scene, pose):
+    return rasterize(scene, pose, size=(16, 32), backend="numba").color.double().sum().item()
+
+
+def _put_sum(scene, pose, queue):
+    queue.put(_sum_colors(scene, pose))
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_a_forked_child_draws_what_its_parent_drew(make_scene, pose):
-    scene, before = _scene(make_scene), torch.get_num_threads()
-    try:
-        torch.set_num_threads(2)
-        expected = rasterize(scene, pose, size=(16, 32), backend="numba").color.double().sum().item()
-        torch.set_num_threads(2)
-        context = multiprocessing.get_context("fork")
-        queue = context.Queue()
-        child = context.Process(target=_in_child, args=(scene, pose, queue))
-        child.start()
-        assert queue.get(timeout=60) == expected
-        child.join()
-        assert child.exitcode == 0
-    finally:
-        torch.set_num_threads(before)
+@pytest.mark.usefixtures("_restore_threads")
+def test_a_forked_child_gives_the_same_image(scene, pose):
+    torch.set_num_threads(2)
+    expected = _sum_colors(scene, pose)
+    context = multiprocessing.get_context("fork")
+    queue = context.Queue()
+    child = context.Process(target=_put_sum, args=(scene, pose, queue))
+    child.start()
+    assert queue.get(timeout=60) == expected
+    child.join()
+    assert child.exitcode == 0

@@ -1,4 +1,4 @@
-"""Kernels are compiled bare and kept; the user is told only when it takes long."""
+"""Compilation, worker threads and working memory."""
 
 import gc
 import inspect
@@ -14,149 +14,156 @@ import torch
 from pansplat.rendering.cpu import runtime
 from pansplat.rendering.cpu.runtime import (
     Workspace,
-    _hash_sources,
     announce_compilation,
     inline_kernel,
     kernel,
     parallel_for,
     pooled_empty,
+    release_idle_memory,
 )
 
-# Shared-out work is done once each, and exceptions come out when all have stopped.
 
-# Leased memory is used again, but never by two at a time.
-
-
-def _work(x):
+def _add_indices(x):
     for i in range(3):
         x += i
     return x
 
 
-def _compile(module):
-    function = type(_work)(_work.__code__, {"range": range})
+def _compile_as_part_of(module):
+    function = type(_add_indices)(_add_indices.__code__, {"range": range})
     function.__module__ = module
     nb.njit(function)(1.0)
 
 
 @pytest.mark.parametrize(
-    ("patience", "module", "lines"),
-    [(0.0, "pansplat.rendering.cpu.observe", 1), (100.0, "pansplat.rendering.cpu.observe", 0), (0.0, "elsewhere", 0)],
+    ("delay", "module", "messages"),
+    [
+        (0.0, "pansplat.rendering.cpu.projection", 1),
+        (100.0, "pansplat.rendering.cpu.projection", 0),
+        (0.0, "elsewhere", 0),
+    ],
 )
-def test_compiling_our_kernels_is_announced_when_it_takes_long(patience, module, lines, monkeypatch, capsys):
-    monkeypatch.setattr(runtime, "_MESSAGE_DELAY", patience)
+def test_long_compilation_of_our_kernels_is_announced_once(delay, module, messages, monkeypatch, capsys):
+    monkeypatch.setattr(runtime, "_MESSAGE_DELAY", delay)
     monkeypatch.setattr(runtime, "_message_shown", False)
     with announce_compilation():
-        _compile(module)
-        _compile(module)  # one after another is still one wait
-    assert capsys.readouterr().err.count("compiling the rasteriser for this processor") == lines
+        _compile_as_part_of(module)
+        _compile_as_part_of(module)
+    assert capsys.readouterr().err.count("compiling the rasteriser for this processor") == messages
+    assert gc.isenabled()
 
 
 @pytest.mark.parametrize("decorate", [kernel, inline_kernel])
-def test_a_wrapped_function_is_compiled_bare(decorate):
+def test_kernels_are_compiled_from_the_unwrapped_function(decorate):
     def wrapper(*args):
         raise AssertionError
 
-    wrapper.__wrapped__ = _work
+    wrapper.__wrapped__ = _add_indices
     compiled = decorate(wrapper)
-    assert compiled.py_func is _work and inspect.isfunction(compiled.py_func)
+    assert compiled.py_func is _add_indices and inspect.isfunction(compiled.py_func)
 
 
-def test_what_is_compiled_into_a_kernel_counts_for_its_freshness(tmp_path, monkeypatch):
+def test_a_change_of_an_imported_module_invalidates_a_kernel(tmp_path, monkeypatch):
     monkeypatch.setattr(runtime, "__file__", str(tmp_path / "runtime.py"))
     package = runtime.__package__
     (tmp_path / "upper.py").write_text(f"from {package} import middle as m, other\n")
     (tmp_path / "middle.py").write_text(f"from {package}.lower import (\n    a,\n    b,\n)\n")
     for name in ("lower", "other", "stranger"):
         (tmp_path / f"{name}.py").write_text("a = 1\n")
-    stamps = [_hash_sources(tmp_path / "upper.py")]
+    hashes = [runtime._hash_sources(tmp_path / "upper.py")]
     for name in ("lower", "other", "stranger"):
         (tmp_path / f"{name}.py").write_text("a = 2\n")
-        stamps.append(_hash_sources(tmp_path / "upper.py"))
-    assert len(set(stamps[:3])) == 3 and stamps[2] == stamps[3]
+        hashes.append(runtime._hash_sources(tmp_path / "upper.py"))
+    assert len(set(hashes[:3])) == 3 and hashes[2] == hashes[3]
 
 
-def test_a_kernel_is_compiled_where_nothing_can_be_kept(monkeypatch):
+def test_a_kernel_is_compiled_without_a_cache_directory(monkeypatch):
     def refuse(*, cache=False, **options):
         if cache:
             raise RuntimeError("cannot cache function: no locator available")
         return nb.njit(**options)
 
     monkeypatch.setattr(runtime, "nb", type("Numba", (), {"njit": staticmethod(refuse)}))
-    assert kernel(_work)(1.0) == 4.0
+    assert kernel(_add_indices)(1.0) == 4.0
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
 @pytest.mark.parametrize("count", [0, 1, 3, 100])
-def test_each_piece_is_done_once(count, threads):
+def test_parallel_for_runs_each_item_once(count, threads):
     done: list[int] = []
     parallel_for(done.append, count, threads)
     assert sorted(done) == list(range(count))
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
-def test_an_exception_is_raised_when_all_have_stopped(threads):
+def test_parallel_for_raises_after_all_threads_have_stopped(threads):
     busy = []
 
-    def work(piece):
-        busy.append(piece)
+    def work(item):
+        busy.append(item)
         try:
-            if piece == 3:
+            if item == 3:
                 raise KeyboardInterrupt
             time.sleep(0.001)
         finally:
-            busy.remove(piece)
+            busy.remove(item)
 
     with pytest.raises(KeyboardInterrupt):
         parallel_for(work, 50, threads)
     assert busy == []
-    parallel_for(work, 3, threads)  # and it can be used again
+    parallel_for(work, 3, threads)  # the pool is still usable
 
 
-def test_two_threads_may_share_out_work_at_once():
+def test_two_threads_may_use_parallel_for_at_once():
     done: list[tuple[int, int]] = []
 
-    def run(who):
-        parallel_for(lambda piece: done.append((who, piece)), 200, 3)
+    def run(caller):
+        parallel_for(lambda item: done.append((caller, item)), 200, 3)
 
-    both = [threading.Thread(target=run, args=(who,)) for who in range(2)]
-    for thread in both:
+    callers = [threading.Thread(target=run, args=(caller,)) for caller in range(2)]
+    for thread in callers:
         thread.start()
-    for thread in both:
+    for thread in callers:
         thread.join()
-    assert sorted(done) == [(who, piece) for who in range(2) for piece in range(200)]
+    assert sorted(done) == [(caller, item) for caller in range(2) for item in range(200)]
 
 
-@pytest.fixture(autouse=True)
-def _nothing_idle(monkeypatch):
+@pytest.fixture
+def no_idle_memory(monkeypatch):
     monkeypatch.setattr(runtime, "_idle", [])
     monkeypatch.setattr(runtime, "_returned", deque())
 
 
-def test_memory_given_back_is_used_again():
-    workspace = Workspace()
-    address = workspace.array((100, 16), np.float32).ctypes.data
-    del workspace
-    assert Workspace().array((50, 32), np.float32).ctypes.data == address
+def _used_address(shape, dtype):
+    """Address of an array of a workspace that has ended."""
+    return Workspace().array(shape, dtype).ctypes.data
 
 
-def test_two_leases_share_nothing():
+@pytest.mark.usefixtures("no_idle_memory")
+def test_memory_of_a_workspace_is_reused_after_its_end():
+    address = _used_address((100, 16), np.float32)
     first, second = Workspace(), Workspace()
-    one, two = first.array(1000, np.float64), second.array(1000, np.float64)
-    again = first.array(1000, np.float64)
-    assert not np.shares_memory(one, two) and not np.shares_memory(one, again)
+    assert first.array((50, 32), np.float32).ctypes.data == address
+    assert second.array((50, 32), np.float32).ctypes.data != address
 
 
-def test_arrays_start_on_a_cache_line_and_have_the_shape_asked_for():
+def test_arrays_of_living_workspaces_share_no_memory():
+    first, second = Workspace(), Workspace()
+    arrays = [first.array(1000, np.float64), second.array(1000, np.float64), first.array(1000, np.float64)]
+    assert not any(np.shares_memory(arrays[i], arrays[j]) for i, j in ((0, 1), (0, 2), (1, 2)))
+
+
+@pytest.mark.parametrize("shape", [(3, 16), (7,), 5, (0, 4), ()])
+def test_arrays_are_contiguous_and_aligned_to_a_cache_line(shape):
     workspace = Workspace()
-    for shape in ((3, 16), (7,), 5, (0, 4), ()):
-        array = workspace.array(shape, np.float32)
+    for array in (workspace.array(shape, np.float32), pooled_empty(shape, np.float32)):
         assert array.size == 0 or array.ctypes.data % 64 == 0
         assert array.shape == (shape if isinstance(shape, tuple) else (shape,))
         assert array.flags.c_contiguous and array.dtype == np.float32
 
 
-def test_no_more_than_a_limit_is_kept(monkeypatch):
+@pytest.mark.usefixtures("no_idle_memory")
+def test_idle_memory_is_limited(monkeypatch):
     monkeypatch.setattr(runtime, "_MAX_IDLE", 5000)
     workspace = Workspace()
     for _ in range(10):
@@ -165,36 +172,33 @@ def test_no_more_than_a_limit_is_kept(monkeypatch):
     assert 0 < sum(block.nbytes for block in runtime._idle) <= 5000
 
 
+@pytest.mark.usefixtures("no_idle_memory")
 def test_a_small_array_does_not_take_a_large_block():
-    workspace = Workspace()
-    workspace.array(1 << 20, np.uint8)
-    del workspace
+    _used_address(1 << 20, np.uint8)
     Workspace().array(10, np.uint8)
     assert max(block.nbytes for block in runtime._idle) > 1 << 20
 
 
-def test_what_is_given_comes_back_when_torch_lets_go_of_it():
+@pytest.mark.usefixtures("no_idle_memory")
+def test_pooled_memory_is_reused_after_the_last_view_of_it():
     tensor = torch.from_numpy(pooled_empty((1000, 3), np.float32))
     part = tensor[10:20, 1]
     del tensor
     assert not np.shares_memory(Workspace().array((1000, 3), np.float32), part.numpy())
     del part
-    runtime.release_idle_memory()
+    release_idle_memory()
     tensor = torch.from_numpy(pooled_empty((1000, 3), np.float32))
     address = tensor.data_ptr()
     del tensor
     assert pooled_empty((1000, 3), np.float32).ctypes.data == address
 
 
-def test_an_empty_array_can_be_given():
-    assert pooled_empty((0, 4), np.float32).shape == (0, 4) and pooled_empty((), np.float32).shape == ()
-
-
-def test_a_lease_that_ends_while_the_lock_is_held_does_not_wait_for_it():
+@pytest.mark.usefixtures("no_idle_memory")
+def test_a_workspace_that_ends_while_the_lock_is_held_does_not_wait():
     workspace = Workspace()
     address = workspace.array(5000, np.uint8).ctypes.data
     with runtime._lock:
         del workspace
         gc.collect()
         assert runtime._idle == []
-    assert Workspace().array(5000, np.uint8).ctypes.data == address
+    assert _used_address(5000, np.uint8) == address

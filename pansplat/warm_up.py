@@ -1,0 +1,67 @@
+"""Compile the numba kernels of the rasteriser and of the sweep into numba's cache: `python -m pansplat.warm_up`.
+
+setup.sh runs this once, so that no later command has to compile them. Kernels for `covariances` in place of scales and
+rotations, and those of the networks, are compiled by the first call that needs them.
+"""
+
+import time
+from functools import partial
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from pansplat.data.views import Views
+from pansplat.gaussians.scene import Gaussians
+from pansplat.pipeline import predict
+from pansplat.rendering import rasterize
+from pansplat.rendering.image_planes import Layout
+from pansplat.rendering.rasterize import RasterOptions
+
+
+def main() -> None:
+    """Compile the kernels, show the progress, and print the time."""
+    ewa = RasterOptions(kernel="ewa", order="z", lowpass="3dgs")
+    steps = {
+        "rasteriser": partial(_rasterize, 0, "equirect", RasterOptions()),
+        "rasteriser, spherical harmonics": partial(_rasterize, 1, "pinhole", RasterOptions()),
+        "rasteriser, EWA": partial(_rasterize, 0, "pinhole", ewa),
+        "rasteriser, EWA and spherical harmonics": partial(_rasterize, 1, "cubemap", ewa),
+        "sweep": _predict,
+    }
+    start = time.perf_counter()
+    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("", total=len(steps))
+        for name, step in steps.items():
+            progress.update(task, description=f"compiling: {name}")
+            step()
+            progress.advance(task)
+    print(f"CPU kernels are compiled ({time.perf_counter() - start:.0f} s)")
+
+
+def _rasterize(degree: int, layout: Layout, options: RasterOptions) -> None:
+    """Rasterise Gaussians with harmonics of a degree, forward and backward."""
+    scene = Gaussians(
+        means=torch.rand(9, 3).requires_grad_(),
+        scales=torch.full((9, 3), 0.1),
+        quats=torch.ones(9, 4),
+        opacities=torch.full((9,), 0.5),
+        harmonics=torch.ones(9, (degree + 1) ** 2, 3),
+        levels=torch.zeros(9, dtype=torch.int64),
+        views=torch.zeros(9, dtype=torch.int64),
+    )
+    pose = torch.eye(4, dtype=torch.float64)
+    rasterize(scene, pose, size=(16, 32), layout=layout, options=options, backend="numba").color.sum().backward()
+
+
+def _predict() -> None:
+    """Predict from two small panoramas of noise."""
+    images, masks = torch.rand(2, 3, 64, 128), torch.ones(2, 64, 128, dtype=torch.bool)
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    poses[1, 0, 3] = 0.2
+    predict(Views(images, poses, masks, near=0.1, far=10.0, names=("left", "right")), "sweep")
+
+
+if __name__ == "__main__":
+    main()
