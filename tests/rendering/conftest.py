@@ -31,6 +31,29 @@ def _scene(count: int, *, seed: int = 0, scale: float = 0.15, spread: float = 1.
     )
 
 
+def _balls(means, sigma=0.1, opacity=0.8, colours=(0.9, 0.4, 0.2)) -> Gaussians:
+    means = torch.as_tensor(means, dtype=torch.float64).reshape(-1, 3)
+    count = len(means)
+    ones = torch.ones(count, dtype=torch.float64)
+    colours = torch.as_tensor(colours, dtype=torch.float64)
+    label = torch.zeros(count, dtype=torch.int64)
+    return Gaussians(
+        means=means,
+        scales=(ones * torch.as_tensor(sigma, dtype=torch.float64))[:, None].expand(count, 3).clone(),
+        quats=torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).repeat(count, 1),
+        opacities=ones * torch.as_tensor(opacity, dtype=torch.float64),
+        harmonics=((colours - 0.5) / 0.28209479177387814).expand(count, colours.shape[-1])[:, None].clone(),
+        levels=label,
+        views=label,
+    )
+
+
+@pytest.fixture
+def balls() -> Callable[..., Gaussians]:
+    """Balls of one size at some places, each with a colour; float64."""
+    return _balls
+
+
 def _adjugate(matrix: Tensor) -> Tensor:
     """Of symmetric 3x3 matrices: columns are cross products of rows, no inverse."""
     a, b, c = matrix.unbind(-2)

@@ -15,7 +15,6 @@ from pansplat.rendering import Rendering, rasterize
 os.environ["TRITON_INTERPRET"] = "1"  # before the kernels are imported
 
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
-_BASE = 0.28209479177387814
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,29 +73,6 @@ _NO_TRITON = find_spec("triton") is None and not os.environ.get("CI")
 def draw(request) -> Renderer:
     """A backend."""
     return _RENDERERS[request.param]
-
-
-def _balls(means, sigma=0.1, opacity=0.8, colours=(0.9, 0.4, 0.2)) -> Gaussians:
-    means = torch.as_tensor(means, dtype=torch.float64).reshape(-1, 3)
-    count = len(means)
-    ones = torch.ones(count, dtype=torch.float64)
-    colours = torch.as_tensor(colours, dtype=torch.float64)
-    label = torch.zeros(count, dtype=torch.int64)
-    return Gaussians(
-        means=means,
-        scales=(ones * torch.as_tensor(sigma, dtype=torch.float64))[:, None].expand(count, 3).clone(),
-        quats=torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).repeat(count, 1),
-        opacities=ones * torch.as_tensor(opacity, dtype=torch.float64),
-        harmonics=((colours - 0.5) / _BASE).expand(count, colours.shape[-1])[:, None].clone(),
-        levels=label,
-        views=label,
-    )
-
-
-@pytest.fixture
-def balls() -> Callable[..., Gaussians]:
-    """Balls of one size at some places, each with a colour; float64."""
-    return _balls
 
 
 def _leaves(scene: Gaussians) -> Gaussians:

@@ -1,4 +1,4 @@
-"""The original's pictures: its rasteriser written out densely, with and without what ours leaves aside."""
+"""`OFFICIAL` against the published rasteriser written out densely, with and without its two cuts."""
 
 import math
 
@@ -10,14 +10,13 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.cubemap import face_poses
 from pansplat.rendering import rasterize
 from pansplat.rendering.image_planes import stitch_faces
+from pansplat.rendering.official import OFFICIAL
 
-_PARITY = {"layout": "cubemap", "kernel": "ewa", "order": "z", "lowpass": "3dgs", "stitching": "official"}
 
-
-def _original_face(
+def _official_face(
     scene: Gaussians, pose: torch.Tensor, num: int, near: float, *, radius_cut: bool, stop: bool
 ) -> torch.Tensor:
-    """RGB of a 90-degree face as OFFICIAL.md 10.3 says, every pixel against every Gaussian; float64.
+    """RGB of a 90-degree face as docs/official.md, 10.3 describes, every pixel against every Gaussian; float64.
 
     Args:
         radius_cut: draw only in tiles of 16 pixels that the square of ceil(3 sigma) touches.
@@ -40,8 +39,8 @@ def _original_face(
     across = torch.arange(num, dtype=torch.float64)
     pixels = torch.stack((across.repeat(num), across.repeat_interleave(num)), dim=1)
     half = 0.5 * (flat[:, 0, 0] + flat[:, 1, 1])
-    spread = half + torch.sqrt((half.square() - torch.linalg.det(flat)).clamp_min(0.1))
-    radius = torch.ceil(3 * torch.sqrt(spread))[:, None]
+    largest = half + torch.sqrt((half.square() - torch.linalg.det(flat)).clamp_min(0.1))
+    radius = torch.ceil(3 * torch.sqrt(largest))[:, None]
     tiles = torch.floor((middle - radius) / 16), torch.floor((middle + radius + 15) / 16)
     mine = torch.floor(pixels / 16)
     rgb, through = torch.zeros(num * num, 3, dtype=torch.float64), torch.ones(num * num, dtype=torch.float64)
@@ -63,8 +62,8 @@ def _original_face(
     return rgb.T.reshape(3, num, num)
 
 
-def _original(scene: Gaussians, pose: torch.Tensor, height: int, near: float, **cuts: bool) -> torch.Tensor:
-    faces = [_original_face(scene, p, height // 2, near, **cuts) for p in face_poses(pose)]
+def _official(scene: Gaussians, pose: torch.Tensor, height: int, near: float, **cuts: bool) -> torch.Tensor:
+    faces = [_official_face(scene, p, height // 2, near, **cuts) for p in face_poses(pose)]
     return stitch_faces(torch.stack(faces), (height, 2 * height), stitching="official")
 
 
@@ -74,7 +73,7 @@ def _psnr(a: torch.Tensor, b: torch.Tensor) -> float:
 
 @pytest.fixture
 def outside(make_scene):
-    """Gaussians no nearer than half a metre, so that no rule about near ones tells two renderers apart."""
+    """Gaussians no nearer than half a metre, where the renderers' rules about near ones agree."""
 
     def make(count: int, scale: float) -> Gaussians:
         scene = make_scene(count, scale=scale, seed=11, degree=3)
@@ -84,10 +83,10 @@ def outside(make_scene):
 
 
 @pytest.mark.parametrize("scale", [0.02, 0.3])
-def test_parity_mode_is_the_original_but_for_its_two_cuts(scale, outside, pose):
+def test_official_options_equal_the_published_rasteriser_without_its_two_cuts(scale, outside, pose):
     scene = outside(150, scale)
-    expected = _original(scene, pose, 32, 0.45, radius_cut=False, stop=False)
-    got = rasterize(scene, pose, size=(32, 64), face_size=16, near=0.45, **_PARITY)
+    expected = _official(scene, pose, 32, 0.45, radius_cut=False, stop=False)
+    got = rasterize(scene, pose, size=(32, 64), face_size=16, near=0.45, layout="cubemap", options=OFFICIAL)
     assert float(expected.mean()) > 0.05
     assert (got.color - expected).abs().max() < 1e-10
 
@@ -97,14 +96,14 @@ def test_parity_mode_is_the_original_but_for_its_two_cuts(scale, outside, pose):
     [({"radius_cut": True, "stop": False}, 80), ({"radius_cut": False, "stop": True}, 95)],
     ids=["radius", "transmittance"],
 )
-def test_the_originals_two_cuts_change_little(cuts, decibels, outside, pose):
+def test_the_published_rasterisers_two_cuts_change_little(cuts, decibels, outside, pose):
     scene = outside(150, 0.3)
-    got = rasterize(scene, pose, size=(64, 128), face_size=32, near=0.45, **_PARITY).color
-    theirs = _original(scene, pose, 64, 0.45, **cuts)
-    assert decibels < _psnr(theirs, got) < 200  # below 200: the cut does something here
+    got = rasterize(scene, pose, size=(64, 128), face_size=32, near=0.45, layout="cubemap", options=OFFICIAL).color
+    theirs = _official(scene, pose, 64, 0.45, **cuts)
+    assert decibels < _psnr(theirs, got) < 200  # below 200: the cut has an effect
 
 
-def test_the_original_alone_draws_what_is_nearer_than_near(make_scene):
+def test_only_the_published_rasteriser_draws_gaussians_nearer_than_near(make_scene):
     eye = torch.eye(4, dtype=torch.float64)
     near_one = make_scene(1, scale=0.02)
     for place, ours, theirs in (
@@ -113,13 +112,13 @@ def test_the_original_alone_draws_what_is_nearer_than_near(make_scene):
         ((0, 0, 0.5), True, True),
     ):
         near_one.means.copy_(torch.tensor([place]))
-        got = rasterize(near_one, eye, size=(32, 64), face_size=16, near=0.45, **_PARITY).color
-        expected = _original(near_one, eye, 32, 0.45, radius_cut=False, stop=False)
+        got = rasterize(near_one, eye, size=(32, 64), face_size=16, near=0.45, layout="cubemap", options=OFFICIAL).color
+        expected = _official(near_one, eye, 32, 0.45, radius_cut=False, stop=False)
         assert (float(got.max()) > 0, float(expected.max()) > 0) == (ours, theirs)
 
 
-def test_parity_mode_differs_from_the_exact_panorama_by_its_approximations(outside, pose):
+def test_official_options_differ_from_the_exact_panorama_by_their_approximations(outside, pose):
     scene = outside(150, 0.1)
-    theirs = rasterize(scene, pose, size=(64, 128), face_size=32, near=0.45, **_PARITY)
+    theirs = rasterize(scene, pose, size=(64, 128), face_size=32, near=0.45, layout="cubemap", options=OFFICIAL)
     exact = rasterize(scene, pose, size=(64, 128), near=0.45)
     assert 18 < _psnr(theirs.color, exact.color) < 30  # measured 22.7

@@ -1,0 +1,109 @@
+"""Image planes, and stitching of cube faces against geometry and the published code's fixtures."""
+
+import pytest
+import torch
+
+from pansplat.geometry.cubemap import face_of, face_rotations, official_faces
+from pansplat.geometry.equirect import pixel_directions, uv_from_directions
+from pansplat.rendering.image_planes import ImagePlane, image_planes, stitch_faces
+
+
+@pytest.mark.shared
+def test_depth_along_an_axis_becomes_distance_by_the_official_factor(golden):
+    ahead = ImagePlane((32, 32), face_rotations()[0], 16.0).directions()[..., 2]
+    assert torch.allclose(1 / ahead, golden("units")["cubemap.depth_norm"].double(), rtol=0, atol=2e-7)
+
+
+@pytest.mark.parametrize("stitching", ["seamless", "official"])
+def test_stitching_face_by_face_adds_up_to_the_whole(stitching):
+    generator = torch.Generator().manual_seed(0)
+    faces = torch.randn(6, 2, 6, 6, generator=generator, dtype=torch.float64)
+    whole = stitch_faces(faces, (12, 24), stitching=stitching)
+    parts = torch.zeros_like(whole)
+    for face in range(6):
+        alone = torch.zeros_like(faces)
+        alone[face] = faces[face]
+        parts += stitch_faces(alone, (12, 24), stitching=stitching)
+    assert torch.allclose(parts, whole, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("num", [1, 2, 7, 16])
+def test_stitching_equal_faces_gives_the_same_value_everywhere(num):
+    faces = torch.full((6, 2, num, num), 0.7, dtype=torch.float64)
+    assert torch.allclose(stitch_faces(faces, (9, 18)), torch.full((2, 9, 18), 0.7, dtype=torch.float64), atol=1e-14)
+
+
+def test_stitching_reproduces_the_direction_of_every_pixel_across_edges_and_corners():
+    expected = pixel_directions(64, 128, dtype=torch.float64).permute(2, 0, 1)
+    # Bilinear within a face, and a neighbour's pixel is less than a pixel from its ideal position.
+    for num, tolerance in ((16, 0.05), (64, 0.012)):
+        faces = torch.stack([plane.directions() for plane in image_planes("cubemap", (64, 128), face_size=num)])
+        stitched = stitch_faces(faces.permute(0, 3, 1, 2), (64, 128))
+        assert float((stitched - expected).norm(dim=0).max()) < tolerance
+    uv = uv_from_directions(stitched.permute(1, 2, 0))
+    assert float((uv[..., 1] - (torch.arange(64) + 0.5)[:, None] / 64).abs().max()) < 0.005
+
+
+def test_every_face_pixel_reaches_a_panorama_that_is_fine_enough():
+    faces = torch.zeros(6, 1, 8, 8, dtype=torch.float64, requires_grad=True)
+    (reach,) = torch.autograd.grad(stitch_faces(faces, (64, 128)).sum(), faces)
+    assert float(reach.min()) > 0
+
+
+def test_official_stitching_refuses_other_sizes():
+    with pytest.raises(ValueError, match="must be 2:1"):
+        stitch_faces(torch.zeros(6, 1, 4, 4), (8, 8), stitching="official")
+    with pytest.raises(ValueError, match="multiple of 4, got 6"):
+        stitch_faces(torch.zeros(6, 1, 4, 4), (6, 12), stitching="official")
+
+
+@pytest.mark.shared
+def test_official_faces_equal_the_fixture(golden):
+    assert torch.equal(official_faces(64), golden("units")["cubemap.face"].long())
+
+
+@pytest.mark.shared
+def test_official_stitching_equals_the_fixture(golden):
+    fixtures = golden("units")
+    expected = fixtures["cubemap.pano_out"][0].double()
+    got = stitch_faces(fixtures["cubemap.faces_in"][0].double(), (64, 128), stitching="official")
+    # The published code samples float32 positions in a strip of six padded faces, 204 pixels long, where neighbouring
+    # numbers are 1.5e-5 apart; the fixture's faces are noise, up to 1 from pixel to pixel.
+    assert float((got - expected).abs().max()) < 3e-5
+    # The same rounding leaves a sixth of the pixels different, in the last bit of their position.
+    face, x, y = (fixtures[f"cubemap.{name}"] for name in ("face", "x", "y"))
+    strip = _pad_official(fixtures["cubemap.faces_in"][0]).permute(1, 0, 2, 3).reshape(3, 6 * 34, 34)
+    grid = torch.stack(((x + 1) / 34 * 2 - 1, (y + 1 + 34 * face) / 204 * 2 - 1), dim=-1)
+    assert grid.dtype == torch.float32
+    rounded = torch.nn.functional.grid_sample(strip[None], grid[None], align_corners=False)[0].to(got)
+    assert float(((rounded - expected).abs().amax(dim=0) > 5e-7).double().mean()) < 0.2
+
+
+def _pad_official(faces: torch.Tensor) -> torch.Tensor:
+    """Faces with the official padding (docs/official.md, P9 and T6), written out edge by edge."""
+    front, right, back, left, up, down = faces
+    padded = torch.zeros(6, 3, 34, 34)
+    padded[:, :, 1:-1, 1:-1] = faces
+    around = (front, right, back, left)
+    over = (up[:, -1], up[:, :, -1].flip(1), up[:, 0].flip(1), up[:, :, 0])
+    under = (down[:, 0], down[:, :, -1], down[:, -1].flip(1), down[:, :, 0].flip(1))
+    for i in range(4):
+        padded[i, :, 1:-1, 0], padded[i, :, 1:-1, -1] = around[i - 1][:, :, -1], around[(i + 1) % 4][:, :, 0]
+        padded[i, :, 0, 1:-1], padded[i, :, -1, 1:-1] = over[i], under[i]
+    padded[4, :, 0, 1:-1], padded[4, :, -1, 1:-1] = back[:, 0].flip(1), front[:, 0]
+    padded[5, :, 0, 1:-1], padded[5, :, -1, 1:-1] = front[:, -1], back[:, -1].flip(1)
+    # Left and right of up and down: shifted down by a row, below a zero; down's are its own columns.
+    padded[4, :, 2:, 0], padded[4, :, 2:, -1] = left[:, 0], right[:, 0].flip(1)
+    padded[5, :, 2:, 0], padded[5, :, 2:, -1] = down[:, :, 0], down[:, :, -1]
+    return padded
+
+
+@pytest.mark.shared
+def test_the_two_stitchings_differ_only_beside_up_and_down(golden):
+    faces = golden("units")["cubemap.faces_in"][0].double()
+    official, seamless = (stitch_faces(faces, (64, 128), stitching=way) for way in ("official", "seamless"))
+    differ = (official - seamless).abs().amax(dim=0) > 1e-12
+    assert 0 < int(differ.sum()) <= 96
+    along = face_of(pixel_directions(64, 128, dtype=torch.float64)) >= 4
+    grown = torch.nn.functional.max_pool2d(along[None].float(), 3, 1, 1)[0] > 0
+    assert not (differ & ~grown).any()

@@ -1,0 +1,249 @@
+"""The call: its arguments, channels, covariances, and the laws that images obey under rotation and in every layout."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from torch._dynamo.utils import counters
+
+from pansplat.bench.scenes import full_lattice_room
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Gaussians
+from pansplat.geometry.cubemap import face_poses
+from pansplat.geometry.equirect import pixel_directions
+from pansplat.geometry.pose import multiply_quats, rotations_from_quats
+from pansplat.rendering import rasterize
+from pansplat.rendering.image_planes import stitch_faces
+from pansplat.rendering.official import OFFICIAL
+from pansplat.rendering.rasterize import RasterOptions
+
+_ORIGIN = torch.eye(4, dtype=torch.float64)
+
+
+# --- arguments ---
+
+
+def test_arguments_out_of_range_are_refused(make_scene, pose, unchecked):
+    scene = make_scene(2)
+    official = {"layout": "cubemap", "stitching": "official"}
+    cases = [
+        ({"size": (0, 4)}, r"`size` must be \(height, width\).*\(0, 4\)"),
+        ({"layout": "fisheye"}, r"`layout` must be one of equirect, cubemap, pinhole, got 'fisheye'"),
+        ({"kernel": "box"}, "`kernel` must be one of ray, ewa"),
+        ({"order": "random"}, "`order` must be one of radial, z"),
+        ({"lowpass": "none"}, "`lowpass` must be one of angular, 3dgs"),
+        ({"backend": "cuda"}, "`backend` must be one of auto, torch"),
+        ({"near": 0.0}, "`near` must be a positive distance"),
+        ({"vertical_fov_degrees": 180.0}, "`vertical_fov_degrees` must lie between 0 and 180"),
+        ({"face_size": 0}, "`face_size` must be at least 1"),
+        ({"kernel": "ewa"}, "'ewa' .* not defined on layout 'equirect'; use layout='cubemap'"),
+        ({**official, "size": (6, 12)}, "'official' needs layout='cubemap' and a 2:1 panorama"),
+        ({**official, "size": (8, 12)}, "'official' needs layout='cubemap' and a 2:1 panorama"),
+        ({**official, "size": (8, 16), "layout": "equirect"}, "'official' needs layout='cubemap' and a 2:1 panorama"),
+        ({"background": (0.1, 0.2)}, r"`background` must hold 3 numbers, .* got \(2,\)"),
+        *(
+            (
+                {"covariances": torch.zeros(shape)},
+                r"`covariances` must have shape \(2, 3, 3\), one matrix a Gaussian, got",
+            )
+            for shape in ((3, 3, 3), (2, 3), (2, 2, 2), (1, 2, 3, 3))
+        ),
+    ]
+    for options, message in cases:
+        with pytest.raises(InputError, match=message):
+            rasterize(scene, pose, **{"size": (4, 8), **options})
+    for bad in (2 * pose, torch.diag(torch.tensor((1.0, 1, -1, 1))), pose * math.nan, torch.eye(3)):
+        with pytest.raises(InputError, match="`cam2world` must be a rigid 4x4"):
+            rasterize(scene, bad, size=(4, 8))
+    with pytest.raises(TypeError, match="unexpected keyword argument 'sharpness'"):
+        rasterize(scene, pose, size=(4, 8), sharpness=2)
+
+
+def test_keywords_override_fields_of_the_options(make_scene, pose):
+    scene = make_scene(20)
+    place = dict(size=(16, 32), layout="cubemap", face_size=8)
+    expected = rasterize(scene, pose, kernel="ewa", order="z", lowpass="3dgs", stitching="official", near=0.3, **place)
+    got = rasterize(scene, pose, options=dataclasses.replace(OFFICIAL, near=0.1), near=0.3, **place)
+    assert torch.equal(got.color, expected.color)
+    assert torch.equal(
+        rasterize(scene, pose, options=OFFICIAL, stitching="seamless", **place).color,
+        rasterize(scene, pose, options=RasterOptions("ewa", "z", "3dgs"), **place).color,
+    )
+
+
+# --- channels ---
+
+
+@pytest.mark.parametrize(("channels", "degree"), [(3, 2), (32, 0)])
+def test_channels_drawn_together_equal_those_drawn_alone(channels, degree, make_scene, pose):
+    scene = make_scene(40, scale=0.25, degree=degree)
+    generator = torch.Generator().manual_seed(1)
+    shape = (40, (degree + 1) ** 2, channels)
+    scene = dataclasses.replace(scene, harmonics=0.4 * torch.randn(shape, generator=generator, dtype=torch.float64))
+    background = torch.linspace(0, 1, channels, dtype=torch.float64)
+    together = rasterize(scene, pose, size=(12, 24), background=background)
+    assert together.color.shape == (channels, 12, 24)
+    for c in range(0, channels, 7):
+        one = dataclasses.replace(scene, harmonics=scene.harmonics[:, :, c : c + 1])
+        alone = rasterize(one, pose, size=(12, 24), background=background[c : c + 1])
+        assert torch.allclose(alone.color[0], together.color[c], rtol=0, atol=1e-12)
+        assert torch.equal(alone.alpha, together.alpha) and torch.equal(alone.depth, together.depth)
+
+
+def test_the_default_background_is_black_for_any_number_of_channels(make_scene, pose):
+    scene = make_scene(3)
+    for channels in (1, 5):
+        one = dataclasses.replace(scene, harmonics=torch.zeros(3, 1, channels, dtype=torch.float64))
+        got = rasterize(one, pose, size=(4, 8))
+        assert torch.allclose(got.color, 0.5 * got.alpha.expand(channels, 4, 8), rtol=0, atol=1e-12)
+
+
+# --- covariances in place of scales and quaternions ---
+
+_COVARIANCE_CASES = [
+    dict(layout="equirect", kernel="ray", lowpass="angular"),
+    dict(layout="pinhole", kernel="ray", lowpass="3dgs"),
+    dict(layout="pinhole", kernel="ewa", lowpass="angular"),
+    dict(layout="cubemap", kernel="ewa", lowpass="3dgs", order="z"),
+]
+
+
+@pytest.mark.parametrize("options", _COVARIANCE_CASES, ids=lambda o: "-".join(o.values()))
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_scenes_own_covariances_change_nothing_and_scales_are_not_read(options, dtype, make_scene, pose):
+    scene = make_scene(80, scale=0.2)
+    expected = rasterize(scene, pose, size=(16, 32), **options)
+    covariances = scene.covariances.to(dtype)
+    blind = dataclasses.replace(scene, scales=torch.full_like(scene.scales, torch.nan), quats=0 * scene.quats)
+    options = dict(size=(16, 32), covariances=covariances, backend="torch", **options)
+    got = rasterize(scene.to(dtype=dtype), pose, **options)
+    tolerance = 1e-9 if dtype == torch.float64 else 2e-5
+    assert float(expected.alpha.mean()) > 0.05 and got.color.dtype == dtype
+    for name in ("color", "alpha"):
+        assert (getattr(got, name) - getattr(expected, name)).abs().max() < tolerance
+    assert torch.equal(rasterize(blind.to(dtype=dtype), pose, **options).color, got.color)
+
+
+def test_each_entry_of_a_symmetric_pair_gets_half_the_gradient(make_scene, pose):
+    scene = make_scene(6, scale=0.4, degree=0)
+    covariances = scene.covariances.clone().requires_grad_()
+    rasterize(scene, pose, size=(8, 16), covariances=covariances).color.sum().backward()
+    assert covariances.grad is not None and covariances.grad.any()
+    assert torch.allclose(covariances.grad, covariances.grad.transpose(1, 2), rtol=0, atol=1e-12)
+
+
+def test_an_empty_scene_takes_empty_covariances(make_scene, pose):
+    scene = make_scene(2).select(torch.zeros(2, dtype=torch.bool))
+    got = rasterize(scene, pose, size=(4, 8), covariances=torch.zeros(0, 3, 3, dtype=torch.float64))
+    assert not got.color.any()
+
+
+# --- rotation and layouts ---
+
+
+def _turned(pose: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
+    turned = pose.clone()
+    turned[:3, :3] = pose[:3, :3] @ rotation
+    return turned
+
+
+@pytest.mark.parametrize(("columns", "width"), [(1, 50), (7, 48), (24, 48)])
+def test_rotating_the_camera_about_y_rolls_the_panorama(columns, width, make_scene, pose):
+    scene = make_scene(150, scale=0.15)
+    angle = columns * 2 * math.pi / width
+    c, s = math.cos(angle), math.sin(angle)
+    yaw = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=torch.float64)
+    still = rasterize(scene, pose, size=(24, width))
+    turned = rasterize(scene, _turned(pose, yaw), size=(24, width))
+    for name in ("color", "alpha", "depth"):
+        rolled = torch.roll(getattr(still, name), -columns, dims=-1)
+        assert torch.allclose(rolled, getattr(turned, name), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("layout", "kernel"),
+    [("equirect", "ray"), ("cubemap", "ray"), ("pinhole", "ray"), ("cubemap", "ewa"), ("pinhole", "ewa")],
+)
+def test_rotating_scene_and_camera_together_changes_nothing(layout, kernel, make_scene, pose):
+    scene = make_scene(60, degree=0)
+    quat = torch.tensor((0.5, -0.3, 0.7, 0.1), dtype=torch.float64)
+    quat = quat / quat.norm()
+    world = _ORIGIN.clone()
+    world[:3, :3] = rotation = rotations_from_quats(quat)
+    quats = multiply_quats(quat.expand(60, 4), scene.quats)
+    rotated = dataclasses.replace(scene, means=scene.means @ rotation.T, quats=quats)
+    a = rasterize(scene, pose, size=(20, 40), layout=layout, kernel=kernel)
+    b = rasterize(rotated, world @ pose, size=(20, 40), layout=layout, kernel=kernel)
+    assert float(a.alpha.mean()) > 0.1
+    assert torch.allclose(a.color, b.color, atol=1e-9) and torch.allclose(a.depth, b.depth, atol=1e-9)
+
+
+def test_a_panorama_pixel_is_a_one_pixel_pinhole_image(make_scene, pose):
+    scene = make_scene(80, scale=0.3)
+    height, width = 16, 32
+    panorama = rasterize(scene, pose, size=(height, width))
+    # A pinhole image whose one pixel covers the same angle, at seams, poles, and the middle.
+    fov = 2 * math.degrees(math.atan(0.5 * math.pi / height))
+    for row, column in ((0, 0), (0, 17), (15, 31), (8, 0), (7, 31), (8, 16), (3, 9)):
+        ahead = pixel_directions(height, width, dtype=torch.float64)[row, column]
+        right = torch.linalg.cross(torch.tensor((0.0, 1.0, 0.0), dtype=torch.float64), ahead)
+        right = right / right.norm()
+        rotation = torch.stack((right, torch.linalg.cross(ahead, right), ahead), dim=1)
+        look = rasterize(scene, _turned(pose, rotation), size=(1, 1), layout="pinhole", vertical_fov_degrees=fov)
+        assert torch.allclose(look.color[:, 0, 0], panorama.color[:, row, column], atol=1e-9)
+        assert torch.allclose(look.depth[0, 0], panorama.depth[row, column], atol=1e-9)
+
+
+@pytest.mark.parametrize("kernel", ["ray", "ewa"])
+def test_a_face_of_the_cubemap_is_a_pinhole_image(kernel, make_scene, pose):
+    scene = make_scene(80, scale=0.3)
+    faces = [rasterize(scene, p, size=(16, 16), layout="pinhole", kernel=kernel, order="z") for p in face_poses(pose)]
+    panorama = rasterize(scene, pose, size=(12, 24), layout="cubemap", face_size=16, kernel=kernel, order="z")
+    expected = stitch_faces(torch.stack([f.color for f in faces]), (12, 24))
+    assert torch.allclose(panorama.color, expected, atol=1e-9)
+
+
+def test_the_cubemap_converges_to_the_direct_panorama(make_scene, pose):
+    scene = make_scene(60, scale=0.4)
+    # Far wider than either filter, which a finer face narrows.
+    scene = dataclasses.replace(scene, scales=scene.scales.clamp_min(0.5))
+    direct = rasterize(scene, pose, size=(32, 64))
+    errors = []
+    for face_size in (20, 40, 80):
+        stitched = rasterize(scene, pose, size=(32, 64), layout="cubemap", face_size=face_size)
+        errors.append(float((stitched.color - direct.color).abs().mean()))
+    # The edges at which alpha is cut are steps, so the error falls with the face's pixel, not its square.
+    assert errors[1] < errors[0] and errors[2] < 0.4 * errors[0] and errors[2] < 2e-3
+
+
+# --- torch.compile ---
+
+
+def _loss(gaussians: Gaussians, backend: str) -> torch.Tensor:
+    moved = dataclasses.replace(gaussians, means=gaussians.means * 1.01, scales=gaussians.scales.log().exp())
+    got = rasterize(moved, _ORIGIN, size=(16, 32), backend=backend)
+    return got.color.square().sum() + 0.1 * got.depth.sum() + got.alpha.sum()
+
+
+def _gradients(loss, gaussians: Gaussians, backend: str):
+    leaves = {name: getattr(gaussians, name).clone().requires_grad_() for name in ("means", "scales", "opacities")}
+    value = loss(dataclasses.replace(gaussians, **leaves), backend)
+    return value.detach(), torch.autograd.grad(value, list(leaves.values()))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.filterwarnings("ignore:The .grad attribute")  # the compiler itself reads it
+@pytest.mark.parametrize("backend", ["numba", "torch"])
+def test_a_compiled_step_has_the_same_loss_and_gradients_without_tracing_the_rasteriser(backend):
+    gaussians = full_lattice_room(16)
+    torch._dynamo.reset()
+    counters.clear()
+    value, gradients = _gradients(torch.compile(_loss, backend="aot_eager"), gaussians, backend)
+    plain, expected = _gradients(_loss, gaussians, backend)
+    assert torch.allclose(value, plain, rtol=1e-6)
+    for found, right in zip(gradients, expected, strict=True):
+        assert torch.allclose(found, right, rtol=1e-5, atol=1e-6 * right.abs().max())
+    assert counters["frames"]["total"] > 0
+    assert any("torch.compiler.disable" in reason for reason in counters["graph_break"])
+    assert sum(counters["graph_break"].values()) <= 4  # around the call; tracing it gives dozens
