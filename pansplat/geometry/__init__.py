@@ -1,1 +1,1 @@
-"""Pure functions of tensors: directions, panoramas, lattices, cube faces, rigid poses."""
+"""Pure functions of tensors: panoramas, cube faces, lattices, rigid poses and paths, warping, correlation."""

@@ -25,21 +25,21 @@ from pansplat.geometry.warp import Sampling, warp_panorama, warp_positions
 Backend = Literal["auto", "torch", "kernel"]
 
 _CHUNK = 1 << 22
-"""Numbers in the warped features, or in the positions, that exist at a time."""
+"""Largest number of elements of the warped features, or of the positions, in memory at a time."""
 
-_MOST_BANDS = 8
-"""Each has its own sum of gradients to the other panorama."""
+_MAX_BANDS = 8
+"""Bands of rows; each has its own gradient sums of the other panorama."""
 
 
 def _kernel(function: Callable[..., Any]) -> Any:
-    # The tests' check of annotations wraps every function; numba needs the bare one.
+    # The tests' annotation checks wrap every function; numba needs the unwrapped one.
     options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz", "reassoc"}}
     return nb.njit(cache=True, **options)(inspect.unwrap(function))
 
 
 @_kernel
 def _corners(x0, y0, height, width, wraps, rows, columns):
-    """Rows and columns of the four pixels about a position, in reading order."""
+    """Rows and columns of the four pixels around a position, in row-major order."""
     for k in range(4):
         row, column = y0 + k // 2, x0 + k % 2
         if wraps:
@@ -65,7 +65,7 @@ def _correlate_band(reference, other, x, y, wraps, out, first, last):
             for k in range(count):
                 px, py = x[k, i, j], y[k, i, j]
                 if not (px >= -1 and px <= width and py >= -1 and py <= height):
-                    out[k, i, j] = np.nan  # a position that is none
+                    out[k, i, j] = np.nan  # the position is NaN
                     continue
                 x0, y0 = int(np.floor(px)), int(np.floor(py))
                 if x0 != cell_x or y0 != cell_y:
@@ -85,8 +85,8 @@ def _correlate_band(reference, other, x, y, wraps, out, first, last):
 
 
 @_kernel
-def _spread(weights, pixel, other, rows, columns, to_reference, to_other):
-    """Add what one pixel and the four about its candidates get from each other."""
+def _accumulate_gradients(weights, pixel, other, rows, columns, to_reference, to_other):
+    """Add the gradients of one reference pixel and of the four pixels around its candidates."""
     for k in range(4):
         weight, row, column = weights[k], rows[k], columns[k]
         seen, gains = other[row, column], to_other[row, column]
@@ -98,7 +98,7 @@ def _spread(weights, pixel, other, rows, columns, to_reference, to_other):
 
 @_kernel
 def _backward_band(gradient, reference, other, x, y, wraps, to_reference, to_other, first, last):
-    """Adds to to_reference (h, w, c), rows `first` to `last`, and anywhere in to_other (h, w, c)."""
+    """Add gradients to rows `first` to `last` of to_reference (h, w, c), and to any rows of to_other (h, w, c)."""
     count, height, width = x.shape
     rows, columns = np.zeros(4, np.int64), np.zeros(4, np.int64)
     weights = np.zeros(4, reference.dtype)
@@ -112,7 +112,9 @@ def _backward_band(gradient, reference, other, x, y, wraps, to_reference, to_oth
                 x0, y0 = int(np.floor(px)), int(np.floor(py))
                 if x0 != cell_x or y0 != cell_y:
                     if cell_x != -9:
-                        _spread(weights, reference[i, j], other, rows, columns, to_reference[i, j], to_other)
+                        _accumulate_gradients(
+                            weights, reference[i, j], other, rows, columns, to_reference[i, j], to_other
+                        )
                     cell_x, cell_y = x0, y0
                     _corners(x0, y0, height, width, wraps, rows, columns)
                 fx, fy, g = px - x0, py - y0, gradient[k, i, j]
@@ -121,7 +123,7 @@ def _backward_band(gradient, reference, other, x, y, wraps, to_reference, to_oth
                 weights[2] += g * fy * (1 - fx)
                 weights[3] += g * fy * fx
             if cell_x != -9:
-                _spread(weights, reference[i, j], other, rows, columns, to_reference[i, j], to_other)
+                _accumulate_gradients(weights, reference[i, j], other, rows, columns, to_reference[i, j], to_other)
 
 
 def correlate_positions(
@@ -135,11 +137,9 @@ def correlate_positions(
     """Dot products of each pixel's features with bilinear samples of the other panorama.
 
     Args:
-        reference: all tensors on the CPU, of one type (float32 or float64).
-        other: is sampled.
-        columns: where, 0 being the first pixel's centre, at most one pixel beyond the border.
-        rows: likewise.
-        wraps: whether columns wrap and rows go on over the poles; otherwise the border's pixels repeat.
+        reference, other: features; all tensors are on the CPU and of one type (float32 or float64).
+        columns, rows: positions in `other`; 0 is the first pixel's centre, at most one pixel beyond the border.
+        wraps: columns wrap and rows continue over the poles; otherwise the border pixels are repeated.
     """
     height = reference.shape[2]
     out = torch.empty_like(columns, memory_format=torch.contiguous_format)
@@ -150,7 +150,7 @@ def correlate_positions(
     def work(pair: int, band: int) -> None:
         _correlate_band(ours[pair], theirs[pair], x[pair], y[pair], wraps, result[pair], *bands[band])
 
-    _share(work, reference.shape[0], len(bands))
+    _run_bands(work, reference.shape[0], len(bands))
     return out
 
 
@@ -163,7 +163,7 @@ def correlate_positions_backward(
     *,
     wraps: bool,
 ) -> tuple[Float[Tensor, "pair channel height width"], Float[Tensor, "pair channel height width"]]:
-    """Gradients of `correlate_positions` to both panoramas' features."""
+    """Gradients of `correlate_positions` with respect to both panoramas' features."""
     pairs, channels, height, width = reference.shape
     ours, theirs, upstream = _channels_last(reference), _channels_last(other), gradient.contiguous().numpy()
     x, y = columns.contiguous().numpy(), rows.contiguous().numpy()
@@ -177,7 +177,7 @@ def correlate_positions_backward(
             both = (to_reference[pair], sums[band])
             _backward_band(upstream[pair], ours[pair], theirs[pair], x[pair], y[pair], wraps, *both, *bands[band])
 
-        _share(work, 1, len(bands))
+        _run_bands(work, 1, len(bands))
         sums.sum(axis=0, out=to_other[pair])
     return torch.from_numpy(to_reference).movedim(-1, 1), torch.from_numpy(to_other).movedim(-1, 1)
 
@@ -187,14 +187,14 @@ def _channels_last(maps: Tensor) -> np.ndarray:
 
 
 def _bands(height: int) -> list[tuple[int, int]]:
-    """Rows shared out among as many threads as torch may use; a few rows are not worth a thread."""
-    count = max(1, min(torch.get_num_threads(), _MOST_BANDS, height // 8))
+    """First and last row of each band: one band per torch thread, of at least eight rows."""
+    count = max(1, min(torch.get_num_threads(), _MAX_BANDS, height // 8))
     edges = [height * band // count for band in range(count + 1)]
     return list(itertools.pairwise(edges))
 
 
-def _share(work: Callable[[int, int], None], pairs: int, bands: int) -> None:
-    """Call `work` for every pair and band, each band on a thread of its own."""
+def _run_bands(work: Callable[[int, int], None], pairs: int, bands: int) -> None:
+    """Call `work` for every pair and band, with one thread per band."""
     if bands == 1:
         for pair in range(pairs):
             work(pair, 0)
@@ -212,30 +212,30 @@ def correlate(
     sampling: Sampling = "sphere",
     backend: Backend = "auto",
 ) -> Float[Tensor, "pair candidate height width"]:
-    """Dot products of each pixel's features with the other panorama's, for each candidate, over sqrt(channel).
+    """Dot products of each pixel's features with the other panorama's at each depth candidate, over sqrt(channel).
 
-    The warped features of all candidates never exist at once, neither forward nor backward. Half-precision features
-    are multiplied in float32. Gradient flows to both features.
+    The warped features of all candidates are never in memory at once, in the forward and in the backward pass.
+    Half-precision features are multiplied in float32. Gradients flow to both features.
 
     Args:
-        reference: features at the pixels.
-        other: features that are sampled, of the same size.
+        reference: features of the pixels.
+        other: features of the same size, which are sampled.
         inverse_depth: candidates of each pixel, 1 / metres.
-        pose: from reference camera axes to the other's.
-        sampling: see above.
-        backend: "kernel" runs on the CPU only, "torch" anywhere; "auto" takes the faster.
+        pose: from the reference camera's axes to the other's.
+        sampling: see `pansplat.geometry.warp`.
+        backend: "kernel" runs on the CPU only, "torch" on any device; "auto" selects the faster one.
     """
     if backend == "auto":
         backend = "kernel" if reference.device.type == "cpu" else "torch"
     method = _ByKernel if backend == "kernel" else _ByWarping
     dtype = torch.promote_types(reference.dtype, torch.float32)
-    # Scaled before the product, so that no sum grows larger than the result.
+    # Scaled before the product, so that no partial sum overflows.
     scaled = reference.to(dtype) / math.sqrt(reference.shape[1])
     return method.apply(scaled, other.to(dtype), inverse_depth.detach().to(dtype), pose.detach(), sampling)
 
 
 class _ByWarping(torch.autograd.Function):
-    """Warps a few candidates at a time, and again in the backward pass."""
+    """Warps a few candidates at a time; the backward pass warps them again."""
 
     @staticmethod
     def forward(ctx, reference, other, inverse_depth, pose, sampling):
@@ -263,15 +263,15 @@ class _ByWarping(torch.autograd.Function):
 
 
 class _ByKernel(torch.autograd.Function):
-    """Loops over pixels in compiled code; warps nothing."""
+    """Runs the compiled kernels, without warping."""
 
     @staticmethod
     def forward(ctx, reference, other, inverse_depth, pose, sampling):
         ctx.save_for_backward(reference, other, inverse_depth, pose)
         ctx.sampling = sampling
         parts = [
-            correlate_positions(reference, other, *place, wraps=sampling == "sphere")
-            for _, place in _placed(inverse_depth, pose, sampling)
+            correlate_positions(reference, other, *positions, wraps=sampling == "sphere")
+            for _, positions in _chunk_positions(inverse_depth, pose, sampling)
         ]
         return torch.cat(parts, dim=1)
 
@@ -280,17 +280,19 @@ class _ByKernel(torch.autograd.Function):
     def backward(ctx, gradient):  # pyright: ignore[reportIncompatibleMethodOverride]
         reference, other, inverse_depth, pose = ctx.saved_tensors
         to_reference, to_other = torch.zeros_like(reference), torch.zeros_like(other)
-        for candidates, place in _placed(inverse_depth, pose, ctx.sampling):
+        for candidates, positions in _chunk_positions(inverse_depth, pose, ctx.sampling):
             steps = correlate_positions_backward(
-                gradient[:, candidates], reference, other, *place, wraps=ctx.sampling == "sphere"
+                gradient[:, candidates], reference, other, *positions, wraps=ctx.sampling == "sphere"
             )
             to_reference += steps[0]
             to_other += steps[1]
         return to_reference, to_other, None, None, None
 
 
-def _placed(inverse_depth: Tensor, pose: Tensor, sampling: Sampling) -> Iterator[tuple[slice, tuple[Tensor, Tensor]]]:
-    """Groups of candidates with their positions in the other panorama."""
+def _chunk_positions(
+    inverse_depth: Tensor, pose: Tensor, sampling: Sampling
+) -> Iterator[tuple[slice, tuple[Tensor, Tensor]]]:
+    """Chunks of candidates with their positions in the other panorama."""
     start = 0
     for chunk in _chunks(inverse_depth, inverse_depth[:, :1].numel()):
         yield slice(start, start + chunk.shape[1]), warp_positions(chunk, pose, sampling)
@@ -298,5 +300,5 @@ def _placed(inverse_depth: Tensor, pose: Tensor, sampling: Sampling) -> Iterator
 
 
 def _chunks(inverse_depth: Tensor, numbers: int) -> tuple[Tensor, ...]:
-    """The candidates in groups within the limit, when one takes so many numbers."""
+    """The candidates in chunks of at most `_CHUNK` elements; one candidate has `numbers` elements."""
     return inverse_depth.split(max(1, _CHUNK // max(1, numbers)), dim=1)

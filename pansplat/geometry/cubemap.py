@@ -42,27 +42,27 @@ def face_poses(cam2world: Float[Tensor, "4 4"]) -> Float[Tensor, "face 4 4"]:
 
 
 def face_of(directions: Float[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
-    """Index of the cube face that each direction meets; ties go to the first in the order of `FACES`."""
+    """Index of the cube face that each direction intersects; at an edge the first in the order of `FACES`."""
     return torch.argmax(directions @ face_rotations()[:, :, 2].to(directions).T, dim=-1)
 
 
 def official_faces(height: int) -> Int[Tensor, "height width"]:
-    """The face that the original takes for each pixel of a 2:1 panorama; differs from `face_of` along up and down.
+    """The official face of each pixel of a 2:1 panorama; differs from `face_of` along the up and down faces.
 
-    Side faces take whole quarters of the columns; where they end towards up and down is rounded to whole rows, over
-    angles that reach both edges of the face instead of the pixels' centres.
+    The side faces are whole quarters of the columns. Their borders to up and down are rounded to whole rows, for angles
+    from edge to edge of a face instead of its pixel centres.
 
-    Source: OFFICIAL.md, section 10.2.
+    Source: docs/official.md, section 10.2.
 
     Raises:
-        ValueError: the height is no multiple of 4, so that the back face does not split evenly over both ends.
+        ValueError: the height is no multiple of 4; the back face would not split evenly over both ends.
     """
     if height < 4 or height % 4:
         raise ValueError(f"`height` must be a positive multiple of 4, got {height}")
     quarter = height // 2
     angles = torch.linspace(-math.pi, math.pi, quarter, dtype=torch.float64) / 4
     outline = height // 2 - torch.round(torch.arctan(torch.cos(angles)) * height / math.pi)
-    # In the order of FACES, front first; rolled so that front comes to stand in the middle.
+    # In the order of FACES, rolled so that front is in the middle.
     middle = 2 * height * 3 // 8
     side = torch.arange(4).repeat_interleave(quarter).roll(middle)
     up = torch.arange(height)[:, None] < outline.repeat(4).roll(middle)
@@ -81,32 +81,32 @@ def strip_directions(face_size: int) -> Float[Tensor, "face_size strip 3"]:
 def strip_from_equirect(
     image: Float[Tensor, "channel height width"], face_size: int
 ) -> Float[Tensor, "channel face_size strip"]:
-    """The strip of six faces that a panorama shows, sampled bilinearly."""
+    """The strip of six faces of a panorama, sampled bilinearly."""
     uv = uv_from_directions(strip_directions(face_size)).to(image.device)
     return sample_equirect(image, uv)
 
 
 def strip_lookup(height: int) -> Float[Tensor, "height width 3"]:
-    """For each pixel of a panorama, where to look in six faces: x, y in [-1, 1], number of the face; float64.
+    """For each pixel of a panorama, its position in the six faces: x, y in [-1, 1], index of the face; float64.
 
-    x and y of -1 and 1 are the centres of a face's outermost pixels. A pixel that belongs to the face beside
-    by a rounding of rows is held to the edge.
+    -1 and 1 are the centres of a face's outermost pixels. Positions outside the face, which occur because
+    `official_faces` rounds to whole rows, are clamped to its edge.
     """
     width = 2 * height
     face = official_faces(height)
     rays = pixel_directions(height, width, dtype=torch.float64)
     local = torch.einsum("hwi,hwij->hwj", rays, face_rotations()[face])
-    place = (local[..., :2] / local[..., 2:]).clamp(-1, 1)
-    return torch.cat((place, face[..., None].double()), dim=-1)
+    position = (local[..., :2] / local[..., 2:]).clamp(-1, 1)
+    return torch.cat((position, face[..., None].double()), dim=-1)
 
 
 def equirect_from_strip(
     strip: Float[Tensor, "batch channel n strip"], lookup: Float[Tensor, "height width 3"]
 ) -> Float[Tensor, "batch channel height width"]:
-    """The panorama that a strip's faces show, sampled bilinearly inside each face where `lookup` says."""
+    """The panorama of a strip's faces, sampled bilinearly inside each face at the positions in `lookup`."""
     size = strip.shape[-2]
     x, y, face = lookup.to(strip.device, torch.float64).unbind(-1)
-    # Inside its face a position stays half a pixel from the edge at least, so that no sample mixes two faces.
+    # Positions are at least half a pixel from the edge of their face, so that no sample mixes two faces.
     column = face * size + (x + 1) / 2 * (size - 1) + 0.5
     row = (y + 1) / 2 * (size - 1) + 0.5
     grid = torch.stack((2 * column / (6 * size) - 1, 2 * row / size - 1), dim=-1)

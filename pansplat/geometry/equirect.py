@@ -19,6 +19,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+Border = Literal["sphere", "wrapped_columns", "zeros"]
+
 
 def directions_from_uv(uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
     """Unit directions in the camera frame of normalised panorama coordinates."""
@@ -61,13 +63,13 @@ def row_weights(height: int, *, dtype: torch.dtype = torch.float64) -> Float[Ten
 def sample_equirect(
     image: Float[Tensor, "channel height width"], uv: Float[Tensor, "*batch 2"]
 ) -> Float[Tensor, "channel *batch"]:
-    """Bilinear samples of a panorama at normalised coordinates; wraps in longitude, continues over the poles."""
+    """Bilinear samples of a panorama at normalised coordinates, across its borders as well."""
     height, width = image.shape[-2:]
     padded = pad_equirect(image, 1)
     x = (uv[..., 0] - torch.floor(uv[..., 0])) * width + 1
     y = uv[..., 1].clamp(0, 1) * height + 1
     grid = torch.stack((2 * x / (width + 2) - 1, 2 * y / (height + 2) - 1), dim=-1).to(image.dtype)
-    samples = torch.nn.functional.grid_sample(
+    samples = functional.grid_sample(
         padded[None], grid.reshape(1, 1, -1, 2), mode="bilinear", padding_mode="border", align_corners=False
     )
     return samples.reshape(image.shape[0], *uv.shape[:-1])
@@ -76,12 +78,9 @@ def sample_equirect(
 def rotate_equirect(
     image: Float[Tensor, "channel height width"], rotation: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "channel height width"]:
-    """The panorama seen by a camera at the same place turned by `rotation` (new camera axes in old ones)."""
+    """The panorama of a camera at the same position rotated by `rotation` (new camera axes in the old ones)."""
     directions = pixel_directions(*image.shape[-2:], dtype=torch.float64, device=image.device)
     return sample_equirect(image, uv_from_directions(directions @ rotation.to(directions).T))
-
-
-Border = Literal["sphere", "wrapped_columns", "zeros"]
 
 
 def pad_equirect(
@@ -90,7 +89,7 @@ def pad_equirect(
     """Maps with `margin` more rows and columns on each side.
 
     Raises:
-        ValueError: the margin is larger than the map, or the width is odd and the border is the sphere's.
+        ValueError: the margin is larger than the map, or the width is odd with the border `sphere`.
     """
     if margin == 0:
         return maps
@@ -99,9 +98,9 @@ def pad_equirect(
     height, width = maps.shape[-2:]
     over_poles = border == "sphere"
     if margin > width or (over_poles and margin > height):
-        raise ValueError(f"a margin of {margin} needs a map at least as large, got {height}x{width}")
+        raise ValueError(f"`maps` must be at least as large as the margin of {margin}, got {height}x{width}")
     if over_poles and width % 2:
-        raise ValueError(f"a map needs an even width to go on over the poles, got {width}")
+        raise ValueError(f"`maps` must have an even width to continue over the poles, got {width}")
     return _Padded.apply(maps, margin, over_poles)
 
 
@@ -143,23 +142,23 @@ class _Padded(torch.autograd.Function):
 
 
 def _beyond_pole(rows: Tensor) -> Tensor:
-    """The rows next to a pole, as they follow one another beyond it; its own inverse."""
+    """The rows next to a pole in their order beyond it; its own inverse."""
     return rows.flip(-2).roll(rows.shape[-1] // 2, -1)
 
 
 def resize_equirect(
     maps: Float[Tensor, "batch channel height width"], size: tuple[int, int]
 ) -> Float[Tensor, "batch channel h w"]:
-    """Maps bilinearly resized to `size` (height, width) on the sphere, pixel centres at half-integers.
+    """Maps resized bilinearly to `size` (height, width) on the sphere, pixel centres at half-integers.
 
-    Not filtered before it is made smaller: a sample is a mean of four pixels, whatever the factor.
+    There is no low-pass filter: a sample is a mean of four pixels at any factor.
     """
     height, width = maps.shape[-2:]
     if size == (height, width):
         return maps
     if size[0] * width != size[1] * height:
-        raise ValueError(f"`size` must keep the shape of {height}x{width}, got {size[0]}x{size[1]}")
-    # The smallest margin that becomes a whole number of pixels, and can be cut off again.
+        raise ValueError(f"`size` must keep the aspect ratio of {height}x{width}, got {size[0]}x{size[1]}")
+    # The smallest margin that corresponds to a whole number of pixels after resizing.
     divisor = math.gcd(height, size[0])
     margin, cut = height // divisor, size[0] // divisor
     padded = pad_equirect(maps, margin)

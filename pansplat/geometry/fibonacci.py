@@ -1,8 +1,8 @@
 """Fibonacci lattices: nearly uniform points on the sphere.
 
-Source: PanSplat, section 3.3. The original computes j * golden angle in float32, which at n = 5.3 million is off
-by half a radian; here the product is reduced to one turn in float64 (OFFICIAL.md trap T1). The original's points
-are there for its weights' sake.
+Source: PanSplat, section 3.3. The official code computes j * golden angle in float32, which is wrong by half a radian
+at n = 5.3 million (docs/official.md, trap T1). Here the product is reduced to one turn in float64. The official points
+are available for the official weights.
 """
 
 import math
@@ -15,7 +15,7 @@ _GOLDEN_TURN = (3 - math.sqrt(5)) / 2  # the golden angle as a fraction of a ful
 
 
 def lattice_size(width: int) -> int:
-    """Number of points of a level whose map is `width` pixels wide: width^2 / pi, the equator's density."""
+    """Number of points of a level with a map of `width` columns: width^2 / pi, the density at the equator."""
     return int(4 * math.pi * (width / (2 * math.pi)) ** 2)
 
 
@@ -34,11 +34,11 @@ def fibonacci_directions(count: int) -> Float[Tensor, "count 3"]:
 
 
 def official_fibonacci_uv(count: int) -> Float[Tensor, "count 2"]:
-    """The original's lattice: normalised panorama coordinates, in float64 though rounded as it rounds them.
+    """The official lattice as normalised panorama coordinates: float64 with the official float32 rounding errors.
 
-    All of it is float32: 0.25 pixel off on average at a map width of 512, 125 pixels at 4096.
+    The mean error is 0.25 pixel at a map width of 512, and 125 pixels at 4096.
 
-    Source: OFFICIAL.md, section 8 and trap T1.
+    Source: docs/official.md, section 8 and trap T1.
     """
     if count < 2:
         raise ValueError(f"`count` must be at least 2, got {count}")

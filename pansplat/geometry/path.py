@@ -1,7 +1,7 @@
-"""Camera paths to fly between the input panoramas.
+"""Camera paths between the input panoramas.
 
-Poses are cam2world, 4x4 float64, OpenCV axes, metres. "Level" poses have no roll or pitch against the up
-direction that the cameras share.
+Poses are cam2world, 4x4 float64, OpenCV axes, metres. A level pose has no roll and no pitch relative to the common up
+direction of the cameras.
 """
 
 import math
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pansplat.geometry.pose import interpolate_poses
 
-_STILL = 1e-6  # metres; a shorter step has no direction
+_MIN_STEP = 1e-6  # metres; a shorter step has no direction
 
 
 def ease_in_out(fraction: float) -> float:
@@ -23,7 +23,7 @@ def ease_in_out(fraction: float) -> float:
 
 
 def up_direction(cam2world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "3"]:
-    """Unit world direction that the cameras agree is up: the mean of their -y axes; -y without cameras."""
+    """Unit world direction of the mean of the cameras' -y axes; -y without cameras."""
     up = -cam2world[:, :3, 1].double().sum(0)
     if len(cam2world) == 0 or float(up.norm()) < 1e-3:
         up = torch.tensor((0.0, -1.0, 0.0), dtype=torch.float64)
@@ -33,7 +33,7 @@ def up_direction(cam2world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "3"]:
 def look_pose(
     position: Float[Tensor, "3"], forward: Float[Tensor, "3"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "4 4"]:
-    """Pose at `position` that looks along `forward` with `up` upright in the image.
+    """Pose at `position` that looks along `forward`; `up` is vertical in the image.
 
     Raises:
         ValueError: when `forward` is (nearly) parallel to `up` or has no length.
@@ -53,7 +53,7 @@ def look_pose(
 
 
 def level_pose(cam2world: Float[Tensor, "4 4"], up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
-    """The same place and heading without roll or pitch; through the vertical it keeps the heading."""
+    """The pose with the same position and heading, without roll or pitch; also for a vertical view."""
     pose = cam2world.double()
     forward, up = pose[:3, 2], up.double() / up.double().norm()
     flat = forward - (forward @ up) * up
@@ -64,7 +64,7 @@ def level_pose(cam2world: Float[Tensor, "4 4"], up: Float[Tensor, "3"]) -> Float
 
 
 def turn_pose(pose: Float[Tensor, "4 4"], yaw_radians: float, up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
-    """The pose turned in place about `up`; positive yaw turns the view to the right."""
+    """The pose rotated about `up`; positive yaw turns the view to the right."""
     axis = -up.double() / up.double().norm()  # down: with y down, right turns z towards x
     x, y, z = axis.tolist()
     cross = torch.tensor(((0, -z, y), (z, 0, -x), (-y, x, 0)), dtype=torch.float64)
@@ -79,10 +79,10 @@ def turn_pose(pose: Float[Tensor, "4 4"], yaw_radians: float, up: Float[Tensor, 
 
 
 def path_poses(cam2world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"]:
-    """A level pose at each camera that looks along the way past it.
+    """A level pose at each camera that looks along the path.
 
-    The way's direction at a camera is that from its predecessor to its successor. Where it has none (one
-    camera, coincident cameras, a climb straight up) the pose keeps that camera's own heading.
+    The direction of the path at a camera is that from its predecessor to its successor. Where it has none (one camera,
+    coincident cameras, a vertical path) the pose keeps the camera's heading.
     """
     up = up_direction(cam2world)
     positions = cam2world[:, :3, 3].double()
@@ -91,7 +91,7 @@ def path_poses(cam2world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"
     for view, pose in enumerate(cam2world.double()):
         along = positions[min(view + 1, last)] - positions[max(view - 1, 0)]
         flat = along - (along @ up) * up
-        if float(flat.norm()) < max(_STILL, 1e-3 * float(along.norm())):
+        if float(flat.norm()) < max(_MIN_STEP, 1e-3 * float(along.norm())):
             poses.append(level_pose(pose, up))
         else:
             poses.append(look_pose(pose[:3, 3], flat, up))
@@ -101,15 +101,15 @@ def path_poses(cam2world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"
 def fly_pose(
     cam2world: Float[Tensor, "view 4 4"], fraction: float, *, turn_degrees: float = 40.0
 ) -> Float[Tensor, "4 4"]:
-    """Pose at a fraction of a flight from the first camera through all of them to the last.
+    """Pose at a fraction of a flight through all cameras.
 
-    The camera leaves and arrives smoothly and looks along the way, sweeping slowly first to the left of it
-    and then to the right, so that parallax shows; at either end and in the middle it looks straight ahead.
+    The camera starts and stops smoothly. It looks along the path and turns slowly to the left and then to the right, so
+    that parallax is visible; at both ends and in the middle it looks straight ahead.
 
     Args:
-        cam2world: the cameras, in the order to visit; at least one.
+        cam2world: the cameras in the order of the flight; at least one.
         fraction: time from 0 (first camera) to 1 (last camera); clamped.
-        turn_degrees: how far the view sweeps to each side.
+        turn_degrees: largest turn to each side.
 
     Raises:
         ValueError: without any camera.
@@ -120,7 +120,7 @@ def fly_pose(
     up = up_direction(cam2world)
     poses = path_poses(cam2world)
     pose = _along(poses, eased)
-    # The sweep follows the eased way, so that the turn also starts and stops smoothly.
+    # The turn depends on the eased fraction, so that it also starts and stops smoothly.
     return turn_pose(pose, -math.radians(turn_degrees) * math.sin(2 * math.pi * eased), up)
 
 
@@ -132,11 +132,11 @@ def fly_path(
 
 
 def _along(poses: Float[Tensor, "stop 4 4"], fraction: float) -> Float[Tensor, "4 4"]:
-    """Pose at a fraction of the polyline's length; where nothing moves, of the number of stops."""
+    """Pose at a fraction of the polyline's length, or of the number of stops where the length is zero."""
     if len(poses) == 1:
         return poses[0]
     steps = (poses[1:, :3, 3] - poses[:-1, :3, 3]).norm(dim=-1)
-    if float(steps.sum()) < _STILL:
+    if float(steps.sum()) < _MIN_STEP:
         steps = torch.ones_like(steps)
     ends = torch.cumsum(steps, 0) / steps.sum()
     leg = min(int(torch.searchsorted(ends, fraction)), len(steps) - 1)

@@ -23,7 +23,7 @@ def rotations_from_quats(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*ba
 
 
 def quats_from_rotations(rotations: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
-    """Unit quaternions (wxyz, w >= 0) of rotation matrices, by the largest of the four components."""
+    """Unit quaternions (wxyz, w >= 0) of rotation matrices, computed from the largest component."""
     m = rotations
     t = torch.stack(
         (
@@ -66,7 +66,7 @@ def multiply_quats(a: Float[Tensor, "*batch 4"], b: Float[Tensor, "*batch 4"]) -
 
 
 def invert_pose(pose: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """Inverse of rigid transforms, exactly rigid itself."""
+    """Inverse of rigid transforms; it is exactly rigid."""
     rotation = pose[..., :3, :3].transpose(-1, -2)
     inverse = torch.zeros_like(pose)
     inverse[..., :3, :3] = rotation
@@ -76,7 +76,7 @@ def invert_pose(pose: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"
 
 
 def orthonormal_error(pose: Float[Tensor, "4 4"]) -> float:
-    """Largest entry of |R R' - 1| together with the bottom row's error: 0 for a rigid pose, inf for a mirror."""
+    """Largest error of R R' = 1 and of the bottom row: 0 for a rigid pose, inf for a mirrored one."""
     rotation = pose[:3, :3].double()
     if not torch.isfinite(pose).all() or torch.linalg.det(rotation) <= 0:
         return float("inf")
@@ -86,7 +86,7 @@ def orthonormal_error(pose: Float[Tensor, "4 4"]) -> float:
 
 
 def interpolate_poses(start: Float[Tensor, "4 4"], end: Float[Tensor, "4 4"], fraction: float) -> Float[Tensor, "4 4"]:
-    """The pose at `fraction` of the way: centre on the segment, rotation on the shortest arc (slerp)."""
+    """The pose at a fraction between two poses: linear in position, spherical linear (slerp) in rotation."""
     a, b = quats_from_rotations(torch.stack((start[:3, :3], end[:3, :3])).double())
     b = torch.where((a * b).sum() < 0, -b, b)
     angle = torch.acos((a * b).sum().clamp(-1, 1))
@@ -113,7 +113,7 @@ def blend_weights(position: Float[Tensor, "3"], positions: Float[Tensor, "view 3
     distances = torch.linalg.vector_norm(position - positions, dim=1)
     nearest = distances.detach().amin()
     at = distances == 0
-    # Only ratios matter, so the nearest distance serves as the unit: nothing overflows.
+    # Only ratios matter. In units of the nearest distance nothing overflows.
     closeness = nearest / torch.where(at, torch.ones_like(distances), distances)
     closeness = torch.where(at, torch.ones_like(distances), closeness)
     return closeness / closeness.sum()

@@ -29,20 +29,20 @@ Sampling = Literal["sphere", "corners"]
 def relative_pose(
     reference: Float[Tensor, "*batch 4 4"], other: Float[Tensor, "*batch 4 4"]
 ) -> Float[Tensor, "*batch 4 4"]:
-    """From reference camera axes to the other's, of two cam2world poses; float64, as distances cancel."""
+    """From the reference camera's axes to the other's, of two cam2world poses; float64 against cancellation."""
     return invert_pose(other.double()) @ reference.double()
 
 
 def warp_positions(
     inverse_depth: Float[Tensor, "pair candidate height width"], pose: Float[Tensor, "pair 4 4"], sampling: Sampling
 ) -> tuple[Float[Tensor, "pair candidate height width"], Float[Tensor, "pair candidate height width"]]:
-    """Column and row in the other panorama of each pixel at each inverse depth; 0 is the first pixel's centre.
+    """Column and row in the other panorama of each pixel at each depth candidate; 0 is the first pixel's centre.
 
     Args:
         inverse_depth: 1 / metres, >= 0; 0 is a point at infinity (not with `corners`).
-        pose: from reference camera axes to the other's, rigid, metres.
+        pose: from the reference camera's axes to the other's, rigid, metres.
 
-    A point in the other camera's centre has no direction; it is given the place of some pixel, never NaN.
+    A point at the other camera's centre has no direction; its position is finite.
     """
     height, width = inverse_depth.shape[-2:]
     rays = pixel_directions(height, width, dtype=inverse_depth.dtype, device=inverse_depth.device)
@@ -56,11 +56,11 @@ def warp_positions(
 
 
 def _sphere_positions(points: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """By the angle from each pixel's own ray to the point: exact where the camera has not moved."""
+    """From the angle between each pixel's ray and the point: exact for the identity pose."""
     height, width = rays.shape[:2]
     x, y, z = points
     ray_x, ray_y, ray_z = rays.unbind(-1)
-    # Unlike a hypotenuse, these round the same way whether or not they are vectorised.
+    # Unlike torch.hypot, these round identically in scalar and vector code.
     flat, ray_flat = (x * x + z * z).sqrt(), (ray_x * ray_x + ray_z * ray_z).sqrt()
     east = torch.atan2(x * ray_z - z * ray_x, z * ray_z + x * ray_x)
     down = torch.atan2(y * ray_flat - flat * ray_y, flat * ray_flat + y * ray_y)
@@ -70,7 +70,7 @@ def _sphere_positions(points: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _corner_positions(points: Tensor) -> tuple[Tensor, Tensor]:
-    """The original's; a sine that rounds above one is cut, where the original has NaN."""
+    """The official positions. A sine that rounds above one is clamped; the official code has NaN there."""
     height, width = points.shape[-2:]
     x, y, z = points
     y = y / (x * x + y * y + z * z).sqrt().clamp(min=1e-3)
@@ -85,7 +85,7 @@ def sample(
     rows: Float[Tensor, "pair candidate h w"],
     sampling: Sampling,
 ) -> Float[Tensor, "pair channel candidate h w"]:
-    """Bilinear samples of maps at columns and rows as `warp_positions` gives them."""
+    """Bilinear samples of maps at positions from `warp_positions`."""
     if sampling == "sphere":
         maps, columns, rows = pad_equirect(maps, 1, "sphere"), columns + 1, rows + 1
     height, width = maps.shape[-2:]
@@ -100,12 +100,12 @@ def warp_panorama(
     pose: Float[Tensor, "pair 4 4"],
     sampling: Sampling = "sphere",
 ) -> Float[Tensor, "pair channel candidate height width"]:
-    """The other panorama as the reference camera would see it, if its pixels had the given inverse depths.
+    """The other panorama warped into the reference view, for each depth candidate of the reference pixels.
 
     Args:
         maps: the other panorama.
         inverse_depth: of the reference pixels, 1 / metres.
-        pose: from reference camera axes to the other's.
+        pose: from the reference camera's axes to the other's.
     """
     with torch.no_grad():
         columns, rows = warp_positions(inverse_depth, pose, sampling)

@@ -1,4 +1,4 @@
-"""The spherical sweep: what another camera sees of points on spheres about this one."""
+"""Warping by depth candidates, and the correlation with the warped features."""
 
 import math
 
@@ -53,7 +53,7 @@ def test_identity_pose_warps_to_identity(height, dtype):
     assert torch.equal(rows, torch.arange(height).to(dtype)[:, None].expand_as(rows))
 
 
-def test_a_warp_samples_the_panorama_where_the_point_is_seen():
+def test_a_warp_samples_the_panorama_at_the_projected_point():
     maps, inverse_depth, poses = _noise(2, 3, H, W), _inverse_depth(2, 4, H, W), _poses(2)
     points = pixel_directions(H, W, dtype=torch.float64) / inverse_depth[..., None]
     points = torch.einsum("nij,ndhwj->ndhwi", poses[:, :3, :3], points) + poses[:, None, None, None, :3, 3]
@@ -61,7 +61,7 @@ def test_a_warp_samples_the_panorama_where_the_point_is_seen():
     assert torch.allclose(warp_panorama(maps, inverse_depth, poses), truth, atol=1e-11)
 
 
-def test_turning_by_whole_columns_rolls_the_panorama():
+def test_a_rotation_by_whole_columns_rolls_the_panorama():
     maps, inverse_depth = _noise(1, 2, H, W), _inverse_depth(1, 2, H, W)
     for columns in (1, 5, 8):
         pose = _turn_about_y(columns * 2 * math.pi / W)[None]
@@ -75,7 +75,7 @@ def test_without_a_baseline_depth_does_not_matter():
     assert torch.equal(warped, warped[:, :, :1].expand_as(warped))
 
 
-def test_the_originals_warp_is_reproduced(golden):
+def test_the_official_warp_is_reproduced(golden):
     units = golden("units")
     feature, depth = units["warp.feature"], units["warp.depth"]
     warped = warp_panorama(feature, 1 / depth, units["warp.pose"], "corners")
@@ -85,21 +85,21 @@ def test_the_originals_warp_is_reproduced(golden):
     assert (fixed - units["warp.out"]).abs().max() / units["warp.out"].std() > 0.5
 
 
-def test_the_originals_identity_is_off_by_half_a_pixel_at_the_borders():
+def test_the_official_identity_warp_is_off_by_half_a_pixel_at_the_borders():
     columns, _ = warp_positions(torch.ones(1, 1, H, W, dtype=torch.float64), torch.eye(4)[None], "corners")
     expected = (torch.arange(W) + 0.5) / W * (W - 1)
     assert torch.allclose(columns[0, 0, 0], expected.double(), atol=1e-6)
 
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_a_point_in_the_other_camera_is_finite(sampling):
+def test_a_point_at_the_other_cameras_centre_is_finite(sampling):
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = -2 * pixel_directions(H, W, dtype=torch.float64)[3, 5]
     inverse_depth = torch.full((1, 1, H, W), 0.5, dtype=torch.float64)
     assert torch.isfinite(warp_panorama(_noise(1, 2, H, W), inverse_depth, pose[None], sampling)).all()
 
 
-def test_a_point_at_infinity_turns_with_the_camera_only():
+def test_a_point_at_infinity_depends_on_the_rotation_only():
     poses = _poses(1)
     far, turned = torch.zeros(1, 1, H, W, dtype=torch.float64), poses.clone()
     turned[:, :3, 3] = 0
@@ -155,7 +155,7 @@ def test_float32_correlation_is_within_1e_4_of_float64(sampling, backend):
     inputs = _inputs(channels=64, candidates=16, height=32)
     truth = correlate(*inputs, sampling, "torch")
     single = correlate(*(tensor.float() for tensor in inputs), sampling, backend)
-    # Rounding moves a sample that is just about to leave the map across its border, where zeros begin.
+    # Rounding can move a sample across the map's border, where zeros begin.
     error = (single - truth).abs().flatten().sort().values
     assert error[int(0.999 * len(error))] < 1e-4 * truth.std()
     assert sampling == "corners" or error[-1] < 3e-4 * truth.std()
@@ -163,7 +163,7 @@ def test_float32_correlation_is_within_1e_4_of_float64(sampling, backend):
 
 @pytest.mark.parametrize("backend", ["torch", "kernel"])
 @pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_correlation_has_the_right_gradient(sampling, backend):
+def test_correlation_passes_gradcheck(sampling, backend):
     reference, other, inverse_depth, poses = _inputs(channels=2, candidates=3, height=4)
     reference.requires_grad_()
     other.requires_grad_()
@@ -194,7 +194,7 @@ def test_chunks_do_not_change_the_correlation(backend, monkeypatch):
         assert torch.allclose(part, expected, atol=1e-12)
 
 
-def test_warped_features_of_all_candidates_never_exist_at_once(monkeypatch):
+def test_the_warped_features_in_memory_are_limited(monkeypatch):
     inputs = [tensor.requires_grad_() for tensor in _inputs()]
     limit, seen = 3 * inputs[0].numel(), []
     monkeypatch.setattr(correlation, "_CHUNK", limit)
@@ -208,7 +208,7 @@ def test_warped_features_of_all_candidates_never_exist_at_once(monkeypatch):
     assert len(seen) == 2 * 3 and max(warped.numel() for warped in seen) <= limit
 
 
-def test_threads_do_not_change_the_correlations_bits():
+def test_the_number_of_threads_does_not_change_the_correlations_bits():
     reference, other, inverse_depth, poses = (tensor.float() for tensor in _inputs(height=32))
     positions = warp_positions(inverse_depth, poses, "sphere")
     threads = torch.get_num_threads()
@@ -221,8 +221,8 @@ def test_threads_do_not_change_the_correlations_bits():
             results.append((forward, *backward))
     finally:
         torch.set_num_threads(threads)
-    for alone, shared_out in zip(results[0], results[2], strict=True):
-        assert torch.allclose(alone, shared_out, rtol=1e-4, atol=1e-4)  # sums over bands come in another order
+    for alone, threaded in zip(results[0], results[2], strict=True):
+        assert torch.allclose(alone, threaded, rtol=1e-4, atol=1e-4)  # the order of the sums over bands differs
     assert torch.equal(results[0][0], results[1][0]) and torch.equal(results[0][0], results[2][0])
 
 
@@ -238,7 +238,7 @@ def test_half_precision_features_are_multiplied_in_float32(dtype):
 
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_a_pose_that_is_no_number_gives_no_number(sampling):
+def test_a_pose_with_nan_gives_nan(sampling):
     reference, other, inverse_depth, poses = _inputs()
     poses[1, 0, 3] = math.nan
     result = correlate(reference, other, inverse_depth, poses, sampling, "kernel")

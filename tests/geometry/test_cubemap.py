@@ -1,7 +1,6 @@
 """Cube faces are proper rotations that look where their names say; strips of faces equal the official ones."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
@@ -19,7 +18,7 @@ from pansplat.geometry.cubemap import (
 from pansplat.geometry.equirect import pixel_directions
 
 
-def test_each_face_looks_where_its_name_says():
+def test_faces_look_along_their_names():
     forward = {
         "front": (0, 0, 1), "right": (1, 0, 0), "back": (0, 0, -1),
         "left": (-1, 0, 0), "up": (0, -1, 0), "down": (0, 1, 0),
@@ -42,34 +41,29 @@ def test_face_poses_share_the_panoramas_centre():
     assert torch.equal(poses[:, :3, :3], face_rotations())
 
 
-@pytest.mark.shared
-def test_face_rotations_are_the_originals(shared: Path):
-    from safetensors.torch import load_file
-
-    expected = load_file(shared / "golden" / "units.safetensors")["cubemap.rotations"]
+def test_face_rotations_equal_the_official_ones(golden: Callable[[str], dict[str, Tensor]]) -> None:
+    expected = golden("units")["cubemap.rotations"]
     assert torch.allclose(face_rotations(dtype=torch.float32), expected[..., :3, :3].float(), atol=1e-6)
 
 
-def test_a_strip_is_the_originals(golden: Callable[[str], dict[str, Tensor]]) -> None:
+def test_a_strip_equals_the_official_one(golden: Callable[[str], dict[str, Tensor]]) -> None:
     units = golden("units")
     strip = strip_from_equirect(units["e2c.in"].movedim(-1, 0), 32)
     assert (strip.movedim(0, -1) - units["e2c.out"]).abs().max() < 2e-5
 
 
 @pytest.mark.parametrize("scale", [5, 4, 3, 2, 1])
-def test_the_lookup_is_the_one_that_checkpoints_store(scale: int, recipe_weights: dict[str, Tensor]) -> None:
+def test_the_lookup_equals_the_one_in_checkpoints(scale: int, recipe_weights: dict[str, Tensor]) -> None:
     stored = recipe_weights[f"mono_depth.c2e.{scale}.sample_grid"][0, 0].double()
     x, y, face = strip_lookup(512 >> scale).unbind(-1)
     assert (torch.stack((x, y, face / 2.5 - 1), dim=-1) - stored).abs().max() < 2e-6
 
 
-def test_faces_look_front_right_back_left_up_down() -> None:
-    centres = strip_directions(3)[1, 1::3]
-    expected = [(0, 0, 1), (1, 0, 0), (0, 0, -1), (-1, 0, 0), (0, -1, 0), (0, 1, 0)]
-    assert torch.equal(centres * 2, torch.tensor(expected, dtype=torch.float64))
+def test_faces_of_a_strip_are_in_the_order_of_faces() -> None:
+    assert torch.equal(2 * strip_directions(3)[1, 1::3], face_rotations()[:, :, 2])
 
 
-def test_touching_faces_share_their_edge() -> None:
+def test_adjacent_faces_share_their_edge() -> None:
     rays = strip_directions(5)
     for right in range(4):
         left = (right - 1) % 4
@@ -79,10 +73,10 @@ def test_touching_faces_share_their_edge() -> None:
 
 
 def test_a_panorama_returns_from_its_strip() -> None:
-    panorama = pixel_directions(64, 128, dtype=torch.float64).movedim(-1, 0)  # smooth, and not the same twice
+    panorama = pixel_directions(64, 128, dtype=torch.float64).movedim(-1, 0)  # smooth and injective
     strip = strip_from_equirect(panorama, 65)
     back = equirect_from_strip(strip[None], strip_lookup(64))[0]
-    # Where whole rows decide on the face, a pixel beside is held to the edge: at most half a pixel's angle off.
+    # Pixels outside their face are clamped to its edge: an error of at most half a pixel's angle.
     assert (back - panorama).abs().max() < 0.03
     assert (back - panorama).abs().mean() < 1e-3
 

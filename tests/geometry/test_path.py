@@ -1,4 +1,4 @@
-"""Flights between cameras start and end at them, smoothly, level and looking along the way."""
+"""Flights pass through the cameras, smoothly, level and along the path."""
 
 import math
 
@@ -49,16 +49,16 @@ def test_up_is_minus_y_of_upright_cameras_and_follows_tilted_ones():
     assert torch.allclose(up_direction(torch.zeros(0, 4, 4)), torch.tensor((0.0, -1.0, 0.0), dtype=torch.float64))
 
 
-def test_look_pose_puts_forward_ahead_and_up_upright():
+def test_look_pose_looks_forward_with_up_vertical():
     pose = look_pose(torch.zeros(3), torch.tensor((0.0, 0, 2)), torch.tensor((0.0, -1, 0)))
     assert torch.allclose(pose, torch.eye(4, dtype=torch.float64))
     tilted = look_pose(torch.zeros(3), torch.tensor((1.0, 0.5, 0)), torch.tensor((0.0, -1, 0)))
     assert orthonormal_error(tilted) < 1e-12
-    assert tilted[1, 0] == 0, "right stays horizontal"
-    assert tilted[1, 1] > 0, "image down points down in the world"
+    assert tilted[1, 0] == 0, "right is horizontal"
+    assert tilted[1, 1] > 0, "down in the image is down in the world"
 
 
-def test_look_pose_refuses_to_look_along_up():
+def test_look_pose_refuses_a_direction_along_up():
     with pytest.raises(ValueError, match="parallel"):
         look_pose(torch.zeros(3), torch.tensor((0.0, 1, 0)), torch.tensor((0.0, -1, 0)))
 
@@ -69,7 +69,7 @@ def test_positive_turn_looks_right():
     assert orthonormal_error(pose) < 1e-12
 
 
-def test_level_pose_drops_roll_and_keeps_heading():
+def test_level_pose_has_no_roll_and_keeps_the_heading():
     up = torch.tensor((0.0, -1, 0))
     rolled = _pose((1, 1, 1), _rotation_z(20))
     assert torch.allclose(level_pose(rolled, up), _pose((1, 1, 1)), atol=1e-12)
@@ -78,7 +78,7 @@ def test_level_pose_drops_roll_and_keeps_heading():
 @pytest.mark.parametrize("looks", [1, -1], ids=["down", "up"])
 def test_level_pose_is_continuous_through_the_vertical(looks: int):
     up = torch.tensor((0.0, -1, 0))
-    # Tipped by 90 degrees about x from looking along +z; 85 degrees is almost there and still has a heading.
+    # Rotated about x from +z; at 85 degrees the heading is still defined.
     headings = []
     for degrees in (85, 90):
         c, s = math.cos(math.radians(degrees)), -looks * math.sin(math.radians(degrees))
@@ -89,14 +89,14 @@ def test_level_pose_is_continuous_through_the_vertical(looks: int):
     assert torch.allclose(headings[0], forward) and torch.allclose(headings[1], forward)
 
 
-def test_flight_starts_and_ends_at_the_cameras_looking_along_the_way():
+def test_flight_starts_and_ends_at_the_cameras_along_the_path():
     start, end = fly_path(TWO, [0.0, 1.0])
     assert torch.allclose(start[:3, 3], TWO[0, :3, 3]) and torch.allclose(end[:3, 3], TWO[1, :3, 3])
     for pose in (start, end, fly_pose(TWO, 0.5)):
         assert torch.allclose(pose[:3, 2], torch.tensor((1.0, 0, 0), dtype=torch.float64), atol=1e-9)
 
 
-def test_flight_sweeps_left_first_then_right_by_the_given_angle():
+def test_flight_turns_left_and_then_right_by_the_given_angle():
     forward = fly_path(TWO, [i / 200 for i in range(201)], turn_degrees=30)[:, :3, 2]
     assert torch.allclose(forward[:, 1], torch.zeros(201, dtype=torch.float64), atol=1e-9)
     yaw = torch.rad2deg(torch.atan2(forward[:, 0], forward[:, 2])) - 90  # heading is +x, right of it is -z
@@ -104,7 +104,7 @@ def test_flight_sweeps_left_first_then_right_by_the_given_angle():
     assert float(yaw[101:].max()) == pytest.approx(30, abs=0.1) and float(yaw[101:].min()) > -1e-6
 
 
-def test_flight_is_rigid_and_never_jumps():
+def test_flight_is_rigid_and_continuous():
     cameras = torch.stack((_pose((0, 0, 0)), _pose((1, 0, 0), _rotation_z(3)), _pose((1, 0.1, 2)), _pose((0, 0, 4))))
     path = fly_path(cameras, [i / 300 for i in range(301)])
     assert max(orthonormal_error(pose) for pose in path) < 1e-9
@@ -120,7 +120,7 @@ def test_flight_passes_through_every_camera():
     assert float((path - cameras[1, :3, 3]).norm(dim=-1).min()) < 2e-3
 
 
-def test_coincident_cameras_fly_nowhere_and_keep_their_heading():
+def test_a_flight_between_coincident_cameras_keeps_position_and_heading():
     cameras = torch.stack((_pose((1, 2, 3)), _pose((1, 2, 3))))
     path = fly_path(cameras, [0, 0.3, 1])
     assert torch.isfinite(path).all()
@@ -128,7 +128,7 @@ def test_coincident_cameras_fly_nowhere_and_keep_their_heading():
     assert torch.allclose(path[0], cameras[0])
 
 
-def test_climb_straight_up_keeps_the_cameras_heading():
+def test_a_vertical_path_keeps_the_cameras_heading():
     cameras = torch.stack((_pose((0, 0, 0)), _pose((0, -2, 0))))
     assert torch.allclose(path_poses(cameras)[:, :3, :3], torch.eye(3, dtype=torch.float64).expand(2, 3, 3))
 

@@ -26,7 +26,7 @@ def _pose(quat: torch.Tensor, centre: tuple[float, float, float]) -> torch.Tenso
     return pose
 
 
-def test_rotations_are_orthonormal_and_ignore_the_quaternions_length_and_sign():
+def test_rotations_are_orthonormal_and_do_not_depend_on_the_quaternions_length_and_sign():
     q = _quats(50)
     rotations = rotations_from_quats(q)
     identity = torch.eye(3, dtype=torch.float64).expand(50, 3, 3)
@@ -44,7 +44,7 @@ def test_half_a_turn_about_x_negates_y_and_z():
     assert torch.allclose(rotation, torch.diag(torch.tensor((1.0, -1.0, -1.0))))
 
 
-def test_quaternions_come_back_from_their_rotations():
+def test_rotations_are_converted_back_to_their_quaternions():
     q = torch.nn.functional.normalize(_quats(200), dim=1)
     half_turns = torch.eye(4, dtype=torch.float64)[1:]
     for quats in (q, half_turns):
@@ -64,7 +64,7 @@ def test_a_pose_times_its_inverse_is_the_identity():
     assert torch.allclose(pose @ invert_pose(pose), torch.eye(4, dtype=torch.float64), atol=1e-12)
 
 
-def test_the_orthonormal_error_knows_rigid_scaled_mirrored_and_broken():
+def test_the_orthonormal_error_of_rigid_scaled_mirrored_and_invalid_poses():
     pose = _pose(_quats(1)[0], (1.0, 2.0, 3.0))
     assert orthonormal_error(pose) < 1e-12
     scaled = pose.clone()
@@ -78,7 +78,7 @@ def test_the_orthonormal_error_knows_rigid_scaled_mirrored_and_broken():
     assert orthonormal_error(bottom) == pytest.approx(0.5)
 
 
-def test_interpolation_starts_and_ends_at_the_poses_and_turns_the_short_way():
+def test_interpolation_starts_and_ends_at_the_poses_on_the_shortest_arc():
     a = _pose(torch.tensor((1.0, 0, 0, 0), dtype=torch.float64), (0.0, 0, 0))
     angle = math.radians(100)
     b = _pose(-torch.tensor((math.cos(angle / 2), 0, math.sin(angle / 2), 0), dtype=torch.float64), (2.0, 0, 0))
