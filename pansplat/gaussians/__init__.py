@@ -1,1 +1,1 @@
-"""What a predictor makes and a renderer draws: 3D Gaussians, and the scene they belong to."""
+"""3D Gaussians, the scene they belong to, spherical harmonics, and .ply files."""

@@ -3,8 +3,9 @@
 Convention: index k = l^2 + l + m, m = -l..l; the sign is (-1)^m relative to the orthonormal real harmonics
 without the Condon-Shortley phase, so k = 1, 2, 3 are -y, z, -x.
 
-Source: PanSplat, section 3.3 (degree 4 colours). Degree 4 continues the sign rule, as common 3DGS
-implementations do.
+Source: PanSplat, section 3.3: degree 4, predicted in camera axes and rotated to the world's. Degree 4 continues the
+sign rule, as common 3DGS implementations do. The official code rotates about the wrong axes (docs/official.md, trap
+T3) and draws a wrong basis function (section 10.3, trap T4).
 """
 
 import functools
@@ -16,6 +17,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 MAX_DEGREE = 4
+_OFFICIAL_DEGREE = 3
+# The official x, y, z axes of the harmonics in world axes: z, x, y.
+_OFFICIAL_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 
 def _norm(rational: float) -> float:
@@ -87,15 +91,15 @@ def evaluate_harmonics(
     degree = math.isqrt(harmonics.shape[-2]) - 1
     if (degree + 1) ** 2 != harmonics.shape[-2] or not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"`harmonics` must hold 1, 4, 9, 16 or 25 coefficients, got {harmonics.shape[-2]}")
-    # relu, not clamp: its slope at exactly 0 is 0, so a colour that is off stays off.
+    # relu, not clamp: its gradient at exactly 0 is 0.
     return torch.relu((harmonics_basis(directions, degree)[..., None, :] @ harmonics)[..., 0, :] + 0.5)
 
 
 def rotation_matrices(rotations: Float[Tensor, "*batch 3 3"], degree: int) -> Float[Tensor, "*batch k k"]:
-    """Matrices D(R) that turn coefficients: sum_k (D c)_k Y_k(R d) = sum_k c_k Y_k(d) in every direction d.
+    """Matrices D(R) that rotate coefficients: sum_k (D c)_k Y_k(R d) = sum_k c_k Y_k(d) in every direction d.
 
-    The integral of Y_j(R d) Y_k(d) over the sphere, by a quadrature that is exact for these products. D is
-    orthogonal, has a block a degree, and D(A B) = D(A) D(B).
+    D is the integral of Y_j(R d) Y_k(d) over the sphere, computed by an exact quadrature. It is orthogonal and
+    block-diagonal by degree, and D(A B) = D(A) D(B).
 
     Raises:
         ValueError: when the degree is not 0..4.
@@ -111,16 +115,16 @@ def rotation_matrices(rotations: Float[Tensor, "*batch 3 3"], degree: int) -> Fl
 def rotate_harmonics(
     harmonics: Float[Tensor, "*batch k channel"], rotation: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "*batch k channel"]:
-    """Coefficients of the same colours after the world was turned by `rotation`."""
+    """Coefficients of the same colours after a rotation of the world."""
     degree = math.isqrt(harmonics.shape[-2]) - 1
     matrix = rotation_matrices(rotation.double(), degree).to(harmonics)
-    return (harmonics.transpose(-1, -2) @ matrix.T).transpose(-1, -2)  # one product, however many Gaussians
+    return (harmonics.transpose(-1, -2) @ matrix.T).transpose(-1, -2)  # a single matrix product
 
 
 @functools.lru_cache
-@torch.inference_mode(False)  # kept for calls that need gradients too
+@torch.inference_mode(False)  # the cached tensors are used with gradients too
 def _quadrature(degree: int) -> tuple[Tensor, Tensor]:
-    """Directions (q 3) and weights (q), float64, that integrate products of two harmonics of a degree exactly."""
+    """Directions (q 3) and weights (q), float64, of an exact quadrature for products of two harmonics of a degree."""
     z, weight = np.polynomial.legendre.leggauss(degree + 1)
     count = 2 * degree + 1
     longitude = np.arange(count) * (2 * np.pi / count)
@@ -131,34 +135,31 @@ def _quadrature(degree: int) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(directions), torch.from_numpy(weights)
 
 
-_DEGREE = 3
-# The original's x, y, z axes of harmonics in the world's: z, x, y.
-_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-
-
 def official_harmonics(harmonics: Float[Tensor, "*batch k channel"]) -> Float[Tensor, "*batch drawn channel"]:
-    """Coefficients, of degree 3 at most, whose colours are those that the original's rasteriser makes of these.
+    """Coefficients, of degree 3 at most, whose colours are those of the official rasteriser for `harmonics`.
 
-    In the original's axes coefficient 14 multiplies x (x^2 - y^2) in place of z (x^2 - y^2). On the unit sphere
-    that is a sum of the harmonics 3, 13 and 15, so the exact renderers can draw it. Degrees above 3 are left out.
+    In the official axes, coefficient 14 multiplies x (x^2 - y^2) in place of z (x^2 - y^2). On the unit sphere this is
+    a sum of the harmonics 3, 13 and 15. Degrees above 3 are not drawn.
+
+    Source: docs/official.md, section 10.3 and trap T4.
     """
-    drawn = harmonics[..., : (_DEGREE + 1) ** 2, :]
+    drawn = harmonics[..., : (_OFFICIAL_DEGREE + 1) ** 2, :]
     if drawn.shape[-2] < 16:
         return drawn
-    return _trap().to(drawn) @ drawn
+    return _official_matrix().to(drawn) @ drawn
 
 
 @functools.lru_cache
-@torch.inference_mode(False)  # kept for calls that need gradients too
-def _trap() -> Float[Tensor, "16 16"]:
-    """What the original's rasteriser does to coefficients in world axes; float64."""
+@torch.inference_mode(False)  # the cached tensors are used with gradients too
+def _official_matrix() -> Float[Tensor, "16 16"]:
+    """Map from coefficients in world axes to the officially drawn ones; float64."""
     # With |d| = 1: x (x^2 - y^2) = 0.4 x - 0.1 x (4 z^2 - x^2 - y^2) + 0.5 x (x^2 - 3 y^2).
     norm = math.sqrt(105 / math.pi) / 4
     parts = {3: (0.4, math.sqrt(3 / math.pi) / 2), 13: (-0.1, math.sqrt(10.5 / math.pi) / 4),
              15: (0.5, math.sqrt(17.5 / math.pi) / 4)}  # fmt: skip
-    own = torch.eye(16, dtype=torch.float64)
-    own[14, 14] = 0
-    for k, (share, other_norm) in parts.items():
-        own[k, 14] = -share * norm / other_norm
-    turn = rotation_matrices(torch.tensor(_AXES, dtype=torch.float64), _DEGREE)
-    return turn.T @ own @ turn
+    matrix = torch.eye(16, dtype=torch.float64)
+    matrix[14, 14] = 0
+    for k, (factor, other_norm) in parts.items():
+        matrix[k, 14] = -factor * norm / other_norm
+    turn = rotation_matrices(torch.tensor(_OFFICIAL_AXES, dtype=torch.float64), _OFFICIAL_DEGREE)
+    return turn.T @ matrix @ turn

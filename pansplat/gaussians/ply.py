@@ -31,14 +31,15 @@ from pansplat.atomic import replacing
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
 
-OPACITY_EPSILON = 1e-6  # opacities are kept this far from 0 and 1, where the logit is infinite
-SCALE_EPSILON = 1e-12  # metres; the log of a smaller scale would be infinite
+OPACITY_EPSILON = 1e-6  # opacities are clamped to this distance from 0 and 1, where the logit is infinite
+SCALE_EPSILON = 1e-12  # metres; smaller scales are clamped, so that the logarithm is finite
 
 _MARK = "pansplat "
-_MAX_RUNS = 4096  # with more runs the header would grow to megabytes, so the Gaussians are sorted first
+_MAX_RUNS = 4096  # with more runs, whose header would have megabytes, the Gaussians are sorted
 _MAX_HEADER = 1 << 24
-_PIECE = 1 << 17  # vertices read at once
-_FOREIGN_NEAR, _FOREIGN_FAR = 0.1, 100.0  # depth range, metres, of a file that does not tell
+_RUNS_SPACE = 4096  # bytes for about 300 runs; some browser viewers need the header within 10,000 bytes
+_READ_VERTICES = 1 << 17  # vertices that are read at a time
+_FOREIGN_NEAR, _FOREIGN_FAR = 0.1, 100.0  # depth range, metres, of a file without one
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
@@ -50,8 +51,8 @@ _TYPES = {
 def save_ply(scene: Scene, path: str | Path) -> None:
     """Write a scene as a 3DGS .ply file, atomically, in float32.
 
-    Gaussians with a non-finite number are left out with a warning. Their order is kept, unless levels and
-    views alternate more than a few thousand times: then they are sorted by level and view.
+    Gaussians with a non-finite value are left out with a warning. The order is kept, unless levels and views alternate
+    more than a few thousand times: then the Gaussians are sorted by level and view.
 
     Raises:
         InputError: when the folder does not exist or cannot be written.
@@ -59,17 +60,87 @@ def save_ply(scene: Scene, path: str | Path) -> None:
     path = Path(path)
     gaussians = _ordered(_finite(scene.gaussians, path))
     with replacing(path) as partial, open(partial, "wb") as file:
-        file.write(header(scene, runs_of(gaussians), gaussians.harmonics.shape[1]))
-        table(gaussians).tofile(file)
+        file.write(_format_header(scene, _label_runs(gaussians), gaussians.harmonics.shape[1]))
+        _vertex_table(gaussians).tofile(file)
 
 
-def header(scene: Scene, runs: list[list[int]], coefficients: int, *, size: int = 0) -> bytes:
-    """All before the first vertex; the gaussians of `scene` are not looked at.
+def save_ply_parts(scene: Scene, parts: Iterable[Gaussians], path: str | Path) -> int:
+    """Write parts one after another, atomically, with one part in memory at a time.
+
+    Gaussians with a non-finite value are left out with a warning.
 
     Args:
-        runs: stretches of one level and view in the file, see `runs_of`.
-        coefficients: of the harmonics, 1 to 25.
-        size: bytes to take at least; spaces after the comment make up what is missing.
+        scene: cameras and names for the header; its own Gaussians are not written.
+        parts: all of one degree.
+
+    Returns:
+        Number of Gaussians in the file.
+
+    Raises:
+        InputError: when the folder does not exist or cannot be written.
+        ValueError: a part has another degree than the first.
+    """
+    path = Path(path)
+    with replacing(path) as partial:
+        rest = iter(parts)
+        first = [next(rest, scene.gaussians.select(scene.gaussians.levels < 0))]
+        coefficients = first[0].harmonics.shape[1]
+        size = len(_format_header(scene, [], coefficients)) + _RUNS_SPACE
+        with open(partial, "wb") as file:
+            file.write(b" " * size)
+            runs, lost = _write_parts(_chain(first, rest), file, coefficients)
+        _fill_header(partial, _format_header(scene, runs, coefficients, size=size), size)
+    count = sum(run[2] for run in runs)
+    if lost:
+        warnings.warn(f"{path}: left out {lost} of {count + lost} Gaussians that are not finite", stacklevel=2)
+    return count
+
+
+def _chain(first: list[Gaussians], rest: Iterator[Gaussians]) -> Iterator[Gaussians]:
+    """The first part and the rest, without a reference to a part that was consumed."""
+    yield first.pop()
+    yield from rest
+
+
+def _write_parts(parts: Iterable[Gaussians], file: BinaryIO, coefficients: int) -> tuple[list[list[int]], int]:
+    """Write the vertices; the runs of labels, and the number of non-finite Gaussians."""
+    runs: list[list[int]] = []
+    lost = 0
+    for part in parts:
+        if part.harmonics.shape[1] != coefficients:
+            raise ValueError(f"`parts` must have {coefficients} harmonics each, got {part.harmonics.shape[1]}")
+        finite = _finite_mask(part)
+        kept = part if bool(finite.all()) else part.select(finite)
+        lost += len(part) - len(kept)
+        for level, view, count in _label_runs(kept):
+            if runs and runs[-1][:2] == [level, view]:
+                runs[-1][2] += count
+            else:
+                runs.append([level, view, count])
+        _vertex_table(kept).tofile(file)
+        del part, kept
+    return runs, lost
+
+
+def _fill_header(path: Path, content: bytes, size: int) -> None:
+    """Write the header into the reserved `size` bytes; a longer header moves the vertices, piece by piece."""
+    if len(content) == size:
+        with open(path, "r+b") as file:
+            file.write(content)
+        return
+    with replacing(path) as longer, open(path, "rb") as vertices, open(longer, "wb") as file:
+        file.write(content)
+        vertices.seek(size)
+        shutil.copyfileobj(vertices, file, 1 << 24)
+
+
+def _format_header(scene: Scene, runs: list[list[int]], coefficients: int, *, size: int = 0) -> bytes:
+    """All bytes before the first vertex; the Gaussians of `scene` are not used.
+
+    Args:
+        runs: see `_label_runs`.
+        coefficients: number of harmonics coefficients, 1 to 25.
+        size: least number of bytes; spaces after the comment fill the difference.
     """
     begin = f"ply\nformat binary_little_endian 1.0\ncomment {_MARK}{_extras(scene, runs)}"
     lines = [f"element vertex {sum(count for _, _, count in runs)}"]
@@ -79,13 +150,13 @@ def header(scene: Scene, runs: list[list[int]], coefficients: int, *, size: int 
 
 
 def load_ply(path: str | Path) -> Scene:
-    """Read a 3DGS .ply file of either byte order; properties it does not know are skipped.
+    """Read a 3DGS .ply file of either byte order; unknown properties are skipped.
 
-    A file from elsewhere gives a scene without cameras whose Gaussians are all level 0 of view 0. Gaussians
-    with a non-finite number are left out with a warning.
+    A file of another tool gives a scene without cameras, with all Gaussians at level 0 of view 0. Gaussians with a
+    non-finite value are left out with a warning.
 
     Raises:
-        InputError: when the file is missing, no binary .ply of Gaussians, truncated, or has no finite one.
+        InputError: the file is missing, not a binary .ply of Gaussians, truncated, or has no finite Gaussian.
     """
     path = Path(path)
     try:
@@ -113,7 +184,7 @@ def load_ply(path: str | Path) -> Scene:
 
 
 def _finite(gaussians: Gaussians, path: Path) -> Gaussians:
-    finite = is_finite(gaussians)
+    finite = _finite_mask(gaussians)
     lost = len(gaussians) - int(finite.sum())
     if not lost:
         return gaussians
@@ -121,25 +192,25 @@ def _finite(gaussians: Gaussians, path: Path) -> Gaussians:
     return gaussians.select(finite)
 
 
-def is_finite(gaussians: Gaussians) -> Bool[Tensor, "n"]:
-    """Which Gaussians have no number that is NaN or infinite."""
+def _finite_mask(gaussians: Gaussians) -> Bool[Tensor, "n"]:
+    """Mask of the Gaussians without NaN and infinite values."""
     finite = torch.isfinite(gaussians.opacities)
     for field in (gaussians.means, gaussians.scales, gaussians.quats, gaussians.harmonics.flatten(1)):
-        # A sum is finite only if its terms are; the rare sum that overflows is looked at term by term.
+        # A finite sum has finite terms. Rows with a non-finite sum, which may be an overflow, are checked by term.
         suspect = ~torch.isfinite(field.sum(dim=1))
         finite[suspect] &= torch.isfinite(field[suspect]).all(dim=1)
     return finite
 
 
 def _ordered(gaussians: Gaussians) -> Gaussians:
-    if len(runs_of(gaussians)) <= _MAX_RUNS:
+    if len(_label_runs(gaussians)) <= _MAX_RUNS:
         return gaussians
     key = gaussians.levels.long() * (int(gaussians.views.max()) + 1) + gaussians.views.long()
     return gaussians.select(torch.sort(key, stable=True).indices)
 
 
-def runs_of(gaussians: Gaussians) -> list[list[int]]:
-    """Stretches of one level and view: [level, view, count], in file order."""
+def _label_runs(gaussians: Gaussians) -> list[list[int]]:
+    """Runs of equal level and view as [level, view, count], in file order."""
     levels, views = gaussians.levels.long().cpu(), gaussians.views.long().cpu()
     if not len(gaussians):
         return []
@@ -171,11 +242,11 @@ def _property_names(coefficients: int) -> list[str]:
     ]
 
 
-def table(gaussians: Gaussians) -> np.ndarray:
-    """All vertices in the file's order of properties, little-endian float32."""
+def _vertex_table(gaussians: Gaussians) -> np.ndarray:
+    """All vertices with the properties in file order, little-endian float32."""
     g = gaussians.to(device="cpu")
     rest = g.harmonics[:, 1:].transpose(1, 2).flatten(1)
-    # Near 1 the logit needs more digits than float32 has.
+    # In float64: near 1 the logit is not accurate in float32.
     logits = torch.logit(g.opacities.double(), eps=OPACITY_EPSILON)[:, None]
     log_scales = g.scales.clamp_min(SCALE_EPSILON).log()
     normals = torch.zeros(len(g), 3)
@@ -257,10 +328,7 @@ def _seek_vertices(file: BinaryIO, header: _Header, path: Path) -> None:
 
 
 def _read_gaussians(file: BinaryIO, header: _Header, path: Path) -> Gaussians:
-    """The vertices from where the file stands, all labelled level 0 of view 0.
-
-    Read piece by piece, so that a scene of gigabytes takes hardly more memory than it has to.
-    """
+    """The vertices at the file's position, with all labels 0; read in pieces to limit the memory."""
     coefficients = _coefficients(header.dtype.names or (), path)
     n, zeros = header.count, torch.zeros(header.count, dtype=torch.int64)
     gaussians = Gaussians(
@@ -272,8 +340,8 @@ def _read_gaussians(file: BinaryIO, header: _Header, path: Path) -> Gaussians:
         levels=zeros,
         views=zeros,
     )
-    for start in range(0, n, _PIECE):
-        rows = slice(start, min(start + _PIECE, n))
+    for start in range(0, n, _READ_VERTICES):
+        rows = slice(start, min(start + _READ_VERTICES, n))
         vertices = np.fromfile(file, header.dtype, rows.stop - start)
         if len(vertices) < rows.stop - start:
             raise InputError(f"{path} became shorter while it was read; read it again when it is whole")
@@ -295,7 +363,7 @@ def _columns(vertices: np.ndarray, *names: str) -> torch.Tensor:
 
 
 def _coefficients(held: Sequence[str], path: Path) -> int:
-    """Number of the harmonics' coefficients of vertices with those properties, 1 to 25."""
+    """Number of harmonics coefficients, 1 to 25, of vertices with these properties."""
     rest = sum(name.startswith("f_rest_") for name in held)
     if rest not in (0, 9, 24, 45, 72):
         raise InputError(f"{path}: {rest} f_rest properties fit no SH degree; 0, 9, 24, 45 or 72 are needed")
@@ -308,7 +376,7 @@ def _coefficients(held: Sequence[str], path: Path) -> int:
 
 
 def _parse_extras(comments: list[str], path: Path) -> dict:
-    """What our own comment says; empty, with a warning, when it was damaged elsewhere."""
+    """Content of the pansplat comment; empty without one, and with a warning when it is damaged."""
     for comment in comments:
         if comment.startswith(_MARK):
             try:
@@ -328,95 +396,22 @@ def _parse_extras(comments: list[str], path: Path) -> dict:
 
 
 def _labels(extras: dict, count: int, path: Path) -> tuple[torch.Tensor, torch.Tensor]:
-    """Level and view of each vertex; zeros when the file tells nothing, or of another count."""
-    unlabelled = torch.zeros(count, dtype=torch.int64), torch.zeros(count, dtype=torch.int64)
+    """Level and view of each vertex; zeros without labels, or with a warning when they do not fit `count`."""
+    zeros = torch.zeros(count, dtype=torch.int64), torch.zeros(count, dtype=torch.int64)
     if not extras:
-        return unlabelled
+        return zeros
     try:
         runs = torch.tensor(extras.get("runs", []), dtype=torch.int64).reshape(-1, 3)
         views = max(len(extras.get("cam2world", [])), 1)
-        sound = bool((runs >= 0).all()) and int(runs[:, 2].sum()) == count
-        sound = sound and (not len(runs) or int(runs[:, 1].max()) < views)
+        valid = bool((runs >= 0).all()) and int(runs[:, 2].sum()) == count
+        valid = valid and (not len(runs) or int(runs[:, 1].max()) < views)
     except (ValueError, TypeError, RuntimeError):
-        runs, sound = torch.zeros(0, 3, dtype=torch.int64), False
-    if not sound:
+        runs, valid = torch.zeros(0, 3, dtype=torch.int64), False
+    if not valid:
         warnings.warn(
             f"{path}: its {count} Gaussians are not those its labels were written for (edited elsewhere?); "
             "levels and views are lost",
             stacklevel=3,
         )
-        return unlabelled
+        return zeros
     return torch.repeat_interleave(runs[:, 0], runs[:, 2]), torch.repeat_interleave(runs[:, 1], runs[:, 2])
-
-
-_ROOM = 4096  # bytes for the runs of level and view: some 300. Viewers in browsers want the header within 10,000 bytes
-
-
-def save_ply_parts(scene: Scene, parts: Iterable[Gaussians], path: str | Path) -> int:
-    """Write parts one after another, atomically; no more than one is held.
-
-    Gaussians with a non-finite number are left out with a warning.
-
-    Args:
-        scene: cameras and names for the header; its own Gaussians are not written.
-        parts: all of one degree.
-
-    Returns:
-        How many Gaussians the file holds.
-
-    Raises:
-        InputError: when the folder does not exist or cannot be written.
-        ValueError: a part has another degree than the first.
-    """
-    path = Path(path)
-    with replacing(path) as partial:
-        rest = iter(parts)
-        first = [next(rest, scene.gaussians.select(scene.gaussians.levels < 0))]
-        coefficients = first[0].harmonics.shape[1]
-        room = len(header(scene, [], coefficients)) + _ROOM
-        with open(partial, "wb") as file:
-            file.write(b" " * room)
-            runs, lost = _write_parts(_taken(first, rest), file, coefficients)
-        _fill_header(partial, header(scene, runs, coefficients, size=room), room)
-    count = sum(run[2] for run in runs)
-    if lost:
-        warnings.warn(f"{path}: left out {lost} of {count + lost} Gaussians that are not finite", stacklevel=2)
-    return count
-
-
-def _taken(first: list[Gaussians], rest: Iterator[Gaussians]) -> Iterator[Gaussians]:
-    """First and rest; parts are large, so none is held here."""
-    yield first.pop()
-    yield from rest
-
-
-def _write_parts(parts: Iterable[Gaussians], file: BinaryIO, coefficients: int) -> tuple[list[list[int]], int]:
-    """Write the vertices; stretches of one level and view, and how many Gaussians were not finite."""
-    runs: list[list[int]] = []
-    lost = 0
-    for part in parts:
-        if part.harmonics.shape[1] != coefficients:
-            raise ValueError(f"`parts` must have {coefficients} harmonics each, got {part.harmonics.shape[1]}")
-        finite = is_finite(part)
-        kept = part if bool(finite.all()) else part.select(finite)
-        lost += len(part) - len(kept)
-        for level, view, count in runs_of(kept):
-            if runs and runs[-1][:2] == [level, view]:
-                runs[-1][2] += count
-            else:
-                runs.append([level, view, count])
-        table(kept).tofile(file)
-        del part, kept
-    return runs, lost
-
-
-def _fill_header(path: Path, content: bytes, room: int) -> None:
-    """Put the header where room was left; where it needs more, the vertices are moved on, piece by piece."""
-    if len(content) == room:
-        with open(path, "r+b") as file:
-            file.write(content)
-        return
-    with replacing(path) as longer, open(path, "rb") as vertices, open(longer, "wb") as file:
-        file.write(content)
-        vertices.seek(room)
-        shutil.copyfileobj(vertices, file, 1 << 24)

@@ -23,13 +23,13 @@ class Gaussians:
     Attributes:
         means: centres in the world, metres.
         scales: standard deviations along the Gaussian's own axes, metres.
-        quats: rotation of the own axes to the world's, wxyz; normalised where it is read.
+        quats: rotation from the Gaussian's axes to the world's, wxyz; need not be normalised.
         opacities: peak opacity, in [0, 1].
         harmonics: real spherical-harmonics coefficients of degree 0..4 in world axes, in the 3DGS order and signs;
             colour in direction d (camera to mean) is max(0, 0.5 + sum_k Y_k(d) c_k). Three channels are RGB;
             the rasteriser draws any number.
         levels: pyramid level, 0 is the finest.
-        views: index of the context view that each Gaussian was lifted from.
+        views: index of the context view of each Gaussian.
     """
 
     means: Float[Tensor, "n 3"]
@@ -42,14 +42,7 @@ class Gaussians:
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
-        needed = {
-            "means": (n, 3),
-            "scales": (n, 3),
-            "quats": (n, 4),
-            "opacities": (n,),
-            "levels": (n,),
-            "views": (n,),
-        }
+        needed = {"means": (n, 3), "scales": (n, 3), "quats": (n, 4), "opacities": (n,), "levels": (n,), "views": (n,)}
         for name, shape in needed.items():
             got = tuple(getattr(self, name).shape)
             if got != shape:
@@ -73,11 +66,11 @@ class Gaussians:
         return axes @ axes.transpose(-1, -2)
 
     def select(self, index: Tensor) -> Gaussians:
-        """The Gaussians at a boolean mask or at indices, in that order."""
+        """The Gaussians of a boolean mask or of indices, in their order."""
         return Gaussians(*(getattr(self, f.name)[index] for f in dataclasses.fields(self)))
 
     def to(self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Gaussians:
-        """The same Gaussians in another floating type or on another device; labels keep their integer type."""
+        """The Gaussians in another floating-point type or on another device; labels keep their integer type."""
         values = []
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
@@ -86,7 +79,7 @@ class Gaussians:
 
     @staticmethod
     def cat(parts: Sequence[Gaussians]) -> Gaussians:
-        """All the parts' Gaussians, one part after another; the parts must have the same SH degree."""
+        """The Gaussians of all parts in order; the parts must have the same SH degree."""
         if not parts:
             raise ValueError("`parts` must hold at least one set of Gaussians, got none")
         degrees = sorted({part.degree for part in parts})
@@ -105,16 +98,16 @@ def empty_gaussians(degree: int = 0) -> Gaussians:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What `predict` returns, `render` and the viewer draw, and `save`/`load` keep.
+    """Gaussians with the cameras they were predicted from: the result of `predict` and the input of `render`.
 
     Attributes:
         gaussians: all context views' Gaussians.
-        cam2world: poses of the context views, float64, in the order of `gaussians.views`; may hold no view
-            when the file came from elsewhere.
+        cam2world: poses of the context views, float64, in the order of `gaussians.views`; empty for a file of another
+            tool.
         near, far: depth range of the prediction, metres.
-        names: one name a context view (its image file's name).
-        model: what made it, e.g. "sweep".
-        height: height of the panoramas it was predicted from, pixels.
+        names: image file name of each context view.
+        model: name of the predictor, e.g. "sweep".
+        height: of the input panoramas, pixels.
     """
 
     gaussians: Gaussians
@@ -126,22 +119,22 @@ class Scene:
     height: int = 512
 
     def pose_between(self, fraction: float) -> Float[Tensor, "4 4"]:
-        """The pose at a fraction of the way from the first context camera (0) to the last (1).
+        """The pose at a fraction between the first context camera (0) and the last (1).
 
         Raises:
-            InputError: when the scene has no cameras, as after loading a file that came from elsewhere.
+            InputError: the scene has no cameras.
         """
         if not len(self.cam2world):
-            raise InputError("the scene has no input cameras to stand between; give a pose instead")
+            raise InputError("the scene has no input cameras to interpolate; give a pose instead")
         return interpolate_poses(self.cam2world[0], self.cam2world[-1], fraction)
 
 
 def prune(gaussians: Gaussians, *, degree: int | None = None, min_opacity: float = 0.0) -> Gaussians:
-    """The Gaussians of at least some opacity, with harmonics up to a degree.
+    """The Gaussians with at least a minimum opacity, and their harmonics up to a degree.
 
     Args:
-        degree: highest degree kept; None keeps all, as does one that is higher than what is there.
-        min_opacity: in [0, 1]; below 1/255 nothing can be seen.
+        degree: highest degree that is kept; None keeps all.
+        min_opacity: in [0, 1]; Gaussians below 1/255 are invisible.
     """
     if min_opacity > 0:
         gaussians = gaussians.select(gaussians.opacities >= min_opacity)

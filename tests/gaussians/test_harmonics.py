@@ -18,9 +18,12 @@ from pansplat.gaussians.harmonics import (
 from pansplat.geometry.pose import rotations_from_quats
 
 
-def _random_directions(count: int, seed: int = 0) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=-1)
+def _random(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def _directions(count: int, seed: int = 0) -> torch.Tensor:
+    return torch.nn.functional.normalize(_random(count, 3, seed=seed), dim=-1)
 
 
 def test_basis_is_orthonormal_on_the_sphere():
@@ -36,13 +39,13 @@ def test_basis_is_orthonormal_on_the_sphere():
 
 
 def test_basis_equals_scipys_with_the_sign_of_3dgs():
-    directions = _random_directions(50)
+    directions = _directions(50)
     x, y, z = directions.numpy().T
     polar, azimuth = np.arccos(z), np.arctan2(y, x)
     ours = harmonics_basis(directions, 4).numpy()
     for degree in range(5):
         for order in range(-degree, degree + 1):
-            complex_value = sph_harm_y(degree, abs(order), polar, azimuth)  # holds the phase (-1)^m already
+            complex_value = sph_harm_y(degree, abs(order), polar, azimuth)  # includes the phase (-1)^m
             part = complex_value.imag if order < 0 else complex_value.real
             expected = part * (math.sqrt(2) if order else 1)
             np.testing.assert_allclose(ours[:, degree * degree + degree + order], expected, atol=1e-12)
@@ -79,13 +82,12 @@ def test_every_coefficient_changes_the_colour(degree: int):
 
 
 def test_colour_is_differentiable_in_coefficients_and_direction():
-    directions = _random_directions(3, seed=1).requires_grad_()
-    generator = torch.Generator().manual_seed(2)
-    harmonics = (0.1 * torch.randn(3, 25, 3, generator=generator, dtype=torch.float64)).requires_grad_()
+    directions = _directions(3, seed=1).requires_grad_()
+    harmonics = (0.1 * _random(3, 25, 3, seed=2)).requires_grad_()
     assert torch.autograd.gradcheck(evaluate_harmonics, (harmonics, directions))
 
 
-def test_colour_never_is_negative_and_has_no_slope_where_it_is_off():
+def test_colours_are_not_negative_and_have_no_gradient_at_zero():
     harmonics = torch.tensor([[[-9.0, -0.5 / 0.28209479177387814, 1.0]]], dtype=torch.float64, requires_grad=True)
     colour = evaluate_harmonics(harmonics, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64))
     colour.sum().backward()
@@ -93,28 +95,26 @@ def test_colour_never_is_negative_and_has_no_slope_where_it_is_off():
     assert harmonics.grad[0, 0, 0] == 0 and harmonics.grad[0, 0, 2] > 0
 
 
-def test_basis_refuses_unknown_degrees():
+def test_unknown_degrees_are_refused():
     with pytest.raises(ValueError, match=r"`degree` must be 0\.\.4, got 5"):
         harmonics_basis(torch.ones(3), 5)
     with pytest.raises(ValueError, match="1, 4, 9, 16 or 25"):
         evaluate_harmonics(torch.zeros(5, 3), torch.ones(3))
-
-
-def _random(*shape: int, seed: int = 0) -> torch.Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"`degree` must be 0\.\.4, got 5"):
+        rotation_matrices(torch.eye(3, dtype=torch.float64), 5)
 
 
 @pytest.mark.parametrize("degree", range(5))
-def test_a_turned_colour_seen_from_turned_directions_is_the_same(degree: int):
+def test_rotated_harmonics_have_the_same_colours_in_rotated_directions(degree: int):
     rotation = rotations_from_quats(_random(4))
     harmonics = _random((degree + 1) ** 2, 3, seed=1)
-    directions = torch.nn.functional.normalize(_random(40, 3, seed=2), dim=-1)
+    directions = _directions(40, seed=2)
     before = harmonics_basis(directions, degree) @ harmonics
     after = harmonics_basis(directions @ rotation.T, degree) @ rotate_harmonics(harmonics, rotation)
     assert torch.allclose(before, after, atol=1e-13)
 
 
-def test_rotations_compose_and_keep_lengths_and_degrees_apart():
+def test_rotation_matrices_compose_are_orthogonal_and_block_diagonal():
     a, b = rotations_from_quats(_random(2, 4))
     matrices = rotation_matrices(torch.stack((a, b, a @ b)), 4)
     assert torch.allclose(matrices[0] @ matrices[1], matrices[2], atol=1e-13)
@@ -124,26 +124,21 @@ def test_rotations_compose_and_keep_lengths_and_degrees_apart():
     assert torch.allclose(unturned, torch.eye(25, dtype=torch.float64), atol=1e-14)
 
 
-def test_degree_one_turns_as_the_axes_do():
+def test_degree_one_rotates_like_the_axes():
     rotation = rotations_from_quats(_random(4, seed=3))
     axes = torch.tensor(((0.0, -1, 0), (0, 0, 1), (-1, 0, 0)), dtype=torch.float64)  # Y_1..3 are -y, z, -x
     assert torch.allclose(rotation_matrices(rotation, 1)[1:, 1:], axes @ rotation @ axes.T, atol=1e-14)
 
 
-def test_rotation_keeps_the_number_type_and_is_differentiable():
+def test_rotation_keeps_the_dtype_and_passes_gradcheck():
     harmonics, rotation = _random(2, 25, 3), rotations_from_quats(_random(4))
     assert rotate_harmonics(harmonics.float(), rotation).dtype == torch.float32
     assert torch.autograd.gradcheck(rotate_harmonics, (harmonics.requires_grad_(), rotation.requires_grad_()))
 
 
-def test_unknown_degrees_are_refused():
-    with pytest.raises(ValueError, match=r"`degree` must be 0\.\.4, got 5"):
-        rotation_matrices(torch.eye(3, dtype=torch.float64), 5)
-
-
 @pytest.mark.shared
-def test_the_originals_rotation_is_ours_in_its_own_axes(golden: Callable[[str], dict[str, torch.Tensor]]):
-    """It turns coefficients of a basis whose polar axis is y; the colours agree in every direction."""
+def test_the_official_rotation_equals_ours_in_its_axes(golden: Callable[[str], dict[str, torch.Tensor]]):
+    """Its basis has the polar axis y."""
     units = golden("units")
     polar_y = torch.tensor(((0.0, 0, 1), (1, 0, 0), (0, 1, 0)), dtype=torch.float64)
     for before, after, rotation in zip(
@@ -151,14 +146,14 @@ def test_the_originals_rotation_is_ours_in_its_own_axes(golden: Callable[[str], 
     ):
         flip = torch.diag(torch.tensor((-1.0, 1, -1), dtype=torch.float64))
         turn = polar_y @ flip @ rotation @ flip @ polar_y.T
-        assert torch.allclose(rotate_harmonics(before.T, turn).T, after, atol=5e-5)  # its own float32 error is 1e-5
+        assert torch.allclose(rotate_harmonics(before.T, turn).T, after, atol=5e-5)  # float32 error: 1e-5
 
 
-_TO_WORLD = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=torch.float64)  # its x, y, z are z, x, y
+_TO_WORLD = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=torch.float64)  # the official x, y, z are z, x, y
 
 
-def _table(directions: torch.Tensor) -> torch.Tensor:
-    """The sixteen functions of OFFICIAL.md 10.3 in world axes, coefficient 14 as it is there."""
+def _official_basis(directions: torch.Tensor) -> torch.Tensor:
+    """The sixteen functions of docs/official.md, section 10.3, in world axes, with its coefficient 14."""
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     return torch.stack(
@@ -174,20 +169,18 @@ def _table(directions: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16, 25])
-def test_colours_are_those_of_the_originals_table(coefficients):
-    generator = torch.Generator().manual_seed(0)
-    theirs = 0.3 * torch.randn(40, coefficients, 3, generator=generator, dtype=torch.float64)
-    directions = torch.nn.functional.normalize(torch.randn(40, 3, generator=generator, dtype=torch.float64), dim=1)
+def test_official_colours_are_those_of_the_official_basis(coefficients):
+    harmonics, directions = 0.3 * _random(40, coefficients, 3), _directions(40, seed=1)
     drawn = min(coefficients, 16)
-    expected = (_table(directions)[:, None, :drawn] @ theirs[:, :drawn])[:, 0] + 0.5
-    world = rotate_harmonics(theirs, _TO_WORLD)
+    expected = (_official_basis(directions)[:, None, :drawn] @ harmonics[:, :drawn])[:, 0] + 0.5
+    world = rotate_harmonics(harmonics, _TO_WORLD)
     got = evaluate_harmonics(official_harmonics(world), directions)
     assert torch.allclose(got, expected.clamp_min(0), rtol=0, atol=1e-7)
     apart = float((evaluate_harmonics(world, directions) - got).abs().max())
     assert (apart > 0.05) == (coefficients >= 16) and (coefficients >= 16 or apart == 0)
 
 
-def test_it_is_linear_and_keeps_type():
+def test_official_harmonics_are_differentiable_and_keep_the_dtype():
     harmonics = torch.randn(5, 25, 2, generator=torch.Generator().manual_seed(0), requires_grad=True)
     drawn = official_harmonics(harmonics)
     assert drawn.shape == (5, 16, 2) and drawn.dtype == torch.float32

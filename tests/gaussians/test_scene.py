@@ -1,9 +1,11 @@
 """The set of Gaussians: checked shapes, covariances, selection, joining, pruning."""
 
+import dataclasses
+
 import pytest
 import torch
 
-from pansplat.gaussians.scene import Gaussians, prune
+from pansplat.gaussians.scene import Gaussians, Scene, prune
 
 
 def _make(n: int, k: int = 4, seed: int = 0) -> Gaussians:
@@ -30,7 +32,7 @@ def test_the_degree_follows_from_the_number_of_coefficients(k, degree):
     assert _make(2, k).degree == degree
 
 
-def test_wrong_shapes_are_refused_by_name(unchecked):
+def test_wrong_shapes_are_refused_with_the_name(unchecked):
     good = _make(3)
     fields = {name: getattr(good, name) for name in good.__dataclass_fields__}
     with pytest.raises(ValueError, match=r"`scales` must have shape \(3, 3\).*got \(2, 3\)"):
@@ -39,14 +41,14 @@ def test_wrong_shapes_are_refused_by_name(unchecked):
         Gaussians(**{**fields, "harmonics": torch.zeros(3, 5, 3)})
 
 
-def test_selecting_keeps_every_field_together():
+def test_selecting_applies_to_every_field():
     gaussians = _make(10)
     chosen = gaussians.select(gaussians.levels == 2)
     assert len(chosen) == 2 and torch.equal(chosen.means, gaussians.means[[2, 6]])
     assert torch.equal(chosen.views, gaussians.views[[2, 6]])
 
 
-def test_joining_appends_and_needs_one_degree():
+def test_joining_appends_sets_of_one_degree():
     a, b = _make(3), _make(4, seed=1)
     joined = Gaussians.cat([a, b])
     assert len(joined) == 7 and torch.equal(joined.quats[3:], b.quats)
@@ -56,43 +58,43 @@ def test_joining_appends_and_needs_one_degree():
         Gaussians.cat([])
 
 
-def test_changing_the_type_leaves_labels_whole():
+def test_changing_the_type_keeps_integer_labels():
     gaussians = _make(3).to(dtype=torch.float64)
     assert gaussians.means.dtype == torch.float64 and gaussians.levels.dtype == torch.int64
 
 
-def _gaussians() -> Gaussians:
-    generator = torch.Generator().manual_seed(0)
-    count = 50
-    return Gaussians(
-        means=torch.randn(count, 3, generator=generator),
-        scales=torch.rand(count, 3, generator=generator),
-        quats=torch.randn(count, 4, generator=generator),
-        opacities=torch.linspace(0, 1, count),
-        harmonics=torch.randn(count, 25, 3, generator=generator),
-        levels=torch.zeros(count, dtype=torch.uint8),
-        views=torch.zeros(count, dtype=torch.uint8),
-    )
+@pytest.fixture
+def increasing() -> Gaussians:
+    """Degree 4, with opacities in increasing order."""
+    return dataclasses.replace(_make(50, 25), opacities=torch.linspace(0, 1, 50))
 
 
-def test_nothing_asked_changes_nothing():
-    gaussians = _gaussians()
+def test_pruning_without_limits_changes_nothing(increasing):
+    gaussians = increasing
     assert prune(gaussians) is gaussians
     assert prune(gaussians, degree=4) is gaussians
 
 
-def test_the_opaque_are_kept_with_all_that_they_have():
-    gaussians = _gaussians()
+def test_pruning_keeps_the_opaque_gaussians(increasing):
+    gaussians = increasing
     kept = prune(gaussians, min_opacity=float(gaussians.opacities[20]))
     assert torch.equal(kept.opacities, gaussians.opacities[20:])
     assert torch.equal(kept.harmonics, gaussians.harmonics[20:])
 
 
-def test_lower_degrees_stay_as_they_are():
-    gaussians = _gaussians()
+def test_pruning_to_a_degree_keeps_the_lower_coefficients(increasing):
+    gaussians = increasing
     for degree in range(4):
         kept = prune(gaussians, degree=degree)
         assert kept.degree == degree and len(kept) == len(gaussians)
         assert torch.equal(kept.harmonics, gaussians.harmonics[:, : (degree + 1) ** 2])
         assert torch.equal(kept.means, gaussians.means)
     assert prune(prune(gaussians, degree=1), degree=3).degree == 1
+
+
+def test_pose_between_starts_and_ends_at_the_cameras():
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    poses[1, :3, 3] = torch.tensor((1 / 3, -2e-7, 12345.678901234567))
+    scene = Scene(_make(2), poses, near=0.5, far=8.0)
+    assert torch.allclose(scene.pose_between(0.0), poses[0]) and torch.allclose(scene.pose_between(1.0), poses[1])
+    assert torch.allclose(scene.pose_between(0.5)[:3, 3], poses[:, :3, 3].mean(dim=0))
