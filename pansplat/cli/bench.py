@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
 
 _SAMPLE = Path(pansplat.__file__).parents[1] / "assets" / "living_room"
+_MIN_SWEEP_HEIGHT = 64  # pixels
 _RASTER_BACKENDS = ("numba", "triton", "gsplat")
 _DEFAULT_MEMORY = 16e9  # bytes, if the system does not report its memory
 _RANDOM_WEIGHTS = "PanSplat with random weights (seed 0): times and memory are true, images meaningless"
@@ -128,7 +129,7 @@ class BenchRaster:
         if self.scene_from == "depth":
             return lift_depth(pair.load_context(height))
         with progress_bar() as progress:
-            return pipeline.predict(pair, "sweep", height=height, progress=progress)
+            return pipeline.predict(pair, "sweep", height=max(height, _MIN_SWEEP_HEIGHT), progress=progress)
 
 
 @dataclass(frozen=True)
