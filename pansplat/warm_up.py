@@ -14,9 +14,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from pansplat.data.views import Views
 from pansplat.gaussians.scene import Gaussians
 from pansplat.pipeline import predict
-from pansplat.rendering import rasterize
 from pansplat.rendering.image_planes import Layout
-from pansplat.rendering.rasterize import RasterOptions
+from pansplat.rendering.rasterize import RasterOptions, rasterize
 
 
 def main() -> None:

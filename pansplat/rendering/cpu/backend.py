@@ -5,7 +5,7 @@ Source: docs/rendering.md; docs/rasterizer.md describes the stages and their cos
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -118,7 +118,7 @@ def rasterize_planes(
     tensors = (gaussians.means, *shape, gaussians.opacities, gaussians.harmonics)
     tensors = tuple(None if tensor is None else tensor.to(torch.float32).contiguous() for tensor in tensors)
     statistics = _Statistics()
-    sums = _Rasterize.apply(*tensors, pose, planes, options, statistics, torch.is_grad_enabled())
+    sums = _Rasterize.apply(pose, planes, options, statistics, torch.is_grad_enabled(), *tensors)
     if options.strict and statistics.dropped:
         raise InputError(not_finite_message(gaussians, covariances, pose, options))
     info = RasterInfo(total=len(gaussians), backend="numba", **vars(statistics))
@@ -131,27 +131,22 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        means: Tensor,
-        quats: Tensor | None,
-        scales: Tensor | None,
-        covariances: Tensor | None,
-        opacities: Tensor,
-        harmonics: Tensor,
         pose: Tensor,
         planes: list[ImagePlane],
         options: RasterOptions,
         statistics: _Statistics,
         grad_enabled: bool,
+        *tensors: Tensor | None,
     ) -> Tensor:
-        tensors = means, quats, scales, covariances, opacities, harmonics
-        fields, camera, threads = _fields(*tensors), _camera(pose, planes[0], options), thread_count()
+        """Sums; `tensors` are those of GaussianArrays, or None."""
+        fields, camera, threads = _fields(tensors), _camera(pose, planes[0], options), thread_count()
         needs_grad = grad_enabled and any(ctx.needs_input_grad)  # the latter ignores no_grad
         workspace = Workspace()
         with announce_compilation():
             with statistics.timed("project"):
                 projected = project_gaussians(fields, camera, workspace, threads)
             view = _View(fields, camera, projected, options, threads)
-            sums = pooled_empty((len(planes), harmonics.shape[2] + 2, *planes[0].size), np.float32)
+            sums = pooled_empty((len(planes), fields.harmonics.shape[2] + 2, *planes[0].size), np.float32)
             states = [
                 _rasterize_plane(view, plane, plane_sums, statistics, workspace if needs_grad else None)
                 for plane, plane_sums in zip(planes, sums, strict=True)
@@ -170,12 +165,12 @@ class _Rasterize(torch.autograd.Function):
             raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
         *tensors, pose, sums = ctx.saved_tensors
         planes, options, projected, states, _workspace, threads = ctx.saved
-        fields, camera = _fields(*tensors), _camera(pose, planes[0], options)
+        fields, camera = _fields(tensors), _camera(pose, planes[0], options)
         view = _View(fields, camera, projected, options, threads)
-        needs_pose = ctx.needs_input_grad[6]
+        needs_pose, _, _, _, _, *needed = ctx.needs_input_grad
         grads = [
-            torch.from_numpy(pooled_empty(tuple(tensor.shape), np.float32)) if needed else None
-            for tensor, needed in zip(tensors, ctx.needs_input_grad, strict=False)
+            torch.from_numpy(pooled_empty(tuple(tensor.shape), np.float32)) if is_needed else None
+            for tensor, is_needed in zip(tensors, needed, strict=True)
         ]
         with announce_compilation():
             workspace = Workspace()
@@ -191,20 +186,12 @@ class _Rasterize(torch.autograd.Function):
         if needs_pose:
             grad_pose = torch.zeros_like(pose)
             grad_pose[:3] = torch.from_numpy(filled.pose)
-        return (*grads, grad_pose, None, None, None, None)
+        return (grad_pose, None, None, None, None, *grads)
 
 
-def _fields(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    covariances: Tensor | None,
-    opacities: Tensor,
-    harmonics: Tensor,
-) -> GaussianArrays:
+def _fields(tensors: Sequence[Any]) -> GaussianArrays:
     """The tensors as arrays; None becomes an array without rows."""
-    tensors = (means, quats, scales, covariances, opacities, harmonics)
-    shapes = ((3,), (4,), (3,), (3, 3), (), harmonics.shape[1:])
+    shapes = ((3,), (4,), (3,), (3, 3), (), tensors[-1].shape[1:])
     return GaussianArrays(
         *(
             np.empty((0, *shape), np.float32) if tensor is None else tensor.detach().numpy()

@@ -77,7 +77,17 @@ TILE_FRAME_SIZE = 15  # see `set_tile_frame`
 
 
 @inline_kernel_no_refcount
-def _pixel_point(kind, columns, rows, rotation, x, y):  # type: ignore[no-untyped-def]
+def image_position(pixel, left, top):
+    """Column and row in the image of a tile's pixel, which are numbered block by block."""
+    block, lane = pixel // LANES, pixel % LANES
+    return (
+        left + (block % BLOCKS_ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH,
+        top + (block // BLOCKS_ACROSS) * BLOCK_HEIGHT + lane // BLOCK_WIDTH,
+    )
+
+
+@inline_kernel_no_refcount
+def _pixel_point(kind, columns, rows, rotation, x, y):
     """The unit direction of pixel (x, y), or its centre for the EWA kernel."""
     if kind == EQUIRECT_RAYS:
         cosine = rows[y, 1]
@@ -95,7 +105,7 @@ def _pixel_point(kind, columns, rows, rotation, x, y):  # type: ignore[no-untype
 
 
 @inline_kernel_no_refcount
-def set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame):  # type: ignore[no-untyped-def]
+def set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame):
     """Set a tile's centre and axes.
 
     Args:
@@ -132,9 +142,7 @@ def set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame):  # 
 
 
 @inline_kernel_no_refcount
-def set_tile_pixels(  # type: ignore[no-untyped-def]
-    kind, columns, rows, rotation, left, top, centre, frame, is_3d, offsets
-):
+def set_tile_pixels(kind, columns, rows, rotation, left, top, centre, frame, is_3d, offsets):
     """Compute the offsets of a tile's pixels from its centre, block by block.
 
     Args:
@@ -144,9 +152,7 @@ def set_tile_pixels(  # type: ignore[no-untyped-def]
     """
     width, height = len(columns), len(rows)
     for pixel in range(TILE_PIXELS):
-        block, lane = pixel // LANES, pixel % LANES
-        x = left + (block % BLOCKS_ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH
-        y = top + (block // BLOCKS_ACROSS) * BLOCK_HEIGHT + lane // BLOCK_WIDTH
+        x, y = image_position(pixel, left, top)
         d_x, d_y, d_z = _pixel_point(kind, columns, rows, rotation, min(x, width - 1), min(y, height - 1))
         d_x, d_y, d_z = d_x - centre[0], d_y - centre[1], d_z - centre[2]
         ahead = frame[12] * d_x + frame[13] * d_y + frame[14] * d_z
@@ -157,18 +163,16 @@ def set_tile_pixels(  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _reset_transmittance(columns, rows, left, top, transmittance):  # type: ignore[no-untyped-def]
+def _reset_transmittance(columns, rows, left, top, transmittance):
     """Set the transmittance to 1, and to 0 for pixels outside the image, which are then finished."""
     width, height = len(columns), len(rows)
     for pixel in range(TILE_PIXELS):
-        block, lane = pixel // LANES, pixel % LANES
-        x = left + (block % BLOCKS_ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH
-        y = top + (block // BLOCKS_ACROSS) * BLOCK_HEIGHT + lane // BLOCK_WIDTH
+        x, y = image_position(pixel, left, top)
         transmittance[pixel] = np.float32(1 if x < width and y < height else 0)
 
 
 @inline_kernel_no_refcount
-def prefetch_slice(records, values, intersections, block, first):  # type: ignore[no-untyped-def]
+def prefetch_slice(records, values, intersections, block, first):
     """Prefetch this block's slice of the chunk that begins at intersection `first`."""
     num_values, end = values.shape[1], len(intersections) // 2 - 1
     for e in range(first + block * _SLICE_SIZE, first + (block + 1) * _SLICE_SIZE):
@@ -178,7 +182,7 @@ def prefetch_slice(records, values, intersections, block, first):  # type: ignor
 
 
 @inline_kernel_no_refcount
-def load_eight_records(records, intersections, e, last):  # type: ignore[no-untyped-def]
+def load_eight_records(records, intersections, e, last):
     """The columns of eight records, in two groups of eight.
 
     Args:
@@ -200,9 +204,7 @@ def load_eight_records(records, intersections, e, last):  # type: ignore[no-unty
 
 
 @inline_kernel_no_refcount
-def load_chunk(  # type: ignore[no-untyped-def]
-    records, values, intersections, first, count, frame, exact, is_3d, footprints, chunk_values
-):
+def load_chunk(records, values, intersections, first, count, frame, exact, is_3d, footprints, chunk_values):
     """Compute the footprints and copy the values of a chunk.
 
     Args:
@@ -234,9 +236,7 @@ def load_chunk(  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _compute_footprints(  # type: ignore[no-untyped-def]
-    records, intersections, first, count, frame, exact, is_3d, footprints
-):
+def _compute_footprints(records, intersections, first, count, frame, exact, is_3d, footprints):
     """Compute a chunk's footprints; returns whether they must be computed again in 3d."""
     last = first + count - 1
     on, one = broadcast(exact), broadcast(np.float32(1))
@@ -280,7 +280,7 @@ def _compute_footprints(  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _to_tile_frame(frame, x, y, z):  # type: ignore[no-untyped-def]
+def _to_tile_frame(frame, x, y, z):
     """Components of vectors along a tile's three axes."""
     return (
         multiply_add(broadcast(frame[6]), x, multiply_add(broadcast(frame[7]), y, broadcast(frame[8]) * z)),
@@ -290,7 +290,7 @@ def _to_tile_frame(frame, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def mark_blocks(intersections, first, count, masks):  # type: ignore[no-untyped-def]
+def mark_blocks(intersections, first, count, masks):
     """Set the bits of the Gaussians that reach each column and each row of blocks; a block's are in both.
 
     Args:
@@ -316,7 +316,7 @@ def mark_blocks(intersections, first, count, masks):  # type: ignore[no-untyped-
 
 
 @inline_kernel_no_refcount
-def _toggle(words, index, bits):  # type: ignore[no-untyped-def]
+def _toggle(words, index, bits):
     store_scalar(words, index, load_scalar(words, index) ^ bits)
 
 
@@ -375,7 +375,7 @@ def rasterize_forward(
 
 
 @kernel
-def _rasterize_tiles(  # type: ignore[no-untyped-def]
+def _rasterize_tiles(
     records, values, intersections, starts, kind, columns, rows, rotation, sums, saved_transmittance, saved_rows,
     saved_num_chunks, first_row, low, high,
 ):  # fmt: skip
@@ -438,15 +438,13 @@ def _rasterize_tiles(  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _save_transmittance(transmittance, saved_transmittance, row):  # type: ignore[no-untyped-def]
+def _save_transmittance(transmittance, saved_transmittance, row):
     for pixel in range(TILE_PIXELS):
         saved_transmittance[row, pixel] = transmittance[pixel]
 
 
 @inline_kernel_no_refcount
-def compute_log2_alphas(  # type: ignore[no-untyped-def]
-    block, masks, is_3d, footprints, offsets, log2_alphas, indices, begin
-):
+def compute_log2_alphas(block, masks, is_3d, footprints, offsets, log2_alphas, indices, begin):
     """Compute log2 alpha, before cut and clamp, of the Gaussians that reach a block, front to back.
 
     Args:
@@ -474,7 +472,7 @@ def compute_log2_alphas(  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _list_gaussians(block, masks, indices, begin):  # type: ignore[no-untyped-def]
+def _list_gaussians(block, masks, indices, begin):
     """Write the chunk indices of the Gaussians that reach a block, and a 0 after them; returns their number."""
     at, column, row = begin, block % BLOCKS_ACROSS, ROW_MASKS + block // BLOCKS_ACROSS
     for word in range(CHUNK_WORDS):
@@ -486,7 +484,7 @@ def _list_gaussians(block, masks, indices, begin):  # type: ignore[no-untyped-de
 
 
 @inline_kernel_no_refcount
-def evaluate_footprint(is_3d, footprints, s, x, y, z):  # type: ignore[no-untyped-def]
+def evaluate_footprint(is_3d, footprints, s, x, y, z):
     """A, B and L of Gaussian `s` of the chunk at a block's pixels, up to a factor per pixel that cancels in Q / L^2.
 
     The offsets from the Gaussian are subtracted first: they are small, so that the sums have no cancellation.
@@ -508,16 +506,14 @@ def evaluate_footprint(is_3d, footprints, s, x, y, z):  # type: ignore[no-untype
 
 
 @inline_kernel_no_refcount
-def compute_alpha(log2_alpha):  # type: ignore[no-untyped-def]
+def compute_alpha(log2_alpha):
     """Alpha: 0 below the cut, at most MAX_ALPHA."""
     alpha = min(exp2(log2_alpha), broadcast(np.float32(MAX_ALPHA)))
     return select(broadcast(np.float32(LOG2_ALPHA_CUT)) <= log2_alpha, alpha, broadcast(np.float32(0)))
 
 
 @inline_kernel_no_refcount
-def _blend_four_values(  # type: ignore[no-untyped-def]
-    block, count, log2_alphas, indices, begin, chunk_values, transmittance, tile_sums
-):
+def _blend_four_values(block, count, log2_alphas, indices, begin, chunk_values, transmittance, tile_sums):
     """Composite the Gaussians of a block, four values each; returns whether a pixel is unfinished."""
     pixel = block * LANES
     passing = load(transmittance, pixel)
@@ -549,7 +545,7 @@ def _blend_four_values(  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _compute_weights(block, count, log2_alphas, begin, transmittance):  # type: ignore[no-untyped-def]
+def _compute_weights(block, count, log2_alphas, begin, transmittance):
     """Replace log2 alphas by weights; returns whether a pixel is unfinished."""
     passing = load(transmittance, block * LANES)
     for at in range(begin, begin + count):
@@ -561,9 +557,7 @@ def _compute_weights(block, count, log2_alphas, begin, transmittance):  # type: 
 
 
 @inline_kernel_no_refcount
-def _accumulate_values(  # type: ignore[no-untyped-def]
-    block, count, weights, indices, begin, chunk_values, num_values, tile_sums
-):
+def _accumulate_values(block, count, weights, indices, begin, chunk_values, num_values, tile_sums):
     """Add a block's weighted values to the sums, any number of values."""
     for channel in range(num_values):
         pixel = channel * TILE_PIXELS + block * LANES
@@ -575,7 +569,7 @@ def _accumulate_values(  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _write_tile(transmittance, tile_sums, sums, left, top, num_values):  # type: ignore[no-untyped-def]
+def _write_tile(transmittance, tile_sums, sums, left, top, num_values):
     """Copy a tile's sums into the image; the last one is the sum of the weights, 1 minus the transmittance."""
     width, height = sums.shape[2], sums.shape[1]
     if left + TILE_SIZE > width or top + TILE_SIZE > height:
@@ -597,11 +591,9 @@ def _write_tile(transmittance, tile_sums, sums, left, top, num_values):  # type:
 
 
 @inline_kernel_no_refcount
-def _write_partial_tile(transmittance, tile_sums, sums, left, top, num_values):  # type: ignore[no-untyped-def]
+def _write_partial_tile(transmittance, tile_sums, sums, left, top, num_values):
     for pixel in range(TILE_PIXELS):
-        block, lane = pixel // LANES, pixel % LANES
-        x = left + (block % BLOCKS_ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH
-        y = top + (block // BLOCKS_ACROSS) * BLOCK_HEIGHT + lane // BLOCK_WIDTH
+        x, y = image_position(pixel, left, top)
         if x < sums.shape[2] and y < sums.shape[1]:
             for channel in range(num_values):
                 sums[channel, y, x] = tile_sums[channel * TILE_PIXELS + pixel]

@@ -38,6 +38,7 @@ from pansplat.rendering.cpu.rasterize import (
     compute_alpha,
     compute_log2_alphas,
     evaluate_footprint,
+    image_position,
     load_chunk,
     load_eight_records,
     mark_blocks,
@@ -119,7 +120,7 @@ def rasterize_backward(
 
 
 @kernel
-def _rasterize_tiles_backward(  # type: ignore[no-untyped-def]
+def _rasterize_tiles_backward(
     records, values, intersections, starts, slots, kind, columns, rows, rotation, sums, saved_transmittance,
     saved_rows, saved_num_chunks, grad_sums, grad_records, grad_values, first_row, low, high,
 ):  # fmt: skip
@@ -173,9 +174,7 @@ def _rasterize_tiles_backward(  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _load_tile_gradients(  # type: ignore[no-untyped-def]
-    sums, grad_sums, left, top, num_values, padded_values, tile_grads
-):
+def _load_tile_gradients(sums, grad_sums, left, top, num_values, padded_values, tile_grads):
     """Load a tile's gradients by blocks, 0 outside the image; then two more rows.
 
     The rows are the gradient of the sum of the weights minus the dot product of gradients and sums, and this dot
@@ -207,14 +206,10 @@ def _load_tile_gradients(  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _load_partial_tile_gradients(  # type: ignore[no-untyped-def]
-    sums, grad_sums, left, top, num_values, padded_values, tile_grads
-):
+def _load_partial_tile_gradients(sums, grad_sums, left, top, num_values, padded_values, tile_grads):
     height, width = grad_sums.shape[1], grad_sums.shape[2]
     for pixel in range(TILE_PIXELS):
-        block, lane = pixel // LANES, pixel % LANES
-        x = left + (block % BLOCKS_ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH
-        y = top + (block // BLOCKS_ACROSS) * BLOCK_HEIGHT + lane // BLOCK_WIDTH
+        x, y = image_position(pixel, left, top)
         total = np.float32(0)
         for channel in range(num_values + 1):
             gradient = np.float32(0)
@@ -227,7 +222,7 @@ def _load_partial_tile_gradients(  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _differentiate_chunk(  # type: ignore[no-untyped-def]
+def _differentiate_chunk(
     records, values, intersections, next_first, is_3d, footprints, chunk_values, masks, offsets, transmittance,
     num_values, padded_values, tile_grads, behind, log2_alphas, indices, alphas, weights, visible, pairs, links, heads,
 ):  # fmt: skip
@@ -260,9 +255,7 @@ def _differentiate_chunk(  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _compute_block_weights(  # type: ignore[no-untyped-def]
-    block, count, log2_alphas, indices, begin, transmittance, output, alphas, weights, visible
-):
+def _compute_block_weights(block, count, log2_alphas, indices, begin, transmittance, output, alphas, weights, visible):
     """Compute alphas and weights of the Gaussians that a pixel of the block sees; returns their number.
 
     Args:
@@ -282,7 +275,7 @@ def _compute_block_weights(  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _differentiate_block(  # type: ignore[no-untyped-def]
+def _differentiate_block(
     block, count, alphas, weights, visible, begin, chunk_values, num_values, padded_values, tile_grads, behind, pairs,
     links, heads, pair,
 ):  # fmt: skip
@@ -312,7 +305,7 @@ def _differentiate_block(  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _write_zeros(slots, first, end, num_values, grad_records, grad_values):  # type: ignore[no-untyped-def]
+def _write_zeros(slots, first, end, num_values, grad_records, grad_values):
     """Write zero gradients for the Gaussians behind a tile's last composited chunk."""
     for e in range(first, end):
         row = RECORD_SIZE * slots[e]
@@ -326,7 +319,7 @@ def _write_zeros(slots, first, end, num_values, grad_records, grad_values):  # t
 
 
 @inline_kernel_no_refcount
-def _write_chunk_gradients(  # type: ignore[no-untyped-def]
+def _write_chunk_gradients(
     records, intersections, first, count, slots, heads, links, pairs, is_3d, footprints, offsets, tile_grads,
     num_values, gradient_sums, exact, grad_records, grad_values,
 ):  # fmt: skip
@@ -345,9 +338,7 @@ def _write_chunk_gradients(  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _accumulate_gradient_sums(  # type: ignore[no-untyped-def]
-    s, heads, links, pairs, is_3d, footprints, offsets, tile_grads, gradient_sums
-):
+def _accumulate_gradient_sums(s, heads, links, pairs, is_3d, footprints, offsets, tile_grads, gradient_sums):
     """Sums over a Gaussian's pixels, without a factor log 2, since `gradient` is by log alpha.
 
     With x = A / L, y = B / L, q = x^2 + y^2 and h = gradient / (1 + radial_variance q)^2, these are the sums of h times
@@ -384,7 +375,7 @@ def _accumulate_gradient_sums(  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _sum_value_gradient(s, heads, links, pairs, tile_grads, value):  # type: ignore[no-untyped-def]
+def _sum_value_gradient(s, heads, links, pairs, tile_grads, value):
     """The gradient of one value of a Gaussian: the sum over its pixels of weight times gradient."""
     total = zero = broadcast(np.float32(0))
     pair = np.int64(load_scalar(heads, s))
@@ -396,9 +387,7 @@ def _sum_value_gradient(s, heads, links, pairs, tile_grads, value):  # type: ign
 
 
 @inline_kernel_no_refcount
-def _write_record_gradients(  # type: ignore[no-untyped-def]
-    s, records, intersections, first, count, slots, gradient_sums, exact, grad_records
-):
+def _write_record_gradients(s, records, intersections, first, count, slots, gradient_sums, exact, grad_records):
     """Convert the sums of eight Gaussians to the gradients of their records, and write these to their slots.
 
     The length of a ray is arbitrary. With L = 1, d - n = x p + y q, where a.p = b.q = 1 and a.q = b.p = l.p = l.q = 0.
@@ -442,7 +431,7 @@ def _write_record_gradients(  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _cross(a, b):  # type: ignore[no-untyped-def]
+def _cross(a, b):
     return (
         multiply_add(a[1], b[2], -(a[2] * b[1])),
         multiply_add(a[2], b[0], -(a[0] * b[2])),
@@ -451,24 +440,24 @@ def _cross(a, b):  # type: ignore[no-untyped-def]
 
 
 @inline_kernel_no_refcount
-def _dot(a, b):  # type: ignore[no-untyped-def]
+def _dot(a, b):
     return multiply_add(a[0], b[0], multiply_add(a[1], b[1], a[2] * b[2]))
 
 
 @inline_kernel_no_refcount
-def _combine(s, a, t, b):  # type: ignore[no-untyped-def]
+def _combine(s, a, t, b):
     """s a + t b"""
     return multiply_add(s, a[0], t * b[0]), multiply_add(s, a[1], t * b[1]), multiply_add(s, a[2], t * b[2])
 
 
 @inline_kernel_no_refcount
-def _load_columns(sums, at):  # type: ignore[no-untyped-def]
+def _load_columns(sums, at):
     """Columns of eight numbers of eight Gaussians."""
     r = _NUM_SUMS
     return load_transposed(sums, at, at + r, at + 2 * r, at + 3 * r, at + 4 * r, at + 5 * r, at + 6 * r, at + 7 * r)
 
 
 @inline_kernel_no_refcount
-def _store_rows(sums, at, rows):  # type: ignore[no-untyped-def]
+def _store_rows(sums, at, rows):
     for row in range(LANES):
         store(sums, at + row * _NUM_SUMS, rows[row])
