@@ -36,6 +36,7 @@ _BYTES, _INTS, _LONGS, _FLOATS, _DOUBLES, _BITS = (
     ir.VectorType(kind, LANES) for kind in (_BYTE, _INT, _LONG, _FLOAT, _DOUBLE, ir.IntType(1))
 )
 _FOUR_FLOATS = ir.VectorType(_FLOAT, 4)
+_ELEMENT = object()  # in place of a type: that of an array's elements
 _VECTOR_TYPES = {"f32x8": _FLOATS, "f64x8": _DOUBLES, "mask": _BITS}
 _ALIGNMENT = {_FLOATS: 4, _FOUR_FLOATS: 4, _DOUBLES: 8, _BYTES: 1}  # bytes: what arrays of the element type guarantee
 _CACHE_LINE = 64  # bytes
@@ -95,21 +96,13 @@ def _call_f64(name: str, builder: ir.IRBuilder, *args: Any) -> Any:
     return builder.call(get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f64"), args)
 
 
-for _symbol, _emit in (
-    (operator.add, ir.IRBuilder.fadd),
-    (operator.sub, ir.IRBuilder.fsub),
-    (operator.mul, ir.IRBuilder.fmul),
-    (operator.truediv, ir.IRBuilder.fdiv),
-):
+_ARITHMETIC = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", operator.truediv: "fdiv"}
+_RELATIONS = {operator.lt: "<", operator.le: "<=", operator.gt: ">", operator.ge: ">=", operator.eq: "=="}
+for _symbol, _name in _ARITHMETIC.items():
+    _emit = getattr(ir.IRBuilder, _name)
     _register(_symbol, _emit, signature(f32x8, f32x8, f32x8))
     _register(_symbol, partial(_emit, flags=_F64_FLAGS), *_f64_cases(f64x8))
-for _symbol, _relation in (
-    (operator.lt, "<"),
-    (operator.le, "<="),
-    (operator.gt, ">"),
-    (operator.ge, ">="),
-    (operator.eq, "=="),
-):
+for _symbol, _relation in _RELATIONS.items():
     _register(_symbol, partial(_compare, _relation), signature(mask, f32x8, f32x8), *_f64_cases(mask))
 for _symbol, _relation in ((min, "<"), (max, ">")):
     _register(_symbol, partial(_select_if, _relation), signature(f32x8, f32x8, f32x8), *_f64_cases(f64x8))
@@ -121,33 +114,133 @@ _register(math.copysign, partial(_call_f64, "copysign"), *_f64_cases(f64x8))
 
 
 def llvm_intrinsic(function: Callable[..., Any]) -> Any:
-    """Make a function that emits LLVM code callable in kernels."""
-    # The tests' check of annotations wraps every function; numba needs the bare one.
-    return intrinsic(inspect.unwrap(function))
+    """Make a function that types its arguments and emits LLVM code callable in kernels."""
+    return intrinsic(inspect.unwrap(function))  # the tests' annotation checks wrap every function
 
 
-# Load, store, broadcast.
+def _with_signature(function: Callable[..., Any], emit: Callable[..., Any], *parameters: str) -> Any:
+    """An intrinsic with the name of `emit` and these parameters, by which numba binds arguments."""
+    function = inspect.unwrap(function)
+    function.__name__, function.__doc__ = emit.__name__, emit.__doc__
+    kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
+    named = [inspect.Parameter(name, kind) for name in ("context", *parameters)]
+    function.__signature__ = inspect.Signature(named)  # type: ignore[attr-defined]
+    return llvm_intrinsic(function)
 
 
-@llvm_intrinsic
-def load(context, array, index):
+def _result(context: Any, builder: Any, kind: Any, emitted: Any) -> Any:
+    """What an intrinsic must return for the value that it emitted."""
+    if kind == types.void:
+        return context.get_dummy_value()
+    return context.make_tuple(builder, kind, emitted) if isinstance(kind, types.UniTuple) else emitted
+
+
+def _operation(result: Any, *operands: Any) -> Callable[..., Any]:
+    """Make `emit(builder, *values)` callable in kernels, for values of these types."""
+
+    def decorate(emit: Callable[..., Any]) -> Any:
+        emit = inspect.unwrap(emit)
+
+        def typed(context, *args):
+            def generate(context, builder, sig, args):
+                return _result(context, builder, result, emit(builder, *args))
+
+            return result(*operands), generate
+
+        return _with_signature(typed, emit, *(f"operand{i}" for i in range(len(operands))))
+
+    return decorate
+
+
+def _access(result: Any, *operands: Any) -> Callable[..., Any]:
+    """Make `emit(builder, pointer, *values)` callable in kernels, with an array and an index for the pointer.
+
+    Args:
+        result, operands: types, or `_ELEMENT` for that of the array's elements.
+    """
+
+    def decorate(emit: Callable[..., Any]) -> Any:
+        emit = inspect.unwrap(emit)
+
+        def typed(context, array, index, *args):
+            returned, *values = (array.dtype if kind is _ELEMENT else kind for kind in (result, *operands))
+
+            def generate(context, builder, sig, args):
+                array, index, *values = args
+                pointer = _pointer(context, builder, sig.args[0], array, index)
+                return _result(context, builder, returned, emit(builder, pointer, *values))
+
+            return returned(array, types.intp, *values), generate
+
+        return _with_signature(typed, emit, "array", "index", *(f"value{i}" for i in range(len(operands))))
+
+    return decorate
+
+
+# Load, store, prefetch, broadcast. Those with a pointer take an array and an index: `load(array, index)`.
+
+
+@_access(f32x8)
+def load(builder, pointer):
     """Eight elements of a float32 array from `index` on."""
-
-    def generate(context, builder, sig, args):
-        return _load(builder, element_pointer(context, builder, sig, args), _FLOATS)
-
-    return f32x8(array, types.intp), generate
+    return _load(builder, pointer, _FLOATS)
 
 
-@llvm_intrinsic
-def load_four(context, array, index):
+@_access(f32x8)
+def load_four(builder, pointer):
     """Four elements of a float32 array from `index` on, and four zeros."""
+    four = _load(builder, pointer, _FOUR_FLOATS)
+    return _shuffle(builder, four, ir.Constant(_FOUR_FLOATS, None), range(LANES))
 
-    def generate(context, builder, sig, args):
-        four = _load(builder, element_pointer(context, builder, sig, args), _FOUR_FLOATS)
-        return _shuffle(builder, four, ir.Constant(_FOUR_FLOATS, None), range(LANES))
 
-    return f32x8(array, types.intp), generate
+@_access(f32x8)
+def load_broadcast(builder, pointer):
+    """Element `index` of a float32 array in every lane."""
+    return _splat(builder, builder.load(pointer), _FLOATS)
+
+
+@_access(_ELEMENT)
+def load_scalar(builder, pointer):
+    """One element, without the check for a negative index that `array[index]` makes."""
+    return builder.load(pointer)
+
+
+@_access(types.void, f32x8)
+def store(builder, pointer, value):
+    """Write eight elements of a float32 array from `index` on."""
+    _store(builder, value, pointer)
+
+
+@_access(types.void, f32x8)
+def store_nontemporal(builder, pointer, value):
+    """Write eight elements that are not read soon; their address must be a multiple of 32 bytes."""
+    stored = _store(builder, value, pointer)
+    stored.align = 4 * LANES
+    stored.set_metadata("nontemporal", builder.module.add_metadata([_INT(1)]))
+
+
+@_access(types.void, mask)
+def store_mask(builder, pointer, condition):
+    """Write the lanes of a mask as bytes from `index` on."""
+    _store(builder, builder.zext(condition, _BYTES), pointer)
+
+
+@_access(types.void, _ELEMENT)
+def store_scalar(builder, pointer, value):
+    """Write one element, without a check of the index."""
+    builder.store(value, pointer)
+
+
+@_access(types.void)
+def prefetch(builder, pointer):
+    """Prefetch the cache line of element `index` for a read."""
+    _prefetch(builder, pointer, is_write=0, locality=2)
+
+
+@_access(types.void)
+def prefetch_for_write(builder, pointer):
+    """Prefetch the cache line of element `index` for a write."""
+    _prefetch(builder, pointer, is_write=1, locality=3)
 
 
 @llvm_intrinsic
@@ -158,50 +251,6 @@ def load_row(context, rows, row, column):
         return _load(builder, _row_pointer(context, builder, sig.args[0], *args), _DOUBLES)
 
     return f64x8(rows, types.intp, types.intp), generate
-
-
-@llvm_intrinsic
-def load_broadcast(context, array, index):
-    """Element `index` of a float32 array in every lane."""
-
-    def generate(context, builder, sig, args):
-        return _splat(builder, builder.load(element_pointer(context, builder, sig, args)), _FLOATS)
-
-    return f32x8(array, types.intp), generate
-
-
-@llvm_intrinsic
-def load_scalar(context, array, index):
-    """One element, without the check for a negative index that `array[index]` makes."""
-
-    def generate(context, builder, sig, args):
-        return builder.load(element_pointer(context, builder, sig, args))
-
-    return array.dtype(array, types.intp), generate
-
-
-@llvm_intrinsic
-def store(context, array, index, value):
-    """Write eight elements of a float32 array from `index` on."""
-
-    def generate(context, builder, sig, args):
-        _store(builder, args[2], element_pointer(context, builder, sig, args))
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, f32x8), generate
-
-
-@llvm_intrinsic
-def store_nontemporal(context, array, index, value):
-    """Write eight elements that are not read soon; their address must be a multiple of 32 bytes."""
-
-    def generate(context, builder, sig, args):
-        stored = _store(builder, args[2], element_pointer(context, builder, sig, args))
-        stored.align = 4 * LANES
-        stored.set_metadata("nontemporal", builder.module.add_metadata([_INT(1)]))
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, f32x8), generate
 
 
 @llvm_intrinsic
@@ -217,34 +266,12 @@ def store_row(context, rows, row, column, value):
 
 
 @llvm_intrinsic
-def store_mask(context, array, index, condition):
-    """Write the lanes of a mask as bytes from `index` on."""
-
-    def generate(context, builder, sig, args):
-        _store(builder, builder.zext(args[2], _BYTES), element_pointer(context, builder, sig, args))
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, mask), generate
-
-
-@llvm_intrinsic
-def store_scalar(context, array, index, value):
-    """Write one element, without a check of the index."""
-
-    def generate(context, builder, sig, args):
-        builder.store(args[2], element_pointer(context, builder, sig, args))
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, array.dtype), generate
-
-
-@llvm_intrinsic
 def copy_four(context, target, target_index, source, source_index):
     """Copy four float32 from one array to another."""
 
     def generate(context, builder, sig, args):
-        to, source = (_pointer(context, builder, sig.args[i], args[i], args[i + 1]) for i in (0, 2))
-        _store(builder, _load(builder, source, _FOUR_FLOATS), to)
+        target, source = (_pointer(context, builder, sig.args[i], args[i], args[i + 1]) for i in (0, 2))
+        _store(builder, _load(builder, source, _FOUR_FLOATS), target)
         return context.get_dummy_value()
 
     return types.void(target, types.intp, source, types.intp), generate
@@ -254,98 +281,60 @@ def copy_four(context, target, target_index, source, source_index):
 def broadcast(context, number):
     """A number in every lane: an `f32x8` of a float32, else an `f64x8`."""
     single, vector = (types.float32, f32x8) if number == types.float32 else (types.float64, f64x8)
-
-    def generate(context, builder, sig, args):
-        return _splat(builder, args[0], _VECTOR_TYPES[vector.name])
-
-    return vector(single), generate
+    return vector(single), lambda context, builder, sig, args: _splat(builder, args[0], _VECTOR_TYPES[vector.name])
 
 
-@llvm_intrinsic
-def prefetch(context, array, index):
-    """Prefetch the cache line of element `index` for a read."""
-
-    def generate(context, builder, sig, args):
-        return _prefetch(context, builder, sig, args, is_write=0, locality=2)
-
-    return types.void(array, types.intp), generate
-
-
-@llvm_intrinsic
-def prefetch_for_write(context, array, index):
-    """Prefetch the cache line of element `index` for a write."""
-
-    def generate(context, builder, sig, args):
-        return _prefetch(context, builder, sig, args, is_write=1, locality=3)
-
-    return types.void(array, types.intp), generate
-
-
-@llvm_intrinsic
-def align_stack(context):
+@_operation(types.void)
+def align_stack(builder):
     """Align the kernel's stack to cache lines; called at its start, so that no spilled vector crosses a line."""
-
-    def generate(context, builder, sig, args):
-        # LLVM fixes the alignment before it allocates registers, by what is on the stack then: here an unused vector.
-        place = alloca_once(builder, _DOUBLES)
-        place.align = _CACHE_LINE
-        kind = ir.FunctionType(ir.VoidType(), [place.type])
-        builder.asm(kind, "", "r,~{memory}", [place], side_effect=True)
-        return context.get_dummy_value()
-
-    return types.void(), generate
+    # LLVM aligns the stack for what is on it before it allocates registers: here a vector that seems to be used.
+    place = alloca_once(builder, _DOUBLES)
+    place.align = _CACHE_LINE
+    kind = ir.FunctionType(ir.VoidType(), [place.type])
+    builder.asm(kind, "", "r,~{memory}", [place], side_effect=True)
 
 
 # Arithmetic, masks, bits.
 
 
-@llvm_intrinsic
-def to_f64(context, value):
+@_operation(f64x8, f32x8)
+def to_f64(builder, value):
     """Eight float32 as float64."""
-    return f64x8(f32x8), lambda context, builder, sig, args: builder.fpext(args[0], _DOUBLES)
+    return builder.fpext(value, _DOUBLES)
 
 
-@llvm_intrinsic
-def to_f32(context, value):
+@_operation(f32x8, f64x8)
+def to_f32(builder, value):
     """Eight float64 rounded to float32."""
-    return f32x8(f64x8), lambda context, builder, sig, args: builder.fptrunc(args[0], _FLOATS)
+    return builder.fptrunc(value, _FLOATS)
 
 
-@llvm_intrinsic
-def multiply_add(context, a, b, c):
+@_operation(f32x8, f32x8, f32x8, f32x8)
+def multiply_add(builder, a, b, c):
     """a b + c, rounded once where the processor can."""
-    return f32x8(f32x8, f32x8, f32x8), lambda context, builder, sig, args: _multiply_add(builder, *args)
+    return _multiply_add(builder, a, b, c)
 
 
-@llvm_intrinsic
-def exp2(context, value):
+@_operation(f32x8, f32x8)
+def exp2(builder, value):
     """2^value within 2e-7 relative, for -126 <= value <= 127; undefined elsewhere."""
-
-    def generate(context, builder, sig, args):
-        shifted = builder.fadd(args[0], _constant(_FLOATS, _ROUND_F32))
-        fraction = builder.fsub(args[0], builder.fsub(shifted, _constant(_FLOATS, _ROUND_F32)))
-        power = _constant(_FLOATS, _EXP2[-1])
-        for coefficient in reversed(_EXP2[:-1]):
-            power = _multiply_add(builder, power, fraction, _constant(_FLOATS, coefficient))
-        exponent = builder.shl(builder.bitcast(shifted, _INTS), _constant(_INTS, 23))
-        return builder.bitcast(builder.add(builder.bitcast(power, _INTS), exponent), _FLOATS)
-
-    return f32x8(f32x8), generate
+    shifted = builder.fadd(value, _constant(_FLOATS, _ROUND_F32))
+    fraction = builder.fsub(value, builder.fsub(shifted, _constant(_FLOATS, _ROUND_F32)))
+    power = _constant(_FLOATS, _EXP2[-1])
+    for coefficient in reversed(_EXP2[:-1]):
+        power = _multiply_add(builder, power, fraction, _constant(_FLOATS, coefficient))
+    exponent = builder.shl(builder.bitcast(shifted, _INTS), _constant(_INTS, 23))
+    return builder.bitcast(builder.add(builder.bitcast(power, _INTS), exponent), _FLOATS)
 
 
-@llvm_intrinsic
-def mantissa_and_exponent(context, value):
+@_operation(types.UniTuple(f64x8, 2), f64x8)
+def mantissa_and_exponent(builder, value):
     """m in [sqrt 1/2, sqrt 2) and a whole number e so that the value, above 0 and not subnormal, is m 2^e."""
-
-    def generate(context, builder, sig, args):
-        bits = builder.bitcast(args[0], _LONGS)
-        exponent = builder.ashr(builder.sub(bits, _constant(_LONGS, _ROOT_HALF_BITS)), _constant(_LONGS, 52))
-        mantissa = builder.bitcast(builder.sub(bits, builder.shl(exponent, _constant(_LONGS, 52))), _DOUBLES)
-        shifted = builder.bitcast(builder.add(exponent, _constant(_LONGS, _ROUND_F64_BITS)), _DOUBLES)
-        number = builder.fsub(shifted, _constant(_DOUBLES, _ROUND_F64))
-        return context.make_tuple(builder, sig.return_type, (mantissa, number))
-
-    return types.UniTuple(f64x8, 2)(f64x8), generate
+    bits = builder.bitcast(value, _LONGS)
+    exponent = builder.ashr(builder.sub(bits, _constant(_LONGS, _ROOT_HALF_BITS)), _constant(_LONGS, 52))
+    mantissa = builder.bitcast(builder.sub(bits, builder.shl(exponent, _constant(_LONGS, 52))), _DOUBLES)
+    shifted = builder.bitcast(builder.add(exponent, _constant(_LONGS, _ROUND_F64_BITS)), _DOUBLES)
+    return mantissa, builder.fsub(shifted, _constant(_DOUBLES, _ROUND_F64))
 
 
 @llvm_intrinsic
@@ -354,26 +343,22 @@ def select(context, condition, yes, no):
     return yes(mask, yes, yes), lambda context, builder, sig, args: builder.select(*args)
 
 
-@llvm_intrinsic
-def any_lane(context, condition):
+@_operation(types.boolean, mask)
+def any_lane(builder, condition):
     """Whether any lane of a mask is true."""
-    return types.boolean(mask), lambda context, builder, sig, args: _any(builder, args[0])
+    return _any(builder, condition)
 
 
-@llvm_intrinsic
-def mask_bits(context, condition):
+@_operation(types.uint64, mask)
+def mask_bits(builder, condition):
     """The lanes of a mask as the lowest bits of a number."""
-
-    def generate(context, builder, sig, args):
-        return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), _LONG)
-
-    return types.uint64(mask), generate
+    return builder.zext(builder.bitcast(condition, ir.IntType(LANES)), _LONG)
 
 
-@llvm_intrinsic
-def popcount(context, bits):
+@_operation(types.intp, types.uint64)
+def popcount(builder, bits):
     """How many bits of an unsigned 64-bit number are set."""
-    return types.intp(types.uint64), lambda context, builder, sig, args: builder.ctpop(args[0])
+    return builder.ctpop(bits)
 
 
 @llvm_intrinsic
@@ -384,87 +369,62 @@ def list_set_bits(context, array, index, bits, base):
     """
 
     def generate(context, builder, sig, args):
-        (_, _, bits, base), pointer = args, element_pointer(context, builder, sig, args)
-        base = builder.trunc(base, _BYTE)
-        if "+avx512vbmi2" in context.codegen().magic_tuple()[2].split(","):
-            _compress_positions(builder, pointer, bits, base)
-        else:
-            loop_over_set_bits(builder, pointer, bits, base)
+        array, index, bits, base = args
+        has_compress = "+avx512vbmi2" in context.codegen().magic_tuple()[2].split(",")
+        emit = _compress_positions if has_compress else _loop_over_set_bits
+        emit(builder, _pointer(context, builder, sig.args[0], array, index), bits, builder.trunc(base, _BYTE))
         return context.get_dummy_value()
 
     return types.void(array, types.intp, types.uint64, types.intp), generate
 
 
-@llvm_intrinsic
-def max_magnitude(context, largest, value):
-    """The larger of two magnitudes lane by lane, as bits without the sign: NaN and infinity are the largest."""
-    return f32x8(f32x8, f32x8), lambda context, builder, sig, args: _max_magnitude(builder, *args)
-
-
-@llvm_intrinsic
-def any_magnitude_reaches(context, largest, bound):
-    """Whether a magnitude of `max_magnitude` reaches a bound, given as twice its bits."""
-
-    def generate(context, builder, sig, args):
-        reached = builder.icmp_unsigned(">=", builder.bitcast(args[0], _INTS), _splat(builder, args[1], _INTS))
-        return _any(builder, reached)
-
-    return types.boolean(f32x8, types.uint32), generate
+@_operation(types.boolean, f32x8, types.uint32)
+def any_magnitude_reaches(builder, largest, bound):
+    """Whether a magnitude of `aos3_to_soa` and the like reaches a bound, given as twice its bits."""
+    return _any(builder, builder.icmp_unsigned(">=", builder.bitcast(largest, _INTS), _splat(builder, bound, _INTS)))
 
 
 # Movement between lanes.
 
 
-@llvm_intrinsic
-def first_lane(context, value):
+@_operation(types.float32, f32x8)
+def first_lane(builder, value):
     """The first lane."""
-    return types.float32(f32x8), lambda context, builder, sig, args: builder.extract_element(args[0], _INT(0))
+    return builder.extract_element(value, _INT(0))
 
 
-@llvm_intrinsic
-def lane_sums(context, a, b, c, d, e, f, g, h):
+@_operation(f32x8, *[f32x8] * LANES)
+def lane_sums(builder, *rows):
     """The sums over the lanes of eight vectors, in order."""
-
-    def generate(context, builder, sig, args):
-        rows, half = list(args), LANES // 2
-        while half:
-            # Pair row i with row i + half; add the two halves of every group of 2 half lanes.
-            pairs = zip(rows[:half], rows[half:], strict=True)
-            rows = [builder.fadd(*_halves(builder, low, high, half)) for low, high in pairs]
-            half //= 2
-        return rows[0]
-
-    return f32x8(*[f32x8] * LANES), generate
+    half = LANES // 2
+    while half:
+        # Pair row i with row i + half; add the two halves of every group of 2 half lanes.
+        pairs = zip(rows[:half], rows[half:], strict=True)
+        rows = [builder.fadd(*_halves(builder, low, high, half)) for low, high in pairs]
+        half //= 2
+    return rows[0]
 
 
-@llvm_intrinsic
-def transpose(context, a, b, c, d, e, f, g, h):
+@_operation(types.UniTuple(f32x8, LANES), *[f32x8] * LANES)
+def transpose(builder, *rows):
     """The columns of the square whose rows are eight vectors."""
-
-    def generate(context, builder, sig, args):
-        rows, half = list(args), LANES // 2
-        while half:
-            swapped = list(rows)
-            for row in range(LANES):
-                if not row & half:
-                    swapped[row], swapped[row + half] = _halves(builder, rows[row], rows[row + half], half)
-            rows, half = swapped, half // 2
-        return context.make_tuple(builder, sig.return_type, rows)
-
-    return types.UniTuple(f32x8, LANES)(*[f32x8] * LANES), generate
+    half = LANES // 2
+    while half:
+        swapped = list(rows)
+        for row in range(LANES):
+            if not row & half:
+                swapped[row], swapped[row + half] = _halves(builder, rows[row], rows[row + half], half)
+        rows, half = swapped, half // 2
+    return rows
 
 
-@llvm_intrinsic
-def join_halves(context, a, b):
+@_operation(types.UniTuple(f32x8, 2), f32x8, f32x8)
+def join_halves(builder, a, b):
     """The lower halves of two vectors as one, and the upper halves; it is its own inverse.
 
     Two blocks of two rows of four pixels become two rows of eight.
     """
-
-    def generate(context, builder, sig, args):
-        return context.make_tuple(builder, sig.return_type, _halves(builder, *args, LANES // 2))
-
-    return types.UniTuple(f32x8, 2)(f32x8, f32x8), generate
+    return _halves(builder, a, b, LANES // 2)
 
 
 @llvm_intrinsic
@@ -644,11 +604,6 @@ def soa_to_records(soa, width, start, count, records):
 # LLVM code that several of the above emit.
 
 
-def element_pointer(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """The address of element `args[1]` of the flat array `args[0]`."""
-    return _pointer(context, builder, sig.args[0], args[0], args[1])
-
-
 def _pointer(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
     return builder.gep(context.make_array(kind)(context, builder, array).data, [index])
 
@@ -671,12 +626,11 @@ def _store(builder: Any, value: Any, pointer: Any) -> Any:
     return stored
 
 
-def _prefetch(context: Any, builder: Any, sig: Any, args: Any, *, is_write: int, locality: int) -> Any:
-    pointer = builder.bitcast(element_pointer(context, builder, sig, args), _BYTE.as_pointer())
+def _prefetch(builder: Any, pointer: Any, *, is_write: int, locality: int) -> None:
+    pointer = builder.bitcast(pointer, _BYTE.as_pointer())
     kind = ir.FunctionType(ir.VoidType(), [pointer.type, _INT, _INT, _INT])
     function = get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
     builder.call(function, [pointer, _INT(is_write), _INT(locality), _INT(1)])
-    return context.get_dummy_value()
 
 
 def _constant(kind: Any, number: float) -> ir.Constant:
@@ -752,7 +706,7 @@ def _compress_positions(builder: Any, pointer: Any, bits: Any, base: Any) -> Non
     builder.store(found, builder.bitcast(pointer, kind.as_pointer())).align = 1
 
 
-def loop_over_set_bits(builder: Any, pointer: Any, bits: Any, base: Any) -> None:
+def _loop_over_set_bits(builder: Any, pointer: Any, bits: Any, base: Any) -> None:
     """List set bits one by one."""
     before, one = builder.block, bits.type(1)
     test, body, after = (builder.append_basic_block(name) for name in ("test", "body", "after"))

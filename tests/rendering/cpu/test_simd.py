@@ -147,16 +147,10 @@ def test_exp2_is_within_two_roundings():
     assert np.array_equal(out[2:], np.ldexp(np.float32(1), np.arange(-126, 128)))
 
 
-@simd.llvm_intrinsic
-def _list_in_a_loop(context, array, index, word, base):
+@simd._access(types.void, types.uint64, types.intp)
+def _list_in_a_loop(builder, pointer, bits, base):
     """What `list_set_bits` does on processors without AVX-512's compress instruction."""
-
-    def generate(context, builder, sig, args):
-        pointer = simd.element_pointer(context, builder, sig, args)
-        simd.loop_over_set_bits(builder, pointer, args[2], builder.trunc(args[3], simd._BYTE))
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, types.uint64, types.intp), generate
+    simd._loop_over_set_bits(builder, pointer, bits, builder.trunc(base, simd._BYTE))
 
 
 @numba.njit
