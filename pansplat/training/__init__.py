@@ -1,4 +1,4 @@
-"""Training: losses, the loop, and what keeps it in little memory. `pansplat-train PRESET` runs it."""
+"""Training: losses, deferred backpropagation, and the training loop. `pansplat-train PRESET` runs it."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""The `pansplat-train` command; also `python -m pansplat.training`, as torchrun starts it."""
+"""The `pansplat-train` command. `python -m pansplat.training` runs it too, for torchrun."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Train and return the exit status: 0 done, 2 bad input, 130 stopped and saved."""
+    """Train and return the exit status: 0 done, 2 invalid input, 130 stopped and saved."""
     return run_command(
         lambda: _train(parse(argv)),
         memory_advice="choose lower --heights, a smaller --optimizer.batch-size, or --memory.backpropagation two-step "
         "with more --memory.tiles.",
-        interruption="steps after the last checkpoint are lost; the same command goes on from it",
+        interruption="steps after the last checkpoint are lost; run the same command to resume from it",
     )
 
 
@@ -31,11 +31,11 @@ def _train(config: TrainConfig) -> int:
         try:
             return 0 if Trainer(config, processes).train() else 130
         finally:
-            processes.leave()
+            processes.destroy()
 
 
 def parse(argv: Sequence[str] | None = None) -> TrainConfig:
-    """The settings that the arguments ask for; else prints help or what is wrong with them, and exits."""
+    """The settings of a command line. Prints help or errors and exits like argparse."""
     import tyro
 
     from pansplat.training.config import PRESETS
@@ -44,7 +44,7 @@ def parse(argv: Sequence[str] | None = None) -> TrainConfig:
         PRESETS,
         args=argv,
         prog="pansplat-train",
-        description="Train a network. A run that was stopped goes on with the same command.",
+        description="Train a network. Run the same command again to resume a stopped run.",
         config=(tyro.conf.FlagCreatePairsOff,),
     )
 

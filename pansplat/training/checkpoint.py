@@ -1,7 +1,6 @@
-"""A run on disk: numbered checkpoints that appear whole or not at all, the newest one that can be read, old ones gone.
+"""Checkpoints of a training run, written atomically and numbered by step.
 
-A checkpoint holds tensors and plain values only. It is read without running what it holds; a file that asks for that
-is refused.
+A checkpoint holds tensors and plain values only. It is loaded without executing code; a file with code is refused.
 """
 
 from __future__ import annotations
@@ -25,17 +24,17 @@ _NAME = re.compile(r"step_(\d{8})\.pt")
 
 
 def checkpoint_path(folder: Path, step: int) -> Path:
-    """Where the checkpoint after so many steps is."""
+    """Path of the checkpoint after `step` steps."""
     return folder / f"step_{step:08d}.pt"
 
 
 def save_checkpoint(folder: Path, step: int, state: Mapping[str, Any], *, keep: int) -> Path:
-    """Write the checkpoint after so many steps, then delete all but the newest `keep`.
+    """Write the checkpoint after `step` steps, then delete all but the newest `keep` checkpoints.
 
-    The file is on the disk before it takes its name, so that a kill or a power cut leaves the ones before it.
+    The file is synced to disk before it is renamed, so that older checkpoints survive a kill or a power failure.
 
     Raises:
-        InputError: no room, or no right to write; what was there stays.
+        InputError: the disk is full or not writable; older checkpoints are kept.
     """
     path = checkpoint_path(folder, step)
     folder.mkdir(parents=True, exist_ok=True)
@@ -45,7 +44,7 @@ def save_checkpoint(folder: Path, step: int, state: Mapping[str, Any], *, keep: 
                 torch.save({"kind": _KIND, "format": _FORMAT, "step": step, **state}, file)
                 file.flush()
                 os.fsync(file.fileno())
-        except RuntimeError as error:  # torch's word for a disk that is full
+        except RuntimeError as error:  # raised by torch when the disk is full
             raise OSError(0, str(error).splitlines()[0]) from error
     for old in checkpoints(folder)[:-keep]:
         old.unlink(missing_ok=True)
@@ -53,21 +52,23 @@ def save_checkpoint(folder: Path, step: int, state: Mapping[str, Any], *, keep: 
 
 
 def checkpoints(folder: Path) -> list[Path]:
-    """Those of a run, oldest first."""
+    """Paths of the checkpoints in a folder, oldest first."""
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if _NAME.fullmatch(path.name))
 
 
 def load_latest(folder: Path) -> tuple[Path, dict[str, Any]] | None:
-    """The newest checkpoint that can be read, with what it holds; None where there is none at all.
+    """Path and content of the newest readable checkpoint; None if there are no checkpoints.
 
-    Remains of writes that were cut off are deleted. A damaged checkpoint is passed over, and a warning says so.
+    Deletes incomplete files. Skips damaged checkpoints with a warning.
 
     Raises:
-        InputError: there are checkpoints and none can be read, or one asks for code to be run.
+        InputError: no checkpoint is readable, or one contains code.
     """
-    _sweep(folder)
+    if folder.is_dir():
+        for partial in folder.glob(".step_*.pt"):
+            partial.unlink(missing_ok=True)
     found = checkpoints(folder)
     failures = []
     for path in reversed(found):
@@ -77,17 +78,17 @@ def load_latest(folder: Path) -> tuple[Path, dict[str, Any]] | None:
             if "asks to run" in str(error):
                 raise
             failures.append(str(error))
-            warnings.warn(f"passed over a checkpoint: {error}", stacklevel=2)
+            warnings.warn(f"skipped a checkpoint: {error}", stacklevel=2)
     if failures:
-        raise InputError(f"{folder}: needed a checkpoint that can be read, got none:\n  " + "\n  ".join(failures))
+        raise InputError(f"{folder}: needed a readable checkpoint, got none:\n  " + "\n  ".join(failures))
     return None
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """What a checkpoint of training holds.
+    """Content of a training checkpoint.
 
     Raises:
-        InputError: damaged, no checkpoint of training, of another format, or one that asks for code to be run.
+        InputError: damaged, not a training checkpoint, of another format, or containing code.
     """
     content = read_checkpoint(path)
     if not is_training_state(content):
@@ -101,22 +102,19 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def is_training_state(content: Mapping[str, Any]) -> bool:
-    """Whether a file's contents are those of a checkpoint of training."""
+    """Whether the content of a file is that of a training checkpoint."""
     return content.get("kind") == _KIND
 
 
 def weights_of(content: Mapping[str, Any], path: Path) -> WeightsFile:
-    """The weights in a checkpoint of training: their running mean, if there is one."""
+    """The weights of a training checkpoint: their moving average, if there is one.
+
+    Raises:
+        InputError: weights are missing or invalid.
+    """
     try:
-        described = json.loads(content["weights"])
+        header = json.loads(content["weights"])
         tensors = content["mean"] if content.get("mean") else content["network"]
-        return WeightsFile(described["model"], described["config"], COMPATS[described["compat"]], dict(tensors))
+        return WeightsFile(header["model"], header["config"], COMPATS[header["compat"]], dict(tensors))
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: needed weights in the checkpoint, got {error!r}; take another.") from error
-
-
-def _sweep(folder: Path) -> None:
-    """Delete what writes that were cut off left behind."""
-    if folder.is_dir():
-        for path in folder.glob(".step_*.pt"):
-            path.unlink(missing_ok=True)
+        raise InputError(f"{path}: needed weights in the checkpoint, got {error!r}; use another file.") from error

@@ -1,4 +1,4 @@
-"""Every setting of a training run. Frozen, typed, and each field's docstring is its help on the command line."""
+"""Settings of a training run, and presets. The docstring of each field is its help on the command line."""
 
 from __future__ import annotations
 
@@ -24,98 +24,98 @@ Mixing = Literal["joint", "by_view"]
 
 @dataclass(frozen=True)
 class DataConfig:
-    """What is trained on."""
+    """Training data."""
 
     kind: DataKind = "generated"
-    """generated: rooms made up on the way, no files. panogrf, 360loc, insta360: these data sets. pairs: a folder as
-    `pansplat predict` takes it, with targets. triplets: NAME.json with NAME_0.png ... beside it."""
+    """generated: rooms generated during training, no files. panogrf, 360loc, insta360: these data sets. pairs: a folder
+    as for `pansplat predict`, with targets. triplets: NAME.json with NAME_0.png ... next to it."""
     root: Path | None = None
-    """Folder of the data; none for generated."""
+    """Folder of the data; not used for generated."""
     validation_root: Path | None = None
-    """Folder of the data to compare with for pairs and triplets; by default the same."""
+    """Folder of the validation data of insta360, pairs and triplets; the same by default."""
     draws: int = 1000
-    """Random pairs a sequence and epoch, of 360loc and insta360."""
+    """Random pairs per sequence and epoch, of 360loc and insta360."""
     training_gap: Literal["uniform", "original"] = "uniform"
-    """Frames between the inputs: drawn from all gaps, or always the least, as the original does."""
+    """Frames between the inputs: uniformly random, or always the smallest gap, as in the official code."""
     workers: int = 2
-    """Processes that read; 0 to read in this one."""
+    """Processes that read data; 0 to read in the training process."""
     augmentation: Augmentation | None = field(default_factory=Augmentation)
-    """What may change in a sample; the original changes nothing."""
+    """Random changes of samples; the official code has none."""
 
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """What is trained."""
+    """The network that is trained."""
 
     shape: NetworkShape = "paper"
-    """The paper's network, smaller ones of the same plan without the monocular network, or the MVSplat baseline."""
+    """The paper's network, smaller ones with the same stages but no monocular network, or the MVSplat baseline."""
     compat: Compat = "fixed"
-    """Whether to train with the original's defects ("official") or without."""
+    """Whether to train with the defects of the official code ("official") or without them."""
     precision: Precision = "float32"
     """Number type of the convolutions (mixed precision); weights, depths and positions stay float32."""
     attention_precision: AttentionPrecision = "float32"
-    """What attention rounds its inputs to."""
+    """Number type to which the inputs of attention are rounded."""
     init: Path | None = None
-    """Weights to begin with: a .safetensors, an original .ckpt, or a checkpoint of pansplat-train."""
+    """Initial weights: a .safetensors, an official .ckpt, or a checkpoint of pansplat-train."""
     frozen: tuple[Part, ...] = ()
-    """Parts that do not learn; their normalisation statistics stay as they are."""
+    """Parts that are not trained; their normalisation statistics do not change either."""
     auxiliary: bool = False
-    """Whether each level of the cost volume also draws a picture by itself (for data without true depth)."""
+    """Whether images are also rendered from each level of the cost volume alone (for data without true depth)."""
 
 
 @dataclass(frozen=True)
 class MemoryConfig:
-    """How gradients are found, which is a matter of memory only."""
+    """How gradients are computed; affects memory and time only."""
 
     backpropagation: Backpropagation = "plain"
-    """plain: one graph. one-step: the heads' Gaussians tile by tile. two-step: and the picture face by face."""
+    """plain: one graph. one-step: the heads tile by tile. two-step: the image face by face too."""
     tiles: int = 1
-    """Tiles along each side of the panorama."""
+    """Number of tiles along each side of the panorama."""
     style: Style = "panorama"
-    """panorama: a ray a pixel. cubemap: six faces. original: six faces as the original code draws them."""
+    """panorama: one ray per pixel. cubemap: six cube faces. original: six cube faces as in the official code."""
     mixing: Mixing = "joint"
-    """joint: all views' Gaussians in one picture. by_view: a picture a view, mixed by distance."""
+    """joint: all views' Gaussians in one image. by_view: one image per view, blended by distance."""
 
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """How the weights move."""
+    """Optimisation of the weights."""
 
     steps: int = 1000
     batch_size: int = 2
-    """Samples a step, process and round of accumulation."""
+    """Samples per step, process and round of accumulation."""
     accumulate: int = 1
-    """Rounds of backpropagation a step."""
+    """Rounds of gradient accumulation per step."""
     rate: float = 2e-4
-    """Of Adam, at the schedule's peak."""
+    """Peak learning rate of Adam."""
     clip: float = 0.5
     """Largest norm of the gradient."""
     ema: float = 0.0
-    """Decay of the running mean of the weights that is validated and written out; 0 for none."""
+    """Decay of the exponential moving average of the weights, which is validated and saved; 0 for none."""
 
 
 @dataclass(frozen=True)
 class ValidationConfig:
-    """What is looked at on the way."""
+    """Validation during training."""
 
     every: int = 1000
     """Steps; 0 for never."""
     samples: int = 16
-    """Compared each time, always the same."""
+    """Samples per validation, always the same ones."""
     pictures: int = 2
-    """Written as PNG each time: what should be seen above what is."""
+    """Images written as PNG per validation: the target above, the rendering below."""
 
 
 @dataclass(frozen=True)
 class CheckpointConfig:
-    """What is kept on disk."""
+    """Checkpoints on disk."""
 
     every: int = 1000
-    """Steps; 0 for never but at the end."""
+    """Steps; 0 for the last step only."""
     minutes: float = 10.0
-    """And after so many minutes; infinity for never."""
+    """Also after this number of minutes; infinity for never."""
     keep: int = 2
-    """Older ones are deleted."""
+    """Number of checkpoints to keep."""
 
 
 @dataclass(frozen=True)
@@ -123,12 +123,12 @@ class TrainConfig:
     """A training run."""
 
     out: Path = Path("runs/run")
-    """Folder of the run; one that holds a checkpoint is gone on with."""
+    """Folder of the run; training is resumed from its latest checkpoint."""
     heights: tuple[int, ...] = (512,)
-    """Of the panoramas, pixels; several share the steps evenly, one after another (progressive resolution)."""
+    """Heights of the panoramas, pixels; each is used for an equal number of steps (progressive resolution)."""
     seed: int = 111123
     perceptual: PerceptualName = "auto"
-    """auto: LPIPS where its files are here, else a measure without weights."""
+    """auto: LPIPS if its files are available, else a distance without weights."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     loss: LossWeights = field(default_factory=LossWeights)
     data: DataConfig = field(default_factory=DataConfig)
@@ -139,15 +139,15 @@ class TrainConfig:
     checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
 
     def height_at(self, step: int) -> int:
-        """Of the panoramas of a step, pixels."""
-        share = min(step, self.optimizer.steps - 1) * len(self.heights) // max(1, self.optimizer.steps)
-        return self.heights[share]
+        """Height of the panoramas of a step, pixels."""
+        index = min(step, self.optimizer.steps - 1) * len(self.heights) // max(1, self.optimizer.steps)
+        return self.heights[index]
 
     def check(self) -> None:
-        """Refuse what cannot be trained.
+        """Check the settings.
 
         Raises:
-            InputError: a setting out of range, or settings that do not go together.
+            InputError: a setting out of range, or settings that contradict each other.
         """
         o = self.optimizer
         wrong = [
@@ -173,36 +173,37 @@ class TrainConfig:
         if self.network.auxiliary and self.network.shape == "mvsplat":
             raise InputError("--network.auxiliary needs a hierarchical cost volume, which the mvsplat baseline lacks.")
         if self.network.frozen and self.network.shape == "mvsplat":
-            raise InputError("--network.frozen names parts of PanSplat, got the mvsplat baseline; leave it out.")
+            raise InputError("--network.frozen names parts of PanSplat, got the mvsplat baseline; remove the option.")
 
 
-_FREE_TO_CHANGE = ("out", "device", "checkpoint", "validation")
-"""Settings that another part of the same run may change without changing what is learnt."""
+_CHANGEABLE = ("out", "device", "checkpoint", "validation")
+"""Settings that do not affect the training result; they may change when a run is resumed."""
 
 
 def as_json(config: TrainConfig) -> str:
-    """All settings, resolved."""
+    """All settings as JSON."""
     return json.dumps(dataclasses.asdict(config), default=str, indent=2)
 
 
-def require_same(kept: str, config: TrainConfig, source: Path) -> None:
-    """Refuse to go on with a run under other settings.
+def require_same(saved: str, config: TrainConfig, source: Path) -> None:
+    """Check that a run is resumed with its own settings.
 
     Args:
-        kept: what `as_json` made of the run's settings.
+        saved: settings of the run, from `as_json`.
+        source: the checkpoint that error messages name.
 
     Raises:
-        InputError: naming the settings that differ.
+        InputError: settings differ; the message names them.
     """
-    old, new = json.loads(kept), json.loads(as_json(config))
-    for free in _FREE_TO_CHANGE:
-        old.pop(free, None), new.pop(free, None)
+    old, new = json.loads(saved), json.loads(as_json(config))
     for settings in (old, new):
+        for name in _CHANGEABLE:
+            settings.pop(name, None)
         settings.get("data", {}).pop("workers", None)
     changed = _differences(old, new)
     if changed:
         raise InputError(
-            f"{source}: this run was begun with other settings ({'; '.join(changed[:4])}); go on with the same, or "
+            f"{source}: this run was started with other settings ({'; '.join(changed[:4])}); use the same settings, or "
             "give another --out."
         )
 
@@ -214,17 +215,21 @@ def _differences(old: object, new: object, name: str = "") -> list[str]:
     return [] if old == new else [f"{name.lstrip('.')} was {old}, now {new}"]
 
 
-_TRIPLETS = 19_950
-_SEQUENCES = 13
+# Presets: the stages of the paper (docs/official.md, section 14), and small models. The paper's presets have the loss
+# weights of the official code, with which the published checkpoints were trained. Numbers of steps follow from epochs,
+# numbers of samples and batch sizes.
+
+_TRIPLETS = 19_950  # of Matterport3D
+_SEQUENCES = 13  # of 360Loc
 _MATTERPORT = DataConfig(kind="panogrf", workers=10, augmentation=None)
 _PLAIN = MemoryConfig(style="cubemap")
-_FOUR = MemoryConfig("two-step", 2, "cubemap")
-_SIXTEEN = MemoryConfig("two-step", 4, "cubemap")
+_TILED_2X2 = MemoryConfig("two-step", 2, "cubemap")
+_TILED_4X4 = MemoryConfig("two-step", 4, "cubemap")
 _FROZEN = ("features", "cost_volume")
 _WITHOUT_DEPTH = replace(CODE, depth=0.0)
 
 
-def _matterport(
+def _matterport_preset(
     name: str,
     height: int,
     batch: int,
@@ -234,7 +239,7 @@ def _matterport(
     memory: MemoryConfig,
     validations: float = 1.0,
 ) -> TrainConfig:
-    an_epoch = _TRIPLETS // batch
+    steps_per_epoch = _TRIPLETS // batch
     return TrainConfig(
         out=Path("runs") / name,
         heights=(height,),
@@ -243,15 +248,15 @@ def _matterport(
         data=_MATTERPORT,
         network=network,
         memory=memory,
-        optimizer=OptimizerConfig(steps=epochs * an_epoch, batch_size=batch),
-        validation=ValidationConfig(every=int(an_epoch / validations)),
+        optimizer=OptimizerConfig(steps=epochs * steps_per_epoch, batch_size=batch),
+        validation=ValidationConfig(every=int(steps_per_epoch / validations)),
     )
 
 
-def _hall(
+def _loc360_preset(
     name: str, height: int, batch: int, epochs: int, draws: int, network: NetworkConfig, memory: MemoryConfig
 ) -> TrainConfig:
-    an_epoch = _SEQUENCES * draws // batch
+    steps_per_epoch = _SEQUENCES * draws // batch
     return TrainConfig(
         out=Path("runs") / name,
         heights=(height,),
@@ -260,11 +265,11 @@ def _hall(
         data=DataConfig(kind="360loc", draws=draws, workers=10, augmentation=None, training_gap="original"),
         network=network,
         memory=replace(memory, mixing="by_view" if network.shape == "paper" else "joint"),
-        optimizer=OptimizerConfig(steps=max(1, epochs * an_epoch), batch_size=batch),
+        optimizer=OptimizerConfig(steps=max(1, epochs * steps_per_epoch), batch_size=batch),
     )
 
 
-def _own(
+def _small_preset(
     name: str, shape: str, heights: tuple[int, ...], steps: int, batch: int, rate: float, every: int
 ) -> TrainConfig:
     return TrainConfig(
@@ -283,45 +288,51 @@ _MVSPLAT = NetworkConfig(shape="mvsplat")
 
 PRESETS: dict[str, tuple[str, TrainConfig]] = {
     "tiny": (
-        "no files, minutes on a CPU: a very small network on generated rooms, 64x128",
-        _own("tiny", "tiny", (64,), 300, 2, 2e-3, 100),
+        "no files, minutes on a CPU: a very small network, generated rooms, 64x128",
+        _small_preset("tiny", "tiny", (64,), 300, 2, 2e-3, 100),
     ),
     "small": (
-        "no files, a day on a CPU: a small network on generated rooms, 128x256 then 256x512",
-        _own("small", "small", (128, 256), 20_000, 2, 1e-3, 1000),
+        "no files, a day on a CPU: a small network, generated rooms, 128x256 then 256x512",
+        _small_preset("small", "small", (128, 256), 20_000, 2, 1e-3, 1000),
     ),
     "pansplat-256": (
-        "the paper's first stage, Matterport3D at 256x512; needs weights of the monocular network in --network.init",
-        _matterport("pansplat-256", 256, 6, 10, CODE, NetworkConfig(), _PLAIN),
+        "the paper's first stage, Matterport3D at 256x512; --network.init must hold the monocular network's weights",
+        _matterport_preset("pansplat-256", 256, 6, 10, CODE, NetworkConfig(), _PLAIN),
     ),
     "pansplat-512": (
-        "the second, 512x1024, from the first",
-        _matterport("pansplat-512", 512, 2, 5, CODE, NetworkConfig(), _PLAIN),
+        "the paper's second stage, 512x1024, from the first",
+        _matterport_preset("pansplat-512", 512, 2, 5, CODE, NetworkConfig(), _PLAIN),
     ),
     "pansplat-1024": (
         "heads only, 1024x2048, two-step, 2x2 tiles, from pansplat-512",
-        _matterport("pansplat-1024", 1024, 3, 3, _WITHOUT_DEPTH, NetworkConfig(frozen=_FROZEN), _FOUR, 2),
+        _matterport_preset("pansplat-1024", 1024, 3, 3, _WITHOUT_DEPTH, NetworkConfig(frozen=_FROZEN), _TILED_2X2, 2),
     ),
     "pansplat-2048": (
         "heads only, 2048x4096, two-step, 4x4 tiles, from pansplat-512",
-        _matterport("pansplat-2048", 2048, 1, 3, _WITHOUT_DEPTH, NetworkConfig(frozen=_FROZEN), _SIXTEEN, 2),
+        _matterport_preset("pansplat-2048", 2048, 1, 3, _WITHOUT_DEPTH, NetworkConfig(frozen=_FROZEN), _TILED_4X4, 2),
     ),
     "pansplat-512-360loc": (
-        "real halls, 512x1024, with auxiliary heads, from pansplat-512",
-        _hall("pansplat-512-360loc", 512, 2, 5, 1000, NetworkConfig(auxiliary=True), _PLAIN),
+        "360Loc, 512x1024, with auxiliary heads, from pansplat-512",
+        _loc360_preset("pansplat-512-360loc", 512, 2, 5, 1000, NetworkConfig(auxiliary=True), _PLAIN),
     ),
     "pansplat-1024-360loc": (
         "heads only, 1024x2048, from pansplat-512-360loc",
-        _hall("pansplat-1024-360loc", 1024, 3, 200, 10, NetworkConfig(frozen=_FROZEN), _FOUR),
+        _loc360_preset("pansplat-1024-360loc", 1024, 3, 200, 10, NetworkConfig(frozen=_FROZEN), _TILED_2X2),
     ),
     "pansplat-2048-360loc": (
         "heads only, 2048x4096, from pansplat-1024-360loc",
-        _hall("pansplat-2048-360loc", 2048, 1, 100, 10, NetworkConfig(frozen=_FROZEN), _SIXTEEN),
+        _loc360_preset("pansplat-2048-360loc", 2048, 1, 100, 10, NetworkConfig(frozen=_FROZEN), _TILED_4X4),
     ),
-    "mvsplat-256": ("the baseline, 256x512", _matterport("mvsplat-256", 256, 6, 10, _WITHOUT_DEPTH, _MVSPLAT, _PLAIN)),
-    "mvsplat-512": ("the baseline, 512x1024", _matterport("mvsplat-512", 512, 1, 10, _WITHOUT_DEPTH, _MVSPLAT, _PLAIN)),
+    "mvsplat-256": (
+        "the baseline on Matterport3D, 256x512",
+        _matterport_preset("mvsplat-256", 256, 6, 10, _WITHOUT_DEPTH, _MVSPLAT, _PLAIN),
+    ),
+    "mvsplat-512": (
+        "the baseline on Matterport3D, 512x1024",
+        _matterport_preset("mvsplat-512", 512, 1, 10, _WITHOUT_DEPTH, _MVSPLAT, _PLAIN),
+    ),
     "mvsplat-512-360loc": (
-        "the baseline on real halls, from mvsplat-512",
-        _hall("mvsplat-512-360loc", 512, 1, 5, 1000, _MVSPLAT, _PLAIN),
+        "the baseline on 360Loc, 512x1024, from mvsplat-512",
+        _loc360_preset("mvsplat-512-360loc", 512, 1, 5, 1000, _MVSPLAT, _PLAIN),
     ),
 }

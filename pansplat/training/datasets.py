@@ -1,4 +1,4 @@
-"""Training and validation data of a run."""
+"""Training and validation data of a run, without the game maps that are reserved for evaluation."""
 
 from __future__ import annotations
 
@@ -25,78 +25,6 @@ from pansplat.data.sources import (
 from pansplat.errors import InputError
 from pansplat.training.config import DataConfig
 
-_OTHER_HOMES = 1_000_003  # apart from the seeds of training
-_FEW_DRAWS = 4  # pairs of each sequence to compare with
-
-
-def sources(config: DataConfig, height: int, seed: int) -> tuple[SampleSource, SampleSource]:
-    """What is trained on, and what is compared with on the way; the latter has one target a sample.
-
-    Triplets of maps that are reserved for evaluation are in neither.
-
-    Args:
-        height: of the panoramas, which decides on the folder of some data sets.
-
-    Raises:
-        InputError: the data are not there, or wrong.
-    """
-    if config.kind == "generated":
-        return GeneratedTriplets(seed), GeneratedTriplets(seed + _OTHER_HOMES)
-    assert config.root is not None
-    return _READERS[config.kind](config, config.root, height)
-
-
-def _panogrf(config: DataConfig, root: Path, height: int) -> tuple[SampleSource, SampleSource]:
-    training, validation = (read_panogrf(root, stage, height) for stage in ("train", "val"))
-    return ConcatSource([TripletSource(t) for t in training]), ConcatSource([TripletSource(t) for t in validation])
-
-
-def _loc360(config: DataConfig, root: Path, height: int) -> tuple[SampleSource, SampleSource]:
-    sampler = BoundedSampler(2, 5, config.training_gap)
-    training = RandomFramePairs(read_loc360(root, "train"), sampler, config.draws)
-    return training, FixedFramePairs(read_loc360(root, "val"), lambda n: sampler.evaluation(n, _FEW_DRAWS))
-
-
-def _insta360(config: DataConfig, root: Path, height: int) -> tuple[SampleSource, SampleSource]:
-    sampler = BoundedSampler(2, 30, config.training_gap)
-    films = read_insta360(root)
-    validation = films if config.validation_root is None else read_insta360(config.validation_root)
-    return (
-        RandomFramePairs(films, sampler, config.draws),
-        FixedFramePairs(validation, lambda n: sampler.evaluation(n, _FEW_DRAWS)),
-    )
-
-
-def _pairs(config: DataConfig, root: Path, height: int) -> tuple[SampleSource, SampleSource]:
-    training, validation = (_pairs_of(folder) for folder in (root, config.validation_root or root))
-    return training, validation
-
-
-def _pairs_of(folder: Path) -> PairSource:
-    pairs = [pair for pair in load_pairs(folder) if pair.targets]
-    return PairSource(without_reserved(pairs, lambda pair: pair.name, folder), targets=1)
-
-
-def _triplets(config: DataConfig, root: Path, height: int) -> tuple[SampleSource, SampleSource]:
-    training, validation = (_game_maps(folder) for folder in (root, config.validation_root or root))
-    return training, validation
-
-
-def _game_maps(folder: Path) -> TripletSource:
-    triplets = read_game_maps(folder)
-    kept = without_reserved(triplets.sources, lambda source: source.stem, folder)
-    return TripletSource(replace(triplets, sources=tuple(kept)))
-
-
-_READERS: dict[str, Callable[[DataConfig, Path, int], tuple[SampleSource, SampleSource]]] = {
-    "panogrf": _panogrf,
-    "360loc": _loc360,
-    "insta360": _insta360,
-    "pairs": _pairs,
-    "triplets": _triplets,
-}
-
-
 _T = TypeVar("_T")
 
 RESERVED = frozenset(
@@ -105,33 +33,79 @@ RESERVED = frozenset(
         *("oa_shouse", "strength", "bleach"),
     }
 )
-"""Names of maps; their triplets are called NAME_NUMBER."""
+"""Game maps for evaluation only; their triplets are named NAME_NUMBER. Maps that share rooms are reserved together."""
 
 _NUMBER = re.compile(r"(_\d+)+$")
+_VALIDATION_SEED_OFFSET = 1_000_003  # generated homes differ from those of training
+_VALIDATION_DRAWS = 4  # frame pairs per sequence
+
+
+def load_sources(config: DataConfig, height: int, seed: int) -> tuple[SampleSource, SampleSource]:
+    """Training samples, and validation samples, which have at least one target.
+
+    Args:
+        height: height of the panoramas; selects the folder of some data sets.
+
+    Raises:
+        InputError: the data are missing or invalid.
+    """
+    if config.kind == "generated":
+        return GeneratedTriplets(seed), GeneratedTriplets(seed + _VALIDATION_SEED_OFFSET)
+    root = config.root
+    assert root is not None
+    if config.kind == "panogrf":
+        training, validation = (
+            ConcatSource([TripletSource(triplets) for triplets in read_panogrf(root, stage, height)])
+            for stage in ("train", "val")
+        )
+        return training, validation
+    if config.kind in ("pairs", "triplets"):
+        read = _read_pairs if config.kind == "pairs" else _read_triplets
+        return read(root), read(config.validation_root or root)
+    if config.kind == "360loc":
+        sampler = BoundedSampler(2, 5, config.training_gap)
+        sequences, unseen = read_loc360(root, "train"), read_loc360(root, "val")
+    else:
+        sampler = BoundedSampler(2, 30, config.training_gap)
+        sequences = read_insta360(root)
+        unseen = sequences if config.validation_root is None else read_insta360(config.validation_root)
+    training = RandomFramePairs(sequences, sampler, config.draws)
+    return training, FixedFramePairs(unseen, lambda count: sampler.evaluation(count, _VALIDATION_DRAWS))
+
+
+def _read_pairs(folder: Path) -> PairSource:
+    pairs = [pair for pair in load_pairs(folder) if pair.targets]
+    return PairSource(remove_reserved(pairs, lambda pair: pair.name, folder), targets=1)
+
+
+def _read_triplets(folder: Path) -> TripletSource:
+    triplets = read_game_maps(folder)
+    kept = remove_reserved(triplets.sources, lambda source: source.stem, folder)
+    return TripletSource(replace(triplets, sources=tuple(kept)))
 
 
 def is_reserved(name: str) -> bool:
-    """Whether a triplet of that name is of a reserved map."""
+    """Whether a triplet of that name belongs to a reserved map."""
     return name.lower() in RESERVED or _NUMBER.sub("", name.lower()) in RESERVED
 
 
-def without_reserved(items: Iterable[_T], name_of: Callable[[_T], str], folder: Path) -> list[_T]:
-    """What may be trained on; a warning tells how many were left out.
+def remove_reserved(items: Iterable[_T], name_of: Callable[[_T], str], folder: Path) -> list[_T]:
+    """The items that do not belong to reserved maps. Warns when items are removed.
 
     Raises:
-        InputError: nothing is left.
+        InputError: no item remains.
     """
-    given = list(items)
-    kept = [item for item in given if not is_reserved(name_of(item))]
-    if given and not kept:
+    items = list(items)
+    kept = [item for item in items if not is_reserved(name_of(item))]
+    if items and not kept:
         raise InputError(
-            f"{folder}: needed something to train on, got {len(given)} triplets of reserved maps only "
-            f"({', '.join(sorted(RESERVED))}), which are for evaluation; take other maps."
+            f"{folder}: needed training data, got {len(items)} triplets of reserved maps only "
+            f"({', '.join(sorted(RESERVED))}), which are for evaluation; use other maps."
         )
-    if len(kept) < len(given):
+    if len(kept) < len(items):
         warnings.warn(
-            f"{folder}: {len(given) - len(kept)} of {len(given)} triplets are of maps reserved for evaluation, and "
-            "are left out.",
+            f"{folder}: {len(items) - len(kept)} of {len(items)} triplets belong to maps that are reserved for "
+            "evaluation, and are skipped.",
             stacklevel=3,
         )
     return kept

@@ -1,4 +1,4 @@
-"""Log files, curves and progress of a training run."""
+"""Logs of a training run: CSV tables, their plot, TensorBoard files, and the progress on the terminal."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from pansplat.atomic import replacing
 
+_SMOOTHING = 20  # the thick curve averages over a 20th of the steps
+
 
 class CsvTable:
-    """A CSV file with a row a step. A run that goes on from an earlier step drops the rows after it.
+    """A CSV file with one row per step. Rows from `step` on, of an earlier run, are removed.
 
     Args:
-        path: of the file.
-        columns: after the first, which is `step`.
+        path: file to write.
+        columns: names after the first column, `step`.
         step: the first step that will be written.
     """
 
@@ -39,7 +41,7 @@ class CsvTable:
         self._writer = csv.DictWriter(self._file, self.columns, lineterminator="\n")
 
     def add(self, step: int, values: Mapping[str, float]) -> None:
-        """Write a row; it is in the file when this returns."""
+        """Write a row and flush it to the file."""
         self._writer.writerow({"step": step, **{name: f"{values[name]:.9g}" for name in self.columns[1:]}})
         self._file.flush()
 
@@ -48,14 +50,53 @@ class CsvTable:
 
 
 def read_table(path: Path) -> list[dict[str, str]]:
-    """The rows of a CSV file; a last row that was cut off is left out."""
+    """The complete rows of a CSV file; an incomplete last row is ignored."""
     with open(path, newline="") as file:
         rows = list(csv.DictReader(file))
     return [row for row in rows if None not in row.values() and (row.get("step") or "").isdigit()]
 
 
+def plot_run(folder: Path) -> Path | None:
+    """Plot the tables of a run's folder as `curves.png`; None if nothing has been logged yet.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    log, scores = (read_table(folder / name) for name in ("log.csv", "validation.csv"))
+    if not log:
+        return None
+    figure = Figure(figsize=(9, 5.5), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    steps = [int(row["step"]) + 1 for row in log]
+    losses = [float(row["loss"]) for row in log]
+    above.plot(steps, losses, color="#b9cfe4", linewidth=1)
+    above.plot(steps, _running_means(losses), color="#1764ab", linewidth=2)
+    above.set_ylabel("loss")
+    for measure, color, label in (("psnr", "#c8501e", "PSNR, dB"), ("ws_psnr", "#e0a030", "WS-PSNR, dB")):
+        values = [float(row[measure]) for row in scores]
+        below.plot([int(row["step"]) for row in scores], values, "o-", color=color, label=label)
+    below.set(xlabel="step", ylabel="unseen places, dB")
+    below.legend(loc="lower right")
+    for axes in (above, below):
+        axes.grid(alpha=0.25)
+    path = folder / "curves.png"
+    with replacing(path) as unfinished:
+        figure.savefig(unfinished, dpi=110, format="png")
+    return path
+
+
+def _running_means(values: list[float]) -> list[float]:
+    """Means over each value and the ones before it, in a window of a 20th of all values."""
+    width = max(1, math.ceil(len(values) / _SMOOTHING))
+    means = []
+    for end in range(1, len(values) + 1):
+        window = values[max(0, end - width) : end]
+        means.append(sum(window) / len(window))
+    return means
+
+
 class TensorBoardLog:
-    """TensorBoard's files, where the package is installed; else nothing."""
+    """TensorBoard files; does nothing if the package is not installed."""
 
     def __init__(self, folder: Path) -> None:
         self._writer: Any = None
@@ -65,7 +106,7 @@ class TensorBoardLog:
             self._writer = SummaryWriter(str(folder))
 
     def add(self, step: int, values: Mapping[str, float], group: str) -> None:
-        """Numbers of a step."""
+        """Write the values of a step as `group/name`."""
         if self._writer is not None:
             for name, value in values.items():
                 self._writer.add_scalar(f"{group}/{name}", value, step)
@@ -76,7 +117,7 @@ class TensorBoardLog:
 
 
 class ProgressDisplay:
-    """A bar with the loss and the time left; without a terminal, a line now and then."""
+    """A progress bar with the loss and the remaining time; lines of text if stderr is not a terminal."""
 
     def __init__(self, step: int, total: int, *, silent: bool) -> None:
         self.console = Console(stderr=True, quiet=silent, highlight=False)
@@ -102,58 +143,13 @@ class ProgressDisplay:
     def __exit__(self, *_: object) -> None:
         self.progress.stop()
 
-    def show(self, done: int, loss: float, seconds: float) -> None:
-        """After so many steps, the last of which took that long."""
+    def update(self, done: int, loss: float, seconds: float) -> None:
+        """Show the number of completed steps, and the loss and duration of the last one."""
         self.progress.update(self.task, completed=done, loss=f"loss {loss:.4f}")
         if not self.console.is_terminal and (done % self._every == 0 or done in (self.first + 1, self.total)):
             left = (self.total - done) * seconds / 60
-            self.say(f"step {done} of {self.total}, loss {loss:.4f}, {seconds:.2f} s a step, {left:.0f} min left")
+            self.print(f"step {done} of {self.total}, loss {loss:.4f}, {seconds:.2f} s per step, {left:.0f} min left")
 
-    def say(self, text: str) -> None:
-        """A line that stays."""
+    def print(self, text: str) -> None:
+        """Print a line above the progress bar."""
         self.console.print(text, markup=False, soft_wrap=True)
-
-
-_SMOOTH = 20  # the thick line is the mean of a 20th of the steps
-
-
-def plot_run(folder: Path) -> Path | None:
-    """Draw `curves.png` of the tables in a run's folder; None where nothing is logged yet.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    log, scores = (read_table(folder / name) for name in ("log.csv", "validation.csv"))
-    if not log:
-        return None
-    figure = Figure(figsize=(9, 5.5), layout="constrained")
-    above, below = figure.subplots(2, 1, sharex=True)
-    steps = [int(row["step"]) + 1 for row in log]
-    losses = [float(row["loss"]) for row in log]
-    above.plot(steps, losses, color="#b9cfe4", linewidth=1)
-    above.plot(steps, _smoothed(losses), color="#1764ab", linewidth=2)
-    above.set_ylabel("loss")
-    for measure, color, label in (("psnr", "#c8501e", "PSNR, dB"), ("ws_psnr", "#e0a030", "WS-PSNR, dB")):
-        below.plot([int(row["step"]) for row in scores], _numbers(scores, measure), "o-", color=color, label=label)
-    below.set(xlabel="step", ylabel="unseen places, dB")
-    below.legend(loc="lower right")
-    for axes in (above, below):
-        axes.grid(alpha=0.25)
-    path = folder / "curves.png"
-    with replacing(path) as unfinished:
-        figure.savefig(unfinished, dpi=110, format="png")
-    return path
-
-
-def _smoothed(values: list[float]) -> list[float]:
-    """Each value's mean with those before it, over a 20th of all."""
-    width = max(1, math.ceil(len(values) / _SMOOTH))
-    means = []
-    for end in range(1, len(values) + 1):
-        window = values[max(0, end - width) : end]
-        means.append(sum(window) / len(window))
-    return means
-
-
-def _numbers(rows: list[dict[str, str]], name: str) -> list[float]:
-    return [float(row[name]) for row in rows]

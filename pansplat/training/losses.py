@@ -1,8 +1,8 @@
-"""What training makes small: the picture's error, its look, the depth's error, and the auxiliary heads' pictures.
+"""Losses of training: error and perceptual distance of images, error of depth, and the auxiliary heads' image loss.
 
-Source: PanSplat, section 3.5; OFFICIAL.md, section 11, and P4 and P5 of section 17 for where paper and code differ.
-Pictures are not clamped. Levels of depth are coarse to fine; the finest counts in full, each coarser one `decay` times
-as much as the next finer.
+Source: PanSplat, section 3.5; docs/official.md, section 11, and section 17, P4 and P5 (differences of paper and code).
+Images are not clamped. Levels of depth are coarse to fine; the finest has weight 1, each coarser one `decay` times the
+weight of the next finer one.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ DepthForm = Literal["depth", "inverse_depth"]
 
 @dataclass(frozen=True)
 class LossWeights:
-    """How much each part of the loss counts."""
+    """Weights of the loss terms."""
 
     square: float = 1.0
-    """Of the mean squared error of the colours."""
+    """Weight of the mean squared error of the colours."""
     perceptual: float = 0.1
-    """Of LPIPS, or what stands in for it (lambda in the paper)."""
+    """Weight of LPIPS, or of its substitute (lambda in the paper)."""
     depth: float = 0.05
-    """Of the depth loss, where there is true depth (alpha in the paper)."""
+    """Weight of the depth loss, for data with true depth (alpha in the paper)."""
     depth_form: DepthForm = "depth"
-    """depth: absolute error in metres against the true depth made as small as each level (the paper). inverse_depth:
-    absolute error of 1 / metres with each level made as large as the true depth (the original code)."""
+    """depth: absolute error in metres, with the true depth resized to each level (the paper). inverse_depth: absolute
+    error in 1 / metres, with each level resized to the true depth (the official code)."""
     decay: float = 0.9
-    """How much a level of the cost volume counts against the next finer one (gamma in the paper)."""
+    """Weight of a level of the cost volume relative to the next finer one (gamma in the paper)."""
 
 
 PAPER = LossWeights()
@@ -48,7 +48,7 @@ LOSS_WEIGHTS = {"paper": PAPER, "code": CODE}
 
 @dataclass(frozen=True)
 class ImageLoss:
-    """The two parts of a picture's loss, each before its weight, and their weighted sum."""
+    """The two terms of the image loss before their weights, and their weighted sum."""
 
     square: Float[Tensor, ""]
     perceptual: Float[Tensor, ""]
@@ -63,17 +63,17 @@ def image_loss(
     *,
     pixel_weights: Float[Tensor, "batch height width"] | None = None,
 ) -> ImageLoss:
-    """Mean squared error and perceptual distance of pictures.
+    """Mean squared error and perceptual distance of images.
 
     Args:
-        perceptual: LPIPS or its substitute; None for neither.
-        pixel_weights: how much each pixel counts; by default all alike. See `pixel_weights_of`.
+        perceptual: LPIPS or its substitute; None for no perceptual term.
+        pixel_weights: weights of the pixels, see `make_pixel_weights`; None for equal weights.
     """
     square = mean_square(prediction, target, pixel_weights)
-    look = square.new_zeros(())
+    distance = square.new_zeros(())
     if perceptual is not None and weights.perceptual:
-        look = perceptual(prediction, target, pixel_weights).mean()
-    return ImageLoss(square, look, weights.square * square + weights.perceptual * look)
+        distance = perceptual(prediction, target, pixel_weights).mean()
+    return ImageLoss(square, distance, weights.square * square + weights.perceptual * distance)
 
 
 def mean_square(
@@ -81,20 +81,20 @@ def mean_square(
     target: Float[Tensor, "batch 3 height width"],
     pixel_weights: Float[Tensor, "batch height width"] | None = None,
 ) -> Float[Tensor, ""]:
-    """Mean squared error over all values, or over the pixels that count."""
+    """Mean squared error over all values, weighted by `pixel_weights` if given."""
     errors = (prediction - target).square().mean(1)
     return errors.mean() if pixel_weights is None else weighted_mean(errors, pixel_weights)
 
 
-def pixel_weights_of(
+def make_pixel_weights(
     masks: Bool[Tensor, "batch height width"] | None, shape: tuple[int, int, int], *, spherical: bool = False
 ) -> Float[Tensor, "batch height width"] | None:
-    """How much each pixel counts; None where all count alike.
+    """Weights of the pixels; None for equal weights.
 
     Args:
-        masks: True where a pixel counts.
+        masks: True for pixels with a weight.
         shape: batch, height, width.
-        spherical: whether a pixel counts by its solid angle. Off in paper and code, which weigh all pixels alike.
+        spherical: whether to weight pixels by their solid angle. Paper and official code do not.
     """
     if masks is None and not spherical:
         return None
@@ -113,16 +113,16 @@ def depth_loss(
     masks: Bool[Tensor, "batch view height width"] | None = None,
     spherical: bool = False,
 ) -> Float[Tensor, ""]:
-    """Absolute error of the levels' depths: in metres ("depth") or 1 / metres ("inverse_depth").
+    """Absolute error of the depth of each level: in metres ("depth") or 1 / metres ("inverse_depth").
 
-    In the form "depth" the truth is made smaller by taking the pixel nearest to each centre, as mixtures of two
-    surfaces are no depth; in the other the prediction is made larger, bilinearly and without wrapping.
+    In the form "depth" the true depth is downsampled by nearest neighbour, because interpolated depth lies between
+    surfaces. In the form "inverse_depth" the prediction is upsampled bilinearly, without wrap-around.
 
     Args:
-        depths: radial, metres, coarse to fine; each level smaller than the truth or as large.
-        true_depth: radial, metres; what is not strictly between `near` and `far` is unknown.
-        masks: True where a pixel counts.
-        spherical: whether a pixel counts by its solid angle.
+        depths: radial, metres, coarse to fine; no level is larger than the true depth.
+        true_depth: radial, metres; values that are not strictly between `near` and `far` are unknown.
+        masks: True for pixels with a weight.
+        spherical: whether to weight pixels by their solid angle.
     """
     near, far = (bound[..., None, None] if isinstance(bound, Tensor) and bound.ndim else bound for bound in (near, far))
     known = (true_depth > near) & (true_depth < far)
@@ -140,7 +140,7 @@ def _level_loss(depth: Tensor, truth: Tensor, known: Tensor, form: DepthForm, sp
     else:
         size = truth.shape[-2:]
         depth = functional.interpolate(depth, size, mode="bilinear", align_corners=False)
-        # Unknown pixels get the prediction's own depth: an infinity times zero would be no number.
+        # Unknown pixels get the predicted depth, because infinity times a weight of zero would be NaN.
         errors = (1 / depth - 1 / torch.where(known, truth, depth.detach())).abs()
     weights = known.to(errors)
     if spherical:
@@ -153,27 +153,27 @@ def _nearest(maps: Tensor, size: Sequence[int]) -> Tensor:
 
 
 def auxiliary_loss(
-    pictures: Sequence[Float[Tensor, "batch 3 height width"]],
+    images: Sequence[Float[Tensor, "batch 3 height width"]],
     target: Float[Tensor, "batch 3 height width"],
     perceptual: Perceptual | None,
     weights: LossWeights = PAPER,
     *,
     pixel_weights: Float[Tensor, "batch height width"] | None = None,
 ) -> Float[Tensor, ""]:
-    """The image loss of what each level of the cost volume makes by itself; for real data, without true depth.
+    """Image loss of renderings of each level of the cost volume alone; for real data without true depth.
 
     Args:
-        pictures: drawn from the auxiliary heads' Gaussians, coarse to fine.
+        images: rendered from the Gaussians of the auxiliary heads, coarse to fine.
     """
     total = target.new_zeros(())
-    for coarser, picture in enumerate(reversed(pictures)):
-        loss = image_loss(picture, target, perceptual, weights, pixel_weights=pixel_weights)
+    for coarser, image in enumerate(reversed(images)):
+        loss = image_loss(image, target, perceptual, weights, pixel_weights=pixel_weights)
         total = total + weights.decay**coarser * loss.total
     return total
 
 
 def weighted_mean(errors: Float[Tensor, "*shape"], weights: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
-    """Mean of what counts; 0, with zero gradients, where nothing does."""
+    """Weighted mean; 0 with zero gradients if all weights are 0."""
     weights = weights.to(errors)
     return (errors * weights).sum() / weights.sum().clamp_min(torch.finfo(errors.dtype).tiny)
 
@@ -182,13 +182,13 @@ PerceptualName = Literal["auto", "lpips-vgg", "lpips-alex", "lpips-squeeze", "st
 
 _SCALES = 3
 _SIGMA, _RADIUS = 1.5, 5  # pixels
-_C1, _C2 = 0.01**2, 0.03**2  # for pictures in [0, 1]
+_C1, _C2 = 0.01**2, 0.03**2  # for images in [0, 1]
 _BACKBONES: dict[str, Backbone] = {"lpips-vgg": "vgg", "lpips-alex": "alex", "lpips-squeeze": "squeeze"}
 
 
 @runtime_checkable
 class Perceptual(Protocol):
-    """Distances of pairs of pictures, 0 for equal ones; differentiable.
+    """A differentiable distance between two images; 0 for equal images.
 
     Attributes:
         name: such as "lpips-vgg" or "structure".
@@ -202,21 +202,21 @@ class Perceptual(Protocol):
         target: Float[Tensor, "batch 3 height width"],
         weights: Float[Tensor, "batch height width"] | None = None,
     ) -> Float[Tensor, "batch"]:
-        """One distance a pair; a pixel of weight 0 has no part in it."""
+        """One distance per pair of images. Pixels of weight 0 have no effect."""
         ...
 
 
 def choose_perceptual(
     name: PerceptualName = "auto", folder: Path | None = None, device: torch.device | None = None
 ) -> Perceptual:
-    """The measure of that name; "auto" takes LPIPS with vgg, alex or squeeze, whose files are here, else "structure".
+    """The distance of a name; "auto" selects LPIPS with vgg, alex or squeeze if its files are found, else "structure".
 
     Args:
-        folder: of LPIPS's weights; see `load_lpips`.
-        device: for its weights; by default the processor's memory.
+        folder: folder of the LPIPS weights; see `load_lpips`.
+        device: device of the LPIPS weights; the CPU by default.
 
     Raises:
-        InputError: no such name, or LPIPS is asked for by name and its files are missing.
+        InputError: unknown name, or files of the named LPIPS are missing.
     """
     if name in _BACKBONES:
         return load_lpips(_BACKBONES[name], folder).to(device)
@@ -229,9 +229,11 @@ def choose_perceptual(
 
 
 class Structure:
-    """Mean over three scales, each half as large, of (1 - SSIM) / 2 and of the absolute differences of gradients.
+    """A distance without weights: mean over three scales of (1 - SSIM) / 2 plus the absolute difference of gradients.
 
-    Windows and gradients know the sphere: they go on over the seam and, for windows, over the poles.
+    It replaces LPIPS where the LPIPS files are missing. It compares edges and local structure, is not calibrated to
+    human judgement, and has another scale: 0 for equal images, about 0.3 for unrelated ones. Windows and gradients wrap
+    around at +-180 degrees, windows also over the poles.
 
     Source: Wang et al., doi:10.1109/TIP.2003.819861 (SSIM); the sum of an SSIM and a gradient term is ours.
     """
@@ -244,26 +246,28 @@ class Structure:
         target: Float[Tensor, "batch 3 height width"],
         weights: Float[Tensor, "batch height width"] | None = None,
     ) -> Float[Tensor, "batch"]:
-        """One distance a pair of panoramas in [0, 1]; a pixel of weight 0 has no part in it."""
-        counted = torch.ones_like(target[:, :1]) if weights is None else weights[:, None].to(target)
-        prediction = torch.where(counted > 0, prediction, target)
+        """See `Perceptual`; for panoramas in [0, 1]."""
+        pixel_weights = torch.ones_like(target[:, :1]) if weights is None else weights[:, None].to(target)
+        prediction = torch.where(pixel_weights > 0, prediction, target)
         total, scales = target.new_zeros(len(target)), 0
         while scales < _SCALES:
-            unlike = (1 - ssim_map(prediction, target)) / 2 + _gradient_difference(prediction, target)
-            total = total + (unlike.mean(1, keepdim=True) * counted).sum(dim=(1, 2, 3)) / counted.sum(
+            distance = (1 - ssim_map(prediction, target)) / 2 + _gradient_difference(prediction, target)
+            total = total + (distance.mean(1, keepdim=True) * pixel_weights).sum(dim=(1, 2, 3)) / pixel_weights.sum(
                 dim=(1, 2, 3)
             ).clamp_min(torch.finfo(target.dtype).tiny)
             scales += 1
             if target.shape[-2] % 2 or target.shape[-2] < 4 * _RADIUS:
-                break  # nothing is left to halve
-            prediction, target, counted = (functional.avg_pool2d(maps, 2) for maps in (prediction, target, counted))
+                break  # cannot be halved again
+            prediction, target, pixel_weights = (
+                functional.avg_pool2d(maps, 2) for maps in (prediction, target, pixel_weights)
+            )
         return total / scales
 
 
 def ssim_map(
     prediction: Float[Tensor, "batch 3 height width"], target: Float[Tensor, "batch 3 height width"]
 ) -> Float[Tensor, "batch 3 height width"]:
-    """Structural similarity about every pixel of a panorama: an 11 x 11 Gaussian window on the sphere.
+    """Structural similarity at every pixel of a panorama, with an 11 x 11 Gaussian window on the sphere.
 
     Source: Wang et al., doi:10.1109/TIP.2003.819861, equation 13.
     """
@@ -271,8 +275,8 @@ def ssim_map(
     variance_a = _window_mean(prediction.square()) - mean_a.square()
     variance_b = _window_mean(target.square()) - mean_b.square()
     covariance = _window_mean(prediction * target) - mean_a * mean_b
-    alike = (2 * mean_a * mean_b + _C1) * (2 * covariance + _C2)
-    return alike / ((mean_a.square() + mean_b.square() + _C1) * (variance_a + variance_b + _C2))
+    numerator = (2 * mean_a * mean_b + _C1) * (2 * covariance + _C2)
+    return numerator / ((mean_a.square() + mean_b.square() + _C1) * (variance_a + variance_b + _C2))
 
 
 def _window_mean(maps: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch 3 height width"]:
@@ -287,8 +291,8 @@ def _window_mean(maps: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "
 def _gradient_difference(
     prediction: Float[Tensor, "batch 3 height width"], target: Float[Tensor, "batch 3 height width"]
 ) -> Float[Tensor, "batch 3 height width"]:
-    """Absolute differences of the differences to the right and the lower neighbour, half of each."""
-    apart = prediction - target
-    right = apart.roll(-1, -1) - apart
-    below = functional.pad(apart[..., 1:, :] - apart[..., :-1, :], (0, 0, 0, 1))
+    """Mean absolute difference of the gradients along x and y (differences to the right and lower neighbour)."""
+    difference = prediction - target
+    right = difference.roll(-1, -1) - difference
+    below = functional.pad(difference[..., 1:, :] - difference[..., :-1, :], (0, 0, 0, 1))
     return (right.abs() + below.abs()) / 2

@@ -1,4 +1,4 @@
-"""The network that is trained: its shape, what it begins with, which parts learn."""
+"""The trained network: its configuration, initial weights, and trainable parts."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from pansplat.training.config import NetworkConfig, NetworkShape
 
 
 def network_config(shape: NetworkShape) -> PanSplatConfig:
-    """The paper's network, or a smaller one of the same plan without the monocular network."""
+    """Configuration of the paper's network, or of a smaller one with the same stages but no monocular network."""
     if shape == "paper":
         return PanSplatConfig()
     if shape == "small":
-        return _smaller(channels=(16, 32, 48, 64), candidates=(64, 32, 16), width=32, blocks=4, degree=1)
-    return _smaller(channels=(8, 16, 24, 32), candidates=(32, 16, 16), width=32, blocks=2, degree=0)
+        return _small_config(channels=(16, 32, 48, 64), candidates=(64, 32, 16), width=32, blocks=4, degree=1)
+    return _small_config(channels=(8, 16, 24, 32), candidates=(32, 16, 16), width=32, blocks=2, degree=0)
 
 
-def _smaller(
+def _small_config(
     *,
     channels: tuple[int, int, int, int],
     candidates: tuple[int, int, int],
@@ -59,13 +59,13 @@ def _smaller(
 
 
 def build_network(config: NetworkConfig, seed: int) -> PanSplat | MVSplat:
-    """The network, with the weights of `config.init` or random ones that the seed decides, ready to learn.
+    """The network with the weights of `config.init`, or with random weights from the seed; frozen parts are frozen.
 
     Raises:
-        InputError: the weights do not fit, or the monocular network, which does not learn, would be random.
+        InputError: the weights do not match, or are missing for the monocular network, which is not trained.
     """
     require_precision(config.precision)
-    given = None if config.init is None else read_weights(config.init)
+    initial = None if config.init is None else read_weights(config.init)
     torch.manual_seed(seed)
     network: PanSplat | MVSplat
     if config.shape == "mvsplat":
@@ -77,24 +77,23 @@ def build_network(config: NetworkConfig, seed: int) -> PanSplat | MVSplat:
             precision=config.precision,
             attention_precision=config.attention_precision,
         )
-    if given is not None:
-        require_shapes(given.tensors, network.state_dict(), config.init)
-        network.load_state_dict(given.tensors, strict=True)
+    if initial is not None:
+        require_shapes(initial.tensors, network.state_dict(), config.init)
+        network.load_state_dict(initial.tensors, strict=True)
     elif isinstance(network, PanSplat) and network.mono_depth is not None:
         raise InputError(
-            "--network.init: the paper's network has a monocular network that does not learn here and must come with "
-            "weights; give an original checkpoint or a file of `pansplat convert`, or train --network.shape small, "
-            "which has none."
+            "--network.init: needed weights of the monocular network, which is not trained, got none; give an official "
+            "checkpoint or a file of `pansplat convert`, or train --network.shape small, which has none."
         )
     freeze(network, config.frozen)
     return network
 
 
 def read_weights(path: Path) -> WeightsFile:
-    """Weights of a .safetensors, an original checkpoint, or a checkpoint of training.
+    """Weights of a .safetensors, an official checkpoint, or a training checkpoint.
 
     Raises:
-        InputError: when the file cannot be used; one that asks for code to be run is refused.
+        InputError: the file cannot be used, or contains code.
     """
     if path.suffix.lower() not in CHECKPOINT_SUFFIXES:
         return load_weights(path)
@@ -103,22 +102,22 @@ def read_weights(path: Path) -> WeightsFile:
 
 
 def write_weights(path: Path, network: PanSplat | MVSplat, state: dict[str, torch.Tensor] | None = None) -> None:
-    """The network's weights, or another state of it, as `--model` takes them."""
+    """Write the network's weights, or another state of it, as a .safetensors for `--model`."""
     model = "mvsplat" if isinstance(network, MVSplat) else "pansplat"
     tensors = dict(network.state_dict() if state is None else state)
     save_weights(path, pack_weights(model, network.config, tensors, compat=network.compat))
 
 
 def freeze(network: nn.Module, parts: tuple[str, ...]) -> None:
-    """Keep parts from learning."""
+    """Make parts of the network not trainable."""
     for part in parts:
         getattr(network, part).requires_grad_(False)
 
 
 def set_training_mode(network: nn.Module, parts: tuple[str, ...]) -> None:
-    """Put the network in training mode, but not its frozen parts: their normalisation statistics stay.
+    """Put the network in training mode, but `parts` in eval mode, so that their normalisation statistics do not change.
 
-    The original lets the statistics of frozen parts drift (OFFICIAL.md, section 11).
+    The official code updates the statistics of frozen parts (docs/official.md, section 11).
     """
     network.train()
     for part in parts:
@@ -126,19 +125,19 @@ def set_training_mode(network: nn.Module, parts: tuple[str, ...]) -> None:
 
 
 def matching_is_trainable(network: nn.Module) -> bool:
-    """Whether anything before the heads learns."""
+    """Whether any parameter before the heads is trainable."""
     return any(p.requires_grad for name, p in network.named_parameters() if not name.startswith("heads."))
 
 
 def trainable_parameters(*modules: nn.Module | None) -> Iterator[nn.Parameter]:
-    """The parameters that learn."""
+    """The trainable parameters of modules."""
     for module in modules:
         if module is not None:
             yield from (p for p in module.parameters() if p.requires_grad)
 
 
 def build_auxiliary_heads(network: PanSplat | MVSplat) -> AuxiliaryHeads:
-    """Heads that make each level of the cost volume draw a picture by itself; random, for training only."""
+    """Randomly initialised heads that predict Gaussians from each level of the cost volume alone; for training only."""
     assert isinstance(network, PanSplat)
     heads = network.config.heads
     if network.config == PanSplatConfig():

@@ -1,4 +1,4 @@
-"""Learning-rate schedule and moving average of the weights."""
+"""Learning-rate schedule, and exponential moving average of the weights."""
 
 from __future__ import annotations
 
@@ -7,36 +7,37 @@ import math
 import torch
 from torch import Tensor, nn
 
-_START = 25.0  # how many times smaller than the peak the first rate is
-_END = 1e4  # how many times smaller than the first the last rate is
+_START_DIVISOR = 25.0  # peak rate over first rate
+_END_DIVISOR = 1e4  # first rate over last rate
 
 
 def one_cycle_rate(step: int, total: int, peak: float, *, rise: float = 0.01) -> float:
-    """The rate of a step, from peak / 25 up to the peak and down to peak / 250,000; the last beyond the end.
+    """Learning rate of a step: from peak / 25 up to the peak and down to peak / 250,000, along two cosines.
+
+    Source: docs/official.md, section 11; Smith and Topin, https://arxiv.org/abs/1708.07120 (one cycle).
 
     Args:
-        step: counted from 0.
-        total: steps of the cycle; the original takes ten more than it trains.
-        rise: part of the steps in which the rate rises.
+        step: counted from 0; later steps than the last have the last rate.
+        total: number of steps of the cycle; the official code uses ten more than it trains.
+        rise: fraction of the steps in which the rate rises.
     """
-    start, last = peak / _START, total - 1
+    start, last = peak / _START_DIVISOR, total - 1
     top = rise * total - 1
     if step < top:
         return _cosine(start, peak, step / top)
-    return _cosine(peak, start / _END, min(1.0, (step - max(top, 0.0)) / max(1e-9, last - max(top, 0.0))))
+    return _cosine(peak, start / _END_DIVISOR, min(1.0, (step - max(top, 0.0)) / max(1e-9, last - max(top, 0.0))))
 
 
-def _cosine(first: float, last: float, part: float) -> float:
-    return last + (first - last) * (1 + math.cos(math.pi * part)) / 2
+def _cosine(first: float, last: float, fraction: float) -> float:
+    return last + (first - last) * (1 + math.cos(math.pi * fraction)) / 2
 
 
 class ExponentialMovingAverage:
     """Exponential moving average of a network's state.
 
     Args:
-        network: whose state is followed; its state now is the first mean.
-        decay: part of the mean that a step keeps, once many steps were taken. Early steps keep less:
-            (1 + step) / (10 + step).
+        network: its current state is the first average.
+        decay: fraction of the average that a step keeps; early steps keep less, (1 + step) / (10 + step).
     """
 
     def __init__(self, network: nn.Module, decay: float) -> None:
@@ -45,16 +46,16 @@ class ExponentialMovingAverage:
 
     @torch.no_grad()
     def update(self, network: nn.Module, step: int) -> None:
-        """Take in the state after a step, counted from 0; what is no floating number is copied."""
-        share = 1 - min(self.decay, (1 + step) / (10 + step))
+        """Add the state after a step, counted from 0. Integer tensors are copied."""
+        weight = 1 - min(self.decay, (1 + step) / (10 + step))
         for name, tensor in network.state_dict().items():
-            mean = self.state[name]
-            if mean.is_floating_point():
-                mean.lerp_(tensor.to(mean), share)
+            average = self.state[name]
+            if average.is_floating_point():
+                average.lerp_(tensor.to(average), weight)
             else:
-                mean.copy_(tensor)
+                average.copy_(tensor)
 
     def load(self, state: dict[str, Tensor]) -> None:
-        """Go on from a state that was saved."""
-        for name, mean in self.state.items():
-            mean.copy_(state[name])
+        """Restore a saved state."""
+        for name, average in self.state.items():
+            average.copy_(state[name])

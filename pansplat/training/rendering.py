@@ -1,10 +1,10 @@
-"""How training draws its pictures: whole, or part by part for two-step backpropagation.
+"""Rendering of target panoramas in training: as a whole, or part by part for two-step deferred backpropagation.
 
-A part is a face of the cube, or a strip of a panorama's rows. Each is drawn of the Gaussians that it can show alone:
-that bounds the memory of its graph. The rasteriser knows no strips, so a strip is cut from a panorama of its own
-Gaussians; what they paint on other rows is thrown away.
+A part is a cube face, or a strip of rows of a panorama. Each part is rendered from the Gaussians visible in it, which
+bounds the memory of its graph. `rasterize` has no argument for strips: a strip is cut from a panorama of the
+strip's Gaussians.
 
-Source: PanSplat, sections 3.4 and 3.6; OFFICIAL.md, section 10.
+Source: PanSplat, sections 3.4 and 3.6; docs/official.md, section 10; docs/rendering.md, section 5 (visibility).
 """
 
 from __future__ import annotations
@@ -28,29 +28,30 @@ from pansplat.rendering.rasterize import RasterOptions, Rendering, rasterize
 from pansplat.training.config import Mixing, Style
 
 _FACES = 6
-_STRIPS = 6  # as many as faces, each as much of the sphere
+_STRIPS = 6  # of equal area on the sphere
+_CHUNK = 1 << 16  # Gaussians per visibility test, because their geometry is float64
 
 
 @dataclass(frozen=True)
 class ImagePart:
-    """A part of a picture that can be drawn by itself.
+    """A part of a panorama that is rendered separately.
 
     Attributes:
-        view: whose Gaussians it shows; None for all views'.
-        part: number of the cube's face, or of the strip of rows from the top.
+        view: index of the input view whose Gaussians are rendered; None for the Gaussians of all views.
+        index: number of the cube face, or of the strip of rows from the top.
     """
 
     view: int | None
-    part: int
+    index: int
 
 
 @dataclass(frozen=True)
 class TargetRenderer:
-    """How to draw.
+    """Renders target panoramas.
 
     Attributes:
         style, mixing: see `MemoryConfig`.
-        height: of the panorama, pixels; it is twice as wide.
+        height: height of the panorama, pixels; it is twice as wide.
     """
 
     style: Style
@@ -64,103 +65,108 @@ class TargetRenderer:
 
     @property
     def face_size(self) -> int:
-        """Pixels; half the height, as in the original."""
+        """Side of a cube face, pixels."""
         return official_face_size(self.height)
 
     def parts(self, views: int) -> list[ImagePart]:
-        """All parts of a picture: view by view if they are mixed, each face by face or strip by strip."""
-        shown = [None] if self.mixing == "joint" else list(range(views))
-        return [ImagePart(view, part) for view in shown for part in range(self._parts)]
+        """All parts of a panorama: the faces or strips of each view, or of all views jointly."""
+        return [ImagePart(view, index) for view in self._view_choices(views) for index in range(self._parts_per_view)]
 
     def visible(
-        self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], layers: Sequence[ImagePart]
+        self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], parts: Sequence[ImagePart]
     ) -> list[Bool[Tensor, "n"]]:
-        """For each layer, the Gaussians that it is to be drawn of."""
-        seen = visible_gaussians(gaussians, cam2world, self._regions(gaussians.means.device), self._options)
+        """A mask for each part: the Gaussians that `render_part` needs."""
+        masks = visible_gaussians(gaussians, cam2world, self._regions(gaussians.means.device), self._options)
         return [
-            seen[layer.part] if layer.view is None else seen[layer.part] & (gaussians.views == layer.view)
-            for layer in layers
+            masks[part.index] if part.view is None else masks[part.index] & (gaussians.views == part.view)
+            for part in parts
         ]
 
     def render(
         self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], context: Float[Tensor, "view 4 4"]
     ) -> Float[Tensor, "3 height width"]:
-        """The panorama, in one graph.
+        """The panorama, rendered in one graph.
 
         Args:
-            cam2world: of the picture.
-            context: of the input views, for how they are mixed.
+            cam2world: pose of the panorama.
+            context: poses of the input views, for the blend weights.
         """
-        shown = [None] if self.mixing == "joint" else list(range(len(context)))
-        panoramas = [self._whole(self._of(gaussians, view), cam2world) for view in shown]
-        return self._mixed(panoramas, cam2world, context)
+        panoramas = [
+            self._render_panorama(self._select(gaussians, view), cam2world) for view in self._view_choices(len(context))
+        ]
+        return self._blend(panoramas, cam2world, context)
 
     def render_part(
-        self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], layer: ImagePart
+        self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], part: ImagePart
     ) -> Float[Tensor, "4 rows columns"]:
         """Colour and opacity of one part.
 
         Args:
-            gaussians: those that `shown` tells of, in the order of all.
+            gaussians: the Gaussians that `visible` selects for the part, in their original order.
         """
         if self.style == "panorama":
-            first, end = self._rows(layer.part)
-            picture = self._whole(gaussians, cam2world)
-            return torch.cat((picture.color, picture.alpha[None]))[:, first:end]
-        pose = face_poses(cam2world.double())[layer.part]
-        gaussians = self._of(gaussians, None)
+            first, end = self._strip_rows(part.index)
+            image = self._render_panorama(gaussians, cam2world)
+            return torch.cat((image.color, image.alpha[None]))[:, first:end]
+        pose = face_poses(cam2world.double())[part.index]
+        gaussians = self._select(gaussians, None)
         size = (self.face_size, self.face_size)
-        picture = rasterize(gaussians, pose, size=size, layout="pinhole", options=self._options, stitching="seamless")
-        return torch.cat((picture.color, picture.alpha[None]))
+        image = rasterize(gaussians, pose, size=size, layout="pinhole", options=self._options, stitching="seamless")
+        return torch.cat((image.color, image.alpha[None]))
 
     def compose(
         self,
-        layers: Sequence[Float[Tensor, "4 rows columns"]],
+        parts: Sequence[Float[Tensor, "4 rows columns"]],
         cam2world: Float[Tensor, "4 4"],
         context: Float[Tensor, "view 4 4"],
     ) -> Float[Tensor, "3 height width"]:
-        """The panorama of all parts, in the order of `layers`."""
+        """The panorama composed of all rendered parts, in the order of `parts`."""
         panoramas = []
-        for start in range(0, len(layers), self._parts):
-            own = list(layers[start : start + self._parts])
+        for start in range(0, len(parts), self._parts_per_view):
+            images = list(parts[start : start + self._parts_per_view])
             if self.style == "panorama":
-                sums = torch.cat(own, dim=1)
+                image = torch.cat(images, dim=1)
             else:
-                sums = stitch_faces(torch.stack(own), self.size, stitching=self._options.stitching)
-            panoramas.append(Rendering(sums[:3], sums[3], torch.zeros_like(sums[3])))
-        return self._mixed(panoramas, cam2world, context)
+                image = stitch_faces(torch.stack(images), self.size, stitching=self._options.stitching)
+            panoramas.append(Rendering(image[:3], image[3], torch.zeros_like(image[3])))
+        return self._blend(panoramas, cam2world, context)
+
+    def _view_choices(self, views: int) -> list[int | None]:
+        """Views that are rendered separately; [None] when all are rendered jointly."""
+        return [None] if self.mixing == "joint" else list(range(views))
 
     @property
-    def _parts(self) -> int:
+    def _parts_per_view(self) -> int:
         return _STRIPS if self.style == "panorama" else _FACES
 
-    def _rows(self, strip: int) -> tuple[int, int]:
-        """The first row of a strip, and the first after it: strips have one area on the sphere."""
+    def _strip_rows(self, strip: int) -> tuple[int, int]:
+        """First row of a strip, and the first row after it."""
         first, end = (
             round(self.height * (0.5 + math.asin(2 * edge / _STRIPS - 1) / math.pi)) for edge in (strip, strip + 1)
         )
         return first, end
 
     def _regions(self, device: torch.device) -> list[Region]:
-        """What the parts show."""
+        """The region of each face or strip."""
         layout = "equirect" if self.style == "panorama" else "cubemap"
         planes = image_planes(layout, self.size, vertical_fov_degrees=90.0, face_size=self.face_size, device=device)
         if self.style == "panorama":
-            return [Region(planes[0], *self._rows(strip)) for strip in range(_STRIPS)]
+            return [Region(planes[0], *self._strip_rows(strip)) for strip in range(_STRIPS)]
         return [Region(plane, 0, self.face_size) for plane in planes]
 
-    def _mixed(self, panoramas: list[Rendering], cam2world: Tensor, context: Tensor) -> Float[Tensor, "3 height width"]:
+    def _blend(self, panoramas: list[Rendering], cam2world: Tensor, context: Tensor) -> Float[Tensor, "3 height width"]:
         if self.mixing == "joint":
             return panoramas[0].color
         weights = blend_weights(cam2world[:3, 3].double(), context[:, :3, 3].double())
         return blend(panoramas, weights.to(panoramas[0].color)).color
 
-    def _of(self, gaussians: Gaussians, view: int | None) -> Gaussians:
+    def _select(self, gaussians: Gaussians, view: int | None) -> Gaussians:
+        """The Gaussians of a view, with the official colours if the style is the official one."""
         if self.style == "original":
             gaussians = official_gaussians(gaussians)
         return gaussians if view is None else gaussians.select((gaussians.views == view).nonzero()[:, 0])
 
-    def _whole(self, gaussians: Gaussians, cam2world: Tensor) -> Rendering:
+    def _render_panorama(self, gaussians: Gaussians, cam2world: Tensor) -> Rendering:
         if self.style == "panorama":
             return rasterize(gaussians, cam2world, size=self.size)
         return rasterize(
@@ -177,19 +183,11 @@ class TargetRenderer:
         return OFFICIAL if self.style == "original" else RasterOptions()
 
 
-_CHUNK = 1 << 16  # Gaussians at a time: their geometry is float64
-
-
 @dataclass(frozen=True)
 class Region:
-    """Rows of a picture.
+    """Rows `first` to `end` (exclusive) of an image plane."""
 
-    Attributes:
-        picture: as the rasteriser draws it.
-        first, end: the rows, `end` left out.
-    """
-
-    picture: ImagePlane
+    plane: ImagePlane
     first: int
     end: int
 
@@ -198,42 +196,42 @@ class Region:
 def visible_gaussians(
     gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], regions: Sequence[Region], options: RasterOptions
 ) -> list[Bool[Tensor, "n"]]:
-    """For each region, the Gaussians that may reach a pixel in it; the others have no part in its colours.
+    """A mask for each region: the Gaussians that may reach one of its pixels. The others do not affect its colours.
 
     Args:
-        cam2world: of the camera that has all the regions' pictures.
-        regions: of pictures of one size and kind.
-        options: as the pictures are drawn.
+        cam2world: pose of the camera of all image planes.
+        regions: regions of image planes of one size and kind.
+        options: options with which the image planes are rasterised.
     """
     pose = cam2world.double().to(gaussians.means.device)
     found: list[list[Tensor]] = [[] for _ in regions]
     for start in range(0, len(gaussians), _CHUNK):
-        observed = project_gaussians(
-            _piece(gaussians, slice(start, start + _CHUNK)),
+        projected = project_gaussians(
+            _without_colours(gaussians, slice(start, start + _CHUNK)),
             None,
             pose,
-            filter_variance=options.filter_variance(regions[0].picture.pixel_angle),
+            filter_variance=options.filter_variance(regions[0].plane.pixel_angle),
             compensate=options.lowpass == "angular",
             exact=False,
         )
         for region, masks in zip(regions, found, strict=True):
-            masks.append(_in_region(observed, region, options))
+            masks.append(_is_in_region(projected, region, options))
     return [torch.cat(masks) if masks else torch.zeros(0, dtype=torch.bool) for masks in found]
 
 
-def _piece(gaussians: Gaussians, rows: slice) -> Gaussians:
-    """Some of the Gaussians, as views of their memory and without colours, which do not matter here."""
+def _without_colours(gaussians: Gaussians, rows: slice) -> Gaussians:
+    """A slice of the Gaussians as views of their memory, with zero harmonics of degree 0."""
     g = gaussians
-    own = (field[rows] for field in (g.means, g.scales, g.quats, g.opacities))
-    return Gaussians(*own, g.harmonics[rows, :1] * 0, g.levels[rows], g.views[rows])
+    geometry = (field[rows] for field in (g.means, g.scales, g.quats, g.opacities))
+    return Gaussians(*geometry, g.harmonics[rows, :1] * 0, g.levels[rows], g.views[rows])
 
 
-def _in_region(observed: ProjectedGaussians, region: Region, options: RasterOptions) -> Bool[Tensor, "n"]:
-    picture, rows = region.picture, (region.first, region.end)
-    if options.kernel == "ewa":  # has no box behind the camera
-        ahead = observed.direction @ picture.rotation[:, 2] > 0
-        seen = torch.zeros_like(ahead)
-        boxes = compute_footprints(ProjectedGaussians(*(part[ahead] for part in observed)), picture, options)[1]
-        seen[ahead] = is_in_image(boxes, picture, rows)
-        return seen
-    return is_in_image(compute_footprints(observed, picture, options)[1], picture, rows)
+def _is_in_region(projected: ProjectedGaussians, region: Region, options: RasterOptions) -> Bool[Tensor, "n"]:
+    plane, rows = region.plane, (region.first, region.end)
+    if options.kernel == "ewa":  # footprints behind the camera have no bounding box
+        is_ahead = projected.direction @ plane.rotation[:, 2] > 0
+        mask = torch.zeros_like(is_ahead)
+        boxes = compute_footprints(ProjectedGaussians(*(field[is_ahead] for field in projected)), plane, options)[1]
+        mask[is_ahead] = is_in_image(boxes, plane, rows)
+        return mask
+    return is_in_image(compute_footprints(projected, plane, options)[1], plane, rows)

@@ -89,7 +89,7 @@ def micro() -> Callable[..., PanSplat]:
 def micro_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., TrainConfig]:
     """Settings of a run of a micro network on painted spheres; runs made after this are of that kind."""
     monkeypatch.setattr(network, "network_config", lambda shape: micro_config())
-    monkeypatch.setattr(trainer, "sources", lambda data, height, seed: (PaintedSphere(), PaintedSphere(2)))
+    monkeypatch.setattr(trainer, "load_sources", lambda data, height, seed: (PaintedSphere(), PaintedSphere(2)))
     monkeypatch.setattr(TrainConfig, "check", lambda self: None)
     assert datasets is not None
 

@@ -72,14 +72,14 @@ def test_a_damaged_checkpoint_is_passed_over_with_a_warning(tmp_path: Path) -> N
     save_checkpoint(tmp_path, 1, state(), keep=2)
     newest = save_checkpoint(tmp_path, 2, state(), keep=2)
     newest.write_bytes(newest.read_bytes()[:300])
-    with pytest.warns(UserWarning, match=r"passed over a checkpoint.*step_00000002.pt"):
+    with pytest.warns(UserWarning, match=r"skipped a checkpoint.*step_00000002.pt"):
         found = load_latest(tmp_path)
     assert found is not None and found[1]["step"] == 1
 
 
 def test_when_none_can_be_read_it_is_an_error(tmp_path: Path) -> None:
     save_checkpoint(tmp_path, 1, state(), keep=1).write_bytes(b"nothing")
-    with pytest.warns(UserWarning, match="passed over"), pytest.raises(InputError, match="got none"):
+    with pytest.warns(UserWarning, match="skipped"), pytest.raises(InputError, match="got none"):
         load_latest(tmp_path)
     assert load_latest(tmp_path / "nowhere") is None
 

@@ -9,7 +9,7 @@ import pytest
 from pansplat.data.sources import PairSource, TripletSource
 from pansplat.errors import InputError
 from pansplat.training.config import DataConfig
-from pansplat.training.datasets import RESERVED, is_reserved, sources
+from pansplat.training.datasets import RESERVED, is_reserved, load_sources
 
 _FAMILIES = (
     *("oa_minia", "oa_koth1", "mictf1beta", "hydronex2", "sleekgrinder", "pul1duel-oa", "oacmpdm1", "oa_shouse"),
@@ -28,8 +28,8 @@ def write_triplets(folder: Path, *names: str) -> Path:
 @pytest.mark.parametrize("family", _FAMILIES)
 def test_a_reserved_map_is_never_trained_on(family: str, tmp_path: Path) -> None:
     write_triplets(tmp_path, f"{family}_000", f"{family}_001", "oa_dm3_000")
-    with pytest.warns(UserWarning, match="2 of 3 triplets are of maps reserved for evaluation"):
-        both = sources(DataConfig("triplets", tmp_path), 64, 0)
+    with pytest.warns(UserWarning, match="2 of 3 triplets belong to maps that are reserved"):
+        both = load_sources(DataConfig("triplets", tmp_path), 64, 0)
     for source in both:
         assert isinstance(source, TripletSource)
         assert [path.stem for path in source.triplets.sources] == ["oa_dm3_000"]
@@ -37,8 +37,8 @@ def test_a_reserved_map_is_never_trained_on(family: str, tmp_path: Path) -> None
 
 def test_a_folder_of_reserved_maps_alone_is_refused(tmp_path: Path) -> None:
     write_triplets(tmp_path, "strength_000", "bleach_017")
-    with pytest.raises(InputError, match="needed something to train on, got 2 triplets of reserved maps only"):
-        sources(DataConfig("triplets", tmp_path), 64, 0)
+    with pytest.raises(InputError, match="needed training data, got 2 triplets of reserved maps only"):
+        load_sources(DataConfig("triplets", tmp_path), 64, 0)
 
 
 def test_names_that_only_look_alike_are_trained_on() -> None:
@@ -51,11 +51,11 @@ def test_names_that_only_look_alike_are_trained_on() -> None:
 def test_the_demo_maps_are_trained_on_without_the_reserved_ones(shared: Path) -> None:
     root = shared / "data" / "bsp_demo"
     with pytest.warns(UserWarning, match="6 of 12 triplets"):
-        training, _ = sources(DataConfig("triplets", root), 64, 0)
+        training, _ = load_sources(DataConfig("triplets", root), 64, 0)
     assert isinstance(training, TripletSource)
     assert {path.stem[:-4] for path in training.triplets.sources} == {"desertfactory", "oa_dm3"}
     with pytest.warns(UserWarning, match="6 of 12 triplets"):
-        pairs, validation = sources(DataConfig("pairs", root), 64, 0)
+        pairs, validation = load_sources(DataConfig("pairs", root), 64, 0)
     for source in (pairs, validation):
         assert isinstance(source, PairSource)
         assert {pair.name.rsplit("_", 1)[0] for pair in source.pairs} == {"desertfactory", "oa_dm3"}

@@ -116,16 +116,16 @@ def test_processes_with_cuda_meet_by_nccl_on_their_device(monkeypatch: pytest.Mo
     monkeypatch.setattr(torch.cuda, "set_device", asked.append)
     monkeypatch.setattr(torch.distributed, "init_process_group", lambda kind, timeout: asked.append(kind))
     _started(monkeypatch, WORLD_SIZE="2", RANK="1", LOCAL_RANK="1")
-    ProcessGroup().join(torch.device("cuda", 1))
-    ProcessGroup().join(torch.device("cpu"))
+    ProcessGroup().initialize(torch.device("cuda", 1))
+    ProcessGroup().initialize(torch.device("cpu"))
     assert asked == [torch.device("cuda", 1), "nccl", "gloo"]
 
 
 @pytest.mark.parametrize(
     ("environment", "told"),
     [
-        ({"WORLD_SIZE": "two"}, "needed a number in the environment's WORLD_SIZE, got 'two'"),
-        ({"WORLD_SIZE": "2"}, "needed a number in the environment's RANK, got ''"),
+        ({"WORLD_SIZE": "two"}, "needed a number in the environment variable WORLD_SIZE, got 'two'"),
+        ({"WORLD_SIZE": "2"}, "needed a number in the environment variable RANK, got ''"),
         ({"WORLD_SIZE": "2", "RANK": "2", "LOCAL_RANK": "0"}, "RANK must be below WORLD_SIZE, got 2 of 2"),
     ],
 )
@@ -141,8 +141,8 @@ def test_processes_that_cannot_meet_are_an_error(monkeypatch: pytest.MonkeyPatch
     _started(monkeypatch, WORLD_SIZE="2", RANK="0", LOCAL_RANK="0")
     for name in ("MASTER_ADDR", "MASTER_PORT"):
         monkeypatch.delenv(name, raising=False)
-    with pytest.raises(InputError, match=r"process 0 of 2 could not meet the others by gloo .*MASTER_ADDR"):
-        ProcessGroup().join(torch.device("cpu"))
+    with pytest.raises(InputError, match=r"process 0 of 2 could not connect to the others by gloo .*MASTER_ADDR"):
+        ProcessGroup().initialize(torch.device("cpu"))
 
 
 def _started(monkeypatch: pytest.MonkeyPatch, **environment: str) -> None:

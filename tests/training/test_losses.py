@@ -19,8 +19,8 @@ from pansplat.training.losses import (
     choose_perceptual,
     depth_loss,
     image_loss,
+    make_pixel_weights,
     mean_square,
-    pixel_weights_of,
     ssim_map,
 )
 
@@ -84,7 +84,7 @@ def test_masked_pixels_have_no_part_in_the_image_loss() -> None:
     masks[:, 16:] = False
     spoilt = prediction.clone()
     spoilt[..., 16:, :] = 9.0
-    weights = pixel_weights_of(masks, (2, 24, 48))
+    weights = make_pixel_weights(masks, (2, 24, 48))
     losses = [image_loss(p, target, Structure(), PAPER, pixel_weights=weights) for p in (prediction, spoilt)]
     assert float(losses[0].total) == pytest.approx(float(losses[1].total), rel=1e-12)
     inside = float((prediction - target)[..., :16, :].square().mean())
@@ -101,13 +101,13 @@ def test_without_any_pixel_the_loss_and_its_gradients_are_zero() -> None:
 
 
 def test_spherical_weights_are_solid_angles_and_off_by_default() -> None:
-    assert pixel_weights_of(None, (1, 8, 16)) is None
-    weights = pixel_weights_of(None, (1, 8, 16), spherical=True)
+    assert make_pixel_weights(None, (1, 8, 16)) is None
+    weights = make_pixel_weights(None, (1, 8, 16), spherical=True)
     assert weights is not None
     torch.testing.assert_close(weights[0, :, 3], row_weights(8).float())
     masks = torch.ones(1, 8, 16, dtype=torch.bool)
     masks[0, 2] = False
-    masked = pixel_weights_of(masks, (1, 8, 16), spherical=True)
+    masked = make_pixel_weights(masks, (1, 8, 16), spherical=True)
     assert masked is not None and not masked[0, 2].any()
     torch.testing.assert_close(masked[0, 3], weights[0, 3])
 

@@ -90,7 +90,7 @@ def test_too_little_memory_is_told_with_what_to_do(
     def full(self: Trainer, batches: list) -> dict[str, float]:
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 10 bytes")
 
-    monkeypatch.setattr(Trainer, "_learn", full)
+    monkeypatch.setattr(Trainer, "_optimize", full)
     monkeypatch.setattr(command, "parse", lambda argv: micro_run())
     assert run([]) == 2
     assert "--memory.backpropagation two-step" in capsys.readouterr().err
@@ -100,21 +100,21 @@ def test_the_same_command_goes_on_and_says_from_where(
     micro_run: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(command, "parse", lambda argv: micro_run(steps=2))
-    learn = Trainer._learn
+    learn = Trainer._optimize
 
     def interrupted(self: Trainer, batches: list) -> dict[str, float]:
         os.kill(os.getpid(), signal.SIGINT)
         return learn(self, batches)
 
     with monkeypatch.context() as patched:
-        patched.setattr(Trainer, "_learn", interrupted)
+        patched.setattr(Trainer, "_optimize", interrupted)
         assert run([]) == 130
     said = capsys.readouterr().err
-    assert "stopped after step 1; the same command goes on from there" in said
-    assert "going on from" not in said
+    assert "stopped after step 1; run the same command to resume" in said
+    assert "resuming from" not in said
     assert run([]) == 0
     said = capsys.readouterr().err
-    assert "going on from" in said and "step_00000001.pt" in said and "from step 1 of 2" in said
+    assert "resuming from" in said and "step_00000001.pt" in said and "from step 1 of 2" in said
     assert "done: " in said and "model.safetensors" in said
     with monkeypatch.context() as patched:
         patched.setattr(command, "parse", lambda argv: micro_run(steps=3))
@@ -142,5 +142,5 @@ def test_ctrl_c_in_a_terminal_saves_and_shows_no_traceback(tmp_path: Path) -> No
         said += child.stderr.read()
     assert child.returncode == 130, said
     assert "Traceback" not in said, said
-    assert "the same command goes on from there" in said
+    assert "run the same command to resume" in said
     assert list((tmp_path / "run" / "checkpoints").glob("step_*.pt"))

@@ -81,7 +81,7 @@ def test_parts_of_no_gaussians_are_empty(style: Style) -> None:
 @pytest.mark.parametrize("height", [32, 64, 512, 2048])
 def test_strips_cover_every_row_once_and_have_one_area(height: int) -> None:
     renderer = TargetRenderer("panorama", "joint", height)
-    rows = [renderer._rows(part.part) for part in renderer.parts(2)]
+    rows = [renderer._strip_rows(part.index) for part in renderer.parts(2)]
     assert rows[0][0] == 0 and rows[-1][1] == height
     assert all(before[1] == after[0] for before, after in itertools.pairwise(rows))
     areas = [math.cos(math.pi * first / height) - math.cos(math.pi * end / height) for first, end in rows]

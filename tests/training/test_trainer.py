@@ -50,7 +50,7 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(
     optimizer = OptimizerConfig(steps=6, batch_size=1, accumulate=accumulate, rate=1e-3, ema=0.9)
     whole, broken = micro_run("whole", optimizer=optimizer), micro_run("broken", optimizer=optimizer)
     wanted = trained(whole)
-    learn = Trainer._learn
+    learn = Trainer._optimize
 
     def killed(self: Trainer, batches: list) -> dict[str, float]:
         if self.step == 5:  # the last checkpoint is of step 4, and a row of step 4 has been written since
@@ -58,7 +58,7 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(
         return learn(self, batches)
 
     with monkeypatch.context() as patched:
-        patched.setattr(Trainer, "_learn", killed)
+        patched.setattr(Trainer, "_optimize", killed)
         with pytest.raises(Killed):
             Trainer(broken, silent=True).train()
     assert [row[0] for row in curve(broken.out)] == list("01234")
@@ -79,7 +79,7 @@ def test_ctrl_c_saves_and_the_same_command_goes_on(
     micro_run: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = micro_run(steps=4, checkpoint=CheckpointConfig(every=0))
-    learn = Trainer._learn
+    learn = Trainer._optimize
 
     def interrupted(self: Trainer, batches: list) -> dict[str, float]:
         if self.step == 1:
@@ -87,7 +87,7 @@ def test_ctrl_c_saves_and_the_same_command_goes_on(
         return learn(self, batches)
 
     with monkeypatch.context() as patched:
-        patched.setattr(Trainer, "_learn", interrupted)
+        patched.setattr(Trainer, "_optimize", interrupted)
         assert not Trainer(config, silent=True).train()
     again = Trainer(config, silent=True)
     assert again.step == 2
@@ -99,7 +99,7 @@ def test_a_loss_that_is_no_number_stops_the_run_and_keeps_the_batch(
     micro_run: Callable[..., TrainConfig], sphere: type, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = sphere(8, broken=frozenset(range(8)))
-    monkeypatch.setattr(trainer, "sources", lambda *_: (source, source))
+    monkeypatch.setattr(trainer, "load_sources", lambda *_: (source, source))
     config = micro_run()
     with pytest.raises(InputError, match=r"step 0: needed finite numbers.*sphere_"):
         Trainer(config, silent=True).train()

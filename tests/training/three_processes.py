@@ -31,7 +31,7 @@ class Lessons(nn.Module):
 
 def main(folder: Path) -> None:
     processes = ProcessGroup()
-    processes.join(torch.device("cpu"))
+    processes.initialize(torch.device("cpu"))
     torch.manual_seed(0)
     lessons = Lessons()
     shared = data_parallel(lessons, processes)
@@ -50,7 +50,7 @@ def main(folder: Path) -> None:
         lessons.zero_grad()
         lessons(given.flatten(0, 1), False)[0].backward()
         torch.save({name: p.grad for name, p in lessons.chain.named_parameters()}, folder / "joint.pt")
-    processes.leave()
+    processes.destroy()
 
 
 def _write(lessons: Lessons, path: Path) -> None:

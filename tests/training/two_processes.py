@@ -24,7 +24,7 @@ WAYS = (("plain", 1), ("plain", 2), ("two-step", 1), ("two-step", 2))
 
 def main(folder: Path) -> None:
     processes = ProcessGroup()
-    processes.join(torch.device("cpu"))
+    processes.initialize(torch.device("cpu"))
     torch.manual_seed(3)
     network = PanSplat(micro_config(), "fixed").double()
     convert_sync_batch_norm(network, processes)
@@ -39,7 +39,7 @@ def main(folder: Path) -> None:
         found |= {f"{method} {rounds} {name}": p.grad for name, p in network.named_parameters() if p.grad is not None}
     buffers = {name: tensor for name, tensor in network.named_buffers() if tensor.is_floating_point()}
     torch.save({**found, **buffers}, folder / f"{processes.count}_{processes.rank}.pt")
-    processes.leave()
+    processes.destroy()
 
 
 def batch_of(processes: ProcessGroup, number: int) -> Batch:
