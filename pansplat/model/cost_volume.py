@@ -1,10 +1,11 @@
-"""Hierarchical spherical cost volume: from features to inverse depth, level by level.
+"""Hierarchical spherical cost volume: from features to inverse depth, coarse to fine.
 
-Each level sweeps candidate spheres about the result of the coarser one, correlates the views' features, refines the
-volume with a U-Net, and takes the mean of the candidates under the softmax of its logits.
+Each level tests depth candidates around the result of the coarser one: it correlates the features of the views at
+every candidate, refines the volume with a U-Net and regresses the mean of the candidates under the softmax of the
+logits. The U-Net attends across positions and views at its bottleneck.
 
-Source: PanSplat, section 3.2 and Figure 3; OFFICIAL.md, section 6. The candidates' spacing halves from level to
-level, as in the original (the paper keeps it; OFFICIAL.md, P3).
+Source: PanSplat, section 3.2 and Figure 3; OFFICIAL.md, sections 6 and 7. The candidate spacing halves from level to
+level, as in the official code; the paper keeps it (OFFICIAL.md, P3).
 """
 
 from dataclasses import dataclass
@@ -34,7 +35,10 @@ from pansplat.model.layers import (
     upsample,
 )
 
-_UNET_MULTIPLE = 4  # what a U-Net of three scales divides the map by
+_UNET_MULTIPLE = 4  # a U-Net of three scales halves the map twice
+
+_GROUPS = 8  # of the group normalisations
+_HEAD_CHANNELS = 32
 
 
 @dataclass(frozen=True)
@@ -42,10 +46,11 @@ class SweepLevel:
     """Shape of one level of the cost volume."""
 
     level: int
-    """0 would be the finest, at the image's size."""
+    """Pyramid level of the features; the map has 2^-level of the image's size."""
     channels: int
-    """Of the features."""
+    """Channels of the features."""
     candidates: int
+    """Depth candidates of a pixel."""
     width: int
     """Channels of the U-Net."""
 
@@ -62,23 +67,23 @@ class CostVolumeConfig:
     """Shape of the cost volume; shipped weights fix all of it."""
 
     sweep: Literal["hierarchical", "single"] = "hierarchical"
-    """All levels, or the coarsest alone."""
+    """All levels, or the coarsest level only."""
     mono_channels: int = 32
-    """Of the monocular features; 0 goes without."""
+    """Channels of the monocular features; 0 for none."""
     refinement: Literal["unet", "none"] = "unet"
-    """Whether a U-Net refines the volume, or a 1x1 convolution alone mixes it."""
+    """Refine the volume by a U-Net beside the 1x1 convolution, or by the convolution only."""
     levels: tuple[SweepLevel, ...] = _HIERARCHY
     """Coarse to fine."""
 
     @property
     def swept_levels(self) -> tuple[SweepLevel, ...]:
-        """Coarse to fine."""
+        """The levels in use, coarse to fine."""
         return self.levels if self.sweep == "hierarchical" else self.levels[:1]
 
 
 @dataclass(frozen=True)
 class LevelDepth:
-    """What one level of the cost volume knows."""
+    """Result of one level of the cost volume."""
 
     level: int
     inverse_depth: Float[Tensor, "batch view height width"]
@@ -87,11 +92,11 @@ class LevelDepth:
     """Largest probability of a candidate."""
     logits: Float[Tensor, "batch view candidate height width"]
     candidates: Float[Tensor, "batch view candidate height width"]
-    """Inverse depths, 1 / metres; the first is the farthest."""
+    """Inverse depths, 1 / metres, from far to near."""
 
     @property
     def depth(self) -> Float[Tensor, "batch view height width"]:
-        """Radial, metres."""
+        """Radial depth, metres."""
         return 1 / self.inverse_depth
 
 
@@ -103,32 +108,17 @@ class Depths:
 
     @property
     def inverse_depth(self) -> list[Float[Tensor, "batch view _ _"]]:
-        """1 / metres, coarse to fine."""
+        """Inverse depth, 1 / metres, coarse to fine."""
         return [level.inverse_depth for level in self.levels]
 
     @property
     def depth(self) -> list[Float[Tensor, "batch view _ _"]]:
-        """Radial, metres, coarse to fine."""
+        """Radial depth, metres, coarse to fine."""
         return [level.depth for level in self.levels]
-
-    @property
-    def confidence(self) -> list[Float[Tensor, "batch view _ _"]]:
-        """Largest probability of a candidate, coarse to fine."""
-        return [level.confidence for level in self.levels]
-
-    @property
-    def logits(self) -> Float[Tensor, "batch view candidate h w"]:
-        """Of the finest swept level."""
-        return self.levels[-1].logits
-
-    @property
-    def candidates(self) -> Float[Tensor, "batch view candidate h w"]:
-        """Inverse depths of the finest swept level, 1 / metres."""
-        return self.levels[-1].candidates
 
 
 class SphericalCostVolume(nn.Module):
-    """Inverse depth of every view, coarse to fine."""
+    """Regresses the inverse depth of every view, coarse to fine."""
 
     def __init__(
         self,
@@ -141,7 +131,7 @@ class SphericalCostVolume(nn.Module):
         self.config = config
         self.precision: Precision = precision
         self.compat: Compat = compat
-        # Keys are the paper's numbers of the levels.
+        # Keys are pyramid levels.
         self.levels = nn.ModuleDict()
         for index, sweep in enumerate(config.swept_levels):
             self.levels[str(sweep.level)] = LevelRefinement(
@@ -157,45 +147,47 @@ class SphericalCostVolume(nn.Module):
         far: Float[Tensor, "batch view"],
         mono_features: Float[Tensor, "batch view mono height width"] | None = None,
     ) -> Depths:
-        """Sweep, refine and regress at each level.
+        """Correlate, refine and regress at each level.
 
         Args:
-            features: of the feature pyramid, coarse to fine; maps finer than the sweep are left alone.
-            cam2world: rigid, metres.
-            near: nearest depth that is looked for, metres, > 0.
-            far: farthest, metres.
+            features: of the feature pyramid, coarse to fine; maps finer than the swept levels are not used.
+            cam2world: rigid poses, metres.
+            near: smallest depth candidate, metres, > 0.
+            far: largest depth candidate, metres.
             mono_features: of the monocular network, at any size.
 
         Raises:
-            InputError: too few views (or too many for the original), a pose that is not rigid, or maps the U-Net
+            InputError: fewer than two views ("official": not two), a pose that is not rigid, or maps that the U-Net
                 cannot halve.
-            ValueError: monocular features missing or surplus.
+            ValueError: `mono_features` are missing, or given although `mono_channels` is 0.
         """
         require_views(cam2world.shape[1], self.compat)
         require_rigid(cam2world)
         if (mono_features is None) != (self.config.mono_channels == 0):
-            raise ValueError(f"mono_channels={self.config.mono_channels}, but `mono_features` say otherwise")
+            raise ValueError(
+                f"mono_channels={self.config.mono_channels} needs `mono_features` exactly where it is not 0"
+            )
         bounds = (1 / far, 1 / near)
-        done: list[LevelDepth] = []
+        regressed: list[LevelDepth] = []
         for sweep, level_features in zip(self.config.swept_levels, features, strict=False):
             height, width = level_features.shape[-2:]
             require_size(height, width, _UNET_MULTIPLE)
-            centre = upsample_centre(done[-1].inverse_depth, self.compat) if done else None
+            centre = upsample_centre(regressed[-1].inverse_depth, self.compat) if regressed else None
             first_count = self.config.swept_levels[0].candidates
             if centre is None:
                 candidates = first_candidates(bounds, first_count, (height, width))
             else:
-                step = (bounds[1] - bounds[0]) / max(1, first_count - 1) / 2 ** len(done)
+                step = (bounds[1] - bounds[0]) / max(1, first_count - 1) / 2 ** len(regressed)
                 candidates = candidates_around(centre, step, bounds, sweep.candidates)
             volume = correlate_views(level_features, candidates, cam2world, self.compat)
             with autocast_convolutions(self.precision, volume.device):
                 logits = self.levels[str(sweep.level)](volume, level_features, centre, mono_features)
-            done.append(regress_depth(sweep.level, logits.to(level_features.dtype), candidates))
-        return Depths(tuple(done))
+            regressed.append(regress_depth(sweep.level, logits.to(level_features.dtype), candidates))
+        return Depths(tuple(regressed))
 
 
 class LevelRefinement(nn.Module):
-    """From a level's cost volume to the logits of its candidates: paper's C to C~."""
+    """From a level's cost volume to the logits of its candidates; from C to C~ in the paper."""
 
     def __init__(
         self, sweep: SweepLevel, config: CostVolumeConfig, *, first: bool, compat: Compat, precision: AttentionPrecision
@@ -255,7 +247,7 @@ class VolumeRefinement(nn.Module):
 def first_candidates(
     bounds: tuple[Float[Tensor, "batch view"], Float[Tensor, "batch view"]], count: int, size: tuple[int, int]
 ) -> Float[Tensor, "batch view candidate height width"]:
-    """Inverse depths evenly from far to near, the same for every pixel; one alone is in the middle."""
+    """Inverse depths, evenly from far to near, the same for every pixel; a single one is the middle."""
     low, high = (bound[:, :, None] for bound in bounds)
     fraction = torch.linspace(0, 1, count).to(low) if count > 1 else torch.full((1,), 0.5).to(low)
     candidates = low + fraction * (high - low)
@@ -268,7 +260,7 @@ def candidates_around(
     bounds: tuple[Float[Tensor, "batch view"], Float[Tensor, "batch view"]],
     count: int,
 ) -> Float[Tensor, "batch view candidate height width"]:
-    """Inverse depths about each pixel's own, clamped to the bounds."""
+    """Inverse depths around each pixel's centre, clamped to the bounds."""
     low, high = (bound[:, :, None, None, None] for bound in bounds)
     offsets = torch.arange(-(count // 2), count - count // 2).to(centre)[:, None, None]
     candidates = centre[:, :, None] + step[:, :, None, None, None] * offsets
@@ -278,7 +270,7 @@ def candidates_around(
 def upsample_centre(
     inverse_depth: Float[Tensor, "batch view height width"], compat: Compat
 ) -> Float[Tensor, "batch view h w"]:
-    """The coarser level's result at twice its size; no gradient flows back through it."""
+    """Double the size of the coarser level's inverse depth; without gradient."""
     return upsample(inverse_depth.detach(), 2, compat)
 
 
@@ -288,15 +280,17 @@ def correlate_views(
     cam2world: Float[Tensor, "batch view 4 4"],
     compat: Compat,
 ) -> Float[Tensor, "batch view candidate height width"]:
-    """Each view's correlation with the others, averaged over them."""
-    total = _correlate_round(features, candidates, cam2world, 1, compat)
+    """Correlate each view with every other view; returns the mean over the others."""
+    total = _correlate_neighbours(features, candidates, cam2world, 1, compat)
     for offset in range(2, features.shape[1]):
-        total = total + _correlate_round(features, candidates, cam2world, offset, compat)
+        total = total + _correlate_neighbours(features, candidates, cam2world, offset, compat)
     return total / (features.shape[1] - 1)
 
 
-def _correlate_round(features: Tensor, candidates: Tensor, cam2world: Tensor, offset: int, compat: Compat) -> Tensor:
-    """Each view's correlation with the one that comes `offset` views later, counted round."""
+def _correlate_neighbours(
+    features: Tensor, candidates: Tensor, cam2world: Tensor, offset: int, compat: Compat
+) -> Tensor:
+    """Correlate each view with the one `offset` views later; the last views continue with the first."""
     sampling: Sampling = "sphere" if compat == "fixed" else "corners"
     correlation = correlate(
         features.flatten(0, 1),
@@ -313,14 +307,10 @@ def regress_depth(
     logits: Float[Tensor, "batch view candidate height width"],
     candidates: Float[Tensor, "batch view candidate height width"],
 ) -> LevelDepth:
-    """The mean of the candidates under the softmax of the logits, in float32 at least."""
+    """Regress the mean of the candidates under the softmax of the logits, in float32 or float64."""
     probability = torch.softmax(logits.to(torch.promote_types(logits.dtype, torch.float32)), dim=2)
     inverse_depth = (probability * candidates).sum(dim=2)
     return LevelDepth(level, inverse_depth, probability.amax(dim=2), logits, candidates)
-
-
-_GROUPS = 8  # of every normalisation
-_HEAD_CHANNELS = 32
 
 
 @dataclass(frozen=True)
@@ -328,13 +318,16 @@ class UNetConfig:
     """Shape of a U-Net."""
 
     channels: int
-    """Of every map."""
+    """Channels of every map."""
     scales: int = 3
-    """Sizes of the map, each half of the one before. Attention is at the last."""
+    """Number of map sizes, each half of the previous one; attention is at the last."""
 
 
 class UNet(nn.Module):
-    """Encoder, middle and decoder; scale 0 is the input's size, the last is the bottleneck."""
+    """2-D U-Net over the maps of all views; scale 0 has the input's size, the last is the bottleneck.
+
+    Source: PanSplat, section 3.2 (after MVSplat, after the U-Net of latent diffusion).
+    """
 
     def __init__(self, config: UNetConfig, border: Border, precision: AttentionPrecision = "float32") -> None:
         super().__init__()
@@ -353,21 +346,21 @@ class UNet(nn.Module):
     def forward(
         self, maps: Float[Tensor, "batch view channel height width"]
     ) -> Float[Tensor, "batch view channel height width"]:
-        """Refine the maps of all views; height and width must halve `scales - 1` times."""
+        """Refine the maps of all views; 2^(scales - 1) must divide height and width."""
         views = maps.shape[1]
-        flow = self.stem(maps.flatten(0, 1))
-        skips = [flow]
+        x = self.stem(maps.flatten(0, 1))
+        skips = [x]
         for scale in self.encoder:
-            flow = scale(flow, views, skips)
+            x = scale(x, views, skips)
         for block in self.middle:
-            flow = block(flow)
+            x = block(x)
         for scale in reversed(self.decoder):
-            flow = scale(flow, views, skips)
-        return functional.silu(self.exit(flow)).unflatten(0, maps.shape[:2])
+            x = scale(x, views, skips)
+        return functional.silu(self.exit(x)).unflatten(0, maps.shape[:2])
 
 
 class EncoderScale(nn.Module):
-    """A residual block, attention at the bottleneck, and elsewhere a convolution that halves the map."""
+    """A residual block, then attention at the bottleneck or a convolution that halves the map elsewhere."""
 
     def __init__(self, channels: int, border: Border, precision: AttentionPrecision, *, bottleneck: bool) -> None:
         super().__init__()
@@ -376,21 +369,21 @@ class EncoderScale(nn.Module):
         self.downsample = None if bottleneck else PanoramaConv2d(channels, channels, 3, stride=2, border=border)
 
     def forward(
-        self, flow: Float[Tensor, "image channel height width"], views: int, skips: list[Tensor]
+        self, x: Float[Tensor, "image channel height width"], views: int, skips: list[Tensor]
     ) -> Float[Tensor, "image channel h w"]:
-        """The next scale's map; what the decoder will want again is added to `skips`."""
-        flow = self.block(flow)
+        """The next scale's map; appends the maps for the decoder to `skips`."""
+        x = self.block(x)
         if self.attention is not None:
-            flow = self.attention(flow, views)
-        skips.append(flow)
+            x = self.attention(x, views)
+        skips.append(x)
         if self.downsample is not None:
-            flow = self.downsample(flow)
-            skips.append(flow)
-        return flow
+            x = self.downsample(x)
+            skips.append(x)
+        return x
 
 
 class DecoderScale(nn.Module):
-    """Two residual blocks that each take a skip, attention at the bottleneck, and a doubling of the map."""
+    """Two residual blocks with skip connections, attention at the bottleneck, upsampling."""
 
     def __init__(
         self, channels: int, border: Border, precision: AttentionPrecision, *, bottleneck: bool, finest: bool
@@ -401,16 +394,16 @@ class DecoderScale(nn.Module):
         self.upsample = None if finest else PanoramaConv2d(channels, channels, 3, border=border)
 
     def forward(
-        self, flow: Float[Tensor, "image channel height width"], views: int, skips: list[Tensor]
+        self, x: Float[Tensor, "image channel height width"], views: int, skips: list[Tensor]
     ) -> Float[Tensor, "image channel h w"]:
-        """The next scale's map; takes its skips off the end of `skips`."""
+        """The next scale's map; pops its skip maps from the end of `skips`."""
         for index, block in enumerate(self.blocks):
-            flow = block(torch.cat((flow, skips.pop()), dim=1))
+            x = block(torch.cat((x, skips.pop()), dim=1))
             if self.attentions is not None:
-                flow = self.attentions[index](flow, views)
+                x = self.attentions[index](x, views)
         if self.upsample is not None:
-            flow = self.upsample(functional.interpolate(flow, scale_factor=2, mode="nearest"))
-        return flow
+            x = self.upsample(functional.interpolate(x, scale_factor=2, mode="nearest"))
+        return x
 
 
 class ConvNorm(nn.Module):
@@ -426,7 +419,7 @@ class ConvNorm(nn.Module):
 
 
 class ResBlock(nn.Module):
-    """Two convolutions beside a shortcut; before training the shortcut is all."""
+    """Two convolutions beside a shortcut; freshly initialised, the output is the shortcut's."""
 
     def __init__(self, inputs: int, outputs: int, border: Border) -> None:
         super().__init__()
@@ -441,7 +434,7 @@ class ResBlock(nn.Module):
 
 
 class JointAttention(nn.Module):
-    """Attention among the positions of all views at once, added to the map; before training it adds nothing."""
+    """Adds attention over the positions of all views; freshly initialised, it adds zero."""
 
     def __init__(self, channels: int, precision: AttentionPrecision) -> None:
         super().__init__()
@@ -456,17 +449,17 @@ class JointAttention(nn.Module):
         self, maps: Float[Tensor, "image channel height width"], views: int
     ) -> Float[Tensor, "image channel height width"]:
         count, channels, height, width = maps.shape
-        projected = _at_each_pixel(self.project_in, maps).movedim(1, -1)
+        projected = _apply_per_pixel(self.project_in, maps).movedim(1, -1)
         tokens = projected.reshape(count // views, views * height * width, 3 * channels)
-        # Each head's query, key and value lie one after another.
+        # The channels of each head are its query, key and value, one after another.
         queries, keys, values = tokens.unflatten(-1, (self.heads, 3, _HEAD_CHANNELS)).permute(3, 0, 2, 1, 4)
         attended = attend(queries, keys, values, precision=self.precision)
         merged = attended.transpose(1, 2).reshape(count, height, width, channels).movedim(-1, 1)
-        return maps + self.norm(_at_each_pixel(self.project_out, to_channels_last(merged)))
+        return maps + self.norm(_apply_per_pixel(self.project_out, to_channels_last(merged)))
 
 
-def _at_each_pixel(
+def _apply_per_pixel(
     linear: nn.Linear, maps: Float[Tensor, "image channel height width"]
 ) -> Float[Tensor, "image c height width"]:
-    """A linear layer across the channels, as the convolution that it is in the original."""
+    """Apply a linear layer to the channels of every pixel, as a 1x1 convolution."""
     return functional.conv2d(maps, linear.weight[:, :, None, None], linear.bias)

@@ -1,10 +1,11 @@
-"""Residual Gaussian heads: from features to Gaussians on the lattices of a pyramid, coarse to fine.
+"""Residual Gaussian heads: from features to Gaussians on the lattices of a spherical pyramid, coarse to fine.
 
-Each level's small CNN reads the image, the view's features, the refined cost volume and what the coarser level
-passed on, and adds to that. A point of the level's lattice reads the sum, and a linear layer turns what it reads
-into one Gaussian. All of it runs tile by tile where memory asks for it.
+The head of a level is a small CNN. It reads the image, the features, the refined cost volume and the map of the coarser
+level, and adds its output to that map. Each lattice point samples the sum; a linear layer turns the sample into the
+parameters of one Gaussian, and the adapter turns those into a Gaussian in the world. The heads run tile by tile to
+bound memory.
 
-Source: PanSplat, sections 3.3 and 3.4, figure 3; OFFICIAL.md, section 8.
+Source: PanSplat, sections 3.3 and 3.4 and Figure 3; OFFICIAL.md, sections 8 and 9.
 """
 
 from __future__ import annotations
@@ -41,10 +42,15 @@ from pansplat.model.tiles import (
     tile_grid,
 )
 
+_SCALE_UNIT = 0.2  # map pixels of a scale of 1
+# The polar axis of the network's harmonics is y: their k-th function of d is the 3DGS function of _POLAR_Y @ d.
+_POLAR_Y = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+_MAX_HEIGHT = 512  # of the cost volume's input
+
 
 @dataclass(frozen=True)
 class AdapterConfig:
-    """Ranges of what the network may predict; shipped weights fix all of it."""
+    """Degree of the colours and range of the scales; shipped weights fix all of it."""
 
     degree: int = 4
     """Degree of the spherical harmonics."""
@@ -55,7 +61,7 @@ class AdapterConfig:
 
     @property
     def num_parameters(self) -> int:
-        """Numbers a Gaussian: 3 scale, 4 rotation, 3 colours of (degree + 1)^2 harmonics."""
+        """Parameters of a Gaussian: 3 of scale, 4 of rotation, (degree + 1)^2 harmonics for each of 3 colours."""
         return 7 + 3 * (self.degree + 1) ** 2
 
 
@@ -64,36 +70,54 @@ class HeadsConfig:
     """Shape of the heads; the switches are the paper's ablations."""
 
     lattice: Lattice = "fibonacci"
-    """Where Gaussians stand: evenly on the sphere, or one a pixel."""
+    """Positions of the Gaussians: evenly on the sphere, or one at each pixel."""
     levels: Literal["pyramid", "single"] = "pyramid"
-    """Heads on all four levels, or on the finest only."""
+    """Heads on all levels, or on the finest only."""
     emitted: Literal["all", "finest"] = "all"
-    """Which levels make Gaussians; coarser ones may serve the finest only."""
+    """Levels that emit Gaussians; with "finest", coarser levels only pass their maps on."""
     residual: bool = True
-    """Whether a level reads, and adds to, what the coarser one passes on."""
+    """Whether a level reads the coarser level's map and adds to it."""
     depth: Literal["refined", "swept"] = "refined"
-    """Depth and opacity from the head's own logits, or the sweep's depth and confidence as they are."""
+    """Depth and opacity from logits of the head, or the depth and confidence of the cost volume."""
     feature_channels: tuple[int, ...] = (128, 96, 64, 32)
     """Channels of the feature maps, coarse to fine."""
     candidates: int = 32
-    """Depth candidates of the finest sweep."""
+    """Depth candidates of the finest swept level."""
     layers: int = 3
-    """Convolutions a level."""
+    """Convolutions of each level."""
     adapter: AdapterConfig = field(default_factory=AdapterConfig)
 
     @property
     def outputs(self) -> int:
-        """Numbers a point: 2 offset, the adapter's, and the logits of depth and opacity where they are refined."""
+        """Outputs for a point: 2 of offset, the adapter's parameters, and logits of depth and opacity if refined."""
         return 2 + self.adapter.num_parameters + (self.candidates + 1 if self.depth == "refined" else 0)
+
+
+AUXILIARY_HEADS = HeadsConfig(depth="swept", layers=2, feature_channels=(128, 96, 64))
+"""Official shape of the auxiliary heads; the features are those of the swept levels, coarse to fine."""
+
+
+@dataclass(frozen=True)
+class MatchedViews:
+    """Images, features and depths of all views: everything that the heads read."""
+
+    images: Float[Tensor, "batch view 3 height width"]
+    """RGB in [0, 1], at full resolution."""
+    features: Sequence[Float[Tensor, "batch view _ _ _"]]
+    """Feature maps, coarse to fine; resized where the images are larger than theirs."""
+    depths: Depths
+    cam2world: Float[Tensor, "batch view 4 4"]
+    near: Float[Tensor, "batch view"]
+    far: Float[Tensor, "batch view"]
 
 
 @dataclass(frozen=True)
 class ViewInputs:
-    """What the heads know of one view. Maps are (channel, height, width)."""
+    """Inputs of the heads for one view of one batch item."""
 
     image: Float[Tensor, "3 height width"]
     features: list[Float[Tensor, "_ _ _"]]
-    """Coarse to fine."""
+    """Feature maps, coarse to fine."""
     logits: Float[Tensor, "candidate h w"]
     candidates: Float[Tensor, "candidate h w"]
     inverse_depth: Float[Tensor, "rows columns"]
@@ -106,15 +130,15 @@ class ViewInputs:
 
 @dataclass(frozen=True)
 class TileGaussians:
-    """The Gaussians of one tile: a set a batch item, and where they stand among those of all tiles."""
+    """The Gaussians of one tile, one set for each batch item."""
 
     gaussians: list[Gaussians]
     index: Integer[Tensor, "n"]
-    """Place of each in the untiled order: level coarse to fine, then view, then lattice point."""
+    """Index of each Gaussian in the untiled order: level coarse to fine, then view, then lattice point."""
 
 
 class LevelHead(nn.Module):
-    """The CNN of one level, and the linear layer that its lattice points read it through."""
+    """The CNN of one level, and the linear layer that is applied to its samples at lattice points."""
 
     def __init__(self, inputs: int, config: HeadsConfig, compat: Compat) -> None:
         super().__init__()
@@ -125,7 +149,7 @@ class LevelHead(nn.Module):
         self.convs = nn.ModuleList(
             nn.Conv2d(before, after, 3, padding=padding) for before, after in itertools.pairwise(widths)
         )
-        # One Gaussian a pixel needs no layer of its own: the map holds its numbers.
+        # On a pixel lattice the map itself holds the outputs of each point.
         self.linear = nn.Linear(hidden, config.outputs) if config.lattice == "fibonacci" else nn.Identity()
 
     def forward(self, inputs: Sequence[Float[Tensor, "_ height width"]]) -> Float[Tensor, "1 hidden h w"]:
@@ -140,10 +164,10 @@ class LevelHead(nn.Module):
 
 
 class GaussianHeads(nn.Module):
-    """Heads of all levels. Any number of views: each is lifted by itself.
+    """Heads of all levels, applied to each view by itself.
 
     Args:
-        precision: number type of the convolutions; all else is in the inputs' type.
+        precision: number type of the convolutions; everything else has the inputs' type.
     """
 
     def __init__(self, config: HeadsConfig, compat: Compat, precision: Precision = "float32") -> None:
@@ -153,74 +177,52 @@ class GaussianHeads(nn.Module):
         self.precision: Precision = precision
         chained = config.levels == "pyramid" and config.residual
         self.margins = Margins.of(config.layers, compat, chained=chained)
-        passed_on = (2 if config.lattice == "fibonacci" else 1) * config.outputs
+        map_channels = (2 if config.lattice == "fibonacci" else 1) * config.outputs
         first = len(config.feature_channels) - 1 if config.levels == "single" else 0
         self.levels = nn.ModuleList(
-            LevelHead(3 + channels + config.candidates + (passed_on if chained and index > 0 else 0), config, compat)
+            LevelHead(3 + channels + config.candidates + (map_channels if chained and index > 0 else 0), config, compat)
             for index, channels in enumerate(config.feature_channels[first:])
         )
 
-    def forward(
-        self,
-        images: Float[Tensor, "batch view 3 height width"],
-        features: Sequence[Float[Tensor, "batch view _ _ _"]],
-        depths: Depths,
-        cam2world: Float[Tensor, "batch view 4 4"],
-        near: Float[Tensor, "batch view"],
-        far: Float[Tensor, "batch view"],
-        *,
-        tiles: int = 1,
-    ) -> list[Gaussians]:
+    def forward(self, matched: MatchedViews, *, tiles: int = 1) -> list[Gaussians]:
         """The Gaussians of each batch item.
 
         Order: level coarse to fine, then view, then lattice point. With `compat="official"` and several tiles the
-        tile comes first, as in the original.
+        tile comes first.
 
         Args:
-            images: RGB in [0, 1], at full resolution.
-            features: maps of every level, coarse to fine; resized where the images are larger than theirs.
-            tiles: tiles along each side of the panorama. With `compat="fixed"` the result is the same for any number.
+            tiles: tiles along each side of the panorama. With `compat="fixed"` the result does not depend on it.
 
         Raises:
-            InputError: when the height cannot be divided into levels and tiles.
+            InputError: the levels and tiles do not divide the height.
         """
-        parts = list(self.iterate_tiles(images, features, depths, cam2world, near, far, tiles=tiles))
-        return merge_tiles(parts, self.compat)
+        return merge_tiles(list(self.iterate_tiles(matched, tiles=tiles)), self.compat)
 
     def iterate_tiles(
-        self,
-        images: Float[Tensor, "batch view 3 height width"],
-        features: Sequence[Float[Tensor, "batch view _ _ _"]],
-        depths: Depths,
-        cam2world: Float[Tensor, "batch view 4 4"],
-        near: Float[Tensor, "batch view"],
-        far: Float[Tensor, "batch view"],
-        *,
-        tiles: int = 1,
-        only: Sequence[int] | None = None,
+        self, matched: MatchedViews, *, tiles: int = 1, only: Sequence[int] | None = None
     ) -> Iterator[TileGaussians]:
-        """One tile's Gaussians after another, so that no more than one tile's maps are in memory.
+        """Yield the Gaussians tile by tile; the maps of one tile at most are in memory.
 
         Args:
-            only: numbers of the tiles wanted, row by row from 0; by default all. A tile alone is what it is among
-                all, with gradients too: two-step backpropagation makes them one by one.
+            only: indices of the tiles to compute, in row-major order; by default all. A tile's Gaussians and
+                gradients do not depend on which others are computed.
 
         Raises:
-            InputError: when the height cannot be divided into levels and tiles.
+            InputError: the levels and tiles do not divide the height.
         """
-        height = images.shape[-2]
+        height = matched.images.shape[-2]
         self._require_divisible(height, tiles)
-        items = split_views(images, features, depths.levels[-1], cam2world, near, far)
+        items = split_views(matched)
         grid = tile_grid(tiles)
         for tile in grid if only is None else [grid[number] for number in only]:
             gaussians = []
             for item in items:
                 by_view = [self._lift_view(view, tile) for view in item]
                 gaussians.append(Gaussians.cat([part for level in zip(*by_view, strict=True) for part in level]))
-            yield TileGaussians(gaussians, untiled_index(tile, self.points(height), images.shape[1]))
+            yield TileGaussians(gaussians, untiled_index(tile, self.points(height), matched.images.shape[1]))
 
     def heights(self, height: int) -> list[int]:
-        """Rows of each level's map, coarse to fine, for images of a height."""
+        """Rows of each level's map, coarse to fine."""
         return [height >> level for level in range(len(self.levels) - 1, -1, -1)]
 
     def points(self, height: int) -> list[Float[Tensor, "n 2"]]:
@@ -232,30 +234,29 @@ class GaussianHeads(nn.Module):
 
     def _lift_view(self, view: ViewInputs, tile: Tile) -> list[Gaussians]:
         """One view's Gaussians inside a tile, by emitting level, coarse to fine."""
-        gaussians, passed_on = [], None
+        gaussians, coarser = [], None
         heights = self.heights(view.image.shape[-2])
         features = view.features[-len(heights) :]
         for index, (head, height, feature) in enumerate(zip(self.levels, heights, features, strict=True)):
             window = tile.window(height)
-            around, known = window.expand(self.margins.input), window.expand(self.margins.output)
+            around = window.expand(self.margins.input)
             inputs = [crop_window(source, height, around, self.compat) for source in (view.image, feature, view.logits)]
-            if passed_on is not None:
-                passed_on = _twice_as_fine(passed_on, self.margins)
-                inputs.append(passed_on[0])
+            if coarser is not None:
+                coarser = _upsample_with_margin(coarser, self.margins)
+                inputs.append(coarser[0])
             with autocast_convolutions(self.precision, feature.device):
                 refined = head(inputs).to(feature.dtype)
-            if passed_on is not None:
-                lost = self.margins.input - self.margins.output
-                refined = refined + _cropped(passed_on, lost)
-            passed_on = refined if self.config.residual else None
+            if coarser is not None:
+                refined = refined + _crop_border(coarser, self.margins.input - self.margins.output)
+            coarser = refined if self.config.residual else None
             level = len(heights) - 1 - index
             if level == 0 or self.config.emitted == "all":
-                # Finer levels add to the colours of the coarsest.
-                read = decode_gaussians(
-                    head, refined[0], known, tile, view, height=height, level=level, colored=index == 0,
-                    config=self.config, compat=self.compat,
+                # Only the coarsest level adds its harmonics to the colour of the image.
+                decoded = decode_gaussians(
+                    head, refined[0], window.expand(self.margins.output), tile, view, height=height, level=level,
+                    colored=index == 0, config=self.config, compat=self.compat,
                 )  # fmt: skip
-                gaussians.append(read)
+                gaussians.append(decoded)
         return gaussians
 
     def _require_divisible(self, height: int, tiles: int) -> None:
@@ -267,14 +268,14 @@ class GaussianHeads(nn.Module):
                 f"{height}; choose another height or fewer tiles"
             )
         if self.compat == "fixed" and coarsest < self.margins.input:
-            least = self.margins.input << (len(self.levels) - 1)
-            raise InputError(f"the heads need panoramas at least {least} pixels high, got {height}; enlarge them")
+            lowest = self.margins.input << (len(self.levels) - 1)
+            raise InputError(f"the heads need panoramas at least {lowest} pixels high, got {height}; enlarge them")
 
 
 def decode_gaussians(
     head: LevelHead,
     refined: Float[Tensor, "hidden h w"],
-    known: Window,
+    window: Window,
     tile: Tile,
     view: ViewInputs,
     *,
@@ -284,29 +285,29 @@ def decode_gaussians(
     config: HeadsConfig,
     compat: Compat,
 ) -> Gaussians:
-    """The Gaussians that a tile's lattice points read off a level's map.
+    """Sample a level's map at the lattice points of a tile and decode the samples into Gaussians.
 
     Args:
-        refined: the map, of which the window `known` is at hand.
+        refined: the part of the level's map inside `window`.
         height: rows of the whole map.
-        colored: whether the harmonics add to the image's colour.
+        colored: whether to add the colour of the image to the harmonics.
     """
     uv = lattice_uv(config.lattice, height, exact=compat == "fixed")
     uv = uv[tile.contains(uv)].to(refined.device)
-    numbers = head.linear(sample_window(refined, known, height, uv))
+    outputs = head.linear(sample_window(refined, window, height, uv))
     sizes = (2, config.adapter.num_parameters, config.outputs - 2 - config.adapter.num_parameters)
-    offsets, parameters, logits = numbers.split(sizes, dim=-1)
+    offsets, parameters, logits = outputs.split(sizes, dim=-1)
 
-    def resized(source: Float[Tensor, "channel _ _"]) -> Float[Tensor, "n channel"]:
-        return sample_window(crop_window(source, height, known, compat), known, height, uv)
+    def sample_resized(source: Float[Tensor, "channel _ _"]) -> Float[Tensor, "n channel"]:
+        return sample_window(crop_window(source, height, window, compat), window, height, uv)
 
     if config.depth == "refined":
         probabilities = torch.softmax(logits[:, :-1], dim=-1)
         inverse_depths = (probabilities * sample_panorama(view.candidates, uv, compat)).sum(dim=-1)
         opacities = torch.sigmoid(logits[:, -1])
     else:
-        inverse_depths = resized(view.inverse_depth[None])[:, 0]
-        opacities = torch.sigmoid(resized(view.confidence[None])[:, 0])
+        inverse_depths = sample_resized(view.inverse_depth[None])[:, 0]
+        opacities = torch.sigmoid(sample_resized(view.confidence[None])[:, 0])
     return adapt_gaussians(
         parameters,
         move_points(uv, offsets, config.lattice, height),
@@ -314,7 +315,7 @@ def decode_gaussians(
         opacities,
         view.cam2world,
         map_height=height,
-        colors=resized(view.image) if colored else None,
+        colors=sample_resized(view.image) if colored else None,
         level=level,
         view=view.view,
         config=config.adapter,
@@ -323,32 +324,32 @@ def decode_gaussians(
 
 
 def untiled_index(tile: Tile, lattices: Sequence[Float[Tensor, "_ 2"]], views: int) -> Integer[Tensor, "n"]:
-    """Where a tile's Gaussians stand among those of the whole panorama: by level, then view, then point."""
-    places, start = [], 0
+    """Indices of a tile's Gaussians in the untiled order: level, then view, then point."""
+    indices, start = [], 0
     for uv in lattices:
         inside = tile.contains(uv).nonzero()[:, 0]
-        places += [start + view * len(uv) + inside for view in range(views)]
+        indices += [start + view * len(uv) + inside for view in range(views)]
         start += views * len(uv)
-    return torch.cat(places)
+    return torch.cat(indices)
 
 
 def merge_tiles(parts: Sequence[TileGaussians], compat: Compat) -> list[Gaussians]:
-    """All tiles' Gaussians of each batch item, in untiled order; in the original's, which is by tile, if official."""
+    """Merge the Gaussians of all tiles for each batch item: in untiled order, or by tile if official."""
     if len(parts) == 1:
         return parts[0].gaussians
-    places = [part.index for part in parts]
+    indices = [part.index for part in parts]
     if compat == "official":
-        places = list(torch.arange(sum(map(len, places))).split([len(index) for index in places]))
-    return [_put(sets, places) for sets in zip(*(part.gaussians for part in parts), strict=True)]
+        indices = list(torch.arange(sum(map(len, indices))).split([len(index) for index in indices]))
+    return [_scatter(sets, indices) for sets in zip(*(part.gaussians for part in parts), strict=True)]
 
 
-def _put(sets: Sequence[Gaussians], places: Sequence[Integer[Tensor, "_"]]) -> Gaussians:
-    """Sets in one, each at its places; written there at once, since all of them are gigabytes in 4K."""
+def _scatter(sets: Sequence[Gaussians], indices: Sequence[Integer[Tensor, "_"]]) -> Gaussians:
+    """Copy each set to its indices in one set, without another copy: in 4K all of them are gigabytes."""
     fields = {}
     for name in (f.name for f in dataclasses.fields(Gaussians)):
         example = getattr(sets[0], name)
         fields[name] = torch.empty(sum(map(len, sets)), *example.shape[1:], dtype=example.dtype, device=example.device)
-        for part, index in zip(sets, places, strict=True):
+        for part, index in zip(sets, indices, strict=True):
             fields[name].index_copy_(0, index.to(example.device), getattr(part, name))
     return Gaussians(**fields)
 
@@ -356,58 +357,48 @@ def _put(sets: Sequence[Gaussians], places: Sequence[Integer[Tensor, "_"]]) -> G
 def concatenate_channels(
     maps: Sequence[Float[Tensor, "_ height width"]], dtype: torch.dtype
 ) -> Float[Tensor, "1 channel height width"]:
-    """Maps as channels of one, channels last: a fifth of the time of `torch.cat` and a change of layout."""
+    """Concatenate channels in channels-last layout: a fifth of the time of `torch.cat` and a layout change."""
     channels = [len(part) for part in maps]
     shape = (1, sum(channels), *maps[0].shape[1:])
-    whole = torch.empty(shape, dtype=dtype, device=maps[0].device, memory_format=torch.channels_last)
+    joined = torch.empty(shape, dtype=dtype, device=maps[0].device, memory_format=torch.channels_last)
     for start, part in zip(itertools.accumulate([0, *channels]), maps, strict=False):
-        whole[0, start : start + len(part)] = part
-    return whole
+        joined[0, start : start + len(part)] = part
+    return joined
 
 
-def split_views(
-    images: Float[Tensor, "batch view 3 height width"],
-    features: Sequence[Float[Tensor, "batch view _ _ _"]],
-    depth: LevelDepth,
-    cam2world: Float[Tensor, "batch view 4 4"],
-    near: Float[Tensor, "batch view"],
-    far: Float[Tensor, "batch view"],
-) -> list[list[ViewInputs]]:
-    """Each batch item's views, one by one."""
+def split_views(matched: MatchedViews) -> list[list[ViewInputs]]:
+    """The inputs of each view of each batch item, with the depth of the finest swept level."""
+    depth = matched.depths.levels[-1]
     return [
         [
             ViewInputs(
-                image=images[item, view],
-                features=[maps[item, view] for maps in features],
+                image=matched.images[item, view],
+                features=[maps[item, view] for maps in matched.features],
                 logits=depth.logits[item, view],
                 candidates=depth.candidates[item, view],
                 inverse_depth=depth.inverse_depth[item, view],
                 confidence=depth.confidence[item, view],
-                cam2world=cam2world[item, view],
-                near=near[item, view],
-                far=far[item, view],
+                cam2world=matched.cam2world[item, view],
+                near=matched.near[item, view],
+                far=matched.far[item, view],
                 view=view,
             )
-            for view in range(images.shape[1])
+            for view in range(matched.images.shape[1])
         ]
-        for item in range(len(images))
+        for item in range(len(matched.images))
     ]
 
 
-def _twice_as_fine(maps: Float[Tensor, "1 hidden height width"], margins: Margins) -> Float[Tensor, "1 hidden h w"]:
-    """A level's map and its margin on the next level's pixels, cut to the margin that the next CNN reads."""
-    raised = functional.interpolate(maps, scale_factor=2, mode="bilinear", align_corners=False)
-    return _cropped(raised, 2 * margins.output - margins.input)
+def _upsample_with_margin(
+    maps: Float[Tensor, "1 hidden height width"], margins: Margins
+) -> Float[Tensor, "1 hidden h w"]:
+    """Double the size of a level's map with its margin, cropped to the margin that the next level reads."""
+    upsampled = functional.interpolate(maps, scale_factor=2, mode="bilinear", align_corners=False)
+    return _crop_border(upsampled, 2 * margins.output - margins.input)
 
 
-def _cropped(maps: Float[Tensor, "1 hidden height width"], margin: int) -> Float[Tensor, "1 hidden h w"]:
+def _crop_border(maps: Float[Tensor, "1 hidden height width"], margin: int) -> Float[Tensor, "1 hidden h w"]:
     return maps[..., margin : maps.shape[-2] - margin, margin : maps.shape[-1] - margin]
-
-
-_SCALE_UNIT = 0.2  # a scale of 1 spans this part of a map pixel
-# The network's colours are in harmonics whose polar axis is y, in the cyclic order y, z, x of the 3DGS axes: with
-# these camera axes in rows, its k-th function along d is the 3DGS one along _POLAR_Y d.
-_POLAR_Y = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 
 def adapt_gaussians(
@@ -424,30 +415,32 @@ def adapt_gaussians(
     config: AdapterConfig,
     compat: Compat,
 ) -> Gaussians:
-    """Gaussians of one view and level.
+    """Turn network outputs into the Gaussians of one view and level.
 
     Args:
         parameters: raw [3 scale | 4 rotation xyzw, camera axes | 3 x (degree + 1)^2 harmonics, colour by colour].
-        uv: where on the panorama, normalised.
+        uv: positions on the panorama, normalised.
         depths: radial distance from the camera, metres.
         opacities: in [0, 1].
-        map_height: rows of the level's map; a scale is a multiple of its pixel's angle times the depth.
-        colors: RGB in [0, 1] that the harmonics are added to, or None where a level adds to no colour.
+        map_height: rows of the level's map; scales are multiples of its pixel's angle times the depth.
+        colors: RGB in [0, 1] to add to the constant harmonic, or None.
         level, view: labels of the Gaussians.
+
+    Source: PanSplat, section 3.3; OFFICIAL.md, section 9.
     """
     camera = cam2world[:3, :3].double()
     directions = directions_from_uv(uv) @ camera.to(uv).T
     scale_part, rotation_part, harmonics_part = parameters.split((3, 4, config.num_parameters - 7), dim=-1)
     scales = config.min_scale + (config.max_scale - config.min_scale) * torch.sigmoid(scale_part)
     pixel_radians = math.pi / map_height
-    # Divided as the original divides: a quaternion of length 0 is not made one of length 1.
-    own = rotation_part.roll(1, dims=-1)  # xyzw to wxyz
-    own = own / (own.norm(dim=-1, keepdim=True) + 1e-8)
-    turn = quats_from_rotations(camera).to(own)
+    # The official normalisation: a zero quaternion stays zero.
+    quats = rotation_part.roll(1, dims=-1)  # xyzw to wxyz
+    quats = quats / (quats.norm(dim=-1, keepdim=True) + 1e-8)
+    camera_quat = quats_from_rotations(camera).to(quats)
     return Gaussians(
         means=cam2world[:3, 3].to(depths) + depths[:, None] * directions,
         scales=scales * (_SCALE_UNIT * pixel_radians) * depths[:, None],
-        quats=multiply_quats(turn.expand_as(own), own),
+        quats=multiply_quats(camera_quat.expand_as(quats), quats),
         opacities=opacities,
         harmonics=_world_harmonics(harmonics_part, colors, camera, config.degree, compat),
         levels=torch.full(depths.shape, level, dtype=torch.uint8, device=depths.device),
@@ -456,11 +449,10 @@ def adapt_gaussians(
 
 
 def world_harmonics_rotation(rotation: Float[Tensor, "3 3"], compat: Compat) -> Float[Tensor, "3 3"]:
-    """Rotation from the axes in which the network's colours are 3DGS harmonics to the world's.
+    """Rotation to world axes from the axes in which the network's colours are 3DGS harmonics.
 
-    The original turns colours by the camera's rotation with x and z reversed, which is right only for a turn
-    about y (OFFICIAL.md, trap T3). Its rasteriser moreover reads z for y in coefficient 14 and leaves out degree 4
-    (trap T4); that is the drawing's business, not the prediction's.
+    The official code rotates colours by the camera's rotation with x and z reversed, which is right only for rotations
+    about y (OFFICIAL.md, trap T3).
     """
     if compat == "official":
         reverse = torch.tensor((-1.0, 1.0, -1.0)).to(rotation)
@@ -475,32 +467,31 @@ def _world_harmonics(
     degree: int,
     compat: Compat,
 ) -> Float[Tensor, "n k 3"]:
-    """Harmonics in the world from raw ones in camera axes: damped by degree, on a base colour."""
-    harmonics = raw.unflatten(-1, (3, -1)) * _damping(degree).to(raw)
+    """Harmonics in world axes from raw ones in camera axes: scaled by degree, added to a base colour."""
+    harmonics = raw.unflatten(-1, (3, -1)) * _degree_factors(degree).to(raw)
     if colors is not None:
         base = 2 * (colors - 0.5)
         harmonics = torch.cat((harmonics[..., :1] + base[..., None], harmonics[..., 1:]), dim=-1)
-    turn = rotation_matrices(world_harmonics_rotation(camera, compat), degree).to(raw)
-    # One product of two matrices: of strided harmonics, torch would make one for each Gaussian.
-    turned = harmonics.reshape(-1, harmonics.shape[-1]) @ turn.T
-    return turned.view(harmonics.shape).transpose(-1, -2)
+    rotation = rotation_matrices(world_harmonics_rotation(camera, compat), degree).to(raw)
+    # Reshaped to one matrix product: with strided harmonics, torch would compute one for each Gaussian.
+    rotated = harmonics.reshape(-1, harmonics.shape[-1]) @ rotation.T
+    return rotated.view(harmonics.shape).transpose(-1, -2)
 
 
-def _damping(degree: int) -> Float[Tensor, "k"]:
-    """Factor of each raw coefficient: higher degrees start close to nothing."""
+def _degree_factors(degree: int) -> Float[Tensor, "k"]:
+    """Factor of each raw coefficient: 1 for degree 0, 0.1 / 4^n for degree n."""
     factors = [1.0] + [0.1 * 0.25**band for band in range(1, degree + 1) for _ in range(2 * band + 1)]
     return torch.tensor(factors, dtype=torch.float64)
 
 
-_MAX_HEIGHT = 512  # of the panoramas that the cost volume sees
-
-
-AUXILIARY_HEADS = HeadsConfig(depth="swept", layers=2, feature_channels=(128, 96, 64))
-"""Their shape in the original; the features are those of the swept levels, coarse to fine."""
-
-
 class AuxiliaryHeads(nn.Module):
-    """One head a level of the cost volume, each on its own, all with maps half as high as the swept images."""
+    """Heads that render each level of the cost volume by itself; for training on real panoramas only.
+
+    Without true depth, the image of each level's own depth and confidence gives the level a loss. There is one
+    independent head for each level, with maps of half the height of the cost volume's input.
+
+    Source: PanSplat, section 3.5 (real data); OFFICIAL.md, section 8 (auxiliary heads).
+    """
 
     def __init__(self, config: HeadsConfig, compat: Compat) -> None:
         super().__init__()
@@ -511,29 +502,21 @@ class AuxiliaryHeads(nn.Module):
             LevelHead(3 + channels + config.candidates, config, compat) for channels in config.feature_channels
         )
 
-    def forward(
-        self,
-        images: Float[Tensor, "batch view 3 height width"],
-        features: Sequence[Float[Tensor, "batch view _ _ _"]],
-        depths: Depths,
-        cam2world: Float[Tensor, "batch view 4 4"],
-        near: Float[Tensor, "batch view"],
-        far: Float[Tensor, "batch view"],
-    ) -> list[list[Gaussians]]:
+    def forward(self, matched: MatchedViews) -> list[list[Gaussians]]:
         """For each level of the cost volume, coarse to fine, the Gaussians of each batch item."""
-        items = split_views(images, features, depths.levels[-1], cam2world, near, far)
+        items = split_views(matched)
         return [
             [
                 Gaussians.cat([self._lift_view(index, item, view, depth) for view in views])
                 for item, views in enumerate(items)
             ]
-            for index, depth in enumerate(depths.levels)
+            for index, depth in enumerate(matched.depths.levels)
         ]
 
     def _lift_view(self, index: int, item: int, view: ViewInputs, depth: LevelDepth) -> Gaussians:
         height = min(view.image.shape[-2], _MAX_HEIGHT) // 2
-        whole = Tile(0, 0, 1)
-        around = whole.window(height).expand(self.margins.input)
+        panorama = Tile(0, 0, 1)
+        around = panorama.window(height).expand(self.margins.input)
         inputs = (view.image, view.features[index], view.logits)
         refined = self.levels[index]([crop_window(source, height, around, self.compat) for source in inputs])
         at = (item, view.view)
@@ -541,8 +524,8 @@ class AuxiliaryHeads(nn.Module):
         return decode_gaussians(
             self.levels[index],
             refined[0],
-            whole.window(height).expand(self.margins.output),
-            whole,
+            panorama.window(height).expand(self.margins.output),
+            panorama,
             own,
             height=height,
             level=depth.level,

@@ -1,13 +1,13 @@
-"""UniFuse: what a single panorama tells of depth, as features for the cost volume. Frozen, always in eval mode.
+"""UniFuse: monocular depth features of panoramas for the cost volume. Frozen, always in eval mode.
 
-A panorama goes through one ResNet-18, its six cube faces through another; at five scales the faces' features are
-laid onto the panorama and fused, and a decoder brings the fused features up to 256x512, whatever the input's size.
+One ResNet-18 encodes the panorama, another one its six cube faces. At five scales the features of the faces are
+projected onto the panorama and fused; a decoder raises the fused features to 256x512, whatever the input's size.
 
-`compat`: "official" pads rows with zeros, resizes the input without knowing that its ends meet, and sees the faces up
-and down one way round. "fixed" continues panoramas over seam and poles in the panorama's encoder and decoder and in
-the resizing, and encodes up and down both ways round, so that rolling the panorama by half a turn rolls the features.
-In both, the faces keep their zero padding, and the way from faces to panorama its border of whole rows: the weights
-learnt them.
+`compat="official"` pads rows with zeros, resizes without wrapping, and encodes each face once. `compat="fixed"` wraps
+columns and continues over the poles in the panorama's encoder and decoder and in the resizing. It also encodes the
+faces up and down in two orientations and averages them, so that half a turn of the panorama rolls the features.
+In both modes faces have zero padding and whole rows of the panorama belong to the faces up and down: the weights were
+trained with them.
 
 Source: Jiang et al., UniFuse, https://arxiv.org/abs/2102.03550; OFFICIAL.md, sections 2.4 and 5.
 """
@@ -33,15 +33,15 @@ from pansplat.model.layers import (
     to_channels_last,
 )
 
-HEIGHT, FACE_SIZE = 512, 256  # of what the encoders see
+HEIGHT, FACE_SIZE = 512, 256  # of the encoders' inputs
 SCALES = (5, 4, 3, 2, 1)  # coarse to fine: 1/32 to 1/2 of the panorama
 FEATURE_CHANNELS = 32
 _ENCODED = {5: 512, 4: 256, 3: 128, 2: 64, 1: 64}  # channels of either encoder
-_DECODED = {5: 256, 4: 128, 3: 64, 2: 32}  # channels after a scale's step up
+_DECODED = {5: 256, 4: 128, 3: 64, 2: 32}  # channels after upsampling from a scale
 
 
 class MonocularDepth(nn.Module):
-    """Features of 1/2 scale for the cost volume, and the depth the network was made for."""
+    """UniFuse: features at 1/2 scale, and depth."""
 
     def __init__(self, compat: Compat = "official") -> None:
         super().__init__()
@@ -54,7 +54,7 @@ class MonocularDepth(nn.Module):
         self.eval()
 
     def train(self, mode: bool = True) -> MonocularDepth:
-        """Stays in eval mode: the network is frozen."""
+        """Stay in eval mode: the network is frozen."""
         return super().train(False)
 
     @torch.no_grad()
@@ -63,51 +63,40 @@ class MonocularDepth(nn.Module):
         panoramas, strips = self.prepare(images.flatten(0, 1))
         from_panorama = self.panorama_encoder(to_channels_last(normalize(panoramas)))
         from_faces = self._encode_faces(strips.unflatten(-1, (6, FACE_SIZE)).permute(0, 3, 1, 2, 4))
-        laid = {scale: to_channels_last(self._lay(from_faces[scale], scale)) for scale in SCALES}
-        return self.decoder(from_panorama, laid).unflatten(0, images.shape[:2])
+        projected = {scale: to_channels_last(_project_faces(from_faces[scale], scale)) for scale in SCALES}
+        return self.decoder(from_panorama, projected).unflatten(0, images.shape[:2])
 
     @torch.no_grad()
     def depth(self, features: Float[Tensor, "batch view 32 256 512"]) -> Float[Tensor, "batch view 512 1024"]:
-        """Radial depth in metres of what `forward` gave; PanSplat does not use it."""
+        """Radial depth in metres of the features of `forward`; PanSplat does not use it."""
         logits = self.decoder.head(features.flatten(0, 1))
         return (self.max_depth * logits.sigmoid()).squeeze(1).unflatten(0, features.shape[:2])
 
     def prepare(
         self, images: Float[Tensor, "batch 3 height width"]
     ) -> tuple[Float[Tensor, "batch 3 512 1024"], Float[Tensor, "batch 3 256 1536"]]:
-        """What the two encoders see: panoramas, by way of half their size as in training, and strips of six faces."""
+        """Inputs of the two encoders: panoramas, resized via 256x512 as in training, and strips of six faces."""
         half = resize(images, (HEIGHT // 2, HEIGHT), self.compat)
         panoramas = resize(half, (HEIGHT, 2 * HEIGHT), self.compat)
         strips = torch.stack([strip_from_equirect(panorama, FACE_SIZE) for panorama in panoramas])
         return panoramas, strips
 
     def _encode_faces(self, faces: Float[Tensor, "batch 6 3 n n"]) -> dict[int, Float[Tensor, "batch 6 channel m m"]]:
-        """Features of the faces at each scale; "fixed" takes up and down both ways round, and the mean of both."""
+        """Features of the faces at each scale; "fixed" averages two orientations of the faces up and down."""
         if self.compat == "fixed":
-            faces = torch.cat((faces, _turned(faces[:, 4:])), dim=1)
+            faces = torch.cat((faces, _rotate_half_turn(faces[:, 4:])), dim=1)
         encoded = self.face_encoder(to_channels_last(normalize(faces.flatten(0, 1))))
         by_face = {scale: maps.unflatten(0, faces.shape[:2]) for scale, maps in encoded.items()}
         if self.compat == "official":
             return by_face
         return {
-            scale: torch.cat((maps[:, :4], (maps[:, 4:6] + _turned(maps[:, 6:])) / 2), dim=1)
+            scale: torch.cat((maps[:, :4], (maps[:, 4:6] + _rotate_half_turn(maps[:, 6:])) / 2), dim=1)
             for scale, maps in by_face.items()
         }
 
-    def _lay(self, faces: Float[Tensor, "batch 6 channel n n"], scale: int) -> Float[Tensor, "batch channel h w"]:
-        """Six faces' features, laid onto the panorama."""
-        strip = faces.permute(0, 2, 3, 1, 4).flatten(-2)
-        return equirect_from_strip(strip, lookup(scale))
-
-
-@functools.cache
-def lookup(scale: int) -> Float[Tensor, "height width 3"]:
-    """Where the panorama of a scale finds itself on the six faces; not a weight, though the original stores it."""
-    return strip_lookup(HEIGHT >> scale)
-
 
 class ResNet18(nn.Module):
-    """The features of a ResNet-18 at 1/2, 1/4, ... 1/32.
+    """Features of a ResNet-18 at 1/2, 1/4, ..., 1/32, by scale 1 to 5.
 
     Source: He et al., https://arxiv.org/abs/1512.03385.
     """
@@ -135,7 +124,7 @@ class ResNet18(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """relu(x + conv(relu(conv(x)))), each convolution normalised over the batch."""
+    """relu(x + conv(relu(conv(x)))) with batch normalisation after each convolution."""
 
     def __init__(self, inputs: int, outputs: int, *, stride: int, border: Border) -> None:
         super().__init__()
@@ -157,7 +146,7 @@ class ResidualBlock(nn.Module):
 
 
 class Fusion(nn.Module):
-    """The faces' features, corrected by what both show, joined to the panorama's.
+    """Corrects the features of the faces by a residual of both, and joins them to those of the panorama.
 
     Source: UniFuse, section III-B ("CEE", without squeeze and excitation).
     """
@@ -180,7 +169,7 @@ class Fusion(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Fused features from 1/32 up to 1/2; `head` goes on to depth at full size."""
+    """Decodes fused features from 1/32 to 1/2; `head` continues to depth at full size."""
 
     def __init__(self, border: Border) -> None:
         super().__init__()
@@ -212,6 +201,19 @@ class Decoder(nn.Module):
         return x
 
 
-def _turned(faces: Float[Tensor, "batch face channel n n"]) -> Float[Tensor, "batch face channel n n"]:
-    """Faces turned by half a turn in their own plane, as up and down are when the panorama rolls by one."""
+def _project_faces(
+    faces: Float[Tensor, "batch 6 channel n n"], scale: int
+) -> Float[Tensor, "batch channel height width"]:
+    """Features of six faces, resampled on the panorama."""
+    return equirect_from_strip(faces.permute(0, 2, 3, 1, 4).flatten(-2), _strip_lookup(scale))
+
+
+@functools.cache
+def _strip_lookup(scale: int) -> Float[Tensor, "height width 3"]:
+    """Positions of the panorama's pixels on the six faces; computed, although official checkpoints store them."""
+    return strip_lookup(HEIGHT >> scale)
+
+
+def _rotate_half_turn(faces: Float[Tensor, "batch face channel n n"]) -> Float[Tensor, "batch face channel n n"]:
+    """Rotate faces by half a turn in their plane, as half a turn of the panorama does with up and down."""
     return faces.flip(-1, -2)

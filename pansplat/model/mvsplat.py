@@ -1,7 +1,7 @@
 """The MVSplat baseline on panoramas: one cost volume at 1/4 of the image, one Gaussian a pixel.
 
-The blocks are PanSplat's. With `compat="official"` nothing knows that a panorama's ends meet (as in the original);
-with "fixed" the convolutions, the resizing and the sweep do.
+Built of PanSplat's layers. With `compat="official"` nothing wraps at the seam, as in the official code; with "fixed"
+convolutions, resizing and correlation continue across seam and poles.
 
 Source: Chen et al., MVSplat, https://arxiv.org/abs/2403.14627; OFFICIAL.md, section 16.
 """
@@ -40,7 +40,7 @@ from pansplat.model.layers import (
 )
 from pansplat.model.tiles import lattice_uv, move_points
 
-_SCALE = 4  # the sweep's map is this many times smaller than the image
+_SCALE = 4  # image size over the size of the cost volume
 _ENCODER_CHANNELS = (64, 64, 96, 96, 128, 128)  # of the residual blocks
 
 
@@ -49,29 +49,29 @@ class MVSplatConfig:
     """Shape of the network; shipped weights fix all of it."""
 
     channels: int = 128
-    """Of the features."""
+    """Channels of the features."""
     candidates: int = 128
+    """Depth candidates of a pixel."""
     width: int = 128
     """Channels of the cost volume's U-Net."""
     refine_width: int = 32
-    """Channels of the full-size U-Net."""
+    """Channels of the U-Net at the image's size."""
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
     adapter: AdapterConfig = field(default_factory=AdapterConfig)
 
 
 @dataclass(frozen=True)
 class MatchedViews:
-    """What is known of the panoramas before a Gaussian is made.
+    """Features and depths of all views, at 1/4 of the image's size.
 
     Attributes:
-        features: at 1/4 of the image, after attention across views.
-        seen: at 1/4 of the image, as the encoder saw each by itself.
-        depths: of the sweep, at 1/4 of the image.
+        features: output of the transformer.
+        encoded: output of the encoder, input of the transformer.
     """
 
     images: Float[Tensor, "batch view 3 height width"]
     features: Float[Tensor, "batch view channel h w"]
-    seen: Float[Tensor, "batch view channel h w"]
+    encoded: Float[Tensor, "batch view channel h w"]
     depths: Depths
     cam2world: Float[Tensor, "batch view 4 4"]
     near: Float[Tensor, "batch view"]
@@ -83,8 +83,8 @@ class MVSplatOutput:
     """A prediction.
 
     Attributes:
-        gaussians: a set a batch item; view by view, row by row.
-        matched: features and depths on the way there.
+        gaussians: one set for each batch item, view by view, in row-major order.
+        matched: intermediate features and depths.
     """
 
     gaussians: list[Gaussians]
@@ -92,12 +92,12 @@ class MVSplatOutput:
 
     @property
     def depths(self) -> Depths:
-        """Depth of each view at 1/4 of the image."""
+        """Depth of each view at 1/4 of the image's size."""
         return self.matched.depths
 
 
 class MVSplat(nn.Module):
-    """Features, a sweep at 1/4 scale, and pixel-aligned Gaussians."""
+    """Features and a cost volume at 1/4 scale, and one Gaussian for each pixel."""
 
     def __init__(
         self,
@@ -137,7 +137,7 @@ class MVSplat(nn.Module):
         """Predict from RGB in [0, 1] and OpenCV cam2world poses; `near` and `far` in metres.
 
         Raises:
-            InputError: too few views (or too many for the original), or a size that 16 does not divide.
+            InputError: fewer than two views ("official": not two), or a size that 16 does not divide.
         """
         matched = self.match_views(images, cam2world, near, far)
         (part,) = self.lift_gaussians(matched)
@@ -150,21 +150,21 @@ class MVSplat(nn.Module):
         near: Float[Tensor, "batch view"],
         far: Float[Tensor, "batch view"],
     ) -> MatchedViews:
-        """Features and depths of all views at 1/4 scale."""
+        """Compute features and depths of all views at 1/4 scale."""
         require_views(images.shape[1], self.compat)
         height, width = images.shape[-2:]
         require_size(height, width, 16)
-        features, seen = self.features(images)
+        features, encoded = self.features(images)
         swept = self.depth(features, cam2world, near, far)
-        return MatchedViews(images, features, seen, Depths((swept,)), cam2world, near, far)
+        return MatchedViews(images, features, encoded, Depths((swept,)), cam2world, near, far)
 
     def lift_gaussians(
         self, matched: MatchedViews, *, tiles: int = 1, only: Sequence[int] | None = None
     ) -> Iterator[TileGaussians]:
-        """All Gaussians in one part: the U-Net sees the whole panorama, so `tiles` and `only` have no say."""
+        """Yield all Gaussians in one part; `tiles` and `only` have no effect, as the U-Net reads whole panoramas."""
         m, views = matched, matched.images.shape[1]
         images, swept = m.images.flatten(0, 1), m.depths.levels[-1]
-        features = self.upsampler(torch.cat((m.features, m.seen), dim=2).flatten(0, 1))
+        features = self.upsampler(torch.cat((m.features, m.encoded), dim=2).flatten(0, 1))
         features = gelu(upsample(features, _SCALE, self.compat))
         inverse_depth = upsample(swept.inverse_depth, _SCALE, self.compat).flatten(0, 1)
         confidence = interpolate(swept.confidence, scale_factor=_SCALE, mode="nearest").flatten(0, 1)
@@ -194,16 +194,16 @@ class MVSplat(nn.Module):
         cam2world: Float[Tensor, "4 4"],
         view: int,
     ) -> Gaussians:
-        """One view's Gaussians, one a pixel, row by row.
+        """One view's Gaussians, one for each pixel, in row-major order.
 
         Args:
-            maps: what the Gaussians' numbers are read off.
-            corrections: to the inverse depth, and the opacity's logit.
-            bounds: of the inverse depth, far then near.
+            maps: input of `to_gaussians`.
+            corrections: correction of the inverse depth, and opacity logit.
+            bounds: smallest and largest inverse depth.
         """
         height = maps.shape[-2]
-        numbers = self.to_gaussians(maps[None])[0].flatten(1).T.contiguous()
-        offsets, parameters = numbers.split((2, self.config.adapter.num_parameters), dim=-1)
+        outputs = self.to_gaussians(maps[None])[0].flatten(1).T.contiguous()
+        offsets, parameters = outputs.split((2, self.config.adapter.num_parameters), dim=-1)
         correction, opacity_logits = corrections.flatten(1)
         uv = lattice_uv("pixel", height).to(maps.device)
         return adapt_gaussians(
@@ -222,7 +222,7 @@ class MVSplat(nn.Module):
 
 
 class Features(nn.Module):
-    """Features of all views at 1/4 scale: after attention across views, and as the encoder saw them."""
+    """Features of all views at 1/4 scale: outputs of the transformer and of the encoder."""
 
     def __init__(self, config: MVSplatConfig, compat: Compat, precision: AttentionPrecision) -> None:
         super().__init__()
@@ -232,12 +232,12 @@ class Features(nn.Module):
     def forward(
         self, images: Float[Tensor, "batch view 3 height width"]
     ) -> tuple[Float[Tensor, "batch view channel h w"], Float[Tensor, "batch view channel h w"]]:
-        seen = self.encoder(normalize(images.flatten(0, 1))).unflatten(0, images.shape[:2])
-        return self.transformer(seen), seen
+        encoded = self.encoder(normalize(images.flatten(0, 1))).unflatten(0, images.shape[:2])
+        return self.transformer(encoded), encoded
 
 
 class Encoder(nn.Module):
-    """A CNN down to 1/4 with instance normalisation.
+    """A CNN to 1/4 scale with instance normalisation.
 
     Source: UniMatch, https://arxiv.org/abs/2211.05783.
     """
@@ -260,7 +260,7 @@ class Encoder(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions, each instance-normalised, beside a shortcut."""
+    """Two convolutions with instance normalisation beside a shortcut."""
 
     def __init__(self, inputs: int, outputs: int, *, stride: int, border: Border) -> None:
         super().__init__()
@@ -277,7 +277,7 @@ class ResidualBlock(nn.Module):
 
 
 class SweptDepth(nn.Module):
-    """Inverse depth at 1/4 scale: correlate, refine, regress."""
+    """Cost volume at 1/4 scale: correlate, refine, regress inverse depth."""
 
     def __init__(self, config: MVSplatConfig, compat: Compat, precision: AttentionPrecision) -> None:
         super().__init__()
@@ -310,7 +310,7 @@ class SweptDepth(nn.Module):
 
 
 class FullSizeRefinement(nn.Module):
-    """A deep, narrow U-Net at the image's size."""
+    """U-Net of five scales at the image's size."""
 
     def __init__(self, inputs: int, width: int, border: Border, precision: AttentionPrecision) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""A trained network as a predictor: checks of the input, tiles, masks, batches, a fingerprint of its weights."""
+"""Networks with weights as predictors: loading, input checks, tiles, masks, batches and the cache fingerprint."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from torch import Tensor
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import uv_from_directions
-from pansplat.model.cost_volume import Depths
 from pansplat.model.heads import TileGaussians, merge_tiles
 from pansplat.model.layers import AttentionPrecision, Compat, Precision, require_views
 from pansplat.model.mvsplat import MVSplat, MVSplatConfig
@@ -35,23 +34,19 @@ from pansplat.model.weights import (
 )
 from pansplat.predictor import Progress
 
+_NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {
+    "pansplat": (PanSplat, PanSplatConfig),
+    "mvsplat": (MVSplat, MVSplatConfig),
+}
 _MIN_HEIGHT = 64
-_UNTILED_HEIGHT = 512  # taller panoramas get twice as many tiles along each side each time they double
-_MULTIPLE = {"official": 16, "fixed": 32}  # what halving, windows and their shifts divide a height by
-_MATCHED = 0.4  # fraction of the time that matching takes, for the progress report
-
-
-@runtime_checkable
-class MatchedViews(Protocol):
-    """What a network knows before it makes Gaussians."""
-
-    @property
-    def depths(self) -> Depths: ...
+_UNTILED_HEIGHT = 512  # above, the number of tiles along each side doubles with the height
+_MULTIPLE = {"official": 16, "fixed": 32}  # divides the height: levels, windows and their shifts
+_MATCHING_FRACTION = 0.4  # of the prediction time, for the progress report
 
 
 @runtime_checkable
 class Network(Protocol):
-    """What a predictor needs of a network, which is an nn.Module: first it matches the views, then lifts Gaussians."""
+    """An nn.Module that matches views and then lifts Gaussians."""
 
     config: Any
     compat: Compat
@@ -63,13 +58,13 @@ class Network(Protocol):
         near: Float[Tensor, "batch view"],
         far: Float[Tensor, "batch view"],
     ) -> Any:
-        """A `MatchedViews`."""
+        """Features of the views, and their depths as `Depths` in the attribute `depths`."""
         ...
 
     def lift_gaussians(
         self, matched: Any, *, tiles: int = 1, only: Sequence[int] | None = None
     ) -> Iterator[TileGaussians]:
-        """Gaussians tile by tile; in one part where the network knows no tiles."""
+        """Yield Gaussians tile by tile, or all at once for a network without tiles."""
         ...
 
     def state_dict(self) -> dict[str, Tensor]: ...
@@ -78,12 +73,12 @@ class Network(Protocol):
 
 
 class NetworkPredictor:
-    """A network with its weights, to be called as any `Predictor`.
+    """A `Predictor` of a network with weights.
 
     Args:
-        name: as users type it.
-        network: an nn.Module that is a `Network`; put in eval mode.
-        tiles: tiles along each side, or None for as many as the height suggests.
+        name: name for users.
+        network: is put in eval mode.
+        tiles: tiles along each side of the panorama; None for `choose_tiles` of the height.
     """
 
     def __init__(self, name: str, network: Network, *, tiles: int | None = None) -> None:
@@ -94,7 +89,7 @@ class NetworkPredictor:
 
     @functools.cached_property
     def fingerprint(self) -> str:
-        """Hash of weights, settings and the code that uses them, so that a kept prediction is never stale."""
+        """Hash of weights, settings and source code: a cached prediction is never stale."""
         precisions = [getattr(self.network, name, None) for name in ("precision", "attention_precision")]
         settings = (self.network.config, self.network.compat, *precisions, self.tiles)
         digest = hashlib.blake2b(repr(settings).encode(), digest_size=8)
@@ -120,20 +115,23 @@ class NetworkPredictor:
         """Predict from RGB in [0, 1] and OpenCV cam2world poses (metres); a list when there is a batch axis.
 
         Args:
-            near, far: radial depth range, metres; numbers, or tensors with one value a batch item or a view.
-            masks: True where a pixel shows the scene; the rest makes no Gaussians.
+            near, far: radial depth range, metres; a number, or a tensor with a value for each batch item or view.
+            masks: True where a pixel shows the scene; Gaussians elsewhere are removed.
 
         Raises:
-            InputError: on shapes, sizes, view counts or values that the network cannot take.
+            InputError: shapes, sizes, view counts or values that the network does not accept.
         """
         if images.ndim == 5:
-            items = range(len(images))
-            own_masks = [None if masks is None else masks[n] for n in items]
             return [
                 self.predict_with_depths(
-                    images[n], cam2world[n], _item(near, n), _item(far, n), masks=own_masks[n], progress=progress
+                    images[n],
+                    cam2world[n],
+                    _item(near, n),
+                    _item(far, n),
+                    masks=None if masks is None else masks[n],
+                    progress=progress,
                 )[0]
-                for n in items
+                for n in range(len(images))
             ]
         return self.predict_with_depths(images, cam2world, near, far, masks=masks, progress=progress)[0]
 
@@ -148,10 +146,10 @@ class NetworkPredictor:
         masks: Bool[Tensor, "view height width"] | None = None,
         progress: Progress | None = None,
     ) -> tuple[Gaussians, list[Float[Tensor, "view _ _"]]]:
-        """The Gaussians, and the radial depth maps on the way there, metres, coarse to fine.
+        """The Gaussians, and the intermediate radial depth maps, metres, coarse to fine.
 
         Raises:
-            InputError: as a call does.
+            InputError: as `__call__`.
         """
         matched, tiles = self._match(images, cam2world, near, far, masks, progress)
         parts = list(self._lift(matched, tiles, progress))
@@ -170,16 +168,16 @@ class NetworkPredictor:
         masks: Bool[Tensor, "view height width"] | None = None,
         progress: Progress | None = None,
     ) -> Iterator[Gaussians]:
-        """The Gaussians of one tile after another: what a call gives, in the order of tiles and in bounded memory.
+        """Yield the Gaussians of `__call__` tile by tile, in bounded memory.
 
         Raises:
-            InputError: as a call does, when the first tile is asked for.
+            InputError: as `__call__`, at the first tile.
         """
         with torch.no_grad():
             matched, tiles = self._match(images, cam2world, near, far, masks, progress)
         parts = self._lift(matched, tiles, progress)
         while True:
-            with torch.no_grad():  # left before each yield, so that it does not reach the caller
+            with torch.no_grad():  # closed before each yield: the caller keeps its own grad mode
                 part = next(parts, None)
                 if part is None:
                     return
@@ -195,8 +193,8 @@ class NetworkPredictor:
         far: float | Tensor,
         masks: Tensor | None,
         progress: Progress | None,
-    ) -> tuple[MatchedViews, int]:
-        """What the network knows of one item before it makes Gaussians, and the tiles to make them in."""
+    ) -> tuple[Any, int]:
+        """Check one item and match its views; returns the match and the number of tiles along each side."""
         views = len(images)
         low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (near, far))
         tiles = self.tiles or choose_tiles(images.shape[-2])
@@ -208,12 +206,12 @@ class NetworkPredictor:
         near_views, far_views = (bound.to(weight).expand(views)[None] for bound in (low, high))
         return self.network.match_views(images.to(weight)[None], pose[None], near_views, far_views), tiles
 
-    def _lift(self, matched: MatchedViews, tiles: int, progress: Progress | None) -> Iterator[TileGaussians]:
-        report = progress or (lambda what, fraction: None)
-        report("making Gaussians", _MATCHED)
+    def _lift(self, matched: Any, tiles: int, progress: Progress | None) -> Iterator[TileGaussians]:
+        report = progress or (lambda stage, fraction: None)
+        report("making Gaussians", _MATCHING_FRACTION)
         for done, part in enumerate(self.network.lift_gaussians(matched, tiles=tiles), start=1):
             yield part
-            report("making Gaussians", _MATCHED + (1 - _MATCHED) * min(1.0, done / tiles**2))
+            report("making Gaussians", _MATCHING_FRACTION + (1 - _MATCHING_FRACTION) * min(1.0, done / tiles**2))
         report("done", 1.0)
 
 
@@ -225,7 +223,7 @@ def choose_tiles(height: int) -> int:
 def remove_masked_gaussians(
     gaussians: Gaussians, cam2world: Float[Tensor, "view 4 4"], masks: Bool[Tensor, "view height width"]
 ) -> Gaussians:
-    """The Gaussians whose means their own view sees at a pixel that its mask keeps."""
+    """Keep the Gaussians whose mean projects into the mask of their own view."""
     height, width = masks.shape[-2:]
     kept = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     for view, (pose, mask) in enumerate(zip(cam2world.to(gaussians.means), masks, strict=True)):
@@ -237,6 +235,7 @@ def remove_masked_gaussians(
 
 
 def _item(value: float | Tensor, n: int) -> float | Tensor:
+    """A batch item's depth bound."""
     return value[n] if isinstance(value, Tensor) and value.ndim else value
 
 
@@ -269,12 +268,6 @@ def _check(
         )
 
 
-_NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {
-    "pansplat": (PanSplat, PanSplatConfig),
-    "mvsplat": (MVSplat, MVSplatConfig),
-}
-
-
 def load_predictor(
     path: str | Path,
     compat: CompatChoice = "trained",
@@ -282,17 +275,17 @@ def load_predictor(
     precision: Precision = "float32",
     attention_precision: AttentionPrecision = "float32",
 ) -> NetworkPredictor:
-    """The predictor whose weights a file holds.
+    """Load a predictor from a file of weights.
 
     Args:
-        path: a .safetensors of `pansplat convert` or of training, or an original Lightning checkpoint.
-        compat: "official" computes what the original does, "fixed" corrects its defects, "trained" is the one that
-            the weights were trained with: for original checkpoints "official".
-        precision: number type of PanSplat's convolutions; see docs/bench_model.md for what bfloat16 costs and gains.
-        attention_precision: what attention rounds its inputs to; the original's was bfloat16.
+        path: a .safetensors of `pansplat convert` or of training, or an official Lightning checkpoint.
+        compat: "official" computes what the official code computes, "fixed" corrects its defects, "trained" is the
+            one that the weights were trained with ("official" for official checkpoints).
+        precision: number type of PanSplat's convolutions; docs/bench_model.md has the time and error of bfloat16.
+        attention_precision: number type that attention rounds to; bfloat16 in the official code.
 
     Raises:
-        InputError: when the file cannot be used, or the processor has no instructions for bfloat16.
+        InputError: the file cannot be used, or the processor has no bfloat16 instructions.
     """
     path = Path(path)
     require_precision(precision)
@@ -312,10 +305,10 @@ def load_predictor(
 
 
 def convert_checkpoint(content: Mapping[str, object], source: object) -> WeightsFile:
-    """An original checkpoint's contents as a weights file.
+    """Convert the content of an official checkpoint to a weights file's.
 
     Raises:
-        InputError: when it is not of an original, unmodified model.
+        InputError: the checkpoint is not of an unmodified official model.
     """
     tensors = convert_tensors(content, source)
     model = match_tensors(content, source).model
@@ -325,10 +318,10 @@ def convert_checkpoint(content: Mapping[str, object], source: object) -> Weights
 
 
 def require_precision(precision: str) -> None:
-    """Refuse number types that this processor can only imitate, slowly.
+    """Check that the processor has instructions for a precision.
 
     Raises:
-        InputError: no such precision, or no instructions for it.
+        InputError: it has none, or there is no such precision.
     """
     if precision not in get_args(Precision):
         raise InputError(f"`precision` must be {' or '.join(get_args(Precision))}, got {precision!r}")
@@ -340,22 +333,22 @@ def require_precision(precision: str) -> None:
 
 
 def has_bfloat16() -> bool:
-    """Whether the processor multiplies bfloat16 numbers by itself."""
-    tell = getattr(torch.cpu, "get_capabilities", None)
-    if tell is None:  # an older torch does not tell
+    """Whether the processor has bfloat16 instructions; True if torch cannot detect them."""
+    get_capabilities = getattr(torch.cpu, "get_capabilities", None)
+    if get_capabilities is None:
         return True
-    facts = tell()
-    return any(facts.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16"))
+    capabilities = get_capabilities()
+    return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16"))
 
 
 def build_network(weights: WeightsFile, compat: Compat, source: object, **choices: Any) -> PanSplat | MVSplat:
-    """The network with its weights, in eval mode.
+    """Build the network of a weights file, in eval mode.
 
     Args:
-        choices: the precisions, as `load_predictor` takes them.
+        choices: `precision` and `attention_precision`, as in `load_predictor`.
 
     Raises:
-        InputError: when the file's settings or tensors fit no network.
+        InputError: the file's settings or tensors fit no network.
     """
     network = build_empty_network(weights, compat, source, **choices)
     require_shapes(weights.tensors, network.state_dict(), source)
@@ -371,10 +364,10 @@ def build_empty_network(
     precision: Precision = "float32",
     attention_precision: AttentionPrecision = "float32",
 ) -> PanSplat | MVSplat:
-    """The network without memory for its weights; random numbers are not drawn.
+    """Build a network on the meta device: without memory for weights, without drawing random numbers.
 
     Raises:
-        InputError: when the file's settings fit no network.
+        InputError: the file's settings fit no network.
     """
     if weights.model not in _NETWORKS:
         raise InputError(f"{source}: needed weights of {' or '.join(_NETWORKS)}, got of {weights.model!r}")

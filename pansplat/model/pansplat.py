@@ -1,4 +1,4 @@
-"""PanSplat: wide-baseline panoramas in, Gaussians on a spherical pyramid out. Read it beside the paper's figure 3.
+"""PanSplat: wide-baseline panoramas in, Gaussians on a spherical pyramid out; see Figure 3 of the paper.
 
 Source: Zhang et al., PanSplat: 4K panorama synthesis with feed-forward Gaussian splatting, CVPR 2025.
 """
@@ -14,12 +14,12 @@ from torch import Tensor, nn
 from pansplat.gaussians.scene import Gaussians
 from pansplat.model.cost_volume import CostVolumeConfig, Depths, SphericalCostVolume
 from pansplat.model.feature_pyramid import FeaturePyramid, FeaturePyramidConfig
-from pansplat.model.heads import GaussianHeads, HeadsConfig, TileGaussians
+from pansplat.model.heads import GaussianHeads, HeadsConfig, MatchedViews, TileGaussians
 from pansplat.model.layers import AttentionPrecision, Compat, Precision, autocast_convolutions, resize
 from pansplat.model.mono_depth import MonocularDepth
 
 MATCHING_HEIGHT = 512
-"""Features are matched at this height at most; the heads see the panoramas as they are."""
+"""Largest height of the images for feature matching; the heads read them at full size."""
 
 
 @dataclass(frozen=True)
@@ -42,25 +42,12 @@ class PanSplatConfig:
 
 
 @dataclass(frozen=True)
-class MatchedViews:
-    """What is known of the panoramas before a Gaussian is made."""
-
-    images: Float[Tensor, "batch view 3 height width"]
-    features: Sequence[Float[Tensor, "batch view _ _ _"]]
-    """Coarse to fine."""
-    depths: Depths
-    cam2world: Float[Tensor, "batch view 4 4"]
-    near: Float[Tensor, "batch view"]
-    far: Float[Tensor, "batch view"]
-
-
-@dataclass(frozen=True)
 class PanSplatOutput:
     """A prediction.
 
     Attributes:
-        gaussians: a set a batch item; their labels tell level and view.
-        matched: features and depths on the way there.
+        gaussians: one set for each batch item, labelled with level and view.
+        matched: intermediate features and depths.
     """
 
     gaussians: list[Gaussians]
@@ -73,13 +60,12 @@ class PanSplatOutput:
 
 
 class PanSplat(nn.Module):
-    """Features, monocular depth, spherical cost volume, residual Gaussian heads.
+    """Feature pyramid, monocular depth, spherical cost volume, residual Gaussian heads.
 
     Args:
-        compat: "official" computes what the original does, its defects included, so that its weights give its
-            numbers; "fixed" corrects them.
-        precision: number type of all convolutions; depths, correlations and positions stay as they are.
-        attention_precision: what attention rounds its inputs to; the original's was bfloat16.
+        compat: "official" computes what the official code computes, its defects included; "fixed" corrects them.
+        precision: number type of all convolutions; depths, correlations and positions are not affected.
+        attention_precision: number type that attention rounds to; bfloat16 in the official code.
     """
 
     def __init__(
@@ -113,11 +99,10 @@ class PanSplat(nn.Module):
         """Predict from RGB in [0, 1] and OpenCV cam2world poses; `near` and `far` in metres.
 
         Raises:
-            InputError: too few views (or too many for the original), or a size the pyramid cannot halve.
+            InputError: fewer than two views ("official": not two), or a size that the pyramid cannot halve.
         """
         matched = self.match_views(images, cam2world, near, far)
-        gaussians = self.heads(images, matched.features, matched.depths, cam2world, near, far, tiles=tiles)
-        return PanSplatOutput(gaussians, matched)
+        return PanSplatOutput(self.heads(matched, tiles=tiles), matched)
 
     def match_views(
         self,
@@ -126,8 +111,8 @@ class PanSplat(nn.Module):
         near: Float[Tensor, "batch view"],
         far: Float[Tensor, "batch view"],
     ) -> MatchedViews:
-        """Features and depths of all views: everything before the heads."""
-        features = self.features(self._matching_size(images))
+        """Compute features and depths of all views: everything before the heads."""
+        features = self.features(self._resize_for_matching(images))
         mono_features = None
         if self.mono_depth is not None:
             with autocast_convolutions(self.precision, images.device):
@@ -138,13 +123,12 @@ class PanSplat(nn.Module):
     def lift_gaussians(
         self, matched: MatchedViews, *, tiles: int = 1, only: Sequence[int] | None = None
     ) -> Iterator[TileGaussians]:
-        """Gaussians tile by tile, for bounded memory; `only` names the tiles wanted, row by row from 0."""
-        m = matched
-        return self.heads.iterate_tiles(
-            m.images, m.features, m.depths, m.cam2world, m.near, m.far, tiles=tiles, only=only
-        )
+        """Yield the Gaussians tile by tile to bound memory; see `GaussianHeads.iterate_tiles`."""
+        return self.heads.iterate_tiles(matched, tiles=tiles, only=only)
 
-    def _matching_size(self, images: Float[Tensor, "batch view 3 height width"]) -> Float[Tensor, "batch view 3 h w"]:
+    def _resize_for_matching(
+        self, images: Float[Tensor, "batch view 3 height width"]
+    ) -> Float[Tensor, "batch view 3 h w"]:
         if images.shape[-2] <= MATCHING_HEIGHT:
             return images
         small = resize(images.flatten(0, 1), (MATCHING_HEIGHT, 2 * MATCHING_HEIGHT), self.compat)

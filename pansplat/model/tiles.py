@@ -1,11 +1,11 @@
-"""Tiles of a panorama: windows into maps of any level, cut with the margins that make tiling exact.
+"""Panorama tiles and lattice points: where the Gaussians of a level are, and windows into maps around them.
 
-A tile is one cell of an N x N grid over the panorama. On each level it is a window of whole pixels, grown by a
-margin; beyond the map's edges a window sees what is really there: columns wrap around, rows go on over the pole
-half a turn away. The original puts zeros beyond the poles and repeats the last column at the seam when it
-resizes, and its margins are too narrow (OFFICIAL.md, P6, P7, T5).
+A tile is one cell of an N x N grid over the panorama. On the map of each level it is a window of whole pixels, expanded
+by a margin. Beyond the borders of the map, columns wrap and rows continue over the pole, half a turn away. The
+official code has zeros beyond the poles, repeats the last column at the seam when it resizes, and has margins that are
+too narrow (OFFICIAL.md, P6, P7, T5).
 
-Source: PanSplat, section 3.4.
+Source: PanSplat, sections 3.3 and 3.4.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size, offi
 from pansplat.model.layers import Compat
 
 Lattice = Literal["fibonacci", "pixel"]
-_NARROWEST = 0.01  # at the poles a pixel is taken to be at most 100 times as wide in longitude
+_MIN_COS_LATITUDE = 0.01  # limits the width of a pixel in longitude at the poles
 
 
 @functools.lru_cache(maxsize=16)
-@torch.inference_mode(False)  # kept for calls that need gradients too
+@torch.inference_mode(False)  # the cached tensor must also serve calls with gradients
 def lattice_uv(lattice: Lattice, height: int, *, exact: bool = True) -> Float[Tensor, "n 2"]:
-    """Normalised panorama coordinates of the points of a level whose map is `height` x `2 height`, float64.
+    """Normalised panorama coordinates of a level's lattice points, float64; do not change the cached result in place.
 
-    A Fibonacci lattice covers the sphere evenly, from the bottom pole up; pixels come row by row and crowd at the
-    poles. Not to be changed in place: calls share it.
+    A Fibonacci lattice covers the sphere evenly, from the bottom pole up. The pixel lattice is in row-major order.
 
     Args:
-        exact: float64 throughout; otherwise the points of the original's float32 arithmetic.
+        height: rows of the level's map.
+        exact: computed in float64; otherwise the points of the official float32 arithmetic.
 
     Source: PanSplat, section 3.3.
     """
@@ -55,20 +55,20 @@ def lattice_uv(lattice: Lattice, height: int, *, exact: bool = True) -> Float[Te
 def move_points(
     uv: Float[Tensor, "n 2"], raw_offsets: Float[Tensor, "n 2"], lattice: Lattice, height: int
 ) -> Float[Tensor, "n 2"]:
-    """Points moved by what the network says, at most half a map pixel each way; they may cross the seam or a pole.
+    """Move points by at most half a map pixel in each direction; they may cross the seam or a pole.
 
-    On a Fibonacci lattice a pixel is as wide in longitude as it must be to span the same arc at every latitude.
+    On a Fibonacci lattice a pixel spans the same arc at every latitude, so it is wider in longitude near the poles.
     """
     width = torch.full_like(uv[:, 0], 2 * height)
     if lattice == "fibonacci":
-        width = width * torch.sin(uv[:, 1] * math.pi).clamp_min(_NARROWEST)
+        width = width * torch.sin(uv[:, 1] * math.pi).clamp_min(_MIN_COS_LATITUDE)
     pixel = torch.stack((1 / width, torch.full_like(width, 1 / height)), dim=-1)
     return uv.to(raw_offsets) + (torch.sigmoid(raw_offsets) - 0.5) * pixel.to(raw_offsets)
 
 
 @dataclass(frozen=True)
 class Window:
-    """A rectangle of map pixels; it may reach beyond the map."""
+    """A rectangle of map pixels; it may extend beyond the map."""
 
     top: int
     left: int
@@ -89,23 +89,23 @@ class Tile:
     grid: int
 
     def window(self, height: int) -> Window:
-        """Its pixels on a map of `height` x `2 height`, without margin."""
+        """The tile's pixels on a map of `height` x `2 height`, without margin."""
         rows, columns = height // self.grid, 2 * height // self.grid
         return Window(self.row * rows, self.column * columns, rows, columns)
 
     def contains(self, uv: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:
-        """Which points belong to it: each point of the panorama to exactly one tile."""
+        """Whether each point is in this tile; every point is in exactly one tile of the grid."""
         cell = (uv * self.grid).floor().clamp(0, self.grid - 1)
         return (cell[:, 0] == self.column) & (cell[:, 1] == self.row)
 
 
 @dataclass(frozen=True)
 class Margins:
-    """Map pixels around a tile: what a level's CNN reads, and what is known of its output.
+    """Map pixels around a tile that a level's convolutions read (`input`) and that their output keeps (`output`).
 
-    The original's output keeps the margin of its input, spoilt from its rim inwards by the zeros each convolution
-    sees there. Ours loses a pixel a convolution; `input` = 7 and `output` = 4 are the least that let the next level
-    be read off, twice as fine, with the same margin again.
+    Each convolution uses up one pixel of the margin. `input` = 7 and `output` = 4 are the smallest margins for three
+    convolutions with which the next level, twice as fine, gets the same margins. In the official code the output
+    keeps the margin of the input, but zero padding changes its outer pixels.
     """
 
     input: int
@@ -113,7 +113,7 @@ class Margins:
 
     @staticmethod
     def of(layers: int, compat: Compat, *, chained: bool) -> Margins:
-        """Margins for a number of convolutions; `chained` where maps are passed on to a finer level."""
+        """Margins for a number of convolutions; `chained` if a finer level reads the output."""
         if compat == "official":
             return Margins(layers, layers)
         output = layers + 1 if chained else 1
@@ -121,16 +121,16 @@ class Margins:
 
 
 def tile_grid(grid: int) -> list[Tile]:
-    """All tiles of a grid, row by row."""
+    """All tiles of a grid, in row-major order."""
     return [Tile(row, column, grid) for row in range(grid) for column in range(grid)]
 
 
 def crop_window(
     source: Float[Tensor, "channel h w"], height: int, window: Window, compat: Compat
 ) -> Float[Tensor, "channel rows columns"]:
-    """A window into a panorama map resized to `height` x `2 height` (bilinear, without antialiasing).
+    """Crop a window of a panorama map that is resized to `height` x `2 height` (bilinear, without antialiasing).
 
-    Only the window is resized, so that memory follows the tile, not the panorama.
+    Only the window is resized, so memory depends on the tile and not on the panorama.
     """
     exact = compat == "fixed"
     rows = torch.arange(window.top, window.top + window.height)
@@ -158,7 +158,12 @@ def sample_window(
     height: int,
     uv: Float[Tensor, "n 2"],
 ) -> Float[Tensor, "n channel"]:
-    """Bilinear samples of a map of `height` x `2 height`, of which only a window is at hand, at points inside it."""
+    """Sample a map bilinearly at points inside a window.
+
+    Args:
+        window_map: the window of the map.
+        height: rows of the whole map.
+    """
     x = uv[:, 0] * (2 * height) - 0.5 - window.left
     y = uv[:, 1] * height - 0.5 - window.top
     x, y = x.clamp(0, window.width - 1), y.clamp(0, window.height - 1)
@@ -170,14 +175,14 @@ def sample_window(
         ((1 - across) * (1 - down), across * (1 - down), (1 - across) * down, across * down), dim=-1
     ).to(window_map)
     pixels = window_map.permute(1, 2, 0).reshape(window.height * window.width, -1)
-    # A bag sums weighed rows in one pass: 7 times as fast on a processor as blending four gathered copies.
+    # embedding_bag sums weighted rows in one pass: on a CPU 7 times as fast as blending four gathered copies.
     return functional.embedding_bag(corners.to(pixels.device), pixels, mode="sum", per_sample_weights=weights)
 
 
 def sample_panorama(
     source: Float[Tensor, "channel h w"], uv: Float[Tensor, "n 2"], compat: Compat
 ) -> Float[Tensor, "n channel"]:
-    """Bilinear samples of a whole map; the original repeats its last column at the seam (OFFICIAL.md, trap T7)."""
+    """Sample a whole map bilinearly; "official" repeats the last column at the seam (OFFICIAL.md, trap T7)."""
     height = source.shape[-2]
     window = Window(0, 0, height, 2 * height)
     if compat == "fixed":
@@ -188,7 +193,7 @@ def sample_panorama(
 def _neighbours(
     index: Integer[Tensor, "n"], source_size: int, size: int, exact: bool
 ) -> tuple[Integer[Tensor, "n"], Integer[Tensor, "n"], Float[Tensor, "n"]]:
-    """The two source pixels on either side of each target pixel's centre, and the weight of the second."""
+    """The two source pixels around each target pixel's centre, and the weight of the second."""
     position = (index.double() + 0.5) * (source_size / size) - 0.5
     if not exact:
         position = position.clamp(0, source_size - 1)
@@ -205,7 +210,7 @@ def _blend(
     weight: Float[Tensor, "n"],
     dim: int,
 ) -> Float[Tensor, "channel rows columns"]:
-    """Source pixels along one axis, blended; a plain slice where no weight is needed."""
+    """Blend source pixels along one axis; a slice where all weights are 0."""
     if bool((weight == 0).all()):
         first, last = int(before[0]), int(before[-1])
         if last - first + 1 == len(before) and bool((before.diff() == 1).all()):

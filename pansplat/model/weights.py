@@ -1,20 +1,22 @@
-"""From the original's weights to ours, strictly.
+"""Weights on disk: our safetensors files, PyTorch checkpoints, and the conversion of official checkpoints.
 
-Every tensor of a checkpoint is used, or known to be of no use here, or an error; every tensor of ours is filled, or
-that is an error. official_names.py has the table.
+A weights file is a .safetensors with four metadata entries: `pansplat_format` (a number), `model` (which network),
+`config` (its architecture, JSON) and `compat` (with which it was trained). A checkpoint is read without running code
+that it contains. Conversion is strict: a tensor that is missing, unknown or not finite is an error.
 
-Source: OFFICIAL.md, section 15.
+Source: OFFICIAL.md, sections 3 to 8, 15 and 16.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import pickle
 import re
 import typing
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -29,25 +31,34 @@ from pansplat.errors import InputError
 from pansplat.geometry.cubemap import strip_lookup
 from pansplat.model.layers import Compat
 
-FORMAT = 1  # changes when names of tensors or the meaning of the metadata do
+FORMAT = 1  # increased when tensor names or the meaning of the metadata change
 
 CompatChoice = Literal["trained", "official", "fixed"]
 CHECKPOINT_SUFFIXES = (".ckpt", ".pt", ".pth")
 WEIGHTS_SUFFIXES = (".safetensors", *CHECKPOINT_SUFFIXES)
 COMPATS: dict[str, Compat] = {"official": "official", "fixed": "fixed"}
 
+ModelName = Literal["pansplat", "mvsplat"]
+
 _T = TypeVar("_T")
+_Layer = tuple[str, str, tuple[str, ...]]  # official name, our name, tensors
+_BARE = ("weight",)
+_FULL = ("weight", "bias")
+_BATCH_NORM = ("weight", "bias", "running_mean", "running_var", "num_batches_tracked")
+_PREFIX = "encoder."  # of the network's tensors in a Lightning checkpoint
+_AUXILIARY_PREFIX = "losses.2.gaussian_head."
+_MAX_NAMES = 4  # in an error
 
 
 @dataclass(frozen=True)
 class WeightsFile:
-    """What a weights file holds.
+    """Content of a weights file.
 
     Attributes:
-        model: the network's name, such as "pansplat".
+        model: name of the network, such as "pansplat".
         config: settings of its architecture.
-        compat: "official" where trained with the original's defects, "fixed" where without.
-        tensors: weights under our names.
+        compat: with which it was trained.
+        tensors: weights by name.
     """
 
     model: str
@@ -57,17 +68,17 @@ class WeightsFile:
 
 
 def pack_weights(model: ModelName, config: object, tensors: dict[str, Tensor], *, compat: Compat) -> WeightsFile:
-    """Weights with what is needed to use them; `config` is the network's dataclass."""
+    """Pack a network's tensors with its settings; `config` is the network's dataclass."""
     assert dataclasses.is_dataclass(config) and not isinstance(config, type)
-    settings = json.loads(json.dumps(dataclasses.asdict(config)))  # lists for tuples, as a file gives them back
+    settings = json.loads(json.dumps(dataclasses.asdict(config)))  # lists instead of tuples, as read from a file
     return WeightsFile(model, settings, compat, tensors)
 
 
 def save_weights(path: str | Path, weights: WeightsFile) -> None:
-    """Write a weights file; it appears whole or not at all.
+    """Write a weights file atomically.
 
     Raises:
-        InputError: when the path does not end in .safetensors, or cannot be written.
+        InputError: the path does not end in .safetensors, or cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() != ".safetensors":
@@ -87,7 +98,7 @@ def load_weights(path: str | Path) -> WeightsFile:
     """Read a weights file.
 
     Raises:
-        InputError: when there is none, it is damaged, or it was not written by pansplat.
+        InputError: the file is missing, damaged, or was not written by pansplat.
     """
     path = Path(path)
     _require_file(path)
@@ -117,29 +128,29 @@ def load_weights(path: str | Path) -> WeightsFile:
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """The contents of a PyTorch (Lightning) checkpoint: tensors and plain values; nothing in it is run.
+    """Read the tensors and plain values of a PyTorch (Lightning) checkpoint, without running code in it.
 
     Raises:
-        InputError: when the file is missing, damaged, no checkpoint, or asks for code to be run.
+        InputError: the file is missing, damaged, no checkpoint, or contains code to run.
     """
     path = Path(path)
     _require_file(path)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of old pickle protocols
+            warnings.simplefilter("ignore")  # about old pickle protocols
             content = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
-        wanted = re.search(r"(?:GLOBAL|global|class|function) ([\w.]+\.[\w.]+)", str(error))
-        if wanted is None:
+        code = re.search(r"(?:GLOBAL|global|class|function) ([\w.]+\.[\w.]+)", str(error))
+        if code is None:
             raise InputError(f"{path}: needed a PyTorch checkpoint, got other contents; {_guess(path)}") from error
         raise InputError(
-            f"{path}: needed a checkpoint of tensors and plain values, got one that asks to run {wanted[1]}; nothing "
+            f"{path}: needed a checkpoint of tensors and plain values, got one that asks to run {code[1]}; nothing "
             "was run. If you trust where it comes from, keep only its `state_dict`: "
             "torch.save({'state_dict': torch.load(PATH, weights_only=False)['state_dict']}, NEW_PATH)"
         ) from error
     except MemoryError:
         raise
-    except Exception as error:  # whatever the readers of zip and pickle stumble over in damaged bytes
+    except Exception as error:  # damaged bytes raise many kinds of error in the zip and pickle readers
         raise InputError(f"{path}: needed a whole PyTorch checkpoint, got a damaged one; {_guess(path)}") from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: needed a checkpoint with a `state_dict`, got a {type(content).__name__}")
@@ -147,10 +158,10 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 
 
 def state_dict_of(content: Mapping[str, Any], path: str | Path) -> dict[str, Tensor]:
-    """The tensors by name of a Lightning checkpoint's contents.
+    """The `state_dict` of a Lightning checkpoint's content.
 
     Raises:
-        InputError: when there is no `state_dict`, or it holds anything but tensors.
+        InputError: there is no `state_dict`, or it holds anything but tensors.
     """
     state = content.get("state_dict")
     if not isinstance(state, Mapping):
@@ -163,10 +174,10 @@ def state_dict_of(content: Mapping[str, Any], path: str | Path) -> dict[str, Ten
 
 
 def config_from_dict(kind: type[_T], values: Mapping[str, Any], where: str = "config") -> _T:
-    """A (nested) frozen dataclass of what `dataclasses.asdict` and JSON made of it.
+    """Restore a nested frozen dataclass from `dataclasses.asdict` after JSON.
 
     Raises:
-        InputError: when a field is unknown or missing.
+        InputError: a field is unknown or missing.
     """
     if not (dataclasses.is_dataclass(kind) and isinstance(values, Mapping)):
         raise InputError(f"{where}: needed settings by name, got {values!r}")
@@ -182,7 +193,7 @@ def config_from_dict(kind: type[_T], values: Mapping[str, Any], where: str = "co
 
 
 def _restore(hint: Any, value: Any, where: str) -> Any:
-    """A value as its field's type has it: JSON knows no dataclasses and no tuples."""
+    """Restore dataclasses and tuples, which JSON stores as objects and lists."""
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return config_from_dict(hint, value, where)
     if typing.get_origin(hint) is tuple and isinstance(value, list):
@@ -201,7 +212,7 @@ def _require_file(path: Path) -> None:
 
 
 def _guess(path: Path) -> str:
-    """What the first bytes tell of a file that is not what it should be."""
+    """Advice for an unreadable file, from its first bytes."""
     with open(path, "rb") as file:
         start = file.read(64).lstrip().lower()
     if start.startswith((b"<!doctype", b"<html", b"<?xml", b"<head")):
@@ -211,21 +222,16 @@ def _guess(path: Path) -> str:
     return "download or copy it again"
 
 
-_PREFIX = "encoder."  # what Lightning puts before the names of the network's tensors
-_AUXILIARY = "losses.2.gaussian_head."
-_SHOWN = 4  # names that an error lists
-
-
 @dataclass(frozen=True)
 class ConversionReport:
-    """What became of a checkpoint's tensors.
+    """How the tensors of an official checkpoint are converted.
 
     Attributes:
-        model: which network they belong to.
-        used: the original's name to ours.
-        unused: reason to the names that are left out for it.
-        surplus: names that nobody knows.
-        missing: the original's names that are not there.
+        model: the network they belong to.
+        used: official names to ours.
+        unused: names that are left out, by reason.
+        surplus: unknown names.
+        missing: official names that the checkpoint lacks.
     """
 
     model: ModelName
@@ -235,10 +241,10 @@ class ConversionReport:
     missing: list[str]
 
     def require_complete(self, source: object) -> None:
-        """Refuse a checkpoint with anything missing or surplus.
+        """Check that nothing is missing or surplus.
 
         Raises:
-            InputError: with the first names, and how many there are.
+            InputError: lists the first names and their number.
         """
         problems = []
         if self.missing:
@@ -253,67 +259,75 @@ class ConversionReport:
 
 
 def convert_tensors(content: Mapping[str, object], source: object) -> dict[str, Tensor]:
-    """The tensors of an original checkpoint under our names.
+    """The tensors of an official checkpoint by our names, floating-point ones in float32.
 
     Args:
-        content: of the checkpoint, as `read_checkpoint` gives it.
+        content: of the checkpoint, from `read_checkpoint`.
         source: the file, for messages.
 
     Raises:
-        InputError: when tensors are missing, surplus, of wrong shape, or not finite.
+        InputError: tensors are missing, unknown or not finite.
     """
     report = match_tensors(content, source)
     report.require_complete(source)
     state = state_dict_of(content, str(source))
-    _compare_derived(state, source)
+    _require_official_grids(state, source)
     tensors = {}
-    for row in name_table(report.model):
-        for name, ours, squeezed in tensor_names(row):
-            tensor = state[_PREFIX + name]
-            tensor = tensor.squeeze(-1) if squeezed else tensor
-            if tensor.is_floating_point():
-                tensor = tensor.float()
-                if not torch.isfinite(tensor).all():
-                    raise InputError(f"{source}: needed finite numbers, got NaN or infinity in {name}; take another")
-            tensors[ours] = tensor
+    for name, ours in official_names(report.model).items():
+        tensor = state[_PREFIX + name]
+        tensor = tensor.squeeze(-1) if tensor.ndim == 3 else tensor  # 1-D convolutions are linear layers here
+        if tensor.is_floating_point():
+            tensor = tensor.float()
+            if not torch.isfinite(tensor).all():
+                raise InputError(f"{source}: needed finite numbers, got NaN or infinity in {name}; take another")
+        tensors[ours] = tensor
     return tensors
 
 
 def match_tensors(content: Mapping[str, object], source: object) -> ConversionReport:
-    """What would become of a checkpoint's tensors, problems included.
+    """Match the tensors of an official checkpoint with ours, and report what is missing or unknown.
 
     Raises:
-        InputError: when it belongs to no network that is known.
+        InputError: the tensors belong to neither network.
     """
     state = state_dict_of(content, str(source))
     model = _model_of(state, source)
-    expected = {_PREFIX + name: ours for row in name_table(model) for name, ours, _ in tensor_names(row)}
-    derived = {_PREFIX + name for name in _derived(model)}
-    auxiliary = {_AUXILIARY + name for name in _auxiliary_names()}
+    expected = {_PREFIX + name: ours for name, ours in official_names(model).items()}
+    grids = {_PREFIX + name for name in _grid_heights(model)}
+    auxiliary = {_AUXILIARY_PREFIX + name for name in _auxiliary_names()}
     unused = {
-        "computed anew": sorted(derived & state.keys()),
+        "recomputed grids": sorted(grids & state.keys()),
         "auxiliary heads, for training only": sorted(auxiliary & state.keys()),
-        "state of the training": sorted(key for key in content if key != "state_dict"),
+        "training state": sorted(key for key in content if key != "state_dict"),
     }
     return ConversionReport(
         model=model,
         used={name: ours for name, ours in expected.items() if name in state},
         unused={reason: names for reason, names in unused.items() if names},
-        surplus=[name for name in state if name not in expected.keys() | derived | auxiliary],
-        missing=[name for name in (*expected, *sorted(derived)) if name not in state],
+        surplus=[name for name in state if name not in expected.keys() | grids | auxiliary],
+        missing=[name for name in (*expected, *sorted(grids)) if name not in state],
     )
 
 
 def official_names(model: ModelName) -> dict[str, str]:
-    """Our name of each of the original's tensors (without the prefix "encoder.") that is used."""
-    return {name: ours for row in name_table(model) for name, ours, _ in tensor_names(row)}
+    """Our name of each official tensor that is used; official names are without the prefix "encoder.".
+
+    The official code counts stages from coarse to fine; our levels are the paper's, where 0 is the finest.
+    """
+    if model == "mvsplat":
+        parts = (_mvsplat(),)
+    else:
+        transformer = _transformer("backbone.transformer", "features.transformer")
+        parts = (_feature_pyramid(), transformer, _mono_depth(), _cost_volume(), _heads())
+    layers = itertools.chain.from_iterable(parts)
+    return {f"{theirs}.{tensor}": f"{ours}.{tensor}" for theirs, ours, tensors in layers for tensor in tensors}
 
 
 def require_shapes(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], source: object) -> None:
-    """Refuse tensors whose names or shapes are not those of a network.
+    """Check that tensors have the names and shapes of a network's.
 
     Raises:
-        InputError: with the first names, and how many there are.
+        InputError: lists the first names and their number.
     """
     missing = [name for name in expected if name not in tensors]
     surplus = [name for name in tensors if name not in expected]
@@ -331,11 +345,8 @@ def require_shapes(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor]
         raise InputError(f"{source}: its tensors do not fit the network: {'; '.join(problems)}; take another file")
 
 
-# What is in checkpoints but not in the network
-
-
-def _derived(model: ModelName) -> dict[str, int]:
-    """Stored lookup grids that are computed here: name and height of the panorama."""
+def _grid_heights(model: ModelName) -> dict[str, int]:
+    """Names of the stored lookup grids, which are computed here, and the heights of their panoramas."""
     if model == "mvsplat":
         return {}
     return {f"mono_depth.c2e.{scale}.sample_grid": 512 >> scale for scale in (5, 4, 3, 2, 1)}
@@ -348,9 +359,9 @@ def _auxiliary_names() -> Iterator[str]:
             yield f"{layer}.bias"
 
 
-def _compare_derived(state: Mapping[str, Tensor], source: object) -> None:
-    """Refuse a checkpoint whose stored grids are not the ones that are computed."""
-    for name, height in _derived("pansplat").items():
+def _require_official_grids(state: Mapping[str, Tensor], source: object) -> None:
+    """Check that stored lookup grids equal the computed ones."""
+    for name, height in _grid_heights("pansplat").items():
         if _PREFIX + name not in state:
             continue
         stored = state[_PREFIX + name]
@@ -371,41 +382,11 @@ def _model_of(state: Mapping[str, Tensor], source: object) -> ModelName:
     )
 
 
-def _some(names: Sequence[str] | Iterable[str]) -> str:
-    names = list(names)
-    return f"{len(names)} ({', '.join(names[:_SHOWN])}{', ...' if len(names) > _SHOWN else ''})"
+def _some(names: Sequence[str]) -> str:
+    return f"{len(names)} ({', '.join(names[:_MAX_NAMES])}{', ...' if len(names) > _MAX_NAMES else ''})"
 
 
-ModelName = Literal["pansplat", "mvsplat"]
-Row = tuple[str, str, tuple[str, ...]]  # the original's layer, our layer, its tensors
-
-_BARE = ("weight",)
-_FULL = ("weight", "bias")
-_POINTWISE = ("weight squeezed", "bias")  # a 1-D convolution over tokens there, a linear layer here
-_BATCH_NORM = ("weight", "bias", "running_mean", "running_var", "num_batches_tracked")
-
-
-def tensor_names(row: Row) -> Iterator[tuple[str, str, bool]]:
-    """The original's name, ours, and whether a last axis of 1 goes, for each tensor of a row."""
-    theirs, ours, kinds = row
-    for kind in kinds:
-        tensor, _, squeezed = kind.partition(" ")
-        yield f"{theirs}.{tensor}", f"{ours}.{tensor}", squeezed != ""
-
-
-def name_table(model: ModelName) -> Iterator[Row]:
-    """The table's rows of a network."""
-    if model == "mvsplat":
-        yield from _mvsplat()
-        return
-    yield from _feature_pyramid()
-    yield from _transformer("backbone.transformer", "features.transformer")
-    yield from _mono_depth()
-    yield from _cost_volume()
-    yield from _heads()
-
-
-def _feature_pyramid() -> Iterator[Row]:
+def _feature_pyramid() -> Iterator[_Layer]:
     encoder = (
         ("conv00", "0.0"),
         ("conv01", "0.1"),
@@ -430,7 +411,7 @@ def _feature_pyramid() -> Iterator[Row]:
         yield f"backbone.decoder.inner{stage}", f"features.decoder.laterals.{3 - stage}", _FULL
 
 
-def _transformer(theirs: str, ours: str) -> Iterator[Row]:
+def _transformer(theirs: str, ours: str) -> Iterator[_Layer]:
     for block in range(6):
         old, new = f"{theirs}.layers.{block}", f"{ours}.blocks.{block}"
         for layer, attention in (("self_attn", "within"), ("cross_attn_ffn", "across")):
@@ -444,7 +425,7 @@ def _transformer(theirs: str, ours: str) -> Iterator[Row]:
         yield f"{old}.cross_attn_ffn.norm2", f"{new}.norm", _FULL
 
 
-def _mono_depth() -> Iterator[Row]:
+def _mono_depth() -> Iterator[_Layer]:
     yield "mono_depth", "mono_depth", ("max_depth",)
     yield from _resnet18("mono_depth.equi_encoder", "mono_depth.panorama_encoder")
     yield from _resnet18("mono_depth.cube_encoder", "mono_depth.face_encoder")
@@ -463,7 +444,7 @@ def _mono_depth() -> Iterator[Row]:
     yield f"{theirs}.depthconv_0.conv", f"{ours}.head.5", _FULL
 
 
-def _resnet18(theirs: str, ours: str) -> Iterator[Row]:
+def _resnet18(theirs: str, ours: str) -> Iterator[_Layer]:
     yield f"{theirs}.conv1", f"{ours}.stem", _BARE
     yield f"{theirs}.bn1", f"{ours}.stem_norm", _BATCH_NORM
     for stage in range(4):
@@ -478,7 +459,7 @@ def _resnet18(theirs: str, ours: str) -> Iterator[Row]:
             yield f"{old}.1", f"{new}.shortcut_norm", _BATCH_NORM
 
 
-def _cost_volume() -> Iterator[Row]:
+def _cost_volume() -> Iterator[_Layer]:
     for stage in range(3):
         ours = f"cost_volume.levels.{3 - stage}"
         yield from _refinement(f"depth_predictor.corr_refine_nets.{stage}", f"{ours}.refine", scales=3)
@@ -487,14 +468,14 @@ def _cost_volume() -> Iterator[Row]:
         yield f"depth_predictor.depth_heads.{stage}.2", f"{ours}.head.2", _FULL
 
 
-def _refinement(theirs: str, ours: str, scales: int) -> Iterator[Row]:
+def _refinement(theirs: str, ours: str, scales: int) -> Iterator[_Layer]:
     yield f"{theirs}.0", f"{ours}.entry", _FULL
     yield f"{theirs}.1", f"{ours}.norm", _FULL
     yield from _unet(f"{theirs}.3", f"{ours}.unet", scales)
     yield f"{theirs}.4", f"{ours}.exit", _FULL
 
 
-def _unet(theirs: str, ours: str, scales: int) -> Iterator[Row]:
+def _unet(theirs: str, ours: str, scales: int) -> Iterator[_Layer]:
     last = scales - 1
     yield f"{theirs}.input_blocks.0.0", f"{ours}.stem", _FULL
     for scale in range(scales):
@@ -519,20 +500,20 @@ def _unet(theirs: str, ours: str, scales: int) -> Iterator[Row]:
     yield f"{theirs}.out.1", f"{ours}.exit.norm", _FULL
 
 
-def _res_block(theirs: str, ours: str) -> Iterator[Row]:
+def _res_block(theirs: str, ours: str) -> Iterator[_Layer]:
     yield f"{theirs}.in_layers.0", f"{ours}.first.conv", _FULL
     yield f"{theirs}.in_layers.1", f"{ours}.first.norm", _FULL
     yield f"{theirs}.out_layers.0", f"{ours}.second.conv", _FULL
     yield f"{theirs}.out_layers.1", f"{ours}.second.norm", _FULL
 
 
-def _attention(theirs: str, ours: str) -> Iterator[Row]:
-    yield f"{theirs}.qkv", f"{ours}.project_in", _POINTWISE
-    yield f"{theirs}.proj_out", f"{ours}.project_out", _POINTWISE
+def _attention(theirs: str, ours: str) -> Iterator[_Layer]:
+    yield f"{theirs}.qkv", f"{ours}.project_in", _FULL
+    yield f"{theirs}.proj_out", f"{ours}.project_out", _FULL
     yield f"{theirs}.norm", f"{ours}.norm", _FULL
 
 
-def _heads() -> Iterator[Row]:
+def _heads() -> Iterator[_Layer]:
     for stage in range(4):
         for layer in range(3):
             theirs = f"gaussian_head.to_gaussians_list.{stage}.{2 * layer}"
@@ -540,7 +521,7 @@ def _heads() -> Iterator[Row]:
         yield f"gaussian_head.gaussians_mlp_list.{stage}.0", f"heads.levels.{stage}.linear", _FULL
 
 
-def _mvsplat() -> Iterator[Row]:
+def _mvsplat() -> Iterator[_Layer]:
     yield from _mvsplat_encoder()
     yield from _transformer("backbone.transformer", "features.transformer")
     theirs, ours = "depth_predictor", "depth"
@@ -558,7 +539,7 @@ def _mvsplat() -> Iterator[Row]:
         yield f"{theirs}.to_disparity.{layer}", f"to_depth.{layer}", _FULL
 
 
-def _mvsplat_encoder() -> Iterator[Row]:
+def _mvsplat_encoder() -> Iterator[_Layer]:
     theirs, ours = "backbone.backbone", "features.encoder"
     yield f"{theirs}.conv1", f"{ours}.stem", _BARE
     for stage in range(3):

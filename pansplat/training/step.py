@@ -127,8 +127,7 @@ class TrainingStep(nn.Module):
         """Image loss of the images rendered from each level of the cost volume alone."""
         if self.auxiliary is None:
             return None
-        m = matched
-        levels = self.auxiliary(m.images, m.features, m.depths, m.cam2world, m.near, m.far)
+        levels = self.auxiliary(matched)
         images = [
             torch.stack(
                 [

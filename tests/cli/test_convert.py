@@ -64,7 +64,7 @@ def test_convert_tells_what_became_of_every_tensor(
     torch.save(content, tmp_path / "original.ckpt")
     assert run(["convert", str(tmp_path / "original.ckpt"), "-o", str(tmp_path / "m.safetensors")]) == 0
     lines = {line.split("│")[1].strip(): line.split("│")[2].strip() for line in _rows(capsys.readouterr().out)}
-    assert lines == {"used": "471", "left out: state of the training": "5", "unknown": "0", "missing": "0"}
+    assert lines == {"used": "471", "left out: training state": "5", "unknown": "0", "missing": "0"}
 
 
 def _rows(text: str) -> list[str]:

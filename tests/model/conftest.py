@@ -1,29 +1,93 @@
-"""Weights for the networks under test."""
+"""Weights and small networks for the tests of the model, and one run of the official network."""
 
+import functools
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
-from pansplat.model.weights import official_names
+from pansplat.gaussians.scene import Gaussians
+from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
+from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
+from pansplat.model.heads import AdapterConfig, HeadsConfig
+from pansplat.model.network import NetworkPredictor, build_network, convert_checkpoint
+from pansplat.model.pansplat import PanSplat, PanSplatConfig
+from pansplat.model.weights import WeightsFile
+
+_HOOKED = (
+    *("features", "features.encoder", "features.transformer", "mono_depth", "cost_volume"),
+    *(f"cost_volume.levels.{level}.refine" for level in (3, 2, 1)),
+)
+
+
+@dataclass(frozen=True)
+class OfficialRun:
+    """A prediction with the official weights on the inputs of the golden fixtures.
+
+    Attributes:
+        inputs, outputs: of the modules in `_HOOKED`, by name.
+    """
+
+    network: PanSplat
+    gaussians: Gaussians
+    inputs: dict[str, Any]
+    outputs: dict[str, Any]
 
 
 @pytest.fixture(scope="session")
-def load_recipe(recipe_weights: dict[str, torch.Tensor]) -> Callable[[torch.nn.Module, str], torch.nn.Module]:
-    """Give a part of PanSplat, such as "features", the recipe's weights; ready to predict."""
+def official_weights(recipe_weights: dict[str, Tensor], as_lightning: Callable[..., dict[str, Any]]) -> WeightsFile:
+    """The recipe's checkpoint, converted."""
+    return convert_checkpoint(as_lightning(recipe_weights), "recipe")
 
-    def load(module: torch.nn.Module, part: str) -> torch.nn.Module:
-        shapes = {name: tensor.shape for name, tensor in module.state_dict().items()}
-        names = {ours.removeprefix(f"{part}."): theirs for theirs, ours in official_names("pansplat").items()}
-        module.load_state_dict({name: recipe_weights[names[name]].reshape(shapes[name]) for name in shapes})
-        return module.eval()
 
-    return load
+@pytest.fixture(scope="session")
+def run_official(official_weights: WeightsFile, golden: Callable[..., dict[str, Tensor]]) -> Callable[..., OfficialRun]:
+    """Run the converted network as a predictor; each combination of arguments runs once."""
+
+    @functools.cache
+    def run(compat: str = "official", attention: str = "float32") -> OfficialRun:
+        network = build_network(official_weights, compat, "recipe", attention_precision=attention)
+        inputs, outputs = {}, {}
+
+        def keep(name: str, given: tuple, output: object) -> None:
+            inputs[name], outputs[name] = given[0], output
+
+        for name in _HOOKED:
+            network.get_submodule(name).register_forward_hook(
+                lambda _, given, output, name=name: keep(name, given, output)
+            )
+        truth = golden("pansplat_64x128_fp32attn")
+        scene = (truth[f"in.{name}"][0] for name in ("image", "extrinsics", "near", "far"))
+        gaussians = NetworkPredictor("pansplat", network)(*scene)
+        return OfficialRun(network, gaussians, inputs, outputs)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def error() -> Callable[[Tensor, Tensor], float]:
+    """Largest difference from a golden tensor, in its standard deviations."""
+    return lambda found, expected: float((found - expected).abs().max() / expected.std())
+
+
+@pytest.fixture(scope="session")
+def small_config() -> PanSplatConfig:
+    """A narrow PanSplat without the monocular network."""
+    return PanSplatConfig(
+        features=FeaturePyramidConfig(channels=(4, 8, 8, 16), transformer=TransformerConfig(channels=16, blocks=2)),
+        cost_volume=CostVolumeConfig(
+            mono_channels=0, levels=(SweepLevel(3, 16, 8, 32), SweepLevel(2, 8, 4, 32), SweepLevel(1, 8, 4, 32))
+        ),
+        heads=HeadsConfig(feature_channels=(16, 8, 8, 4), candidates=4, adapter=AdapterConfig(degree=1)),
+    )
 
 
 @pytest.fixture(scope="session")
 def randomize() -> Callable[[torch.nn.Module], torch.nn.Module]:
-    """Fill a network with float64 noise, so that no part of it does nothing; ready to predict."""
+    """Fill a network with float64 noise, so that no layer is an identity or zero; in eval mode."""
 
     def fill(module: torch.nn.Module) -> torch.nn.Module:
         generator = torch.Generator().manual_seed(5)

@@ -1,20 +1,32 @@
-"""Features of the panoramas: the original's numbers, and the sphere's symmetries."""
+"""Feature pyramid and its transformer: the official numbers, attention in windows, symmetries of the sphere."""
+
+import math
 
 import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.model.feature_pyramid import FeaturePyramid, FeaturePyramidConfig, TransformerConfig
+from pansplat.model.feature_pyramid import (
+    FeaturePyramid,
+    FeaturePyramidConfig,
+    Transformer,
+    TransformerConfig,
+    merge_windows,
+    position_encoding,
+    shift_mask,
+    split_windows,
+)
 
 _SMALL = FeaturePyramidConfig(channels=(8, 8, 8, 16), transformer=TransformerConfig(16, blocks=2, expansion=1))
+_SMALL_TRANSFORMER = TransformerConfig(channels=16, blocks=3, expansion=2)
 
 
 def _images(*shape):
     return torch.rand(shape, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
 
 
-def _relative(result, truth):
-    return float((result - truth).abs().max() / truth.std())
+def _noise(*shape):
+    return torch.randn(shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
 
 
 @pytest.fixture(scope="module")
@@ -22,29 +34,14 @@ def small(randomize):
     return randomize(FeaturePyramid(_SMALL, "fixed"))
 
 
-def test_features_are_the_originals(golden, load_recipe):
-    truth = golden("pansplat_64x128_fp32attn")
-    pyramid = load_recipe(FeaturePyramid(FeaturePyramidConfig(), "official"), "features")
-    refined = []
-    pyramid.transformer.register_forward_hook(lambda module, inputs, output: refined.append(output))
-    encoded = []
-    pyramid.encoder.register_forward_hook(lambda module, inputs, output: encoded.extend(output))
-    with torch.inference_mode():
-        features = pyramid(truth["in.image"])
+@pytest.mark.shared
+def test_features_match_the_official_code(run_official, golden, error):
+    truth, outputs = golden("pansplat_64x128_fp32attn"), run_official().outputs
     for stage in range(4):
-        assert _relative(features[stage], truth[f"backbone.feat.{stage}"]) < 2e-4
-    for stage in range(4):
-        assert _relative(encoded[3 - stage], truth[f"backbone.cnn.{stage}"][0]) < 2e-4
+        assert error(outputs["features"][stage], truth[f"backbone.feat.{stage}"]) < 2e-4
+        assert error(outputs["features.encoder"][3 - stage], truth[f"backbone.cnn.{stage}"][0]) < 2e-4
     for view in range(2):
-        assert _relative(refined[0][:, view], truth[f"transformer.{view}"]) < 2e-4
-
-
-def test_fixed_features_are_not_the_originals(golden, load_recipe):
-    truth = golden("pansplat_64x128_fp32attn")
-    pyramid = load_recipe(FeaturePyramid(FeaturePyramidConfig(), "fixed"), "features")
-    with torch.inference_mode():
-        features = pyramid(truth["in.image"])
-    assert all(_relative(features[stage], truth[f"backbone.feat.{stage}"]) > 0.1 for stage in range(4))
+        assert error(outputs["features.transformer"][:, view], truth[f"transformer.{view}"]) < 2e-4
 
 
 def test_levels_halve_from_coarse_to_fine(small):
@@ -54,19 +51,19 @@ def test_levels_halve_from_coarse_to_fine(small):
     ]  # fmt: skip
 
 
-def test_half_a_turn_of_the_panoramas_turns_the_features(small):
+def test_rolling_by_half_a_turn_rolls_the_features(small):
     images = _images(1, 2, 3, 32, 64)
-    for turned, maps in zip(small(images.roll(32, -1)), small(images), strict=True):
-        assert torch.allclose(turned, maps.roll(maps.shape[-1] // 2, -1), atol=1e-11)
+    for rolled, maps in zip(small(images.roll(32, -1)), small(images), strict=True):
+        assert torch.allclose(rolled, maps.roll(maps.shape[-1] // 2, -1), atol=1e-11)
 
 
-def test_each_image_decoded_alone_is_as_all_decoded_together(small):
+def test_decoding_images_one_by_one_equals_decoding_all_at_once(small):
     coarsest, finer = small.encoder(_images(2, 3, 32, 64))[-1], small.encoder(_images(2, 3, 32, 64))[:-1]
     for alone, together in zip(small.decoder(coarsest, finer), small.decoder._decode(coarsest, finer), strict=True):
         assert torch.allclose(alone, together, atol=1e-13)
 
 
-def test_gradient_reaches_the_images_and_every_parameter(small):
+def test_gradients_reach_the_images_and_every_parameter(small):
     small.zero_grad()
     images = _images(1, 2, 3, 32, 64).requires_grad_()
     sum(maps.square().sum() for maps in small(images)).backward()
@@ -92,6 +89,107 @@ def test_training_mode_normalises_over_the_batch():
         ("official", (1, 2, 3, 40, 80), "that 16 divides, got 40x80"),
     ],
 )
-def test_what_the_pyramid_cannot_take_is_refused(compat, shape, message):
+def test_unusable_views_and_sizes_are_refused(compat, shape, message):
     with pytest.raises(InputError, match=message):
         FeaturePyramid(_SMALL, compat)(torch.zeros(shape))
+
+
+# Transformer
+
+
+@pytest.fixture(scope="module")
+def transformer(randomize):
+    def make(compat="fixed", **changes):
+        return randomize(Transformer(TransformerConfig(**{**vars(_SMALL_TRANSFORMER), **changes}), compat))
+
+    return make
+
+
+@pytest.mark.shared
+def test_position_encoding_matches_the_official_code(golden):
+    assert (position_encoding(4, 8, 128) - golden("units")["posenc.4x8"][0]).abs().max() < 1e-6
+
+
+@pytest.mark.shared
+def test_official_shift_mask_matches_the_official_code(golden):
+    assert torch.equal(shift_mask(8, 16, 2, "official"), golden("units")["shiftmask.8x16"])
+
+
+def test_fixed_shift_mask_wraps_at_the_seam_but_not_at_the_poles():
+    mask = shift_mask(8, 16, 2, "fixed")
+    assert not mask[:2].any()  # all tokens of the upper windows are neighbours
+    rows = torch.arange(4).repeat_interleave(8)  # of a lower window's tokens; half of them wrapped around
+    apart = (rows[:, None] < 2) != (rows[None] < 2)
+    assert torch.equal(mask[2:] == -math.inf, apart.expand(2, -1, -1))
+
+
+def test_merging_windows_inverts_splitting():
+    tokens = _noise(2, 3, 8, 12, 5)
+    windows = split_windows(tokens, 2)
+    assert windows.shape == (2, 3, 4, 24, 5)
+    assert torch.equal(windows[0, 0, 1, 0], tokens[0, 0, 0, 6])
+    assert torch.equal(merge_windows(windows, 8, 12), tokens)
+
+
+def test_rolling_by_half_a_turn_rolls_the_output(transformer):
+    maps = _noise(1, 2, 16, 8, 16)
+    rolled = transformer()(maps.roll(8, -1))
+    assert torch.allclose(rolled, transformer()(maps).roll(8, -1), atol=1e-11)
+
+
+def test_rolling_by_half_a_turn_does_not_roll_the_official_output(transformer):
+    maps, official = _noise(1, 2, 16, 8, 16), transformer("official")
+    assert not torch.allclose(official(maps.roll(8, -1)), official(maps).roll(8, -1), atol=1e-3)
+
+
+def test_a_quarter_turn_changes_which_tokens_meet(transformer):
+    maps = _noise(1, 2, 16, 8, 16)
+    assert not torch.allclose(transformer()(maps.roll(4, -1)), transformer()(maps).roll(4, -1), atol=1e-3)
+
+
+def test_blocks_without_output_add_only_the_position_encoding(transformer):
+    network, maps = transformer(), _noise(1, 2, 16, 4, 8)
+    with torch.no_grad():
+        for name, parameter in network.named_parameters():
+            if "norm" in name:
+                parameter.zero_()
+    encoding = position_encoding(2, 4, 16).double().repeat(1, 2, 2)
+    assert torch.allclose(network(maps), maps + encoding, atol=1e-6)
+
+
+@pytest.mark.parametrize("views", [2, 3])
+def test_the_order_of_the_views_does_not_matter(transformer, views):
+    maps, order = _noise(1, views, 16, 4, 8), torch.arange(views).flip(0)
+    assert torch.allclose(transformer()(maps[:, order]), transformer()(maps)[:, order], atol=1e-12)
+
+
+def test_a_repeated_view_changes_nothing(transformer):
+    network = transformer(blocks=1)
+    maps = _noise(1, 2, 16, 4, 8)
+    twice = network(torch.cat((maps, maps[:, 1:]), dim=1))
+    assert torch.allclose(twice[:, 0], network(maps)[:, 0], atol=1e-12)
+
+
+def test_each_view_reads_the_others(transformer):
+    maps = _noise(1, 3, 16, 4, 8)
+    before = transformer(blocks=1)(maps)
+    maps[:, 2] += 1
+    moved = (transformer(blocks=1)(maps) - before).abs().amax(dim=(2, 3, 4))
+    assert (moved > 1e-3).all()
+
+
+def test_batch_items_are_independent(transformer):
+    maps = _noise(2, 2, 16, 4, 8)
+    assert torch.allclose(transformer()(maps)[1], transformer()(maps[1:])[0], atol=1e-12)
+
+
+def test_gradients_reach_the_maps_and_every_parameter(transformer):
+    network, maps = transformer(), _noise(1, 2, 16, 4, 8).requires_grad_()
+    network(maps).square().sum().backward()
+    assert maps.grad.abs().min() > 0
+    assert all(parameter.grad.abs().max() > 0 for parameter in network.parameters())
+
+
+def test_a_map_that_cannot_be_split_into_windows_is_refused(transformer):
+    with pytest.raises(InputError, match="that 4 divides, got 6x12"):
+        transformer()(_noise(1, 2, 16, 6, 12))

@@ -1,6 +1,6 @@
-"""UniFuse: the original's numbers, and what the corrected network keeps when the panorama rolls."""
+"""UniFuse: the official numbers, and the roll of the fixed network's features."""
 
-from collections.abc import Callable
+import types
 
 import pytest
 import torch
@@ -11,13 +11,12 @@ from pansplat.model.mono_depth import Decoder, MonocularDepth, ResNet18
 _CHANNELS = {5: 512, 4: 256, 3: 128, 2: 64, 1: 64}
 
 
-def deviation(ours: Tensor, theirs: Tensor) -> float:
-    """Largest difference in standard deviations of the golden tensor."""
-    return float((ours - theirs).abs().max() / theirs.std())
+def _noise(*shape: int, seed: int) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def seeded(module: torch.nn.Module) -> torch.nn.Module:
-    """A module with the same random weights every time, none of them special."""
+def _seeded(module: torch.nn.Module) -> torch.nn.Module:
+    """A module with the same random weights and statistics every time."""
     generator = torch.Generator().manual_seed(5)
     for tensor in module.state_dict().values():
         if tensor.is_floating_point():
@@ -26,66 +25,43 @@ def seeded(module: torch.nn.Module) -> torch.nn.Module:
     return module.double().eval()
 
 
-@pytest.fixture(scope="module")
-def network(load_recipe: Callable[[torch.nn.Module, str], torch.nn.Module]) -> torch.nn.Module:
-    return load_recipe(MonocularDepth("official"), "mono_depth")
+@pytest.mark.shared
+def test_features_and_depth_match_the_official_code(run_official, golden, error) -> None:
+    truth, run = golden("pansplat_64x128_fp32attn"), run_official()
+    panoramas, strips = run.network.mono_depth.prepare(truth["in.image"][0])
+    assert error(panoramas[..., ::8, ::8], truth["in.mono_image_sub"][0]) < 2e-4
+    assert error(strips[..., ::8, ::8], truth["in.cube_image_sub"][0]) < 2e-4
+    features = run.outputs["mono_depth"]
+    assert features.shape == (1, 2, 32, 256, 512) and not features.requires_grad
+    assert error(features[..., ::16, ::16], truth["mono.feat_sub"]) < 2e-4
+    depth = run.network.mono_depth.depth(features)
+    assert error(depth[..., ::8, ::8], truth["mono.pred_depth_sub"]) < 2e-4
 
 
-@pytest.fixture(scope="module")
-def expected(golden: Callable[[str], dict[str, Tensor]]) -> dict[str, Tensor]:
-    return golden("pansplat_64x128_fp32attn")
+@pytest.mark.shared
+def test_rolling_the_panorama_by_half_a_turn_rolls_the_features(run_official, golden, error) -> None:
+    fixed = run_official("fixed").network.mono_depth
+    image = golden("pansplat_64x128_fp32attn")["in.image"][:, :1]
+    assert error(fixed(image.roll(64, dims=-1)), fixed(image).roll(256, dims=-1)) < 1e-3
 
 
-def test_the_encoders_see_what_the_originals_saw(network: MonocularDepth, expected: dict[str, Tensor]) -> None:
-    panoramas, strips = network.prepare(expected["in.image"][0])
-    assert deviation(panoramas[..., ::8, ::8], expected["in.mono_image_sub"][0]) < 2e-4
-    assert deviation(strips[..., ::8, ::8], expected["in.cube_image_sub"][0]) < 2e-4
-
-
-def test_features_and_depth_are_the_originals(network: MonocularDepth, expected: dict[str, Tensor]) -> None:
-    features = network(expected["in.image"])
-    assert features.shape == (1, 2, 32, 256, 512)
-    assert deviation(features[..., ::16, ::16], expected["mono.feat_sub"]) < 2e-4
-    depth = network.depth(features)
-    assert deviation(depth[..., ::8, ::8], expected["mono.pred_depth_sub"]) < 2e-4
-    assert not features.requires_grad
-
-
-def test_the_network_is_frozen(network: MonocularDepth) -> None:
-    network.train()
+def test_the_network_stays_frozen_in_training_mode() -> None:
+    with torch.device("meta"):
+        network = MonocularDepth().train()
     assert not any(module.training for module in network.modules())
     assert not any(parameter.requires_grad for parameter in network.parameters())
 
 
-def test_the_fixed_input_is_seamless_and_the_originals_is_not() -> None:
-    image = torch.rand(1, 3, 16, 32, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    rolled = image.roll(16, dims=-1)
-    for compat, seamless in (("fixed", True), ("official", False)):
-        network = MonocularDepth.prepare(_Only(compat), image)[0]
-        turned = MonocularDepth.prepare(_Only(compat), rolled)[0]
-        assert torch.allclose(turned, network.roll(512, dims=-1), atol=1e-12) == seamless
-
-
-class _Only:
-    """All that `prepare` asks of its network."""
-
-    def __init__(self, compat: str) -> None:
-        self.compat = compat
-
-
-def test_rolling_the_panorama_by_half_a_turn_rolls_the_features(
-    network: MonocularDepth, expected: dict[str, Tensor]
-) -> None:
-    fixed = MonocularDepth("fixed")
-    fixed.load_state_dict(network.state_dict())
-    image = expected["in.image"][:, :1]
-    features, turned = fixed(image), fixed(image.roll(64, dims=-1))
-    assert deviation(turned, features.roll(256, dims=-1)) < 1e-3
+def test_the_fixed_input_wraps_and_the_official_one_does_not() -> None:
+    image = _noise(1, 3, 16, 32, seed=0)
+    for compat, wraps in (("fixed", True), ("official", False)):
+        network = types.SimpleNamespace(compat=compat)  # `prepare` reads nothing else
+        before, after = (MonocularDepth.prepare(network, i)[0] for i in (image, image.roll(16, dims=-1)))
+        assert torch.allclose(after, before.roll(512, dims=-1), atol=1e-12) == wraps
 
 
 def test_rolling_the_panorama_rolls_its_encoding() -> None:
-    encoder = seeded(ResNet18("sphere"))
-    image = torch.rand(1, 3, 64, 128, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    encoder, image = _seeded(ResNet18("sphere")), _noise(1, 3, 64, 128, seed=1)
     with torch.no_grad():
         before, after = encoder(image), encoder(image.roll(64, dims=-1))
     for scale, maps in before.items():
@@ -93,28 +69,22 @@ def test_rolling_the_panorama_rolls_its_encoding() -> None:
         assert torch.allclose(after[scale], maps.roll(64 >> scale, dims=-1), rtol=1e-9)
 
 
-def test_faces_do_not_see_beyond_their_border() -> None:
-    encoder = seeded(ResNet18("zeros"))
-    image = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+def test_rolling_a_face_does_not_roll_its_encoding() -> None:
+    encoder, image = _seeded(ResNet18("zeros")), _noise(1, 3, 64, 64, seed=2)
     with torch.no_grad():
         before, after = encoder(image)[1], encoder(image.roll(32, dims=-1))[1]
     assert not torch.allclose(after, before.roll(16, dims=-1), rtol=1e-3)
 
 
-def test_rolling_the_features_rolls_what_is_decoded() -> None:
-    decoder = seeded(Decoder("sphere"))
-    generator = torch.Generator().manual_seed(3)
-
-    def maps() -> dict[int, Tensor]:
-        return {
-            scale: torch.rand(1, channels, 64 >> scale, 128 >> scale, generator=generator, dtype=torch.float64)
-            for scale, channels in _CHANNELS.items()
-        }
-
-    panorama, faces = maps(), maps()
-    turned = [{scale: m.roll(64 >> scale, dims=-1) for scale, m in part.items()} for part in (panorama, faces)]
+def test_rolling_the_features_rolls_the_decoded_maps() -> None:
+    decoder = _seeded(Decoder("sphere"))
+    parts = [
+        {s: _noise(1, channels, 64 >> s, 128 >> s, seed=10 * seed + s) for s, channels in _CHANNELS.items()}
+        for seed in (1, 2)
+    ]
+    rolled = [{scale: maps.roll(64 >> scale, dims=-1) for scale, maps in part.items()} for part in parts]
     with torch.no_grad():
-        before, after = decoder(panorama, faces), decoder(*turned)
+        before, after = decoder(*parts), decoder(*rolled)
         assert before.shape == (1, 32, 32, 64)
         assert torch.allclose(after, before.roll(32, dims=-1), rtol=1e-9)
         assert torch.allclose(decoder.head(after), decoder.head(before).roll(64, dims=-1), rtol=1e-9)

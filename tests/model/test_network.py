@@ -1,37 +1,46 @@
-"""A network as a predictor: what it refuses, masks, batches, tiles, streams, its fingerprint."""
+"""Networks as predictors: batches, masks, tiles, streams, fingerprints, refusals; loading from files of weights."""
 
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import uv_from_directions
 from pansplat.geometry.fibonacci import lattice_size
-from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
-from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
-from pansplat.model.heads import AdapterConfig, HeadsConfig
-from pansplat.model.network import NetworkPredictor, choose_tiles
+from pansplat.model.feature_pyramid import TransformerConfig
+from pansplat.model.mvsplat import MVSplat, MVSplatConfig
+from pansplat.model.network import (
+    NetworkPredictor,
+    build_empty_network,
+    build_network,
+    choose_tiles,
+    convert_checkpoint,
+    load_predictor,
+    require_precision,
+)
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
+from pansplat.model.weights import WeightsFile, pack_weights, save_weights
+from pansplat.pipeline import load_model
 from pansplat.predictor import Predictor
 
-SMALL = PanSplatConfig(
-    features=FeaturePyramidConfig(channels=(4, 8, 8, 16), transformer=TransformerConfig(channels=16, blocks=1)),
-    cost_volume=CostVolumeConfig(
-        mono_channels=0,
-        levels=(SweepLevel(3, 16, 8, 32), SweepLevel(2, 8, 4, 32), SweepLevel(1, 8, 4, 32)),
-    ),
-    heads=HeadsConfig(feature_channels=(16, 8, 8, 4), candidates=4, adapter=AdapterConfig(degree=1)),
-)
+SMALL_MVSPLAT = MVSplatConfig(channels=16, candidates=8, width=32, transformer=TransformerConfig(channels=16, blocks=2))
 _PER_VIEW = sum(lattice_size(128 >> level) for level in range(4))
 
 
-def _predictor(compat="fixed", tiles: int | None = None, seed: int = 0) -> NetworkPredictor:
+def _predictor(config: PanSplatConfig, compat="fixed", tiles: int | None = None, seed: int = 0) -> NetworkPredictor:
     torch.manual_seed(seed)
-    return NetworkPredictor("small", PanSplat(SMALL, compat), tiles=tiles)
+    return NetworkPredictor("small", PanSplat(config, compat), tiles=tiles)
+
+
+@pytest.fixture(scope="module")
+def predictor(small_config) -> NetworkPredictor:
+    return _predictor(small_config)
 
 
 def _inputs(height: int = 64, views: int = 2) -> tuple[torch.Tensor, torch.Tensor]:
@@ -41,12 +50,12 @@ def _inputs(height: int = 64, views: int = 2) -> tuple[torch.Tensor, torch.Tenso
     return torch.rand(views, 3, height, 2 * height, generator=generator), poses
 
 
-def test_it_is_a_predictor():
-    assert isinstance(_predictor(), Predictor)
+def test_it_is_a_predictor(predictor):
+    assert isinstance(predictor, Predictor)
 
 
-def test_a_batch_gives_a_list_of_what_its_items_give():
-    predictor, (images, poses) = _predictor(), _inputs()
+def test_a_batch_gives_a_list_of_the_predictions_of_its_items(predictor):
+    images, poses = _inputs()
     alone = predictor(images, poses, 0.5, 20.0)
     assert isinstance(alone, Gaussians) and len(alone) == 2 * _PER_VIEW
     both = predictor(torch.stack((images.flip(0), images)), torch.stack((poses, poses)), torch.tensor((1.0, 0.5)), 20.0)
@@ -55,8 +64,8 @@ def test_a_batch_gives_a_list_of_what_its_items_give():
     assert not torch.equal(both[0].means, alone.means)
 
 
-def test_masked_pixels_make_no_gaussians_and_leave_the_others():
-    predictor, (images, poses) = _predictor(), _inputs()
+def test_masked_pixels_make_no_gaussians_and_leave_the_others(predictor):
+    images, poses = _inputs()
     masks = torch.ones(2, 64, 128, dtype=torch.bool)
     masks[1, 40:] = False
     every, kept = predictor(images, poses, 0.5, 20.0), predictor(images, poses, 0.5, 20.0, masks=masks)
@@ -69,91 +78,207 @@ def test_masked_pixels_make_no_gaussians_and_leave_the_others():
     assert len(predictor(images, poses, 0.5, 20.0, masks=~torch.ones_like(masks))) == 0
 
 
-def test_depths_come_with_the_gaussians_when_asked_for():
-    predictor, (images, poses) = _predictor(), _inputs()
+def test_depths_come_with_the_gaussians(predictor):
+    images, poses = _inputs()
     gaussians, depths = predictor.predict_with_depths(images, poses, 0.5, 20.0)
     assert torch.equal(gaussians.means, predictor(images, poses, 0.5, 20.0).means)
     assert [tuple(depth.shape) for depth in depths] == [(2, 8, 16), (2, 16, 32), (2, 32, 64)]
     assert all(float(depth.min()) >= 0.5 - 1e-6 and float(depth.max()) <= 20 + 1e-4 for depth in depths)
 
 
-def test_a_stream_gives_the_same_gaussians_tile_by_tile():
-    predictor, (images, poses) = _predictor(tiles=2), _inputs()
+def test_a_stream_yields_the_same_gaussians_tile_by_tile(small_config):
+    predictor, (images, poses) = _predictor(small_config, tiles=2), _inputs()
     masks = torch.ones(2, 64, 128, dtype=torch.bool)
     masks[0, :20] = False
-    whole = predictor(images, poses, 0.5, 20.0, masks=masks)
+    untiled = predictor(images, poses, 0.5, 20.0, masks=masks)
     parts = list(predictor.stream(images, poses, 0.5, 20.0, masks=masks))
     assert len(parts) == 4 and all(len(part) > 0 for part in parts)
     streamed = Gaussians.cat(parts)
-    assert len(streamed) == len(whole)
+    assert len(streamed) == len(untiled)
     for name in ("means", "opacities"):
-        a, b = (getattr(g, name).reshape(len(g), -1).sort(dim=0).values for g in (whole, streamed))
+        a, b = (getattr(g, name).reshape(len(g), -1).sort(dim=0).values for g in (untiled, streamed))
         assert torch.equal(a, b)
 
 
-def test_no_gradient_is_kept():
-    predictor, (images, poses) = _predictor(), _inputs()
+def test_predictions_carry_no_gradient(predictor):
+    images, poses = _inputs()
     assert not predictor(images.requires_grad_(), poses, 0.5, 20.0).means.requires_grad
     assert not next(predictor.stream(images, poses, 0.5, 20.0)).means.requires_grad
     assert torch.is_grad_enabled()
 
 
-def test_progress_rises_to_one():
-    predictor, (images, poses) = _predictor(tiles=2), _inputs()
-    told: list[tuple[str, float]] = []
-    predictor(images, poses, 0.5, 20.0, progress=lambda what, fraction: told.append((what, fraction)))
-    fractions = [fraction for _, fraction in told]
-    assert fractions == sorted(fractions) and fractions[0] == 0 and told[-1] == ("done", 1.0)
-    assert {what for what, _ in told} == {"matching views", "making Gaussians", "done"}
+def test_progress_rises_to_one(small_config):
+    predictor, (images, poses) = _predictor(small_config, tiles=2), _inputs()
+    reports: list[tuple[str, float]] = []
+    predictor(images, poses, 0.5, 20.0, progress=lambda stage, fraction: reports.append((stage, fraction)))
+    fractions = [fraction for _, fraction in reports]
+    assert fractions == sorted(fractions) and fractions[0] == 0 and reports[-1] == ("done", 1.0)
+    assert {stage for stage, _ in reports} == {"matching views", "making Gaussians", "done"}
 
 
 def test_tiles_follow_the_height():
     assert [choose_tiles(height) for height in (256, 512, 1024, 2048)] == [1, 1, 2, 4]
 
 
-def test_the_fingerprint_tells_weights_settings_and_compatibility_apart():
-    fingerprints = {
-        _predictor().fingerprint,
-        _predictor(seed=1).fingerprint,
-        _predictor("official").fingerprint,
-        NetworkPredictor(
-            "small", PanSplat(dataclasses.replace(SMALL, heads=dataclasses.replace(SMALL.heads, residual=False)))
-        ).fingerprint,
-    }
-    assert len(fingerprints) == 4
-    assert _predictor().fingerprint == _predictor().fingerprint
+def test_the_fingerprint_depends_on_weights_settings_and_compatibility(small_config):
+    other = dataclasses.replace(small_config, heads=dataclasses.replace(small_config.heads, residual=False))
+    predictors = (
+        _predictor(small_config),
+        _predictor(small_config, seed=1),
+        _predictor(small_config, "official"),
+        _predictor(other),
+    )
+    assert len({predictor.fingerprint for predictor in predictors}) == 4
+    assert _predictor(small_config).fingerprint == predictors[0].fingerprint
 
 
-@pytest.mark.usefixtures("unchecked")
-class TestRefusals:
-    """What is wrong, what was needed, and what to do."""
+# Refusals
 
-    def _refused(self, match: str, images: torch.Tensor, poses: torch.Tensor, near=0.5, far=20.0, **options) -> None:
-        compat = options.pop("compat", "fixed")
+
+@pytest.fixture
+def refuse(small_config, unchecked):
+    """Check that a prediction is refused with a message."""
+
+    def check(match: str, images: torch.Tensor, poses: torch.Tensor, near=0.5, far=20.0, compat="fixed", **options):
         with pytest.raises(InputError, match=match):
-            _predictor(compat)(images, poses, near, far, **options)
+            _predictor(small_config, compat)(images, poses, near, far, **options)
 
-    def test_shapes(self):
-        images, poses = _inputs()
-        self._refused(r"must be \(view, 3, height, 2 \* height\), got \(2, 3, 64, 64\)", images[..., :64], poses)
-        self._refused(r"`cam2world` must be \(2, 4, 4\) to fit the images, got \(1, 4, 4\)", images, poses[:1])
-        masks = torch.ones(2, 32, 64, dtype=torch.bool)
-        self._refused(r"`masks` must be \(2, 64, 128\)", images, poses, masks=masks)
+    return check
 
-    def test_sizes(self):
-        self._refused("a multiple of 32, got 80; resize", *_inputs(80))
-        self._refused("a multiple of 16, got 72; resize", *_inputs(72), compat="official")
-        self._refused("at least 64 pixels high", *_inputs(32))
 
-    def test_view_counts(self):
-        self._refused("two or more views, got 1", *_inputs(views=1))
-        self._refused("exactly two views", *_inputs(views=3), compat="official")
+def test_wrong_shapes_are_refused(refuse):
+    images, poses = _inputs()
+    refuse(r"must be \(view, 3, height, 2 \* height\), got \(2, 3, 64, 64\)", images[..., :64], poses)
+    refuse(r"`cam2world` must be \(2, 4, 4\) to fit the images, got \(1, 4, 4\)", images, poses[:1])
+    refuse(r"`masks` must be \(2, 64, 128\)", images, poses, masks=torch.ones(2, 32, 64, dtype=torch.bool))
 
-    def test_values(self):
-        images, poses = _inputs()
-        broken = images.clone()
-        broken[0, 0, 0, 0] = float("nan")
-        self._refused("must be finite, got NaN", broken, poses)
-        self._refused("0 < near < far", images, poses, near=3.0, far=2.0)
-        self._refused("0 < near < far", images, poses, near=0.0)
-        self._refused("one number, or one a view", images, poses, near=torch.ones(3))
+
+def test_wrong_sizes_are_refused(refuse):
+    refuse("a multiple of 32, got 80; resize", *_inputs(80))
+    refuse("a multiple of 16, got 72; resize", *_inputs(72), compat="official")
+    refuse("at least 64 pixels high", *_inputs(32))
+
+
+def test_wrong_numbers_of_views_are_refused(refuse):
+    refuse("two or more views, got 1", *_inputs(views=1))
+    refuse("exactly two views", *_inputs(views=3), compat="official")
+
+
+def test_wrong_values_are_refused(refuse):
+    images, poses = _inputs()
+    refuse("must be finite, got NaN", images.index_fill(-1, torch.tensor(3), float("nan")), poses)
+    refuse("0 < near < far", images, poses, near=3.0, far=2.0)
+    refuse("0 < near < far", images, poses, near=0.0)
+    refuse("one number, or one a view", images, poses, near=torch.ones(3))
+
+
+# Loading
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """Weights of a small network that was trained with compat="fixed"."""
+    torch.manual_seed(3)
+    path = tmp_path / "small.safetensors"
+    save_weights(path, pack_weights("mvsplat", SMALL_MVSPLAT, MVSplat(SMALL_MVSPLAT).state_dict(), compat="fixed"))
+    return path
+
+
+def _network_of(predictor: object) -> torch.nn.Module:
+    assert isinstance(predictor, NetworkPredictor)
+    return predictor.network
+
+
+def test_weights_load_with_the_compat_of_their_training_by_default(file: Path) -> None:
+    assert _network_of(load_model(file)).compat == "fixed"
+    assert _network_of(load_model(str(file), compat="fixed")).compat == "fixed"
+    assert _network_of(load_model(file, compat="official")).compat == "official"
+
+
+def test_a_loaded_network_predicts_as_the_saved_one(file: Path) -> None:
+    torch.manual_seed(3)
+    saved = NetworkPredictor("mvsplat", MVSplat(SMALL_MVSPLAT))
+    loaded = load_predictor(file)
+    assert loaded.name == "mvsplat"
+    assert loaded.fingerprint == saved.fingerprint
+    assert torch.equal(loaded(*_inputs(), 0.5, 10.0).means, saved(*_inputs(), 0.5, 10.0).means)
+
+
+def test_compat_changes_the_prediction_and_the_fingerprint(file: Path) -> None:
+    fixed, official = load_predictor(file, "fixed"), load_predictor(file, "official")
+    assert fixed.fingerprint != official.fingerprint
+    assert not torch.allclose(fixed(*_inputs(), 0.5, 10.0).means, official(*_inputs(), 0.5, 10.0).means)
+
+
+def test_loading_draws_no_random_numbers_and_fills_every_tensor(file: Path) -> None:
+    torch.manual_seed(0)
+    expected = torch.rand(3)
+    torch.manual_seed(0)
+    network = _network_of(load_predictor(file))
+    assert torch.equal(torch.rand(3), expected)
+    held = [*network.parameters(), *network.buffers()]
+    assert not any(tensor.is_meta for tensor in held)
+    assert not any(module.training for module in network.modules())
+
+
+def test_a_checkpoint_and_its_converted_file_load_equally(
+    tmp_path: Path, mvsplat_weights: dict[str, Tensor], as_lightning: Callable[[dict[str, Tensor]], dict[str, object]]
+) -> None:
+    content = as_lightning(mvsplat_weights)
+    torch.save(content, tmp_path / "original.ckpt")
+    save_weights(tmp_path / "converted.safetensors", convert_checkpoint(content, "original.ckpt"))
+    first, second = load_model(tmp_path / "original.ckpt"), load_model(tmp_path / "converted.safetensors")
+    assert _network_of(first).compat == _network_of(second).compat == "official"
+    assert first.fingerprint == second.fingerprint
+
+
+def test_a_packed_config_is_restored(tmp_path: Path) -> None:
+    config = PanSplatConfig()
+    heads = dataclasses.replace(config.heads, lattice="pixel", residual=False)
+    config = dataclasses.replace(config, heads=heads)
+    network = build_empty_network(pack_weights("pansplat", config, {}, compat="fixed"), "fixed", "x")
+    assert isinstance(network, PanSplat) and network.config == config
+
+
+def test_files_that_fit_no_network_are_refused(file: Path, unchecked: None) -> None:
+    tensors = MVSplat(SMALL_MVSPLAT).state_dict()
+    good = pack_weights("mvsplat", SMALL_MVSPLAT, tensors, compat="fixed")
+    odd: list[tuple[WeightsFile, str]] = [
+        (dataclasses.replace(good, model="splatter"), "needed weights of pansplat or mvsplat, got of 'splatter'"),
+        (dataclasses.replace(good, config={"channels": 16}), r"x: config: needed the settings of this version"),
+        (dataclasses.replace(good, config=good.config | {"transformer": 3}), "needed settings by name, got 3"),
+        (dataclasses.replace(good, tensors=tensors | {"new": torch.zeros(1)}), r"found unknown 1 \(new\)"),
+        (dataclasses.replace(good, config=good.config | {"width": 64}), r"got \d+ \(depth\.shortcut\.weight"),
+    ]
+    for weights, message in odd:
+        with pytest.raises(InputError, match=message):
+            build_network(weights, "fixed", "x")
+
+
+def test_settings_that_contradict_each_other_are_refused() -> None:
+    good = pack_weights("pansplat", PanSplatConfig(), {}, compat="fixed")
+    wrong = good.config | {"heads": good.config["heads"] | {"candidates": 7}}
+    with pytest.raises(InputError, match=r"needed settings of a pansplat network, got .*candidates"):
+        build_empty_network(dataclasses.replace(good, config=wrong), "fixed", "x")
+
+
+def test_choices_that_make_no_sense_are_refused(file: Path, unchecked: None) -> None:
+    with pytest.raises(InputError, match="`compat` must be one of trained, official, fixed, got 'broken'"):
+        load_model(file, compat="broken")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="`compat` is for networks, and sweep is not one"):
+        load_model("sweep", compat="fixed")
+    with pytest.raises(InputError, match="nothing there"):
+        load_model(file.with_name("other.safetensors"))
+    with pytest.raises(InputError, match=r"a file of weights \(\.safetensors, \.ckpt, \.pt, \.pth\), got .*scene\.ply"):
+        load_model(file.with_name("scene.ply"))
+
+
+def test_a_processor_without_bfloat16_is_refused(monkeypatch):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_f": True, "avx512_bf16": False})
+    with pytest.raises(InputError, match=r"this one has none .* use float32"):
+        require_precision("bfloat16")
+    require_precision("float32")
+    with pytest.raises(InputError, match="float32 or bfloat16, got 'float16'"):
+        require_precision("float16")
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
+    require_precision("bfloat16")

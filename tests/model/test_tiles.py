@@ -1,10 +1,13 @@
-"""Tiles and windows: each point in one tile, each window a piece of the whole resized and continued map."""
+"""Lattice points and tiles: each point in one tile, each window a part of the resized and continued map."""
+
+import math
 
 import pytest
 import torch
 from torch.nn import functional
 
-from pansplat.geometry.equirect import pad_equirect, sample_equirect
+from pansplat.geometry.equirect import directions_from_uv, pad_equirect, sample_equirect
+from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
 from pansplat.model.layers import resize
 from pansplat.model.tiles import (
     Margins,
@@ -12,6 +15,7 @@ from pansplat.model.tiles import (
     Window,
     crop_window,
     lattice_uv,
+    move_points,
     sample_panorama,
     sample_window,
     tile_grid,
@@ -41,8 +45,8 @@ def test_points_lie_inside_their_tiles_window():
         assert bool((pixel[:, 1] >= window.top).all() and (pixel[:, 1] <= window.top + window.height).all())
 
 
-@pytest.mark.parametrize("height", [8, 16, 32, 64, 128])
-def test_a_window_of_the_sphere_is_cut_from_the_resized_and_padded_map(height):
+@pytest.mark.parametrize("height", [8, 32, 128])
+def test_a_fixed_window_is_a_crop_of_the_resized_and_padded_map(height):
     source = _random(3, 32, 64)
     whole = pad_equirect(resize(source[None], (height, 2 * height), "fixed")[0], 7)
     for tile in tile_grid(2):
@@ -51,8 +55,8 @@ def test_a_window_of_the_sphere_is_cut_from_the_resized_and_padded_map(height):
         assert torch.allclose(crop_window(source, height, window, "fixed"), expected, atol=1e-14)
 
 
-@pytest.mark.parametrize("height", [8, 16, 32, 64, 128])
-def test_the_originals_window_wraps_columns_and_has_zero_rows(height):
+@pytest.mark.parametrize("height", [8, 32, 128])
+def test_an_official_window_wraps_columns_and_has_zero_rows(height):
     source = _random(3, 32, 64)
     resized = functional.interpolate(source[None], (height, 2 * height), mode="bilinear", align_corners=False)[0]
     whole = functional.pad(torch.cat((resized[..., -3:], resized, resized[..., :3]), dim=-1), (0, 0, 3, 3))
@@ -68,7 +72,7 @@ def test_samples_at_pixel_centres_are_the_pixels():
     assert torch.allclose(samples, source.flatten(1).T, atol=1e-14)
 
 
-def test_samples_of_a_whole_map_know_the_sphere_or_its_border():
+def test_samples_of_a_whole_map_wrap_or_repeat_the_border():
     source, uv = _random(5, 8, 16), lattice_uv("fibonacci", 32)
     assert torch.allclose(sample_panorama(source, uv, "fixed"), sample_equirect(source, uv).T, atol=1e-14)
     grid = (2 * uv - 1)[None, None]
@@ -76,27 +80,70 @@ def test_samples_of_a_whole_map_know_the_sphere_or_its_border():
     assert torch.allclose(sample_panorama(source, uv, "official"), border, atol=1e-14)
 
 
-def test_cut_and_sample_are_differentiable():
+def test_crop_and_sample_are_differentiable():
     uv = lattice_uv("fibonacci", 8)[:20]
     window = Window(-2, -3, 20, 38)
 
-    def read(source: torch.Tensor) -> torch.Tensor:
+    def crop_and_sample(source: torch.Tensor) -> torch.Tensor:
         return sample_window(crop_window(source, 16, window, "fixed"), window, 16, uv)
 
-    assert torch.autograd.gradcheck(read, (_random(2, 8, 16).requires_grad_(),))
+    assert torch.autograd.gradcheck(crop_and_sample, (_random(2, 8, 16).requires_grad_(),))
 
 
 def test_margins_let_the_next_level_be_read_with_the_same_margin():
     margins = Margins.of(3, "fixed", chained=True)
-    assert margins.input - margins.output == 3  # a pixel a convolution
-    # The farthest pixel the next CNN reads lies between these two of ours, which must be known.
+    assert margins.input - margins.output == 3  # one pixel for each convolution
+    # The outermost pixel that the next level reads lies between two pixels of this one; both must be in the output.
     farthest = (-margins.input + 0.5) / 2 - 0.5
     assert -margins.output <= farthest - 0.25
-    assert (-(margins.input - 1) + 0.5) / 2 - 0.5 - 0.25 <= -margins.output + 1  # one less would not be spare
+    assert (-(margins.input - 1) + 0.5) / 2 - 0.5 - 0.25 <= -margins.output + 1  # a smaller margin does not suffice
     assert Margins.of(3, "official", chained=True) == Margins(3, 3)
 
 
-def test_a_grid_runs_row_by_row():
+def test_a_tile_grid_is_in_row_major_order():
     assert tile_grid(2) == [Tile(0, 0, 2), Tile(0, 1, 2), Tile(1, 0, 2), Tile(1, 1, 2)]
     assert Tile(1, 0, 2).window(8) == Window(4, 0, 4, 8)
     assert Window(4, 0, 4, 8).expand(2) == Window(2, -2, 8, 12)
+
+
+def test_fibonacci_points_are_those_of_the_geometry():
+    uv = lattice_uv("fibonacci", 32)
+    assert len(uv) == lattice_size(64)
+    assert torch.allclose(directions_from_uv(uv), fibonacci_directions(len(uv)), atol=1e-14)
+
+
+def test_pixel_lattice_has_the_pixel_centres_in_row_major_order():
+    uv = lattice_uv("pixel", 4)
+    assert uv.shape == (32, 2)
+    assert uv[0].tolist() == [0.5 / 8, 0.5 / 4] and uv[9].tolist() == [1.5 / 8, 1.5 / 4]
+
+
+def test_official_points_are_near_the_exact_ones():
+    exact, official = (lattice_uv("fibonacci", 64, exact=exact) for exact in (True, False))
+    difference = (exact - official)[1:-1].abs() * torch.tensor((128, 64))
+    assert 0 < float(difference[:, 1].max()) < 1e-3 and float(difference[:, 0].median()) < 0.05
+
+
+@pytest.mark.parametrize("lattice", ["fibonacci", "pixel"])
+def test_zero_offset_does_not_move_points(lattice):
+    uv = lattice_uv(lattice, 16)
+    assert torch.equal(move_points(uv, torch.zeros_like(uv), lattice, 16), uv)
+
+
+def test_points_move_at_most_half_a_pixel_of_their_latitude():
+    uv = lattice_uv("fibonacci", 32)
+    moved = move_points(uv, torch.full_like(uv, 50.0), "fibonacci", 32) - uv
+    assert torch.allclose(moved[:, 1], torch.full_like(moved[:, 1], 0.5 / 32))
+    arc = moved[:, 0] * 64 * torch.sin(uv[:, 1] * math.pi)
+    inner = (uv[:, 1] - 0.5).abs() < 0.49
+    assert torch.allclose(arc[inner], torch.full_like(arc[inner], 0.5))
+    assert float(moved[:, 0].max()) <= 0.5 / 64 / 0.01 + 1e-12
+
+
+def test_a_lattice_cached_in_inference_mode_serves_gradients():
+    lattice_uv.cache_clear()
+    with torch.inference_mode():
+        lattice_uv("fibonacci", 8)
+    offsets = torch.zeros(lattice_size(16), 2, dtype=torch.float64, requires_grad=True)
+    (move_points(lattice_uv("fibonacci", 8), offsets, "fibonacci", 8) ** 2).sum().backward()
+    assert offsets.grad is not None and bool(torch.isfinite(offsets.grad).all())

@@ -1,19 +1,211 @@
-"""The table of names is complete both ways, and whatever does not fit it is refused by name."""
+"""Weights on disk: round trips, refusals, checkpoints that are not run, and the conversion of official names."""
 
+import dataclasses
+import os
+import pickle
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, Literal
 
 import pytest
+import safetensors.torch
 import torch
 from torch import Tensor
 
 from pansplat.errors import InputError
 from pansplat.model.mvsplat import MVSplat
 from pansplat.model.pansplat import PanSplat
-from pansplat.model.weights import ModelName, convert_tensors, match_tensors, official_names, require_shapes
+from pansplat.model.weights import (
+    ModelName,
+    WeightsFile,
+    config_from_dict,
+    convert_tensors,
+    load_weights,
+    match_tensors,
+    official_names,
+    read_checkpoint,
+    require_shapes,
+    save_weights,
+    state_dict_of,
+)
 
-Wrap = Callable[[dict[str, Tensor]], dict[str, object]]
-CASES: list[tuple[ModelName, int, int]] = [("pansplat", 993, 5), ("mvsplat", 471, 0)]
+Wrap = Callable[[dict[str, Tensor]], dict[str, Any]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Inner:
+    width: int = 8
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    kind: Literal["a", "b"] = "a"
+    sizes: tuple[int, ...] = (1, 2)
+    inner: Inner = dataclasses.field(default_factory=Inner)
+    several: tuple[Inner, ...] = (Inner(1), Inner(2))
+
+
+class Poison:
+    """Runs a command when it is unpickled: the command creates a file."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.system, (f"touch '{self.mark}'",)
+
+
+def weights() -> WeightsFile:
+    tensors = {"a": torch.rand(3, 4).T, "count": torch.tensor(7)}  # one of them not contiguous
+    return WeightsFile("pansplat", {"width": 3, "levels": [1, 2]}, "fixed", tensors)
+
+
+# Our files
+
+
+def test_weights_survive_a_round_trip(tmp_path: Path) -> None:
+    before = weights()
+    save_weights(tmp_path / "w.safetensors", before)
+    after = load_weights(tmp_path / "w.safetensors")
+    assert (after.model, after.config, after.compat) == (before.model, before.config, before.compat)
+    assert after.tensors.keys() == before.tensors.keys()
+    assert all(torch.equal(after.tensors[name], tensor) for name, tensor in before.tensors.items())
+
+
+def test_a_file_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="needed an existing folder"):
+        save_weights(tmp_path / "no" / "w.safetensors", weights())
+    with pytest.raises(InputError, match=r"must end in \.safetensors, got '\.ckpt'"):
+        save_weights(tmp_path / "w.ckpt", weights())
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kept", [0, 5, 40, 0.5, 0.99])
+def test_a_truncated_weights_file_is_refused(tmp_path: Path, kept: float) -> None:
+    path = tmp_path / "w.safetensors"
+    save_weights(path, weights())
+    content = path.read_bytes()
+    path.write_bytes(content[: kept if isinstance(kept, int) else int(kept * len(content))])
+    with pytest.raises(InputError, match=r"w\.safetensors: needed .* again"):
+        load_weights(path)
+
+
+def test_other_safetensors_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "w.safetensors"
+    safetensors.torch.save_file({"a": torch.zeros(1)}, path)
+    with pytest.raises(InputError, match="without their metadata; convert the original checkpoint"):
+        load_weights(path)
+    metadata = {"pansplat_format": "99", "model": "pansplat", "config": "{}", "compat": "fixed"}
+    safetensors.torch.save_file({"a": torch.zeros(1)}, path, metadata)
+    with pytest.raises(InputError, match="needed format 1 of weights files, got 99"):
+        load_weights(path)
+    safetensors.torch.save_file({"a": torch.zeros(1)}, path, metadata | {"pansplat_format": "1", "config": "{"})
+    with pytest.raises(InputError, match="needed settings in its metadata"):
+        load_weights(path)
+    safetensors.torch.save_file({"a": torch.zeros(1)}, path, metadata | {"pansplat_format": "1", "compat": "new"})
+    with pytest.raises(InputError, match="needed settings in its metadata, got 'new'"):
+        load_weights(path)
+
+
+# Settings
+
+
+def test_settings_survive_json() -> None:
+    values = {"kind": "b", "sizes": [3, 4, 5], "inner": {"width": 2}, "several": [{"width": 5}]}
+    assert config_from_dict(Config, values) == Config("b", (3, 4, 5), Inner(2), (Inner(5),))
+
+
+def test_settings_of_another_version_are_refused() -> None:
+    values = {"kind": "b", "sizes": [], "inner": {"width": 2}, "several": []}
+    with pytest.raises(InputError, match=r"config: .* unknown \['extra'\] and lacked \[\]"):
+        config_from_dict(Config, values | {"extra": 1})
+    with pytest.raises(InputError, match=r"config\.inner: .* unknown \['wide'\] and lacked \['width'\]"):
+        config_from_dict(Config, values | {"inner": {"wide": 1}})
+    with pytest.raises(InputError, match=r"config\.kind: needed one of \('a', 'b'\), got 'c'"):
+        config_from_dict(Config, values | {"kind": "c"})
+
+
+# Checkpoints
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_a_checkpoint_is_read(tmp_path: Path, zipped: bool) -> None:
+    path = tmp_path / "good.ckpt"
+    tensor = torch.rand(5)
+    torch.save({"state_dict": {"a": tensor}}, path, _use_new_zipfile_serialization=zipped)
+    assert torch.equal(state_dict_of(read_checkpoint(path), path)["a"], tensor)
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_a_poisoned_checkpoint_is_refused_and_not_run(tmp_path: Path, zipped: bool) -> None:
+    mark, path = tmp_path / "was run", tmp_path / "poisoned.ckpt"
+    torch.save({"state_dict": {}, "callback": Poison(mark)}, path, _use_new_zipfile_serialization=zipped)
+    with pytest.raises(InputError, match=r"asks to run (posix|nt)\.system; nothing was run"):
+        read_checkpoint(path)
+    assert not mark.exists()
+    torch.load(path, weights_only=False)  # the command would run
+    assert mark.exists()
+
+
+def test_a_poisoned_pickle_is_refused_and_not_run(tmp_path: Path) -> None:
+    mark, path = tmp_path / "was run", tmp_path / "poisoned.ckpt"
+    path.write_bytes(pickle.dumps(Poison(mark)))
+    with pytest.raises(InputError, match="poisoned"):
+        read_checkpoint(path)
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+@pytest.mark.parametrize("kept", [0.1, 0.95])
+def test_a_truncated_checkpoint_is_refused(tmp_path: Path, kept: float, zipped: bool) -> None:
+    path = tmp_path / "short.ckpt"
+    torch.save({"state_dict": {"a": torch.rand(5000)}}, path, _use_new_zipfile_serialization=zipped)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(kept * len(content))])
+    with pytest.raises(InputError, match=r"short\.ckpt: needed a whole PyTorch checkpoint, got a damaged one"):
+        read_checkpoint(path)
+
+
+@pytest.mark.parametrize("content", [b"hello\n" * 50, bytes(3000), bytes(range(256)) * 9])
+def test_a_file_of_other_content_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "wrong.ckpt"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"wrong\.ckpt: needed a .*PyTorch checkpoint, got .* again"):
+        read_checkpoint(path)
+
+
+def test_a_web_page_and_a_git_lfs_pointer_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "wrong.ckpt"
+    path.write_bytes(b"<!DOCTYPE html><html><body>OneDrive</body></html>")
+    with pytest.raises(InputError, match="it is a web page: download the file itself"):
+        read_checkpoint(path)
+    path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+    with pytest.raises(InputError, match="run `git lfs pull`"):
+        read_checkpoint(path)
+
+
+def test_missing_and_empty_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="got nothing there"):
+        read_checkpoint(tmp_path / "none.ckpt")
+    with pytest.raises(InputError, match="got a folder"):
+        read_checkpoint(tmp_path)
+    (tmp_path / "empty.ckpt").touch()
+    with pytest.raises(InputError, match="got an empty file"):
+        read_checkpoint(tmp_path / "empty.ckpt")
+
+
+def test_a_checkpoint_without_tensors_by_name_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "odd.ckpt"
+    torch.save(torch.rand(3), path)
+    with pytest.raises(InputError, match="needed a checkpoint with a `state_dict`, got a Tensor"):
+        read_checkpoint(path)
+    with pytest.raises(InputError, match="got one with model, epoch"):
+        state_dict_of({"model": {}, "epoch": 1}, path)
+    with pytest.raises(InputError, match="needed a `state_dict` of tensors, got others at b"):
+        state_dict_of({"state_dict": {"a": torch.rand(1), "b": 3}}, path)
+
+
+# Official names
 
 
 def listed(shared: Path, keys: str) -> list[str]:
@@ -25,12 +217,12 @@ def empty(shared: Path, keys: str) -> dict[str, Tensor]:
     return {name.removeprefix("encoder."): torch.zeros(1) for name in listed(shared, keys)}
 
 
-@pytest.mark.parametrize(("model", "count", "derived"), CASES)
-def test_every_original_tensor_is_used_or_computed(model: ModelName, count: int, derived: int, shared: Path) -> None:
+@pytest.mark.parametrize(("model", "count", "grids"), [("pansplat", 993, 5), ("mvsplat", 471, 0)])
+def test_every_original_tensor_is_used_or_computed(model: ModelName, count: int, grids: int, shared: Path) -> None:
     theirs = {name.removeprefix("encoder.") for name in listed(shared, f"{model}-512")}
     table = official_names(model)
     assert len(theirs) == count and table.keys() <= theirs
-    assert len(theirs - table.keys()) == derived
+    assert len(theirs - table.keys()) == grids
     assert all(name.endswith("sample_grid") for name in theirs - table.keys())
 
 
@@ -43,48 +235,48 @@ def test_every_tensor_of_ours_has_one_original(model: ModelName) -> None:
     assert set(names) == network.state_dict().keys()
 
 
-def test_converted_tensors_fit_the_network(recipe_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
-    tensors = convert_tensors(as_lightning(recipe_weights), "recipe")
-    with torch.device("meta"):
-        require_shapes(tensors, PanSplat().state_dict(), "recipe")
+def test_converted_tensors_are_the_official_ones(
+    official_weights: WeightsFile, recipe_weights: dict[str, Tensor]
+) -> None:
     assert torch.equal(
-        tensors["heads.levels.3.linear.weight"], recipe_weights["gaussian_head.gaussians_mlp_list.3.0.weight"]
+        official_weights.tensors["heads.levels.3.linear.weight"],
+        recipe_weights["gaussian_head.gaussians_mlp_list.3.0.weight"],
     )
     assert torch.equal(
-        tensors["cost_volume.levels.1.refine.unet.encoder.2.attention.project_in.weight"],
+        official_weights.tensors["cost_volume.levels.1.refine.unet.encoder.2.attention.project_in.weight"],
         recipe_weights["depth_predictor.corr_refine_nets.2.3.input_blocks.5.1.qkv.weight"][..., 0],
     )
 
 
-def test_a_checkpoint_with_auxiliary_heads_is_told_what_is_left_out(shared: Path, as_lightning: Wrap) -> None:
+def test_the_report_counts_tensors_that_are_left_out(shared: Path, as_lightning: Wrap) -> None:
     content = as_lightning(empty(shared, "pansplat-512"))
     auxiliary = listed(shared, "pansplat-512-360loc_aux")
     content["state_dict"] |= {name: torch.zeros(1) for name in auxiliary}
     report = match_tensors(content, "360loc")
     assert len(report.used) == 988 and not report.missing and not report.surplus
     left = {reason: len(names) for reason, names in report.unused.items()}
-    assert left == {"computed anew": 5, "auxiliary heads, for training only": 18, "state of the training": 5}
+    assert left == {"recomputed grids": 5, "auxiliary heads, for training only": 18, "training state": 5}
     report.require_complete("360loc")
 
 
 def test_missing_and_surplus_tensors_are_named_and_counted(shared: Path, as_lightning: Wrap) -> None:
     content = as_lightning(empty(shared, "pansplat-512"))
     state = content["state_dict"]
-    gone = [name for name in state if "q_proj" in name]
-    for name in gone:
+    removed = [name for name in state if "q_proj" in name]
+    for name in removed:
         del state[name]
     state["encoder.new.weight"] = state["losses.2.gaussian_head.new"] = torch.zeros(1)
     report = match_tensors(content, "odd.ckpt")
-    assert sorted(report.missing) == sorted(gone)
+    assert sorted(report.missing) == sorted(removed)
     with pytest.raises(InputError) as caught:
         report.require_complete("odd.ckpt")
     message = str(caught.value)
     assert message.startswith("odd.ckpt: needed exactly the tensors of the original pansplat, lacked 12 (")
-    assert gone[0] in message and ", ...)" in message
+    assert removed[0] in message and ", ...)" in message
     assert "found unknown 2 (encoder.new.weight, losses.2.gaussian_head.new)" in message
 
 
-def test_a_missing_grid_is_missing(shared: Path, as_lightning: Wrap) -> None:
+def test_a_missing_grid_is_reported(shared: Path, as_lightning: Wrap) -> None:
     weights = empty(shared, "pansplat-512")
     del weights["mono_depth.c2e.3.sample_grid"]
     assert match_tensors(as_lightning(weights), "x").missing == ["encoder.mono_depth.c2e.3.sample_grid"]
@@ -97,7 +289,7 @@ def test_checkpoints_of_other_models_are_refused(as_lightning: Wrap) -> None:
         match_tensors(as_lightning({}), "x")
 
 
-def test_another_grid_is_refused(recipe_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
+def test_a_changed_grid_is_refused(recipe_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
     name = "mono_depth.c2e.2.sample_grid"
     with pytest.raises(InputError, match=f"the original's grid in {name}"):
         convert_tensors(as_lightning(recipe_weights | {name: recipe_weights[name].flip(2)}), "x")
@@ -105,12 +297,12 @@ def test_another_grid_is_refused(recipe_weights: dict[str, Tensor], as_lightning
         convert_tensors(as_lightning(recipe_weights | {name: recipe_weights[name][:, :, :4]}), "x")
 
 
-def test_numbers_that_are_not_finite_are_refused(mvsplat_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
+def test_values_that_are_not_finite_are_refused(mvsplat_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
     name = "backbone.backbone.conv2.bias"
-    spoilt = mvsplat_weights[name].clone()
-    spoilt[3] = torch.nan
+    broken = mvsplat_weights[name].clone()
+    broken[3] = torch.nan
     with pytest.raises(InputError, match=f"got NaN or infinity in {name}"):
-        convert_tensors(as_lightning(mvsplat_weights | {name: spoilt}), "x")
+        convert_tensors(as_lightning(mvsplat_weights | {name: broken}), "x")
 
 
 def test_half_precision_weights_become_float32(mvsplat_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
