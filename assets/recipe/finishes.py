@@ -1,7 +1,7 @@
-"""Surface finishes of the generated rooms as Cycles node materials: aperiodic, so that stereo finds matches.
+"""Surface finishes of the generated rooms as Cycles node materials.
 
-Every finish is computed from the position in the room (metres), so that no UV map is needed and no pattern
-repeats: a repeating wallpaper looks alike under many disparities. All are rough, as a mirror has no depth.
+Every finish is a function of the position in the room (metres). It needs no UV map and does not repeat: a periodic
+pattern matches at many disparities. All finishes are rough, because a mirror has no depth.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import bpy
 Color = tuple[float, float, float]
 
 
-class Graph:
-    """A material under construction: adds nodes and links in one call each."""
+class MaterialGraph:
+    """The node graph of a new material."""
 
     def __init__(self, name: str, roughness: float = 0.8, specular: float = 0.2) -> None:
         self.material = bpy.data.materials.new(name)
@@ -27,7 +27,7 @@ class Graph:
         self.position = self.add("ShaderNodeTexCoord").outputs["Object"]
 
     def add(self, kind: str, **inputs: object) -> bpy.types.Node:
-        """A node whose inputs are values or other nodes' outputs; underscores stand for spaces."""
+        """Add a node. Inputs are values or outputs of other nodes; underscores in their names stand for spaces."""
         node = self.nodes.new(kind)
         for name, value in inputs.items():
             socket = node.inputs[name.replace("_", " ")]
@@ -38,17 +38,17 @@ class Graph:
         return node
 
     def stretched(self, scale: Color, turn: float = 0.0) -> bpy.types.NodeSocket:
-        """Position scaled per axis, after a turn about z by `turn` radians."""
+        """The position, rotated about z by `turn` radians and scaled per axis."""
         return self.add("ShaderNodeMapping", Vector=self.position, Scale=scale, Rotation=(0.0, 0.0, turn)).outputs[
             "Vector"
         ]
 
     def noise(self, vector: bpy.types.NodeSocket, scale: float, detail: float = 6.0) -> bpy.types.NodeSocket:
-        """Fractal noise, mostly in 0.3 to 0.7."""
+        """Fractal noise, mostly between 0.3 and 0.7."""
         return self.add("ShaderNodeTexNoise", Vector=vector, Scale=scale, Detail=detail, Roughness=0.6).outputs["Fac"]
 
     def ramp(self, value: bpy.types.NodeSocket, stops: list[tuple[float, Color]]) -> bpy.types.NodeSocket:
-        """Colours along a value, at least two stops."""
+        """A colour ramp over a value, of at least two stops."""
         node = self.add("ShaderNodeValToRGB", Fac=value)
         elements = node.color_ramp.elements
         for _ in stops[2:]:
@@ -60,7 +60,7 @@ class Graph:
     def mix(
         self, a: bpy.types.NodeSocket, b: bpy.types.NodeSocket, mode: str = "MULTIPLY", amount: float = 1.0
     ) -> bpy.types.NodeSocket:
-        """Two colours combined."""
+        """Two colours combined with a blend mode."""
         node = self.nodes.new("ShaderNodeMixRGB")
         node.blend_type = mode
         node.inputs["Fac"].default_value = amount
@@ -69,14 +69,14 @@ class Graph:
         return node.outputs["Color"]
 
     def bump(self, height: bpy.types.NodeSocket, distance: float) -> None:
-        """Relief of `distance` metres."""
+        """Add a relief of `distance` metres."""
         node = self.add("ShaderNodeBump", Height=height, Distance=distance, Strength=0.6)
         self.links.new(node.outputs["Normal"], self.surface.inputs["Normal"])
 
     def finish(self, color: bpy.types.NodeSocket, mean: Color | None = None) -> bpy.types.Material:
-        """The material with `color` as its base.
+        """The material with `color` as its base colour.
 
-        Given the `mean` colour, indirect light sees only that: it looks the same and renders faster.
+        With `mean`, indirect light uses that constant colour, which renders faster and looks the same.
         """
         self.links.new(color, self.surface.inputs["Base Color"])
         if mean is not None:
@@ -94,8 +94,8 @@ def _scaled(color: Color, factor: float) -> Color:
 
 
 def plaster(color: Color, contrast: float = 0.22) -> bpy.types.Material:
-    """Limewashed wall: brushed clouds at three scales."""
-    g = Graph("plaster", roughness=0.9, specular=0.1)
+    """Limewashed wall: cloudy colours with brush strokes."""
+    g = MaterialGraph("plaster", roughness=0.9, specular=0.1)
     clouds = g.noise(g.position, 1.7, 9.0)
     brushed = g.noise(g.stretched((5.0, 5.0, 14.0)), 1.6, 4.0)
     wide = g.ramp(clouds, [(0.3, _scaled(color, 1 - contrast)), (0.7, _scaled(color, 1 + contrast))])
@@ -106,7 +106,7 @@ def plaster(color: Color, contrast: float = 0.22) -> bpy.types.Material:
 
 def wood(color: Color, axis: int = 0, fineness: float = 1.0) -> bpy.types.Material:
     """Grained wood whose fibres run along `axis` (0 x, 1 y, 2 z)."""
-    g = Graph("wood", roughness=0.55, specular=0.25)
+    g = MaterialGraph("wood", roughness=0.55, specular=0.25)
     scale = [9.0 * fineness] * 3
     scale[axis] = 0.7 * fineness
     vector = g.stretched(tuple(scale))
@@ -125,8 +125,8 @@ def wood(color: Color, axis: int = 0, fineness: float = 1.0) -> bpy.types.Materi
 
 
 def planks(color: Color, length: float = 1.35, width: float = 0.13, spread: float = 0.4) -> bpy.types.Material:
-    """Long boards along x, each with its own tone (1 - `spread` to 1 + `spread` of the colour)."""
-    g = Graph("planks", roughness=0.75, specular=0.12)
+    """Long boards along x; the brightness of each is 1 - `spread` to 1 + `spread` of the colour."""
+    g = MaterialGraph("planks", roughness=0.75, specular=0.12)
     low, high = (1 - spread,) * 3, (1 + spread,) * 3
     brick = g.add(
         "ShaderNodeTexBrick", Vector=g.position, Scale=1.0, Mortar_Size=0.0035, Bias=0.0, Brick_Width=length,
@@ -140,8 +140,8 @@ def planks(color: Color, length: float = 1.35, width: float = 0.13, spread: floa
 
 
 def bricks(light: Color, dark: Color) -> bpy.types.Material:
-    """Brick wall (along x or y), each brick of its own tone."""
-    g = Graph("bricks", roughness=0.95, specular=0.05)
+    """Brick wall along x or y; bricks differ in tone."""
+    g = MaterialGraph("bricks", roughness=0.95, specular=0.05)
     split = g.add("ShaderNodeSeparateXYZ", Vector=g.position)
     along = g.add("ShaderNodeMath")
     g.links.new(split.outputs["X"], along.inputs[0])
@@ -158,8 +158,8 @@ def bricks(light: Color, dark: Color) -> bpy.types.Material:
 
 
 def fabric(color: Color, contrast: float = 0.35, grain: float = 90.0) -> bpy.types.Material:
-    """Woven cloth: heathered yarn and larger wear."""
-    g = Graph("fabric", roughness=0.95, specular=0.05)
+    """Woven cloth: mottled yarn and worn areas."""
+    g = MaterialGraph("fabric", roughness=0.95, specular=0.05)
     yarn = g.noise(g.position, grain, 3.0)
     wear = g.noise(g.position, 4.0, 6.0)
     fine = g.ramp(yarn, [(0.35, _scaled(color, 1 - contrast)), (0.65, _scaled(color, 1 + contrast))])
@@ -169,8 +169,8 @@ def fabric(color: Color, contrast: float = 0.35, grain: float = 90.0) -> bpy.typ
 
 
 def leather(color: Color) -> bpy.types.Material:
-    """Worn leather: patches lighter where it was sat on."""
-    g = Graph("leather", roughness=0.55, specular=0.3)
+    """Leather with lighter worn patches."""
+    g = MaterialGraph("leather", roughness=0.55, specular=0.3)
     wear = g.noise(g.position, 5.0, 9.0)
     tone = g.ramp(wear, [(0.3, _scaled(color, 0.5)), (0.55, color), (0.75, _scaled(color, 1.7))])
     g.bump(g.noise(g.position, 60.0, 4.0), 0.002)
@@ -178,16 +178,16 @@ def leather(color: Color) -> bpy.types.Material:
 
 
 def picture(image: bpy.types.Image) -> bpy.types.Material:
-    """A picture on a mesh with UV coordinates."""
-    g = Graph("picture", roughness=0.8, specular=0.1)
+    """An image on a mesh with UV coordinates."""
+    g = MaterialGraph("picture", roughness=0.8, specular=0.1)
     node = g.add("ShaderNodeTexImage", Vector=g.add("ShaderNodeTexCoord").outputs["UV"])
     node.image = image
     return g.finish(node.outputs["Color"])
 
 
 def backdrop(environment: Path, strength: float, turn: float) -> bpy.types.Material:
-    """What is seen through the windows: an HDR panorama on a dome, shining by itself."""
-    g = Graph("backdrop")
+    """The view through the windows: an HDR panorama as an emissive dome."""
+    g = MaterialGraph("backdrop")
     g.nodes.remove(g.surface)
     node = g.add("ShaderNodeTexEnvironment", Vector=g.stretched((1.0, 1.0, 1.0), turn))
     node.image = bpy.data.images.load(str(environment))
@@ -197,7 +197,7 @@ def backdrop(environment: Path, strength: float, turn: float) -> bpy.types.Mater
 
 
 def sky(environment: Path, strength: float, turn: float) -> None:
-    """Daylight of the whole scene from an HDR panorama turned by `turn` radians."""
+    """Light the scene with an HDR panorama, rotated by `turn` radians."""
     world = bpy.data.worlds.new("sky")
     world.use_nodes = True
     nodes, links = world.node_tree.nodes, world.node_tree.links

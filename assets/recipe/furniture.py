@@ -1,7 +1,7 @@
 """Furniture from Sweet Home 3D's free libraries (Debian package sweethome3d-furniture), at its real size.
 
-A library (.sh3f) is a zip of OBJ models with a catalogue that gives each model's size in centimetres, an
-optional rotation and its author. Every model that is placed is noted with its licence for the credits.
+A library (.sh3f) is a zip file of OBJ models and a catalogue with each model's size in centimetres, optional rotation
+and author. The credits list every model that is used, with its licence.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-# Each library's licence, for the models that do not bring a page of their own (Debian's copyright file).
+# Each library's licence, for models without a licence page of their own. Source: Debian's copyright file.
 LIBRARIES = {
     "Scopia": "CC BY 3.0",
     "BlendSwap-CC-0": "CC0 1.0",
@@ -30,7 +30,7 @@ LIBRARIES = {
 
 @dataclass(frozen=True)
 class Entry:
-    """One model of a library's catalogue; size is width, depth, height in metres."""
+    """A model of a library's catalogue; `size` is width, depth and height in metres."""
 
     library: str
     name: str
@@ -42,7 +42,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Credit:
-    """Who made a model, and under which licence."""
+    """A model's author and licence."""
 
     model: str
     title: str
@@ -52,7 +52,7 @@ class Credit:
 
 
 def unpack(archive_folder: Path, folder: Path) -> None:
-    """Unzip the libraries found in `archive_folder` into one folder each."""
+    """Unzip the libraries of `archive_folder` into one folder each."""
     for library in LIBRARIES:
         if not (folder / library).exists():
             with zipfile.ZipFile(archive_folder / f"{library}.sh3f") as archive:
@@ -60,15 +60,15 @@ def unpack(archive_folder: Path, folder: Path) -> None:
 
 
 def _licence(library: str, folder: Path) -> str:
-    """The licence of a model: its own licence page where there is one, else its library's.
+    """The licence of a model: that of its own licence page if it has one, else its library's.
 
-    Some models of the library called CC-0 come with a page that says CC BY; the page counts.
+    Some models of the CC-0 library have a page with CC BY.
     """
     for page in sorted(folder.iterdir()):
         if "licen" in page.name.lower():
             text = unescape(re.sub(r"<[^>]*>", " ", page.read_text(encoding="utf-8", errors="replace")))
             if re.search(r"Attribution.{0,20}(Share|Non|NoDer)", text):
-                raise ValueError(f"{page}: not a licence we take; choose another model")
+                raise ValueError(f"{page}: this licence is not allowed; choose another model")
             if "Attribution 3.0" in text:
                 return "CC BY 3.0"
             if re.search(r"CC-?0|CC-Zero|Creative Commons Zero|Public Domain", text, re.IGNORECASE):
@@ -79,7 +79,7 @@ def _licence(library: str, folder: Path) -> str:
 
 @cache
 def catalogue(folder: Path) -> dict[str, Entry]:
-    """All models by `library/model`, e.g. `Scopia/fireplace1`."""
+    """All models by `library/model`, such as `Scopia/fireplace1`."""
     entries = {}
     for library in LIBRARIES:
         fields: dict[str, dict[str, str]] = {}
@@ -97,7 +97,7 @@ def catalogue(folder: Path) -> dict[str, Entry]:
 
 
 class Furniture:
-    """Places models in the scene and remembers whom to credit."""
+    """Places models in the scene and collects their credits."""
 
     def __init__(self, folder: Path) -> None:
         self.entries = catalogue(folder)
@@ -105,7 +105,7 @@ class Furniture:
         self._templates: dict[str, list[bpy.types.Object]] = {}
 
     def _load(self, key: str) -> list[bpy.types.Object]:
-        """A model's meshes, scaled, turned upright, standing on z = 0 with its front towards -y."""
+        """A model's meshes in metres, upright, standing on z = 0, with its front towards -y."""
         entry = self.entries[key]
         before = set(bpy.data.objects)
         bpy.ops.wm.obj_import(filepath=str(entry.obj), forward_axis="NEGATIVE_Z", up_axis="Y", use_split_objects=False)
@@ -114,11 +114,11 @@ class Furniture:
             for slot in part.material_slots:
                 _find_images(slot.material, entry.obj.parent)
         upright = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], float)  # y up to z up
-        turn = upright @ entry.rotation @ upright.T
+        rotation = upright @ entry.rotation @ upright.T
         for part in parts:
             part.data.transform(part.matrix_world)
             part.matrix_world = Matrix.Identity(4)
-            part.data.transform(Matrix(turn.tolist()).to_4x4())
+            part.data.transform(Matrix(rotation.tolist()).to_4x4())
         points = np.concatenate([_points(p) for p in parts])
         low, high = points.min(0), points.max(0)
         scale = np.array(entry.size) / np.maximum(high - low, 1e-9)
@@ -145,11 +145,11 @@ class Furniture:
         finish: bpy.types.Material | None = None,
         finishes: dict[str, bpy.types.Material] | None = None,
     ) -> None:
-        """Put a copy of a model at (x, y, z), turned counter-clockwise seen from above.
+        """Place a copy of a model at (x, y, z), rotated counter-clockwise as seen from above.
 
         Args:
-            finish: replaces all its materials.
-            finishes: replaces the materials whose name contains the key; the first match counts.
+            finish: replaces all materials.
+            finishes: replace the materials whose names contain the keys; the first match counts.
         """
         if key not in self._templates:
             self._templates[key] = self._load(key)
@@ -178,13 +178,13 @@ def _points(part: bpy.types.Object) -> np.ndarray:
 
 
 def _find_images(material: bpy.types.Material | None, folder: Path) -> None:
-    """Textures named by their author's own disk: take the file beside the model, or do without."""
+    """Replace textures with paths of their author's machine by the files in the model's folder, or remove them."""
     if material is None or not material.use_nodes:
         return
     tree = material.node_tree
     for node in [n for n in tree.nodes if n.type == "TEX_IMAGE" and n.image and not n.image.size[0]]:
-        wanted = Path(bpy.path.abspath(node.image.filepath)).stem.lower()
-        found = [p for p in sorted(folder.iterdir()) if p.suffix in (".jpg", ".png") and p.stem.lower() in wanted]
+        name = Path(bpy.path.abspath(node.image.filepath)).stem.lower()
+        found = [p for p in sorted(folder.iterdir()) if p.suffix in (".jpg", ".png") and p.stem.lower() in name]
         if found:
             node.image = bpy.data.images.load(str(found[0]), check_existing=True)
         else:
@@ -192,7 +192,7 @@ def _find_images(material: bpy.types.Material | None, folder: Path) -> None:
 
 
 def _soften(material: bpy.types.Material | None) -> None:
-    """Matt surfaces: highlights and mirrors move with the camera, which stereo takes for depth."""
+    """Make surfaces matt: stereo takes highlights and reflections, which move with the camera, for depth."""
     if material is None or not material.use_nodes:
         return
     for node in material.node_tree.nodes:

@@ -1,8 +1,9 @@
-"""Build a furnished living room with a dining room beyond, and render it as posed panoramas with exact depth.
+"""Build a furnished living room with a dining room behind it, and render posed panoramas with exact depth.
 
     python living_room.py --sources FOLDER --out ../living_room
 
-FOLDER is what fetch.sh fills. Needs bpy 4.2.0 (Blender as a Python module), numpy and Pillow; see README.md.
+FOLDER holds the files that fetch.sh downloads. Needs bpy 4.2.0 (Blender as a Python module), numpy and Pillow; see
+README.md.
 
 Blender's world is x east, y north, z up; the sample's is x east, y down, z north, so that gravity is +y.
 """
@@ -31,8 +32,8 @@ HEIGHT = 2.72  # of the ceiling, metres
 
 
 @dataclass(frozen=True)
-class Taste:
-    """What differs between rooms of different seeds. Colours are linear RGB."""
+class RoomStyle:
+    """What depends on the seed. Colours are linear RGB."""
 
     wall: f.Color = (0.66, 0.54, 0.38)
     second_wall: f.Color = (0.30, 0.42, 0.40)
@@ -45,18 +46,18 @@ class Taste:
     jitter: float = 0.0
 
     @staticmethod
-    def of(seed: int) -> Taste:
-        """The shipped room for seed 0; other seeds vary colours, sun and the furniture's places."""
+    def of(seed: int) -> RoomStyle:
+        """The shipped room for seed 0; other seeds change colours, the sun and the positions of furniture."""
         if seed == 0:
-            return Taste()
+            return RoomStyle()
         rng = np.random.default_rng(seed)
 
         def near(color: f.Color, hue: bool = True) -> f.Color:
             shuffled = rng.permutation(color) if hue and rng.random() < 0.6 else np.array(color)
             return tuple((shuffled * rng.uniform(0.7, 1.35, 3)).clip(0.01, 0.8).tolist())
 
-        base = Taste()
-        return Taste(
+        base = RoomStyle()
+        return RoomStyle(
             near(base.wall), near(base.second_wall), base.panel, near(base.floor, False), near(base.sofa),
             near(base.chair), near(base.drape), rng.uniform(150, 230), 0.12,
         )  # fmt: skip
@@ -78,16 +79,16 @@ END = Wall(1, -2.6, 2.6, 7.2, 7.45, HEIGHT, -1, (END_WINDOW,))
 BACK_OF_EAST = Wall(1, -2.6, 2.6, 3.3, 3.46, HEIGHT, 1, (ARCH,))
 
 
-def build_shell(taste: Taste) -> None:
-    """Floor, ceiling, walls, windows, doors and mouldings of both rooms."""
-    painted, trim = f.plaster(taste.wall), f.wood(taste.panel, axis=2, fineness=0.5)
-    second = f.plaster(taste.second_wall)
+def build_shell(style: RoomStyle) -> None:
+    """Add floor, ceiling, walls, windows, doors and mouldings of both rooms."""
+    painted, trim = f.plaster(style.wall), f.wood(style.panel, axis=2, fineness=0.5)
+    second = f.plaster(style.second_wall)
     beam = f.wood((0.20, 0.105, 0.05), axis=1, fineness=0.8)
     boxes("walls", SOUTH.solid() + NORTH.solid() + EAST.solid(), painted)
     boxes("chimney wall", WEST.solid(), f.bricks((0.45, 0.19, 0.11), (0.26, 0.10, 0.065)))
     boxes("walls beyond", SOUTH2.solid() + NORTH2.solid() + END.solid(), second)
     boxes("lining beyond", _lining(BACK_OF_EAST), second)
-    boxes("floor", [(-3.5, 7.5, -2.9, 2.9, -0.1, 0.0)], f.planks(taste.floor))
+    boxes("floor", [(-3.5, 7.5, -2.9, 2.9, -0.1, 0.0)], f.planks(style.floor))
     boxes(
         "ceiling",
         [(-3.5, 7.5, -2.9, 2.9, HEIGHT, HEIGHT + 0.1)],
@@ -121,7 +122,7 @@ def _crosses(wall: Wall, x: float, top: float) -> bool:
 
 
 def _lining(wall: Wall) -> list[Box]:
-    """A thin skin that gives a shared wall its own colour on this side."""
+    """Thin boxes that give this side of a shared wall its own colour."""
     return [
         wall.box(a, b, wall.face, wall.face + wall.inside * 0.008, z0, z1)
         for a, b, z0, z1 in (
@@ -132,9 +133,9 @@ def _lining(wall: Wall) -> list[Box]:
     ]
 
 
-def hang_curtains(taste: Taste) -> None:
-    """Curtains left and right of each window, on a rod."""
-    cloth = f.fabric(taste.drape, 0.3, 60.0)
+def hang_curtains(style: RoomStyle) -> None:
+    """Add curtains on a rod left and right of each window."""
+    cloth = f.fabric(style.drape, 0.3, 60.0)
     rod = f.wood((0.16, 0.08, 0.04), axis=0)
     for k, (wall, o) in enumerate(((SOUTH, WINDOWS[0]), (SOUTH, WINDOWS[1]), (SOUTH2, FAR_WINDOW), (END, END_WINDOW))):
         for side, (a, b) in enumerate(((o.start - 0.34, o.start + 0.10), (o.end - 0.10, o.end + 0.34))):
@@ -144,7 +145,7 @@ def hang_curtains(taste: Taste) -> None:
 
 
 def books(x: float, y: float, z: float, count: int, seed: int, flat: bool = False) -> None:
-    """A row (or, lying `flat`, a pile) of cloth-bound books starting at (x, y, z)."""
+    """Add a row of books, or a pile if `flat`, that starts at (x, y, z)."""
     rng = np.random.default_rng(seed)
     colors = [(0.35, 0.05, 0.04), (0.05, 0.12, 0.25), (0.06, 0.2, 0.1), (0.45, 0.3, 0.08), (0.3, 0.26, 0.2)]
     for _ in range(count):
@@ -159,20 +160,20 @@ def books(x: float, y: float, z: float, count: int, seed: int, flat: bool = Fals
             x += thick + 0.001
 
 
-def furnish_living(room: Furniture, taste: Taste, wiggle: Callable[[], float]) -> None:
-    """Sofa group, fireplace, bookcases, piano and plants."""
-    hide = f.leather(taste.sofa)
+def furnish_living(room: Furniture, style: RoomStyle, jitter: Callable[[], float]) -> None:
+    """Add sofa, armchairs, fireplace, bookcases, piano and plants."""
+    hide = f.leather(style.sofa)
     oak = f.wood((0.25, 0.12, 0.055), axis=2)
     legs = {"feet": f.wood((0.1, 0.05, 0.025), axis=2)}
-    room.place("KatorLegaz/oriental-rug", -0.25, 0.85, 0.0, degrees=90 + 20 * wiggle(), scale=(1.2, 1.2, 0.5))
-    room.place("BlendSwap-CC-0/winchesterSofa", -0.35 + wiggle(), 2.06, finishes={**legs, "": hide})
+    room.place("KatorLegaz/oriental-rug", -0.25, 0.85, 0.0, degrees=90 + 20 * jitter(), scale=(1.2, 1.2, 0.5))
+    room.place("BlendSwap-CC-0/winchesterSofa", -0.35 + jitter(), 2.06, finishes={**legs, "": hide})
     room.place(
-        "BlendSwap-CC-0/winchesterArmchair", 1.85, 0.75 + wiggle(), degrees=-78 + 60 * wiggle(),
-        finishes={**legs, "": f.fabric(taste.chair, 0.45)},
+        "BlendSwap-CC-0/winchesterArmchair", 1.85, 0.75 + jitter(), degrees=-78 + 60 * jitter(),
+        finishes={**legs, "": f.fabric(style.chair, 0.45)},
     )  # fmt: skip
-    room.place("Scopia/armchair2", -2.05 + wiggle(), -1.55, degrees=128 + 60 * wiggle())
+    room.place("Scopia/armchair2", -2.05 + jitter(), -1.55, degrees=128 + 60 * jitter())
     room.place(
-        "KatorLegaz/chair-ottoman", 2.15, -1.75 + wiggle(), degrees=218,
+        "KatorLegaz/chair-ottoman", 2.15, -1.75 + jitter(), degrees=218,
         finishes={"leather": f.leather((0.34, 0.17, 0.075))},
     )  # fmt: skip
     room.place(
@@ -180,7 +181,7 @@ def furnish_living(room: Furniture, taste: Taste, wiggle: Callable[[], float]) -
         -0.3,
         0.95,
         0.008,
-        degrees=4 + 30 * wiggle(),
+        degrees=4 + 30 * jitter(),
         finish=f.wood((0.13, 0.06, 0.03), axis=0),
     )
     room.place("Scopia/bowlWithFruits", -0.42, 0.97, 0.525)
@@ -201,7 +202,7 @@ def furnish_living(room: Furniture, taste: Taste, wiggle: Callable[[], float]) -
     room.place("Scopia/little_lamp1", -1.86, 2.3, 0.455, scale=1.2)
     room.place("Scopia/living_lamp", 1.25, 2.22, scale=1.12, degrees=160)
     room.place("BlendSwap-CC-BY/piano", -0.05, -2.26, degrees=180, finishes={"material.001": oak, "klavierlack": oak})
-    room.place("BlendSwap-CC-0/pianoBench", -0.05 + wiggle(), -1.62, degrees=180)
+    room.place("BlendSwap-CC-0/pianoBench", -0.05 + jitter(), -1.62, degrees=180)
     room.place("Scopia/calla_lily_with_roses", 0.4, -2.35, 1.385)
     books(-0.6, -2.45, 1.385, 6, 21)
     room.place("BlendSwap-CC-0/cuckooClock", 3.21, -1.55, 1.45, degrees=-90)
@@ -209,15 +210,15 @@ def furnish_living(room: Furniture, taste: Taste, wiggle: Callable[[], float]) -
     room.place("BlendSwap-CC-BY/tulips", -1.5, -2.52, 0.72, scale=0.9)
     room.place("Scopia/ficus", 2.9, 2.15, scale=2.1)
     room.place("BlendSwap-CC-0/lamp2", -0.3, 0.95, HEIGHT - 0.65)
-    for i, (x, color) in enumerate(((-1.1, (0.5, 0.33, 0.1)), (-0.78, taste.chair), (0.35, (0.55, 0.48, 0.36)))):
+    for i, (x, color) in enumerate(((-1.1, (0.5, 0.33, 0.1)), (-0.78, style.chair), (0.35, (0.55, 0.48, 0.36)))):
         cushion((x, 2.06, 0.66), 0.42, 0.25 * (i - 1), 0.35, f.fabric(color, 0.6, 35.0))
 
 
-def furnish_dining(room: Furniture, wiggle: Callable[[], float]) -> None:
-    """Table and chairs, a dresser, plants."""
+def furnish_dining(room: Furniture, jitter: Callable[[], float]) -> None:
+    """Add a table with chairs, a dresser and plants."""
     room.place("BlendSwap-CC-0/oakTable", 5.35, -0.1, scale=(1.15, 1.15, 1.0))
     for k, degrees in enumerate((12, 100, 195, 280)):
-        angle = math.radians(degrees + 40 * wiggle())
+        angle = math.radians(degrees + 40 * jitter())
         room.place(
             "BlendSwap-CC-0/oakChair", 5.35 + 0.82 * math.sin(angle), -0.1 + 0.82 * math.cos(angle),
             degrees=-math.degrees(angle) + 8 * (k % 2),
@@ -234,7 +235,7 @@ def furnish_dining(room: Furniture, wiggle: Callable[[], float]) -> None:
 
 
 def hang_pictures(folder: Path, seed: int) -> None:
-    """Pictures on all walls."""
+    """Add pictures on all walls."""
     works = {name: bpy.data.images.load(str(path)) for name, path in pictures.paint_all(folder, seed + 1).items()}
     dark, gold = f.wood((0.08, 0.04, 0.02), axis=0), f.wood((0.5, 0.33, 0.12), axis=2)
     framed(NORTH, -0.35, 1.70, (1.4, 0.84), works["evening"], gold)
@@ -249,13 +250,13 @@ def hang_pictures(folder: Path, seed: int) -> None:
     framed(END, -1.95, 1.62, (0.6, 0.6), works["hills"], gold)
 
 
-def light_up(taste: Taste, garden: Path) -> None:
-    """Sun, sky, the garden outside and the lamps inside."""
+def light_up(style: RoomStyle, garden: Path) -> None:
+    """Add sun, sky, the garden outside and the lamps inside."""
     f.sky(garden, 6.5, 1.2)
     sun = bpy.data.lights.new("sun", "SUN")
     sun.energy, sun.angle, sun.color = 3.5, math.radians(1.5), (1.0, 0.9, 0.76)
     item = bpy.data.objects.new("sun", sun)
-    item.rotation_euler = (math.radians(52), 0.0, math.radians(taste.sun_degrees - 180))
+    item.rotation_euler = (math.radians(52), 0.0, math.radians(style.sun_degrees - 180))
     bpy.context.scene.collection.objects.link(item)
     bpy.ops.mesh.primitive_uv_sphere_add(segments=64, ring_count=32, radius=9.0, location=(2.0, 0.0, 1.4))
     dome = bpy.context.object
@@ -278,21 +279,21 @@ def light_up(taste: Taste, garden: Path) -> None:
 
 
 def build(sources: Path, scratch: Path, seed: int) -> Furniture:
-    """The whole scene of a seed; returns the furniture, which knows its credits."""
+    """Build the scene of a seed and return its furniture, which has the credits."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    taste, rng = Taste.of(seed), np.random.default_rng(seed)
+    style, rng = RoomStyle.of(seed), np.random.default_rng(seed)
     garden = Path(bpy.utils.resource_path("LOCAL")) / "datafiles" / "studiolights" / "world" / "forest.exr"
 
-    def wiggle() -> float:
-        return float(rng.uniform(-taste.jitter, taste.jitter))
+    def jitter() -> float:
+        return float(rng.uniform(-style.jitter, style.jitter))
 
-    build_shell(taste)
-    hang_curtains(taste)
+    build_shell(style)
+    hang_curtains(style)
     room = Furniture(sources / "models")
-    furnish_living(room, taste, wiggle)
-    furnish_dining(room, wiggle)
+    furnish_living(room, style, jitter)
+    furnish_dining(room, jitter)
     hang_pictures(scratch / "pictures", seed)
-    light_up(taste, garden)
+    light_up(style, garden)
     return room
 
 

@@ -1,7 +1,7 @@
 """Cameras, rendering and export of the sample: equirectangular colour, radial depth and poses.
 
-Blender's world (x east, y north, z up) becomes x east, y down, z north; its camera axes (x right, y up, z
-backward) become OpenCV's (x right, y down, z forward).
+The export converts Blender's world (x east, y north, z up) to x east, y down, z north, and its camera axes (x right,
+y up, z backward) to OpenCV's (x right, y down, z forward).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from furniture import Credit
 from mathutils import Matrix
 from PIL import Image
 
-# name: (x, y, z) in metres, then yaw (counter-clockwise from north), pitch (up) and roll in degrees
+# Name: (x, y, z) in metres; yaw (counter-clockwise from north), pitch (up) and roll in degrees.
 VIEWS = {
     "left": ((-0.5, -0.3, 1.5), (14.0, 1.5, -1.0)),
     "middle": ((0.0, -0.3, 1.5), (0.0, 0.0, 0.0)),
@@ -31,7 +31,7 @@ _CAMERA = np.diag([1.0, -1.0, -1.0])
 
 
 def blender_rotation(yaw: float, pitch: float, roll: float) -> np.ndarray:
-    """Camera-to-world rotation in Blender's axes, level and facing north at zero angles (degrees)."""
+    """Camera-to-world rotation in Blender's axes; angles in degrees, zero angles are level and face north."""
     y, p, r = (math.radians(a) for a in (yaw, pitch, roll))
     about_z = np.array([[math.cos(y), -math.sin(y), 0], [math.sin(y), math.cos(y), 0], [0, 0, 1]])
     tilt = math.pi / 2 + p
@@ -40,11 +40,11 @@ def blender_rotation(yaw: float, pitch: float, roll: float) -> np.ndarray:
     return about_z @ about_x @ about_view
 
 
-def cam2world(place: Sequence[float], angles: Sequence[float]) -> np.ndarray:
-    """Pose as the sample's poses.json has it: OpenCV axes, y-down world."""
+def cam2world(position: Sequence[float], angles: Sequence[float]) -> np.ndarray:
+    """Pose for poses.json: OpenCV axes, world with y down."""
     pose = np.eye(4)
     pose[:3, :3] = _WORLD @ blender_rotation(*angles) @ _CAMERA
-    pose[:3, 3] = _WORLD @ np.array(place)
+    pose[:3, 3] = _WORLD @ np.array(position)
     return pose
 
 
@@ -89,9 +89,9 @@ def _render_color(path: Path) -> np.ndarray:
 
 
 def _render_depth(folder: Path) -> np.ndarray:
-    """Distance along the ray through each pixel's centre: one sample, and a filter that reaches nowhere."""
+    """Distance along the ray through each pixel's centre: one sample and a pixel filter of almost no width."""
     scene, cycles = bpy.context.scene, bpy.context.scene.cycles
-    kept = (
+    saved = (
         cycles.samples,
         cycles.use_denoising,
         cycles.pixel_filter_type,
@@ -115,7 +115,7 @@ def _render_depth(folder: Path) -> np.ndarray:
         cycles.pixel_filter_type,
         cycles.filter_width,
         cycles.max_bounces,
-    ) = kept
+    ) = saved
     image = bpy.data.images.load(str(folder / f"depth_{scene.frame_current:04d}.exr"))
     image.colorspace_settings.name = "Non-Color"
     pixels = np.empty(image.size[0] * image.size[1] * image.channels, np.float32)
@@ -138,15 +138,15 @@ def _write_json(path: Path, content: object) -> None:
 
 
 def render_all(out: Path, views: Sequence[str], height: int, samples: int, threads: int, scratch: Path) -> None:
-    """Render the named views and write the pair folder."""
+    """Render the named views and write the pair's folder."""
     out.mkdir(parents=True, exist_ok=True)
     _setup(height, samples, threads)
     camera = _camera()
     poses = {}
     for name in views:
-        place, angles = VIEWS[name]
+        position, angles = VIEWS[name]
         matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = blender_rotation(*angles), place
+        matrix[:3, :3], matrix[:3, 3] = blender_rotation(*angles), position
         camera.matrix_world = Matrix(matrix.tolist())
         depth = _render_depth(scratch)
         color = _render_color(scratch / f"{name}.png")
@@ -154,13 +154,13 @@ def render_all(out: Path, views: Sequence[str], height: int, samples: int, threa
         _save(Image.fromarray(millimetres), out / f"{name}_depth.png", optimize=True)
         _save(Image.fromarray(color), out / f"{name}.jpg", quality=94, subsampling=0, optimize=True)
         print(f"{name}: depth {depth.min():.3f} to {depth.max():.3f} m", flush=True)
-    for name, (place, angles) in VIEWS.items():
-        pose = np.round(cam2world(place, angles), 15) + 0.0
+    for name, (position, angles) in VIEWS.items():
+        pose = np.round(cam2world(position, angles), 15) + 0.0
         poses[f"{name}.jpg"] = {"cam2world": pose.tolist(), "depth": f"{name}_depth.png"}
     _write_json(out / "poses.json", {"convention": "cam2world opencv", "near": NEAR, "far": FAR, "poses": poses})
     _write_json(out / "pairs.json", {"pairs": [{"context": ["left.jpg", "right.jpg"], "target": ["middle.jpg"]}]})
 
 
 def write_credits(path: Path, credits: Iterable[Credit]) -> None:
-    """The models in the room, their authors and licences."""
+    """Write the models in the room, their authors and licences."""
     _write_json(path, [asdict(c) for c in sorted(credits, key=lambda c: c.model.lower())])

@@ -1,4 +1,4 @@
-"""Pictures for the walls, painted by program: landscapes in brush strokes and a poster with words to read."""
+"""Procedural pictures for the walls: landscapes in brush strokes, and a poster with text."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 Tone = tuple[int, int, int]
 
-# Of the sky's top, the sky above the horizon, the sun, and the far, middle and near ground.
+# Colours of the upper sky, the sky above the horizon, the sun, and the far, middle and near ground.
 _PALETTES = {
     "evening": (
         (64, 88, 140), (244, 178, 110), (255, 232, 170), ((122, 96, 128), (96, 84, 70), (74, 92, 44)),
@@ -25,7 +25,7 @@ _PALETTES = {
 
 
 def _ridge(rng: np.random.Generator, width: int, base: float, height: float, roughness: float) -> np.ndarray:
-    """A skyline: sums of sines of falling amplitude, in pixels from the top."""
+    """A skyline as a sum of sines with decreasing amplitudes, in pixels from the top."""
     x = np.linspace(0, 1, width)
     line = np.zeros(width)
     for octave in range(1, 8):
@@ -34,7 +34,7 @@ def _ridge(rng: np.random.Generator, width: int, base: float, height: float, rou
 
 
 def _stroke_over(base: Image.Image, rng: np.random.Generator) -> Image.Image:
-    """Repaint a picture with short strokes, from broad to fine."""
+    """Repaint an image with short strokes, from broad to fine."""
     width, height = base.size
     source = np.asarray(base).astype(np.int64)
     canvas = base.copy()
@@ -52,7 +52,7 @@ def _stroke_over(base: Image.Image, rng: np.random.Generator) -> Image.Image:
 
 
 def landscape(seed: int, width: int, height: int, palette: str = "evening") -> Image.Image:
-    """Hills before a low sun, with poplars and a pond. Palettes: evening, morning, sea."""
+    """Hills with poplars, or a sea with sails, below a low sun. Palettes: evening, morning, sea."""
     rng = np.random.default_rng(seed)
     top, low, sun, hills = _PALETTES[palette]
     t = np.linspace(0, 1, height)[:, None, None] ** 0.8
@@ -87,7 +87,7 @@ def landscape(seed: int, width: int, height: int, palette: str = "evening") -> I
 
 
 def poster(width: int, height: int, title: str, lines: tuple[str, ...], paper: Tone, ink: Tone) -> Image.Image:
-    """A printed poster: a Fibonacci lattice on a ball above words, so that a mirrored room is noticed."""
+    """A poster with a Fibonacci lattice on a sphere above text, which shows if the room is mirrored."""
     image = Image.new("RGB", (width, height), paper)
     draw = ImageDraw.Draw(image)
     cx, cy, radius = width / 2, height * 0.36, width * 0.34
@@ -111,7 +111,7 @@ def poster(width: int, height: int, title: str, lines: tuple[str, ...], paper: T
 
 
 def paint_all(folder: Path, seed: int) -> dict[str, Path]:
-    """Write the room's pictures into `folder`; returns their paths by name."""
+    """Write the room's pictures into `folder` and return their paths by name."""
     folder.mkdir(parents=True, exist_ok=True)
     words = ("two panoramas in,", "a room to walk in")
     works = {

@@ -1,8 +1,8 @@
-"""Write the sample's README.md: what it is, whom to credit, how it was made, checksums.
+"""Write the sample's README.md: contents, credits, how it was made, checksums.
 
     python readme.py ../living_room
 
-Needs nothing but Python.
+Needs only Python.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ python assets/recipe/readme.py assets/living_room
 
 
 def write(folder: Path) -> None:
-    """Write `folder`/README.md from the files beside it."""
+    """Write README.md from the other files of `folder`."""
     credits = json.loads((folder / "credits.json").read_text(encoding="utf-8"))
     fields = ("model", "title", "author", "licence", "source")
     rows = ["| " + " | ".join(credit[k] for k in fields) + " |" for credit in credits]

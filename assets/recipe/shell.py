@@ -1,6 +1,6 @@
-"""Walls with openings, windows, curtains, beams, frames and cushions: the parts of a room we model ourselves.
+"""The modelled parts of a room: walls with openings, windows, doors, curtains, picture frames and cushions.
 
-Blender's world: x east, y north, z up, metres. Meshes carry world coordinates, so finishes can use positions.
+Blender's world: x east, y north, z up, metres. Meshes have world coordinates, because finishes depend on the position.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def mesh(
     uvs: Sequence[Sequence[float]] | None = None,
     smooth: bool = False,
 ) -> bpy.types.Object:
-    """A mesh object in the scene; `uvs` has one entry a vertex."""
+    """Add a mesh object to the scene; `uvs` has one entry per vertex."""
     data = bpy.data.meshes.new(name)
     data.from_pydata(vertices, [], faces)
     if uvs is not None:
@@ -47,7 +47,7 @@ _SIDES = [(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), 
 
 
 def boxes(name: str, items: Sequence[Box], material: Material) -> bpy.types.Object:
-    """Boxes (x0, x1, y0, y1, z0, z1) as one object."""
+    """Add boxes (x0, x1, y0, y1, z0, z1) as one object."""
     vertices, faces = [], []
     for box in items:
         faces += [[len(vertices) + i for i in side] for side in _SIDES]
@@ -67,9 +67,9 @@ class Opening:
 
 @dataclass(frozen=True)
 class Wall:
-    """A straight wall. It runs along `axis` (0 x, 1 y); `low` and `high` bound it on the other one.
+    """A straight wall along `axis` (0 x, 1 y); `low` and `high` bound it on the other axis.
 
-    `inside` is the sign of the direction, across the wall, in which the furnished room lies.
+    `inside` is the sign of the direction across the wall towards the room.
     """
 
     axis: int
@@ -88,7 +88,7 @@ class Wall:
 
     @property
     def face(self) -> float:
-        """Where the surface that one sees from the room lies, across the wall."""
+        """Coordinate, across the wall, of the surface that is visible from the room."""
         return self.high if self.inside > 0 else self.low
 
     def solid(self) -> list[Box]:
@@ -106,7 +106,7 @@ class Wall:
         return result
 
     def strip(self, z0: float, z1: float, depth: float) -> list[Box]:
-        """A skirting board or moulding along the wall, interrupted at openings that it would cross."""
+        """A skirting board or moulding along the wall, interrupted at openings."""
         spans, x = [], self.start
         for o in sorted(self.openings, key=lambda o: o.start):
             if o.bottom < z1 and o.top > z0:
@@ -117,7 +117,7 @@ class Wall:
         return [self.box(a, b, self.face, edge, z0, z1) for a, b in spans if b > a]
 
     def casing(self, o: Opening, width: float = 0.09, depth: float = 0.03) -> list[Box]:
-        """Boards around an opening, on the room's side."""
+        """Boards around an opening, on the side of the room."""
         edge = self.face + self.inside * depth
         sides = [
             self.box(o.start - width, o.start, self.face, edge, o.bottom, o.top + width),
@@ -144,7 +144,7 @@ class Wall:
         return parts
 
     def door(self, o: Opening, panels: int = 3) -> list[Box]:
-        """A closed panelled door set into an opening."""
+        """A closed panelled door in an opening."""
         back = self.face - self.inside * 0.04
         parts = [self.box(o.start, o.end, back, back - self.inside * 0.04, o.bottom, o.top)]
         step = (o.top - o.bottom - 0.12) / panels
@@ -158,7 +158,7 @@ class Wall:
         return parts
 
     def portal(self, o: Opening) -> None:
-        """Tell the path tracer that daylight comes in here."""
+        """Add a light portal, where the path tracer samples daylight."""
         light = bpy.data.lights.new("portal", "AREA")
         light.shape, light.size, light.size_y = "RECTANGLE", o.end - o.start, o.top - o.bottom
         light.cycles.is_portal = True
@@ -173,7 +173,7 @@ class Wall:
 def curtain(
     wall: Wall, start: float, end: float, bottom: float, top: float, material: Material, seed: int
 ) -> bpy.types.Object:
-    """A hanging cloth whose folds deepen towards the floor."""
+    """Add a hanging curtain whose folds are deeper near the floor."""
     rng = np.random.default_rng(seed)
     columns, rows = 120, 14
     s, t = np.meshgrid(np.linspace(0, 1, columns), np.linspace(0, 1, rows))
@@ -199,7 +199,7 @@ def framed(
     image: bpy.types.Image,
     frame: Material,
 ) -> None:
-    """A picture of `size` (width, height) metres in a frame, hung on a wall with its centre at `height`."""
+    """Add a framed picture of `size` (width, height) metres on a wall, with its centre at `height`."""
     width, tall = size
     rim, out = 0.045, wall.inside
     a, b, z0, z1 = along - width / 2, along + width / 2, height - tall / 2, height + tall / 2
@@ -214,7 +214,7 @@ def framed(
         ],
         frame,
     )
-    # Seen from the room, a picture's left is at the wall's low end where the room lies to its south or east.
+    # As seen from the room, the picture's left side is at the wall's low end if the room is south or east of the wall.
     mirrored = wall.inside > 0 if wall.axis == 0 else wall.inside < 0
     left, right = (b, a) if mirrored else (a, b)
     corners = [(left, z0), (right, z0), (right, z1), (left, z1)]
@@ -223,7 +223,7 @@ def framed(
 
 
 def cushion(center: Sequence[float], size: float, turn: float, lean: float, material: Material) -> None:
-    """A stuffed square cushion, standing and leaning back by `lean` radians."""
+    """Add a square cushion that leans back by `lean` radians."""
     n = 25
     s, t = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
     bulge = 0.32 * size * ((1 - s**2) * (1 - t**2)) ** 0.45
