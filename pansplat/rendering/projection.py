@@ -115,9 +115,7 @@ def _is_finite(gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None)
 
 
 def _has_valid_shape(
-    gaussians: Gaussians,
-    covariances: Float[Tensor, "n 3 3"] | None,
-    radius: Float[Tensor, "n"],
+    gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None, radius: Float[Tensor, "n"]
 ) -> Bool[Tensor, "n"]:
     """Whether a Gaussian is not too large for its distance, and its covariance positive semidefinite."""
     if covariances is None:
@@ -517,10 +515,7 @@ def _cone_slopes(mixed: Tensor, side: Tensor, ahead: Tensor) -> Float[Tensor, "n
 
 
 def _max_sine(
-    sine: Float[Tensor, "n"],
-    cosine: Float[Tensor, "n"],
-    ends: Float[Tensor, "n 2"],
-    sides: Float[Tensor, "n"],
+    sine: Float[Tensor, "n"], cosine: Float[Tensor, "n"], ends: Float[Tensor, "n 2"], sides: Float[Tensor, "n"]
 ) -> Float[Tensor, "n"]:
     """Upper bound of the sine of latitude over a box in the tangent plane at latitude asin(sine).
 

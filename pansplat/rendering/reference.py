@@ -295,10 +295,7 @@ class _Composite(torch.autograd.Function):
                 with torch.enable_grad():
                     outputs = _block(inputs[0], inputs[1], centres, offsets, inputs[2], exact=exact)
                 grads = torch.autograd.grad(
-                    outputs,
-                    inputs,
-                    (torch.cat((grad_through, ended)), grad_sums[live]),
-                    materialize_grads=True,
+                    outputs, inputs, (torch.cat((grad_through, ended)), grad_sums[live]), materialize_grads=True
                 )
                 grad_records.index_add_(0, block.reshape(-1), grads[0].flatten(0, 1))
                 grad_points.index_add_(0, block.reshape(-1), grads[1].flatten(0, 1))
