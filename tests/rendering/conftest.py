@@ -1,4 +1,4 @@
-"""Scenes, and a dense renderer that follows docs/rendering.md's definitions as literally as it can."""
+"""Scenes, and a dense renderer that is a literal translation of docs/rendering.md."""
 
 import math
 import os
@@ -50,12 +50,12 @@ def _balls(means, sigma=0.1, opacity=0.8, colours=(0.9, 0.4, 0.2)) -> Gaussians:
 
 @pytest.fixture
 def balls() -> Callable[..., Gaussians]:
-    """Balls of one size at some places, each with a colour; float64."""
+    """Spheres at given positions, each with a colour; float64."""
     return _balls
 
 
 def _adjugate(matrix: Tensor) -> Tensor:
-    """Of symmetric 3x3 matrices: columns are cross products of rows, no inverse."""
+    """Adjugate of symmetric 3x3 matrices by cross products of rows."""
     a, b, c = matrix.unbind(-2)
     return torch.stack((torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)), dim=-1)
 
@@ -75,7 +75,7 @@ def _dense(
     lowpass: str = "angular",
     near: float = 0.05,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Colour on black, alpha and alpha x depth: every pixel against every Gaussian, one after another."""
+    """Colour on black, alpha and alpha x depth, by a loop over the Gaussians."""
     height, width = size
     rotation, centre = cam2world[:3, :3], cam2world[:3, 3]
     focal = 0.0 if fov is None else 0.5 * height / math.tan(math.radians(fov) / 2)
@@ -112,7 +112,7 @@ def _dense(
             front = rays @ adjugate @ mean[i] > 0
         else:
             dilation = 0.3 if lowpass == "3dgs" else 0.0
-            q = _classic_q(mean[i], s[i], pixels, focal, size, dilation)
+            q = _ewa_q(mean[i], s[i], pixels, focal, size, dilation)
             front = torch.ones_like(q, dtype=torch.bool)
         alpha = (opacity[i] * torch.exp(-q / 2)).clamp_max(0.99)
         alpha = torch.where(front & (alpha >= 1 / 255), alpha, 0)
@@ -123,7 +123,7 @@ def _dense(
     return sums[:3], sums[4], sums[3]
 
 
-def _classic_q(mean: Tensor, s: Tensor, pixels: Tensor, focal: float, size: tuple[int, int], dilation: float) -> Tensor:
+def _ewa_q(mean: Tensor, s: Tensor, pixels: Tensor, focal: float, size: tuple[int, int], dilation: float) -> Tensor:
     height, width = size
     x, y, z = mean
     zero = torch.zeros_like(z)
@@ -150,7 +150,7 @@ def dense() -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
 
 @pytest.fixture
 def pose() -> Tensor:
-    """A camera turned about all axes, off the origin."""
+    """A camera rotated about all axes, not at the origin."""
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = rotations_from_quats(torch.tensor((0.9, 0.2, -0.3, 0.4), dtype=torch.float64))
     pose[:3, 3] = torch.tensor((0.1, 0.2, -0.1))
@@ -167,6 +167,6 @@ def triton_interpreter() -> None:
     assert isinstance(tl.sum, interpreter.InterpretedFunction), (
         "triton was imported before TRITON_INTERPRET=1 was set; set it at the head of the conftest.py"
     )
-    # It replaces its whole language again at every call of a device function; once is enough, and six times as fast.
+    # It patches its language at every call of a device function; once is enough, and six times faster.
     interpreter._patch_lang(tl.sum.fn)
     interpreter.InterpretedFunction.__call__ = lambda self, *args, **kwargs: self.rewrite()(*args, **kwargs)

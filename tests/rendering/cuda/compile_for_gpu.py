@@ -1,7 +1,7 @@
-"""Compiles every kernel for GPUs that need not be there, and prints one JSON line each.
+"""Compile every kernel for GPUs that need not be present, and print one JSON line each.
 
 Run: python tests/rendering/cuda/compile_for_gpu.py [COMPUTE_CAPABILITY ...]   (by default 80 90)
-Without TRITON_INTERPRET. Registers and spills are those that NVIDIA's assembler, which Triton brings, reports.
+Without TRITON_INTERPRET. NVIDIA's assembler, which Triton includes, reports registers and spills.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Everything here runs under Triton's interpreter, chosen before anything can import Triton."""
+"""Run these tests under Triton's interpreter; the variable must be set before Triton is imported."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""The observing kernel, interpreted, against the torch reference, forward and backward."""
+"""The projection kernels, interpreted, against the torch reference, forward and backward."""
 
 import dataclasses
 
@@ -22,8 +22,8 @@ _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
         (False, False, True, 0),
     ],
 )
-def test_what_is_seen_equals_the_reference(exact, compensate, by_covariance, degree, make_scene, pose):
-    scene = make_scene(150, seed=degree, degree=degree)  # one program and a part
+def test_projected_gaussians_equal_the_reference(exact, compensate, by_covariance, degree, make_scene, pose):
+    scene = make_scene(150, seed=degree, degree=degree)  # one and a fraction programs
     scene.quats[3] = 0
     scene.scales[5, 1] = 0
     scene.scales[6] = 0
@@ -46,7 +46,7 @@ def test_gradients_equal_the_references(exact, by_covariance, make_scene, pose, 
     from pansplat.rendering.cuda import projection_backward
 
     monkeypatch.setattr(projection_backward, "_CHUNK_SIZE", 50)
-    scene = make_scene(70)  # one program and a part
+    scene = make_scene(70)  # one and a fraction programs
     scene.quats[3] = 0
     scene.scales[5, 1] = 0
     scene.scales[6] = 0
@@ -76,7 +76,7 @@ def test_gradients_equal_the_references(exact, by_covariance, make_scene, pose, 
 
 
 def _rounded(covariances: torch.Tensor) -> torch.Tensor:
-    """Covariances some of which are discs and needles that rounding made slightly indefinite."""
+    """Covariances, some of them discs and needles that rounding made slightly indefinite."""
     rounded = covariances.clone()
     for thin in (1, 2):
         axes = torch.linalg.eigh(covariances[thin::7])
@@ -87,7 +87,7 @@ def _rounded(covariances: torch.Tensor) -> torch.Tensor:
 
 
 def _any_loss(seen: ProjectedGaussians, generator: torch.Generator) -> torch.Tensor:
-    """Depends on everything, but on the forms only through pictures: their two first may turn into each other."""
+    """A loss of all fields; of the first two rows only through A^2 + B^2, which a rotation of the frame keeps."""
     random = [torch.rand(value.shape, generator=generator, dtype=value.dtype) for value in seen]
     total = sum((value * factor).sum() for value, factor in zip(seen, random, strict=True) if value is not seen.rows)
     if seen.rows.numel():

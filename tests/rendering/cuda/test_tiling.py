@@ -1,4 +1,4 @@
-"""Lists of tiles against a brute-force search, and the tables the kernels read."""
+"""Tile intersections against a brute-force search, and the tables that the kernels read."""
 
 import pytest
 import torch
@@ -23,7 +23,7 @@ def _boxes(count: int, size: tuple[int, int], seed: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("wraps", [True, False])
 @pytest.mark.parametrize("limit", [1, 30, 1 << 20])
-def test_tile_lists_equal_brute_force_in_bands_of_any_size(wraps, limit):
+def test_tile_intersections_equal_brute_force_in_bands_of_any_size(wraps, limit):
     size, num = (50, 70), 3
     boxes = [_boxes(40, size, seed) for seed in range(num)]
     keys = [torch.randint(0, 9, (40,), generator=torch.Generator().manual_seed(seed)).double() for seed in range(num)]
@@ -32,40 +32,40 @@ def test_tile_lists_equal_brute_force_in_bands_of_any_size(wraps, limit):
     rows, columns = instances.grid
     assert (rows, columns) == (4 * num, 5)
     expected = [[] for _ in range(rows * columns)]
-    for picture in range(num):
-        ranges = tile_ranges(boxes[picture], size, wraps, TILE_SIZE).tolist()
-        for i in sorted(range(40), key=lambda i: (float(keys[picture][i]), i)):
+    for plane in range(num):
+        ranges = tile_ranges(boxes[plane], size, wraps, TILE_SIZE).tolist()
+        for i in sorted(range(40), key=lambda i: (float(keys[plane][i]), i)):
             left, across, top, down = ranges[i]
             for tile in ((y, (left + x) % columns) for y in range(top, top + down) for x in range(across)):
-                expected[(picture * 4 + tile[0]) * columns + tile[1]].append(bases[picture] + i)
+                expected[(plane * 4 + tile[0]) * columns + tile[1]].append(bases[plane] + i)
     found, bands = [], 0
-    for lists in intersect_tiles(instances, limit):
-        assert lists.rows[0] * columns == len(found)
+    for band in intersect_tiles(instances, limit):
+        assert band.rows[0] * columns == len(found)
         bands += 1
-        found += [lists.record_ids[a:b].tolist() for a, b in zip(lists.starts[:-1], lists.starts[1:], strict=True)]
+        found += [band.record_ids[a:b].tolist() for a, b in zip(band.starts[:-1], band.starts[1:], strict=True)]
     assert found == expected and sum(map(len, expected)) > 100
     assert bands == {1: 4 * num, 1 << 20: 1}.get(limit, bands)
 
 
-def test_slots_gather_the_entries_of_one_gaussian():
+def test_slots_are_the_positions_before_the_sort_by_tile():
     size = (50, 70)
     box, key = _boxes(40, size, 0), torch.rand(40, generator=torch.Generator().manual_seed(1))
     instances = sort_instances([box], [key], [0], size, wraps=False)
-    (lists,) = intersect_tiles(instances)
-    together = torch.empty_like(lists.record_ids)
-    together[lists.slots.long()] = lists.record_ids
-    counts = lists.ends.diff(prepend=lists.ends.new_zeros(1))
+    (band,) = intersect_tiles(instances)
+    together = torch.empty_like(band.record_ids)
+    together[band.slots.long()] = band.record_ids
+    counts = band.ends.diff(prepend=band.ends.new_zeros(1))
     assert torch.equal(together, instances.records.repeat_interleave(counts))
-    assert int(counts.max()) > 4 and lists.ends.dtype == torch.int64
+    assert int(counts.max()) > 4 and band.ends.dtype == torch.int64
 
 
-def test_more_tiles_than_16_bits_count_are_listed_in_several_bands(monkeypatch):
+def test_tiles_are_split_into_bands_of_16_bit_indices(monkeypatch):
     from pansplat.rendering.cuda import tiling
 
     monkeypatch.setattr(tiling, "_MAX_TILES", 10)
     size = (50, 70)
     instances = sort_instances([_boxes(40, size, 0)], [torch.arange(40.0)], [0], size, wraps=False)
-    found = [lists.rows for lists in intersect_tiles(instances)]
+    found = [band.rows for band in intersect_tiles(instances)]
     assert found == [(0, 2), (2, 4)]
 
 
@@ -79,26 +79,26 @@ def test_centres_and_offsets_keep_more_digits_than_their_type():
         both = both.reshape(len(planes), rows, columns, -1, TILE_SIZE, TILE_SIZE).permute(0, 1, 4, 2, 5, 3)
         both = both.reshape(len(planes), rows * TILE_SIZE, columns * TILE_SIZE, -1)[:, :height, :width]
         points = torch.stack([plane.directions() if exact else plane.coordinates() for plane in planes])
-        # Rounding the offsets is all that is lost.
+        # Only the offsets are rounded.
         assert float((both - points).abs().max()) < 2**-24 * float(pixels.offsets.abs().max())
 
 
 @pytest.mark.parametrize("exact", [True, False])
-def test_records_and_gradients_have_the_layouts_lengths(exact):
+def test_records_and_gradient_records_have_the_layouts_sizes(exact):
     layout = RecordLayout(exact, channels=5)
-    splats = Footprints(*(torch.rand(3, *shape) for shape in ((3,), (3, 3), (), (), (6,))))
-    splats = splats._replace(point=torch.rand(3, 3, dtype=torch.float64))
-    records = pack_records(splats, layout)
+    footprints = Footprints(*(torch.rand(3, *shape) for shape in ((3,), (3, 3), (), (), (6,))))
+    footprints = footprints._replace(point=torch.rand(3, 3, dtype=torch.float64))
+    records = pack_records(footprints, layout)
     point, remainder = records.double().split((layout.axes, layout.axes, layout.record_size - 2 * layout.axes), dim=1)[
         :2
     ]
-    assert float((point + remainder - splats.point[:, : layout.axes]).abs().max()) < 1e-14
+    assert float((point + remainder - footprints.point[:, : layout.axes]).abs().max()) < 1e-14
     assert records.shape == (3, layout.record_size)
-    assert torch.equal(records[:, layout.peak_column], splats.peak) and torch.equal(
-        records[:, layout.peak_column + 1 :], splats.values
+    assert torch.equal(records[:, layout.peak_column], footprints.peak) and torch.equal(
+        records[:, layout.peak_column + 1 :], footprints.values
     )
     rows = torch.arange(3.0 * layout.gradient_size).reshape(3, -1)
-    back = unpack_gradients(rows, splats.rows, layout)
+    back = unpack_gradients(rows, footprints.rows, layout)
     assert torch.equal(back.peak, rows[:, -7]) and torch.equal(back.values, rows[:, -6:])
     assert torch.equal(back.radial_variance, rows[:, -8] if exact else torch.zeros(3))
     assert back.point.dtype == torch.float64 and back.rows.shape == (3, 3, 3)

@@ -1,4 +1,4 @@
-"""Every backend there is, simple scenes, and a comparison with the dense float64 renderer, forward and backward."""
+"""All backends, and a comparison with the dense float64 renderer, forward and backward."""
 
 import dataclasses
 import os
@@ -19,12 +19,12 @@ _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 
 @dataclasses.dataclass(frozen=True)
 class Renderer:
-    """One backend with the type it draws in, and how near to the truth it must come.
+    """A backend, its type and its tolerances.
 
     Attributes:
-        image: largest error of a pixel, where no pixel lies within rounding of a cut.
+        image: largest error of a pixel that is not within rounding of a cut.
         gradient: relative error of a field's gradient, by norm.
-        height: of the panoramas it can draw in a moment.
+        height: of the tests' panoramas, pixels.
     """
 
     name: str
@@ -35,17 +35,17 @@ class Renderer:
 
     @property
     def interpreted(self) -> bool:
-        """Whether it runs under Triton's interpreter, where a second's work takes minutes."""
+        """Whether it runs under Triton's interpreter, a thousand times slower."""
         return self.name == "triton"
 
     @property
     def size(self) -> tuple[int, int]:
         return self.height, 2 * self.height
 
-    def spare(self, variation: bool) -> None:
-        """Leave a variation out in the interpreter, where another one shows as much in less time."""
+    def skip_interpreted(self, variation: bool) -> None:
+        """Skip a variation under the interpreter; another parameter of the same test covers it."""
         if self.interpreted and variation:
-            pytest.skip("a variation that Triton's interpreter is spared")
+            pytest.skip("not under Triton's interpreter: another variation covers it")
 
     def __call__(self, scene: Gaussians, pose: Tensor | None = None, **options) -> Rendering:
         pose = torch.eye(4, dtype=torch.float64) if pose is None else pose
@@ -82,12 +82,12 @@ def _leaves(scene: Gaussians) -> Gaussians:
 
 @pytest.fixture
 def leaves() -> Callable[[Gaussians], Gaussians]:
-    """The same Gaussians, of which gradients can be asked."""
+    """The same Gaussians as leaves that require gradients."""
     return _leaves
 
 
 def _loss(color: Tensor, alpha: Tensor, mass: Tensor) -> Tensor:
-    """Any number that hangs on every pixel's colour, alpha, and alpha x depth, each in its own way."""
+    """A random weighted sum of every pixel's colour, alpha, and alpha x depth."""
     parts = torch.cat((color.double(), alpha.double()[None], mass.double()[None]))
     weights = torch.rand(parts.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     return (parts * weights).sum()
@@ -95,19 +95,19 @@ def _loss(color: Tensor, alpha: Tensor, mass: Tensor) -> Tensor:
 
 @pytest.fixture
 def loss_of() -> Callable[[Rendering], Tensor]:
-    """A loss that hangs on every number of a picture."""
-    return lambda picture: _loss(picture.color, picture.alpha, picture.depth * picture.alpha)
+    """A loss that depends on every number of an image."""
+    return lambda image: _loss(image.color, image.alpha, image.depth * image.alpha)
 
 
 @pytest.fixture
 def gradients(leaves, loss_of) -> Callable[..., dict[str, Tensor]]:
-    """Gradients of that loss for every field of the scene, and for the pose."""
+    """Gradients of that loss with respect to every field of the scene and the pose."""
 
     def find(draw: Renderer, scene: Gaussians, pose: Tensor | None = None, **options) -> dict[str, Tensor]:
         camera = (torch.eye(4, dtype=torch.float64) if pose is None else pose).clone().requires_grad_()
-        asked = leaves(scene.to(dtype=draw.dtype))
-        loss_of(draw(asked, camera, **options)).backward()
-        found = {name: getattr(asked, name).grad for name in _FIELDS}
+        fields = leaves(scene.to(dtype=draw.dtype))
+        loss_of(draw(fields, camera, **options)).backward()
+        found = {name: getattr(fields, name).grad for name in _FIELDS}
         return {**found, "pose": camera.grad}
 
     return find
@@ -115,7 +115,7 @@ def gradients(leaves, loss_of) -> Callable[..., dict[str, Tensor]]:
 
 @pytest.fixture
 def equals_dense(dense, leaves, gradients) -> Callable[..., None]:
-    """Assert that a backend's picture and gradients are the dense float64 renderer's."""
+    """Assert that a backend's image and gradients are the dense float64 renderer's."""
 
     def check(
         draw: Renderer,
@@ -131,20 +131,20 @@ def equals_dense(dense, leaves, gradients) -> Callable[..., None]:
         size = options.pop("size", draw.size)
         literal = {key: options[key] for key in ("kernel", "order", "lowpass", "near") if key in options}
         fov = options.get("vertical_fov_degrees", 90.0) if pinhole else None
-        # What a float32 backend is given is the rounded scene, so that is what the truth is of.
+        # A float32 backend gets the rounded scene, so the truth is computed from it.
         truth = leaves(scene.to(dtype=draw.dtype).to(dtype=torch.float64))
         color, alpha, mass = dense(truth, pose, size, fov=fov, **literal)
         got = draw(scene, pose, size=size, **options)
         for found, expected in ((got.color, color), (got.alpha, alpha), (got.depth * got.alpha, mass)):
             scale = max(1.0, float(expected.detach().abs().max()))
             error = float((found - expected.detach()).abs().max())
-            assert error <= looser * draw.image * scale, f"picture off by {error:.2g}"
+            assert error <= looser * draw.image * scale, f"image off by {error:.2g}"
         _loss(color, alpha, mass).backward()
         ours = gradients(draw, scene, pose, size=size, **options)
         for name in fields:
             expected, found = getattr(truth, name).grad, ours[name]
             assert torch.isfinite(found).all(), name
-            norm = max(float(expected.norm()), 1e-6)  # a ball's quaternion has a slope of rounding only
+            norm = max(float(expected.norm()), 1e-6)  # a sphere's quaternion has only rounding errors as gradient
             error = float((found - expected).norm()) / norm
             assert error <= looser * draw.gradient, f"gradient of {name} off by {error:.2g}"
 

@@ -23,7 +23,7 @@ def _images(balls, count: int) -> list[Rendering]:
 
 @pytest.mark.hard_case(45)
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_at_an_input_position_its_view_alone_is_shown_and_the_weights_are_flat(count, balls):
+def test_at_an_input_position_only_its_view_counts_and_the_weights_have_no_gradient(count, balls):
     positions = _positions(count)
     images = _images(balls, count)
     for i in range(count):
@@ -35,15 +35,15 @@ def test_at_an_input_position_its_view_alone_is_shown_and_the_weights_are_flat(c
         mixed = blend(images, weights.detach())
         here = images[i].alpha > 0
         assert here.any()
-        # One rounding: a share of exactly 1 times the colour.
+        # The weight is exactly 1.
         for name in ("color", "alpha", "depth"):
             assert torch.equal(getattr(mixed, name)[..., here], getattr(images[i], name)[..., here])
 
 
 @pytest.mark.hard_case(46)
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_with_all_in_one_place_every_view_weighs_the_same(count, balls):
-    """The original divides 0 by 0 here, and shows nothing but NaN."""
+def test_inputs_in_one_place_have_equal_weights(count, balls):
+    """The published code divides 0 by 0 here."""
     place = torch.tensor((0.3, -0.2, 0.1), dtype=torch.float64)
     positions = place.expand(count, 3).clone().requires_grad_()
     position = place.clone().requires_grad_()
@@ -57,8 +57,8 @@ def test_with_all_in_one_place_every_view_weighs_the_same(count, balls):
 @pytest.mark.hard_case(47)
 @pytest.mark.parametrize("count", [1, 2, 3])
 @pytest.mark.parametrize("distance", [1e2, 1e9, 1e150])
-def test_far_outside_weights_are_positive_sum_to_one_and_tend_to_equal(count, distance):
-    """The original's 1 - d / sum d sums to one less than the number of views."""
+def test_far_outside_weights_are_positive_sum_to_one_and_converge_to_equal(count, distance):
+    """The published code's 1 - d / sum d has the sum number of views - 1."""
     position = torch.tensor((distance, 0.3 * distance, 0), dtype=torch.float64, requires_grad=True)
     weights = blend_weights(position, _positions(count))
     assert (weights > 0).all() and float(weights.detach().sum()) == pytest.approx(1, abs=1e-12)
@@ -68,7 +68,7 @@ def test_far_outside_weights_are_positive_sum_to_one_and_tend_to_equal(count, di
 
 
 @pytest.mark.hard_case(48)
-def test_a_hole_in_one_view_shows_the_other_and_gradients_stay_finite(balls):
+def test_a_hole_in_one_view_is_filled_by_the_other_with_finite_gradients(balls):
     near, other = _images(balls, 2)
     hole = (near.alpha == 0) & (other.alpha > 0)
     assert hole.any()
@@ -87,7 +87,7 @@ def test_a_hole_in_one_view_shows_the_other_and_gradients_stay_finite(balls):
 
 
 @pytest.mark.hard_case(49)
-def test_where_no_view_sees_anything_there_is_the_background_and_no_gradient(balls):
+def test_where_all_views_are_empty_there_is_background_without_gradient(balls):
     scene = balls((0, 0, 2.0), 0.3)
     background = (0.125, 0.25, 0.5)
     images = [_image(scene, background) for _ in range(3)]

@@ -14,24 +14,24 @@ _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 
 @pytest.mark.hard_case(36)
 @pytest.mark.parametrize("kernel", ["ray", "ewa"])
-def test_the_number_of_threads_changes_no_bit_of_picture_or_gradients(kernel, draw, make_scene, pose, gradients):
-    """Vector widths are compared where there are any: tests/rendering/cpu."""
+def test_the_number_of_threads_changes_no_bit_of_image_or_gradients(kernel, draw, make_scene, pose, gradients):
+    """tests/rendering/cpu compares SIMD widths."""
     count = 12 if draw.interpreted else 100
     scene = make_scene(count, scale=0.15, degree=1)
     layout = "pinhole" if draw.interpreted else "cubemap"
     options = {"kernel": kernel, "layout": layout, "face_size": 24}
-    before, pictures, found = torch.get_num_threads(), [], []
+    before, images, found = torch.get_num_threads(), [], []
     try:
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            pictures.append(draw(scene, pose, **options))
+            images.append(draw(scene, pose, **options))
             found.append(gradients(draw, scene, pose, **options))
             assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
     for other in (1, 2):
-        assert torch.equal(pictures[0].color, pictures[other].color)
-        assert torch.equal(pictures[0].depth, pictures[other].depth)
+        assert torch.equal(images[0].color, images[other].color)
+        assert torch.equal(images[0].depth, images[other].depth)
         for name in (*_FIELDS, "pose"):
             assert torch.equal(found[0][name], found[other][name]), name
 
@@ -39,13 +39,13 @@ def test_the_number_of_threads_changes_no_bit_of_picture_or_gradients(kernel, dr
 @pytest.mark.hard_case(37)
 def test_two_python_threads_draw_at_once(draw, make_scene, pose, gradients):
     if draw.interpreted:
-        pytest.skip("Triton's interpreter itself runs in one thread only")
+        pytest.skip("Triton's interpreter runs in one thread")
     scenes = [make_scene(8, scale=0.3, degree=0, seed=seed) for seed in range(4)]
     alone = [(draw(scene, pose).color, gradients(draw, scene, pose)["means"]) for scene in scenes]
     with ThreadPoolExecutor(2) as pool:
         together = list(pool.map(lambda s: (draw(s, pose).color, gradients(draw, s, pose)["means"]), scenes))
-    for (color, slope), (other, other_slope) in zip(alone, together, strict=True):
-        assert torch.equal(color, other) and torch.equal(slope, other_slope)
+    for (color, gradient), (other, other_gradient) in zip(alone, together, strict=True):
+        assert torch.equal(color, other) and torch.equal(gradient, other_gradient)
 
 
 def _draw_in_child(pipe, draw, scene, pose):
@@ -64,7 +64,7 @@ def test_a_fork_after_use_draws_the_same(draw, make_scene, pose):
     context = multiprocessing.get_context("fork")
     ours, theirs = context.Pipe(duplex=False)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # that forking beside threads may fail is what is tested
+        warnings.simplefilter("ignore", DeprecationWarning)  # forking with threads may fail: this is the test
         child = context.Process(target=_draw_in_child, args=(theirs, draw, scene, pose))
         child.start()
     theirs.close()
@@ -78,7 +78,7 @@ def test_a_fork_after_use_draws_the_same(draw, make_scene, pose):
 
 
 @pytest.mark.hard_case(37)
-def test_without_gradients_the_picture_is_the_same(draw, make_scene, pose, leaves):
+def test_without_gradients_the_image_is_the_same(draw, make_scene, pose, leaves):
     scene = make_scene(8, scale=0.3, degree=1).to(dtype=draw.dtype)
     asked = leaves(scene)
     with torch.no_grad():
@@ -87,15 +87,15 @@ def test_without_gradients_the_picture_is_the_same(draw, make_scene, pose, leave
         inference = draw(scene, pose)
     attached = draw(asked, pose)
     assert not without.color.requires_grad and attached.color.requires_grad
-    for picture in (without, inference):
+    for image in (without, inference):
         for name in ("color", "alpha", "depth"):
-            assert torch.equal(getattr(picture, name), getattr(attached, name).detach()), name
-    attached.color.sum().backward()  # still possible after inference mode has been here
+            assert torch.equal(getattr(image, name), getattr(attached, name).detach()), name
+    attached.color.sum().backward()  # possible after inference mode
     assert asked.means.grad.any()
 
 
 @pytest.mark.hard_case(37)
-def test_gradients_are_found_for_what_asks_for_them_only(draw, make_scene, pose, leaves):
+def test_only_fields_that_require_gradients_get_them(draw, make_scene, pose, leaves):
     scene = make_scene(6, scale=0.3, degree=0).to(dtype=draw.dtype)
     everything = leaves(scene)
     draw(everything, pose).color.sum().backward()
@@ -112,15 +112,15 @@ def test_gradients_are_found_for_what_asks_for_them_only(draw, make_scene, pose,
 @pytest.mark.hard_case(37)
 def test_a_second_derivative_is_refused_clearly(draw, make_scene, pose, leaves):
     asked = leaves(make_scene(3, scale=0.5).to(dtype=draw.dtype))
-    picture = draw(asked, pose)
+    image = draw(asked, pose)
     with pytest.raises(RuntimeError, match="second derivatives"):
-        torch.autograd.grad(picture.color.sum(), asked.means, create_graph=True)
+        torch.autograd.grad(image.color.sum(), asked.means, create_graph=True)
 
 
 @pytest.mark.hard_case(37)
-def test_a_picture_says_who_drew_it(draw, balls):
-    picture = draw(balls((0, 0, 2.0)))
-    assert picture.info is not None and picture.info.backend == draw.name
-    assert picture.color.dtype == picture.alpha.dtype == picture.depth.dtype == draw.dtype
+def test_an_image_names_its_backend(draw, balls):
+    image = draw(balls((0, 0, 2.0)))
+    assert image.info is not None and image.info.backend == draw.name
+    assert image.color.dtype == image.alpha.dtype == image.depth.dtype == draw.dtype
     automatic = rasterize(balls((0, 0, 2.0)), torch.eye(4, dtype=torch.float64), size=(2, 4))
-    assert automatic.info is not None and automatic.info.backend == "torch"  # float64 is the reference's
+    assert automatic.info is not None and automatic.info.backend == "torch"  # for float64

@@ -1,4 +1,4 @@
-"""Any numbers in any field, any picture: never a NaN in it, never a crash, and gradients that are finite."""
+"""Any numbers in any field give an image without NaN and finite gradients."""
 
 import dataclasses
 import math
@@ -39,8 +39,8 @@ _QUIET = settings(
 
 
 @st.composite
-def _pictures(draw_from) -> dict:
-    """Size, layout and the mathematics of a picture; some are refused."""
+def _images(draw_from) -> dict:
+    """Arguments of a call; some are refused."""
     layout = draw_from(st.sampled_from(("equirect", "cubemap", "pinhole")))
     return {
         "layout": layout,
@@ -58,7 +58,7 @@ def _pictures(draw_from) -> dict:
 
 @st.composite
 def _scenes(draw_from) -> tuple[Gaussians, torch.Tensor | None]:
-    """A few Gaussians, perhaps with covariances, in which some numbers are poison."""
+    """A few Gaussians, with or without covariances, with some extreme numbers."""
     count, channels = draw_from(st.integers(0, 6)), draw_from(st.sampled_from((1, 3, 4)))
     degree = draw_from(st.integers(0, 4))
     generator = torch.Generator().manual_seed(draw_from(st.integers(0, 1000)))
@@ -107,16 +107,16 @@ def _check(draw, leaves, given_scene, options: dict) -> None:
 
 
 @settings(_QUIET, max_examples=60)
-@given(scene=_scenes(), options=_pictures())
-def test_no_numbers_break_a_picture_or_its_gradients(draw, leaves, scene, options):
+@given(scene=_scenes(), options=_images())
+def test_extreme_numbers_give_finite_images_and_gradients(draw, leaves, scene, options):
     if draw.interpreted:
         pytest.skip("the next test has fewer examples")
     _check(draw, leaves, scene, options)
 
 
 @settings(_QUIET, max_examples=6)
-@given(scene=_scenes(), options=_pictures())
-def test_no_numbers_break_a_small_picture_of_the_interpreters(draw, leaves, scene, options):
+@given(scene=_scenes(), options=_images())
+def test_extreme_numbers_give_finite_small_images_under_the_interpreter(draw, leaves, scene, options):
     if not draw.interpreted:
         pytest.skip("the test before has more examples")
     _check(draw, leaves, scene, {**options, "size": (3, 6), "face_size": 3})
@@ -124,7 +124,7 @@ def test_no_numbers_break_a_small_picture_of_the_interpreters(draw, leaves, scen
 
 @settings(_QUIET, max_examples=30)
 @given(scene=_scenes(), field=st.sampled_from(_FIELDS[:-1]), index=st.integers(0, 5), value=st.floats(width=32))
-def test_any_number_at_all_in_one_place_leaves_a_picture_without_nan(draw, scene, field, index, value):
+def test_any_float32_in_one_place_gives_an_image_without_nan(draw, scene, field, index, value):
     if draw.interpreted:
         pytest.skip("the interpreter takes minutes")
     gaussians, _ = scene

@@ -1,4 +1,4 @@
-"""Hard case 50: both ends of the Fibonacci lattice, and its even spacing where single precision fails."""
+"""Hard case 50: both ends of the Fibonacci lattice, and its spacing where float32 fails."""
 
 import math
 
@@ -23,7 +23,7 @@ def test_the_lattice_ends_at_the_poles_without_nan(count):
 
 
 def _nearest(directions: torch.Tensor, band: slice) -> torch.Tensor:
-    """Distances of a few thousand points of a band of the lattice to their nearest neighbours, in pixels of 4K."""
+    """Distances of 4000 lattice points to their nearest neighbours, in pixels of a 4K panorama."""
     points = directions[band].double().numpy()
     some = points[len(points) // 2 - 2000 : len(points) // 2 + 2000]
     distance, _ = cKDTree(points).query(some, k=2)
@@ -31,7 +31,7 @@ def _nearest(directions: torch.Tensor, band: slice) -> torch.Tensor:
 
 
 @pytest.mark.hard_case(50)
-def test_neighbours_keep_their_distance_at_4k_where_the_originals_do_not():
+def test_neighbours_keep_their_distance_at_4k_where_the_published_lattice_does_not():
     count = lattice_size(4096)
     assert count > 5_000_000
     ours, theirs = fibonacci_directions(count), directions_from_uv(official_fibonacci_uv(count))
@@ -40,4 +40,4 @@ def test_neighbours_keep_their_distance_at_4k_where_the_originals_do_not():
         nearest = _nearest(ours, band)
         assert float(nearest.min()) > 0.9 and float(nearest.max()) < 1.05
         assert float(_nearest(theirs, band).min()) < 0.6
-    assert float(_nearest(ours, slice(0, 4000)).min()) > 0.5  # the pole's own neighbours
+    assert float(_nearest(ours, slice(0, 4000)).min()) > 0.5  # around the pole

@@ -1,4 +1,4 @@
-"""Hard cases 17 to 20 and 30: opacity at its limits, light that runs out, sums that must be one."""
+"""Hard cases 17 to 20 and 30: limits of the opacity, saturation, and weights whose sum is one."""
 
 import dataclasses
 import math
@@ -13,7 +13,7 @@ _PINHOLE = {"layout": "pinhole", "lowpass": "3dgs"}
 
 @pytest.mark.hard_case(17)
 @pytest.mark.parametrize(
-    ("opacity", "expected", "slope"),
+    ("opacity", "expected", "gradient"),
     [
         (0.0, 0.0, 0.0),
         (-0.5, 0.0, 0.0),
@@ -26,18 +26,18 @@ _PINHOLE = {"layout": "pinhole", "lowpass": "3dgs"}
         (1e29, 0.99, 0.0),
     ],
 )
-def test_opacity_is_cut_below_and_clamped_above_and_has_no_slope_there(opacity, expected, slope, draw, balls, leaves):
+def test_opacity_is_cut_and_clamped_and_has_no_gradient_there(opacity, expected, gradient, draw, balls, leaves):
     scene = leaves(balls((0, 0, 2.0), 1.9, opacity).to(dtype=draw.dtype))
     got = draw(scene, size=(5, 5), **_PINHOLE)
     assert float(got.alpha[2, 2].detach()) == pytest.approx(expected, abs=1e-6)
     got.alpha[2, 2].backward()
-    assert float(scene.opacities.grad) == pytest.approx(slope, abs=1e-5)
+    assert float(scene.opacities.grad) == pytest.approx(gradient, abs=1e-5)
     assert torch.isfinite(got.color).all()
     assert all(torch.isfinite(field.grad).all() for field in (scene.means, scene.scales, scene.quats))
 
 
 def _stack(balls, count: int, opacity: float, depth: float = 1e-6):
-    """Many Gaussians behind each other on the axis, of random colours."""
+    """Gaussians behind each other on the axis, with random colours."""
     generator = torch.Generator().manual_seed(0)
     far = 2 + depth * torch.arange(count, dtype=torch.float64)
     means = torch.stack((torch.zeros_like(far), torch.zeros_like(far), far), dim=1)
@@ -45,23 +45,23 @@ def _stack(balls, count: int, opacity: float, depth: float = 1e-6):
 
 
 @pytest.mark.hard_case(18)
-def test_a_million_gaussians_in_one_pixel_are_the_convex_mean_of_the_first(draw, balls):
+def test_a_million_gaussians_in_one_pixel_give_the_weighted_mean_of_the_first(draw, balls):
     if draw.interpreted:
-        pytest.skip("the interpreter takes minutes; the next test saturates a pixel with a thousand")
+        pytest.skip("takes minutes; the next test saturates a pixel with fewer")
     scene = _stack(balls, 1_000_000, 0.3)
     got = draw(scene, size=(1, 1), layout="pinhole")
-    # The angular filter of so large a pixel widens the Gaussians and lowers their opacity by a known factor.
+    # The angular filter of this large pixel lowers the opacity by a known factor.
     own, wide = (0.9 / 2) ** 2, (0.9 / 2) ** 2 + 0.1 * 4
     opacity = 0.3 * own / wide
-    shares = opacity * (1 - opacity) ** torch.arange(400, dtype=torch.float64)
+    weights = opacity * (1 - opacity) ** torch.arange(400, dtype=torch.float64)
     colours = torch.rand(1_000_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)[:400]
-    expected = (shares[:, None] * colours).sum(dim=0)
+    expected = (weights[:, None] * colours).sum(dim=0)
     assert float(got.alpha) == pytest.approx(1, abs=1e-4)
     assert (got.color[:, 0, 0] - expected).abs().max() < 1e-4
 
 
 @pytest.mark.hard_case(18)
-def test_gradients_of_a_saturated_pixel_go_to_the_front_and_are_exactly_zero_in_the_dark(draw, balls, leaves):
+def test_gradients_of_a_saturated_pixel_are_exactly_zero_behind_the_front(draw, balls, leaves):
     count = 300 if draw.interpreted else 3000
     scene = leaves(_stack(balls, count, 0.95).to(dtype=draw.dtype))
     got = draw(scene, size=(1, 1), **_PINHOLE)
@@ -73,7 +73,7 @@ def test_gradients_of_a_saturated_pixel_go_to_the_front_and_are_exactly_zero_in_
     tiny = torch.finfo(draw.dtype).tiny
     for field in (scene.means, scene.opacities, scene.harmonics):
         gradient = field.grad.abs()
-        # Numbers too small to be normal are slow; the last step of a backend may hold a few.
+        # Denormal numbers are slow; the last step of a backend may contain a few.
         assert int(((gradient > 0) & (gradient < tiny)).sum()) <= 64
     smallest = 0.05**12
     assert (scene.harmonics.grad.abs().amax(dim=(1, 2))[:10] > smallest).all()
@@ -81,8 +81,8 @@ def test_gradients_of_a_saturated_pixel_go_to_the_front_and_are_exactly_zero_in_
 
 @pytest.mark.hard_case(19)
 @pytest.mark.parametrize("opacity", [0.3, 0.9, 0.999])
-def test_gradients_where_hardly_any_light_is_left(opacity, draw, balls, equals_dense):
-    draw.spare(opacity == 0.9)
+def test_gradients_at_low_transmittance_equal_the_dense_renderers(opacity, draw, balls, equals_dense):
+    draw.skip_interpreted(opacity == 0.9)
     count = 12
     scene = _stack(balls, count, opacity, depth=0.01)
     shift = 0.2 * torch.randn(count, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
@@ -91,7 +91,7 @@ def test_gradients_where_hardly_any_light_is_left(opacity, draw, balls, equals_d
 
 
 @pytest.mark.hard_case(20)
-def test_only_pixels_within_rounding_of_a_cut_may_differ(draw, make_scene, pose, dense):
+def test_only_pixels_within_rounding_of_the_alpha_cut_may_differ(draw, make_scene, pose, dense):
     scene = make_scene(40, scale=0.2, degree=0).to(dtype=draw.dtype)
     truth = scene.to(dtype=torch.float64)
     color, _, _ = dense(truth, pose, draw.size)
@@ -105,7 +105,7 @@ def test_only_pixels_within_rounding_of_a_cut_may_differ(draw, make_scene, pose,
 
 
 @pytest.mark.hard_case(20)
-def test_the_cut_is_a_step_at_one_255th_and_the_limit_a_bend_at_99_hundredths(draw, balls):
+def test_alpha_is_cut_at_one_255th_and_clamped_at_0_99(draw, balls):
     def alpha(opacity: float) -> float:
         return float(draw(balls((0, 0, 2.0), 1.9, opacity), size=(1, 1), **_PINHOLE).alpha)
 
@@ -116,8 +116,8 @@ def test_the_cut_is_a_step_at_one_255th_and_the_limit_a_bend_at_99_hundredths(dr
 
 @pytest.mark.hard_case(30)
 @pytest.mark.parametrize("layout", ["equirect", "cubemap", "pinhole"])
-def test_in_a_white_furnace_everything_is_the_furnaces_colour(layout, draw, make_scene, pose, leaves):
-    draw.spare(layout == "cubemap")
+def test_a_white_furnace_has_one_colour(layout, draw, make_scene, pose, leaves):
+    draw.skip_interpreted(layout == "cubemap")
     scene = make_scene(30, scale=0.3, degree=0)
     colour = torch.tensor((0.7, 0.3, 0.5), dtype=torch.float64)
     harmonics = ((colour - 0.5) / 0.28209479177387814).expand(30, 1, 3).clone()
@@ -127,6 +127,6 @@ def test_in_a_white_furnace_everything_is_the_furnaces_colour(layout, draw, make
     assert float(got.alpha.detach().mean()) > 0.1
     assert (got.color - colour[:, None, None]).abs().max() < (1e-6 if draw.dtype == torch.float32 else 1e-13)
     got.color.sum().backward()
-    # What the colours and the background weigh together is one a pixel.
-    shares = scene.harmonics.grad.double().sum(dim=(0, 1)) / 0.28209479177387814 + background.grad.double()
-    assert torch.allclose(shares / math.prod(draw.size), torch.ones(3, dtype=torch.float64), atol=1e-6)
+    # The weights of the colours and the background have the sum 1 at each pixel.
+    weights = scene.harmonics.grad.double().sum(dim=(0, 1)) / 0.28209479177387814 + background.grad.double()
+    assert torch.allclose(weights / math.prod(draw.size), torch.ones(3, dtype=torch.float64), atol=1e-6)

@@ -24,8 +24,8 @@ def test_coincident_gaussians_are_drawn_in_the_order_of_their_index(order, layou
 
 
 @pytest.mark.hard_case(11)
-def test_what_is_between_ties_may_be_permuted(draw, balls):
-    """Moving other Gaussians about in the list does not change who of the coincident ones is in front."""
+def test_permuting_other_gaussians_keeps_the_order_of_ties(draw, balls):
+    """Other Gaussians in the list do not affect the order of coincident ones."""
     generator = torch.Generator().manual_seed(3)
     others = balls(2.5 * torch.nn.functional.normalize(torch.randn(10, 3, generator=generator)), 0.2)
     ties = balls([(0.4, 0.1, 2.0)] * 3, 0.4, colours=torch.rand(3, 3, generator=generator))
@@ -36,23 +36,23 @@ def test_what_is_between_ties_may_be_permuted(draw, balls):
 
 
 @pytest.mark.hard_case(11)
-def test_ties_are_broken_alike_for_any_number_of_threads(draw, balls):
+def test_ties_do_not_depend_on_the_number_of_threads(draw, balls):
     generator = torch.Generator().manual_seed(5)
     means = torch.nn.functional.normalize(torch.randn(15, 3, generator=generator, dtype=torch.float64), dim=1)
     colours = torch.rand(60, 3, generator=generator, dtype=torch.float64)
     scene = balls(2 * means.repeat(4, 1), 0.4, colours=colours)
-    before, pictures = torch.get_num_threads(), []
+    before, images = torch.get_num_threads(), []
     try:
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            pictures.append(draw(scene).color)
+            images.append(draw(scene).color)
     finally:
         torch.set_num_threads(before)
-    assert torch.equal(pictures[0], pictures[1]) and torch.equal(pictures[0], pictures[2])
+    assert torch.equal(images[0], images[1]) and torch.equal(images[0], images[2])
 
 
 @pytest.mark.hard_case(12)
-def test_a_flip_of_nearly_tied_gaussians_changes_a_picture_within_its_bound(draw, balls):
+def test_swapping_nearly_tied_gaussians_changes_an_image_within_its_bound(draw, balls):
     still = balls([(0.1, 0.05, 2.0)] * 2, 0.4, (0.7, 0.6), colours=_RED_GREEN)
     middle = draw(still)
     first, second = (draw(still.select(torch.tensor([i]))).alpha for i in (0, 1))
@@ -66,8 +66,8 @@ def test_a_flip_of_nearly_tied_gaussians_changes_a_picture_within_its_bound(draw
 
 
 @pytest.mark.hard_case(13)
-def test_radial_order_survives_any_turn_of_the_camera(draw, balls):
-    """Distances are found before any rotation, so even neighbouring numbers keep their order all around."""
+def test_radial_order_does_not_depend_on_the_cameras_rotation(draw, balls):
+    """Distances are computed before any rotation, so even adjacent float32 numbers keep their order."""
     base = torch.tensor((0.3, 0.2, 2.0), dtype=torch.float32)
     other = base.clone()
     other[2] = torch.nextafter(base[2], base[2] + 1)
@@ -83,16 +83,16 @@ def test_radial_order_survives_any_turn_of_the_camera(draw, balls):
 
 
 @pytest.mark.hard_case(13)
-def test_turning_by_a_hair_pops_with_order_by_depth_only(draw, balls):
-    """Two large Gaussians equally deep but for a hair: a turn swaps their depths, never their distances."""
+def test_a_tiny_rotation_pops_only_with_order_by_depth(draw, balls):
+    """Two large Gaussians of nearly equal depth: a rotation swaps their depths, never their distances."""
     scene = balls([(-0.4, 0, 2.0), (0.41, 0, 2.0)], 0.8, 0.9, colours=_RED_GREEN)
     jumps = {}
     for order in ("radial", "z"):
-        pictures = []
+        images = []
         for angle in (-1e-4, 1e-4):
             pose = torch.eye(4, dtype=torch.float64)
             pose[0, 0] = pose[2, 2] = math.cos(angle)
             pose[0, 2], pose[2, 0] = math.sin(angle), -math.sin(angle)
-            pictures.append(draw(scene, pose, layout="pinhole", order=order).color)
-        jumps[order] = float((pictures[1] - pictures[0]).abs().max())
+            images.append(draw(scene, pose, layout="pinhole", order=order).color)
+        jumps[order] = float((images[1] - images[0]).abs().max())
     assert jumps["radial"] < 1e-3 < 0.2 < jumps["z"]

@@ -1,4 +1,4 @@
-"""Hard cases 1 to 9: where Gaussians lie, from nowhere to all around the camera."""
+"""Hard cases 1 to 9: positions of Gaussians, from none to all around the camera."""
 
 import dataclasses
 import math
@@ -20,7 +20,7 @@ def _yaw(angle: float) -> torch.Tensor:
 
 @pytest.mark.hard_case(1)
 @pytest.mark.parametrize("layout", ["equirect", "cubemap", "pinhole"])
-def test_nothing_to_draw_leaves_the_background_and_gradients_of_zero(layout, draw, balls, gradients):
+def test_an_empty_scene_is_background_and_gradients_of_zero(layout, draw, balls, gradients):
     full = balls([(0, 0, 2.0), (1.0, 0, 1)])
     scenes = {
         "none": full.select(torch.zeros(2, dtype=torch.bool)),
@@ -41,7 +41,7 @@ def test_nothing_to_draw_leaves_the_background_and_gradients_of_zero(layout, dra
 @pytest.mark.hard_case(2)
 @pytest.mark.parametrize("mean", [(0, 0, 2.0), (1.0, -0.7, 1.3)])
 @pytest.mark.parametrize("options", [{}, {"layout": "pinhole"}, {"layout": "pinhole", "kernel": "ewa"}])
-def test_a_single_gaussian_is_its_closed_form_with_its_slopes(mean, options, draw, balls, equals_dense):
+def test_a_single_gaussian_and_its_gradients_equal_the_dense_renderer(mean, options, draw, balls, equals_dense):
     scene = balls(mean, sigma=0.3)
     scales = torch.tensor([[0.4, 0.2, 0.3]], dtype=torch.float64)
     quats = torch.tensor([[0.8, 0.3, -0.4, 0.2]], dtype=torch.float64)
@@ -49,7 +49,7 @@ def test_a_single_gaussian_is_its_closed_form_with_its_slopes(mean, options, dra
 
 
 @pytest.mark.hard_case(3)
-def test_a_centre_on_an_edge_or_corner_looks_the_same_from_every_face(draw, balls):
+def test_a_centre_on_an_edge_or_corner_gives_the_same_image_on_every_face(draw, balls):
     poses = face_poses(_EYE)
 
     def face(scene, index):
@@ -66,13 +66,13 @@ def test_a_centre_on_an_edge_or_corner_looks_the_same_from_every_face(draw, ball
 
 
 @pytest.mark.hard_case(3)
-def test_gradients_of_a_centre_on_an_edge_are_those_of_one_in_a_faces_middle_turned(draw, balls, leaves):
-    def slopes(mean):
+def test_gradients_of_a_centre_on_an_edge_are_the_rotated_ones_of_a_faces_middle(draw, balls, leaves):
+    def gradients(mean):
         scene = leaves(balls(mean, 0.3).to(dtype=draw.dtype))
-        draw(scene, size=(8, 16)).depth.sum().backward()  # the same sum however the camera turns about y
+        draw(scene, size=(8, 16)).depth.sum().backward()  # does not depend on rotations about y
         return scene
 
-    middle, edge = slopes((0, 0, 2.0)), slopes((math.sqrt(2), 0, math.sqrt(2)))
+    middle, edge = gradients((0, 0, 2.0)), gradients((math.sqrt(2), 0, math.sqrt(2)))
     turn = _yaw(math.pi / 4)[:3, :3].to(draw.dtype)
     for name, expected in (("means", middle.means.grad @ turn.T), ("opacities", middle.opacities.grad)):
         found = getattr(edge, name).grad
@@ -92,7 +92,7 @@ def test_a_centre_at_a_pole_fills_its_rows_evenly(side, draw, balls, gradients):
 
 
 @pytest.mark.hard_case(5)
-def test_the_seam_at_180_degrees_cannot_be_seen(draw, balls, make_scene, gradients):
+def test_there_is_no_seam_at_180_degrees(draw, balls, make_scene, gradients):
     behind = balls((0.0, 0.3, -2.0), 0.5)
     alpha = draw(behind).alpha
     assert float(alpha[:, 0].max()) > 0.3
@@ -107,8 +107,8 @@ def test_the_seam_at_180_degrees_cannot_be_seen(draw, balls, make_scene, gradien
 @pytest.mark.hard_case(6)
 @pytest.mark.parametrize("mean", [(0, 0, 0), (0, 0, 1e-6), (0.03, 0, 0.03), (0.049, 0, 0)])
 @pytest.mark.parametrize("layout", ["equirect", "cubemap"])
-def test_nearer_than_near_by_distance_is_left_out_of_every_face(mean, layout, draw, balls, gradients):
-    draw.spare(layout == "cubemap" and any(mean))
+def test_gaussians_nearer_than_near_are_missing_on_every_face(mean, layout, draw, balls, gradients):
+    draw.skip_interpreted(layout == "cubemap" and any(mean))
     scene = balls([mean, (0, 0, 2.0)], 0.3)
     got = draw(scene, layout=layout)
     assert got.info is not None and got.info.near == 1 and got.info.dropped == 0
@@ -120,8 +120,8 @@ def test_nearer_than_near_by_distance_is_left_out_of_every_face(mean, layout, dr
 
 
 @pytest.mark.hard_case(7)
-def test_the_near_distance_is_a_step_and_smooth_on_either_side(draw, balls):
-    """A fade would change pictures of everything beyond; the step is documented in docs/rendering.md, section 1."""
+def test_alpha_is_a_step_at_near_and_smooth_beyond_it(draw, balls):
+    """docs/rendering.md, section 1 gives the reason for the step."""
     near = 0.5
     middle = (draw.height // 2, draw.height)
 
@@ -136,12 +136,12 @@ def test_the_near_distance_is_a_step_and_smooth_on_either_side(draw, balls):
     scene = dataclasses.replace(scene.to(dtype=draw.dtype), means=scene.means.to(draw.dtype).clone().requires_grad_())
     draw(scene, near=near).alpha[middle].backward()
     step = 1e-3
-    slope = (alpha(near * 1.01 + step) - alpha(near * 1.01 - step)) / (2 * step)
-    assert float(scene.means.grad[0, 2]) == pytest.approx(slope, rel=0.02, abs=1e-3)
+    gradient = (alpha(near * 1.01 + step) - alpha(near * 1.01 - step)) / (2 * step)
+    assert float(scene.means.grad[0, 2]) == pytest.approx(gradient, rel=0.02, abs=1e-3)
 
 
 @pytest.mark.hard_case(8)
-def test_what_is_behind_stays_behind(draw, balls, gradients):
+def test_gaussians_behind_a_pinhole_camera_are_not_drawn(draw, balls, gradients):
     for mean in ((0, 0, -2.0), (0.5, 0.2, -2.0), (1.0, 0, -0.9)):
         scene = balls(mean, 0.1)
         for kernel in ("ray", "ewa"):

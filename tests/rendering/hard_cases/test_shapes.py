@@ -13,7 +13,7 @@ _PINHOLE = {"layout": "pinhole", "vertical_fov_degrees": 90.0}
 
 @pytest.mark.hard_case(10)
 @pytest.mark.parametrize("lowpass", ["angular", "3dgs"])
-def test_the_classic_kernel_clamps_what_lies_outside_the_view(lowpass, draw, balls, equals_dense):
+def test_ewa_clamps_means_outside_the_view(lowpass, draw, balls, equals_dense):
     means = [(14 * 0.3, 0.1, 0.3), (-0.5, 0.9, 0.21), (0.3, 1.4, 1.0), (0.1, -0.1, 2.0)]
     scene = balls(means, sigma=[1.5, 0.4, 0.5, 0.3], colours=torch.rand(4, 3, dtype=torch.float64))
     assert all(abs(x / z) > 1.3 or abs(y / z) > 1.3 for x, y, z in means[:3])
@@ -25,8 +25,8 @@ def test_the_classic_kernel_clamps_what_lies_outside_the_view(lowpass, draw, bal
 
 
 @pytest.mark.hard_case(10)
-def test_where_the_classic_kernel_clamps_only_the_centre_moves(draw, balls, leaves):
-    """The clamped projection hangs on x / z no more, so its variances' slopes there are those of the centre alone."""
+def test_where_ewa_clamps_the_gradient_is_that_of_the_centre(draw, balls, leaves):
+    """The clamped Jacobian does not depend on x / z."""
     scene = leaves(balls((2.0, 0.0, 1.0), 0.6).to(dtype=draw.dtype))
     draw(scene, kernel="ewa", **_PINHOLE).alpha.sum().backward()
     step, sums = 1e-3, []
@@ -39,7 +39,7 @@ def test_where_the_classic_kernel_clamps_only_the_centre_moves(draw, balls, leav
 @pytest.mark.parametrize("along", [0, 1, 2], ids=["across", "down", "along"])
 @pytest.mark.parametrize("kernel", ["ray", "ewa"])
 def test_needles_of_ten_thousand_to_one(along, kernel, draw, balls, equals_dense):
-    draw.spare(along != 0)
+    draw.skip_interpreted(along != 0)
     scene = balls([(0.1, 0.1, 2.0), (-0.6, 0.3, 1.5)], colours=torch.rand(2, 3, dtype=torch.float64))
     scales = torch.full((2, 3), 1e-4, dtype=torch.float64)
     scales[:, along] = 1.0
@@ -50,7 +50,7 @@ def test_needles_of_ten_thousand_to_one(along, kernel, draw, balls, equals_dense
 
 
 @pytest.mark.hard_case(15)
-def test_a_disc_that_faces_the_camera_is_a_surfel(draw, balls):
+def test_a_disc_that_faces_the_camera_has_its_closed_form(draw, balls):
     size, sigma = (draw.height + 1, 2 * draw.height + 1), 0.5
     scene = balls((0, 0, 2.0))
     scene = dataclasses.replace(scene, scales=torch.tensor([[sigma, sigma, 0.0]], dtype=torch.float64))
@@ -67,7 +67,7 @@ def test_a_disc_that_faces_the_camera_is_a_surfel(draw, balls):
 @pytest.mark.parametrize("kernel", ["ray", "ewa"])
 @pytest.mark.parametrize("lowpass", ["angular", "3dgs"])
 def test_discs_on_edge_lines_and_points_vanish_or_stay_finite(kernel, lowpass, draw, balls, gradients):
-    draw.spare((kernel, lowpass) not in (("ray", "angular"), ("ewa", "3dgs")))
+    draw.skip_interpreted((kernel, lowpass) not in (("ray", "angular"), ("ewa", "3dgs")))
     flat = {"edge-on disc": (0.0, 0.5, 0.5), "line": (0.0, 0.0, 0.5), "line aside": (0.5, 0, 0), "point": (0, 0, 0)}
     for name, scales in flat.items():
         scene = balls((0, 0, 2.0))
@@ -76,7 +76,7 @@ def test_discs_on_edge_lines_and_points_vanish_or_stay_finite(kernel, lowpass, d
         alpha = draw(scene, **options).alpha
         assert torch.isfinite(alpha).all()
         if lowpass == "angular":
-            assert not alpha.any(), name  # nothing is left of what has no area
+            assert not alpha.any(), name  # a shape without area has no energy
         for field, gradient in gradients(draw, scene, **options).items():
             assert torch.isfinite(gradient).all(), (name, field)
             assert lowpass == "3dgs" or not gradient.any()
@@ -84,11 +84,11 @@ def test_discs_on_edge_lines_and_points_vanish_or_stay_finite(kernel, lowpass, d
 
 @pytest.mark.hard_case(16)
 def test_specks_of_a_twentieth_pixel_keep_their_energy(draw, balls, equals_dense):
-    """Mass below the cut is missing by definition, and known: the share cut / peak of a Gaussian's mass."""
+    """The alpha cut removes a known fraction of a Gaussian's mass: cut / peak."""
     count, apart, focal = 9, 5, 1000.0
     size = (count * apart, count * apart)
     y, x = torch.meshgrid(torch.arange(count), torch.arange(count), indexing="ij")
-    places = torch.stack((x, y), dim=-1).double().reshape(-1, 2) * (apart + 1 / count) + 2.5  # every shift of a pixel
+    places = torch.stack((x, y), dim=-1).double().reshape(-1, 2) * (apart + 1 / count) + 2.5  # all sub-pixel positions
     ahead = torch.cat(((places - 0.5 * size[0]) / focal, torch.ones(count**2, 1, dtype=torch.float64)), dim=1)
     scene = balls(torch.nn.functional.normalize(ahead, dim=1), 0.05 / focal, 1.0)
     fov = 2 * math.degrees(math.atan(0.5 * size[0] / focal))
@@ -98,15 +98,15 @@ def test_specks_of_a_twentieth_pixel_keep_their_energy(draw, balls, equals_dense
         energies[lowpass] = float(alpha.sum()) / (2 * math.pi * 0.05**2 * count**2)
     peak = 0.05**2 / (0.05**2 + 0.1)
     assert energies["angular"] / (1 - 1 / 255 / peak) == pytest.approx(1, abs=0.01)
-    assert energies["3dgs"] > 10  # what widening without lowering the opacity does
+    assert energies["3dgs"] > 10  # adds variance without lowering the opacity
     speck = balls((0.02, 0.01, 1.0), 0.3 * math.pi / draw.height, 1.0)
     equals_dense(draw, speck, fields=("means", "scales", "opacities", "harmonics"), looser=2)
 
 
 @pytest.mark.hard_case(23)
 @pytest.mark.parametrize("kernel", ["ray", "ewa"])
-def test_covariances_draw_what_scales_and_quaternions_draw(kernel, draw, make_scene, pose, leaves, loss_of):
-    """Forward, and backward: the slopes of a covariance, carried on to scales and quaternions, are theirs."""
+def test_covariances_equal_scales_and_quaternions(kernel, draw, make_scene, pose, leaves, loss_of):
+    """Forward and backward."""
     scene = make_scene(10, scale=0.6, degree=1).to(dtype=draw.dtype)
     options = {"kernel": kernel, "layout": "pinhole", "vertical_fov_degrees": 110.0}
     by_shape, by_matrix = leaves(scene), leaves(scene)
@@ -122,7 +122,7 @@ def test_covariances_draw_what_scales_and_quaternions_draw(kernel, draw, make_sc
 
 
 @pytest.mark.hard_case(23)
-def test_matrices_that_are_no_covariance_are_dropped_and_counted(draw, balls, leaves, loss_of):
+def test_matrices_that_are_not_covariances_are_dropped_and_counted(draw, balls, leaves, loss_of):
     scene = balls([(0, 0, 2.0), (0.5, 0, 2.0), (-0.5, 0, 2.0)], 0.3)
     good = scene.covariances
     broken = {

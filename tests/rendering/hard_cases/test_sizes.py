@@ -11,13 +11,13 @@ from pansplat.rendering.reference import intersect_tiles, tile_grid
 
 
 @pytest.mark.hard_case(27)
-def test_entries_are_counted_in_64_bits_and_listed_in_bands():
-    """20,000 Gaussians over all of an 8K panorama are 10^10 entries: listed a band at a time, none of them twice."""
+def test_intersections_are_counted_in_64_bits_and_listed_in_bands():
+    """20,000 Gaussians over all of an 8K panorama have 10^10 intersections."""
     size, count, limit = (4096, 8192), 20_000, 1 << 20
     rows, columns = tile_grid(*size)
     assert count * rows * columns > 2**31
     everywhere = torch.tensor([[-1e9, 1e9, -1e9, 1e9]], dtype=torch.float64).expand(count, 4)
-    # One row of tiles alone holds 20 million entries, so a band is a row: take the first and look no further.
+    # A row of tiles has 20 million intersections, so the first band of fewer Gaussians is enough.
     narrow = next(intersect_tiles(everywhere[:100], torch.arange(100), size, wraps=True, limit=limit))
     assert narrow.starts.dtype == torch.int64
     assert narrow.tiles == (0, columns * (limit // (100 * columns)))
@@ -28,12 +28,12 @@ def test_entries_are_counted_in_64_bits_and_listed_in_bands():
 @pytest.mark.hard_case(27)
 @pytest.mark.parametrize("value", [1e9, 1e18, 1e300, float("inf")])
 @pytest.mark.parametrize("wraps", [False, True])
-def test_boxes_of_any_extent_are_limited_before_they_become_integers(value, wraps):
+def test_boxes_of_any_extent_are_clamped_before_the_cast_to_integers(value, wraps):
     boxes = torch.tensor(
         [[-value, value, -value, value], [value, value, 0, 1], [-value, -value, 0, 1], [3, 5, -value, 9]],
         dtype=torch.float64,
     )
-    if wraps:  # a panorama's boxes are limited to the panorama before they are listed, or go all around
+    if wraps:  # boxes of a panorama that start beyond it do not occur
         boxes = boxes[[0, 3]]
     found = list(intersect_tiles(boxes, torch.arange(len(boxes)), (16, 32), wraps=wraps))
     assert len(found) == 1
@@ -54,19 +54,19 @@ quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
 colours = torch.rand(count, 1, 3, generator=generator)
 scene = Gaussians(means, torch.full((count, 3), 0.8), quats, torch.full((count,), 0.3), colours, label, label)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-picture = rasterize(scene, torch.eye(4), size=size, backend="torch")
+image = rasterize(scene, torch.eye(4), size=size, backend="torch")
 grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-print(picture.info.intersections, float(picture.alpha.min()), grown)
+print(image.info.intersections, float(image.alpha.min()), grown)
 """
 
 
 @pytest.mark.hard_case(27)
 @pytest.mark.slow
-def test_a_crowd_that_fills_a_large_panorama_needs_bounded_memory():
-    """In a process of its own, where nothing else has grown. tests/rendering/cpu measures the numba backend."""
+def test_gaussians_that_fill_a_large_panorama_need_bounded_memory():
+    """In a separate process, whose memory nothing else uses. tests/rendering/cpu measures the numba backend."""
     run = subprocess.run([sys.executable, "-c", _CROWD], capture_output=True, text=True, check=True, timeout=300)
-    entries, alpha, grown = (float(word) for word in run.stdout.split())
-    assert entries > 10_000_000 and alpha > 0.9
+    count, alpha, grown = (float(word) for word in run.stdout.split())
+    assert count > 10_000_000 and alpha > 0.9
     # Measured: 560 MB in bands of 4 million, 1.1 GB when listed at once.
     assert grown < 800 * 1024, f"grew by {grown / 1024:.0f} MB"
 
@@ -74,7 +74,7 @@ def test_a_crowd_that_fills_a_large_panorama_needs_bounded_memory():
 @pytest.mark.hard_case(28)
 @pytest.mark.parametrize("height", [1, 2, 3, 5, 17, 31, 33, 100])
 def test_odd_sizes_equal_the_dense_renderer(height, draw, balls, equals_dense):
-    draw.spare(height not in (1, 5, 17))
+    draw.skip_interpreted(height not in (1, 5, 17))
     generator = torch.Generator().manual_seed(1)
     scene = balls(2 * torch.nn.functional.normalize(torch.randn(5, 3, generator=generator), dim=1), 0.6)
     fields = ("means", "opacities", "harmonics")
@@ -85,7 +85,7 @@ def test_odd_sizes_equal_the_dense_renderer(height, draw, balls, equals_dense):
 @pytest.mark.hard_case(28)
 @pytest.mark.parametrize("face_size", [1, 2, 3, 5, 7])
 def test_faces_of_any_size_are_stitched(face_size, draw, balls, gradients):
-    draw.spare(face_size != 5)
+    draw.skip_interpreted(face_size != 5)
     scene = balls([(0.5, 0.3, 1.0), (-1.0, -0.4, -0.3)], 0.5)
     for kernel in ("ray", "ewa"):
         options = {"size": (7, 15), "layout": "cubemap", "face_size": face_size, "kernel": kernel}
@@ -94,8 +94,8 @@ def test_faces_of_any_size_are_stitched(face_size, draw, balls, gradients):
 
 
 @pytest.mark.hard_case(28)
-def test_a_picture_is_the_middle_of_a_larger_one(draw, make_scene, pose):
-    """Pixels beyond an odd edge count for nothing: a picture with a wider view and the same focal length holds it."""
+def test_an_image_is_the_centre_of_a_larger_one(draw, make_scene, pose):
+    """The pixels of a partial tile beyond the edge have no effect."""
     scene, size, margin = make_scene(10, scale=0.3, degree=0), (5, 7), 3
     focal = 4.0
     options = {"layout": "pinhole", "kernel": "ray"}
@@ -108,7 +108,7 @@ def test_a_picture_is_the_middle_of_a_larger_one(draw, make_scene, pose):
 
 @pytest.mark.hard_case(29)
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_a_handful_of_gaussians_in_a_large_picture(count, draw, balls):
+def test_a_handful_of_gaussians_in_a_large_image(count, draw, balls):
     height = {"torch": 256, "numba": 1024, "triton": 48}[draw.name]
     means = [(0, 0.1, 2.0), (-1.0, 0.2, 0.9), (0.3, -0.5, -1.0)][:count]
     got = draw(balls(means, 0.1), size=(height, 2 * height))
