@@ -1,1 +1,1 @@
-"""Metrics, baselines, reports, and the pose self-check."""
+"""Metrics, baselines, the paper's evaluations and tables, and the pose check."""

@@ -33,20 +33,20 @@ from pansplat.model.weights import read_checkpoint
 Backbone = Literal["vgg", "alex", "squeeze"]
 
 MIN_IMAGE_SIZE = 32
-"""Pixels that a picture must have along each side, or nothing is left for the last layers."""
+"""Least height and width of an image, pixels; the last layers have no output for a smaller one."""
 
-# What the classifiers were trained on, for pictures in [-1, 1].
+# Normalisation of the classifiers' training images, for images in [-1, 1].
 _MEAN = (-0.030, -0.088, -0.188)
 _DEVIATION = (0.458, 0.448, 0.450)
-# Pictures of more pixels are looked at in bands of so many by VGG, whose activations are the largest.
+# VGG, which has the largest activations, processes images of more pixels in bands of fewer.
 _WHOLE, _BAND = 1 << 19, 1 << 18
 
 _VGG = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512)  # outputs; 0 is a pooling
 # inputs, squeezed, expanded by each of two; 0 is a pooling
 _SQUEEZE = ((64, 16, 64), (128, 16, 64), 0, (128, 32, 128), (256, 32, 128), 0, (256, 48, 192), (384, 48, 192))
 
-# Layers whose activations are compared, and how many channels they have.
-TAPS: dict[Backbone, dict[int, int]] = {
+# Layers whose activations are compared, with their number of channels.
+LAYER_CHANNELS: dict[Backbone, dict[int, int]] = {
     "vgg": {3: 64, 8: 128, 15: 256, 22: 512, 29: 512},
     "alex": {1: 64, 4: 192, 7: 384, 9: 256, 11: 256},
     "squeeze": {1: 64, 4: 128, 7: 256, 9: 384, 10: 384, 11: 512, 12: 512},
@@ -54,10 +54,10 @@ TAPS: dict[Backbone, dict[int, int]] = {
 
 
 class Lpips(nn.Module):
-    """The metric with its weights, all fixed; differentiable in the pictures.
+    """The metric with its weights, which are not trained; differentiable in the images.
 
     Args:
-        backbone: which classifier.
+        backbone: the classifier.
     """
 
     def __init__(self, backbone: Backbone) -> None:
@@ -65,12 +65,12 @@ class Lpips(nn.Module):
         self.backbone: Backbone = backbone
         self.name = f"lpips-{backbone}"
         self.features = _LAYERS[backbone]()
-        self.heads = nn.ParameterList(torch.zeros(channels) for channels in TAPS[backbone].values())
+        self.heads = nn.ParameterList(torch.zeros(channels) for channels in LAYER_CHANNELS[backbone].values())
         self.requires_grad_(False)
         self.eval()
 
     def train(self, mode: bool = True) -> Lpips:
-        """Stays as it is: a yardstick does not learn."""
+        """Has no effect: the metric stays in evaluation mode."""
         return super().train(False)
 
     def forward(
@@ -79,36 +79,35 @@ class Lpips(nn.Module):
         target: Float[Tensor, "batch 3 height width"],
         weights: Float[Tensor, "batch height width"] | None = None,
     ) -> Float[Tensor, "batch"]:
-        """The distance of each pair of pictures; 0 for equal ones.
+        """The distance of each pair of images; 0 for equal ones.
 
         Args:
-            prediction, target: RGB in [0, 1]; values outside are taken as they are.
-            weights: how much each pixel counts; by default all alike. A pixel of weight 0 has no part at all: what
-                `prediction` shows there is not looked at.
+            prediction, target: RGB in [0, 1]; values outside are not clamped.
+            weights: of the pixels; by default equal. The prediction is not used at pixels of weight 0.
 
         Raises:
-            InputError: when the pictures are too small for the classifier.
+            InputError: the images are too small for the classifier.
         """
         if min(target.shape[-2:]) < MIN_IMAGE_SIZE:
             size = "x".join(str(side) for side in target.shape[-2:])
             raise InputError(
-                f"LPIPS needs pictures of {MIN_IMAGE_SIZE} pixels or more along each side, got {size}; "
-                "choose a larger height, or do without LPIPS"
+                f"LPIPS needs images of {MIN_IMAGE_SIZE} pixels or more along each side, got {size}; "
+                "choose a larger height, or no LPIPS"
             )
         if weights is not None:
             prediction = torch.where(weights[:, None] > 0, prediction, target)
         total = target.new_zeros(len(target))
-        for apart in self._distances(self._normalized(prediction), self._normalized(target)):
-            total = total + _mean(apart, weights)
+        for layer_distances in self._distances(self._normalized(prediction), self._normalized(target)):
+            total = total + _mean(layer_distances, weights)
         return total
 
     @torch.no_grad()
     def distance(self, prediction: Float[Tensor, "3 height width"], target: Float[Tensor, "3 height width"]) -> float:
-        """The distance of two single pictures, as a figure."""
+        """The distance of two single images."""
         return float(self(prediction[None], target[None]))
 
     def _distances(self, a: Tensor, b: Tensor) -> Iterator[Float[Tensor, "batch _ _"]]:
-        """One map a layer that is compared."""
+        """The distance map of each compared layer."""
         if self.backbone == "vgg" and a.shape[-2] * a.shape[-1] > _WHOLE:
             return banded_distances(a, b, self.features, self.heads, _BAND)
         activations = (self._activations(maps) for maps in (a, b))
@@ -122,7 +121,7 @@ class Lpips(nn.Module):
         kept = []
         for index, layer in enumerate(self.features):
             maps = layer(maps)
-            if index in TAPS[self.backbone]:
+            if index in LAYER_CHANNELS[self.backbone]:
                 kept.append(maps)
         return kept
 
@@ -130,15 +129,15 @@ class Lpips(nn.Module):
 def _mean(
     maps: Float[Tensor, "batch h w"], weights: Float[Tensor, "batch height width"] | None
 ) -> Float[Tensor, "batch"]:
-    """Mean over the pixels of a layer, each counting as much as the pixels it stands for."""
+    """Mean over the pixels of a layer, weighted by the mean weight of the image pixels they cover."""
     if weights is None:
         return maps.mean(dim=(1, 2))
-    counted = functional.adaptive_avg_pool2d(weights[:, None].to(maps), (maps.shape[-2], maps.shape[-1]))[:, 0]
-    return (maps * counted).sum(dim=(1, 2)) / counted.sum(dim=(1, 2)).clamp_min(torch.finfo(maps.dtype).tiny)
+    pooled = functional.adaptive_avg_pool2d(weights[:, None].to(maps), (maps.shape[-2], maps.shape[-1]))[:, 0]
+    return (maps * pooled).sum(dim=(1, 2)) / pooled.sum(dim=(1, 2)).clamp_min(torch.finfo(maps.dtype).tiny)
 
 
 class _Fire(nn.Module):
-    """Fewer channels by a 1x1 convolution, then more by a 1x1 and a 3x3 one side by side."""
+    """A 1x1 convolution to fewer channels, then a 1x1 and a 3x3 convolution in parallel."""
 
     def __init__(self, inputs: int, squeezed: int, expanded: int) -> None:
         super().__init__()
@@ -147,8 +146,8 @@ class _Fire(nn.Module):
         self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
 
     def forward(self, maps: Tensor) -> Tensor:
-        few = functional.relu(self.squeeze(maps))
-        return functional.relu(torch.cat((self.expand1x1(few), self.expand3x3(few)), dim=1))
+        squeezed = functional.relu(self.squeeze(maps))
+        return functional.relu(torch.cat((self.expand1x1(squeezed), self.expand3x3(squeezed)), dim=1))
 
 
 def _vgg() -> nn.Sequential:
@@ -182,8 +181,7 @@ def _squeeze() -> nn.Sequential:
 
 _LAYERS = {"vgg": _vgg, "alex": _alex, "squeeze": _squeeze}
 
-
-_FLOOR = 1e-20  # squared length of a pixel's activations: none at all has a direction of zeros, and a gradient
+_EPSILON = 1e-20  # added to the squared length of a pixel's activations; zero activations have a finite gradient
 
 
 def distances(
@@ -191,7 +189,7 @@ def distances(
     b: Float[Tensor, "batch channel height width"],
     head: Float[Tensor, "channel"],
 ) -> Float[Tensor, "batch height width"]:
-    """How far the directions of two pictures' activations are apart at each pixel, channels weighed by `head`."""
+    """Squared difference of the normalised activations at each pixel, with channel weights `head`."""
     return torch.einsum("bchw,c->bhw", (_directions(a) - _directions(b)).square(), head)
 
 
@@ -202,16 +200,16 @@ def banded_distances(
     heads: Iterable[Float[Tensor, "_"]],
     pixels: int,
 ) -> Iterator[Float[Tensor, "batch _ _"]]:
-    """`distances` after each block of a classifier of 3x3 convolutions with a margin, rectifiers and 2x2 poolings.
+    """`distances` after each block of a classifier of padded 3x3 convolutions, ReLUs and 2x2 poolings.
 
     Args:
-        heads: one a block.
-        pixels: of a band, at the resolution of its block.
+        heads: one for each block.
+        pixels: number of pixels of a band, at the resolution of its block.
     """
     needs_gradient = torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)
     for block, head in zip(_blocks(layers), heads, strict=True):
         height, width = a.shape[-2:]
-        rows = max(2, pixels // width // 2 * 2)  # even: a pooling's rows stay together
+        rows = max(2, pixels // width // 2 * 2)  # even, so that bands do not split a pooling window
         parts = []
         for first in range(0, height, rows):
             given = (block, a, b, head, first, min(first + rows, height))
@@ -234,7 +232,7 @@ def _blocks(layers: nn.Sequential) -> list[nn.Sequential]:
 def _band(
     block: nn.Sequential, a: Tensor, b: Tensor, head: Tensor, first: int, end: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Both pictures' rows for the next block, and the distances in this."""
+    """The rows of both images for the next block, and the distances of this block."""
     pooling = block[-1] if isinstance(block[-1], nn.MaxPool2d) else nn.Identity()
     convolving = block[:-1] if isinstance(block[-1], nn.MaxPool2d) else block
     margin = sum(isinstance(layer, nn.Conv2d) for layer in convolving)
@@ -244,18 +242,18 @@ def _band(
 
 
 def _pooled(pooling: nn.Module, maps: Tensor) -> Tensor:
-    """The last row of an odd number is lost, and it may be a band."""
-    is_lost = isinstance(pooling, nn.MaxPool2d) and maps.shape[2] == 1
-    return maps[:, :, :0, : maps.shape[3] // 2] if is_lost else pooling(maps)
+    """Pooled rows; pooling drops the last row of an odd number, also where it is a band."""
+    is_dropped = isinstance(pooling, nn.MaxPool2d) and maps.shape[2] == 1
+    return maps[:, :, :0, : maps.shape[3] // 2] if is_dropped else pooling(maps)
 
 
 def _directions(maps: Float[Tensor, "batch channel height width"]) -> Float[Tensor, "batch channel height width"]:
     """Activations divided by their length over the channels."""
-    return maps * (maps.square().sum(1, keepdim=True) + _FLOOR).rsqrt()
+    return maps * (maps.square().sum(1, keepdim=True) + _EPSILON).rsqrt()
 
 
 FOLDER_VARIABLE = "PANSPLAT_LPIPS"
-"""Environment variable with the folder of the weights."""
+"""Environment variable that names the folder of the weights."""
 
 _CLASSIFIERS: dict[Backbone, str] = {
     "vgg": "vgg16-397923af.pth",
@@ -273,15 +271,15 @@ def load_lpips(backbone: Backbone, folder: Path | None = None) -> Lpips:
 
     Args:
         backbone: the paper's figures are those of "vgg".
-        folder: where to look first; then the folder that PANSPLAT_LPIPS names, the cache of torch.hub, and, for the
-            channels' weights, an installed `lpips` package.
+        folder: searched first; then the folder of PANSPLAT_LPIPS, the cache of torch.hub, and, for the channels'
+            weights, an installed `lpips` package.
 
     Raises:
-        InputError: when a file is missing (it says which, where it is to be had and where it belongs) or damaged.
+        InputError: a file is missing (the message names its source and its folder) or damaged.
     """
     classifier, heads = find_classifier(backbone, folder), find_heads(backbone, folder)
     if classifier is None or heads is None:
-        raise InputError(_what_to_fetch(backbone, folder, classifier, heads))
+        raise InputError(_missing_message(backbone, folder, classifier, heads))
     metric = Lpips(backbone)
     state = {**_classifier_state(metric, classifier), **_head_state(backbone, heads)}
     metric.load_state_dict(state)
@@ -289,13 +287,13 @@ def load_lpips(backbone: Backbone, folder: Path | None = None) -> Lpips:
 
 
 def find_backbone(folder: Path | None = None) -> Backbone | None:
-    """The first of vgg, alex and squeeze whose files are here; None when there are none."""
+    """The first of vgg, alex and squeeze whose files exist; None without any."""
     found = (b for b in get_args(Backbone) if find_classifier(b, folder) and find_heads(b, folder))
     return next(found, None)
 
 
 def find_classifier(backbone: Backbone, folder: Path | None = None) -> Path | None:
-    """The file of torchvision's classifier: by its own name or one that begins alike."""
+    """The file of torchvision's classifier, by its name or a name with the same beginning."""
     found = (path for place in _places(folder) for path in sorted(place.glob(_PATTERNS[backbone])))
     return next(found, None)
 
@@ -318,7 +316,7 @@ def _hub() -> Path:
     return Path(torch.hub.get_dir()) / "checkpoints"
 
 
-def _what_to_fetch(backbone: Backbone, folder: Path | None, classifier: Path | None, heads: Path | None) -> str:
+def _missing_message(backbone: Backbone, folder: Path | None, classifier: Path | None, heads: Path | None) -> str:
     missing = []
     if classifier is None:
         missing.append(f"{_CLASSIFIERS[backbone]} (from {_CLASSIFIER_SITE}{_CLASSIFIERS[backbone]})")
@@ -327,21 +325,21 @@ def _what_to_fetch(backbone: Backbone, folder: Path | None, classifier: Path | N
     looked = ", ".join(str(place) for place in _places(folder))
     return (
         f"LPIPS with {backbone} needed {' and '.join(missing)}, got no such file in {looked}; put it into {_hub()} or "
-        f"into a folder that --lpips-weights or {FOLDER_VARIABLE} names. Nothing is fetched by itself."
+        f"into a folder that --lpips-weights or {FOLDER_VARIABLE} names. Nothing is downloaded."
     )
 
 
 def _classifier_state(metric: Lpips, path: Path) -> dict[str, Tensor]:
-    """The classifier's layers that the metric has; those that decide on a class are left."""
+    """The layers of the classifier that the metric uses."""
     content = read_checkpoint(path)
-    wanted = {name: t for name, t in metric.state_dict().items() if name.startswith("features.")}
-    return {name: _tensor(content, name, wanted[name].shape, path) for name in wanted}
+    needed = {name: t for name, t in metric.state_dict().items() if name.startswith("features.")}
+    return {name: _tensor(content, name, needed[name].shape, path) for name in needed}
 
 
 def _head_state(backbone: Backbone, path: Path) -> dict[str, Tensor]:
     content = read_checkpoint(path)
     state = {}
-    for index, channels in enumerate(TAPS[backbone].values()):
+    for index, channels in enumerate(LAYER_CHANNELS[backbone].values()):
         weight = _tensor(content, f"lin{index}.model.1.weight", torch.Size((1, channels, 1, 1)), path)
         state[f"heads.{index}"] = weight.flatten()
     return state
@@ -351,5 +349,5 @@ def _tensor(content: Mapping[str, object], name: str, shape: torch.Size, path: P
     tensor = content.get(name)
     if not isinstance(tensor, Tensor) or tensor.shape != shape:
         got = f"one of {tuple(tensor.shape)}" if isinstance(tensor, Tensor) else "none"
-        raise InputError(f"{path}: needed a tensor {name} of {tuple(shape)}, got {got}; fetch the file again.")
+        raise InputError(f"{path}: needed a tensor {name} of {tuple(shape)}, got {got}; download the file again.")
     return tensor.float()

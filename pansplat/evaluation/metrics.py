@@ -41,7 +41,7 @@ def ws_psnr(
     *,
     mask: Bool[Tensor, "height width"] | None = None,
 ) -> float:
-    """PSNR in dB where each pixel counts by its solid angle; infinite when the images are equal.
+    """PSNR in dB with pixels weighted by their solid angle; infinite when the images are equal.
 
     Source: Sun, Lu and Yu, weighted-to-spherically-uniform quality evaluation, doi:10.1109/LSP.2017.2720693.
     """
@@ -55,7 +55,7 @@ def ssim(prediction: Float[Tensor, "3 height width"], target: Float[Tensor, "3 h
     """Mean structural similarity of the three channels: Gaussian window, sample covariance, border cropped.
 
     Source: Wang et al., doi:10.1109/TIP.2003.819861, with the settings of the official protocol: 11 x 11
-    window of sigma 1.5, K = (0.01, 0.03), data range 1, windows that leave the picture not counted.
+    window of sigma 1.5, K = (0.01, 0.03), data range 1, only windows inside the image.
     """
     _check(prediction, target, None)
     if min(prediction.shape[-2:]) <= 2 * _SSIM_RADIUS:
@@ -74,7 +74,7 @@ def ssim(prediction: Float[Tensor, "3 height width"], target: Float[Tensor, "3 h
 
 
 def _window_mean(image: np.ndarray) -> np.ndarray:
-    """Gaussian-weighted local means (3 H W) of all windows that lie inside the picture."""
+    """Gaussian-weighted local means (3 H W) of all windows inside the image."""
     from scipy.ndimage import correlate1d
 
     offsets = np.arange(-_SSIM_RADIUS, _SSIM_RADIUS + 1)
@@ -105,7 +105,7 @@ def _check(prediction: Tensor, target: Tensor, mask: Tensor | None) -> None:
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Errors of one scene, all its views together; NaN where no pixel has a true depth.
+    """Errors over all views of one scene; NaN without any true depth.
 
     Attributes:
         abs_rel: mean of |error| / truth.
@@ -124,7 +124,7 @@ def depth_errors(
     """Errors over the pixels whose true depth is strictly between `near` and `far`.
 
     Args:
-        depth: radial, metres; made as large as the truth bilinearly, pixel centres at half-integers, not wrapping.
+        depth: radial, metres; resized to the truth bilinearly, without wrapping.
         true_depth: radial, metres, 0 where unknown.
     """
     size = true_depth.shape[-2:]
@@ -146,7 +146,7 @@ def cross_fade(
     cam2world: Float[Tensor, "view 4 4"],
     target: Float[Tensor, "4 4"],
 ) -> Float[Tensor, "3 height width"]:
-    """The panorama at pose `target` as if everything were far away: inputs weighted by nearness."""
+    """The baseline without geometry: inputs rotated to the target's orientation, weighted by inverse distance."""
     poses, target = cam2world.double(), target.double()
     weights = blend_weights(target[:3, 3], poses[:, :3, 3]).to(images)
     faded = torch.zeros_like(images[0])

@@ -1,7 +1,8 @@
-"""Do the poses fit the pictures? Each view is warped into the other with the poses as read and as misread.
+"""Pose check: do the poses fit the images, and would another convention fit better?
 
-The depth for the warp comes from a small plane sweep of its own, so the check needs no model: under the right
-poses some depth makes the two views alike nearly everywhere, under wrong ones it does not.
+Each view is warped into the other with the poses as given and under each common mistake. The depth for the warp comes
+from a small sphere sweep, so the check needs no model. With the right poses some depth explains nearly every pixel;
+with wrong poses none does.
 """
 
 from __future__ import annotations
@@ -22,53 +23,53 @@ from pansplat.geometry.pose import invert_pose
 AS_GIVEN = "as given"
 
 _HEIGHT = 64  # pixels
-_DEPTHS = 32  # inverse depths
-_AGGREGATION = 2  # pixels on each side over which differences are averaged
-_DIFFERENCE_CAP = 0.6  # per feature; what is hidden in the other view must not decide
-_CLEARLY_BETTER = 0.92  # of the error as given: below that another reading is named,
-_FITS = 0.46  # if its own error is below that
-_DIFFERENT = 0.02  # and at least so much less: among nearly perfect fits a ratio means nothing
-_UNLIKE = 0.5  # least error above which the views show too little in common to tell anything
-_SAME_POSE = 0.02  # entries of the relative pose (translation by its length) that count as equal
+_CANDIDATES = 32  # inverse depths
+_AGGREGATION = 2  # half size of the window over which differences are averaged, pixels
+_DIFFERENCE_CAP = 0.6  # of a feature; limits the effect of occlusions
+# Another reading is reported if its error is below this ratio of the error as given, below this error, and smaller by
+# this difference (a ratio of nearly perfect fits is not significant).
+_MAX_RATIO, _MAX_ERROR, _MIN_DIFFERENCE = 0.92, 0.46, 0.02
+_NO_OVERLAP = 0.5  # lowest error above which the views have too little in common
+_SAME_POSE = 0.02  # largest difference of equal relative poses (translation relative to its length)
 
 _ADVICE = {
-    # An inverse brings the axes named in the file to the world's side, so its advice names both words.
-    "inverse": 'the matrices look like the inverse of what was said, with OpenCV axes: exchange "cam2world" '
-    'and "world2cam", and say "opencv"',
-    "opengl axes": "the camera axes look like OpenGL's (y up, z backward) where OpenCV's were said, or the "
-    'other way round: exchange "opencv" and "opengl"',
-    "inverse, opengl axes": "the matrices look like the inverse of what was said, with OpenGL axes: exchange "
-    '"cam2world" and "world2cam", and say "opengl"',
+    # An inverse moves the axes of the convention to the world's side, so its advice names both words.
+    "inverse": 'the matrices look like the inverse of the stated ones, with OpenCV axes: exchange "cam2world" '
+    'and "world2cam", and state "opencv"',
+    "opengl axes": "the camera axes look like OpenGL's (y up, z backward) where OpenCV's were stated, or the "
+    'reverse: exchange "opencv" and "opengl"',
+    "inverse, opengl axes": "the matrices look like the inverse of the stated ones, with OpenGL axes: exchange "
+    '"cam2world" and "world2cam", and state "opengl"',
     "transposed rotation": "the rotations look inverted while the translations are right: transpose the 3x3 "
     "parts, or conjugate the quaternions",
-    "swapped views": "the poses of the two views look exchanged: check which pose belongs to which picture",
-    "mirrored left-right": "the scene looks mirrored left to right: a flipped picture or a left-handed world",
+    "swapped views": "the poses of the two views look exchanged: check which pose belongs to which image",
+    "mirrored left-right": "the scene looks mirrored left to right: a flipped image or a left-handed world",
     "mirrored up-down": "the up axis looks flipped alone (a left-handed system): flip a second axis with it",
     "mirrored front-back": "the forward axis looks flipped alone (a left-handed system): flip a second axis with it",
-    "z-up camera": "the camera axes look like x right, y forward, z up: turn them into x right, y down, z forward",
-    "x-forward camera": "the camera axes look like x forward, y left, z up (robotics, ROS): turn them into "
+    "z-up camera": "the camera axes look like x right, y forward, z up: rotate them to x right, y down, z forward",
+    "x-forward camera": "the camera axes look like x forward, y left, z up (robotics, ROS): rotate them to "
     "x right, y down, z forward",
-    "turned by 90 degrees": "the panoramas' centre looks along the camera's x axis: turn the poses by 90 "
-    "degrees about the vertical axis or shift the pictures by a quarter",
-    "turned by 180 degrees": "the panoramas' centre looks backward: turn the poses by 180 degrees about the "
-    "vertical axis or shift the pictures by half",
-    "turned by -90 degrees": "the panoramas' centre looks along the camera's -x axis: turn the poses by -90 "
-    "degrees about the vertical axis or shift the pictures by a quarter",
+    "turned by 90 degrees": "the panoramas' centre looks along the camera's x axis: rotate the poses by 90 "
+    "degrees about the vertical axis or shift the images by a quarter",
+    "turned by 180 degrees": "the panoramas' centre looks backward: rotate the poses by 180 degrees about the "
+    "vertical axis or shift the images by half",
+    "turned by -90 degrees": "the panoramas' centre looks along the camera's -x axis: rotate the poses by -90 "
+    "degrees about the vertical axis or shift the images by a quarter",
 }
 
 
 @dataclass(frozen=True)
 class PoseCheck:
-    """What `check_pair` found.
+    """The result of a pose check.
 
     Attributes:
         name: of the pair.
         baseline: largest distance between context cameras, metres.
-        error: photometric error of the warp with the poses as given; 0 is perfect, about 1 is unrelated.
-        errors: the same for each reading of the poses, best first; `AS_GIVEN` is one.
-        indistinguishable: readings that make the same relative pose as given, so that pictures cannot tell.
-        likely_mistake: advice in words where another reading fits far better, else None.
-        warnings: what else is implausible.
+        error: photometric error of the warp with the poses as given: 0 for a perfect fit, about 1 for unrelated images.
+        errors: the error for each reading of the poses, best first; `AS_GIVEN` is one.
+        indistinguishable: readings with the same relative pose as given.
+        likely_mistake: advice if another reading fits clearly better, else None.
+        warnings: on other implausible input.
     """
 
     name: str
@@ -86,7 +87,7 @@ class PoseCheck:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing speaks against the poses."""
+        """Whether there is no likely mistake and no warning."""
         return self.likely_mistake is None and not self.warnings
 
     def report(self) -> str:
@@ -103,32 +104,32 @@ class PoseCheck:
 
 
 def check_pair(pair: Pair) -> PoseCheck:
-    """Whether the poses of a pair's context views fit their pictures, and what else would; takes seconds.
+    """Whether the poses of a pair's context views fit their images, and which other reading would; takes seconds.
 
     Raises:
-        InputError: a picture cannot be used.
+        InputError: an image cannot be used.
     """
     return check_views(pair.load_context(_HEIGHT), pair.name)
 
 
 def check_views(views: Views, name: str = "views") -> PoseCheck:
-    """The same as `check_pair` for loaded views; small ones (height about 64) are enough.
+    """`check_pair` for loaded views; a height of about 64 pixels is enough.
 
     Args:
-        views: two or more; neighbours in their order are compared.
+        views: two or more; consecutive views are compared.
         name: for the report.
     """
     features = torch.stack([_features(image) for image in views.images])
     poses = views.cam2world
-    relatives = {reading: _relatives(poses, reading) for reading in (AS_GIVEN, *_ADVICE)}
+    relatives = {reading: _relative_poses(poses, reading) for reading in (AS_GIVEN, *_ADVICE)}
     given = relatives[AS_GIVEN]
     indistinguishable = [r for r in _ADVICE if _same_motion(relatives[r], given)]
     errors: dict[str, float] = {}
     for reading, relative in relatives.items():
         if reading in indistinguishable:
             continue
-        twin = next((r for r in errors if _same_motion(relatives[r], relative)), None)
-        errors[reading] = errors[twin] if twin else _photometric_error(features, views, relative)
+        equal = next((r for r in errors if _same_motion(relatives[r], relative)), None)
+        errors[reading] = errors[equal] if equal else _photometric_error(features, views, relative)
     errors = dict(sorted(errors.items(), key=lambda item: item[1]))
     centres = poses[:, :3, 3]
     baseline = max(float((a - b).norm()) for a, b in itertools.combinations(centres, 2))
@@ -139,26 +140,26 @@ def check_views(views: Views, name: str = "views") -> PoseCheck:
         errors,
         tuple(indistinguishable),
         _likely_mistake(errors),
-        (*_implausible(centres, baseline, views), *_hopeless(errors)),
+        (*_distance_warnings(centres, baseline, views), *_overlap_warnings(errors)),
     )
 
 
 def _likely_mistake(errors: dict[str, float]) -> str | None:
-    """Advice for the best reading, and those that fit just as well, if it is clearly better than as given."""
+    """Advice for the best reading, and for equally good ones, if it is clearly better than as given."""
     best = next(iter(errors.values()))
-    if best > min(_CLEARLY_BETTER * errors[AS_GIVEN], errors[AS_GIVEN] - _DIFFERENT, _FITS):
+    if best > min(_MAX_RATIO * errors[AS_GIVEN], errors[AS_GIVEN] - _MIN_DIFFERENCE, _MAX_ERROR):
         return None
     named = [_ADVICE[r] for r, error in errors.items() if r != AS_GIVEN and error <= best * 1.001]
     return "; or ".join(named) + f" (error {best:.3f} instead of {errors[AS_GIVEN]:.3f})."
 
 
-def _implausible(centres: Float[Tensor, "view 3"], baseline: float, views: Views) -> tuple[str, ...]:
+def _distance_warnings(centres: Float[Tensor, "view 3"], baseline: float, views: Views) -> tuple[str, ...]:
     """Warnings on the distances between the cameras."""
     found = []
     closest = min(float((a - b).norm()) for a, b in itertools.combinations(centres, 2))
     if baseline > 0.5 * views.far:
         found.append(
-            f"the cameras are {baseline:.3g} m apart, which is much against far = {views.far:g} m: "
+            f"the cameras are {baseline:.3g} m apart, which is large against far = {views.far:g} m: "
             "are the poses in centimetres or millimetres? Convert them to metres, or set near and far to fit."
         )
     if closest < 0.02 * views.near:
@@ -171,25 +172,25 @@ def _implausible(centres: Float[Tensor, "view 3"], baseline: float, views: Views
     return tuple(found)
 
 
-def _hopeless(errors: dict[str, float]) -> tuple[str, ...]:
-    """A warning when no reading of the poses makes the pictures alike."""
+def _overlap_warnings(errors: dict[str, float]) -> tuple[str, ...]:
+    """A warning if no reading of the poses fits."""
     best = next(iter(errors.values()))
-    if best <= _UNLIKE:
+    if best <= _NO_OVERLAP:
         return ()
     return (
-        f"no reading of the poses makes the views alike (best error {best:.3f}): they show too little "
-        "in common, or the poses or the order of the pictures are wrong in another way.",
+        f"no reading of the poses fits the views (best error {best:.3f}): they have too little in common, "
+        "or the poses or the order of the images are wrong in another way.",
     )
 
 
-def _relatives(cam2world: Float[Tensor, "view 4 4"], reading: str) -> Float[Tensor, "pair 4 4"]:
-    """Poses of each view in the next one's camera, if the given matrices are to be read so."""
+def _relative_poses(cam2world: Float[Tensor, "view 4 4"], reading: str) -> Float[Tensor, "pair 4 4"]:
+    """Poses of each view in the next one's camera, under a reading of the given matrices."""
     poses = _read_as(cam2world, reading)
     return torch.linalg.solve(poses[1:], poses[:-1])
 
 
 def _read_as(poses: Float[Tensor, "view 4 4"], reading: str) -> Float[Tensor, "view 4 4"]:
-    """The cam2world poses in OpenCV axes that a wrong reading turned into the given ones."""
+    """The OpenCV cam2world poses that a mistake turned into the given matrices."""
     opengl = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=poses.dtype))
     if reading == "inverse":
         return invert_pose(poses)
@@ -223,7 +224,7 @@ def _read_as(poses: Float[Tensor, "view 4 4"], reading: str) -> Float[Tensor, "v
 
 
 def _same_motion(first: Float[Tensor, "pair 4 4"], second: Float[Tensor, "pair 4 4"]) -> bool:
-    """Whether two readings move the cameras alike, up to what a small picture can show."""
+    """Whether two readings have the same relative poses within the tolerance of a small image."""
     length = second[:, :3, 3].norm(dim=-1).clamp_min(1e-9)
     rotation = (first - second)[:, :3, :3].abs().max()
     translation = ((first - second)[:, :3, 3].norm(dim=-1) / length).max()
@@ -231,7 +232,7 @@ def _same_motion(first: Float[Tensor, "pair 4 4"], second: Float[Tensor, "pair 4
 
 
 def _features(image: Float[Tensor, "3 height width"]) -> Float[Tensor, "feature height width"]:
-    """Colour and locally normalised brightness and gradients: exposure may differ from view to view."""
+    """Colour, and locally normalised brightness and gradients, which are robust against exposure."""
     padded = pad_equirect(image.mean(dim=0), 4)
     box = torch.nn.functional.avg_pool2d(padded[None, None], 9, stride=1)[0, 0]
     squares = torch.nn.functional.avg_pool2d(padded[None, None] ** 2, 9, stride=1)[0, 0]
@@ -245,7 +246,7 @@ def _features(image: Float[Tensor, "3 height width"]) -> Float[Tensor, "feature 
 def _photometric_error(
     features: Float[Tensor, "view feature height width"], views: Views, relative: Float[Tensor, "pair 4 4"]
 ) -> float:
-    """Mean over both directions of all neighbouring views."""
+    """Mean over both directions of all pairs of consecutive views."""
     total = []
     for i, motion in enumerate(relative):
         for a, b, pose in ((i, i + 1, motion), (i + 1, i, torch.linalg.inv(motion))):
@@ -261,16 +262,16 @@ def _sweep_error(
     pose: Float[Tensor, "4 4"],
     views: Views,
 ) -> float:
-    """Mean over the sphere of the least aggregated difference over all depths; about 1 when unrelated."""
+    """Mean over the sphere of the lowest aggregated difference over all depths; about 1 for unrelated images."""
     height, width = reference.shape[-2:]
-    inverse = torch.linspace(1 / views.far, 1 / views.near, _DEPTHS)
+    inverse = torch.linspace(1 / views.far, 1 / views.near, _CANDIDATES)
     rays = pixel_directions(height, width) @ pose[:3, :3].T.float()
-    points = rays + inverse[:, None, None, None] * pose[:3, 3].float()  # over depth: only directions count
+    points = rays + inverse[:, None, None, None] * pose[:3, 3].float()  # divided by the depth: only directions matter
     size = torch.tensor((width, height), dtype=torch.float32)
     grid = 2 * (uv_from_directions(points) * size + 1) / (size + 2) - 1
     source = pad_equirect(torch.cat((other, other_mask[None].to(other.dtype))), 1)
     warped = torch.nn.functional.grid_sample(
-        source.expand(_DEPTHS, -1, -1, -1), grid, padding_mode="border", align_corners=False
+        source.expand(_CANDIDATES, -1, -1, -1), grid, padding_mode="border", align_corners=False
     )
     difference = (warped[:, :-1] - reference).abs().clamp_max(_DIFFERENCE_CAP).mean(dim=1)
     seen = (warped[:, -1] > 0.5) & mask

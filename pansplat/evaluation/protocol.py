@@ -39,7 +39,7 @@ from pansplat.data.views import Sample, Views
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import DepthErrors, depth_errors, psnr, ssim, ws_psnr
-from pansplat.evaluation.report import error_image, warm_up
+from pansplat.evaluation.report import error_image, finite_json, make_folder, warm_up
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.model.network import NetworkPredictor
 from pansplat.pipeline import Drawing
@@ -47,7 +47,7 @@ from pansplat.predictor import Predictor, Progress
 
 LOC360, INSTA360 = "360Loc", "Insta360"
 
-_INSIDE = {  # where a data set may lie in the folder that is given
+_SUBFOLDERS = {  # possible locations of a data set in the given folder
     "panogrf": (".", "pano_grf", "datasets/pano_grf"),
     LOC360: (".", "360Loc", "datasets/360Loc"),
     INSTA360: (".", "insta360", "datasets/insta360"),
@@ -57,7 +57,7 @@ _SAMPLERS = {LOC360: BoundedSampler(2, 5), INSTA360: BoundedSampler(2, 30)}
 
 @dataclass(frozen=True)
 class EvaluationCase:
-    """One scene of a set: `read(height)` gives its inputs and targets."""
+    """One scene of a set; `read(height)` loads its inputs and targets."""
 
     name: str
     read: Callable[[int], Sample]
@@ -68,9 +68,9 @@ class EvaluationSet:
     """A test set.
 
     Attributes:
-        name: as the paper's tables have it, such as "M3D 1.0 m".
-        cases: empty where the data is missing.
-        missing: what would have been needed, naming the folder; empty where it is here.
+        name: as in the paper's tables, such as "M3D 1.0 m".
+        cases: empty if the data is missing.
+        missing: message that names the missing folder; empty if the data is there.
     """
 
     name: str
@@ -78,11 +78,11 @@ class EvaluationSet:
     missing: str = ""
 
 
-def panogrf_set(root: Path, title: str, name: str, distance: float, height: int) -> EvaluationSet:
-    """Triplets of one kind and one distance (metres) from an input to the middle view."""
-    for inside in _INSIDE["panogrf"]:
+def find_panogrf_set(root: Path, title: str, name: str, distance: float, height: int) -> EvaluationSet:
+    """PanoGRF triplets of one kind, with one distance (metres) from an input to the middle view."""
+    for subfolder in _SUBFOLDERS["panogrf"]:
         try:
-            (triplets,) = read_panogrf(root / inside, "test", height, [(name, distance)])
+            (triplets,) = read_panogrf(root / subfolder, "test", height, [(name, distance)])
         except InputError:
             continue
         cases = [
@@ -90,8 +90,10 @@ def panogrf_set(root: Path, title: str, name: str, distance: float, height: int)
             for index, source in enumerate(triplets.sources)
         ]
         return EvaluationSet(title, tuple(cases))
-    wanted = panogrf_folder(root / "pano_grf", "test", name, distance, height)
-    return EvaluationSet(title, missing=f"{title}: needed PanoGRF's scenes in {wanted} (or in {root / wanted.name})")
+    expected = panogrf_folder(root / "pano_grf", "test", name, distance, height)
+    return EvaluationSet(
+        title, missing=f"{title}: needed PanoGRF's scenes in {expected} (or in {root / expected.name})"
+    )
 
 
 def _read_triplet(triplets: TripletSet, index: int, height: int) -> Sample:
@@ -99,28 +101,28 @@ def _read_triplet(triplets: TripletSet, index: int, height: int) -> Sample:
     return Sample(pair.name, pair.load_context(height), pair.load_targets(height))
 
 
-def sequence_set(root: Path, name: str, draws: int = 100) -> EvaluationSet:
-    """`LOC360` or `INSTA360`: pairs spread evenly over each sequence, all frames between and at them as targets."""
+def find_sequence_set(root: Path, name: str, draws: int = 100) -> EvaluationSet:
+    """`LOC360` or `INSTA360`: pairs spread evenly over each sequence; all frames between and at them are targets."""
     sequences, missing = find_sequences(root, name)
-    return EvaluationSet(name, tuple(_cases(sequences, _SAMPLERS[name], draws)), missing)
+    return EvaluationSet(name, tuple(_draw_cases(sequences, _SAMPLERS[name], draws)), missing)
 
 
-def frame_distance_set(sequences: Sequence[FrameSequence], gap: int, draws: int) -> EvaluationSet:
-    """Pairs of frames `gap` apart, spread evenly over each sequence, with the frame in the middle as target."""
+def make_frame_distance_set(sequences: Sequence[FrameSequence], gap: int, draws: int) -> EvaluationSet:
+    """Pairs of frames `gap` apart, spread evenly over each sequence; the middle frame is the target."""
     long = [sequence for sequence in sequences if len(sequence.poses) > gap]
-    cases = tuple(_cases(long, BoundedSampler(gap, gap), draws, middle=True))
+    cases = tuple(_draw_cases(long, BoundedSampler(gap, gap), draws, middle=True))
     missing = "" if cases else f"{gap} frames apart: needed a sequence of more than {gap} frames"
     return EvaluationSet(f"{gap} frames", cases, missing)
 
 
 def find_sequences(root: Path, name: str) -> tuple[Sequence[FrameSequence], str]:
-    """The sequences of `LOC360` (its test location) or `INSTA360`, and what is missing when there are none.
+    """The sequences of `LOC360` (its test location) or `INSTA360`, and a message if there are none.
 
     Raises:
-        InputError: when the data is there and wrong.
+        InputError: the data is invalid.
     """
-    for inside in _INSIDE[name]:
-        folder = root / inside
+    for subfolder in _SUBFOLDERS[name]:
+        folder = root / subfolder
         if name == LOC360 and (folder / "atrium").is_dir():
             return read_loc360(folder, "test"), ""
         if name == INSTA360 and _has_videos(folder):
@@ -134,7 +136,7 @@ def _has_videos(folder: Path) -> bool:
     return any(folder.glob("*.mp4")) or any(folder.glob("*/*.mp4"))
 
 
-def _cases(
+def _draw_cases(
     sequences: Sequence[FrameSequence], sampler: BoundedSampler, draws: int, *, middle: bool = False
 ) -> list[EvaluationCase]:
     cases = []
@@ -152,11 +154,10 @@ Blend = Literal["joint", "deferred"]
 
 @dataclass(frozen=True)
 class Method:
-    """A predictor with the way its Gaussians are drawn: a row of a table.
+    """A predictor with its rendering options: a row of a table.
 
     Attributes:
-        blend: how the views' Gaussians are brought together.
-        drawing: see `pipeline.render`.
+        blend, drawing: see `pipeline.render`.
     """
 
     name: str
@@ -167,7 +168,7 @@ class Method:
 
 @dataclass(frozen=True)
 class Score:
-    """Figures of one target: dB, SSIM, and LPIPS where its weights are here."""
+    """Metrics of one target; PSNR in dB, LPIPS None if it was not measured."""
 
     case: str
     target: str
@@ -179,11 +180,11 @@ class Score:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a predictor makes of a case.
+    """The prediction of a case.
 
     Attributes:
-        depth: radial, metres, of the inputs at the finest level that was swept; None where the predictor has none.
-        seconds: the prediction took.
+        depth: radial, metres, of the inputs at the finest level of the network; None for other predictors.
+        seconds: duration of the prediction.
     """
 
     scene: Scene
@@ -193,16 +194,16 @@ class Prediction:
 
 @dataclass(frozen=True)
 class RenderedTarget:
-    """A target as drawn, with its figures."""
+    """A rendered target with its metrics."""
 
     score: Score
-    picture: Float[Tensor, "3 height width"]
+    image: Float[Tensor, "3 height width"]
     target: Float[Tensor, "3 height width"]
     seconds: float
 
 
 def predict_case(context: Views, predictor: Predictor) -> Prediction:
-    """The scene of a case's inputs, and their depth where the predictor is a network."""
+    """The scene of a case's inputs, and their depth if the predictor is a network."""
     masks = None if bool(context.masks.all()) else context.masks
     inputs = (context.images, context.cam2world, context.near, context.far)
     began = time.perf_counter()
@@ -213,7 +214,7 @@ def predict_case(context: Views, predictor: Predictor) -> Prediction:
     else:
         gaussians = predictor(*inputs, masks=masks)
     seconds = time.perf_counter() - began
-    assert isinstance(gaussians, Gaussians)  # a list answers a batch only
+    assert isinstance(gaussians, Gaussians)  # a list is returned for a batch only
     scene = Scene(
         gaussians,
         context.cam2world,
@@ -229,29 +230,28 @@ def predict_case(context: Views, predictor: Predictor) -> Prediction:
 def render_targets(
     sample: Sample, prediction: Prediction, blend: Blend, lpips: Lpips | None, drawing: Drawing = "exact"
 ) -> Iterator[RenderedTarget]:
-    """Each target of the case, drawn and measured; nothing is clamped but for PSNR, nothing masked."""
+    """Render and measure each target of the case, without masks; only PSNR clamps."""
     for index, target in enumerate(sample.targets.images):
         began = time.perf_counter()
         with torch.no_grad():
             pose, size = sample.targets.cam2world[index], (target.shape[-2], target.shape[-1])
-            drawn = pipeline.render(prediction.scene, pose, blend=blend, size=size, drawing=drawing)
-            picture = drawn.color.float()
+            image = pipeline.render(prediction.scene, pose, blend=blend, size=size, drawing=drawing).color.float()
         seconds = time.perf_counter() - began
         score = Score(
             case=sample.name,
             target=sample.targets.names[index],
-            ws_psnr=ws_psnr(picture, target),
-            psnr=psnr(picture, target),
-            ssim=ssim(picture, target),
-            lpips=None if lpips is None else lpips.distance(picture, target),
+            ws_psnr=ws_psnr(image, target),
+            psnr=psnr(image, target),
+            ssim=ssim(image, target),
+            lpips=None if lpips is None else lpips.distance(image, target),
         )
-        yield RenderedTarget(score, picture, target, seconds)
+        yield RenderedTarget(score, image, target, seconds)
 
 
 def measure_depth(context: Views, prediction: Prediction) -> DepthErrors | None:
-    """Errors of the inputs' depth; None where there is no true depth.
+    """Errors of the inputs' depth; None without true depth.
 
-    A predictor without depth maps is measured by what its Gaussians draw at each input, from that input's own.
+    For a predictor without depth maps, the depth at each input is rendered from the Gaussians of that input.
     """
     if context.depths is None:
         return None
@@ -259,16 +259,16 @@ def measure_depth(context: Views, prediction: Prediction) -> DepthErrors | None:
     if depth is None:
         size = (context.images.shape[-2], context.images.shape[-1])
         with torch.no_grad():
-            drawn = [
+            depths = [
                 pipeline.render(prediction.scene, pose, blend=view, size=size).depth
                 for view, pose in enumerate(context.cam2world)
             ]
-        depth = torch.stack(drawn)
+        depth = torch.stack(depths)
     return depth_errors(depth, context.depths, context.near, context.far)
 
 
 def mean_depth_errors(errors: list[DepthErrors]) -> DepthErrors | None:
-    """Mean over the scenes; None where there are none."""
+    """Mean over the scenes; None without any."""
     if not errors:
         return None
     names = [field.name for field in dataclasses.fields(DepthErrors)]
@@ -277,7 +277,7 @@ def mean_depth_errors(errors: list[DepthErrors]) -> DepthErrors | None:
 
 ProtocolName = Literal["m3d", "narrow", "replica", "residential", "360loc", "insta360", "ablation", "frame-distance"]
 
-# By protocol: the table's name of a set, PanoGRF's, and metres from an input to the middle view.
+# By protocol: name of the set in the table, its PanoGRF kind, and metres from an input to the middle view.
 _PANOGRF: dict[str, tuple[tuple[str, str, float], ...]] = {
     "m3d": (("M3D 1.0 m", "m3d", 0.5), ("M3D 1.5 m", "m3d", 0.75), ("M3D 2.0 m", "m3d", 1.0)),
     "narrow": (("M3D 0.2 m", "m3d", 0.1), ("M3D 0.5 m", "m3d", 0.25)),
@@ -290,13 +290,13 @@ _DEPTH_SET = "M3D 1.0 m"  # the only one whose depth the paper's code measures
 
 @dataclass(frozen=True)
 class ProtocolOptions:
-    """How an evaluation is run.
+    """Settings of an evaluation.
 
     Attributes:
-        height: panoramas are resized to it, pixels; the paper's is 512.
-        limit: at most so many cases a set, spread evenly over it; None for all, as in the paper.
-        pictures: of so many cases a set pictures are written.
-        draws: pairs a sequence, for 360Loc and Insta360.
+        height: of the resized panoramas, pixels; the paper's is 512.
+        limit: largest number of cases of a set, spread evenly; None for all, as in the paper.
+        pictures: number of cases of a set whose images are written.
+        draws: number of pairs of a sequence, for 360Loc and Insta360.
         gaps: frames between the inputs, for the figure over the frame distance.
     """
 
@@ -309,12 +309,12 @@ class ProtocolOptions:
 
 @dataclass
 class SetResult:
-    """What one method reached on one set.
+    """Results of one method on one set.
 
     Attributes:
         depth: errors of each case whose inputs have a true depth.
-        gaussians: of each case.
-        predict_seconds, render_seconds: of each prediction, and of each picture.
+        gaussians: number of Gaussians of each case.
+        predict_seconds, render_seconds: of each prediction, and of each target.
     """
 
     set: str
@@ -326,7 +326,7 @@ class SetResult:
     render_seconds: list[float] = field(default_factory=list)
 
     def mean(self, metric: str) -> float | None:
-        """Mean of a metric over the set's images (of depth over its scenes); None where it was not measured."""
+        """Mean of a metric over the set's images, or of a depth metric over its scenes; None if it was not measured."""
         if metric == "gaussians":
             return _mean(self.gaussians)
         if metric in ("abs_rel", "sq_rel", "rmse"):
@@ -336,7 +336,7 @@ class SetResult:
         return None if None in values else _mean(values)
 
     def as_json(self) -> dict[str, object]:
-        """What results.json says."""
+        """The entry in results.json."""
         metrics = ("psnr", "ws_psnr", "ssim", "lpips", "abs_rel", "sq_rel", "rmse", "gaussians")
         return {
             "set": self.set,
@@ -354,9 +354,9 @@ class ProtocolResult:
     """A whole evaluation.
 
     Attributes:
-        lpips: which classifier LPIPS asked, such as "lpips-vgg"; None without.
-        missing: a line for each set whose data is not here.
-        skipped: a line for each case that could not be read.
+        lpips: name of the LPIPS metric, such as "lpips-vgg"; None without.
+        missing: a message for each set without data.
+        skipped: a message for each case that could not be read.
     """
 
     protocol: str
@@ -367,12 +367,12 @@ class ProtocolResult:
     skipped: list[str] = field(default_factory=list)
 
     def as_json(self) -> dict[str, object]:
-        """What results.json holds; numbers that are not finite become null."""
+        """The content of results.json; non-finite numbers become null."""
         return {
             "protocol": self.protocol,
             "height": self.height,
             "lpips": self.lpips,
-            "results": _finite([result.as_json() for result in self.sets]),
+            "results": finite_json([result.as_json() for result in self.sets]),
             "missing": self.missing,
             "skipped": self.skipped,
         }
@@ -385,14 +385,14 @@ def list_methods(
     name: str | None = None,
     drawing: Drawing = "exact",
 ) -> list[Method]:
-    """The rows a predictor gets in a protocol's table.
+    """The rows of a predictor in a protocol's table.
 
-    On rendered scenes the paper draws all Gaussians together, on real ones it compares that with deferred blending. A
-    predictor that is no network is drawn with deferred blending only: its Gaussians are made for that.
+    On synthetic scenes the paper renders all Gaussians jointly; on real ones it compares that with deferred blending.
+    Predictors other than networks are rendered with deferred blending, for which their Gaussians are made.
 
     Args:
-        blend: this one only.
-        name: what to call the predictor; its own name by default.
+        blend: the only blending; by default as above.
+        name: of the predictor in the table; its own name by default.
         drawing: see `pipeline.render`.
     """
     blends: tuple[Blend, ...] = ("joint", "deferred") if protocol not in _PANOGRF else ("joint",)
@@ -400,30 +400,30 @@ def list_methods(
         blends = (blend,)
     elif not isinstance(predictor, NetworkPredictor):
         blends = ("deferred",)
-    words = {"joint": "", "deferred": " + deferred blending"}
-    called = f"ours, {name or predictor.name}" + (", drawn as the original" if drawing == "original" else "")
-    return [Method(f"{called}{words[b]}", predictor, b, drawing) for b in blends]
+    suffixes = {"joint": "", "deferred": " + deferred blending"}
+    title = f"ours, {name or predictor.name}" + (", drawn as the original" if drawing == "original" else "")
+    return [Method(f"{title}{suffixes[b]}", predictor, b, drawing) for b in blends]
 
 
 def find_sets(protocol: ProtocolName, root: Path, options: ProtocolOptions) -> list[EvaluationSet]:
-    """The protocol's sets, those whose data is missing included.
+    """The protocol's sets, including those without data.
 
     Raises:
-        InputError: when `root` is no folder, or data is there and wrong.
+        InputError: `root` is not a folder, or the data is invalid.
     """
     if not root.is_dir():
         raise InputError(f"{root}: needed the folder that holds the test data, got no such folder; check --data.")
     if protocol in _PANOGRF:
-        return [panogrf_set(root, *kind, options.height) for kind in _PANOGRF[protocol]]
+        return [find_panogrf_set(root, *kind, options.height) for kind in _PANOGRF[protocol]]
     if protocol in ("360loc", "insta360"):
-        return [sequence_set(root, LOC360 if protocol == "360loc" else INSTA360, options.draws)]
+        return [find_sequence_set(root, LOC360 if protocol == "360loc" else INSTA360, options.draws)]
     sequences, missing = find_sequences(root, INSTA360)
     if not sequences:
         sequences, also = find_sequences(root, LOC360)
         missing = f"{missing}; or {also}"
     if not sequences:
         return [EvaluationSet("frame distance", missing=missing)]
-    return [frame_distance_set(sequences, gap, options.draws) for gap in options.gaps]
+    return [make_frame_distance_set(sequences, gap, options.draws) for gap in options.gaps]
 
 
 def run_protocol(
@@ -436,10 +436,10 @@ def run_protocol(
     lpips: Lpips | None = None,
     progress: Progress | None = None,
 ) -> ProtocolResult:
-    """Evaluate the methods on what is here; results.json is written after every case, pictures beside it.
+    """Evaluate the methods on the available sets; results.json is written after every case.
 
     Raises:
-        InputError: when none of the data is here (it names the folders), or none of it can be read, or `out` cannot be
+        InputError: no data is available (the message names the folders), none of it can be read, or `out` cannot be
             written.
     """
     options = options or ProtocolOptions()
@@ -449,24 +449,24 @@ def run_protocol(
     if len(result.missing) == len(sets):
         raise InputError(
             f"{root}: got none of the data of --protocol {protocol}. " + ". ".join(result.missing) + ". "
-            "Fetch it, or give the folder that holds it as --data."
+            "Download it, or give the folder that holds it as --data."
         )
-    chosen = [(found, _spread(found.cases, options.limit)) for found in sets if found.cases]
+    chosen = [(found, _take_evenly(found.cases, options.limit)) for found in sets if found.cases]
     total = sum(len(cases) for _, cases in chosen)
     for predictor in {id(method.predictor): method.predictor for method in methods}.values():
         warm_up(predictor)
     done = 0
-    for found, cases in chosen:
-        rows = [SetResult(found.name, method.name) for method in methods]
+    for evaluation_set, cases in chosen:
+        rows = [SetResult(evaluation_set.name, method.name) for method in methods]
         result.sets += rows
         for number, case in enumerate(cases):
             if progress is not None:
-                progress(f"{found.name}: {case.name}", done / total)
-            folder = out / _slug(found.name) / _slug(case.name) if number < options.pictures else None
+                progress(f"{evaluation_set.name}: {case.name}", done / total)
+            folder = out / _slug(evaluation_set.name) / _slug(case.name) if number < options.pictures else None
             try:
                 _run_case(case, methods, rows, options.height, lpips, folder)
             except InputError as error:
-                result.skipped.append(f"{found.name}, {case.name}: {error}")
+                result.skipped.append(f"{evaluation_set.name}, {case.name}: {error}")
             done += 1
             write_json(result, out / "results.json")
     if not any(row.scores for row in result.sets):
@@ -475,12 +475,12 @@ def run_protocol(
 
 
 def write_json(result: ProtocolResult, path: Path) -> None:
-    """Write what was measured so far, atomically; the folder is made.
+    """Write the results atomically, and make the folder.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: the file cannot be written.
     """
-    _make_folder(path.parent)
+    make_folder(path.parent)
     with replacing(path) as partial:
         partial.write_text(json.dumps(result.as_json(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
@@ -493,7 +493,7 @@ def _run_case(
     lpips: Lpips | None,
     folder: Path | None,
 ) -> None:
-    """Add a case to the rows of the methods; a predictor that several of them share predicts once."""
+    """Add a case to the rows of the methods; methods with the same predictor share its prediction."""
     sample = case.read(height)
     predictions = {}
     for method, row in zip(methods, rows, strict=True):
@@ -506,33 +506,26 @@ def _run_case(
         if row.set == _DEPTH_SET:
             errors = measure_depth(sample.context, prediction)
             row.depth += [errors] if errors is not None and math.isfinite(errors.rmse) else []
-        for drawn in render_targets(sample, prediction, method.blend, lpips, method.drawing):
-            row.scores.append(drawn.score)
-            row.render_seconds.append(drawn.seconds)
+        for rendered in render_targets(sample, prediction, method.blend, lpips, method.drawing):
+            row.scores.append(rendered.score)
+            row.render_seconds.append(rendered.seconds)
             if folder is not None:
-                _write_pictures(folder, method.name, drawn)
+                _write_images(folder, method.name, rendered)
 
 
-def _write_pictures(folder: Path, method: str, drawn: RenderedTarget) -> None:
-    _make_folder(folder)
-    stem = _slug(drawn.score.target)
-    write_image(folder / f"{stem}_target.png", drawn.target)
-    write_image(folder / f"{stem}_{_slug(method)}.png", drawn.picture)
-    write_image(folder / f"{stem}_{_slug(method)}_error.png", error_image(drawn.picture, drawn.target))
+def _write_images(folder: Path, method: str, rendered: RenderedTarget) -> None:
+    make_folder(folder)
+    stem = _slug(rendered.score.target)
+    write_image(folder / f"{stem}_target.png", rendered.target)
+    write_image(folder / f"{stem}_{_slug(method)}.png", rendered.image)
+    write_image(folder / f"{stem}_{_slug(method)}_error.png", error_image(rendered.image, rendered.target))
 
 
-def _spread(cases: Sequence[EvaluationCase], limit: int | None) -> Sequence[EvaluationCase]:
-    """At most `limit` cases, evenly spread from the first to the last."""
+def _take_evenly(cases: Sequence[EvaluationCase], limit: int | None) -> Sequence[EvaluationCase]:
+    """At most `limit` cases, spread evenly from the first to the last."""
     if limit is None or limit >= len(cases):
         return cases
     return [cases[i * (len(cases) - 1) // max(limit - 1, 1)] for i in range(limit)]
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot make {folder} ({error.strerror}); choose another --out") from error
 
 
 def _slug(name: str) -> str:
@@ -541,12 +534,3 @@ def _slug(name: str) -> str:
 
 def _mean(values: Sequence[float]) -> float | None:
     return sum(values) / len(values) if values else None
-
-
-def _finite(value: object) -> object:
-    """The same with null for numbers that JSON has no word for."""
-    if isinstance(value, dict):
-        return {key: _finite(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_finite(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,6 +1,6 @@
-"""Predictions against real panoramas: pictures, figures and the table of a whole evaluation.
+"""Evaluation of predictions against real panoramas: images, metrics and a table, with the cross-fade as baseline.
 
-Source: PanSplat, section 4 (metrics of the views between the inputs), beside a cross-fade without geometry.
+Source: PanSplat, section 4 (metrics of the views between the inputs).
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from pansplat.pipeline import Drawing
 from pansplat.predictor import Predictor, Progress
 from pansplat.rendering import Rendering
 
-ERROR_SCALE = 0.25  # mean absolute error of the colours that the error picture shows brightest
+ERROR_SCALE = 0.25  # mean absolute colour error at the brightest colour of the error image
 
 
 @dataclass(frozen=True)
 class Case:
-    """One target view: the figures (dB where PSNR) and where its pictures lie.
+    """Metrics of one target view (PSNR in dB), and the paths of its images.
 
     Attributes:
-        masked_ws_psnr: WS-PSNR of what the target's mask leaves, when it has one; only in the printed table.
-        lpips: None where it was not measured.
+        masked_ws_psnr: WS-PSNR of the unmasked pixels; None without a mask. It is only in the printed table.
+        lpips: None if it was not measured.
     """
 
     name: str
@@ -61,13 +61,12 @@ class Case:
     lpips: float | None = field(default=None, compare=False)
 
     def as_json(self) -> dict[str, object]:
-        """What results.json says of the case; numbers that are not finite become null."""
+        """The entry in results.json; non-finite numbers become null."""
         values = dataclasses.asdict(self)
         del values["masked_ws_psnr"]
         if self.lpips is None:
             del values["lpips"]
-        finite = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
-        return {key: str(value) if isinstance(value, Path) else value for key, value in finite.items()}
+        return {key: str(value) if isinstance(value, Path) else finite_json(value) for key, value in values.items()}
 
 
 def evaluate(
@@ -81,21 +80,21 @@ def evaluate(
     lpips: Lpips | None = None,
     progress: Progress | None = None,
 ) -> list[Case]:
-    """Evaluate every target of the pairs and write results.json and the pictures into `out`.
+    """Evaluate every target of the pairs, and write results.json and images into `out`.
 
-    Each pair is predicted anew, whatever is cached, and the predictor has compiled what it compiles on first use, so
-    that the times are true. results.json is written after each pair: what was done before an interruption is there.
+    For correct times, predictions are not read from the cache, and the predictor runs once before the first pair.
+    results.json is written after each pair, so that an interruption keeps the results so far.
 
     Args:
         blend, drawing: see `pipeline.render`.
 
     Raises:
-        InputError: when no pair has a target, or `out` cannot be written.
+        InputError: no pair has a target, or `out` cannot be written.
     """
     with_targets = [pair for pair in pairs if pair.targets]
     if not with_targets:
         raise InputError("none of the pairs has a target view to compare with; name targets in pairs.json")
-    _make_folder(out)
+    make_folder(out)
     warm_up(predictor)
     draw = partial(pipeline.render, blend=blend, size=(height, 2 * height), drawing=drawing)
     cases: list[Case] = []
@@ -112,7 +111,7 @@ def evaluate(
 
 
 def warm_up(predictor: Predictor) -> None:
-    """Predict from small noise once: kernels compiled on first use are not part of a prediction's time."""
+    """Predict once from small noise, to compile the kernels that the predictor compiles at its first use."""
     images = torch.rand(2, 3, 64, 128, generator=torch.Generator().manual_seed(0))
     poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     poses[1, 0, 3] = 1.0
@@ -138,37 +137,37 @@ def _evaluate_pair(
         pose = targets.cam2world[view]
         began = time.perf_counter()
         with torch.no_grad():
-            picture = draw(scene, pose).color.float()
+            image = draw(scene, pose).color.float()
         render_seconds = time.perf_counter() - began
         name = pair.name if len(targets.images) == 1 else f"{pair.name} {Path(targets.names[view]).stem}"
         folder = out / _free_name(name, taken)
-        _make_folder(folder)
-        write_image(folder / "prediction.png", picture)
+        make_folder(folder)
+        write_image(folder / "prediction.png", image)
         write_image(folder / "target.png", target)
-        write_image(folder / "error.png", error_image(picture, target))
+        write_image(folder / "error.png", error_image(image, target))
         mask = targets.masks[view]
         yield Case(
             name=folder.name,
             model=predictor.name,
             height=height,
-            ws_psnr=ws_psnr(picture, target),
-            psnr=psnr(picture, target),
-            ssim=ssim(picture, target),
+            ws_psnr=ws_psnr(image, target),
+            psnr=psnr(image, target),
+            ssim=ssim(image, target),
             cross_fade_ws_psnr=ws_psnr(cross_fade(context.images, context.cam2world, pose), target),
             predict_seconds=predict_seconds,
             render_seconds=render_seconds,
             num_gaussians=len(scene.gaussians),
             prediction=(folder / "prediction.png").resolve(),
             target=(folder / "target.png").resolve(),
-            masked_ws_psnr=None if bool(mask.all()) else ws_psnr(picture, target, mask=mask),
-            lpips=None if lpips is None else lpips.distance(picture, target),
+            masked_ws_psnr=None if bool(mask.all()) else ws_psnr(image, target, mask=mask),
+            lpips=None if lpips is None else lpips.distance(image, target),
         )
 
 
 def error_image(
     prediction: Float[Tensor, "3 height width"], target: Float[Tensor, "3 height width"]
 ) -> Float[Tensor, "3 height width"]:
-    """The mean absolute error of the colours as heat: black where equal, pale yellow from ERROR_SCALE up."""
+    """The mean absolute colour error as a heat map: black at 0, pale yellow from ERROR_SCALE up."""
     from matplotlib import colormaps
 
     error = (prediction - target).abs().mean(0).div(ERROR_SCALE).clamp(0, 1).cpu().numpy()
@@ -184,7 +183,7 @@ def write_results(cases: Sequence[Case], path: Path) -> None:
 
 
 def results_table(cases: Sequence[Case]) -> Table:
-    """A table of the cases with their mean, to print."""
+    """A printable table of the cases and their mean."""
     columns = _columns(cases)
     table = Table(title=f"{cases[0].model}, {cases[0].height}x{2 * cases[0].height}" if cases else None)
     table.add_column("case")
@@ -202,7 +201,7 @@ def results_table(cases: Sequence[Case]) -> Table:
 
 
 def _columns(cases: Sequence[Case]) -> dict[str, tuple[Callable[[Case], float], str]]:
-    """By head, a column's figure of a case and how it is written; columns that no case has are left out."""
+    """By heading, the value of a case and its format; columns without any value are left out."""
     columns: dict[str, tuple[Callable[[Case], float], str]] = {"WS-PSNR": (lambda case: case.ws_psnr, ".2f")}
     if any(case.masked_ws_psnr is not None for case in cases):
         columns["masked"] = (lambda case: case.ws_psnr if case.masked_ws_psnr is None else case.masked_ws_psnr, ".2f")
@@ -218,7 +217,17 @@ def _columns(cases: Sequence[Case]) -> dict[str, tuple[Callable[[Case], float], 
     }
 
 
-def _make_folder(folder: Path) -> None:
+def finite_json(value: object) -> object:
+    """The value with null for numbers that JSON cannot represent."""
+    if isinstance(value, dict):
+        return {key: finite_json(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [finite_json(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and its parents; an InputError if it cannot be made."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -226,7 +235,7 @@ def _make_folder(folder: Path) -> None:
 
 
 def _free_name(name: str, taken: set[str]) -> str:
-    """The name as one that a folder can have, numbered when another case has it already."""
+    """The name as a valid folder name, numbered if another case has it."""
     base = re.sub(r"[^\w.+-]+", "_", name).strip("._") or "case"
     free, number = base, 2
     while free in taken:

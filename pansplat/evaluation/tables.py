@@ -30,14 +30,14 @@ HEADS = {
     "rmse": "RMSE",
 }
 _FORMATS = {"gaussians": ",.0f", "psnr": ".2f", "ws_psnr": ".2f", "abs_rel": ".4f", "sq_rel": ".4f", "rmse": ".4f"}
-_USUAL = ("ws_psnr", "ssim", "lpips")
-_ALL = ("psnr", "ws_psnr", "ssim", "lpips")
+_METRICS = ("ws_psnr", "ssim", "lpips")
+_METRICS_WITH_PSNR = ("psnr", "ws_psnr", "ssim", "lpips")
 _RERUN = "PanSplat (a user's re-run)"
 
 
 @dataclass(frozen=True)
 class TableRow:
-    """A method and what it reached."""
+    """The values of one method."""
 
     method: str
     values: Values
@@ -48,9 +48,7 @@ class Layout:
     """A table of the paper.
 
     Attributes:
-        title: what it shows.
-        sets: test sets, left to right.
-        metrics: for each of them, left to right.
+        sets, metrics: from left to right; every set has all metrics.
         rows: the paper's.
     """
 
@@ -69,20 +67,20 @@ def _layout(
     title: str, sets: tuple[str, ...], metrics: tuple[str, ...], rows: Mapping[str, Sequence[float | None]]
 ) -> Layout:
     columns = [(name, metric) for name in sets for metric in metrics]
-    made = []
+    table_rows = []
     for method, numbers in rows.items():
         values = {c: n for c, n in zip(columns, numbers, strict=True) if n is not None}
-        made.append(TableRow(method, values))
-    return Layout(title, sets, metrics, tuple(made))
+        table_rows.append(TableRow(method, values))
+    return Layout(title, sets, metrics, tuple(table_rows))
 
 
-_NONE3 = (None, None, None)
+_NO_VALUES = (None, None, None)
 
 LAYOUTS: dict[str, Layout] = {
     "m3d": _layout(
         "Matterport3D, wide baselines",
         ("M3D 1.0 m", "M3D 1.5 m", "M3D 2.0 m"),
-        _USUAL,
+        _METRICS,
         {
             "S-NeRF": (15.25, 0.579, 0.546, 14.16, 0.563, 0.580, 13.13, 0.523, 0.607),
             "OmniSyn": (22.90, 0.850, 0.244, 20.31, 0.790, 0.317, 18.91, 0.761, 0.354),
@@ -97,7 +95,7 @@ LAYOUTS: dict[str, Layout] = {
     "narrow": _layout(
         "Matterport3D, narrow baselines",
         ("M3D 0.2 m", "M3D 0.5 m"),
-        _USUAL,
+        _METRICS,
         {
             "PanoGRF": (33.27, None, None, 30.46, None, None),
             "MVSplat (spherical)": (32.04, None, None, 30.58, None, None),
@@ -108,7 +106,7 @@ LAYOUTS: dict[str, Layout] = {
     "replica": _layout(
         "Replica",
         ("Replica 1.0 m",),
-        _USUAL,
+        _METRICS,
         {
             "S-NeRF": (16.10, 0.723, 0.443),
             "OmniSyn": (23.17, 0.898, 0.189),
@@ -123,10 +121,10 @@ LAYOUTS: dict[str, Layout] = {
     "residential": _layout(
         "Residential",
         ("Residential 0.3 m",),
-        _USUAL,
+        _METRICS,
         {
             "S-NeRF": (22.47, 0.741, 0.435),
-            "OmniSyn": _NONE3,
+            "OmniSyn": _NO_VALUES,
             "IBRNet": (22.47, 0.735, 0.498),
             "NeuRay": (22.38, 0.753, 0.427),
             "PanoGRF": (31.03, 0.909, 0.207),
@@ -138,7 +136,7 @@ LAYOUTS: dict[str, Layout] = {
     "360loc": _layout(
         "360Loc",
         ("360Loc",),
-        _ALL,
+        _METRICS_WITH_PSNR,
         {
             "MVSplat (spherical)": (24.13, 24.67, 0.823, 0.170),
             "PanSplat": (24.96, 25.58, 0.833, 0.159),
@@ -148,7 +146,7 @@ LAYOUTS: dict[str, Layout] = {
     "insta360": _layout(
         "Insta360",
         ("Insta360",),
-        _ALL,
+        _METRICS_WITH_PSNR,
         {
             "MVSplat (spherical)": (20.93, 23.24, 0.786, 0.227),
             "PanSplat": (21.92, 24.43, 0.813, 0.211),
@@ -158,7 +156,7 @@ LAYOUTS: dict[str, Layout] = {
     "ablation": _layout(
         "Ablation on Matterport3D",
         ("M3D 1.0 m",),
-        ("gaussians", *_USUAL),
+        ("gaussians", *_METRICS),
         {
             "Base": (1_049_000, 27.07, 0.895, 0.127),
             "+ Fibonacci lattice": (668_000, 27.86, 0.906, 0.116),
@@ -180,10 +178,10 @@ DEPTH_LAYOUT = _layout(
 
 
 def rich_table(layout: Layout, ours: Sequence[TableRow], heads: Mapping[str, str] = HEADS) -> Table:
-    """The table to print: the paper's rows, a line, ours in bold.
+    """The printable table: the paper's rows, a line, and ours in bold.
 
     Args:
-        heads: what to call the metrics.
+        heads: headings of the metrics.
     """
     table = Table(title=layout.title)
     table.add_column("method")
@@ -199,7 +197,7 @@ def rich_table(layout: Layout, ours: Sequence[TableRow], heads: Mapping[str, str
 
 
 def markdown_table(layout: Layout, ours: Sequence[TableRow], heads: Mapping[str, str] = HEADS) -> str:
-    """The same as a Markdown table, ours in bold."""
+    """The table in Markdown, with ours in bold."""
     names = [f"{name} {heads[metric]}" for name, metric in layout.columns]
     lines = [f"### {layout.title}", "", f"| method | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
     for row in (*layout.rows, *ours):
@@ -211,7 +209,7 @@ def markdown_table(layout: Layout, ours: Sequence[TableRow], heads: Mapping[str,
 
 
 def _cells(row: TableRow, layout: Layout) -> list[str]:
-    """Formatted numbers; a dash where there is none."""
+    """Formatted numbers; a dash for a missing one."""
     cells = []
     for column in layout.columns:
         value = row.values.get(column)
@@ -220,13 +218,13 @@ def _cells(row: TableRow, layout: Layout) -> list[str]:
 
 
 def frame_distance_layout(result: ProtocolResult) -> Layout:
-    """A table of the figure's numbers; the paper gives none."""
+    """A table of the numbers of the figure over the frame distance; the paper has none."""
     sets = tuple(dict.fromkeys(row.set for row in result.sets))
     return Layout("The frame in the middle, by frames between the inputs", sets, ("ws_psnr",), ())
 
 
-def curves(rows: Sequence[SetResult], metric: str) -> dict[str, list[tuple[int, float]]]:
-    """By method, the frame distances and what was reached there."""
+def frame_distance_curves(rows: Sequence[SetResult], metric: str) -> dict[str, list[tuple[int, float]]]:
+    """By method, the frame distances and the values of the metric."""
     lines: dict[str, list[tuple[int, float]]] = {}
     for row in rows:
         value = row.mean(metric)
@@ -236,7 +234,7 @@ def curves(rows: Sequence[SetResult], metric: str) -> dict[str, list[tuple[int, 
 
 
 def plot_frame_distance(result: ProtocolResult, path: Path) -> None:
-    """Write the figure: one panel for WS-PSNR, one for LPIPS where it was measured.
+    """Write the figure: a panel for WS-PSNR, and one for LPIPS if it was measured.
 
     Raises:
         InputError: the file cannot be written.
@@ -245,7 +243,7 @@ def plot_frame_distance(result: ProtocolResult, path: Path) -> None:
     figure = Figure(figsize=(5.5 * len(metrics), 4), layout="constrained")
     panels = figure.subplots(1, len(metrics), squeeze=False)[0]
     for axes, metric in zip(panels, metrics, strict=True):
-        for method, line in curves(result.sets, metric).items():
+        for method, line in frame_distance_curves(result.sets, metric).items():
             axes.plot(*zip(*line, strict=True), marker="o", label=method)
         unit = ", dB" if metric == "ws_psnr" else f" ({result.lpips}), lower is better"
         axes.set(xlabel="frames between the inputs", ylabel=HEADS[metric] + unit)
@@ -259,7 +257,7 @@ _PAPER_LPIPS = "lpips-vgg"
 
 
 def list_layouts(result: ProtocolResult) -> list[Layout]:
-    """The tables of the evaluation, as the paper has them."""
+    """The paper's tables for the evaluation."""
     if result.protocol == "frame-distance":
         return [frame_distance_layout(result)]
     with_depth = result.protocol == "m3d" and any(row.depth for row in result.sets)
@@ -267,30 +265,30 @@ def list_layouts(result: ProtocolResult) -> list[Layout]:
 
 
 def our_rows(result: ProtocolResult, layout: Layout) -> list[TableRow]:
-    """A row a method with what it reached on the table's sets."""
+    """A row for each method with its values on the table's sets."""
     rows: dict[str, TableRow] = {}
-    for reached in result.sets:
-        row = rows.setdefault(reached.method, TableRow(reached.method, {}))
+    for set_result in result.sets:
+        row = rows.setdefault(set_result.method, TableRow(set_result.method, {}))
         for metric in layout.metrics:
-            value = reached.mean(metric)
+            value = set_result.mean(metric)
             if value is not None:
-                row.values[reached.set, metric] = value
+                row.values[set_result.set, metric] = value
     return list(rows.values())
 
 
 def rich_tables(result: ProtocolResult) -> list[Table]:
-    """The tables to print."""
+    """The printable tables."""
     return [rich_table(layout, our_rows(result, layout), HEADS) for layout in list_layouts(result)]
 
 
 def report_notes(result: ProtocolResult) -> list[str]:
-    """What a reader of the tables must know: how many images, what is missing, what cannot be compared."""
+    """Notes on the tables: numbers of images, missing data, and figures that are not comparable."""
     counts = {row.set: len(row.scores) for row in result.sets}
     lines = ["Ours: " + ", ".join(f"{name}: {_images(count)}" for name, count in counts.items()) + "."]
     if result.height != 512:
         lines.append(f"Ours is at {result.height}x{2 * result.height}, the paper's figures at 512x1024.")
     if result.lpips is None:
-        lines.append("No LPIPS: its weights are not here (docs/evaluation.md says where to get them).")
+        lines.append("No LPIPS: its weights were not found (see docs/evaluation.md).")
     elif result.lpips != _PAPER_LPIPS:
         lines.append(f"LPIPS of ours is {result.lpips}, the paper's is {_PAPER_LPIPS}: do not compare them.")
     lines += [f"Missing: {line}." for line in result.missing]
@@ -299,23 +297,21 @@ def report_notes(result: ProtocolResult) -> list[str]:
 
 
 def write_report(result: ProtocolResult, out: Path) -> list[Path]:
-    """Write table.md, and frame_distance.png where it is asked for; the paths.
+    """Write table.md, and frame_distance.png for that protocol; return the paths.
 
     Raises:
-        InputError: they cannot be written.
+        InputError: a file cannot be written.
     """
     tables = [markdown_table(layout, our_rows(result, layout)) for layout in list_layouts(result)]
     with replacing(out / "table.md") as partial:
-        partial.write_text("\n".join([*tables, *_items(report_notes(result))]) + "\n", encoding="utf-8")
+        partial.write_text(
+            "\n".join([*tables, *(f"* {note}" for note in report_notes(result))]) + "\n", encoding="utf-8"
+        )
     written = [out / "table.md"]
     if result.protocol == "frame-distance":
         plot_frame_distance(result, out / "frame_distance.png")
         written.append(out / "frame_distance.png")
     return written
-
-
-def _items(lines: Sequence[str]) -> list[str]:
-    return [f"* {line}" for line in lines]
 
 
 def _images(count: int) -> str:

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from pansplat.errors import InputError
 from pansplat.evaluation import lpips
-from pansplat.evaluation.lpips import FOLDER_VARIABLE, TAPS, Backbone, Lpips, find_backbone, load_lpips
+from pansplat.evaluation.lpips import FOLDER_VARIABLE, LAYER_CHANNELS, Backbone, Lpips, find_backbone, load_lpips
 
-# What lpips 0.1.4 (PyPI, over torchvision 0.29.2 and torch 2.13.0, float64) says of `pair()`, with `normalize=True`.
-# "recipe": its own heads, and a classifier whose layers `recipe` made, put into `LPIPS(...).net` by their names.
+# lpips 0.1.4 (PyPI, torchvision 0.29.2, torch 2.13.0, float64) of `pair()` with `normalize=True`; its heads, and a
+# classifier with the weights of `recipe`, loaded into `LPIPS(...).net` by name.
 RECIPE_VALUES: dict[Backbone, float] = {"vgg": 0.0726357020, "alex": 0.0342026892, "squeeze": 0.0611231423}
 # With the trained SqueezeNet 1.1 of ../shared/weights.
 TRAINED_VALUE = 0.2198666598
@@ -23,7 +23,7 @@ TOLERANCE = 1e-7  # the package keeps the mean and deviation of its training in 
 
 
 def pair() -> tuple[Tensor, Tensor]:
-    """Two pictures (1 3 66 100) that any program can make again; float64 of float32 values."""
+    """Two reproducible images (1 3 66 100), float64 of float32 values."""
     noise = 0.1 * torch.sin(torch.arange(66 * 100 * 3).reshape(3, 66, 100).double() * 1.7).float()
     return waves(0.0)[None].double(), (waves(0.7) + noise)[None].double()
 
@@ -35,7 +35,7 @@ def waves(phase: float) -> Tensor:
 
 
 def recipe(name: str, shape: torch.Size) -> Tensor:
-    """Numbers for a layer of torchvision's name: normal, seeded by it."""
+    """Normal weights of a layer, seeded by its torchvision name."""
     drawn = np.random.RandomState(zlib.crc32(name.encode())).standard_normal(shape)
     scale = np.sqrt(2 / np.prod(shape[1:])) if name.endswith("weight") else 0.1
     return torch.from_numpy(scale * drawn).float()
@@ -47,13 +47,13 @@ def write_classifier(path: Path, backbone: Backbone) -> None:
 
 
 def write_heads(path: Path, backbone: Backbone) -> None:
-    rows = enumerate(TAPS[backbone].values())
+    rows = enumerate(LAYER_CHANNELS[backbone].values())
     torch.save({f"lin{i}.model.1.weight": recipe(f"{i}.weight", (1, c, 1, 1)).abs() for i, c in rows}, path)
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Lpips:
-    """Squeeze with made-up weights, as a bare clone has it; float64."""
+    """Squeeze with random weights, float64."""
     folder = tmp_path_factory.mktemp("weights")
     write_classifier(folder / "squeezenet1_1-made.pth", "squeeze")
     write_heads(folder / "squeeze.pth", "squeeze")
@@ -62,7 +62,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Lpips:
 
 @pytest.fixture
 def nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A machine without weights; its empty torch.hub cache."""
+    """The empty torch.hub cache of a machine without weights."""
     monkeypatch.delenv(FOLDER_VARIABLE, raising=False)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     return tmp_path / "torch" / "hub" / "checkpoints"
@@ -84,14 +84,14 @@ def test_equals_the_lpips_package_with_trained_weights(shared: Path) -> None:
     assert float(metric(*pair())) == pytest.approx(TRAINED_VALUE, rel=TOLERANCE)
 
 
-def test_is_zero_for_equal_pictures_and_symmetric(made: Lpips) -> None:
+def test_the_distance_is_symmetric_and_zero_for_equal_images(made: Lpips) -> None:
     a, b = pair()
     assert float(made(a, a)) == 0
     assert float(made(a, b)) == pytest.approx(float(made(b, a)), rel=1e-12)
     assert float(made(a, b)) > 0
 
 
-def test_a_batch_is_its_items(made: Lpips) -> None:
+def test_a_batch_equals_its_items(made: Lpips) -> None:
     a, b = pair()
     both = made(torch.cat((a, b)), torch.cat((b, b)))
     assert both.tolist() == pytest.approx([float(made(a, b)), 0.0], abs=1e-12)
@@ -102,7 +102,7 @@ def test_equal_weights_change_nothing(made: Lpips) -> None:
     assert float(made(a, b, torch.full((1, 66, 100), 0.3).double())) == pytest.approx(float(made(a, b)), rel=1e-12)
 
 
-def test_what_is_masked_has_no_part(made: Lpips) -> None:
+def test_pixels_of_weight_zero_have_no_effect(made: Lpips) -> None:
     a, b = pair()
     weights = torch.ones(1, 66, 100, dtype=torch.float64)
     weights[:, 40:] = 0
@@ -115,18 +115,18 @@ def test_what_is_masked_has_no_part(made: Lpips) -> None:
     assert float(made(a, b, torch.zeros_like(weights))) == 0
 
 
-def test_gradients_are_those_of_finite_differences(made: Lpips) -> None:
+def test_gradients_equal_finite_differences(made: Lpips) -> None:
     a, b = pair()
     a = a.requires_grad_()
     (gradient,) = torch.autograd.grad(made(a, b).sum(), a)
     direction = torch.sin(torch.arange(a.numel()).double()).reshape(a.shape)
     step = 1e-6
     with torch.no_grad():
-        slope = float(made(a + step * direction, b) - made(a - step * direction, b)) / (2 * step)
-    assert float((gradient * direction).sum()) == pytest.approx(slope, rel=1e-4)
+        derivative = float(made(a + step * direction, b) - made(a - step * direction, b)) / (2 * step)
+    assert float((gradient * direction).sum()) == pytest.approx(derivative, rel=1e-4)
 
 
-def test_where_nothing_is_activated_the_distance_and_its_gradients_are_zero() -> None:
+def test_zero_activations_have_zero_distance_and_gradient() -> None:
     metric = Lpips("squeeze")
     for parameter in metric.features.parameters():
         parameter.data.zero_()
@@ -138,18 +138,18 @@ def test_where_nothing_is_activated_the_distance_and_its_gradients_are_zero() ->
     assert distance.item() == 0 and not gradient.any()
 
 
-def test_weights_do_not_learn(made: Lpips) -> None:
+def test_weights_are_not_trained(made: Lpips) -> None:
     assert not any(parameter.requires_grad for parameter in made.parameters())
     assert not made.train().training
 
 
-def test_small_pictures_are_refused(made: Lpips) -> None:
+def test_small_images_are_refused(made: Lpips) -> None:
     small = torch.zeros(1, 3, 16, 32, dtype=torch.float64)
     with pytest.raises(InputError, match="32 pixels or more along each side, got 16x32"):
         made(small, small)
 
 
-def test_missing_files_are_named_with_where_to_get_and_put_them(nowhere: Path, tmp_path: Path) -> None:
+def test_missing_files_are_named_with_their_source_and_folders(nowhere: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError) as error:
         load_lpips("vgg", tmp_path)
     for part in (
@@ -163,7 +163,7 @@ def test_missing_files_are_named_with_where_to_get_and_put_them(nowhere: Path, t
     assert find_backbone(tmp_path) is None
 
 
-def test_only_the_missing_file_is_asked_for(nowhere: Path, tmp_path: Path) -> None:
+def test_only_missing_files_are_named(nowhere: Path, tmp_path: Path) -> None:
     write_heads(tmp_path / "alex.pth", "alex")
     with pytest.raises(InputError) as error:
         load_lpips("alex", tmp_path)
@@ -171,7 +171,7 @@ def test_only_the_missing_file_is_asked_for(nowhere: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("place", ["folder", "variable", "hub"])
-def test_files_are_found_where_they_may_lie(
+def test_files_are_found_in_every_folder(
     place: str, nowhere: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = nowhere if place == "hub" else tmp_path / "mine"
@@ -205,7 +205,7 @@ def vgg() -> Lpips:
 
 
 def measured(metric: Lpips, size: tuple[int, int], weighed: bool) -> tuple[torch.Tensor, torch.Tensor]:
-    """The distances of two pictures each, and their gradient."""
+    """The distances of two pairs of images, and their gradient."""
     generator = torch.Generator().manual_seed(1)
     shape = (2, 3, *size)
     a, b = (torch.rand(shape, generator=generator, dtype=torch.float64) for _ in range(2))
@@ -224,18 +224,18 @@ def measured(metric: Lpips, size: tuple[int, int], weighed: bool) -> tuple[torch
 def test_bands_change_neither_distances_nor_gradients(
     size: tuple[int, int], pixels: int, weighed: bool, vgg: Lpips, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wanted, wanted_gradient = measured(vgg, size, weighed)
+    expected, expected_gradient = measured(vgg, size, weighed)
     monkeypatch.setattr(lpips, "_WHOLE", 0)
     monkeypatch.setattr(lpips, "_BAND", pixels)
     found, gradient = measured(vgg, size, weighed)
-    torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-14)
-    torch.testing.assert_close(gradient, wanted_gradient, rtol=1e-9, atol=1e-9 * float(wanted_gradient.abs().max()))
-    assert float(wanted.min()) > 0.01
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(gradient, expected_gradient, rtol=1e-9, atol=1e-9 * float(expected_gradient.abs().max()))
+    assert float(expected.min()) > 0.01
 
 
-def test_bands_keep_a_band_of_activations_at_a_time(vgg: Lpips, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bands_limit_the_activations_in_memory(vgg: Lpips, monkeypatch: pytest.MonkeyPatch) -> None:
     def largest() -> int:
-        """Numbers that are kept for the backward pass before it begins."""
+        """Number of values saved for the backward pass."""
         kept: dict[int, int] = {}
 
         def keep(tensor: torch.Tensor) -> torch.Tensor:

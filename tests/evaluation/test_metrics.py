@@ -24,7 +24,7 @@ def pair() -> tuple[torch.Tensor, torch.Tensor]:
 
 @pytest.mark.shared
 @pytest.mark.parametrize("name", METRICS)
-def test_equals_the_official_value(shared: Path, name: str) -> None:
+def test_metrics_equal_the_official_values(shared: Path, name: str) -> None:
     golden = load_file(shared / "golden" / "units.safetensors")
     for i in range(2):
         value = METRICS[name](golden["metric.pred"][i], golden["metric.gt"][i])
@@ -52,7 +52,7 @@ def test_only_psnr_clamps() -> None:
     assert ws_psnr(target + 0.5, target) == pytest.approx(-20 * math.log10(0.5))
 
 
-def test_a_pole_row_counts_by_its_solid_angle() -> None:
+def test_ws_psnr_weights_rows_by_solid_angle() -> None:
     height = 16
     target = torch.zeros(3, height, 32, dtype=torch.float64)
     weights = row_weights(height)
@@ -64,7 +64,7 @@ def test_a_pole_row_counts_by_its_solid_angle() -> None:
         assert psnr(wrong, target) == pytest.approx(-10 * math.log10(1 / height))
 
 
-def test_masked_pixels_do_not_count(pair: tuple[torch.Tensor, torch.Tensor]) -> None:
+def test_masked_pixels_are_ignored(pair: tuple[torch.Tensor, torch.Tensor]) -> None:
     _, target = pair
     wrong = target.clone()
     wrong[:, 20:] = 0.0
@@ -77,7 +77,7 @@ def test_masked_pixels_do_not_count(pair: tuple[torch.Tensor, torch.Tensor]) -> 
 
 
 def test_ssim_of_constant_images_is_its_closed_form() -> None:
-    """Without structure only the luminance term is left."""
+    """Without structure only the luminance term remains."""
     a, b = 0.3, 0.7
     value = ssim(*(torch.full((3, 20, 40), c, dtype=torch.float64) for c in (a, b)))
     assert value == pytest.approx((2 * a * b + 1e-4) / (a * a + b * b + 1e-4), abs=1e-9)
@@ -100,7 +100,7 @@ def test_a_mask_of_another_size_is_refused(unchecked: None) -> None:
         psnr(image, image, mask=torch.ones(8, 16, dtype=torch.bool))
 
 
-def test_ssim_needs_a_window() -> None:
+def test_ssim_refuses_images_smaller_than_its_window() -> None:
     with pytest.raises(ValueError, match="larger than 10 x 10"):
         ssim(torch.zeros(3, 10, 20), torch.zeros(3, 10, 20))
 
@@ -108,7 +108,7 @@ def test_ssim_needs_a_window() -> None:
 NEAR, FAR = 0.45, 10.0
 
 
-def test_constant_depths_have_the_closed_forms_errors() -> None:
+def test_depth_errors_of_constants_have_their_closed_forms() -> None:
     truth = torch.full((2, 8, 16), 4.0)
     errors = depth_errors(torch.full((2, 4, 8), 5.0), truth, NEAR, FAR)
     assert (errors.abs_rel, errors.sq_rel, errors.rmse) == pytest.approx((0.25, 0.25, 1.0))
@@ -116,7 +116,7 @@ def test_constant_depths_have_the_closed_forms_errors() -> None:
     assert (errors.abs_rel, errors.sq_rel, errors.rmse) == pytest.approx((0.5, 1.0, 2.0))
 
 
-def test_pixels_of_all_views_are_one_set() -> None:
+def test_depth_errors_are_means_over_the_pixels_of_all_views() -> None:
     truth = torch.full((2, 4, 8), 2.0)
     truth[0, :3] = 0  # the first view has a quarter of its pixels
     depth = truth.clone()
@@ -127,7 +127,7 @@ def test_pixels_of_all_views_are_one_set() -> None:
 
 
 @pytest.mark.parametrize("unknown", [0.0, NEAR, FAR, 30.0])
-def test_depth_at_or_beyond_the_range_is_unknown(unknown: float) -> None:
+def test_depth_outside_the_range_is_ignored(unknown: float) -> None:
     truth = torch.full((1, 4, 8), 2.0)
     truth[:, 2:] = unknown
     depth = torch.full((1, 4, 8), 2.0)
@@ -136,14 +136,14 @@ def test_depth_at_or_beyond_the_range_is_unknown(unknown: float) -> None:
     assert (errors.abs_rel, errors.sq_rel, errors.rmse) == (0, 0, 0)
 
 
-def test_a_smaller_map_is_made_larger_bilinearly_between_pixel_centres() -> None:
+def test_a_smaller_depth_map_is_resized_bilinearly() -> None:
     """Two columns of 1 and 3 metres become 1, 1.5, 2.5, 3."""
     depth = torch.tensor([1.0, 3.0]).expand(1, 1, 2)
     truth = torch.tensor([1.0, 1.5, 2.5, 3.0]).expand(1, 2, 4)
     assert depth_errors(depth, truth, NEAR, FAR).rmse == pytest.approx(0, abs=1e-12)
 
 
-def test_without_a_known_pixel_errors_are_not_numbers() -> None:
+def test_depth_errors_without_known_pixels_are_nan() -> None:
     errors = depth_errors(torch.ones(1, 4, 8), torch.zeros(1, 4, 8), NEAR, FAR)
     assert math.isnan(errors.abs_rel) and math.isnan(errors.sq_rel) and math.isnan(errors.rmse)
 
@@ -156,25 +156,25 @@ def pose_at(x: float, quat: tuple[float, ...] = (1, 0, 0, 0)) -> torch.Tensor:
 
 
 def sky(pose: torch.Tensor, height: int = 64) -> torch.Tensor:
-    """What a camera sees of smooth colours at infinity."""
+    """A panorama of smooth colours at infinity."""
     directions = pixel_directions(height, 2 * height, dtype=torch.float64) @ pose[:3, :3].T
     return (0.5 + 0.4 * torch.sin(2 * directions + directions.roll(1, -1))).permute(2, 0, 1).float()
 
 
-def test_a_far_away_world_is_reproduced_in_any_orientation() -> None:
+def test_the_cross_fade_is_exact_for_a_scene_at_infinity() -> None:
     poses = [pose_at(0, (0.9, 0.2, 0.4, -0.1)), pose_at(1, (0.3, -0.8, 0.1, 0.5))]
     target = pose_at(0.3, (0.7, 0.1, -0.6, 0.3))
     faded = cross_fade(torch.stack([sky(p) for p in poses]), torch.stack(poses), target)
     assert float((faded - sky(target)).abs().max()) < 5e-3  # bilinear sampling
 
 
-def test_at_an_input_the_other_does_not_matter() -> None:
+def test_the_cross_fade_at_an_input_is_that_input() -> None:
     images = torch.stack((sky(pose_at(0)), torch.rand(3, 64, 128)))
     faded = cross_fade(images, torch.stack((pose_at(0), pose_at(1))), pose_at(0))
     torch.testing.assert_close(faded, images[0], atol=1e-5, rtol=0)
 
 
-def test_weights_follow_the_distance() -> None:
+def test_the_cross_fade_weights_inputs_by_distance() -> None:
     images = torch.stack((torch.zeros(3, 8, 16), torch.ones(3, 8, 16)))
     faded = cross_fade(images, torch.stack((pose_at(0), pose_at(1))), pose_at(0.25))
     torch.testing.assert_close(faded, torch.full((3, 8, 16), 0.25))
@@ -182,7 +182,7 @@ def test_weights_follow_the_distance() -> None:
 
 @pytest.mark.shared
 @pytest.mark.parametrize(("folder", "expected"), [("mp3d_sample", [16.0]), ("zind", [14.1, 15.8, 17.1])])
-def test_reference_figures_of_real_rooms(shared: Path, folder: str, expected: list[float]) -> None:
+def test_the_cross_fade_of_real_rooms_is_unchanged(shared: Path, folder: str, expected: list[float]) -> None:
     pairs = [pair for pair in load_pairs(shared / "data" / folder) if pair.targets]
     scores = []
     for pair in pairs:

@@ -1,4 +1,4 @@
-"""The right poses win; each wrong convention is named, unless the pictures cannot tell."""
+"""The right poses fit best; each wrong convention is named, unless the images cannot distinguish it."""
 
 import dataclasses
 from pathlib import Path
@@ -52,7 +52,7 @@ _TILTED = (_pose((0.9, 0.1, 0.3, 0.05), (0.4, 0.2, -0.3)), _pose((0.6, -0.15, -0
 
 
 def _wrong(poses: torch.Tensor, mistake: str) -> torch.Tensor:
-    """What a user who makes the mistake gives as OpenCV cam2world poses."""
+    """The given poses under a mistake, read as OpenCV cam2world."""
     turned = poses.clone()
     turned[:, :3, :3] = poses[:, :3, :3].transpose(-1, -2)
     robot = torch.eye(4, dtype=torch.float64)  # columns: forward, left and up in OpenCV's axes
@@ -73,7 +73,7 @@ _MISTAKES = ("inverse", "opengl axes", "inverse, opengl axes", "transposed rotat
              "x-forward camera", "turned by 90 degrees")  # fmt: skip
 
 
-def test_right_poses_fit_best_and_nothing_is_said_against_them() -> None:
+def test_right_poses_fit_best() -> None:
     check = check_views(_views(*_TILTED), "box")
     assert check.best == AS_GIVEN
     assert check.ok
@@ -93,12 +93,12 @@ def test_each_wrong_convention_is_named(mistake: str) -> None:
     assert not check.ok
 
 
-def test_among_nearly_perfect_fits_none_is_called_a_mistake() -> None:
+def test_a_nearly_perfect_fit_is_no_mistake() -> None:
     assert _likely_mistake({"inverse": 0.001, AS_GIVEN: 0.004}) is None
     assert _likely_mistake({"inverse": 0.201, AS_GIVEN: 0.304}) is not None
 
 
-def test_readings_of_the_same_motion_are_called_indistinguishable() -> None:
+def test_readings_with_the_same_relative_pose_are_indistinguishable() -> None:
     side = (_pose((1, 0, 0, 0), (0, 0, 0)), _pose((1, 0, 0, 0), (0.8, 0, 0)))
     check = check_views(_views(*side))
     assert check.best == AS_GIVEN
@@ -106,7 +106,7 @@ def test_readings_of_the_same_motion_are_called_indistinguishable() -> None:
     assert "same as given for these views: " in check.report()
 
 
-def test_mistakes_that_make_the_same_motion_are_named_together() -> None:
+def test_mistakes_with_the_same_relative_pose_are_named_together() -> None:
     side = (_pose((1, 0, 0, 0), (0, 0, 0)), _pose((1, 0, 0, 0), (0.8, 0, 0)))
     views = _views(*side)
     check = check_views(dataclasses.replace(views, cam2world=invert_pose(views.cam2world)))
@@ -120,7 +120,7 @@ def test_three_views_are_checked_together() -> None:
     assert check_views(_views(*_TILTED, third)).best == AS_GIVEN
 
 
-def test_poses_in_millimetres_are_warned_of() -> None:
+def test_poses_in_millimetres_give_a_warning() -> None:
     views = _views(*_TILTED)
     poses = views.cam2world.clone()
     poses[:, :3, 3] *= 1000
@@ -128,13 +128,13 @@ def test_poses_in_millimetres_are_warned_of() -> None:
     assert "millimetres" in warning
 
 
-def test_a_baseline_of_nothing_is_warned_of() -> None:
+def test_coincident_cameras_give_a_warning() -> None:
     views = _views(_TILTED[0], _TILTED[0])
     check = check_views(views)
     assert any("parallax" in warning for warning in check.warnings)
 
 
-def test_pictures_of_different_places_are_warned_of() -> None:
+def test_unrelated_images_give_a_warning() -> None:
     views = _views(*_TILTED)
     noise = torch.rand(views.images.shape, generator=torch.Generator().manual_seed(0))
     check = check_views(dataclasses.replace(views, images=noise))
@@ -157,13 +157,10 @@ def test_shared_poses_pass(shared: Path, data: str, index: int) -> None:
     [
         ("cam2world opengl", "opengl axes"),
         ("world2cam opencv", "inverse"),
-        (
-            "world2cam opengl",
-            "inverse",
-        ),  # what it says, and OpenCV axes: both words of the convention were wrong
+        ("world2cam opengl", "inverse"),  # with OpenCV axes: both words of the convention are wrong
     ],
 )
-def test_a_real_pair_read_with_the_wrong_convention_is_caught(shared: Path, convention: str, reading: str) -> None:
+def test_a_real_pair_with_the_wrong_convention_is_detected(shared: Path, convention: str, reading: str) -> None:
     check = check_pair(load_pairs(shared / "data" / "zind", convention=convention)[3])
     assert check.best == reading
     assert check.likely_mistake is not None

@@ -1,4 +1,4 @@
-"""The paper's evaluations on whatever of their data is here: the sets, the figures, what is said of what is missing."""
+"""The paper's evaluations: their sets, metrics and reports, and messages for missing data."""
 
 import json
 import math
@@ -18,15 +18,24 @@ from pansplat.evaluation.protocol import (
     INSTA360,
     LOC360,
     ProtocolOptions,
+    ProtocolResult,
     Score,
     SetResult,
+    find_sequence_set,
     find_sequences,
     find_sets,
     list_methods,
     run_protocol,
-    sequence_set,
 )
-from pansplat.evaluation.tables import LAYOUTS, curves, list_layouts, our_rows, report_notes, rich_tables, write_report
+from pansplat.evaluation.tables import (
+    LAYOUTS,
+    frame_distance_curves,
+    list_layouts,
+    our_rows,
+    report_notes,
+    rich_tables,
+    write_report,
+)
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.model.network import NetworkPredictor
@@ -37,7 +46,7 @@ RADIUS = 2.0  # metres
 
 
 class Sphere:
-    """One Gaussian a pixel on a sphere round each camera; counts its calls."""
+    """One Gaussian for each pixel on a sphere around each camera; counts its calls."""
 
     name, fingerprint = "sphere", "1"
 
@@ -61,7 +70,7 @@ class Sphere:
 
 
 class Network(NetworkPredictor):
-    """The sphere as a network that also tells depths, coarse to fine; only the finest is right."""
+    """The sphere as a network with depths from coarse to fine; only the finest is right."""
 
     name, fingerprint = "network", "1"
 
@@ -76,7 +85,7 @@ class Network(NetworkPredictor):
         return self(images, cam2world, near, far), depths
 
 
-def write_picture(path: Path, seed: int) -> None:
+def write_panorama(path: Path, seed: int) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     blocks = np.random.default_rng(seed).integers(0, 255, (HEIGHT // 4, HEIGHT // 2, 3), dtype=np.uint8)
     Image.fromarray(blocks.repeat(4, 0).repeat(4, 1)).save(path)
@@ -88,7 +97,7 @@ def write_triplets(root: Path, kind: str, *, scenes: int = 2, depth_metres: floa
     for scene in range(scenes):
         for view in range(3):
             place = folder / f"{scene:08d}" / f"{view:02d}"
-            write_picture(place / "rgb.png", 10 * scene + view)
+            write_panorama(place / "rgb.png", 10 * scene + view)
             np.savetxt(place / "rot.txt", np.eye(3))
             np.savetxt(place / "tran.txt", [0.5 * view, 0, 0])
             if depth_metres is not None:
@@ -101,7 +110,7 @@ def write_loc360(root: Path, frames: int = 7) -> Path:
     folder = root / "atrium" / "mapping" / "daytime_360_0"
     poses = {}
     for frame in range(frames):
-        write_picture(folder / "image" / f"{frame:04d}.png", frame)
+        write_panorama(folder / "image" / f"{frame:04d}.png", frame)
         pose = np.eye(4)
         pose[0, 3] = 0.2 * frame
         poses[f"{frame:04d}.png"] = pose.tolist()
@@ -112,8 +121,8 @@ def write_loc360(root: Path, frames: int = 7) -> Path:
 def write_insta360(root: Path, frames: int) -> Path:
     folder = root / "insta360" / "VID_0001"
     folder.mkdir(parents=True)
-    pictures = (np.full((HEIGHT, 2 * HEIGHT, 3), 5 * frame + 20, np.uint8) for frame in range(frames))
-    write_video(folder / "video.mp4", pictures, 24.0)
+    images = (np.full((HEIGHT, 2 * HEIGHT, 3), 5 * frame + 20, np.uint8) for frame in range(frames))
+    write_video(folder / "video.mp4", images, 24.0)
     lines = [f"1 0 0 {0.1 * frame} 0 1 0 0 0 0 1 0" for frame in range(frames)]
     (folder / "frame_trajectory.txt").write_text("\n".join(lines))
     (folder / "scale.txt").write_text("2.0")
@@ -127,13 +136,13 @@ def methods(protocol: str = "m3d", predictor: Sphere | None = None):
 # The sets
 
 
-def test_a_protocols_sets_are_the_columns_of_its_table(tmp_path: Path) -> None:
+def test_the_sets_of_a_protocol_are_the_columns_of_its_table(tmp_path: Path) -> None:
     for protocol, layout in LAYOUTS.items():
         sets = find_sets(protocol, tmp_path, OPTIONS)
         assert tuple(found.name for found in sets) == layout.sets
 
 
-def test_missing_data_is_named_by_its_folder(tmp_path: Path) -> None:
+def test_missing_data_is_named_with_its_folder(tmp_path: Path) -> None:
     with pytest.raises(InputError) as error:
         run_protocol("m3d", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
     for distance in ("0.5", "0.75", "1.0"):
@@ -152,22 +161,22 @@ def test_a_missing_root_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("inside", [".", "pano_grf", "datasets/pano_grf"])
-def test_data_is_found_where_the_original_code_keeps_it(tmp_path: Path, inside: str) -> None:
+def test_data_is_found_in_the_official_folders(tmp_path: Path, inside: str) -> None:
     write_triplets(tmp_path / inside, "residential_dist_0.15", scenes=1)
     (found,) = find_sets("residential", tmp_path, OPTIONS)
     assert [case.name for case in found.cases] == ["00000000"]
 
 
-def test_a_taller_panorama_reads_its_own_folder(tmp_path: Path) -> None:
+def test_a_larger_height_has_its_own_folder(tmp_path: Path) -> None:
     write_triplets(tmp_path, "replica_dist_0.5", scenes=1)
     (found,) = find_sets("replica", tmp_path, ProtocolOptions(height=1024))
     assert not found.cases and "png_render_test_2048x1024_seq_len_3_replica_dist_0.5" in found.missing
 
 
-def test_a_sequence_gives_even_pairs_with_all_frames_between_and_at_them(tmp_path: Path) -> None:
-    """OFFICIAL.md 2.5: 360Loc's inputs are three frames apart."""
+def test_pairs_of_a_sequence_are_spread_evenly(tmp_path: Path) -> None:
+    """docs/official.md, section 2.5: the inputs of 360Loc are three frames apart."""
     write_loc360(tmp_path, frames=7)
-    found = sequence_set(tmp_path, LOC360, draws=3)
+    found = find_sequence_set(tmp_path, LOC360, draws=3)
     names = [case.name[-13:] for case in found.cases]
     assert names == ["000000-000003", "000001-000004", "000003-000006"]
     sample = found.cases[1].read(HEIGHT)
@@ -175,8 +184,8 @@ def test_a_sequence_gives_even_pairs_with_all_frames_between_and_at_them(tmp_pat
     assert sample.targets.names == ("0001", "0002", "0003", "0004")
 
 
-def test_a_films_inputs_are_sixteen_frames_apart(tmp_path: Path) -> None:
-    """OFFICIAL.md 2.5: all 17 frames from the left input to the right one are targets."""
+def test_inputs_of_insta360_are_sixteen_frames_apart(tmp_path: Path) -> None:
+    """docs/official.md, section 2.5: all 17 frames from the left input to the right one are targets."""
     write_insta360(tmp_path, frames=20)
     (found,) = find_sets("insta360", tmp_path, OPTIONS)
     assert [case.name for case in found.cases] == [f"VID_0001-{i:06d}-{i + 16:06d}" for i in (0, 1, 3)]
@@ -186,7 +195,7 @@ def test_a_films_inputs_are_sixteen_frames_apart(tmp_path: Path) -> None:
     assert float(sample.targets.images[16].mean()) == pytest.approx((5 * 19 + 20) / 255, abs=0.02)
 
 
-def test_the_frame_distance_takes_the_frame_in_the_middle(tmp_path: Path) -> None:
+def test_the_target_of_the_frame_distance_is_the_middle_frame(tmp_path: Path) -> None:
     write_loc360(tmp_path, frames=7)
     by_gap = find_sets("frame-distance", tmp_path, OPTIONS)
     assert [found.name for found in by_gap] == ["2 frames", "4 frames"]
@@ -199,7 +208,7 @@ def test_the_frame_distance_takes_the_frame_in_the_middle(tmp_path: Path) -> Non
 # Rows
 
 
-def test_real_scenes_are_drawn_jointly_and_blended_rendered_ones_jointly() -> None:
+def test_networks_are_blended_jointly_and_on_real_scenes_also_deferred() -> None:
     network = Network()
     assert [m.blend for m in list_methods(network, "m3d")] == ["joint"]
     assert [m.blend for m in list_methods(network, "360loc")] == ["joint", "deferred"]
@@ -208,28 +217,28 @@ def test_real_scenes_are_drawn_jointly_and_blended_rendered_ones_jointly() -> No
     assert list_methods(network, "insta360", name="mine")[1].name == "ours, mine + deferred blending"
 
 
-# Figures
+# Metrics
 
 
-def test_figures_are_those_of_the_written_pictures(tmp_path: Path) -> None:
+def test_metrics_are_those_of_the_written_images(tmp_path: Path) -> None:
     write_triplets(tmp_path, "replica_dist_0.5", scenes=1)
     result = run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
     folder = tmp_path / "out" / "replica_1.0_m" / "00000000"
-    pictures = sorted(path.name for path in folder.iterdir())
+    images = sorted(path.name for path in folder.iterdir())
     ours = "01_ours_sphere_deferred_blending"
-    assert pictures == [f"{ours}.png", f"{ours}_error.png", "01_target.png"]
-    drawn, target = (
+    assert images == [f"{ours}.png", f"{ours}_error.png", "01_target.png"]
+    rendered, target = (
         torch.from_numpy(np.array(Image.open(folder / name)) / np.float32(255)).permute(2, 0, 1)
-        for name in (pictures[0], "01_target.png")
+        for name in (images[0], "01_target.png")
     )
     (score,) = result.sets[0].scores
-    assert score.psnr == pytest.approx(psnr(drawn, target), abs=0.02)  # 8 bits
-    assert score.ws_psnr == pytest.approx(ws_psnr(drawn, target), abs=0.02)
-    assert score.ssim == pytest.approx(ssim(drawn, target), abs=2e-3)
+    assert score.psnr == pytest.approx(psnr(rendered, target), abs=0.02)  # 8 bits
+    assert score.ws_psnr == pytest.approx(ws_psnr(rendered, target), abs=0.02)
+    assert score.ssim == pytest.approx(ssim(rendered, target), abs=2e-3)
     assert score.lpips is None and (score.case, score.target) == ("00000000", "01")
 
 
-def test_a_set_is_the_plain_mean_of_its_images(tmp_path: Path) -> None:
+def test_the_value_of_a_set_is_the_mean_over_its_images(tmp_path: Path) -> None:
     write_loc360(tmp_path)
     result = run_protocol("360loc", tmp_path, methods("360loc"), tmp_path / "out", options=OPTIONS)
     (row,) = result.sets
@@ -240,18 +249,18 @@ def test_a_set_is_the_plain_mean_of_its_images(tmp_path: Path) -> None:
     assert stored["results"][0]["images"] == 12 and stored["protocol"] == "360loc"
 
 
-def test_methods_of_one_predictor_share_its_prediction(tmp_path: Path) -> None:
+def test_methods_with_the_same_predictor_share_its_prediction(tmp_path: Path) -> None:
     write_loc360(tmp_path)
     predictor = Sphere()
     both = [*list_methods(predictor, "360loc", "joint"), *list_methods(predictor, "360loc", "deferred")]
     result = run_protocol("360loc", tmp_path, both, tmp_path / "out", options=OPTIONS)
-    assert predictor.calls == 1 + 3  # once to warm up
+    assert predictor.calls == 1 + 3  # one for the warm-up
     joint, deferred = result.sets
     assert joint.scores != deferred.scores
 
 
 def test_the_true_depth_has_no_error(tmp_path: Path) -> None:
-    """The Gaussians lie on a sphere about each input: what is drawn there is its radius."""
+    """The Gaussians lie on a sphere around each input: the rendered depth is its radius."""
     write_triplets(tmp_path, "m3d_dist_0.5", scenes=1, depth_metres=RADIUS)
     write_triplets(tmp_path, "m3d_dist_1.0", scenes=1, depth_metres=RADIUS)
     result = run_protocol("m3d", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
@@ -261,13 +270,13 @@ def test_the_true_depth_has_no_error(tmp_path: Path) -> None:
     assert len(rich_tables(result)) == 2
 
 
-def test_a_networks_own_finest_depth_is_measured(tmp_path: Path) -> None:
+def test_the_finest_depth_of_a_network_is_measured(tmp_path: Path) -> None:
     write_triplets(tmp_path, "m3d_dist_0.5", scenes=1, depth_metres=RADIUS)
     result = run_protocol("m3d", tmp_path, list_methods(Network(), "m3d"), tmp_path / "out", options=OPTIONS)
     assert result.sets[0].mean("rmse") == pytest.approx(0, abs=1e-6)
 
 
-def test_lpips_is_measured_where_it_is_given(tmp_path: Path) -> None:
+def test_lpips_is_optional(tmp_path: Path) -> None:
     write_triplets(tmp_path, "replica_dist_0.5", scenes=1)
     metric = Lpips("squeeze")
     for index, head in enumerate(metric.heads):
@@ -278,10 +287,10 @@ def test_lpips_is_measured_where_it_is_given(tmp_path: Path) -> None:
     assert any("do not compare" in note for note in report_notes(result))
 
 
-# What is left out is said
+# Missing and invalid data
 
 
-def test_unreadable_cases_are_left_out_and_named(tmp_path: Path) -> None:
+def test_unreadable_cases_are_skipped_and_named(tmp_path: Path) -> None:
     folder = write_triplets(tmp_path, "replica_dist_0.5", scenes=2)
     (folder / "00000001" / "02" / "tran.txt").unlink()
     result = run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
@@ -292,14 +301,14 @@ def test_unreadable_cases_are_left_out_and_named(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "out" / "results.json").read_text())["skipped"] == [line]
 
 
-def test_nothing_readable_is_an_error(tmp_path: Path) -> None:
+def test_a_set_without_a_readable_case_is_an_error(tmp_path: Path) -> None:
     folder = write_triplets(tmp_path, "replica_dist_0.5", scenes=1)
     (folder / "00000000" / "02" / "tran.txt").unlink()
     with pytest.raises(InputError, match=r"none of the 1 cases can be used.*tran\.txt"):
         run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
 
 
-def test_a_limit_spreads_over_the_set_and_pictures_have_their_own(tmp_path: Path) -> None:
+def test_limited_cases_are_spread_over_the_set(tmp_path: Path) -> None:
     write_triplets(tmp_path, "replica_dist_0.5", scenes=5)
     options = ProtocolOptions(HEIGHT, limit=3, pictures=1)
     result = run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=options)
@@ -307,7 +316,7 @@ def test_a_limit_spreads_over_the_set_and_pictures_have_their_own(tmp_path: Path
     assert [path.name for path in (tmp_path / "out" / "replica_1.0_m").iterdir()] == ["00000000"]
 
 
-def test_the_page_has_the_papers_rows_ours_and_what_is_missing(tmp_path: Path) -> None:
+def test_the_report_has_the_papers_rows_ours_and_the_missing_sets(tmp_path: Path) -> None:
     write_triplets(tmp_path, "m3d_dist_0.5", scenes=1)
     result = run_protocol("m3d", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
     (path,) = write_report(result, tmp_path / "out")
@@ -318,27 +327,21 @@ def test_the_page_has_the_papers_rows_ours_and_what_is_missing(tmp_path: Path) -
     assert f"{HEIGHT}x{2 * HEIGHT}" in page
 
 
-def test_figures_that_are_not_finite_become_null(tmp_path: Path) -> None:
+def test_non_finite_values_become_null() -> None:
     row = SetResult("Replica 1.0 m", "ours", [Score("a", "b", math.inf, math.inf, 1.0, None)])
-    result = run_one_row(tmp_path, row)
+    result = ProtocolResult("replica", 512, None, [row]).as_json()
     assert json.loads(json.dumps(result, allow_nan=False))["results"][0]["ws_psnr"] is None
-
-
-def run_one_row(folder: Path, row: SetResult) -> dict[str, object]:
-    from pansplat.evaluation.protocol import ProtocolResult
-
-    return ProtocolResult("replica", 512, None, [row]).as_json()
 
 
 # The figure
 
 
-def test_the_figure_has_a_line_a_method_over_the_frame_distance(tmp_path: Path) -> None:
+def test_the_figure_has_a_line_for_each_method(tmp_path: Path) -> None:
     write_loc360(tmp_path, frames=7)
     predictor = Sphere()
     both = [*list_methods(predictor, "frame-distance", "joint"), *list_methods(predictor, "frame-distance", "deferred")]
     result = run_protocol("frame-distance", tmp_path, both, tmp_path / "out", options=OPTIONS)
-    lines = curves(result.sets, "ws_psnr")
+    lines = frame_distance_curves(result.sets, "ws_psnr")
     assert {method: [gap for gap, _ in line] for method, line in lines.items()} == {m.name: [2, 4] for m in both}
     written = write_report(result, tmp_path / "out")
     assert {path.name for path in written} == {"table.md", "frame_distance.png"}
@@ -349,7 +352,7 @@ def test_the_figure_has_a_line_a_method_over_the_frame_distance(tmp_path: Path) 
 
 
 @pytest.mark.shared
-def test_the_original_sample_is_a_case_of_m3d(shared: Path) -> None:
+def test_the_official_sample_is_a_case_of_m3d(shared: Path) -> None:
     found = find_sets("m3d", shared / "data" / "mp3d_sample", ProtocolOptions())
     assert [len(s.cases) for s in found] == [1, 0, 0]
     sample = found[0].cases[0].read(64)

@@ -1,4 +1,4 @@
-"""An evaluation: its files, its figures, its manners."""
+"""The evaluation of pairs: its files, metrics and table."""
 
 import io
 import json
@@ -68,37 +68,34 @@ def read(path: str | Path) -> Tensor:
     return torch.from_numpy(np.array(Image.open(path)) / np.float32(255)).permute(2, 0, 1)
 
 
-def test_results_are_exactly_the_promised_fields(tmp_path: Path) -> None:
-    evaluate(load_pairs(write_triplet(tmp_path / "room")), GreyBall(), tmp_path / "out", height=HEIGHT)
-    (result,) = json.loads((tmp_path / "out" / "results.json").read_text())
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a triplet in `room`, evaluated once into `out`."""
+    folder = tmp_path_factory.mktemp("report")
+    evaluate(load_pairs(write_triplet(folder / "room")), GreyBall(), folder / "out", height=HEIGHT)
+    return folder
+
+
+def test_results_have_the_documented_fields_and_files(room: Path) -> None:
+    (result,) = json.loads((room / "out" / "results.json").read_text())
     assert list(result) == KEYS
-    assert (result["name"], result["model"], result["height"], result["num_gaussians"]) == (
-        "room",
-        "ball",
-        HEIGHT,
-        2,
-    )
+    assert [result[key] for key in ("name", "model", "height", "num_gaussians")] == ["room", "ball", HEIGHT, 2]
     assert result["predict_seconds"] > 0 and result["render_seconds"] > 0
-    assert {p.name for p in (tmp_path / "out" / "room").iterdir()} == {
-        "prediction.png",
-        "target.png",
-        "error.png",
-    }
+    assert {p.name for p in (room / "out" / "room").iterdir()} == {"prediction.png", "target.png", "error.png"}
 
 
-def test_figures_are_those_of_the_written_pictures(tmp_path: Path) -> None:
-    evaluate(load_pairs(write_triplet(tmp_path / "room")), GreyBall(), tmp_path / "out", height=HEIGHT)
-    (result,) = json.loads((tmp_path / "out" / "results.json").read_text())
+def test_metrics_are_those_of_the_written_images(room: Path) -> None:
+    (result,) = json.loads((room / "out" / "results.json").read_text())
     prediction, target = read(result["prediction"]), read(result["target"])
-    torch.testing.assert_close(target, read(tmp_path / "room" / "c.png"))
+    torch.testing.assert_close(target, read(room / "room" / "c.png"))
     assert result["ws_psnr"] == pytest.approx(ws_psnr(prediction, target), abs=0.01)  # 8 bits
     assert result["psnr"] == pytest.approx(psnr(prediction, target), abs=0.01)
     assert result["ssim"] == pytest.approx(ssim(prediction, target), abs=1e-3)
-    inputs = [read(tmp_path / "room" / name) for name in ("a.png", "b.png")]
+    inputs = [read(room / "room" / name) for name in ("a.png", "b.png")]
     assert result["cross_fade_ws_psnr"] == pytest.approx(ws_psnr(sum(inputs) / 2, target), abs=0.01)
 
 
-def test_pictures_are_drawn_as_asked(tmp_path: Path) -> None:
+def test_the_drawing_changes_the_images(tmp_path: Path) -> None:
     pairs = load_pairs(write_triplet(tmp_path / "room"))
     exact, original = (
         evaluate(pairs, GreyBall(), tmp_path / name, height=HEIGHT, drawing=name)[0] for name in ("exact", "original")
@@ -106,21 +103,25 @@ def test_pictures_are_drawn_as_asked(tmp_path: Path) -> None:
     assert original.psnr != exact.psnr and abs(original.psnr - exact.psnr) < 3
 
 
-def test_each_evaluation_predicts_anew_and_leaves_no_cache(tmp_path: Path) -> None:
+def test_an_evaluation_does_not_use_the_prediction_cache(tmp_path: Path) -> None:
     pairs, predictor = load_pairs(write_triplet(tmp_path / "room")), GreyBall()
     for _ in range(2):
         evaluate(pairs, predictor, tmp_path / "out", height=HEIGHT)
-    assert predictor.calls == 4 and not (tmp_path / "room" / ".pansplat").exists()  # each time a warm-up first
+    assert predictor.calls == 4 and not (tmp_path / "room" / ".pansplat").exists()  # each with a warm-up
 
 
-def test_cases_of_one_name_do_not_overwrite_each_other(tmp_path: Path) -> None:
+def test_cases_of_one_name_have_their_own_folders_and_the_table_has_their_mean(tmp_path: Path) -> None:
     pairs = [load_pairs(write_triplet(tmp_path / place / "room"))[0] for place in ("x", "y")]
     cases = evaluate(pairs, GreyBall(), tmp_path / "out", height=HEIGHT)
     assert [case.name for case in cases] == ["room", "room-2"]
     assert len({case.prediction for case in cases}) == 2
+    console = Console(width=140, record=True, file=io.StringIO())
+    console.print(results_table(cases))
+    (mean,) = (line for line in console.export_text().splitlines() if "mean" in line)
+    assert f"{cases[0].ws_psnr:.2f}" in mean
 
 
-def test_pairs_without_target_are_passed_over(tmp_path: Path) -> None:
+def test_pairs_without_target_are_skipped(tmp_path: Path) -> None:
     alone = load_pairs(write_triplet(tmp_path / "alone", target=False))
     with_target = load_pairs(write_triplet(tmp_path / "room"))
     assert len(evaluate([*alone, *with_target], GreyBall(), tmp_path / "out", height=HEIGHT)) == 1
@@ -129,14 +130,14 @@ def test_pairs_without_target_are_passed_over(tmp_path: Path) -> None:
     assert not (tmp_path / "nothing").exists()
 
 
-def test_a_file_in_the_folders_place_is_an_input_error(tmp_path: Path) -> None:
+def test_a_file_at_the_output_folders_path_is_an_input_error(tmp_path: Path) -> None:
     pairs = load_pairs(write_triplet(tmp_path / "room"))
     (tmp_path / "out").write_text("")
     with pytest.raises(InputError, match=r"cannot make .*choose another"):
         evaluate(pairs, GreyBall(), tmp_path / "out", height=HEIGHT)
 
 
-def test_a_masked_target_gets_a_second_figure_in_the_table_only(tmp_path: Path) -> None:
+def test_a_masked_target_has_a_second_value_in_the_table_only(tmp_path: Path) -> None:
     folder = write_triplet(tmp_path / "room")
     mask = np.full((HEIGHT, 2 * HEIGHT), 255, np.uint8)
     mask[-4:] = 0
@@ -149,7 +150,7 @@ def test_a_masked_target_gets_a_second_figure_in_the_table_only(tmp_path: Path) 
     assert "masked" in [str(column.header) for column in results_table([case]).columns]
 
 
-def test_lpips_is_measured_where_it_is_given(tmp_path: Path) -> None:
+def test_lpips_is_optional(tmp_path: Path) -> None:
     pairs, metric = load_pairs(write_triplet(tmp_path / "room")), Lpips("squeeze")
     for head in metric.heads:
         head.data.fill_(0.1)
@@ -160,22 +161,13 @@ def test_lpips_is_measured_where_it_is_given(tmp_path: Path) -> None:
     assert "LPIPS" in [str(column.header) for column in results_table([case]).columns]
 
 
-def test_the_table_ends_with_the_mean(tmp_path: Path) -> None:
-    pairs = [load_pairs(write_triplet(tmp_path / place / "room"))[0] for place in ("x", "y")]
-    cases = evaluate(pairs, GreyBall(), tmp_path / "out", height=HEIGHT)
-    console = Console(width=140, record=True, file=io.StringIO())
-    console.print(results_table(cases))
-    last = [line for line in console.export_text().splitlines() if "mean" in line]
-    assert len(last) == 1 and f"{cases[0].ws_psnr:.2f}" in last[0]
-
-
-def test_a_perfect_picture_is_null_in_json(tmp_path: Path) -> None:
+def test_an_infinite_psnr_is_null_in_json(tmp_path: Path) -> None:
     (case,) = evaluate(load_pairs(write_triplet(tmp_path / "room")), GreyBall(), tmp_path / "out", height=HEIGHT)
     object.__setattr__(case, "psnr", math.inf)
     assert json.loads(json.dumps(case.as_json(), allow_nan=False))["psnr"] is None
 
 
-def test_error_pictures_are_dark_where_equal_and_bright_where_not() -> None:
+def test_error_images_are_brighter_for_larger_errors() -> None:
     target = torch.full((3, 4, 8), 0.5)
     prediction = target.clone()
     prediction[:, 0] += 10 * ERROR_SCALE

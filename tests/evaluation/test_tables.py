@@ -1,4 +1,4 @@
-"""The paper's tables: their figures, ours beside them, as text."""
+"""The paper's tables with our rows."""
 
 import io
 
@@ -14,7 +14,7 @@ def printed(layout, ours) -> str:
     return console.export_text()
 
 
-def test_the_papers_own_rows_are_there() -> None:
+def test_the_papers_rows_have_its_values() -> None:
     def value(protocol: str, method: str, name: str, metric: str) -> float:
         (row,) = (row for row in LAYOUTS[protocol].rows if row.method == method)
         return row.values[name, metric]
@@ -31,7 +31,7 @@ def test_the_papers_own_rows_are_there() -> None:
 
 
 @pytest.mark.parametrize("layout", [*LAYOUTS.values(), DEPTH_LAYOUT])
-def test_every_figure_belongs_to_a_column_and_is_plausible(layout) -> None:
+def test_every_value_has_a_column_and_is_plausible(layout) -> None:
     ranges = {"psnr": (10, 40), "ws_psnr": (10, 40), "gaussians": (1e5, 1e7)}
     for row in layout.rows:
         assert set(row.values) <= set(layout.columns)
@@ -41,7 +41,7 @@ def test_every_figure_belongs_to_a_column_and_is_plausible(layout) -> None:
 
 
 @pytest.mark.parametrize("text", [printed, markdown_table])
-def test_ours_follow_the_papers_and_what_is_missing_is_a_dash(text) -> None:
+def test_our_rows_are_last_and_missing_values_are_dashes(text) -> None:
     layout = LAYOUTS["m3d"]
     ours = TableRow("ours, sweep", {("M3D 1.0 m", "ws_psnr"): 21.5, ("M3D 1.0 m", "ssim"): 0.75})
     lines = [line for line in text(layout, [ours]).splitlines() if line.strip()]
@@ -51,7 +51,7 @@ def test_ours_follow_the_papers_and_what_is_missing_is_a_dash(text) -> None:
     assert [cell for cell in cells if cell][1:] == ["21.50", "0.750"] + 7 * ["-"]
 
 
-def test_gaussians_are_counted_in_whole_numbers() -> None:
+def test_numbers_of_gaussians_are_integers() -> None:
     assert "1,049,000" in markdown_table(LAYOUTS["ablation"], [])
 
 
