@@ -50,7 +50,7 @@ def require_views(count: int, compat: Compat) -> None:
         raise InputError(f"a prediction needs two or more views, got {count}; add a panorama of the same place")
     if count > 2 and compat == "official":
         raise InputError(
-            f'compat="official" takes exactly two views, as the original does, got {count}; use compat="fixed"'
+            f'compat="official" takes exactly two views, as the official code does, got {count}; use compat="fixed"'
         )
 
 

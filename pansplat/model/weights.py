@@ -111,12 +111,12 @@ def load_weights(path: str | Path) -> WeightsFile:
     if not {"pansplat_format", "model", "config", "compat"} <= metadata.keys():
         raise InputError(
             f"{path}: needed weights that `pansplat convert` or `pansplat-train` wrote, got a .safetensors file "
-            "without their metadata; convert the original checkpoint"
+            "without their metadata; convert the official checkpoint"
         )
     if metadata["pansplat_format"] != str(FORMAT):
         raise InputError(
             f"{path}: needed format {FORMAT} of weights files, got {metadata['pansplat_format']}; "
-            "use the pansplat version that wrote it, or convert the original checkpoint again"
+            "use the pansplat version that wrote it, or convert the official checkpoint again"
         )
     try:
         config, compat = json.loads(metadata["config"]), COMPATS[metadata["compat"]]
@@ -186,7 +186,7 @@ def config_from_dict(kind: type[_T], values: Mapping[str, Any], where: str = "co
         unknown, missing = sorted(values.keys() - fields), sorted(fields - values.keys())
         raise InputError(
             f"{where}: needed the settings of this version, got unknown {unknown} and lacked {missing}; use the "
-            "pansplat version that wrote the file, or convert the original checkpoint again"
+            "pansplat version that wrote the file, or convert the official checkpoint again"
         )
     hints = typing.get_type_hints(kind)
     return kind(**{name: _restore(hints[name], value, f"{where}.{name}") for name, value in values.items()})
@@ -253,7 +253,7 @@ class ConversionReport:
             problems.append(f"found unknown {_some(self.surplus)}")
         if problems:
             raise InputError(
-                f"{source}: needed exactly the tensors of the original {self.model}, {' and '.join(problems)}; "
+                f"{source}: needed exactly the tensors of the official {self.model}, {' and '.join(problems)}; "
                 "take the checkpoint of an unmodified model"
             )
 
@@ -368,7 +368,7 @@ def _require_official_grids(state: Mapping[str, Tensor], source: object) -> None
         x, y, face = strip_lookup(height).unbind(-1)
         computed = torch.stack((x, y, face / 2.5 - 1), dim=-1)[None, None]
         if stored.shape != computed.shape or (stored.double() - computed).abs().max() > 1e-4:
-            raise InputError(f"{source}: needed the original's grid in {name}, got another; the model was modified")
+            raise InputError(f"{source}: needed the official grid in {name}, got another; the model was modified")
 
 
 def _model_of(state: Mapping[str, Tensor], source: object) -> ModelName:
@@ -377,7 +377,7 @@ def _model_of(state: Mapping[str, Tensor], source: object) -> ModelName:
     if any(name.startswith("encoder.backbone.backbone.") for name in state):
         return "mvsplat"
     raise InputError(
-        f"{source}: needed a checkpoint of the original PanSplat or its MVSplat baseline, got tensors "
+        f"{source}: needed a checkpoint of the official PanSplat or its MVSplat baseline, got tensors "
         f"{_some(list(state)) if state else 'none'}"
     )
 

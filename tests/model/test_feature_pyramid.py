@@ -84,7 +84,7 @@ def test_training_mode_normalises_over_the_batch():
     ("compat", "shape", "message"),
     [
         ("fixed", (1, 1, 3, 32, 64), "two or more views, got 1"),
-        ("official", (1, 3, 3, 32, 64), "exactly two views, as the original does, got 3"),
+        ("official", (1, 3, 3, 32, 64), "exactly two views, as the official code does, got 3"),
         ("fixed", (1, 2, 3, 48, 96), "that 32 divides, got 48x96"),
         ("official", (1, 2, 3, 40, 80), "that 16 divides, got 40x80"),
     ],

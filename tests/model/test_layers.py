@@ -147,7 +147,9 @@ def test_numbers_of_views_that_do_not_fit_are_refused():
         require_views(count, compat)
     with pytest.raises(InputError, match="needs two or more views, got 1"):
         require_views(1, "fixed")
-    with pytest.raises(InputError, match='takes exactly two views, as the original does, got 3; use compat="fixed"'):
+    with pytest.raises(
+        InputError, match='takes exactly two views, as the official code does, got 3; use compat="fixed"'
+    ):
         require_views(3, "official")
 
 

@@ -93,7 +93,7 @@ def test_a_truncated_weights_file_is_refused(tmp_path: Path, kept: float) -> Non
 def test_other_safetensors_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "w.safetensors"
     safetensors.torch.save_file({"a": torch.zeros(1)}, path)
-    with pytest.raises(InputError, match="without their metadata; convert the original checkpoint"):
+    with pytest.raises(InputError, match="without their metadata; convert the official checkpoint"):
         load_weights(path)
     metadata = {"pansplat_format": "99", "model": "pansplat", "config": "{}", "compat": "fixed"}
     safetensors.torch.save_file({"a": torch.zeros(1)}, path, metadata)
@@ -218,7 +218,7 @@ def empty(shared: Path, keys: str) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize(("model", "count", "grids"), [("pansplat", 993, 5), ("mvsplat", 471, 0)])
-def test_every_original_tensor_is_used_or_computed(model: ModelName, count: int, grids: int, shared: Path) -> None:
+def test_every_official_tensor_is_used_or_computed(model: ModelName, count: int, grids: int, shared: Path) -> None:
     theirs = {name.removeprefix("encoder.") for name in listed(shared, f"{model}-512")}
     table = official_names(model)
     assert len(theirs) == count and table.keys() <= theirs
@@ -227,7 +227,7 @@ def test_every_original_tensor_is_used_or_computed(model: ModelName, count: int,
 
 
 @pytest.mark.parametrize("model", ["pansplat", "mvsplat"])
-def test_every_tensor_of_ours_has_one_original(model: ModelName) -> None:
+def test_every_tensor_of_ours_has_one_official_name(model: ModelName) -> None:
     with torch.device("meta"):
         network = PanSplat() if model == "pansplat" else MVSplat()
     names = list(official_names(model).values())
@@ -271,7 +271,7 @@ def test_missing_and_surplus_tensors_are_named_and_counted(shared: Path, as_ligh
     with pytest.raises(InputError) as caught:
         report.require_complete("odd.ckpt")
     message = str(caught.value)
-    assert message.startswith("odd.ckpt: needed exactly the tensors of the original pansplat, lacked 12 (")
+    assert message.startswith("odd.ckpt: needed exactly the tensors of the official pansplat, lacked 12 (")
     assert removed[0] in message and ", ...)" in message
     assert "found unknown 2 (encoder.new.weight, losses.2.gaussian_head.new)" in message
 
@@ -283,7 +283,7 @@ def test_a_missing_grid_is_reported(shared: Path, as_lightning: Wrap) -> None:
 
 
 def test_checkpoints_of_other_models_are_refused(as_lightning: Wrap) -> None:
-    with pytest.raises(InputError, match=r"original PanSplat or its MVSplat baseline, got tensors 1 \(encoder.fc\)"):
+    with pytest.raises(InputError, match=r"official PanSplat or its MVSplat baseline, got tensors 1 \(encoder.fc\)"):
         match_tensors(as_lightning({"fc": torch.zeros(1)}), "x")
     with pytest.raises(InputError, match="got tensors none"):
         match_tensors(as_lightning({}), "x")
@@ -291,9 +291,9 @@ def test_checkpoints_of_other_models_are_refused(as_lightning: Wrap) -> None:
 
 def test_a_changed_grid_is_refused(recipe_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
     name = "mono_depth.c2e.2.sample_grid"
-    with pytest.raises(InputError, match=f"the original's grid in {name}"):
+    with pytest.raises(InputError, match=f"the official grid in {name}"):
         convert_tensors(as_lightning(recipe_weights | {name: recipe_weights[name].flip(2)}), "x")
-    with pytest.raises(InputError, match=f"the original's grid in {name}"):
+    with pytest.raises(InputError, match=f"the official grid in {name}"):
         convert_tensors(as_lightning(recipe_weights | {name: recipe_weights[name][:, :, :4]}), "x")
 
 
