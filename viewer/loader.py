@@ -4,11 +4,11 @@ Pairs go through the prediction pipeline with its cache, .ply files are read. Im
 """
 
 import re
-import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from pansplat.errors import InputError
 
@@ -117,7 +117,7 @@ def load_entry(entry: SceneEntry, options: LoadOptions, progress: Progress, *, p
     return LoadedScene(entry, scene, entry.pair.load_context(max(PHOTO_HEIGHT, options.height)))
 
 
-class _Cancelled(Exception):
+class _CancelledError(Exception):
     """Raised from the progress call to end a load that was cancelled."""
 
 
@@ -126,27 +126,29 @@ class _Job:
     entry: SceneEntry
     task: str = "starting"
     fraction: float = 0.0
-    cancelled: threading.Event = field(default_factory=threading.Event)
-    outcome: Any = None
-    thread: threading.Thread | None = None
+    cancelled: bool = False
+    future: Future[LoadedScene] | None = None
+
+    def report(self, task: str, fraction: float) -> None:
+        if self.cancelled:
+            raise _CancelledError
+        self.task, self.fraction = task, min(max(fraction, 0.0), 1.0)
 
 
 class SceneLoader:
-    """Loads entries in a worker thread; a new request cancels the previous one."""
+    """Loads entries in worker threads; a new request cancels the previous one."""
 
     def __init__(self, load: Callable[[SceneEntry, Progress], LoadedScene]) -> None:
         """`load` loads one entry, such as `load_entry` with its options."""
         self._load = load
+        self._executor = ThreadPoolExecutor(thread_name_prefix="scene-loader")
         self._job: _Job | None = None
-        self._cancelled_threads: list[threading.Thread] = []
 
     def request(self, entry: SceneEntry) -> None:
         """Start loading an entry."""
         self.cancel()
-        job = _Job(entry)
-        job.thread = threading.Thread(target=self._run, args=(job,), name=f"load {entry.name}")
-        self._job = job
-        job.thread.start()
+        self._job = _Job(entry)
+        self._job.future = self._executor.submit(self._load, entry, self._job.report)
 
     @property
     def progress(self) -> tuple[str, str, float] | None:
@@ -154,40 +156,20 @@ class SceneLoader:
         job = self._job
         return (job.entry.name, job.task, job.fraction) if job else None
 
-    def poll(self) -> LoadedScene | Exception | None:
+    def poll(self) -> LoadedScene | BaseException | None:
         """Return the result or exception of the request once; None while it is loading or if there is no request."""
-        job = self._job
-        if job is None or job.outcome is None:
+        if self._job is None or self._job.future is None or not self._job.future.done():
             return None
-        self._job = None
-        if job.thread:
-            job.thread.join()
-        return job.outcome
+        future, self._job = self._job.future, None
+        return future.exception() or future.result()
 
     def cancel(self) -> None:
         """Cancel the request; its thread stops at its next progress call."""
         if self._job is not None:
-            self._job.cancelled.set()
-            if self._job.thread:
-                self._cancelled_threads.append(self._job.thread)
+            self._job.cancelled = True
             self._job = None
 
     def close(self) -> None:
         """Cancel the request and wait for all threads."""
         self.cancel()
-        for thread in self._cancelled_threads:
-            thread.join()
-        self._cancelled_threads.clear()
-
-    def _run(self, job: _Job) -> None:
-        def progress(task: str, fraction: float) -> None:
-            if job.cancelled.is_set():
-                raise _Cancelled
-            job.task, job.fraction = task, min(max(fraction, 0.0), 1.0)
-
-        try:
-            job.outcome = self._load(job.entry, progress)
-        except _Cancelled:
-            job.outcome = None
-        except Exception as error:  # shown in the window
-            job.outcome = error
+        self._executor.shutdown()

@@ -5,8 +5,8 @@ neither. `SplatSorter` computes both in a worker thread.
 """
 
 import math
-import threading
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -236,51 +236,20 @@ class SplatSorter:
 
     def __init__(self) -> None:
         """Create the sorter; the thread starts with the first request."""
-        self._condition = threading.Condition()
-        self._request: tuple[Splats, tuple[float, float, float]] | None = None
-        self._result: SortedSplats | Exception | None = None
-        self._thread: threading.Thread | None = None
-        self._closed = False
+        self._executor = ThreadPoolExecutor(1, "splat-sorter")
+        self._futures: list[Future[SortedSplats]] = []
 
     def request(self, splats: Splats, position: tuple[float, float, float]) -> None:
         """Queue a sort and return at once."""
-        with self._condition:
-            if self._closed:
-                raise RuntimeError("the sorter is closed")
-            self._request = (splats, position)
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="splat-sorter", daemon=True)
-                self._thread.start()
-            self._condition.notify()
+        self._futures = [future for future in self._futures if not future.cancel()]
+        self._futures.append(self._executor.submit(sort_splats, splats, position))
 
     def take(self) -> SortedSplats | None:
         """Return the newest result once, else None; raises the exception of a sort that failed."""
-        with self._condition:
-            result, self._result = self._result, None
-        if isinstance(result, Exception):
-            raise result
-        return result
+        done = [future for future in self._futures if future.done()]
+        self._futures = [future for future in self._futures if future not in done]
+        return done[-1].result() if done else None
 
     def close(self) -> None:
         """Stop the thread and wait for it."""
-        with self._condition:
-            self._closed = True
-            self._condition.notify()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
-
-    def _run(self) -> None:
-        while True:
-            with self._condition:
-                self._condition.wait_for(lambda: self._closed or self._request is not None)
-                if self._closed or self._request is None:
-                    return
-                splats, position = self._request
-                self._request = None
-            try:
-                result: SortedSplats | Exception = sort_splats(splats, position)
-            except Exception as error:
-                result = error
-            with self._condition:
-                self._result = result
+        self._executor.shutdown(cancel_futures=True)

@@ -97,11 +97,6 @@ class Presenter:
         self._photos: list[moderngl.Texture] = []
         self._poses: Float[np.ndarray, "view 4 4"] = np.zeros((0, 4, 4))
 
-    @property
-    def photo_count(self) -> int:
-        """Number of uploaded photographs."""
-        return len(self._photos)
-
     def upload_photos(
         self, images: Float[np.ndarray, "view height width 3"] | None, cam2world: Float[np.ndarray, "view 4 4"]
     ) -> None:
@@ -122,12 +117,11 @@ class Presenter:
         image: moderngl.Texture,
         target: moderngl.Framebuffer,
         *,
-        photo: int | None = None,
-        split: float = 1.0,
-        cam2world: Float[np.ndarray, "4 4"] | None = None,
-        vertical_fov_degrees: float = 90.0,
+        photo: int | None,
+        split: float,
+        camera: cameras.Camera,
     ) -> None:
-        """Fill `target` with the image, and right of `split` with the photograph of index `photo`.
+        """Fill `target` with the image of `camera`, and right of `split` with the photograph of index `photo`.
 
         The photograph is sampled by direction only: it has no parallax and matches exactly at its own camera.
         """
@@ -135,16 +129,16 @@ class Presenter:
         self.ctx.disable(moderngl.DEPTH_TEST | moderngl.BLEND | moderngl.CULL_FACE)
         image.filter = (moderngl.LINEAR, moderngl.LINEAR)
         image.use(0)
-        if photo is None or cam2world is None or photo >= len(self._photos):
+        if photo is None:
             self._program["split"] = 2.0
             image.use(1)
         else:
             self._program["split"] = split
             self._photos[photo].use(1)
-            rotation = self._poses[photo][:3, :3].T @ cam2world[:3, :3]
+            rotation = self._poses[photo][:3, :3].T @ cameras.pose(camera)[:3, :3]
             self._program["camera_to_photo"] = tuple(rotation.T.ravel().tolist())  # column by column
             width, height = target.viewport[2:]
-            tangent = math.tan(math.radians(vertical_fov_degrees) / 2)
+            tangent = math.tan(math.radians(camera.vertical_fov_degrees) / 2)
             self._program["tangent"] = (tangent * width / height, tangent)
         self._triangle.render(moderngl.TRIANGLES, vertices=3)
 
@@ -301,7 +295,7 @@ class Viewer:
     def _nearest_photo(self) -> int | None:
         """Return the index of the photograph nearest to the camera; None if there is none."""
         photos = self._loaded.photos if self._loaded else None
-        if photos is None or not self.presenter.photo_count:
+        if photos is None or not len(photos.cam2world):
             return None
         return cameras.nearest_view(self.state.camera, photos.cam2world.double().numpy())
 
@@ -312,14 +306,8 @@ class Viewer:
         self._last_camera = camera
         plan = self._resolution.plan(now, moved=moved, turned=turned, adaptive=self.state.adaptive)
         image = self._render(cameras.pose(camera), size, plan)
-        self.presenter.draw(
-            image,
-            target,
-            photo=self._nearest_photo() if self.state.photo else None,
-            split=self.state.split,
-            cam2world=cameras.pose(camera),
-            vertical_fov_degrees=camera.vertical_fov_degrees,
-        )
+        photo = self._nearest_photo() if self.state.photo else None
+        self.presenter.draw(image, target, photo=photo, split=self.state.split, camera=camera)
 
     def _render(
         self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], plan: ResolutionPlan

@@ -26,13 +26,6 @@ class NoWindowError(Exception):
     """No window can be opened; the message has the reason, in one line."""
 
 
-def display_problem() -> str | None:
-    """Return why no window can be opened according to the environment; None if it may be possible."""
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        return "no display (neither DISPLAY nor WAYLAND_DISPLAY is set)"
-    return None
-
-
 class Window:
     """A glfw window with a current OpenGL 3.3 core context.
 
@@ -47,11 +40,14 @@ class Window:
         Raises:
             NoWindowError: there is no display, or it has no OpenGL 3.3.
         """
-        problem = display_problem()
-        if problem:
-            raise NoWindowError(problem)
+        if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            raise NoWindowError("no display (neither DISPLAY nor WAYLAND_DISPLAY is set)")
         load_llvm_before_mesa()
-        self._glfw = _import_glfw()
+        try:
+            import glfw
+        except ImportError as error:
+            raise NoWindowError(f"glfw cannot be loaded ({error})") from error
+        self._glfw = glfw
         self.dropped: list[Path] = []
         self._handle = self._create(title, size)
         self._glfw.set_drop_callback(self._handle, self._drop)
@@ -169,21 +165,9 @@ def _loop(window: Window, viewer: Viewer) -> None:
         target.viewport = (0, 0, *size)
         viewer.frame(target, seconds, imgui.backends.glfw_new_frame)
         window.swap()
-        if title != (title := _title(viewer)):
+        data = viewer.panel_data
+        if data.current >= 0 and title != (title := f"{data.entries[data.current]} - pansplat"):
             window.set_title(title)
-
-
-def _title(viewer: Viewer) -> str:
-    data = viewer.panel_data
-    return f"{data.entries[data.current]} - pansplat" if data.current >= 0 else "pansplat"
-
-
-def _import_glfw() -> Any:
-    try:
-        import glfw
-    except ImportError as error:
-        raise NoWindowError(f"glfw cannot be loaded ({error})") from error
-    return glfw
 
 
 def _reason(caught: list[warnings.WarningMessage]) -> str:

@@ -55,6 +55,15 @@ def test_without_a_display_a_fly_through_is_written(room, capsys):
     assert np.abs(images["view_050.png"] - frames[0]).mean() > 8
 
 
+@pytest.mark.gl
+def test_with_an_unusable_display_a_fly_through_is_written(room, capsys, monkeypatch):
+    monkeypatch.setenv("DISPLAY", ":98765")
+    assert run([str(room), "--size", "64x32", "--seconds", "0.2"]) == 0
+    first_line = capsys.readouterr().out.splitlines()[0]
+    assert "98765" in first_line and "writing a fly-through" in first_line
+    assert (room.parent / "renders" / "room" / "flythrough.mp4").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

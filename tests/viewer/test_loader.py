@@ -22,6 +22,10 @@ def wait_for(loader: SceneLoader) -> object:
     return result
 
 
+def threads_of_loaders() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name.startswith("scene-loader")]
+
+
 def work_forever(entry, progress):
     while True:
         progress("working", 0.5)
@@ -111,14 +115,14 @@ def test_a_new_request_cancels_the_previous_one(small_scene):
     loader.request(SceneEntry("second"))
     assert wait_for(loader).entry.name == "second"
     loader.close()
-    assert not any(thread.name == "load first" for thread in threading.enumerate())
+    assert not threads_of_loaders()
 
 
 def test_close_cancels_the_request_and_joins_its_thread():
     loader = SceneLoader(work_forever)
     loader.request(SceneEntry("endless"))
     loader.close()
-    assert not any(thread.name == "load endless" for thread in threading.enumerate())
+    assert not threads_of_loaders()
 
 
 def test_predictions_have_the_arguments_of_the_options(monkeypatch, small_scene):

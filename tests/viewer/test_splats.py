@@ -90,5 +90,5 @@ def test_close_ends_the_thread(splats):
     wait_for(sorter)
     sorter.close()
     assert threading.active_count() == before
-    with pytest.raises(RuntimeError, match="closed"):
+    with pytest.raises(RuntimeError, match="shutdown"):
         sorter.request(splats, (0.0, 0.0, 0.0))

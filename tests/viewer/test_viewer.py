@@ -476,17 +476,19 @@ def test_resolution_is_lower_while_the_camera_moves(user):
 
 
 def test_the_viewer_shows_progress_and_accepts_input_while_loading(user, small_scene, monkeypatch):
-    go = threading.Event()
+    reported, go = threading.Event(), threading.Event()
 
     def slow(entry, progress):
         progress("searching depth", 0.5)
+        reported.set()
         assert go.wait(20)
         return LoadedScene(entry, small_scene)
 
     before = user.image()
     monkeypatch.setattr(user.viewer.loader, "_load", slow)
     user.viewer.show([SceneEntry("slow")], 0)
-    user.frames(5)
+    assert reported.wait(20)
+    user.frames(2)
     assert user.data.loading == ("slow", "searching depth", 0.5)
     assert changed(before, user.screen()) > 0.02, "a progress bar is on the screen"
     user.key(imgui.Key.w, frames=3)

@@ -174,20 +174,3 @@ def test_an_interrupt_ends_with_status_130(display, room):
         viewer.send_signal(signal.SIGINT)
         _, errors = viewer.communicate(timeout=30)
         assert viewer.returncode == 130 and "Traceback" not in errors
-
-
-def test_a_missing_display_gives_a_fly_through(room):
-    environment = {**os.environ, "DISPLAY": ":98765", "WAYLAND_DISPLAY": ""}
-    options = ("--size", "64x32", "--seconds", "0.2")
-    result = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(room), *options],
-        env=environment,
-        cwd=room.parent,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert result.returncode == 0, result.stderr
-    assert "writing a fly-through" in result.stdout.splitlines()[0]
-    assert "98765" in result.stdout.splitlines()[0], "the reason names the display"
-    assert (room.parent / "renders" / "room" / "flythrough.mp4").exists()
