@@ -485,10 +485,10 @@ def _degree_factors(degree: int) -> Float[Tensor, "k"]:
 
 
 class AuxiliaryHeads(nn.Module):
-    """Heads that render each level of the cost volume by itself; for training on real panoramas only.
+    """Gaussians of each level of the cost volume by itself, for training on real panoramas only.
 
-    Without true depth, the image of each level's own depth and confidence gives the level a loss. There is one
-    independent head for each level, with maps of half the height of the cost volume's input.
+    They have the depth and confidence of the level. The images rendered from them give every level a loss without
+    true depth. The heads are independent; their maps have half the height of the cost volume's input.
 
     Source: PanSplat, section 3.5 (real data); OFFICIAL.md, section 8 (auxiliary heads).
     """
@@ -518,15 +518,18 @@ class AuxiliaryHeads(nn.Module):
         panorama = Tile(0, 0, 1)
         around = panorama.window(height).expand(self.margins.input)
         inputs = (view.image, view.features[index], view.logits)
-        refined = self.levels[index]([crop_window(source, height, around, self.compat) for source in inputs])
-        at = (item, view.view)
-        own = dataclasses.replace(view, inverse_depth=depth.inverse_depth[at], confidence=depth.confidence[at])
+        head = self.levels[index]
+        refined = head([crop_window(source, height, around, self.compat) for source in inputs])
+        index_of_view = (item, view.view)
+        swept = dataclasses.replace(
+            view, inverse_depth=depth.inverse_depth[index_of_view], confidence=depth.confidence[index_of_view]
+        )
         return decode_gaussians(
-            self.levels[index],
+            head,
             refined[0],
             panorama.window(height).expand(self.margins.output),
             panorama,
-            own,
+            swept,
             height=height,
             level=depth.level,
             colored=True,

@@ -110,6 +110,7 @@ class MVSplat(nn.Module):
         config = config or MVSplatConfig()
         self.config = config
         self.compat: Compat = compat
+        self.attention_precision: AttentionPrecision = attention_precision
         border = _border_of(compat)
         channels, fine = config.channels, config.refine_width
         self.features = Features(config, compat, attention_precision)

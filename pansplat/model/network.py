@@ -227,10 +227,10 @@ def remove_masked_gaussians(
     height, width = masks.shape[-2:]
     kept = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     for view, (pose, mask) in enumerate(zip(cam2world.to(gaussians.means), masks, strict=True)):
-        own = gaussians.views == view
-        uv = uv_from_directions((gaussians.means[own] - pose[:3, 3]) @ pose[:3, :3])
+        of_view = gaussians.views == view
+        uv = uv_from_directions((gaussians.means[of_view] - pose[:3, 3]) @ pose[:3, :3])
         column, row = (uv[:, 0] * width).long(), (uv[:, 1] * height).long()
-        kept[own] = mask.to(kept.device)[row.clamp(0, height - 1), column.clamp(0, width - 1)]
+        kept[of_view] = mask.to(kept.device)[row.clamp(0, height - 1), column.clamp(0, width - 1)]
     return gaussians.select(kept)
 
 

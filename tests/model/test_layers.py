@@ -159,10 +159,10 @@ def test_a_size_that_cannot_be_halved_is_refused():
         require_size(80, 160, 32)
 
 
-@pytest.mark.parametrize("spoil", [lambda r: r * 1.001, lambda r: -r, lambda r: r * math.nan])
-def test_a_pose_that_is_not_rigid_is_refused(spoil):
+@pytest.mark.parametrize("break_rotation", [lambda r: r * 1.001, lambda r: -r, lambda r: r * math.nan])
+def test_a_pose_that_is_not_rigid_is_refused(break_rotation):
     poses = torch.eye(4).repeat(2, 3, 1, 1)
     require_rigid(poses)
-    poses[1, 2, :3, :3] = spoil(poses[1, 2, :3, :3])
+    poses[1, 2, :3, :3] = break_rotation(poses[1, 2, :3, :3])
     with pytest.raises(InputError, match="of item 1, view 2 must be a rigid pose"):
         require_rigid(poses)

@@ -204,9 +204,10 @@ def test_a_loaded_network_predicts_as_the_saved_one(file: Path) -> None:
     assert torch.equal(loaded(*_inputs(), 0.5, 10.0).means, saved(*_inputs(), 0.5, 10.0).means)
 
 
-def test_compat_changes_the_prediction_and_the_fingerprint(file: Path) -> None:
+def test_compat_and_precision_change_the_fingerprint(file: Path) -> None:
     fixed, official = load_predictor(file, "fixed"), load_predictor(file, "official")
-    assert fixed.fingerprint != official.fingerprint
+    rounded = load_predictor(file, attention_precision="bfloat16")
+    assert len({predictor.fingerprint for predictor in (fixed, official, rounded)}) == 3
     assert not torch.allclose(fixed(*_inputs(), 0.5, 10.0).means, official(*_inputs(), 0.5, 10.0).means)
 
 
