@@ -1,1 +1,1 @@
-"""Rooms made from a seed: layout, furniture, surfaces and a ray caster to see them with."""
+"""Rooms made from a seed: layout, furniture, materials and a ray caster to see them with."""

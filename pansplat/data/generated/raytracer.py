@@ -1,4 +1,12 @@
-"""Ray tracing of generated scenes."""
+"""Ray tracing of generated scenes: radial depth along the ray of each pixel centre, and antialiased colours.
+
+A body is a box, ellipsoid or cylinder with an affine map from the world to its own space, in which it is [-1, 1]^3, the
+unit sphere, or x^2 + z^2 <= 1, |y| <= 1. Ray parameters are equal in both spaces. The bodies are in a bounding volume
+hierarchy (BVH).
+
+Lighting is diffuse, and therefore independent of the view: lamps and a sun with shadows, and ambient light, which is
+weaker in corners.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +22,13 @@ BOX, ELLIPSOID, CYLINDER = 0, 1, 2
 _LEAF = 2  # bodies
 
 
-def build_tree(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Nested boxes over bodies with the given corners (body 3).
+def build_bvh(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """A bounding volume hierarchy of bodies with the given corners (body 3).
 
     Returns:
-        Corners (node 6), and per node: first child (the second follows it) and 0, or first place in the order and
-        the number of bodies; the order stands in the last column.
+        Corners (node 6), and links (node 3). The first two columns hold the index of the first child (the second child
+        follows it) and 0, or for leaves the first place in the order and the number of bodies. The third column holds
+        the order of the bodies.
     """
     order = np.arange(len(low))
     bounds, links = [np.zeros(6)], [[0, 0]]
@@ -61,7 +70,7 @@ def _box(ox, oy, oz, dx, dy, dz):
 @nb.njit(**OPTIONS)
 def _ellipsoid(ox, oy, oz, dx, dy, dz):
     a, b = dx * dx + dy * dy + dz * dz, ox * dx + oy * dy + oz * dz
-    # The nearest point of the ray, then half a chord: no cancellation for small spheres far away.
+    # Half a chord from the point of the ray nearest to the centre: avoids cancellation for small, distant spheres.
     px, py, pz = ox - b / a * dx, oy - b / a * dy, oz - b / a * dz
     left = 1 - (px * px + py * py + pz * pz)
     if left < 0:
@@ -89,8 +98,8 @@ def _cylinder(ox, oy, oz, dx, dy, dz):
 
 
 @nb.njit(**OPTIONS)
-def meet(kind, m, x, y, z, dx, dy, dz):
-    """Distance at which a ray enters a body; inf where it does not, negative behind or from within."""
+def intersect_body(kind, m, x, y, z, dx, dy, dz):
+    """Distance at which a ray enters a body; inf if it misses, negative if the body is behind or around the origin."""
     px, py, pz = x - m[3], y - m[7], z - m[11]
     ox, oy, oz = (
         m[0] * px + m[1] * py + m[2] * pz,
@@ -110,15 +119,17 @@ def meet(kind, m, x, y, z, dx, dy, dz):
 
 
 @nb.njit(**OPTIONS)
-def first_hit(bodies, x, y, z, dx, dy, dz, most, any_will_do):
-    """The distance to the first body nearer than `most` and its number (-1: none); or to any, for shadows.
+def first_hit(bodies, x, y, z, dx, dy, dz, limit, any_hit):
+    """Distance and index of the first body nearer than `limit`; `limit` and -1 if there is none.
 
-    `bodies` are kinds, maps, the tree's corners and links, and room for 64 numbers to work in.
+    Args:
+        bodies: kinds, maps, corners and links of the BVH, and a stack of 64 integers.
+        any_hit: whether any body nearer than `limit` is sufficient, for shadow rays.
     """
     kinds, maps, bounds, links, stack = bodies
     ix, iy, iz = 1 / dx, 1 / dy, 1 / dz
     stack[0], depth = 0, 1
-    best, body = most, -1
+    best, body = limit, -1
     while depth:
         depth -= 1
         node = stack[depth]
@@ -132,7 +143,7 @@ def first_hit(bodies, x, y, z, dx, dy, dz, most, any_will_do):
             continue
         first, count = links[node, 0], links[node, 1]
         if count == 0:
-            # The child on the ray's side first.
+            # Visit the child nearer to the origin first.
             nearer = 0
             left, right = bounds[first], bounds[first + 1]
             along = (
@@ -147,19 +158,29 @@ def first_hit(bodies, x, y, z, dx, dy, dz, most, any_will_do):
             continue
         for place in range(first, first + count):
             k = links[place, 2]
-            t = meet(kinds[k], maps[k], x, y, z, dx, dy, dz)
+            t = intersect_body(kinds[k], maps[k], x, y, z, dx, dy, dz)
             if 1e-6 < t < best:
                 best, body = t, k
-                if any_will_do:
+                if any_hit:
                     return best, body
     return best, body
 
 
-SKY = 40.0  # metres to the sphere that sky and horizon are painted on
-WALL, FLOOR, CEILING = -1, -2, -3  # materials that the room decides
-# Places in a room's row of numbers, after its corners x z x z.
-WALL_LOOK, FLOOR_LOOK, CEILING_LOOK, TRIM_LOOK, PANEL_LOOK, PANEL_HEIGHT, TRIM_HEIGHT, TALL, ROOM_NUMBERS = range(4, 13)
-# Places in a light's row of numbers: position (or direction to a sun), colour, size, 1 for a sun.
+SKY = 40.0  # radius of the sphere of sky and horizon, metres
+WALL, FLOOR, CEILING = -1, -2, -3  # materials that depend on the room
+# Columns of a room after its corners x0 z0 x1 z1.
+(
+    WALL_MATERIAL,
+    FLOOR_MATERIAL,
+    CEILING_MATERIAL,
+    TRIM_MATERIAL,
+    PANEL_MATERIAL,
+    PANEL_HEIGHT,
+    TRIM_HEIGHT,
+    HEIGHT,
+    ROOM_NUMBERS,
+) = range(4, 13)
+# Columns of a light: position (or direction to a sun), colour, size, 1 for a sun.
 LIGHT_COLOR, LIGHT_SIZE, LIGHT_SUN, LIGHT_NUMBERS = 3, 6, 7, 8
 
 
@@ -172,8 +193,8 @@ def _room_at(rooms, x, z):
 
 
 @nb.njit(**OPTIONS)
-def _surface(kind, m, half, x, y, z):
-    """Unit normal, face (two an axis; the side of round bodies is 0), place and half size on the surface, metres."""
+def _surface_point(kind, m, half, x, y, z):
+    """Unit normal, face (two per axis; 0 for round sides), texture coordinates and half size of the face, metres."""
     px, py, pz = x - m[3], y - m[7], z - m[11]
     qx, qy, qz = (
         m[0] * px + m[1] * py + m[2] * pz,
@@ -208,48 +229,48 @@ def _surface(kind, m, half, x, y, z):
 
 
 @nb.njit(**OPTIONS)
-def _room_look(rooms, room, wanted, y, outside):
-    """The material of a wall, floor or ceiling of a room; walls have a trim at the floor and maybe a panel above."""
+def _room_material(rooms, room, kind, y, outside):
+    """The material of a room's wall, floor or ceiling at height -y; walls may have a trim and a panel above it."""
     if room < 0:
         return outside
-    place = WALL_LOOK
-    if wanted == FLOOR:
-        place = FLOOR_LOOK
-    elif wanted == CEILING:
-        place = CEILING_LOOK
+    place = WALL_MATERIAL
+    if kind == FLOOR:
+        place = FLOOR_MATERIAL
+    elif kind == CEILING:
+        place = CEILING_MATERIAL
     elif -y < rooms[room, TRIM_HEIGHT]:
-        place = TRIM_LOOK
+        place = TRIM_MATERIAL
     elif -y < rooms[room, PANEL_HEIGHT]:
-        place = PANEL_LOOK
+        place = PANEL_MATERIAL
     return int(rooms[room, place])
 
 
 @nb.njit(**OPTIONS)
-def _openness(rooms, room, x, y, z, nx, ny, nz):
-    """Share of the surrounding light that reaches a point near the room's corners and edges."""
+def _ambient_visibility(rooms, room, x, y, z, nx, ny, nz):
+    """Fraction of the ambient light at a point; below 1 near the edges and corners of its room."""
     if room < 0:
         return 1.0
     r = rooms[room]
-    share = 1.0
+    visibility = 1.0
     for away, towards in (
         (x - r[0], nx),
         (r[2] - x, -nx),
         (z - r[1], nz),
         (r[3] - z, -nz),
         (-y, -ny),
-        (y + r[TALL], ny),
+        (y + r[HEIGHT], ny),
     ):
-        if towards < 0.5:  # not the plane it lies on itself
-            share *= 1 - 0.3 * math.exp(-max(away, 0.0) / 0.3)
-    return share
+        if towards < 0.5:  # excludes the plane of the point itself
+            visibility *= 1 - 0.3 * math.exp(-max(away, 0.0) / 0.3)
+    return visibility
 
 
 @nb.njit(**OPTIONS)
-def _sky(looks, sky, dx, dy, dz, w):
-    """Sky, clouds and a skyline in a direction from the world's origin; `sky` is a material."""
+def _sky_color(materials, sky, dx, dy, dz, w):
+    """Light of sky, clouds and skyline in a direction from the world origin; `sky` is the index of a material."""
     up = -dy
     around = math.atan2(dx, dz) * 4
-    m = looks[sky]
+    m = materials[sky]
     t = min(1.0, max(0.0, up)) ** 0.5
     cloud = min(1.0, max(0.0, 0.5 + 2.5 * fractal(around + 3 * up, 9 * up, 1.5, 5, w * 4, int(m[14])))) * 0.6
     r = (m[COLOR_A] * t + m[COLOR_B] * (1 - t)) * (1 - cloud) + cloud
@@ -265,11 +286,12 @@ def _sky(looks, sky, dx, dy, dz, w):
 
 
 @nb.njit(**OPTIONS)
-def _lit(bodies, lights, last, x, y, z, nx, ny, nz, jitter):
-    """Light (red, green, blue) from lamps and sun at a point, with shadows.
+def _direct_light(bodies, lights, last, x, y, z, nx, ny, nz, jitter):
+    """Light (red, green, blue) of lamps and sun at a point, with shadows.
 
-    `jitter` chooses a place on a lamp. `last` is the body that stood before each light at the point before: most
-    often it still does.
+    Args:
+        last: per light, the body that blocked it at the previous point, which is tested first; updated.
+        jitter: selects a point on each lamp.
     """
     kinds, maps = bodies[0], bodies[1]
     r, g, b = 0.0, 0.0, 0.0
@@ -279,20 +301,20 @@ def _lit(bodies, lights, last, x, y, z, nx, ny, nz, jitter):
         size = light[LIGHT_SIZE]
         jx, jy, jz = size * (2 * (jitter & 1) - 1), 0.3 * size * ((jitter % 3) - 1), size * ((jitter & 2) - 1)
         if light[LIGHT_SUN] > 0:
-            lx, ly, lz, most, fall = light[0] + jx, light[1] + jy, light[2] + jz, 2 * SKY, 1.0
+            lx, ly, lz, limit, fall = light[0] + jx, light[1] + jy, light[2] + jz, 2 * SKY, 1.0
             away = math.sqrt(lx * lx + ly * ly + lz * lz)
         else:
             lx, ly, lz = light[0] + jx - x, light[1] + jy - y, light[2] + jz - z
             away = math.sqrt(lx * lx + ly * ly + lz * lz)
-            most, fall = away, 1 / (0.6 + away * away)
+            limit, fall = away, 1 / (0.6 + away * away)
         facing = (nx * lx + ny * ly + nz * lz) / away
         power = facing * fall
         if power < 0.01:
             continue
         lx, ly, lz = lx / away, ly / away, lz / away
-        if last[k] >= 0 and 1e-6 < meet(kinds[last[k]], maps[last[k]], x, y, z, lx, ly, lz) < most:
+        if last[k] >= 0 and 1e-6 < intersect_body(kinds[last[k]], maps[last[k]], x, y, z, lx, ly, lz) < limit:
             continue
-        _, last[k] = first_hit(bodies, x, y, z, lx, ly, lz, most, True)
+        _, last[k] = first_hit(bodies, x, y, z, lx, ly, lz, limit, True)
         if last[k] < 0:
             r, g, b = (
                 r + power * light[LIGHT_COLOR],
@@ -303,33 +325,33 @@ def _lit(bodies, lights, last, x, y, z, nx, ny, nz, jitter):
 
 
 @nb.njit(**OPTIONS)
-def _seen(scene, bodies, last, x, y, z, dx, dy, dz, pixel, jitter):
-    """Colour and distance of what a ray meets; `pixel` is the angle of a pixel."""
-    kinds, maps, halves, faces, _, _, looks, rooms, lights, ambient, outside, sky = scene
+def _trace_ray(scene, bodies, last, x, y, z, dx, dy, dz, pixel, jitter):
+    """Light (red, green, blue) and distance of the first hit of a ray; `pixel` is the angle of a pixel, radians."""
+    kinds, maps, halves, faces, _, _, materials, rooms, lights, ambient, outside, sky = scene
     t, body = first_hit(bodies, x, y, z, dx, dy, dz, math.inf, False)
     if body < 0:
-        t = _to_sky(x, y, z, dx, dy, dz)
+        t = _distance_to_sky(x, y, z, dx, dy, dz)
         px, py, pz = (x + t * dx) / SKY, (y + t * dy) / SKY, (z + t * dz) / SKY
-        r, g, b = _sky(looks, sky, px, py, pz, pixel)
+        r, g, b = _sky_color(materials, sky, px, py, pz, pixel)
         return r, g, b, t
     px, py, pz = x + t * dx, y + t * dy, z + t * dz
-    nx, ny, nz, face, u, v, half_u, half_v = _surface(kinds[body], maps[body], halves[body], px, py, pz)
+    nx, ny, nz, face, u, v, half_u, half_v = _surface_point(kinds[body], maps[body], halves[body], px, py, pz)
     facing = abs(nx * dx + ny * dy + nz * dz)
-    width = pixel * t / max(0.7 * math.sqrt(facing), 0.15)  # between the pixel's short and its long side
-    look = faces[body, face]
+    width = pixel * t / max(0.7 * math.sqrt(facing), 0.15)  # between the sides of the pixel's footprint
+    material = faces[body, face]
     room = _room_at(rooms, px + 0.02 * nx, pz + 0.02 * nz)
-    if look < 0:
+    if material < 0:
         if ny > 0.5 or ny < -0.5:
             u, v = px, pz
         elif abs(nx) > abs(nz):
             u, v = pz, py
         else:
             u, v = px, py
-        look = _room_look(rooms, room, look, py, outside)
-    r, g, b = color(looks[look], u, v, width, half_u, half_v)
-    around = _openness(rooms, room, px, py, pz, nx, ny, nz) * (0.85 - 0.15 * ny)
-    lr, lg, lb = _lit(bodies, lights, last, px, py, pz, nx, ny, nz, jitter)
-    glow = looks[look, GLOW]
+        material = _room_material(rooms, room, material, py, outside)
+    r, g, b = color(materials[material], u, v, width, half_u, half_v)
+    around = _ambient_visibility(rooms, room, px, py, pz, nx, ny, nz) * (0.85 - 0.15 * ny)
+    lr, lg, lb = _direct_light(bodies, lights, last, px, py, pz, nx, ny, nz, jitter)
+    glow = materials[material, GLOW]
     return (
         r * (ambient[0] * around + lr + glow),
         g * (ambient[1] * around + lg + glow),
@@ -339,14 +361,14 @@ def _seen(scene, bodies, last, x, y, z, dx, dy, dz, pixel, jitter):
 
 
 @nb.njit(**OPTIONS)
-def _to_sky(x, y, z, dx, dy, dz):
+def _distance_to_sky(x, y, z, dx, dy, dz):
     b = x * dx + y * dy + z * dz
     return -b + math.sqrt(b * b + SKY * SKY - (x * x + y * y + z * z))
 
 
 @nb.njit(**OPTIONS)
-def draw_panorama(scene, pose, samples, image, depth):
-    """Fill `image` (H W 3), linear light, with the mean of samples x samples rays a pixel; `depth` (H W) in metres."""
+def trace_panorama(scene, pose, samples, image, depth):
+    """Fill `image` (H W 3) with linear light, the mean of samples x samples rays, and `depth` (H W) with metres."""
     height, width = depth.shape
     bodies = (scene[0], scene[1], scene[4], scene[5], np.empty(64, np.int64))
     last = np.full(len(scene[8]), -1)
@@ -354,7 +376,7 @@ def draw_panorama(scene, pose, samples, image, depth):
     pixel = math.pi / height
     for i in range(height):
         for j in range(width):
-            for k in range(samples * samples + 1):  # the last one through the pixel's centre
+            for k in range(samples * samples + 1):  # the last ray, for depth, passes through the pixel centre
                 centre = k == samples * samples
                 du, dv = ((k % samples) + 0.5) / samples, ((k // samples) + 0.5) / samples
                 if centre:
@@ -373,10 +395,10 @@ def draw_panorama(scene, pose, samples, image, depth):
                 dz = pose[2, 0] * cx + pose[2, 1] * cy + pose[2, 2] * cz
                 if centre:
                     t, body = first_hit(bodies, x, y, z, dx, dy, dz, math.inf, False)
-                    depth[i, j] = t if body >= 0 else _to_sky(x, y, z, dx, dy, dz)
+                    depth[i, j] = t if body >= 0 else _distance_to_sky(x, y, z, dx, dy, dz)
                 else:
-                    r, g, b, _ = _seen(scene, bodies, last, x, y, z, dx, dy, dz, pixel, k)
-                    share = 1 / (samples * samples)
-                    image[i, j, 0] += share * r
-                    image[i, j, 1] += share * g
-                    image[i, j, 2] += share * b
+                    r, g, b, _ = _trace_ray(scene, bodies, last, x, y, z, dx, dy, dz, pixel, k)
+                    weight = 1 / (samples * samples)
+                    image[i, j, 0] += weight * r
+                    image[i, j, 1] += weight * g
+                    image[i, j, 2] += weight * b

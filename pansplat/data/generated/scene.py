@@ -1,4 +1,4 @@
-"""Collecting bodies, surfaces and lights into the arrays that the ray caster takes."""
+"""Generated scenes: bodies, materials, rooms and lights as arrays for the ray tracer."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from pansplat.data.generated.raytracer import (
     ELLIPSOID,
     LIGHT_NUMBERS,
     ROOM_NUMBERS,
-    build_tree,
-    draw_panorama,
+    build_bvh,
+    trace_panorama,
 )
 from pansplat.data.generated.textures import NUMBERS, Pattern
 
@@ -26,27 +26,31 @@ Vector = Sequence[float] | Array
 
 @dataclass(frozen=True, eq=False)
 class GeneratedScene:
-    """A scene as arrays; the world's y points down and the floor is at y = 0, metres."""
+    """A scene as arrays. World axes: y down, the floor at y = 0, metres.
+
+    Attributes:
+        arrays: arguments of `trace_panorama`.
+        low, high: corners of the bodies' bounding boxes (body 3), metres.
+    """
 
     arrays: tuple[Any, ...]
     low: Array
-    """Smallest corner of each body's box in the world, (body 3)."""
     high: Array
 
     def panorama(self, cam2world: Array, height: int, samples: int = 2) -> tuple[Array, Array]:
-        """Linear light (H W 3) and radial depth (H W), metres, seen from a pose."""
+        """Linear light (H W 3) and radial depth (H W), metres, at a pose, with samples x samples rays per pixel."""
         image, depth = np.zeros((height, 2 * height, 3)), np.zeros((height, 2 * height))
-        draw_panorama(self.arrays, np.ascontiguousarray(cam2world, dtype=np.float64), samples, image, depth)
+        trace_panorama(self.arrays, np.ascontiguousarray(cam2world, dtype=np.float64), samples, image, depth)
         return image, depth
 
     def clearance(self, points: Array) -> Array:
-        """Distance in metres from points (n 3) to the nearest body's box."""
-        apart = np.maximum(np.maximum(self.low - points[:, None], points[:, None] - self.high), 0)
-        return np.linalg.norm(apart, axis=-1).min(axis=1)
+        """Distances in metres from points (n 3) to the nearest bounding box of a body."""
+        offset = np.maximum(np.maximum(self.low - points[:, None], points[:, None] - self.high), 0)
+        return np.linalg.norm(offset, axis=-1).min(axis=1)
 
 
 class SceneBuilder:
-    """A scene in the making; `rng` decides all that is random in it."""
+    """Collects the parts of a scene; `rng` supplies all random numbers."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
@@ -56,11 +60,11 @@ class SceneBuilder:
         self.faces: list[list[int]] = []
         self.low: list[Array] = []
         self.high: list[Array] = []
-        self.looks: list[Array] = []
+        self.materials: list[Array] = []
         self.rooms: list[Array] = []
         self.lights: list[Array] = []
 
-    def look(
+    def add_material(
         self,
         pattern: Pattern,
         a: Vector,
@@ -68,44 +72,56 @@ class SceneBuilder:
         c: Vector | None = None,
         *,
         size: tuple[float, float] = (0.5, 0.5),
-        share: float = 0.1,
+        fraction: float = 0.1,
         mottle: float = 0.2,
         glow: float = 0.0,
     ) -> int:
-        """A new material; returns its number. Colours are shares of light given back, see `patterns`."""
+        """Add a material and return its index.
+
+        Args:
+            a, b, c: reflectances (red, green, blue); their meaning depends on the pattern, see `textures`.
+            size: size of the pattern, metres.
+            fraction: of joints, stripes or veins in the pattern.
+            mottle: strength of irregular wear.
+            glow: emitted light, relative to the reflectance.
+        """
         row = np.zeros(NUMBERS)
-        row[:16] = [pattern, *a, *(b or a), *(c or a), *size, share, mottle, self.rng.integers(1 << 20), glow]
-        self.looks.append(row)
-        return len(self.looks) - 1
+        row[:16] = [pattern, *a, *(b or a), *(c or a), *size, fraction, mottle, self.rng.integers(1 << 20), glow]
+        self.materials.append(row)
+        return len(self.materials) - 1
 
-    def box(self, centre: Vector, half: Vector, look: int | Sequence[int], yaw: float = 0, pitch: float = 0) -> None:
-        """A box; `look` is one material, or six: left right (x), up down (y), back front (z)."""
-        self._add(BOX, centre, half, look, yaw, pitch)
+    def box(
+        self, centre: Vector, half: Vector, material: int | Sequence[int], yaw: float = 0, pitch: float = 0
+    ) -> None:
+        """Add a box with one material, or with six: left right (x), up down (y), back front (z)."""
+        self._add(BOX, centre, half, material, yaw, pitch)
 
-    def ellipsoid(self, centre: Vector, half: Vector, look: int, yaw: float = 0) -> None:
-        """An ellipsoid with the given half axes."""
-        self._add(ELLIPSOID, centre, half, look, yaw, 0)
+    def ellipsoid(self, centre: Vector, half: Vector, material: int, yaw: float = 0) -> None:
+        """Add an ellipsoid with the given half axes."""
+        self._add(ELLIPSOID, centre, half, material, yaw, 0)
 
-    def cylinder(self, centre: Vector, radius: float, half_height: float, look: int, pitch: float = 0) -> None:
-        """An upright cylinder."""
-        self._add(CYLINDER, centre, (radius, half_height, radius), look, 0, pitch)
+    def cylinder(self, centre: Vector, radius: float, half_height: float, material: int, pitch: float = 0) -> None:
+        """Add an upright cylinder."""
+        self._add(CYLINDER, centre, (radius, half_height, radius), material, 0, pitch)
 
     def light(self, position: Vector, color: Vector, size: float, *, sun: bool = False) -> None:
-        """A lamp at a position, or a sun in a direction."""
+        """Add a lamp at a position, or a sun in a direction."""
         row = np.zeros(LIGHT_NUMBERS)
         row[:8] = [*position, *color, size, float(sun)]
         self.lights.append(row)
 
-    def room(self, corners: Vector, looks: Sequence[int], panel_height: float, trim_height: float, tall: float) -> None:
-        """A room x0 z0 x1 z1 with its wall, floor, ceiling, trim and panel materials."""
+    def room(
+        self, corners: Vector, materials: Sequence[int], panel_height: float, trim_height: float, height: float
+    ) -> None:
+        """Add a room x0 z0 x1 z1 with its materials of wall, floor, ceiling, trim and panel."""
         row = np.zeros(ROOM_NUMBERS)
-        row[:] = [*corners, *looks, panel_height, trim_height, tall]
+        row[:] = [*corners, *materials, panel_height, trim_height, height]
         self.rooms.append(row)
 
     def finish(self, ambient: Vector, outside: int, sky: int) -> GeneratedScene:
-        """The scene so far; `outside` and `sky` are materials."""
+        """The scene; `outside` and `sky` are indices of materials."""
         low, high = np.array(self.low), np.array(self.high)
-        bounds, links = build_tree(low, high)
+        bounds, links = build_bvh(low, high)
         lights = np.array(self.lights) if self.lights else np.zeros((0, LIGHT_NUMBERS))
         arrays = (
             np.array(self.kinds, np.int64),
@@ -114,7 +130,7 @@ class SceneBuilder:
             np.array(self.faces, np.int64),
             bounds,
             links,
-            np.array(self.looks),
+            np.array(self.materials),
             np.array(self.rooms),
             lights,
             np.array(ambient, np.float64),
@@ -124,7 +140,7 @@ class SceneBuilder:
         return GeneratedScene(arrays, low, high)
 
     def _add(
-        self, kind: int, centre: Vector, half: Vector, look: int | Sequence[int], yaw: float, pitch: float
+        self, kind: int, centre: Vector, half: Vector, material: int | Sequence[int], yaw: float, pitch: float
     ) -> None:
         middle, reach = np.asarray(centre, np.float64), np.asarray(half, np.float64)
         cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
@@ -133,6 +149,6 @@ class SceneBuilder:
         self.kinds.append(kind)
         self.maps.append(np.concatenate((rotation.T / reach[:, None], middle[:, None]), axis=1).ravel())
         self.halves.append(reach)
-        self.faces.append([look] * 6 if isinstance(look, int) else list(look))
+        self.faces.append([material] * 6 if isinstance(material, int) else list(material))
         self.low.append(middle - extent - 1e-6)
         self.high.append(middle + extent + 1e-6)

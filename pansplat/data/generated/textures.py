@@ -1,7 +1,7 @@
-"""Colours of surfaces by formula, without grain finer than the picture can show.
+"""Procedural textures, averaged over the footprint of a pixel.
 
-Every pattern takes the width `w` of a pixel on the surface, in metres, and is averaged over it: steps are integrated
-exactly, noise loses the octaves that are too fine. So nearby views agree, as photographs do.
+Every pattern gets the width `w` of a pixel on the surface, metres. Steps are integrated exactly, and octaves of noise
+finer than `w` are omitted. Nearby views therefore agree, as photographs do.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"c
 
 
 class Pattern(IntEnum):
-    """What a surface looks like; the numbers index `color`."""
+    """Kinds of patterns; the numbers select them in `color`."""
 
     PLAIN = 0
     PLANKS = 1
@@ -29,14 +29,14 @@ class Pattern(IntEnum):
     TERRAZZO = 9
 
 
-# Places in a material's row of numbers.
+# Columns of a material.
 KIND, COLOR_A, COLOR_B, COLOR_C = 0, 1, 4, 7
-SIZE_U, SIZE_V, SHARE, MOTTLE, SEED, GLOW, NUMBERS = 10, 11, 12, 13, 14, 15, 16
+SIZE_U, SIZE_V, FRACTION, MOTTLE, SEED, GLOW, NUMBERS = 10, 11, 12, 13, 14, 15, 16
 
 
 @nb.njit(**OPTIONS)
 def hash_unit(i, j, seed):
-    """A number in [0, 1) for two whole numbers and a seed."""
+    """A pseudo-random number in [0, 1) from two integers and a seed."""
     h = (int(i) * 374761393 + int(j) * 668265263 + int(seed) * 974634721) & 0xFFFFFFFF
     h = ((h ^ (h >> 15)) * 1274126177) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1103515245) & 0xFFFFFFFF
@@ -45,7 +45,7 @@ def hash_unit(i, j, seed):
 
 @nb.njit(**OPTIONS)
 def noise(x, y, seed):
-    """Smooth noise in [0, 1] of wavelength about 2."""
+    """Smooth value noise in [0, 1] with a wavelength of about 2."""
     i, j = math.floor(x), math.floor(y)
     fx, fy = x - i, y - j
     fx, fy = fx * fx * (3 - 2 * fx), fy * fy * (3 - 2 * fy)
@@ -56,7 +56,7 @@ def noise(x, y, seed):
 
 @nb.njit(**OPTIONS)
 def fractal(u, v, size, octaves, w, seed):
-    """Noise about 0 with finer and finer octaves, the first `size` metres wide; octaves below `w` fade."""
+    """Fractal noise with mean 0; the first octave is `size` metres wide, octaves finer than `w` fade out."""
     total, gain = 0.0, 1.0
     for octave in range(octaves):
         shown = min(1.0, max(0.0, 1.5 - w / size))
@@ -70,7 +70,7 @@ def fractal(u, v, size, octaves, w, seed):
 
 @nb.njit(**OPTIONS)
 def pulse(x, share, w):
-    """1 in the first `share` of each period of 1, else 0; averaged over a window `w` wide."""
+    """A pulse wave of period 1 that is 1 in the first `share` of a period, averaged over a window of width `w`."""
     if w >= 1:
         return share
     a, b = x - 0.5 * w, x + 0.5 * w
@@ -92,7 +92,7 @@ def _mix(material, first, second, t):
 
 @nb.njit(**OPTIONS)
 def _per_cell(cell, size, w):
-    """How much of a cell's own random tone is left where cells are as small as pixels; `cell` in [0, 1)."""
+    """The random tone `cell` in [0, 1) of a pattern cell about 0, faded out where cells are as small as pixels."""
     return (cell - 0.5) * min(1.0, max(0.0, 1.5 - w / size))
 
 
@@ -103,16 +103,16 @@ def _planks(material, u, v, w, seed):
     along = u / long + hash_unit(row, 3, seed)
     tone = 0.5 + 0.8 * _per_cell(hash_unit(row, math.floor(along), seed), wide, w)
     tone += 1.2 * fractal(u * 0.12, v + 0.3 * tone, 0.05, 4, w, seed) * 0.8
-    joint = max(pulse(v / wide, material[SHARE], w / wide), pulse(along, material[SHARE] * wide / long, w / long))
+    joint = max(pulse(v / wide, material[FRACTION], w / wide), pulse(along, material[FRACTION] * wide / long, w / long))
     r, g, b = _mix(material, COLOR_A, COLOR_B, tone)
     return r * (1 - 0.7 * joint), g * (1 - 0.7 * joint), b * (1 - 0.7 * joint)
 
 
 @nb.njit(**OPTIONS)
 def _tiles(material, u, v, w, seed):
-    size_u, size_v, share = material[SIZE_U], material[SIZE_V], material[SHARE]
+    size_u, size_v, share = material[SIZE_U], material[SIZE_V], material[FRACTION]
     row = math.floor(v / size_v)
-    shifted = u / size_u + (0.5 * (row % 2) if size_u > 1.5 * size_v else 0.0)  # long ones are laid as bricks
+    shifted = u / size_u + (0.5 * (row % 2) if size_u > 1.5 * size_v else 0.0)  # long tiles are laid as bricks
     column = math.floor(shifted)
     joint = 1 - (1 - pulse(shifted, share * size_v / size_u, w / size_u)) * (1 - pulse(v / size_v, share, w / size_v))
     small = min(size_u, size_v)
@@ -131,7 +131,7 @@ def _tiles(material, u, v, w, seed):
 @nb.njit(**OPTIONS)
 def _stripes(material, u, v, w, seed):
     size = material[SIZE_U]
-    wide = pulse(u / size, material[SHARE], w / size)
+    wide = pulse(u / size, material[FRACTION], w / size)
     narrow = pulse(u / size + 0.3, 0.12, w / size)
     r, g, b = _mix(material, COLOR_A, COLOR_B, wide)
     return (
@@ -145,7 +145,7 @@ def _stripes(material, u, v, w, seed):
 def _stone(material, u, v, w, seed):
     size = material[SIZE_U]
     turbulent = fractal(u, v, size, 6, w, seed)
-    if material[SHARE] > 0.5:  # veins
+    if material[FRACTION] > 0.5:  # veins
         vein = 1 - abs(math.sin((u + 0.7 * v) / size * 3 + 6 * turbulent))
         return _mix(material, COLOR_A, COLOR_B, vein * vein * vein * min(1.0, max(0.0, 1.5 - 2 * w / size)))
     return _mix(material, COLOR_A, COLOR_B, 0.5 + 1.3 * turbulent)
@@ -153,7 +153,7 @@ def _stone(material, u, v, w, seed):
 
 @nb.njit(**OPTIONS)
 def _picture(material, u, v, w, seed, half_u, half_v):
-    """Soft ground with a dozen discs and bars on it, each with a colour of its own."""
+    """A noisy background with twelve discs and bars of random colours."""
     x, y = u / half_u, v / half_v
     w /= min(half_u, half_v)
     r, g, b = _mix(material, COLOR_A, COLOR_B, 0.5 + 0.5 * y + 1.5 * fractal(x, y, 0.8, 5, w, seed))
@@ -176,7 +176,7 @@ def _picture(material, u, v, w, seed, half_u, half_v):
 
 @nb.njit(**OPTIONS)
 def _text(material, u, v, w, seed, half_u, half_v):
-    """Lines of words of random letters on a plain ground, with a margin and a short last line here and there."""
+    """Lines of words of random letters on a plain background, with a margin; some lines are short."""
     tall = material[SIZE_U]
     line = math.floor(v / (1.6 * tall))
     y = v / tall - 1.6 * line
@@ -197,7 +197,7 @@ def _text(material, u, v, w, seed, half_u, half_v):
 
 @nb.njit(**OPTIONS)
 def _books(material, u, v, w, seed):
-    """Backs of books of several widths side by side, most with a title band."""
+    """Spines of books of several widths, most with a title band."""
     size = material[SIZE_U]
     x = u / size + 0.6 * noise(1.3 * u / size, 0.5, seed)
     book = math.floor(x)
@@ -214,7 +214,7 @@ def _books(material, u, v, w, seed):
 
 @nb.njit(**OPTIONS)
 def _rug(material, u, v, w, seed, half_u, half_v):
-    """Borders inside one another round a field of diamonds."""
+    """Nested borders around a field of diamonds."""
     edge = min(half_u - abs(u), half_v - abs(v))
     size = material[SIZE_U]
     if edge < 3 * size:
@@ -234,7 +234,7 @@ def _rug(material, u, v, w, seed, half_u, half_v):
 
 @nb.njit(**OPTIONS)
 def _terrazzo(material, u, v, w, seed):
-    """Chips of two colours in a third."""
+    """Chips of two colours in a third colour."""
     size = material[SIZE_U]
     x, y = u / size, v / size
     i, j = math.floor(x), math.floor(y)
@@ -258,13 +258,13 @@ def _terrazzo(material, u, v, w, seed):
 
 @nb.njit(**OPTIONS)
 def color(material, u, v, w, half_u, half_v):
-    """Share of the light (red, green, blue) that a surface gives back.
+    """Reflectance (red, green, blue) of a surface.
 
     Args:
-        material: row of numbers, see the indices above.
-        u, v: place on the surface, metres; v grows downwards on upright ones.
-        w: width of a pixel there, metres.
-        half_u, half_v: half the surface's size, metres, for patterns that fill it.
+        material: a row of numbers, see the columns above.
+        u, v: texture coordinates, metres; v points down on upright surfaces.
+        w: width of a pixel on the surface, metres.
+        half_u, half_v: half the size of the surface, metres, for patterns that fill it.
     """
     kind, seed = int(material[KIND]), int(material[SEED])
     if kind == 1:

@@ -1,6 +1,6 @@
-"""Training data without files: triplets of panoramas of generated homes, as many as one wants, with exact depth.
+"""Training data without files: triplets of panoramas of random generated homes, with exact depth.
 
-Each home has its own plan, furniture, surfaces, colours and light. The same seed and number give the same picture.
+Each home has its own plan, furniture, materials and lights. Equal seeds and indices give equal triplets.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from pansplat.data.views import Sample, Views
 
 Array = NDArray[np.float64]
 
-_CLEARANCE = NEAR  # metres from the cameras' path to the nearest thing
-_PLACES = 60  # tried in a home before another one is built
+_CLEARANCE = NEAR  # least distance of the cameras' path to a body, metres
+_MAX_ATTEMPTS = 60  # random places in a home before another home is generated
 
 
 @dataclass(frozen=True)
 class GeneratedTriplets:
-    """An endless source of triplets; `count` is what counts as an epoch.
+    """A `SampleSource` of generated triplets.
 
     Attributes:
-        seed: another seed gives other homes.
-        count: samples an epoch; numbers beyond it give more.
-        baseline: smallest and largest distance between the two input cameras, metres.
-        samples: rays a pixel are `samples` squared.
+        seed: seed of the homes.
+        count: samples per epoch; larger indices are valid too.
+        baseline: smallest and largest distance between the two context cameras, metres.
+        samples: `samples` squared is the number of rays per pixel.
     """
 
     seed: int = 0
@@ -43,13 +43,13 @@ class GeneratedTriplets:
         return self.count
 
     def sample(self, index: int, height: int, seed: int = 0) -> Sample:
-        """The triplet of that number; `seed` has no part in it."""
+        """Triplet `index`; `seed` has no effect."""
         rng = np.random.default_rng((self.seed, index))
-        scene, poses = self._home(rng)
-        pictures = [scene.panorama(pose, height, self.samples) for pose in poses]
-        exposure = _exposure([light for light, _ in pictures], rng)
-        images = [torch.from_numpy(srgb_from_linear(exposure * light)).permute(2, 0, 1) for light, _ in pictures]
-        depths = [torch.from_numpy(depth).float() for _, depth in pictures]
+        scene, poses = self._sample_home(rng)
+        renderings = [scene.panorama(pose, height, self.samples) for pose in poses]
+        exposure = _sample_exposure([light for light, _ in renderings], rng)
+        images = [torch.from_numpy(srgb_from_linear(exposure * light)).permute(2, 0, 1) for light, _ in renderings]
+        depths = [torch.from_numpy(depth).float() for _, depth in renderings]
         name = f"generated_{self.seed}_{index:06d}"
         order = ((0, 2), (1,))
         context, targets = (
@@ -66,30 +66,30 @@ class GeneratedTriplets:
         )
         return Sample(name, context, targets)
 
-    def _home(self, rng: np.random.Generator) -> tuple[GeneratedScene, list[Array]]:
-        """A home in which there is room for the cameras, and their poses."""
+    def _sample_home(self, rng: np.random.Generator) -> tuple[GeneratedScene, list[Array]]:
+        """A home with enough free space for the cameras, and their poses."""
         while True:
             scene, plan = build_home(rng)
-            poses = _triplet(scene, plan, self.baseline, rng)
+            poses = _sample_poses(scene, plan, self.baseline, rng)
             if poses is not None:
                 return scene, poses
 
 
-def _triplet(
+def _sample_poses(
     scene: GeneratedScene, plan: Plan, baseline: tuple[float, float], rng: np.random.Generator
 ) -> list[Array] | None:
-    """Poses of an input, the target and the other input, on a free path; None where no place was found."""
+    """Poses of the first input, the target and the second input, on a free path; None if none was found."""
     yaw, length = rng.uniform(0, 2 * np.pi), rng.uniform(*baseline)
     rotation = np.array(((np.cos(yaw), 0, np.sin(yaw)), (0, 1, 0), (-np.sin(yaw), 0, np.cos(yaw))))
-    for _ in range(_PLACES):
+    for _ in range(_MAX_ATTEMPTS):
         room = plan.rooms[rng.integers(len(plan.rooms))]
         x, z = (rng.uniform(room[k] + _CLEARANCE, room[k + 2] - _CLEARANCE) for k in (0, 1))
         start = np.array((x, -rng.uniform(0.9, 1.8), z))
-        around = rng.uniform(0, 2 * np.pi)
-        way = np.array((np.sin(around), rng.normal(0, 0.05), np.cos(around)))
-        end = start + length * way / np.linalg.norm(way)
+        azimuth = rng.uniform(0, 2 * np.pi)
+        direction = np.array((np.sin(azimuth), rng.normal(0, 0.05), np.cos(azimuth)))
+        end = start + length * direction / np.linalg.norm(direction)
         middle = start + rng.uniform(0.35, 0.65) * (end - start) + rng.normal(0, 0.04 * length, size=3)
-        if not _inside(end, plan):
+        if not _is_inside(end, plan):
             continue
         path = np.concatenate((np.linspace(start, middle, 8), np.linspace(middle, end, 8)))
         if scene.clearance(path).min() < _CLEARANCE:
@@ -103,12 +103,12 @@ def _triplet(
     return None
 
 
-def _inside(point: Array, plan: Plan) -> bool:
+def _is_inside(point: Array, plan: Plan) -> bool:
     x0, z0, x1, z1 = plan.whole
     return bool(x0 < point[0] < x1 and z0 < point[2] < z1 and -2.1 < point[1] < -0.5)
 
 
-def _exposure(pictures: list[Array], rng: np.random.Generator) -> float:
-    """One factor for all views, as a camera with fixed exposure has: the middle of the tones lands near mid-grey."""
-    middle = float(np.median(np.stack(pictures).mean(axis=-1)))
+def _sample_exposure(renderings: list[Array], rng: np.random.Generator) -> float:
+    """A random exposure for all views that maps the median brightness to about mid-grey."""
+    middle = float(np.median(np.stack(renderings).mean(axis=-1)))
     return rng.uniform(0.14, 0.34) / max(middle, 1e-3)

@@ -1,4 +1,4 @@
-"""Rays meet bodies where formulas say, and the tree of boxes loses none."""
+"""Rays intersect_body bodies where formulas say, and the tree of boxes loses none."""
 
 import math
 
@@ -13,25 +13,25 @@ STACK = np.empty(64, np.int64)
 
 
 def _scene(fill) -> GeneratedScene:
-    build = SceneBuilder(np.random.default_rng(0))
-    look = build.look(Pattern.PLAIN, (0.5, 0.5, 0.5), mottle=0)
-    fill(build, look)
-    build.room((-20, -20, 20, 20), [look] * 5, 0, 0, 20)
-    return build.finish((1, 1, 1), look, look)
+    builder = SceneBuilder(np.random.default_rng(0))
+    material = builder.add_material(Pattern.PLAIN, (0.5, 0.5, 0.5), mottle=0)
+    fill(builder, material)
+    builder.room((-20, -20, 20, 20), [material] * 5, 0, 0, 20)
+    return builder.finish((1, 1, 1), material, material)
 
 
-def _distance(scene: GeneratedScene, origin, towards, most: float = math.inf) -> tuple[float, int]:
+def _distance(scene: GeneratedScene, origin, towards, limit: float = math.inf) -> tuple[float, int]:
     kinds, maps, _, _, bounds, links = scene.arrays[:6]
     direction = np.asarray(towards, float) / np.linalg.norm(towards)
-    return first_hit((kinds, maps, bounds, links, STACK), *map(float, origin), *direction, most, False)
+    return first_hit((kinds, maps, bounds, links, STACK), *map(float, origin), *direction, limit, False)
 
 
 def test_distances_to_single_bodies_are_exact() -> None:
-    turned = _scene(lambda b, look: b.box((0, 0, 4), (1, 1, 1), look, yaw=math.pi / 4))
+    turned = _scene(lambda b, material: b.box((0, 0, 4), (1, 1, 1), material, yaw=math.pi / 4))
     assert _distance(turned, (0, 0, 0), (1e-9, 1e-9, 1)) == (pytest.approx(4 - math.sqrt(2)), 0)
-    ball = _scene(lambda b, look: b.ellipsoid((3, 0, 0), (2, 1, 0.5), look))
+    ball = _scene(lambda b, material: b.ellipsoid((3, 0, 0), (2, 1, 0.5), material))
     assert _distance(ball, (0, 0, 0), (1, 0, 0))[0] == pytest.approx(1)
-    drum = _scene(lambda b, look: b.cylinder((0, 3, 0), 1, 0.5, look))
+    drum = _scene(lambda b, material: b.cylinder((0, 3, 0), 1, 0.5, material))
     assert _distance(drum, (0.9, 0, 0), (1e-9, 1, 1e-9))[0] == pytest.approx(2.5)
     assert _distance(drum, (-3, 3.2, 0), (1, 1e-9, 1e-9))[0] == pytest.approx(2)
     assert _distance(drum, (0, 0, 1.1), (1e-9, 1, 1e-9)) == (math.inf, -1)
@@ -40,16 +40,16 @@ def test_distances_to_single_bodies_are_exact() -> None:
 def test_the_tree_finds_what_a_search_of_all_bodies_finds() -> None:
     rng = np.random.default_rng(5)
 
-    def fill(build: SceneBuilder, look: int) -> None:
+    def fill(builder: SceneBuilder, material: int) -> None:
         for _ in range(60):
             centre, half = rng.uniform(-5, 5, size=3), rng.uniform(0.1, 0.8, size=3)
             kind = rng.integers(3)
             if kind == 0:
-                build.box(centre, half, look, *rng.uniform(0, 3, size=2))
+                builder.box(centre, half, material, *rng.uniform(0, 3, size=2))
             elif kind == 1:
-                build.ellipsoid(centre, half, look, rng.uniform(0, 3))
+                builder.ellipsoid(centre, half, material, rng.uniform(0, 3))
             else:
-                build.cylinder(centre, half[0], half[1], look, rng.uniform(0, 3))
+                builder.cylinder(centre, half[0], half[1], material, rng.uniform(0, 3))
 
     scene = _scene(fill)
     kinds, maps, _, _, bounds, links = scene.arrays[:6]
@@ -72,7 +72,7 @@ def test_the_tree_finds_what_a_search_of_all_bodies_finds() -> None:
 
 
 def test_depth_is_along_the_ray_through_the_pixels_centre() -> None:
-    scene = _scene(lambda b, look: b.box((0, 1.5, 0), (30, 0.1, 30), look))
+    scene = _scene(lambda b, material: b.box((0, 1.5, 0), (30, 0.1, 30), material))
     pose = np.eye(4)
     pose[:3, 3] = 3, 0.2, -1
     _, depth = scene.panorama(pose, 32, 2)
@@ -84,10 +84,10 @@ def test_depth_is_along_the_ray_through_the_pixels_centre() -> None:
 
 
 def test_shadows_fall_behind_things() -> None:
-    def fill(build: SceneBuilder, look: int) -> None:
-        build.box((0, 1.1, 0), (5, 0.1, 5), look)
-        build.box((0, -0.5, 0), (0.3, 0.02, 0.3), look)
-        build.light((0, -2, 0), (20, 20, 20), 0.0)
+    def fill(builder: SceneBuilder, material: int) -> None:
+        builder.box((0, 1.1, 0), (5, 0.1, 5), material)
+        builder.box((0, -0.5, 0), (0.3, 0.02, 0.3), material)
+        builder.light((0, -2, 0), (20, 20, 20), 0.0)
 
     image, _ = _scene(fill).panorama(np.eye(4) + _at(1.2, 0, 0), 64, 1)
     row = 32 + round(math.degrees(math.atan(1 / 1.2)) / 180 * 64)
