@@ -12,15 +12,14 @@ from pansplat.rendering.cpu.runtime import inline_kernel
 from pansplat.rendering.cpu.simd import (
     LANES,
     broadcast,
-    deinterleave,
-    interleave,
-    load,
+    load_aos3,
     load_aos4,
     load_row,
     load_scalar,
     multiply_add,
     select,
-    store,
+    store_aos3,
+    store_aos4,
     to_f32,
 )
 
@@ -178,18 +177,11 @@ def _evaluate_constant_rgb(harmonics, start, count, rows, radius_row, values):
     weight, half, zero = broadcast(np.float32(_C0)), broadcast(np.float32(0.5)), broadcast(np.float32(0))
     coefficients, written, whole = harmonics.reshape(-1), values.reshape(-1), count // LANES * LANES
     for i in range(0, whole, LANES):
-        first, at = 3 * (start + i), 4 * (start + i)
-        red, green, blue = deinterleave(
-            (load(coefficients, first), load(coefficients, first + LANES), load(coefficients, first + 2 * LANES))
-        )
+        red, green, blue = load_aos3(coefficients, 3 * (start + i))
         red = max(multiply_add(weight, red, half), zero)
         green = max(multiply_add(weight, green, half), zero)
         blue = max(multiply_add(weight, blue, half), zero)
-        v0, v1, v2, v3 = interleave((red, green, blue, to_f32(load_row(rows, radius_row, i))))
-        store(written, at, v0)
-        store(written, at + LANES, v1)
-        store(written, at + 2 * LANES, v2)
-        store(written, at + 3 * LANES, v3)
+        store_aos4(written, 4 * (start + i), red, green, blue, to_f32(load_row(rows, radius_row, i)))
     return whole
 
 
@@ -262,16 +254,10 @@ def backpropagate_constant_colors(harmonics, start, count, values, grad_values, 
         for i in range(0, whole, LANES):
             grad_red, grad_green, grad_blue, _ = load_aos4(grad_values, 4 * i)
             red, green, blue, _ = load_aos4(forward, 4 * (start + i))
-            a, b, c = interleave(
-                (
-                    select(red > zero, factor * grad_red, zero),
-                    select(green > zero, factor * grad_green, zero),
-                    select(blue > zero, factor * grad_blue, zero),
-                )
-            )
-            store(written, 3 * (start + i), a)
-            store(written, 3 * (start + i) + LANES, b)
-            store(written, 3 * (start + i) + 2 * LANES, c)
+            grad_red = select(red > zero, factor * grad_red, zero)
+            grad_green = select(green > zero, factor * grad_green, zero)
+            grad_blue = select(blue > zero, factor * grad_blue, zero)
+            store_aos3(written, 3 * (start + i), grad_red, grad_green, grad_blue)
         for i in range(whole, count):
             for c in range(3):
                 grad_colors[i, c] = load_scalar(grad_values, 4 * i + c)

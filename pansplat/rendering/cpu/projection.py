@@ -1,10 +1,10 @@
-"""Projection: the record and the values of each Gaussian that a camera sees.
+"""Stage one: Gaussians projected to records and values, once per camera.
 
-Source: docs/rendering.md, sections 1 to 3; records.py for the layout. Arithmetic is float64, eight Gaussians at a time,
-in blocks of `GAUSSIAN_BLOCK`; a work item is `GAUSSIANS_PER_ITEM`. Lengths are divided by the distance.
+Source: docs/rendering.md, sections 1 to 3; records.py for the layout. Arithmetic is float64, on vectors of eight
+Gaussians in blocks of `GAUSSIAN_BLOCK`; a work item is `GAUSSIANS_PER_ITEM`. Lengths are divided by the distance.
 
-A covariance in the tangent frame (u, v, n) is a tuple, `cov`, of its entries and of the minors that float arithmetic
-cannot compute from them:
+A covariance in the tangent frame (u, v, n) is a tuple, `cov`, of its entries and its minors. The minors are computed
+separately, because from the entries they would suffer cancellation:
 
     uu, uv, vv, un, vn, nn    C in the frame
     det_across                det B
@@ -54,7 +54,7 @@ _MAX_MAGNITUDE_BITS = np.uint32(2 * int(np.float32(MAX_MAGNITUDE).view(np.uint32
 _ROUNDING = -MIN_EIGENVALUE_RATIO
 _DROPPED, _NEAR = 0, 1  # columns of the tallies
 
-# Rows of a block: loaded, computed, stored for the kernels that read the covariances.
+# Rows of a block: what is loaded, what is computed, and what the EWA kernel reads.
 MEAN_ROW, SHAPE_ROW, OPACITY_ROW = 0, 3, 12  # the shape is a quaternion and three scales, or a covariance
 DIRECTION_ROW, RADIUS_ROW, VALID_ROW = 13, 16, 17  # world axes; metres; 1, or 0 where a number is unusable
 FRAME_ROW, COV_ROW = 18, 24
@@ -82,7 +82,7 @@ class GaussianArrays(NamedTuple):
 
     @property
     def kernel_arguments(self) -> tuple[np.ndarray | None, ...]:
-        """The arrays, None for those not given: kernels leave out code that depends on a None."""
+        """The arrays, None for those not given: code that depends on a None is not compiled."""
         by_covariance = len(self.covariances) > 0
         shape = (None, None, self.covariances) if by_covariance else (self.quats, self.scales, None)
         return self.means, *shape, self.opacities, self.harmonics
@@ -244,7 +244,7 @@ def load_block(means, quats, scales, covariances, opacities, start, count, rows)
     largest = broadcast(np.float32(0))
     largest = aos3_to_soa(means.reshape(-1), start, count, rows, MEAN_ROW, largest)
     largest = aos1_to_soa(opacities, start, count, rows, OPACITY_ROW, largest)
-    # Two tests: numba leaves out what depends on a None, but not the other branch.
+    # Two conditions and no `else`: numba removes the branch of an argument that is None, but not the other one.
     if covariances is not None:
         for i in range(count):
             for j in range(9):
@@ -257,7 +257,7 @@ def load_block(means, quats, scales, covariances, opacities, start, count, rows)
 
 @inline_kernel
 def _invalidate_large_numbers(rows, first, end, count):
-    """Clear the validity of Gaussians with a number in these rows that is not finite or absurdly large."""
+    """Mark Gaussians invalid that have a number in these rows that is not finite or too large."""
     for row in range(first, end):
         for i in range(count):
             if not abs(rows[row, i]) < MAX_MAGNITUDE:
@@ -266,7 +266,7 @@ def _invalidate_large_numbers(rows, first, end, count):
 
 @inline_kernel
 def _validate_harmonics(harmonic_bits, size, start, count, rows):
-    """Set the validity of a block's Gaussians: 0 where one of `size` coefficients is not finite or absurdly large."""
+    """Mark Gaussians valid, or invalid if one of their `size` coefficients is not finite or too large."""
     for i in range(GAUSSIAN_BLOCK):
         rows[VALID_ROW, i] = 1.0
     largest = np.uint32(0)
@@ -313,7 +313,7 @@ def pose_columns(pose):
 
 @inline_kernel
 def compute_direction(rows, i, pose, near):
-    """Direction, distance, one over the distance, and a state: 1, or -1 if too near."""
+    """Direction, distance, one over the distance, and a state: 1, or -1 where the Gaussian is too near."""
     mx, my, mz = load_vector(rows, MEAN_ROW, i)
     x, y, z = mx - pose[3][0], my - pose[3][1], mz - pose[3][2]
     radius = math.sqrt(x * x + y * y + z * z)
@@ -447,7 +447,7 @@ def whitened_axes(u, v, factors):
     return a, ((v[0] - mix * u[0]) * b_scale, (v[1] - mix * u[1]) * b_scale, (v[2] - mix * u[2]) * b_scale)
 
 
-# Covariances of a block, for the EWA kernel.
+# Covariances of a block, one Gaussian at a time, for the EWA kernel.
 
 
 @inline_kernel
@@ -478,7 +478,7 @@ def load_tangent_covariance(rows, i):
     return u, v, n, cov
 
 
-# Of numbers or vectors.
+# Vector algebra, for float64 and f64x8.
 
 
 @inline_kernel

@@ -1,4 +1,4 @@
-"""Backward of the projection: from gradients of records and values to those of the Gaussians and the camera's pose.
+"""Gradients of stage one: from those of records and values to those of the Gaussians and the camera's pose.
 
 Source: docs/rendering.md, sections 1 to 3, differentiated by hand. Turning the rows a and b about n together does not
 change an image, so their derivative is taken in the gauge where it is symmetric. With E = C + e^2, p the axis dual to a
@@ -10,8 +10,8 @@ and q that to b, a motion dn across n and a change dC of the covariance,
     dS' = l'dC l - 2 (S' + e^2) (l - n).dn
     d ln det B' = X_aa + X_bb
 
-and likewise for b; alpha and beta are the components of l along a and b. Nothing is divided by a width, so needles and
-discs lose no more accuracy than in the forward.
+and likewise for b; alpha and beta are the components of l along a and b. Nothing is divided by a width, so the
+gradients of needles and discs are as accurate as the forward.
 """
 
 import math
@@ -291,7 +291,7 @@ def _backpropagate_records(
     else:
         g_n, g_radius = _backpropagate_axes(rows, i, ewa_grads, u, n, inverse, g_n, parts, g_det)
     store_row(rows, _RADIUS_GRAD_ROW, i, load_row(rows, _RADIUS_GRAD_ROW, i) + g_radius)
-    g_log_peak = (1 / math.log(2)) * to_f64(load(soa, layout.LOG2_PEAK * GAUSSIAN_BLOCK + i))
+    g_log_peak = (1 / math.log(2)) * _load_field(soa, layout.LOG2_PEAK, i)
     store_row(rows, OPACITY_ROW, i, g_log_peak / load_row(rows, OPACITY_ROW, i))
     store_row(rows, RADIUS_ROW, i, radius)
     store_vector(rows, _MEAN_GRAD_ROW, i, g_n)
@@ -300,46 +300,58 @@ def _backpropagate_records(
 
 @inline_kernel
 def _backpropagate_footprint_rows(pose, filter_variance, compensate, u, v, n, cov, soa, i, grad_pose):
-    """The gradient of n, the parts of that of C for `_covariance_gradient`, and that of ln det B."""
+    """The gradient of n, the parts of that of C for `_covariance_gradient`, and that of det B."""
     unit, inverse_unit = math.sqrt(layout.HALF_LOG2_E), 1 / math.sqrt(layout.HALF_LOG2_E)
     factors, alpha, beta, radial_variance, det_filtered, _ = compute_whitening(cov, filter_variance)
     a_scale, mix, b_scale = factors
     a, b = whitened_axes(u, v, factors)
-    g_n = _to_world(pose, _load_gradient(soa, layout.DIRECTION, i, 1.0))
-    g_a = _to_world(pose, _load_gradient(soa, layout.ROW_A, i, unit))
-    g_b = _to_world(pose, _load_gradient(soa, layout.ROW_B, i, unit))
+    g_n = _to_world(pose, _load_fields(soa, layout.DIRECTION, i, 1.0))
+    g_a = _to_world(pose, _load_fields(soa, layout.ROW_A, i, unit))
+    g_b = _to_world(pose, _load_fields(soa, layout.ROW_B, i, unit))
     if grad_pose.shape[0] > 0:
         _add_to_pose(grad_pose, n, a, b, g_n, g_a, g_b)
-    g_alpha = inverse_unit * to_f64(load(soa, layout.L_ALONG_A * GAUSSIAN_BLOCK + i))
-    g_beta = inverse_unit * to_f64(load(soa, layout.L_ALONG_B * GAUSSIAN_BLOCK + i))
-    g_radial = (1 / layout.HALF_LOG2_E) * to_f64(load(soa, layout.RADIAL_VARIANCE * GAUSSIAN_BLOCK + i))
-    half, g_det = broadcast(0.0), broadcast(0.0)
+    g_alpha = inverse_unit * _load_field(soa, layout.L_ALONG_A, i)
+    g_beta = inverse_unit * _load_field(soa, layout.L_ALONG_B, i)
+    g_radial = (1 / layout.HALF_LOG2_E) * _load_field(soa, layout.RADIAL_VARIANCE, i)
+    g_ln_ratio, g_det = broadcast(0.0), broadcast(0.0)  # of ln (det B / det B') and of det B
     if compensate:
-        counts = cov[6] > MIN_COMPENSATION * det_filtered
-        half = select(counts, (0.5 / math.log(2)) * to_f64(load(soa, layout.LOG2_PEAK * GAUSSIAN_BLOCK + i)), half)
-        g_det = select(counts, half / cov[6], g_det)
-    g_aa = -0.5 * (dot(*g_a, *a) + alpha * g_alpha) - half
+        is_compensated = cov[6] > MIN_COMPENSATION * det_filtered
+        g_ln_ratio = select(is_compensated, (0.5 / math.log(2)) * _load_field(soa, layout.LOG2_PEAK, i), g_ln_ratio)
+        g_det = select(is_compensated, g_ln_ratio / cov[6], g_det)
+    g_aa = -0.5 * (dot(*g_a, *a) + alpha * g_alpha) - g_ln_ratio
     g_ab = -0.5 * (dot(*g_a, *b) + dot(*g_b, *a) + beta * g_alpha + alpha * g_beta)
-    g_bb = -0.5 * (dot(*g_b, *b) + beta * g_beta) - half
+    g_bb = -0.5 * (dot(*g_b, *b) + beta * g_beta) - g_ln_ratio
     length = math.sqrt(det_filtered)
     ahead, back = cov[5] + filter_variance, 2 * (radial_variance + filter_variance) * g_radial
     by_a = 2 * alpha * g_aa + beta * g_ab - dot(*g_a, *n) + ahead * g_alpha - back * alpha
     by_b = b_scale * (alpha * g_ab + 2 * beta * g_bb - dot(*g_b, *n) + ahead * g_beta - back * beta)
     by_p, by_q = b_scale * length * g_alpha, a_scale * length * g_beta
     by_u, by_v = by_a * a_scale - by_b * mix - by_p, by_b - by_p * mix - by_q  # p = b ^ n, q = n ^ a
-    g_n = g_n[0] + by_u * u[0] + by_v * v[0], g_n[1] + by_u * u[1] + by_v * v[1], g_n[2] + by_u * u[2] + by_v * v[2]
+    g_n = _add_tangent(g_n, by_u, u, by_v, v)
     halves = 0.5 * g_aa, 0.5 * g_ab, 0.5 * g_bb, 0.5 * g_alpha, 0.5 * g_beta
     return g_n, (factors, (alpha, beta), g_radial, halves), g_det
 
 
 @inline_kernel
-def _load_gradient(soa, field, i, factor):
-    """The gradient of three fields of the records."""
+def _load_field(soa, field, i):
+    """The gradient of one field of the records."""
+    return to_f64(load(soa, field * GAUSSIAN_BLOCK + i))
+
+
+@inline_kernel
+def _load_fields(soa, field, i, factor):
+    """The gradient of three fields."""
     return (
-        factor * to_f64(load(soa, field * GAUSSIAN_BLOCK + i)),
-        factor * to_f64(load(soa, (field + 1) * GAUSSIAN_BLOCK + i)),
-        factor * to_f64(load(soa, (field + 2) * GAUSSIAN_BLOCK + i)),
+        factor * _load_field(soa, field, i),
+        factor * _load_field(soa, field + 1, i),
+        factor * _load_field(soa, field + 2, i),
     )
+
+
+@inline_kernel
+def _add_tangent(g_n, by_u, u, by_v, v):
+    """g_n + by_u u + by_v v"""
+    return g_n[0] + by_u * u[0] + by_v * v[0], g_n[1] + by_u * u[1] + by_v * v[1], g_n[2] + by_u * u[2] + by_v * v[2]
 
 
 @inline_kernel
@@ -419,7 +431,7 @@ def _backpropagate_matrices(rows, i, ewa_grads, u, v, n, cov, inverse, g_n, part
     Args:
         ewa_grads: None if there are none.
         inverse: one over the distance.
-        g_n, parts, g: gradients of n, C (see `_covariance_gradient`) and ln det B.
+        g_n, parts, g: gradients of n, C (see `_covariance_gradient`) and det B.
     """
     xx, xy, xz, yy, yz, zz = _covariance_gradient(u, v, n, parts)
     if ewa_grads is not None:
@@ -433,8 +445,7 @@ def _backpropagate_matrices(rows, i, ewa_grads, u, v, n, cov, inverse, g_n, part
     xy = xy + g * (vv * u[0] * u[1] + uu * v[0] * v[1] - uv * (u[0] * v[1] + u[1] * v[0]))
     xz = xz + g * (vv * u[0] * u[2] + uu * v[0] * v[2] - uv * (u[0] * v[2] + u[2] * v[0]))
     yz = yz + g * (vv * u[1] * u[2] + uu * v[1] * v[2] - uv * (u[1] * v[2] + u[2] * v[1]))
-    by_u, by_v = 2 * g * (uv * vn - vv * un), 2 * g * (uv * un - uu * vn)
-    g_n = g_n[0] + by_u * u[0] + by_v * v[0], g_n[1] + by_u * u[1] + by_v * v[1], g_n[2] + by_u * u[2] + by_v * v[2]
+    g_n = _add_tangent(g_n, 2 * g * (uv * vn - vv * un), u, 2 * g * (uv * un - uu * vn), v)
     x_row, y_row = load_vector(rows, SHAPE_ROW, i), load_vector(rows, SHAPE_ROW + 3, i)
     z_row = load_vector(rows, SHAPE_ROW + 6, i)
     whole = xx * x_row[0] + yy * y_row[1] + zz * z_row[2]
@@ -452,14 +463,14 @@ def _backpropagate_matrices(rows, i, ewa_grads, u, v, n, cov, inverse, g_n, part
 def _backpropagate_axes(rows, i, ewa_grads, u, n, inverse, g_n, parts, g):
     """Store the gradients of quaternions and scales; return those of n and the distance.
 
-    ln det B = ln sum_k w_k (n.e_k)^2. Turning the axes about one of them changes nothing if the other two scales are
-    equal, and rounding does not hide that: with G the gradient of C in the Gaussian's own axes and a_k the squared
-    scales, the torque about axis 0 is 2 (a_1 - a_2) (G_12 - g a_0 n_1 n_2), and cyclically.
+    det B = sum_k w_k (n.e_k)^2. A rotation about one axis has no effect if the other two scales are equal, and this is
+    exact here: with G the gradient of C in the Gaussian's own axes and a_k the squared scales, the torque about
+    axis 0 is 2 (a_1 - a_2) (G_12 - g a_0 n_1 n_2), and cyclically.
 
     Args:
         ewa_grads: None if there are none.
         inverse: one over the distance.
-        g_n, parts, g: gradients of n, C (see `_covariance_gradient`) and ln det B.
+        g_n, parts, g: gradients of n, C (see `_covariance_gradient`) and det B.
     """
     e0, e1, e2, inverse2 = load_axes(rows, i)
     s0, s1, s2 = load_vector(rows, SHAPE_ROW + 4, i)

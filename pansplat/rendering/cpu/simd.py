@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba.core import types
-from numba.core.cgutils import alloca_once, get_or_insert_function, unpack_tuple
+from numba.core.cgutils import alloca_once, get_or_insert_function
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
@@ -427,45 +427,49 @@ def join_halves(builder, a, b):
     return _halves(builder, a, b, LANES // 2)
 
 
-@llvm_intrinsic
-def deinterleave(context, vectors):
-    """Of k vectors that hold eight groups of k numbers: the first of each group, the second, and so on."""
-
-    def generate(context, builder, sig, args):
-        return context.make_tuple(builder, sig.return_type, _deinterleave(builder, unpack_tuple(builder, args[0])))
-
-    return vectors(vectors), generate
-
-
-@llvm_intrinsic
-def interleave(context, vectors):
-    """Undo `deinterleave`."""
-
-    def generate(context, builder, sig, args):
-        return context.make_tuple(builder, sig.return_type, _interleave(builder, unpack_tuple(builder, args[0])))
-
-    return vectors(vectors), generate
-
-
 # Arrays of structures to structures of arrays, and back.
 
 
+@_access(types.UniTuple(f32x8, 3))
+def load_aos3(builder, pointer):
+    """Eight groups of three float32: the first of each group, the second and the third."""
+    return _deinterleave(builder, _load_vectors(builder, pointer, 3))
+
+
+@_access(types.UniTuple(f32x8, 4))
+def load_aos4(builder, pointer):
+    """Eight groups of four float32, likewise."""
+    return _deinterleave(builder, _load_vectors(builder, pointer, 4))
+
+
+@_access(types.void, *[f32x8] * 3)
+def store_aos3(builder, pointer, *vectors):
+    """Write three vectors as eight groups of three float32."""
+    _store_vectors(builder, pointer, _interleave(builder, vectors))
+
+
+@_access(types.void, *[f32x8] * 4)
+def store_aos4(builder, pointer, *vectors):
+    """Write four vectors as eight groups of four float32."""
+    _store_vectors(builder, pointer, _interleave(builder, vectors))
+
+
 def _aos_to_soa(size: int) -> Any:
-    """A kernel function that reads groups of `size` float32, one a Gaussian, into rows of float64."""
+    """Make a kernel function `read(numbers, start, count, rows, row, largest)`.
+
+    It reads `count` groups of `size` float32, from group `start` on, into `size` rows of float64, from `row` on, and
+    returns the largest magnitudes so far, for `any_magnitude_reaches`.
+    """
 
     @llvm_intrinsic
     def read_eight(context, numbers, index, rows, row, column, largest):
         def generate(context, builder, sig, args):
             numbers, index, rows, row, column, largest = args
-            vectors = []
-            for j in range(size):
-                at = builder.add(index, index.type(LANES * j))
-                vectors.append(_load(builder, _pointer(context, builder, sig.args[0], numbers, at), _FLOATS))
+            vectors = _load_vectors(builder, _pointer(context, builder, sig.args[0], numbers, index), size)
             for vector in vectors:
                 largest = _max_magnitude(builder, largest, vector)
             for j, vector in enumerate(_deinterleave(builder, vectors)):
-                at = builder.add(row, row.type(j))
-                pointer = _row_pointer(context, builder, sig.args[2], rows, at, column)
+                pointer = _row_pointer(context, builder, sig.args[2], rows, builder.add(row, row.type(j)), column)
                 _store(builder, builder.fpext(vector, _DOUBLES), pointer)
             return largest
 
@@ -489,7 +493,7 @@ def _aos_to_soa(size: int) -> Any:
 
 
 def _soa_to_aos(size: int) -> Any:
-    """A kernel function that writes rows of float64 as groups of `size` float32, one a Gaussian."""
+    """Make a kernel function `write(rows, row, start, count, numbers)`, the reverse of `_aos_to_soa`; it rounds."""
 
     @llvm_intrinsic
     def write_eight(context, rows, row, column, numbers, index):
@@ -497,12 +501,10 @@ def _soa_to_aos(size: int) -> Any:
             rows, row, column, numbers, index = args
             vectors = []
             for j in range(size):
-                at = builder.add(row, row.type(j))
-                pointer = _row_pointer(context, builder, sig.args[0], rows, at, column)
+                pointer = _row_pointer(context, builder, sig.args[0], rows, builder.add(row, row.type(j)), column)
                 vectors.append(builder.fptrunc(_load(builder, pointer, _DOUBLES), _FLOATS))
-            for j, vector in enumerate(_interleave(builder, vectors)):
-                at = builder.add(index, index.type(LANES * j))
-                _store(builder, vector, _pointer(context, builder, sig.args[3], numbers, at))
+            pointer = _pointer(context, builder, sig.args[3], numbers, index)
+            _store_vectors(builder, pointer, _interleave(builder, vectors))
             return context.get_dummy_value()
 
         return types.void(rows, types.intp, types.intp, numbers, types.intp), generate
@@ -519,24 +521,8 @@ def _soa_to_aos(size: int) -> Any:
     return write
 
 
-# read(numbers, start, count, rows, row, largest): read `count` groups from group `start` on into `size` rows from `row`
-# on; return the largest magnitudes so far, for `any_magnitude_reaches`.
 aos1_to_soa, aos3_to_soa, aos4_to_soa = (_aos_to_soa(size) for size in (1, 3, 4))
-# write(rows, row, start, count, numbers): the reverse, rounded.
 soa_to_aos1, soa_to_aos3, soa_to_aos4 = (_soa_to_aos(size) for size in (1, 3, 4))
-
-
-@inline_kernel
-def load_aos4(numbers, first):
-    """Eight groups of four float32 from `first` on: the first of each group, the second, and so on."""
-    return deinterleave(
-        (
-            load(numbers, first),
-            load(numbers, first + LANES),
-            load(numbers, first + 2 * LANES),
-            load(numbers, first + 3 * LANES),
-        )
-    )
 
 
 @inline_kernel
@@ -624,6 +610,16 @@ def _store(builder: Any, value: Any, pointer: Any) -> Any:
     stored = builder.store(value, builder.bitcast(pointer, value.type.as_pointer()))
     stored.align = _ALIGNMENT[value.type]
     return stored
+
+
+def _load_vectors(builder: Any, pointer: Any, count: int) -> list[Any]:
+    """Adjacent vectors of float32."""
+    return [_load(builder, builder.gep(pointer, [_LONG(LANES * j)]), _FLOATS) for j in range(count)]
+
+
+def _store_vectors(builder: Any, pointer: Any, vectors: Sequence[Any]) -> None:
+    for j, vector in enumerate(vectors):
+        _store(builder, vector, builder.gep(pointer, [_LONG(LANES * j)]))
 
 
 def _prefetch(builder: Any, pointer: Any, *, is_write: int, locality: int) -> None:
