@@ -385,27 +385,14 @@ def test_the_mean_is_taken_in_float32(dtype):
     assert torch.allclose(level.inverse_depth, candidates.mean(dim=2), rtol=1e-6)
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 @pytest.mark.parametrize("backend", ["torch", "kernel"])
-def test_products_beyond_half_precision_do_not_overflow(dtype, backend):
-    features = torch.full((1, 128, H, W), 30.0, dtype=dtype).requires_grad_()
+def test_products_beyond_half_precision_do_not_overflow(backend):
+    features = torch.full((1, 128, H, W), 30.0, dtype=torch.float16).requires_grad_()
     pose = _poses()[:, 1]
     result = correlate(features, features, _candidates(*_bounds())[0, :1].float(), pose, "sphere", backend)
     assert torch.allclose(result, torch.tensor(128 * 900 / math.sqrt(128)), rtol=1e-4)
     result.mean().backward()
     assert torch.isfinite(features.grad).all()
-
-
-def test_a_network_in_bfloat16_is_near_the_one_in_float32(randomize):
-    inputs = (_features(torch.float32), _poses(), *(bound.float() for bound in _bounds()))
-    full = randomize(SphericalCostVolume(_EXTREME, "fixed")).float()
-    half = randomize(SphericalCostVolume(_EXTREME, "fixed", precision="bfloat16")).float()
-    with torch.no_grad():
-        truth = full(*inputs).inverse_depth[0]
-        result = half(*inputs).inverse_depth[0]
-    assert not torch.equal(result, truth)
-    assert result.dtype == torch.float32
-    assert (result - truth).abs().mean() < 0.02 * (2.0 - 0.1)
 
 
 # Rotated cameras
