@@ -4,8 +4,9 @@ Each level tests depth candidates around the result of the coarser one: it corre
 every candidate, refines the volume with a U-Net and regresses the mean of the candidates under the softmax of the
 logits. The U-Net attends across positions and views at its bottleneck.
 
-Source: PanSplat, section 3.2 and Figure 3; OFFICIAL.md, sections 6 and 7. The candidate spacing halves from level to
-level, as in the official code; the paper keeps it (OFFICIAL.md, P3).
+The candidate spacing halves from level to level, as in the official code; the paper keeps it (docs/paper.md, P3).
+
+Source: PanSplat, section 3.2 and Figure 3; docs/official.md, sections 6 and 7.
 """
 
 from dataclasses import dataclass

@@ -5,7 +5,7 @@ half a window. With two views each attends to the other; with more, to the token
 the panoramas maps windows onto windows, so with `compat="fixed"` it rolls the output exactly; other rolls change which
 tokens share a window.
 
-Source: PanSplat, section 3.1 and Figure 3; OFFICIAL.md, section 4.
+Source: PanSplat, section 3.1 and Figure 3; docs/official.md, section 4.
 """
 
 import math

@@ -5,7 +5,7 @@ level, and adds its output to that map. Each lattice point samples the sum; a li
 parameters of one Gaussian, and the adapter turns those into a Gaussian in the world. The heads run tile by tile to
 bound memory.
 
-Source: PanSplat, sections 3.3 and 3.4 and Figure 3; OFFICIAL.md, sections 8 and 9.
+Source: PanSplat, sections 3.3 and 3.4 and Figure 3; docs/official.md, sections 8 and 9.
 """
 
 from __future__ import annotations
@@ -426,7 +426,7 @@ def adapt_gaussians(
         colors: RGB in [0, 1] to add to the constant harmonic, or None.
         level, view: labels of the Gaussians.
 
-    Source: PanSplat, section 3.3; OFFICIAL.md, section 9.
+    Source: PanSplat, section 3.3; docs/official.md, section 9.
     """
     camera = cam2world[:3, :3].double()
     directions = directions_from_uv(uv) @ camera.to(uv).T
@@ -452,7 +452,7 @@ def world_harmonics_rotation(rotation: Float[Tensor, "3 3"], compat: Compat) -> 
     """Rotation to world axes from the axes in which the network's colours are 3DGS harmonics.
 
     The official code rotates colours by the camera's rotation with x and z reversed, which is right only for rotations
-    about y (OFFICIAL.md, trap T3).
+    about y (docs/paper.md, T3).
     """
     if compat == "official":
         reverse = torch.tensor((-1.0, 1.0, -1.0)).to(rotation)
@@ -490,7 +490,7 @@ class AuxiliaryHeads(nn.Module):
     They have the depth and confidence of the level. The images rendered from them give every level a loss without
     true depth. The heads are independent; their maps have half the height of the cost volume's input.
 
-    Source: PanSplat, section 3.5 (real data); OFFICIAL.md, section 8 (auxiliary heads).
+    Source: PanSplat, section 3.5 (real data); docs/official.md, section 8 (auxiliary heads).
     """
 
     def __init__(self, config: HeadsConfig, compat: Compat) -> None:

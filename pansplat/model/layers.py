@@ -3,7 +3,7 @@
 `compat="official"` computes what the official code computes, its defects included. `compat="fixed"` has pixel centres
 at half-integers and continues every map across the seam and the poles.
 
-Source: PanSplat, section 3.1; OFFICIAL.md, sections 4, 6 and 7.
+Source: PanSplat, section 3.1; docs/official.md, sections 4, 6 and 7.
 """
 
 from typing import Literal

@@ -3,7 +3,7 @@
 Built of PanSplat's layers. With `compat="official"` nothing wraps at the seam, as in the official code; with "fixed"
 convolutions, resizing and correlation continue across seam and poles.
 
-Source: Chen et al., MVSplat, https://arxiv.org/abs/2403.14627; OFFICIAL.md, section 16.
+Source: Chen et al., MVSplat, https://arxiv.org/abs/2403.14627; docs/official.md, section 16.
 """
 
 from __future__ import annotations

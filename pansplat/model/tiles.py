@@ -3,7 +3,7 @@
 A tile is one cell of an N x N grid over the panorama. On the map of each level it is a window of whole pixels, expanded
 by a margin. Beyond the borders of the map, columns wrap and rows continue over the pole, half a turn away. The
 official code has zeros beyond the poles, repeats the last column at the seam when it resizes, and has margins that are
-too narrow (OFFICIAL.md, P6, P7, T5).
+too narrow (docs/paper.md, P6, P7, T5).
 
 Source: PanSplat, sections 3.3 and 3.4.
 """
@@ -182,7 +182,7 @@ def sample_window(
 def sample_panorama(
     source: Float[Tensor, "channel h w"], uv: Float[Tensor, "n 2"], compat: Compat
 ) -> Float[Tensor, "n channel"]:
-    """Sample a whole map bilinearly; "official" repeats the last column at the seam (OFFICIAL.md, trap T7)."""
+    """Sample a whole map bilinearly; "official" repeats the last column at the seam (docs/paper.md, T7)."""
     height = source.shape[-2]
     window = Window(0, 0, height, 2 * height)
     if compat == "fixed":

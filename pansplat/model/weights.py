@@ -4,7 +4,7 @@ A weights file is a .safetensors with four metadata entries: `pansplat_format` (
 `config` (its architecture, JSON) and `compat` (with which it was trained). A checkpoint is read without running code
 that it contains. Conversion is strict: a tensor that is missing, unknown or not finite is an error.
 
-Source: OFFICIAL.md, sections 3 to 8, 15 and 16.
+Source: docs/official.md, sections 3 to 8, 15 and 16.
 """
 
 from __future__ import annotations

@@ -187,7 +187,7 @@ def test_panogrf_scenes_are_read_from_any_of_their_folders(tmp_path: Path) -> No
     views = pair.load_context(16)
     assert views.depths is not None
     assert views.depths.unique().tolist() == [2.5]
-    # Habitat's identity, in a z-up world: right is +x, down is -z, forward is +y (OFFICIAL.md 2.1).
+    # Habitat's identity, in a z-up world: right is +x, down is -z, forward is +y (docs/official.md, section 2.1).
     assert views.cam2world[0].tolist() == [[1, 0, 0, 0], [0, 0, 1, 0.5], [0, -1, 0, 0.5], [0, 0, 0, 1]]
 
 

@@ -106,7 +106,7 @@ def test_panogrf_sets_are_read_by_stage_and_missing_ones_named(tmp_path: Path) -
     sample = TripletSource(sets[2]).sample(1, 8, 0)
     assert sample.name == "00000001"
     assert sample.context.images[:, 0, 0, 0].tolist() == pytest.approx([0.2, 0.6], abs=3e-3)
-    # A file's +z is the world's -y (OFFICIAL.md 2.1).
+    # A file's +z is the world's -y (docs/official.md, section 2.1).
     assert sample.context.cam2world[:, 1, 3].tolist() == [0, -1.0]
     with pytest.raises(InputError, match=r"scenes for train, got none in .*png_render_train_1024x512_seq_len_3_m3d"):
         read_panogrf(tmp_path, "train", 512)

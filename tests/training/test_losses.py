@@ -47,7 +47,7 @@ def far_off(prediction: Tensor, target: Tensor, weights: Tensor | None = None) -
 
 
 def test_presets_are_those_of_paper_and_code() -> None:
-    """OFFICIAL.md, P4 and P5: swapped weights, another form of the depth loss."""
+    """docs/paper.md, P4 and P5: swapped weights, another form of the depth loss."""
     assert LOSS_WEIGHTS == {"paper": PAPER, "code": CODE}
     assert (PAPER.square, PAPER.perceptual, PAPER.depth, PAPER.depth_form, PAPER.decay) == (1, 0.1, 0.05, "depth", 0.9)
     assert (CODE.square, CODE.perceptual, CODE.depth, CODE.depth_form, CODE.decay) == (
