@@ -4,18 +4,15 @@ import re
 import sys
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from pansplat.errors import InputError
 from pansplat_viewer.loader import LoadOptions, SceneEntry, SceneLoader, find_entries, load_entry
 from pansplat_viewer.settings import DrawSettings, Kernel, Mode, Order
-
-if TYPE_CHECKING:
-    from pansplat_viewer.window import Window
 
 
 @dataclass(frozen=True)
@@ -78,16 +75,8 @@ class Options:
     @property
     def load_options(self) -> LoadOptions:
         """Options of reading and prediction."""
-        return LoadOptions(
-            self.model,
-            self.compat,
-            self.precision,
-            self.height,
-            not self.no_cache,
-            self.convention,
-            self.near,
-            self.far,
-        )
+        same = {name: getattr(self, name) for name in ("model", "compat", "precision", "height", "convention")}
+        return LoadOptions(**same, cache=not self.no_cache, near=self.near, far=self.far)
 
     @property
     def settings(self) -> DrawSettings:
@@ -146,7 +135,7 @@ def _run(options: Options) -> int:
     first = 0 if show_all else choose_entry(entries, options.pair)
     folder = options.offscreen
     if folder is None:
-        problem = _try_window(options, entries, first, pixels)
+        problem = _run_window(options, entries, first, pixels)
         if problem is None:
             return 0
         print(f"{problem}: writing a fly-through instead")
@@ -162,46 +151,32 @@ def _run(options: Options) -> int:
     return 0
 
 
-def _try_window(options: Options, entries: list[SceneEntry], first: int, pixels: tuple[int, int]) -> str | None:
+def _run_window(options: Options, entries: list[SceneEntry], first: int, pixels: tuple[int, int]) -> str | None:
     """Run the viewer in a window; returns the reason if no window can be opened."""
-    from pansplat_viewer.window import NoWindowError, Window
+    from pansplat_viewer.state import ViewerState
+    from pansplat_viewer.viewer import Viewer
+    from pansplat_viewer.window import NoWindowError, Window, run_viewer
 
     try:
         window = Window("pansplat", pixels)
     except NoWindowError as error:
         return str(error)
-    _run_window(window, options, entries, first)
-    return None
-
-
-def _run_window(window: "Window", options: Options, entries: list[SceneEntry], first: int) -> None:
-    import moderngl
-
-    from pansplat_viewer.state import ViewerState
-    from pansplat_viewer.viewer import Viewer
-    from pansplat_viewer.window import run as run_window
-
     load_options = options.load_options
-
-    def make_viewer(ctx: moderngl.Context, dpi_scale: float) -> Viewer:
-        viewer = Viewer(
-            ctx,
-            SceneLoader(lambda entry, progress: load_entry(entry, load_options, progress)),
-            find=lambda path: find_entries(path, load_options),
-            state=ViewerState(settings=options.settings),
-            at=options.at or 0.0,
-            dpi_scale=dpi_scale,
-        )
-        viewer.show(entries, first)
-        return viewer
-
-    run_window(window, make_viewer)
+    viewer = Viewer(
+        window.ctx,
+        SceneLoader(lambda entry, progress: load_entry(entry, load_options, progress)),
+        find=lambda path: find_entries(path, load_options),
+        state=ViewerState(settings=options.settings),
+        at=options.at or 0.0,
+        dpi_scale=window.dpi_scale,
+    )
+    viewer.show(entries, first)
+    run_viewer(window, viewer)
+    return None
 
 
 def _write_flythrough(options: Options, entry: SceneEntry, folder: Path, pixels: tuple[int, int]) -> None:
     """Load one entry and write its fly-through, with progress bars."""
-    from dataclasses import replace
-
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from pansplat_viewer.capture import Film, write_flythrough

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from importlib import resources
-from typing import Any, get_args
+from typing import get_args
 
 import imgui_bundle
 import moderngl
@@ -111,7 +111,7 @@ class Gui:
 
 
 class Panels:
-    """Draws the panels and applies what is changed in them to the state.
+    """Draws the panels and applies changes in them to the state.
 
     Attributes:
         items: rectangle of each widget of the last frame, by its label; for tests that click.
@@ -127,18 +127,18 @@ class Panels:
         self.items.clear()
         commands = Commands()
         if state.overlay:
-            self._panel(state, data, commands)
-            self._stats(state, data)
+            self._draw_main_panel(state, data, commands)
+            _draw_stats(state, data)
         if state.photo and data.photo_name is not None and 0 < state.split < 1:
-            _split_line(state.split)
+            _draw_split_line(state.split)
         if state.help:
-            self._help(state)
+            state.help = _draw_help()
         if data.loading:
-            _progress(*data.loading)
+            _draw_progress(*data.loading)
         elif data.error:
-            self._error(data.error, commands)
+            self._draw_error(data.error, commands)
         if state.message and now < state.message_until:
-            _message(state.message)
+            _draw_message(state.message)
         return commands
 
     def _mark(self, label: str) -> None:
@@ -161,40 +161,36 @@ class Panels:
         return pressed
 
     def _slider(self, label: str, value: float, low: float, high: float, form: str) -> float:
-        clamp = imgui.SliderFlags_.always_clamp.value
-        changed, chosen = imgui.slider_float(label, value, low, high, form, clamp)
+        changed, chosen = imgui.slider_float(label, value, low, high, form, imgui.SliderFlags_.always_clamp.value)
         self._mark(label)
-        return chosen if changed else value  # the returned value is rounded to float32
+        return chosen if changed else value  # imgui returns an unchanged value rounded to float32
 
-    def _section(self, label: str, draw: Callable[[], Any]) -> None:
+    def _section(self, label: str, draw: Callable[..., None], *args: object) -> None:
         opened = imgui.collapsing_header(label, imgui.TreeNodeFlags_.default_open.value)
         self._mark(label)
         if opened:
             imgui.push_id(label)
-            draw()
+            draw(*args)
             imgui.pop_id()
 
-    def _panel(self, state: ViewerState, data: PanelData, commands: Commands) -> None:
-        scale = imgui.get_style().font_scale_dpi
-        height = imgui.get_io().display_size.y
+    def _draw_main_panel(self, state: ViewerState, data: PanelData, commands: Commands) -> None:
+        scale, height = imgui.get_style().font_scale_dpi, imgui.get_io().display_size.y
+        width = _PANEL_WIDTH * scale
         imgui.set_next_window_pos((_MARGIN, _MARGIN))
-        imgui.set_next_window_size_constraints(
-            (_PANEL_WIDTH * scale, 0), (_PANEL_WIDTH * scale, max(height - 2 * _MARGIN, 50))
-        )
-        flags = _FIXED | imgui.WindowFlags_.always_auto_resize.value
-        opened, _ = imgui.begin("pansplat", None, flags)
+        imgui.set_next_window_size_constraints((width, 0), (width, max(height - 2 * _MARGIN, 50)))
+        opened, _ = imgui.begin("pansplat", None, _FIXED | imgui.WindowFlags_.always_auto_resize.value)
         if opened:
             imgui.push_item_width(-110 * scale)
-            self._section("Scene", lambda: self._scene(data, commands))
-            self._section("Gaussians", lambda: self._gaussians(state))
-            self._section("Drawing", lambda: self._drawing(state))
-            self._section("Camera", lambda: self._camera(state))
-            self._section("Photograph", lambda: self._photograph(state, data))
-            self._section("Screenshot", lambda: self._screenshot(commands))
+            self._section("Scene", self._draw_scene, data, commands)
+            self._section("Gaussians", self._draw_gaussians, state)
+            self._section("Drawing", self._draw_drawing, state)
+            self._section("Camera", self._draw_camera, state)
+            self._section("Photograph", self._draw_photograph, state, data)
+            self._section("Screenshot", self._draw_screenshot, commands)
             imgui.pop_item_width()
         imgui.end()
 
-    def _scene(self, data: PanelData, commands: Commands) -> None:
+    def _draw_scene(self, data: PanelData, commands: Commands) -> None:
         if data.entries:
             names = [f"{i + 1}. {name}" for i, name in enumerate(data.entries)]  # numbered, because names may repeat
             imgui.set_next_item_width(-1)
@@ -203,61 +199,48 @@ class Panels:
             if changed:
                 commands.choose = index
         imgui.set_next_item_width(-60 * imgui.get_style().font_scale_dpi)
-        entered, self.path = imgui.input_text_with_hint(
-            "##path", "folder or .ply, or drop it here", self.path,
-            imgui.InputTextFlags_.enter_returns_true.value,
-        )  # fmt: skip
+        hint, flags = "folder or .ply, or drop it here", imgui.InputTextFlags_.enter_returns_true.value
+        entered, self.path = imgui.input_text_with_hint("##path", hint, self.path, flags)
         self._mark("path")
         imgui.same_line()
         if (self._button("Open") or entered) and self.path.strip():
             commands.open = self.path.strip()
 
-    def _gaussians(self, state: ViewerState) -> None:
-        settings = state.settings
-        views = len(state.context)
-        if self._radio("joint", settings.mode == "joint"):
-            settings = replace(settings, mode="joint")
-        if views > 1:
-            imgui.same_line()
-            if self._radio("deferred", settings.mode == "deferred"):
-                settings = replace(settings, mode="deferred")
-            imgui.same_line()
-            if self._radio("difference", settings.mode == "difference"):
-                settings = replace(settings, mode="difference", view=0)
-        for view in range(views):
+    def _draw_gaussians(self, state: ViewerState) -> None:
+        settings, num_views = state.settings, len(state.context)
+        for mode in ("joint", "deferred", "difference") if num_views > 1 else ("joint",):
+            if mode != "joint":
+                imgui.same_line()
+            if self._radio(mode, settings.mode == mode):
+                settings = replace(settings, mode=mode, view=0 if mode == "difference" else settings.view)
+        for view in range(num_views):
             if view % 3:
                 imgui.same_line()
             if self._radio(f"view {view}", settings.mode == "view" and settings.view == view):
                 settings = replace(settings, mode="view", view=view)
         if len(state.levels) > 1:
             shown = set(state.levels if settings.levels is None else settings.levels)
-            imgui.align_text_to_frame_padding()
-            imgui.text_unformatted("level")
+            _draw_row_label("level")
             for level in state.levels:
                 imgui.same_line()
                 if self._check(f"{level}##level", level in shown):
                     shown.add(level)
                 else:
                     shown.discard(level)
-            everything = shown == set(state.levels)
-            settings = replace(settings, levels=None if everything else frozenset(shown))
+            settings = replace(settings, levels=None if shown == set(state.levels) else frozenset(shown))
         threshold = self._slider("min. opacity", settings.opacity_threshold, 0.0, 1.0, "%.2f")
         state.settings = replace(settings, opacity_threshold=threshold)
 
-    def _drawing(self, state: ViewerState) -> None:
+    def _draw_drawing(self, state: ViewerState) -> None:
         settings = state.settings
         for name, choices in (("kernel", Kernel), ("order", Order), ("lowpass", Lowpass)):
-            imgui.align_text_to_frame_padding()
-            imgui.text_unformatted(name)
+            _draw_row_label(name)
             for choice in get_args(choices):
                 imgui.same_line()
                 if self._radio(choice, getattr(settings, name) == choice):
                     settings = replace(settings, **{name: choice})
-        changed, background = imgui.color_edit3(
-            "background",
-            list(settings.background),
-            imgui.ColorEditFlags_.no_inputs.value,
-        )
+        flags = imgui.ColorEditFlags_.no_inputs.value
+        changed, background = imgui.color_edit3("background", list(settings.background), flags)
         self._mark("background")
         for name, color in (("black", 0.0), ("grey", 0.5), ("white", 1.0)):
             imgui.same_line()
@@ -269,7 +252,7 @@ class Panels:
         state.settings = settings
         state.adaptive = self._check("coarser while moving", state.adaptive)
 
-    def _camera(self, state: ViewerState) -> None:
+    def _draw_camera(self, state: ViewerState) -> None:
         if self._radio("fly", not state.orbiting):
             state.orbiting = False
         imgui.same_line()
@@ -279,8 +262,7 @@ class Panels:
         if self._button("Reset"):
             state.playing, state.camera = False, state.home
         fov = state.camera.vertical_fov_degrees
-        low, high = cameras.MIN_FOV_DEGREES, cameras.MAX_FOV_DEGREES
-        chosen = self._slider("field of view", fov, low, high, "%.0f deg")
+        chosen = self._slider("field of view", fov, cameras.MIN_FOV_DEGREES, cameras.MAX_FOV_DEGREES, "%.0f deg")
         if chosen != fov:
             state.camera = replace(state.camera, vertical_fov_degrees=chosen)
         state.speed = self._slider("speed", state.speed, 0.1, 10.0, "%.1f m/s")
@@ -300,63 +282,22 @@ class Panels:
             state.playing = False
             fly_to(state, flight)
 
-    def _photograph(self, state: ViewerState, data: PanelData) -> None:
+    def _draw_photograph(self, state: ViewerState, data: PanelData) -> None:
         if data.photo_name is None:
             imgui.text_disabled("this scene has no photographs")
             return
         state.photo = self._check("nearest photograph", state.photo)
         state.split = self._slider("split", state.split, 0.0, 1.0, "%.2f")
 
-    def _screenshot(self, commands: Commands) -> None:
+    def _draw_screenshot(self, commands: Commands) -> None:
         commands.png = self._button("PNG")
         imgui.same_line()
         commands.exr = self._button("EXR + depth")
         imgui.same_line()
         commands.panorama = self._button("360 PNG")
 
-    def _stats(self, state: ViewerState, data: PanelData) -> None:
-        size, scale = imgui.get_io().display_size, imgui.get_style().font_scale_dpi
-        if size.x > 2.2 * _PANEL_WIDTH * scale:
-            imgui.set_next_window_pos((size.x - _MARGIN, _MARGIN), 0, (1.0, 0.0))
-        else:  # too narrow for both: bottom right
-            imgui.set_next_window_pos((size.x - _MARGIN, size.y - _MARGIN), 0, (1.0, 1.0))
-        imgui.set_next_window_bg_alpha(0.6)
-        imgui.begin("##stats", None, _LABEL)
-        stats = data.stats
-        x, y, z = state.camera.position
-        lines = [
-            f"frame {data.frame_ms:.1f} ms   draw {stats.frame_ms:.1f} ms   sort {stats.sort_ms:.0f} ms",
-            f"{stats.drawn:,} drawn of {stats.visible:,} of {stats.total:,}",
-            f"{data.size[0]} x {data.size[1]}   {stats.tier}" + ("   cached" if stats.cached else ""),
-            f"x {x:.2f}  y {y:.2f}  z {z:.2f} m",
-        ]
-        if state.photo and data.photo_name is not None:
-            lines.append(f"right: {data.photo_name}" if state.split > 0 else data.photo_name)
-        for line in lines:
-            imgui.text_unformatted(line)
-        imgui.end()
-
-    def _help(self, state: ViewerState) -> None:
-        size = imgui.get_io().display_size
-        imgui.set_next_window_pos((size.x / 2, size.y / 2), 0, (0.5, 0.5))
-        flags = _FIXED | imgui.WindowFlags_.always_auto_resize.value | imgui.WindowFlags_.no_collapse.value
-        _, opened = imgui.begin("Keys", True, flags)
-        if imgui.begin_table("keys", 2, imgui.TableFlags_.sizing_fixed_fit.value):
-            for keys, meaning in HELP:
-                imgui.table_next_row()
-                imgui.table_next_column()
-                imgui.text_unformatted(keys)
-                imgui.table_next_column()
-                imgui.text_unformatted(meaning)
-            imgui.end_table()
-        imgui.end()
-        state.help = bool(opened)
-
-    def _error(self, error: str, commands: Commands) -> None:
-        size = imgui.get_io().display_size
-        width = min(560 * imgui.get_style().font_scale_dpi, size.x - 2 * _MARGIN)
-        imgui.set_next_window_pos((size.x / 2, size.y / 2), 0, (0.5, 0.5))
-        imgui.set_next_window_size((width, 0))
+    def _draw_error(self, error: str, commands: Commands) -> None:
+        _place_at_centre(width=560)
         imgui.begin("Error", None, _FIXED | imgui.WindowFlags_.no_collapse.value)
         imgui.push_text_wrap_pos(0.0)
         imgui.text_unformatted(error)
@@ -365,28 +306,77 @@ class Panels:
         imgui.end()
 
 
-def _split_line(split: float) -> None:
-    size = imgui.get_io().display_size
-    lines = imgui.get_background_draw_list()
-    color = imgui.color_convert_float4_to_u32((1.0, 1.0, 1.0, 0.9))
-    lines.add_line((split * size.x, 0), (split * size.x, size.y), color, 2.0)
+def _draw_row_label(label: str) -> None:
+    imgui.align_text_to_frame_padding()
+    imgui.text_unformatted(label)
 
 
-def _progress(name: str, what: str, fraction: float) -> None:
+def _place_at_centre(width: float | None = None) -> None:
+    """Place the next window at the centre, with a width at a DPI scale of 1 or its automatic size."""
     size = imgui.get_io().display_size
     imgui.set_next_window_pos((size.x / 2, size.y / 2), 0, (0.5, 0.5))
-    imgui.set_next_window_size((min(420 * imgui.get_style().font_scale_dpi, size.x - 2 * _MARGIN), 0))
-    flags = _FIXED | imgui.WindowFlags_.no_title_bar.value | imgui.WindowFlags_.no_inputs.value
-    imgui.begin("##progress", None, flags)
-    imgui.text_unformatted(f"{name}: {what}")
+    if width is not None:
+        imgui.set_next_window_size((min(width * imgui.get_style().font_scale_dpi, size.x - 2 * _MARGIN), 0))
+
+
+def _draw_stats(state: ViewerState, data: PanelData) -> None:
+    size, scale = imgui.get_io().display_size, imgui.get_style().font_scale_dpi
+    if size.x > 2.2 * _PANEL_WIDTH * scale:
+        imgui.set_next_window_pos((size.x - _MARGIN, _MARGIN), 0, (1.0, 0.0))
+    else:  # too narrow next to the main panel: bottom right
+        imgui.set_next_window_pos((size.x - _MARGIN, size.y - _MARGIN), 0, (1.0, 1.0))
+    stats = data.stats
+    x, y, z = state.camera.position
+    lines = [
+        f"frame {data.frame_ms:.1f} ms   draw {stats.frame_ms:.1f} ms   sort {stats.sort_ms:.0f} ms",
+        f"{stats.drawn:,} drawn of {stats.visible:,} of {stats.total:,}",
+        f"{data.size[0]} x {data.size[1]}   {stats.tier}" + ("   cached" if stats.cached else ""),
+        f"x {x:.2f}  y {y:.2f}  z {z:.2f} m",
+    ]
+    if state.photo and data.photo_name is not None:
+        lines.append(f"right: {data.photo_name}" if state.split > 0 else data.photo_name)
+    _draw_label("##stats", lines, alpha=0.6)
+
+
+def _draw_message(message: str) -> None:
+    size = imgui.get_io().display_size
+    imgui.set_next_window_pos((size.x / 2, size.y - 2 * _MARGIN), 0, (0.5, 1.0))
+    _draw_label("##message", [message], alpha=0.75)
+
+
+def _draw_label(name: str, lines: list[str], alpha: float) -> None:
+    imgui.set_next_window_bg_alpha(alpha)
+    imgui.begin(name, None, _LABEL)
+    for line in lines:
+        imgui.text_unformatted(line)
+    imgui.end()
+
+
+def _draw_help() -> bool:
+    """Draw the key help; returns whether it stays open."""
+    _place_at_centre()
+    flags = _FIXED | imgui.WindowFlags_.always_auto_resize.value | imgui.WindowFlags_.no_collapse.value
+    _, opened = imgui.begin("Keys", True, flags)
+    if imgui.begin_table("keys", 2, imgui.TableFlags_.sizing_fixed_fit.value):
+        for row in HELP:
+            imgui.table_next_row()
+            for text in row:
+                imgui.table_next_column()
+                imgui.text_unformatted(text)
+        imgui.end_table()
+    imgui.end()
+    return bool(opened)
+
+
+def _draw_progress(name: str, task: str, fraction: float) -> None:
+    _place_at_centre(width=420)
+    imgui.begin("##progress", None, _FIXED | imgui.WindowFlags_.no_title_bar.value | imgui.WindowFlags_.no_inputs.value)
+    imgui.text_unformatted(f"{name}: {task}")
     imgui.progress_bar(fraction, (-1, 0), f"{100 * fraction:.0f}%")
     imgui.end()
 
 
-def _message(message: str) -> None:
+def _draw_split_line(split: float) -> None:
     size = imgui.get_io().display_size
-    imgui.set_next_window_pos((size.x / 2, size.y - 2 * _MARGIN), 0, (0.5, 1.0))
-    imgui.set_next_window_bg_alpha(0.75)
-    imgui.begin("##message", None, _LABEL)
-    imgui.text_unformatted(message)
-    imgui.end()
+    color = imgui.color_convert_float4_to_u32((1.0, 1.0, 1.0, 0.9))
+    imgui.get_background_draw_list().add_line((split * size.x, 0), (split * size.x, size.y), color, 2.0)

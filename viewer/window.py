@@ -8,7 +8,6 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -132,9 +131,8 @@ class Window:
         self.dropped.extend(Path(path) for path in paths)
 
 
-def run(window: Window, make_viewer: Callable[[moderngl.Context, float], Viewer]) -> None:
+def run_viewer(window: Window, viewer: Viewer) -> None:
     """Run a viewer in the window until the user quits, then free everything and join all threads."""
-    viewer = make_viewer(window.ctx, window.dpi_scale)
     try:
         window.attach_gui()
         _loop(window, viewer)
