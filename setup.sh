@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Makes everything ready on a fresh Debian or Ubuntu machine: .venv with tested versions, and the system
-# libraries that OpenGL needs. Safe to run again: what is there already is left alone.
+# Set up pansplat on a Debian or Ubuntu machine: .venv with tested versions, the system libraries of OpenGL,
+# and compiled CPU kernels. Run it again at any time: it only does what is missing.
 #
 #   bash setup.sh          to use pansplat
-#   bash setup.sh --dev    to work on it as well (tests, linters, a virtual display)
-#   bash setup.sh --cuda   with PyTorch's CUDA build even where no NVIDIA GPU is seen (--cpu: never)
+#   bash setup.sh --dev    to develop it (tests, linters, a virtual display)
+#   bash setup.sh --cuda   to install PyTorch's CUDA build even without a visible NVIDIA GPU (--cpu: never)
 #
-# PYTHON=python3.12 bash setup.sh takes that Python (3.10 or newer) for .venv.
+# PYTHON=python3.12 bash setup.sh uses that Python (3.10 or newer) for .venv.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
 
@@ -28,7 +28,7 @@ for argument in "$@"; do
     esac
 done
 
-# How to become root without being asked for a password; empty when there is no way.
+# The command that runs others as root without a password; empty if there is none.
 if [ "$(id -u)" = 0 ]; then as_root=(env)
 elif sudo -n true 2>/dev/null; then as_root=(sudo -n)
 else as_root=()
@@ -38,7 +38,7 @@ apt_updated=""
 apt_install() {
     command -v apt-get >/dev/null && [ ${#as_root[@]} -gt 0 ] || return 1
     if [ -z "$apt_updated" ]; then
-        "${as_root[@]}" apt-get update -qq || say "apt-get update failed; trying with the lists there are"
+        "${as_root[@]}" apt-get update -qq || say "apt-get update failed; using the existing package lists"
         apt_updated=yes
     fi
     "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >/dev/null
@@ -48,20 +48,20 @@ installed() { dpkg-query -W -f '${Status}' "$1" 2>/dev/null | grep -q 'ok instal
 
 # --- system libraries ---
 install_libraries() {
-    command -v dpkg-query >/dev/null || { say "no Debian or Ubuntu here: OpenGL, EGL and X11 libraries are yours to install"; return; }
+    command -v dpkg-query >/dev/null || { say "not Debian or Ubuntu: please install the OpenGL, EGL and X11 libraries yourself"; return; }
     local wanted=("${GL_PACKAGES[@]}") missing=() package
     [ -z "$extra" ] || wanted+=("${DEV_PACKAGES[@]}")
     for package in "${wanted[@]}"; do installed "$package" || missing+=("$package"); done
     [ ${#missing[@]} -gt 0 ] || return 0
     if [ ${#as_root[@]} = 0 ]; then
-        say "the viewer needs system libraries that are missing; please run"
+        say "the viewer needs missing system libraries; please run"
         say "    sudo apt-get install ${missing[*]}"
         return
     fi
     say "installing ${missing[*]}"
-    # One by one when all together fail: a release may lack one of them (libosmesa6 left newer ones).
+    # If this fails, install them one by one: a release may lack one (newer ones have no libosmesa6).
     apt_install "${missing[@]}" && return
-    for package in "${missing[@]}"; do apt_install "$package" || say "could not install $package; going on without it"; done
+    for package in "${missing[@]}"; do apt_install "$package" || say "could not install $package; continuing without it"; done
 }
 
 # --- Python ---
@@ -70,7 +70,7 @@ find_python() {
     command -v "$python" >/dev/null || apt_install python3 python3-venv \
         || die "needs Python 3.10 or newer; run: sudo apt-get install python3 python3-venv"
     "$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' \
-        || die "needs Python 3.10 or newer, $python is $("$python" -V 2>&1); give another with PYTHON=python3.12 bash setup.sh"
+        || die "needs Python 3.10 or newer, $python is $("$python" -V 2>&1); choose another with PYTHON=python3.12 bash setup.sh"
 }
 
 make_venv() {
@@ -82,15 +82,15 @@ make_venv() {
         apt_install "$package" || apt_install python3-venv \
             || die "Python's venv module is missing; run: sudo apt-get install $package"
     fi
-    say "making .venv with $("$python" -V)"
+    say "creating .venv with $("$python" -V)"
     "$python" -m venv --clear .venv
 }
 
 # --- packages ---
 pip_install() { .venv/bin/python -m pip install --disable-pip-version-check -qq -c constraints.txt "$@"; }
 
-# A plain `pip install torch` pulls gigabytes of CUDA on Linux, so a machine without a GPU asks for the CPU build by
-# name: first where pip looks anyway (a mirror or a folder of wheels may have it), then from PyTorch.
+# On Linux a plain `pip install torch` downloads gigabytes of CUDA. So without a GPU the CPU build is installed by name:
+# first from pip's own sources (a mirror or a folder of wheels may have it), then from PyTorch.
 install_torch() {
     local version
     version=$(sed -n 's/^torch==\([0-9.]*\).*/\1/p' constraints.txt)
@@ -111,8 +111,8 @@ install_torch() {
         && ! pip_install --retries 1 --extra-index-url "$CPU_WHEELS" "torch==$version+cpu" 2>>"$log"; then
         cat "$log" >&2
         rm -f "$log"
-        die "found no CPU build of PyTorch $version, neither where pip looks nor at $CPU_WHEELS. Is the network up?
-       (bash setup.sh --cuda takes the large default build instead)"
+        die "found no CPU build of PyTorch $version, neither in pip's sources nor at $CPU_WHEELS. Is the network up?
+       (bash setup.sh --cuda installs the large default build instead)"
     fi
     rm -f "$log"
 }
@@ -120,7 +120,7 @@ install_torch() {
 install_packages() {
     local stamp=.venv/pansplat-setup mark
     mark="$(cat constraints.txt pyproject.toml setup.sh | sha256sum) $build"
-    # With [dev] installed the plain set is there, too.
+    # [dev] includes the plain set.
     if [ "$(cat "$stamp" 2>/dev/null)" = "$mark [dev]" ] || [ "$(cat "$stamp" 2>/dev/null)" = "$mark $extra" ]; then
         return
     fi
@@ -131,10 +131,10 @@ install_packages() {
 }
 
 # --- kernels ---
-# Numba keeps the compiled kernels; later runs load them in a second.
+# Numba caches the compiled kernels, so only the first run takes long.
 compile_kernels() {
-    say "compiling the CPU kernels (about a minute, once)"
-    .venv/bin/python -m pansplat.warm_up || say "the kernels could not be compiled; the first command compiles them"
+    say "compiling the CPU kernels (about a minute the first time)"
+    .venv/bin/python -m pansplat.warm_up || say "could not compile the CPU kernels; the first command that needs them will"
 }
 
 find_python

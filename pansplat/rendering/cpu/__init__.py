@@ -1,6 +1,6 @@
-"""The rasteriser on the processor: numba kernels with explicit vectors, no compiler needed, differentiable.
+"""The rasteriser on a CPU: differentiable numba kernels with explicit SIMD vectors.
 
-Source: docs/rendering.md; docs/rasterizer.md tells how it works.
+Source: docs/rendering.md; docs/rasterizer.md describes the stages.
 """
 
 from pansplat.rendering.cpu.backend import rasterize_planes

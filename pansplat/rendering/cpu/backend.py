@@ -50,7 +50,7 @@ _MIN_FILTER_VARIANCE = 1e-9  # pixel^2: unfiltered, a disc seen edge-on has widt
 class _View(NamedTuple):
     """A scene as one camera sees it, and how to rasterise it."""
 
-    fields: GaussianArrays
+    gaussians: GaussianArrays
     camera: Camera
     projected: ProjectedGaussians
     options: RasterOptions
@@ -126,7 +126,7 @@ def rasterize_planes(
 
 
 class _Rasterize(torch.autograd.Function):
-    """The sums of all image planes, differentiable once in the fields and the pose."""
+    """The sums of all image planes, differentiable once in the tensors and the pose."""
 
     @staticmethod
     def forward(
@@ -139,14 +139,14 @@ class _Rasterize(torch.autograd.Function):
         *tensors: Tensor | None,
     ) -> Tensor:
         """Sums; `tensors` are those of GaussianArrays, or None."""
-        fields, camera, threads = _fields(tensors), _camera(pose, planes[0], options), thread_count()
+        gaussians, camera, threads = _to_arrays(tensors), _camera(pose, planes[0], options), thread_count()
         needs_grad = grad_enabled and any(ctx.needs_input_grad)  # the latter ignores no_grad
         workspace = Workspace()
         with announce_compilation():
             with statistics.timed("project"):
-                projected = project_gaussians(fields, camera, workspace, threads)
-            view = _View(fields, camera, projected, options, threads)
-            sums = pooled_empty((len(planes), fields.harmonics.shape[2] + 2, *planes[0].size), np.float32)
+                projected = project_gaussians(gaussians, camera, workspace, threads)
+            view = _View(gaussians, camera, projected, options, threads)
+            sums = pooled_empty((len(planes), gaussians.harmonics.shape[2] + 2, *planes[0].size), np.float32)
             states = [
                 _rasterize_plane(view, plane, plane_sums, statistics, workspace if needs_grad else None)
                 for plane, plane_sums in zip(planes, sums, strict=True)
@@ -165,8 +165,8 @@ class _Rasterize(torch.autograd.Function):
             raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
         *tensors, pose, sums = ctx.saved_tensors
         planes, options, projected, states, _workspace, threads = ctx.saved
-        fields, camera = _fields(tensors), _camera(pose, planes[0], options)
-        view = _View(fields, camera, projected, options, threads)
+        gaussians, camera = _to_arrays(tensors), _camera(pose, planes[0], options)
+        view = _View(gaussians, camera, projected, options, threads)
         needs_pose, _, _, _, _, *needed = ctx.needs_input_grad
         grads = [
             torch.from_numpy(pooled_empty(tuple(tensor.shape), np.float32)) if is_needed else None
@@ -175,13 +175,13 @@ class _Rasterize(torch.autograd.Function):
         with announce_compilation():
             workspace = Workspace()
             grad_sums = grad_outputs[0].contiguous().numpy()
-            slots = _differentiate_planes(view, planes, states, sums.numpy(), grad_sums, workspace)
+            slots = _backpropagate_planes(view, planes, states, sums.numpy(), grad_sums, workspace)
             outputs = (
-                np.empty((0, *field.shape[1:]), np.float32) if grad is None else grad.numpy()
-                for field, grad in zip(fields, grads, strict=True)
+                np.empty((0, *array.shape[1:]), np.float32) if grad is None else grad.numpy()
+                for array, grad in zip(gaussians, grads, strict=True)
             )
             wanted = GaussianGradients(*outputs, pose=np.empty((3 if needs_pose else 0, 4)))
-            filled = backpropagate_projection(fields, camera, projected, *slots, wanted, threads)
+            filled = backpropagate_projection(gaussians, camera, projected, *slots, wanted, threads)
         grad_pose = None
         if needs_pose:
             grad_pose = torch.zeros_like(pose)
@@ -189,7 +189,7 @@ class _Rasterize(torch.autograd.Function):
         return (grad_pose, None, None, None, None, *grads)
 
 
-def _fields(tensors: Sequence[Any]) -> GaussianArrays:
+def _to_arrays(tensors: Sequence[Any]) -> GaussianArrays:
     """The tensors as arrays; None becomes an array without rows."""
     shapes = ((3,), (4,), (3,), (3, 3), (), tensors[-1].shape[1:])
     return GaussianArrays(
@@ -223,7 +223,7 @@ def _rasterize_plane(
     """
     projected, threads, needs_grad = view.projected, view.threads, saved_in is not None
     workspace = saved_in or Workspace()
-    with statistics.timed("bounds"):
+    with statistics.timed("bound"):
         records, boxes = _find_footprints(view, plane, workspace)
     distances = projected.radii
     if view.options.order == "z" and not plane.is_panorama:
@@ -261,7 +261,7 @@ def _find_footprints(view: _View, plane: ImagePlane, workspace: Workspace) -> tu
         records = view.projected.records
         return records, find_bounding_boxes(records, plane, workspace, view.threads)
     depth_cut = EWA_NEAR_FACTOR * view.options.near
-    scene = view.fields, view.camera, view.projected
+    scene = view.gaussians, view.camera, view.projected
     return project_ewa(*scene, plane, view.options.dilation, depth_cut, workspace, view.threads)
 
 
@@ -280,7 +280,7 @@ def _rasterize_band(
     )  # fmt: skip
 
 
-def _differentiate_planes(
+def _backpropagate_planes(
     view: _View,
     planes: list[ImagePlane],
     states: list[_PlaneState],
@@ -288,16 +288,15 @@ def _differentiate_planes(
     grad_sums: np.ndarray,
     workspace: Workspace,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """GaussianGradients of records and values by slot, the EWA kernel's totals, and the first slot of each Gaussian.
+    """Gradients of records and values by slot, those of the EWA projection, and the first slot of each Gaussian.
 
     With one image plane in one band the slots are those of its intersections; otherwise each Gaussian has one.
     """
-    fields, camera, projected, options, threads = view
+    gaussians, camera, projected, options, threads = view
     num, num_values = projected.values.shape
-    num_items = -(-num // GAUSSIANS_PER_ITEM)
     is_single = view.is_exact and len(planes) == 1 and states[0].tiles is not None
     total_records = np.zeros((num if view.is_exact and not is_single else 0, RECORD_SIZE), np.float32)
-    totals = np.zeros((0 if view.is_exact else num, EWA_GRAD_SIZE))
+    ewa_grads = np.zeros((0 if view.is_exact else num, EWA_GRAD_SIZE))
     total_values = np.zeros((0 if is_single else num, num_values), np.float32)
     for plane, state, plane_sums, plane_grads in zip(planes, states, sums, grad_sums, strict=True):
         tables = tabulate_pixels(plane, exact=view.is_exact)
@@ -319,14 +318,15 @@ def _differentiate_planes(
             )  # fmt: skip
             offsets = tiles.offsets
             if is_single:
-                return grad_records, grad_values, totals, offsets
+                return grad_records, grad_values, ewa_grads, offsets
             if view.is_exact:
-                _add_slots(offsets, grad_records, total_records, num_items, threads)
+                _add_slots(offsets, grad_records, total_records, threads)
             else:
-                backpropagate_ewa(fields, camera, plane, options.dilation, grad_records, offsets, totals, threads)
-            _add_slots(offsets, grad_values, total_values, num_items, threads)
-    return total_records, total_values, totals, np.arange(num + 1)
+                backpropagate_ewa(gaussians, camera, plane, options.dilation, grad_records, offsets, ewa_grads, threads)
+            _add_slots(offsets, grad_values, total_values, threads)
+    return total_records, total_values, ewa_grads, np.arange(num + 1)
 
 
-def _add_slots(offsets: np.ndarray, slots: np.ndarray, totals: np.ndarray, num_items: int, threads: int) -> None:
+def _add_slots(offsets: np.ndarray, slots: np.ndarray, totals: np.ndarray, threads: int) -> None:
+    num_items = -(-len(totals) // GAUSSIANS_PER_ITEM)
     parallel_for(lambda item: accumulate_slots(item, offsets, slots, totals), num_items, threads)

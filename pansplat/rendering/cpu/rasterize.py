@@ -21,7 +21,7 @@ import numpy.typing as npt
 from pansplat.constants import ALPHA_CUT, MAX_ALPHA, TRANSMITTANCE_CUT
 from pansplat.rendering.cpu.projection import dot, tangent_frame
 from pansplat.rendering.cpu.records import EQUIRECT_RAYS, PIXEL_CENTRES, RECORD_SIZE, TILE_SIZE, PixelTables
-from pansplat.rendering.cpu.runtime import Workspace, inline_kernel_no_refcount, kernel, parallel_for
+from pansplat.rendering.cpu.runtime import Workspace, inline_kernel_no_refcount, kernel
 from pansplat.rendering.cpu.simd import (
     LANES,
     any_lane,
@@ -41,7 +41,7 @@ from pansplat.rendering.cpu.simd import (
     store,
     store_scalar,
 )
-from pansplat.rendering.cpu.tiling import split_tiles
+from pansplat.rendering.cpu.tiling import parallel_for_tiles
 
 Floats = npt.NDArray[np.float32]
 Integers = npt.NDArray[np.int32]
@@ -364,14 +364,9 @@ def rasterize_forward(
         saved: written, if given, for the backward.
         threads: number of threads; the result does not depend on it.
     """
-    cuts = split_tiles(starts, threads)
-    scene = records.reshape(-1), values, intersections.reshape(-1), starts
     saved = saved or SavedForBackward(np.empty((0, TILE_PIXELS), np.float32), starts, starts)
-
-    def rasterize(item: int) -> None:
-        _rasterize_tiles(*scene, *tables, sums, *saved, first_row, cuts[item], cuts[item + 1])
-
-    parallel_for(rasterize, len(cuts) - 1, threads)
+    scene = records.reshape(-1), values, intersections.reshape(-1), starts
+    parallel_for_tiles(_rasterize_tiles, (*scene, *tables, sums, *saved, first_row), starts, threads)
 
 
 @kernel

@@ -47,7 +47,7 @@ from pansplat.rendering.cpu.rasterize import (
     set_tile_pixels,
 )
 from pansplat.rendering.cpu.records import PIXEL_CENTRES, RECORD_SIZE, TILE_SIZE, PixelTables
-from pansplat.rendering.cpu.runtime import inline_kernel_no_refcount, kernel, parallel_for
+from pansplat.rendering.cpu.runtime import inline_kernel_no_refcount, kernel
 from pansplat.rendering.cpu.simd import (
     LANES,
     any_lane,
@@ -67,7 +67,7 @@ from pansplat.rendering.cpu.simd import (
     store_scalar,
     transpose,
 )
-from pansplat.rendering.cpu.tiling import split_tiles
+from pansplat.rendering.cpu.tiling import parallel_for_tiles
 
 _MAX_PAIRS = NUM_BLOCKS * CHUNK_SIZE  # pairs of a Gaussian and a block, in a chunk
 _PAIR_SIZE = 2 * LANES  # numbers in a pair: gradients by log alpha, and weights; one cache line
@@ -109,14 +109,9 @@ def rasterize_backward(
         threads: number of threads; the result does not depend on it.
     """
     assert grad_records.size == 0 or grad_records.ctypes.data % (4 * LANES) == 0
-    cuts = split_tiles(starts, threads)
     scene = records.reshape(-1), values, intersections.reshape(-1), starts, slots
     gradients = sums, *saved, grad_sums, grad_records.reshape(-1), grad_values.reshape(-1)
-
-    def differentiate(item: int) -> None:
-        _rasterize_tiles_backward(*scene, *tables, *gradients, first_row, cuts[item], cuts[item + 1])
-
-    parallel_for(differentiate, len(cuts) - 1, threads)
+    parallel_for_tiles(_rasterize_tiles_backward, (*scene, *tables, *gradients, first_row), starts, threads)
 
 
 @kernel
@@ -162,7 +157,7 @@ def _rasterize_tiles_backward(
             next_first = first - CHUNK_SIZE
             if chunk == 0:  # the last chunk of the next tile
                 next_first = end + CHUNK_SIZE * (saved_num_chunks[min(tile + 1, high - 1)] - 1)
-            _differentiate_chunk(
+            _backpropagate_chunk(
                 records, values, intersections, next_first, is_3d, footprints, chunk_values, masks, offsets,
                 saved_transmittance[saved_rows[tile] + chunk], num_values, padded_values, tile_grads, behind,
                 log2_alphas, indices, alphas, weights, visible, pairs, links, heads,
@@ -222,7 +217,7 @@ def _load_partial_tile_gradients(sums, grad_sums, left, top, num_values, padded_
 
 
 @inline_kernel_no_refcount
-def _differentiate_chunk(
+def _backpropagate_chunk(
     records, values, intersections, next_first, is_3d, footprints, chunk_values, masks, offsets, transmittance,
     num_values, padded_values, tile_grads, behind, log2_alphas, indices, alphas, weights, visible, pairs, links, heads,
 ):  # fmt: skip
@@ -245,7 +240,7 @@ def _differentiate_chunk(
                 ready, num_ready, log2_alphas, indices, other, transmittance, begin, alphas, weights, visible
             )
         if weighted >= 0:
-            _differentiate_block(
+            _backpropagate_block(
                 weighted, num_weighted, alphas, weights, visible, other, chunk_values, num_values, padded_values,
                 tile_grads, behind, pairs, links, heads, pair,
             )  # fmt: skip
@@ -275,7 +270,7 @@ def _compute_block_weights(block, count, log2_alphas, indices, begin, transmitta
 
 
 @inline_kernel_no_refcount
-def _differentiate_block(
+def _backpropagate_block(
     block, count, alphas, weights, visible, begin, chunk_values, num_values, padded_values, tile_grads, behind, pairs,
     links, heads, pair,
 ):  # fmt: skip

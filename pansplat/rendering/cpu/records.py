@@ -80,21 +80,21 @@ class PixelTables(NamedTuple):
         return -(-len(self.rows) // TILE_SIZE), -(-len(self.columns) // TILE_SIZE)
 
 
-def tabulate_pixels(picture: ImagePlane, *, exact: bool) -> PixelTables:
+def tabulate_pixels(plane: ImagePlane, *, exact: bool) -> PixelTables:
     """Pixel tables of an image plane, for the exact kernel or for EWA.
 
     Source: docs/rendering.md, section 6.
     """
-    height, width = picture.size
+    height, width = plane.size
     x, y = (np.arange(extent, dtype=np.float64) + 0.5 for extent in (width, height))
-    rotation = np.ascontiguousarray(picture.rotation.to("cpu", torch.float64).numpy())
+    rotation = np.ascontiguousarray(plane.rotation.to("cpu", torch.float64).numpy())
     if not exact:
         return PixelTables(PIXEL_CENTRES, _table(x, np.zeros(width)), _table(y, np.zeros(height)), rotation)
-    if picture.is_panorama:
+    if plane.is_panorama:
         longitude, latitude = (2 * x / width - 1) * np.pi, (y / height - 0.5) * np.pi
         columns, rows = (_table(np.sin(angle), np.cos(angle)) for angle in (longitude, latitude))
         return PixelTables(EQUIRECT_RAYS, columns, rows, rotation)
-    x, y = (x - 0.5 * width) / picture.focal, (y - 0.5 * height) / picture.focal
+    x, y = (x - 0.5 * width) / plane.focal, (y - 0.5 * height) / plane.focal
     return PixelTables(PINHOLE_RAYS, _table(x, np.zeros(width)), _table(y, np.zeros(height)), rotation)
 
 

@@ -13,7 +13,8 @@ first; on a panorama it wraps around if the last column is left of the first.
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -119,7 +120,7 @@ def _is_outside(n, p, q, radial_variance, kappa, normal_x, normal_y, normal_z):
 
 
 @kernel
-def _bound_pinhole(item, records, rotation, height, width, focal, boxes):
+def _bound_pinhole(records, rotation, height, width, focal, boxes, item):
     rows = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK), np.float32)
     side, end = np.float32(width / (2 * focal)), np.float32(height / (2 * focal))
     middle_x, middle_y, scale = np.float32(0.5 * width), np.float32(0.5 * height), np.float32(focal)
@@ -217,7 +218,7 @@ def _max_latitude(sine, cosine, low, high, sides2):
 
 
 @kernel
-def _bound_equirect(item, records, rotation, height, width, boxes):
+def _bound_equirect(records, rotation, height, width, boxes, item):
     rows = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK), np.float32)
     margin, side, last_y = _pixel_margin(height, width), np.float32(width), np.float32(height - 1)
     last_x, per_side = np.float32(width - 1), np.float32(1 / width)
@@ -287,18 +288,15 @@ def _equirect_edges(rows, height, width):
         rows[_EDGES + 3, i] = _ABOVE_IMAGE if kappa < _ZERO else bottom
 
 
-def find_bounding_boxes(records: np.ndarray, picture: ImagePlane, workspace: Workspace, threads: int) -> np.ndarray:
+def find_bounding_boxes(records: np.ndarray, plane: ImagePlane, workspace: Workspace, threads: int) -> np.ndarray:
     """Bounding box of each record of the exact kernel on an image plane, (n, 4) int16."""
     words = workspace.array((len(records), 2), np.int32)
-    rotation = np.ascontiguousarray(picture.rotation.numpy().astype(np.float32))
-    height, width, flat = *picture.size, records.reshape(-1)
-
-    def bound(item: int) -> None:
-        if picture.is_panorama:
-            _bound_equirect(item, flat, rotation, height, width, words)
-        else:
-            _bound_pinhole(item, flat, rotation, height, width, picture.focal, words)
-
+    rotation = np.ascontiguousarray(plane.rotation.numpy().astype(np.float32))
+    height, width, flat = *plane.size, records.reshape(-1)
+    if plane.is_panorama:
+        bound = partial(_bound_equirect, flat, rotation, height, width, words)
+    else:
+        bound = partial(_bound_pinhole, flat, rotation, height, width, plane.focal, words)
     parallel_for(bound, -(-len(records) // GAUSSIANS_PER_ITEM), threads)
     return words.view(np.int16)
 
@@ -369,7 +367,7 @@ def _tile_range(word):
 
 
 @kernel
-def _count_intersections(part, ends, words, rows, columns, counts):
+def _count_intersections(ends, words, rows, columns, counts, part):
     """Count the Gaussians of one part of the scene in each tile.
 
     Args:
@@ -454,7 +452,7 @@ def _buffer_all(gaussian, word, low, high, columns, width, buffered, tiles, pair
 
 @kernel
 def _write_intersections(
-    part, ends, words, columns, low, high, width, all_positions, first_slots, intersections, slots, offsets
+    ends, words, columns, low, high, width, all_positions, first_slots, intersections, slots, offsets, part
 ):
     """Write the intersections of one part of the scene with the tiles of a band.
 
@@ -510,38 +508,20 @@ def intersect_tiles(
     parts = _PARTS_PER_THREAD * threads if threads > 1 else 1
     ends = np.linspace(0, len(words), parts + 1).astype(np.int64)
     all_counts = np.empty((parts, rows * columns), np.int64)
-    parallel_for(lambda part: _count_intersections(part, ends, words, rows, columns, all_counts), parts, threads)
+    parallel_for(partial(_count_intersections, ends, words, rows, columns, all_counts), parts, threads)
     per_row = all_counts.sum(axis=0).reshape(rows, columns).sum(axis=1)
     for low, high in _split_rows(per_row.tolist(), limit):
-        yield _intersect_band(words, ends, all_counts[:, low * columns : high * columns], low, size, slots, threads)
-
-
-def _intersect_band(
-    words: np.ndarray,
-    ends: np.ndarray,
-    counts: np.ndarray,
-    first_row: int,
-    size: tuple[int, int],
-    needs_slots: bool,
-    threads: int,
-) -> TileIntersections:
-    """The intersections with a band of tile rows, from their counts (part, tile of the band)."""
-    width, columns, workspace = size[1], -(-size[1] // TILE_SIZE), Workspace()
-    starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts.sum(axis=0))))
-    positions, per_part = starts[:-1] + np.cumsum(counts, axis=0) - counts, counts.sum(axis=1)
-    num, end_row, first_slots = int(starts[-1]), first_row + counts.shape[1] // columns, np.cumsum(per_part) - per_part
-    intersections = workspace.array(num, np.int64)
-    slots = workspace.array(num if needs_slots else 0, np.int32 if num < 2**31 else np.int64)
-    offsets = workspace.array(len(words) + 1 if needs_slots else 0, np.int64)
-    offsets[:1] = 0
-
-    def write(part: int) -> None:
-        _write_intersections(
-            part, ends, words, columns, first_row, end_row, width, positions, first_slots, intersections, slots, offsets
-        )
-
-    parallel_for(write, len(counts), threads)
-    return TileIntersections(first_row, intersections.view(np.int32).reshape(-1, 2), starts, slots, offsets, workspace)
+        counts, workspace = all_counts[:, low * columns : high * columns], Workspace()
+        starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts.sum(axis=0))))
+        positions, per_part = starts[:-1] + np.cumsum(counts, axis=0) - counts, counts.sum(axis=1)
+        num = int(starts[-1])
+        intersections = workspace.array(num, np.int64)
+        numbers = workspace.array(num if slots else 0, np.int32 if num < 2**31 else np.int64)
+        offsets = workspace.array(len(words) + 1 if slots else 0, np.int64)
+        offsets[:1] = 0
+        outputs = positions, np.cumsum(per_part) - per_part, intersections, numbers, offsets
+        parallel_for(partial(_write_intersections, ends, words, columns, low, high, size[1], *outputs), parts, threads)
+        yield TileIntersections(low, intersections.view(np.int32).reshape(-1, 2), starts, numbers, offsets, workspace)
 
 
 def _split_rows(per_row: list[int], limit: int) -> Iterator[tuple[int, int]]:
@@ -572,7 +552,7 @@ _EMPTY_TILE_COST = 32  # in intersections
 
 
 @kernel
-def _measure_depths(item, records, radii, axis, depths):
+def _measure_depths(records, radii, axis, depths, item):
     for g in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, len(radii))):
         x = np.float64(records[g, 0]) + np.float64(records[g, 3])
         y = np.float64(records[g, 1]) + np.float64(records[g, 4])
@@ -593,8 +573,8 @@ def compute_depths(
         threads: number of threads.
     """
     depths = workspace.array(len(radii), np.float64)
-    num_items = -(-len(radii) // GAUSSIANS_PER_ITEM)
-    parallel_for(lambda item: _measure_depths(item, records, radii, axis, depths), num_items, threads)
+    measure = partial(_measure_depths, records, radii, axis, depths)
+    parallel_for(measure, -(-len(radii) // GAUSSIANS_PER_ITEM), threads)
     return depths
 
 
@@ -735,18 +715,18 @@ def sort_front_to_back(tiles: TileIntersections, distances: np.ndarray, threads:
             and indices together exceed 64 bits.
         threads: number of threads; the order does not depend on it.
     """
-    cuts = split_tiles(tiles.starts, threads)
     intersections, keys = tiles.intersections.reshape(-1).view(np.int64), distances.view(np.int64)
-
-    def sort(item: int) -> None:
-        _sort_tiles(intersections, tiles.slots, keys, tiles.starts, cuts[item], cuts[item + 1])
-
-    parallel_for(sort, len(cuts) - 1, threads)
+    parallel_for_tiles(_sort_tiles, (intersections, tiles.slots, keys, tiles.starts), tiles.starts, threads)
 
 
-def split_tiles(starts: np.ndarray, threads: int) -> list[int]:
-    """Cut a band of tiles into work items with about the same number of intersections; returns the item's limits."""
+def parallel_for_tiles(tile_kernel: Any, arguments: tuple[Any, ...], starts: np.ndarray, threads: int) -> None:
+    """Call a kernel with the arguments and the first and last + 1 tile of work items of about equal cost.
+
+    Args:
+        starts: of the tiles' intersections, whose number is the cost.
+    """
     num_tiles = len(starts) - 1
     cost = starts - starts[0] + _EMPTY_TILE_COST * np.arange(num_tiles + 1)
     targets = np.linspace(0, cost[-1], min(num_tiles, _ITEMS_PER_THREAD * threads if threads > 1 else 1) + 1)
-    return [int(cut) for cut in np.unique(np.searchsorted(cost, targets))]
+    cuts = [int(cut) for cut in np.unique(np.searchsorted(cost, targets))]
+    parallel_for(lambda item: tile_kernel(*arguments, cuts[item], cuts[item + 1]), len(cuts) - 1, threads)

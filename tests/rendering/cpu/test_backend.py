@@ -146,7 +146,7 @@ def test_without_grad_nothing_is_saved(scene, pose):
     with torch.no_grad():
         unrecorded = rasterize_planes(scene, *arguments)
     assert not unrecorded.sums.requires_grad
-    assert set(unrecorded.info.seconds) == {"project", "bounds", "intersect", "sort", "rasterize"}
+    assert set(unrecorded.info.seconds) == {"project", "bound", "intersect", "sort", "rasterize"}
     assert unrecorded.info.bytes == plain.info.bytes < recorded.info.bytes
 
 
