@@ -19,9 +19,12 @@ from pansplat.rendering.cpu.projection import (
     GaussianArrays,
     ProjectedGaussians,
     dot,
+    from_axes,
     load_block,
     load_tangent_covariance,
+    matrix_columns,
     store_tangent_covariances,
+    to_axes,
 )
 from pansplat.rendering.cpu.runtime import Workspace, inline_kernel, kernel, parallel_for
 from pansplat.rendering.cpu.tiling import round_boxes
@@ -115,28 +118,6 @@ def _plane_axes(camera: Camera, plane: ImagePlane) -> tuple[np.ndarray, np.ndarr
 
 
 @inline_kernel
-def _to_plane(axes, vector):
-    """A vector in the image plane's axes, from the world's."""
-    x, y, z = vector
-    return (
-        axes[0, 0] * x + axes[1, 0] * y + axes[2, 0] * z,
-        axes[0, 1] * x + axes[1, 1] * y + axes[2, 1] * z,
-        axes[0, 2] * x + axes[1, 2] * y + axes[2, 2] * z,
-    )
-
-
-@inline_kernel
-def _to_world(axes, vector):
-    """A vector in the world's axes, from the image plane's."""
-    x, y, z = vector
-    return (
-        axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z,
-        axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z,
-        axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z,
-    )
-
-
-@inline_kernel
 def _jacobian(n, height, width, focal):
     """Tangents, clamped tangents and scale of J at a direction with n_z > 0."""
     inverse = 1 / n[2]
@@ -172,7 +153,7 @@ def _times_covariance(cov, filter_variance, on_u, on_v, on_n):
 def _project_covariance(rows, i, axes, height, width, focal, filter_variance):
     """The frame in the image plane's axes, J, J n, the rows of J F times the covariance, and V before dilation."""
     u, v, n, cov = load_tangent_covariance(rows, i)
-    u, v, n = _to_plane(axes, u), _to_plane(axes, v), _to_plane(axes, n)
+    u, v, n = to_axes(axes, u), to_axes(axes, v), to_axes(axes, n)
     jacobian = _jacobian(n, height, width, focal)
     on_u, on_v, on_n = _apply_jacobian(jacobian, u), _apply_jacobian(jacobian, v), _apply_jacobian(jacobian, n)
     x_row, y_row = (on_u[0], on_v[0], on_n[0]), (on_u[1], on_v[1], on_n[1])
@@ -190,7 +171,7 @@ def _project_ewa(
     item, means, quats, scales, covariances, opacities, _harmonics, pose, filter_variance, _compensate, near,
     camera_records, radii, rotation, axes, height, width, focal, dilation, z_near, records, words, boxes,
 ):  # fmt: skip
-    rows = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK))
+    rows, axes = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK)), matrix_columns(axes)
     unit = math.sqrt(layout.HALF_LOG2_E)
     num = camera_records.shape[0]
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, num), GAUSSIAN_BLOCK):
@@ -262,7 +243,7 @@ def _backpropagate_ewa(
     item, means, quats, scales, covariances, opacities, _harmonics, pose, filter_variance, _compensate, near,
     axes, height, width, focal, dilation, grad_records, offsets, ewa_grads,
 ):  # fmt: skip
-    rows = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK))
+    rows, axes = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK)), matrix_columns(axes)
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, means.shape[0]), GAUSSIAN_BLOCK):
         count = min(GAUSSIAN_BLOCK, means.shape[0] - start)
         if _sum_slots(grad_records, offsets, start, count, rows) == 0:
@@ -332,9 +313,9 @@ def _backpropagate_records(rows, axes, height, width, focal, filter_variance, di
         g_tan_y = focal * rows[_RECORD_GRAD_ROW + 1, i] - (2 * scale * y_ahead if tan_y == clamped_y else 0.0)
         inverse = 1 / n[2]
         g_z = -(g_tan_x * tan_x + g_tan_y * tan_y + g_scale * scale) * inverse
-        g_n = _to_world(axes, (g_tan_x * inverse, g_tan_y * inverse, g_z))
-        j_x = _to_world(axes, (scale, 0.0, -scale * clamped_x))
-        j_y = _to_world(axes, (0.0, scale, -scale * clamped_y))
+        g_n = from_axes(axes, (g_tan_x * inverse, g_tan_y * inverse, g_z))
+        j_x = from_axes(axes, (scale, 0.0, -scale * clamped_x))
+        j_y = from_axes(axes, (0.0, scale, -scale * clamped_y))
         n_x = -2 * filter_variance * (h_xx * n_image[0] + h_xy * n_image[1])
         n_y = -2 * filter_variance * (h_xy * n_image[0] + h_yy * n_image[1])
         at = _EWA_GRAD_ROW + 3

@@ -185,7 +185,6 @@ def _project_gaussians(
 @inline_kernel
 def _compute_records(covariances, pose, filter_variance, compensate, near, rows, i, soa):
     """Write the records of eight Gaussians, a field a row of `soa`; return their states and which are drawn."""
-    right, down, ahead, _ = pose
     unit, inverse_unit = math.sqrt(layout.HALF_LOG2_E), 1 / math.sqrt(layout.HALF_LOG2_E)
     n, radius, inverse, state = compute_direction(rows, i, pose, near)
     store_row(rows, RADIUS_ROW, i, radius)
@@ -194,16 +193,12 @@ def _compute_records(covariances, pose, filter_variance, compensate, near, rows,
     factors, l_along_a, l_along_b, radial_variance, _, inverse_det = compute_whitening(cov, filter_variance)
     a, b = whitened_axes(u, v, factors)
     store_vector(rows, DIRECTION_ROW, i, n)
-    _store_direction(soa, 0, dot(*right, *n))
-    _store_direction(soa, 1, dot(*down, *n))
-    _store_direction(soa, 2, dot(*ahead, *n))
-    a_row, b_row = layout.ROW_A * LANES, layout.ROW_B * LANES
-    store(soa, a_row, to_f32(unit * dot(*right, *a)))
-    store(soa, a_row + LANES, to_f32(unit * dot(*down, *a)))
-    store(soa, a_row + 2 * LANES, to_f32(unit * dot(*ahead, *a)))
-    store(soa, b_row, to_f32(unit * dot(*right, *b)))
-    store(soa, b_row + LANES, to_f32(unit * dot(*down, *b)))
-    store(soa, b_row + 2 * LANES, to_f32(unit * dot(*ahead, *b)))
+    x, y, z = to_axes(pose, n)
+    _store_fields(soa, layout.DIRECTION, 1.0, (x, y, z))
+    residual = x - to_f64(to_f32(x)), y - to_f64(to_f32(y)), z - to_f64(to_f32(z))
+    _store_fields(soa, layout.DIRECTION_RESIDUAL, 1.0, residual)
+    _store_fields(soa, layout.ROW_A, unit, to_axes(pose, a))
+    _store_fields(soa, layout.ROW_B, unit, to_axes(pose, b))
     store(soa, layout.L_ALONG_A * LANES, to_f32(inverse_unit * l_along_a))
     store(soa, layout.L_ALONG_B * LANES, to_f32(inverse_unit * l_along_b))
     store(soa, layout.RADIAL_VARIANCE * LANES, to_f32((1 / layout.HALF_LOG2_E) * radial_variance))
@@ -218,11 +213,11 @@ def _compute_records(covariances, pose, filter_variance, compensate, near, rows,
 
 
 @inline_kernel
-def _store_direction(soa, axis, value):
-    """Store a coordinate of the direction as its float32 value and the residual."""
-    head = to_f32(value)
-    store(soa, (layout.DIRECTION + axis) * LANES, head)
-    store(soa, (layout.DIRECTION_RESIDUAL + axis) * LANES, to_f32(value - to_f64(head)))
+def _store_fields(soa, field, factor, vector):
+    """Store three fields, rounded to float32."""
+    store(soa, field * LANES, to_f32(factor * vector[0]))
+    store(soa, (field + 1) * LANES, to_f32(factor * vector[1]))
+    store(soa, (field + 2) * LANES, to_f32(factor * vector[2]))
 
 
 @inline_kernel
@@ -301,14 +296,19 @@ def store_vector(rows, row, i, vector):
 
 
 @inline_kernel
-def pose_columns(pose):
-    """The camera's axes and centre as numbers; an array would be read again for every eight Gaussians."""
+def matrix_columns(matrix):
+    """Three columns of a matrix as numbers; an array would be read again for every eight Gaussians."""
     return (
-        (pose[0, 0], pose[1, 0], pose[2, 0]),
-        (pose[0, 1], pose[1, 1], pose[2, 1]),
-        (pose[0, 2], pose[1, 2], pose[2, 2]),
-        (pose[0, 3], pose[1, 3], pose[2, 3]),
+        (matrix[0, 0], matrix[1, 0], matrix[2, 0]),
+        (matrix[0, 1], matrix[1, 1], matrix[2, 1]),
+        (matrix[0, 2], matrix[1, 2], matrix[2, 2]),
     )
+
+
+@inline_kernel
+def pose_columns(pose):
+    """The camera's axes and its centre."""
+    return (*matrix_columns(pose), (pose[0, 3], pose[1, 3], pose[2, 3]))
 
 
 @inline_kernel
@@ -479,6 +479,20 @@ def load_tangent_covariance(rows, i):
 
 
 # Vector algebra, for float64 and f64x8.
+
+
+@inline_kernel
+def to_axes(axes, vector):
+    """A vector along each of three axes."""
+    return dot(*axes[0], *vector), dot(*axes[1], *vector), dot(*axes[2], *vector)
+
+
+@inline_kernel
+def from_axes(axes, vector):
+    """The vector with these components along three axes."""
+    (xx, yx, zx), (xy, yy, zy), (xz, yz, zz) = axes[0], axes[1], axes[2]
+    x, y, z = vector
+    return xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z
 
 
 @inline_kernel

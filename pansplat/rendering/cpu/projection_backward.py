@@ -44,6 +44,7 @@ from pansplat.rendering.cpu.projection import (
     compute_whitening,
     cross,
     dot,
+    from_axes,
     load_axes,
     load_block,
     load_vector,
@@ -305,9 +306,9 @@ def _backpropagate_footprint_rows(pose, filter_variance, compensate, u, v, n, co
     factors, alpha, beta, radial_variance, det_filtered, _ = compute_whitening(cov, filter_variance)
     a_scale, mix, b_scale = factors
     a, b = whitened_axes(u, v, factors)
-    g_n = _to_world(pose, _load_fields(soa, layout.DIRECTION, i, 1.0))
-    g_a = _to_world(pose, _load_fields(soa, layout.ROW_A, i, unit))
-    g_b = _to_world(pose, _load_fields(soa, layout.ROW_B, i, unit))
+    g_n = from_axes(pose, _load_fields(soa, layout.DIRECTION, i, 1.0))
+    g_a = from_axes(pose, _load_fields(soa, layout.ROW_A, i, unit))
+    g_b = from_axes(pose, _load_fields(soa, layout.ROW_B, i, unit))
     if grad_pose.shape[0] > 0:
         _add_to_pose(grad_pose, n, a, b, g_n, g_a, g_b)
     g_alpha = inverse_unit * _load_field(soa, layout.L_ALONG_A, i)
@@ -352,13 +353,6 @@ def _load_fields(soa, field, i, factor):
 def _add_tangent(g_n, by_u, u, by_v, v):
     """g_n + by_u u + by_v v"""
     return g_n[0] + by_u * u[0] + by_v * v[0], g_n[1] + by_u * u[1] + by_v * v[1], g_n[2] + by_u * u[2] + by_v * v[2]
-
-
-@inline_kernel
-def _to_world(pose, vector):
-    (xx, yx, zx), (xy, yy, zy), (xz, yz, zz), _ = pose
-    x, y, z = vector
-    return xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z
 
 
 @inline_kernel
