@@ -33,6 +33,7 @@ def test_an_empty_scene_is_background_and_gradients_of_zero(layout, draw, balls,
         expected = torch.tensor((0.1, 0.25, 0.5), dtype=draw.dtype)[:, None, None].expand(3, *draw.size)
         assert torch.equal(got.color, expected), name
         assert float(got.alpha.abs().max()) == float(got.depth.abs().max()) == 0
+        assert got.info is not None and got.info.intersections == 0
         for field, gradient in gradients(draw, scene, layout=layout).items():
             shape = (4, 4) if field == "pose" else getattr(scene, field).shape
             assert gradient.shape == shape and not gradient.any(), (name, field)
