@@ -142,6 +142,8 @@ class LevelHead(nn.Module):
 
     def __init__(self, inputs: int, config: HeadsConfig, compat: Compat) -> None:
         super().__init__()
+        self.config = config
+        self.compat: Compat = compat
         hidden = 2 * config.outputs
         last = hidden if config.lattice == "fibonacci" else config.outputs
         widths = [inputs, *[hidden] * (config.layers - 1), last]
@@ -161,6 +163,55 @@ class LevelHead(nn.Module):
                 maps = functional.gelu(maps)
             maps = conv(maps)
         return maps
+
+    def decode_gaussians(
+        self,
+        refined: Float[Tensor, "hidden h w"],
+        window: Window,
+        tile: Tile,
+        view: ViewInputs,
+        *,
+        height: int,
+        level: int,
+        colored: bool,
+    ) -> Gaussians:
+        """Sample a level's map at the lattice points of a tile and decode the samples into Gaussians.
+
+        Args:
+            refined: the part of the level's map inside `window`.
+            height: rows of the whole map.
+            colored: whether to add the colour of the image to the harmonics.
+        """
+        config, compat = self.config, self.compat
+        uv = lattice_uv(config.lattice, height, exact=compat == "fixed")
+        uv = uv[tile.contains(uv)].to(refined.device)
+        outputs = self.linear(sample_window(refined, window, height, uv))
+        sizes = (2, config.adapter.num_parameters, config.outputs - 2 - config.adapter.num_parameters)
+        offsets, parameters, logits = outputs.split(sizes, dim=-1)
+
+        def sample_resized(source: Float[Tensor, "channel _ _"]) -> Float[Tensor, "n channel"]:
+            return sample_window(crop_window(source, height, window, compat), window, height, uv)
+
+        if config.depth == "refined":
+            probabilities = torch.softmax(logits[:, :-1], dim=-1)
+            inverse_depths = (probabilities * sample_panorama(view.candidates, uv, compat)).sum(dim=-1)
+            opacities = torch.sigmoid(logits[:, -1])
+        else:
+            inverse_depths = sample_resized(view.inverse_depth[None])[:, 0]
+            opacities = torch.sigmoid(sample_resized(view.confidence[None])[:, 0])
+        return adapt_gaussians(
+            parameters,
+            move_points(uv, offsets, config.lattice, height),
+            1 / inverse_depths.clamp(1 / view.far, 1 / view.near),
+            opacities,
+            view.cam2world,
+            map_height=height,
+            colors=sample_resized(view.image) if colored else None,
+            level=level,
+            view=view.view,
+            config=config.adapter,
+            compat=compat,
+        )
 
 
 class GaussianHeads(nn.Module):
@@ -252,11 +303,10 @@ class GaussianHeads(nn.Module):
             level = len(heights) - 1 - index
             if level == 0 or self.config.emitted == "all":
                 # Only the coarsest level adds its harmonics to the colour of the image.
-                decoded = decode_gaussians(
-                    head, refined[0], window.expand(self.margins.output), tile, view, height=height, level=level,
-                    colored=index == 0, config=self.config, compat=self.compat,
-                )  # fmt: skip
-                gaussians.append(decoded)
+                known = window.expand(self.margins.output)
+                gaussians.append(
+                    head.decode_gaussians(refined[0], known, tile, view, height=height, level=level, colored=index == 0)
+                )
         return gaussians
 
     def _require_divisible(self, height: int, tiles: int) -> None:
@@ -270,57 +320,6 @@ class GaussianHeads(nn.Module):
         if self.compat == "fixed" and coarsest < self.margins.input:
             lowest = self.margins.input << (len(self.levels) - 1)
             raise InputError(f"the heads need panoramas at least {lowest} pixels high, got {height}; enlarge them")
-
-
-def decode_gaussians(
-    head: LevelHead,
-    refined: Float[Tensor, "hidden h w"],
-    window: Window,
-    tile: Tile,
-    view: ViewInputs,
-    *,
-    height: int,
-    level: int,
-    colored: bool,
-    config: HeadsConfig,
-    compat: Compat,
-) -> Gaussians:
-    """Sample a level's map at the lattice points of a tile and decode the samples into Gaussians.
-
-    Args:
-        refined: the part of the level's map inside `window`.
-        height: rows of the whole map.
-        colored: whether to add the colour of the image to the harmonics.
-    """
-    uv = lattice_uv(config.lattice, height, exact=compat == "fixed")
-    uv = uv[tile.contains(uv)].to(refined.device)
-    outputs = head.linear(sample_window(refined, window, height, uv))
-    sizes = (2, config.adapter.num_parameters, config.outputs - 2 - config.adapter.num_parameters)
-    offsets, parameters, logits = outputs.split(sizes, dim=-1)
-
-    def sample_resized(source: Float[Tensor, "channel _ _"]) -> Float[Tensor, "n channel"]:
-        return sample_window(crop_window(source, height, window, compat), window, height, uv)
-
-    if config.depth == "refined":
-        probabilities = torch.softmax(logits[:, :-1], dim=-1)
-        inverse_depths = (probabilities * sample_panorama(view.candidates, uv, compat)).sum(dim=-1)
-        opacities = torch.sigmoid(logits[:, -1])
-    else:
-        inverse_depths = sample_resized(view.inverse_depth[None])[:, 0]
-        opacities = torch.sigmoid(sample_resized(view.confidence[None])[:, 0])
-    return adapt_gaussians(
-        parameters,
-        move_points(uv, offsets, config.lattice, height),
-        1 / inverse_depths.clamp(1 / view.far, 1 / view.near),
-        opacities,
-        view.cam2world,
-        map_height=height,
-        colors=sample_resized(view.image) if colored else None,
-        level=level,
-        view=view.view,
-        config=config.adapter,
-        compat=compat,
-    )
 
 
 def untiled_index(tile: Tile, lattices: Sequence[Float[Tensor, "_ 2"]], views: int) -> Integer[Tensor, "n"]:
@@ -524,15 +523,5 @@ class AuxiliaryHeads(nn.Module):
         swept = dataclasses.replace(
             view, inverse_depth=depth.inverse_depth[index_of_view], confidence=depth.confidence[index_of_view]
         )
-        return decode_gaussians(
-            head,
-            refined[0],
-            panorama.window(height).expand(self.margins.output),
-            panorama,
-            swept,
-            height=height,
-            level=depth.level,
-            colored=True,
-            config=self.config,
-            compat=self.compat,
-        )
+        known = panorama.window(height).expand(self.margins.output)
+        return head.decode_gaussians(refined[0], known, panorama, swept, height=height, level=depth.level, colored=True)
