@@ -20,21 +20,16 @@ from pansplat.sweep.matching import (
 )
 from pansplat.sweep.surface import ray_grid
 
-_ANYWHERE = (math.inf, -math.inf)
 _PLAIN = MatchingConfig(textureless_weight=1.0, distance_penalty=0.0)
 _IMPOSSIBLE = 2 * (_PLAIN.correlation_weight + _PLAIN.color_weight)
 _NEUTRAL = 0.5 * (_PLAIN.correlation_weight + _PLAIN.color_weight)
 
 
-def _spheres(height: int, inverses: np.ndarray) -> HypothesisSet:
+def _spheres(inverses, height: int = 96) -> HypothesisSet:
     """Spheres at equally spaced inverse depths."""
-    shape = (height, 2 * height)
-    return HypothesisSet(
-        np.full(shape, inverses[0], np.float32),
-        np.full(shape, inverses[1] - inverses[0], np.float32),
-        np.zeros((2, len(inverses)), np.float32),
-        np.zeros(shape, np.uint8),
-    )
+    shape, (first, second) = (height, 2 * height), np.float32(inverses[:2])
+    maps = np.full(shape, first, np.float32), np.full(shape, second - first, np.float32)
+    return HypothesisSet(*maps, np.zeros((2, len(inverses)), np.float32), np.zeros(shape, np.uint8))
 
 
 def _view(image: np.ndarray, valid: np.ndarray | None = None, inverse: float | None = None, trust: float = 1) -> View:
@@ -48,26 +43,25 @@ def _view(image: np.ndarray, valid: np.ndarray | None = None, inverse: float | N
     )
 
 
-def _around_the_truth(observed, view: int, factors: np.ndarray) -> np.ndarray:
-    """Cost (h, w, factor) of the true inverse depth times equally spaced factors."""
-    posed = observed.posed
-    true = (1 / observed.depths[view]).astype(np.float32)
-    spheres = HypothesisSet(
-        factors[0] * true,
-        (factors[1] - factors[0]) * true,
-        np.zeros((2, len(factors)), np.float32),
-        np.zeros(true.shape, np.uint8),
-    )
-    views = [_view(image) for image in posed.images]
-    pose = posed.relative_pose(view, 1 - view)
-    return matching_cost(views[view], views[1 - view], pose, [spheres], (0.05, 8.0), _ANYWHERE, _PLAIN)
+def _cost(views, *sets, pose=None, limits=(0.1, 2.0), bounds=(math.inf, -math.inf), config=_PLAIN) -> np.ndarray:
+    """Cost of a view against another, by default with the same pose."""
+    return matching_cost(*views, np.eye(4) if pose is None else pose, list(sets), limits, bounds, config)
 
 
-def test_an_image_matches_itself_at_every_hypothesis(empty_room):
+@pytest.fixture(scope="module")
+def twice(empty_room) -> tuple[View, View]:
+    """One view, matched against itself."""
     view = _view(empty_room.posed.images[0])
-    spheres = _spheres(96, np.linspace(0.2, 1.5, 11, dtype=np.float32))
-    cost = matching_cost(view, view, np.eye(4), [spheres], (0.1, 2.0), _ANYWHERE, _PLAIN)
-    assert cost.max() < 0.02
+    return view, view
+
+
+@pytest.fixture(scope="module")
+def views(empty_room) -> list[View]:
+    return [_view(image) for image in empty_room.posed.images]
+
+
+def test_an_image_matches_itself_at_every_hypothesis(twice):
+    assert _cost(twice, _spheres(np.linspace(0.2, 1.5, 11))).max() < 0.02
 
 
 def test_a_camera_turned_in_place_matches_at_every_hypothesis(empty_room, turn):
@@ -75,132 +69,140 @@ def test_a_camera_turned_in_place_matches_at_every_hypothesis(empty_room, turn):
     room, pose = empty_room.room, empty_room.posed.cam2world[0]
     turned = pose.copy()
     turned[:3, :3] = pose[:3, :3] @ turn("x", 50) @ turn("y", 75)
-    views = [_view(room.cast(p, 96)[0]) for p in (pose, turned)]
-    spheres = _spheres(96, np.linspace(0.2, 1.5, 3, dtype=np.float32))
-    cost = matching_cost(*views, np.linalg.inv(turned) @ pose, [spheres], (0.1, 2.0), _ANYWHERE, _PLAIN)
+    rotated = [_view(room.cast(p, 96)[0]) for p in (pose, turned)]
+    cost = _cost(rotated, _spheres(np.linspace(0.2, 1.5, 3)), pose=np.linalg.inv(turned) @ pose)
     assert np.median(cost) < 0.1 and (cost < 0.3).mean() > 0.97
-    assert np.ptp(cost, axis=2).max() < 1e-5  # without a baseline all hypotheses are one
+    assert np.ptp(cost, axis=2).max() < 1e-5  # without a baseline all hypotheses are equal
 
 
 @pytest.mark.parametrize("view", (0, 1))
-def test_the_true_depth_has_the_lowest_cost(empty_room, view):
-    cost = _around_the_truth(empty_room, view, np.linspace(0.6, 1.4, 9, dtype=np.float32))
+def test_the_true_depth_has_the_lowest_cost(empty_room, views, view):
+    factors = np.linspace(0.6, 1.4, 9, dtype=np.float32)
+    true = (1 / empty_room.depths[view]).astype(np.float32)
+    near = HypothesisSet(
+        *(factors[0] * true, (factors[1] - factors[0]) * true),
+        *(np.zeros((2, len(factors)), np.float32), np.zeros(true.shape, np.uint8)),
+    )
+    pose = empty_room.posed.relative_pose(view, 1 - view)
+    cost = _cost((views[view], views[1 - view]), near, pose=pose, limits=(0.05, 8.0))
     assert (cost[..., 4] < cost[..., 0]).mean() > 0.9
     assert (cost[..., 4] < cost[..., 8]).mean() > 0.9
     assert np.abs(cost.argmin(axis=2) - 4).mean() < 0.8
     assert np.median(cost[..., 4]) < 0.25 * np.median(cost[..., (0, 8)])
 
 
-def test_rolling_both_panoramas_rolls_the_cost(empty_room, turn):
-    posed, columns = empty_room.posed, 31
-    roll = np.eye(4)
+def test_rolling_both_panoramas_rolls_the_cost(empty_room, views, turn):
+    columns, roll = 31, np.eye(4)
     roll[:3, :3] = turn("y", -360 * columns / 192)  # from rolled to former camera axes
-    pose = posed.relative_pose(0, 1)
-    spheres = _spheres(96, np.linspace(0.2, 1.0, 5, dtype=np.float32))
-    plain = matching_cost(*(_view(i) for i in posed.images), pose, [spheres], (0.1, 2.0), _ANYWHERE, _PLAIN)
-    rolled = matching_cost(
-        *(_view(np.roll(i, columns, axis=1)) for i in posed.images),
-        np.linalg.inv(roll) @ pose @ roll, [spheres], (0.1, 2.0), _ANYWHERE, _PLAIN,
-    )  # fmt: skip
-    assert np.allclose(np.roll(rolled, -columns, axis=1), plain, atol=2e-3)
+    pose, spheres = empty_room.posed.relative_pose(0, 1), _spheres(np.linspace(0.2, 1.0, 5))
+    rolled_views = [_view(np.roll(image, columns, axis=1)) for image in empty_room.posed.images]
+    rolled = _cost(rolled_views, spheres, pose=np.linalg.inv(roll) @ pose @ roll)
+    assert np.allclose(np.roll(rolled, -columns, axis=1), _cost(views, spheres, pose=pose), atol=2e-3)
 
 
-def test_hypothesis_sets_do_not_affect_each_other(empty_room):
-    posed = empty_room.posed
-    views, pose = [_view(i) for i in posed.images], posed.relative_pose(0, 1)
-    sets = [_spheres(96, np.linspace(low, 1.0, 10, dtype=np.float32)) for low in (0.2, 0.4)]
-    both = matching_cost(*views, pose, sets, (0.1, 2.0), _ANYWHERE, _PLAIN)
-    alone = [matching_cost(*views, pose, [f], (0.1, 2.0), _ANYWHERE, _PLAIN) for f in sets]
-    assert np.array_equal(both, np.concatenate(alone, axis=2))
+def test_hypothesis_sets_do_not_affect_each_other(empty_room, views):
+    pose = empty_room.posed.relative_pose(0, 1)
+    sets = [_spheres(np.linspace(low, 1.0, 10)) for low in (0.2, 0.4)]
+    alone = [_cost(views, spheres, pose=pose) for spheres in sets]
+    assert np.array_equal(_cost(views, *sets, pose=pose), np.concatenate(alone, axis=2))
 
 
-@pytest.mark.parametrize("whose", ("own", "other"))
-def test_masked_pixels_have_the_same_cost_at_every_hypothesis(empty_room, whose):
-    image, height = empty_room.posed.images[0], 96
-    valid = np.ones((height, 2 * height), bool)
+@pytest.mark.parametrize("masked", (0, 1), ids=("own", "other"))
+def test_masked_pixels_have_the_same_cost_at_every_hypothesis(twice, masked):
+    valid = np.ones((96, 192), bool)
     valid[:20] = False
-    views = _view(image, valid if whose == "own" else None), _view(image, valid if whose == "other" else None)
-    spheres = _spheres(height, np.linspace(0.2, 1.5, 6, dtype=np.float32))
-    cost = matching_cost(*views, np.eye(4), [spheres], (0.1, 2.0), _ANYWHERE, _PLAIN)
+    pair = list(twice)
+    pair[masked] = dataclasses.replace(twice[0], valid=valid)
+    cost = _cost(pair, _spheres(np.linspace(0.2, 1.5, 6)))
     assert np.allclose(cost[:20], _NEUTRAL)
     assert cost[20:].max() < 0.02
 
 
-def test_hypotheses_out_of_range_are_impossible(empty_room):
-    posed = empty_room.posed
+def test_hypotheses_out_of_range_are_impossible(empty_room, views):
     inverses = np.linspace(0.1, 1.1, 11, dtype=np.float32)
-    cost = matching_cost(
-        *(_view(i) for i in posed.images), posed.relative_pose(0, 1), [_spheres(96, inverses)],
-        (0.35, 0.85), _ANYWHERE, _PLAIN,
-    )  # fmt: skip
+    cost = _cost(views, _spheres(inverses), pose=empty_room.posed.relative_pose(0, 1), limits=(0.35, 0.85))
     out = (inverses < 0.35) | (inverses > 0.85)
     assert (cost[..., out] == _IMPOSSIBLE).all()
     assert cost[..., ~out].max() < _IMPOSSIBLE
 
 
-def test_the_other_views_surface_changes_the_cost_as_configured(empty_room):
+def test_the_other_views_surface_changes_the_cost_as_configured(twice):
     """A penalty in free space, a bonus when consistent, a constant cost when occluded."""
-    image = empty_room.posed.images[0]
-    spheres = _spheres(96, np.array((0.25, 0.5, 0.75, 1.0), np.float32))
-    cost = matching_cost(
-        _view(image), _view(image, inverse=0.5), np.eye(4), [spheres], (0.1, 2.0), _ANYWHERE, _PLAIN
-    ).reshape(-1, 4)
-    expected = (_PLAIN.occluded_cost, -_PLAIN.consistency_bonus, _PLAIN.free_space_penalty, _PLAIN.free_space_penalty)
+    image, spheres = twice[0].image, _spheres((0.25, 0.5, 0.75, 1.0))
+    cost = _cost((twice[0], _view(image, inverse=0.5)), spheres)
+    config = _PLAIN
+    expected = (config.occluded_cost, -config.consistency_bonus, config.free_space_penalty, config.free_space_penalty)
     assert np.allclose(cost, expected, atol=0.02)
-    unverified = matching_cost(
-        _view(image), _view(image, inverse=0.5, trust=0), np.eye(4), [spheres], (0.1, 2.0), _ANYWHERE, _PLAIN
-    )
-    assert unverified.max() < 0.02
+    assert _cost((twice[0], _view(image, inverse=0.5, trust=0)), spheres).max() < 0.02
 
 
-def test_hypotheses_below_the_floor_or_above_the_ceiling_are_penalised(empty_room):
-    view = _view(empty_room.posed.images[0])
-    spheres = _spheres(96, np.array((0.25, 0.5), np.float32))  # 4 and 2 metres
-    cost = matching_cost(view, view, np.eye(4), [spheres], (0.1, 2.0), (1.5, -1.0), _PLAIN)
-    down = view.down[..., None] * np.array((4.0, 2.0))
+def test_hypotheses_below_the_floor_or_above_the_ceiling_are_penalised(twice):
+    cost = _cost(twice, _spheres((0.25, 0.5)), bounds=(1.5, -1.0))
+    down = twice[0].down[..., None] * np.array((4.0, 2.0))
     outside = (down > 1.5) | (down < -1.0)
-    sure = np.minimum(np.abs(down - 1.5), np.abs(down + 1.0)) > 1e-4
+    clear = np.minimum(np.abs(down - 1.5), np.abs(down + 1.0)) > 1e-4
     assert outside.any() and not outside.all()
-    assert np.allclose(cost[sure], np.where(outside, _PLAIN.outside_penalty, 0)[sure], atol=0.02)
+    assert np.allclose(cost[clear], np.where(outside, _PLAIN.outside_penalty, 0)[clear], atol=0.02)
 
 
-def test_penalties_depend_on_the_side(empty_room):
-    view = _view(empty_room.posed.images[0])
-    plain = _spheres(96, np.array((0.25, 0.5), np.float32))
-    side = np.zeros(plain.side.shape, np.uint8)
+def test_penalties_depend_on_the_side(twice):
+    side = np.zeros((96, 192), np.uint8)
     side[:, 96:] = 1
-    spheres = HypothesisSet(plain.base, plain.step, np.array(((0.0, 0.3), (0.7, 0.0)), np.float32), side)
-    cost = matching_cost(view, view, np.eye(4), [spheres], (0.1, 2.0), _ANYWHERE, _PLAIN)
+    penalty = np.array(((0.0, 0.3), (0.7, 0.0)), np.float32)
+    cost = _cost(twice, dataclasses.replace(_spheres((0.25, 0.5)), penalty=penalty, side=side))
     assert np.allclose(cost[:, :96], (0.0, 0.3), atol=0.02)
     assert np.allclose(cost[:, 96:], (0.7, 0.0), atol=0.02)
 
 
 def test_a_window_without_texture_has_less_weight():
     """White against grey: the colour difference is truncated, the correlation is undefined."""
-    white, gray = np.ones((32, 64, 3)), np.full((32, 64, 3), 0.5)
-    spheres = _spheres(32, np.array((0.25, 0.5), np.float32))
+    flat = [_view(np.full((32, 64, 3), value)) for value in (1.0, 0.5)]
     config = MatchingConfig()
-    cost = matching_cost(_view(white), _view(gray), np.eye(4), [spheres], (0.1, 2.0), _ANYWHERE, config)
-    expected = (
-        config.textureless_weight * config.color_weight + (1 - config.textureless_weight) * config.textureless_cost
-    )
-    assert np.allclose(cost, expected, atol=1e-3)
+    cost = _cost(flat, _spheres((0.25, 0.5), 32), config=config)
+    weight = config.textureless_weight
+    assert np.allclose(cost, weight * config.color_weight + (1 - weight) * config.textureless_cost, atol=1e-3)
 
 
-def test_points_much_nearer_to_one_camera_than_to_the_other_are_penalised(empty_room):
-    views, pose = [_view(image) for image in empty_room.posed.images], np.eye(4)
+def _two_metres_apart(inverses) -> tuple[np.ndarray, np.ndarray]:
+    """A pose 2 m along x, and the points of all hypotheses in the other camera."""
+    pose = np.eye(4)
     pose[0, 3] = 2.0
+    return pose, ray_grid(96)[..., None, :] / np.array(inverses)[:, None] + np.array((2.0, 0, 0))
+
+
+def test_points_much_nearer_to_one_camera_than_to_the_other_are_penalised(views):
     inverses = np.array((0.25, 2.0, 3.75), np.float32)
+    pose, there = _two_metres_apart(inverses)
     penalised = dataclasses.replace(_PLAIN, distance_penalty=0.5)
     plain, far_apart = (
-        matching_cost(*views, pose, [_spheres(96, inverses)], (0.1, 4.0), _ANYWHERE, config)
-        for config in (_PLAIN, penalised)
+        _cost(views, _spheres(inverses), pose=pose, limits=(0.1, 4.0), config=config) for config in (_PLAIN, penalised)
     )
-    points = ray_grid(96)[..., None, :] / inverses[:, None]
-    ratio = np.linalg.norm(points + np.array((2.0, 0, 0)), axis=-1) * inverses
+    ratio = np.linalg.norm(there, axis=-1) * inverses
     expected = 0.5 * np.maximum(1 - penalised.distance_ratio * np.minimum(ratio, 1 / ratio), 0)
     assert np.allclose(far_apart - plain, expected, atol=1e-4)
     assert (expected[..., 0] == 0).all() and (expected[..., 2] > 0).all()
+
+
+def test_a_plane_that_separates_the_views_has_a_constant_cost(empty_room, views):
+    plain, pose = _spheres((0.25, 0.5)), empty_room.posed.relative_pose(0, 1)
+    hidden = dataclasses.replace(plain, back_facing=np.array(((False, True), (False, False))))
+    before, cost = (_cost(views, hypotheses, pose=pose) for hypotheses in (plain, hidden))
+    assert np.array_equal(cost[..., 0], before[..., 0])
+    assert np.allclose(cost[..., 1], _PLAIN.back_facing_cost)
+    assert not np.allclose(before[..., 1], _PLAIN.back_facing_cost)
+
+
+def test_spheres_seen_from_opposite_directions_are_penalised_and_planes_are_not(views):
+    inverses = np.array((0.5, 1.25, 2.0), np.float32)
+    pose, there = _two_metres_apart(inverses)
+    plain, sphere = (
+        _cost(views, dataclasses.replace(_spheres(inverses), sphere=is_sphere), pose=pose, limits=(0.1, 4.0))
+        for is_sphere in (False, True)
+    )
+    cosine = (ray_grid(96)[..., None, :] * there).sum(axis=-1) / np.linalg.norm(there, axis=-1)
+    expected = _PLAIN.opposed_penalty * ((0.2 - cosine) / 0.7).clip(0, 1)
+    assert expected.max() == _PLAIN.opposed_penalty and (expected == 0).mean() > 0.3
+    assert np.allclose(sphere - plain, expected, atol=1e-4)
 
 
 @nb.njit
@@ -220,37 +222,9 @@ def test_fast_atan2_is_within_two_microradians():
     assert np.allclose(_all_atan2(y, x), np.arctan2(y, x), atol=2e-6)
 
 
-def test_a_plane_that_separates_the_views_has_a_constant_cost(empty_room):
-    views = [_view(image) for image in empty_room.posed.images]
-    plain = _spheres(96, np.array((0.25, 0.5), np.float32))
-    hidden = dataclasses.replace(plain, back_facing=np.array(((False, True), (False, False))))
-    pose = empty_room.posed.relative_pose(0, 1)
-    before, cost = (matching_cost(*views, pose, [f], (0.1, 2.0), _ANYWHERE, _PLAIN) for f in (plain, hidden))
-    assert np.array_equal(cost[..., 0], before[..., 0])
-    assert np.allclose(cost[..., 1], _PLAIN.back_facing_cost) and not np.allclose(
-        before[..., 1], _PLAIN.back_facing_cost
-    )
-
-
-def test_spheres_seen_from_opposite_directions_are_penalised_and_planes_are_not(empty_room):
-    views, pose = [_view(image) for image in empty_room.posed.images], np.eye(4)
-    pose[0, 3] = 2.0
-    inverses = np.array((0.5, 1.25, 2.0), np.float32)
-    spheres = _spheres(96, inverses)
-    plain, sphere = (
-        matching_cost(*views, pose, [dataclasses.replace(spheres, sphere=s)], (0.1, 4.0), _ANYWHERE, _PLAIN)
-        for s in (False, True)
-    )
-    rays = ray_grid(96)[..., None, :]
-    there = rays / inverses[:, None] + np.array((2.0, 0, 0))
-    cosine = (rays * there).sum(axis=-1) / np.linalg.norm(there, axis=-1)
-    expected = _PLAIN.opposed_penalty * ((0.2 - cosine) / 0.7).clip(0, 1)
-    assert expected.max() == _PLAIN.opposed_penalty and (expected == 0).mean() > 0.3
-    assert np.allclose(sphere - plain, expected, atol=1e-4)
-
-
 _AWAY_FROM_POLES = slice(4, -4)
 """Rows where the start of a path has no effect after half a turn; near a pole penalties are too high for that."""
+_DEFAULT = AggregationConfig()
 _FREE = AggregationConfig(step_penalty=0, crease_penalty=0, jump_penalty=0)
 
 
@@ -269,16 +243,21 @@ def _noise(height: int, labels: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).random((height, 2 * height, labels)).astype(np.float32)
 
 
+def _aggregate(cost: np.ndarray, guide: np.ndarray | None = None, *, sets: int = 1, config=_DEFAULT) -> np.ndarray:
+    height = len(cost)
+    return aggregate(cost, _gray(height) if guide is None else guide, _slots(height, sets), 12, config)
+
+
 def test_without_penalties_every_direction_adds_the_cost_once():
     cost = _noise(32, 24)
-    total = aggregate(cost, _gray(32), _slots(32, 2), 12, _FREE)
+    total = _aggregate(cost, sets=2, config=_FREE)
     assert np.allclose(total, 8 * cost, atol=1e-5)
 
 
 def test_a_hypothesis_that_matches_everywhere_has_cost_zero():
     cost = 0.1 + _noise(32, 24)
     cost[..., 17] = 0
-    total = aggregate(cost, _gray(32), _slots(32, 2), 12, AggregationConfig())
+    total = _aggregate(cost, sets=2)
     assert np.abs(total[..., 17]).max() < 1e-5
     assert np.delete(total, 17, axis=2).min() > 0.1
 
@@ -298,7 +277,7 @@ def test_a_plane_continues_through_a_gap_without_evidence(gap, cost_in_gap):
     cost[..., 5] = 0
     cost[gap] = cost_in_gap * _noise(32, 12, seed=1)[gap]
     assert (cost[gap].argmin(axis=-1) == 5).mean() < 0.3
-    total = aggregate(cost, _gray(32), _slots(32), 12, AggregationConfig())
+    total = _aggregate(cost)
     assert (total.argmin(axis=-1) == 5).all()
 
 
@@ -314,8 +293,8 @@ def test_a_path_continues_over_the_pole_half_a_turn_away(dy):
     penalties = tuple(np.float32(price) for price in (0.08, 0.15, 0.8, 0.1))
     _aggregate_columns(cost, total, _gray(height), _slots(height), 1, count, count, penalties, dy, 0, height // 4)
     first = total[0 if dy > 0 else -1]
-    knows = np.sort(first, axis=1)[:, 1] > first[:, 5] + 0.05
-    assert np.flatnonzero(knows).tolist() == [0, 1, 2, 3, 32, 33, 34, 35]
+    evident = np.sort(first, axis=1)[:, 1] > first[:, 5] + 0.05
+    assert np.flatnonzero(evident).tolist() == [0, 1, 2, 3, 32, 33, 34, 35]
 
 
 def test_a_discontinuity_follows_the_image_edge():
@@ -326,7 +305,7 @@ def test_a_discontinuity_follows_the_image_edge():
     cost = 1 + _noise(height, 12)
     cost[:, :26, 2], cost[:, 34:, 9] = 0, 0
     cost[:, 26:34] = 0
-    total = aggregate(cost, guide, _slots(height), 12, AggregationConfig())
+    total = _aggregate(cost, guide)
     rows = slice(8, 24)
     assert (total[rows, 10:29].argmin(axis=-1) == 2).mean() > 0.98
     assert (total[rows, 29:54].argmin(axis=-1) == 9).mean() > 0.98
@@ -355,21 +334,16 @@ def test_the_number_of_threads_changes_no_bit():
 
 def test_rolling_the_cost_rolls_the_total():
     cost, guide, columns = _noise(32, 12), 0.1 * _noise(32, 3, seed=2), 23
-    total = aggregate(cost, guide, _slots(32), 12, AggregationConfig())
-    rolled = aggregate(
-        np.roll(cost, columns, axis=1), np.roll(guide, columns, axis=1), _slots(32), 12, AggregationConfig()
-    )
+    total = _aggregate(cost, guide)
+    rolled = _aggregate(np.roll(cost, columns, axis=1), np.roll(guide, columns, axis=1))
     assert np.allclose(np.roll(rolled, -columns, axis=1)[_AWAY_FROM_POLES], total[_AWAY_FROM_POLES], atol=1e-4)
 
 
 @pytest.mark.parametrize("axis", (0, 1))
 def test_mirroring_the_cost_mirrors_the_total(axis):
     cost, guide = _noise(32, 12), 0.1 * _noise(32, 3, seed=2)
-    total = aggregate(cost, guide, _slots(32), 12, AggregationConfig())
-    mirrored = aggregate(
-        np.ascontiguousarray(np.flip(cost, axis)), np.ascontiguousarray(np.flip(guide, axis)),
-        _slots(32), 12, AggregationConfig(),
-    )  # fmt: skip
+    total = _aggregate(cost, guide)
+    mirrored = _aggregate(*(np.ascontiguousarray(np.flip(a, axis)) for a in (cost, guide)))
     assert np.allclose(np.flip(mirrored, axis)[_AWAY_FROM_POLES], total[_AWAY_FROM_POLES], atol=1e-4)
 
 
