@@ -447,7 +447,7 @@ def compute_log2_alphas(block, masks, is_3d, footprints, offsets, log2_alphas, i
 
     Returns:
         The number of Gaussians. One more with alpha 0 follows them. Gaussians that no pixel of the block sees, in a
-        corner of their box, are included: to drop them would make each Gaussian depend on the previous one.
+        corner of their box, are included: dropping them would make each step of the loop depend on the previous one.
     """
     pixel = block * LANES
     x, y, z = load(offsets, pixel), load(offsets, TILE_PIXELS + pixel), load(offsets, 2 * TILE_PIXELS + pixel)

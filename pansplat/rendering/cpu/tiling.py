@@ -313,7 +313,7 @@ _LAST = TILE_SIZE - 1
 _PARTS_PER_THREAD = 4  # some processors are slower than others
 _BUFFER_SIZE = 512  # pairs collected before they are written: two small loops are twice as fast as one large loop
 _WRITE_AHEAD = 16  # intersections of a tile, from the prefetch of a cache line to the write
-_SIDE = np.int64(0xFFFF)  # a box as one word: x0, x1, y0, y1 from the lowest bits up
+_INT16_MASK = np.int64(0xFFFF)  # a box as one word: x0, x1, y0, y1 from the lowest bits up
 EMPTY_BOX = np.int64(1 << 32)  # the empty box as one word: first row 1, last row 0
 
 
@@ -340,7 +340,7 @@ class TileIntersections(NamedTuple):
 def _count_columns(word, columns):
     """Number of tile columns that a packed box touches, counting around the panorama if it wraps."""
     first, last, _, _ = _tile_range(word)
-    if (word >> 16 & _SIDE) >= (word & _SIDE):
+    if (word >> 16 & _INT16_MASK) >= (word & _INT16_MASK):
         return last - first + 1
     return min(columns - first + last + 1, columns)
 
@@ -363,7 +363,12 @@ def _columns_in_tile(x0, x1, column, width):
 def _tile_range(word):
     """Tiles of a packed box's first and last column and first and last row."""
     shift = np.int64(_SHIFT)
-    return (word & _SIDE) >> shift, (word >> 16 & _SIDE) >> shift, (word >> 32 & _SIDE) >> shift, word >> 48 >> shift
+    return (
+        (word & _INT16_MASK) >> shift,
+        (word >> 16 & _INT16_MASK) >> shift,
+        (word >> 32 & _INT16_MASK) >> shift,
+        word >> 48 >> shift,
+    )
 
 
 @kernel
@@ -382,7 +387,7 @@ def _count_intersections(ends, words, rows, columns, counts, part):
         word = load_scalar(words, g)
         first, last, top, bottom = _tile_range(word)
         upper, lower = top * across, (bottom + 1 if word != EMPTY_BOX else top) * across
-        if (word >> 16 & _SIDE) < (word & _SIDE):  # wraps around
+        if (word >> 16 & _INT16_MASK) < (word & _INT16_MASK):  # wraps around
             if last < first:
                 _add(steps, upper, 1)
                 _add(steps, lower, -1)
@@ -437,7 +442,7 @@ def _buffer_corners(gaussian, word, low, columns, width, buffered, tiles, pairs)
 def _buffer_all(gaussian, word, low, high, columns, width, buffered, tiles, pairs):
     """Buffer the pairs of a Gaussian with any tiles of a band; returns the number of buffered pairs."""
     first, _, top, bottom = _tile_range(word)
-    x0, x1, y0, y1 = word & _SIDE, word >> 16 & _SIDE, word >> 32 & _SIDE, word >> 48
+    x0, x1, y0, y1 = word & _INT16_MASK, word >> 16 & _INT16_MASK, word >> 32 & _INT16_MASK, word >> 48
     for i in range(max(top, low), min(bottom + 1, high) if word != EMPTY_BOX else low):
         corner = i << _SHIFT
         rows = max(y0 - corner, 0) << (2 * BOX_BITS) | min(y1 - corner, _LAST) << (3 * BOX_BITS)
@@ -471,7 +476,7 @@ def _write_intersections(
     for g in range(ends[part], ends[part + 1]):
         word = load_scalar(words, g)
         first, last, top, bottom = _tile_range(word)
-        small = (last - first <= 1) & (bottom - top <= 1) & ((word >> 16 & _SIDE) >= (word & _SIDE))
+        small = (last - first <= 1) & (bottom - top <= 1) & ((word >> 16 & _INT16_MASK) >= (word & _INT16_MASK))
         if small & (top >= low) & (bottom < high) & (word != EMPTY_BOX):
             buffered = _buffer_corners(g, word, low, columns, width, buffered, tiles, pairs)
         else:
