@@ -185,6 +185,8 @@ def measure_case(
 def _measure_job(job: Mapping[str, Any]) -> tuple[dict[str, object], dict[str, Tensor]]:
     """Measure the job of a child process."""
     case, near, far = ModelCase(**job["case"]), job["near"], job["far"]
+    views = safetensors.torch.load_file(job["views"])
+    images, cam2world = views["images"], views["cam2world"]
     network = build_network(
         load_weights(Path(job["weights"])),
         case.compat,
@@ -194,8 +196,6 @@ def _measure_job(job: Mapping[str, Any]) -> tuple[dict[str, object], dict[str, T
     )
     assert isinstance(network, PanSplat)
     _warm_up(case)
-    views = safetensors.torch.load_file(job["views"])
-    images, cam2world = views["images"], views["cam2world"]
     bounds = [torch.full((1, len(images)), bound) for bound in (near, far)]
     stages: dict[str, float] = {}
     has_peak, before = reset_resident_peak(), time.process_time()

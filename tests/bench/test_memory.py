@@ -157,21 +157,6 @@ def test_failed_rows_are_measured_again_if_their_height_is_requested_and_kept_ot
     assert {row["status"] for row in again} == {"measured"} and len(again) == len(both)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--heights", "80"], "multiples of 32"),
-        (["--heights", "32"], "64 pixels or more"),
-        (["--threads", "0"], "--threads must be at least 1"),
-        (["--limit-gb", "0"], "--limit-gb must be positive"),
-    ],
-)
-def test_invalid_arguments_are_refused(measured, arguments, message, capsys):
-    assert run(["bench", "memory", "--preset", "tiny", *arguments]) == 2
-    assert message in capsys.readouterr().err
-    assert measured == []
-
-
 def row_of(work: str, tiles: int, height: int, **result: float) -> MemoryRow:
     return MemoryRow("memory", "sphere", MemoryCase(work, tiles, height), MemoryResult(**result))
 

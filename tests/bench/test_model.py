@@ -81,38 +81,6 @@ def test_the_command_writes_and_prints_what_was_measured(measured, tmp_path, cap
         assert word in printed
 
 
-def test_an_interruption_keeps_what_was_measured(measured, tmp_path, monkeypatch, capsys):
-    measure = bench_model.measure_case
-
-    def interrupted(case: ModelCase, *arguments, **options) -> tuple:
-        if len(measured) == 2:
-            raise KeyboardInterrupt
-        return measure(case, *arguments, **options)
-
-    monkeypatch.setattr(bench_model, "measure_case", interrupted)
-    file = tmp_path / "rows.json"
-    assert run(["bench", "model", "--height", "64", "--json", str(file)]) == 130
-    assert len(json.loads(file.read_text())["rows"]) == 2
-    assert "reference" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--height", "80"], "multiple of 64"),
-        (["--threads", "0"], "--threads must be at least 1"),
-        (["--json", "no/rows.json"], "create it first"),
-        (["--pair", "nowhere"], "nowhere is not a folder"),
-        (["--model", "none.safetensors"], "none.safetensors"),
-    ],
-)
-def test_invalid_arguments_are_refused(measured, arguments, message, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert run(["bench", "model", *arguments]) == 2
-    assert message in capsys.readouterr().err
-    assert measured == []
-
-
 def test_each_compat_begins_with_its_reference():
     cases = model_cases(2, bfloat16=True, quick=False)
     assert len(set(cases)) == len(cases)

@@ -15,12 +15,13 @@ from pansplat.cli import bench, run
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 
+SAMPLE = Path(__file__).parents[2] / "assets" / "living_room"
 _raster_groups = raster_cases.raster_groups
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    """Seconds instead of minutes: a small dense image, few repeats, no sample, no viewer."""
+    """Seconds instead of minutes: a small dense image, one repeat, few cases, no sample, no viewer."""
     monkeypatch.setattr(raster_cases, "DENSE_HEIGHT", 8)
     monkeypatch.setattr(raster, "_MAX_REPEATS", 1)
     monkeypatch.setattr(roofline, "_STEPS", 1 << 12)
@@ -41,7 +42,7 @@ def _no_viewer(*_: object) -> None:
     raise InputError("there is none in this test")
 
 
-def test_quick_writes_rows_and_pictures_and_prints_the_tables(tmp_path, capsys):
+def test_the_quick_run_writes_rows_and_plots_and_prints_the_tables(tmp_path, capsys):
     out = tmp_path / "out"
     assert run(["bench", "raster", "--quick", "--height", "16", "--out", str(out), "--threads", "1"]) == 0
     content = json.loads((out / "raster.json").read_text())
@@ -56,7 +57,7 @@ def test_quick_writes_rows_and_pictures_and_prints_the_tables(tmp_path, capsys):
         assert word in printed
 
 
-def test_a_scene_of_the_users_is_measured(tmp_path):
+def test_a_ply_scene_is_measured(tmp_path):
     scene = Scene(full_lattice_room(16), room_cameras(2), 0.1, 10.0, ("a", "b"))
     pipeline.save(scene, tmp_path / "mine.ply")
     file = tmp_path / "rows.json"
@@ -66,46 +67,41 @@ def test_a_scene_of_the_users_is_measured(tmp_path):
     assert {row["scene"] for row in rows} == {"mine", "mine 1/16"}
 
 
-def test_a_pairs_depth_is_measured_with_a_gaussian_at_every_lattice_point(tmp_path):
-    sample, file = Path(__file__).parents[2] / "assets" / "living_room", tmp_path / "rows.json"
-    command = ["bench", "raster", str(sample), "--scene-from", "depth", "--quick", "--height", "16"]
+def test_the_depth_of_a_pair_gives_a_gaussian_at_every_lattice_point(tmp_path):
+    file = tmp_path / "rows.json"
+    command = ["bench", "raster", str(SAMPLE), "--scene-from", "depth", "--quick", "--height", "16"]
     assert run([*command, "--json", str(file)]) == 0
     headline = [row for row in json.loads(file.read_text())["rows"] if row["suite"] == "headline"]
     assert {(row["scene"], row["num_gaussians"]) for row in headline} == {("living_room", lattice_room_size(16))}
 
 
-def test_an_interruption_prints_and_keeps_what_was_measured(tmp_path, monkeypatch, capsys):
-    original = raster.render_case
-
-    def interrupted(case, *arguments):
-        if case.layout == "cubemap":
-            raise KeyboardInterrupt
-        return original(case, *arguments)
-
-    monkeypatch.setattr(raster, "render_case", interrupted)
-    file = tmp_path / "rows.json"
-    assert run(["bench", "raster", "--quick", "--height", "16", "--json", str(file), "--threads", "1"]) == 130
-    assert len(json.loads(file.read_text())["rows"]) >= 2
-    printed = capsys.readouterr()
-    assert "headline: room 16" in printed.out and "interrupted" in printed.err
-
-
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
-        (["--height", "20"], "multiple of 8"),
-        (["--height", "7"], "--height must be"),
-        (["--threads", "0"], "--threads must be at least 1"),
-        (["--json", "no/rows.json"], "create it first"),
-        (["--plot", "rows.jpg"], ".png, .svg or .pdf"),
-        (["none.ply"], "none.ply"),
-        (["none.ply", "--scene-from", "depth"], "needs a pair's folder"),
+        ("raster --height 20", "multiple of 8"),
+        ("raster --height 7", "--height must be"),
+        ("raster --threads 0", "--threads must be at least 1"),
+        ("raster --json no/rows.json", "create it first"),
+        ("raster --plot rows.jpg", ".png, .svg or .pdf"),
+        ("raster none.ply", "none.ply"),
+        ("raster none.ply --scene-from depth", "needs a pair's folder"),
+        ("model --height 80", "multiple of 64"),
+        ("model --threads 0", "--threads must be at least 1"),
+        ("model --json no/rows.json", "create it first"),
+        ("model --pair nowhere", "nowhere is not a folder"),
+        ("model --height 64 --model none.safetensors", "none.safetensors"),
+        ("memory --heights 80", "multiples of 32"),
+        ("memory --heights 32", "64 pixels or more"),
+        ("memory --threads 0", "--threads must be at least 1"),
+        ("memory --limit-gb 0", "--limit-gb must be positive"),
     ],
 )
-def test_unusable_arguments_are_refused_before_the_work(arguments, told, capsys, tmp_path, monkeypatch):
+def test_invalid_arguments_are_refused_before_the_work(arguments, message, refusal, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert run(["bench", "raster", *arguments]) == 2
-    assert told in capsys.readouterr().err
+    monkeypatch.setattr(bench, "_RASTER_BACKENDS", ())
+    if "--model" in arguments:
+        monkeypatch.setattr(bench, "_SAMPLE", SAMPLE)
+    assert message in refusal("bench", *arguments.split())
 
 
 def test_the_machine_is_described(capsys):

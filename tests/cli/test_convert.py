@@ -1,14 +1,13 @@
-"""`pansplat convert`, and what it makes at work in the other commands."""
+"""`pansplat convert`: its report and its refusals; and the other commands with the converted weights."""
 
-import json
+import contextlib
+import io
 import os
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 from torch import Tensor
 
 from pansplat.cli import run
@@ -28,81 +27,56 @@ def content(
 
 
 @pytest.fixture(scope="module")
-def converted(content: dict[str, object], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def conversion(content: dict[str, object], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
+    """The checkpoint, the converted weights, and what the command printed."""
     folder = tmp_path_factory.mktemp("weights")
-    torch.save(content, folder / "original.ckpt")
-    assert run(["convert", str(folder / "original.ckpt"), "-o", str(folder / "model.safetensors")]) == 0
-    return folder / "model.safetensors"
+    original, converted = folder / "original.ckpt", folder / "model.safetensors"
+    torch.save(content, original)
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        assert run(["convert", str(original), "-o", str(converted)]) == 0
+    return original, converted, printed.getvalue()
 
 
-@pytest.fixture
-def room(tmp_path: Path) -> Path:
-    """A folder with a pair of tiny panoramas and the one between them."""
-    random = np.random.default_rng(0)
-    poses = {}
-    for name, x in {"a.png": 0.0, "b.png": 1.0, "c.png": 0.5}.items():
-        Image.fromarray(random.integers(0, 255, (HEIGHT, 2 * HEIGHT, 3), dtype=np.uint8)).save(tmp_path / name)
-        pose = np.eye(4)
-        pose[0, 3] = x
-        poses[name] = pose.tolist()
-    (tmp_path / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
-    pairs = [{"context": ["a.png", "b.png"], "target": "c.png"}]
-    (tmp_path / "pairs.json").write_text(json.dumps({"pairs": pairs}))
-    return tmp_path
+def test_the_report_counts_every_tensor(conversion: tuple[Path, Path, str]) -> None:
+    lines = [line.split("│") for line in conversion[2].splitlines() if line.startswith("│")]
+    counts = {cells[1].strip(): cells[2].strip() for cells in lines}
+    assert counts == {"used": "471", "left out: training state": "5", "unknown": "0", "missing": "0"}
 
 
-def refusal(path: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
-    capsys.readouterr()
-    assert run(["convert", str(path), "-o", str(out)]) == 2
-    assert not out.exists()
-    return capsys.readouterr().err
-
-
-def test_convert_tells_what_became_of_every_tensor(
-    content: dict[str, object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    torch.save(content, tmp_path / "original.ckpt")
-    assert run(["convert", str(tmp_path / "original.ckpt"), "-o", str(tmp_path / "m.safetensors")]) == 0
-    lines = {line.split("│")[1].strip(): line.split("│")[2].strip() for line in _rows(capsys.readouterr().out)}
-    assert lines == {"used": "471", "left out: training state": "5", "unknown": "0", "missing": "0"}
-
-
-def _rows(text: str) -> list[str]:
-    return [line for line in text.splitlines() if line.startswith("│")]
-
-
-def test_converted_weights_say_what_they_are(converted: Path) -> None:
-    weights = load_weights(converted)
+def test_converted_weights_have_their_model_and_compat(conversion: tuple[Path, Path, str]) -> None:
+    weights = load_weights(conversion[1])
     assert (weights.model, weights.compat, len(weights.tensors)) == ("mvsplat", "official", 471)
     assert weights.config["candidates"] == 128
 
 
-def test_converted_weights_work_wherever_a_model_is_named(converted: Path, room: Path) -> None:
-    model = ["--model", str(converted)]
+def test_all_commands_and_the_viewer_take_converted_weights(
+    conversion: tuple[Path, Path, str], tmp_path: Path, write_room
+) -> None:
+    room, converted = write_room(tmp_path / "room", height=HEIGHT), str(conversion[1])
+
+    def run_on_room(command: str, out: Path, *arguments: str) -> None:
+        assert run([command, str(room), "-o", str(out), "--model", converted, *arguments]) == 0
+
     scenes = {}
     for compat in ("trained", "official", "fixed"):
-        out = room / f"{compat}.ply"
-        arguments = ["predict", str(room), "-o", str(out), "--height", "64", "--compat", compat, *model]
-        assert run(arguments) == 0
+        out = tmp_path / f"{compat}.ply"
+        run_on_room("predict", out, "--height", "64", "--compat", compat)
         scenes[compat] = load(out)
     assert scenes["trained"].model == "mvsplat"
     assert len(scenes["trained"].gaussians) == 2 * 2 * HEIGHT**2
     assert torch.equal(scenes["trained"].gaussians.means, scenes["official"].gaussians.means)
     assert not torch.allclose(scenes["fixed"].gaussians.means, scenes["official"].gaussians.means)
-    picture = room / "picture.png"
-    arguments = ["render", str(room), "-o", str(picture), "--predict-height", "64", "--height", "16", *model]
-    assert run(arguments) == 0
-    assert picture.stat().st_size > 0
-    results = room / "results"
-    assert run(["evaluate", str(room), "-o", str(results), "--height", "64", "--compat", "fixed", *model]) == 0
-    assert (results / "results.json").exists()
-    options = LoadOptions(model=str(converted), compat="fixed", height=64)
+    run_on_room("render", tmp_path / "image.png", "--predict-height", "64", "--height", "16")
+    assert (tmp_path / "image.png").stat().st_size > 0
+    run_on_room("evaluate", tmp_path / "results", "--height", "64", "--compat", "fixed")
+    assert (tmp_path / "results" / "results.json").exists()
+    options = LoadOptions(model=converted, compat="fixed", height=64)
     (entry,) = (entry for entry in find_entries(room, options) if entry.pair is not None)
     viewed = load_entry(entry, options, lambda what, done: None, photos=False).scene
     assert torch.equal(viewed.gaussians.means, scenes["fixed"].gaussians.means)
 
 
-def test_a_mismatched_checkpoint_is_shown_before_it_is_refused(
+def test_a_mismatched_checkpoint_is_reported_before_it_is_refused(
     content: dict[str, object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     state = dict(content["state_dict"])  # type: ignore[call-overload]
@@ -116,7 +90,7 @@ def test_a_mismatched_checkpoint_is_shown_before_it_is_refused(
     assert not (tmp_path / "m.safetensors").exists()
 
 
-def test_a_poisoned_checkpoint_is_refused_and_not_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_code_in_a_checkpoint_is_not_executed(tmp_path: Path, refusal) -> None:
     mark = tmp_path / "was run"
 
     class Poison:
@@ -124,20 +98,18 @@ def test_a_poisoned_checkpoint_is_refused_and_not_run(tmp_path: Path, capsys: py
             return os.mkdir, (str(mark),)
 
     torch.save({"state_dict": {}, "callbacks": Poison()}, tmp_path / "poisoned.ckpt")
-    assert "nothing was run" in refusal(tmp_path / "poisoned.ckpt", tmp_path / "m.safetensors", capsys)
-    assert not mark.exists()
+    assert "nothing was run" in refusal("convert", tmp_path / "poisoned.ckpt", "-o", tmp_path / "m.safetensors")
+    assert not mark.exists() and not (tmp_path / "m.safetensors").exists()
 
 
-def test_a_truncated_checkpoint_is_refused(
-    content: dict[str, object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    torch.save(content, tmp_path / "short.ckpt")
-    with open(tmp_path / "short.ckpt", "r+b") as file:
-        file.truncate(1 << 20)
-    assert "got a damaged one; download" in refusal(tmp_path / "short.ckpt", tmp_path / "m.safetensors", capsys)
+def test_a_truncated_checkpoint_is_refused(conversion: tuple[Path, Path, str], tmp_path: Path, refusal) -> None:
+    with conversion[0].open("rb") as original:
+        (tmp_path / "short.ckpt").write_bytes(original.read(1 << 20))
+    message = refusal("convert", tmp_path / "short.ckpt", "-o", tmp_path / "m.safetensors")
+    assert "got a damaged one; download" in message
+    assert not (tmp_path / "m.safetensors").exists()
 
 
-def test_convert_refuses_other_outputs(converted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    original = converted.with_name("original.ckpt")
-    assert "--out must be a .safetensors" in refusal(original, tmp_path / "m.ckpt", capsys)
-    assert "existing folder" in refusal(original, tmp_path / "no" / "m.safetensors", capsys)
+def test_other_outputs_are_refused(conversion: tuple[Path, Path, str], tmp_path: Path, refusal) -> None:
+    assert "--out must be a .safetensors" in refusal("convert", conversion[0], "-o", tmp_path / "m.ckpt")
+    assert "existing folder" in refusal("convert", conversion[0], "-o", tmp_path / "no" / "m.safetensors")

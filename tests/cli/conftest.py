@@ -1,0 +1,109 @@
+"""A predictor, panoramas and a scene for the commands' tests."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from pansplat import pipeline
+from pansplat.cli import run
+from pansplat.gaussians.scene import Gaussians
+from pansplat.geometry.equirect import pixel_directions
+
+HEIGHT = 16
+
+
+class Sphere:
+    """A predictor of one Gaussian per pixel on a sphere of 2 m around each camera."""
+
+    name, fingerprint = "sphere", "1"
+
+    def __call__(self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None, progress=None):
+        if progress is not None:
+            progress("predicting", 0.5)
+        view, _, height, width = images.shape
+        directions = pixel_directions(height, width, dtype=torch.float64).reshape(-1, 3)
+        count = view * len(directions)
+        return Gaussians(
+            means=torch.cat([2 * directions @ p[:3, :3].T + p[:3, 3] for p in cam2world.double()]).float(),
+            scales=torch.full((count, 3), 0.3),
+            quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+            opacities=torch.full((count,), 0.9),
+            harmonics=((images.flatten(2).transpose(1, 2).reshape(-1, 1, 3) - 0.5) / 0.28209479).contiguous(),
+            levels=torch.arange(count) % 2,
+            views=torch.arange(view).repeat_interleave(len(directions)),
+        )
+
+
+@pytest.fixture(autouse=True)
+def sphere_model(monkeypatch: pytest.MonkeyPatch) -> type:
+    """The predictor, which commands find as `--model sphere`."""
+    monkeypatch.setitem(pipeline._MODELS, "sphere", Sphere)
+    return Sphere
+
+
+WriteRoom = Callable[..., Path]
+
+
+@pytest.fixture(scope="session")
+def write_room() -> WriteRoom:
+    """A function that writes a folder with a pair of tiny panoramas and a target between them."""
+
+    def write(folder: Path, *, height: int = HEIGHT, target: bool = True) -> Path:
+        folder.mkdir(parents=True)
+        random = np.random.default_rng(0)
+        poses = {}
+        for name, x in {"a.png": 0.0, "b.png": 1.0, "c.png": 0.5}.items():
+            Image.fromarray(random.integers(0, 255, (height, 2 * height, 3), dtype=np.uint8)).save(folder / name)
+            pose = np.eye(4)
+            pose[0, 3] = x
+            poses[name] = pose.tolist()
+        (folder / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
+        case = {"context": ["a.png", "b.png"]} | ({"target": "c.png"} if target else {})
+        (folder / "pairs.json").write_text(json.dumps({"pairs": [case]}))
+        return folder
+
+    return write
+
+
+@pytest.fixture
+def room(tmp_path: Path, write_room: WriteRoom) -> Path:
+    return write_room(tmp_path / "room")
+
+
+@pytest.fixture
+def predict(room: Path, tmp_path: Path) -> Callable[..., int]:
+    """A function that runs `pansplat predict` on the room and returns its status."""
+
+    def run_predict(*arguments: str) -> int:
+        start = ["predict", str(room), "-o", str(tmp_path / "scene.ply"), "--model", "sphere"]
+        return run([*start, "--height", str(HEIGHT), *arguments])
+
+    return run_predict
+
+
+@pytest.fixture
+def scene(predict: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    assert predict() == 0
+    capsys.readouterr()
+    return tmp_path / "scene.ply"
+
+
+@pytest.fixture
+def refusal(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """A function that runs a command, which must fail with status 2, and returns its one message."""
+
+    def run_refused(*arguments: object) -> str:
+        capsys.readouterr()
+        assert run([str(argument) for argument in arguments]) == 2
+        out, err = capsys.readouterr()
+        assert out == "" and err.startswith("error: ") and err.count("\n") == 1
+        assert "Traceback" not in err
+        return err
+
+    return run_refused

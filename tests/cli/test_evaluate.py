@@ -1,0 +1,99 @@
+"""`pansplat evaluate`, on folders of pairs and with --protocol: what it writes, prints and refuses."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pansplat import pipeline
+from pansplat.cli import run
+
+HEIGHT = 32
+
+
+@pytest.fixture(autouse=True)
+def no_lpips_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("PANSPLAT_LPIPS", raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+
+
+def test_evaluate_writes_results_and_prints_the_table(room: Path, tmp_path: Path, write_room, capsys) -> None:
+    write_room(tmp_path / "alone", target=False)
+    start = ["evaluate", str(room), str(tmp_path / "alone"), "--out", str(tmp_path / "out"), "--model", "sphere"]
+    assert run([*start, "--height", "16"]) == 0
+    out, err = capsys.readouterr()
+    assert "WS-PSNR" in out and "cross-fade" in out and "room" in out
+    assert "alone: none of its 1 pairs has a target view; skipped" in err
+    (result,) = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert f"{result['ws_psnr']:.2f}" in out
+    assert Path(result["prediction"]).is_file() and Path(result["target"]).is_file()
+
+
+def test_folders_without_targets_are_refused(tmp_path: Path, write_room, refusal, capsys) -> None:
+    alone = write_room(tmp_path / "alone", target=False)
+    assert run(["evaluate", str(alone), "--out", str(tmp_path / "out"), "--model", "sphere"]) == 2
+    assert "none of the pairs has a target view" in capsys.readouterr().err
+    assert "at least one folder" in refusal("evaluate", "--out", tmp_path / "out")
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """One Replica triplet in PanoGRF's layout."""
+    scene = tmp_path / "data" / "png_render_test_1024x512_seq_len_3_replica_dist_0.5" / "00000000"
+    for view in range(3):
+        folder = scene / f"{view:02d}"
+        folder.mkdir(parents=True)
+        Image.fromarray(np.full((HEIGHT, 2 * HEIGHT, 3), 60 * view + 60, np.uint8)).save(folder / "rgb.png")
+        np.savetxt(folder / "rot.txt", np.eye(3))
+        np.savetxt(folder / "tran.txt", [0.5 * view, 0, 0])
+    return tmp_path / "data"
+
+
+def arguments(data: Path, out: Path, *more: str) -> list[str]:
+    start = ["evaluate", "--protocol", "replica", "--data", str(data), "--out", str(out), "--model", "sphere"]
+    return [*start, "--height", str(HEIGHT), *more]
+
+
+def test_a_protocol_prints_the_papers_rows_and_ours(data: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out"
+    assert run(arguments(data, out)) == 0
+    printed = capsys.readouterr().out
+    assert "PanoGRF" in printed and "29.22" in printed and "ours, sphere + deferred blending" in printed
+    assert "Replica 1.0 m: 1 image" in printed and "No LPIPS" in printed
+    (row,) = json.loads((out / "results.json").read_text())["results"]
+    assert f"{row['ws_psnr']:.2f}" in printed and row["lpips"] is None
+    assert "29.22" in (out / "table.md").read_text()
+    assert (out / "replica_1.0_m" / "00000000" / "01_target.png").is_file()
+
+
+def test_each_model_has_a_row(data: Path, tmp_path: Path, sphere_model: type, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(pipeline._MODELS, "other", sphere_model)
+    assert run(arguments(data, tmp_path / "out", "--models", "other", "--blend", "joint")) == 0
+    rows = json.loads((tmp_path / "out" / "results.json").read_text())["results"]
+    assert [row["method"] for row in rows] == ["ours, sphere", "ours, other"]
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--near", "1"], "--near is set by the protocol"),
+        (["--blend", "view0"], "--blend must be joint or deferred with --protocol"),
+        (["--limit", "0"], "--limit must be at least 1"),
+        (["--models", "sphere"], "must have distinct names"),
+        (["--lpips", "vgg"], "LPIPS with vgg needed vgg16-397923af.pth"),
+        (["--protocol", "360loc"], "360Loc: needed"),
+    ],
+)
+def test_arguments_that_a_protocol_does_not_have_are_refused(
+    data: Path, tmp_path: Path, refusal, more: list[str], message: str
+) -> None:
+    assert message in refusal(*arguments(data, tmp_path / "out", *more))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_protocol_needs_data_and_no_folders(tmp_path: Path, refusal) -> None:
+    start = ["--out", tmp_path / "out", "--protocol", "m3d"]
+    assert "--protocol needs --data" in refusal("evaluate", *start)
+    assert "as well; leave it out" in refusal("evaluate", tmp_path, *start, "--data", tmp_path)

@@ -1,0 +1,108 @@
+"""What all commands share: help, errors, warnings, interruptions, exit statuses."""
+
+import json
+import os
+import subprocess
+import sys
+import warnings
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+
+import pansplat.cli
+from pansplat.cli import run
+from pansplat.errors import InputError
+
+
+def test_help_does_not_import_torch() -> None:
+    program = (
+        "import sys\nfrom pansplat.cli import run\n"
+        "commands = ['predict', 'render', 'evaluate', 'check', 'info', 'convert', 'bench']\n"
+        "benches = [['bench', name] for name in ('raster', 'model', 'memory', 'machine')]\n"
+        "for arguments in ([], *([name] for name in commands), *benches):\n"
+        "    try: run([*arguments, '--help'])\n    except SystemExit as stop: assert stop.code == 0, stop.code\n"
+        "heavy = {'torch', 'numpy', 'scipy', 'cv2', 'numba', 'matplotlib'} & set(sys.modules)\n"
+        "sys.exit(f'imported {heavy}' if heavy else 0)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    for command in ("predict", "render", "evaluate", "check", "info", "convert", "bench memory", "bench machine"):
+        assert f"usage: pansplat {command} " in done.stdout
+
+
+@pytest.mark.parametrize("arguments", [["predict"], ["predikt", "x"], ["render", "x", "-o", "y.png", "--heigth", "3"]])
+def test_missing_or_misspelt_arguments_exit_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        run(arguments)
+    assert stop.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_warning_of_ours_is_one_note(room: Path, predict, tmp_path: Path, capsys) -> None:
+    content = json.loads((room / "poses.json").read_text())
+    content["poses"]["b.png"] = content["poses"]["a.png"]  # coincident cameras
+    (room / "poses.json").write_text(json.dumps(content))
+    assert predict() == 0
+    err = capsys.readouterr().err
+    assert err.startswith("note: ") and "coincide" in err and err.count("\n") == 1
+    assert (tmp_path / "scene.ply").exists()
+
+
+@pytest.fixture
+def fail(monkeypatch: pytest.MonkeyPatch, sphere_model: type):
+    """A function that makes the predictor raise an error."""
+
+    def set_error(error: BaseException) -> None:
+        def predict(*_: object, **__: object) -> None:
+            raise error
+
+        monkeypatch.setattr(sphere_model, "__call__", predict)
+
+    return set_error
+
+
+def test_interrupting_exits_with_130_and_leaves_no_file(room: Path, predict, fail, tmp_path: Path, capsys) -> None:
+    fail(KeyboardInterrupt())
+    before = sorted(os.listdir(tmp_path))
+    assert predict() == 130
+    assert capsys.readouterr().err.startswith("interrupted")
+    assert sorted(os.listdir(tmp_path)) == before
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory: ...")])
+def test_too_little_memory_is_one_line(predict, fail, tmp_path: Path, capsys, error: Exception) -> None:
+    fail(error)
+    assert predict() == 2
+    message = capsys.readouterr().err
+    assert "error: this takes more memory" in message and len(message.splitlines()) == 1
+    assert not list(tmp_path.glob("*.ply"))
+
+
+def test_defects_keep_their_traceback(predict, fail) -> None:
+    fail(RuntimeError("a defect"))
+    with pytest.raises(RuntimeError, match="a defect"):
+        predict()
+
+
+def test_warning_filters_are_restored_after_a_command(scene: Path) -> None:
+    shown, filters = warnings.showwarning, list(warnings.filters)
+    run(["info", str(scene)])
+    assert warnings.showwarning is shown and list(warnings.filters) == filters
+
+
+@pytest.mark.parametrize("entry", ["pansplat", "pansplat-train"])
+def test_entry_points_are_installed(entry: str) -> None:
+    (found,) = entry_points(group="console_scripts", name=entry)
+    assert callable(found.load())
+
+
+def test_main_exits_with_the_status_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pansplat.cli, "run", lambda argv: 3)
+    with pytest.raises(SystemExit) as stop:
+        pansplat.cli.main([])
+    assert stop.value.code == 3
+
+
+def test_input_errors_are_value_errors() -> None:
+    assert issubclass(InputError, ValueError)

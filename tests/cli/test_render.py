@@ -1,0 +1,97 @@
+"""`pansplat render`: images and videos of scenes and pairs, camera poses, what it refuses."""
+
+import json
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pansplat import pipeline
+from pansplat.cli import run
+from pansplat.data.images import read_depth
+
+HEIGHT = 16
+
+
+def render(path: Path, out: Path, *arguments: object) -> np.ndarray:
+    """Render and read an image."""
+    assert run(["render", str(path), "-o", str(out), *map(str, arguments)]) == 0
+    with Image.open(out) as image:
+        return np.array(image).astype(int)
+
+
+def test_a_scene_and_its_pair_give_the_same_image(scene: Path, room: Path, tmp_path: Path) -> None:
+    first = render(scene, tmp_path / "a.png", "--at", 0.5)
+    second = render(room, tmp_path / "b.png", "--model", "sphere", "--predict-height", HEIGHT)
+    assert first.shape == (HEIGHT, 2 * HEIGHT, 3) and first.std() > 5
+    assert np.abs(first - second).max() <= 1  # the .ply stores float32 logits and logarithms
+
+
+@pytest.mark.parametrize(
+    ("layout", "shape"), [("equirect", (20, 40, 3)), ("cubemap", (20, 40, 3)), ("perspective", (20, 36, 3))]
+)
+def test_the_height_sets_the_size_of_each_layout(
+    scene: Path, tmp_path: Path, layout: str, shape: tuple[int, ...]
+) -> None:
+    assert render(scene, tmp_path / "x.png", "--layout", layout, "--height", 20).shape == shape
+
+
+def test_blend_modes_differ(scene: Path, tmp_path: Path) -> None:
+    modes = ("deferred", "joint", "view0", "view1")
+    assert len({render(scene, tmp_path / "x.png", "--blend", mode).tobytes() for mode in modes}) == 4
+
+
+def test_an_exr_holds_depth(scene: Path, tmp_path: Path) -> None:
+    assert run(["render", str(scene), "--at", "0", "-o", str(tmp_path / "x.exr"), "--blend", "view0"]) == 0
+    depth = read_depth(tmp_path / "x.exr", HEIGHT)
+    assert float(depth.median()) == pytest.approx(2.0, abs=0.01)
+
+
+def test_pose_files_of_all_formats_give_the_same_image(scene: Path, tmp_path: Path) -> None:
+    pose = pipeline.load(scene).pose_between(0.25)
+    text = " ".join(str(x) for x in pose.flatten().tolist())
+    opengl = (pose @ torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))).tolist()
+    expected = render(scene, tmp_path / "expected.png", "--at", 0.25)
+    for name, content in {
+        "matrix.json": json.dumps(pose.tolist()),
+        "object.json": json.dumps({"convention": "cam2world opengl", "cam2world": opengl}),
+        "sixteen.txt": text,
+        "kitti.txt": " ".join(text.split()[:12]),
+    }.items():
+        (tmp_path / name).write_text(content)
+        image = render(scene, tmp_path / "image.png", "--pose", tmp_path / name)
+        assert np.abs(image - expected).max() <= 1, name
+
+
+def test_a_video_moves_between_the_cameras(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.mp4"
+    assert run(["render", str(scene), "-o", str(out), "--height", "18", "--seconds", "0.5", "--fps", "8"]) == 0
+    with av.open(str(out)) as video:
+        frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    assert len(frames) == 4 and frames[0].shape == (18, 32, 3)
+    assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 1
+
+
+def test_invalid_arguments_are_refused(scene: Path, room: Path, tmp_path: Path, refusal, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("path.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
+    for path, out, arguments, message in (
+        (scene, "x.tiff", [], "--out must end in"),
+        (scene, "no/x.png", [], "folder does not exist"),
+        (scene, "x.png", ["--at", 0.5, "--pose", "path.txt"], "give one of them"),
+        (scene, "x.png", ["--pose", "path.txt"], "holds 2 poses"),
+        (scene, "x.mp4", ["--at", 0.5], "--at is one position"),
+        (scene, "x.png", ["--at", "nan"], "--at must be a number"),
+        (scene, "x.png", ["--blend", "mixed"], "--blend must be"),
+        (scene, "x.png", ["--blend", "view7"], "from 0 to 1, got 7"),
+        (scene, "x.png", ["--fov", 180], "--fov must be"),
+        (scene, "x.png", ["--height", 0], "--height"),
+        (scene, "x.mp4", ["--fps", 0], "must be positive"),
+        ("nowhere.ply", "x.png", [], "nowhere.ply"),
+        (room, "x.png", ["--model", "sphere", "--precision", "bfloat16"], "`precision` is for networks"),
+    ):
+        assert message in refusal("render", path, "-o", out, *arguments)
+    assert not list(tmp_path.glob("x.*"))
