@@ -161,9 +161,9 @@ def _project_gaussians(
     num_dropped, num_near, camera = 0, 0, pose_columns(pose)
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, means.shape[0]), GAUSSIAN_BLOCK):
         count = min(GAUSSIAN_BLOCK, means.shape[0] - start)
-        suspect = load_block(means, quats, scales, covariances, opacities, start, count, rows)
+        may_be_invalid = load_block(means, quats, scales, covariances, opacities, start, count, rows)
         _validate_harmonics(harmonic_bits, harmonics.shape[1] * harmonics.shape[2], start, count, rows)
-        if suspect:
+        if may_be_invalid:
             _invalidate_large_numbers(rows, MEAN_ROW, OPACITY_ROW + 1, count)
         for i in range(0, count, LANES):
             state, is_drawn = _compute_records(covariances, camera, filter_variance, compensate, near, rows, i, soa)

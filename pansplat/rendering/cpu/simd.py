@@ -87,7 +87,7 @@ def _compare(relation: str, builder: ir.IRBuilder, a: Any, b: Any) -> Any:
 
 
 def _select_if(relation: str, builder: ir.IRBuilder, a: Any, b: Any) -> Any:
-    """`a` where the relation holds, else `b`: also where one of them is NaN."""
+    """`a` where the relation holds, else `b`; `b` if one of them is NaN."""
     return builder.select(builder.fcmp_ordered(relation, a, b), a, b)
 
 
@@ -129,7 +129,7 @@ def _with_signature(function: Callable[..., Any], emit: Callable[..., Any], *par
 
 
 def _result(context: Any, builder: Any, kind: Any, emitted: Any) -> Any:
-    """What an intrinsic must return for the value that it emitted."""
+    """An emitted value in the form that numba expects of an intrinsic."""
     if kind == types.void:
         return context.get_dummy_value()
     return context.make_tuple(builder, kind, emitted) if isinstance(kind, types.UniTuple) else emitted
@@ -398,7 +398,7 @@ def lane_sums(builder, *rows):
     """The sums over the lanes of eight vectors, in order."""
     half = LANES // 2
     while half:
-        # Pair row i with row i + half; add the two halves of every group of 2 half lanes.
+        # Pair row i with row i + half; add the two halves of every group of `2 * half` lanes.
         pairs = zip(rows[:half], rows[half:], strict=True)
         rows = [builder.fadd(*_halves(builder, low, high, half)) for low, high in pairs]
         half //= 2
@@ -655,7 +655,7 @@ def _any(builder: Any, bits: Any) -> Any:
 
 
 def _halves(builder: Any, low: Any, high: Any, half: int) -> tuple[Any, Any]:
-    """First halves of each group of 2 half lanes of `low` and of `high`, then the second halves."""
+    """The first halves of each group of `2 * half` lanes of `low` and of `high`, and the second halves."""
     first = [lane if not lane & half else LANES + lane - half for lane in range(LANES)]
     return _shuffle(builder, low, high, first), _shuffle(builder, low, high, [lane + half for lane in first])
 
