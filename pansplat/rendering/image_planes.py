@@ -1,7 +1,7 @@
 """The image planes of a camera (pinhole image, direct panorama, cube faces), and stitching of cube faces.
 
-Source: PanSplat, section 3.4; docs/rendering.md, section 6; docs/official.md, section 10.2 and P9 for the published
-code's stitching.
+Source: PanSplat, section 3.4; docs/rendering.md, section 6; docs/official.md, section 10.2 and P9 for the official
+stitching.
 """
 
 import functools
@@ -115,7 +115,7 @@ def stitch_faces(
     Args:
         faces: in the order of `FACES`.
         size: height and width of the panorama, pixels.
-        stitching: "seamless" pads each face with its true neighbours; "official" reproduces the published code's wrong
+        stitching: "seamless" pads each face with its true neighbours; "official" reproduces the official code's wrong
             padding left and right of up and down, and its outline of these faces.
 
     Raises:
@@ -185,7 +185,7 @@ def _border(num: int) -> Int[Tensor, "padded 3"]:
 
 
 def _official_border(border: Int[Tensor, "padded 3"], num: int) -> Int[Tensor, "padded 3"]:
-    """The published code's padding: left and right of up and down it is not the neighbour's pixels.
+    """The official code's padding: left and right of up and down it is not the neighbour's pixels.
 
     These columns are shifted down by one row, with zero in the first; down's repeat its own outermost columns. Beyond
     the corners of a side face it takes the corner of up or down. (No pixel of the fixtures shows a corner.)

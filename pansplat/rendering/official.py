@@ -1,4 +1,4 @@
-"""Images as the published code draws them, its defects included, for the figures that were published of its weights.
+"""Images as the official code draws them, its defects included, for the figures that were published of its weights.
 
 Source: docs/official.md, section 10.
 """
@@ -16,16 +16,16 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.rasterize import Backend, RasterOptions, Rendering, rasterize
 
 OFFICIAL = RasterOptions(kernel="ewa", order="z", lowpass="3dgs", stitching="official")
-"""The published code's choices; a pinhole image or a single face needs stitching="seamless"."""
+"""The official code's choices; a pinhole image or a single face needs stitching="seamless"."""
 
 
 def official_face_size(height: int) -> int:
-    """Side of the published code's cube faces for a panorama of that height, pixels."""
+    """Side of the official code's cube faces for a panorama of that height, pixels."""
     return height // 2
 
 
 def official_gaussians(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians with the colours that the published rasteriser gives them: harmonics of degree 3 at most."""
+    """The Gaussians with the colours that the official rasteriser gives them: harmonics of degree 3 at most."""
     return replace(gaussians, harmonics=official_harmonics(gaussians.harmonics))
 
 
@@ -42,7 +42,7 @@ def rasterize_official(
     Args:
         cam2world: pose of the camera, OpenCV axes, metres.
         size: height, a multiple of 4, and width of the panorama, pixels.
-        near: of the prediction, metres; Gaussians nearer than a fifth of it are not drawn. The published code measures
+        near: of the prediction, metres; Gaussians nearer than a fifth of it are not drawn. The official code measures
             that along a face's axis.
         backend: see `rasterize`.
     """

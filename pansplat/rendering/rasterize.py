@@ -40,7 +40,7 @@ _Arguments, _Result = ParamSpec("_Arguments"), TypeVar("_Result")
 class RasterOptions:
     """Everything that changes an image except the scene, the camera and the layout.
 
-    `pansplat.rendering.official.OFFICIAL` holds the options of the published code.
+    `pansplat.rendering.official.OFFICIAL` holds the options of the official code.
 
     Attributes:
         kernel: "ray" is exact; "ewa" is the approximation of 3DGS, for pinhole images and cube faces.
@@ -48,7 +48,7 @@ class RasterOptions:
         lowpass: "angular" conserves energy; "3dgs" adds 0.3 pixel^2.
         near: Gaussians whose mean is nearer are not drawn, metres.
         strict: raise an error for Gaussians that are not finite, instead of leaving them out.
-        stitching: of cube faces, "seamless", or "official" with the borders of the published code.
+        stitching: of cube faces, "seamless", or "official" with the borders of the official code.
 
     Raises:
         InputError: a field is out of range.

@@ -1,4 +1,4 @@
-"""Image planes, and stitching of cube faces against geometry and the published code's fixtures."""
+"""Image planes, and stitching of cube faces against geometry and the official code's fixtures."""
 
 import pytest
 import torch
@@ -67,7 +67,7 @@ def test_official_stitching_equals_the_fixture(golden):
     fixtures = golden("units")
     expected = fixtures["cubemap.pano_out"][0].double()
     got = stitch_faces(fixtures["cubemap.faces_in"][0].double(), (64, 128), stitching="official")
-    # The published code samples float32 positions in a strip of six padded faces, 204 pixels long, where neighbouring
+    # The official code samples float32 positions in a strip of six padded faces, 204 pixels long, where neighbouring
     # numbers are 1.5e-5 apart; the fixture's faces are noise, up to 1 from pixel to pixel.
     assert float((got - expected).abs().max()) < 3e-5
     # The same rounding leaves a sixth of the pixels different, in the last bit of their position.

@@ -1,4 +1,4 @@
-"""`OFFICIAL` against the published rasteriser written out densely, with and without its two cuts."""
+"""`OFFICIAL` against the official rasteriser written out densely, with and without its two cuts."""
 
 import math
 
@@ -83,7 +83,7 @@ def outside(make_scene):
 
 
 @pytest.mark.parametrize("scale", [0.02, 0.3])
-def test_official_options_equal_the_published_rasteriser_without_its_two_cuts(scale, outside, pose):
+def test_official_options_equal_the_official_rasteriser_without_its_two_cuts(scale, outside, pose):
     scene = outside(150, scale)
     expected = _official(scene, pose, 32, 0.45, radius_cut=False, stop=False)
     got = rasterize(scene, pose, size=(32, 64), face_size=16, near=0.45, layout="cubemap", options=OFFICIAL)
@@ -96,14 +96,14 @@ def test_official_options_equal_the_published_rasteriser_without_its_two_cuts(sc
     [({"radius_cut": True, "stop": False}, 80), ({"radius_cut": False, "stop": True}, 95)],
     ids=["radius", "transmittance"],
 )
-def test_the_published_rasterisers_two_cuts_change_little(cuts, decibels, outside, pose):
+def test_the_official_rasterisers_two_cuts_change_little(cuts, decibels, outside, pose):
     scene = outside(150, 0.3)
     got = rasterize(scene, pose, size=(64, 128), face_size=32, near=0.45, layout="cubemap", options=OFFICIAL).color
     theirs = _official(scene, pose, 64, 0.45, **cuts)
     assert decibels < _psnr(theirs, got) < 200  # below 200: the cut has an effect
 
 
-def test_only_the_published_rasteriser_draws_gaussians_nearer_than_near(make_scene):
+def test_only_the_official_rasteriser_draws_gaussians_nearer_than_near(make_scene):
     eye = torch.eye(4, dtype=torch.float64)
     near_one = make_scene(1, scale=0.02)
     for place, ours, theirs in (

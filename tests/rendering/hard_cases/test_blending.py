@@ -43,7 +43,7 @@ def test_at_an_input_position_only_its_view_counts_and_the_weights_have_no_gradi
 @pytest.mark.hard_case(46)
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_inputs_in_one_place_have_equal_weights(count, balls):
-    """The published code divides 0 by 0 here."""
+    """The official code divides 0 by 0 here."""
     place = torch.tensor((0.3, -0.2, 0.1), dtype=torch.float64)
     positions = place.expand(count, 3).clone().requires_grad_()
     position = place.clone().requires_grad_()
@@ -58,7 +58,7 @@ def test_inputs_in_one_place_have_equal_weights(count, balls):
 @pytest.mark.parametrize("count", [1, 2, 3])
 @pytest.mark.parametrize("distance", [1e2, 1e9, 1e150])
 def test_far_outside_weights_are_positive_sum_to_one_and_converge_to_equal(count, distance):
-    """The published code's 1 - d / sum d has the sum number of views - 1."""
+    """The official code's 1 - d / sum d has the sum number of views - 1."""
     position = torch.tensor((distance, 0.3 * distance, 0), dtype=torch.float64, requires_grad=True)
     weights = blend_weights(position, _positions(count))
     assert (weights > 0).all() and float(weights.detach().sum()) == pytest.approx(1, abs=1e-12)

@@ -56,7 +56,7 @@ def test_distance_as_a_channel_is_the_depth(draw, make_scene, pose):
 
 @pytest.mark.hard_case(34)
 def test_every_harmonic_up_to_degree_4_has_its_value(draw, balls):
-    """The published code ignores coefficients 16 to 24, and evaluates coefficient 14 on the wrong axis."""
+    """The official code ignores coefficients 16 to 24, and evaluates coefficient 14 on the wrong axis."""
     ahead = torch.tensor((0.48, -0.36, 0.8), dtype=torch.float64)
     expected = harmonics_basis(ahead, 4)
     scene = balls(2 * ahead, 1.0, 1.0)

@@ -31,7 +31,7 @@ def _nearest(directions: torch.Tensor, band: slice) -> torch.Tensor:
 
 
 @pytest.mark.hard_case(50)
-def test_neighbours_keep_their_distance_at_4k_where_the_published_lattice_does_not():
+def test_neighbours_keep_their_distance_at_4k_where_the_official_lattice_does_not():
     count = lattice_size(4096)
     assert count > 5_000_000
     ours, theirs = fibonacci_directions(count), directions_from_uv(official_fibonacci_uv(count))
