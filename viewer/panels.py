@@ -297,7 +297,7 @@ class Panels:
         commands.panorama = self._button("360 PNG")
 
     def _draw_error(self, error: str, commands: Commands) -> None:
-        _place_at_centre(width=560)
+        _place_at_center(width=560)
         imgui.begin("Error", None, _FIXED | imgui.WindowFlags_.no_collapse.value)
         imgui.push_text_wrap_pos(0.0)
         imgui.text_unformatted(error)
@@ -311,7 +311,7 @@ def _draw_row_label(label: str) -> None:
     imgui.text_unformatted(label)
 
 
-def _place_at_centre(width: float | None = None) -> None:
+def _place_at_center(width: float | None = None) -> None:
     """Place the next window at the centre, with a width at a DPI scale of 1 or its automatic size."""
     size = imgui.get_io().display_size
     imgui.set_next_window_pos((size.x / 2, size.y / 2), 0, (0.5, 0.5))
@@ -354,7 +354,7 @@ def _draw_label(name: str, lines: list[str], alpha: float) -> None:
 
 def _draw_help() -> bool:
     """Draw the key help; returns whether it stays open."""
-    _place_at_centre()
+    _place_at_center()
     flags = _FIXED | imgui.WindowFlags_.always_auto_resize.value | imgui.WindowFlags_.no_collapse.value
     _, opened = imgui.begin("Keys", True, flags)
     if imgui.begin_table("keys", 2, imgui.TableFlags_.sizing_fixed_fit.value):
@@ -369,7 +369,7 @@ def _draw_help() -> bool:
 
 
 def _draw_progress(name: str, task: str, fraction: float) -> None:
-    _place_at_centre(width=420)
+    _place_at_center(width=420)
     imgui.begin("##progress", None, _FIXED | imgui.WindowFlags_.no_title_bar.value | imgui.WindowFlags_.no_inputs.value)
     imgui.text_unformatted(f"{name}: {task}")
     imgui.progress_bar(fraction, (-1, 0), f"{100 * fraction:.0f}%")

@@ -102,11 +102,11 @@ class Splats:
         """Return RGB and a padding column of all splats, seen from a camera position in the moved frame."""
         colors = np.zeros((len(self), 4), np.float32)
         means = torch.from_numpy(self.means)
-        centre = torch.tensor(position, dtype=torch.float32)
+        center = torch.tensor(position, dtype=torch.float32)
         degree = math.isqrt(len(self.harmonics)) - 1
         for start in range(0, len(self), _CHUNK_SIZE):
             chunk = slice(start, start + _CHUNK_SIZE)
-            directions = torch.nn.functional.normalize(means[chunk] - centre, dim=-1)
+            directions = torch.nn.functional.normalize(means[chunk] - center, dim=-1)
             values = np.ascontiguousarray(harmonics_basis(directions, degree).numpy().T)
             sums = np.full((3, values.shape[1]), 0.5, np.float32)
             for value, coefficients in zip(values, self.harmonics, strict=True):

@@ -243,7 +243,7 @@ class Viewer:
         self.ctx.clear(*self.state.settings.background)
         if self._loaded is not None:
             if key_commands.focus:
-                self._focus_centre()
+                self._focus_center()
             self._draw_image(size, target, now)
         self.gui.end(self.ctx, target)
         for commands in (panel_commands, key_commands):
@@ -324,11 +324,11 @@ class Viewer:
         assert self._image is not None
         return self._image
 
-    def _focus_centre(self) -> None:
+    def _focus_center(self) -> None:
         """Orbit the point in the centre of the last image."""
         if self._image is None:
             return
-        distance = centre_depth(self.renderer.read_depth())
+        distance = center_depth(self.renderer.read_depth())
         self._image = None  # `read_depth` may have replaced the texture
         if distance is not None:
             camera = self.state.camera
@@ -375,7 +375,7 @@ class Viewer:
         self.state.show_message(f"wrote {path}", now)
 
 
-def centre_depth(depth: Float[np.ndarray, "height width"]) -> float | None:
+def center_depth(depth: Float[np.ndarray, "height width"]) -> float | None:
     """Return the median depth around the image centre, metres; None if nothing is drawn there."""
     row, column = depth.shape[0] // 2, depth.shape[1] // 2
     for reach in (4, 16, 64):

@@ -157,8 +157,8 @@ def test_deferred_blending_equals_the_reference(
     renderer, random_scene, pose, reference, assert_matches, layout, position
 ):
     scene = random_scene(120)  # sparse, so that one or both views have holes
-    centres = scene.cam2world[:, :3, 3].numpy()
-    pose[:3, 3] = {"between": centres.mean(0), "at view 1": centres[1], "elsewhere": (0.1, 0.2, 0.3)}[position]
+    centers = scene.cam2world[:, :3, 3].numpy()
+    pose[:3, 3] = {"between": centers.mean(0), "at view 1": centers[1], "elsewhere": (0.1, 0.2, 0.3)}[position]
     settings = replace(SETTINGS, mode="deferred", layout=layout)
     drawn = renderer(scene)
     drawn.render(pose, SIZE, settings)
