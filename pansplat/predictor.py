@@ -1,4 +1,4 @@
-"""What every predictor offers, so that the sweep and the networks are interchangeable."""
+"""The interface of all predictors: the sweep and the networks."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from torch import Tensor
 
 from pansplat.gaussians.scene import Gaussians
 
-Progress = Callable[[str, float], None]  # what is being done, fraction of the whole in [0, 1]
+Progress = Callable[[str, float], None]  # current step, fraction done in [0, 1]
 
 
 @runtime_checkable
 class Predictor(Protocol):
-    """Posed panoramas in, Gaussians out.
+    """A callable from posed panoramas to Gaussians.
 
     Attributes:
-        name: as users type it.
+        name: on the command line.
     """
 
     name: str
 
     @property
     def fingerprint(self) -> str:
-        """Changes whenever the output for the same input could; keys the prediction cache."""
+        """Hash of everything that determines the output for an input; keys the prediction cache."""
         ...
 
     def __call__(

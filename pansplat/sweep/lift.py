@@ -220,7 +220,7 @@ def _opacity(
     for other, surface in enumerate(surfaces):
         if other == view:
             continue
-        visibility, _ = classify_visibility(points, surface, posed.cam2world[other], config.discontinuity)
+        visibility = classify_visibility(points, surface, posed.cam2world[other], config.discontinuity)
         local = (points - posed.cam2world[other, :3, 3]) @ posed.cam2world[other, :3, :3]
         row, column = nearest_pixel(local, surface.height)
         certain = consistent[other][row, column] & posed.masks[other][row, column]
@@ -241,8 +241,8 @@ def _log_gradients(inverse: np.ndarray, discontinuity: float) -> np.ndarray:
     south = np.where(np.abs(south) > discontinuity, 0, south)
     latitude = ((np.arange(height) + 0.5) / height - 0.5) * math.pi
     pixel = math.pi / height
-    narrow = np.maximum(np.cos(latitude), 1 / width)[:, None]
-    return np.stack((east / (pixel * narrow), south / pixel), axis=-1)
+    shrink = np.maximum(np.cos(latitude), 1 / width)[:, None]  # width of a pixel relative to the equator
+    return np.stack((east / (pixel * shrink), south / pixel), axis=-1)
 
 
 def _shape_discs(
@@ -252,7 +252,7 @@ def _shape_discs(
     longitude = np.arctan2(rays[:, 0], rays[:, 2])  # 0 at the poles
     east = np.stack((np.cos(longitude), np.zeros(len(rays)), -np.sin(longitude)), axis=-1)
     south = np.cross(rays, east)
-    # X = ray / rho, so dX / angle = (direction - ray * dlog(rho) / angle) / rho.
+    # X = ray / rho, so dX = (direction - ray * dlog(rho)) / rho per radian.
     steepest = np.linalg.norm(gradient, axis=-1)
     # A disc that is nearly parallel to its ray must end well before the camera.
     limit = min(config.max_stretch[level], _MAX_LENGTH / (config.footprint * spacing))

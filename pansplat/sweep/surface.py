@@ -71,14 +71,8 @@ class Surface:
         return self.inverse_depth.shape[0]
 
 
-def classify_visibility(
-    points: np.ndarray, surface: Surface, cam2world: np.ndarray, tolerance: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Whether world points (..., 3) are CONSISTENT with a view's surface, OCCLUDED by it, or in FREE_SPACE.
-
-    Returns:
-        The class (uint8), and the ratio of the point's inverse depth to the surface's.
-    """
+def classify_visibility(points: np.ndarray, surface: Surface, cam2world: np.ndarray, tolerance: float) -> np.ndarray:
+    """Class (uint8) of world points (..., 3): CONSISTENT with a view's surface, OCCLUDED by it, or in FREE_SPACE."""
     local = (points - cam2world[:3, 3]) @ cam2world[:3, :3]
     distance = np.maximum(np.linalg.norm(local, axis=-1), 1e-9)
     row, column = nearest_pixel(local, surface.height)
@@ -86,7 +80,7 @@ def classify_visibility(
     result = np.full(ratio.shape, OCCLUDED, np.uint8)
     result[ratio > 1 - tolerance] = CONSISTENT
     result[ratio > 1 + tolerance] = FREE_SPACE
-    return result, ratio
+    return result
 
 
 def world_points(surface: Surface, cam2world: np.ndarray) -> np.ndarray:
@@ -103,7 +97,7 @@ def consistency_mask(
     consistent = np.zeros(points.shape[:2], bool)
     for other, surface in enumerate(surfaces):
         if other != view:
-            consistent |= classify_visibility(points, surface, cam2world[other], tolerance)[0] == CONSISTENT
+            consistent |= classify_visibility(points, surface, cam2world[other], tolerance) == CONSISTENT
     return consistent
 
 
