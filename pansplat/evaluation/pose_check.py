@@ -26,8 +26,8 @@ _HEIGHT = 64  # pixels
 _CANDIDATES = 32  # inverse depths
 _AGGREGATION = 2  # half size of the window over which differences are averaged, pixels
 _DIFFERENCE_CAP = 0.6  # of a feature; limits the effect of occlusions
-# Another reading is reported if its error is below this ratio of the error as given, below this error, and smaller by
-# this difference (a ratio of nearly perfect fits is not significant).
+# Another interpretation is reported if its error is below this ratio of the error as given, below this error, and
+# smaller by this difference (a ratio of nearly perfect fits is not significant).
 _MAX_RATIO, _MAX_ERROR, _MIN_DIFFERENCE = 0.92, 0.46, 0.02
 _NO_OVERLAP = 0.5  # lowest error above which the views have too little in common
 _SAME_POSE = 0.02  # largest difference of equal relative poses (translation relative to its length)
@@ -66,9 +66,9 @@ class PoseCheck:
         name: of the pair.
         baseline: largest distance between context cameras, metres.
         error: photometric error of the warp with the poses as given: 0 for a perfect fit, about 1 for unrelated images.
-        errors: the error for each reading of the poses, best first; `AS_GIVEN` is one.
-        indistinguishable: readings with the same relative pose as given.
-        likely_mistake: advice if another reading fits clearly better, else None.
+        errors: the error for each interpretation of the poses, best first; `AS_GIVEN` is one.
+        indistinguishable: interpretations with the same relative pose as given.
+        likely_mistake: advice if another interpretation fits clearly better, else None.
         warnings: on other implausible input.
     """
 
@@ -80,31 +80,9 @@ class PoseCheck:
     likely_mistake: str | None
     warnings: tuple[str, ...]
 
-    @property
-    def best(self) -> str:
-        """The reading of the poses that fits best."""
-        return next(iter(self.errors))
-
-    @property
-    def ok(self) -> bool:
-        """Whether there is no likely mistake and no warning."""
-        return self.likely_mistake is None and not self.warnings
-
-    def report(self) -> str:
-        """The findings as text of several lines."""
-        lines = [
-            f"{self.name}: baseline {self.baseline:.3f} m, photometric error {self.error:.3f} with the poses as given"
-        ]
-        lines += [f"  {error:.3f}  {name}" for name, error in self.errors.items()]
-        if self.indistinguishable:
-            lines.append(f"  same as given for these views: {', '.join(self.indistinguishable)}")
-        lines += [f"  warning: {warning}" for warning in self.warnings]
-        mistake = f"likely mistake: {self.likely_mistake}" if self.likely_mistake else "no other reading fits better"
-        return "\n".join((*lines, f"  {mistake}"))
-
 
 def check_pair(pair: Pair) -> PoseCheck:
-    """Whether the poses of a pair's context views fit their images, and which other reading would; takes seconds.
+    """Check the poses of a pair's context views against their images; takes seconds.
 
     Raises:
         InputError: an image cannot be used.
@@ -121,15 +99,15 @@ def check_views(views: Views, name: str = "views") -> PoseCheck:
     """
     features = torch.stack([_features(image) for image in views.images])
     poses = views.cam2world
-    relatives = {reading: _relative_poses(poses, reading) for reading in (AS_GIVEN, *_ADVICE)}
+    relatives = {interpretation: _relative_poses(poses, interpretation) for interpretation in (AS_GIVEN, *_ADVICE)}
     given = relatives[AS_GIVEN]
     indistinguishable = [r for r in _ADVICE if _same_motion(relatives[r], given)]
     errors: dict[str, float] = {}
-    for reading, relative in relatives.items():
-        if reading in indistinguishable:
+    for interpretation, relative in relatives.items():
+        if interpretation in indistinguishable:
             continue
         equal = next((r for r in errors if _same_motion(relatives[r], relative)), None)
-        errors[reading] = errors[equal] if equal else _photometric_error(features, views, relative)
+        errors[interpretation] = errors[equal] if equal else _photometric_error(features, views, relative)
     errors = dict(sorted(errors.items(), key=lambda item: item[1]))
     centres = poses[:, :3, 3]
     baseline = max(float((a - b).norm()) for a, b in itertools.combinations(centres, 2))
@@ -145,7 +123,7 @@ def check_views(views: Views, name: str = "views") -> PoseCheck:
 
 
 def _likely_mistake(errors: dict[str, float]) -> str | None:
-    """Advice for the best reading, and for equally good ones, if it is clearly better than as given."""
+    """Advice for the best interpretation, and for equally good ones, if it is clearly better than as given."""
     best = next(iter(errors.values()))
     if best > min(_MAX_RATIO * errors[AS_GIVEN], errors[AS_GIVEN] - _MIN_DIFFERENCE, _MAX_ERROR):
         return None
@@ -173,39 +151,39 @@ def _distance_warnings(centres: Float[Tensor, "view 3"], baseline: float, views:
 
 
 def _overlap_warnings(errors: dict[str, float]) -> tuple[str, ...]:
-    """A warning if no reading of the poses fits."""
+    """A warning if no interpretation of the poses fits."""
     best = next(iter(errors.values()))
     if best <= _NO_OVERLAP:
         return ()
     return (
-        f"no reading of the poses fits the views (best error {best:.3f}): they have too little in common, "
+        f"no interpretation of the poses fits the views (best error {best:.3f}): they have too little in common, "
         "or the poses or the order of the images are wrong in another way.",
     )
 
 
-def _relative_poses(cam2world: Float[Tensor, "view 4 4"], reading: str) -> Float[Tensor, "pair 4 4"]:
-    """Poses of each view in the next one's camera, under a reading of the given matrices."""
-    poses = _read_as(cam2world, reading)
+def _relative_poses(cam2world: Float[Tensor, "view 4 4"], interpretation: str) -> Float[Tensor, "pair 4 4"]:
+    """Poses of each view in the next one's camera, under an interpretation of the given matrices."""
+    poses = _read_as(cam2world, interpretation)
     return torch.linalg.solve(poses[1:], poses[:-1])
 
 
-def _read_as(poses: Float[Tensor, "view 4 4"], reading: str) -> Float[Tensor, "view 4 4"]:
+def _read_as(poses: Float[Tensor, "view 4 4"], interpretation: str) -> Float[Tensor, "view 4 4"]:
     """The OpenCV cam2world poses that a mistake turned into the given matrices."""
     opengl = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=poses.dtype))
-    if reading == "inverse":
+    if interpretation == "inverse":
         return invert_pose(poses)
-    if reading == "opengl axes":
+    if interpretation == "opengl axes":
         return poses @ opengl
-    if reading == "inverse, opengl axes":
+    if interpretation == "inverse, opengl axes":
         return invert_pose(poses) @ opengl
-    if reading == "transposed rotation":
+    if interpretation == "transposed rotation":
         turned = poses.clone()
         turned[:, :3, :3] = poses[:, :3, :3].transpose(-1, -2)
         return turned
-    if reading == "swapped views":
+    if interpretation == "swapped views":
         return poses.flip(0)
-    if reading.startswith("mirrored"):
-        axis = ("left-right", "up-down", "front-back").index(reading.split()[1])
+    if interpretation.startswith("mirrored"):
+        axis = ("left-right", "up-down", "front-back").index(interpretation.split()[1])
         mirror = torch.eye(4, dtype=poses.dtype)
         mirror[axis, axis] = -1
         return mirror @ poses @ mirror
@@ -216,15 +194,15 @@ def _read_as(poses: Float[Tensor, "view 4 4"], reading: str) -> Float[Tensor, "v
         "turned by 180 degrees": ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
         "turned by -90 degrees": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
     }
-    if reading not in turns:
+    if interpretation not in turns:
         return poses
     turn = torch.eye(4, dtype=poses.dtype)
-    turn[:3, :3] = torch.tensor(turns[reading], dtype=poses.dtype)
+    turn[:3, :3] = torch.tensor(turns[interpretation], dtype=poses.dtype)
     return poses @ turn
 
 
 def _same_motion(first: Float[Tensor, "pair 4 4"], second: Float[Tensor, "pair 4 4"]) -> bool:
-    """Whether two readings have the same relative poses within the tolerance of a small image."""
+    """Whether two interpretations have the same relative poses within the tolerance of a small image."""
     length = second[:, :3, 3].norm(dim=-1).clamp_min(1e-9)
     rotation = (first - second)[:, :3, :3].abs().max()
     translation = ((first - second)[:, :3, 3].norm(dim=-1) / length).max()
