@@ -55,13 +55,13 @@ class _Logs:
     board: TensorBoardLog
 
     @staticmethod
-    def open(folder: Path, config: TrainConfig, step: int) -> _Logs:
-        """Write config.json, and open the logs for the steps from `step` on."""
+    def open(folder: Path, config: TrainConfig, step: int, validation_step: int) -> _Logs:
+        """Write config.json, and open the logs. Rows from `step` or `validation_step` on are removed."""
         with replacing(folder / "config.json") as partial:
             partial.write_text(as_json(config) + "\n")
         return _Logs(
             CsvTable(folder / "log.csv", _COLUMNS, step),
-            CsvTable(folder / "validation.csv", ("height", *MEASURES), step + 1 if step else 0),
+            CsvTable(folder / "validation.csv", ("height", *MEASURES), validation_step),
             TensorBoardLog(folder / "tensorboard"),
         )
 
@@ -116,7 +116,8 @@ class Trainer:
         """
         out, total, is_first = self.config.out, self.config.optimizer.steps, self.processes.is_first
         out.mkdir(parents=True, exist_ok=True)
-        logs = _Logs.open(out, self.config, self.step) if is_first else None
+        validation_step = 0 if self.resumed_from is None else self.step + 1
+        logs = _Logs.open(out, self.config, self.step, validation_step) if is_first else None
         saved_at = time.monotonic()
         try:
             with ProgressDisplay(self.step, total, silent=self.silent) as progress, self._stop_on_signal(progress):

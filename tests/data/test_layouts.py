@@ -21,15 +21,6 @@ def _pose(x: float, z: float = 0.0) -> list[list[float]]:
     return [[0, 0, 1, x], [0, 1, 0, 0], [-1, 0, 0, z], [0, 0, 0, 1]]
 
 
-def _picture(path: Path, value: float = 0.5, height: int = 16) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_image(path, torch.full((3, height, 2 * height), value))
-
-
-def _depth(path: Path, millimetres: int) -> None:
-    cv2.imwrite(str(path), np.full((16, 32), millimetres, np.uint16))
-
-
 def _folder(folder: Path, names: Sequence[str] = ("left.png", "right.png"), **content: object) -> Path:
     """A pair folder whose i-th camera is at x = i; `content` goes into poses.json, None removes an entry."""
     for i, name in enumerate(names):

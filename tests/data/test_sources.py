@@ -1,22 +1,19 @@
-"""Every kind of data becomes the same samples."""
+"""Every kind of data gives the same kind of samples."""
 
+import itertools
 import json
+from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
 
 from pansplat.data.generated.triplets import GeneratedTriplets
-from pansplat.data.images import write_image
 from pansplat.data.layouts import load_pairs
-from pansplat.data.sequences import BoundedSampler, read_loc360
 from pansplat.data.sources import (
     ConcatSource,
-    FixedFramePairs,
     PairSource,
-    RandomFramePairs,
     TripletSource,
     read_game_maps,
     read_panogrf,
@@ -25,42 +22,20 @@ from pansplat.data.views import collate
 from pansplat.errors import InputError
 
 
-def _pose(x: float) -> list[list[float]]:
-    return [[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+@pytest.fixture
+def write_game_map(write_panorama: Callable, write_depth: Callable, matrix: Callable) -> Callable[..., None]:
+    def write(folder: Path, *names: str) -> None:
+        for name in names:
+            for i in range(3):
+                write_panorama(folder / f"{name}_{i}.png", 0.2 * (i + 1))
+                write_depth(folder / f"{name}_{i}_depth.png", 1000 * (i + 1))
+            (folder / f"{name}.json").write_text(json.dumps({"c2w": [matrix(0), matrix(1), matrix(2)]}))
+
+    return write
 
 
-def _picture(path: Path, value: float = 0.5) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_image(path, torch.full((3, 16, 32), value))
-
-
-def _game_map(folder: Path, name: str) -> None:
-    for i in range(3):
-        _picture(folder / f"{name}_{i}.png", 0.2 * (i + 1))
-        cv2.imwrite(str(folder / f"{name}_{i}_depth.png"), np.full((16, 32), 1000 * (i + 1), np.uint16))
-    (folder / f"{name}.json").write_text(json.dumps({"c2w": [_pose(0), _pose(1), _pose(2)]}))
-
-
-def _panogrf(root: Path, kind: str, scenes: int = 2, stage: str = "test") -> None:
-    for scene in range(scenes):
-        for i in range(3):
-            view = root / f"png_render_{stage}_1024x512_seq_len_3_{kind}" / f"{scene:08d}" / f"{i:02d}"
-            _picture(view / "rgb.png", 0.2 * (i + 1))
-            np.savetxt(view / "rot.txt", np.eye(3))
-            np.savetxt(view / "tran.txt", [0, 0, 0.5 * i])
-
-
-def _loc360(root: Path, location: str, part: str, name: str, count: int = 9) -> None:
-    folder = root / location / part / name
-    for i in range(count):
-        _picture(folder / "image" / f"{i}.png", i / 10)
-    poses = {f"{i}.png": _pose(i) for i in range(count)}
-    (folder / "camera_pose.json").write_text(json.dumps(poses))
-
-
-def test_game_map_triplets_are_samples_with_depth(tmp_path: Path) -> None:
-    _game_map(tmp_path, "a")
-    _game_map(tmp_path, "b")
+def test_game_map_triplets_are_samples_with_depth(tmp_path: Path, write_game_map: Callable) -> None:
+    write_game_map(tmp_path, "a", "b")
     source = TripletSource(read_game_maps(tmp_path))
     samples = [source.sample(index, 8, 0) for index in range(len(source))]
     assert [sample.name for sample in samples] == ["a", "b"]
@@ -76,9 +51,8 @@ def test_game_map_triplets_are_samples_with_depth(tmp_path: Path) -> None:
     assert torch.equal(moved.images, batch.images) and moved.names == batch.names
 
 
-def test_samples_with_and_without_depth_share_a_batch(tmp_path: Path) -> None:
-    _game_map(tmp_path, "a")
-    _game_map(tmp_path, "b")
+def test_samples_without_depth_have_zero_depth_in_a_batch(tmp_path: Path, write_game_map: Callable) -> None:
+    write_game_map(tmp_path, "a", "b")
     for depth in tmp_path.glob("b_*_depth.png"):
         depth.unlink()
     source = TripletSource(read_game_maps(tmp_path))
@@ -87,8 +61,8 @@ def test_samples_with_and_without_depth_share_a_batch(tmp_path: Path) -> None:
     assert (batch.depths[0] > 0).all() and (batch.depths[1] == 0).all()
 
 
-def test_samples_of_two_shapes_are_no_batch(tmp_path: Path) -> None:
-    _game_map(tmp_path, "a")
+def test_samples_of_different_shapes_cannot_be_batched(tmp_path: Path, write_game_map: Callable) -> None:
+    write_game_map(tmp_path, "a")
     source = TripletSource(read_game_maps(tmp_path))
     with pytest.raises(InputError, match=r"cannot batch a with a: needed context of shape \(2, 3, 8, 16\)"):
         collate([source.sample(0, 8, 0), source.sample(0, 4, 0)])
@@ -96,9 +70,13 @@ def test_samples_of_two_shapes_are_no_batch(tmp_path: Path) -> None:
         collate([])
 
 
-def test_panogrf_sets_are_read_by_stage_and_missing_ones_named(tmp_path: Path) -> None:
-    _panogrf(tmp_path, "m3d_dist_0.5")
-    _panogrf(tmp_path, "m3d_dist_1.0", 1)
+def test_panogrf_sets_are_read_by_stage_and_missing_ones_warn(tmp_path: Path, write_panorama: Callable) -> None:
+    for kind, scenes in (("m3d_dist_0.5", 2), ("m3d_dist_1.0", 1)):
+        for scene, i in itertools.product(range(scenes), range(3)):
+            view = tmp_path / f"png_render_test_1024x512_seq_len_3_{kind}" / f"{scene:08d}" / f"{i:02d}"
+            write_panorama(view / "rgb.png", 0.2 * (i + 1))
+            np.savetxt(view / "rot.txt", np.eye(3))
+            np.savetxt(view / "tran.txt", [0, 0, 0.5 * i])
     with pytest.warns(UserWarning, match=r"no PanoGRF scenes in .*m3d_dist_0\.1.*replica_dist_0\.5; these sets"):
         sets = read_panogrf(tmp_path, "test", 256)
     assert [(s.name, len(s.sources)) for s in sets if s.sources] == [("m3d_dist_0.5", 2), ("m3d_dist_1.0", 1)]
@@ -114,67 +92,38 @@ def test_panogrf_sets_are_read_by_stage_and_missing_ones_named(tmp_path: Path) -
         read_panogrf(tmp_path, "test", 2048, [("m3d", 0.5)])
 
 
-def test_360loc_trains_on_some_halls_and_tests_on_another(tmp_path: Path) -> None:
-    for location in ("concourse", "hall", "piatrium"):
-        _loc360(tmp_path, location, "mapping", "daytime_360_0")
-    _loc360(tmp_path, "hall", "query_360", "night_360_1", 5)
-    (tmp_path / "hall" / "query_360" / "night_pinhole").mkdir()
-    sequences = read_loc360(tmp_path, "train")
-    names = [sequence.name for sequence in sequences]
-    assert names == ["concourse-daytime_360_0", "hall-daytime_360_0", "hall-night_360_1", "piatrium-daytime_360_0"]
-    with pytest.raises(InputError, match=r"atrium: needed 360Loc sequences .* for test, got none"):
-        read_loc360(tmp_path, "test")
-    source = RandomFramePairs(sequences, BoundedSampler(2, 5), draws=10)
-    assert len(source) == 40
-    first, again = source.sample(3, 8, 7), source.sample(3, 8, 7)
-    assert first.name == again.name and torch.equal(first.context.images, again.context.images)
-    assert len({source.sample(3, 8, seed).name for seed in range(8)}) > 1
-    assert source.sample(25, 8, 0).name.startswith("hall-night_360_1")
-    gap = float((first.context.cam2world[1] - first.context.cam2world[0])[0, 3])
-    assert 2 <= gap <= 5 and first.context.far == 50
-
-
-def test_360loc_is_evaluated_on_all_frames_between(tmp_path: Path) -> None:
-    _loc360(tmp_path, "atrium", "mapping", "daytime_360_0", 9)
-    source = FixedFramePairs(read_loc360(tmp_path, "test"), BoundedSampler(2, 5).evaluation)
-    assert len(source) == 100
-    last = source.sample(99, 8, 0)
-    assert last.context.names == ("5", "8") and last.targets.names == ("5", "6", "7", "8")
-    assert torch.equal(last.context.images[0], last.targets.images[0])
-    assert last.targets.cam2world[:, 0, 3].tolist() == [5, 6, 7, 8]
-
-
-def test_pair_folders_need_targets_and_draw_among_them(tmp_path: Path) -> None:
+def test_pairs_need_targets_and_a_random_one_is_chosen(
+    tmp_path: Path, write_panorama: Callable, matrix: Callable
+) -> None:
     names = [f"{i}.png" for i in range(5)]
     for i, name in enumerate(names):
-        _picture(tmp_path / name, i / 10)
-    poses = {name: _pose(i) for i, name in enumerate(names)}
+        write_panorama(tmp_path / name, i / 10)
+    poses = {name: matrix(i) for i, name in enumerate(names)}
     (tmp_path / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
     with pytest.raises(InputError, match="needed 1 target panorama"):
         PairSource(load_pairs(tmp_path))
-    cases = {"pairs": [{"context": ["0.png", "4.png"], "target": ["1.png", "2.png", "3.png"]}]}
-    (tmp_path / "pairs.json").write_text(json.dumps(cases))
+    groups = {"pairs": [{"context": ["0.png", "4.png"], "target": ["1.png", "2.png", "3.png"]}]}
+    (tmp_path / "pairs.json").write_text(json.dumps(groups))
     pairs = load_pairs(tmp_path)
     assert PairSource(pairs).sample(0, 8, 0).targets.names == ("1", "2", "3")
-    drawn = {PairSource(pairs, targets=1).sample(0, 8, seed).targets.names for seed in range(20)}
-    assert drawn == {("1",), ("2",), ("3",)}
+    chosen = {PairSource(pairs, targets=1).sample(0, 8, seed).targets.names for seed in range(20)}
+    assert chosen == {("1",), ("2",), ("3",)}
     with pytest.raises(InputError, match="needed 4 target"):
         PairSource(pairs, targets=4)
 
 
-def test_joined_sources_follow_one_another(tmp_path: Path) -> None:
-    _game_map(tmp_path, "a")
-    _game_map(tmp_path, "b")
+def test_concatenated_sources_keep_their_order(tmp_path: Path, write_game_map: Callable) -> None:
+    write_game_map(tmp_path, "a", "b")
     maps, homes = TripletSource(read_game_maps(tmp_path)), GeneratedTriplets(count=3, samples=1)
-    joined = ConcatSource([maps, homes, maps])
-    assert len(joined) == 7
-    names = [joined.sample(i, 8, 0).name for i in range(7)]
+    concatenated = ConcatSource([maps, homes, maps])
+    assert len(concatenated) == 7
+    names = [concatenated.sample(i, 8, 0).name for i in range(7)]
     homes_names = [f"generated_0_{i:06d}" for i in range(3)]
     assert names == ["a", "b", *homes_names, "a", "b"]
 
 
 @pytest.mark.shared
-def test_the_shared_renderings_are_read(shared: Path) -> None:
+def test_shared_samples_are_read(shared: Path) -> None:
     (triplets,) = read_panogrf(shared / "data" / "mp3d_sample", "test", 256, [("m3d", 0.5)])
     sample = TripletSource(triplets).sample(0, 64, 0)
     assert sample.context.names == ("00", "02") and sample.targets.names == ("01",)
