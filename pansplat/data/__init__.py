@@ -1,1 +1,1 @@
-"""Reading posed panoramas from files, and writing pictures."""
+"""Reading posed panoramas and training samples from files; writing images and videos."""

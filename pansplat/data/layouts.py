@@ -1,7 +1,8 @@
 """Folder layouts of posed panoramas: `load_pairs` recognises and reads them (docs/input.md).
 
 Each layout has a function that recognises a folder and one that reads it into a `Collection`. The argument `convention`
-of the readers overrides the layout's pose convention.
+of the readers overrides the layout's pose convention. Readers raise an InputError for missing or invalid files; the
+message names the file and the entry.
 """
 
 from __future__ import annotations
@@ -142,11 +143,7 @@ def is_pose_file_folder(folder: Path) -> bool:
 
 
 def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collection:
-    """The panoramas of poses.json, and the groups of pairs.json. File names in them are relative to the folder.
-
-    Raises:
-        InputError: something is missing or invalid; the message names the file and the entry.
-    """
+    """The panoramas of poses.json, and the groups of pairs.json. File names in them are relative to the folder."""
     source = folder / POSES
     content = read_json(source)
     entries = content.get("poses") if isinstance(content, dict) else None
@@ -271,9 +268,6 @@ def read_matterport3d_scene(folder: Path, convention: str | None = None) -> Coll
     """The views of a scene folder, sorted by name: the first and last are the context, those between are targets.
 
     The world is rotated to z-up, as in the official code.
-
-    Raises:
-        InputError: a file of a view is missing or invalid.
     """
     convention = _choose_convention(convention, "cam2world opengl")
     panoramas = tuple(_read_view_folder(view, folder, convention) for view in _view_folders(folder))
@@ -325,9 +319,6 @@ def read_triplet(source: Path, convention: str | None = None) -> Collection:
     """The views of a NAME.json, which has `c2w`, a list of cam2world matrices with OpenCV axes.
 
     The first and last view are the context, those between are targets.
-
-    Raises:
-        InputError: poses or images are missing or invalid.
     """
     convention = _choose_convention(convention, "cam2world opencv")
     content = read_json(source)
@@ -359,9 +350,6 @@ def read_loc360_sequence(folder: Path, convention: str | None = None) -> Collect
     """The frames of a 360Loc sequence in the order of camera_pose.json ({frame: 4x4 matrix}); images are in image/.
 
     The matrices are cam2world with OpenCV axes, as the official code reads them.
-
-    Raises:
-        InputError: a frame without an image, or an invalid pose.
     """
     source = folder / LOC360
     convention = _choose_convention(convention, "cam2world opencv")
@@ -381,11 +369,7 @@ def read_loc360_sequence(folder: Path, convention: str | None = None) -> Collect
 
 
 def find_trajectory(folder: Path) -> Path | None:
-    """The trajectory file of a folder: *.kitti, *.tum, poses.txt or *trajectory*.txt.
-
-    Raises:
-        InputError: there are several.
-    """
+    """The trajectory file of a folder (*.kitti, *.tum, poses.txt, *trajectory*.txt); an error if there are several."""
     found = [
         path
         for path in sorted(folder.iterdir())
@@ -406,9 +390,6 @@ def read_trajectory_folder(folder: Path, convention: str | None = None) -> Colle
     """The images of a folder, sorted by name, with the poses of its trajectory file: image i has line i.
 
     The number in scale.txt, if there is one, converts the translations to metres.
-
-    Raises:
-        InputError: no images, different numbers of poses and images, an invalid file.
     """
     source = find_trajectory(folder)
     if source is None:

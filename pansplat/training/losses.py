@@ -1,6 +1,6 @@
 """Losses of training: error and perceptual distance of images, error of depth, and the auxiliary heads' image loss.
 
-Source: PanSplat, section 3.5; docs/official.md, section 11, and section 17, P4 and P5 (differences of paper and code).
+Source: PanSplat, section 3.5; docs/official.md, section 11; docs/paper.md, P4 and P5 (differences of paper and code).
 Images are not clamped. Levels of depth are coarse to fine; the finest has weight 1, each coarser one `decay` times the
 weight of the next finer one.
 """

@@ -1,4 +1,4 @@
-"""Augmented samples are true samples: their depth still takes each view into the other."""
+"""Augmented samples are consistent: their depth still warps each view into the other."""
 
 import math
 
@@ -45,7 +45,7 @@ def _warping_error(a: Views, b: Views) -> float:
     return float((warped - a.images[0]).abs().mean())
 
 
-def test_the_check_itself_sees_a_wrong_pose() -> None:
+def test_a_wrong_pose_fails_the_consistency_check() -> None:
     room = _room([(0, 0, 0), (0.6, 0.1, 0.2)])
     assert _warping_error(room, room) < 3e-3
     rolled = roll_views(room, [5, 5])
@@ -63,7 +63,7 @@ def test_the_check_itself_sees_a_wrong_pose() -> None:
         Augmentation(yaw="each", mirror="half", tilt_degrees=5, colour=0),
     ],
 )
-def test_warping_by_depth_agrees_after_as_before(settings: Augmentation) -> None:
+def test_augmented_views_warp_into_each_other(settings: Augmentation) -> None:
     for seed in range(4):
         changed = augment(_sample(), settings, np.random.default_rng(seed))
         limit = 8e-3 if settings.tilt_degrees else 3e-3  # nearest depth under a tilt
@@ -74,7 +74,7 @@ def test_warping_by_depth_agrees_after_as_before(settings: Augmentation) -> None
         assert torch.allclose(torch.linalg.det(rotation), torch.ones(2, dtype=torch.float64))
 
 
-def test_rolling_moves_pixels_exactly_and_back() -> None:
+def test_rolling_is_exact_and_invertible() -> None:
     room = _room([(0, 0, 0), (0.6, 0.1, 0.2)])
     rolled = roll_views(room, [7, 90])
     assert torch.equal(rolled.images[0], room.images[0].roll(7, -1))
@@ -89,7 +89,7 @@ def test_mirroring_twice_is_the_identity() -> None:
     assert not torch.equal(mirror_views(room).images, room.images)
 
 
-def test_turning_by_whole_pixels_is_rolling() -> None:
+def test_rotating_by_whole_pixels_equals_rolling() -> None:
     room = _room([(0, 0, 0)])
     rolled = roll_views(room, [4])
     turned = rotate_views(room, room.cam2world[:, :3, :3].mT @ rolled.cam2world[:, :3, :3])
@@ -98,7 +98,7 @@ def test_turning_by_whole_pixels_is_rolling() -> None:
     assert torch.allclose(turned.cam2world, rolled.cam2world)
 
 
-def test_colour_changes_all_views_alike_and_exposure_each() -> None:
+def test_colour_changes_are_shared_and_exposure_differs_by_view() -> None:
     room = _room([(0, 0, 0), (0, 0, 0)])
     sample = Sample("room", room, room)
     alike = augment(sample, Augmentation(colour=0.2), np.random.default_rng(0))
@@ -110,7 +110,7 @@ def test_colour_changes_all_views_alike_and_exposure_each() -> None:
     assert not torch.equal(each.context.images[0], each.context.images[1])
 
 
-def test_the_seed_decides_everything() -> None:
+def test_augmentation_is_determined_by_the_seed() -> None:
     settings = Augmentation(tilt_degrees=3, exposure=0.5)
     first, again = (augment(_sample(), settings, np.random.default_rng(3)) for _ in range(2))
     assert torch.equal(first.context.images, again.context.images)
@@ -118,7 +118,7 @@ def test_the_seed_decides_everything() -> None:
     assert not torch.equal(first.context.images, other.context.images)
 
 
-def test_nothing_on_changes_nothing() -> None:
+def test_disabled_augmentation_changes_nothing() -> None:
     sample = _sample()
     same = augment(sample, Augmentation("off", "off", 0, 0, 0), np.random.default_rng(0))
     assert torch.allclose(same.context.images, sample.context.images, atol=1e-6)

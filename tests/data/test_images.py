@@ -1,4 +1,4 @@
-"""Pictures are read alike from every format, and whatever is wrong with a file is said."""
+"""Images of every format are read alike, and defects of files are reported."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from pansplat.data.images import (
 from pansplat.errors import InputError
 
 
-def _picture(height: int = 16) -> torch.Tensor:
+def _panorama(height: int = 16) -> torch.Tensor:
     """A smooth panorama, (3 height 2 height), whose columns meet at +-180 degrees."""
     v, u = torch.meshgrid(torch.linspace(0, 1, height), torch.arange(2 * height) / (2 * height), indexing="ij")
     return torch.stack((0.5 + 0.4 * torch.sin(6.2832 * u), v, 0.5 + 0.3 * torch.cos(6.2832 * u) * v))
@@ -32,8 +32,8 @@ def _entries(folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize(("suffix", "tolerance"), [(".png", 2e-3), (".webp", 2e-3), (".jpg", 0.05), (".exr", 1e-5)])
-def test_reading_gives_what_was_written(tmp_path: Path, suffix: str, tolerance: float) -> None:
-    image = _picture()
+def test_read_images_equal_written_images(tmp_path: Path, suffix: str, tolerance: float) -> None:
+    image = _panorama()
     write_image(tmp_path / f"a{suffix}", image)
     read, opaque = read_panorama(tmp_path / f"a{suffix}", 16)
     assert read.dtype == torch.float32
@@ -42,22 +42,22 @@ def test_reading_gives_what_was_written(tmp_path: Path, suffix: str, tolerance: 
     assert _entries(tmp_path) == [f"a{suffix}"]
 
 
-def test_an_array_is_written_as_the_tensor_of_the_same_picture(tmp_path: Path) -> None:
-    image = _picture()
+def test_arrays_and_tensors_give_the_same_file(tmp_path: Path) -> None:
+    image = _panorama()
     write_image(tmp_path / "a.png", image)
     write_image(tmp_path / "b.png", image.permute(1, 2, 0).numpy())
     write_image(tmp_path / "c.png", (image.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8))
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes() == (tmp_path / "c.png").read_bytes()
 
 
-def test_format_is_told_by_content_not_by_name(tmp_path: Path) -> None:
-    write_image(tmp_path / "a.png", _picture())
+def test_the_format_is_detected_from_the_content(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.png", _panorama())
     (tmp_path / "a.png").rename(tmp_path / "a.jpg")
-    assert (read_panorama(tmp_path / "a.jpg", 16)[0] - _picture()).abs().max() < 2e-3
+    assert (read_panorama(tmp_path / "a.jpg", 16)[0] - _panorama()).abs().max() < 2e-3
 
 
 def test_sixteen_bit_png_keeps_its_precision(tmp_path: Path) -> None:
-    image = _picture()
+    image = _panorama()
     values = (image.permute(1, 2, 0).numpy() * 65535).round().astype(np.uint16)
     cv2.imwrite(str(tmp_path / "a.png"), values[..., ::-1])
     assert (read_panorama(tmp_path / "a.png", 16)[0] - image).abs().max() < 1e-5
@@ -83,8 +83,8 @@ def test_srgb_and_linear_are_inverse() -> None:
 
 
 @pytest.mark.parametrize("height", [8, 16, 31])
-def test_resizing_rolls_with_the_panorama(tmp_path: Path, height: int) -> None:
-    image = _picture(62)
+def test_resizing_commutes_with_rolling(tmp_path: Path, height: int) -> None:
+    image = _panorama(62)
     write_image(tmp_path / "a.png", image)
     write_image(tmp_path / "b.png", torch.roll(image, 62, dims=2))
     a, b = (read_panorama(tmp_path / name, height)[0] for name in ("a.png", "b.png"))
@@ -96,8 +96,8 @@ def test_resizing_rolls_with_the_panorama(tmp_path: Path, height: int) -> None:
     ).abs().max() < 0.05
 
 
-def test_a_thumbnail_is_the_panorama_made_small(tmp_path: Path) -> None:
-    write_image(tmp_path / "a.jpg", _picture(128))
+def test_a_thumbnail_equals_the_resized_panorama(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.jpg", _panorama(128))
     thumbnail = read_thumbnail(tmp_path / "a.jpg", 16)
     assert (thumbnail - read_panorama(tmp_path / "a.jpg", 16)[0]).abs().max() < 0.03
 
@@ -112,7 +112,7 @@ def test_transparent_pixels_are_masked_with_a_warning(tmp_path: Path) -> None:
     assert not opaque[12:].any()
 
 
-def test_an_opaque_alpha_channel_is_as_none(tmp_path: Path) -> None:
+def test_an_opaque_alpha_channel_has_no_effect(tmp_path: Path) -> None:
     Image.fromarray(np.full((16, 32, 4), 255, np.uint8)).save(tmp_path / "a.png")
     assert read_panorama(tmp_path / "a.png", 16)[1].all()  # and no warning, which would be an error here
 
@@ -127,7 +127,7 @@ def test_a_mask_is_true_where_white(tmp_path: Path) -> None:
     assert read[2:].all()
 
 
-def test_depth_is_metres_and_never_mixed(tmp_path: Path) -> None:
+def test_depth_is_in_metres_and_not_interpolated(tmp_path: Path) -> None:
     depth = np.full((16, 32), 1500, np.uint16)
     depth[:, 16:] = 4000
     depth[0] = 0
@@ -137,7 +137,7 @@ def test_depth_is_metres_and_never_mixed(tmp_path: Path) -> None:
 
 
 def test_eight_bit_depth_is_refused(tmp_path: Path) -> None:
-    write_image(tmp_path / "depth.png", _picture())
+    write_image(tmp_path / "depth.png", _panorama())
     with pytest.raises(InputError, match=r"depth\.png: needed depth as a one-channel 16-bit PNG .* got uint8"):
         read_depth(tmp_path / "depth.png", 16)
 
@@ -161,7 +161,7 @@ def test_truncated_sixteen_bit_png_is_refused(tmp_path: Path) -> None:
             read(path, 64)
 
 
-def test_a_file_of_no_bytes_is_refused(tmp_path: Path) -> None:
+def test_an_empty_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").touch()
     with pytest.raises(InputError, match=r"a\.jpg: needed an image, got a file of 0 bytes"):
         read_panorama(tmp_path / "a.jpg", 16)
@@ -174,7 +174,7 @@ def test_an_unknown_format_is_refused(tmp_path: Path, content: bytes) -> None:
         read_panorama(tmp_path / "a.png", 16)
 
 
-def test_a_picture_that_is_not_two_to_one_is_refused(tmp_path: Path) -> None:
+def test_images_must_be_two_to_one(tmp_path: Path) -> None:
     write_image(tmp_path / "a.png", torch.zeros(3, 16, 24))
     with pytest.raises(InputError, match=r"a\.png: needed a 2:1 equirectangular panorama, got 24x16"):
         read_panorama(tmp_path / "a.png", 16)
@@ -204,7 +204,7 @@ def test_a_missing_file_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.exr"])
 def test_nan_is_never_written(tmp_path: Path, name: str) -> None:
-    image = _picture()
+    image = _panorama()
     write_image(tmp_path / name, image)
     before = (tmp_path / name).read_bytes()
     image[0, 0, 0] = torch.nan
@@ -214,15 +214,15 @@ def test_nan_is_never_written(tmp_path: Path, name: str) -> None:
     assert _entries(tmp_path) == [name]
 
 
-def test_writing_refuses_what_the_format_cannot_hold(tmp_path: Path) -> None:
+def test_unsupported_content_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"needed a name ending in"):
-        write_image(tmp_path / "a.gif", _picture())
+        write_image(tmp_path / "a.gif", _panorama())
     with pytest.raises(InputError, match=r"cannot write depth to .*needed an \.exr"):
-        write_image(tmp_path / "a.png", _picture(), depth=torch.ones(16, 32))
+        write_image(tmp_path / "a.png", _panorama(), depth=torch.ones(16, 32))
     with pytest.raises(InputError, match=r"needed finite depth of shape \(16, 32\), got shape \(8, 8\)"):
-        write_image(tmp_path / "a.exr", _picture(), depth=torch.ones(8, 8))
+        write_image(tmp_path / "a.exr", _panorama(), depth=torch.ones(8, 8))
     with pytest.raises(InputError, match="got shape"):
         write_image(tmp_path / "a.png", torch.zeros(16, 32))
     with pytest.raises(InputError, match="needed an existing folder"):
-        write_image(tmp_path / "none" / "a.png", _picture())
+        write_image(tmp_path / "none" / "a.png", _panorama())
     assert _entries(tmp_path) == []

@@ -1,4 +1,4 @@
-"""Pairs come out of every layout with the same cameras, and bad folders are refused with the reason."""
+"""Every folder layout gives the same cameras, and invalid folders are refused with the reason."""
 
 import json
 import warnings
@@ -21,10 +21,19 @@ def _pose(x: float, z: float = 0.0) -> list[list[float]]:
     return [[0, 0, 1, x], [0, 1, 0, 0], [-1, 0, 0, z], [0, 0, 0, 1]]
 
 
+def _write_panorama(path: Path, value: float = 0.5) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, torch.full((3, 16, 32), value))
+
+
+def _write_depth(path: Path, millimetres: int) -> None:
+    cv2.imwrite(str(path), np.full((16, 32), millimetres, np.uint16))
+
+
 def _folder(folder: Path, names: Sequence[str] = ("left.png", "right.png"), **content: object) -> Path:
     """A pair folder whose i-th camera is at x = i; `content` goes into poses.json, None removes an entry."""
     for i, name in enumerate(names):
-        _picture(folder / name, 0.1 * (i + 1))
+        _write_panorama(folder / name, 0.1 * (i + 1))
     poses = {"convention": OPENCV, "poses": {name: _pose(i) for i, name in enumerate(names)}} | content
     (folder / "poses.json").write_text(json.dumps({k: v for k, v in poses.items() if v is not None}))
     return folder
@@ -34,7 +43,7 @@ def _centres(pair) -> list[float]:
     return [float(panorama.cam2world[0, 3]) for panorama in pair.context]
 
 
-def test_two_pictures_with_poses_are_a_pair(tmp_path: Path) -> None:
+def test_two_images_with_poses_are_a_pair(tmp_path: Path) -> None:
     (pair,) = load_pairs(_folder(tmp_path / "room"))
     assert pair.name == "room"
     assert [panorama.name for panorama in pair.context] == ["left", "right"]
@@ -50,12 +59,12 @@ def test_two_pictures_with_poses_are_a_pair(tmp_path: Path) -> None:
     assert pair.load_targets(8).images.shape == (0, 3, 8, 16)
 
 
-def test_the_path_may_be_the_pose_file_or_a_text(tmp_path: Path) -> None:
+def test_the_path_may_be_the_pose_file_or_a_string(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "room")
     assert load_pairs(folder / "poses.json")[0].name == load_pairs(str(folder))[0].name == "room"
 
 
-def test_loading_reads_no_picture_before_it_is_asked_for(tmp_path: Path) -> None:
+def test_images_are_read_only_by_load_context(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "room")
     (folder / "left.png").write_bytes(b"")
     (pair,) = load_pairs(folder)
@@ -63,13 +72,13 @@ def test_loading_reads_no_picture_before_it_is_asked_for(tmp_path: Path) -> None
         pair.load_context(8)
 
 
-def test_a_pair_folder_has_depth_masks_range_and_targets(tmp_path: Path) -> None:
+def test_a_pair_has_depth_masks_range_and_targets(tmp_path: Path) -> None:
     names = ("left.png", "middle.png", "right.png")
     entries = {n: {"cam2world": _pose(i), "depth": f"{n[:-4]}_depth.png"} for i, n in enumerate(names)}
     entries["left.png"]["mask"] = "own.png"
     folder = _folder(tmp_path / "room", names, poses=entries, near=0.2, far=30)
     for i, name in enumerate(names):
-        _depth(folder / f"{name[:-4]}_depth.png", 1000 * (i + 1))
+        _write_depth(folder / f"{name[:-4]}_depth.png", 1000 * (i + 1))
     mask = torch.ones(3, 16, 32)
     mask[:, 8:] = 0
     write_image(folder / "own.png", mask)
@@ -85,7 +94,7 @@ def test_a_pair_folder_has_depth_masks_range_and_targets(tmp_path: Path) -> None
     assert views.masks[1].all()
 
 
-def test_masks_beside_the_pictures_are_found(tmp_path: Path) -> None:
+def test_mask_files_are_found_by_name(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "room")
     whole, own = torch.ones(3, 16, 32), torch.ones(3, 16, 32)
     whole[:, :, :4], own[:, :, 20:] = 0, 0
@@ -96,7 +105,7 @@ def test_masks_beside_the_pictures_are_found(tmp_path: Path) -> None:
     assert torch.equal(masks[1], whole[0] > 0)
 
 
-def test_a_mask_that_leaves_nothing_is_refused(tmp_path: Path) -> None:
+def test_a_mask_without_scene_is_refused(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "room")
     write_image(folder / "right_mask.png", torch.zeros(3, 16, 32))
     with pytest.raises(InputError, match=r"right_mask\.png: needed some pixels that show the scene.*invert the mask"):
@@ -114,19 +123,19 @@ def test_transparent_pixels_are_masked(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("file", "key"), [("cam2world opencv", "cam2world"), ("world2cam OpenGL", "world2cam")])
-def test_the_argument_goes_before_the_files_convention(tmp_path: Path, file: str, key: str) -> None:
+def test_the_convention_argument_overrides_the_file(tmp_path: Path, file: str, key: str) -> None:
     poses = {name: {key: _pose(i)} for i, name in enumerate(("left.png", "right.png"))}
     folder = _folder(tmp_path / "room", convention=file, poses=poses)
     given = load_pairs(folder, convention="world2cam opencv")[0].context[1].cam2world
     assert torch.allclose(given, torch.linalg.inv(torch.tensor(_pose(1), dtype=torch.float64)))
 
 
-def test_near_and_far_arguments_go_before_the_files(tmp_path: Path) -> None:
+def test_near_and_far_arguments_override_the_file(tmp_path: Path) -> None:
     (pair,) = load_pairs(_folder(tmp_path / "room", near=1, far=2), near=0.3, far=4)
     assert (pair.near, pair.far) == (0.3, 4)
 
 
-def test_a_folder_of_pair_folders_gives_all_pairs_with_unique_names(tmp_path: Path) -> None:
+def test_pairs_of_nested_folders_have_unique_names(tmp_path: Path) -> None:
     for name in ("b", "a", "c"):
         _folder(tmp_path / name / "room")
     pairs = load_pairs(tmp_path)
@@ -134,14 +143,14 @@ def test_a_folder_of_pair_folders_gives_all_pairs_with_unique_names(tmp_path: Pa
     assert len({pair.name for pair in pairs}) == 3
 
 
-def test_many_panoramas_without_pairs_file_pair_with_their_nearest(tmp_path: Path) -> None:
+def test_without_pairs_file_panoramas_are_paired_along_the_spanning_tree(tmp_path: Path) -> None:
     names = [f"{i}.png" for i in range(4)]
     poses = {name: _pose(x) for name, x in zip(names, (0.0, 10.0, 1.0, 12.0), strict=True)}
     pairs = load_pairs(_folder(tmp_path / "flat", names, poses=poses))
     assert [pair.name for pair in pairs] == ["0-2", "1-2", "1-3"]
 
 
-def test_triplets_come_first_and_no_context_twice(tmp_path: Path) -> None:
+def test_triplets_come_first_and_contexts_are_unique(tmp_path: Path) -> None:
     names = ("a.png", "b.png", "c.png")
     folder = _folder(tmp_path / "flat", names)
     pairs = [{"context": ["a.png", "b.png"]}, {"context": ["a.png", "c.png"]}]
@@ -151,7 +160,7 @@ def test_triplets_come_first_and_no_context_twice(tmp_path: Path) -> None:
     assert [(pair.name, [t.name for t in pair.targets]) for pair in loaded] == [("a-c", ["b"]), ("a-b", [])]
 
 
-def test_coincident_cameras_work_with_a_warning(tmp_path: Path) -> None:
+def test_coincident_cameras_warn(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "room", poses={"left.png": _pose(1), "right.png": _pose(1)})
     (pair,) = load_pairs(folder)
     with pytest.warns(UserWarning, match="room: cameras of the context views coincide"):
@@ -161,14 +170,14 @@ def test_coincident_cameras_work_with_a_warning(tmp_path: Path) -> None:
 def _matterport3d(scene: Path) -> Path:
     for i in range(3):
         view = scene / f"{i:02d}"
-        _picture(view / "rgb.png")
-        _depth(view / "depth.png", 2500)
+        _write_panorama(view / "rgb.png")
+        _write_depth(view / "depth.png", 2500)
         np.savetxt(view / "rot.txt", np.eye(3))
         np.savetxt(view / "tran.txt", [0, 0.5, 0.5 * (i - 1)])
     return scene
 
 
-def test_panogrf_scenes_are_read_from_any_of_their_folders(tmp_path: Path) -> None:
+def test_panogrf_scenes_are_found_from_every_level_of_folders(tmp_path: Path) -> None:
     top = tmp_path / "mp3d"
     scene = _matterport3d(top / "png_render_test_32x16_seq_len_3_m3d_dist_0.5" / "00000007")
     for path in (top, scene.parent, scene):
@@ -184,8 +193,8 @@ def test_panogrf_scenes_are_read_from_any_of_their_folders(tmp_path: Path) -> No
 
 def test_game_map_triplets_are_read(tmp_path: Path) -> None:
     for i in range(3):
-        _picture(tmp_path / f"map_0_{i}.png")
-        _depth(tmp_path / f"map_0_{i}_depth.png", 1000)
+        _write_panorama(tmp_path / f"map_0_{i}.png")
+        _write_depth(tmp_path / f"map_0_{i}_depth.png", 1000)
     (tmp_path / "map_0.json").write_text(json.dumps({"c2w": [_pose(0), _pose(1), _pose(3)]}))
     (pair,) = load_pairs(tmp_path)
     assert pair.name == "map_0"
@@ -196,7 +205,7 @@ def test_game_map_triplets_are_read(tmp_path: Path) -> None:
 def _sequence(folder: Path, count: int = 3) -> list[str]:
     names = [f"{i:04d}.png" for i in range(count)]
     for name in names:
-        _picture(folder / "image" / name)
+        _write_panorama(folder / "image" / name)
     return names
 
 
@@ -212,7 +221,7 @@ def test_360loc_sequences_pair_consecutive_frames(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["poses.txt", "frame_trajectory.txt", "a.kitti"])
-def test_trajectories_belong_to_the_pictures_in_order_and_scale(tmp_path: Path, name: str) -> None:
+def test_trajectory_lines_are_the_scaled_poses_of_the_sorted_images(tmp_path: Path, name: str) -> None:
     _sequence(tmp_path)
     lines = [" ".join(map(str, np.array(_pose(i))[:3].ravel())) for i in range(3)]
     (tmp_path / name).write_text("\n".join(lines))
@@ -220,7 +229,7 @@ def test_trajectories_belong_to_the_pictures_in_order_and_scale(tmp_path: Path, 
     assert [_centres(pair) for pair in load_pairs(tmp_path)] == [[0, 2.5], [2.5, 5]]
 
 
-def test_trajectories_of_another_length_are_refused(tmp_path: Path) -> None:
+def test_trajectories_that_do_not_match_are_refused(tmp_path: Path) -> None:
     _sequence(tmp_path)
     (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n" * 2)
     with pytest.raises(InputError, match=r"poses\.tum: needed one pose per image \(3 images\), got 2 TUM poses"):
@@ -246,18 +255,9 @@ def test_trajectories_of_another_length_are_refused(tmp_path: Path) -> None:
         ({"poses": {"left.png": _pose(0)}}, "got 1; images without a pose: right.png"),
         ({"poses": {"left.png": _pose(0), "right.png": None}}, "'right.png': needed a pose, got none"),
         ({"poses": {"left.png": _pose(0), "gone.png": _pose(1)}}, "needed the image .*gone.png"),
-        (
-            {"poses": {"left.png": _pose(0), "right.png": {"room": "x"}}},
-            r"needed a pose, got only \['room'\]",
-        ),
-        (
-            {"poses": {"left.png": _pose(0), "right.png": {"world2cam": _pose(1)}}},
-            'got the key "world2cam" under',
-        ),
-        (
-            {"poses": {"left.png": _pose(0), "right.png": {"pose": _pose(1), "mask": "m.png"}}},
-            "needed the mask file",
-        ),
+        ({"poses": {"left.png": _pose(0), "right.png": {"room": "x"}}}, r"needed a pose, got only \['room'\]"),
+        ({"poses": {"left.png": _pose(0), "right.png": {"world2cam": _pose(1)}}}, 'got the key "world2cam" under'),
+        ({"poses": {"left.png": _pose(0), "right.png": {"pose": _pose(1), "mask": "m.png"}}}, "needed the mask file"),
         (
             {"poses": {"left.png": _pose(0), "right.png": {"pose": _pose(1), "depth": "d.png"}}},
             "needed the depth file",
@@ -267,7 +267,7 @@ def test_trajectories_of_another_length_are_refused(tmp_path: Path) -> None:
         ({"far": "much"}, "needed a number in metres as \"far\", got 'much'"),
     ],
 )
-def test_bad_pose_files_are_refused(tmp_path: Path, content: dict, message: str) -> None:
+def test_invalid_pose_files_are_refused(tmp_path: Path, content: dict, message: str) -> None:
     folder = _folder(tmp_path / "room", **content)
     with pytest.raises(InputError, match=message) as caught:
         load_pairs(folder)
@@ -285,24 +285,18 @@ def test_bad_pose_files_are_refused(tmp_path: Path, content: dict, message: str)
         ({"pairs": [{"context": [["left.png"], {"b": 1}]}]}, "needed two or more different images"),
         ({"pairs": {"context": ["left.png", "right.png"]}}, 'needed a list as "pairs"'),
         ({"pairs": [{"context": ["left.png", "right.png"], "target": 5}]}, 'needed an image .* as "target", got 5'),
-        (
-            {"pairs": [{"context": ["left.png", "rigth.png"]}]},
-            r"got 'rigth.png' \(did you mean 'right.png'\?\)",
-        ),
-        (
-            {"triplets": [{"context": ["left.png", "right.png"], "target": ["no.png"]}]},
-            "triplets 1: .*got 'no.png'",
-        ),
+        ({"pairs": [{"context": ["left.png", "rigth.png"]}]}, r"got 'rigth.png' \(did you mean 'right.png'\?\)"),
+        ({"triplets": [{"context": ["left.png", "right.png"], "target": ["no.png"]}]}, "triplets 1: .*got 'no.png'"),
     ],
 )
-def test_bad_pairs_files_are_refused(tmp_path: Path, content: dict, message: str) -> None:
+def test_invalid_pairs_files_are_refused(tmp_path: Path, content: dict, message: str) -> None:
     folder = _folder(tmp_path / "room")
     (folder / "pairs.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=rf"pairs\.json.*{message}"):
         load_pairs(folder)
 
 
-def test_broken_json_is_refused_with_the_line(tmp_path: Path) -> None:
+def test_invalid_json_is_refused_with_the_line(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "room")
     (folder / "poses.json").write_text('{\n "convention": "cam2world opencv",\n}')
     with pytest.raises(InputError, match=r"poses\.json: needed JSON, got invalid text at line 3"):
@@ -314,8 +308,8 @@ def test_one_panorama_is_refused(tmp_path: Path) -> None:
         load_pairs(_folder(tmp_path / "room", ["only.png"]))
 
 
-def test_pictures_without_poses_are_refused(tmp_path: Path) -> None:
-    _picture(tmp_path / "left.png")
+def test_images_without_poses_are_refused(tmp_path: Path) -> None:
+    _write_panorama(tmp_path / "left.png")
     with pytest.raises(InputError, match=r"needed poses for the panoramas, got images only \(left\.png\)"):
         load_pairs(tmp_path)
 
@@ -325,7 +319,7 @@ def test_paths_without_panoramas_are_refused(tmp_path: Path) -> None:
         load_pairs(tmp_path)
     with pytest.raises(InputError, match="got no such path"):
         load_pairs(tmp_path / "gone")
-    _picture(tmp_path / "a.png")
+    _write_panorama(tmp_path / "a.png")
     with pytest.raises(InputError, match="needed a folder of posed panoramas, got a file"):
         load_pairs(tmp_path / "a.png")
 

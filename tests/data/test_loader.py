@@ -1,4 +1,4 @@
-"""Batches are decided by seed and step alone; what cannot be read is left out, counted and named."""
+"""Batches are determined by seed and step; unreadable samples are skipped, counted and named."""
 
 import itertools
 import json
@@ -36,7 +36,7 @@ def _equal(first: list[Batch], second: list[Batch]) -> bool:
     )
 
 
-def test_each_epoch_is_another_order_of_all_samples(tmp_path: Path) -> None:
+def test_each_epoch_is_a_permutation_of_all_samples(tmp_path: Path) -> None:
     loader = Loader(_triplets(tmp_path, 6), height=8, batch_size=2)
     names = [name for batch in _take(loader, 9) for name in batch.names]
     epochs = [names[6 * k : 6 * k + 6] for k in range(3)]
@@ -44,14 +44,14 @@ def test_each_epoch_is_another_order_of_all_samples(tmp_path: Path) -> None:
     assert len(set(map(tuple, epochs))) > 1
 
 
-def test_a_run_resumed_at_a_step_goes_on_as_if_never_stopped(tmp_path: Path) -> None:
+def test_batches_from_a_step_equal_those_of_an_uninterrupted_run(tmp_path: Path) -> None:
     loader = Loader(_triplets(tmp_path, 5), height=8, batch_size=2, seed=3, augmentation=Augmentation(tilt_degrees=4))
     whole = _take(loader, 7)
     assert _equal(_take(loader, 3, step=4), whole[4:])
     assert not _equal(_take(loader, 3, step=3), whole[4:])
 
 
-def test_the_number_of_workers_does_not_matter(tmp_path: Path) -> None:
+def test_batches_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     scenes = GeneratedTriplets(count=5, samples=1)
     options = {"height": 8, "batch_size": 2, "seed": 1, "augmentation": Augmentation(exposure=0.3)}
     alone = _take(Loader(scenes, **options), 3)
@@ -59,7 +59,7 @@ def test_the_number_of_workers_does_not_matter(tmp_path: Path) -> None:
     assert not _equal(_take(Loader(scenes, **(options | {"seed": 2})), 3), alone)
 
 
-def test_processes_share_each_step(tmp_path: Path) -> None:
+def test_ranks_get_consecutive_parts_of_each_batch(tmp_path: Path) -> None:
     source = _triplets(tmp_path, 8)
     whole = _take(Loader(source, height=8, batch_size=4), 2)
     parts = [_take(Loader(source, height=8, batch_size=2, rank=rank, world_size=2), 2) for rank in range(2)]
@@ -67,23 +67,23 @@ def test_processes_share_each_step(tmp_path: Path) -> None:
         assert batch.names == first.names + second.names
 
 
-def test_unreadable_samples_are_left_out_counted_and_named(tmp_path: Path) -> None:
+def test_unreadable_samples_are_skipped_counted_and_named(tmp_path: Path) -> None:
     source = _triplets(tmp_path, 6)
     (tmp_path / "2_1.png").write_bytes(b"")
     (tmp_path / "4_0.png").write_bytes((tmp_path / "4_0.png").read_bytes()[:40])
     loader = Loader(source, height=8, batch_size=3)
-    with pytest.warns(UserWarning, match="skipped sample") as told:
+    with pytest.warns(UserWarning, match="skipped sample") as caught:
         batches = _take(loader, 4)
     assert all(len(batch) == 3 for batch in batches)
     assert not {"2", "4"} & {name for batch in batches for name in batch.names}
-    assert len(told) == 2 and any("2_1.png" in str(w.message) for w in told)
+    assert len(caught) == 2 and any("2_1.png" in str(w.message) for w in caught)
     assert sorted(message.split(":")[0].rsplit("/")[-1] for message in loader.skipped) == ["2_1.png", "4_0.png"]
     assert all(count >= 2 for count in loader.skipped.values())  # in each of the two epochs
     with pytest.warns(UserWarning):
         assert _equal(_take(Loader(source, height=8, batch_size=3), 2, step=2), batches[2:])
 
 
-def test_if_all_are_unreadable_the_error_names_some(tmp_path: Path) -> None:
+def test_an_error_names_files_when_all_samples_are_unreadable(tmp_path: Path) -> None:
     source = _triplets(tmp_path, 4)
     for path in tmp_path.glob("*_1.png"):
         path.write_bytes(b"")
@@ -94,7 +94,7 @@ def test_if_all_are_unreadable_the_error_names_some(tmp_path: Path) -> None:
         _take(Loader(source, height=8, batch_size=1), 1)
 
 
-def test_a_mistake_in_the_code_is_not_taken_for_a_bad_file() -> None:
+def test_other_exceptions_of_a_source_are_not_caught() -> None:
     class Broken:
         def __len__(self) -> int:
             return 3
@@ -106,7 +106,7 @@ def test_a_mistake_in_the_code_is_not_taken_for_a_bad_file() -> None:
         _take(Loader(Broken(), height=8, batch_size=1), 1)
 
 
-def test_loaders_of_nothing_are_refused() -> None:
+def test_empty_sources_and_batches_are_refused() -> None:
     with pytest.raises(InputError, match="empty source"):
         Loader(GeneratedTriplets(count=0), height=8, batch_size=1)
     with pytest.raises(InputError, match="batch_size >= 1"):

@@ -30,7 +30,7 @@ def _room(x: float, z: float, plain: bool = False) -> torch.Tensor:
 
 
 def _cap(image: torch.Tensor, degrees: float, *, top: bool) -> torch.Tensor:
-    """The image with a black disc of that radius round a pole."""
+    """The image with a black disc of that radius around a pole."""
     capped = image.clone()
     rows = round(degrees / 180 * _HEIGHT)
     if top:
@@ -45,7 +45,7 @@ _PLACES = ((0.0, 0.0), (0.9, 0.3), (-0.5, 1.1), (0.2, -1.3), (1.3, 1.5))
 
 @pytest.mark.parametrize("count", [2, 3, 5])
 @pytest.mark.parametrize("top", [False, True])
-def test_a_cap_that_travels_with_the_camera_is_masked(count: int, top: bool) -> None:
+def test_a_cap_fixed_to_the_camera_is_masked(count: int, top: bool) -> None:
     images = torch.stack([_cap(_room(*place), 15, top=top) for place in _PLACES[:count]])
     scene = detect_scene_mask(images)
     rows = round(15 / 180 * _HEIGHT)
@@ -59,27 +59,27 @@ def test_a_cap_that_travels_with_the_camera_is_masked(count: int, top: bool) -> 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
 @pytest.mark.parametrize("plain", [False, True])
-def test_floors_and_ceilings_are_scene(count: int, plain: bool) -> None:
+def test_floors_and_ceilings_are_not_masked(count: int, plain: bool) -> None:
     assert detect_scene_mask(torch.stack([_room(*p, plain=plain) for p in _PLACES[:count]])).all()
 
 
-def test_a_camera_that_did_not_move_masks_nothing() -> None:
+def test_nothing_is_masked_for_a_camera_that_did_not_move() -> None:
     image = _cap(_room(0, 0), 15, top=False)
     assert detect_scene_mask(torch.stack((image, image, image + 0.001))).all()
 
 
-def test_the_mask_rolls_with_the_panoramas() -> None:
+def test_rolling_the_panoramas_rolls_the_mask() -> None:
     images = torch.stack([_cap(_room(*place), 15, top=False) for place in _PLACES[:3]])
     images[:, :, 220:, 100:160] = 0  # an arm to one side
     rolled = detect_scene_mask(torch.roll(images, 128, dims=-1))
     assert (torch.roll(detect_scene_mask(images), 128, dims=-1) != rolled).float().mean() < 0.01
 
 
-def test_one_panorama_masks_nothing() -> None:
+def test_nothing_is_masked_in_a_single_panorama() -> None:
     assert detect_scene_mask(_room(0, 0)[None]).all()
 
 
-def test_files_are_masked_at_the_size_wanted(tmp_path: Path) -> None:
+def test_masks_of_files_have_the_requested_size(tmp_path: Path) -> None:
     paths = []
     for i, place in enumerate(_PLACES[:3]):
         paths.append(tmp_path / f"{i}.png")
@@ -93,11 +93,11 @@ def test_files_are_masked_at_the_size_wanted(tmp_path: Path) -> None:
 
 
 @pytest.mark.shared
-def test_zinds_tripod_is_masked_and_nothing_else(shared: Path) -> None:
+def test_only_the_tripod_of_zind_is_masked(shared: Path) -> None:
     pair = load_pairs(shared / "data" / "zind")[0]
     scene = scene_mask_of_files(pair.siblings, _HEIGHT)
     area = (row_weights(_HEIGHT)[:, None] * ~scene).sum() / (2 * _HEIGHT * row_weights(_HEIGHT).sum())
     assert 0.01 < float(area) < 0.04
-    assert not scene[round(_HEIGHT * (1 - 6 / 180)) :].any()  # the body, 6 degrees round the nadir
+    assert not scene[round(_HEIGHT * (1 - 6 / 180)) :].any()  # the body, 6 degrees around the nadir
     assert scene[: round(_HEIGHT * (1 - 35 / 180))].all()
     assert math.isclose(float(pair.load_context(64).masks.float().mean()), float(scene.float().mean()), abs_tol=0.01)

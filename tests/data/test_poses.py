@@ -1,4 +1,4 @@
-"""Every convention leads to the same camera, and what is no pose is refused with the reason."""
+"""Every convention gives the same camera, and invalid poses are refused with the reason."""
 
 import math
 from pathlib import Path
@@ -20,7 +20,7 @@ def _pose() -> torch.Tensor:
     return pose
 
 
-def _written_as(cam2world: torch.Tensor, convention: str) -> torch.Tensor:
+def _in_convention(cam2world: torch.Tensor, convention: str) -> torch.Tensor:
     """The matrix that a user of the convention would have for an OpenCV cam2world pose."""
     flip = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=torch.float64))
     own = cam2world @ flip if convention.endswith("opengl") else cam2world
@@ -28,14 +28,9 @@ def _written_as(cam2world: torch.Tensor, convention: str) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_every_convention_leads_to_the_same_camera(convention: str) -> None:
-    matrix = rigid_matrix(_written_as(_pose(), convention).tolist(), "test")
+def test_every_convention_gives_the_same_camera(convention: str) -> None:
+    matrix = rigid_matrix(_in_convention(_pose(), convention).tolist(), "test")
     assert torch.allclose(to_cam2world(matrix, convention), _pose(), atol=1e-12)
-
-
-def test_conventions_differ() -> None:
-    poses = torch.stack([to_cam2world(_pose(), convention) for convention in CONVENTIONS])
-    assert torch.pdist(poses.reshape(4, 16)).min() > 0.5
 
 
 @pytest.mark.parametrize(
@@ -66,7 +61,7 @@ def test_unknown_conventions_are_refused_with_the_valid_names(text) -> None:
     assert all(name in str(caught.value) for name in CONVENTIONS)
 
 
-def test_three_rows_are_a_pose() -> None:
+def test_a_pose_may_have_three_rows() -> None:
     assert torch.equal(rigid_matrix(_pose()[:3].tolist(), "test"), _pose())
 
 
@@ -106,7 +101,7 @@ def _changed(**entries: float) -> list:
         ),
     ],
 )
-def test_what_is_no_rigid_pose_is_refused_with_the_reason(values, message: str) -> None:
+def test_matrices_that_are_not_rigid_are_refused_with_the_reason(values, message: str) -> None:
     with pytest.raises(InputError, match=f"^poses.json, 'a.png': .*{message}"):
         rigid_matrix(values, "poses.json, 'a.png'")
 
@@ -125,9 +120,9 @@ def _tum(poses: list[torch.Tensor]) -> str:
 
 @pytest.mark.parametrize("convention", [None, *CONVENTIONS])
 @pytest.mark.parametrize(("kind", "text"), [("kitti", _kitti), ("tum", _tum)])
-def test_trajectories_hold_the_poses_written_to_them(tmp_path: Path, kind: str, text, convention: str | None) -> None:
+def test_read_trajectories_equal_written_ones(tmp_path: Path, kind: str, text, convention: str | None) -> None:
     poses = [torch.eye(4, dtype=torch.float64), _pose()]
-    (tmp_path / "a.txt").write_text(text([_written_as(pose, convention or CONVENTIONS[0]) for pose in poses]))
+    (tmp_path / "a.txt").write_text(text([_in_convention(pose, convention or CONVENTIONS[0]) for pose in poses]))
     read = read_trajectory(tmp_path / "a.txt", convention)
     assert read.kind == kind
     assert (torch.stack(read.poses) - torch.stack(poses)).abs().max() < 1e-8
@@ -151,7 +146,7 @@ def test_trajectories_hold_the_poses_written_to_them(tmp_path: Path, kind: str, 
         ("1 0 0 0 0 1 0 0 0 0 9 0", None, "line 1: needed a rigid pose"),
     ],
 )
-def test_bad_trajectories_are_refused(tmp_path: Path, text: str, expected: str | None, message: str) -> None:
+def test_invalid_trajectories_are_refused(tmp_path: Path, text: str, expected: str | None, message: str) -> None:
     (tmp_path / "a.txt").write_text(text)
     with pytest.raises(InputError, match=message):
         read_trajectory(tmp_path / "a.txt", expected=expected)

@@ -1,4 +1,4 @@
-"""Networks and rooms so small that a step of training takes a moment."""
+"""Networks and samples that are small enough for fast training steps."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConf
 from pansplat.model.heads import AdapterConfig, HeadsConfig
 from pansplat.model.layers import Compat
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
-from pansplat.training import datasets, network, trainer
+from pansplat.training import network, trainer
 from pansplat.training.config import CheckpointConfig, DataConfig, NetworkConfig, OptimizerConfig, TrainConfig
 from pansplat.training.config import ValidationConfig as Validation
 
 
 def micro_config() -> PanSplatConfig:
-    """The paper's plan with as little in it as it bears; takes panoramas 32 pixels high."""
+    """The smallest network with all stages; for panoramas with a height of 32."""
     channels = (8, 8, 8, 8)
     levels = tuple(SweepLevel(3 - i, 8, 4, 32) for i in range(3))
     return PanSplatConfig(
@@ -32,7 +32,7 @@ def micro_config() -> PanSplatConfig:
 
 
 class PaintedSphere:
-    """Views from within a painted sphere of 3 m; sample n is the n-th painting."""
+    """A sample source: views inside a sphere of 3 m; sample n has the n-th random texture, `broken` samples are NaN."""
 
     def __init__(self, count: int = 8, broken: frozenset[int] = frozenset()) -> None:
         self.count, self.broken = count, broken
@@ -70,13 +70,13 @@ def sphere() -> type[PaintedSphere]:
 
 @pytest.fixture
 def make_batch() -> Callable[..., Batch]:
-    """A batch of painted spheres 32 pixels high."""
+    """Make a batch of painted spheres with a height of 32."""
     return lambda *numbers: collate([PaintedSphere().sample(n, 32, 0) for n in numbers or (0,)])
 
 
 @pytest.fixture
 def micro() -> Callable[..., PanSplat]:
-    """A network of a seed, float64 unless asked otherwise."""
+    """Make a network from a seed, float64 by default."""
 
     def make(compat: Compat = "fixed", dtype: torch.dtype = torch.float64) -> PanSplat:
         torch.manual_seed(3)
@@ -87,11 +87,10 @@ def micro() -> Callable[..., PanSplat]:
 
 @pytest.fixture
 def micro_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., TrainConfig]:
-    """Settings of a run of a micro network on painted spheres; runs made after this are of that kind."""
+    """Make settings of a run; trainers use a micro network and painted spheres while the fixture is active."""
     monkeypatch.setattr(network, "network_config", lambda shape: micro_config())
     monkeypatch.setattr(trainer, "load_sources", lambda data, height, seed: (PaintedSphere(), PaintedSphere(2)))
     monkeypatch.setattr(TrainConfig, "check", lambda self: None)
-    assert datasets is not None
 
     def make(name: str = "run", steps: int = 4, **settings: object) -> TrainConfig:
         whole: dict = {

@@ -1,4 +1,4 @@
-"""What is trained on: never the maps that are kept for evaluation."""
+"""Game maps that are reserved for evaluation are never training data."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _FAMILIES = (
 
 
 def write_triplets(folder: Path, *names: str) -> Path:
-    """Triplets as far as their names go: nothing in them is read before a sample is asked for."""
+    """Files with the names of triplets; their content is not read."""
     for name in names:
         (folder / f"{name}.json").write_text("{}")
         (folder / f"{name}_0.png").write_bytes(b"")
@@ -26,7 +26,7 @@ def write_triplets(folder: Path, *names: str) -> Path:
 
 
 @pytest.mark.parametrize("family", _FAMILIES)
-def test_a_reserved_map_is_never_trained_on(family: str, tmp_path: Path) -> None:
+def test_reserved_maps_are_skipped_with_a_warning(family: str, tmp_path: Path) -> None:
     write_triplets(tmp_path, f"{family}_000", f"{family}_001", "oa_dm3_000")
     with pytest.warns(UserWarning, match="2 of 3 triplets belong to maps that are reserved"):
         both = load_sources(DataConfig("triplets", tmp_path), 64, 0)
@@ -35,20 +35,20 @@ def test_a_reserved_map_is_never_trained_on(family: str, tmp_path: Path) -> None
         assert [path.stem for path in source.triplets.sources] == ["oa_dm3_000"]
 
 
-def test_a_folder_of_reserved_maps_alone_is_refused(tmp_path: Path) -> None:
+def test_a_folder_of_reserved_maps_only_is_refused(tmp_path: Path) -> None:
     write_triplets(tmp_path, "strength_000", "bleach_017")
     with pytest.raises(InputError, match="needed training data, got 2 triplets of reserved maps only"):
         load_sources(DataConfig("triplets", tmp_path), 64, 0)
 
 
-def test_names_that_only_look_alike_are_trained_on() -> None:
+def test_similar_names_are_not_reserved() -> None:
     free = ("oacmpdm10_000", "oa_koth2_003", "pul1ctf_001", "strengthened_000", "oa_minias", "desertfactory_002")
     assert not any(map(is_reserved, free))
     assert all(is_reserved(f"{name}_012") and is_reserved(name.upper()) for name in RESERVED)
     assert set(_FAMILIES) <= RESERVED
 
 
-def test_the_demo_maps_are_trained_on_without_the_reserved_ones(shared: Path) -> None:
+def test_reserved_demo_maps_are_skipped(shared: Path) -> None:
     root = shared / "data" / "bsp_demo"
     with pytest.warns(UserWarning, match="6 of 12 triplets"):
         training, _ = load_sources(DataConfig("triplets", root), 64, 0)

@@ -1,4 +1,4 @@
-"""Deferred gradients are the plain path's."""
+"""Gradients of deferred backpropagation equal those of plain backpropagation."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from pansplat.training.step import TrainingStep, accumulate_gradients
 def gradients(
     network: PanSplat | MVSplat, memory: MemoryConfig, *batches: Batch, auxiliary: AuxiliaryHeads | None = None
 ) -> tuple[dict[str, torch.Tensor], dict[str, float]]:
-    """Of every parameter that gets one, and the parts of the loss."""
+    """Gradients by parameter, and the loss terms."""
     network.zero_grad()
-    told = accumulate_gradients(TrainingStep(network, auxiliary, Structure(), LossWeights(), memory), batches)
-    return {name: p.grad.clone() for name, p in network.named_parameters() if p.grad is not None}, told
+    terms = accumulate_gradients(TrainingStep(network, auxiliary, Structure(), LossWeights(), memory), batches)
+    return {name: p.grad.clone() for name, p in network.named_parameters() if p.grad is not None}, terms
 
 
-def assert_equal_gradients(found: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> None:
-    assert found.keys() == wanted.keys()
-    for name, gradient in wanted.items():
+def assert_equal_gradients(found: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) -> None:
+    assert found.keys() == expected.keys()
+    for name, gradient in expected.items():
         scale = float(gradient.abs().max())
         torch.testing.assert_close(found[name], gradient, rtol=1e-6, atol=1e-6 * scale + 1e-14, msg=name)
 
@@ -41,22 +41,22 @@ def test_deferred_gradients_equal_plain_ones(
 ) -> None:
     network, batch = micro(), make_batch()
     set_training_mode(network, ())
-    wanted, loss = gradients(network, MemoryConfig("plain", 1, style), batch)
+    expected, loss = gradients(network, MemoryConfig("plain", 1, style), batch)
     found, deferred_loss = gradients(network, MemoryConfig(method, 2, style), batch)
     assert loss["depth"] > 0 and loss["square"] > 0
     assert deferred_loss == pytest.approx(loss, rel=1e-9)
-    assert any(name.startswith("features.") for name in wanted)
-    assert_equal_gradients(found, wanted)
+    assert any(name.startswith("features.") for name in expected)
+    assert_equal_gradients(found, expected)
 
 
-def test_deferred_gradients_equal_plain_ones_when_views_are_mixed(
+def test_deferred_gradients_equal_plain_ones_with_blended_views(
     micro: Callable[..., PanSplat], make_batch: Callable[..., Batch]
 ) -> None:
     network, batch = micro(), make_batch()
     set_training_mode(network, ())
-    wanted, _ = gradients(network, MemoryConfig("plain", 1, "cubemap", "by_view"), batch)
+    expected, _ = gradients(network, MemoryConfig("plain", 1, "cubemap", "by_view"), batch)
     found, _ = gradients(network, MemoryConfig("two-step", 2, "cubemap", "by_view"), batch)
-    assert_equal_gradients(found, wanted)
+    assert_equal_gradients(found, expected)
 
 
 def test_deferred_gradients_equal_plain_ones_with_auxiliary_heads(
@@ -64,50 +64,50 @@ def test_deferred_gradients_equal_plain_ones_with_auxiliary_heads(
 ) -> None:
     network, batch = micro(), make_batch()
     set_training_mode(network, ())
-    extra = build_auxiliary_heads(network).double()
-    wanted, plain = gradients(network, MemoryConfig("plain"), batch, auxiliary=extra)
-    own = [p.grad.clone() for p in extra.parameters() if p.grad is not None]
-    extra.zero_grad()
-    found, _ = gradients(network, MemoryConfig("two-step", 2), batch, auxiliary=extra)
+    heads = build_auxiliary_heads(network).double()
+    expected, plain = gradients(network, MemoryConfig("plain"), batch, auxiliary=heads)
+    own = [p.grad.clone() for p in heads.parameters() if p.grad is not None]
+    heads.zero_grad()
+    found, _ = gradients(network, MemoryConfig("two-step", 2), batch, auxiliary=heads)
     assert plain["auxiliary"] > 0
-    assert_equal_gradients(found, wanted)
-    for parameter, gradient in zip(extra.parameters(), own, strict=True):
+    assert_equal_gradients(found, expected)
+    for parameter, gradient in zip(heads.parameters(), own, strict=True):
         torch.testing.assert_close(parameter.grad, gradient)
 
 
-def test_a_frozen_part_gets_no_gradient_and_keeps_its_statistics(
+def test_frozen_parts_have_no_gradient_and_keep_their_statistics(
     micro: Callable[..., PanSplat], make_batch: Callable[..., Batch]
 ) -> None:
     network, batch, frozen = micro(), make_batch(), ("features", "cost_volume")
     freeze(network, frozen)
     set_training_mode(network, frozen)
     before = {name: tensor.clone() for name, tensor in network.features.state_dict().items()}
-    wanted, _ = gradients(network, MemoryConfig("plain", 1, "cubemap"), batch)
+    expected, _ = gradients(network, MemoryConfig("plain", 1, "cubemap"), batch)
     found, _ = gradients(network, MemoryConfig("two-step", 2, "cubemap"), batch)
-    assert wanted and all(name.startswith("heads.") for name in wanted)
-    assert_equal_gradients(found, wanted)
+    assert expected and all(name.startswith("heads.") for name in expected)
+    assert_equal_gradients(found, expected)
     for name, tensor in network.features.state_dict().items():
         assert torch.equal(tensor, before[name]), name
 
 
-def test_gradients_of_two_items_are_those_of_two_batches_of_one(
+def test_gradients_of_a_batch_equal_those_of_its_items_accumulated(
     micro: Callable[..., PanSplat], make_batch: Callable[..., Batch]
 ) -> None:
     network, memory = micro().eval(), MemoryConfig("two-step", 1, "cubemap")
-    both, joint = gradients(network, memory, make_batch(0, 1))
-    found, apart = gradients(network, memory, make_batch(0), make_batch(1))
-    assert_equal_gradients(found, both)
-    assert apart == pytest.approx(joint, rel=1e-9)
+    expected, joint = gradients(network, memory, make_batch(0, 1))
+    found, separate = gradients(network, memory, make_batch(0), make_batch(1))
+    assert_equal_gradients(found, expected)
+    assert separate == pytest.approx(joint, rel=1e-9)
 
 
 def test_deferred_gradients_of_the_baseline_equal_plain_ones(make_batch: Callable[..., Batch]) -> None:
     network, batch = micro_mvsplat(), make_batch(0, 1)
-    wanted, loss = gradients(network, MemoryConfig("plain", 1, "cubemap"), batch)
-    assert wanted.keys() == {name for name, _ in network.named_parameters()}
+    expected, loss = gradients(network, MemoryConfig("plain", 1, "cubemap"), batch)
+    assert expected.keys() == {name for name, _ in network.named_parameters()}
     for method in ("one-step", "two-step"):
-        found, deferred_loss = gradients(network, MemoryConfig(method, 2, "cubemap"), batch)  # it has one tile only
+        found, deferred_loss = gradients(network, MemoryConfig(method, 2, "cubemap"), batch)  # has one tile in any case
         assert deferred_loss == pytest.approx(loss, rel=1e-9)
-        assert_equal_gradients(found, wanted)
+        assert_equal_gradients(found, expected)
 
 
 def micro_mvsplat() -> MVSplat:

@@ -1,4 +1,4 @@
-"""The losses have their closed forms' values and their finite differences' gradients; what is masked has no part."""
+"""Losses have their closed forms and the gradients of finite differences; masked pixels have no effect."""
 
 import math
 from pathlib import Path
@@ -27,10 +27,10 @@ from pansplat.training.losses import (
 NEAR, FAR = 0.5, 10.0
 
 
-def pictures(height: int = 24, *, seed: int = 0, batch: int = 2) -> tuple[Tensor, Tensor]:
+def random_images(height: int = 24, *, seed: int = 0, batch: int = 2) -> tuple[Tensor, Tensor]:
     random = torch.Generator().manual_seed(seed)
-    made = torch.rand(2, batch, 3, height, 2 * height, generator=random, dtype=torch.float64)
-    return made[0], made[1]
+    images = torch.rand(2, batch, 3, height, 2 * height, generator=random, dtype=torch.float64)
+    return images[0], images[1]
 
 
 def depths(*heights: int, seed: int = 0) -> list[Tensor]:
@@ -38,7 +38,7 @@ def depths(*heights: int, seed: int = 0) -> list[Tensor]:
     return [1 + 4 * torch.rand(1, 2, h, 2 * h, generator=random, dtype=torch.float64) for h in heights]
 
 
-def far_off(prediction: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
+def mean_distance(prediction: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
     """A perceptual distance that anyone can compute: the absolute difference of the means."""
     return (prediction.mean(dim=(1, 2, 3)) - target.mean(dim=(1, 2, 3))).abs()
 
@@ -56,30 +56,30 @@ def test_presets_are_those_of_paper_and_code() -> None:
     )
 
 
-# Pictures
+# Images
 
 
-def test_an_error_of_a_tenth_squares_to_a_hundredth() -> None:
+def test_mean_square_has_its_closed_form() -> None:
     target = torch.full((1, 3, 8, 16), 0.5, dtype=torch.float64)
     assert float(mean_square(target + 0.1, target)) == pytest.approx(0.01)
 
 
-def test_pictures_are_not_clamped() -> None:
+def test_images_are_not_clamped() -> None:
     target = torch.ones(1, 3, 8, 16, dtype=torch.float64)
     assert float(mean_square(target + 1, target)) == pytest.approx(1.0)
 
 
-def test_the_image_loss_is_the_weighted_sum_of_its_parts() -> None:
+def test_the_image_loss_is_the_weighted_sum_of_its_terms() -> None:
     target = torch.full((2, 3, 8, 16), 0.5, dtype=torch.float64)
-    loss = image_loss(target + 0.2, target, far_off, CODE)
+    loss = image_loss(target + 0.2, target, mean_distance, CODE)
     assert float(loss.square) == pytest.approx(0.04)
     assert float(loss.perceptual) == pytest.approx(0.2)
     assert float(loss.total) == pytest.approx(0.04 + 0.05 * 0.2)
     assert float(image_loss(target + 0.2, target, None, CODE).total) == pytest.approx(0.04)
 
 
-def test_masked_pixels_have_no_part_in_the_image_loss() -> None:
-    prediction, target = pictures()
+def test_masked_pixels_do_not_affect_the_image_loss() -> None:
+    prediction, target = random_images()
     masks = torch.ones(2, 24, 48, dtype=torch.bool)
     masks[:, 16:] = False
     spoilt = prediction.clone()
@@ -91,8 +91,8 @@ def test_masked_pixels_have_no_part_in_the_image_loss() -> None:
     assert float(losses[0].square) == pytest.approx(inside)
 
 
-def test_without_any_pixel_the_loss_and_its_gradients_are_zero() -> None:
-    prediction, target = pictures()
+def test_the_loss_and_its_gradients_are_zero_when_all_pixels_are_masked() -> None:
+    prediction, target = random_images()
     prediction.requires_grad_()
     weights = torch.zeros(2, 24, 48)
     loss = image_loss(prediction, target, Structure(), pixel_weights=weights).total
@@ -114,7 +114,7 @@ def test_spherical_weights_are_solid_angles_and_off_by_default() -> None:
 
 @pytest.mark.parametrize("weighted", [False, True])
 def test_the_image_loss_has_the_gradients_of_finite_differences(weighted: bool) -> None:
-    prediction, target = pictures(12, batch=1)
+    prediction, target = random_images(12, batch=1)
     weights = torch.rand(1, 12, 24, generator=torch.Generator().manual_seed(1)).double() if weighted else None
 
     def total(p: Tensor) -> Tensor:
@@ -123,11 +123,11 @@ def test_the_image_loss_has_the_gradients_of_finite_differences(weighted: bool) 
     assert torch.autograd.gradcheck(total, prediction.requires_grad_(), fast_mode=True)
 
 
-# What stands in for LPIPS
+# Structure
 
 
-def test_structure_is_zero_for_equal_pictures_and_symmetric() -> None:
-    prediction, target = pictures()
+def test_structure_is_symmetric_and_zero_for_equal_images() -> None:
+    prediction, target = random_images()
     structure = Structure()
     assert structure(target, target).tolist() == pytest.approx([0.0, 0.0], abs=1e-12)
     forth, back = structure(prediction, target), structure(target, prediction)
@@ -135,7 +135,7 @@ def test_structure_is_zero_for_equal_pictures_and_symmetric() -> None:
     assert float(forth.min()) > 0.1
 
 
-def test_structure_of_constant_pictures_is_its_closed_form() -> None:
+def test_structure_of_constant_images_has_its_closed_form() -> None:
     """Without structure only SSIM's luminance term is left, on every scale."""
     a, b = 0.3, 0.7
     value = Structure()(*(torch.full((1, 3, 48, 96), c, dtype=torch.float64) for c in (a, b)))
@@ -143,30 +143,30 @@ def test_structure_of_constant_pictures_is_its_closed_form() -> None:
     assert float(value) == pytest.approx((1 - luminance) / 2, abs=1e-9)
 
 
-def test_ssim_of_the_inside_equals_the_metric_up_to_its_sample_covariance() -> None:
+def test_ssim_inside_the_image_equals_the_metric() -> None:
     """The windows that lie inside the picture; the metric's (co)variances are 121/120 of ours."""
     from pansplat.evaluation.metrics import ssim
 
-    prediction, target = (picture[0] for picture in pictures(32))
+    prediction, target = (image[0] for image in random_images(32))
     ours = float(ssim_map(prediction[None], target[None])[..., 5:-5, 5:-5].mean())
     assert ours == pytest.approx(ssim(prediction, target), abs=2e-3)
 
 
-def test_structure_rolls_with_the_panorama() -> None:
-    prediction, target = pictures(32)
+def test_structure_is_invariant_to_rolling() -> None:
+    prediction, target = random_images(32)
     rolled = Structure()(prediction.roll(8, -1), target.roll(8, -1))
     torch.testing.assert_close(rolled, Structure()(prediction, target))
 
 
-def test_structure_grows_with_blur_where_the_mean_error_is_the_same() -> None:
-    _, target = pictures(32)
+def test_structure_is_larger_for_blur_than_for_brightness() -> None:
+    _, target = random_images(32)
     brighter = target + 0.05
     blurred = (target + target.roll(1, -1) + target.roll(-1, -1)) / 3
     assert float(Structure()(blurred, target).mean()) > float(Structure()(brighter, target).mean())
 
 
 @pytest.mark.shared
-def test_auto_takes_lpips_where_its_files_are_and_structure_where_not(
+def test_auto_selects_lpips_if_its_files_exist_and_structure_otherwise(
     shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("PANSPLAT_LPIPS", raising=False)
@@ -182,13 +182,13 @@ def test_auto_takes_lpips_where_its_files_are_and_structure_where_not(
 
 
 @pytest.mark.parametrize("form", ["depth", "inverse_depth"])
-def test_the_true_depth_has_no_loss(form) -> None:
+def test_the_depth_loss_of_the_true_depth_is_zero(form) -> None:
     truth = torch.full((1, 2, 32, 64), 3.0, dtype=torch.float64)
     levels = [torch.full((1, 2, h, 2 * h), 3.0, dtype=torch.float64) for h in (4, 8, 16)]
     assert float(depth_loss(levels, truth, NEAR, FAR, form=form)) == pytest.approx(0, abs=1e-15)
 
 
-def test_depth_losses_are_their_closed_forms() -> None:
+def test_depth_losses_have_their_closed_forms() -> None:
     """Constant depths: metres apart in one form, inverse metres in the other; coarser levels count less."""
     truth = torch.full((1, 2, 32, 64), 2.0, dtype=torch.float64)
     levels = [torch.full((1, 2, h, 2 * h), d, dtype=torch.float64) for h, d in ((4, 5.0), (8, 4.0), (16, 2.5))]
@@ -214,7 +214,7 @@ def test_depth_outside_the_range_is_unknown(form, unknown: float) -> None:
 
 
 @pytest.mark.parametrize("form", ["depth", "inverse_depth"])
-def test_masked_depth_has_no_part(form) -> None:
+def test_masked_depth_does_not_affect_the_loss(form) -> None:
     (level,), (truth,) = depths(16), depths(16, seed=1)
     masks = torch.ones(1, 2, 16, 32, dtype=torch.bool)
     masks[..., 8:, :] = False
@@ -234,7 +234,7 @@ def test_each_view_has_its_own_range() -> None:
     assert float(both) == pytest.approx(float(first))
 
 
-def test_depths_are_not_mixed_when_the_truth_is_made_smaller() -> None:
+def test_true_depth_is_downsampled_without_interpolation() -> None:
     """Columns of 2 and 6 metres: a mixture would be 4."""
     truth = torch.full((1, 1, 16, 32), 2.0, dtype=torch.float64)
     truth[..., 1::2] = 6.0
@@ -242,7 +242,7 @@ def test_depths_are_not_mixed_when_the_truth_is_made_smaller() -> None:
     assert float(depth_loss([level], truth, NEAR, FAR, form="depth")) == 0
 
 
-def test_a_spherical_depth_loss_counts_rows_by_their_solid_angle() -> None:
+def test_the_spherical_depth_loss_weights_rows_by_solid_angle() -> None:
     truth = torch.full((1, 1, 16, 32), 2.0, dtype=torch.float64)
     level = truth.clone()
     level[..., 0, :] = 3.0
@@ -266,15 +266,15 @@ def test_depth_losses_have_the_gradients_of_finite_differences(form) -> None:
 
 def test_the_auxiliary_loss_sums_the_levels_image_losses() -> None:
     target = torch.full((1, 3, 8, 16), 0.5, dtype=torch.float64)
-    drawn = [target + error for error in (0.4, 0.2, 0.1)]
+    rendered = [target + error for error in (0.4, 0.2, 0.1)]
     weights = LossWeights(perceptual=0.5)
     parts = [error**2 + 0.5 * error for error in (0.4, 0.2, 0.1)]
-    value = float(auxiliary_loss(drawn, target, far_off, weights))
+    value = float(auxiliary_loss(rendered, target, mean_distance, weights))
     assert value == pytest.approx(0.9**2 * parts[0] + 0.9 * parts[1] + parts[2])
 
 
 def test_the_auxiliary_loss_reaches_every_level() -> None:
-    _, target = pictures(12)
-    drawn = [pictures(12, seed=seed)[0].requires_grad_() for seed in (1, 2, 3)]
-    auxiliary_loss(drawn, target, Structure()).backward()
-    assert all(picture.grad is not None and bool(picture.grad.any()) for picture in drawn)
+    _, target = random_images(12)
+    rendered = [random_images(12, seed=seed)[0].requires_grad_() for seed in (1, 2, 3)]
+    auxiliary_loss(rendered, target, Structure()).backward()
+    assert all(image.grad is not None and bool(image.grad.any()) for image in rendered)

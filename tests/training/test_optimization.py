@@ -1,4 +1,4 @@
-"""The rate is the original's, by value, and is a cycle for any length."""
+"""Learning rates equal the official ones, and form a cycle for any number of steps."""
 
 from collections.abc import Callable
 
@@ -8,10 +8,10 @@ import torch
 from pansplat.training.optimization import one_cycle_rate
 
 
-def test_rates_are_the_originals(golden: Callable[[str], dict[str, torch.Tensor]]) -> None:
-    wanted = golden("units")["lr.total1000"]
+def test_rates_equal_the_official_ones(golden: Callable[[str], dict[str, torch.Tensor]]) -> None:
+    expected = golden("units")["lr.total1000"]
     ours = torch.tensor([one_cycle_rate(step, 1000 + 10, 2e-4) for step in range(1000)], dtype=torch.float64)
-    torch.testing.assert_close(ours, wanted, rtol=1e-9, atol=1e-16)
+    torch.testing.assert_close(ours, expected, rtol=1e-9, atol=1e-16)
 
 
 @pytest.mark.parametrize("total", [11, 60, 310, 33_260])
@@ -22,6 +22,6 @@ def test_the_rate_is_positive_and_at_most_the_peak(total: int) -> None:
     assert rates[-1] == pytest.approx(1 / 25e4)
 
 
-def test_a_rise_that_ends_at_the_first_step_begins_at_the_peak() -> None:
+def test_a_rise_of_one_step_starts_at_the_peak() -> None:
     assert one_cycle_rate(0, 100, 2.0) == 2.0
     assert one_cycle_rate(99, 100, 2.0) == pytest.approx(2.0 / 250_000)

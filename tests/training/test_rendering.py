@@ -1,4 +1,4 @@
-"""A picture drawn part by part, each of the Gaussians that it can show, is the picture."""
+"""An image composed of parts, each rendered from its visible Gaussians, equals the whole image."""
 
 from __future__ import annotations
 
@@ -44,18 +44,20 @@ def cloud(count: int = 400, dtype: torch.dtype = torch.float64) -> Gaussians:
 
 
 @pytest.mark.parametrize(("style", "mixing"), list(itertools.product(STYLES, ("joint", "by_view"))))
-def test_the_parts_together_are_the_picture(style: Style, mixing: Mixing) -> None:
+def test_composed_parts_equal_the_whole_image(style: Style, mixing: Mixing) -> None:
     renderer, gaussians = TargetRenderer(style, mixing, HEIGHT), cloud()
     parts = renderer.parts(len(CONTEXT))
     masks = renderer.visible(gaussians, POSE, parts)
-    drawn = [renderer.render_part(gaussians.select(mask), POSE, part) for mask, part in zip(masks, parts, strict=True)]
+    rendered = [
+        renderer.render_part(gaussians.select(mask), POSE, part) for mask, part in zip(masks, parts, strict=True)
+    ]
     whole = renderer.render(gaussians, POSE, CONTEXT)
     assert float(whole.std()) > 0.05
-    torch.testing.assert_close(renderer.compose(drawn, POSE, CONTEXT), whole, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(renderer.compose(rendered, POSE, CONTEXT), whole, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("style", STYLES)
-def test_what_a_part_leaves_out_cannot_be_seen_in_it(style: Style) -> None:
+def test_gaussians_that_are_not_selected_are_invisible(style: Style) -> None:
     renderer, gaussians = TargetRenderer(style, "joint", HEIGHT), cloud()
     parts = renderer.parts(2)
     for mask, part in zip(renderer.visible(gaussians, POSE, parts), parts, strict=True):
@@ -63,7 +65,7 @@ def test_what_a_part_leaves_out_cannot_be_seen_in_it(style: Style) -> None:
 
 
 @pytest.mark.parametrize("style", STYLES)
-def test_a_part_is_drawn_of_few_gaussians(style: Style) -> None:
+def test_a_part_needs_few_of_the_gaussians(style: Style) -> None:
     renderer = TargetRenderer(style, "joint", 128)
     masks = renderer.visible(full_lattice_room(128), POSE, renderer.parts(2))
     assert max(float(mask.double().mean()) for mask in masks) < 0.3
@@ -79,7 +81,7 @@ def test_parts_of_no_gaussians_are_empty(style: Style) -> None:
 
 
 @pytest.mark.parametrize("height", [32, 64, 512, 2048])
-def test_strips_cover_every_row_once_and_have_one_area(height: int) -> None:
+def test_strips_cover_every_row_once_and_have_equal_areas(height: int) -> None:
     renderer = TargetRenderer("panorama", "joint", height)
     rows = [renderer._strip_rows(part.index) for part in renderer.parts(2)]
     assert rows[0][0] == 0 and rows[-1][1] == height

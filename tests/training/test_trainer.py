@@ -1,10 +1,8 @@
-"""A run learns, is gone on with exactly, and stops when it must."""
+"""Training reduces the loss, resumes bit-identically, and stops on errors and signals."""
 
 from __future__ import annotations
 
 import csv
-import os
-import signal
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,13 +14,13 @@ from PIL import Image
 from pansplat.errors import InputError
 from pansplat.model.weights import load_weights
 from pansplat.training import trainer
-from pansplat.training.config import CheckpointConfig, OptimizerConfig, TrainConfig, ValidationConfig
+from pansplat.training.config import OptimizerConfig, TrainConfig, ValidationConfig
 from pansplat.training.network import read_weights
 from pansplat.training.trainer import Trainer
 
 
 def curve(folder: Path) -> list[tuple[str, str, str]]:
-    """Step, loss and norm of the gradient of every row, to all digits that are written."""
+    """Step, loss and gradient norm of every row, as written."""
     with open(folder / "log.csv") as file:
         return [(row["step"], row["loss"], row["gradient_norm"]) for row in csv.DictReader(file)]
 
@@ -32,7 +30,7 @@ def trained(config: TrainConfig) -> dict[str, torch.Tensor]:
     return load_weights(config.out / "model.safetensors").tensors
 
 
-def test_a_run_learns(micro_run: Callable[..., TrainConfig]) -> None:
+def test_the_loss_decreases(micro_run: Callable[..., TrainConfig]) -> None:
     config = micro_run(steps=14, optimizer=OptimizerConfig(steps=14, batch_size=1, rate=5e-3))
     trained(config)
     losses = [float(loss) for _, loss, _ in curve(config.out)]
@@ -40,22 +38,22 @@ def test_a_run_learns(micro_run: Callable[..., TrainConfig]) -> None:
 
 
 class Killed(BaseException):
-    """As if the process were killed."""
+    """Simulates a kill."""
 
 
 @pytest.mark.parametrize("accumulate", [1, 2])
-def test_a_killed_run_goes_on_as_if_nothing_had_happened(
+def test_a_killed_run_resumes_bit_identically(
     accumulate: int, micro_run: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     optimizer = OptimizerConfig(steps=6, batch_size=1, accumulate=accumulate, rate=1e-3, ema=0.9)
     whole, broken = micro_run("whole", optimizer=optimizer), micro_run("broken", optimizer=optimizer)
-    wanted = trained(whole)
-    learn = Trainer._optimize
+    expected = trained(whole)
+    optimize = Trainer._optimize
 
     def killed(self: Trainer, batches: list) -> dict[str, float]:
         if self.step == 5:  # the last checkpoint is of step 4, and a row of step 4 has been written since
             raise Killed
-        return learn(self, batches)
+        return optimize(self, batches)
 
     with monkeypatch.context() as patched:
         patched.setattr(Trainer, "_optimize", killed)
@@ -65,37 +63,17 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(
     found = trained(broken)
     assert curve(broken.out) == curve(whole.out)
     assert len(curve(whole.out)) == 6
-    for name, tensor in wanted.items():
+    for name, tensor in expected.items():
         assert torch.equal(found[name], tensor), name
 
 
-def test_settings_may_not_change_under_way(micro_run: Callable[..., TrainConfig]) -> None:
+def test_resuming_with_other_settings_is_refused(micro_run: Callable[..., TrainConfig]) -> None:
     trained(micro_run(steps=1))
     with pytest.raises(InputError, match=r"optimizer.steps was 1, now 2"):
         Trainer(micro_run(steps=2), silent=True)
 
 
-def test_ctrl_c_saves_and_the_same_command_goes_on(
-    micro_run: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = micro_run(steps=4, checkpoint=CheckpointConfig(every=0))
-    learn = Trainer._optimize
-
-    def interrupted(self: Trainer, batches: list) -> dict[str, float]:
-        if self.step == 1:
-            os.kill(os.getpid(), signal.SIGINT)
-        return learn(self, batches)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Trainer, "_optimize", interrupted)
-        assert not Trainer(config, silent=True).train()
-    again = Trainer(config, silent=True)
-    assert again.step == 2
-    assert again.train()
-    assert len(curve(config.out)) == 4
-
-
-def test_a_loss_that_is_no_number_stops_the_run_and_keeps_the_batch(
+def test_a_loss_that_is_not_finite_stops_the_run_and_saves_the_batch(
     micro_run: Callable[..., TrainConfig], sphere: type, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = sphere(8, broken=frozenset(range(8)))
@@ -110,7 +88,7 @@ def test_a_loss_that_is_no_number_stops_the_run_and_keeps_the_batch(
     assert not list(config.out.glob("model.safetensors"))
 
 
-def test_validation_writes_numbers_and_pictures(micro_run: Callable[..., TrainConfig]) -> None:
+def test_validation_writes_measures_and_images(micro_run: Callable[..., TrainConfig]) -> None:
     config = micro_run(steps=2, validation=ValidationConfig(every=1, samples=2, pictures=1))
     trained(config)
     rows = list(csv.DictReader((config.out / "validation.csv").read_text().splitlines()))
@@ -121,19 +99,19 @@ def test_validation_writes_numbers_and_pictures(micro_run: Callable[..., TrainCo
         assert min(curves.size) > 300
 
 
-def test_the_height_grows_while_training(micro_run: Callable[..., TrainConfig]) -> None:
+def test_the_height_grows_during_training(micro_run: Callable[..., TrainConfig]) -> None:
     config = micro_run(steps=2, heights=(32, 64), validation=ValidationConfig(every=1, samples=1, pictures=0))
     trained(config)
     rows = csv.DictReader((config.out / "validation.csv").read_text().splitlines())
     assert [row["height"] for row in rows] == ["32", "32", "64"]
 
 
-def test_a_run_begins_with_the_weights_of_another(micro_run: Callable[..., TrainConfig]) -> None:
+def test_initial_weights_are_those_of_a_file(micro_run: Callable[..., TrainConfig]) -> None:
     config = micro_run(steps=2)
     final = trained(config)
     checkpoint = read_weights(config.out / "checkpoints" / "step_00000002.pt")
     assert all(torch.equal(checkpoint.tensors[name], tensor) for name, tensor in final.items())
 
     other = micro_run("other", network=replace(config.network, init=config.out / "model.safetensors"))
-    begun = Trainer(other, silent=True).network.state_dict()
-    assert all(torch.equal(begun[name], tensor) for name, tensor in final.items())
+    initial = Trainer(other, silent=True).network.state_dict()
+    assert all(torch.equal(initial[name], tensor) for name, tensor in final.items())

@@ -101,16 +101,12 @@ def _cylinder(ox, oy, oz, dx, dy, dz):
 def intersect_body(kind, m, x, y, z, dx, dy, dz):
     """Distance at which a ray enters a body; inf if it misses, negative if the body is behind or around the origin."""
     px, py, pz = x - m[3], y - m[7], z - m[11]
-    ox, oy, oz = (
-        m[0] * px + m[1] * py + m[2] * pz,
-        m[4] * px + m[5] * py + m[6] * pz,
-        m[8] * px + m[9] * py + m[10] * pz,
-    )
-    ux, uy, uz = (
-        m[0] * dx + m[1] * dy + m[2] * dz,
-        m[4] * dx + m[5] * dy + m[6] * dz,
-        m[8] * dx + m[9] * dy + m[10] * dz,
-    )
+    ox = m[0] * px + m[1] * py + m[2] * pz
+    oy = m[4] * px + m[5] * py + m[6] * pz
+    oz = m[8] * px + m[9] * py + m[10] * pz
+    ux = m[0] * dx + m[1] * dy + m[2] * dz
+    uy = m[4] * dx + m[5] * dy + m[6] * dz
+    uz = m[8] * dx + m[9] * dy + m[10] * dz
     if kind == 0:
         return _box(ox, oy, oz, ux, uy, uz)
     if kind == 1:
@@ -196,11 +192,9 @@ def _room_at(rooms, x, z):
 def _surface_point(kind, m, half, x, y, z):
     """Unit normal, face (two per axis; 0 for round sides), texture coordinates and half size of the face, metres."""
     px, py, pz = x - m[3], y - m[7], z - m[11]
-    qx, qy, qz = (
-        m[0] * px + m[1] * py + m[2] * pz,
-        m[4] * px + m[5] * py + m[6] * pz,
-        m[8] * px + m[9] * py + m[10] * pz,
-    )
+    qx = m[0] * px + m[1] * py + m[2] * pz
+    qy = m[4] * px + m[5] * py + m[6] * pz
+    qz = m[8] * px + m[9] * py + m[10] * pz
     a, b, c = abs(qx), abs(qy), abs(qz)
     nx, ny, nz, face = 0.0, 0.0, 0.0, 0
     u, v, half_u, half_v = qx * half[0], qy * half[1], half[0], half[1]
@@ -219,11 +213,9 @@ def _surface_point(kind, m, half, x, y, z):
         u, half_u = qz * half[2], half[2]
     else:
         nz, face = math.copysign(1.0, qz), 5 if qz > 0 else 4
-    wx, wy, wz = (
-        m[0] * nx + m[4] * ny + m[8] * nz,
-        m[1] * nx + m[5] * ny + m[9] * nz,
-        m[2] * nx + m[6] * ny + m[10] * nz,
-    )
+    wx = m[0] * nx + m[4] * ny + m[8] * nz
+    wy = m[1] * nx + m[5] * ny + m[9] * nz
+    wz = m[2] * nx + m[6] * ny + m[10] * nz
     size = math.sqrt(wx * wx + wy * wy + wz * wz)
     return wx / size, wy / size, wz / size, face, u, v, half_u, half_v
 
@@ -316,11 +308,9 @@ def _direct_light(bodies, lights, last, x, y, z, nx, ny, nz, jitter):
             continue
         _, last[k] = first_hit(bodies, x, y, z, lx, ly, lz, limit, True)
         if last[k] < 0:
-            r, g, b = (
-                r + power * light[LIGHT_COLOR],
-                g + power * light[LIGHT_COLOR + 1],
-                b + power * light[LIGHT_COLOR + 2],
-            )
+            r += power * light[LIGHT_COLOR]
+            g += power * light[LIGHT_COLOR + 1]
+            b += power * light[LIGHT_COLOR + 2]
     return r, g, b
 
 
@@ -381,15 +371,11 @@ def trace_panorama(scene, pose, samples, image, depth):
                 du, dv = ((k % samples) + 0.5) / samples, ((k // samples) + 0.5) / samples
                 if centre:
                     du, dv = 0.5, 0.5
-                longitude, latitude = (
-                    2 * math.pi * (j + du) / width - math.pi,
-                    math.pi * (i + dv) / height - 0.5 * math.pi,
-                )
-                cx, cy, cz = (
-                    math.cos(latitude) * math.sin(longitude),
-                    math.sin(latitude),
-                    math.cos(latitude) * math.cos(longitude),
-                )
+                longitude = 2 * math.pi * (j + du) / width - math.pi
+                latitude = math.pi * (i + dv) / height - 0.5 * math.pi
+                cx = math.cos(latitude) * math.sin(longitude)
+                cy = math.sin(latitude)
+                cz = math.cos(latitude) * math.cos(longitude)
                 dx = pose[0, 0] * cx + pose[0, 1] * cy + pose[0, 2] * cz
                 dy = pose[1, 0] * cx + pose[1, 1] * cy + pose[1, 2] * cz
                 dz = pose[2, 0] * cx + pose[2, 1] * cy + pose[2, 2] * cz

@@ -1,4 +1,4 @@
-"""Rays intersect_body bodies where formulas say, and the tree of boxes loses none."""
+"""Ray tracing has closed-form distances, and the BVH finds every hit."""
 
 import math
 
@@ -37,7 +37,7 @@ def test_distances_to_single_bodies_are_exact() -> None:
     assert _distance(drum, (0, 0, 1.1), (1e-9, 1, 1e-9)) == (math.inf, -1)
 
 
-def test_the_tree_finds_what_a_search_of_all_bodies_finds() -> None:
+def test_the_bvh_gives_the_hits_of_an_exhaustive_search() -> None:
     rng = np.random.default_rng(5)
 
     def fill(builder: SceneBuilder, material: int) -> None:
@@ -71,7 +71,7 @@ def test_the_tree_finds_what_a_search_of_all_bodies_finds() -> None:
     assert 50 < hits < 450
 
 
-def test_depth_is_along_the_ray_through_the_pixels_centre() -> None:
+def test_depth_is_radial_at_pixel_centres() -> None:
     scene = _scene(lambda b, material: b.box((0, 1.5, 0), (30, 0.1, 30), material))
     pose = np.eye(4)
     pose[:3, 3] = 3, 0.2, -1
@@ -83,7 +83,7 @@ def test_depth_is_along_the_ray_through_the_pixels_centre() -> None:
     assert np.isfinite(depth).all()
 
 
-def test_shadows_fall_behind_things() -> None:
+def test_bodies_cast_shadows() -> None:
     def fill(builder: SceneBuilder, material: int) -> None:
         builder.box((0, 1.1, 0), (5, 0.1, 5), material)
         builder.box((0, -0.5, 0), (0.3, 0.02, 0.3), material)

@@ -1,4 +1,4 @@
-"""Generated triplets are exact, free, repeatable and all different."""
+"""Generated triplets are exact, reproducible and different; their cameras are in free space."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def scenes() -> GeneratedTriplets:
     return GeneratedTriplets(seed=3, samples=1)
 
 
-def test_number_and_seed_decide_the_picture(scenes: GeneratedTriplets) -> None:
+def test_triplets_are_determined_by_seed_and_index(scenes: GeneratedTriplets) -> None:
     first, again, other = scenes.sample(4, 16), scenes.sample(4, 16, 99), scenes.sample(5, 16)
     assert torch.equal(first.context.images, again.context.images)
     assert torch.equal(first.targets.cam2world, again.targets.cam2world)
@@ -42,8 +42,8 @@ def test_samples_are_triplets_with_depth_and_free_cameras(scenes: GeneratedTripl
     assert max(baselines) - min(baselines) > 0.3
 
 
-def test_depth_takes_one_view_into_the_other(scenes: GeneratedTriplets) -> None:
-    """Both depths agree except behind things, and colours with them; not so with the baseline reversed."""
+def test_depth_warps_one_view_into_the_other(scenes: GeneratedTriplets) -> None:
+    """Depths and colours agree except behind objects, but not with a reversed baseline."""
     for index in range(3):
         views = scenes.sample(index, HEIGHT).context
         assert views.depths is not None
@@ -56,7 +56,7 @@ def test_depth_takes_one_view_into_the_other(scenes: GeneratedTriplets) -> None:
 
 
 def _agreement(images: torch.Tensor, depths: torch.Tensor, cam2world: torch.Tensor) -> tuple[float, float]:
-    """Share of view 0 where view 1's own depth is as expected, and the mean difference of their colours there."""
+    """Fraction of view 0 where the depth of view 1 agrees, and the mean difference of colours there."""
     pose = relative_pose(cam2world[:1], cam2world[1:])
     inverse = 1 / depths[:1, None]
     warped = warp_panorama(images[1:], inverse, pose.float())[0, :, 0]
@@ -67,15 +67,15 @@ def _agreement(images: torch.Tensor, depths: torch.Tensor, cam2world: torch.Tens
     return float(visible.float().mean()), float((warped - images[0]).abs().mean(dim=0)[visible].mean())
 
 
-def test_more_rays_a_pixel_smooth_the_picture_only() -> None:
+def test_more_rays_per_pixel_change_only_the_antialiasing() -> None:
     coarse, fine = (GeneratedTriplets(seed=3, samples=samples).sample(1, 32) for samples in (1, 3))
     assert torch.equal(coarse.context.depths, fine.context.depths)
     difference = (coarse.context.images - fine.context.images).abs().mean()
     assert 1e-4 < float(difference) < 0.06
 
 
-def test_no_ray_leaves_a_home_but_through_its_openings() -> None:
-    """Plans close: looked at from inside, most of the view is within the house."""
+def test_rays_leave_a_home_only_through_its_openings() -> None:
+    """Most of the view from inside is within the house."""
     for index in range(6):
         scene, plan = build_home(np.random.default_rng((11, index)))
         x0, z0, x1, z1 = plan.rooms[0]

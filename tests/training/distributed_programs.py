@@ -1,0 +1,98 @@
+"""Programs that torchrun starts for test_distributed.py: PROGRAM FOLDER. Each process writes its gradients to files."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from pansplat.data.views import Batch, collate
+from pansplat.model.pansplat import PanSplat
+from pansplat.training.config import MemoryConfig
+from pansplat.training.distributed import ProcessGroup, convert_sync_batch_norm, data_parallel, no_sync
+from pansplat.training.losses import LossWeights
+from pansplat.training.network import set_training_mode
+from pansplat.training.step import TrainingStep, accumulate_gradients
+
+sys.path.insert(0, str(Path(__file__).parent))
+from conftest import PaintedSphere, micro_config
+
+METHODS = (("plain", 1), ("plain", 2), ("two-step", 1), ("two-step", 2))
+"""Method of backpropagation, and number of batches per step."""
+
+
+def split_batches(folder: Path, processes: ProcessGroup) -> None:
+    """Gradients of a network for batches of two samples, of which each process has its part."""
+    torch.manual_seed(3)
+    network = PanSplat(micro_config(), "fixed").double()
+    convert_sync_batch_norm(network, processes)
+    set_training_mode(network, ())
+    step = TrainingStep(network, None, None, LossWeights(), MemoryConfig())
+    wrapped = data_parallel(step, processes)
+    found = {}
+    for method, rounds in METHODS:
+        step.memory = MemoryConfig(method, 1 if method == "plain" else 2, "original")
+        step.zero_grad()
+        accumulate_gradients(wrapped, [_batch_part(processes, n) for n in range(rounds)])
+        found |= {f"{method} {rounds} {name}": p.grad for name, p in network.named_parameters() if p.grad is not None}
+    buffers = {name: tensor for name, tensor in network.named_buffers() if tensor.is_floating_point()}
+    torch.save({**found, **buffers}, folder / f"{processes.count}_{processes.rank}.pt")
+
+
+def _batch_part(processes: ProcessGroup, number: int) -> Batch:
+    indices = [2 * number, 2 * number + 1]
+    own = indices if processes.count == 1 else indices[processes.rank : processes.rank + 1]
+    return collate([PaintedSphere().sample(n, 32, 0) for n in own])
+
+
+class Chain(nn.Module):
+    """A chain of layers, and an unused layer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.chain = nn.Sequential(*(nn.Linear(50, 50) for _ in range(4)))
+        self.unused = nn.Linear(3, 3)
+
+    def forward(self, inputs: Tensor, early: bool) -> tuple[Tensor, None]:
+        """The loss; with `early` without a graph, and its gradients are computed in two parts in the forward pass."""
+        loss = self.chain(inputs).square().mean()
+        if early:
+            for part in self.chain(inputs).square().mean(1):
+                (part / len(inputs)).backward(retain_graph=True)
+            loss = loss.detach()
+        return loss, None
+
+
+def repeated_steps(folder: Path, processes: ProcessGroup) -> None:
+    """Gradients of equal steps with gradients in the backward and in the forward pass, and without averaging."""
+    torch.manual_seed(0)
+    step = Chain()
+    wrapped = data_parallel(step, processes)
+    inputs = torch.randn(3, 2, 50, generator=torch.Generator().manual_seed(1))
+    for number, early in enumerate((False, False, True)):
+        wrapped.zero_grad()
+        loss, _ = wrapped(inputs[processes.rank], early)
+        loss.backward()
+        _save_gradients(step, folder / f"{number}_{processes.rank}.pt")
+    wrapped.zero_grad()
+    with no_sync(wrapped):
+        wrapped(inputs[processes.rank], False)[0].backward()
+    _save_gradients(step, folder / f"local_{processes.rank}.pt")
+    if processes.rank == 0:
+        step.zero_grad()
+        step(inputs.flatten(0, 1), False)[0].backward()
+        torch.save({name: p.grad for name, p in step.chain.named_parameters()}, folder / "joint.pt")
+
+
+def _save_gradients(step: Chain, path: Path) -> None:
+    unused = {f"unused.{name}": p.grad for name, p in step.unused.named_parameters()}
+    torch.save({name: p.grad for name, p in step.chain.named_parameters()} | unused, path)
+
+
+if __name__ == "__main__":
+    group = ProcessGroup()
+    group.initialize(torch.device("cpu"))
+    {"split_batches": split_batches, "repeated_steps": repeated_steps}[sys.argv[1]](Path(sys.argv[2]), group)
+    group.destroy()
