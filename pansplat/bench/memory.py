@@ -32,7 +32,7 @@ from pansplat.bench.harness import (
     serve_job,
     time_call,
 )
-from pansplat.bench.report import Column, Report, Row, number, row_from_json, save_figure
+from pansplat.bench.report import Column, Report, Row, number, result_column, row_from_json, save_figure
 from pansplat.data.views import Batch, Sample, Views, collate
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions
@@ -412,10 +412,6 @@ def _tile_count(tiles: int) -> str:
     return "untiled" if tiles == 1 else f"{tiles**2} tiles"
 
 
-def _column(title: str, form: str, name: str) -> Column[MemoryRow]:
-    return Column(title, lambda row: number(getattr(row.result, name), form))
-
-
 def _deviation(row: MemoryRow) -> str:
     return "reference" if row.is_reference else number(row.result.deviation, "{:.1e}")
 
@@ -424,11 +420,11 @@ MEMORY_COLUMNS: tuple[Column[MemoryRow], ...] = (
     Column("height", lambda row: str(row.case.height)),
     Column("work", lambda row: row.case.work, "left"),
     Column("tiles", lambda row: str(row.case.tiles**2)),
-    _column("base GiB", "{:.2f}", "base_gib"),
-    _column("peak GiB", "{:.2f}", "peak_gib"),
-    _column("taken GiB", "{:.2f}", "taken_gib"),
-    _column("seconds", "{:.1f}", "wall_s"),
-    _column("processor s", "{:.1f}", "processor_s"),
+    result_column("base GiB", "{:.2f}", "base_gib"),
+    result_column("peak GiB", "{:.2f}", "peak_gib"),
+    result_column("taken GiB", "{:.2f}", "taken_gib"),
+    result_column("seconds", "{:.1f}", "wall_s"),
+    result_column("processor s", "{:.1f}", "processor_s"),
     Column("deviation", _deviation),
     Column("", lambda row: "" if row.status == "measured" else f"{row.status}: {row.note}", "left"),
 )

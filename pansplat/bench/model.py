@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from pansplat.bench.fidelity import clamped_psnr, relative_depth_errors
 from pansplat.bench.harness import CaseFailedError, reset_resident_peak, resident_peak, run_child, serve_job
-from pansplat.bench.report import Column, Report, Row, number, save_figure
+from pansplat.bench.report import Column, Report, Row, number, result_column, save_figure
 from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
@@ -310,11 +310,11 @@ MODEL_COLUMNS: tuple[Column[ModelRow], ...] = (
     Column("tiles", lambda row: _tiles(row.case)),
     Column("threads", lambda row: str(row.case.threads)),
     *map(_stage_column, STAGES),
-    Column("total s", lambda row: number(row.result.total_s, "{:.1f}")),
-    Column("processor s", lambda row: number(row.result.processor_s, "{:.1f}")),
-    Column("peak GiB", lambda row: number(row.result.peak_gib, "{:.2f}")),
+    result_column("total s", "{:.1f}", "total_s"),
+    result_column("processor s", "{:.1f}", "processor_s"),
+    result_column("peak GiB", "{:.2f}", "peak_gib"),
     Column("depth median", _depth_median),
-    Column("depth max", lambda row: number(row.result.depth_max_error, "{:.1e}")),
+    result_column("depth max", "{:.1e}", "depth_max_error"),
     Column("PSNR dB", _decibels),
 )
 

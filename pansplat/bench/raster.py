@@ -29,7 +29,7 @@ from pansplat.bench.renderers import (
     render_with_graph,
     warm_up,
 )
-from pansplat.bench.report import Column, Report, Row, number, save_figure
+from pansplat.bench.report import Column, Report, Row, number, result_column, save_figure
 from pansplat.bench.roofline import BACKWARD_OPERATIONS, FORWARD_OPERATIONS, Work, panorama_work
 from pansplat.constants import NEAR
 from pansplat.gaussians.scene import Gaussians
@@ -363,10 +363,6 @@ def _section(row: RasterRow) -> str:
     return row.suite if row.suite in ("count", "resolution") else f"{row.suite}: {row.scene}"
 
 
-def _column(title: str, form: str, name: str) -> Column[RasterRow]:
-    return Column(title, lambda row: number(getattr(row.result, name), form))
-
-
 def _times(title: str, name: str, spread: str | None = None) -> Column[RasterRow]:
     return Column(title, lambda row: _time(getattr(row.result, name), getattr(row.result, spread) if spread else None))
 
@@ -399,18 +395,18 @@ RASTER_COLUMNS: tuple[Column[RasterRow], ...] = (
     Column("filter", lambda row: row.case.filter, "left"),
     Column("layout", _layout, "left"),
     Column("height", lambda row: str(row.case.height)),
-    _column("Gaussians", "{:,}", "num_gaussians"),
+    result_column("Gaussians", "{:,}", "num_gaussians"),
     Column("threads", lambda row: str(row.case.threads)),
     _times("forward ms", "forward_ms", "forward_spread_ms"),
     _times("CPU", "forward_cpu_ms"),
     _times("backward ms", "backward_ms", "backward_spread_ms"),
     _times("CPU", "backward_cpu_ms"),
-    _column("peak MB", "{:,.0f}", "peak_mb"),
+    result_column("peak MB", "{:,.0f}", "peak_mb"),
     Column("PSNR dB", _decibels),
-    _column("max error", "{:.1e}", "max_error"),
-    _column("seam", "{:.1e}", "seam_jump"),
-    _column("energy", "{:+.2%}", "energy_error"),
-    _column("own error", "{:.1e}", "own_max_error"),
+    result_column("max error", "{:.1e}", "max_error"),
+    result_column("seam", "{:.1e}", "seam_jump"),
+    result_column("energy", "{:+.2%}", "energy_error"),
+    result_column("own error", "{:.1e}", "own_max_error"),
 )
 
 

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
@@ -91,6 +91,11 @@ class Column(Generic[AnyRow]):
     justify: Literal["left", "right"] = "right"
 
 
+def result_column(title: str, form: str, name: str) -> Column[Any]:
+    """The column of a field of the result."""
+    return Column(title, lambda row: number(getattr(row.result, name), form))
+
+
 def number(value: float | None, form: str) -> str:
     """The text of a cell; empty for None."""
     return "" if value is None else form.format(value)
@@ -137,53 +142,41 @@ def save_figure(figure: Figure, path: Path) -> None:
         figure.savefig(partial, dpi=110)
 
 
+@dataclass
 class Report(Generic[AnyRow]):
     """The rows of one run: shown while they are measured, printed and written at the end.
 
     As a context manager it prints and writes what was measured even if the run was interrupted.
 
     Attributes:
+        columns: of the tables.
+        section: title of the table that a row belongs to.
+        machine: from `describe_machine`; written to the JSON file.
+        header: more values of the JSON file.
+        facts: entries of `machine` to print.
+        findings: sentences about all rows, for the terminal and the page.
+        json_file: written after every step.
+        page: Markdown, written at the end.
+        plots: functions that write plots, by file; they return False if there is nothing to plot.
+        print_steps: print each step if there is no terminal.
+        width: characters of a printed line if there is no terminal.
         rows: what was measured so far.
-        machine: description of the machine, as `describe_machine` returns it.
     """
 
-    def __init__(
-        self,
-        columns: Sequence[Column[AnyRow]],
-        section: Callable[[AnyRow], str],
-        machine: Mapping[str, Any],
-        *,
-        header: Mapping[str, object] | None = None,
-        facts: Sequence[str] = (),
-        findings: Callable[[Sequence[AnyRow]], list[str]] = lambda rows: [],
-        json_file: Path | None = None,
-        page: Path | None = None,
-        plots: Mapping[Path, Callable[[Sequence[AnyRow], Path], bool]] | None = None,
-        print_steps: bool = False,
-        width: int = 150,
-    ) -> None:
-        """Begin a report.
-
-        Args:
-            columns: of the tables.
-            section: title of the table that a row belongs to.
-            machine: written to the JSON file.
-            header: more values of the JSON file.
-            facts: entries of `machine` to print.
-            findings: sentences about all rows, for the terminal and the page.
-            json_file: written after every step.
-            page: Markdown, written at the end.
-            plots: functions that write plots, by file; they return False if there is nothing to plot.
-            print_steps: print each step if there is no terminal.
-            width: characters of a printed line if there is no terminal.
-        """
-        self.rows: list[AnyRow] = []
-        self.machine = machine
-        self._columns, self._section, self._findings = columns, section, findings
-        self._header, self._facts, self._width = {"machine": machine, **(header or {})}, facts, width
-        self._json, self._page, self._plots = json_file, page, plots or {}
-        self._print_steps = print_steps
-        self._live: Any = None
+    columns: Sequence[Column[AnyRow]]
+    section: Callable[[AnyRow], str]
+    machine: Mapping[str, Any]
+    _: KW_ONLY
+    header: Mapping[str, object] = field(default_factory=dict)
+    facts: Sequence[str] = ()
+    findings: Callable[[Sequence[AnyRow]], list[str]] = lambda rows: []
+    json_file: Path | None = None
+    page: Path | None = None
+    plots: Mapping[Path, Callable[[Sequence[AnyRow], Path], bool]] = field(default_factory=dict)
+    print_steps: bool = False
+    width: int = 150
+    rows: list[AnyRow] = field(default_factory=list)
+    _live: Any = None
 
     def __enter__(self) -> Report[AnyRow]:
         from rich.console import Console
@@ -202,8 +195,8 @@ class Report(Generic[AnyRow]):
 
     def update(self, step: str = "") -> None:
         """Write the JSON file and show the last rows and the step that follows."""
-        if self._json is not None and self.rows:
-            write_rows(self._json, self._header, self.rows)
+        if self.json_file is not None and self.rows:
+            write_rows(self.json_file, {"machine": self.machine, **self.header}, self.rows)
         if self._live is None:
             return
         if self._live.console.is_terminal:
@@ -211,44 +204,44 @@ class Report(Generic[AnyRow]):
             from rich.text import Text
 
             self._live.update(Group(*self.tables(self.rows[-_LIVE_ROWS:]), Text(step, style="cyan")))
-        elif step and self._print_steps:
+        elif step and self.print_steps:
             self._live.console.print(step, highlight=False, soft_wrap=True)
 
     def tables(self, rows: Sequence[AnyRow]) -> list[Table]:
         """One table for each section, in the order of the rows."""
-        return [terminal_table(self._columns, part, title) for title, part in self._sections(rows).items()]
+        return [terminal_table(self.columns, part, title) for title, part in self._sections(rows).items()]
 
     def markdown(self) -> str:
         """The findings and all tables as the text of a page."""
-        parts = ["\n".join(f"* {sentence}" for sentence in self._findings(self.rows))]
+        parts = ["\n".join(f"* {sentence}" for sentence in self.findings(self.rows))]
         for title, part in self._sections(self.rows).items():
-            parts.append(f"### {title[:1].upper()}{title[1:]}\n\n{markdown_table(self._columns, part)}")
+            parts.append(f"### {title[:1].upper()}{title[1:]}\n\n{markdown_table(self.columns, part)}")
         return "\n\n".join(part for part in parts if part) + "\n"
 
     def _sections(self, rows: Sequence[AnyRow]) -> dict[str, list[AnyRow]]:
         sections: dict[str, list[AnyRow]] = {}
         for row in rows:
-            sections.setdefault(self._section(row), []).append(row)
+            sections.setdefault(self.section(row), []).append(row)
         return sections
 
     def _print(self) -> None:
-        print_facts({name: self.machine[name] for name in self._facts})
-        console = table_console(self._width)
+        print_facts({name: self.machine[name] for name in self.facts})
+        console = table_console(self.width)
         for table in self.tables(self.rows):
             console.print(table)
-        for sentence in self._findings(self.rows):
+        for sentence in self.findings(self.rows):
             print(sentence)
 
     def _write(self) -> list[Path]:
         """Write the files and return those that were written."""
         if not self.rows:
             return []
-        written = [] if self._json is None else [self._json]
-        if self._page is not None:
-            with replacing(self._page) as partial:
+        written = [] if self.json_file is None else [self.json_file]
+        if self.page is not None:
+            with replacing(self.page) as partial:
                 partial.write_text(self.markdown())
-            written.append(self._page)
-        return written + [path for path, plot in self._plots.items() if plot(self.rows, path)]
+            written.append(self.page)
+        return written + [path for path, plot in self.plots.items() if plot(self.rows, path)]
 
 
 def print_facts(facts: Mapping[str, object]) -> None:

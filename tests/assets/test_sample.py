@@ -1,4 +1,4 @@
-"""The shipped sample keeps what it promises: rigid poses, exact depth, a free licence for every model."""
+"""The shipped sample: rigid poses, exact depth, a free licence for every model."""
 
 import hashlib
 import json
@@ -41,7 +41,7 @@ def views(poses: dict) -> dict[str, View]:
 
 
 def project(view: View, pose: torch.Tensor, stride: int = 3) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Where `view`'s pixels lie in a camera at `pose`: uv, distance to it, and their solid angles."""
+    """Positions of the pixels of `view` in a camera at `pose`: uv, distance to the camera, solid angles."""
     height, width = view.depth.shape
     rays = pixel_directions(height, width, dtype=torch.float64)[::stride, ::stride]
     points = rays * view.depth[::stride, ::stride, None]
@@ -66,28 +66,28 @@ def weighted_median(values: torch.Tensor, weights: torch.Tensor) -> float:
 
 
 def photometric_error(middle: View, other: View, pose: torch.Tensor) -> float:
-    """Median absolute colour difference of the middle view and `other`, taken to stand at `pose`."""
+    """Median absolute colour difference of the middle view and `other`, if its pose were `pose`."""
     uv, distance, weights = project(middle, pose)
     seen = (nearest_depth(other, uv) / distance - 1).abs() < 0.03
     difference = (sample_equirect(other.color, uv) - middle.color[:, ::3, ::3]).abs().mean(0)
     return weighted_median(difference[seen], weights[seen]) if seen.float().mean() > 0.3 else 1.0
 
 
-def test_pair_lists_two_context_views_and_the_middle_target(poses: dict):
+def test_the_pair_has_two_context_views_and_the_middle_target(poses: dict):
     pairs = json.loads((SAMPLE / "pairs.json").read_text())
     assert pairs == {"pairs": [{"context": ["left.jpg", "right.jpg"], "target": ["middle.jpg"]}]}
     assert poses["convention"] == "cam2world opencv"
     assert set(poses["poses"]) == {f"{name}.jpg" for name in NAMES}
 
 
-def test_poses_are_rigid_and_the_target_stands_midway(views: dict[str, View]):
+def test_poses_are_rigid_and_the_target_is_midway(views: dict[str, View]):
     assert max(orthonormal_error(v.pose) for v in views.values()) < 1e-12
     left, middle, right = (views[n].pose[:3, 3] for n in NAMES)
     torch.testing.assert_close(middle, (left + right) / 2)
     assert float((right - left).norm()) == pytest.approx(1.0)
 
 
-def test_context_views_are_turned_apart_and_tilted(views: dict[str, View]):
+def test_context_views_are_rotated_apart_and_tilted(views: dict[str, View]):
     left, right = (views[n].pose[:3, :3] for n in INPUTS)
     angle = torch.rad2deg(torch.acos(((left.T @ right).trace() - 1) / 2))
     assert 20 < float(angle) < 90
@@ -108,7 +108,7 @@ def test_every_depth_lies_between_near_and_far(views: dict[str, View], poses: di
         assert poses["near"] < float(view.depth.min()) and float(view.depth.max()) < poses["far"]
 
 
-def test_exposure_is_natural(views: dict[str, View]):
+def test_few_pixels_are_over_or_underexposed(views: dict[str, View]):
     for view in views.values():
         luma = view.color.mean(0)
         assert 0.3 < float(luma.mean()) < 0.65
@@ -121,18 +121,18 @@ def test_floor_is_below_and_ceiling_above(views: dict[str, View]):
         down = view.pose[:3, :3].T @ torch.tensor((0.0, 1.0, 0.0), dtype=torch.float64)
         below = nearest_depth(view, uv_from_directions(down[None]))
         above = nearest_depth(view, uv_from_directions(-down[None]))
-        assert float(below) == pytest.approx(1.5, abs=0.03)  # less the rug
+        assert float(below) == pytest.approx(1.5, abs=0.03)  # 1.5 m above the floor, less the rug
         assert 1.0 < float(above) < 1.25
 
 
 @pytest.mark.parametrize("name", INPUTS)
-def test_warping_by_depth_and_pose_explains_the_other_view(views: dict[str, View], name: str):
+def test_warping_by_depth_and_pose_gives_the_other_view(views: dict[str, View], name: str):
     assert photometric_error(views["middle"], views[name], views[name].pose) < 0.015
 
 
 @pytest.mark.parametrize("name", INPUTS)
 @pytest.mark.parametrize("wrong", ["baseline reversed", "rotation inverted", "not moved", "y and z flipped"])
-def test_wrong_conventions_do_not_explain_it(views: dict[str, View], name: str, wrong: str):
+def test_warping_with_a_wrong_pose_does_not(views: dict[str, View], name: str, wrong: str):
     pose = views[name].pose.clone()
     if wrong == "baseline reversed":
         pose[:3, 3] = 2 * views["middle"].pose[:3, 3] - pose[:3, 3]
@@ -152,9 +152,9 @@ def test_wrong_conventions_do_not_explain_it(views: dict[str, View], name: str, 
 def test_depths_of_two_views_agree(views: dict[str, View], name: str):
     uv, distance, weights = project(views["middle"], views[name].pose)
     ratio = nearest_depth(views[name], uv) / distance
-    share = weights / weights.sum()
-    assert float(share[(ratio - 1).abs() < 0.02].sum()) > 0.85
-    assert float(share[ratio > 1.02].sum()) < 0.05  # nothing is seen through, but for the edges' pixels
+    fractions = weights / weights.sum()
+    assert float(fractions[(ratio - 1).abs() < 0.02].sum()) > 0.85
+    assert float(fractions[ratio > 1.02].sum()) < 0.05  # no surface is transparent; pixels on edges may differ
     assert weighted_median((ratio - 1).abs().flatten(), weights.flatten()) < 0.002
 
 
@@ -178,7 +178,7 @@ def test_readme_lists_the_checksum_of_every_file():
     assert listed == found
 
 
-def test_recipe_names_no_folder_of_any_machine():
+def test_the_recipe_has_no_absolute_paths():
     for path in [*RECIPE.iterdir(), *SAMPLE.glob("*.md"), *SAMPLE.glob("*.json")]:
         if path.is_file():
             assert not re.search(r"/(tmp|home|work|root|Users|media)/", path.read_text()), path
