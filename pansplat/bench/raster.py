@@ -541,7 +541,7 @@ def plot_choices(rows: Sequence[RasterRow], path: Path) -> bool:
     axes.set(xscale="log", yscale="log", xlabel="forward, milliseconds")
     axes.set_ylim(bottom=min(axes.get_ylim()[0], 0.03 * min(y for _, y in points)))
     _annotate(axes, [(points[i], _choice_name(shown[i])) for i in front])
-    axes.set_ylabel(f"root mean square error of the colours (the exact image is drawn at {_MIN_ERROR:.0e})")
+    axes.set_ylabel(f"root mean square error of the colours (the exact image is plotted at {_MIN_ERROR:.0e})")
     axes.set_title(f"{shown[0].scene}: {_size(shown[0])}", loc="left")
     decibels = axes.secondary_yaxis("right", functions=(lambda y: y, lambda y: y))
     decibels.set_yticks([10.0**-k for k in range(9)], [f"{20 * k} dB" for k in range(9)])

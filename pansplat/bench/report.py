@@ -1,4 +1,4 @@
-"""Rows of a benchmark, and what is made of them: a live table, a JSON file, tables in Markdown, plots."""
+"""Rows of a benchmark and their report: a live table, a JSON file, tables in Markdown, plots."""
 
 from __future__ import annotations
 

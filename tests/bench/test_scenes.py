@@ -87,8 +87,8 @@ def test_a_scene_from_depth_looks_like_its_images():
     views = views_in_a_sphere()
     scene = lift_depth(views)
     for image, pose in zip(views.images, views.cam2world, strict=True):
-        drawn = rasterize(scene.gaussians, pose, size=(HEIGHT, 2 * HEIGHT)).color
-        error = (drawn - image).abs()  # colours span 0.8
+        rendered = rasterize(scene.gaussians, pose, size=(HEIGHT, 2 * HEIGHT)).color
+        error = (rendered - image).abs()  # colours span 0.8
         assert error.mean() < 0.03 and error.max() < 0.1
 
 

@@ -1,4 +1,4 @@
-"""What the README says works as it says."""
+"""Commands, calls, links and pose files of the README work."""
 
 import re
 import shlex
@@ -23,7 +23,7 @@ def test_the_readme_shows_every_command() -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_commands_of_the_readme_are_understood(command: str) -> None:
+def test_commands_of_the_readme_are_valid(command: str) -> None:
     parsed = parse(shlex.split(command))
     assert type(parsed).__name__.lower() == command.split()[0]
 
@@ -34,14 +34,14 @@ def test_calls_of_the_readme_exist() -> None:
     assert calls <= set(pansplat.__all__)
 
 
-def test_links_and_pictures_of_the_readme_lead_somewhere() -> None:
+def test_links_and_images_of_the_readme_exist() -> None:
     targets = re.findall(r"\]\(([^)#]+)\)", README) + re.findall(r'src="([^"]+)"', README)
     local = [target for target in targets if not target.startswith("http")]
     assert local
     assert not [target for target in local if not (ROOT / target).exists()]
 
 
-def test_the_readme_leads_to_every_document() -> None:
+def test_the_readme_links_every_document() -> None:
     documents = {f"docs/{file.name}" for file in (ROOT / "docs").glob("*.md")}
     assert documents and not [document for document in documents if f"]({document})" not in README]
 
@@ -50,7 +50,7 @@ def test_pose_files_of_the_readme_are_read(tmp_path: Path) -> None:
     (poses,) = re.findall(r"```json\n(.+?)```", README, flags=re.DOTALL)
     (tmp_path / "poses.json").write_text(poses)
     for name in ("left.jpg", "right.jpg"):
-        (tmp_path / name).touch()  # pictures are read later
+        (tmp_path / name).touch()  # images are read later
     (pair,) = pansplat.load_pairs(tmp_path)
     assert [panorama.image.name for panorama in pair.context] == ["left.jpg", "right.jpg"]
     assert (pair.near, pair.far) == (0.45, 10.0)
@@ -64,10 +64,10 @@ def test_the_two_commands_are_those_of_ci_and_setup() -> None:
     assert "assets/living_room" in (ROOT / "setup.sh").read_text()
 
 
-def test_setup_explains_itself_and_refuses_what_it_does_not_know() -> None:
+def test_setup_has_help_and_refuses_unknown_options() -> None:
     if sys.platform == "win32":
         pytest.skip("setup.sh is for Linux")
-    told = subprocess.run(["bash", ROOT / "setup.sh", "--help"], capture_output=True, text=True)
-    assert told.returncode == 0 and "--dev" in told.stdout
+    done = subprocess.run(["bash", ROOT / "setup.sh", "--help"], capture_output=True, text=True)
+    assert done.returncode == 0 and "--dev" in done.stdout
     refused = subprocess.run(["bash", ROOT / "setup.sh", "--dve"], capture_output=True, text=True)
     assert refused.returncode == 1 and "unknown option --dve" in refused.stderr
