@@ -7,7 +7,7 @@ compositing reads have the Gaussians' type.
 import functools
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -174,7 +174,7 @@ def project_gaussians(
     """
     shape = (gaussians.quats, gaussians.scales) if covariances is None else (covariances,)
     fields = (gaussians.means, gaussians.opacities, gaussians.harmonics, *shape)
-    options = dict(cam2world=cam2world, filter_variance=filter_variance, compensate=compensate, exact=exact)
+    options: Any = dict(cam2world=cam2world, filter_variance=filter_variance, compensate=compensate, exact=exact)
     project = functools.partial(_project_chunk, **options)
     needs_grad = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (*fields, cam2world))
     parts = []

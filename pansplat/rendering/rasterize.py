@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Literal, ParamSpec, Protocol, TypeVar, get_args, runtime_checkable
+from typing import Any, Literal, ParamSpec, Protocol, TypeVar, get_args, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -33,7 +33,8 @@ _MODULES = {
 }
 _MAX_POSE_ERROR = 1e-4
 
-_Arguments, _Result = ParamSpec("_Arguments"), TypeVar("_Result")
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True)
@@ -226,7 +227,9 @@ def rasterize(
         InputError: an argument is out of range or does not fit the Gaussians, the pose is not rigid, kernel "ewa" is
             combined with layout "equirect", or `strict` and a Gaussian is not finite.
     """
-    given = dict(kernel=kernel, order=order, lowpass=lowpass, near=near, strict=strict, stitching=stitching)
+    given: dict[str, Any] = dict(
+        kernel=kernel, order=order, lowpass=lowpass, near=near, strict=strict, stitching=stitching
+    )
     options = replace(options or RasterOptions(), **{name: value for name, value in given.items() if value is not None})
     _check(size, layout, vertical_fov_degrees, face_size, backend, options)
     device = gaussians.means.device

@@ -264,6 +264,7 @@ def network(randomize):
 # No baseline
 
 
+@pytest.mark.hard_case(38)
 def test_without_a_baseline_the_cost_is_the_same_for_all_candidates():
     for dtype in (torch.float32, torch.float64):
         candidates = _candidates(*(bound.to(dtype) for bound in _bounds()))
@@ -271,12 +272,14 @@ def test_without_a_baseline_the_cost_is_the_same_for_all_candidates():
         assert torch.equal(volume, volume[:, :, :1].expand_as(volume))
 
 
+@pytest.mark.hard_case(38)
 def test_without_a_baseline_identical_views_match_fully():
     features = _noise(1, 1, 8, H, W).expand(1, 2, -1, -1, -1)
     volume = correlate_views(features, _candidates(*_bounds()), _poses((0, 0, 0)), "fixed")
     assert torch.allclose(volume, (features.square().sum(dim=2) / 8**0.5)[:, :, None].expand_as(volume), atol=1e-12)
 
 
+@pytest.mark.hard_case(38)
 def test_identical_views_give_finite_depths_and_gradients(network):
     network.zero_grad()
     depths = network(_features(), _poses((0, 0, 0)), *_bounds())
@@ -288,6 +291,7 @@ def test_identical_views_give_finite_depths_and_gradients(network):
 # The epipole
 
 
+@pytest.mark.hard_case(39)
 def test_a_candidate_at_the_other_camera_is_finite_with_its_gradient():
     inverse_depth = 0.5
     other_camera = pixel_directions(H, W, dtype=torch.float64)[3, 5] / inverse_depth
@@ -300,6 +304,7 @@ def test_a_candidate_at_the_other_camera_is_finite_with_its_gradient():
     assert all(torch.isfinite(t).all() for t in (result, reference.grad, other.grad))
 
 
+@pytest.mark.hard_case(39)
 def test_candidates_before_and_behind_the_other_camera_have_opposite_directions():
     ray = pixel_directions(H, W, dtype=torch.float64)[3, 5]
     pose = torch.eye(4, dtype=torch.float64)[None].clone()
@@ -310,6 +315,7 @@ def test_candidates_before_and_behind_the_other_camera_have_opposite_directions(
     assert torch.allclose(behind, ray, atol=0.05) and torch.allclose(before, -ray, atol=0.1)
 
 
+@pytest.mark.hard_case(39)
 def test_at_the_epipole_candidates_do_not_differ():
     ray = pixel_directions(H, W, dtype=torch.float64)[3, 5]
     pose = torch.eye(4, dtype=torch.float64)[None].clone()
@@ -321,6 +327,7 @@ def test_at_the_epipole_candidates_do_not_differ():
 # Over the seam and over the poles
 
 
+@pytest.mark.hard_case(40)
 def test_samples_continue_across_the_seam_and_the_poles():
     """A rotated camera samples a smooth field on the sphere without a jump."""
     height, width = 64, 128
@@ -336,11 +343,13 @@ def test_samples_continue_across_the_seam_and_the_poles():
 # Bounds
 
 
+@pytest.mark.hard_case(41)
 def test_equal_bounds_give_that_depth(network):
     depths = network(_features(), _poses(), *_bounds(2.0, 2.0))
     assert all(torch.allclose(depth, torch.tensor(2.0).double(), rtol=1e-12) for depth in depths.depth)
 
 
+@pytest.mark.hard_case(41)
 def test_one_candidate_is_the_depth(randomize):
     config = CostVolumeConfig(sweep="single", mono_channels=0, levels=(SweepLevel(2, 8, 1, 32),))
     level = randomize(SphericalCostVolume(config, "fixed"))(_features(), _poses(), *_bounds()).levels[0]
@@ -348,6 +357,7 @@ def test_one_candidate_is_the_depth(randomize):
     assert torch.equal(level.confidence, torch.ones_like(level.confidence))
 
 
+@pytest.mark.hard_case(41)
 def test_after_one_candidate_finer_levels_still_search(randomize):
     config = CostVolumeConfig(mono_channels=0, levels=(SweepLevel(2, 8, 1, 32), SweepLevel(1, 4, 4, 32)))
     level = randomize(SphericalCostVolume(config, "fixed"))(_features(), _poses(), *_bounds()).levels[1]
@@ -355,6 +365,7 @@ def test_after_one_candidate_finer_levels_still_search(randomize):
     assert torch.allclose(level.candidates[0, 0, :, 3, 3], expected)
 
 
+@pytest.mark.hard_case(41)
 def test_no_logits_lead_outside_the_bounds(network):
     with torch.no_grad():
         for sign in (-1, 1):
@@ -366,6 +377,7 @@ def test_no_logits_lead_outside_the_bounds(network):
 # Half precision
 
 
+@pytest.mark.hard_case(42)
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_huge_logits_in_half_precision_choose_one_candidate(dtype):
     candidates = _candidates(*(bound.float() for bound in _bounds()))
@@ -378,6 +390,7 @@ def test_huge_logits_in_half_precision_choose_one_candidate(dtype):
     assert torch.isfinite(logits.grad).all()
 
 
+@pytest.mark.hard_case(42)
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_the_mean_is_taken_in_float32(dtype):
     candidates = _candidates(*(bound.float() for bound in _bounds()))
@@ -385,6 +398,7 @@ def test_the_mean_is_taken_in_float32(dtype):
     assert torch.allclose(level.inverse_depth, candidates.mean(dim=2), rtol=1e-6)
 
 
+@pytest.mark.hard_case(42)
 @pytest.mark.parametrize("backend", ["torch", "kernel"])
 def test_products_beyond_half_precision_do_not_overflow(backend):
     features = torch.full((1, 128, H, W), 30.0, dtype=torch.float16).requires_grad_()
@@ -398,6 +412,7 @@ def test_products_beyond_half_precision_do_not_overflow(backend):
 # Rotated cameras
 
 
+@pytest.mark.hard_case(43)
 def test_a_tiny_rotation_changes_little(network):
     angle = 1e-7
     turned = _poses()
@@ -408,6 +423,7 @@ def test_a_tiny_rotation_changes_little(network):
     assert torch.allclose(before, after, rtol=1e-3)
 
 
+@pytest.mark.hard_case(43)
 def test_a_half_turn_of_one_camera_rolls_its_panorama_only():
     (features, _), candidates = _features(), _candidates(*_bounds())
     half_turn = torch.diag(torch.tensor((-1.0, 1.0, -1.0, 1.0)).double())
@@ -423,6 +439,7 @@ def test_a_half_turn_of_one_camera_rolls_its_panorama_only():
 # A depth range of 1e4
 
 
+@pytest.mark.hard_case(44)
 def test_over_a_depth_ratio_of_10000_each_candidate_is_exact():
     bounds = [bound.float() for bound in _bounds(0.01, 100.0)]
     candidates = _candidates(*bounds, count=128)
@@ -433,6 +450,7 @@ def test_over_a_depth_ratio_of_10000_each_candidate_is_exact():
         assert torch.equal(regress_depth(3, logits, candidates).inverse_depth, candidates[:, :, index])
 
 
+@pytest.mark.hard_case(44)
 def test_over_a_depth_ratio_of_10000_a_float32_warp_is_as_exact_as_over_10():
     poses, candidates = _poses(), _candidates(*_bounds(0.01, 100.0), count=16)
     features = _noise(1, 8, H, W)
@@ -442,6 +460,7 @@ def test_over_a_depth_ratio_of_10000_a_float32_warp_is_as_exact_as_over_10():
     assert (single - truth).abs().max() < 2e-4
 
 
+@pytest.mark.hard_case(44)
 def test_over_a_depth_ratio_of_10000_depths_are_finite(network):
     depths = network(_features(), _poses(), *_bounds(0.01, 100.0))
     assert all(((depth >= 0.01 - 1e-9) & (depth <= 100 + 1e-6)).all() for depth in depths.depth)

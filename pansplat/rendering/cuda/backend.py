@@ -106,8 +106,9 @@ class _Project(torch.autograd.Function):
 
         fields = tuple(field.contiguous() for field in fields)
         ctx.save_for_backward(cam2world, *fields)
-        ctx.options = dict(filter_variance=filter_variance, compensate=compensate, exact=exact)
-        return tuple(project_forward(cam2world, fields, **ctx.options))
+        options: Any = dict(filter_variance=filter_variance, compensate=compensate, exact=exact)
+        ctx.options = options
+        return tuple(project_forward(cam2world, fields, **options))
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:

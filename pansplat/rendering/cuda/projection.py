@@ -7,7 +7,7 @@ whatever the Gaussians' type is.
 # ruff: noqa: RUF005  # Triton does not unpack into a tuple
 
 import math
-from typing import no_type_check
+from typing import Any, no_type_check
 
 import torch
 import triton
@@ -365,7 +365,7 @@ def project_forward(
     means, opacities, harmonics, *shape = fields
     count, terms, channels = harmonics.shape
     camera = torch.nn.functional.pad(cam2world.reshape(-1), (0, 1), value=filter_variance)
-    double = dict(dtype=torch.float64, device=means.device)
+    double: Any = dict(dtype=torch.float64, device=means.device)
     out = ProjectedGaussians(
         direction=torch.empty(count, 3, **double),
         radius=torch.empty(count, **double),
