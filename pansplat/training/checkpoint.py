@@ -23,11 +23,6 @@ _KIND, _FORMAT = "pansplat-training", 1
 _NAME = re.compile(r"step_(\d{8})\.pt")
 
 
-def checkpoint_path(folder: Path, step: int) -> Path:
-    """Path of the checkpoint after `step` steps."""
-    return folder / f"step_{step:08d}.pt"
-
-
 def save_checkpoint(folder: Path, step: int, state: Mapping[str, Any], *, keep: int) -> Path:
     """Write the checkpoint after `step` steps, then delete all but the newest `keep` checkpoints.
 
@@ -36,7 +31,7 @@ def save_checkpoint(folder: Path, step: int, state: Mapping[str, Any], *, keep: 
     Raises:
         InputError: the disk is full or not writable; older checkpoints are kept.
     """
-    path = checkpoint_path(folder, step)
+    path = folder / f"step_{step:08d}.pt"
     folder.mkdir(parents=True, exist_ok=True)
     with replacing(path) as partial:
         try:

@@ -83,7 +83,7 @@ def _readable_samples(source: SampleSource, count: int, height: int) -> Iterator
     """Those of the first samples that are readable.
 
     Raises:
-        InputError: none is.
+        InputError: no sample is readable.
     """
     failures, readable = [], 0
     for index in range(min(count, len(source))):

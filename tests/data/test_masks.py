@@ -1,4 +1,4 @@
-"""Only what stays in place round a pole while the scene moves is masked."""
+"""Only static regions around a pole are masked."""
 
 import math
 from pathlib import Path

@@ -227,7 +227,7 @@ def test_masked_depth_does_not_affect_the_loss(form) -> None:
 
 def test_each_view_has_its_own_range() -> None:
     (level,), (truth,) = depths(16), depths(16, seed=1)
-    far = torch.tensor([[FAR, 0.9]], dtype=torch.float64)  # nothing of the second view is nearer than that
+    far = torch.tensor([[FAR, 0.9]], dtype=torch.float64)  # below all depths of the second view
     near = torch.tensor([[NEAR, NEAR]], dtype=torch.float64)
     both = depth_loss([level], truth, near, far)
     first = depth_loss([level[:, :1]], truth[:, :1], NEAR, FAR)
