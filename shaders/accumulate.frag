@@ -1,6 +1,6 @@
 // One weighted layer at one pixel; the blend function adds the layers up.
-// LAYER_STORAGE (layers.py): 0 one image of the same size, 1 cube faces read by a pinhole camera, 2 cube faces read by a
-// panorama. A compile-time constant, because software OpenGL executes both sides of a branch.
+// LAYER_STORAGE (layers.py): 0 one image of the same size, 1 cube faces read by a pinhole camera, 2 cube faces read by
+// a panorama. A compile-time constant, because software OpenGL executes both sides of a branch.
 #if LAYER_STORAGE != 0
 #include "faces.glsl"
 #endif

@@ -1,6 +1,6 @@
 // Bilinear look-up in six cube faces that are stored in one texture (an atlas of three columns and two rows).
-// `sample_faces` is docs/rendering.md, section 6, in float32. `atlas_uv` gives texture coordinates for the texture unit's
-// filter, whose weights may have few bits; it reads faces with a border of one pixel.
+// `sample_faces` is docs/rendering.md, section 6, in float32. `atlas_uv` returns texture coordinates for the texture
+// unit's filter, whose weights may have few bits; its faces have a border of one pixel.
 
 uniform int face_size;              // pixels a side, without the border
 

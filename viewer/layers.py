@@ -1,7 +1,7 @@
 """Layers: premultiplied images of sets of Gaussians, drawn directly or as six cube faces and kept between frames.
 
-`LayerPainter.paint` draws what a frame needs of a layer and is not there yet. `SplatRasterizer` draws splats with
-OpenGL: it projects Gaussians to records and rasterises the records as quads, back to front.
+`LayerPainter.paint` draws the parts of a layer that a frame reads and that are not valid. `SplatRasterizer` draws
+splats with OpenGL: it projects Gaussians to records and rasterises the records as quads, back to front.
 """
 
 from __future__ import annotations
@@ -235,7 +235,7 @@ class TargetStore:
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """The premultiplied image of one set of Gaussians, and what drawing it for this frame took.
+    """The premultiplied image of one set of Gaussians, and the work that it took in this frame.
 
     Attributes:
         target: the textures.

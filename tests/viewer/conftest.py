@@ -55,7 +55,7 @@ def _renderers(gl_context: moderngl.Context) -> Iterator[dict[tuple[str, int, in
 
 @pytest.fixture
 def renderer(ctx, _renderers) -> Callable[..., SplatRenderer]:
-    """Returns a renderer with 32-bit targets and a newly uploaded scene; `slot` tells apart those of one test."""
+    """Returns a renderer with 32-bit targets and a newly uploaded scene; `slot` selects one of several."""
 
     def get(scene: Scene, tier: str = "auto", color_bits: int = 32, slot: int = 0) -> SplatRenderer:
         key = (tier, color_bits, slot)
