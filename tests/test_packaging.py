@@ -117,7 +117,7 @@ def test_the_entry_points_of_an_installed_wheel_work(installed: Path, command: s
 
 def test_tests_pass_against_the_installed_wheel(installed: Path) -> None:
     """Run the tests of one module with the wheel instead of the checkout."""
-    options = ["-q", "-p", "no:cacheprovider", "-c", str(ROOT / "pyproject.toml")]
+    options = ["-q", "-n", "0", "-p", "no:cacheprovider", "-c", str(ROOT / "pyproject.toml")]
     done = run_in(installed, sys.executable, "-m", "pytest", *options, str(ROOT / "tests/gaussians/test_ply.py"))
     assert done.returncode == 0, done.stdout
     assert " passed" in done.stdout
