@@ -38,22 +38,14 @@ def network_config(shape: NetworkShape) -> PanSplatConfig:
 
 
 def _small_config(
-    *,
-    channels: tuple[int, int, int, int],
-    candidates: tuple[int, int, int],
-    width: int,
-    blocks: int,
-    degree: int,
+    *, channels: tuple[int, int, int, int], candidates: tuple[int, int, int], width: int, blocks: int, degree: int
 ) -> PanSplatConfig:
     levels = tuple(SweepLevel(3 - i, channels[3 - i], count, width) for i, count in enumerate(candidates))
     return PanSplatConfig(
         features=FeaturePyramidConfig(channels, TransformerConfig(channels[-1], blocks)),
         cost_volume=CostVolumeConfig(mono_channels=0, levels=levels),
         heads=HeadsConfig(
-            feature_channels=channels[::-1],
-            candidates=candidates[-1],
-            layers=3,
-            adapter=AdapterConfig(degree=degree),
+            feature_channels=channels[::-1], candidates=candidates[-1], layers=3, adapter=AdapterConfig(degree=degree)
         ),
     )
 

@@ -170,12 +170,7 @@ class TargetRenderer:
         if self.style == "panorama":
             return rasterize(gaussians, cam2world, size=self.size)
         return rasterize(
-            gaussians,
-            cam2world,
-            size=self.size,
-            layout="cubemap",
-            face_size=self.face_size,
-            options=self._options,
+            gaussians, cam2world, size=self.size, layout="cubemap", face_size=self.face_size, options=self._options
         )
 
     @property

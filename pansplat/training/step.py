@@ -16,14 +16,7 @@ from pansplat.model.pansplat import PanSplat
 from pansplat.training.config import MemoryConfig
 from pansplat.training.deferred import LossTerms, Problem, backpropagate, whole_loss
 from pansplat.training.distributed import no_sync
-from pansplat.training.losses import (
-    LossWeights,
-    Perceptual,
-    auxiliary_loss,
-    depth_loss,
-    image_loss,
-    make_pixel_weights,
-)
+from pansplat.training.losses import LossWeights, Perceptual, auxiliary_loss, depth_loss, image_loss, make_pixel_weights
 from pansplat.training.network import matching_is_trainable
 from pansplat.training.rendering import TargetRenderer
 

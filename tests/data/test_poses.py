@@ -91,14 +91,8 @@ def _changed(**entries: float) -> list:
         (_changed(m00=3.0), "no rotation"),
         (_changed(m33=2.0), "bottom row"),
         (_pose().T.tolist(), "transposed"),
-        (
-            (_pose() @ torch.diag(torch.tensor((1.0, 1.0, -1.0, 1.0), dtype=torch.float64))).tolist(),
-            "mirrored",
-        ),
-        (
-            (_pose() @ torch.diag(torch.tensor((2.0, 2.0, 2.0, 1.0), dtype=torch.float64))).tolist(),
-            "scaled by 2",
-        ),
+        ((_pose() @ torch.diag(torch.tensor((1.0, 1.0, -1.0, 1.0), dtype=torch.float64))).tolist(), "mirrored"),
+        ((_pose() @ torch.diag(torch.tensor((2.0, 2.0, 2.0, 1.0), dtype=torch.float64))).tolist(), "scaled by 2"),
     ],
 )
 def test_matrices_that_are_not_rigid_are_refused_with_the_reason(values, message: str) -> None:

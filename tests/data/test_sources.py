@@ -11,13 +11,7 @@ import torch
 
 from pansplat.data.generated.triplets import GeneratedTriplets
 from pansplat.data.layouts import load_pairs
-from pansplat.data.sources import (
-    ConcatSource,
-    PairSource,
-    TripletSource,
-    read_game_maps,
-    read_panogrf,
-)
+from pansplat.data.sources import ConcatSource, PairSource, TripletSource, read_game_maps, read_panogrf
 from pansplat.data.views import collate
 from pansplat.errors import InputError
 

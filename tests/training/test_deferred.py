@@ -35,8 +35,7 @@ def assert_equal_gradients(found: dict[str, torch.Tensor], expected: dict[str, t
 
 
 @pytest.mark.parametrize(
-    ("style", "mixing"),
-    [("panorama", "joint"), ("cubemap", "joint"), ("cubemap", "by_view"), ("original", "joint")],
+    ("style", "mixing"), [("panorama", "joint"), ("cubemap", "joint"), ("cubemap", "by_view"), ("original", "joint")]
 )
 def test_deferred_gradients_equal_plain_ones(
     style: str, mixing: str, micro: Callable[..., PanSplat], make_batch: Callable[..., Batch]
