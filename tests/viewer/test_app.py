@@ -82,6 +82,13 @@ def test_invalid_arguments_are_refused_in_one_line_with_status_2(room, capsys, a
 
 
 @pytest.mark.gl
+def test_offscreen_writes_the_fly_through_to_the_given_folder(room):
+    assert run([str(room), "--offscreen", "out", "--size", "64x32", "--seconds", "0.2"]) == 0
+    assert list((room.parent / "out").rglob("flythrough.mp4"))
+    assert not (room.parent / "renders").exists()
+
+
+@pytest.mark.gl
 def test_a_damaged_scene_is_refused_with_status_2(room, capsys):
     room.write_bytes(room.read_bytes()[:500])
     assert run([str(room), "--offscreen", "out"]) == 2
