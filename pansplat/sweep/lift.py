@@ -1,6 +1,6 @@
 """From surfaces to Gaussians: the spherical Gaussian pyramid on Fibonacci lattices.
 
-Levels 0 and 1 are discs on the surface, which break at depth discontinuities; level 0 is used only where level 1 would
+Levels 0 and 1 are discs on the surface, with gaps at depth discontinuities; level 0 is used only where level 1 would
 lose image detail. Levels 2 and 3 are a closed background layer slightly behind the surface: at every discontinuity it
 continues the far side, so that a moving camera sees no holes. Points in the consistent free space of another view are
 removed.
@@ -36,14 +36,14 @@ from pansplat.sweep.surface import (
 )
 
 NUM_LEVELS = 4
-_SH_0 = 0.28209479177387814  # Y_0
+_SH_0 = 0.28209479177387814  # the harmonic of degree 0
 _MAX_LENGTH = 0.2  # largest standard deviation of a disc, relative to its distance
 _MIN_DISTANCE = 0.5  # smallest distance of a Gaussian from an input camera, relative to `near`
 
 
 @dataclass(frozen=True)
 class LiftConfig:
-    """Settings of the Gaussians."""
+    """Settings of the Gaussians' sizes, opacities and levels."""
 
     footprint: float = 0.7
     """Standard deviation of a disc, in lattice spacings."""
@@ -64,7 +64,7 @@ class LiftConfig:
     single_view_opacity: float = 0.9
     """Where no other view sees the surface."""
     uncertain_opacity: float = 0.8
-    """In the free space of another view that is itself not consistent with a third one."""
+    """In the free space of another view whose own surface is not consistent with any view."""
 
 
 def lift(posed: PosedImages, surfaces: list[Surface], config: LiftConfig) -> Gaussians:
@@ -90,12 +90,12 @@ def _remove_inconsistent(
 ) -> Surface:
     """The surface, with the points in other views' consistent free space moved back to the background layer."""
     surface = surfaces[view]
-    points = world_points(surface, posed.cam2world[view])
-    _, kept = _opacity(points.reshape(-1, 3), posed, surfaces, consistent, view, config)
-    wrong = ~kept.reshape(surface.inverse_depth.shape)
+    points = world_points(surface, posed.cam2world[view]).reshape(-1, 3)
+    _, kept = _estimate_opacity(points, posed, surfaces, consistent, view, config)
     far = _background_inverse_depth(surface.inverse_depth, posed.masks[view], 2, config)
     behind = np.minimum(surface.inverse_depth, resize_sphere(far, surface.height))
-    return Surface(np.where(wrong, behind, surface.inverse_depth), surface.orientation)
+    kept = kept.reshape(behind.shape)
+    return Surface(np.where(kept, surface.inverse_depth, behind), surface.orientation)
 
 
 def _background_inverse_depth(inverse: np.ndarray, mask: np.ndarray, level: int, config: LiftConfig) -> np.ndarray:
@@ -120,10 +120,10 @@ def _lift_level(
     height = image.shape[0] >> level
     color_map = resize_sphere(image, height)
     if level < 2:
-        shape = resize_sphere(inverse, height) if level else inverse
+        level_inverse = resize_sphere(inverse, height) if level else inverse
         needed = mask & (_choose_levels(image, inverse, config) == level)
     else:
-        color_map, shape = _background_layer(image, inverse, mask, level, config)
+        color_map, level_inverse = _background_layer(image, inverse, mask, level, config)
         needed = mask
     count = lattice_size(2 * height)
     rays = fibonacci_directions(count).numpy()
@@ -131,16 +131,16 @@ def _lift_level(
     chosen = needed[row, column]
     rays = rays[chosen]
     row, column = nearest_pixel(rays, height)
-    rho = np.maximum(shape[row, column].astype(np.float64), 1e-6)
+    inverse_depth = np.maximum(level_inverse[row, column].astype(np.float64), 1e-6)
     pose = posed.cam2world[view]
-    points = (rays / rho[:, None]) @ pose[:3, :3].T + pose[:3, 3]
-    opacity, kept = _opacity(points, posed, surfaces, consistent, view, config)
+    points = (rays / inverse_depth[:, None]) @ pose[:3, :3].T + pose[:3, 3]
+    opacity, kept = _estimate_opacity(points, posed, surfaces, consistent, view, config)
     spacing = math.sqrt(4 * math.pi / count)
-    rays, rho, points, opacity = rays[kept], rho[kept], points[kept], opacity[kept]
+    rays, inverse_depth, points, opacity = rays[kept], inverse_depth[kept], points[kept], opacity[kept]
     row, column = row[kept], column[kept]
-    gradient = _log_gradients(shape, config.discontinuity if level < 2 else math.inf)[row, column]
-    axes, scales = _shape_discs(rays, rho, gradient, spacing, level, config)
-    color = _bilinear(color_map, rays)
+    gradient = _differentiate_log(level_inverse, config.discontinuity if level < 2 else math.inf)[row, column]
+    axes, scales = _shape_discs(rays, inverse_depth, gradient, spacing, level, config)
+    color = _sample_bilinear(color_map, rays)
     quats = quats_from_rotations(torch.from_numpy(pose[:3, :3] @ axes))
     return Gaussians(
         means=torch.from_numpy(points).float(),
@@ -153,7 +153,8 @@ def _lift_level(
     )
 
 
-def _bilinear(image: np.ndarray, rays: np.ndarray) -> np.ndarray:
+def _sample_bilinear(image: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Bilinear samples (n, c) of a panorama along rays (n, 3)."""
     height, width = image.shape[:2]
     x, y = (c + 0.5 for c in pixel_coordinates(rays, height))  # of the padded image
     x0, y0 = np.clip(x.astype(np.int64), 0, width), np.clip(y.astype(np.int64), 0, height)
@@ -200,13 +201,13 @@ def _background_layer(
         missing = np.clip(1 - filled_weight, 0, 1)
         filled_color += missing[..., None] * wide_color
         filled_weight += missing * wide_weight
-    blank = filled_weight < 1e-3
+    unknown = filled_weight < 1e-3
     color_map = filled_color / np.maximum(filled_weight, 1e-3)[..., None]
-    color_map[blank] = resize_sphere(image, height)[blank]
+    color_map[unknown] = resize_sphere(image, height)[unknown]
     return color_map.astype(np.float32), (far / config.background_depth[level - 2]).astype(np.float32)
 
 
-def _opacity(
+def _estimate_opacity(
     points: np.ndarray,
     posed: PosedImages,
     surfaces: list[Surface],
@@ -231,8 +232,8 @@ def _opacity(
     return opacity, kept
 
 
-def _log_gradients(inverse: np.ndarray, discontinuity: float) -> np.ndarray:
-    """Gradient of log inverse depth (h, w, 2) per radian to the east and south; zero across a discontinuity."""
+def _differentiate_log(inverse: np.ndarray, discontinuity: float) -> np.ndarray:
+    """Gradient (h, w, 2) of the logarithm of inverse depth per radian to the east and south; 0 at a discontinuity."""
     height, width = inverse.shape
     padded = np.log(np.maximum(pad_sphere(inverse, 1), 1e-6))
     east = (padded[1:-1, 2:] - padded[1:-1, :-2]) / 2
@@ -246,24 +247,24 @@ def _log_gradients(inverse: np.ndarray, discontinuity: float) -> np.ndarray:
 
 
 def _shape_discs(
-    rays: np.ndarray, rho: np.ndarray, gradient: np.ndarray, spacing: float, level: int, config: LiftConfig
+    rays: np.ndarray, inverse_depth: np.ndarray, gradient: np.ndarray, spacing: float, level: int, config: LiftConfig
 ) -> tuple[np.ndarray, np.ndarray]:
     """Axes (n, 3, 3) in the camera frame, as columns, and standard deviations (n, 3) of discs on the surface."""
     longitude = np.arctan2(rays[:, 0], rays[:, 2])  # 0 at the poles
     east = np.stack((np.cos(longitude), np.zeros(len(rays)), -np.sin(longitude)), axis=-1)
     south = np.cross(rays, east)
-    # X = ray / rho, so dX = (direction - ray * dlog(rho)) / rho per radian.
-    steepest = np.linalg.norm(gradient, axis=-1)
+    # X = ray / inverse_depth, so dX = (direction - ray * dlog(inverse_depth)) / inverse_depth per radian.
+    steepness = np.linalg.norm(gradient, axis=-1)
     # A disc that is nearly parallel to its ray must end well before the camera.
     limit = min(config.max_stretch[level], _MAX_LENGTH / (config.footprint * spacing))
-    gradient = gradient * np.minimum(1, limit / np.maximum(steepest, 1e-9))[:, None]
-    steepest = np.minimum(steepest, limit)
-    uphill = np.where(steepest[:, None] > 1e-6, gradient / np.maximum(steepest, 1e-6)[:, None], (1.0, 0.0))
-    along = uphill[:, :1] * east + uphill[:, 1:] * south
-    across = -uphill[:, 1:] * east + uphill[:, :1] * south
-    long = along - steepest[:, None] * rays
+    gradient = gradient * np.minimum(1, limit / np.maximum(steepness, 1e-9))[:, None]
+    steepness = np.minimum(steepness, limit)
+    ascent = np.where(steepness[:, None] > 1e-6, gradient / np.maximum(steepness, 1e-6)[:, None], (1.0, 0.0))
+    along = ascent[:, :1] * east + ascent[:, 1:] * south
+    across = -ascent[:, 1:] * east + ascent[:, :1] * south
+    long = along - steepness[:, None] * rays
     stretch = np.linalg.norm(long, axis=-1)
     long = long / stretch[:, None]
     axes = np.stack((long, across, np.cross(long, across)), axis=-1)
-    size = config.footprint * spacing / rho
+    size = config.footprint * spacing / inverse_depth
     return axes, np.stack((size * stretch, size, size * config.thickness), axis=-1)

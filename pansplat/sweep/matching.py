@@ -5,10 +5,10 @@ concentric spheres they are constant (PanSplat, section 3.2). For parallel plane
 component along the normal, so that a matching window is warped as its plane requires. For a narrow search the base is
 the coarser level's surface.
 
-Aggregation runs along eight directions. A path pays a small penalty for the next hypothesis of the same set, a crease
+Aggregation runs along eight directions. A path adds a small penalty for the next hypothesis of the same set, a crease
 penalty for a hypothesis of another set with the same depth at this pixel, and a jump penalty, lower at image edges, for
-any other. A plane stays one hypothesis however slanted it is, at no penalty. Horizontal paths wrap; vertical paths
-continue over the poles.
+any other. A slanted plane is a single hypothesis and has no penalty. Horizontal paths wrap; vertical paths continue
+over the poles.
 
 Source: Hirschmueller, doi:10.1109/TPAMI.2007.1166, generalised from fronto-parallel labels to sets of hypotheses.
 """
@@ -167,16 +167,15 @@ def _pad_in_place(padded, m):
 
 
 @nb.njit(parallel=True, fastmath=True, cache=True)
-def _set_cost(
+def _compute_set_cost(
     image, gray, mean, variance, other, rays, rotation, translation, base, step, limits, penalty, back_facing, sphere,
-    side, down, floor_ceiling, valid, other_valid, other_inverse, other_confidence, informed, weights, m,
+    side, down, floor_ceiling, valid, other_valid, other_inverse, other_confidence, has_surface, weights, m,
     cost, offset, count,
 ):  # fmt: skip
     height, width = image.shape[:2]
     low, high = limits
-    correlation_weight, color_weight, color_truncation, epsilon, visible, bonus, occluded, tolerance, outside = weights[
-        :9
-    ]
+    correlation_weight, color_weight, color_truncation, epsilon, free_space_penalty = weights[:5]
+    consistency_bonus, occluded_cost, tolerance, outside_penalty = weights[5:9]
     textureless_weight, textureless_cost, texture_variance, distance_ratio, distance_penalty = weights[9:14]
     opposed_penalty, back_facing_cost = weights[14:]
     opposed_from, opposed_to = _OPPOSED
@@ -188,15 +187,12 @@ def _set_cost(
     for block in nb.prange((count + _BLOCK - 1) // _BLOCK):
         warped = np.empty((height + 2 * m, width + 2 * m), np.float32)
         difference = np.empty((height, width), np.float32)
-        state = np.empty((height, width), np.uint8)  # 0 matched, 1 out of range, 2 back_facing or masked
+        state = np.empty((height, width), np.uint8)  # 0 matched, 1 out of range, 2 masked in the other view
         ratio = np.empty((height, width), np.float32)
-        trust = np.empty((height, width), np.float32)
+        confidence_map = np.empty((height, width), np.float32)
         geometry = np.empty((height, width), np.float32)
-        sum_b, sum_bb, sum_ab = (
-            np.empty((height, width), np.float32),
-            np.empty((height, width), np.float32),
-            np.empty((height, width), np.float32),
-        )
+        sum_b, sum_bb = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+        sum_ab = np.empty((height, width), np.float32)
         column = np.empty((3, width + 2 * m), np.float32)
         u, v, scale = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
         inverse, cosine = np.empty(width, np.float32), np.empty(width, np.float32)
@@ -226,13 +222,13 @@ def _set_cost(
                     qi = min(max(int(v[j] - np.float32(0.5)), 0), height - 1)
                     qj = int(u[j] - np.float32(0.5)) % width
                     state[i, j] = 1 if inverse[j] < low or inverse[j] > high else (0 if other_valid[qi, qj] else 2)
-                    ratio[i, j] = inverse[j] * scale[j] / other_inverse[qi, qj] if informed else np.float32(1)
+                    ratio[i, j] = inverse[j] * scale[j] / other_inverse[qi, qj] if has_surface else np.float32(1)
                     geometry[i, j] = distance_penalty * max(
                         1 - distance_ratio * min(scale[j], 1 / scale[j]), np.float32(0)
                     )
                     opposed = (opposed_from - cosine[j]) / (opposed_from - opposed_to)
                     geometry[i, j] += opposed_penalty * min(max(opposed, np.float32(0)), np.float32(1))
-                    trust[i, j] = other_confidence[qi, qj] if informed else np.float32(0)
+                    confidence_map[i, j] = other_confidence[qi, qj] if has_surface else np.float32(0)
             _pad_in_place(warped, m)
             _window_sums(gray, warped, m, column[0], column[1], column[2], sum_b, sum_bb, sum_ab)
             for i in range(height):
@@ -246,20 +242,20 @@ def _set_cost(
                     textured = textureless_weight + (1 - textureless_weight) * textured
                     c = textured * c + (1 - textured) * textureless_cost
                     extra = penalty[side[i, j], k] + geometry[i, j]
-                    t = trust[i, j]
+                    t = confidence_map[i, j]
                     if ratio[i, j] > 1 + tolerance:
-                        extra += visible * t
+                        extra += free_space_penalty * t
                     elif ratio[i, j] > 1 - tolerance:
-                        extra -= bonus * t
+                        extra -= consistency_bonus * t
                     else:
-                        c = (1 - t) * c + t * occluded
+                        c = (1 - t) * c + t * occluded_cost
                     if back_facing[side[i, j], k]:
                         c = back_facing_cost
                     if state[i, j] == 2 or not valid[i, j]:
                         c = neutral
                     below = down[i, j] / max(base[i, j] + np.float32(k) * step[i, j], low)
                     if below > floor_ceiling[0] or below < floor_ceiling[1]:
-                        extra += outside
+                        extra += outside_penalty
                     result[i, j, k - first] = impossible if state[i, j] == 1 else c + extra
         for i in range(height):
             for j in range(width):
@@ -274,8 +270,8 @@ class HypothesisSet:
     Attributes:
         base, step: (h, w) float32, 1/m.
         penalty: (2, count) added to the cost of a hypothesis, by `side`.
-        side: (h, w) whether a pixel sees the planes at negative (0) or positive (1) distances along their normal.
-        back_facing: (2, count) planes whose other side the other view sees; None for none.
+        side: (h, w) 0 where a pixel sees the planes at negative distances along their normal, 1 at positive ones.
+        back_facing: (2, count) planes that the two views see from different sides; None for none.
         sphere: the hypotheses are spheres around the camera.
     """
 
@@ -305,7 +301,7 @@ class View:
     confidence: np.ndarray | None = None
 
 
-def matching_cost(
+def compute_matching_cost(
     view: View,
     other: View,
     pose: np.ndarray,
@@ -329,9 +325,9 @@ def matching_cost(
     mean = np.ascontiguousarray(cv2.boxFilter(gray, -1, window)[inside])
     variance = np.ascontiguousarray(cv2.boxFilter(gray * gray, -1, window)[inside])
     variance = np.maximum(variance - mean * mean, 0)
-    informed = other.inverse_depth is not None and other.confidence is not None
-    other_inverse = other.inverse_depth if informed else np.ones((height, width), np.float32)
-    other_confidence = other.confidence if informed else np.zeros((height, width), np.float32)
+    has_surface = other.inverse_depth is not None and other.confidence is not None
+    other_inverse = other.inverse_depth if has_surface else np.ones((height, width), np.float32)
+    other_confidence = other.confidence if has_surface else np.zeros((height, width), np.float32)
     weights = tuple(np.float32(getattr(config, name)) for name in _WEIGHTS)
     count = sets[0].penalty.shape[1]
     cost = np.empty((height, width, len(sets) * count), np.float32)
@@ -340,12 +336,12 @@ def matching_cost(
     translation = np.ascontiguousarray(pose[:3, 3], np.float32)
     for n, hypotheses in enumerate(sets):
         back_facing = np.zeros((2, count), bool) if hypotheses.back_facing is None else hypotheses.back_facing
-        _set_cost(
+        _compute_set_cost(
             view.image, gray, mean, variance, other_image, rays, rotation, translation, hypotheses.base,
             hypotheses.step, (np.float32(limits[0]), np.float32(limits[1])), hypotheses.penalty, back_facing,
             hypotheses.sphere, hypotheses.side, view.down,
             (np.float32(floor_ceiling[0]), np.float32(floor_ceiling[1])), view.valid, other.valid, other_inverse,
-            other_confidence, informed, weights, m, cost, n * count, count,
+            other_confidence, has_surface, weights, m, cost, n * count, count,
         )  # fmt: skip
     return cost
 
@@ -413,7 +409,7 @@ def _aggregate_rows(cost, total, guide, slot_map, sets, count, slots, penalties,
     previous, current = np.empty(labels, np.float32), np.empty(labels, np.float32)
     a, b = np.empty(slots, np.float32), np.empty(slots, np.float32)
     for i in range(height):
-        t = stretch[i]  # neighbours near a pole are closer: higher penalties
+        t = stretch[i]  # neighbours near a pole are closer, so penalties are higher
         previous[:] = cost[i, 0]
         for n in range(1, 2 * width):
             j, jp = (dx * n) % width, (dx * (n - 1)) % width
@@ -460,7 +456,7 @@ def _aggregate_columns(cost, total, guide, slot_map, sets, count, slots, penalti
         previous, current = current, previous
 
 
-def aggregate(
+def aggregate_costs(
     cost: np.ndarray,
     guide: np.ndarray,
     slot_map: np.ndarray,
@@ -503,7 +499,7 @@ def aggregate(
 
 
 @nb.njit(parallel=True, cache=True)
-def best_labels(total: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def select_labels(total: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Label of lowest cost (h, w) int32, and its subpixel offset in [-0.5, 0.5] labels by a parabola fit."""
     height, width, labels = total.shape
     label = np.empty((height, width), np.int32)

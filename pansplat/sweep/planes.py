@@ -21,21 +21,21 @@ import cv2
 import numpy as np
 
 from pansplat.geometry.equirect import row_weights
-from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View, matching_cost
+from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View, compute_matching_cost
 from pansplat.sweep.surface import Surface, pad_sphere, ray_grid, world_points
 
-_MIN_GRADIENT = 0.02  # per pixel of the image that the axes are estimated from; smaller gradients are noise
-_MAX_GRADIENT = 0.2  # weights of larger gradients are truncated
+_MIN_GRADIENT = 0.02  # per pixel; smaller gradients are noise
+_MAX_GRADIENT = 0.2  # larger gradients have the weight of this one
 
-_BIN = 1 / 9  # of `near`: 5 cm indoors
-_MIN_SHARE, _MAX_SHARE = 2e-4, 2e-2  # shares of all directions at which a plane's support is 0 and 1
+_BIN_WIDTH = 1 / 9  # in units of `near`: 5 cm indoors
+_MIN_SOLID_ANGLE, _MAX_SOLID_ANGLE = 2e-4, 2e-2  # fractions of the sphere at which a plane's support is 0 and 1
 _DOWN_AXIS = 0
 MIN_FLOOR = 0.9  # smallest distance of the floor or ceiling from the camera, in units of `near`
-_FLOOR_SHARE = 0.02
+_FLOOR_SOLID_ANGLE = 0.02  # smallest fraction of the sphere that a floor or ceiling covers
 
 _CANDIDATES = 192  # planes across an axis
-_SOFTNESS = np.float32(0.1)  # difference of cost at which a vote is smaller by e
-_MAX_COST = np.float32(0.6)  # cost at which a match has no vote
+_SOFTNESS = np.float32(0.1)  # difference of cost that divides a vote by e
+_MAX_COST = np.float32(0.6)  # smallest cost of a match without a vote
 _MAX_VARIANCE = 4e-3  # of grey values; more texture gives no more votes
 _MIN_SLANT = 0.2  # smallest component of a ray along a plane's normal
 _MIN_VOTES = 0.1  # scale of a plane's votes, relative to the strongest plane
@@ -115,8 +115,8 @@ def _fit_down(normal: np.ndarray, weight: np.ndarray, start: np.ndarray) -> np.n
 
 def _fit_yaw(normal: np.ndarray, weight: np.ndarray, down: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
     """Angle in [0, pi/2) from `a` of the most frequent direction of horizontal lines."""
-    lean = np.abs(normal @ down)
-    horizontal = (lean > math.sin(math.radians(8))) & (lean < math.sin(math.radians(80)))
+    vertical = np.abs(normal @ down)
+    horizontal = (vertical > math.sin(math.radians(8))) & (vertical < math.sin(math.radians(80)))
     angle = np.arctan2(-(normal[horizontal] @ a), normal[horizontal] @ b)
     bins = 180
     votes, _ = np.histogram(angle % (math.pi / 2), bins=bins, range=(0, math.pi / 2), weights=weight[horizontal])
@@ -137,7 +137,7 @@ class ScenePlanes:
     Attributes:
         axes: (3, 3) see `estimate_axes`.
         origin: (3,) in the world.
-        histogram: (3, bins) share of all directions whose surface lies on a plane.
+        histogram: (3, bins) fraction of the sphere whose surface lies on a plane.
         bin: width of a bin, metres.
         votes: (3, bins) support in [0, 1] by Hough voting.
         floor_ceiling: offsets down and up (negative) of the detected floor and ceiling, metres; infinite without one.
@@ -164,7 +164,7 @@ class ScenePlanes:
         """Support in [0, 1], (2, n), of planes at distances 1 / `inverse` on the negative and positive side."""
         centre = self.axes[axis] @ (cam2world[:3, 3] - self.origin)
         index = np.stack([self._bin(centre + sign / inverse) for sign in (-1, 1)])
-        found = np.log1p(self.histogram[axis, index] / _MIN_SHARE) / np.log1p(_MAX_SHARE / _MIN_SHARE)
+        found = np.log1p(self.histogram[axis, index] / _MIN_SOLID_ANGLE) / np.log1p(_MAX_SOLID_ANGLE / _MIN_SOLID_ANGLE)
         return np.clip(np.maximum(found, self.votes[axis, index]), 0, 1)
 
     def separating(self, axis: int, cam2world: np.ndarray, other: np.ndarray, inverse: np.ndarray) -> np.ndarray:
@@ -182,7 +182,7 @@ class ScenePlanes:
     def vertical_bounds(self, cam2world: np.ndarray) -> tuple[float, float]:
         """Extent of the scene below and above (negative) a camera, metres; infinite where unknown."""
         horizontal = self.histogram[_DOWN_AXIS]
-        middle, gap = len(horizontal) // 2, round(MIN_FLOOR / _BIN)
+        middle, gap = len(horizontal) // 2, round(MIN_FLOOR / _BIN_WIDTH)
         camera = self.axes[_DOWN_AXIS] @ (cam2world[:3, 3] - self.origin)
         bounds = []
         for voted, start, part, sign in (
@@ -191,35 +191,35 @@ class ScenePlanes:
         ):
             peak = start + int(part.argmax())
             offset = voted
-            if math.isinf(voted) and horizontal[max(peak - 2, 0) : peak + 3].sum() > _FLOOR_SHARE:
+            if math.isinf(voted) and horizontal[max(peak - 2, 0) : peak + 3].sum() > _FLOOR_SOLID_ANGLE:
                 offset = self.offsets[peak]
             bounds.append(1.06 * (offset - camera) + sign * self.bin)
         return bounds[0], bounds[1]
 
 
-def no_planes(cam2world: np.ndarray, axes: np.ndarray, near: float, far: float) -> ScenePlanes:
-    """Empty evidence around the mean of the cameras; `near` sets the width of the bins, `far` their range."""
-    width = near * _BIN
+def make_empty_planes(cam2world: np.ndarray, axes: np.ndarray, near: float, far: float) -> ScenePlanes:
+    """Planes without evidence, around the mean of the cameras; `near` sets the bins' width and `far` their range."""
+    width = near * _BIN_WIDTH
     empty = np.zeros((3, 2 * int(1.5 * far / width)))
     return ScenePlanes(axes, cam2world[:, :3, 3].mean(axis=0), empty, width, empty)
 
 
 def collect_planes(
-    surfaces: Sequence[Surface], consistent: Sequence[np.ndarray], cam2world: np.ndarray, known: ScenePlanes
+    surfaces: Sequence[Surface], consistent: Sequence[np.ndarray], cam2world: np.ndarray, planes: ScenePlanes
 ) -> ScenePlanes:
-    """The evidence with a new histogram of the pixels (h, w) whose surfaces are consistent between views."""
-    histogram = np.zeros_like(known.histogram)
+    """The planes with a new histogram, of the pixels (h, w) whose surfaces are consistent between views."""
+    histogram = np.zeros_like(planes.histogram)
     bins = histogram.shape[1]
     for surface, mask, pose in zip(surfaces, consistent, cam2world, strict=True):
         height, width = surface.inverse_depth.shape
         area = np.repeat(row_weights(height).numpy()[:, None], width, axis=1)
         area /= area.sum() * len(surfaces)
-        points = world_points(surface, pose) - known.origin
+        points = world_points(surface, pose) - planes.origin
         for axis in range(3):
             chosen = mask & (surface.orientation == axis + 1)
-            index = known._bin(points[chosen] @ known.axes[axis])
+            index = planes._bin(points[chosen] @ planes.axes[axis])
             histogram[axis] += np.bincount(index, weights=area[chosen], minlength=bins)
-    return dataclasses.replace(known, histogram=cv2.GaussianBlur(histogram, (9, 1), 1.0))
+    return dataclasses.replace(planes, histogram=cv2.GaussianBlur(histogram, (9, 1), 1.0))
 
 
 def detect_planes(
@@ -231,7 +231,7 @@ def detect_planes(
     min_floor: float,
     config: MatchingConfig,
 ) -> ScenePlanes:
-    """The evidence with the planes, the floor and the ceiling that are found by Hough voting.
+    """The planes with the votes, the floor and the ceiling that Hough voting finds.
 
     Args:
         rays: (3, h, w) for each view, components of its rays along the scene's axes.
@@ -276,7 +276,7 @@ def _count_votes(
         )
         for axis, (slope, side) in enumerate(zip(np.abs(rays), (rays > 0).astype(np.uint8), strict=True))
     ]  # fmt: skip
-    cost = matching_cost(view, other, np.linalg.inv(there) @ here, sets, limits, _UNBOUNDED, config)
+    cost = compute_matching_cost(view, other, np.linalg.inv(there) @ here, sets, limits, _UNBOUNDED, config)
     vote = np.exp(-cost / _SOFTNESS)
     vote *= (_vote_weights(view) / vote.sum(axis=-1))[..., None] * np.maximum(_MAX_COST - cost, 0)
     votes = np.zeros_like(planes.histogram)

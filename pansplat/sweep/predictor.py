@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 
@@ -37,7 +36,7 @@ class Sweep:
 
     def __init__(self, config: SweepConfig | None = None) -> None:
         self.config = config or SweepConfig()
-        self.fingerprint = _fingerprint(self.config)
+        self.fingerprint = _compute_fingerprint(self.config)
 
     def __call__(
         self,
@@ -54,8 +53,8 @@ class Sweep:
         Args:
             near, far: radial depth range, metres: numbers, or tensors with one value for each batch item or view; the
                 range then covers all views.
-            masks: True where a pixel shows the scene. Other pixels are not matched and have no Gaussians; nor have
-                patches of exact black (0, 0, 0), the holes of scans.
+            masks: True where a pixel shows the scene. Other pixels are not matched and have no Gaussians. Patches of
+                exact black (0, 0, 0), the holes of scans, are masked too.
 
         Raises:
             ValueError: on wrong shapes, fewer than two views, non-finite values, or near >= far.
@@ -63,7 +62,9 @@ class Sweep:
         if images.ndim == 5:
             item_masks = [None] * len(images) if masks is None else masks
             return [
-                self._predict(images[n], cam2world[n], _item(near, n), _item(far, n), item_masks[n], progress)
+                self._predict(
+                    images[n], cam2world[n], _select_item(near, n), _select_item(far, n), item_masks[n], progress
+                )
                 for n in range(len(images))
             ]
         return self._predict(images, cam2world, near, far, masks, progress)
@@ -78,7 +79,7 @@ class Sweep:
         progress: Progress | None,
     ) -> Gaussians:
         low, high = float(torch.as_tensor(near).min()), float(torch.as_tensor(far).max())
-        _check(images, cam2world, low, high, masks)
+        _check_inputs(images, cam2world, low, high, masks)
         posed = PosedImages(
             images=np.ascontiguousarray(images.detach().cpu().float().permute(0, 2, 3, 1).numpy()),
             cam2world=cam2world.detach().cpu().double().numpy(),
@@ -104,11 +105,11 @@ def _mask_holes(images: Tensor) -> np.ndarray:
     return visible
 
 
-def _item(value: float | Tensor, n: int) -> float | Tensor:
+def _select_item(value: float | Tensor, n: int) -> float | Tensor:
     return value[n] if isinstance(value, Tensor) and value.ndim else value
 
 
-def _check(images: Tensor, cam2world: Tensor, near: float, far: float, masks: Tensor | None) -> None:
+def _check_inputs(images: Tensor, cam2world: Tensor, near: float, far: float, masks: Tensor | None) -> None:
     shape = tuple(images.shape)
     if images.ndim != 4 or shape[0] < 2 or shape[1] != 3 or shape[3] != 2 * shape[2]:
         raise ValueError(
@@ -127,11 +128,10 @@ def _check(images: Tensor, cam2world: Tensor, near: float, far: float, masks: Te
         raise ValueError(f"`near` and `far` must satisfy 0 < near < far, got {near} and {far} (metres)")
 
 
-def _fingerprint(config: SweepConfig) -> str:
+def _compute_fingerprint(config: SweepConfig) -> str:
     """Hash of the settings and of the source code that computes the Gaussians; keys the prediction cache."""
     digest = hashlib.sha256(repr(config).encode())
-    packages: Sequence[str] = ("pansplat.sweep", "pansplat.gaussians", "pansplat.geometry")
-    for package in packages:
+    for package in ("pansplat.sweep", "pansplat.gaussians", "pansplat.geometry"):
         for source in sorted(files(package).iterdir(), key=lambda s: s.name):
             if source.name.endswith(".py"):
                 digest.update(source.read_bytes())

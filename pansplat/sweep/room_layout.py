@@ -1,13 +1,13 @@
-"""The room layout that a single panorama shows: where the floor ends, and which straight walls stand there.
+"""The room layout of a single panorama: the edge of the floor, and the straight walls on it.
 
 A wall that only one view sees cannot be matched, but the boundary of the floor gives its distance. The appearance of
-the floor is learned from the scene: pixels far below the cameras that match as floor are floor, pixels above the
-horizon are not.
+the floor is estimated from the scene: pixels far below the cameras that match the floor plane are floor, and pixels
+above the horizon are not.
 
 In a single direction the boundary is often unreliable. If walls are straight, neighbouring directions share a plane.
-For each view a path around the horizon is sought that follows the floor boundary on few vertical planes across the
-scene's axes. The walls are used where matching gives no evidence; they are dropped where the views agree on another
-surface.
+For each view, dynamic programming finds a path around the horizon that follows the floor boundary on few vertical
+planes across the scene's axes. The walls are used where matching gives no evidence; they are dropped where the views
+agree on another surface.
 """
 
 from __future__ import annotations
@@ -22,45 +22,41 @@ import numpy as np
 from scipy import ndimage
 
 from pansplat.geometry.equirect import row_weights
-from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View, matching_cost
+from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View, compute_matching_cost
 from pansplat.sweep.planes import ScenePlanes
 from pansplat.sweep.surface import nearest_pixel, pad_sphere, ray_grid, resize_sphere
 
 _BINS = (5, 8, 32, 32)  # texture, lightness and the two colour axes of CIELAB
 _BLUR = (0.7, 0.5, 1.0, 1.0)  # of the histogram, bins
 _MIN_DENSITY = 2e-5  # added to each bin of the histogram
-# Two rounds of learning: sine of the least angle below the horizon, and largest matching cost as floor, of the pixels
-# that are learned from. The first round uses what lies under the cameras, the second all that looks like it.
+# Samples of the floor in two rounds: sine of the smallest angle below the horizon, and largest matching cost of the
+# floor. The first round samples pixels below the cameras, the second all pixels of similar appearance.
 _ROUNDS = ((0.8, 0.8), (0.4, 0.5))
-_MIN_SCORE = -0.01  # least floor score of a pixel that is learned from
+_MIN_SCORE = -0.01  # smallest floor score of a sample
 _SMOOTHING, _EDGE = 50.0, 6.0  # of the floor score: lambda, and sigma in 8 bit values, of the edge-aware filter
-_FLOOR_SCORE = 0.2  # least floor score before the boundary
+_FLOOR_SCORE = 0.2  # smallest floor score below the boundary
 _MIN_DROP, _FULL_DROP = 0.25, 0.8  # drop of the floor score at which a boundary has confidence 0 and 1
-_MAX_FLOOR_COST, _COST_SLACK = (
-    1.0,
-    0.2,
-)  # matching cost before a boundary at which its confidence is 0; width of the ramp
+_MAX_FLOOR_COST = 1.0  # matching cost of the floor below a boundary with confidence 0
+_COST_RAMP = 0.2  # decrease of that cost at which the confidence is 1
 _BOUNDARY_TOLERANCE = 0.12  # of the logarithm of the distance
-_EDGE_NOISE, _EDGE_SCALE = 2.0, 30.0  # CIELAB difference between rows that is ignored; difference that attenuates by e
-_ABOVE_HORIZON_SCALE = 3.0  # factor on the edge sum that ends what continues from above the horizon
-_FAINT_DROP, _DROP_RANGE = 0.15, 0.65  # drop at which the boundary score is 0, and range up to 1
+_EDGE_NOISE, _EDGE_SCALE = 2.0, 30.0  # CIELAB differences between rows: ignored; divides a bonus by e
+_ABOVE_HORIZON_SCALE = 3.0  # of edge sums, for surfaces that continue from above the horizon
+_FAINT_DROP, _DROP_RANGE = 0.15, 0.65  # drop at which the boundary score is 0; its increase to score 1
 _ANY_DEPTH = (1e-6, 1e6)  # inverse, 1/m
 # Axis order of a panorama that is aligned with the scene (down first): its x is the third axis, its z the second.
 _DOWN_FIRST, _ALIGNED = [1, 2, 0], [2, 0, 1]
 
-# In units of the camera's height: the least and largest distance of a wall's base, and the spacing of the planes.
+# In units of the camera's height: the smallest and largest distance of a wall's base, and the spacing of the planes.
 _NEAREST, _FARTHEST, _SPACING = 1 / 7, 20.0, 1 / 85
 _NEIGHBOUR = 0.8  # factor on the boundary score of the neighbouring rows
 _NO_WALL = 0.3  # score of a direction without a wall; a certain boundary has score 1
-_CHANGE_PENALTY = 0.75  # for the begin and the end of a wall
+_CHANGE_PENALTY = 0.75  # at the start and at the end of a wall
 _IMPOSSIBLE = 0.5
 _FULL_SCORE, _FULL_WIDTH = 0.6, 0.15  # mean boundary score, and width in radians, of a wall with confidence 1
 _TOP = 0.5  # radians above the horizon up to which a wall is compared with other surfaces
 _SAME_DEPTH = 0.12  # of the logarithm of the depth
-_CONTRADICTED, _CONTRADICTION_RANGE = (
-    0.15,
-    0.2,
-)  # share of a wall at which its confidence starts to fall; range down to 0
+_CONTRADICTED = 0.15  # contradicted fraction of a wall at which its confidence starts to fall
+_CONTRADICTION_RANGE = 0.2  # increase of that fraction at which the confidence is 0
 _WALL_TOLERANCE = 0.1  # of the logarithm of a wall's depth
 
 
@@ -69,15 +65,15 @@ class RoomLayoutConfig:
     """Weights of the room layout, in the unit of the matching cost."""
 
     not_floor_penalty: float = 0.5
-    """For the floor where its score is -1."""
+    """Added to the floor where the floor score is -1."""
     floor_like_penalty: float = 0.3
-    """For all but the floor where the floor's score is 1."""
+    """Added to all other surfaces where the floor score is 1."""
     boundary_bonus: float = 0.8
-    """For surfaces that stand on the floor boundary."""
+    """Subtracted from surfaces that stand on the floor boundary."""
     boundary_decay: float = 1.5
-    """Angle above the boundary, radians, over which the bonus falls by e; it falls faster across image edges."""
+    """Angle above the boundary, radians, that divides the bonus by e; image edges reduce it further."""
     wall_bonus: float = 2.0
-    """For a wall that no other view contradicts."""
+    """Subtracted from a wall that no other view contradicts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +86,7 @@ class FloorBoundary:
         distance: (azimuths) from the camera to the boundary along the floor, metres.
         confidence: (azimuths) in [0, 1]; 0 where no boundary was found.
         score: (rows, azimuths) up to 1: evidence that the floor ends at the lower edge of a pixel.
-        edge_sum: (rows, azimuths) sum of image edges from the bottom up to a row; each unit attenuates by e.
+        edge_sum: (rows, azimuths) sum of image edges from the bottom up to a row; each unit divides a bonus by e.
     """
 
     floor_score: np.ndarray
@@ -155,7 +151,7 @@ def _floor_cost(
     """Matching cost (h, w) of the floor plane."""
     base = np.maximum(down, 1e-3).astype(np.float32) / np.float32(camera_height)
     floor = HypothesisSet(base, np.zeros_like(base), np.zeros((2, 1), np.float32), np.zeros(base.shape, np.uint8))
-    return matching_cost(view, other, pose, [floor], _ANY_DEPTH, (math.inf, -math.inf), config)[..., 0]
+    return compute_matching_cost(view, other, pose, [floor], _ANY_DEPTH, (math.inf, -math.inf), config)[..., 0]
 
 
 def _angle_above(angle: np.ndarray, rays: np.ndarray) -> np.ndarray:
@@ -213,7 +209,7 @@ def _appearance_bins(image: np.ndarray) -> tuple[np.ndarray, ...]:
 def _find_boundary(
     floor_score: np.ndarray, cost: np.ndarray, view: View, camera_height: float, down_first: np.ndarray
 ) -> FloorBoundary:
-    """The lowest boundary at each azimuth.
+    """The lowest floor boundary at each azimuth.
 
     Args:
         cost: (h, w) of the floor plane.
@@ -225,7 +221,7 @@ def _find_boundary(
     score, cost, valid = floor_score[row, column], cost[row, column], view.valid[row, column]
     valid &= np.roll(valid, -3, axis=0)
     edge_sum = _sum_edges(cv2.blur(view.image, (3, 3))[row, column])
-    # What continues below the horizon without an edge is not floor, whatever its colour.
+    # A surface that continues from above the horizon without an edge is not floor.
     standing = np.exp(-_ABOVE_HORIZON_SCALE * np.maximum(edge_sum[height // 2] - edge_sum, 0)) * (angle > 0)[:, None]
     score = score * (1 - standing) - standing
     before = _mean_of_rows(score, 1, 4)
@@ -236,7 +232,7 @@ def _find_boundary(
     ends[-4:] = False
     lowest = height - 1 - ends[::-1].argmax(axis=0)
     azimuth = np.arange(width)
-    is_floor = np.clip((_MAX_FLOOR_COST - _mean_of_rows(cost, 2, 7)) / _COST_SLACK, 0, 1)
+    is_floor = np.clip((_MAX_FLOOR_COST - _mean_of_rows(cost, 2, 7)) / _COST_RAMP, 0, 1)
     confidence = np.clip((drop - _MIN_DROP) / (_FULL_DROP - _MIN_DROP), 0, 1) * is_floor
     boundary = angle[lowest] + 0.5 * math.pi / height
     return FloorBoundary(
@@ -297,7 +293,7 @@ def apply_floor_costs(
     _, column = boundary.locate(rays)
     weight = config.boundary_bonus * boundary.confidence[column] * boundary.attenuation(boundary.angle, rays)
     weight *= np.exp(-np.maximum(_angle_above(boundary.angle[column], rays), 0) / config.boundary_decay)
-    depth = boundary.distance[column] / np.sqrt(np.maximum(1 - rays[0] ** 2, 1e-6))  # of what stands on the boundary
+    depth = boundary.distance[column] / np.sqrt(np.maximum(1 - rays[0] ** 2, 1e-6))  # of surfaces on the boundary
     rows, columns = np.nonzero(weight > 1e-3)
     k = np.arange(count, dtype=np.float32)
     for n, hypotheses in enumerate(sets):
@@ -347,8 +343,8 @@ def fit_walls(boundary: FloorBoundary, camera_height: float, far: float) -> Wall
     angle = np.arctan(camera_height / np.where(in_range, distance, 1))
     row = np.clip((angle / math.pi + 0.5) * height - 1, 0, height - 1.001)  # of the pixel with this lower edge
     scores = np.maximum(boundary.score, _NEIGHBOUR * ndimage.maximum_filter1d(boundary.score, 3, axis=0))
-    upper, part, column = row.astype(np.int64), row % 1, np.arange(width)[:, None]
-    found = (1 - part) * scores[upper, column] + part * scores[upper + 1, column]
+    upper, fraction, column = row.astype(np.int64), row % 1, np.arange(width)[:, None]
+    found = (1 - fraction) * scores[upper, column] + fraction * scores[upper + 1, column]
     found = np.where(in_range, found, -_IMPOSSIBLE)
     chosen = _best_path(found)
     is_wall = chosen >= 0
@@ -376,19 +372,19 @@ def _best_path(found: np.ndarray) -> np.ndarray:
     """
     width, planes = found.shape
     walls, none = np.zeros(planes), 0.0
-    came_from = np.empty((2 * width, planes + 1), np.int64)  # the last column is the predecessor of "no wall"
+    predecessor = np.empty((2 * width, planes + 1), np.int64)  # the last column is the predecessor of "no wall"
     for n in range(2 * width):
         best = int(walls.argmax())
         between, source = max((none, -1), (walls[best] - _CHANGE_PENALTY, best))
         begins = between - _CHANGE_PENALTY > walls
-        came_from[n, :-1] = np.where(begins, source, np.arange(planes))
-        came_from[n, -1] = source
+        predecessor[n, :-1] = np.where(begins, source, np.arange(planes))
+        predecessor[n, -1] = source
         walls, none = np.where(begins, between - _CHANGE_PENALTY, walls) + found[n % width], between + _NO_WALL
     last = int(walls.argmax()) if walls.max() > none else -1
     path = np.empty(2 * width, np.int64)
     for n in range(2 * width - 1, -1, -1):
         path[n] = last
-        last = int(came_from[n, last])
+        last = int(predecessor[n, last])
     return np.concatenate((path[width : width + width // 2], path[width // 2 : width]))
 
 
@@ -403,7 +399,7 @@ def discount_contradicted(
         consistent: (h, w) where that surface is consistent with another view.
     """
     _, column = boundary.locate(rays)
-    wall = _inverse_depth(walls, rays, column)
+    wall = _wall_inverse_depth(walls, rays, column)
     angle = np.arcsin(np.clip(rays[0], -1, 1))
     compared = (walls.index[column] >= 0) & (wall > 0) & (angle < walls.base_angle[column]) & (angle > -_TOP)
     index, area = walls.index[column][compared], np.cos(angle)[compared]
@@ -434,7 +430,7 @@ def apply_wall_bonus(
     """
     count = sets[0].penalty.shape[1]
     _, column = boundary.locate(rays)
-    wall = _inverse_depth(walls, rays, column)
+    wall = _wall_inverse_depth(walls, rays, column)
     weight = bonus * walls.confidence[column] * boundary.attenuation(walls.base_angle, rays)
     weight *= (wall > 0) & (rays[0] > ceiling * wall)
     k = np.arange(count, dtype=np.float32)
@@ -448,7 +444,7 @@ def apply_wall_bonus(
         ).astype(np.float32)  # fmt: skip
 
 
-def _inverse_depth(walls: Walls, rays: np.ndarray, column: np.ndarray) -> np.ndarray:
+def _wall_inverse_depth(walls: Walls, rays: np.ndarray, column: np.ndarray) -> np.ndarray:
     """Inverse depth (h, w) of the walls at rays, at most 0 where there is none."""
     across = np.where(walls.axis[column] == 1, rays[1], rays[2])
     return np.where(walls.axis[column] > 0, across / walls.offset[column], 0)

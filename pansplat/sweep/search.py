@@ -1,6 +1,6 @@
-"""The hierarchical sphere sweep: from posed panoramas to a surface for each of them.
+"""The hierarchical sphere sweep: from posed panoramas to one surface per view.
 
-First the scene's planes are detected, and the room layout of each view. Three levels of matching follow at 1/4, 1/2 and
+The scene's planes and the room layout of each view are detected first. Three levels of matching follow at 1/4, 1/2 and
 1/1 of the height, as in the paper's hierarchical cost volume (PanSplat, section 3.2). The coarse level searches the
 whole depth range with spheres and with planes across the scene's axes. It runs twice: the second pass uses the surfaces
 of the first for occlusion, consistency between views, and the support of planes. Each finer level searches a narrow
@@ -22,9 +22,9 @@ from pansplat.sweep.matching import (
     HypothesisSet,
     MatchingConfig,
     View,
-    aggregate,
-    best_labels,
-    matching_cost,
+    aggregate_costs,
+    compute_matching_cost,
+    select_labels,
 )
 from pansplat.sweep.planes import (
     MIN_FLOOR,
@@ -33,7 +33,7 @@ from pansplat.sweep.planes import (
     collect_planes,
     detect_planes,
     estimate_axes,
-    no_planes,
+    make_empty_planes,
 )
 from pansplat.sweep.room_layout import (
     FloorBoundary,
@@ -47,8 +47,8 @@ from pansplat.sweep.room_layout import (
 )
 from pansplat.sweep.surface import Surface, consistency_mask, guided_upsample, resize_sphere
 
-_DETECTION_HEIGHT = 128  # of the images that planes and room layouts are detected in
-_FLOOR_THICKNESS = 2.5  # bins of the planes' offsets
+_DETECTION_HEIGHT = 128  # pixels; planes and room layouts are detected at this size
+_FLOOR_THICKNESS = 2.5  # in bins of the planes' offsets
 
 
 @dataclass(frozen=True)
@@ -65,11 +65,11 @@ class SearchConfig:
     narrow_candidates: tuple[int, int] = (24, 16)
     """Hypotheses of a set at the two finer levels."""
     unverified_confidence: float = 0.1
-    """Weight in other views' matching of a surface that is consistent with no other view."""
+    """Confidence of a surface that is consistent with no other view, when other views are matched against it."""
     plane_prior: float = 0.3
     """Penalty of a plane without support in the scene."""
     sphere_prior: float = 0.18
-    """Penalty of spheres, against supported planes."""
+    """Penalty of spheres relative to supported planes."""
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     aggregation: AggregationConfig = field(default_factory=AggregationConfig)
     room_layout: RoomLayoutConfig = field(default_factory=RoomLayoutConfig)
@@ -110,7 +110,7 @@ def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[
     count = int(np.clip(math.ceil(steps), 48, config.max_candidates))
     step = (high - low) / (count - 1)
     report("finding floor, ceiling and walls", 0.0)
-    planes = no_planes(posed.cam2world, axes, posed.near, posed.far)
+    planes = make_empty_planes(posed.cam2world, axes, posed.near, posed.far)
     detection = _Level(posed, min(finest, _DETECTION_HEIGHT), planes, (low, high), config, None)
     planes = detection.detect_planes()
     boundaries = detect_floor_boundaries(detection.views, detection.rays, posed.cam2world, planes, config.matching)
@@ -208,7 +208,7 @@ class _Level:
             for slope, penalty, side in zip(slopes, penalties, sides, strict=True)
         ]
         slot_map = np.stack([np.stack((s, (s - 1) * low / step + 0.5), axis=-1) for s in slopes], axis=2)
-        cost = self._mean_cost(view, lambda other: self._against(view, other, sets, inverse))
+        cost = self._mean_cost(view, lambda other: self._mark_separating_planes(view, other, sets, inverse))
         if layout is not None:
             camera_height = self.planes.camera_height(self.posed.cam2world[view])
             is_floor = np.abs(1 / inverse - camera_height) < _FLOOR_THICKNESS * self.planes.bin
@@ -220,15 +220,17 @@ class _Level:
     def _apply_walls(
         self, view: int, boundary: FloorBoundary, walls: Walls, sets: list[HypothesisSet], cost: np.ndarray
     ) -> None:
-        """Lower the cost of the view's walls, as far as the surfaces do not contradict them."""
+        """Lower the cost of those of the view's walls that its surface does not contradict."""
         known, confidence = self.views[view].inverse_depth, self.views[view].confidence
         assert known is not None and confidence is not None
         walls = discount_contradicted(walls, boundary, self.rays[view], known, confidence == 1)
         _, ceiling = self.planes.vertical_bounds(self.posed.cam2world[view])
         apply_wall_bonus(cost, walls, boundary, sets, self.rays[view], ceiling, self.config.room_layout.wall_bonus)
 
-    def _against(self, view: int, other: int, sets: list[HypothesisSet], inverse: np.ndarray) -> list[HypothesisSet]:
-        """The sets, with the planes marked that separate the view from the other view."""
+    def _mark_separating_planes(
+        self, view: int, other: int, sets: list[HypothesisSet], inverse: np.ndarray
+    ) -> list[HypothesisSet]:
+        """Copies of the sets in which the planes that separate the two views are back-facing."""
         pose, there = self.posed.cam2world[[view, other]]
         marks = [None] + [self.planes.separating(axis, pose, there, inverse) for axis in range(3)]
         return [dataclasses.replace(s, back_facing=m, sphere=m is None) for s, m in zip(sets, marks, strict=True)]
@@ -258,7 +260,7 @@ class _Level:
         bounds = self.planes.vertical_bounds(self.posed.cam2world[view])
         cost: np.ndarray | None = None
         for other in others:
-            part = matching_cost(
+            part = compute_matching_cost(
                 self.views[view], self.views[other], self.posed.relative_pose(view, other),
                 sets_against(other), self.limits, bounds, self.config.matching,
             )  # fmt: skip
@@ -273,8 +275,8 @@ class _Level:
     ) -> Surface:
         """The surface of lowest aggregated cost."""
         count = sets[0].penalty.shape[1]
-        total = aggregate(cost, self.views[view].image, slot_map, slots, self.config.aggregation)
-        label, offset = best_labels(total, count)
+        total = aggregate_costs(cost, self.views[view].image, slot_map, slots, self.config.aggregation)
+        label, offset = select_labels(total, count)
         chosen, k = label // count, label % count
         base = np.stack([s.base for s in sets], axis=-1)
         step = np.stack([s.step for s in sets], axis=-1)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pansplat.sweep.matching import MatchingConfig, View
-from pansplat.sweep.planes import axis_components, no_planes
+from pansplat.sweep.planes import axis_components, make_empty_planes
 from pansplat.sweep.room_layout import FloorBoundary, detect_floor_boundaries
 from pansplat.sweep.search import PosedImages, SearchConfig, search_surfaces
 from pansplat.sweep.surface import Surface, ray_grid, resize_sphere
@@ -200,7 +200,7 @@ def views_of() -> Callable[..., tuple[list[View], list[np.ndarray]]]:
 
 def _find_boundaries(posed, images, floor: float) -> tuple[list[FloorBoundary] | None, list[np.ndarray]]:
     views, rays = _views_of(posed, images, posed.masks)
-    planes = no_planes(posed.cam2world, _AXES, posed.near, posed.far)
+    planes = make_empty_planes(posed.cam2world, _AXES, posed.near, posed.far)
     planes = dataclasses.replace(planes, floor_ceiling=(floor - planes.origin[1], -math.inf))
     return detect_floor_boundaries(views, rays, posed.cam2world, planes, MatchingConfig()), rays
 

@@ -14,9 +14,9 @@ from pansplat.sweep.matching import (
     View,
     _aggregate_columns,
     _fast_atan2,
-    aggregate,
-    best_labels,
-    matching_cost,
+    aggregate_costs,
+    compute_matching_cost,
+    select_labels,
 )
 from pansplat.sweep.surface import ray_grid
 
@@ -45,7 +45,7 @@ def _view(image: np.ndarray, valid: np.ndarray | None = None, inverse: float | N
 
 def _cost(views, *sets, pose=None, limits=(0.1, 2.0), bounds=(math.inf, -math.inf), config=_PLAIN) -> np.ndarray:
     """Cost of a view against another, by default with the same pose."""
-    return matching_cost(*views, np.eye(4) if pose is None else pose, list(sets), limits, bounds, config)
+    return compute_matching_cost(*views, np.eye(4) if pose is None else pose, list(sets), limits, bounds, config)
 
 
 @pytest.fixture(scope="module")
@@ -245,7 +245,7 @@ def _noise(height: int, labels: int, seed: int = 0) -> np.ndarray:
 
 def _aggregate(cost: np.ndarray, guide: np.ndarray | None = None, *, sets: int = 1, config=_DEFAULT) -> np.ndarray:
     height = len(cost)
-    return aggregate(cost, _gray(height) if guide is None else guide, _slots(height, sets), 12, config)
+    return aggregate_costs(cost, _gray(height) if guide is None else guide, _slots(height, sets), 12, config)
 
 
 def test_without_penalties_every_direction_adds_the_cost_once():
@@ -321,14 +321,14 @@ def test_a_change_of_set_is_cheap_only_at_equal_depth():
     for start in (0.5, 6.5):  # hypothesis 4 of set 1 lies in slot 4, or in slot 10
         slot_map = _slots(height, 2)
         slot_map[..., 1, 1] = start
-        total = aggregate(cost, _gray(height), slot_map, 20, AggregationConfig())
+        total = aggregate_costs(cost, _gray(height), slot_map, 20, AggregationConfig())
         least.append(float(total[16, 32, count + 4]))
     assert 0 < least[0] < 0.5 * least[1]
 
 
 def test_the_number_of_threads_changes_no_bit():
     cost, guide = _noise(32, 24), _noise(32, 3, seed=2)
-    one, two = (aggregate(cost, guide, _slots(32, 2), 12, AggregationConfig(), threads=n) for n in (1, 2))
+    one, two = (aggregate_costs(cost, guide, _slots(32, 2), 12, AggregationConfig(), threads=n) for n in (1, 2))
     assert np.array_equal(one, two)
 
 
@@ -351,7 +351,7 @@ def test_the_best_label_lies_at_the_vertex_of_a_parabola():
     count = 12
     vertex = np.random.default_rng(0).uniform(1, count - 2, (16, 32, 1))
     total = ((np.arange(count) - vertex) ** 2).astype(np.float32)
-    label, offset = best_labels(np.concatenate((total + 1, total), axis=2), count)
+    label, offset = select_labels(np.concatenate((total + 1, total), axis=2), count)
     assert (label >= count).all()
     assert np.allclose(label - count + offset, vertex[..., 0], atol=1e-3)
 
@@ -360,6 +360,6 @@ def test_offsets_do_not_cross_hypothesis_sets():
     total = np.ones((8, 16, 24), np.float32)
     total[:, :8, 11], total[:, :8, 12] = 0, 0.2  # 11 is the last of the first set
     total[:, 8:, 12], total[:, 8:, 11] = 0, 0.2
-    label, offset = best_labels(total, 12)
+    label, offset = select_labels(total, 12)
     assert set(np.unique(label)) == {11, 12}
     assert (offset == 0).all()

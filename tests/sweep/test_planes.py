@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from pansplat.sweep.matching import MatchingConfig
-from pansplat.sweep.planes import ScenePlanes, axis_components, collect_planes, detect_planes, estimate_axes, no_planes
+from pansplat.sweep.planes import (
+    ScenePlanes,
+    axis_components,
+    collect_planes,
+    detect_planes,
+    estimate_axes,
+    make_empty_planes,
+)
 from pansplat.sweep.surface import Surface, consistency_mask, ray_grid, world_points
 
 
@@ -83,7 +90,7 @@ def planes(empty_room) -> ScenePlanes:
         low, high = np.array(room.low) @ _AXES.T, np.array(room.high) @ _AXES.T
         wall = np.minimum(np.abs(points - low), np.abs(points - high)).argmin(axis=-1)
         surfaces.append(Surface(plain.inverse_depth, (wall + 1).astype(np.uint8)))
-    return collect_planes(surfaces, list(empty_room.posed.masks), poses, no_planes(poses, _AXES, 0.5, 8.0))
+    return collect_planes(surfaces, list(empty_room.posed.masks), poses, make_empty_planes(poses, _AXES, 0.5, 8.0))
 
 
 def test_the_histogram_sums_to_one(planes):
@@ -114,7 +121,7 @@ def test_vertical_bounds_contain_the_floor_and_the_ceiling(planes, empty_room, v
 def test_without_consistent_pixels_there_is_no_support(empty_room):
     no_pixels = [np.zeros_like(mask) for mask in empty_room.posed.masks]
     poses = empty_room.posed.cam2world
-    planes = collect_planes(empty_room.surfaces, no_pixels, poses, no_planes(poses, _AXES, 0.45, 8.0))
+    planes = collect_planes(empty_room.surfaces, no_pixels, poses, make_empty_planes(poses, _AXES, 0.45, 8.0))
     assert planes.vertical_bounds(empty_room.posed.cam2world[0]) == (np.inf, -np.inf)
     assert planes.support(1, empty_room.posed.cam2world[0], np.linspace(0.1, 2, 20)).max() == 0
 
@@ -126,14 +133,16 @@ def test_floor_and_ceiling_follow_from_the_sweeps_surfaces(empty_room):
         for s, p in zip(empty_room.surfaces, poses, strict=True)
     ]
     agreed = [consistency_mask(labelled, poses, view) for view in (0, 1)]
-    down, up = collect_planes(labelled, agreed, poses, no_planes(poses, _AXES, 0.45, 8.0)).vertical_bounds(poses[0])
+    down, up = collect_planes(labelled, agreed, poses, make_empty_planes(poses, _AXES, 0.45, 8.0)).vertical_bounds(
+        poses[0]
+    )
     assert down == pytest.approx(1.06 * empty_room.room.high[1] + 0.05, abs=0.1)
     assert up == pytest.approx(1.06 * empty_room.room.low[1] - 0.05, abs=0.1)
 
 
 def test_votes_support_a_plane_without_any_surface(empty_room):
     poses = empty_room.posed.cam2world
-    nothing = no_planes(poses, _AXES, 0.45, 8.0)
+    nothing = make_empty_planes(poses, _AXES, 0.45, 8.0)
     votes = np.zeros_like(nothing.votes)
     votes[0, nothing.offsets.searchsorted(1.2)] = 0.7
     voted = dataclasses.replace(nothing, votes=votes)
@@ -154,7 +163,7 @@ def test_planes_between_two_cameras_are_separating():
     """Cameras at x = 0 and x = 1, planes across x."""
     here, there = np.eye(4), np.eye(4)
     there[0, 3] = 1.0
-    nothing = no_planes(np.stack((here, there)), _AXES, 0.5, 8.0)
+    nothing = make_empty_planes(np.stack((here, there)), _AXES, 0.5, 8.0)
     distance = np.array((0.5, 0.9, 1.1, 3.0))
     assert np.array_equal(nothing.separating(1, here, there, 1 / distance), ((False,) * 4, (True, True, False, False)))
     assert np.array_equal(nothing.separating(1, there, here, 1 / distance), ((True, True, False, False), (False,) * 4))
@@ -164,7 +173,7 @@ def test_planes_between_two_cameras_are_separating():
 def test_each_camera_has_its_own_height_over_the_floor():
     poses = np.stack((np.eye(4), np.eye(4)))
     poses[1, 1, 3] = 0.4  # y points down
-    floor = dataclasses.replace(no_planes(poses, _AXES, 0.5, 8.0), floor_ceiling=(1.0, -np.inf))
+    floor = dataclasses.replace(make_empty_planes(poses, _AXES, 0.5, 8.0), floor_ceiling=(1.0, -np.inf))
     assert floor.camera_height(poses[0]) == pytest.approx(1.2)
     assert floor.camera_height(poses[1]) == pytest.approx(0.8)
 
@@ -177,7 +186,7 @@ def detect(views_of):
         views, rays = views_of(
             posed, posed.images if images is None else images, posed.masks if masks is None else masks
         )
-        planes = no_planes(posed.cam2world, _AXES, posed.near, posed.far)
+        planes = make_empty_planes(posed.cam2world, _AXES, posed.near, posed.far)
         return detect_planes(views, rays, posed.cam2world, planes, (0.125, 2.5), 0.45, MatchingConfig())
 
     return run
