@@ -1,7 +1,7 @@
 """LPIPS: the perceptual distance of two images, from the activations of an image classifier.
 
 The classifiers (VGG-16, AlexNet, SqueezeNet 1.1) and the weights of their channels are read from the user's files;
-nothing is downloaded. Layers have the numbers of torchvision, so that its files fit.
+nothing is downloaded. Layers are numbered as in torchvision, so that its files can be loaded.
 
 Large images are processed in bands of rows: the activations of a 4K image and their gradient would take 30 GB. A block
 of the classifier (the convolutions between two poolings) reads as many rows beyond a band as it has convolutions. A
@@ -54,11 +54,7 @@ LAYER_CHANNELS: dict[Backbone, dict[int, int]] = {
 
 
 class Lpips(nn.Module):
-    """The metric with its weights, which are not trained; differentiable in the images.
-
-    Args:
-        backbone: the classifier.
-    """
+    """The metric with its weights, which are not trained; differentiable in the images."""
 
     def __init__(self, backbone: Backbone) -> None:
         super().__init__()
@@ -97,8 +93,8 @@ class Lpips(nn.Module):
         if weights is not None:
             prediction = torch.where(weights[:, None] > 0, prediction, target)
         total = target.new_zeros(len(target))
-        for layer_distances in self._distances(self._normalized(prediction), self._normalized(target)):
-            total = total + _mean(layer_distances, weights)
+        for layer_distances in self._compare_layers(self._normalize(prediction), self._normalize(target)):
+            total = total + _average_map(layer_distances, weights)
         return total
 
     @torch.no_grad()
@@ -106,18 +102,18 @@ class Lpips(nn.Module):
         """The distance of two single images."""
         return float(self(prediction[None], target[None]))
 
-    def _distances(self, a: Tensor, b: Tensor) -> Iterator[Float[Tensor, "batch _ _"]]:
+    def _compare_layers(self, a: Tensor, b: Tensor) -> Iterator[Float[Tensor, "batch _ _"]]:
         """The distance map of each compared layer."""
         if self.backbone == "vgg" and a.shape[-2] * a.shape[-1] > _WHOLE:
             return banded_distances(a, b, self.features, self.heads, _BAND)
-        activations = (self._activations(maps) for maps in (a, b))
+        activations = (self._compute_activations(maps) for maps in (a, b))
         return (distances(*pair, head) for head, *pair in zip(self.heads, *activations, strict=True))
 
-    def _normalized(self, images: Tensor) -> Tensor:
+    def _normalize(self, images: Tensor) -> Tensor:
         mean, deviation = (images.new_tensor(values)[:, None, None] for values in (_MEAN, _DEVIATION))
         return (2 * images - 1 - mean) / deviation
 
-    def _activations(self, maps: Tensor) -> list[Tensor]:
+    def _compute_activations(self, maps: Tensor) -> list[Tensor]:
         kept = []
         for index, layer in enumerate(self.features):
             maps = layer(maps)
@@ -126,7 +122,7 @@ class Lpips(nn.Module):
         return kept
 
 
-def _mean(
+def _average_map(
     maps: Float[Tensor, "batch h w"], weights: Float[Tensor, "batch height width"] | None
 ) -> Float[Tensor, "batch"]:
     """Mean over the pixels of a layer, weighted by the mean weight of the image pixels they cover."""
@@ -190,7 +186,7 @@ def distances(
     head: Float[Tensor, "channel"],
 ) -> Float[Tensor, "batch height width"]:
     """Squared difference of the normalised activations at each pixel, with channel weights `head`."""
-    return torch.einsum("bchw,c->bhw", (_directions(a) - _directions(b)).square(), head)
+    return torch.einsum("bchw,c->bhw", (_normalize_channels(a) - _normalize_channels(b)).square(), head)
 
 
 def banded_distances(
@@ -207,29 +203,29 @@ def banded_distances(
         pixels: number of pixels of a band, at the resolution of its block.
     """
     needs_gradient = torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)
-    for block, head in zip(_blocks(layers), heads, strict=True):
+    for block, head in zip(_split_blocks(layers), heads, strict=True):
         height, width = a.shape[-2:]
         rows = max(2, pixels // width // 2 * 2)  # even, so that bands do not split a pooling window
         parts = []
         for first in range(0, height, rows):
             given = (block, a, b, head, first, min(first + rows, height))
             parts.append(
-                checkpoint(_band, *given, use_reentrant=False, preserve_rng_state=False)
+                checkpoint(_process_band, *given, use_reentrant=False, preserve_rng_state=False)
                 if needs_gradient
-                else _band(*given)
+                else _process_band(*given)
             )
         a, b = (torch.cat([part[i] for part in parts], dim=2) for i in (0, 1))
         yield torch.cat([part[2] for part in parts], dim=1)
 
 
-def _blocks(layers: nn.Sequential) -> list[nn.Sequential]:
+def _split_blocks(layers: nn.Sequential) -> list[nn.Sequential]:
     """The layers up to each pooling, and those after the last."""
     ends = [index + 1 for index, layer in enumerate(layers) if isinstance(layer, nn.MaxPool2d)]
     bounds = [0, *ends, len(layers)]
     return [layers[start:end] for start, end in itertools.pairwise(bounds)]
 
 
-def _band(
+def _process_band(
     block: nn.Sequential, a: Tensor, b: Tensor, head: Tensor, first: int, end: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The rows of both images for the next block, and the distances of this block."""
@@ -238,16 +234,18 @@ def _band(
     margin = sum(isinstance(layer, nn.Conv2d) for layer in convolving)
     above, below = min(margin, first), min(margin, a.shape[2] - end)
     a, b = (convolving(maps[:, :, first - above : end + below])[:, :, above : above + end - first] for maps in (a, b))
-    return (*(_pooled(pooling, maps) for maps in (a, b)), distances(a, b, head))
+    return (*(_pool_rows(pooling, maps) for maps in (a, b)), distances(a, b, head))
 
 
-def _pooled(pooling: nn.Module, maps: Tensor) -> Tensor:
+def _pool_rows(pooling: nn.Module, maps: Tensor) -> Tensor:
     """Pooled rows; pooling drops the last row of an odd number, also where it is a band."""
     is_dropped = isinstance(pooling, nn.MaxPool2d) and maps.shape[2] == 1
     return maps[:, :, :0, : maps.shape[3] // 2] if is_dropped else pooling(maps)
 
 
-def _directions(maps: Float[Tensor, "batch channel height width"]) -> Float[Tensor, "batch channel height width"]:
+def _normalize_channels(
+    maps: Float[Tensor, "batch channel height width"],
+) -> Float[Tensor, "batch channel height width"]:
     """Activations divided by their length over the channels."""
     return maps * (maps.square().sum(1, keepdim=True) + _EPSILON).rsqrt()
 
@@ -279,9 +277,9 @@ def load_lpips(backbone: Backbone, folder: Path | None = None) -> Lpips:
     """
     classifier, heads = find_classifier(backbone, folder), find_heads(backbone, folder)
     if classifier is None or heads is None:
-        raise InputError(_missing_message(backbone, folder, classifier, heads))
+        raise InputError(_describe_missing_files(backbone, folder, classifier, heads))
     metric = Lpips(backbone)
-    state = {**_classifier_state(metric, classifier), **_head_state(backbone, heads)}
+    state = {**_load_classifier(metric, classifier), **_load_heads(backbone, heads)}
     metric.load_state_dict(state)
     return metric
 
@@ -294,58 +292,61 @@ def find_backbone(folder: Path | None = None) -> Backbone | None:
 
 def find_classifier(backbone: Backbone, folder: Path | None = None) -> Path | None:
     """The file of torchvision's classifier, by its name or a name with the same beginning."""
-    found = (path for place in _places(folder) for path in sorted(place.glob(_PATTERNS[backbone])))
+    found = (path for candidate in _list_folders(folder) for path in sorted(candidate.glob(_PATTERNS[backbone])))
     return next(found, None)
 
 
 def find_heads(backbone: Backbone, folder: Path | None = None) -> Path | None:
     """The lpips package's file of the channels' weights, such as vgg.pth."""
-    places = [place / inner for place in _places(folder) for inner in _HEAD_FOLDERS]
+    candidates = [candidate / inner for candidate in _list_folders(folder) for inner in _HEAD_FOLDERS]
     package = find_spec("lpips")
     for root in (package.submodule_search_locations or ()) if package else ():
-        places.append(Path(root) / "weights" / "v0.1")
-    return next((path for place in places if (path := place / f"{backbone}.pth").is_file()), None)
+        candidates.append(Path(root) / "weights" / "v0.1")
+    return next((path for candidate in candidates if (path := candidate / f"{backbone}.pth").is_file()), None)
 
 
-def _places(folder: Path | None) -> list[Path]:
+def _list_folders(folder: Path | None) -> list[Path]:
     named = os.environ.get(FOLDER_VARIABLE)
-    return [*([folder] if folder else []), *([Path(named).expanduser()] if named else []), _hub()]
+    return [*([folder] if folder else []), *([Path(named).expanduser()] if named else []), _hub_folder()]
 
 
-def _hub() -> Path:
+def _hub_folder() -> Path:
     return Path(torch.hub.get_dir()) / "checkpoints"
 
 
-def _missing_message(backbone: Backbone, folder: Path | None, classifier: Path | None, heads: Path | None) -> str:
+def _describe_missing_files(
+    backbone: Backbone, folder: Path | None, classifier: Path | None, heads: Path | None
+) -> str:
     missing = []
     if classifier is None:
         missing.append(f"{_CLASSIFIERS[backbone]} (from {_CLASSIFIER_SITE}{_CLASSIFIERS[backbone]})")
     if heads is None:
         missing.append(f"{backbone}.pth (from {_HEAD_SITE}, or `pip install lpips`)")
-    looked = ", ".join(str(place) for place in _places(folder))
+    searched = ", ".join(str(candidate) for candidate in _list_folders(folder))
     return (
-        f"LPIPS with {backbone} needed {' and '.join(missing)}, got no such file in {looked}; put it into {_hub()} or "
-        f"into a folder that --lpips-weights or {FOLDER_VARIABLE} names. Nothing is downloaded."
+        f"LPIPS with {backbone} needed {' and '.join(missing)}, got no such file in {searched}; "
+        f"put it into {_hub_folder()} or into a folder that --lpips-weights or {FOLDER_VARIABLE} names. "
+        "Nothing is downloaded."
     )
 
 
-def _classifier_state(metric: Lpips, path: Path) -> dict[str, Tensor]:
+def _load_classifier(metric: Lpips, path: Path) -> dict[str, Tensor]:
     """The layers of the classifier that the metric uses."""
     content = read_checkpoint(path)
     needed = {name: t for name, t in metric.state_dict().items() if name.startswith("features.")}
-    return {name: _tensor(content, name, needed[name].shape, path) for name in needed}
+    return {name: _take_tensor(content, name, needed[name].shape, path) for name in needed}
 
 
-def _head_state(backbone: Backbone, path: Path) -> dict[str, Tensor]:
+def _load_heads(backbone: Backbone, path: Path) -> dict[str, Tensor]:
     content = read_checkpoint(path)
     state = {}
     for index, channels in enumerate(LAYER_CHANNELS[backbone].values()):
-        weight = _tensor(content, f"lin{index}.model.1.weight", torch.Size((1, channels, 1, 1)), path)
+        weight = _take_tensor(content, f"lin{index}.model.1.weight", torch.Size((1, channels, 1, 1)), path)
         state[f"heads.{index}"] = weight.flatten()
     return state
 
 
-def _tensor(content: Mapping[str, object], name: str, shape: torch.Size, path: Path) -> Tensor:
+def _take_tensor(content: Mapping[str, object], name: str, shape: torch.Size, path: Path) -> Tensor:
     tensor = content.get(name)
     if not isinstance(tensor, Tensor) or tensor.shape != shape:
         got = f"one of {tuple(tensor.shape)}" if isinstance(tensor, Tensor) else "none"

@@ -1,8 +1,8 @@
-"""Pose check: do the poses fit the images, and would another convention fit better?
+"""Check of poses against images, and of common mistakes in the convention of the poses.
 
-Each view is warped into the other with the poses as given and under each common mistake. The depth for the warp comes
-from a small sphere sweep, so the check needs no model. With the right poses some depth explains nearly every pixel;
-with wrong poses none does.
+Each view is warped into the next one with the poses as given and under each common mistake. A small sphere sweep finds
+the depth, so that no model is needed. With the right poses nearly every pixel matches at some depth; with wrong poses
+few pixels do.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ _DIFFERENCE_CAP = 0.6  # of a feature; limits the effect of occlusions
 # Another interpretation is reported if its error is below this ratio of the error as given, below this error, and
 # smaller by this difference (a ratio of nearly perfect fits is not significant).
 _MAX_RATIO, _MAX_ERROR, _MIN_DIFFERENCE = 0.92, 0.46, 0.02
-_NO_OVERLAP = 0.5  # lowest error above which the views have too little in common
+_NO_OVERLAP = 0.5  # if even the lowest error is larger, the views overlap too little
 _SAME_POSE = 0.02  # largest difference of equal relative poses (translation relative to its length)
 
 _ADVICE = {
-    # An inverse moves the axes of the convention to the world's side, so its advice names both words.
+    # The inverse of a matrix also exchanges the sides of its axes, so this advice names both parts of the convention.
     "inverse": 'the matrices look like the inverse of the stated ones, with OpenCV axes: exchange "cam2world" '
     'and "world2cam", and state "opencv"',
     "opengl axes": "the camera axes look like OpenGL's (y up, z backward) where OpenCV's were stated, or the "
@@ -97,16 +97,16 @@ def check_views(views: Views, name: str = "views") -> PoseCheck:
         views: two or more; consecutive views are compared.
         name: for the report.
     """
-    features = torch.stack([_features(image) for image in views.images])
+    features = torch.stack([_compute_features(image) for image in views.images])
     poses = views.cam2world
     relatives = {interpretation: _relative_poses(poses, interpretation) for interpretation in (AS_GIVEN, *_ADVICE)}
     given = relatives[AS_GIVEN]
-    indistinguishable = [r for r in _ADVICE if _same_motion(relatives[r], given)]
+    indistinguishable = [r for r in _ADVICE if _have_same_motion(relatives[r], given)]
     errors: dict[str, float] = {}
     for interpretation, relative in relatives.items():
         if interpretation in indistinguishable:
             continue
-        equal = next((r for r in errors if _same_motion(relatives[r], relative)), None)
+        equal = next((r for r in errors if _have_same_motion(relatives[r], relative)), None)
         errors[interpretation] = errors[equal] if equal else _photometric_error(features, views, relative)
     errors = dict(sorted(errors.items(), key=lambda item: item[1]))
     centres = poses[:, :3, 3]
@@ -117,12 +117,12 @@ def check_views(views: Views, name: str = "views") -> PoseCheck:
         errors[AS_GIVEN],
         errors,
         tuple(indistinguishable),
-        _likely_mistake(errors),
-        (*_distance_warnings(centres, baseline, views), *_overlap_warnings(errors)),
+        _describe_mistake(errors),
+        (*_warn_of_distances(centres, baseline, views), *_warn_of_overlap(errors)),
     )
 
 
-def _likely_mistake(errors: dict[str, float]) -> str | None:
+def _describe_mistake(errors: dict[str, float]) -> str | None:
     """Advice for the best interpretation, and for equally good ones, if it is clearly better than as given."""
     best = next(iter(errors.values()))
     if best > min(_MAX_RATIO * errors[AS_GIVEN], errors[AS_GIVEN] - _MIN_DIFFERENCE, _MAX_ERROR):
@@ -131,7 +131,7 @@ def _likely_mistake(errors: dict[str, float]) -> str | None:
     return "; or ".join(named) + f" (error {best:.3f} instead of {errors[AS_GIVEN]:.3f})."
 
 
-def _distance_warnings(centres: Float[Tensor, "view 3"], baseline: float, views: Views) -> tuple[str, ...]:
+def _warn_of_distances(centres: Float[Tensor, "view 3"], baseline: float, views: Views) -> tuple[str, ...]:
     """Warnings on the distances between the cameras."""
     found = []
     closest = min(float((a - b).norm()) for a, b in itertools.combinations(centres, 2))
@@ -150,24 +150,24 @@ def _distance_warnings(centres: Float[Tensor, "view 3"], baseline: float, views:
     return tuple(found)
 
 
-def _overlap_warnings(errors: dict[str, float]) -> tuple[str, ...]:
+def _warn_of_overlap(errors: dict[str, float]) -> tuple[str, ...]:
     """A warning if no interpretation of the poses fits."""
     best = next(iter(errors.values()))
     if best <= _NO_OVERLAP:
         return ()
     return (
-        f"no interpretation of the poses fits the views (best error {best:.3f}): they have too little in common, "
+        f"no interpretation of the poses fits the views (best error {best:.3f}): they overlap too little, "
         "or the poses or the order of the images are wrong in another way.",
     )
 
 
 def _relative_poses(cam2world: Float[Tensor, "view 4 4"], interpretation: str) -> Float[Tensor, "pair 4 4"]:
     """Poses of each view in the next one's camera, under an interpretation of the given matrices."""
-    poses = _read_as(cam2world, interpretation)
+    poses = _interpret_poses(cam2world, interpretation)
     return torch.linalg.solve(poses[1:], poses[:-1])
 
 
-def _read_as(poses: Float[Tensor, "view 4 4"], interpretation: str) -> Float[Tensor, "view 4 4"]:
+def _interpret_poses(poses: Float[Tensor, "view 4 4"], interpretation: str) -> Float[Tensor, "view 4 4"]:
     """The OpenCV cam2world poses that a mistake turned into the given matrices."""
     opengl = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=poses.dtype))
     if interpretation == "inverse":
@@ -201,7 +201,7 @@ def _read_as(poses: Float[Tensor, "view 4 4"], interpretation: str) -> Float[Ten
     return poses @ turn
 
 
-def _same_motion(first: Float[Tensor, "pair 4 4"], second: Float[Tensor, "pair 4 4"]) -> bool:
+def _have_same_motion(first: Float[Tensor, "pair 4 4"], second: Float[Tensor, "pair 4 4"]) -> bool:
     """Whether two interpretations have the same relative poses within the tolerance of a small image."""
     length = second[:, :3, 3].norm(dim=-1).clamp_min(1e-9)
     rotation = (first - second)[:, :3, :3].abs().max()
@@ -209,7 +209,7 @@ def _same_motion(first: Float[Tensor, "pair 4 4"], second: Float[Tensor, "pair 4
     return bool(rotation < _SAME_POSE and translation < _SAME_POSE)
 
 
-def _features(image: Float[Tensor, "3 height width"]) -> Float[Tensor, "feature height width"]:
+def _compute_features(image: Float[Tensor, "3 height width"]) -> Float[Tensor, "feature height width"]:
     """Colour, and locally normalised brightness and gradients, which are robust against exposure."""
     padded = pad_equirect(image.mean(dim=0), 4)
     box = torch.nn.functional.avg_pool2d(padded[None, None], 9, stride=1)[0, 0]
@@ -252,10 +252,10 @@ def _sweep_error(
         source.expand(_CANDIDATES, -1, -1, -1), grid, padding_mode="border", align_corners=False
     )
     difference = (warped[:, :-1] - reference).abs().clamp_max(_DIFFERENCE_CAP).mean(dim=1)
-    seen = (warped[:, -1] > 0.5) & mask
-    difference = torch.where(seen, difference, torch.full_like(difference, _DIFFERENCE_CAP / 2))
+    visible = (warped[:, -1] > 0.5) & mask
+    difference = torch.where(visible, difference, torch.full_like(difference, _DIFFERENCE_CAP / 2))
     window = 2 * _AGGREGATION + 1
     padded = pad_equirect(difference, _AGGREGATION)[:, None]
-    least = torch.nn.functional.avg_pool2d(padded, window, stride=1)[:, 0].amin(dim=0)
-    weights = row_weights(height, dtype=least.dtype)[:, None] * mask
-    return float((least * weights).sum() / weights.sum().clamp_min(1e-9)) / (_DIFFERENCE_CAP / 2)
+    lowest = torch.nn.functional.avg_pool2d(padded, window, stride=1)[:, 0].amin(dim=0)
+    weights = row_weights(height, dtype=lowest.dtype)[:, None] * mask
+    return float((lowest * weights).sum() / weights.sum().clamp_min(1e-9)) / (_DIFFERENCE_CAP / 2)

@@ -1,7 +1,7 @@
-"""The paper's evaluations: test sets, the measurement of one case, and one table an evaluation.
+"""The paper's evaluations: test sets, the metrics of one case, and one table per evaluation.
 
-A test set has the name that the paper's tables give it. The figures are computed for each target image; a set's figure
-is their plain mean.
+A test set has its name in the paper's tables. Metrics are computed for each target image; the value of a set is their
+unweighted mean.
 
 Source: PanSplat, section 4; docs/official.md, sections 2.1 to 2.5 and 13.
 """
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import math
 import re
 import time
@@ -24,7 +23,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat import pipeline
-from pansplat.atomic import replacing
 from pansplat.data.images import write_image
 from pansplat.data.sequences import (
     BoundedSampler,
@@ -39,7 +37,7 @@ from pansplat.data.views import Sample, Views
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import DepthErrors, depth_errors, psnr, ssim, ws_psnr
-from pansplat.evaluation.report import error_image, finite_json, make_folder, warm_up
+from pansplat.evaluation.report import error_image, finite_json, make_folder, warm_up, write_json
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.model.network import NetworkPredictor
 from pansplat.pipeline import Drawing
@@ -101,16 +99,16 @@ def _read_triplet(triplets: TripletSet, index: int, height: int) -> Sample:
     return Sample(pair.name, pair.load_context(height), pair.load_targets(height))
 
 
-def find_sequence_set(root: Path, name: str, draws: int = 100) -> EvaluationSet:
-    """`LOC360` or `INSTA360`: pairs spread evenly over each sequence; all frames between and at them are targets."""
+def find_sequence_set(root: Path, name: str, pairs_per_sequence: int = 100) -> EvaluationSet:
+    """`LOC360` or `INSTA360`: pairs spread evenly over each sequence; all frames from one to the other are targets."""
     sequences, missing = find_sequences(root, name)
-    return EvaluationSet(name, tuple(_draw_cases(sequences, _SAMPLERS[name], draws)), missing)
+    return EvaluationSet(name, tuple(_make_cases(sequences, _SAMPLERS[name], pairs_per_sequence)), missing)
 
 
-def make_frame_distance_set(sequences: Sequence[FrameSequence], gap: int, draws: int) -> EvaluationSet:
+def make_frame_distance_set(sequences: Sequence[FrameSequence], gap: int, pairs_per_sequence: int) -> EvaluationSet:
     """Pairs of frames `gap` apart, spread evenly over each sequence; the middle frame is the target."""
-    long = [sequence for sequence in sequences if len(sequence.poses) > gap]
-    cases = tuple(_draw_cases(long, BoundedSampler(gap, gap), draws, middle=True))
+    long_enough = [sequence for sequence in sequences if len(sequence.poses) > gap]
+    cases = tuple(_make_cases(long_enough, BoundedSampler(gap, gap), pairs_per_sequence, middle=True))
     missing = "" if cases else f"{gap} frames apart: needed a sequence of more than {gap} frames"
     return EvaluationSet(f"{gap} frames", cases, missing)
 
@@ -125,27 +123,23 @@ def find_sequences(root: Path, name: str) -> tuple[Sequence[FrameSequence], str]
         folder = root / subfolder
         if name == LOC360 and (folder / "atrium").is_dir():
             return read_loc360(folder, "test"), ""
-        if name == INSTA360 and _has_videos(folder):
+        if name == INSTA360 and (any(folder.glob("*.mp4")) or any(folder.glob("*/*.mp4"))):
             return read_insta360(folder), ""
     if name == LOC360:
-        return [], f"{name}: needed {root / '360Loc' / 'atrium'} (mapping/*360*/camera_pose.json with image/ beside it)"
-    return [], f"{name}: needed {root / 'insta360' / 'VID_*'} (video.mp4 with frame_trajectory.txt beside it)"
+        return [], f"{name}: needed {root / '360Loc' / 'atrium'} (with camera_pose.json and image/ in mapping/*360*)"
+    return [], f"{name}: needed {root / 'insta360' / 'VID_*'} (with video.mp4 and frame_trajectory.txt)"
 
 
-def _has_videos(folder: Path) -> bool:
-    return any(folder.glob("*.mp4")) or any(folder.glob("*/*.mp4"))
-
-
-def _draw_cases(
-    sequences: Sequence[FrameSequence], sampler: BoundedSampler, draws: int, *, middle: bool = False
+def _make_cases(
+    sequences: Sequence[FrameSequence], sampler: BoundedSampler, pairs_per_sequence: int, *, middle: bool = False
 ) -> list[EvaluationCase]:
     cases = []
     for sequence in sequences:
-        for draw in sampler.evaluation(len(sequence.poses), draws):
+        for pair in sampler.evaluation(len(sequence.poses), pairs_per_sequence):
             if middle:
-                draw = FramePair(draw.left, draw.right, (draw.targets[len(draw.targets) // 2],))
-            name = f"{sequence.name}-{draw.left:06d}-{draw.right:06d}"
-            cases.append(EvaluationCase(name, functools.partial(read_frame_pair, sequence, draw)))
+                pair = FramePair(pair.left, pair.right, (pair.targets[len(pair.targets) // 2],))
+            name = f"{sequence.name}-{pair.left:06d}-{pair.right:06d}"
+            cases.append(EvaluationCase(name, functools.partial(read_frame_pair, sequence, pair)))
     return cases
 
 
@@ -183,7 +177,7 @@ class Prediction:
     """The prediction of a case.
 
     Attributes:
-        depth: radial, metres, of the inputs at the finest level of the network; None for other predictors.
+        depth: radial depth of the inputs at the network's finest level, metres; None for other predictors.
         seconds: duration of the prediction.
     """
 
@@ -206,14 +200,14 @@ def predict_case(context: Views, predictor: Predictor) -> Prediction:
     """The scene of a case's inputs, and their depth if the predictor is a network."""
     masks = None if bool(context.masks.all()) else context.masks
     inputs = (context.images, context.cam2world, context.near, context.far)
-    began = time.perf_counter()
+    start = time.perf_counter()
     depth = None
     if isinstance(predictor, NetworkPredictor):
         gaussians, depths = predictor.predict_with_depths(*inputs, masks=masks)
         depth = depths[-1]
     else:
         gaussians = predictor(*inputs, masks=masks)
-    seconds = time.perf_counter() - began
+    seconds = time.perf_counter() - start
     assert isinstance(gaussians, Gaussians)  # a list is returned for a batch only
     scene = Scene(
         gaussians,
@@ -230,13 +224,13 @@ def predict_case(context: Views, predictor: Predictor) -> Prediction:
 def render_targets(
     sample: Sample, prediction: Prediction, blend: Blend, lpips: Lpips | None, drawing: Drawing = "exact"
 ) -> Iterator[RenderedTarget]:
-    """Render and measure each target of the case, without masks; only PSNR clamps."""
+    """Render each target of the case and compute its metrics, without masks; only PSNR clamps."""
     for index, target in enumerate(sample.targets.images):
-        began = time.perf_counter()
+        start = time.perf_counter()
         with torch.no_grad():
             pose, size = sample.targets.cam2world[index], (target.shape[-2], target.shape[-1])
             image = pipeline.render(prediction.scene, pose, blend=blend, size=size, drawing=drawing).color.float()
-        seconds = time.perf_counter() - began
+        seconds = time.perf_counter() - start
         score = Score(
             case=sample.name,
             target=sample.targets.names[index],
@@ -267,14 +261,6 @@ def measure_depth(context: Views, prediction: Prediction) -> DepthErrors | None:
     return depth_errors(depth, context.depths, context.near, context.far)
 
 
-def mean_depth_errors(errors: list[DepthErrors]) -> DepthErrors | None:
-    """Mean over the scenes; None without any."""
-    if not errors:
-        return None
-    names = [field.name for field in dataclasses.fields(DepthErrors)]
-    return DepthErrors(*(sum(getattr(error, name) for error in errors) / len(errors) for name in names))
-
-
 ProtocolName = Literal["m3d", "narrow", "replica", "residential", "360loc", "insta360", "ablation", "frame-distance"]
 
 # By protocol: name of the set in the table, its PanoGRF kind, and metres from an input to the middle view.
@@ -285,7 +271,7 @@ _PANOGRF: dict[str, tuple[tuple[str, str, float], ...]] = {
     "residential": (("Residential 0.3 m", "residential", 0.15),),
     "ablation": (("M3D 1.0 m", "m3d", 0.5),),
 }
-_DEPTH_SET = "M3D 1.0 m"  # the only one whose depth the paper's code measures
+_DEPTH_SET = "M3D 1.0 m"  # the official code measures depth on this set only
 
 
 @dataclass(frozen=True)
@@ -295,15 +281,15 @@ class ProtocolOptions:
     Attributes:
         height: of the resized panoramas, pixels; the paper's is 512.
         limit: largest number of cases of a set, spread evenly; None for all, as in the paper.
-        pictures: number of cases of a set whose images are written.
-        draws: number of pairs of a sequence, for 360Loc and Insta360.
-        gaps: frames between the inputs, for the figure over the frame distance.
+        image_cases: number of cases whose images are written, for each set.
+        pairs_per_sequence: number of pairs of a sequence, for 360Loc and Insta360.
+        gaps: distances of the inputs in frames, for the frame-distance figure.
     """
 
     height: int = 512
     limit: int | None = None
-    pictures: int = 8
-    draws: int = 100
+    image_cases: int = 8
+    pairs_per_sequence: int = 100
     gaps: tuple[int, ...] = (4, 8, 12, 16, 20, 24, 28, 32)
 
 
@@ -330,8 +316,7 @@ class SetResult:
         if metric == "gaussians":
             return _mean(self.gaussians)
         if metric in ("abs_rel", "sq_rel", "rmse"):
-            errors = mean_depth_errors(self.depth)
-            return None if errors is None else getattr(errors, metric)
+            return _mean([getattr(errors, metric) for errors in self.depth])
         values = [getattr(score, metric) for score in self.scores]
         return None if None in values else _mean(values)
 
@@ -388,7 +373,7 @@ def list_methods(
     """The rows of a predictor in a protocol's table.
 
     On synthetic scenes the paper renders all Gaussians jointly; on real ones it compares that with deferred blending.
-    Predictors other than networks are rendered with deferred blending, for which their Gaussians are made.
+    The Gaussians of other predictors are made for deferred blending and rendered with it.
 
     Args:
         blend: the only blending; by default as above.
@@ -401,7 +386,7 @@ def list_methods(
     elif not isinstance(predictor, NetworkPredictor):
         blends = ("deferred",)
     suffixes = {"joint": "", "deferred": " + deferred blending"}
-    title = f"ours, {name or predictor.name}" + (", drawn as the original" if drawing == "original" else "")
+    title = f"ours, {name or predictor.name}" + (", official rendering" if drawing == "original" else "")
     return [Method(f"{title}{suffixes[b]}", predictor, b, drawing) for b in blends]
 
 
@@ -416,14 +401,14 @@ def find_sets(protocol: ProtocolName, root: Path, options: ProtocolOptions) -> l
     if protocol in _PANOGRF:
         return [find_panogrf_set(root, *kind, options.height) for kind in _PANOGRF[protocol]]
     if protocol in ("360loc", "insta360"):
-        return [find_sequence_set(root, LOC360 if protocol == "360loc" else INSTA360, options.draws)]
+        return [find_sequence_set(root, LOC360 if protocol == "360loc" else INSTA360, options.pairs_per_sequence)]
     sequences, missing = find_sequences(root, INSTA360)
     if not sequences:
-        sequences, also = find_sequences(root, LOC360)
-        missing = f"{missing}; or {also}"
+        sequences, other_missing = find_sequences(root, LOC360)
+        missing = f"{missing}; or {other_missing}"
     if not sequences:
         return [EvaluationSet("frame distance", missing=missing)]
-    return [make_frame_distance_set(sequences, gap, options.draws) for gap in options.gaps]
+    return [make_frame_distance_set(sequences, gap, options.pairs_per_sequence) for gap in options.gaps]
 
 
 def run_protocol(
@@ -456,33 +441,23 @@ def run_protocol(
     for predictor in {id(method.predictor): method.predictor for method in methods}.values():
         warm_up(predictor)
     done = 0
-    for evaluation_set, cases in chosen:
-        rows = [SetResult(evaluation_set.name, method.name) for method in methods]
+    for test_set, cases in chosen:
+        rows = [SetResult(test_set.name, method.name) for method in methods]
         result.sets += rows
         for number, case in enumerate(cases):
             if progress is not None:
-                progress(f"{evaluation_set.name}: {case.name}", done / total)
-            folder = out / _slug(evaluation_set.name) / _slug(case.name) if number < options.pictures else None
+                progress(f"{test_set.name}: {case.name}", done / total)
+            folder = out / _slugify(test_set.name) / _slugify(case.name) if number < options.image_cases else None
             try:
                 _run_case(case, methods, rows, options.height, lpips, folder)
             except InputError as error:
-                result.skipped.append(f"{evaluation_set.name}, {case.name}: {error}")
+                result.skipped.append(f"{test_set.name}, {case.name}: {error}")
             done += 1
-            write_json(result, out / "results.json")
+            make_folder(out)
+            write_json(result.as_json(), out / "results.json")
     if not any(row.scores for row in result.sets):
         raise InputError(f"{root}: none of the {total} cases can be used. The first: {result.skipped[0]}")
     return result
-
-
-def write_json(result: ProtocolResult, path: Path) -> None:
-    """Write the results atomically, and make the folder.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    make_folder(path.parent)
-    with replacing(path) as partial:
-        partial.write_text(json.dumps(result.as_json(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _run_case(
@@ -515,10 +490,10 @@ def _run_case(
 
 def _write_images(folder: Path, method: str, rendered: RenderedTarget) -> None:
     make_folder(folder)
-    stem = _slug(rendered.score.target)
+    stem = _slugify(rendered.score.target)
     write_image(folder / f"{stem}_target.png", rendered.target)
-    write_image(folder / f"{stem}_{_slug(method)}.png", rendered.image)
-    write_image(folder / f"{stem}_{_slug(method)}_error.png", error_image(rendered.image, rendered.target))
+    write_image(folder / f"{stem}_{_slugify(method)}.png", rendered.image)
+    write_image(folder / f"{stem}_{_slugify(method)}_error.png", error_image(rendered.image, rendered.target))
 
 
 def _take_evenly(cases: Sequence[EvaluationCase], limit: int | None) -> Sequence[EvaluationCase]:
@@ -528,7 +503,7 @@ def _take_evenly(cases: Sequence[EvaluationCase], limit: int | None) -> Sequence
     return [cases[i * (len(cases) - 1) // max(limit - 1, 1)] for i in range(limit)]
 
 
-def _slug(name: str) -> str:
+def _slugify(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9.]+", "_", name).strip("._").lower() or "case"
 
 

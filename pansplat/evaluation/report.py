@@ -33,7 +33,7 @@ from pansplat.pipeline import Drawing
 from pansplat.predictor import Predictor, Progress
 from pansplat.rendering import Rendering
 
-ERROR_SCALE = 0.25  # mean absolute colour error at the brightest colour of the error image
+ERROR_SCALE = 0.25  # mean absolute colour error that the brightest colour of an error image shows
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def evaluate(
 ) -> list[Case]:
     """Evaluate every target of the pairs, and write results.json and images into `out`.
 
-    For correct times, predictions are not read from the cache, and the predictor runs once before the first pair.
+    For correct times, predictions are not read from the cache and the predictor runs once before the first pair.
     results.json is written after each pair, so that an interruption keeps the results so far.
 
     Args:
@@ -96,7 +96,7 @@ def evaluate(
         raise InputError("none of the pairs has a target view to compare with; name targets in pairs.json")
     make_folder(out)
     warm_up(predictor)
-    draw = partial(pipeline.render, blend=blend, size=(height, 2 * height), drawing=drawing)
+    render = partial(pipeline.render, blend=blend, size=(height, 2 * height), drawing=drawing)
     cases: list[Case] = []
     for index, pair in enumerate(with_targets):
 
@@ -105,8 +105,8 @@ def evaluate(
                 progress(f"{pair.name}: {what}", (index + fraction) / len(with_targets))
 
         taken = {case.prediction.parent.name for case in cases}
-        cases += _evaluate_pair(pair, predictor, out, taken, height, draw, lpips, report)
-        write_results(cases, out / "results.json")
+        cases += _evaluate_pair(pair, predictor, out, taken, height, render, lpips, report)
+        write_json([case.as_json() for case in cases], out / "results.json")
     return cases
 
 
@@ -124,23 +124,23 @@ def _evaluate_pair(
     out: Path,
     taken: set[str],
     height: int,
-    draw: Callable[[Scene, Tensor], Rendering],
+    render: Callable[[Scene, Tensor], Rendering],
     lpips: Lpips | None,
     progress: Progress,
 ) -> Iterator[Case]:
     context, targets = pair.load_context(height), pair.load_targets(height)
-    began = time.perf_counter()
+    start = time.perf_counter()
     scene = pipeline.predict(context, predictor, progress=progress)
-    predict_seconds = time.perf_counter() - began
+    predict_seconds = time.perf_counter() - start
     for view, target in enumerate(targets.images):
         progress("rendering", 1.0)
         pose = targets.cam2world[view]
-        began = time.perf_counter()
+        start = time.perf_counter()
         with torch.no_grad():
-            image = draw(scene, pose).color.float()
-        render_seconds = time.perf_counter() - began
+            image = render(scene, pose).color.float()
+        render_seconds = time.perf_counter() - start
         name = pair.name if len(targets.images) == 1 else f"{pair.name} {Path(targets.names[view]).stem}"
-        folder = out / _free_name(name, taken)
+        folder = out / _choose_folder_name(name, taken)
         make_folder(folder)
         write_image(folder / "prediction.png", image)
         write_image(folder / "target.png", target)
@@ -175,9 +175,9 @@ def error_image(
     return torch.from_numpy(heat).permute(2, 0, 1)
 
 
-def write_results(cases: Sequence[Case], path: Path) -> None:
-    """Write the cases as a JSON list of objects, atomically."""
-    text = json.dumps([case.as_json() for case in cases], indent=1)
+def write_json(value: object, path: Path) -> None:
+    """Write a value without non-finite numbers as JSON, atomically."""
+    text = json.dumps(value, indent=1, allow_nan=False)
     with replacing(path) as unfinished:
         unfinished.write_text(text + "\n", encoding="utf-8")
 
@@ -190,7 +190,7 @@ def results_table(cases: Sequence[Case]) -> Table:
     for head in columns:
         table.add_column(head, justify="right")
     rows = [[figure(case) for figure, _ in columns.values()] for case in cases]
-    formats = [how for _, how in columns.values()]
+    formats = [format_spec for _, format_spec in columns.values()]
     for case, row in zip(cases, rows, strict=True):
         table.add_row(case.name, *map(format, row, formats))
     if len(rows) > 1:
@@ -234,7 +234,7 @@ def make_folder(folder: Path) -> None:
         raise InputError(f"cannot make {folder} ({error.strerror}); choose another --out") from error
 
 
-def _free_name(name: str, taken: set[str]) -> str:
+def _choose_folder_name(name: str, taken: set[str]) -> str:
     """The name as a valid folder name, numbered if another case has it."""
     base = re.sub(r"[^\w.+-]+", "_", name).strip("._") or "case"
     free, number = base, 2

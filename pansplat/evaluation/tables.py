@@ -1,7 +1,8 @@
-"""The paper's tables with our rows, the figure over the frame distance, and the files of an evaluation.
+"""The paper's tables with our rows, the frame-distance figure, and the files of an evaluation.
 
 Source: PanSplat, section 4 and tables 1 to 4; a user's re-run of the released 512 checkpoint (PanSplat issue 6). The
-code of the figure on Insta360 is not public: ours uses the middle frame of pairs spread evenly over the sequences.
+code of the paper's figure on Insta360 is not public: ours uses the middle frame of pairs spread evenly over the
+sequences.
 """
 
 from __future__ import annotations
@@ -177,17 +178,13 @@ DEPTH_LAYOUT = _layout(
 )
 
 
-def rich_table(layout: Layout, ours: Sequence[TableRow], heads: Mapping[str, str] = HEADS) -> Table:
-    """The printable table: the paper's rows, a line, and ours in bold.
-
-    Args:
-        heads: headings of the metrics.
-    """
+def rich_table(layout: Layout, ours: Sequence[TableRow]) -> Table:
+    """The printable table: the paper's rows, a line, and ours in bold."""
     table = Table(title=layout.title)
     table.add_column("method")
     for index, (name, metric) in enumerate(layout.columns):
         above = name if index % len(layout.metrics) == 0 else ""
-        table.add_column(f"{above}\n{heads[metric]}", justify="right")
+        table.add_column(f"{above}\n{HEADS[metric]}", justify="right")
     for row in layout.rows:
         table.add_row(row.method, *_cells(row, layout))
     table.add_section()
@@ -196,9 +193,9 @@ def rich_table(layout: Layout, ours: Sequence[TableRow], heads: Mapping[str, str
     return table
 
 
-def markdown_table(layout: Layout, ours: Sequence[TableRow], heads: Mapping[str, str] = HEADS) -> str:
+def markdown_table(layout: Layout, ours: Sequence[TableRow]) -> str:
     """The table in Markdown, with ours in bold."""
-    names = [f"{name} {heads[metric]}" for name, metric in layout.columns]
+    names = [f"{name} {HEADS[metric]}" for name, metric in layout.columns]
     lines = [f"### {layout.title}", "", f"| method | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
     for row in (*layout.rows, *ours):
         cells = [row.method, *_cells(row, layout)]
@@ -215,12 +212,6 @@ def _cells(row: TableRow, layout: Layout) -> list[str]:
         value = row.values.get(column)
         cells.append("-" if value is None else format(value, _FORMATS.get(column[1], ".3f")))
     return cells
-
-
-def frame_distance_layout(result: ProtocolResult) -> Layout:
-    """A table of the numbers of the figure over the frame distance; the paper has none."""
-    sets = tuple(dict.fromkeys(row.set for row in result.sets))
-    return Layout("The frame in the middle, by frames between the inputs", sets, ("ws_psnr",), ())
 
 
 def frame_distance_curves(rows: Sequence[SetResult], metric: str) -> dict[str, list[tuple[int, float]]]:
@@ -257,9 +248,10 @@ _PAPER_LPIPS = "lpips-vgg"
 
 
 def list_layouts(result: ProtocolResult) -> list[Layout]:
-    """The paper's tables for the evaluation."""
+    """The paper's tables for the evaluation; a table without the paper's rows for the frame-distance figure."""
     if result.protocol == "frame-distance":
-        return [frame_distance_layout(result)]
+        sets = tuple(dict.fromkeys(row.set for row in result.sets))
+        return [Layout("The frame in the middle, by frames between the inputs", sets, ("ws_psnr",), ())]
     with_depth = result.protocol == "m3d" and any(row.depth for row in result.sets)
     return [LAYOUTS[result.protocol], *([DEPTH_LAYOUT] if with_depth else [])]
 
@@ -278,7 +270,7 @@ def our_rows(result: ProtocolResult, layout: Layout) -> list[TableRow]:
 
 def rich_tables(result: ProtocolResult) -> list[Table]:
     """The printable tables."""
-    return [rich_table(layout, our_rows(result, layout), HEADS) for layout in list_layouts(result)]
+    return [rich_table(layout, our_rows(result, layout)) for layout in list_layouts(result)]
 
 
 def report_notes(result: ProtocolResult) -> list[str]:
@@ -290,7 +282,7 @@ def report_notes(result: ProtocolResult) -> list[str]:
     if result.lpips is None:
         lines.append("No LPIPS: its weights were not found (see docs/evaluation.md).")
     elif result.lpips != _PAPER_LPIPS:
-        lines.append(f"LPIPS of ours is {result.lpips}, the paper's is {_PAPER_LPIPS}: do not compare them.")
+        lines.append(f"LPIPS of ours is {result.lpips}, the paper's is {_PAPER_LPIPS}: they are not comparable.")
     lines += [f"Missing: {line}." for line in result.missing]
     lines += [f"Left out: {line}" for line in result.skipped]
     return lines

@@ -5,7 +5,7 @@ without the Condon-Shortley phase, so k = 1, 2, 3 are -y, z, -x.
 
 Source: PanSplat, section 3.3: degree 4, predicted in camera axes and rotated to the world's. Degree 4 continues the
 sign rule, as common 3DGS implementations do. The official code rotates about the wrong axes (docs/official.md, trap
-T3) and draws a wrong basis function (section 10.3, trap T4).
+T3) and evaluates a wrong basis function (section 10.3, trap T4).
 """
 
 import functools
@@ -106,8 +106,8 @@ def rotation_matrices(rotations: Float[Tensor, "*batch 3 3"], degree: int) -> Fl
     """
     directions, weights = _quadrature(degree)
     directions, weights = directions.to(rotations), weights.to(rotations)
-    turned = harmonics_basis(torch.einsum("...ij,qj->...qi", rotations, directions), degree)
-    matrices = turned.transpose(-1, -2) @ (harmonics_basis(directions, degree) * weights[:, None])
+    rotated = harmonics_basis(torch.einsum("...ij,qj->...qi", rotations, directions), degree)
+    matrices = rotated.transpose(-1, -2) @ (harmonics_basis(directions, degree) * weights[:, None])
     block = torch.tensor([math.isqrt(k) for k in range((degree + 1) ** 2)], device=matrices.device)
     return torch.where(block[:, None] == block, matrices, 0)
 
@@ -135,24 +135,22 @@ def _quadrature(degree: int) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(directions), torch.from_numpy(weights)
 
 
-def official_harmonics(harmonics: Float[Tensor, "*batch k channel"]) -> Float[Tensor, "*batch drawn channel"]:
-    """Coefficients, of degree 3 at most, whose colours are those of the official rasteriser for `harmonics`.
+def official_harmonics(harmonics: Float[Tensor, "*batch k channel"]) -> Float[Tensor, "*batch k_official channel"]:
+    """Coefficients, of degree 3 at most, with the colours that the official rasteriser gives `harmonics`.
 
     In the official axes, coefficient 14 multiplies x (x^2 - y^2) in place of z (x^2 - y^2). On the unit sphere this is
-    a sum of the harmonics 3, 13 and 15. Degrees above 3 are not drawn.
+    a sum of the harmonics 3, 13 and 15. The official rasteriser ignores degrees above 3.
 
     Source: docs/official.md, section 10.3 and trap T4.
     """
-    drawn = harmonics[..., : (_OFFICIAL_DEGREE + 1) ** 2, :]
-    if drawn.shape[-2] < 16:
-        return drawn
-    return _official_matrix().to(drawn) @ drawn
+    kept = harmonics[..., : (_OFFICIAL_DEGREE + 1) ** 2, :]
+    return kept if kept.shape[-2] < 16 else _official_matrix().to(kept) @ kept
 
 
 @functools.lru_cache
 @torch.inference_mode(False)  # the cached tensors are used with gradients too
 def _official_matrix() -> Float[Tensor, "16 16"]:
-    """Map from coefficients in world axes to the officially drawn ones; float64."""
+    """Map from coefficients to those of `official_harmonics`, both in world axes; float64."""
     # With |d| = 1: x (x^2 - y^2) = 0.4 x - 0.1 x (4 z^2 - x^2 - y^2) + 0.5 x (x^2 - 3 y^2).
     norm = math.sqrt(105 / math.pi) / 4
     parts = {3: (0.4, math.sqrt(3 / math.pi) / 2), 13: (-0.1, math.sqrt(10.5 / math.pi) / 4),
@@ -161,5 +159,5 @@ def _official_matrix() -> Float[Tensor, "16 16"]:
     matrix[14, 14] = 0
     for k, (factor, other_norm) in parts.items():
         matrix[k, 14] = -factor * norm / other_norm
-    turn = rotation_matrices(torch.tensor(_OFFICIAL_AXES, dtype=torch.float64), _OFFICIAL_DEGREE)
-    return turn.T @ matrix @ turn
+    rotation = rotation_matrices(torch.tensor(_OFFICIAL_AXES, dtype=torch.float64), _OFFICIAL_DEGREE)
+    return rotation.T @ matrix @ rotation

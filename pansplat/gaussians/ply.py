@@ -1,9 +1,8 @@
 """Scenes as .ply files that any 3D Gaussian splatting tool opens, written at once or part by part.
 
-The vertices have the original 3DGS binary layout: position, unused normals, `f_dc`, `f_rest` (channel by
-channel), logit opacity, log scales, rotation to world axes (wxyz). Input cameras, the depth range, and the level and
-view of each Gaussian have no place in that layout. They are one header comment, `comment pansplat {json}`, which
-other tools skip.
+The vertices have the binary layout of 3DGS: position, unused normals, `f_dc`, `f_rest` (channel by channel), logit
+opacity, log scales, rotation to world axes (wxyz). Input cameras, the depth range, and the level and view of each
+Gaussian are not part of that layout. One header comment holds them, `comment pansplat {json}`, which other tools skip.
 
 The header holds the number of vertices. A file that is written part by part reserves space for its header and fills
 it at the end.
@@ -34,12 +33,12 @@ from pansplat.gaussians.scene import Gaussians, Scene
 OPACITY_EPSILON = 1e-6  # opacities are clamped to this distance from 0 and 1, where the logit is infinite
 SCALE_EPSILON = 1e-12  # metres; smaller scales are clamped, so that the logarithm is finite
 
-_MARK = "pansplat "
-_MAX_RUNS = 4096  # with more runs, whose header would have megabytes, the Gaussians are sorted
+_COMMENT_PREFIX = "pansplat "
+_MAX_RUNS = 4096  # the Gaussians are sorted if the header would list more runs, which take megabytes
 _MAX_HEADER = 1 << 24
 _RUNS_SPACE = 4096  # bytes for about 300 runs; some browser viewers need the header within 10,000 bytes
 _READ_VERTICES = 1 << 17  # vertices that are read at a time
-_FOREIGN_NEAR, _FOREIGN_FAR = 0.1, 100.0  # depth range, metres, of a file without one
+_DEFAULT_NEAR, _DEFAULT_FAR = 0.1, 100.0  # depth range, metres, for a file without one
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
@@ -58,7 +57,7 @@ def save_ply(scene: Scene, path: str | Path) -> None:
         InputError: when the folder does not exist or cannot be written.
     """
     path = Path(path)
-    gaussians = _ordered(_finite(scene.gaussians, path))
+    gaussians = _sort_by_label(_select_finite(scene.gaussians, path))
     with replacing(path) as partial, open(partial, "wb") as file:
         file.write(_format_header(scene, _label_runs(gaussians), gaussians.harmonics.shape[1]))
         _vertex_table(gaussians).tofile(file)
@@ -88,30 +87,32 @@ def save_ply_parts(scene: Scene, parts: Iterable[Gaussians], path: str | Path) -
         size = len(_format_header(scene, [], coefficients)) + _RUNS_SPACE
         with open(partial, "wb") as file:
             file.write(b" " * size)
-            runs, lost = _write_parts(_chain(first, rest), file, coefficients)
+            runs, num_removed = _write_parts(_chain(first, rest), file, coefficients)
         _fill_header(partial, _format_header(scene, runs, coefficients, size=size), size)
     count = sum(run[2] for run in runs)
-    if lost:
-        warnings.warn(f"{path}: left out {lost} of {count + lost} Gaussians that are not finite", stacklevel=2)
+    if num_removed:
+        warnings.warn(
+            f"{path}: left out {num_removed} of {count + num_removed} Gaussians that are not finite", stacklevel=2
+        )
     return count
 
 
 def _chain(first: list[Gaussians], rest: Iterator[Gaussians]) -> Iterator[Gaussians]:
-    """The first part and the rest, without a reference to a part that was consumed."""
+    """The first part and the rest; keeps no reference to a consumed part."""
     yield first.pop()
     yield from rest
 
 
 def _write_parts(parts: Iterable[Gaussians], file: BinaryIO, coefficients: int) -> tuple[list[list[int]], int]:
-    """Write the vertices; the runs of labels, and the number of non-finite Gaussians."""
+    """Write the vertices; return the runs of labels and the number of non-finite Gaussians."""
     runs: list[list[int]] = []
-    lost = 0
+    num_removed = 0
     for part in parts:
         if part.harmonics.shape[1] != coefficients:
             raise ValueError(f"`parts` must have {coefficients} harmonics each, got {part.harmonics.shape[1]}")
         finite = _finite_mask(part)
         kept = part if bool(finite.all()) else part.select(finite)
-        lost += len(part) - len(kept)
+        num_removed += len(part) - len(kept)
         for level, view, count in _label_runs(kept):
             if runs and runs[-1][:2] == [level, view]:
                 runs[-1][2] += count
@@ -119,7 +120,7 @@ def _write_parts(parts: Iterable[Gaussians], file: BinaryIO, coefficients: int) 
                 runs.append([level, view, count])
         _vertex_table(kept).tofile(file)
         del part, kept
-    return runs, lost
+    return runs, num_removed
 
 
 def _fill_header(path: Path, content: bytes, size: int) -> None:
@@ -142,7 +143,7 @@ def _format_header(scene: Scene, runs: list[list[int]], coefficients: int, *, si
         coefficients: number of harmonics coefficients, 1 to 25.
         size: least number of bytes; spaces after the comment fill the difference.
     """
-    begin = f"ply\nformat binary_little_endian 1.0\ncomment {_MARK}{_extras(scene, runs)}"
+    begin = f"ply\nformat binary_little_endian 1.0\ncomment {_COMMENT_PREFIX}{_format_extras(scene, runs)}"
     lines = [f"element vertex {sum(count for _, _, count in runs)}"]
     lines += [*(f"property float {name}" for name in _property_names(coefficients)), "end_header\n"]
     end = "\n" + "\n".join(lines)
@@ -167,28 +168,28 @@ def load_ply(path: str | Path) -> Scene:
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
     extras = _parse_extras(header.comments, path)
-    levels, views = _labels(extras, header.count, path)
-    gaussians = _finite(replace(gaussians, levels=levels, views=views), path)
+    levels, views = _read_labels(extras, header.count, path)
+    gaussians = _select_finite(replace(gaussians, levels=levels, views=views), path)
     if header.count and not len(gaussians):
         raise InputError(f"{path}: none of its {header.count} Gaussians is finite; write the file again")
     cam2world = torch.tensor(extras.get("cam2world", []), dtype=torch.float64).reshape(-1, 4, 4)
     return Scene(
         gaussians,
         cam2world,
-        near=float(extras.get("near", _FOREIGN_NEAR)),
-        far=float(extras.get("far", _FOREIGN_FAR)),
+        near=float(extras.get("near", _DEFAULT_NEAR)),
+        far=float(extras.get("far", _DEFAULT_FAR)),
         names=tuple(str(name) for name in extras.get("names", ())),
         model=str(extras.get("model", "")),
         height=int(extras.get("height", 512)),
     )
 
 
-def _finite(gaussians: Gaussians, path: Path) -> Gaussians:
+def _select_finite(gaussians: Gaussians, path: Path) -> Gaussians:
     finite = _finite_mask(gaussians)
-    lost = len(gaussians) - int(finite.sum())
-    if not lost:
+    num_removed = len(gaussians) - int(finite.sum())
+    if not num_removed:
         return gaussians
-    warnings.warn(f"{path}: left out {lost} of {len(gaussians)} Gaussians that are not finite", stacklevel=3)
+    warnings.warn(f"{path}: left out {num_removed} of {len(gaussians)} Gaussians that are not finite", stacklevel=3)
     return gaussians.select(finite)
 
 
@@ -202,7 +203,7 @@ def _finite_mask(gaussians: Gaussians) -> Bool[Tensor, "n"]:
     return finite
 
 
-def _ordered(gaussians: Gaussians) -> Gaussians:
+def _sort_by_label(gaussians: Gaussians) -> Gaussians:
     if len(_label_runs(gaussians)) <= _MAX_RUNS:
         return gaussians
     key = gaussians.levels.long() * (int(gaussians.views.max()) + 1) + gaussians.views.long()
@@ -220,7 +221,7 @@ def _label_runs(gaussians: Gaussians) -> list[list[int]]:
     return torch.stack((levels[starts], views[starts], counts), dim=1).tolist()
 
 
-def _extras(scene: Scene, runs: list[list[int]]) -> str:
+def _format_extras(scene: Scene, runs: list[list[int]]) -> str:
     extras = {
         "version": 1,
         "model": scene.model,
@@ -236,10 +237,8 @@ def _extras(scene: Scene, runs: list[list[int]]) -> str:
 
 def _property_names(coefficients: int) -> list[str]:
     rest = [f"f_rest_{i}" for i in range(3 * (coefficients - 1))]
-    scales = [f"scale_{i}" for i in range(3)]
-    return ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *rest, "opacity", *scales] + [
-        f"rot_{i}" for i in range(4)
-    ]
+    scales, rotation = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
+    return [*("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"), *rest, "opacity", *scales, *rotation]
 
 
 def _vertex_table(gaussians: Gaussians) -> np.ndarray:
@@ -249,8 +248,7 @@ def _vertex_table(gaussians: Gaussians) -> np.ndarray:
     # In float64: near 1 the logit is not accurate in float32.
     logits = torch.logit(g.opacities.double(), eps=OPACITY_EPSILON)[:, None]
     log_scales = g.scales.clamp_min(SCALE_EPSILON).log()
-    normals = torch.zeros(len(g), 3)
-    parts = (g.means, normals, g.harmonics[:, 0], rest, logits, log_scales, g.quats)
+    parts = (g.means, torch.zeros(len(g), 3), g.harmonics[:, 0], rest, logits, log_scales, g.quats)
     columns = np.empty((len(g), sum(part.shape[1] for part in parts)), "<f4")
     start = 0
     for part in parts:
@@ -262,7 +260,7 @@ def _vertex_table(gaussians: Gaussians) -> np.ndarray:
 @dataclass(frozen=True)
 class _Header:
     order: str
-    skip: int  # bytes of the elements before the vertices
+    skipped_bytes: int  # of the elements before the vertices
     count: int
     dtype: np.dtype
     comments: list[str]
@@ -278,7 +276,7 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
         left -= len(line)
         words = line.decode("ascii", errors="replace").split()
         if not line.endswith(b"\n"):
-            raise InputError(f"{path}: its header does not end; the file is cut off or no .ply")
+            raise InputError(f"{path}: its header does not end; the file is truncated or not a .ply")
         if words == ["end_header"]:
             break
         try:
@@ -299,7 +297,7 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
 
 
 def _vertex_header(order: str, elements: list, comments: list[str], path: Path) -> _Header:
-    skip = 0
+    skipped_bytes = 0
     for name, count, fields in elements:
         if count < 0:
             raise InputError(f"{path}: element `{name}` has a negative count {count}")
@@ -310,18 +308,18 @@ def _vertex_header(order: str, elements: list, comments: list[str], path: Path) 
             raise InputError(f"{path}: element `{name}` has {what}; save the file as a plain 3DGS .ply")
         dtype = np.dtype([(field, order + kind) for field, kind in fields])
         if name == "vertex":
-            return _Header(order, skip, count, dtype, comments)
-        skip += count * dtype.itemsize
+            return _Header(order, skipped_bytes, count, dtype, comments)
+        skipped_bytes += count * dtype.itemsize
     raise InputError(f"{path}: it has no `vertex` element; give a 3DGS .ply")
 
 
 def _seek_vertices(file: BinaryIO, header: _Header, path: Path) -> None:
-    start = file.tell() + header.skip
+    start = file.tell() + header.skipped_bytes
     needed = header.count * header.dtype.itemsize
-    held = file.seek(0, os.SEEK_END) - start
-    if held < needed:
+    available = file.seek(0, os.SEEK_END) - start
+    if available < needed:
         raise InputError(
-            f"{path} is cut off: {header.count} vertices need {needed} bytes, it holds {max(held, 0)}; "
+            f"{path} is truncated: {header.count} vertices need {needed} bytes, it holds {max(available, 0)}; "
             "copy or download it again"
         )
     file.seek(start)
@@ -329,7 +327,7 @@ def _seek_vertices(file: BinaryIO, header: _Header, path: Path) -> None:
 
 def _read_gaussians(file: BinaryIO, header: _Header, path: Path) -> Gaussians:
     """The vertices at the file's position, with all labels 0; read in pieces to limit the memory."""
-    coefficients = _coefficients(header.dtype.names or (), path)
+    coefficients = _count_coefficients(header.dtype.names or (), path)
     n, zeros = header.count, torch.zeros(header.count, dtype=torch.int64)
     gaussians = Gaussians(
         means=torch.empty(n, 3),
@@ -344,33 +342,33 @@ def _read_gaussians(file: BinaryIO, header: _Header, path: Path) -> Gaussians:
         rows = slice(start, min(start + _READ_VERTICES, n))
         vertices = np.fromfile(file, header.dtype, rows.stop - start)
         if len(vertices) < rows.stop - start:
-            raise InputError(f"{path} became shorter while it was read; read it again when it is whole")
-        gaussians.means[rows] = _columns(vertices, "x", "y", "z")
-        gaussians.scales[rows] = _columns(vertices, "scale_0", "scale_1", "scale_2").exp()
-        gaussians.quats[rows] = _columns(vertices, "rot_0", "rot_1", "rot_2", "rot_3")
-        gaussians.opacities[rows] = _columns(vertices, "opacity").sigmoid()[:, 0]
-        gaussians.harmonics[rows, 0] = _columns(vertices, "f_dc_0", "f_dc_1", "f_dc_2")
-        rest = _columns(vertices, *(f"f_rest_{i}" for i in range(3 * (coefficients - 1))))
+            raise InputError(f"{path} was truncated while it was read; read it again when it is complete")
+        gaussians.means[rows] = _stack_columns(vertices, "x", "y", "z")
+        gaussians.scales[rows] = _stack_columns(vertices, "scale_0", "scale_1", "scale_2").exp()
+        gaussians.quats[rows] = _stack_columns(vertices, "rot_0", "rot_1", "rot_2", "rot_3")
+        gaussians.opacities[rows] = _stack_columns(vertices, "opacity").sigmoid()[:, 0]
+        gaussians.harmonics[rows, 0] = _stack_columns(vertices, "f_dc_0", "f_dc_1", "f_dc_2")
+        rest = _stack_columns(vertices, *(f"f_rest_{i}" for i in range(3 * (coefficients - 1))))
         gaussians.harmonics[rows, 1:] = rest.reshape(len(vertices), 3, coefficients - 1).transpose(1, 2)
     return gaussians
 
 
-def _columns(vertices: np.ndarray, *names: str) -> torch.Tensor:
+def _stack_columns(vertices: np.ndarray, *names: str) -> torch.Tensor:
     values = np.empty((len(vertices), len(names)), np.float32)
     for index, name in enumerate(names):
         values[:, index] = vertices[name]
     return torch.from_numpy(values)
 
 
-def _coefficients(held: Sequence[str], path: Path) -> int:
+def _count_coefficients(available: Sequence[str], path: Path) -> int:
     """Number of harmonics coefficients, 1 to 25, of vertices with these properties."""
-    rest = sum(name.startswith("f_rest_") for name in held)
+    rest = sum(name.startswith("f_rest_") for name in available)
     if rest not in (0, 9, 24, 45, 72):
         raise InputError(f"{path}: {rest} f_rest properties fit no SH degree; 0, 9, 24, 45 or 72 are needed")
     needed = [name for name in _property_names(rest // 3 + 1) if name not in ("nx", "ny", "nz")]
-    missing = [name for name in needed if name not in held]
+    missing = [name for name in needed if name not in available]
     if missing:
-        hint = "a compressed .ply; uncompress it first" if "packed_position" in held else "no 3DGS .ply"
+        hint = "a compressed .ply; uncompress it first" if "packed_position" in available else "not a 3DGS .ply"
         raise InputError(f"{path}: the vertices lack {', '.join(missing[:6])}: this is {hint}")
     return rest // 3 + 1
 
@@ -378,9 +376,9 @@ def _coefficients(held: Sequence[str], path: Path) -> int:
 def _parse_extras(comments: list[str], path: Path) -> dict:
     """Content of the pansplat comment; empty without one, and with a warning when it is damaged."""
     for comment in comments:
-        if comment.startswith(_MARK):
+        if comment.startswith(_COMMENT_PREFIX):
             try:
-                extras = json.loads(comment.removeprefix(_MARK))
+                extras = json.loads(comment.removeprefix(_COMMENT_PREFIX))
                 poses = np.asarray(extras.get("cam2world", []), np.float64)
                 if poses.size and (poses.shape[1:] != (4, 4) or not np.isfinite(poses).all()):
                     raise ValueError("cam2world")
@@ -391,11 +389,13 @@ def _parse_extras(comments: list[str], path: Path) -> dict:
                     raise ValueError("names or runs")
                 return extras
             except (ValueError, TypeError, AttributeError):
-                warnings.warn(f"{path}: its pansplat comment is damaged; cameras and labels are lost", stacklevel=3)
+                warnings.warn(
+                    f"{path}: its pansplat comment is damaged; cameras, levels and views are ignored", stacklevel=3
+                )
     return {}
 
 
-def _labels(extras: dict, count: int, path: Path) -> tuple[torch.Tensor, torch.Tensor]:
+def _read_labels(extras: dict, count: int, path: Path) -> tuple[torch.Tensor, torch.Tensor]:
     """Level and view of each vertex; zeros without labels, or with a warning when they do not fit `count`."""
     zeros = torch.zeros(count, dtype=torch.int64), torch.zeros(count, dtype=torch.int64)
     if not extras:
@@ -409,8 +409,7 @@ def _labels(extras: dict, count: int, path: Path) -> tuple[torch.Tensor, torch.T
         runs, valid = torch.zeros(0, 3, dtype=torch.int64), False
     if not valid:
         warnings.warn(
-            f"{path}: its {count} Gaussians are not those its labels were written for (edited elsewhere?); "
-            "levels and views are lost",
+            f"{path}: its levels and views do not fit its {count} Gaussians (edited by another tool?) and are ignored",
             stacklevel=3,
         )
         return zeros

@@ -27,7 +27,7 @@ class Gaussians:
         opacities: peak opacity, in [0, 1].
         harmonics: real spherical-harmonics coefficients of degree 0..4 in world axes, in the 3DGS order and signs;
             colour in direction d (camera to mean) is max(0, 0.5 + sum_k Y_k(d) c_k). Three channels are RGB;
-            the rasteriser draws any number.
+            the rasteriser accepts any number.
         levels: pyramid level, 0 is the finest.
         views: index of the context view of each Gaussian.
     """
@@ -89,11 +89,10 @@ class Gaussians:
 
 
 def empty_gaussians(degree: int = 0) -> Gaussians:
-    """An empty set."""
-    labels = torch.zeros(0, dtype=torch.uint8)
+    """An empty set of Gaussians with harmonics of a degree."""
+    vectors, labels = torch.zeros(0, 3), torch.zeros(0, dtype=torch.uint8)
     harmonics = torch.zeros(0, (degree + 1) ** 2, 3)
-    rows = torch.zeros(0, 3)
-    return Gaussians(rows, rows, torch.zeros(0, 4), torch.zeros(0), harmonics, labels, labels)
+    return Gaussians(vectors, vectors, torch.zeros(0, 4), torch.zeros(0), harmonics, labels, labels)
 
 
 @dataclass(frozen=True, eq=False)

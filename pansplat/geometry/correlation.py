@@ -32,13 +32,13 @@ _MAX_BANDS = 8
 
 
 def _kernel(function: Callable[..., Any]) -> Any:
-    # The tests' annotation checks wrap every function; numba needs the unwrapped one.
+    # The tests wrap every function to check its annotations; numba needs the unwrapped function.
     options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz", "reassoc"}}
     return nb.njit(cache=True, **options)(inspect.unwrap(function))
 
 
 @_kernel
-def _corners(x0, y0, height, width, wraps, rows, columns):
+def _find_corners(x0, y0, height, width, wraps, rows, columns):
     """Rows and columns of the four pixels around a position, in row-major order."""
     for k in range(4):
         row, column = y0 + k // 2, x0 + k % 2
@@ -70,7 +70,7 @@ def _correlate_band(reference, other, x, y, wraps, out, first, last):
                 x0, y0 = int(np.floor(px)), int(np.floor(py))
                 if x0 != cell_x or y0 != cell_y:
                     cell_x, cell_y = x0, y0
-                    _corners(x0, y0, height, width, wraps, rows, columns)
+                    _find_corners(x0, y0, height, width, wraps, rows, columns)
                     a, b = other[rows[0], columns[0]], other[rows[1], columns[1]]
                     c, d = other[rows[2], columns[2]], other[rows[3], columns[3]]
                     d0 = d1 = d2 = d3 = pixel[0] * 0
@@ -85,20 +85,20 @@ def _correlate_band(reference, other, x, y, wraps, out, first, last):
 
 
 @_kernel
-def _accumulate_gradients(weights, pixel, other, rows, columns, to_reference, to_other):
+def _accumulate_gradients(weights, pixel, other, rows, columns, grad_reference, grad_other):
     """Add the gradients of one reference pixel and of the four pixels around its candidates."""
     for k in range(4):
         weight, row, column = weights[k], rows[k], columns[k]
-        seen, gains = other[row, column], to_other[row, column]
+        features, grad_features = other[row, column], grad_other[row, column]
         for n in range(pixel.shape[0]):
-            to_reference[n] += weight * seen[n]
-            gains[n] += weight * pixel[n]
+            grad_reference[n] += weight * features[n]
+            grad_features[n] += weight * pixel[n]
         weights[k] = 0
 
 
 @_kernel
-def _backward_band(gradient, reference, other, x, y, wraps, to_reference, to_other, first, last):
-    """Add gradients to rows `first` to `last` of to_reference (h, w, c), and to any rows of to_other (h, w, c)."""
+def _backward_band(gradient, reference, other, x, y, wraps, grad_reference, grad_other, first, last):
+    """Add gradients to rows `first` to `last` of grad_reference (h, w, c), and to any rows of grad_other (h, w, c)."""
     count, height, width = x.shape
     rows, columns = np.zeros(4, np.int64), np.zeros(4, np.int64)
     weights = np.zeros(4, reference.dtype)
@@ -113,17 +113,17 @@ def _backward_band(gradient, reference, other, x, y, wraps, to_reference, to_oth
                 if x0 != cell_x or y0 != cell_y:
                     if cell_x != -9:
                         _accumulate_gradients(
-                            weights, reference[i, j], other, rows, columns, to_reference[i, j], to_other
+                            weights, reference[i, j], other, rows, columns, grad_reference[i, j], grad_other
                         )
                     cell_x, cell_y = x0, y0
-                    _corners(x0, y0, height, width, wraps, rows, columns)
+                    _find_corners(x0, y0, height, width, wraps, rows, columns)
                 fx, fy, g = px - x0, py - y0, gradient[k, i, j]
                 weights[0] += g * (1 - fy) * (1 - fx)
                 weights[1] += g * (1 - fy) * fx
                 weights[2] += g * fy * (1 - fx)
                 weights[3] += g * fy * fx
             if cell_x != -9:
-                _accumulate_gradients(weights, reference[i, j], other, rows, columns, to_reference[i, j], to_other)
+                _accumulate_gradients(weights, reference[i, j], other, rows, columns, grad_reference[i, j], grad_other)
 
 
 def correlate_positions(
@@ -143,12 +143,12 @@ def correlate_positions(
     """
     height = reference.shape[2]
     out = torch.empty_like(columns, memory_format=torch.contiguous_format)
-    ours, theirs = _channels_last(reference), _channels_last(other)
+    reference_maps, other_maps = _to_channels_last(reference), _to_channels_last(other)
     x, y, result = columns.contiguous().numpy(), rows.contiguous().numpy(), out.numpy()
-    bands = _bands(height)
+    bands = _split_rows(height)
 
     def work(pair: int, band: int) -> None:
-        _correlate_band(ours[pair], theirs[pair], x[pair], y[pair], wraps, result[pair], *bands[band])
+        _correlate_band(reference_maps[pair], other_maps[pair], x[pair], y[pair], wraps, result[pair], *bands[band])
 
     _run_bands(work, reference.shape[0], len(bands))
     return out
@@ -165,28 +165,31 @@ def correlate_positions_backward(
 ) -> tuple[Float[Tensor, "pair channel height width"], Float[Tensor, "pair channel height width"]]:
     """Gradients of `correlate_positions` with respect to both panoramas' features."""
     pairs, channels, height, width = reference.shape
-    ours, theirs, upstream = _channels_last(reference), _channels_last(other), gradient.contiguous().numpy()
+    reference_maps, other_maps = _to_channels_last(reference), _to_channels_last(other)
+    upstream = gradient.contiguous().numpy()
     x, y = columns.contiguous().numpy(), rows.contiguous().numpy()
-    bands = _bands(height)
-    to_reference = np.zeros((pairs, height, width, channels), ours.dtype)
-    to_other = np.zeros_like(to_reference)
+    bands = _split_rows(height)
+    grad_reference = np.zeros((pairs, height, width, channels), reference_maps.dtype)
+    grad_other = np.zeros_like(grad_reference)
     for pair in range(pairs):
-        sums = np.zeros((len(bands), height, width, channels), ours.dtype)
+        sums = np.zeros((len(bands), height, width, channels), reference_maps.dtype)
 
         def work(_: int, band: int, pair: int = pair, sums: np.ndarray = sums) -> None:
-            both = (to_reference[pair], sums[band])
-            _backward_band(upstream[pair], ours[pair], theirs[pair], x[pair], y[pair], wraps, *both, *bands[band])
+            both = (grad_reference[pair], sums[band])
+            _backward_band(
+                upstream[pair], reference_maps[pair], other_maps[pair], x[pair], y[pair], wraps, *both, *bands[band]
+            )
 
         _run_bands(work, 1, len(bands))
-        sums.sum(axis=0, out=to_other[pair])
-    return torch.from_numpy(to_reference).movedim(-1, 1), torch.from_numpy(to_other).movedim(-1, 1)
+        sums.sum(axis=0, out=grad_other[pair])
+    return torch.from_numpy(grad_reference).movedim(-1, 1), torch.from_numpy(grad_other).movedim(-1, 1)
 
 
-def _channels_last(maps: Tensor) -> np.ndarray:
+def _to_channels_last(maps: Tensor) -> np.ndarray:
     return maps.detach().movedim(1, -1).contiguous().numpy()
 
 
-def _bands(height: int) -> list[tuple[int, int]]:
+def _split_rows(height: int) -> list[tuple[int, int]]:
     """First and last row of each band: one band per torch thread, of at least eight rows."""
     count = max(1, min(torch.get_num_threads(), _MAX_BANDS, height // 8))
     edges = [height * band // count for band in range(count + 1)]
@@ -227,14 +230,14 @@ def correlate(
     """
     if backend == "auto":
         backend = "kernel" if reference.device.type == "cpu" else "torch"
-    method = _ByKernel if backend == "kernel" else _ByWarping
+    method = _KernelCorrelation if backend == "kernel" else _WarpedCorrelation
     dtype = torch.promote_types(reference.dtype, torch.float32)
     # Scaled before the product, so that no partial sum overflows.
     scaled = reference.to(dtype) / math.sqrt(reference.shape[1])
     return method.apply(scaled, other.to(dtype), inverse_depth.detach().to(dtype), pose.detach(), sampling)
 
 
-class _ByWarping(torch.autograd.Function):
+class _WarpedCorrelation(torch.autograd.Function):
     """Warps a few candidates at a time; the backward pass warps them again."""
 
     @staticmethod
@@ -251,18 +254,18 @@ class _ByWarping(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):  # pyright: ignore[reportIncompatibleMethodOverride]
         reference, other, inverse_depth, pose = ctx.saved_tensors
-        to_reference, to_other = torch.zeros_like(reference), torch.zeros_like(other)
+        grad_reference, grad_other = torch.zeros_like(reference), torch.zeros_like(other)
         chunks = _chunks(inverse_depth, reference.numel())
         for chunk, part in zip(chunks, gradient.split([c.shape[1] for c in chunks], dim=1), strict=True):
             with torch.enable_grad():
                 leaf = other.detach().requires_grad_()
                 warped = warp_panorama(leaf, chunk, pose, ctx.sampling)
-            to_reference += torch.einsum("ndhw,ncdhw->nchw", part, warped.detach())
-            to_other += torch.autograd.grad(warped, leaf, part[:, None] * reference[:, :, None])[0]
-        return to_reference, to_other, None, None, None
+            grad_reference += torch.einsum("ndhw,ncdhw->nchw", part, warped.detach())
+            grad_other += torch.autograd.grad(warped, leaf, part[:, None] * reference[:, :, None])[0]
+        return grad_reference, grad_other, None, None, None
 
 
-class _ByKernel(torch.autograd.Function):
+class _KernelCorrelation(torch.autograd.Function):
     """Runs the compiled kernels, without warping."""
 
     @staticmethod
@@ -279,14 +282,14 @@ class _ByKernel(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):  # pyright: ignore[reportIncompatibleMethodOverride]
         reference, other, inverse_depth, pose = ctx.saved_tensors
-        to_reference, to_other = torch.zeros_like(reference), torch.zeros_like(other)
+        grad_reference, grad_other = torch.zeros_like(reference), torch.zeros_like(other)
         for candidates, positions in _chunk_positions(inverse_depth, pose, ctx.sampling):
-            steps = correlate_positions_backward(
+            parts = correlate_positions_backward(
                 gradient[:, candidates], reference, other, *positions, wraps=ctx.sampling == "sphere"
             )
-            to_reference += steps[0]
-            to_other += steps[1]
-        return to_reference, to_other, None, None, None
+            grad_reference += parts[0]
+            grad_other += parts[1]
+        return grad_reference, grad_other, None, None, None
 
 
 def _chunk_positions(
@@ -299,6 +302,6 @@ def _chunk_positions(
         start += chunk.shape[1]
 
 
-def _chunks(inverse_depth: Tensor, numbers: int) -> tuple[Tensor, ...]:
-    """The candidates in chunks of at most `_CHUNK` elements; one candidate has `numbers` elements."""
-    return inverse_depth.split(max(1, _CHUNK // max(1, numbers)), dim=1)
+def _chunks(inverse_depth: Tensor, elements: int) -> tuple[Tensor, ...]:
+    """The candidates in chunks of at most `_CHUNK` elements; one candidate has `elements` elements."""
+    return inverse_depth.split(max(1, _CHUNK // max(1, elements)), dim=1)

@@ -1,7 +1,7 @@
 """Cubemaps in the panorama camera's frame: face poses, and strips of six faces as the monocular network reads them.
 
-The faces that pansplat.rendering draws have pixel centres at half-integers. The faces of a strip are sampled corner to
-corner: the first and the last pixel of a row lie on the cube's edges. The network was trained so.
+The faces of pansplat.rendering have pixel centres at half-integers. The faces of a strip are sampled corner to corner:
+the first and the last pixel of a row lie on the cube's edges, as in the training of the monocular network.
 
 Source: PanSplat, section 3.4; face order and axes of the official renderer (docs/official.md, section 10.1); strips:
 docs/official.md, sections 2.4 and 5; Jiang et al., UniFuse, https://arxiv.org/abs/2102.03550.
@@ -55,7 +55,7 @@ def official_faces(height: int) -> Int[Tensor, "height width"]:
     Source: docs/official.md, section 10.2.
 
     Raises:
-        ValueError: the height is no multiple of 4; the back face would not split evenly over both ends.
+        ValueError: the height is not a multiple of 4; the back face would not split evenly over both ends.
     """
     if height < 4 or height % 4:
         raise ValueError(f"`height` must be a positive multiple of 4, got {height}")
@@ -82,8 +82,7 @@ def strip_from_equirect(
     image: Float[Tensor, "channel height width"], face_size: int
 ) -> Float[Tensor, "channel face_size strip"]:
     """The strip of six faces of a panorama, sampled bilinearly."""
-    uv = uv_from_directions(strip_directions(face_size)).to(image.device)
-    return sample_equirect(image, uv)
+    return sample_equirect(image, uv_from_directions(strip_directions(face_size)).to(image.device))
 
 
 def strip_lookup(height: int) -> Float[Tensor, "height width 3"]:

@@ -53,7 +53,7 @@ def look_pose(
 
 
 def level_pose(cam2world: Float[Tensor, "4 4"], up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
-    """The pose with the same position and heading, without roll or pitch; also for a vertical view."""
+    """The pose with the same position and heading, without roll or pitch; a vertical view is allowed."""
     pose = cam2world.double()
     forward, up = pose[:3, 2], up.double() / up.double().norm()
     flat = forward - (forward @ up) * up
@@ -81,8 +81,8 @@ def turn_pose(pose: Float[Tensor, "4 4"], yaw_radians: float, up: Float[Tensor, 
 def path_poses(cam2world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"]:
     """A level pose at each camera that looks along the path.
 
-    The direction of the path at a camera is that from its predecessor to its successor. Where it has none (one camera,
-    coincident cameras, a vertical path) the pose keeps the camera's heading.
+    The path's direction at a camera is the direction from its predecessor to its successor. Without a direction (one
+    camera, coincident cameras, a vertical path) the pose keeps the camera's heading.
     """
     up = up_direction(cam2world)
     positions = cam2world[:, :3, 3].double()
@@ -118,8 +118,7 @@ def fly_pose(
         raise ValueError("`cam2world` must hold at least one camera to fly from, got none")
     eased = ease_in_out(fraction)
     up = up_direction(cam2world)
-    poses = path_poses(cam2world)
-    pose = _along(poses, eased)
+    pose = _interpolate_path(path_poses(cam2world), eased)
     # The turn depends on the eased fraction, so that it also starts and stops smoothly.
     return turn_pose(pose, -math.radians(turn_degrees) * math.sin(2 * math.pi * eased), up)
 
@@ -131,7 +130,7 @@ def fly_path(
     return torch.stack([fly_pose(cam2world, fraction, turn_degrees=turn_degrees) for fraction in fractions])
 
 
-def _along(poses: Float[Tensor, "stop 4 4"], fraction: float) -> Float[Tensor, "4 4"]:
+def _interpolate_path(poses: Float[Tensor, "stop 4 4"], fraction: float) -> Float[Tensor, "4 4"]:
     """Pose at a fraction of the polyline's length, or of the number of stops where the length is zero."""
     if len(poses) == 1:
         return poses[0]

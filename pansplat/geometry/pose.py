@@ -104,7 +104,7 @@ def blend_weights(position: Float[Tensor, "3"], positions: Float[Tensor, "view 3
     """Weights of the input views at a camera position: normalised inverse distances.
 
     The weights are non-negative and sum to one. At an input position they are one-hot; inputs that coincide with the
-    position share the weight equally.
+    position have equal weights.
 
     Source: PanSplat, section 3.4 (deferred blending), for any number of views; docs/rendering.md, section 7.
     """
@@ -112,8 +112,8 @@ def blend_weights(position: Float[Tensor, "3"], positions: Float[Tensor, "view 3
         raise ValueError("`positions` must hold at least one view, got none")
     distances = torch.linalg.vector_norm(position - positions, dim=1)
     nearest = distances.detach().amin()
-    at = distances == 0
+    is_at_position = distances == 0
     # Only ratios matter. In units of the nearest distance nothing overflows.
-    closeness = nearest / torch.where(at, torch.ones_like(distances), distances)
-    closeness = torch.where(at, torch.ones_like(distances), closeness)
+    closeness = nearest / torch.where(is_at_position, torch.ones_like(distances), distances)
+    closeness = torch.where(is_at_position, torch.ones_like(distances), closeness)
     return closeness / closeness.sum()

@@ -1,11 +1,11 @@
-"""Warping between posed panoramas: where another camera sees the points of a pixel's ray.
+"""Warping between posed panoramas.
 
 A depth candidate is an inverse depth. The point at this depth on a pixel's ray has a position in the other camera's
-panorama; the warp samples the panorama there.
+panorama; the warp samples the panorama at this position.
 
-There are two ways of sampling. `sphere` is exact: pixel centres at half-integers, columns wrap, rows continue over the
-poles. `corners` is the official one: rays pass through half-integer centres, but samples are placed as if the corner
-pixels' centres lay on the border, with zeros outside. It shifts even the identity by up to half a pixel.
+There are two kinds of sampling. `sphere` is exact: pixel centres at half-integers, columns wrap, rows continue over the
+poles. `corners` is the official sampling: rays pass through half-integer centres, but samples are placed as if the
+corner pixels' centres lay on the border, with zeros outside. It shifts even the identity by up to half a pixel.
 
 No gradient flows to poses and candidates.
 
@@ -47,16 +47,16 @@ def warp_positions(
     height, width = inverse_depth.shape[-2:]
     rays = pixel_directions(height, width, dtype=inverse_depth.dtype, device=inverse_depth.device)
     pose = pose.to(inverse_depth)
-    turned = torch.einsum("nij,hwj->inhw", pose[:, :3, :3], rays)[:, :, None]
+    rotated = torch.einsum("nij,hwj->inhw", pose[:, :3, :3], rays)[:, :, None]
     translation = pose[:, :3, 3].T[:, :, None, None, None]
     if sampling == "corners":
-        return _corner_positions(turned / inverse_depth + translation)
-    points = turned + translation * inverse_depth
+        return _corner_positions(rotated / inverse_depth + translation)
+    points = rotated + translation * inverse_depth
     return _sphere_positions(points, rays)
 
 
 def _sphere_positions(points: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """From the angle between each pixel's ray and the point: exact for the identity pose."""
+    """Positions by the angles between each pixel's ray and its point: exact for the identity pose."""
     height, width = rays.shape[:2]
     x, y, z = points
     ray_x, ray_y, ray_z = rays.unbind(-1)
@@ -79,7 +79,7 @@ def _corner_positions(points: Tensor) -> tuple[Tensor, Tensor]:
     return u * (width - 1), v * (height - 1)
 
 
-def sample(
+def sample_maps(
     maps: Float[Tensor, "pair channel height width"],
     columns: Float[Tensor, "pair candidate h w"],
     rows: Float[Tensor, "pair candidate h w"],
@@ -109,4 +109,4 @@ def warp_panorama(
     """
     with torch.no_grad():
         columns, rows = warp_positions(inverse_depth, pose, sampling)
-    return sample(maps, columns, rows, sampling)
+    return sample_maps(maps, columns, rows, sampling)

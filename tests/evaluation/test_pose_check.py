@@ -8,7 +8,7 @@ import torch
 
 from pansplat.data.layouts import load_pairs
 from pansplat.data.views import Views
-from pansplat.evaluation.pose_check import _ADVICE, AS_GIVEN, PoseCheck, _likely_mistake, check_pair, check_views
+from pansplat.evaluation.pose_check import _ADVICE, AS_GIVEN, PoseCheck, _describe_mistake, check_pair, check_views
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import invert_pose, rotations_from_quats
 
@@ -95,8 +95,8 @@ def test_each_wrong_convention_is_named(mistake: str) -> None:
 
 
 def test_a_nearly_perfect_fit_is_no_mistake() -> None:
-    assert _likely_mistake({"inverse": 0.001, AS_GIVEN: 0.004}) is None
-    assert _likely_mistake({"inverse": 0.201, AS_GIVEN: 0.304}) is not None
+    assert _describe_mistake({"inverse": 0.001, AS_GIVEN: 0.004}) is None
+    assert _describe_mistake({"inverse": 0.201, AS_GIVEN: 0.304}) is not None
 
 
 def test_readings_with_the_same_relative_pose_are_indistinguishable() -> None:
@@ -139,7 +139,7 @@ def test_unrelated_images_give_a_warning() -> None:
     noise = torch.rand(views.images.shape, generator=torch.Generator().manual_seed(0))
     check = check_views(dataclasses.replace(views, images=noise))
     assert check.likely_mistake is None
-    assert any("too little in common" in warning for warning in check.warnings)
+    assert any("overlap too little" in warning for warning in check.warnings)
 
 
 @pytest.mark.shared

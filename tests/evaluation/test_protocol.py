@@ -41,7 +41,7 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.model.network import NetworkPredictor
 
 HEIGHT = 32
-OPTIONS = ProtocolOptions(HEIGHT, draws=3, gaps=(2, 4))
+OPTIONS = ProtocolOptions(HEIGHT, pairs_per_sequence=3, gaps=(2, 4))
 RADIUS = 2.0  # metres
 
 
@@ -176,7 +176,7 @@ def test_a_larger_height_has_its_own_folder(tmp_path: Path) -> None:
 def test_pairs_of_a_sequence_are_spread_evenly(tmp_path: Path) -> None:
     """docs/official.md, section 2.5: the inputs of 360Loc are three frames apart."""
     write_loc360(tmp_path, frames=7)
-    found = find_sequence_set(tmp_path, LOC360, draws=3)
+    found = find_sequence_set(tmp_path, LOC360, pairs_per_sequence=3)
     names = [case.name[-13:] for case in found.cases]
     assert names == ["000000-000003", "000001-000004", "000003-000006"]
     sample = found.cases[1].read(HEIGHT)
@@ -284,7 +284,7 @@ def test_lpips_is_optional(tmp_path: Path) -> None:
     result = run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=OPTIONS, lpips=metric)
     value = result.sets[0].mean("lpips")
     assert value is not None and value > 0 and result.lpips == "lpips-squeeze"
-    assert any("do not compare" in note for note in report_notes(result))
+    assert any("not comparable" in note for note in report_notes(result))
 
 
 # Missing and invalid data
@@ -310,7 +310,7 @@ def test_a_set_without_a_readable_case_is_an_error(tmp_path: Path) -> None:
 
 def test_limited_cases_are_spread_over_the_set(tmp_path: Path) -> None:
     write_triplets(tmp_path, "replica_dist_0.5", scenes=5)
-    options = ProtocolOptions(HEIGHT, limit=3, pictures=1)
+    options = ProtocolOptions(HEIGHT, limit=3, image_cases=1)
     result = run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=options)
     assert [score.case for score in result.sets[0].scores] == ["00000000", "00000002", "00000004"]
     assert [path.name for path in (tmp_path / "out" / "replica_1.0_m").iterdir()] == ["00000000"]

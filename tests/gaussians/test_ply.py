@@ -158,7 +158,7 @@ def test_a_file_with_another_count_loses_its_labels_but_not_its_cameras(tmp_path
     header, body = path.read_bytes().split(b"end_header\n", 1)
     row = len(body) // 40
     path.write_bytes(header.replace(b"vertex 40", b"vertex 39") + b"end_header\n" + body[row:])
-    with pytest.warns(UserWarning, match="39 Gaussians are not those"):
+    with pytest.warns(UserWarning, match="do not fit its 39 Gaussians"):
         scene = load_ply(path)
     assert len(scene.gaussians) == 39 and not scene.gaussians.levels.any()
     assert len(scene.cam2world) == 2
@@ -228,7 +228,7 @@ REFUSED = [
     (header_with(GOOD + "element vertex 0\nproperty float x\nproperty float y"), "lack z, f_dc_0"),
     (header_with(GOOD + "element vertex 0\nproperty uint packed_position"), "compressed .ply"),
     (header_with(GOOD + "element vertex 0\nproperty float f_rest_0"), "1 f_rest properties fit no SH degree"),
-    (header_with(GOOD + "element vertex 999999999999\nproperty float x"), "cut off"),
+    (header_with(GOOD + "element vertex 999999999999\nproperty float x"), "truncated"),
 ]
 
 
