@@ -23,17 +23,17 @@ def replacing(path: Path | str) -> Iterator[Path]:
     """
     path = Path(path)
     if not path.parent.is_dir():
-        raise InputError(f"cannot write {path}: needed an existing folder, got {path.parent}; create it first.")
+        raise InputError(f"cannot write {path}: needed an existing folder, got {path.parent}; create it first")
     if path.is_dir():
-        raise InputError(f"cannot write {path}: needed a file name, got a folder; give a file inside it.")
+        raise InputError(f"cannot write {path}: needed a file name, got a folder; give a file inside it")
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
         raise InputError(
-            f"cannot write {path}: needed a writable folder with room on the disk, got "
-            f"'{error.strerror or error}'; choose another place."
+            f"cannot write {path}: needed a writable folder with free disk space, got "
+            f"'{error.strerror or error}'; choose another folder"
         ) from error
     finally:
         temporary.unlink(missing_ok=True)

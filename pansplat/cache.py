@@ -1,4 +1,4 @@
-"""Predictions on disk, under a hash of everything that they depend on."""
+"""The cache of predictions on disk, keyed by a hash of all inputs."""
 
 from __future__ import annotations
 
@@ -24,27 +24,24 @@ _FIELDS = ("means", "scales", "quats", "opacities", "harmonics", "levels", "view
 
 
 class CachedPrediction:
-    """The file that holds one prediction: safetensors and a CRC-32.
+    """The file of one prediction: safetensors, followed by a CRC-32.
 
-    It lies in `.pansplat/` in the pair's folder, or in the user's cache folder where that cannot be written. Its name
-    holds a hash of the decoded pixels, masks, poses, depth range and the predictor's fingerprint.
+    The file is in `.pansplat/` in the pair's folder, or in the user's cache folder if that is not writable. Its name
+    contains a hash of the decoded pixels, masks, poses, depth range and the predictor's fingerprint.
     """
 
     def __init__(self, pair: Pair, views: Views, predictor: Predictor, height: int) -> None:
-        self._stem = f"{_file_name(pair.name)}-{_file_name(predictor.name)}-{height}-"
+        self._stem = f"{_make_file_name(pair.name)}-{_make_file_name(predictor.name)}-{height}-"
         self._name = f"{self._stem}{_hash_inputs(views, predictor)}.scene"
-        self._folders = cache_folders(pair)
+        self._folders = list_cache_folders(pair)
 
     def read(self) -> Gaussians | None:
-        """The Gaussians of the first folder that has them; None if no file exists or all are damaged."""
-        for folder in self._folders:
-            gaussians = _read_gaussians(folder / self._name)
-            if gaussians is not None:
-                return gaussians
-        return None
+        """Gaussians of the first undamaged file; None if there is none."""
+        found = (_read_gaussians(folder / self._name) for folder in self._folders)
+        return next((gaussians for gaussians in found if gaussians is not None), None)
 
     def write(self, gaussians: Gaussians) -> None:
-        """Write to the first writable folder, if there is one, and delete outdated predictions there."""
+        """Write to the first writable folder, if any, and delete outdated predictions there."""
         tensors = {name: getattr(gaussians, name).detach().cpu().contiguous() for name in _FIELDS}
         body = safetensors.torch.save(tensors)
         for folder in self._folders:
@@ -61,15 +58,15 @@ class CachedPrediction:
             return
 
 
-def cache_folders(pair: Pair) -> list[Path]:
-    """Folders that may hold a pair's predictions, preferred first."""
+def list_cache_folders(pair: Pair) -> list[Path]:
+    """Folders for a pair's predictions, in order of preference."""
     pair_hash = hashlib.blake2b(str(pair.folder.resolve()).encode(), digest_size=8).hexdigest()
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return [pair.folder / ".pansplat", Path(home) / "pansplat" / pair_hash]
 
 
 def _hash_inputs(views: Views, predictor: Predictor) -> str:
-    # Pixels are hashed, not files: a mask may depend on the folder's other panoramas, and a decoder may change.
+    # Pixels are hashed, not files: a mask may depend on other panoramas of the folder, and a decoder may change.
     digest = hashlib.blake2b(digest_size=16)
     settings = [_FORMAT, list(views.images.shape), views.near, views.far, predictor.name, predictor.fingerprint]
     digest.update(json.dumps(settings).encode())
@@ -90,5 +87,5 @@ def _read_gaussians(path: Path) -> Gaussians | None:
         return None
 
 
-def _file_name(name: str) -> str:
+def _make_file_name(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_.]+", "_", name)[:60]

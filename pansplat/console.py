@@ -1,4 +1,4 @@
-"""What the commands share on the terminal: messages on standard error, exit statuses, tables."""
+"""Terminal output of the commands: messages on standard error, exit statuses, tables."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ def run_command(command: Callable[[], int], *, memory_advice: str, interruption:
     """Run a command and return its exit status.
 
     Args:
-        command: returns its own status.
-        memory_advice: what to change if the memory does not suffice.
-        interruption: printed after Ctrl+C.
+        command: returns its exit status.
+        memory_advice: advice for the case that memory runs out.
+        interruption: message after Ctrl+C.
 
     Returns:
-        The command's status; 2 for bad input or too little memory, 130 for an interruption.
+        The command's status; 2 for bad input or if memory runs out, 130 after Ctrl+C.
     """
     try:
         return command()
@@ -35,7 +35,7 @@ def run_command(command: Callable[[], int], *, memory_advice: str, interruption:
         if not is_out_of_memory(error):
             raise
         cause = "".join(f" ({line[:120]})" for line in str(error).splitlines()[:1])
-        print_message("error", f"this takes more memory than there is{cause}; {memory_advice}")
+        print_message("error", f"out of memory{cause}; {memory_advice}")
         return 2
     except KeyboardInterrupt:
         print_message("interrupted", interruption)
@@ -57,13 +57,13 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def describes_out_of_memory(message: str) -> bool:
-    """Whether an error message is one of a failed allocation."""
+    """Whether an error message reports a failed allocation."""
     return "allocate" in message or "out of memory" in message.lower() or message.startswith("MemoryError")
 
 
 @contextlib.contextmanager
 def own_warnings() -> Iterator[None]:
-    """Print warnings of pansplat as notes, and hide those of other libraries."""
+    """Print warnings of pansplat as notes and hide those of other libraries."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.filterwarnings("always", category=UserWarning, module=r"pansplat(\.|$)")
@@ -71,8 +71,8 @@ def own_warnings() -> Iterator[None]:
         yield
 
 
-def table_console(width: int = 140) -> Console:
-    """The terminal; if standard output is none, lines of `width` characters, so that tables keep their columns."""
+def make_table_console(width: int = 140) -> Console:
+    """A console of the terminal's width, or of `width` characters if standard output is not a terminal."""
     from rich.console import Console
 
     console = Console(highlight=False)

@@ -1,6 +1,6 @@
-"""The calls of a user: load pairs and predictors, predict, render, save and load scenes.
+"""The public functions: load pairs and predictors, predict, render, save and load scenes.
 
-Every public name here is also an attribute of `pansplat`.
+Every name in `__all__` is also an attribute of `pansplat`.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ def load_model(
     """Load a predictor.
 
     Args:
-        name: `sweep`, or a file of weights: a .safetensors file of `pansplat convert` or of training, or an official
-            checkpoint (.ckpt).
+        name: "sweep", or a file of weights: a .safetensors file from `pansplat convert` or from training, or an
+            official checkpoint (.ckpt).
         compat: for networks: "official" reproduces the official code with its defects; "fixed" corrects them;
-            "trained" is the mode that the weights were trained in, which is "official" for official weights.
+            "trained" is the mode of the training, which is "official" for official weights.
         precision: for networks: number type of the convolutions; docs/bench_model.md shows time against error.
-        **options: for the constructor of `sweep`; for networks, see `pansplat.model.network.load_predictor`.
+        **options: arguments of `pansplat.sweep.Sweep` or of `pansplat.model.network.load_predictor`.
 
     Raises:
-        InputError: the predictor does not exist, the processor lacks the precision, or the file cannot be used.
+        InputError: there is no such predictor, the processor lacks the precision, or the file cannot be used.
     """
     if compat not in get_args(CompatChoice):
         raise InputError(f"`compat` must be one of {', '.join(get_args(CompatChoice))}, got {compat!r}")
@@ -93,10 +93,10 @@ def predict(
 ) -> Scene:
     """Predict the scene of a pair's context panoramas.
 
-    The result of a pair is cached in its folder (`pansplat.cache`).
+    The prediction of a pair is cached in its folder (`pansplat.cache`).
 
     Args:
-        source: a pair, the path of a folder that holds exactly one, or loaded panoramas (never cached).
+        source: a pair, the path of a folder that holds exactly one pair, or loaded panoramas (never cached).
         model: the name of a predictor, a file of weights, or a predictor.
         compat, precision: see `load_model`; without effect on a predictor object.
         height: panoramas are resized to (height, 2 height); loaded panoramas keep their size.
@@ -142,7 +142,7 @@ def predict_to_file(
         source, compat, precision, height, progress: see `predict`.
         model: a file of network weights, or a network's predictor.
         degree: highest degree of harmonics in the file; None keeps all.
-        min_opacity: Gaussians of lower opacity are left out.
+        min_opacity: Gaussians of lower opacity are omitted.
 
     Returns:
         The number of Gaussians in the file.
@@ -153,7 +153,9 @@ def predict_to_file(
     _require_ply(path)
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
     if not can_stream(predictor):
-        raise InputError(f"{predictor.name} makes all Gaussians at once; use `predict` and `save`, or a network")
+        raise InputError(
+            f"`model` must be a network to write tile by tile, got {predictor.name}; use `predict` and `save`"
+        )
     pair = _load_only_pair(source) if isinstance(source, (str, Path)) else source
     views = pair if isinstance(pair, Views) else pair.load_context(height)
     parts: Iterator[Gaussians] = predictor.stream(  # pyright: ignore[reportAttributeAccessIssue]
@@ -183,8 +185,8 @@ def render(
     Args:
         scene: the Gaussians and their input cameras.
         cam2world: pose of the camera, OpenCV axes, metres.
-        blend: "deferred" renders each context view's Gaussians and blends the images by nearness; "joint" renders all
-            Gaussians together; a number renders one view's Gaussians only.
+        blend: "deferred" renders the Gaussians of each context view and blends the images by nearness; "joint" renders
+            all Gaussians together; a number renders the Gaussians of one view only.
         size: (height, width), pixels; by default the scene's height, 2:1 (16:9 for `pinhole`).
         layout: "equirect", "cubemap" or "pinhole".
         drawing: "exact", or "original": a panorama as the official code renders it, with its defects, to reproduce
@@ -197,34 +199,34 @@ def render(
     pose = torch.as_tensor(cam2world, dtype=torch.float64)
     if size is None:
         size = (scene.height, round(scene.height * 16 / 9) if layout == "pinhole" else 2 * scene.height)
-    draw = _choose_renderer(drawing, scene, size, layout, raster)
+    rasterize_gaussians = _choose_rasterizer(drawing, scene, size, layout, raster)
     num_views = len(scene.cam2world)
     if isinstance(blend, int):
         if not 0 <= blend < max(num_views, 1):
             raise InputError(f"`blend` must be a view from 0 to {max(num_views, 1) - 1}, got {blend}")
-        return draw(scene.gaussians.select(scene.gaussians.views == blend), pose)
+        return rasterize_gaussians(scene.gaussians.select(scene.gaussians.views == blend), pose)
     if blend not in ("deferred", "joint"):
         raise InputError(f"`blend` must be deferred, joint or the number of a view, got {blend!r}")
     if blend == "joint" or num_views < 2:
-        return draw(scene.gaussians, pose)
+        return rasterize_gaussians(scene.gaussians, pose)
     weights = blend_weights(pose[:3, 3], scene.cam2world[:, :3, 3].double())
     # Views of zero weight do not contribute; at an input pose one view remains.
     views = [view for view in range(num_views) if float(weights[view]) > 0]
-    renderings = [draw(scene.gaussians.select(scene.gaussians.views == view), pose) for view in views]
+    renderings = [rasterize_gaussians(scene.gaussians.select(scene.gaussians.views == view), pose) for view in views]
     return renderings[0] if len(views) == 1 else blend_renderings(renderings, weights[views])
 
 
-def _choose_renderer(
+def _choose_rasterizer(
     drawing: Drawing, scene: Scene, size: tuple[int, int], layout: str, raster: dict[str, Any]
 ) -> Callable[[Gaussians, Tensor], Rendering]:
-    """The function that renders Gaussians from a pose at that size."""
+    """Return a function from Gaussians and a pose to their rendering."""
     if drawing == "exact":
         return partial(rasterize, size=size, layout=layout, **raster)
     if drawing != "original":
         raise InputError(f"`drawing` must be exact or original, got {drawing!r}")
     if layout != "equirect" or set(raster) - {"backend"}:
         given = ", ".join([*sorted(raster), *(["layout"] if layout != "equirect" else [])])
-        raise InputError(f"drawing='original' sets all options but size and backend, got {given}; leave them out")
+        raise InputError(f"drawing='original' sets all options but size and backend, got {given}; omit them")
     return partial(rasterize_official, size=size, near=scene.near, **raster)
 
 

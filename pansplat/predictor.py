@@ -15,17 +15,14 @@ Progress = Callable[[str, float], None]  # current step, fraction done in [0, 1]
 
 @runtime_checkable
 class Predictor(Protocol):
-    """A callable from posed panoramas to Gaussians.
-
-    Attributes:
-        name: on the command line.
-    """
+    """A callable from posed panoramas to Gaussians."""
 
     name: str
+    """Name on the command line."""
 
     @property
     def fingerprint(self) -> str:
-        """Hash of everything that determines the output for an input; keys the prediction cache."""
+        """Hash of all that determines the prediction besides the input; part of the cache key."""
         ...
 
     def __call__(

@@ -1,4 +1,4 @@
-"""Single-threaded sections of torch code."""
+"""Run sections of torch code on one thread."""
 
 import contextlib
 import threading
@@ -7,26 +7,26 @@ from collections.abc import Iterator
 import torch
 
 _lock = threading.Lock()
-_inside = 0
-_outside = 1
+_num_running = 0  # sections that are running
+_num_threads = 1  # outside of all sections
 
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
     """Run torch operations on the calling thread only, then restore the number of threads.
 
-    Operations on a few thousand numbers do not benefit from a second core. On a busy machine they wait for it: three
-    jobs on two cores ran 40 times slower. One thread also fixes the order of summation.
+    Operations on a few thousand numbers do not benefit from a second core, and on a busy machine they wait for it:
+    three jobs on two cores ran 40 times slower. One thread also fixes the order of summation.
     """
-    global _inside, _outside
+    global _num_running, _num_threads
     with _lock:
-        if _inside == 0:
-            _outside = torch.get_num_threads()
-        _inside += 1
+        if _num_running == 0:
+            _num_threads = torch.get_num_threads()
+        _num_running += 1
         torch.set_num_threads(1)
     try:
         yield
     finally:
         with _lock:
-            _inside -= 1
-            torch.set_num_threads(_outside)
+            _num_running -= 1
+            torch.set_num_threads(_num_threads)

@@ -166,3 +166,20 @@ def pair_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A pair 16 pixels high; the user's cache folder lies beside it."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return _write_pair(tmp_path / "pair")
+
+
+@pytest.fixture(scope="session")
+def small_config() -> Any:
+    """The config of a narrow PanSplat without the monocular network."""
+    from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel  # after the import hook
+    from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
+    from pansplat.model.heads import AdapterConfig, HeadsConfig
+    from pansplat.model.pansplat import PanSplatConfig
+
+    return PanSplatConfig(
+        features=FeaturePyramidConfig(channels=(4, 8, 8, 16), transformer=TransformerConfig(channels=16, blocks=2)),
+        cost_volume=CostVolumeConfig(
+            mono_channels=0, levels=(SweepLevel(3, 16, 8, 32), SweepLevel(2, 8, 4, 32), SweepLevel(1, 8, 4, 32))
+        ),
+        heads=HeadsConfig(feature_channels=(16, 8, 8, 4), candidates=4, adapter=AdapterConfig(degree=1)),
+    )

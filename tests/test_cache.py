@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from pansplat.cache import cache_folders
+from pansplat.cache import list_cache_folders
 from pansplat.gaussians.scene import Scene
 from pansplat.pipeline import load_pairs, predict
 
@@ -141,4 +141,4 @@ def test_loaded_views_are_not_cached(pair_folder: Path, sphere_predictor) -> Non
     pair = load_pairs(pair_folder)[0]
     views = pair.load_context(HEIGHT)
     assert same(predict(views, predictor), predict(pair, predictor, height=HEIGHT, cache=False))
-    assert not any(folder.exists() for folder in cache_folders(pair))
+    assert not any(folder.exists() for folder in list_cache_folders(pair))

@@ -1,17 +1,25 @@
-"""Predict, render, save and load."""
+"""Predict into memory or a file, render, save and load."""
 
 import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from pansplat import pipeline
+from pansplat.cli import predict as predict_command
+from pansplat.cli import run
 from pansplat.errors import InputError
 from pansplat.gaussians.harmonics import official_harmonics
-from pansplat.gaussians.scene import Scene
-from pansplat.pipeline import load, load_model, predict, render, save
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.model import network
+from pansplat.model.pansplat import PanSplat
+from pansplat.model.weights import pack_weights, save_weights
+from pansplat.pipeline import load, load_model, predict, predict_to_file, render, save
 from pansplat.rendering import blend, rasterize
 
 HEIGHT = 16
@@ -85,12 +93,12 @@ def test_render_accepts_sizes_layouts_and_numpy_poses(scene: Scene) -> None:
 
 def test_original_drawing_uses_the_official_kernel_stitching_and_harmonics(scene: Scene) -> None:
     pose = scene.pose_between(0.5)
-    drawn = render(scene, pose, blend="joint", size=(32, 64), drawing="original").color
-    bent = replace(scene.gaussians, harmonics=official_harmonics(scene.gaussians.harmonics))
-    choices = {"kernel": "ewa", "order": "z", "lowpass": "3dgs", "stitching": "official", "face_size": 16}
-    expected = rasterize(bent, pose, size=(32, 64), layout="cubemap", near=0.2 * scene.near, **choices).color
-    assert torch.equal(drawn, expected)
-    assert not torch.allclose(drawn, render(scene, pose, blend="joint", size=(32, 64)).color, atol=1e-3)
+    rendered = render(scene, pose, blend="joint", size=(32, 64), drawing="original").color
+    official = replace(scene.gaussians, harmonics=official_harmonics(scene.gaussians.harmonics))
+    options = {"kernel": "ewa", "order": "z", "lowpass": "3dgs", "stitching": "official", "face_size": 16}
+    expected = rasterize(official, pose, size=(32, 64), layout="cubemap", near=0.2 * scene.near, **options).color
+    assert torch.equal(rendered, expected)
+    assert not torch.allclose(rendered, render(scene, pose, blend="joint", size=(32, 64)).color, atol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -123,3 +131,85 @@ def test_save_and_load_refuse_other_suffixes(scene: Scene, tmp_path: Path) -> No
     with pytest.raises(InputError, match=r"must end in \.ply, got 'no suffix'"):
         load(tmp_path / "scene")
     assert os.listdir(tmp_path) == ["pair"]
+
+
+# Predictions into a file, tile by tile
+
+
+TILED_HEIGHT = 64
+
+
+@pytest.fixture
+def masked_pair(tmp_path: Path, write_pair) -> Path:
+    """Two panoramas; the lower third of the first is masked."""
+    folder = write_pair(tmp_path / "pair", height=TILED_HEIGHT)
+    mask = np.full((TILED_HEIGHT, 2 * TILED_HEIGHT), 255, np.uint8)
+    mask[40:] = 0
+    Image.fromarray(mask).save(folder / "left_mask.png")
+    return folder
+
+
+@pytest.fixture
+def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_config) -> Path:
+    """Weights of a small network that cuts panoramas of 64 rows into four tiles; the command streams such panoramas."""
+    monkeypatch.setattr(network, "_UNTILED_HEIGHT", TILED_HEIGHT // 2)
+    monkeypatch.setattr(predict_command, "_MAX_CACHED_HEIGHT", TILED_HEIGHT // 2)
+    torch.manual_seed(0)
+    path = tmp_path / "small.safetensors"
+    save_weights(path, pack_weights("pansplat", small_config, PanSplat(small_config).state_dict(), compat="fixed"))
+    return path
+
+
+def _sorted_rows(gaussians: Gaussians) -> np.ndarray:
+    fields = (gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities, gaussians.harmonics)
+    labels = (gaussians.levels, gaussians.views)
+    rows = torch.cat([field.reshape(len(gaussians), -1).float() for field in (*fields, *labels)], dim=1).numpy()
+    return rows[np.lexsort(rows.T[::-1])]
+
+
+def test_predict_to_file_writes_the_gaussians_of_predict(masked_pair: Path, weights: Path, tmp_path: Path) -> None:
+    scene = predict(masked_pair, weights, height=TILED_HEIGHT, cache=False)
+    save(scene, tmp_path / "whole.ply")
+    whole = load(tmp_path / "whole.ply")
+    count = predict_to_file(masked_pair, tmp_path / "tiles.ply", weights, height=TILED_HEIGHT)
+    tiles = load(tmp_path / "tiles.ply")
+    assert count == len(tiles.gaussians) == len(scene.gaussians) > 1000
+    assert 0 < int((tiles.gaussians.views == 0).sum()) < int((tiles.gaussians.views == 1).sum())  # masked
+    np.testing.assert_array_equal(_sorted_rows(tiles.gaussians), _sorted_rows(whole.gaussians))
+    assert not torch.equal(tiles.gaussians.means, whole.gaussians.means)  # ordered by tile
+    assert torch.equal(tiles.cam2world, whole.cam2world)
+    assert all(getattr(tiles, name) == getattr(whole, name) for name in ("near", "far", "names", "model", "height"))
+
+
+def test_predict_to_file_limits_degree_and_opacity(masked_pair: Path, weights: Path, tmp_path: Path) -> None:
+    predict_to_file(masked_pair, tmp_path / "all.ply", weights, height=TILED_HEIGHT)
+    all_gaussians = load(tmp_path / "all.ply").gaussians
+    min_opacity = float(all_gaussians.opacities.median())
+    count = predict_to_file(
+        masked_pair, tmp_path / "few.ply", weights, height=TILED_HEIGHT, degree=0, min_opacity=min_opacity
+    )
+    few = load(tmp_path / "few.ply").gaussians
+    assert few.degree == 0 and len(few) == count
+    assert abs(count - int((all_gaussians.opacities >= min_opacity).sum())) <= 2  # logits are rounded
+    assert float(few.opacities.min()) >= min_opacity - 1e-6
+
+
+def test_the_predict_command_streams_large_predictions(
+    masked_pair: Path, weights: Path, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    command = ["predict", str(masked_pair), "--model", str(weights), "--height", str(TILED_HEIGHT), "--degree", "0"]
+    monkeypatch.setattr(pipeline, "predict", None)  # must not be called
+    assert run([*command, "-o", str(tmp_path / "tiles.ply")]) == 0
+    assert "Gaussians from left, right in" in capsys.readouterr().out
+    monkeypatch.undo()
+    assert run([*command, "-o", str(tmp_path / "whole.ply"), "--no-cache"]) == 0
+    tiles, whole = (load(tmp_path / name).gaussians for name in ("tiles.ply", "whole.ply"))
+    assert tiles.degree == whole.degree == 0
+    np.testing.assert_allclose(_sorted_rows(tiles)[:, 0], _sorted_rows(whole)[:, 0], atol=1e-5)
+
+
+def test_predict_to_file_refuses_other_predictors_and_suffixes(pair_folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="`model` must be a network to write tile by tile, got sweep"):
+        predict_to_file(pair_folder, tmp_path / "a.ply", "sweep")
+    with pytest.raises(InputError, match=r"must end in \.ply"):
+        predict_to_file(pair_folder, tmp_path / "a.obj", "sweep")

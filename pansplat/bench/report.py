@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from pansplat.atomic import replacing
-from pansplat.console import table_console
+from pansplat.console import make_table_console
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -226,7 +226,7 @@ class Report(Generic[AnyRow]):
 
     def _print(self) -> None:
         print_facts({name: self.machine[name] for name in self.facts})
-        console = table_console(self.width)
+        console = make_table_console(self.width)
         for table in self.tables(self.rows):
             console.print(table)
         for sentence in self.findings(self.rows):

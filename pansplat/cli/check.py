@@ -8,7 +8,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from pansplat.cli.inputs import PairChoice, choose_pair
-from pansplat.console import table_console
+from pansplat.console import make_table_console
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Check:
         for reading, error in check.errors.items():
             style = "bold" if reading == AS_GIVEN else "green" if error < check.error and check.likely_mistake else ""
             table.add_row(reading, f"{error:.3f}", style=style)
-        console = table_console()
+        console = make_table_console()
         console.print(table)
         if check.indistinguishable:
             print(f"these views do not distinguish {AS_GIVEN} from: {', '.join(check.indistinguishable)}")

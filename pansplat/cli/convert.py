@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from pansplat.cli.inputs import Out
-from pansplat.console import table_console
+from pansplat.console import make_table_console
 from pansplat.errors import InputError
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class Convert:
         if self.out.suffix.lower() != ".safetensors" or not self.out.resolve().parent.is_dir():
             raise InputError(f"--out must be a .safetensors file in an existing folder, got {self.out}")
         content = read_checkpoint(self.path)
-        table_console().print(_report_table(match_tensors(content, self.path)))
+        make_table_console().print(_report_table(match_tensors(content, self.path)))
         weights = convert_checkpoint(content, self.path)
         save_weights(self.out, weights)
         numbers = sum(tensor.numel() for tensor in weights.tensors.values())
@@ -62,7 +62,7 @@ def _report_table(report: ConversionReport) -> Table:
     table.add_row("used", str(len(report.used)), _first_names(list(report.used)))
     for reason, names in report.unused.items():
         table.add_row(f"left out: {reason}", str(len(names)), _first_names(names))
-    for word, names in (("unknown", report.surplus), ("missing", report.missing)):
+    for word, names in (("unknown", report.unexpected), ("missing", report.missing)):
         table.add_row(word, str(len(names)), _first_names(names), style="bold red" if names else "")
     return table
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal, cast
 from tyro.conf import Positional
 
 from pansplat.cli.inputs import Compat, Out, Precision, blend_mode, progress_bar, require_height
-from pansplat.console import table_console
+from pansplat.console import make_table_console
 from pansplat.errors import InputError
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ class Evaluate:
                 lpips=lpips,
                 progress=progress,
             )
-        table_console().print(results_table(cases))
+        make_table_console().print(results_table(cases))
         if lpips is not None:
             print(f"LPIPS is {lpips.name}")
         print(f"{self.out / 'results.json'} and the images of each case")
@@ -131,7 +131,7 @@ class Evaluate:
         with progress_bar() as progress:
             result = run_protocol(protocol, data, methods, self.out, options=options, lpips=lpips, progress=progress)
         written = write_report(result, self.out)
-        console = table_console(_PROTOCOL_WIDTH)
+        console = make_table_console(_PROTOCOL_WIDTH)
         for table in rich_tables(result):
             console.print(table)
         for note in report_notes(result):

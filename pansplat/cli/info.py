@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from pansplat.console import table_console
+from pansplat.console import make_table_console
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -38,7 +38,7 @@ class Info:
             print(f"{source}, near {scene.near:g} m, far {scene.far:g} m")
         if not len(gaussians):
             return 0
-        table_console().print(_count_table(scene))
+        make_table_console().print(_count_table(scene))
         for name, values, unit in (
             ("opacity", gaussians.opacities, ""),
             ("largest scale", gaussians.scales.amax(dim=1), " m"),

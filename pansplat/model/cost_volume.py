@@ -27,7 +27,7 @@ from pansplat.model.layers import (
     Precision,
     attend,
     autocast_convolutions,
-    border_of,
+    choose_border,
     require_rigid,
     require_size,
     require_views,
@@ -176,10 +176,10 @@ class SphericalCostVolume(nn.Module):
             centre = upsample_centre(regressed[-1].inverse_depth, self.compat) if regressed else None
             first_count = self.config.swept_levels[0].candidates
             if centre is None:
-                candidates = first_candidates(bounds, first_count, (height, width))
+                candidates = make_first_candidates(bounds, first_count, (height, width))
             else:
                 step = (bounds[1] - bounds[0]) / max(1, first_count - 1) / 2 ** len(regressed)
-                candidates = candidates_around(centre, step, bounds, sweep.candidates)
+                candidates = make_candidates_around(centre, step, bounds, sweep.candidates)
             volume = correlate_views(level_features, candidates, cam2world, self.compat)
             with autocast_convolutions(self.precision, volume.device):
                 logits = self.levels[str(sweep.level)](volume, level_features, centre, mono_features)
@@ -195,7 +195,7 @@ class LevelRefinement(nn.Module):
     ) -> None:
         super().__init__()
         self.compat: Compat = compat
-        border = border_of(compat)
+        border = choose_border(compat)
         inputs = sweep.candidates + sweep.channels + (0 if first else 1) + config.mono_channels
         self.shortcut = nn.Conv2d(inputs, sweep.width, 1)
         self.refine = VolumeRefinement(inputs, sweep.width, border, precision) if config.refinement == "unet" else None
@@ -245,7 +245,7 @@ class VolumeRefinement(nn.Module):
         return self.exit(refined.flatten(0, 1)).unflatten(0, views)
 
 
-def first_candidates(
+def make_first_candidates(
     bounds: tuple[Float[Tensor, "batch view"], Float[Tensor, "batch view"]], count: int, size: tuple[int, int]
 ) -> Float[Tensor, "batch view candidate height width"]:
     """Inverse depths, evenly from far to near, the same for every pixel; a single one is the middle."""
@@ -255,7 +255,7 @@ def first_candidates(
     return candidates[..., None, None].expand(*candidates.shape, *size)
 
 
-def candidates_around(
+def make_candidates_around(
     centre: Float[Tensor, "batch view height width"],
     step: Float[Tensor, "batch view"],
     bounds: tuple[Float[Tensor, "batch view"], Float[Tensor, "batch view"]],

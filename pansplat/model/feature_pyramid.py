@@ -23,7 +23,7 @@ from pansplat.model.layers import (
     Precision,
     attend,
     autocast_convolutions,
-    border_of,
+    choose_border,
     convolve_and_normalize,
     require_size,
     require_views,
@@ -70,7 +70,7 @@ class FeaturePyramid(nn.Module):
         super().__init__()
         self.compat: Compat = compat
         self.precision: Precision = precision
-        self.encoder = Encoder(config.channels, border_of(compat))
+        self.encoder = Encoder(config.channels, choose_border(compat))
         self.transformer = Transformer(config.transformer, compat, attention_precision)
         self.decoder = Decoder(config.channels, compat)
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # convolves faster
@@ -102,9 +102,9 @@ class Encoder(nn.Module):
         self.levels = nn.ModuleList(
             (
                 nn.Sequential(ConvNormAct(3, c0, 7, border), ConvNormAct(c0, c0, 5, border)),
-                _halving_level(c0, c1, 5, border),
-                _halving_level(c1, c2, 5, border),
-                _halving_level(c2, c3, 3, border),
+                _make_halving_level(c0, c1, 5, border),
+                _make_halving_level(c1, c2, 5, border),
+                _make_halving_level(c2, c3, 3, border),
             )
         )
 
@@ -125,7 +125,7 @@ class Decoder(nn.Module):
         super().__init__()
         self.compat: Compat = compat
         *finer, width = channels
-        border = border_of(compat)
+        border = choose_border(compat)
         self.laterals = nn.ModuleList(nn.Conv2d(c, width, 1) for c in finer)
         self.outputs = nn.ModuleList([LevelOutput(width, c, 3, border) for c in finer])
         self.outputs.append(LevelOutput(width, width, 1, border))
@@ -190,7 +190,7 @@ def normalize(images: Float[Tensor, "image 3 height width"]) -> Float[Tensor, "i
     return (images - mean) / std
 
 
-def _halving_level(inputs: int, outputs: int, kernel: int, border: Border) -> nn.Sequential:
+def _make_halving_level(inputs: int, outputs: int, kernel: int, border: Border) -> nn.Sequential:
     return nn.Sequential(
         ConvNormAct(inputs, outputs, kernel, border, stride=2),
         ConvNormAct(outputs, outputs, 3, border),
@@ -222,9 +222,9 @@ class Transformer(nn.Module):
         splits = self.config.splits
         require_size(height, width, 2 * splits if self.compat == "fixed" else splits)
         window = (height // splits, width // splits)
-        encoding = position_encoding(*window, self.config.channels).to(maps).repeat(1, splits, splits)
+        encoding = encode_positions(*window, self.config.channels).to(maps).repeat(1, splits, splits)
         shift = (window[0] // 2, window[1] // 2)
-        mask = shift_mask(height, width, splits, self.compat).to(maps)
+        mask = make_shift_mask(height, width, splits, self.compat).to(maps)
         tokens = (maps + encoding).movedim(2, -1)  # batch view height width channel
         for index, block in enumerate(self.blocks):
             shifted = index % 2 == 1
@@ -257,7 +257,7 @@ class TransformerBlock(nn.Module):
     ) -> Float[Tensor, "batch view window token channel"]:
         entering = tokens
         tokens = tokens + self.within(tokens, tokens, mask)
-        others = other_views(entering)
+        others = concatenate_other_views(entering)
         if mask is not None:
             mask = mask.repeat(1, 1, entering.shape[1] - 1)
         message = self.across(tokens, others, mask)
@@ -295,7 +295,7 @@ class WindowAttention(nn.Module):
         return self.norm(self.merge(attended.unflatten(0, queries.shape[:2])))
 
 
-def other_views(
+def concatenate_other_views(
     tokens: Float[Tensor, "batch view window token channel"],
 ) -> Float[Tensor, "batch view window others channel"]:
     """For each view, the concatenated tokens of all other views."""
@@ -324,7 +324,7 @@ def merge_windows(
     return tokens.reshape(batch, views, height, width, channels)
 
 
-def position_encoding(height: int, width: int, channels: int) -> Float[Tensor, "channel height width"]:
+def encode_positions(height: int, width: int, channels: int) -> Float[Tensor, "channel height width"]:
     """Sine encoding of the row (first half of the channels) and the column in a window.
 
     Source: DETR (Carion et al. 2020), with coordinates counted from 1 and scaled to 2 pi.
@@ -343,12 +343,12 @@ def position_encoding(height: int, width: int, channels: int) -> Float[Tensor, "
     return torch.cat((rows, columns), dim=-1).movedim(-1, 0)
 
 
-def shift_mask(height: int, width: int, splits: int, compat: Compat) -> Float[Tensor, "window token token"]:
+def make_shift_mask(height: int, width: int, splits: int, compat: Compat) -> Float[Tensor, "window token token"]:
     """Additive attention mask of shifted windows: separates tokens that are not neighbours on the panorama.
 
     The shift wraps rows and columns around. A panorama's columns wrap, its rows do not; "official" separates both.
     """
-    rows, columns = (_shifted_regions(size, size // splits) for size in (height, width))
+    rows, columns = (_label_shifted_regions(size, size // splits) for size in (height, width))
     if compat == "fixed":
         columns = torch.zeros_like(columns)
     regions = (3 * rows[:, None] + columns).reshape(1, 1, height, width, 1)
@@ -357,7 +357,7 @@ def shift_mask(height: int, width: int, splits: int, compat: Compat) -> Float[Te
     return torch.zeros(apart.shape).masked_fill(apart, -100.0 if compat == "official" else -math.inf)
 
 
-def _shifted_regions(size: int, window: int) -> Float[Tensor, "size"]:
+def _label_shifted_regions(size: int, window: int) -> Float[Tensor, "size"]:
     """Region of each row or column after the shift: 0 before the last window, 1 and 2 its halves; 2 wrapped around."""
     position = torch.arange(size)
     return (position >= size - window).float() + (position >= size - window // 2).float()

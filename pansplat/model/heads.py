@@ -35,11 +35,11 @@ from pansplat.model.tiles import (
     Tile,
     Window,
     crop_window,
-    lattice_uv,
+    make_lattice_uv,
+    make_tiles,
     move_points,
     sample_panorama,
     sample_window,
-    tile_grid,
 )
 
 _SCALE_UNIT = 0.2  # map pixels of a scale of 1
@@ -183,7 +183,7 @@ class LevelHead(nn.Module):
             colored: whether to add the colour of the image to the harmonics.
         """
         config, compat = self.config, self.compat
-        uv = lattice_uv(config.lattice, height, exact=compat == "fixed")
+        uv = make_lattice_uv(config.lattice, height, exact=compat == "fixed")
         uv = uv[tile.contains(uv)].to(refined.device)
         outputs = self.linear(sample_window(refined, window, height, uv))
         sizes = (2, config.adapter.num_parameters, config.outputs - 2 - config.adapter.num_parameters)
@@ -264,13 +264,13 @@ class GaussianHeads(nn.Module):
         height = matched.images.shape[-2]
         self._require_divisible(height, tiles)
         items = split_views(matched)
-        grid = tile_grid(tiles)
+        grid = make_tiles(tiles)
         for tile in grid if only is None else [grid[number] for number in only]:
             gaussians = []
             for item in items:
                 by_view = [self._lift_view(view, tile) for view in item]
                 gaussians.append(Gaussians.cat([part for level in zip(*by_view, strict=True) for part in level]))
-            yield TileGaussians(gaussians, untiled_index(tile, self.points(height), matched.images.shape[1]))
+            yield TileGaussians(gaussians, compute_untiled_index(tile, self.points(height), matched.images.shape[1]))
 
     def heights(self, height: int) -> list[int]:
         """Rows of each level's map, coarse to fine."""
@@ -281,7 +281,7 @@ class GaussianHeads(nn.Module):
         heights = self.heights(height)
         if self.config.emitted == "finest":
             heights = heights[-1:]
-        return [lattice_uv(self.config.lattice, rows, exact=self.compat == "fixed") for rows in heights]
+        return [make_lattice_uv(self.config.lattice, rows, exact=self.compat == "fixed") for rows in heights]
 
     def _lift_view(self, view: ViewInputs, tile: Tile) -> list[Gaussians]:
         """One view's Gaussians inside a tile, by emitting level, coarse to fine."""
@@ -322,7 +322,7 @@ class GaussianHeads(nn.Module):
             raise InputError(f"the heads need panoramas at least {lowest} pixels high, got {height}; enlarge them")
 
 
-def untiled_index(tile: Tile, lattices: Sequence[Float[Tensor, "_ 2"]], views: int) -> Integer[Tensor, "n"]:
+def compute_untiled_index(tile: Tile, lattices: Sequence[Float[Tensor, "_ 2"]], views: int) -> Integer[Tensor, "n"]:
     """Indices of a tile's Gaussians in the untiled order: level, then view, then point."""
     indices, start = [], 0
     for uv in lattices:
@@ -441,13 +441,13 @@ def adapt_gaussians(
         scales=scales * (_SCALE_UNIT * pixel_radians) * depths[:, None],
         quats=multiply_quats(camera_quat.expand_as(quats), quats),
         opacities=opacities,
-        harmonics=_world_harmonics(harmonics_part, colors, camera, config.degree, compat),
+        harmonics=_rotate_harmonics_to_world(harmonics_part, colors, camera, config.degree, compat),
         levels=torch.full(depths.shape, level, dtype=torch.uint8, device=depths.device),
         views=torch.full(depths.shape, view, dtype=torch.uint8, device=depths.device),
     )
 
 
-def world_harmonics_rotation(rotation: Float[Tensor, "3 3"], compat: Compat) -> Float[Tensor, "3 3"]:
+def compute_harmonics_rotation(rotation: Float[Tensor, "3 3"], compat: Compat) -> Float[Tensor, "3 3"]:
     """Rotation to world axes from the axes in which the network's colours are 3DGS harmonics.
 
     The official code rotates colours by the camera's rotation with x and z reversed, which is right only for rotations
@@ -459,7 +459,7 @@ def world_harmonics_rotation(rotation: Float[Tensor, "3 3"], compat: Compat) -> 
     return rotation @ torch.tensor(_POLAR_Y).to(rotation).T
 
 
-def _world_harmonics(
+def _rotate_harmonics_to_world(
     raw: Float[Tensor, "n parameter"],
     colors: Float[Tensor, "n 3"] | None,
     camera: Float[Tensor, "3 3"],
@@ -467,17 +467,17 @@ def _world_harmonics(
     compat: Compat,
 ) -> Float[Tensor, "n k 3"]:
     """Harmonics in world axes from raw ones in camera axes: scaled by degree, added to a base colour."""
-    harmonics = raw.unflatten(-1, (3, -1)) * _degree_factors(degree).to(raw)
+    harmonics = raw.unflatten(-1, (3, -1)) * _make_degree_factors(degree).to(raw)
     if colors is not None:
         base = 2 * (colors - 0.5)
         harmonics = torch.cat((harmonics[..., :1] + base[..., None], harmonics[..., 1:]), dim=-1)
-    rotation = rotation_matrices(world_harmonics_rotation(camera, compat), degree).to(raw)
+    rotation = rotation_matrices(compute_harmonics_rotation(camera, compat), degree).to(raw)
     # Reshaped to one matrix product: with strided harmonics, torch would compute one for each Gaussian.
     rotated = harmonics.reshape(-1, harmonics.shape[-1]) @ rotation.T
     return rotated.view(harmonics.shape).transpose(-1, -2)
 
 
-def _degree_factors(degree: int) -> Float[Tensor, "k"]:
+def _make_degree_factors(degree: int) -> Float[Tensor, "k"]:
     """Factor of each raw coefficient: 1 for degree 0, 0.1 / 4^n for degree n."""
     factors = [1.0] + [0.1 * 0.25**band for band in range(1, degree + 1) for _ in range(2 * band + 1)]
     return torch.tensor(factors, dtype=torch.float64)

@@ -35,7 +35,7 @@ def to_channels_last(maps: Float[Tensor, "image channel height width"]) -> Float
     return maps.contiguous(memory_format=torch.channels_last)
 
 
-def border_of(compat: Compat) -> Border:
+def choose_border(compat: Compat) -> Border:
     """The border of PanSplat's convolutions."""
     return "sphere" if compat == "fixed" else "wrapped_columns"
 

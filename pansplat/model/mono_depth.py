@@ -27,7 +27,7 @@ from pansplat.model.feature_pyramid import normalize
 from pansplat.model.layers import (
     Compat,
     PanoramaConv2d,
-    border_of,
+    choose_border,
     convolve_and_normalize,
     resize,
     to_channels_last,
@@ -46,9 +46,9 @@ class MonocularDepth(nn.Module):
     def __init__(self, compat: Compat = "official") -> None:
         super().__init__()
         self.compat: Compat = compat
-        self.panorama_encoder = ResNet18(border_of(compat))
+        self.panorama_encoder = ResNet18(choose_border(compat))
         self.face_encoder = ResNet18("zeros")
-        self.decoder = Decoder(border_of(compat))
+        self.decoder = Decoder(choose_border(compat))
         self.register_buffer("max_depth", torch.tensor(10.0))
         self.requires_grad_(False)
         self.eval()

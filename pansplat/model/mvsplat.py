@@ -25,7 +25,7 @@ from pansplat.model.cost_volume import (
     UNetConfig,
     VolumeRefinement,
     correlate_views,
-    first_candidates,
+    make_first_candidates,
     regress_depth,
 )
 from pansplat.model.feature_pyramid import Transformer, TransformerConfig, normalize
@@ -38,7 +38,7 @@ from pansplat.model.layers import (
     require_views,
     upsample,
 )
-from pansplat.model.tiles import lattice_uv, move_points
+from pansplat.model.tiles import make_lattice_uv, move_points
 
 _SCALE = 4  # image size over the size of the cost volume
 _ENCODER_CHANNELS = (64, 64, 96, 96, 128, 128)  # of the residual blocks
@@ -111,7 +111,7 @@ class MVSplat(nn.Module):
         self.config = config
         self.compat: Compat = compat
         self.attention_precision: AttentionPrecision = attention_precision
-        border = _border_of(compat)
+        border = _choose_border(compat)
         channels, fine = config.channels, config.refine_width
         self.features = Features(config, compat, attention_precision)
         self.depth = SweptDepth(config, compat, attention_precision)
@@ -206,7 +206,7 @@ class MVSplat(nn.Module):
         outputs = self.to_gaussians(maps[None])[0].flatten(1).T.contiguous()
         offsets, parameters = outputs.split((2, self.config.adapter.num_parameters), dim=-1)
         correction, opacity_logits = corrections.flatten(1)
-        uv = lattice_uv("pixel", height).to(maps.device)
+        uv = make_lattice_uv("pixel", height).to(maps.device)
         return adapt_gaussians(
             parameters,
             move_points(uv, offsets, "pixel", height),
@@ -227,7 +227,7 @@ class Features(nn.Module):
 
     def __init__(self, config: MVSplatConfig, compat: Compat, precision: AttentionPrecision) -> None:
         super().__init__()
-        self.encoder = Encoder(config.channels, _border_of(compat))
+        self.encoder = Encoder(config.channels, _choose_border(compat))
         self.transformer = Transformer(config.transformer, compat, precision)
 
     def forward(
@@ -284,7 +284,7 @@ class SweptDepth(nn.Module):
         super().__init__()
         self.config = config
         self.compat: Compat = compat
-        border = _border_of(compat)
+        border = _choose_border(compat)
         inputs = config.candidates + config.channels
         self.shortcut = nn.Conv2d(inputs, config.width, 1)
         self.refine = VolumeRefinement(inputs, config.width, border, precision)
@@ -302,7 +302,7 @@ class SweptDepth(nn.Module):
         far: Float[Tensor, "batch view"],
     ) -> LevelDepth:
         height, width = features.shape[-2:]
-        candidates = first_candidates((1 / far, 1 / near), self.config.candidates, (height, width))
+        candidates = make_first_candidates((1 / far, 1 / near), self.config.candidates, (height, width))
         volume = correlate_views(features, candidates, cam2world, self.compat)
         inputs = torch.cat((volume, features), dim=2)
         refined = self.shortcut(inputs.flatten(0, 1)) + self.refine(inputs).flatten(0, 1)
@@ -326,5 +326,5 @@ class FullSizeRefinement(nn.Module):
         return self.unet(entered.unflatten(0, (-1, views))).flatten(0, 1)
 
 
-def _border_of(compat: Compat) -> Border:
+def _choose_border(compat: Compat) -> Border:
     return "sphere" if compat == "fixed" else "zeros"

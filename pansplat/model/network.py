@@ -126,8 +126,8 @@ class NetworkPredictor:
                 self.predict_with_depths(
                     images[n],
                     cam2world[n],
-                    _item(near, n),
-                    _item(far, n),
+                    _select_item(near, n),
+                    _select_item(far, n),
                     masks=None if masks is None else masks[n],
                     progress=progress,
                 )[0]
@@ -198,7 +198,7 @@ class NetworkPredictor:
         views = len(images)
         low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (near, far))
         tiles = self.tiles or choose_tiles(images.shape[-2])
-        _check(images, cam2world, low, high, masks, self.network.compat, tiles)
+        _check_inputs(images, cam2world, low, high, masks, self.network.compat, tiles)
         if progress is not None:
             progress("matching views", 0.0)
         weight = next(self.network.parameters())
@@ -234,12 +234,12 @@ def remove_masked_gaussians(
     return gaussians.select(kept)
 
 
-def _item(value: float | Tensor, n: int) -> float | Tensor:
+def _select_item(value: float | Tensor, n: int) -> float | Tensor:
     """A batch item's depth bound."""
     return value[n] if isinstance(value, Tensor) and value.ndim else value
 
 
-def _check(
+def _check_inputs(
     images: Tensor, cam2world: Tensor, near: Tensor, far: Tensor, masks: Tensor | None, compat: Compat, tiles: int
 ) -> None:
     shape = tuple(images.shape)

@@ -30,7 +30,7 @@ _MIN_COS_LATITUDE = 0.01  # limits the width of a pixel in longitude at the pole
 
 @functools.lru_cache(maxsize=16)
 @torch.inference_mode(False)  # the cached tensor must also serve calls with gradients
-def lattice_uv(lattice: Lattice, height: int, *, exact: bool = True) -> Float[Tensor, "n 2"]:
+def make_lattice_uv(lattice: Lattice, height: int, *, exact: bool = True) -> Float[Tensor, "n 2"]:
     """Normalised panorama coordinates of a level's lattice points, float64; do not change the cached result in place.
 
     A Fibonacci lattice covers the sphere evenly, from the bottom pole up. The pixel lattice is in row-major order.
@@ -120,7 +120,7 @@ class Margins:
         return Margins(output + layers, output)
 
 
-def tile_grid(grid: int) -> list[Tile]:
+def make_tiles(grid: int) -> list[Tile]:
     """All tiles of a grid, in row-major order."""
     return [Tile(row, column, grid) for row in range(grid) for column in range(grid)]
 

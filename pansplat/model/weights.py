@@ -50,6 +50,10 @@ _AUXILIARY_PREFIX = "losses.2.gaussian_head."
 _MAX_NAMES = 4  # in an error
 
 
+class UnsafeCheckpointError(InputError):
+    """A checkpoint contains code, which was not executed."""
+
+
 @dataclass(frozen=True)
 class WeightsFile:
     """Content of a weights file.
@@ -107,7 +111,7 @@ def load_weights(path: str | Path) -> WeightsFile:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # not a dict
     except (safetensors.SafetensorError, OSError, ValueError) as error:
-        raise InputError(f"{path}: needed a whole .safetensors file, got '{error}'; {_guess(path)}") from error
+        raise InputError(f"{path}: needed a whole .safetensors file, got '{error}'; {_suggest_remedy(path)}") from error
     if not {"pansplat_format", "model", "config", "compat"} <= metadata.keys():
         raise InputError(
             f"{path}: needed weights that `pansplat convert` or `pansplat-train` wrote, got a .safetensors file "
@@ -128,10 +132,11 @@ def load_weights(path: str | Path) -> WeightsFile:
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Read the tensors and plain values of a PyTorch (Lightning) checkpoint, without running code in it.
+    """Read the tensors and plain values of a PyTorch (Lightning) checkpoint, without executing code in it.
 
     Raises:
-        InputError: the file is missing, damaged, no checkpoint, or contains code to run.
+        UnsafeCheckpointError: the file contains code.
+        InputError: the file is missing, damaged, or not a checkpoint.
     """
     path = Path(path)
     _require_file(path)
@@ -142,22 +147,26 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     except pickle.UnpicklingError as error:
         code = re.search(r"(?:GLOBAL|global|class|function) ([\w.]+\.[\w.]+)", str(error))
         if code is None:
-            raise InputError(f"{path}: needed a PyTorch checkpoint, got other contents; {_guess(path)}") from error
-        raise InputError(
-            f"{path}: needed a checkpoint of tensors and plain values, got one that asks to run {code[1]}; nothing "
-            "was run. If you trust where it comes from, keep only its `state_dict`: "
+            raise InputError(
+                f"{path}: needed a PyTorch checkpoint, got other contents; {_suggest_remedy(path)}"
+            ) from error
+        raise UnsafeCheckpointError(
+            f"{path}: needed a checkpoint of tensors and plain values, got one that calls {code[1]}; the call was not "
+            "executed. If you trust the source of the file, keep only its `state_dict`: "
             "torch.save({'state_dict': torch.load(PATH, weights_only=False)['state_dict']}, NEW_PATH)"
         ) from error
     except MemoryError:
         raise
     except Exception as error:  # damaged bytes raise many kinds of error in the zip and pickle readers
-        raise InputError(f"{path}: needed a whole PyTorch checkpoint, got a damaged one; {_guess(path)}") from error
+        raise InputError(
+            f"{path}: needed a whole PyTorch checkpoint, got a damaged one; {_suggest_remedy(path)}"
+        ) from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: needed a checkpoint with a `state_dict`, got a {type(content).__name__}")
     return content
 
 
-def state_dict_of(content: Mapping[str, Any], path: str | Path) -> dict[str, Tensor]:
+def get_state_dict(content: Mapping[str, Any], path: str | Path) -> dict[str, Tensor]:
     """The `state_dict` of a Lightning checkpoint's content.
 
     Raises:
@@ -211,7 +220,7 @@ def _require_file(path: Path) -> None:
         raise InputError(f"{path}: needed a file of weights, got an empty file; download or copy it again")
 
 
-def _guess(path: Path) -> str:
+def _suggest_remedy(path: Path) -> str:
     """Advice for an unreadable file, from its first bytes."""
     with open(path, "rb") as file:
         start = file.read(64).lstrip().lower()
@@ -230,27 +239,27 @@ class ConversionReport:
         model: the network they belong to.
         used: official names to ours.
         unused: names that are left out, by reason.
-        surplus: unknown names.
+        unexpected: unknown names.
         missing: official names that the checkpoint lacks.
     """
 
     model: ModelName
     used: dict[str, str]
     unused: dict[str, list[str]]
-    surplus: list[str]
+    unexpected: list[str]
     missing: list[str]
 
     def require_complete(self, source: object) -> None:
-        """Check that nothing is missing or surplus.
+        """Check that nothing is missing or unexpected.
 
         Raises:
             InputError: lists the first names and their number.
         """
         problems = []
         if self.missing:
-            problems.append(f"lacked {_some(self.missing)}")
-        if self.surplus:
-            problems.append(f"found unknown {_some(self.surplus)}")
+            problems.append(f"lacked {_join_names(self.missing)}")
+        if self.unexpected:
+            problems.append(f"found unknown {_join_names(self.unexpected)}")
         if problems:
             raise InputError(
                 f"{source}: needed exactly the tensors of the official {self.model}, {' and '.join(problems)}; "
@@ -270,10 +279,10 @@ def convert_tensors(content: Mapping[str, object], source: object) -> dict[str, 
     """
     report = match_tensors(content, source)
     report.require_complete(source)
-    state = state_dict_of(content, str(source))
+    state = get_state_dict(content, str(source))
     _require_official_grids(state, source)
     tensors = {}
-    for name, ours in official_names(report.model).items():
+    for name, ours in map_official_names(report.model).items():
         tensor = state[_PREFIX + name]
         tensor = tensor.squeeze(-1) if tensor.ndim == 3 else tensor  # 1-D convolutions are linear layers here
         if tensor.is_floating_point():
@@ -290,11 +299,11 @@ def match_tensors(content: Mapping[str, object], source: object) -> ConversionRe
     Raises:
         InputError: the tensors belong to neither network.
     """
-    state = state_dict_of(content, str(source))
-    model = _model_of(state, source)
-    expected = {_PREFIX + name: ours for name, ours in official_names(model).items()}
-    grids = {_PREFIX + name for name in _grid_heights(model)}
-    auxiliary = {_AUXILIARY_PREFIX + name for name in _auxiliary_names()}
+    state = get_state_dict(content, str(source))
+    model = _detect_model(state, source)
+    expected = {_PREFIX + name: ours for name, ours in map_official_names(model).items()}
+    grids = {_PREFIX + name for name in _list_grid_heights(model)}
+    auxiliary = {_AUXILIARY_PREFIX + name for name in _list_auxiliary_names()}
     unused = {
         "recomputed grids": sorted(grids & state.keys()),
         "auxiliary heads, for training only": sorted(auxiliary & state.keys()),
@@ -304,12 +313,12 @@ def match_tensors(content: Mapping[str, object], source: object) -> ConversionRe
         model=model,
         used={name: ours for name, ours in expected.items() if name in state},
         unused={reason: names for reason, names in unused.items() if names},
-        surplus=[name for name in state if name not in expected.keys() | grids | auxiliary],
+        unexpected=[name for name in state if name not in expected.keys() | grids | auxiliary],
         missing=[name for name in (*expected, *sorted(grids)) if name not in state],
     )
 
 
-def official_names(model: ModelName) -> dict[str, str]:
+def map_official_names(model: ModelName) -> dict[str, str]:
     """Our name of each official tensor that is used; official names are without the prefix "encoder.".
 
     The official code counts stages from coarse to fine; our levels are the paper's, where 0 is the finest.
@@ -330,29 +339,29 @@ def require_shapes(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor]
         InputError: lists the first names and their number.
     """
     missing = [name for name in expected if name not in tensors]
-    surplus = [name for name in tensors if name not in expected]
+    unexpected = [name for name in tensors if name not in expected]
     wrong = [
         f"{name} {tuple(tensors[name].shape)} instead of {tuple(tensor.shape)}"
         for name, tensor in expected.items()
         if name in tensors and tensors[name].shape != tensor.shape
     ]
     problems = [
-        f"{what} {_some(names)}"
-        for what, names in (("lacked", missing), ("found unknown", surplus), ("got", wrong))
+        f"{what} {_join_names(names)}"
+        for what, names in (("lacked", missing), ("found unknown", unexpected), ("got", wrong))
         if names
     ]
     if problems:
         raise InputError(f"{source}: its tensors do not fit the network: {'; '.join(problems)}; take another file")
 
 
-def _grid_heights(model: ModelName) -> dict[str, int]:
+def _list_grid_heights(model: ModelName) -> dict[str, int]:
     """Names of the stored lookup grids, which are computed here, and the heights of their panoramas."""
     if model == "mvsplat":
         return {}
     return {f"mono_depth.c2e.{scale}.sample_grid": 512 >> scale for scale in (5, 4, 3, 2, 1)}
 
 
-def _auxiliary_names() -> Iterator[str]:
+def _list_auxiliary_names() -> Iterator[str]:
     for stage in range(3):
         for layer in (f"to_gaussians_list.{stage}.0", f"to_gaussians_list.{stage}.2", f"gaussians_mlp_list.{stage}.0"):
             yield f"{layer}.weight"
@@ -361,7 +370,7 @@ def _auxiliary_names() -> Iterator[str]:
 
 def _require_official_grids(state: Mapping[str, Tensor], source: object) -> None:
     """Check that stored lookup grids equal the computed ones."""
-    for name, height in _grid_heights("pansplat").items():
+    for name, height in _list_grid_heights("pansplat").items():
         if _PREFIX + name not in state:
             continue
         stored = state[_PREFIX + name]
@@ -371,18 +380,18 @@ def _require_official_grids(state: Mapping[str, Tensor], source: object) -> None
             raise InputError(f"{source}: needed the official grid in {name}, got another; the model was modified")
 
 
-def _model_of(state: Mapping[str, Tensor], source: object) -> ModelName:
+def _detect_model(state: Mapping[str, Tensor], source: object) -> ModelName:
     if any(name.startswith("encoder.gaussian_head.") for name in state):
         return "pansplat"
     if any(name.startswith("encoder.backbone.backbone.") for name in state):
         return "mvsplat"
     raise InputError(
         f"{source}: needed a checkpoint of the official PanSplat or its MVSplat baseline, got tensors "
-        f"{_some(list(state)) if state else 'none'}"
+        f"{_join_names(list(state)) if state else 'none'}"
     )
 
 
-def _some(names: Sequence[str]) -> str:
+def _join_names(names: Sequence[str]) -> str:
     return f"{len(names)} ({', '.join(names[:_MAX_NAMES])}{', ...' if len(names) > _MAX_NAMES else ''})"
 
 

@@ -17,7 +17,7 @@ import torch
 
 from pansplat.atomic import replacing
 from pansplat.errors import InputError
-from pansplat.model.weights import COMPATS, WeightsFile, read_checkpoint
+from pansplat.model.weights import COMPATS, UnsafeCheckpointError, WeightsFile, read_checkpoint
 
 _KIND, _FORMAT = "pansplat-training", 1
 _NAME = re.compile(r"step_(\d{8})\.pt")
@@ -59,7 +59,8 @@ def load_latest(folder: Path) -> tuple[Path, dict[str, Any]] | None:
     Deletes incomplete files. Skips damaged checkpoints with a warning.
 
     Raises:
-        InputError: no checkpoint is readable, or one contains code.
+        UnsafeCheckpointError: a checkpoint contains code.
+        InputError: no checkpoint is readable.
     """
     if folder.is_dir():
         for partial in folder.glob(".step_*.pt"):
@@ -69,9 +70,9 @@ def load_latest(folder: Path) -> tuple[Path, dict[str, Any]] | None:
     for path in reversed(found):
         try:
             return path, load_checkpoint(path)
+        except UnsafeCheckpointError:
+            raise
         except InputError as error:
-            if "asks to run" in str(error):
-                raise
             failures.append(str(error))
             warnings.warn(f"skipped a checkpoint: {error}", stacklevel=2)
     if failures:

@@ -98,7 +98,7 @@ def test_code_in_a_checkpoint_is_not_executed(tmp_path: Path, refusal) -> None:
             return os.mkdir, (str(mark),)
 
     torch.save({"state_dict": {}, "callbacks": Poison()}, tmp_path / "poisoned.ckpt")
-    assert "nothing was run" in refusal("convert", tmp_path / "poisoned.ckpt", "-o", tmp_path / "m.safetensors")
+    assert "was not executed" in refusal("convert", tmp_path / "poisoned.ckpt", "-o", tmp_path / "m.safetensors")
     assert not mark.exists() and not (tmp_path / "m.safetensors").exists()
 
 

@@ -75,7 +75,7 @@ def test_too_little_memory_is_one_line(predict, fail, tmp_path: Path, capsys, er
     fail(error)
     assert predict() == 2
     message = capsys.readouterr().err
-    assert "error: this takes more memory" in message and len(message.splitlines()) == 1
+    assert "error: out of memory" in message and len(message.splitlines()) == 1
     assert not list(tmp_path.glob("*.ply"))
 
 

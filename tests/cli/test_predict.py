@@ -24,6 +24,8 @@ def test_predict_writes_the_scene(scene: Path) -> None:
         (["--near", "9", "--far", "3"], "0 < near < far"),
         (["--convention", "sideways"], "needed a known pose convention"),
         (["--precision", "bfloat16"], "`precision` is for networks, and sphere is not one"),
+        (["--degree", "5"], "--degree must be 0 to 4, got 5"),
+        (["--min-opacity", "1"], "--min-opacity must be at least 0 and less than 1"),
     ],
 )
 def test_invalid_arguments_are_refused_before_the_prediction(

@@ -10,11 +10,8 @@ import torch
 from torch import Tensor
 
 from pansplat.gaussians.scene import Gaussians
-from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
-from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
-from pansplat.model.heads import AdapterConfig, HeadsConfig
 from pansplat.model.network import NetworkPredictor, build_network, convert_checkpoint
-from pansplat.model.pansplat import PanSplat, PanSplatConfig
+from pansplat.model.pansplat import PanSplat
 from pansplat.model.weights import WeightsFile
 
 _HOOKED = (
@@ -71,18 +68,6 @@ def run_official(official_weights: WeightsFile, golden: Callable[..., dict[str, 
 def error() -> Callable[[Tensor, Tensor], float]:
     """Largest difference from a golden tensor, in its standard deviations."""
     return lambda found, expected: float((found - expected).abs().max() / expected.std())
-
-
-@pytest.fixture(scope="session")
-def small_config() -> PanSplatConfig:
-    """A narrow PanSplat without the monocular network."""
-    return PanSplatConfig(
-        features=FeaturePyramidConfig(channels=(4, 8, 8, 16), transformer=TransformerConfig(channels=16, blocks=2)),
-        cost_volume=CostVolumeConfig(
-            mono_channels=0, levels=(SweepLevel(3, 16, 8, 32), SweepLevel(2, 8, 4, 32), SweepLevel(1, 8, 4, 32))
-        ),
-        heads=HeadsConfig(feature_channels=(16, 8, 8, 4), candidates=4, adapter=AdapterConfig(degree=1)),
-    )
 
 
 @pytest.fixture(scope="session")

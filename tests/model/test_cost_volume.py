@@ -19,9 +19,9 @@ from pansplat.model.cost_volume import (
     SweepLevel,
     UNet,
     UNetConfig,
-    candidates_around,
     correlate_views,
-    first_candidates,
+    make_candidates_around,
+    make_first_candidates,
     regress_depth,
 )
 
@@ -68,14 +68,14 @@ def test_depths_match_the_official_code(run_official, golden, error):
 
 
 def test_the_first_candidates_run_evenly_from_far_to_near():
-    candidates = first_candidates(_BOUNDS, 5, (2, 4))
+    candidates = make_first_candidates(_BOUNDS, 5, (2, 4))
     assert candidates.shape == (1, 2, 5, 2, 4)
     assert torch.allclose(candidates[0, 1, :, 1, 3], torch.tensor((0.1, 0.575, 1.05, 1.525, 2.0)).double())
 
 
 def test_later_candidates_lie_about_the_centre_within_the_bounds():
     centre = torch.tensor((0.2, 1.0)).double().expand(1, 2, 3, 2)
-    candidates = candidates_around(centre, torch.full((1, 2), 0.1).double(), _BOUNDS, 4)
+    candidates = make_candidates_around(centre, torch.full((1, 2), 0.1).double(), _BOUNDS, 4)
     assert torch.allclose(candidates[0, 0, :, 0, 0], torch.tensor((0.1, 0.1, 0.2, 0.3)).double())
     assert torch.allclose(candidates[0, 0, :, 0, 1], torch.tensor((0.8, 0.9, 1.0, 1.1)).double())
 
@@ -89,7 +89,7 @@ def test_the_spacing_halves_from_level_to_level(small):
 
 
 def test_a_certain_candidate_is_the_result():
-    candidates = first_candidates(_BOUNDS, 5, (2, 4))
+    candidates = make_first_candidates(_BOUNDS, 5, (2, 4))
     logits = torch.full((1, 2, 5, 2, 4), -1e4).double()
     logits[:, :, 3] = 1e4
     level = regress_depth(1, logits, candidates)
@@ -103,7 +103,7 @@ def test_a_certain_candidate_is_the_result():
 
 def test_each_view_is_correlated_with_the_mean_of_the_others():
     (features, *_), poses, near, far, _ = _inputs(views=3)
-    candidates = first_candidates((1 / far, 1 / near), 4, (8, 16))
+    candidates = make_first_candidates((1 / far, 1 / near), 4, (8, 16))
     result = correlate_views(features, candidates, poses, "fixed")
     for view in range(3):
         others = []
@@ -116,7 +116,7 @@ def test_each_view_is_correlated_with_the_mean_of_the_others():
 
 def test_a_repeated_view_changes_nothing():
     (features, *_), poses, near, far, _ = _inputs()
-    candidates = first_candidates((1 / far, 1 / near), 4, (8, 16))
+    candidates = make_first_candidates((1 / far, 1 / near), 4, (8, 16))
     twice = torch.cat((features, features[:, 1:]), dim=1), torch.cat((poses, poses[:, 1:]), dim=1)
     result = correlate_views(twice[0], torch.cat((candidates, candidates[:, 1:]), dim=1), twice[1], "fixed")
     assert torch.allclose(result[:, 0], correlate_views(features, candidates, poses, "fixed")[:, 0], atol=1e-12)
@@ -253,7 +253,7 @@ def _bounds(near=0.5, far=10.0):
 
 
 def _candidates(near, far, count=6, size=(H, W)):
-    return first_candidates((1 / far, 1 / near), count, size)
+    return make_first_candidates((1 / far, 1 / near), count, size)
 
 
 @pytest.fixture(scope="module")

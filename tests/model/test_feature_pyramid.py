@@ -11,9 +11,9 @@ from pansplat.model.feature_pyramid import (
     FeaturePyramidConfig,
     Transformer,
     TransformerConfig,
+    encode_positions,
+    make_shift_mask,
     merge_windows,
-    position_encoding,
-    shift_mask,
     split_windows,
 )
 
@@ -107,16 +107,16 @@ def transformer(randomize):
 
 @pytest.mark.shared
 def test_position_encoding_matches_the_official_code(golden):
-    assert (position_encoding(4, 8, 128) - golden("units")["posenc.4x8"][0]).abs().max() < 1e-6
+    assert (encode_positions(4, 8, 128) - golden("units")["posenc.4x8"][0]).abs().max() < 1e-6
 
 
 @pytest.mark.shared
 def test_official_shift_mask_matches_the_official_code(golden):
-    assert torch.equal(shift_mask(8, 16, 2, "official"), golden("units")["shiftmask.8x16"])
+    assert torch.equal(make_shift_mask(8, 16, 2, "official"), golden("units")["shiftmask.8x16"])
 
 
 def test_fixed_shift_mask_wraps_at_the_seam_but_not_at_the_poles():
-    mask = shift_mask(8, 16, 2, "fixed")
+    mask = make_shift_mask(8, 16, 2, "fixed")
     assert not mask[:2].any()  # all tokens of the upper windows are neighbours
     rows = torch.arange(4).repeat_interleave(8)  # of a lower window's tokens; half of them wrapped around
     apart = (rows[:, None] < 2) != (rows[None] < 2)
@@ -153,7 +153,7 @@ def test_blocks_without_output_add_only_the_position_encoding(transformer):
         for name, parameter in network.named_parameters():
             if "norm" in name:
                 parameter.zero_()
-    encoding = position_encoding(2, 4, 16).double().repeat(1, 2, 2)
+    encoding = encode_positions(2, 4, 16).double().repeat(1, 2, 2)
     assert torch.allclose(network(maps), maps + encoding, atol=1e-6)
 
 

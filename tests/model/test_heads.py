@@ -21,9 +21,9 @@ from pansplat.model.heads import (
     HeadsConfig,
     MatchedViews,
     adapt_gaussians,
-    untiled_index,
+    compute_untiled_index,
 )
-from pansplat.model.tiles import tile_grid
+from pansplat.model.tiles import make_tiles
 
 SMALL = HeadsConfig(feature_channels=(6, 5, 4, 3), candidates=4, adapter=AdapterConfig(degree=1))
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
@@ -136,7 +136,7 @@ def test_a_tile_computed_alone_has_the_same_gaussians_and_gradients():
 
 def test_tiles_hold_every_gaussian_once():
     points = _heads().points(64)
-    index = torch.cat([untiled_index(tile, points, views=3) for tile in tile_grid(4)])
+    index = torch.cat([compute_untiled_index(tile, points, views=3) for tile in make_tiles(4)])
     assert torch.equal(index.sort().values, torch.arange(3 * sum(lattice_size(128 >> level) for level in range(4))))
 
 

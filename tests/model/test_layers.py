@@ -12,7 +12,7 @@ from pansplat.model.layers import (
     PanoramaConv2d,
     attend,
     autocast_convolutions,
-    border_of,
+    choose_border,
     convolve_and_normalize,
     require_rigid,
     require_size,
@@ -49,7 +49,7 @@ def test_the_zeros_border_is_an_ordinary_convolution():
 @pytest.mark.parametrize("kernel", [1, 3, 7])
 @pytest.mark.parametrize("compat", ["official", "fixed"])
 def test_rolling_a_panorama_rolls_its_convolution(compat, kernel, stride, columns):
-    conv = PanoramaConv2d(2, 3, kernel, stride=stride, border=border_of(compat)).double()
+    conv = PanoramaConv2d(2, 3, kernel, stride=stride, border=choose_border(compat)).double()
     maps = _noise(1, 2, 8, 16)
     assert torch.allclose(conv(maps.roll(columns, -1)), conv(maps).roll(columns // stride, -1), atol=1e-14)
     assert conv(maps).shape[-2:] == (8 // stride, 16 // stride)

@@ -11,7 +11,7 @@ from pansplat.errors import InputError
 from pansplat.gaussians.harmonics import rotate_harmonics
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.model.feature_pyramid import TransformerConfig
-from pansplat.model.heads import AdapterConfig, world_harmonics_rotation
+from pansplat.model.heads import AdapterConfig, compute_harmonics_rotation
 from pansplat.model.mvsplat import MVSplat, MVSplatConfig, MVSplatOutput
 from pansplat.model.network import NetworkPredictor
 from pansplat.model.weights import convert_tensors
@@ -71,7 +71,7 @@ def test_features_and_depth_match_the_official_code(run: OfficialRun, expected: 
 def test_gaussians_match_the_official_code(run: OfficialRun, expected: dict[str, Tensor], error) -> None:
     gaussians = run.output.gaussians[0]
     # The fixture's harmonics are in the axes of docs/official.md, section 10.3.
-    to_world = world_harmonics_rotation(torch.eye(3, dtype=torch.float64), "official")
+    to_world = compute_harmonics_rotation(torch.eye(3, dtype=torch.float64), "official")
     for view in range(2):
         part = gaussians.select(gaussians.views == view)
         for name in ("means", "covariances", "opacities", "scales"):

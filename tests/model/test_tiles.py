@@ -14,11 +14,11 @@ from pansplat.model.tiles import (
     Tile,
     Window,
     crop_window,
-    lattice_uv,
+    make_lattice_uv,
+    make_tiles,
     move_points,
     sample_panorama,
     sample_window,
-    tile_grid,
 )
 
 
@@ -30,15 +30,15 @@ def _random(*shape: int) -> torch.Tensor:
 @pytest.mark.parametrize("grid", [1, 2, 4])
 def test_each_point_belongs_to_exactly_one_tile(lattice, grid):
     for exact in (True, False):
-        uv = lattice_uv(lattice, 64, exact=exact)
-        held = torch.stack([tile.contains(uv) for tile in tile_grid(grid)])
+        uv = make_lattice_uv(lattice, 64, exact=exact)
+        held = torch.stack([tile.contains(uv) for tile in make_tiles(grid)])
         assert bool((held.sum(dim=0) == 1).all())
         assert int(held.sum(dim=1).min()) > 0
 
 
 def test_points_lie_inside_their_tiles_window():
-    uv = lattice_uv("fibonacci", 64)
-    for tile in tile_grid(4):
+    uv = make_lattice_uv("fibonacci", 64)
+    for tile in make_tiles(4):
         window = tile.window(64)
         pixel = uv[tile.contains(uv)] * torch.tensor((128, 64))
         assert bool((pixel[:, 0] >= window.left).all() and (pixel[:, 0] <= window.left + window.width).all())
@@ -49,7 +49,7 @@ def test_points_lie_inside_their_tiles_window():
 def test_a_fixed_window_is_a_crop_of_the_resized_and_padded_map(height):
     source = _random(3, 32, 64)
     whole = pad_equirect(resize(source[None], (height, 2 * height), "fixed")[0], 7)
-    for tile in tile_grid(2):
+    for tile in make_tiles(2):
         window = tile.window(height).expand(7)
         expected = whole[:, window.top + 7 :, window.left + 7 :][:, : window.height, : window.width]
         assert torch.allclose(crop_window(source, height, window, "fixed"), expected, atol=1e-14)
@@ -60,7 +60,7 @@ def test_an_official_window_wraps_columns_and_has_zero_rows(height):
     source = _random(3, 32, 64)
     resized = functional.interpolate(source[None], (height, 2 * height), mode="bilinear", align_corners=False)[0]
     whole = functional.pad(torch.cat((resized[..., -3:], resized, resized[..., :3]), dim=-1), (0, 0, 3, 3))
-    for tile in tile_grid(2):
+    for tile in make_tiles(2):
         window = tile.window(height).expand(3)
         expected = whole[:, window.top + 3 :, window.left + 3 :][:, : window.height, : window.width]
         assert torch.allclose(crop_window(source, height, window, "official"), expected, atol=1e-14)
@@ -68,12 +68,12 @@ def test_an_official_window_wraps_columns_and_has_zero_rows(height):
 
 def test_samples_at_pixel_centres_are_the_pixels():
     source = _random(5, 8, 16)
-    samples = sample_window(source, Window(0, 0, 8, 16), 8, lattice_uv("pixel", 8))
+    samples = sample_window(source, Window(0, 0, 8, 16), 8, make_lattice_uv("pixel", 8))
     assert torch.allclose(samples, source.flatten(1).T, atol=1e-14)
 
 
 def test_samples_of_a_whole_map_wrap_or_repeat_the_border():
-    source, uv = _random(5, 8, 16), lattice_uv("fibonacci", 32)
+    source, uv = _random(5, 8, 16), make_lattice_uv("fibonacci", 32)
     assert torch.allclose(sample_panorama(source, uv, "fixed"), sample_equirect(source, uv).T, atol=1e-14)
     grid = (2 * uv - 1)[None, None]
     border = functional.grid_sample(source[None], grid, padding_mode="border", align_corners=False)[0, :, 0].T
@@ -81,7 +81,7 @@ def test_samples_of_a_whole_map_wrap_or_repeat_the_border():
 
 
 def test_crop_and_sample_are_differentiable():
-    uv = lattice_uv("fibonacci", 8)[:20]
+    uv = make_lattice_uv("fibonacci", 8)[:20]
     window = Window(-2, -3, 20, 38)
 
     def crop_and_sample(source: torch.Tensor) -> torch.Tensor:
@@ -101,37 +101,37 @@ def test_margins_let_the_next_level_be_read_with_the_same_margin():
 
 
 def test_a_tile_grid_is_in_row_major_order():
-    assert tile_grid(2) == [Tile(0, 0, 2), Tile(0, 1, 2), Tile(1, 0, 2), Tile(1, 1, 2)]
+    assert make_tiles(2) == [Tile(0, 0, 2), Tile(0, 1, 2), Tile(1, 0, 2), Tile(1, 1, 2)]
     assert Tile(1, 0, 2).window(8) == Window(4, 0, 4, 8)
     assert Window(4, 0, 4, 8).expand(2) == Window(2, -2, 8, 12)
 
 
 def test_fibonacci_points_are_those_of_the_geometry():
-    uv = lattice_uv("fibonacci", 32)
+    uv = make_lattice_uv("fibonacci", 32)
     assert len(uv) == lattice_size(64)
     assert torch.allclose(directions_from_uv(uv), fibonacci_directions(len(uv)), atol=1e-14)
 
 
 def test_pixel_lattice_has_the_pixel_centres_in_row_major_order():
-    uv = lattice_uv("pixel", 4)
+    uv = make_lattice_uv("pixel", 4)
     assert uv.shape == (32, 2)
     assert uv[0].tolist() == [0.5 / 8, 0.5 / 4] and uv[9].tolist() == [1.5 / 8, 1.5 / 4]
 
 
 def test_official_points_are_near_the_exact_ones():
-    exact, official = (lattice_uv("fibonacci", 64, exact=exact) for exact in (True, False))
+    exact, official = (make_lattice_uv("fibonacci", 64, exact=exact) for exact in (True, False))
     difference = (exact - official)[1:-1].abs() * torch.tensor((128, 64))
     assert 0 < float(difference[:, 1].max()) < 1e-3 and float(difference[:, 0].median()) < 0.05
 
 
 @pytest.mark.parametrize("lattice", ["fibonacci", "pixel"])
 def test_zero_offset_does_not_move_points(lattice):
-    uv = lattice_uv(lattice, 16)
+    uv = make_lattice_uv(lattice, 16)
     assert torch.equal(move_points(uv, torch.zeros_like(uv), lattice, 16), uv)
 
 
 def test_points_move_at_most_half_a_pixel_of_their_latitude():
-    uv = lattice_uv("fibonacci", 32)
+    uv = make_lattice_uv("fibonacci", 32)
     moved = move_points(uv, torch.full_like(uv, 50.0), "fibonacci", 32) - uv
     assert torch.allclose(moved[:, 1], torch.full_like(moved[:, 1], 0.5 / 32))
     arc = moved[:, 0] * 64 * torch.sin(uv[:, 1] * math.pi)
@@ -141,9 +141,9 @@ def test_points_move_at_most_half_a_pixel_of_their_latitude():
 
 
 def test_a_lattice_cached_in_inference_mode_serves_gradients():
-    lattice_uv.cache_clear()
+    make_lattice_uv.cache_clear()
     with torch.inference_mode():
-        lattice_uv("fibonacci", 8)
+        make_lattice_uv("fibonacci", 8)
     offsets = torch.zeros(lattice_size(16), 2, dtype=torch.float64, requires_grad=True)
-    (move_points(lattice_uv("fibonacci", 8), offsets, "fibonacci", 8) ** 2).sum().backward()
+    (move_points(make_lattice_uv("fibonacci", 8), offsets, "fibonacci", 8) ** 2).sum().backward()
     assert offsets.grad is not None and bool(torch.isfinite(offsets.grad).all())

@@ -17,16 +17,17 @@ from pansplat.model.mvsplat import MVSplat
 from pansplat.model.pansplat import PanSplat
 from pansplat.model.weights import (
     ModelName,
+    UnsafeCheckpointError,
     WeightsFile,
     config_from_dict,
     convert_tensors,
+    get_state_dict,
     load_weights,
+    map_official_names,
     match_tensors,
-    official_names,
     read_checkpoint,
     require_shapes,
     save_weights,
-    state_dict_of,
 )
 
 Wrap = Callable[[dict[str, Tensor]], dict[str, Any]]
@@ -133,14 +134,14 @@ def test_a_checkpoint_is_read(tmp_path: Path, zipped: bool) -> None:
     path = tmp_path / "good.ckpt"
     tensor = torch.rand(5)
     torch.save({"state_dict": {"a": tensor}}, path, _use_new_zipfile_serialization=zipped)
-    assert torch.equal(state_dict_of(read_checkpoint(path), path)["a"], tensor)
+    assert torch.equal(get_state_dict(read_checkpoint(path), path)["a"], tensor)
 
 
 @pytest.mark.parametrize("zipped", [True, False])
 def test_a_poisoned_checkpoint_is_refused_and_not_run(tmp_path: Path, zipped: bool) -> None:
     mark, path = tmp_path / "was run", tmp_path / "poisoned.ckpt"
     torch.save({"state_dict": {}, "callback": Poison(mark)}, path, _use_new_zipfile_serialization=zipped)
-    with pytest.raises(InputError, match=r"asks to run (posix|nt)\.system; nothing was run"):
+    with pytest.raises(UnsafeCheckpointError, match=r"calls (posix|nt)\.system; the call was not executed"):
         read_checkpoint(path)
     assert not mark.exists()
     torch.load(path, weights_only=False)  # the command would run
@@ -200,9 +201,9 @@ def test_a_checkpoint_without_tensors_by_name_is_refused(tmp_path: Path) -> None
     with pytest.raises(InputError, match="needed a checkpoint with a `state_dict`, got a Tensor"):
         read_checkpoint(path)
     with pytest.raises(InputError, match="got one with model, epoch"):
-        state_dict_of({"model": {}, "epoch": 1}, path)
+        get_state_dict({"model": {}, "epoch": 1}, path)
     with pytest.raises(InputError, match="needed a `state_dict` of tensors, got others at b"):
-        state_dict_of({"state_dict": {"a": torch.rand(1), "b": 3}}, path)
+        get_state_dict({"state_dict": {"a": torch.rand(1), "b": 3}}, path)
 
 
 # Official names
@@ -220,7 +221,7 @@ def empty(shared: Path, keys: str) -> dict[str, Tensor]:
 @pytest.mark.parametrize(("model", "count", "grids"), [("pansplat", 993, 5), ("mvsplat", 471, 0)])
 def test_every_official_tensor_is_used_or_computed(model: ModelName, count: int, grids: int, shared: Path) -> None:
     theirs = {name.removeprefix("encoder.") for name in listed(shared, f"{model}-512")}
-    table = official_names(model)
+    table = map_official_names(model)
     assert len(theirs) == count and table.keys() <= theirs
     assert len(theirs - table.keys()) == grids
     assert all(name.endswith("sample_grid") for name in theirs - table.keys())
@@ -230,7 +231,7 @@ def test_every_official_tensor_is_used_or_computed(model: ModelName, count: int,
 def test_every_tensor_of_ours_has_one_official_name(model: ModelName) -> None:
     with torch.device("meta"):
         network = PanSplat() if model == "pansplat" else MVSplat()
-    names = list(official_names(model).values())
+    names = list(map_official_names(model).values())
     assert len(set(names)) == len(names)
     assert set(names) == network.state_dict().keys()
 
@@ -253,7 +254,7 @@ def test_the_report_counts_tensors_that_are_left_out(shared: Path, as_lightning:
     auxiliary = listed(shared, "pansplat-512-360loc_aux")
     content["state_dict"] |= {name: torch.zeros(1) for name in auxiliary}
     report = match_tensors(content, "360loc")
-    assert len(report.used) == 988 and not report.missing and not report.surplus
+    assert len(report.used) == 988 and not report.missing and not report.unexpected
     left = {reason: len(names) for reason, names in report.unused.items()}
     assert left == {"recomputed grids": 5, "auxiliary heads, for training only": 18, "training state": 5}
     report.require_complete("360loc")
