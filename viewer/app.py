@@ -29,10 +29,10 @@ class Options:
     pair: str | None = None
     """Name or number of the pair to show first if the path holds several; offscreen also "all"."""
     model: str = "sweep"
-    """Predictor for pairs: `sweep`, or a file of weights (.safetensors, or an original .ckpt)."""
+    """Predictor for pairs: `sweep`, or a file of weights (.safetensors, or an official .ckpt)."""
     compat: Literal["trained", "official", "fixed"] = "trained"
-    """For a network: compute what the original code computes (official), or with its defects fixed; by default as the
-    weights were trained."""
+    """For a network: `official` equals the official code, `fixed` corrects its defects, `trained` is the choice that
+    the weights were trained with."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """Type of a network's convolutions; bfloat16 is faster on CPUs that support it, and less accurate."""
     height: int = 512
@@ -75,8 +75,8 @@ class Options:
     @property
     def load_options(self) -> LoadOptions:
         """Options of reading and prediction."""
-        same = {name: getattr(self, name) for name in ("model", "compat", "precision", "height", "convention")}
-        return LoadOptions(**same, cache=not self.no_cache, near=self.near, far=self.far)
+        names = ("model", "compat", "precision", "height", "convention", "near", "far")
+        return LoadOptions(**{name: getattr(self, name) for name in names}, cache=not self.no_cache)
 
     @property
     def settings(self) -> DrawSettings:
@@ -91,12 +91,7 @@ def main(args: Sequence[str] | None = None) -> None:
 
 def run(args: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
-    options = tyro.cli(
-        Options,
-        args=args,
-        prog="pansplat-view",
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
+    options = tyro.cli(Options, args=args, prog="pansplat-view", config=(tyro.conf.FlagCreatePairsOff,))
     with warnings.catch_warnings():
         # Show warnings of pansplat to the user; hide those of libraries.
         warnings.simplefilter("ignore")
@@ -152,7 +147,7 @@ def _run(options: Options) -> int:
 
 
 def _run_window(options: Options, entries: list[SceneEntry], first: int, pixels: tuple[int, int]) -> str | None:
-    """Run the viewer in a window; returns the reason if no window can be opened."""
+    """Run the viewer in a window; if no window can be opened, returns the reason."""
     from pansplat_viewer.state import ViewerState
     from pansplat_viewer.viewer import Viewer
     from pansplat_viewer.window import NoWindowError, Window, run_viewer
@@ -196,19 +191,16 @@ def _write_flythrough(options: Options, entry: SceneEntry, folder: Path, pixels:
         )
         bars.update(load, description=f"{entry.name}: {len(loaded.scene.gaussians):,} Gaussians", completed=1.0)
         draw = bars.add_task("fly-through", total=1.0)
+
+        def show_progress(task: str, done: float) -> None:
+            bars.update(draw, description=f"fly-through: {task}", completed=done)
+
         settings = options.settings
         if len(loaded.scene.cam2world) < 2 and settings.mode in ("deferred", "difference"):
             settings = replace(settings, mode="joint")
         renderer = SplatRenderer(ctx, color_bits=32)
         try:
-            written = write_flythrough(
-                renderer,
-                loaded.scene,
-                folder,
-                film,
-                settings,
-                lambda task, done: bars.update(draw, description=f"fly-through: {task}", completed=done),
-            )
+            written = write_flythrough(renderer, loaded.scene, folder, film, settings, show_progress)
         finally:
             renderer.release()
             ctx.release()

@@ -39,83 +39,75 @@ class Camera:
     level: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     distance: float = 2.0
 
+    @property
+    def rotation(self) -> Float[np.ndarray, "3 3"]:
+        """The camera axes in the world (columns right, down, forward), without roll."""
+        cy, sy = math.cos(self.yaw_radians), math.sin(self.yaw_radians)
+        cp, sp = math.cos(self.pitch_radians), math.sin(self.pitch_radians)
+        yaw = np.array(((cy, 0, sy), (0, 1, 0), (-sy, 0, cy)))
+        pitch = np.array(((1, 0, 0), (0, cp, -sp), (0, sp, cp)))
+        return np.asarray(self.level) @ yaw @ pitch
 
-def rotation(camera: Camera) -> Float[np.ndarray, "3 3"]:
-    """Return the camera axes in the world (columns right, down, forward), without roll."""
-    cy, sy = math.cos(camera.yaw_radians), math.sin(camera.yaw_radians)
-    cp, sp = math.cos(camera.pitch_radians), math.sin(camera.pitch_radians)
-    yaw = np.array(((cy, 0, sy), (0, 1, 0), (-sy, 0, cy)))
-    pitch = np.array(((1, 0, 0), (0, cp, -sp), (0, sp, cp)))
-    return np.asarray(camera.level) @ yaw @ pitch
+    @property
+    def cam2world(self) -> Float[np.ndarray, "4 4"]:
+        """The camera's pose."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.rotation
+        matrix[:3, 3] = self.position
+        return matrix
+
+    @property
+    def orbit_center(self) -> Float[np.ndarray, "3"]:
+        """The orbit centre, metres."""
+        return np.asarray(self.position) + self.distance * self.rotation[:, 2]
 
 
-def pose(camera: Camera) -> Float[np.ndarray, "4 4"]:
-    """Return the camera's cam2world."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation(camera)
-    matrix[:3, 3] = camera.position
-    return matrix
-
-
-def place(camera: Camera, cam2world: Float[np.ndarray, "4 4"]) -> Camera:
+def move_to_pose(camera: Camera, cam2world: Float[np.ndarray, "4 4"]) -> Camera:
     """Move the camera to the position and viewing direction of a pose; the roll of the pose is dropped."""
     local = np.asarray(camera.level).T @ cam2world[:3, :3]
     right, forward = local[:, 0], local[:, 2]
-    pitch = math.asin(min(max(-float(forward[1]), -1.0), 1.0))
+    pitch = math.asin(_clamp(-float(forward[1]), 1.0))
     if math.hypot(forward[0], forward[2]) > 1e-6:
         yaw = math.atan2(forward[0], forward[2])
     else:  # straight up or down: the heading follows from the right axis
         yaw = math.atan2(-right[2], right[0])
-    return replace(
-        camera,
-        position=_triple(cam2world[:3, 3]),
-        yaw_radians=yaw,
-        pitch_radians=_clamp(pitch, MAX_PITCH_RADIANS),
-    )
+    pitch = _clamp(pitch, MAX_PITCH_RADIANS)
+    return replace(camera, position=_triple(cam2world[:3, 3]), yaw_radians=yaw, pitch_radians=pitch)
 
 
-def look(camera: Camera, yaw_radians: float, pitch_radians: float) -> Camera:
-    """Turn the camera in place, right by yaw and up by pitch; the pitch is limited before the poles."""
+def turn(camera: Camera, yaw_radians: float, pitch_radians: float) -> Camera:
+    """Turn the camera right by yaw and up by pitch; the pitch stays within MAX_PITCH_RADIANS."""
     yaw = math.remainder(camera.yaw_radians + yaw_radians, 2 * math.pi)
-    return replace(
-        camera,
-        yaw_radians=yaw,
-        pitch_radians=_clamp(camera.pitch_radians + pitch_radians, MAX_PITCH_RADIANS),
-    )
+    pitch = _clamp(camera.pitch_radians + pitch_radians, MAX_PITCH_RADIANS)
+    return replace(camera, yaw_radians=yaw, pitch_radians=pitch)
 
 
-def drag_look(camera: Camera, pixels: tuple[float, float], height: int) -> Camera:
-    """Turn so that the scene follows a pointer that moved by `pixels` (right, down) in a window of this height."""
-    radians_a_pixel = 2 * math.tan(math.radians(camera.vertical_fov_degrees) / 2) / max(height, 1)
-    return look(camera, -pixels[0] * radians_a_pixel, pixels[1] * radians_a_pixel)
+def turn_by_drag(camera: Camera, pixels: tuple[float, float], height: int) -> Camera:
+    """Turn so that the scene follows a pointer that moved by `pixels` (right, down); `height` is the window's."""
+    radians_per_pixel = 2 * math.tan(math.radians(camera.vertical_fov_degrees) / 2) / max(height, 1)
+    return turn(camera, -pixels[0] * radians_per_pixel, pixels[1] * radians_per_pixel)
 
 
 def fly(camera: Camera, right: float, up: float, forward: float) -> Camera:
     """Move by metres along the camera's right and forward axes and along the scene's up axis."""
-    axes = rotation(camera)
+    axes = camera.rotation
     step = right * axes[:, 0] + forward * axes[:, 2] - up * np.asarray(camera.level)[:, 1]
     return replace(camera, position=_triple(np.asarray(camera.position) + step))
 
 
-def orbit_center(camera: Camera) -> Float[np.ndarray, "3"]:
-    """Return the orbit centre, metres."""
-    return np.asarray(camera.position) + camera.distance * rotation(camera)[:, 2]
-
-
 def orbit(camera: Camera, pixels: tuple[float, float], height: int) -> Camera:
     """Turn around the orbit centre; a drag over the window's height is half a turn."""
-    radians_a_pixel = math.pi / max(height, 1)
-    center = orbit_center(camera)
-    turned = look(camera, pixels[0] * radians_a_pixel, -pixels[1] * radians_a_pixel)
-    return replace(turned, position=_triple(center - camera.distance * rotation(turned)[:, 2]))
+    radians_per_pixel = math.pi / max(height, 1)
+    center = camera.orbit_center
+    turned = turn(camera, pixels[0] * radians_per_pixel, -pixels[1] * radians_per_pixel)
+    return replace(turned, position=_triple(center - camera.distance * turned.rotation[:, 2]))
 
 
 def dolly(camera: Camera, steps: float) -> Camera:
     """Move towards (positive) or away from the orbit centre by 10% of the distance per step."""
-    center = orbit_center(camera)
+    center = camera.orbit_center
     distance = max(camera.distance * 0.9**steps, MIN_DISTANCE)
-    position = center - distance * rotation(camera)[:, 2]
-    return replace(camera, distance=distance, position=_triple(position))
+    return replace(camera, distance=distance, position=_triple(center - distance * camera.rotation[:, 2]))
 
 
 def zoom(camera: Camera, steps: float) -> Camera:
@@ -124,21 +116,18 @@ def zoom(camera: Camera, steps: float) -> Camera:
     return replace(camera, vertical_fov_degrees=fov)
 
 
-def focus(camera: Camera, point: Float[np.ndarray, "3"]) -> Camera:
+def focus_on_point(camera: Camera, point: Float[np.ndarray, "3"]) -> Camera:
     """Look at a point and make it the orbit centre; a point at the camera's position changes nothing."""
     offset = np.asarray(camera.level).T @ (np.asarray(point) - np.asarray(camera.position))
     distance = float(np.linalg.norm(offset))
     if distance < 1e-6:
         return camera
-    turned = replace(
-        camera,
-        yaw_radians=math.atan2(offset[0], offset[2]),
-        pitch_radians=_clamp(math.asin(min(max(-offset[1] / distance, -1.0), 1.0)), MAX_PITCH_RADIANS),
-    )
-    return replace(turned, distance=max(distance, MIN_DISTANCE))
+    yaw = math.atan2(offset[0], offset[2])
+    pitch = _clamp(math.asin(_clamp(-offset[1] / distance, 1.0)), MAX_PITCH_RADIANS)
+    return replace(camera, yaw_radians=yaw, pitch_radians=pitch, distance=max(distance, MIN_DISTANCE))
 
 
-def nearest_view(camera: Camera, cam2world: Float[np.ndarray, "view 4 4"]) -> int:
+def find_nearest_view(camera: Camera, cam2world: Float[np.ndarray, "view 4 4"]) -> int:
     """Return the index of the input camera nearest to the camera's position; the first on ties."""
     offsets = cam2world[:, :3, 3] - np.asarray(camera.position)
     return int(np.argmin(np.linalg.norm(offsets, axis=1)))

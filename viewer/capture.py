@@ -73,7 +73,7 @@ def flight_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
     state = ViewerState()
     enter_scene(state, scene)
     height = 1000
-    return cameras.pose(cameras.orbit(state.camera, (2 * height * fraction, 0.0), height))
+    return cameras.orbit(state.camera, (2 * height * fraction, 0.0), height).cam2world
 
 
 def panorama_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
@@ -96,11 +96,11 @@ def write_flythrough(
 
     Args:
         renderer: on any context; the scene is uploaded to it.
-        scene: what to show.
+        scene: the scene.
         folder: created if it does not exist.
         film: sizes and times.
-        settings: how to draw; field of view and layout are those of the film.
-        progress: called with what is rendered and the fraction done.
+        settings: draw settings; the film's field of view and layout replace theirs.
+        progress: called with the task and the fraction done.
 
     Raises:
         InputError: the folder cannot be written, or the scene is empty.
@@ -135,10 +135,7 @@ def write_flythrough(
 
 
 def _render(
-    renderer: SplatRenderer,
-    cam2world: Float[np.ndarray, "4 4"],
-    size: tuple[int, int],
-    settings: DrawSettings,
+    renderer: SplatRenderer, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings
 ) -> Float[np.ndarray, "height width 3"]:
     renderer.render(cam2world, size, settings, wait=True)
     return np.clip(renderer.read_color()[..., :3], 0.0, 1.0)

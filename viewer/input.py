@@ -16,7 +16,7 @@ FLY_SPEED = 1.0  # metres per second
 FAST, SLOW = 4.0, 0.2
 ORBIT_KEY_PIXELS = 400.0  # per second, of a window 1000 pixels high
 
-# The key help of the window and of docs/viewer.md, in the order of the window.
+# Rows of the key help in the window; docs/viewer.md has the same keys.
 HELP = (
     ("W A S D", "fly forward, left, back, right"),
     ("Q E", "fly down, up"),
@@ -63,7 +63,7 @@ class Input:
 
 @dataclass
 class Commands:
-    """Actions, given by keys or panels, that are not a change of the state.
+    """Actions by keys or panels that do not change the state.
 
     Attributes:
         png, exr, panorama: write a screenshot.
@@ -98,7 +98,7 @@ _KEYS = {
 
 
 def read_input(seconds: float) -> Input:
-    """Return this frame's input from imgui, without what a panel captures."""
+    """Return this frame's input from imgui, without the events that a panel captures."""
     from imgui_bundle import imgui
 
     io = imgui.get_io()
@@ -126,15 +126,15 @@ def read_input(seconds: float) -> Input:
     return Input(seconds, frozenset(held), frozenset(pressed), drag, pan, scroll, int(io.display_size.y))
 
 
-def apply_input(state: ViewerState, given: Input) -> Commands:
-    """Apply the input to the state; returns the commands in it."""
-    if "ctrl" in given.held:
-        state.quit = state.quit or "q" in given.pressed
+def apply_input(state: ViewerState, events: Input) -> Commands:
+    """Apply the input to the state, and return its commands."""
+    if "ctrl" in events.held:
+        state.quit = state.quit or "q" in events.pressed
         return Commands()
-    _apply_pressed(state, given.pressed)
-    _move_camera(state, given)
-    shift, screenshot = "shift" in given.held, "p" in given.pressed
-    return Commands(png=screenshot and not shift, exr=screenshot and shift, focus="f" in given.pressed)
+    _apply_pressed(state, events.pressed)
+    _move_camera(state, events)
+    shift, screenshot = "shift" in events.held, "p" in events.pressed
+    return Commands(png=screenshot and not shift, exr=screenshot and shift, focus="f" in events.pressed)
 
 
 def _apply_pressed(state: ViewerState, pressed: frozenset[str]) -> None:
@@ -143,14 +143,9 @@ def _apply_pressed(state: ViewerState, pressed: frozenset[str]) -> None:
             state.help = False
         else:
             state.quit = True
-    if "tab" in pressed:
-        state.overlay = not state.overlay
-    if "h" in pressed:
-        state.help = not state.help
-    if "c" in pressed:
-        state.photo = not state.photo
-    if "v" in pressed:
-        state.orbiting = not state.orbiting
+    for key, name in (("tab", "overlay"), ("h", "help"), ("c", "photo"), ("v", "orbiting")):
+        if key in pressed:
+            setattr(state, name, not getattr(state, name))
     if "space" in pressed:
         toggle_play(state)
     if "r" in pressed:
@@ -158,14 +153,13 @@ def _apply_pressed(state: ViewerState, pressed: frozenset[str]) -> None:
     for view in range(4):
         if str(view + 1) in pressed:
             jump_to_view(state, view)
-    if "," in pressed:
-        step_flight(state, -1)
-    if "." in pressed:
-        step_flight(state, 1)
+    for key, steps in ((",", -1), (".", 1)):
+        if key in pressed:
+            step_flight(state, steps)
 
 
-def _move_camera(state: ViewerState, given: Input) -> None:
-    held = given.held
+def _move_camera(state: ViewerState, events: Input) -> None:
+    held = events.held
     axes = np.array(
         (
             ("d" in held or "right" in held) - ("a" in held or "left" in held),
@@ -177,26 +171,26 @@ def _move_camera(state: ViewerState, given: Input) -> None:
     factor = (FAST if "shift" in held else 1.0) * (SLOW if "alt" in held else 1.0)
     camera = state.camera
     if state.orbiting:
-        pixels = ORBIT_KEY_PIXELS * given.seconds * factor * given.height / 1000
+        pixels = ORBIT_KEY_PIXELS * events.seconds * factor * events.height / 1000
         if axes[0] or axes[1]:
-            camera = cameras.orbit(camera, (-axes[0] * pixels, axes[1] * pixels), given.height)
+            camera = cameras.orbit(camera, (-axes[0] * pixels, axes[1] * pixels), events.height)
         if axes[2]:
-            camera = cameras.dolly(camera, axes[2] * 6 * given.seconds * factor)
-        if any(given.drag):
-            camera = cameras.orbit(camera, given.drag, given.height)
-        if given.scroll:
-            camera = cameras.dolly(camera, given.scroll)
+            camera = cameras.dolly(camera, axes[2] * 6 * events.seconds * factor)
+        if any(events.drag):
+            camera = cameras.orbit(camera, events.drag, events.height)
+        if events.scroll:
+            camera = cameras.dolly(camera, events.scroll)
     else:
-        step = axes * FLY_SPEED * state.speed * factor * given.seconds
+        step = axes * FLY_SPEED * state.speed * factor * events.seconds
         if axes.any():
             camera = cameras.fly(camera, *step)
-        if any(given.drag):
-            camera = cameras.drag_look(camera, given.drag, given.height)
-        if given.scroll:
-            camera = cameras.zoom(camera, given.scroll)
-    if any(given.pan):
-        metres = camera.distance / max(given.height, 1)
-        camera = cameras.fly(camera, -given.pan[0] * metres, given.pan[1] * metres, 0.0)
+        if any(events.drag):
+            camera = cameras.turn_by_drag(camera, events.drag, events.height)
+        if events.scroll:
+            camera = cameras.zoom(camera, events.scroll)
+    if any(events.pan):
+        metres = camera.distance / max(events.height, 1)
+        camera = cameras.fly(camera, -events.pan[0] * metres, events.pan[1] * metres, 0.0)
     if camera != state.camera:
         # Moving the camera stops the flight; a change of the field of view alone does not.
         moved = replace(camera, vertical_fov_degrees=state.camera.vertical_fov_degrees) != state.camera

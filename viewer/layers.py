@@ -44,14 +44,14 @@ class LayerStorage(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One image to draw: camera, size and settings, with everything that follows from them.
+    """One image to draw: camera, size and settings, and the values that follow from them.
 
     Attributes:
         rotation: camera to world.
         position: camera centre in the splats' moved frame.
         world_position: camera centre, metres.
         size: (width, height), pixels.
-        settings: how to draw.
+        settings: draw settings.
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -134,7 +134,7 @@ class Target:
     """A render target: a framebuffer with an RGBA colour texture and an optional float32 texture for depth.
 
     Attributes:
-        key: what the content depends on; None if there is no valid content.
+        key: identifies the values that the content depends on; None if there is no valid content.
         parts: the parts (cube faces; 0 if there is one part) whose content is valid.
     """
 
@@ -154,7 +154,7 @@ class Target:
         self.num_bytes = size[0] * size[1] * (color_bits // 2 + 4 * depth_components)
 
     def invalidate(self, key: Hashable) -> None:
-        """Mark the content as invalid; `key` describes what is drawn next."""
+        """Mark the content as invalid; `key` is that of the next content."""
         self.key = key
         self.parts.clear()
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 PHOTO_HEIGHT = 1024  # smallest height of the photographs for comparison, pixels
 
-Progress = Callable[[str, float], None]  # what is done, fraction done
+Progress = Callable[[str, float], None]  # task, fraction done
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +91,9 @@ def load_entry(entry: SceneEntry, options: LoadOptions, progress: Progress, *, p
     """Read or predict an entry's scene.
 
     Args:
-        entry: what to load.
+        entry: the entry.
         options: arguments of reading and prediction.
-        progress: called with what is being done and the fraction done.
+        progress: called with the task and the fraction done.
         photos: whether to read the input photographs.
     """
     from pansplat import pipeline
@@ -152,7 +152,7 @@ class SceneLoader:
 
     @property
     def progress(self) -> tuple[str, str, float] | None:
-        """Name of the entry, what is being done and the fraction done; None if nothing is loading."""
+        """Name of the entry, task and fraction done; None if nothing is loading."""
         job = self._job
         return (job.entry.name, job.task, job.fraction) if job else None
 

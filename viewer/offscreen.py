@@ -30,16 +30,15 @@ def create_context(backend: Literal["auto", "egl", "osmesa"] = "auto") -> modern
     Raises:
         InputError: OpenGL 3.3 is not available; the message has the reasons and the Debian packages.
     """
-    makers = {"egl": _create_egl, "osmesa": _create_osmesa}
-    if backend != "auto" and backend not in makers:
+    arguments = {"egl": lambda: {"backend": "egl"}, "osmesa": lambda: {"context": _OsMesa()}}
+    if backend != "auto" and backend not in arguments:
         raise InputError(f"`backend` must be auto, egl or osmesa, got {backend!r}")
     load_llvm_before_mesa()
     failures = []
-    for name in makers if backend == "auto" else (backend,):
+    for name in arguments if backend == "auto" else (backend,):
         try:
-            return makers[name]()
-        # The libraries raise OSError, ValueError, moderngl.Error or plain Exception.
-        except Exception as error:
+            return moderngl.create_context(require=330, standalone=True, **arguments[name]())
+        except Exception as error:  # the libraries raise OSError, ValueError, moderngl.Error or plain Exception
             failures.append(f"{name}: {error}")
     raise InputError(
         "drawing needs OpenGL 3.3, and none could be started "
@@ -51,19 +50,11 @@ def create_context(backend: Literal["auto", "egl", "osmesa"] = "auto") -> modern
 def load_llvm_before_mesa() -> None:
     """Import Triton if it is installed; call this before the first OpenGL context is created.
 
-    Torch imports Triton at some point, and Mesa's software drivers link to another LLVM. If Mesa's LLVM is loaded
-    first, loading Triton's ends the process with a segmentation fault.
+    Torch may import Triton later. Triton and Mesa's software drivers contain different versions of LLVM. If Mesa's is
+    loaded first, loading Triton's ends the process with a segmentation fault.
     """
     with contextlib.suppress(ImportError):
         import triton  # noqa: F401
-
-
-def _create_egl() -> moderngl.Context:
-    return moderngl.create_context(require=330, standalone=True, backend="egl")
-
-
-def _create_osmesa() -> moderngl.Context:
-    return moderngl.create_context(require=330, standalone=True, context=_OsMesa())
 
 
 class _OsMesa:
@@ -72,13 +63,8 @@ class _OsMesa:
     def __init__(self) -> None:
         library = _load_osmesa()
         attributes = (
-            *(_OSMESA_FORMAT, _GL_RGBA),
-            *(_OSMESA_DEPTH_BITS, 24),
-            *(_OSMESA_STENCIL_BITS, 8),
-            *(_OSMESA_PROFILE, _OSMESA_CORE_PROFILE),
-            *(_OSMESA_CONTEXT_MAJOR, 3),
-            *(_OSMESA_CONTEXT_MINOR, 3),
-            0,
+            *(_OSMESA_FORMAT, _GL_RGBA, _OSMESA_DEPTH_BITS, 24, _OSMESA_STENCIL_BITS, 8),
+            *(_OSMESA_PROFILE, _OSMESA_CORE_PROFILE, _OSMESA_CONTEXT_MAJOR, 3, _OSMESA_CONTEXT_MINOR, 3, 0),
         )
         self._library = library
         self._context = library.OSMesaCreateContextAttribs((ctypes.c_int * len(attributes))(*attributes), None)
@@ -95,8 +81,7 @@ class _OsMesa:
     load = load_opengl_function
 
     def __enter__(self) -> None:
-        made = self._library.OSMesaMakeCurrent(self._context, self._pixel, _GL_UNSIGNED_BYTE, 1, 1)
-        if not made:
+        if not self._library.OSMesaMakeCurrent(self._context, self._pixel, _GL_UNSIGNED_BYTE, 1, 1):
             raise OSError("OSMesaMakeCurrent failed")
 
     def __exit__(self, *_: object) -> None:
@@ -110,10 +95,8 @@ class _OsMesa:
 
 
 def _load_osmesa() -> Any:
-    names = [ctypes.util.find_library("OSMesa"), "libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"]
-    for name in names:
-        if name is None:
-            continue
+    names = (ctypes.util.find_library("OSMesa"), "libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
+    for name in filter(None, names):
         try:
             library = ctypes.CDLL(name)
         except OSError:

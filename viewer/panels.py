@@ -34,14 +34,14 @@ _LABEL = (
 
 @dataclass
 class PanelData:
-    """What the panels show and do not change.
+    """Data that the panels show but do not change.
 
     Attributes:
         entries: names of the scenes to choose from; `current` is the index of the scene that is shown.
         stats: of the last image; `frame_ms` is the time of a whole frame, smoothed.
         size: of the rendered image, pixels; smaller than the window while the camera moves.
         photo_name: of the nearest input photograph; None if the scene has none.
-        loading: name, what is being done, fraction done; None if nothing is loading.
+        loading: name, task, fraction done; None if nothing is loading.
         error: message of the last failure.
     """
 
@@ -141,33 +141,33 @@ class Panels:
             _draw_message(state.message)
         return commands
 
-    def _mark(self, label: str) -> None:
+    def _record_rectangle(self, label: str) -> None:
         low, high = imgui.get_item_rect_min(), imgui.get_item_rect_max()
         self.items[label] = (low.x, low.y, high.x, high.y)
 
     def _radio(self, label: str, active: bool) -> bool:
         chosen = imgui.radio_button(label, active)
-        self._mark(label)
+        self._record_rectangle(label)
         return chosen
 
     def _check(self, label: str, value: bool) -> bool:
         _, value = imgui.checkbox(label, value)
-        self._mark(label)
+        self._record_rectangle(label)
         return value
 
     def _button(self, label: str) -> bool:
         pressed = imgui.button(label)
-        self._mark(label)
+        self._record_rectangle(label)
         return pressed
 
     def _slider(self, label: str, value: float, low: float, high: float, form: str) -> float:
         changed, chosen = imgui.slider_float(label, value, low, high, form, imgui.SliderFlags_.always_clamp.value)
-        self._mark(label)
+        self._record_rectangle(label)
         return chosen if changed else value  # imgui returns an unchanged value rounded to float32
 
     def _section(self, label: str, draw: Callable[..., None], *args: object) -> None:
         opened = imgui.collapsing_header(label, imgui.TreeNodeFlags_.default_open.value)
-        self._mark(label)
+        self._record_rectangle(label)
         if opened:
             imgui.push_id(label)
             draw(*args)
@@ -183,7 +183,7 @@ class Panels:
             imgui.push_item_width(-110 * scale)
             self._section("Scene", self._draw_scene, data, commands)
             self._section("Gaussians", self._draw_gaussians, state)
-            self._section("Drawing", self._draw_drawing, state)
+            self._section("Drawing", self._draw_settings, state)
             self._section("Camera", self._draw_camera, state)
             self._section("Photograph", self._draw_photograph, state, data)
             self._section("Screenshot", self._draw_screenshot, commands)
@@ -195,13 +195,13 @@ class Panels:
             names = [f"{i + 1}. {name}" for i, name in enumerate(data.entries)]  # numbered, because names may repeat
             imgui.set_next_item_width(-1)
             changed, index = imgui.combo("##pair", max(data.current, 0), names)
-            self._mark("pair")
+            self._record_rectangle("pair")
             if changed:
                 commands.choose = index
         imgui.set_next_item_width(-60 * imgui.get_style().font_scale_dpi)
         hint, flags = "folder or .ply, or drop it here", imgui.InputTextFlags_.enter_returns_true.value
         entered, self.path = imgui.input_text_with_hint("##path", hint, self.path, flags)
-        self._mark("path")
+        self._record_rectangle("path")
         imgui.same_line()
         if (self._button("Open") or entered) and self.path.strip():
             commands.open = self.path.strip()
@@ -231,7 +231,7 @@ class Panels:
         threshold = self._slider("min. opacity", settings.opacity_threshold, 0.0, 1.0, "%.2f")
         state.settings = replace(settings, opacity_threshold=threshold)
 
-    def _draw_drawing(self, state: ViewerState) -> None:
+    def _draw_settings(self, state: ViewerState) -> None:
         settings = state.settings
         for name, choices in (("kernel", Kernel), ("order", Order), ("lowpass", Lowpass)):
             _draw_row_label(name)
@@ -241,12 +241,12 @@ class Panels:
                     settings = replace(settings, **{name: choice})
         flags = imgui.ColorEditFlags_.no_inputs.value
         changed, background = imgui.color_edit3("background", list(settings.background), flags)
-        self._mark("background")
+        self._record_rectangle("background")
         for name, color in (("black", 0.0), ("grey", 0.5), ("white", 1.0)):
             imgui.same_line()
             if imgui.small_button(name):
                 changed, background = True, [color] * 3
-            self._mark(name)
+            self._record_rectangle(name)
         if changed:
             settings = replace(settings, background=(background[0], background[1], background[2]))
         state.settings = settings

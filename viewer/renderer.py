@@ -27,11 +27,9 @@ from pansplat_viewer.splats import SortedSplats, Splats, SplatSorter, sort_splat
 
 _SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software")
 
-# Smallest weight of a view in deferred blending, by the bits of the render targets. Shows a view where the others are
-# empty (such as the masked tripod of an input) and is lost in rounding elsewhere.
+# Smallest weight of a view in deferred blending, by the bits of the render targets. With it, a view shows where the
+# others are empty (such as the masked tripod of an input); elsewhere it vanishes in rounding.
 _MIN_WEIGHT = {16: 1e-4, 32: 2.0**-26}
-
-__all__ = ["DrawSettings", "FrameStats", "SplatRenderer"]
 
 
 class SplatRenderer:
@@ -106,7 +104,7 @@ class SplatRenderer:
         Args:
             cam2world: rigid pose, OpenCV axes, metres.
             size: (width, height) in pixels.
-            settings: what to draw and how.
+            settings: draw settings.
             wait: sort for this position first. If False, draw at once with the last order while a worker thread sorts;
                 `stats.settled` is then False, and the caller renders again until it is True.
 
@@ -182,17 +180,17 @@ class SplatRenderer:
         """Sort for this position, here or in the worker thread; returns whether the order fits the position."""
         assert self._splats is not None
         if self._sorted is None or (wait and self._sorted.position != position):
-            self._use(sort_splats(self._splats, position))
+            self._set_sorted(sort_splats(self._splats, position))
         elif self._sorted.position != position:
             ready = self._sorter.take()
             if ready is not None and ready.splats is self._splats:
-                self._use(ready)
+                self._set_sorted(ready)
             if self._sorted.position != position:
                 self._sorter.request(self._splats, position)
         assert self._sorted is not None
         return self._sorted.position == position
 
-    def _use(self, sorted_splats: SortedSplats) -> None:
+    def _set_sorted(self, sorted_splats: SortedSplats) -> None:
         assert self._painter is not None
         if sorted_splats.colors is not None:
             self._painter.rasterizer.write_colors(sorted_splats.colors)

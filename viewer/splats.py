@@ -1,4 +1,4 @@
-"""A scene's Gaussians as the renderer reads them on the CPU: arrays, colours, sort order, selection and culling.
+"""A scene's Gaussians on the CPU: arrays, colours, sort order, selection and culling.
 
 Order and colours depend on the position of the camera and not on its rotation (radial order), so a rotation needs
 neither. `SplatSorter` computes both in a worker thread.
@@ -35,7 +35,7 @@ class Splats:
             is nowhere visible.
         extent: reach times the largest standard deviation, metres.
         levels, views: labels.
-        geometry: what the shaders read: mean, opacity; quaternion; scales, 0.
+        geometry: rows that the shaders read: mean, opacity; quaternion; scales, 0.
         harmonics: coefficients; Gaussians are the innermost axis, so that sums over coefficients read memory in order.
         base_colors: colours if they do not depend on the direction (degree 0), else None.
         view_positions: camera centres of the context views in the world.
@@ -98,7 +98,7 @@ class Splats:
             dropped=dropped,
         )
 
-    def colors_from(self, position: tuple[float, float, float]) -> Float[np.ndarray, "n 4"]:
+    def evaluate_colors(self, position: tuple[float, float, float]) -> Float[np.ndarray, "n 4"]:
         """Return RGB and a padding column of all splats, seen from a camera position in the moved frame."""
         colors = np.zeros((len(self), 4), np.float32)
         means = torch.from_numpy(self.means)
@@ -163,7 +163,7 @@ def radix_argsort(keys: Float[np.ndarray, "n"]) -> UInt[np.ndarray, "n"]:
 
 @dataclass(frozen=True, eq=False)
 class SortedSplats:
-    """Splats with everything that depends on the camera's position.
+    """Splats with the order and colours of one camera position.
 
     Attributes:
         splats: the scene.
@@ -226,7 +226,7 @@ def sort_splats(splats: Splats, position: tuple[float, float, float]) -> SortedS
     squared += y * y
     squared += z * z
     order = radix_argsort(squared)
-    colors = splats.colors_from(position) if splats.base_colors is None else None
+    colors = splats.evaluate_colors(position) if splats.base_colors is None else None
     milliseconds = 1e3 * (time.perf_counter() - start)
     return SortedSplats(splats, position, np.sqrt(squared), order, colors, milliseconds)
 

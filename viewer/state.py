@@ -1,4 +1,4 @@
-"""What the viewer shows, without window or GL: values that keys and panels change and that a frame reads."""
+"""The viewer's state: values that keys and panels change and that a frame reads. Needs neither window nor GL."""
 
 from dataclasses import dataclass, field, replace
 
@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose, level_pose, look_pose, path_poses, up_direction
-from pansplat_viewer.camera import Camera, place
+from pansplat_viewer.camera import Camera, move_to_pose
 from pansplat_viewer.settings import DrawSettings
 
 FLIGHT_SECONDS = 6.0
@@ -22,7 +22,7 @@ class ViewerState:
     Attributes:
         camera: the current camera; `home` is the camera that R restores.
         orbiting: whether the camera orbits (True) or flies (False).
-        settings: what to draw; the field of view is the camera's.
+        settings: draw settings; the field of view is the camera's.
         flight: fraction of the flight between the panoramas in [0, 1]; `playing` while it is played.
         overlay, help: whether panels and key help are shown.
         photo: whether the nearest input photograph is shown, right of `split` (fraction of the width).
@@ -73,20 +73,19 @@ def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
     state.settings = settings
     state.playing, state.flight = False, min(max(at, 0.0), 1.0)
     level = tuple(tuple(float(x) for x in row) for row in _level_axes(scene))
-    camera = place(replace(state.camera, level=level), _start_pose(scene, state.flight))
+    camera = move_to_pose(replace(state.camera, level=level), _start_pose(scene, state.flight))
     state.camera = state.home = replace(camera, distance=_typical_distance(scene))
 
 
-def jump_to_view(state: ViewerState, view: int) -> bool:
-    """Move to an input camera's position and heading, level; returns False if the scene has no such camera."""
+def jump_to_view(state: ViewerState, view: int) -> None:
+    """Move to an input camera's position and heading, level; does nothing if the scene has no such camera."""
     if view >= len(state.context):
-        return False
+        return
     up = up_direction(torch.from_numpy(state.context))
     target = level_pose(torch.from_numpy(state.context[view]), up).numpy()
     state.playing = False
-    state.camera = place(state.camera, target)
+    state.camera = move_to_pose(state.camera, target)
     state.flight = view / max(len(state.context) - 1, 1)
-    return True
 
 
 def fly_to(state: ViewerState, fraction: float) -> None:
@@ -94,7 +93,7 @@ def fly_to(state: ViewerState, fraction: float) -> None:
     state.flight = min(max(fraction, 0.0), 1.0)
     if len(state.context):
         target = fly_pose(torch.from_numpy(state.context), state.flight).numpy()
-        state.camera = place(state.camera, target)
+        state.camera = move_to_pose(state.camera, target)
 
 
 def toggle_play(state: ViewerState) -> None:

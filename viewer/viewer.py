@@ -135,7 +135,7 @@ class Presenter:
         else:
             self._program["split"] = split
             self._photos[photo].use(1)
-            rotation = self._poses[photo][:3, :3].T @ cameras.pose(camera)[:3, :3]
+            rotation = self._poses[photo][:3, :3].T @ camera.cam2world[:3, :3]
             self._program["camera_to_photo"] = tuple(rotation.T.ravel().tolist())  # column by column
             width, height = target.viewport[2:]
             tangent = math.tan(math.radians(camera.vertical_fov_degrees) / 2)
@@ -150,12 +150,12 @@ class Presenter:
 
 
 class Viewer:
-    """Everything that the window shows; tests run it on a context without a window.
+    """Scene, image and panels; tests run it on a context without a window.
 
     Attributes:
-        state: what a user can change.
+        state: the values that a user can change.
         panels: the panels, with the rectangles of their widgets.
-        panel_data: what the panels showed in the last frame.
+        panel_data: the data of the panels in the last frame.
         screenshots: files written so far.
     """
 
@@ -260,7 +260,7 @@ class Viewer:
         self.gui.close()
 
     def _take_loaded(self, now: float) -> None:
-        """Show the scene, or the error, of a load that has finished."""
+        """Show the scene or the error of a finished load."""
         result = self.loader.poll()
         if isinstance(result, LoadedScene):
             try:
@@ -297,7 +297,7 @@ class Viewer:
         photos = self._loaded.photos if self._loaded else None
         if photos is None or not len(photos.cam2world):
             return None
-        return cameras.nearest_view(self.state.camera, photos.cam2world.double().numpy())
+        return cameras.find_nearest_view(self.state.camera, photos.cam2world.double().numpy())
 
     def _draw_image(self, size: tuple[int, int], target: moderngl.Framebuffer, now: float) -> None:
         camera = self.state.camera
@@ -305,7 +305,7 @@ class Viewer:
         turned = not moved and camera != self._last_camera
         self._last_camera = camera
         plan = self._resolution.plan(now, moved=moved, turned=turned, adaptive=self.state.adaptive)
-        image = self._render(cameras.pose(camera), size, plan)
+        image = self._render(camera.cam2world, size, plan)
         photo = self._nearest_photo() if self.state.photo else None
         self.presenter.draw(image, target, photo=photo, split=self.state.split, camera=camera)
 
@@ -332,8 +332,8 @@ class Viewer:
         self._image = None  # `read_depth` may have replaced the texture
         if distance is not None:
             camera = self.state.camera
-            point = np.asarray(camera.position) + distance * cameras.rotation(camera)[:, 2]
-            self.state.camera = cameras.focus(camera, point)
+            point = np.asarray(camera.position) + distance * camera.rotation[:, 2]
+            self.state.camera = cameras.focus_on_point(camera, point)
             self.state.orbiting = True
 
     def _execute(self, commands: Commands, size: tuple[int, int], now: float) -> None:
@@ -358,7 +358,7 @@ class Viewer:
         settings = self.state.draw_settings
         if panorama:
             settings = replace(settings, layout="equirect")
-        self.renderer.render(cameras.pose(self.state.camera), size, settings, wait=True)
+        self.renderer.render(self.state.camera.cam2world, size, settings, wait=True)
         self._image = None  # the texture holds the screenshot
         try:
             path = write_screenshot(

@@ -18,7 +18,7 @@ from pansplat_viewer.offscreen import load_llvm_before_mesa
 from pansplat_viewer.viewer import Viewer
 
 _DEBIAN = "on Debian or Ubuntu: apt-get install libgl1 libegl1 libgl1-mesa-dri libgles2"
-_IDLE_SECONDS = 0.1  # between frames when nothing moves; leaves the CPU to a prediction
+_IDLE_SECONDS = 0.1  # between frames when nothing moves; so that a prediction gets the CPU
 
 
 class NoWindowError(Exception):
@@ -57,7 +57,7 @@ class Window:
         with warnings.catch_warnings(record=True) as caught:  # glfw reports errors as warnings
             warnings.simplefilter("always")
             if not glfw.init():
-                raise NoWindowError(f"the display cannot be used ({_reason(caught)})")
+                raise NoWindowError(f"the display cannot be used ({_describe_last(caught)})")
             glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, 3)
             glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, 3)
             glfw.window_hint(glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE)
@@ -66,7 +66,7 @@ class Window:
             handle = glfw.create_window(*size, title, None, None)
             if not handle:
                 glfw.terminate()
-                raise NoWindowError(f"the display has no OpenGL 3.3 ({_reason(caught)}); {_DEBIAN}")
+                raise NoWindowError(f"the display has no OpenGL 3.3 ({_describe_last(caught)}); {_DEBIAN}")
         glfw.make_context_current(handle)
         glfw.swap_interval(1)
         try:
@@ -135,14 +135,14 @@ def run_viewer(window: Window, viewer: Viewer) -> None:
     """Run a viewer in the window until the user quits, then free everything and join all threads."""
     try:
         window.attach_gui()
-        _loop(window, viewer)
+        _run_loop(window, viewer)
     finally:
         window.detach_gui()
         viewer.close()
         window.close()
 
 
-def _loop(window: Window, viewer: Viewer) -> None:
+def _run_loop(window: Window, viewer: Viewer) -> None:
     last, title = time.perf_counter(), None
     active_until = 0.0
     target = window.ctx.detect_framebuffer(0)
@@ -168,6 +168,6 @@ def _loop(window: Window, viewer: Viewer) -> None:
             window.set_title(title)
 
 
-def _reason(caught: list[warnings.WarningMessage]) -> str:
+def _describe_last(caught: list[warnings.WarningMessage]) -> str:
     text = str(caught[-1].message) if caught else "unknown reason"
     return " ".join(text.split())

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pansplat_viewer import camera as cameras
 from pansplat_viewer.input import FAST, FLY_SPEED, SLOW, Commands, Input, apply_input
 from pansplat_viewer.state import ViewerState, advance_flight, enter_scene
 
@@ -58,14 +57,14 @@ def test_scroll_changes_the_field_of_view_when_flying_and_the_distance_when_orbi
 def test_v_switches_to_orbiting_which_keeps_the_centre(state):
     press(state, "v")
     assert state.orbiting
-    center = cameras.orbit_center(state.camera)
+    center = state.camera.orbit_center
     apply_input(state, Input(drag=(80.0, 10.0)))
-    assert np.allclose(cameras.orbit_center(state.camera), center)
+    assert np.allclose(state.camera.orbit_center, center)
     assert state.camera.position != state.home.position
     for key in "wasdqe":
         before = state.camera
         apply_input(state, Input(held=frozenset(key)))
-        assert np.allclose(cameras.orbit_center(state.camera), center) and state.camera != before
+        assert np.allclose(state.camera.orbit_center, center) and state.camera != before
     press(state, "v")
     assert not state.orbiting
 
@@ -176,7 +175,7 @@ def test_a_scene_without_cameras_is_seen_from_outside_and_has_no_flight(small_sc
     state = ViewerState()
     enter_scene(state, replace(small_scene, cam2world=small_scene.cam2world[:0]))
     means = small_scene.gaussians.means.double().numpy()
-    ahead = (means - np.asarray(state.camera.position)) @ cameras.rotation(state.camera)[:, 2]
+    ahead = (means - np.asarray(state.camera.position)) @ state.camera.rotation[:, 2]
     assert (ahead > 0).mean() > 0.95
     press(state, "space", "1", ".")
     assert not state.playing

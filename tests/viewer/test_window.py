@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pansplat_viewer.window import Window, _loop
+from pansplat_viewer.window import Window, _run_loop
 
 pytestmark = [pytest.mark.gl, pytest.mark.slow]
 
@@ -164,7 +164,7 @@ def test_a_dropped_path_is_opened():
         def swap(self) -> None: ...
 
     window, viewer = Dropped(), Opener()
-    _loop(window, viewer)
+    _run_loop(window, viewer)
     assert viewer.opened == [Path("/somewhere/a pair")] and window.dropped == []
 
 
