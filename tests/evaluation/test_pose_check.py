@@ -1,4 +1,4 @@
-"""The right poses fit best; each wrong convention is named, unless the images cannot distinguish it."""
+"""The right poses fit best; each wrong convention is detected, unless the images cannot distinguish it."""
 
 import dataclasses
 from pathlib import Path
@@ -51,8 +51,8 @@ def _views(*poses: torch.Tensor, near: float = 0.45, far: float = 10.0) -> Views
 _TILTED = (_pose((0.9, 0.1, 0.3, 0.05), (0.4, 0.2, -0.3)), _pose((0.6, -0.15, -0.6, 0.1), (-0.5, -0.2, 0.5)))
 
 
-def _wrong(poses: torch.Tensor, mistake: str) -> torch.Tensor:
-    """The given poses under a mistake, read as OpenCV cam2world."""
+def _make_mistakes(poses: torch.Tensor) -> dict[str, torch.Tensor]:
+    """By mistake, the matrices that a user with the mistake states as OpenCV cam2world poses."""
     turned = poses.clone()
     turned[:, :3, :3] = poses[:, :3, :3].transpose(-1, -2)
     robot = torch.eye(4, dtype=torch.float64)  # columns: forward, left and up in OpenCV's axes
@@ -66,15 +66,11 @@ def _wrong(poses: torch.Tensor, mistake: str) -> torch.Tensor:
         "swapped views": poses.flip(0),
         "x-forward camera": poses @ robot,
         "turned by 90 degrees": poses @ invert_pose(quarter),
-    }[mistake]
+    }
 
 
 def _best(check: PoseCheck) -> str:
     return next(iter(check.errors))
-
-
-_MISTAKES = ("inverse", "opengl axes", "inverse, opengl axes", "transposed rotation", "swapped views",
-             "x-forward camera", "turned by 90 degrees")  # fmt: skip
 
 
 def test_right_poses_fit_best() -> None:
@@ -85,10 +81,10 @@ def test_right_poses_fit_best() -> None:
     assert check.baseline == pytest.approx(float((_TILTED[0] - _TILTED[1])[:3, 3].norm()))
 
 
-@pytest.mark.parametrize("mistake", _MISTAKES)
+@pytest.mark.parametrize("mistake", _make_mistakes(torch.stack(_TILTED)))
 def test_each_wrong_convention_is_named(mistake: str) -> None:
     views = _views(*_TILTED)
-    check = check_views(dataclasses.replace(views, cam2world=_wrong(views.cam2world, mistake)))
+    check = check_views(dataclasses.replace(views, cam2world=_make_mistakes(views.cam2world)[mistake]))
     assert _best(check) == mistake
     assert check.likely_mistake is not None
     assert check.likely_mistake.startswith(_ADVICE[mistake])
@@ -99,16 +95,17 @@ def test_a_nearly_perfect_fit_is_no_mistake() -> None:
     assert _describe_mistake({"inverse": 0.201, AS_GIVEN: 0.304}) is not None
 
 
-def test_readings_with_the_same_relative_pose_are_indistinguishable() -> None:
-    side = (_pose((1, 0, 0, 0), (0, 0, 0)), _pose((1, 0, 0, 0), (0.8, 0, 0)))
-    check = check_views(_views(*side))
+_SIDE_BY_SIDE = (_pose((1, 0, 0, 0), (0, 0, 0)), _pose((1, 0, 0, 0), (0.8, 0, 0)))
+
+
+def test_interpretations_with_the_same_relative_pose_are_indistinguishable() -> None:
+    check = check_views(_views(*_SIDE_BY_SIDE))
     assert _best(check) == AS_GIVEN
     assert {"opengl axes", "mirrored up-down", "transposed rotation"} <= set(check.indistinguishable)
 
 
 def test_mistakes_with_the_same_relative_pose_are_named_together() -> None:
-    side = (_pose((1, 0, 0, 0), (0, 0, 0)), _pose((1, 0, 0, 0), (0.8, 0, 0)))
-    views = _views(*side)
+    views = _views(*_SIDE_BY_SIDE)
     check = check_views(dataclasses.replace(views, cam2world=invert_pose(views.cam2world)))
     assert check.likely_mistake is not None
     assert _ADVICE["inverse"] in check.likely_mistake
@@ -129,8 +126,7 @@ def test_poses_in_millimetres_give_a_warning() -> None:
 
 
 def test_coincident_cameras_give_a_warning() -> None:
-    views = _views(_TILTED[0], _TILTED[0])
-    check = check_views(views)
+    check = check_views(_views(_TILTED[0], _TILTED[0]))
     assert any("parallax" in warning for warning in check.warnings)
 
 

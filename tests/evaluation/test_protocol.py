@@ -129,8 +129,8 @@ def write_insta360(root: Path, frames: int) -> Path:
     return folder
 
 
-def methods(protocol: str = "m3d", predictor: Sphere | None = None):
-    return list_methods(predictor or Sphere(), protocol)
+def methods(protocol: str = "m3d"):
+    return list_methods(Sphere(), protocol)
 
 
 # The sets

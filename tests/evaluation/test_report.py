@@ -1,5 +1,6 @@
 """The evaluation of pairs: its files, metrics and table."""
 
+import dataclasses
 import io
 import json
 import math
@@ -16,7 +17,7 @@ from pansplat.data.layouts import load_pairs
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
-from pansplat.evaluation.report import ERROR_SCALE, error_image, evaluate, results_table
+from pansplat.evaluation.report import ERROR_SCALE, Case, error_image, evaluate, results_table
 from pansplat.gaussians.scene import Gaussians
 
 HEIGHT = 16
@@ -69,38 +70,40 @@ def read(path: str | Path) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a triplet in `room`, evaluated once into `out`."""
-    folder = tmp_path_factory.mktemp("report")
-    evaluate(load_pairs(write_triplet(folder / "room")), GreyBall(), folder / "out", height=HEIGHT)
-    return folder
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a triplet in `room`."""
+    return write_triplet(tmp_path_factory.mktemp("report") / "room").parent
 
 
-def test_results_have_the_documented_fields_and_files(room: Path) -> None:
-    (result,) = json.loads((room / "out" / "results.json").read_text())
+@pytest.fixture(scope="module")
+def case(folder: Path) -> Case:
+    """The triplet's only case, evaluated into `out`."""
+    (case,) = evaluate(load_pairs(folder / "room"), GreyBall(), folder / "out", height=HEIGHT)
+    return case
+
+
+def test_results_have_the_documented_fields_and_files(folder: Path, case: Case) -> None:
+    (result,) = json.loads((folder / "out" / "results.json").read_text())
     assert list(result) == KEYS
     assert [result[key] for key in ("name", "model", "height", "num_gaussians")] == ["room", "ball", HEIGHT, 2]
     assert result["predict_seconds"] > 0 and result["render_seconds"] > 0
-    assert {p.name for p in (room / "out" / "room").iterdir()} == {"prediction.png", "target.png", "error.png"}
+    assert {p.name for p in (folder / "out" / "room").iterdir()} == {"prediction.png", "target.png", "error.png"}
 
 
-def test_metrics_are_those_of_the_written_images(room: Path) -> None:
-    (result,) = json.loads((room / "out" / "results.json").read_text())
-    prediction, target = read(result["prediction"]), read(result["target"])
-    torch.testing.assert_close(target, read(room / "room" / "c.png"))
-    assert result["ws_psnr"] == pytest.approx(ws_psnr(prediction, target), abs=0.01)  # 8 bits
-    assert result["psnr"] == pytest.approx(psnr(prediction, target), abs=0.01)
-    assert result["ssim"] == pytest.approx(ssim(prediction, target), abs=1e-3)
-    inputs = [read(room / "room" / name) for name in ("a.png", "b.png")]
-    assert result["cross_fade_ws_psnr"] == pytest.approx(ws_psnr(sum(inputs) / 2, target), abs=0.01)
+def test_metrics_are_those_of_the_written_images(folder: Path, case: Case) -> None:
+    assert json.loads((folder / "out" / "results.json").read_text()) == [case.as_json()]
+    prediction, target = read(case.prediction), read(case.target)
+    torch.testing.assert_close(target, read(folder / "room" / "c.png"))
+    assert case.ws_psnr == pytest.approx(ws_psnr(prediction, target), abs=0.01)  # 8 bits
+    assert case.psnr == pytest.approx(psnr(prediction, target), abs=0.01)
+    assert case.ssim == pytest.approx(ssim(prediction, target), abs=1e-3)
+    inputs = [read(folder / "room" / name) for name in ("a.png", "b.png")]
+    assert case.cross_fade_ws_psnr == pytest.approx(ws_psnr(sum(inputs) / 2, target), abs=0.01)
 
 
-def test_the_drawing_changes_the_images(tmp_path: Path) -> None:
-    pairs = load_pairs(write_triplet(tmp_path / "room"))
-    exact, original = (
-        evaluate(pairs, GreyBall(), tmp_path / name, height=HEIGHT, drawing=name)[0] for name in ("exact", "original")
-    )
-    assert original.psnr != exact.psnr and abs(original.psnr - exact.psnr) < 3
+def test_the_drawing_changes_the_images(folder: Path, case: Case, tmp_path: Path) -> None:
+    (official,) = evaluate(load_pairs(folder / "room"), GreyBall(), tmp_path, height=HEIGHT, drawing="original")
+    assert official.psnr != case.psnr and abs(official.psnr - case.psnr) < 3
 
 
 def test_an_evaluation_does_not_use_the_prediction_cache(tmp_path: Path) -> None:
@@ -130,11 +133,10 @@ def test_pairs_without_target_are_skipped(tmp_path: Path) -> None:
     assert not (tmp_path / "nothing").exists()
 
 
-def test_a_file_at_the_output_folders_path_is_an_input_error(tmp_path: Path) -> None:
-    pairs = load_pairs(write_triplet(tmp_path / "room"))
+def test_a_file_at_the_output_folders_path_is_an_input_error(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "out").write_text("")
     with pytest.raises(InputError, match=r"cannot make .*choose another"):
-        evaluate(pairs, GreyBall(), tmp_path / "out", height=HEIGHT)
+        evaluate(load_pairs(folder / "room"), GreyBall(), tmp_path / "out", height=HEIGHT)
 
 
 def test_a_masked_target_has_a_second_value_in_the_table_only(tmp_path: Path) -> None:
@@ -150,8 +152,8 @@ def test_a_masked_target_has_a_second_value_in_the_table_only(tmp_path: Path) ->
     assert "masked" in [str(column.header) for column in results_table([case]).columns]
 
 
-def test_lpips_is_optional(tmp_path: Path) -> None:
-    pairs, metric = load_pairs(write_triplet(tmp_path / "room")), Lpips("squeeze")
+def test_lpips_is_optional(folder: Path, tmp_path: Path) -> None:
+    pairs, metric = load_pairs(folder / "room"), Lpips("squeeze")
     for head in metric.heads:
         head.data.fill_(0.1)
     (case,) = evaluate(pairs, GreyBall(), tmp_path / "out", height=32, lpips=metric)
@@ -161,10 +163,9 @@ def test_lpips_is_optional(tmp_path: Path) -> None:
     assert "LPIPS" in [str(column.header) for column in results_table([case]).columns]
 
 
-def test_an_infinite_psnr_is_null_in_json(tmp_path: Path) -> None:
-    (case,) = evaluate(load_pairs(write_triplet(tmp_path / "room")), GreyBall(), tmp_path / "out", height=HEIGHT)
-    object.__setattr__(case, "psnr", math.inf)
-    assert json.loads(json.dumps(case.as_json(), allow_nan=False))["psnr"] is None
+def test_an_infinite_psnr_is_null_in_json(case: Case) -> None:
+    infinite = dataclasses.replace(case, psnr=math.inf)
+    assert json.loads(json.dumps(infinite.as_json(), allow_nan=False))["psnr"] is None
 
 
 def test_error_images_are_brighter_for_larger_errors() -> None:

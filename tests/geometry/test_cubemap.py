@@ -1,10 +1,7 @@
 """Cube faces are proper rotations that look where their names say; strips of faces equal the official ones."""
 
-from collections.abc import Callable
-
 import pytest
 import torch
-from torch import Tensor
 
 from pansplat.geometry.cubemap import (
     FACES,
@@ -41,29 +38,29 @@ def test_face_poses_share_the_panoramas_centre():
     assert torch.equal(poses[:, :3, :3], face_rotations())
 
 
-def test_face_rotations_equal_the_official_ones(golden: Callable[[str], dict[str, Tensor]]) -> None:
+def test_face_rotations_equal_the_official_ones(golden):
     expected = golden("units")["cubemap.rotations"]
     assert torch.allclose(face_rotations(dtype=torch.float32), expected[..., :3, :3].float(), atol=1e-6)
 
 
-def test_a_strip_equals_the_official_one(golden: Callable[[str], dict[str, Tensor]]) -> None:
+def test_a_strip_equals_the_official_one(golden):
     units = golden("units")
     strip = strip_from_equirect(units["e2c.in"].movedim(-1, 0), 32)
     assert (strip.movedim(0, -1) - units["e2c.out"]).abs().max() < 2e-5
 
 
 @pytest.mark.parametrize("scale", [5, 4, 3, 2, 1])
-def test_the_lookup_equals_the_one_in_checkpoints(scale: int, recipe_weights: dict[str, Tensor]) -> None:
+def test_the_lookup_equals_the_one_in_checkpoints(scale, recipe_weights):
     stored = recipe_weights[f"mono_depth.c2e.{scale}.sample_grid"][0, 0].double()
     x, y, face = strip_lookup(512 >> scale).unbind(-1)
     assert (torch.stack((x, y, face / 2.5 - 1), dim=-1) - stored).abs().max() < 2e-6
 
 
-def test_faces_of_a_strip_are_in_the_order_of_faces() -> None:
+def test_faces_of_a_strip_are_in_the_order_of_faces():
     assert torch.equal(2 * strip_directions(3)[1, 1::3], face_rotations()[:, :, 2])
 
 
-def test_adjacent_faces_share_their_edge() -> None:
+def test_adjacent_faces_share_their_edge():
     rays = strip_directions(5)
     for right in range(4):
         left = (right - 1) % 4
@@ -72,7 +69,7 @@ def test_adjacent_faces_share_their_edge() -> None:
     assert torch.equal(rays[0, 25:30], rays[4, 0:5])  # the upper edge of down is the lower edge of front
 
 
-def test_a_panorama_returns_from_its_strip() -> None:
+def test_a_panorama_returns_from_its_strip():
     panorama = pixel_directions(64, 128, dtype=torch.float64).movedim(-1, 0)  # smooth and injective
     strip = strip_from_equirect(panorama, 65)
     back = equirect_from_strip(strip[None], strip_lookup(64))[0]
@@ -81,7 +78,7 @@ def test_a_panorama_returns_from_its_strip() -> None:
     assert (back - panorama).abs().mean() < 1e-3
 
 
-def test_no_sample_mixes_two_faces() -> None:
+def test_no_sample_mixes_two_faces():
     numbers = torch.arange(6.0).repeat_interleave(8).expand(1, 1, 8, 48).contiguous()
     back = equirect_from_strip(numbers, strip_lookup(32))[0, 0]
     assert (back - strip_lookup(32)[..., 2]).abs().max() < 1e-4

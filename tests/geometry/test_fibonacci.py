@@ -1,11 +1,9 @@
 """Fibonacci lattices: the paper's counts, exact poles, uniform spacing at any size, and the official rounding."""
 
 import math
-from collections.abc import Callable
 
 import pytest
 import torch
-from torch import Tensor
 
 from pansplat.geometry.equirect import uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size, official_fibonacci_uv
@@ -50,9 +48,7 @@ def test_an_empty_lattice_is_refused():
 
 
 @pytest.mark.parametrize(("width", "error"), [(16, 1e-5), (128, 2e-3), (512, 1e-2)])
-def test_lattices_equal_the_official_ones_up_to_their_rounding(
-    golden: Callable[[str], dict[str, Tensor]], width: int, error: float
-) -> None:
+def test_lattices_equal_the_official_ones_up_to_their_rounding(golden, width, error):
     lonlat = golden("units")[f"fibonacci.{width}"].double()
     points = fibonacci_directions(len(lonlat))
     lon, lat = lonlat[1:-1].unbind(-1)

@@ -1,4 +1,4 @@
-"""Textured rooms with known depth, searched once for all tests of the sweep."""
+"""Textured rooms with known depth; each is searched once for all tests."""
 
 import dataclasses
 import math
@@ -72,6 +72,10 @@ class Room:
         pose[:3, :3] /= scale
         return pose
 
+    def wall_distances(self, points: np.ndarray) -> np.ndarray:
+        """Distances (..., 6) of points in room axes from the planes of the walls, the ceiling and the floor."""
+        return np.concatenate((np.abs(points - self.low), np.abs(points - self.high)), axis=-1)
+
     def _hits(self, rays: np.ndarray, cam2world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """First intersections of a camera's rays (h, w, 3): points in room axes, and world distances."""
         to_room = np.linalg.inv(self.placed)
@@ -107,6 +111,15 @@ class Observed:
     depths: np.ndarray
     """True radial depth (v, h, 2h)."""
     surfaces: list[Surface] = field(default_factory=list)
+
+    @property
+    def inverse_depths(self) -> np.ndarray:
+        """Inverse depth (v, h, 2h) of the sweep's surfaces."""
+        return np.stack([surface.inverse_depth for surface in self.surfaces])
+
+    def make_exact_surfaces(self) -> list[Surface]:
+        """Surfaces with the true depth."""
+        return [Surface((1 / d).astype(np.float32), np.zeros(d.shape, np.uint8)) for d in self.depths]
 
 
 def _observe(room: Room, poses: Sequence[np.ndarray], height: int, *, search: bool = False) -> Observed:

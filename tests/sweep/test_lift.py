@@ -17,10 +17,6 @@ from pansplat.sweep.search import PosedImages
 from pansplat.sweep.surface import Surface
 
 
-def _exact(observed) -> list[Surface]:
-    return [Surface((1 / d).astype(np.float32), np.zeros(d.shape, np.uint8)) for d in observed.depths]
-
-
 @pytest.fixture(scope="module")
 def gaussians(small_furnished_room) -> Gaussians:
     return lift(small_furnished_room.posed, small_furnished_room.surfaces, LiftConfig())
@@ -64,18 +60,16 @@ def test_no_level_has_more_gaussians_than_its_lattice_has_points(gaussians):
 
 def test_discs_lie_on_the_surface(small_furnished_room):
     """Fine means in the room's planes, and the discs' thin axes along the planes' normals."""
-    surfaces = _exact(small_furnished_room)
-    fine = lift(small_furnished_room.posed, surfaces, LiftConfig())
+    fine = lift(small_furnished_room.posed, small_furnished_room.make_exact_surfaces(), LiftConfig())
     fine = fine.select(fine.levels == 0)
-    points, room = fine.means.numpy(), small_furnished_room.room
-    planes = np.concatenate((np.abs(points - room.low), np.abs(points - room.high)), axis=1)
-    on_wall = planes.min(axis=1) < 0.05
+    distances = small_furnished_room.room.wall_distances(fine.means.numpy())
+    on_wall = distances.min(axis=1) < 0.05
     assert on_wall.mean() > 0.7  # the rest is on the box, or at a discontinuity
-    axis = planes.argmin(axis=1) % 3
+    axis = distances.argmin(axis=1) % 3
     thin = rotations_from_quats(fine.quats).numpy()[:, :, 2]
-    lean = np.abs(thin[np.arange(len(axis)), axis])[on_wall]
-    assert np.median(lean) > 0.99
-    assert (lean > 0.9).mean() > 0.8
+    cosine = np.abs(thin[np.arange(len(axis)), axis])[on_wall]
+    assert np.median(cosine) > 0.99
+    assert (cosine > 0.9).mean() > 0.8
 
 
 @pytest.mark.parametrize("view", (0, 1))
@@ -103,7 +97,7 @@ def test_there_are_no_holes_between_the_inputs(small_furnished_room, gaussians, 
 def test_no_gaussian_contains_a_camera(small_furnished_room, gaussians, searched):
     """A Gaussian is drawn within 3.33 standard deviations; from inside it would cover the whole panorama."""
     if not searched:
-        gaussians = lift(small_furnished_room.posed, _exact(small_furnished_room), LiftConfig())
+        gaussians = lift(small_furnished_room.posed, small_furnished_room.make_exact_surfaces(), LiftConfig())
     axes = rotations_from_quats(gaussians.quats).double()
     for pose in small_furnished_room.posed.cam2world:
         away = torch.from_numpy(pose[:3, 3]) - gaussians.means.double()
@@ -154,11 +148,8 @@ def test_only_image_detail_makes_gaussians_of_level_0():
 def test_gaussians_of_a_sphere_lie_on_the_fibonacci_lattices_at_its_radius():
     gaussians = lift(*_sphere_around(np.ones((64, 128, 3), np.float32)), LiftConfig())
     radius = gaussians.means.norm(dim=1)
-    for level, depth in (
-        (1, 3.0),
-        (2, 3.0 * LiftConfig().background_depth[0]),
-        (3, 3.0 * LiftConfig().background_depth[1]),
-    ):
+    for level, factor in zip((1, 2, 3), (1.0, *LiftConfig().background_depth), strict=True):
+        depth = 3.0 * factor
         chosen = gaussians.levels == level
         assert int(chosen.sum()) == 2 * lattice_size(128 >> level)
         assert torch.allclose(radius[chosen], torch.tensor(depth), rtol=1e-4)
@@ -176,18 +167,12 @@ def test_colours_are_those_of_the_image():
 def test_points_in_the_consistent_free_space_of_another_view_are_dropped(make_room, observe, two_poses):
     room = make_room()
     observed = observe(room, [*two_poses(room), room.pose((0.1, -0.1, -0.6))], 64)
-    surfaces = _exact(observed)
-    wrong = surfaces[0].inverse_depth.copy()
-    wrong[20:30, 50:70] *= 2.0  # a surface in the free space of the other views
-    ghost = lift(observed.posed, [Surface(wrong, surfaces[0].orientation), *surfaces[1:]], LiftConfig())
-    plain = lift(observed.posed, surfaces, LiftConfig())
+    surfaces = observed.make_exact_surfaces()
+    surfaces[0].inverse_depth[20:30, 50:70] *= 2.0  # a surface in the free space of the other views
+    gaussians = lift(observed.posed, surfaces, LiftConfig())
     for level in (0, 1):
-        kept, all_ = (((g.views == 0) & (g.levels == level)) for g in (ghost, plain))
-        walls = np.minimum(
-            np.abs(ghost.means[kept].numpy() - room.low), np.abs(ghost.means[kept].numpy() - room.high)
-        ).min(axis=1)
-        assert (walls < 0.15).mean() > 0.97
-        assert int(all_.sum()) > 0
+        chosen = (gaussians.views == 0) & (gaussians.levels == level)
+        assert (room.wall_distances(gaussians.means[chosen].numpy()).min(axis=1) < 0.15).mean() > 0.97
 
 
 def test_panoramas_larger_than_the_search_are_lifted_at_their_own_height(small_furnished_room, observe, two_poses):
@@ -200,8 +185,5 @@ def test_panoramas_larger_than_the_search_are_lifted_at_their_own_height(small_f
 def test_three_views_make_gaussians_of_three(three_views):
     gaussians = lift(three_views.posed, three_views.surfaces, LiftConfig())
     assert gaussians.views.unique().tolist() == [0, 1, 2]
-    room = three_views.room
-    off = torch.minimum(
-        (gaussians.means - torch.tensor(room.low)).abs(), (gaussians.means - torch.tensor(room.high)).abs()
-    ).amin(dim=1)
-    assert off[gaussians.levels == 0].median() < 0.05
+    fine = gaussians.means[gaussians.levels == 0].numpy()
+    assert np.median(three_views.room.wall_distances(fine).min(axis=1)) < 0.05

@@ -18,8 +18,8 @@ from pansplat.sweep.planes import (
 from pansplat.sweep.surface import Surface, consistency_mask, ray_grid, world_points
 
 
-def _degrees_off(found: np.ndarray, wanted: np.ndarray) -> float:
-    return math.degrees(math.acos(min(1.0, float(found @ wanted))))
+def _degrees_off(found: np.ndarray, true: np.ndarray) -> float:
+    return math.degrees(math.acos(min(1.0, float(found @ true))))
 
 
 def _yaw_degrees_off(axes: np.ndarray, placed: np.ndarray) -> float:
@@ -84,8 +84,7 @@ def planes(empty_room) -> ScenePlanes:
     """From the exact surfaces, with the true orientation of every pixel."""
     room, poses = empty_room.room, empty_room.posed.cam2world
     surfaces = []
-    for pose, depth in zip(poses, empty_room.depths, strict=True):
-        plain = Surface((1 / depth).astype(np.float32), np.zeros(depth.shape, np.uint8))
+    for pose, plain in zip(poses, empty_room.make_exact_surfaces(), strict=True):
         points = world_points(plain, pose) @ _AXES.T
         low, high = np.array(room.low) @ _AXES.T, np.array(room.high) @ _AXES.T
         wall = np.minimum(np.abs(points - low), np.abs(points - high)).argmin(axis=-1)

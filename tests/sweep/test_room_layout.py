@@ -170,6 +170,11 @@ def _square(half: float) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
+def rays(room_axes) -> np.ndarray:
+    return axis_components(room_axes, np.eye(3), _HEIGHT)
+
+
+@pytest.fixture(scope="module")
 def square_walls() -> Walls:
     return fit_walls(_boundary(_score_at(_square(1.5))), _CAMERA_HEIGHT, _FAR)
 
@@ -225,18 +230,16 @@ def test_narrow_walls_have_a_low_confidence(square_walls):
     ((1.0, True, 1.0), (0.6, True, 0.0), (0.6, False, 1.0)),
     ids=("consistent with the wall", "consistent elsewhere", "inconsistent"),
 )
-def test_a_wall_is_dropped_where_views_agree_on_another_surface(square_walls, room_axes, distance, consistent, factor):
-    rays = axis_components(room_axes, np.eye(3), _HEIGHT)
+def test_a_wall_is_dropped_where_views_agree_on_another_surface(square_walls, rays, distance, consistent, factor):
     walls = 1.5 / np.maximum(np.abs(rays[1]), np.abs(rays[2]))
     mask = np.full(rays[0].shape, consistent)
     discounted = discount_contradicted(square_walls, _NO_BOUNDARY, rays, 1 / (distance * walls), mask)
     assert np.allclose(discounted.confidence, factor * square_walls.confidence, atol=1e-6)
 
 
-def test_without_a_boundary_there_are_no_walls_and_costs_do_not_change(room_axes):
+def test_without_a_boundary_there_are_no_walls_and_costs_do_not_change(rays):
     none = fit_walls(_NO_BOUNDARY, _CAMERA_HEIGHT, _FAR)
     assert (none.axis == 0).all() and (none.index == -1).all() and (none.confidence == 0).all()
-    rays = axis_components(room_axes, np.eye(3), _HEIGHT)
     shape = rays[0].shape
     discounted = discount_contradicted(none, _NO_BOUNDARY, rays, np.ones(shape), np.ones(shape, bool))
     assert (discounted.confidence == 0).all()
@@ -245,8 +248,7 @@ def test_without_a_boundary_there_are_no_walls_and_costs_do_not_change(room_axes
     assert (cost == 0).all()
 
 
-def test_the_wall_has_the_lowest_cost_between_the_floor_and_the_ceiling(square_walls, room_axes):
-    rays = axis_components(room_axes, np.eye(3), _HEIGHT)
+def test_the_wall_has_the_lowest_cost_between_the_floor_and_the_ceiling(square_walls, rays):
     shape, count, ceiling = rays[0].shape, 50, -1.0
     inverse = np.linspace(0.1, 2.0, count)
     cost = np.zeros((*shape, 4 * count), np.float32)

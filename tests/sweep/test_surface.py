@@ -48,27 +48,24 @@ def test_a_point_at_the_camera_is_in_free_space():
 
 
 def test_world_points_lie_on_the_rooms_walls(empty_room):
-    room = empty_room.room
-    for pose, depth in zip(empty_room.posed.cam2world, empty_room.depths, strict=True):
-        points = world_points(_surface(1 / depth), pose)
-        off = np.minimum(np.abs(points - room.low), np.abs(points - room.high)).min(axis=-1)
-        assert off.max() < 1e-5
+    for pose, surface in zip(empty_room.posed.cam2world, empty_room.make_exact_surfaces(), strict=True):
+        assert empty_room.room.wall_distances(world_points(surface, pose)).min(axis=-1).max() < 1e-5
 
 
 def test_exact_surfaces_are_consistent_in_an_empty_room(empty_room):
-    surfaces = [_surface(1 / depth) for depth in empty_room.depths]
+    surfaces = empty_room.make_exact_surfaces()
     for view in (0, 1):
         assert consistency_mask(surfaces, empty_room.posed.cam2world, view).mean() > 0.995
 
 
 def test_exact_surfaces_are_inconsistent_only_at_occlusions(furnished_room):
-    surfaces = [_surface(1 / depth) for depth in furnished_room.depths]
-    shares = [1 - consistency_mask(surfaces, furnished_room.posed.cam2world, view).mean() for view in (0, 1)]
-    assert all(0.005 < share < 0.15 for share in shares)
+    surfaces = furnished_room.make_exact_surfaces()
+    for view in (0, 1):
+        assert 0.85 < consistency_mask(surfaces, furnished_room.posed.cam2world, view).mean() < 0.995
 
 
 def test_consistency_does_not_depend_on_the_order_of_the_views(furnished_room):
-    surfaces, poses = [_surface(1 / depth) for depth in furnished_room.depths], furnished_room.posed.cam2world
+    surfaces, poses = furnished_room.make_exact_surfaces(), furnished_room.posed.cam2world
     for view in (0, 1):
         assert np.array_equal(
             consistency_mask(surfaces, poses, view), consistency_mask(surfaces[::-1], poses[::-1], 1 - view)
