@@ -339,11 +339,10 @@ def _load_classifier(metric: Lpips, path: Path) -> dict[str, Tensor]:
 
 def _load_heads(backbone: Backbone, path: Path) -> dict[str, Tensor]:
     content = read_checkpoint(path)
-    state = {}
-    for index, channels in enumerate(LAYER_CHANNELS[backbone].values()):
-        weight = _take_tensor(content, f"lin{index}.model.1.weight", torch.Size((1, channels, 1, 1)), path)
-        state[f"heads.{index}"] = weight.flatten()
-    return state
+    shapes = {
+        index: torch.Size((1, channels, 1, 1)) for index, channels in enumerate(LAYER_CHANNELS[backbone].values())
+    }
+    return {f"heads.{i}": _take_tensor(content, f"lin{i}.model.1.weight", s, path).flatten() for i, s in shapes.items()}
 
 
 def _take_tensor(content: Mapping[str, object], name: str, shape: torch.Size, path: Path) -> Tensor:

@@ -142,9 +142,7 @@ def depth_errors(
 
 
 def cross_fade(
-    images: Float[Tensor, "view 3 height width"],
-    cam2world: Float[Tensor, "view 4 4"],
-    target: Float[Tensor, "4 4"],
+    images: Float[Tensor, "view 3 height width"], cam2world: Float[Tensor, "view 4 4"], target: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "3 height width"]:
     """The baseline without geometry: inputs rotated to the target's orientation, weighted by inverse distance."""
     poses, target = cam2world.double(), target.double()

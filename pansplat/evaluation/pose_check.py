@@ -118,7 +118,7 @@ def check_views(views: Views, name: str = "views") -> PoseCheck:
         errors,
         tuple(indistinguishable),
         _describe_mistake(errors),
-        (*_warn_of_distances(centres, baseline, views), *_warn_of_overlap(errors)),
+        _list_warnings(errors, centres, baseline, views),
     )
 
 
@@ -131,34 +131,31 @@ def _describe_mistake(errors: dict[str, float]) -> str | None:
     return "; or ".join(named) + f" (error {best:.3f} instead of {errors[AS_GIVEN]:.3f})."
 
 
-def _warn_of_distances(centres: Float[Tensor, "view 3"], baseline: float, views: Views) -> tuple[str, ...]:
-    """Warnings on the distances between the cameras."""
-    found = []
+def _list_warnings(
+    errors: dict[str, float], centres: Float[Tensor, "view 3"], baseline: float, views: Views
+) -> tuple[str, ...]:
+    """Warnings on the distances between the cameras, and on poses that fit under no interpretation."""
+    warnings = []
     closest = min(float((a - b).norm()) for a, b in itertools.combinations(centres, 2))
     if baseline > 0.5 * views.far:
-        found.append(
+        warnings.append(
             f"the cameras are {baseline:.3g} m apart, which is large against far = {views.far:g} m: "
             "are the poses in centimetres or millimetres? Convert them to metres, or set near and far to fit."
         )
     if closest < 0.02 * views.near:
         degrees = math.degrees(math.atan2(closest, views.near))
-        found.append(
+        warnings.append(
             f"two cameras are only {closest:.3g} m apart: even at near = {views.near:g} m the parallax is "
             f"{degrees:.2g} degrees, so depth cannot be measured. Check the unit of the poses, or set "
             "near and far to fit."
         )
-    return tuple(found)
-
-
-def _warn_of_overlap(errors: dict[str, float]) -> tuple[str, ...]:
-    """A warning if no interpretation of the poses fits."""
     best = next(iter(errors.values()))
-    if best <= _NO_OVERLAP:
-        return ()
-    return (
-        f"no interpretation of the poses fits the views (best error {best:.3f}): they overlap too little, "
-        "or the poses or the order of the images are wrong in another way.",
-    )
+    if best > _NO_OVERLAP:
+        warnings.append(
+            f"no interpretation of the poses fits the views (best error {best:.3f}): they overlap too little, "
+            "or the poses or the order of the images are wrong in another way."
+        )
+    return tuple(warnings)
 
 
 def _relative_poses(cam2world: Float[Tensor, "view 4 4"], interpretation: str) -> Float[Tensor, "pair 4 4"]:
@@ -167,19 +164,22 @@ def _relative_poses(cam2world: Float[Tensor, "view 4 4"], interpretation: str) -
     return torch.linalg.solve(poses[1:], poses[:-1])
 
 
+_CAMERA_AXES = {  # OpenCV camera axes, as columns, in the stated camera axes
+    "opengl axes": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+    "z-up camera": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    "x-forward camera": ((0, 0, 1), (-1, 0, 0), (0, -1, 0)),
+    "turned by 90 degrees": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
+    "turned by 180 degrees": ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
+    "turned by -90 degrees": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
+}
+
+
 def _interpret_poses(poses: Float[Tensor, "view 4 4"], interpretation: str) -> Float[Tensor, "view 4 4"]:
     """The OpenCV cam2world poses that a mistake turned into the given matrices."""
-    opengl = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=poses.dtype))
-    if interpretation == "inverse":
-        return invert_pose(poses)
-    if interpretation == "opengl axes":
-        return poses @ opengl
-    if interpretation == "inverse, opengl axes":
-        return invert_pose(poses) @ opengl
     if interpretation == "transposed rotation":
-        turned = poses.clone()
-        turned[:, :3, :3] = poses[:, :3, :3].transpose(-1, -2)
-        return turned
+        transposed = poses.clone()
+        transposed[:, :3, :3] = poses[:, :3, :3].transpose(-1, -2)
+        return transposed
     if interpretation == "swapped views":
         return poses.flip(0)
     if interpretation.startswith("mirrored"):
@@ -187,18 +187,14 @@ def _interpret_poses(poses: Float[Tensor, "view 4 4"], interpretation: str) -> F
         mirror = torch.eye(4, dtype=poses.dtype)
         mirror[axis, axis] = -1
         return mirror @ poses @ mirror
-    turns = {
-        "z-up camera": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
-        "x-forward camera": ((0, 0, 1), (-1, 0, 0), (0, -1, 0)),
-        "turned by 90 degrees": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
-        "turned by 180 degrees": ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
-        "turned by -90 degrees": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
-    }
-    if interpretation not in turns:
+    if interpretation.startswith("inverse"):
+        poses = invert_pose(poses)
+    axes = _CAMERA_AXES.get(interpretation.removeprefix("inverse, "))
+    if axes is None:
         return poses
-    turn = torch.eye(4, dtype=poses.dtype)
-    turn[:3, :3] = torch.tensor(turns[interpretation], dtype=poses.dtype)
-    return poses @ turn
+    rotation = torch.eye(4, dtype=poses.dtype)
+    rotation[:3, :3] = torch.tensor(axes, dtype=poses.dtype)
+    return poses @ rotation
 
 
 def _have_same_motion(first: Float[Tensor, "pair 4 4"], second: Float[Tensor, "pair 4 4"]) -> bool:

@@ -364,11 +364,7 @@ class ProtocolResult:
 
 
 def list_methods(
-    predictor: Predictor,
-    protocol: str,
-    blend: Blend | None = None,
-    name: str | None = None,
-    drawing: Drawing = "exact",
+    predictor: Predictor, protocol: str, blend: Blend | None = None, name: str | None = None, drawing: Drawing = "exact"
 ) -> list[Method]:
     """The rows of a predictor in a protocol's table.
 

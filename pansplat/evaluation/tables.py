@@ -68,10 +68,10 @@ def _layout(
     title: str, sets: tuple[str, ...], metrics: tuple[str, ...], rows: Mapping[str, Sequence[float | None]]
 ) -> Layout:
     columns = [(name, metric) for name in sets for metric in metrics]
-    table_rows = []
-    for method, numbers in rows.items():
-        values = {c: n for c, n in zip(columns, numbers, strict=True) if n is not None}
-        table_rows.append(TableRow(method, values))
+    table_rows = (
+        TableRow(method, {c: n for c, n in zip(columns, numbers, strict=True) if n is not None})
+        for method, numbers in rows.items()
+    )
     return Layout(title, sets, metrics, tuple(table_rows))
 
 

@@ -109,12 +109,7 @@ def _background_inverse_depth(inverse: np.ndarray, mask: np.ndarray, level: int,
 
 
 def _lift_level(
-    posed: PosedImages,
-    surfaces: list[Surface],
-    consistent: list[np.ndarray],
-    view: int,
-    level: int,
-    config: LiftConfig,
+    posed: PosedImages, surfaces: list[Surface], consistent: list[np.ndarray], view: int, level: int, config: LiftConfig
 ) -> Gaussians:
     image, inverse, mask = posed.images[view], surfaces[view].inverse_depth, posed.masks[view]
     height = image.shape[0] >> level

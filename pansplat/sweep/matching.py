@@ -457,12 +457,7 @@ def _aggregate_columns(cost, total, guide, slot_map, sets, count, slots, penalti
 
 
 def aggregate_costs(
-    cost: np.ndarray,
-    guide: np.ndarray,
-    slot_map: np.ndarray,
-    slots: int,
-    config: AggregationConfig,
-    threads: int = 2,
+    cost: np.ndarray, guide: np.ndarray, slot_map: np.ndarray, slots: int, config: AggregationConfig, threads: int = 2
 ) -> np.ndarray:
     """Sum of the path costs of all eight directions, (h, w, sets * count).
 

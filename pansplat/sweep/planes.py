@@ -81,12 +81,7 @@ def _edge_normals(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     ones = np.ones((height, width))
     east = np.stack((np.cos(longitude) * ones, 0 * ones, -np.sin(longitude) * ones), axis=-1)
     south = np.stack(
-        (
-            -np.sin(latitude) * np.sin(longitude),
-            np.cos(latitude) * ones,
-            -np.sin(latitude) * np.cos(longitude),
-        ),
-        axis=-1,
+        (-np.sin(latitude) * np.sin(longitude), np.cos(latitude) * ones, -np.sin(latitude) * np.cos(longitude)), axis=-1
     )
     stretch = np.maximum(np.cos(latitude), 0.05)  # width of a pixel relative to the horizon
     normal = (along_u / stretch)[..., None] * east + along_v[..., None] * south

@@ -52,7 +52,7 @@ def write_heads(path: Path, backbone: Backbone) -> None:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Lpips:
+def squeeze(tmp_path_factory: pytest.TempPathFactory) -> Lpips:
     """Squeeze with random weights, float64."""
     folder = tmp_path_factory.mktemp("weights")
     write_classifier(folder / "squeezenet1_1-made.pth", "squeeze")
@@ -61,7 +61,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Lpips:
 
 
 @pytest.fixture
-def nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def empty_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The empty torch.hub cache of a machine without weights."""
     monkeypatch.delenv(FOLDER_VARIABLE, raising=False)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
@@ -84,45 +84,47 @@ def test_equals_the_lpips_package_with_trained_weights(shared: Path) -> None:
     assert float(metric(*pair())) == pytest.approx(TRAINED_VALUE, rel=TOLERANCE)
 
 
-def test_the_distance_is_symmetric_and_zero_for_equal_images(made: Lpips) -> None:
+def test_the_distance_is_symmetric_and_zero_for_equal_images(squeeze: Lpips) -> None:
     a, b = pair()
-    assert float(made(a, a)) == 0
-    assert float(made(a, b)) == pytest.approx(float(made(b, a)), rel=1e-12)
-    assert float(made(a, b)) > 0
+    assert float(squeeze(a, a)) == 0
+    assert float(squeeze(a, b)) == pytest.approx(float(squeeze(b, a)), rel=1e-12)
+    assert float(squeeze(a, b)) > 0
 
 
-def test_a_batch_equals_its_items(made: Lpips) -> None:
+def test_a_batch_equals_its_items(squeeze: Lpips) -> None:
     a, b = pair()
-    both = made(torch.cat((a, b)), torch.cat((b, b)))
-    assert both.tolist() == pytest.approx([float(made(a, b)), 0.0], abs=1e-12)
+    both = squeeze(torch.cat((a, b)), torch.cat((b, b)))
+    assert both.tolist() == pytest.approx([float(squeeze(a, b)), 0.0], abs=1e-12)
 
 
-def test_equal_weights_change_nothing(made: Lpips) -> None:
+def test_equal_weights_change_nothing(squeeze: Lpips) -> None:
     a, b = pair()
-    assert float(made(a, b, torch.full((1, 66, 100), 0.3).double())) == pytest.approx(float(made(a, b)), rel=1e-12)
+    assert float(squeeze(a, b, torch.full((1, 66, 100), 0.3).double())) == pytest.approx(
+        float(squeeze(a, b)), rel=1e-12
+    )
 
 
-def test_pixels_of_weight_zero_have_no_effect(made: Lpips) -> None:
+def test_pixels_of_weight_zero_have_no_effect(squeeze: Lpips) -> None:
     a, b = pair()
     weights = torch.ones(1, 66, 100, dtype=torch.float64)
     weights[:, 40:] = 0
-    spoilt = a.clone()
-    spoilt[..., 40:, :] = 7.0
-    assert float(made(spoilt, b, weights)) == pytest.approx(float(made(a, b, weights)), rel=1e-12)
+    changed = a.clone()
+    changed[..., 40:, :] = 7.0
+    assert float(squeeze(changed, b, weights)) == pytest.approx(float(squeeze(a, b, weights)), rel=1e-12)
     below = b.clone()
     below[..., :40, :] = a[..., :40, :]
-    assert float(made(a, below, weights)) == 0
-    assert float(made(a, b, torch.zeros_like(weights))) == 0
+    assert float(squeeze(a, below, weights)) == 0
+    assert float(squeeze(a, b, torch.zeros_like(weights))) == 0
 
 
-def test_gradients_equal_finite_differences(made: Lpips) -> None:
+def test_gradients_equal_finite_differences(squeeze: Lpips) -> None:
     a, b = pair()
     a = a.requires_grad_()
-    (gradient,) = torch.autograd.grad(made(a, b).sum(), a)
+    (gradient,) = torch.autograd.grad(squeeze(a, b).sum(), a)
     direction = torch.sin(torch.arange(a.numel()).double()).reshape(a.shape)
     step = 1e-6
     with torch.no_grad():
-        derivative = float(made(a + step * direction, b) - made(a - step * direction, b)) / (2 * step)
+        derivative = float(squeeze(a + step * direction, b) - squeeze(a - step * direction, b)) / (2 * step)
     assert float((gradient * direction).sum()) == pytest.approx(derivative, rel=1e-4)
 
 
@@ -138,32 +140,32 @@ def test_zero_activations_have_zero_distance_and_gradient() -> None:
     assert distance.item() == 0 and not gradient.any()
 
 
-def test_weights_are_not_trained(made: Lpips) -> None:
-    assert not any(parameter.requires_grad for parameter in made.parameters())
-    assert not made.train().training
+def test_weights_are_not_trained(squeeze: Lpips) -> None:
+    assert not any(parameter.requires_grad for parameter in squeeze.parameters())
+    assert not squeeze.train().training
 
 
-def test_small_images_are_refused(made: Lpips) -> None:
+def test_small_images_are_refused(squeeze: Lpips) -> None:
     small = torch.zeros(1, 3, 16, 32, dtype=torch.float64)
     with pytest.raises(InputError, match="32 pixels or more along each side, got 16x32"):
-        made(small, small)
+        squeeze(small, small)
 
 
-def test_missing_files_are_named_with_their_source_and_folders(nowhere: Path, tmp_path: Path) -> None:
+def test_missing_files_are_named_with_their_source_and_folders(empty_hub: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError) as error:
         load_lpips("vgg", tmp_path)
     for part in (
         "vgg16-397923af.pth (from https://download.pytorch.org/models/vgg16-397923af.pth)",
         "vgg.pth (from https://github.com/richzhang/PerceptualSimilarity",
         str(tmp_path),
-        str(nowhere),
+        str(empty_hub),
         FOLDER_VARIABLE,
     ):
         assert part in str(error.value)
     assert find_backbone(tmp_path) is None
 
 
-def test_only_missing_files_are_named(nowhere: Path, tmp_path: Path) -> None:
+def test_only_missing_files_are_named(empty_hub: Path, tmp_path: Path) -> None:
     write_heads(tmp_path / "alex.pth", "alex")
     with pytest.raises(InputError) as error:
         load_lpips("alex", tmp_path)
@@ -172,9 +174,9 @@ def test_only_missing_files_are_named(nowhere: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("place", ["folder", "variable", "hub"])
 def test_files_are_found_in_every_folder(
-    place: str, nowhere: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    place: str, empty_hub: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = nowhere if place == "hub" else tmp_path / "mine"
+    folder = empty_hub if place == "hub" else tmp_path / "mine"
     (folder / "lpips_heads").mkdir(parents=True)
     write_classifier(folder / "squeezenet1_1-b8a52dc0.pth", "squeeze")
     write_heads(folder / "lpips_heads" / "squeeze.pth", "squeeze")
@@ -185,7 +187,7 @@ def test_files_are_found_in_every_folder(
     assert load_lpips("squeeze", given).name == "lpips-squeeze"
 
 
-def test_a_file_of_another_classifier_is_refused(nowhere: Path, tmp_path: Path) -> None:
+def test_a_file_of_another_classifier_is_refused(empty_hub: Path, tmp_path: Path) -> None:
     write_classifier(tmp_path / "vgg16.pth", "alex")
     write_heads(tmp_path / "vgg.pth", "vgg")
     with pytest.raises(
@@ -198,18 +200,18 @@ def test_a_file_of_another_classifier_is_refused(nowhere: Path, tmp_path: Path) 
 def vgg() -> Lpips:
     """VGG with random weights, float64."""
     torch.manual_seed(0)
-    made = Lpips("vgg").double()
-    for head in made.heads:
+    metric = Lpips("vgg").double()
+    for head in metric.heads:
         head.uniform_()
-    return made
+    return metric
 
 
-def measured(metric: Lpips, size: tuple[int, int], weighed: bool) -> tuple[torch.Tensor, torch.Tensor]:
+def measure_distances(metric: Lpips, size: tuple[int, int], weighted: bool) -> tuple[torch.Tensor, torch.Tensor]:
     """The distances of two pairs of images, and their gradient."""
     generator = torch.Generator().manual_seed(1)
     shape = (2, 3, *size)
     a, b = (torch.rand(shape, generator=generator, dtype=torch.float64) for _ in range(2))
-    weights = torch.rand(2, *size, generator=generator, dtype=torch.float64) if weighed else None
+    weights = torch.rand(2, *size, generator=generator, dtype=torch.float64) if weighted else None
     a.requires_grad_()
     found = metric(a, b, weights)
     found.sum().backward()
@@ -218,16 +220,16 @@ def measured(metric: Lpips, size: tuple[int, int], weighed: bool) -> tuple[torch
 
 
 @pytest.mark.parametrize(
-    ("size", "pixels", "weighed"),
+    ("size", "pixels", "weighted"),
     [((64, 48), 1000, False), ((67, 33), 300, True), ((70, 40), 600, False), ((35, 32), 1, True)],
 )
 def test_bands_change_neither_distances_nor_gradients(
-    size: tuple[int, int], pixels: int, weighed: bool, vgg: Lpips, monkeypatch: pytest.MonkeyPatch
+    size: tuple[int, int], pixels: int, weighted: bool, vgg: Lpips, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    expected, expected_gradient = measured(vgg, size, weighed)
+    expected, expected_gradient = measure_distances(vgg, size, weighted)
     monkeypatch.setattr(lpips, "_WHOLE", 0)
     monkeypatch.setattr(lpips, "_BAND", pixels)
-    found, gradient = measured(vgg, size, weighed)
+    found, gradient = measure_distances(vgg, size, weighted)
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-14)
     torch.testing.assert_close(gradient, expected_gradient, rtol=1e-9, atol=1e-9 * float(expected_gradient.abs().max()))
     assert float(expected.min()) > 0.01

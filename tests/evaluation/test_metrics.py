@@ -155,7 +155,7 @@ def pose_at(x: float, quat: tuple[float, ...] = (1, 0, 0, 0)) -> torch.Tensor:
     return pose
 
 
-def sky(pose: torch.Tensor, height: int = 64) -> torch.Tensor:
+def render_sky(pose: torch.Tensor, height: int = 64) -> torch.Tensor:
     """A panorama of smooth colours at infinity."""
     directions = pixel_directions(height, 2 * height, dtype=torch.float64) @ pose[:3, :3].T
     return (0.5 + 0.4 * torch.sin(2 * directions + directions.roll(1, -1))).permute(2, 0, 1).float()
@@ -164,12 +164,12 @@ def sky(pose: torch.Tensor, height: int = 64) -> torch.Tensor:
 def test_the_cross_fade_is_exact_for_a_scene_at_infinity() -> None:
     poses = [pose_at(0, (0.9, 0.2, 0.4, -0.1)), pose_at(1, (0.3, -0.8, 0.1, 0.5))]
     target = pose_at(0.3, (0.7, 0.1, -0.6, 0.3))
-    faded = cross_fade(torch.stack([sky(p) for p in poses]), torch.stack(poses), target)
-    assert float((faded - sky(target)).abs().max()) < 5e-3  # bilinear sampling
+    faded = cross_fade(torch.stack([render_sky(p) for p in poses]), torch.stack(poses), target)
+    assert float((faded - render_sky(target)).abs().max()) < 5e-3  # bilinear sampling
 
 
 def test_the_cross_fade_at_an_input_is_that_input() -> None:
-    images = torch.stack((sky(pose_at(0)), torch.rand(3, 64, 128)))
+    images = torch.stack((render_sky(pose_at(0)), torch.rand(3, 64, 128)))
     faded = cross_fade(images, torch.stack((pose_at(0), pose_at(1))), pose_at(0))
     torch.testing.assert_close(faded, images[0], atol=1e-5, rtol=0)
 

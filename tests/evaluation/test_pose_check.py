@@ -23,7 +23,7 @@ def _pose(quat: tuple[float, ...], centre: tuple[float, ...]) -> torch.Tensor:
     return pose
 
 
-def _photograph(cam2world: torch.Tensor) -> torch.Tensor:
+def _render_room(cam2world: torch.Tensor) -> torch.Tensor:
     """A textured box room, ray cast."""
     d = pixel_directions(_HEIGHT, 2 * _HEIGHT, dtype=torch.float64) @ cam2world[:3, :3].T
     walls = torch.tensor((2.5, 1.5, 3.0), dtype=torch.float64)
@@ -39,7 +39,7 @@ def _photograph(cam2world: torch.Tensor) -> torch.Tensor:
 
 def _views(*poses: torch.Tensor, near: float = 0.45, far: float = 10.0) -> Views:
     return Views(
-        torch.stack([_photograph(pose) for pose in poses]),
+        torch.stack([_render_room(pose) for pose in poses]),
         torch.stack(poses),
         torch.ones(len(poses), _HEIGHT, 2 * _HEIGHT, dtype=torch.bool),
         near,

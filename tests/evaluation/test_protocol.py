@@ -133,16 +133,13 @@ def methods(protocol: str = "m3d"):
     return list_methods(Sphere(), protocol)
 
 
-# The sets
-
-
 def test_the_sets_of_a_protocol_are_the_columns_of_its_table(tmp_path: Path) -> None:
     for protocol, layout in LAYOUTS.items():
         sets = find_sets(protocol, tmp_path, OPTIONS)
         assert tuple(found.name for found in sets) == layout.sets
 
 
-def test_missing_data_is_named_with_its_folder(tmp_path: Path) -> None:
+def test_missing_data_and_a_missing_root_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError) as error:
         run_protocol("m3d", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
     for distance in ("0.5", "0.75", "1.0"):
@@ -153,9 +150,6 @@ def test_missing_data_is_named_with_its_folder(tmp_path: Path) -> None:
             run_protocol(protocol, tmp_path, methods(), tmp_path / "out", options=OPTIONS)
         assert folder in str(error.value)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_missing_root_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="needed the folder that holds the test data"):
         find_sets("m3d", tmp_path / "nowhere", OPTIONS)
 
@@ -205,9 +199,6 @@ def test_the_target_of_the_frame_distance_is_the_middle_frame(tmp_path: Path) ->
     assert not sequences and "VID_*" in missing
 
 
-# Rows
-
-
 def test_networks_are_blended_jointly_and_on_real_scenes_also_deferred() -> None:
     network = Network()
     assert [m.blend for m in list_methods(network, "m3d")] == ["joint"]
@@ -215,9 +206,6 @@ def test_networks_are_blended_jointly_and_on_real_scenes_also_deferred() -> None
     assert [m.blend for m in list_methods(network, "360loc", "deferred")] == ["deferred"]
     assert [m.blend for m in list_methods(Sphere(), "m3d")] == ["deferred"]
     assert list_methods(network, "insta360", name="mine")[1].name == "ours, mine + deferred blending"
-
-
-# Metrics
 
 
 def test_metrics_are_those_of_the_written_images(tmp_path: Path) -> None:
@@ -287,10 +275,7 @@ def test_lpips_is_optional(tmp_path: Path) -> None:
     assert any("not comparable" in note for note in report_notes(result))
 
 
-# Missing and invalid data
-
-
-def test_unreadable_cases_are_skipped_and_named(tmp_path: Path) -> None:
+def test_unreadable_cases_are_skipped_and_named_unless_all_are_unreadable(tmp_path: Path) -> None:
     folder = write_triplets(tmp_path, "replica_dist_0.5", scenes=2)
     (folder / "00000001" / "02" / "tran.txt").unlink()
     result = run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
@@ -299,12 +284,8 @@ def test_unreadable_cases_are_skipped_and_named(tmp_path: Path) -> None:
     assert line.startswith("Replica 1.0 m, 00000001: ") and "tran.txt" in line
     assert any(line in note for note in report_notes(result))
     assert json.loads((tmp_path / "out" / "results.json").read_text())["skipped"] == [line]
-
-
-def test_a_set_without_a_readable_case_is_an_error(tmp_path: Path) -> None:
-    folder = write_triplets(tmp_path, "replica_dist_0.5", scenes=1)
     (folder / "00000000" / "02" / "tran.txt").unlink()
-    with pytest.raises(InputError, match=r"none of the 1 cases can be used.*tran\.txt"):
+    with pytest.raises(InputError, match=r"none of the 2 cases can be used.*tran\.txt"):
         run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
 
 
@@ -331,9 +312,6 @@ def test_non_finite_values_become_null() -> None:
     row = SetResult("Replica 1.0 m", "ours", [Score("a", "b", math.inf, math.inf, 1.0, None)])
     result = ProtocolResult("replica", 512, None, [row]).as_json()
     assert json.loads(json.dumps(result, allow_nan=False))["results"][0]["ws_psnr"] is None
-
-
-# The figure
 
 
 def test_the_figure_has_a_line_for_each_method(tmp_path: Path) -> None:

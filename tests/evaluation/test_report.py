@@ -65,7 +65,7 @@ def write_triplet(folder: Path, *, target: bool = True) -> Path:
     return folder
 
 
-def read(path: str | Path) -> Tensor:
+def read_image(path: str | Path) -> Tensor:
     return torch.from_numpy(np.array(Image.open(path)) / np.float32(255)).permute(2, 0, 1)
 
 
@@ -92,12 +92,12 @@ def test_results_have_the_documented_fields_and_files(folder: Path, case: Case) 
 
 def test_metrics_are_those_of_the_written_images(folder: Path, case: Case) -> None:
     assert json.loads((folder / "out" / "results.json").read_text()) == [case.as_json()]
-    prediction, target = read(case.prediction), read(case.target)
-    torch.testing.assert_close(target, read(folder / "room" / "c.png"))
+    prediction, target = read_image(case.prediction), read_image(case.target)
+    torch.testing.assert_close(target, read_image(folder / "room" / "c.png"))
     assert case.ws_psnr == pytest.approx(ws_psnr(prediction, target), abs=0.01)  # 8 bits
     assert case.psnr == pytest.approx(psnr(prediction, target), abs=0.01)
     assert case.ssim == pytest.approx(ssim(prediction, target), abs=1e-3)
-    inputs = [read(folder / "room" / name) for name in ("a.png", "b.png")]
+    inputs = [read_image(folder / "room" / name) for name in ("a.png", "b.png")]
     assert case.cross_fade_ws_psnr == pytest.approx(ws_psnr(sum(inputs) / 2, target), abs=0.01)
 
 
@@ -145,7 +145,7 @@ def test_a_masked_target_has_a_second_value_in_the_table_only(tmp_path: Path) ->
     mask[-4:] = 0
     Image.fromarray(mask).save(folder / "c_mask.png")
     (case,) = evaluate(load_pairs(folder), GreyBall(), tmp_path / "out", height=HEIGHT)
-    target, prediction = read(case.target), read(case.prediction)
+    target, prediction = read_image(case.target), read_image(case.prediction)
     assert case.masked_ws_psnr == pytest.approx(ws_psnr(prediction, target, mask=torch.from_numpy(mask > 0)), abs=0.01)
     assert case.ws_psnr == pytest.approx(ws_psnr(prediction, target), abs=0.01)
     assert list(json.loads((tmp_path / "out" / "results.json").read_text())[0]) == KEYS
@@ -159,7 +159,7 @@ def test_lpips_is_optional(folder: Path, tmp_path: Path) -> None:
     (case,) = evaluate(pairs, GreyBall(), tmp_path / "out", height=32, lpips=metric)
     (result,) = json.loads((tmp_path / "out" / "results.json").read_text())
     assert set(result) == {*KEYS, "lpips"} and result["lpips"] == case.lpips
-    assert case.lpips == pytest.approx(metric.distance(read(case.prediction), read(case.target)), abs=1e-3)
+    assert case.lpips == pytest.approx(metric.distance(read_image(case.prediction), read_image(case.target)), abs=1e-3)
     assert "LPIPS" in [str(column.header) for column in results_table([case]).columns]
 
 

@@ -8,7 +8,7 @@ from rich.console import Console
 from pansplat.evaluation.tables import DEPTH_LAYOUT, LAYOUTS, TableRow, markdown_table, rich_table
 
 
-def printed(layout, ours) -> str:
+def print_table(layout, ours) -> str:
     console = Console(width=160, record=True, file=io.StringIO())
     console.print(rich_table(layout, ours))
     return console.export_text()
@@ -40,7 +40,7 @@ def test_every_value_has_a_column_and_is_plausible(layout) -> None:
             assert low < value < high, (row.method, metric)
 
 
-@pytest.mark.parametrize("text", [printed, markdown_table])
+@pytest.mark.parametrize("text", [print_table, markdown_table])
 def test_our_rows_are_last_and_missing_values_are_dashes(text) -> None:
     layout = LAYOUTS["m3d"]
     ours = TableRow("ours, sweep", {("M3D 1.0 m", "ws_psnr"): 21.5, ("M3D 1.0 m", "ssim"): 0.75})

@@ -64,32 +64,29 @@ def test_changing_the_type_keeps_integer_labels():
 
 
 @pytest.fixture
-def increasing() -> Gaussians:
+def translucent() -> Gaussians:
     """Degree 4, with opacities in increasing order."""
     return dataclasses.replace(_make(50, 25), opacities=torch.linspace(0, 1, 50))
 
 
-def test_pruning_without_limits_changes_nothing(increasing):
-    gaussians = increasing
-    assert prune(gaussians) is gaussians
-    assert prune(gaussians, degree=4) is gaussians
+def test_pruning_without_limits_changes_nothing(translucent):
+    assert prune(translucent) is translucent
+    assert prune(translucent, degree=4) is translucent
 
 
-def test_pruning_keeps_the_opaque_gaussians(increasing):
-    gaussians = increasing
-    kept = prune(gaussians, min_opacity=float(gaussians.opacities[20]))
-    assert torch.equal(kept.opacities, gaussians.opacities[20:])
-    assert torch.equal(kept.harmonics, gaussians.harmonics[20:])
+def test_pruning_keeps_the_opaque_gaussians(translucent):
+    kept = prune(translucent, min_opacity=float(translucent.opacities[20]))
+    assert torch.equal(kept.opacities, translucent.opacities[20:])
+    assert torch.equal(kept.harmonics, translucent.harmonics[20:])
 
 
-def test_pruning_to_a_degree_keeps_the_lower_coefficients(increasing):
-    gaussians = increasing
+def test_pruning_to_a_degree_keeps_the_lower_coefficients(translucent):
     for degree in range(4):
-        kept = prune(gaussians, degree=degree)
-        assert kept.degree == degree and len(kept) == len(gaussians)
-        assert torch.equal(kept.harmonics, gaussians.harmonics[:, : (degree + 1) ** 2])
-        assert torch.equal(kept.means, gaussians.means)
-    assert prune(prune(gaussians, degree=1), degree=3).degree == 1
+        kept = prune(translucent, degree=degree)
+        assert kept.degree == degree and len(kept) == len(translucent)
+        assert torch.equal(kept.harmonics, translucent.harmonics[:, : (degree + 1) ** 2])
+        assert torch.equal(kept.means, translucent.means)
+    assert prune(prune(translucent, degree=1), degree=3).degree == 1
 
 
 def test_pose_between_starts_and_ends_at_the_cameras():

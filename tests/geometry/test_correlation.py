@@ -37,9 +37,6 @@ def _turn_about_y(angle):
     return pose
 
 
-# Warping
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("height", [8, 30, 64])
 def test_identity_pose_warps_to_identity(height, dtype):
@@ -115,9 +112,6 @@ def test_a_relative_pose_keeps_double_precision():
     assert relative_pose(moved[0].float(), moved[1].float()).dtype == torch.float64
     point = torch.tensor((1.0, 2.0, 3.0, 1.0), dtype=torch.float64)
     assert torch.allclose(near_origin[1] @ relative_pose(*near_origin) @ point, near_origin[0] @ point, atol=1e-12)
-
-
-# Correlation
 
 
 def _truth(reference, other, inverse_depth, pose, sampling):

@@ -69,7 +69,7 @@ def test_adjacent_faces_share_their_edge():
     assert torch.equal(rays[0, 25:30], rays[4, 0:5])  # the upper edge of down is the lower edge of front
 
 
-def test_a_panorama_returns_from_its_strip():
+def test_a_panorama_is_restored_from_its_strip():
     panorama = pixel_directions(64, 128, dtype=torch.float64).movedim(-1, 0)  # smooth and injective
     strip = strip_from_equirect(panorama, 65)
     back = equirect_from_strip(strip[None], strip_lookup(64))[0]

@@ -9,7 +9,7 @@ from pansplat.geometry.equirect import uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size, official_fibonacci_uv
 
 
-def test_lattice_sizes_are_the_papers():
+def test_lattice_sizes_equal_those_of_the_paper():
     sizes = {64: 1303, 128: 5215, 256: 20860, 512: 83443, 1024: 333772, 2048: 1335088, 4096: 5340353}
     assert {width: lattice_size(width) for width in sizes} == sizes
     assert 2 * sum(lattice_size(1024 >> level) for level in range(4)) == 886580

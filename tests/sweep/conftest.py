@@ -58,8 +58,8 @@ class Room:
     def cast(self, cam2world: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray]:
         """The panorama (h, 2h, 3), averaged over each pixel, and the radial depth (h, 2h) at pixel centres."""
         fine = ray_grid(height * self.supersample).astype(np.float64)
-        image = _PAINTS[self.paint](self._hits(fine, cam2world)[0].reshape(-1, 3)).reshape(fine.shape)
-        depth = self._hits(ray_grid(height).astype(np.float64), cam2world)[1]
+        image = _PAINTS[self.paint](self._intersect(fine, cam2world)[0].reshape(-1, 3)).reshape(fine.shape)
+        depth = self._intersect(ray_grid(height).astype(np.float64), cam2world)[1]
         return resize_sphere(image.astype(np.float32), height), depth
 
     def pose(self, position: tuple[float, float, float], rotation: np.ndarray | None = None) -> np.ndarray:
@@ -76,7 +76,7 @@ class Room:
         """Distances (..., 6) of points in room axes from the planes of the walls, the ceiling and the floor."""
         return np.concatenate((np.abs(points - self.low), np.abs(points - self.high)), axis=-1)
 
-    def _hits(self, rays: np.ndarray, cam2world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _intersect(self, rays: np.ndarray, cam2world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """First intersections of a camera's rays (h, w, 3): points in room axes, and world distances."""
         to_room = np.linalg.inv(self.placed)
         start = to_room[:3, :3] @ cam2world[:3, 3] + to_room[:3, 3]

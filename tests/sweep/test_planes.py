@@ -150,7 +150,7 @@ def test_votes_support_a_plane_without_any_surface(empty_room):
     assert nothing.support(0, poses[0], np.array((1 / distance,))).max() == 0
 
 
-def test_detected_floor_and_ceiling_precede_those_of_surfaces(planes, empty_room):
+def test_a_detected_floor_overrides_the_floor_of_surfaces(planes, empty_room):
     pose = empty_room.posed.cam2world[0]
     voted = dataclasses.replace(planes, floor_ceiling=(2.0, -np.inf)).vertical_bounds(pose)
     below = 2.0 - (pose[1, 3] - planes.origin[1])
