@@ -7,19 +7,19 @@ Source: docs/rendering.md.
 ALPHA_CUT = 1 / 255  # smaller alphas count as zero: less than one step of an 8-bit image
 MAX_ALPHA = 0.99  # keeps 1 - alpha, by which gradients divide, away from zero
 FILTER_VARIANCE = {"angular": 0.1, "3dgs": 0.3}  # pixel^2, added by the low-pass filters
-NEAR = 0.05  # metres; Gaussians whose mean is nearer are not drawn, unless the caller chooses another distance
-EWA_NEAR_FACTOR = 0.2  # of `near`: the classic renderer culls at this depth along the optical axis
-EWA_CLAMP = 1.3  # half sides of the image: the classic Jacobian is taken no farther from its centre
+NEAR = 0.05  # metres, by default; Gaussians whose mean is nearer are not rasterised
+EWA_NEAR_FACTOR = 0.2  # of `near`: 3DGS culls at this depth along the optical axis
+EWA_CLAMP = 1.3  # half sides of the image: 3DGS evaluates its Jacobian no farther from the centre
 
 # Early termination: a tile is finished once no pixel's transmittance exceeds this.
 TRANSMITTANCE_CUT = {"numba": 1e-7, "triton": 1e-4}
 
-# Rounding: the same Gaussians are drawn, and have a gradient, in every backend.
+# Rounding: every backend rasterises the same Gaussians, and gives gradients to the same ones.
 ALPHA_CUT_ROUNDING = 1e-7  # relative; an alpha equal to the cut is kept
-OPACITY_CUT = ALPHA_CUT * (1 - 1e-6)  # Gaussians of less opacity are removed first
+OPACITY_CUT = ALPHA_CUT * (1 - 1e-6)  # Gaussians of less opacity are removed before projection
 KAPPA_MARGIN = 1e-5  # added to kappa, so that bounding boxes contain every pixel that reaches the cut
 MAX_MAGNITUDE = 1e30  # products of larger parameters could overflow
 MAX_SCALE_RATIO = 1e12  # of scale to distance; beyond it the products of docs/rendering.md, section 2, could overflow
-MIN_EIGENVALUE_RATIO = -1e-3  # of a covariance, smallest to largest: what rounding to bfloat16 can leave
-MIN_COMPENSATION = 1e-12  # of det B / det B': keeps its root differentiable; less opacity never reaches the cut
-MIN_EWA_VARIANCE = 1e-12  # pixel^2; rounding can leave the determinant of a needle at or below zero
+MIN_EIGENVALUE_RATIO = -1e-3  # of a covariance, smallest to largest: bfloat16's rounding stays above it
+MIN_COMPENSATION = 1e-12  # of det B / det B': keeps its root differentiable; below it alpha is always cut
+MIN_EWA_VARIANCE = 1e-12  # pixel^2; the determinant of a needle can round to zero or less

@@ -1,4 +1,4 @@
-"""Rasterising Gaussians: one call over three backends, and blending of the images of single views."""
+"""Rasterising Gaussians: one function for three backends, and deferred blending of the images of single views."""
 
 from pansplat.geometry.pose import blend_weights
 from pansplat.rendering.blend import blend

@@ -15,7 +15,7 @@ from pansplat.rendering.rasterize import Rendering
 def blend(renderings: Sequence[Rendering], weights: Float[Tensor, "view"]) -> Rendering:
     """Mix images of the same size; at each pixel a view's weight is multiplied by its alpha.
 
-    Where all views of positive weight are empty, the others are mixed by their alpha.
+    Where all views of positive weight are empty, the others are mixed in proportion to their alpha.
     """
     if len(renderings) < 1 or weights.shape != (len(renderings),):
         raise ValueError(

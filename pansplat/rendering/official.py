@@ -1,4 +1,4 @@
-"""Images as the official code draws them, its defects included, for the figures that were published of its weights.
+"""Images equal to those of the official code, its defects included, to reproduce its published metrics.
 
 Source: docs/official.md, section 10.
 """
@@ -16,16 +16,16 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.rasterize import Backend, RasterOptions, Rendering, rasterize
 
 OFFICIAL = RasterOptions(kernel="ewa", order="z", lowpass="3dgs", stitching="official")
-"""The official code's choices; a pinhole image or a single face needs stitching="seamless"."""
+"""The official code's options; a pinhole image or a single face needs stitching="seamless"."""
 
 
 def official_face_size(height: int) -> int:
-    """Side of the official code's cube faces for a panorama of that height, pixels."""
+    """Side of the official code's cube faces for a panorama of this height, pixels."""
     return height // 2
 
 
 def official_gaussians(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians with the colours that the official rasteriser gives them: harmonics of degree 3 at most."""
+    """Reduce the harmonics to those that the official rasteriser evaluates: degree 3 at most."""
     return replace(gaussians, harmonics=official_harmonics(gaussians.harmonics))
 
 
@@ -37,13 +37,13 @@ def rasterize_official(
     near: float,
     backend: Backend = "auto",
 ) -> Rendering:
-    """A panorama stitched from six faces of half its height, rasterised with `OFFICIAL`.
+    """Rasterise a panorama with `OFFICIAL`, stitched from six faces of half its height.
 
     Args:
         cam2world: pose of the camera, OpenCV axes, metres.
         size: height, a multiple of 4, and width of the panorama, pixels.
-        near: of the prediction, metres; Gaussians nearer than a fifth of it are not drawn. The official code measures
-            that along a face's axis.
+        near: of the prediction, metres; Gaussians nearer than a fifth of it are not rasterised. The official code
+            compares the depth along a face's axis with it instead.
         backend: see `rasterize`.
     """
     return rasterize(

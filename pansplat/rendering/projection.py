@@ -1,6 +1,6 @@
-"""Projection: which Gaussians are drawn, what one camera sees of them, their footprints and their bounding boxes.
+"""Projection: selection of Gaussians, their projection to one camera, footprints and bounding boxes.
 
-Source: docs/rendering.md, sections 1 to 3 and 5. Geometry is float64 whatever the Gaussians' type is; the numbers that
+Source: docs/rendering.md, sections 1 to 3 and 5. Geometry is float64 for Gaussians of any type; the numbers that
 compositing reads have the Gaussians' type.
 """
 
@@ -41,13 +41,13 @@ _UNBOUNDED = 1e9  # pixels, far outside any image
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The Gaussians to project, and how many of the others were left out.
+    """The Gaussians to project, and the number of the others.
 
     Attributes:
         covariances: of the same Gaussians, if given in place of scales and quats.
-        total: number of Gaussians given.
-        dropped: not finite.
-        near: nearer than `near`.
+        total: number of Gaussians before the selection.
+        dropped: number of Gaussians that are not finite.
+        near: number of Gaussians nearer than `near`.
     """
 
     gaussians: Gaussians
@@ -60,17 +60,14 @@ class Selection:
 def select_drawable(
     gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None, pose: Float[Tensor, "4 4"], options: RasterOptions
 ) -> Selection:
-    """Select before any arithmetic, so that the gradients of all other Gaussians are exactly zero.
-
-    Args:
-        pose: cam2world.
+    """Select Gaussians before any arithmetic, so that the gradients of all others are exactly zero.
 
     Raises:
         InputError: `options.strict` and a Gaussian is not finite.
     """
-    radius = _radius(gaussians, pose)
+    radius = _compute_radius(gaussians, pose)
     close = radius < options.near
-    usable = _usable(gaussians, covariances, radius, close)
+    usable = _are_usable(gaussians, covariances, radius, close)
     dropped = len(gaussians) - int(usable.sum())
     if options.strict and dropped:
         raise InputError(not_finite_message(gaussians, covariances, pose, options))
@@ -86,9 +83,9 @@ def select_drawable(
 def not_finite_message(
     gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None, pose: Float[Tensor, "4 4"], options: RasterOptions
 ) -> str:
-    """The error message for Gaussians of which at least one is not finite."""
-    radius = _radius(gaussians, pose)
-    wrong = torch.nonzero(~_usable(gaussians, covariances, radius, radius < options.near))[:, 0]
+    """Error message with the number of Gaussians that are not finite."""
+    radius = _compute_radius(gaussians, pose)
+    wrong = torch.nonzero(~_are_usable(gaussians, covariances, radius, radius < options.near))[:, 0]
     return (
         f"`gaussians` must hold only finite numbers, got {len(wrong)} of {len(gaussians)} that do not (the first is "
         f"number {int(wrong[0])}); remove them, or render with strict=False to leave them out"
@@ -96,17 +93,17 @@ def not_finite_message(
 
 
 @torch.no_grad()
-def _radius(gaussians: Gaussians, pose: Tensor) -> Float[Tensor, "n"]:
+def _compute_radius(gaussians: Gaussians, pose: Tensor) -> Float[Tensor, "n"]:
     return torch.linalg.vector_norm(gaussians.means.double() - pose[:3, 3], dim=1)
 
 
 @torch.no_grad()
-def _usable(gaussians: Gaussians, covariances: Tensor | None, radius: Tensor, close: Tensor) -> Bool[Tensor, "n"]:
-    return _is_finite(gaussians, covariances) & (close | _has_valid_shape(gaussians, covariances, radius))
+def _are_usable(gaussians: Gaussians, covariances: Tensor | None, radius: Tensor, close: Tensor) -> Bool[Tensor, "n"]:
+    return _are_finite(gaussians, covariances) & (close | _have_valid_shapes(gaussians, covariances, radius))
 
 
-def _is_finite(gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None) -> Bool[Tensor, "n"]:
-    """Whether all numbers of a Gaussian are finite, and so small that products do not overflow."""
+def _are_finite(gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None) -> Bool[Tensor, "n"]:
+    """Which Gaussians have finite numbers only, small enough for their products."""
     shape = (gaussians.scales, gaussians.quats) if covariances is None else (covariances,)
     keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     for field in (gaussians.means, *shape, gaussians.opacities, gaussians.harmonics):
@@ -114,15 +111,15 @@ def _is_finite(gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None)
     return keep
 
 
-def _has_valid_shape(
+def _have_valid_shapes(
     gaussians: Gaussians, covariances: Float[Tensor, "n 3 3"] | None, radius: Float[Tensor, "n"]
 ) -> Bool[Tensor, "n"]:
-    """Whether a Gaussian is not too large for its distance, and its covariance positive semidefinite."""
+    """Which Gaussians are not too large for their distance, with a positive semidefinite covariance."""
     if covariances is None:
         return gaussians.scales.detach().double().abs().amax(dim=1) <= MAX_SCALE_RATIO * radius
     relative = covariances.detach().double() / radius.square()[:, None, None]
     largest = relative.diagonal(dim1=1, dim2=2).amax(dim=1)
-    # Rounding to float32 or less makes the smallest variance of a disc slightly negative.
+    # Rounding to float32 or less can make the smallest variance of a disc slightly negative.
     finite = torch.where(torch.isfinite(relative), relative, 0)
     smallest = torch.linalg.eigvalsh(0.5 * (finite + finite.transpose(1, 2)))[:, 0]
     return (largest <= MAX_SCALE_RATIO**2) & (smallest >= MIN_EIGENVALUE_RATIO * largest)
@@ -139,7 +136,7 @@ class ProjectedGaussians(NamedTuple):
         radius: distance of the mean, metres, float64.
         covariance: C' of docs/rendering.md, camera axes, float64.
         peak: opacity after the filter's compensation.
-        values: channels (RGB) seen from the camera, and the distance: the quantities that are averaged along a ray.
+        values: colour (RGB) seen from the camera, then the distance; compositing averages both along a ray.
         rows: a, b, l of the exact kernel; none for `ewa`, which computes them for each image plane.
         radial_variance: S', the variance along the ray.
     """
@@ -165,11 +162,11 @@ def project_gaussians(
     """Project Gaussians in chunks; under autograd, backward recomputes each chunk to bound the memory.
 
     Args:
-        gaussians: all drawable (see `select_drawable`).
+        gaussians: selected by `select_drawable`.
         covariances: in place of the Gaussians' scales and quats, square metres.
         cam2world: float64.
         filter_variance: e^2, added across the ray, radians^2.
-        compensate: scale the opacity by the loss of energy that the filter would otherwise add.
+        compensate: lower the opacity so that the filter does not add energy.
         exact: compute the rows of the exact kernel.
     """
     shape = (gaussians.quats, gaussians.scales) if covariances is None else (covariances,)
@@ -203,20 +200,24 @@ def _project_chunk(
     world2cam = cam2world[:3, :3].T
     frame = torch.stack((*tangent_frame(direction), direction), dim=1)
     if len(shape) == 2:
-        own = _shape_from_axes(world2cam @ rotations_from_quats(shape[0].double()), shape[1], radius, frame)
+        unfiltered = _shape_from_axes(world2cam @ rotations_from_quats(shape[0].double()), shape[1], radius, frame)
     else:
-        own = _shape_from_covariance(world2cam @ shape[0].double() @ world2cam.T, radius, frame)
+        unfiltered = _shape_from_covariance(world2cam @ shape[0].double() @ world2cam.T, radius, frame)
     outer = direction[:, :, None] * direction[:, None, :]
-    covariance = own.covariance + filter_variance * (torch.eye(3, dtype=torch.float64, device=means.device) - outer)
-    det_filtered = own.det_across + filter_variance * own.trace_across + filter_variance**2
+    covariance = unfiltered.covariance + filter_variance * (
+        torch.eye(3, dtype=torch.float64, device=means.device) - outer
+    )
+    det_filtered = unfiltered.det_across + filter_variance * unfiltered.trace_across + filter_variance**2
     peak = opacities.double()
     if compensate:
-        peak = peak * torch.sqrt((own.det_across / det_filtered).clamp_min(MIN_COMPENSATION))
+        peak = peak * torch.sqrt((unfiltered.det_across / det_filtered).clamp_min(MIN_COMPENSATION))
     rows, radial_variance = covariance.new_zeros(len(means), 0, 3), torch.zeros_like(radius)
     if exact:
-        radial_variance = filter_variance**2 * own.radial_variance + filter_variance * own.mixed + own.det
+        radial_variance = (
+            filter_variance**2 * unfiltered.radial_variance + filter_variance * unfiltered.mixed + unfiltered.det
+        )
         radial_variance = radial_variance / det_filtered
-        rows = _ray_rows(frame, own.in_frame, filter_variance, det_filtered)
+        rows = _compute_ray_rows(frame, unfiltered.in_frame, filter_variance, det_filtered)
     values = torch.cat((colours, radius.to(dtype)[:, None]), dim=1)
     return ProjectedGaussians(
         direction, radius, covariance, peak.to(dtype), values, rows.to(dtype), radial_variance.to(dtype)
@@ -245,13 +246,16 @@ class _Shape(NamedTuple):
 
 
 def _shape_from_axes(
-    own: Float[Tensor, "n 3 3"], scales: Float[Tensor, "n 3"], radius: Float[Tensor, "n"], frame: Float[Tensor, "n 3 3"]
+    rotation: Float[Tensor, "n 3 3"],
+    scales: Float[Tensor, "n 3"],
+    radius: Float[Tensor, "n"],
+    frame: Float[Tensor, "n 3 3"],
 ) -> _Shape:
-    """From unit axes (columns, camera frame) and scales, by sums of squares, so that nothing cancels."""
+    """Compute the shape from a rotation to camera axes and scales, by sums of squares, without cancellation."""
     size = scales.double() / radius[:, None]
-    axes = own * size[:, None, :]
+    axes = rotation * size[:, None, :]
     turned = frame @ axes
-    cosine2 = (frame[:, 2:] @ own)[:, 0, :].square()
+    cosine2 = (frame[:, 2:] @ rotation)[:, 0, :].square()
     minors2 = (size[:, (1, 2, 0)] * size[:, (2, 0, 1)]).square()
     return _Shape(
         covariance=axes @ axes.transpose(1, 2),
@@ -267,7 +271,7 @@ def _shape_from_axes(
 def _shape_from_covariance(
     covariance: Float[Tensor, "n 3 3"], radius: Float[Tensor, "n"], frame: Float[Tensor, "n 3 3"]
 ) -> _Shape:
-    """From a covariance in camera axes; minors that rounding made negative are set to zero."""
+    """Compute the shape from covariances in camera axes; minors that rounding made negative are set to zero."""
     c = 0.5 * (covariance + covariance.transpose(1, 2)) / radius.square()[:, None, None]
     turned = frame @ c @ frame.transpose(1, 2)
     uu, vv, nn = turned.diagonal(dim1=1, dim2=2).unbind(1)
@@ -284,13 +288,13 @@ def _shape_from_covariance(
     )
 
 
-def _ray_rows(
+def _compute_ray_rows(
     frame: Float[Tensor, "n 3 3"],
     in_frame: Float[Tensor, "n 3 3"],
     filter_variance: float,
     det_filtered: Float[Tensor, "n"],
 ) -> Float[Tensor, "n 3 3"]:
-    """Rows a, b, l of section 3: whitened tangent axes, and the front row."""
+    """Compute rows a, b, l of section 3: whitened tangent axes, and the row along the ray."""
     right, down, direction = frame.unbind(1)
     b_uu, b_vv = in_frame[:, 0, 0] + filter_variance, in_frame[:, 1, 1] + filter_variance
     b_uv, c_u, c_v = in_frame[:, 0, 1], in_frame[:, 0, 2], in_frame[:, 1, 2]
@@ -336,7 +340,7 @@ class Footprints(NamedTuple):
 def compute_footprints(
     projected: ProjectedGaussians, plane: ImagePlane, options: RasterOptions
 ) -> tuple[Footprints, Float[Tensor, "n 4"]]:
-    """Footprints on an image plane, and their bounding boxes (left, right, top, bottom; pixels)."""
+    """Compute footprints on an image plane, and their bounding boxes (left, right, top, bottom; pixels)."""
     if options.kernel == "ewa":
         footprints, variances = ewa_footprints(projected, plane.rotation, plane.size, plane.focal, options.dilation)
         return footprints, ewa_boxes(footprints.point.detach(), variances, kappa(projected.peak.detach()))
@@ -357,7 +361,7 @@ def ray_footprints(projected: ProjectedGaussians) -> Footprints:
 def ewa_footprints(
     projected: ProjectedGaussians, rotation: Float[Tensor, "3 3"], size: tuple[int, int], focal: float, dilation: float
 ) -> tuple[Footprints, Float[Tensor, "n 2"]]:
-    """Footprints of EWA splatting on a pinhole image, points in pixels, and their variances in x and y.
+    """Compute EWA footprints on a pinhole image, with points in pixels, and their variances in x and y.
 
     Args:
         projected: all with a positive depth in the image plane's axes.
@@ -392,7 +396,7 @@ def ewa_footprints(
 
 
 def kappa(peak: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Largest q at which alpha reaches the cut, rounded up; negative where it never does."""
+    """Largest q at which alpha reaches the cut, rounded up; negative where the peak is below the cut."""
     return 2 * torch.log(peak.double().clamp_min(1e-30) / ALPHA_CUT) + KAPPA_MARGIN
 
 
@@ -441,7 +445,7 @@ def pinhole_boxes(
             edge = focal * (middle + sign * root) / safe + 0.5 * extent
             edges.append(torch.where(crosses, torch.full_like(edge, sign * _UNBOUNDED), edge))
     unseen = (kappas < 0) | (~crosses & (n_z < 0))
-    # Gaussians that cross z = 0 have no box, but most of them lie outside the view frustum.
+    # Gaussians that cross z = 0 have no bound, but most of them lie outside the view frustum.
     for normal in _frustum_normals(size, focal, direction):
         distance = direction @ normal
         clear = distance.square() > kappas * (covariance @ normal @ normal)
@@ -471,7 +475,7 @@ def equirect_boxes(
     kappas: Float[Tensor, "n"],
     size: tuple[int, int],
 ) -> Float[Tensor, "n 4"]:
-    """Boxes of the exact kernel on a panorama, pixels; they wrap: left may be negative, right beyond the width."""
+    """Boxes of the exact kernel on a panorama, pixels; left may be negative and right beyond the width: boxes wrap."""
     height, width = size
     x, y, z = direction.unbind(1)
     kappas = kappas[:, None]
@@ -508,7 +512,7 @@ def equirect_boxes(
 
 
 def _cone_slopes(mixed: Tensor, side: Tensor, ahead: Tensor) -> Float[Tensor, "n 2"]:
-    """Lower and upper slope of a cone with dual entries -mixed, -side and ahead; ahead <= 0 is replaced by 1."""
+    """Lower and upper slope of a cone with dual entries -mixed, -side and ahead; 1 replaces ahead <= 0."""
     ahead = torch.where(ahead > 0, ahead, torch.ones_like(ahead))
     root = torch.sqrt((mixed.square() + side * ahead).clamp_min(0))
     return torch.cat((-mixed - root, -mixed + root), dim=1) / ahead

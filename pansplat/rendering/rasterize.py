@@ -1,4 +1,4 @@
-"""The call that rasterises Gaussians: options, arguments, the backends' protocol, background and normalisation.
+"""The function `rasterize`: options, arguments, the protocol of backends, background and normalisation.
 
 Source: docs/rendering.md; PanSplat, section 3.4; docs/adr/0005 for why there are several backends.
 """
@@ -26,20 +26,20 @@ Order = Literal["radial", "z"]
 Lowpass = Literal["angular", "3dgs"]
 Backend = Literal["auto", "torch", "numba", "triton"]
 
-_MODULES = {
+_BACKEND_MODULES = {
     "torch": "pansplat.rendering.reference",
     "numba": "pansplat.rendering.cpu",
     "triton": "pansplat.rendering.cuda",
 }
 _MAX_POSE_ERROR = 1e-4
 
-_Arguments = ParamSpec("_Arguments")
-_Result = TypeVar("_Result")
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 
 @dataclass(frozen=True)
 class RasterOptions:
-    """Everything that changes an image except the scene, the camera and the layout.
+    """Options of an image, apart from scene, camera and layout.
 
     `pansplat.rendering.official.OFFICIAL` holds the options of the official code.
 
@@ -47,8 +47,8 @@ class RasterOptions:
         kernel: "ray" is exact; "ewa" is the approximation of 3DGS, for pinhole images and cube faces.
         order: sort by distance, or by depth along each image plane's optical axis as 3DGS does.
         lowpass: "angular" conserves energy; "3dgs" adds 0.3 pixel^2.
-        near: Gaussians whose mean is nearer are not drawn, metres.
-        strict: raise an error for Gaussians that are not finite, instead of leaving them out.
+        near: Gaussians whose mean is nearer are not rasterised, metres.
+        strict: raise an error for Gaussians that are not finite, instead of dropping them.
         stitching: of cube faces, "seamless", or "official" with the borders of the official code.
 
     Raises:
@@ -63,7 +63,6 @@ class RasterOptions:
     stitching: Stitching = "seamless"
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         _check_choice("kernel", self.kernel, Kernel)
         _check_choice("order", self.order, Order)
         _check_choice("lowpass", self.lowpass, Lowpass)
@@ -91,9 +90,9 @@ class RasterInfo:
 
     Attributes:
         total: Gaussians given.
-        dropped: not drawn because a number is not finite or too large, or a covariance is not positive.
-        near: not drawn because they are nearer than `near`.
-        visible: could reach the alpha cut somewhere in the image (summed over the faces of a cubemap).
+        dropped: Gaussians with a number that is not finite or too large, or a covariance that is not positive.
+        near: Gaussians nearer than `near`.
+        visible: Gaussians that can reach the alpha cut in the image (summed over the faces of a cubemap).
         intersections: pairs of a Gaussian and a raster tile.
         backend: its name.
         bytes: peak working memory, where the backend counts it.
@@ -125,9 +124,9 @@ class RasterSums:
 
 @runtime_checkable
 class RasterBackend(Protocol):
-    """A backend's `rasterize_planes`: Gaussians and a pose in, sums of every image plane out.
+    """Signature of a backend's `rasterize_planes`.
 
-    Differentiable in all floating fields, in `covariances` and in the pose.
+    Differentiable in the pose, in `covariances` and in all floating-point fields of the Gaussians.
     """
 
     def __call__(
@@ -138,7 +137,7 @@ class RasterBackend(Protocol):
         planes: list[ImagePlane],
         options: RasterOptions,
     ) -> RasterSums:
-        """Rasterise.
+        """Rasterise Gaussians on every image plane.
 
         Args:
             gaussians: float32 or float64.
@@ -158,10 +157,10 @@ class Rendering:
     """One image.
 
     Attributes:
-        color: RGB (or as many channels as the Gaussians have) over the background; not clamped to 1.
+        color: the Gaussians' channels (RGB) over the background; not clamped to 1.
         alpha: opacity in [0, 1].
         depth: mean radial distance, weighted as the colours are, metres; 0 where alpha is 0.
-        info: counts, if `rasterize` made the image.
+        info: counts; None for an image that `rasterize` did not return.
     """
 
     color: Float[Tensor, "channel height width"]
@@ -170,19 +169,19 @@ class Rendering:
     info: RasterInfo | None = None
 
 
-def _untraced(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Exclude a function from torch.compile: its kernels are not torch operations, and tracing would try every line."""
+def _exclude_from_compile(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Exclude a function from torch.compile, which cannot trace kernels that are not torch operations."""
 
     @functools.wraps(function)
-    def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        if torch.compiler.is_compiling():  # `disable` imports the compiler, which takes a second
+    def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        if torch.compiler.is_compiling():  # only then: `disable` imports the compiler, which takes a second
             return torch.compiler.disable(function)(*args, **kwargs)
         return function(*args, **kwargs)
 
     return call
 
 
-@_untraced
+@_exclude_from_compile
 def rasterize(
     gaussians: Gaussians,
     cam2world: Float[Tensor, "4 4"],
@@ -207,17 +206,17 @@ def rasterize(
     Source: docs/rendering.md; PanSplat, section 3.4.
 
     Args:
-        gaussians: float32 or float64 (halves are drawn in float32); differentiable in everything but labels.
+        gaussians: float32 or float64 (float16 and bfloat16 become float32); differentiable in all but the labels.
         cam2world: rigid pose, metres; differentiable.
         size: height and width of the image, pixels.
-        layout: "equirect" traces one ray a pixel; "cubemap" stitches a panorama from six faces; "pinhole".
+        layout: "equirect" has one ray for each pixel; "cubemap" stitches a panorama from six faces; "pinhole".
         vertical_fov_degrees: of a pinhole image.
-        face_size: of a cubemap's faces, pixels; by default as fine as the panorama's equator.
-        background: behind the scene, a number a channel; the default is black whatever the channels.
+        face_size: of a cubemap's faces, pixels; by default with the panorama's resolution at the equator.
+        background: one number for each channel; the default is black for any number of channels.
         covariances: world covariances in place of those of `scales` and `quats`, square metres.
         backend: "torch" is the reference, "numba" is fast on a CPU, "triton" on CUDA; "auto" chooses the fastest
             available for the Gaussians' type and device.
-        options: see `RasterOptions`; by default its defaults.
+        options: by default `RasterOptions()`.
         kernel, order, lowpass, near, strict, stitching: each replaces that field of `options`.
 
     Returns:
@@ -231,34 +230,34 @@ def rasterize(
         kernel=kernel, order=order, lowpass=lowpass, near=near, strict=strict, stitching=stitching
     )
     options = replace(options or RasterOptions(), **{name: value for name, value in given.items() if value is not None})
-    _check(size, layout, vertical_fov_degrees, face_size, backend, options)
+    _check_arguments(size, layout, vertical_fov_degrees, face_size, backend, options)
     device = gaussians.means.device
     pose = torch.as_tensor(cam2world, device=device).double()
     error = orthonormal_error(pose.detach()) if pose.shape == (4, 4) else math.inf
     if error > _MAX_POSE_ERROR:
         raise InputError(
             f"`cam2world` must be a rigid 4x4 camera-to-world matrix, got shape {tuple(pose.shape)} with an "
-            f"error of {error:.2g}; normalise its rotation, and check that it is no projection or mirror"
+            f"error of {error:.2g}; normalise its rotation, and check that it is not a projection or a mirror image"
         )
     if gaussians.means.dtype not in (torch.float32, torch.float64):
         gaussians = gaussians.to(dtype=torch.float32)
-    covariances = _covariances(covariances, gaussians)
-    behind = _background(background, gaussians)
+    covariances = _convert_covariances(covariances, gaussians)
+    background_color = _convert_background(background, gaussians)
     planes = image_planes(layout, size, vertical_fov_degrees=vertical_fov_degrees, face_size=face_size, device=device)
-    result = _backend(backend, gaussians)(gaussians, covariances, pose, planes, options)
+    result = _select_backend(backend, gaussians)(gaussians, covariances, pose, planes, options)
     sums = result.sums.squeeze(0)
     if layout == "cubemap":
         sums = stitch_faces(result.sums, size, stitching=options.stitching)
-    return _finish(sums, behind, result.info)
+    return _normalise_sums(sums, background_color, result.info)
 
 
-def _backend(name: Backend, gaussians: Gaussians) -> RasterBackend:
-    """The backend of that name; "auto" chooses by the Gaussians' type and device."""
+def _select_backend(name: Backend, gaussians: Gaussians) -> RasterBackend:
+    """Select the backend of this name; "auto" chooses by the Gaussians' type and device."""
     if name == "auto":
         fast: Backend = "numba" if gaussians.means.device.type == "cpu" else "triton"
         available = fast == "numba" or (gaussians.means.is_cuda and find_spec("triton") is not None)
         name = fast if available and gaussians.means.dtype == torch.float32 else "torch"
-    module = import_module(_MODULES[name])
+    module = import_module(_BACKEND_MODULES[name])
     return module.rasterize_planes  # type: ignore[no-any-return]
 
 
@@ -267,7 +266,7 @@ def _check_choice(name: str, value: str, choices: object) -> None:
         raise InputError(f"`{name}` must be one of {', '.join(get_args(choices))}, got {value!r}")
 
 
-def _check(
+def _check_arguments(
     size: tuple[int, int],
     layout: str,
     vertical_fov_degrees: float,
@@ -295,8 +294,8 @@ def _check(
         )
 
 
-def _covariances(given: Tensor | None, gaussians: Gaussians) -> Tensor | None:
-    """The covariances in the Gaussians' type."""
+def _convert_covariances(given: Tensor | None, gaussians: Gaussians) -> Tensor | None:
+    """Convert covariances to the Gaussians' type."""
     if given is None:
         return None
     if tuple(given.shape) != (len(gaussians), 3, 3):
@@ -306,27 +305,27 @@ def _covariances(given: Tensor | None, gaussians: Gaussians) -> Tensor | None:
     return given.to(gaussians.means)
 
 
-def _background(given: Sequence[float] | Tensor, gaussians: Gaussians) -> Float[Tensor, "channel"] | None:
-    """The background in the Gaussians' type and number of channels; None for a black constant."""
+def _convert_background(given: Sequence[float] | Tensor, gaussians: Gaussians) -> Float[Tensor, "channel"] | None:
+    """Convert the background to the Gaussians' type and number of channels; None for constant black."""
     if not isinstance(given, Tensor) and not any(given):
         return None
-    behind = torch.as_tensor(given, dtype=gaussians.means.dtype, device=gaussians.means.device)
+    color = torch.as_tensor(given, dtype=gaussians.means.dtype, device=gaussians.means.device)
     channels = gaussians.harmonics.shape[2]
-    if behind.shape != (channels,) and not behind.any():
-        behind = behind.new_zeros(channels)
-    if behind.shape != (channels,):
+    if color.shape != (channels,) and not color.any():
+        color = color.new_zeros(channels)
+    if color.shape != (channels,):
         raise InputError(
-            f"`background` must hold {channels} numbers, as many as the Gaussians have channels, got "
-            f"{tuple(behind.shape)}"
+            f"`background` must hold {channels} numbers, one for each channel of the Gaussians, got "
+            f"{tuple(color.shape)}"
         )
-    return behind
+    return color
 
 
-def _finish(
+def _normalise_sums(
     sums: Float[Tensor, "sums height width"], background: Float[Tensor, "channel"] | None, info: RasterInfo
 ) -> Rendering:
     """Composite over the background, and divide the sum of distances by the sum of weights."""
-    # Split instead of indexed: backward concatenates three pieces, instead of adding three whole images.
+    # The backward of `split` concatenates three pieces; that of indexing would add three whole images.
     channels, distance, weight = sums.split((len(sums) - 2, 1, 1))
     distance, weight = distance.squeeze(0), weight.squeeze(0)
     alpha = weight.clamp_max(1)

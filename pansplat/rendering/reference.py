@@ -3,8 +3,8 @@
 Source: docs/rendering.md, section 4. Every faster backend is compared with this one.
 
 Compositing is dense within small blocks of pixels and Gaussians. The tiles of an image are processed in groups with
-similar numbers of Gaussians, and a group's Gaussians in blocks, so that memory is bounded; only the transmittance is
-carried from block to block. Backward visits the same blocks in reverse and recomputes each under autograd.
+similar numbers of Gaussians, and a group's Gaussians in blocks, which bounds the memory; a block passes only the
+transmittance to the next. Backward visits the same blocks in reverse order and recomputes each under autograd.
 """
 
 import itertools
@@ -31,11 +31,11 @@ from pansplat.rendering.rasterize import Kernel, RasterInfo, RasterOptions, Rast
 from pansplat.threads import one_thread
 
 TILE_SIZE = 8  # pixels
-_BOX_MARGIN = 0.01  # pixels added around each box, far more than rounding
-_MAX_INTERSECTIONS = 1 << 22  # listed at a time
-_BLOCK_SIZE = 32  # Gaussians a step
-_MAX_PAIRS = 32768  # of a pixel and a Gaussian a step, so that they fit the cache
-_MIN_TRANSMITTANCE = 1e-20  # less is set to zero: float32 loses digits below 1e-38, and denormals are slow
+_BOX_MARGIN = 0.01  # pixels added around each box, far more than rounding errors
+_MAX_INTERSECTIONS = 1 << 22  # in one band of tile rows
+_BLOCK_SIZE = 32  # Gaussians in a block
+_MAX_PAIRS = 32768  # of a pixel and a Gaussian in a block, so that they fit the cache
+_MIN_TRANSMITTANCE = 1e-20  # less is set to zero: float32 is slow and inexact below 1e-38
 _VALUES = 11  # first column of the values in a record, after rows, radial variance and peak
 
 
@@ -93,7 +93,7 @@ def rasterize_planes(
 def _rasterize_plane(
     projected: ProjectedGaussians, plane: ImagePlane, options: RasterOptions
 ) -> tuple[Float[Tensor, "sums height width"], int, int]:
-    """Sums of weight x (channels, distance, 1), the number of visible Gaussians, and of intersections."""
+    """Compute sums of weight x (channels, distance, 1), and count visible Gaussians and intersections."""
     z = (projected.direction.detach() @ plane.rotation[:, 2]) * projected.radius.detach()
     if options.kernel == "ewa":
         ahead = z > EWA_NEAR_FACTOR * options.near
@@ -104,7 +104,7 @@ def _rasterize_plane(
     if len(visible) < len(boxes):
         footprints, boxes = Footprints(*(field[visible] for field in footprints)), boxes[visible]
         key = key[visible]
-    pixels = _tile_pixels(plane, options.kernel, projected.peak.dtype)
+    pixels = _arrange_pixels(plane, options.kernel, projected.peak.dtype)
     rows, columns = tile_grid(*plane.size)
     order = torch.argsort(key, stable=True)
     bands, intersections = [], 0
@@ -116,8 +116,8 @@ def _rasterize_plane(
     return sums[:, : plane.size[0], : plane.size[1]], len(visible), intersections
 
 
-def _tile_pixels(plane: ImagePlane, kernel: Kernel, dtype: torch.dtype) -> TilePixels:
-    """The image's pixels by tile; tiles that extend beyond the image repeat its last row and column."""
+def _arrange_pixels(plane: ImagePlane, kernel: Kernel, dtype: torch.dtype) -> TilePixels:
+    """Arrange the pixels by tile; tiles that extend beyond the image repeat its last row and column."""
     points = plane.directions() if kernel == "ray" else plane.coordinates()
     rows, columns = tile_grid(*plane.size)
     y = torch.arange(rows * TILE_SIZE, device=points.device).clamp_max(plane.size[0] - 1)
@@ -134,7 +134,7 @@ def _tile_pixels(plane: ImagePlane, kernel: Kernel, dtype: torch.dtype) -> TileP
 
 
 def tile_grid(height: int, width: int, tile_size: int = TILE_SIZE) -> tuple[int, int]:
-    """Number of rows and columns of tiles that cover an image."""
+    """Count the rows and columns of tiles that cover an image."""
     return -(-height // tile_size), -(-width // tile_size)
 
 
@@ -146,7 +146,7 @@ def intersect_tiles(
     wraps: bool,
     limit: int = _MAX_INTERSECTIONS,
 ) -> Iterator[TileIntersections]:
-    """Intersections of all tiles, in bands of tile rows with about `limit` intersections at most.
+    """List the intersections of all tiles, in bands of tile rows with at most `limit` intersections (or one row).
 
     Args:
         boxes: left, right, top, bottom, pixels; left > right where a Gaussian is not seen.
@@ -158,7 +158,7 @@ def intersect_tiles(
     ranges = tile_ranges(boxes[order], size, wraps)
     seen = torch.nonzero((ranges[:, 1] > 0) & (ranges[:, 3] > 0))[:, 0]
     order, (first_column, num_columns, first_row, num_rows) = order[seen], ranges[seen].unbind(1)
-    # Intersections in each row of tiles, by differences at the boxes' ends.
+    # Count the intersections in each row of tiles, from differences at the boxes' ends.
     change = torch.zeros(rows + 1, dtype=torch.int64, device=boxes.device)
     change.index_add_(0, first_row, num_columns)
     change.index_add_(0, first_row + num_rows, -num_columns)
@@ -179,12 +179,12 @@ def intersect_tiles(
 def tile_ranges(
     boxes: Float[Tensor, "n 4"], size: tuple[int, int], wraps: bool, tile_size: int = TILE_SIZE
 ) -> Int[Tensor, "n 4"]:
-    """First column, number of columns, first row, number of rows of the tiles that each box intersects."""
+    """Find the tiles of each box: first column, number of columns, first row, number of rows."""
     height, width = size
     columns = tile_grid(height, width, tile_size)[1]
     left, right, top, bottom = boxes.unbind(1)
     hidden = (left > right) | (top > bottom)
-    # Pixels whose centres lie inside; clamped as floats, before the cast can overflow.
+    # Pixels whose centres lie inside; clamped as floats, because the cast could overflow.
     first_x, first_y = (torch.ceil(edge - 0.5 - _BOX_MARGIN) for edge in (left, top))
     last_x, last_y = (torch.floor(edge - 0.5 + _BOX_MARGIN) for edge in (right, bottom))
     hidden |= (first_y > height - 1) | (last_y < 0) | (last_y < first_y) | (last_x < first_x)
@@ -225,7 +225,7 @@ def split_rows(per_row: list[int], limit: int) -> Iterator[tuple[int, int]]:
 def composite(
     footprints: Footprints, intersections: TileIntersections, pixels: TilePixels, *, exact: bool
 ) -> Float[Tensor, "tile pixel sums"]:
-    """Sums along each pixel's ray of weight x (values, 1), for the tiles of `intersections`.
+    """Sum weight x (values, 1) along the ray of each pixel, for the tiles of `intersections`.
 
     Differentiable once in all of `footprints`.
     """
@@ -235,7 +235,7 @@ def composite(
 
 
 class _Composite(torch.autograd.Function):
-    """The sums, with a backward that recomputes block by block."""
+    """Compositing whose backward recomputes the blocks."""
 
     @staticmethod
     @one_thread()
@@ -249,22 +249,24 @@ class _Composite(torch.autograd.Function):
         grad_enabled: bool,
     ) -> Float[Tensor, "tile pixel sums"]:
         needs_grad = grad_enabled and any(ctx.needs_input_grad)  # needs_input_grad ignores no_grad
-        padded = _pad(records), _pad(points)
+        padded = _append_zero_row(records), _append_zero_row(points)
         first = intersections.tiles[0]
         count = intersections.tiles[1] - first
         size = pixels.offsets.shape[-1]
         sums = records.new_zeros(count, size, records.shape[1] - _VALUES + 1)
         kept = []
-        for tiles, blocks in _tile_groups(intersections, len(records), size):
+        for tiles, blocks in _group_tiles(intersections, len(records), size):
             transmittance = records.new_ones(len(tiles), size)
             before = []
             for block in blocks:
-                live = tiles[: len(block)]
+                active = tiles[: len(block)]
                 through = transmittance[: len(block)]
                 if needs_grad:
                     before.append(through)
-                transmittance, added = _block(*_gather(padded, block, pixels, live + first), through, exact=exact)
-                sums.index_add_(0, live, added)
+                transmittance, added = _composite_block(
+                    *_gather_block(padded, block, pixels, active + first), through, exact=exact
+                )
+                sums.index_add_(0, active, added)
                 if float(transmittance.max()) <= (0.0 if needs_grad else torch.finfo(records.dtype).eps):
                     break
             kept.append(before)
@@ -280,22 +282,22 @@ class _Composite(torch.autograd.Function):
         (grad_sums,) = grad_outputs
         records, points = ctx.saved_tensors
         intersections, pixels, exact, kept = ctx.saved
-        padded = _pad(records), _pad(points)
+        padded = _append_zero_row(records), _append_zero_row(points)
         grad_records, grad_points = torch.zeros_like(padded[0]), torch.zeros_like(padded[1])
-        groups = _tile_groups(intersections, len(records), pixels.offsets.shape[-1])
+        groups = _group_tiles(intersections, len(records), pixels.offsets.shape[-1])
         for (tiles, blocks), before in zip(groups, kept, strict=True):
             grad_through = records.new_zeros(0, pixels.offsets.shape[-1])
             composited = list(itertools.islice(blocks, len(before)))  # forward may have stopped early
             for block, through in zip(reversed(composited), reversed(before), strict=True):
-                live = tiles[: len(block)]
-                record, point, centres, offsets = _gather(padded, block, pixels, live + intersections.tiles[0])
+                active = tiles[: len(block)]
+                record, point, centres, offsets = _gather_block(padded, block, pixels, active + intersections.tiles[0])
                 inputs = tuple(t.detach().requires_grad_() for t in (record, point, through))
                 # Tiles that end with this block have no gradient from a later one.
-                ended = records.new_zeros(len(live) - len(grad_through), grad_through.shape[1])
+                ended = records.new_zeros(len(active) - len(grad_through), grad_through.shape[1])
                 with torch.enable_grad():
-                    outputs = _block(inputs[0], inputs[1], centres, offsets, inputs[2], exact=exact)
+                    outputs = _composite_block(inputs[0], inputs[1], centres, offsets, inputs[2], exact=exact)
                 grads = torch.autograd.grad(
-                    outputs, inputs, (torch.cat((grad_through, ended)), grad_sums[live]), materialize_grads=True
+                    outputs, inputs, (torch.cat((grad_through, ended)), grad_sums[active]), materialize_grads=True
                 )
                 grad_records.index_add_(0, block.reshape(-1), grads[0].flatten(0, 1))
                 grad_points.index_add_(0, block.reshape(-1), grads[1].flatten(0, 1))
@@ -303,49 +305,49 @@ class _Composite(torch.autograd.Function):
         return grad_records[:-1], grad_points[:-1], None, None, None, None
 
 
-def _pad(table: Tensor) -> Tensor:
-    """The table with a row of zeros, an invisible Gaussian that fills up blocks."""
+def _append_zero_row(table: Tensor) -> Tensor:
+    """Append a row of zeros: an invisible Gaussian that pads blocks."""
     return torch.cat((table, table.new_zeros(1, table.shape[1])))
 
 
-def _tile_groups(
-    intersections: TileIntersections, filler: int, size: int
-) -> Iterator[tuple[Int[Tensor, "g"], Iterator[Int[Tensor, "live block"]]]]:
-    """Groups of tiles (counted from the band's first), each with its blocks of Gaussians, front to back.
+def _group_tiles(
+    intersections: TileIntersections, padding: int, size: int
+) -> Iterator[tuple[Int[Tensor, "g"], Iterator[Int[Tensor, "active block"]]]]:
+    """Group tiles (counted from the band's first), and list the blocks of Gaussians of each group, front to back.
 
-    A group's tiles are sorted by falling number of Gaussians, so those still live in a block come first.
+    A group's tiles are in descending order of their number of Gaussians: those with Gaussians in a block come first.
     """
     counts, tiles = torch.sort(intersections.starts.diff(), descending=True, stable=True)
     tiles = tiles[counts > 0]
     num = max(1, _MAX_PAIRS // (_BLOCK_SIZE * size))
     for low in range(0, len(tiles), num):
         group = tiles[low : low + num]
-        yield group, _blocks(intersections, group, counts[low : low + len(group)], filler)
+        yield group, _list_blocks(intersections, group, counts[low : low + len(group)], padding)
 
 
-def _blocks(
-    intersections: TileIntersections, tiles: Int[Tensor, "g"], counts: Int[Tensor, "g"], filler: int
-) -> Iterator[Int[Tensor, "live block"]]:
+def _list_blocks(
+    intersections: TileIntersections, tiles: Int[Tensor, "g"], counts: Int[Tensor, "g"], padding: int
+) -> Iterator[Int[Tensor, "active block"]]:
     step = torch.arange(_BLOCK_SIZE, device=tiles.device)
     starts, ends = intersections.starts[tiles, None], intersections.starts[tiles + 1, None]
     for low in range(0, int(counts[0]), _BLOCK_SIZE):
-        live = int((counts > low).sum())
-        place = starts[:live] + low + step
+        active = int((counts > low).sum())
+        place = starts[:active] + low + step
         index = intersections.indices[place.clamp_max(len(intersections.indices) - 1)]
-        yield torch.where(place < ends[:live], index, filler)
+        yield torch.where(place < ends[:active], index, padding)
 
 
-def _gather(
+def _gather_block(
     padded: tuple[Tensor, Tensor], block: Int[Tensor, "g block"], pixels: TilePixels, tiles: Int[Tensor, "g"]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Records and points of a block's Gaussians, centres and pixels of its tiles."""
+    """Gather records and points of a block's Gaussians, and centres and pixels of its tiles."""
     flat = block.reshape(-1)
     record = padded[0].index_select(0, flat).view(*block.shape, -1)
     point = padded[1].index_select(0, flat).view(*block.shape, 3)
     return record, point, pixels.centres[tiles], pixels.offsets[tiles]
 
 
-def _block(
+def _composite_block(
     record: Float[Tensor, "g block record"],
     point: Float[Tensor, "g block 3"],
     centres: Float[Tensor, "g 3"],
@@ -354,8 +356,8 @@ def _block(
     *,
     exact: bool,
 ) -> tuple[Float[Tensor, "g pixel"], Float[Tensor, "g pixel sums"]]:
-    """Transmittance behind a block of Gaussians, and the block's contribution to the sums."""
-    alpha = _alphas(record, (point - centres[:, None]).to(record.dtype), offsets, exact=exact)
+    """Compute the transmittance behind a block of Gaussians, and the block's contribution to the sums."""
+    alpha = _evaluate_alphas(record, (point - centres[:, None]).to(record.dtype), offsets, exact=exact)
     behind = _zero_up_to(torch.cumprod(1 - alpha, dim=1), _MIN_TRANSMITTANCE)
     ahead = torch.cat((torch.ones_like(behind[:, :1]), behind[:, :-1]), dim=1)
     weights = alpha * ahead * through[:, None]
@@ -363,14 +365,14 @@ def _block(
     return _zero_up_to(through * behind[:, -1], _MIN_TRANSMITTANCE), weights.transpose(1, 2) @ values
 
 
-def _alphas(
+def _evaluate_alphas(
     record: Float[Tensor, "g block record"],
     point: Float[Tensor, "g block 3"],
     offsets: Float[Tensor, "g 4 pixel"],
     *,
     exact: bool,
 ) -> Float[Tensor, "g block pixel"]:
-    """Alpha of each Gaussian at each pixel of its tile.
+    """Evaluate alpha of each Gaussian at each pixel of its tile.
 
     Args:
         record: rows a, b, l; radial variance; peak; values.
@@ -387,20 +389,20 @@ def _alphas(
     peak = record[..., 10, None]
     if not exact:
         return _clamp_alpha(peak * torch.exp(-0.5 * q))
-    # The bound only matters next to the plane L = 0; it keeps gradients finite there.
+    # The bound has an effect only near the plane L = 0; it keeps gradients finite there.
     ahead = 1 + front[0]
     bounded = ahead.clamp_min(torch.finfo(record.dtype).eps ** 0.5)
     alpha = _clamp_alpha(peak * torch.exp(-0.5 * q / (bounded * bounded + record[..., 9, None] * q)))
-    if bool(ahead.detach().amin() > 0):  # nearly always
+    if bool(ahead.detach().amin() > 0):  # in nearly every block
         return alpha
     return alpha * (ahead > 0)
 
 
 def _clamp_alpha(alpha: Tensor) -> Tensor:
-    """At most 0.99, and 0 below 1/255."""
+    """Limit alpha to 0.99, and set it to 0 below 1/255."""
     return _zero_up_to(alpha.clamp_max(MAX_ALPHA), ALPHA_CUT * (1 - ALPHA_CUT_ROUNDING))
 
 
 def _zero_up_to(values: Tensor, floor: float) -> Tensor:
-    """The values, but 0 and without gradient where they are at most `floor`."""
+    """Set values of at most `floor` to 0, without gradient."""
     return torch.nn.functional.threshold(values, floor, 0.0)

@@ -1,7 +1,7 @@
-"""The Triton backend: the stages joined into a differentiable call, in bounded memory.
+"""The Triton backend: a differentiable call of all stages, in bounded memory.
 
-Source: docs/rendering.md; docs/triton.md describes the stages. Without a GPU it runs under Triton's interpreter, for
-tests only: a thousand times slower than the other backends.
+Source: docs/rendering.md; docs/triton.md describes the stages. Without a GPU it runs under Triton's interpreter, which
+is a thousand times slower than the other backends and for tests only.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ from pansplat.rendering.rasterize import RasterInfo, RasterOptions, RasterSums
 if TYPE_CHECKING:
     from pansplat.rendering.cuda.tiling import Instances
 
-_SORTING_BYTES = 40  # an intersection, while a band's are sorted
+_SORTING_BYTES = 40  # for each intersection of the band that is being sorted
 
 
 def rasterize_planes(
@@ -44,10 +44,10 @@ def rasterize_planes(
     """Rasterise with Triton kernels; see `pansplat.rendering.rasterize.RasterBackend`.
 
     Raises:
-        InputError: Triton is not installed, or the Gaussians are not on a CUDA device; or as stated there.
+        InputError: as stated there; Triton is not installed; or the Gaussians are not on a CUDA device.
     """
     device = gaussians.means.device
-    _check(device)
+    _check_device(device)
     # Triton launches on torch's current device, not on that of its arguments.
     with torch.cuda.device(device) if device.type == "cuda" else contextlib.nullcontext():
         chosen = select_drawable(gaussians, covariances, pose.detach(), options)
@@ -59,15 +59,15 @@ def rasterize_planes(
             compensate=options.lowpass == "angular",
             exact=options.kernel == "ray",
         )
-        footprints, instances = _place_footprints(projected, planes, options)
+        footprints, instances = _compute_instances(projected, planes, options)
         sums, count, size = _composite(footprints, instances, planes, exact=options.kernel == "ray")
     visible = sum(instances.planes)
     info = RasterInfo(chosen.total, chosen.dropped, chosen.near, visible, count, backend="triton", bytes=size)
     return RasterSums(sums, info)
 
 
-def _check(device: torch.device) -> None:
-    """Raise an error if Triton cannot run on the device. Its kernels are imported in the functions that launch them."""
+def _check_device(device: torch.device) -> None:
+    """Raise an error if Triton cannot run on the device; kernels are imported later, where they are launched."""
     if importlib.util.find_spec("triton") is None:
         raise InputError(
             "backend 'triton' needs the package triton, which is not installed; install it (pip install triton, on "
@@ -112,17 +112,19 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
-        from pansplat.rendering.cuda.projection_backward import project_backward
+        from pansplat.rendering.cuda.projection_backward import backpropagate_projection
 
         cam2world, *fields = ctx.saved_tensors
-        grad_pose, *grad_fields = project_backward(cam2world, fields, ProjectedGaussians(*grad_outputs), **ctx.options)
+        grad_pose, *grad_fields = backpropagate_projection(
+            cam2world, fields, ProjectedGaussians(*grad_outputs), **ctx.options
+        )
         return grad_pose, None, None, None, *grad_fields
 
 
-def _place_footprints(
+def _compute_instances(
     projected: ProjectedGaussians, planes: list[ImagePlane], options: RasterOptions
 ) -> tuple[Footprints, "Instances"]:
-    """Footprints, and the image planes they are visible on; for the exact kernel, planes share footprints."""
+    """Compute footprints and their instances; all planes share the footprints of the exact kernel."""
     from pansplat.rendering.cuda.tiling import sort_instances
 
     fixed = ProjectedGaussians(*(field.detach() for field in projected))
@@ -134,15 +136,15 @@ def _place_footprints(
             key = z
         if options.kernel == "ewa":
             ahead = torch.nonzero(z > EWA_NEAR_FACTOR * options.near)[:, 0]
-            box = _boxes(ProjectedGaussians(*(field[ahead] for field in fixed)), plane, options)
-            touched = is_in_image(box, plane)
-            seen, box = ahead[touched], box[touched]
-            part = ProjectedGaussians(*(_TakeRows.apply(field, seen) for field in projected))
+            box = _compute_boxes(ProjectedGaussians(*(field[ahead] for field in fixed)), plane, options)
+            visible = is_in_image(box, plane)
+            seen, box = ahead[visible], box[visible]
+            part = ProjectedGaussians(*(_SelectRows.apply(field, seen) for field in projected))
             parts.append(checkpoint(compute_footprints, part, plane, options, use_reentrant=False)[0])
             bases.append(total)
             total, key = total + len(seen), key[seen]
         else:
-            box = _boxes(fixed, plane, options)
+            box = _compute_boxes(fixed, plane, options)
             bases.append(0)
         boxes.append(box)
         keys.append(key)
@@ -153,12 +155,12 @@ def _place_footprints(
 
 
 @torch.no_grad()
-def _boxes(projected: ProjectedGaussians, plane: ImagePlane, options: RasterOptions) -> Float[Tensor, "n 4"]:
+def _compute_boxes(projected: ProjectedGaussians, plane: ImagePlane, options: RasterOptions) -> Float[Tensor, "n 4"]:
     return compute_footprints(projected, plane, options)[1]
 
 
-class _TakeRows(torch.autograd.Function):
-    """Rows of a tensor, each at most once, so that backward needs neither a sort nor atomics."""
+class _SelectRows(torch.autograd.Function):
+    """Select rows of a tensor, each at most once, so that backward needs neither a sort nor atomics."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, rows: Int[Tensor, "m"]) -> Tensor:
@@ -175,7 +177,7 @@ class _TakeRows(torch.autograd.Function):
 def _composite(
     footprints: Footprints, instances: "Instances", planes: list[ImagePlane], *, exact: bool
 ) -> tuple[Float[Tensor, "plane sums height width"], int, int]:
-    """Sums of weight x (values, 1) over image planes, the number of intersections, and bytes of working memory.
+    """Sum weight x (values, 1) along the rays of all image planes; count intersections and bytes of working memory.
 
     Differentiable once in all of `footprints`.
     """
@@ -184,12 +186,12 @@ def _composite(
 
     layout = RecordLayout(exact, footprints.values.shape[1] - 1)
     pixels = tile_pixels(planes, exact=exact, dtype=footprints.rows.dtype)
-    plan = instances, pixels, layout, planes[0].size
-    return _Composite.apply(*footprints, plan, torch.is_grad_enabled())  # type: ignore[no-any-return]
+    setup = instances, pixels, layout, planes[0].size
+    return _Composite.apply(*footprints, setup, torch.is_grad_enabled())  # type: ignore[no-any-return]
 
 
 class _Composite(torch.autograd.Function):
-    """Compositing; backward reads the records, the intersections and the sums of forward."""
+    """Compositing; backward uses the records, the intersections and the sums of forward."""
 
     @staticmethod
     def forward(
@@ -199,13 +201,13 @@ class _Composite(torch.autograd.Function):
         radial_variance: Tensor,
         peak: Tensor,
         values: Tensor,
-        plan: tuple[Any, ...],
+        setup: tuple[Any, ...],
         grad_enabled: bool,
     ) -> tuple[Tensor, int, int]:
         from pansplat.rendering.cuda.rasterize import pack_records, rasterize
         from pansplat.rendering.cuda.tiling import intersect_tiles
 
-        instances, pixels, layout, size = plan
+        instances, pixels, layout, size = setup
         records = pack_records(Footprints(point, rows, radial_variance, peak, values), layout)
         sums = records.new_empty(len(instances.planes), layout.channels + 2, *size)
         count, largest, kept = 0, 0, []
@@ -216,7 +218,7 @@ class _Composite(torch.autograd.Function):
             if grad_enabled and any(ctx.needs_input_grad):  # needs_input_grad ignores no_grad
                 kept.append((band, stops))
         ctx.save_for_backward(records, rows, sums)
-        ctx.plan, ctx.kept = plan, kept
+        ctx.setup, ctx.kept = setup, kept
         held = (records, sums, pixels.centres, pixels.offsets, instances.records, instances.ranges)
         return sums, count, largest + sum(t.numel() * t.element_size() for t in held)
 
@@ -227,7 +229,7 @@ class _Composite(torch.autograd.Function):
         if torch.is_grad_enabled():  # create_graph=True
             raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
         records, rows, sums = ctx.saved_tensors
-        instances, pixels, layout, _ = ctx.plan
+        instances, pixels, layout, _ = ctx.setup
         totals = records.new_zeros(len(instances.records), layout.gradient_size)
         for band, stops in ctx.kept:
             rasterize_backward(records, band, stops, pixels, sums, grad_outputs[0].contiguous(), layout, totals)

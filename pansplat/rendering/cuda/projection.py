@@ -1,8 +1,8 @@
 """Projection of Gaussians in one kernel.
 
-Source: docs/rendering.md, sections 1 to 3; `pansplat.rendering.projection.project_gaussians` is its reference. As torch
-operations the same arithmetic moves 7 kB a Gaussian through memory, here a third of a kilobyte. Geometry is float64
-whatever the Gaussians' type is.
+Source: docs/rendering.md, sections 1 to 3; `pansplat.rendering.projection.project_gaussians` is its reference. The
+kernel moves a third of a kilobyte for each Gaussian; the same arithmetic in torch operations moves 7 kB. Geometry is
+float64 for Gaussians of any type.
 """
 # ruff: noqa: RUF005  # Triton does not unpack into a tuple
 
@@ -24,7 +24,7 @@ from pansplat.rendering.projection import ProjectedGaussians
 @triton.jit
 @no_type_check
 def load_numbers(pointer, NUM: tl.constexpr):
-    """NUM scalars in a row, as a tuple."""
+    """Load NUM adjacent scalars as a tuple."""
     numbers = ()
     for k in tl.static_range(NUM):
         numbers = numbers + (tl.load(pointer + k),)
@@ -34,7 +34,7 @@ def load_numbers(pointer, NUM: tl.constexpr):
 @triton.jit
 @no_type_check
 def load_fields(pointer, index, mask, NUM: tl.constexpr):
-    """NUM numbers of each of some rows, as float64 blocks in a tuple."""
+    """Load NUM numbers of each row in `index`, as a tuple of float64 blocks."""
     fields = ()
     for k in tl.static_range(NUM):
         fields = fields + (tl.load(pointer + index * NUM + k, mask=mask, other=0.0).to(tl.float64),)
@@ -44,7 +44,7 @@ def load_fields(pointer, index, mask, NUM: tl.constexpr):
 @triton.jit
 @no_type_check
 def store_fields(pointer, index, mask, fields, NUM: tl.constexpr):
-    """Store NUM numbers of each of some rows, in the table's type."""
+    """Store NUM numbers of each row in `index`, in the table's type."""
     for k in tl.static_range(NUM):
         tl.store(pointer + index * NUM + k, fields[k], mask=mask)
 
@@ -58,7 +58,7 @@ def dot(a, b):
 
 @triton.jit
 @no_type_check
-def to_camera(camera, vector):
+def rotate_to_camera(camera, vector):
     """Rotate a vector from world to camera axes."""
     return (
         camera[0] * vector[0] + camera[4] * vector[1] + camera[8] * vector[2],
@@ -69,7 +69,7 @@ def to_camera(camera, vector):
 
 @triton.jit
 @no_type_check
-def to_world(camera, vector):
+def rotate_to_world(camera, vector):
     """Rotate a vector from camera to world axes."""
     return (
         camera[0] * vector[0] + camera[1] * vector[1] + camera[2] * vector[2],
@@ -81,7 +81,7 @@ def to_world(camera, vector):
 @triton.jit
 @no_type_check
 def symmetric_part(m):
-    """The symmetric part of a matrix given row by row."""
+    """The symmetric part of a matrix, which is given row by row."""
     return m[0], 0.5 * (m[1] + m[3]), 0.5 * (m[2] + m[6]), m[4], 0.5 * (m[5] + m[7]), m[8]
 
 
@@ -122,8 +122,8 @@ def tangent_frame(direction):
 
 @triton.jit
 @no_type_check
-def own_axes(quats, index, mask):
-    """Columns of the rotation of quaternions of any length; the zero quaternion is the identity."""
+def rotation_axes(quats, index, mask):
+    """Columns of the rotation matrix of a quaternion of any length; the zero quaternion is the identity."""
     quat = load_fields(quats, index, mask, 4)
     norm = tl.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
     safe = tl.where(norm > 0, norm, 1.0)
@@ -138,16 +138,16 @@ def own_axes(quats, index, mask):
 
 @triton.jit
 @no_type_check
-def from_axes(quats, scales, camera, radius, direction, index, mask):
-    """C in camera axes, and det B, tr B, g, M, det C, by sums of squares, so that nothing cancels."""
-    axes = own_axes(quats, index, mask)
+def shape_from_axes(quats, scales, camera, radius, direction, index, mask):
+    """Compute C in camera axes, and det B, tr B, g, M, det C, by sums of squares, without cancellation."""
+    axes = rotation_axes(quats, index, mask)
     scale = load_fields(scales, index, mask, 3)
     size = (scale[0] / radius, scale[1] / radius, scale[2] / radius)
     zero = radius * 0
     c = (zero, zero, zero, zero, zero, zero)
     det_across, trace, radial_variance, mixed = zero, zero, zero, zero
     for k in tl.static_range(3):
-        axis = to_camera(camera, axes[k])
+        axis = rotate_to_camera(camera, axes[k])
         square = size[k] * size[k]
         cosine = dot(direction, axis)
         minor = size[(k + 1) % 3] * size[(k + 2) % 3]
@@ -169,8 +169,8 @@ def from_axes(quats, scales, camera, radius, direction, index, mask):
 
 @triton.jit
 @no_type_check
-def to_frame(c, u, v, n):
-    """Entries uu, uv, un, vv, vn, nn of a symmetric matrix in a frame."""
+def rotate_to_frame(c, u, v, n):
+    """Transform a symmetric matrix to a frame: entries uu, uv, un, vv, vn, nn."""
     return (
         bilinear(c, u, u),
         bilinear(c, u, v),
@@ -183,8 +183,8 @@ def to_frame(c, u, v, n):
 
 @triton.jit
 @no_type_check
-def from_covariance(covariances, camera, radius, right, down, direction, index, mask):
-    """The same from world covariances; minors that rounding made negative are set to zero."""
+def shape_from_covariance(covariances, camera, radius, right, down, direction, index, mask):
+    """Compute the same from world covariances; minors that rounding made negative are set to zero."""
     world = symmetric_part(load_fields(covariances, index, mask, 9))
     # Row j of cam2world' is column j of cam2world.
     x, y, z = (camera[0], camera[4], camera[8]), (camera[1], camera[5], camera[9]), (camera[2], camera[6], camera[10])
@@ -197,7 +197,7 @@ def from_covariance(covariances, camera, radius, right, down, direction, index, 
         bilinear(world, y, z) / square,
         bilinear(world, z, z) / square,
     )
-    uu, uv, un, vv, vn, nn = to_frame(c, right, down, direction)
+    uu, uv, un, vv, vn, nn = rotate_to_frame(c, right, down, direction)
     det = uu * (vv * nn - vn * vn) - uv * (uv * nn - vn * un) + un * (uv * vn - vv * un)
     return c, (
         tl.maximum(uu * vv - uv * uv, 0.0),
@@ -275,15 +275,15 @@ def harmonics_basis(x, y, z, DEGREE: tl.constexpr):
 
 
 _BLOCK_SIZE = 128
-"""Gaussians a program: one a thread, which takes 90 to 120 registers in float64."""
+"""Gaussians of one program: one for each thread, which needs 90 to 120 registers in float64."""
 
 MIN_RATIO: tl.constexpr = tl.constexpr(MIN_COMPENSATION)
 
 
 @triton.jit
 @no_type_check
-def ray_rows(c, right, down, direction, e2, det):
-    """Rows a, b, l of section 3, given C before the filter and det B' after it."""
+def compute_ray_rows(c, right, down, direction, e2, det):
+    """Compute rows a, b, l of section 3 from C before the filter and det B' after it."""
     uu, uv, vv = bilinear(c, right, right) + e2, bilinear(c, right, down), bilinear(c, down, down) + e2
     un, vn = bilinear(c, right, direction), bilinear(c, down, direction)
     first, second, slant = 1 / tl.sqrt(uu), tl.sqrt(uu / det), uv / uu
@@ -316,13 +316,13 @@ def project_kernel(
     offset = (mean[0] - pose[3], mean[1] - pose[7], mean[2] - pose[11])
     radius = tl.where(mask, tl.sqrt(dot(offset, offset)), 1.0)
     world = (offset[0] / radius, offset[1] / radius, offset[2] / radius)
-    direction = to_camera(pose, world)
+    direction = rotate_to_camera(pose, world)
     x, y, z = direction[0], direction[1], direction[2]
     right, down = tangent_frame(direction)
     if BY_AXES:
-        c, minors = from_axes(first_shape, second_shape, pose, radius, direction, index, mask)
+        c, minors = shape_from_axes(first_shape, second_shape, pose, radius, direction, index, mask)
     else:
-        c, minors = from_covariance(first_shape, pose, radius, right, down, direction, index, mask)
+        c, minors = shape_from_covariance(first_shape, pose, radius, right, down, direction, index, mask)
     det = minors[0] + e2 * minors[1] + e2 * e2
     peak = tl.load(opacities + index, mask=mask, other=0.0).to(tl.float64)
     if COMPENSATE:
@@ -330,7 +330,7 @@ def project_kernel(
     tl.store(peaks + index, peak, mask=mask)
     if EXACT:
         tl.store(radial_variances + index, (e2 * e2 * minors[2] + e2 * minors[3] + minors[4]) / det, mask=mask)
-        store_fields(rows, index, mask, ray_rows(c, right, down, direction, e2, det), 9)
+        store_fields(rows, index, mask, compute_ray_rows(c, right, down, direction, e2, det), 9)
     xx, xy, xz = c[0] + e2 * (1 - x * x), c[1] - e2 * x * y, c[2] - e2 * x * z
     yy, yz, zz = c[3] + e2 * (1 - y * y), c[4] - e2 * y * z, c[5] + e2 * (1 - z * z)
     store_fields(covariances, index, mask, (xx, xy, xz, xy, yy, yz, xz, yz, zz), 9)

@@ -20,31 +20,31 @@ from pansplat.rendering.cuda.projection import (
     MIN_RATIO,
     bilinear,
     dot,
-    from_axes,
-    from_covariance,
     load_fields,
     load_numbers,
     multiply,
-    own_axes,
+    rotate_to_camera,
+    rotate_to_frame,
+    rotate_to_world,
+    rotation_axes,
+    shape_from_axes,
+    shape_from_covariance,
     store_fields,
     symmetric_part,
     tangent_frame,
-    to_camera,
-    to_frame,
-    to_world,
 )
 from pansplat.rendering.projection import ProjectedGaussians
 
 _BLOCK_SIZE = 64
-"""Gaussians a program. A program sums its gradients of the pose; torch sums those over programs."""
+"""Gaussians of one program. A program sums its gradients of the pose; torch sums over programs."""
 
 _CHUNK_SIZE = 1 << 18
-"""Gaussians whose colours torch differentiates at a time, up to 2 kB each."""
+"""Gaussians whose colours torch differentiates together, up to 2 kB each."""
 
 
 @triton.jit
 @no_type_check
-def rows_backward(grad_rows, frame, c_uvn, e2, det):
+def backpropagate_rows(grad_rows, frame, c_uvn, e2, det):
     """Gradients of uu, uv, un, vv, vn, of det B', and of the rotations of n towards u and v, from those of a, b, l."""
     u, v, n = frame[0], frame[1], frame[2]
     uu, uv, un, vv, vn = c_uvn[0] + e2, c_uvn[1], c_uvn[2], c_uvn[3] + e2, c_uvn[4]
@@ -70,7 +70,7 @@ def rows_backward(grad_rows, frame, c_uvn, e2, det):
 
 @triton.jit
 @no_type_check
-def minors_backward(grad_minors, c_uvn, BY_AXES: tl.constexpr):
+def backpropagate_minors(grad_minors, c_uvn, BY_AXES: tl.constexpr):
     """Gradients of uu, uv, un, vv, vn, nn from those of det B, tr B, g, M and det C."""
     uu, uv, un, vv, vn, nn = c_uvn[0], c_uvn[1], c_uvn[2], c_uvn[3], c_uvn[4], c_uvn[5]
     grad_across, grad_trace, grad_radial_variance = grad_minors[0], grad_minors[1], grad_minors[2]
@@ -94,7 +94,7 @@ def minors_backward(grad_minors, c_uvn, BY_AXES: tl.constexpr):
 
 @triton.jit
 @no_type_check
-def quats_backward(grad_axes, quats, index, mask):
+def backpropagate_quats(grad_axes, quats, index, mask):
     """Gradients of quaternions from those of the columns of the rotation."""
     quat = load_fields(quats, index, mask, 4)
     norm = tl.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
@@ -118,7 +118,9 @@ def quats_backward(grad_axes, quats, index, mask):
 
 @triton.jit
 @no_type_check
-def frame_backward(c_uvn, minors, frame, e2, opacity, grad_peak, grad_rows, grad_radial_variance, SIZES: tl.constexpr):
+def backpropagate_shape(
+    c_uvn, minors, frame, e2, opacity, grad_peak, grad_rows, grad_radial_variance, SIZES: tl.constexpr
+):
     """Gradients of C's six entries, of the rotations of n towards u and v, and of the opacity.
 
     Args:
@@ -134,7 +136,7 @@ def frame_backward(c_uvn, minors, frame, e2, opacity, grad_peak, grad_rows, grad
     g, grad_det, turn_u, turn_v = (zero, zero, zero, zero, zero), zero, zero, zero
     grad_minors = (zero, zero, zero, zero, zero)
     if SIZES[2]:
-        g, grad_det, turn_u, turn_v = rows_backward(grad_rows, frame, c_uvn, e2, det)
+        g, grad_det, turn_u, turn_v = backpropagate_rows(grad_rows, frame, c_uvn, e2, det)
         radial_variance = (e2 * e2 * minors[2] + e2 * minors[3] + minors[4]) / det
         grad_s = grad_radial_variance
         grad_minors = (zero, zero, e2 * e2 * grad_s / det, e2 * grad_s / det, grad_s / det)
@@ -147,7 +149,7 @@ def frame_backward(c_uvn, minors, frame, e2, opacity, grad_peak, grad_rows, grad
         grad_det -= grad_ratio * ratio / det
         grad_peak = grad_peak * root
     grad_minors = (grad_minors[0] + grad_det, e2 * grad_det, grad_minors[2], grad_minors[3], grad_minors[4])
-    m = minors_backward(grad_minors, c_uvn, SIZES[0])
+    m = backpropagate_minors(grad_minors, c_uvn, SIZES[0])
     uu, uv, un, vv, vn, nn = g[0] + m[0], g[1] + m[1], g[2] + m[2], g[3] + m[3], g[4] + m[4], m[5]
     turn_u += 2 * (nn - uu) * c_uvn[2] + un * (c_uvn[0] - c_uvn[5]) + vn * c_uvn[1] - uv * c_uvn[4]
     turn_v += 2 * (nn - vv) * c_uvn[4] + vn * (c_uvn[3] - c_uvn[5]) + un * c_uvn[1] - uv * c_uvn[2]
@@ -156,10 +158,10 @@ def frame_backward(c_uvn, minors, frame, e2, opacity, grad_peak, grad_rows, grad
 
 @triton.jit
 @no_type_check
-def from_frame(grad_uvn, frame):
-    """Gradient of C in camera axes from the gradients of its entries uu, uv, un, vv, vn, nn."""
+def rotate_from_frame(grad_uvn, frame):
+    """Compute the gradient of C in camera axes from the gradients of its entries uu, uv, un, vv, vn, nn."""
     u, v, n = frame[0], frame[1], frame[2]
-    # Halves: an entry off the diagonal appears on both sides of it.
+    # Halves: an off-diagonal entry appears twice in the matrix.
     rows = ()
     for i in tl.static_range(3):
         rows = rows + (
@@ -181,26 +183,26 @@ def from_frame(grad_uvn, frame):
 
 @triton.jit
 @no_type_check
-def axes_backward(grad_c, quats, scales, grad_quats, grad_scales, pose, radius, index, mask):
+def backpropagate_axes(grad_c, quats, scales, grad_quats, grad_scales, pose, radius, index, mask):
     """Write the gradients of quaternions and scales."""
-    axes = own_axes(quats, index, mask)
+    axes = rotation_axes(quats, index, mask)
     scale = load_fields(scales, index, mask, 3)
     grad_axes, grad_scale = (), ()
     for k in tl.static_range(3):
-        axis = to_camera(pose, axes[k])
+        axis = rotate_to_camera(pose, axes[k])
         grad_axis = multiply(grad_c, axis)
         factor = 2 * scale[k] / (radius * radius)
         grad_scale = grad_scale + (factor * dot(axis, grad_axis),)
-        grad_axis = to_world(pose, grad_axis)
+        grad_axis = rotate_to_world(pose, grad_axis)
         factor = factor * scale[k]
         grad_axes = grad_axes + ((factor * grad_axis[0], factor * grad_axis[1], factor * grad_axis[2]),)
-    store_fields(grad_quats, index, mask, quats_backward(grad_axes, quats, index, mask), 4)
+    store_fields(grad_quats, index, mask, backpropagate_quats(grad_axes, quats, index, mask), 4)
     store_fields(grad_scales, index, mask, grad_scale, 3)
 
 
 @triton.jit
 @no_type_check
-def covariances_backward(grad_c, grad_covariances, pose, radius, index, mask):
+def backpropagate_covariances(grad_c, grad_covariances, pose, radius, index, mask):
     """Write the gradients of covariances."""
     x, y, z = (pose[0], pose[1], pose[2]), (pose[4], pose[5], pose[6]), (pose[8], pose[9], pose[10])
     square = radius * radius
@@ -211,7 +213,7 @@ def covariances_backward(grad_c, grad_covariances, pose, radius, index, mask):
 
 @triton.jit
 @no_type_check
-def pose_backward(out, pose, world, c, grad_n, grad_c, grad_offset, mask):
+def backpropagate_pose(out, pose, world, c, grad_n, grad_c, grad_offset, mask):
     """Write a program's gradients of the pose: n = A' w and C = A' (world C) A, the offset is mean - t."""
     rows = ((c[0], c[1], c[2]), (c[1], c[3], c[4]), (c[2], c[4], c[5]))
     columns = ((grad_c[0], grad_c[1], grad_c[2]), (grad_c[1], grad_c[3], grad_c[4]), (grad_c[2], grad_c[4], grad_c[5]))
@@ -227,13 +229,13 @@ def pose_backward(out, pose, world, c, grad_n, grad_c, grad_offset, mask):
 # fmt: off
 @triton.jit(do_not_specialize=["num"])
 @no_type_check
-def project_backward_kernel(
+def backpropagate_projection_kernel(
     means, opacities, first_shape, second_shape, camera,
     grad_world_directions, grad_directions, grad_radii, grad_covariances, grad_peaks, grad_rows, grad_radial_variances,
     grad_means, grad_opacities, grad_first_shape, grad_second_shape, grad_camera, num,
     BY_AXES: tl.constexpr, COMPENSATE: tl.constexpr, EXACT: tl.constexpr, BLOCK: tl.constexpr,
 ):
-    """Write the gradients of the geometry; `grad_world_directions` are those that colours have by directions."""
+    """Write the gradients of the geometry; `grad_world_directions` are those of the colours."""
     index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     mask = index < num
     pose = load_numbers(camera, 17)
@@ -242,14 +244,14 @@ def project_backward_kernel(
     offset = (mean[0] - pose[3], mean[1] - pose[7], mean[2] - pose[11])
     radius = tl.where(mask, tl.sqrt(dot(offset, offset)), 1.0)
     world = (offset[0] / radius, offset[1] / radius, offset[2] / radius)
-    n = to_camera(pose, world)
+    n = rotate_to_camera(pose, world)
     u, v = tangent_frame(n)
     if BY_AXES:
-        c, minors = from_axes(first_shape, second_shape, pose, radius, n, index, mask)
+        c, minors = shape_from_axes(first_shape, second_shape, pose, radius, n, index, mask)
     else:
-        c, minors = from_covariance(first_shape, pose, radius, u, v, n, index, mask)
-    c_uvn = to_frame(c, u, v, n)
-    grad_shape, turn_u, turn_v, grad_opacity = frame_backward(
+        c, minors = shape_from_covariance(first_shape, pose, radius, u, v, n, index, mask)
+    c_uvn = rotate_to_frame(c, u, v, n)
+    grad_shape, turn_u, turn_v, grad_opacity = backpropagate_shape(
         c_uvn, minors, (u, v, n), e2,
         load_fields(opacities, index, mask, 1)[0], load_fields(grad_peaks, index, mask, 1)[0],
         load_fields(grad_rows, index, mask, 9 if EXACT else 0), load_fields(grad_radial_variances, index, mask, 1)[0],
@@ -260,7 +262,7 @@ def project_backward_kernel(
     grad_filtered = load_fields(grad_covariances, index, mask, 9)
     direct = symmetric_part(grad_filtered)
     widened = multiply(direct, n)
-    shaped = from_frame(grad_shape, (u, v, n))
+    shaped = rotate_from_frame(grad_shape, (u, v, n))
     grad_c = ()
     for k in tl.static_range(6):
         grad_c = grad_c + (direct[k] + shaped[k],)
@@ -268,24 +270,26 @@ def project_backward_kernel(
     for k in tl.static_range(3):
         grad_camera_n = grad_camera_n + (grad_n[k] + turn_u * u[k] + turn_v * v[k] - 2 * e2 * widened[k],)
     if BY_AXES:
-        axes_backward(grad_c, first_shape, second_shape, grad_first_shape, grad_second_shape, pose, radius, index, mask)
+        backpropagate_axes(
+            grad_c, first_shape, second_shape, grad_first_shape, grad_second_shape, pose, radius, index, mask
+        )
     else:
-        covariances_backward(grad_c, grad_first_shape, pose, radius, index, mask)
+        backpropagate_covariances(grad_c, grad_first_shape, pose, radius, index, mask)
     contracted = c[0] * grad_c[0] + c[3] * grad_c[3] + c[5] * grad_c[5]
     contracted += 2 * (c[1] * grad_c[1] + c[2] * grad_c[2] + c[4] * grad_c[4])
     grad_radius = load_fields(grad_radii, index, mask, 1)[0] - 2 * contracted / radius
-    grad_colour, turned = load_fields(grad_world_directions, index, mask, 3), to_world(pose, grad_camera_n)
+    grad_colour, turned = load_fields(grad_world_directions, index, mask, 3), rotate_to_world(pose, grad_camera_n)
     grad_world = (grad_colour[0] + turned[0], grad_colour[1] + turned[1], grad_colour[2] + turned[2])
     outward = dot(grad_world, world)
     grad_offset = ()
     for k in tl.static_range(3):
         grad_offset = grad_offset + ((grad_world[k] - outward * world[k]) / radius + grad_radius * world[k],)
     store_fields(grad_means, index, mask, grad_offset, 3)
-    pose_backward(grad_camera + tl.program_id(0) * 12, pose, world, c, grad_camera_n, grad_c, grad_offset, mask)
+    backpropagate_pose(grad_camera + tl.program_id(0) * 12, pose, world, c, grad_camera_n, grad_c, grad_offset, mask)
 # fmt: on
 
 
-def project_backward(
+def backpropagate_projection(
     cam2world: Float[Tensor, "4 4"],
     fields: list[Tensor],
     grads: ProjectedGaussians,
@@ -294,7 +298,7 @@ def project_backward(
     compensate: bool,
     exact: bool,
 ) -> tuple[Tensor, ...]:
-    """Gradients of the pose, then of the fields.
+    """Compute the gradient of the pose, then those of the fields.
 
     Args:
         cam2world: float64.
@@ -308,11 +312,11 @@ def project_backward(
     grad_fields = [torch.empty_like(field) for field in fields]
     if not count:
         return grad_camera, *grad_fields
-    grad_harmonics, grad_world_directions = _colours_backward(means, harmonics, cam2world, grads.values[:, :-1])
+    grad_harmonics, grad_world_directions = _backpropagate_colours(means, harmonics, cam2world, grads.values[:, :-1])
     grad_fields[2] = grad_harmonics
     programs = triton.cdiv(count, _BLOCK_SIZE)
     parts = cam2world.new_empty(programs, 3, 4)
-    project_backward_kernel[(programs,)](
+    backpropagate_projection_kernel[(programs,)](
         means, opacities, shape[0], shape[-1],
         torch.nn.functional.pad(cam2world.reshape(-1), (0, 1), value=filter_variance),
         grad_world_directions, grads.direction.contiguous(), grads.radius + grads.values[:, -1].double(),
@@ -325,7 +329,7 @@ def project_backward(
     return grad_camera, *grad_fields
 
 
-def _colours_backward(
+def _backpropagate_colours(
     means: Float[Tensor, "n 3"],
     harmonics: Float[Tensor, "n k channel"],
     cam2world: Float[Tensor, "4 4"],

@@ -3,7 +3,7 @@
 Source: docs/rendering.md, sections 3 and 4. An image plane's points have `axes` coordinates: three for the exact kernel
 (directions), two for EWA (pixels). Both have as many footprint rows.
 
-A record is all that a tile reads of one footprint:
+A record holds the numbers of one footprint that a tile reads:
 
     point               axes            the footprint's point, rounded to the records' type
     residual            axes            of that rounding, so that differences to a tile's centre keep their digits
@@ -14,20 +14,16 @@ A record is all that a tile reads of one footprint:
 
 A gradient record holds sums over the pixels of one tile:
 
-    moments             axes x axes     gradient of each row's value, times (pixel - point)
-    gradients           axes            gradient of each row's value
+    rows                axes x axes     gradient of each row's value, times (pixel - point)
+    row values          axes            gradient of each row's value
     radial variance     1 if exact
     peak                1
     values              channels + 1
 
 Sizes are fixed, not tuned. Tiles of 16 x 16 pixels match the extent of the lattice's Gaussians (a few pixels), and 256
 pixels divide evenly among one, two or four warps. Every warp reads a record by uniform loads, which cost four times an
-arithmetic instruction; with four or eight pixels a thread, arithmetic hides them. A tile is tested for saturation once
-in 32 records, because the test synchronises all threads.
-
-Backward visits a tile's records front to back: the sum behind a record is the total minus the sum passed, so nothing is
-divided by a transmittance. There are no atomics: every intersection writes its own gradient record, those of one
-footprint are adjacent and are summed in a fixed order, so that gradients are the same in every run.
+arithmetic instruction; with four or eight pixels for each thread, arithmetic hides them. A tile is tested for
+saturation once in 32 records, because the test synchronises all threads. docs/triton.md describes the backward.
 """
 # ruff: noqa: RUF005  # Triton does not unpack into a tuple
 
@@ -81,7 +77,7 @@ class RecordLayout:
 
 
 def pack_records(footprints: Footprints, layout: RecordLayout) -> Float[Tensor, "n record"]:
-    """Records of footprints, in the type of their rows."""
+    """Pack footprints into records, in the type of their rows."""
     dtype = footprints.rows.dtype
     point = footprints.point[:, : layout.axes].double()
     rounded = point.to(dtype)
@@ -95,12 +91,12 @@ def pack_records(footprints: Footprints, layout: RecordLayout) -> Float[Tensor, 
 def unpack_gradients(
     gradient: Float[Tensor, "n gradient"], rows: Float[Tensor, "n 3 3"], layout: RecordLayout
 ) -> Footprints:
-    """Gradients of footprints, given their rows, from gradient records summed over tiles."""
+    """Compute the gradients of footprints from their rows and from gradient records summed over tiles."""
     axes, channels = layout.axes, layout.channels
-    moments, gradients, rest = gradient.split((axes * axes, axes, gradient.shape[1] - axes * (axes + 1)), dim=1)
+    row_sums, value_sums, rest = gradient.split((axes * axes, axes, gradient.shape[1] - axes * (axes + 1)), dim=1)
     grad_rows = torch.zeros_like(rows)
-    grad_rows[:, :axes, :axes] = moments.view(-1, axes, axes)
-    grad_point = -(gradients.double()[:, :, None] * rows[:, :axes].double()).sum(dim=1)
+    grad_rows[:, :axes, :axes] = row_sums.view(-1, axes, axes)
+    grad_point = -(value_sums.double()[:, :, None] * rows[:, :axes].double()).sum(dim=1)
     radial_variance = rest[:, 0] if layout.exact else torch.zeros_like(rest[:, 0])
     return Footprints(grad_point, grad_rows, radial_variance, rest[:, -channels - 2], rest[:, -channels - 1 :])
 
@@ -121,7 +117,7 @@ _MINUS_HALF_LOG2_E: tl.constexpr = tl.constexpr(-0.72134752044448170368)
 @triton.jit
 @no_type_check
 def load_rows(pointer, stride, index, NUM: tl.constexpr):
-    """NUM blocks at `index`, `stride` numbers apart, as a tuple."""
+    """Load NUM blocks at `index`, `stride` numbers apart, as a tuple."""
     rows = ()
     for k in tl.static_range(NUM):
         rows = rows + (tl.load(pointer + k * stride + index),)
@@ -131,7 +127,7 @@ def load_rows(pointer, stride, index, NUM: tl.constexpr):
 @triton.jit
 @no_type_check
 def evaluate_rows(record, centre, offsets, AXES: tl.constexpr):
-    """The pixels relative to a footprint's point, and the values of its rows there.
+    """Compute the pixels relative to a footprint's point, and the values of its rows there.
 
     Args:
         centre: of the tile, and the residual of its rounding.
@@ -139,7 +135,7 @@ def evaluate_rows(record, centre, offsets, AXES: tl.constexpr):
     """
     delta = ()
     for k in tl.static_range(AXES):
-        # Both differences are exact or tiny: no digits of the pixel are lost.
+        # Both differences are exact or tiny, so rounding loses no digits of the pixel.
         point = (record[k] - centre[k]) + (record[AXES + k] - centre[AXES + k])
         delta = delta + (offsets[k] - point,)
     rows = ()
@@ -154,11 +150,11 @@ def evaluate_rows(record, centre, offsets, AXES: tl.constexpr):
 @triton.jit
 @no_type_check
 def evaluate_response(rows, radial_variance, TINY: tl.constexpr, AXES: tl.constexpr):
-    """exp(-q / 2) at pixels (0 where L <= 0); for the exact kernel also Q, L and the divisor in q = Q / divisor."""
+    """Evaluate exp(-q / 2) at pixels (0 where L <= 0); for the exact kernel also Q, L, and the divisor of Q in q."""
     square = rows[0] * rows[0] + rows[1] * rows[1]
     if AXES == 3:
         ahead = 1 + rows[2]
-        # The bound only matters next to the plane L = 0; it keeps gradients finite there.
+        # The bound has an effect only near the plane L = 0; it keeps gradients finite there.
         bounded = tl.maximum(ahead, TINY)
         divisor = bounded * bounded + radial_variance * square
         falloff = tl.where(ahead > 0, tl.exp2((square / divisor) * _MINUS_HALF_LOG2_E), 0.0)
@@ -170,14 +166,14 @@ def evaluate_response(rows, radial_variance, TINY: tl.constexpr, AXES: tl.conste
 @triton.jit
 @no_type_check
 def clamp_alpha(raw):
-    """At most 0.99, and 0 below 1/255."""
+    """Limit alpha to 0.99, and set it to 0 below 1/255."""
     return tl.where(raw >= _ALPHA_CUT, tl.minimum(raw, _MAX_ALPHA), 0.0)
 
 
 @triton.jit
 @no_type_check
 def locate_pixels(tile, pixel, columns, tiles, height, width, SUMS: tl.constexpr):
-    """Offsets of a tile's pixels in the first channel of its image plane, the channels' stride, and a mask.
+    """Locate a tile's pixels: offsets in the first channel of its image plane, the channels' stride, and a mask.
 
     Args:
         tile: 64-bit, counted over image planes.
@@ -194,11 +190,11 @@ def locate_pixels(tile, pixel, columns, tiles, height, width, SUMS: tl.constexpr
 @triton.jit(do_not_specialize=["first_tile", "columns", "tiles", "height", "width"])
 @no_type_check
 def rasterize_kernel(
-    records, record_ids, starts, busiest, centres, offsets, sums, stops, first_tile, columns, tiles, height, width,
+    records, record_ids, starts, tile_order, centres, offsets, sums, stops, first_tile, columns, tiles, height, width,
     TINY: tl.constexpr, AXES: tl.constexpr, CHANNELS: tl.constexpr, RECORD: tl.constexpr, PEAK: tl.constexpr,
 ):
-    """Write the sums of weight x (channels, distance, 1), and the position of the stop; one program a tile."""
-    local = tl.load(busiest + tl.program_id(0)).to(tl.int64)
+    """Write the sums of weight x (channels, distance, 1), and the position of the stop; one program for each tile."""
+    local = tl.load(tile_order + tl.program_id(0)).to(tl.int64)
     tile = first_tile + local
     pixel = tl.arange(0, _PIXELS)
     centre = load_numbers(centres + tile * 2 * AXES, 2 * AXES)
@@ -248,15 +244,15 @@ def rasterize(
     tiles = len(intersections.starts) - 1
     stops = torch.empty(tiles, dtype=torch.int32, device=records.device)
     rasterize_kernel[(tiles,)](
-        records, intersections.record_ids, intersections.starts, busiest_tiles(intersections), pixels.centres,
+        records, intersections.record_ids, intersections.starts, sort_tiles_by_load(intersections), pixels.centres,
         pixels.offsets, sums, stops,
         *launch_geometry(intersections, sums), **launch_constants(records, layout), num_warps=num_warps(layout, 2),
     )  # fmt: skip
     return stops
 
 
-def busiest_tiles(intersections: TileIntersections) -> Int[Tensor, "tile"]:
-    """The tiles by falling number of intersections, so that the longest do not start last."""
+def sort_tiles_by_load(intersections: TileIntersections) -> Int[Tensor, "tile"]:
+    """Sort the tiles by descending number of intersections, so that the slowest start first."""
     return torch.argsort(intersections.starts.diff(), descending=True, stable=True).int()
 
 
@@ -276,33 +272,33 @@ def launch_constants(records: Float[Tensor, "n record"], layout: RecordLayout) -
     return dict(TINY=tiny, AXES=layout.axes, CHANNELS=layout.channels, **record)
 
 
-def num_warps(layout: RecordLayout, usual: int) -> int:
-    """Warps a tile: more channels need fewer pixels a thread, to keep all sums in registers."""
-    return usual if layout.channels <= 4 else 4 if layout.channels <= 12 else 8
+def num_warps(layout: RecordLayout, default: int) -> int:
+    """Warps for each tile: with more channels a thread has fewer pixels, so that all sums stay in registers."""
+    return default if layout.channels <= 4 else 4 if layout.channels <= 12 else 8
 
 
 _MANY_TILES = 32
-"""An instance with more tiles is summed by its own program."""
+"""An instance with more tiles has its own program in the sum over tiles."""
 
 
 # fmt: off
 @triton.jit(do_not_specialize=["first_tile", "columns", "tiles", "height", "width"])
 @no_type_check
 def rasterize_backward_kernel(
-    records, record_ids, slots, starts, stops, busiest, centres, offsets, sums, grad_sums, gradients,
+    records, record_ids, slots, starts, stops, tile_order, centres, offsets, sums, grad_sums, gradients,
     first_tile, columns, tiles, height, width,
     TINY: tl.constexpr, AXES: tl.constexpr, CHANNELS: tl.constexpr, RECORD: tl.constexpr, PEAK: tl.constexpr,
     GRADIENT: tl.constexpr, FIELDS: tl.constexpr,
 ):
-    """Write the gradient record of each intersection of a tile; one program a tile."""
-    local = tl.load(busiest + tl.program_id(0)).to(tl.int64)
+    """Write the gradient record of each intersection of a tile; one program for each tile."""
+    local = tl.load(tile_order + tl.program_id(0)).to(tl.int64)
     tile = first_tile + local
     pixel = tl.arange(0, _PIXELS)
     centre = load_numbers(centres + tile * 2 * AXES, 2 * AXES)
     offset = load_rows(offsets + tile * AXES * _PIXELS, _PIXELS, pixel, AXES)
     first_channel, stride, inside = locate_pixels(tile, pixel, columns, tiles, height, width, CHANNELS + 2)
     grad = ()
-    behind = tl.zeros([_PIXELS], records.dtype.element_ty)  # gradient x (the sums still behind)
+    behind = tl.zeros([_PIXELS], records.dtype.element_ty)  # gradient x (the sums behind the record)
     for c in tl.static_range(CHANNELS + 2):
         grad_plane = tl.load(grad_sums + first_channel + c * stride, mask=inside, other=0.0)
         behind += grad_plane * tl.load(sums + first_channel + c * stride, mask=inside, other=0.0)
@@ -347,7 +343,7 @@ def rasterize_backward_kernel(
 @triton.jit
 @no_type_check
 def sum_row_gradients(grad_rows, delta, AXES: tl.constexpr):
-    """Sums over pixels of gradient x (pixel - point), row by row, then of the gradients alone."""
+    """Sum gradient x (pixel - point) over pixels, row by row, then the gradients alone."""
     sums = ()
     for f in tl.static_range(AXES):
         for k in tl.static_range(AXES):
@@ -357,22 +353,16 @@ def sum_row_gradients(grad_rows, delta, AXES: tl.constexpr):
     return sums
 
 
+# fmt: off
 @triton.jit(do_not_specialize=["num"])
 @no_type_check
 def sum_gradients_kernel(
-    gradients,
-    ends,
-    which,
-    totals,
-    num,
-    GRADIENT: tl.constexpr,
-    FIELDS: tl.constexpr,
-    GROUP: tl.constexpr,
-    AT_ONCE: tl.constexpr,
+    gradients, ends, instances, totals, num,
+    GRADIENT: tl.constexpr, FIELDS: tl.constexpr, GROUP: tl.constexpr, AT_ONCE: tl.constexpr,
 ):
-    """Add the gradient records of its tiles to each instance's total."""
+    """Add the gradient records of an instance's tiles to its total."""
     group = tl.program_id(0) * GROUP + tl.arange(0, GROUP)
-    instance = tl.load(which + group, mask=group < num, other=0).to(tl.int64)
+    instance = tl.load(instances + group, mask=group < num, other=0).to(tl.int64)
     first = tl.load(ends + instance - 1, mask=(group < num) & (instance > 0), other=0)
     count = tl.load(ends + instance, mask=group < num, other=0) - first
     field = tl.arange(0, FIELDS)[None, None, :]
@@ -386,6 +376,7 @@ def sum_gradients_kernel(
     place = totals + instance[:, None] * GRADIENT + field
     mask = (group < num)[:, None] & (field < GRADIENT)
     tl.store(place, tl.load(place, mask=mask, other=0.0) + total, mask=mask)
+# fmt: on
 
 
 def rasterize_backward(
@@ -412,24 +403,24 @@ def rasterize_backward(
     gradients = records.new_zeros(len(intersections.record_ids), num)  # 0 where forward stopped early
     rasterize_backward_kernel[(tiles,)](
         records, intersections.record_ids, intersections.slots, intersections.starts, stops,
-        busiest_tiles(intersections), pixels.centres, pixels.offsets, sums, grad_sums, gradients,
+        sort_tiles_by_load(intersections), pixels.centres, pixels.offsets, sums, grad_sums, gradients,
         *launch_geometry(intersections, sums), **launch_constants(records, layout), GRADIENT=num, FIELDS=fields,
         num_warps=num_warps(layout, 1),
     )  # fmt: skip
     counts = intersections.ends.diff(prepend=intersections.ends.new_zeros(1))
     few = torch.nonzero((counts > 0) & (counts <= _MANY_TILES))[:, 0].int()
     many = torch.nonzero(counts > _MANY_TILES)[:, 0].int()
-    for which, group, at_once in ((few, 16, 1), (many, 1, 16)):
-        if len(which):
-            grid = (triton.cdiv(len(which), group),)
+    for selected, group, at_once in ((few, 16, 1), (many, 1, 16)):
+        if len(selected):
+            grid = (triton.cdiv(len(selected), group),)
             sum_gradients_kernel[grid](
-                gradients, intersections.ends, which, totals, len(which),
+                gradients, intersections.ends, selected, totals, len(selected),
                 GRADIENT=num, FIELDS=fields, GROUP=group, AT_ONCE=at_once, num_warps=2,
             )  # fmt: skip
 
 
 def sum_by_record(totals: Float[Tensor, "m gradient"], instances: Instances, num: int) -> Float[Tensor, "n gradient"]:
-    """Each record's gradient: the sum over planes, on each of which it has one instance at most."""
+    """Sum the gradients of each record over image planes; a record has at most one instance on a plane."""
     gradient = totals.new_zeros(num, totals.shape[1])
     for records, total in zip(
         instances.records.long().split(instances.planes), totals.split(instances.planes), strict=True

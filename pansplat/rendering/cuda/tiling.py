@@ -1,4 +1,4 @@
-"""Tile intersections in drawing order, and the pixels of each tile.
+"""Tile intersections, front to back, and the pixels of each tile.
 
 Source: docs/rendering.md, sections 3 to 5. Gaussians are sorted once by depth, then intersections only by tile.
 """
@@ -19,12 +19,12 @@ from pansplat.rendering.reference import split_rows, tile_grid, tile_ranges
 TILE_SIZE = 16  # pixels
 
 _MAX_INTERSECTIONS = 1 << 24
-"""Intersections listed at a time: about 40 bytes each while they are sorted, 70 to 130 in backward."""
+"""Intersections in a band: about 40 bytes each while they are sorted, 70 to 130 in backward."""
 
 _MAX_TILES = 1 << 15
-"""Tiles listed at a time: their indices are sorted as 16-bit integers, in half the passes of 32."""
+"""Tiles in a band: their indices are sorted as 16-bit integers, in half the passes of 32."""
 
-_BLOCK_SIZE: tl.constexpr = tl.constexpr(512)  # intersections a program
+_BLOCK_SIZE: tl.constexpr = tl.constexpr(512)  # intersections of one program
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +52,8 @@ class TileIntersections:
         rows: first row of tiles, and one past the last.
         record_ids: indices of records, tile after tile.
         starts: of each tile in `record_ids`, and the end of the last.
-        slots: position of each intersection before the sort by tile, where an instance's are adjacent.
-        ends: of each instance, before the sort by tile.
+        slots: position of each intersection before the sort by tile; those of an instance are adjacent.
+        ends: of each instance's slots.
     """
 
     rows: tuple[int, int]
@@ -71,7 +71,7 @@ def sort_instances(
     *,
     wraps: bool,
 ) -> Instances:
-    """The visible records of each image plane, front to back.
+    """Sort the visible records of each image plane front to back.
 
     Args:
         boxes: on each plane, pixels; left > right where not seen.
@@ -97,10 +97,10 @@ def sort_instances(
 
 
 def intersect_tiles(instances: Instances, limit: int = _MAX_INTERSECTIONS) -> Iterator[TileIntersections]:
-    """Intersections of all tiles, in bands of tile rows with about `limit` intersections at most."""
+    """List the intersections of all tiles, in bands of tile rows with at most `limit` intersections (or one row)."""
     rows, columns = instances.grid
     num_columns, first_row, num_rows = instances.ranges.long()[:, 1:].unbind(1)
-    # Intersections in each row of tiles, by differences at the instances' ends.
+    # Count the intersections in each row of tiles, from differences at the instances' ends.
     change = torch.zeros(rows + 1, dtype=torch.int64, device=first_row.device)
     change.index_add_(0, first_row, num_columns)
     change.index_add_(0, first_row + num_rows, -num_columns)
@@ -134,7 +134,7 @@ def _limit_bands(bands: Iterator[tuple[int, int]], limit: int) -> Iterator[tuple
 @triton.jit(do_not_specialize=["num", "total", "low", "columns", "steps"])
 @no_type_check
 def intersect_kernel(ends, ranges, records, tiles, record_ids, num, total, low, columns, steps):
-    """Write the tile and the record of each slot: instance by instance, the tiles of each row by row."""
+    """Write the tile and the record of each slot; an instance's slots are its tiles, row by row."""
     slot = tl.program_id(0).to(tl.int64) * _BLOCK_SIZE + tl.arange(0, _BLOCK_SIZE)
     inside = slot < total
     # Binary search for the slot's instance: the first that ends after it.
@@ -156,7 +156,7 @@ def intersect_kernel(ends, ranges, records, tiles, record_ids, num, total, low, 
 
 @dataclass(frozen=True, eq=False)
 class TilePixels:
-    """Pixels by tile, relative to the tile's centre; all planes, tiles row by row.
+    """Pixels of all planes by tile, relative to the tile's centre; tiles are row by row.
 
     Attributes:
         centres: of the tiles, rounded to the kernels' type, and the residual of the rounding.
@@ -168,17 +168,17 @@ class TilePixels:
 
 
 def tile_pixels(planes: list[ImagePlane], *, exact: bool, dtype: torch.dtype) -> TilePixels:
-    """Pixels of image planes of one size; tiles that extend beyond an image repeat its last row and column.
+    """Arrange the pixels of image planes of one size by tile; tiles beyond an edge repeat the last row or column.
 
     Args:
         exact: points are directions in camera axes, not x, y in pixels.
         dtype: the kernels' type.
     """
-    tables = [_plane_pixels(plane, exact, dtype) for plane in planes]
+    tables = [_arrange_pixels(plane, exact, dtype) for plane in planes]
     return TilePixels(*(torch.cat(table) for table in zip(*tables, strict=True)))
 
 
-def _plane_pixels(
+def _arrange_pixels(
     plane: ImagePlane, exact: bool, dtype: torch.dtype
 ) -> tuple[Float[Tensor, "tile both axis"], Float[Tensor, "tile axis pixel"]]:
     points = plane.directions() if exact else plane.coordinates()

@@ -17,7 +17,7 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from pansplat.rendering.cuda.projection import project_kernel
-from pansplat.rendering.cuda.projection_backward import project_backward_kernel
+from pansplat.rendering.cuda.projection_backward import backpropagate_projection_kernel
 from pansplat.rendering.cuda.rasterize import (
     RecordLayout,
     num_warps,
@@ -39,7 +39,7 @@ _FLOATS = (
     "radial_variances",
 )
 _FLOATS += ("records", "centres", "offsets", "sums", "grad_sums", "gradients", "totals")
-_INTEGERS = ("record_ids", "slots", "starts", "stops", "busiest", "which", "ranges")
+_INTEGERS = ("record_ids", "slots", "starts", "stops", "tile_order", "instances", "ranges")
 _FLOATS += ("grad_world_directions", "grad_peaks", "grad_rows", "grad_radial_variances")
 _FLOATS += ("grad_means", "grad_opacities", "grad_first_shape", "grad_second_shape")
 _DOUBLES = ("camera", "directions", "radii", "covariances", "grad_directions", "grad_radii")
@@ -95,7 +95,7 @@ def main() -> None:
             name = "scales" if by_axes else "covariances"
             _report(f"project, degree 4, {name}", project_kernel, 4, capability, **sizes)
             sizes |= dict(BLOCK=64)
-            _report(f"project backward, {name}", project_backward_kernel, 2, capability, **sizes)
+            _report(f"project backward, {name}", backpropagate_projection_kernel, 2, capability, **sizes)
         _report("intersect", intersect_kernel, 4, capability)
 
 

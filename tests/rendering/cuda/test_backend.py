@@ -139,9 +139,9 @@ def test_a_missing_triton_is_an_error(make_scene, pose, monkeypatch):
 
 def test_auto_selects_triton_only_on_cuda(unchecked):
     from pansplat.rendering import cuda, rasterize as _  # noqa: F401, I001
-    from pansplat.rendering.rasterize import _backend
+    from pansplat.rendering.rasterize import _select_backend
 
     means = types.SimpleNamespace(is_cuda=True, device=torch.device("cuda"), dtype=torch.float32)
-    assert _backend("auto", types.SimpleNamespace(means=means)) is cuda.rasterize_planes
+    assert _select_backend("auto", types.SimpleNamespace(means=means)) is cuda.rasterize_planes
     means.is_cuda, means.device = False, torch.device("cpu")
-    assert _backend("auto", types.SimpleNamespace(means=means)) is not cuda.rasterize_planes
+    assert _select_backend("auto", types.SimpleNamespace(means=means)) is not cuda.rasterize_planes
