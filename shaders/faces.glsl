@@ -29,9 +29,9 @@ vec4 fetch_inside(sampler2D atlas, int face, ivec2 pixel) {
 
 // The neighbour face's pixel that touches this face's border: exchange `axis` and forward.
 vec4 fetch_across(sampler2D atlas, int face, ivec2 pixel, int axis) {
-    vec2 place = (2.0 * vec2(clamp(pixel, ivec2(0), ivec2(face_size - 1))) + 1.0) / float(face_size) - 1.0;
-    vec3 local = vec3(place, 1.0);
-    local.z = abs(place[axis]);
+    vec2 center = (2.0 * vec2(clamp(pixel, ivec2(0), ivec2(face_size - 1))) + 1.0) / float(face_size) - 1.0;
+    vec3 local = vec3(center, 1.0);
+    local.z = abs(center[axis]);
     local[axis] = pixel[axis] < 0 ? -1.0 : 1.0;
     vec3 d = FACES[face] * local;
     vec3 outward = FACES[face] * vec3(axis == 0 ? local.x : 0.0, axis == 1 ? local.y : 0.0, 0.0);
@@ -50,8 +50,8 @@ vec4 fetch(sampler2D atlas, int face, ivec2 pixel) {
 
 vec4 sample_faces(sampler2D atlas, vec3 d) {
     int face = face_of(d);
-    vec2 place = face_pixel(face, d);
-    vec2 corner = floor(place - 0.5), f = place - 0.5 - corner;
+    vec2 pixel = face_pixel(face, d);
+    vec2 corner = floor(pixel - 0.5), f = pixel - 0.5 - corner;
     ivec2 p = ivec2(corner);
     vec4 top = mix(fetch(atlas, face, p), fetch(atlas, face, p + ivec2(1, 0)), f.x);
     vec4 bottom = mix(fetch(atlas, face, p + ivec2(0, 1)), fetch(atlas, face, p + ivec2(1, 1)), f.x);
@@ -61,6 +61,6 @@ vec4 sample_faces(sampler2D atlas, vec3 d) {
 vec2 atlas_uv(vec3 d) {
     int face = face_of(d);
     float side = float(face_size + 2);
-    vec2 place = face_pixel(face, d) + 1.0;
-    return (vec2(face % 3, face / 3) + vec2(place.x, side - place.y) / side) / vec2(3.0, 2.0);
+    vec2 pixel = face_pixel(face, d) + 1.0;
+    return (vec2(face % 3, face / 3) + vec2(pixel.x, side - pixel.y) / side) / vec2(3.0, 2.0);
 }

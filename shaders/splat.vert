@@ -16,9 +16,9 @@ flat out vec3 v_color;
 
 void main() {
     vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
-    vec2 place = (quad_1.xy + corner.x * quad_1.zw + corner.y * quad_2.xy) / half_size;
+    vec2 position = (quad_1.xy + corner.x * quad_1.zw + corner.y * quad_2.xy) / half_size;
     // The quad of a record that is not visible is one point outside the image.
-    gl_Position = row_l.w > 0.0 ? vec4(place.x, -place.y, 0.0, 1.0) : vec4(2.0, 2.0, 2.0, 1.0);
+    gl_Position = row_l.w > 0.0 ? vec4(position.x, -position.y, 0.0, 1.0) : vec4(2.0, 2.0, 2.0, 1.0);
     v_base = quad_2.zw;
     v_a = row_a;
     v_b = row_b;

@@ -31,8 +31,7 @@ class Options:
     model: str = "sweep"
     """Predictor for pairs: `sweep`, or a file of weights (.safetensors, or an official .ckpt)."""
     compat: Literal["trained", "official", "fixed"] = "trained"
-    """For a network: `official` equals the official code, `fixed` corrects its defects, `trained` is the choice that
-    the weights were trained with."""
+    """For a network: as the official code, with its defects fixed, or as the weights were trained."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """Type of a network's convolutions; bfloat16 is faster on CPUs that support it, and less accurate."""
     height: int = 512

@@ -105,10 +105,14 @@ class Frame:
         """Rotation from the camera's axes to the cube's."""
         return self.faces_to_world.T @ self.rotation
 
+    @property
+    def _pinhole(self) -> Pinhole:
+        return Pinhole(self.rotation, self.position, self.focal, *self.size)
+
     def layer_cameras(self) -> list[Pinhole]:
         """Return the cameras of a layer's parts: one, or one for each cube face."""
         if self.storage == LayerStorage.IMAGE:
-            return [Pinhole(self.rotation, self.position, self.focal, *self.size)]
+            return [self._pinhole]
         border = 1 if self.storage == LayerStorage.PADDED_FACES else 0
         return cube_face_cameras(self.faces_to_world, self.position, self.face_size, border)
 
@@ -118,11 +122,10 @@ class Frame:
             return [0]
         if self.storage == LayerStorage.FACES:
             return list(range(6))
-        half_size = 0.5 * self.size[0] / self.focal, 0.5 * self.size[1] / self.focal
-        return find_faces_in_view(self.camera_to_faces, half_size)
+        return find_faces_in_view(self.camera_to_faces, self._pinhole.half_size)
 
     def layer_key(self, splats: SortedSplats) -> tuple[Hashable, ...]:
-        """Return everything that a layer's content depends on, except its set of Gaussians."""
+        """Return the values that a layer's content depends on, except its set of Gaussians."""
         s = self.settings
         key = (splats, self.position, s.kernel, s.order, s.lowpass, s.levels, s.opacity_threshold, s.near)
         if self.storage == LayerStorage.IMAGE:
@@ -138,9 +141,7 @@ class Target:
         parts: the parts (cube faces; 0 if there is one part) whose content is valid.
     """
 
-    def __init__(
-        self, ctx: moderngl.Context, size: tuple[int, int], *, color_bits: int, depth_components: int = 0
-    ) -> None:
+    def __init__(self, ctx: moderngl.Context, size: tuple[int, int], color_bits: int, depth_components: int) -> None:
         """Allocate the textures; their content is undefined."""
         self._ctx = ctx
         self.size = size
@@ -161,7 +162,7 @@ class Target:
     def release(self) -> None:
         """Free the textures."""
         if self._ctx.fbo is self.framebuffer:
-            # When moderngl makes a framebuffer it binds the previous one again, which must then still exist.
+            # moderngl binds the previous framebuffer again after it creates one, so the previous one must exist.
             (self._ctx.screen or self._ctx.detect_framebuffer(0)).use()
         self.framebuffer.release()
         self.color.release()
@@ -202,7 +203,7 @@ class TargetStore:
                 target.release()
                 target = None
         if target is None:
-            target = Target(self._ctx, size, color_bits=self.color_bits, depth_components=depth_components)
+            target = Target(self._ctx, size, self.color_bits, depth_components)
             self._targets[name] = target
         if key is None or target.key != key:
             target.invalidate(key)
@@ -241,7 +242,7 @@ class Layer:
         target: the textures.
         visible: number of Gaussians in the set.
         drawn: number of splats drawn for this frame.
-        cached: whether nothing had to be drawn.
+        cached: whether all parts in view were valid before.
     """
 
     target: Target
@@ -290,6 +291,7 @@ class LayerPainter:
         selected: Bool[np.ndarray, "n"],
         settings: DrawSettings,
     ) -> int:
+        """Draw one part of a layer; returns the number of splats."""
         variance, _ = lowpass_variances(settings, camera.focal)
         seen = splats.cull(camera, selected, kernel=settings.kernel, filter_variance=variance)
         indices = splats.sort_back_to_front(camera, seen, settings.order)
@@ -332,8 +334,7 @@ class SplatRasterizer:
         self._capacity = max(min(_CHUNK_SIZE, len(splats)), 1)
         self._indices = ctx.buffer(reserve=4 * self._capacity, dynamic=True)
         self._records = ctx.buffer(reserve=RECORD_BYTES * self._capacity, dynamic=True)
-        layout = " ".join(["4f"] * len(RECORD)) + " /i"
-        self._quads = ctx.vertex_array(programs.splat(), [(self._records, layout, *RECORD)])
+        self._quads = ctx.vertex_array(programs.splat(), [(self._records, "4f " * len(RECORD) + "/i", *RECORD)])
         self._points: moderngl.VertexArray | None = None
         if tier == "gl33":
             self._points = ctx.vertex_array(

@@ -1,4 +1,4 @@
-"""GLSL programs: sources are read from the package, includes resolved, and programs compiled at first use."""
+"""GLSL programs, compiled at first use from the sources in the package."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pansplat.errors import InputError
 
 _INCLUDE = re.compile(r'^#include "([^"]+)"$', re.MULTILINE)
 
-# Numbers of pansplat.constants that the shaders read.
+# Names in pansplat.constants that every shader source gets as #define lines.
 _SHARED_CONSTANTS = ("ALPHA_CUT", "MAX_ALPHA", "EWA_NEAR_FACTOR", "EWA_CLAMP")
 
 # Members of a record, in the order of shaders/project.vert and project.comp.
@@ -37,13 +37,13 @@ def choose_tier(ctx: moderngl.Context, tier: str) -> str:
     return "gl43" if has_compute and tier != "gl33" else "gl33"
 
 
-def source(name: str, version: int, **defines: float) -> str:
+def read_source(name: str, version: int, **defines: float) -> str:
     """Return a shader's text with its includes and the `#version` line for GL `version` (330 or 430).
 
     Args:
         name: file in shaders/.
         version: of the `#version` line.
-        defines: constants in addition to those that all renderers share.
+        defines: constants in addition to the shared ones.
     """
     defines = {key: getattr(constants, key) for key in _SHARED_CONSTANTS} | defines
     folder = resources.files("pansplat_viewer.shaders")
@@ -65,7 +65,7 @@ def set_uniforms(program: Any, **values: Any) -> None:
 
 
 class Programs:
-    """The viewer's programs on one context."""
+    """The viewer's programs on one context; each method compiles its program at the first call and returns it."""
 
     def __init__(self, ctx: moderngl.Context) -> None:
         """Create an empty cache."""
@@ -77,13 +77,13 @@ class Programs:
         return self._compile(
             "project.vert",
             lambda: self._ctx.program(
-                vertex_shader=source("project.vert", 330), varyings=RECORD, varyings_capture_mode="interleaved"
+                vertex_shader=read_source("project.vert", 330), varyings=RECORD, varyings_capture_mode="interleaved"
             ),
         )
 
     def project_compute(self) -> moderngl.ComputeShader:
         """Gaussians to records by a compute shader (GL 4.3)."""
-        return self._compile("project.comp", lambda: self._ctx.compute_shader(source("project.comp", 430)))
+        return self._compile("project.comp", lambda: self._ctx.compute_shader(read_source("project.comp", 430)))
 
     def splat(self) -> moderngl.Program:
         """Records to pixels of a layer."""
@@ -111,7 +111,7 @@ class Programs:
         return self._compile(
             f"{fragment} {defines}",
             lambda: self._ctx.program(
-                vertex_shader=source(vertex, 330), fragment_shader=source(fragment, 330, **defines)
+                vertex_shader=read_source(vertex, 330), fragment_shader=read_source(fragment, 330, **defines)
             ),
         )
 

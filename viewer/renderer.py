@@ -1,8 +1,7 @@
 """Draws a scene's Gaussians with OpenGL into a texture: any pose, pinhole or panorama, any blending mode.
 
-Needs no window. GL objects belong to the context's thread; call everything from there. `SplatRenderer._draw` holds the
-data flow of a frame: the splats are painted into layers (one for each set of Gaussians), and the layers are composed to
-the image. Layers are kept until something that they depend on changes.
+Needs no window. All calls must come from the thread of the context. `SplatRenderer._draw` has the data flow of a frame:
+the splats are painted into layers (one for each set of Gaussians), and the layers are composed to the image.
 """
 
 from __future__ import annotations
@@ -266,13 +265,9 @@ class Compositor:
         program = self._programs.resolve()
         set_uniforms(program, difference=len(sums) == 2, background=frame.settings.background)
         first, second = sums[0], sums[-1]
-        self._bind_textures(
-            program,
-            first_color=first.color,
-            first_depth=first.depth,
-            second_color=second.color,
-            second_depth=second.depth,
-        )
+        textures = {"first_color": first.color, "first_depth": first.depth}
+        textures |= {"second_color": second.color, "second_depth": second.depth}
+        self._bind_textures(program, **textures)
         self._ctx.enable_only(moderngl.NOTHING)
         self._resolve.render(moderngl.TRIANGLES, vertices=3)
         return image

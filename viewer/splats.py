@@ -1,7 +1,7 @@
 """A scene's Gaussians on the CPU: arrays, colours, sort order, selection and culling.
 
-Order and colours depend on the position of the camera and not on its rotation (radial order), so a rotation needs
-neither. `SplatSorter` computes both in a worker thread.
+Colours and radial order depend on the position of the camera and not on its rotation. `SplatSorter` computes both in
+a worker thread.
 """
 
 import math
@@ -17,8 +17,8 @@ from pansplat.gaussians.harmonics import harmonics_basis
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat_viewer.camera import Pinhole
 
-# Gaussians whose harmonics are evaluated together. Fits the cache and stays below the size at which torch starts its
-# threads, whose start costs more than they save here.
+# Gaussians whose harmonics are evaluated together. Fits the cache, and is below the size at which torch starts threads,
+# which would cost more time than it saves.
 _CHUNK_SIZE = 1 << 13
 
 
@@ -31,12 +31,11 @@ class Splats:
             the world's origin.
         means: moved centres.
         opacities: peak opacities.
-        reach: sqrt(2 ln(255 opacity)), the number of standard deviations up to which a Gaussian is visible; 0 if it
-            is nowhere visible.
+        reach: sqrt(2 ln(255 opacity)); a Gaussian is visible up to this number of standard deviations, 0 is nowhere.
         extent: reach times the largest standard deviation, metres.
         levels, views: labels.
         geometry: rows that the shaders read: mean, opacity; quaternion; scales, 0.
-        harmonics: coefficients; Gaussians are the innermost axis, so that sums over coefficients read memory in order.
+        harmonics: coefficients; Gaussians are the last axis, so that sums over coefficients read memory in order.
         base_colors: colours if they do not depend on the direction (degree 0), else None.
         view_positions: camera centres of the context views in the world.
         num_views: number of context views that have Gaussians or a camera.

@@ -30,7 +30,7 @@ class ViewerState:
         speed: of flying, metres per second.
         context: poses of the input cameras; empty for a file without cameras.
         levels: pyramid levels of the scene, ascending.
-        message: a line to show until `message_until` (seconds of the viewer's clock).
+        message: a text to show until `message_until` (seconds of the viewer's clock).
         quit: whether to close the viewer.
     """
 
@@ -58,7 +58,7 @@ class ViewerState:
         return replace(self.settings, vertical_fov_degrees=self.camera.vertical_fov_degrees)
 
     def show_message(self, message: str, now: float, seconds: float = 4.0) -> None:
-        """Show a line for some seconds."""
+        """Show a message for some seconds."""
         self.message, self.message_until = message, now + seconds
 
 

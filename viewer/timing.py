@@ -61,9 +61,9 @@ def run_job(job: dict[str, Any]) -> Iterator[dict[str, object]]:
                 continue
             renderer = SplatRenderer(ctx, tier=tier, color_bits=32)
             try:
-                for index, one in enumerate(settings):
+                for index, each in enumerate(settings):
                     file = Path(job["folder"]) / f"{tier}_{index}.npy"
-                    measured = _measure(renderer, scene, pose, tuple(job["size"]), one, job["repeats"], file)
+                    measured = _measure(renderer, scene, pose, tuple(job["size"]), each, job["repeats"], file)
                     yield {"tier": tier, "settings": index, "renderer": ctx.info["GL_RENDERER"], **measured}
             finally:
                 renderer.release()

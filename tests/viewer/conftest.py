@@ -2,8 +2,10 @@
 
 import functools
 import os
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -20,6 +22,20 @@ from pansplat_viewer.offscreen import create_context
 from pansplat_viewer.renderer import DrawSettings, SplatRenderer
 
 _Y0 = 0.28209479177387814  # the constant harmonic
+
+
+@pytest.fixture(scope="session")
+def wait_until() -> Callable[..., Any]:
+    """Calls a function until its result is true, and returns the result; fails after `seconds`."""
+
+    def wait(condition: Callable[[], Any], expected: str, seconds: float = 20.0) -> Any:
+        deadline = time.monotonic() + seconds
+        while not (result := condition()):
+            assert time.monotonic() < deadline, f"no {expected} in {seconds:.0f} s"
+            time.sleep(0.005)
+        return result
+
+    return wait
 
 
 @pytest.fixture(scope="session")
@@ -127,14 +143,20 @@ def reference() -> Callable[..., Rendering]:
 
 @pytest.fixture
 def assert_matches() -> Callable[..., None]:
-    """Checks a renderer's last image against a Rendering, optionally at a mask of pixels.
+    """Renders an image of the expected size and compares it with the Rendering, at all pixels or at those of a mask.
 
-    Bounds: mean 1e-4, max 5e-3. Where alpha is within rounding of 1/255, one renderer may draw a splat that the other
-    leaves out. That changes a pixel by at most 1/255 of the splat's colour, which the maximum covers for colours up to
-    1.25, so no pixel is left out.
+    Bounds: mean 1e-4, max 5e-3. Where alpha is within rounding of 1/255, one renderer may draw a splat and the other
+    may skip it. That changes a pixel by at most 1/255 of the splat's colour. The maximum covers colours up to 1.25.
     """
 
-    def check(renderer: SplatRenderer, expected: Rendering, where: np.ndarray | None = None) -> None:
+    def check(
+        renderer: SplatRenderer,
+        cam2world: np.ndarray,
+        settings: DrawSettings,
+        expected: Rendering,
+        where: np.ndarray | None = None,
+    ) -> None:
+        renderer.render(cam2world, expected.alpha.shape[::-1], settings)
         where = np.ones(expected.alpha.shape, bool) if where is None else where
         color = np.concatenate((expected.color.numpy(), expected.alpha.numpy()[None])).transpose(1, 2, 0)
         error = np.abs(renderer.read_color() - color)[where]
@@ -156,9 +178,7 @@ def assert_reference(renderer, assert_matches) -> Callable[..., None]:
     def check(scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> None:
         expected = _reference(scene, cam2world, size, settings)
         for tier in ("gl33", "gl43"):
-            drawn = renderer(scene, tier)
-            drawn.render(cam2world, size, settings)
-            assert_matches(drawn, expected)
+            assert_matches(renderer(scene, tier), cam2world, settings, expected)
 
     return check
 

@@ -1,6 +1,5 @@
-"""What is kept between frames: layers, cached cube faces, and the order from the worker thread."""
+"""State between frames: layers, cached cube faces, and the order from the worker thread."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +15,7 @@ CACHED = DrawSettings(cached=True, background=(0.3, 0.2, 0.1))
 STORAGES = (CACHED, replace(CACHED, cached=False), replace(CACHED, cached=False, layout="equirect"))
 
 
-def turned(pose, degrees):
+def turn_right(pose, degrees):
     """The camera turned to the right."""
     angle = np.radians(degrees)
     c, s = np.cos(angle), np.sin(angle)
@@ -25,12 +24,12 @@ def turned(pose, degrees):
     return result
 
 
-def smooth(scene):
+def enlarge_gaussians(scene):
     """The scene with Gaussians of several pixels, which resampling hardly blurs."""
     return replace(scene, gaussians=replace(scene.gaussians, scales=scene.gaussians.scales.clamp_min(0.15)))
 
 
-def image_of(drawn, pose, settings, size=SIZE):
+def render_image(drawn, pose, settings, size=SIZE):
     drawn.render(pose, size, settings)
     return drawn.read_color()
 
@@ -38,18 +37,20 @@ def image_of(drawn, pose, settings, size=SIZE):
 @pytest.mark.parametrize("color_bits", [16, 32])
 @pytest.mark.parametrize("mode", ["joint", "deferred", "difference"])
 def test_cached_faces_give_the_image_of_direct_drawing(renderer, random_scene, pose, mode, color_bits):
-    scene = smooth(random_scene(150))
+    scene = enlarge_gaussians(random_scene(150))
     kept, direct = renderer(scene, color_bits=color_bits, slot=1), renderer(scene)
     for degrees in (0, 40, 100, 170, 260):
-        camera = turned(pose, degrees)
+        camera = turn_right(pose, degrees)
         settings = replace(CACHED, mode=mode)
-        error = np.abs(image_of(kept, camera, settings) - image_of(direct, camera, replace(settings, cached=False)))
+        error = np.abs(
+            render_image(kept, camera, settings) - render_image(direct, camera, replace(settings, cached=False))
+        )
         assert error.mean() < 4e-3
         assert error.max() < 0.04
 
 
 def test_cached_faces_give_the_depth_of_direct_drawing(renderer, random_scene, pose):
-    scene = smooth(random_scene(400, size=0.2))
+    scene = enlarge_gaussians(random_scene(400, size=0.2))
     kept, direct = renderer(scene), renderer(scene, slot=1)
     kept.render(pose, SIZE, CACHED)
     direct.render(pose, SIZE, replace(CACHED, cached=False))
@@ -59,8 +60,8 @@ def test_cached_faces_give_the_depth_of_direct_drawing(renderer, random_scene, p
 def test_rotation_draws_each_face_once(renderer, random_scene, pose):
     drawn = renderer(random_scene())
     for degrees in range(0, 360, 30):
-        drawn.render(turned(pose, degrees), SIZE, CACHED)
-    drawn.render(turned(pose, 90), SIZE, CACHED)
+        drawn.render(turn_right(pose, degrees), SIZE, CACHED)
+    drawn.render(turn_right(pose, 90), SIZE, CACHED)
     assert drawn.stats.cached and drawn.stats.drawn == 0
     drawn.render(pose, SIZE, replace(CACHED, background=(1, 1, 1)))
     assert drawn.stats.cached, "layers do not depend on the background"
@@ -69,7 +70,7 @@ def test_rotation_draws_each_face_once(renderer, random_scene, pose):
 def test_narrow_field_of_view_is_drawn_directly(renderer, random_scene, pose):
     drawn = renderer(random_scene())
     narrow = replace(CACHED, vertical_fov_degrees=1.0)
-    assert np.array_equal(image_of(drawn, pose, narrow), image_of(drawn, pose, replace(narrow, cached=False)))
+    assert np.array_equal(render_image(drawn, pose, narrow), render_image(drawn, pose, replace(narrow, cached=False)))
 
 
 @pytest.mark.parametrize(
@@ -89,11 +90,11 @@ def test_kept_layers_follow_every_setting(renderer, random_scene, pose, change):
     scene = random_scene(size=0.1)
     drawn, fresh = renderer(scene), renderer(scene, slot=1)
     for settings in STORAGES:
-        before = image_of(drawn, pose, settings)
+        before = render_image(drawn, pose, settings)
         changed = replace(settings, **change)
-        after = image_of(drawn, pose, changed)
+        after = render_image(drawn, pose, changed)
         assert np.abs(after - before).max() > 1e-3
-        assert np.array_equal(after, image_of(fresh, pose, changed))
+        assert np.array_equal(after, render_image(fresh, pose, changed))
 
 
 def test_kept_layers_follow_position_size_and_scene(renderer, random_scene, pose):
@@ -104,19 +105,19 @@ def test_kept_layers_follow_position_size_and_scene(renderer, random_scene, pose
         drawn.render(pose, SIZE, settings)
         drawn.render(moved, SIZE, settings)
         assert not drawn.stats.cached
-        assert np.array_equal(drawn.read_color(), image_of(fresh, moved, settings))
-        small = image_of(drawn, moved, settings, (50, 30))
+        assert np.array_equal(drawn.read_color(), render_image(fresh, moved, settings))
+        small = render_image(drawn, moved, settings, (50, 30))
         assert small.shape == (30, 50, 4)
-        assert np.array_equal(small, image_of(fresh, moved, settings, (50, 30)))
+        assert np.array_equal(small, render_image(fresh, moved, settings, (50, 30)))
     other = random_scene(seed=7)
     drawn.upload(other)
-    assert np.array_equal(image_of(drawn, moved, CACHED), image_of(renderer(other, slot=1), moved, CACHED))
+    assert np.array_equal(render_image(drawn, moved, CACHED), render_image(renderer(other, slot=1), moved, CACHED))
 
 
 def test_reading_depth_changes_nothing_else(renderer, random_scene, pose):
     drawn = renderer(random_scene())
     for settings in STORAGES:
-        color, stats = image_of(drawn, pose, settings), drawn.stats
+        color, stats = render_image(drawn, pose, settings), drawn.stats
         first = drawn.read_depth()
         assert drawn.stats == stats
         assert np.array_equal(drawn.read_color(), color)
@@ -125,7 +126,7 @@ def test_reading_depth_changes_nothing_else(renderer, random_scene, pose):
         assert np.array_equal(drawn.read_depth(), first)
 
 
-def test_unsettled_images_settle_to_the_sorted_one(renderer, random_scene, pose):
+def test_unsettled_images_settle_to_the_sorted_one(renderer, random_scene, pose, wait_until):
     scene = random_scene(degree=2, size=0.1)
     drawn = renderer(scene)
     drawn.render(pose, SIZE, DrawSettings(), wait=False)
@@ -133,12 +134,13 @@ def test_unsettled_images_settle_to_the_sorted_one(renderer, random_scene, pose)
     pose[:3, 3] += (0.5, 0.0, -0.4)
     drawn.render(pose, SIZE, DrawSettings(), wait=False)
     assert not drawn.stats.settled
-    deadline = time.monotonic() + 20
-    while not drawn.stats.settled and time.monotonic() < deadline:
-        time.sleep(0.002)
+
+    def render_again() -> bool:
         drawn.render(pose, SIZE, DrawSettings(), wait=False)
-    assert drawn.stats.settled
-    assert np.array_equal(drawn.read_color(), image_of(renderer(scene, slot=1), pose, DrawSettings()))
+        return drawn.stats.settled
+
+    wait_until(render_again, "settled image")
+    assert np.array_equal(drawn.read_color(), render_image(renderer(scene, slot=1), pose, DrawSettings()))
 
 
 def test_framebuffer_binding_of_the_caller_is_restored(ctx, renderer, random_scene, pose):

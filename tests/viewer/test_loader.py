@@ -14,15 +14,7 @@ from pansplat_viewer.loader import LoadedScene, LoadOptions, SceneEntry, SceneLo
 def ignore(task: str, done: float) -> None: ...
 
 
-def wait_for(loader: SceneLoader) -> object:
-    deadline = time.monotonic() + 10
-    while (result := loader.poll()) is None:
-        assert time.monotonic() < deadline, "the loader returned nothing in 10 s"
-        time.sleep(0.005)
-    return result
-
-
-def threads_of_loaders() -> list[threading.Thread]:
+def list_loader_threads() -> list[threading.Thread]:
     return [thread for thread in threading.enumerate() if thread.name.startswith("scene-loader")]
 
 
@@ -76,7 +68,7 @@ def test_folder_name_is_a_single_valid_name(name, folder):
     assert SceneEntry(name).folder_name == folder
 
 
-def test_loader_reports_progress_and_returns_the_result_once(small_scene):
+def test_loader_reports_progress_and_returns_the_result_once(small_scene, wait_until):
     go, reported = threading.Event(), threading.Event()
 
     def load(entry, progress):
@@ -91,38 +83,38 @@ def test_loader_reports_progress_and_returns_the_result_once(small_scene):
     assert reported.wait(10)
     assert loader.progress == ("kitchen", "reading", 0.25) and loader.poll() is None
     go.set()
-    assert wait_for(loader).scene is small_scene
+    assert wait_until(loader.poll, "result").scene is small_scene
     assert loader.progress is None and loader.poll() is None
     loader.close()
 
 
-def test_an_exception_is_returned(small_scene):
+def test_an_exception_is_returned(wait_until):
     def load(entry, progress):
         raise InputError(f"{entry.name} is damaged")
 
     loader = SceneLoader(load)
     loader.request(SceneEntry("kitchen"))
-    assert str(wait_for(loader)) == "kitchen is damaged"
+    assert str(wait_until(loader.poll, "result")) == "kitchen is damaged"
     loader.close()
 
 
-def test_a_new_request_cancels_the_previous_one(small_scene):
+def test_a_new_request_cancels_the_previous_one(small_scene, wait_until):
     def load(entry, progress):
         return work_forever(entry, progress) if entry.name == "first" else LoadedScene(entry, small_scene)
 
     loader = SceneLoader(load)
     loader.request(SceneEntry("first"))
     loader.request(SceneEntry("second"))
-    assert wait_for(loader).entry.name == "second"
+    assert wait_until(loader.poll, "result").entry.name == "second"
     loader.close()
-    assert not threads_of_loaders()
+    assert not list_loader_threads()
 
 
 def test_close_cancels_the_request_and_joins_its_thread():
     loader = SceneLoader(work_forever)
     loader.request(SceneEntry("endless"))
     loader.close()
-    assert not threads_of_loaders()
+    assert not list_loader_threads()
 
 
 def test_predictions_have_the_arguments_of_the_options(monkeypatch, small_scene):

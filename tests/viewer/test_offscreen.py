@@ -1,9 +1,12 @@
 """Contexts without a window, and the same image on every version of OpenGL."""
 
 import importlib.util
+import inspect
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import moderngl
 import numpy as np
@@ -29,29 +32,39 @@ _WITHOUT = " ".join(
     )
 )
 
-# Renders the given scene with every kernel and layout, and writes the images, the OpenGL version and the tier.
-_RENDER = """
+
+def render_images(renderer, pose):
+    """Images of every kernel and layout, and one from cached faces."""
+    settings = {
+        f"{kernel} {layout}": DrawSettings(kernel=kernel, layout=layout, mode="deferred")
+        for kernel in ("ray", "ewa")
+        for layout in ("pinhole", "equirect")
+    }
+    settings["cached"] = DrawSettings(cached=True)
+    images = {}
+    for name, each in settings.items():
+        renderer.render(pose, (64, 48), each)
+        images[name] = renderer.read_color()
+    return images
+
+
+# Writes the images of the given scene, the OpenGL version and the tier.
+_SCRIPT = f"""
 import sys
 import numpy as np, torch
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat_viewer.offscreen import create_context
 from pansplat_viewer.renderer import DrawSettings, SplatRenderer
 
+{inspect.getsource(render_images)}
 scene_file, out, backend = sys.argv[1:]
 scene = torch.load(scene_file, weights_only=True)
 ctx = create_context(backend)
 renderer = SplatRenderer(ctx, color_bits=32)
 renderer.upload(Scene(Gaussians(**scene["gaussians"]), scene["cam2world"], 0.45, 10.0))
-images = {"version": ctx.version_code, "tier": renderer.tier}
-for kernel in ("ray", "ewa"):
-    for layout in ("pinhole", "equirect"):
-        settings = DrawSettings(kernel=kernel, layout=layout, mode="deferred")
-        renderer.render(scene["pose"].numpy(), (64, 48), settings)
-        images[f"{kernel} {layout}"] = renderer.read_color()
-renderer.render(scene["pose"].numpy(), (64, 48), DrawSettings(cached=True))
-images["cached"] = renderer.read_color()
+images = render_images(renderer, scene["pose"].numpy())
 assert ctx.error == "GL_NO_ERROR", ctx.error
-np.savez(out, **images)
+np.savez(out, version=ctx.version_code, tier=renderer.tier, **images)
 """
 
 
@@ -76,17 +89,9 @@ def test_old_opengl_and_osmesa_render_the_same_images(renderer, random_scene, po
     processes = {}
     for name, environment in runs.items():
         backend = "osmesa" if name == "osmesa" else "egl"
-        command = [sys.executable, "-c", _RENDER, str(tmp_path / "scene.pt"), str(tmp_path / f"{name}.npz"), backend]
-        environment = os.environ | environment
-        processes[name] = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
-    drawn = renderer(scene)
-    expected = {}
-    for kernel in ("ray", "ewa"):
-        for layout in ("pinhole", "equirect"):
-            drawn.render(pose, (64, 48), DrawSettings(kernel=kernel, layout=layout, mode="deferred"))
-            expected[f"{kernel} {layout}"] = drawn.read_color()
-    drawn.render(pose, (64, 48), DrawSettings(cached=True))
-    expected["cached"] = drawn.read_color()
+        command = [sys.executable, "-c", _SCRIPT, str(tmp_path / "scene.pt"), str(tmp_path / f"{name}.npz"), backend]
+        processes[name] = subprocess.Popen(command, env=os.environ | environment, stderr=subprocess.PIPE, text=True)
+    expected = render_images(renderer(scene), pose)
     for name, process in processes.items():
         _, errors = process.communicate(timeout=120)
         assert process.returncode == 0, errors
@@ -98,14 +103,8 @@ def test_old_opengl_and_osmesa_render_the_same_images(renderer, random_scene, po
 
 
 def test_missing_opengl_is_reported_with_the_packages(monkeypatch):
-    def fail(**_):
-        raise Exception("libEGL not loaded")
-
-    def fail_too():
-        raise OSError("libOSMesa is not installed")
-
-    monkeypatch.setattr(moderngl, "create_context", fail)
-    monkeypatch.setattr(offscreen, "_load_osmesa", fail_too)
+    monkeypatch.setattr(moderngl, "create_context", Mock(side_effect=Exception("libEGL not loaded")))
+    monkeypatch.setattr(offscreen, "_load_osmesa", Mock(side_effect=OSError("libOSMesa is not installed")))
     with pytest.raises(InputError, match=r"libEGL not loaded.*libOSMesa.*apt-get install libegl1.*libosmesa6"):
         offscreen.create_context()
 
@@ -116,19 +115,14 @@ def test_unknown_backend_is_refused():
 
 
 def test_tier_follows_the_version_of_the_context():
-    class Old:
-        version_code = 410
-
-    class New:
-        version_code = 430
-
-    assert choose_tier(Old(), "auto") == "gl33"
-    assert choose_tier(New(), "auto") == "gl43"
-    assert choose_tier(New(), "gl33") == "gl33"
+    old, new = SimpleNamespace(version_code=410), SimpleNamespace(version_code=430)
+    assert choose_tier(old, "auto") == "gl33"
+    assert choose_tier(new, "auto") == "gl43"
+    assert choose_tier(new, "gl33") == "gl33"
     with pytest.raises(InputError, match=r"needs OpenGL 4.3, this context has 4.1; use tier gl33"):
-        choose_tier(Old(), "gl43")
+        choose_tier(old, "gl43")
     with pytest.raises(InputError, match="auto, gl33 or gl43, got 'gl21'"):
-        choose_tier(New(), "gl21")
+        choose_tier(new, "gl21")
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not available for this system")

@@ -8,7 +8,7 @@ import torch
 
 from pansplat.constants import ALPHA_CUT
 from pansplat.geometry.cubemap import face_rotations
-from pansplat_viewer.programs import Programs, source
+from pansplat_viewer.programs import Programs, read_source
 
 FOLDER = resources.files("pansplat_viewer.shaders")
 SOURCES = sorted(path.name for path in FOLDER.iterdir() if path.name.endswith((".glsl", ".vert", ".frag", ".comp")))
@@ -27,7 +27,7 @@ def test_readme_names_every_file_uniform_and_input():
 
 def test_source_has_the_version_first_then_constants_and_no_includes():
     for name in SOURCES:
-        lines = source(name, 330, LAYER_STORAGE=2).splitlines()
+        lines = read_source(name, 330, LAYER_STORAGE=2).splitlines()
         defines = [line for line in lines if line.startswith("#define")]
         assert lines[: len(defines) + 1] == ["#version 330 core", *defines]
         assert {f"#define ALPHA_CUT {ALPHA_CUT}", "#define LAYER_STORAGE 2"} <= set(defines)

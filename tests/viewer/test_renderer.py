@@ -21,12 +21,12 @@ SETTINGS = DrawSettings(background=(0.1, 0.4, 0.7))
 KERNELS = pytest.mark.parametrize("kernel", ["ray", "ewa"])
 
 
-def only(scene, mask):
+def select(scene, mask):
     return replace(scene, gaussians=scene.gaussians.select(mask))
 
 
-def view_of(scene, view):
-    return only(scene, scene.gaussians.views == view)
+def select_view(scene, view):
+    return select(scene, scene.gaussians.views == view)
 
 
 @KERNELS
@@ -75,8 +75,7 @@ def test_colors_of_any_degree_follow_the_position(renderer, random_scene, pose, 
     drawn = renderer(scene)
     for shift in (0.0, 0.5):
         pose[0, 3] += shift
-        drawn.render(pose, SIZE, SETTINGS)
-        assert_matches(drawn, reference(scene, pose, SIZE, SETTINGS))
+        assert_matches(drawn, pose, SETTINGS, reference(scene, pose, SIZE, SETTINGS))
 
 
 @pytest.mark.parametrize("order", ["radial", "z"])
@@ -146,8 +145,8 @@ def test_panorama_error_at_seams_is_not_larger_than_inside_faces(renderer, rando
 def test_mode_view_draws_the_gaussians_of_the_view(renderer, random_scene, pose, reference, assert_matches, view):
     scene = random_scene()
     drawn = renderer(scene)
-    drawn.render(pose, SIZE, replace(SETTINGS, mode="view", view=view))
-    assert_matches(drawn, reference(view_of(scene, view), pose, SIZE, SETTINGS))
+    expected = reference(select_view(scene, view), pose, SIZE, SETTINGS)
+    assert_matches(drawn, pose, replace(SETTINGS, mode="view", view=view), expected)
     assert drawn.stats.visible <= int((scene.gaussians.views == view).sum())
 
 
@@ -161,20 +160,19 @@ def test_deferred_blending_equals_the_reference(
     pose[:3, 3] = {"between": centers.mean(0), "at view 1": centers[1], "elsewhere": (0.1, 0.2, 0.3)}[position]
     settings = replace(SETTINGS, mode="deferred", layout=layout)
     drawn = renderer(scene)
-    drawn.render(pose, SIZE, settings)
-    images = [reference(view_of(scene, view), pose, SIZE, settings) for view in (0, 1)]
+    images = [reference(select_view(scene, view), pose, SIZE, settings) for view in (0, 1)]
     weights = blend_weights(torch.from_numpy(pose[:3, 3].copy()), scene.cam2world[:, :3, 3])
     total = sum(weight * image.alpha for weight, image in zip(weights, images, strict=True))
     band = (total > 0) & (total < 1e-3)  # where the weighted views are nearly empty (docs/rendering.md, section 7)
     assert band.float().mean() < 0.02
-    assert_matches(drawn, blend(images, weights), ~band.numpy())
+    assert_matches(drawn, pose, settings, blend(images, weights), ~band.numpy())
 
 
 def test_difference_is_that_of_the_images_of_two_views(renderer, random_scene, pose, reference):
     scene = random_scene()
     drawn = renderer(scene)
     drawn.render(pose, SIZE, replace(SETTINGS, mode="difference"))
-    first, second = (reference(view_of(scene, view), pose, SIZE, SETTINGS) for view in (0, 1))
+    first, second = (reference(select_view(scene, view), pose, SIZE, SETTINGS) for view in (0, 1))
     expected = (first.color - second.color).abs().permute(1, 2, 0).numpy()
     forwards = drawn.read_color()
     assert np.abs(forwards[..., :3] - expected).max() <= 5e-3
@@ -186,17 +184,18 @@ def test_difference_is_that_of_the_images_of_two_views(renderer, random_scene, p
 def test_levels_and_opacity_threshold_select_gaussians(renderer, random_scene, pose, reference, assert_matches):
     scene = random_scene()
     drawn = renderer(scene)
+    cases = [({"opacity_threshold": 0.6}, scene.gaussians.opacities >= 0.6)]
     for levels in ((), (0,), (1, 3)):
-        drawn.render(pose, SIZE, replace(SETTINGS, levels=frozenset(levels)))
         mask = torch.isin(scene.gaussians.levels, torch.tensor(levels, dtype=torch.int64))
-        assert_matches(drawn, reference(only(scene, mask), pose, SIZE, SETTINGS))
-    drawn.render(pose, SIZE, replace(SETTINGS, opacity_threshold=0.6))
-    assert_matches(drawn, reference(only(scene, scene.gaussians.opacities >= 0.6), pose, SIZE, SETTINGS))
+        cases.append(({"levels": frozenset(levels)}, mask))
+    for change, mask in cases:
+        expected = reference(select(scene, mask), pose, SIZE, SETTINGS)
+        assert_matches(drawn, pose, replace(SETTINGS, **change), expected)
 
 
 def test_empty_scene_is_the_background(renderer, random_scene, pose):
     scene = random_scene()
-    drawn = renderer(only(scene, torch.zeros(len(scene.gaussians), dtype=torch.bool)))
+    drawn = renderer(select(scene, torch.zeros(len(scene.gaussians), dtype=torch.bool)))
     for settings in (SETTINGS, replace(SETTINGS, layout="equirect", mode="deferred")):
         drawn.render(pose, SIZE, settings)
         assert np.allclose(drawn.read_color(), (*SETTINGS.background, 0), atol=1e-6)
@@ -215,11 +214,10 @@ def test_gaussians_with_non_finite_values_are_dropped_and_counted(
     fields["opacities"][3] = float("nan")
     fields["harmonics"][4, 2, 0] = float("-inf")
     drawn = renderer(replace(scene, gaussians=replace(scene.gaussians, **fields)))
-    drawn.render(pose, SIZE, SETTINGS)
+    finite = select(scene, torch.arange(len(scene.gaussians)) >= 5)
+    assert_matches(drawn, pose, SETTINGS, reference(finite, pose, SIZE, SETTINGS))
     assert drawn.stats.dropped == 5
     assert drawn.stats.total == len(scene.gaussians) - 5
-    finite = only(scene, torch.arange(len(scene.gaussians)) >= 5)
-    assert_matches(drawn, reference(finite, pose, SIZE, SETTINGS))
 
 
 def test_half_float_targets_are_close(renderer, random_scene, pose):
@@ -247,7 +245,7 @@ def test_software_gl_has_32_bit_targets_by_default(ctx, random_scene, pose):
 
 
 def test_image_is_upright_and_not_mirrored(renderer, random_scene):
-    scene = only(random_scene(), torch.arange(300) < 1)
+    scene = select(random_scene(), torch.arange(300) < 1)
     gaussians = replace(scene.gaussians, means=torch.tensor(((0.5, -0.5, 1.0),)), opacities=torch.ones(1))
     drawn = renderer(replace(scene, gaussians=replace(gaussians, scales=torch.full((1, 3), 0.05))))
     texture = drawn.render(np.eye(4), (64, 64), DrawSettings())

@@ -1,7 +1,6 @@
-"""Sorting, and the worker thread that sorts."""
+"""Sorting by distance, and the worker thread that sorts."""
 
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from pansplat_viewer import splats as splats_module
-from pansplat_viewer.splats import SortedSplats, Splats, SplatSorter, radix_argsort, sort_splats
+from pansplat_viewer.splats import Splats, SplatSorter, radix_argsort, sort_splats
 
 _FLOATS = st.floats(width=32, allow_nan=False)
 
@@ -40,15 +39,7 @@ def test_splats_are_sorted_by_distance_from_the_position(random_scene):
     assert sorted(result.order.tolist()) == list(range(len(splats)))
 
 
-def wait_for(sorter: SplatSorter) -> SortedSplats:
-    deadline = time.monotonic() + 10
-    while (result := sorter.take()) is None:
-        assert time.monotonic() < deadline, "the sorter returned nothing in 10 s"
-        time.sleep(0.005)
-    return result
-
-
-def test_sorter_skips_requests_that_were_replaced(splats, monkeypatch):
+def test_sorter_skips_requests_that_were_replaced(splats, monkeypatch, wait_until):
     started, go, positions = threading.Event(), threading.Event(), []
 
     def slow(splats, position):
@@ -65,13 +56,12 @@ def test_sorter_skips_requests_that_were_replaced(splats, monkeypatch):
     sorter.request(splats, (3.0, 0.0, 0.0))
     assert sorter.take() is None
     go.set()
-    while wait_for(sorter).position != (3.0, 0.0, 0.0):
-        pass
+    wait_until(lambda: (result := sorter.take()) and result.position == (3.0, 0.0, 0.0), "order of the last position")
     sorter.close()
     assert positions == [(1.0, 0.0, 0.0), (3.0, 0.0, 0.0)]
 
 
-def test_exception_in_the_thread_is_raised_by_take(splats, monkeypatch):
+def test_exception_in_the_thread_is_raised_by_take(splats, monkeypatch, wait_until):
     def fail(splats, position):
         raise MemoryError("out of memory")
 
@@ -79,15 +69,15 @@ def test_exception_in_the_thread_is_raised_by_take(splats, monkeypatch):
     sorter = SplatSorter()
     sorter.request(splats, (0.0, 0.0, 0.0))
     with pytest.raises(MemoryError, match="out of memory"):
-        wait_for(sorter)
+        wait_until(sorter.take, "exception")
     sorter.close()
 
 
-def test_close_ends_the_thread(splats):
+def test_close_ends_the_thread(splats, wait_until):
     before = threading.active_count()
     sorter = SplatSorter()
     sorter.request(splats, (0.0, 0.0, 0.0))
-    wait_for(sorter)
+    wait_until(sorter.take, "order")
     sorter.close()
     assert threading.active_count() == before
     with pytest.raises(RuntimeError, match="shutdown"):

@@ -51,7 +51,7 @@ OTHER_WIDGETS = {
 }  # fmt: skip
 
 
-def run(resolution: AdaptiveResolution, full_ms: float, frames: int) -> list[float]:
+def move_camera(resolution: AdaptiveResolution, full_ms: float, frames: int) -> list[float]:
     """Move for some frames whose time is proportional to their pixels; returns the scales."""
     scales = []
     for frame in range(frames):
@@ -62,25 +62,25 @@ def run(resolution: AdaptiveResolution, full_ms: float, frames: int) -> list[flo
 
 
 def test_resolution_is_full_on_a_fast_machine_and_fits_the_budget_on_a_slow_one():
-    assert set(run(AdaptiveResolution(), BUDGET_MS / 2, 30)) == {1.0}
-    scales = run(AdaptiveResolution(), 5 * BUDGET_MS, 30)
+    assert set(move_camera(AdaptiveResolution(), BUDGET_MS / 2, 30)) == {1.0}
+    scales = move_camera(AdaptiveResolution(), 5 * BUDGET_MS, 30)
     assert scales[-1] < 0.6 and 5 * BUDGET_MS * scales[-1] ** 2 <= 1.2 * BUDGET_MS
-    assert run(AdaptiveResolution(), 1e6, 30)[-1] == SCALES[-1]
+    assert move_camera(AdaptiveResolution(), 1e6, 30)[-1] == SCALES[-1]
 
 
 def test_resolution_does_not_oscillate():
     for full_ms in (60.0, 100.0, 150.0, 300.0, 700.0):
-        assert len(set(run(AdaptiveResolution(), full_ms, 60)[20:])) == 1
+        assert len(set(move_camera(AdaptiveResolution(), full_ms, 60)[20:])) == 1
 
 
 def test_resolution_rises_when_frames_get_fast_and_when_the_camera_stops():
     resolution = AdaptiveResolution()
-    run(resolution, 10 * BUDGET_MS, 20)
+    move_camera(resolution, 10 * BUDGET_MS, 20)
     last = 19 / 60
     assert resolution.plan(last + REFINE_AFTER / 2, moved=False, turned=False).scale < 1
     assert resolution.plan(last + REFINE_AFTER * 1.01, moved=False, turned=False).scale == 1
     assert resolution.plan(0.5, moved=True, turned=False, adaptive=False).scale == 1
-    assert run(resolution, BUDGET_MS / 10, 20)[-1] == 1.0
+    assert move_camera(resolution, BUDGET_MS / 10, 20)[-1] == 1.0
 
 
 def test_cached_faces_are_used_only_for_rotations_on_a_slow_machine():
@@ -99,35 +99,35 @@ class User:
         self.viewer, self.target, self.clock = viewer, target, clock
         self.state, self.data, self.panels = viewer.state, viewer.panel_data, viewer.panels
 
-    def frames(self, count: int, seconds: float = 1 / 30) -> None:
+    def draw_frames(self, count: int, seconds: float = 1 / 30) -> None:
         for _ in range(count):
             self.clock[0] += seconds
             self.viewer.frame(self.target, seconds)
 
     def settle(self) -> None:
         """Draw frames until nothing changes without input."""
-        self.frames(3, REFINE_AFTER)
+        self.draw_frames(3, REFINE_AFTER)
         deadline = time.monotonic() + 20
         while self.viewer.busy:
             assert time.monotonic() < deadline, "the viewer does not settle"
-            self.frames(1)
+            self.draw_frames(1)
             time.sleep(0.002)
-        self.frames(1)
+        self.draw_frames(1)
 
-    def screen(self) -> np.ndarray:
+    def read_screen(self) -> np.ndarray:
         pixels = np.frombuffer(self.target.read(components=3), np.uint8).reshape(SIZE[1], SIZE[0], 3)
         return pixels[::-1][IMAGE].astype(int)
 
     def image(self) -> np.ndarray:
         self.settle()
-        return self.screen()
+        return self.read_screen()
 
     def show(self, *entries: SceneEntry) -> None:
         self.viewer.show(list(entries), 0)
         self.settle()
 
     def click(self, label: str) -> None:
-        self.frames(1)
+        self.draw_frames(1)
         left, top, right, bottom = self.panels.items[label]
         x = (left + right) / 2
         if "opacity" in label or label in ("field of view", "split"):  # the label is right of the slider
@@ -139,27 +139,27 @@ class User:
     def click_at(self, x: float, y: float) -> None:
         self.drag((x, y), (x, y))
         imgui.get_io().add_mouse_pos_event(SIZE[0] - 5, SIZE[1] - 5)
-        self.frames(1)
+        self.draw_frames(1)
 
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
         io = imgui.get_io()
         io.add_mouse_pos_event(*start)
-        self.frames(2)
+        self.draw_frames(2)
         io.add_mouse_button_event(0, True)
-        self.frames(1)
+        self.draw_frames(1)
         io.add_mouse_pos_event(*end)
-        self.frames(1)
+        self.draw_frames(1)
         io.add_mouse_button_event(0, False)
-        self.frames(2)
+        self.draw_frames(2)
 
-    def key(self, *keys: imgui.Key, frames: int = 1) -> None:
+    def press(self, *keys: imgui.Key, frames: int = 1) -> None:
         for down in (True, False):
             for key in keys:
                 imgui.get_io().add_key_event(key, down)
-            self.frames(frames if down else 1)
+            self.draw_frames(frames if down else 1)
 
 
-def sphere(entry: SceneEntry, photos: np.ndarray) -> LoadedScene:
+def make_sphere_scene(entry: SceneEntry, photos: np.ndarray) -> LoadedScene:
     """A photograph, and the same photograph as Gaussians around its camera, in a world with z up."""
     pose = torch.eye(4, dtype=torch.float64)
     yaw = 0.7
@@ -192,7 +192,7 @@ def session(gl_context, small_scene, axis_photos, tmp_path_factory) -> Iterator[
 
     def load(entry, progress):
         if entry.name == "sphere":
-            return sphere(entry, axis_photos)
+            return make_sphere_scene(entry, axis_photos)
         if entry.name == "damaged":
             raise InputError("damaged.ply: 100% unreadable; export it again")
         return LoadedScene(entry, small_scene, None if entry.name == "no photographs" else photos)
@@ -226,11 +226,11 @@ def user(session, ctx) -> User:
     state.camera, state.adaptive, state.message = state.home, True, ""
     session.data.error, session.viewer._resolution.budget_ms = None, BUDGET_MS
     imgui.get_io().add_mouse_pos_event(SIZE[0] - 5, SIZE[1] - 5)
-    session.frames(2, REFINE_AFTER)
+    session.draw_frames(2, REFINE_AFTER)
     return session
 
 
-def changed(before: np.ndarray, after: np.ndarray) -> float:
+def changed_fraction(before: np.ndarray, after: np.ndarray) -> float:
     """Fraction of the pixels that differ visibly."""
     return float((np.abs(before - after).max(-1) > 2).mean())
 
@@ -245,7 +245,7 @@ def test_clicking_the_widget_changes_the_image(user, label):
     user.state.settings = replace(user.state.settings, **INITIAL_SETTINGS.get(label, {}))
     before = user.image()
     user.click(label)
-    assert changed(before, user.image()) > 0.001
+    assert changed_fraction(before, user.image()) > 0.001
 
 
 @pytest.mark.parametrize("label", ["0##level", "nearest photograph"])
@@ -254,7 +254,7 @@ def test_clicking_a_check_box_twice_restores_the_image(user, label):
     user.click(label)
     user.image()
     user.click(label)
-    assert changed(before, user.image()) == 0
+    assert changed_fraction(before, user.image()) == 0
 
 
 def test_hiding_every_level_leaves_the_background(user):
@@ -306,24 +306,24 @@ def test_the_scene_follows_a_drag_on_the_image(user):
 
 def test_keys_and_wheel_move_the_camera_and_r_restores_it(user):
     before = user.image()
-    user.key(imgui.Key.w, frames=5)
+    user.press(imgui.Key.w, frames=5)
     assert user.state.camera.position[2] > 0.1
-    user.key(imgui.Key.r)
+    user.press(imgui.Key.r)
     assert user.state.camera == user.state.home
     imgui.get_io().add_mouse_wheel_event(0, 1)
-    user.frames(2)
+    user.draw_frames(2)
     assert user.state.camera.vertical_fov_degrees < user.state.home.vertical_fov_degrees
-    assert changed(before, user.image()) > 0.1
+    assert changed_fraction(before, user.image()) > 0.1
 
 
 def test_tab_hides_the_panels_and_h_shows_the_keys(user):
-    user.key(imgui.Key.tab)
+    user.press(imgui.Key.tab)
     assert not user.panels.items
     plain = user.image()
-    user.key(imgui.Key.h)
-    assert changed(plain, user.image()) > 0.1
-    user.key(imgui.Key.escape)
-    assert changed(plain, user.image()) == 0 and not user.state.quit
+    user.press(imgui.Key.h)
+    assert changed_fraction(plain, user.image()) > 0.1
+    user.press(imgui.Key.escape)
+    assert changed_fraction(plain, user.image()) == 0 and not user.state.quit
 
 
 def test_typing_a_path_does_not_fly_and_enter_opens_it(user):
@@ -332,12 +332,12 @@ def test_typing_a_path_does_not_fly_and_enter_opens_it(user):
     for character in "wasd":
         io.add_key_event(getattr(imgui.Key, character), True)
         io.add_input_character(ord(character))
-        user.frames(2)
+        user.draw_frames(2)
         io.add_key_event(getattr(imgui.Key, character), False)
-        user.frames(1)
+        user.draw_frames(1)
     assert user.panels.path == "wasd"
     assert user.state.camera == user.state.home
-    user.key(imgui.Key.enter)
+    user.press(imgui.Key.enter)
     user.settle()
     assert user.data.entries == ["opened"]
 
@@ -353,12 +353,12 @@ def test_the_list_of_scenes_loads_the_other_pair(user):
 def test_errors_are_shown_and_keep_the_scene(user):
     before = user.image()
     user.viewer.open(Path("nothing"))
-    user.frames(2)
+    user.draw_frames(2)
     assert "no such file" in user.data.error
-    assert changed(before, user.image()) > 0.02, "the message is on the screen"
+    assert changed_fraction(before, user.image()) > 0.02, "the message is on the screen"
     user.click("OK")
     assert user.data.error is None
-    assert changed(before, user.image()) == 0
+    assert changed_fraction(before, user.image()) == 0
     user.show(SceneEntry("damaged"))
     assert user.data.error.startswith("damaged.ply: 100% unreadable")
 
@@ -400,8 +400,8 @@ def test_the_rendering_is_left_of_the_split(user):
     user.state.split = 0.75
     compared = user.image()
     column = int(0.75 * SIZE[0]) - IMAGE[1].start
-    assert changed(rendered[:, : column - 2], compared[:, : column - 2]) == 0
-    assert changed(rendered[:, column + 2 :], compared[:, column + 2 :]) > 0.9
+    assert changed_fraction(rendered[:, : column - 2], compared[:, : column - 2]) == 0
+    assert changed_fraction(rendered[:, column + 2 :], compared[:, column + 2 :]) > 0.9
     user.click("split")
     assert user.state.split < 0.75
 
@@ -410,8 +410,8 @@ def test_a_scene_without_photographs_has_no_comparison(user):
     user.show(SceneEntry("no photographs"))
     assert "nearest photograph" not in user.panels.items
     before = user.image()
-    user.key(imgui.Key.c)
-    assert changed(before, user.image()) == 0
+    user.press(imgui.Key.c)
+    assert changed_fraction(before, user.image()) == 0
 
 
 def test_screenshots_show_the_image_without_the_panels(user, monkeypatch):
@@ -424,15 +424,15 @@ def test_screenshots_show_the_image_without_the_panels(user, monkeypatch):
         assert file.size == SIZE
         pixels = np.asarray(file).astype(int)
     assert np.abs(pixels[IMAGE] - image).max() <= 3
-    assert changed(pixels[20:560, 20:290], np.zeros_like(pixels[20:560, 20:290])) > 0.3
+    assert changed_fraction(pixels[20:560, 20:290], np.zeros_like(pixels[20:560, 20:290])) > 0.3
     with Image.open(panorama) as file:
         assert file.size == (256, 128)
     user.state.message = ""
-    assert changed(image, user.image()) == 0, "the window shows the view again"
+    assert changed_fraction(image, user.image()) == 0, "the window shows the view again"
 
 
 def test_exr_screenshot_holds_color_and_radial_depth(user):
-    user.key(imgui.Key.left_shift, imgui.Key.mod_shift, imgui.Key.p)
+    user.press(imgui.Key.left_shift, imgui.Key.mod_shift, imgui.Key.p)
     path = user.viewer.screenshots[-1]
     assert path.suffix == ".exr"
     with OpenEXR.File(str(path)) as file:
@@ -443,7 +443,7 @@ def test_exr_screenshot_holds_color_and_radial_depth(user):
 
 def test_focus_orbits_the_point_in_the_centre(user):
     user.settle()
-    user.key(imgui.Key.f)
+    user.press(imgui.Key.f)
     assert user.state.orbiting
     assert 1.5 < user.state.camera.distance < 4.5
     assert user.state.camera.position == user.state.home.position
@@ -453,13 +453,13 @@ def test_resolution_is_lower_while_the_camera_moves(user):
     user.viewer._resolution.budget_ms = 1e-3
     io = imgui.get_io()
     io.add_key_event(imgui.Key.w, True)
-    user.frames(8)
+    user.draw_frames(8)
     assert user.data.size[0] < SIZE[0]
     io.add_key_event(imgui.Key.w, False)
     user.settle()
     assert user.data.size == SIZE
     user.click("coarser while moving")
-    user.key(imgui.Key.w, frames=4)
+    user.press(imgui.Key.w, frames=4)
     assert user.data.size == SIZE
 
 
@@ -476,10 +476,10 @@ def test_the_viewer_shows_progress_and_accepts_input_while_loading(user, small_s
     monkeypatch.setattr(user.viewer.loader, "_load", slow)
     user.viewer.show([SceneEntry("slow")], 0)
     assert reported.wait(20)
-    user.frames(2)
+    user.draw_frames(2)
     assert user.data.loading == ("slow", "searching depth", 0.5)
-    assert changed(before, user.screen()) > 0.02, "a progress bar is on the screen"
-    user.key(imgui.Key.w, frames=3)
+    assert changed_fraction(before, user.read_screen()) > 0.02, "a progress bar is on the screen"
+    user.press(imgui.Key.w, frames=3)
     assert user.state.camera.position[2] > 0
     go.set()
     user.settle()

@@ -1,4 +1,4 @@
-"""The window, in its own process under Xvfb, driven by synthetic mouse and key events."""
+"""The window, run in a process under Xvfb with synthetic mouse and key events."""
 
 import os
 import shutil
@@ -7,7 +7,7 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,14 +23,6 @@ pytestmark = [pytest.mark.gl, pytest.mark.slow]
 
 PROGRAM = "from pansplat_viewer.app import main; main()"
 TITLE = "room - pansplat"
-
-
-def wait_until(condition: Callable[[], Any], what: str, seconds: float = 60.0) -> Any:
-    deadline = time.monotonic() + seconds
-    while not (value := condition()):
-        assert time.monotonic() < deadline, f"no {what} in {seconds:.0f} s"
-        time.sleep(0.05)
-    return value
 
 
 class Display:
@@ -57,8 +49,8 @@ class Display:
         rows = np.frombuffer(data, np.uint8, height * stride, start).reshape(height, stride)
         return rows[:, : 4 * width].reshape(height, width, 4)[..., 2::-1].astype(int)
 
-    def do(self, *command: str) -> str:
-        """Run xdotool on this display."""
+    def run_xdotool(self, *command: str) -> str:
+        """Run xdotool on this display and return its output."""
         environment = {**os.environ, "DISPLAY": self.name}
         result = subprocess.run(["xdotool", *command], env=environment, capture_output=True, text=True, timeout=20)
         return result.stdout.strip()
@@ -99,39 +91,39 @@ def running(display: Display, room: Path, *options: str) -> Iterator[subprocess.
             viewer.kill()
 
 
-def test_mouse_and_keys_drive_the_window_and_escape_closes_it(display, room):
+def test_mouse_and_keys_move_the_camera_and_escape_closes_the_window(display, room, wait_until):
     with running(display, room, "--size", "640x480") as viewer:
         find = ("search", "--name", f"^{TITLE}$")
-        window = wait_until(lambda: display.do(*find), "window").split()[0]
-        display.do("windowmove", window, "0", "0")
-        display.do("windowfocus", window)
+        window = wait_until(lambda: display.run_xdotool(*find), "window", 60).split()[0]
+        display.run_xdotool("windowmove", window, "0", "0")
+        display.run_xdotool("windowfocus", window)
         image = (slice(10, 370), slice(320, 630))
-        wait_until(lambda: (display.screen()[image].max(-1) > 60).mean() > 0.3, "scene")
+        wait_until(lambda: (display.screen()[image].max(-1) > 60).mean() > 0.3, "scene", 60)
         time.sleep(1.0)
 
         before = display.screen()[image]
-        display.do("mousemove", "450", "200", "mousedown", "1")
-        display.do("mousemove", "380", "200")
+        display.run_xdotool("mousemove", "450", "200", "mousedown", "1")
+        display.run_xdotool("mousemove", "380", "200")
         time.sleep(0.3)
-        display.do("mouseup", "1")
+        display.run_xdotool("mouseup", "1")
         wait_until(lambda: np.abs(display.screen()[image] - before).mean() > 5, "rotation of the view")
 
         panel = (slice(20, 300), slice(20, 280))
         with_panel = display.screen()[panel]
-        display.do("key", "Tab")
+        display.run_xdotool("key", "Tab")
         wait_until(lambda: np.abs(display.screen()[panel] - with_panel).mean() > 5, "change of the panels")
 
-        display.do("key", "p")
+        display.run_xdotool("key", "p")
         shot = room.parent / "renders" / "room" / "view_001.png"
         wait_until(shot.exists, "screenshot")
         with Image.open(shot) as file:
             assert file.size == (640, 480)
 
-        display.do("windowsize", window, "800", "600")
+        display.run_xdotool("windowsize", window, "800", "600")
         outside = (slice(490, 590), slice(500, 790))
         wait_until(lambda: (display.screen()[outside].max(-1) > 60).mean() > 0.2, "larger image")
 
-        display.do("key", "Escape")
+        display.run_xdotool("key", "Escape")
         output, errors = viewer.communicate(timeout=30)
         assert viewer.returncode == 0, errors
         assert errors == "" and output == ""
@@ -168,9 +160,9 @@ def test_a_dropped_path_is_opened():
     assert viewer.opened == [Path("/somewhere/a pair")] and window.dropped == []
 
 
-def test_an_interrupt_ends_with_status_130(display, room):
+def test_an_interrupt_ends_with_status_130(display, room, wait_until):
     with running(display, room, "--size", "320x240") as viewer:
-        wait_until(lambda: display.do("search", "--name", f"^{TITLE}$"), "window")
+        wait_until(lambda: display.run_xdotool("search", "--name", f"^{TITLE}$"), "window", 60)
         viewer.send_signal(signal.SIGINT)
         _, errors = viewer.communicate(timeout=30)
         assert viewer.returncode == 130 and "Traceback" not in errors
