@@ -5,7 +5,7 @@ nothing is downloaded. Layers are numbered as in torchvision, so that its files 
 
 Large images are processed in bands of rows: the activations of a 4K image and their gradient would take 30 GB. A block
 of the classifier (the convolutions between two poolings) reads as many rows beyond a band as it has convolutions. A
-band of a block's output is therefore computed with that many additional rows, which are then cut off. The backward
+band of a block's output is therefore computed with that many additional rows, which are then removed. The backward
 pass computes each band again.
 
 Source: Zhang et al., The unreasonable effectiveness of deep features as a perceptual metric, CVPR 2018, equation 1;
@@ -38,7 +38,7 @@ MIN_IMAGE_SIZE = 32
 # Normalisation of the classifiers' training images, for images in [-1, 1].
 _MEAN = (-0.030, -0.088, -0.188)
 _DEVIATION = (0.458, 0.448, 0.450)
-# VGG, which has the largest activations, processes images of more pixels in bands of fewer.
+# VGG has the largest activations: an image of more than _WHOLE pixels is processed in bands of _BAND pixels.
 _WHOLE, _BAND = 1 << 19, 1 << 18
 
 _VGG = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512)  # outputs; 0 is a pooling
@@ -273,7 +273,7 @@ def load_lpips(backbone: Backbone, folder: Path | None = None) -> Lpips:
             weights, an installed `lpips` package.
 
     Raises:
-        InputError: a file is missing (the message names its source and its folder) or damaged.
+        InputError: a file is missing (the message states its source and its folder) or damaged.
     """
     classifier, heads = find_classifier(backbone, folder), find_heads(backbone, folder)
     if classifier is None or heads is None:
@@ -339,9 +339,7 @@ def _load_classifier(metric: Lpips, path: Path) -> dict[str, Tensor]:
 
 def _load_heads(backbone: Backbone, path: Path) -> dict[str, Tensor]:
     content = read_checkpoint(path)
-    shapes = {
-        index: torch.Size((1, channels, 1, 1)) for index, channels in enumerate(LAYER_CHANNELS[backbone].values())
-    }
+    shapes = {i: torch.Size((1, channels, 1, 1)) for i, channels in enumerate(LAYER_CHANNELS[backbone].values())}
     return {f"heads.{i}": _take_tensor(content, f"lin{i}.model.1.weight", s, path).flatten() for i, s in shapes.items()}
 
 

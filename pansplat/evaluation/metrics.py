@@ -30,9 +30,9 @@ def psnr(
     mask: Bool[Tensor, "height width"] | None = None,
 ) -> float:
     """Peak signal-to-noise ratio in dB, both images clamped to [0, 1]; infinite when they are equal."""
-    _check(prediction, target, mask)
+    _check_shapes(prediction, target, mask)
     error = (prediction.double().clamp(0, 1) - target.double().clamp(0, 1)).square().mean(0)
-    return _decibels(_weighted_mean(error, torch.ones_like(error), mask))
+    return _to_decibels(_weighted_mean(error, torch.ones_like(error), mask))
 
 
 def ws_psnr(
@@ -45,10 +45,10 @@ def ws_psnr(
 
     Source: Sun, Lu and Yu, weighted-to-spherically-uniform quality evaluation, doi:10.1109/LSP.2017.2720693.
     """
-    _check(prediction, target, mask)
+    _check_shapes(prediction, target, mask)
     error = (prediction.double() - target.double()).square().mean(0)
     weights = row_weights(error.shape[0]).to(error.device)[:, None].expand_as(error)
-    return _decibels(_weighted_mean(error, weights, mask))
+    return _to_decibels(_weighted_mean(error, weights, mask))
 
 
 def ssim(prediction: Float[Tensor, "3 height width"], target: Float[Tensor, "3 height width"]) -> float:
@@ -57,23 +57,23 @@ def ssim(prediction: Float[Tensor, "3 height width"], target: Float[Tensor, "3 h
     Source: Wang et al., doi:10.1109/TIP.2003.819861, with the settings of the official protocol: 11 x 11
     window of sigma 1.5, K = (0.01, 0.03), data range 1, only windows inside the image.
     """
-    _check(prediction, target, None)
+    _check_shapes(prediction, target, None)
     if min(prediction.shape[-2:]) <= 2 * _SSIM_RADIUS:
         raise ValueError(f"`prediction` must be larger than 10 x 10 pixels, got {tuple(prediction.shape[-2:])}")
     a, b = (image.detach().cpu().double().numpy() for image in (prediction, target))
-    mean_a, mean_b = _window_mean(a), _window_mean(b)
+    mean_a, mean_b = _average_windows(a), _average_windows(b)
     samples = (2 * _SSIM_RADIUS + 1) ** 2
     unbiased = samples / (samples - 1)
-    variance_a = unbiased * (_window_mean(a * a) - mean_a**2)
-    variance_b = unbiased * (_window_mean(b * b) - mean_b**2)
-    covariance = unbiased * (_window_mean(a * b) - mean_a * mean_b)
+    variance_a = unbiased * (_average_windows(a * a) - mean_a**2)
+    variance_b = unbiased * (_average_windows(b * b) - mean_b**2)
+    covariance = unbiased * (_average_windows(a * b) - mean_a * mean_b)
     c1, c2 = 0.01**2, 0.03**2
-    likeness = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
-    likeness /= (mean_a**2 + mean_b**2 + c1) * (variance_a + variance_b + c2)
-    return float(likeness.mean())
+    similarity = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
+    similarity /= (mean_a**2 + mean_b**2 + c1) * (variance_a + variance_b + c2)
+    return float(similarity.mean())
 
 
-def _window_mean(image: np.ndarray) -> np.ndarray:
+def _average_windows(image: np.ndarray) -> np.ndarray:
     """Gaussian-weighted local means (3 H W) of all windows inside the image."""
     from scipy.ndimage import correlate1d
 
@@ -91,11 +91,11 @@ def _weighted_mean(error: Tensor, weights: Tensor, mask: Tensor | None) -> float
     return float((error * weights).sum()) / total if total > 0 else math.nan
 
 
-def _decibels(mean_square: float) -> float:
+def _to_decibels(mean_square: float) -> float:
     return -10 * math.log10(mean_square) if mean_square > 0 else (math.inf if mean_square == 0 else math.nan)
 
 
-def _check(prediction: Tensor, target: Tensor, mask: Tensor | None) -> None:
+def _check_shapes(prediction: Tensor, target: Tensor, mask: Tensor | None) -> None:
     if prediction.shape != target.shape or prediction.ndim != 3:
         shapes = f"{tuple(prediction.shape)} and {tuple(target.shape)}"
         raise ValueError(f"`prediction` and `target` must both be (3, height, width), got {shapes}")

@@ -184,7 +184,7 @@ def write_json(value: object, path: Path) -> None:
 
 def results_table(cases: Sequence[Case]) -> Table:
     """A printable table of the cases and their mean."""
-    columns = _columns(cases)
+    columns = _select_columns(cases)
     table = Table(title=f"{cases[0].model}, {cases[0].height}x{2 * cases[0].height}" if cases else None)
     table.add_column("case")
     for head in columns:
@@ -200,7 +200,7 @@ def results_table(cases: Sequence[Case]) -> Table:
     return table
 
 
-def _columns(cases: Sequence[Case]) -> dict[str, tuple[Callable[[Case], float], str]]:
+def _select_columns(cases: Sequence[Case]) -> dict[str, tuple[Callable[[Case], float], str]]:
     """By heading, the value of a case and its format; columns without any value are left out."""
     columns: dict[str, tuple[Callable[[Case], float], str]] = {"WS-PSNR": (lambda case: case.ws_psnr, ".2f")}
     if any(case.masked_ws_psnr is not None for case in cases):

@@ -64,7 +64,7 @@ class Layout:
         return [(name, metric) for name in self.sets for metric in self.metrics]
 
 
-def _layout(
+def _make_layout(
     title: str, sets: tuple[str, ...], metrics: tuple[str, ...], rows: Mapping[str, Sequence[float | None]]
 ) -> Layout:
     columns = [(name, metric) for name in sets for metric in metrics]
@@ -78,7 +78,7 @@ def _layout(
 _NO_VALUES = (None, None, None)
 
 LAYOUTS: dict[str, Layout] = {
-    "m3d": _layout(
+    "m3d": _make_layout(
         "Matterport3D, wide baselines",
         ("M3D 1.0 m", "M3D 1.5 m", "M3D 2.0 m"),
         _METRICS,
@@ -93,7 +93,7 @@ LAYOUTS: dict[str, Layout] = {
             _RERUN: (28.806, 0.9305, 0.0905, 24.089, 0.8493, 0.1802, 20.194, 0.7731, 0.2722),
         },
     ),
-    "narrow": _layout(
+    "narrow": _make_layout(
         "Matterport3D, narrow baselines",
         ("M3D 0.2 m", "M3D 0.5 m"),
         _METRICS,
@@ -104,7 +104,7 @@ LAYOUTS: dict[str, Layout] = {
             _RERUN: (32.880, 0.9587, 0.0661, 31.448, 0.9504, 0.0720),
         },
     ),
-    "replica": _layout(
+    "replica": _make_layout(
         "Replica",
         ("Replica 1.0 m",),
         _METRICS,
@@ -119,7 +119,7 @@ LAYOUTS: dict[str, Layout] = {
             _RERUN: (30.746, 0.9613, 0.0696),
         },
     ),
-    "residential": _layout(
+    "residential": _make_layout(
         "Residential",
         ("Residential 0.3 m",),
         _METRICS,
@@ -134,7 +134,7 @@ LAYOUTS: dict[str, Layout] = {
             _RERUN: (30.996, 0.9167, 0.1726),
         },
     ),
-    "360loc": _layout(
+    "360loc": _make_layout(
         "360Loc",
         ("360Loc",),
         _METRICS_WITH_PSNR,
@@ -144,7 +144,7 @@ LAYOUTS: dict[str, Layout] = {
             "PanSplat + deferred blending": (27.35, 28.14, 0.860, 0.127),
         },
     ),
-    "insta360": _layout(
+    "insta360": _make_layout(
         "Insta360",
         ("Insta360",),
         _METRICS_WITH_PSNR,
@@ -154,7 +154,7 @@ LAYOUTS: dict[str, Layout] = {
             "PanSplat + deferred blending": (23.36, 25.68, 0.822, 0.183),
         },
     ),
-    "ablation": _layout(
+    "ablation": _make_layout(
         "Ablation on Matterport3D",
         ("M3D 1.0 m",),
         ("gaussians", *_METRICS),
@@ -170,7 +170,7 @@ LAYOUTS: dict[str, Layout] = {
     ),
 }
 
-DEPTH_LAYOUT = _layout(
+DEPTH_LAYOUT = _make_layout(
     "Depth of the inputs, Matterport3D",
     ("M3D 1.0 m",),
     ("abs_rel", "sq_rel", "rmse"),
@@ -186,10 +186,10 @@ def rich_table(layout: Layout, ours: Sequence[TableRow]) -> Table:
         above = name if index % len(layout.metrics) == 0 else ""
         table.add_column(f"{above}\n{HEADS[metric]}", justify="right")
     for row in layout.rows:
-        table.add_row(row.method, *_cells(row, layout))
+        table.add_row(row.method, *_format_cells(row, layout))
     table.add_section()
     for row in ours:
-        table.add_row(row.method, *_cells(row, layout), style="bold")
+        table.add_row(row.method, *_format_cells(row, layout), style="bold")
     return table
 
 
@@ -198,14 +198,14 @@ def markdown_table(layout: Layout, ours: Sequence[TableRow]) -> str:
     names = [f"{name} {HEADS[metric]}" for name, metric in layout.columns]
     lines = [f"### {layout.title}", "", f"| method | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
     for row in (*layout.rows, *ours):
-        cells = [row.method, *_cells(row, layout)]
+        cells = [row.method, *_format_cells(row, layout)]
         if row in ours:
             cells = [f"**{cell}**" for cell in cells]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
-def _cells(row: TableRow, layout: Layout) -> list[str]:
+def _format_cells(row: TableRow, layout: Layout) -> list[str]:
     """Formatted numbers; a dash for a missing one."""
     cells = []
     for column in layout.columns:
@@ -276,7 +276,7 @@ def rich_tables(result: ProtocolResult) -> list[Table]:
 def report_notes(result: ProtocolResult) -> list[str]:
     """Notes on the tables: numbers of images, missing data, and figures that are not comparable."""
     counts = {row.set: len(row.scores) for row in result.sets}
-    lines = ["Ours: " + ", ".join(f"{name}: {_images(count)}" for name, count in counts.items()) + "."]
+    lines = ["Ours: " + ", ".join(f"{name}: {n} image{'s' * (n != 1)}" for name, n in counts.items()) + "."]
     if result.height != 512:
         lines.append(f"Ours is at {result.height}x{2 * result.height}, the paper's figures at 512x1024.")
     if result.lpips is None:
@@ -304,7 +304,3 @@ def write_report(result: ProtocolResult, out: Path) -> list[Path]:
         plot_frame_distance(result, out / "frame_distance.png")
         written.append(out / "frame_distance.png")
     return written
-
-
-def _images(count: int) -> str:
-    return f"{count} image" + ("s" if count != 1 else "")

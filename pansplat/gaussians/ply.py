@@ -59,8 +59,8 @@ def save_ply(scene: Scene, path: str | Path) -> None:
     path = Path(path)
     gaussians = _sort_by_label(_select_finite(scene.gaussians, path))
     with replacing(path) as partial, open(partial, "wb") as file:
-        file.write(_format_header(scene, _label_runs(gaussians), gaussians.harmonics.shape[1]))
-        _vertex_table(gaussians).tofile(file)
+        file.write(_format_header(scene, _find_label_runs(gaussians), gaussians.harmonics.shape[1]))
+        _build_vertex_table(gaussians).tofile(file)
 
 
 def save_ply_parts(scene: Scene, parts: Iterable[Gaussians], path: str | Path) -> int:
@@ -87,13 +87,11 @@ def save_ply_parts(scene: Scene, parts: Iterable[Gaussians], path: str | Path) -
         size = len(_format_header(scene, [], coefficients)) + _RUNS_SPACE
         with open(partial, "wb") as file:
             file.write(b" " * size)
-            runs, num_removed = _write_parts(_chain(first, rest), file, coefficients)
+            runs, dropped = _write_parts(_chain(first, rest), file, coefficients)
         _fill_header(partial, _format_header(scene, runs, coefficients, size=size), size)
     count = sum(run[2] for run in runs)
-    if num_removed:
-        warnings.warn(
-            f"{path}: left out {num_removed} of {count + num_removed} Gaussians that are not finite", stacklevel=2
-        )
+    if dropped:
+        warnings.warn(f"{path}: left out {dropped} of {count + dropped} Gaussians that are not finite", stacklevel=2)
     return count
 
 
@@ -106,25 +104,25 @@ def _chain(first: list[Gaussians], rest: Iterator[Gaussians]) -> Iterator[Gaussi
 def _write_parts(parts: Iterable[Gaussians], file: BinaryIO, coefficients: int) -> tuple[list[list[int]], int]:
     """Write the vertices; return the runs of labels and the number of non-finite Gaussians."""
     runs: list[list[int]] = []
-    num_removed = 0
+    dropped = 0
     for part in parts:
         if part.harmonics.shape[1] != coefficients:
             raise ValueError(f"`parts` must have {coefficients} harmonics each, got {part.harmonics.shape[1]}")
         finite = _finite_mask(part)
         kept = part if bool(finite.all()) else part.select(finite)
-        num_removed += len(part) - len(kept)
-        for level, view, count in _label_runs(kept):
+        dropped += len(part) - len(kept)
+        for level, view, count in _find_label_runs(kept):
             if runs and runs[-1][:2] == [level, view]:
                 runs[-1][2] += count
             else:
                 runs.append([level, view, count])
-        _vertex_table(kept).tofile(file)
+        _build_vertex_table(kept).tofile(file)
         del part, kept
-    return runs, num_removed
+    return runs, dropped
 
 
 def _fill_header(path: Path, content: bytes, size: int) -> None:
-    """Write the header into the reserved `size` bytes; a longer header moves the vertices, piece by piece."""
+    """Write the header into the reserved `size` bytes; a longer header moves the vertices, in pieces."""
     if len(content) == size:
         with open(path, "r+b") as file:
             file.write(content)
@@ -139,13 +137,24 @@ def _format_header(scene: Scene, runs: list[list[int]], coefficients: int, *, si
     """All bytes before the first vertex; the Gaussians of `scene` are not used.
 
     Args:
-        runs: see `_label_runs`.
+        runs: see `_find_label_runs`.
         coefficients: number of harmonics coefficients, 1 to 25.
-        size: least number of bytes; spaces after the comment fill the difference.
+        size: minimum number of bytes; spaces after the comment fill the difference.
     """
-    begin = f"ply\nformat binary_little_endian 1.0\ncomment {_COMMENT_PREFIX}{_format_extras(scene, runs)}"
+    extras = {
+        "version": 1,
+        "model": scene.model,
+        "height": scene.height,
+        "near": scene.near,
+        "far": scene.far,
+        "names": list(scene.names),
+        "cam2world": scene.cam2world.double().cpu().tolist(),
+        "runs": runs,
+    }
+    comment = _COMMENT_PREFIX + json.dumps(extras, separators=(",", ":"))
+    begin = f"ply\nformat binary_little_endian 1.0\ncomment {comment}"
     lines = [f"element vertex {sum(count for _, _, count in runs)}"]
-    lines += [*(f"property float {name}" for name in _property_names(coefficients)), "end_header\n"]
+    lines += [*(f"property float {name}" for name in _list_properties(coefficients)), "end_header\n"]
     end = "\n" + "\n".join(lines)
     return (begin + " " * (size - len(begin) - len(end)) + end).encode("ascii")
 
@@ -186,10 +195,10 @@ def load_ply(path: str | Path) -> Scene:
 
 def _select_finite(gaussians: Gaussians, path: Path) -> Gaussians:
     finite = _finite_mask(gaussians)
-    num_removed = len(gaussians) - int(finite.sum())
-    if not num_removed:
+    dropped = len(gaussians) - int(finite.sum())
+    if not dropped:
         return gaussians
-    warnings.warn(f"{path}: left out {num_removed} of {len(gaussians)} Gaussians that are not finite", stacklevel=3)
+    warnings.warn(f"{path}: left out {dropped} of {len(gaussians)} Gaussians that are not finite", stacklevel=3)
     return gaussians.select(finite)
 
 
@@ -204,13 +213,13 @@ def _finite_mask(gaussians: Gaussians) -> Bool[Tensor, "n"]:
 
 
 def _sort_by_label(gaussians: Gaussians) -> Gaussians:
-    if len(_label_runs(gaussians)) <= _MAX_RUNS:
+    if len(_find_label_runs(gaussians)) <= _MAX_RUNS:
         return gaussians
     key = gaussians.levels.long() * (int(gaussians.views.max()) + 1) + gaussians.views.long()
     return gaussians.select(torch.sort(key, stable=True).indices)
 
 
-def _label_runs(gaussians: Gaussians) -> list[list[int]]:
+def _find_label_runs(gaussians: Gaussians) -> list[list[int]]:
     """Runs of equal level and view as [level, view, count], in file order."""
     levels, views = gaussians.levels.long().cpu(), gaussians.views.long().cpu()
     if not len(gaussians):
@@ -221,27 +230,13 @@ def _label_runs(gaussians: Gaussians) -> list[list[int]]:
     return torch.stack((levels[starts], views[starts], counts), dim=1).tolist()
 
 
-def _format_extras(scene: Scene, runs: list[list[int]]) -> str:
-    extras = {
-        "version": 1,
-        "model": scene.model,
-        "height": scene.height,
-        "near": scene.near,
-        "far": scene.far,
-        "names": list(scene.names),
-        "cam2world": scene.cam2world.double().cpu().tolist(),
-        "runs": runs,
-    }
-    return json.dumps(extras, separators=(",", ":"))
-
-
-def _property_names(coefficients: int) -> list[str]:
+def _list_properties(coefficients: int) -> list[str]:
     rest = [f"f_rest_{i}" for i in range(3 * (coefficients - 1))]
     scales, rotation = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
     return [*("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"), *rest, "opacity", *scales, *rotation]
 
 
-def _vertex_table(gaussians: Gaussians) -> np.ndarray:
+def _build_vertex_table(gaussians: Gaussians) -> np.ndarray:
     """All vertices with the properties in file order, little-endian float32."""
     g = gaussians.to(device="cpu")
     rest = g.harmonics[:, 1:].transpose(1, 2).flatten(1)
@@ -293,10 +288,10 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
             raise InputError(f"{path}: cannot understand the header line {line[:80]!r}") from None
     if order not in _ORDERS:
         raise InputError(f"{path}: format {order or 'unknown'!r} is not read; save it as binary_little_endian")
-    return _vertex_header(_ORDERS[order], elements, comments, path)
+    return _select_vertex_element(_ORDERS[order], elements, comments, path)
 
 
-def _vertex_header(order: str, elements: list, comments: list[str], path: Path) -> _Header:
+def _select_vertex_element(order: str, elements: list, comments: list[str], path: Path) -> _Header:
     skipped_bytes = 0
     for name, count, fields in elements:
         if count < 0:
@@ -304,8 +299,8 @@ def _vertex_header(order: str, elements: list, comments: list[str], path: Path) 
         names = [field for field, _ in fields]
         lists = [field for field, kind in fields if kind is None]
         if lists or len(set(names)) < len(names):
-            what = f"the list property `{lists[0]}`" if lists else "a property twice"
-            raise InputError(f"{path}: element `{name}` has {what}; save the file as a plain 3DGS .ply")
+            problem = f"the list property `{lists[0]}`" if lists else "a property twice"
+            raise InputError(f"{path}: element `{name}` has {problem}; save the file as a plain 3DGS .ply")
         dtype = np.dtype([(field, order + kind) for field, kind in fields])
         if name == "vertex":
             return _Header(order, skipped_bytes, count, dtype, comments)
@@ -365,7 +360,7 @@ def _count_coefficients(available: Sequence[str], path: Path) -> int:
     rest = sum(name.startswith("f_rest_") for name in available)
     if rest not in (0, 9, 24, 45, 72):
         raise InputError(f"{path}: {rest} f_rest properties fit no SH degree; 0, 9, 24, 45 or 72 are needed")
-    needed = [name for name in _property_names(rest // 3 + 1) if name not in ("nx", "ny", "nz")]
+    needed = [name for name in _list_properties(rest // 3 + 1) if name not in ("nx", "ny", "nz")]
     missing = [name for name in needed if name not in available]
     if missing:
         hint = "a compressed .ply; uncompress it first" if "packed_position" in available else "not a 3DGS .ply"

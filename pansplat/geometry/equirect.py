@@ -118,8 +118,8 @@ class _Padded(torch.autograd.Function):
         within = padded[..., margin : margin + width]
         within[..., margin:-margin, :] = maps
         if over_poles:
-            within[..., :margin, :] = _beyond_pole(maps[..., :margin, :])
-            within[..., -margin:, :] = _beyond_pole(maps[..., -margin:, :])
+            within[..., :margin, :] = _continue_over_pole(maps[..., :margin, :])
+            within[..., -margin:, :] = _continue_over_pole(maps[..., -margin:, :])
         else:
             within[..., :margin, :] = 0
             within[..., -margin:, :] = 0
@@ -136,12 +136,12 @@ class _Padded(torch.autograd.Function):
         within[..., :margin] += gradient[..., -margin:]
         result = within[..., margin:-margin, :]
         if ctx.over_poles:
-            result[..., :margin, :] += _beyond_pole(within[..., :margin, :])
-            result[..., -margin:, :] += _beyond_pole(within[..., -margin:, :])
+            result[..., :margin, :] += _continue_over_pole(within[..., :margin, :])
+            result[..., -margin:, :] += _continue_over_pole(within[..., -margin:, :])
         return result, None, None
 
 
-def _beyond_pole(rows: Tensor) -> Tensor:
+def _continue_over_pole(rows: Tensor) -> Tensor:
     """The rows next to a pole in their order beyond it; its own inverse."""
     return rows.flip(-2).roll(rows.shape[-1] // 2, -1)
 

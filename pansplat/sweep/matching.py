@@ -357,7 +357,7 @@ class AggregationConfig:
     crease_penalty: float = 0.15
     jump_penalty: float = 1.6
     edge_scale: float = 0.1
-    """Sum of absolute colour differences over which the jump penalty falls by e."""
+    """Sum of absolute colour differences that divides the jump penalty by e."""
 
 
 @nb.njit(fastmath=True, inline="always")

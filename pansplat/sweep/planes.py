@@ -5,9 +5,9 @@ image gradients: a straight line and the camera span a plane, whose normal is th
 and the line's direction is perpendicular to this normal.
 
 The planes across each axis are detected by Hough voting, before any surface is known. Most hypotheses of a single
-pixel are wrong, but wrong ones are spread over all offsets, while the pixels of a floor or a wall share one offset.
-Each pixel distributes one vote over its hypotheses by their matching cost, so that a bare wall, which matches
-everywhere, has no influence. Later the histogram of the consistent surfaces adds to the votes.
+pixel are wrong. Wrong hypotheses are spread over all offsets, while the pixels of a floor or a wall have one offset.
+Each pixel distributes one vote over its hypotheses by their matching cost. A wall without texture matches everywhere
+and therefore has no influence. After the first pass the histogram of the consistent surfaces supplements the votes.
 """
 
 from __future__ import annotations

@@ -161,9 +161,9 @@ def _angle_above(angle: np.ndarray, rays: np.ndarray) -> np.ndarray:
 
 def _score_floor(views: Sequence[View], rays: Sequence[np.ndarray], costs: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Score from -1 to 1: frequency of a pixel's colour and texture on the floor against above the horizon."""
-    appearances = [_appearance_bins(view.image) for view in views]
+    appearances = [_classify_appearance(view.image) for view in views]
     areas = [row_weights(len(view.image)).numpy()[:, None] * view.valid for view in views]
-    above = _density(appearances, [area * (ray[0] < 0) for area, ray in zip(areas, rays, strict=True)])
+    above = _estimate_density(appearances, [area * (ray[0] < 0) for area, ray in zip(areas, rays, strict=True)])
     scores = [np.zeros(cost.shape, np.float32) for cost in costs]
     for min_down, max_cost in _ROUNDS:
         samples = [
@@ -172,13 +172,13 @@ def _score_floor(views: Sequence[View], rays: Sequence[np.ndarray], costs: Seque
         ]
         if not any(weight.any() for weight in samples):
             break
-        floor = _density(appearances, samples)
+        floor = _estimate_density(appearances, samples)
         ratio = ((floor - above) / (floor + above)).astype(np.float32)
-        scores = [_smooth(ratio[bins], view.image) for bins, view in zip(appearances, views, strict=True)]
+        scores = [_smooth_between_edges(ratio[bins], view.image) for bins, view in zip(appearances, views, strict=True)]
     return scores
 
 
-def _density(appearances: Sequence[tuple[np.ndarray, ...]], weights: Sequence[np.ndarray]) -> np.ndarray:
+def _estimate_density(appearances: Sequence[tuple[np.ndarray, ...]], weights: Sequence[np.ndarray]) -> np.ndarray:
     """Density of each colour and texture, by weights (h, w) for each view."""
     histogram = np.zeros(_BINS)
     for bins, weight in zip(appearances, weights, strict=True):
@@ -186,7 +186,7 @@ def _density(appearances: Sequence[tuple[np.ndarray, ...]], weights: Sequence[np
     return ndimage.gaussian_filter(histogram / max(histogram.sum(), 1e-9), _BLUR) + _MIN_DENSITY
 
 
-def _smooth(values: np.ndarray, image: np.ndarray) -> np.ndarray:
+def _smooth_between_edges(values: np.ndarray, image: np.ndarray) -> np.ndarray:
     """Values (h, w) smoothed between the image's edges."""
     margin = 8
     guide = (pad_sphere(image, margin) * 255).astype(np.uint8)
@@ -194,7 +194,7 @@ def _smooth(values: np.ndarray, image: np.ndarray) -> np.ndarray:
     return padded[margin:-margin, margin:-margin]
 
 
-def _appearance_bins(image: np.ndarray) -> tuple[np.ndarray, ...]:
+def _classify_appearance(image: np.ndarray) -> tuple[np.ndarray, ...]:
     """Bins of texture and colour, four maps (h, w)."""
     padded = pad_sphere(image, 2)
     inside = (slice(2, -2), slice(2, -2))
@@ -224,15 +224,15 @@ def _find_boundary(
     # A surface that continues from above the horizon without an edge is not floor.
     standing = np.exp(-_ABOVE_HORIZON_SCALE * np.maximum(edge_sum[height // 2] - edge_sum, 0)) * (angle > 0)[:, None]
     score = score * (1 - standing) - standing
-    before = _mean_of_rows(score, 1, 4)
-    drop = before - _mean_of_rows(score, -2, 1)
+    before = _average_rows(score, 1, 4)
+    drop = before - _average_rows(score, -2, 1)
     ends = (drop > _MIN_DROP) & (before > _FLOOR_SCORE) & valid
     ends &= drop >= ndimage.maximum_filter1d(drop, 5, axis=0)
     ends &= (angle > 0)[:, None]
     ends[-4:] = False
     lowest = height - 1 - ends[::-1].argmax(axis=0)
     azimuth = np.arange(width)
-    is_floor = np.clip((_MAX_FLOOR_COST - _mean_of_rows(cost, 2, 7)) / _COST_RAMP, 0, 1)
+    is_floor = np.clip((_MAX_FLOOR_COST - _average_rows(cost, 2, 7)) / _COST_RAMP, 0, 1)
     confidence = np.clip((drop - _MIN_DROP) / (_FULL_DROP - _MIN_DROP), 0, 1) * is_floor
     boundary = angle[lowest] + 0.5 * math.pi / height
     return FloorBoundary(
@@ -259,7 +259,7 @@ def _sum_edges(image: np.ndarray) -> np.ndarray:
     return np.cumsum((np.maximum(step - _EDGE_NOISE, 0) / _EDGE_SCALE)[::-1], axis=0)[::-1]
 
 
-def _mean_of_rows(values: np.ndarray, first: int, end: int) -> np.ndarray:
+def _average_rows(values: np.ndarray, first: int, end: int) -> np.ndarray:
     """For each row the mean of the rows from `first` up to `end` below it; the border rows are repeated."""
     margin = max(-first, end)
     padded = np.pad(values, ((margin, margin), (0, 0)), mode="edge").astype(np.float64)
@@ -346,7 +346,7 @@ def fit_walls(boundary: FloorBoundary, camera_height: float, far: float) -> Wall
     upper, fraction, column = row.astype(np.int64), row % 1, np.arange(width)[:, None]
     found = (1 - fraction) * scores[upper, column] + fraction * scores[upper + 1, column]
     found = np.where(in_range, found, -_IMPOSSIBLE)
-    chosen = _best_path(found)
+    chosen = _find_best_path(found)
     is_wall = chosen >= 0
     index = np.where(is_wall, np.cumsum(chosen != np.roll(chosen, 1)), -1)
     index[index == index[-1]] = index[0] if chosen[0] == chosen[-1] else index[-1]
@@ -365,7 +365,7 @@ def fit_walls(boundary: FloorBoundary, camera_height: float, far: float) -> Wall
     )
 
 
-def _best_path(found: np.ndarray) -> np.ndarray:
+def _find_best_path(found: np.ndarray) -> np.ndarray:
     """The plane at each azimuth, -1 for none, of the path with the highest score; `found` is (azimuths, planes).
 
     Dynamic programming over two turns; the middle turn does not depend on the start and the end.

@@ -102,8 +102,9 @@ def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[
     small = [resize_sphere(image, max(finest // 2, 32)) for image in posed.images]
     axes = estimate_axes(small, posed.cam2world[:, :3, :3])
     heights = [max(finest // 4, 16), max(finest // 2, 16), finest]
-    if posed.baseline < 1e-3 * posed.near:
-        return [_surface_without_parallax(finest, posed) for _ in posed.images]
+    if posed.baseline < 1e-3 * posed.near:  # coincident cameras cannot be matched
+        middle = np.full((finest, 2 * finest), 0.5 * (1 / posed.near + 1 / posed.far), np.float32)
+        return [Surface(middle, np.zeros(middle.shape, np.uint8)) for _ in posed.images]
     surfaces: list[Surface] | None = None
     low, high = 1 / posed.far, 1 / (config.near_margin * posed.near)
     steps = (high - low) * posed.baseline / (math.pi / heights[0])  # candidates are a pixel of parallax apart
@@ -112,7 +113,9 @@ def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[
     report("finding floor, ceiling and walls", 0.0)
     planes = make_empty_planes(posed.cam2world, axes, posed.near, posed.far)
     detection = _Level(posed, min(finest, _DETECTION_HEIGHT), planes, (low, high), config, None)
-    planes = detection.detect_planes()
+    planes = detect_planes(
+        detection.views, detection.rays, posed.cam2world, planes, (low, high), MIN_FLOOR * posed.near, config.matching
+    )
     boundaries = detect_floor_boundaries(detection.views, detection.rays, posed.cam2world, planes, config.matching)
     layouts = boundaries and [
         (boundary, fit_walls(boundary, planes.camera_height(pose), posed.far))
@@ -138,12 +141,6 @@ def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[
         ]
     assert surfaces is not None
     return surfaces
-
-
-def _surface_without_parallax(height: int, posed: PosedImages) -> Surface:
-    """The middle of the inverse depth range: coincident cameras cannot be matched."""
-    inverse = np.full((height, 2 * height), 0.5 * (1 / posed.near + 1 / posed.far), np.float32)
-    return Surface(inverse, np.zeros(inverse.shape, np.uint8))
 
 
 class _Level:
@@ -180,13 +177,6 @@ class _Level:
             )
             for n, (image, mask, rays) in enumerate(zip(posed.images, masks, self.rays, strict=True))
         ]
-
-    def detect_planes(self) -> ScenePlanes:
-        """The scene's planes by Hough voting of all views' pixels."""
-        return detect_planes(
-            self.views, self.rays, self.posed.cam2world, self.planes, self.limits,
-            MIN_FLOOR * self.posed.near, self.config.matching,
-        )  # fmt: skip
 
     def search_full_range(self, view: int, count: int, layout: tuple[FloorBoundary, Walls] | None) -> Surface:
         """The best hypotheses of the whole depth range: spheres (set 0) and planes across the axes (sets 1 to 3)."""

@@ -277,7 +277,7 @@ def test_a_failed_save_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.M
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("pansplat.gaussians.ply._vertex_table", full)
+    monkeypatch.setattr("pansplat.gaussians.ply._build_vertex_table", full)
     with pytest.raises(InputError, match="No space left"):
         save_ply(make_scene(seed=1), path)
     assert path.read_bytes() == before
