@@ -112,15 +112,13 @@ def write_flythrough(
     written = []
     for done, fraction in enumerate(STILLS):
         progress("stills", done / steps)
-        path = folder / f"view_{round(100 * fraction):03d}.png"
-        write_image(path, _render(renderer, flight_pose(scene, fraction), film.size, settings))
-        written.append(path)
+        written.append(folder / f"view_{round(100 * fraction):03d}.png")
+        write_image(written[-1], _render(renderer, flight_pose(scene, fraction), film.size, settings))
     progress("panorama", len(STILLS) / steps)
     height = film.panorama_height or scene.height
-    path = folder / f"panorama_{round(100 * film.at):03d}.png"
+    written.append(folder / f"panorama_{round(100 * film.at):03d}.png")
     equirect = replace(settings, layout="equirect")
-    write_image(path, _render(renderer, panorama_pose(scene, film.at), (2 * height, height), equirect))
-    written.append(path)
+    write_image(written[-1], _render(renderer, panorama_pose(scene, film.at), (2 * height, height), equirect))
 
     def render_frames() -> Iterator[np.ndarray]:
         for frame in range(film.num_frames):

@@ -10,6 +10,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Float
 
+from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat_viewer import camera as cameras
 from pansplat_viewer.capture import write_screenshot
@@ -97,16 +98,17 @@ class Presenter:
         self._photos: list[moderngl.Texture] = []
         self._poses: Float[np.ndarray, "view 4 4"] = np.zeros((0, 4, 4))
 
-    def upload_photos(
-        self, images: Float[np.ndarray, "view height width 3"] | None, cam2world: Float[np.ndarray, "view 4 4"]
-    ) -> None:
-        """Replace the photographs: panoramas, RGB in [0, 1], with their poses; None removes them."""
-        for photo in self._photos:
-            photo.release()
-        self._photos, self._poses = [], cam2world
-        for image in images if images is not None else ():
+    def upload_photos(self, photos: Views | None) -> None:
+        """Replace the photographs and their poses; None removes them."""
+        for texture in self._photos:
+            texture.release()
+        self._photos.clear()
+        if photos is None:
+            return
+        self._poses = photos.cam2world.double().numpy()
+        for image in photos.images.permute(0, 2, 3, 1).numpy():
             height, width = image.shape[:2]
-            pixels = np.ascontiguousarray((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8))
+            pixels = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
             texture = self.ctx.texture((width, height), 3, pixels.tobytes(), alignment=1)
             texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
             texture.repeat_x, texture.repeat_y = True, False
@@ -144,7 +146,7 @@ class Presenter:
 
     def release(self) -> None:
         """Free the GL objects."""
-        self.upload_photos(None, np.zeros((0, 4, 4)))
+        self.upload_photos(None)
         self._triangle.release()
         self._programs.release()
 
@@ -277,10 +279,7 @@ class Viewer:
     def _enter(self, loaded: LoadedScene, now: float) -> None:
         self._loaded, self._image_key, self._image = loaded, None, None
         self._resolution = AdaptiveResolution()
-        photos = loaded.photos
-        images = None if photos is None else photos.images.permute(0, 2, 3, 1).numpy()
-        poses = np.zeros((0, 4, 4)) if photos is None else photos.cam2world.double().numpy()
-        self.presenter.upload_photos(images, poses)
+        self.presenter.upload_photos(loaded.photos)
         enter_scene(self.state, loaded.scene, at=self._at)
         self._last_camera = self.state.camera
         self.state.show_message(f"{loaded.entry.name}   (H shows the keys)", now)

@@ -3,6 +3,7 @@
 imgui_bundle must be imported before glfw, because it selects the glfw library.
 """
 
+import contextlib
 import ctypes
 import os
 import sys
@@ -50,7 +51,6 @@ class Window:
         self.dropped: list[Path] = []
         self._handle = self._create(title, size)
         self._glfw.set_drop_callback(self._handle, self._drop)
-        self._backend = False
 
     def _create(self, title: str, size: tuple[int, int]) -> Any:
         glfw = self._glfw
@@ -94,13 +94,10 @@ class Window:
         address = ctypes.cast(self._handle, ctypes.c_void_p).value
         assert address is not None
         imgui.backends.glfw_init_for_opengl(address, True)
-        self._backend = True
 
     def detach_gui(self) -> None:
         """Stop sending events to imgui; call before imgui's context is destroyed."""
-        if self._backend:
-            imgui.backends.glfw_shutdown()
-            self._backend = False
+        imgui.backends.glfw_shutdown()
 
     def wait(self, seconds: float) -> None:
         """Process events; wait up to `seconds` for the first."""
@@ -133,13 +130,12 @@ class Window:
 
 def run_viewer(window: Window, viewer: Viewer) -> None:
     """Run a viewer in the window until the user quits, then free everything and join all threads."""
-    try:
+    with contextlib.ExitStack() as stack:
+        stack.callback(window.close)
+        stack.callback(viewer.close)
         window.attach_gui()
+        stack.callback(window.detach_gui)
         _run_loop(window, viewer)
-    finally:
-        window.detach_gui()
-        viewer.close()
-        window.close()
 
 
 def _run_loop(window: Window, viewer: Viewer) -> None:

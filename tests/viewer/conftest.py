@@ -83,8 +83,14 @@ def renderer(ctx, _renderers) -> Callable[..., SplatRenderer]:
     return get
 
 
+@pytest.fixture(scope="session")
+def random_scene() -> Callable[..., Scene]:
+    """Returns a shell of Gaussians of `size` radians, 1 to 4 m from the origin, elongated up to 10:1; do not modify."""
+    return _make_random_scene
+
+
 @functools.cache
-def _random_scene(count: int = 300, degree: int = 1, size: float = 0.06, seed: int = 0) -> Scene:
+def _make_random_scene(count: int = 300, degree: int = 1, size: float = 0.06, seed: int = 0) -> Scene:
     random = torch.Generator().manual_seed(seed)
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=random), dim=-1)
     radii = 1 + 3 * torch.rand(count, 1, generator=random)
@@ -104,12 +110,6 @@ def _random_scene(count: int = 300, degree: int = 1, size: float = 0.06, seed: i
 
 
 @pytest.fixture
-def random_scene() -> Callable[..., Scene]:
-    """Returns a shell of Gaussians of `size` radians, 1 to 4 m from the origin, elongated up to 10:1; do not modify."""
-    return _random_scene
-
-
-@pytest.fixture
 def pose() -> np.ndarray:
     """A camera near the origin with a general rotation."""
     cam2world = np.eye(4)
@@ -119,7 +119,9 @@ def pose() -> np.ndarray:
     return cam2world
 
 
-def _reference(scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> Rendering:
+def _rasterize_reference(
+    scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings
+) -> Rendering:
     return rasterize(
         scene.gaussians.to(dtype=torch.float64),
         torch.from_numpy(cam2world),
@@ -138,7 +140,7 @@ def _reference(scene: Scene, cam2world: np.ndarray, size: tuple[int, int], setti
 @pytest.fixture
 def reference() -> Callable[..., Rendering]:
     """Renders a scene with the float64 torch reference under the same settings."""
-    return _reference
+    return _rasterize_reference
 
 
 @pytest.fixture
@@ -172,11 +174,11 @@ def assert_matches() -> Callable[..., None]:
 
 
 @pytest.fixture
-def assert_reference(renderer, assert_matches) -> Callable[..., None]:
+def assert_reference(renderer, reference, assert_matches) -> Callable[..., None]:
     """Checks that both tiers render a scene as the reference does."""
 
     def check(scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> None:
-        expected = _reference(scene, cam2world, size, settings)
+        expected = reference(scene, cam2world, size, settings)
         for tier in ("gl33", "gl43"):
             assert_matches(renderer(scene, tier), cam2world, settings, expected)
 

@@ -1,8 +1,9 @@
-"""The scenes at a path, and loading them in a worker thread."""
+"""Scenes at a path are found, and loaded in a worker thread."""
 
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -120,12 +121,6 @@ def test_close_cancels_the_request_and_joins_its_thread():
 def test_predictions_have_the_arguments_of_the_options(monkeypatch, small_scene):
     arguments = {}
 
-    class FakePair:
-        name = "kitchen"
-
-        def load_context(self, height: int) -> str:
-            return f"photographs at {height}"
-
     def predict(pair, **options):
         arguments.update(options)
         options["progress"]("predicting", 0.5)
@@ -133,7 +128,8 @@ def test_predictions_have_the_arguments_of_the_options(monkeypatch, small_scene)
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
     tasks = []
-    entry = SceneEntry("kitchen", pair=FakePair())
+    pair = SimpleNamespace(name="kitchen", load_context=lambda height: f"photographs at {height}")
+    entry = SceneEntry("kitchen", pair=pair)
     options = LoadOptions(model="sweep", height=256, cache=False)
     loaded = load_entry(entry, options, lambda task, done: tasks.append(task))
     assert (arguments["model"], arguments["height"], arguments["cache"]) == ("sweep", 256, False)

@@ -10,8 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, ClassVar
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -130,34 +129,13 @@ def test_mouse_and_keys_move_the_camera_and_escape_closes_the_window(display, ro
 
 
 def test_a_dropped_path_is_opened():
-    class Opener:
-        moving = True
-        state = SimpleNamespace(quit=False)
-        panel_data = SimpleNamespace(current=-1)
-        opened: ClassVar[list[Path]] = []
-
-        def open(self, path: Path) -> None:
-            self.opened.append(path)
-
-        def frame(self, *_: Any) -> None:
-            self.state.quit = True
-
-    class Dropped(Window):
-        ctx = SimpleNamespace(detect_framebuffer=lambda _: SimpleNamespace())
-        framebuffer_size = (64, 32)
-        closing = False
-
-        def __init__(self) -> None:
-            self.dropped = []
-            self._drop(None, ["/somewhere/a pair"])
-
-        def wait(self, seconds: float) -> None: ...
-        def set_title(self, title: str) -> None: ...
-        def swap(self) -> None: ...
-
-    window, viewer = Dropped(), Opener()
+    window = Mock(spec=Window, ctx=Mock(), closing=False, framebuffer_size=(64, 32), dropped=[])
+    Window._drop(window, None, ["/somewhere/a pair"])
+    viewer = Mock(moving=True, state=Mock(quit=False), panel_data=Mock(current=-1))
+    viewer.frame.side_effect = lambda *_: setattr(viewer.state, "quit", True)
     _run_loop(window, viewer)
-    assert viewer.opened == [Path("/somewhere/a pair")] and window.dropped == []
+    viewer.open.assert_called_once_with(Path("/somewhere/a pair"))
+    assert window.dropped == []
 
 
 def test_an_interrupt_ends_with_status_130(display, room, wait_until):
