@@ -137,10 +137,9 @@ def _run(options: Options) -> int:
     if len(chosen) < len(entries):
         print(f"{options.path} has {len(entries)} scenes: showing {chosen[0].name}; select with --pair NAME or all")
     for entry in chosen:
-        if folder is None:
-            target = Path("renders") / entry.folder_name
-        else:
-            target = folder / entry.folder_name if show_all else folder
+        target = Path("renders") if folder is None else folder
+        if folder is None or show_all:
+            target /= entry.folder_name
         _write_flythrough(options, entry, target, pixels)
     return 0
 

@@ -111,9 +111,8 @@ def read_input(seconds: float) -> Input:
                 held.add(name)
             if imgui.is_key_pressed(value, repeat=name in ",."):
                 pressed.add(name)
-    for name, down in (("shift", io.key_shift), ("alt", io.key_alt), ("ctrl", io.key_ctrl)):
-        if down:
-            held.add(name)
+    modifiers = {"shift": io.key_shift, "alt": io.key_alt, "ctrl": io.key_ctrl}
+    held |= {name for name, down in modifiers.items() if down}
     drag = pan = (0.0, 0.0)
     scroll = 0.0
     if not io.want_capture_mouse:

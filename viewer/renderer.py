@@ -137,9 +137,7 @@ class SplatRenderer:
         `render` draws no depth. The first call after it draws the frame again with depth. In mode `difference` this is
         the absolute difference of the two depths.
         """
-        if self._image is None or self._frame is None:
-            raise InputError("there is no image to read; call `render` first")
-        if self._image.depth is None:
+        if self._image is not None and self._frame is not None and self._image.depth is None:
             bound, stats = self._ctx.fbo, self.stats
             self._draw(self._frame, with_depth=True)
             self.stats = stats

@@ -70,7 +70,7 @@ def _renderers(gl_context: moderngl.Context) -> Iterator[dict[tuple[str, int, in
 
 
 @pytest.fixture
-def renderer(ctx, _renderers) -> Callable[..., SplatRenderer]:
+def make_renderer(ctx, _renderers) -> Callable[..., SplatRenderer]:
     """Returns a renderer with 32-bit targets and a newly uploaded scene; `slot` selects one of several."""
 
     def get(scene: Scene, tier: str = "auto", color_bits: int = 32, slot: int = 0) -> SplatRenderer:
@@ -174,13 +174,13 @@ def assert_matches() -> Callable[..., None]:
 
 
 @pytest.fixture
-def assert_reference(renderer, reference, assert_matches) -> Callable[..., None]:
+def assert_reference(make_renderer, reference, assert_matches) -> Callable[..., None]:
     """Checks that both tiers render a scene as the reference does."""
 
     def check(scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> None:
         expected = reference(scene, cam2world, size, settings)
         for tier in ("gl33", "gl43"):
-            assert_matches(renderer(scene, tier), cam2world, settings, expected)
+            assert_matches(make_renderer(scene, tier), cam2world, settings, expected)
 
     return check
 

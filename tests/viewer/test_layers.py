@@ -29,16 +29,16 @@ def enlarge_gaussians(scene):
     return replace(scene, gaussians=replace(scene.gaussians, scales=scene.gaussians.scales.clamp_min(0.15)))
 
 
-def render_image(drawn, pose, settings, size=SIZE):
-    drawn.render(pose, size, settings)
-    return drawn.read_color()
+def render_image(renderer, pose, settings, size=SIZE):
+    renderer.render(pose, size, settings)
+    return renderer.read_color()
 
 
 @pytest.mark.parametrize("color_bits", [16, 32])
 @pytest.mark.parametrize("mode", ["joint", "deferred", "difference"])
-def test_cached_faces_give_the_image_of_direct_drawing(renderer, random_scene, pose, mode, color_bits):
+def test_cached_faces_give_the_image_of_direct_drawing(make_renderer, random_scene, pose, mode, color_bits):
     scene = enlarge_gaussians(random_scene(150))
-    kept, direct = renderer(scene, color_bits=color_bits, slot=1), renderer(scene)
+    kept, direct = make_renderer(scene, color_bits=color_bits, slot=1), make_renderer(scene)
     for degrees in (0, 40, 100, 170, 260):
         camera = turn_right(pose, degrees)
         settings = replace(CACHED, mode=mode)
@@ -49,28 +49,30 @@ def test_cached_faces_give_the_image_of_direct_drawing(renderer, random_scene, p
         assert error.max() < 0.04
 
 
-def test_cached_faces_give_the_depth_of_direct_drawing(renderer, random_scene, pose):
+def test_cached_faces_give_the_depth_of_direct_drawing(make_renderer, random_scene, pose):
     scene = enlarge_gaussians(random_scene(400, size=0.2))
-    kept, direct = renderer(scene), renderer(scene, slot=1)
+    kept, direct = make_renderer(scene), make_renderer(scene, slot=1)
     kept.render(pose, SIZE, CACHED)
     direct.render(pose, SIZE, replace(CACHED, cached=False))
     assert np.abs(kept.read_depth() - direct.read_depth()).mean() < 0.01
 
 
-def test_rotation_draws_each_face_once(renderer, random_scene, pose):
-    drawn = renderer(random_scene())
+def test_rotation_draws_each_face_once(make_renderer, random_scene, pose):
+    renderer = make_renderer(random_scene())
     for degrees in range(0, 360, 30):
-        drawn.render(turn_right(pose, degrees), SIZE, CACHED)
-    drawn.render(turn_right(pose, 90), SIZE, CACHED)
-    assert drawn.stats.cached and drawn.stats.drawn == 0
-    drawn.render(pose, SIZE, replace(CACHED, background=(1, 1, 1)))
-    assert drawn.stats.cached, "layers do not depend on the background"
+        renderer.render(turn_right(pose, degrees), SIZE, CACHED)
+    renderer.render(turn_right(pose, 90), SIZE, CACHED)
+    assert renderer.stats.cached and renderer.stats.drawn == 0
+    renderer.render(pose, SIZE, replace(CACHED, background=(1, 1, 1)))
+    assert renderer.stats.cached, "layers do not depend on the background"
 
 
-def test_narrow_field_of_view_is_drawn_directly(renderer, random_scene, pose):
-    drawn = renderer(random_scene())
+def test_narrow_field_of_view_is_drawn_directly(make_renderer, random_scene, pose):
+    renderer = make_renderer(random_scene())
     narrow = replace(CACHED, vertical_fov_degrees=1.0)
-    assert np.array_equal(render_image(drawn, pose, narrow), render_image(drawn, pose, replace(narrow, cached=False)))
+    assert np.array_equal(
+        render_image(renderer, pose, narrow), render_image(renderer, pose, replace(narrow, cached=False))
+    )
 
 
 @pytest.mark.parametrize(
@@ -86,70 +88,72 @@ def test_narrow_field_of_view_is_drawn_directly(renderer, random_scene, pose):
     ],
     ids=str,
 )
-def test_kept_layers_follow_every_setting(renderer, random_scene, pose, change):
+def test_kept_layers_follow_every_setting(make_renderer, random_scene, pose, change):
     scene = random_scene(size=0.1)
-    drawn, fresh = renderer(scene), renderer(scene, slot=1)
+    renderer, fresh = make_renderer(scene), make_renderer(scene, slot=1)
     for settings in STORAGES:
-        before = render_image(drawn, pose, settings)
+        before = render_image(renderer, pose, settings)
         changed = replace(settings, **change)
-        after = render_image(drawn, pose, changed)
+        after = render_image(renderer, pose, changed)
         assert np.abs(after - before).max() > 1e-3
         assert np.array_equal(after, render_image(fresh, pose, changed))
 
 
-def test_kept_layers_follow_position_size_and_scene(renderer, random_scene, pose):
-    drawn, fresh = renderer(random_scene()), renderer(random_scene(), slot=1)
+def test_kept_layers_follow_position_size_and_scene(make_renderer, random_scene, pose):
+    renderer, fresh = make_renderer(random_scene()), make_renderer(random_scene(), slot=1)
     moved = pose.copy()
     moved[0, 3] += 0.2
     for settings in STORAGES[:2]:
-        drawn.render(pose, SIZE, settings)
-        drawn.render(moved, SIZE, settings)
-        assert not drawn.stats.cached
-        assert np.array_equal(drawn.read_color(), render_image(fresh, moved, settings))
-        small = render_image(drawn, moved, settings, (50, 30))
+        renderer.render(pose, SIZE, settings)
+        renderer.render(moved, SIZE, settings)
+        assert not renderer.stats.cached
+        assert np.array_equal(renderer.read_color(), render_image(fresh, moved, settings))
+        small = render_image(renderer, moved, settings, (50, 30))
         assert small.shape == (30, 50, 4)
         assert np.array_equal(small, render_image(fresh, moved, settings, (50, 30)))
     other = random_scene(seed=7)
-    drawn.upload(other)
-    assert np.array_equal(render_image(drawn, moved, CACHED), render_image(renderer(other, slot=1), moved, CACHED))
+    renderer.upload(other)
+    assert np.array_equal(
+        render_image(renderer, moved, CACHED), render_image(make_renderer(other, slot=1), moved, CACHED)
+    )
 
 
-def test_reading_depth_changes_nothing_else(renderer, random_scene, pose):
-    drawn = renderer(random_scene())
+def test_reading_depth_changes_nothing_else(make_renderer, random_scene, pose):
+    renderer = make_renderer(random_scene())
     for settings in STORAGES:
-        color, stats = render_image(drawn, pose, settings), drawn.stats
-        first = drawn.read_depth()
-        assert drawn.stats == stats
-        assert np.array_equal(drawn.read_color(), color)
-        drawn.render(pose, SIZE, settings)
-        assert drawn.stats.cached
-        assert np.array_equal(drawn.read_depth(), first)
+        color, stats = render_image(renderer, pose, settings), renderer.stats
+        first = renderer.read_depth()
+        assert renderer.stats == stats
+        assert np.array_equal(renderer.read_color(), color)
+        renderer.render(pose, SIZE, settings)
+        assert renderer.stats.cached
+        assert np.array_equal(renderer.read_depth(), first)
 
 
-def test_unsettled_images_settle_to_the_sorted_one(renderer, random_scene, pose, wait_until):
+def test_unsettled_images_settle_to_the_sorted_one(make_renderer, random_scene, pose, wait_until):
     scene = random_scene(degree=2, size=0.1)
-    drawn = renderer(scene)
-    drawn.render(pose, SIZE, DrawSettings(), wait=False)
-    assert drawn.stats.settled, "the first frame waits for its order"
+    renderer = make_renderer(scene)
+    renderer.render(pose, SIZE, DrawSettings(), wait=False)
+    assert renderer.stats.settled, "the first frame waits for its order"
     pose[:3, 3] += (0.5, 0.0, -0.4)
-    drawn.render(pose, SIZE, DrawSettings(), wait=False)
-    assert not drawn.stats.settled
+    renderer.render(pose, SIZE, DrawSettings(), wait=False)
+    assert not renderer.stats.settled
 
     def render_again() -> bool:
-        drawn.render(pose, SIZE, DrawSettings(), wait=False)
-        return drawn.stats.settled
+        renderer.render(pose, SIZE, DrawSettings(), wait=False)
+        return renderer.stats.settled
 
     wait_until(render_again, "settled image")
-    assert np.array_equal(drawn.read_color(), render_image(renderer(scene, slot=1), pose, DrawSettings()))
+    assert np.array_equal(renderer.read_color(), render_image(make_renderer(scene, slot=1), pose, DrawSettings()))
 
 
-def test_framebuffer_binding_of_the_caller_is_restored(ctx, renderer, random_scene, pose):
-    drawn = renderer(random_scene())
+def test_framebuffer_binding_of_the_caller_is_restored(ctx, make_renderer, random_scene, pose):
+    renderer = make_renderer(random_scene())
     bound = ctx.framebuffer([ctx.texture((8, 8), 4)])
     bound.use()
-    drawn.render(pose, SIZE, DrawSettings())
+    renderer.render(pose, SIZE, DrawSettings())
     assert ctx.fbo is bound
-    drawn.read_depth()
+    renderer.read_depth()
     assert ctx.fbo is bound
     bound.clear(0.0, 1.0, 0.0, 1.0)
     assert bound.read(components=4)[:4] == bytes((0, 255, 0, 255))
@@ -178,8 +182,8 @@ def test_target_content_is_valid_for_its_key_only(ctx):
 
 def test_release_leaves_the_context_usable(ctx, random_scene, pose):
     for _ in range(2):
-        drawn = SplatRenderer(ctx)
-        drawn.upload(random_scene(10))
-        drawn.render(pose, SIZE, CACHED)
-        drawn.release()
+        renderer = SplatRenderer(ctx)
+        renderer.upload(random_scene(10))
+        renderer.render(pose, SIZE, CACHED)
+        renderer.release()
         assert ctx.error == "GL_NO_ERROR"

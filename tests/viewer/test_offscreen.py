@@ -21,7 +21,7 @@ from pansplat_viewer.renderer import DrawSettings
 pytestmark = pytest.mark.gl
 
 # Makes Mesa behave like macOS: an old version without compute shaders, storage buffers and images.
-_WITHOUT = " ".join(
+_DISABLED_EXTENSIONS = " ".join(
     f"-GL_ARB_{name}"
     for name in (
         "compute_shader",
@@ -68,7 +68,7 @@ np.savez(out, version=ctx.version_code, tier=renderer.tier, **images)
 """
 
 
-def test_old_opengl_and_osmesa_render_the_same_images(renderer, random_scene, pose, tmp_path):
+def test_old_opengl_and_osmesa_render_the_same_images(make_renderer, random_scene, pose, tmp_path):
     scene = random_scene()
     stored = {"gaussians": vars(scene.gaussians), "cam2world": scene.cam2world, "pose": torch.from_numpy(pose)}
     torch.save(stored, tmp_path / "scene.pt")
@@ -76,7 +76,7 @@ def test_old_opengl_and_osmesa_render_the_same_images(renderer, random_scene, po
         f"{version}0": {
             "MESA_GL_VERSION_OVERRIDE": f"{version[0]}.{version[1]}",
             "MESA_GLSL_VERSION_OVERRIDE": f"{version}0",
-            "MESA_EXTENSION_OVERRIDE": _WITHOUT,
+            "MESA_EXTENSION_OVERRIDE": _DISABLED_EXTENSIONS,
         }
         for version in ("33", "41")
     }
@@ -91,7 +91,7 @@ def test_old_opengl_and_osmesa_render_the_same_images(renderer, random_scene, po
         backend = "osmesa" if name == "osmesa" else "egl"
         command = [sys.executable, "-c", _SCRIPT, str(tmp_path / "scene.pt"), str(tmp_path / f"{name}.npz"), backend]
         processes[name] = subprocess.Popen(command, env=os.environ | environment, stderr=subprocess.PIPE, text=True)
-    expected = render_images(renderer(scene), pose)
+    expected = render_images(make_renderer(scene), pose)
     for name, process in processes.items():
         _, errors = process.communicate(timeout=120)
         assert process.returncode == 0, errors

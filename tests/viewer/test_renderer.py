@@ -70,12 +70,12 @@ def test_subpixel_needle_and_disc_gaussians_equal_the_reference(random_scene, po
 
 
 @pytest.mark.parametrize("degree", [0, 2, 4])
-def test_colors_of_any_degree_follow_the_position(renderer, random_scene, pose, reference, assert_matches, degree):
+def test_colors_of_any_degree_follow_the_position(make_renderer, random_scene, pose, reference, assert_matches, degree):
     scene = random_scene(degree=degree, seed=5)
-    drawn = renderer(scene)
+    renderer = make_renderer(scene)
     for shift in (0.0, 0.5):
         pose[0, 3] += shift
-        assert_matches(drawn, pose, SETTINGS, reference(scene, pose, SIZE, SETTINGS))
+        assert_matches(renderer, pose, SETTINGS, reference(scene, pose, SIZE, SETTINGS))
 
 
 @pytest.mark.parametrize("order", ["radial", "z"])
@@ -97,113 +97,100 @@ def test_near_unusual_opacities_and_odd_sizes_equal_the_reference(random_scene, 
     assert_reference(replace(scene, gaussians=replace(scene.gaussians, opacities=opacities)), pose, SIZE, SETTINGS)
 
 
-@pytest.mark.parametrize("unit", [1e-3, 1e4])
-def test_image_does_not_depend_on_the_unit_of_length(renderer, random_scene, pose, unit):
+@pytest.mark.parametrize(("unit", "origin"), [(1e-3, (0, 0, 0)), (1e4, (0, 0, 0)), (1, (4e5, -2e5, 1e5))])
+def test_image_does_not_depend_on_the_unit_of_length_and_the_origin(make_renderer, random_scene, pose, unit, origin):
     scene = random_scene(seed=7)
-    drawn = renderer(scene)
-    drawn.render(pose, SIZE, DrawSettings())
-    expected = drawn.read_color()
+    renderer = make_renderer(scene)
+    renderer.render(pose, SIZE, DrawSettings())
+    expected = renderer.read_color()
+    origin = torch.tensor(origin, dtype=torch.float64)
     cam2world = scene.cam2world.clone()
-    cam2world[:, :3, 3] *= unit
-    gaussians = replace(scene.gaussians, means=scene.gaussians.means * unit, scales=scene.gaussians.scales * unit)
-    drawn.upload(replace(scene, gaussians=gaussians, cam2world=cam2world))
-    pose[:3, 3] *= unit
-    drawn.render(pose, SIZE, DrawSettings(near=0.05 * unit))
-    assert np.abs(drawn.read_color() - expected).max() <= 5e-3
-    assert np.abs(drawn.read_color() - expected).mean() <= 1e-5
+    cam2world[:, :3, 3] = cam2world[:, :3, 3] * unit + origin
+    gaussians = scene.gaussians.to(dtype=torch.float64)
+    gaussians = replace(gaussians, means=gaussians.means * unit + origin, scales=gaussians.scales * unit)
+    renderer.upload(replace(scene, gaussians=gaussians, cam2world=cam2world))
+    pose[:3, 3] = pose[:3, 3] * unit + origin.numpy()
+    renderer.render(pose, SIZE, DrawSettings(near=0.05 * unit))
+    assert np.abs(renderer.read_color() - expected).max() <= 5e-3
+    assert np.abs(renderer.read_color() - expected).mean() <= 1e-5
 
 
-def test_image_does_not_depend_on_the_position_of_the_scene(renderer, random_scene, pose):
-    scene = random_scene(seed=8)
-    drawn = renderer(scene)
-    drawn.render(pose, SIZE, DrawSettings())
-    expected = drawn.read_color()
-    offset = torch.tensor((4e5, -2e5, 1e5), dtype=torch.float64)
-    cam2world = scene.cam2world.clone()
-    cam2world[:, :3, 3] += offset
-    gaussians = replace(scene.gaussians.to(dtype=torch.float64), means=scene.gaussians.means.double() + offset)
-    drawn.upload(replace(scene, gaussians=gaussians, cam2world=cam2world))
-    pose[:3, 3] += offset.numpy()
-    drawn.render(pose, SIZE, DrawSettings())
-    assert np.abs(drawn.read_color() - expected).mean() <= 1e-5
-
-
-def test_panorama_error_at_seams_is_not_larger_than_inside_faces(renderer, random_scene, pose):
+def test_panorama_error_at_seams_is_not_larger_than_inside_faces(make_renderer, random_scene, pose):
     scene = random_scene(200, degree=0, size=0.12, seed=12)
     height, width = 64, 128
-    drawn = renderer(scene)
-    drawn.render(pose, (width, height), DrawSettings(layout="equirect", face_size=64))
+    renderer = make_renderer(scene)
+    renderer.render(pose, (width, height), DrawSettings(layout="equirect", face_size=64))
     gaussians = scene.gaussians.to(dtype=torch.float64)
     direct = rasterize(gaussians, torch.from_numpy(pose), size=(height, width), layout="equirect")  # without faces
-    error = np.abs(drawn.read_color()[..., :3] - direct.color.permute(1, 2, 0).numpy()).mean(axis=-1)
+    error = np.abs(renderer.read_color()[..., :3] - direct.color.permute(1, 2, 0).numpy()).mean(axis=-1)
     largest = np.sort(np.abs(pixel_directions(height, width).numpy()), axis=-1)
     seam = largest[..., 2] - largest[..., 1] < 3 * math.pi / height
     assert error[seam].mean() <= 1.5 * error[~seam].mean() + 1e-4
 
 
 @pytest.mark.parametrize("view", [0, 1])
-def test_mode_view_draws_the_gaussians_of_the_view(renderer, random_scene, pose, reference, assert_matches, view):
+def test_mode_view_draws_the_gaussians_of_the_view(make_renderer, random_scene, pose, reference, assert_matches, view):
     scene = random_scene()
-    drawn = renderer(scene)
+    renderer = make_renderer(scene)
     expected = reference(select_view(scene, view), pose, SIZE, SETTINGS)
-    assert_matches(drawn, pose, replace(SETTINGS, mode="view", view=view), expected)
-    assert drawn.stats.visible <= int((scene.gaussians.views == view).sum())
+    assert_matches(renderer, pose, replace(SETTINGS, mode="view", view=view), expected)
+    assert renderer.stats.visible <= int((scene.gaussians.views == view).sum())
 
 
 @pytest.mark.parametrize("layout", ["pinhole", "equirect"])
 @pytest.mark.parametrize("position", ["between", "at view 1", "elsewhere"])
 def test_deferred_blending_equals_the_reference(
-    renderer, random_scene, pose, reference, assert_matches, layout, position
+    make_renderer, random_scene, pose, reference, assert_matches, layout, position
 ):
     scene = random_scene(120)  # sparse, so that one or both views have holes
     centers = scene.cam2world[:, :3, 3].numpy()
     pose[:3, 3] = {"between": centers.mean(0), "at view 1": centers[1], "elsewhere": (0.1, 0.2, 0.3)}[position]
     settings = replace(SETTINGS, mode="deferred", layout=layout)
-    drawn = renderer(scene)
+    renderer = make_renderer(scene)
     images = [reference(select_view(scene, view), pose, SIZE, settings) for view in (0, 1)]
     weights = blend_weights(torch.from_numpy(pose[:3, 3].copy()), scene.cam2world[:, :3, 3])
     total = sum(weight * image.alpha for weight, image in zip(weights, images, strict=True))
     band = (total > 0) & (total < 1e-3)  # where the weighted views are nearly empty (docs/rendering.md, section 7)
     assert band.float().mean() < 0.02
-    assert_matches(drawn, pose, settings, blend(images, weights), ~band.numpy())
+    assert_matches(renderer, pose, settings, blend(images, weights), ~band.numpy())
 
 
-def test_difference_is_that_of_the_images_of_two_views(renderer, random_scene, pose, reference):
+def test_difference_is_that_of_the_images_of_two_views(make_renderer, random_scene, pose, reference):
     scene = random_scene()
-    drawn = renderer(scene)
-    drawn.render(pose, SIZE, replace(SETTINGS, mode="difference"))
+    renderer = make_renderer(scene)
+    renderer.render(pose, SIZE, replace(SETTINGS, mode="difference"))
     first, second = (reference(select_view(scene, view), pose, SIZE, SETTINGS) for view in (0, 1))
     expected = (first.color - second.color).abs().permute(1, 2, 0).numpy()
-    forwards = drawn.read_color()
+    forwards = renderer.read_color()
     assert np.abs(forwards[..., :3] - expected).max() <= 5e-3
-    assert np.abs(drawn.read_depth() - (first.depth - second.depth).abs().numpy()).mean() <= 1e-3
-    drawn.render(pose, SIZE, replace(SETTINGS, mode="difference", view=1))
-    assert np.abs(drawn.read_color() - forwards).max() <= 1e-6
+    assert np.abs(renderer.read_depth() - (first.depth - second.depth).abs().numpy()).mean() <= 1e-3
+    renderer.render(pose, SIZE, replace(SETTINGS, mode="difference", view=1))
+    assert np.abs(renderer.read_color() - forwards).max() <= 1e-6
 
 
-def test_levels_and_opacity_threshold_select_gaussians(renderer, random_scene, pose, reference, assert_matches):
+def test_levels_and_opacity_threshold_select_gaussians(make_renderer, random_scene, pose, reference, assert_matches):
     scene = random_scene()
-    drawn = renderer(scene)
+    renderer = make_renderer(scene)
     cases = [({"opacity_threshold": 0.6}, scene.gaussians.opacities >= 0.6)]
     for levels in ((), (0,), (1, 3)):
         mask = torch.isin(scene.gaussians.levels, torch.tensor(levels, dtype=torch.int64))
         cases.append(({"levels": frozenset(levels)}, mask))
     for change, mask in cases:
         expected = reference(select(scene, mask), pose, SIZE, SETTINGS)
-        assert_matches(drawn, pose, replace(SETTINGS, **change), expected)
+        assert_matches(renderer, pose, replace(SETTINGS, **change), expected)
 
 
-def test_empty_scene_is_the_background(renderer, random_scene, pose):
+def test_empty_scene_is_the_background(make_renderer, random_scene, pose):
     scene = random_scene()
-    drawn = renderer(select(scene, torch.zeros(len(scene.gaussians), dtype=torch.bool)))
+    renderer = make_renderer(select(scene, torch.zeros(len(scene.gaussians), dtype=torch.bool)))
     for settings in (SETTINGS, replace(SETTINGS, layout="equirect", mode="deferred")):
-        drawn.render(pose, SIZE, settings)
-        assert np.allclose(drawn.read_color(), (*SETTINGS.background, 0), atol=1e-6)
-        assert not drawn.read_depth().any()
+        renderer.render(pose, SIZE, settings)
+        assert np.allclose(renderer.read_color(), (*SETTINGS.background, 0), atol=1e-6)
+        assert not renderer.read_depth().any()
 
 
 def test_gaussians_with_non_finite_values_are_dropped_and_counted(
-    renderer, random_scene, pose, reference, assert_matches
+    make_renderer, random_scene, pose, reference, assert_matches
 ):
     scene = random_scene()
     names = ("means", "scales", "quats", "opacities", "harmonics")
@@ -213,17 +200,17 @@ def test_gaussians_with_non_finite_values_are_dropped_and_counted(
     fields["quats"][2, 3] = float("nan")
     fields["opacities"][3] = float("nan")
     fields["harmonics"][4, 2, 0] = float("-inf")
-    drawn = renderer(replace(scene, gaussians=replace(scene.gaussians, **fields)))
+    renderer = make_renderer(replace(scene, gaussians=replace(scene.gaussians, **fields)))
     finite = select(scene, torch.arange(len(scene.gaussians)) >= 5)
-    assert_matches(drawn, pose, SETTINGS, reference(finite, pose, SIZE, SETTINGS))
-    assert drawn.stats.dropped == 5
-    assert drawn.stats.total == len(scene.gaussians) - 5
+    assert_matches(renderer, pose, SETTINGS, reference(finite, pose, SIZE, SETTINGS))
+    assert renderer.stats.dropped == 5
+    assert renderer.stats.total == len(scene.gaussians) - 5
 
 
-def test_half_float_targets_are_close(renderer, random_scene, pose):
-    exact, half = renderer(random_scene()), renderer(random_scene(), color_bits=16)
-    for drawn in (exact, half):
-        drawn.render(pose, SIZE, SETTINGS)
+def test_half_float_targets_are_close(make_renderer, random_scene, pose):
+    exact, half = make_renderer(random_scene()), make_renderer(random_scene(), color_bits=16)
+    for renderer in (exact, half):
+        renderer.render(pose, SIZE, SETTINGS)
     assert 0 < np.abs(exact.read_color() - half.read_color()).max() < 0.02
 
 
@@ -238,27 +225,27 @@ def test_software_gl_has_32_bit_targets_by_default(ctx, random_scene, pose):
             return getattr(ctx, name)
 
     for context, dtype in ((ctx, "f4" if "llvmpipe" in ctx.info["GL_RENDERER"] else "f2"), (Gpu(), "f2")):
-        drawn = SplatRenderer(context)
-        drawn.upload(random_scene(20))
-        assert drawn.render(pose, SIZE, SETTINGS).dtype == dtype
-        drawn.release()
+        renderer = SplatRenderer(context)
+        renderer.upload(random_scene(20))
+        assert renderer.render(pose, SIZE, SETTINGS).dtype == dtype
+        renderer.release()
 
 
-def test_image_is_upright_and_not_mirrored(renderer, random_scene):
+def test_image_is_upright_and_not_mirrored(make_renderer, random_scene):
     scene = select(random_scene(), torch.arange(300) < 1)
     gaussians = replace(scene.gaussians, means=torch.tensor(((0.5, -0.5, 1.0),)), opacities=torch.ones(1))
-    drawn = renderer(replace(scene, gaussians=replace(gaussians, scales=torch.full((1, 3), 0.05))))
-    texture = drawn.render(np.eye(4), (64, 64), DrawSettings())
-    row, column = np.unravel_index(drawn.read_color()[..., 3].argmax(), (64, 64))
+    renderer = make_renderer(replace(scene, gaussians=replace(gaussians, scales=torch.full((1, 3), 0.05))))
+    texture = renderer.render(np.eye(4), (64, 64), DrawSettings())
+    row, column = np.unravel_index(renderer.read_color()[..., 3].argmax(), (64, 64))
     assert row < 24 and column > 40, "a mean ahead, up and to the right is at the upper right"
     raw = np.frombuffer(texture.read(), np.float32).reshape(64, 64, 4)
-    assert np.array_equal(raw[::-1], drawn.read_color()), "row 0 of the texture is the bottom row"
+    assert np.array_equal(raw[::-1], renderer.read_color()), "row 0 of the texture is the bottom row"
 
 
-def test_culling_does_not_change_the_image(renderer, random_scene, pose, monkeypatch):
+def test_culling_does_not_change_the_image(make_renderer, random_scene, pose, monkeypatch):
     scene = random_scene(1000, size=0.1)
     settings = [replace(SETTINGS, vertical_fov_degrees=fov) for fov in (10, 60, 150)]
-    culled, whole = renderer(scene), renderer(scene, slot=1)
+    culled, whole = make_renderer(scene), make_renderer(scene, slot=1)
     images = []
     for each in settings:
         culled.render(pose, SIZE, each)
@@ -284,23 +271,23 @@ def test_invalid_settings_are_refused(change, message):
         DrawSettings(**change)
 
 
-def test_settings_poses_and_sizes_that_do_not_fit_are_refused(renderer, random_scene, pose):
+def test_settings_poses_and_sizes_that_do_not_fit_are_refused(make_renderer, random_scene, pose):
     scene = random_scene()
-    drawn = renderer(scene)
+    renderer = make_renderer(scene)
     for change, message in (
         ({"mode": "view", "view": 2}, "`view` must be 0..1 in this scene, got 2"),
         ({"layout": "equirect", "face_size": 100_000}, "limit is .*; use a smaller size or face_size"),
     ):
         with pytest.raises(InputError, match=message):
-            drawn.render(pose, SIZE, replace(SETTINGS, **change))
+            renderer.render(pose, SIZE, replace(SETTINGS, **change))
     with pytest.raises(InputError, match="finite 4x4"):
-        drawn.render(np.full((4, 4), np.nan), SIZE, SETTINGS)
+        renderer.render(np.full((4, 4), np.nan), SIZE, SETTINGS)
     with pytest.raises(InputError, match="at least 1x1"):
-        drawn.render(pose, (0, 10), SETTINGS)
-    drawn.upload(replace(scene, cam2world=torch.zeros(0, 4, 4, dtype=torch.float64), names=()))
-    drawn.render(pose, SIZE, SETTINGS)
+        renderer.render(pose, (0, 10), SETTINGS)
+    renderer.upload(replace(scene, cam2world=torch.zeros(0, 4, 4, dtype=torch.float64), names=()))
+    renderer.render(pose, SIZE, SETTINGS)
     with pytest.raises(InputError, match="0 cameras for 2 views; use mode joint"):
-        drawn.render(pose, SIZE, replace(SETTINGS, mode="deferred"))
+        renderer.render(pose, SIZE, replace(SETTINGS, mode="deferred"))
 
 
 def test_renderer_without_a_scene_refuses_to_draw(ctx, pose):
