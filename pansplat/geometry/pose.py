@@ -36,15 +36,14 @@ def quats_from_rotations(rotations: Float[Tensor, "*batch 3 3"]) -> Float[Tensor
     )
     a, b, c = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
     d, e, f = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
-    candidates = torch.stack(
-        (
-            torch.stack((t[..., 0], a, b, c), dim=-1),
-            torch.stack((a, t[..., 1], d, e), dim=-1),
-            torch.stack((b, d, t[..., 2], f), dim=-1),
-            torch.stack((c, e, f, t[..., 3]), dim=-1),
-        ),
-        dim=-2,
-    )
+    t0, t1, t2, t3 = t.unbind(-1)
+    rows = (
+        t0, a, b, c,
+        a, t1, d, e,
+        b, d, t2, f,
+        c, e, f, t3,
+    )  # fmt: skip
+    candidates = torch.stack(rows, dim=-1).unflatten(-1, (4, 4))
     best = t.argmax(dim=-1)[..., None, None].expand(*t.shape[:-1], 1, 4)
     quats = torch.nn.functional.normalize(candidates.gather(-2, best).squeeze(-2), dim=-1)
     return torch.where(quats[..., :1] < 0, -quats, quats)

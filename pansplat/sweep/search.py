@@ -112,7 +112,7 @@ def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[
     step = (high - low) / (count - 1)
     report("finding floor, ceiling and walls", 0.0)
     planes = make_empty_planes(posed.cam2world, axes, posed.near, posed.far)
-    detection = _Level(posed, min(finest, _DETECTION_HEIGHT), planes, (low, high), config, None)
+    detection = _SearchLevel(posed, min(finest, _DETECTION_HEIGHT), planes, (low, high), config, None)
     planes = detect_planes(
         detection.views, detection.rays, posed.cam2world, planes, (low, high), MIN_FLOOR * posed.near, config.matching
     )
@@ -123,7 +123,7 @@ def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[
     ]
     for n in range(config.coarse_passes):
         report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
-        level = _Level(posed, heights[0], planes, (low, high), config, surfaces)
+        level = _SearchLevel(posed, heights[0], planes, (low, high), config, surfaces)
         surfaces = [
             level.search_full_range(view, count, layouts and layouts[view]) for view in range(len(posed.images))
         ]
@@ -135,7 +135,7 @@ def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[
             for s, image in zip(surfaces, posed.images, strict=True)
         ]
         step /= 2
-        level = _Level(posed, height, planes, (low, high), config, surfaces)
+        level = _SearchLevel(posed, height, planes, (low, high), config, surfaces)
         surfaces = [
             level.refine(view, config.narrow_candidates[n], step, widen=n == 0) for view in range(len(posed.images))
         ]
@@ -143,8 +143,8 @@ def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[
     return surfaces
 
 
-class _Level:
-    """All views at one height, with the surfaces found so far."""
+class _SearchLevel:
+    """All views at the height of one level of the search, with the surfaces found so far."""
 
     def __init__(
         self,
@@ -244,15 +244,15 @@ class _Level:
         surface = self._select_hypotheses(view, sets, cost, slot_map, slots)
         return Surface(surface.inverse_depth, self.surfaces[view].orientation)
 
-    def _mean_cost(self, view: int, sets_against: Callable[[int], list[HypothesisSet]]) -> np.ndarray:
-        """Mean matching cost (h, w, sets * count) over the other views; `sets_against(other)` are the hypotheses."""
+    def _mean_cost(self, view: int, make_sets: Callable[[int], list[HypothesisSet]]) -> np.ndarray:
+        """Mean matching cost (h, w, sets * count) over the other views, of the sets that `make_sets(other)` returns."""
         others = [n for n in range(len(self.views)) if n != view]
         bounds = self.planes.vertical_bounds(self.posed.cam2world[view])
         cost: np.ndarray | None = None
         for other in others:
             part = compute_matching_cost(
                 self.views[view], self.views[other], self.posed.relative_pose(view, other),
-                sets_against(other), self.limits, bounds, self.config.matching,
+                make_sets(other), self.limits, bounds, self.config.matching,
             )  # fmt: skip
             cost = part if cost is None else cost + part
         assert cost is not None

@@ -1,4 +1,4 @@
-"""Spherical harmonics: orthonormal, in 3DGS order and signs, differentiable, rotated, and as officially drawn."""
+"""Spherical harmonics: orthonormal, in 3DGS order and signs, differentiable, rotated; the official evaluation."""
 
 import math
 
@@ -144,8 +144,8 @@ def test_the_official_rotation_equals_ours_in_its_axes(golden):
         units["sh.in"].double(), units["sh.out"].double(), units["sh.rotations"].double(), strict=True
     ):
         flip = torch.diag(torch.tensor((-1.0, 1, -1), dtype=torch.float64))
-        turn = polar_y @ flip @ rotation @ flip @ polar_y.T
-        assert torch.allclose(rotate_harmonics(before.T, turn).T, after, atol=5e-5)  # float32 error: 1e-5
+        our_rotation = polar_y @ flip @ rotation @ flip @ polar_y.T
+        assert torch.allclose(rotate_harmonics(before.T, our_rotation).T, after, atol=5e-5)  # float32 error: 1e-5
 
 
 _TO_WORLD = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=torch.float64)  # the official x, y, z are z, x, y
@@ -170,8 +170,8 @@ def _official_basis(directions: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16, 25])
 def test_official_colours_are_those_of_the_official_basis(coefficients):
     harmonics, directions = 0.3 * _random(40, coefficients, 3), _directions(40, seed=1)
-    drawn = min(coefficients, 16)
-    expected = (_official_basis(directions)[:, None, :drawn] @ harmonics[:, :drawn])[:, 0] + 0.5
+    kept = min(coefficients, 16)
+    expected = (_official_basis(directions)[:, None, :kept] @ harmonics[:, :kept])[:, 0] + 0.5
     world = rotate_harmonics(harmonics, _TO_WORLD)
     got = evaluate_harmonics(official_harmonics(world), directions)
     assert torch.allclose(got, expected.clamp_min(0), rtol=0, atol=1e-7)
@@ -181,7 +181,7 @@ def test_official_colours_are_those_of_the_official_basis(coefficients):
 
 def test_official_harmonics_are_differentiable_and_keep_the_dtype():
     harmonics = torch.randn(5, 25, 2, generator=torch.Generator().manual_seed(0), requires_grad=True)
-    drawn = official_harmonics(harmonics)
-    assert drawn.shape == (5, 16, 2) and drawn.dtype == torch.float32
-    (gradient,) = torch.autograd.grad(drawn.sum(), harmonics)
+    kept = official_harmonics(harmonics)
+    assert kept.shape == (5, 16, 2) and kept.dtype == torch.float32
+    (gradient,) = torch.autograd.grad(kept.sum(), harmonics)
     assert torch.isfinite(gradient).all() and float(gradient[:, 16:].abs().max()) == 0

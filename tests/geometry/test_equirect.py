@@ -17,6 +17,17 @@ from pansplat.geometry.equirect import (
 )
 from pansplat.geometry.pose import rotations_from_quats
 
+
+def _noise(*shape):
+    return torch.randn(shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+
+def _uv(height, width, margin=0):
+    u = (torch.arange(-margin, width + margin, dtype=torch.float64) + 0.5) / width
+    v = (torch.arange(-margin, height + margin, dtype=torch.float64) + 0.5) / height
+    return torch.stack((u.expand(len(v), -1), v[:, None].expand(-1, len(u))), dim=-1)
+
+
 DIRECTIONS = {
     "forward": ((0.5, 0.5), (0, 0, 1)),
     "right": ((0.75, 0.5), (1, 0, 0)),
@@ -38,10 +49,7 @@ def test_the_six_directions_follow_the_convention(name):
 
 
 def test_pixel_centres_are_at_half_integers():
-    rays = pixel_directions(4, 8, dtype=torch.float64)
-    uv = uv_from_directions(rays)
-    assert torch.allclose(uv[..., 0], ((torch.arange(8, dtype=torch.float64) + 0.5) / 8).expand(4, 8))
-    assert torch.allclose(uv[..., 1], ((torch.arange(4, dtype=torch.float64) + 0.5) / 4)[:, None].expand(4, 8))
+    assert torch.allclose(uv_from_directions(pixel_directions(4, 8, dtype=torch.float64)), _uv(4, 8))
 
 
 def test_coordinates_of_any_direction_are_finite_even_for_zero():
@@ -58,13 +66,12 @@ def test_row_weights_are_the_solid_angle_of_the_rows():
 
 
 def test_sampling_at_pixel_centres_returns_the_pixels():
-    image = torch.rand(3, 6, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    uv = uv_from_directions(pixel_directions(6, 12, dtype=torch.float64))
-    assert torch.allclose(sample_equirect(image, uv), image, atol=1e-12)
+    image = _noise(3, 6, 12)
+    assert torch.allclose(sample_equirect(image, _uv(6, 12)), image, atol=1e-12)
 
 
 def test_sampling_on_the_seam_is_the_mean_of_both_edges():
-    image = torch.rand(1, 6, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    image = _noise(1, 6, 12)
     row = torch.tensor(2.5 / 6, dtype=torch.float64)
     for u in (0.0, 1.0):
         value = sample_equirect(image, torch.stack((torch.tensor(u, dtype=torch.float64), row)))
@@ -72,7 +79,7 @@ def test_sampling_on_the_seam_is_the_mean_of_both_edges():
 
 
 def test_a_quarter_turn_to_the_right_rolls_the_panorama_left():
-    image = torch.rand(3, 8, 16, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    image = _noise(3, 8, 16)
     turn = rotations_from_quats(torch.tensor((math.cos(math.pi / 4), 0, math.sin(math.pi / 4), 0), dtype=torch.float64))
     assert torch.allclose(turn[:, 2], torch.tensor((1.0, 0, 0), dtype=torch.float64), atol=1e-12)
     assert torch.allclose(rotate_equirect(image, turn), image.roll(-4, dims=-1), atol=1e-9)
@@ -82,16 +89,6 @@ def test_sampling_passes_gradcheck():
     image = torch.rand(1, 4, 8, dtype=torch.float64, requires_grad=True)
     uv = torch.tensor([[0.13, 0.4], [0.97, 0.08]], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(sample_equirect, (image, uv))
-
-
-def _uv(height, width, margin=0):
-    u = (torch.arange(-margin, width + margin, dtype=torch.float64) + 0.5) / width
-    v = (torch.arange(-margin, height + margin, dtype=torch.float64) + 0.5) / height
-    return torch.stack((u.expand(len(v), -1), v[:, None].expand(-1, len(u))), dim=-1)
-
-
-def _noise(*shape, dtype=torch.float64):
-    return torch.randn(shape, generator=torch.Generator().manual_seed(1), dtype=dtype)
 
 
 @pytest.mark.parametrize("margin", [1, 3, 6])

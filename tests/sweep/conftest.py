@@ -44,13 +44,13 @@ _PAINTS = {"waves": _waves, "tiles": _tiles, "blank": _blank}
 
 @dataclass(frozen=True)
 class Room:
-    """A textured room, with or without a box that stands in it. Metres, room axes, y down."""
+    """A textured room, with or without a box on its floor. Metres, room axes, y down."""
 
     paint: str = "waves"
     low: tuple[float, float, float] = (-2.4, -1.3, -1.9)
     high: tuple[float, float, float] = (2.1, 1.2, 2.6)
     box: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
-    placed: np.ndarray = field(default_factory=lambda: np.eye(4))
+    room2world: np.ndarray = field(default_factory=lambda: np.eye(4))
     """Similarity (4, 4) from the room's axes to the world's."""
     supersample: int = 2
     """Rays along each side of a pixel. Hard edges need more than smooth colours."""
@@ -64,11 +64,11 @@ class Room:
 
     def pose(self, position: tuple[float, float, float], rotation: np.ndarray | None = None) -> np.ndarray:
         """cam2world (4, 4) of a camera at a position in the room, with its rotation in the room's axes."""
-        scale = np.cbrt(np.linalg.det(self.placed[:3, :3]))
+        scale = np.cbrt(np.linalg.det(self.room2world[:3, :3]))
         local = np.eye(4)
         local[:3, :3] = np.eye(3) if rotation is None else rotation
         local[:3, 3] = position
-        pose = self.placed @ local
+        pose = self.room2world @ local
         pose[:3, :3] /= scale
         return pose
 
@@ -78,7 +78,7 @@ class Room:
 
     def _intersect(self, rays: np.ndarray, cam2world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """First intersections of a camera's rays (h, w, 3): points in room axes, and world distances."""
-        to_room = np.linalg.inv(self.placed)
+        to_room = np.linalg.inv(self.room2world)
         start = to_room[:3, :3] @ cam2world[:3, 3] + to_room[:3, 3]
         along = rays @ (to_room[:3, :3] @ cam2world[:3, :3]).T
         with np.errstate(divide="ignore"):
@@ -139,7 +139,7 @@ def _two_poses(room: Room) -> list[np.ndarray]:
 
 @pytest.fixture(scope="session")
 def make_room() -> type[Room]:
-    """The room's class, to build others."""
+    """The class of rooms."""
     return Room
 
 
@@ -157,7 +157,7 @@ def two_poses() -> Callable[[Room], list[np.ndarray]]:
 
 @pytest.fixture(scope="session")
 def observe() -> Callable[..., Observed]:
-    """Panoramas of a room from poses at a height, with `search=True` also the sweep's surfaces."""
+    """Renders a room's panoramas at poses and a height; `search=True` adds the sweep's surfaces."""
     return _observe
 
 
@@ -170,7 +170,7 @@ def empty_room() -> Observed:
 
 @pytest.fixture(scope="session")
 def furnished_room() -> Observed:
-    """The same with a box on the floor, which occludes a part of the room in either view."""
+    """Two views of the room with a box on the floor, which occludes a part of the room in each view, searched."""
     return _observe(_FURNISHED, _two_poses(_FURNISHED), 96, search=True)
 
 
@@ -207,7 +207,7 @@ def _views_of(posed: PosedImages, images: np.ndarray, masks: np.ndarray) -> tupl
 
 @pytest.fixture(scope="session")
 def views_of() -> Callable[..., tuple[list[View], list[np.ndarray]]]:
-    """Views of images and masks at the poses of posed images, and their rays along the room's axes."""
+    """Makes views of images and masks at the poses of posed images, and their rays along the room's axes."""
     return _views_of
 
 
@@ -220,13 +220,13 @@ def _find_boundaries(posed, images, floor: float) -> tuple[list[FloorBoundary] |
 
 @pytest.fixture(scope="session")
 def find_boundaries():
-    """Floor boundaries of images at the poses of posed images, for a floor at an offset (metres), and the rays."""
+    """Finds the floor boundaries of images at the poses of posed images, and the rays, for a floor at an offset."""
     return _find_boundaries
 
 
 @pytest.fixture(scope="session")
 def paint_floor(empty_room) -> Callable[..., np.ndarray]:
-    """Images of the room with a brown floor and white surfaces; points where `wall(points)` holds get another brown."""
+    """Paints the room's floor brown and its walls white, but points where `wall(points)` is true in another brown."""
 
     def paint(wall: Callable[[np.ndarray], np.ndarray] = lambda points: np.zeros(points.shape[:2], bool)) -> np.ndarray:
         images, posed = [], empty_room.posed

@@ -95,7 +95,7 @@ def test_there_are_no_holes_between_the_inputs(small_furnished_room, gaussians, 
 
 @pytest.mark.parametrize("searched", (True, False))
 def test_no_gaussian_contains_a_camera(small_furnished_room, gaussians, searched):
-    """A Gaussian is drawn within 3.33 standard deviations; from inside it would cover the whole panorama."""
+    """A Gaussian reaches 3.33 standard deviations; from inside it would cover the whole panorama."""
     if not searched:
         gaussians = lift(small_furnished_room.posed, small_furnished_room.make_exact_surfaces(), LiftConfig())
     axes = rotations_from_quats(gaussians.quats).double()

@@ -22,22 +22,22 @@ def _degrees_off(found: np.ndarray, true: np.ndarray) -> float:
     return math.degrees(math.acos(min(1.0, float(found @ true))))
 
 
-def _yaw_degrees_off(axes: np.ndarray, placed: np.ndarray) -> float:
+def _yaw_degrees_off(axes: np.ndarray, room2world: np.ndarray) -> float:
     """Smallest turn about the vertical that brings the wall normals onto the room's."""
-    in_room = axes[1] @ placed
+    in_room = axes[1] @ room2world
     turned = math.degrees(math.atan2(in_room[2], in_room[0])) % 90
     return min(turned, 90 - turned)
 
 
 @pytest.mark.parametrize(("yaw", "pitch", "roll"), ((0, 0, 0), (58, 6, -4), (12, -35, 50)))
 def test_down_and_the_wall_normals_are_found_in_a_room_of_bricks(make_room, observe, turn, yaw, pitch, roll):
-    placed = np.eye(4)
-    placed[:3, :3] = turn("z", roll) @ turn("x", pitch) @ turn("y", yaw)
-    room = make_room(paint="tiles", placed=placed, supersample=8)
+    room2world = np.eye(4)
+    room2world[:3, :3] = turn("z", roll) @ turn("x", pitch) @ turn("y", yaw)
+    room = make_room(paint="tiles", room2world=room2world, supersample=8)
     posed = observe(room, [room.pose((-0.4, 0, -0.2)), room.pose((0.4, 0, 0.1), turn("y", 23))], 128).posed
     axes = estimate_axes(posed.images, posed.cam2world[:, :3, :3])
-    assert _degrees_off(axes[0], placed[:3, 1]) < 1.0
-    assert _yaw_degrees_off(axes, placed[:3, :3]) < 1.0
+    assert _degrees_off(axes[0], room2world[:3, 1]) < 1.0
+    assert _yaw_degrees_off(axes, room2world[:3, :3]) < 1.0
 
 
 def test_tilted_cameras_do_not_tilt_the_scene(make_room, observe, turn):

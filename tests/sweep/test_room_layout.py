@@ -23,7 +23,7 @@ def _azimuths(count: int) -> np.ndarray:
     return ((np.arange(count) + 0.5) / count * 2 - 1) * math.pi
 
 
-def _reach(room, pose: np.ndarray, axes: np.ndarray, azimuth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _locate_walls(room, pose: np.ndarray, axes: np.ndarray, azimuth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Signed offsets (2, azimuths) of the walls that a camera faces, and their distances along the floor."""
     low, high = ((np.array(corner) - pose[:3, 3]) @ axes.T for corner in (room.low, room.high))
     along = np.stack((np.cos(azimuth), np.sin(azimuth)))
@@ -55,7 +55,7 @@ def test_pixels_in_the_floors_colour_have_a_high_score(brown_floor, empty_room, 
 @pytest.mark.parametrize("view", (0, 1))
 def test_the_floor_ends_at_the_walls(brown_floor, empty_room, room_axes, view):
     boundary, room, pose = brown_floor[0][view], empty_room.room, empty_room.posed.cam2world[view]
-    true = _reach(room, pose, room_axes, _azimuths(len(boundary.angle)))[1].min(axis=0)
+    true = _locate_walls(room, pose, room_axes, _azimuths(len(boundary.angle)))[1].min(axis=0)
     found = boundary.confidence > 0.5
     error = np.abs(boundary.distance[found] / true[found] - 1)
     assert found.mean() > 0.8
@@ -183,7 +183,7 @@ def square_walls() -> Walls:
 def test_a_rooms_four_walls_are_found(brown_floor, empty_room, room_axes, view):
     boundary, pose = brown_floor[0][view], empty_room.posed.cam2world[view]
     walls = fit_walls(boundary, float(empty_room.room.high[1] - pose[1, 3]), empty_room.posed.far)
-    offsets, reach = _reach(empty_room.room, pose, room_axes, _azimuths(len(walls.axis)))
+    offsets, reach = _locate_walls(empty_room.room, pose, room_axes, _azimuths(len(walls.axis)))
     axis = reach.argmin(axis=0)
     right = (walls.axis == axis + 1) & (walls.confidence > 0.9)
     assert right.mean() > 0.9
