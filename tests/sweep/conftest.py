@@ -161,6 +161,12 @@ def observe() -> Callable[..., Observed]:
     return _observe
 
 
+@pytest.fixture(params=(0, 1), ids=("view 0", "view 1"))
+def view(request: pytest.FixtureRequest) -> int:
+    """Each of two views."""
+    return request.param
+
+
 @pytest.fixture(scope="session")
 def empty_room() -> Observed:
     """Two views of the textured room, 96 pixels high, searched."""

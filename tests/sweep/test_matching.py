@@ -75,7 +75,6 @@ def test_a_camera_turned_in_place_matches_at_every_hypothesis(empty_room, turn):
     assert np.ptp(cost, axis=2).max() < 1e-5  # without a baseline all hypotheses are equal
 
 
-@pytest.mark.parametrize("view", (0, 1))
 def test_the_true_depth_has_the_lowest_cost(empty_room, views, view):
     factors = np.linspace(0.6, 1.4, 9, dtype=np.float32)
     true = (1 / empty_room.depths[view]).astype(np.float32)

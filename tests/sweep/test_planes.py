@@ -96,7 +96,6 @@ def test_the_histogram_sums_to_one(planes):
     assert np.isclose(planes.histogram.sum(), 1, atol=1e-3)
 
 
-@pytest.mark.parametrize("view", (0, 1))
 def test_every_wall_has_support_at_its_distance_and_none_between(planes, empty_room, view):
     pose = empty_room.posed.cam2world[view]
     low, high = (np.array(corner) @ _AXES.T for corner in (empty_room.room.low, empty_room.room.high))
@@ -108,7 +107,6 @@ def test_every_wall_has_support_at_its_distance_and_none_between(planes, empty_r
         assert planes.support(axis, pose, 1 / (0.7 * distances)).max() < 0.1
 
 
-@pytest.mark.parametrize("view", (0, 1))
 def test_vertical_bounds_contain_the_floor_and_the_ceiling(planes, empty_room, view):
     pose, room = empty_room.posed.cam2world[view], empty_room.room
     down, up = planes.vertical_bounds(pose)

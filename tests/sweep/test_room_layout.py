@@ -43,7 +43,6 @@ def _sets(inverse: np.ndarray, rays: np.ndarray) -> list[HypothesisSet]:
     ]
 
 
-@pytest.mark.parametrize("view", (0, 1))
 def test_pixels_in_the_floors_colour_have_a_high_score(brown_floor, empty_room, view):
     boundaries, rays = brown_floor
     pose, depth = empty_room.posed.cam2world[view], empty_room.depths[view]
@@ -52,7 +51,6 @@ def test_pixels_in_the_floors_colour_have_a_high_score(brown_floor, empty_room, 
     assert (boundaries[view].floor_score[~floor] < -0.2).mean() > 0.95
 
 
-@pytest.mark.parametrize("view", (0, 1))
 def test_the_floor_ends_at_the_walls(brown_floor, empty_room, room_axes, view):
     boundary, room, pose = brown_floor[0][view], empty_room.room, empty_room.posed.cam2world[view]
     true = _locate_walls(room, pose, room_axes, _azimuths(len(boundary.angle)))[1].min(axis=0)
@@ -179,7 +177,6 @@ def square_walls() -> Walls:
     return fit_walls(_boundary(_score_at(_square(1.5))), _CAMERA_HEIGHT, _FAR)
 
 
-@pytest.mark.parametrize("view", (0, 1))
 def test_a_rooms_four_walls_are_found(brown_floor, empty_room, room_axes, view):
     boundary, pose = brown_floor[0][view], empty_room.posed.cam2world[view]
     walls = fit_walls(boundary, float(empty_room.room.high[1] - pose[1, 3]), empty_room.posed.far)

@@ -18,7 +18,6 @@ def _error(observed, view: int) -> np.ndarray:
     return np.abs(1 / (observed.surfaces[view].inverse_depth * observed.depths[view]) - 1)
 
 
-@pytest.mark.parametrize("view", (0, 1))
 def test_surfaces_have_the_rooms_depth(empty_room, view):
     error = _error(empty_room, view)
     assert np.median(error) < 0.012
@@ -26,7 +25,6 @@ def test_surfaces_have_the_rooms_depth(empty_room, view):
     assert (error < 0.10).mean() > 0.98
 
 
-@pytest.mark.parametrize("view", (0, 1))
 @pytest.mark.parametrize(
     ("region", "min_accurate"),
     (((slice(None), np.arange(-3, 3)), 0.95), (slice(8), 0.97), (slice(-8, None), 0.97)),
@@ -38,7 +36,6 @@ def test_surfaces_are_accurate_at_the_borders_and_the_poles(empty_room, view, re
     assert (error < 0.10).mean() > min_accurate
 
 
-@pytest.mark.parametrize("view", (0, 1))
 def test_a_box_is_in_front_of_the_walls(furnished_room, empty_room, view):
     truth, behind = furnished_room.depths[view], empty_room.depths[view]
     box = truth < 0.8 * behind
