@@ -7,6 +7,7 @@ mirrored world. Radial depth is moved, never interpolated.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -71,24 +72,12 @@ def roll_views(views: Views, columns: list[int]) -> Views:
     def roll(maps: Tensor) -> Tensor:
         return torch.stack([m.roll(c, dims=-1) for m, c in zip(maps, columns, strict=True)]) if columns else maps
 
-    return replace(
-        views,
-        images=roll(views.images),
-        masks=roll(views.masks),
-        depths=None if views.depths is None else roll(views.depths),
-        cam2world=_rotate(views.cam2world, _rotations_about_y(angles)),
-    )
+    return _replace_maps(views, roll, _rotate(views.cam2world, _rotations_about_y(angles)))
 
 
 def mirror_views(views: Views) -> Views:
     """Mirror the world at its plane x = 0; left and right are exchanged in each image."""
-    return replace(
-        views,
-        images=views.images.flip(-1),
-        masks=views.masks.flip(-1),
-        depths=None if views.depths is None else views.depths.flip(-1),
-        cam2world=_MIRROR @ views.cam2world @ _MIRROR,
-    )
+    return _replace_maps(views, lambda maps: maps.flip(-1), _MIRROR @ views.cam2world @ _MIRROR)
 
 
 def rotate_views(views: Views, rotations: Float[Tensor, "view 3 3"]) -> Views:
@@ -116,6 +105,12 @@ def rotate_views(views: Views, rotations: Float[Tensor, "view 3 3"]) -> Views:
         depths=torch.stack(depths) if depths else None,
         cam2world=_rotate(views.cam2world, rotations),
     )
+
+
+def _replace_maps(views: Views, change: Callable[[Tensor], Tensor], cam2world: Float[Tensor, "view 4 4"]) -> Views:
+    """The views with changed images, masks and depths, and with other poses."""
+    depths = None if views.depths is None else change(views.depths)
+    return replace(views, images=change(views.images), masks=change(views.masks), depths=depths, cam2world=cam2world)
 
 
 def _rotate(cam2world: Float[Tensor, "view 4 4"], rotations: Float[Tensor, "view 3 3"]) -> Float[Tensor, "view 4 4"]:

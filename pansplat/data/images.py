@@ -63,11 +63,8 @@ def read_panorama(
     Raises:
         InputError: no such file, unknown format, damaged or truncated data, not 2:1, NaN.
     """
-    path = Path(path)
-    _check_height(height)
-    decoded = _decode(path)
-    _check_two_to_one(path, decoded.color.shape[1], decoded.color.shape[0])
-    image = torch.from_numpy(_resize_color(decoded.color, height)).permute(2, 0, 1).contiguous()
+    decoded = _decode_panorama(path, height)
+    image = resize_panorama(decoded.color, height)
     if decoded.alpha is None or decoded.alpha.min() == 1:
         return image, torch.ones(height, 2 * height, dtype=torch.bool)
     opaque = _resize_plane(decoded.alpha, height, Image.Resampling.BOX) >= 0.5
@@ -81,23 +78,17 @@ def read_panorama(
 
 def read_thumbnail(path: Path | str, height: int) -> Float[Tensor, "3 height width"]:
     """A panorama at a small size; faster than `read_panorama`, because JPEGs are decoded at reduced size. No alpha."""
-    path = Path(path)
-    decoded = _decode(path, at_least=height)
-    _check_two_to_one(path, decoded.color.shape[1], decoded.color.shape[0])
-    return torch.from_numpy(_resize_color(decoded.color, height)).permute(2, 0, 1).contiguous()
+    return resize_panorama(_decode_panorama(path, height, reduced=True).color, height)
 
 
-def resize_panorama(pixels: NDArray[np.uint8], height: int) -> Float[Tensor, "3 height width"]:
+def resize_panorama(pixels: NDArray[Any], height: int) -> Float[Tensor, "3 height width"]:
     """Pixels (H W 3) of a panorama, resampled to (height, 2 height) as in `read_panorama`."""
     return torch.from_numpy(_resize_color(pixels, height)).permute(2, 0, 1).contiguous()
 
 
 def read_mask(path: Path | str, height: int) -> Bool[Tensor, "height width"]:
     """A mask image at (height, 2 height): True where it is white (the scene)."""
-    path = Path(path)
-    _check_height(height)
-    color = _decode(path).color
-    _check_two_to_one(path, color.shape[1], color.shape[0])
+    color = _decode_panorama(path, height).color
     scale = 255.0 if color.dtype == np.uint8 else 1.0
     grey = color.astype(np.float32).mean(axis=2) / np.float32(scale)
     return torch.from_numpy(_resize_plane(grey, height, Image.Resampling.BOX) >= 0.5)
@@ -236,6 +227,15 @@ def _read_bytes(path: Path) -> bytes:
     if not data:
         raise InputError(f"{path}: needed an image, got a file of 0 bytes; copy or export it again.")
     return data
+
+
+def _decode_panorama(path: Path | str, height: int, *, reduced: bool = False) -> _DecodedImage:
+    """Pixels of a 2:1 image file. `reduced`: whether a JPEG may be decoded at a smaller size, of at least `height`."""
+    path = Path(path)
+    _check_height(height)
+    decoded = _decode(path, height if reduced else None)
+    _check_two_to_one(path, decoded.color.shape[1], decoded.color.shape[0])
+    return decoded
 
 
 def _decode(path: Path, at_least: int | None = None) -> _DecodedImage:

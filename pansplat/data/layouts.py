@@ -40,8 +40,8 @@ from pansplat.data.poses import (
 )
 from pansplat.errors import InputError
 
-POSES, PAIRS = "poses.json", "pairs.json"
-LOC360 = "camera_pose.json"
+_POSES, _PAIRS = "poses.json", "pairs.json"
+_CAMERA_POSES = "camera_pose.json"  # of 360Loc
 
 _MAX_DEPTH = 4  # levels of nested folders that are searched
 _MATRIX_KEYS = ("cam2world", "world2cam", "pose")
@@ -89,7 +89,7 @@ def load_pairs(
 
 def _find_collections(folder: Path, convention: str | None, depth: int) -> list[tuple[Path, Collection]]:
     """The collections in a folder itself, or else those in its subfolders."""
-    if is_pose_file_folder(folder):
+    if (folder / _POSES).is_file():
         return [(folder, read_pose_file_folder(folder, convention))]
     if is_loc360_sequence(folder):
         return [(folder, read_loc360_sequence(folder, convention))]
@@ -137,14 +137,9 @@ def _choose_convention(convention: str | None, default: str) -> str:
 # poses.json with an optional pairs.json: the package's own layout.
 
 
-def is_pose_file_folder(folder: Path) -> bool:
-    """Whether the folder has a poses.json."""
-    return (folder / POSES).is_file()
-
-
 def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collection:
     """The panoramas of poses.json, and the groups of pairs.json. File names in them are relative to the folder."""
-    source = folder / POSES
+    source = folder / _POSES
     content = read_json(source)
     entries = content.get("poses") if isinstance(content, dict) else None
     if not isinstance(entries, dict):
@@ -153,10 +148,8 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
             "see docs/input.md."
         )
     is_stated = convention is None
-    if convention is None:
-        convention = parse_convention(content.get("convention"), source)
-    else:
-        convention = parse_convention(convention, "`convention`")
+    text, origin = (content.get("convention"), source) if is_stated else (convention, "`convention`")
+    convention = parse_convention(text, origin)
     panoramas = tuple(_read_pose_entry(folder, name, entry, convention, is_stated) for name, entry in entries.items())
     if len(panoramas) < 2:
         with_pose = {panorama.image.name for panorama in panoramas}
@@ -166,7 +159,7 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
             f"{source}: needed poses of two or more panoramas, got {len(panoramas)}{without}; add what is missing."
         )
     near, far = number_field(content, "near", source), number_field(content, "far", source)
-    groups = _read_groups(folder / PAIRS, list(entries)) if (folder / PAIRS).is_file() else None
+    groups = _read_groups(folder / _PAIRS, list(entries)) if (folder / _PAIRS).is_file() else None
     is_single = (len(panoramas) - 1 if groups is None else len(groups)) == 1
     return Collection(
         source,
@@ -180,7 +173,7 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
 
 def _read_pose_entry(folder: Path, name: str, entry: Any, convention: str, is_stated: bool) -> Panorama:
     """One entry of poses.json. `is_stated`: whether `convention` comes from the file."""
-    source = f"{folder / POSES}, {name!r}"
+    source = f"{folder / _POSES}, {name!r}"
     image = folder / name
     if not image.is_file():
         raise InputError(f"{source}: needed the image {image}, got no such file; correct the name or add the file.")
@@ -201,7 +194,6 @@ def _read_pose_entry(folder: Path, name: str, entry: Any, convention: str, is_st
 
 
 def _optional_file(folder: Path, entry: dict[str, Any], key: str, source: str) -> Path | None:
-    """The file that an entry gives for `key`."""
     if entry.get(key) is None:
         return None
     path = folder / str(entry[key])
@@ -252,7 +244,7 @@ def _find_name(name: str, names: list[str], where: str) -> int:
         return names.index(name)
     close = difflib.get_close_matches(name, names, n=1)
     suggestion = f" (did you mean {close[0]!r}?)" if close else ""
-    raise InputError(f"{where}: needed images that have a pose in {POSES}, got {name!r}{suggestion}; add its pose.")
+    raise InputError(f"{where}: needed images that have a pose in {_POSES}, got {name!r}{suggestion}; add its pose.")
 
 
 # PanoGRF's rendered Matterport3D scenes (docs/official.md, section 2.1): one folder per view with rgb.png, depth.png
@@ -343,7 +335,7 @@ def read_triplet(source: Path, convention: str | None = None) -> Collection:
 
 def is_loc360_sequence(folder: Path) -> bool:
     """Whether the folder has a camera_pose.json."""
-    return (folder / LOC360).is_file()
+    return (folder / _CAMERA_POSES).is_file()
 
 
 def read_loc360_sequence(folder: Path, convention: str | None = None) -> Collection:
@@ -351,7 +343,7 @@ def read_loc360_sequence(folder: Path, convention: str | None = None) -> Collect
 
     The matrices are cam2world with OpenCV axes, as the official code reads them.
     """
-    source = folder / LOC360
+    source = folder / _CAMERA_POSES
     convention = _choose_convention(convention, "cam2world opencv")
     content = read_json(source)
     if not isinstance(content, dict):

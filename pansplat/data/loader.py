@@ -49,7 +49,7 @@ class Loader:
         rank, world_size: index of this process, and number of processes in distributed training.
 
     Attributes:
-        skipped: number of times each unreadable sample was skipped, by message. The first time, a warning is issued.
+        skipped: by message, the number of times that an unreadable sample was skipped. The first time it warns.
 
     Raises:
         InputError: an empty source, or an invalid batch size, number of workers or rank.
@@ -147,7 +147,7 @@ class _Reader(Dataset[tuple[Sample | None, list[Skipped]]]):
         return None, skipped
 
     def _read(self, epoch: int, index: int, place: int) -> Sample:
-        """Seeded by the place too, so that a sample that also replaces an unreadable one differs."""
+        """The sample at an index. The seed includes `place`, so that two reads of a sample in one epoch differ."""
         seeds = np.random.SeedSequence((self.seed, epoch, index, place)).spawn(2)
         sample = self.source.sample(index, self.height, int(seeds[0].generate_state(1)[0]))
         if self.augmentation is None:

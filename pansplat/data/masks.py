@@ -88,7 +88,7 @@ def _cached_mask(stamped: tuple[tuple[Path, int, int], ...]) -> NDArray[np.bool_
     for path, *_ in stamped:
         try:
             images.append(read_thumbnail(path, _HEIGHT))
-        except InputError:  # is raised again when the file itself is loaded
+        except InputError:  # raised again when the panorama is loaded
             continue
     if len(images) < 2:
         return np.ones((_HEIGHT, 2 * _HEIGHT), dtype=bool)
@@ -174,31 +174,23 @@ def _closed_outline(edges: Array) -> NDArray[np.intp]:
     return np.roll(outline[half : half + sectors], half)
 
 
-def _disc_grid() -> tuple[Array, Array]:
-    """x, y of the samples of a flat map around the pole, degrees."""
+def _disc_coordinates() -> tuple[Array, Array]:
+    """Radius and azimuth of the samples of a flat map around the pole, degrees."""
     axis = ((np.arange(2 * _RINGS) + 0.5) * _STEP - _REACH).astype(np.float32)
     x, y = np.meshgrid(axis, axis)
-    return x, y
-
-
-def _disc_radius() -> Array:
-    return np.hypot(*_disc_grid())
-
-
-def _disc_azimuth() -> Array:
-    x, y = _disc_grid()
-    return np.degrees(np.arctan2(y, x)) % 360
+    return np.hypot(x, y), np.degrees(np.arctan2(y, x)) % 360
 
 
 def _disc(grey: Array) -> Array:
     """Flat (azimuthal equidistant) map of a panorama around its upper pole."""
-    return _sample(grey, _disc_radius(), _disc_azimuth())
+    return _sample(grey, *_disc_coordinates())
 
 
 def _inside(outline: NDArray[np.intp]) -> NDArray[Any]:
     """A mask of the disc samples within the outline."""
-    sector = (_disc_azimuth() / 360 * _SECTORS).astype(int) % _SECTORS
-    return (_disc_radius() <= (outline[sector] + 0.5) * _STEP).astype(np.uint8)
+    radius, azimuth = _disc_coordinates()
+    sector = (azimuth / 360 * _SECTORS).astype(int) % _SECTORS
+    return (radius <= (outline[sector] + 0.5) * _STEP).astype(np.uint8)
 
 
 def _ellipse(samples: int) -> NDArray[Any]:
@@ -216,7 +208,7 @@ def _is_static(discs: Array, inside: NDArray[Any]) -> bool:
 
     False where little moves at all, such as a high ceiling with a short baseline.
     """
-    near = _disc_radius() < _REACH
+    near = _disc_coordinates()[0] < _REACH
     outline = (cv2.dilate(inside, _ellipse(_BAND)) > cv2.erode(inside, _ellipse(_BAND))) & near
     around = (cv2.dilate(inside, _ellipse(_SURROUNDINGS[1])) > cv2.dilate(inside, _ellipse(_SURROUNDINGS[0]))) & near
     views = range(len(discs))
@@ -253,7 +245,7 @@ def _add_legs(discs: Array, region: NDArray[Any]) -> NDArray[Any]:
         parts |= (common > _LEG_CONTRAST).astype(np.uint8)
     joined = cv2.morphologyEx(region | parts, cv2.MORPH_CLOSE, _ellipse(_LEG_GAP))
     _, labels = cv2.connectedComponents(joined, connectivity=8)
-    found = (labels == labels[_RINGS, _RINGS]) & (labels > 0) & (_disc_radius() < _REACH)
+    found = (labels == labels[_RINGS, _RINGS]) & (labels > 0) & (_disc_coordinates()[0] < _REACH)
     return found.astype(np.uint8) | region
 
 

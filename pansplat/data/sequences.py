@@ -256,7 +256,6 @@ def _list_videos(folder: Path) -> list[Path]:
 
 
 def _read_scale(folder: Path) -> float:
-    """Metres per unit of the trajectory."""
     source = folder / "scale.txt"
     if source.is_file():
         return read_number(source)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pansplat.atomic import replacing
 from pansplat.errors import InputError
 
-_MAX_SKIP = 48  # frames; nearer frames are reached by decoding on, farther ones by seeking
+_MAX_SKIP = 48  # frames between two reads; a larger gap is skipped by seeking
 _ENCODERS = ("libx264", "libopenh264", "mpeg4")  # H.264 first: every browser and player supports it
 
 
@@ -68,7 +68,7 @@ class VideoFile:
         return found
 
     def _decode(self, container: Any, frames: Sequence[int], seek_to: int) -> dict[int, NDArray[np.uint8]]:
-        """Those of `frames` that are decoded from the key frame at or before the time `seek_to` on."""
+        """Pixels of the frames that are found from the key frame at or before the time `seek_to` on."""
         from av.error import FFmpegError
 
         numbers = {self.stamps[frame]: frame for frame in frames}

@@ -41,12 +41,12 @@ def save_checkpoint(folder: Path, step: int, state: Mapping[str, Any], *, keep: 
                 os.fsync(file.fileno())
         except RuntimeError as error:  # raised by torch when the disk is full
             raise OSError(0, str(error).splitlines()[0]) from error
-    for old in checkpoints(folder)[:-keep]:
+    for old in list_checkpoints(folder)[:-keep]:
         old.unlink(missing_ok=True)
     return path
 
 
-def checkpoints(folder: Path) -> list[Path]:
+def list_checkpoints(folder: Path) -> list[Path]:
     """Paths of the checkpoints in a folder, oldest first."""
     if not folder.is_dir():
         return []
@@ -65,7 +65,7 @@ def load_latest(folder: Path) -> tuple[Path, dict[str, Any]] | None:
     if folder.is_dir():
         for partial in folder.glob(".step_*.pt"):
             partial.unlink(missing_ok=True)
-    found = checkpoints(folder)
+    found = list_checkpoints(folder)
     failures = []
     for path in reversed(found):
         try:
@@ -102,7 +102,7 @@ def is_training_state(content: Mapping[str, Any]) -> bool:
     return content.get("kind") == _KIND
 
 
-def weights_of(content: Mapping[str, Any], path: Path) -> WeightsFile:
+def extract_weights(content: Mapping[str, Any], path: Path) -> WeightsFile:
     """The weights of a training checkpoint: their moving average, if there is one.
 
     Raises:

@@ -230,18 +230,16 @@ _WITHOUT_DEPTH = replace(CODE, depth=0.0)
 
 
 def _matterport_preset(
-    name: str,
     height: int,
     batch: int,
     epochs: int,
     loss: LossWeights,
     network: NetworkConfig,
     memory: MemoryConfig,
-    validations: float = 1.0,
+    validations: int = 1,
 ) -> TrainConfig:
     steps_per_epoch = _TRIPLETS // batch
     return TrainConfig(
-        out=Path("runs") / name,
         heights=(height,),
         perceptual="lpips-vgg",
         loss=loss,
@@ -254,11 +252,10 @@ def _matterport_preset(
 
 
 def _loc360_preset(
-    name: str, height: int, batch: int, epochs: int, draws: int, network: NetworkConfig, memory: MemoryConfig
+    height: int, batch: int, epochs: int, draws: int, network: NetworkConfig, memory: MemoryConfig
 ) -> TrainConfig:
     steps_per_epoch = _SEQUENCES * draws // batch
     return TrainConfig(
-        out=Path("runs") / name,
         heights=(height,),
         perceptual="lpips-vgg",
         loss=_WITHOUT_DEPTH,
@@ -270,14 +267,13 @@ def _loc360_preset(
 
 
 def _small_preset(
-    name: str, shape: str, heights: tuple[int, ...], steps: int, batch: int, rate: float, every: int
+    shape: NetworkShape, heights: tuple[int, ...], steps: int, batch: int, rate: float, every: int
 ) -> TrainConfig:
     return TrainConfig(
-        out=Path("runs") / name,
         heights=heights,
         perceptual="structure",
         loss=LossWeights(perceptual=0.1, depth=0.1),
-        network=NetworkConfig(shape="tiny" if shape == "tiny" else "small"),
+        network=NetworkConfig(shape=shape),
         optimizer=OptimizerConfig(steps=steps, batch_size=batch, rate=rate, clip=1.0, ema=0.99),
         validation=ValidationConfig(every=every, samples=4),
         checkpoint=CheckpointConfig(every=every),
@@ -286,53 +282,56 @@ def _small_preset(
 
 _MVSPLAT = NetworkConfig(shape="mvsplat")
 
-PRESETS: dict[str, tuple[str, TrainConfig]] = {
+_PRESETS: dict[str, tuple[str, TrainConfig]] = {
     "tiny": (
         "no files, minutes on a CPU: a very small network, generated rooms, 64x128",
-        _small_preset("tiny", "tiny", (64,), 300, 2, 2e-3, 100),
+        _small_preset("tiny", (64,), 300, 2, 2e-3, 100),
     ),
     "small": (
         "no files, a day on a CPU: a small network, generated rooms, 128x256 then 256x512",
-        _small_preset("small", "small", (128, 256), 20_000, 2, 1e-3, 1000),
+        _small_preset("small", (128, 256), 20_000, 2, 1e-3, 1000),
     ),
     "pansplat-256": (
         "the paper's first stage, Matterport3D at 256x512; --network.init must hold the monocular network's weights",
-        _matterport_preset("pansplat-256", 256, 6, 10, CODE, NetworkConfig(), _PLAIN),
+        _matterport_preset(256, 6, 10, CODE, NetworkConfig(), _PLAIN),
     ),
     "pansplat-512": (
         "the paper's second stage, 512x1024, from the first",
-        _matterport_preset("pansplat-512", 512, 2, 5, CODE, NetworkConfig(), _PLAIN),
+        _matterport_preset(512, 2, 5, CODE, NetworkConfig(), _PLAIN),
     ),
     "pansplat-1024": (
         "heads only, 1024x2048, two-step, 2x2 tiles, from pansplat-512",
-        _matterport_preset("pansplat-1024", 1024, 3, 3, _WITHOUT_DEPTH, NetworkConfig(frozen=_FROZEN), _TILED_2X2, 2),
+        _matterport_preset(1024, 3, 3, _WITHOUT_DEPTH, NetworkConfig(frozen=_FROZEN), _TILED_2X2, 2),
     ),
     "pansplat-2048": (
         "heads only, 2048x4096, two-step, 4x4 tiles, from pansplat-512",
-        _matterport_preset("pansplat-2048", 2048, 1, 3, _WITHOUT_DEPTH, NetworkConfig(frozen=_FROZEN), _TILED_4X4, 2),
+        _matterport_preset(2048, 1, 3, _WITHOUT_DEPTH, NetworkConfig(frozen=_FROZEN), _TILED_4X4, 2),
     ),
     "pansplat-512-360loc": (
         "360Loc, 512x1024, with auxiliary heads, from pansplat-512",
-        _loc360_preset("pansplat-512-360loc", 512, 2, 5, 1000, NetworkConfig(auxiliary=True), _PLAIN),
+        _loc360_preset(512, 2, 5, 1000, NetworkConfig(auxiliary=True), _PLAIN),
     ),
     "pansplat-1024-360loc": (
         "heads only, 1024x2048, from pansplat-512-360loc",
-        _loc360_preset("pansplat-1024-360loc", 1024, 3, 200, 10, NetworkConfig(frozen=_FROZEN), _TILED_2X2),
+        _loc360_preset(1024, 3, 200, 10, NetworkConfig(frozen=_FROZEN), _TILED_2X2),
     ),
     "pansplat-2048-360loc": (
         "heads only, 2048x4096, from pansplat-1024-360loc",
-        _loc360_preset("pansplat-2048-360loc", 2048, 1, 100, 10, NetworkConfig(frozen=_FROZEN), _TILED_4X4),
+        _loc360_preset(2048, 1, 100, 10, NetworkConfig(frozen=_FROZEN), _TILED_4X4),
     ),
     "mvsplat-256": (
         "the baseline on Matterport3D, 256x512",
-        _matterport_preset("mvsplat-256", 256, 6, 10, _WITHOUT_DEPTH, _MVSPLAT, _PLAIN),
+        _matterport_preset(256, 6, 10, _WITHOUT_DEPTH, _MVSPLAT, _PLAIN),
     ),
     "mvsplat-512": (
         "the baseline on Matterport3D, 512x1024",
-        _matterport_preset("mvsplat-512", 512, 1, 10, _WITHOUT_DEPTH, _MVSPLAT, _PLAIN),
+        _matterport_preset(512, 1, 10, _WITHOUT_DEPTH, _MVSPLAT, _PLAIN),
     ),
     "mvsplat-512-360loc": (
         "the baseline on 360Loc, 512x1024, from mvsplat-512",
-        _loc360_preset("mvsplat-512-360loc", 512, 1, 5, 1000, _MVSPLAT, _PLAIN),
+        _loc360_preset(512, 1, 5, 1000, _MVSPLAT, _PLAIN),
     ),
 }
+
+PRESETS = {name: (text, replace(config, out=Path("runs") / name)) for name, (text, config) in _PRESETS.items()}
+"""Description and settings of each preset."""

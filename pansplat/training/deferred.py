@@ -70,7 +70,7 @@ def whole_loss(
     """
     matched = _match(problem, network, matching_is_trainable)
     scenes = merge_tiles(list(network.lift_gaussians(matched, tiles=tiles)), network.compat)
-    loss, terms = problem.image_loss(_render(scenes, problem, renderer))
+    loss, terms = problem.image_loss(renderer.render_batch(scenes, problem.targets, problem.cam2world))
     match_loss, match_terms = problem.match_loss(matched)
     return loss + _zero_if_none(match_loss), terms | match_terms
 
@@ -98,7 +98,9 @@ def backpropagate(
     with torch.no_grad():
         tiled = [Cut(part, everything=True).leaves for part in network.lift_gaussians(maps.leaves, tiles=tiles)]
     if method == "one-step":
-        loss, terms = problem.image_loss(_render(merge_tiles(tiled, network.compat), problem, renderer))
+        loss, terms = problem.image_loss(
+            renderer.render_batch(merge_tiles(tiled, network.compat), problem.targets, problem.cam2world)
+        )
         (weight * loss).backward()
     else:
         ordered = network.compat == "fixed"
@@ -119,13 +121,6 @@ def backpropagate(
 def _match(problem: Problem, network: Network, matching_is_trainable: bool) -> Any:
     with torch.set_grad_enabled(matching_is_trainable):
         return network.match_views(problem.images, problem.cam2world, problem.near, problem.far)
-
-
-def _render(scenes: list[Gaussians], problem: Problem, renderer: TargetRenderer) -> Float[Tensor, "batch target 3 h w"]:
-    items = zip(scenes, problem.targets, problem.cam2world, strict=True)
-    return torch.stack(
-        [torch.stack([renderer.render(scene, pose, context) for pose in poses]) for scene, poses, context in items]
-    )
 
 
 @dataclass(frozen=True)
@@ -149,8 +144,10 @@ def _backpropagate_parts(
     """Add the image loss's gradient to the Gaussians' gradients, with the graph of one part at a time."""
     images = []
     for scene, poses, context in zip(scenes, problem.targets, problem.cam2world, strict=True):
-        parts = renderer.parts(len(context))
-        images += [_PartwiseImage(scene, pose, context, parts, scene.visible(renderer, pose, parts)) for pose in poses]
+        parts = renderer.list_parts(len(context))
+        images += [
+            _PartwiseImage(scene, pose, context, parts, scene.find_visible(renderer, pose, parts)) for pose in poses
+        ]
     rendered = []
     with torch.no_grad():
         for image in images:
@@ -164,9 +161,9 @@ def _backpropagate_parts(
     for parts, image in zip(rendered, images, strict=True):
         for leaf, part, rows in zip(parts, image.parts, image.rows, strict=True):
             gaussians = Cut(image.scene.select(rows), everything=True).leaves
-            again = renderer.render_part(gaussians, image.pose, part)
-            if again.requires_grad and leaf.grad is not None:
-                again.backward(leaf.grad)
+            recomputed = renderer.render_part(gaussians, image.pose, part)
+            if recomputed.requires_grad and leaf.grad is not None:
+                recomputed.backward(leaf.grad)
                 image.scene.add_gradients(gaussians, rows)
             leaf.grad = None
     return loss, terms
@@ -201,11 +198,11 @@ class TiledGaussians:
         self._tiles = [tile.gaussians[item] for tile in tiled]
         self._places = [tile.index for tile in tiled] if ordered and len(tiled) > 1 else None
 
-    def visible(
+    def find_visible(
         self, renderer: TargetRenderer, pose: Float[Tensor, "4 4"], parts: list[ImagePart]
     ) -> list[list[Tensor]]:
         """For each part, the indices of its visible Gaussians in each tile."""
-        by_tile = [[mask.nonzero()[:, 0] for mask in renderer.visible(tile, pose, parts)] for tile in self._tiles]
+        by_tile = [[mask.nonzero()[:, 0] for mask in renderer.find_visible(tile, pose, parts)] for tile in self._tiles]
         return [list(rows) for rows in zip(*by_tile, strict=True)]
 
     @torch.no_grad()

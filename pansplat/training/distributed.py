@@ -22,11 +22,7 @@ _TIMEOUT = timedelta(hours=2)  # the other processes wait while the first one va
 
 
 def _read_environment(name: str, default: int | None) -> int:
-    """A number that torchrun puts into the environment.
-
-    Raises:
-        InputError: not a number, or missing without a default.
-    """
+    """A number that torchrun puts into the environment; without a default it must exist."""
     text = os.environ.get(name, "" if default is None else str(default))
     try:
         return int(text)
@@ -209,7 +205,7 @@ class _ReachAllParameters(nn.Module):
     """Makes the loss of a module depend on every trainable parameter, as DistributedDataParallel requires.
 
     DistributedDataParallel averages the gradient of a parameter when `backward()` reaches it, and waits for all
-    parameters. Gradients that the forward pass has computed are averaged too, since it reads them only then.
+    parameters. It reads gradients only then, so it averages gradients that the forward pass has computed too.
     """
 
     def __init__(self, step: nn.Module) -> None:

@@ -43,7 +43,6 @@ class LossWeights:
 
 PAPER = LossWeights()
 CODE = LossWeights(perceptual=0.05, depth=0.1, depth_form="inverse_depth")
-LOSS_WEIGHTS = {"paper": PAPER, "code": CODE}
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from pansplat.model.weights import (
     require_shapes,
     save_weights,
 )
-from pansplat.training.checkpoint import is_training_state, weights_of
+from pansplat.training.checkpoint import extract_weights, is_training_state
 from pansplat.training.config import NetworkConfig, NetworkShape
 
 
@@ -90,7 +90,7 @@ def read_weights(path: Path) -> WeightsFile:
     if path.suffix.lower() not in CHECKPOINT_SUFFIXES:
         return load_weights(path)
     content = read_checkpoint(path)
-    return weights_of(content, path) if is_training_state(content) else convert_checkpoint(content, path)
+    return extract_weights(content, path) if is_training_state(content) else convert_checkpoint(content, path)
 
 
 def write_weights(path: Path, network: PanSplat | MVSplat, state: dict[str, torch.Tensor] | None = None) -> None:

@@ -68,15 +68,15 @@ class TargetRenderer:
         """Side of a cube face, pixels."""
         return official_face_size(self.height)
 
-    def parts(self, views: int) -> list[ImagePart]:
+    def list_parts(self, views: int) -> list[ImagePart]:
         """All parts of a panorama: the faces or strips of each view, or of all views jointly."""
         return [ImagePart(view, index) for view in self._view_choices(views) for index in range(self._parts_per_view)]
 
-    def visible(
+    def find_visible(
         self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], parts: Sequence[ImagePart]
     ) -> list[Bool[Tensor, "n"]]:
         """A mask for each part: the Gaussians that `render_part` needs."""
-        masks = visible_gaussians(gaussians, cam2world, self._regions(gaussians.means.device), self._options)
+        masks = find_visible_gaussians(gaussians, cam2world, self._regions(gaussians.means.device), self._options)
         return [
             masks[part.index] if part.view is None else masks[part.index] & (gaussians.views == part.view)
             for part in parts
@@ -96,13 +96,25 @@ class TargetRenderer:
         ]
         return self._blend(panoramas, cam2world, context)
 
+    def render_batch(
+        self,
+        scenes: Sequence[Gaussians],
+        targets: Float[Tensor, "batch target 4 4"],
+        contexts: Float[Tensor, "batch view 4 4"],
+    ) -> Float[Tensor, "batch target 3 height width"]:
+        """The panoramas of all targets, see `render`."""
+        items = zip(scenes, targets, contexts, strict=True)
+        return torch.stack(
+            [torch.stack([self.render(scene, pose, context) for pose in poses]) for scene, poses, context in items]
+        )
+
     def render_part(
         self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], part: ImagePart
     ) -> Float[Tensor, "4 rows columns"]:
         """Colour and opacity of one part.
 
         Args:
-            gaussians: the Gaussians that `visible` selects for the part, in their original order.
+            gaussians: the Gaussians that `find_visible` selects for the part, in their original order.
         """
         if self.style == "panorama":
             first, end = self._strip_rows(part.index)
@@ -120,7 +132,7 @@ class TargetRenderer:
         cam2world: Float[Tensor, "4 4"],
         context: Float[Tensor, "view 4 4"],
     ) -> Float[Tensor, "3 height width"]:
-        """The panorama composed of all rendered parts, in the order of `parts`."""
+        """The panorama composed of all rendered parts, in the order of `list_parts`."""
         panoramas = []
         for start in range(0, len(parts), self._parts_per_view):
             images = list(parts[start : start + self._parts_per_view])
@@ -147,7 +159,6 @@ class TargetRenderer:
         return first, end
 
     def _regions(self, device: torch.device) -> list[Region]:
-        """The region of each face or strip."""
         layout = "equirect" if self.style == "panorama" else "cubemap"
         planes = image_planes(layout, self.size, vertical_fov_degrees=90.0, face_size=self.face_size, device=device)
         if self.style == "panorama":
@@ -188,7 +199,7 @@ class Region:
 
 
 @torch.no_grad()
-def visible_gaussians(
+def find_visible_gaussians(
     gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], regions: Sequence[Region], options: RasterOptions
 ) -> list[Bool[Tensor, "n"]]:
     """A mask for each region: the Gaussians that may reach one of its pixels. The others do not affect its colours.

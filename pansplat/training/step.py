@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from pansplat.data.views import Batch
@@ -117,19 +116,11 @@ class TrainingStep(nn.Module):
         )
 
     def _auxiliary_loss(self, batch: Batch, matched: Any, renderer: TargetRenderer) -> Tensor | None:
-        """Image loss of the images rendered from each level of the cost volume alone."""
         if self.auxiliary is None:
             return None
-        levels = self.auxiliary(matched)
         images = [
-            torch.stack(
-                [
-                    renderer.render(scene, pose, batch.cam2world[item])
-                    for item, scene in enumerate(scenes)
-                    for pose in batch.target_cam2world[item]
-                ]
-            )
-            for scenes in levels
+            renderer.render_batch(scenes, batch.target_cam2world, batch.cam2world).flatten(0, 1)
+            for scenes in self.auxiliary(matched)
         ]
         return auxiliary_loss(
             images,

@@ -138,8 +138,8 @@ class Trainer:
                     stopped = self.processes.any(self._stop)
                     if self._is_due(self.config.validation.every) and logs is not None and not stopped:
                         self._validate(logs, progress)
-                    is_late = time.monotonic() - saved_at > 60 * self.config.checkpoint.minutes
-                    if self._is_due(self.config.checkpoint.every) or is_late or stopped or self.step == total:
+                    is_overdue = time.monotonic() - saved_at > 60 * self.config.checkpoint.minutes
+                    if self._is_due(self.config.checkpoint.every) or is_overdue or stopped or self.step == total:
                         self.save()
                         saved_at = time.monotonic()
                     if stopped and self.step < total:

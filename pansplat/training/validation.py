@@ -80,11 +80,7 @@ def _measure(
 
 
 def _readable_samples(source: SampleSource, count: int, height: int) -> Iterator[Sample]:
-    """Those of the first samples that are readable.
-
-    Raises:
-        InputError: no sample is readable.
-    """
+    """The readable ones of the first `count` samples; an InputError if there is none."""
     failures, readable = [], 0
     for index in range(min(count, len(source))):
         try:

@@ -12,9 +12,10 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.warp import relative_pose, warp_panorama
 
 HEIGHT = 48
+PLACES = ((0, 0, 0), (0.6, 0.1, 0.2))
 
 
-def _room(centres: list[tuple[float, float, float]], yaw: float = 0.7) -> Views:
+def _room(*centres: tuple[float, float, float], yaw: float = 0.7) -> Views:
     """Views in a box with a smooth colour on its walls, and exact depth."""
     cosine, sine = math.cos(yaw), math.sin(yaw)
     pose = torch.eye(4, dtype=torch.float64).repeat(len(centres), 1, 1)
@@ -34,11 +35,11 @@ def _room(centres: list[tuple[float, float, float]], yaw: float = 0.7) -> Views:
 
 
 def _sample() -> Sample:
-    return Sample("room", _room([(0, 0, 0), (0.6, 0.1, 0.2)]), _room([(0.3, 0, 0.1)]))
+    return Sample("room", _room(*PLACES), _room((0.3, 0, 0.1)))
 
 
 def _warping_error(a: Views, b: Views) -> float:
-    """Mean difference of the first view of `a` from the last of `b`, warped by the first's depth."""
+    """Mean difference of the first image of `a` and the last of `b`, warped by the depth of the first."""
     assert a.depths is not None
     pose = relative_pose(a.cam2world[:1], b.cam2world[-1:]).float()
     warped = warp_panorama(b.images[-1:], 1 / a.depths[:1, None], pose)[0, :, 0]
@@ -46,7 +47,7 @@ def _warping_error(a: Views, b: Views) -> float:
 
 
 def test_a_wrong_pose_fails_the_consistency_check() -> None:
-    room = _room([(0, 0, 0), (0.6, 0.1, 0.2)])
+    room = _room(*PLACES)
     assert _warping_error(room, room) < 3e-3
     rolled = roll_views(room, [5, 5])
     wrong = Views(rolled.images, room.cam2world, room.masks, 0.3, 10.0, room.names, rolled.depths)
@@ -75,7 +76,7 @@ def test_augmented_views_warp_into_each_other(settings: Augmentation) -> None:
 
 
 def test_rolling_is_exact_and_invertible() -> None:
-    room = _room([(0, 0, 0), (0.6, 0.1, 0.2)])
+    room = _room(*PLACES)
     rolled = roll_views(room, [7, 90])
     assert torch.equal(rolled.images[0], room.images[0].roll(7, -1))
     back = roll_views(rolled, [-7, -90])
@@ -83,14 +84,14 @@ def test_rolling_is_exact_and_invertible() -> None:
 
 
 def test_mirroring_twice_is_the_identity() -> None:
-    room = _room([(0, 0, 0), (0.6, 0.1, 0.2)])
+    room = _room(*PLACES)
     twice = mirror_views(mirror_views(room))
     assert torch.equal(twice.images, room.images) and torch.equal(twice.cam2world, room.cam2world)
     assert not torch.equal(mirror_views(room).images, room.images)
 
 
 def test_rotating_by_whole_pixels_equals_rolling() -> None:
-    room = _room([(0, 0, 0)])
+    room = _room((0, 0, 0))
     rolled = roll_views(room, [4])
     turned = rotate_views(room, room.cam2world[:, :3, :3].mT @ rolled.cam2world[:, :3, :3])
     assert torch.allclose(turned.images, rolled.images, atol=1e-5)
@@ -99,7 +100,7 @@ def test_rotating_by_whole_pixels_equals_rolling() -> None:
 
 
 def test_colour_changes_are_shared_and_exposure_differs_by_view() -> None:
-    room = _room([(0, 0, 0), (0, 0, 0)])
+    room = _room((0, 0, 0), (0, 0, 0))
     sample = Sample("room", room, room)
     alike = augment(sample, Augmentation(colour=0.2), np.random.default_rng(0))
     assert torch.equal(alike.context.images[0], alike.context.images[1])

@@ -24,7 +24,7 @@ METHODS = (("plain", 1), ("plain", 2), ("two-step", 1), ("two-step", 2))
 
 
 def split_batches(folder: Path, processes: ProcessGroup) -> None:
-    """Gradients of a network for batches of two samples, of which each process has its part."""
+    """Gradients of a network for batches of two samples, which the processes share."""
     torch.manual_seed(3)
     network = PanSplat(micro_config(), "fixed").double()
     convert_sync_batch_norm(network, processes)
@@ -56,7 +56,7 @@ class Chain(nn.Module):
         self.unused = nn.Linear(3, 3)
 
     def forward(self, inputs: Tensor, early: bool) -> tuple[Tensor, None]:
-        """The loss; with `early` without a graph, and its gradients are computed in two parts in the forward pass."""
+        """The loss. With `early` it has no graph, and the forward pass computes its gradients in two parts."""
         loss = self.chain(inputs).square().mean()
         if early:
             for part in self.chain(inputs).square().mean(1):

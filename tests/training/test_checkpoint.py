@@ -16,7 +16,7 @@ import torch
 
 from pansplat.errors import InputError
 from pansplat.model.weights import UnsafeCheckpointError
-from pansplat.training.checkpoint import checkpoints, load_checkpoint, load_latest, save_checkpoint
+from pansplat.training.checkpoint import list_checkpoints, load_checkpoint, load_latest, save_checkpoint
 
 _WRITER = """
 import sys, torch
@@ -113,7 +113,7 @@ def test_a_checkpoint_with_code_is_refused_and_not_executed(kind: str, tmp_path:
 def test_only_the_newest_checkpoints_are_kept(tmp_path: Path) -> None:
     for step in range(5):
         save_checkpoint(tmp_path, step, state(), keep=2)
-    assert [path.name for path in checkpoints(tmp_path)] == ["step_00000003.pt", "step_00000004.pt"]
+    assert [path.name for path in list_checkpoints(tmp_path)] == ["step_00000003.pt", "step_00000004.pt"]
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:

@@ -37,9 +37,7 @@ def assert_equal_gradients(found: dict[str, torch.Tensor], expected: dict[str, t
 @pytest.mark.parametrize(
     ("style", "mixing"), [("panorama", "joint"), ("cubemap", "joint"), ("cubemap", "by_view"), ("original", "joint")]
 )
-def test_deferred_gradients_equal_plain_ones(
-    style: str, mixing: str, micro: Callable[..., PanSplat], make_batch: Callable[..., Batch]
-) -> None:
+def test_deferred_gradients_equal_plain_ones(style: str, mixing: str, micro: Callable, make_batch: Callable) -> None:
     network, batch = micro(), make_batch()
     set_training_mode(network, ())
     expected, loss = gradients(network, MemoryConfig("plain", 1, style, mixing), batch)
@@ -51,9 +49,7 @@ def test_deferred_gradients_equal_plain_ones(
         assert_equal_gradients(found, expected)
 
 
-def test_deferred_gradients_equal_plain_ones_with_auxiliary_heads(
-    micro: Callable[..., PanSplat], make_batch: Callable[..., Batch]
-) -> None:
+def test_deferred_gradients_equal_plain_ones_with_auxiliary_heads(micro: Callable, make_batch: Callable) -> None:
     network, batch = micro(), make_batch()
     set_training_mode(network, ())
     heads = build_auxiliary_heads(network).double()
@@ -67,9 +63,7 @@ def test_deferred_gradients_equal_plain_ones_with_auxiliary_heads(
         torch.testing.assert_close(parameter.grad, gradient)
 
 
-def test_frozen_parts_have_no_gradient_and_keep_their_statistics(
-    micro: Callable[..., PanSplat], make_batch: Callable[..., Batch]
-) -> None:
+def test_frozen_parts_have_no_gradient_and_keep_their_statistics(micro: Callable, make_batch: Callable) -> None:
     network, batch, frozen = micro(), make_batch(), ("features", "cost_volume")
     freeze(network, frozen)
     set_training_mode(network, frozen)
@@ -82,9 +76,7 @@ def test_frozen_parts_have_no_gradient_and_keep_their_statistics(
         assert torch.equal(tensor, before[name]), name
 
 
-def test_gradients_of_a_batch_equal_those_of_its_items_accumulated(
-    micro: Callable[..., PanSplat], make_batch: Callable[..., Batch]
-) -> None:
+def test_gradients_of_a_batch_equal_those_of_its_items_accumulated(micro: Callable, make_batch: Callable) -> None:
     network, memory = micro().eval(), MemoryConfig("two-step", 1, "cubemap")
     expected, joint = gradients(network, memory, make_batch(0, 1))
     found, separate = gradients(network, memory, make_batch(0), make_batch(1))
@@ -92,7 +84,7 @@ def test_gradients_of_a_batch_equal_those_of_its_items_accumulated(
     assert separate == pytest.approx(joint, rel=1e-9)
 
 
-def test_deferred_gradients_of_the_baseline_equal_plain_ones(make_batch: Callable[..., Batch]) -> None:
+def test_deferred_gradients_of_the_baseline_equal_plain_ones(make_batch: Callable) -> None:
     network, batch = micro_mvsplat(), make_batch(0, 1)
     expected, loss = gradients(network, MemoryConfig("plain", 1, "cubemap"), batch)
     assert expected.keys() == {name for name, _ in network.named_parameters()}

@@ -14,7 +14,6 @@ import torch
 
 from pansplat.errors import InputError
 from pansplat.training import step as step_module
-from pansplat.training.config import TrainConfig
 from pansplat.training.distributed import ProcessGroup, data_parallel, no_sync
 from pansplat.training.step import LOSS_TERMS, accumulate_gradients
 from pansplat.training.trainer import Trainer
@@ -121,9 +120,7 @@ def test_torchrun_trains_and_only_the_first_process_writes(tmp_path: Path) -> No
     }  # fmt: skip
 
 
-def test_only_the_first_process_writes_checkpoints(
-    micro_run: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_the_first_process_writes_checkpoints(micro_run: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     config, second = micro_run(), ProcessGroup()
     second.rank = 1
     Trainer(config, second, silent=True).save()
@@ -179,7 +176,6 @@ def test_failed_initialisation_is_an_error(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def _set_environment(monkeypatch: pytest.MonkeyPatch, **environment: str) -> None:
-    """Set the environment variables of a launcher."""
     for name in ("WORLD_SIZE", "RANK", "LOCAL_RANK"):
         monkeypatch.delenv(name, raising=False)
     for name, value in environment.items():

@@ -15,26 +15,21 @@ import torch
 
 from pansplat.training import __main__ as command
 from pansplat.training.__main__ import parse, run
-from pansplat.training.config import PRESETS, CheckpointConfig, TrainConfig
+from pansplat.training.config import PRESETS, CheckpointConfig
 from pansplat.training.trainer import Trainer
 
 _SHORT = ("--optimizer.steps", "40", "--optimizer.batch-size", "1", "--data.workers", "1", "--validation.every", "0")
 
 
-def test_help_lists_every_preset(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "expected"), [([], PRESETS), (["pansplat-2048"], ("--memory.tiles", "(default: 4)"))]
+)
+def test_help_lists_presets_and_settings(arguments: list, expected: tuple, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as done:
-        parse(["--help"])
+        parse([*arguments, "--help"])
     message = capsys.readouterr().out
     assert done.value.code == 0
-    assert all(name in message for name in PRESETS)
-
-
-def test_help_of_a_preset_lists_its_settings(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as done:
-        parse(["pansplat-2048", "--help"])
-    message = capsys.readouterr().out
-    assert done.value.code == 0
-    assert "--memory.tiles" in message and "(default: 4)" in message
+    assert all(text in message for text in expected)
 
 
 @pytest.mark.parametrize(
@@ -88,7 +83,7 @@ def test_a_missing_device_is_refused(monkeypatch: pytest.MonkeyPatch, capsys: py
 
 
 def test_out_of_memory_is_an_error_with_advice(
-    micro_run: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    micro_run: Callable, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def full(self: Trainer, batches: list) -> dict[str, float]:
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 10 bytes")
@@ -100,7 +95,7 @@ def test_out_of_memory_is_an_error_with_advice(
 
 
 def test_the_same_command_resumes_a_stopped_run(
-    micro_run: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    micro_run: Callable, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = micro_run(steps=2, checkpoint=CheckpointConfig(every=0))
     monkeypatch.setattr(command, "parse", lambda argv: config)

@@ -8,7 +8,7 @@ import torch
 from pansplat.training.optimization import one_cycle_rate
 
 
-def test_rates_equal_the_official_ones(golden: Callable[[str], dict[str, torch.Tensor]]) -> None:
+def test_rates_equal_the_official_ones(golden: Callable) -> None:
     expected = golden("units")["lr.total1000"]
     ours = torch.tensor([one_cycle_rate(step, 1000 + 10, 2e-4) for step in range(1000)], dtype=torch.float64)
     torch.testing.assert_close(ours, expected, rtol=1e-9, atol=1e-16)

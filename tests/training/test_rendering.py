@@ -22,7 +22,7 @@ CONTEXT[1, 0, 3] = 0.5
 
 
 def cloud(count: int = 400, dtype: torch.dtype = torch.float64) -> Gaussians:
-    """Gaussians all around, from needles to some that hold the camera; also faint, too near and not finite ones."""
+    """Random Gaussians around the camera; some are thin, contain the camera, are faint, or are not finite."""
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -46,8 +46,8 @@ def cloud(count: int = 400, dtype: torch.dtype = torch.float64) -> Gaussians:
 @pytest.mark.parametrize(("style", "mixing"), list(itertools.product(STYLES, ("joint", "by_view"))))
 def test_composed_parts_equal_the_whole_image(style: Style, mixing: Mixing) -> None:
     renderer, gaussians = TargetRenderer(style, mixing, HEIGHT), cloud()
-    parts = renderer.parts(len(CONTEXT))
-    masks = renderer.visible(gaussians, POSE, parts)
+    parts = renderer.list_parts(len(CONTEXT))
+    masks = renderer.find_visible(gaussians, POSE, parts)
     rendered = [
         renderer.render_part(gaussians.select(mask), POSE, part) for mask, part in zip(masks, parts, strict=True)
     ]
@@ -59,15 +59,15 @@ def test_composed_parts_equal_the_whole_image(style: Style, mixing: Mixing) -> N
 @pytest.mark.parametrize("style", STYLES)
 def test_gaussians_that_are_not_selected_are_invisible(style: Style) -> None:
     renderer, gaussians = TargetRenderer(style, "joint", HEIGHT), cloud()
-    parts = renderer.parts(2)
-    for mask, part in zip(renderer.visible(gaussians, POSE, parts), parts, strict=True):
+    parts = renderer.list_parts(2)
+    for mask, part in zip(renderer.find_visible(gaussians, POSE, parts), parts, strict=True):
         assert not renderer.render_part(gaussians.select(~mask), POSE, part)[3].any()
 
 
 @pytest.mark.parametrize("style", STYLES)
 def test_a_part_needs_few_of_the_gaussians(style: Style) -> None:
     renderer = TargetRenderer(style, "joint", 128)
-    masks = renderer.visible(full_lattice_room(128), POSE, renderer.parts(2))
+    masks = renderer.find_visible(full_lattice_room(128), POSE, renderer.list_parts(2))
     assert max(float(mask.double().mean()) for mask in masks) < 0.3
     assert sum(float(mask.double().mean()) for mask in masks) < 1.5
 
@@ -75,15 +75,15 @@ def test_a_part_needs_few_of_the_gaussians(style: Style) -> None:
 @pytest.mark.parametrize("style", STYLES)
 def test_parts_of_no_gaussians_are_empty(style: Style) -> None:
     renderer, none = TargetRenderer(style, "joint", HEIGHT), cloud().select(torch.zeros(400, dtype=torch.bool))
-    parts = renderer.parts(2)
-    for mask, part in zip(renderer.visible(none, POSE, parts), parts, strict=True):
+    parts = renderer.list_parts(2)
+    for mask, part in zip(renderer.find_visible(none, POSE, parts), parts, strict=True):
         assert len(mask) == 0 and not renderer.render_part(none, POSE, part).any()
 
 
 @pytest.mark.parametrize("height", [32, 64, 512, 2048])
 def test_strips_cover_every_row_once_and_have_equal_areas(height: int) -> None:
     renderer = TargetRenderer("panorama", "joint", height)
-    rows = [renderer._strip_rows(part.index) for part in renderer.parts(2)]
+    rows = [renderer._strip_rows(part.index) for part in renderer.list_parts(2)]
     assert rows[0][0] == 0 and rows[-1][1] == height
     assert all(before[1] == after[0] for before, after in itertools.pairwise(rows))
     areas = [math.cos(math.pi * first / height) - math.cos(math.pi * end / height) for first, end in rows]

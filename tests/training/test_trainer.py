@@ -30,7 +30,7 @@ def trained(config: TrainConfig) -> dict[str, torch.Tensor]:
     return load_weights(config.out / "model.safetensors").tensors
 
 
-def test_the_loss_decreases(micro_run: Callable[..., TrainConfig]) -> None:
+def test_the_loss_decreases(micro_run: Callable) -> None:
     config = micro_run(steps=14, optimizer=OptimizerConfig(steps=14, batch_size=1, rate=5e-3))
     trained(config)
     losses = [float(loss) for _, loss, _ in curve(config.out)]
@@ -43,7 +43,7 @@ class Killed(BaseException):
 
 @pytest.mark.parametrize("accumulate", [1, 2])
 def test_a_killed_run_resumes_bit_identically(
-    accumulate: int, micro_run: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch
+    accumulate: int, micro_run: Callable, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     optimizer = OptimizerConfig(steps=6, batch_size=1, accumulate=accumulate, rate=1e-3, ema=0.9)
     whole, broken = micro_run("whole", optimizer=optimizer), micro_run("broken", optimizer=optimizer)
@@ -67,14 +67,14 @@ def test_a_killed_run_resumes_bit_identically(
         assert torch.equal(found[name], tensor), name
 
 
-def test_resuming_with_other_settings_is_refused(micro_run: Callable[..., TrainConfig]) -> None:
+def test_resuming_with_other_settings_is_refused(micro_run: Callable) -> None:
     trained(micro_run(steps=1))
     with pytest.raises(InputError, match=r"optimizer.steps was 1, now 2"):
         Trainer(micro_run(steps=2), silent=True)
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_and_saves_the_batch(
-    micro_run: Callable[..., TrainConfig], sphere: type, monkeypatch: pytest.MonkeyPatch
+    micro_run: Callable, sphere: type, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = sphere(8, broken=frozenset(range(8)))
     monkeypatch.setattr(trainer, "load_sources", lambda *_: (source, source))
@@ -88,7 +88,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_saves_the_batch(
     assert not list(config.out.glob("model.safetensors"))
 
 
-def test_validation_writes_measures_and_images(micro_run: Callable[..., TrainConfig]) -> None:
+def test_validation_writes_measures_and_images(micro_run: Callable) -> None:
     config = micro_run(steps=2, validation=ValidationConfig(every=1, samples=2, pictures=1))
     trained(config)
     rows = list(csv.DictReader((config.out / "validation.csv").read_text().splitlines()))
@@ -99,14 +99,14 @@ def test_validation_writes_measures_and_images(micro_run: Callable[..., TrainCon
         assert min(curves.size) > 300
 
 
-def test_the_height_grows_during_training(micro_run: Callable[..., TrainConfig]) -> None:
+def test_the_height_grows_during_training(micro_run: Callable) -> None:
     config = micro_run(steps=2, heights=(32, 64), validation=ValidationConfig(every=1, samples=1, pictures=0))
     trained(config)
     rows = csv.DictReader((config.out / "validation.csv").read_text().splitlines())
     assert [row["height"] for row in rows] == ["32", "32", "64"]
 
 
-def test_initial_weights_are_those_of_a_file(micro_run: Callable[..., TrainConfig]) -> None:
+def test_initial_weights_are_those_of_a_file(micro_run: Callable) -> None:
     config = micro_run(steps=2)
     final = trained(config)
     checkpoint = read_weights(config.out / "checkpoints" / "step_00000002.pt")

@@ -1,1 +1,1 @@
-"""Rooms made from a seed: layout, furniture, materials and a ray caster to see them with."""
+"""Furnished rooms that are generated from a seed, and a ray tracer that renders them."""

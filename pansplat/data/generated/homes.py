@@ -57,9 +57,9 @@ def sample_plan(rng: np.random.Generator) -> Plan:
     whole = (-width / 2, -depth / 2, width / 2, depth / 2)
     rooms, walls = [whole], []
     for _ in range(rng.integers(0, 4)):
-        rooms.sort(key=_longest)
+        rooms.sort(key=_longer_side)
         x0, z0, x1, z1 = room = rooms[-1]
-        if _longest(room) < 2 * _MIN_SIDE + 0.2:
+        if _longer_side(room) < 2 * _MIN_SIDE + 0.2:
             break
         rooms.pop()
         if x1 - x0 > z1 - z0:
@@ -96,20 +96,20 @@ def holes_of_side(plan: Plan, side: tuple[int, float, float, float, int]) -> lis
     ]
 
 
-def _longest(room: Rectangle) -> float:
+def _longer_side(room: Rectangle) -> float:
     return max(room[2] - room[0], room[3] - room[1])
 
 
 def _add_holes(wall: Wall, walls: list[Wall], rng: np.random.Generator) -> None:
     """Add random holes between the junctions with other walls."""
-    meets = [
+    junctions = [
         other.at
         for other in walls
         if other.axis != wall.axis
         and wall.start < other.at < wall.end
         and min(abs(other.start - wall.at), abs(other.end - wall.at)) < 1e-9
     ]
-    stops = [wall.start, *sorted(meets), wall.end]
+    stops = [wall.start, *sorted(junctions), wall.end]
     for start, end in itertools.pairwise(stops):
         free = end - start - 0.4
         if wall.outer:
@@ -137,14 +137,14 @@ def build_home(rng: np.random.Generator) -> tuple[GeneratedScene, Plan]:
     top = max(heights) + 0.1
     x0, z0, x1, z1 = plan.whole
     middle, half = ((x0 + x1) / 2, (z0 + z1) / 2), ((x1 - x0) / 2 + OUTER, (z1 - z0) / 2 + OUTER)
-    builder.box((middle[0], 0.1, middle[1]), (half[0], 0.1, half[1]), FLOOR)
-    builder.box((0, 0.45, 0), (_GROUND, 0.3, _GROUND), grass)
+    builder.add_box((middle[0], 0.1, middle[1]), (half[0], 0.1, half[1]), FLOOR)
+    builder.add_box((0, 0.45, 0), (_GROUND, 0.3, _GROUND), grass)
     for wall in plan.walls:
         _add_wall(builder, wall, top)
     trim = materials.plain(builder, 0.2, 0.6) if rng.random() < 0.6 else materials.wood(builder)
     for room, height in zip(plan.rooms, heights, strict=True):
         _add_room(builder, room, height, top, trim)
-        occupied = _doorways(plan, room)
+        occupied = _find_doorways(plan, room)
         _furnish_room(builder, plan, room, occupied)
         _decorate_walls(builder, plan, room, height)
     if rng.random() < 0.6:
@@ -155,7 +155,6 @@ def build_home(rng: np.random.Generator) -> tuple[GeneratedScene, Plan]:
 
 
 def _outdoor_materials(builder: SceneBuilder) -> tuple[int, int, int]:
-    """Materials of the outer walls, the sky and the ground."""
     rng = builder.rng
     outside = materials.wall(builder)
     blue = rng.uniform(0.2, 0.6)
@@ -167,9 +166,7 @@ def _outdoor_materials(builder: SceneBuilder) -> tuple[int, int, int]:
         glow=rng.uniform(0.8, 2.0),
     )
     green = (rng.uniform(0.05, 0.25), rng.uniform(0.1, 0.3), rng.uniform(0.02, 0.15))
-    grass = builder.add_material(
-        Pattern.STONE, green, materials.shade(green, 0.4), size=(0.7, 0.7), fraction=0, mottle=0.6
-    )
+    grass = builder.add_material(Pattern.STONE, green, materials.shade(green, 0.4), size=0.7, fraction=0, mottle=0.6)
     return outside, sky, grass
 
 
@@ -178,7 +175,7 @@ def _add_sun(builder: SceneBuilder) -> None:
     up, around = np.radians(rng.uniform(20, 55)), rng.uniform(0, 2 * np.pi)
     power = rng.uniform(0.8, 2.0)
     direction = (np.cos(up) * np.sin(around), -np.sin(up), np.cos(up) * np.cos(around))
-    builder.light(direction, (power, 0.93 * power, 0.8 * power), 0.01, sun=True)
+    builder.add_light(direction, (power, 0.93 * power, 0.8 * power), 0.01, sun=True)
 
 
 def _add_wall_part(builder: SceneBuilder, wall: Wall, span: tuple[float, float], rise: tuple[float, float]) -> None:
@@ -188,11 +185,8 @@ def _add_wall_part(builder: SceneBuilder, wall: Wall, span: tuple[float, float],
     thick = OUTER if wall.outer else INNER
     across = wall.at + (np.sign(wall.at) * OUTER / 2 if wall.outer else 0.0)
     along, y = (span[0] + span[1]) / 2, -(rise[0] + rise[1]) / 2
-    half = ((span[1] - span[0]) / 2, (rise[1] - rise[0]) / 2)
-    if wall.axis == 0:
-        builder.box((across, y, along), (thick / 2, half[1], half[0]), WALL)
-    else:
-        builder.box((along, y, across), (half[0], half[1], thick / 2), WALL)
+    half = ((span[1] - span[0]) / 2, (rise[1] - rise[0]) / 2, thick / 2)
+    _add_wall_box(builder, wall.axis, across, along, y, half, WALL)
 
 
 def _add_wall(builder: SceneBuilder, wall: Wall, top: float) -> None:
@@ -210,7 +204,6 @@ def _add_wall(builder: SceneBuilder, wall: Wall, top: float) -> None:
 
 
 def _add_window_frame(builder: SceneBuilder, wall: Wall, hole: Hole) -> None:
-    """Add the bars of a window."""
     rng = builder.rng
     material, bar = materials.plain(builder, 0.2, 0.5), rng.uniform(0.02, 0.04)
     across = wall.at + np.sign(wall.at) * OUTER / 2
@@ -222,9 +215,7 @@ def _add_window_frame(builder: SceneBuilder, wall: Wall, hole: Hole) -> None:
     if rng.random() < 0.5:
         bars.append((middle, y, half, bar * 0.7))
     for along, rise, width, high in bars:
-        centre = (across, rise, along) if wall.axis == 0 else (along, rise, across)
-        size = (0.03, high, width) if wall.axis == 0 else (width, high, 0.03)
-        builder.box(centre, size, material)
+        _add_wall_box(builder, wall.axis, across, along, rise, (width, high, 0.03), material)
 
 
 def _add_room(builder: SceneBuilder, room: Rectangle, height: float, top: float, trim: int) -> None:
@@ -232,7 +223,9 @@ def _add_room(builder: SceneBuilder, room: Rectangle, height: float, top: float,
     rng = builder.rng
     x0, z0, x1, z1 = room
     x, z = (x0 + x1) / 2, (z0 + z1) / 2
-    builder.box((x, -(height + top + 0.2) / 2, z), ((x1 - x0) / 2, (top + 0.2 - height) / 2, (z1 - z0) / 2), CEILING)
+    builder.add_box(
+        (x, -(height + top + 0.2) / 2, z), ((x1 - x0) / 2, (top + 0.2 - height) / 2, (z1 - z0) / 2), CEILING
+    )
     room_materials = [
         materials.wall(builder),
         materials.floor(builder),
@@ -241,26 +234,28 @@ def _add_room(builder: SceneBuilder, room: Rectangle, height: float, top: float,
         materials.wall(builder),
     ]
     panel = rng.uniform(0.8, 1.3) if rng.random() < 0.25 else 0.0
-    builder.room(room, room_materials, panel, rng.uniform(0.05, 0.14) if rng.random() < 0.75 else 0.0, height)
+    builder.add_room(room, room_materials, panel, rng.uniform(0.05, 0.14) if rng.random() < 0.75 else 0.0, height)
     if rng.random() < 0.15:
         beam = materials.wood(builder)
         for at in np.arange(x0 + 0.5, x1 - 0.3, rng.uniform(0.8, 1.4)):
-            builder.box((at, -height + 0.08, z), (0.07, 0.08, (z1 - z0) / 2), beam)
+            builder.add_box((at, -height + 0.08, z), (0.07, 0.08, (z1 - z0) / 2), beam)
     x, z = x + rng.uniform(-0.3, 0.3), z + rng.uniform(-0.3, 0.3)
     shade = builder.add_material(Pattern.PLAIN, materials.random_color(rng, 0.3, 0.8, 1.0), glow=rng.uniform(0.8, 2.0))
     power, warm = rng.uniform(0.7, 2.6), rng.uniform(0, 0.3)
     if rng.random() < 0.5:
         drop, size = rng.uniform(0.2, 0.5), rng.uniform(0.08, 0.22)
-        builder.cylinder((x, -height + drop / 2, z), 0.008, drop / 2, trim)
-        builder.ellipsoid((x, -height + drop, z), (size, size * rng.uniform(0.5, 1), size), shade)
+        builder.add_cylinder((x, -height + drop / 2, z), 0.008, drop / 2, trim)
+        builder.add_ellipsoid((x, -height + drop, z), (size, size * rng.uniform(0.5, 1), size), shade)
         drop += size + 0.05
     else:
         drop = 0.1
-        builder.box((x, -height, z), (rng.uniform(0.1, 0.4), 0.03, rng.uniform(0.1, 0.4)), shade)
-    builder.light((x, -height + drop, z), (power, power * (1 - warm / 2), power * (1 - warm)), rng.uniform(0.03, 0.12))
+        builder.add_box((x, -height, z), (rng.uniform(0.1, 0.4), 0.03, rng.uniform(0.1, 0.4)), shade)
+    builder.add_light(
+        (x, -height + drop, z), (power, power * (1 - warm / 2), power * (1 - warm)), rng.uniform(0.03, 0.12)
+    )
 
 
-def _doorways(plan: Plan, room: Rectangle) -> list[Rectangle]:
+def _find_doorways(plan: Plan, room: Rectangle) -> list[Rectangle]:
     """The areas in front of doors, where no furniture may stand."""
     occupied = []
     for side in sides(room):
@@ -315,9 +310,9 @@ def _add_rug(builder: SceneBuilder, room: Rectangle) -> None:
     width, depth = (rng.uniform(0.3, 0.7) * (room[k + 2] - room[k]) for k in (0, 1))
     size = rng.uniform(0.04, 0.15)
     colors = [materials.random_color(rng) for _ in range(3)]
-    material = builder.add_material(Pattern.RUG, *colors, size=(size, size), mottle=0.4)
+    material = builder.add_material(Pattern.RUG, *colors, size=size, mottle=0.4)
     x, z = (room[0] + room[2]) / 2, (room[1] + room[3]) / 2
-    builder.box((x, -0.008, z), (width / 2, 0.008, depth / 2), material)
+    builder.add_box((x, -0.008, z), (width / 2, 0.008, depth / 2), material)
 
 
 def _decorate_walls(builder: SceneBuilder, plan: Plan, room: Rectangle, height: float) -> None:
@@ -341,21 +336,21 @@ def _decorate_walls(builder: SceneBuilder, plan: Plan, room: Rectangle, height: 
                 (frame, rng.uniform(0.0, 0.06), 0.02),
                 (materials.picture(builder), 0.0, 0.025),
             ):
-                _add_on_wall(builder, axis, inner, along, rise, (width / 2 + grow, high / 2 + grow, thick), material)
+                _add_wall_box(builder, axis, inner, along, rise, (width / 2 + grow, high / 2 + grow, thick), material)
         for hole in holes_of_side(plan, side):
             if hole.low > 0 and rng.random() < 0.4:
                 cloth, width = materials.fabric(builder), rng.uniform(0.1, 0.25)
                 for along in (hole.start - width, hole.end + width):
                     if start + width < along < end - width:
-                        _add_on_wall(builder, axis, inner - sign * 0.05, along, -1.15, (width, 1.1, 0.04), cloth)
+                        _add_wall_box(builder, axis, inner - sign * 0.05, along, -1.15, (width, 1.1, 0.04), cloth)
 
 
-def _add_on_wall(
+def _add_wall_box(
     builder: SceneBuilder, axis: int, at: float, along: float, y: float, half: tuple[float, float, float], material: int
 ) -> None:
-    """Add a box on a wall; `half` is half its width, height and thickness, metres."""
+    """Add a box along a wall; `half` is half its width, height and thickness, metres."""
     width, high, thick = half
     if axis == 0:
-        builder.box((at, y, along), (thick, high, width), material)
+        builder.add_box((at, y, along), (thick, high, width), material)
     else:
-        builder.box((along, y, at), (width, high, thick), material)
+        builder.add_box((along, y, at), (width, high, thick), material)

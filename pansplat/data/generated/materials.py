@@ -59,15 +59,8 @@ def wall(builder: SceneBuilder) -> int:
     if kind == 1:
         other = shade(base, rng.uniform(0.6, 0.92))
         size = rng.uniform(0.08, 0.5)
-        return builder.add_material(
-            Pattern.STRIPES,
-            base,
-            other,
-            random_color(rng),
-            size=(size, size),
-            fraction=rng.uniform(0.3, 0.6),
-            mottle=0.15,
-        )
+        line, fraction = random_color(rng), rng.uniform(0.3, 0.6)
+        return builder.add_material(Pattern.STRIPES, base, other, line, size=size, fraction=fraction, mottle=0.15)
     if kind == 2:
         brick = (rng.uniform(0.2, 0.5), rng.uniform(0.08, 0.2), rng.uniform(0.05, 0.15)) if rng.random() < 0.6 else base
         joint = (0.5, 0.48, 0.45)
@@ -77,13 +70,11 @@ def wall(builder: SceneBuilder) -> int:
     if kind == 3:
         size = rng.uniform(0.1, 0.4)
         return builder.add_material(
-            Pattern.TILES, base, shade(base, 0.8), random_color(rng, 0.2), size=(size, size), fraction=0.04, mottle=0.1
+            Pattern.TILES, base, shade(base, 0.8), random_color(rng, 0.2), size=size, fraction=0.04, mottle=0.1
         )
     if kind == 4:
         size = rng.uniform(0.2, 1.2)
-        return builder.add_material(
-            Pattern.STONE, base, shade(base, rng.uniform(0.55, 0.85)), size=(size, size), fraction=0
-        )
+        return builder.add_material(Pattern.STONE, base, shade(base, rng.uniform(0.55, 0.85)), size=size, fraction=0)
     return wood(builder, (rng.uniform(0.08, 0.2), 2.6))
 
 
@@ -98,15 +89,15 @@ def floor(builder: SceneBuilder) -> int:
         size, joint = rng.uniform(0.15, 0.7), random_color(rng, 0.2, 0.3, 0.8)
         other = random_color(rng, 0.4, 0.15, 0.9) if rng.random() < 0.4 else shade(base, 0.75)
         return builder.add_material(
-            Pattern.TILES, base, other, joint, size=(size, size), fraction=0.03, mottle=rng.uniform(0.1, 0.8)
+            Pattern.TILES, base, other, joint, size=size, fraction=0.03, mottle=rng.uniform(0.1, 0.8)
         )
     if kind == 2:
         size = rng.uniform(0.03, 0.3)
-        return builder.add_material(Pattern.STONE, base, shade(base, 0.6), size=(size, size), fraction=0, mottle=0.5)
+        return builder.add_material(Pattern.STONE, base, shade(base, 0.6), size=size, fraction=0, mottle=0.5)
     if kind == 3:
         size = rng.uniform(0.5, 1.5)
-        return builder.add_material(Pattern.STONE, base, random_color(rng, 0.3), size=(size, size), fraction=1)
-    return builder.add_material(Pattern.TERRAZZO, base, random_color(rng), random_color(rng), size=(0.06, 0.06))
+        return builder.add_material(Pattern.STONE, base, random_color(rng, 0.3), size=size, fraction=1)
+    return builder.add_material(Pattern.TERRAZZO, base, random_color(rng), random_color(rng), size=0.06)
 
 
 def ceiling(builder: SceneBuilder) -> int:
@@ -118,7 +109,7 @@ def ceiling(builder: SceneBuilder) -> int:
     if rng.random() < 0.4:
         return wood(builder, (0.12, 3.0))
     return builder.add_material(
-        Pattern.TILES, white, shade(white, 0.9), (0.3, 0.3, 0.3), size=(0.6, 0.6), fraction=0.03, mottle=0.2
+        Pattern.TILES, white, shade(white, 0.9), (0.3, 0.3, 0.3), size=0.6, fraction=0.03, mottle=0.2
     )
 
 
@@ -132,15 +123,15 @@ def fabric(builder: SceneBuilder) -> int:
     if kind == 1:
         size = rng.uniform(0.04, 0.3)
         return builder.add_material(
-            Pattern.STRIPES, base, random_color(rng), random_color(rng), size=(size, size), fraction=0.5
+            Pattern.STRIPES, base, random_color(rng), random_color(rng), size=size, fraction=0.5
         )
     if kind == 2:
         size = rng.uniform(0.05, 0.2)
         return builder.add_material(
-            Pattern.TILES, base, random_color(rng), random_color(rng), size=(size, size), fraction=0.2, mottle=0.9
+            Pattern.TILES, base, random_color(rng), random_color(rng), size=size, fraction=0.2, mottle=0.9
         )
     size = rng.uniform(0.03, 0.25)
-    return builder.add_material(Pattern.STONE, base, random_color(rng), size=(size, size), fraction=0)
+    return builder.add_material(Pattern.STONE, base, random_color(rng), size=size, fraction=0)
 
 
 def picture(builder: SceneBuilder) -> int:

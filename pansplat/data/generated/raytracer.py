@@ -165,17 +165,8 @@ def first_hit(bodies, x, y, z, dx, dy, dz, limit, any_hit):
 SKY = 40.0  # radius of the sphere of sky and horizon, metres
 WALL, FLOOR, CEILING = -1, -2, -3  # materials that depend on the room
 # Columns of a room after its corners x0 z0 x1 z1.
-(
-    WALL_MATERIAL,
-    FLOOR_MATERIAL,
-    CEILING_MATERIAL,
-    TRIM_MATERIAL,
-    PANEL_MATERIAL,
-    PANEL_HEIGHT,
-    TRIM_HEIGHT,
-    HEIGHT,
-    ROOM_NUMBERS,
-) = range(4, 13)
+WALL_MATERIAL, FLOOR_MATERIAL, CEILING_MATERIAL, TRIM_MATERIAL, PANEL_MATERIAL = range(4, 9)
+PANEL_HEIGHT, TRIM_HEIGHT, HEIGHT = range(9, 12)
 # Columns of a light: position (or direction to a sun), colour, size, 1 for a sun.
 LIGHT_COLOR, LIGHT_SIZE, LIGHT_SUN, LIGHT_NUMBERS = 3, 6, 7, 8
 

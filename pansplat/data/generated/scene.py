@@ -9,15 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pansplat.data.generated.raytracer import (
-    BOX,
-    CYLINDER,
-    ELLIPSOID,
-    LIGHT_NUMBERS,
-    ROOM_NUMBERS,
-    build_bvh,
-    trace_panorama,
-)
+from pansplat.data.generated.raytracer import BOX, CYLINDER, ELLIPSOID, LIGHT_NUMBERS, build_bvh, trace_panorama
 from pansplat.data.generated.textures import NUMBERS, Pattern
 
 Array = NDArray[np.float64]
@@ -71,7 +63,7 @@ class SceneBuilder:
         b: Vector | None = None,
         c: Vector | None = None,
         *,
-        size: tuple[float, float] = (0.5, 0.5),
+        size: float | tuple[float, float] = 0.5,
         fraction: float = 0.1,
         mottle: float = 0.2,
         glow: float = 0.0,
@@ -80,43 +72,40 @@ class SceneBuilder:
 
         Args:
             a, b, c: reflectances (red, green, blue); their meaning depends on the pattern, see `textures`.
-            size: size of the pattern, metres.
+            size: width and height of the pattern, metres; one number if they are equal.
             fraction: of joints, stripes or veins in the pattern.
             mottle: strength of irregular wear.
             glow: emitted light, relative to the reflectance.
         """
+        sides = size if isinstance(size, tuple) else (size, size)
         row = np.zeros(NUMBERS)
-        row[:16] = [pattern, *a, *(b or a), *(c or a), *size, fraction, mottle, self.rng.integers(1 << 20), glow]
+        row[:16] = [pattern, *a, *(b or a), *(c or a), *sides, fraction, mottle, self.rng.integers(1 << 20), glow]
         self.materials.append(row)
         return len(self.materials) - 1
 
-    def box(
+    def add_box(
         self, centre: Vector, half: Vector, material: int | Sequence[int], yaw: float = 0, pitch: float = 0
     ) -> None:
         """Add a box with one material, or with six: left right (x), up down (y), back front (z)."""
-        self._add(BOX, centre, half, material, yaw, pitch)
+        self._add_body(BOX, centre, half, material, yaw, pitch)
 
-    def ellipsoid(self, centre: Vector, half: Vector, material: int, yaw: float = 0) -> None:
+    def add_ellipsoid(self, centre: Vector, half: Vector, material: int, yaw: float = 0) -> None:
         """Add an ellipsoid with the given half axes."""
-        self._add(ELLIPSOID, centre, half, material, yaw, 0)
+        self._add_body(ELLIPSOID, centre, half, material, yaw, 0)
 
-    def cylinder(self, centre: Vector, radius: float, half_height: float, material: int, pitch: float = 0) -> None:
+    def add_cylinder(self, centre: Vector, radius: float, half_height: float, material: int, pitch: float = 0) -> None:
         """Add an upright cylinder."""
-        self._add(CYLINDER, centre, (radius, half_height, radius), material, 0, pitch)
+        self._add_body(CYLINDER, centre, (radius, half_height, radius), material, 0, pitch)
 
-    def light(self, position: Vector, color: Vector, size: float, *, sun: bool = False) -> None:
+    def add_light(self, position: Vector, color: Vector, size: float, *, sun: bool = False) -> None:
         """Add a lamp at a position, or a sun in a direction."""
-        row = np.zeros(LIGHT_NUMBERS)
-        row[:8] = [*position, *color, size, float(sun)]
-        self.lights.append(row)
+        self.lights.append(np.array((*position, *color, size, sun), np.float64))
 
-    def room(
+    def add_room(
         self, corners: Vector, materials: Sequence[int], panel_height: float, trim_height: float, height: float
     ) -> None:
         """Add a room x0 z0 x1 z1 with its materials of wall, floor, ceiling, trim and panel."""
-        row = np.zeros(ROOM_NUMBERS)
-        row[:] = [*corners, *materials, panel_height, trim_height, height]
-        self.rooms.append(row)
+        self.rooms.append(np.array((*corners, *materials, panel_height, trim_height, height), np.float64))
 
     def finish(self, ambient: Vector, outside: int, sky: int) -> GeneratedScene:
         """The scene; `outside` and `sky` are indices of materials."""
@@ -139,7 +128,7 @@ class SceneBuilder:
         )
         return GeneratedScene(arrays, low, high)
 
-    def _add(
+    def _add_body(
         self, kind: int, centre: Vector, half: Vector, material: int | Sequence[int], yaw: float, pitch: float
     ) -> None:
         middle, reach = np.asarray(centre, np.float64), np.asarray(half, np.float64)

@@ -92,7 +92,7 @@ def _mix(material, first, second, t):
 
 @nb.njit(**OPTIONS)
 def _per_cell(cell, size, w):
-    """The random tone `cell` in [0, 1) of a pattern cell about 0, faded out where cells are as small as pixels."""
+    """A random tone `cell` in [0, 1), centred at 0; it fades out where pattern cells are as small as pixels."""
     return (cell - 0.5) * min(1.0, max(0.0, 1.5 - w / size))
 
 

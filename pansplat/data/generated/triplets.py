@@ -51,7 +51,6 @@ class GeneratedTriplets:
         images = [torch.from_numpy(srgb_from_linear(exposure * light)).permute(2, 0, 1) for light, _ in renderings]
         depths = [torch.from_numpy(depth).float() for _, depth in renderings]
         name = f"generated_{self.seed}_{index:06d}"
-        order = ((0, 2), (1,))
         context, targets = (
             Views(
                 images=torch.stack([images[i] for i in chosen]).contiguous(),
@@ -62,7 +61,7 @@ class GeneratedTriplets:
                 names=tuple(f"{name}_{i}" for i in chosen),
                 depths=torch.stack([depths[i] for i in chosen]),
             )
-            for chosen in order
+            for chosen in ((0, 2), (1,))
         )
         return Sample(name, context, targets)
 

@@ -16,7 +16,7 @@ def _scene(fill) -> GeneratedScene:
     builder = SceneBuilder(np.random.default_rng(0))
     material = builder.add_material(Pattern.PLAIN, (0.5, 0.5, 0.5), mottle=0)
     fill(builder, material)
-    builder.room((-20, -20, 20, 20), [material] * 5, 0, 0, 20)
+    builder.add_room((-20, -20, 20, 20), [material] * 5, 0, 0, 20)
     return builder.finish((1, 1, 1), material, material)
 
 
@@ -27,11 +27,11 @@ def _distance(scene: GeneratedScene, origin, towards, limit: float = math.inf) -
 
 
 def test_distances_to_single_bodies_are_exact() -> None:
-    turned = _scene(lambda b, material: b.box((0, 0, 4), (1, 1, 1), material, yaw=math.pi / 4))
+    turned = _scene(lambda b, material: b.add_box((0, 0, 4), (1, 1, 1), material, yaw=math.pi / 4))
     assert _distance(turned, (0, 0, 0), (1e-9, 1e-9, 1)) == (pytest.approx(4 - math.sqrt(2)), 0)
-    ball = _scene(lambda b, material: b.ellipsoid((3, 0, 0), (2, 1, 0.5), material))
+    ball = _scene(lambda b, material: b.add_ellipsoid((3, 0, 0), (2, 1, 0.5), material))
     assert _distance(ball, (0, 0, 0), (1, 0, 0))[0] == pytest.approx(1)
-    drum = _scene(lambda b, material: b.cylinder((0, 3, 0), 1, 0.5, material))
+    drum = _scene(lambda b, material: b.add_cylinder((0, 3, 0), 1, 0.5, material))
     assert _distance(drum, (0.9, 0, 0), (1e-9, 1, 1e-9))[0] == pytest.approx(2.5)
     assert _distance(drum, (-3, 3.2, 0), (1, 1e-9, 1e-9))[0] == pytest.approx(2)
     assert _distance(drum, (0, 0, 1.1), (1e-9, 1, 1e-9)) == (math.inf, -1)
@@ -45,11 +45,11 @@ def test_the_bvh_gives_the_hits_of_an_exhaustive_search() -> None:
             centre, half = rng.uniform(-5, 5, size=3), rng.uniform(0.1, 0.8, size=3)
             kind = rng.integers(3)
             if kind == 0:
-                builder.box(centre, half, material, *rng.uniform(0, 3, size=2))
+                builder.add_box(centre, half, material, *rng.uniform(0, 3, size=2))
             elif kind == 1:
-                builder.ellipsoid(centre, half, material, rng.uniform(0, 3))
+                builder.add_ellipsoid(centre, half, material, rng.uniform(0, 3))
             else:
-                builder.cylinder(centre, half[0], half[1], material, rng.uniform(0, 3))
+                builder.add_cylinder(centre, half[0], half[1], material, rng.uniform(0, 3))
 
     scene = _scene(fill)
     kinds, maps, _, _, bounds, links = scene.arrays[:6]
@@ -72,7 +72,7 @@ def test_the_bvh_gives_the_hits_of_an_exhaustive_search() -> None:
 
 
 def test_depth_is_radial_at_pixel_centres() -> None:
-    scene = _scene(lambda b, material: b.box((0, 1.5, 0), (30, 0.1, 30), material))
+    scene = _scene(lambda b, material: b.add_box((0, 1.5, 0), (30, 0.1, 30), material))
     pose = np.eye(4)
     pose[:3, 3] = 3, 0.2, -1
     _, depth = scene.panorama(pose, 32, 2)
@@ -85,9 +85,9 @@ def test_depth_is_radial_at_pixel_centres() -> None:
 
 def test_bodies_cast_shadows() -> None:
     def fill(builder: SceneBuilder, material: int) -> None:
-        builder.box((0, 1.1, 0), (5, 0.1, 5), material)
-        builder.box((0, -0.5, 0), (0.3, 0.02, 0.3), material)
-        builder.light((0, -2, 0), (20, 20, 20), 0.0)
+        builder.add_box((0, 1.1, 0), (5, 0.1, 5), material)
+        builder.add_box((0, -0.5, 0), (0.3, 0.02, 0.3), material)
+        builder.add_light((0, -2, 0), (20, 20, 20), 0.0)
 
     image, _ = _scene(fill).panorama(np.eye(4) + _at(1.2, 0, 0), 64, 1)
     row = 32 + round(math.degrees(math.atan(1 / 1.2)) / 180 * 64)
