@@ -84,15 +84,11 @@ class Batch:
     def __len__(self) -> int:
         return len(self.names)
 
-    def to(self, device: torch.device | str) -> Batch:
-        """The batch on another device."""
+    def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> Batch:
+        """The batch on another device; `dtype` is that of its floating-point tensors, by default unchanged."""
         tensors = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
-        return replace(self, **{name: value.to(device, non_blocking=True) for name, value in tensors.items()})
-
-    def to_dtype(self, dtype: torch.dtype) -> Batch:
-        """The batch with its floating-point tensors converted."""
-        tensors = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
-        return replace(self, **{name: v.to(dtype) for name, v in tensors.items() if v.is_floating_point()})
+        types = {name: dtype if value.is_floating_point() else None for name, value in tensors.items()}
+        return replace(self, **{name: v.to(device, types[name], non_blocking=True) for name, v in tensors.items()})
 
 
 def collate(samples: Sequence[Sample]) -> Batch:

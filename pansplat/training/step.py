@@ -67,7 +67,7 @@ class TrainingStep(nn.Module):
         and its gradients have already been added to the parameters' gradients.
         """
         parameter = next(self.network.parameters())
-        batch = batch.to_dtype(parameter.dtype).to(parameter.device)
+        batch = batch.to(parameter.device, parameter.dtype)
         renderer = TargetRenderer(self.memory.style, self.memory.mixing, batch.images.shape[-2])
 
         def image_terms(images: Tensor) -> tuple[Tensor, LossTerms]:

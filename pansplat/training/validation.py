@@ -64,7 +64,7 @@ def _measure(
 ) -> tuple[dict[str, float], Tensor]:
     """Measures of a sample's first target, and its rendering."""
     parameter = next(network.parameters())
-    batch = collate([sample]).to_dtype(parameter.dtype).to(parameter.device)
+    batch = collate([sample]).to(parameter.device, parameter.dtype)
     matched = network.match_views(batch.images, batch.cam2world, batch.near, batch.far)
     (scene,) = merge_tiles(list(network.lift_gaussians(matched, tiles=tiles)), network.compat)
     rendered = renderer.render(scene, batch.target_cam2world[0, 0], batch.cam2world[0])

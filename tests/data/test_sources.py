@@ -17,20 +17,20 @@ from pansplat.errors import InputError
 
 
 @pytest.fixture
-def write_game_map(write_panorama: Callable, write_depth: Callable, matrix: Callable) -> Callable[..., None]:
-    def write(folder: Path, *names: str) -> None:
+def write_triplets(write_panorama: Callable, write_depth: Callable, matrix: Callable) -> Callable[..., TripletSource]:
+    def write(folder: Path, *names: str) -> TripletSource:
         for name in names:
             for i in range(3):
                 write_panorama(folder / f"{name}_{i}.png", 0.2 * (i + 1))
                 write_depth(folder / f"{name}_{i}_depth.png", 1000 * (i + 1))
             (folder / f"{name}.json").write_text(json.dumps({"c2w": [matrix(0), matrix(1), matrix(2)]}))
+        return TripletSource(read_game_maps(folder))
 
     return write
 
 
-def test_game_map_triplets_are_samples_with_depth(tmp_path: Path, write_game_map: Callable) -> None:
-    write_game_map(tmp_path, "a", "b")
-    source = TripletSource(read_game_maps(tmp_path))
+def test_game_map_triplets_are_samples_with_depth(tmp_path: Path, write_triplets: Callable) -> None:
+    source = write_triplets(tmp_path, "a", "b")
     samples = [source.sample(index, 8, 0) for index in range(len(source))]
     assert [sample.name for sample in samples] == ["a", "b"]
     batch = collate(samples)
@@ -45,19 +45,17 @@ def test_game_map_triplets_are_samples_with_depth(tmp_path: Path, write_game_map
     assert torch.equal(moved.images, batch.images) and moved.names == batch.names
 
 
-def test_samples_without_depth_have_zero_depth_in_a_batch(tmp_path: Path, write_game_map: Callable) -> None:
-    write_game_map(tmp_path, "a", "b")
+def test_samples_without_depth_have_zero_depth_in_a_batch(tmp_path: Path, write_triplets: Callable) -> None:
+    source = write_triplets(tmp_path, "a", "b")
     for depth in tmp_path.glob("b_*_depth.png"):
         depth.unlink()
-    source = TripletSource(read_game_maps(tmp_path))
     batch = collate([source.sample(index, 8, 0) for index in range(len(source))])
     assert batch.depths is not None
     assert (batch.depths[0] > 0).all() and (batch.depths[1] == 0).all()
 
 
-def test_samples_of_different_shapes_cannot_be_batched(tmp_path: Path, write_game_map: Callable) -> None:
-    write_game_map(tmp_path, "a")
-    source = TripletSource(read_game_maps(tmp_path))
+def test_samples_of_different_shapes_cannot_be_batched(tmp_path: Path, write_triplets: Callable) -> None:
+    source = write_triplets(tmp_path, "a")
     with pytest.raises(InputError, match=r"cannot batch a with a: needed context of shape \(2, 3, 8, 16\)"):
         collate([source.sample(0, 8, 0), source.sample(0, 4, 0)])
     with pytest.raises(InputError, match="at least one sample"):
@@ -106,14 +104,12 @@ def test_pairs_need_targets_and_a_random_one_is_chosen(
         PairSource(pairs, targets=4)
 
 
-def test_concatenated_sources_keep_their_order(tmp_path: Path, write_game_map: Callable) -> None:
-    write_game_map(tmp_path, "a", "b")
-    maps, homes = TripletSource(read_game_maps(tmp_path)), GeneratedTriplets(count=3, samples=1)
+def test_concatenated_sources_keep_their_order(tmp_path: Path, write_triplets: Callable) -> None:
+    maps, homes = write_triplets(tmp_path, "a", "b"), GeneratedTriplets(count=3, samples=1)
     concatenated = ConcatSource([maps, homes, maps])
     assert len(concatenated) == 7
     names = [concatenated.sample(i, 8, 0).name for i in range(7)]
-    homes_names = [f"generated_0_{i:06d}" for i in range(3)]
-    assert names == ["a", "b", *homes_names, "a", "b"]
+    assert names == ["a", "b", *(f"generated_0_{i:06d}" for i in range(3)), "a", "b"]
 
 
 @pytest.mark.shared

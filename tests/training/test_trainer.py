@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,14 +14,14 @@ from pansplat.errors import InputError
 from pansplat.model.weights import load_weights
 from pansplat.training import trainer
 from pansplat.training.config import OptimizerConfig, TrainConfig, ValidationConfig
+from pansplat.training.logs import read_table
 from pansplat.training.network import read_weights
 from pansplat.training.trainer import Trainer
 
 
 def curve(folder: Path) -> list[tuple[str, str, str]]:
     """Step, loss and gradient norm of every row, as written."""
-    with open(folder / "log.csv") as file:
-        return [(row["step"], row["loss"], row["gradient_norm"]) for row in csv.DictReader(file)]
+    return [(row["step"], row["loss"], row["gradient_norm"]) for row in read_table(folder / "log.csv")]
 
 
 def trained(config: TrainConfig) -> dict[str, torch.Tensor]:
@@ -91,7 +90,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_saves_the_batch(
 def test_validation_writes_measures_and_images(micro_run: Callable) -> None:
     config = micro_run(steps=2, validation=ValidationConfig(every=1, samples=2, pictures=1))
     trained(config)
-    rows = list(csv.DictReader((config.out / "validation.csv").read_text().splitlines()))
+    rows = read_table(config.out / "validation.csv")
     assert [row["step"] for row in rows] == ["0", "1", "2"]
     assert all(float(row["psnr"]) > 0 and float(row["depth_error"]) > 0 for row in rows)
     assert len(list((config.out / "pictures").glob("*.png"))) == 3
@@ -102,8 +101,7 @@ def test_validation_writes_measures_and_images(micro_run: Callable) -> None:
 def test_the_height_grows_during_training(micro_run: Callable) -> None:
     config = micro_run(steps=2, heights=(32, 64), validation=ValidationConfig(every=1, samples=1, pictures=0))
     trained(config)
-    rows = csv.DictReader((config.out / "validation.csv").read_text().splitlines())
-    assert [row["height"] for row in rows] == ["32", "32", "64"]
+    assert [row["height"] for row in read_table(config.out / "validation.csv")] == ["32", "32", "64"]
 
 
 def test_initial_weights_are_those_of_a_file(micro_run: Callable) -> None:
