@@ -22,6 +22,8 @@ from pansplat.evaluation.lpips import Backbone, find_backbone, load_lpips
 from pansplat.geometry.equirect import pad_equirect, row_weights
 
 DepthForm = Literal["depth", "inverse_depth"]
+Images = Float[Tensor, "batch 3 height width"]
+PixelWeights = Float[Tensor, "batch height width"]
 
 
 @dataclass(frozen=True)
@@ -55,12 +57,12 @@ class ImageLoss:
 
 
 def image_loss(
-    prediction: Float[Tensor, "batch 3 height width"],
-    target: Float[Tensor, "batch 3 height width"],
+    prediction: Images,
+    target: Images,
     perceptual: Perceptual | None,
     weights: LossWeights = PAPER,
     *,
-    pixel_weights: Float[Tensor, "batch height width"] | None = None,
+    pixel_weights: PixelWeights | None = None,
 ) -> ImageLoss:
     """Mean squared error and perceptual distance of images.
 
@@ -75,11 +77,7 @@ def image_loss(
     return ImageLoss(square, distance, weights.square * square + weights.perceptual * distance)
 
 
-def mean_square(
-    prediction: Float[Tensor, "batch 3 height width"],
-    target: Float[Tensor, "batch 3 height width"],
-    pixel_weights: Float[Tensor, "batch height width"] | None = None,
-) -> Float[Tensor, ""]:
+def mean_square(prediction: Images, target: Images, pixel_weights: PixelWeights | None = None) -> Float[Tensor, ""]:
     """Mean squared error over all values, weighted by `pixel_weights` if given."""
     errors = (prediction - target).square().mean(1)
     return errors.mean() if pixel_weights is None else weighted_mean(errors, pixel_weights)
@@ -87,7 +85,7 @@ def mean_square(
 
 def make_pixel_weights(
     masks: Bool[Tensor, "batch height width"] | None, shape: tuple[int, int, int], *, spherical: bool = False
-) -> Float[Tensor, "batch height width"] | None:
+) -> PixelWeights | None:
     """Weights of the pixels; None for equal weights.
 
     Args:
@@ -152,12 +150,12 @@ def _nearest(maps: Tensor, size: Sequence[int]) -> Tensor:
 
 
 def auxiliary_loss(
-    images: Sequence[Float[Tensor, "batch 3 height width"]],
-    target: Float[Tensor, "batch 3 height width"],
+    images: Sequence[Images],
+    target: Images,
     perceptual: Perceptual | None,
     weights: LossWeights = PAPER,
     *,
-    pixel_weights: Float[Tensor, "batch height width"] | None = None,
+    pixel_weights: PixelWeights | None = None,
 ) -> Float[Tensor, ""]:
     """Image loss of renderings of each level of the cost volume alone; for real data without true depth.
 
@@ -196,10 +194,7 @@ class Perceptual(Protocol):
     name: str
 
     def __call__(
-        self,
-        prediction: Float[Tensor, "batch 3 height width"],
-        target: Float[Tensor, "batch 3 height width"],
-        weights: Float[Tensor, "batch height width"] | None = None,
+        self, prediction: Images, target: Images, weights: PixelWeights | None = None
     ) -> Float[Tensor, "batch"]:
         """One distance per pair of images. Pixels of weight 0 have no effect."""
         ...
@@ -240,10 +235,7 @@ class Structure:
     name = "structure"
 
     def __call__(
-        self,
-        prediction: Float[Tensor, "batch 3 height width"],
-        target: Float[Tensor, "batch 3 height width"],
-        weights: Float[Tensor, "batch height width"] | None = None,
+        self, prediction: Images, target: Images, weights: PixelWeights | None = None
     ) -> Float[Tensor, "batch"]:
         """See `Perceptual`; for panoramas in [0, 1]."""
         pixel_weights = torch.ones_like(target[:, :1]) if weights is None else weights[:, None].to(target)
@@ -263,9 +255,7 @@ class Structure:
         return total / scales
 
 
-def ssim_map(
-    prediction: Float[Tensor, "batch 3 height width"], target: Float[Tensor, "batch 3 height width"]
-) -> Float[Tensor, "batch 3 height width"]:
+def ssim_map(prediction: Images, target: Images) -> Images:
     """Structural similarity at every pixel of a panorama, with an 11 x 11 Gaussian window on the sphere.
 
     Source: Wang et al., doi:10.1109/TIP.2003.819861, equation 13.
@@ -278,7 +268,7 @@ def ssim_map(
     return numerator / ((mean_a.square() + mean_b.square() + _C1) * (variance_a + variance_b + _C2))
 
 
-def _window_mean(maps: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch 3 height width"]:
+def _window_mean(maps: Images) -> Images:
     offsets = torch.arange(-_RADIUS, _RADIUS + 1, dtype=torch.float64)
     kernel = torch.exp(-0.5 * (offsets / _SIGMA).square())
     kernel = (kernel / kernel.sum()).to(maps)
@@ -287,9 +277,7 @@ def _window_mean(maps: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "
     return means[:, 0].unflatten(0, maps.shape[:2])
 
 
-def _gradient_difference(
-    prediction: Float[Tensor, "batch 3 height width"], target: Float[Tensor, "batch 3 height width"]
-) -> Float[Tensor, "batch 3 height width"]:
+def _gradient_difference(prediction: Images, target: Images) -> Images:
     """Mean absolute difference of the gradients along x and y (differences to the right and lower neighbour)."""
     difference = prediction - target
     right = difference.roll(-1, -1) - difference
