@@ -446,18 +446,13 @@ def pinhole_boxes(
             edges.append(torch.where(crosses, torch.full_like(edge, sign * _UNBOUNDED), edge))
     unseen = (kappas < 0) | (~crosses & (n_z < 0))
     # Gaussians that cross z = 0 have no bound, but most of them lie outside the view frustum.
-    for normal in _frustum_normals(size, focal, direction):
+    half_width, half_height = width / (2 * focal), height / (2 * focal)
+    inward_normals = ((1, 0, half_width), (-1, 0, half_width), (0, 1, half_height), (0, -1, half_height))
+    for normal in direction.new_tensor(inward_normals):
         distance = direction @ normal
         clear = distance.square() > kappas * (covariance @ normal @ normal)
         unseen |= clear & (distance < 0)
     return _mark_unseen(torch.stack(edges, dim=1), unseen)
-
-
-def _frustum_normals(size: tuple[int, int], focal: float, like: Tensor) -> Float[Tensor, "4 3"]:
-    """Inward normals of the four sides of the view frustum."""
-    across, down = size[1] / (2 * focal), size[0] / (2 * focal)
-    normals = ((1, 0, across), (-1, 0, across), (0, 1, down), (0, -1, down))
-    return torch.tensor(normals, dtype=like.dtype, device=like.device)
 
 
 def ewa_boxes(

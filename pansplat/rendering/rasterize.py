@@ -300,7 +300,8 @@ def _convert_covariances(given: Tensor | None, gaussians: Gaussians) -> Tensor |
         return None
     if tuple(given.shape) != (len(gaussians), 3, 3):
         raise InputError(
-            f"`covariances` must have shape ({len(gaussians)}, 3, 3), one matrix a Gaussian, got {tuple(given.shape)}"
+            f"`covariances` must have shape ({len(gaussians)}, 3, 3), one matrix for each Gaussian, got "
+            f"{tuple(given.shape)}"
         )
     return given.to(gaussians.means)
 

@@ -1,4 +1,4 @@
-"""Scenes, and a dense renderer that is a literal translation of docs/rendering.md."""
+"""Scenes, camera poses, and a dense renderer that is a literal translation of docs/rendering.md."""
 
 import math
 import os
@@ -14,14 +14,14 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import rotations_from_quats
 
 
-def _scene(count: int, *, seed: int = 0, scale: float = 0.15, spread: float = 1.5, degree: int = 2) -> Gaussians:
+def _scene(count: int, *, seed: int = 0, scale: float = 0.15, extent: float = 1.5, degree: int = 2) -> Gaussians:
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
     return Gaussians(
-        means=spread * normal(count, 3),
+        means=extent * normal(count, 3),
         scales=scale * torch.exp(0.7 * normal(count, 3)),
         quats=normal(count, 4),
         opacities=torch.sigmoid(normal(count) + 1),
@@ -101,7 +101,7 @@ def _dense(
         opacity = opacity * torch.sqrt(ratio.clamp_min(1e-12))
     colour = evaluate_harmonics(gaussians.harmonics, (gaussians.means - centre) / radius[:, None])
     key = radius if order == "radial" else mean[:, 2]
-    sums, through = torch.zeros(5, len(rays), dtype=torch.float64), torch.ones(len(rays), dtype=torch.float64)
+    sums, transmittance = torch.zeros(5, len(rays), dtype=torch.float64), torch.ones(len(rays), dtype=torch.float64)
     for i in torch.argsort(key.detach(), stable=True).tolist():
         if radius[i] < near or (kernel == "ewa" and mean[i, 2] <= 0.2 * near):
             continue
@@ -116,9 +116,9 @@ def _dense(
             front = torch.ones_like(q, dtype=torch.bool)
         alpha = (opacity[i] * torch.exp(-q / 2)).clamp_max(0.99)
         alpha = torch.where(front & (alpha >= 1 / 255), alpha, 0)
-        weight = alpha * through
+        weight = alpha * transmittance
         sums = sums + weight * torch.cat((colour[i], radius[i : i + 1], torch.ones_like(radius[:1])))[:, None]
-        through = through * (1 - alpha)
+        transmittance = transmittance * (1 - alpha)
     sums = sums.reshape(5, height, width)
     return sums[:3], sums[4], sums[3]
 
@@ -155,6 +155,18 @@ def pose() -> Tensor:
     pose[:3, :3] = rotations_from_quats(torch.tensor((0.9, 0.2, -0.3, 0.4), dtype=torch.float64))
     pose[:3, 3] = torch.tensor((0.1, 0.2, -0.1))
     return pose
+
+
+@pytest.fixture
+def yaw() -> Callable[[float], Tensor]:
+    """A camera at the origin, rotated about y by an angle in radians."""
+
+    def make(angle: float) -> Tensor:
+        pose, c, s = torch.eye(4, dtype=torch.float64), math.cos(angle), math.sin(angle)
+        pose[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=torch.float64)
+        return pose
+
+    return make
 
 
 @pytest.fixture(scope="session")

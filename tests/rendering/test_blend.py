@@ -1,4 +1,4 @@
-"""Deferred blending: weights are a partition of unity, and alpha renormalises them. Limits are hard cases 45 to 49."""
+"""Deferred blending: weights are a partition of unity, and alpha scales them. Hard cases 45 to 49 test the limits."""
 
 import pytest
 import torch
@@ -28,7 +28,7 @@ def test_weights_are_a_partition_of_unity(position, others):
     assert (weights >= 0).all() and float(weights.sum()) == pytest.approx(1, abs=1e-12)
 
 
-def test_two_views_get_the_papers_weights():
+def test_two_views_have_the_papers_weights():
     weights = blend_weights(_points((0, 0, 0.2))[0], _points((0, 0, 0), (0, 0, 1)))
     assert torch.allclose(weights, torch.tensor([0.8, 0.2], dtype=torch.float64))
 

@@ -70,7 +70,7 @@ def test_official_stitching_equals_the_fixture(golden):
     # The official code samples float32 positions in a strip of six padded faces, 204 pixels long, where neighbouring
     # numbers are 1.5e-5 apart; the fixture's faces are noise, up to 1 from pixel to pixel.
     assert float((got - expected).abs().max()) < 3e-5
-    # The same rounding leaves a sixth of the pixels different, in the last bit of their position.
+    # With the same rounding a sixth of the pixels differ, because the last bit of their position differs.
     face, x, y = (fixtures[f"cubemap.{name}"] for name in ("face", "x", "y"))
     strip = _pad_official(fixtures["cubemap.faces_in"][0]).permute(1, 0, 2, 3).reshape(3, 6 * 34, 34)
     grid = torch.stack(((x + 1) / 34 * 2 - 1, (y + 1 + 34 * face) / 204 * 2 - 1), dim=-1)
@@ -92,18 +92,18 @@ def _pad_official(faces: torch.Tensor) -> torch.Tensor:
         padded[i, :, 0, 1:-1], padded[i, :, -1, 1:-1] = over[i], under[i]
     padded[4, :, 0, 1:-1], padded[4, :, -1, 1:-1] = back[:, 0].flip(1), front[:, 0]
     padded[5, :, 0, 1:-1], padded[5, :, -1, 1:-1] = front[:, -1], back[:, -1].flip(1)
-    # Left and right of up and down: shifted down by a row, below a zero; down's are its own columns.
+    # Left and right edges of up and down: shifted down by one row, below a zero; those of down are its own columns.
     padded[4, :, 2:, 0], padded[4, :, 2:, -1] = left[:, 0], right[:, 0].flip(1)
     padded[5, :, 2:, 0], padded[5, :, 2:, -1] = down[:, :, 0], down[:, :, -1]
     return padded
 
 
 @pytest.mark.shared
-def test_the_two_stitchings_differ_only_beside_up_and_down(golden):
+def test_the_two_stitchings_differ_only_next_to_the_up_and_down_faces(golden):
     faces = golden("units")["cubemap.faces_in"][0].double()
-    official, seamless = (stitch_faces(faces, (64, 128), stitching=way) for way in ("official", "seamless"))
+    official, seamless = (stitch_faces(faces, (64, 128), stitching=s) for s in ("official", "seamless"))
     differ = (official - seamless).abs().amax(dim=0) > 1e-12
     assert 0 < int(differ.sum()) <= 96
-    along = face_of(pixel_directions(64, 128, dtype=torch.float64)) >= 4
-    grown = torch.nn.functional.max_pool2d(along[None].float(), 3, 1, 1)[0] > 0
+    up_or_down = face_of(pixel_directions(64, 128, dtype=torch.float64)) >= 4
+    grown = torch.nn.functional.max_pool2d(up_or_down[None].float(), 3, 1, 1)[0] > 0
     assert not (differ & ~grown).any()

@@ -1,4 +1,4 @@
-"""`OFFICIAL` against the official rasteriser written out densely, with and without its two cuts."""
+"""`OFFICIAL` against a dense version of the official rasteriser, with and without its two cuts."""
 
 import math
 
@@ -19,7 +19,7 @@ def _official_face(
     """RGB of a 90-degree face as docs/official.md, 10.3 describes, every pixel against every Gaussian; float64.
 
     Args:
-        radius_cut: draw only in tiles of 16 pixels that the square of ceil(3 sigma) touches.
+        radius_cut: rasterise only in tiles of 16 pixels that the square of ceil(3 sigma) touches.
         stop: end a ray before the transmittance falls below 1e-4.
     """
     means, centre = scene.means / near, pose[:3, 3] / near
@@ -38,27 +38,27 @@ def _official_face(
     colour = evaluate_harmonics(scene.harmonics, torch.nn.functional.normalize(means - centre, dim=1))
     across = torch.arange(num, dtype=torch.float64)
     pixels = torch.stack((across.repeat(num), across.repeat_interleave(num)), dim=1)
-    half = 0.5 * (flat[:, 0, 0] + flat[:, 1, 1])
-    largest = half + torch.sqrt((half.square() - torch.linalg.det(flat)).clamp_min(0.1))
+    mean_variance = 0.5 * (flat[:, 0, 0] + flat[:, 1, 1])
+    largest = mean_variance + torch.sqrt((mean_variance.square() - torch.linalg.det(flat)).clamp_min(0.1))
     radius = torch.ceil(3 * torch.sqrt(largest))[:, None]
     tiles = torch.floor((middle - radius) / 16), torch.floor((middle + radius + 15) / 16)
-    mine = torch.floor(pixels / 16)
-    rgb, through = torch.zeros(num * num, 3, dtype=torch.float64), torch.ones(num * num, dtype=torch.float64)
-    live = torch.ones_like(through, dtype=torch.bool)
+    pixel_tiles = torch.floor(pixels / 16)
+    rgb, transmittance = torch.zeros(num * num, 3, dtype=torch.float64), torch.ones(num * num, dtype=torch.float64)
+    live = torch.ones_like(transmittance, dtype=torch.bool)
     for i in torch.argsort(z, stable=True).tolist():
         if z[i] <= 0.2:
             continue
         delta = middle[i] - pixels
         alpha = scene.opacities[i] * torch.exp(-0.5 * ((delta @ conic[i]) * delta).sum(dim=1))
         alpha = alpha.clamp_max(0.99)
-        drawn = alpha >= 1 / 255
+        visible = alpha >= 1 / 255
         if radius_cut:
-            drawn &= ((mine >= tiles[0][i]) & (mine < tiles[1][i])).all(dim=1)
+            visible &= ((pixel_tiles >= tiles[0][i]) & (pixel_tiles < tiles[1][i])).all(dim=1)
         if stop:
-            live &= ~drawn | (through * (1 - alpha) >= 1e-4)
-        alpha = torch.where(drawn & live, alpha, 0)
-        rgb += (alpha * through)[:, None] * colour[i]
-        through = through * (1 - alpha)
+            live &= ~visible | (transmittance * (1 - alpha) >= 1e-4)
+        alpha = torch.where(visible & live, alpha, 0)
+        rgb += (alpha * transmittance)[:, None] * colour[i]
+        transmittance = transmittance * (1 - alpha)
     return rgb.T.reshape(3, num, num)
 
 
@@ -73,7 +73,7 @@ def _psnr(a: torch.Tensor, b: torch.Tensor) -> float:
 
 @pytest.fixture
 def outside(make_scene):
-    """Gaussians no nearer than half a metre, where the renderers' rules about near ones agree."""
+    """Gaussians so far from the camera that `near` removes none of them."""
 
     def make(count: int, scale: float) -> Gaussians:
         scene = make_scene(count, scale=scale, seed=11, degree=3)
@@ -99,26 +99,22 @@ def test_official_options_equal_the_official_rasteriser_without_its_two_cuts(sca
 def test_the_official_rasterisers_two_cuts_change_little(cuts, decibels, outside, pose):
     scene = outside(150, 0.3)
     got = rasterize(scene, pose, size=(64, 128), face_size=32, near=0.45, layout="cubemap", options=OFFICIAL).color
-    theirs = _official(scene, pose, 64, 0.45, **cuts)
-    assert decibels < _psnr(theirs, got) < 200  # below 200: the cut has an effect
+    official = _official(scene, pose, 64, 0.45, **cuts)
+    assert decibels < _psnr(official, got) < 200  # below 200: the cut has an effect
 
 
-def test_only_the_official_rasteriser_draws_gaussians_nearer_than_near(make_scene):
+def test_only_the_official_rasteriser_rasterises_gaussians_nearer_than_near(make_scene):
     eye = torch.eye(4, dtype=torch.float64)
     near_one = make_scene(1, scale=0.02)
-    for place, ours, theirs in (
-        ((0.0, 0, 0.3), False, True),
-        ((0.0, 0, 0.08), False, False),
-        ((0, 0, 0.5), True, True),
-    ):
-        near_one.means.copy_(torch.tensor([place]))
+    for mean, is_ours, is_official in (((0.0, 0, 0.3), 0, 1), ((0.0, 0, 0.08), 0, 0), ((0, 0, 0.5), 1, 1)):
+        near_one.means.copy_(torch.tensor([mean]))
         got = rasterize(near_one, eye, size=(32, 64), face_size=16, near=0.45, layout="cubemap", options=OFFICIAL).color
         expected = _official(near_one, eye, 32, 0.45, radius_cut=False, stop=False)
-        assert (float(got.max()) > 0, float(expected.max()) > 0) == (ours, theirs)
+        assert (float(got.max()) > 0, float(expected.max()) > 0) == (is_ours, is_official)
 
 
 def test_official_options_differ_from_the_exact_panorama_by_their_approximations(outside, pose):
     scene = outside(150, 0.1)
-    theirs = rasterize(scene, pose, size=(64, 128), face_size=32, near=0.45, layout="cubemap", options=OFFICIAL)
+    official = rasterize(scene, pose, size=(64, 128), face_size=32, near=0.45, layout="cubemap", options=OFFICIAL)
     exact = rasterize(scene, pose, size=(64, 128), near=0.45)
-    assert 18 < _psnr(theirs.color, exact.color) < 30  # measured 22.7
+    assert 18 < _psnr(official.color, exact.color) < 30  # measured 22.7

@@ -58,7 +58,7 @@ def test_pinhole_boxes_contain_every_visible_pixel_and_touch_it(size):
         centre = torch.arange(extent) + 0.5
         inside = (centre >= low[:, None] - 1e-6) & (centre <= high[:, None] + 1e-6)
         assert not (shadow & ~inside).any()
-        # Cones that are wholly in the image: a pixel next to their edge is seen.
+        # For cones wholly in the image, a pixel next to the box's edge is seen.
         whole = (boxes[:, 0] > 2) & (boxes[:, 1] < 78) & (boxes[:, 2] > 2) & (boxes[:, 3] < 58)
         whole &= (boxes[:, 1] - boxes[:, 0] > 12) & (boxes[:, 3] - boxes[:, 2] > 12)
         extra = (inside & ~shadow).sum(dim=1)[whole]

@@ -1,4 +1,4 @@
-"""The call: its arguments, channels, covariances, and the laws that images obey under rotation and in every layout."""
+"""The function `rasterize`: arguments, channels, covariances, rotations, layouts and torch.compile."""
 
 import dataclasses
 import math
@@ -45,7 +45,7 @@ def test_arguments_out_of_range_are_refused(make_scene, pose, unchecked):
         *(
             (
                 {"covariances": torch.zeros(shape)},
-                r"`covariances` must have shape \(2, 3, 3\), one matrix a Gaussian, got",
+                r"`covariances` must have shape \(2, 3, 3\), one matrix for each Gaussian, got",
             )
             for shape in ((3, 3, 3), (2, 3), (2, 2, 2), (1, 2, 3, 3))
         ),
@@ -76,7 +76,7 @@ def test_keywords_override_fields_of_the_options(make_scene, pose):
 
 
 @pytest.mark.parametrize(("channels", "degree"), [(3, 2), (32, 0)])
-def test_channels_drawn_together_equal_those_drawn_alone(channels, degree, make_scene, pose):
+def test_channels_rasterised_together_equal_those_rasterised_alone(channels, degree, make_scene, pose):
     scene = make_scene(40, scale=0.25, degree=degree)
     generator = torch.Generator().manual_seed(1)
     shape = (40, (degree + 1) ** 2, channels)
@@ -115,14 +115,14 @@ def test_the_scenes_own_covariances_change_nothing_and_scales_are_not_read(optio
     scene = make_scene(80, scale=0.2)
     expected = rasterize(scene, pose, size=(16, 32), **options)
     covariances = scene.covariances.to(dtype)
-    blind = dataclasses.replace(scene, scales=torch.full_like(scene.scales, torch.nan), quats=0 * scene.quats)
+    without_shape = dataclasses.replace(scene, scales=torch.full_like(scene.scales, torch.nan), quats=0 * scene.quats)
     options = dict(size=(16, 32), covariances=covariances, backend="torch", **options)
     got = rasterize(scene.to(dtype=dtype), pose, **options)
     tolerance = 1e-9 if dtype == torch.float64 else 2e-5
     assert float(expected.alpha.mean()) > 0.05 and got.color.dtype == dtype
     for name in ("color", "alpha"):
         assert (getattr(got, name) - getattr(expected, name)).abs().max() < tolerance
-    assert torch.equal(rasterize(blind.to(dtype=dtype), pose, **options).color, got.color)
+    assert torch.equal(rasterize(without_shape.to(dtype=dtype), pose, **options).color, got.color)
 
 
 def test_each_entry_of_a_symmetric_pair_gets_half_the_gradient(make_scene, pose):
@@ -142,20 +142,11 @@ def test_an_empty_scene_takes_empty_covariances(make_scene, pose):
 # --- rotation and layouts ---
 
 
-def _turned(pose: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
-    turned = pose.clone()
-    turned[:3, :3] = pose[:3, :3] @ rotation
-    return turned
-
-
 @pytest.mark.parametrize(("columns", "width"), [(1, 50), (7, 48), (24, 48)])
-def test_rotating_the_camera_about_y_rolls_the_panorama(columns, width, make_scene, pose):
+def test_rotating_the_camera_about_y_rolls_the_panorama(columns, width, make_scene, pose, yaw):
     scene = make_scene(150, scale=0.15)
-    angle = columns * 2 * math.pi / width
-    c, s = math.cos(angle), math.sin(angle)
-    yaw = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=torch.float64)
     still = rasterize(scene, pose, size=(24, width))
-    turned = rasterize(scene, _turned(pose, yaw), size=(24, width))
+    turned = rasterize(scene, pose @ yaw(columns * 2 * math.pi / width), size=(24, width))
     for name in ("color", "alpha", "depth"):
         rolled = torch.roll(getattr(still, name), -columns, dims=-1)
         assert torch.allclose(rolled, getattr(turned, name), atol=1e-9)
@@ -189,8 +180,9 @@ def test_a_panorama_pixel_is_a_one_pixel_pinhole_image(make_scene, pose):
         ahead = pixel_directions(height, width, dtype=torch.float64)[row, column]
         right = torch.linalg.cross(torch.tensor((0.0, 1.0, 0.0), dtype=torch.float64), ahead)
         right = right / right.norm()
-        rotation = torch.stack((right, torch.linalg.cross(ahead, right), ahead), dim=1)
-        look = rasterize(scene, _turned(pose, rotation), size=(1, 1), layout="pinhole", vertical_fov_degrees=fov)
+        rotation = _ORIGIN.clone()
+        rotation[:3, :3] = torch.stack((right, torch.linalg.cross(ahead, right), ahead), dim=1)
+        look = rasterize(scene, pose @ rotation, size=(1, 1), layout="pinhole", vertical_fov_degrees=fov)
         assert torch.allclose(look.color[:, 0, 0], panorama.color[:, row, column], atol=1e-9)
         assert torch.allclose(look.depth[0, 0], panorama.depth[row, column], atol=1e-9)
 
@@ -206,14 +198,14 @@ def test_a_face_of_the_cubemap_is_a_pinhole_image(kernel, make_scene, pose):
 
 def test_the_cubemap_converges_to_the_direct_panorama(make_scene, pose):
     scene = make_scene(60, scale=0.4)
-    # Far wider than either filter, which a finer face narrows.
+    # Far wider than either layout's filter, whose variance falls with the pixel.
     scene = dataclasses.replace(scene, scales=scene.scales.clamp_min(0.5))
     direct = rasterize(scene, pose, size=(32, 64))
     errors = []
     for face_size in (20, 40, 80):
         stitched = rasterize(scene, pose, size=(32, 64), layout="cubemap", face_size=face_size)
         errors.append(float((stitched.color - direct.color).abs().mean()))
-    # The edges at which alpha is cut are steps, so the error falls with the face's pixel, not its square.
+    # Alpha is a step at its cut, so the error is proportional to the face's pixel and not to its square.
     assert errors[1] < errors[0] and errors[2] < 0.4 * errors[0] and errors[2] < 2e-3
 
 
@@ -233,7 +225,7 @@ def _gradients(loss, gaussians: Gaussians, backend: str):
 
 
 @pytest.mark.usefixtures("unchecked")
-@pytest.mark.filterwarnings("ignore:The .grad attribute")  # the compiler itself reads it
+@pytest.mark.filterwarnings("ignore:The .grad attribute")  # the compiler reads it
 @pytest.mark.parametrize("backend", ["numba", "torch"])
 def test_a_compiled_step_has_the_same_loss_and_gradients_without_tracing_the_rasteriser(backend):
     gaussians = full_lattice_room(16)
@@ -246,4 +238,4 @@ def test_a_compiled_step_has_the_same_loss_and_gradients_without_tracing_the_ras
         assert torch.allclose(found, right, rtol=1e-5, atol=1e-6 * right.abs().max())
     assert counters["frames"]["total"] > 0
     assert any("torch.compiler.disable" in reason for reason in counters["graph_break"])
-    assert sum(counters["graph_break"].values()) <= 4  # around the call; tracing it gives dozens
+    assert sum(counters["graph_break"].values()) <= 4  # around `rasterize`; tracing it gives dozens

@@ -105,7 +105,11 @@ def intersect_tiles(instances: Instances, limit: int = _MAX_INTERSECTIONS) -> It
     change.index_add_(0, first_row, num_columns)
     change.index_add_(0, first_row + num_rows, -num_columns)
     per_row = change.cumsum(0)[:rows].tolist()
-    for low, high in _limit_bands(split_rows(per_row, limit), max(1, _MAX_TILES // columns)):
+    most = max(1, _MAX_TILES // columns)  # rows in a band
+    bands = (
+        (row, min(row + most, end)) for first, end in split_rows(per_row, limit) for row in range(first, end, most)
+    )
+    for low, high in bands:
         top = first_row.clamp_min(low)
         count = ((first_row + num_rows).clamp_max(high) - top).clamp_min(0) * num_columns
         ends = count.cumsum(0)
@@ -122,13 +126,6 @@ def intersect_tiles(instances: Instances, limit: int = _MAX_INTERSECTIONS) -> It
         numbers = torch.arange((high - low) * columns, dtype=torch.int32, device=ends.device)
         starts = torch.nn.functional.pad(torch.searchsorted(tiles.int(), numbers), (0, 1), value=total)
         yield TileIntersections((low, high), record_ids[slots], starts.int(), slots.int(), ends)
-
-
-def _limit_bands(bands: Iterator[tuple[int, int]], limit: int) -> Iterator[tuple[int, int]]:
-    """Split bands into bands of at most `limit` rows."""
-    for low, high in bands:
-        for start in range(low, high, limit):
-            yield start, min(start + limit, high)
 
 
 @triton.jit(do_not_specialize=["num", "total", "low", "columns", "steps"])

@@ -1,7 +1,7 @@
-"""Compile every kernel for GPUs that need not be present, and print one JSON line each.
+"""Compile every kernel for GPUs, which need not be present, and print one JSON line for each.
 
 Run: python tests/rendering/cuda/compile_for_gpu.py [COMPUTE_CAPABILITY ...]   (by default 80 90)
-Without TRITON_INTERPRET. NVIDIA's assembler, which Triton includes, reports registers and spills.
+TRITON_INTERPRET must not be set. NVIDIA's assembler, which Triton includes, reports registers and spills.
 """
 
 import json
@@ -27,18 +27,8 @@ from pansplat.rendering.cuda.rasterize import (
 )
 from pansplat.rendering.cuda.tiling import intersect_kernel
 
-_FLOATS = (
-    "means",
-    "opacities",
-    "harmonics",
-    "first_shape",
-    "second_shape",
-    "peaks",
-    "values",
-    "rows",
-    "radial_variances",
-)
-_FLOATS += ("records", "centres", "offsets", "sums", "grad_sums", "gradients", "totals")
+_FLOATS = ("means", "opacities", "harmonics", "first_shape", "second_shape", "peaks", "values", "rows")
+_FLOATS += ("radial_variances", "records", "centres", "offsets", "sums", "grad_sums", "gradients", "totals")
 _INTEGERS = ("record_ids", "slots", "starts", "stops", "tile_order", "instances", "ranges")
 _FLOATS += ("grad_world_directions", "grad_peaks", "grad_rows", "grad_radial_variances")
 _FLOATS += ("grad_means", "grad_opacities", "grad_first_shape", "grad_second_shape")

@@ -34,8 +34,8 @@ def _gradients(scene: Gaussians, camera: Tensor, dtype: torch.dtype, covariances
         options["covariances"] = leaves["covariances"]
     leaves["pose"] = camera.clone().requires_grad_()
     leaves["background"] = torch.linspace(0.2, 0.9, scene.harmonics.shape[2], dtype=dtype).requires_grad_()
-    drawn = dataclasses.replace(scene, **{name: leaves[name] for name in _FIELDS})
-    got = rasterize(drawn, leaves["pose"], background=leaves["background"], **options)
+    changed = dataclasses.replace(scene, **{name: leaves[name] for name in _FIELDS})
+    got = rasterize(changed, leaves["pose"], background=leaves["background"], **options)
     everything = torch.cat((got.color, got.alpha[None], (got.depth * got.alpha)[None]))
     target = torch.rand(everything.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     (everything.double() * target).sum().backward()
@@ -43,6 +43,32 @@ def _gradients(scene: Gaussians, camera: Tensor, dtype: torch.dtype, covariances
     turn = camera[:3, :3].T @ gradients["pose"][:3, :3]
     gradients["pose"] = torch.cat((turn - turn.T, gradients["pose"][:3, 3:]), dim=1)
     return everything.detach(), gradients, got.info
+
+
+def _compare(
+    scene: Gaussians,
+    camera: Tensor,
+    dtype: torch.dtype,
+    tolerances: tuple[float, float],
+    *,
+    covariances: Tensor | None = None,
+    invisible: tuple[str, ...] = (),
+    **options,
+):
+    """Assert that Triton's image and gradients equal those of float64 torch, and return both.
+
+    Args:
+        tolerances: largest error of a pixel, and relative error of a gradient by norm.
+        invisible: gradients that are too small to compare.
+    """
+    expected = _gradients(scene, camera, torch.float64, covariances, backend="torch", **options)
+    got = _gradients(scene, camera, dtype, covariances, backend="triton", **options)
+    assert float((got[0] - expected[0]).abs().max()) < tolerances[0]
+    assert got[1].keys() == expected[1].keys()
+    for name in expected[1].keys() - set(invisible):
+        error = float((got[1][name] - expected[1][name]).norm() / expected[1][name].norm())
+        assert error < tolerances[1], name
+    return expected, got
 
 
 @pytest.mark.parametrize(
@@ -55,15 +81,10 @@ def test_images_and_gradients_equal_float64_torch(options, dtype, channels, make
     scene = dataclasses.replace(scene, harmonics=scene.harmonics.repeat(1, 1, 2)[:, :, :channels])
     covariances = scene.covariances if options["lowpass"] == "3dgs" else None
     options = {"size": (18, 36), "vertical_fov_degrees": 80.0, **options}
-    truth = _gradients(scene, pose, torch.float64, covariances, backend="torch", **options)
-    got = _gradients(scene, pose, dtype, covariances, backend="triton", **options)
-    single = dtype == torch.float32
-    assert float(truth[0][channels].mean()) > 0.02
-    assert float((got[0] - truth[0]).abs().max()) < (2e-6 if single else 1e-13)
-    assert got[1].keys() == truth[1].keys() and len(truth[1]) == (6 if covariances is not None else 7)
-    for name, expected in truth[1].items():
-        error = float((got[1][name] - expected).norm() / expected.norm())
-        assert error < (1e-5 if single else 1e-12), name
+    tolerances = (2e-6, 1e-5) if dtype == torch.float32 else (1e-13, 1e-12)
+    expected, got = _compare(scene, pose, dtype, tolerances, covariances=covariances, **options)
+    assert float(expected[0][channels].mean()) > 0.02
+    assert len(got[1]) == (6 if covariances is not None else 7)
     assert got[2].backend == "triton" and got[2].intersections > 0 and got[2].bytes > 0
 
 
@@ -71,30 +92,22 @@ def test_a_gaussian_over_many_tiles_has_the_gradient_of_float64_torch(make_scene
     from pansplat.rendering.cuda import rasterize as stage
 
     monkeypatch.setattr(stage, "_MANY_TILES", 4)
-    scene = make_scene(2, scale=1.5, spread=0.8, seed=1, degree=0)
-    options = dict(size=(48, 96), layout="equirect")
-    truth = _gradients(scene, pose, torch.float64, None, backend="torch", **options)
-    got = _gradients(scene, pose, torch.float32, None, backend="triton", **options)
-    assert got[2].intersections > 2 * 16  # each is summed by its own program, in more than one step
-    for name, expected in truth[1].items():
-        assert float((got[1][name] - expected).norm() / expected.norm()) < 1e-5, name
+    scene = make_scene(2, scale=1.5, extent=0.8, seed=1, degree=0)
+    _, got = _compare(scene, pose, torch.float32, (1e-5, 1e-5), size=(48, 96), layout="equirect")
+    assert got[2].intersections > 2 * 16  # each has its own program, which sums in more than one step
 
 
 def test_opaque_gaussians_around_the_camera_equal_float64_torch(make_scene):
-    scene = make_scene(12, scale=1.5, spread=0.6, seed=2, degree=0)
+    scene = make_scene(12, scale=1.5, extent=0.6, seed=2, degree=0)
     scene = dataclasses.replace(scene, opacities=torch.linspace(0.5, 2.0, 12, dtype=torch.float64))
     camera = torch.eye(4, dtype=torch.float64)
-    options = dict(size=(9, 18), layout="equirect")
-    truth = _gradients(scene, camera, torch.float64, None, backend="torch", **options)
-    got = _gradients(scene, camera, torch.float64, None, backend="triton", **options)
-    assert float(truth[0][3].max()) > 0.9999  # several at the largest alpha
-    assert float((got[0] - truth[0]).abs().max()) < 2e-5  # tiles stop early
-    for name, expected in truth[1].items():
-        assert float((got[1][name] - expected).norm() / expected.norm()) < 1e-3, name
+    # Triton's tiles stop early.
+    expected, _ = _compare(scene, camera, torch.float64, (2e-5, 1e-3), size=(9, 18), layout="equirect")
+    assert float(expected[0][3].max()) > 0.9999  # several at the largest alpha
 
 
-def test_gaussians_behind_a_saturated_tile_are_not_drawn(make_scene, pose):
-    scene = make_scene(130, scale=3.0, spread=0.1, seed=2, degree=0)
+def test_gaussians_behind_a_saturated_tile_are_left_out(make_scene, pose):
+    scene = make_scene(130, scale=3.0, extent=0.1, seed=2, degree=0)
     ahead = torch.tensor((0.0, 0.0, 3.0), dtype=torch.float64)
     scene = dataclasses.replace(
         scene,
@@ -102,23 +115,19 @@ def test_gaussians_behind_a_saturated_tile_are_not_drawn(make_scene, pose):
         opacities=torch.full_like(scene.opacities, 0.2),  # 32 of them do not saturate
     )
     options = dict(size=(4, 4), layout="pinhole")
-    truth = _gradients(scene, pose, torch.float64, None, backend="torch", **options)
-    got = _gradients(scene, pose, torch.float32, None, backend="triton", **options)
-    assert float((got[0] - truth[0]).abs().max()) < 1e-4
-    hidden = (got[1]["opacities"] == 0) & (truth[1]["opacities"] != 0)
+    expected, got = _compare(scene, pose, torch.float32, (1e-4, 1e-3), invisible=("background",), **options)
+    hidden = (got[1]["opacities"] == 0) & (expected[1]["opacities"] != 0)
     assert 20 < int(hidden.sum()) < 100
-    del truth[1]["background"]  # invisible
-    for name, expected in truth[1].items():
-        assert float((got[1][name] - expected).norm() / expected.norm()) < 1e-3, name
 
 
 def test_an_image_is_the_same_in_narrow_bands(make_scene, pose, monkeypatch):
     from pansplat.rendering.cuda import tiling
 
     scene = make_scene(12, scale=0.3, degree=0)
-    wide = _gradients(scene, pose, torch.float64, None, backend="triton", size=(20, 40), layout="equirect")
+    options = dict(backend="triton", size=(20, 40), layout="equirect")
+    wide = _gradients(scene, pose, torch.float64, None, **options)
     monkeypatch.setattr(tiling, "intersect_tiles", functools.partial(tiling.intersect_tiles, limit=1))
-    narrow = _gradients(scene, pose, torch.float64, None, backend="triton", size=(20, 40), layout="equirect")
+    narrow = _gradients(scene, pose, torch.float64, None, **options)
     assert torch.equal(narrow[0], wide[0]) and narrow[2].intersections == wide[2].intersections
     assert narrow[2].bytes < wide[2].bytes
     for name, expected in wide[1].items():

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 
+from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.cuda.backend import project_gaussians
 from pansplat.rendering.projection import ProjectedGaussians
 from pansplat.rendering.projection import project_gaussians as reference
@@ -23,10 +24,7 @@ _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
     ],
 )
 def test_projected_gaussians_equal_the_reference(exact, compensate, by_covariance, degree, make_scene, pose):
-    scene = make_scene(150, seed=degree, degree=degree)  # one and a fraction programs
-    scene.quats[3] = 0
-    scene.scales[5, 1] = 0
-    scene.scales[6] = 0
+    scene = _make_degenerate(make_scene(150, seed=degree, degree=degree))  # more than one program
     covariances = _rounded(scene.covariances) if by_covariance else None
     options = dict(filter_variance=3e-4, compensate=compensate, exact=exact)
     for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-6)):
@@ -42,28 +40,19 @@ def test_projected_gaussians_equal_the_reference(exact, compensate, by_covarianc
 
 @pytest.mark.parametrize("by_covariance", [True, False])
 @pytest.mark.parametrize("exact", [True, False])
-def test_gradients_equal_the_references(exact, by_covariance, make_scene, pose, monkeypatch):
+def test_gradients_equal_those_of_the_reference(exact, by_covariance, make_scene, pose, monkeypatch):
     from pansplat.rendering.cuda import projection_backward
 
     monkeypatch.setattr(projection_backward, "_CHUNK_SIZE", 50)
-    scene = make_scene(70)  # one and a fraction programs
-    scene.quats[3] = 0
-    scene.scales[5, 1] = 0
-    scene.scales[6] = 0
+    scene = _make_degenerate(make_scene(70))  # more than one program
     generator = torch.Generator().manual_seed(0)
     found = []
     for function in (reference, project_gaussians):
         leaves = {name: getattr(scene, name).clone().requires_grad_() for name in _FIELDS}
         covariances = scene.covariances.clone().requires_grad_() if by_covariance else None
         camera = pose.clone().requires_grad_()
-        seen = function(
-            dataclasses.replace(scene, **leaves),
-            covariances,
-            camera,
-            filter_variance=3e-4,
-            compensate=True,
-            exact=exact,
-        )
+        changed, options = dataclasses.replace(scene, **leaves), dict(compensate=True, exact=exact)
+        seen = function(changed, covariances, camera, filter_variance=3e-4, **options)
         _any_loss(seen, generator.manual_seed(0)).backward()
         turn = pose[:3, :3].T @ camera.grad[:3, :3]
         leaves |= {} if covariances is None else {"covariances": covariances}
@@ -73,6 +62,14 @@ def test_gradients_equal_the_references(exact, by_covariance, make_scene, pose, 
     assert found[0].keys() == found[1].keys() and len(found[0]) == (5 if by_covariance else 6)
     for name, expected in found[0].items():
         assert float((found[1][name] - expected).norm() / expected.norm()) < 1e-10, name
+
+
+def _make_degenerate(scene: Gaussians) -> Gaussians:
+    """Set a quaternion, one scale of a Gaussian and all scales of another to zero."""
+    scene.quats[3] = 0
+    scene.scales[5, 1] = 0
+    scene.scales[6] = 0
+    return scene
 
 
 def _rounded(covariances: torch.Tensor) -> torch.Tensor:

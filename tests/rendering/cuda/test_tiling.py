@@ -69,7 +69,7 @@ def test_tiles_are_split_into_bands_of_16_bit_indices(monkeypatch):
     assert found == [(0, 2), (2, 4)]
 
 
-def test_centres_and_offsets_keep_more_digits_than_their_type():
+def test_centres_and_offsets_together_are_more_accurate_than_their_type():
     for layout, exact in (("equirect", True), ("cubemap", True), ("pinhole", False)):
         planes = image_planes(layout, (200, 360), vertical_fov_degrees=90.0, face_size=100, device=torch.device("cpu"))
         pixels = tile_pixels(planes, exact=exact, dtype=torch.float32)
@@ -84,19 +84,16 @@ def test_centres_and_offsets_keep_more_digits_than_their_type():
 
 
 @pytest.mark.parametrize("exact", [True, False])
-def test_records_and_gradient_records_have_the_layouts_sizes(exact):
+def test_records_and_gradient_records_have_the_columns_of_their_layout(exact):
     layout = RecordLayout(exact, channels=5)
     footprints = Footprints(*(torch.rand(3, *shape) for shape in ((3,), (3, 3), (), (), (6,))))
     footprints = footprints._replace(point=torch.rand(3, 3, dtype=torch.float64))
     records = pack_records(footprints, layout)
-    point, remainder = records.double().split((layout.axes, layout.axes, layout.record_size - 2 * layout.axes), dim=1)[
-        :2
-    ]
-    assert float((point + remainder - footprints.point[:, : layout.axes]).abs().max()) < 1e-14
+    point, residual = records[:, : 2 * layout.axes].double().split(layout.axes, dim=1)
+    assert float((point + residual - footprints.point[:, : layout.axes]).abs().max()) < 1e-14
     assert records.shape == (3, layout.record_size)
-    assert torch.equal(records[:, layout.peak_column], footprints.peak) and torch.equal(
-        records[:, layout.peak_column + 1 :], footprints.values
-    )
+    assert torch.equal(records[:, layout.peak_column], footprints.peak)
+    assert torch.equal(records[:, layout.peak_column + 1 :], footprints.values)
     rows = torch.arange(3.0 * layout.gradient_size).reshape(3, -1)
     back = unpack_gradients(rows, footprints.rows, layout)
     assert torch.equal(back.peak, rows[:, -7]) and torch.equal(back.values, rows[:, -6:])

@@ -1,4 +1,4 @@
-"""All backends, and a comparison with the dense float64 renderer, forward and backward."""
+"""All backends, and their comparison with the dense float64 renderer, forward and backward."""
 
 import dataclasses
 import os
@@ -70,7 +70,7 @@ _NO_TRITON = find_spec("triton") is None and not os.environ.get("CI")
         for name in _RENDERERS
     ]
 )
-def draw(request) -> Renderer:
+def render(request) -> Renderer:
     """A backend."""
     return _RENDERERS[request.param]
 
@@ -82,13 +82,13 @@ def _leaves(scene: Gaussians) -> Gaussians:
 
 @pytest.fixture
 def leaves() -> Callable[[Gaussians], Gaussians]:
-    """The same Gaussians as leaves that require gradients."""
+    """Copy Gaussians to leaves that require gradients."""
     return _leaves
 
 
-def _loss(color: Tensor, alpha: Tensor, mass: Tensor) -> Tensor:
+def _loss(color: Tensor, alpha: Tensor, weighted_depth: Tensor) -> Tensor:
     """A random weighted sum of every pixel's colour, alpha, and alpha x depth."""
-    parts = torch.cat((color.double(), alpha.double()[None], mass.double()[None]))
+    parts = torch.cat((color.double(), alpha.double()[None], weighted_depth.double()[None]))
     weights = torch.rand(parts.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     return (parts * weights).sum()
 
@@ -103,10 +103,10 @@ def loss_of() -> Callable[[Rendering], Tensor]:
 def gradients(leaves, loss_of) -> Callable[..., dict[str, Tensor]]:
     """Gradients of that loss with respect to every field of the scene and the pose."""
 
-    def find(draw: Renderer, scene: Gaussians, pose: Tensor | None = None, **options) -> dict[str, Tensor]:
+    def find(render: Renderer, scene: Gaussians, pose: Tensor | None = None, **options) -> dict[str, Tensor]:
         camera = (torch.eye(4, dtype=torch.float64) if pose is None else pose).clone().requires_grad_()
-        fields = leaves(scene.to(dtype=draw.dtype))
-        loss_of(draw(fields, camera, **options)).backward()
+        fields = leaves(scene.to(dtype=render.dtype))
+        loss_of(render(fields, camera, **options)).backward()
         found = {name: getattr(fields, name).grad for name in _FIELDS}
         return {**found, "pose": camera.grad}
 
@@ -114,38 +114,56 @@ def gradients(leaves, loss_of) -> Callable[..., dict[str, Tensor]]:
 
 
 @pytest.fixture
+def with_threads() -> Callable[[Callable], list]:
+    """Results of a function with one, two and three threads."""
+
+    def call(function: Callable) -> list:
+        before, results = torch.get_num_threads(), []
+        try:
+            for threads in (1, 2, 3):
+                torch.set_num_threads(threads)
+                results.append(function())
+                assert torch.get_num_threads() == threads
+        finally:
+            torch.set_num_threads(before)
+        return results
+
+    return call
+
+
+@pytest.fixture
 def equals_dense(dense, leaves, gradients) -> Callable[..., None]:
-    """Assert that a backend's image and gradients are the dense float64 renderer's."""
+    """Assert that a backend's image and gradients equal those of the dense float64 renderer."""
 
     def check(
-        draw: Renderer,
+        render: Renderer,
         scene: Gaussians,
         pose: Tensor | None = None,
         *,
-        looser: float = 1.0,
+        slack: float = 1.0,
         fields: tuple[str, ...] = _FIELDS,
         **options,
     ) -> None:
         pose = torch.eye(4, dtype=torch.float64) if pose is None else pose
         pinhole = options.get("layout") == "pinhole"
-        size = options.pop("size", draw.size)
-        literal = {key: options[key] for key in ("kernel", "order", "lowpass", "near") if key in options}
+        size = options.pop("size", render.size)
+        dense_options = {key: options[key] for key in ("kernel", "order", "lowpass", "near") if key in options}
         fov = options.get("vertical_fov_degrees", 90.0) if pinhole else None
-        # A float32 backend gets the rounded scene, so the truth is computed from it.
-        truth = leaves(scene.to(dtype=draw.dtype).to(dtype=torch.float64))
-        color, alpha, mass = dense(truth, pose, size, fov=fov, **literal)
-        got = draw(scene, pose, size=size, **options)
-        for found, expected in ((got.color, color), (got.alpha, alpha), (got.depth * got.alpha, mass)):
+        # The scene is rounded to the backend's type first, for the dense renderer too.
+        truth = leaves(scene.to(dtype=render.dtype).to(dtype=torch.float64))
+        color, alpha, weighted_depth = dense(truth, pose, size, fov=fov, **dense_options)
+        got = render(scene, pose, size=size, **options)
+        for found, expected in ((got.color, color), (got.alpha, alpha), (got.depth * got.alpha, weighted_depth)):
             scale = max(1.0, float(expected.detach().abs().max()))
             error = float((found - expected.detach()).abs().max())
-            assert error <= looser * draw.image * scale, f"image off by {error:.2g}"
-        _loss(color, alpha, mass).backward()
-        ours = gradients(draw, scene, pose, size=size, **options)
+            assert error <= slack * render.image * scale, f"image off by {error:.2g}"
+        _loss(color, alpha, weighted_depth).backward()
+        gradients_found = gradients(render, scene, pose, size=size, **options)
         for name in fields:
-            expected, found = getattr(truth, name).grad, ours[name]
+            expected, found = getattr(truth, name).grad, gradients_found[name]
             assert torch.isfinite(found).all(), name
             norm = max(float(expected.norm()), 1e-6)  # a sphere's quaternion has only rounding errors as gradient
             error = float((found - expected).norm()) / norm
-            assert error <= looser * draw.gradient, f"gradient of {name} off by {error:.2g}"
+            assert error <= slack * render.gradient, f"gradient of {name} off by {error:.2g}"
 
     return check

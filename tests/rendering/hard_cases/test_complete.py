@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 CASES = {
-    1: "nothing to draw",
+    1: "an empty scene",
     2: "a single Gaussian",
     3: "a centre on a cube's edge or corner",
     4: "a centre at a pole",

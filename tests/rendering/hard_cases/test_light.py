@@ -26,9 +26,9 @@ _PINHOLE = {"layout": "pinhole", "lowpass": "3dgs"}
         (1e29, 0.99, 0.0),
     ],
 )
-def test_opacity_is_cut_and_clamped_and_has_no_gradient_there(opacity, expected, gradient, draw, balls, leaves):
-    scene = leaves(balls((0, 0, 2.0), 1.9, opacity).to(dtype=draw.dtype))
-    got = draw(scene, size=(5, 5), **_PINHOLE)
+def test_opacity_is_cut_and_clamped_and_has_no_gradient_there(opacity, expected, gradient, render, balls, leaves):
+    scene = leaves(balls((0, 0, 2.0), 1.9, opacity).to(dtype=render.dtype))
+    got = render(scene, size=(5, 5), **_PINHOLE)
     assert float(got.alpha[2, 2].detach()) == pytest.approx(expected, abs=1e-6)
     got.alpha[2, 2].backward()
     assert float(scene.opacities.grad) == pytest.approx(gradient, abs=1e-5)
@@ -45,11 +45,11 @@ def _stack(balls, count: int, opacity: float, depth: float = 1e-6):
 
 
 @pytest.mark.hard_case(18)
-def test_a_million_gaussians_in_one_pixel_give_the_weighted_mean_of_the_first(draw, balls):
-    if draw.interpreted:
+def test_a_million_gaussians_in_one_pixel_give_the_weighted_mean_of_the_first(render, balls):
+    if render.interpreted:
         pytest.skip("takes minutes; the next test saturates a pixel with fewer")
     scene = _stack(balls, 1_000_000, 0.3)
-    got = draw(scene, size=(1, 1), layout="pinhole")
+    got = render(scene, size=(1, 1), layout="pinhole")
     # The angular filter of this large pixel lowers the opacity by a known factor.
     own, wide = (0.9 / 2) ** 2, (0.9 / 2) ** 2 + 0.1 * 4
     opacity = 0.3 * own / wide
@@ -61,16 +61,16 @@ def test_a_million_gaussians_in_one_pixel_give_the_weighted_mean_of_the_first(dr
 
 
 @pytest.mark.hard_case(18)
-def test_gradients_of_a_saturated_pixel_are_exactly_zero_behind_the_front(draw, balls, leaves):
-    count = 300 if draw.interpreted else 3000
-    scene = leaves(_stack(balls, count, 0.95).to(dtype=draw.dtype))
-    got = draw(scene, size=(1, 1), **_PINHOLE)
+def test_gradients_of_a_saturated_pixel_are_exactly_zero_behind_the_front(render, balls, leaves):
+    count = 300 if render.interpreted else 3000
+    scene = leaves(_stack(balls, count, 0.95).to(dtype=render.dtype))
+    got = render(scene, size=(1, 1), **_PINHOLE)
     got.color.sum().backward()
     assert torch.isfinite(got.color).all()
     size = scene.opacities.grad.abs()
     assert torch.isfinite(size).all() and float(size[0]) > 0.01
     assert not size[100:].any()
-    tiny = torch.finfo(draw.dtype).tiny
+    tiny = torch.finfo(render.dtype).tiny
     for field in (scene.means, scene.opacities, scene.harmonics):
         gradient = field.grad.abs()
         # Denormal numbers are slow; the last step of a backend may contain a few.
@@ -81,33 +81,33 @@ def test_gradients_of_a_saturated_pixel_are_exactly_zero_behind_the_front(draw, 
 
 @pytest.mark.hard_case(19)
 @pytest.mark.parametrize("opacity", [0.3, 0.9, 0.999])
-def test_gradients_at_low_transmittance_equal_the_dense_renderers(opacity, draw, balls, equals_dense):
-    draw.skip_interpreted(opacity == 0.9)
+def test_gradients_at_low_transmittance_equal_the_dense_renderers(opacity, render, balls, equals_dense):
+    render.skip_interpreted(opacity == 0.9)
     count = 12
     scene = _stack(balls, count, opacity, depth=0.01)
     shift = 0.2 * torch.randn(count, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     scene = dataclasses.replace(scene, means=scene.means + shift * torch.tensor((1.0, 1, 0)))
-    equals_dense(draw, scene, size=(5, 9), fields=("means", "scales", "opacities", "harmonics"), looser=2, **_PINHOLE)
+    equals_dense(render, scene, size=(5, 9), fields=("means", "scales", "opacities", "harmonics"), slack=2, **_PINHOLE)
 
 
 @pytest.mark.hard_case(20)
-def test_only_pixels_within_rounding_of_the_alpha_cut_may_differ(draw, make_scene, pose, dense):
-    scene = make_scene(40, scale=0.2, degree=0).to(dtype=draw.dtype)
+def test_only_pixels_within_rounding_of_the_alpha_cut_may_differ(render, make_scene, pose, dense):
+    scene = make_scene(40, scale=0.2, degree=0).to(dtype=render.dtype)
     truth = scene.to(dtype=torch.float64)
-    color, _, _ = dense(truth, pose, draw.size)
-    band = torch.zeros(draw.size, dtype=torch.bool)
+    color, _, _ = dense(truth, pose, render.size)
+    band = torch.zeros(render.size, dtype=torch.bool)
     for i in range(len(scene)):
-        _, alpha, _ = dense(truth.select(torch.tensor([i])), pose, draw.size)
+        _, alpha, _ = dense(truth.select(torch.tensor([i])), pose, render.size)
         band |= (alpha > 0) & (alpha < ALPHA_CUT * (1 + 1e-4))
-    off = (draw(scene, pose).color - color).abs().amax(dim=0)
-    assert float(off[~band].max()) < draw.image
+    off = (render(scene, pose).color - color).abs().amax(dim=0)
+    assert float(off[~band].max()) < render.image
     assert float(off.max()) <= ALPHA_CUT * 1.5
 
 
 @pytest.mark.hard_case(20)
-def test_alpha_is_cut_at_one_255th_and_clamped_at_0_99(draw, balls):
+def test_alpha_is_cut_at_one_255th_and_clamped_at_0_99(render, balls):
     def alpha(opacity: float) -> float:
-        return float(draw(balls((0, 0, 2.0), 1.9, opacity), size=(1, 1), **_PINHOLE).alpha)
+        return float(render(balls((0, 0, 2.0), 1.9, opacity), size=(1, 1), **_PINHOLE).alpha)
 
     assert alpha(ALPHA_CUT * (1 - 1e-5)) == 0
     assert alpha(ALPHA_CUT * (1 + 1e-5)) == pytest.approx(ALPHA_CUT, rel=1e-4)
@@ -116,17 +116,17 @@ def test_alpha_is_cut_at_one_255th_and_clamped_at_0_99(draw, balls):
 
 @pytest.mark.hard_case(30)
 @pytest.mark.parametrize("layout", ["equirect", "cubemap", "pinhole"])
-def test_a_white_furnace_has_one_colour(layout, draw, make_scene, pose, leaves):
-    draw.skip_interpreted(layout == "cubemap")
+def test_a_white_furnace_has_one_colour(layout, render, make_scene, pose, leaves):
+    render.skip_interpreted(layout == "cubemap")
     scene = make_scene(30, scale=0.3, degree=0)
     colour = torch.tensor((0.7, 0.3, 0.5), dtype=torch.float64)
     harmonics = ((colour - 0.5) / 0.28209479177387814).expand(30, 1, 3).clone()
-    scene = leaves(dataclasses.replace(scene, harmonics=harmonics).to(dtype=draw.dtype))
-    background = colour.to(draw.dtype).clone().requires_grad_()
-    got = draw(scene, pose, layout=layout, background=background)
+    scene = leaves(dataclasses.replace(scene, harmonics=harmonics).to(dtype=render.dtype))
+    background = colour.to(render.dtype).clone().requires_grad_()
+    got = render(scene, pose, layout=layout, background=background)
     assert float(got.alpha.detach().mean()) > 0.1
-    assert (got.color - colour[:, None, None]).abs().max() < (1e-6 if draw.dtype == torch.float32 else 1e-13)
+    assert (got.color - colour[:, None, None]).abs().max() < (1e-6 if render.dtype == torch.float32 else 1e-13)
     got.color.sum().backward()
     # The weights of the colours and the background have the sum 1 at each pixel.
     weights = scene.harmonics.grad.double().sum(dim=(0, 1)) / 0.28209479177387814 + background.grad.double()
-    assert torch.allclose(weights / math.prod(draw.size), torch.ones(3, dtype=torch.float64), atol=1e-6)
+    assert torch.allclose(weights / math.prod(render.size), torch.ones(3, dtype=torch.float64), atol=1e-6)

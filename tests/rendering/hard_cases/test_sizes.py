@@ -73,45 +73,45 @@ def test_gaussians_that_fill_a_large_panorama_need_bounded_memory():
 
 @pytest.mark.hard_case(28)
 @pytest.mark.parametrize("height", [1, 2, 3, 5, 17, 31, 33, 100])
-def test_odd_sizes_equal_the_dense_renderer(height, draw, balls, equals_dense):
-    draw.skip_interpreted(height not in (1, 5, 17))
+def test_odd_sizes_equal_the_dense_renderer(height, render, balls, equals_dense):
+    render.skip_interpreted(height not in (1, 5, 17))
     generator = torch.Generator().manual_seed(1)
     scene = balls(2 * torch.nn.functional.normalize(torch.randn(5, 3, generator=generator), dim=1), 0.6)
     fields = ("means", "opacities", "harmonics")
-    equals_dense(draw, scene, size=(height, 2 * height + height % 3), fields=fields, looser=4)
-    equals_dense(draw, scene, size=(height, height + 3), layout="pinhole", fields=fields, looser=4)
+    equals_dense(render, scene, size=(height, 2 * height + height % 3), fields=fields, slack=4)
+    equals_dense(render, scene, size=(height, height + 3), layout="pinhole", fields=fields, slack=4)
 
 
 @pytest.mark.hard_case(28)
 @pytest.mark.parametrize("face_size", [1, 2, 3, 5, 7])
-def test_faces_of_any_size_are_stitched(face_size, draw, balls, gradients):
-    draw.skip_interpreted(face_size != 5)
+def test_faces_of_any_size_are_stitched(face_size, render, balls, gradients):
+    render.skip_interpreted(face_size != 5)
     scene = balls([(0.5, 0.3, 1.0), (-1.0, -0.4, -0.3)], 0.5)
     for kernel in ("ray", "ewa"):
         options = {"size": (7, 15), "layout": "cubemap", "face_size": face_size, "kernel": kernel}
-        assert torch.isfinite(draw(scene, **options).color).all()
-        assert all(torch.isfinite(gradient).all() for gradient in gradients(draw, scene, **options).values())
+        assert torch.isfinite(render(scene, **options).color).all()
+        assert all(torch.isfinite(gradient).all() for gradient in gradients(render, scene, **options).values())
 
 
 @pytest.mark.hard_case(28)
-def test_an_image_is_the_centre_of_a_larger_one(draw, make_scene, pose):
+def test_an_image_is_the_centre_of_a_larger_one(render, make_scene, pose):
     """The pixels of a partial tile beyond the edge have no effect."""
     scene, size, margin = make_scene(10, scale=0.3, degree=0), (5, 7), 3
     focal = 4.0
     options = {"layout": "pinhole", "kernel": "ray"}
     small_fov, large_fov = (2 * math.degrees(math.atan(0.5 * h / focal)) for h in (size[0], size[0] + 2 * margin))
-    small = draw(scene, pose, size=size, vertical_fov_degrees=small_fov, **options).color
+    small = render(scene, pose, size=size, vertical_fov_degrees=small_fov, **options).color
     larger = (size[0] + 2 * margin, size[1] + 2 * margin)
-    large = draw(scene, pose, size=larger, vertical_fov_degrees=large_fov, **options).color
-    assert (large[:, margin:-margin, margin:-margin] - small).abs().max() < 4 * draw.image
+    large = render(scene, pose, size=larger, vertical_fov_degrees=large_fov, **options).color
+    assert (large[:, margin:-margin, margin:-margin] - small).abs().max() < 4 * render.image
 
 
 @pytest.mark.hard_case(29)
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_a_handful_of_gaussians_in_a_large_image(count, draw, balls):
-    height = {"torch": 256, "numba": 1024, "triton": 48}[draw.name]
+def test_a_few_gaussians_in_a_large_image_are_visible_at_their_pixels(count, render, balls):
+    height = {"torch": 256, "numba": 1024, "triton": 48}[render.name]
     means = [(0, 0.1, 2.0), (-1.0, 0.2, 0.9), (0.3, -0.5, -1.0)][:count]
-    got = draw(balls(means, 0.1), size=(height, 2 * height))
+    got = render(balls(means, 0.1), size=(height, 2 * height))
     assert got.info is not None and got.info.visible == count
     for x, y, z in means:
         row = int((math.asin(y / math.hypot(x, y, z)) / math.pi + 0.5) * height)
