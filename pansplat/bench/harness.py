@@ -1,6 +1,6 @@
 """Time and memory of one call, in this process or in a child process.
 
-A child process measures memory without what earlier cases left behind, and has its own number of threads.
+In a child process, memory of earlier cases does not count, and the number of threads is its own.
 """
 
 from __future__ import annotations
@@ -58,10 +58,10 @@ def time_call(call: Callable[[], T], device: torch.device) -> tuple[Timing, T]:
 
 
 def peak_memory(call: Callable[[], T], device: torch.device) -> tuple[float | None, T]:
-    """Largest memory during a call beyond what was held before it, 10^6 bytes, and the result of the call.
+    """Largest additional memory during a call, 10^6 bytes, and the result of the call.
 
     On the CPU it is the kernel's high-water mark of the resident memory, reset before the call; on CUDA that of
-    the allocator. None if the system has neither (not Linux).
+    the allocator. None if the system has no such mark (not Linux).
     """
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
@@ -131,7 +131,7 @@ class OverLimitError(CaseFailedError):
 def run_child(
     module: str, job: Mapping[str, object], *, threads: int, limit_gib: float | None = None
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Run `python -m module`, which calls `serve_job`, and return what it measured.
+    """Run `python -m module`, which calls `serve_job`, and return its numbers and tensors.
 
     Args:
         module: name of the module.
@@ -140,7 +140,7 @@ def run_child(
         limit_gib: the child is ended if its resident memory exceeds this, 2^30 bytes.
 
     Raises:
-        OverLimitError: it took more than the limit, or than is available.
+        OverLimitError: it exceeded the limit or the available memory.
         CaseFailedError: it failed otherwise.
     """
     with tempfile.TemporaryDirectory() as name:

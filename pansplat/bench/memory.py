@@ -32,7 +32,7 @@ from pansplat.bench.harness import (
     serve_job,
     time_call,
 )
-from pansplat.bench.report import Column, Report, Row, number, result_column, row_from_json, save_figure
+from pansplat.bench.report import Column, Report, Row, error_column, result_column, row_from_json
 from pansplat.data.views import Batch, Sample, Views, collate
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions
@@ -47,6 +47,7 @@ from pansplat.training.step import TrainingStep, accumulate_gradients
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Work = Literal["inference", "plain", "one-step", "two-step"]
 
@@ -92,7 +93,7 @@ class MemoryCase:
 
     @property
     def kind(self) -> Literal["inference", "training"]:
-        """What its tensors are: a prediction, or gradients."""
+        """Cases of one kind have comparable tensors: those of a prediction, or gradients."""
         return "inference" if self.work == "inference" else "training"
 
     def __str__(self) -> str:
@@ -103,7 +104,7 @@ class MemoryCase:
 
 @dataclass(frozen=True)
 class MemorySetting:
-    """What all cases have in common.
+    """The options that are the same in all cases.
 
     Attributes:
         network: its size; weights are random, the same in each case.
@@ -127,7 +128,7 @@ class MemoryResult:
     """Memory and time of a case.
 
     Attributes:
-        base_gib: held before: Python, libraries, weights, input; on a GPU weights and input. 2^30 bytes.
+        base_gib: held before the case: Python, libraries, weights, input; on a GPU weights and input. 2^30 bytes.
         peak_gib: largest memory, the base included.
         taken_gib: their difference.
         wall_s, processor_s: elapsed seconds, and those of all threads together.
@@ -149,10 +150,10 @@ MemoryRow = Row[MemoryCase, MemoryResult]
 
 
 def memory_cases(heights: Sequence[int], *, quick: bool) -> list[MemoryCase]:
-    """By height, inference before training; the first of each kind keeps everything in memory and is the reference.
+    """The cases by height, inference before training; the first of each kind is the reference: it has no tiles.
 
     Args:
-        quick: leave out one-step, and all tiles but the fewest and the most.
+        quick: leave out one-step backpropagation and the middle number of tiles.
     """
     tiles = (1, 4) if quick else _TILES
     works: tuple[Work, ...] = ("inference", "plain", "two-step") if quick else get_args(Work)
@@ -230,7 +231,7 @@ class MemoryBench:
 def expected_gib(case: MemoryCase, rows: Sequence[MemoryRow]) -> float:
     """Upper bound of a case's memory from the same work at the next smaller height; 0 if that is unknown.
 
-    Rows up to the height at which all of the network is trained say nothing about training above it.
+    Above some height only a part of the network is trained, so rows at or below it do not bound training above it.
     """
     smaller = [
         row
@@ -279,7 +280,7 @@ def measure_case(case: MemoryCase, setting: MemorySetting, weights: Path) -> tup
         The result; gradients by name, or means, opacities and image of a prediction.
 
     Raises:
-        OverLimitError: it took more than the limit, or than is available.
+        OverLimitError: it exceeded the limit or the available memory.
         CaseFailedError: it failed otherwise.
     """
     job = {"case": dataclasses.asdict(case), "setting": dataclasses.asdict(setting), "weights": str(weights)}
@@ -298,7 +299,7 @@ def _measure_job(job: Mapping[str, Any]) -> tuple[dict[str, object], dict[str, T
     network = PanSplat(network_config(setting.network), "fixed")
     network.load_state_dict(read_weights(Path(job["weights"])).tensors)
     work = _prepare_work(case, setting, network.to(device))
-    work(painted_sphere(_WARM_UP_HEIGHT).to(device))  # compiles and loads what the measured call needs
+    work(painted_sphere(_WARM_UP_HEIGHT).to(device))  # compiles kernels and loads libraries
     batch = painted_sphere(case.height).to(device)
     gc.collect()
     release_idle_memory()
@@ -352,7 +353,7 @@ def _frozen_parts(height: int) -> tuple[str, ...]:
 
 
 def painted_sphere(height: int) -> Batch:
-    """Two views and one target inside a painted sphere: a scene of any size that needs no files."""
+    """Two views and one target inside a painted sphere, at any height and without files."""
     generator = torch.Generator().manual_seed(0)
     waves, phases = 2 * torch.randn(3, 3, generator=generator), torch.randn(3, generator=generator)
     rays = pixel_directions(height, 2 * height, dtype=torch.float32)
@@ -388,9 +389,6 @@ def memory_report(
     device = machine["gpu"] if setting.device == "cuda" else machine["cpu"]
     title = f"{setting.network} network, batch 1, {setting.style} images, {setting.perceptual} loss; {device}"
 
-    def plot(rows: Sequence[MemoryRow], path: Path) -> bool:
-        return plot_memory(rows, path, title)
-
     def missing_rows(rows: Sequence[MemoryRow]) -> list[str]:
         missing = len(set(cases) - {row.case for row in rows})
         return [f"{missing} of {len(cases)} rows are still to be measured"] if missing else []
@@ -403,17 +401,13 @@ def memory_report(
         findings=missing_rows,
         json_file=None if out is None else out / "memory.json",
         page=None if out is None else out / "memory.md",
-        plots={} if out is None else {out / "memory.png": plot},
+        plots={} if out is None else {out / "memory.png": lambda rows: plot_memory(rows, title)},
         print_steps=True,
     )
 
 
 def _tile_count(tiles: int) -> str:
     return "untiled" if tiles == 1 else f"{tiles**2} tiles"
-
-
-def _deviation(row: MemoryRow) -> str:
-    return "reference" if row.is_reference else number(row.result.deviation, "{:.1e}")
 
 
 MEMORY_COLUMNS: tuple[Column[MemoryRow], ...] = (
@@ -425,20 +419,16 @@ MEMORY_COLUMNS: tuple[Column[MemoryRow], ...] = (
     result_column("taken GiB", "{:.2f}", "taken_gib"),
     result_column("seconds", "{:.1f}", "wall_s"),
     result_column("processor s", "{:.1f}", "processor_s"),
-    Column("deviation", _deviation),
+    error_column("deviation", "{:.1e}", "deviation"),
     Column("", lambda row: "" if row.status == "measured" else f"{row.status}: {row.note}", "left"),
 )
 
 
-def plot_memory(rows: Sequence[MemoryRow], path: Path, title: str) -> bool:
-    """Plot the taken memory over the height, training and inference apart; False if there is nothing to plot.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+def plot_memory(rows: Sequence[MemoryRow], title: str) -> Figure | None:
+    """Plot the taken memory over the height for training and for inference; None if there is nothing to plot."""
     shown = [row for row in rows if row.result.taken_gib]
     if not shown:
-        return False
+        return None
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 5.5), layout="constrained")
@@ -455,8 +445,7 @@ def plot_memory(rows: Sequence[MemoryRow], path: Path, title: str) -> bool:
         axes.minorticks_off()
         axes.grid(alpha=0.25)
     figure.suptitle(title, x=0.01, ha="left", fontsize=10)
-    save_figure(figure, path)
-    return True
+    return figure
 
 
 def _plot_kind(axes: Axes, rows: Sequence[MemoryRow], kind: str) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import safetensors.torch
 import torch
@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from pansplat.bench.fidelity import clamped_psnr, relative_depth_errors
 from pansplat.bench.harness import CaseFailedError, reset_resident_peak, resident_peak, run_child, serve_job
-from pansplat.bench.report import Column, Report, Row, number, result_column, save_figure
+from pansplat.bench.report import Column, Report, Row, error_column, format_number, result_column
 from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
@@ -33,6 +33,9 @@ from pansplat.model.network import build_network
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
 from pansplat.model.weights import load_weights, pack_weights, save_weights
 from pansplat.pipeline import render
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 STAGES = ("features", "mono", "cost volume", "heads")
 _STAGE_COLORS = ("#1764ab", "#6aaed6", "#e0a030", "#c8501e")
@@ -144,8 +147,7 @@ def measure_model(
                 errors = relative_depth_errors(tensors["depth"], reference["depth"])
                 result.depth_median_error, result.depth_max_error = errors
                 result.psnr_db = clamped_psnr(tensors["image"], reference["image"])
-            report.rows.append(row)
-            report.update()
+            report.add(row)
 
 
 @contextmanager
@@ -215,7 +217,7 @@ def _measure_job(job: Mapping[str, Any]) -> tuple[dict[str, object], dict[str, T
 
 
 def _warm_up(case: ModelCase) -> None:
-    """Compile and load what the measured prediction needs, with a narrow network."""
+    """Predict with a narrow network, so that kernels are compiled and libraries loaded before the measurement."""
     network = PanSplat(
         _WARM_UP_CONFIG, case.compat, precision=case.precision, attention_precision=case.attention
     ).eval()
@@ -259,15 +261,12 @@ def model_report(
 
     Args:
         machine: from `describe_machine`.
-        network: what its weights are.
+        network: a description of its weights.
         height: of the panoramas, pixels.
         json: file of the rows.
         out: folder for model.md and model.png.
     """
     size = f"{height}x{2 * height}"
-
-    def plot(rows: Sequence[ModelRow], path: Path) -> bool:
-        return plot_model(rows, path, f"{size}, {machine['cpu']}")
 
     return Report(
         MODEL_COLUMNS,
@@ -277,7 +276,7 @@ def model_report(
         facts=("cpu", "threads", "fma_gflops"),
         json_file=json,
         page=None if out is None else out / "model.md",
-        plots={} if out is None else {out / "model.png": plot},
+        plots={} if out is None else {out / "model.png": lambda rows: plot_model(rows, f"{size}, {machine['cpu']}")},
         print_steps=True,
         width=190,
     )
@@ -291,16 +290,8 @@ def _threads(case: ModelCase) -> str:
     return "1 thread" if case.threads == 1 else f"{case.threads} threads"
 
 
-def _depth_median(row: ModelRow) -> str:
-    return "reference" if row.is_reference else number(row.result.depth_median_error, "{:.1e}")
-
-
-def _decibels(row: ModelRow) -> str:
-    return "same" if row.result.psnr_db == math.inf else number(row.result.psnr_db, "{:.1f}")
-
-
 def _stage_column(stage: str) -> Column[ModelRow]:
-    return Column(f"{stage} s", lambda row: number(row.result.stages_s.get(stage), "{:.1f}"))
+    return Column(f"{stage} s", lambda row: format_number(row.result.stages_s.get(stage), "{:.1f}"))
 
 
 MODEL_COLUMNS: tuple[Column[ModelRow], ...] = (
@@ -313,20 +304,14 @@ MODEL_COLUMNS: tuple[Column[ModelRow], ...] = (
     result_column("total s", "{:.1f}", "total_s"),
     result_column("processor s", "{:.1f}", "processor_s"),
     result_column("peak GiB", "{:.2f}", "peak_gib"),
-    Column("depth median", _depth_median),
+    error_column("depth median", "{:.1e}", "depth_median_error"),
     result_column("depth max", "{:.1e}", "depth_max_error"),
-    Column("PSNR dB", _decibels),
+    result_column("PSNR dB", "{:.1f}", "psnr_db"),
 )
 
 
-def plot_model(rows: Sequence[ModelRow], path: Path, title: str) -> bool:
-    """Plot each row's seconds by stage and its memory as bars; False if there is nothing to plot.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    if not rows:
-        return False
+def plot_model(rows: Sequence[ModelRow], title: str) -> Figure:
+    """Plot each row's seconds by stage and its memory as bars."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 1.5 + 0.4 * len(rows)), layout="constrained")
@@ -345,8 +330,7 @@ def plot_model(rows: Sequence[ModelRow], path: Path, title: str) -> bool:
     right.set(xlabel="largest resident memory, GiB")
     for axes in (left, right):
         axes.grid(axis="x", alpha=0.25)
-    save_figure(figure, path)
-    return True
+    return figure
 
 
 def _bar_name(case: ModelCase) -> str:

@@ -29,7 +29,7 @@ from pansplat.bench.renderers import (
     render_with_graph,
     warm_up,
 )
-from pansplat.bench.report import Column, Report, Row, number, result_column, save_figure
+from pansplat.bench.report import Column, Report, Row, result_column
 from pansplat.bench.roofline import BACKWARD_OPERATIONS, FORWARD_OPERATIONS, Work, panorama_work
 from pansplat.constants import NEAR
 from pansplat.gaussians.scene import Gaussians
@@ -37,6 +37,7 @@ from pansplat.rendering.rasterize import RasterOptions
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _MIN_REPEATS, _MAX_REPEATS = 3, 15  # of fast cases
 _MARKERS = {"numba": "o", "torch": "s", "triton": "D", "gl33": "^", "gl43": "v", "gsplat": "P", "dense": "X"}
@@ -60,7 +61,7 @@ class RasterResult:
         backward_ms, backward_min_ms, backward_spread_ms: of the backward pass alone, to all fields of the Gaussians.
         forward_cpu_ms, backward_cpu_ms: minimum of the processor time, of all threads together.
         repeats: number of timed images.
-        peak_mb: largest memory beyond what was held before, forward without gradients, 10^6 bytes.
+        peak_mb: largest additional memory of the forward pass without gradients, 10^6 bytes.
         backward_peak_mb: likewise, of forward and backward together.
         psnr_db, max_error, seam_jump, energy_error: see `fidelity.Fidelity`.
         stages_ms: by the backend's own clock, of the fastest forward pass.
@@ -199,7 +200,7 @@ class RasterBench:
             result.stages_ms = {"sort": image.sort_ms, "draw": max(0.0, result.forward_ms - image.sort_ms)}
             result.set_errors(case, image.color, *references[image.index])
             row.note = f"rendered by {image.renderer}"
-            self._add(row)
+            self._report.add(row)
 
     def _load(self, scene: BenchScene) -> None:
         if scene is self._scene:
@@ -217,7 +218,7 @@ class RasterBench:
             self._report.update(f"{case}: first image")
             measurement = _Measurement(self._new_row(group, case))
             measurement.row.result.set_errors(case, self._render_first(measurement).color, *references)
-            self._add(measurement.row)
+            self._report.add(measurement.row)
             measurements.append(measurement)
         while not all(measurement.is_done for measurement in measurements):
             for measurement in measurements:
@@ -244,16 +245,12 @@ class RasterBench:
             color = self._references[key] = self._render_first(measurement).color
             exact = color if case == case.exact else self._reference_image(group, case.exact)
             measurement.row.result.set_errors(case, color, exact, None)
-            self._add(measurement.row)
+            self._report.add(measurement.row)
         return self._references[key]
 
     def _new_row(self, group: Group, case: RasterCase) -> RasterRow:
         assert self._gaussians is not None
         return Row(group.suite, group.scene.name, case, RasterResult(len(self._gaussians)))
-
-    def _add(self, row: RasterRow) -> None:
-        self._report.rows.append(row)
-        self._report.update()
 
     def _render_first(self, measurement: _Measurement) -> RenderedImage:
         """Render the first image: warm up, measure the memory, choose the number of repeats."""
@@ -308,7 +305,7 @@ class RasterBench:
         return timing
 
     def _set_fractions_of_peaks(self, measurement: _Measurement) -> None:
-        """Set what fraction of the machine's arithmetic and bandwidth a direct panorama reached."""
+        """Set the fractions of the machine's arithmetic and bandwidth that a direct panorama reached."""
         case, result = measurement.case, measurement.row.result
         if case.layout != "equirect" or case.backend not in ("torch", "numba"):
             return
@@ -336,7 +333,7 @@ def raster_report(
     """The report of a run.
 
     Args:
-        machine: from `describe_machine`; its peaks are what the rows are compared with.
+        machine: from `describe_machine`; the rows are compared with its peaks.
         json: file of the rows.
         plot: time against error; the costs over counts and resolutions go to a second file, NAME_sweeps.
         page: tables in Markdown.
@@ -344,12 +341,11 @@ def raster_report(
     plots = {} if plot is None else {
         plot: plot_choices, plot.with_name(f"{plot.stem}_sweeps{plot.suffix}"): plot_sweeps
     }  # fmt: skip
-    facts = ("cpu", "threads", "gpu", "fma_gflops", "bandwidth_gb_s")
     return Report(
         RASTER_COLUMNS,
         _section,
         machine,
-        facts=facts,
+        facts=("cpu", "threads", "gpu", "fma_gflops", "bandwidth_gb_s"),
         findings=raster_findings,
         json_file=json,
         page=page,
@@ -384,10 +380,6 @@ def _layout(row: RasterRow) -> str:
     return f"{row.case.layout}{faces}{' official' if row.case.stitching == 'official' else ''}"
 
 
-def _decibels(row: RasterRow) -> str:
-    return "exact" if row.result.max_error == 0 else number(row.result.psnr_db, "{:.1f}")
-
-
 RASTER_COLUMNS: tuple[Column[RasterRow], ...] = (
     Column("renderer", _renderer, "left"),
     Column("kernel", lambda row: row.case.kernel, "left"),
@@ -402,7 +394,7 @@ RASTER_COLUMNS: tuple[Column[RasterRow], ...] = (
     _times("backward ms", "backward_ms", "backward_spread_ms"),
     _times("CPU", "backward_cpu_ms"),
     result_column("peak MB", "{:,.0f}", "peak_mb"),
-    Column("PSNR dB", _decibels),
+    result_column("PSNR dB", "{:.1f}", "psnr_db"),
     result_column("max error", "{:.1e}", "max_error"),
     result_column("seam", "{:.1e}", "seam_jump"),
     result_column("energy", "{:+.2%}", "energy_error"),
@@ -512,12 +504,8 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     return front
 
 
-def plot_choices(rows: Sequence[RasterRow], path: Path) -> bool:
-    """Plot the root mean square error over the time, both logarithmic; False if there is nothing to plot.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+def plot_choices(rows: Sequence[RasterRow]) -> Figure | None:
+    """Plot the root mean square error over the time, both logarithmic; None if there is nothing to plot."""
     from matplotlib.figure import Figure
 
     shown, points = [], []
@@ -527,7 +515,7 @@ def plot_choices(rows: Sequence[RasterRow], path: Path) -> bool:
             shown.append(row)
             points.append((result.forward_ms, max(_MIN_ERROR, 10 ** (-result.psnr_db / 20))))
     if not shown:
-        return False
+        return None
     figure = Figure(figsize=(10, 6.5), layout="constrained")
     axes = figure.subplots()
     for row, (x, y) in zip(shown, points, strict=True):
@@ -547,8 +535,7 @@ def plot_choices(rows: Sequence[RasterRow], path: Path) -> bool:
     decibels.set_yticks([10.0**-k for k in range(9)], [f"{20 * k} dB" for k in range(9)])
     _add_choice_legend(axes, shown)
     axes.grid(alpha=0.25)
-    save_figure(figure, path)
-    return True
+    return figure
 
 
 def _choice_name(row: RasterRow) -> str:
@@ -585,18 +572,14 @@ def _add_choice_legend(axes: Axes, rows: Sequence[RasterRow]) -> None:
     axes.legend(fontsize=8, loc="best")
 
 
-def plot_sweeps(rows: Sequence[RasterRow], path: Path) -> bool:
-    """Plot the minimum times over the number of Gaussians and of pixels; False if there is nothing to plot.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+def plot_sweeps(rows: Sequence[RasterRow]) -> Figure | None:
+    """Plot the minimum times over the number of Gaussians and of pixels; None if there is nothing to plot."""
     from matplotlib.figure import Figure
 
     timed = [row for row in rows if row.result.forward_ms]
     sweeps = {suite: [row for row in timed if row.suite == suite] for suite in ("count", "resolution")}
     if not any(sweeps.values()):
-        return False
+        return None
     figure = Figure(figsize=(11, 4.5), layout="constrained")
     left, right = figure.subplots(1, 2)
     heights = {row.case.height for row in sweeps["count"]}
@@ -607,8 +590,7 @@ def plot_sweeps(rows: Sequence[RasterRow], path: Path) -> bool:
     right.set(xlabel="height of the panorama, pixels", title="image size, scene of the same size")
     for axes in (left, right):
         axes.set_ylabel("milliseconds, minimum of the repeats")
-    save_figure(figure, path)
-    return True
+    return figure
 
 
 def _plot_curves(axes: Axes, rows: Sequence[RasterRow], x: Callable[[RasterRow], int]) -> None:

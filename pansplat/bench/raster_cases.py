@@ -1,6 +1,6 @@
 """Cases of the raster benchmark: ways to render an image, in groups that answer one question on one scene.
 
-The quick run compares all choices at a fraction of the height, and the main ones at the full height.
+The quick run compares all choices at a reduced height, and the main ones at the full height.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from pansplat.rendering.rasterize import Kernel, Lowpass, Order
 Precision = Literal["float32", "float64"]
 References = Literal["own", "exact", "none"]
 
-DENSE_HEIGHT = 64  # a renderer without tiles takes seconds for it
+DENSE_HEIGHT = 64  # at which a renderer without tiles takes seconds
 _BYTES_PER_GAUSSIAN = 600  # upper bound: the scene, its gradients and the renderer's buffers
 _MAX_TORCH_GAUSSIANS = 4_000_000  # the torch reference renders them in minutes
 _MAX_CHOICE_HEIGHT = 512  # pixels: every choice needs a float64 reference of its own
@@ -148,7 +148,7 @@ def official_choice(backend: str, height: int, threads: int) -> RasterCase:
 
 @dataclass(frozen=True)
 class Settings:
-    """What a run measures.
+    """Extent of a run.
 
     Attributes:
         height: of the largest images of the comparison, pixels.
@@ -188,7 +188,7 @@ class Settings:
 
 
 def room_scene(height: int) -> BenchScene:
-    """The synthetic room from between its cameras, a little off their line.
+    """The synthetic room, rendered from a pose between its cameras and slightly off the line through them.
 
     The camera is rotated so that no wall is parallel to a cube face: all points of such a wall have one depth, and
     order "z" would depend on rounding.
@@ -200,7 +200,7 @@ def room_scene(height: int) -> BenchScene:
 
 
 def raster_groups(settings: Settings, scene_of: Callable[[int], BenchScene], *, synthetic: bool) -> list[Group]:
-    """All groups of a scene, the most informative first.
+    """All groups of a scene, the most important first.
 
     Args:
         scene_of: the scene for a height.
@@ -235,7 +235,7 @@ def sample_group(settings: Settings, scene: BenchScene) -> Group:
 
 
 def viewer_group(settings: Settings, scene: BenchScene) -> Group:
-    """The choices that the viewer has, for comparison with the other renderers' choices."""
+    """The choices that the viewer supports."""
     height = settings.choice_height
     sizes = (default_face_size(height),) if settings.quick else settings.face_sizes
     cases = [case for case in all_choices("gl", height, sizes, settings.threads) if case.layout == "cubemap"]

@@ -1,6 +1,6 @@
-"""Renders the cases of the raster benchmark: the backends of `pansplat.rasterize`, and three others to compare with.
+"""Renders the cases of the raster benchmark with the backends of `pansplat.rasterize` and three other renderers.
 
-The others are a dense renderer in torch, gsplat, and the viewer's OpenGL renderer in a process of its own.
+The others are a dense renderer in torch, gsplat, and the viewer's OpenGL renderer in a separate process.
 """
 
 from __future__ import annotations
@@ -209,11 +209,11 @@ def _render_dense_block(
 
 
 def render_gsplat(
-    case: RasterCase, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], *, near: float = NEAR
+    case: RasterCase, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "channel height width"]:
-    """A panorama of six cube faces by gsplat (CUDA only), EWA kernel and z order, stitched as ours are.
+    """A panorama from six cube faces by gsplat (CUDA only), EWA kernel and z order, stitched like pansplat's.
 
-    Not tested: there was no machine with gsplat. The options follow gsplat's documentation of `rasterization`.
+    Not tested. The options follow gsplat's documentation of `rasterization`.
 
     Raises:
         InputError: gsplat is not installed, or does not render such an image.
@@ -237,7 +237,7 @@ def render_gsplat(
         Ks=intrinsics.expand(6, 3, 3),
         width=side,
         height=side,
-        near_plane=near,
+        near_plane=NEAR,
         eps2d=FILTER_VARIANCE[case.filter],
         sh_degree=gaussians.degree,
         packed=False,
@@ -311,7 +311,7 @@ def _viewer_settings(case: RasterCase) -> dict[str, object]:
 
 
 def _viewer_output(job: Path, threads: int) -> Iterator[dict[str, Any]]:
-    """The lines that the viewer's command prints, each as soon as it comes."""
+    """Yield the lines that the viewer's command prints, each as soon as it is printed."""
     environment = os.environ | {"LP_NUM_THREADS": str(threads)}  # of Mesa's software OpenGL
     command = [sys.executable, "-m", f"{_VIEWER_PACKAGE}.timing", str(job)]
     with (

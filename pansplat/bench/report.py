@@ -30,11 +30,11 @@ class Row(Generic[Case, Result]):
     """One benchmark case and its result.
 
     Attributes:
-        suite: the question that the case belongs to.
-        scene: name of what was rendered or predicted.
+        suite: the question that the case answers.
+        scene: name of the rendered or predicted scene.
         case: the configuration.
-        result: what was measured; None in a field means not measured.
-        status: whether it was measured, or why not.
+        result: the measured values; None in a field means not measured.
+        status: whether the case was measured, or why not.
         is_reference: whether other rows are compared with this one.
         note: additional information.
     """
@@ -93,12 +93,19 @@ class Column(Generic[AnyRow]):
 
 def result_column(title: str, form: str, name: str) -> Column[Any]:
     """The column of a field of the result."""
-    return Column(title, lambda row: number(getattr(row.result, name), form))
+    return Column(title, lambda row: format_number(getattr(row.result, name), form))
 
 
-def number(value: float | None, form: str) -> str:
-    """The text of a cell; empty for None."""
-    return "" if value is None else form.format(value)
+def error_column(title: str, form: str, name: str) -> Column[Any]:
+    """The column of an error against the reference row."""
+    return Column(
+        title, lambda row: "reference" if row.is_reference else format_number(getattr(row.result, name), form)
+    )
+
+
+def format_number(value: float | None, form: str) -> str:
+    """The text of a cell: empty for None, "exact" for an infinite PSNR."""
+    return "" if value is None else "exact" if value == math.inf else form.format(value)
 
 
 def terminal_table(columns: Sequence[Column[AnyRow]], rows: Iterable[AnyRow], title: str) -> Table:
@@ -132,21 +139,11 @@ def write_rows(path: Path, header: Mapping[str, object], rows: Iterable[Row[Any,
         partial.write_text(text + "\n")
 
 
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    with replacing(path) as partial:
-        figure.savefig(partial, dpi=110)
-
-
 @dataclass
 class Report(Generic[AnyRow]):
     """The rows of one run: shown while they are measured, printed and written at the end.
 
-    As a context manager it prints and writes what was measured even if the run was interrupted.
+    As a context manager it prints and writes the measured rows even if the run was interrupted.
 
     Attributes:
         columns: of the tables.
@@ -157,10 +154,10 @@ class Report(Generic[AnyRow]):
         findings: sentences about all rows, for the terminal and the page.
         json_file: written after every step.
         page: Markdown, written at the end.
-        plots: functions that write plots, by file; they return False if there is nothing to plot.
+        plots: functions that plot the rows, by file; they return None if there is nothing to plot.
         print_steps: print each step if there is no terminal.
         width: characters of a printed line if there is no terminal.
-        rows: what was measured so far.
+        rows: measured so far.
     """
 
     columns: Sequence[Column[AnyRow]]
@@ -172,7 +169,7 @@ class Report(Generic[AnyRow]):
     findings: Callable[[Sequence[AnyRow]], list[str]] = lambda rows: []
     json_file: Path | None = None
     page: Path | None = None
-    plots: Mapping[Path, Callable[[Sequence[AnyRow], Path], bool]] = field(default_factory=dict)
+    plots: Mapping[Path, Callable[[Sequence[AnyRow]], Figure | None]] = field(default_factory=dict)
     print_steps: bool = False
     width: int = 150
     rows: list[AnyRow] = field(default_factory=list)
@@ -192,6 +189,11 @@ class Report(Generic[AnyRow]):
         self._print()
         for file in self._write():
             print(file)
+
+    def add(self, row: AnyRow) -> None:
+        """Add a measured row, write the JSON file and show the last rows."""
+        self.rows.append(row)
+        self.update()
 
     def update(self, step: str = "") -> None:
         """Write the JSON file and show the last rows and the step that follows."""
@@ -241,7 +243,13 @@ class Report(Generic[AnyRow]):
             with replacing(self.page) as partial:
                 partial.write_text(self.markdown())
             written.append(self.page)
-        return written + [path for path, plot in self.plots.items() if plot(self.rows, path)]
+        for path, plot in self.plots.items():
+            figure = plot(self.rows)
+            if figure is not None:
+                with replacing(path) as partial:
+                    figure.savefig(partial, dpi=110)
+                written.append(path)
+        return written
 
 
 def print_facts(facts: Mapping[str, object]) -> None:

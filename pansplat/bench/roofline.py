@@ -1,12 +1,12 @@
-"""The machine's peaks, and the arithmetic and memory traffic that an image needs at least.
+"""The machine's peaks, and the least arithmetic and memory traffic of an image.
 
 Peaks are measured with small kernels: independent chains of fused multiply-adds in registers, and the triad
 a = b + s c over arrays far larger than the caches (12 bytes an element are counted, as in STREAM; writing also reads
 the cache line, so that 16 move).
 
 The work of an image follows from the scene alone and bounds that of any tiled renderer from below: pixel centres inside
-each Gaussian's exact box (docs/rendering.md, section 5), hidden or not; and the traffic of reading the scene once,
-writing a record of 80 bytes per Gaussian, reading it once per tile of 32 x 32 pixels, and writing the image.
+each Gaussian's exact box (docs/rendering.md, section 5), hidden pixels included; and the traffic of reading the scene
+once, writing a record of 80 bytes per Gaussian, reading it once per tile of 32 x 32 pixels, and writing the image.
 """
 
 import contextlib
@@ -195,7 +195,7 @@ class Work:
 
 @torch.no_grad()
 def panorama_work(gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], height: int, options: RasterOptions) -> Work:
-    """The least work of rendering a panorama; counted for the exact kernel whatever `options.kernel` is."""
+    """The least work of rendering a panorama; counted for the exact kernel, independently of `options.kernel`."""
     size = (height, 2 * height)
     (plane,) = image_planes("equirect", size, vertical_fov_degrees=90.0, face_size=None, device=torch.device("cpu"))
     pairs = intersections = 0

@@ -156,4 +156,4 @@ def test_cells_of_unmeasured_values_are_empty():
     row = ModelRow("model", "room", PLAIN, ModelResult(64))
     assert [column.cell(row) for column in MODEL_COLUMNS][5:] == [""] * 10
     row.result = ModelResult(64, depth_median_error=0.0, depth_max_error=0.0, psnr_db=math.inf)
-    assert [column.cell(row) for column in MODEL_COLUMNS][-3:] == ["0.0e+00", "0.0e+00", "same"]
+    assert [column.cell(row) for column in MODEL_COLUMNS][-3:] == ["0.0e+00", "0.0e+00", "exact"]

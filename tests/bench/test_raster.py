@@ -233,7 +233,7 @@ def test_the_front_is_what_no_other_point_beats(points):
     assert ordered == sorted(ordered, key=lambda point: (point[0], -point[1]))
 
 
-def test_plots_are_written(row, tmp_path):
+def test_plots_are_made_of_the_rows_of_their_suites(row, tmp_path):
     choices = [
         change(row, suite="choices"),
         change(row, suite="choices", backend="torch", precision="float64", psnr_db=math.inf),
@@ -242,8 +242,6 @@ def test_plots_are_written(row, tmp_path):
     counts = [change(row, suite="count"), change(row, suite="count", num_gaussians=20, backward_min_ms=9.0)]
     sweeps = counts + [change(one, suite="resolution", height=16 * n) for n, one in enumerate(counts, 1)]
     for plot, rows in ((plot_choices, choices), (plot_sweeps, sweeps)):
-        assert plot(rows, tmp_path / "plot.png")
+        plot(rows).savefig(tmp_path / "plot.png")
         assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
-        (tmp_path / "plot.png").unlink()
-        assert not plot([change(row, suite="dense")], tmp_path / "none.png")
-    assert not list(tmp_path.iterdir())
+        assert plot([change(row, suite="dense")]) is None

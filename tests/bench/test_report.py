@@ -6,9 +6,10 @@ import math
 from dataclasses import dataclass, field
 
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console
 
-from pansplat.bench.report import Column, Report, Row, number, row_from_json, write_rows
+from pansplat.bench.report import Column, Report, Row, format_number, row_from_json, write_rows
 from pansplat.errors import InputError
 
 
@@ -25,7 +26,7 @@ class Result:
 
 COLUMNS = (
     Column("height", lambda row: str(row.case.height)),
-    Column("seconds", lambda row: number(row.result.seconds, "{:.1f}")),
+    Column("seconds", lambda row: format_number(row.result.seconds, "{:.1f}")),
     Column("", lambda row: row.note, "left"),
 )
 
@@ -85,14 +86,14 @@ def test_markdown_holds_the_findings_and_the_tables():
 
 def test_an_interrupted_run_is_printed_and_written(tmp_path, capsys):
     files = {"json_file": tmp_path / "rows.json", "page": tmp_path / "page.md"}
-    plots = {tmp_path / "a.png": lambda rows, path: bool(path.write_text("plot")), tmp_path / "b.png": lambda *_: False}
+    plots = {tmp_path / "a.png": lambda rows: Figure(), tmp_path / "b.png": lambda rows: None}
     with pytest.raises(KeyboardInterrupt), report(**files, plots=plots, facts=("cpu", "gpu")) as page:
         page.update("the first row")
-        page.rows.append(row(16, seconds=2.0))
-        page.update()
+        page.add(row(16, seconds=2.0))
         raise KeyboardInterrupt
     assert len(json.loads(files["json_file"].read_text())["rows"]) == 1
     assert "### Speed: 16" in files["page"].read_text()
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG") and not (tmp_path / "b.png").exists()
     printed = capsys.readouterr().out
     assert "cpu             some" in printed and "gpu             none" in printed and "speed: 16" in printed
     assert printed.split()[-3:] == [str(tmp_path / name) for name in ("rows.json", "page.md", "a.png")]

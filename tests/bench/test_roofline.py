@@ -47,16 +47,16 @@ def test_the_machine_is_described(fast_peaks):
     assert machine["versions"]["torch"]
 
 
-def one(gaussians: Gaussians, index: int) -> Gaussians:
+def select_one(gaussians: Gaussians, index: int) -> Gaussians:
     return gaussians.select(torch.tensor([index]))
 
 
 def test_pairs_are_the_pixels_of_a_tight_box():
     room = full_lattice_room(16, views=1)
     for index in range(0, len(room), 37):
-        alpha = rasterize(one(room, index), POSE, size=(16, 32), backend="torch").alpha
+        alpha = rasterize(select_one(room, index), POSE, size=(16, 32), backend="torch").alpha
         shown = alpha > 0
-        pairs = panorama_work(one(room, index), POSE, 16, OPTIONS).pairs
+        pairs = panorama_work(select_one(room, index), POSE, 16, OPTIONS).pairs
         rows, columns = int(shown.any(dim=1).sum()), int(shown.any(dim=0).sum())
         assert int(shown.sum()) <= pairs
         assert pairs <= (rows + 1) * (columns + 1) or rows * columns == 0 or columns > 16
@@ -65,7 +65,7 @@ def test_pairs_are_the_pixels_of_a_tight_box():
 def test_work_is_a_sum_over_gaussians():
     room = full_lattice_room(8)
     whole = panorama_work(room, POSE, 16, OPTIONS)
-    assert whole.pairs == sum(panorama_work(one(room, i), POSE, 16, OPTIONS).pairs for i in range(len(room)))
+    assert whole.pairs == sum(panorama_work(select_one(room, i), POSE, 16, OPTIONS).pairs for i in range(len(room)))
 
 
 def test_traffic_is_that_of_the_scene_its_records_and_the_image():
@@ -83,7 +83,7 @@ def test_gaussians_nearer_than_near_have_no_work():
 
 def test_a_gaussian_around_the_camera_counts_every_pixel_once():
     room = full_lattice_room(8)
-    around = one(room, 0)
+    around = select_one(room, 0)
     around = replace(around, scales=torch.full((1, 3), 50.0), opacities=torch.ones(1))
     assert panorama_work(around, POSE, 16, OPTIONS).pairs == 16 * 32
     below = replace(around, means=torch.tensor([[0.0, 1.2, 0.0]]), scales=torch.full((1, 3), 0.15))
