@@ -37,11 +37,10 @@ class MaterialGraph:
                 socket.default_value = value
         return node
 
-    def stretched(self, scale: Color, turn: float = 0.0) -> bpy.types.NodeSocket:
+    def stretch_position(self, scale: Color, turn: float = 0.0) -> bpy.types.NodeSocket:
         """The position, rotated about z by `turn` radians and scaled per axis."""
-        return self.add("ShaderNodeMapping", Vector=self.position, Scale=scale, Rotation=(0.0, 0.0, turn)).outputs[
-            "Vector"
-        ]
+        node = self.add("ShaderNodeMapping", Vector=self.position, Scale=scale, Rotation=(0.0, 0.0, turn))
+        return node.outputs["Vector"]
 
     def noise(self, vector: bpy.types.NodeSocket, scale: float, detail: float = 6.0) -> bpy.types.NodeSocket:
         """Fractal noise, mostly between 0.3 and 0.7."""
@@ -89,7 +88,7 @@ class MaterialGraph:
         return self.material
 
 
-def _scaled(color: Color, factor: float) -> Color:
+def _scale_color(color: Color, factor: float) -> Color:
     return tuple(min(1.0, c * factor) for c in color)
 
 
@@ -97,11 +96,11 @@ def plaster(color: Color, contrast: float = 0.22) -> bpy.types.Material:
     """Limewashed wall: cloudy colours with brush strokes."""
     g = MaterialGraph("plaster", roughness=0.9, specular=0.1)
     clouds = g.noise(g.position, 1.7, 9.0)
-    brushed = g.noise(g.stretched((5.0, 5.0, 14.0)), 1.6, 4.0)
-    wide = g.ramp(clouds, [(0.3, _scaled(color, 1 - contrast)), (0.7, _scaled(color, 1 + contrast))])
+    brushed = g.noise(g.stretch_position((5.0, 5.0, 14.0)), 1.6, 4.0)
+    wide = g.ramp(clouds, [(0.3, _scale_color(color, 1 - contrast)), (0.7, _scale_color(color, 1 + contrast))])
     fine = g.ramp(brushed, [(0.3, (0.84, 0.83, 0.82)), (0.62, (1.0, 1.0, 1.0))])
     g.bump(brushed, 0.004)
-    return g.finish(g.mix(wide, fine), _scaled(color, 0.94))
+    return g.finish(g.mix(wide, fine), _scale_color(color, 0.94))
 
 
 def wood(color: Color, axis: int = 0, fineness: float = 1.0) -> bpy.types.Material:
@@ -109,19 +108,11 @@ def wood(color: Color, axis: int = 0, fineness: float = 1.0) -> bpy.types.Materi
     g = MaterialGraph("wood", roughness=0.55, specular=0.25)
     scale = [9.0 * fineness] * 3
     scale[axis] = 0.7 * fineness
-    vector = g.stretched(tuple(scale))
-    grain = g.noise(vector, 2.2, 8.0)
-    color_ = g.ramp(
-        grain,
-        [
-            (0.28, _scaled(color, 0.45)),
-            (0.5, color),
-            (0.58, _scaled(color, 0.8)),
-            (0.75, _scaled(color, 1.35)),
-        ],
-    )
+    grain = g.noise(g.stretch_position(tuple(scale)), 2.2, 8.0)
+    dark, light = _scale_color(color, 0.45), _scale_color(color, 1.35)
+    tone = g.ramp(grain, [(0.28, dark), (0.5, color), (0.58, _scale_color(color, 0.8)), (0.75, light)])
     g.bump(grain, 0.002)
-    return g.finish(color_, _scaled(color, 0.85))
+    return g.finish(tone, _scale_color(color, 0.85))
 
 
 def planks(color: Color, length: float = 1.35, width: float = 0.13, spread: float = 0.4) -> bpy.types.Material:
@@ -133,10 +124,12 @@ def planks(color: Color, length: float = 1.35, width: float = 0.13, spread: floa
         Row_Height=width, Color1=(*low, 1), Color2=(*high, 1), Mortar=(0.12, 0.1, 0.09, 1),
     )  # fmt: skip
     brick.offset, brick.offset_frequency = 0.37, 2
-    grain = g.noise(g.stretched((1.1, 16.0, 4.0)), 2.0, 9.0)
-    tone = g.ramp(grain, [(0.3, _scaled(color, 1 - spread)), (0.52, color), (0.72, _scaled(color, 1 + 0.7 * spread))])
+    grain = g.noise(g.stretch_position((1.1, 16.0, 4.0)), 2.0, 9.0)
+    tone = g.ramp(
+        grain, [(0.3, _scale_color(color, 1 - spread)), (0.52, color), (0.72, _scale_color(color, 1 + 0.7 * spread))]
+    )
     stain = g.ramp(g.noise(g.position, 0.9, 5.0), [(0.35, (0.8, 0.78, 0.76)), (0.65, (1.0, 1.0, 1.0))])
-    return g.finish(g.mix(g.mix(tone, brick.outputs["Color"]), stain), _scaled(color, 0.82))
+    return g.finish(g.mix(g.mix(tone, brick.outputs["Color"]), stain), _scale_color(color, 0.82))
 
 
 def bricks(light: Color, dark: Color) -> bpy.types.Material:
@@ -162,17 +155,17 @@ def fabric(color: Color, contrast: float = 0.35, grain: float = 90.0) -> bpy.typ
     g = MaterialGraph("fabric", roughness=0.95, specular=0.05)
     yarn = g.noise(g.position, grain, 3.0)
     wear = g.noise(g.position, 4.0, 6.0)
-    fine = g.ramp(yarn, [(0.35, _scaled(color, 1 - contrast)), (0.65, _scaled(color, 1 + contrast))])
+    fine = g.ramp(yarn, [(0.35, _scale_color(color, 1 - contrast)), (0.65, _scale_color(color, 1 + contrast))])
     wide = g.ramp(wear, [(0.32, (0.72, 0.7, 0.7)), (0.66, (1.0, 1.0, 1.0))])
     g.bump(yarn, 0.002)
-    return g.finish(g.mix(fine, wide), _scaled(color, 0.88))
+    return g.finish(g.mix(fine, wide), _scale_color(color, 0.88))
 
 
 def leather(color: Color) -> bpy.types.Material:
     """Leather with lighter worn patches."""
     g = MaterialGraph("leather", roughness=0.55, specular=0.3)
     wear = g.noise(g.position, 5.0, 9.0)
-    tone = g.ramp(wear, [(0.3, _scaled(color, 0.5)), (0.55, color), (0.75, _scaled(color, 1.7))])
+    tone = g.ramp(wear, [(0.3, _scale_color(color, 0.5)), (0.55, color), (0.75, _scale_color(color, 1.7))])
     g.bump(g.noise(g.position, 60.0, 4.0), 0.002)
     return g.finish(tone, color)
 
@@ -189,7 +182,7 @@ def backdrop(environment: Path, strength: float, turn: float) -> bpy.types.Mater
     """The view through the windows: an HDR panorama as an emissive dome."""
     g = MaterialGraph("backdrop")
     g.nodes.remove(g.surface)
-    node = g.add("ShaderNodeTexEnvironment", Vector=g.stretched((1.0, 1.0, 1.0), turn))
+    node = g.add("ShaderNodeTexEnvironment", Vector=g.stretch_position((1.0, 1.0, 1.0), turn))
     node.image = bpy.data.images.load(str(environment))
     emission = g.add("ShaderNodeEmission", Color=node.outputs["Color"], Strength=strength)
     g.links.new(emission.outputs[0], g.nodes["Material Output"].inputs["Surface"])

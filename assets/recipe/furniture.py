@@ -59,8 +59,8 @@ def unpack(archive_folder: Path, folder: Path) -> None:
                 archive.extractall(folder / library)
 
 
-def _licence(library: str, folder: Path) -> str:
-    """The licence of a model: that of its own licence page if it has one, else its library's.
+def _find_licence(library: str, folder: Path) -> str:
+    """The licence on the model's own licence page if it has one, else the licence of its library.
 
     Some models of the CC-0 library have a page with CC BY.
     """
@@ -119,15 +119,15 @@ class Furniture:
             part.data.transform(part.matrix_world)
             part.matrix_world = Matrix.Identity(4)
             part.data.transform(Matrix(rotation.tolist()).to_4x4())
-        points = np.concatenate([_points(p) for p in parts])
+        points = np.concatenate([_read_points(p) for p in parts])
         low, high = points.min(0), points.max(0)
         scale = np.array(entry.size) / np.maximum(high - low, 1e-9)
         middle = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
         for part in parts:
             part.data.transform(Matrix.Diagonal((*scale, 1.0)) @ Matrix.Translation((-middle).tolist()))
             for slot in part.material_slots:
-                _soften(slot.material)
-        licence = _licence(entry.library, entry.obj.parent)
+                _make_matt(slot.material)
+        licence = _find_licence(entry.library, entry.obj.parent)
         self.credits[key] = Credit(
             entry.obj.stem, entry.name, entry.creator or entry.library, licence, f"{entry.library}.sh3f"
         )
@@ -171,14 +171,14 @@ class Furniture:
                 slot.material = finish or next((m for k, m in (finishes or {}).items() if k in name), slot.material)
 
 
-def _points(part: bpy.types.Object) -> np.ndarray:
+def _read_points(part: bpy.types.Object) -> np.ndarray:
     flat = np.empty(len(part.data.vertices) * 3)
     part.data.vertices.foreach_get("co", flat)
     return flat.reshape(-1, 3)
 
 
 def _find_images(material: bpy.types.Material | None, folder: Path) -> None:
-    """Replace textures with paths of their author's machine by the files in the model's folder, or remove them."""
+    """Replace textures whose file is missing by the files in the model's folder, or remove them."""
     if material is None or not material.use_nodes:
         return
     tree = material.node_tree
@@ -191,8 +191,8 @@ def _find_images(material: bpy.types.Material | None, folder: Path) -> None:
             tree.nodes.remove(node)
 
 
-def _soften(material: bpy.types.Material | None) -> None:
-    """Make surfaces matt: stereo takes highlights and reflections, which move with the camera, for depth."""
+def _make_matt(material: bpy.types.Material | None) -> None:
+    """Make surfaces matt: highlights and reflections move with the camera, which disturbs stereo matching."""
     if material is None or not material.use_nodes:
         return
     for node in material.node_tree.nodes:

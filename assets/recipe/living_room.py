@@ -33,7 +33,7 @@ HEIGHT = 2.72  # of the ceiling, metres
 
 @dataclass(frozen=True)
 class RoomStyle:
-    """What depends on the seed. Colours are linear RGB."""
+    """Properties that depend on the seed. Colours are linear RGB."""
 
     wall: f.Color = (0.66, 0.54, 0.38)
     second_wall: f.Color = (0.30, 0.42, 0.40)
@@ -46,7 +46,7 @@ class RoomStyle:
     jitter: float = 0.0
 
     @staticmethod
-    def of(seed: int) -> RoomStyle:
+    def from_seed(seed: int) -> RoomStyle:
         """The shipped room for seed 0; other seeds change colours, the sun and the positions of furniture."""
         if seed == 0:
             return RoomStyle()
@@ -89,11 +89,8 @@ def build_shell(style: RoomStyle) -> None:
     boxes("walls beyond", SOUTH2.solid() + NORTH2.solid() + END.solid(), second)
     boxes("lining beyond", _lining(BACK_OF_EAST), second)
     boxes("floor", [(-3.5, 7.5, -2.9, 2.9, -0.1, 0.0)], f.planks(style.floor))
-    boxes(
-        "ceiling",
-        [(-3.5, 7.5, -2.9, 2.9, HEIGHT, HEIGHT + 0.1)],
-        f.planks((0.70, 0.67, 0.60), 1.9, 0.105, 0.16),
-    )
+    boards = f.planks((0.70, 0.67, 0.60), 1.9, 0.105, 0.16)
+    boxes("ceiling", [(-3.5, 7.5, -2.9, 2.9, HEIGHT, HEIGHT + 0.1)], boards)
     boxes(
         "beams",
         [(x - 0.075, x + 0.075, -2.6, 2.6, HEIGHT - 0.15, HEIGHT) for x in np.arange(-2.5, 7.2, 1.32)],
@@ -177,12 +174,7 @@ def furnish_living(room: Furniture, style: RoomStyle, jitter: Callable[[], float
         finishes={"leather": f.leather((0.34, 0.17, 0.075))},
     )  # fmt: skip
     room.place(
-        "Scopia/saloon_table",
-        -0.3,
-        0.95,
-        0.008,
-        degrees=4 + 30 * jitter(),
-        finish=f.wood((0.13, 0.06, 0.03), axis=0),
+        "Scopia/saloon_table", -0.3, 0.95, 0.008, degrees=4 + 30 * jitter(), finish=f.wood((0.13, 0.06, 0.03), axis=0)
     )
     room.place("Scopia/bowlWithFruits", -0.42, 0.97, 0.525)
     room.place("Scopia/teapot", 0.12, 1.05, 0.525, degrees=30)
@@ -263,12 +255,7 @@ def light_up(style: RoomStyle, garden: Path) -> None:
     dome.data.materials.append(f.backdrop(garden, 2.4, 1.2))
     for flag in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
         setattr(dome, f"visible_{flag}", False)
-    lamps = [
-        ((-1.86, 2.3, 0.86), 16),
-        ((1.25, 2.22, 1.5), 20),
-        ((5.35, -0.1, 1.95), 45),
-        ((-2.95, -0.25, 0.35), 10),
-    ]
+    lamps = [((-1.86, 2.3, 0.86), 16), ((1.25, 2.22, 1.5), 20), ((5.35, -0.1, 1.95), 45), ((-2.95, -0.25, 0.35), 10)]
     lamps += [((-0.3 + 0.28 * math.cos(a), 0.95 + 0.28 * math.sin(a), 2.3), 7) for a in (0.3, 2.4, 4.5)]
     for place, watts in lamps:
         lamp = bpy.data.lights.new("lamp", "POINT")
@@ -279,9 +266,9 @@ def light_up(style: RoomStyle, garden: Path) -> None:
 
 
 def build(sources: Path, scratch: Path, seed: int) -> Furniture:
-    """Build the scene of a seed and return its furniture, which has the credits."""
+    """Build the scene of a seed and return its furniture with the credits."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    style, rng = RoomStyle.of(seed), np.random.default_rng(seed)
+    style, rng = RoomStyle.from_seed(seed), np.random.default_rng(seed)
     garden = Path(bpy.utils.resource_path("LOCAL")) / "datafiles" / "studiolights" / "world" / "forest.exr"
 
     def jitter() -> float:

@@ -48,7 +48,7 @@ def cam2world(position: Sequence[float], angles: Sequence[float]) -> np.ndarray:
     return pose
 
 
-def _camera() -> bpy.types.Object:
+def _add_camera() -> bpy.types.Object:
     data = bpy.data.cameras.new("panorama")
     data.type, data.clip_start, data.clip_end = "PANO", 0.01, 100.0
     data.panorama_type = "EQUIRECTANGULAR"
@@ -58,7 +58,7 @@ def _camera() -> bpy.types.Object:
     return item
 
 
-def _setup(height: int, samples: int, threads: int) -> None:
+def _configure_cycles(height: int, samples: int, threads: int) -> None:
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     scene.render.resolution_x, scene.render.resolution_y = 2 * height, height
@@ -89,15 +89,10 @@ def _render_color(path: Path) -> np.ndarray:
 
 
 def _render_depth(folder: Path) -> np.ndarray:
-    """Distance along the ray through each pixel's centre: one sample and a pixel filter of almost no width."""
+    """Distance along the ray through each pixel's centre, rendered with one sample and a very narrow pixel filter."""
     scene, cycles = bpy.context.scene, bpy.context.scene.cycles
-    saved = (
-        cycles.samples,
-        cycles.use_denoising,
-        cycles.pixel_filter_type,
-        cycles.filter_width,
-        cycles.max_bounces,
-    )
+    names = ("samples", "use_denoising", "pixel_filter_type", "filter_width", "max_bounces")
+    saved = {name: getattr(cycles, name) for name in names}
     cycles.samples, cycles.use_denoising, cycles.max_bounces = 1, False, 0
     cycles.pixel_filter_type, cycles.filter_width = "BLACKMAN_HARRIS", 0.01
     scene.use_nodes = True
@@ -109,13 +104,8 @@ def _render_depth(folder: Path) -> np.ndarray:
     links.new(layers.outputs["Depth"], output.inputs[0])
     bpy.ops.render.render()
     scene.use_nodes = False
-    (
-        cycles.samples,
-        cycles.use_denoising,
-        cycles.pixel_filter_type,
-        cycles.filter_width,
-        cycles.max_bounces,
-    ) = saved
+    for name, value in saved.items():
+        setattr(cycles, name, value)
     image = bpy.data.images.load(str(folder / f"depth_{scene.frame_current:04d}.exr"))
     image.colorspace_settings.name = "Non-Color"
     pixels = np.empty(image.size[0] * image.size[1] * image.channels, np.float32)
@@ -140,8 +130,8 @@ def _write_json(path: Path, content: object) -> None:
 def render_all(out: Path, views: Sequence[str], height: int, samples: int, threads: int, scratch: Path) -> None:
     """Render the named views and write the pair's folder."""
     out.mkdir(parents=True, exist_ok=True)
-    _setup(height, samples, threads)
-    camera = _camera()
+    _configure_cycles(height, samples, threads)
+    camera = _add_camera()
     poses = {}
     for name in views:
         position, angles = VIEWS[name]

@@ -31,7 +31,7 @@ class Fidelity:
     energy_error: float
 
 
-def image_fidelity(
+def measure_fidelity(
     image: Float[Tensor, "channel height width"],
     reference: Float[Tensor, "channel height width"],
     *,

@@ -57,7 +57,7 @@ def time_call(call: Callable[[], T], device: torch.device) -> tuple[Timing, T]:
     return Timing(time.perf_counter() - began, time.process_time() - began_cpu), result
 
 
-def peak_memory(call: Callable[[], T], device: torch.device) -> tuple[float | None, T]:
+def measure_peak_memory(call: Callable[[], T], device: torch.device) -> tuple[float | None, T]:
     """Largest additional memory during a call, 10^6 bytes, and the result of the call.
 
     On the CPU it is the kernel's high-water mark of the resident memory, reset before the call; on CUDA that of
@@ -70,9 +70,9 @@ def peak_memory(call: Callable[[], T], device: torch.device) -> tuple[float | No
         return (torch.cuda.max_memory_allocated(device) - before) / 1e6, result
     if not reset_resident_peak():
         return None, call()
-    before = resident_memory()
+    before = read_resident_memory()
     result = call()
-    return max(0, resident_peak() - before) / 1e6, result
+    return max(0, read_resident_peak() - before) / 1e6, result
 
 
 def reset_resident_peak() -> bool:
@@ -87,17 +87,17 @@ def reset_resident_peak() -> bool:
     return True
 
 
-def resident_peak() -> int:
+def read_resident_peak() -> int:
     """Largest resident memory of the process since the last reset, bytes."""
-    return _status_bytes(_STATUS, "VmHWM")
+    return _read_status_bytes(_STATUS, "VmHWM")
 
 
-def resident_memory() -> int:
+def read_resident_memory() -> int:
     """Resident memory of the process, bytes."""
-    return _status_bytes(_STATUS, "VmRSS")
+    return _read_status_bytes(_STATUS, "VmRSS")
 
 
-def _status_bytes(status: Path, field: str) -> int:
+def _read_status_bytes(status: Path, field: str) -> int:
     found = re.search(rf"{field}:\s+(\d+) kB", status.read_text())
     return 1024 * int(found[1]) if found else 0  # a process that has just ended has no such line
 
@@ -111,7 +111,7 @@ def quartile_range(times: Sequence[float]) -> float:
 
 
 @contextlib.contextmanager
-def restored_threads() -> Iterator[None]:
+def restore_threads() -> Iterator[None]:
     """Restore torch's number of threads afterwards."""
     threads = torch.get_num_threads()
     try:
@@ -161,7 +161,7 @@ def run_child(
         if over_limit:
             raise OverLimitError(f"ended at {limit_gib:g} GiB")
         if child.returncode:
-            raise _child_error(child.returncode, (folder / "log").read_text(errors="replace"))
+            raise _make_error(child.returncode, (folder / "log").read_text(errors="replace"))
         numbers = json.loads((folder / "numbers.json").read_text())
         return numbers, safetensors.torch.load_file(folder / "tensors.safetensors")
 
@@ -175,12 +175,12 @@ def _exceeds_limit(child: subprocess.Popen[bytes], limit_gib: float | None) -> b
     while child.poll() is None:
         time.sleep(_POLL_INTERVAL)
         with contextlib.suppress(OSError):  # it has just ended, or the system has no such file
-            if _status_bytes(status, "VmRSS") > limit_gib * 2**30:
+            if _read_status_bytes(status, "VmRSS") > limit_gib * 2**30:
                 return True
     return False
 
 
-def _child_error(status: int, log: str) -> CaseFailedError:
+def _make_error(status: int, log: str) -> CaseFailedError:
     """The error of a child with this exit status and output."""
     message = (log.strip() or "no message").splitlines()[-1]
     if describes_out_of_memory(message):

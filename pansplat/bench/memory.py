@@ -25,14 +25,14 @@ from pansplat.bench.fidelity import relative_deviation
 from pansplat.bench.harness import (
     CaseFailedError,
     OverLimitError,
-    peak_memory,
+    measure_peak_memory,
+    read_resident_memory,
     reset_resident_peak,
-    resident_memory,
     run_child,
     serve_job,
     time_call,
 )
-from pansplat.bench.report import Column, Report, Row, error_column, result_column, row_from_json
+from pansplat.bench.report import Column, Report, Row, error_column, read_row, result_column
 from pansplat.data.views import Batch, Sample, Views, collate
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions
@@ -149,7 +149,7 @@ class MemoryResult:
 MemoryRow = Row[MemoryCase, MemoryResult]
 
 
-def memory_cases(heights: Sequence[int], *, quick: bool) -> list[MemoryCase]:
+def list_memory_cases(heights: Sequence[int], *, quick: bool) -> list[MemoryCase]:
     """The cases by height, inference before training; the first of each kind is the reference: it has no tiles.
 
     Args:
@@ -177,7 +177,7 @@ class MemoryBench:
     report: Report[MemoryRow]
 
     def run(self, cases: Sequence[MemoryCase]) -> None:
-        """Measure the cases that have no measured row. The report's rows have the order of `memory_cases`."""
+        """Measure the cases that have no measured row. The report's rows have the order of `list_memory_cases`."""
         rows = self.report.rows
         rows[:] = [row for row in rows if row.status == "measured" or row.case not in cases]
         self._drop_lost_references(cases)
@@ -206,7 +206,7 @@ class MemoryBench:
         row = MemoryRow("memory", _SCENE, case, MemoryResult())
         # Failures of earlier runs do not count: their limit may have been lower.
         known = [row for row in self.report.rows if row.status == "measured" or row.case in cases]
-        expected = expected_gib(case, known)
+        expected = estimate_gib(case, known)
         if expected > self.setting.limit_gib:
             row.status = "not tried"
             row.note = f"{expected:.1f} GiB expected" if math.isfinite(expected) else "a smaller height failed"
@@ -228,7 +228,7 @@ class MemoryBench:
         return row
 
 
-def expected_gib(case: MemoryCase, rows: Sequence[MemoryRow]) -> float:
+def estimate_gib(case: MemoryCase, rows: Sequence[MemoryRow]) -> float:
     """Upper bound of a case's memory from the same work at the next smaller height; 0 if that is unknown.
 
     Above some height only a part of the network is trained, so rows at or below it do not bound training above it.
@@ -259,7 +259,7 @@ def read_rows(path: Path, setting: MemorySetting) -> list[MemoryRow]:
     try:
         content = json.loads(path.read_text())
         before = content["setting"]
-        rows = [row_from_json(values, MemoryCase, MemoryResult) for values in content["rows"]]
+        rows = [read_row(values, MemoryCase, MemoryResult) for values in content["rows"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: needed rows of `pansplat bench memory`, got {error!r}; delete it.") from error
     now = dataclasses.asdict(setting)
@@ -299,13 +299,13 @@ def _measure_job(job: Mapping[str, Any]) -> tuple[dict[str, object], dict[str, T
     network = PanSplat(network_config(setting.network), "fixed")
     network.load_state_dict(read_weights(Path(job["weights"])).tensors)
     work = _prepare_work(case, setting, network.to(device))
-    work(painted_sphere(_WARM_UP_HEIGHT).to(device))  # compiles kernels and loads libraries
-    batch = painted_sphere(case.height).to(device)
+    work(make_painted_sphere(_WARM_UP_HEIGHT).to(device))  # compiles kernels and loads libraries
+    batch = make_painted_sphere(case.height).to(device)
     gc.collect()
     release_idle_memory()
     reset_resident_peak()
-    base = torch.cuda.memory_allocated(device) if device.type == "cuda" else resident_memory()
-    taken_mb, (timing, (count, tensors)) = peak_memory(lambda: time_call(lambda: work(batch), device), device)
+    base = torch.cuda.memory_allocated(device) if device.type == "cuda" else read_resident_memory()
+    taken_mb, (timing, (count, tensors)) = measure_peak_memory(lambda: time_call(lambda: work(batch), device), device)
     if taken_mb is None:
         raise InputError("this system does not report a process's peak memory; run the benchmark on Linux")
     base_gib, taken_gib = base / 2**30, 1e6 * taken_mb / 2**30
@@ -352,7 +352,7 @@ def _frozen_parts(height: int) -> tuple[str, ...]:
     return ("features", "cost_volume") if height > _MAX_MATCHING_HEIGHT else ()
 
 
-def painted_sphere(height: int) -> Batch:
+def make_painted_sphere(height: int) -> Batch:
     """Two views and one target inside a painted sphere, at any height and without files."""
     generator = torch.Generator().manual_seed(0)
     waves, phases = 2 * torch.randn(3, 3, generator=generator), torch.randn(3, generator=generator)
@@ -376,7 +376,7 @@ def painted_sphere(height: int) -> Batch:
     return collate([Sample("sphere", views((-0.5, 0.5)), views((0.1,)))])
 
 
-def memory_report(
+def make_memory_report(
     machine: Mapping[str, Any], setting: MemorySetting, cases: Sequence[MemoryCase], out: Path | None
 ) -> Report[MemoryRow]:
     """The report of a run.

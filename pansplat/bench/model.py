@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from pansplat.bench.fidelity import clamped_psnr, relative_depth_errors
-from pansplat.bench.harness import CaseFailedError, reset_resident_peak, resident_peak, run_child, serve_job
+from pansplat.bench.harness import CaseFailedError, read_resident_peak, reset_resident_peak, run_child, serve_job
 from pansplat.bench.report import Column, Report, Row, error_column, format_number, result_column
 from pansplat.data.views import Views
 from pansplat.errors import InputError
@@ -102,7 +102,7 @@ class ModelResult:
 ModelRow = Row[ModelCase, ModelResult]
 
 
-def model_cases(threads: int, *, bfloat16: bool, quick: bool) -> list[ModelCase]:
+def list_model_cases(threads: int, *, bfloat16: bool, quick: bool) -> list[ModelCase]:
     """Ways to run the network; the first of each `compat` is the reference of the others."""
     plain = ModelCase("fixed", "float32", "float32", threads, tiles=1)
     cases = [plain]
@@ -137,7 +137,7 @@ def measure_model(
         InputError: a case failed, for example because of too little memory.
     """
     references: dict[str, dict[str, Tensor]] = {}
-    with _views_file(views) as file:
+    with _write_views(views) as file:
         for index, case in enumerate(cases, start=1):
             report.update(f"{index} of {len(cases)}: {case}")
             result, tensors = measure_case(case, weights, file, near=views.near, far=views.far)
@@ -151,7 +151,7 @@ def measure_model(
 
 
 @contextmanager
-def _views_file(views: Views) -> Iterator[Path]:
+def _write_views(views: Views) -> Iterator[Path]:
     """A temporary file of the panoramas for the child processes."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "views.safetensors")
@@ -207,7 +207,7 @@ def _measure_job(job: Mapping[str, Any]) -> tuple[dict[str, object], dict[str, T
     (gaussians,) = merge_tiles(list(network.lift_gaussians(matched, tiles=case.tiles)), case.compat)
     stages["heads"] = time.perf_counter() - began
     processor = time.process_time() - before
-    peak = resident_peak() / 2**30 if has_peak else None
+    peak = read_resident_peak() / 2**30 if has_peak else None
     depth = matched.depths.depth[-1][0]
     del matched
     scene = Scene(gaussians, cam2world.double(), near, far, height=images.shape[-2])
@@ -254,7 +254,7 @@ def _timed_stages(network: PanSplat, stages: dict[str, float]) -> Iterator[None]
             handle.remove()
 
 
-def model_report(
+def make_model_report(
     machine: Mapping[str, Any], network: str, *, height: int, json: Path | None = None, out: Path | None = None
 ) -> Report[ModelRow]:
     """The report of a run.
@@ -316,7 +316,7 @@ def plot_model(rows: Sequence[ModelRow], title: str) -> Figure:
 
     figure = Figure(figsize=(11, 1.5 + 0.4 * len(rows)), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(2, 1))
-    names = [_bar_name(row.case) for row in rows]
+    names = [_describe_case(row.case) for row in rows]
     starts = [0.0] * len(rows)
     for stage, color in zip(STAGES, _STAGE_COLORS, strict=True):
         widths = [row.result.stages_s.get(stage, 0.0) for row in rows]
@@ -333,7 +333,7 @@ def plot_model(rows: Sequence[ModelRow], title: str) -> Figure:
     return figure
 
 
-def _bar_name(case: ModelCase) -> str:
+def _describe_case(case: ModelCase) -> str:
     parts = [case.compat, case.precision]
     parts += ["attention bfloat16"] * (case.attention == "bfloat16")
     parts += [f"{_tiles(case)} tiles"] * (case.tiles > 1)

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, cast
 import torch
 from torch import Tensor
 
-from pansplat.bench.fidelity import image_fidelity
-from pansplat.bench.harness import Timing, peak_memory, quartile_range, restored_threads, time_call
+from pansplat.bench.fidelity import measure_fidelity
+from pansplat.bench.harness import Timing, measure_peak_memory, quartile_range, restore_threads, time_call
 from pansplat.bench.raster_cases import BenchScene, Group, RasterCase
 from pansplat.bench.renderers import (
     RenderedImage,
@@ -30,7 +30,7 @@ from pansplat.bench.renderers import (
     warm_up,
 )
 from pansplat.bench.report import Column, Report, Row, result_column
-from pansplat.bench.roofline import BACKWARD_OPERATIONS, FORWARD_OPERATIONS, Work, panorama_work
+from pansplat.bench.roofline import BACKWARD_OPERATIONS, FORWARD_OPERATIONS, Work, count_panorama_work
 from pansplat.constants import NEAR
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.rasterize import RasterOptions
@@ -106,11 +106,11 @@ class RasterResult:
         """Set the errors against the exact image and against the float64 image of the case's own choices."""
         panorama = case.layout != "pinhole"
         if exact is not None:
-            errors = image_fidelity(color, exact, panorama=panorama)
+            errors = measure_fidelity(color, exact, panorama=panorama)
             self.max_error, self.psnr_db = errors.max_error, errors.psnr_db
             self.seam_jump, self.energy_error = errors.seam_jump, errors.energy_error
         if own is not None:
-            errors = image_fidelity(color, own, panorama=panorama)
+            errors = measure_fidelity(color, own, panorama=panorama)
             self.own_max_error, self.own_psnr_db = errors.max_error, errors.psnr_db
 
 
@@ -174,7 +174,7 @@ class RasterBench:
         """
         for group in groups:
             self._load(group.scene)
-            with restored_threads():
+            with restore_threads():
                 self._measure(group)
 
     def run_viewer(self, group: Group, repeats: int) -> None:
@@ -188,7 +188,7 @@ class RasterBench:
             InputError: the viewer is not installed, or there is no OpenGL.
         """
         self._load(group.scene)
-        with restored_threads():  # before the viewer starts, so that its times are not disturbed
+        with restore_threads():  # before the viewer starts, so that its times are not disturbed
             references = [self._reference_images(group, case) for case in group.cases]
         assert self._gaussians is not None
         for image in render_in_viewer(group.scene, self._gaussians, group.cases, repeats):
@@ -256,7 +256,7 @@ class RasterBench:
         """Render the first image: warm up, measure the memory, choose the number of repeats."""
         case, result = measurement.case, measurement.row.result
         release_workspace(case.backend)
-        result.peak_mb, (image, timing) = peak_memory(lambda: self._time_forward(case), device_of(case.backend))
+        result.peak_mb, (image, timing) = measure_peak_memory(lambda: self._time_forward(case), device_of(case.backend))
         walls = [timing.wall]
         result.stages_ms = {name: 1e3 * value for name, value in image.stages.items()}
         if timing.wall > self._slow or case.precision == "float64":
@@ -264,7 +264,7 @@ class RasterBench:
         if case.backward:
             release_workspace(case.backend)
             device = device_of(case.backend)
-            result.backward_peak_mb, timing = peak_memory(lambda: self._time_backward(case), device)
+            result.backward_peak_mb, timing = measure_peak_memory(lambda: self._time_backward(case), device)
             walls.append(timing.wall)
             if timing.wall > self._slow:
                 measurement.backward.append(timing)
@@ -316,7 +316,7 @@ class RasterBench:
         if key not in self._work:
             self._report.update(f"{case}: counting its work")
             options = RasterOptions(case.kernel, case.order, case.filter, NEAR, strict=False)
-            self._work[key] = panorama_work(self._gaussians, self._scene.pose, case.height, options)
+            self._work[key] = count_panorama_work(self._gaussians, self._scene.pose, case.height, options)
         work, machine = self._work[key], self._report.machine
         result.pairs = work.pairs
         flops_per_ms = 1e6 * machine["fma_gflops"]["1"]
@@ -327,7 +327,7 @@ class RasterBench:
             result.backward_fma_fraction = BACKWARD_OPERATIONS * work.pairs / flops_per_ms / result.backward_cpu_ms
 
 
-def raster_report(
+def make_raster_report(
     machine: Mapping[str, Any], *, json: Path | None = None, plot: Path | None = None, page: Path | None = None
 ) -> Report[RasterRow]:
     """The report of a run.
@@ -346,7 +346,7 @@ def raster_report(
         _section,
         machine,
         facts=("cpu", "threads", "gpu", "fma_gflops", "bandwidth_gb_s"),
-        findings=raster_findings,
+        findings=list_findings,
         json_file=json,
         page=page,
         plots=plots,
@@ -402,7 +402,7 @@ RASTER_COLUMNS: tuple[Column[RasterRow], ...] = (
 )
 
 
-def raster_findings(rows: Sequence[RasterRow]) -> list[str]:
+def list_findings(rows: Sequence[RasterRow]) -> list[str]:
     """The main results as sentences: speed against torch and the dense renderer, and fractions of the peaks."""
     return [*_compare_with_torch(rows), *_compare_with_dense(rows), *_compare_with_peaks(rows)]
 
@@ -492,7 +492,7 @@ def _size(row: RasterRow) -> str:
     return f"{row.case.height}x{2 * row.case.height}, {row.result.num_gaussians:,} Gaussians"
 
 
-def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+def find_pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     """Indices of the points that no other point beats in both numbers, by increasing first number.
 
     Of equal points all or none are on the front.
@@ -524,11 +524,11 @@ def plot_choices(rows: Sequence[RasterRow]) -> Figure | None:
         edge = color if row.case.precision == "float32" else "#444444"
         marker = _MARKERS.get(row.case.backend, "*")
         axes.scatter(x, y, s=55, marker=marker, facecolors=fill, edgecolors=edge, zorder=3)
-    front = pareto_front(points)
+    front = find_pareto_front(points)
     axes.plot(*zip(*(points[i] for i in front), strict=True), color=_FRONT_COLOR, linewidth=1.5, zorder=2)
     axes.set(xscale="log", yscale="log", xlabel="forward, milliseconds")
     axes.set_ylim(bottom=min(axes.get_ylim()[0], 0.03 * min(y for _, y in points)))
-    _annotate(axes, [(points[i], _choice_name(shown[i])) for i in front])
+    _annotate(axes, [(points[i], _describe_choice(shown[i])) for i in front])
     axes.set_ylabel(f"root mean square error of the colours (the exact image is plotted at {_MIN_ERROR:.0e})")
     axes.set_title(f"{shown[0].scene}: {_size(shown[0])}", loc="left")
     decibels = axes.secondary_yaxis("right", functions=(lambda y: y, lambda y: y))
@@ -538,7 +538,7 @@ def plot_choices(rows: Sequence[RasterRow]) -> Figure | None:
     return figure
 
 
-def _choice_name(row: RasterRow) -> str:
+def _describe_choice(row: RasterRow) -> str:
     case = row.case
     layout = "direct" if case.layout == "equirect" else f"faces of {case.face_size}"
     order = "" if case.layout == "equirect" else f" {case.order}"

@@ -125,7 +125,7 @@ def default_face_size(height: int) -> int:
     return max(1, round(2 * height / math.pi))
 
 
-def all_choices(backend: str, height: int, face_sizes: tuple[int, ...], threads: int) -> list[RasterCase]:
+def list_choices(backend: str, height: int, face_sizes: tuple[int, ...], threads: int) -> list[RasterCase]:
     """Every kernel, order and filter on every layout that has them; an equirect has one kernel and one order."""
     filters: tuple[Lowpass, ...] = ("angular", "3dgs")
     orders: tuple[Order, ...] = ("radial", "z")
@@ -139,7 +139,7 @@ def all_choices(backend: str, height: int, face_sizes: tuple[int, ...], threads:
     return equirects + cubemaps + pinholes
 
 
-def official_choice(backend: str, height: int, threads: int) -> RasterCase:
+def make_official_case(backend: str, height: int, threads: int) -> RasterCase:
     """The options of the official code (`OFFICIAL`)."""
     o, face_size = OFFICIAL, official_face_size(height)
     stitching = "seamless" if height % 4 else o.stitching
@@ -187,7 +187,7 @@ class Settings:
         return lattice_room_size(self.height) <= _MAX_TORCH_GAUSSIANS
 
 
-def room_scene(height: int) -> BenchScene:
+def make_room_scene(height: int) -> BenchScene:
     """The synthetic room, rendered from a pose between its cameras and slightly off the line through them.
 
     The camera is rotated so that no wall is parallel to a cube face: all points of such a wall have one depth, and
@@ -199,7 +199,7 @@ def room_scene(height: int) -> BenchScene:
     return BenchScene(f"room {height}", partial(full_lattice_room, _multiple_of_8(height)), pose)
 
 
-def raster_groups(settings: Settings, scene_of: Callable[[int], BenchScene], *, synthetic: bool) -> list[Group]:
+def list_raster_groups(settings: Settings, scene_of: Callable[[int], BenchScene], *, synthetic: bool) -> list[Group]:
     """All groups of a scene, the most important first.
 
     Args:
@@ -209,47 +209,47 @@ def raster_groups(settings: Settings, scene_of: Callable[[int], BenchScene], *, 
     height, small = settings.height, settings.choice_height
     references = ("exact" if settings.quick else "own") if settings.with_torch else "none"
     groups = [
-        _group("headline", scene_of(height), _headline_cases(settings), references),
-        _group("choices", scene_of(small), _choice_cases(settings), "own"),
+        _make_group("headline", scene_of(height), _list_headline_cases(settings), references),
+        _make_group("choices", scene_of(small), _list_choice_cases(settings), "own"),
     ]
     if synthetic:
         dense = RasterCase("dense", DENSE_HEIGHT)
         others = [replace(dense, backend=name) for name in ("torch", *settings.backends)]
-        groups.append(_group("dense", room_scene(DENSE_HEIGHT), [dense, *others], "own"))
-    for index, scene in enumerate(_count_scenes(settings, scene_of, synthetic)):
-        cases = _sweep_cases(settings, height, with_torch=index == 0 and not settings.quick)
-        groups.append(_group("count", scene, cases, "none"))
-    for index, scene_height in enumerate(_sweep_heights(settings)):
+        groups.append(_make_group("dense", make_room_scene(DENSE_HEIGHT), [dense, *others], "own"))
+    for index, scene in enumerate(_list_count_scenes(settings, scene_of, synthetic)):
+        cases = _list_sweep_cases(settings, height, with_torch=index == 0 and not settings.quick)
+        groups.append(_make_group("count", scene, cases, "none"))
+    for index, scene_height in enumerate(_list_sweep_heights(settings)):
         if not synthetic or lattice_room_size(scene_height) * _BYTES_PER_GAUSSIAN < settings.memory:
-            cases = _sweep_cases(settings, scene_height, with_torch=index < 2)
-            groups.append(_group("resolution", scene_of(scene_height), cases, "none"))
+            cases = _list_sweep_cases(settings, scene_height, with_torch=index < 2)
+            groups.append(_make_group("resolution", scene_of(scene_height), cases, "none"))
     return [group for group in groups if group.cases]
 
 
-def sample_group(settings: Settings, scene: BenchScene) -> Group:
+def make_sample_group(settings: Settings, scene: BenchScene) -> Group:
     """The main choices on a real scene, to check the results of the room."""
     small = replace(settings, height=settings.choice_height)
-    cases = [case for name in settings.sweep_backends for case in _main_choices(small, name)]
-    cases += [RasterCase("torch", small.height)] if cases else _main_choices(small, "torch")
-    return _group("scene", scene, cases, "own")
+    cases = [case for name in settings.sweep_backends for case in _list_main_choices(small, name)]
+    cases += [RasterCase("torch", small.height)] if cases else _list_main_choices(small, "torch")
+    return _make_group("scene", scene, cases, "own")
 
 
-def viewer_group(settings: Settings, scene: BenchScene) -> Group:
+def make_viewer_group(settings: Settings, scene: BenchScene) -> Group:
     """The choices that the viewer supports."""
     height = settings.choice_height
     sizes = (default_face_size(height),) if settings.quick else settings.face_sizes
-    cases = [case for case in all_choices("gl", height, sizes, settings.threads) if case.layout == "cubemap"]
+    cases = [case for case in list_choices("gl", height, sizes, settings.threads) if case.layout == "cubemap"]
     if settings.quick:  # exact choices, EWA with them, and all choices of the classic renderer
         kept = [("ray", "radial", "angular"), ("ewa", "radial", "angular"), ("ewa", "z", "3dgs")]
         cases = [case for case in cases if (case.kernel, case.order, case.filter) in kept]
     return Group("choices", scene, tuple(cases), "own")
 
 
-def _group(suite: str, scene: BenchScene, cases: list[RasterCase], references: References) -> Group:
+def _make_group(suite: str, scene: BenchScene, cases: list[RasterCase], references: References) -> Group:
     return Group(suite, scene, tuple(case for case in cases if case.is_supported), references)
 
 
-def _main_choices(settings: Settings, backend: str) -> list[RasterCase]:
+def _list_main_choices(settings: Settings, backend: str) -> list[RasterCase]:
     """The direct panorama, the stitched ones, and the official choices."""
     height, threads = settings.height, 1 if backend == "torch" else settings.threads
     face_size = default_face_size(height)
@@ -258,38 +258,38 @@ def _main_choices(settings: Settings, backend: str) -> list[RasterCase]:
         RasterCase(backend, height, threads=threads),
         stitched,
         replace(stitched, kernel="ewa"),
-        official_choice(backend, height, threads),
+        make_official_case(backend, height, threads),
     ]
 
 
-def _headline_cases(settings: Settings) -> list[RasterCase]:
+def _list_headline_cases(settings: Settings) -> list[RasterCase]:
     cases = []
     for backend in settings.backends:
-        cases += _main_choices(settings, backend)
+        cases += _list_main_choices(settings, backend)
         if settings.threads > 1:
             cases.append(RasterCase(backend, settings.height))
     return [*cases, RasterCase("torch", settings.height)] if settings.with_torch else cases
 
 
-def _choice_cases(settings: Settings) -> list[RasterCase]:
+def _list_choice_cases(settings: Settings) -> list[RasterCase]:
     height, cases = settings.choice_height, []
     for backend in settings.backends:
-        cases += all_choices(backend, height, settings.face_sizes, settings.threads)
+        cases += list_choices(backend, height, settings.face_sizes, settings.threads)
     if settings.quick:
-        return cases + _main_choices(replace(settings, height=height), "torch")
-    return cases + [replace(case, backward=False) for case in all_choices("torch", height, settings.face_sizes, 1)]
+        return cases + _list_main_choices(replace(settings, height=height), "torch")
+    return cases + [replace(case, backward=False) for case in list_choices("torch", height, settings.face_sizes, 1)]
 
 
-def _sweep_cases(settings: Settings, height: int, *, with_torch: bool) -> list[RasterCase]:
+def _list_sweep_cases(settings: Settings, height: int, *, with_torch: bool) -> list[RasterCase]:
     """The direct panorama by the fast backends, and by torch if that does not take long."""
     fast = [RasterCase(name, height, threads=settings.threads) for name in settings.sweep_backends]
     return fast + ([RasterCase("torch", height)] if (with_torch and settings.with_torch) or not fast else [])
 
 
-def _count_scenes(settings: Settings, scene_of: Callable[[int], BenchScene], synthetic: bool) -> list[BenchScene]:
+def _list_count_scenes(settings: Settings, scene_of: Callable[[int], BenchScene], synthetic: bool) -> list[BenchScene]:
     """Scenes of about a sixteenth, an eighth, a quarter, half and all Gaussians."""
     if synthetic:
-        return [room_scene(_multiple_of_8(settings.height * factor)) for factor in (0.25, 0.354, 0.5, 0.707, 1.0)]
+        return [make_room_scene(_multiple_of_8(settings.height * factor)) for factor in (0.25, 0.354, 0.5, 0.707, 1.0)]
     whole = scene_of(settings.height)
     return [
         BenchScene(f"{whole.name} 1/{step}", partial(_every_nth, whole.load, step), whole.pose)
@@ -302,7 +302,7 @@ def _every_nth(load: Callable[[], Gaussians], step: int) -> Gaussians:
     return gaussians.select(torch.arange(0, len(gaussians), step))
 
 
-def _sweep_heights(settings: Settings) -> list[int]:
+def _list_sweep_heights(settings: Settings) -> list[int]:
     factors = (0.25, 0.5, 1, 2) if settings.quick else (0.25, 0.5, 1, 2, 4)
     return [_multiple_of_8(settings.height * factor) for factor in factors]
 

@@ -62,7 +62,7 @@ def _rounded(value: Any) -> Any:
     return value
 
 
-def row_from_json(values: Mapping[str, Any], case: type[Case], result: type[Result]) -> Row[Case, Result]:
+def read_row(values: Mapping[str, Any], case: type[Case], result: type[Result]) -> Row[Case, Result]:
     """The row of a dictionary that `Row.as_json` made.
 
     Raises:
@@ -108,7 +108,7 @@ def format_number(value: float | None, form: str) -> str:
     return "" if value is None else "exact" if value == math.inf else form.format(value)
 
 
-def terminal_table(columns: Sequence[Column[AnyRow]], rows: Iterable[AnyRow], title: str) -> Table:
+def make_terminal_table(columns: Sequence[Column[AnyRow]], rows: Iterable[AnyRow], title: str) -> Table:
     """A table for the terminal; only cells of columns without a title may wrap."""
     from rich.table import Table
 
@@ -120,7 +120,7 @@ def terminal_table(columns: Sequence[Column[AnyRow]], rows: Iterable[AnyRow], ti
     return table
 
 
-def markdown_table(columns: Sequence[Column[AnyRow]], rows: Iterable[AnyRow]) -> str:
+def format_markdown_table(columns: Sequence[Column[AnyRow]], rows: Iterable[AnyRow]) -> str:
     """A table in Markdown, without a line break after the last row."""
     rule = "|" + "|".join("---:" if column.justify == "right" else "---" for column in columns) + "|"
     cells = [[column.title for column in columns], *([column.cell(row) for column in columns] for row in rows)]
@@ -211,13 +211,13 @@ class Report(Generic[AnyRow]):
 
     def tables(self, rows: Sequence[AnyRow]) -> list[Table]:
         """One table for each section, in the order of the rows."""
-        return [terminal_table(self.columns, part, title) for title, part in self._sections(rows).items()]
+        return [make_terminal_table(self.columns, part, title) for title, part in self._sections(rows).items()]
 
     def markdown(self) -> str:
         """The findings and all tables as the text of a page."""
         parts = ["\n".join(f"* {sentence}" for sentence in self.findings(self.rows))]
         for title, part in self._sections(self.rows).items():
-            parts.append(f"### {title[:1].upper()}{title[1:]}\n\n{markdown_table(self.columns, part)}")
+            parts.append(f"### {title[:1].upper()}{title[1:]}\n\n{format_markdown_table(self.columns, part)}")
         return "\n\n".join(part for part in parts if part) + "\n"
 
     def _sections(self, rows: Sequence[AnyRow]) -> dict[str, list[AnyRow]]:

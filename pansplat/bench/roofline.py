@@ -69,19 +69,19 @@ def describe_machine(threads: int) -> dict[str, object]:
     """
     counts = sorted({1, threads})
     return {
-        "cpu": _processor_name(),
+        "cpu": _read_processor_name(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "threads": threads,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        "versions": _package_versions(),
+        "versions": _read_package_versions(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        "fma_gflops": {str(count): round(fma_peak(count), 1) for count in counts},
-        "bandwidth_gb_s": {str(count): round(bandwidth(count), 1) for count in counts},
+        "fma_gflops": {str(count): round(measure_fma_peak(count), 1) for count in counts},
+        "bandwidth_gb_s": {str(count): round(measure_bandwidth(count), 1) for count in counts},
     }
 
 
-def _processor_name() -> str:
+def _read_processor_name() -> str:
     """The processor's name, with its widest vector extension on Linux."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -97,7 +97,7 @@ def _processor_name() -> str:
     return f"{model} ({widest})" if widest else model
 
 
-def _package_versions() -> dict[str, str]:
+def _read_package_versions() -> dict[str, str]:
     """Versions of the installed packages that render."""
     versions = {}
     for name in _PACKAGES:
@@ -106,14 +106,14 @@ def _package_versions() -> dict[str, str]:
     return versions
 
 
-def fma_peak(threads: int) -> float:
+def measure_fma_peak(threads: int) -> float:
     """Single-precision multiply-adds of all threads together, 10^9 operations a second (a multiply-add is two)."""
     flops = 2.0 * _vector_lanes() * _CHAINS * _STEPS
     _multiply_add_chains(np.float32(0.5), 1)
     return _best_rate(lambda _: _multiply_add_chains(np.float32(0.5), _STEPS), threads, flops)
 
 
-def bandwidth(threads: int) -> float:
+def measure_bandwidth(threads: int) -> float:
     """Memory traffic of the triad on all threads together, 10^9 bytes a second."""
     size = _ELEMENTS // threads
     arrays = [tuple(np.full(size, value, np.float32) for value in (0.0, 1.0, 2.0)) for _ in range(threads)]
@@ -194,7 +194,9 @@ class Work:
 
 
 @torch.no_grad()
-def panorama_work(gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], height: int, options: RasterOptions) -> Work:
+def count_panorama_work(
+    gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], height: int, options: RasterOptions
+) -> Work:
     """The least work of rendering a panorama; counted for the exact kernel, independently of `options.kernel`."""
     size = (height, 2 * height)
     (plane,) = image_planes("equirect", size, vertical_fov_degrees=90.0, face_size=None, device=torch.device("cpu"))

@@ -47,7 +47,7 @@ _THICKNESS = 0.1  # of a disc's width
 _OPACITY = (0.3, 0.95)
 
 
-def room_cameras(views: int = 2) -> Float[Tensor, "view 4 4"]:
+def make_room_cameras(views: int = 2) -> Float[Tensor, "view 4 4"]:
     """Poses of the input cameras of `full_lattice_room`: upright, on a line a metre long."""
     poses = torch.eye(4, dtype=torch.float64).repeat(views, 1, 1)
     if views > 1:
@@ -85,13 +85,13 @@ def full_lattice_room(height: int, *, views: int = 2, degree: int = 0, seed: int
     for level in range(NUM_LEVELS):
         rays = fibonacci_directions(lattice_size(2 * height >> level))
         pixel_angle = math.pi / (height >> level)
-        for view, pose in enumerate(room_cameras(views)):
+        for view, pose in enumerate(make_room_cameras(views)):
             for chunk in rays.split(_CHUNK):
-                parts.append(_discs(chunk, pose[:3, 3], pixel_angle, degree, generator, level, view))
+                parts.append(_make_discs(chunk, pose[:3, 3], pixel_angle, degree, generator, level, view))
     return Gaussians.cat(parts)
 
 
-def _discs(
+def _make_discs(
     rays: Float[Tensor, "n 3"],
     position: Float[Tensor, "3"],
     pixel_angle: float,
@@ -101,22 +101,22 @@ def _discs(
     view: int,
 ) -> Gaussians:
     """A disc where each ray from a camera meets the room."""
-    distance, axis, body = _trace(rays, position)
+    distance, axis, body = _trace_room(rays, position)
     points = position + distance[:, None] * rays
     normals = torch.nn.functional.one_hot(axis, 3).double()
     facing = (rays * normals).sum(dim=1)
-    size = disc_sizes(len(rays), generator)
-    harmonics = _harmonics(points, 6 * body + 2 * axis + (facing > 0), degree, generator)
-    return flat_discs(rays, points, normals, size, distance * pixel_angle, harmonics, level, view)
+    size = sample_disc_sizes(len(rays), generator)
+    harmonics = _make_harmonics(points, 6 * body + 2 * axis + (facing > 0), degree, generator)
+    return make_flat_discs(rays, points, normals, size, distance * pixel_angle, harmonics, level, view)
 
 
-def disc_sizes(count: int, generator: torch.Generator) -> Float[Tensor, "n 2"]:
+def sample_disc_sizes(count: int, generator: torch.Generator) -> Float[Tensor, "n 2"]:
     """Random standard deviations, in pixels of the level, and opacities."""
     low, high = torch.tensor((_FOOTPRINT, _OPACITY), dtype=torch.float64).T
     return low + (high - low) * torch.rand(2, count, generator=generator, dtype=torch.float64).T
 
 
-def flat_discs(
+def make_flat_discs(
     rays: Float[Tensor, "n 3"],
     points: Float[Tensor, "n 3"],
     normals: Float[Tensor, "n 3"],
@@ -131,7 +131,7 @@ def flat_discs(
     Args:
         rays: unit directions from the camera to the points.
         normals: of the surfaces, of unit length.
-        sizes: from `disc_sizes`.
+        sizes: from `sample_disc_sizes`.
         pixel: width of a pixel of the level at the points, metres.
     """
     facing = (rays * normals).sum(dim=1, keepdim=True)
@@ -151,7 +151,7 @@ def flat_discs(
     )
 
 
-def _trace(
+def _trace_room(
     rays: Float[Tensor, "n 3"], position: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"], Int[Tensor, "n"]]:
     """Distance to the first surface, the axis of its normal, and the number of its body (0: room)."""
@@ -170,7 +170,7 @@ def _trace(
     return distance, axis, body
 
 
-def _harmonics(
+def _make_harmonics(
     points: Float[Tensor, "n 3"], surface: Int[Tensor, "n"], degree: int, generator: torch.Generator
 ) -> Float[Tensor, "n k 3"]:
     """One colour per surface with stripes and noise; small random coefficients of higher degrees, like highlights."""
@@ -225,17 +225,17 @@ def _lift_level(
     height = image.shape[-2] >> level
     maps = torch.cat((image.double(), 1 / depth[None]))
     maps = resize_equirect(maps[None], (height, 2 * height))[0]
-    maps = torch.cat((maps, _normals(1 / maps[3])))
+    maps = torch.cat((maps, _compute_normals(1 / maps[3])))
     rays = fibonacci_directions(lattice_size(2 * height))
     samples = sample_equirect(maps, uv_from_directions(rays)).T
     distance = 1 / samples[:, 3]
     normals = torch.nn.functional.normalize(samples[:, 4:], dim=1)
     rotation = pose[:3, :3]
-    return flat_discs(
+    return make_flat_discs(
         rays @ rotation.T,
         (distance[:, None] * rays) @ rotation.T + pose[:3, 3],
         normals @ rotation.T,
-        disc_sizes(len(rays), generator),
+        sample_disc_sizes(len(rays), generator),
         distance * math.pi / height,
         ((samples[:, :3] - 0.5) / harmonics_basis(rays, 0))[:, None, :],
         level,
@@ -243,7 +243,7 @@ def _lift_level(
     )
 
 
-def _normals(depth: Float[Tensor, "height width"]) -> Float[Tensor, "3 height width"]:
+def _compute_normals(depth: Float[Tensor, "height width"]) -> Float[Tensor, "3 height width"]:
     """Unit normals of the surface, from the points of neighbouring pixels."""
     points = (pixel_directions(*depth.shape, dtype=torch.float64) * depth[..., None]).permute(2, 0, 1)
     around = pad_equirect(points, 1, "sphere")

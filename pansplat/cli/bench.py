@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, subcommand
 
 import pansplat
-from pansplat.cli.inputs import OptionalOut, PairChoice, choose_pair, progress_bar, require_height
+from pansplat.cli.inputs import OptionalOut, PairChoice, choose_pair, predict_scene, require_height
 from pansplat.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ _SAMPLE = Path(pansplat.__file__).parents[1] / "assets" / "living_room"
 _MIN_SWEEP_HEIGHT = 64  # pixels
 _RASTER_BACKENDS = ("numba", "triton", "gsplat")
 _DEFAULT_MEMORY = 16e9  # bytes, if the system does not report its memory
-_RANDOM_WEIGHTS = "PanSplat with random weights (seed 0): times and memory are true, images meaningless"
+_RANDOM_WEIGHTS = "PanSplat with random weights (seed 0): times and memory are valid, images are meaningless"
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,14 @@ class BenchRaster:
     """The largest number of threads to use; by default torch's."""
 
     def run(self) -> int:
-        """Measure, print the tables and write the files; an interruption keeps what was measured."""
-        from pansplat.bench.raster import RasterBench, raster_report
-        from pansplat.bench.raster_cases import raster_groups, room_scene, sample_group, viewer_group
+        """Measure, print the tables and write the files; an interruption keeps the measured rows."""
+        from pansplat.bench.raster import RasterBench, make_raster_report
+        from pansplat.bench.raster_cases import (
+            list_raster_groups,
+            make_room_scene,
+            make_sample_group,
+            make_viewer_group,
+        )
         from pansplat.bench.roofline import describe_machine
 
         json, plot, page = self._files()
@@ -62,24 +67,24 @@ class BenchRaster:
         if self.height % 8:
             raise InputError(f"--height must be a multiple of 8 pixels, got {self.height}")
         settings = self._settings()
-        scene_of = room_scene if self.scene is None else self._scene_of(self.scene, self.height)
+        scene_of = make_room_scene if self.scene is None else self._scene_of(self.scene, self.height)
         budget, slow = (1.0, 3.0) if self.quick else (8.0, 5.0)
         machine = describe_machine(settings.threads)
-        with raster_report(machine, json=json, plot=plot, page=page) as report:
+        with make_raster_report(machine, json=json, plot=plot, page=page) as report:
             bench = RasterBench(report, budget=budget, slow=slow)
-            bench.run(raster_groups(settings, scene_of, synthetic=self.scene is None))
+            bench.run(list_raster_groups(settings, scene_of, synthetic=self.scene is None))
             if self.scene is None and _SAMPLE.is_dir():
                 small = settings.choice_height
-                bench.run([sample_group(settings, self._scene_of(_SAMPLE, small)(small))])
+                bench.run([make_sample_group(settings, self._scene_of(_SAMPLE, small)(small))])
             try:
-                group = viewer_group(settings, scene_of(settings.choice_height))
+                group = make_viewer_group(settings, scene_of(settings.choice_height))
                 bench.run_viewer(group, repeats=2 if self.quick else 5)
             except InputError as error:
                 print(f"without the viewer: {error}")
         return 0
 
     def _files(self) -> tuple[Path | None, Path | None, Path | None]:
-        """The files of rows, plot and tables; refused before the work if a folder is missing."""
+        """The files of rows, plot and tables; refuses missing folders before the work."""
         json, plot, page = self.json, self.plot, None
         if self.out is not None:
             self.out.mkdir(parents=True, exist_ok=True)
@@ -92,7 +97,7 @@ class BenchRaster:
         return json, plot, page
 
     def _settings(self) -> Settings:
-        """What to measure; prints which backends are left out and why."""
+        """The settings of the run; prints the backends that are left out, with the reason."""
         from pansplat.bench.raster_cases import Settings
         from pansplat.bench.renderers import unavailable_reason
 
@@ -104,10 +109,10 @@ class BenchRaster:
                 available.append(name)
             else:
                 print(f"without {name}: {reason}")
-        return Settings(self.height, self.quick, threads, tuple(available), _usable_memory())
+        return Settings(self.height, self.quick, threads, tuple(available), _find_usable_memory())
 
     def _scene_of(self, path: Path, height: int) -> Callable[[int], BenchScene]:
-        """The scene of a .ply file or a pair from between its cameras (from the origin if it has none)."""
+        """The scene of a .ply file or a pair, seen from between its cameras, or from the origin if it has none."""
         import torch
 
         from pansplat.bench.raster_cases import BenchScene
@@ -117,7 +122,7 @@ class BenchRaster:
         return lambda _: BenchScene(path.stem, lambda: scene.gaussians, pose)
 
     def _read_scene(self, path: Path, height: int) -> Scene:
-        """The scene of a .ply file; of a pair's folder the prediction of `sweep`, or its depth maps."""
+        """The scene of a .ply file, or the scene of a pair's folder by `sweep` or from its depth maps."""
         from pansplat import pipeline
         from pansplat.bench.scenes import lift_depth
 
@@ -128,8 +133,8 @@ class BenchRaster:
         pair = choose_pair(path, PairChoice())
         if self.scene_from == "depth":
             return lift_depth(pair.load_context(height))
-        with progress_bar() as progress:
-            return pipeline.predict(pair, "sweep", height=max(height, _MIN_SWEEP_HEIGHT), progress=progress)
+        model = pipeline.load_model("sweep")
+        return predict_scene(pair, model, max(height, _MIN_SWEEP_HEIGHT), cache=True)
 
 
 @dataclass(frozen=True)
@@ -137,7 +142,7 @@ class BenchModel:
     """Measure the network: seconds of each part and memory against error, for each precision and way to run it."""
 
     model: Path | None = None
-    """Weights of PanSplat (.safetensors); by default random ones, which take as long."""
+    """Weights of PanSplat (.safetensors); by default random ones, which take the same time."""
     pair: Path | None = None
     """Folder of a pair; by default the sample, if it is there."""
     height: int = 512
@@ -152,8 +157,8 @@ class BenchModel:
     """The largest number of threads to use; by default torch's."""
 
     def run(self) -> int:
-        """Measure, print the table and write the files; an interruption keeps what was measured."""
-        from pansplat.bench.model import measure_model, model_cases, model_report
+        """Measure, print the table and write the files; an interruption keeps the measured rows."""
+        from pansplat.bench.model import list_model_cases, make_model_report, measure_model
         from pansplat.bench.roofline import describe_machine
         from pansplat.model.network import has_bfloat16
 
@@ -174,17 +179,17 @@ class BenchModel:
         if not bfloat16:
             print("without bfloat16: this processor has no instructions for it")
         machine = describe_machine(threads)
-        cases = model_cases(threads, bfloat16=bfloat16, quick=self.quick)
+        cases = list_model_cases(threads, bfloat16=bfloat16, quick=self.quick)
         with (
             self._weights() as (weights, network),
-            model_report(machine, network, height=self.height, json=json, out=self.out) as report,
+            make_model_report(machine, network, height=self.height, json=json, out=self.out) as report,
         ):
             measure_model(cases, views, weights, report, scene=folder.name)
         return 0
 
     @contextmanager
     def _weights(self) -> Iterator[tuple[Path, str]]:
-        """The file of weights, and what they are."""
+        """The file of weights, and a description of them."""
         from pansplat.bench.model import save_random_weights
         from pansplat.model.weights import load_weights
 
@@ -210,11 +215,11 @@ class BenchMemory:
     preset: Literal["tiny", "small", "paper"] = "small"
     """Size of the network; weights are random."""
     heights: tuple[int, ...] = (128, 256, 512, 1024)
-    """Of the panoramas, pixels; multiples of 32. Above 512 only the heads are trained, as in the paper's stages."""
+    """Heights of the panoramas, pixels; multiples of 32. Above 512 only the heads are trained, as in the paper."""
     quick: bool = False
     """Without one-step and 4 tiles."""
     limit_gb: float = 8.0
-    """Largest memory of a row, 10^9 bytes. Rows expected to need more are skipped, rows that take more are ended."""
+    """Largest memory of a row, 10^9 bytes. Rows expected to need more are skipped; rows that exceed it are ended."""
     style: Literal["panorama", "cubemap", "original"] = "cubemap"
     """How images are rendered; as training's --memory.style."""
     perceptual: Literal["structure", "lpips-vgg", "lpips-alex", "lpips-squeeze"] = "structure"
@@ -227,8 +232,8 @@ class BenchMemory:
     """Folder for memory.json, memory.md and memory.png."""
 
     def run(self) -> int:
-        """Measure, print the table and write the files; an interruption keeps what was measured."""
-        from pansplat.bench.memory import MemoryBench, memory_cases, memory_report, read_rows
+        """Measure, print the table and write the files; an interruption keeps the measured rows."""
+        from pansplat.bench.memory import MemoryBench, list_memory_cases, make_memory_report, read_rows
         from pansplat.bench.model import save_random_weights
         from pansplat.bench.roofline import describe_machine
         from pansplat.training.network import network_config
@@ -237,7 +242,7 @@ class BenchMemory:
         for height in self.heights:
             if height < 64 or height % 32:  # 4x4 tiles must fit the four levels
                 raise InputError(f"--heights must be 64 pixels or more and multiples of 32, got {height}")
-        cases = memory_cases(self.heights, quick=self.quick)
+        cases = list_memory_cases(self.heights, quick=self.quick)
         with tempfile.TemporaryDirectory() as temporary:
             folder = self.out or Path(temporary)
             folder.mkdir(parents=True, exist_ok=True)
@@ -246,7 +251,7 @@ class BenchMemory:
             save_random_weights(weights, network_config(setting.network))
             references = folder / "references"
             references.mkdir(exist_ok=True)
-            with memory_report(describe_machine(setting.threads), setting, cases, self.out) as report:
+            with make_memory_report(describe_machine(setting.threads), setting, cases, self.out) as report:
                 report.rows += rows
                 MemoryBench(setting, weights, references, report).run(cases)
             shutil.rmtree(references, ignore_errors=True)  # only an interrupted run needs them
@@ -308,8 +313,8 @@ def _choose_threads(threads: int | None) -> int:
     return threads or torch.get_num_threads()
 
 
-def _usable_memory() -> float:
-    """Bytes that a run may take: three quarters of the free memory."""
+def _find_usable_memory() -> float:
+    """Bytes that a run may use: three quarters of the free memory."""
     try:
         pages = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (ValueError, OSError, AttributeError):

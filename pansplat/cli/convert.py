@@ -33,14 +33,14 @@ class Convert:
     """The .safetensors file to write."""
 
     def run(self) -> int:
-        """Print what becomes of every tensor, then convert and save; the table also explains a refusal."""
+        """Print the report of all tensors, then convert and save; the report also explains a refusal."""
         from pansplat.model.network import convert_checkpoint
         from pansplat.model.weights import match_tensors, read_checkpoint, save_weights
 
         if self.out.suffix.lower() != ".safetensors" or not self.out.resolve().parent.is_dir():
             raise InputError(f"--out must be a .safetensors file in an existing folder, got {self.out}")
         content = read_checkpoint(self.path)
-        make_table_console().print(_report_table(match_tensors(content, self.path)))
+        make_table_console().print(_make_report_table(match_tensors(content, self.path)))
         weights = convert_checkpoint(content, self.path)
         save_weights(self.out, weights)
         numbers = sum(tensor.numel() for tensor in weights.tensors.values())
@@ -51,7 +51,7 @@ class Convert:
         return 0
 
 
-def _report_table(report: ConversionReport) -> Table:
+def _make_report_table(report: ConversionReport) -> Table:
     """Rows of used, unused (by reason), unknown and missing tensors."""
     from rich.table import Table
 
@@ -59,13 +59,13 @@ def _report_table(report: ConversionReport) -> Table:
     table.add_column("")
     table.add_column("count", justify="right")
     table.add_column("such as", overflow="fold")
-    table.add_row("used", str(len(report.used)), _first_names(list(report.used)))
+    table.add_row("used", str(len(report.used)), _join_first_names(list(report.used)))
     for reason, names in report.unused.items():
-        table.add_row(f"left out: {reason}", str(len(names)), _first_names(names))
+        table.add_row(f"left out: {reason}", str(len(names)), _join_first_names(names))
     for word, names in (("unknown", report.unexpected), ("missing", report.missing)):
-        table.add_row(word, str(len(names)), _first_names(names), style="bold red" if names else "")
+        table.add_row(word, str(len(names)), _join_first_names(names), style="bold red" if names else "")
     return table
 
 
-def _first_names(names: list[str]) -> str:
+def _join_first_names(names: list[str]) -> str:
     return ", ".join(names[:_MAX_NAMES]) + (", ..." if len(names) > _MAX_NAMES else "")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, cast
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Compat, Out, Precision, blend_mode, progress_bar, require_height
+from pansplat.cli.inputs import Compat, Out, Precision, parse_blend, progress_bar, require_height
 from pansplat.console import make_table_console
 from pansplat.errors import InputError
 
@@ -60,7 +60,7 @@ class Evaluate:
     out: Out
     """Folder for results.json and, for each case, prediction.png, target.png and error.png."""
     model: str = "sweep"
-    """Predictor: `sweep`, or a file of weights. The cache is not used, so that times are true."""
+    """Predictor: `sweep`, or a file of weights. The cache is not used, so that times are valid."""
     compat: Compat = "trained"
     """For a network: official, fixed, or as its weights were trained; see `pansplat predict --help`."""
     precision: Precision = "float32"
@@ -92,7 +92,7 @@ class Evaluate:
         require_height(self.height)
         if not self.paths:
             raise InputError("`pansplat evaluate` needs at least one folder of pairs, or --protocol")
-        blend = blend_mode(self.blend or "deferred")
+        blend = parse_blend(self.blend or "deferred")
         lpips = choose_lpips(self.lpips, self.height)
         pairs = []
         for path in self.paths:
@@ -158,7 +158,7 @@ class Evaluate:
         return self.protocol.data.expanduser()
 
     def _protocol_methods(self, protocol: ProtocolName) -> list[Method]:
-        """The methods of all predictors; those with weights have the name of the file."""
+        """The methods of all predictors; a predictor with weights has the name of their file."""
         from pansplat import pipeline
         from pansplat.evaluation.protocol import list_methods
         from pansplat.model.weights import WEIGHTS_SUFFIXES

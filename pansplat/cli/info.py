@@ -21,7 +21,7 @@ _BARS = " ▁▂▃▄▅▆▇█"
 
 @dataclass(frozen=True)
 class Info:
-    """Print what a scene file holds: Gaussians by level and view, opacities, scales, bounds, cameras."""
+    """Print the contents of a scene file: Gaussians by level and view, opacities, scales, bounds, cameras."""
 
     path: Positional[Path]
     """The .ply file."""
@@ -38,13 +38,13 @@ class Info:
             print(f"{source}, near {scene.near:g} m, far {scene.far:g} m")
         if not len(gaussians):
             return 0
-        make_table_console().print(_count_table(scene))
+        make_table_console().print(_make_count_table(scene))
         for name, values, unit in (
             ("opacity", gaussians.opacities, ""),
             ("largest scale", gaussians.scales.amax(dim=1), " m"),
             ("smallest scale", gaussians.scales.amin(dim=1), " m"),
         ):
-            print(_distribution(name, values, unit, log=unit != ""))
+            print(_format_distribution(name, values, unit, log=unit != ""))
         low, high = gaussians.means.amin(dim=0).tolist(), gaussians.means.amax(dim=0).tolist()
         axes = (f"{axis} {a:.2f} to {b:.2f} m" for axis, a, b in zip("xyz", low, high, strict=True))
         print("bounds          " + ", ".join(axes))
@@ -55,7 +55,7 @@ class Info:
         return 0
 
 
-def _count_table(scene: Scene) -> Table:
+def _make_count_table(scene: Scene) -> Table:
     """Number of Gaussians by level (rows) and view (columns)."""
     from rich.table import Table
 
@@ -71,7 +71,7 @@ def _count_table(scene: Scene) -> Table:
     return table
 
 
-def _distribution(name: str, values: Tensor, unit: str, *, log: bool) -> str:
+def _format_distribution(name: str, values: Tensor, unit: str, *, log: bool) -> str:
     """One line: minimum, maximum, median, and a histogram of 24 bars."""
     import torch
 

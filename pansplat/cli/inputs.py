@@ -1,4 +1,4 @@
-"""Arguments that several commands share, and the pair, scene and progress bar that they lead to.
+"""Arguments that several commands share, the pair or scene that they choose, and a progress bar.
 
 Modules of this package import torch and everything that needs it inside functions, so that `--help` is fast.
 """
@@ -74,7 +74,7 @@ def require_height(height: int) -> None:
         raise InputError(f"--height must be an even number of 16 to 8192 pixels, got {height}")
 
 
-def blend_mode(text: str) -> str | int:
+def parse_blend(text: str) -> str | int:
     """The `blend` of `pansplat.render` for an argument: "deferred", "joint", or the number of "view0", "view1", ..."""
     if text in ("deferred", "joint"):
         return text

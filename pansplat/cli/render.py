@@ -15,8 +15,8 @@ from pansplat.cli.inputs import (
     Out,
     PairChoice,
     Precision,
-    blend_mode,
     choose_pair,
+    parse_blend,
     predict_scene,
     progress_bar,
     require_height,
@@ -78,7 +78,7 @@ class Render:
         from pansplat.data.images import write_image
         from pansplat.data.video import write_video
 
-        self._check()
+        self._refuse_invalid_arguments()
         poses = None if self.pose is None else read_poses(self.pose)
         if poses is not None and len(poses) > 1 and not self._is_video:
             raise InputError(f"{self.pose} holds {len(poses)} poses; write an .mp4, or keep one pose in the file")
@@ -89,7 +89,7 @@ class Render:
         if self._is_video:
             poses = self._path_between_cameras(scene) if poses is None else poses
             with progress_bar() as progress:
-                count = write_video(self.out, _frames(scene, poses, options, progress), self.fps)
+                count = write_video(self.out, _render_frames(scene, poses, options, progress), self.fps)
             print(f"{self.out}: {count} frames of {size}, {layout}")
             return 0
         pose = scene.pose_between(0.5 if self.at is None else self.at) if poses is None else poses[0]
@@ -104,8 +104,8 @@ class Render:
     def _is_video(self) -> bool:
         return self.out.suffix.lower() == ".mp4"
 
-    def _check(self) -> None:
-        """Refuse invalid arguments before the prediction, which takes seconds."""
+    def _refuse_invalid_arguments(self) -> None:
+        """Raise an error before the prediction, which takes seconds."""
         if not self._is_video and self.out.suffix.lower() not in _IMAGE_SUFFIXES:
             raise InputError(f"--out must end in {', '.join(_IMAGE_SUFFIXES)} or .mp4, got {self.out}")
         if not self.out.resolve().parent.is_dir():
@@ -122,7 +122,7 @@ class Render:
             raise InputError(f"--fov must be 1 to 170 degrees, got {self.fov}")
         if self._is_video and not (0 < self.seconds < 3600 and 0 < self.fps <= 240):
             raise InputError(f"--seconds and --fps must be positive, got {self.seconds} and {self.fps}")
-        blend_mode(self.blend)
+        parse_blend(self.blend)
 
     def _open_scene(self) -> Scene:
         """The scene of a .ply file, or the prediction of a pair's folder."""
@@ -137,7 +137,7 @@ class Render:
 
     def _render_options(self, layout: str, height: int) -> dict[str, Any]:
         """Keyword arguments of `pipeline.render`."""
-        options: dict[str, Any] = {"blend": blend_mode(self.blend)}
+        options: dict[str, Any] = {"blend": parse_blend(self.blend)}
         if layout == "perspective":
             return options | {
                 "layout": "pinhole",
@@ -180,7 +180,9 @@ def read_poses(path: Path) -> list[Tensor]:
     return list(read_trajectory(path).poses)
 
 
-def _frames(scene: Scene, poses: list[Tensor], options: dict[str, Any], progress: Progress) -> Iterator[np.ndarray]:
+def _render_frames(
+    scene: Scene, poses: list[Tensor], options: dict[str, Any], progress: Progress
+) -> Iterator[np.ndarray]:
     """8-bit RGB images at the poses."""
     import torch
 

@@ -132,7 +132,7 @@ def test_warping_by_depth_and_pose_gives_the_other_view(views: dict[str, View], 
 
 @pytest.mark.parametrize("name", INPUTS)
 @pytest.mark.parametrize("wrong", ["baseline reversed", "rotation inverted", "not moved", "y and z flipped"])
-def test_warping_with_a_wrong_pose_does_not(views: dict[str, View], name: str, wrong: str):
+def test_warping_with_a_wrong_pose_does_not_give_the_other_view(views: dict[str, View], name: str, wrong: str):
     pose = views[name].pose.clone()
     if wrong == "baseline reversed":
         pose[:3, 3] = 2 * views["middle"].pose[:3, 3] - pose[:3, 3]

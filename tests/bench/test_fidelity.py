@@ -7,7 +7,7 @@ import torch
 
 from pansplat.bench.fidelity import (
     clamped_psnr,
-    image_fidelity,
+    measure_fidelity,
     relative_depth_errors,
     relative_deviation,
     seam_jump,
@@ -27,21 +27,21 @@ def reference():
 
 
 def test_the_reference_has_no_error(reference):
-    found = image_fidelity(reference, reference, panorama=True)
+    found = measure_fidelity(reference, reference, panorama=True)
     assert (found.max_error, found.psnr_db, found.seam_jump, found.energy_error) == (0, math.inf, 0, 0)
 
 
 def test_one_wrong_pixel_sets_the_largest_error_and_the_psnr(reference):
     wrong = reference.clone()
     wrong[1, 10, 20] += 0.25
-    found = image_fidelity(wrong, reference, panorama=True)
+    found = measure_fidelity(wrong, reference, panorama=True)
     assert found.max_error == pytest.approx(0.25)
     assert found.psnr_db == pytest.approx(-10 * math.log10(0.25**2 / reference.numel()))
 
 
 def test_energy_error_is_the_relative_error_of_the_sum(reference):
-    assert image_fidelity(1.01 * reference, reference, panorama=True).energy_error == pytest.approx(0.01)
-    assert image_fidelity(0.9 * reference, reference, panorama=False).energy_error == pytest.approx(-0.1)
+    assert measure_fidelity(1.01 * reference, reference, panorama=True).energy_error == pytest.approx(0.01)
+    assert measure_fidelity(0.9 * reference, reference, panorama=False).energy_error == pytest.approx(-0.1)
 
 
 def test_energy_weighs_pixels_by_their_solid_angle(reference):
@@ -49,33 +49,33 @@ def test_energy_weighs_pixels_by_their_solid_angle(reference):
     top = flat.clone()
     top[:, 0] += 1
     expected = (1 - math.cos(math.pi / HEIGHT)) / 2  # of the sphere
-    assert image_fidelity(top, flat, panorama=True).energy_error == pytest.approx(expected, rel=1e-2)
+    assert measure_fidelity(top, flat, panorama=True).energy_error == pytest.approx(expected, rel=1e-2)
 
 
 def test_an_offset_of_one_face_is_a_seam(reference):
     wrong = reference + 0.1 * (FACES == 5)
-    expected = image_fidelity(wrong, reference, panorama=True).seam_jump
+    expected = measure_fidelity(wrong, reference, panorama=True).seam_jump
     assert expected is not None and 0.03 < expected < 0.1  # only some of the borders belong to that face
 
 
 def test_an_image_without_seams_has_no_seam_jump(reference):
     smooth = DIRECTIONS.permute(2, 0, 1) * 0.3  # an error without borders
     assert seam_jump(smooth) < 1e-3 * float(smooth.max())
-    assert image_fidelity(reference + 0.2, reference, panorama=True).seam_jump == pytest.approx(0, abs=1e-12)
+    assert measure_fidelity(reference + 0.2, reference, panorama=True).seam_jump == pytest.approx(0, abs=1e-12)
 
 
 def test_edges_of_the_reference_are_not_seams():
     faces = FACES.double().expand(3, -1, -1)
-    assert image_fidelity(faces + 0.01, faces, panorama=True).seam_jump == pytest.approx(0, abs=1e-12)
+    assert measure_fidelity(faces + 0.01, faces, panorama=True).seam_jump == pytest.approx(0, abs=1e-12)
 
 
 def test_pinhole_images_have_no_seam_jump(reference):
-    assert image_fidelity(reference, reference, panorama=False).seam_jump is None
+    assert measure_fidelity(reference, reference, panorama=False).seam_jump is None
 
 
 def test_images_of_different_sizes_are_refused(reference):
     with pytest.raises(ValueError, match="reference's shape"):
-        image_fidelity(reference[:, :-1], reference, panorama=True)
+        measure_fidelity(reference[:, :-1], reference, panorama=True)
 
 
 def test_depth_errors_are_relative_to_the_reference():

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.bench.harness import CaseFailedError, OverLimitError, _child_error, peak_memory, quartile_range, time_call
+from pansplat.bench.harness import (
+    CaseFailedError,
+    OverLimitError,
+    _make_error,
+    measure_peak_memory,
+    quartile_range,
+    time_call,
+)
 
 CPU = torch.device("cpu")
 linux = pytest.mark.skipif(sys.platform != "linux", reason="the high-water mark is Linux's")
@@ -14,13 +21,13 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="the high-water mark 
 
 @linux
 @pytest.mark.parametrize("count", [2, 6])
-def test_peak_memory_is_what_the_call_holds_at_once(count):
+def test_peak_memory_is_the_memory_that_the_call_holds_at_once(count):
     before = np.ones(50_000_000, np.uint8)
 
     def hold() -> int:
         return sum(int(block.sum()) for block in [np.ones(10_000_000, np.uint8) for _ in range(count)])
 
-    peak, total = peak_memory(hold, CPU)
+    peak, total = measure_peak_memory(hold, CPU)
     assert total == count * 10_000_000
     assert peak is not None and 10 * count - 2 <= peak <= 10 * count + 5
     assert before[0] == 1  # held during the call
@@ -49,5 +56,5 @@ def test_outliers_hardly_change_the_quartile_range():
     ],
 )
 def test_errors_of_children_name_their_cause(status, log, kind, message):
-    error = _child_error(status, log)
+    error = _make_error(status, log)
     assert type(error) is kind and str(error).startswith(message)

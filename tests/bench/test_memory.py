@@ -1,4 +1,4 @@
-"""`pansplat bench memory`: one process per row, no row silently missing, interrupted runs continue."""
+"""`pansplat bench memory`: one process per row, a status for every row, and continued runs."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from pansplat.bench.memory import (
     MemoryResult,
     MemoryRow,
     MemorySetting,
-    expected_gib,
+    estimate_gib,
+    list_memory_cases,
     measure_case,
-    memory_cases,
     plot_memory,
 )
 from pansplat.bench.model import save_random_weights
@@ -78,12 +78,12 @@ def references_in(folder: Path) -> list[tuple[str, int]]:
     return [(row["work"], row["tiles"]) for row in rows_in(folder) if row["is_reference"]]
 
 
-def test_the_command_writes_and_prints_what_was_measured(measured, tmp_path, capsys):
+def test_the_command_writes_and_prints_the_rows(measured, tmp_path, capsys):
     out = tmp_path / "out"
     assert run([*ARGUMENTS, "--out", str(out)]) == 0
     assert sorted(file.name for file in out.iterdir()) == ["memory.json", "memory.md", "memory.png"]
     rows = rows_in(out)
-    assert measured == memory_cases((64, 128), quick=False)
+    assert measured == list_memory_cases((64, 128), quick=False)
     assert [MemoryCase(row["work"], row["tiles"], row["height"]) for row in rows] == measured
     assert {row["status"] for row in rows} == {"measured"}
     assert references_in(out) == 2 * [("inference", 1), ("plain", 1)]
@@ -150,7 +150,7 @@ def test_failed_rows_are_measured_again_if_their_height_is_requested_and_kept_ot
     assert [row["status"] for row in small if row["work"] == "plain"] == ["over the limit"]
     both = run_at(128)
     assert [row for row in both if row["height"] == 64] == small
-    assert measured == memory_cases([128], quick=False)  # all are tried: the limit may be another one
+    assert measured == list_memory_cases([128], quick=False)  # all are tried: the limit may be another one
     fail(lambda case: None)
     again = run_at(64)
     assert MemoryCase("plain", 1, 64) in measured and MemoryCase("inference", 1, 64) not in measured
@@ -164,13 +164,13 @@ def row_of(work: str, tiles: int, height: int, **result: float) -> MemoryRow:
 def test_memory_is_expected_to_grow_with_the_number_of_pixels():
     case, known = MemoryCase("two-step", 2, 256), {"base_gib": 0.5, "taken_gib": 0.25}
     row = row_of("two-step", 2, 64, **known)
-    assert expected_gib(case, []) == 0
-    assert expected_gib(case, [row]) == pytest.approx(0.5 + 16 * 0.25)
-    assert expected_gib(case, [row_of("two-step", 1, 64, **known), row_of("two-step", 2, 512, **known)]) == 0
-    assert expected_gib(case, [row_of("two-step", 2, 128), row]) == math.inf
-    assert expected_gib(MemoryCase("two-step", 2, 1024), [row]) == 0  # only the heads are trained there
+    assert estimate_gib(case, []) == 0
+    assert estimate_gib(case, [row]) == pytest.approx(0.5 + 16 * 0.25)
+    assert estimate_gib(case, [row_of("two-step", 1, 64, **known), row_of("two-step", 2, 512, **known)]) == 0
+    assert estimate_gib(case, [row_of("two-step", 2, 128), row]) == math.inf
+    assert estimate_gib(MemoryCase("two-step", 2, 1024), [row]) == 0  # only the heads are trained there
     tall = row_of("two-step", 2, 1024, **known)
-    assert expected_gib(MemoryCase("two-step", 2, 2048), [tall, row]) == pytest.approx(0.5 + 4 * 0.25)
+    assert estimate_gib(MemoryCase("two-step", 2, 2048), [tall, row]) == pytest.approx(0.5 + 4 * 0.25)
 
 
 def test_cells_of_rows_that_were_not_measured_are_empty_except_for_the_reason():

@@ -19,8 +19,8 @@ from pansplat.bench.model import (
     ModelCase,
     ModelResult,
     ModelRow,
+    list_model_cases,
     measure_case,
-    model_cases,
     save_random_weights,
 )
 from pansplat.cli import run
@@ -65,7 +65,7 @@ def measured(monkeypatch: pytest.MonkeyPatch, fast_peaks: None) -> list[ModelCas
     return cases
 
 
-def test_the_command_writes_and_prints_what_was_measured(measured, tmp_path, capsys):
+def test_the_command_writes_and_prints_the_rows(measured, tmp_path, capsys):
     out = tmp_path / "out"
     assert run(["bench", "model", "--height", "64", "--quick", "--out", str(out), "--threads", "1"]) == 0
     assert sorted(file.name for file in out.iterdir()) == ["model.json", "model.md", "model.png"]
@@ -82,13 +82,13 @@ def test_the_command_writes_and_prints_what_was_measured(measured, tmp_path, cap
 
 
 def test_each_compat_begins_with_its_reference():
-    cases = model_cases(2, bfloat16=True, quick=False)
+    cases = list_model_cases(2, bfloat16=True, quick=False)
     assert len(set(cases)) == len(cases)
     for compat in ("fixed", "official"):
         first = next(case for case in cases if case.compat == compat)
         assert dataclasses.replace(first, compat="fixed", threads=1) == PLAIN
     assert {case.tiles for case in cases} == {1, 2, 4} and {case.threads for case in cases} == {1, 2}
-    assert all(case.precision == "float32" for case in model_cases(1, bfloat16=False, quick=False))
+    assert all(case.precision == "float32" for case in list_model_cases(1, bfloat16=False, quick=False))
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The raster benchmark keeps what it measured, and its findings compare like with like."""
+"""The raster benchmark keeps its rows when interrupted, and its findings compare rows of the same kind."""
 
 import json
 import math
@@ -16,13 +16,13 @@ from pansplat.bench.raster import (
     RasterBench,
     RasterResult,
     RasterRow,
-    pareto_front,
+    find_pareto_front,
+    list_findings,
+    make_raster_report,
     plot_choices,
     plot_sweeps,
-    raster_findings,
-    raster_report,
 )
-from pansplat.bench.raster_cases import Group, RasterCase, default_face_size, official_choice, room_scene
+from pansplat.bench.raster_cases import Group, RasterCase, default_face_size, make_official_case, make_room_scene
 from pansplat.bench.renderers import ViewerImage
 
 HEIGHT = 16
@@ -34,11 +34,13 @@ NUMBER = st.integers(1, 6).map(float)
 
 
 def group(*cases: RasterCase, references: str = "own", backward: bool = False, height: int = HEIGHT) -> Group:
-    return Group("choices", room_scene(height), tuple(replace(case, backward=backward) for case in cases), references)
+    return Group(
+        "choices", make_room_scene(height), tuple(replace(case, backward=backward) for case in cases), references
+    )
 
 
 def measure(*groups: Group, budget: float = 0, **files) -> list[RasterRow]:
-    report = raster_report(MACHINE, **files)
+    report = make_raster_report(MACHINE, **files)
     RasterBench(report, budget=budget).run(groups)
     return report.rows
 
@@ -67,7 +69,7 @@ def test_rows_hold_times_memory_errors_and_fractions_of_the_peaks():
 
 
 def test_errors_of_the_choice_are_separate_from_those_of_the_backend():
-    found = results(measure(group(FACES, replace(FACES, kernel="ewa"), official_choice("torch", HEIGHT, 1))))
+    found = results(measure(group(FACES, replace(FACES, kernel="ewa"), make_official_case("torch", HEIGHT, 1))))
     exact, ewa = found["ray", "radial", "cubemap", "float32"], found["ewa", "radial", "cubemap", "float32"]
     official = found["ewa", "z", "cubemap", "float32"]
     assert exact.psnr_db > ewa.psnr_db > official.psnr_db
@@ -141,7 +143,7 @@ def test_rows_of_the_viewer_have_its_times_and_errors(monkeypatch):
             )
 
     monkeypatch.setattr(raster, "render_in_viewer", render_in_viewer)
-    report = raster_report(MACHINE)
+    report = make_raster_report(MACHINE)
     RasterBench(report).run_viewer(group(replace(FACES, backend="gl"), replace(FACES, backend="gl", order="z")), 3)
     rows = [row for row in report.rows if row.case.backend == "gl33"]
     assert [row.case.order for row in rows] == ["radial", "z"]
@@ -192,14 +194,14 @@ def test_cells_of_unmeasured_values_are_empty(row):
 
 
 def test_a_sweep_has_one_table_for_all_scenes(row):
-    report = raster_report(MACHINE)
+    report = make_raster_report(MACHINE)
     sweep = [change(row, suite="count", scene=f"room {height}") for height in (128, 256)]
     assert [(table.title, table.row_count) for table in report.tables([row, *sweep])] == [
         *(("headline: room 512", 1), ("count", 2))
     ]
 
 
-def test_findings_compare_like_with_like(row):
+def test_findings_compare_rows_of_the_same_kind(row):
     rows = [
         row,
         change(row, threads=2, forward_ms=50.0),
@@ -209,7 +211,7 @@ def test_findings_compare_like_with_like(row):
         change(row, suite="dense", backend="dense", height=64, num_gaussians=13_848, forward_ms=4000.0),
         change(row, suite="dense", height=64, num_gaussians=13_848, forward_ms=2.0),
     ]
-    text = "\n".join(raster_findings(rows))
+    text = "\n".join(list_findings(rows))
     assert "numba on one thread is 100 times (backward 150 times) [by processor time 90] as fast" in text
     assert "numba on 2 threads is 200 times" in text
     assert "numba on one thread is 2,000 times" in text and "64x128" in text
@@ -218,15 +220,15 @@ def test_findings_compare_like_with_like(row):
         "reaches 50% of the multiply-add peak forward (56% in the raster stage), 40% backward, and 10% of the memory"
     )
     assert peaks in text
-    assert raster_findings([]) == []
+    assert list_findings([]) == []
 
 
 @given(st.lists(st.tuples(NUMBER, NUMBER), min_size=1, max_size=20))
-def test_the_front_is_what_no_other_point_beats(points):
+def test_no_other_point_beats_a_point_of_the_front(points):
     def beats(one: tuple[float, float], other: tuple[float, float]) -> bool:
         return one[0] <= other[0] and one[1] <= other[1] and one != other
 
-    front = pareto_front(points)
+    front = find_pareto_front(points)
     for index, point in enumerate(points):
         assert (index in front) == (not any(beats(other, point) for other in points))
     ordered = [points[i] for i in front]

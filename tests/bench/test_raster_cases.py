@@ -1,4 +1,4 @@
-"""The groups cover every choice and leave out what takes too long."""
+"""The groups cover every choice and leave out cases that take too long."""
 
 from dataclasses import replace
 
@@ -9,12 +9,12 @@ from pansplat.bench.raster_cases import (
     BenchScene,
     RasterCase,
     Settings,
-    all_choices,
-    official_choice,
-    raster_groups,
-    room_scene,
-    sample_group,
-    viewer_group,
+    list_choices,
+    list_raster_groups,
+    make_official_case,
+    make_room_scene,
+    make_sample_group,
+    make_viewer_group,
 )
 from pansplat.bench.scenes import full_lattice_room
 
@@ -23,7 +23,7 @@ FULL = replace(QUICK, quick=False)
 
 
 def groups_of(settings: Settings, suite: str) -> list:
-    return [group for group in raster_groups(settings, room_scene, synthetic=True) if group.suite == suite]
+    return [group for group in list_raster_groups(settings, make_room_scene, synthetic=True) if group.suite == suite]
 
 
 def cases_of(settings: Settings, suite: str) -> list[RasterCase]:
@@ -33,11 +33,11 @@ def cases_of(settings: Settings, suite: str) -> list[RasterCase]:
 @pytest.mark.parametrize(("settings", "height", "sizes"), [(QUICK, 192, (122,)), (FULL, 512, (256, 326, 512))])
 def test_every_choice_of_the_fast_backend_is_measured(settings, height, sizes):
     assert settings.choice_height == height
-    assert set(all_choices("numba", height, sizes, 2)) <= set(cases_of(settings, "choices"))
+    assert set(list_choices("numba", height, sizes, 2)) <= set(cases_of(settings, "choices"))
 
 
 def test_all_choices_are_all_combinations():
-    choices = all_choices("torch", 64, (32, 48), 1)
+    choices = list_choices("torch", 64, (32, 48), 1)
     assert len(set(choices)) == len(choices) == 2 + 2 * 8 + 2
     equirects = [case for case in choices if case.layout == "equirect"]
     assert [(case.kernel, case.order, case.filter) for case in equirects] == [
@@ -60,11 +60,11 @@ def test_scenes_that_do_not_fit_in_memory_are_left_out():
     assert heights == [128, 256, 512]
 
 
-def test_slow_renderers_get_small_scenes():
-    groups = raster_groups(FULL, room_scene, synthetic=True)
+def test_slow_renderers_have_small_scenes():
+    groups = list_raster_groups(FULL, make_room_scene, synthetic=True)
     assert {case.height for group in groups for case in group.cases if case.backend == "dense"} == {64}
     huge = replace(FULL, height=2048, memory=1e12)
-    groups = raster_groups(huge, room_scene, synthetic=True)
+    groups = list_raster_groups(huge, make_room_scene, synthetic=True)
     assert [group.references for group in groups if group.suite == "headline"] == ["none"]
     assert max(case.height for group in groups for case in group.cases if case.backend == "torch") <= 1024
     assert {case.height for case in cases_of(huge, "choices")} == {512}
@@ -74,7 +74,7 @@ def test_slow_renderers_get_small_scenes():
 def test_other_scenes_are_thinned_out():
     gaussians = full_lattice_room(16)
     scene = BenchScene("mine", lambda: gaussians, torch.eye(4, dtype=torch.float64))
-    groups = raster_groups(QUICK, lambda height: scene, synthetic=False)
+    groups = list_raster_groups(QUICK, lambda height: scene, synthetic=False)
     assert not [group for group in groups if group.suite == "dense"]
     sizes = [len(group.scene.load()) for group in groups if group.suite == "count"]
     assert sizes == [-(-len(gaussians) // step) for step in (16, 8, 4, 2, 1)]
@@ -83,21 +83,21 @@ def test_other_scenes_are_thinned_out():
 def test_without_a_fast_backend_torch_is_measured():
     alone = replace(QUICK, backends=())
     assert {case.backend for case in cases_of(alone, "count")} == {"torch"}
-    assert {case.backend for case in sample_group(alone, room_scene(64)).cases} == {"torch"}
+    assert {case.backend for case in make_sample_group(alone, make_room_scene(64)).cases} == {"torch"}
 
 
-def test_gsplat_gets_only_what_it_supports():
+def test_gsplat_has_only_the_cases_that_it_supports():
     cases = [case for case in cases_of(replace(QUICK, backends=("gsplat",)), "choices") if case.backend == "gsplat"]
     assert cases and all((case.layout, case.kernel, case.order) == ("cubemap", "ewa", "z") for case in cases)
 
 
 def test_the_viewer_has_cubemaps_only():
-    quick, full = (viewer_group(settings, room_scene(192)).cases for settings in (QUICK, FULL))
+    quick, full = (make_viewer_group(settings, make_room_scene(192)).cases for settings in (QUICK, FULL))
     assert {case.layout for case in (*quick, *full)} == {"cubemap"} and len(quick) == 3 and len(full) == 24
 
 
 def test_official_choices():
-    case = official_choice("numba", 512, 2)
+    case = make_official_case("numba", 512, 2)
     choices = (case.kernel, case.order, case.filter, case.face_size, case.stitching)
     assert choices == ("ewa", "z", "3dgs", 256, "official")
     assert case.exact == RasterCase("torch", 512, precision="float64", backward=False)

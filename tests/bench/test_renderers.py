@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pansplat.bench import renderers
-from pansplat.bench.raster_cases import RasterCase, room_scene
+from pansplat.bench.raster_cases import RasterCase, make_room_scene
 from pansplat.bench.renderers import render_case, render_dense, render_in_viewer, unavailable_reason
 from pansplat.bench.scenes import full_lattice_room
 from pansplat.errors import InputError
@@ -73,7 +73,7 @@ def test_missing_gsplat_is_named(monkeypatch, pose):
 
 @pytest.mark.gl
 def test_the_viewer_renders_each_case():
-    scene, cases = room_scene(HEIGHT), [VIEWER_CASE, replace(VIEWER_CASE, kernel="ewa")]
+    scene, cases = make_room_scene(HEIGHT), [VIEWER_CASE, replace(VIEWER_CASE, kernel="ewa")]
     gaussians = scene.load()
     try:
         images = list(render_in_viewer(scene, gaussians, cases, repeats=2))
@@ -92,7 +92,7 @@ def test_the_viewer_renders_each_case():
 def test_a_missing_viewer_is_an_error(monkeypatch):
     monkeypatch.setattr(renderers, "_VIEWER_PACKAGE", "no_such_viewer")
     with pytest.raises(InputError, match="not installed"):
-        next(render_in_viewer(room_scene(8), full_lattice_room(8), [VIEWER_CASE], repeats=1))
+        next(render_in_viewer(make_room_scene(8), full_lattice_room(8), [VIEWER_CASE], repeats=1))
 
 
 def test_an_error_of_the_viewer_is_passed_on(tmp_path):

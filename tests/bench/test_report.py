@@ -9,7 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from pansplat.bench.report import Column, Report, Row, format_number, row_from_json, write_rows
+from pansplat.bench.report import Column, Report, Row, format_number, read_row, write_rows
 from pansplat.errors import InputError
 
 
@@ -45,7 +45,7 @@ def test_rows_are_read_as_they_were_written(tmp_path):
     write_rows(tmp_path / "rows.json", {"machine": {"cpu": "some"}}, rows)
     content = json.loads((tmp_path / "rows.json").read_text())
     assert set(content) == {"machine", "rows"} and content["machine"] == {"cpu": "some"}
-    assert [row_from_json(values, Case, Result) for values in content["rows"]] == rows
+    assert [read_row(values, Case, Result) for values in content["rows"]] == rows
 
 
 def test_numbers_have_six_digits_and_infinite_ones_are_null(tmp_path):

@@ -1,4 +1,4 @@
-"""The kernels of the peaks do the counted arithmetic, and the counted work covers what is rendered."""
+"""The kernels of the peaks do the counted arithmetic, and the counted work covers the rendered pixels."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from pansplat.bench import roofline
-from pansplat.bench.roofline import describe_machine, panorama_work
+from pansplat.bench.roofline import count_panorama_work, describe_machine
 from pansplat.bench.scenes import full_lattice_room
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import rasterize
@@ -56,7 +56,7 @@ def test_pairs_are_the_pixels_of_a_tight_box():
     for index in range(0, len(room), 37):
         alpha = rasterize(select_one(room, index), POSE, size=(16, 32), backend="torch").alpha
         shown = alpha > 0
-        pairs = panorama_work(select_one(room, index), POSE, 16, OPTIONS).pairs
+        pairs = count_panorama_work(select_one(room, index), POSE, 16, OPTIONS).pairs
         rows, columns = int(shown.any(dim=1).sum()), int(shown.any(dim=0).sum())
         assert int(shown.sum()) <= pairs
         assert pairs <= (rows + 1) * (columns + 1) or rows * columns == 0 or columns > 16
@@ -64,28 +64,30 @@ def test_pairs_are_the_pixels_of_a_tight_box():
 
 def test_work_is_a_sum_over_gaussians():
     room = full_lattice_room(8)
-    whole = panorama_work(room, POSE, 16, OPTIONS)
-    assert whole.pairs == sum(panorama_work(select_one(room, i), POSE, 16, OPTIONS).pairs for i in range(len(room)))
+    whole = count_panorama_work(room, POSE, 16, OPTIONS)
+    assert whole.pairs == sum(
+        count_panorama_work(select_one(room, i), POSE, 16, OPTIONS).pairs for i in range(len(room))
+    )
 
 
 def test_traffic_is_that_of_the_scene_its_records_and_the_image():
     room = full_lattice_room(8, degree=2)
     far = room.select(torch.tensor([0]))  # straight down; the image has one tile
     scene, record, intersection, image = 4 * (11 + 27), 80, 88, 4 * 5 * 16 * 32
-    assert panorama_work(far, POSE, 16, OPTIONS).bytes == scene + record + intersection + image
+    assert count_panorama_work(far, POSE, 16, OPTIONS).bytes == scene + record + intersection + image
 
 
 def test_gaussians_nearer_than_near_have_no_work():
     room = full_lattice_room(8)
     options = RasterOptions("ray", "radial", "angular", 100.0, False)
-    assert panorama_work(room, POSE, 16, options).pairs == 0
+    assert count_panorama_work(room, POSE, 16, options).pairs == 0
 
 
 def test_a_gaussian_around_the_camera_counts_every_pixel_once():
     room = full_lattice_room(8)
     around = select_one(room, 0)
     around = replace(around, scales=torch.full((1, 3), 50.0), opacities=torch.ones(1))
-    assert panorama_work(around, POSE, 16, OPTIONS).pairs == 16 * 32
+    assert count_panorama_work(around, POSE, 16, OPTIONS).pairs == 16 * 32
     below = replace(around, means=torch.tensor([[0.0, 1.2, 0.0]]), scales=torch.full((1, 3), 0.15))
     rows = int((rasterize(below, POSE, size=(16, 32), backend="torch").alpha > 0).any(dim=1).sum())
-    assert 32 * rows <= panorama_work(below, POSE, 16, OPTIONS).pairs <= 32 * (rows + 1)
+    assert 32 * rows <= count_panorama_work(below, POSE, 16, OPTIONS).pairs <= 32 * (rows + 1)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from pansplat.bench.scenes import full_lattice_room, lattice_room_size, lift_depth, room_cameras
+from pansplat.bench.scenes import full_lattice_room, lattice_room_size, lift_depth, make_room_cameras
 from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions
@@ -36,7 +36,7 @@ def test_fields_are_float32_of_the_degree(degree):
 
 def test_discs_are_half_a_pixel_to_a_pixel_wide_across_the_line_of_sight():
     room = full_lattice_room(64)
-    distance = (room.means - room_cameras(2)[room.views.long(), :3, 3]).norm(dim=1)
+    distance = (room.means - make_room_cameras(2)[room.views.long(), :3, 3]).norm(dim=1)
     pixels = room.scales[:, 1] / distance / (math.pi / 64 * 2.0**room.levels)
     assert float(pixels.min()) > 0.4999 and float(pixels.max()) < 1.0001
     assert float(room.opacities.min()) >= 0.3 and float(room.opacities.max()) <= 0.95

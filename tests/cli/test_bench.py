@@ -10,13 +10,13 @@ import pytest
 from pansplat import pipeline
 from pansplat.bench import raster, raster_cases, roofline
 from pansplat.bench.raster_cases import Group
-from pansplat.bench.scenes import full_lattice_room, lattice_room_size, room_cameras
+from pansplat.bench.scenes import full_lattice_room, lattice_room_size, make_room_cameras
 from pansplat.cli import bench, run
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 
 SAMPLE = Path(__file__).parents[2] / "assets" / "living_room"
-_raster_groups = raster_cases.raster_groups
+_raster_groups = raster_cases.list_raster_groups
 
 
 @pytest.fixture(autouse=True)
@@ -29,7 +29,7 @@ def small(monkeypatch):
     monkeypatch.setattr(bench, "_SAMPLE", Path("no such folder"))
     monkeypatch.setattr(raster, "render_in_viewer", _no_viewer)
     monkeypatch.setattr(bench, "_RASTER_BACKENDS", ("triton", "gsplat"))
-    monkeypatch.setattr(raster_cases, "raster_groups", _one_per_suite)
+    monkeypatch.setattr(raster_cases, "list_raster_groups", _one_per_suite)
 
 
 def _one_per_suite(*arguments: Any, **options: Any) -> list[Group]:
@@ -58,7 +58,7 @@ def test_the_quick_run_writes_rows_and_plots_and_prints_the_tables(tmp_path, cap
 
 
 def test_a_ply_scene_is_measured(tmp_path):
-    scene = Scene(full_lattice_room(16), room_cameras(2), 0.1, 10.0, ("a", "b"))
+    scene = Scene(full_lattice_room(16), make_room_cameras(2), 0.1, 10.0, ("a", "b"))
     pipeline.save(scene, tmp_path / "mine.ply")
     file = tmp_path / "rows.json"
     command = ["bench", "raster", str(tmp_path / "mine.ply"), "--quick", "--height", "16", "--json", str(file)]

@@ -1,4 +1,4 @@
-"""`pansplat convert`: its report and its refusals; and the other commands with the converted weights."""
+"""`pansplat convert`: its report, refused checkpoints, and the other commands with the converted weights."""
 
 import contextlib
 import io
@@ -28,13 +28,13 @@ def content(
 
 @pytest.fixture(scope="module")
 def conversion(content: dict[str, object], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
-    """The checkpoint, the converted weights, and what the command printed."""
+    """The checkpoint, the converted weights, and the output of the command."""
     folder = tmp_path_factory.mktemp("weights")
-    original, converted = folder / "original.ckpt", folder / "model.safetensors"
-    torch.save(content, original)
+    official, converted = folder / "official.ckpt", folder / "model.safetensors"
+    torch.save(content, official)
     with contextlib.redirect_stdout(io.StringIO()) as printed:
-        assert run(["convert", str(original), "-o", str(converted)]) == 0
-    return original, converted, printed.getvalue()
+        assert run(["convert", str(official), "-o", str(converted)]) == 0
+    return official, converted, printed.getvalue()
 
 
 def test_the_report_counts_every_tensor(conversion: tuple[Path, Path, str]) -> None:
@@ -103,8 +103,8 @@ def test_code_in_a_checkpoint_is_not_executed(tmp_path: Path, refusal) -> None:
 
 
 def test_a_truncated_checkpoint_is_refused(conversion: tuple[Path, Path, str], tmp_path: Path, refusal) -> None:
-    with conversion[0].open("rb") as original:
-        (tmp_path / "short.ckpt").write_bytes(original.read(1 << 20))
+    with conversion[0].open("rb") as official:
+        (tmp_path / "short.ckpt").write_bytes(official.read(1 << 20))
     message = refusal("convert", tmp_path / "short.ckpt", "-o", tmp_path / "m.safetensors")
     assert "got a damaged one; download" in message
     assert not (tmp_path / "m.safetensors").exists()

@@ -1,4 +1,4 @@
-"""`pansplat evaluate`, on folders of pairs and with --protocol: what it writes, prints and refuses."""
+"""`pansplat evaluate` on folders of pairs and with --protocol: files, output, refused arguments."""
 
 import json
 from pathlib import Path

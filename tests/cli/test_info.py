@@ -1,4 +1,4 @@
-"""`pansplat info` and `pansplat check`: what they print."""
+"""The output of `pansplat info` and `pansplat check`."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What all commands share: help, errors, warnings, interruptions, exit statuses."""
+"""Help, errors, warnings, interruptions and exit statuses of all commands."""
 
 import json
 import os
@@ -39,7 +39,7 @@ def test_missing_or_misspelt_arguments_exit_with_2(arguments: list[str], capsys:
     assert "Traceback" not in capsys.readouterr().err
 
 
-def test_a_warning_of_ours_is_one_note(room: Path, predict, tmp_path: Path, capsys) -> None:
+def test_a_warning_of_pansplat_is_one_note(room: Path, predict, tmp_path: Path, capsys) -> None:
     content = json.loads((room / "poses.json").read_text())
     content["poses"]["b.png"] = content["poses"]["a.png"]  # coincident cameras
     (room / "poses.json").write_text(json.dumps(content))

@@ -1,4 +1,4 @@
-"""`pansplat predict`: the scene that it writes, the pair that it chooses, what it refuses."""
+"""`pansplat predict`: the written scene, the chosen pair, refused arguments."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""`pansplat render`: images and videos of scenes and pairs, camera poses, what it refuses."""
+"""`pansplat render`: images and videos of scenes and pairs, camera poses, refused arguments."""
 
 import json
 from pathlib import Path
