@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from pansplat.bench.fidelity import clamped_psnr, relative_depth_errors
 from pansplat.bench.harness import CaseFailedError, read_resident_peak, reset_resident_peak, run_child, serve_job
-from pansplat.bench.report import Column, Report, Row, error_column, format_number, result_column
+from pansplat.bench.report import Column, Report, Row, error_column, format_number, format_threads, result_column
 from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
@@ -70,7 +70,8 @@ class ModelCase:
 
     def __str__(self) -> str:
         """The case as it is shown while it is measured."""
-        return f"{self.compat}, {self.precision}, attention {self.attention}, {_tiles(self)} tiles, {_threads(self)}"
+        tiles, threads = _tiles(self), format_threads(self.threads)
+        return f"{self.compat}, {self.precision}, attention {self.attention}, {tiles} tiles, {threads}"
 
 
 @dataclass
@@ -286,10 +287,6 @@ def _tiles(case: ModelCase) -> str:
     return f"{case.tiles}x{case.tiles}"
 
 
-def _threads(case: ModelCase) -> str:
-    return "1 thread" if case.threads == 1 else f"{case.threads} threads"
-
-
 def _stage_column(stage: str) -> Column[ModelRow]:
     return Column(f"{stage} s", lambda row: format_number(row.result.stages_s.get(stage), "{:.1f}"))
 
@@ -337,7 +334,7 @@ def _describe_case(case: ModelCase) -> str:
     parts = [case.compat, case.precision]
     parts += ["attention bfloat16"] * (case.attention == "bfloat16")
     parts += [f"{_tiles(case)} tiles"] * (case.tiles > 1)
-    return ", ".join([*parts, _threads(case)])
+    return ", ".join([*parts, format_threads(case.threads)])
 
 
 def save_random_weights(path: Path, config: PanSplatConfig | None = None, seed: int = 0) -> None:

@@ -29,7 +29,7 @@ from pansplat.bench.renderers import (
     render_with_graph,
     warm_up,
 )
-from pansplat.bench.report import Column, Report, Row, result_column
+from pansplat.bench.report import Column, Report, Row, format_threads, result_column
 from pansplat.bench.roofline import BACKWARD_OPERATIONS, FORWARD_OPERATIONS, Work, count_panorama_work
 from pansplat.constants import NEAR
 from pansplat.gaussians.scene import Gaussians
@@ -119,7 +119,7 @@ RasterRow = Row[RasterCase, RasterResult]
 
 @dataclass(eq=False)
 class _Measurement:
-    """A row and the timings taken so far."""
+    """A row and its timings."""
 
     row: RasterRow
     repeats: int = 1
@@ -375,17 +375,12 @@ def _renderer(row: RasterRow) -> str:
     return row.case.backend if row.case.precision == "float32" else f"{row.case.backend} {row.case.precision}"
 
 
-def _layout(row: RasterRow) -> str:
-    faces = f" {row.case.face_size}" if row.case.face_size else ""
-    return f"{row.case.layout}{faces}{' official' if row.case.stitching == 'official' else ''}"
-
-
 RASTER_COLUMNS: tuple[Column[RasterRow], ...] = (
     Column("renderer", _renderer, "left"),
     Column("kernel", lambda row: row.case.kernel, "left"),
     Column("order", lambda row: row.case.order, "left"),
     Column("filter", lambda row: row.case.filter, "left"),
-    Column("layout", _layout, "left"),
+    Column("layout", lambda row: row.case.layout_name, "left"),
     Column("height", lambda row: str(row.case.height)),
     result_column("Gaussians", "{:,}", "num_gaussians"),
     Column("threads", lambda row: str(row.case.threads)),
@@ -421,8 +416,8 @@ def _direct_rows(rows: Sequence[RasterRow], suite: str, backend: str) -> list[Ra
 
 def _compare_with_torch(rows: Sequence[RasterRow]) -> list[str]:
     return [
-        f"{row.case.backend} on {_threads(row)} is {_speedup(torch_row, row)} as fast as the tiled torch reference "
-        f"on one, {_size(row)}."
+        f"{row.case.backend} on {format_threads(row.case.threads)} is {_speedup(torch_row, row)} as fast as the tiled "
+        f"torch reference on one, {_size(row)}."
         for torch_row in _direct_rows(rows, "headline", "torch")[:1]
         for row in (*_direct_rows(rows, "headline", "numba"), *_direct_rows(rows, "headline", "triton"))
     ]
@@ -455,7 +450,8 @@ def _compare_with_peaks(rows: Sequence[RasterRow]) -> list[str]:
         result = row.result
         if result.fma_fraction is None or result.bandwidth_fraction is None or result.forward_cpu_ms is None:
             continue
-        text = f"numba on {_threads(row)} reaches {result.fma_fraction:.0%} of the multiply-add peak forward"
+        threads = format_threads(row.case.threads)
+        text = f"numba on {threads} reaches {result.fma_fraction:.0%} of the multiply-add peak forward"
         if result.stages_ms.get("raster"):
             ratio = result.forward_cpu_ms / row.case.threads / result.stages_ms["raster"]
             text += f" ({result.fma_fraction * ratio:.0%} in the raster stage)"
@@ -482,10 +478,6 @@ def _speedup(slow: RasterRow, fast: RasterRow) -> str:
 def _quotient(slow: float | None, fast: float | None) -> str:
     assert slow is not None and fast
     return f"{slow / fast:,.0f}"
-
-
-def _threads(row: RasterRow) -> str:
-    return "one thread" if row.case.threads == 1 else f"{row.case.threads} threads"
 
 
 def _size(row: RasterRow) -> str:
@@ -606,7 +598,7 @@ def _plot_curves(axes: Axes, rows: Sequence[RasterRow], x: Callable[[RasterRow],
     axes.set(xscale="log", yscale="log")
     axes.grid(alpha=0.25, which="both")
     low, high = axes.get_ylim()
-    if high < 10 * low:  # less than a decade would exaggerate noise
+    if high < 10 * low:  # a smaller range would exaggerate noise
         middle = math.sqrt(low * high)
         axes.set_ylim(middle / math.sqrt(10), middle * math.sqrt(10))
     if rows:

@@ -84,10 +84,15 @@ class RasterCase:
         layout = "pinhole" if self.layout == "pinhole" else "equirect"
         return RasterCase("torch", self.height, layout=layout, precision="float64", backward=False)
 
+    @property
+    def layout_name(self) -> str:
+        """The layout with the size of its faces and its stitching."""
+        faces = f" {self.face_size}" if self.face_size else ""
+        return f"{self.layout}{faces}{' official' if self.stitching == 'official' else ''}"
+
     def __str__(self) -> str:
         """The case as it is shown while it is measured."""
-        faces = f" {self.face_size}" if self.face_size else ""
-        choice = f"{self.backend} {self.kernel} {self.order} {self.filter} {self.layout}{faces}"
+        choice = f"{self.backend} {self.kernel} {self.order} {self.filter} {self.layout_name}"
         return f"{choice}, height {self.height}, {self.threads} threads"
 
 

@@ -108,6 +108,11 @@ def format_number(value: float | None, form: str) -> str:
     return "" if value is None else "exact" if value == math.inf else form.format(value)
 
 
+def format_threads(count: int) -> str:
+    """A number of threads in words."""
+    return "one thread" if count == 1 else f"{count} threads"
+
+
 def make_terminal_table(columns: Sequence[Column[AnyRow]], rows: Iterable[AnyRow], title: str) -> Table:
     """A table for the terminal; only cells of columns without a title may wrap."""
     from rich.table import Table
