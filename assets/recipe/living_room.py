@@ -91,11 +91,7 @@ def build_shell(style: RoomStyle) -> None:
     boxes("floor", [(-3.5, 7.5, -2.9, 2.9, -0.1, 0.0)], f.planks(style.floor))
     boards = f.planks((0.70, 0.67, 0.60), 1.9, 0.105, 0.16)
     boxes("ceiling", [(-3.5, 7.5, -2.9, 2.9, HEIGHT, HEIGHT + 0.1)], boards)
-    boxes(
-        "beams",
-        [(x - 0.075, x + 0.075, -2.6, 2.6, HEIGHT - 0.15, HEIGHT) for x in np.arange(-2.5, 7.2, 1.32)],
-        beam,
-    )
+    boxes("beams", [(x - 0.075, x + 0.075, -2.6, 2.6, HEIGHT - 0.15, HEIGHT) for x in np.arange(-2.5, 7.2, 1.32)], beam)
     for wall in (SOUTH, NORTH, EAST, WEST, SOUTH2, NORTH2, END, BACK_OF_EAST):
         boxes("skirting", wall.strip(0.0, 0.13, 0.022) + wall.strip(HEIGHT - 0.07, HEIGHT, 0.03), trim)
         for opening in wall.openings:

@@ -75,11 +75,7 @@ def landscape(seed: int, width: int, height: int, palette: str = "evening") -> I
         dark = tuple(int(c * rng.uniform(0.35, 0.6)) for c in hills[-1])
         draw.ellipse((x - tall * 0.14, foot - tall, x + tall * 0.14, foot), fill=dark)
     for _ in range(5 if palette == "sea" else 0):
-        x, y, s = (
-            rng.uniform(0.05, 0.95) * width,
-            rng.uniform(0.6, 0.74) * height,
-            rng.uniform(0.02, 0.06) * width,
-        )
+        x, y, s = (rng.uniform(0.05, 0.95) * width, rng.uniform(0.6, 0.74) * height, rng.uniform(0.02, 0.06) * width)
         draw.polygon([(x, y - 2 * s), (x, y), (x + s, y)], fill=(250, 246, 236))
         hull = [(x - s, y + 3), (x + s * 1.1, y + 3), (x + s * 0.6, y + s * 0.4), (x - s * 0.6, y + s * 0.4)]
         draw.polygon(hull, fill=(90, 40, 34))

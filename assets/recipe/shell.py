@@ -150,10 +150,7 @@ class Wall:
         step = (o.top - o.bottom - 0.12) / panels
         for i in range(panels):
             z = o.bottom + 0.12 + i * step
-            for a, b in (
-                (o.start + 0.1, (o.start + o.end) / 2 - 0.05),
-                ((o.start + o.end) / 2 + 0.05, o.end - 0.1),
-            ):
+            for a, b in ((o.start + 0.1, (o.start + o.end) / 2 - 0.05), ((o.start + o.end) / 2 + 0.05, o.end - 0.1)):
                 parts.append(self.box(a, b, back, back + self.inside * 0.018, z, z + step - 0.12))
         return parts
 
@@ -192,12 +189,7 @@ def curtain(
 
 
 def framed(
-    wall: Wall,
-    along: float,
-    height: float,
-    size: tuple[float, float],
-    image: bpy.types.Image,
-    frame: Material,
+    wall: Wall, along: float, height: float, size: tuple[float, float], image: bpy.types.Image, frame: Material
 ) -> None:
     """Add a framed picture of `size` (width, height) metres on a wall, with its centre at `height`."""
     width, tall = size
@@ -235,12 +227,7 @@ def cushion(center: Sequence[float], size: float, turn: float, lean: float, mate
         points += sheet.tolist()
         for r in range(n - 1):
             for c in range(n - 1):
-                quad = [
-                    base + r * n + c,
-                    base + r * n + c + 1,
-                    base + (r + 1) * n + c + 1,
-                    base + (r + 1) * n + c,
-                ]
+                quad = [base + r * n + c, base + r * n + c + 1, base + (r + 1) * n + c + 1, base + (r + 1) * n + c]
                 faces.append(quad if sign < 0 else quad[::-1])
     item = mesh("cushion", points, faces, material, smooth=True)
     item.rotation_euler = (-lean, 0.0, turn)

@@ -32,10 +32,7 @@ class Fidelity:
 
 
 def measure_fidelity(
-    image: Float[Tensor, "channel height width"],
-    reference: Float[Tensor, "channel height width"],
-    *,
-    panorama: bool,
+    image: Float[Tensor, "channel height width"], reference: Float[Tensor, "channel height width"], *, panorama: bool
 ) -> Fidelity:
     """The errors of an image.
 

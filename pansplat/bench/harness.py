@@ -35,12 +35,7 @@ _POLL_INTERVAL = 0.05  # seconds between two checks of a child process
 
 
 class Timing(NamedTuple):
-    """Seconds of a call.
-
-    Attributes:
-        wall: elapsed time.
-        cpu: processor time of all threads of the process; other processes affect it far less.
-    """
+    """Seconds of a call: elapsed, and of all threads of the process, which other processes affect far less."""
 
     wall: float
     cpu: float

@@ -98,11 +98,7 @@ class RasterCase:
 
 @dataclass(frozen=True, eq=False)
 class BenchScene:
-    """A scene and the pose that it is rendered from.
-
-    Attributes:
-        load: returns the float32 Gaussians; called when they are needed.
-    """
+    """A scene, which `load` makes as float32 Gaussians when they are needed, and the pose that it is rendered from."""
 
     name: str
     load: Callable[[], Gaussians]

@@ -44,11 +44,7 @@ _VIEWER_PACKAGE = "pansplat_viewer"
 
 @dataclass(frozen=True, eq=False)
 class RenderedImage:
-    """Colours on black.
-
-    Attributes:
-        stages: seconds by stage, if the renderer reports them.
-    """
+    """Colours on black, and seconds by stage if the renderer reports them."""
 
     color: Float[Tensor, "channel height width"]
     stages: dict[str, float] = field(default_factory=dict)

@@ -182,12 +182,7 @@ def _triad(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> None:
 
 @dataclass(frozen=True)
 class Work:
-    """The least work of one panorama by the exact kernel.
-
-    Attributes:
-        pairs: pixel centres inside the boxes of Gaussians, summed over the Gaussians.
-        bytes: traffic of a forward pass.
-    """
+    """The least work of one panorama: pixel centres in the boxes of all Gaussians, and bytes of a forward pass."""
 
     pairs: int
     bytes: int

@@ -5,13 +5,7 @@ import math
 import pytest
 import torch
 
-from pansplat.bench.fidelity import (
-    clamped_psnr,
-    measure_fidelity,
-    relative_depth_errors,
-    relative_deviation,
-    seam_jump,
-)
+from pansplat.bench.fidelity import clamped_psnr, measure_fidelity, relative_depth_errors, relative_deviation, seam_jump
 from pansplat.geometry.cubemap import face_of
 from pansplat.geometry.equirect import pixel_directions
 

@@ -53,10 +53,7 @@ def measured(monkeypatch: pytest.MonkeyPatch, fast_peaks: None) -> list[ModelCas
         cases.append(case)
         error = 0.001 * (len(cases) - 1)
         stages = {"features": 1.0, "mono": 2.0, "cost volume": 3.0, "heads": 4.0}
-        tensors = {
-            "depth": torch.full((2, 32, 64), 2.0 + 2 * error),
-            "image": torch.full((3, 64, 128), 0.5 + error),
-        }
+        tensors = {"depth": torch.full((2, 32, 64), 2.0 + 2 * error), "image": torch.full((3, 64, 128), 0.5 + error)}
         return ModelResult(64, 10, stages, 10.0, 17.0, 1.5), tensors
 
     monkeypatch.setattr(bench_model, "measure_case", measure)
