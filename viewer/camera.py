@@ -163,7 +163,7 @@ class Pinhole:
         """Half the image size in image-plane units (z = 1)."""
         return 0.5 * self.width / self.focal, 0.5 * self.height / self.focal
 
-    def side_normals(self) -> Float[np.ndarray, "4 3"]:
+    def compute_side_normals(self) -> Float[np.ndarray, "4 3"]:
         """Return the inward unit normals, in world axes, of the view frustum's four sides."""
         x, y = self.half_size
         normals = np.array(((-1, 0, x), (1, 0, x), (0, -1, y), (0, 1, y)), dtype=np.float64)
@@ -171,7 +171,7 @@ class Pinhole:
         return normals @ self.rotation.T
 
 
-def cube_face_cameras(
+def create_face_cameras(
     orientation: Float[np.ndarray, "3 3"], position: tuple[float, float, float], face_size: int, border: int
 ) -> list[Pinhole]:
     """Return the six face cameras of a cube with axes `orientation` (to world), with `border` extra pixels a side."""

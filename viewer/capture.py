@@ -66,7 +66,7 @@ class Film:
         return max(round(self.seconds * self.fps), 2)
 
 
-def flight_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
+def compute_flight_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
     """Return the pose at a fraction of the scene's flight; a scene without cameras is orbited once."""
     if len(scene.cam2world):
         return fly_pose(scene.cam2world, fraction).numpy()
@@ -76,10 +76,10 @@ def flight_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
     return cameras.orbit(state.camera, (2 * height * fraction, 0.0), height).cam2world
 
 
-def panorama_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
+def compute_panorama_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
     """Return a level pose between the first and last camera; the image centre is in the direction of flight."""
     if not len(scene.cam2world):
-        return flight_pose(scene, fraction)
+        return compute_flight_pose(scene, fraction)
     level = path_poses(scene.cam2world)
     return interpolate_poses(level[0], level[-1], fraction).numpy()
 
@@ -113,17 +113,17 @@ def write_flythrough(
     for done, fraction in enumerate(STILLS):
         progress("stills", done / steps)
         written.append(folder / f"view_{round(100 * fraction):03d}.png")
-        write_image(written[-1], _render(renderer, flight_pose(scene, fraction), film.size, settings))
+        write_image(written[-1], _render(renderer, compute_flight_pose(scene, fraction), film.size, settings))
     progress("panorama", len(STILLS) / steps)
     height = film.panorama_height or scene.height
     written.append(folder / f"panorama_{round(100 * film.at):03d}.png")
     equirect = replace(settings, layout="equirect")
-    write_image(written[-1], _render(renderer, panorama_pose(scene, film.at), (2 * height, height), equirect))
+    write_image(written[-1], _render(renderer, compute_panorama_pose(scene, film.at), (2 * height, height), equirect))
 
     def render_frames() -> Iterator[np.ndarray]:
         for frame in range(film.num_frames):
             progress("film", (len(STILLS) + 1 + frame) / steps)
-            pose = flight_pose(scene, frame / (film.num_frames - 1))
+            pose = compute_flight_pose(scene, frame / (film.num_frames - 1))
             yield (_render(renderer, pose, film.size, settings) * 255 + 0.5).astype(np.uint8)
 
     written.append(folder / "flythrough.mp4")

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, UInt
 
 from pansplat.constants import FILTER_VARIANCE
 from pansplat.errors import InputError
-from pansplat_viewer.camera import Pinhole, cube_face_cameras, find_faces_in_view
+from pansplat_viewer.camera import Pinhole, create_face_cameras, find_faces_in_view
 from pansplat_viewer.programs import RECORD, RECORD_BYTES, Programs, set_uniforms
 from pansplat_viewer.settings import DrawSettings
 from pansplat_viewer.splats import SortedSplats, Splats
@@ -109,14 +109,14 @@ class Frame:
     def _pinhole(self) -> Pinhole:
         return Pinhole(self.rotation, self.position, self.focal, *self.size)
 
-    def layer_cameras(self) -> list[Pinhole]:
+    def create_layer_cameras(self) -> list[Pinhole]:
         """Return the cameras of a layer's parts: one, or one for each cube face."""
         if self.storage == LayerStorage.IMAGE:
             return [self._pinhole]
         border = 1 if self.storage == LayerStorage.PADDED_FACES else 0
-        return cube_face_cameras(self.faces_to_world, self.position, self.face_size, border)
+        return create_face_cameras(self.faces_to_world, self.position, self.face_size, border)
 
-    def parts_in_view(self) -> list[int]:
+    def find_parts_in_view(self) -> list[int]:
         """Return the indices of the layer parts that the frame reads."""
         if self.storage == LayerStorage.IMAGE:
             return [0]
@@ -124,7 +124,7 @@ class Frame:
             return list(range(6))
         return find_faces_in_view(self.camera_to_faces, self._pinhole.half_size)
 
-    def layer_key(self, splats: SortedSplats) -> tuple[Hashable, ...]:
+    def create_layer_key(self, splats: SortedSplats) -> tuple[Hashable, ...]:
         """Return the values that a layer's content depends on, except its set of Gaussians."""
         s = self.settings
         key = (splats, self.position, s.kernel, s.order, s.lowpass, s.levels, s.opacity_threshold, s.near)
@@ -264,13 +264,13 @@ class LayerPainter:
     def paint(self, frame: Frame, splats: SortedSplats, view: int | None, *, with_depth: bool) -> Layer:
         """Return the layer of one view's Gaussians, or of all (None); draws the parts in view that are not valid."""
         selected = self._select(frame.settings, view)
-        cameras = frame.layer_cameras()
+        cameras = frame.create_layer_cameras()
         width, height = cameras[0].width, cameras[0].height
         size = (width, height) if frame.storage == LayerStorage.IMAGE else (3 * width, 2 * height)
         target = self._targets.get(
-            (frame.storage, view), size, depth_components=int(with_depth), key=frame.layer_key(splats)
+            (frame.storage, view), size, depth_components=int(with_depth), key=frame.create_layer_key(splats)
         )
-        missing = [part for part in frame.parts_in_view() if part not in target.parts]
+        missing = [part for part in frame.find_parts_in_view() if part not in target.parts]
         drawn = 0
         for part in missing:
             viewport = (part % 3 * width, part // 3 * height, width, height)
@@ -292,7 +292,7 @@ class LayerPainter:
         settings: DrawSettings,
     ) -> int:
         """Draw one part of a layer; returns the number of splats."""
-        variance, _ = lowpass_variances(settings, camera.focal)
+        variance, _ = compute_lowpass_variances(settings, camera.focal)
         seen = splats.cull(camera, selected, kernel=settings.kernel, filter_variance=variance)
         indices = splats.sort_back_to_front(camera, seen, settings.order)
         framebuffer = target.framebuffer
@@ -312,7 +312,7 @@ class LayerPainter:
         return self._selections[key]
 
 
-def lowpass_variances(settings: DrawSettings, focal: float) -> tuple[float, float]:
+def compute_lowpass_variances(settings: DrawSettings, focal: float) -> tuple[float, float]:
     """Return (e^2, dilation) of docs/rendering.md, section 2, in image-plane units squared."""
     pixel = 1.0 / (focal * focal)
     variance = FILTER_VARIANCE[settings.lowpass] * pixel
@@ -391,7 +391,7 @@ class SplatRasterizer:
         self._ctx.memory_barrier()
 
     def _set_uniforms(self, camera: Pinhole, settings: DrawSettings, viewport: tuple[int, int, int, int]) -> None:
-        variance, dilation = lowpass_variances(settings, camera.focal)
+        variance, dilation = compute_lowpass_variances(settings, camera.focal)
         project = self._programs.project() if self._tier == "gl33" else self._programs.project_compute()
         set_uniforms(
             project,

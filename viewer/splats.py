@@ -91,7 +91,7 @@ class Splats:
             views=views,
             geometry=geometry,
             harmonics=harmonics,
-            base_colors=_constant_colors(harmonics) if gaussians.degree == 0 else None,
+            base_colors=_evaluate_constant_colors(harmonics) if gaussians.degree == 0 else None,
             view_positions=positions,
             num_views=max(len(positions), int(views.max(initial=-1)) + 1),
             dropped=dropped,
@@ -139,7 +139,7 @@ def _choose_origin(positions: np.ndarray, means: torch.Tensor) -> np.ndarray:
     return np.zeros(3)
 
 
-def _constant_colors(harmonics: Float[np.ndarray, "1 3 n"]) -> Float[np.ndarray, "n 4"]:
+def _evaluate_constant_colors(harmonics: Float[np.ndarray, "1 3 n"]) -> Float[np.ndarray, "n 4"]:
     colors = np.zeros((harmonics.shape[2], 4), np.float32)
     colors[:, :3] = np.maximum(0.5 + harmonics[0].T / (2 * math.sqrt(math.pi)), 0)
     return colors
@@ -192,7 +192,7 @@ class SortedSplats:
         if kernel == "ewa":
             normals, bound = camera.rotation[:, 2][None], np.float32(0)
         else:
-            normals = camera.side_normals()
+            normals = camera.compute_side_normals()
             moved = math.dist(camera.position, self.position)
             deviation = np.float32(1.001 * math.sqrt(filter_variance))
             bound = self.distances + np.float32(moved)

@@ -72,9 +72,9 @@ def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
         settings = replace(settings, mode="joint")
     state.settings = settings
     state.playing, state.flight = False, min(max(at, 0.0), 1.0)
-    level = tuple(tuple(float(x) for x in row) for row in _level_axes(scene))
-    camera = move_to_pose(replace(state.camera, level=level), _start_pose(scene, state.flight))
-    state.camera = state.home = replace(camera, distance=_typical_distance(scene))
+    level = tuple(tuple(float(x) for x in row) for row in _compute_level_axes(scene))
+    camera = move_to_pose(replace(state.camera, level=level), _choose_start_pose(scene, state.flight))
+    state.camera = state.home = replace(camera, distance=_measure_typical_distance(scene))
 
 
 def jump_to_view(state: ViewerState, view: int) -> None:
@@ -118,7 +118,7 @@ def advance_flight(state: ViewerState, seconds: float) -> None:
         state.playing = state.flight < 1
 
 
-def _level_axes(scene: Scene) -> Float[np.ndarray, "3 3"]:
+def _compute_level_axes(scene: Scene) -> Float[np.ndarray, "3 3"]:
     """Return right, down, forward of a level camera in the direction of flight (columns, world axes)."""
     if len(scene.cam2world):
         return path_poses(scene.cam2world)[0, :3, :3].numpy()
@@ -126,28 +126,28 @@ def _level_axes(scene: Scene) -> Float[np.ndarray, "3 3"]:
     return look_pose(torch.zeros(3), forward, up_direction(scene.cam2world))[:3, :3].numpy()
 
 
-def _start_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
+def _choose_start_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
     """Return the pose at a fraction of the flight; in a scene without cameras, a pose that sees it from outside."""
     if len(scene.cam2world):
         return fly_pose(scene.cam2world, fraction).numpy()
     matrix = np.eye(4)
-    matrix[:3, :3] = _level_axes(scene)
+    matrix[:3, :3] = _compute_level_axes(scene)
     means = scene.gaussians.means.double().numpy()
     if len(means):
         middle = np.median(means, axis=0)
-        matrix[:3, 3] = middle - 2 * _median_distance(means, middle) * matrix[:3, 2]
+        matrix[:3, 3] = middle - 2 * _measure_median_distance(means, middle) * matrix[:3, 2]
     return matrix
 
 
-def _typical_distance(scene: Scene) -> float:
+def _measure_typical_distance(scene: Scene) -> float:
     """Return the median distance of the Gaussians from the first camera (else the start pose), metres; 2 if none."""
     means = scene.gaussians.means.double().numpy()
     if not len(means):
         return 2.0
     if len(scene.cam2world):
         return float(np.median(np.linalg.norm(means - scene.cam2world[0, :3, 3].double().numpy(), axis=1)))
-    return 2 * _median_distance(means, np.median(means, axis=0))
+    return 2 * _measure_median_distance(means, np.median(means, axis=0))
 
 
-def _median_distance(means: Float[np.ndarray, "n 3"], point: Float[np.ndarray, "3"]) -> float:
+def _measure_median_distance(means: Float[np.ndarray, "n 3"], point: Float[np.ndarray, "3"]) -> float:
     return float(np.median(np.linalg.norm(means - point, axis=1))) or 1.0

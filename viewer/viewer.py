@@ -327,7 +327,7 @@ class Viewer:
         """Orbit the point in the centre of the last image."""
         if self._image is None:
             return
-        distance = center_depth(self.renderer.read_depth())
+        distance = measure_center_depth(self.renderer.read_depth())
         self._image = None  # `read_depth` may have replaced the texture
         if distance is not None:
             camera = self.state.camera
@@ -374,7 +374,7 @@ class Viewer:
         self.state.show_message(f"wrote {path}", now)
 
 
-def center_depth(depth: Float[np.ndarray, "height width"]) -> float | None:
+def measure_center_depth(depth: Float[np.ndarray, "height width"]) -> float | None:
     """Return the median depth around the image centre, metres; None if nothing is drawn there."""
     row, column = depth.shape[0] // 2, depth.shape[1] // 2
     for reach in (4, 16, 64):

@@ -11,7 +11,7 @@ from PIL import Image
 
 from pansplat.errors import InputError
 from pansplat_viewer.app import Options, choose_entry, run
-from pansplat_viewer.capture import STILLS, Film, flight_pose, panorama_pose
+from pansplat_viewer.capture import STILLS, Film, compute_flight_pose, compute_panorama_pose
 from pansplat_viewer.loader import LoadOptions, SceneEntry
 
 
@@ -115,14 +115,14 @@ def test_options_are_passed_on(tmp_path):
 def test_flight_and_panorama_poses_go_from_camera_to_camera(small_scene):
     for fraction, view in ((0.0, 0), (1.0, 1)):
         center = small_scene.cam2world[view, :3, 3].numpy()
-        assert np.allclose(flight_pose(small_scene, fraction)[:3, 3], center)
-        assert np.allclose(panorama_pose(small_scene, fraction)[:3, 3], center)
-    assert np.allclose(panorama_pose(small_scene, 0.5)[:3, :3], np.eye(3)), "level, in the direction of flight"
+        assert np.allclose(compute_flight_pose(small_scene, fraction)[:3, 3], center)
+        assert np.allclose(compute_panorama_pose(small_scene, fraction)[:3, 3], center)
+    assert np.allclose(compute_panorama_pose(small_scene, 0.5)[:3, :3], np.eye(3)), "level, in the direction of flight"
 
 
 def test_a_scene_without_cameras_is_orbited(small_scene):
     scene = replace(small_scene, cam2world=small_scene.cam2world[:0])
-    poses = [flight_pose(scene, fraction) for fraction in (0.0, 0.25, 0.5, 1.0)]
+    poses = [compute_flight_pose(scene, fraction) for fraction in (0.0, 0.25, 0.5, 1.0)]
     middle = np.median(scene.gaussians.means.numpy(), axis=0)
     for pose in poses:
         ahead = middle - pose[:3, 3]

@@ -1,4 +1,4 @@
-"""The interactive camera moves as its functions say and stays level."""
+"""The interactive camera moves and stays level."""
 
 import math
 from dataclasses import replace

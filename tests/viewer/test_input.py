@@ -1,4 +1,4 @@
-"""Every key does what the help says."""
+"""Every key has the effect that the help states."""
 
 from dataclasses import replace
 

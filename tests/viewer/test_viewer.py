@@ -1,4 +1,4 @@
-"""Clicks and keys that are sent to the panels on a context without a window change the rendered image."""
+"""Synthetic clicks and keys, on a context without a window, change the rendered image."""
 
 import threading
 import time
@@ -115,10 +115,12 @@ class User:
         self.draw_frames(1)
 
     def read_screen(self) -> np.ndarray:
+        """RGB of the last frame, outside the panels."""
         pixels = np.frombuffer(self.target.read(components=3), np.uint8).reshape(SIZE[1], SIZE[0], 3)
         return pixels[::-1][IMAGE].astype(int)
 
-    def image(self) -> np.ndarray:
+    def read_image(self) -> np.ndarray:
+        """RGB of a settled frame, outside the panels."""
         self.settle()
         return self.read_screen()
 
@@ -243,26 +245,26 @@ def test_every_widget_has_a_test_and_fits_without_scrolling(user):
 @pytest.mark.parametrize("label", IMAGE_WIDGETS)
 def test_clicking_the_widget_changes_the_image(user, label):
     user.state.settings = replace(user.state.settings, **INITIAL_SETTINGS.get(label, {}))
-    before = user.image()
+    before = user.read_image()
     user.click(label)
-    assert changed_fraction(before, user.image()) > 0.001
+    assert changed_fraction(before, user.read_image()) > 0.001
 
 
 @pytest.mark.parametrize("label", ["0##level", "nearest photograph"])
 def test_clicking_a_check_box_twice_restores_the_image(user, label):
-    before = user.image()
+    before = user.read_image()
     user.click(label)
-    user.image()
+    user.read_image()
     user.click(label)
-    assert changed_fraction(before, user.image()) == 0
+    assert changed_fraction(before, user.read_image()) == 0
 
 
-def test_hiding_every_level_leaves_the_background(user):
+def test_hiding_every_level_shows_the_background(user):
     for level in range(4):
         user.click(f"{level}##level")
-    assert user.image().max() == 0
+    assert user.read_image().max() == 0
     user.click("white")
-    assert user.image().min() == 255
+    assert user.read_image().min() == 255
 
 
 def test_fly_button_plays_and_stop_pauses(user):
@@ -296,16 +298,16 @@ def test_dragging_a_slider_changes_its_value_and_not_the_camera(user):
 
 
 def test_the_scene_follows_a_drag_on_the_image(user):
-    before = user.image()
+    before = user.read_image()
     user.drag((500, 400), (470, 400))
-    after = user.image()
+    after = user.read_image()
     assert user.state.camera.yaw_radians > 0 and user.state.camera.position == user.state.home.position
     errors = {s: np.abs(before[100:380, 60:200] - after[100:380, 60 + s : 200 + s]).mean() for s in (-30, 0, 30)}
     assert min(errors, key=errors.get) == -30, "the image is shifted by the 30 pixels of the drag"
 
 
 def test_keys_and_wheel_move_the_camera_and_r_restores_it(user):
-    before = user.image()
+    before = user.read_image()
     user.press(imgui.Key.w, frames=5)
     assert user.state.camera.position[2] > 0.1
     user.press(imgui.Key.r)
@@ -313,17 +315,17 @@ def test_keys_and_wheel_move_the_camera_and_r_restores_it(user):
     imgui.get_io().add_mouse_wheel_event(0, 1)
     user.draw_frames(2)
     assert user.state.camera.vertical_fov_degrees < user.state.home.vertical_fov_degrees
-    assert changed_fraction(before, user.image()) > 0.1
+    assert changed_fraction(before, user.read_image()) > 0.1
 
 
 def test_tab_hides_the_panels_and_h_shows_the_keys(user):
     user.press(imgui.Key.tab)
     assert not user.panels.items
-    plain = user.image()
+    plain = user.read_image()
     user.press(imgui.Key.h)
-    assert changed_fraction(plain, user.image()) > 0.1
+    assert changed_fraction(plain, user.read_image()) > 0.1
     user.press(imgui.Key.escape)
-    assert changed_fraction(plain, user.image()) == 0 and not user.state.quit
+    assert changed_fraction(plain, user.read_image()) == 0 and not user.state.quit
 
 
 def test_typing_a_path_does_not_fly_and_enter_opens_it(user):
@@ -351,14 +353,14 @@ def test_the_list_of_scenes_loads_the_other_pair(user):
 
 
 def test_errors_are_shown_and_keep_the_scene(user):
-    before = user.image()
+    before = user.read_image()
     user.viewer.open(Path("nothing"))
     user.draw_frames(2)
     assert "no such file" in user.data.error
-    assert changed_fraction(before, user.image()) > 0.02, "the message is on the screen"
+    assert changed_fraction(before, user.read_image()) > 0.02, "the message is on the screen"
     user.click("OK")
     assert user.data.error is None
-    assert changed_fraction(before, user.image()) == 0
+    assert changed_fraction(before, user.read_image()) == 0
     user.show(SceneEntry("damaged"))
     assert user.data.error.startswith("damaged.ply: 100% unreadable")
 
@@ -368,16 +370,16 @@ def test_the_photograph_is_shown_in_the_viewing_direction(user):
     state.photo, state.split = True, 0.0
     state.settings = replace(state.settings, levels=frozenset())  # saves time: the photograph covers the rendering
     state.camera = replace(state.home, yaw_radians=np.pi / 2, vertical_fov_degrees=30)
-    image = user.image()
+    image = user.read_image()
     red, green, blue = image[180:200].mean((0, 1)) / 255
     assert red > 0.95 and 0.4 < green < 0.6 and 0.4 < blue < 0.6, "right is red"
     rows = image[..., 1].mean(1)
     assert rows[0] > rows[-1] + 20, "up is green: upright"
     state.camera = replace(state.camera, yaw_radians=0.0)
-    columns = user.image()[..., 0].mean(0)
+    columns = user.read_image()[..., 0].mean(0)
     assert columns[-1] > columns[0] + 20, "right is red: not mirrored"
     state.camera = replace(state.camera, position=(0.0, 0.0, 0.4))
-    assert user.image().max() < 90, "the nearest photograph is the second, dim one"
+    assert user.read_image().max() < 90, "the nearest photograph is the second, dim one"
 
 
 def test_rendering_at_an_input_camera_looks_like_its_photograph(user):
@@ -386,19 +388,19 @@ def test_rendering_at_an_input_camera_looks_like_its_photograph(user):
     for yaw, pitch in ((0.0, 0.0), (2.0, 0.5), (-2.0, -0.9)):
         state.camera = replace(state.home, yaw_radians=yaw, pitch_radians=pitch)
         state.photo = False
-        rendered = user.image()
+        rendered = user.read_image()
         state.photo, state.split = True, 0.0
-        photograph = user.image()
+        photograph = user.read_image()
         assert np.abs(rendered - photograph).mean() < 4
         assert np.abs(rendered - photograph[:, ::-1]).mean() > 8, "not mirrored"
         assert np.abs(rendered - photograph[::-1]).mean() > 8, "not upside down"
 
 
 def test_the_rendering_is_left_of_the_split(user):
-    rendered = user.image()
+    rendered = user.read_image()
     user.click("nearest photograph")
     user.state.split = 0.75
-    compared = user.image()
+    compared = user.read_image()
     column = int(0.75 * SIZE[0]) - IMAGE[1].start
     assert changed_fraction(rendered[:, : column - 2], compared[:, : column - 2]) == 0
     assert changed_fraction(rendered[:, column + 2 :], compared[:, column + 2 :]) > 0.9
@@ -409,14 +411,14 @@ def test_the_rendering_is_left_of_the_split(user):
 def test_a_scene_without_photographs_has_no_comparison(user):
     user.show(SceneEntry("no photographs"))
     assert "nearest photograph" not in user.panels.items
-    before = user.image()
+    before = user.read_image()
     user.press(imgui.Key.c)
-    assert changed_fraction(before, user.image()) == 0
+    assert changed_fraction(before, user.read_image()) == 0
 
 
 def test_screenshots_show_the_image_without_the_panels(user, monkeypatch):
     monkeypatch.setattr("pansplat_viewer.viewer.PANORAMA_HEIGHT", 128)
-    image = user.image()
+    image = user.read_image()
     user.click("PNG")
     user.click("360 PNG")
     png, panorama = user.viewer.screenshots[-2:]
@@ -428,7 +430,7 @@ def test_screenshots_show_the_image_without_the_panels(user, monkeypatch):
     with Image.open(panorama) as file:
         assert file.size == (256, 128)
     user.state.message = ""
-    assert changed_fraction(image, user.image()) == 0, "the window shows the view again"
+    assert changed_fraction(image, user.read_image()) == 0, "the window shows the view again"
 
 
 def test_exr_screenshot_holds_color_and_radial_depth(user):
@@ -472,7 +474,7 @@ def test_the_viewer_shows_progress_and_accepts_input_while_loading(user, small_s
         assert go.wait(20)
         return LoadedScene(entry, small_scene)
 
-    before = user.image()
+    before = user.read_image()
     monkeypatch.setattr(user.viewer.loader, "_load", slow)
     user.viewer.show([SceneEntry("slow")], 0)
     assert reported.wait(20)
