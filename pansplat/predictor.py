@@ -18,7 +18,7 @@ class Predictor(Protocol):
     """A callable from posed panoramas to Gaussians."""
 
     name: str
-    """Name on the command line."""
+    """Name in messages and scene files."""
 
     @property
     def fingerprint(self) -> str:

@@ -17,7 +17,7 @@ from jaxtyping import config, install_import_hook
 from PIL import Image
 from torch import Tensor
 
-import pansplat.testing  # noqa: F401  # the hook names it
+import pansplat.testing  # noqa: F401  # for the import hook
 
 # One thread per pytest-xdist worker and its child processes: workers must not compete for cores.
 if "PYTEST_XDIST_WORKER" in os.environ:
@@ -32,24 +32,24 @@ with contextlib.suppress(ImportError):
 
 # Check annotated shapes and types at every call; install the hook before the packages are imported.
 _CHECKED = ("geometry", "gaussians", "model", "rendering", "predictor", "evaluation", "pipeline")
-install_import_hook([f"pansplat.{room}" for room in _CHECKED], "pansplat.testing.check_types")
+install_import_hook([f"pansplat.{name}" for name in _CHECKED], "pansplat.testing.check_types")
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The ../shared folder of fixtures and data; without it the test fails in CI and is skipped elsewhere."""
+    """The folder ../shared of fixtures and data; if it is missing, the test fails in CI and is skipped elsewhere."""
     if not _SHARED.is_dir():
         if os.environ.get("CI"):
-            pytest.fail("CI needs ../shared beside the checkout")
-        pytest.skip("needs the ../shared folder beside the checkout")
+            pytest.fail("CI needs the folder ../shared")
+        pytest.skip("needs the folder ../shared")
     return _SHARED
 
 
 @pytest.fixture(scope="session")
 def recipe(shared: Path) -> Callable[[str], dict[str, torch.Tensor]]:
-    """Make weights by the golden recipe for a list of keys, such as "pansplat-512", with official names."""
+    """Make weights with official names by the golden recipe, for the name of a key list such as "pansplat-512"."""
     source = importlib.util.spec_from_file_location("make_weights", shared / "golden" / "make_weights.py")
     assert source is not None and source.loader is not None
     module = importlib.util.module_from_spec(source)
@@ -95,7 +95,7 @@ def as_lightning() -> Callable[[dict[str, torch.Tensor]], dict[str, object]]:
 
 @pytest.fixture(scope="session")
 def golden(shared: Path) -> Callable[[str], dict[str, torch.Tensor]]:
-    """Load output of the official code: a fixture such as "pansplat_64x128_fp32attn" or "units"."""
+    """Load outputs of the official code, such as "pansplat_64x128_fp32attn" or "units"."""
 
     def load(name: str) -> dict[str, torch.Tensor]:
         return safetensors.torch.load_file(shared / "golden" / f"{name}.safetensors")
@@ -151,7 +151,7 @@ def _write_pair(folder: Path, *, height: int = 16, seed: int = 0) -> Path:
 
 @pytest.fixture(scope="session")
 def sphere_predictor() -> type[SpherePredictor]:
-    """The class of a predictor that needs no search."""
+    """The class of a predictor without depth estimation."""
     return SpherePredictor
 
 
@@ -163,7 +163,7 @@ def write_pair() -> Callable[..., Path]:
 
 @pytest.fixture
 def pair_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A pair 16 pixels high; the user's cache folder lies beside it."""
+    """A pair of 16 rows; the user's cache folder is `cache` in the same temporary folder."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return _write_pair(tmp_path / "pair")
 

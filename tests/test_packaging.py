@@ -1,4 +1,4 @@
-"""The wheel contains both packages and nothing else, and works on its own."""
+"""The wheel contains both packages and nothing else, and works without the checkout."""
 
 import os
 import shutil
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = {"pansplat": "pansplat", "pansplat_viewer": "viewer", "pansplat_viewer.shaders": "shaders"}
 
 
-def project() -> dict:
+def read_project() -> dict:
     return tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
@@ -32,8 +32,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     build = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "-qq", "-w", "dist", "."]
     done = subprocess.run(build, cwd=source, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    (made,) = (source / "dist").glob("*.whl")
-    return made
+    (file,) = (source / "dist").glob("*.whl")
+    return file
 
 
 @pytest.fixture(scope="module")
@@ -53,27 +53,20 @@ def run_in(site: Path, *command: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_package_list_equals_the_packages_on_disk() -> None:
-    on_disk = {".".join(file.parent.relative_to(ROOT).parts) for file in (ROOT / "pansplat").rglob("__init__.py")} | {
-        "pansplat_viewer",
-        "pansplat_viewer.shaders",
-    }
-    on_disk |= {
+    on_disk = {".".join(file.parent.relative_to(ROOT).parts) for file in (ROOT / "pansplat").rglob("__init__.py")}
+    on_disk |= {"pansplat_viewer", "pansplat_viewer.shaders"} | {
         "pansplat_viewer." + ".".join(file.parent.relative_to(ROOT / "viewer").parts)
         for file in (ROOT / "viewer").glob("*/**/__init__.py")
     }
-    listed = project()["tool"]["setuptools"]["packages"]
+    listed = read_project()["tool"]["setuptools"]["packages"]
     assert sorted(listed) == sorted(on_disk)
     assert len(set(listed)) == len(listed)
 
 
 def test_the_wheel_contains_both_packages_and_nothing_else(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
-    version = project()["project"]["version"]
-    assert {name.split("/")[0] for name in names} == {
-        "pansplat",
-        "pansplat_viewer",
-        f"pansplat-{version}.dist-info",
-    }
+    version = read_project()["project"]["version"]
+    assert {name.split("/")[0] for name in names} == {"pansplat", "pansplat_viewer", f"pansplat-{version}.dist-info"}
     assert not [name for name in names if "test_" in name or "conftest" in name or "__pycache__" in name]
 
 
@@ -91,7 +84,7 @@ def test_the_wheel_contains_every_module_and_shader(wheel: Path) -> None:
 def test_package_and_project_have_the_same_version(wheel: Path) -> None:
     import pansplat
 
-    assert project()["project"]["version"] == pansplat.__version__
+    assert read_project()["project"]["version"] == pansplat.__version__
 
 
 def test_an_installed_wheel_reads_its_own_shaders(installed: Path) -> None:
@@ -127,8 +120,8 @@ def test_setup_pins_every_direct_dependency() -> None:
     constraints = (ROOT / "constraints.txt").read_text().splitlines()
     assert "torch==2.13.0" in constraints
     pinned = {line.split("==")[0] for line in constraints if line and not line.startswith("#")}
-    wanted = project()["project"]
-    names = [*wanted["dependencies"], *wanted["optional-dependencies"]["dev"]]
-    bare = {name.split(";")[0].split(">")[0].split("[")[0].strip().lower().replace("_", "-") for name in names}
-    assert not bare - pinned
+    metadata = read_project()["project"]
+    requirements = [*metadata["dependencies"], *metadata["optional-dependencies"]["dev"]]
+    names = {name.split(";")[0].split(">")[0].split("[")[0].strip().lower().replace("_", "-") for name in requirements}
+    assert not names - pinned
     assert subprocess.run(["bash", "-n", str(ROOT / "setup.sh")]).returncode == 0

@@ -1,4 +1,4 @@
-"""After the warm-up, no command has to compile a kernel."""
+"""The warm-up compiles all CPU kernels."""
 
 import subprocess
 import sys

@@ -28,7 +28,7 @@ from pansplat.gaussians.scene import Scene
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
 from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
 from pansplat.model.heads import AdapterConfig, HeadsConfig, merge_tiles
-from pansplat.model.layers import AttentionPrecision, Compat, Precision
+from pansplat.model.layers import Compat, Precision
 from pansplat.model.network import build_network
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
 from pansplat.model.weights import load_weights, pack_weights, save_weights
@@ -64,7 +64,7 @@ class ModelCase:
 
     compat: Compat
     precision: Precision
-    attention: AttentionPrecision
+    attention: Precision
     threads: int
     tiles: int
 

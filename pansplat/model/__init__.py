@@ -1,5 +1,5 @@
-"""The PanSplat network and the MVSplat baseline: posed panoramas in, Gaussians out.
+"""The PanSplat network and the MVSplat baseline: from posed panoramas to Gaussians.
 
-In the order of the paper's Figure 3: `feature_pyramid`, `mono_depth`, `cost_volume` and `heads` are the parts of
-`pansplat`; `mvsplat` is the baseline; `weights` reads and writes their files; `network` makes a predictor of either.
+`pansplat` consists of `feature_pyramid`, `mono_depth`, `cost_volume` and `heads`, in the order of the paper's Figure 3.
+`mvsplat` is the baseline. `weights` reads and writes the weights of both, and `network` makes predictors of them.
 """

@@ -21,7 +21,6 @@ from pansplat.geometry.correlation import correlate
 from pansplat.geometry.equirect import Border
 from pansplat.geometry.warp import Sampling, relative_pose
 from pansplat.model.layers import (
-    AttentionPrecision,
     Compat,
     PanoramaConv2d,
     Precision,
@@ -38,7 +37,7 @@ from pansplat.model.layers import (
 
 _UNET_MULTIPLE = 4  # a U-Net of three scales halves the map twice
 
-_GROUPS = 8  # of the group normalisations
+_GROUPS = 8  # of the group normalisation
 _HEAD_CHANNELS = 32
 
 
@@ -51,7 +50,7 @@ class SweepLevel:
     channels: int
     """Channels of the features."""
     candidates: int
-    """Depth candidates of a pixel."""
+    """Depth candidates per pixel."""
     width: int
     """Channels of the U-Net."""
 
@@ -72,7 +71,7 @@ class CostVolumeConfig:
     mono_channels: int = 32
     """Channels of the monocular features; 0 for none."""
     refinement: Literal["unet", "none"] = "unet"
-    """Refine the volume by a U-Net beside the 1x1 convolution, or by the convolution only."""
+    """Refine the volume by a U-Net plus a 1x1 convolution, or by the convolution only."""
     levels: tuple[SweepLevel, ...] = _HIERARCHY
     """Coarse to fine."""
 
@@ -125,7 +124,7 @@ class SphericalCostVolume(nn.Module):
         self,
         config: CostVolumeConfig,
         compat: Compat,
-        attention_precision: AttentionPrecision = "float32",
+        attention_precision: Precision = "float32",
         precision: Precision = "float32",
     ) -> None:
         super().__init__()
@@ -151,34 +150,35 @@ class SphericalCostVolume(nn.Module):
         """Correlate, refine and regress at each level.
 
         Args:
-            features: of the feature pyramid, coarse to fine; maps finer than the swept levels are not used.
+            features: maps of the feature pyramid, coarse to fine; maps finer than the swept levels are not used.
             cam2world: rigid poses, metres.
             near: smallest depth candidate, metres, > 0.
             far: largest depth candidate, metres.
-            mono_features: of the monocular network, at any size.
+            mono_features: features of the monocular network, at any size.
 
         Raises:
-            InputError: fewer than two views ("official": not two), a pose that is not rigid, or maps that the U-Net
-                cannot halve.
+            InputError: fewer than two views ("official": not two), a pose that is not rigid, or a map size that 4 does
+                not divide.
             ValueError: `mono_features` are missing, or given although `mono_channels` is 0.
         """
         require_views(cam2world.shape[1], self.compat)
         require_rigid(cam2world)
         if (mono_features is None) != (self.config.mono_channels == 0):
             raise ValueError(
-                f"mono_channels={self.config.mono_channels} needs `mono_features` exactly where it is not 0"
+                "`mono_features` must be given if and only if mono_channels > 0, got "
+                f"mono_channels={self.config.mono_channels}"
             )
         bounds = (1 / far, 1 / near)
         regressed: list[LevelDepth] = []
         for sweep, level_features in zip(self.config.swept_levels, features, strict=False):
             height, width = level_features.shape[-2:]
             require_size(height, width, _UNET_MULTIPLE)
-            centre = upsample_centre(regressed[-1].inverse_depth, self.compat) if regressed else None
-            first_count = self.config.swept_levels[0].candidates
-            if centre is None:
-                candidates = make_first_candidates(bounds, first_count, (height, width))
+            if not regressed:
+                centre, candidates = None, make_first_candidates(bounds, sweep.candidates, (height, width))
             else:
-                step = (bounds[1] - bounds[0]) / max(1, first_count - 1) / 2 ** len(regressed)
+                centre = upsample(regressed[-1].inverse_depth.detach(), 2, self.compat)
+                intervals = max(1, self.config.swept_levels[0].candidates - 1)
+                step = (bounds[1] - bounds[0]) / intervals / 2 ** len(regressed)
                 candidates = make_candidates_around(centre, step, bounds, sweep.candidates)
             volume = correlate_views(level_features, candidates, cam2world, self.compat)
             with autocast_convolutions(self.precision, volume.device):
@@ -188,10 +188,10 @@ class SphericalCostVolume(nn.Module):
 
 
 class LevelRefinement(nn.Module):
-    """From a level's cost volume to the logits of its candidates; from C to C~ in the paper."""
+    """Computes the logits of a level's candidates from its cost volume; in the paper C~ from C."""
 
     def __init__(
-        self, sweep: SweepLevel, config: CostVolumeConfig, *, first: bool, compat: Compat, precision: AttentionPrecision
+        self, sweep: SweepLevel, config: CostVolumeConfig, *, first: bool, compat: Compat, precision: Precision
     ) -> None:
         super().__init__()
         self.compat: Compat = compat
@@ -229,10 +229,10 @@ class LevelRefinement(nn.Module):
 class VolumeRefinement(nn.Module):
     """A U-Net between two convolutions."""
 
-    def __init__(self, inputs: int, width: int, border: Border, precision: AttentionPrecision) -> None:
+    def __init__(self, inputs: int, width: int, border: Border, precision: Precision) -> None:
         super().__init__()
         self.entry = PanoramaConv2d(inputs, width, 3, border=border)
-        self.norm = nn.GroupNorm(8, width)
+        self.norm = nn.GroupNorm(_GROUPS, width)
         self.unet = UNet(UNetConfig(width), border, precision)
         self.exit = PanoramaConv2d(width, width, 3, border=border)
 
@@ -248,7 +248,7 @@ class VolumeRefinement(nn.Module):
 def make_first_candidates(
     bounds: tuple[Float[Tensor, "batch view"], Float[Tensor, "batch view"]], count: int, size: tuple[int, int]
 ) -> Float[Tensor, "batch view candidate height width"]:
-    """Inverse depths, evenly from far to near, the same for every pixel; a single one is the middle."""
+    """Evenly spaced inverse depths from far to near, equal for all pixels; a single one is the mean of the bounds."""
     low, high = (bound[:, :, None] for bound in bounds)
     fraction = torch.linspace(0, 1, count).to(low) if count > 1 else torch.full((1,), 0.5).to(low)
     candidates = low + fraction * (high - low)
@@ -268,20 +268,13 @@ def make_candidates_around(
     return torch.minimum(torch.maximum(candidates, low), high)
 
 
-def upsample_centre(
-    inverse_depth: Float[Tensor, "batch view height width"], compat: Compat
-) -> Float[Tensor, "batch view h w"]:
-    """Double the size of the coarser level's inverse depth; without gradient."""
-    return upsample(inverse_depth.detach(), 2, compat)
-
-
 def correlate_views(
     features: Float[Tensor, "batch view channel height width"],
     candidates: Float[Tensor, "batch view candidate height width"],
     cam2world: Float[Tensor, "batch view 4 4"],
     compat: Compat,
 ) -> Float[Tensor, "batch view candidate height width"]:
-    """Correlate each view with every other view; returns the mean over the others."""
+    """Mean correlation of each view with all other views."""
     total = _correlate_neighbours(features, candidates, cam2world, 1, compat)
     for offset in range(2, features.shape[1]):
         total = total + _correlate_neighbours(features, candidates, cam2world, offset, compat)
@@ -291,7 +284,7 @@ def correlate_views(
 def _correlate_neighbours(
     features: Tensor, candidates: Tensor, cam2world: Tensor, offset: int, compat: Compat
 ) -> Tensor:
-    """Correlate each view with the one `offset` views later; the last views continue with the first."""
+    """Correlate view i with view (i + offset) mod the number of views."""
     sampling: Sampling = "sphere" if compat == "fixed" else "corners"
     correlation = correlate(
         features.flatten(0, 1),
@@ -325,12 +318,12 @@ class UNetConfig:
 
 
 class UNet(nn.Module):
-    """2-D U-Net over the maps of all views; scale 0 has the input's size, the last is the bottleneck.
+    """2-D U-Net over the maps of all views; scale 0 has the input's size, the last scale is the bottleneck.
 
     Source: PanSplat, section 3.2 (after MVSplat, after the U-Net of latent diffusion).
     """
 
-    def __init__(self, config: UNetConfig, border: Border, precision: AttentionPrecision = "float32") -> None:
+    def __init__(self, config: UNetConfig, border: Border, precision: Precision = "float32") -> None:
         super().__init__()
         channels, last = config.channels, config.scales - 1
         self.stem = PanoramaConv2d(channels, channels, 3, border=border)
@@ -361,9 +354,9 @@ class UNet(nn.Module):
 
 
 class EncoderScale(nn.Module):
-    """A residual block, then attention at the bottleneck or a convolution that halves the map elsewhere."""
+    """A residual block, then attention (at the bottleneck) or a convolution of stride 2 (elsewhere)."""
 
-    def __init__(self, channels: int, border: Border, precision: AttentionPrecision, *, bottleneck: bool) -> None:
+    def __init__(self, channels: int, border: Border, precision: Precision, *, bottleneck: bool) -> None:
         super().__init__()
         self.block = ResBlock(channels, channels, border)
         self.attention = JointAttention(channels, precision) if bottleneck else None
@@ -372,7 +365,7 @@ class EncoderScale(nn.Module):
     def forward(
         self, x: Float[Tensor, "image channel height width"], views: int, skips: list[Tensor]
     ) -> Float[Tensor, "image channel h w"]:
-        """The next scale's map; appends the maps for the decoder to `skips`."""
+        """Return the next scale's map; append the maps for the decoder to `skips`."""
         x = self.block(x)
         if self.attention is not None:
             x = self.attention(x, views)
@@ -386,9 +379,7 @@ class EncoderScale(nn.Module):
 class DecoderScale(nn.Module):
     """Two residual blocks with skip connections, attention at the bottleneck, upsampling."""
 
-    def __init__(
-        self, channels: int, border: Border, precision: AttentionPrecision, *, bottleneck: bool, finest: bool
-    ) -> None:
+    def __init__(self, channels: int, border: Border, precision: Precision, *, bottleneck: bool, finest: bool) -> None:
         super().__init__()
         self.blocks = nn.ModuleList(ResBlock(2 * channels, channels, border) for _ in range(2))
         self.attentions = nn.ModuleList(JointAttention(channels, precision) for _ in range(2)) if bottleneck else None
@@ -397,7 +388,7 @@ class DecoderScale(nn.Module):
     def forward(
         self, x: Float[Tensor, "image channel height width"], views: int, skips: list[Tensor]
     ) -> Float[Tensor, "image channel h w"]:
-        """The next scale's map; pops its skip maps from the end of `skips`."""
+        """Return the next scale's map; pop two maps from the end of `skips`."""
         for index, block in enumerate(self.blocks):
             x = block(torch.cat((x, skips.pop()), dim=1))
             if self.attentions is not None:
@@ -420,7 +411,7 @@ class ConvNorm(nn.Module):
 
 
 class ResBlock(nn.Module):
-    """Two convolutions beside a shortcut; freshly initialised, the output is the shortcut's."""
+    """Two convolutions plus a shortcut; after initialisation the convolutions give zero."""
 
     def __init__(self, inputs: int, outputs: int, border: Border) -> None:
         super().__init__()
@@ -435,11 +426,11 @@ class ResBlock(nn.Module):
 
 
 class JointAttention(nn.Module):
-    """Adds attention over the positions of all views; freshly initialised, it adds zero."""
+    """Adds attention over the positions of all views to the input; after initialisation it adds zero."""
 
-    def __init__(self, channels: int, precision: AttentionPrecision) -> None:
+    def __init__(self, channels: int, precision: Precision) -> None:
         super().__init__()
-        self.precision: AttentionPrecision = precision
+        self.precision: Precision = precision
         self.heads = channels // _HEAD_CHANNELS
         self.project_in = nn.Linear(channels, 3 * channels)
         self.project_out = nn.Linear(channels, channels)
@@ -452,7 +443,7 @@ class JointAttention(nn.Module):
         count, channels, height, width = maps.shape
         projected = _apply_per_pixel(self.project_in, maps).movedim(1, -1)
         tokens = projected.reshape(count // views, views * height * width, 3 * channels)
-        # The channels of each head are its query, key and value, one after another.
+        # The channels of a head are its query, its key and its value, in this order.
         queries, keys, values = tokens.unflatten(-1, (self.heads, 3, _HEAD_CHANNELS)).permute(3, 0, 2, 1, 4)
         attended = attend(queries, keys, values, precision=self.precision)
         merged = attended.transpose(1, 2).reshape(count, height, width, channels).movedim(-1, 1)

@@ -1,9 +1,8 @@
 """Feature pyramid network: an encoder, a cross-view transformer at the coarsest level, a decoder.
 
 The transformer attends within 2 x 2 windows, inside a view and across views; every second block shifts the windows by
-half a window. With two views each attends to the other; with more, to the tokens of all others jointly. Half a turn of
-the panoramas maps windows onto windows, so with `compat="fixed"` it rolls the output exactly; other rolls change which
-tokens share a window.
+half a window. Each view attends to the tokens of all other views jointly. Half a turn of the panoramas maps windows to
+windows, so with `compat="fixed"` it rolls the output exactly; other rolls change which tokens share a window.
 
 Source: PanSplat, section 3.1 and Figure 3; docs/official.md, section 4.
 """
@@ -17,7 +16,6 @@ from torch import Tensor, nn
 
 from pansplat.geometry.equirect import Border
 from pansplat.model.layers import (
-    AttentionPrecision,
     Compat,
     PanoramaConv2d,
     Precision,
@@ -53,18 +51,18 @@ class FeaturePyramidConfig:
     """Shape of the feature pyramid; shipped weights fix all of it."""
 
     channels: tuple[int, int, int, int] = (32, 64, 96, 128)
-    """Of levels 0 (finest) to 3."""
+    """Channels of levels 0 (finest) to 3."""
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
 
 
 class FeaturePyramid(nn.Module):
-    """Features of levels 3 to 0, at 1/8 to 1/1 of the image; paper's F^l."""
+    """Features of levels 3 to 0, at 1/8 to 1/1 of the image size; F^l in the paper."""
 
     def __init__(
         self,
         config: FeaturePyramidConfig,
         compat: Compat,
-        attention_precision: AttentionPrecision = "float32",
+        attention_precision: Precision = "float32",
         precision: Precision = "float32",
     ) -> None:
         super().__init__()
@@ -76,7 +74,7 @@ class FeaturePyramid(nn.Module):
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # convolves faster
 
     def forward(self, images: Float[Tensor, "batch view 3 height width"]) -> list[Float[Tensor, "batch view _ _ _"]]:
-        """Features of all views, coarse to fine, of RGB images in [0, 1].
+        """Compute features of RGB images in [0, 1], coarse to fine.
 
         Raises:
             InputError: fewer than two views ("official": not two), or a size that 32 ("official": 16) does not divide.
@@ -119,7 +117,7 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """From coarse to fine: the coarser map, enlarged, plus the encoder's map of the level."""
+    """From coarse to fine: the upsampled coarser map plus the encoder's map of the level."""
 
     def __init__(self, channels: tuple[int, int, int, int], compat: Compat) -> None:
         super().__init__()
@@ -143,7 +141,7 @@ class Decoder(nn.Module):
         """
         if self.training:
             return self._decode(coarsest, fine_to_coarse)
-        # In eval mode images are independent: decoding one at a time keeps only one image's largest maps in memory.
+        # In eval mode images are independent. One at a time, only one image's largest maps are in memory.
         images = [
             self._decode(coarsest[i : i + 1], [maps[i : i + 1] for maps in fine_to_coarse])
             for i in range(coarsest.shape[0])
@@ -172,7 +170,7 @@ class ConvNormAct(nn.Module):
 
 
 class LevelOutput(nn.Module):
-    """Convolution, batch normalisation, SiLU: from the decoder's map to the features of a level."""
+    """Convolution, batch normalisation and SiLU; computes the features of a level from the decoder's map."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, border: Border) -> None:
         super().__init__()
@@ -201,7 +199,7 @@ def _make_halving_level(inputs: int, outputs: int, kernel: int, border: Border) 
 class Transformer(nn.Module):
     """Blocks of self- and cross-attention over the views' maps."""
 
-    def __init__(self, config: TransformerConfig, compat: Compat, precision: AttentionPrecision = "float32") -> None:
+    def __init__(self, config: TransformerConfig, compat: Compat, precision: Precision = "float32") -> None:
         super().__init__()
         self.config = config
         self.compat: Compat = compat
@@ -239,9 +237,9 @@ class Transformer(nn.Module):
 
 
 class TransformerBlock(nn.Module):
-    """Self-attention, attention to the other views' tokens at the block's input, feed-forward network."""
+    """Self-attention, cross-attention to the other views' tokens at the block's input, feed-forward network."""
 
-    def __init__(self, config: TransformerConfig, precision: AttentionPrecision) -> None:
+    def __init__(self, config: TransformerConfig, precision: Precision) -> None:
         super().__init__()
         self.within = WindowAttention(config.channels, precision)
         self.across = WindowAttention(config.channels, precision)
@@ -255,11 +253,11 @@ class TransformerBlock(nn.Module):
         tokens: Float[Tensor, "batch view window token channel"],
         mask: Float[Tensor, "window token token"] | None,
     ) -> Float[Tensor, "batch view window token channel"]:
-        entering = tokens
+        block_input = tokens
         tokens = tokens + self.within(tokens, tokens, mask)
-        others = concatenate_other_views(entering)
+        others = concatenate_other_views(block_input)
         if mask is not None:
-            mask = mask.repeat(1, 1, entering.shape[1] - 1)
+            mask = mask.repeat(1, 1, block_input.shape[1] - 1)
         message = self.across(tokens, others, mask)
         message = self.narrow(nn.functional.gelu(self.widen(torch.cat((tokens, message), dim=-1))))
         return tokens + self.norm(message)
@@ -268,9 +266,9 @@ class TransformerBlock(nn.Module):
 class WindowAttention(nn.Module):
     """Single-head attention inside each window, projected and normalised."""
 
-    def __init__(self, channels: int, precision: AttentionPrecision) -> None:
+    def __init__(self, channels: int, precision: Precision) -> None:
         super().__init__()
-        self.precision: AttentionPrecision = precision
+        self.precision: Precision = precision
         self.query = nn.Linear(channels, channels, bias=False)
         self.key = nn.Linear(channels, channels, bias=False)
         self.value = nn.Linear(channels, channels, bias=False)
@@ -284,7 +282,7 @@ class WindowAttention(nn.Module):
         mask: Float[Tensor, "window token key"] | None,
     ) -> Float[Tensor, "batch view window token channel"]:
         queries, keys, values = self.query(tokens), self.key(source), self.value(source)
-        # Windows are passed as heads because torch's fused kernels need four axes.
+        # Windows take the place of heads, because torch's fused kernels need four axes.
         attended = attend(
             queries.flatten(0, 1),
             keys.flatten(0, 1),
@@ -298,7 +296,7 @@ class WindowAttention(nn.Module):
 def concatenate_other_views(
     tokens: Float[Tensor, "batch view window token channel"],
 ) -> Float[Tensor, "batch view window others channel"]:
-    """For each view, the concatenated tokens of all other views."""
+    """Concatenate the tokens of all other views, for each view."""
     views = tokens.shape[1]
     return torch.cat([tokens.roll(-offset, dims=1) for offset in range(1, views)], dim=3)
 
@@ -306,7 +304,7 @@ def concatenate_other_views(
 def split_windows(
     tokens: Float[Tensor, "batch view height width channel"], splits: int
 ) -> Float[Tensor, "batch view window token channel"]:
-    """Split the map into splits x splits windows; windows and their tokens are in row-major order."""
+    """Split a map into splits x splits windows; windows and their tokens are in row-major order."""
     batch, views, height, width, channels = tokens.shape
     rows, columns = height // splits, width // splits
     windows = tokens.reshape(batch, views, splits, rows, splits, columns, channels).transpose(3, 4)
@@ -316,7 +314,7 @@ def split_windows(
 def merge_windows(
     windows: Float[Tensor, "batch view window token channel"], height: int, width: int
 ) -> Float[Tensor, "batch view height width channel"]:
-    """The inverse of `split_windows`."""
+    """Invert `split_windows`."""
     batch, views, count, _, channels = windows.shape
     splits = math.isqrt(count)
     rows, columns = height // splits, width // splits
@@ -325,7 +323,7 @@ def merge_windows(
 
 
 def encode_positions(height: int, width: int, channels: int) -> Float[Tensor, "channel height width"]:
-    """Sine encoding of the row (first half of the channels) and the column in a window.
+    """Encode the row (first half of the channels) and the column in a window by sines.
 
     Source: DETR (Carion et al. 2020), with coordinates counted from 1 and scaled to 2 pi.
     """
@@ -344,9 +342,10 @@ def encode_positions(height: int, width: int, channels: int) -> Float[Tensor, "c
 
 
 def make_shift_mask(height: int, width: int, splits: int, compat: Compat) -> Float[Tensor, "window token token"]:
-    """Additive attention mask of shifted windows: separates tokens that are not neighbours on the panorama.
+    """Additive attention mask of shifted windows; it separates tokens that are not neighbours on the panorama.
 
-    The shift wraps rows and columns around. A panorama's columns wrap, its rows do not; "official" separates both.
+    The shift wraps rows and columns around. "fixed" separates wrapped rows only, because a panorama's columns do wrap;
+    "official" separates both.
     """
     rows, columns = (_label_shifted_regions(size, size // splits) for size in (height, width))
     if compat == "fixed":
@@ -358,6 +357,6 @@ def make_shift_mask(height: int, width: int, splits: int, compat: Compat) -> Flo
 
 
 def _label_shifted_regions(size: int, window: int) -> Float[Tensor, "size"]:
-    """Region of each row or column after the shift: 0 before the last window, 1 and 2 its halves; 2 wrapped around."""
+    """Label each row or column after the shift: 0 before the last window, 1 and 2 in its halves; 2 wrapped around."""
     position = torch.arange(size)
     return (position >= size - window).float() + (position >= size - window // 2).float()

@@ -1,8 +1,8 @@
 """Residual Gaussian heads: from features to Gaussians on the lattices of a spherical pyramid, coarse to fine.
 
 The head of a level is a small CNN. It reads the image, the features, the refined cost volume and the map of the coarser
-level, and adds its output to that map. Each lattice point samples the sum; a linear layer turns the sample into the
-parameters of one Gaussian, and the adapter turns those into a Gaussian in the world. The heads run tile by tile to
+level, and adds its output to that map. The sum is sampled at each lattice point. A linear layer maps the sample to the
+parameters of one Gaussian, and the adapter computes the Gaussian in the world from them. The heads run tile by tile to
 bound memory.
 
 Source: PanSplat, sections 3.3 and 3.4 and Figure 3; docs/official.md, sections 8 and 9.
@@ -42,7 +42,7 @@ from pansplat.model.tiles import (
     sample_window,
 )
 
-_SCALE_UNIT = 0.2  # map pixels of a scale of 1
+_SCALE_UNIT = 0.2  # a scale of 1, in map pixels
 # The polar axis of the network's harmonics is y: their k-th function of d is the 3DGS function of _POLAR_Y @ d.
 _POLAR_Y = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 _MAX_HEIGHT = 512  # of the cost volume's input
@@ -70,11 +70,11 @@ class HeadsConfig:
     """Shape of the heads; the switches are the paper's ablations."""
 
     lattice: Lattice = "fibonacci"
-    """Positions of the Gaussians: evenly on the sphere, or one at each pixel."""
+    """Positions of the Gaussians: evenly distributed on the sphere, or one per pixel."""
     levels: Literal["pyramid", "single"] = "pyramid"
     """Heads on all levels, or on the finest only."""
     emitted: Literal["all", "finest"] = "all"
-    """Levels that emit Gaussians; with "finest", coarser levels only pass their maps on."""
+    """Levels that emit Gaussians; with "finest", the maps of coarser levels are only inputs of finer levels."""
     residual: bool = True
     """Whether a level reads the coarser level's map and adds to it."""
     depth: Literal["refined", "swept"] = "refined"
@@ -89,7 +89,7 @@ class HeadsConfig:
 
     @property
     def outputs(self) -> int:
-        """Outputs for a point: 2 of offset, the adapter's parameters, and logits of depth and opacity if refined."""
+        """Outputs per point: 2 of offset, the adapter's parameters, and logits of depth and opacity if refined."""
         return 2 + self.adapter.num_parameters + (self.candidates + 1 if self.depth == "refined" else 0)
 
 
@@ -104,7 +104,7 @@ class MatchedViews:
     images: Float[Tensor, "batch view 3 height width"]
     """RGB in [0, 1], at full resolution."""
     features: Sequence[Float[Tensor, "batch view _ _ _"]]
-    """Feature maps, coarse to fine; resized where the images are larger than theirs."""
+    """Feature maps, coarse to fine; of resized images if `images` are higher than 512."""
     depths: Depths
     cam2world: Float[Tensor, "batch view 4 4"]
     near: Float[Tensor, "batch view"]
@@ -151,7 +151,7 @@ class LevelHead(nn.Module):
         self.convs = nn.ModuleList(
             nn.Conv2d(before, after, 3, padding=padding) for before, after in itertools.pairwise(widths)
         )
-        # On a pixel lattice the map itself holds the outputs of each point.
+        # On a pixel lattice the map contains the outputs of each point.
         self.linear = nn.Linear(hidden, config.outputs) if config.lattice == "fibonacci" else nn.Identity()
 
     def forward(self, inputs: Sequence[Float[Tensor, "_ height width"]]) -> Float[Tensor, "1 hidden h w"]:
@@ -215,7 +215,7 @@ class LevelHead(nn.Module):
 
 
 class GaussianHeads(nn.Module):
-    """Heads of all levels, applied to each view by itself.
+    """Heads of all levels, applied to each view independently.
 
     Args:
         precision: number type of the convolutions; everything else has the inputs' type.
@@ -236,10 +236,10 @@ class GaussianHeads(nn.Module):
         )
 
     def forward(self, matched: MatchedViews, *, tiles: int = 1) -> list[Gaussians]:
-        """The Gaussians of each batch item.
+        """Compute the Gaussians of each batch item.
 
-        Order: level coarse to fine, then view, then lattice point. With `compat="official"` and several tiles the
-        tile comes first.
+        They are ordered by level (coarse to fine), view and lattice point. With `compat="official"` and several tiles
+        they are ordered by tile first.
 
         Args:
             tiles: tiles along each side of the panorama. With `compat="fixed"` the result does not depend on it.
@@ -252,11 +252,11 @@ class GaussianHeads(nn.Module):
     def iterate_tiles(
         self, matched: MatchedViews, *, tiles: int = 1, only: Sequence[int] | None = None
     ) -> Iterator[TileGaussians]:
-        """Yield the Gaussians tile by tile; the maps of one tile at most are in memory.
+        """Yield the Gaussians tile by tile; at most one tile's maps are in memory.
 
         Args:
-            only: indices of the tiles to compute, in row-major order; by default all. A tile's Gaussians and
-                gradients do not depend on which others are computed.
+            only: row-major indices of the tiles to compute; by default all. The Gaussians and gradients of a tile do
+                not depend on the other tiles.
 
         Raises:
             InputError: the levels and tiles do not divide the height.
@@ -270,28 +270,32 @@ class GaussianHeads(nn.Module):
             for item in items:
                 by_view = [self._lift_view(view, tile) for view in item]
                 gaussians.append(Gaussians.cat([part for level in zip(*by_view, strict=True) for part in level]))
-            yield TileGaussians(gaussians, compute_untiled_index(tile, self.points(height), matched.images.shape[1]))
+            yield TileGaussians(
+                gaussians, compute_untiled_index(tile, self.make_points(height), matched.images.shape[1])
+            )
 
-    def heights(self, height: int) -> list[int]:
+    def compute_heights(self, height: int) -> list[int]:
         """Rows of each level's map, coarse to fine."""
         return [height >> level for level in range(len(self.levels) - 1, -1, -1)]
 
-    def points(self, height: int) -> list[Float[Tensor, "n 2"]]:
+    def make_points(self, height: int) -> list[Float[Tensor, "n 2"]]:
         """Normalised panorama coordinates of the lattice points of each emitting level, coarse to fine."""
-        heights = self.heights(height)
+        heights = self.compute_heights(height)
         if self.config.emitted == "finest":
             heights = heights[-1:]
         return [make_lattice_uv(self.config.lattice, rows, exact=self.compat == "fixed") for rows in heights]
 
     def _lift_view(self, view: ViewInputs, tile: Tile) -> list[Gaussians]:
-        """One view's Gaussians inside a tile, by emitting level, coarse to fine."""
+        """Compute one view's Gaussians inside a tile, by emitting level, coarse to fine."""
         gaussians, coarser = [], None
-        heights = self.heights(view.image.shape[-2])
+        heights = self.compute_heights(view.image.shape[-2])
         features = view.features[-len(heights) :]
         for index, (head, height, feature) in enumerate(zip(self.levels, heights, features, strict=True)):
             window = tile.window(height)
-            around = window.expand(self.margins.input)
-            inputs = [crop_window(source, height, around, self.compat) for source in (view.image, feature, view.logits)]
+            input_window = window.expand(self.margins.input)
+            inputs = [
+                crop_window(source, height, input_window, self.compat) for source in (view.image, feature, view.logits)
+            ]
             if coarser is not None:
                 coarser = _upsample_with_margin(coarser, self.margins)
                 inputs.append(coarser[0])
@@ -303,14 +307,16 @@ class GaussianHeads(nn.Module):
             level = len(heights) - 1 - index
             if level == 0 or self.config.emitted == "all":
                 # Only the coarsest level adds its harmonics to the colour of the image.
-                known = window.expand(self.margins.output)
+                output_window = window.expand(self.margins.output)
                 gaussians.append(
-                    head.decode_gaussians(refined[0], known, tile, view, height=height, level=level, colored=index == 0)
+                    head.decode_gaussians(
+                        refined[0], output_window, tile, view, height=height, level=level, colored=index == 0
+                    )
                 )
         return gaussians
 
     def _require_divisible(self, height: int, tiles: int) -> None:
-        coarsest = self.heights(height)[0]
+        coarsest = self.compute_heights(height)[0]
         factor = tiles << (len(self.levels) - 1)
         if tiles < 1 or height % factor:
             raise InputError(
@@ -323,7 +329,7 @@ class GaussianHeads(nn.Module):
 
 
 def compute_untiled_index(tile: Tile, lattices: Sequence[Float[Tensor, "_ 2"]], views: int) -> Integer[Tensor, "n"]:
-    """Indices of a tile's Gaussians in the untiled order: level, then view, then point."""
+    """Compute the indices of a tile's Gaussians in the untiled order: level, then view, then point."""
     indices, start = [], 0
     for uv in lattices:
         inside = tile.contains(uv).nonzero()[:, 0]
@@ -333,7 +339,7 @@ def compute_untiled_index(tile: Tile, lattices: Sequence[Float[Tensor, "_ 2"]], 
 
 
 def merge_tiles(parts: Sequence[TileGaussians], compat: Compat) -> list[Gaussians]:
-    """Merge the Gaussians of all tiles for each batch item: in untiled order, or by tile if official."""
+    """Merge the Gaussians of all tiles for each batch item: in the untiled order, or ordered by tile if official."""
     if len(parts) == 1:
         return parts[0].gaussians
     indices = [part.index for part in parts]
@@ -343,7 +349,7 @@ def merge_tiles(parts: Sequence[TileGaussians], compat: Compat) -> list[Gaussian
 
 
 def _scatter(sets: Sequence[Gaussians], indices: Sequence[Integer[Tensor, "_"]]) -> Gaussians:
-    """Copy each set to its indices in one set, without another copy: in 4K all of them are gigabytes."""
+    """Write each set to its indices of one new set; in 4K a second copy would take gigabytes."""
     fields = {}
     for name in (f.name for f in dataclasses.fields(Gaussians)):
         example = getattr(sets[0], name)
@@ -356,7 +362,7 @@ def _scatter(sets: Sequence[Gaussians], indices: Sequence[Integer[Tensor, "_"]])
 def concatenate_channels(
     maps: Sequence[Float[Tensor, "_ height width"]], dtype: torch.dtype
 ) -> Float[Tensor, "1 channel height width"]:
-    """Concatenate channels in channels-last layout: a fifth of the time of `torch.cat` and a layout change."""
+    """Concatenate channels in channels-last layout, 5 times faster than `torch.cat` and a layout change."""
     channels = [len(part) for part in maps]
     shape = (1, sum(channels), *maps[0].shape[1:])
     joined = torch.empty(shape, dtype=dtype, device=maps[0].device, memory_format=torch.channels_last)
@@ -366,7 +372,7 @@ def concatenate_channels(
 
 
 def split_views(matched: MatchedViews) -> list[list[ViewInputs]]:
-    """The inputs of each view of each batch item, with the depth of the finest swept level."""
+    """Split into inputs of single views, by batch item and view, with the depth of the finest swept level."""
     depth = matched.depths.levels[-1]
     return [
         [
@@ -391,7 +397,7 @@ def split_views(matched: MatchedViews) -> list[list[ViewInputs]]:
 def _upsample_with_margin(
     maps: Float[Tensor, "1 hidden height width"], margins: Margins
 ) -> Float[Tensor, "1 hidden h w"]:
-    """Double the size of a level's map with its margin, cropped to the margin that the next level reads."""
+    """Double the size of a level's map and crop it to the margin that the next level reads."""
     upsampled = functional.interpolate(maps, scale_factor=2, mode="bilinear", align_corners=False)
     return _crop_border(upsampled, 2 * margins.output - margins.input)
 
@@ -414,15 +420,15 @@ def adapt_gaussians(
     config: AdapterConfig,
     compat: Compat,
 ) -> Gaussians:
-    """Turn network outputs into the Gaussians of one view and level.
+    """Compute the Gaussians of one view and level from network outputs.
 
     Args:
         parameters: raw [3 scale | 4 rotation xyzw, camera axes | 3 x (degree + 1)^2 harmonics, colour by colour].
         uv: positions on the panorama, normalised.
         depths: radial distance from the camera, metres.
         opacities: in [0, 1].
-        map_height: rows of the level's map; scales are multiples of its pixel's angle times the depth.
-        colors: RGB in [0, 1] to add to the constant harmonic, or None.
+        map_height: rows of the level's map; scales are multiples of the angle of its pixels times the depth.
+        colors: RGB in [0, 1], added to the constant harmonic.
         level, view: labels of the Gaussians.
 
     Source: PanSplat, section 3.3; docs/official.md, section 9.
@@ -448,10 +454,10 @@ def adapt_gaussians(
 
 
 def compute_harmonics_rotation(rotation: Float[Tensor, "3 3"], compat: Compat) -> Float[Tensor, "3 3"]:
-    """Rotation to world axes from the axes in which the network's colours are 3DGS harmonics.
+    """Compute the rotation to world axes from the axes in which the network's colours are 3DGS harmonics.
 
-    The official code rotates colours by the camera's rotation with x and z reversed, which is right only for rotations
-    about y (docs/paper.md, T3).
+    The official code rotates colours by the camera's rotation with x and z reversed, which is correct for rotations
+    about y only (docs/paper.md, T3).
     """
     if compat == "official":
         reverse = torch.tensor((-1.0, 1.0, -1.0)).to(rotation)
@@ -466,28 +472,28 @@ def _rotate_harmonics_to_world(
     degree: int,
     compat: Compat,
 ) -> Float[Tensor, "n k 3"]:
-    """Harmonics in world axes from raw ones in camera axes: scaled by degree, added to a base colour."""
+    """Scale raw harmonics by degree, add a base colour, and rotate them from camera to world axes."""
     harmonics = raw.unflatten(-1, (3, -1)) * _make_degree_factors(degree).to(raw)
     if colors is not None:
         base = 2 * (colors - 0.5)
         harmonics = torch.cat((harmonics[..., :1] + base[..., None], harmonics[..., 1:]), dim=-1)
     rotation = rotation_matrices(compute_harmonics_rotation(camera, compat), degree).to(raw)
-    # Reshaped to one matrix product: with strided harmonics, torch would compute one for each Gaussian.
+    # Reshaped to one matrix product; with strided harmonics torch would compute one product per Gaussian.
     rotated = harmonics.reshape(-1, harmonics.shape[-1]) @ rotation.T
     return rotated.view(harmonics.shape).transpose(-1, -2)
 
 
 def _make_degree_factors(degree: int) -> Float[Tensor, "k"]:
-    """Factor of each raw coefficient: 1 for degree 0, 0.1 / 4^n for degree n."""
+    """Factors of the raw coefficients: 1 for degree 0, 0.1 / 4^n for degree n."""
     factors = [1.0] + [0.1 * 0.25**band for band in range(1, degree + 1) for _ in range(2 * band + 1)]
     return torch.tensor(factors, dtype=torch.float64)
 
 
 class AuxiliaryHeads(nn.Module):
-    """Gaussians of each level of the cost volume by itself, for training on real panoramas only.
+    """Heads that compute Gaussians from single levels of the cost volume, for training on real panoramas only.
 
-    They have the depth and confidence of the level. The images rendered from them give every level a loss without
-    true depth. The heads are independent; their maps have half the height of the cost volume's input.
+    The Gaussians have the depth and confidence of the level. A loss on their images trains each level without true
+    depth. The heads are independent; their maps have half the height of the cost volume's input.
 
     Source: PanSplat, section 3.5 (real data); docs/official.md, section 8 (auxiliary heads).
     """
@@ -502,7 +508,7 @@ class AuxiliaryHeads(nn.Module):
         )
 
     def forward(self, matched: MatchedViews) -> list[list[Gaussians]]:
-        """For each level of the cost volume, coarse to fine, the Gaussians of each batch item."""
+        """Compute the Gaussians by level of the cost volume (coarse to fine) and batch item."""
         items = split_views(matched)
         return [
             [
@@ -515,13 +521,15 @@ class AuxiliaryHeads(nn.Module):
     def _lift_view(self, index: int, item: int, view: ViewInputs, depth: LevelDepth) -> Gaussians:
         height = min(view.image.shape[-2], _MAX_HEIGHT) // 2
         panorama = Tile(0, 0, 1)
-        around = panorama.window(height).expand(self.margins.input)
+        input_window = panorama.window(height).expand(self.margins.input)
         inputs = (view.image, view.features[index], view.logits)
         head = self.levels[index]
-        refined = head([crop_window(source, height, around, self.compat) for source in inputs])
-        index_of_view = (item, view.view)
+        refined = head([crop_window(source, height, input_window, self.compat) for source in inputs])
+        item_and_view = (item, view.view)
         swept = dataclasses.replace(
-            view, inverse_depth=depth.inverse_depth[index_of_view], confidence=depth.confidence[index_of_view]
+            view, inverse_depth=depth.inverse_depth[item_and_view], confidence=depth.confidence[item_and_view]
         )
-        known = panorama.window(height).expand(self.margins.output)
-        return head.decode_gaussians(refined[0], known, panorama, swept, height=height, level=depth.level, colored=True)
+        output_window = panorama.window(height).expand(self.margins.output)
+        return head.decode_gaussians(
+            refined[0], output_window, panorama, swept, height=height, level=depth.level, colored=True
+        )

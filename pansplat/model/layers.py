@@ -1,4 +1,4 @@
-"""Layers that the networks share: convolution, resizing and attention on panorama maps; checks of the input.
+"""Shared layers of the networks: convolution, resizing and attention on panorama maps; input checks.
 
 `compat="official"` computes what the official code computes, its defects included. `compat="fixed"` has pixel centres
 at half-integers and continues every map across the seam and the poles.
@@ -19,7 +19,6 @@ from pansplat.geometry.pose import orthonormal_error
 
 Compat = Literal["official", "fixed"]
 Precision = Literal["float32", "bfloat16"]
-AttentionPrecision = Literal["float32", "bfloat16"]
 
 
 def autocast_convolutions(precision: Precision, device: torch.device) -> torch.autocast:
@@ -50,7 +49,7 @@ def require_views(count: int, compat: Compat) -> None:
         raise InputError(f"a prediction needs two or more views, got {count}; add a panorama of the same place")
     if count > 2 and compat == "official":
         raise InputError(
-            f'compat="official" takes exactly two views, as the official code does, got {count}; use compat="fixed"'
+            f'compat="official" needs exactly two views, as the official code does, got {count}; use compat="fixed"'
         )
 
 
@@ -78,13 +77,13 @@ def require_rigid(cam2world: Float[Tensor, "batch view 4 4"]) -> None:
             error = orthonormal_error(pose)
             if not error <= 1e-4:
                 raise InputError(
-                    f"`cam2world` of item {item}, view {view} must be a rigid pose, it is off by {error:.2g}; "
-                    "normalise the rotation, and keep scale out of it"
+                    f"`cam2world` of item {item}, view {view} must be a rigid pose, got an error of {error:.2g}; "
+                    "normalise the rotation and remove its scale"
                 )
 
 
 class PanoramaConv2d(nn.Conv2d):
-    """Convolution of panorama maps, padded by `border`; the output has the input's size, divided by the stride."""
+    """Convolution of panorama maps that are padded by `border`; the output has the input's size over the stride."""
 
     def __init__(
         self, inputs: int, outputs: int, kernel: int, *, border: Border, stride: int = 1, bias: bool = True
@@ -123,7 +122,7 @@ def convolve_and_normalize(
 def upsample(
     maps: Float[Tensor, "batch channel height width"], factor: int, compat: Compat
 ) -> Float[Tensor, "batch channel h w"]:
-    """Enlarge maps bilinearly; "official" aligns the centres of corner pixels (`align_corners=True`)."""
+    """Upsample maps bilinearly; "official" aligns the centres of the corner pixels (`align_corners=True`)."""
     if compat == "official":
         return functional.interpolate(maps, scale_factor=factor, mode="bilinear", align_corners=True)
     height, width = maps.shape[-2:]
@@ -145,28 +144,20 @@ def attend(
     values: Float[Tensor, "batch head key channel"],
     *,
     mask: Float[Tensor, "#batch #head query key"] | None = None,
-    precision: AttentionPrecision = "float32",
+    precision: Precision = "float32",
 ) -> Float[Tensor, "batch head query channel"]:
     """Scaled dot-product attention; `mask` is added to the logits.
 
     Precision "bfloat16" rounds inputs and output to bfloat16, as the official kernel does; on a CPU the sums are
     in float32.
     """
-    with torch.autocast(queries.device.type, enabled=False):
-        return _attend(queries, keys, values, mask, precision)
-
-
-def _attend(
-    queries: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None, precision: AttentionPrecision
-) -> Tensor:
-    if precision == "float32":
-        exact = [tensor.to(torch.promote_types(tensor.dtype, torch.float32)) for tensor in (queries, keys, values)]
-        return functional.scaled_dot_product_attention(*exact, attn_mask=mask)
-    kept = queries.dtype
-    rounded = [tensor.to(torch.bfloat16) for tensor in (queries, keys, values)]
-    bias = None if mask is None else mask.to(torch.bfloat16)
-    if queries.device.type == "cpu":
-        rounded = [tensor.to(kept) for tensor in rounded]
-        bias = None if bias is None else bias.to(kept)
-    attended = functional.scaled_dot_product_attention(*rounded, attn_mask=bias)
-    return attended.to(torch.bfloat16).to(kept)
+    inputs, dtype, device = (queries, keys, values), queries.dtype, queries.device.type
+    with torch.autocast(device, enabled=False):
+        if precision == "float32":
+            exact = [tensor.to(torch.promote_types(tensor.dtype, torch.float32)) for tensor in inputs]
+            return functional.scaled_dot_product_attention(*exact, attn_mask=mask)
+        rounded = [None if tensor is None else tensor.to(torch.bfloat16) for tensor in (*inputs, mask)]
+        if device == "cpu":
+            rounded = [None if tensor is None else tensor.to(dtype) for tensor in rounded]
+        attended = functional.scaled_dot_product_attention(*rounded[:3], attn_mask=rounded[3])
+        return attended.to(torch.bfloat16).to(dtype)

@@ -1,13 +1,13 @@
 """UniFuse: monocular depth features of panoramas for the cost volume. Frozen, always in eval mode.
 
 One ResNet-18 encodes the panorama, another one its six cube faces. At five scales the features of the faces are
-projected onto the panorama and fused; a decoder raises the fused features to 256x512, whatever the input's size.
+projected onto the panorama and fused; a decoder upsamples the fused features to 256x512 for any input size.
 
 `compat="official"` pads rows with zeros, resizes without wrapping, and encodes each face once. `compat="fixed"` wraps
 columns and continues over the poles in the panorama's encoder and decoder and in the resizing. It also encodes the
 faces up and down in two orientations and averages them, so that half a turn of the panorama rolls the features.
-In both modes faces have zero padding and whole rows of the panorama belong to the faces up and down: the weights were
-trained with them.
+Both modes keep two properties of the training: faces have zero padding, and whole rows of the panorama belong to the
+faces up and down.
 
 Source: Jiang et al., UniFuse, https://arxiv.org/abs/2102.03550; docs/official.md, sections 2.4 and 5.
 """
@@ -36,7 +36,7 @@ from pansplat.model.layers import (
 HEIGHT, FACE_SIZE = 512, 256  # of the encoders' inputs
 SCALES = (5, 4, 3, 2, 1)  # coarse to fine: 1/32 to 1/2 of the panorama
 FEATURE_CHANNELS = 32
-_ENCODED = {5: 512, 4: 256, 3: 128, 2: 64, 1: 64}  # channels of either encoder
+_ENCODED = {5: 512, 4: 256, 3: 128, 2: 64, 1: 64}  # channels of each encoder
 _DECODED = {5: 256, 4: 128, 3: 64, 2: 32}  # channels after upsampling from a scale
 
 
@@ -60,7 +60,7 @@ class MonocularDepth(nn.Module):
     @torch.no_grad()
     def forward(self, images: Float[Tensor, "batch view 3 height width"]) -> Float[Tensor, "batch view 32 256 512"]:
         """Features of panoramas of any size, RGB in [0, 1]."""
-        panoramas, strips = self.prepare(images.flatten(0, 1))
+        panoramas, strips = self.prepare_inputs(images.flatten(0, 1))
         from_panorama = self.panorama_encoder(to_channels_last(normalize(panoramas)))
         from_faces = self._encode_faces(strips.unflatten(-1, (6, FACE_SIZE)).permute(0, 3, 1, 2, 4))
         projected = {scale: to_channels_last(_project_faces(from_faces[scale], scale)) for scale in SCALES}
@@ -72,10 +72,10 @@ class MonocularDepth(nn.Module):
         logits = self.decoder.head(features.flatten(0, 1))
         return (self.max_depth * logits.sigmoid()).squeeze(1).unflatten(0, features.shape[:2])
 
-    def prepare(
+    def prepare_inputs(
         self, images: Float[Tensor, "batch 3 height width"]
     ) -> tuple[Float[Tensor, "batch 3 512 1024"], Float[Tensor, "batch 3 256 1536"]]:
-        """Inputs of the two encoders: panoramas, resized via 256x512 as in training, and strips of six faces."""
+        """Make the inputs of both encoders: panoramas resized via 256x512 as in training, and strips of six faces."""
         half = resize(images, (HEIGHT // 2, HEIGHT), self.compat)
         panoramas = resize(half, (HEIGHT, 2 * HEIGHT), self.compat)
         strips = torch.stack([strip_from_equirect(panorama, FACE_SIZE) for panorama in panoramas])
@@ -146,7 +146,7 @@ class ResidualBlock(nn.Module):
 
 
 class Fusion(nn.Module):
-    """Corrects the features of the faces by a residual of both, and joins them to those of the panorama.
+    """Adds to the face features a residual computed from both inputs, and joins the sum with the panorama features.
 
     Source: UniFuse, section III-B ("CEE", without squeeze and excitation).
     """
@@ -204,7 +204,7 @@ class Decoder(nn.Module):
 def _project_faces(
     faces: Float[Tensor, "batch 6 channel n n"], scale: int
 ) -> Float[Tensor, "batch channel height width"]:
-    """Features of six faces, resampled on the panorama."""
+    """Resample the features of six faces on the panorama."""
     return equirect_from_strip(faces.permute(0, 2, 3, 1, 4).flatten(-2), _strip_lookup(scale))
 
 
@@ -215,5 +215,5 @@ def _strip_lookup(scale: int) -> Float[Tensor, "height width 3"]:
 
 
 def _rotate_half_turn(faces: Float[Tensor, "batch face channel n n"]) -> Float[Tensor, "batch face channel n n"]:
-    """Rotate faces by half a turn in their plane, as half a turn of the panorama does with up and down."""
+    """Rotate faces by half a turn in their plane; half a turn of the panorama does this to the faces up and down."""
     return faces.flip(-1, -2)

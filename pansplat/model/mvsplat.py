@@ -1,6 +1,6 @@
-"""The MVSplat baseline on panoramas: one cost volume at 1/4 of the image, one Gaussian a pixel.
+"""The MVSplat baseline on panoramas: one cost volume at 1/4 of the image, one Gaussian per pixel.
 
-Built of PanSplat's layers. With `compat="official"` nothing wraps at the seam, as in the official code; with "fixed"
+It uses PanSplat's layers. With `compat="official"` nothing wraps at the seam, as in the official code; with "fixed"
 convolutions, resizing and correlation continue across seam and poles.
 
 Source: Chen et al., MVSplat, https://arxiv.org/abs/2403.14627; docs/official.md, section 16.
@@ -31,9 +31,9 @@ from pansplat.model.cost_volume import (
 from pansplat.model.feature_pyramid import Transformer, TransformerConfig, normalize
 from pansplat.model.heads import AdapterConfig, TileGaussians, adapt_gaussians
 from pansplat.model.layers import (
-    AttentionPrecision,
     Compat,
     PanoramaConv2d,
+    Precision,
     require_size,
     require_views,
     upsample,
@@ -51,7 +51,7 @@ class MVSplatConfig:
     channels: int = 128
     """Channels of the features."""
     candidates: int = 128
-    """Depth candidates of a pixel."""
+    """Depth candidates per pixel."""
     width: int = 128
     """Channels of the cost volume's U-Net."""
     refine_width: int = 32
@@ -104,13 +104,13 @@ class MVSplat(nn.Module):
         config: MVSplatConfig | None = None,
         compat: Compat = "fixed",
         *,
-        attention_precision: AttentionPrecision = "float32",
+        attention_precision: Precision = "float32",
     ) -> None:
         super().__init__()
         config = config or MVSplatConfig()
         self.config = config
         self.compat: Compat = compat
-        self.attention_precision: AttentionPrecision = attention_precision
+        self.attention_precision: Precision = attention_precision
         border = _choose_border(compat)
         channels, fine = config.channels, config.refine_width
         self.features = Features(config, compat, attention_precision)
@@ -162,16 +162,16 @@ class MVSplat(nn.Module):
     def lift_gaussians(
         self, matched: MatchedViews, *, tiles: int = 1, only: Sequence[int] | None = None
     ) -> Iterator[TileGaussians]:
-        """Yield all Gaussians in one part; `tiles` and `only` have no effect, as the U-Net reads whole panoramas."""
-        m, views = matched, matched.images.shape[1]
-        images, swept = m.images.flatten(0, 1), m.depths.levels[-1]
-        features = self.upsampler(torch.cat((m.features, m.encoded), dim=2).flatten(0, 1))
+        """Yield all Gaussians at once; `tiles` and `only` have no effect because the U-Net reads whole panoramas."""
+        views, swept = matched.images.shape[1], matched.depths.levels[-1]
+        images = matched.images.flatten(0, 1)
+        features = self.upsampler(torch.cat((matched.features, matched.encoded), dim=2).flatten(0, 1))
         features = gelu(upsample(features, _SCALE, self.compat))
         inverse_depth = upsample(swept.inverse_depth, _SCALE, self.compat).flatten(0, 1)
         confidence = interpolate(swept.confidence, scale_factor=_SCALE, mode="nearest").flatten(0, 1)
         maps = (images, self.project(features), inverse_depth[:, None], confidence[:, None])
         refined = self.refine(torch.cat(maps, dim=1), views)
-        poses, near, far = (tensor.flatten(0, 1) for tensor in (m.cam2world, m.near, m.far))
+        poses, near, far = (tensor.flatten(0, 1) for tensor in (matched.cam2world, matched.near, matched.far))
         by_view = [
             self._lift_view(
                 torch.cat((refined[i], images[i], features[i])),
@@ -225,7 +225,7 @@ class MVSplat(nn.Module):
 class Features(nn.Module):
     """Features of all views at 1/4 scale: outputs of the transformer and of the encoder."""
 
-    def __init__(self, config: MVSplatConfig, compat: Compat, precision: AttentionPrecision) -> None:
+    def __init__(self, config: MVSplatConfig, compat: Compat, precision: Precision) -> None:
         super().__init__()
         self.encoder = Encoder(config.channels, _choose_border(compat))
         self.transformer = Transformer(config.transformer, compat, precision)
@@ -261,7 +261,7 @@ class Encoder(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions with instance normalisation beside a shortcut."""
+    """Two convolutions with instance normalisation, plus a shortcut."""
 
     def __init__(self, inputs: int, outputs: int, *, stride: int, border: Border) -> None:
         super().__init__()
@@ -278,9 +278,9 @@ class ResidualBlock(nn.Module):
 
 
 class SweptDepth(nn.Module):
-    """Cost volume at 1/4 scale: correlate, refine, regress inverse depth."""
+    """Inverse depth from a cost volume at 1/4 scale."""
 
-    def __init__(self, config: MVSplatConfig, compat: Compat, precision: AttentionPrecision) -> None:
+    def __init__(self, config: MVSplatConfig, compat: Compat, precision: Precision) -> None:
         super().__init__()
         self.config = config
         self.compat: Compat = compat
@@ -313,7 +313,7 @@ class SweptDepth(nn.Module):
 class FullSizeRefinement(nn.Module):
     """U-Net of five scales at the image's size."""
 
-    def __init__(self, inputs: int, width: int, border: Border, precision: AttentionPrecision) -> None:
+    def __init__(self, inputs: int, width: int, border: Border, precision: Precision) -> None:
         super().__init__()
         self.entry = PanoramaConv2d(inputs, width, 3, border=border)
         self.norm = nn.GroupNorm(4, width)

@@ -1,4 +1,4 @@
-"""Networks with weights as predictors: loading, input checks, tiles, masks, batches and the cache fingerprint."""
+"""Predictors that run a network: loading, input checks, tiles, masks, batches and the cache fingerprint."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import uv_from_directions
 from pansplat.model.heads import TileGaussians, merge_tiles
-from pansplat.model.layers import AttentionPrecision, Compat, Precision, require_views
+from pansplat.model.layers import Compat, Precision, require_views
 from pansplat.model.mvsplat import MVSplat, MVSplatConfig
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
 from pansplat.model.weights import (
@@ -58,7 +58,7 @@ class Network(Protocol):
         near: Float[Tensor, "batch view"],
         far: Float[Tensor, "batch view"],
     ) -> Any:
-        """Features of the views, and their depths as `Depths` in the attribute `depths`."""
+        """Match the views; the result has an attribute `depths` of type `Depths`."""
         ...
 
     def lift_gaussians(
@@ -73,12 +73,12 @@ class Network(Protocol):
 
 
 class NetworkPredictor:
-    """A `Predictor` of a network with weights.
+    """A `Predictor` that runs a network.
 
     Args:
-        name: name for users.
-        network: is put in eval mode.
-        tiles: tiles along each side of the panorama; None for `choose_tiles` of the height.
+        name: name of the predictor in messages and scene files.
+        network: the network, which is set to eval mode.
+        tiles: tiles along each side of the panorama; by default `choose_tiles`.
     """
 
     def __init__(self, name: str, network: Network, *, tiles: int | None = None) -> None:
@@ -89,7 +89,7 @@ class NetworkPredictor:
 
     @functools.cached_property
     def fingerprint(self) -> str:
-        """Hash of weights, settings and source code: a cached prediction is never stale."""
+        """Hash of weights, settings and source code, so that a cached prediction is never outdated."""
         precisions = [getattr(self.network, name, None) for name in ("precision", "attention_precision")]
         settings = (self.network.config, self.network.compat, *precisions, self.tiles)
         digest = hashlib.blake2b(repr(settings).encode(), digest_size=8)
@@ -115,11 +115,11 @@ class NetworkPredictor:
         """Predict from RGB in [0, 1] and OpenCV cam2world poses (metres); a list when there is a batch axis.
 
         Args:
-            near, far: radial depth range, metres; a number, or a tensor with a value for each batch item or view.
+            near, far: radial depth range, metres: a number, or a tensor with one value per batch item or view.
             masks: True where a pixel shows the scene; Gaussians elsewhere are removed.
 
         Raises:
-            InputError: shapes, sizes, view counts or values that the network does not accept.
+            InputError: the network does not accept the shapes, sizes, number of views or values.
         """
         if images.ndim == 5:
             return [
@@ -146,10 +146,10 @@ class NetworkPredictor:
         masks: Bool[Tensor, "view height width"] | None = None,
         progress: Progress | None = None,
     ) -> tuple[Gaussians, list[Float[Tensor, "view _ _"]]]:
-        """The Gaussians, and the intermediate radial depth maps, metres, coarse to fine.
+        """Predict Gaussians, and return them with the radial depth maps of the swept levels, metres, coarse to fine.
 
         Raises:
-            InputError: as `__call__`.
+            InputError: see `__call__`.
         """
         matched, tiles = self._match(images, cam2world, near, far, masks, progress)
         parts = list(self._lift(matched, tiles, progress))
@@ -171,7 +171,7 @@ class NetworkPredictor:
         """Yield the Gaussians of `__call__` tile by tile, in bounded memory.
 
         Raises:
-            InputError: as `__call__`, at the first tile.
+            InputError: see `__call__`; raised when the first part is requested.
         """
         with torch.no_grad():
             matched, tiles = self._match(images, cam2world, near, far, masks, progress)
@@ -194,7 +194,7 @@ class NetworkPredictor:
         masks: Tensor | None,
         progress: Progress | None,
     ) -> tuple[Any, int]:
-        """Check one item and match its views; returns the match and the number of tiles along each side."""
+        """Check and match the views of one item; return the match and the number of tiles along each side."""
         views = len(images)
         low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (near, far))
         tiles = self.tiles or choose_tiles(images.shape[-2])
@@ -235,7 +235,7 @@ def remove_masked_gaussians(
 
 
 def _select_item(value: float | Tensor, n: int) -> float | Tensor:
-    """A batch item's depth bound."""
+    """The depth bound of a batch item."""
     return value[n] if isinstance(value, Tensor) and value.ndim else value
 
 
@@ -261,7 +261,9 @@ def _check_inputs(
     if not (torch.isfinite(images).all() and torch.isfinite(cam2world).all()):
         raise InputError("`images` and `cam2world` must be finite, got NaN or infinity; clean the input first")
     if near.numel() not in (1, shape[0]) or far.numel() not in (1, shape[0]):
-        raise InputError(f"`near` and `far` must be one number, or one a view, got {near.tolist()} and {far.tolist()}")
+        raise InputError(
+            f"`near` and `far` must be one number, or one number per view, got {near.tolist()} and {far.tolist()}"
+        )
     if not bool((near > 0).all() and (near < far).all() and torch.isfinite(far).all()):
         raise InputError(
             f"`near` and `far` must satisfy 0 < near < far, got {near.tolist()} and {far.tolist()} (metres)"
@@ -273,15 +275,15 @@ def load_predictor(
     compat: CompatChoice = "trained",
     *,
     precision: Precision = "float32",
-    attention_precision: AttentionPrecision = "float32",
+    attention_precision: Precision = "float32",
 ) -> NetworkPredictor:
     """Load a predictor from a file of weights.
 
     Args:
         path: a .safetensors of `pansplat convert` or of training, or an official Lightning checkpoint.
-        compat: "official" computes what the official code computes, "fixed" corrects its defects, "trained" is the
-            one that the weights were trained with ("official" for official checkpoints).
-        precision: number type of PanSplat's convolutions; docs/bench_model.md has the time and error of bfloat16.
+        compat: "official" computes the numbers of the official code, "fixed" corrects its defects, "trained" is the
+            mode of the training ("official" for official checkpoints).
+        precision: number type of PanSplat's convolutions; docs/bench_model.md lists the time and error of bfloat16.
         attention_precision: number type that attention rounds to; bfloat16 in the official code.
 
     Raises:
@@ -305,10 +307,10 @@ def load_predictor(
 
 
 def convert_checkpoint(content: Mapping[str, object], source: object) -> WeightsFile:
-    """Convert the content of an official checkpoint to a weights file's.
+    """Convert the content of an official checkpoint to the content of a weights file.
 
     Raises:
-        InputError: the checkpoint is not of an unmodified official model.
+        InputError: the checkpoint does not hold an unmodified official model.
     """
     tensors = convert_tensors(content, source)
     model = match_tensors(content, source).model
@@ -327,8 +329,8 @@ def require_precision(precision: str) -> None:
         raise InputError(f"`precision` must be {' or '.join(get_args(Precision))}, got {precision!r}")
     if precision == "bfloat16" and not has_bfloat16():
         raise InputError(
-            "`precision` bfloat16 needs a processor with bfloat16 instructions (AVX512_BF16, AMX), this one has none "
-            "and would be slower than with float32; use float32"
+            "`precision` bfloat16 needs a processor with bfloat16 instructions (AVX512_BF16, AMX), got one "
+            "without them; use float32, which is faster on it"
         )
 
 
@@ -362,15 +364,15 @@ def build_empty_network(
     source: object,
     *,
     precision: Precision = "float32",
-    attention_precision: AttentionPrecision = "float32",
+    attention_precision: Precision = "float32",
 ) -> PanSplat | MVSplat:
-    """Build a network on the meta device: without memory for weights, without drawing random numbers.
+    """Build a network on the meta device, without memory for weights and without random numbers.
 
     Raises:
         InputError: the file's settings fit no network.
     """
     if weights.model not in _NETWORKS:
-        raise InputError(f"{source}: needed weights of {' or '.join(_NETWORKS)}, got of {weights.model!r}")
+        raise InputError(f"{source}: needed weights of {' or '.join(_NETWORKS)}, got weights of {weights.model!r}")
     kind, config_kind = _NETWORKS[weights.model]
     try:
         config = config_from_dict(config_kind, weights.config, f"{source}: config")

@@ -1,4 +1,4 @@
-"""PanSplat: wide-baseline panoramas in, Gaussians on a spherical pyramid out; see Figure 3 of the paper.
+"""The PanSplat network: from wide-baseline panoramas to Gaussians on a spherical pyramid; Figure 3 of the paper.
 
 Source: Zhang et al., PanSplat: 4K panorama synthesis with feed-forward Gaussian splatting, CVPR 2025.
 """
@@ -15,7 +15,7 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.model.cost_volume import CostVolumeConfig, Depths, SphericalCostVolume
 from pansplat.model.feature_pyramid import FeaturePyramid, FeaturePyramidConfig
 from pansplat.model.heads import GaussianHeads, HeadsConfig, MatchedViews, TileGaussians
-from pansplat.model.layers import AttentionPrecision, Compat, Precision, autocast_convolutions, resize
+from pansplat.model.layers import Compat, Precision, autocast_convolutions, resize
 from pansplat.model.mono_depth import MonocularDepth
 
 MATCHING_HEIGHT = 512
@@ -36,8 +36,8 @@ class PanSplatConfig:
             raise ValueError(f"`heads.candidates` must be the {swept} of the finest sweep, got {self.heads.candidates}")
         if self.heads.feature_channels != self.features.channels[::-1]:
             raise ValueError(
-                f"`heads.feature_channels` must be {self.features.channels[::-1]}, those of the features coarse to "
-                f"fine, got {self.heads.feature_channels}"
+                f"`heads.feature_channels` must be {self.features.channels[::-1]}, the channels of the features "
+                f"coarse to fine, got {self.heads.feature_channels}"
             )
 
 
@@ -63,7 +63,7 @@ class PanSplat(nn.Module):
     """Feature pyramid, monocular depth, spherical cost volume, residual Gaussian heads.
 
     Args:
-        compat: "official" computes what the official code computes, its defects included; "fixed" corrects them.
+        compat: "official" computes the numbers of the official code with its defects; "fixed" corrects them.
         precision: number type of all convolutions; depths, correlations and positions are not affected.
         attention_precision: number type that attention rounds to; bfloat16 in the official code.
     """
@@ -74,14 +74,14 @@ class PanSplat(nn.Module):
         compat: Compat = "fixed",
         *,
         precision: Precision = "float32",
-        attention_precision: AttentionPrecision = "float32",
+        attention_precision: Precision = "float32",
     ) -> None:
         super().__init__()
         config = config or PanSplatConfig()
         self.config = config
         self.compat: Compat = compat
         self.precision: Precision = precision
-        self.attention_precision: AttentionPrecision = attention_precision
+        self.attention_precision: Precision = attention_precision
         self.features = FeaturePyramid(config.features, compat, attention_precision, precision)
         self.mono_depth = MonocularDepth(compat) if config.cost_volume.mono_channels else None
         self.cost_volume = SphericalCostVolume(config.cost_volume, compat, attention_precision, precision)
@@ -111,7 +111,7 @@ class PanSplat(nn.Module):
         near: Float[Tensor, "batch view"],
         far: Float[Tensor, "batch view"],
     ) -> MatchedViews:
-        """Compute features and depths of all views: everything before the heads."""
+        """Compute features and depths of all views, the inputs of the heads."""
         features = self.features(self._resize_for_matching(images))
         mono_features = None
         if self.mono_depth is not None:

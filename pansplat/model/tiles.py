@@ -1,9 +1,9 @@
-"""Panorama tiles and lattice points: where the Gaussians of a level are, and windows into maps around them.
+"""Lattice points, panorama tiles, and windows of maps around the tiles.
 
-A tile is one cell of an N x N grid over the panorama. On the map of each level it is a window of whole pixels, expanded
-by a margin. Beyond the borders of the map, columns wrap and rows continue over the pole, half a turn away. The
-official code has zeros beyond the poles, repeats the last column at the seam when it resizes, and has margins that are
-too narrow (docs/paper.md, P6, P7, T5).
+A tile is one cell of an N x N grid over the panorama. On the map of each level it is a window of whole pixels, which is
+expanded by a margin. Outside the map, columns wrap and rows continue over the pole, half a turn away. The official code
+has zeros outside the rows, repeats the last column at the seam when it resizes, and has too narrow margins
+(docs/paper.md, P6, P7, T5).
 
 Source: PanSplat, sections 3.3 and 3.4.
 """
@@ -29,15 +29,16 @@ _MIN_COS_LATITUDE = 0.01  # limits the width of a pixel in longitude at the pole
 
 
 @functools.lru_cache(maxsize=16)
-@torch.inference_mode(False)  # the cached tensor must also serve calls with gradients
+@torch.inference_mode(False)  # calls with gradients also use the cached tensor
 def make_lattice_uv(lattice: Lattice, height: int, *, exact: bool = True) -> Float[Tensor, "n 2"]:
-    """Normalised panorama coordinates of a level's lattice points, float64; do not change the cached result in place.
+    """Normalised panorama coordinates of a level's lattice points, float64.
 
-    A Fibonacci lattice covers the sphere evenly, from the bottom pole up. The pixel lattice is in row-major order.
+    A Fibonacci lattice covers the sphere evenly and starts at the bottom pole. The pixel lattice is in row-major order.
+    The result is cached: do not change it in place.
 
     Args:
         height: rows of the level's map.
-        exact: computed in float64; otherwise the points of the official float32 arithmetic.
+        exact: compute in float64; otherwise as the official code does, in float32.
 
     Source: PanSplat, section 3.3.
     """
@@ -57,7 +58,7 @@ def move_points(
 ) -> Float[Tensor, "n 2"]:
     """Move points by at most half a map pixel in each direction; they may cross the seam or a pole.
 
-    On a Fibonacci lattice a pixel spans the same arc at every latitude, so it is wider in longitude near the poles.
+    On a Fibonacci lattice a pixel has one arc length at all latitudes, so it is wider in longitude near the poles.
     """
     width = torch.full_like(uv[:, 0], 2 * height)
     if lattice == "fibonacci":
@@ -68,7 +69,7 @@ def move_points(
 
 @dataclass(frozen=True)
 class Window:
-    """A rectangle of map pixels; it may extend beyond the map."""
+    """A rectangle of map pixels, which may extend outside the map."""
 
     top: int
     left: int
@@ -101,11 +102,11 @@ class Tile:
 
 @dataclass(frozen=True)
 class Margins:
-    """Map pixels around a tile that a level's convolutions read (`input`) and that their output keeps (`output`).
+    """Margins around a tile, in map pixels: of the input of a level's convolutions, and of their output.
 
-    Each convolution uses up one pixel of the margin. `input` = 7 and `output` = 4 are the smallest margins for three
-    convolutions with which the next level, twice as fine, gets the same margins. In the official code the output
-    keeps the margin of the input, but zero padding changes its outer pixels.
+    Each convolution reduces the margin by one pixel. For three convolutions, 7 and 4 are the smallest margins that the
+    next level, twice as fine, can also have. In the official code the output has the margin of the input, but zero
+    padding changes its outer pixels.
     """
 
     input: int
@@ -113,7 +114,7 @@ class Margins:
 
     @staticmethod
     def of(layers: int, compat: Compat, *, chained: bool) -> Margins:
-        """Margins for a number of convolutions; `chained` if a finer level reads the output."""
+        """Margins for a number of convolutions; `chained`: a finer level reads the output."""
         if compat == "official":
             return Margins(layers, layers)
         output = layers + 1 if chained else 1
@@ -128,24 +129,24 @@ def make_tiles(grid: int) -> list[Tile]:
 def crop_window(
     source: Float[Tensor, "channel h w"], height: int, window: Window, compat: Compat
 ) -> Float[Tensor, "channel rows columns"]:
-    """Crop a window of a panorama map that is resized to `height` x `2 height` (bilinear, without antialiasing).
+    """Crop a window of a map resized to `height` x `2 height`, bilinearly and without antialiasing.
 
-    Only the window is resized, so memory depends on the tile and not on the panorama.
+    Only the window is resized, so the memory does not depend on the size of the panorama.
     """
     exact = compat == "fixed"
     rows = torch.arange(window.top, window.top + window.height)
     columns = torch.arange(window.left, window.left + window.width)
     if not exact:
         columns = columns.remainder(2 * height)
-    before_y, after_y, weight_y = _neighbours(rows, source.shape[1], height, exact)
-    before_x, after_x, weight_x = _neighbours(columns, source.shape[2], 2 * height, exact)
+    before_y, after_y, weight_y = _find_neighbours(rows, source.shape[1], height, exact)
+    before_x, after_x, weight_x = _find_neighbours(columns, source.shape[2], 2 * height, exact)
     if exact:
         edges = (before_y[0], before_x[0], source.shape[1] - 1 - after_y[-1], source.shape[2] - 1 - after_x[-1])
         margin = max(0, -min(int(edge) for edge in edges))
         source = pad_equirect(source, margin, "sphere")
         before_y, after_y, before_x, after_x = (i + margin for i in (before_y, after_y, before_x, after_x))
-    resized = _blend(source, before_y, after_y, weight_y, dim=1)
-    resized = _blend(resized, before_x, after_x, weight_x, dim=2)
+    resized = _interpolate(source, before_y, after_y, weight_y, dim=1)
+    resized = _interpolate(resized, before_x, after_x, weight_x, dim=2)
     if exact:
         return resized
     inside = (rows >= 0) & (rows < height)
@@ -161,7 +162,7 @@ def sample_window(
     """Sample a map bilinearly at points inside a window.
 
     Args:
-        window_map: the window of the map.
+        window_map: the part of the map inside `window`.
         height: rows of the whole map.
     """
     x = uv[:, 0] * (2 * height) - 0.5 - window.left
@@ -175,7 +176,7 @@ def sample_window(
         ((1 - across) * (1 - down), across * (1 - down), (1 - across) * down, across * down), dim=-1
     ).to(window_map)
     pixels = window_map.permute(1, 2, 0).reshape(window.height * window.width, -1)
-    # embedding_bag sums weighted rows in one pass: on a CPU 7 times as fast as blending four gathered copies.
+    # embedding_bag sums weighted rows in one pass; on a CPU this is 7 times faster than a sum of four gathered copies.
     return functional.embedding_bag(corners.to(pixels.device), pixels, mode="sum", per_sample_weights=weights)
 
 
@@ -190,10 +191,10 @@ def sample_panorama(
     return sample_window(crop_window(source, height, window, compat), window, height, uv)
 
 
-def _neighbours(
+def _find_neighbours(
     index: Integer[Tensor, "n"], source_size: int, size: int, exact: bool
 ) -> tuple[Integer[Tensor, "n"], Integer[Tensor, "n"], Float[Tensor, "n"]]:
-    """The two source pixels around each target pixel's centre, and the weight of the second."""
+    """Find the two source pixels around each target pixel's centre, and the weight of the second."""
     position = (index.double() + 0.5) * (source_size / size) - 0.5
     if not exact:
         position = position.clamp(0, source_size - 1)
@@ -203,14 +204,14 @@ def _neighbours(
     return before.long(), after.long(), weight
 
 
-def _blend(
+def _interpolate(
     source: Float[Tensor, "channel h w"],
     before: Integer[Tensor, "n"],
     after: Integer[Tensor, "n"],
     weight: Float[Tensor, "n"],
     dim: int,
 ) -> Float[Tensor, "channel rows columns"]:
-    """Blend source pixels along one axis; a slice where all weights are 0."""
+    """Interpolate source pixels along one axis; return a slice if all weights are 0 and the pixels are adjacent."""
     if bool((weight == 0).all()):
         first, last = int(before[0]), int(before[-1])
         if last - first + 1 == len(before) and bool((before.diff() == 1).all()):

@@ -1,8 +1,8 @@
-"""Weights on disk: our safetensors files, PyTorch checkpoints, and the conversion of official checkpoints.
+"""Weights on disk: safetensors files of pansplat, PyTorch checkpoints, conversion of official checkpoints.
 
-A weights file is a .safetensors with four metadata entries: `pansplat_format` (a number), `model` (which network),
-`config` (its architecture, JSON) and `compat` (with which it was trained). A checkpoint is read without running code
-that it contains. Conversion is strict: a tensor that is missing, unknown or not finite is an error.
+A weights file is a .safetensors file with four metadata entries: `pansplat_format` (a number), `model` (the network's
+name), `config` (its architecture, JSON) and `compat` (the mode of its training). Checkpoints are read without executing
+code in them. Conversion is strict: a tensor that is missing, unknown or not finite is an error.
 
 Source: docs/official.md, sections 3 to 8, 15 and 16.
 """
@@ -47,7 +47,7 @@ _FULL = ("weight", "bias")
 _BATCH_NORM = ("weight", "bias", "running_mean", "running_var", "num_batches_tracked")
 _PREFIX = "encoder."  # of the network's tensors in a Lightning checkpoint
 _AUXILIARY_PREFIX = "losses.2.gaussian_head."
-_MAX_NAMES = 4  # in an error
+_MAX_NAMES = 4  # in an error message
 
 
 class UnsafeCheckpointError(InputError):
@@ -61,7 +61,7 @@ class WeightsFile:
     Attributes:
         model: name of the network, such as "pansplat".
         config: settings of its architecture.
-        compat: with which it was trained.
+        compat: mode of its training.
         tensors: weights by name.
     """
 
@@ -72,7 +72,7 @@ class WeightsFile:
 
 
 def pack_weights(model: ModelName, config: object, tensors: dict[str, Tensor], *, compat: Compat) -> WeightsFile:
-    """Pack a network's tensors with its settings; `config` is the network's dataclass."""
+    """Pack a network's tensors with its settings; `config` is a dataclass."""
     assert dataclasses.is_dataclass(config) and not isinstance(config, type)
     settings = json.loads(json.dumps(dataclasses.asdict(config)))  # lists instead of tuples, as read from a file
     return WeightsFile(model, settings, compat, tensors)
@@ -167,10 +167,10 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 
 
 def get_state_dict(content: Mapping[str, Any], path: str | Path) -> dict[str, Tensor]:
-    """The `state_dict` of a Lightning checkpoint's content.
+    """Get the `state_dict` from the content of a Lightning checkpoint.
 
     Raises:
-        InputError: there is no `state_dict`, or it holds anything but tensors.
+        InputError: there is no `state_dict`, or it contains other values than tensors.
     """
     state = content.get("state_dict")
     if not isinstance(state, Mapping):
@@ -178,12 +178,12 @@ def get_state_dict(content: Mapping[str, Any], path: str | Path) -> dict[str, Te
         raise InputError(f"{path}: needed a checkpoint with a `state_dict`, got one with {keys or 'nothing'}")
     odd = [str(name) for name, value in state.items() if not isinstance(value, Tensor)]
     if odd:
-        raise InputError(f"{path}: needed a `state_dict` of tensors, got others at {', '.join(odd[:3])}")
+        raise InputError(f"{path}: needed a `state_dict` of tensors, got other values at {', '.join(odd[:3])}")
     return {str(name): value for name, value in state.items()}
 
 
 def config_from_dict(kind: type[_T], values: Mapping[str, Any], where: str = "config") -> _T:
-    """Restore a nested frozen dataclass from `dataclasses.asdict` after JSON.
+    """Restore a nested dataclass from the JSON of its `dataclasses.asdict`.
 
     Raises:
         InputError: a field is unknown or missing.
@@ -215,13 +215,13 @@ def _restore(hint: Any, value: Any, where: str) -> Any:
 
 def _require_file(path: Path) -> None:
     if not path.is_file():
-        raise InputError(f"{path}: needed a file of weights, got {'a folder' if path.exists() else 'nothing there'}")
+        raise InputError(f"{path}: needed a file of weights, got {'a folder' if path.exists() else 'no file'}")
     if path.stat().st_size == 0:
         raise InputError(f"{path}: needed a file of weights, got an empty file; download or copy it again")
 
 
 def _suggest_remedy(path: Path) -> str:
-    """Advice for an unreadable file, from its first bytes."""
+    """Suggest what to do about an unreadable file, from its first bytes."""
     with open(path, "rb") as file:
         start = file.read(64).lstrip().lower()
     if start.startswith((b"<!doctype", b"<html", b"<?xml", b"<head")):
@@ -236,10 +236,10 @@ class ConversionReport:
     """How the tensors of an official checkpoint are converted.
 
     Attributes:
-        model: the network they belong to.
-        used: official names to ours.
-        unused: names that are left out, by reason.
-        unexpected: unknown names.
+        model: name of the network.
+        used: our name of each tensor that is used, by official name.
+        unused: official names of tensors that are not used, by reason.
+        unexpected: names that are not official.
         missing: official names that the checkpoint lacks.
     """
 
@@ -250,10 +250,10 @@ class ConversionReport:
     missing: list[str]
 
     def require_complete(self, source: object) -> None:
-        """Check that nothing is missing or unexpected.
+        """Check that no tensor is missing or unexpected.
 
         Raises:
-            InputError: lists the first names and their number.
+            InputError: some are; the message has their number and the first names.
         """
         problems = []
         if self.missing:
@@ -263,15 +263,15 @@ class ConversionReport:
         if problems:
             raise InputError(
                 f"{source}: needed exactly the tensors of the official {self.model}, {' and '.join(problems)}; "
-                "take the checkpoint of an unmodified model"
+                "use the checkpoint of an unmodified model"
             )
 
 
 def convert_tensors(content: Mapping[str, object], source: object) -> dict[str, Tensor]:
-    """The tensors of an official checkpoint by our names, floating-point ones in float32.
+    """Convert the tensors of an official checkpoint to our names, and floating-point numbers to float32.
 
     Args:
-        content: of the checkpoint, from `read_checkpoint`.
+        content: result of `read_checkpoint`.
         source: the file, for messages.
 
     Raises:
@@ -288,7 +288,7 @@ def convert_tensors(content: Mapping[str, object], source: object) -> dict[str, 
         if tensor.is_floating_point():
             tensor = tensor.float()
             if not torch.isfinite(tensor).all():
-                raise InputError(f"{source}: needed finite numbers, got NaN or infinity in {name}; take another")
+                raise InputError(f"{source}: needed finite numbers, got NaN or infinity in {name}; use another file")
         tensors[ours] = tensor
     return tensors
 
@@ -319,7 +319,7 @@ def match_tensors(content: Mapping[str, object], source: object) -> ConversionRe
 
 
 def map_official_names(model: ModelName) -> dict[str, str]:
-    """Our name of each official tensor that is used; official names are without the prefix "encoder.".
+    """Map the official name, without the prefix "encoder.", of each tensor that is used to our name.
 
     The official code counts stages from coarse to fine; our levels are the paper's, where 0 is the finest.
     """
@@ -333,10 +333,10 @@ def map_official_names(model: ModelName) -> dict[str, str]:
 
 
 def require_shapes(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], source: object) -> None:
-    """Check that tensors have the names and shapes of a network's.
+    """Check that tensors have the names and shapes of a network's tensors.
 
     Raises:
-        InputError: lists the first names and their number.
+        InputError: some do not; the message has their number and the first names.
     """
     missing = [name for name in expected if name not in tensors]
     unexpected = [name for name in tensors if name not in expected]
@@ -346,16 +346,16 @@ def require_shapes(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor]
         if name in tensors and tensors[name].shape != tensor.shape
     ]
     problems = [
-        f"{what} {_join_names(names)}"
-        for what, names in (("lacked", missing), ("found unknown", unexpected), ("got", wrong))
+        f"{problem} {_join_names(names)}"
+        for problem, names in (("lacked", missing), ("found unknown", unexpected), ("got", wrong))
         if names
     ]
     if problems:
-        raise InputError(f"{source}: its tensors do not fit the network: {'; '.join(problems)}; take another file")
+        raise InputError(f"{source}: its tensors do not fit the network: {'; '.join(problems)}; use another file")
 
 
 def _list_grid_heights(model: ModelName) -> dict[str, int]:
-    """Names of the stored lookup grids, which are computed here, and the heights of their panoramas."""
+    """Map the names of the stored lookup grids, which are recomputed here, to the heights of their panoramas."""
     if model == "mvsplat":
         return {}
     return {f"mono_depth.c2e.{scale}.sample_grid": 512 >> scale for scale in (5, 4, 3, 2, 1)}
@@ -377,7 +377,7 @@ def _require_official_grids(state: Mapping[str, Tensor], source: object) -> None
         x, y, face = strip_lookup(height).unbind(-1)
         computed = torch.stack((x, y, face / 2.5 - 1), dim=-1)[None, None]
         if stored.shape != computed.shape or (stored.double() - computed).abs().max() > 1e-4:
-            raise InputError(f"{source}: needed the official grid in {name}, got another; the model was modified")
+            raise InputError(f"{source}: needed the official grid in {name}, got another; use an unmodified model")
 
 
 def _detect_model(state: Mapping[str, Tensor], source: object) -> ModelName:

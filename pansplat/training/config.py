@@ -11,7 +11,7 @@ from typing import Literal
 
 from pansplat.data.augment import Augmentation
 from pansplat.errors import InputError
-from pansplat.model.layers import AttentionPrecision, Compat, Precision
+from pansplat.model.layers import Compat, Precision
 from pansplat.training.losses import CODE, LossWeights, PerceptualName
 
 DataKind = Literal["generated", "panogrf", "360loc", "insta360", "pairs", "triplets"]
@@ -53,7 +53,7 @@ class NetworkConfig:
     """Whether to train with the defects of the official code ("official") or without them."""
     precision: Precision = "float32"
     """Number type of the convolutions (mixed precision); weights, depths and positions stay float32."""
-    attention_precision: AttentionPrecision = "float32"
+    attention_precision: Precision = "float32"
     """Number type to which the inputs of attention are rounded."""
     init: Path | None = None
     """Initial weights: a .safetensors, an official .ckpt, or a checkpoint of pansplat-train."""

@@ -1,4 +1,4 @@
-"""Weights and small networks for the tests of the model, and one run of the official network."""
+"""Fixtures of the model tests: official weights, one run of the official network, random weights and inputs."""
 
 import functools
 from collections.abc import Callable
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pansplat.gaussians.scene import Gaussians
+from pansplat.geometry.pose import rotations_from_quats
 from pansplat.model.network import NetworkPredictor, build_network, convert_checkpoint
 from pansplat.model.pansplat import PanSplat
 from pansplat.model.weights import WeightsFile
@@ -22,10 +23,10 @@ _HOOKED = (
 
 @dataclass(frozen=True)
 class OfficialRun:
-    """A prediction with the official weights on the inputs of the golden fixtures.
+    """A prediction with the recipe's weights for the inputs of the golden fixtures.
 
     Attributes:
-        inputs, outputs: of the modules in `_HOOKED`, by name.
+        inputs, outputs: inputs and outputs of the modules in `_HOOKED`, by name.
     """
 
     network: PanSplat
@@ -36,7 +37,7 @@ class OfficialRun:
 
 @pytest.fixture(scope="session")
 def official_weights(recipe_weights: dict[str, Tensor], as_lightning: Callable[..., dict[str, Any]]) -> WeightsFile:
-    """The recipe's checkpoint, converted."""
+    """Weights converted from a checkpoint of the golden recipe."""
     return convert_checkpoint(as_lightning(recipe_weights), "recipe")
 
 
@@ -49,13 +50,12 @@ def run_official(official_weights: WeightsFile, golden: Callable[..., dict[str, 
         network = build_network(official_weights, compat, "recipe", attention_precision=attention)
         inputs, outputs = {}, {}
 
-        def keep(name: str, given: tuple, output: object) -> None:
-            inputs[name], outputs[name] = given[0], output
-
         for name in _HOOKED:
-            network.get_submodule(name).register_forward_hook(
-                lambda _, given, output, name=name: keep(name, given, output)
-            )
+
+            def keep(_: object, arguments: tuple, output: object, name: str = name) -> None:
+                inputs[name], outputs[name] = arguments[0], output
+
+            network.get_submodule(name).register_forward_hook(keep)
         truth = golden("pansplat_64x128_fp32attn")
         scene = (truth[f"in.{name}"][0] for name in ("image", "extrinsics", "near", "far"))
         gaussians = NetworkPredictor("pansplat", network)(*scene)
@@ -84,3 +84,20 @@ def randomize() -> Callable[[torch.nn.Module], torch.nn.Module]:
         return module
 
     return fill
+
+
+@pytest.fixture(scope="session")
+def make_inputs() -> Callable[..., tuple[Tensor, ...]]:
+    """Make random images and rigid poses of a network, with near and far; float64."""
+
+    def make(height: int = 64, views: int = 2, batch: int = 1) -> tuple[Tensor, ...]:
+        generator = torch.Generator().manual_seed(1)
+        poses = torch.eye(4, dtype=torch.float64).repeat(batch, views, 1, 1)
+        quats = torch.randn(batch, views, 4, generator=generator, dtype=torch.float64)
+        poses[..., :3, :3] = rotations_from_quats(quats)
+        poses[..., :3, 3] = 0.3 * torch.randn(batch, views, 3, generator=generator, dtype=torch.float64)
+        images = torch.rand(batch, views, 3, height, 2 * height, generator=generator, dtype=torch.float64)
+        near, far = (torch.full((batch, views), bound, dtype=torch.float64) for bound in (0.5, 20.0))
+        return images, poses, near, far
+
+    return make

@@ -1,4 +1,4 @@
-"""Spherical cost volume and its U-Net: the official numbers, candidates, ablations, symmetries, extreme inputs."""
+"""Spherical cost volume and U-Net: agreement with the official code, candidates, ablations, symmetries, hard cases."""
 
 import math
 from dataclasses import replace
@@ -73,7 +73,7 @@ def test_the_first_candidates_run_evenly_from_far_to_near():
     assert torch.allclose(candidates[0, 1, :, 1, 3], torch.tensor((0.1, 0.575, 1.05, 1.525, 2.0)).double())
 
 
-def test_later_candidates_lie_about_the_centre_within_the_bounds():
+def test_later_candidates_lie_around_the_centre_within_the_bounds():
     centre = torch.tensor((0.2, 1.0)).double().expand(1, 2, 3, 2)
     candidates = make_candidates_around(centre, torch.full((1, 2), 0.1).double(), _BOUNDS, 4)
     assert torch.allclose(candidates[0, 0, :, 0, 0], torch.tensor((0.1, 0.1, 0.2, 0.3)).double())
@@ -88,7 +88,7 @@ def test_the_spacing_halves_from_level_to_level(small):
     assert torch.allclose(steps, first.diff(dim=2).mean() / 2, atol=1e-12)
 
 
-def test_a_certain_candidate_is_the_result():
+def test_a_candidate_of_probability_one_is_the_result():
     candidates = make_first_candidates(_BOUNDS, 5, (2, 4))
     logits = torch.full((1, 2, 5, 2, 4), -1e4).double()
     logits[:, :, 3] = 1e4
@@ -232,10 +232,10 @@ def test_monocular_features_must_be_given_exactly_if_configured(small, randomize
         randomize(SphericalCostVolume(replace(_SMALL, mono_channels=0), "fixed"))(*rest, mono)
 
 
-# Extreme inputs: fixed mode, two views, no monocular features
+# Hard cases, in fixed mode with two views and without monocular features
 
 
-_EXTREME = replace(_SMALL, mono_channels=0)
+_HARD_CASES = replace(_SMALL, mono_channels=0)
 
 
 def _features(dtype=torch.float64):
@@ -258,7 +258,7 @@ def _candidates(near, far, count=6, size=(H, W)):
 
 @pytest.fixture(scope="module")
 def network(randomize):
-    return randomize(SphericalCostVolume(_EXTREME, "fixed"))
+    return randomize(SphericalCostVolume(_HARD_CASES, "fixed"))
 
 
 # No baseline
@@ -316,7 +316,7 @@ def test_candidates_before_and_behind_the_other_camera_have_opposite_directions(
 
 
 @pytest.mark.hard_case(39)
-def test_at_the_epipole_candidates_do_not_differ():
+def test_at_the_epipole_all_candidates_have_the_same_cost():
     ray = pixel_directions(H, W, dtype=torch.float64)[3, 5]
     pose = torch.eye(4, dtype=torch.float64)[None].clone()
     pose[0, :3, 3] = -0.3 * ray  # nearer than all candidates
@@ -358,7 +358,7 @@ def test_one_candidate_is_the_depth(randomize):
 
 
 @pytest.mark.hard_case(41)
-def test_after_one_candidate_finer_levels_still_search(randomize):
+def test_finer_levels_have_candidates_around_a_single_candidate(randomize):
     config = CostVolumeConfig(mono_channels=0, levels=(SweepLevel(2, 8, 1, 32), SweepLevel(1, 4, 4, 32)))
     level = randomize(SphericalCostVolume(config, "fixed"))(_features(), _poses(), *_bounds()).levels[1]
     expected = torch.tensor((0.1, 0.1, 1.05, 2.0)).double()  # about the middle, by half the range, clamped
@@ -366,7 +366,7 @@ def test_after_one_candidate_finer_levels_still_search(randomize):
 
 
 @pytest.mark.hard_case(41)
-def test_no_logits_lead_outside_the_bounds(network):
+def test_extreme_features_give_depths_within_the_bounds(network):
     with torch.no_grad():
         for sign in (-1, 1):
             scaled = [1e3 * sign * features for features in _features()]
@@ -491,7 +491,7 @@ def test_the_unet_does_not_depend_on_the_order_of_the_views(unet, views):
     assert torch.allclose(unet(maps[:, order]), unet(maps)[:, order], atol=1e-11)
 
 
-def test_views_read_each_other_and_batch_items_do_not(unet):
+def test_views_depend_on_each_other_and_batch_items_do_not(unet):
     maps = _noise(2, 2, 32, 4, 8)
     before = unet(maps)
     maps[0, 1] += 1

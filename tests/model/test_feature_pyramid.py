@@ -1,4 +1,4 @@
-"""Feature pyramid and its transformer: the official numbers, attention in windows, symmetries of the sphere."""
+"""Feature pyramid and transformer: agreement with the official code, windowed attention, symmetries of the sphere."""
 
 import math
 
@@ -142,7 +142,7 @@ def test_rolling_by_half_a_turn_does_not_roll_the_official_output(transformer):
     assert not torch.allclose(official(maps.roll(8, -1)), official(maps).roll(8, -1), atol=1e-3)
 
 
-def test_a_quarter_turn_changes_which_tokens_meet(transformer):
+def test_rolling_by_a_quarter_turn_does_not_roll_the_output(transformer):
     maps = _noise(1, 2, 16, 8, 16)
     assert not torch.allclose(transformer()(maps.roll(4, -1)), transformer()(maps).roll(4, -1), atol=1e-3)
 
@@ -170,7 +170,7 @@ def test_a_repeated_view_changes_nothing(transformer):
     assert torch.allclose(twice[:, 0], network(maps)[:, 0], atol=1e-12)
 
 
-def test_each_view_reads_the_others(transformer):
+def test_each_view_depends_on_the_others(transformer):
     maps = _noise(1, 3, 16, 4, 8)
     before = transformer(blocks=1)(maps)
     maps[:, 2] += 1

@@ -1,4 +1,4 @@
-"""Gaussian heads and adapter: tiled equals untiled, symmetries, ablations, gradients, the official numbers."""
+"""Gaussian heads and adapter: tiles, symmetries, ablations, gradients, agreement with the official code."""
 
 import dataclasses
 import math
@@ -135,7 +135,7 @@ def test_a_tile_computed_alone_has_the_same_gaussians_and_gradients():
 
 
 def test_tiles_hold_every_gaussian_once():
-    points = _heads().points(64)
+    points = _heads().make_points(64)
     index = torch.cat([compute_untiled_index(tile, points, views=3) for tile in make_tiles(4)])
     assert torch.equal(index.sort().values, torch.arange(3 * sum(lattice_size(128 >> level) for level in range(4))))
 
@@ -245,14 +245,14 @@ def test_a_single_level_has_the_finest_head_only():
     assert len(gaussians) == 2 * lattice_size(128)
 
 
-def test_coarse_heads_may_serve_the_finest_level_only():
+def test_with_finest_only_the_finest_level_emits_gaussians():
     heads, gaussians = _run(emitted="finest")
     _, every = _run()
     assert len(heads.levels) == 4
     assert _difference(gaussians, every.select(every.levels == 0)) == 0
 
 
-def test_without_residual_no_level_reads_another():
+def test_without_residual_levels_are_independent():
     heads, gaussians = _run(residual=False)
     assert [head.convs[0].in_channels for head in heads.levels] == [13, 12, 11, 10]
     heads.levels[0].convs[0].weight.data.zero_()
@@ -272,7 +272,7 @@ def test_swept_depth_is_that_of_the_cost_volume():
     assert heads.config.outputs == 2 + 7 + 12
 
 
-def test_sizes_that_do_not_divide_are_refused():
+def test_unusable_heights_are_refused():
     with pytest.raises(InputError, match="4x4 tiles on 4 levels need a height that 32 divides, got 80"):
         _heads()(_matched(80), tiles=4)
     with pytest.raises(InputError, match="at least 56 pixels high, got 48"):
@@ -374,7 +374,7 @@ def test_official_harmonics_rotate_correctly_about_y_only():
         assert difference < 1e-14 if correct else difference > 0.01
 
 
-def test_every_raw_harmonic_changes_the_colour():
+def test_each_raw_harmonic_changes_its_colour_only():
     for k in range(25):
         parameters = torch.zeros(30, 82, dtype=torch.float64)
         parameters[:, 3] = 1

@@ -1,4 +1,4 @@
-"""Convolution on the sphere, resizing, attention, autocast, checks of the input."""
+"""Convolution on the sphere, resizing, attention, autocast, input checks."""
 
 import math
 
@@ -148,7 +148,7 @@ def test_numbers_of_views_that_do_not_fit_are_refused():
     with pytest.raises(InputError, match="needs two or more views, got 1"):
         require_views(1, "fixed")
     with pytest.raises(
-        InputError, match='takes exactly two views, as the official code does, got 3; use compat="fixed"'
+        InputError, match='needs exactly two views, as the official code does, got 3; use compat="fixed"'
     ):
         require_views(3, "official")
 

@@ -1,4 +1,4 @@
-"""UniFuse: the official numbers, and the roll of the fixed network's features."""
+"""UniFuse: agreement with the official code, and equivariance of the fixed network under half a turn."""
 
 import types
 
@@ -28,7 +28,7 @@ def _seeded(module: torch.nn.Module) -> torch.nn.Module:
 @pytest.mark.shared
 def test_features_and_depth_match_the_official_code(run_official, golden, error) -> None:
     truth, run = golden("pansplat_64x128_fp32attn"), run_official()
-    panoramas, strips = run.network.mono_depth.prepare(truth["in.image"][0])
+    panoramas, strips = run.network.mono_depth.prepare_inputs(truth["in.image"][0])
     assert error(panoramas[..., ::8, ::8], truth["in.mono_image_sub"][0]) < 2e-4
     assert error(strips[..., ::8, ::8], truth["in.cube_image_sub"][0]) < 2e-4
     features = run.outputs["mono_depth"]
@@ -56,8 +56,8 @@ def test_the_network_stays_frozen_in_training_mode() -> None:
 def test_the_fixed_input_wraps_and_the_official_one_does_not() -> None:
     image = _noise(1, 3, 16, 32, seed=0)
     for compat, wraps in (("fixed", True), ("official", False)):
-        network = types.SimpleNamespace(compat=compat)  # `prepare` reads nothing else
-        before, after = (MonocularDepth.prepare(network, i)[0] for i in (image, image.roll(16, dims=-1)))
+        network = types.SimpleNamespace(compat=compat)  # `prepare_inputs` reads nothing else
+        before, after = (MonocularDepth.prepare_inputs(network, i)[0] for i in (image, image.roll(16, dims=-1)))
         assert torch.allclose(after, before.roll(512, dims=-1), atol=1e-12) == wraps
 
 

@@ -1,4 +1,4 @@
-"""The MVSplat baseline: the official numbers, symmetries of the fixed network."""
+"""The MVSplat baseline: agreement with the official code, symmetries of the fixed network."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -81,24 +81,13 @@ def test_gaussians_match_the_official_code(run: OfficialRun, expected: dict[str,
         assert error(part.harmonics[:: 8192 // len(theirs)].double(), theirs) < 2e-4
 
 
-def _inputs(height: int = 64, views: int = 2, batch: int = 1) -> tuple[Tensor, ...]:
-    generator = torch.Generator().manual_seed(1)
-    poses = torch.eye(4, dtype=torch.float64).repeat(batch, views, 1, 1)
-    quats = torch.randn(batch, views, 4, generator=generator, dtype=torch.float64)
-    poses[..., :3, :3] = rotations_from_quats(quats)
-    poses[..., :3, 3] = 0.3 * torch.randn(batch, views, 3, generator=generator, dtype=torch.float64)
-    images = torch.rand(batch, views, 3, height, 2 * height, generator=generator, dtype=torch.float64)
-    near, far = (torch.full((batch, views), bound, dtype=torch.float64) for bound in (0.5, 20.0))
-    return images, poses, near, far
-
-
 @pytest.fixture(scope="module")
 def small(randomize: Callable[[torch.nn.Module], torch.nn.Module]) -> MVSplat:
     return randomize(MVSplat(SMALL, "fixed"))
 
 
-def test_rolling_by_half_a_turn_rolls_the_prediction(small: MVSplat) -> None:
-    images, poses, near, far = _inputs()
+def test_rolling_by_half_a_turn_rolls_the_prediction(small: MVSplat, make_inputs) -> None:
+    images, poses, near, far = make_inputs()
     half_turn = torch.diag(torch.tensor((-1.0, 1.0, -1.0, 1.0), dtype=torch.float64))
     with torch.no_grad():
         before = small(images, poses, near, far)
@@ -109,8 +98,8 @@ def test_rolling_by_half_a_turn_rolls_the_prediction(small: MVSplat) -> None:
     assert torch.allclose(after.gaussians[0].means.reshape(2, 64, 128, 3), means, atol=1e-8)
 
 
-def test_rotating_the_world_rotates_the_prediction(small: MVSplat) -> None:
-    images, poses, near, far = _inputs()
+def test_rotating_the_world_rotates_the_prediction(small: MVSplat, make_inputs) -> None:
+    images, poses, near, far = make_inputs()
     rotation = rotations_from_quats(torch.tensor((0.3, -0.5, 0.7, 0.2), dtype=torch.float64))
     world = torch.eye(4, dtype=torch.float64)
     world[:3, :3], world[:3, 3] = rotation, torch.tensor((1.0, -2.0, 3.0))
@@ -121,8 +110,8 @@ def test_rotating_the_world_rotates_the_prediction(small: MVSplat) -> None:
     assert torch.allclose(after.harmonics, rotate_harmonics(before.harmonics, rotation), atol=1e-8)
 
 
-def test_batch_items_are_independent(small: MVSplat) -> None:
-    inputs = _inputs(height=32, batch=2, views=3)
+def test_batch_items_are_independent(small: MVSplat, make_inputs) -> None:
+    inputs = make_inputs(height=32, batch=2, views=3)
     with torch.no_grad():
         together = small(*inputs).gaussians
         apart = [small(*(tensor[n : n + 1] for tensor in inputs)).gaussians[0] for n in range(2)]
@@ -132,8 +121,8 @@ def test_batch_items_are_independent(small: MVSplat) -> None:
         assert torch.allclose(ours.opacities, alone.opacities, atol=1e-9)
 
 
-def test_gradients_reach_every_weight(small: MVSplat) -> None:
-    gaussians = small(*_inputs()).gaussians[0]
+def test_gradients_reach_every_weight(small: MVSplat, make_inputs) -> None:
+    gaussians = small(*make_inputs()).gaussians[0]
     loss = gaussians.means.square().mean() + gaussians.opacities.mean() + gaussians.harmonics.square().mean()
     loss = loss + gaussians.scales.mean() + gaussians.quats.sum(dim=0).square().mean()
     gradients = torch.autograd.grad(loss, list(small.parameters()))
@@ -142,9 +131,9 @@ def test_gradients_reach_every_weight(small: MVSplat) -> None:
     assert not without
 
 
-def test_its_predictor_applies_masks(small: MVSplat) -> None:
+def test_an_mvsplat_predictor_applies_masks(small: MVSplat, make_inputs) -> None:
     predictor = NetworkPredictor("mvsplat", small)
-    images, poses, _, _ = (tensor[0] for tensor in _inputs())
+    images, poses, _, _ = (tensor[0] for tensor in make_inputs())
     masks = torch.ones(2, 64, 128, dtype=torch.bool)
     masks[0, 32:] = False
     gaussians = predictor(images, poses, 0.5, 20.0, masks=masks)
@@ -153,9 +142,9 @@ def test_its_predictor_applies_masks(small: MVSplat) -> None:
     assert predictor.fingerprint.startswith("mvsplat-fixed-")
 
 
-def test_unusable_views_and_sizes_are_refused() -> None:
+def test_unusable_views_and_sizes_are_refused(make_inputs) -> None:
     network = MVSplat(SMALL, "official").double()
     with pytest.raises(InputError, match="exactly two views"):
-        network(*_inputs(views=3))
+        network(*make_inputs(views=3))
     with pytest.raises(InputError, match="a height and a width that 16 divides, got 40x80"):
-        network(*_inputs(height=40))
+        network(*make_inputs(height=40))

@@ -1,4 +1,4 @@
-"""Networks as predictors: batches, masks, tiles, streams, fingerprints, refusals; loading from files of weights."""
+"""Network predictors: batches, masks, tiles, streams, fingerprints, refusals, loading from files of weights."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _inputs(height: int = 64, views: int = 2) -> tuple[torch.Tensor, torch.Tenso
     return torch.rand(views, 3, height, 2 * height, generator=generator), poses
 
 
-def test_it_is_a_predictor(predictor):
+def test_a_network_predictor_is_a_predictor(predictor):
     assert isinstance(predictor, Predictor)
 
 
@@ -65,7 +65,7 @@ def test_a_batch_gives_a_list_of_the_predictions_of_its_items(predictor):
     assert not torch.equal(both[0].means, alone.means)
 
 
-def test_masked_pixels_make_no_gaussians_and_leave_the_others(predictor):
+def test_masks_remove_only_the_gaussians_of_masked_pixels(predictor):
     images, poses = _inputs()
     masks = torch.ones(2, 64, 128, dtype=torch.bool)
     masks[1, 40:] = False
@@ -79,7 +79,7 @@ def test_masked_pixels_make_no_gaussians_and_leave_the_others(predictor):
     assert len(predictor(images, poses, 0.5, 20.0, masks=~torch.ones_like(masks))) == 0
 
 
-def test_depths_come_with_the_gaussians(predictor):
+def test_predict_with_depths_also_returns_the_depth_of_each_swept_level(predictor):
     images, poses = _inputs()
     gaussians, depths = predictor.predict_with_depths(images, poses, 0.5, 20.0)
     assert torch.equal(gaussians.means, predictor(images, poses, 0.5, 20.0).means)
@@ -108,7 +108,7 @@ def test_predictions_carry_no_gradient(predictor):
     assert torch.is_grad_enabled()
 
 
-def test_progress_rises_to_one(small_config):
+def test_progress_increases_to_one(small_config):
     predictor, (images, poses) = _predictor(small_config, tiles=2), _inputs()
     reports: list[tuple[str, float]] = []
     predictor(images, poses, 0.5, 20.0, progress=lambda stage, fraction: reports.append((stage, fraction)))
@@ -170,7 +170,7 @@ def test_wrong_values_are_refused(refuse):
     refuse("must be finite, got NaN", images.index_fill(-1, torch.tensor(3), float("nan")), poses)
     refuse("0 < near < far", images, poses, near=3.0, far=2.0)
     refuse("0 < near < far", images, poses, near=0.0)
-    refuse("one number, or one a view", images, poses, near=torch.ones(3))
+    refuse("one number, or one number per view", images, poses, near=torch.ones(3))
 
 
 # Loading
@@ -246,7 +246,10 @@ def test_files_that_fit_no_network_are_refused(file: Path, unchecked: None) -> N
     tensors = MVSplat(SMALL_MVSPLAT).state_dict()
     good = pack_weights("mvsplat", SMALL_MVSPLAT, tensors, compat="fixed")
     odd: list[tuple[WeightsFile, str]] = [
-        (dataclasses.replace(good, model="splatter"), "needed weights of pansplat or mvsplat, got of 'splatter'"),
+        (
+            dataclasses.replace(good, model="splatter"),
+            "needed weights of pansplat or mvsplat, got weights of 'splatter'",
+        ),
         (dataclasses.replace(good, config={"channels": 16}), r"x: config: needed the settings of this version"),
         (dataclasses.replace(good, config=good.config | {"transformer": 3}), "needed settings by name, got 3"),
         (dataclasses.replace(good, tensors=tensors | {"new": torch.zeros(1)}), r"found unknown 1 \(new\)"),
@@ -264,12 +267,12 @@ def test_settings_that_contradict_each_other_are_refused() -> None:
         build_empty_network(dataclasses.replace(good, config=wrong), "fixed", "x")
 
 
-def test_choices_that_make_no_sense_are_refused(file: Path, unchecked: None) -> None:
+def test_invalid_choices_are_refused(file: Path, unchecked: None) -> None:
     with pytest.raises(InputError, match="`compat` must be one of trained, official, fixed, got 'broken'"):
         load_model(file, compat="broken")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="`compat` is for networks, and sweep is not one"):
         load_model("sweep", compat="fixed")
-    with pytest.raises(InputError, match="nothing there"):
+    with pytest.raises(InputError, match="got no file"):
         load_model(file.with_name("other.safetensors"))
     with pytest.raises(InputError, match=r"a file of weights \(\.safetensors, \.ckpt, \.pt, \.pth\), got .*scene\.ply"):
         load_model(file.with_name("scene.ply"))
@@ -277,7 +280,7 @@ def test_choices_that_make_no_sense_are_refused(file: Path, unchecked: None) -> 
 
 def test_a_processor_without_bfloat16_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_f": True, "avx512_bf16": False})
-    with pytest.raises(InputError, match=r"this one has none .* use float32"):
+    with pytest.raises(InputError, match=r"got one without them; use float32"):
         require_precision("bfloat16")
     require_precision("float32")
     with pytest.raises(InputError, match="float32 or bfloat16, got 'float16'"):

@@ -1,4 +1,4 @@
-"""PanSplat as a whole: the official numbers, symmetries of the fixed network, precision."""
+"""The whole PanSplat: agreement with the official code, symmetries of the fixed network, precision."""
 
 import dataclasses
 import math
@@ -6,7 +6,6 @@ import math
 import pytest
 import torch
 
-from pansplat.errors import InputError
 from pansplat.gaussians.harmonics import rotate_harmonics
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
@@ -21,23 +20,13 @@ def network(small_config) -> PanSplat:
     return PanSplat(small_config, "fixed").double().eval()
 
 
-def _inputs(height: int = 64, views: int = 2) -> tuple[torch.Tensor, ...]:
-    generator = torch.Generator().manual_seed(1)
-    poses = torch.eye(4, dtype=torch.float64).repeat(1, views, 1, 1)
-    poses[0, :, :3, :3] = rotations_from_quats(torch.randn(views, 4, generator=generator, dtype=torch.float64))
-    poses[0, :, :3, 3] = 0.3 * torch.randn(views, 3, generator=generator, dtype=torch.float64)
-    images = torch.rand(1, views, 3, height, 2 * height, generator=generator, dtype=torch.float64)
-    near, far = torch.full((1, views), 0.5, dtype=torch.float64), torch.full((1, views), 20.0, dtype=torch.float64)
-    return images, poses, near, far
-
-
 @pytest.fixture(scope="module")
-def prediction(network):
+def prediction(network, make_inputs):
     with torch.no_grad():
-        return network(*_inputs())
+        return network(*make_inputs())
 
 
-# The official numbers
+# Agreement with the official code
 
 
 @pytest.mark.shared
@@ -79,7 +68,7 @@ def test_official_prediction_with_bfloat16_attention_is_near_the_official_code(r
 
 
 @pytest.mark.shared
-def test_fixed_prediction_is_not_the_official_one(run_official, golden, error):
+def test_fixed_prediction_differs_from_the_official_one(run_official, golden, error):
     truth, run = golden("pansplat_64x128_fp32attn"), run_official("fixed")
     for stage in range(4):
         assert error(run.outputs["features"][stage], truth[f"backbone.feat.{stage}"]) > 0.1
@@ -90,8 +79,8 @@ def test_fixed_prediction_is_not_the_official_one(run_official, golden, error):
 # Symmetries of the fixed network
 
 
-def test_rotating_the_world_rotates_the_prediction(network, prediction):
-    images, poses, near, far = _inputs()
+def test_rotating_the_world_rotates_the_prediction(network, prediction, make_inputs):
+    images, poses, near, far = make_inputs()
     world = torch.eye(4, dtype=torch.float64)
     world[:3, :3] = rotations_from_quats(torch.tensor((0.3, -0.5, 0.7, 0.2), dtype=torch.float64))
     world[:3, 3] = torch.tensor((1.0, -2.0, 3.0))
@@ -105,12 +94,12 @@ def test_rotating_the_world_rotates_the_prediction(network, prediction):
     assert torch.allclose(after.opacities, before.opacities, atol=1e-8)
 
 
-def test_rolling_the_panoramas_by_half_a_turn_with_their_poses_leaves_the_scene(small_config):
+def test_rolling_panoramas_and_turning_poses_by_half_a_turn_keeps_the_scene(small_config, make_inputs):
     """With a Gaussian at each pixel, so that both predictions have the same points."""
     torch.manual_seed(0)
     heads = dataclasses.replace(small_config.heads, lattice="pixel", emitted="finest")
     network = PanSplat(dataclasses.replace(small_config, heads=heads), "fixed").double().eval()
-    images, poses, near, far = _inputs()
+    images, poses, near, far = make_inputs()
     half_turn = torch.diag(torch.tensor((-1.0, 1.0, -1.0, 1.0), dtype=torch.float64))
     with torch.no_grad():
         before = network(images, poses, near, far)
@@ -122,48 +111,43 @@ def test_rolling_the_panoramas_by_half_a_turn_with_their_poses_leaves_the_scene(
         assert torch.allclose(a, b.roll(64, dims=2), atol=1e-9)
 
 
-def test_tiled_prediction_equals_untiled(network, prediction):
+def test_tiled_prediction_equals_untiled(network, prediction, make_inputs):
     with torch.no_grad():
-        tiled = network(*_inputs(), tiles=4).gaussians[0]
+        tiled = network(*make_inputs(), tiles=4).gaussians[0]
     assert torch.allclose(prediction.gaussians[0].means, tiled.means, atol=1e-11)
     assert torch.allclose(prediction.gaussians[0].harmonics, tiled.harmonics, atol=1e-11)
 
 
-def test_matching_then_lifting_is_the_prediction(network, prediction):
+def test_matching_and_lifting_equal_the_prediction(network, prediction, make_inputs):
     with torch.no_grad():
-        (part,) = network.lift_gaussians(network.match_views(*_inputs()))
+        (part,) = network.lift_gaussians(network.match_views(*make_inputs()))
     assert torch.equal(part.gaussians[0].means, prediction.gaussians[0].means)
 
 
 # Views, sizes, configurations
 
 
-def test_each_of_three_views_has_gaussians(network):
+def test_each_of_three_views_has_gaussians(network, make_inputs):
     with torch.no_grad():
-        gaussians = network(*_inputs(views=3)).gaussians[0]
+        gaussians = network(*make_inputs(views=3)).gaussians[0]
     assert gaussians.views.unique().tolist() == [0, 1, 2]
     assert bool(torch.isfinite(gaussians.means).all())
 
 
-def test_three_views_are_refused_in_official_mode(small_config):
-    with pytest.raises(InputError, match="exactly two views"):
-        PanSplat(small_config, "official").double()(*_inputs(views=3))
-
-
-def test_large_panoramas_are_matched_at_512_rows_and_lifted_at_full_size(network, monkeypatch):
+def test_large_panoramas_are_matched_at_low_and_lifted_at_full_resolution(network, monkeypatch, make_inputs):
     monkeypatch.setattr("pansplat.model.pansplat.MATCHING_HEIGHT", 64)
     with torch.no_grad():
-        output = network(*_inputs(128))
+        output = network(*make_inputs(128))
     assert output.matched.features[-1].shape[-2:] == (64, 128)
     assert output.depths.depth[-1].shape[-2:] == (32, 64)
     assert int((output.gaussians[0].levels == 0).sum()) == 2 * int(256**2 / math.pi)
 
 
 @pytest.mark.parametrize("compat", ["official", "fixed"])
-def test_gradients_reach_every_weight_and_the_images(compat, small_config):
+def test_gradients_reach_every_weight_and_the_images(compat, small_config, make_inputs):
     """Coarser levels get gradients from a loss of their own: finer levels detach them."""
     torch.manual_seed(0)
-    network, (images, poses, near, far) = PanSplat(small_config, compat).double().eval(), _inputs()
+    network, (images, poses, near, far) = PanSplat(small_config, compat).double().eval(), make_inputs()
     output = network(images.requires_grad_(), poses, near, far)
     gaussians = output.gaussians[0]
     losses = [gaussians.means.square().sum(), gaussians.harmonics.sum(), gaussians.opacities.sum()]
@@ -182,26 +166,26 @@ def test_the_monocular_network_exists_only_if_configured_and_is_frozen(network, 
         assert not any(parameter.requires_grad for parameter in PanSplat(config).mono_depth.parameters())
 
 
-def test_heads_read_the_candidates_of_a_single_swept_level(small_config):
+def test_heads_read_the_candidates_of_a_single_swept_level(small_config, make_inputs):
     single = dataclasses.replace(small_config.cost_volume, sweep="single")
     with pytest.raises(ValueError, match=r"`heads\.candidates` must be the 8 of the finest sweep, got 4"):
         dataclasses.replace(small_config, cost_volume=single)
     heads = dataclasses.replace(small_config.heads, candidates=8)
     network = PanSplat(dataclasses.replace(small_config, cost_volume=single, heads=heads)).double().eval()
     with torch.no_grad():
-        output = network(*_inputs())
+        output = network(*make_inputs())
     assert len(output.depths.levels) == 1 and output.gaussians[0].levels.unique().tolist() == [0, 1, 2, 3]
 
 
 def test_heads_that_do_not_fit_the_features_are_refused(small_config):
-    with pytest.raises(ValueError, match=r"must be \(16, 8, 8, 4\), those of the features"):
+    with pytest.raises(ValueError, match=r"must be \(16, 8, 8, 4\), the channels of the features"):
         dataclasses.replace(small_config, heads=dataclasses.replace(small_config.heads, feature_channels=(8, 8, 8, 4)))
 
 
 # Precision
 
 
-def test_bfloat16_prediction_is_close_to_float32_and_in_float32(randomize):
+def test_bfloat16_prediction_is_close_to_float32_and_in_float32(randomize, make_inputs):
     config = PanSplatConfig(
         features=FeaturePyramidConfig(channels=(8, 8, 16, 32), transformer=TransformerConfig(channels=32, blocks=2)),
         cost_volume=CostVolumeConfig(
@@ -209,7 +193,7 @@ def test_bfloat16_prediction_is_close_to_float32_and_in_float32(randomize):
         ),
         heads=HeadsConfig(feature_channels=(32, 16, 8, 8), candidates=8),
     )
-    inputs = [tensor.float() for tensor in _inputs()]
+    inputs = [tensor.float() for tensor in make_inputs()]
     with torch.no_grad():
         exact, rounded = (
             randomize(PanSplat(config, "fixed", precision=precision)).float()(*inputs)

@@ -1,4 +1,4 @@
-"""Lattice points and tiles: each point in one tile, each window a part of the resized and continued map."""
+"""Lattice points, tiles and windows of maps."""
 
 import math
 
@@ -72,7 +72,7 @@ def test_samples_at_pixel_centres_are_the_pixels():
     assert torch.allclose(samples, source.flatten(1).T, atol=1e-14)
 
 
-def test_samples_of_a_whole_map_wrap_or_repeat_the_border():
+def test_panorama_samples_wrap_if_fixed_and_repeat_the_border_if_official():
     source, uv = _random(5, 8, 16), make_lattice_uv("fibonacci", 32)
     assert torch.allclose(sample_panorama(source, uv, "fixed"), sample_equirect(source, uv).T, atol=1e-14)
     grid = (2 * uv - 1)[None, None]

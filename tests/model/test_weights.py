@@ -1,4 +1,4 @@
-"""Weights on disk: round trips, refusals, checkpoints that are not run, and the conversion of official names."""
+"""Weights on disk: round trips, refusals, checkpoints with code, and the conversion of official names."""
 
 import dataclasses
 import os
@@ -46,8 +46,8 @@ class Config:
     several: tuple[Inner, ...] = (Inner(1), Inner(2))
 
 
-class Poison:
-    """Runs a command when it is unpickled: the command creates a file."""
+class MaliciousObject:
+    """An object whose unpickling runs a command that creates a file."""
 
     def __init__(self, mark: Path) -> None:
         self.mark = mark
@@ -56,16 +56,16 @@ class Poison:
         return os.system, (f"touch '{self.mark}'",)
 
 
-def weights() -> WeightsFile:
-    tensors = {"a": torch.rand(3, 4).T, "count": torch.tensor(7)}  # one of them not contiguous
+def make_weights() -> WeightsFile:
+    tensors = {"a": torch.rand(3, 4).T, "count": torch.tensor(7)}  # the first is not contiguous
     return WeightsFile("pansplat", {"width": 3, "levels": [1, 2]}, "fixed", tensors)
 
 
 # Our files
 
 
-def test_weights_survive_a_round_trip(tmp_path: Path) -> None:
-    before = weights()
+def test_saved_weights_load_unchanged(tmp_path: Path) -> None:
+    before = make_weights()
     save_weights(tmp_path / "w.safetensors", before)
     after = load_weights(tmp_path / "w.safetensors")
     assert (after.model, after.config, after.compat) == (before.model, before.config, before.compat)
@@ -75,16 +75,16 @@ def test_weights_survive_a_round_trip(tmp_path: Path) -> None:
 
 def test_a_file_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="needed an existing folder"):
-        save_weights(tmp_path / "no" / "w.safetensors", weights())
+        save_weights(tmp_path / "no" / "w.safetensors", make_weights())
     with pytest.raises(InputError, match=r"must end in \.safetensors, got '\.ckpt'"):
-        save_weights(tmp_path / "w.ckpt", weights())
+        save_weights(tmp_path / "w.ckpt", make_weights())
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("kept", [0, 5, 40, 0.5, 0.99])
 def test_a_truncated_weights_file_is_refused(tmp_path: Path, kept: float) -> None:
     path = tmp_path / "w.safetensors"
-    save_weights(path, weights())
+    save_weights(path, make_weights())
     content = path.read_bytes()
     path.write_bytes(content[: kept if isinstance(kept, int) else int(kept * len(content))])
     with pytest.raises(InputError, match=r"w\.safetensors: needed .* again"):
@@ -111,7 +111,7 @@ def test_other_safetensors_files_are_refused(tmp_path: Path) -> None:
 # Settings
 
 
-def test_settings_survive_json() -> None:
+def test_settings_are_restored_from_json() -> None:
     values = {"kind": "b", "sizes": [3, 4, 5], "inner": {"width": 2}, "several": [{"width": 5}]}
     assert config_from_dict(Config, values) == Config("b", (3, 4, 5), Inner(2), (Inner(5),))
 
@@ -138,20 +138,20 @@ def test_a_checkpoint_is_read(tmp_path: Path, zipped: bool) -> None:
 
 
 @pytest.mark.parametrize("zipped", [True, False])
-def test_a_poisoned_checkpoint_is_refused_and_not_run(tmp_path: Path, zipped: bool) -> None:
-    mark, path = tmp_path / "was run", tmp_path / "poisoned.ckpt"
-    torch.save({"state_dict": {}, "callback": Poison(mark)}, path, _use_new_zipfile_serialization=zipped)
+def test_code_in_a_checkpoint_is_refused_and_not_executed(tmp_path: Path, zipped: bool) -> None:
+    mark, path = tmp_path / "executed", tmp_path / "malicious.ckpt"
+    torch.save({"state_dict": {}, "callback": MaliciousObject(mark)}, path, _use_new_zipfile_serialization=zipped)
     with pytest.raises(UnsafeCheckpointError, match=r"calls (posix|nt)\.system; the call was not executed"):
         read_checkpoint(path)
     assert not mark.exists()
-    torch.load(path, weights_only=False)  # the command would run
+    torch.load(path, weights_only=False)  # this executes the command
     assert mark.exists()
 
 
-def test_a_poisoned_pickle_is_refused_and_not_run(tmp_path: Path) -> None:
-    mark, path = tmp_path / "was run", tmp_path / "poisoned.ckpt"
-    path.write_bytes(pickle.dumps(Poison(mark)))
-    with pytest.raises(InputError, match="poisoned"):
+def test_code_in_a_pickle_is_refused_and_not_executed(tmp_path: Path) -> None:
+    mark, path = tmp_path / "executed", tmp_path / "malicious.ckpt"
+    path.write_bytes(pickle.dumps(MaliciousObject(mark)))
+    with pytest.raises(InputError, match="malicious"):
         read_checkpoint(path)
     assert not mark.exists()
 
@@ -175,7 +175,7 @@ def test_a_file_of_other_content_is_refused(tmp_path: Path, content: bytes) -> N
         read_checkpoint(path)
 
 
-def test_a_web_page_and_a_git_lfs_pointer_are_named(tmp_path: Path) -> None:
+def test_a_web_page_and_a_git_lfs_pointer_are_recognised(tmp_path: Path) -> None:
     path = tmp_path / "wrong.ckpt"
     path.write_bytes(b"<!DOCTYPE html><html><body>OneDrive</body></html>")
     with pytest.raises(InputError, match="it is a web page: download the file itself"):
@@ -186,7 +186,7 @@ def test_a_web_page_and_a_git_lfs_pointer_are_named(tmp_path: Path) -> None:
 
 
 def test_missing_and_empty_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="got nothing there"):
+    with pytest.raises(InputError, match="got no file"):
         read_checkpoint(tmp_path / "none.ckpt")
     with pytest.raises(InputError, match="got a folder"):
         read_checkpoint(tmp_path)
@@ -202,25 +202,25 @@ def test_a_checkpoint_without_tensors_by_name_is_refused(tmp_path: Path) -> None
         read_checkpoint(path)
     with pytest.raises(InputError, match="got one with model, epoch"):
         get_state_dict({"model": {}, "epoch": 1}, path)
-    with pytest.raises(InputError, match="needed a `state_dict` of tensors, got others at b"):
+    with pytest.raises(InputError, match="needed a `state_dict` of tensors, got other values at b"):
         get_state_dict({"state_dict": {"a": torch.rand(1), "b": 3}}, path)
 
 
 # Official names
 
 
-def listed(shared: Path, keys: str) -> list[str]:
+def list_names(shared: Path, keys: str) -> list[str]:
     lines = (shared / "golden" / f"state_dict_{keys}.tsv").read_text().splitlines()
     return [line.split("\t")[0] for line in lines if line and not line.startswith("#")]
 
 
-def empty(shared: Path, keys: str) -> dict[str, Tensor]:
-    return {name.removeprefix("encoder."): torch.zeros(1) for name in listed(shared, keys)}
+def make_tensors(shared: Path, keys: str) -> dict[str, Tensor]:
+    return {name.removeprefix("encoder."): torch.zeros(1) for name in list_names(shared, keys)}
 
 
 @pytest.mark.parametrize(("model", "count", "grids"), [("pansplat", 993, 5), ("mvsplat", 471, 0)])
 def test_every_official_tensor_is_used_or_computed(model: ModelName, count: int, grids: int, shared: Path) -> None:
-    theirs = {name.removeprefix("encoder.") for name in listed(shared, f"{model}-512")}
+    theirs = {name.removeprefix("encoder.") for name in list_names(shared, f"{model}-512")}
     table = map_official_names(model)
     assert len(theirs) == count and table.keys() <= theirs
     assert len(theirs - table.keys()) == grids
@@ -250,8 +250,8 @@ def test_converted_tensors_are_the_official_ones(
 
 
 def test_the_report_counts_tensors_that_are_left_out(shared: Path, as_lightning: Wrap) -> None:
-    content = as_lightning(empty(shared, "pansplat-512"))
-    auxiliary = listed(shared, "pansplat-512-360loc_aux")
+    content = as_lightning(make_tensors(shared, "pansplat-512"))
+    auxiliary = list_names(shared, "pansplat-512-360loc_aux")
     content["state_dict"] |= {name: torch.zeros(1) for name in auxiliary}
     report = match_tensors(content, "360loc")
     assert len(report.used) == 988 and not report.missing and not report.unexpected
@@ -261,7 +261,7 @@ def test_the_report_counts_tensors_that_are_left_out(shared: Path, as_lightning:
 
 
 def test_missing_and_surplus_tensors_are_named_and_counted(shared: Path, as_lightning: Wrap) -> None:
-    content = as_lightning(empty(shared, "pansplat-512"))
+    content = as_lightning(make_tensors(shared, "pansplat-512"))
     state = content["state_dict"]
     removed = [name for name in state if "q_proj" in name]
     for name in removed:
@@ -278,7 +278,7 @@ def test_missing_and_surplus_tensors_are_named_and_counted(shared: Path, as_ligh
 
 
 def test_a_missing_grid_is_reported(shared: Path, as_lightning: Wrap) -> None:
-    weights = empty(shared, "pansplat-512")
+    weights = make_tensors(shared, "pansplat-512")
     del weights["mono_depth.c2e.3.sample_grid"]
     assert match_tensors(as_lightning(weights), "x").missing == ["encoder.mono_depth.c2e.3.sample_grid"]
 
