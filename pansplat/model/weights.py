@@ -399,22 +399,12 @@ def _join_names(names: Sequence[str]) -> str:
 
 
 def _feature_pyramid() -> Iterator[_Layer]:
-    encoder = (
-        ("conv00", "0.0"),
-        ("conv01", "0.1"),
-        ("downsample1", "1.0"),
-        ("conv10", "1.1"),
-        ("conv11", "1.2"),
-        ("downsample2", "2.0"),
-        ("conv20", "2.1"),
-        ("conv21", "2.2"),
-        ("downsample3", "3.0"),
-        ("conv30", "3.1"),
-        ("conv31", "3.2"),
-    )
-    for official, ours in encoder:
-        yield f"backbone.encoder.{official}.conv", f"features.encoder.levels.{ours}.conv", _BARE
-        yield f"backbone.encoder.{official}.bn", f"features.encoder.levels.{ours}.norm", _BATCH_NORM
+    for level in range(4):
+        names = ("conv00", "conv01") if level == 0 else (f"downsample{level}", f"conv{level}0", f"conv{level}1")
+        for index, name in enumerate(names):
+            official, ours = f"backbone.encoder.{name}", f"features.encoder.levels.{level}.{index}"
+            yield f"{official}.conv", f"{ours}.conv", _BARE
+            yield f"{official}.bn", f"{ours}.norm", _BATCH_NORM
     for stage in range(4):
         official, ours = f"backbone.decoder.out{stage}", f"features.decoder.outputs.{3 - stage}"
         yield f"{official}.0", f"{ours}.conv", _FULL

@@ -242,10 +242,14 @@ def _features(dtype=torch.float64):
     return [_noise(1, 2, 8, H, W, dtype=dtype), _noise(1, 2, 4, 2 * H, 2 * W, dtype=dtype)]
 
 
+def _translation(vector):
+    pose = torch.eye(4, dtype=torch.float64)[None].clone()
+    pose[0, :3, 3] = vector
+    return pose
+
+
 def _poses(baseline=(0.7, 0.1, -0.3)):
-    poses = torch.eye(4, dtype=torch.float64).repeat(1, 2, 1, 1)
-    poses[0, 1, :3, 3] = torch.tensor(baseline)
-    return poses
+    return torch.stack((_translation(torch.zeros(3)), _translation(torch.tensor(baseline))), dim=1)
 
 
 def _bounds(near=0.5, far=10.0):
@@ -295,8 +299,7 @@ def test_identical_views_give_finite_depths_and_gradients(network):
 def test_a_candidate_at_the_other_camera_is_finite_with_its_gradient():
     inverse_depth = 0.5
     other_camera = pixel_directions(H, W, dtype=torch.float64)[3, 5] / inverse_depth
-    pose = torch.eye(4, dtype=torch.float64)[None].clone()
-    pose[0, :3, 3] = -other_camera
+    pose = _translation(-other_camera)
     reference, other = (_noise(1, 4, H, W, seed=seed).requires_grad_() for seed in (1, 2))
     candidates = torch.tensor((0.25, inverse_depth, 1.0)).double()[None, :, None, None].expand(1, 3, H, W)
     result = correlate(reference, other, candidates, pose)
@@ -307,8 +310,7 @@ def test_a_candidate_at_the_other_camera_is_finite_with_its_gradient():
 @pytest.mark.hard_case(39)
 def test_candidates_before_and_behind_the_other_camera_have_opposite_directions():
     ray = pixel_directions(H, W, dtype=torch.float64)[3, 5]
-    pose = torch.eye(4, dtype=torch.float64)[None].clone()
-    pose[0, :3, 3] = -2 * ray
+    pose = _translation(-2 * ray)
     seen = pixel_directions(H, W, dtype=torch.float64).movedim(-1, 0)[None]
     candidates = torch.tensor((0.25, 1.0)).double()[None, :, None, None].expand(1, 2, H, W)
     behind, before = warp_panorama(seen, candidates, pose)[0, :, :, 3, 5].T
@@ -318,8 +320,7 @@ def test_candidates_before_and_behind_the_other_camera_have_opposite_directions(
 @pytest.mark.hard_case(39)
 def test_at_the_epipole_all_candidates_have_the_same_cost():
     ray = pixel_directions(H, W, dtype=torch.float64)[3, 5]
-    pose = torch.eye(4, dtype=torch.float64)[None].clone()
-    pose[0, :3, 3] = -0.3 * ray  # nearer than all candidates
+    pose = _translation(-0.3 * ray)  # nearer than all candidates
     volume = correlate(*_noise(2, 1, 8, H, W), _candidates(*_bounds())[0, :1], pose)[0, :, 3, 5]
     assert torch.allclose(volume, volume[:1].expand_as(volume), atol=1e-12)
 
