@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
 # Set up pansplat on a Debian or Ubuntu machine: .venv with tested versions, the system libraries of OpenGL,
-# and compiled CPU kernels. Run it again at any time: it only does what is missing.
+# and compiled CPU kernels. You may run it again at any time: it skips the steps that are done.
 #
 #   bash setup.sh          to use pansplat
 #   bash setup.sh --dev    to develop it (tests, linters, a virtual display)
 #   bash setup.sh --cuda   to install PyTorch's CUDA build even without a visible NVIDIA GPU (--cpu: never)
 #
-# PYTHON=python3.12 bash setup.sh uses that Python (3.10 or newer) for .venv.
+# PYTHON=python3.12 bash setup.sh makes .venv with that Python (3.10 or newer).
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
 
@@ -28,7 +28,7 @@ for argument in "$@"; do
     esac
 done
 
-# The command that runs others as root without a password; empty if there is none.
+# The prefix that runs a command as root without a password; empty if there is none.
 if [ "$(id -u)" = 0 ]; then as_root=(env)
 elif sudo -n true 2>/dev/null; then as_root=(sudo -n)
 else as_root=()
@@ -48,18 +48,18 @@ installed() { dpkg-query -W -f '${Status}' "$1" 2>/dev/null | grep -q 'ok instal
 
 # --- system libraries ---
 install_libraries() {
-    command -v dpkg-query >/dev/null || { say "not Debian or Ubuntu: please install the OpenGL, EGL and X11 libraries yourself"; return; }
-    local wanted=("${GL_PACKAGES[@]}") missing=() package
-    [ -z "$extra" ] || wanted+=("${DEV_PACKAGES[@]}")
-    for package in "${wanted[@]}"; do installed "$package" || missing+=("$package"); done
+    command -v dpkg-query >/dev/null || { say "this is not Debian or Ubuntu; please install the OpenGL, EGL and X11 libraries with your package manager"; return; }
+    local required=("${GL_PACKAGES[@]}") missing=() package
+    [ -z "$extra" ] || required+=("${DEV_PACKAGES[@]}")
+    for package in "${required[@]}"; do installed "$package" || missing+=("$package"); done
     [ ${#missing[@]} -gt 0 ] || return 0
     if [ ${#as_root[@]} = 0 ]; then
-        say "the viewer needs missing system libraries; please run"
+        say "system libraries of the viewer are missing; to install them, run"
         say "    sudo apt-get install ${missing[*]}"
         return
     fi
     say "installing ${missing[*]}"
-    # If this fails, install them one by one: a release may lack one (newer ones have no libosmesa6).
+    # If this fails, install the packages one by one: some releases lack one of them (newer ones lack libosmesa6).
     apt_install "${missing[@]}" && return
     for package in "${missing[@]}"; do apt_install "$package" || say "could not install $package; continuing without it"; done
 }
@@ -68,9 +68,9 @@ install_libraries() {
 find_python() {
     python=${PYTHON:-python3}
     command -v "$python" >/dev/null || apt_install python3 python3-venv \
-        || die "needs Python 3.10 or newer; run: sudo apt-get install python3 python3-venv"
+        || die "Python 3.10 or newer is missing; run: sudo apt-get install python3 python3-venv"
     "$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' \
-        || die "needs Python 3.10 or newer, $python is $("$python" -V 2>&1); choose another with PYTHON=python3.12 bash setup.sh"
+        || die "Python must be 3.10 or newer, got $("$python" -V 2>&1) ($python); choose another with PYTHON=python3.12 bash setup.sh"
 }
 
 make_venv() {
@@ -89,8 +89,8 @@ make_venv() {
 # --- packages ---
 pip_install() { .venv/bin/python -m pip install --disable-pip-version-check -qq -c constraints.txt "$@"; }
 
-# On Linux a plain `pip install torch` downloads gigabytes of CUDA. So without a GPU the CPU build is installed by name:
-# first from pip's own sources (a mirror or a folder of wheels may have it), then from PyTorch.
+# On Linux a plain `pip install torch` downloads gigabytes of CUDA libraries. So without a GPU the CPU build is installed
+# by its version, first from pip's configured sources (a mirror or a folder of wheels may have it), then from PyTorch.
 install_torch() {
     local version
     version=$(sed -n 's/^torch==\([0-9.]*\).*/\1/p' constraints.txt)
@@ -111,7 +111,7 @@ install_torch() {
         && ! pip_install --retries 1 --extra-index-url "$CPU_WHEELS" "torch==$version+cpu" 2>>"$log"; then
         cat "$log" >&2
         rm -f "$log"
-        die "found no CPU build of PyTorch $version, neither in pip's sources nor at $CPU_WHEELS. Is the network up?
+        die "found no CPU build of PyTorch $version in pip's sources or at $CPU_WHEELS; check the network connection
        (bash setup.sh --cuda installs the large default build instead)"
     fi
     rm -f "$log"
@@ -120,7 +120,7 @@ install_torch() {
 install_packages() {
     local stamp=.venv/pansplat-setup mark
     mark="$(cat constraints.txt pyproject.toml setup.sh | sha256sum) $build"
-    # [dev] includes the plain set.
+    # The packages of [dev] include the plain ones.
     if [ "$(cat "$stamp" 2>/dev/null)" = "$mark [dev]" ] || [ "$(cat "$stamp" 2>/dev/null)" = "$mark $extra" ]; then
         return
     fi
@@ -134,7 +134,7 @@ install_packages() {
 # Numba caches the compiled kernels, so only the first run takes long.
 compile_kernels() {
     say "compiling the CPU kernels (about a minute the first time)"
-    .venv/bin/python -m pansplat.warm_up || say "could not compile the CPU kernels; the first command that needs them will"
+    .venv/bin/python -m pansplat.warm_up || say "could not compile the CPU kernels; the first command that uses them compiles them"
 }
 
 find_python

@@ -1,7 +1,7 @@
 """Compile the numba kernels of the rasteriser and of the sweep into numba's cache: `python -m pansplat.warm_up`.
 
-setup.sh runs this once, so that no later command has to compile them. Kernels for `covariances` in place of scales and
-rotations, and those of the networks, are compiled by the first call that needs them.
+setup.sh runs this once, so that later commands do not compile them. Kernels for `covariances` in place of scales and
+rotations, and those of the networks, are compiled by the first call that uses them.
 """
 
 import time

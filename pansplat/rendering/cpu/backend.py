@@ -1,11 +1,11 @@
-"""The CPU backend: its stages joined, from torch tensors to sums over image planes and back to gradients.
+"""The CPU backend: runs the stages from torch tensors to the sums of image planes, and back to gradients.
 
 Source: docs/rendering.md; docs/rasterizer.md describes the stages and their cost.
 """
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -20,18 +20,12 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.cpu import tiling
 from pansplat.rendering.cpu.ewa import EWA_GRAD_SIZE, backpropagate_ewa, project_ewa
-from pansplat.rendering.cpu.projection import (
-    GAUSSIANS_PER_ITEM,
-    Camera,
-    GaussianArrays,
-    ProjectedGaussians,
-    project_gaussians,
-)
+from pansplat.rendering.cpu.projection import Camera, GaussianArrays, ProjectedGaussians, project_gaussians
 from pansplat.rendering.cpu.projection_backward import GaussianGradients, accumulate_slots, backpropagate_projection
 from pansplat.rendering.cpu.rasterize import SavedForBackward, allocate_saved, rasterize_forward
 from pansplat.rendering.cpu.rasterize_backward import rasterize_backward
 from pansplat.rendering.cpu.records import RECORD_SIZE, PixelTables, tabulate_pixels
-from pansplat.rendering.cpu.runtime import Workspace, announce_compilation, parallel_for, pooled_empty, thread_count
+from pansplat.rendering.cpu.runtime import Workspace, announce_compilation, pooled_empty, thread_count
 from pansplat.rendering.cpu.tiling import (
     LARGEST_SIDE,
     TileIntersections,
@@ -44,11 +38,11 @@ from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.projection import not_finite_message
 from pansplat.rendering.rasterize import RasterInfo, RasterOptions, RasterSums
 
-_MIN_FILTER_VARIANCE = 1e-9  # pixel^2: unfiltered, a disc seen edge-on has width 0, by which stage one divides
+_MIN_FILTER_VARIANCE = 1e-9  # pixel^2: without a filter, a disc seen edge-on has width 0, and stage one divides by it
 
 
 class _View(NamedTuple):
-    """A scene as one camera sees it, and how to rasterise it."""
+    """A scene, its projection for one camera, and the options."""
 
     gaussians: GaussianArrays
     camera: Camera
@@ -67,7 +61,7 @@ class _PlaneState(NamedTuple):
 
     records: np.ndarray
     boxes: np.ndarray
-    distances: np.ndarray  # by which intersections are sorted
+    distances: np.ndarray  # the intersections are sorted by these
     tiles: TileIntersections | None = None
     saved: SavedForBackward | None = None
 
@@ -85,7 +79,7 @@ class _Statistics:
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        """Add the time of the block to a stage."""
+        """Add the time of the `with` block to a stage."""
         start = time.perf_counter()
         yield
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
@@ -138,10 +132,10 @@ class _Rasterize(torch.autograd.Function):
         grad_enabled: bool,
         *tensors: Tensor | None,
     ) -> Tensor:
-        """Sums; `tensors` are those of GaussianArrays, or None."""
-        gaussians, camera, threads = _to_arrays(tensors), _camera(pose, planes[0], options), thread_count()
-        needs_grad = grad_enabled and any(ctx.needs_input_grad)  # the latter ignores no_grad
-        workspace = Workspace()
+        """Sums; `tensors` are the fields of GaussianArrays, or None."""
+        gaussians, camera = GaussianArrays.from_tensors(tensors), _make_camera(pose, planes[0], options)
+        threads, workspace = thread_count(), Workspace()
+        needs_grad = grad_enabled and any(ctx.needs_input_grad)  # needs_input_grad ignores no_grad
         with announce_compilation():
             with statistics.timed("project"):
                 projected = project_gaussians(gaussians, camera, workspace, threads)
@@ -165,7 +159,7 @@ class _Rasterize(torch.autograd.Function):
             raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
         *tensors, pose, sums = ctx.saved_tensors
         planes, options, projected, states, _workspace, threads = ctx.saved
-        gaussians, camera = _to_arrays(tensors), _camera(pose, planes[0], options)
+        gaussians, camera = GaussianArrays.from_tensors(tensors), _make_camera(pose, planes[0], options)
         view = _View(gaussians, camera, projected, options, threads)
         needs_pose, _, _, _, _, *needed = ctx.needs_input_grad
         grads = [
@@ -180,34 +174,18 @@ class _Rasterize(torch.autograd.Function):
                 np.empty((0, *array.shape[1:]), np.float32) if grad is None else grad.numpy()
                 for array, grad in zip(gaussians, grads, strict=True)
             )
-            wanted = GaussianGradients(*outputs, pose=np.empty((3 if needs_pose else 0, 4)))
-            filled = backpropagate_projection(gaussians, camera, projected, *slots, wanted, threads)
+            gradients = GaussianGradients(*outputs, pose=np.empty((3 if needs_pose else 0, 4)))
+            gradients = backpropagate_projection(gaussians, camera, projected, *slots, gradients, threads)
         grad_pose = None
         if needs_pose:
             grad_pose = torch.zeros_like(pose)
-            grad_pose[:3] = torch.from_numpy(filled.pose)
+            grad_pose[:3] = torch.from_numpy(gradients.pose)
         return (grad_pose, None, None, None, None, *grads)
 
 
-def _to_arrays(tensors: Sequence[Any]) -> GaussianArrays:
-    """The tensors as arrays; None becomes an array without rows."""
-    shapes = ((3,), (4,), (3,), (3, 3), (), tensors[-1].shape[1:])
-    return GaussianArrays(
-        *(
-            np.empty((0, *shape), np.float32) if tensor is None else tensor.detach().numpy()
-            for tensor, shape in zip(tensors, shapes, strict=True)
-        )
-    )
-
-
-def _camera(pose: Tensor, plane: ImagePlane, options: RasterOptions) -> Camera:
-    least = _MIN_FILTER_VARIANCE * plane.pixel_angle**2
-    return Camera(
-        np.ascontiguousarray(pose.detach().numpy()),
-        max(options.filter_variance(plane.pixel_angle), least),
-        options.lowpass == "angular",
-        options.near,
-    )
+def _make_camera(pose: Tensor, plane: ImagePlane, options: RasterOptions) -> Camera:
+    variance = max(options.filter_variance(plane.pixel_angle), _MIN_FILTER_VARIANCE * plane.pixel_angle**2)
+    return Camera(np.ascontiguousarray(pose.detach().numpy()), variance, options.lowpass == "angular", options.near)
 
 
 def _rasterize_plane(
@@ -216,7 +194,7 @@ def _rasterize_plane(
     """Write the sums of one image plane.
 
     Args:
-        saved_in: memory for the state that the backward needs.
+        saved_in: memory for the state that the backward reads.
 
     Returns:
         This state, or None without `saved_in`.
@@ -250,7 +228,7 @@ def _rasterize_plane(
         statistics.bytes = max(statistics.bytes, sum(array.nbytes for array in arrays))
         if saved is not None:
             state = state._replace(tiles=tiles, saved=saved)
-        del tiles, arrays  # their memory serves the next band
+        del tiles, arrays  # the next band reuses their memory
     statistics.visible += int(np.count_nonzero(boxes.view(np.int64) != tiling.EMPTY_BOX))
     return state if needs_grad else None
 
@@ -305,7 +283,7 @@ def _backpropagate_planes(
         )  # fmt: skip
         for tiles in bands:
             saved = state.saved
-            if saved is None:  # rasterise again: transmittances of several bands would take too much memory
+            if saved is None:  # rasterise again: the transmittances of all bands would take too much memory
                 sort_front_to_back(tiles, state.distances, threads)
                 saved = allocate_saved(tiles.starts, tiles.workspace)
                 _rasterize_band(view, state.records, tiles, tables, plane_sums, saved)
@@ -320,13 +298,8 @@ def _backpropagate_planes(
             if is_single:
                 return grad_records, grad_values, ewa_grads, offsets
             if view.is_exact:
-                _add_slots(offsets, grad_records, total_records, threads)
+                accumulate_slots(offsets, grad_records, total_records, threads)
             else:
                 backpropagate_ewa(gaussians, camera, plane, options.dilation, grad_records, offsets, ewa_grads, threads)
-            _add_slots(offsets, grad_values, total_values, threads)
+            accumulate_slots(offsets, grad_values, total_values, threads)
     return total_records, total_values, ewa_grads, np.arange(num + 1)
-
-
-def _add_slots(offsets: np.ndarray, slots: np.ndarray, totals: np.ndarray, threads: int) -> None:
-    num_items = -(-len(totals) // GAUSSIANS_PER_ITEM)
-    parallel_for(lambda item: accumulate_slots(item, offsets, slots, totals), num_items, threads)

@@ -1,10 +1,12 @@
 """The EWA kernel: records and boxes of a pinhole image plane, and their backward.
 
 Source: docs/rendering.md, section 3, `ewa`. With the tangent frame F = (u, v, n) the projected covariance is
-V = (J F) C' (J F)', in float64, from the covariances: through the records, needles would lose 5% of their gradients.
+V = (J F) C' (J F)'. It is computed in float64 from the covariances; from the records, needles would lose 5% of their
+gradients.
 """
 
 import math
+from functools import partial
 
 import numpy as np
 
@@ -53,27 +55,23 @@ def project_ewa(
     workspace: Workspace,
     threads: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The records of an image plane, written where a box is not empty, and the boxes.
+    """The records of an image plane, written only if the box is not empty, and the boxes.
 
     Args:
-        gaussians, camera: what is drawn, and the camera.
-        projected: of the camera.
-        plane: pinhole.
+        gaussians, camera, projected: the scene, the camera, and the scene's projection.
+        plane: a pinhole image.
         dilation: variance added on both axes, pixels^2.
-        z_near: Gaussians at a smaller depth are not drawn, metres.
-        workspace: for the returned arrays.
+        z_near: Gaussians at a smaller depth are culled, metres.
+        workspace: memory for the returned arrays.
         threads: number of threads.
     """
     num = len(projected.records)
     records, words = workspace.array((num, layout.RECORD_SIZE), np.float32), workspace.array((num, 2), np.int32)
     rotation, axes = _plane_axes(camera, plane)
-
-    def work(item: int) -> None:
-        _project_ewa(
-            item, *gaussians.kernel_arguments, *camera, projected.records, projected.radii, rotation, axes,
-            *plane.size, plane.focal, dilation, z_near, records, words, words.view(np.int16),
-        )  # fmt: skip
-
+    work = partial(
+        _project_ewa, *gaussians.kernel_arguments, *camera, projected.records, projected.radii, rotation, axes,
+        *plane.size, plane.focal, dilation, z_near, records, words, words.view(np.int16),
+    )  # fmt: skip
     parallel_for(work, -(-num // GAUSSIANS_PER_ITEM), threads)
     return records, words.view(np.int16)
 
@@ -88,7 +86,7 @@ def backpropagate_ewa(
     ewa_grads: np.ndarray,
     threads: int,
 ) -> None:
-    """Add the gradients of directions, covariances and peaks that an image plane's records have.
+    """Add the gradients of directions, covariances and peaks, given those of an image plane's records.
 
     Args:
         gaussians, camera, plane, dilation: of the forward.
@@ -98,13 +96,10 @@ def backpropagate_ewa(
         threads: number of threads; the result does not depend on it.
     """
     _, axes = _plane_axes(camera, plane)
-
-    def work(item: int) -> None:
-        _backpropagate_ewa(
-            item, *gaussians.kernel_arguments, *camera, axes, *plane.size, plane.focal, dilation,
-            grad_records, offsets, ewa_grads,
-        )  # fmt: skip
-
+    work = partial(
+        _backpropagate_ewa, *gaussians.kernel_arguments, *camera, axes, *plane.size, plane.focal, dilation,
+        grad_records, offsets, ewa_grads,
+    )  # fmt: skip
     parallel_for(work, -(-len(gaussians.means) // GAUSSIANS_PER_ITEM), threads)
 
 
@@ -114,7 +109,7 @@ def _plane_axes(camera: Camera, plane: ImagePlane) -> tuple[np.ndarray, np.ndarr
     return rotation, np.ascontiguousarray(camera.pose[:3, :3] @ rotation)
 
 
-# Of both passes.
+# --- both passes ---
 
 
 @inline_kernel
@@ -123,13 +118,8 @@ def _jacobian(n, height, width, focal):
     inverse = 1 / n[2]
     tan_x, tan_y = n[0] * inverse, n[1] * inverse
     limit_x, limit_y = _CLAMP * width / focal, _CLAMP * height / focal
-    return (
-        tan_x,
-        tan_y,
-        min(max(tan_x, -limit_x), limit_x),
-        min(max(tan_y, -limit_y), limit_y),
-        focal * inverse,
-    )
+    clamped_x, clamped_y = min(max(tan_x, -limit_x), limit_x), min(max(tan_y, -limit_y), limit_y)
+    return tan_x, tan_y, clamped_x, clamped_y, focal * inverse
 
 
 @inline_kernel
@@ -140,7 +130,7 @@ def _apply_jacobian(jacobian, vector):
 
 @inline_kernel
 def _times_covariance(cov, filter_variance, on_u, on_v, on_n):
-    """A row of J F times the filtered covariance."""
+    """A row (on_u, on_v, on_n) of J F times the filtered covariance."""
     uu, uv, vv, un, vn, nn = cov[0] + filter_variance, cov[1], cov[2] + filter_variance, cov[3], cov[4], cov[5]
     return (
         uu * on_u + uv * on_v + un * on_n,
@@ -163,13 +153,13 @@ def _project_covariance(rows, i, axes, height, width, focal, filter_variance):
     return (u, v, n), jacobian, on_n, x_weighted, y_weighted, variance
 
 
-# Forward.
+# --- forward ---
 
 
 @kernel
 def _project_ewa(
-    item, means, quats, scales, covariances, opacities, _harmonics, pose, filter_variance, _compensate, near,
-    camera_records, radii, rotation, axes, height, width, focal, dilation, z_near, records, words, boxes,
+    means, quats, scales, covariances, opacities, _harmonics, pose, filter_variance, _compensate, near,
+    camera_records, radii, rotation, axes, height, width, focal, dilation, z_near, records, words, boxes, item,
 ):  # fmt: skip
     rows, axes = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK)), matrix_columns(axes)
     unit = math.sqrt(layout.HALF_LOG2_E)
@@ -201,8 +191,8 @@ def _project_ewa(
 
 @inline_kernel
 def _load_peaks(camera_records, radii, rotation, start, count, z_near, rows):
-    """Load log2_peak, `CULLED` for Gaussians behind the near plane; return how many are in front."""
-    in_front = 0
+    """Load log2_peak, `CULLED` for Gaussians behind the near plane; return the number of the others."""
+    num_kept = 0
     for i in range(GAUSSIAN_BLOCK):
         rows[_LOG2_PEAK_ROW, i] = CULLED
     for i in range(count):
@@ -210,10 +200,10 @@ def _load_peaks(camera_records, radii, rotation, start, count, z_near, rows):
         z = (np.float64(camera_records[g, 0]) + np.float64(camera_records[g, 3])) * rotation[0, 2]
         z += (np.float64(camera_records[g, 1]) + np.float64(camera_records[g, 4])) * rotation[1, 2]
         z += (np.float64(camera_records[g, 2]) + np.float64(camera_records[g, 5])) * rotation[2, 2]
-        drawn = (z * radii[g] > z_near) & (camera_records[g, layout.LOG2_PEAK] > CULLED)
-        rows[_LOG2_PEAK_ROW, i] = camera_records[g, layout.LOG2_PEAK] if drawn else CULLED
-        in_front += drawn
-    return in_front
+        kept = (z * radii[g] > z_near) & (camera_records[g, layout.LOG2_PEAK] > CULLED)
+        rows[_LOG2_PEAK_ROW, i] = camera_records[g, layout.LOG2_PEAK] if kept else CULLED
+        num_kept += kept
+    return num_kept
 
 
 @inline_kernel
@@ -235,13 +225,13 @@ def _write_records(rows, start, count, boxes, records):
         records[g, layout.LOG2_PEAK] = np.float32(rows[_LOG2_PEAK_ROW, i])
 
 
-# Backward.
+# --- backward ---
 
 
 @kernel
 def _backpropagate_ewa(
-    item, means, quats, scales, covariances, opacities, _harmonics, pose, filter_variance, _compensate, near,
-    axes, height, width, focal, dilation, grad_records, offsets, ewa_grads,
+    means, quats, scales, covariances, opacities, _harmonics, pose, filter_variance, _compensate, near,
+    axes, height, width, focal, dilation, grad_records, offsets, ewa_grads, item,
 ):  # fmt: skip
     rows, axes = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK)), matrix_columns(axes)
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, means.shape[0]), GAUSSIAN_BLOCK):
@@ -259,15 +249,15 @@ def _backpropagate_ewa(
 
 @inline_kernel
 def _sum_slots(grad_records, offsets, start, count, rows):
-    """Sum each Gaussian's slots; return how many Gaussians of the block have any."""
-    num_seen = 0
+    """Sum each Gaussian's slots, in their order; return the number of Gaussians with a slot."""
+    num_with_slots = 0
     unit = math.sqrt(layout.HALF_LOG2_E)
     for i in range(GAUSSIAN_BLOCK):
         for j in range(6):
             rows[_RECORD_GRAD_ROW + j, i] = 0.0
     for i in range(count):
         g = start + i
-        num_seen += offsets[g + 1] > offsets[g]
+        num_with_slots += offsets[g + 1] > offsets[g]
         for slot in range(offsets[g], offsets[g + 1]):
             rows[_RECORD_GRAD_ROW, i] += grad_records[slot, layout.DIRECTION]
             rows[_RECORD_GRAD_ROW + 1, i] += grad_records[slot, layout.DIRECTION + 1]
@@ -275,12 +265,12 @@ def _sum_slots(grad_records, offsets, start, count, rows):
             rows[_RECORD_GRAD_ROW + 3, i] += unit * grad_records[slot, layout.ROW_B]
             rows[_RECORD_GRAD_ROW + 4, i] += unit * grad_records[slot, layout.ROW_B + 1]
             rows[_RECORD_GRAD_ROW + 5, i] += grad_records[slot, layout.LOG2_PEAK]
-    return num_seen
+    return num_with_slots
 
 
 @inline_kernel
 def _backpropagate_records(rows, axes, height, width, focal, filter_variance, dilation):
-    """Gradients of n and C in world axes, from those of the point, a and b."""
+    """Write the gradients of n, C (world axes) and log2_peak, given those of the point, a, b and log2_peak."""
     for i in range(GAUSSIAN_BLOCK):
         frame, jacobian, n_image, x_weighted, y_weighted, v = _project_covariance(
             rows, i, axes, height, width, focal, filter_variance
@@ -294,7 +284,7 @@ def _backpropagate_records(rows, axes, height, width, focal, filter_variance, di
         h_yy = -0.5 * b_y * b_y * b_y * (g_by + g_bx * m) if across >= MIN_EWA_VARIANCE else 0.0
         h_xx = -0.5 * g_ax * a_x * a_x * a_x + m * m * h_yy - g_m * m / v_xx
         h_xy = m * h_yy - 0.5 * g_m / v_xx
-        # V = J C' J': the gradient of J is 2 H (J C'), that of C is J' H J, and n has that of the filter's - e^2 n n'.
+        # V = J C' J': the gradient of J is 2 H (J C'), that of C is J' H J. n also has that of - e^2 n n'.
         x_mixed = (
             h_xx * x_weighted[0] + h_xy * y_weighted[0],
             h_xx * x_weighted[1] + h_xy * y_weighted[1],

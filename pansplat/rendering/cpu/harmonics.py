@@ -1,7 +1,7 @@
-"""Real spherical harmonics of a block of directions, colours of coefficients in any number of channels, and gradients.
+"""Real spherical harmonics of a block of directions, colours of any number of channels, and their gradients.
 
 Convention: order and signs of pansplat.gaussians.harmonics, which has the same polynomials. `view_dependent` is None if
-there is one harmonic: code that depends on it is not compiled then.
+there is one harmonic; numba does not compile the code for several ones then.
 """
 
 import math
@@ -36,7 +36,7 @@ _C4_ZONAL = 0.1875 / math.sqrt(math.pi)
 
 @inline_kernel
 def evaluate_basis(rows, direction_row, num, view_dependent, basis):
-    """Write the first `num` harmonics of the directions, a row each; a direction is three of `rows`."""
+    """Write the first `num` harmonics, a row each, of the directions in three of `rows`."""
     num_directions = basis.shape[1]
     for i in range(num_directions):
         basis[0, i] = _C0
@@ -64,10 +64,8 @@ def evaluate_basis(rows, direction_row, num, view_dependent, basis):
         for i in range(num_directions):
             x, y, z = rows[direction_row, i], rows[direction_row + 1, i], rows[direction_row + 2, i]
             xx, yy, zz = x * x, y * y, z * z
-            basis[16, i], basis[24, i] = (
-                _C4D * x * y * (xx - yy),
-                0.25 * _C4D * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
-            )
+            basis[16, i] = _C4D * x * y * (xx - yy)
+            basis[24, i] = 0.25 * _C4D * (xx * (xx - 3 * yy) - yy * (3 * xx - yy))
             basis[17, i], basis[23, i] = -_C4C * y * z * (3 * xx - yy), -_C4C * x * z * (xx - 3 * yy)
             basis[18, i], basis[22, i] = _C4B * x * y * (7 * zz - 1), 0.5 * _C4B * (xx - yy) * (7 * zz - 1)
             basis[19, i], basis[21, i] = -_C4A * y * z * (7 * zz - 3), -_C4A * x * z * (7 * zz - 3)
@@ -76,9 +74,9 @@ def evaluate_basis(rows, direction_row, num, view_dependent, basis):
 
 @inline_kernel
 def accumulate_direction_gradients(rows, direction_row, num, view_dependent, grad_basis, grad_row):
-    """Add the gradients of the directions to three of `rows`, given that of each harmonic.
+    """Add the gradients of the directions to three of `rows`, given those of the harmonics.
 
-    They hold along the sphere; their component across it has no meaning, as in the torch reference.
+    Only their tangential components have a meaning, as in the torch reference.
     """
     if view_dependent is None:
         return
@@ -91,13 +89,8 @@ def accumulate_direction_gradients(rows, direction_row, num, view_dependent, gra
     if num >= 9:
         for i in range(num_directions):
             x, y, z = rows[direction_row, i], rows[direction_row + 1, i], rows[direction_row + 2, i]
-            g4, g5, g6, g7, g8 = (
-                grad_basis[4, i],
-                grad_basis[5, i],
-                grad_basis[6, i],
-                grad_basis[7, i],
-                grad_basis[8, i],
-            )
+            g4, g5, g6 = grad_basis[4, i], grad_basis[5, i], grad_basis[6, i]
+            g7, g8 = grad_basis[7, i], grad_basis[8, i]
             rows[grad_row, i] += _C2 * (g4 * y - g7 * z + g8 * x) - 2 * _C2_ZONAL * g6 * x
             rows[grad_row + 1, i] += _C2 * (g4 * x - g5 * z - g8 * y) - 2 * _C2_ZONAL * g6 * y
             rows[grad_row + 2, i] += -_C2 * (g5 * y + g7 * x) + 4 * _C2_ZONAL * g6 * z
@@ -147,11 +140,7 @@ def accumulate_direction_gradients(rows, direction_row, num, view_dependent, gra
 
 @inline_kernel
 def evaluate_colors(harmonics, start, count, basis, view_dependent, rows, radius_row, values):
-    """Write the colour max(0, 0.5 + sum_k Y_k c_k) and the radius of `count` Gaussians from `start` on into values.
-
-    Args:
-        rows, radius_row: the radii are a row of float64.
-    """
+    """Write the colour max(0, 0.5 + sum_k Y_k c_k) and the radius of `count` Gaussians from `start` on into values."""
     channels, done = harmonics.shape[2], 0
     if channels == 3:
         if view_dependent is None:
@@ -173,7 +162,7 @@ def evaluate_colors(harmonics, start, count, basis, view_dependent, rows, radius
 
 @inline_kernel
 def _evaluate_constant_rgb(harmonics, start, count, rows, radius_row, values):
-    """Colours of one harmonic, as many as fill whole vectors; return their number."""
+    """Write the colours and radii of whole vectors of Gaussians with one harmonic; return their number."""
     weight, half, zero = broadcast(np.float32(_C0)), broadcast(np.float32(0.5)), broadcast(np.float32(0))
     coefficients, written, whole = harmonics.reshape(-1), values.reshape(-1), count // LANES * LANES
     for i in range(0, whole, LANES):
@@ -187,7 +176,7 @@ def _evaluate_constant_rgb(harmonics, start, count, rows, radius_row, values):
 
 @inline_kernel
 def _evaluate_rgb(harmonics, start, count, basis, rows, radius_row, values):
-    """Colours of several harmonics; return their number."""
+    """Write the colours and radii of Gaussians with several harmonics; return their number."""
     zero = np.float32(0)
     for i in range(count):
         g = start + i
@@ -203,21 +192,21 @@ def _evaluate_rgb(harmonics, start, count, basis, rows, radius_row, values):
 
 
 @inline_kernel
-def backpropagate_colors(harmonics, start, drawn, basis, values, grad_colors, grad_harmonics, grad_basis):
-    """Write the gradients of coefficients and of each harmonic, given those of a block's colours.
+def backpropagate_colors(harmonics, start, kept, basis, values, grad_colors, grad_harmonics, grad_basis):
+    """Write the gradients of coefficients and harmonics, given those of a block's colours.
 
     Args:
         start: the block's first Gaussian.
-        drawn: which Gaussians of the block are drawn; the gradients of others are 0 whatever their coefficients.
+        kept: false for culled Gaussians, whose gradients are 0, whether or not their coefficients are finite.
         values: colours of the forward; a channel at 0 has no gradient.
-        grad_colors: a row a Gaussian; overwritten.
+        grad_colors: a row per Gaussian; overwritten.
         grad_harmonics: no rows if not needed.
-        grad_basis: written, a row a harmonic.
+        grad_basis: written, a row per harmonic.
     """
     num, channels, needed = harmonics.shape[1], harmonics.shape[2], grad_harmonics.shape[0] > 0
-    for i in range(len(drawn)):
+    for i in range(len(kept)):
         g = start + i
-        if not drawn[i]:
+        if not kept[i]:
             for k in range(num):
                 grad_basis[k, i] = 0
                 if needed and g < harmonics.shape[0]:
@@ -237,12 +226,12 @@ def backpropagate_colors(harmonics, start, drawn, basis, values, grad_colors, gr
 
 @inline_kernel
 def backpropagate_constant_colors(harmonics, start, count, values, grad_values, grad_colors, grad_harmonics):
-    """Write the gradients of coefficients of one harmonic, if needed, given those of the colours.
+    """Write the gradients of the coefficients of one harmonic, given those of the colours.
 
     Args:
         values: colours of the forward; a channel at 0 has no gradient.
         grad_values: of three channels and the radius, flat; read if there are three channels.
-        grad_colors: a row a Gaussian; read if there are not three channels.
+        grad_colors: a row per Gaussian; read for other numbers of channels.
         grad_harmonics: no rows if not needed.
     """
     channels, whole, weight = harmonics.shape[2], 0, np.float32(_C0)

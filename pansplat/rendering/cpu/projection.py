@@ -1,10 +1,11 @@
 """Stage one: Gaussians projected to records and values, once per camera.
 
 Source: docs/rendering.md, sections 1 to 3; records.py for the layout. Arithmetic is float64, on vectors of eight
-Gaussians in blocks of `GAUSSIAN_BLOCK`; a work item is `GAUSSIANS_PER_ITEM`. Lengths are divided by the distance.
+Gaussians. A block is `GAUSSIAN_BLOCK` Gaussians here, a work item `GAUSSIANS_PER_ITEM`. Lengths are divided by the
+distance.
 
-A covariance in the tangent frame (u, v, n) is a tuple, `cov`, of its entries and its minors. The minors are computed
-separately, because from the entries they would suffer cancellation:
+A covariance in the tangent frame (u, v, n) is a tuple, `cov`, of its entries and minors. The minors are computed
+separately, because the entries would cancel:
 
     uu, uv, vv, un, vn, nn    C in the frame
     det_across                det B
@@ -13,7 +14,9 @@ separately, because from the entries they would suffer cancellation:
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -48,15 +51,15 @@ from pansplat.rendering.cpu.simd import (
 
 GAUSSIAN_BLOCK = 64
 GAUSSIANS_PER_ITEM = 8192
-CULLED = -128.0  # log2_peak of a Gaussian that is not drawn
+CULLED = -128.0  # log2_peak of a culled Gaussian
 
 _MAX_MAGNITUDE_BITS = np.uint32(2 * int(np.float32(MAX_MAGNITUDE).view(np.uint32)))  # without the sign
 _ROUNDING = -MIN_EIGENVALUE_RATIO
-_DROPPED, _NEAR = 0, 1  # columns of the tallies
+_DROPPED, _NEAR = 0, 1  # columns of the counts
 
-# Rows of a block: what is loaded, what is computed, and what the EWA kernel reads.
+# Rows of a block: inputs, results, and inputs of the EWA kernel.
 MEAN_ROW, SHAPE_ROW, OPACITY_ROW = 0, 3, 12  # the shape is a quaternion and three scales, or a covariance
-DIRECTION_ROW, RADIUS_ROW, VALID_ROW = 13, 16, 17  # world axes; metres; 1, or 0 where a number is unusable
+DIRECTION_ROW, RADIUS_ROW, VALID_ROW = 13, 16, 17  # world axes; metres; 1, or 0 if a number is unusable
 FRAME_ROW, COV_ROW = 18, 24
 NUM_ROWS = 33
 
@@ -80,9 +83,20 @@ class GaussianArrays(NamedTuple):
     opacities: np.ndarray
     harmonics: np.ndarray
 
+    @classmethod
+    def from_tensors(cls, tensors: Sequence[Any]) -> "GaussianArrays":
+        """The arrays of float32 tensors; None becomes an array without rows."""
+        shapes = ((3,), (4,), (3,), (3, 3), (), tensors[-1].shape[1:])
+        return cls(
+            *(
+                np.empty((0, *shape), np.float32) if tensor is None else tensor.detach().numpy()
+                for tensor, shape in zip(tensors, shapes, strict=True)
+            )
+        )
+
     @property
     def kernel_arguments(self) -> tuple[np.ndarray | None, ...]:
-        """The arrays, None for those not given: code that depends on a None is not compiled."""
+        """The arrays, None for those not given: numba does not compile code that depends on a None."""
         by_covariance = len(self.covariances) > 0
         shape = (None, None, self.covariances) if by_covariance else (self.quats, self.scales, None)
         return self.means, *shape, self.opacities, self.harmonics
@@ -99,7 +113,7 @@ class Camera(NamedTuple):
     Attributes:
         pose: cam2world, (4, 4) float64.
         filter_variance: e^2, added across the ray, radians^2; above 0.
-        compensate: whether the opacity is lowered by as much as the filter widens the Gaussian.
+        compensate: whether the filter lowers the opacity by the factor by which it widens the Gaussian.
         near: metres.
     """
 
@@ -110,12 +124,12 @@ class Camera(NamedTuple):
 
 
 class ProjectedGaussians(NamedTuple):
-    """What a camera sees of each Gaussian.
+    """The Gaussians as one camera sees them.
 
     Attributes:
-        records, values: see records.py; `log2_peak` is `CULLED` where a Gaussian is not drawn.
+        records, values: see records.py; `log2_peak` is `CULLED` if a Gaussian is culled.
         radii: (n,) float64, metres.
-        drawn: (n,) uint8, 0 for Gaussians that no image plane shows.
+        kept: (n,) uint8, 0 for culled Gaussians.
         dropped: number of Gaussians with an unusable number.
         near: number of Gaussians that are too near.
     """
@@ -123,7 +137,7 @@ class ProjectedGaussians(NamedTuple):
     records: np.ndarray
     values: np.ndarray
     radii: np.ndarray
-    drawn: np.ndarray
+    kept: np.ndarray
     dropped: int
     near: int
 
@@ -134,29 +148,26 @@ def project_gaussians(
     """Project all Gaussians; the arrays belong to the workspace."""
     num, channels = len(gaussians.means), gaussians.harmonics.shape[2]
     records, radii = workspace.array((num, layout.RECORD_SIZE), np.float32), workspace.array(num, np.float64)
-    values, drawn = workspace.array((num, channels + 1), np.float32), workspace.array(num, np.uint8)
-    items = -(-num // GAUSSIANS_PER_ITEM)
-    tallies = np.zeros((items, 2), np.int64)
+    values, kept = workspace.array((num, channels + 1), np.float32), workspace.array(num, np.uint8)
+    num_items = -(-num // GAUSSIANS_PER_ITEM)
+    counts = np.zeros((num_items, 2), np.int64)
     harmonic_bits = gaussians.harmonics.reshape(-1).view(np.uint32)
-
-    def work(item: int) -> None:
-        _project_gaussians(
-            item, *gaussians.kernel_arguments, harmonic_bits, *camera, gaussians.view_dependent,
-            records.reshape(-1), values, radii, drawn, tallies,
-        )  # fmt: skip
-
-    parallel_for(work, items, threads)
-    dropped, near = (int(count) for count in tallies.sum(axis=0))
-    return ProjectedGaussians(records, values, radii, drawn, dropped, near)
+    work = partial(
+        _project_gaussians, *gaussians.kernel_arguments, harmonic_bits, *camera, gaussians.view_dependent,
+        records.reshape(-1), values, radii, kept, counts,
+    )  # fmt: skip
+    parallel_for(work, num_items, threads)
+    dropped, near = (int(count) for count in counts.sum(axis=0))
+    return ProjectedGaussians(records, values, radii, kept, dropped, near)
 
 
 @kernel
 def _project_gaussians(
-    item, means, quats, scales, covariances, opacities, harmonics, harmonic_bits,
-    pose, filter_variance, compensate, near, view_dependent, records, values, radii, drawn, tallies,
+    means, quats, scales, covariances, opacities, harmonics, harmonic_bits,
+    pose, filter_variance, compensate, near, view_dependent, records, values, radii, kept, counts, item,
 ):  # fmt: skip
     align_stack()
-    rows, block_drawn = np.ones((NUM_ROWS, GAUSSIAN_BLOCK)), np.empty(GAUSSIAN_BLOCK, np.uint8)
+    rows, block_kept = np.ones((NUM_ROWS, GAUSSIAN_BLOCK)), np.empty(GAUSSIAN_BLOCK, np.uint8)
     basis, soa = np.empty((25, GAUSSIAN_BLOCK), np.float32), np.empty(layout.RECORD_SIZE * LANES, np.float32)
     num_dropped, num_near, camera = 0, 0, pose_columns(pose)
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, means.shape[0]), GAUSSIAN_BLOCK):
@@ -166,25 +177,25 @@ def _project_gaussians(
         if may_be_invalid:
             _invalidate_large_numbers(rows, MEAN_ROW, OPACITY_ROW + 1, count)
         for i in range(0, count, LANES):
-            state, is_drawn = _compute_records(covariances, camera, filter_variance, compensate, near, rows, i, soa)
+            state, is_kept = _compute_records(covariances, camera, filter_variance, compensate, near, rows, i, soa)
             lanes_used = min(LANES, count - i)
             used = np.uint64((1 << lanes_used) - 1)
             num_dropped += popcount(mask_bits(state == 0.0) & used)
             num_near += popcount(mask_bits(state < 0.0) & used)
-            store_mask(block_drawn, i, is_drawn)
+            store_mask(block_kept, i, is_kept)
             soa_to_records(soa, LANES, start + i, lanes_used, records)
         for i in range(count):
             store_scalar(radii, start + i, rows[RADIUS_ROW, i])
         for i in range(count):
-            store_scalar(drawn, start + i, block_drawn[i])
+            store_scalar(kept, start + i, block_kept[i])
         evaluate_basis(rows, DIRECTION_ROW, harmonics.shape[1], view_dependent, basis)
         evaluate_colors(harmonics, start, count, basis, view_dependent, rows, RADIUS_ROW, values)
-    tallies[item, _DROPPED], tallies[item, _NEAR] = num_dropped, num_near
+    counts[item, _DROPPED], counts[item, _NEAR] = num_dropped, num_near
 
 
 @inline_kernel
 def _compute_records(covariances, pose, filter_variance, compensate, near, rows, i, soa):
-    """Write the records of eight Gaussians, a field a row of `soa`; return their states and which are drawn."""
+    """Write the records of eight Gaussians, a row of `soa` per field; return their states and which are kept."""
     unit, inverse_unit = math.sqrt(layout.HALF_LOG2_E), 1 / math.sqrt(layout.HALF_LOG2_E)
     n, radius, inverse, state = compute_direction(rows, i, pose, near)
     store_row(rows, RADIUS_ROW, i, radius)
@@ -206,10 +217,10 @@ def _compute_records(covariances, pose, filter_variance, compensate, near, rows,
     squared_peak = opacity * opacity
     if compensate:
         squared_peak = squared_peak * max(cov[6] * inverse_det, MIN_COMPENSATION)
-    drawn = (state > 0) & (opacity >= OPACITY_CUT)
-    log2_peak = select(drawn, 0.5 * _log2(select(drawn, squared_peak, broadcast(1.0))), broadcast(CULLED))
+    kept = (state > 0) & (opacity >= OPACITY_CUT)
+    log2_peak = select(kept, 0.5 * _log2(select(kept, squared_peak, broadcast(1.0))), broadcast(CULLED))
     store(soa, layout.LOG2_PEAK * LANES, to_f32(log2_peak))
-    return state, drawn
+    return state, kept
 
 
 @inline_kernel
@@ -230,7 +241,7 @@ def _log2(value):
     return exponent + (2 / math.log(2)) * s * series
 
 
-# Loading a block.
+# --- loading a block ---
 
 
 @inline_kernel
@@ -239,7 +250,7 @@ def load_block(means, quats, scales, covariances, opacities, start, count, rows)
     largest = broadcast(np.float32(0))
     largest = aos3_to_soa(means.reshape(-1), start, count, rows, MEAN_ROW, largest)
     largest = aos1_to_soa(opacities, start, count, rows, OPACITY_ROW, largest)
-    # Two conditions and no `else`: numba removes the branch of an argument that is None, but not the other one.
+    # Two conditions and no `else`: numba removes the branch of a None argument, but not its `else`.
     if covariances is not None:
         for i in range(count):
             for j in range(9):
@@ -252,7 +263,7 @@ def load_block(means, quats, scales, covariances, opacities, start, count, rows)
 
 @inline_kernel
 def _invalidate_large_numbers(rows, first, end, count):
-    """Mark Gaussians invalid that have a number in these rows that is not finite or too large."""
+    """Mark Gaussians as invalid if a number in these rows is not finite or too large."""
     for row in range(first, end):
         for i in range(count):
             if not abs(rows[row, i]) < MAX_MAGNITUDE:
@@ -261,7 +272,7 @@ def _invalidate_large_numbers(rows, first, end, count):
 
 @inline_kernel
 def _validate_harmonics(harmonic_bits, size, start, count, rows):
-    """Mark Gaussians valid, or invalid if one of their `size` coefficients is not finite or too large."""
+    """Mark Gaussians as valid, or as invalid if one of their `size` coefficients is not finite or too large."""
     for i in range(GAUSSIAN_BLOCK):
         rows[VALID_ROW, i] = 1.0
     largest = np.uint32(0)
@@ -278,7 +289,7 @@ def _validate_harmonics(harmonic_bits, size, start, count, rows):
             rows[VALID_ROW, j // size] = 0.0
 
 
-# Direction, frame and covariance of eight Gaussians.
+# --- direction, frame and covariance of eight Gaussians ---
 
 
 @inline_kernel
@@ -297,7 +308,7 @@ def store_vector(rows, row, i, vector):
 
 @inline_kernel
 def matrix_columns(matrix):
-    """Three columns of a matrix as numbers; an array would be read again for every eight Gaussians."""
+    """Three columns of a matrix as numbers; an array would be read again for each vector of Gaussians."""
     return (
         (matrix[0, 0], matrix[1, 0], matrix[2, 0]),
         (matrix[0, 1], matrix[1, 1], matrix[2, 1]),
@@ -313,7 +324,7 @@ def pose_columns(pose):
 
 @inline_kernel
 def compute_direction(rows, i, pose, near):
-    """Direction, distance, one over the distance, and a state: 1, or -1 where the Gaussian is too near."""
+    """Direction, distance, one over the distance, and a state: 1, or -1 if the Gaussian is too near."""
     mx, my, mz = load_vector(rows, MEAN_ROW, i)
     x, y, z = mx - pose[3][0], my - pose[3][1], mz - pose[3][2]
     radius = math.sqrt(x * x + y * y + z * z)
@@ -324,7 +335,7 @@ def compute_direction(rows, i, pose, near):
 
 @inline_kernel
 def compute_tangent_covariance(covariances, rows, i, n, inverse, state):
-    """Tangent axes u and v, the covariance, and the state: 0 where the shape is unusable.
+    """Tangent axes u and v, the covariance, and the state: 0 if the shape is unusable.
 
     Args:
         covariances: None if the shapes are quaternions and scales.
@@ -350,7 +361,7 @@ def load_axes(rows, i):
 
 @inline_kernel
 def _rotation(w, x, y, z):
-    """Rows of the rotation matrix of a quaternion of any length, and one over its square; zero is the identity."""
+    """Rotation matrix, by rows, of a quaternion of any length, and one over its square; zero gives the identity."""
     norm2 = w * w + x * x + y * y + z * z
     inverse = select(norm2 > 0, 1 / norm2, broadcast(0.0))
     twice = 2 * inverse
@@ -365,7 +376,7 @@ def _rotation(w, x, y, z):
 
 @inline_kernel
 def _covariance_of_axes(rows, i, u, n, inverse, state):
-    """The covariance of rotations and scales, as sums of squares: nothing cancels."""
+    """The covariance of rotations and scales, as sums of squares, without cancellation."""
     s0, s1, s2 = load_vector(rows, SHAPE_ROW + 4, i)
     e0, e1, e2, _ = load_axes(rows, i)
     s0, s1, s2 = s0 * inverse, s1 * inverse, s2 * inverse
@@ -391,7 +402,7 @@ def _covariance_of_axes(rows, i, u, n, inverse, state):
 
 @inline_kernel
 def _covariance_of_matrices(rows, i, u, v, n, inverse, state):
-    """The covariance of matrices; minors that rounding made negative are 0.
+    """The covariance of matrices; minors that are negative by rounding become 0.
 
     Args:
         inverse: one over the squared distance.
@@ -415,7 +426,7 @@ def _covariance_of_matrices(rows, i, u, v, n, inverse, state):
 
 @inline_kernel
 def _is_covariance(xx, xy, xz, yy, yz, zz):
-    """Whether a symmetric matrix over squared distance has no eigenvalue below what rounding explains."""
+    """Whether a symmetric matrix over squared distance has no eigenvalue below the bound for rounding."""
     largest = max(max(xx, yy), zz)
     bound = (1 + _ROUNDING) * largest
     bound = bound * bound
@@ -447,7 +458,7 @@ def whitened_axes(u, v, factors):
     return a, ((v[0] - mix * u[0]) * b_scale, (v[1] - mix * u[1]) * b_scale, (v[2] - mix * u[2]) * b_scale)
 
 
-# Covariances of a block, one Gaussian at a time, for the EWA kernel.
+# --- covariances of a block, for the EWA kernel ---
 
 
 @inline_kernel
@@ -478,7 +489,7 @@ def load_tangent_covariance(rows, i):
     return u, v, n, cov
 
 
-# Vector algebra, for float64 and f64x8.
+# --- vector algebra, for float64 and f64x8 ---
 
 
 @inline_kernel

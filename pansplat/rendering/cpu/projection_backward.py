@@ -1,8 +1,8 @@
-"""Gradients of stage one: from those of records and values to those of the Gaussians and the camera's pose.
+"""Gradients of stage one: of the Gaussians and the camera's pose, from those of records and values.
 
-Source: docs/rendering.md, sections 1 to 3, differentiated by hand. Turning the rows a and b about n together does not
-change an image, so their derivative is taken in the gauge where it is symmetric. With E = C + e^2, p the axis dual to a
-and q that to b, a motion dn across n and a change dC of the covariance,
+Source: docs/rendering.md, sections 1 to 3, differentiated by hand. Rotating the rows a and b together about n does not
+change an image, so their derivatives may differ by such a rotation; these are the symmetric ones. With p the axis dual
+to a, q the axis dual to b, a change dn of the direction across n and a change dC of the covariance,
 
     X_aa = a'dC a + 2 alpha a.dn     X_ab = a'dC b + beta a.dn + alpha b.dn     X_bb = b'dC b + 2 beta b.dn
     da = -(X_aa a + X_ab b) / 2 - (a.dn) n
@@ -10,11 +10,12 @@ and q that to b, a motion dn across n and a change dC of the covariance,
     dS' = l'dC l - 2 (S' + e^2) (l - n).dn
     d ln det B' = X_aa + X_bb
 
-and likewise for b; alpha and beta are the components of l along a and b. Nothing is divided by a width, so the
-gradients of needles and discs are as accurate as the forward.
+and likewise for b; alpha and beta are the components of l along a and b. No term is divided by a footprint's width, so
+the gradients of needles and discs are as accurate as the forward.
 """
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -85,7 +86,7 @@ _NUM_ROWS = NUM_ROWS + 20
 
 
 class GaussianGradients(NamedTuple):
-    """Gradients of `GaussianArrays`, float32; no rows where not needed. `pose` is (3, 4) float64."""
+    """Gradients of `GaussianArrays`, float32; an array that is not needed has no rows. `pose` is (3, 4) float64."""
 
     means: np.ndarray
     quats: np.ndarray
@@ -107,28 +108,25 @@ def backpropagate_projection(
     gradients: GaussianGradients,
     threads: int,
 ) -> GaussianGradients:
-    """Fill in the gradients of the Gaussians and the pose.
+    """Write the gradients of the Gaussians and return them with that of the pose.
 
     Args:
         gaussians, camera, projected: of the forward.
         grad_records: (slot, RECORD_SIZE), of the camera's records.
         grad_values: (slot, channel + 1).
-        ewa_grads: of `backpropagate_ewa`, in place of `grad_records`; else no rows.
+        ewa_grads: from `backpropagate_ewa`, in place of `grad_records`; no rows for the exact kernel.
         offsets: (n + 1), where each Gaussian's slots begin.
-        gradients: arrays to fill; those without rows are left alone.
+        gradients: arrays to write; arrays without rows are skipped.
         threads: number of threads; the result does not depend on it.
     """
-    items = -(-len(gaussians.means) // GAUSSIANS_PER_ITEM)
-    pose_sums = np.zeros((items if len(gradients.pose) > 0 else 0, _POSE_SIZE))
-
-    def work(item: int) -> None:
-        _backpropagate_projection(
-            item, *gaussians.kernel_arguments, *camera, gaussians.view_dependent, projected.drawn, projected.values,
-            grad_records.reshape(-1), grad_values.reshape(-1), ewa_grads if len(ewa_grads) > 0 else None, offsets,
-            *gradients[:6], pose_sums,
-        )  # fmt: skip
-
-    parallel_for(work, items, threads)
+    num_items = -(-len(gaussians.means) // GAUSSIANS_PER_ITEM)
+    pose_sums = np.zeros((num_items if len(gradients.pose) > 0 else 0, _POSE_SIZE))
+    work = partial(
+        _backpropagate_projection, *gaussians.kernel_arguments, *camera, gaussians.view_dependent, projected.kept,
+        projected.values, grad_records.reshape(-1), grad_values.reshape(-1), ewa_grads if len(ewa_grads) > 0 else None,
+        offsets, *gradients[:6], pose_sums,
+    )  # fmt: skip
+    parallel_for(work, num_items, threads)
     if len(gradients.pose) == 0:
         return gradients
     pose = pose_sums.sum(axis=0).reshape(3, 4)
@@ -136,27 +134,31 @@ def backpropagate_projection(
     return gradients._replace(pose=pose)
 
 
-@kernel
-def accumulate_slots(item, offsets, slot_grads, totals):
+def accumulate_slots(offsets: np.ndarray, slots: np.ndarray, totals: np.ndarray, threads: int) -> None:
     """Add each Gaussian's slots, in their order, to its row of `totals`."""
+    parallel_for(partial(_accumulate_slots, offsets, slots, totals), -(-len(totals) // GAUSSIANS_PER_ITEM), threads)
+
+
+@kernel
+def _accumulate_slots(offsets, slots, totals, item):
     for g in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, totals.shape[0])):
         for slot in range(offsets[g], offsets[g + 1]):
             for j in range(totals.shape[1]):
-                totals[g, j] += slot_grads[slot, j]
+                totals[g, j] += slots[slot, j]
 
 
 @kernel
 def _backpropagate_projection(
-    item, means, quats, scales, covariances, opacities, harmonics, pose, filter_variance, compensate, near,
-    view_dependent, scene_drawn, values, grad_records, grad_values, ewa_grads, offsets,
-    grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities, grad_harmonics, pose_sums,
+    means, quats, scales, covariances, opacities, harmonics, pose, filter_variance, compensate, near,
+    view_dependent, scene_kept, values, grad_records, grad_values, ewa_grads, offsets,
+    grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities, grad_harmonics, pose_sums, item,
 ):  # fmt: skip
     align_stack()
     rows, camera = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK)), pose_columns(pose)
     grad_pose = np.zeros((_POSE_SIZE if pose_sums.shape[0] > 0 else 0, LANES))
     record_sums = np.zeros(GAUSSIAN_BLOCK * layout.RECORD_SIZE, np.float32)
     value_sums = np.zeros(4 * GAUSSIAN_BLOCK + 4, np.float32)
-    soa, drawn = np.zeros((layout.RECORD_SIZE, GAUSSIAN_BLOCK), np.float32), np.zeros(GAUSSIAN_BLOCK, np.bool_)
+    soa, kept = np.zeros((layout.RECORD_SIZE, GAUSSIAN_BLOCK), np.float32), np.zeros(GAUSSIAN_BLOCK, np.bool_)
     basis, grad_basis = np.zeros((25, GAUSSIAN_BLOCK), np.float32), np.zeros((25, GAUSSIAN_BLOCK), np.float32)
     grad_colors = np.zeros((GAUSSIAN_BLOCK, harmonics.shape[2]), np.float32)
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, means.shape[0]), GAUSSIAN_BLOCK):
@@ -166,7 +168,7 @@ def _backpropagate_projection(
             grad_records, grad_values, ewa_grads, offsets, start, count, record_sums, value_sums, grad_colors, rows
         )
         _load_record_gradients(record_sums, ewa_grads, start, count, soa, rows)
-        _clear_undrawn(scene_drawn, start, count, pose, rows, soa, drawn)
+        _clear_culled(scene_kept, start, count, pose, rows, soa, kept)
         for i in range(0, GAUSSIAN_BLOCK, LANES):
             _backpropagate_records(
                 covariances, ewa_grads, camera, filter_variance, compensate, near, rows, soa.reshape(-1), grad_pose, i
@@ -179,12 +181,12 @@ def _backpropagate_projection(
                     for c in range(3):
                         grad_colors[i, c] = load_scalar(value_sums, 4 * i + c)
             evaluate_basis(rows, DIRECTION_ROW, harmonics.shape[1], view_dependent, basis)
-            backpropagate_colors(harmonics, start, drawn, basis, values, grad_colors, grad_harmonics, grad_basis)
+            backpropagate_colors(harmonics, start, kept, basis, values, grad_colors, grad_harmonics, grad_basis)
             accumulate_direction_gradients(
                 rows, DIRECTION_ROW, harmonics.shape[1], view_dependent, grad_basis, _MEAN_GRAD_ROW
             )
         _backpropagate_means(rows, grad_pose)
-        _store_gradients(rows, start, count, grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities)
+        _write_gradients(rows, start, count, grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities)
     for j in range(grad_pose.shape[0]):
         total = 0.0
         for i in range(LANES):
@@ -192,20 +194,20 @@ def _backpropagate_projection(
         pose_sums[item, j] = total
 
 
-# Loading the gradients of a block.
+# --- loading the gradients of a block ---
 
 
 @inline_kernel
 def _sum_slots(
     grad_records, grad_values, ewa_grads, offsets, start, count, record_sums, value_sums, grad_colors, rows
 ):  # fmt: skip
-    """Sum the slots of each Gaussian of a block, in their order; zeros where it has none.
+    """Sum the slots of each Gaussian of a block, in their order; 0 if it has none.
 
     Args:
         grad_records, grad_values: flat.
-        record_sums: (GAUSSIAN_BLOCK RECORD_SIZE), flat, written.
-        value_sums: (GAUSSIAN_BLOCK 4 and 4 more), flat, written if there are three channels.
-        grad_colors: (GAUSSIAN_BLOCK, channel), written if there are not.
+        record_sums: (RECORD_SIZE GAUSSIAN_BLOCK), written.
+        value_sums: (4 GAUSSIAN_BLOCK + 4), written if there are three channels.
+        grad_colors: (GAUSSIAN_BLOCK, channel), written for other numbers of channels.
     """
     channels, zero = grad_colors.shape[1], broadcast(np.float32(0))
     for i in range(count):
@@ -213,7 +215,7 @@ def _sum_slots(
         low, high, values, radius = zero, zero, zero, np.float32(0)
         prefetch(grad_records, layout.RECORD_SIZE * (first + PREFETCH_DISTANCE // 4))
         prefetch(grad_values, 4 * (first + PREFETCH_DISTANCE // 4))
-        if channels == 3:  # the common case; one loop, so that its end is mispredicted once
+        if channels == 3:  # the common case has one loop, so that its end is mispredicted once
             for slot in range(first, end):
                 if ewa_grads is None:
                     low = low + load(grad_records, layout.RECORD_SIZE * slot)
@@ -250,18 +252,18 @@ def _load_record_gradients(record_sums, ewa_grads, start, count, soa, rows):
 
 
 @inline_kernel
-def _clear_undrawn(scene_drawn, start, count, pose, rows, soa, drawn):
-    """Replace the numbers of Gaussians that are not drawn by finite ones: their gradients are 0 and must stay so."""
+def _clear_culled(scene_kept, start, count, pose, rows, soa, kept):
+    """Replace the numbers of culled Gaussians by finite ones, so that their gradients are 0 and not NaN."""
     missing = GAUSSIAN_BLOCK - count
     for i in range(count):
-        drawn[i] = load_scalar(scene_drawn, start + i) != 0
-        missing += load_scalar(scene_drawn, start + i) == 0
+        kept[i] = load_scalar(scene_kept, start + i) != 0
+        missing += load_scalar(scene_kept, start + i) == 0
     if missing == 0:
         return
     for i in range(GAUSSIAN_BLOCK):
-        if i < count and drawn[i]:
+        if i < count and kept[i]:
             continue
-        drawn[i] = False
+        kept[i] = False
         rows[MEAN_ROW, i], rows[MEAN_ROW + 1, i], rows[MEAN_ROW + 2, i] = pose[0, 3], pose[1, 3], pose[2, 3]
         rows[MEAN_ROW, i] += 1 + abs(pose[0, 3])
         rows[OPACITY_ROW, i], rows[_RADIUS_GRAD_ROW, i] = 1.0, 0.0
@@ -272,14 +274,14 @@ def _clear_undrawn(scene_drawn, start, count, pose, rows, soa, drawn):
             soa[j, i] = 0.0
 
 
-# Gradients of records, eight Gaussians at a time.
+# --- gradients of records, eight Gaussians at a time ---
 
 
 @inline_kernel
 def _backpropagate_records(
     covariances, ewa_grads, pose, filter_variance, compensate, near, rows, soa, grad_pose, i
 ):  # fmt: skip
-    """Store the gradients of shapes, opacities, directions and distances, given those of records."""
+    """Write the gradients of shapes, opacities, directions and distances, given those of records."""
     n, radius, inverse, state = compute_direction(rows, i, pose, near)
     u, v, cov, _ = compute_tangent_covariance(covariances, rows, i, n, inverse, state)
     g_n, parts, g_det = _backpropagate_footprint_rows(
@@ -357,7 +359,7 @@ def _add_tangent(g_n, by_u, u, by_v, v):
 
 @inline_kernel
 def _add_to_pose(grad_pose, n, a, b, g_n, g_a, g_b):
-    """Add to the rotation's gradient: n_camera = A'n, so it is the sum of n g_n' A and the like; A is applied last."""
+    """Add to the rotation's gradient, without its last factor A: n_camera = A'n gives n g_n' A, likewise a and b."""
     for axis in range(3):
         for other in range(3):
             term = n[axis] * g_n[other] + a[axis] * g_a[other] + b[axis] * g_b[other]
@@ -390,10 +392,7 @@ def _ewa_covariance_gradient(rows, i):
 
 @inline_kernel
 def _covariance_gradient(u, v, n, parts):
-    """The gradient of C (xx xy xz yy yz zz) in the axes of u, v and n.
-
-    Its rows are combinations of a, b, n, l; it is symmetric once its transpose is added.
-    """
+    """The gradient of C (xx xy xz yy yz zz) in the axes of u, v and n."""
     factors, (alpha, beta), g_radial, (aa, ab, bb, by_alpha, by_beta) = parts
     a, b = whitened_axes(u, v, factors)
     c = (
@@ -420,7 +419,7 @@ def _covariance_gradient(u, v, n, parts):
 
 @inline_kernel
 def _backpropagate_matrices(rows, i, ewa_grads, u, v, n, cov, inverse, g_n, parts, g):
-    """Store the gradients of covariances; return those of n and the distance.
+    """Write the gradients of covariances; return those of n and the distance.
 
     Args:
         ewa_grads: None if there are none.
@@ -432,7 +431,7 @@ def _backpropagate_matrices(rows, i, ewa_grads, u, v, n, cov, inverse, g_n, part
         t = _ewa_covariance_gradient(rows, i)
         xx, xy, xz, yy, yz, zz = xx + t[0], xy + t[1], xz + t[2], yy + t[3], yz + t[4], zz + t[5]
     uu, uv, vv, un, vn = cov[0], cov[1], cov[2], cov[3], cov[4]
-    # det B = uu vv - uv^2; the frame turns with n.
+    # det B = uu vv - uv^2; the frame rotates with n.
     xx = xx + g * (vv * u[0] * u[0] + uu * v[0] * v[0] - 2 * uv * u[0] * v[0])
     yy = yy + g * (vv * u[1] * u[1] + uu * v[1] * v[1] - 2 * uv * u[1] * v[1])
     zz = zz + g * (vv * u[2] * u[2] + uu * v[2] * v[2] - 2 * uv * u[2] * v[2])
@@ -455,11 +454,11 @@ def _backpropagate_matrices(rows, i, ewa_grads, u, v, n, cov, inverse, g_n, part
 
 @inline_kernel
 def _backpropagate_axes(rows, i, ewa_grads, u, n, inverse, g_n, parts, g):
-    """Store the gradients of quaternions and scales; return those of n and the distance.
+    """Write the gradients of quaternions and scales; return those of n and the distance.
 
-    det B = sum_k w_k (n.e_k)^2. A rotation about one axis has no effect if the other two scales are equal, and this is
-    exact here: with G the gradient of C in the Gaussian's own axes and a_k the squared scales, the torque about
-    axis 0 is 2 (a_1 - a_2) (G_12 - g a_0 n_1 n_2), and cyclically.
+    det B = sum_k w_k (n.e_k)^2. A rotation about one axis has no effect if the other two scales are equal, and the
+    gradient is exactly 0 then: with G the gradient of C in the Gaussian's own axes and a_k the squared scales, the
+    torque about axis 0 is 2 (a_1 - a_2) (G_12 - g a_0 n_1 n_2), and cyclically.
 
     Args:
         ewa_grads: None if there are none.
@@ -493,7 +492,7 @@ def _backpropagate_axes(rows, i, ewa_grads, u, n, inverse, g_n, parts, g):
     store_row(rows, _SHAPE_GRAD_ROW + 4, i, d0 * inverse)
     store_row(rows, _SHAPE_GRAD_ROW + 5, i, d1 * inverse)
     store_row(rows, _SHAPE_GRAD_ROW + 6, i, d2 * inverse)
-    # A unit quaternion q that turns with the torque changes by q (0, torque) / 2.
+    # A rotation by the torque changes a unit quaternion q by q (0, torque) / 2.
     twice = 4 * inverse2
     x = twice * (a1 - a2) * (g12 - a0 * gn1 * n2)
     y = twice * (a2 - a0) * (g02 - a1 * gn2 * n0)
@@ -512,12 +511,12 @@ def _symmetric_times(matrix, e):
     return dot(xx, xy, xz, *e), dot(xy, yy, yz, *e), dot(xz, yz, zz, *e)
 
 
-# Gradients of a block's means, and storing the gradients.
+# --- gradients of a block's means, and writing the gradients ---
 
 
 @inline_kernel
 def _backpropagate_means(rows, grad_pose):
-    """Turn the gradients of directions into those of means, with those of distances."""
+    """Compute the gradients of means from those of directions and distances."""
     for i in range(0, GAUSSIAN_BLOCK, LANES):
         n, g = load_vector(rows, DIRECTION_ROW, i), load_vector(rows, _MEAN_GRAD_ROW, i)
         inverse = 1 / load_row(rows, RADIUS_ROW, i)
@@ -530,7 +529,7 @@ def _backpropagate_means(rows, grad_pose):
 
 
 @inline_kernel
-def _store_gradients(rows, start, count, grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities):
+def _write_gradients(rows, start, count, grad_means, grad_quats, grad_scales, grad_covariances, grad_opacities):
     if grad_means.shape[0] > 0:
         soa_to_aos3(rows, _MEAN_GRAD_ROW, start, count, grad_means.reshape(-1))
     if grad_opacities.shape[0] > 0:

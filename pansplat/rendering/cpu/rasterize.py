@@ -4,9 +4,9 @@ Source: docs/rendering.md, section 4. A tile is rasterised in chunks of Gaussian
 reach each block of 4 x 2 pixels, one SIMD vector, are listed as bits. Then each block composites its list with the
 transmittance and the sums in registers. The inner loops have no branches to mispredict.
 
-The length of a ray is arbitrary. So a tile takes its pixels and Gaussians where their rays meet the plane that touches
-the sphere at the tile's centre, and footprint rows have two components. Where a Gaussian or a pixel is too far from the
-centre for that, they have three ("3d" below).
+The length of a ray is arbitrary. So a tile places its pixels and Gaussians where their rays meet the plane that touches
+the sphere at the tile's centre, and footprint rows have two components. If a Gaussian or a pixel is too far from the
+centre for that plane, footprint rows have three components ("3d" below).
 
 The footprints of a chunk are a structure of arrays (`FOOTPRINT_SIZE` x `CHUNK_SIZE`) that fits the L1 cache: setup
 computes eight Gaussians at once, and compositing broadcasts one number to eight pixels.
@@ -54,10 +54,10 @@ BLOCKS_DOWN = TILE_SIZE // BLOCK_HEIGHT
 NUM_BLOCKS = BLOCKS_ACROSS * BLOCKS_DOWN
 TILE_PIXELS = TILE_SIZE * TILE_SIZE
 CHUNK_SIZE = 256  # Gaussians
-CHUNK_WORDS = CHUNK_SIZE // 64  # of 64 bits, one a Gaussian
-ROW_MASKS = BLOCKS_ACROSS + 1  # where the masks of rows begin, after those of columns; see `mark_blocks`
-NUM_MASKS = ROW_MASKS + BLOCKS_DOWN + 1  # for each word of a chunk
-BUFFER_SIZE = CHUNK_SIZE + 64  # log2 alphas of a block, and what `list_set_bits` overwrites
+CHUNK_WORDS = CHUNK_SIZE // 64  # a word has 64 bits, one per Gaussian
+ROW_MASKS = BLOCKS_ACROSS + 1  # index of the first row's mask, after the columns; see `mark_blocks`
+NUM_MASKS = ROW_MASKS + BLOCKS_DOWN + 1  # per word of a chunk
+BUFFER_SIZE = CHUNK_SIZE + 64  # log2 alphas of a block, and up to 64 bytes that `list_set_bits` overwrites
 _SLICE_SIZE = CHUNK_SIZE // NUM_BLOCKS  # Gaussians of the next chunk that each block prefetches
 
 # Rows of a chunk's footprints.
@@ -68,17 +68,17 @@ THIRD = 10  # third components of a, b, l and the point; only used in 3d
 FOOTPRINT_SIZE = 14
 
 LOG2_ALPHA_CUT = math.log2(ALPHA_CUT)
-LOG2_ZERO = -1000.0  # of an alpha that counts as zero
+LOG2_ZERO = -1000.0  # log2 of an alpha that counts as zero
 MIN_TRANSMITTANCE = TRANSMITTANCE_CUT["numba"]  # a pixel is finished at this transmittance or below
 MIN_PLANAR_COSINE = 0.5  # of the angle to the tile's centre; below it footprint rows have three components
 _HORIZON_MARGIN = 0.1  # in log2 alpha
-VALUE_LANES = 4  # values that are accumulated together: RGB and the distance
+VALUE_LANES = 4  # values accumulated together: RGB and the distance
 TILE_FRAME_SIZE = 15  # see `set_tile_frame`
 
 
 @inline_kernel_no_refcount
 def image_position(pixel, left, top):
-    """Column and row in the image of a tile's pixel, which are numbered block by block."""
+    """Column and row in the image of a tile's pixel; a tile numbers its pixels block by block."""
     block, lane = pixel // LANES, pixel % LANES
     return (
         left + (block % BLOCKS_ACROSS) * BLOCK_WIDTH + lane % BLOCK_WIDTH,
@@ -112,13 +112,13 @@ def set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame):
         kind, columns, rows, rotation: of the PixelTables.
         left, top: pixel at the tile's corner.
         centre: (3) float64, written.
-        frame: (TILE_FRAME_SIZE), written: the centre as float32, its residual, two axes across, and the third axis: the
-            centre, or zeros for the EWA kernel.
+        frame: (TILE_FRAME_SIZE), written: the centre as float32, its residual, two axes across, and a third axis, which
+            is the centre, or zeros for the EWA kernel.
 
     Returns:
         Whether a pixel is too far from the centre for footprint rows with two components.
     """
-    least = 1.0  # cosine of the angle from the centre to the farthest pixel, which is in a corner
+    min_cosine = 1.0  # of the angle from the centre to the farthest pixel, which is in a corner
     for corner in range(-1, 4):
         x, y = left + TILE_SIZE // 2, top + TILE_SIZE // 2
         if corner >= 0:
@@ -128,7 +128,7 @@ def set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame):
         if corner < 0:
             centre[0], centre[1], centre[2] = d_x, d_y, d_z
         elif kind != PIXEL_CENTRES:
-            least = min(least, dot(centre[0], centre[1], centre[2], d_x, d_y, d_z))
+            min_cosine = min(min_cosine, dot(centre[0], centre[1], centre[2], d_x, d_y, d_z))
     axes = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
     if kind != PIXEL_CENTRES:
         axes = tangent_frame(centre[0], centre[1], centre[2])
@@ -138,7 +138,7 @@ def set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame):
         frame[12 + axis] = np.float32(0 if kind == PIXEL_CENTRES else centre[axis])
     for axis in range(6):
         frame[6 + axis] = np.float32(axes[axis])
-    return least < MIN_PLANAR_COSINE
+    return min_cosine < MIN_PLANAR_COSINE
 
 
 @inline_kernel_no_refcount
@@ -147,7 +147,7 @@ def set_tile_pixels(kind, columns, rows, rotation, left, top, centre, frame, is_
 
     Args:
         kind, columns, rows, rotation, left, top, centre, frame: as in `set_tile_frame`.
-        is_3d: whether along all three axes; otherwise on the plane that touches the sphere at the centre.
+        is_3d: offsets along all three axes; otherwise on the plane that touches the sphere at the centre.
         offsets: (3 TILE_PIXELS), written.
     """
     width, height = len(columns), len(rows)
@@ -164,7 +164,7 @@ def set_tile_pixels(kind, columns, rows, rotation, left, top, centre, frame, is_
 
 @inline_kernel_no_refcount
 def _reset_transmittance(columns, rows, left, top, transmittance):
-    """Set the transmittance to 1, and to 0 for pixels outside the image, which are then finished."""
+    """Set the transmittance to 1; to 0 for pixels outside the image, so that they count as finished."""
     width, height = len(columns), len(rows)
     for pixel in range(TILE_PIXELS):
         x, y = image_position(pixel, left, top)
@@ -187,7 +187,7 @@ def load_eight_records(records, intersections, e, last):
 
     Args:
         e: first intersection.
-        last: intersection that is repeated past the end.
+        last: last intersection, repeated past the end.
     """
     r0 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * e))
     r1 = RECORD_SIZE * np.int64(load_scalar(intersections, 2 * min(e + 1, last)))
@@ -218,7 +218,7 @@ def load_chunk(records, values, intersections, first, count, frame, exact, is_3d
         chunk_values: (CHUNK_SIZE value), written.
 
     Returns:
-        Whether the footprints have three components, since a Gaussian may be too far from the tile's centre for two.
+        Whether the footprints have three components, because a Gaussian is too far from the tile's centre for two.
     """
     num_values = values.shape[1]
     while _compute_footprints(records, intersections, first, count, frame, exact, is_3d, footprints):
@@ -237,10 +237,10 @@ def load_chunk(records, values, intersections, first, count, frame, exact, is_3d
 
 @inline_kernel_no_refcount
 def _compute_footprints(records, intersections, first, count, frame, exact, is_3d, footprints):
-    """Compute a chunk's footprints; returns whether they must be computed again in 3d."""
+    """Compute a chunk's footprints; return whether they must be computed again in 3d."""
     last = first + count - 1
-    on, one = broadcast(exact), broadcast(np.float32(1))
-    least, most = one, broadcast(np.float32(0))
+    l_factor, one = broadcast(exact), broadcast(np.float32(1))
+    min_ahead, max_horizon = one, broadcast(np.float32(0))
     for at in range(0, count, LANES):
         low, high = load_eight_records(records, intersections, first + at, last)
         n_x, n_y, n_z, residual_x, residual_y, residual_z, a_x, a_y = low
@@ -251,11 +251,11 @@ def _compute_footprints(records, intersections, first, count, frame, exact, is_3
         m_x, m_y, m_z = _to_tile_frame(frame, m_x, m_y, m_z)
         a_x, a_y, a_z = _to_tile_frame(frame, a_x, a_y, a_z)
         b_x, b_y, b_z = _to_tile_frame(frame, b_x, b_y, b_z)
-        l_x = on * multiply_add(l_along_a, a_x, multiply_add(l_along_b, b_x, m_x))
-        l_y = on * multiply_add(l_along_a, a_y, multiply_add(l_along_b, b_y, m_y))
+        l_x = l_factor * multiply_add(l_along_a, a_x, multiply_add(l_along_b, b_x, m_x))
+        l_y = l_factor * multiply_add(l_along_a, a_y, multiply_add(l_along_b, b_y, m_y))
         ahead = one + m_z
         if is_3d:
-            l_z = on * multiply_add(l_along_a, a_z, multiply_add(l_along_b, b_z, ahead))
+            l_z = l_factor * multiply_add(l_along_a, a_z, multiply_add(l_along_b, b_z, ahead))
             store(footprints, THIRD * CHUNK_SIZE + at, a_z)
             store(footprints, (THIRD + 1) * CHUNK_SIZE + at, b_z)
             store(footprints, (THIRD + 2) * CHUNK_SIZE + at, l_z)
@@ -264,8 +264,8 @@ def _compute_footprints(records, intersections, first, count, frame, exact, is_3
         # If this is below 1, no pixel beyond the horizon, where L < 0, reaches the alpha cut: log2 alpha is at most
         # log2_peak - 1 / radial_variance there.
         horizon = radial_variance * (log2_peak + broadcast(np.float32(_HORIZON_MARGIN - LOG2_ALPHA_CUT)))
-        least, inverse = min(least, ahead), one / ahead
-        most = max(most, horizon)
+        min_ahead, inverse = min(min_ahead, ahead), one / ahead
+        max_horizon = max(max_horizon, horizon)
         store(footprints, ROW_A * CHUNK_SIZE + at, ahead * a_x)
         store(footprints, (ROW_A + 1) * CHUNK_SIZE + at, ahead * a_y)
         store(footprints, ROW_B * CHUNK_SIZE + at, ahead * b_x)
@@ -276,7 +276,8 @@ def _compute_footprints(records, intersections, first, count, frame, exact, is_3
         store(footprints, (POINT + 1) * CHUNK_SIZE + at, inverse * m_y)
         store(footprints, RADIAL_VARIANCE * CHUNK_SIZE + at, radial_variance)
         store(footprints, LOG2_PEAK * CHUNK_SIZE + at, log2_peak)
-    return not is_3d and (any_lane(broadcast(np.float32(MIN_PLANAR_COSINE)) > least) or any_lane(most > one))
+    is_far = any_lane(broadcast(np.float32(MIN_PLANAR_COSINE)) > min_ahead)
+    return not is_3d and (is_far or any_lane(max_horizon > one))
 
 
 @inline_kernel_no_refcount
@@ -291,7 +292,7 @@ def _to_tile_frame(frame, x, y, z):
 
 @inline_kernel_no_refcount
 def mark_blocks(intersections, first, count, masks):
-    """Set the bits of the Gaussians that reach each column and each row of blocks; a block's are in both.
+    """Set the bits of the Gaussians that reach each column and each row of blocks; those of a block are in both.
 
     Args:
         intersections: flat.
@@ -335,7 +336,7 @@ class SavedForBackward(NamedTuple):
 
 
 def allocate_saved(starts: Longs, workspace: Workspace) -> SavedForBackward:
-    """Memory for what `rasterize_forward` saves of these tiles."""
+    """Allocate the memory of `SavedForBackward` for these tiles."""
     num_chunks = -(-np.diff(starts) // CHUNK_SIZE)
     rows = np.concatenate((np.zeros(1, np.int64), np.cumsum(num_chunks)))
     transmittance = workspace.array((int(rows[-1]), TILE_PIXELS), np.float32)
@@ -402,7 +403,7 @@ def _rasterize_tiles(
                 set_tile_pixels(kind, columns, rows, rotation, left, top, centre, frame, is_3d, offsets)
                 pixels_are_3d = np.int64(is_3d)
             mark_blocks(intersections, first, count, masks)
-            is_open = False
+            is_unfinished = False
             # The alphas of one block are computed before those of the previous block are composited (software
             # pipelining), so that the latencies of both overlap. Two halves of the buffers alternate.
             ready, num_ready, num_next, begin = -1, 0, 0, 0
@@ -416,16 +417,16 @@ def _rasterize_tiles(
                     )
                 other = BUFFER_SIZE - begin
                 if ready >= 0 and num_values == VALUE_LANES:
-                    is_open |= _blend_four_values(
+                    is_unfinished |= _blend_four_values(
                         ready, num_ready, log2_alphas, indices, other, chunk_values, transmittance, tile_sums
                     )
                 elif ready >= 0:
-                    is_open |= _compute_weights(ready, num_ready, log2_alphas, other, transmittance)
+                    is_unfinished |= _compute_weights(ready, num_ready, log2_alphas, other, transmittance)
                     _accumulate_values(
                         ready, num_ready, log2_alphas, indices, other, chunk_values, num_values, tile_sums
                     )
                 ready, num_ready, begin = block, num_next, other
-            if not is_open:
+            if not is_unfinished:
                 break
         if len(saved_transmittance) > 0:
             saved_num_chunks[tile] = num_chunks
@@ -446,8 +447,8 @@ def compute_log2_alphas(block, masks, is_3d, footprints, offsets, log2_alphas, i
         log2_alphas, indices: written from `begin` on, LANES and one number per Gaussian; indices are within the chunk.
 
     Returns:
-        The number of Gaussians. One more with alpha 0 follows them. Gaussians that no pixel of the block sees, in a
-        corner of their box, are included: dropping them would make each step of the loop depend on the previous one.
+        The number of Gaussians. One with alpha 0 follows them. Gaussians with alpha 0 in the whole block are included:
+        if they were skipped, each step of the loop would depend on the previous one.
     """
     pixel = block * LANES
     x, y, z = load(offsets, pixel), load(offsets, TILE_PIXELS + pixel), load(offsets, 2 * TILE_PIXELS + pixel)
@@ -468,7 +469,7 @@ def compute_log2_alphas(block, masks, is_3d, footprints, offsets, log2_alphas, i
 
 @inline_kernel_no_refcount
 def _list_gaussians(block, masks, indices, begin):
-    """Write the chunk indices of the Gaussians that reach a block, and a 0 after them; returns their number."""
+    """Write the chunk indices of the Gaussians that reach a block, and a 0 after them; return their number."""
     at, column, row = begin, block % BLOCKS_ACROSS, ROW_MASKS + block // BLOCKS_ACROSS
     for word in range(CHUNK_WORDS):
         bits = load_scalar(masks, word * NUM_MASKS + column) & load_scalar(masks, word * NUM_MASKS + row)
@@ -482,7 +483,7 @@ def _list_gaussians(block, masks, indices, begin):
 def evaluate_footprint(is_3d, footprints, s, x, y, z):
     """A, B and L of Gaussian `s` of the chunk at a block's pixels, up to a factor per pixel that cancels in Q / L^2.
 
-    The offsets from the Gaussian are subtracted first: they are small, so that the sums have no cancellation.
+    Offsets are relative to the Gaussian first: they are small, so the sums have no cancellation.
     """
     x = x - load_broadcast(footprints, POINT * CHUNK_SIZE + s)
     y = y - load_broadcast(footprints, (POINT + 1) * CHUNK_SIZE + s)
@@ -509,9 +510,9 @@ def compute_alpha(log2_alpha):
 
 @inline_kernel_no_refcount
 def _blend_four_values(block, count, log2_alphas, indices, begin, chunk_values, transmittance, tile_sums):
-    """Composite the Gaussians of a block, four values each; returns whether a pixel is unfinished."""
+    """Composite the Gaussians of a block, four values each; return whether a pixel is unfinished."""
     pixel = block * LANES
-    passing = load(transmittance, pixel)
+    transmitted = load(transmittance, pixel)
     sum0, sum1 = load(tile_sums, pixel), load(tile_sums, TILE_PIXELS + pixel)
     sum2, sum3 = load(tile_sums, 2 * TILE_PIXELS + pixel), load(tile_sums, 3 * TILE_PIXELS + pixel)
     for at in range(begin, begin + count, 2):  # after an odd number the last alpha is 0
@@ -519,41 +520,41 @@ def _blend_four_values(block, count, log2_alphas, indices, begin, chunk_values, 
         second = VALUE_LANES * np.int64(load_scalar(indices, at + 1))
         alpha = compute_alpha(load(log2_alphas, at * LANES))
         next_alpha = compute_alpha(load(log2_alphas, at * LANES + LANES))
-        weight = alpha * passing
-        passing = multiply_add(-alpha, passing, passing)
+        weight = alpha * transmitted
+        transmitted = multiply_add(-alpha, transmitted, transmitted)
         sum0 = multiply_add(weight, load_broadcast(chunk_values, first), sum0)
         sum1 = multiply_add(weight, load_broadcast(chunk_values, first + 1), sum1)
         sum2 = multiply_add(weight, load_broadcast(chunk_values, first + 2), sum2)
         sum3 = multiply_add(weight, load_broadcast(chunk_values, first + 3), sum3)
-        weight = next_alpha * passing
-        passing = multiply_add(-next_alpha, passing, passing)
+        weight = next_alpha * transmitted
+        transmitted = multiply_add(-next_alpha, transmitted, transmitted)
         sum0 = multiply_add(weight, load_broadcast(chunk_values, second), sum0)
         sum1 = multiply_add(weight, load_broadcast(chunk_values, second + 1), sum1)
         sum2 = multiply_add(weight, load_broadcast(chunk_values, second + 2), sum2)
         sum3 = multiply_add(weight, load_broadcast(chunk_values, second + 3), sum3)
-    store(transmittance, pixel, passing)
+    store(transmittance, pixel, transmitted)
     store(tile_sums, pixel, sum0)
     store(tile_sums, TILE_PIXELS + pixel, sum1)
     store(tile_sums, 2 * TILE_PIXELS + pixel, sum2)
     store(tile_sums, 3 * TILE_PIXELS + pixel, sum3)
-    return any_lane(passing > broadcast(np.float32(MIN_TRANSMITTANCE)))
+    return any_lane(transmitted > broadcast(np.float32(MIN_TRANSMITTANCE)))
 
 
 @inline_kernel_no_refcount
 def _compute_weights(block, count, log2_alphas, begin, transmittance):
-    """Replace log2 alphas by weights; returns whether a pixel is unfinished."""
-    passing = load(transmittance, block * LANES)
+    """Replace log2 alphas by weights; return whether a pixel is unfinished."""
+    transmitted = load(transmittance, block * LANES)
     for at in range(begin, begin + count):
         alpha = compute_alpha(load(log2_alphas, at * LANES))
-        store(log2_alphas, at * LANES, alpha * passing)
-        passing = multiply_add(-alpha, passing, passing)
-    store(transmittance, block * LANES, passing)
-    return any_lane(passing > broadcast(np.float32(MIN_TRANSMITTANCE)))
+        store(log2_alphas, at * LANES, alpha * transmitted)
+        transmitted = multiply_add(-alpha, transmitted, transmitted)
+    store(transmittance, block * LANES, transmitted)
+    return any_lane(transmitted > broadcast(np.float32(MIN_TRANSMITTANCE)))
 
 
 @inline_kernel_no_refcount
 def _accumulate_values(block, count, weights, indices, begin, chunk_values, num_values, tile_sums):
-    """Add a block's weighted values to the sums, any number of values."""
+    """Add a block's weighted values to the sums, for any number of values."""
     for channel in range(num_values):
         pixel = channel * TILE_PIXELS + block * LANES
         total = load(tile_sums, pixel)

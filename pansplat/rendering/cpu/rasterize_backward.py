@@ -1,14 +1,14 @@
-"""Gradients of stage three: from an image's gradient to those of records and values, one slot per intersection.
+"""Gradients of stage three: of records and values, one slot per intersection, from the gradient of an image.
 
 Source: docs/rendering.md, sections 3 and 4. The forward saved the transmittance before each chunk of a tile, so chunks
 are processed back to front, each with all its data in the L2 cache. In each block the weights are recomputed front to
-back, then gradients follow back to front. What a ray meets behind a Gaussian is blended from the back as a mean, so
-nothing is divided by a transmittance. Last, the gradient sums of each Gaussian over all its blocks are accumulated in
-registers and become the gradient of its record.
+back, then gradients back to front. The mean gradient by weight behind each Gaussian is blended from the back, without a
+division by a transmittance. Then the gradient sums of each Gaussian over all its blocks are accumulated in registers
+and converted to the gradient of its record.
 
 An alpha depends on a pixel through A / L and B / L alone, which are a projective map of the pixel. This map has eight
 parameters, and a rotation of A and B into each other has no effect on the alpha. So seven sums, and two for the radial
-variance and the peak, are sufficient statistics of a tile's pixels, whatever frame the footprints are computed in.
+variance and the peak, are sufficient statistics of a tile's pixels in any frame.
 """
 
 import math
@@ -71,8 +71,8 @@ from pansplat.rendering.cpu.tiling import parallel_for_tiles
 
 _MAX_PAIRS = NUM_BLOCKS * CHUNK_SIZE  # pairs of a Gaussian and a block, in a chunk
 _PAIR_SIZE = 2 * LANES  # numbers in a pair: gradients by log alpha, and weights; one cache line
-_NUM_SUMS = 16  # for each Gaussian; see `_accumulate_gradient_sums`
-_VALUE_SUMS = 9  # where the sums of values begin
+_NUM_SUMS = 16  # per Gaussian; see `_accumulate_gradient_sums`
+_VALUE_SUMS = 9  # index of the first sum of values
 _LN2 = math.log(2)
 _MIN_DIVISOR = 1e-16  # of L^2 + radial_variance Q; only reached where the gradient is 0
 _WRITE_AHEAD = 24  # Gaussians, from the prefetch of a slot to the write
@@ -127,7 +127,7 @@ def _rasterize_tiles_backward(
     tile_grads, behind = np.zeros((padded_values + 2) * TILE_PIXELS, np.float32), np.empty(TILE_PIXELS, np.float32)
     footprints = np.empty(FOOTPRINT_SIZE * CHUNK_SIZE, np.float32)
     chunk_values = np.zeros(num_values * CHUNK_SIZE + VALUE_LANES, np.float32)
-    # Of each pair also its block, and the previous pair of the same Gaussian: a linked list from `heads` on.
+    # `links` holds the block of each pair and the previous pair of the same Gaussian: a linked list from `heads` on.
     pairs, links = np.empty(_MAX_PAIRS * _PAIR_SIZE, np.float32), np.empty(2 * _MAX_PAIRS, np.int32)
     heads, masks = np.empty(CHUNK_SIZE, np.int32), np.empty(CHUNK_WORDS * NUM_MASKS, np.uint64)
     log2_alphas, indices = np.empty(2 * BUFFER_SIZE * LANES, np.float32), np.empty(2 * BUFFER_SIZE, np.uint8)
@@ -170,11 +170,11 @@ def _rasterize_tiles_backward(
 
 @inline_kernel_no_refcount
 def _load_tile_gradients(sums, grad_sums, left, top, num_values, padded_values, tile_grads):
-    """Load a tile's gradients by blocks, 0 outside the image; then two more rows.
+    """Load a tile's gradients by blocks, 0 outside the image; then write two more rows.
 
-    The rows are the gradient of the sum of the weights minus the dot product of gradients and sums, and this dot
+    These are the gradient of the sum of the weights minus the dot product of gradients and sums, and this dot
     product. The weights and the final transmittance sum to 1, so a constant may be subtracted from the value of each
-    Gaussian and of what lies behind all of them: with their mean the differences are small.
+    Gaussian and of the background. With their mean as this constant, the differences are small.
     """
     height, width = grad_sums.shape[1], grad_sums.shape[2]
     if left + TILE_SIZE > width or top + TILE_SIZE > height:
@@ -224,14 +224,14 @@ def _backpropagate_chunk(
     """Compute weights and gradients by log alpha of a chunk's pairs, block by block."""
     heads[:] = -1
     # Three blocks are in progress at a time (software pipelining): log2 alphas of one, weights of the previous one,
-    # gradients of the one before. Their latencies overlap, and each loop count is known long before its loop.
+    # gradients of the one before. Their latencies overlap, and each loop count is computed long before its loop.
     ready, num_ready, weighted, num_weighted, begin, pair = -1, 0, -1, 0, 0, 0
     for block in range(NUM_BLOCKS + 2):
-        num_next, is_open = 0, False
+        num_next, is_unfinished = 0, False
         if block < NUM_BLOCKS:
             prefetch_slice(records, values, intersections, block, next_first)
-            is_open = any_lane(load(transmittance, block * LANES) > broadcast(np.float32(MIN_TRANSMITTANCE)))
-            if not is_open:
+            is_unfinished = any_lane(load(transmittance, block * LANES) > broadcast(np.float32(MIN_TRANSMITTANCE)))
+            if not is_unfinished:
                 continue
             num_next = compute_log2_alphas(block, masks, is_3d, footprints, offsets, log2_alphas, indices, begin)
         other, num_visible = BUFFER_SIZE - begin, 0
@@ -245,28 +245,28 @@ def _backpropagate_chunk(
                 tile_grads, behind, pairs, links, heads, pair,
             )  # fmt: skip
             pair += num_weighted
-        weighted, num_weighted, ready, num_ready = ready, num_visible, block if is_open else -1, num_next
+        weighted, num_weighted, ready, num_ready = ready, num_visible, block if is_unfinished else -1, num_next
         begin = other
 
 
 @inline_kernel_no_refcount
 def _compute_block_weights(block, count, log2_alphas, indices, begin, transmittance, output, alphas, weights, visible):
-    """Compute alphas and weights of the Gaussians that a pixel of the block sees; returns their number.
+    """Compute alphas and weights of the Gaussians that a pixel of the block sees; return their number.
 
     Args:
         log2_alphas, indices: of `count` Gaussians, from `begin` on.
         alphas, weights, visible: written from `output` on; `visible` holds indices within the chunk.
     """
-    passing, to = load(transmittance, block * LANES), output
+    transmitted, end = load(transmittance, block * LANES), output
     for at in range(begin, begin + count):
         alpha = compute_alpha(load(log2_alphas, at * LANES))
-        store(alphas, to * LANES, alpha)
-        store(weights, to * LANES, alpha * passing)
-        store_scalar(visible, to, np.int32(load_scalar(indices, at)))
-        passing = multiply_add(-alpha, passing, passing)
-        # The next Gaussian overwrites this one if no pixel sees it: a branch could not be predicted.
-        to += np.int64(any_lane(alpha > broadcast(np.float32(0))))
-    return to - output
+        store(alphas, end * LANES, alpha)
+        store(weights, end * LANES, alpha * transmitted)
+        store_scalar(visible, end, np.int32(load_scalar(indices, at)))
+        transmitted = multiply_add(-alpha, transmitted, transmitted)
+        # The next Gaussian overwrites this one if no pixel sees it: a branch would be mispredicted.
+        end += np.int64(any_lane(alpha > broadcast(np.float32(0))))
+    return end - output
 
 
 @inline_kernel_no_refcount
@@ -281,14 +281,20 @@ def _backpropagate_block(
     for at in range(begin + count - 1, begin - 1, -1):
         s = np.int64(load_scalar(visible, at))
         alpha, weight = load(alphas, at * LANES), load(weights, at * LANES)
-        worth = base
-        for value in range(0, padded_values, VALUE_LANES):  # past the last value: finite numbers times 0
-            row, own = value * TILE_PIXELS + pixel, num_values * s + value
-            worth = multiply_add(load(tile_grads, row), load_broadcast(chunk_values, own), worth)
-            worth = multiply_add(load(tile_grads, row + TILE_PIXELS), load_broadcast(chunk_values, own + 1), worth)
-            worth = multiply_add(load(tile_grads, row + 2 * TILE_PIXELS), load_broadcast(chunk_values, own + 2), worth)
-            worth = multiply_add(load(tile_grads, row + 3 * TILE_PIXELS), load_broadcast(chunk_values, own + 3), worth)
-        difference = worth - mean_behind
+        grad_weight = base
+        for value in range(0, padded_values, VALUE_LANES):  # padding: finite numbers times 0
+            row, first = value * TILE_PIXELS + pixel, num_values * s + value
+            grad_weight = multiply_add(load(tile_grads, row), load_broadcast(chunk_values, first), grad_weight)
+            grad_weight = multiply_add(
+                load(tile_grads, row + TILE_PIXELS), load_broadcast(chunk_values, first + 1), grad_weight
+            )
+            grad_weight = multiply_add(
+                load(tile_grads, row + 2 * TILE_PIXELS), load_broadcast(chunk_values, first + 2), grad_weight
+            )
+            grad_weight = multiply_add(
+                load(tile_grads, row + 3 * TILE_PIXELS), load_broadcast(chunk_values, first + 3), grad_weight
+            )
+        difference = grad_weight - mean_behind
         store(pairs, pair * _PAIR_SIZE, select(max_alpha > alpha, weight * difference, zero))
         store(pairs, pair * _PAIR_SIZE + LANES, weight)
         mean_behind = multiply_add(alpha, difference, mean_behind)
@@ -385,8 +391,7 @@ def _sum_value_gradient(s, heads, links, pairs, tile_grads, value):
 def _write_record_gradients(s, records, intersections, first, count, slots, gradient_sums, exact, grad_records):
     """Convert the sums of eight Gaussians to the gradients of their records, and write these to their slots.
 
-    The length of a ray is arbitrary. With L = 1, d - n = x p + y q, where a.p = b.q = 1 and a.q = b.p = l.p = l.q = 0.
-    So x and y give the offset.
+    The length of a ray is arbitrary. For L = 1, d - n = x p + y q, where a.p = b.q = 1 and a.q = b.p = l.p = l.q = 0.
     """
     at = _NUM_SUMS * s
     xx, xy, yy, sum_x, sum_y, qx, qy, qq = _load_columns(gradient_sums, at)
@@ -395,10 +400,10 @@ def _write_record_gradients(s, records, intersections, first, count, slots, grad
     n_x, n_y, n_z, _, _, _, a_x, a_y = low
     a_z, b_x, b_y, b_z, l_along_a, l_along_b, _, _ = high
     n, a, b = (n_x, n_y, n_z), (a_x, a_y, a_z), (b_x, b_y, b_z)
-    zero, one, on = broadcast(np.float32(0)), broadcast(np.float32(1)), broadcast(exact)
+    zero, one, l_factor = broadcast(np.float32(0)), broadcast(np.float32(1)), broadcast(exact)
     two = broadcast(np.float32(2 * _LN2))
-    twice, half = two * on, broadcast(np.float32(_LN2))
-    ahead = on * n[0], on * n[1], multiply_add(on, n[2], one - on)
+    twice, half = two * l_factor, broadcast(np.float32(_LN2))
+    ahead = l_factor * n[0], l_factor * n[1], multiply_add(l_factor, n[2], one - l_factor)
     p, q = _cross(b, ahead), _cross(ahead, a)
     inverse = one / _dot(a, p)
     p = _combine(inverse, p, -l_along_a, n)
@@ -412,17 +417,17 @@ def _write_record_gradients(s, records, intersections, first, count, slots, grad
     grad_n_x = grad_l[0] + multiply_add(back, l_row[0], across[0])
     grad_n_y = grad_l[1] + multiply_add(back, l_row[1], across[1])
     grad_n_z = grad_l[2] + multiply_add(back, l_row[2], across[2])
-    # The sums have been read, so the rows of the gradients replace them.
+    # The gradients overwrite the sums, which are in registers.
     low = transpose(grad_n_x, grad_n_y, grad_n_z, zero, zero, zero, grad_a[0], grad_a[1])
     high = transpose(
-        grad_a[2], grad_b[0], grad_b[1], grad_b[2], twice * qx, twice * qy, half * on * qq, half * sum_gradient
+        grad_a[2], grad_b[0], grad_b[1], grad_b[2], twice * qx, twice * qy, half * l_factor * qq, half * sum_gradient
     )
     _store_rows(gradient_sums, at, low)
     _store_rows(gradient_sums, at + LANES, high)
-    for place in range(s, min(s + LANES, count)):
-        row = RECORD_SIZE * slots[first + place]
-        store_nontemporal(grad_records, row, load(gradient_sums, _NUM_SUMS * place))
-        store_nontemporal(grad_records, row + LANES, load(gradient_sums, _NUM_SUMS * place + LANES))
+    for i in range(s, min(s + LANES, count)):
+        row = RECORD_SIZE * slots[first + i]
+        store_nontemporal(grad_records, row, load(gradient_sums, _NUM_SUMS * i))
+        store_nontemporal(grad_records, row + LANES, load(gradient_sums, _NUM_SUMS * i + LANES))
 
 
 @inline_kernel_no_refcount

@@ -1,7 +1,7 @@
-"""Layout of the arrays that the CPU rasteriser reads: records, values, tile intersections and pixel tables.
+"""Layout of the CPU rasteriser's arrays: records, values, tile intersections and pixel tables.
 
-Source: docs/rendering.md, section 3, in powers of two. With n the unit direction of the Gaussian, d the ray of a
-pixel, and a, b, l the footprint rows:
+Source: docs/rendering.md, section 3, with powers of two for exponentials. With n the unit direction of the
+Gaussian, d the ray of a pixel, and a, b, l the footprint rows:
 
     A = a.(d - n),  B = b.(d - n),  L = 1 + l.(d - n),  l = n + l_along_a a + l_along_b b
     alpha = min(0.99, 2^(log2_peak - Q / (L^2 + radial_variance Q))),  Q = A^2 + B^2
@@ -51,8 +51,8 @@ HALF_LOG2_E = 0.5 * math.log2(math.e)
 
 BOX_BITS = 8
 """A box within a tile is x0 + (x1 << 8) + (y0 << 16) + (y1 << 24): first and last pixel column and row, 0 to 31,
-inclusive. It may be larger than the footprint, whose alpha is below the cut there. A box that wraps around the panorama
-and reaches both ends of one tile takes the tile's full width."""
+inclusive. It may be larger than the footprint: the alpha cut removes the other pixels. A box that wraps around the
+panorama and reaches both ends of one tile has the tile's full width."""
 
 EQUIRECT_RAYS = 0  # columns: sine and cosine of the longitude; rows: of the latitude
 PINHOLE_RAYS = 1  # columns: x of the ray (x, y, 1); rows: y

@@ -1,6 +1,6 @@
-"""What the CPU kernels run on: compilation by numba, worker threads, and working memory that is reused.
+"""Compilation by numba, worker threads, and reused working memory for the CPU kernels.
 
-Compiled code is cached on disk, in numba's cache directory, so each kernel is compiled once per machine.
+Numba caches compiled code on disk, so each kernel is compiled once per machine.
 """
 
 import contextlib
@@ -53,7 +53,7 @@ def kernel(function: Callable[..., Any]) -> Any:
         compiled: Any = nb.njit(cache=True, **_OPTIONS)(function)
     except RuntimeError:  # no writable cache directory
         return nb.njit(**_OPTIONS)(function)
-    # Numba invalidates by the kernel's own file; the functions inlined into it come from others.
+    # Numba only checks the kernel's own file for changes; functions from other files are inlined into it.
     compiled._cache._cache_file._source_stamp = _hash_sources(Path(inspect.getfile(function)))
     return compiled
 
@@ -72,7 +72,7 @@ def _hash_sources(module: Path) -> str:
 
 
 def inline_kernel(function: Callable[..., Any]) -> Any:
-    """Compile a function into each kernel that calls it."""
+    """Inline a function into each kernel that calls it."""
     return _inline(function)
 
 
@@ -106,7 +106,7 @@ def announce_compilation() -> Iterator[None]:
 class _CompileListener(event.Listener):
     """Schedules the message when the first kernel of this package is compiled, and pauses garbage collection.
 
-    Compilation makes millions of objects and little garbage; collection would take a tenth of the time.
+    Compilation makes millions of objects and little garbage; its collection would take a tenth of the time.
     """
 
     def __init__(self) -> None:
@@ -115,8 +115,8 @@ class _CompileListener(event.Listener):
 
     def on_start(self, event: event.Event) -> None:
         data: Any = event.data
-        is_ours = data["dispatcher"].py_func.__module__.startswith(_PACKAGE)
-        if is_ours and self._timer is None:
+        is_from_pansplat = data["dispatcher"].py_func.__module__.startswith(_PACKAGE)
+        if is_from_pansplat and self._timer is None:
             self._timer = threading.Timer(_MESSAGE_DELAY, _show_message)
             self._timer.daemon = True
             self._timer.start()
@@ -124,7 +124,7 @@ class _CompileListener(event.Listener):
             gc.disable()
 
     def on_end(self, event: event.Event) -> None:
-        """Nothing: the delay counts from the first of several kernels."""
+        """Do nothing: the delay counts from the first of several kernels."""
 
     def stop(self) -> None:
         """Cancel the message and resume garbage collection."""
@@ -147,14 +147,14 @@ _pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
 
 
 def thread_count() -> int:
-    """Number of threads to use: as many as torch's operations may use."""
+    """Number of threads of torch's operations, at least 1."""
     return max(1, torch.get_num_threads())
 
 
 def parallel_for(work: Callable[[int], object], count: int, threads: int) -> None:
-    """Call `work` with 0 .. count - 1 on several threads, the calling thread included; each takes the next item.
+    """Call `work` with each item, 0 to count - 1, on several threads, one of which is the calling thread.
 
-    Items must be independent: which thread takes which is not fixed. An exception, KeyboardInterrupt included, is
+    Items must be independent, because any thread may process any item. An exception, KeyboardInterrupt included, is
     raised after all threads have stopped, so that no thread writes to a buffer that the caller has released.
     """
     threads = min(threads, count)
@@ -182,7 +182,7 @@ def parallel_for(work: Callable[[int], object], count: int, threads: int) -> Non
 
 
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """The pool for this number of threads; a forked child makes its own, since threads do not survive a fork."""
+    """The pool for this number of threads; a forked process makes its own, since threads do not survive a fork."""
     key = os.getpid(), threads
     pool = _pools.get(key)
     if pool is None:
@@ -192,34 +192,36 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 # --- working memory ---
 #
-# Fresh pages cost as much time as a stage's arithmetic, because the system clears them; so blocks are reused.
+# Buffers are reused, because new pages cost as much time as a stage's arithmetic: the system clears them.
 
-_MAX_BLOCK = 1 << 28  # bytes of a block that is kept for reuse
-_MAX_IDLE = 1 << 29  # bytes of all idle blocks
+_MAX_BUFFER = 1 << 28  # bytes of a buffer that is kept for reuse
+_MAX_IDLE = 1 << 29  # bytes of all idle buffers
 _ALIGNMENT = 64  # bytes: a cache line
 
 _lock = threading.Lock()
 _idle: list[npt.NDArray[np.uint8]] = []
-_returned: deque[npt.NDArray[np.uint8]] = deque()  # not yet in `_idle`: a workspace may end while the lock is held
+_returned: deque[npt.NDArray[np.uint8]] = (
+    deque()
+)  # not yet in `_idle`: a workspace may end while a thread holds the lock
 
 
 class Workspace:
-    """Arrays that stay valid as long as this object lives; their memory is then reused by other workspaces."""
+    """Arrays that are valid while this object exists; other workspaces reuse their memory afterwards."""
 
     def __init__(self) -> None:
-        self._blocks: list[npt.NDArray[np.uint8]] = []
+        self._buffers: list[npt.NDArray[np.uint8]] = []
 
     def array(self, shape: int | tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
         """An uninitialised array, aligned to a cache line."""
         size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-        block = _take_block(size) if size <= _MAX_BLOCK else np.empty(size + _ALIGNMENT, np.uint8)
-        if size <= _MAX_BLOCK:
-            self._blocks.append(block)
-        start = -block.ctypes.data % _ALIGNMENT
-        return block[start : start + size].view(dtype).reshape(shape)
+        buffer = _take_buffer(size) if size <= _MAX_BUFFER else np.empty(size + _ALIGNMENT, np.uint8)
+        if size <= _MAX_BUFFER:
+            self._buffers.append(buffer)
+        start = -buffer.ctypes.data % _ALIGNMENT
+        return buffer[start : start + size].view(dtype).reshape(shape)
 
     def __del__(self) -> None:
-        _returned.extend(getattr(self, "_blocks", ()))  # torch.compile makes objects without calling __init__
+        _returned.extend(getattr(self, "_buffers", ()))  # torch.compile makes objects without calling __init__
         if _lock.acquire(blocking=False):
             try:
                 _collect_returned()
@@ -242,18 +244,18 @@ def pooled_empty(shape: int | tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDAr
 
 
 def _collect_returned() -> None:
-    """Move returned blocks to the idle ones and free the oldest beyond the limit; the caller holds the lock."""
+    """Move returned buffers to the idle ones and free the oldest beyond the limit; the caller holds the lock."""
     while _returned:
         _idle.append(_returned.popleft())
-    while sum(block.nbytes for block in _idle) > _MAX_IDLE:
+    while sum(buffer.nbytes for buffer in _idle) > _MAX_IDLE:
         _idle.pop(0)
 
 
-def _take_block(size: int) -> npt.NDArray[np.uint8]:
-    """The smallest idle block that fits without wasting more than half, or a new one."""
+def _take_buffer(size: int) -> npt.NDArray[np.uint8]:
+    """The smallest idle buffer that fits without wasting more than half, or a new one."""
     with _lock:
         _collect_returned()
-        fitting = [i for i, block in enumerate(_idle) if size + _ALIGNMENT <= block.nbytes <= 2 * size + 4096]
+        fitting = [i for i, buffer in enumerate(_idle) if size + _ALIGNMENT <= buffer.nbytes <= 2 * size + 4096]
         if fitting:
             return _idle.pop(min(fitting, key=lambda i: _idle[i].nbytes))
     return np.empty(size + _ALIGNMENT, np.uint8)

@@ -1,12 +1,12 @@
 """SIMD vectors of eight float32 or float64 inside numba kernels, and transposes between arrays and vectors.
 
-They exist in compiled code only. `+ - * /`, unary minus, comparisons, `min` and `max` work on vectors, `&` on masks. On
-`f64x8` also `abs`, `math.sqrt` and `math.copysign` do, and one operand may be a float64, so a formula written for
-numbers serves for vectors. Loops that LLVM vectorises by itself check whether their arrays overlap and write every
+They exist in compiled code only. `+ - * /`, unary minus, comparisons, `min` and `max` work on vectors, `&` on masks;
+`abs`, `math.sqrt` and `math.copysign` work on `f64x8`. One operand of an `f64x8` may be a float64, so a formula for
+numbers also works on vectors. Loops that LLVM vectorises by itself check whether their arrays overlap and write every
 intermediate value to memory; these vectors stay in registers.
 
 LLVM maps an `f32x8` to one AVX register, or to two of SSE or NEON. On processors that execute 512-bit operations in two
-halves, eight lanes are as fast as sixteen and fit a Gaussian's outline better.
+halves, eight lanes are as fast as sixteen, and fewer of them lie outside a footprint.
 
 Arrays are C-contiguous. `array` and `numbers` are flat; `rows` is 2-D.
 """
@@ -36,15 +36,15 @@ _BYTES, _INTS, _LONGS, _FLOATS, _DOUBLES, _BITS = (
     ir.VectorType(kind, LANES) for kind in (_BYTE, _INT, _LONG, _FLOAT, _DOUBLE, ir.IntType(1))
 )
 _FOUR_FLOATS = ir.VectorType(_FLOAT, 4)
-_ELEMENT = object()  # in place of a type: that of an array's elements
+_ELEMENT = object()  # stands for the type of an array's elements
 _VECTOR_TYPES = {"f32x8": _FLOATS, "f64x8": _DOUBLES, "mask": _BITS}
-_ALIGNMENT = {_FLOATS: 4, _FOUR_FLOATS: 4, _DOUBLES: 8, _BYTES: 1}  # bytes: what arrays of the element type guarantee
+_ALIGNMENT = {_FLOATS: 4, _FOUR_FLOATS: 4, _DOUBLES: 8, _BYTES: 1}  # bytes, of the elements' type
 _CACHE_LINE = 64  # bytes
 _F64_FLAGS = ("contract", "nsz")  # as in runtime.py
 
 # 2^x on [-1/2, 1/2]: least maximum relative error (9.2e-8) among polynomials of degree 5 that are 1 at 0.
 _EXP2 = (1.0, 0.6931470036506653, 0.24022242426872253, 0.05550733581185341, 0.009671512991189957, 0.001326472731307149)
-_ROUND_F32 = 1.5 * 2.0**23  # adding it leaves the nearest integer in the low bits
+_ROUND_F32 = 1.5 * 2.0**23  # added to a number, it gives the nearest integer in the low bits
 _ROUND_F64 = 1.5 * 2.0**52
 _ROUND_F64_BITS = 0x4338000000000000
 _ROOT_HALF_BITS = 0x3FE6A09E667F3BCD  # of sqrt(1/2)
@@ -124,7 +124,7 @@ def _with_signature(function: Callable[..., Any], emit: Callable[..., Any], *par
     function.__name__, function.__doc__ = emit.__name__, emit.__doc__
     kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
     named = [inspect.Parameter(name, kind) for name in ("context", *parameters)]
-    function.__signature__ = inspect.Signature(named)  # type: ignore[attr-defined]
+    function.__signature__ = inspect.Signature(named)
     return llvm_intrinsic(function)
 
 
@@ -177,7 +177,9 @@ def _access(result: Any, *operands: Any) -> Callable[..., Any]:
     return decorate
 
 
-# Load, store, prefetch, broadcast. Those with a pointer take an array and an index: `load(array, index)`.
+# --- load, store, prefetch, broadcast ---
+#
+# A pointer is given as an array and an index: `load(array, index)`.
 
 
 @_access(f32x8)
@@ -201,7 +203,7 @@ def load_broadcast(builder, pointer):
 
 @_access(_ELEMENT)
 def load_scalar(builder, pointer):
-    """One element, without the check for a negative index that `array[index]` makes."""
+    """One element, without the check of `array[index]` for a negative index."""
     return builder.load(pointer)
 
 
@@ -287,14 +289,14 @@ def broadcast(context, number):
 @_operation(types.void)
 def align_stack(builder):
     """Align the kernel's stack to cache lines; called at its start, so that no spilled vector crosses a line."""
-    # LLVM aligns the stack for what is on it before it allocates registers: here a vector that seems to be used.
+    # LLVM aligns the stack for its variables before it allocates registers: this vector only seems to be used.
     place = alloca_once(builder, _DOUBLES)
     place.align = _CACHE_LINE
     kind = ir.FunctionType(ir.VoidType(), [place.type])
     builder.asm(kind, "", "r,~{memory}", [place], side_effect=True)
 
 
-# Arithmetic, masks, bits.
+# --- arithmetic, masks, bits ---
 
 
 @_operation(f64x8, f32x8)
@@ -311,7 +313,7 @@ def to_f32(builder, value):
 
 @_operation(f32x8, f32x8, f32x8, f32x8)
 def multiply_add(builder, a, b, c):
-    """a b + c, rounded once where the processor can."""
+    """a b + c, rounded once if the processor has such an instruction."""
     return _multiply_add(builder, a, b, c)
 
 
@@ -329,7 +331,7 @@ def exp2(builder, value):
 
 @_operation(types.UniTuple(f64x8, 2), f64x8)
 def mantissa_and_exponent(builder, value):
-    """m in [sqrt 1/2, sqrt 2) and a whole number e so that the value, above 0 and not subnormal, is m 2^e."""
+    """m in [sqrt 1/2, sqrt 2) and a whole number e with value = m 2^e; the value is above 0 and not subnormal."""
     bits = builder.bitcast(value, _LONGS)
     exponent = builder.ashr(builder.sub(bits, _constant(_LONGS, _ROOT_HALF_BITS)), _constant(_LONGS, 52))
     mantissa = builder.bitcast(builder.sub(bits, builder.shl(exponent, _constant(_LONGS, 52))), _DOUBLES)
@@ -338,9 +340,9 @@ def mantissa_and_exponent(builder, value):
 
 
 @llvm_intrinsic
-def select(context, condition, yes, no):
-    """`yes` where the condition holds, elsewhere `no`."""
-    return yes(mask, yes, yes), lambda context, builder, sig, args: builder.select(*args)
+def select(context, condition, if_true, if_false):
+    """`if_true` in the lanes where the condition holds, `if_false` in the others."""
+    return if_true(mask, if_true, if_true), lambda context, builder, sig, args: builder.select(*args)
 
 
 @_operation(types.boolean, mask)
@@ -357,7 +359,7 @@ def mask_bits(builder, condition):
 
 @_operation(types.intp, types.uint64)
 def popcount(builder, bits):
-    """How many bits of an unsigned 64-bit number are set."""
+    """Number of set bits of an unsigned 64-bit number."""
     return builder.ctpop(bits)
 
 
@@ -380,11 +382,11 @@ def list_set_bits(context, array, index, bits, base):
 
 @_operation(types.boolean, f32x8, types.uint32)
 def any_magnitude_reaches(builder, largest, bound):
-    """Whether a magnitude of `aos3_to_soa` and the like reaches a bound, given as twice its bits."""
+    """Whether a magnitude from `aos3_to_soa` and its variants reaches a bound, given as twice the bound's bits."""
     return _any(builder, builder.icmp_unsigned(">=", builder.bitcast(largest, _INTS), _splat(builder, bound, _INTS)))
 
 
-# Movement between lanes.
+# --- movement between lanes ---
 
 
 @_operation(types.float32, f32x8)
@@ -407,7 +409,7 @@ def lane_sums(builder, *rows):
 
 @_operation(types.UniTuple(f32x8, LANES), *[f32x8] * LANES)
 def transpose(builder, *rows):
-    """The columns of the square whose rows are eight vectors."""
+    """The columns of the 8 x 8 matrix whose rows are these vectors."""
     half = LANES // 2
     while half:
         swapped = list(rows)
@@ -420,14 +422,14 @@ def transpose(builder, *rows):
 
 @_operation(types.UniTuple(f32x8, 2), f32x8, f32x8)
 def join_halves(builder, a, b):
-    """The lower halves of two vectors as one, and the upper halves; it is its own inverse.
+    """The lower halves of two vectors as one vector, and the upper halves as one: two blocks become two rows of pixels.
 
-    Two blocks of two rows of four pixels become two rows of eight.
+    The operation is its own inverse.
     """
     return _halves(builder, a, b, LANES // 2)
 
 
-# Arrays of structures to structures of arrays, and back.
+# --- arrays of structures to structures of arrays, and back ---
 
 
 @_access(types.UniTuple(f32x8, 3))
@@ -438,7 +440,7 @@ def load_aos3(builder, pointer):
 
 @_access(types.UniTuple(f32x8, 4))
 def load_aos4(builder, pointer):
-    """Eight groups of four float32, likewise."""
+    """Eight groups of four float32: the first to the fourth of each group."""
     return _deinterleave(builder, _load_vectors(builder, pointer, 4))
 
 
@@ -527,22 +529,16 @@ soa_to_aos1, soa_to_aos3, soa_to_aos4 = (_soa_to_aos(size) for size in (1, 3, 4)
 
 @inline_kernel
 def load_transposed(numbers, r0, r1, r2, r3, r4, r5, r6, r7):
-    """The columns of eight rows of eight float32, given where the rows begin."""
+    """The columns of eight rows of eight float32, given the index of each row's first number."""
     return transpose(
-        load(numbers, r0),
-        load(numbers, r1),
-        load(numbers, r2),
-        load(numbers, r3),
-        load(numbers, r4),
-        load(numbers, r5),
-        load(numbers, r6),
-        load(numbers, r7),
-    )
+        load(numbers, r0), load(numbers, r1), load(numbers, r2), load(numbers, r3),
+        load(numbers, r4), load(numbers, r5), load(numbers, r6), load(numbers, r7),
+    )  # fmt: skip
 
 
 @inline_kernel
 def records_to_soa(records, start, count, soa, width):
-    """Turn `count` records into rows of `width` float32, one a field; past `count` the last record is repeated.
+    """Turn `count` records into rows of `width` float32, one per field; past `count` the last record is repeated.
 
     Args:
         records, soa: flat.
@@ -566,7 +562,7 @@ def records_to_soa(records, start, count, soa, width):
 
 @inline_kernel
 def soa_to_records(soa, width, start, count, records):
-    """Turn rows of `width` float32, one a field, into `count` records from `start` on.
+    """Turn rows of `width` float32, one per field, into `count` records from `start` on.
 
     Args:
         soa, records: flat.
@@ -587,7 +583,7 @@ def soa_to_records(soa, width, start, count, records):
             records[RECORD_SIZE * (start + i) + field] = soa[field * width + i]
 
 
-# LLVM code that several of the above emit.
+# --- LLVM code shared by several operations ---
 
 
 def _pointer(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
@@ -639,7 +635,7 @@ def _splat(builder: Any, number: Any, kind: Any) -> Any:
 
 
 def _multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
-    # Not llvm.fma: it calls a function for every lane where the processor has no such instruction.
+    # Not llvm.fma: without such an instruction it calls a function for every lane.
     kind = ir.FunctionType(_FLOATS, [_FLOATS] * 3)
     return builder.call(get_or_insert_function(builder.module, kind, f"llvm.fmuladd.v{LANES}f32"), [a, b, c])
 
@@ -676,7 +672,7 @@ def _interleave(builder: Any, vectors: Sequence[Any]) -> list[Any]:
 
 
 def _gather_lanes(builder: Any, vectors: Sequence[Any], lanes: list[tuple[int, int]]) -> Any:
-    """A vector whose lanes are lanes of others: for each, the vector's number and the lane in it."""
+    """A vector of lanes of other vectors; a lane is given by its vector's index and its index in that vector."""
     first, *others = sorted({source for source, _ in lanes})
     gathered, chosen = vectors[first], [lane if source == first else 0 for source, lane in lanes]
     for other in others:

@@ -32,7 +32,7 @@ LARGEST_SIDE = 32767  # pixels; boxes are int16
 _KAPPA_MARGIN = np.float32(KAPPA_MARGIN)
 _LOG2_ALPHA_CUT = np.float32(math.log2(ALPHA_CUT))
 
-# float32 suffices, since a margin covers its rounding. Python floats would promote to float64.
+# float32 suffices, since a margin covers its rounding. Python floats would promote the arithmetic to float64.
 _ZERO, _ONE, _HALF, _PI = np.float32(0), np.float32(1), np.float32(0.5), np.float32(math.pi)
 _SCALE, _ROOT_SCALE = np.float32(layout.HALF_LOG2_E), np.float32(math.sqrt(layout.HALF_LOG2_E))
 _MIN_HORIZONTAL = np.float32(1e-12)  # length of a unit direction's horizontal part
@@ -41,7 +41,7 @@ _ABOVE_IMAGE = np.float32(-1e9)  # last row of an empty box
 _CULLED = np.float32(CULLED)
 _UNBOUNDED = np.float32(1e9)
 
-# Rows of a block of records, structure of arrays: the record's numbers, then those derived from them.
+# Rows of a block of Gaussians: the record's numbers, then those derived from them.
 _RADIAL_VARIANCE, _KAPPA = layout.RADIAL_VARIANCE, layout.LOG2_PEAK  # overwritten in place
 _N, _P, _Q = layout.RECORD_SIZE, layout.RECORD_SIZE + 3, layout.RECORD_SIZE + 6
 _EDGES = layout.RECORD_SIZE + 9  # left, right, top, bottom, pixels
@@ -122,7 +122,7 @@ def _is_outside(n, p, q, radial_variance, kappa, normal_x, normal_y, normal_z):
 @kernel
 def _bound_pinhole(records, rotation, height, width, focal, boxes, item):
     rows = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK), np.float32)
-    side, end = np.float32(width / (2 * focal)), np.float32(height / (2 * focal))
+    tan_x, tan_y = np.float32(width / (2 * focal)), np.float32(height / (2 * focal))  # of half the field of view
     middle_x, middle_y, scale = np.float32(0.5 * width), np.float32(0.5 * height), np.float32(focal)
     num = len(records) // layout.RECORD_SIZE
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, num), GAUSSIAN_BLOCK):
@@ -133,19 +133,19 @@ def _bound_pinhole(records, rotation, height, width, focal, boxes, item):
             d_zz = n[2] * n[2] - kappa * (radial_variance * n[2] * n[2] + p[2] * p[2] + q[2] * q[2])
             x, root_x = _pinhole_edges(n[0], n[2], p[0], p[2], q[0], q[2], radial_variance, kappa)
             y, root_y = _pinhole_edges(n[1], n[2], p[1], p[2], q[1], q[2], radial_variance, kappa)
-            bounded = d_zz > _ZERO  # otherwise the cone crosses the plane z = 0
+            bounded = d_zz > _ZERO  # else the cone crosses the plane z = 0
             to_pixels = scale / d_zz
-            unseen = (kappa < _ZERO) | (bounded & (n[2] < _ZERO))
-            # A cone that crosses the plane z = 0 has no box, but most of these are outside the field of view.
-            unseen |= _is_outside(n, p, q, radial_variance, kappa, _ONE, _ZERO, side)
-            unseen |= _is_outside(n, p, q, radial_variance, kappa, -_ONE, _ZERO, side)
-            unseen |= _is_outside(n, p, q, radial_variance, kappa, _ZERO, _ONE, end)
-            unseen |= _is_outside(n, p, q, radial_variance, kappa, _ZERO, -_ONE, end)
+            invisible = (kappa < _ZERO) | (bounded & (n[2] < _ZERO))
+            # A cone that crosses the plane z = 0 has no bounding box; most such cones are outside the field of view.
+            invisible |= _is_outside(n, p, q, radial_variance, kappa, _ONE, _ZERO, tan_x)
+            invisible |= _is_outside(n, p, q, radial_variance, kappa, -_ONE, _ZERO, tan_x)
+            invisible |= _is_outside(n, p, q, radial_variance, kappa, _ZERO, _ONE, tan_y)
+            invisible |= _is_outside(n, p, q, radial_variance, kappa, _ZERO, -_ONE, tan_y)
             rows[_EDGES, i] = (x - root_x) * to_pixels + middle_x if bounded else -_UNBOUNDED
             rows[_EDGES + 1, i] = (x + root_x) * to_pixels + middle_x if bounded else _UNBOUNDED
             rows[_EDGES + 2, i] = (y - root_y) * to_pixels + middle_y if bounded else -_UNBOUNDED
             bottom = (y + root_y) * to_pixels + middle_y if bounded else _UNBOUNDED
-            rows[_EDGES + 3, i] = _ABOVE_IMAGE if unseen else bottom
+            rows[_EDGES + 3, i] = _ABOVE_IMAGE if invisible else bottom
         round_boxes(rows, _EDGES, start, count, height, width, boxes)
 
 
@@ -155,7 +155,7 @@ def round_boxes(rows, edges, start, count, height, width, boxes):
 
     Args:
         rows, edges: left, right, top and bottom in pixels, in four rows from row `edges` on.
-        boxes: (n, 2) int32, two numbers of a box in each.
+        boxes: (n, 2) int32, two numbers of a box per int32.
     """
     margin = _pixel_margin(height, width)
     last_x, last_y = np.float32(width - 1), np.float32(height - 1)
@@ -164,15 +164,15 @@ def round_boxes(rows, edges, start, count, height, width, boxes):
         x1 = min(np.floor(rows[edges + 1, i] - _HALF + margin), last_x)
         y0 = max(np.ceil(rows[edges + 2, i] - _HALF - margin), _ZERO)
         y1 = min(np.floor(rows[edges + 3, i] - _HALF + margin), last_y)
-        seen = (x0 <= x1) & (y0 <= y1)
-        rows[edges, i], rows[edges + 1, i] = x0 if seen else _ZERO, x1 if seen else _ZERO
-        rows[edges + 2, i], rows[edges + 3, i] = y0 if seen else _ONE, y1 if seen else _ZERO
+        visible = (x0 <= x1) & (y0 <= y1)
+        rows[edges, i], rows[edges + 1, i] = x0 if visible else _ZERO, x1 if visible else _ZERO
+        rows[edges + 2, i], rows[edges + 3, i] = y0 if visible else _ONE, y1 if visible else _ZERO
     _write_boxes(rows, edges, start, count, boxes)
 
 
 @inline_kernel
 def _write_boxes(rows, edges, start, count, boxes):
-    """Write four rows of whole numbers as boxes, two numbers in each int32."""
+    """Write four rows of whole numbers as boxes, two numbers per int32."""
     for i in range(count):
         boxes[start + i, 0] = np.int32(rows[edges, i]) | np.int32(rows[edges + 1, i]) << np.int32(16)
         boxes[start + i, 1] = np.int32(rows[edges + 2, i]) | np.int32(rows[edges + 3, i]) << np.int32(16)
@@ -206,9 +206,9 @@ def _max_latitude(sine, cosine, low, high, sides2):
         sides2: squared extent of the box to the side.
     """
     first, second = sine + low * cosine, sine + high * cosine  # sines before normalisation
-    flat_first, flat_second = cosine - low * sine, cosine - high * sine
-    first2 = flat_first * flat_first + (_ZERO if first > _ZERO else sides2)
-    second2 = flat_second * flat_second + (_ZERO if second > _ZERO else sides2)
+    horizontal_first, horizontal_second = cosine - low * sine, cosine - high * sine
+    first2 = horizontal_first * horizontal_first + (_ZERO if first > _ZERO else sides2)
+    second2 = horizontal_second * horizontal_second + (_ZERO if second > _ZERO else sides2)
     second_is_higher = second * abs(second) * first2 > first * abs(first) * second2
     holds_pole = (sine > _ZERO) & (low * sine <= cosine) & (cosine <= high * sine)
     return _arctan2(
@@ -220,8 +220,8 @@ def _max_latitude(sine, cosine, low, high, sides2):
 @kernel
 def _bound_equirect(records, rotation, height, width, boxes, item):
     rows = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK), np.float32)
-    margin, side, last_y = _pixel_margin(height, width), np.float32(width), np.float32(height - 1)
-    last_x, per_side = np.float32(width - 1), np.float32(1 / width)
+    margin, period, last_y = _pixel_margin(height, width), np.float32(width), np.float32(height - 1)
+    last_x, inverse_period = np.float32(width - 1), np.float32(1 / width)
     num = len(records) // layout.RECORD_SIZE
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, num), GAUSSIAN_BLOCK):
         count = min(GAUSSIAN_BLOCK, num - start)
@@ -233,13 +233,13 @@ def _bound_equirect(records, rotation, height, width, boxes, item):
             y0 = max(np.ceil(rows[_EDGES + 2, i] - _HALF - margin), _ZERO)
             y1 = min(np.floor(rows[_EDGES + 3, i] - _HALF + margin), last_y)
             full_width = x1 - x0 >= last_x
-            seen = (x0 <= x1) & (y0 <= y1)
-            # Half a pixel, so that rounding cannot put a column of 0 below 0.
-            x0 -= side * np.floor((x0 + _HALF) * per_side)
-            x1 -= side * np.floor((x1 + _HALF) * per_side)
-            rows[_EDGES, i] = _ZERO if full_width | ~seen else x0
-            rows[_EDGES + 1, i] = (last_x if full_width else x1) if seen else _ZERO
-            rows[_EDGES + 2, i], rows[_EDGES + 3, i] = y0 if seen else _ONE, y1 if seen else _ZERO
+            visible = (x0 <= x1) & (y0 <= y1)
+            # Add half a pixel, so that rounding cannot move column 0 below 0.
+            x0 -= period * np.floor((x0 + _HALF) * inverse_period)
+            x1 -= period * np.floor((x1 + _HALF) * inverse_period)
+            rows[_EDGES, i] = _ZERO if full_width | ~visible else x0
+            rows[_EDGES + 1, i] = (last_x if full_width else x1) if visible else _ZERO
+            rows[_EDGES + 2, i], rows[_EDGES + 3, i] = y0 if visible else _ONE, y1 if visible else _ZERO
         _write_boxes(rows, _EDGES, start, count, boxes)
 
 
@@ -249,18 +249,20 @@ def _equirect_edges(rows, height, width):
     middle_x, middle_y = np.float32(0.5 * width), np.float32(0.5 * height)
     for i in range(GAUSSIAN_BLOCK):
         n, p, q, radial_variance, kappa = _cone(rows, i)
-        flat = math.sqrt(n[0] * n[0] + n[2] * n[2])
-        on_axis = flat < _MIN_HORIZONTAL
-        inverse = _ZERO if on_axis else _ONE / flat
+        horizontal = math.sqrt(n[0] * n[0] + n[2] * n[2])
+        on_axis = horizontal < _MIN_HORIZONTAL
+        inverse = _ZERO if on_axis else _ONE / horizontal
         ahead_x, ahead_z = n[0] * inverse, _ONE if on_axis else n[2] * inverse
         p_ahead, q_ahead = p[0] * ahead_x + p[2] * ahead_z, q[0] * ahead_x + q[2] * ahead_z
         p_east, q_east = p[0] * ahead_z - p[2] * ahead_x, q[0] * ahead_z - q[2] * ahead_x
-        p_south, q_south = p[1] * flat - n[1] * p_ahead, q[1] * flat - n[1] * q_ahead
+        p_south, q_south = p[1] * horizontal - n[1] * p_ahead, q[1] * horizontal - n[1] * q_ahead
         p_n, q_n = dot(*p, *n), dot(*q, *n)
         east = kappa * (p_east * p_east + q_east * q_east)
 
         # Longitude: tangents of the cone's projection on the horizontal plane.
-        d_ff = flat * flat - kappa * (radial_variance * flat * flat + p_ahead * p_ahead + q_ahead * q_ahead)
+        d_ff = horizontal * horizontal - kappa * (
+            radial_variance * horizontal * horizontal + p_ahead * p_ahead + q_ahead * q_ahead
+        )
         middle = -kappa * (p_east * p_ahead + q_east * q_ahead)
         root = math.sqrt(max(middle * middle + east * d_ff, _ZERO))
         low, high = middle - root, middle + root
@@ -278,8 +280,8 @@ def _equirect_edges(rows, height, width):
         middle = -kappa * (p_south * p_n + q_south * q_n)
         root = math.sqrt(max(middle * middle + south * d_nn, _ZERO))
         low, high = (middle - root) * inverse, (middle + root) * inverse
-        bottom = _max_latitude(n[1], flat, low, high, sides * sides)
-        top = -_max_latitude(-n[1], flat, -high, -low, sides * sides)
+        bottom = _max_latitude(n[1], horizontal, low, high, sides * sides)
+        top = -_max_latitude(-n[1], horizontal, -high, -low, sides * sides)
         has_longitudes = bounded & (d_ff > _ZERO)
         rows[_EDGES, i] = left * per_column + middle_x if has_longitudes else -_UNBOUNDED
         rows[_EDGES + 1, i] = right * per_column + middle_x if has_longitudes else _UNBOUNDED
@@ -292,27 +294,26 @@ def find_bounding_boxes(records: np.ndarray, plane: ImagePlane, workspace: Works
     """Bounding box of each record of the exact kernel on an image plane, (n, 4) int16."""
     words = workspace.array((len(records), 2), np.int32)
     rotation = np.ascontiguousarray(plane.rotation.numpy().astype(np.float32))
-    height, width, flat = *plane.size, records.reshape(-1)
     if plane.is_panorama:
-        bound = partial(_bound_equirect, flat, rotation, height, width, words)
+        bound = partial(_bound_equirect, records.reshape(-1), rotation, *plane.size, words)
     else:
-        bound = partial(_bound_pinhole, flat, rotation, height, width, plane.focal, words)
+        bound = partial(_bound_pinhole, records.reshape(-1), rotation, *plane.size, plane.focal, words)
     parallel_for(bound, -(-len(records) // GAUSSIANS_PER_ITEM), threads)
     return words.view(np.int16)
 
 
 # --- tile intersections ---
 #
-# A counting sort of (Gaussian, tile) pairs, in bands of tile rows so that memory is bounded. For the backward every
-# intersection has a slot, and the slots of one Gaussian are contiguous: tiles write gradients without conflicts, and
-# each Gaussian sums its own in a fixed order.
+# A counting sort of tile intersections, in bands of tile rows to bound the memory. For the backward every intersection
+# has a slot, and the slots of one Gaussian are contiguous: tiles write gradients without conflicts, and the slots of
+# each Gaussian are summed in a fixed order.
 
 MAX_INTERSECTIONS = 1 << 26  # in one band: 512 MB
-_SHIFT = TILE_SIZE.bit_length() - 1
-_LAST = TILE_SIZE - 1
-_PARTS_PER_THREAD = 4  # some processors are slower than others
-_BUFFER_SIZE = 512  # pairs collected before they are written: two small loops are twice as fast as one large loop
-_WRITE_AHEAD = 16  # intersections of a tile, from the prefetch of a cache line to the write
+_TILE_SHIFT = TILE_SIZE.bit_length() - 1
+_LAST_PIXEL = TILE_SIZE - 1
+_PARTS_PER_THREAD = 4  # of the scene: some cores are slower than others
+_BUFFER_SIZE = 512  # intersections buffered before a write: two small loops are twice as fast as one large loop
+_WRITE_AHEAD = 16  # intersections of a tile between the prefetch of a cache line and the write
 _INT16_MASK = np.int64(0xFFFF)  # a box as one word: x0, x1, y0, y1 from the lowest bits up
 EMPTY_BOX = np.int64(1 << 32)  # the empty box as one word: first row 1, last row 0
 
@@ -321,11 +322,11 @@ class TileIntersections(NamedTuple):
     """Tile intersections of a band of tile rows.
 
     Attributes:
-        first_row: of tiles.
+        first_row: first row of tiles of the band.
         intersections, starts: see records.py.
         slots: of each intersection, counted within the band; empty unless requested.
         offsets: (n + 1), first slot of each Gaussian; empty unless requested.
-        workspace: holds intersections, slots and offsets.
+        workspace: memory of intersections, slots and offsets.
     """
 
     first_row: int
@@ -338,7 +339,7 @@ class TileIntersections(NamedTuple):
 
 @inline_kernel
 def _count_columns(word, columns):
-    """Number of tile columns that a packed box touches, counting around the panorama if it wraps."""
+    """Number of tile columns that a packed box reaches, around the panorama if it wraps."""
     first, last, _, _ = _tile_range(word)
     if (word >> 16 & _INT16_MASK) >= (word & _INT16_MASK):
         return last - first + 1
@@ -348,8 +349,8 @@ def _count_columns(word, columns):
 @inline_kernel
 def _columns_in_tile(x0, x1, column, width):
     """First and last pixel column of a box within a tile, relative to the tile."""
-    corner = column << _SHIFT
-    end = min(np.int64(_LAST), width - 1 - corner)
+    corner = column << _TILE_SHIFT
+    end = min(np.int64(_LAST_PIXEL), width - 1 - corner)
     low, high = max(x0 - corner, 0), min(x1 - corner, end)
     if x1 >= x0:
         return low, high
@@ -362,7 +363,7 @@ def _columns_in_tile(x0, x1, column, width):
 @inline_kernel
 def _tile_range(word):
     """Tiles of a packed box's first and last column and first and last row."""
-    shift = np.int64(_SHIFT)
+    shift = np.int64(_TILE_SHIFT)
     return (
         (word & _INT16_MASK) >> shift,
         (word >> 16 & _INT16_MASK) >> shift,
@@ -380,7 +381,7 @@ def _count_intersections(ends, words, rows, columns, counts, part):
         rows, columns: of tiles.
         counts: (part, tile), written.
     """
-    # As differences between neighbouring tiles, so that a box of any size costs four updates.
+    # Differences between neighbouring tiles are counted, so that a box of any size costs four updates.
     across, row = columns + 1, counts[part]
     steps = np.zeros((rows + 1) * across, np.int64)
     for g in range(ends[part], ends[part + 1]):
@@ -410,47 +411,48 @@ def _add(numbers, index, step):
 
 
 @inline_kernel
-def _buffer_pair(tile, gaussian, box, index, tiles, pairs):
+def _buffer_intersection(tile, gaussian, box, index, tiles, packed):
     store_scalar(tiles, index, tile)
-    store_scalar(pairs, index, gaussian | box << 32)
+    store_scalar(packed, index, gaussian | box << 32)
 
 
 @inline_kernel
-def _buffer_corners(gaussian, word, low, columns, width, buffered, tiles, pairs):
-    """Buffer the pairs of a Gaussian that touches at most 2 x 2 tiles, without branches.
+def _buffer_four(gaussian, word, low, columns, width, buffered, tiles, packed):
+    """Buffer the intersections of a Gaussian with at most 2 x 2 tiles, without branches.
 
     Returns:
-        The number of buffered pairs. All four are written; the next overwrites those that do not count.
+        The number of buffered intersections. Four are always written; the next Gaussian overwrites the surplus.
     """
     first, last, top, bottom = _tile_range(word)
-    x0, x1, y0, y1 = word & _LAST, word >> 16 & _LAST, word >> 32 & _LAST, word >> 48 & _LAST
-    aside, down = np.int64(first != last), bottom - top
-    end = min(np.int64(_LAST), width - 1 - (first << _SHIFT))
-    left, right = x0 | (end if aside else x1) << BOX_BITS, x1 << BOX_BITS
-    upper, lower = (y0 | (np.int64(_LAST) if down else y1) << BOX_BITS) << (2 * BOX_BITS), y1 << (3 * BOX_BITS)
+    x0, x1, y0, y1 = word & _LAST_PIXEL, word >> 16 & _LAST_PIXEL, word >> 32 & _LAST_PIXEL, word >> 48 & _LAST_PIXEL
+    two_columns, two_rows = np.int64(first != last), bottom - top
+    end = min(np.int64(_LAST_PIXEL), width - 1 - (first << _TILE_SHIFT))
+    left, right = x0 | (end if two_columns else x1) << BOX_BITS, x1 << BOX_BITS
+    upper = (y0 | (np.int64(_LAST_PIXEL) if two_rows else y1) << BOX_BITS) << (2 * BOX_BITS)
+    lower = y1 << (3 * BOX_BITS)
     above, below = (top - low) * columns, (bottom - low) * columns
-    _buffer_pair(above + first, gaussian, left | upper, buffered, tiles, pairs)
-    _buffer_pair(above + last, gaussian, right | upper, buffered + 1, tiles, pairs)
-    buffered += 1 + aside
-    _buffer_pair(below + first, gaussian, left | lower, buffered, tiles, pairs)
-    buffered += down
-    _buffer_pair(below + last, gaussian, right | lower, buffered, tiles, pairs)
-    return buffered + (aside & down)
+    _buffer_intersection(above + first, gaussian, left | upper, buffered, tiles, packed)
+    _buffer_intersection(above + last, gaussian, right | upper, buffered + 1, tiles, packed)
+    buffered += 1 + two_columns
+    _buffer_intersection(below + first, gaussian, left | lower, buffered, tiles, packed)
+    buffered += two_rows
+    _buffer_intersection(below + last, gaussian, right | lower, buffered, tiles, packed)
+    return buffered + (two_columns & two_rows)
 
 
 @inline_kernel
-def _buffer_all(gaussian, word, low, high, columns, width, buffered, tiles, pairs):
-    """Buffer the pairs of a Gaussian with any tiles of a band; returns the number of buffered pairs."""
+def _buffer_all(gaussian, word, low, high, columns, width, buffered, tiles, packed):
+    """Buffer the intersections of a Gaussian with any tiles of a band; return the number of buffered ones."""
     first, _, top, bottom = _tile_range(word)
     x0, x1, y0, y1 = word & _INT16_MASK, word >> 16 & _INT16_MASK, word >> 32 & _INT16_MASK, word >> 48
     for i in range(max(top, low), min(bottom + 1, high) if word != EMPTY_BOX else low):
-        corner = i << _SHIFT
-        rows = max(y0 - corner, 0) << (2 * BOX_BITS) | min(y1 - corner, _LAST) << (3 * BOX_BITS)
+        corner = i << _TILE_SHIFT
+        rows = max(y0 - corner, 0) << (2 * BOX_BITS) | min(y1 - corner, _LAST_PIXEL) << (3 * BOX_BITS)
         for k in range(first, first + _count_columns(word, columns)):
             column = k if k < columns else k - columns
             left, right = _columns_in_tile(x0, x1, column, width)
             tile, box = (i - low) * columns + column, left | right << BOX_BITS | rows
-            _buffer_pair(tile, gaussian, box, buffered, tiles, pairs)
+            _buffer_intersection(tile, gaussian, box, buffered, tiles, packed)
             buffered += 1
     return buffered
 
@@ -464,7 +466,7 @@ def _write_intersections(
     Args:
         words: packed boxes.
         low, high: rows of tiles.
-        all_positions: (part, tile of the band), where each part's intersections begin.
+        all_positions: (part, tile of the band), index of each part's first intersection.
         first_slots: of each part.
         intersections: as 64-bit words.
         slots: of each intersection, written unless empty.
@@ -472,15 +474,15 @@ def _write_intersections(
     """
     positions, slot, buffered = all_positions[part], first_slots[part], np.int64(0)
     capacity = _BUFFER_SIZE + len(positions) + 4
-    tiles, pairs = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
+    tiles, packed = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
     for g in range(ends[part], ends[part + 1]):
         word = load_scalar(words, g)
         first, last, top, bottom = _tile_range(word)
         small = (last - first <= 1) & (bottom - top <= 1) & ((word >> 16 & _INT16_MASK) >= (word & _INT16_MASK))
         if small & (top >= low) & (bottom < high) & (word != EMPTY_BOX):
-            buffered = _buffer_corners(g, word, low, columns, width, buffered, tiles, pairs)
+            buffered = _buffer_four(g, word, low, columns, width, buffered, tiles, packed)
         else:
-            buffered = _buffer_all(g, word, low, high, columns, width, buffered, tiles, pairs)
+            buffered = _buffer_all(g, word, low, high, columns, width, buffered, tiles, packed)
         if len(offsets) > 0:
             store_scalar(offsets, g + 1, slot + buffered)
         if buffered >= _BUFFER_SIZE or g == ends[part + 1] - 1:
@@ -488,7 +490,7 @@ def _write_intersections(
                 tile = load_scalar(tiles, k)
                 position = load_scalar(positions, tile)
                 store_scalar(positions, tile, position + 1)
-                store_scalar(intersections, position, load_scalar(pairs, k))
+                store_scalar(intersections, position, load_scalar(packed, k))
                 prefetch_for_write(intersections, position + _WRITE_AHEAD)
                 if len(slots) > 0:
                     store_scalar(slots, position, slots.dtype.type(slot + k))
@@ -504,7 +506,7 @@ def intersect_tiles(
     Args:
         boxes: (n, 4) int16.
         size: height and width, pixels.
-        slots: whether to number the intersections for the backward.
+        slots: whether to assign slots for the backward.
         threads: number of threads; the result does not depend on it.
         limit: largest number of intersections in a band, unless a single row has more.
     """
@@ -543,14 +545,14 @@ def _split_rows(per_row: list[int], limit: int) -> Iterator[tuple[int, int]]:
 # --- sorting ---
 #
 # A tile's few thousand intersections are sorted within the L1 cache: their distances, as integers of the same order, by
-# the two leading digits, then by insertion. Where insertion would take too long, such as for all but one at nearly the
-# same distance, a radix sort by all digits replaces it; its time does not depend on the distances.
+# the two leading digits, then by insertion. If insertion takes too many moves, such as when all but one are at nearly
+# the same distance, a radix sort by all digits replaces it; its time does not depend on the distances.
 
-_DIGIT_BITS = 11  # at most: 2048 counters fit the L1 cache
-_EXTRA_BITS = 3  # of a digit beyond half of those that index a tile's intersections, so that few stay out of order
-_MAX_MOVES = 4  # positions that insertion moves an intersection, on average, before radix sort replaces it
-_READ_AHEAD = 32  # intersections, from the prefetch of a distance to its use
-_ROUNDING_BITS = 12  # of a distance, cut off: equal distances, computed in other steps, may differ in these
+_MAX_DIGIT_BITS = 11  # 2048 counters fit the L1 cache
+_EXTRA_BITS = 3  # of a digit, beyond half the bits of an index in the tile, so that few intersections stay out of order
+_MAX_MOVES = 4  # average moves of an intersection by insertion before radix sort replaces it
+_READ_AHEAD = 32  # intersections between the prefetch of a distance and its use
+_ROUNDING_BITS = 12  # lowest bits of a distance, ignored: equal distances, computed in other steps, may differ in these
 _SIGN_MASK = np.int64(0x7FFFFFFFFFFFFFFF)
 _ITEMS_PER_THREAD = 8
 _EMPTY_TILE_COST = 32  # in intersections
@@ -574,7 +576,7 @@ def compute_depths(
         records: of the Gaussians.
         radii: radial distances, float64, metres.
         axis: in the records' axes.
-        workspace: for the depths.
+        workspace: memory for the depths.
         threads: number of threads.
     """
     depths = workspace.array(len(radii), np.float64)
@@ -584,12 +586,8 @@ def compute_depths(
 
 
 @inline_kernel
-def _read_keys(intersections, slots, keys, begin, count, words, own_intersections, own_slots):
-    """Copy a tile's intersections and slots, and read its distances as integers of the same order.
-
-    Returns:
-        The smallest and the largest of these integers.
-    """
+def _read_keys(intersections, slots, keys, begin, count, words, tile_intersections, tile_slots):
+    """Copy a tile's intersections and slots, and read its distances as integers of the same order; return the range."""
     low, high, end = _SIGN_MASK, -_SIGN_MASK, len(intersections) - 1
     for j in range(count):
         prefetch(keys, load_scalar(intersections, min(begin + j + _READ_AHEAD, end)) & np.int64(0xFFFFFFFF))
@@ -598,10 +596,10 @@ def _read_keys(intersections, slots, keys, begin, count, words, own_intersection
         key = (key if key >= 0 else (key ^ _SIGN_MASK) + 1) >> _ROUNDING_BITS  # -0.0 equals 0.0
         low, high = min(low, key), max(high, key)
         store_scalar(words, j, np.uint64(key))
-        store_scalar(own_intersections, j, intersection)
+        store_scalar(tile_intersections, j, intersection)
     if len(slots) > 0:
         for j in range(count):
-            store_scalar(own_slots, j, load_scalar(slots, begin + j))
+            store_scalar(tile_slots, j, load_scalar(slots, begin + j))
     return np.uint64(low), np.uint64(high)
 
 
@@ -615,14 +613,14 @@ def _bit_length(number):
 
 
 @inline_kernel
-def _pack(words, count, least, cut, place_bits, low, high, bits, low_counters, high_counters):
-    """Append each key's index in the tile to it, and count two digits of `bits` bits, from bits `low` and `high` on."""
+def _add_indices(words, count, smallest, cut, index_bits, low, high, bits, low_counters, high_counters):
+    """Append to each key its index in the tile, and count two digits of `bits` bits, from bits `low` and `high` on."""
     for digit in range(1 << bits):
         store_scalar(low_counters, digit, np.int32(0))
         store_scalar(high_counters, digit, np.int32(0))
     mask = (np.uint64(1) << np.uint64(bits)) - np.uint64(1)
     for j in range(count):
-        word = (load_scalar(words, j) - least) >> cut << np.uint64(place_bits) | np.uint64(j)
+        word = (load_scalar(words, j) - smallest) >> cut << np.uint64(index_bits) | np.uint64(j)
         store_scalar(words, j, word)
         first, second = np.int64(word >> np.uint64(low) & mask), np.int64(word >> np.uint64(high) & mask)
         store_scalar(low_counters, first, np.int32(load_scalar(low_counters, first) + 1))
@@ -634,20 +632,20 @@ def _scatter(words, count, shift, bits, counters, scattered):
     """One stable pass of a radix sort, by the digit at bit `shift`; overwrites the counters."""
     mask, total = (np.uint64(1) << np.uint64(bits)) - np.uint64(1), np.int64(0)
     for digit in range(1 << bits):
-        held = load_scalar(counters, digit)
+        count_of_digit = load_scalar(counters, digit)
         store_scalar(counters, digit, np.int32(total))
-        total += np.int64(held)
+        total += np.int64(count_of_digit)
     for j in range(count):
         word = load_scalar(words, j)
         digit = np.int64(word >> np.uint64(shift) & mask)
-        place = load_scalar(counters, digit)
-        store_scalar(counters, digit, np.int32(place + 1))
-        store_scalar(scattered, np.int64(place), word)
+        position = load_scalar(counters, digit)
+        store_scalar(counters, digit, np.int32(position + 1))
+        store_scalar(scattered, np.int64(position), word)
 
 
 @inline_kernel
 def _insertion_sort(words, count):
-    """Sort words that are nearly in order; returns False, with the words half sorted, if it takes too many moves."""
+    """Sort words that are nearly in order; return False, with the words partly sorted, if it takes too many moves."""
     moves = np.int64(0)
     for j in range(1, count):
         word, at = load_scalar(words, j), j
@@ -663,13 +661,13 @@ def _insertion_sort(words, count):
 
 @inline_kernel
 def _radix_sort(words, spare, count, end, counters):
-    """Sort words of `end` bits; returns the two arrays, the sorted one first."""
-    for shift in range(0, end, _DIGIT_BITS):
+    """Sort words of `end` bits; return the two arrays, the sorted one first."""
+    for shift in range(0, end, _MAX_DIGIT_BITS):
         counters[:] = 0
         for j in range(count):
-            digit = np.int64(load_scalar(words, j) >> np.uint64(shift) & np.uint64((1 << _DIGIT_BITS) - 1))
+            digit = np.int64(load_scalar(words, j) >> np.uint64(shift) & np.uint64((1 << _MAX_DIGIT_BITS) - 1))
             store_scalar(counters, digit, np.int32(load_scalar(counters, digit) + 1))
-        _scatter(words, count, shift, _DIGIT_BITS, counters, spare)
+        _scatter(words, count, shift, _MAX_DIGIT_BITS, counters, spare)
         words, spare = spare, words
     return words, spare
 
@@ -682,33 +680,36 @@ def _sort_tiles(intersections, slots, keys, starts, low, high):
         intersections: as 64-bit words.
         keys: bits of the distances, int64.
     """
-    most = 1
+    max_count = 1
     for tile in range(low, high):
-        most = max(most, starts[tile + 1] - starts[tile])
-    words, spare, own_intersections = np.empty(most, np.uint64), np.empty(most, np.uint64), np.empty(most, np.int64)
-    own_slots = np.empty(most if len(slots) > 0 else 0, slots.dtype)
-    low_counters, high_counters = np.empty(1 << _DIGIT_BITS, np.int32), np.empty(1 << _DIGIT_BITS, np.int32)
+        max_count = max(max_count, starts[tile + 1] - starts[tile])
+    words, spare = np.empty(max_count, np.uint64), np.empty(max_count, np.uint64)
+    tile_intersections = np.empty(max_count, np.int64)
+    tile_slots = np.empty(max_count if len(slots) > 0 else 0, slots.dtype)
+    low_counters, high_counters = np.empty(1 << _MAX_DIGIT_BITS, np.int32), np.empty(1 << _MAX_DIGIT_BITS, np.int32)
     for tile in range(low, high):
         begin, count = starts[tile], starts[tile + 1] - starts[tile]
         if count < 2:
             continue
-        least, largest = _read_keys(intersections, slots, keys, begin, count, words, own_intersections, own_slots)
-        key_bits, place_bits = _bit_length(largest - least), _bit_length(np.uint64(count - 1))
-        cut = max(0, key_bits + place_bits - 64)
-        end = key_bits - cut + place_bits
-        bits = min(place_bits // 2 + _EXTRA_BITS, _DIGIT_BITS, end // 2)
+        smallest, largest = _read_keys(intersections, slots, keys, begin, count, words, tile_intersections, tile_slots)
+        key_bits, index_bits = _bit_length(largest - smallest), _bit_length(np.uint64(count - 1))
+        cut = max(0, key_bits + index_bits - 64)
+        end = key_bits - cut + index_bits
+        bits = min(index_bits // 2 + _EXTRA_BITS, _MAX_DIGIT_BITS, end // 2)
         upper, lower = end - bits, end - 2 * bits
-        _pack(words, count, least, np.uint64(cut), place_bits, lower, upper, bits, low_counters, high_counters)
+        _add_indices(
+            words, count, smallest, np.uint64(cut), index_bits, lower, upper, bits, low_counters, high_counters
+        )
         _scatter(words, count, lower, bits, low_counters, spare)
         _scatter(spare, count, upper, bits, high_counters, words)
         if not _insertion_sort(words, count):
             words, spare = _radix_sort(words, spare, count, end, low_counters)
-        mask = (np.uint64(1) << np.uint64(place_bits)) - np.uint64(1)
+        mask = (np.uint64(1) << np.uint64(index_bits)) - np.uint64(1)
         for j in range(count):
-            place = np.int64(load_scalar(words, j) & mask)
-            store_scalar(intersections, begin + j, load_scalar(own_intersections, place))
+            index = np.int64(load_scalar(words, j) & mask)
+            store_scalar(intersections, begin + j, load_scalar(tile_intersections, index))
             if len(slots) > 0:
-                store_scalar(slots, begin + j, load_scalar(own_slots, place))
+                store_scalar(slots, begin + j, load_scalar(tile_slots, index))
 
 
 def sort_front_to_back(tiles: TileIntersections, distances: np.ndarray, threads: int) -> None:
@@ -725,11 +726,7 @@ def sort_front_to_back(tiles: TileIntersections, distances: np.ndarray, threads:
 
 
 def parallel_for_tiles(tile_kernel: Any, arguments: tuple[Any, ...], starts: np.ndarray, threads: int) -> None:
-    """Call a kernel with the arguments and the first and last + 1 tile of work items of about equal cost.
-
-    Args:
-        starts: of the tiles' intersections, whose number is the cost.
-    """
+    """Call a kernel with the arguments and a range of tiles, for work items of about equal numbers of intersections."""
     num_tiles = len(starts) - 1
     cost = starts - starts[0] + _EMPTY_TILE_COST * np.arange(num_tiles + 1)
     targets = np.linspace(0, cost[-1], min(num_tiles, _ITEMS_PER_THREAD * threads if threads > 1 else 1) + 1)

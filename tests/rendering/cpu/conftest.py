@@ -12,7 +12,9 @@ from torch import Tensor
 
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import projection as reference
+from pansplat.rendering.cpu.ewa import EWA_GRAD_SIZE
 from pansplat.rendering.cpu.projection import Camera, GaussianArrays, ProjectedGaussians, project_gaussians
+from pansplat.rendering.cpu.projection_backward import GaussianGradients, backpropagate_projection
 from pansplat.rendering.cpu.rasterize import MIN_PLANAR_COSINE
 from pansplat.rendering.cpu.records import (
     DIRECTION,
@@ -37,20 +39,11 @@ FILTER_VARIANCE = 0.1 * (math.pi / 64) ** 2
 
 
 class View(NamedTuple):
-    """Gaussians, a camera, and what it sees: the first arguments of most stages."""
+    """Gaussians, a camera, and their projection: the first arguments of most stages."""
 
     gaussians: GaussianArrays
     camera: Camera
     projected: ProjectedGaussians
-
-
-def _to_arrays(scene: Gaussians, covariances: Tensor | None) -> GaussianArrays:
-    scene, empty = scene.to(dtype=torch.float32), np.empty
-    if covariances is None:
-        shape = scene.quats.numpy(), scene.scales.numpy(), empty((0, 3, 3), np.float32)
-    else:
-        shape = empty((0, 4), np.float32), empty((0, 3), np.float32), covariances.float().numpy()
-    return GaussianArrays(scene.means.numpy(), *shape, scene.opacities.numpy(), scene.harmonics.numpy())
 
 
 @pytest.fixture
@@ -69,7 +62,9 @@ def project(workspace: Workspace, pose: Tensor) -> Callable[..., View]:
         scene: Gaussians, covariances: Tensor | None = None, *, camera: Camera | None = None, threads: int = 1
     ) -> View:
         camera = camera or Camera(pose.numpy(), FILTER_VARIANCE, True, 0.05)
-        gaussians = _to_arrays(scene, covariances)
+        scene = scene.to(dtype=torch.float32)
+        shape = (scene.quats, scene.scales, None) if covariances is None else (None, None, covariances.float())
+        gaussians = GaussianArrays.from_tensors((scene.means, *shape, scene.opacities, scene.harmonics))
         return View(gaussians, camera, project_gaussians(gaussians, camera, workspace, threads))
 
     return run
@@ -100,8 +95,39 @@ def _decode_records(records: Tensor) -> tuple[Tensor, ...]:
 
 @pytest.fixture
 def decode_records() -> Callable[[Tensor], tuple[Tensor, ...]]:
-    """Direction, the rows a, b and l, S' and the peak of records."""
     return _decode_records
+
+
+@pytest.fixture
+def rigid_part() -> Callable[[Tensor, Tensor], Tensor]:
+    """The part of a pose's gradient along rigid motions."""
+
+    def select(pose: Tensor, gradient: Tensor) -> Tensor:
+        turn = pose.detach()[:3, :3].T @ gradient[:3, :3]
+        return torch.cat((turn - turn.T, gradient[:3, 3:]), dim=1)
+
+    return select
+
+
+@pytest.fixture
+def backpropagate() -> Callable[..., GaussianGradients]:
+    """Propagates the gradients of records and values, one slot per Gaussian by default, to Gaussians and pose."""
+
+    def run(
+        view: View,
+        grad_records: np.ndarray,
+        grad_values: np.ndarray,
+        *,
+        ewa_grads: np.ndarray | None = None,
+        offsets: np.ndarray | None = None,
+        threads: int = 1,
+    ) -> GaussianGradients:
+        gradients = GaussianGradients(*(np.full_like(field, np.nan) for field in view.gaussians), pose=np.zeros((3, 4)))
+        offsets = np.arange(len(grad_values) + 1) if offsets is None else offsets
+        ewa_grads = np.zeros((0, EWA_GRAD_SIZE)) if ewa_grads is None else ewa_grads
+        return backpropagate_projection(*view, grad_records, grad_values, ewa_grads, offsets, gradients, threads)
+
+    return run
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,8 +156,8 @@ class Case:
             l = n + l_along_a * a + l_along_b * b  # noqa: E741
             offset = self.points - n
             if self.tables.kind != PIXEL_CENTRES:
-                # The length of a ray is free, and so are the gradients that would turn a and b out of their plane.
-                # The kernel's are those at L = 1.
+                # The length of a ray is arbitrary, and so are the gradients that rotate a and b out of their plane.
+                # The kernel computes those at L = 1.
                 length = (1 + offset @ l).detach()
                 offset = self.points / torch.where(length > 0, length, 1)[..., None] - n
             front = 1 + offset @ l
@@ -147,6 +173,11 @@ class Case:
         if upstream is None:
             return (sums.detach(),)
         return sums.detach(), *torch.autograd.grad(sums, (records, values), torch.from_numpy(upstream).double())
+
+    def flatten(self) -> "Case":
+        """Make every footprint of an EWA case wider than its tiles, with a constant alpha."""
+        self.records[:, ROW_A:L_ALONG_A] = 1e-3 * np.array((1, 0, 0, 0, 1, 0))
+        return self
 
     def reduce(self, slots: np.ndarray) -> np.ndarray:
         """The sum of each Gaussian's slots."""
@@ -225,7 +256,7 @@ def make_case(pose: Tensor) -> Callable[..., Case]:
 
 @pytest.fixture(params=["behind", "around the camera"])
 def one_too_wide(request: pytest.FixtureRequest, make_case: Callable[..., Case]) -> Case:
-    """A tile of two chunks whose last Gaussian needs three components: 100 degrees away, or around the camera."""
+    """A tile of two chunks whose last Gaussian, 100 degrees away or around the camera, needs three components."""
     case = make_case("pinhole", (TILE_SIZE, TILE_SIZE), 300, opacity=(0.02, 0.1))
     centre = case.points[TILE_SIZE // 2, TILE_SIZE // 2]
     assert (case.records[:, :DIRECTION_RESIDUAL] @ centre.numpy()).min() > MIN_PLANAR_COSINE
@@ -234,7 +265,7 @@ def one_too_wide(request: pytest.FixtureRequest, make_case: Callable[..., Case])
     right, down = (axis[0] for axis in reference.tangent_frame(centre[None]))
     direction = math.cos(angle) * centre + math.sin(angle) * right
     towards = math.sin(angle) * centre - math.cos(angle) * right
-    # It is seen in a part of the tile: the ellipsoid is oblique, which makes L positive there or negative elsewhere.
+    # It is visible in a part of the tile: the ellipsoid is oblique, so L is positive there or negative elsewhere.
     size, *rest = (0.5, 1.5, 0, 0.0, -1.0) if behind else (3.0, 0.7, 0, 1e3, -3.0)
     case.records[-1] = torch.cat((direction, torch.zeros(3), size * towards, size * down, torch.tensor(rest))).numpy()
     return case

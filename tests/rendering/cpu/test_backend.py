@@ -194,7 +194,7 @@ def test_strict_reports_the_first_gaussian_that_is_not_finite(scene, pose):
         rasterize(scene, pose, strict=True, **options)
 
 
-def test_a_side_longer_than_a_box_can_hold_is_refused(scene, pose):
+def test_a_side_longer_than_32767_pixels_is_refused(scene, pose):
     with pytest.raises(InputError, match="at most 32767 pixels a side"):
         rasterize(scene, pose, size=(1, 40000), layout="pinhole", backend="numba")
 

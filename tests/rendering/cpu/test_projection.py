@@ -69,7 +69,7 @@ def test_a_covariance_with_a_negative_eigenvalue_is_dropped(make_scene, project)
     scene = make_scene(64).to(dtype=torch.float32)
     covariances = scene.covariances.clone()
     eigenvalues, axes = torch.linalg.eigh(covariances[[5, 6]])
-    smallest = torch.tensor((-2e-3, -5e-4)) * eigenvalues[:, 2]  # too negative, and what rounding may leave
+    smallest = torch.tensor((-2e-3, -5e-4)) * eigenvalues[:, 2]  # beyond the bound for rounding, and within it
     eigenvalues = torch.stack((smallest, eigenvalues[:, 1], eigenvalues[:, 2]), dim=1)
     covariances[[5, 6]] = axes @ torch.diag_embed(eigenvalues) @ axes.transpose(1, 2)
     projected = project(scene, covariances).projected
@@ -107,7 +107,7 @@ def test_the_length_of_a_quaternion_does_not_matter_and_zero_is_the_identity(qua
     assert np.array_equal(project(scene).projected.records, project(other).projected.records)
 
 
-def test_records_are_equal_bits_on_any_number_of_threads(make_scene, project):
+def test_the_number_of_threads_changes_no_bit(make_scene, project):
     scene = make_scene(20000, degree=1)
     one = project(scene).projected
     for threads in (2, 3, 5):

@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from pansplat.rendering import projection as reference
-from pansplat.rendering.cpu.ewa import EWA_GRAD_SIZE
 from pansplat.rendering.cpu.projection import Camera
-from pansplat.rendering.cpu.projection_backward import GaussianGradients, accumulate_slots, backpropagate_projection
+from pansplat.rendering.cpu.projection_backward import accumulate_slots
 from pansplat.rendering.cpu.records import DIRECTION_RESIDUAL, RECORD_SIZE, ROW_A
 
 _NAMES = ("means", "quats", "scales", "opacities", "harmonics")
@@ -43,19 +42,6 @@ def _record_gradients(projected, decode_records, weights):
     return records.grad.float().numpy(), values.grad.float().numpy()
 
 
-def _rigid(pose, gradient):
-    """The part of a pose's gradient along rigid motions."""
-    turn = pose[:3, :3].T @ gradient[:3, :3]
-    return torch.cat((turn - turn.T, gradient[:3, 3:]), dim=1)
-
-
-def _backpropagate(view, grad_records, grad_values, offsets=None, threads=1):
-    gradients = GaussianGradients(*(np.full_like(field, np.nan) for field in view.gaussians), pose=np.zeros((3, 4)))
-    offsets = np.arange(len(grad_records) + 1) if offsets is None else offsets
-    no_ewa = np.zeros((0, EWA_GRAD_SIZE))
-    return backpropagate_projection(*view, grad_records, grad_values, no_ewa, offsets, gradients, threads)
-
-
 def _random_slots(count, channels=3):
     random = np.random.default_rng(0)
     return [random.standard_normal((count, size)).astype(np.float32) for size in (RECORD_SIZE, channels + 1)]
@@ -64,7 +50,9 @@ def _random_slots(count, channels=3):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 @pytest.mark.parametrize("by_covariance", [False, True])
 @pytest.mark.parametrize("compensate", [False, True])
-def test_gradients_equal_autograd(degree, by_covariance, compensate, make_scene, project, decode_records, pose):
+def test_gradients_equal_autograd(
+    degree, by_covariance, compensate, make_scene, project, decode_records, backpropagate, rigid_part, pose
+):
     scene = make_scene(500, scale=0.3, degree=degree).to(dtype=torch.float32)
     covariances = scene.covariances.double().requires_grad_() if by_covariance else None
     leaves = {name: getattr(scene, name).double().requires_grad_() for name in _NAMES}
@@ -83,25 +71,25 @@ def test_gradients_equal_autograd(degree, by_covariance, compensate, make_scene,
     _loss(expected.direction, *rows, expected.radial_variance, expected.peak, expected.values, weights).backward()
 
     view = project(scene, None if covariances is None else covariances.detach(), camera=camera)
-    found = _backpropagate(view, *_record_gradients(view.projected, decode_records, weights))
-    wanted = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+    found = backpropagate(view, *_record_gradients(view.projected, decode_records, weights))
+    gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
     if covariances is not None:
-        wanted["covariances"] = covariances.grad
-    assert len(wanted) == (4 if by_covariance else 5)
-    for name, gradient in wanted.items():
+        gradients["covariances"] = covariances.grad
+    assert len(gradients) == (4 if by_covariance else 5)
+    for name, gradient in gradients.items():
         difference = torch.from_numpy(getattr(found, name)).double() - gradient
         assert float(difference.norm() / gradient.norm()) < 5e-7, name
-    wanted, got = (_rigid(pose.detach(), gradient) for gradient in (pose.grad, torch.from_numpy(found.pose)))
+    wanted, got = (rigid_part(pose, gradient) for gradient in (pose.grad, torch.from_numpy(found.pose)))
     assert float((got - wanted).norm() / wanted.norm()) < 5e-7
 
 
-def test_culled_gaussians_have_zero_gradients_and_change_no_other(make_scene, project, pose):
+def test_culled_gaussians_have_zero_gradients_and_change_no_other(make_scene, project, backpropagate, pose):
     scene = make_scene(130, degree=2).to(dtype=torch.float32)
     scene.means[1], scene.quats[2], scene.harmonics[3] = math.nan, math.inf, math.nan
     scene.opacities[4], scene.scales[5, 0], scene.opacities[6] = 0.0, 1e30, math.nan
     scene.means[7] = pose[:3, 3]
     offsets = np.cumsum([0] + [0 if 1 <= g <= 7 else 2 for g in range(130)])  # culled Gaussians have no slots
-    found = _backpropagate(project(scene), *_random_slots(offsets[-1]), offsets)
+    found = backpropagate(project(scene), *_random_slots(offsets[-1]), offsets=offsets)
     for name in _NAMES:
         gradient = getattr(found, name)
         assert np.isfinite(gradient).all(), name
@@ -111,34 +99,35 @@ def test_culled_gaussians_have_zero_gradients_and_change_no_other(make_scene, pr
 
 
 @pytest.mark.parametrize("channels", [1, 3, 5])
-def test_slots_of_a_gaussian_are_summed(channels, make_scene, project):
+def test_slots_of_a_gaussian_are_summed(channels, make_scene, project, backpropagate):
     harmonics = torch.randn(75, 4, channels, generator=torch.Generator().manual_seed(1)).double()
-    view = project(dataclasses.replace(make_scene(75, degree=1), harmonics=harmonics))  # over a block, no whole vectors
+    # More Gaussians than a block, and no multiple of a vector's lanes.
+    view = project(dataclasses.replace(make_scene(75, degree=1), harmonics=harmonics))
     counts = np.arange(75) % 5
     offsets, owner = np.cumsum([0, *counts]), np.repeat(np.arange(75), counts)
     slots = _random_slots(len(owner), channels)
     summed = [np.zeros((75, part.shape[1]), np.float32) for part in slots]
     for part, total in zip(slots, summed, strict=True):
         np.add.at(total, owner, part)
-    found, expected = _backpropagate(view, *slots, offsets), _backpropagate(view, *summed)
+    found, expected = backpropagate(view, *slots, offsets=offsets), backpropagate(view, *summed)
     for name in (*_NAMES, "pose"):
         assert np.array_equal(getattr(found, name), getattr(expected, name)), name
 
 
-def test_gradients_are_equal_bits_on_any_number_of_threads(make_scene, project):
+def test_the_number_of_threads_changes_no_bit(make_scene, project, backpropagate):
     view, slots = project(make_scene(20000, degree=1)), _random_slots(20000)
-    one = _backpropagate(view, *slots)
+    one = backpropagate(view, *slots)
     for threads in (2, 3, 5):
-        several = _backpropagate(view, *slots, threads=threads)
+        several = backpropagate(view, *slots, threads=threads)
         for name in (*_NAMES, "pose"):
             assert np.array_equal(getattr(one, name), getattr(several, name)), name
 
 
-def test_a_zero_quaternion_has_zero_gradient(make_scene, project):
+def test_a_zero_quaternion_has_zero_gradient(make_scene, project, backpropagate):
     scene = make_scene(3)
     scene.quats[1] = 0
     view = project(scene)
-    quats = _backpropagate(view, np.ones((3, RECORD_SIZE), np.float32), np.ones((3, 4), np.float32)).quats
+    quats = backpropagate(view, np.ones((3, RECORD_SIZE), np.float32), np.ones((3, 4), np.float32)).quats
     assert not quats[1].any() and quats[0].any() and quats[2].any()
     # The length of a quaternion does not matter, so the gradient is across it.
     assert abs((quats * view.gaussians.quats).sum(axis=1)).max() < 1e-6 * abs(quats).max()
@@ -147,5 +136,5 @@ def test_a_zero_quaternion_has_zero_gradient(make_scene, project):
 def test_accumulated_slots_are_added_to_totals():
     offsets, slots = np.array([0, 2, 2, 5]), np.arange(10, dtype=np.float32).reshape(5, 2)
     totals = np.ones((3, 2), np.float32)
-    accumulate_slots(0, offsets, slots, totals)
+    accumulate_slots(offsets, slots, totals, 1)
     assert totals.tolist() == [[3, 5], [1, 1], [19, 22]]

@@ -43,7 +43,7 @@ def _compile_as_part_of(module):
         (0.0, "elsewhere", 0),
     ],
 )
-def test_long_compilation_of_our_kernels_is_announced_once(delay, module, messages, monkeypatch, capsys):
+def test_long_compilation_of_pansplat_kernels_is_announced_once(delay, module, messages, monkeypatch, capsys):
     monkeypatch.setattr(runtime, "_MESSAGE_DELAY", delay)
     monkeypatch.setattr(runtime, "_message_shown", False)
     with announce_compilation():
@@ -169,14 +169,14 @@ def test_idle_memory_is_limited(monkeypatch):
     for _ in range(10):
         workspace.array(1000, np.uint8)
     del workspace
-    assert 0 < sum(block.nbytes for block in runtime._idle) <= 5000
+    assert 0 < sum(buffer.nbytes for buffer in runtime._idle) <= 5000
 
 
 @pytest.mark.usefixtures("no_idle_memory")
-def test_a_small_array_does_not_take_a_large_block():
+def test_a_small_array_does_not_take_a_large_buffer():
     _used_address(1 << 20, np.uint8)
     Workspace().array(10, np.uint8)
-    assert max(block.nbytes for block in runtime._idle) > 1 << 20
+    assert max(buffer.nbytes for buffer in runtime._idle) > 1 << 20
 
 
 @pytest.mark.usefixtures("no_idle_memory")

@@ -1,4 +1,4 @@
-"""SIMD vectors compute lane by lane what numpy computes; transposes turn arrays into rows and back."""
+"""SIMD vectors give the results of numpy in every lane; transposes convert arrays to rows and back."""
 
 import math
 
@@ -35,7 +35,7 @@ def _f32_arithmetic(a, b, out):
     return simd.any_lane(x > y), simd.any_lane(x > x)
 
 
-def test_f32_arithmetic_is_numpys():
+def test_f32_arithmetic_equals_numpy():
     out = np.empty((11, 8), np.float32)
     assert _f32_arithmetic(FIRST, SECOND, out.reshape(-1)) == (True, False)
     a, b = FIRST, SECOND
@@ -65,7 +65,7 @@ def _f64_arithmetic(rows):
     return simd.mask_bits(a <= 0), simd.mask_bits(a > b), simd.mask_bits(a == a)
 
 
-def test_f64_arithmetic_is_numpys():
+def test_f64_arithmetic_equals_numpy():
     rows = np.zeros((10, LANES))
     rows[:2] = np.random.default_rng(0).standard_normal((2, LANES)) * 10.0 ** np.arange(-4, 4)
     a, b = rows[:2].copy()
@@ -80,7 +80,7 @@ def test_f64_arithmetic_is_numpys():
     assert np.array_equal(rows[9], a.astype(np.float32))
 
 
-def test_masks_as_bits_are_numpys_comparisons():
+def test_mask_bits_equal_numpy_comparisons():
     rows = np.zeros((10, LANES))
     rows[:2] = np.random.default_rng(0).standard_normal((2, LANES))
     rows[0, 3] = np.nan
@@ -120,7 +120,7 @@ def _square(square, out):
     store(out, 96, other)
 
 
-def test_squares_are_transposed_and_summed_and_halves_joined():
+def test_matrices_are_transposed_and_summed_and_halves_joined():
     out = np.empty((13, 8), np.float32)
     _square(SQUARE.reshape(-1), out.reshape(-1))
     assert np.array_equal(out[:8], SQUARE.T)
@@ -149,7 +149,7 @@ def test_exp2_is_within_two_roundings():
 
 @simd._access(types.void, types.uint64, types.intp)
 def _list_in_a_loop(builder, pointer, bits, base):
-    """What `list_set_bits` does on processors without AVX-512's compress instruction."""
+    """The code of `list_set_bits` for processors without AVX-512's compress instruction."""
     simd._loop_over_set_bits(builder, pointer, bits, builder.trunc(base, simd._BYTE))
 
 
@@ -197,7 +197,7 @@ def _groups():
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 16])
-def test_soa_rows_are_the_transposed_groups_and_turn_back_into_them(count):
+def test_soa_rows_are_the_transposed_groups_and_convert_back(count):
     groups = _groups()
     rows = np.full((8, WIDTH), np.nan)
     assert not _aos_to_soa(*(group.reshape(-1) for group in groups), 5, count, rows, _BOUND)
@@ -231,7 +231,7 @@ def _soa_to_records(soa, start, count, records):
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 16])
-def test_soa_rows_are_the_transposed_records_and_the_last_one_fills_up(count, workspace):
+def test_soa_rows_are_the_transposed_records_padded_with_the_last_one(count, workspace):
     records = np.random.default_rng(0).standard_normal((30, RECORD_SIZE)).astype(np.float32)
     soa = np.full((RECORD_SIZE, WIDTH), np.nan, np.float32)
     _records_to_soa(records.reshape(-1), 5, count, soa.reshape(-1))
