@@ -101,6 +101,7 @@ def test_an_installed_wheel_reads_its_own_shaders(installed: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["pansplat", "pansplat-view", "pansplat-train"])
 def test_the_entry_points_of_an_installed_wheel_work(installed: Path, command: str) -> None:
     done = run_in(installed, sys.executable, str(installed / "bin" / command), "--help")
@@ -108,6 +109,7 @@ def test_the_entry_points_of_an_installed_wheel_work(installed: Path, command: s
     assert command in done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_tests_pass_against_the_installed_wheel(installed: Path) -> None:
     """Run the tests of one module with the wheel instead of the checkout."""
     options = ["-q", "-n", "0", "-p", "no:cacheprovider", "-c", str(ROOT / "pyproject.toml")]

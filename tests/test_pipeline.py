@@ -167,6 +167,7 @@ def _sorted_rows(gaussians: Gaussians) -> np.ndarray:
     return rows[np.lexsort(rows.T[::-1])]
 
 
+@pytest.mark.slow
 def test_predict_to_file_writes_the_gaussians_of_predict(masked_pair: Path, weights: Path, tmp_path: Path) -> None:
     scene = predict(masked_pair, weights, height=TILED_HEIGHT, cache=False)
     save(scene, tmp_path / "whole.ply")
@@ -181,6 +182,7 @@ def test_predict_to_file_writes_the_gaussians_of_predict(masked_pair: Path, weig
     assert all(getattr(tiles, name) == getattr(whole, name) for name in ("near", "far", "names", "model", "height"))
 
 
+@pytest.mark.slow
 def test_predict_to_file_limits_degree_and_opacity(masked_pair: Path, weights: Path, tmp_path: Path) -> None:
     predict_to_file(masked_pair, tmp_path / "all.ply", weights, height=TILED_HEIGHT)
     all_gaussians = load(tmp_path / "all.ply").gaussians
@@ -194,6 +196,7 @@ def test_predict_to_file_limits_degree_and_opacity(masked_pair: Path, weights: P
     assert float(few.opacities.min()) >= min_opacity - 1e-6
 
 
+@pytest.mark.slow
 def test_the_predict_command_streams_large_predictions(
     masked_pair: Path, weights: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:

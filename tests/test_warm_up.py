@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 _CHECK = """
 import sys
 from numba.core.caching import NullCache
@@ -18,6 +20,7 @@ for kernel in kernels:
 """
 
 
+@pytest.mark.slow
 def test_warm_up_compiles_every_kernel_of_the_rasteriser_and_the_sweep() -> None:
     done = subprocess.run([sys.executable, "-c", _CHECK], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

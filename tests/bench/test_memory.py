@@ -188,6 +188,7 @@ def weights(tmp_path_factory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_child_measures_gradients_and_memory(weights):
     cases = MemoryCase("plain", 1, 64), MemoryCase("two-step", 4, 64)
     (plain, plain_gradients), (tiled, tiled_gradients) = (measure_case(case, SETTING, weights) for case in cases)

@@ -106,6 +106,7 @@ def plain(files) -> tuple:
     return measure_case(PLAIN, *files, near=0.5, far=10.0)
 
 
+@pytest.mark.slow
 def test_a_child_measures_the_prediction_of_the_network(files, plain):
     result, tensors = plain
     assert list(result.stages_s) == list(STAGES)
@@ -122,12 +123,14 @@ def test_a_child_measures_the_prediction_of_the_network(files, plain):
     assert tensors["image"].shape == (3, 64, 128) and float(tensors["image"].std()) > 0.01
 
 
+@pytest.mark.slow
 def test_tiles_hardly_change_the_prediction(files, plain):
     _, tiled = measure_case(dataclasses.replace(PLAIN, tiles=2), *files, near=0.5, far=10.0)
     assert torch.equal(plain[1]["depth"], tiled["depth"])  # only the heads are tiled
     assert clamped_psnr(tiled["image"], plain[1]["image"]) > 60
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not has_bfloat16(), reason="emulated bfloat16 is slow")
 def test_bfloat16_changes_the_prediction_a_little(files, plain):
     _, rounded = measure_case(dataclasses.replace(PLAIN, precision="bfloat16"), *files, near=0.5, far=10.0)
@@ -136,6 +139,7 @@ def test_bfloat16_changes_the_prediction_a_little(files, plain):
     assert clamped_psnr(rounded["image"], plain[1]["image"]) > 25
 
 
+@pytest.mark.slow
 def test_the_error_of_a_child_is_passed_on(files, tmp_path):
     with pytest.raises(InputError, match=r"a row of the bench failed \(.*FileNotFoundError.*try a smaller --height"):
         measure_case(PLAIN, files[0], tmp_path / "none.safetensors", near=0.5, far=10.0)

@@ -71,6 +71,7 @@ def test_missing_gsplat_is_named(monkeypatch, pose):
         render_case(RasterCase("gsplat", 8, "ewa", "z", layout="cubemap", face_size=4), full_lattice_room(8), pose)
 
 
+@pytest.mark.slow
 @pytest.mark.gl
 def test_the_viewer_renders_each_case():
     scene, cases = make_room_scene(HEIGHT), [VIEWER_CASE, replace(VIEWER_CASE, kernel="ewa")]
@@ -95,6 +96,7 @@ def test_a_missing_viewer_is_an_error(monkeypatch):
         next(render_in_viewer(make_room_scene(8), full_lattice_room(8), [VIEWER_CASE], repeats=1))
 
 
+@pytest.mark.slow
 def test_an_error_of_the_viewer_is_passed_on(tmp_path):
     (tmp_path / "job.json").write_text("{}")
     with pytest.raises(InputError, match="the viewer rendered nothing: error: 'scene'"):

@@ -42,6 +42,7 @@ def _no_viewer(*_: object) -> None:
     raise InputError("there is none in this test")
 
 
+@pytest.mark.slow
 def test_the_quick_run_writes_rows_and_plots_and_prints_the_tables(tmp_path, capsys):
     out = tmp_path / "out"
     assert run(["bench", "raster", "--quick", "--height", "16", "--out", str(out), "--threads", "1"]) == 0
@@ -57,6 +58,7 @@ def test_the_quick_run_writes_rows_and_plots_and_prints_the_tables(tmp_path, cap
         assert word in printed
 
 
+@pytest.mark.slow
 def test_a_ply_scene_is_measured(tmp_path):
     scene = Scene(full_lattice_room(16), make_room_cameras(2), 0.1, 10.0, ("a", "b"))
     pipeline.save(scene, tmp_path / "mine.ply")
@@ -67,6 +69,7 @@ def test_a_ply_scene_is_measured(tmp_path):
     assert {row["scene"] for row in rows} == {"mine", "mine 1/16"}
 
 
+@pytest.mark.slow
 def test_the_depth_of_a_pair_gives_a_gaussian_at_every_lattice_point(tmp_path):
     file = tmp_path / "rows.json"
     command = ["bench", "raster", str(SAMPLE), "--scene-from", "depth", "--quick", "--height", "16"]

@@ -49,6 +49,7 @@ def test_converted_weights_have_their_model_and_compat(conversion: tuple[Path, P
     assert weights.config["candidates"] == 128
 
 
+@pytest.mark.slow
 def test_all_commands_and_the_viewer_take_converted_weights(
     conversion: tuple[Path, Path, str], tmp_path: Path, write_room
 ) -> None:

@@ -51,6 +51,7 @@ def test_batches_from_a_step_equal_those_of_an_uninterrupted_run(tmp_path: Path)
     assert not _equal(_take(loader, 3, step=3), whole[4:])
 
 
+@pytest.mark.slow
 def test_batches_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     scenes = GeneratedTriplets(count=5, samples=1)
     options = {"height": 8, "batch_size": 2, "seed": 1, "augmentation": Augmentation(exposure=0.3)}

@@ -219,6 +219,7 @@ def measure_distances(metric: Lpips, size: tuple[int, int], weighted: bool) -> t
     return found.detach(), a.grad
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "pixels", "weighted"),
     [((64, 48), 1000, False), ((67, 33), 300, True), ((70, 40), 600, False), ((35, 32), 1, True)],

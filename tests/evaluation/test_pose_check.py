@@ -81,6 +81,7 @@ def test_right_poses_fit_best() -> None:
     assert check.baseline == pytest.approx(float((_TILTED[0] - _TILTED[1])[:3, 3].norm()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", _make_mistakes(torch.stack(_TILTED)))
 def test_each_wrong_convention_is_named(mistake: str) -> None:
     views = _views(*_TILTED)
@@ -138,6 +139,7 @@ def test_unrelated_images_give_a_warning() -> None:
     assert any("overlap too little" in warning for warning in check.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 @pytest.mark.parametrize(
     ("data", "index"), [("mp3d_sample", 0), ("zind", 0), ("zind", 1), ("bsp_demo", 0), ("bsp_demo", 7)]
@@ -147,6 +149,7 @@ def test_shared_poses_pass(shared: Path, data: str, index: int) -> None:
     assert check.likely_mistake is None
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 @pytest.mark.parametrize(
     ("convention", "interpretation"),

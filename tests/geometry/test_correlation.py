@@ -128,6 +128,7 @@ def _inputs(channels=5, candidates=7, height=H):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["torch", "kernel"])
 @pytest.mark.parametrize("sampling", SAMPLINGS)
 def test_correlation_is_the_product_with_the_warped_panorama(sampling, backend):

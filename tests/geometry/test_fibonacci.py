@@ -61,6 +61,7 @@ def test_lattices_equal_the_official_ones_up_to_their_rounding(golden, width, er
     assert float(difference.abs().max()) < 1e-6
 
 
+@pytest.mark.slow
 def test_the_official_rounding_errors_grow_with_the_count():
     for width, pixels in ((128, 0.1), (4096, 10.0)):
         count = lattice_size(width)

@@ -114,6 +114,7 @@ def test_flight_is_rigid_and_continuous():
     assert float(torch.rad2deg(torch.acos(cosines)).max()) < 4
 
 
+@pytest.mark.slow
 def test_flight_passes_through_every_camera():
     cameras = torch.stack((_pose((0, 0, 0)), _pose((1, 0, 0)), _pose((1, 0, 2))))
     path = fly_path(cameras, [i / 2000 for i in range(2001)])[:, :3, 3]

@@ -48,6 +48,7 @@ def small(randomize):
     return randomize(SphericalCostVolume(_SMALL, "fixed"))
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 def test_depths_match_the_official_code(run_official, golden, error):
     truth, run = golden("pansplat_64x128_fp32attn"), run_official()

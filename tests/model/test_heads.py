@@ -96,6 +96,7 @@ def _difference(a: Gaussians, b: Gaussians) -> float:
 # Tiles
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lattice", "tiles"), [("pixel", 2), ("fibonacci", 8)])
 def test_tiled_heads_equal_untiled(lattice, tiles):
     heads, matched = _heads(lattice=lattice), _matched(views=1)
@@ -119,6 +120,7 @@ def test_official_tiles_change_the_output():
         assert _difference(heads(matched)[0], tiled.select(torch.argsort(index))) > 1e-3
 
 
+@pytest.mark.slow
 def test_a_tile_computed_alone_has_the_same_gaussians_and_gradients():
     heads, matched = _heads(), _matched()
     untiled = heads(matched)[0]

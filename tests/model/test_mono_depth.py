@@ -38,6 +38,7 @@ def test_features_and_depth_match_the_official_code(run_official, golden, error)
     assert error(depth[..., ::8, ::8], truth["mono.pred_depth_sub"]) < 2e-4
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 def test_rolling_the_panorama_by_half_a_turn_rolls_the_features(run_official, golden, error) -> None:
     run = run_official("fixed")

@@ -86,6 +86,7 @@ def small(randomize: Callable[[torch.nn.Module], torch.nn.Module]) -> MVSplat:
     return randomize(MVSplat(SMALL, "fixed"))
 
 
+@pytest.mark.slow
 def test_rolling_by_half_a_turn_rolls_the_prediction(small: MVSplat, make_inputs) -> None:
     images, poses, near, far = make_inputs()
     half_turn = torch.diag(torch.tensor((-1.0, 1.0, -1.0, 1.0), dtype=torch.float64))
@@ -98,6 +99,7 @@ def test_rolling_by_half_a_turn_rolls_the_prediction(small: MVSplat, make_inputs
     assert torch.allclose(after.gaussians[0].means.reshape(2, 64, 128, 3), means, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_rotating_the_world_rotates_the_prediction(small: MVSplat, make_inputs) -> None:
     images, poses, near, far = make_inputs()
     rotation = rotations_from_quats(torch.tensor((0.3, -0.5, 0.7, 0.2), dtype=torch.float64))
@@ -110,6 +112,7 @@ def test_rotating_the_world_rotates_the_prediction(small: MVSplat, make_inputs) 
     assert torch.allclose(after.harmonics, rotate_harmonics(before.harmonics, rotation), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_batch_items_are_independent(small: MVSplat, make_inputs) -> None:
     inputs = make_inputs(height=32, batch=2, views=3)
     with torch.no_grad():
@@ -121,6 +124,7 @@ def test_batch_items_are_independent(small: MVSplat, make_inputs) -> None:
         assert torch.allclose(ours.opacities, alone.opacities, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_gradients_reach_every_weight(small: MVSplat, make_inputs) -> None:
     gaussians = small(*make_inputs()).gaussians[0]
     loss = gaussians.means.square().mean() + gaussians.opacities.mean() + gaussians.harmonics.square().mean()

@@ -49,6 +49,7 @@ def test_official_prediction_matches_the_official_code(run_official, golden, err
     assert max(errors.values()) < 2e-4, errors
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 def test_official_prediction_with_bfloat16_attention_is_near_the_official_code(run_official, golden, error):
     """Float32 rounding flips some roundings to bfloat16, which grow to 3e-2 of a standard deviation."""
@@ -111,6 +112,7 @@ def test_rolling_panoramas_and_turning_poses_by_half_a_turn_keeps_the_scene(smal
         assert torch.allclose(a, b.roll(64, dims=2), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_tiled_prediction_equals_untiled(network, prediction, make_inputs):
     with torch.no_grad():
         tiled = network(*make_inputs(), tiles=4).gaussians[0]
@@ -143,6 +145,7 @@ def test_large_panoramas_are_matched_at_low_and_lifted_at_full_resolution(networ
     assert int((output.gaussians[0].levels == 0).sum()) == 2 * int(256**2 / math.pi)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compat", ["official", "fixed"])
 def test_gradients_reach_every_weight_and_the_images(compat, small_config, make_inputs):
     """Coarser levels get gradients from a loss of their own: finer levels detach them."""
@@ -185,6 +188,7 @@ def test_heads_that_do_not_fit_the_features_are_refused(small_config):
 # Precision
 
 
+@pytest.mark.slow
 def test_bfloat16_prediction_is_close_to_float32_and_in_float32(randomize, make_inputs):
     config = PanSplatConfig(
         features=FeaturePyramidConfig(channels=(8, 8, 16, 32), transformer=TransformerConfig(channels=32, blocks=2)),

@@ -224,6 +224,7 @@ def _gradients(loss, gaussians: Gaussians, backend: str):
     return value.detach(), torch.autograd.grad(value, list(leaves.values()))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.filterwarnings("ignore:The .grad attribute")  # the compiler reads it
 @pytest.mark.parametrize("backend", ["numba", "torch"])

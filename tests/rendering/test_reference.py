@@ -127,6 +127,7 @@ def _leaves(scene: Gaussians) -> dict[str, torch.Tensor]:
     return {name: getattr(scene, name).detach().clone().requires_grad_() for name in _FIELDS}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("layout", "kernel", "lowpass"),
     [

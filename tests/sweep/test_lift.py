@@ -37,6 +37,7 @@ def _middle(observed) -> np.ndarray:
     return interpolate_poses(*torch.from_numpy(observed.posed.cam2world), 0.5).numpy()
 
 
+@pytest.mark.slow
 def test_gaussians_are_ordered_by_level_and_then_by_view(gaussians):
     order = gaussians.levels.long() * 2 + gaussians.views.long()
     assert (order.diff() >= 0).all()

@@ -29,6 +29,7 @@ def _yaw_degrees_off(axes: np.ndarray, room2world: np.ndarray) -> float:
     return min(turned, 90 - turned)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("yaw", "pitch", "roll"), ((0, 0, 0), (58, 6, -4), (12, -35, 50)))
 def test_down_and_the_wall_normals_are_found_in_a_room_of_bricks(make_room, observe, turn, yaw, pitch, roll):
     room2world = np.eye(4)
@@ -215,6 +216,7 @@ def test_the_floor_and_the_ceiling_are_found(voted, empty_room):
     assert up == pytest.approx(empty_room.room.low[1] - voted.origin[1], abs=1.5 * voted.bin)
 
 
+@pytest.mark.slow
 def test_a_box_standing_on_the_floor_is_not_the_floor(furnished_room, detect):
     down, _ = detect(furnished_room.posed).floor_ceiling
     assert down == pytest.approx(furnished_room.room.high[1], abs=0.1)

@@ -88,6 +88,7 @@ def swapped(small) -> Gaussians:
     return Sweep()(small[0].flip(0), small[1].flip(0), 0.5, 6.0)
 
 
+@pytest.mark.slow
 def test_a_batch_gives_a_list_of_its_items(small, predicted, swapped):
     images, poses = (torch.stack((t, t.flip(0))) for t in small)
     batch = Sweep()(images, poses, 0.5, torch.tensor((8.0, 6.0)))
@@ -104,6 +105,7 @@ def test_swapping_the_views_swaps_their_labels(predicted, swapped):
         assert distance.median() < 0.03  # the two views' lattices are about 0.1 m apart
 
 
+@pytest.mark.slow
 def test_holes_of_a_scan_are_masked_and_the_input_is_not_changed(small):
     holed, poses = small[0].clone(), small[1].clone()
     holed[0, :, 20:30, 40:60] = 0

@@ -57,6 +57,7 @@ def test_surfaces_stay_within_the_depth_range(small_furnished_room):
     assert inverse.min() >= np.float32(1 / 2.5) and inverse.max() <= np.float32(1 / (2.0 * margin))
 
 
+@pytest.mark.slow
 def test_rolling_the_panoramas_rolls_the_surfaces(empty_room, turn):
     posed, columns = empty_room.posed, 40
     turned = posed.cam2world.copy()
@@ -83,6 +84,7 @@ def test_rotating_the_world_changes_no_surface(empty_room, turn):
     assert ((np.abs(inverse / empty_room.inverse_depths - 1) < 0.01).mean(axis=(1, 2)) > 0.95).all()
 
 
+@pytest.mark.slow
 def test_swapping_the_views_swaps_the_surfaces(empty_room):
     posed = empty_room.posed
     swapped = _search(posed, images=posed.images[::-1], cam2world=posed.cam2world[::-1])
@@ -91,6 +93,7 @@ def test_swapping_the_views_swaps_the_surfaces(empty_room):
     assert (change < 0.05).mean() > 0.95
 
 
+@pytest.mark.slow
 def test_scaling_the_world_scales_the_surfaces(empty_room):
     posed, scale = empty_room.posed, 0.25
     scaled = posed.cam2world.copy()
@@ -111,6 +114,7 @@ def test_coincident_cameras_give_the_middle_of_the_range(empty_room):
     assert np.allclose(inverse, 0.5 * (1 / 0.5 + 1 / 8.0))
 
 
+@pytest.mark.slow
 def test_masked_pixels_are_not_matched(empty_room):
     """A tripod moves with the camera. Without the mask its match pulls the surface away from the truth."""
     rows = slice(-14, None)

@@ -36,6 +36,7 @@ def state(value: float = 1.0, count: int = 4) -> dict[str, object]:
     return {"network": {"weight": torch.full((count,), value)}}
 
 
+@pytest.mark.slow
 def test_a_kill_at_any_time_leaves_a_readable_checkpoint(tmp_path: Path) -> None:
     first = 0
     for number in range(3):

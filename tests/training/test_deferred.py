@@ -34,6 +34,7 @@ def assert_equal_gradients(found: dict[str, torch.Tensor], expected: dict[str, t
         torch.testing.assert_close(found[name], gradient, rtol=1e-6, atol=1e-6 * scale + 1e-14, msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("style", "mixing"), [("panorama", "joint"), ("cubemap", "joint"), ("cubemap", "by_view"), ("original", "joint")]
 )
@@ -49,6 +50,7 @@ def test_deferred_gradients_equal_plain_ones(style: str, mixing: str, micro: Cal
         assert_equal_gradients(found, expected)
 
 
+@pytest.mark.slow
 def test_deferred_gradients_equal_plain_ones_with_auxiliary_heads(micro: Callable, make_batch: Callable) -> None:
     network, batch = micro(), make_batch()
     set_training_mode(network, ())
@@ -63,6 +65,7 @@ def test_deferred_gradients_equal_plain_ones_with_auxiliary_heads(micro: Callabl
         torch.testing.assert_close(parameter.grad, gradient)
 
 
+@pytest.mark.slow
 def test_frozen_parts_have_no_gradient_and_keep_their_statistics(micro: Callable, make_batch: Callable) -> None:
     network, batch, frozen = micro(), make_batch(), ("features", "cost_volume")
     freeze(network, frozen)
@@ -76,6 +79,7 @@ def test_frozen_parts_have_no_gradient_and_keep_their_statistics(micro: Callable
         assert torch.equal(tensor, before[name]), name
 
 
+@pytest.mark.slow
 def test_gradients_of_a_batch_equal_those_of_its_items_accumulated(micro: Callable, make_batch: Callable) -> None:
     network, memory = micro().eval(), MemoryConfig("two-step", 1, "cubemap")
     expected, joint = gradients(network, memory, make_batch(0, 1))
@@ -84,6 +88,7 @@ def test_gradients_of_a_batch_equal_those_of_its_items_accumulated(micro: Callab
     assert separate == pytest.approx(joint, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_deferred_gradients_of_the_baseline_equal_plain_ones(make_batch: Callable) -> None:
     network, batch = micro_mvsplat(), make_batch(0, 1)
     expected, loss = gradients(network, MemoryConfig("plain", 1, "cubemap"), batch)

@@ -35,6 +35,7 @@ def _launch(count: int, *arguments: str) -> subprocess.CompletedProcess[str]:
     return done
 
 
+@pytest.mark.slow
 def test_two_processes_have_the_gradients_of_one_process_with_the_joint_batch(tmp_path: Path) -> None:
     for count in (1, 2):
         _launch(count, _PROGRAMS, "split_batches", str(tmp_path))
@@ -49,6 +50,7 @@ def test_two_processes_have_the_gradients_of_one_process_with_the_joint_batch(tm
         torch.testing.assert_close(second[name], first[name], rtol=0, atol=0)
 
 
+@pytest.mark.slow
 def test_every_step_sums_gradients_in_the_same_order(tmp_path: Path) -> None:
     _launch(3, _PROGRAMS, "repeated_steps", str(tmp_path))
     read = {path.stem: torch.load(path) for path in tmp_path.iterdir()}
@@ -105,6 +107,7 @@ def test_only_the_last_batch_of_a_step_is_synchronised(monkeypatch: pytest.Monke
     assert module.weight.grad is not None and float(module.weight.grad) == pytest.approx(3.0)
 
 
+@pytest.mark.slow
 def test_torchrun_trains_and_only_the_first_process_writes(tmp_path: Path) -> None:
     out = tmp_path / "run"
     settings = ("--optimizer.steps", "1", "--optimizer.batch-size", "1", "--data.workers", "0", "--device", "cpu")

@@ -94,6 +94,7 @@ def test_out_of_memory_is_an_error_with_advice(
     assert "--memory.backpropagation two-step" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_same_command_resumes_a_stopped_run(
     micro_run: Callable, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -122,6 +123,7 @@ def test_the_same_command_resumes_a_stopped_run(
     assert "optimizer.steps was 2, now 3" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_a_terminal_saves_without_a_traceback(tmp_path: Path) -> None:
     """A terminal sends the signal to the whole process group, including the data workers."""
     arguments = ["tiny", "--out", str(tmp_path / "run"), *_SHORT]

@@ -29,6 +29,7 @@ def trained(config: TrainConfig) -> dict[str, torch.Tensor]:
     return load_weights(config.out / "model.safetensors").tensors
 
 
+@pytest.mark.slow
 def test_the_loss_decreases(micro_run: Callable) -> None:
     config = micro_run(steps=14, optimizer=OptimizerConfig(steps=14, batch_size=1, rate=5e-3))
     trained(config)
@@ -40,6 +41,7 @@ class Killed(BaseException):
     """Simulates a kill."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("accumulate", [1, 2])
 def test_a_killed_run_resumes_bit_identically(
     accumulate: int, micro_run: Callable, monkeypatch: pytest.MonkeyPatch
@@ -87,6 +89,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_saves_the_batch(
     assert not list(config.out.glob("model.safetensors"))
 
 
+@pytest.mark.slow
 def test_validation_writes_measures_and_images(micro_run: Callable) -> None:
     config = micro_run(steps=2, validation=ValidationConfig(every=1, samples=2, pictures=1))
     trained(config)
@@ -98,6 +101,7 @@ def test_validation_writes_measures_and_images(micro_run: Callable) -> None:
         assert min(curves.size) > 300
 
 
+@pytest.mark.slow
 def test_the_height_grows_during_training(micro_run: Callable) -> None:
     config = micro_run(steps=2, heights=(32, 64), validation=ValidationConfig(every=1, samples=1, pictures=0))
     trained(config)

@@ -68,6 +68,7 @@ np.savez(out, version=ctx.version_code, tier=renderer.tier, **images)
 """
 
 
+@pytest.mark.slow
 def test_old_opengl_and_osmesa_render_the_same_images(make_renderer, random_scene, pose, tmp_path):
     scene = random_scene()
     stored = {"gaussians": vars(scene.gaussians), "cam2world": scene.cam2world, "pose": torch.from_numpy(pose)}

@@ -242,6 +242,7 @@ def test_every_widget_has_a_test_and_fits_without_scrolling(user):
     assert max(rectangle[3] for rectangle in user.panels.items.values()) < SIZE[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("label", IMAGE_WIDGETS)
 def test_clicking_the_widget_changes_the_image(user, label):
     user.state.settings = replace(user.state.settings, **INITIAL_SETTINGS.get(label, {}))
@@ -382,6 +383,7 @@ def test_the_photograph_is_shown_in_the_viewing_direction(user):
     assert user.read_image().max() < 90, "the nearest photograph is the second, dim one"
 
 
+@pytest.mark.slow
 def test_rendering_at_an_input_camera_looks_like_its_photograph(user):
     user.show(SceneEntry("sphere"))
     state = user.state

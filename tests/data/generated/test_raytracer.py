@@ -71,6 +71,7 @@ def test_the_bvh_gives_the_hits_of_an_exhaustive_search() -> None:
     assert 50 < hits < 450
 
 
+@pytest.mark.slow
 def test_depth_is_radial_at_pixel_centres() -> None:
     scene = _scene(lambda b, material: b.add_box((0, 1.5, 0), (30, 0.1, 30), material))
     pose = np.eye(4)

@@ -87,6 +87,7 @@ def _compare(scene, pose, layout, options=None, covariances=None):
     assert result.info.backend == "numba" and result.info.bytes > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("layout", "options"), _CASES)
 def test_sums_and_gradients_equal_the_reference(layout, options, scene, pose):
     _compare(scene, pose, layout, options)

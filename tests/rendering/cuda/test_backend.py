@@ -71,6 +71,7 @@ def _compare(
     return expected, got
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "dtype", "channels"),
     [*((case, torch.float64, 5) for case in _CASES), *((_CASES[k], torch.float32, 3) for k in (0, 4, 5))],

@@ -15,6 +15,7 @@ def _coloured(scene, colours: torch.Tensor):
     return dataclasses.replace(scene, harmonics=((colours - 0.5) / _BASE)[:, None])
 
 
+@pytest.mark.slow
 @pytest.mark.hard_case(31)
 @pytest.mark.parametrize("channels", [1, 3, 32])
 def test_an_image_is_linear_in_its_colours(channels, render, make_scene, pose, leaves):
@@ -54,6 +55,7 @@ def test_distance_as_a_channel_is_the_depth(render, make_scene, pose):
     assert float(got.depth.max()) > 1
 
 
+@pytest.mark.slow
 @pytest.mark.hard_case(34)
 def test_every_harmonic_up_to_degree_4_has_its_value(render, balls):
     """The official code ignores coefficients 16 to 24, and evaluates coefficient 14 on the wrong axis."""
@@ -72,6 +74,7 @@ def test_every_harmonic_up_to_degree_4_has_its_value(render, balls):
     assert (colours - (0.5 + 0.3 * expected)).abs().max() < 20 * render.image
 
 
+@pytest.mark.slow
 @pytest.mark.hard_case(34)
 @pytest.mark.parametrize("degree", range(5))
 def test_gradients_of_harmonics_and_directions_equal_the_dense_renderers(

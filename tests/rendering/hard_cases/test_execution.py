@@ -12,6 +12,7 @@ from pansplat.rendering import rasterize
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 
 
+@pytest.mark.slow
 @pytest.mark.hard_case(36)
 @pytest.mark.parametrize("kernel", ["ray", "ewa"])
 def test_the_number_of_threads_changes_no_bit_of_image_or_gradients(

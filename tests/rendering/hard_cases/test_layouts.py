@@ -23,6 +23,7 @@ def test_stitching_and_its_gradient_are_adjoint(stitching, size):
     assert float((left - right).abs() / left.abs()) < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.hard_case(32)
 def test_the_cubemap_and_the_direct_panorama_have_no_seam(render, balls, yaw):
     """A sphere on an edge of the cube and in the middle of a face gives the same image, up to the faces' pixels."""
@@ -36,6 +37,7 @@ def test_the_cubemap_and_the_direct_panorama_have_no_seam(render, balls, yaw):
             assert float((torch.roll(still, -2, dims=1) - turned).abs().max()) < tolerance, (mean, layout)
 
 
+@pytest.mark.slow
 @pytest.mark.hard_case(33)
 @pytest.mark.parametrize("kernel", ["ray", "ewa"])
 @pytest.mark.parametrize("stitching", ["seamless", "official"])

@@ -44,6 +44,7 @@ def _stack(balls, count: int, opacity: float, depth: float = 1e-6):
     return balls(means, 0.9, opacity, torch.rand(count, 3, generator=generator, dtype=torch.float64))
 
 
+@pytest.mark.slow
 @pytest.mark.hard_case(18)
 def test_a_million_gaussians_in_one_pixel_give_the_weighted_mean_of_the_first(render, balls):
     if render.interpreted:

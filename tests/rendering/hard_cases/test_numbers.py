@@ -33,6 +33,7 @@ def test_quaternions_of_any_length_are_rotations_and_zero_is_the_identity(render
     assert float(radial.max()) < 1e-4 * float(gradient.norm(dim=1)[1:].max())  # tangential
 
 
+@pytest.mark.slow
 @pytest.mark.hard_case(22)
 @pytest.mark.parametrize("field", _FIELDS)
 @pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf, 1e38])
@@ -61,6 +62,7 @@ def _scaled(scene, unit: float):
     return dataclasses.replace(scene, means=unit * scene.means, scales=unit * scene.scales)
 
 
+@pytest.mark.slow
 @pytest.mark.hard_case(24)
 @pytest.mark.hard_case(25)
 @pytest.mark.parametrize("unit", [1e-18, 1e-9, 1e-3, 1e4, 1e9, 1e18])

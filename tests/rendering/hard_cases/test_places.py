@@ -11,6 +11,7 @@ from pansplat.geometry.cubemap import face_poses
 _EYE = torch.eye(4, dtype=torch.float64)
 
 
+@pytest.mark.slow
 @pytest.mark.hard_case(1)
 @pytest.mark.parametrize("layout", ["equirect", "cubemap", "pinhole"])
 def test_an_empty_scene_is_background_and_gradients_of_zero(layout, render, balls, gradients):
@@ -32,6 +33,7 @@ def test_an_empty_scene_is_background_and_gradients_of_zero(layout, render, ball
             assert gradient.shape == shape and not gradient.any(), (name, field)
 
 
+@pytest.mark.slow
 @pytest.mark.hard_case(2)
 @pytest.mark.parametrize("mean", [(0, 0, 2.0), (1.0, -0.7, 1.3)])
 @pytest.mark.parametrize("options", [{}, {"layout": "pinhole"}, {"layout": "pinhole", "kernel": "ewa"}])
@@ -98,6 +100,7 @@ def test_there_is_no_seam_at_180_degrees(render, balls, make_scene, gradients, y
     assert all(torch.isfinite(gradient).all() for gradient in gradients(render, behind).values())
 
 
+@pytest.mark.slow
 @pytest.mark.hard_case(6)
 @pytest.mark.parametrize("mean", [(0, 0, 0), (0, 0, 1e-6), (0.03, 0, 0.03), (0.049, 0, 0)])
 @pytest.mark.parametrize("layout", ["equirect", "cubemap"])

@@ -63,6 +63,7 @@ def test_a_disc_that_faces_the_camera_has_its_closed_form(render, balls):
     assert (alpha - torch.where(expected >= 1 / 255, expected, 0)).abs().max() < 10 * render.image
 
 
+@pytest.mark.slow
 @pytest.mark.hard_case(15)
 @pytest.mark.parametrize("kernel", ["ray", "ewa"])
 @pytest.mark.parametrize("lowpass", ["angular", "3dgs"])
@@ -120,6 +121,7 @@ def test_covariances_equal_scales_and_quaternions(kernel, render, make_scene, po
         assert float((found - reference).norm()) < 4 * render.gradient * float(reference.norm()), name
 
 
+@pytest.mark.slow
 @pytest.mark.hard_case(23)
 def test_matrices_that_are_not_covariances_are_dropped_and_counted(render, balls, leaves, loss_of):
     scene = balls([(0, 0, 2.0), (0.5, 0, 2.0), (-0.5, 0, 2.0)], 0.3)

@@ -71,6 +71,7 @@ def test_gaussians_that_fill_a_large_panorama_need_bounded_memory():
     assert grown < 800 * 1024, f"grew by {grown / 1024:.0f} MB"
 
 
+@pytest.mark.slow
 @pytest.mark.hard_case(28)
 @pytest.mark.parametrize("height", [1, 2, 3, 5, 17, 31, 33, 100])
 def test_odd_sizes_equal_the_dense_renderer(height, render, balls, equals_dense):
@@ -82,6 +83,7 @@ def test_odd_sizes_equal_the_dense_renderer(height, render, balls, equals_dense)
     equals_dense(render, scene, size=(height, height + 3), layout="pinhole", fields=fields, slack=4)
 
 
+@pytest.mark.slow
 @pytest.mark.hard_case(28)
 @pytest.mark.parametrize("face_size", [1, 2, 3, 5, 7])
 def test_faces_of_any_size_are_stitched(face_size, render, balls, gradients):
