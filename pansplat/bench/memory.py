@@ -333,7 +333,7 @@ def _prepare_work(
         accumulate_gradients(TrainingStep(network, None, perceptual, weights, memory), [batch])
         gradients = {name: p.grad for name, p in network.named_parameters() if p.grad is not None}
         optimizer.step()
-        return batch.images.shape[1] * sum(len(points) for points in network.heads.points(height)), gradients
+        return batch.images.shape[1] * sum(len(points) for points in network.heads.make_points(height)), gradients
 
     return train
 
