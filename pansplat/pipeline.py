@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.cache import CachedPrediction
-from pansplat.data.layouts import load_pairs
+from pansplat.data.folders import load_pairs
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
 from pansplat.errors import InputError

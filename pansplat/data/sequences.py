@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pansplat.data.folders import find_trajectory, is_loc360_sequence, read_loc360_sequence
 from pansplat.data.images import read_mask, resize_panorama
-from pansplat.data.layouts import find_trajectory, is_loc360_sequence, read_loc360_sequence
 from pansplat.data.pairs import FAR_SEQUENCE, NEAR, Pair, Panorama
 from pansplat.data.poses import read_number, read_trajectory
 from pansplat.data.video import VideoFile, open_video

@@ -17,7 +17,7 @@ from typing import Protocol
 
 import numpy as np
 
-from pansplat.data.layouts import is_matterport3d_scene, read_matterport3d_scene, read_triplet, triplet_files
+from pansplat.data.folders import is_matterport3d_scene, read_matterport3d_scene, read_triplet, triplet_files
 from pansplat.data.pairs import Pair
 from pansplat.data.sequences import BoundedSampler, FramePair, FrameSequence, Stage, read_frame_pair
 from pansplat.data.views import Sample
@@ -77,7 +77,7 @@ class PairSource:
 
 @dataclass(frozen=True)
 class TripletSet:
-    """Triplets on disk, in PanoGRF's layout or that of game maps.
+    """Triplets on disk, in PanoGRF's format or that of game maps.
 
     Attributes:
         name: such as "m3d_dist_0.5".

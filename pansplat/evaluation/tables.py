@@ -45,7 +45,7 @@ class TableRow:
 
 
 @dataclass(frozen=True)
-class Layout:
+class TableLayout:
     """A table of the paper.
 
     Attributes:
@@ -66,18 +66,18 @@ class Layout:
 
 def _make_layout(
     title: str, sets: tuple[str, ...], metrics: tuple[str, ...], rows: Mapping[str, Sequence[float | None]]
-) -> Layout:
+) -> TableLayout:
     columns = [(name, metric) for name in sets for metric in metrics]
     table_rows = (
         TableRow(method, {c: n for c, n in zip(columns, numbers, strict=True) if n is not None})
         for method, numbers in rows.items()
     )
-    return Layout(title, sets, metrics, tuple(table_rows))
+    return TableLayout(title, sets, metrics, tuple(table_rows))
 
 
 _NO_VALUES = (None, None, None)
 
-LAYOUTS: dict[str, Layout] = {
+LAYOUTS: dict[str, TableLayout] = {
     "m3d": _make_layout(
         "Matterport3D, wide baselines",
         ("M3D 1.0 m", "M3D 1.5 m", "M3D 2.0 m"),
@@ -178,7 +178,7 @@ DEPTH_LAYOUT = _make_layout(
 )
 
 
-def rich_table(layout: Layout, ours: Sequence[TableRow]) -> Table:
+def rich_table(layout: TableLayout, ours: Sequence[TableRow]) -> Table:
     """The printable table: the paper's rows, a line, and ours in bold."""
     table = Table(title=layout.title)
     table.add_column("method")
@@ -193,7 +193,7 @@ def rich_table(layout: Layout, ours: Sequence[TableRow]) -> Table:
     return table
 
 
-def markdown_table(layout: Layout, ours: Sequence[TableRow]) -> str:
+def markdown_table(layout: TableLayout, ours: Sequence[TableRow]) -> str:
     """The table in Markdown, with ours in bold."""
     names = [f"{name} {HEADS[metric]}" for name, metric in layout.columns]
     lines = [f"### {layout.title}", "", f"| method | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
@@ -205,7 +205,7 @@ def markdown_table(layout: Layout, ours: Sequence[TableRow]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _format_cells(row: TableRow, layout: Layout) -> list[str]:
+def _format_cells(row: TableRow, layout: TableLayout) -> list[str]:
     """Formatted numbers; a dash for a missing one."""
     cells = []
     for column in layout.columns:
@@ -247,16 +247,16 @@ def plot_frame_distance(result: ProtocolResult, path: Path) -> None:
 _PAPER_LPIPS = "lpips-vgg"
 
 
-def list_layouts(result: ProtocolResult) -> list[Layout]:
+def list_table_layouts(result: ProtocolResult) -> list[TableLayout]:
     """The paper's tables for the evaluation; a table without the paper's rows for the frame-distance figure."""
     if result.protocol == "frame-distance":
         sets = tuple(dict.fromkeys(row.set for row in result.sets))
-        return [Layout("The frame in the middle, by frames between the inputs", sets, ("ws_psnr",), ())]
+        return [TableLayout("The frame in the middle, by frames between the inputs", sets, ("ws_psnr",), ())]
     with_depth = result.protocol == "m3d" and any(row.depth for row in result.sets)
     return [LAYOUTS[result.protocol], *([DEPTH_LAYOUT] if with_depth else [])]
 
 
-def our_rows(result: ProtocolResult, layout: Layout) -> list[TableRow]:
+def our_rows(result: ProtocolResult, layout: TableLayout) -> list[TableRow]:
     """A row for each method with its values on the table's sets."""
     rows: dict[str, TableRow] = {}
     for set_result in result.sets:
@@ -270,7 +270,7 @@ def our_rows(result: ProtocolResult, layout: Layout) -> list[TableRow]:
 
 def rich_tables(result: ProtocolResult) -> list[Table]:
     """The printable tables."""
-    return [rich_table(layout, our_rows(result, layout)) for layout in list_layouts(result)]
+    return [rich_table(layout, our_rows(result, layout)) for layout in list_table_layouts(result)]
 
 
 def report_notes(result: ProtocolResult) -> list[str]:
@@ -294,7 +294,7 @@ def write_report(result: ProtocolResult, out: Path) -> list[Path]:
     Raises:
         InputError: a file cannot be written.
     """
-    tables = [markdown_table(layout, our_rows(result, layout)) for layout in list_layouts(result)]
+    tables = [markdown_table(layout, our_rows(result, layout)) for layout in list_table_layouts(result)]
     with replacing(out / "table.md") as partial:
         partial.write_text(
             "\n".join([*tables, *(f"* {note}" for note in report_notes(result))]) + "\n", encoding="utf-8"

@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
+from pansplat.data.folders import load_pairs
 from pansplat.data.generated.triplets import GeneratedTriplets
-from pansplat.data.layouts import load_pairs
 from pansplat.data.sequences import BoundedSampler, read_insta360, read_loc360
 from pansplat.data.sources import (
     ConcatSource,

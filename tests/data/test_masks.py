@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from pansplat.data.folders import load_pairs
 from pansplat.data.images import write_image
-from pansplat.data.layouts import load_pairs
 from pansplat.data.masks import detect_scene_mask, scene_mask_of_files
 from pansplat.geometry.equirect import pixel_directions, row_weights
 

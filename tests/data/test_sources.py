@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from pansplat.data.folders import load_pairs
 from pansplat.data.generated.triplets import GeneratedTriplets
-from pansplat.data.layouts import load_pairs
 from pansplat.data.sources import ConcatSource, PairSource, TripletSource, read_game_maps, read_panogrf
 from pansplat.data.views import collate
 from pansplat.errors import InputError

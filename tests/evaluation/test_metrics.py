@@ -7,7 +7,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from pansplat.data.layouts import load_pairs
+from pansplat.data.folders import load_pairs
 from pansplat.evaluation.metrics import cross_fade, depth_errors, psnr, ssim, ws_psnr
 from pansplat.geometry.equirect import pixel_directions, row_weights
 from pansplat.geometry.pose import rotations_from_quats

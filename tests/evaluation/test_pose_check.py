@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pansplat.data.layouts import load_pairs
+from pansplat.data.folders import load_pairs
 from pansplat.data.views import Views
 from pansplat.evaluation.pose_check import _ADVICE, AS_GIVEN, PoseCheck, _describe_mistake, check_pair, check_views
 from pansplat.geometry.equirect import pixel_directions

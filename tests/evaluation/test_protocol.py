@@ -30,7 +30,7 @@ from pansplat.evaluation.protocol import (
 from pansplat.evaluation.tables import (
     LAYOUTS,
     frame_distance_curves,
-    list_layouts,
+    list_table_layouts,
     our_rows,
     report_notes,
     rich_tables,
@@ -325,7 +325,7 @@ def test_the_figure_has_a_line_for_each_method(tmp_path: Path) -> None:
     assert {path.name for path in written} == {"table.md", "frame_distance.png"}
     with Image.open(tmp_path / "out" / "frame_distance.png") as figure:
         assert figure.size[0] > 300
-    (layout,) = list_layouts(result)
+    (layout,) = list_table_layouts(result)
     assert layout.sets == ("2 frames", "4 frames") and all(len(row.values) == 2 for row in our_rows(result, layout))
 
 

@@ -13,7 +13,7 @@ from PIL import Image
 from rich.console import Console
 from torch import Tensor
 
-from pansplat.data.layouts import load_pairs
+from pansplat.data.folders import load_pairs
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr

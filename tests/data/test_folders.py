@@ -1,4 +1,4 @@
-"""Every folder layout gives the same cameras, and invalid folders are refused with the reason."""
+"""Every folder format gives the same cameras, and invalid folders are refused with the reason."""
 
 import json
 import warnings
@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
+from pansplat.data.folders import load_pairs
 from pansplat.data.images import write_image
-from pansplat.data.layouts import load_pairs
 from pansplat.errors import InputError
 
 OPENCV = "cam2world opencv"

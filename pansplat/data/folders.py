@@ -1,7 +1,7 @@
-"""Folder layouts of posed panoramas: `load_pairs` recognises and reads them (docs/input.md).
+"""Folder formats of posed panoramas: `load_pairs` recognises and reads them (docs/input.md).
 
-Each layout has a function that recognises a folder and one that reads it into a `Collection`. The argument `convention`
-of the readers overrides the layout's pose convention. Readers raise an InputError for missing or invalid files; the
+Each format has a function that recognises a folder and one that reads it into a `Collection`. The argument `convention`
+of the readers overrides the format's pose convention. Readers raise an InputError for missing or invalid files; the
 message names the file and the entry.
 """
 
@@ -55,14 +55,14 @@ def load_pairs(
     """The pairs at a path, those with targets first. Image files are read when a pair is loaded.
 
     Args:
-        path: a pair folder, a folder of many posed panoramas, or a folder of such folders, in one of the layouts of
+        path: a pair folder, a folder of many posed panoramas, or a folder of such folders, in one of the formats of
             docs/input.md (poses.json, PanoGRF, 360Loc, KITTI, TUM, game-map triplets). Also one of their files with
             poses.
         convention: pose convention, such as "world2cam opengl"; overrides that of the files.
         near, far: radial depth range in metres; overrides that of the files.
 
     Raises:
-        InputError: no known layout was found, or a file is missing or invalid.
+        InputError: no known format was found, or a file is missing or invalid.
     """
     root = Path(path).expanduser()
     if not root.exists():
@@ -134,7 +134,7 @@ def _choose_convention(convention: str | None, default: str) -> str:
     return default if convention is None else parse_convention(convention, "`convention`")
 
 
-# poses.json with an optional pairs.json: the package's own layout.
+# poses.json with an optional pairs.json: the package's own format.
 
 
 def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collection:
