@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -20,7 +21,7 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.predictor import Predictor
 
 _FORMAT = "1"  # version of the file's layout; part of the hash
-_FIELDS = ("means", "scales", "quats", "opacities", "harmonics", "levels", "views")
+_FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
 
 
 class CachedPrediction:

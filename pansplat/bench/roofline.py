@@ -203,7 +203,7 @@ def count_panorama_work(
             None,
             cam2world.double(),
             filter_variance=options.filter_variance(plane.pixel_angle),
-            compensate=options.lowpass == "angular",
+            compensate=options.compensate,
             exact=False,
         )
         boxes = equirect_boxes(seen.direction, seen.covariance, kappa(seen.peak), size)

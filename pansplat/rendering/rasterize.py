@@ -75,13 +75,18 @@ class RasterOptions:
         return FILTER_VARIANCE[self.lowpass] * pixel_angle**2 if self._filters_across_ray else 0.0
 
     @property
+    def compensate(self) -> bool:
+        """Whether the opacity is lowered by as much as the filter widens a Gaussian."""
+        return self.lowpass == "angular"
+
+    @property
     def dilation(self) -> float:
         """Variance added to the projected covariance, pixels^2."""
         return 0.0 if self._filters_across_ray else FILTER_VARIANCE[self.lowpass]
 
     @property
     def _filters_across_ray(self) -> bool:
-        return self.lowpass == "angular" or self.kernel == "ray"
+        return self.compensate or self.kernel == "ray"
 
 
 @dataclass(frozen=True)

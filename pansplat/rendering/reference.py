@@ -82,7 +82,7 @@ def rasterize_planes(
         chosen.covariances,
         pose,
         filter_variance=options.filter_variance(planes[0].pixel_angle),
-        compensate=options.lowpass == "angular",
+        compensate=options.compensate,
         exact=options.kernel == "ray",
     )
     sums, visible, intersections = zip(*(_rasterize_plane(projected, plane, options) for plane in planes), strict=True)

@@ -217,7 +217,7 @@ def find_visible_gaussians(
             None,
             pose,
             filter_variance=options.filter_variance(regions[0].plane.pixel_angle),
-            compensate=options.lowpass == "angular",
+            compensate=options.compensate,
             exact=False,
         )
         for region, masks in zip(regions, found, strict=True):

@@ -185,7 +185,7 @@ class _Rasterize(torch.autograd.Function):
 
 def _make_camera(pose: Tensor, plane: ImagePlane, options: RasterOptions) -> Camera:
     variance = max(options.filter_variance(plane.pixel_angle), _MIN_FILTER_VARIANCE * plane.pixel_angle**2)
-    return Camera(np.ascontiguousarray(pose.detach().numpy()), variance, options.lowpass == "angular", options.near)
+    return Camera(np.ascontiguousarray(pose.detach().numpy()), variance, options.compensate, options.near)
 
 
 def _rasterize_plane(

@@ -56,7 +56,7 @@ def rasterize_planes(
             chosen.covariances,
             pose,
             filter_variance=options.filter_variance(planes[0].pixel_angle),
-            compensate=options.lowpass == "angular",
+            compensate=options.compensate,
             exact=options.kernel == "ray",
         )
         footprints, instances = _compute_instances(projected, planes, options)
