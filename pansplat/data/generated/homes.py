@@ -234,7 +234,8 @@ def _add_room(builder: SceneBuilder, room: Rectangle, height: float, top: float,
         materials.wall(builder),
     ]
     panel = rng.uniform(0.8, 1.3) if rng.random() < 0.25 else 0.0
-    builder.add_room(room, room_materials, panel, rng.uniform(0.05, 0.14) if rng.random() < 0.75 else 0.0, height)
+    trim_height = rng.uniform(0.05, 0.14) if rng.random() < 0.75 else 0.0
+    builder.add_room(room, room_materials, panel, trim_height, height, [rng.uniform(0.35, 0.7)] * 3)
     if rng.random() < 0.15:
         beam = materials.wood(builder)
         for at in np.arange(x0 + 0.5, x1 - 0.3, rng.uniform(0.8, 1.4)):

@@ -4,8 +4,9 @@ A body is a box, ellipsoid or cylinder with an affine map from the world to its 
 unit sphere, or x^2 + z^2 <= 1, |y| <= 1. Ray parameters are equal in both spaces. The bodies are in a bounding volume
 hierarchy (BVH).
 
-Lighting is diffuse, and therefore independent of the view: lamps and a sun with shadows, and ambient light, which is
-weaker in corners.
+Lighting is diffuse, and therefore independent of the view: lamps and a sun with shadows, portals (windows and open
+doors as luminous rectangles), and the ambient light of a room, which is weaker in corners. Rooms that share a light
+group share their lamps and portals.
 """
 
 from __future__ import annotations
@@ -166,9 +167,12 @@ SKY = 40.0  # radius of the sphere of sky and horizon, metres
 WALL, FLOOR, CEILING = -1, -2, -3  # materials that depend on the room
 # Columns of a room after its corners x0 z0 x1 z1.
 WALL_MATERIAL, FLOOR_MATERIAL, CEILING_MATERIAL, TRIM_MATERIAL, PANEL_MATERIAL = range(4, 9)
-PANEL_HEIGHT, TRIM_HEIGHT, HEIGHT = range(9, 12)
-# Columns of a light: position (or direction to a sun), colour, size, 1 for a sun.
-LIGHT_COLOR, LIGHT_SIZE, LIGHT_SUN, LIGHT_NUMBERS = 3, 6, 7, 8
+PANEL_HEIGHT, TRIM_HEIGHT, HEIGHT, AMBIENT, LIGHT_GROUP = 9, 10, 11, 12, 15
+# Columns of a light: position (direction to a sun, centre of a portal), colour, size, kind, the light group that it
+# reaches (-1 for all), and for portals: half width, half height, the axis of the normal, whether bodies cast shadows.
+LIGHT_COLOR, LIGHT_SIZE, LIGHT_KIND, LIGHT_REACHES = 3, 6, 7, 8
+PORTAL_WIDTH, PORTAL_HEIGHT, PORTAL_AXIS, PORTAL_SHADOWS, LIGHT_NUMBERS = 9, 10, 11, 12, 13
+LAMP, SUN, PORTAL = 0, 1, 2
 
 
 @nb.njit(**OPTIONS)
@@ -269,8 +273,41 @@ def _sky_color(materials, sky, dx, dy, dz, w):
 
 
 @nb.njit(**OPTIONS)
-def _direct_light(bodies, lights, last, x, y, z, nx, ny, nz, jitter):
-    """Light (red, green, blue) of lamps and sun at a point, with shadows.
+def portal_form_factor(light, x, y, z, nx, ny, nz):
+    """Fraction of a surface element's light that comes from an upright rectangle.
+
+    The vector form factor of the rectangle is exact (Lambert's formula). A sphere of equal vector form factor then
+    gives the part above the plane of the surface, which is smooth where that plane cuts the rectangle.
+    """
+    ax, az = 0.0, light[PORTAL_WIDTH]
+    if light[PORTAL_AXIS] > 0:
+        ax, az = az, ax
+    cx, cy, cz, high = light[0] - x, light[1] - y, light[2] - z, light[PORTAL_HEIGHT]
+    fx, fy, fz = 0.0, 0.0, 0.0
+    px, py, pz = cx - ax, cy + high, cz - az
+    size = math.sqrt(px * px + py * py + pz * pz) + 1e-9
+    px, py, pz = px / size, py / size, pz / size
+    for k in range(4):
+        along, up = (1.0 if k < 2 else -1.0), (1.0 if k == 0 or k == 3 else -1.0)
+        qx, qy, qz = cx + along * ax, cy + up * high, cz + along * az
+        size = math.sqrt(qx * qx + qy * qy + qz * qz) + 1e-9
+        qx, qy, qz = qx / size, qy / size, qz / size
+        cosine = min(0.9999, max(-0.9999, px * qx + py * qy + pz * qz))
+        weight = math.acos(cosine) / math.sqrt(1 - cosine * cosine) * (0.5 / math.pi)
+        fx += weight * (py * qz - pz * qy)
+        fy += weight * (pz * qx - px * qz)
+        fz += weight * (px * qy - py * qx)
+        px, py, pz = qx, qy, qz
+    size = math.sqrt(fx * fx + fy * fy + fz * fz)
+    towards = fx * nx + fy * ny + fz * nz
+    if fx * cx + fy * cy + fz * cz < 0:
+        towards = -towards
+    return max(0.0, (size * size + towards) / (size + 1))
+
+
+@nb.njit(**OPTIONS)
+def _direct_light(bodies, lights, last, group, x, y, z, nx, ny, nz, jitter):
+    """Light (red, green, blue) of lamps, portals and sun at a point of a light group, with shadows.
 
     Args:
         last: per light, the body that blocked it at the previous point, which is tested first; updated.
@@ -281,19 +318,36 @@ def _direct_light(bodies, lights, last, x, y, z, nx, ny, nz, jitter):
     x, y, z = x + 1e-4 * nx, y + 1e-4 * ny, z + 1e-4 * nz
     for k in range(len(lights)):
         light = lights[k]
+        if light[LIGHT_REACHES] >= 0 and light[LIGHT_REACHES] != group:
+            continue
         size = light[LIGHT_SIZE]
         jx, jy, jz = size * (2 * (jitter & 1) - 1), 0.3 * size * ((jitter % 3) - 1), size * ((jitter & 2) - 1)
-        if light[LIGHT_SUN] > 0:
-            lx, ly, lz, limit, fall = light[0] + jx, light[1] + jy, light[2] + jz, 2 * SKY, 1.0
+        if light[LIGHT_KIND] == PORTAL:
+            power = portal_form_factor(light, x, y, z, nx, ny, nz)
+            along = 0.5 * light[PORTAL_WIDTH] * (2 * (jitter & 1) - 1)
+            lx, ly, lz = light[0] - x, light[1] - y + 0.5 * light[PORTAL_HEIGHT] * ((jitter & 2) - 1), light[2] - z
+            if light[PORTAL_AXIS] > 0:
+                lx += along
+            else:
+                lz += along
             away = math.sqrt(lx * lx + ly * ly + lz * lz)
+            if light[PORTAL_SHADOWS] == 0 or nx * lx + ny * ly + nz * lz < 0:
+                r += power * light[LIGHT_COLOR]
+                g += power * light[LIGHT_COLOR + 1]
+                b += power * light[LIGHT_COLOR + 2]
+                continue
+            limit = away
         else:
-            lx, ly, lz = light[0] + jx - x, light[1] + jy - y, light[2] + jz - z
-            away = math.sqrt(lx * lx + ly * ly + lz * lz)
-            limit, fall = away, 1 / (0.6 + away * away)
-        facing = (nx * lx + ny * ly + nz * lz) / away
-        power = facing * fall
-        if power < 0.01:
-            continue
+            if light[LIGHT_KIND] == SUN:
+                lx, ly, lz, limit, fall = light[0] + jx, light[1] + jy, light[2] + jz, 2 * SKY, 1.0
+                away = math.sqrt(lx * lx + ly * ly + lz * lz)
+            else:
+                lx, ly, lz = light[0] + jx - x, light[1] + jy - y, light[2] + jz - z
+                away = math.sqrt(lx * lx + ly * ly + lz * lz)
+                limit, fall = away, 1 / (0.6 + away * away)
+            power = (nx * lx + ny * ly + nz * lz) / away * fall
+            if power < 0.01:
+                continue
         lx, ly, lz = lx / away, ly / away, lz / away
         if last[k] >= 0 and 1e-6 < intersect_body(kinds[last[k]], maps[last[k]], x, y, z, lx, ly, lz) < limit:
             continue
@@ -331,7 +385,10 @@ def _trace_ray(scene, bodies, last, x, y, z, dx, dy, dz, pixel, jitter):
         material = _room_material(rooms, room, material, py, outside)
     r, g, b = color(materials[material], u, v, width, half_u, half_v)
     around = _ambient_visibility(rooms, room, px, py, pz, nx, ny, nz) * (0.85 - 0.15 * ny)
-    lr, lg, lb = _direct_light(bodies, lights, last, px, py, pz, nx, ny, nz, jitter)
+    group = -1
+    if room >= 0:
+        ambient, group = rooms[room, AMBIENT:LIGHT_GROUP], int(rooms[room, LIGHT_GROUP])
+    lr, lg, lb = _direct_light(bodies, lights, last, group, px, py, pz, nx, ny, nz, jitter)
     glow = materials[material, GLOW]
     return (
         r * (ambient[0] * around + lr + glow),

@@ -9,7 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pansplat.data.generated.raytracer import BOX, CYLINDER, ELLIPSOID, LIGHT_NUMBERS, build_bvh, trace_panorama
+from pansplat.data.generated.raytracer import (
+    BOX,
+    CYLINDER,
+    ELLIPSOID,
+    LAMP,
+    LIGHT_NUMBERS,
+    PORTAL,
+    SUN,
+    build_bvh,
+    trace_panorama,
+)
 from pansplat.data.generated.textures import NUMBERS, Pattern
 
 Array = NDArray[np.float64]
@@ -36,9 +46,10 @@ class GeneratedScene:
         return image, depth
 
     def clearance(self, points: Array) -> Array:
-        """Distances in metres from points (n 3) to the nearest bounding box of a body."""
-        offset = np.maximum(np.maximum(self.low - points[:, None], points[:, None] - self.high), 0)
-        return np.linalg.norm(offset, axis=-1).min(axis=1)
+        """Distances in metres from points (n 3) to the nearest box, or oriented bounding box of a round body."""
+        maps, halves = self.arrays[1].reshape(-1, 3, 4), self.arrays[2]
+        local = np.abs(np.einsum("bij,nbj->nbi", maps[:, :, :3], points[:, None] - maps[:, :, 3]))
+        return np.linalg.norm(np.maximum(local - 1, 0) * halves, axis=-1).min(axis=1)
 
 
 class SceneBuilder:
@@ -97,18 +108,32 @@ class SceneBuilder:
         """Add an upright cylinder."""
         self._add_body(CYLINDER, centre, (radius, half_height, radius), material, 0, pitch)
 
-    def add_light(self, position: Vector, color: Vector, size: float, *, sun: bool = False) -> None:
-        """Add a lamp at a position, or a sun in a direction."""
-        self.lights.append(np.array((*position, *color, size, sun), np.float64))
+    def add_light(self, position: Vector, color: Vector, size: float, *, sun: bool = False, group: int = -1) -> None:
+        """Add a lamp at a position, or a sun in a direction; it lights the rooms of a light group, or all if -1."""
+        self.lights.append(np.array((*position, *color, size, SUN if sun else LAMP, group, 0, 0, 0, 0), np.float64))
+
+    def add_portal(
+        self, centre: Vector, half: tuple[float, float], axis: int, color: Vector, group: int, *, shadows: bool = False
+    ) -> None:
+        """Add a luminous upright rectangle, seen from the rooms of one light group; `axis` is that of its normal."""
+        self.lights.append(np.array((*centre, *color, 0, PORTAL, group, *half, axis, shadows), np.float64))
 
     def add_room(
-        self, corners: Vector, materials: Sequence[int], panel_height: float, trim_height: float, height: float
+        self,
+        corners: Vector,
+        materials: Sequence[int],
+        panel_height: float,
+        trim_height: float,
+        height: float,
+        ambient: Vector = (1.0, 1.0, 1.0),
+        group: int = 0,
     ) -> None:
-        """Add a room x0 z0 x1 z1 with its materials of wall, floor, ceiling, trim and panel."""
-        self.rooms.append(np.array((*corners, *materials, panel_height, trim_height, height), np.float64))
+        """Add a room x0 z0 x1 z1 with its materials of wall, floor, ceiling, trim and panel, light and light group."""
+        row = (*corners, *materials, panel_height, trim_height, height, *ambient, group)
+        self.rooms.append(np.array(row, np.float64))
 
     def finish(self, ambient: Vector, outside: int, sky: int) -> GeneratedScene:
-        """The scene; `outside` and `sky` are indices of materials."""
+        """The scene; `ambient` is the light outdoors, `outside` and `sky` are indices of materials."""
         low, high = np.array(self.low), np.array(self.high)
         bounds, links = build_bvh(low, high)
         lights = np.array(self.lights) if self.lights else np.zeros((0, LIGHT_NUMBERS))

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from pansplat.data.generated.raytracer import first_hit
+from pansplat.data.generated.raytracer import first_hit, portal_form_factor
 from pansplat.data.generated.scene import GeneratedScene, SceneBuilder
 from pansplat.data.generated.textures import Pattern
 
@@ -95,6 +95,20 @@ def test_bodies_cast_shadows() -> None:
     under_the_plate, on_the_other_side = image[row, 32, 0], image[row, 96, 0]
     assert under_the_plate == pytest.approx(0.5, abs=0.03)  # of the surrounding light, floors get all
     assert on_the_other_side > under_the_plate + 0.3
+
+
+def test_a_portal_lights_its_group_as_the_integral_over_its_area() -> None:
+    builder = SceneBuilder(np.random.default_rng(0))
+    builder.add_portal((0, -1.2, 3), (0.7, 0.5), 2, (1, 1, 1), 0)
+    light = builder.lights[0]
+    x, y = np.meshgrid(np.linspace(-0.7, 0.7, 401), -1.2 + np.linspace(-0.5, 0.5, 401))
+    for point, normal in (((0.3, -1.0, 0), (0, 0, 1)), ((-1, 0, 1), (0, -1, 0)), ((-2, -1, 2), (1, 0, 0))):
+        ray = np.stack((x, y, np.full_like(x, 3)), axis=-1) - point
+        away = np.linalg.norm(ray, axis=-1)
+        exact = (ray @ normal * ray[..., 2] / (np.pi * away**4)).mean() * 1.4
+        assert portal_form_factor(light, *map(float, point), *map(float, normal)) == pytest.approx(exact, rel=0.1)
+    threshold = portal_form_factor(light, 0.0, -1.2, 2.9999, 0.0, -1.0, 0.0)
+    assert threshold == pytest.approx(0.5, abs=0.01)
 
 
 def _at(x: float, y: float, z: float) -> np.ndarray:
