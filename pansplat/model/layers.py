@@ -86,9 +86,17 @@ class PanoramaConv2d(nn.Conv2d):
     """Convolution of panorama maps that are padded by `border`; the output has the input's size over the stride."""
 
     def __init__(
-        self, inputs: int, outputs: int, kernel: int, *, border: Border, stride: int = 1, bias: bool = True
+        self,
+        inputs: int,
+        outputs: int,
+        kernel: int,
+        *,
+        border: Border,
+        stride: int = 1,
+        groups: int = 1,
+        bias: bool = True,
     ) -> None:
-        super().__init__(inputs, outputs, kernel, stride=stride, bias=bias)
+        super().__init__(inputs, outputs, kernel, stride=stride, groups=groups, bias=bias)
         self.border: Border = border
         self.margin = kernel // 2
 
@@ -103,8 +111,8 @@ class PanoramaConv2d(nn.Conv2d):
     ) -> Float[Tensor, "batch c h w"]:
         """Convolve with the given weights and bias."""
         if self.border == "zeros":
-            return functional.conv2d(maps, weight, bias, self.stride, self.margin)
-        return functional.conv2d(pad_equirect(maps, self.margin, self.border), weight, bias, self.stride)
+            return functional.conv2d(maps, weight, bias, self.stride, self.margin, groups=self.groups)
+        return functional.conv2d(pad_equirect(maps, self.margin, self.border), weight, bias, self.stride, groups=self.groups)
 
 
 def convolve_and_normalize(

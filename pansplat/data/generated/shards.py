@@ -1,0 +1,209 @@
+"""Tours of generated homes on disk: linear light, depth and poses of several cameras in each home.
+
+A shard is an .npz file of `TOURS_PER_SHARD` tours. Tour n of a seed is always the same tour. Light is stored as its
+square root in 16-bit PNG, depth as millimetres in 16-bit PNG; both are lossless.
+"""
+
+from __future__ import annotations
+
+import bisect
+import json
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32
+from numpy.typing import NDArray
+
+from pansplat.atomic import replacing
+from pansplat.errors import InputError
+
+TOURS_PER_SHARD = 16
+_FORMAT = 1
+_MEDIAN_LIGHT = 0.2  # of a stored tour
+_MAX_LIGHT = 64.0
+_MILLIMETRES = 1000.0
+_LARGEST = 65535
+
+
+@dataclass(frozen=True, eq=False)
+class Tour:
+    """Panoramas of one place.
+
+    Attributes:
+        light: (view h w 3) linear light, float32; its median is 0.2.
+        depth: (view h w) radial depth in metres, float32; 0 where it is unknown.
+        cam2world: (view 4 4) float64.
+        camera_height: (view) height over the floor in metres, float64.
+    """
+
+    light: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    cam2world: NDArray[np.float64]
+    camera_height: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TourSettings:
+    """What a folder of shards contains.
+
+    Attributes:
+        seed: seed of the homes.
+        height: height of the panoramas, pixels.
+        cameras: cameras in each home.
+        samples: `samples` squared is the number of rays per pixel.
+    """
+
+    seed: int = 0
+    height: int = 128
+    cameras: int = 4
+    samples: int = 2
+
+
+def render_tour(settings: TourSettings, index: int) -> Tour:
+    """Tour `index` of a seed."""
+    from pansplat.data.generated.homes import build_home
+
+    rng = np.random.default_rng((settings.seed, index))
+    cameras = None
+    while cameras is None:
+        home = build_home(rng)
+        cameras = home.sample_cameras(rng, settings.cameras)
+    views = [home.variants[variant].panorama(pose, settings.height, settings.samples) for variant, pose in cameras]
+    light = np.stack([view[0] for view in views]).astype(np.float32)
+    light *= _MEDIAN_LIGHT / max(float(np.median(light)), 1e-4)
+    poses = np.stack([pose for _, pose in cameras])
+    return Tour(light, np.stack([view[1] for view in views]).astype(np.float32), poses, -poses[:, 1, 3])
+
+
+def write_shards(
+    folder: Path,
+    count: int,
+    settings: TourSettings,
+    *,
+    workers: int = 1,
+    progress: Callable[[int], None] | None = None,
+) -> int:
+    """Write the shards of tours 0 to `count` - 1, rounded up to whole shards, and return the number of new shards.
+
+    Shards that are there are kept, so that an interrupted call can be repeated.
+
+    Args:
+        progress: called with the number of tours in each shard that is finished.
+
+    Raises:
+        InputError: the folder holds shards of other settings, or cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    _claim_folder(folder, settings)
+    numbers = range(-(-count // TOURS_PER_SHARD))
+    missing = [n for n in numbers if not _shard_path(folder, n).exists()]
+    for _ in range(len(numbers) - len(missing)):
+        (progress or (lambda tours: None))(TOURS_PER_SHARD)
+    tasks = [(folder, settings, n) for n in missing]
+    for _ in _run_tasks(tasks, workers):
+        (progress or (lambda tours: None))(TOURS_PER_SHARD)
+    return len(missing)
+
+
+class ShardReader:
+    """The tours of one or more folders of shards, by index.
+
+    Raises:
+        InputError: a folder without shards.
+    """
+
+    def __init__(self, folders: list[Path]) -> None:
+        self.paths: list[Path] = []
+        for folder in folders:
+            found = sorted(folder.glob("shard_*.npz"))
+            if not found:
+                raise InputError(f"{folder}: needed shards of tours, got none; make them by `pansplat data homes`.")
+            self.paths += found
+        self._ends = [TOURS_PER_SHARD * (k + 1) for k in range(len(self.paths))]
+
+    def __len__(self) -> int:
+        return self._ends[-1]
+
+    def read(self, index: int) -> Tour:
+        """Tour `index`.
+
+        Raises:
+            InputError: a damaged shard.
+        """
+        shard = bisect.bisect_right(self._ends, index)
+        path, place = self.paths[shard], index % TOURS_PER_SHARD
+        try:
+            with np.load(path, allow_pickle=False) as shard_file:
+                lights = [_decode(png) for png in _unpack(shard_file[f"{place}.light"])]
+                depths = [_decode(png) for png in _unpack(shard_file[f"{place}.depth"])]
+                poses, heights = shard_file[f"{place}.cam2world"], shard_file[f"{place}.camera_height"]
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile, cv2.error) as error:
+            raise InputError(f"{path}: needed a shard of tours, got {error!r}; delete it and make it again.") from error
+        light = np.stack(lights).astype(np.float32) / _LARGEST
+        return Tour(light * light * _MAX_LIGHT, np.stack(depths) / np.float32(_MILLIMETRES), poses, heights)
+
+
+def _run_tasks(tasks: list[tuple[Path, TourSettings, int]], workers: int) -> Iterator[None]:
+    if workers <= 1:
+        yield from map(_write_shard, tasks)
+        return
+    with get_context("spawn").Pool(workers) as pool:
+        yield from pool.imap_unordered(_write_shard, tasks)
+
+
+def _write_shard(task: tuple[Path, TourSettings, int]) -> None:
+    folder, settings, number = task
+    arrays: dict[str, NDArray] = {}
+    for place in range(TOURS_PER_SHARD):
+        tour = render_tour(settings, number * TOURS_PER_SHARD + place)
+        code = np.sqrt(np.clip(tour.light, 0, _MAX_LIGHT) / _MAX_LIGHT) * _LARGEST
+        arrays[f"{place}.light"] = _pack([_encode(view) for view in code])
+        arrays[f"{place}.depth"] = _pack([_encode(np.minimum(view * _MILLIMETRES, _LARGEST)) for view in tour.depth])
+        arrays[f"{place}.cam2world"], arrays[f"{place}.camera_height"] = tour.cam2world, tour.camera_height
+    with replacing(_shard_path(folder, number)) as partial, open(partial, "wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+
+
+def _shard_path(folder: Path, number: int) -> Path:
+    return folder / f"shard_{number:05d}.npz"
+
+
+def _claim_folder(folder: Path, settings: TourSettings) -> None:
+    """Write the settings into the folder, or check that they are those of its shards."""
+    path = folder / "settings.json"
+    text = json.dumps({"format": _FORMAT, **settings.__dict__}, indent=1)
+    if path.exists() and path.read_text() != text:
+        raise InputError(f"{folder}: needed a folder with shards of the same settings, got others; see {path}.")
+    with replacing(path) as partial:
+        partial.write_text(text)
+
+
+def _encode(image: Float[NDArray, "height width *channel"]) -> NDArray[np.uint8]:
+    done, png = cv2.imencode(".png", np.rint(image).astype(np.uint16), [cv2.IMWRITE_PNG_COMPRESSION, 4])
+    assert done
+    return png.ravel()
+
+
+def _decode(png: NDArray[np.uint8]) -> Float32[NDArray, "height width *channel"]:
+    image = cv2.imdecode(png, cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise ValueError("a damaged PNG")
+    return image
+
+
+def _pack(parts: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Join byte strings of any length into one array: their count and lengths first."""
+    lengths = np.array([len(parts), *(len(part) for part in parts)], "<u4")
+    return np.concatenate((lengths.view(np.uint8), *parts))
+
+
+def _unpack(packed: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+    count = int(packed[:4].view("<u4")[0])
+    lengths = packed[4 : 4 + 4 * count].view("<u4").astype(np.int64)
+    ends = 4 + 4 * count + np.cumsum(lengths)
+    return [packed[end - length : end] for end, length in zip(ends, lengths, strict=True)]

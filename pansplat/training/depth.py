@@ -1,0 +1,321 @@
+"""Training of the depth network on pairs of panoramas from tours of generated homes.
+
+`python -m pansplat.training.depth --out RUN --tours SHARDS...` trains until it is stopped. The same command resumes.
+The learning rate rises, stays, and falls in the last `decay_steps` before `steps`; a longer run can therefore continue
+from a checkpoint of a shorter one. The tours are read anew at each start, so that more can be added.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import signal
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pansplat.console import own_warnings, run_command
+from pansplat.data.augment import mirror_views, roll_views
+from pansplat.data.generated.shards import ShardReader, Tour
+from pansplat.data.views import Views
+from pansplat.errors import InputError
+from pansplat.geometry.equirect import row_weights
+from pansplat.model.depth_network import DepthEstimate, DepthNetwork, DepthNetworkConfig
+from pansplat.model.efficientnet import load_imagenet_weights
+from pansplat.model.layers import to_channels_last
+from pansplat.training.checkpoint import load_latest, save_checkpoint
+from pansplat.training.logs import CsvTable
+from pansplat.training.optimization import ExponentialMovingAverage
+
+_COLUMNS = ("loss", "log_depth_error", "relative_error", "log_scale", "rate", "gradient_norm", "seconds")
+_MEASURES = ("log_depth_error", "relative_error", "likelihood")
+_MAX_DEPTH = 12.0  # in camera heights; surfaces farther away are all "far"
+_SCALES = (1, 2, 4)  # pixels, of the loss on differences between neighbours
+
+
+@dataclass(frozen=True)
+class DepthTrainConfig:
+    """A training run of the depth network."""
+
+    out: Path
+    """Folder of the run."""
+    tours: tuple[Path, ...]
+    """Folders of shards of tours."""
+    validation: Path | None = None
+    """Folder of shards of tours that are not trained on."""
+    seed: int = 0
+    steps: int = 100_000
+    decay_steps: int = 10_000
+    """Steps at the end in which the learning rate falls to zero."""
+    warm_up: int = 500
+    """Steps at the start in which the learning rate rises."""
+    pairs: int = 4
+    """Pairs of panoramas in a batch."""
+    rate: float = 4e-4
+    encoder_rate: float = 2e-4
+    weight_decay: float = 1e-2
+    ema: float = 0.999
+    clip: float = 5.0
+    baseline: tuple[float, float] = (0.3, 4.5)
+    """Smallest and largest distance of the cameras of a pair, metres, where a tour has such a pair."""
+    minutes: float = 5.0
+    """Minutes between checkpoints."""
+    validate_every: int = 500
+    validation_tours: int = 48
+    threads: int = 1
+    stop_after_minutes: float = 0.0
+    """Save and stop after so many minutes; 0 for none."""
+    network: DepthNetworkConfig = field(default_factory=DepthNetworkConfig)
+
+
+def read_pair(
+    tours: ShardReader, index: int, rng: np.random.Generator, baseline: tuple[float, float]
+) -> tuple[Views, Float[Tensor, "2"]]:
+    """Two photographed and augmented panoramas of a tour, with the heights of their cameras over the floor, metres."""
+    tour = tours.read(index)
+    chosen = _choose_pair(tour, rng, baseline)
+    images = _photograph(tour.light[chosen], rng)
+    depth = torch.from_numpy(tour.depth[chosen])
+    views = Views(
+        images=torch.from_numpy(images).permute(0, 3, 1, 2).contiguous(),
+        cam2world=torch.from_numpy(tour.cam2world[chosen]),
+        masks=torch.ones(depth.shape, dtype=torch.bool),
+        near=0.3,
+        far=20.0,
+        names=(f"tour_{index}_{chosen[0]}", f"tour_{index}_{chosen[1]}"),
+        depths=depth,
+    )
+    if rng.random() < 0.5:
+        views = mirror_views(views)
+    views = roll_views(views, rng.integers(depth.shape[-1], size=2).tolist())
+    return views, torch.from_numpy(tour.camera_height[chosen]).float()
+
+
+def _choose_pair(tour: Tour, rng: np.random.Generator, baseline: tuple[float, float]) -> list[int]:
+    centres = tour.cam2world[:, :3, 3]
+    distance = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    fitting = np.argwhere((distance >= baseline[0]) & (distance <= baseline[1]))
+    if len(fitting) == 0:
+        return [int(k) for k in rng.permutation(len(centres))[:2]]
+    return [int(k) for k in fitting[rng.integers(len(fitting))]]
+
+
+def _photograph(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Images (view h w 3) with random exposure, white balance, tone curve, blur and noise."""
+    import cv2
+
+    exposure = 2 ** rng.normal(0, 0.5)
+    images = []
+    white = 1 + rng.normal(0, 0.08, size=3)
+    gamma, contrast, saturation = 2.2 * 2 ** rng.normal(0, 0.2), 2 ** rng.normal(0, 0.15), 2 ** rng.normal(-0.2, 0.4)
+    shoulder = rng.uniform(0.3, 1.0)
+    for view in light:
+        x = view * exposure * 2 ** rng.normal(0, 0.25) * (white + rng.normal(0, 0.02, size=3))
+        x = np.maximum(x, 0) / (1 + (1 - shoulder) * np.maximum(x, 0)) * (2 - shoulder)
+        x = np.clip(x, 0, 1) ** (1 / gamma)
+        grey = x.mean(axis=-1, keepdims=True)
+        x = grey + saturation * (x - grey)
+        x = (x - 0.5) * contrast + 0.5
+        x = x.astype(np.float32)
+        if rng.random() < 0.5:
+            x = cv2.GaussianBlur(x, (0, 0), rng.uniform(0.3, 0.8), borderType=cv2.BORDER_REPLICATE)
+        x = x + rng.normal(0, rng.uniform(0.0, 0.02), size=x.shape)
+        images.append(np.clip(x, 0, 1))
+    return np.stack(images).astype(np.float32)
+
+
+def depth_targets(
+    views: Views, camera_height: Float[Tensor, "view"], generator: torch.Generator | None = None
+) -> tuple[Float[Tensor, "view h w"], Bool[Tensor, "view h w"]]:
+    """Log-depth in camera heights at half the size, and where it is known.
+
+    Each value is that of one of the four pixels: a random one with a generator, else the first.
+    """
+    assert views.depths is not None
+    blocks = views.depths.unflatten(-1, (-1, 2)).unflatten(-3, (-1, 2)).transpose(-2, -3).flatten(-2)
+    masks = views.masks.unflatten(-1, (-1, 2)).unflatten(-3, (-1, 2)).transpose(-2, -3).flatten(-2)
+    chosen = torch.zeros(blocks.shape[:-1], dtype=torch.long)
+    if generator is not None:
+        chosen = torch.randint(4, blocks.shape[:-1], generator=generator)
+    depth = blocks.gather(-1, chosen[..., None]).squeeze(-1)
+    known = masks.gather(-1, chosen[..., None]).squeeze(-1) & (depth > 0)
+    relative = (depth / camera_height[:, None, None]).clamp(1e-3, _MAX_DEPTH)
+    return relative.log(), known
+
+
+def depth_loss(
+    estimate: DepthEstimate, target: Float[Tensor, "batch h w"], known: Bool[Tensor, "batch h w"]
+) -> dict[str, Tensor]:
+    """Loss terms: the likelihood, absolute error, and differences between neighbours; weighted by solid angle."""
+    weight = known * row_weights(known.shape[-2], dtype=torch.float32)[:, None]
+    weight = weight / weight.sum().clamp_min(1e-6)
+    error = estimate.log_depth - target
+    absolute = error.abs()
+    likelihood = absolute * (-estimate.log_scale).exp() + estimate.log_scale
+    differences = error.new_zeros(())
+    for step in _SCALES:
+        for axis in (-1, -2):
+            there = error.roll(-step, axis)
+            both = weight * known.roll(-step, axis)
+            if axis == -2:
+                both = both[..., :-step, :]
+                difference = (there - error)[..., :-step, :]
+            else:
+                difference = there - error
+            differences = differences + (both * difference.abs()).sum() / len(_SCALES)
+    return {
+        "loss": (weight * likelihood).sum() + (weight * absolute).sum() + differences,
+        "log_depth_error": (weight * absolute).sum(),
+        "relative_error": (weight * ((error).exp() - 1).abs()).sum(),
+        "likelihood": (weight * likelihood).sum(),
+        "log_scale": (weight * estimate.log_scale).sum(),
+    }
+
+
+class DepthTrainer:
+    """A training run, resumed from its latest checkpoint if there is one."""
+
+    def __init__(self, config: DepthTrainConfig) -> None:
+        self.config = config
+        torch.set_num_threads(config.threads)
+        torch.manual_seed(config.seed)
+        self.tours = ShardReader(list(config.tours))
+        self.network = DepthNetwork(config.network)
+        self.step = 0
+        latest = load_latest(config.out / "checkpoints")
+        if latest is None:
+            self.network.encoder.load_imagenet(load_imagenet_weights())
+        self.network.to(memory_format=torch.channels_last)
+        encoder = {id(p) for p in self.network.encoder.parameters()}
+        self.optimizer = torch.optim.AdamW(
+            [
+                {"params": [p for p in self.network.parameters() if id(p) not in encoder], "peak": config.rate},
+                {"params": list(self.network.encoder.parameters()), "peak": config.encoder_rate},
+            ],
+            lr=config.rate,
+            weight_decay=config.weight_decay,
+        )
+        self.average = ExponentialMovingAverage(self.network, config.ema)
+        if latest is not None:
+            state = latest[1]
+            self.step = state["step"]
+            self.network.load_state_dict(state["network"])
+            self.average.load(state["mean"])
+            self.optimizer.load_state_dict(state["optimizer"])
+        self._stop = False
+
+    def train(self) -> bool:
+        """Train the remaining steps. Returns whether all were done."""
+        config = self.config
+        config.out.mkdir(parents=True, exist_ok=True)
+        log = CsvTable(config.out / "log.csv", _COLUMNS, self.step)
+        scores = CsvTable(config.out / "validation.csv", _MEASURES, self.step + 1)
+        for kind in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(kind, self._request_stop)
+        began = saved = time.monotonic()
+        print(f"from step {self.step} of {config.steps}, {len(self.tours)} tours", flush=True)
+        try:
+            while self.step < config.steps and not self._stop:
+                values = self._optimize()
+                log.add(self.step, values)
+                self.step += 1
+                now = time.monotonic()
+                if config.stop_after_minutes and now - began > 60 * config.stop_after_minutes:
+                    self._stop = True
+                if config.validation is not None and self.step % config.validate_every == 0:
+                    measures = self.validate()
+                    scores.add(self.step, measures)
+                    print(f"step {self.step}:", {k: round(v, 4) for k, v in measures.items()}, flush=True)
+                if now - saved > 60 * config.minutes or self._stop or self.step == config.steps:
+                    self.save()
+                    saved = now
+        finally:
+            log.close()
+            scores.close()
+        return self.step >= config.steps
+
+    def save(self) -> None:
+        """Write a checkpoint and delete old ones."""
+        state = {
+            "config": json.dumps(dataclasses.asdict(self.config), default=str),
+            "network": self.network.state_dict(),
+            "mean": self.average.state,
+            "optimizer": self.optimizer.state_dict(),
+        }
+        save_checkpoint(self.config.out / "checkpoints", self.step, state, keep=2)
+
+    @torch.no_grad()
+    def validate(self) -> dict[str, float]:
+        """Mean measures of the averaged weights over the validation tours."""
+        assert self.config.validation is not None
+        tours = ShardReader([self.config.validation])
+        network = DepthNetwork(self.config.network)
+        network.load_state_dict(self.average.state)
+        network.eval()
+        sums = dict.fromkeys(_MEASURES, 0.0)
+        count = min(self.config.validation_tours, len(tours))
+        for index in range(count):
+            views, heights = read_pair(tours, index, np.random.default_rng(index), self.config.baseline)
+            terms = depth_loss(network(to_channels_last(views.images)), *depth_targets(views, heights))
+            for name in _MEASURES:
+                sums[name] += float(terms[name]) / count
+        return sums
+
+    def _request_stop(self, number: int, frame: object) -> None:
+        self._stop = True
+
+    def _learning_rate_factor(self) -> float:
+        rise = min(1.0, (self.step + 1) / max(1, self.config.warm_up))
+        left = (self.config.steps - self.step) / max(1, self.config.decay_steps)
+        return rise * min(1.0, left)
+
+    def _optimize(self) -> dict[str, float]:
+        began = time.perf_counter()
+        rng = np.random.default_rng((self.config.seed, self.step))
+        generator = torch.Generator().manual_seed(int(rng.integers(1 << 40)))
+        images, targets, known = [], [], []
+        for _ in range(self.config.pairs):
+            views, heights = read_pair(self.tours, int(rng.integers(len(self.tours))), rng, self.config.baseline)
+            target, is_known = depth_targets(views, heights, generator)
+            images.append(views.images)
+            targets.append(target)
+            known.append(is_known)
+        factor = self._learning_rate_factor()
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["peak"] * factor
+        self.network.train()
+        terms = depth_loss(self.network(to_channels_last(torch.cat(images))), torch.cat(targets), torch.cat(known))
+        self.optimizer.zero_grad()
+        terms["loss"].backward()
+        norm = float(torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip))
+        if not (math.isfinite(float(terms["loss"])) and math.isfinite(norm)):
+            raise InputError(f"step {self.step}: needed finite numbers, got a loss of {float(terms['loss'])}.")
+        self.optimizer.step()
+        self.average.update(self.network, self.step)
+        values = {name: float(value) for name, value in terms.items() if name in _COLUMNS}
+        return {**values, "rate": self.config.rate * factor, "gradient_norm": norm, "seconds": time.perf_counter() - began}
+
+
+def main() -> None:
+    """Run the command line and exit."""
+    import tyro
+
+    config = tyro.cli(DepthTrainConfig)
+
+    def train() -> int:
+        with own_warnings():
+            return 0 if DepthTrainer(config).train() else 130
+
+    sys.exit(run_command(train, memory_advice="choose fewer --pairs.", interruption="run the command again to resume"))
+
+
+if __name__ == "__main__":
+    main()
