@@ -4,55 +4,110 @@ A body is a box, ellipsoid or cylinder with an affine map from the world to its 
 unit sphere, or x^2 + z^2 <= 1, |y| <= 1. Ray parameters are equal in both spaces. The bodies are in a bounding volume
 hierarchy (BVH).
 
-Lighting is diffuse, and therefore independent of the view: lamps and a sun with shadows, portals (windows and open
-doors as luminous rectangles), and the ambient light of a room, which is weaker in corners. Rooms that share a light
-group share their lamps and portals.
+Light comes from lamps and a sun with shadows, from portals (windows and open doors as luminous rectangles), and from
+the ambient light of a room, which is weaker in corners. Rooms of a light group share their lamps and portals. Most
+surfaces are diffuse. Mirrors, polished surfaces and glass reflect the first thing that the reflected ray meets.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from pansplat.data.generated.textures import COLOR_A, COLOR_B, COLOR_C, GLOW, OPTIONS, color, fractal
+from pansplat.data.generated.textures import COLOR_A, COLOR_B, COLOR_C, GLOSS, GLOW, MIRROR, OPTIONS, color, fractal
 
-BOX, ELLIPSOID, CYLINDER = 0, 1, 2
-_LEAF = 2  # bodies
+BOX, ELLIPSOID, CYLINDER, GLASS = range(4)
+"""Kinds of bodies. A pane of glass is a box that transmits all rays and reflects some of the light."""
+_BINS = 12  # candidates for the split of a BVH node
 
 
-def build_bvh(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """A bounding volume hierarchy of bodies with the given corners (body 3).
+@nb.njit(**OPTIONS)
+def _half_area(box):
+    x, y, z = box[3] - box[0], box[4] - box[1], box[5] - box[2]
+    return x * y + y * z + z * x
+
+
+@nb.njit(**OPTIONS)
+def _extend(box, low, high):
+    for k in range(3):
+        box[k], box[k + 3] = min(box[k], low[k]), max(box[k + 3], high[k])
+
+
+@nb.njit(**OPTIONS)
+def build_bvh(low, high, leaf):
+    """A bounding volume hierarchy of items with the given corners (item 3), by the surface area heuristic.
+
+    Args:
+        leaf: the largest number of items in a leaf.
 
     Returns:
-        Corners (node 6), and links (node 3). The first two columns hold the index of the first child (the second child
-        follows it) and 0, or for leaves the first place in the order and the number of bodies. The third column holds
-        the order of the bodies.
+        Corners (node 6), links (node 2), and the order in which the items must be stored. Links are the index of the
+        first child (the second child follows it) and 0, or for leaves the first item and the number of items.
     """
-    order = np.arange(len(low))
-    bounds, links = [np.zeros(6)], [[0, 0]]
-    pending = [(0, 0, len(low))]
-    while pending:
-        node, start, end = pending.pop()
-        chosen = order[start:end]
-        bounds[node] = np.concatenate((low[chosen].min(axis=0), high[chosen].max(axis=0)))
-        if end - start <= _LEAF:
-            links[node] = [start, end - start]
+    count, used = len(low), 1
+    order = np.arange(count)
+    bounds, links = np.empty((max(2 * count, 1), 6)), np.zeros((max(2 * count, 1), 2), np.int64)
+    pending = np.empty((64 + count, 3), np.int64)
+    pending[0, 0], pending[0, 1], pending[0, 2] = 0, 0, count
+    waiting = 1
+    centres = low + high
+    boxes, counts, costs = np.empty((_BINS, 6)), np.empty(_BINS, np.int64), np.empty(_BINS)
+    running = np.empty(6)
+    while waiting:
+        waiting -= 1
+        node, start, end = pending[waiting]
+        bounds[node, :3], bounds[node, 3:] = np.inf, -np.inf
+        running[:3], running[3:] = np.inf, -np.inf
+        for k in order[start:end]:
+            _extend(bounds[node], low[k], high[k])
+            _extend(running, centres[k], centres[k])
+        if end - start <= leaf:
+            links[node, 0], links[node, 1] = start, end - start
             continue
-        centres = low[chosen] + high[chosen]
-        axis = int(np.ptp(centres, axis=0).argmax())
-        order[start:end] = chosen[np.argsort(centres[:, axis], kind="stable")]
-        middle, child = (start + end) // 2, len(bounds)
-        links[node] = [child, 0]
-        bounds += [np.zeros(6), np.zeros(6)]
-        links += [[0, 0], [0, 0]]
-        pending += [(child, start, middle), (child + 1, middle, end)]
-    rows = np.zeros((max(len(bounds), len(low)), 3), np.int64)
-    rows[: len(links), :2] = links
-    rows[: len(low), 2] = order
-    return np.array(bounds), rows
+        axis = int(np.argmax(running[3:] - running[:3]))
+        first, size = running[axis], running[axis + 3] - running[axis]
+        middle = (start + end) // 2
+        if size > 0:
+            boxes[:, :3], boxes[:, 3:] = np.inf, -np.inf
+            counts[:] = 0
+            for k in order[start:end]:
+                place = min(_BINS - 1, int((centres[k, axis] - first) / size * _BINS))
+                counts[place] += 1
+                _extend(boxes[place], low[k], high[k])
+            for sweep in range(2):  # areas of the bins on one side, then of those on the other side
+                running[:3], running[3:] = np.inf, -np.inf
+                total = 0
+                for step in range(_BINS - 1):
+                    place = step if sweep == 0 else _BINS - 1 - step
+                    total += counts[place]
+                    _extend(running, boxes[place, :3], boxes[place, 3:])
+                    cost = total * _half_area(running) if total else 0.0
+                    if sweep == 0:
+                        costs[place] = cost
+                    else:
+                        costs[place - 1] += cost
+            split = int(np.argmin(costs[: _BINS - 1]))
+            middle = start
+            for place in range(start, end):
+                k = order[place]
+                if min(_BINS - 1, int((centres[k, axis] - first) / size * _BINS)) <= split:
+                    order[place] = order[middle]
+                    order[middle] = k
+                    middle += 1
+        if middle in (start, end):
+            middle = (start + end) // 2
+        links[node, 0] = used
+        for child in range(2):
+            pending[waiting, 0] = used + child
+            pending[waiting, 1] = start if child == 0 else middle
+            pending[waiting, 2] = middle if child == 0 else end
+            waiting += 1
+        used += 2
+    return bounds[:used].copy(), links[:used].copy(), order
 
 
 @nb.njit(**OPTIONS)
@@ -108,20 +163,34 @@ def intersect_body(kind, m, x, y, z, dx, dy, dz):
     ux = m[0] * dx + m[1] * dy + m[2] * dz
     uy = m[4] * dx + m[5] * dy + m[6] * dz
     uz = m[8] * dx + m[9] * dy + m[10] * dz
-    if kind == 0:
+    if kind == BOX or kind == GLASS:  # noqa: SIM109
         return _box(ox, oy, oz, ux, uy, uz)
-    if kind == 1:
+    if kind == ELLIPSOID:
         return _ellipsoid(ox, oy, oz, ux, uy, uz)
     return _cylinder(ox, oy, oz, ux, uy, uz)
 
 
 @nb.njit(**OPTIONS)
-def first_hit(bodies, x, y, z, dx, dy, dz, limit, any_hit):
+def _enter(box, x, y, z, ix, iy, iz):
+    """Distance at which a ray enters an axis-aligned box; 0 from inside, inf if it misses."""
+    ax, bx = (box[0] - x) * ix, (box[3] - x) * ix
+    ay, by = (box[1] - y) * iy, (box[4] - y) * iy
+    az, bz = (box[2] - z) * iz, (box[5] - z) * iz
+    enter = max(max(min(ax, bx), min(ay, by)), min(az, bz))
+    leave = min(min(max(ax, bx), max(ay, by)), max(az, bz))
+    if enter > leave or leave < 0:
+        return np.inf
+    return max(enter, 0.0)
+
+
+@nb.njit(**OPTIONS)
+def first_hit(bodies, x, y, z, dx, dy, dz, limit, any_hit, glass):
     """Distance and index of the first body nearer than `limit`; `limit` and -1 if there is none.
 
     Args:
         bodies: kinds, maps, corners and links of the BVH, and a stack of 64 integers.
         any_hit: whether any body nearer than `limit` is sufficient, for shadow rays.
+        glass: whether panes of glass count.
     """
     kinds, maps, bounds, links, stack = bodies
     ix, iy, iz = 1 / dx, 1 / dy, 1 / dz
@@ -130,31 +199,22 @@ def first_hit(bodies, x, y, z, dx, dy, dz, limit, any_hit):
     while depth:
         depth -= 1
         node = stack[depth]
-        box = bounds[node]
-        ax, bx = (box[0] - x) * ix, (box[3] - x) * ix
-        ay, by = (box[1] - y) * iy, (box[4] - y) * iy
-        az, bz = (box[2] - z) * iz, (box[5] - z) * iz
-        enter = max(max(min(ax, bx), min(ay, by)), min(az, bz))
-        leave = min(min(max(ax, bx), max(ay, by)), max(az, bz))
-        if enter > leave or leave < 0 or enter > best:
-            continue
         first, count = links[node, 0], links[node, 1]
         if count == 0:
-            # Visit the child nearer to the origin first.
-            nearer = 0
-            left, right = bounds[first], bounds[first + 1]
-            along = (
-                (right[0] + right[3] - left[0] - left[3]) * dx
-                + (right[1] + right[4] - left[1] - left[4]) * dy
-                + (right[2] + right[5] - left[2] - left[5]) * dz
-            )
-            if along < 0:
-                nearer = 1
-            stack[depth], stack[depth + 1] = first + 1 - nearer, first + nearer
-            depth += 2
+            near, far = first, first + 1
+            at_near, at_far = _enter(bounds[near], x, y, z, ix, iy, iz), _enter(bounds[far], x, y, z, ix, iy, iz)
+            if at_far < at_near:
+                near, far, at_near, at_far = far, near, at_far, at_near
+            if at_far < best:
+                stack[depth] = far
+                depth += 1
+            if at_near < best:
+                stack[depth] = near
+                depth += 1
             continue
-        for place in range(first, first + count):
-            k = links[place, 2]
+        for k in range(first, first + count):
+            if kinds[k] == GLASS and not glass:
+                continue
             t = intersect_body(kinds[k], maps[k], x, y, z, dx, dy, dz)
             if 1e-6 < t < best:
                 best, body = t, k
@@ -172,7 +232,32 @@ PANEL_HEIGHT, TRIM_HEIGHT, HEIGHT, AMBIENT, LIGHT_GROUP = 9, 10, 11, 12, 15
 # reaches (-1 for all), and for portals: half width, half height, the axis of the normal, whether bodies cast shadows.
 LIGHT_COLOR, LIGHT_SIZE, LIGHT_KIND, LIGHT_REACHES = 3, 6, 7, 8
 PORTAL_WIDTH, PORTAL_HEIGHT, PORTAL_AXIS, PORTAL_SHADOWS, LIGHT_NUMBERS = 9, 10, 11, 12, 13
-LAMP, SUN, PORTAL = 0, 1, 2
+LAMP, SUN, PORTAL = range(3)
+_LEAST_REFLECTION = 0.03  # of the light; weaker reflections are omitted
+
+
+class SceneArrays(NamedTuple):
+    """A scene for `trace_panorama`; rows are bodies (with boxes of a BVH and its links), materials, rooms or lights.
+
+    Attributes:
+        halves: half sizes of the bodies, metres.
+        faces: materials of a body's six faces: left right (x), up down (y), back front (z).
+        ambient: ambient light (red, green, blue) outside the rooms.
+        outside, sky: indices of materials.
+    """
+
+    kinds: NDArray[np.int64]
+    maps: NDArray[np.float64]
+    halves: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    bounds: NDArray[np.float64]
+    links: NDArray[np.int64]
+    materials: NDArray[np.float64]
+    rooms: NDArray[np.float64]
+    lights: NDArray[np.float64]
+    ambient: NDArray[np.float64]
+    outside: int
+    sky: int
 
 
 @nb.njit(**OPTIONS)
@@ -306,75 +391,96 @@ def portal_form_factor(light, x, y, z, nx, ny, nz):
 
 
 @nb.njit(**OPTIONS)
-def _direct_light(bodies, lights, last, group, x, y, z, nx, ny, nz, jitter):
+def _irradiance(light, group, x, y, z, nx, ny, nz, a, b):
+    """Unshadowed irradiance of a light of unit colour, direction to a point on it, and the distance of that point.
+
+    Args:
+        group: light group of the surface.
+        a, b: select the point on the light, in [-1, 1].
+    """
+    kind, size = light[LIGHT_KIND], light[LIGHT_SIZE]
+    lx, ly, lz = light[0], light[1], light[2]
+    if light[LIGHT_REACHES] >= 0 and light[LIGHT_REACHES] != group:
+        return 0.0, 0.0, 1.0, 0.0, 0.0
+    if kind == PORTAL:
+        power = portal_form_factor(light, x, y, z, nx, ny, nz)
+        lx, ly, lz = lx - x, ly - y + b * light[PORTAL_HEIGHT], lz - z
+        if light[PORTAL_AXIS] > 0:
+            lx += a * light[PORTAL_WIDTH]
+        else:
+            lz += a * light[PORTAL_WIDTH]
+    elif kind == SUN:
+        power = nx * lx + ny * ly + nz * lz
+        lx, ly, lz = lx + size * a, ly + 0.3 * size * b, lz + size * b
+    else:
+        lx, ly, lz = lx - x, ly - y, lz - z
+        square = lx * lx + ly * ly + lz * lz
+        power = (nx * lx + ny * ly + nz * lz) / (math.sqrt(square) * (0.6 + square))
+        lx, ly, lz = lx + size * a, ly + 0.3 * size * b, lz + size * b
+    away = math.sqrt(lx * lx + ly * ly + lz * lz)
+    return power, lx / away, ly / away, lz / away, 2 * SKY if kind == SUN else away
+
+
+@nb.njit(**OPTIONS)
+def _direct_light(bodies, lights, last, group, x, y, z, nx, ny, nz, a, b, few):
     """Light (red, green, blue) of lamps, portals and sun at a point of a light group, with shadows.
 
     Args:
         last: per light, the body that blocked it at the previous point, which is tested first; updated.
-        jitter: selects a point on each lamp.
+        a, b: select a point on each light, in [-1, 1].
+        few: whether only the strongest light casts shadows.
     """
     kinds, maps = bodies[0], bodies[1]
-    r, g, b = 0.0, 0.0, 0.0
+    red, green, blue = 0.0, 0.0, 0.0
     x, y, z = x + 1e-4 * nx, y + 1e-4 * ny, z + 1e-4 * nz
+    strongest, most = -1, 0.0
+    if few:
+        for k in range(len(lights)):
+            power, _, _, _, _ = _irradiance(lights[k], group, x, y, z, nx, ny, nz, a, b)
+            power *= max(lights[k, LIGHT_COLOR], lights[k, LIGHT_COLOR + 1], lights[k, LIGHT_COLOR + 2])
+            if power > most:
+                strongest, most = k, power
     for k in range(len(lights)):
         light = lights[k]
-        if light[LIGHT_REACHES] >= 0 and light[LIGHT_REACHES] != group:
+        power, lx, ly, lz, limit = _irradiance(light, group, x, y, z, nx, ny, nz, a, b)
+        if power * max(light[LIGHT_COLOR], light[LIGHT_COLOR + 1], light[LIGHT_COLOR + 2]) < 0.005:
             continue
-        size = light[LIGHT_SIZE]
-        jx, jy, jz = size * (2 * (jitter & 1) - 1), 0.3 * size * ((jitter % 3) - 1), size * ((jitter & 2) - 1)
-        if light[LIGHT_KIND] == PORTAL:
-            power = portal_form_factor(light, x, y, z, nx, ny, nz)
-            along = 0.5 * light[PORTAL_WIDTH] * (2 * (jitter & 1) - 1)
-            lx, ly, lz = light[0] - x, light[1] - y + 0.5 * light[PORTAL_HEIGHT] * ((jitter & 2) - 1), light[2] - z
-            if light[PORTAL_AXIS] > 0:
-                lx += along
-            else:
-                lz += along
-            away = math.sqrt(lx * lx + ly * ly + lz * lz)
-            if light[PORTAL_SHADOWS] == 0 or nx * lx + ny * ly + nz * lz < 0:
-                r += power * light[LIGHT_COLOR]
-                g += power * light[LIGHT_COLOR + 1]
-                b += power * light[LIGHT_COLOR + 2]
+        if few and k != strongest:
+            power *= 0.7
+        elif light[LIGHT_KIND] != PORTAL or (light[PORTAL_SHADOWS] > 0 and nx * lx + ny * ly + nz * lz > 0):
+            if last[k] >= 0 and 1e-6 < intersect_body(kinds[last[k]], maps[last[k]], x, y, z, lx, ly, lz) < limit:
                 continue
-            limit = away
-        else:
-            if light[LIGHT_KIND] == SUN:
-                lx, ly, lz, limit, fall = light[0] + jx, light[1] + jy, light[2] + jz, 2 * SKY, 1.0
-                away = math.sqrt(lx * lx + ly * ly + lz * lz)
-            else:
-                lx, ly, lz = light[0] + jx - x, light[1] + jy - y, light[2] + jz - z
-                away = math.sqrt(lx * lx + ly * ly + lz * lz)
-                limit, fall = away, 1 / (0.6 + away * away)
-            power = (nx * lx + ny * ly + nz * lz) / away * fall
-            if power < 0.01:
+            _, last[k] = first_hit(bodies, x, y, z, lx, ly, lz, limit, True, False)
+            if last[k] >= 0:
                 continue
-        lx, ly, lz = lx / away, ly / away, lz / away
-        if last[k] >= 0 and 1e-6 < intersect_body(kinds[last[k]], maps[last[k]], x, y, z, lx, ly, lz) < limit:
-            continue
-        _, last[k] = first_hit(bodies, x, y, z, lx, ly, lz, limit, True)
-        if last[k] < 0:
-            r += power * light[LIGHT_COLOR]
-            g += power * light[LIGHT_COLOR + 1]
-            b += power * light[LIGHT_COLOR + 2]
-    return r, g, b
+        red += power * light[LIGHT_COLOR]
+        green += power * light[LIGHT_COLOR + 1]
+        blue += power * light[LIGHT_COLOR + 2]
+    return red, green, blue
 
 
 @nb.njit(**OPTIONS)
-def _trace_ray(scene, bodies, last, x, y, z, dx, dy, dz, pixel, jitter):
-    """Light (red, green, blue) and distance of the first hit of a ray; `pixel` is the angle of a pixel, radians."""
-    kinds, maps, halves, faces, _, _, materials, rooms, lights, ambient, outside, sky = scene
-    t, body = first_hit(bodies, x, y, z, dx, dy, dz, math.inf, False)
+def _shade(scene, bodies, last, body, x, y, z, dx, dy, dz, t, width, a, b, few):
+    """Diffuse light (red, green, blue), unit normal and material at the hit of a ray; material -1 is the sky.
+
+    Args:
+        t: distance of the hit, metres; any number if `body` is negative.
+        width: angle of a pixel times the length of the whole path to the hit, metres.
+    """
     if body < 0:
         t = _distance_to_sky(x, y, z, dx, dy, dz)
-        px, py, pz = (x + t * dx) / SKY, (y + t * dy) / SKY, (z + t * dz) / SKY
-        r, g, b = _sky_color(materials, sky, px, py, pz, pixel)
-        return r, g, b, t
+        red, green, blue = _sky_color(
+            scene.materials, scene.sky, (x + t * dx) / SKY, (y + t * dy) / SKY, (z + t * dz) / SKY, width / SKY
+        )
+        return red, green, blue, 0.0, 0.0, 0.0, -1
     px, py, pz = x + t * dx, y + t * dy, z + t * dz
-    nx, ny, nz, face, u, v, half_u, half_v = _surface_point(kinds[body], maps[body], halves[body], px, py, pz)
+    nx, ny, nz, face, u, v, half_u, half_v = _surface_point(
+        scene.kinds[body], scene.maps[body], scene.halves[body], px, py, pz
+    )
     facing = abs(nx * dx + ny * dy + nz * dz)
-    width = pixel * t / max(0.7 * math.sqrt(facing), 0.15)  # between the sides of the pixel's footprint
-    material = faces[body, face]
-    room = _room_at(rooms, px + 0.02 * nx, pz + 0.02 * nz)
+    width /= max(0.7 * math.sqrt(facing), 0.15)  # between the sides of the pixel's footprint
+    material = scene.faces[body, face]
+    room = _room_at(scene.rooms, px + 0.02 * nx, pz + 0.02 * nz)
     if material < 0:
         if ny > 0.5 or ny < -0.5:
             u, v = px, pz
@@ -382,20 +488,85 @@ def _trace_ray(scene, bodies, last, x, y, z, dx, dy, dz, pixel, jitter):
             u, v = pz, py
         else:
             u, v = px, py
-        material = _room_material(rooms, room, material, py, outside)
-    r, g, b = color(materials[material], u, v, width, half_u, half_v)
-    around = _ambient_visibility(rooms, room, px, py, pz, nx, ny, nz) * (0.85 - 0.15 * ny)
-    group = -1
+        material = _room_material(scene.rooms, room, material, py, scene.outside)
+    red, green, blue = color(scene.materials[material], u, v, width, half_u, half_v)
+    ambient, group = scene.ambient, -1
     if room >= 0:
-        ambient, group = rooms[room, AMBIENT:LIGHT_GROUP], int(rooms[room, LIGHT_GROUP])
-    lr, lg, lb = _direct_light(bodies, lights, last, group, px, py, pz, nx, ny, nz, jitter)
-    glow = materials[material, GLOW]
+        ambient, group = scene.rooms[room, AMBIENT:LIGHT_GROUP], int(scene.rooms[room, LIGHT_GROUP])
+    around = _ambient_visibility(scene.rooms, room, px, py, pz, nx, ny, nz) * (0.85 - 0.15 * ny)
+    lr, lg, lb = _direct_light(bodies, scene.lights, last, group, px, py, pz, nx, ny, nz, a, b, few)
+    glow = scene.materials[material, GLOW]
     return (
-        r * (ambient[0] * around + lr + glow),
-        g * (ambient[1] * around + lg + glow),
-        b * (ambient[2] * around + lb + glow),
-        t,
+        red * (ambient[0] * around + lr + glow),
+        green * (ambient[1] * around + lg + glow),
+        blue * (ambient[2] * around + lb + glow),
+        nx,
+        ny,
+        nz,
+        material,
     )
+
+
+@nb.njit(**OPTIONS)
+def _reflect(scene, bodies, last, x, y, z, dx, dy, dz, t, nx, ny, nz, pixel, a, b, few):
+    """Light (red, green, blue) that a ray meets after its reflection at distance `t`; the rest as in `_shade`."""
+    facing = nx * dx + ny * dy + nz * dz
+    px, py, pz = x + t * dx - 1e-4 * facing * nx, y + t * dy - 1e-4 * facing * ny, z + t * dz - 1e-4 * facing * nz
+    dx, dy, dz = dx - 2 * facing * nx, dy - 2 * facing * ny, dz - 2 * facing * nz
+    further, body = first_hit(bodies, px, py, pz, dx, dy, dz, math.inf, False, False)
+    width = pixel * (t + further) if body >= 0 else pixel * SKY
+    red, green, blue, _, _, _, _ = _shade(scene, bodies, last, body, px, py, pz, dx, dy, dz, further, width, a, b, few)
+    return red, green, blue
+
+
+@nb.njit(**OPTIONS)
+def _fresnel(facing):
+    """Reflectance of glass or varnish. Source: Schlick 1994, refractive index 1.5."""
+    return 0.04 + 0.96 * (1 - facing) ** 5
+
+
+@nb.njit(**OPTIONS)
+def _trace_ray(scene, bodies, last, x, y, z, dx, dy, dz, pixel, a, b):
+    """Light (red, green, blue), distance, unit normal and material of the first hit of a ray behind any glass.
+
+    Args:
+        pixel: angle of a pixel, radians.
+        a, b: select a point on each light, in [-1, 1].
+    """
+    pane, pane_red, pane_green, pane_blue = 0.0, 0.0, 0.0, 0.0
+    t, body = first_hit(bodies, x, y, z, dx, dy, dz, math.inf, False, True)
+    if body >= 0 and scene.kinds[body] == GLASS:
+        nx, ny, nz, _, _, _, _, _ = _surface_point(
+            GLASS, scene.maps[body], scene.halves[body], x + t * dx, y + t * dy, z + t * dz
+        )
+        once = _fresnel(abs(nx * dx + ny * dy + nz * dz))
+        pane = 2 * once / (1 + once)  # both faces of the pane
+        pane_red, pane_green, pane_blue = _reflect(
+            scene, bodies, last, x, y, z, dx, dy, dz, t, nx, ny, nz, pixel, a, b, True
+        )
+        t, body = first_hit(bodies, x, y, z, dx, dy, dz, math.inf, False, False)
+    width = pixel * t if body >= 0 else pixel * SKY
+    red, green, blue, nx, ny, nz, material = _shade(
+        scene, bodies, last, body, x, y, z, dx, dy, dz, t, width, a, b, False
+    )
+    if body < 0:
+        t = _distance_to_sky(x, y, z, dx, dy, dz)
+    else:
+        mirror = scene.materials[material, MIRROR]
+        share = mirror
+        if mirror == 0:
+            gloss = scene.materials[material, GLOSS]
+            share = gloss * _fresnel(abs(nx * dx + ny * dy + nz * dz)) - _LEAST_REFLECTION
+        if share > 0:
+            mr, mg, mb = _reflect(scene, bodies, last, x, y, z, dx, dy, dz, t, nx, ny, nz, pixel, a, b, mirror == 0)
+            red, green, blue = red + share * (mr - red), green + share * (mg - green), blue + share * (mb - blue)
+    if pane > 0:
+        red, green, blue = (
+            red + pane * (pane_red - red),
+            green + pane * (pane_green - green),
+            blue + pane * (pane_blue - blue),
+        )
+    return red, green, blue, t, nx, ny, nz, material
 
 
 @nb.njit(**OPTIONS)
@@ -405,34 +576,91 @@ def _distance_to_sky(x, y, z, dx, dy, dz):
 
 
 @nb.njit(**OPTIONS)
-def trace_panorama(scene, pose, samples, image, depth):
-    """Fill `image` (H W 3) with linear light, the mean of samples x samples rays, and `depth` (H W) with metres."""
-    height, width = depth.shape
-    bodies = (scene[0], scene[1], scene[4], scene[5], np.empty(64, np.int64))
-    last = np.full(len(scene[8]), -1)
-    x, y, z = pose[0, 3], pose[1, 3], pose[2, 3]
+def _trace_pixel(scene, bodies, last, pose, i, j, du, dv, height, index):
+    """`_trace_ray` through a point of pixel (i, j); `index` selects the points on the lights. Also the direction."""
     pixel = math.pi / height
+    longitude, latitude = pixel * (j + du) - math.pi, pixel * (i + dv) - 0.5 * math.pi
+    cx = math.cos(latitude) * math.sin(longitude)
+    cy = math.sin(latitude)
+    cz = math.cos(latitude) * math.cos(longitude)
+    dx = pose[0, 0] * cx + pose[0, 1] * cy + pose[0, 2] * cz
+    dy = pose[1, 0] * cx + pose[1, 1] * cy + pose[1, 2] * cz
+    dz = pose[2, 0] * cx + pose[2, 1] * cy + pose[2, 2] * cz
+    # The R2 sequence, spread over blocks of 4 x 4 pixels.
+    a, b = 0.7548776662466927 * index, 0.5698402909980532 * index
+    a, b = 2 * (a - math.floor(a)) - 1, 2 * (b - math.floor(b)) - 1
+    hit = _trace_ray(scene, bodies, last, pose[0, 3], pose[1, 3], pose[2, 3], dx, dy, dz, pixel, a, b)
+    return hit, (dx, dy, dz)
+
+
+@nb.njit(**OPTIONS)
+def _is_edge(image, depth, points, normals, shown, i, j, k, m, pixel):
+    """Whether pixels (i, j) and (k, m) show different surfaces, or colours that differ by more than 6 percent."""
+    if shown[i, j] != shown[k, m]:
+        return True
+    if shown[i, j] < 0:
+        return False
+    along, off, other = 0.0, 0.0, 0.0
+    for c in range(3):
+        step = points[k, m, c] - points[i, j, c]
+        along += normals[i, j, c] * normals[k, m, c]
+        off += step * normals[i, j, c]
+        other += step * normals[k, m, c]
+    if along < 0.9 or abs(off) + abs(other) > 4 * pixel * min(depth[i, j], depth[k, m]):
+        return True
+    contrast = 0.0
+    for c in range(3):
+        contrast = max(contrast, abs(image[i, j, c] - image[k, m, c]) / (image[i, j, c] + image[k, m, c] + 1e-6))
+    return contrast > 0.03
+
+
+@nb.njit(**OPTIONS)
+def trace_panorama(scene, pose, samples, image, depth):
+    """Fill `image` (H W 3) with linear light and `depth` (H W) with metres, 0 where a mirror is seen.
+
+    One ray passes through each pixel centre. Pixels that differ from a neighbour then get the mean of samples x samples
+    rays in place of it.
+    """
+    height, width = depth.shape
+    bodies = (scene.kinds, scene.maps, scene.bounds, scene.links, np.empty(64, np.int64))
+    last = np.full(len(scene.lights), -1)
+    points, normals = np.empty((height, width, 3)), np.empty((height, width, 3))
+    shown, refined = np.empty((height, width), np.int64), np.zeros((height, width), np.bool_)
+    rays = samples * samples
     for i in range(height):
         for j in range(width):
-            for k in range(samples * samples + 1):  # the last ray, for depth, passes through the pixel centre
-                centre = k == samples * samples
-                du, dv = ((k % samples) + 0.5) / samples, ((k // samples) + 0.5) / samples
-                if centre:
-                    du, dv = 0.5, 0.5
-                longitude = 2 * math.pi * (j + du) / width - math.pi
-                latitude = math.pi * (i + dv) / height - 0.5 * math.pi
-                cx = math.cos(latitude) * math.sin(longitude)
-                cy = math.sin(latitude)
-                cz = math.cos(latitude) * math.cos(longitude)
-                dx = pose[0, 0] * cx + pose[0, 1] * cy + pose[0, 2] * cz
-                dy = pose[1, 0] * cx + pose[1, 1] * cy + pose[1, 2] * cz
-                dz = pose[2, 0] * cx + pose[2, 1] * cy + pose[2, 2] * cz
-                if centre:
-                    t, body = first_hit(bodies, x, y, z, dx, dy, dz, math.inf, False)
-                    depth[i, j] = t if body >= 0 else _distance_to_sky(x, y, z, dx, dy, dz)
-                else:
-                    r, g, b, _ = _trace_ray(scene, bodies, last, x, y, z, dx, dy, dz, pixel, k)
-                    weight = 1 / (samples * samples)
-                    image[i, j, 0] += weight * r
-                    image[i, j, 1] += weight * g
-                    image[i, j, 2] += weight * b
+            block = 4 * (i % 4) + j % 4
+            (red, green, blue, t, nx, ny, nz, material), (dx, dy, dz) = _trace_pixel(
+                scene, bodies, last, pose, i, j, 0.5, 0.5, height, block
+            )
+            image[i, j, 0], image[i, j, 1], image[i, j, 2] = red, green, blue
+            points[i, j, 0], points[i, j, 1], points[i, j, 2] = t * dx, t * dy, t * dz
+            normals[i, j, 0], normals[i, j, 1], normals[i, j, 2] = nx, ny, nz
+            depth[i, j], shown[i, j] = t, material
+    if samples > 1:
+        pixel = math.pi / height
+        for i in range(height):
+            for j in range(width):
+                right, below = (j + 1) % width, min(i + 1, height - 1)
+                if _is_edge(image, depth, points, normals, shown, i, j, i, right, pixel):
+                    refined[i, j] = refined[i, right] = True
+                if _is_edge(image, depth, points, normals, shown, i, j, below, j, pixel):
+                    refined[i, j] = refined[below, j] = True
+        for i in range(height):
+            for j in range(width):
+                if not refined[i, j]:
+                    continue
+                image[i, j] = 0
+                for k in range(rays):
+                    du, dv = (k % samples + 0.5) / samples, (k // samples + 0.5) / samples
+                    index = rays * (4 * (i % 4) + j % 4) + k
+                    (red, green, blue, _, _, _, _, _), _ = _trace_pixel(
+                        scene, bodies, last, pose, i, j, du, dv, height, index
+                    )
+                    image[i, j, 0] += red / rays
+                    image[i, j, 1] += green / rays
+                    image[i, j, 2] += blue / rays
+    for i in range(height):
+        for j in range(width):
+            if shown[i, j] >= 0 and scene.materials[shown[i, j], MIRROR] > 0:
+                depth[i, j] = 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +12,16 @@ from pansplat.data.generated.raytracer import (
     BOX,
     CYLINDER,
     ELLIPSOID,
+    GLASS,
     LAMP,
     LIGHT_NUMBERS,
     PORTAL,
     SUN,
+    SceneArrays,
     build_bvh,
     trace_panorama,
 )
-from pansplat.data.generated.textures import NUMBERS, Pattern
+from pansplat.data.generated.textures import GLOSS, MIRROR, NUMBERS, Pattern
 
 Array = NDArray[np.float64]
 Vector = Sequence[float] | Array
@@ -31,23 +32,29 @@ class GeneratedScene:
     """A scene as arrays. World axes: y down, the floor at y = 0, metres.
 
     Attributes:
-        arrays: arguments of `trace_panorama`.
+        arrays: for `trace_panorama`.
         low, high: corners of the bodies' bounding boxes (body 3), metres.
     """
 
-    arrays: tuple[Any, ...]
+    arrays: SceneArrays
     low: Array
     high: Array
 
     def panorama(self, cam2world: Array, height: int, samples: int = 2) -> tuple[Array, Array]:
-        """Linear light (H W 3) and radial depth (H W), metres, at a pose, with samples x samples rays per pixel."""
+        """Linear light (H W 3) and radial depth (H W) in metres at a pose.
+
+        Depth is that of the pixel centre, behind glass. It is 0, unknown, where a mirror is seen.
+
+        Args:
+            samples: pixels at edges get samples x samples rays, others one.
+        """
         image, depth = np.zeros((height, 2 * height, 3)), np.zeros((height, 2 * height))
         trace_panorama(self.arrays, np.ascontiguousarray(cam2world, dtype=np.float64), samples, image, depth)
         return image, depth
 
     def clearance(self, points: Array) -> Array:
         """Distances in metres from points (n 3) to the nearest box, or oriented bounding box of a round body."""
-        maps, halves = self.arrays[1].reshape(-1, 3, 4), self.arrays[2]
+        maps, halves = self.arrays.maps.reshape(-1, 3, 4), self.arrays.halves
         local = np.abs(np.einsum("bij,nbj->nbi", maps[:, :, :3], points[:, None] - maps[:, :, 3]))
         return np.linalg.norm(np.maximum(local - 1, 0) * halves, axis=-1).min(axis=1)
 
@@ -78,6 +85,8 @@ class SceneBuilder:
         fraction: float = 0.1,
         mottle: float = 0.2,
         glow: float = 0.0,
+        gloss: float = 0.0,
+        mirror: float = 0.0,
     ) -> int:
         """Add a material and return its index.
 
@@ -87,10 +96,13 @@ class SceneBuilder:
             fraction: of joints, stripes or veins in the pattern.
             mottle: strength of irregular wear.
             glow: emitted light, relative to the reflectance.
+            gloss: from 0 to 1, strength of the weak reflection of varnish, tiles and stone (about 0.3 to 1).
+            mirror: reflectance of a mirror; depth is unknown there.
         """
         sides = size if isinstance(size, tuple) else (size, size)
         row = np.zeros(NUMBERS)
         row[:16] = [pattern, *a, *(b or a), *(c or a), *sides, fraction, mottle, self.rng.integers(1 << 20), glow]
+        row[GLOSS], row[MIRROR] = gloss, mirror
         self.materials.append(row)
         return len(self.materials) - 1
 
@@ -107,6 +119,10 @@ class SceneBuilder:
     def add_cylinder(self, centre: Vector, radius: float, half_height: float, material: int, pitch: float = 0) -> None:
         """Add an upright cylinder."""
         self._add_body(CYLINDER, centre, (radius, half_height, radius), material, 0, pitch)
+
+    def add_glass(self, centre: Vector, half: Vector, yaw: float = 0) -> None:
+        """Add a pane of clear glass, which neither depth nor shadows show."""
+        self._add_body(GLASS, centre, half, 0, yaw, 0)
 
     def add_light(self, position: Vector, color: Vector, size: float, *, sun: bool = False, group: int = -1) -> None:
         """Add a lamp at a position, or a sun in a direction; it lights the rooms of a light group, or all if -1."""
@@ -135,21 +151,21 @@ class SceneBuilder:
     def finish(self, ambient: Vector, outside: int, sky: int) -> GeneratedScene:
         """The scene; `ambient` is the light outdoors, `outside` and `sky` are indices of materials."""
         low, high = np.array(self.low), np.array(self.high)
-        bounds, links = build_bvh(low, high)
+        bounds, links, order = build_bvh(low, high, 2)
         lights = np.array(self.lights) if self.lights else np.zeros((0, LIGHT_NUMBERS))
-        arrays = (
-            np.array(self.kinds, np.int64),
-            np.array(self.maps),
-            np.array(self.halves),
-            np.array(self.faces, np.int64),
-            bounds,
-            links,
-            np.array(self.materials),
-            np.array(self.rooms),
-            lights,
-            np.array(ambient, np.float64),
-            outside,
-            sky,
+        arrays = SceneArrays(
+            kinds=np.array(self.kinds, np.int64)[order],
+            maps=np.array(self.maps)[order],
+            halves=np.array(self.halves)[order],
+            faces=np.array(self.faces, np.int64)[order],
+            bounds=bounds,
+            links=links,
+            materials=np.array(self.materials),
+            rooms=np.array(self.rooms),
+            lights=lights,
+            ambient=np.array(ambient, np.float64),
+            outside=outside,
+            sky=sky,
         )
         return GeneratedScene(arrays, low, high)
 

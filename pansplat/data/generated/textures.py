@@ -31,7 +31,7 @@ class Pattern(IntEnum):
 
 # Columns of a material.
 KIND, COLOR_A, COLOR_B, COLOR_C = 0, 1, 4, 7
-SIZE_U, SIZE_V, FRACTION, MOTTLE, SEED, GLOW, NUMBERS = 10, 11, 12, 13, 14, 15, 16
+SIZE_U, SIZE_V, FRACTION, MOTTLE, SEED, GLOW, GLOSS, MIRROR, NUMBERS = range(10, 19)
 
 
 @nb.njit(**OPTIONS)

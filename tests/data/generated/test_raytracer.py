@@ -21,9 +21,13 @@ def _scene(fill) -> GeneratedScene:
 
 
 def _distance(scene: GeneratedScene, origin, towards, limit: float = math.inf) -> tuple[float, int]:
-    kinds, maps, _, _, bounds, links = scene.arrays[:6]
     direction = np.asarray(towards, float) / np.linalg.norm(towards)
-    return first_hit((kinds, maps, bounds, links, STACK), *map(float, origin), *direction, limit, False)
+    return first_hit(_bodies(scene), *map(float, origin), *direction, limit, False, True)
+
+
+def _bodies(scene: GeneratedScene):
+    arrays = scene.arrays
+    return arrays.kinds, arrays.maps, arrays.bounds, arrays.links, STACK
 
 
 def test_distances_to_single_bodies_are_exact() -> None:
@@ -52,21 +56,22 @@ def test_the_bvh_gives_the_hits_of_an_exhaustive_search() -> None:
                 builder.add_cylinder(centre, half[0], half[1], material, rng.uniform(0, 3))
 
     scene = _scene(fill)
-    kinds, maps, _, _, bounds, links = scene.arrays[:6]
-    everything = np.tile([-99.0, -99, -99, 99, 99, 99], (60, 1))
+    kinds, maps = scene.arrays.kinds, scene.arrays.maps
+    everything = np.array([[-99.0, -99, -99, 99, 99, 99]])
     hits = 0
     for _ in range(500):
         origin, direction = rng.uniform(-6, 6, size=3), rng.normal(size=3)
         direction /= np.linalg.norm(direction)
-        found = first_hit((kinds, maps, bounds, links, STACK), *origin, *direction, math.inf, False)
+        found = first_hit(_bodies(scene), *origin, *direction, math.inf, False, True)
         best = (math.inf, -1)
         for k in range(60):
-            single = np.array([[0, 1, k]], np.int64)
-            best = min(best, first_hit((kinds, maps, everything, single, STACK), *origin, *direction, math.inf, False))
+            single = np.array([[k, 1]], np.int64)
+            alone = (kinds, maps, everything, single, STACK)
+            best = min(best, first_hit(alone, *origin, *direction, math.inf, False, True))
         hits += found[1] >= 0
         assert found[0] == best[0]
         assert found[1] == best[1] or found[1] < 0
-        blocked = first_hit((kinds, maps, bounds, links, STACK), *origin, *direction, 3.0, True)[1] >= 0
+        blocked = first_hit(_bodies(scene), *origin, *direction, 3.0, True, True)[1] >= 0
         assert blocked == (found[0] < 3)
     assert 50 < hits < 450
 
@@ -115,3 +120,72 @@ def _at(x: float, y: float, z: float) -> np.ndarray:
     offset = np.zeros((4, 4))
     offset[:3, 3] = x, y, z
     return offset
+
+
+def _pose(x: float, y: float, z: float) -> np.ndarray:
+    return np.eye(4) + _at(x, y, z)
+
+
+def test_a_mirror_shows_the_mirrored_scene_and_has_no_depth() -> None:
+    def fill(sign: int, builder: SceneBuilder, material: int) -> None:
+        red = builder.add_material(Pattern.PLAIN, (0.8, 0.1, 0.1), mottle=0)
+        builder.add_box((0.4, 0.1, 2 - sign), (0.3, 0.5, 0.1), red)
+        builder.add_ellipsoid((-0.5, -0.4, 2 - 0.6 * sign), (0.3, 0.2, 0.4), material)
+        builder.add_light((0.2, -2, 2 - 0.3 * sign), (5, 5, 5), 0.0)
+
+    def fill_mirror(builder: SceneBuilder, material: int) -> None:
+        fill(1, builder, material)
+        glass = builder.add_material(Pattern.PLAIN, (0, 0, 0), mirror=0.9)
+        builder.add_box((0, 0, 2.001), (3, 3, 0.001), glass)
+
+    seen, depth = _scene(fill_mirror).panorama(_pose(0, 0, 1.6), 64, 1)
+    direct, _ = _scene(lambda b, m: fill(-1, b, m)).panorama(_pose(0, 0, 1.6), 64, 1)
+    ahead = np.s_[26:38, 55:74]
+    assert (depth[ahead] == 0).all()
+    assert np.isclose(seen[ahead], 0.9 * direct[ahead], rtol=1e-3).mean() > 0.98
+    assert direct[ahead].std() > 0.1
+    assert (depth[:, :30] > 0).all()
+
+
+def test_glass_shows_what_is_behind_it_and_reflects_at_grazing_angles() -> None:
+    def fill(builder: SceneBuilder, material: int) -> None:
+        white = builder.add_material(Pattern.PLAIN, (0.9, 0.9, 0.9), glow=1, mottle=0)
+        builder.add_box((0, 0, 4), (9, 9, 0.1), material)
+        builder.add_box((9, 0, -4), (0.1, 9, 4.5), white)
+
+    def fill_glass(builder: SceneBuilder, material: int) -> None:
+        fill(builder, material)
+        builder.add_glass((0, 0, 1), (9, 9, 0.01))
+
+    through, depth = _scene(fill_glass).panorama(np.eye(4), 64, 1)
+    without, distance = _scene(fill).panorama(np.eye(4), 64, 1)
+    assert np.array_equal(depth, distance)
+    assert np.allclose(through[32, 64], (1 - 0.08 / 1.04) * without[32, 64] + 0.08 / 1.04 * 0.5, atol=0.06)
+    assert through[32, 90, 0] - without[32, 90, 0] > 2 * abs(through[32, 64, 0] - without[32, 64, 0])
+
+
+def test_lamps_and_ambient_light_belong_to_rooms() -> None:
+    builder = SceneBuilder(np.random.default_rng(0))
+    material = builder.add_material(Pattern.PLAIN, (0.5, 0.5, 0.5), mottle=0)
+    builder.add_box((0, 0.1, 0), (9, 0.1, 9), material)
+    builder.add_room((-9, -9, 0, 9), [material] * 5, 0, 0, 20, (2, 1, 1), 0)
+    builder.add_room((0, -9, 9, 9), [material] * 5, 0, 0, 20, (1, 1, 1), 1)
+    builder.add_light((0, -2, 0), (0, 0, 4), 0.0, group=1)
+    image, _ = builder.finish((1, 1, 1), material, material).panorama(_pose(0, -2, 0), 64, 1)
+    angle = 54.5 / 64 * math.pi - math.pi / 2
+    lit = 0.5 + 0.5 * 4 * math.sin(angle) / (0.6 + 4 / math.sin(angle) ** 2)
+    assert image[54, 96] == pytest.approx([0.5, 0.5, lit], rel=0.03)
+    assert image[54, 32] == pytest.approx([1, 0.5, 0.5], rel=0.03)
+
+
+def test_polished_floors_reflect_more_at_grazing_angles() -> None:
+    def fill(gloss: float, builder: SceneBuilder, material: int) -> None:
+        floor = builder.add_material(Pattern.PLAIN, (0.1, 0.1, 0.1), gloss=gloss, mottle=0)
+        white = builder.add_material(Pattern.PLAIN, (0.9, 0.9, 0.9), glow=1, mottle=0)
+        builder.add_box((0, 0.1, 0), (9, 0.1, 9), floor)
+        builder.add_box((0, -4, 9), (9, 4, 0.1), white)
+
+    matt, polished = (_scene(lambda b, m, g=g: fill(g, b, m)).panorama(_pose(0, -1.5, 0), 64, 1) for g in (0.0, 1.0))
+    assert np.array_equal(matt[1], polished[1])
+    gain = polished[0][..., 0] - matt[0][..., 0]
+    assert gain[38, 64] > 2 * gain[46, 64] > 0
