@@ -75,7 +75,13 @@ class DepthNetwork(nn.Module):
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> DepthEstimate:
         """Depth in camera heights at half the size of panoramas, RGB in [0, 1]; 32 divides their height."""
         features, _ = self.encode(images)
-        return estimate_from_maps(self.head(features))
+        return self.estimate(features)
+
+    def estimate(self, features: Float[Tensor, "batch c h w"]) -> DepthEstimate:
+        """The estimate of decoded features."""
+        maps = self.head(features)
+        log_scale = MAX_LOG_SCALE * torch.tanh((maps[:, 1] - 1.0) / MAX_LOG_SCALE)
+        return DepthEstimate(maps[:, 0] + _MEAN_LOG_DEPTH, log_scale)
 
     def encode(
         self, images: Float[Tensor, "batch 3 height width"]
@@ -88,11 +94,6 @@ class DepthNetwork(nn.Module):
         for merge, skip in zip(self.decoder, reversed(encoded[:-1]), strict=True):
             x = merge(x, skip)
         return x, encoded
-
-
-def estimate_from_maps(maps: Float[Tensor, "batch 2 h w"]) -> DepthEstimate:
-    """The estimate in the two channels of a head."""
-    return DepthEstimate(maps[:, 0] + _MEAN_LOG_DEPTH, MAX_LOG_SCALE * torch.tanh((maps[:, 1] - 1.0) / MAX_LOG_SCALE))
 
 
 class UpsampleAndMerge(nn.Module):

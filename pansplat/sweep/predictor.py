@@ -15,6 +15,7 @@ from torch import Tensor
 from pansplat.gaussians.scene import Gaussians
 from pansplat.predictor import Progress
 from pansplat.sweep.lift import LiftConfig, lift
+from pansplat.sweep.prior import PriorModel
 from pansplat.sweep.search import PosedImages, SearchConfig, search_surfaces
 
 
@@ -34,8 +35,8 @@ class Sweep:
 
     name = "sweep"
 
-    def __init__(self, config: SweepConfig | None = None) -> None:
-        self.config = config or SweepConfig()
+    def __init__(self, config: SweepConfig | None = None, prior: PriorModel | None = None) -> None:
+        self.config, self.prior = config or SweepConfig(), prior
         self.fingerprint = _compute_fingerprint(self.config)
 
     def __call__(
@@ -88,7 +89,7 @@ class Sweep:
             far=high,
         )
         report = progress or (lambda what, fraction: None)
-        surfaces = search_surfaces(posed, self.config.search, lambda what, f: report(what, 0.85 * f))
+        surfaces = search_surfaces(posed, self.config.search, lambda what, f: report(what, 0.85 * f), self.prior)
         report("placing Gaussians", 0.85)
         gaussians = lift(posed, surfaces, self.config.lift)
         report("done", 1.0)

@@ -35,6 +35,7 @@ from pansplat.sweep.planes import (
     estimate_axes,
     make_empty_planes,
 )
+from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorModel, agreed_scale, apply_prior_cost, estimate_scale
 from pansplat.sweep.room_layout import (
     FloorBoundary,
     RoomLayoutConfig,
@@ -73,6 +74,8 @@ class SearchConfig:
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     aggregation: AggregationConfig = field(default_factory=AggregationConfig)
     room_layout: RoomLayoutConfig = field(default_factory=RoomLayoutConfig)
+    use_room_layout: bool = True
+    prior: PriorConfig = field(default_factory=PriorConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +99,12 @@ class PosedImages:
         return float(np.linalg.norm(centres[:, None] - centres[None], axis=-1).max())
 
 
-def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[str, float], None]) -> list[Surface]:
+def search_surfaces(
+    posed: PosedImages,
+    config: SearchConfig,
+    report: Callable[[str, float], None],
+    prior_model: PriorModel | None = None,
+) -> list[Surface]:
     """The surface of each view, at the finest level."""
     finest = min(posed.images.shape[1], config.finest_height)
     small = [resize_sphere(image, max(finest // 2, 32)) for image in posed.images]
@@ -121,11 +129,35 @@ def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[
         (boundary, fit_walls(boundary, planes.camera_height(pose), posed.far))
         for boundary, pose in zip(boundaries, posed.cam2world, strict=True)
     ]
+    priors = prior_model(posed.images) if prior_model is not None else None
+    factors: list[float] = []
+    if priors is not None:
+        at_detection = [prior.resize(detection.height) for prior in priors]
+        for view, prior in enumerate(at_detection):
+            others = [
+                (detection.views[n], posed.relative_pose(view, n)) for n in range(len(posed.images)) if n != view
+            ]
+            factors.append(
+                estimate_scale(prior, detection.views[view], others, (low, high), config.matching)
+            )
     for n in range(config.coarse_passes):
         report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
         level = _SearchLevel(posed, heights[0], planes, (low, high), config, surfaces)
+        level_priors = None
+        if priors is not None:
+            level_priors = [prior.resize(heights[0]) for prior in priors]
+            if surfaces is not None:
+                factors = [
+                    agreed_scale(prior, v.inverse_depth, v.confidence == 1, factor)
+                    for prior, v, factor in zip(level_priors, level.views, factors, strict=True)
+                ]
+            if DEBUG: print('heights', [math.exp(f) for f in factors])
         surfaces = [
-            level.search_full_range(view, count, layouts and layouts[view]) for view in range(len(posed.images))
+            level.search_full_range(
+                view, count, layouts[view] if layouts and config.use_room_layout else None,
+                level_priors and (level_priors[view], factors[view]),
+            )
+            for view in range(len(posed.images))
         ]
     for n, height in enumerate(heights[1:]):
         report("refining the surfaces", 0.5 + 0.25 * n)
@@ -141,6 +173,9 @@ def search_surfaces(posed: PosedImages, config: SearchConfig, report: Callable[[
         ]
     assert surfaces is not None
     return surfaces
+
+
+DEBUG = False
 
 
 class _SearchLevel:
@@ -178,7 +213,13 @@ class _SearchLevel:
             for n, (image, mask, rays) in enumerate(zip(posed.images, masks, self.rays, strict=True))
         ]
 
-    def search_full_range(self, view: int, count: int, layout: tuple[FloorBoundary, Walls] | None) -> Surface:
+    def search_full_range(
+        self,
+        view: int,
+        count: int,
+        layout: tuple[FloorBoundary, Walls] | None,
+        prior: tuple[DepthPrior, float] | None = None,
+    ) -> Surface:
         """The best hypotheses of the whole depth range: spheres (set 0) and planes across the axes (sets 1 to 3)."""
         low, high = self.limits
         step = (high - low) / (count - 1)
@@ -205,6 +246,8 @@ class _SearchLevel:
             apply_floor_costs(cost, layout[0], sets, is_floor, self.rays[view], self.config.room_layout)
             if self.surfaces is not None:
                 self._apply_walls(view, *layout, sets, cost)
+        if prior is not None:
+            apply_prior_cost(cost, *prior, sets, self.config.prior)
         return self._select_hypotheses(view, sets, cost, slot_map.astype(np.float32), count)
 
     def _apply_walls(

@@ -1,4 +1,4 @@
-"""Training of the depth network on pairs of panoramas from tours of generated homes.
+"""Training of monocular depth and its refinement on pairs of panoramas from tours of generated homes.
 
 `python -m pansplat.training.depth --out RUN --tours SHARDS...` trains until it is stopped. The same command resumes.
 The learning rate rises, stays, and falls in the last `decay_steps` before `steps`; a longer run can therefore continue
@@ -28,15 +28,16 @@ from pansplat.data.generated.shards import ShardReader, Tour
 from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import row_weights
-from pansplat.model.depth_network import DepthEstimate, DepthNetwork, DepthNetworkConfig
+from pansplat.model.depth_network import DepthEstimate
+from pansplat.model.depth_refinement import DepthRefinement, RefinementConfig
 from pansplat.model.efficientnet import load_imagenet_weights
 from pansplat.model.layers import to_channels_last
-from pansplat.training.checkpoint import load_latest, save_checkpoint
+from pansplat.training.checkpoint import load_checkpoint, load_latest, save_checkpoint
 from pansplat.training.logs import CsvTable
 from pansplat.training.optimization import ExponentialMovingAverage
 
-_COLUMNS = ("loss", "log_depth_error", "relative_error", "log_scale", "rate", "gradient_norm", "seconds")
-_MEASURES = ("log_depth_error", "relative_error", "likelihood")
+_COLUMNS = ("loss", "mono_error", "refined_error", "mono_likelihood", "refined_likelihood", "rate", "gradient_norm", "seconds")
+_MEASURES = ("mono_error", "mono_relative_error", "mono_likelihood", "refined_error", "refined_relative_error", "refined_likelihood")
 _MAX_DEPTH = 12.0  # in camera heights; surfaces farther away are all "far"
 _SCALES = (1, 2, 4)  # pixels, of the loss on differences between neighbours
 
@@ -73,7 +74,11 @@ class DepthTrainConfig:
     threads: int = 1
     stop_after_minutes: float = 0.0
     """Save and stop after so many minutes; 0 for none."""
-    network: DepthNetworkConfig = field(default_factory=DepthNetworkConfig)
+    init: Path | None = None
+    """Checkpoint of another run whose weights of the same names the run starts from."""
+    factor_noise: tuple[float, float] = (0.1, 0.03)
+    """Deviation of the logarithm of the monocular depth's factor: of both views together, and of each view."""
+    network: RefinementConfig = field(default_factory=RefinementConfig)
 
 
 def read_pair(
@@ -176,8 +181,43 @@ def depth_loss(
         "log_depth_error": (weight * absolute).sum(),
         "relative_error": (weight * ((error).exp() - 1).abs()).sum(),
         "likelihood": (weight * likelihood).sum(),
-        "log_scale": (weight * estimate.log_scale).sum(),
     }
+
+
+_PAIR_OF_VIEWS = [(0, 1), (1, 0)]
+
+
+def training_terms(
+    network: DepthRefinement,
+    samples: list[tuple[Views, Float[Tensor, "2"]]],
+    generator: torch.Generator | None,
+    *,
+    iterations: int,
+    factor_noise: tuple[float, float] = (0.0, 0.0),
+) -> dict[str, Tensor]:
+    """Loss terms of monocular depth and of its refinement, for pairs of views with their cameras' heights."""
+    images = torch.cat([views.images for views, _ in samples])
+    heights = torch.cat([heights for _, heights in samples])
+    poses = torch.cat([views.cam2world for views, _ in samples])
+    targets, known = zip(*(depth_targets(views, h, generator) for views, h in samples), strict=True)
+    target, is_known = torch.cat(targets), torch.cat(known)
+    mono, observed = network.observe(to_channels_last(images))
+    terms = {f"mono_{name}": value for name, value in depth_loss(mono, target, is_known).items()}
+    loss = terms.pop("mono_loss")
+    noise = torch.zeros(len(heights))
+    if generator is not None:
+        noise = torch.randn(len(samples), generator=generator).repeat_interleave(2) * factor_noise[0]
+        noise = noise + torch.randn(len(heights), generator=generator) * factor_noise[1]
+    factor = heights.log()[:, None, None]
+    estimate = DepthEstimate(mono.log_depth + factor + noise[:, None, None], mono.log_scale)
+    pairs = [(2 * n + i, 2 * n + j) for n in range(len(samples)) for i, j in _PAIR_OF_VIEWS]
+    for _ in range(iterations):
+        estimate = network.refine(observed, estimate, poses, pairs)
+        refined = depth_loss(DepthEstimate(estimate.log_depth - factor, estimate.log_scale), target, is_known)
+        loss = loss + refined["loss"] / iterations
+    terms |= {f"refined_{name}": value for name, value in refined.items() if name != "loss"}
+    terms = {name.replace("log_depth_error", "error"): value for name, value in terms.items()}
+    return {"loss": loss, **terms}
 
 
 class DepthTrainer:
@@ -188,17 +228,19 @@ class DepthTrainer:
         torch.set_num_threads(config.threads)
         torch.manual_seed(config.seed)
         self.tours = ShardReader(list(config.tours))
-        self.network = DepthNetwork(config.network)
+        self.network = DepthRefinement(config.network)
         self.step = 0
         latest = load_latest(config.out / "checkpoints")
         if latest is None:
-            self.network.encoder.load_imagenet(load_imagenet_weights())
+            self.network.mono.encoder.load_imagenet(load_imagenet_weights())
+        if latest is None and config.init is not None:
+            load_matching(self.network, config.init)
         self.network.to(memory_format=torch.channels_last)
-        encoder = {id(p) for p in self.network.encoder.parameters()}
+        encoder = {id(p) for p in self.network.mono.encoder.parameters()}
         self.optimizer = torch.optim.AdamW(
             [
                 {"params": [p for p in self.network.parameters() if id(p) not in encoder], "peak": config.rate},
-                {"params": list(self.network.encoder.parameters()), "peak": config.encoder_rate},
+                {"params": list(self.network.mono.encoder.parameters()), "peak": config.encoder_rate},
             ],
             lr=config.rate,
             weight_decay=config.weight_decay,
@@ -257,14 +299,14 @@ class DepthTrainer:
         """Mean measures of the averaged weights over the validation tours."""
         assert self.config.validation is not None
         tours = ShardReader([self.config.validation])
-        network = DepthNetwork(self.config.network)
+        network = DepthRefinement(self.config.network)
         network.load_state_dict(self.average.state)
         network.eval()
         sums = dict.fromkeys(_MEASURES, 0.0)
         count = min(self.config.validation_tours, len(tours))
         for index in range(count):
             views, heights = read_pair(tours, index, np.random.default_rng(index), self.config.baseline)
-            terms = depth_loss(network(to_channels_last(views.images)), *depth_targets(views, heights))
+            terms = training_terms(network, [(views, heights)], None, iterations=2)
             for name in _MEASURES:
                 sums[name] += float(terms[name]) / count
         return sums
@@ -281,18 +323,18 @@ class DepthTrainer:
         began = time.perf_counter()
         rng = np.random.default_rng((self.config.seed, self.step))
         generator = torch.Generator().manual_seed(int(rng.integers(1 << 40)))
-        images, targets, known = [], [], []
-        for _ in range(self.config.pairs):
-            views, heights = read_pair(self.tours, int(rng.integers(len(self.tours))), rng, self.config.baseline)
-            target, is_known = depth_targets(views, heights, generator)
-            images.append(views.images)
-            targets.append(target)
-            known.append(is_known)
+        samples = [
+            read_pair(self.tours, int(rng.integers(len(self.tours))), rng, self.config.baseline)
+            for _ in range(self.config.pairs)
+        ]
         factor = self._learning_rate_factor()
         for group in self.optimizer.param_groups:
             group["lr"] = group["peak"] * factor
         self.network.train()
-        terms = depth_loss(self.network(to_channels_last(torch.cat(images))), torch.cat(targets), torch.cat(known))
+        iterations = 1 + self.step % 2
+        terms = training_terms(
+            self.network, samples, generator, iterations=iterations, factor_noise=self.config.factor_noise
+        )
         self.optimizer.zero_grad()
         terms["loss"].backward()
         norm = float(torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip))
@@ -302,6 +344,15 @@ class DepthTrainer:
         self.average.update(self.network, self.step)
         values = {name: float(value) for name, value in terms.items() if name in _COLUMNS}
         return {**values, "rate": self.config.rate * factor, "gradient_norm": norm, "seconds": time.perf_counter() - began}
+
+
+def load_matching(network: DepthRefinement, path: Path) -> None:
+    """Load the averaged weights of a checkpoint that have the names and shapes of the network's."""
+    state = load_checkpoint(path)["mean"]
+    own = network.state_dict()
+    renamed = {f"mono.{name}" if f"mono.{name}" in own else name: tensor for name, tensor in state.items()}
+    fitting = {name: t for name, t in renamed.items() if name in own and own[name].shape == t.shape}
+    network.load_state_dict({**own, **fitting})
 
 
 def main() -> None:
