@@ -56,9 +56,7 @@ class InvertedResidual(nn.Module):
         if expansion > 1:
             self.expand = PanoramaConv2d(inputs, inner, 1, border="sphere", bias=False)
             self.expand_norm = _make_norm(inner)
-        self.depthwise = PanoramaConv2d(
-            inner, inner, kernel, border="sphere", stride=stride, groups=inner, bias=False
-        )
+        self.depthwise = PanoramaConv2d(inner, inner, kernel, border="sphere", stride=stride, groups=inner, bias=False)
         self.depthwise_norm = _make_norm(inner)
         self.project = PanoramaConv2d(inner, outputs, 1, border="sphere", bias=False)
         self.project_norm = _make_norm(outputs)

@@ -112,7 +112,9 @@ class PanoramaConv2d(nn.Conv2d):
         """Convolve with the given weights and bias."""
         if self.border == "zeros":
             return functional.conv2d(maps, weight, bias, self.stride, self.margin, groups=self.groups)
-        return functional.conv2d(pad_equirect(maps, self.margin, self.border), weight, bias, self.stride, groups=self.groups)
+        return functional.conv2d(
+            pad_equirect(maps, self.margin, self.border), weight, bias, self.stride, groups=self.groups
+        )
 
 
 def convolve_and_normalize(

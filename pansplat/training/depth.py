@@ -343,7 +343,12 @@ class DepthTrainer:
         self.optimizer.step()
         self.average.update(self.network, self.step)
         values = {name: float(value) for name, value in terms.items() if name in _COLUMNS}
-        return {**values, "rate": self.config.rate * factor, "gradient_norm": norm, "seconds": time.perf_counter() - began}
+        return {
+            **values,
+            "rate": self.config.rate * factor,
+            "gradient_norm": norm,
+            "seconds": time.perf_counter() - began,
+        }
 
 
 def load_matching(network: DepthRefinement, path: Path) -> None:

@@ -36,12 +36,12 @@ _SUBSAMPLING = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420, cv2.IMWRITE_JPEG_SAMPLING_
 class CameraEffects:
     """Strengths of the effects of `photograph`. Zero or None switches an effect off; `NO_EFFECTS` has all off."""
 
-    grey: tuple[float, float] | None = (0.17, 0.33)
+    grey: tuple[float, float] | None = (0.14, 0.38)
     """Range of the linear light to which automatic exposure maps a tour's metered light. None: the light is kept."""
     exposure_stops: float = 0.7
     """Largest difference of exposure between two views of a tour, stops."""
     tour_white_balance: float = 0.15
-    """Largest relative error of the red and blue gains of a tour."""
+    """Largest relative error of the red and blue gains of a tour, more often warm than cold."""
     view_white_balance: float = 0.04
     """Largest relative deviation of a view's red and blue gains from those of its tour."""
     flare: float = 0.08
@@ -62,11 +62,11 @@ class CameraEffects:
     """Largest relative loss of light at the seams between lenses."""
     lens_exposure: float = 0.05
     """Largest relative deviation of one lens's exposure."""
-    seam_softness: float = 0.6
+    seam_softness: float = 0.4
     """Largest fraction of fine detail that is lost near the seams."""
-    softness: float = 0.3
+    softness: float = 0.2
     """Largest fraction of fine detail that is lost everywhere."""
-    sharpening: float = 0.9
+    sharpening: float = 1.2
     """Largest gain of fine detail by sharpening, which makes halos."""
     seam_shift_degrees: float = 1.0
     """Largest misalignment of the images of two lenses at their seam, degrees."""
@@ -80,7 +80,7 @@ class CameraEffects:
     """Largest radius of patches and caps around the poles, degrees."""
     operator_probability: float = 0.04
     """Probability that a person stands below and behind the camera in all views of a tour."""
-    noise: float = 0.012
+    noise: float = 0.008
     """Largest standard deviation of the noise at mid-grey, of 1."""
     jpeg_quality: tuple[int, int] | None = (60, 98)
     """Range of the JPEG quality, which includes quantisation to 8 bits and often chroma subsampling."""
@@ -110,7 +110,8 @@ def photograph(
 
     Args:
         light: (view h w 3) float32, linear light, equirectangular.
-        depth: (view h w), radial depth in metres; the camera's height and the operator's visibility follow from it.
+        depth: (view h w), radial depth in metres, 0 where unknown; the camera's height and the operator's visibility
+            follow from it.
         rng: supplies all random numbers; equal states give equal photographs.
         effects: strengths.
     """
@@ -133,7 +134,7 @@ def photograph(
 def _expose(light: Array, rng: np.random.Generator, effects: CameraEffects) -> tuple[Array, NDArray[np.float64]]:
     """Light times the exposure and white balance of each view, and the exposures."""
     views = len(light)
-    quantile, adaptation = rng.uniform(0.4, 0.7), rng.random() ** 2
+    quantile, adaptation = rng.uniform(0.4, 0.7), rng.random()
     luminance = light[:, ::2, ::2] @ np.full(3, 1 / 3, np.float32)
     metered = np.quantile(luminance.reshape(views, -1), quantile, axis=1, method="nearest").clip(1e-6, 1e6)
     middle = np.exp(np.log(metered).mean())
@@ -143,7 +144,7 @@ def _expose(light: Array, rng: np.random.Generator, effects: CameraEffects) -> t
     grey = rng.uniform()
     if effects.grey is not None:
         exposures *= (effects.grey[0] + grey * (effects.grey[1] - effects.grey[0])) / middle
-    tour = rng.uniform(-1, 1, 2) * effects.tour_white_balance
+    tour = rng.uniform((-0.5, -1), (1, 0.5)) * effects.tour_white_balance
     balance = np.ones((views, 3))
     balance[:, (0, 2)] = 1 + tour + rng.uniform(-1, 1, (views, 2)) * effects.view_white_balance
     gains = (exposures[:, None] * balance).astype(np.float32)
@@ -254,6 +255,13 @@ def _blur(image: Array, sigma: float) -> Array:
     return blurred[:, reach:-reach]
 
 
+def _enlarge(image: Array, height: int, width: int) -> Array:
+    """The image at a larger size; interpolation wraps at +-180 degrees."""
+    margin = round(2 * width / image.shape[1])
+    large = cv2.resize(_wrap_columns(image, 2), (width + 2 * margin, height), interpolation=cv2.INTER_LINEAR)
+    return large[:, margin : margin + width]
+
+
 # ---- light to display values
 
 
@@ -267,10 +275,8 @@ def _scatter(light: Array, rng: np.random.Generator, effects: CameraEffects) -> 
     for image, scattered in zip(light, out, strict=True):
         small = cv2.resize(image, (width // _REDUCTION, height // _REDUCTION), interpolation=cv2.INTER_AREA)
         tiny = cv2.resize(small, (16, 8), interpolation=cv2.INTER_AREA)
-        near = _blur(small, height / _REDUCTION / 40)
-        far = cv2.resize(_blur(tiny, 1.5), (small.shape[1], small.shape[0]), interpolation=cv2.INTER_CUBIC)
-        halo = near + np.maximum(far, 0)
-        scattered += cv2.resize(halo, (width, height), interpolation=cv2.INTER_LINEAR) * (fraction / 2)
+        halo = _blur(small, height / _REDUCTION / 40) + _enlarge(_blur(tiny, 1.5), *small.shape[:2])
+        scattered += _enlarge(halo, height, width) * (fraction / 2)
     return out
 
 
@@ -307,16 +313,14 @@ def _base(light: Array, smoothness: float) -> Array:
     radius = max(size[1] // 8, 1)
     padded = cv2.copyMakeBorder(log, 0, 0, 3 * radius, 3 * radius, cv2.BORDER_WRAP)
 
-    def mean(plane: Array) -> Array:
+    def mean(plane: NDArray) -> NDArray:
         return cv2.blur(plane, (2 * radius + 1, 2 * radius + 1), borderType=cv2.BORDER_REPLICATE)
 
     average = mean(padded)
     variance = np.maximum(mean(padded * padded) - average * average, 0)
     slope = variance / (variance + np.float32(smoothness))
-    planes = np.dstack((mean(slope), mean(average * (1 - slope))))[:, 2 * radius : -2 * radius]
-    fine = radius * width // size[0]
-    large = cv2.resize(planes, (width + 2 * fine, height), interpolation=cv2.INTER_LINEAR)
-    return np.ascontiguousarray(large[:, fine : fine + width])
+    planes = np.dstack((mean(slope), mean(average * (1 - slope))))[:, 3 * radius : -3 * radius]
+    return np.ascontiguousarray(_enlarge(planes, height, width))
 
 
 def _tone_table(rng: np.random.Generator, effects: CameraEffects) -> Array:
@@ -403,7 +407,7 @@ def _cover_poles(images: Array, masks: Mask, depth: Array, rng: np.random.Genera
         draw = _sample_cover(kind, size, images.shape[1], rng)
         for image, mask, far in zip(images, masks, depth, strict=True):
             rows = slice(None, None, -1) if up else slice(None)
-            draw(image[rows], mask[rows], float(np.median(far[-2:])))
+            draw(image[rows], mask[rows], float(np.median(far[-2:])) or 1.5)
 
 
 def _sample_cover(kind: str, radius: float, height: int, rng: np.random.Generator) -> Draw:
@@ -462,8 +466,8 @@ def _sample_tripod(height: int, rng: np.random.Generator) -> Draw:
     first = height - len(angle)
     monopod = rng.random() < 0.25
     start = rng.uniform(0, 2 * np.pi)
-    head = np.radians(rng.uniform(2, 5) if monopod else rng.uniform(4, 12))
-    bump, sharpness = head * rng.uniform(0, 0.8) * (not monopod), rng.uniform(0.5, 6)
+    head = np.radians(rng.uniform(2, 5) if monopod else rng.uniform(4, 13))
+    bump, sharpness = head * rng.uniform(0, 1) * (not monopod), rng.uniform(0.5, 6)
     third = np.cos(3 * (azimuth - start))
     outline = head + bump * np.exp(sharpness * (third - 1))
     for wave in range(2, 9):
@@ -507,7 +511,7 @@ def _add_operator(images: Array, masks: Mask, depth: Array, rng: np.random.Gener
         return
     height = images.shape[1]
     azimuth, away, down = rng.uniform(0, 2 * np.pi), rng.uniform(0.15, 0.6), rng.uniform(0.25, 0.6)
-    colors = rng.uniform(0.03, 0.7, (4, 3)).astype(np.float32)
+    colors = (rng.uniform(0.03, 0.6, (3, 1)) * rng.uniform(0.7, 1.3, (3, 3))).astype(np.float32)
     skin = np.array((0.75, 0.55, 0.42), np.float32) * rng.uniform(0.4, 1.1)
     sin_latitude, cos_latitude, sin_azimuth, cos_azimuth = _sines(height)
     across = cos_latitude[:, None] * (sin_azimuth * np.cos(azimuth) - cos_azimuth * np.sin(azimuth))
@@ -519,7 +523,7 @@ def _add_operator(images: Array, masks: Mask, depth: Array, rng: np.random.Gener
         ((0, down + 0.42, away + 0.03), (0.23, 0.32, 0.14), colors[1]),
         ((0.09, down + 1.05, away + 0.03), (0.09, 0.5, 0.1), colors[2]),
         ((-0.09, down + 1.05, away + 0.03), (0.09, 0.5, 0.1), colors[2]),
-        ((0.18, (down + 0.2) * 0.7, away * 0.6), (0.06, 0.25, 0.2), colors[1]),
+        ((0.2, down + 0.25, away - 0.1), (0.05, 0.12, 0.16), colors[1]),
     )
     nearest = np.full(across.shape, np.inf, np.float32)
     person = np.zeros((*across.shape, 3), np.float32)
@@ -529,7 +533,7 @@ def _add_operator(images: Array, masks: Mask, depth: Array, rng: np.random.Gener
         nearest[hit] = distance[hit]
         person[hit] = (color * (0.55 - 0.45 * normal[..., None]))[hit]
     for image, mask, far in zip(images, masks, depth, strict=True):
-        hit = nearest < far
+        hit = nearest < np.where(far > 0, far, np.inf)
         image[hit] = person[hit]
         mask[hit] = False
 
@@ -562,11 +566,11 @@ def _sharpen(images: Array, lenses: _Lenses, rng: np.random.Generator, effects: 
 
 def _compress(images: Array, rng: np.random.Generator, effects: CameraEffects) -> Array:
     """Images after JPEG compression."""
-    chance, subsampling = rng.random(), _SUBSAMPLING[int(rng.random() < 0.3)]
+    chance, subsampling = rng.random(), _SUBSAMPLING[int(rng.random() < 0.5)]
     if effects.jpeg_quality is None:
         return images
     low, high = effects.jpeg_quality
-    quality = round(high - (high - low) * chance**2)
+    quality = round(high - (high - low) * chance**3)
     out = np.empty_like(images)
     for image, decoded in zip(images, out, strict=True):
         pixels = cv2.convertScaleAbs(image, alpha=255)
