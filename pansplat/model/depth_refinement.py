@@ -23,7 +23,13 @@ from torch.nn.functional import avg_pool2d, interpolate, normalize, relu, unfold
 from pansplat.geometry.correlation import correlate, correlate_positions
 from pansplat.geometry.equirect import pad_equirect, pixel_directions
 from pansplat.geometry.warp import relative_pose, warp_positions
-from pansplat.model.depth_network import MAX_LOG_SCALE, DepthEstimate, DepthNetwork, DepthNetworkConfig, UpsampleAndMerge
+from pansplat.model.depth_network import (
+    MAX_LOG_SCALE,
+    DepthEstimate,
+    DepthNetwork,
+    DepthNetworkConfig,
+    UpsampleAndMerge,
+)
 from pansplat.model.efficientnet import CHANNELS
 from pansplat.model.layers import PanoramaConv2d, convolve_and_normalize, to_channels_last
 

@@ -134,12 +134,8 @@ def search_surfaces(
     if priors is not None:
         at_detection = [prior.resize(detection.height) for prior in priors]
         for view, prior in enumerate(at_detection):
-            others = [
-                (detection.views[n], posed.relative_pose(view, n)) for n in range(len(posed.images)) if n != view
-            ]
-            factors.append(
-                estimate_scale(prior, detection.views[view], others, (low, high), config.matching)
-            )
+            others = [(detection.views[n], posed.relative_pose(view, n)) for n in range(len(posed.images)) if n != view]
+            factors.append(estimate_scale(prior, detection.views[view], others, (low, high), config.matching))
     for n in range(config.coarse_passes):
         report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
         level = _SearchLevel(posed, heights[0], planes, (low, high), config, surfaces)
@@ -151,10 +147,13 @@ def search_surfaces(
                     agreed_scale(prior, v.inverse_depth, v.confidence == 1, factor)
                     for prior, v, factor in zip(level_priors, level.views, factors, strict=True)
                 ]
-            if DEBUG: print('heights', [math.exp(f) for f in factors])
+            if DEBUG:
+                print("heights", [math.exp(f) for f in factors])
         surfaces = [
             level.search_full_range(
-                view, count, layouts[view] if layouts and config.use_room_layout else None,
+                view,
+                count,
+                layouts[view] if layouts and config.use_room_layout else None,
                 level_priors and (level_priors[view], factors[view]),
             )
             for view in range(len(posed.images))

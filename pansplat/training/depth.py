@@ -15,7 +15,6 @@ import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -24,6 +23,7 @@ from torch import Tensor
 
 from pansplat.console import own_warnings, run_command
 from pansplat.data.augment import mirror_views, roll_views
+from pansplat.data.generated.camera import photograph
 from pansplat.data.generated.shards import ShardReader, Tour
 from pansplat.data.views import Views
 from pansplat.errors import InputError
@@ -36,8 +36,24 @@ from pansplat.training.checkpoint import load_checkpoint, load_latest, save_chec
 from pansplat.training.logs import CsvTable
 from pansplat.training.optimization import ExponentialMovingAverage
 
-_COLUMNS = ("loss", "mono_error", "refined_error", "mono_likelihood", "refined_likelihood", "rate", "gradient_norm", "seconds")
-_MEASURES = ("mono_error", "mono_relative_error", "mono_likelihood", "refined_error", "refined_relative_error", "refined_likelihood")
+_COLUMNS = (
+    "loss",
+    "mono_error",
+    "refined_error",
+    "mono_likelihood",
+    "refined_likelihood",
+    "rate",
+    "gradient_norm",
+    "seconds",
+)
+_MEASURES = (
+    "mono_error",
+    "mono_relative_error",
+    "mono_likelihood",
+    "refined_error",
+    "refined_relative_error",
+    "refined_likelihood",
+)
 _MAX_DEPTH = 12.0  # in camera heights; surfaces farther away are all "far"
 _SCALES = (1, 2, 4)  # pixels, of the loss on differences between neighbours
 
@@ -87,12 +103,12 @@ def read_pair(
     """Two photographed and augmented panoramas of a tour, with the heights of their cameras over the floor, metres."""
     tour = tours.read(index)
     chosen = _choose_pair(tour, rng, baseline)
-    images = _photograph(tour.light[chosen], rng)
+    photographs = photograph(tour.light[chosen], tour.depth[chosen], rng)
     depth = torch.from_numpy(tour.depth[chosen])
     views = Views(
-        images=torch.from_numpy(images).permute(0, 3, 1, 2).contiguous(),
+        images=torch.from_numpy(photographs.images).permute(0, 3, 1, 2).contiguous(),
         cam2world=torch.from_numpy(tour.cam2world[chosen]),
-        masks=torch.ones(depth.shape, dtype=torch.bool),
+        masks=torch.from_numpy(photographs.masks),
         near=0.3,
         far=20.0,
         names=(f"tour_{index}_{chosen[0]}", f"tour_{index}_{chosen[1]}"),
@@ -113,47 +129,22 @@ def _choose_pair(tour: Tour, rng: np.random.Generator, baseline: tuple[float, fl
     return [int(k) for k in fitting[rng.integers(len(fitting))]]
 
 
-def _photograph(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Images (view h w 3) with random exposure, white balance, tone curve, blur and noise."""
-    import cv2
-
-    exposure = 2 ** rng.normal(0, 0.5)
-    images = []
-    white = 1 + rng.normal(0, 0.08, size=3)
-    gamma, contrast, saturation = 2.2 * 2 ** rng.normal(0, 0.2), 2 ** rng.normal(0, 0.15), 2 ** rng.normal(-0.2, 0.4)
-    shoulder = rng.uniform(0.3, 1.0)
-    for view in light:
-        x = view * exposure * 2 ** rng.normal(0, 0.25) * (white + rng.normal(0, 0.02, size=3))
-        x = np.maximum(x, 0) / (1 + (1 - shoulder) * np.maximum(x, 0)) * (2 - shoulder)
-        x = np.clip(x, 0, 1) ** (1 / gamma)
-        grey = x.mean(axis=-1, keepdims=True)
-        x = grey + saturation * (x - grey)
-        x = (x - 0.5) * contrast + 0.5
-        x = x.astype(np.float32)
-        if rng.random() < 0.5:
-            x = cv2.GaussianBlur(x, (0, 0), rng.uniform(0.3, 0.8), borderType=cv2.BORDER_REPLICATE)
-        x = x + rng.normal(0, rng.uniform(0.0, 0.02), size=x.shape)
-        images.append(np.clip(x, 0, 1))
-    return np.stack(images).astype(np.float32)
-
-
 def depth_targets(
     views: Views, camera_height: Float[Tensor, "view"], generator: torch.Generator | None = None
 ) -> tuple[Float[Tensor, "view h w"], Bool[Tensor, "view h w"]]:
     """Log-depth in camera heights at half the size, and where it is known.
 
-    Each value is that of one of the four pixels: a random one with a generator, else the first.
+    Each value is that of one of the four pixels: a random one with a generator, else the first. The scene behind what
+    is fixed to the camera counts, so that the network continues the floor under a tripod.
     """
     assert views.depths is not None
     blocks = views.depths.unflatten(-1, (-1, 2)).unflatten(-3, (-1, 2)).transpose(-2, -3).flatten(-2)
-    masks = views.masks.unflatten(-1, (-1, 2)).unflatten(-3, (-1, 2)).transpose(-2, -3).flatten(-2)
     chosen = torch.zeros(blocks.shape[:-1], dtype=torch.long)
     if generator is not None:
         chosen = torch.randint(4, blocks.shape[:-1], generator=generator)
     depth = blocks.gather(-1, chosen[..., None]).squeeze(-1)
-    known = masks.gather(-1, chosen[..., None]).squeeze(-1) & (depth > 0)
     relative = (depth / camera_height[:, None, None]).clamp(1e-3, _MAX_DEPTH)
-    return relative.log(), known
+    return relative.log(), depth > 0
 
 
 def depth_loss(
