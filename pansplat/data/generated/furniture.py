@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pansplat.data.generated import materials
+from pansplat.data.generated.plans import Plan, Rectangle, RoomKind
 from pansplat.data.generated.scene import SceneBuilder
 from pansplat.data.generated.textures import Pattern
 
@@ -85,9 +86,21 @@ def table(place: Place, rng: np.random.Generator, width: float, depth: float) ->
     clutter(place, rng, height + 0.02, width, depth, 7)
 
 
+def screen(place: Place, rng: np.random.Generator, width: float, depth: float) -> None:
+    """A television on a low board."""
+    board, black = materials.wood(place.builder), materials.paint(place.builder, (0.015, 0.015, 0.02))
+    high, wide = rng.uniform(0.35, 0.6), rng.uniform(0.8, 1.0) * width
+    place.add_box(0, high / 2, 0, width, high, depth, board)
+    place.add_box(0, high + 0.06, 0.05, 0.3, 0.12, 0.15, black)
+    place.add_box(0, high + 0.1 + 0.28 * wide, 0.05, wide, 0.56 * wide, 0.04, black)
+
+
 def chair(place: Place, rng: np.random.Generator, width: float, depth: float) -> None:
     """A chair with a slatted or a full back."""
-    frame, seat = materials.wood(place.builder), materials.random_material(place.builder)
+    _chair(place, rng, materials.wood(place.builder), materials.random_material(place.builder))
+
+
+def _chair(place: Place, rng: np.random.Generator, frame: int, seat: int) -> None:
     place.add_box(0, 0.45, 0, 0.42, 0.05, 0.42, seat)
     _add_legs(place, frame, 0.42, 0.42, 0.43, 0.035, bool(rng.random() < 0.5))
     if rng.random() < 0.5:
@@ -212,33 +225,130 @@ def ball(place: Place, rng: np.random.Generator, width: float, depth: float) -> 
         place.add_cylinder(0, height / 2, 0, size / 2, height, materials.random_material(place.builder))
 
 
-def stairs(place: Place, rng: np.random.Generator, width: float, depth: float) -> None:
-    """A few steps."""
-    material, count = materials.floor(place.builder), rng.integers(3, 7)
-    run = depth / count
+_Choice = tuple[Piece, float, float, float]
+"""A piece, its nominal width and depth in metres, and its weight."""
+
+_AGAINST_WALL: dict[RoomKind, tuple[_Choice, ...]] = {
+    RoomKind.LIVING: (
+        (sofa, 2.0, 0.95, 3),
+        (shelf, 1.2, 0.36, 2),
+        (cabinet, 1.4, 0.5, 2),
+        (table, 1.3, 0.6, 1),
+        (lamp, 0.5, 0.5, 1),
+        (plant, 0.6, 0.6, 1),
+        (screen, 1.5, 0.45, 2),
+    ),
+    RoomKind.DINING: ((cabinet, 1.4, 0.5, 2), (shelf, 1.0, 0.36, 1), (plant, 0.6, 0.6, 1), (table, 1.2, 0.6, 1)),
+    RoomKind.KITCHEN: ((cabinet, 0.8, 0.5, 1), (shelf, 0.8, 0.36, 1), (table, 1.0, 0.7, 1)),
+    RoomKind.BEDROOM: (
+        (bed, 1.6, 2.1, 5),
+        (cabinet, 1.2, 0.55, 3),
+        (cabinet, 0.5, 0.4, 2),
+        (shelf, 1.0, 0.36, 1),
+        (table, 1.2, 0.6, 1),
+        (plant, 0.6, 0.6, 1),
+    ),
+    RoomKind.BATHROOM: ((crates, 0.4, 0.4, 1), (shelf, 0.5, 0.3, 1), (plant, 0.4, 0.4, 1)),
+    RoomKind.HALL: ((cabinet, 0.9, 0.35, 2), (shelf, 0.8, 0.3, 1), (plant, 0.4, 0.4, 1)),
+    RoomKind.UTILITY: ((shelf, 1.0, 0.4, 2), (crates, 0.5, 0.5, 2), (cabinet, 0.8, 0.5, 1)),
+    RoomKind.CLOSET: ((crates, 0.4, 0.4, 1),),
+    RoomKind.ALCOVE: ((shelf, 0.9, 0.36, 1), (plant, 0.5, 0.5, 1), (table, 1.0, 0.5, 1)),
+}
+_STANDING: tuple[_Choice, ...] = (
+    (chair, 0.5, 0.5, 3),
+    (table, 1.1, 0.7, 1.5),
+    (lamp, 0.4, 0.4, 1),
+    (plant, 0.6, 0.6, 1),
+    (crates, 0.6, 0.6, 1),
+    (board, 1.0, 0.7, 0.3),
+    (ball, 0.6, 0.6, 0.5),
+)
+_WALL_DENSITY = (0.0, 0.12, 0.3, 0.5)  # pieces per square metre, by furnishing
+_FLOOR_DENSITY = (0.0, 0.04, 0.12, 0.35)
+
+
+def furnish(builder: SceneBuilder, plan: Plan, index: int, occupied: list[Rectangle], furnishing: int) -> None:
+    """Add furniture of a room's kind along its walls and in it; `occupied` gets the floor that it covers."""
+    rng, room = builder.rng, plan.rooms[index]
+    is_staged = rng.random() < (0.0, 0.5, 0.95, 1.0)[furnishing]
+    if not is_staged:
+        return
+    interior = plan.interior(index)
+    area, sides = (interior[2] - interior[0]) * (interior[3] - interior[1]), plan.sides(index)
+    if room.kind in (RoomKind.LIVING, RoomKind.BEDROOM, RoomKind.DINING) and rng.random() < 0.45:
+        _add_rug(builder, interior)
+    if room.kind == RoomKind.DINING or (room.kind == RoomKind.KITCHEN and area > 10):
+        _add_dining_table(builder, interior, occupied)
+    against = _AGAINST_WALL[room.kind]
+    weights = np.array([choice[3] for choice in against])
+    for attempt in range(round(2 + area * _WALL_DENSITY[furnishing] * rng.uniform(0.5, 1.5))):
+        chosen = 0 if attempt == 0 else rng.choice(len(against), p=weights / weights.sum())
+        piece, width, depth, _ = against[chosen]
+        width *= rng.uniform(0.8, 1.2)
+        high = 2.1 if piece in (shelf, cabinet) and rng.random() < 0.6 else 0.9
+        side = sides[rng.integers(4)]
+        spans = [(a, b) for a, b in side.free_spans(high, depth + 0.1, occupied) if b - a > width + 0.04]
+        if not spans:
+            continue
+        low, end = spans[rng.integers(len(spans))]
+        along = rng.uniform(low + width / 2 + 0.02, end - width / 2 - 0.02)
+        if piece in (sofa, bed) and rng.random() < 0.6:
+            along = (low + end) / 2
+        occupied.append(side.area(along - width / 2, along + width / 2, depth + 0.25))
+        piece(Place(builder, *side.point(along, depth / 2 + 0.03), side.yaw), rng, width, depth)
+    weights = np.array([choice[3] for choice in _STANDING])
+    for _ in range(round(area * _FLOOR_DENSITY[furnishing] * rng.uniform(0.3, 1.7))):
+        piece, width, depth, _ = _STANDING[rng.choice(len(_STANDING), p=weights / weights.sum())]
+        reach = 0.5 * float(np.hypot(width, depth))
+        x, z = rng.uniform(interior[0], interior[2]), rng.uniform(interior[1], interior[3])
+        place = (x - reach, z - reach, x + reach, z + reach)
+        if _is_free(place, occupied, interior):
+            occupied.append(place)
+            piece(Place(builder, x, z, rng.uniform(0, 2 * np.pi)), rng, width, depth)
+
+
+def _is_free(place: Rectangle, occupied: list[Rectangle], room: Rectangle) -> bool:
+    x0, z0, x1, z1 = place
+    if x0 < room[0] + 0.02 or z0 < room[1] + 0.02 or x1 > room[2] - 0.02 or z1 > room[3] - 0.02:
+        return False
+    return all(x1 < t[0] or x0 > t[2] or z1 < t[1] or z0 > t[3] for t in occupied)
+
+
+def _add_rug(builder: SceneBuilder, room: Rectangle) -> None:
+    rng = builder.rng
+    width, depth = (rng.uniform(0.35, 0.7) * (room[k + 2] - room[k]) for k in (0, 1))
+    kind = rng.random()
+    if kind < 0.5:
+        colors = [materials.random_color(rng, 0.4) for _ in range(3)]
+        material = builder.add_material(Pattern.RUG, *colors, size=rng.uniform(0.04, 0.15), mottle=0.4)
+    else:
+        material = materials.carpet(builder) if kind < 0.75 else materials.fabric(builder)
+    x, z = (room[0] + room[2]) / 2, (room[1] + room[3]) / 2
+    builder.add_box((x, -0.004, z), (width / 2, 0.008, depth / 2), material)
+
+
+def _add_dining_table(builder: SceneBuilder, room: Rectangle, occupied: list[Rectangle]) -> None:
+    """Add a table with chairs around it in the middle of a room, if there is space."""
+    rng = builder.rng
+    width, depth = rng.uniform(1.1, 2.0), rng.uniform(0.8, 1.0)
+    x, z, is_along_x = (room[0] + room[2]) / 2, (room[1] + room[3]) / 2, room[2] - room[0] > room[3] - room[1]
+    half = (width / 2 + 0.15, depth / 2 + 0.45) if is_along_x else (depth / 2 + 0.45, width / 2 + 0.15)
+    area = (x - half[0], z - half[1], x + half[0], z + half[1])
+    if not _is_free(area, occupied, room):
+        return
+    occupied.append(area)
+    yaw = 0.0 if is_along_x else np.pi / 2
+    place = Place(builder, x, z, yaw)
+    wood = materials.wood(builder)
+    place.add_box(0, 0.74, 0, width, 0.04, depth, wood)
+    _add_legs(place, wood, width, depth, 0.74, 0.07, bool(rng.random() < 0.3))
+    clutter(place, rng, 0.76, width, depth, 5)
+    seat = materials.random_material(builder)
+    frame = materials.wood(builder)
+    count = max(1, round(width / 0.6))
     for k in range(count):
-        height = 0.17 * (k + 1)
-        place.add_box(0, height / 2, -depth / 2 + (k + 0.5) * run, width, height, run, material)
-
-
-AGAINST_WALL: tuple[tuple[Piece, float, float], ...] = (
-    (sofa, 2.0, 0.95),
-    (bed, 1.6, 2.1),
-    (shelf, 1.2, 0.36),
-    (cabinet, 1.2, 0.55),
-    (cabinet, 0.8, 0.5),
-    (table, 1.3, 0.6),
-    (stairs, 1.0, 1.4),
-)
-STANDING: tuple[tuple[Piece, float, float], ...] = (
-    (table, 1.4, 0.9),
-    (table, 0.9, 0.9),
-    (chair, 0.5, 0.5),
-    (chair, 0.5, 0.5),
-    (lamp, 0.4, 0.4),
-    (plant, 0.6, 0.6),
-    (crates, 0.6, 0.6),
-    (board, 1.0, 0.7),
-    (ball, 0.6, 0.6),
-)
-"""Pieces with their nominal width and depth, metres."""
+        for sign in (-1, 1):
+            along, across = (k + 0.5) * width / count - width / 2, sign * (depth / 2 + rng.uniform(0.0, 0.2))
+            dx, dz = place.cos * along + place.sin * across, -place.sin * along + place.cos * across
+            turn = yaw + (0 if sign > 0 else np.pi) + rng.normal(0, 0.1)
+            _chair(Place(builder, x + dx, z + dz, turn), rng, frame, seat)

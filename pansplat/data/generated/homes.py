@@ -1,160 +1,333 @@
-"""Random furnished homes: floor plan, walls, rooms, furniture and lights."""
+"""Random homes as real-estate tours show them: plan, walls, doors, fixtures, furniture, lights and cameras.
+
+World axes: y down, the floor at y = 0, metres.
+"""
 
 from __future__ import annotations
 
-import itertools
+import copy
 from dataclasses import dataclass, field
+from enum import IntEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pansplat.data.generated import materials
-from pansplat.data.generated.furniture import AGAINST_WALL, STANDING, Place
-from pansplat.data.generated.raytracer import CEILING, FLOOR, WALL
+from pansplat.data.generated.doors import (
+    DoorStyle,
+    Leaf,
+    add_casing,
+    add_entrance,
+    add_leaf,
+    add_wall,
+    add_window,
+    plan_leaves,
+)
+from pansplat.data.generated.fixtures import add_ceiling_lamp, add_details, add_fixtures
+from pansplat.data.generated.furniture import Place, chair, crates, furnish
+from pansplat.data.generated.lighting import LightMood, add_lights, sample_mood
+from pansplat.data.generated.plans import OUTER, Hole, HoleKind, Plan, Rectangle, Room, RoomKind, sample_plan
+from pansplat.data.generated.raytracer import CEILING, FLOOR
 from pansplat.data.generated.scene import GeneratedScene, SceneBuilder
 from pansplat.data.generated.textures import Pattern
 
-Rectangle = tuple[float, float, float, float]
-"""x0, z0, x1, z1, metres."""
+Array = NDArray[np.float64]
 
-INNER, OUTER = 0.12, 0.25  # thickness of walls, metres
-_MIN_SIDE = 2.2  # side of a room, metres
+_GROUND = 27.0  # half the side of the ground, metres; within the sphere of the sky
+_CLEARANCE = 0.35  # least distance of a camera to a body, metres
+_DISTANCE = 0.3, 4.0  # between a camera and the nearest other one of its set, metres
+
+
+class Furnishing(IntEnum):
+    """How much stands in a home."""
+
+    EMPTY = 0
+    HALF = 1
+    FURNISHED = 2
+    CLUTTERED = 3
 
 
 @dataclass(frozen=True)
-class Hole:
-    """A door or window from `start` to `end` along its wall and from `low` to `top` above the floor, metres."""
+class Home:
+    """A home in several states.
 
-    start: float
-    end: float
-    low: float
-    top: float
+    Attributes:
+        variants: scenes that differ in the angles of doors and in a few movable things.
+        doorways: passages in which a camera may stand: world x, z and the room's index.
+        camera_height: usual height of the cameras, metres.
+    """
+
+    plan: Plan
+    furnishing: Furnishing
+    variants: tuple[GeneratedScene, ...]
+    camera_height: float
+
+    def sample_cameras(self, rng: np.random.Generator, count: int = 4) -> list[tuple[int, Array]]:
+        """Variants and poses (cam2world) of cameras of a tour, in rooms that are connected by at most three passages.
+
+        Each camera is 0.3 to 4 metres from the nearest other one. Fewer than `count` are returned if there is no space.
+        """
+        areas = np.array([room.area if room.kind != RoomKind.CLOSET else 0.3 * room.area for room in self.plan.rooms])
+        areas = np.sqrt(areas)
+        has_changes = rng.random() < 0.6
+        yaw, spread = rng.uniform(0, 2 * np.pi), 0.05 if rng.random() < 0.6 else np.pi
+        keeps_height, cameras = rng.random() < 0.75, []
+        steps = self.plan.steps_from(int(rng.choice(len(areas), p=areas / areas.sum())))
+        near = np.array([(1.0, 0.6, 0.3, 0.1)[step] if 0 <= step < 4 else 0.0 for step in steps])
+        for attempt in range(40 * count):
+            if len(cameras) == count:
+                break
+            variant = int(has_changes and rng.random() < 0.5)
+            weights = near * areas if attempt % 3 else areas * (np.array(steps) == 0)
+            x, z = self._sample_place(int(rng.choice(len(areas), p=weights / weights.sum())), rng)
+            height = self.camera_height + rng.normal(0, 0.01) if keeps_height else rng.uniform(0.9, 1.9)
+            centre = np.array((x, -height, z))
+            if cameras:
+                distances = [np.linalg.norm(pose[:3, 3] - centre) for _, pose in cameras]
+                if not _DISTANCE[0] <= min(distances) <= _DISTANCE[1]:
+                    continue
+            if self.variants[variant].clearance(centre[None])[0] >= _CLEARANCE:
+                cameras.append((variant, _pose(centre, yaw + spread * rng.uniform(-1, 1))))
+        return cameras
+
+    def _sample_place(self, room: int, rng: np.random.Generator) -> tuple[float, float]:
+        """World x and z of a camera in a room: near its middle, anywhere in it, or in one of its doorways."""
+        kind = rng.random()
+        x0, z0, x1, z1 = self.plan.interior(room)
+        passages = [(wall, hole) for wall, hole in self.plan.passages() if room in wall.rooms]
+        if kind < 0.25 and passages:
+            wall, hole = passages[rng.integers(len(passages))]
+            return wall.point(hole.middle + rng.normal(0, 0.05) * hole.width, rng.normal(0, 0.25))
+        if kind < 0.6:
+            share = rng.uniform(0.3, 0.7, size=2)
+            return x0 + share[0] * (x1 - x0), z0 + share[1] * (z1 - z0)
+        return rng.uniform(x0, x1), rng.uniform(z0, z1)
+
+
+def _pose(centre: Array, yaw: float) -> Array:
+    pose = np.eye(4)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    pose[:3, :3] = ((cos, 0, sin), (0, 1, 0), (-sin, 0, cos))
+    pose[:3, 3] = centre
+    return pose
 
 
 @dataclass
-class Wall:
-    """A wall in the plane x = at (axis 0) or z = at (axis 2), from `start` to `end` along the other axis, metres."""
+class _Style:
+    """Materials that several rooms of a home share."""
 
-    axis: int
-    at: float
-    start: float
-    end: float
-    outer: bool
-    holes: list[Hole] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Rooms that fill a rectangle, and their walls."""
-
-    whole: Rectangle
-    rooms: tuple[Rectangle, ...]
-    walls: tuple[Wall, ...]
+    wall: int
+    ceiling: int
+    trim_height: float
+    doors: DoorStyle
+    floors: dict[RoomKind, int]
+    materials: dict[int, list[int]] = field(default_factory=dict)
 
 
-def sample_plan(rng: np.random.Generator) -> Plan:
-    """A random plan of one to four rooms, with doors in inner walls and windows in outer walls."""
-    width, depth = rng.uniform(3.2, 9.0), rng.uniform(3.0, 8.0)
-    whole = (-width / 2, -depth / 2, width / 2, depth / 2)
-    rooms, walls = [whole], []
-    for _ in range(rng.integers(0, 4)):
-        rooms.sort(key=_longer_side)
-        x0, z0, x1, z1 = room = rooms[-1]
-        if _longer_side(room) < 2 * _MIN_SIDE + 0.2:
-            break
-        rooms.pop()
-        if x1 - x0 > z1 - z0:
-            at = rng.uniform(x0 + _MIN_SIDE, x1 - _MIN_SIDE)
-            rooms += [(x0, z0, at, z1), (at, z0, x1, z1)]
-            walls.append(Wall(0, at, z0, z1, False))
-        else:
-            at = rng.uniform(z0 + _MIN_SIDE, z1 - _MIN_SIDE)
-            rooms += [(x0, z0, x1, at), (x0, at, x1, z1)]
-            walls.append(Wall(2, at, x0, x1, False))
-    x0, z0, x1, z1 = whole
-    walls += [Wall(0, x0, z0, z1, True), Wall(0, x1, z0, z1, True)]
-    walls += [Wall(2, z0, x0, x1, True), Wall(2, z1, x0, x1, True)]
-    for wall in walls:
-        _add_holes(wall, walls, rng)
-    return Plan(whole, tuple(rooms), tuple(walls))
+def _sample_style(builder: SceneBuilder, plan: Plan, furnishing: Furnishing) -> _Style:
+    rng = builder.rng
+    trim = materials.trim(builder)
+    leaf = trim if rng.random() < 0.6 else materials.wood(builder) if rng.random() < 0.6 else materials.trim(builder)
+    panels = ((0, 0), (1, 1), (2, 1), (3, 2), (2, 2))[rng.choice(5, p=(0.35, 0.1, 0.2, 0.25, 0.1))]
+    casing = rng.uniform(0.05, 0.08) if rng.random() < 0.85 else 0.0
+    doors = DoorStyle(trim, leaf, materials.metal(builder), panels, casing)
+    wall = materials.paint(builder, materials.paint_color(rng))
+    if furnishing != Furnishing.EMPTY and rng.random() < 0.25:
+        wall = materials.wall(builder)
+    main = materials.floor(builder)
+    bedroom = (
+        main if rng.random() < 0.5 else materials.carpet(builder) if rng.random() < 0.7 else materials.floor(builder)
+    )
+    kitchen = (
+        main
+        if rng.random() < 0.6
+        else materials.floor_tiles(builder)
+        if rng.random() < 0.7
+        else materials.boards(builder)
+    )
+    hall = bedroom if rng.random() < 0.5 else main
+    wet = materials.floor_tiles(builder) if rng.random() < 0.75 else kitchen
+    kinds = RoomKind
+    floors = {
+        kinds.LIVING: main,
+        kinds.DINING: kitchen if rng.random() < 0.5 else main,
+        kinds.KITCHEN: kitchen,
+        kinds.BEDROOM: bedroom,
+        kinds.BATHROOM: wet,
+        kinds.HALL: hall,
+        kinds.CLOSET: bedroom,
+        kinds.UTILITY: wet,
+    }
+    trim_height = rng.uniform(0.05, 0.14) if rng.random() < 0.9 else 0.0
+    return _Style(wall, materials.ceiling(builder), trim_height, doors, floors)
 
 
-def sides(room: Rectangle) -> list[tuple[int, float, float, float, int]]:
-    """The four sides of a room: axis, coordinate, start, end, and the sign of the outward direction on the axis."""
-    x0, z0, x1, z1 = room
-    return [(0, x0, z0, z1, -1), (0, x1, z0, z1, 1), (2, z0, x0, x1, -1), (2, z1, x0, x1, 1)]
+def build_home(rng: np.random.Generator) -> Home:
+    """A random home."""
+    furnishing = Furnishing(rng.choice(4, p=(0.3, 0.2, 0.35, 0.15)))
+    plan, builder = sample_plan(rng), SceneBuilder(rng)
+    style, mood = _sample_style(builder, plan, furnishing), sample_mood(rng)
+    heights = np.full(len(plan.rooms), rng.uniform(2.3, 2.75) if rng.random() < 0.75 else rng.uniform(2.6, 3.3))
+    if rng.random() < 0.25:
+        heights += rng.uniform(-0.25, 0.4, size=len(heights)) * (rng.random(len(heights)) < 0.4)
+    heights = np.maximum(heights, 2.3)
+    for index, room in enumerate(plan.rooms):
+        if room.kind == RoomKind.ALCOVE:
+            heights[index] = heights[room.parent]
+    top = float(heights.max()) + 0.1
+    outside, sky = _add_outdoors(builder, plan, mood)
+    rooms = [_room_row(builder, plan, index, style, furnishing, heights[index]) for index in range(len(plan.rooms))]
+    leaves, occupied = _add_walls(builder, plan, style, top)
+    for index, room in enumerate(plan.rooms):
+        x0, z0, x1, z1 = room.corners
+        centre = ((x0 + x1) / 2, -(heights[index] + top + 0.2) / 2, (z0 + z1) / 2)
+        builder.add_box(centre, ((x1 - x0) / 2, (top + 0.2 - heights[index]) / 2, (z1 - z0) / 2), CEILING)
+    spots: list[tuple[int, tuple[float, float]]] = []
+    lamps = []
+    for index, room in enumerate(plan.rooms):
+        lamps += add_ceiling_lamp(builder, plan, index, float(heights[index]), mood.lamps, occupied[index])
+        add_fixtures(builder, plan, index, float(heights[index]), occupied[index], style.doors.trim)
+        furnish(builder, plan, index, occupied[index], int(furnishing))
+        add_details(builder, plan, index, float(heights[index]), occupied[index], int(furnishing))
+        if furnishing != Furnishing.EMPTY and room.area > 5 and rng.random() < 0.5:
+            place = _find_place(plan, index, occupied[index], rng)
+            if place is not None:
+                spots.append((index, place))
+    variants = []
+    angles = [_sample_angle(leaf, rng) for leaf in leaves]
+    for _ in range(2):
+        variant = _fork(builder)
+        for leaf, angle in zip(leaves, angles, strict=True):
+            add_leaf(variant, leaf, angle, style.doors)
+        _add_movables(variant, spots, rng)
+        add_lights(variant, plan, rooms, heights, lamps, _openness(leaves, angles), mood, furnishing > 0)
+        variants.append(variant.finish(mood.outdoors, outside, sky))
+        angles = [
+            angle if rng.random() < 0.55 else _sample_angle(leaf, rng)
+            for leaf, angle in zip(leaves, angles, strict=True)
+        ]
+    height = rng.uniform(1.2, 1.75)
+    return Home(plan, furnishing, tuple(variants), min(height, float(heights.min()) - 0.6))
 
 
-def holes_of_side(plan: Plan, side: tuple[int, float, float, float, int]) -> list[Hole]:
-    """Doors and windows in one side of a room."""
-    axis, at, start, end, _ = side
-    return [
-        hole
-        for wall in plan.walls
-        if wall.axis == axis and abs(wall.at - at) < 1e-9
-        for hole in wall.holes
-        if hole.end > start and hole.start < end
-    ]
+def _fork(builder: SceneBuilder) -> SceneBuilder:
+    """A builder that continues the same scene independently; it shares the random numbers."""
+    fork = copy.copy(builder)
+    for name, value in vars(builder).items():
+        if isinstance(value, list):
+            setattr(fork, name, value.copy())
+    return fork
 
 
-def _longer_side(room: Rectangle) -> float:
-    return max(room[2] - room[0], room[3] - room[1])
+def _sample_angle(leaf: Leaf, rng: np.random.Generator) -> float:
+    """A closed, half open or fully open door, radians."""
+    kind = rng.choice(3, p=(0.28, 0.22, 0.5))
+    if kind == 0:
+        return 0.0
+    return rng.uniform(0.2, 0.8) * leaf.largest if kind == 1 else leaf.largest * rng.uniform(0.9, 1.0)
 
 
-def _add_holes(wall: Wall, walls: list[Wall], rng: np.random.Generator) -> None:
-    """Add random holes between the junctions with other walls."""
-    junctions = [
-        other.at
-        for other in walls
-        if other.axis != wall.axis
-        and wall.start < other.at < wall.end
-        and min(abs(other.start - wall.at), abs(other.end - wall.at)) < 1e-9
-    ]
-    stops = [wall.start, *sorted(junctions), wall.end]
-    for start, end in itertools.pairwise(stops):
-        free = end - start - 0.4
-        if wall.outer:
-            if free > 0.7 and rng.random() < 0.55:
-                width = rng.uniform(0.6, min(2.4, free))
-                low = 0.0 if rng.random() < 0.2 else rng.uniform(0.7, 1.1)
-                left = start + 0.2 + rng.uniform(0, free - width)
-                wall.holes.append(Hole(left, left + width, low, rng.uniform(1.9, 2.2)))
-        elif free > 0.8 and (not wall.holes or rng.random() < 0.6):
-            width = rng.uniform(0.8, min(2.6 if rng.random() < 0.4 else 1.1, free))
-            left = start + 0.2 + rng.uniform(0, free - width)
-            wall.holes.append(Hole(left, left + width, 0.0, rng.uniform(2.0, 2.2)))
+def _openness(leaves: list[Leaf], angles: list[float]) -> dict[Hole, float]:
+    """For each door with leaves, the free fraction of its area."""
+    found: dict[Hole, float] = {}
+    for leaf, angle in zip(leaves, angles, strict=True):
+        share = leaf.width / leaf.hole.width
+        found[leaf.hole] = found.get(leaf.hole, 0.0) + share * float(1 - np.cos(min(angle, np.pi / 2)))
+    return found
 
 
-_GROUND = 27.0  # half the side of the ground, metres; within the sphere of the sky
+def _room_row(
+    builder: SceneBuilder, plan: Plan, index: int, style: _Style, furnishing: Furnishing, height: float
+) -> tuple[list[int], float, float]:
+    """Materials of a room, and heights of its panel and trim, metres."""
+    rng, room = builder.rng, plan.rooms[index]
+    if room.kind == RoomKind.ALCOVE and room.parent in style.materials:
+        found = style.materials[room.parent]
+    else:
+        wall, panel = style.wall, style.wall
+        if rng.random() < (0.15 if furnishing == Furnishing.EMPTY else 0.3):
+            wall = materials.wall(builder)
+        if room.kind == RoomKind.BATHROOM and rng.random() < 0.4:
+            panel = materials.wall_tiles(builder)
+            wall = panel if rng.random() < 0.4 else wall
+        elif rng.random() < 0.06:
+            panel = style.doors.trim
+        ceiling = style.ceiling if rng.random() < 0.9 else materials.ceiling(builder)
+        floor = style.floors.get(room.kind, style.floors[RoomKind.LIVING])
+        if room.parent >= 0 and room.parent in style.materials:
+            floor = style.materials[room.parent][1]
+        found = [wall, floor, ceiling, style.doors.trim, panel if panel != style.wall else wall]
+        style.materials[index] = found
+    panel_height = rng.uniform(0.9, 1.4) if found[4] != found[0] else 0.0
+    return found, panel_height, style.trim_height
 
 
-def build_home(rng: np.random.Generator) -> tuple[GeneratedScene, Plan]:
-    """A random furnished home and its plan. World axes: y down, the floor at y = 0."""
-    builder, plan = SceneBuilder(rng), sample_plan(rng)
-    outside, sky, grass = _outdoor_materials(builder)
-    heights = [rng.uniform(2.3, 3.3) for _ in plan.rooms]
-    if rng.random() < 0.6:
-        heights = [heights[0]] * len(heights)
-    top = max(heights) + 0.1
-    x0, z0, x1, z1 = plan.whole
-    middle, half = ((x0 + x1) / 2, (z0 + z1) / 2), ((x1 - x0) / 2 + OUTER, (z1 - z0) / 2 + OUTER)
-    builder.add_box((middle[0], 0.1, middle[1]), (half[0], 0.1, half[1]), FLOOR)
-    builder.add_box((0, 0.45, 0), (_GROUND, 0.3, _GROUND), grass)
+def _add_walls(
+    builder: SceneBuilder, plan: Plan, style: _Style, top: float
+) -> tuple[list[Leaf], list[list[Rectangle]]]:
+    """Add the walls and what is in their holes, except inner door leaves.
+
+    Returns:
+        The leaves of inner doors, and for each room the floor where nothing may stand.
+    """
+    rng, leaves = builder.rng, []
+    occupied: list[list[Rectangle]] = [[] for _ in plan.rooms]
     for wall in plan.walls:
-        _add_wall(builder, wall, top)
-    trim = materials.plain(builder, 0.2, 0.6) if rng.random() < 0.6 else materials.wood(builder)
-    for room, height in zip(plan.rooms, heights, strict=True):
-        _add_room(builder, room, height, top, trim)
-        occupied = _find_doorways(plan, room)
-        _furnish_room(builder, plan, room, occupied)
-        _decorate_walls(builder, plan, room, height)
-    if rng.random() < 0.6:
-        _add_sun(builder)
-    warm = rng.uniform(-0.12, 0.12)
-    ambient = rng.uniform(0.35, 0.7) * np.array((1 + warm, 1.0, 1 - warm))
-    return builder.finish(ambient, outside, sky), plan
+        add_wall(builder, plan, wall, top)
+        for hole in wall.holes:
+            if hole.kind == HoleKind.DOOR:
+                add_casing(builder, wall, hole, style.doors, max(style.doors.casing, 0.0))
+                if rng.random() < 0.85:
+                    leaves += plan_leaves(plan, wall, hole, rng)
+            elif hole.kind == HoleKind.OPENING:
+                if hole.top < np.inf and style.doors.casing > 0 and rng.random() < 0.4:
+                    add_casing(builder, wall, hole, style.doors, style.doors.casing)
+            elif hole.kind == HoleKind.ENTRANCE:
+                add_casing(builder, wall, hole, style.doors, style.doors.casing)
+                add_entrance(builder, wall, hole, style.doors)
+            else:
+                add_window(builder, wall, hole, style.doors, rng)
+            if hole.low == 0:
+                for index, sign in zip(wall.rooms, (-1, 1), strict=True):
+                    if index >= 0:
+                        (ax, az), (bx, bz) = wall.point(hole.start, 0.0), wall.point(hole.end, 0.95 * sign)
+                        occupied[index].append((min(ax, bx), min(az, bz), max(ax, bx), max(az, bz)))
+    return leaves, occupied
 
 
-def _outdoor_materials(builder: SceneBuilder) -> tuple[int, int, int]:
+def _find_place(
+    plan: Plan, room: int, occupied: list[Rectangle], rng: np.random.Generator
+) -> tuple[float, float] | None:
+    """A free square of 1.2 metres in a room, which becomes occupied; its centre."""
+    x0, z0, x1, z1 = plan.interior(room)
+    for _ in range(6):
+        x, z = rng.uniform(x0 + 0.6, max(x1 - 0.6, x0 + 0.6)), rng.uniform(z0 + 0.6, max(z1 - 0.6, z0 + 0.6))
+        place = (x - 0.6, z - 0.6, x + 0.6, z + 0.6)
+        if (
+            place[2] < x1
+            and place[3] < z1
+            and all(place[2] < a or place[0] > c or place[3] < b or place[1] > d for a, b, c, d in occupied)
+        ):
+            occupied.append(place)
+            return x, z
+    return None
+
+
+def _add_movables(
+    builder: SceneBuilder, spots: list[tuple[int, tuple[float, float]]], rng: np.random.Generator
+) -> None:
+    """Add a chair or boxes at random offsets, some of them missing."""
+    for number, (_, (x, z)) in enumerate(spots):
+        if rng.random() < 0.75:
+            place = Place(
+                builder, x + rng.uniform(-0.25, 0.25), z + rng.uniform(-0.25, 0.25), rng.uniform(0, 2 * np.pi)
+            )
+            piece = chair if number % 2 == 0 else crates
+            piece(place, rng, 0.5, 0.5)
+
+
+def _add_outdoors(builder: SceneBuilder, plan: Plan, mood: LightMood) -> tuple[int, int]:
+    """Add ground, foundation, neighbours, fences and trees; the materials of outer walls and of the sky."""
     rng = builder.rng
     outside = materials.wall(builder)
     blue = rng.uniform(0.2, 0.6)
@@ -163,195 +336,48 @@ def _outdoor_materials(builder: SceneBuilder) -> tuple[int, int, int]:
         (blue * 0.4, blue * 0.7, blue * 1.4),
         (0.7, 0.8, 0.9),
         materials.random_color(rng, 0.5, 0.2, 0.6),
-        glow=rng.uniform(0.8, 2.0),
+        glow=float(np.mean(mood.outdoors)) * 1.3,
     )
     green = (rng.uniform(0.05, 0.25), rng.uniform(0.1, 0.3), rng.uniform(0.02, 0.15))
     grass = builder.add_material(Pattern.STONE, green, materials.shade(green, 0.4), size=0.7, fraction=0, mottle=0.6)
-    return outside, sky, grass
-
-
-def _add_sun(builder: SceneBuilder) -> None:
-    rng = builder.rng
-    up, around = np.radians(rng.uniform(20, 55)), rng.uniform(0, 2 * np.pi)
-    power = rng.uniform(0.8, 2.0)
-    direction = (np.cos(up) * np.sin(around), -np.sin(up), np.cos(up) * np.cos(around))
-    builder.add_light(direction, (power, 0.93 * power, 0.8 * power), 0.01, sun=True)
-
-
-def _add_wall_part(builder: SceneBuilder, wall: Wall, span: tuple[float, float], rise: tuple[float, float]) -> None:
-    """Add a part of a wall: its extent along the wall and above the floor, metres."""
-    if span[1] - span[0] < 1e-6 or rise[1] - rise[0] < 1e-6:
-        return
-    thick = OUTER if wall.outer else INNER
-    across = wall.at + (np.sign(wall.at) * OUTER / 2 if wall.outer else 0.0)
-    along, y = (span[0] + span[1]) / 2, -(rise[0] + rise[1]) / 2
-    half = ((span[1] - span[0]) / 2, (rise[1] - rise[0]) / 2, thick / 2)
-    _add_wall_box(builder, wall.axis, across, along, y, half, WALL)
-
-
-def _add_wall(builder: SceneBuilder, wall: Wall, top: float) -> None:
-    """Add the parts of a wall around its holes, and window frames."""
-    extra = OUTER if wall.outer else 0.0  # outer walls overlap in the corners
-    at = wall.start - extra
-    for hole in sorted(wall.holes, key=lambda hole: hole.start):
-        _add_wall_part(builder, wall, (at, hole.start), (0, top))
-        _add_wall_part(builder, wall, (hole.start, hole.end), (hole.top, top))
-        _add_wall_part(builder, wall, (hole.start, hole.end), (0, hole.low))
-        at = hole.end
-        if wall.outer:
-            _add_window_frame(builder, wall, hole)
-    _add_wall_part(builder, wall, (at, wall.end + extra), (0, top))
-
-
-def _add_window_frame(builder: SceneBuilder, wall: Wall, hole: Hole) -> None:
-    rng = builder.rng
-    material, bar = materials.plain(builder, 0.2, 0.5), rng.uniform(0.02, 0.04)
-    across = wall.at + np.sign(wall.at) * OUTER / 2
-    y, height = -(hole.low + hole.top) / 2, (hole.top - hole.low) / 2
-    middle, half = (hole.start + hole.end) / 2, (hole.end - hole.start) / 2
-    posts = np.linspace(hole.start + bar, hole.end - bar, 2 + int(rng.integers(1, 4)))
-    bars = [(post, y, bar, height) for post in posts]
-    bars += [(middle, rise, half, bar) for rise in (-hole.low - bar, -hole.top + bar)]
-    if rng.random() < 0.5:
-        bars.append((middle, y, half, bar * 0.7))
-    for along, rise, width, high in bars:
-        _add_wall_box(builder, wall.axis, across, along, rise, (width, high, 0.03), material)
-
-
-def _add_room(builder: SceneBuilder, room: Rectangle, height: float, top: float, trim: int) -> None:
-    """Add the ceiling, materials, beams and lamp of a room."""
-    rng = builder.rng
-    x0, z0, x1, z1 = room
-    x, z = (x0 + x1) / 2, (z0 + z1) / 2
-    builder.add_box(
-        (x, -(height + top + 0.2) / 2, z), ((x1 - x0) / 2, (top + 0.2 - height) / 2, (z1 - z0) / 2), CEILING
-    )
-    room_materials = [
-        materials.wall(builder),
-        materials.floor(builder),
-        materials.ceiling(builder),
-        trim,
-        materials.wall(builder),
-    ]
-    panel = rng.uniform(0.8, 1.3) if rng.random() < 0.25 else 0.0
-    trim_height = rng.uniform(0.05, 0.14) if rng.random() < 0.75 else 0.0
-    builder.add_room(room, room_materials, panel, trim_height, height, [rng.uniform(0.35, 0.7)] * 3)
-    if rng.random() < 0.15:
-        beam = materials.wood(builder)
-        for at in np.arange(x0 + 0.5, x1 - 0.3, rng.uniform(0.8, 1.4)):
-            builder.add_box((at, -height + 0.08, z), (0.07, 0.08, (z1 - z0) / 2), beam)
-    x, z = x + rng.uniform(-0.3, 0.3), z + rng.uniform(-0.3, 0.3)
-    shade = builder.add_material(Pattern.PLAIN, materials.random_color(rng, 0.3, 0.8, 1.0), glow=rng.uniform(0.8, 2.0))
-    power, warm = rng.uniform(0.7, 2.6), rng.uniform(0, 0.3)
-    if rng.random() < 0.5:
-        drop, size = rng.uniform(0.2, 0.5), rng.uniform(0.08, 0.22)
-        builder.add_cylinder((x, -height + drop / 2, z), 0.008, drop / 2, trim)
-        builder.add_ellipsoid((x, -height + drop, z), (size, size * rng.uniform(0.5, 1), size), shade)
-        drop += size + 0.05
-    else:
-        drop = 0.1
-        builder.add_box((x, -height, z), (rng.uniform(0.1, 0.4), 0.03, rng.uniform(0.1, 0.4)), shade)
-    builder.add_light(
-        (x, -height + drop, z), (power, power * (1 - warm / 2), power * (1 - warm)), rng.uniform(0.03, 0.12)
-    )
-
-
-def _find_doorways(plan: Plan, room: Rectangle) -> list[Rectangle]:
-    """The areas in front of doors, where no furniture may stand."""
-    occupied = []
-    for side in sides(room):
-        axis, at, _, _, sign = side
-        for hole in holes_of_side(plan, side):
-            if hole.low > 0:
-                continue
-            near, far = sorted((at, at - 0.9 * sign))
-            occupied.append((near, hole.start, far, hole.end) if axis == 0 else (hole.start, near, hole.end, far))
-    return occupied
-
-
-def _is_free(place: Rectangle, occupied: list[Rectangle], room: Rectangle) -> bool:
-    x0, z0, x1, z1 = place
-    if x0 < room[0] + 0.07 or z0 < room[1] + 0.07 or x1 > room[2] - 0.07 or z1 > room[3] - 0.07:
-        return False
-    return all(x1 < t[0] or x0 > t[2] or z1 < t[1] or z0 > t[3] for t in occupied)
-
-
-def _furnish_room(builder: SceneBuilder, plan: Plan, room: Rectangle, occupied: list[Rectangle]) -> None:
-    """Add furniture along the walls and in the room where there is space."""
-    rng = builder.rng
-    area = (room[2] - room[0]) * (room[3] - room[1])
-    if rng.random() < 0.5:
-        _add_rug(builder, room)
-    for _ in range(round(area * rng.uniform(0.1, 0.45))):
-        piece, width, depth = AGAINST_WALL[rng.integers(len(AGAINST_WALL))]
-        width *= rng.uniform(0.75, 1.25)
-        axis, at, start, end, sign = sides(room)[rng.integers(4)]
-        if end - start < width + 0.2:
+    x0, z0, x1, z1 = plan.bounds
+    builder.add_box((0, 0.1, 0), ((x1 - x0) / 2 + OUTER, 0.1, (z1 - z0) / 2 + OUTER), FLOOR)
+    builder.add_box((0, 0.45, 0), (_GROUND, 0.3, _GROUND), grass)
+    bark = materials.wood(builder)
+    for _ in range(rng.integers(2, 14)):
+        angle, size = rng.uniform(0, 2 * np.pi), rng.uniform(0.8, 2.5)
+        away = np.hypot(x1 - x0, z1 - z0) / 2 + rng.uniform(1.5 + size, 12)
+        x, z = away * np.sin(angle), away * np.cos(angle)
+        leaves = materials.shade(green, rng.uniform(0.3, 1.2))
+        leaf = builder.add_material(
+            Pattern.STONE, leaves, materials.shade(leaves, 0.2), size=0.4, fraction=0, mottle=0.8
+        )
+        if rng.random() < 0.4:
+            builder.add_ellipsoid((x, -0.4 * size, z), (size, size * 0.8, size), leaf)
             continue
-        along, across = rng.uniform(start + width / 2, end - width / 2), at - sign * (depth / 2 + 0.09)
-        x, z = (across, along) if axis == 0 else (along, across)
-        half = (depth / 2, width / 2) if axis == 0 else (width / 2, depth / 2)
-        place = (x - half[0], z - half[1], x + half[0], z + half[1])
-        if _is_free(place, occupied, room):
-            occupied.append(place)
-            yaw = np.pi / 2 * sign if axis == 0 else (0.0 if sign > 0 else np.pi)
-            piece(Place(builder, x, z, yaw), rng, width, depth)
-    for _ in range(round(area * rng.uniform(0.1, 0.6))):
-        piece, width, depth = STANDING[rng.integers(len(STANDING))]
-        reach = 0.5 * np.hypot(width, depth)
-        x, z = rng.uniform(room[0], room[2]), rng.uniform(room[1], room[3])
-        place = (x - reach, z - reach, x + reach, z + reach)
-        if _is_free(place, occupied, room):
-            occupied.append(place)
-            piece(Place(builder, x, z, rng.uniform(0, 2 * np.pi)), rng, width, depth)
+        height = rng.uniform(2, 5)
+        builder.add_cylinder((x, -height / 2, z), 0.15, height / 2, bark)
+        for _ in range(3):
+            dx, dy, dz = rng.normal(0, 0.4 * size, size=3)
+            builder.add_ellipsoid((x + dx, -height - dy, z + dz), rng.uniform(0.5, 1.0, size=3) * size, leaf)
+    fence = materials.wood(builder, (0.14, 3.0)) if rng.random() < 0.7 else materials.wall(builder)
+    for axis in (0, 1):
+        for sign in (-1, 1):
+            reach = (x1 - x0, z1 - z0)[axis] / 2 + rng.uniform(2.5, 9)
+            if rng.random() < 0.35:  # a neighbour's house
+                half = (rng.uniform(3, 7), rng.uniform(1.4, 3.0), rng.uniform(3, 7))
+                centre = [0.0, -half[1] + 0.3, 0.0]
+                centre[2 * axis], centre[2 - 2 * axis] = sign * (reach + half[2 * axis]), rng.uniform(-4, 4)
+                builder.add_box(centre, half, materials.wall(builder))
+            if rng.random() < 0.5:
+                high = rng.uniform(0.5, 1.0)
+                centre, half = [0.0, 0.15 - high, 0.0], [14.0, high, 14.0]
+                centre[2 * axis], half[2 * axis] = sign * reach, 0.03
+                builder.add_box(centre, half, fence)
+    return outside, sky
 
 
-def _add_rug(builder: SceneBuilder, room: Rectangle) -> None:
-    rng = builder.rng
-    width, depth = (rng.uniform(0.3, 0.7) * (room[k + 2] - room[k]) for k in (0, 1))
-    size = rng.uniform(0.04, 0.15)
-    colors = [materials.random_color(rng) for _ in range(3)]
-    material = builder.add_material(Pattern.RUG, *colors, size=size, mottle=0.4)
-    x, z = (room[0] + room[2]) / 2, (room[1] + room[3]) / 2
-    builder.add_box((x, -0.008, z), (width / 2, 0.008, depth / 2), material)
-
-
-def _decorate_walls(builder: SceneBuilder, plan: Plan, room: Rectangle, height: float) -> None:
-    """Add pictures and curtains to the walls."""
-    rng = builder.rng
-    for side in sides(room):
-        axis, at, start, end, sign = side
-        holes = holes_of_side(plan, side)
-        inner = at - sign * (0.0 if abs(at) >= max(map(abs, plan.whole)) - 1e-9 else INNER / 2)
-        for _ in range(rng.integers(0, 4)):
-            width, high = rng.uniform(0.2, 1.2), rng.uniform(0.2, 0.9)
-            if end - start < width + 0.4:
-                continue
-            along = rng.uniform(start + width / 2 + 0.15, end - width / 2 - 0.15)
-            if any(hole.start - width / 2 - 0.1 < along < hole.end + width / 2 + 0.1 for hole in holes):
-                continue
-            holes.append(Hole(along - width / 2, along + width / 2, 1, 2))
-            rise = -rng.uniform(1.3, min(1.9, height - high / 2 - 0.1))
-            frame = materials.wood(builder) if rng.random() < 0.5 else materials.plain(builder)
-            for material, grow, thick in (
-                (frame, rng.uniform(0.0, 0.06), 0.02),
-                (materials.picture(builder), 0.0, 0.025),
-            ):
-                _add_wall_box(builder, axis, inner, along, rise, (width / 2 + grow, high / 2 + grow, thick), material)
-        for hole in holes_of_side(plan, side):
-            if hole.low > 0 and rng.random() < 0.4:
-                cloth, width = materials.fabric(builder), rng.uniform(0.1, 0.25)
-                for along in (hole.start - width, hole.end + width):
-                    if start + width < along < end - width:
-                        _add_wall_box(builder, axis, inner - sign * 0.05, along, -1.15, (width, 1.1, 0.04), cloth)
-
-
-def _add_wall_box(
-    builder: SceneBuilder, axis: int, at: float, along: float, y: float, half: tuple[float, float, float], material: int
-) -> None:
-    """Add a box along a wall; `half` is half its width, height and thickness, metres."""
-    width, high, thick = half
-    if axis == 0:
-        builder.add_box((at, y, along), (thick, high, width), material)
-    else:
-        builder.add_box((along, y, at), (width, high, thick), material)
+def room_of(plan: Plan, index: int) -> Room:
+    """The room, or for an alcove the room that it is part of."""
+    room = plan.rooms[index]
+    return plan.rooms[room.parent] if room.kind == RoomKind.ALCOVE else room

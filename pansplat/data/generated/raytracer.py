@@ -233,6 +233,7 @@ PANEL_HEIGHT, TRIM_HEIGHT, HEIGHT, AMBIENT, LIGHT_GROUP = 9, 10, 11, 12, 15
 LIGHT_COLOR, LIGHT_SIZE, LIGHT_KIND, LIGHT_REACHES = 3, 6, 7, 8
 PORTAL_WIDTH, PORTAL_HEIGHT, PORTAL_AXIS, PORTAL_SHADOWS, LIGHT_NUMBERS = 9, 10, 11, 12, 13
 LAMP, SUN, PORTAL = range(3)
+_LEAST_LIGHT = 0.005  # lights that give less to a surface are omitted
 _LEAST_REFLECTION = 0.03  # of the light; weaker reflections are omitted
 
 
@@ -391,6 +392,12 @@ def portal_form_factor(light, x, y, z, nx, ny, nz):
 
 
 @nb.njit(**OPTIONS)
+def _brightness(light):
+    """Of the strongest colour; portals to a darker room have negative colours."""
+    return max(abs(light[LIGHT_COLOR]), abs(light[LIGHT_COLOR + 1]), abs(light[LIGHT_COLOR + 2]))
+
+
+@nb.njit(**OPTIONS)
 def _irradiance(light, group, x, y, z, nx, ny, nz, a, b):
     """Unshadowed irradiance of a light of unit colour, direction to a point on it, and the distance of that point.
 
@@ -403,6 +410,10 @@ def _irradiance(light, group, x, y, z, nx, ny, nz, a, b):
     if light[LIGHT_REACHES] >= 0 and light[LIGHT_REACHES] != group:
         return 0.0, 0.0, 1.0, 0.0, 0.0
     if kind == PORTAL:
+        wide, high = light[PORTAL_WIDTH], light[PORTAL_HEIGHT]
+        square = (lx - x) ** 2 + (ly - y) ** 2 + (lz - z) ** 2
+        if square > 4 * (wide * wide + high * high) and 4 * wide * high * _brightness(light) < _LEAST_LIGHT * square:
+            return 0.0, 0.0, 1.0, 0.0, 0.0
         power = portal_form_factor(light, x, y, z, nx, ny, nz)
         lx, ly, lz = lx - x, ly - y + b * light[PORTAL_HEIGHT], lz - z
         if light[PORTAL_AXIS] > 0:
@@ -437,13 +448,13 @@ def _direct_light(bodies, lights, last, group, x, y, z, nx, ny, nz, a, b, few):
     if few:
         for k in range(len(lights)):
             power, _, _, _, _ = _irradiance(lights[k], group, x, y, z, nx, ny, nz, a, b)
-            power *= max(lights[k, LIGHT_COLOR], lights[k, LIGHT_COLOR + 1], lights[k, LIGHT_COLOR + 2])
+            power *= _brightness(lights[k])
             if power > most:
                 strongest, most = k, power
     for k in range(len(lights)):
         light = lights[k]
         power, lx, ly, lz, limit = _irradiance(light, group, x, y, z, nx, ny, nz, a, b)
-        if power * max(light[LIGHT_COLOR], light[LIGHT_COLOR + 1], light[LIGHT_COLOR + 2]) < 0.005:
+        if power * _brightness(light) < _LEAST_LIGHT:
             continue
         if few and k != strongest:
             power *= 0.7

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pansplat.data.generated.homes import Plan, build_home
+from pansplat.data.generated.homes import Home, build_home
+from pansplat.data.generated.plans import OUTSIDE
 from pansplat.data.generated.scene import GeneratedScene
 from pansplat.data.images import srgb_from_linear
 from pansplat.data.pairs import FAR, NEAR
@@ -68,30 +69,31 @@ class GeneratedTriplets:
     def _sample_home(self, rng: np.random.Generator) -> tuple[GeneratedScene, list[Array]]:
         """A home with enough free space for the cameras, and their poses."""
         while True:
-            scene, plan = build_home(rng)
-            poses = _sample_poses(scene, plan, self.baseline, rng)
+            home = build_home(rng)
+            poses = _sample_poses(home, self.baseline, rng)
             if poses is not None:
-                return scene, poses
+                return home.variants[0], poses
 
 
-def _sample_poses(
-    scene: GeneratedScene, plan: Plan, baseline: tuple[float, float], rng: np.random.Generator
-) -> list[Array] | None:
+def _sample_poses(home: Home, baseline: tuple[float, float], rng: np.random.Generator) -> list[Array] | None:
     """Poses of the first input, the target and the second input, on a free path; None if none was found."""
     yaw, length = rng.uniform(0, 2 * np.pi), rng.uniform(*baseline)
     rotation = np.array(((np.cos(yaw), 0, np.sin(yaw)), (0, 1, 0), (-np.sin(yaw), 0, np.cos(yaw))))
+    rooms = [room for room in home.plan.rooms if min(room.width, room.depth) > 2 * _CLEARANCE]
     for _ in range(_MAX_ATTEMPTS):
-        room = plan.rooms[rng.integers(len(plan.rooms))]
+        if not rooms:
+            break
+        room = rooms[rng.integers(len(rooms))].corners
         x, z = (rng.uniform(room[k] + _CLEARANCE, room[k + 2] - _CLEARANCE) for k in (0, 1))
         start = np.array((x, -rng.uniform(0.9, 1.8), z))
         azimuth = rng.uniform(0, 2 * np.pi)
         direction = np.array((np.sin(azimuth), rng.normal(0, 0.05), np.cos(azimuth)))
         end = start + length * direction / np.linalg.norm(direction)
         middle = start + rng.uniform(0.35, 0.65) * (end - start) + rng.normal(0, 0.04 * length, size=3)
-        if not _is_inside(end, plan):
+        if not -2.1 < end[1] < -0.5 or home.plan.room_at(end[0], end[2]) == OUTSIDE:
             continue
         path = np.concatenate((np.linspace(start, middle, 8), np.linspace(middle, end, 8)))
-        if scene.clearance(path).min() < _CLEARANCE:
+        if home.variants[0].clearance(path).min() < _CLEARANCE:
             continue
         poses = []
         for centre in (start, middle, end):
@@ -100,11 +102,6 @@ def _sample_poses(
             poses.append(pose)
         return poses
     return None
-
-
-def _is_inside(point: Array, plan: Plan) -> bool:
-    x0, z0, x1, z1 = plan.whole
-    return bool(x0 < point[0] < x1 and z0 < point[2] < z1 and -2.1 < point[1] < -0.5)
 
 
 def _sample_exposure(renderings: list[Array], rng: np.random.Generator) -> float:
