@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numba
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pansplat.data.images import srgb_from_linear
 
-Array = NDArray[np.float32]
+Array = NDArray[Any]  # float32
 Mask = NDArray[np.bool_]
 Draw = Callable[[Array, Mask, float], None]
 """Draws on an image (h w 3) and its mask (h w), in place, given the height of the camera in metres."""
@@ -27,7 +27,6 @@ _EXPONENTS = -14, 6  # of 2: darkest and brightest light of the tone table; 1 is
 _LEAST_LIGHT, _MAX_LIGHT = 2.0 ** _EXPONENTS[0], 2.0 ** _EXPONENTS[1]
 _STEPS = 64  # entries of the tone table per octave
 _REDUCTION = 4  # factor by which images are reduced for wide blurs
-_WRAP = 4  # columns that are repeated beyond +-180 degrees for cubic interpolation
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR)
 _SUBSAMPLING = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
 
@@ -201,14 +200,17 @@ def _warp(light: Array, lenses: _Lenses, rng: np.random.Generator, effects: Came
         return light
     height, width = light.shape[1:3]
     shift = np.zeros((height, width, 2), np.float32) if lenses.shift is None else lenses.shift
-    sines = _sines(height)
-    coordinates, warped = np.empty((height, width, 2), np.float32), np.empty_like(light)
+    sines, margin = _sines(height), 3 + int(np.abs(shift).max() * height / np.pi)
+    warped, coordinates = np.empty_like(light), np.empty((2, height, width), np.float32)
+    columns, rows = coordinates
     for image, out in zip(light, warped, strict=True):
         axis = rng.normal(size=3)
         angle = np.radians(effects.pose_degrees) * tour * rng.uniform(0, 1)
         rotation = cv2.Rodrigues(axis / np.linalg.norm(axis) * angle)[0].astype(np.float32)
-        _source_coordinates(rotation, sines, shift, coordinates)
-        cv2.remap(_wrap_columns(image), coordinates, None, cv2.INTER_CUBIC, dst=out, borderMode=cv2.BORDER_REPLICATE)
+        _source_coordinates(rotation, sines, shift, margin, coordinates)
+        cv2.remap(
+            _wrap_columns(image, margin), columns, rows, cv2.INTER_CUBIC, dst=out, borderMode=cv2.BORDER_REPLICATE
+        )
     return np.clip(warped, 0, _MAX_LIGHT, out=warped)
 
 
@@ -222,10 +224,10 @@ def _sines(height: int) -> tuple[Array, Array, Array, Array]:
 
 
 @numba.njit(cache=True, fastmath=True)
-def _source_coordinates(rotation, sines, shift, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Column and row, with `_WRAP` added columns, of each pixel in the unrotated image with shifts in radians."""
+def _source_coordinates(rotation, sines, shift, margin, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write columns and rows (2 h w) of the pixels in the unrotated image, which is wrapped by `margin` columns."""
     sin_latitude, cos_latitude, sin_azimuth, cos_azimuth = sines
-    height, width = out.shape[:2]
+    height, width = out.shape[1:]
     scale = np.float32(height / np.pi)
     for i in range(height):
         for j in range(width):
@@ -235,16 +237,11 @@ def _source_coordinates(rotation, sines, shift, out):  # type: ignore[no-untyped
             w = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
             azimuth = np.arctan2(u, w) + shift[i, j, 0]
             colatitude = np.arctan2(np.sqrt(u * u + w * w), -v) - shift[i, j, 1]
-            column = azimuth * scale + np.float32(width / 2 - 0.5)
-            if column < -0.5:
-                column += width
-            elif column >= width - 0.5:
-                column -= width
-            out[i, j, 0] = column + np.float32(_WRAP)
-            out[i, j, 1] = colatitude * scale - np.float32(0.5)
+            out[0, i, j] = azimuth * scale + np.float32(width / 2 - 0.5 + margin)
+            out[1, i, j] = colatitude * scale - np.float32(0.5)
 
 
-def _wrap_columns(image: Array, columns: int = _WRAP) -> Array:
+def _wrap_columns(image: Array, columns: int) -> Array:
     return cv2.copyMakeBorder(image, 0, 0, columns, columns, cv2.BORDER_WRAP)
 
 
@@ -313,7 +310,7 @@ def _base(light: Array, smoothness: float) -> Array:
     radius = max(size[1] // 8, 1)
     padded = cv2.copyMakeBorder(log, 0, 0, 3 * radius, 3 * radius, cv2.BORDER_WRAP)
 
-    def mean(plane: NDArray) -> NDArray:
+    def mean(plane: Array) -> Array:
         return cv2.blur(plane, (2 * radius + 1, 2 * radius + 1), borderType=cv2.BORDER_REPLICATE)
 
     average = mean(padded)
@@ -575,5 +572,5 @@ def _compress(images: Array, rng: np.random.Generator, effects: CameraEffects) -
     for image, decoded in zip(images, out, strict=True):
         pixels = cv2.convertScaleAbs(image, alpha=255)
         _, data = cv2.imencode(".jpg", pixels, (_JPEG[0], quality, _JPEG[1], subsampling))
-        np.multiply(cv2.imdecode(data, cv2.IMREAD_COLOR), np.float32(1 / 255), out=decoded)
+        np.multiply(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR)), np.float32(1 / 255), out=decoded)
     return out
