@@ -18,10 +18,27 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from pansplat.data.generated.textures import COLOR_A, COLOR_B, COLOR_C, GLOSS, GLOW, MIRROR, OPTIONS, color, fractal
+from pansplat.data.generated.textures import (
+    COLOR_A,
+    COLOR_B,
+    COLOR_C,
+    GLOSS,
+    GLOW,
+    IMAGE,
+    KIND,
+    MIRROR,
+    OPTIONS,
+    SIZE_U,
+    color,
+    fractal,
+    image_color,
+    is_opaque,
+)
 
-BOX, ELLIPSOID, CYLINDER, GLASS = range(4)
-"""Kinds of bodies. A pane of glass is a box that transmits all rays and reflects some of the light."""
+BOX, ELLIPSOID, CYLINDER, GLASS, MESH = range(5)
+"""Kinds of bodies. A pane of glass is a box that transmits all rays and reflects some of the light. A mesh fills a box
+with triangles."""
+STACK_SIZE = 128
 _BINS = 12  # candidates for the split of a BVH node
 
 
@@ -184,18 +201,75 @@ def _enter(box, x, y, z, ix, iy, iz):
 
 
 @nb.njit(**OPTIONS)
-def first_hit(bodies, x, y, z, dx, dy, dz, limit, any_hit, glass):
-    """Distance and index of the first body nearer than `limit`; `limit` and -1 if there is none.
+def _hit_mesh(bodies, root, depth, x, y, z, dx, dy, dz, limit, any_hit):
+    """Distance and index of the first triangle nearer than `limit` of the mesh at node `root`, or `limit` and -1.
 
     Args:
-        bodies: kinds, maps, corners and links of the BVH, and a stack of 64 integers.
-        any_hit: whether any body nearer than `limit` is sufficient, for shadow rays.
+        depth: number of entries of the stack that are in use.
+        x, y, z, dx, dy, dz: ray in the space of the mesh.
+    """
+    bounds, links, triangles, stack = bodies.mesh_bounds, bodies.mesh_links, bodies.triangles, bodies.stack
+    ix, iy, iz = 1 / dx, 1 / dy, 1 / dz
+    base, best, hit = depth, limit, -1
+    stack[depth] = root
+    depth += 1
+    while depth > base:
+        depth -= 1
+        node = stack[depth]
+        first, count = links[node, 0], links[node, 1]
+        if count == 0:
+            near, far = first, first + 1
+            at_near, at_far = _enter(bounds[near], x, y, z, ix, iy, iz), _enter(bounds[far], x, y, z, ix, iy, iz)
+            if at_far < at_near:
+                near, far, at_near, at_far = far, near, at_far, at_near
+            if at_far < best:
+                stack[depth] = far
+                depth += 1
+            if at_near < best:
+                stack[depth] = near
+                depth += 1
+            continue
+        for k in range(first, first + count):  # Source: Moeller and Trumbore 1997
+            t = triangles[k]
+            px, py, pz = dy * t[8] - dz * t[7], dz * t[6] - dx * t[8], dx * t[7] - dy * t[6]
+            scale = t[3] * px + t[4] * py + t[5] * pz
+            if scale == 0:
+                continue
+            scale = 1 / scale
+            ox, oy, oz = x - t[0], y - t[1], z - t[2]
+            u = (ox * px + oy * py + oz * pz) * scale
+            if u < 0 or u > 1:
+                continue
+            qx, qy, qz = oy * t[5] - oz * t[4], oz * t[3] - ox * t[5], ox * t[4] - oy * t[3]
+            v = (dx * qx + dy * qy + dz * qz) * scale
+            if v < 0 or u + v > 1:
+                continue
+            away = (t[6] * qx + t[7] * qy + t[8] * qz) * scale
+            if 1e-6 < away < best:
+                if bodies.cutouts[k] >= 0:
+                    c = bodies.texcoords[k]
+                    cu, cv = c[0] + u * (c[2] - c[0]) + v * (c[4] - c[0]), c[1] + u * (c[3] - c[1]) + v * (c[5] - c[1])
+                    if not is_opaque(bodies.texels, bodies.images[bodies.cutouts[k]], cu, cv):
+                        continue
+                best, hit = away, k
+                if any_hit:
+                    return best, hit
+    return best, hit
+
+
+@nb.njit(**OPTIONS)
+def first_hit(bodies, x, y, z, dx, dy, dz, limit, any_hit, glass):
+    """Distance, body and triangle (-1 except in meshes) of the first hit nearer than `limit`; body -1 if there is none.
+
+    Args:
+        bodies: a `Bodies`.
+        any_hit: whether any hit nearer than `limit` is sufficient, for shadow rays.
         glass: whether panes of glass count.
     """
-    kinds, maps, bounds, links, stack = bodies
+    kinds, maps, bounds, links, stack = bodies.kinds, bodies.maps, bodies.bounds, bodies.links, bodies.stack
     ix, iy, iz = 1 / dx, 1 / dy, 1 / dz
     stack[0], depth = 0, 1
-    best, body = limit, -1
+    best, body, triangle = limit, -1, -1
     while depth:
         depth -= 1
         node = stack[depth]
@@ -213,14 +287,31 @@ def first_hit(bodies, x, y, z, dx, dy, dz, limit, any_hit, glass):
                 depth += 1
             continue
         for k in range(first, first + count):
-            if kinds[k] == GLASS and not glass:
-                continue
-            t = intersect_body(kinds[k], maps[k], x, y, z, dx, dy, dz)
-            if 1e-6 < t < best:
-                best, body = t, k
-                if any_hit:
-                    return best, body
-    return best, body
+            if kinds[k] == MESH:
+                m = maps[k]
+                px, py, pz = x - m[3], y - m[7], z - m[11]
+                t, found = _hit_mesh(
+                    bodies,
+                    bodies.roots[k],
+                    depth,
+                    m[0] * px + m[1] * py + m[2] * pz,
+                    m[4] * px + m[5] * py + m[6] * pz,
+                    m[8] * px + m[9] * py + m[10] * pz,
+                    m[0] * dx + m[1] * dy + m[2] * dz,
+                    m[4] * dx + m[5] * dy + m[6] * dz,
+                    m[8] * dx + m[9] * dy + m[10] * dz,
+                    best,
+                    any_hit,
+                )
+                if found >= 0:
+                    best, body, triangle = t, k, found
+            elif glass or kinds[k] != GLASS:
+                t = intersect_body(kinds[k], maps[k], x, y, z, dx, dy, dz)
+                if 1e-6 < t < best:
+                    best, body, triangle = t, k, -1
+            if any_hit and body >= 0:
+                return best, body, triangle
+    return best, body, triangle
 
 
 SKY = 40.0  # radius of the sphere of sky and horizon, metres
@@ -237,22 +328,52 @@ _LEAST_LIGHT = 0.005  # lights that give less to a surface are omitted
 _LEAST_REFLECTION = 0.03  # of the light; weaker reflections are omitted
 
 
-class SceneArrays(NamedTuple):
-    """A scene for `trace_panorama`; rows are bodies (with boxes of a BVH and its links), materials, rooms or lights.
+class Bodies(NamedTuple):
+    """Bodies in the leaves of a BVH, and triangles in the leaves of one BVH for each mesh.
 
     Attributes:
-        halves: half sizes of the bodies, metres.
-        faces: materials of a body's six faces: left right (x), up down (y), back front (z).
-        ambient: ambient light (red, green, blue) outside the rooms.
-        outside, sky: indices of materials.
+        roots: node of `mesh_bounds` and `mesh_links` with the root of a body's mesh.
+        triangles: first corner and the two edges from it, in the space of the mesh, [-1, 1]^3.
+        texcoords: image coordinates of the corners, in [0, 1]; v points up.
+        cutouts: image whose opacity cuts holes into a triangle, or -1.
+        texels, images: see `textures.image_color`.
+        stack: `STACK_SIZE` integers of workspace.
     """
 
     kinds: NDArray[np.int64]
     maps: NDArray[np.float64]
-    halves: NDArray[np.float64]
-    faces: NDArray[np.int64]
+    roots: NDArray[np.int64]
     bounds: NDArray[np.float64]
     links: NDArray[np.int64]
+    mesh_bounds: NDArray[np.float32]
+    mesh_links: NDArray[np.int32]
+    triangles: NDArray[np.float32]
+    texcoords: NDArray[np.float32]
+    cutouts: NDArray[np.int32]
+    texels: NDArray[np.uint8]
+    images: NDArray[np.int64]
+    stack: NDArray[np.int64]
+
+
+class SceneArrays(NamedTuple):
+    """A scene for `trace_panorama`; rows are bodies, triangles, materials, rooms or lights.
+
+    Attributes:
+        halves: half sizes of the bodies, metres.
+        faces: materials of a body's six faces: left right (x), up down (y), back front (z); or of a mesh, the place of
+            its first material in `slots`.
+        normals: normals of a triangle's corners.
+        triangle_slots: place of a triangle's material relative to the first one of the mesh.
+        ambient: ambient light (red, green, blue) outside the rooms.
+        outside, sky: indices of materials.
+    """
+
+    bodies: Bodies
+    halves: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    normals: NDArray[np.float32]
+    triangle_slots: NDArray[np.int32]
+    slots: NDArray[np.int64]
     materials: NDArray[np.float64]
     rooms: NDArray[np.float64]
     lights: NDArray[np.float64]
@@ -294,11 +415,66 @@ def _surface_point(kind, m, half, x, y, z):
         u, half_u = qz * half[2], half[2]
     else:
         nz, face = math.copysign(1.0, qz), 5 if qz > 0 else 4
-    wx = m[0] * nx + m[4] * ny + m[8] * nz
-    wy = m[1] * nx + m[5] * ny + m[9] * nz
-    wz = m[2] * nx + m[6] * ny + m[10] * nz
-    size = math.sqrt(wx * wx + wy * wy + wz * wz)
-    return wx / size, wy / size, wz / size, face, u, v, half_u, half_v
+    nx, ny, nz = _world_normal(m, nx, ny, nz)
+    return nx, ny, nz, face, u, v, half_u, half_v
+
+
+@nb.njit(**OPTIONS)
+def _mesh_point(scene, body, triangle, x, y, z, dx, dy, dz):
+    """Unit normal towards the origin of the ray, place in `slots`, image coordinates, their change per metre, and
+    texture coordinates in metres."""
+    m, half, t, c = (
+        scene.bodies.maps[body],
+        scene.halves[body],
+        scene.bodies.triangles[triangle],
+        scene.normals[triangle],
+    )
+    px, py, pz = x - m[3], y - m[7], z - m[11]
+    qx = m[0] * px + m[1] * py + m[2] * pz
+    qy = m[4] * px + m[5] * py + m[6] * pz
+    qz = m[8] * px + m[9] * py + m[10] * pz
+    # Barycentric coordinates, in metres.
+    ax, ay, az = t[3] * half[0], t[4] * half[1], t[5] * half[2]
+    bx, by, bz = t[6] * half[0], t[7] * half[1], t[8] * half[2]
+    rx, ry, rz = (qx - t[0]) * half[0], (qy - t[1]) * half[1], (qz - t[2]) * half[2]
+    aa, ab, bb = ax * ax + ay * ay + az * az, ax * bx + ay * by + az * bz, bx * bx + by * by + bz * bz
+    ra, rb = rx * ax + ry * ay + rz * az, rx * bx + ry * by + rz * bz
+    square = max(aa * bb - ab * ab, 1e-30)
+    u, v = (ra * bb - rb * ab) / square, (rb * aa - ra * ab) / square
+    # Normals of the plane and of the interpolated corners, in the space of the mesh.
+    gx, gy, gz = t[4] * t[8] - t[5] * t[7], t[5] * t[6] - t[3] * t[8], t[3] * t[7] - t[4] * t[6]
+    sx = c[0] + u * (c[3] - c[0]) + v * (c[6] - c[0])
+    sy = c[1] + u * (c[4] - c[1]) + v * (c[7] - c[1])
+    sz = c[2] + u * (c[5] - c[2]) + v * (c[8] - c[2])
+    plane_x, plane_y, plane_z = _world_normal(m, gx, gy, gz)
+    nx, ny, nz = _world_normal(m, sx, sy, sz)
+    if plane_x * dx + plane_y * dy + plane_z * dz > 0:
+        plane_x, plane_y, plane_z = -plane_x, -plane_y, -plane_z
+    along = plane_x * nx + plane_y * ny + plane_z * nz
+    if along < 0:
+        nx, ny, nz = -nx, -ny, -nz
+    if abs(along) < 0.3 or nx * dx + ny * dy + nz * dz > 0:
+        nx, ny, nz = plane_x, plane_y, plane_z
+    w = scene.bodies.texcoords[triangle]
+    au, av, bu, bv = w[2] - w[0], w[3] - w[1], w[4] - w[0], w[5] - w[1]
+    density = math.sqrt(abs(au * bv - av * bu) / math.sqrt(square))
+    # Texture coordinates in metres are those of the box around the mesh.
+    mu, mv = qx * half[0], qy * half[1]
+    if abs(ny) > 0.7:
+        mv = qz * half[2]
+    elif abs(gx) * half[1] * half[2] > abs(gz) * half[0] * half[1]:
+        mu = qz * half[2]
+    slot = scene.faces[body, 0] + scene.triangle_slots[triangle]
+    return nx, ny, nz, slot, w[0] + u * au + v * bu, w[1] + u * av + v * bv, density, mu, mv
+
+
+@nb.njit(**OPTIONS)
+def _world_normal(m, x, y, z):
+    nx = m[0] * x + m[4] * y + m[8] * z
+    ny = m[1] * x + m[5] * y + m[9] * z
+    nz = m[2] * x + m[6] * y + m[10] * z
+    size = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-30
+    return nx / size, ny / size, nz / size
 
 
 @nb.njit(**OPTIONS)
@@ -441,7 +617,7 @@ def _direct_light(bodies, lights, last, group, x, y, z, nx, ny, nz, a, b, few):
         a, b: select a point on each light, in [-1, 1].
         few: whether only the strongest light casts shadows.
     """
-    kinds, maps = bodies[0], bodies[1]
+    kinds, maps = bodies.kinds, bodies.maps
     red, green, blue = 0.0, 0.0, 0.0
     x, y, z = x + 1e-4 * nx, y + 1e-4 * ny, z + 1e-4 * nz
     strongest, most = -1, 0.0
@@ -461,8 +637,9 @@ def _direct_light(bodies, lights, last, group, x, y, z, nx, ny, nz, a, b, few):
         elif light[LIGHT_KIND] != PORTAL or (light[PORTAL_SHADOWS] > 0 and nx * lx + ny * ly + nz * lz > 0):
             if last[k] >= 0 and 1e-6 < intersect_body(kinds[last[k]], maps[last[k]], x, y, z, lx, ly, lz) < limit:
                 continue
-            _, last[k] = first_hit(bodies, x, y, z, lx, ly, lz, limit, True, False)
-            if last[k] >= 0:
+            _, blocker, triangle = first_hit(bodies, x, y, z, lx, ly, lz, limit, True, False)
+            last[k] = blocker if triangle < 0 else -1
+            if blocker >= 0:
                 continue
         red += power * light[LIGHT_COLOR]
         green += power * light[LIGHT_COLOR + 1]
@@ -471,7 +648,7 @@ def _direct_light(bodies, lights, last, group, x, y, z, nx, ny, nz, a, b, few):
 
 
 @nb.njit(**OPTIONS)
-def _shade(scene, bodies, last, body, x, y, z, dx, dy, dz, t, width, a, b, few):
+def _shade(scene, last, body, triangle, x, y, z, dx, dy, dz, t, width, a, b, few):
     """Diffuse light (red, green, blue), unit normal and material at the hit of a ray; material -1 is the sky.
 
     Args:
@@ -485,12 +662,17 @@ def _shade(scene, bodies, last, body, x, y, z, dx, dy, dz, t, width, a, b, few):
         )
         return red, green, blue, 0.0, 0.0, 0.0, -1
     px, py, pz = x + t * dx, y + t * dy, z + t * dz
-    nx, ny, nz, face, u, v, half_u, half_v = _surface_point(
-        scene.kinds[body], scene.maps[body], scene.halves[body], px, py, pz
-    )
+    density, image_u, image_v = 0.0, 0.0, 0.0
+    if triangle >= 0:
+        nx, ny, nz, slot, image_u, image_v, density, u, v = _mesh_point(scene, body, triangle, px, py, pz, dx, dy, dz)
+        half_u, half_v, material = scene.halves[body, 0], scene.halves[body, 1], scene.slots[slot]
+    else:
+        nx, ny, nz, face, u, v, half_u, half_v = _surface_point(
+            scene.bodies.kinds[body], scene.bodies.maps[body], scene.halves[body], px, py, pz
+        )
+        material = scene.faces[body, face]
     facing = abs(nx * dx + ny * dy + nz * dz)
     width /= max(0.7 * math.sqrt(facing), 0.15)  # between the sides of the pixel's footprint
-    material = scene.faces[body, face]
     room = _room_at(scene.rooms, px + 0.02 * nx, pz + 0.02 * nz)
     if material < 0:
         if ny > 0.5 or ny < -0.5:
@@ -500,13 +682,19 @@ def _shade(scene, bodies, last, body, x, y, z, dx, dy, dz, t, width, a, b, few):
         else:
             u, v = px, py
         material = _room_material(scene.rooms, room, material, py, scene.outside)
-    red, green, blue = color(scene.materials[material], u, v, width, half_u, half_v)
+    surface = scene.materials[material]
+    if surface[KIND] == IMAGE:
+        image = scene.bodies.images[int(surface[SIZE_U])]
+        red, green, blue = image_color(scene.bodies.texels, image, image_u, image_v, width * density)
+        red, green, blue = red * surface[COLOR_A], green * surface[COLOR_A + 1], blue * surface[COLOR_A + 2]
+    else:
+        red, green, blue = color(surface, u, v, width, half_u, half_v)
     ambient, group = scene.ambient, -1
     if room >= 0:
         ambient, group = scene.rooms[room, AMBIENT:LIGHT_GROUP], int(scene.rooms[room, LIGHT_GROUP])
     around = _ambient_visibility(scene.rooms, room, px, py, pz, nx, ny, nz) * (0.85 - 0.15 * ny)
-    lr, lg, lb = _direct_light(bodies, scene.lights, last, group, px, py, pz, nx, ny, nz, a, b, few)
-    glow = scene.materials[material, GLOW]
+    lr, lg, lb = _direct_light(scene.bodies, scene.lights, last, group, px, py, pz, nx, ny, nz, a, b, few)
+    glow = surface[GLOW]
     return (
         red * (ambient[0] * around + lr + glow),
         green * (ambient[1] * around + lg + glow),
@@ -519,14 +707,16 @@ def _shade(scene, bodies, last, body, x, y, z, dx, dy, dz, t, width, a, b, few):
 
 
 @nb.njit(**OPTIONS)
-def _reflect(scene, bodies, last, x, y, z, dx, dy, dz, t, nx, ny, nz, pixel, a, b, few):
+def _reflect(scene, last, x, y, z, dx, dy, dz, t, nx, ny, nz, pixel, a, b, few):
     """Light (red, green, blue) that a ray meets after its reflection at distance `t`; the rest as in `_shade`."""
     facing = nx * dx + ny * dy + nz * dz
     px, py, pz = x + t * dx - 1e-4 * facing * nx, y + t * dy - 1e-4 * facing * ny, z + t * dz - 1e-4 * facing * nz
     dx, dy, dz = dx - 2 * facing * nx, dy - 2 * facing * ny, dz - 2 * facing * nz
-    further, body = first_hit(bodies, px, py, pz, dx, dy, dz, math.inf, False, False)
+    further, body, triangle = first_hit(scene.bodies, px, py, pz, dx, dy, dz, math.inf, False, False)
     width = pixel * (t + further) if body >= 0 else pixel * SKY
-    red, green, blue, _, _, _, _ = _shade(scene, bodies, last, body, px, py, pz, dx, dy, dz, further, width, a, b, few)
+    red, green, blue, _, _, _, _ = _shade(
+        scene, last, body, triangle, px, py, pz, dx, dy, dz, further, width, a, b, few
+    )
     return red, green, blue
 
 
@@ -537,7 +727,7 @@ def _fresnel(facing):
 
 
 @nb.njit(**OPTIONS)
-def _trace_ray(scene, bodies, last, x, y, z, dx, dy, dz, pixel, a, b):
+def _trace_ray(scene, last, x, y, z, dx, dy, dz, pixel, a, b):
     """Light (red, green, blue), distance, unit normal and material of the first hit of a ray behind any glass.
 
     Args:
@@ -545,20 +735,18 @@ def _trace_ray(scene, bodies, last, x, y, z, dx, dy, dz, pixel, a, b):
         a, b: select a point on each light, in [-1, 1].
     """
     pane, pane_red, pane_green, pane_blue = 0.0, 0.0, 0.0, 0.0
-    t, body = first_hit(bodies, x, y, z, dx, dy, dz, math.inf, False, True)
-    if body >= 0 and scene.kinds[body] == GLASS:
+    t, body, triangle = first_hit(scene.bodies, x, y, z, dx, dy, dz, math.inf, False, True)
+    if body >= 0 and scene.bodies.kinds[body] == GLASS:
         nx, ny, nz, _, _, _, _, _ = _surface_point(
-            GLASS, scene.maps[body], scene.halves[body], x + t * dx, y + t * dy, z + t * dz
+            GLASS, scene.bodies.maps[body], scene.halves[body], x + t * dx, y + t * dy, z + t * dz
         )
         once = _fresnel(abs(nx * dx + ny * dy + nz * dz))
         pane = 2 * once / (1 + once)  # both faces of the pane
-        pane_red, pane_green, pane_blue = _reflect(
-            scene, bodies, last, x, y, z, dx, dy, dz, t, nx, ny, nz, pixel, a, b, True
-        )
-        t, body = first_hit(bodies, x, y, z, dx, dy, dz, math.inf, False, False)
+        pane_red, pane_green, pane_blue = _reflect(scene, last, x, y, z, dx, dy, dz, t, nx, ny, nz, pixel, a, b, True)
+        t, body, triangle = first_hit(scene.bodies, x, y, z, dx, dy, dz, math.inf, False, False)
     width = pixel * t if body >= 0 else pixel * SKY
     red, green, blue, nx, ny, nz, material = _shade(
-        scene, bodies, last, body, x, y, z, dx, dy, dz, t, width, a, b, False
+        scene, last, body, triangle, x, y, z, dx, dy, dz, t, width, a, b, False
     )
     if body < 0:
         t = _distance_to_sky(x, y, z, dx, dy, dz)
@@ -569,7 +757,7 @@ def _trace_ray(scene, bodies, last, x, y, z, dx, dy, dz, pixel, a, b):
             gloss = scene.materials[material, GLOSS]
             share = gloss * _fresnel(abs(nx * dx + ny * dy + nz * dz)) - _LEAST_REFLECTION
         if share > 0:
-            mr, mg, mb = _reflect(scene, bodies, last, x, y, z, dx, dy, dz, t, nx, ny, nz, pixel, a, b, mirror == 0)
+            mr, mg, mb = _reflect(scene, last, x, y, z, dx, dy, dz, t, nx, ny, nz, pixel, a, b, mirror == 0)
             red, green, blue = red + share * (mr - red), green + share * (mg - green), blue + share * (mb - blue)
     if pane > 0:
         red, green, blue = (
@@ -587,7 +775,7 @@ def _distance_to_sky(x, y, z, dx, dy, dz):
 
 
 @nb.njit(**OPTIONS)
-def _trace_pixel(scene, bodies, last, pose, i, j, du, dv, height, index):
+def _trace_pixel(scene, last, pose, i, j, du, dv, height, index):
     """`_trace_ray` through a point of pixel (i, j); `index` selects the points on the lights. Also the direction."""
     pixel = math.pi / height
     longitude, latitude = pixel * (j + du) - math.pi, pixel * (i + dv) - 0.5 * math.pi
@@ -600,7 +788,7 @@ def _trace_pixel(scene, bodies, last, pose, i, j, du, dv, height, index):
     # The R2 sequence, spread over blocks of 4 x 4 pixels.
     a, b = 0.7548776662466927 * index, 0.5698402909980532 * index
     a, b = 2 * (a - math.floor(a)) - 1, 2 * (b - math.floor(b)) - 1
-    hit = _trace_ray(scene, bodies, last, pose[0, 3], pose[1, 3], pose[2, 3], dx, dy, dz, pixel, a, b)
+    hit = _trace_ray(scene, last, pose[0, 3], pose[1, 3], pose[2, 3], dx, dy, dz, pixel, a, b)
     return hit, (dx, dy, dz)
 
 
@@ -633,7 +821,6 @@ def trace_panorama(scene, pose, samples, image, depth):
     rays in place of it.
     """
     height, width = depth.shape
-    bodies = (scene.kinds, scene.maps, scene.bounds, scene.links, np.empty(64, np.int64))
     last = np.full(len(scene.lights), -1)
     points, normals = np.empty((height, width, 3)), np.empty((height, width, 3))
     shown, refined = np.empty((height, width), np.int64), np.zeros((height, width), np.bool_)
@@ -642,7 +829,7 @@ def trace_panorama(scene, pose, samples, image, depth):
         for j in range(width):
             block = 4 * (i % 4) + j % 4
             (red, green, blue, t, nx, ny, nz, material), (dx, dy, dz) = _trace_pixel(
-                scene, bodies, last, pose, i, j, 0.5, 0.5, height, block
+                scene, last, pose, i, j, 0.5, 0.5, height, block
             )
             image[i, j, 0], image[i, j, 1], image[i, j, 2] = red, green, blue
             points[i, j, 0], points[i, j, 1], points[i, j, 2] = t * dx, t * dy, t * dz
@@ -665,9 +852,7 @@ def trace_panorama(scene, pose, samples, image, depth):
                 for k in range(rays):
                     du, dv = (k % samples + 0.5) / samples, (k // samples + 0.5) / samples
                     index = rays * (4 * (i % 4) + j % 4) + k
-                    (red, green, blue, _, _, _, _, _), _ = _trace_pixel(
-                        scene, bodies, last, pose, i, j, du, dv, height, index
-                    )
+                    (red, green, blue, _, _, _, _, _), _ = _trace_pixel(scene, last, pose, i, j, du, dv, height, index)
                     image[i, j, 0] += red / rays
                     image[i, j, 1] += green / rays
                     image[i, j, 2] += blue / rays

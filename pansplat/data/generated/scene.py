@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pansplat.data.generated.meshes import NO_MESH, NO_TEXTURE, Mesh, Texture, pack_meshes
 from pansplat.data.generated.raytracer import (
     BOX,
     CYLINDER,
@@ -15,13 +16,16 @@ from pansplat.data.generated.raytracer import (
     GLASS,
     LAMP,
     LIGHT_NUMBERS,
+    MESH,
     PORTAL,
+    STACK_SIZE,
     SUN,
+    Bodies,
     SceneArrays,
     build_bvh,
     trace_panorama,
 )
-from pansplat.data.generated.textures import GLOSS, MIRROR, NUMBERS, Pattern
+from pansplat.data.generated.textures import GLOSS, IMAGE, KIND, MIRROR, NUMBERS, Pattern
 
 Array = NDArray[np.float64]
 Vector = Sequence[float] | Array
@@ -49,12 +53,14 @@ class GeneratedScene:
             samples: pixels at edges get samples x samples rays, others one.
         """
         image, depth = np.zeros((height, 2 * height, 3)), np.zeros((height, 2 * height))
-        trace_panorama(self.arrays, np.ascontiguousarray(cam2world, dtype=np.float64), samples, image, depth)
+        bodies = self.arrays.bodies._replace(stack=np.empty(STACK_SIZE, np.int64))  # one for each thread
+        pose = np.ascontiguousarray(cam2world, dtype=np.float64)
+        trace_panorama(self.arrays._replace(bodies=bodies), pose, samples, image, depth)
         return image, depth
 
     def clearance(self, points: Array) -> Array:
         """Distances in metres from points (n 3) to the nearest box, or oriented bounding box of a round body."""
-        maps, halves = self.arrays.maps.reshape(-1, 3, 4), self.arrays.halves
+        maps, halves = self.arrays.bodies.maps.reshape(-1, 3, 4), self.arrays.halves
         local = np.abs(np.einsum("bij,nbj->nbi", maps[:, :, :3], points[:, None] - maps[:, :, 3]))
         return np.linalg.norm(np.maximum(local - 1, 0) * halves, axis=-1).min(axis=1)
 
@@ -73,6 +79,10 @@ class SceneBuilder:
         self.materials: list[Array] = []
         self.rooms: list[Array] = []
         self.lights: list[Array] = []
+        self.meshes: dict[Mesh, int] = {NO_MESH: 0}
+        self.roots: list[int] = []
+        self.slots: list[int] = []
+        self.textures: dict[Texture, int] = {NO_TEXTURE: 0}
 
     def add_material(
         self,
@@ -105,6 +115,36 @@ class SceneBuilder:
         row[GLOSS], row[MIRROR] = gloss, mirror
         self.materials.append(row)
         return len(self.materials) - 1
+
+    def add_image_material(self, texture: Texture, tint: Vector = (1, 1, 1), *, gloss: float = 0.0) -> int:
+        """Add a material that shows an image on meshes, multiplied by `tint` (red, green, blue); return its index."""
+        index = self.textures.setdefault(texture, len(self.textures))
+        material = self.add_material(Pattern.PLAIN, tint, size=(index, 0), mottle=0, gloss=gloss)
+        self.materials[material][KIND] = IMAGE
+        return material
+
+    def add_mesh_materials(self, mesh: Mesh) -> list[int]:
+        """Add the materials of a mesh and return their indices."""
+        return [
+            self.add_material(Pattern.PLAIN, m.color, mottle=0.1, gloss=m.gloss)
+            if m.texture is None
+            else self.add_image_material(m.texture, m.color, gloss=m.gloss)
+            for m in mesh.materials
+        ]
+
+    def add_mesh(self, mesh: Mesh, centre: Vector, half: Vector, materials: Sequence[int], yaw: float = 0) -> None:
+        """Add a mesh that fills a box.
+
+        Args:
+            half: half the size of the box, metres.
+            materials: one for each material of the mesh.
+        """
+        for material in mesh.materials:
+            if material.texture is not None:
+                self.textures.setdefault(material.texture, len(self.textures))
+        number = self.meshes.setdefault(mesh, len(self.meshes))
+        self._add_body(MESH, centre, half, len(self.slots), yaw, 0, number)
+        self.slots += materials
 
     def add_box(
         self, centre: Vector, half: Vector, material: int | Sequence[int], yaw: float = 0, pitch: float = 0
@@ -152,17 +192,34 @@ class SceneBuilder:
         """The scene; `ambient` is the light outdoors, `outside` and `sky` are indices of materials."""
         low, high = np.array(self.low), np.array(self.high)
         bounds, links, order = build_bvh(low, high, 2)
-        lights = np.array(self.lights) if self.lights else np.zeros((0, LIGHT_NUMBERS))
-        arrays = SceneArrays(
+        tree, cutouts, roots = pack_meshes(list(self.meshes), self.textures)
+        texels = [texture.texels for texture in self.textures]
+        starts = np.cumsum([0] + [len(part) for part in texels])
+        bodies = Bodies(
             kinds=np.array(self.kinds, np.int64)[order],
             maps=np.array(self.maps)[order],
-            halves=np.array(self.halves)[order],
-            faces=np.array(self.faces, np.int64)[order],
+            roots=roots[self.roots][order],
             bounds=bounds,
             links=links,
+            mesh_bounds=tree.bounds,
+            mesh_links=tree.links,
+            triangles=tree.triangles,
+            texcoords=tree.texcoords,
+            cutouts=cutouts,
+            texels=np.concatenate(texels),
+            images=np.array([(start, *texture.size) for start, texture in zip(starts, self.textures, strict=False)]),
+            stack=np.empty(STACK_SIZE, np.int64),
+        )
+        arrays = SceneArrays(
+            bodies=bodies,
+            halves=np.array(self.halves)[order],
+            faces=np.array(self.faces, np.int64)[order],
+            normals=tree.normals,
+            triangle_slots=tree.slots,
+            slots=np.array(self.slots, np.int64),
             materials=np.array(self.materials),
             rooms=np.array(self.rooms),
-            lights=lights,
+            lights=np.array(self.lights) if self.lights else np.zeros((0, LIGHT_NUMBERS)),
             ambient=np.array(ambient, np.float64),
             outside=outside,
             sky=sky,
@@ -170,13 +227,21 @@ class SceneBuilder:
         return GeneratedScene(arrays, low, high)
 
     def _add_body(
-        self, kind: int, centre: Vector, half: Vector, material: int | Sequence[int], yaw: float, pitch: float
+        self,
+        kind: int,
+        centre: Vector,
+        half: Vector,
+        material: int | Sequence[int],
+        yaw: float,
+        pitch: float,
+        mesh: int = 0,
     ) -> None:
         middle, reach = np.asarray(centre, np.float64), np.asarray(half, np.float64)
         cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
         rotation = np.array(((cy, 0, sy), (0, 1, 0), (-sy, 0, cy))) @ np.array(((1, 0, 0), (0, cp, -sp), (0, sp, cp)))
         extent = np.abs(rotation) @ reach
         self.kinds.append(kind)
+        self.roots.append(mesh)
         self.maps.append(np.concatenate((rotation.T / reach[:, None], middle[:, None]), axis=1).ravel())
         self.halves.append(reach)
         self.faces.append([material] * 6 if isinstance(material, int) else list(material))

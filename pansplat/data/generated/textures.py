@@ -10,6 +10,8 @@ import math
 from enum import IntEnum
 
 import numba as nb
+import numpy as np
+from numpy.typing import NDArray
 
 OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
 
@@ -32,6 +34,11 @@ class Pattern(IntEnum):
 # Columns of a material.
 KIND, COLOR_A, COLOR_B, COLOR_C = 0, 1, 4, 7
 SIZE_U, SIZE_V, FRACTION, MOTTLE, SEED, GLOW, GLOSS, MIRROR, NUMBERS = range(10, 19)
+
+IMAGE = 100
+"""Kind of a material with an image in place of a pattern: `SIZE_U` is its index, the first colour multiplies it."""
+_BYTES = np.arange(256) / 255
+_LINEAR = np.where(_BYTES <= 0.04045, _BYTES / 12.92, ((_BYTES + 0.055) / 1.055) ** 2.4)
 
 
 @nb.njit(**OPTIONS)
@@ -289,3 +296,72 @@ def color(material, u, v, w, half_u, half_v):
         r, g, b = material[COLOR_A], material[COLOR_A + 1], material[COLOR_A + 2]
     worn = 1 + material[MOTTLE] * fractal(u, v, 0.9, 7, w, seed + 77)
     return r * worn, g * worn, b * worn
+
+
+def mip_levels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Texels (n 4) of an image (H W 4), sRGB with opacity, at all its levels of half the size, the finest first.
+
+    Each texel is the mean, in linear light, of 2 x 2 texels of the finer level; the last row or column of an odd size
+    is omitted.
+    """
+    level = np.concatenate((_LINEAR[image[..., :3]], image[..., 3:] / 255), axis=-1)
+    levels = [image.reshape(-1, 4)]
+    while max(level.shape[:2]) > 1:
+        height, width = max(level.shape[0] // 2, 1), max(level.shape[1] // 2, 1)
+        rows, columns = min(level.shape[0], 2), min(level.shape[1], 2)
+        level = level[: rows * height, : columns * width].reshape(height, rows, width, columns, 4).mean(axis=(1, 3))
+        encoded = level.copy()
+        encoded[..., :3] = np.where(level <= 0.0031308, 12.92 * level, 1.055 * level ** (1 / 2.4) - 0.055)[..., :3]
+        levels.append(np.rint(255 * encoded).astype(np.uint8).reshape(-1, 4))
+    return np.concatenate(levels)
+
+
+@nb.njit(**OPTIONS)
+def _bilinear(texels, start, width, height, u, v):
+    """Linear light at image coordinates in a level that starts at texel `start`; the image repeats."""
+    x, y = (u - math.floor(u)) * width - 0.5, (math.floor(v) + 1 - v) * height - 0.5
+    left, top = math.floor(x), math.floor(y)
+    fx, fy = x - left, y - top
+    left, top = int(left), int(top)
+    red, green, blue = 0.0, 0.0, 0.0
+    for corner in range(4):
+        column, row = left + (corner & 1), top + (corner >> 1)
+        weight = (fx if corner & 1 else 1 - fx) * (fy if corner >> 1 else 1 - fy)
+        texel = texels[start + (row + height) % height * width + (column + width) % width]
+        red += weight * _LINEAR[texel[0]]
+        green += weight * _LINEAR[texel[1]]
+        blue += weight * _LINEAR[texel[2]]
+    return red, green, blue
+
+
+@nb.njit(**OPTIONS)
+def image_color(texels, image, u, v, w):
+    """Linear light (red, green, blue) of an image.
+
+    Args:
+        texels: `mip_levels` of all images.
+        image: first texel, width and height.
+        u, v: image coordinates, in [0, 1] and repeated; v points up.
+        w: width of a pixel in these coordinates.
+    """
+    start, width, height = image[0], image[1], image[2]
+    level = max(0.0, math.log2(max(w * math.sqrt(width * height), 1e-9)))
+    while level >= 1 and (width > 1 or height > 1):
+        start += width * height
+        width, height = max(width // 2, 1), max(height // 2, 1)
+        level -= 1
+    red, green, blue = _bilinear(texels, start, width, height, u, v)
+    if level > 0 and (width > 1 or height > 1):
+        level = min(level, 1.0)
+        start += width * height
+        r, g, b = _bilinear(texels, start, max(width // 2, 1), max(height // 2, 1), u, v)
+        red, green, blue = red + level * (r - red), green + level * (g - green), blue + level * (b - blue)
+    return red, green, blue
+
+
+@nb.njit(**OPTIONS)
+def is_opaque(texels, image, u, v):
+    """Whether the texel of the finest level at image coordinates is more than half opaque."""
+    width, height = image[1], image[2]
+    column, row = int((u - math.floor(u)) * width), int((math.floor(v) + 1 - v) * height)
+    return texels[image[0] + min(row, height - 1) * width + min(column, width - 1), 3] > 127

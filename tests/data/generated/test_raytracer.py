@@ -9,8 +9,6 @@ from pansplat.data.generated.raytracer import first_hit, portal_form_factor
 from pansplat.data.generated.scene import GeneratedScene, SceneBuilder
 from pansplat.data.generated.textures import Pattern
 
-STACK = np.empty(64, np.int64)
-
 
 def _scene(fill) -> GeneratedScene:
     builder = SceneBuilder(np.random.default_rng(0))
@@ -22,12 +20,7 @@ def _scene(fill) -> GeneratedScene:
 
 def _distance(scene: GeneratedScene, origin, towards, limit: float = math.inf) -> tuple[float, int]:
     direction = np.asarray(towards, float) / np.linalg.norm(towards)
-    return first_hit(_bodies(scene), *map(float, origin), *direction, limit, False, True)
-
-
-def _bodies(scene: GeneratedScene):
-    arrays = scene.arrays
-    return arrays.kinds, arrays.maps, arrays.bounds, arrays.links, STACK
+    return first_hit(scene.arrays.bodies, *map(float, origin), *direction, limit, False, True)[:2]
 
 
 def test_distances_to_single_bodies_are_exact() -> None:
@@ -56,22 +49,22 @@ def test_the_bvh_gives_the_hits_of_an_exhaustive_search() -> None:
                 builder.add_cylinder(centre, half[0], half[1], material, rng.uniform(0, 3))
 
     scene = _scene(fill)
-    kinds, maps = scene.arrays.kinds, scene.arrays.maps
+    bodies = scene.arrays.bodies
     everything = np.array([[-99.0, -99, -99, 99, 99, 99]])
     hits = 0
     for _ in range(500):
         origin, direction = rng.uniform(-6, 6, size=3), rng.normal(size=3)
         direction /= np.linalg.norm(direction)
-        found = first_hit(_bodies(scene), *origin, *direction, math.inf, False, True)
+        found = first_hit(bodies, *origin, *direction, math.inf, False, True)[:2]
         best = (math.inf, -1)
         for k in range(60):
             single = np.array([[k, 1]], np.int64)
-            alone = (kinds, maps, everything, single, STACK)
-            best = min(best, first_hit(alone, *origin, *direction, math.inf, False, True))
+            alone = bodies._replace(bounds=everything, links=single)
+            best = min(best, first_hit(alone, *origin, *direction, math.inf, False, True)[:2])
         hits += found[1] >= 0
         assert found[0] == best[0]
         assert found[1] == best[1] or found[1] < 0
-        blocked = first_hit(_bodies(scene), *origin, *direction, 3.0, True, True)[1] >= 0
+        blocked = first_hit(bodies, *origin, *direction, 3.0, True, True)[1] >= 0
         assert blocked == (found[0] < 3)
     assert 50 < hits < 450
 
