@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from pansplat.data.generated import materials
+from pansplat.data.generated.library import FurniturePiece
+from pansplat.data.generated.meshes import MeshMaterial
 from pansplat.data.generated.plans import Plan, Rectangle, RoomKind
 from pansplat.data.generated.scene import SceneBuilder
 from pansplat.data.generated.textures import Pattern
@@ -225,6 +228,61 @@ def ball(place: Place, rng: np.random.Generator, width: float, depth: float) -> 
         place.add_cylinder(0, height / 2, 0, size / 2, height, materials.random_material(place.builder))
 
 
+_LIBRARY: dict[Piece, tuple[str, ...]] = {
+    sofa: ("sofa",),
+    bed: ("bed",),
+    shelf: ("shelf", "piano", "wardrobe"),
+    cabinet: ("cabinet", "wardrobe", "nightstand", "cabinet"),
+    table: ("desk", "table", "coffee table"),
+    screen: ("cabinet", "fireplace", "shelf"),
+    chair: ("chair", "chair", "armchair", "office chair", "stool"),
+    lamp: ("lamp", "speaker", "plant"),
+    plant: ("plant",),
+    crates: ("box", "bin", "toy", "washing machine"),
+    board: ("gear",),
+    ball: ("toy", "game", "gear"),
+}
+"""Categories of the library for which our own pieces stand."""
+
+
+def _library_piece(builder: SceneBuilder, own: Piece) -> tuple[Piece, float, float, float] | None:
+    """Sometimes a piece of the library in place of `own`, with its width, depth and height in metres."""
+    rng = builder.rng
+    if builder.library is None or own not in _LIBRARY or rng.random() > 0.5:
+        return None
+    categories = _LIBRARY[own]
+    pieces = builder.library.by_category.get(categories[rng.integers(len(categories))], ())
+    if not pieces:
+        return None
+    chosen = pieces[rng.integers(len(pieces))]
+    width, height, depth = np.array(chosen.size) * rng.uniform(0.9, 1.1)
+    return partial(_place_mesh, chosen, height), width, depth, height
+
+
+def _place_mesh(
+    chosen: FurniturePiece, height: float, place: Place, rng: np.random.Generator, width: float, depth: float
+) -> None:
+    """Place a piece of the library with random colours; its back is towards +z."""
+    found = [_mesh_material(place.builder, chosen.category, material) for material in chosen.mesh.materials]
+    centre, half = (place.x, -height / 2, place.z), (width / 2, height / 2, depth / 2)
+    place.builder.add_mesh(chosen.mesh, centre, half, found, place.yaw)
+
+
+def _mesh_material(builder: SceneBuilder, category: str, material: MeshMaterial) -> int:
+    """The material of a mesh, often with another colour or cloth."""
+    rng = builder.rng
+    if material.texture is not None:
+        tint = np.array(material.color) * (materials.random_color(rng, 0.3, 0.8, 1.0) if rng.random() < 0.4 else 1.0)
+        return builder.add_image_material(material.texture, tuple(tint), gloss=material.gloss)
+    kind = rng.random()
+    if kind < 0.25 and category in ("sofa", "bed", "armchair"):
+        return materials.fabric(builder)
+    if kind < 0.25 and category in ("cabinet", "wardrobe", "nightstand", "shelf", "table", "coffee table", "desk"):
+        return materials.wood(builder)
+    color = material.color if kind > 0.6 else materials.random_color(rng)
+    return builder.add_material(Pattern.PLAIN, color, mottle=rng.uniform(0.05, 0.3), gloss=material.gloss)
+
+
 _Choice = tuple[Piece, float, float, float]
 """A piece, its nominal width and depth in metres, and its weight."""
 
@@ -286,19 +344,24 @@ def furnish(builder: SceneBuilder, plan: Plan, index: int, occupied: list[Rectan
         piece, width, depth, _ = against[chosen]
         width *= rng.uniform(0.8, 1.2)
         high = 2.1 if piece in (shelf, cabinet) and rng.random() < 0.6 else 0.9
+        is_centred = piece in (sofa, bed) and rng.random() < 0.6
+        if (found := _library_piece(builder, piece)) is not None:
+            piece, width, depth, high = found
         side = sides[rng.integers(4)]
         spans = [(a, b) for a, b in side.free_spans(high, depth + 0.1, occupied) if b - a > width + 0.04]
         if not spans:
             continue
         low, end = spans[rng.integers(len(spans))]
         along = rng.uniform(low + width / 2 + 0.02, end - width / 2 - 0.02)
-        if piece in (sofa, bed) and rng.random() < 0.6:
+        if is_centred:
             along = (low + end) / 2
         occupied.append(side.area(along - width / 2, along + width / 2, depth + 0.25))
         piece(Place(builder, *side.point(along, depth / 2 + 0.03), side.yaw), rng, width, depth)
     weights = np.array([choice[3] for choice in _STANDING])
     for _ in range(round(area * _FLOOR_DENSITY[furnishing] * rng.uniform(0.3, 1.7))):
         piece, width, depth, _ = _STANDING[rng.choice(len(_STANDING), p=weights / weights.sum())]
+        if (found := _library_piece(builder, piece)) is not None:
+            piece, width, depth, _ = found
         reach = 0.5 * float(np.hypot(width, depth))
         x, z = rng.uniform(interior[0], interior[2]), rng.uniform(interior[1], interior[3])
         place = (x - reach, z - reach, x + reach, z + reach)

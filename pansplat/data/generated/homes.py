@@ -25,6 +25,7 @@ from pansplat.data.generated.doors import (
 )
 from pansplat.data.generated.fixtures import add_ceiling_lamp, add_details, add_fixtures
 from pansplat.data.generated.furniture import Place, chair, crates, furnish
+from pansplat.data.generated.library import FurnitureLibrary
 from pansplat.data.generated.lighting import LightMood, add_lights, sample_mood
 from pansplat.data.generated.plans import OUTER, Hole, HoleKind, Plan, Rectangle, Room, RoomKind, sample_plan
 from pansplat.data.generated.raytracer import CEILING, FLOOR
@@ -162,10 +163,10 @@ def _sample_style(builder: SceneBuilder, plan: Plan, furnishing: Furnishing) -> 
     return _Style(wall, materials.ceiling(builder), trim_height, doors, floors)
 
 
-def build_home(rng: np.random.Generator) -> Home:
-    """A random home."""
+def build_home(rng: np.random.Generator, library: FurnitureLibrary | None = None) -> Home:
+    """A random home; a part of its furniture comes from `library`, if there is one."""
     furnishing = Furnishing(rng.choice(4, p=(0.3, 0.2, 0.35, 0.15)))
-    plan, builder = sample_plan(rng), SceneBuilder(rng)
+    plan, builder = sample_plan(rng), SceneBuilder(rng, library)
     style, mood = _sample_style(builder, plan, furnishing), sample_mood(rng)
     heights = np.full(len(plan.rooms), rng.uniform(2.3, 2.75) if rng.random() < 0.75 else rng.uniform(2.6, 3.3))
     if rng.random() < 0.25:

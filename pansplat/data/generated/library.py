@@ -25,15 +25,15 @@ from pansplat.data.generated.meshes import (
     Mesh,
     MeshMaterial,
     Texture,
-    Triangles,
     make_mesh,
     read_obj,
+    select_triangles,
     simplify,
 )
 from pansplat.errors import InputError
 
-_VERSION = 2  # of the cache
-_MAX_TRIANGLES = 5000
+_VERSION = 1  # of the cache
+_MIN_TRIANGLES, _MAX_TRIANGLES = 8, 5000
 _MAX_TEXTURE = 256  # pixels
 _LICENCES = {
     "BlendSwap-CC-0": "CC0",
@@ -206,8 +206,8 @@ def load_furniture(folder: Path | str, cache: Path | str | None = None) -> Furni
     return _unpack(arrays)
 
 
-def _read_catalogue(path: Path) -> Iterable[tuple[dict[str, Any], Triangles, list[MeshMaterial]]]:
-    """Description, triangles and materials of each usable piece of a catalogue."""
+def _read_catalogue(path: Path) -> Iterable[tuple[dict[str, Any], Mesh]]:
+    """Description and mesh of each usable piece of a catalogue."""
     with zipfile.ZipFile(path) as archive:
         text = archive.read("PluginFurnitureCatalog.properties").decode("latin-1")
         items: dict[int, dict[str, str]] = {}
@@ -229,14 +229,12 @@ def _read_catalogue(path: Path) -> Iterable[tuple[dict[str, Any], Triangles, lis
                     category, place = "ceiling " + category, CEILING
                 elif size[1] < 0.7:
                     category, place = "table " + category, SURFACE
-            read = _read_model(archive, item["model"].lstrip("/"), "table" in category or category == "desk")
-            if read is None:
-                continue
-            triangles, materials = read
             # The files have y up and the front towards +z; `modelRotation` brings a model there.
             turn = np.array(item.get("modelRotation", "1 0 0 0 1 0 0 0 1").split(), float).reshape(3, 3)
             turn = np.diag((1.0, -1.0, -1.0)) @ turn
-            triangles = triangles._replace(corners=triangles.corners @ turn.T, normals=triangles.normals @ turn.T)
+            mesh = _read_model(archive, item["model"].lstrip("/"), turn, "table" in category or category == "desk")
+            if len(mesh.slots) < _MIN_TRIANGLES:
+                continue
             description = {
                 "name": item["name"],
                 "category": category,
@@ -246,11 +244,11 @@ def _read_catalogue(path: Path) -> Iterable[tuple[dict[str, Any], Triangles, lis
                 "author": item.get("creator", path.stem),
                 "licence": _LICENCES[path.stem],
             }
-            yield description, triangles, materials
+            yield description, mesh
 
 
-def _read_model(archive: zipfile.ZipFile, name: str, with_glass: bool) -> tuple[Triangles, list[MeshMaterial]] | None:
-    """Simplified triangles of an OBJ file, opaque or without glass, and the materials; None if there are too few."""
+def _read_model(archive: zipfile.ZipFile, name: str, turn: NDArray[np.float64], with_glass: bool) -> Mesh:
+    """The simplified and turned model of an OBJ file; glass is opaque, or is omitted."""
     folder = PurePosixPath(name).parent
     text = archive.read(name).decode("latin-1")
     triangles, names = read_obj(text)
@@ -268,12 +266,9 @@ def _read_model(archive: zipfile.ZipFile, name: str, with_glass: bool) -> tuple[
             else:
                 row[key] = value.strip()
     materials, opacities = zip(*(_material(archive, folder, rows.get(key, {})) for key in names), strict=True)
-    if not with_glass:
-        triangles = triangles.select(np.array(opacities)[triangles.slots] > 0.4)
-    triangles = simplify(triangles, _MAX_TRIANGLES)
-    if len(triangles.slots) < 8:
-        return None
-    return triangles, list(materials)
+    mesh = make_mesh(simplify(triangles, _MAX_TRIANGLES), materials, turn)
+    # The box, which the catalogue's size describes, contains the glass.
+    return mesh if with_glass else select_triangles(mesh, np.array(opacities)[mesh.slots] > 0.4)
 
 
 def _material(archive: zipfile.ZipFile, folder: PurePosixPath, row: dict[str, str]) -> tuple[MeshMaterial, float]:
@@ -305,14 +300,13 @@ def _texture(archive: zipfile.ZipFile, folder: PurePosixPath, name: str) -> Text
     return None
 
 
-def _pack(pieces: Iterable[tuple[dict[str, Any], Triangles, list[MeshMaterial]]]) -> dict[str, NDArray]:
+def _pack(pieces: Iterable[tuple[dict[str, Any], Mesh]]) -> dict[str, NDArray]:
     """Arrays of the cache."""
     parts: dict[str, list[NDArray]] = {key: [] for key in ("corners", "normals", "texcoords", "slots", "materials")}
     descriptions, images, known = [], [], {}
-    for description, triangles, materials in pieces:
-        mesh = make_mesh(triangles, tuple(materials))
+    for description, mesh in pieces:
         rows = []
-        for material in materials:
+        for material in mesh.materials:
             image = -1
             if material.texture is not None:
                 pixels = material.texture.pixels

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -130,7 +129,7 @@ class Triangles(NamedTuple):
     texcoords: NDArray[np.float64]
     slots: NDArray[np.int64]
 
-    def select(self, kept: NDArray[np.bool_]) -> Triangles:
+    def select(self, kept: NDArray) -> Triangles:
         """The triangles for which `kept` is true."""
         return Triangles(*(array[kept] for array in self))
 
@@ -228,11 +227,15 @@ def simplify(triangles: Triangles, limit: int) -> Triangles:
     return best
 
 
-def make_mesh(
-    triangles: Triangles, materials: tuple[MeshMaterial, ...], rotate: Callable[[NDArray], NDArray] = lambda x: x
-) -> Mesh:
-    """A mesh that fills the box [-1, 1]^3 with triangles, after a rotation of points and normals."""
-    corners, normals = rotate(triangles.corners), rotate(triangles.normals)
+def make_mesh(triangles: Triangles, materials: tuple[MeshMaterial, ...], turn: NDArray | None = None) -> Mesh:
+    """A mesh whose triangles fill the box [-1, 1]^3.
+
+    Args:
+        turn: rotation (3 3) of the triangles.
+    """
+    corners, normals = triangles.corners, triangles.normals
+    if turn is not None:
+        corners, normals = corners @ turn.T, normals @ turn.T
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     half = np.maximum((high - low) / 2, 1e-6)
     normals = normals * half
@@ -244,3 +247,8 @@ def make_mesh(
         triangles.slots.astype(np.int32),
         materials,
     )
+
+
+def select_triangles(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:
+    """A part of a mesh."""
+    return Mesh(mesh.corners[kept], mesh.normals[kept], mesh.texcoords[kept], mesh.slots[kept], mesh.materials)

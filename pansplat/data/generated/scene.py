@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pansplat.data.generated.library import FurnitureLibrary
 from pansplat.data.generated.meshes import NO_MESH, NO_TEXTURE, Mesh, Texture, pack_meshes
 from pansplat.data.generated.raytracer import (
     BOX,
@@ -66,10 +67,10 @@ class GeneratedScene:
 
 
 class SceneBuilder:
-    """Collects the parts of a scene; `rng` supplies all random numbers."""
+    """Collects the parts of a scene; `rng` supplies all random numbers, `library` optional furniture."""
 
-    def __init__(self, rng: np.random.Generator) -> None:
-        self.rng = rng
+    def __init__(self, rng: np.random.Generator, library: FurnitureLibrary | None = None) -> None:
+        self.rng, self.library = rng, library
         self.kinds: list[int] = []
         self.maps: list[Array] = []
         self.halves: list[Array] = []

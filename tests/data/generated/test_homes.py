@@ -15,7 +15,7 @@ def homes() -> list[Home]:
 def test_equal_seeds_give_equal_homes(homes: list[Home]) -> None:
     again = build_home(np.random.default_rng((11, 0)))
     for first, second in zip(homes[0].variants, again.variants, strict=True):
-        assert np.array_equal(first.arrays.maps, second.arrays.maps)
+        assert np.array_equal(first.arrays.bodies.maps, second.arrays.maps)
         assert np.array_equal(first.arrays.lights, second.arrays.lights)
     assert len(homes[1].plan.rooms) != len(again.plan.rooms) or homes[1].plan.rooms != again.plan.rooms
 
@@ -34,7 +34,7 @@ def test_rays_leave_a_home_only_through_its_openings(homes: list[Home]) -> None:
 def test_variants_share_most_bodies_and_some_doors_move(homes: list[Home]) -> None:
     moved = 0
     for home in homes:
-        first, second = ({row.tobytes() for row in variant.arrays.maps} for variant in home.variants)
+        first, second = ({row.tobytes() for row in variant.arrays.bodies.maps} for variant in home.variants)
         assert len(first & second) > 0.75 * len(first)
         moved += first != second
     assert moved > 0.6 * len(homes)

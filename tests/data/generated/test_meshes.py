@@ -99,7 +99,7 @@ def test_meshes_of_spheres_are_shaded_as_spheres() -> None:
     assert both.sum() > 200
     assert (np.abs(near - far)[both] < 0.01).mean() > 0.95
     assert np.abs(seen - exact)[both].mean() < 0.01
-    assert exact[both].std() > 0.1
+    assert exact[both].std() > 0.05
 
 
 def test_both_sides_of_a_face_are_visible_and_lit() -> None:
@@ -121,7 +121,7 @@ def test_images_are_seen_upright_and_unmirrored_from_the_front() -> None:
     pixels = np.full((2, 2, 4), 255, np.uint8)
     pixels[0, 0, :3], pixels[0, 1, :3], pixels[1, 0, :3] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
     material = (MeshMaterial((1, 1, 1), Texture(pixels)),)
-    square = make_mesh(read_obj(SQUARE)[0], material, lambda points: points * (1, -1, -1))
+    square = make_mesh(read_obj(SQUARE)[0], material, np.diag((1, -1, -1)))
     scene = _scene((square, (0, 0, 2), (1.0, 1.0, 0.01), 0.0))
     image, _ = scene.panorama(np.eye(4), 128, 1)
     found = {(dy, dx): image[64 + 8 * dy, 128 + 8 * dx].argmax() for dy, dx in product((-1, 1), (-1, 1))}
@@ -131,7 +131,7 @@ def test_images_are_seen_upright_and_unmirrored_from_the_front() -> None:
 def test_transparent_texels_are_holes() -> None:
     pixels = np.full((8, 8, 4), 255, np.uint8)
     pixels[:, 4:, 3] = 0
-    square = make_mesh(read_obj(SQUARE)[0], (MeshMaterial((1, 1, 1), Texture(pixels)),), lambda p: p * (1, -1, -1))
+    square = make_mesh(read_obj(SQUARE)[0], (MeshMaterial((1, 1, 1), Texture(pixels)),), np.diag((1, -1, -1)))
     _, depth = _scene((square, (0, 0, 2), (1.0, 1.0, 0.01), 0.0)).panorama(np.eye(4), 64, 1)
     assert depth[32, 60] < 2.2 < 30 < depth[32, 68]
 
