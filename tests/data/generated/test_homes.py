@@ -15,7 +15,7 @@ def homes() -> list[Home]:
 def test_equal_seeds_give_equal_homes(homes: list[Home]) -> None:
     again = build_home(np.random.default_rng((11, 0)))
     for first, second in zip(homes[0].variants, again.variants, strict=True):
-        assert np.array_equal(first.arrays.bodies.maps, second.arrays.maps)
+        assert np.array_equal(first.arrays.bodies.maps, second.arrays.bodies.maps)
         assert np.array_equal(first.arrays.lights, second.arrays.lights)
     assert len(homes[1].plan.rooms) != len(again.plan.rooms) or homes[1].plan.rooms != again.plan.rooms
 
