@@ -33,7 +33,7 @@ from pansplat.model.depth_network import (
 from pansplat.model.efficientnet import CHANNELS
 from pansplat.model.layers import PanoramaConv2d, convolve_and_normalize, to_channels_last
 
-_PATCH = 5  # pixels
+_PATCH, _DILATION = 3, 2  # pixels of a patch, and their distance
 _PATCH_NOISE = 0.02  # standard deviation of a patch below which its correlation fades
 _AGREEMENT_SCALE = 0.1  # ratio of log-distances at which a candidate is clearly before or behind a surface
 
@@ -43,7 +43,7 @@ class RefinementConfig:
     """Settings of the refinement."""
 
     mono: DepthNetworkConfig = field(default_factory=DepthNetworkConfig)
-    candidates: int = 33
+    candidates: int = 27
     reach: float = 1.2
     """Logarithm of the ratio of the outermost candidates to the present depth."""
     concentration: float = 0.7
@@ -180,7 +180,8 @@ def _make_patches(images: Float[Tensor, "view 3 h w"]) -> Float[Tensor, "view c 
     """Grey patches of each pixel with mean 0 and norm 1, or less in patches without texture."""
     height, width = images.shape[-2:]
     grey = images.mean(dim=1, keepdim=True)
-    patches = unfold(pad_equirect(grey, _PATCH // 2, "sphere"), _PATCH).unflatten(-1, (height, width))
+    padded = pad_equirect(grey, _PATCH // 2 * _DILATION, "sphere")
+    patches = unfold(padded, _PATCH, dilation=_DILATION).unflatten(-1, (height, width))
     patches = patches - patches.mean(dim=1, keepdim=True)
     deviation = patches.square().sum(dim=1, keepdim=True)
     return patches / (deviation + _PATCH**2 * _PATCH_NOISE**2).sqrt()

@@ -36,24 +36,9 @@ from pansplat.training.checkpoint import load_checkpoint, load_latest, save_chec
 from pansplat.training.logs import CsvTable
 from pansplat.training.optimization import ExponentialMovingAverage
 
-_COLUMNS = (
-    "loss",
-    "mono_error",
-    "refined_error",
-    "mono_likelihood",
-    "refined_likelihood",
-    "rate",
-    "gradient_norm",
-    "seconds",
-)
-_MEASURES = (
-    "mono_error",
-    "mono_relative_error",
-    "mono_likelihood",
-    "refined_error",
-    "refined_relative_error",
-    "refined_likelihood",
-)
+_TERMS = ("loss", "mono_error", "mono_likelihood", "refined_error", "refined_likelihood")
+_COLUMNS = (*_TERMS, "rate", "gradient_norm", "seconds")
+_MEASURES = (*_TERMS[1:], "mono_relative_error", "refined_relative_error")
 _MAX_DEPTH = 12.0  # in camera heights; surfaces farther away are all "far"
 _SCALES = (1, 2, 4)  # pixels, of the loss on differences between neighbours
 
@@ -322,7 +307,7 @@ class DepthTrainer:
         for group in self.optimizer.param_groups:
             group["lr"] = group["peak"] * factor
         self.network.train()
-        iterations = 1 + self.step % 2
+        iterations = 2 if self.step % 4 == 0 else 1
         terms = training_terms(
             self.network, samples, generator, iterations=iterations, factor_noise=self.config.factor_noise
         )
