@@ -573,6 +573,9 @@ def _brightness(light):
     return max(abs(light[LIGHT_COLOR]), abs(light[LIGHT_COLOR + 1]), abs(light[LIGHT_COLOR + 2]))
 
 
+_WINDOW_DEPTH = 0.4  # metres in front of a portal without shadows
+
+
 @nb.njit(**OPTIONS)
 def _irradiance(light, group, x, y, z, nx, ny, nz, a, b):
     """Unshadowed irradiance of a light of unit colour, direction to a point on it, and the distance of that point.
@@ -605,7 +608,12 @@ def _irradiance(light, group, x, y, z, nx, ny, nz, a, b):
         power = (nx * lx + ny * ly + nz * lz) / (math.sqrt(square) * (0.6 + square))
         lx, ly, lz = lx + size * a, ly + 0.3 * size * b, lz + size * b
     away = math.sqrt(lx * lx + ly * ly + lz * lz)
-    return power, lx / away, ly / away, lz / away, 2 * SKY if kind == SUN else away
+    limit = away
+    if kind == SUN:
+        limit = 2 * SKY
+    elif kind == PORTAL:  # the bars of its window would shadow a part of the rays to it in the whole room
+        limit = max(away - _WINDOW_DEPTH, 0.0)
+    return power, lx / away, ly / away, lz / away, limit
 
 
 @nb.njit(**OPTIONS)

@@ -69,8 +69,8 @@ def render_tour(settings: TourSettings, index: int) -> Tour:
     from pansplat.data.generated.homes import build_home
 
     rng = np.random.default_rng((settings.seed, index))
-    cameras = None
-    while cameras is None:
+    cameras = []
+    while len(cameras) < settings.cameras:
         home = build_home(rng)
         cameras = home.sample_cameras(rng, settings.cameras)
     views = [home.variants[variant].panorama(pose, settings.height, settings.samples) for variant, pose in cameras]
