@@ -38,7 +38,10 @@ class CameraEffects:
     grey: tuple[float, float] | None = (0.14, 0.38)
     """Range of the linear light to which automatic exposure maps a tour's metered light. None: the light is kept."""
     exposure_stops: float = 0.7
-    """Largest difference of exposure between two views of a tour, stops."""
+    """Largest difference of exposure between two views of a tour, stops, apart from `room_stops`."""
+    room_stops: float | None = 1.25
+    """Largest difference of an exposed view's metered light from its tour's, stops: views of darker and brighter rooms
+    are exposed longer and shorter to stay within it. None: no limit."""
     tour_white_balance: float = 0.15
     """Largest relative error of the red and blue gains of a tour, more often warm than cold."""
     view_white_balance: float = 0.04
@@ -54,7 +57,7 @@ class CameraEffects:
     contrast: float = 0.35
     """Largest strength of an S-shaped tone curve, with either sign; below 1."""
     saturation: float = 0.35
-    """Largest relative change of the saturation."""
+    """Largest relative change of the saturation, more often up than down."""
     pale_probability: float = 0.03
     """Probability that a tour is almost grey."""
     vignetting: float = 0.25
@@ -85,7 +88,9 @@ class CameraEffects:
     """Range of the JPEG quality, which includes quantisation to 8 bits and often chroma subsampling."""
 
 
-NO_EFFECTS = CameraEffects(**{f.name: 0.0 for f in fields(CameraEffects)} | {"grey": None, "jpeg_quality": None})  # type: ignore[arg-type]
+_NONE_IS_OFF = ("grey", "room_stops", "jpeg_quality")
+_OFF: dict[str, Any] = {f.name: None if f.name in _NONE_IS_OFF else 0.0 for f in fields(CameraEffects)}
+NO_EFFECTS = CameraEffects(**_OFF)
 
 
 class Photographs(NamedTuple):
@@ -137,9 +142,12 @@ def _expose(light: Array, rng: np.random.Generator, effects: CameraEffects) -> t
     luminance = light[:, ::2, ::2] @ np.full(3, 1 / 3, np.float32)
     metered = np.quantile(luminance.reshape(views, -1), quantile, axis=1, method="nearest").clip(1e-6, 1e6)
     middle = np.exp(np.log(metered).mean())
-    stops = adaptation * np.log2(middle / metered) + rng.normal(0, 0.15 * adaptation, views)
-    half = effects.exposure_stops / 2
-    exposures = 2 ** np.clip(stops - stops.mean(), -half, half)
+    brightness = np.log2(metered / middle)
+    stops = rng.normal(0, 0.15 * adaptation, views) - adaptation * brightness
+    stops = np.clip(stops - stops.mean(), -effects.exposure_stops / 2, effects.exposure_stops / 2)
+    if effects.room_stops is not None:
+        stops = np.clip(brightness + stops, -effects.room_stops, effects.room_stops) - brightness
+    exposures = 2**stops
     grey = rng.uniform()
     if effects.grey is not None:
         exposures *= (effects.grey[0] + grey * (effects.grey[1] - effects.grey[0])) / middle
@@ -284,7 +292,7 @@ def _develop(light: Array, lenses: _Lenses, rng: np.random.Generator, effects: C
     compression = effects.local_contrast * max(0.0, rng.uniform(-0.4, 1.0))
     smoothness, boost = rng.uniform(0.1, 2.0), 0.4 * compression * rng.uniform(0, 1)
     table = _tone_table(rng, effects)
-    saturation = np.exp(rng.uniform(-1, 1) * effects.saturation)
+    saturation = np.exp(rng.uniform(-0.6, 1) * effects.saturation)
     pale = rng.uniform(0.05, 0.4)
     if rng.random() < effects.pale_probability:
         saturation = pale

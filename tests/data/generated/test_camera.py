@@ -37,7 +37,7 @@ def test_each_effect_alone_changes_the_images(name: str) -> None:
     needed = {"cap_degrees": {"nadir_probability": 1.0}, "zenith_probability": {"cap_degrees": 25.0}}
     strength = needed.get(name, {})
     strength |= {name: 1.0 if "probability" in name else getattr(CameraEffects(), name)}
-    light = TEXTURE * np.array((1, 4), np.float32)[:, None, None, None]
+    light = TEXTURE * np.array((0.5, 8), np.float32)[:, None, None, None]
     plain = srgb_from_linear(light)
     images = [take(light, seed, **strength).images for seed in range(3)]
     assert max(np.abs(image - plain).max() for image in images) > 0.01
@@ -83,6 +83,13 @@ def test_exposures_of_two_views_differ_by_at_most_the_stated_stops() -> None:
     assert max(stops) <= 0.7 + 1e-9
     assert max(stops) > 0.6 and min(stops) < 0.2
     assert np.ptp(take(light, exposure_stops=0.0).exposures) == 0
+
+
+def test_views_of_dark_and_bright_rooms_are_exposed_to_a_limited_difference() -> None:
+    light = np.concatenate((grey(0.002), grey(2.0)))[1:3]
+    for seed in range(10):
+        exposures = take(light, seed, exposure_stops=0.7, room_stops=1.0).exposures
+        np.testing.assert_allclose(exposures * (0.002, 2.0), 0.002**0.5 * 2**0.5 * np.array((0.5, 2)), rtol=1e-3)
 
 
 def test_darker_views_are_exposed_longer() -> None:
