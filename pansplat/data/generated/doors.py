@@ -43,6 +43,7 @@ class DoorStyle:
     Attributes:
         panels: rows and columns of raised panels, or of none.
         casing: width of the boards around holes, metres; 0 for none.
+        has_glass: whether windows have panes, which reflect.
     """
 
     trim: int
@@ -50,6 +51,7 @@ class DoorStyle:
     knob: int
     panels: tuple[int, int]
     casing: float
+    has_glass: bool
 
 
 def add_wall_box(
@@ -204,6 +206,10 @@ def add_window(builder: SceneBuilder, wall: Wall, hole: Hole, style: DoorStyle, 
         rises.append(hole.low + rng.uniform(0.4, 0.6) * (hole.top - hole.low))
     for rise in rises:
         add_wall_box(builder, wall, (hole.start, hole.end), (rise, rise + bar), (middle[0], middle[1]), frame)
+    if style.has_glass:
+        x, z = wall.point(hole.middle, sign * 0.16)
+        half = (0.003, hole.width / 2) if wall.axis == 0 else (hole.width / 2, 0.003)
+        builder.add_glass((x, -(hole.low + hole.top) / 2, z), (half[0], (hole.top - hole.low) / 2, half[1]))
     _add_shade(builder, wall, hole, sign, rng)
 
 

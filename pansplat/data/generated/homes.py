@@ -27,9 +27,17 @@ from pansplat.data.generated.fixtures import add_ceiling_lamp, add_details, add_
 from pansplat.data.generated.furniture import Place, chair, crates, furnish
 from pansplat.data.generated.library import FurnitureLibrary
 from pansplat.data.generated.lighting import LightMood, add_lights, sample_mood
-from pansplat.data.generated.plans import OUTER, Hole, HoleKind, Plan, Rectangle, Room, RoomKind, sample_plan
-from pansplat.data.generated.raytracer import CEILING, FLOOR
+from pansplat.data.generated.plans import OUTER, Hole, HoleKind, Plan, Rectangle, RoomKind, sample_plan
+from pansplat.data.generated.raytracer import FLOOR
 from pansplat.data.generated.scene import GeneratedScene, SceneBuilder
+from pansplat.data.generated.structure import (
+    add_ceiling,
+    add_slopes,
+    add_stairs,
+    add_structure,
+    drop_windows_under_slopes,
+    plan_stairs,
+)
 from pansplat.data.generated.textures import Pattern
 
 Array = NDArray[np.float64]
@@ -69,7 +77,7 @@ class Home:
         Each camera is 0.3 to 4 metres from the nearest other one. Fewer than `count` are returned if there is no space.
         """
         areas = np.array([room.area if room.kind != RoomKind.CLOSET else 0.3 * room.area for room in self.plan.rooms])
-        areas = np.sqrt(areas)
+        areas = areas**0.8
         has_changes = rng.random() < 0.6
         yaw, spread = rng.uniform(0, 2 * np.pi), 0.05 if rng.random() < 0.6 else np.pi
         keeps_height, cameras = rng.random() < 0.75, []
@@ -131,7 +139,7 @@ def _sample_style(builder: SceneBuilder, plan: Plan, furnishing: Furnishing) -> 
     leaf = trim if rng.random() < 0.6 else materials.wood(builder) if rng.random() < 0.6 else materials.trim(builder)
     panels = ((0, 0), (1, 1), (2, 1), (3, 2), (2, 2))[rng.choice(5, p=(0.35, 0.1, 0.2, 0.25, 0.1))]
     casing = rng.uniform(0.05, 0.08) if rng.random() < 0.85 else 0.0
-    doors = DoorStyle(trim, leaf, materials.metal(builder), panels, casing)
+    doors = DoorStyle(trim, leaf, materials.metal(builder), panels, casing, bool(rng.random() < 0.6))
     wall = materials.paint(builder, materials.paint_color(rng))
     if furnishing != Furnishing.EMPTY and rng.random() < 0.25:
         wall = materials.wall(builder)
@@ -167,7 +175,7 @@ def build_home(rng: np.random.Generator, library: FurnitureLibrary | None = None
     """A random home; a part of its furniture comes from `library`, if there is one."""
     furnishing = Furnishing(rng.choice(4, p=(0.3, 0.2, 0.35, 0.15)))
     plan, builder = sample_plan(rng), SceneBuilder(rng, library)
-    style, mood = _sample_style(builder, plan, furnishing), sample_mood(rng)
+    style, mood = _sample_style(builder, plan, furnishing), sample_mood(rng, plan)
     heights = np.full(len(plan.rooms), rng.uniform(2.3, 2.75) if rng.random() < 0.75 else rng.uniform(2.6, 3.3))
     if rng.random() < 0.25:
         heights += rng.uniform(-0.25, 0.4, size=len(heights)) * (rng.random(len(heights)) < 0.4)
@@ -175,14 +183,27 @@ def build_home(rng: np.random.Generator, library: FurnitureLibrary | None = None
     for index, room in enumerate(plan.rooms):
         if room.kind == RoomKind.ALCOVE:
             heights[index] = heights[room.parent]
-    top = float(heights.max()) + 0.1
+    top, is_attic = float(heights.max()) + 0.1, rng.random() < 0.1
+    attic_axis = (0, 2)[rng.integers(2)]
+    if is_attic:
+        drop_windows_under_slopes(plan, attic_axis)
     outside, sky = _add_outdoors(builder, plan, mood)
     rooms = [_room_row(builder, plan, index, style, furnishing, heights[index]) for index in range(len(plan.rooms))]
     leaves, occupied = _add_walls(builder, plan, style, top)
-    for index, room in enumerate(plan.rooms):
-        x0, z0, x1, z1 = room.corners
-        centre = ((x0 + x1) / 2, -(heights[index] + top + 0.2) / 2, (z0 + z1) / 2)
-        builder.add_box(centre, ((x1 - x0) / 2, (top + 0.2 - heights[index]) / 2, (z1 - z0) / 2), CEILING)
+    stairs, knee = None, rng.uniform(1.0, 1.7)
+    host = int(rng.integers(len(plan.rooms)))
+    if rng.random() < 0.4 and plan.rooms[host].kind in (RoomKind.LIVING, RoomKind.HALL, RoomKind.DINING):
+        stairs = plan_stairs(plan, host, float(heights[host]), occupied[host], rng)
+    for index in range(len(plan.rooms)):
+        height = float(heights[index])
+        well = stairs[4] if stairs is not None and index == host else None
+        add_ceiling(builder, plan, index, height, top, well)
+        add_structure(builder, plan, index, height, occupied[index])
+        if is_attic and well is None:
+            add_slopes(builder, plan, index, height, attic_axis, knee)
+    if stairs is not None:
+        looks = (materials.wood(builder), style.doors.trim)
+        add_stairs(builder, *stairs[:4], float(heights[host]), looks)
     spots: list[tuple[int, tuple[float, float]]] = []
     lamps = []
     for index, room in enumerate(plan.rooms):
@@ -215,7 +236,7 @@ def _fork(builder: SceneBuilder) -> SceneBuilder:
     """A builder that continues the same scene independently; it shares the random numbers."""
     fork = copy.copy(builder)
     for name, value in vars(builder).items():
-        if isinstance(value, list):
+        if isinstance(value, list | dict):
             setattr(fork, name, value.copy())
     return fork
 
@@ -331,15 +352,17 @@ def _add_outdoors(builder: SceneBuilder, plan: Plan, mood: LightMood) -> tuple[i
     """Add ground, foundation, neighbours, fences and trees; the materials of outer walls and of the sky."""
     rng = builder.rng
     outside = materials.wall(builder)
-    blue = rng.uniform(0.2, 0.6)
+    blue, land = rng.uniform(0.2, 0.6), materials.foliage_color(rng)
+    if rng.random() < 0.3:
+        land = materials.random_color(rng, 0.2, 0.2, 0.6)
     sky = builder.add_material(
         Pattern.PLAIN,
         (blue * 0.4, blue * 0.7, blue * 1.4),
         (0.7, 0.8, 0.9),
-        materials.random_color(rng, 0.5, 0.2, 0.6),
+        land,
         glow=float(np.mean(mood.outdoors)) * 1.3,
     )
-    green = (rng.uniform(0.05, 0.25), rng.uniform(0.1, 0.3), rng.uniform(0.02, 0.15))
+    green = materials.foliage_color(rng)
     grass = builder.add_material(Pattern.STONE, green, materials.shade(green, 0.4), size=0.7, fraction=0, mottle=0.6)
     x0, z0, x1, z1 = plan.bounds
     builder.add_box((0, 0.1, 0), ((x1 - x0) / 2 + OUTER, 0.1, (z1 - z0) / 2 + OUTER), FLOOR)
@@ -376,9 +399,3 @@ def _add_outdoors(builder: SceneBuilder, plan: Plan, mood: LightMood) -> tuple[i
                 centre[2 * axis], half[2 * axis] = sign * reach, 0.03
                 builder.add_box(centre, half, fence)
     return outside, sky
-
-
-def room_of(plan: Plan, index: int) -> Room:
-    """The room, or for an alcove the room that it is part of."""
-    room = plan.rooms[index]
-    return plan.rooms[room.parent] if room.kind == RoomKind.ALCOVE else room

@@ -43,8 +43,8 @@ class LightMood:
     compression: float
 
 
-def sample_mood(rng: np.random.Generator) -> LightMood:
-    """A random time of day, weather and camera."""
+def sample_mood(rng: np.random.Generator, plan: Plan) -> LightMood:
+    """A random time of day, weather and camera. The sun shines into a window, mostly."""
     kind = rng.choice(3, p=(0.35, 0.5, 0.15))  # daylight, daylight and lamps, lamps
     cool, warm = rng.uniform(-0.05, 0.12), rng.uniform(0.05, 0.4)
     day = np.array((1 - cool, 1.0, 1 + cool))
@@ -52,7 +52,12 @@ def sample_mood(rng: np.random.Generator) -> LightMood:
     outdoors = day * (rng.uniform(0.03, 0.3) if kind == 2 else np.exp(rng.uniform(np.log(0.9), np.log(16))))
     sun = None
     if kind < 2 and rng.random() < 0.6:
-        up, around = np.radians(rng.uniform(15, 55)), rng.uniform(0, 2 * np.pi)
+        up, around = np.radians(rng.uniform(12, 50)), rng.uniform(0, 2 * np.pi)
+        windows = [w for w in plan.walls if w.is_outer and any(h.kind != HoleKind.ENTRANCE for h in w.holes)]
+        if windows and rng.random() < 0.85:
+            wall = windows[rng.integers(len(windows))]
+            outward = (0.0 if wall.axis == 2 else np.pi / 2) + (np.pi if wall.rooms[0] == OUTSIDE else 0.0)
+            around = outward + np.radians(rng.uniform(-60, 60))
         direction = np.array((np.cos(up) * np.sin(around), -np.sin(up), np.cos(up) * np.cos(around)))
         sun = direction, rng.uniform(1.0, 6.0) * np.array((1.0, 0.94, 0.82))
     lamp = rng.uniform(0.6, 1.8) * np.array((1.0, 1 - 0.5 * warm, 1 - warm))
@@ -147,7 +152,7 @@ def add_lights(
             color = share * (ambient[groups[there]] - ambient[groups[here]])
             builder.add_portal((x, middle, z), half, wall.axis, color, int(groups[here]))
     for index, position in lamps:
-        builder.add_light(position, mood.lamp * scale[groups[index]], 0.08, group=int(groups[index]))
+        builder.add_light(position, mood.lamp * scale[groups[index]], 0.03, group=int(groups[index]))
     if mood.sun is not None:
         builder.add_light(*mood.sun, 0.01, sun=True)
     for index, (room, (row, panel, trim)) in enumerate(zip(plan.rooms, rooms, strict=True)):

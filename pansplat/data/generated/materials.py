@@ -15,8 +15,14 @@ Color = tuple[float, float, float]
 def random_color(rng: np.random.Generator, saturation: float = 0.6, dark: float = 0.1, light: float = 0.9) -> Color:
     """A linear-light colour of random hue; its sRGB brightness is between `dark` and `light`."""
     hue, value = rng.random(), rng.uniform(dark, light)
-    red, green, blue = colorsys.hsv_to_rgb(hue, saturation * rng.random() ** 0.7, value)
+    red, green, blue = colorsys.hsv_to_rgb(hue, saturation * rng.random() ** 1.3, value)
     return red**2.2, green**2.2, blue**2.2
+
+
+def foliage_color(rng: np.random.Generator) -> Color:
+    """Green to brown, as grass, hedges and woods."""
+    value = rng.uniform(0.05, 0.25)
+    return value * rng.uniform(0.5, 1.1), value, value * rng.uniform(0.15, 0.5)
 
 
 def shade(color: Color, factor: float) -> Color:
@@ -85,7 +91,7 @@ def carpet(builder: SceneBuilder) -> int:
         red, green, blue = colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.1, 0.6), rng.uniform(0.25, 0.7))
     base, size = (red**2.2, green**2.2, blue**2.2), rng.uniform(0.012, 0.05)
     return builder.add_material(
-        Pattern.STONE, base, shade(base, rng.uniform(0.5, 0.85)), size=size, fraction=0, mottle=rng.uniform(0.02, 0.25)
+        Pattern.STONE, base, shade(base, rng.uniform(0.5, 0.85)), size=size, fraction=0, mottle=rng.uniform(0.02, 0.12)
     )
 
 
@@ -104,7 +110,10 @@ def floor_tiles(builder: SceneBuilder) -> int:
         other, mottle = random_color(rng, 0.3, 0.15, 0.9), 0.55
     sides = (size, size) if rng.random() < 0.75 else (1.9 * size, 0.9 * size)
     fraction = rng.uniform(0.003, 0.008) / size
-    return builder.add_material(Pattern.TILES, base, other, joint, size=sides, fraction=fraction, mottle=mottle)
+    gloss = rng.uniform(0.1, 1.0)
+    return builder.add_material(
+        Pattern.TILES, base, other, joint, size=sides, fraction=fraction, mottle=mottle, gloss=gloss
+    )
 
 
 def wall_tiles(builder: SceneBuilder) -> int:
@@ -115,17 +124,27 @@ def wall_tiles(builder: SceneBuilder) -> int:
     sides = (size, size) if rng.random() < 0.5 else (2 * size, size)
     joint = shade(base, rng.uniform(0.6, 1.1))
     return builder.add_material(
-        Pattern.TILES, base, shade(base, rng.uniform(0.8, 0.97)), joint, size=sides, fraction=0.03, mottle=0.04
+        Pattern.TILES,
+        base,
+        shade(base, rng.uniform(0.8, 0.97)),
+        joint,
+        size=sides,
+        fraction=0.03,
+        mottle=0.04,
+        gloss=0.7,
     )
 
 
 def wood(builder: SceneBuilder, size: tuple[float, float] | None = None) -> int:
     """Wood with grain; boards of that size with joints if `size` (metres) is given."""
     light, dark = random_wood_colors(builder.rng)
+    gloss = builder.rng.uniform(0.0, 0.8)
     if size is None:
-        return builder.add_material(Pattern.PLANKS, light, dark, size=(3.0, 5.0), fraction=0.0, mottle=0.15)
+        return builder.add_material(
+            Pattern.PLANKS, light, dark, size=(3.0, 5.0), fraction=0.0, mottle=0.15, gloss=0.6 * gloss
+        )
     return builder.add_material(
-        Pattern.PLANKS, light, dark, size=size, fraction=builder.rng.uniform(0.01, 0.04), mottle=0.15
+        Pattern.PLANKS, light, dark, size=size, fraction=builder.rng.uniform(0.01, 0.04), mottle=0.15, gloss=gloss
     )
 
 
@@ -199,7 +218,7 @@ def ceiling(builder: SceneBuilder) -> int:
 def fabric(builder: SceneBuilder) -> int:
     """Plain, striped, checked or flecked fabric."""
     rng = builder.rng
-    base = random_color(rng, 0.8, 0.15, 0.9)
+    base = random_color(rng, 0.7, 0.15, 0.9)
     kind = rng.integers(4)
     if kind == 0:
         return builder.add_material(Pattern.PLAIN, base, mottle=0.5)
@@ -267,6 +286,6 @@ def stone_wall(builder: SceneBuilder) -> int:
 
 
 def mirror(builder: SceneBuilder) -> int:
-    """A dull mirror: grey, brighter towards its top."""
-    value = builder.rng.uniform(0.35, 0.6)
-    return builder.add_material(Pattern.STONE, (value, value, value), shade((value,) * 3, 0.8), size=1.2, fraction=0)
+    """A mirror of silvered glass."""
+    value = builder.rng.uniform(0.75, 0.92)
+    return builder.add_material(Pattern.PLAIN, (value, value, value), mottle=0, mirror=value)

@@ -324,6 +324,7 @@ PANEL_HEIGHT, TRIM_HEIGHT, HEIGHT, AMBIENT, LIGHT_GROUP = 9, 10, 11, 12, 15
 LIGHT_COLOR, LIGHT_SIZE, LIGHT_KIND, LIGHT_REACHES = 3, 6, 7, 8
 PORTAL_WIDTH, PORTAL_HEIGHT, PORTAL_AXIS, PORTAL_SHADOWS, LIGHT_NUMBERS = 9, 10, 11, 12, 13
 LAMP, SUN, PORTAL = range(3)
+_SHARPNESS = 0.3  # size of the part of a portal that shadows are cast from; a larger part needs more rays
 _LEAST_LIGHT = 0.005  # lights that give less to a surface are omitted
 _LEAST_REFLECTION = 0.03  # of the light; weaker reflections are omitted
 
@@ -594,11 +595,11 @@ def _irradiance(light, group, x, y, z, nx, ny, nz, a, b):
         if square > 4 * (wide * wide + high * high) and 4 * wide * high * _brightness(light) < _LEAST_LIGHT * square:
             return 0.0, 0.0, 1.0, 0.0, 0.0
         power = portal_form_factor(light, x, y, z, nx, ny, nz)
-        lx, ly, lz = lx - x, ly - y + b * light[PORTAL_HEIGHT], lz - z
+        lx, ly, lz = lx - x, ly - y + _SHARPNESS * b * light[PORTAL_HEIGHT], lz - z
         if light[PORTAL_AXIS] > 0:
-            lx += a * light[PORTAL_WIDTH]
+            lx += _SHARPNESS * a * light[PORTAL_WIDTH]
         else:
-            lz += a * light[PORTAL_WIDTH]
+            lz += _SHARPNESS * a * light[PORTAL_WIDTH]
     elif kind == SUN:
         power = nx * lx + ny * ly + nz * lz
         lx, ly, lz = lx + size * a, ly + 0.3 * size * b, lz + size * b

@@ -1,0 +1,55 @@
+"""Stairs are walkable, and ceilings are closed around their wells."""
+
+import numpy as np
+
+from pansplat.data.generated.plans import Hole, HoleKind, Plan, Room, RoomKind, Wall
+from pansplat.data.generated.scene import GeneratedScene, SceneBuilder
+from pansplat.data.generated.structure import add_ceiling, add_slopes, add_stairs, plan_stairs
+from pansplat.data.generated.textures import Pattern
+
+HEIGHT = 2.6
+
+
+def _plan() -> Plan:
+    """A room of 6 x 4 metres with a door in one wall."""
+    walls = [
+        Wall(axis, at, 0.0, 4.0 if axis == 0 else 6.0, rooms)
+        for axis, at, rooms in ((0, 0.0, (-1, 0)), (0, 6.0, (0, -1)), (2, 0.0, (-1, 0)), (2, 4.0, (0, -1)))
+    ]
+    walls[0].holes.append(Hole(1.5, 2.4, 0.0, 2.0, HoleKind.ENTRANCE))
+    return Plan((Room((0, 0, 6, 4), RoomKind.LIVING),), tuple(walls))
+
+
+def _finish(builder: SceneBuilder, material: int) -> GeneratedScene:
+    builder.add_room((0, 0, 6, 4), [material] * 5, 0, 0, HEIGHT)
+    return builder.finish((1, 1, 1), material, material)
+
+
+def test_stairs_have_headroom_up_to_the_upper_floor() -> None:
+    builder, plan = SceneBuilder(np.random.default_rng(0)), _plan()
+    material = builder.add_material(Pattern.PLAIN, (0.5, 0.5, 0.5))
+    found = plan_stairs(plan, 0, HEIGHT, [], builder.rng)
+    assert found is not None
+    side, lower, upper, width, well = found
+    add_ceiling(builder, plan, 0, HEIGHT, HEIGHT + 0.1, well)
+    add_stairs(builder, side, lower, upper, width, HEIGHT, (material, material))
+    scene = _finish(builder, material)
+    for share in np.linspace(0.02, 0.96, 20):
+        x, z = side.point(lower + share * (upper - lower), 0.45 * width)
+        heads = np.array([(x, -share * HEIGHT - 0.25 - up, z) for up in (0.1, 0.8, 1.5)])
+        assert scene.clearance(heads).min() > 0.03
+    under = np.array([(*side.point(lower + 0.5 * (upper - lower), 0.45 * width),)])
+    assert scene.clearance(np.array([(under[0, 0], -0.3, under[0, 1])]))[0] == 0
+
+
+def test_a_slope_joins_the_wall_at_the_knee_and_the_ceiling() -> None:
+    builder, plan = SceneBuilder(np.random.default_rng(0)), _plan()
+    material = builder.add_material(Pattern.PLAIN, (0.5, 0.5, 0.5))
+    add_slopes(builder, plan, 0, HEIGHT, 0, 1.4)
+    scene = _finish(builder, material)
+    assert len(builder.maps) == 1  # the other side has a door
+    (just_below, above) = (scene.clearance(np.array([(6.0, -up, 2.0)]))[0] for up in (1.38, 1.44))
+    assert 0 < just_below < 0.03 and above == 0
+    reach = HEIGHT - 1.4
+    assert scene.clearance(np.array([(6.0 - reach, -HEIGHT - 0.02, 2.0)]))[0] < 0.01
+    assert scene.clearance(np.array([(6.0 - reach - 0.1, -HEIGHT + 0.3, 2.0)]))[0] > 0.1
