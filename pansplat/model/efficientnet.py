@@ -1,4 +1,4 @@
-"""EfficientNet-Lite0 as an encoder of panoramas: features at 1/2 to 1/32, with convolutions that continue over the seam.
+"""EfficientNet-Lite0 as an encoder of panoramas: features at 1/2 to 1/32; its convolutions continue over the seam.
 
 Source: Tan and Le, https://arxiv.org/abs/1905.11946; the Lite variant has no squeeze-and-excitation and uses ReLU6.
 """

@@ -1,25 +1,32 @@
-"""A prior of each view's depth in the search: a hypothesis set of its shape, and a cost for hypotheses far from it.
+"""A prior of each view's depth in the search, from a model that knows what rooms look like.
 
-A prior gives the logarithm of depth up to one factor per view, with a Laplace scale at each pixel. `estimate_scale`
-finds the factor by matching: the prior's surface, scaled by each candidate, is warped into the other views.
+The model sees upright panoramas. Its first estimate is the logarithm of depth in units of the camera's height over the
+floor; the height follows by matching: the estimated surfaces, scaled by each candidate, are warped into the other
+views. The model then refines its estimates by comparison of the views. In the search the prior is a cost for
+hypotheses whose depth differs from it, relative to its uncertainty.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numba as nb
 import numpy as np
+import torch
 
-from pansplat.geometry.equirect import row_weights
+from pansplat.geometry.equirect import rotate_equirect, row_weights
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View, compute_matching_cost
 from pansplat.sweep.surface import resize_sphere
 
-_SCALE_CANDIDATES = 96
-_SHARP_SCALE = 0.08  # Laplace scale up to which a pixel has full weight in the search of the factor
+_HEIGHT_CANDIDATES = 96
+_SHARP_SCALE = 0.08  # Laplace scale up to which a pixel has full weight in the search of the height
+_MAX_COST = 1.2  # matching cost above which a pixel does not count against a height
+_MAX_VARIANCE = 4e-3  # of grey values; more texture has no more weight
+_MIN_TILT = math.radians(0.5)  # of a camera that is turned upright
 _UNBOUNDED = (math.inf, -math.inf)
 
 
@@ -33,8 +40,8 @@ class PriorConfig:
     """Deviation, in Laplace scales, above which the cost is constant."""
     min_scale: float = 0.03
     """Smallest Laplace scale of log-depth."""
-    penalty: float = 0.0
-    """Penalty of the hypotheses of the prior's shape."""
+    iterations: int = 2
+    """Refinements by comparison of the views."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +49,7 @@ class DepthPrior:
     """One view's prior.
 
     Attributes:
-        log_depth: (h, w) logarithm of radial depth up to a constant.
+        log_depth: (h, w) logarithm of radial depth.
         scale: (h, w) Laplace scale of it.
     """
 
@@ -50,70 +57,155 @@ class DepthPrior:
     scale: np.ndarray
 
     def resize(self, height: int) -> DepthPrior:
+        """The prior at another height."""
         return DepthPrior(resize_sphere(self.log_depth, height), resize_sphere(self.scale, height))
 
+    def rotate(self, rotation: np.ndarray) -> DepthPrior:
+        """The prior of the camera rotated by `rotation` (3, 3), its new axes in the old ones."""
+        both = torch.from_numpy(np.stack((self.log_depth, self.scale)))
+        rotated = rotate_equirect(both, torch.from_numpy(rotation)).numpy()
+        return DepthPrior(rotated[0], rotated[1])
 
-PriorModel = Callable[[Sequence[np.ndarray]], list[DepthPrior]]
-"""Priors of upright panoramas (h, w, 3), RGB in [0, 1]."""
+
+class ObservedViews(Protocol):
+    """The model's view of upright panoramas.
+
+    Attributes:
+        priors: the estimate of each panorama by itself, in units of its camera's height.
+    """
+
+    priors: list[DepthPrior]
+
+    def refine(self, camera_heights: Sequence[float], cam2world: np.ndarray, iterations: int) -> list[DepthPrior]:
+        """The estimates in the unit of the poses (v, 4, 4), refined by comparison of the views."""
+        ...
 
 
-def estimate_scale(
-    prior: DepthPrior,
-    view: View,
-    others: Sequence[tuple[View, np.ndarray]],
+class PriorModel(Protocol):
+    """Estimates depth. `fingerprint` changes whenever the estimates could."""
+
+    fingerprint: str
+
+    def observe(self, images: Sequence[np.ndarray]) -> ObservedViews:
+        """Observe upright panoramas (h, w, 3), RGB in [0, 1]."""
+        ...
+
+
+def estimate_priors(
+    model: PriorModel,
+    images: Sequence[np.ndarray],
+    cam2world: np.ndarray,
+    views: Sequence[View],
+    down: np.ndarray,
     limits: tuple[float, float],
-    config: MatchingConfig,
-) -> float:
-    """The logarithm of the factor from the prior's depth to metres with the lowest matching cost.
+    config: PriorConfig,
+    matching: MatchingConfig,
+) -> list[DepthPrior]:
+    """The prior of each view, in the unit of the poses.
 
     Args:
-        others: the other views, and the poses (4, 4) from `view`'s camera to theirs.
-        limits: smallest and largest inverse depth, 1/m; they bound the factor's inverse.
+        images: (h, w, 3) of each view.
+        cam2world: (v, 4, 4).
+        views: the views at the size at which heights are compared.
+        down: (3,) unit vector of the world.
+        limits: smallest and largest inverse height of the cameras over the floor.
     """
-    height = view.image.shape[0]
-    inverse = np.exp(-prior.log_depth).astype(np.float32)
+    turns = [_upright_rotation(pose[:3, :3], down) for pose in cam2world]
+    upright = [image if turn is None else _rotate_image(image, turn) for image, turn in zip(images, turns, strict=True)]
+    observed = model.observe(upright)
+    first = [
+        prior if turn is None else prior.rotate(turn.T) for prior, turn in zip(observed.priors, turns, strict=True)
+    ]
+    heights = _estimate_camera_heights(first, views, cam2world, down, limits, matching)
+    poses = np.array(cam2world, np.float64)
+    for pose, turn in zip(poses, turns, strict=True):
+        if turn is not None:
+            pose[:3, :3] = pose[:3, :3] @ turn
+    refined = observed.refine(heights, poses, config.iterations)
+    return [prior if turn is None else prior.rotate(turn.T) for prior, turn in zip(refined, turns, strict=True)]
+
+
+def _upright_rotation(rotation: np.ndarray, down: np.ndarray) -> np.ndarray | None:
+    """The smallest rotation (3, 3) after which a camera's y axis is `down`, as new axes in the old ones."""
+    target = rotation.T @ down
+    axis = np.cross((0.0, 1.0, 0.0), target)
+    sine, cosine = float(np.linalg.norm(axis)), float(target[1])
+    angle = math.atan2(sine, cosine)
+    if angle < _MIN_TILT:
+        return None
+    if sine < 1e-9:  # upside down
+        return np.diag((1.0, -1.0, -1.0))
+    return cv2.Rodrigues(axis / sine * angle)[0]
+
+
+def _rotate_image(image: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    maps = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)
+    return np.ascontiguousarray(rotate_equirect(maps, torch.from_numpy(rotation)).permute(1, 2, 0).numpy())
+
+
+def _estimate_camera_heights(
+    priors: Sequence[DepthPrior],
+    views: Sequence[View],
+    cam2world: np.ndarray,
+    down: np.ndarray,
+    limits: tuple[float, float],
+    config: MatchingConfig,
+) -> list[float]:
+    """The height of each camera over the common floor at which the priors match the other views best."""
+    above = -(cam2world[:, :3, 3] @ down)  # of each camera, over any level
+    above -= above.mean()
     low, high = limits
-    step = (high - low) / (_SCALE_CANDIDATES - 1)
+    candidates = low + (high - low) / (_HEIGHT_CANDIDATES - 1) * np.arange(_HEIGHT_CANDIDATES)  # inverse heights
+    total = np.zeros(_HEIGHT_CANDIDATES)
+    for n, prior in enumerate(priors):
+        cost = _match_heights(prior, n, views, cam2world, candidates, config)
+        own = 1 / np.maximum(1 / candidates + above[n], 1e-6)  # this camera's inverse height, by the mean's
+        total += np.interp(own, candidates, cost)
+    best = int(total.argmin())
+    offset = 0.0
+    if 0 < best < _HEIGHT_CANDIDATES - 1:
+        left, middle, right = total[best - 1 : best + 2]
+        offset = float(np.clip(0.5 * (left - right) / max(left + right - 2 * middle, 1e-12), -0.5, 0.5))
+    mean = 1 / (low + (best + offset) * (candidates[1] - candidates[0]))
+    return [max(mean + float(a), 1 / high) for a in above]
+
+
+def _match_heights(
+    prior: DepthPrior,
+    index: int,
+    views: Sequence[View],
+    cam2world: np.ndarray,
+    candidates: np.ndarray,
+    config: MatchingConfig,
+) -> np.ndarray:
+    """Weighted matching cost (candidates) of a view's prior at each inverse height."""
+    view = views[index]
+    height = view.image.shape[0]
+    prior = prior.resize(height)
+    inverse = np.exp(-prior.log_depth).astype(np.float32)
     shape = HypothesisSet(
-        (low * inverse).astype(np.float32),
-        (step * inverse).astype(np.float32),
-        np.zeros((2, _SCALE_CANDIDATES), np.float32),
+        (candidates[0] * inverse).astype(np.float32),
+        ((candidates[1] - candidates[0]) * inverse).astype(np.float32),
+        np.zeros((2, len(candidates)), np.float32),
         np.zeros(inverse.shape, np.uint8),
     )
     gray = view.image.mean(axis=2)
     variance = cv2.boxFilter(gray * gray, -1, (5, 5)) - cv2.boxFilter(gray, -1, (5, 5)) ** 2
-    weight = np.clip(variance, 0, 4e-3) * view.valid * row_weights(height).numpy()[:, None]
+    weight = np.clip(variance, 0, _MAX_VARIANCE) * view.valid * row_weights(height).numpy()[:, None]
     weight *= np.minimum(_SHARP_SCALE / np.maximum(prior.scale, 1e-3), 1)
-    total = np.zeros(_SCALE_CANDIDATES)
-    for other, pose in others:
-        cost = compute_matching_cost(view, other, pose, [shape], (1e-6, 1e6), _UNBOUNDED, config)
-        total += np.einsum("hw,hwk->k", weight, np.minimum(cost, 1.2))
-    best = int(total.argmin())
-    offset = 0.0
-    if 0 < best < _SCALE_CANDIDATES - 1:
-        left, middle, right = total[best - 1 : best + 2]
-        offset = float(np.clip(0.5 * (left - right) / max(left + right - 2 * middle, 1e-12), -0.5, 0.5))
-    return -math.log(low + (best + offset) * step)
+    total = np.zeros(len(candidates))
+    for n, other in enumerate(views):
+        if n != index:
+            pose = np.linalg.inv(cam2world[n]) @ cam2world[index]
+            cost = compute_matching_cost(view, other, pose, [shape], (1e-6, 1e6), _UNBOUNDED, config)
+            total += np.einsum("hw,hwk->k", weight, np.minimum(cost, _MAX_COST))
+    return total
 
 
-def agreed_scale(prior: DepthPrior, inverse: np.ndarray, consistent: np.ndarray, fallback: float) -> float:
-    """The weighted median of the factor's logarithm over pixels (h, w) whose surface is consistent between views."""
-    if consistent.sum() < 64:
-        return fallback
-    values = (-np.log(np.maximum(inverse, 1e-6)) - prior.log_depth)[consistent]
-    area = np.broadcast_to(row_weights(len(inverse)).numpy()[:, None], inverse.shape)[consistent]
-    weight = area * np.minimum(_SHARP_SCALE / np.maximum(prior.scale[consistent], 1e-3), 1)
-    order = np.argsort(values)
-    below = np.cumsum(weight[order])
-    return float(values[order][np.searchsorted(below, 0.5 * below[-1])])
-
-
-def apply_prior_cost(
-    cost: np.ndarray, prior: DepthPrior, log_factor: float, sets: Sequence[HypothesisSet], config: PriorConfig
-) -> None:
+def apply_prior_cost(cost: np.ndarray, prior: DepthPrior, sets: Sequence[HypothesisSet], config: PriorConfig) -> None:
     """Add the prior's cost to that of all hypotheses (h, w, sets * count), in place."""
     count = sets[0].penalty.shape[1]
-    log_depth = (prior.log_depth + log_factor).astype(np.float32)
+    log_depth = prior.log_depth.astype(np.float32)
     scale = np.maximum(prior.scale, config.min_scale).astype(np.float32)
     for n, hypotheses in enumerate(sets):
         _add_cost(

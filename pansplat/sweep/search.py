@@ -35,7 +35,7 @@ from pansplat.sweep.planes import (
     estimate_axes,
     make_empty_planes,
 )
-from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorModel, agreed_scale, apply_prior_cost, estimate_scale
+from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorModel, apply_prior_cost, estimate_priors
 from pansplat.sweep.room_layout import (
     FloorBoundary,
     RoomLayoutConfig,
@@ -73,8 +73,8 @@ class SearchConfig:
     """Penalty of spheres relative to supported planes."""
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     aggregation: AggregationConfig = field(default_factory=AggregationConfig)
-    room_layout: RoomLayoutConfig = field(default_factory=RoomLayoutConfig)
-    use_room_layout: bool = True
+    room_layout: RoomLayoutConfig | None = field(default_factory=RoomLayoutConfig)
+    """None for no room layout."""
     prior: PriorConfig = field(default_factory=PriorConfig)
 
 
@@ -124,38 +124,26 @@ def search_surfaces(
     planes = detect_planes(
         detection.views, detection.rays, posed.cam2world, planes, (low, high), MIN_FLOOR * posed.near, config.matching
     )
-    boundaries = detect_floor_boundaries(detection.views, detection.rays, posed.cam2world, planes, config.matching)
+    boundaries = None
+    if config.room_layout is not None:
+        boundaries = detect_floor_boundaries(detection.views, detection.rays, posed.cam2world, planes, config.matching)
     layouts = boundaries and [
         (boundary, fit_walls(boundary, planes.camera_height(pose), posed.far))
         for boundary, pose in zip(boundaries, posed.cam2world, strict=True)
     ]
-    priors = prior_model(posed.images) if prior_model is not None else None
-    factors: list[float] = []
-    if priors is not None:
-        at_detection = [prior.resize(detection.height) for prior in priors]
-        for view, prior in enumerate(at_detection):
-            others = [(detection.views[n], posed.relative_pose(view, n)) for n in range(len(posed.images)) if n != view]
-            factors.append(estimate_scale(prior, detection.views[view], others, (low, high), config.matching))
+    priors = None
+    if prior_model is not None:
+        report("estimating depth", 0.05)
+        priors = estimate_priors(
+            prior_model, posed.images, posed.cam2world, detection.views, axes[0], (low, high), config.prior,
+            config.matching,
+        )  # fmt: skip
+        priors = [prior.resize(heights[0]) for prior in priors]
     for n in range(config.coarse_passes):
         report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
         level = _SearchLevel(posed, heights[0], planes, (low, high), config, surfaces)
-        level_priors = None
-        if priors is not None:
-            level_priors = [prior.resize(heights[0]) for prior in priors]
-            if surfaces is not None:
-                factors = [
-                    agreed_scale(prior, v.inverse_depth, v.confidence == 1, factor)
-                    for prior, v, factor in zip(level_priors, level.views, factors, strict=True)
-                ]
-            if DEBUG:
-                print("heights", [math.exp(f) for f in factors])
         surfaces = [
-            level.search_full_range(
-                view,
-                count,
-                layouts[view] if layouts and config.use_room_layout else None,
-                level_priors and (level_priors[view], factors[view]),
-            )
+            level.search_full_range(view, count, layouts and layouts[view], priors and priors[view])
             for view in range(len(posed.images))
         ]
     for n, height in enumerate(heights[1:]):
@@ -172,9 +160,6 @@ def search_surfaces(
         ]
     assert surfaces is not None
     return surfaces
-
-
-DEBUG = False
 
 
 class _SearchLevel:
@@ -213,11 +198,7 @@ class _SearchLevel:
         ]
 
     def search_full_range(
-        self,
-        view: int,
-        count: int,
-        layout: tuple[FloorBoundary, Walls] | None,
-        prior: tuple[DepthPrior, float] | None = None,
+        self, view: int, count: int, layout: tuple[FloorBoundary, Walls] | None, prior: DepthPrior | None
     ) -> Surface:
         """The best hypotheses of the whole depth range: spheres (set 0) and planes across the axes (sets 1 to 3)."""
         low, high = self.limits
@@ -246,7 +227,7 @@ class _SearchLevel:
             if self.surfaces is not None:
                 self._apply_walls(view, *layout, sets, cost)
         if prior is not None:
-            apply_prior_cost(cost, *prior, sets, self.config.prior)
+            apply_prior_cost(cost, prior, sets, self.config.prior)
         return self._select_hypotheses(view, sets, cost, slot_map.astype(np.float32), count)
 
     def _apply_walls(
