@@ -39,6 +39,8 @@ BOX, ELLIPSOID, CYLINDER, GLASS, MESH = range(5)
 """Kinds of bodies. A pane of glass is a box that transmits all rays and reflects some of the light. A mesh fills a box
 with triangles."""
 STACK_SIZE = 128
+INLINE = OPTIONS | {"forceinline": True}  # calls would copy the arrays of a scene, more than a kilobyte
+_FIRST, _BEHIND, _MIRRORED, _WEAK = range(4)  # rays of the camera, behind glass, from mirrors and from polish or glass
 _BINS = 12  # candidates for the split of a BVH node
 
 
@@ -170,7 +172,7 @@ def _cylinder(ox, oy, oz, dx, dy, dz):
     return enter
 
 
-@nb.njit(**OPTIONS)
+@nb.njit(**INLINE)
 def intersect_body(kind, m, x, y, z, dx, dy, dz):
     """Distance at which a ray enters a body; inf if it misses, negative if the body is behind or around the origin."""
     px, py, pz = x - m[3], y - m[7], z - m[11]
@@ -187,7 +189,7 @@ def intersect_body(kind, m, x, y, z, dx, dy, dz):
     return _cylinder(ox, oy, oz, ux, uy, uz)
 
 
-@nb.njit(**OPTIONS)
+@nb.njit(**INLINE)
 def _enter(box, x, y, z, ix, iy, iz):
     """Distance at which a ray enters an axis-aligned box; 0 from inside, inf if it misses."""
     ax, bx = (box[0] - x) * ix, (box[3] - x) * ix
@@ -200,7 +202,7 @@ def _enter(box, x, y, z, ix, iy, iz):
     return max(enter, 0.0)
 
 
-@nb.njit(**OPTIONS)
+@nb.njit(**INLINE)
 def _hit_mesh(bodies, root, depth, x, y, z, dx, dy, dz, limit, any_hit):
     """Distance and index of the first triangle nearer than `limit` of the mesh at node `root`, or `limit` and -1.
 
@@ -257,7 +259,7 @@ def _hit_mesh(bodies, root, depth, x, y, z, dx, dy, dz, limit, any_hit):
     return best, hit
 
 
-@nb.njit(**OPTIONS)
+@nb.njit(**INLINE)
 def first_hit(bodies, x, y, z, dx, dy, dz, limit, any_hit, glass):
     """Distance, body and triangle (-1 except in meshes) of the first hit nearer than `limit`; body -1 if there is none.
 
@@ -326,6 +328,7 @@ PORTAL_WIDTH, PORTAL_HEIGHT, PORTAL_AXIS, PORTAL_SHADOWS, LIGHT_NUMBERS = 9, 10,
 LAMP, SUN, PORTAL = range(3)
 _SHARPNESS = 0.3  # size of the part of a portal that shadows are cast from; a larger part needs more rays
 _LEAST_LIGHT = 0.005  # lights that give less to a surface are omitted
+_STRONG_LIGHT = 0.4  # lights that give less cast no shadows in weak reflections
 _LEAST_REFLECTION = 0.03  # of the light; weaker reflections are omitted
 
 
@@ -420,7 +423,7 @@ def _surface_point(kind, m, half, x, y, z):
     return nx, ny, nz, face, u, v, half_u, half_v
 
 
-@nb.njit(**OPTIONS)
+@nb.njit(**INLINE)
 def _mesh_point(scene, body, triangle, x, y, z, dx, dy, dz):
     """Unit normal towards the origin of the ray, place in `slots`, image coordinates, their change per metre, and
     texture coordinates in metres."""
@@ -510,7 +513,7 @@ def _ambient_visibility(rooms, room, x, y, z, nx, ny, nz):
         (-y, -ny),
         (y + r[HEIGHT], ny),
     ):
-        if towards < 0.5:  # excludes the plane of the point itself
+        if towards < 0.5 and away < 1.5:  # excludes the plane of the point itself
             visibility *= 1 - 0.3 * math.exp(-max(away, 0.0) / 0.3)
     return visibility
 
@@ -577,7 +580,7 @@ def _brightness(light):
 _WINDOW_DEPTH = 0.4  # metres in front of a portal without shadows
 
 
-@nb.njit(**OPTIONS)
+@nb.njit(**INLINE)
 def _irradiance(light, group, x, y, z, nx, ny, nz, a, b):
     """Unshadowed irradiance of a light of unit colour, direction to a point on it, and the distance of that point.
 
@@ -617,31 +620,25 @@ def _irradiance(light, group, x, y, z, nx, ny, nz, a, b):
     return power, lx / away, ly / away, lz / away, limit
 
 
-@nb.njit(**OPTIONS)
+@nb.njit(**INLINE)
 def _direct_light(bodies, lights, last, group, x, y, z, nx, ny, nz, a, b, few):
     """Light (red, green, blue) of lamps, portals and sun at a point of a light group, with shadows.
 
     Args:
         last: per light, the body that blocked it at the previous point, which is tested first; updated.
         a, b: select a point on each light, in [-1, 1].
-        few: whether only the strongest light casts shadows.
+        few: whether only strong lights cast shadows.
     """
     kinds, maps = bodies.kinds, bodies.maps
     red, green, blue = 0.0, 0.0, 0.0
     x, y, z = x + 1e-4 * nx, y + 1e-4 * ny, z + 1e-4 * nz
-    strongest, most = -1, 0.0
-    if few:
-        for k in range(len(lights)):
-            power, _, _, _, _ = _irradiance(lights[k], group, x, y, z, nx, ny, nz, a, b)
-            power *= _brightness(lights[k])
-            if power > most:
-                strongest, most = k, power
     for k in range(len(lights)):
         light = lights[k]
         power, lx, ly, lz, limit = _irradiance(light, group, x, y, z, nx, ny, nz, a, b)
-        if power * _brightness(light) < _LEAST_LIGHT:
+        strength = power * _brightness(light)
+        if strength < _LEAST_LIGHT:
             continue
-        if few and k != strongest:
+        if few and strength < _STRONG_LIGHT:
             power *= 0.7
         elif light[LIGHT_KIND] != PORTAL or (light[PORTAL_SHADOWS] > 0 and nx * lx + ny * ly + nz * lz > 0):
             if last[k] >= 0 and 1e-6 < intersect_body(kinds[last[k]], maps[last[k]], x, y, z, lx, ly, lz) < limit:
@@ -656,7 +653,7 @@ def _direct_light(bodies, lights, last, group, x, y, z, nx, ny, nz, a, b, few):
     return red, green, blue
 
 
-@nb.njit(**OPTIONS)
+@nb.njit(**INLINE)
 def _shade(scene, last, body, triangle, x, y, z, dx, dy, dz, t, width, a, b, few):
     """Diffuse light (red, green, blue), unit normal and material at the hit of a ray; material -1 is the sky.
 
@@ -716,65 +713,68 @@ def _shade(scene, last, body, triangle, x, y, z, dx, dy, dz, t, width, a, b, few
 
 
 @nb.njit(**OPTIONS)
-def _reflect(scene, last, x, y, z, dx, dy, dz, t, nx, ny, nz, pixel, a, b, few):
-    """Light (red, green, blue) that a ray meets after its reflection at distance `t`; the rest as in `_shade`."""
-    facing = nx * dx + ny * dy + nz * dz
-    px, py, pz = x + t * dx - 1e-4 * facing * nx, y + t * dy - 1e-4 * facing * ny, z + t * dz - 1e-4 * facing * nz
-    dx, dy, dz = dx - 2 * facing * nx, dy - 2 * facing * ny, dz - 2 * facing * nz
-    further, body, triangle = first_hit(scene.bodies, px, py, pz, dx, dy, dz, math.inf, False, False)
-    width = pixel * (t + further) if body >= 0 else pixel * SKY
-    red, green, blue, _, _, _, _ = _shade(
-        scene, last, body, triangle, px, py, pz, dx, dy, dz, further, width, a, b, few
-    )
-    return red, green, blue
-
-
-@nb.njit(**OPTIONS)
 def _fresnel(facing):
     """Reflectance of glass or varnish. Source: Schlick 1994, refractive index 1.5."""
     return 0.04 + 0.96 * (1 - facing) ** 5
 
 
-@nb.njit(**OPTIONS)
-def _trace_ray(scene, last, x, y, z, dx, dy, dz, pixel, a, b):
+@nb.njit(**INLINE)
+def _trace_ray(scene, last, queue, x, y, z, dx, dy, dz, pixel, a, b):
     """Light (red, green, blue), distance, unit normal and material of the first hit of a ray behind any glass.
 
     Args:
+        queue: workspace for rays (4 9): origin, direction, weight, length of the path to the origin, and kind.
         pixel: angle of a pixel, radians.
         a, b: select a point on each light, in [-1, 1].
     """
-    pane, pane_red, pane_green, pane_blue = 0.0, 0.0, 0.0, 0.0
-    t, body, triangle = first_hit(scene.bodies, x, y, z, dx, dy, dz, math.inf, False, True)
-    if body >= 0 and scene.bodies.kinds[body] == GLASS:
-        nx, ny, nz, _, _, _, _, _ = _surface_point(
-            GLASS, scene.bodies.maps[body], scene.halves[body], x + t * dx, y + t * dy, z + t * dz
-        )
-        once = _fresnel(abs(nx * dx + ny * dy + nz * dz))
-        pane = 2 * once / (1 + once)  # both faces of the pane
-        pane_red, pane_green, pane_blue = _reflect(scene, last, x, y, z, dx, dy, dz, t, nx, ny, nz, pixel, a, b, True)
-        t, body, triangle = first_hit(scene.bodies, x, y, z, dx, dy, dz, math.inf, False, False)
-    width = pixel * t if body >= 0 else pixel * SKY
-    red, green, blue, nx, ny, nz, material = _shade(
-        scene, last, body, triangle, x, y, z, dx, dy, dz, t, width, a, b, False
-    )
-    if body < 0:
-        t = _distance_to_sky(x, y, z, dx, dy, dz)
-    else:
-        mirror = scene.materials[material, MIRROR]
-        share = mirror
-        if mirror == 0:
-            gloss = scene.materials[material, GLOSS]
-            share = gloss * _fresnel(abs(nx * dx + ny * dy + nz * dz)) - _LEAST_REFLECTION
+    red, green, blue = 0.0, 0.0, 0.0
+    seen, seen_x, seen_y, seen_z, seen_material = 0.0, 0.0, 0.0, 0.0, -1
+    queue[0, 0], queue[0, 1], queue[0, 2], queue[0, 3], queue[0, 4], queue[0, 5] = x, y, z, dx, dy, dz
+    queue[0, 6], queue[0, 7], queue[0, 8] = 1, 0, _FIRST
+    waiting = 1
+    while waiting:
+        waiting -= 1
+        ray = queue[waiting]
+        x, y, z, dx, dy, dz, weight, length, kind = ray
+        t, body, triangle = first_hit(scene.bodies, x, y, z, dx, dy, dz, math.inf, False, kind == _FIRST)
+        share, reflected = 0.0, _WEAK
+        if body >= 0 and scene.bodies.kinds[body] == GLASS:
+            nx, ny, nz, _, _, _, _, _ = _surface_point(
+                GLASS, scene.bodies.maps[body], scene.halves[body], x + t * dx, y + t * dy, z + t * dz
+            )
+            once = _fresnel(abs(nx * dx + ny * dy + nz * dz))
+            share = 2 * once / (1 + once)  # both faces of the pane
+            ray[6], ray[8] = weight * (1 - share), _BEHIND
+            waiting += 1
+        else:
+            if body < 0:
+                t = _distance_to_sky(x, y, z, dx, dy, dz)
+            width = pixel * (length + t) if body >= 0 else pixel * SKY
+            r, g, b_, nx, ny, nz, material = _shade(
+                scene, last, body, triangle, x, y, z, dx, dy, dz, t, width, a, b, kind == _WEAK
+            )
+            if kind <= _BEHIND:
+                seen, seen_x, seen_y, seen_z, seen_material = t, nx, ny, nz, material
+                if material >= 0 and scene.materials[material, MIRROR] > 0:
+                    share, reflected = scene.materials[material, MIRROR], _MIRRORED
+                elif material >= 0 and scene.materials[material, GLOSS] > 0:
+                    share = scene.materials[material, GLOSS] * _fresnel(abs(nx * dx + ny * dy + nz * dz))
+                    share = max(share - _LEAST_REFLECTION, 0.0)
+            red, green, blue = (
+                red + weight * (1 - share) * r,
+                green + weight * (1 - share) * g,
+                blue + weight * (1 - share) * b_,
+            )
         if share > 0:
-            mr, mg, mb = _reflect(scene, last, x, y, z, dx, dy, dz, t, nx, ny, nz, pixel, a, b, mirror == 0)
-            red, green, blue = red + share * (mr - red), green + share * (mg - green), blue + share * (mb - blue)
-    if pane > 0:
-        red, green, blue = (
-            red + pane * (pane_red - red),
-            green + pane * (pane_green - green),
-            blue + pane * (pane_blue - blue),
-        )
-    return red, green, blue, t, nx, ny, nz, material
+            facing = nx * dx + ny * dy + nz * dz
+            ray = queue[waiting]
+            ray[0] = x + t * dx - 1e-4 * facing * nx
+            ray[1] = y + t * dy - 1e-4 * facing * ny
+            ray[2] = z + t * dz - 1e-4 * facing * nz
+            ray[3], ray[4], ray[5] = dx - 2 * facing * nx, dy - 2 * facing * ny, dz - 2 * facing * nz
+            ray[6], ray[7], ray[8] = weight * share, length + t, reflected
+            waiting += 1
+    return red, green, blue, seen, seen_x, seen_y, seen_z, seen_material
 
 
 @nb.njit(**OPTIONS)
@@ -784,26 +784,33 @@ def _distance_to_sky(x, y, z, dx, dy, dz):
 
 
 @nb.njit(**OPTIONS)
-def _trace_pixel(scene, last, pose, i, j, du, dv, height, index):
-    """`_trace_ray` through a point of pixel (i, j); `index` selects the points on the lights. Also the direction."""
-    pixel = math.pi / height
-    longitude, latitude = pixel * (j + du) - math.pi, pixel * (i + dv) - 0.5 * math.pi
-    cx = math.cos(latitude) * math.sin(longitude)
-    cy = math.sin(latitude)
-    cz = math.cos(latitude) * math.cos(longitude)
-    dx = pose[0, 0] * cx + pose[0, 1] * cy + pose[0, 2] * cz
-    dy = pose[1, 0] * cx + pose[1, 1] * cy + pose[1, 2] * cz
-    dz = pose[2, 0] * cx + pose[2, 1] * cy + pose[2, 2] * cz
-    # The R2 sequence, spread over blocks of 4 x 4 pixels.
-    a, b = 0.7548776662466927 * index, 0.5698402909980532 * index
-    a, b = 2 * (a - math.floor(a)) - 1, 2 * (b - math.floor(b)) - 1
-    hit = _trace_ray(scene, last, pose[0, 3], pose[1, 3], pose[2, 3], dx, dy, dz, pixel, a, b)
-    return hit, (dx, dy, dz)
+def _direction(pose, height, i, j):
+    """World direction through a point (row i, column j; pixel centres at half-integers) of a panorama."""
+    longitude, latitude = math.pi * j / height - math.pi, math.pi * i / height - 0.5 * math.pi
+    x, y, z = math.cos(latitude) * math.sin(longitude), math.sin(latitude), math.cos(latitude) * math.cos(longitude)
+    return (
+        pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z,
+        pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z,
+        pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z,
+    )
+
+
+@nb.njit(**OPTIONS)
+def _find_edges(image, depth, points, normals, shown):
+    """Pixels that differ from a neighbour."""
+    height, width = depth.shape
+    edges, pixel = np.zeros((height, width), np.bool_), math.pi / height
+    for i in range(height):
+        for j in range(width):
+            for k, m in ((i, (j + 1) % width), (min(i + 1, height - 1), j)):
+                if _is_edge(image, depth, points, normals, shown, i, j, k, m, pixel):
+                    edges[i, j] = edges[k, m] = True
+    return edges
 
 
 @nb.njit(**OPTIONS)
 def _is_edge(image, depth, points, normals, shown, i, j, k, m, pixel):
-    """Whether pixels (i, j) and (k, m) show different surfaces, or colours that differ by more than 6 percent."""
+    """Whether pixels (i, j) and (k, m) show different surfaces, or colours that differ by more than 10 percent."""
     if shown[i, j] != shown[k, m]:
         return True
     if shown[i, j] < 0:
@@ -819,7 +826,7 @@ def _is_edge(image, depth, points, normals, shown, i, j, k, m, pixel):
     contrast = 0.0
     for c in range(3):
         contrast = max(contrast, abs(image[i, j, c] - image[k, m, c]) / (image[i, j, c] + image[k, m, c] + 1e-6))
-    return contrast > 0.03
+    return contrast > 0.05
 
 
 @nb.njit(**OPTIONS)
@@ -830,41 +837,38 @@ def trace_panorama(scene, pose, samples, image, depth):
     rays in place of it.
     """
     height, width = depth.shape
-    last = np.full(len(scene.lights), -1)
+    last, queue = np.full(len(scene.lights), -1), np.empty((4, 9))
     points, normals = np.empty((height, width, 3)), np.empty((height, width, 3))
-    shown, refined = np.empty((height, width), np.int64), np.zeros((height, width), np.bool_)
-    rays = samples * samples
-    for i in range(height):
-        for j in range(width):
-            block = 4 * (i % 4) + j % 4
-            (red, green, blue, t, nx, ny, nz, material), (dx, dy, dz) = _trace_pixel(
-                scene, last, pose, i, j, 0.5, 0.5, height, block
-            )
-            image[i, j, 0], image[i, j, 1], image[i, j, 2] = red, green, blue
-            points[i, j, 0], points[i, j, 1], points[i, j, 2] = t * dx, t * dy, t * dz
-            normals[i, j, 0], normals[i, j, 1], normals[i, j, 2] = nx, ny, nz
-            depth[i, j], shown[i, j] = t, material
-    if samples > 1:
-        pixel = math.pi / height
+    shown = np.empty((height, width), np.int64)
+    chosen = np.ones((height, width), np.bool_)
+    x, y, z = pose[0, 3], pose[1, 3], pose[2, 3]
+    for step in range(2 if samples > 1 else 1):
+        side = 1 if step == 0 else samples
+        if step == 1:
+            chosen = _find_edges(image, depth, points, normals, shown)
+        rays = side * side
         for i in range(height):
             for j in range(width):
-                right, below = (j + 1) % width, min(i + 1, height - 1)
-                if _is_edge(image, depth, points, normals, shown, i, j, i, right, pixel):
-                    refined[i, j] = refined[i, right] = True
-                if _is_edge(image, depth, points, normals, shown, i, j, below, j, pixel):
-                    refined[i, j] = refined[below, j] = True
-        for i in range(height):
-            for j in range(width):
-                if not refined[i, j]:
+                if not chosen[i, j]:
                     continue
-                image[i, j] = 0
+                total_red, total_green, total_blue = 0.0, 0.0, 0.0
                 for k in range(rays):
-                    du, dv = (k % samples + 0.5) / samples, (k // samples + 0.5) / samples
-                    index = rays * (4 * (i % 4) + j % 4) + k
-                    (red, green, blue, _, _, _, _, _), _ = _trace_pixel(scene, last, pose, i, j, du, dv, height, index)
-                    image[i, j, 0] += red / rays
-                    image[i, j, 1] += green / rays
-                    image[i, j, 2] += blue / rays
+                    dx, dy, dz = _direction(pose, height, i + (k // side + 0.5) / side, j + (k % side + 0.5) / side)
+                    # Points on lights follow the R2 sequence, spread over blocks of 4 x 4 pixels.
+                    number = rays * (4 * (i % 4) + j % 4) + k
+                    a, b = 0.7548776662466927 * number, 0.5698402909980532 * number
+                    a, b = 2 * (a - math.floor(a)) - 1, 2 * (b - math.floor(b)) - 1
+                    red, green, blue, t, nx, ny, nz, material = _trace_ray(
+                        scene, last, queue, x, y, z, dx, dy, dz, math.pi / height, a, b
+                    )
+                    total_red, total_green, total_blue = total_red + red, total_green + green, total_blue + blue
+                    if step == 0:
+                        points[i, j, 0], points[i, j, 1], points[i, j, 2] = t * dx, t * dy, t * dz
+                        normals[i, j, 0], normals[i, j, 1], normals[i, j, 2] = nx, ny, nz
+                        depth[i, j], shown[i, j] = t, material
+                image[i, j, 0] = total_red / rays
+                image[i, j, 1] = total_green / rays
+                image[i, j, 2] = total_blue / rays
     for i in range(height):
         for j in range(width):
             if shown[i, j] >= 0 and scene.materials[shown[i, j], MIRROR] > 0:
