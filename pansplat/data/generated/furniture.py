@@ -279,7 +279,10 @@ def _mesh_material(builder: SceneBuilder, category: str, material: MeshMaterial)
         return materials.fabric(builder)
     if kind < 0.25 and category in ("cabinet", "wardrobe", "nightstand", "shelf", "table", "coffee table", "desk"):
         return materials.wood(builder)
-    color = material.color if kind > 0.6 else materials.random_color(rng)
+    if kind < 0.5 and category in ("sofa", "bed", "armchair", "chair", "stool", "office chair", "lamp", "box", "toy"):
+        color = materials.random_color(rng, 0.5)
+    else:
+        color = materials.shade(material.color, rng.uniform(0.6, 1.2))
     return builder.add_material(Pattern.PLAIN, color, mottle=rng.uniform(0.05, 0.3), gloss=material.gloss)
 
 

@@ -31,6 +31,7 @@ from pansplat.data.generated.textures import (
     SIZE_U,
     color,
     fractal,
+    hash_unit,
     image_color,
     is_opaque,
 )
@@ -854,9 +855,8 @@ def trace_panorama(scene, pose, samples, image, depth):
                 total_red, total_green, total_blue = 0.0, 0.0, 0.0
                 for k in range(rays):
                     dx, dy, dz = _direction(pose, height, i + (k // side + 0.5) / side, j + (k % side + 0.5) / side)
-                    # Points on lights follow the R2 sequence, spread over blocks of 4 x 4 pixels.
-                    number = rays * (4 * (i % 4) + j % 4) + k
-                    a, b = 0.7548776662466927 * number, 0.5698402909980532 * number
+                    # Points on lights follow the R2 sequence from a random start.
+                    a, b = 0.7548776662466927 * k + hash_unit(i, j, 1), 0.5698402909980532 * k + hash_unit(i, j, 2)
                     a, b = 2 * (a - math.floor(a)) - 1, 2 * (b - math.floor(b)) - 1
                     red, green, blue, t, nx, ny, nz, material = _trace_ray(
                         scene, last, queue, x, y, z, dx, dy, dz, math.pi / height, a, b
