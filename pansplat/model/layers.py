@@ -106,7 +106,7 @@ class PanoramaConv2d(nn.Conv2d):
     def convolve(
         self,
         maps: Float[Tensor, "batch channel height width"],
-        weight: Float[Tensor, "c channel kernel kernel"],
+        weight: Float[Tensor, "c d kernel kernel"],
         bias: Float[Tensor, "c"] | None,
     ) -> Float[Tensor, "batch c h w"]:
         """Convolve with the given weights and bias."""
