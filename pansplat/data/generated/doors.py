@@ -25,6 +25,7 @@ class Leaf:
         towards: sign of the direction from the hinge to the handle when the door is closed.
         side: sign of the side of the wall to which the door opens.
         largest: largest angle, radians.
+        slides: whether it moves along the wall instead.
     """
 
     wall: Wall
@@ -34,6 +35,7 @@ class Leaf:
     side: int
     width: float
     largest: float
+    slides: bool = False
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ class DoorStyle:
         panels: rows and columns of raised panels, or of none.
         casing: width of the boards around holes, metres; 0 for none.
         has_glass: whether windows have panes, which reflect.
+        sliding: material of sliding doors.
     """
 
     trim: int
@@ -52,6 +55,7 @@ class DoorStyle:
     panels: tuple[int, int]
     casing: float
     has_glass: bool
+    sliding: int
 
 
 def add_wall_box(
@@ -132,6 +136,8 @@ def plan_leaves(plan: Plan, wall: Wall, hole: Hole, rng: np.random.Generator) ->
     (low, high), depth = ((z0, z1), x1 - x0) if wall.axis == 0 else ((x0, x1), z1 - z0)
     clear = hole.width - 2 * LINING - 0.004
     ends = [(hole.start + LINING + 0.002, 1), (hole.end - LINING - 0.002, -1)]
+    if RoomKind.CLOSET in kinds and clear > 1.2 and rng.random() < 0.45:
+        return [Leaf(wall, hole, hinge, towards, side, 0.52 * clear, np.pi / 2, True) for hinge, towards in ends]
     if clear < 1.1:
         # The hinge is at the end nearer to a corner, mostly.
         nearer = hole.start - low < high - hole.end
@@ -147,15 +153,20 @@ def plan_leaves(plan: Plan, wall: Wall, hole: Hole, rng: np.random.Generator) ->
     return leaves
 
 
-def add_leaf(builder: SceneBuilder, leaf: Leaf, angle: float, style: DoorStyle, shift: float = 0.0) -> None:
-    """Add a door leaf at an angle, radians; 0 is closed. `shift` moves it across the wall, metres."""
+def add_leaf(builder: SceneBuilder, leaf: Leaf, angle: float, style: DoorStyle) -> None:
+    """Add a door leaf at an angle, radians; 0 is closed. Sliding leaves are closed at 0 and open at pi / 2."""
+    shift, slide = 0.0, 0.0
+    if leaf.slides:  # two panels behind each other, of which the first moves
+        shift = -leaf.side * (0.005 if leaf.towards > 0 else 0.06)
+        slide = (leaf.hole.width - leaf.width - 2 * LINING) * angle / leaf.largest if leaf.towards > 0 else 0.0
+        angle = 0.0
     cos, sin = np.cos(angle), np.sin(angle)
     along, normal = leaf.towards, leaf.side
 
     def point(out: float, thick: float) -> tuple[float, float]:
         """World x and z at a distance from the hinge and a depth behind the leaf's face."""
         return leaf.wall.point(
-            leaf.hinge + along * (cos * out + sin * thick),
+            leaf.hinge + along * (cos * out + sin * thick + slide),
             normal * (INNER / 2 + sin * out - cos * thick) + shift,
         )
 
@@ -167,6 +178,10 @@ def add_leaf(builder: SceneBuilder, leaf: Leaf, angle: float, style: DoorStyle, 
         x, z = point((start + end) / 2, _LEAF / 2)
         builder.add_box((x, -(low + top) / 2, z), ((end - start) / 2, (top - low) / 2, thick / 2), material, yaw)
 
+    if leaf.slides:
+        add(0.0, leaf.width, 0.008, high, _LEAF, style.leaf)
+        add(0.05, leaf.width - 0.05, 0.06, high - 0.05, _LEAF + 0.006, style.sliding)
+        return
     add(0.0, leaf.width, 0.008, high, _LEAF, style.leaf)
     rows, columns = style.panels
     if leaf.width < 0.5:

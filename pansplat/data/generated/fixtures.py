@@ -104,6 +104,8 @@ def _front(
 ) -> None:
     """Add a front with a small gap around it, before a body of that depth, and its handle."""
     place.add_box(x, (low + top) / 2, -depth / 2, width - 0.012, top - low - 0.012, 0.03, material)
+    if top - low > 0.3 and width > 0.25:  # a raised panel
+        place.add_box(x, (low + top) / 2, -depth / 2, width - 0.13, top - low - 0.13, 0.042, material)
     up = top - 0.1 if low < 1 else low + 0.1
     if top - low < 0.3:
         place.add_box(x, (low + top) / 2, -depth / 2 - 0.025, min(0.12, width / 2), 0.012, 0.02, knob)
@@ -115,8 +117,8 @@ def _add_kitchen(
     builder: SceneBuilder, sides: list[Side], interior: Rectangle, height: float, occupied: list[Rectangle]
 ) -> None:
     rng = builder.rng
-    if rng.random() < 0.4:
-        front = materials.wood(builder)
+    if rng.random() < 0.45:
+        front = materials.upright_wood(builder)
     else:
         front = materials.paint(
             builder, materials.paint_color(rng) if rng.random() < 0.75 else materials.random_color(rng)
@@ -324,7 +326,13 @@ def _add_tub(
     place.add_cylinder(end * length * 0.4, 1.9, 0.33, 0.06, 0.03, steel)
     place.add_box(end * length * 0.4, 1.4, 0.36, 0.02, 1.0, 0.02, steel)
     place.add_ellipsoid(end * length * 0.4, 0.9, 0.35, 0.08, 0.08, 0.06, steel)
-    if rng.random() < 0.6:
+    if rng.random() < 0.3:
+        x, z = side.point(at + length / 2, 0.73)
+        half = (0.004, length / 2) if side.axis == 0 else (length / 2, 0.004)
+        builder.add_glass((x, -(high + 1.9) / 2, z), (half[0], (1.9 - high) / 2, half[1]))
+        for up in (high + 0.01, 1.9):
+            place.add_box(0, up, -0.355, length, 0.03, 0.03, steel)
+    elif rng.random() < 0.7:
         place.add_box(0, 2.0, -0.36, length, 0.025, 0.025, steel)
         if rng.random() < 0.7:
             cloth, wide = materials.fabric(builder), rng.uniform(0.2, 0.9) * length
@@ -335,7 +343,9 @@ def _add_tub(
 
 def _add_vanity(builder: SceneBuilder, side: Side, at: float, width: float, white: int, steel: int) -> None:
     rng = builder.rng
-    front = materials.wood(builder) if rng.random() < 0.5 else materials.paint(builder, materials.paint_color(rng))
+    front = (
+        materials.upright_wood(builder) if rng.random() < 0.5 else materials.paint(builder, materials.paint_color(rng))
+    )
     place = Place(builder, *side.point(at + width / 2, 0.25), side.yaw)
     if rng.random() < 0.2:
         place.add_cylinder(0, 0.4, 0.05, 0.09, 0.8, white)
@@ -443,9 +453,9 @@ def _add_fireplace(builder: SceneBuilder, sides: list[Side], height: float, occu
 
 
 def add_details(
-    builder: SceneBuilder, plan: Plan, index: int, height: float, occupied: list[Rectangle], furnishing: int
+    builder: SceneBuilder, plan: Plan, index: int, height: float, furnishing: int, has_radiators: bool
 ) -> None:
-    """Add outlets, switches, vents, a smoke detector, and pictures in furnished homes."""
+    """Add outlets, switches, vents, a smoke detector, radiators, and pictures in furnished homes."""
     rng, room = builder.rng, plan.rooms[index]
     if room.kind == RoomKind.CLOSET:
         return
@@ -465,6 +475,8 @@ def add_details(
                 if any(low < along - 0.06 and along + 0.06 < high for low, high in spans):
                     place = Place(builder, *side.point(along, 0.0), side.yaw)
                     place.add_box(0, 1.15, 0, rng.choice((0.07, 0.12)), 0.115, 0.016, white)
+        if has_radiators:
+            _add_radiator(builder, side, white)
         if furnishing:
             _hang_pictures(builder, side, height, furnishing)
     x0, z0, x1, z1 = plan.interior(index)
@@ -476,6 +488,18 @@ def add_details(
     if rng.random() < 0.4:
         x, z = rng.uniform(x0 + 0.3, max(x1 - 0.3, x0 + 0.3)), rng.uniform(z0 + 0.3, max(z1 - 0.3, z0 + 0.3))
         builder.add_cylinder((x, -height + 0.015, z), 0.065, 0.02, white)
+
+
+def _add_radiator(builder: SceneBuilder, side: Side, white: int) -> None:
+    """Add a radiator below the first window of a side."""
+    for hole in side.holes[:1]:
+        high = min(0.6, hole.low - 0.2)
+        if high > 0.25:
+            width = min(hole.width, builder.rng.uniform(0.6, 1.6))
+            place = Place(builder, *side.point(hole.middle, 0.07), side.yaw)
+            place.add_box(0, 0.12 + high / 2, 0, width, high, 0.06, white)
+            for x in np.arange(-width / 2 + 0.03, width / 2, 0.06):
+                place.add_box(x, 0.12 + high / 2, -0.035, 0.035, high - 0.04, 0.02, white)
 
 
 def _hang_pictures(builder: SceneBuilder, side: Side, height: float, furnishing: int) -> None:

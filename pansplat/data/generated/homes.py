@@ -77,7 +77,7 @@ class Home:
         Each camera is 0.3 to 4 metres from the nearest other one. Fewer than `count` are returned if there is no space.
         """
         areas = np.array([room.area if room.kind != RoomKind.CLOSET else 0.3 * room.area for room in self.plan.rooms])
-        areas = areas**0.8
+        areas = areas**0.9
         has_changes = rng.random() < 0.6
         yaw, spread = rng.uniform(0, 2 * np.pi), 0.05 if rng.random() < 0.6 else np.pi
         keeps_height, cameras = rng.random() < 0.75, []
@@ -104,10 +104,10 @@ class Home:
         kind = rng.random()
         x0, z0, x1, z1 = self.plan.interior(room)
         passages = [(wall, hole) for wall, hole in self.plan.passages() if room in wall.rooms]
-        if kind < 0.25 and passages:
+        if kind < 0.22 and passages:
             wall, hole = passages[rng.integers(len(passages))]
             return wall.point(hole.middle + rng.normal(0, 0.05) * hole.width, rng.normal(0, 0.25))
-        if kind < 0.6:
+        if kind < 0.68:
             share = rng.uniform(0.3, 0.7, size=2)
             return x0 + share[0] * (x1 - x0), z0 + share[1] * (z1 - z0)
         return rng.uniform(x0, x1), rng.uniform(z0, z1)
@@ -136,10 +136,11 @@ class _Style:
 def _sample_style(builder: SceneBuilder, plan: Plan, furnishing: Furnishing) -> _Style:
     rng = builder.rng
     trim = materials.trim(builder)
-    leaf = trim if rng.random() < 0.6 else materials.wood(builder) if rng.random() < 0.6 else materials.trim(builder)
+    leaf = trim if rng.random() < 0.6 else (materials.upright_wood if rng.random() < 0.6 else materials.trim)(builder)
     panels = ((0, 0), (1, 1), (2, 1), (3, 2), (2, 2))[rng.choice(5, p=(0.35, 0.1, 0.2, 0.25, 0.1))]
     casing = rng.uniform(0.05, 0.08) if rng.random() < 0.85 else 0.0
-    doors = DoorStyle(trim, leaf, materials.metal(builder), panels, casing, bool(rng.random() < 0.6))
+    sliding = materials.mirror(builder) if rng.random() < 0.3 else leaf
+    doors = DoorStyle(trim, leaf, materials.metal(builder), panels, casing, bool(rng.random() < 0.6), sliding)
     wall = materials.paint(builder, materials.paint_color(rng))
     if furnishing != Furnishing.EMPTY and rng.random() < 0.25:
         wall = materials.wall(builder)
@@ -204,13 +205,14 @@ def build_home(rng: np.random.Generator, library: FurnitureLibrary | None = None
     if stairs is not None:
         looks = (materials.wood(builder), style.doors.trim)
         add_stairs(builder, *stairs[:4], float(heights[host]), looks)
+    has_radiators = bool(rng.random() < 0.25)
     spots: list[tuple[int, tuple[float, float]]] = []
     lamps = []
     for index, room in enumerate(plan.rooms):
         lamps += add_ceiling_lamp(builder, plan, index, float(heights[index]), mood.lamps, occupied[index])
         add_fixtures(builder, plan, index, float(heights[index]), occupied[index], style.doors.trim)
         furnish(builder, plan, index, occupied[index], int(furnishing))
-        add_details(builder, plan, index, float(heights[index]), occupied[index], int(furnishing))
+        add_details(builder, plan, index, float(heights[index]), int(furnishing), has_radiators)
         if furnishing != Furnishing.EMPTY and room.area > 5 and rng.random() < 0.5:
             place = _find_place(plan, index, occupied[index], rng)
             if place is not None:
@@ -253,8 +255,10 @@ def _openness(leaves: list[Leaf], angles: list[float]) -> dict[Hole, float]:
     """For each door with leaves, the free fraction of its area."""
     found: dict[Hole, float] = {}
     for leaf, angle in zip(leaves, angles, strict=True):
-        share = leaf.width / leaf.hole.width
-        found[leaf.hole] = found.get(leaf.hole, 0.0) + share * float(1 - np.cos(min(angle, np.pi / 2)))
+        share = leaf.width / leaf.hole.width * float(1 - np.cos(min(angle, np.pi / 2)))
+        if leaf.slides:
+            share = 0.45 * angle / leaf.largest if leaf.towards > 0 else 0.0
+        found[leaf.hole] = found.get(leaf.hole, 0.0) + share
     return found
 
 

@@ -51,11 +51,12 @@ def sample_mood(rng: np.random.Generator, plan: Plan) -> LightMood:
     window = day * (rng.uniform(0.05, 0.3) if kind == 2 else rng.uniform(5, 20))
     outdoors = day * (rng.uniform(0.03, 0.3) if kind == 2 else np.exp(rng.uniform(np.log(0.9), np.log(16))))
     sun = None
-    if kind < 2 and rng.random() < 0.6:
+    if kind < 2 and rng.random() < 0.75:
         up, around = np.radians(rng.uniform(12, 50)), rng.uniform(0, 2 * np.pi)
         windows = [w for w in plan.walls if w.is_outer and any(h.kind != HoleKind.ENTRANCE for h in w.holes)]
         if windows and rng.random() < 0.85:
-            wall = windows[rng.integers(len(windows))]
+            sizes = np.array([sum(h.width * (h.top - h.low) for h in w.holes) for w in windows])
+            wall = windows[rng.choice(len(windows), p=sizes / sizes.sum())]
             outward = (0.0 if wall.axis == 2 else np.pi / 2) + (np.pi if wall.rooms[0] == OUTSIDE else 0.0)
             around = outward + np.radians(rng.uniform(-60, 60))
         direction = np.array((np.cos(up) * np.sin(around), -np.sin(up), np.cos(up) * np.cos(around)))
@@ -68,8 +69,8 @@ def sample_mood(rng: np.random.Generator, plan: Plan) -> LightMood:
 def light_groups(plan: Plan) -> list[int]:
     """For each room, the number of its light group."""
     groups = list(range(len(plan.rooms)))
-    for wall, hole in plan.passages():
-        if hole.kind == HoleKind.OPENING and hole.width > _WIDE:
+    for wall in plan.walls:
+        if not wall.is_outer and any(h.kind == HoleKind.OPENING and h.width > _WIDE for h in wall.holes):
             first, second = (groups[i] for i in wall.rooms)
             groups = [first if group == second else group for group in groups]
     numbers = {group: number for number, group in enumerate(sorted(set(groups)))}
@@ -157,8 +158,7 @@ def add_lights(
         builder.add_light(*mood.sun, 0.01, sun=True)
     for index, (room, (row, panel, trim)) in enumerate(zip(plan.rooms, rooms, strict=True)):
         corners = list(room.corners)
-        for wall in plan.walls_of(index):
-            if wall.is_outer:  # the inner half of the wall's holes belongs to the room
-                side = (0 if wall.axis == 0 else 1) + (2 if wall.rooms[0] == index else 0)
-                corners[side] = wall.at + (0.12 if side >= 2 else -0.12)
+        for k, side in enumerate(plan.sides(index)):
+            if side.is_outer:  # the inner half of the wall's holes belongs to the room
+                corners[k] += 0.12 * side.outward
         builder.add_room(corners, row, panel, trim, float(heights[index]), ambient[groups[index]], int(groups[index]))

@@ -60,8 +60,8 @@ def paint(builder: SceneBuilder, color: Color) -> int:
 def trim(builder: SceneBuilder) -> int:
     """White paint, mostly; wood or another colour."""
     rng, kind = builder.rng, builder.rng.random()
-    if kind < 0.22:
-        return wood(builder)
+    if kind < 0.25:
+        return upright_wood(builder)
     value = rng.uniform(0.85, 0.98) ** 2.2 if kind < 0.94 else rng.uniform(0.1, 0.5) ** 2.2
     return paint(builder, (value, value, value * rng.uniform(0.9, 1.0)))
 
@@ -70,7 +70,7 @@ def frame(builder: SceneBuilder) -> int:
     """White, dark or wooden frames of windows."""
     kind = builder.rng.random()
     if kind < 0.2:
-        return wood(builder)
+        return upright_wood(builder)
     value = builder.rng.uniform(0.02, 0.1) if kind < 0.35 else builder.rng.uniform(0.7, 0.92)
     return paint(builder, (value, value, value))
 
@@ -135,8 +135,15 @@ def wall_tiles(builder: SceneBuilder) -> int:
     )
 
 
+def upright_wood(builder: SceneBuilder) -> int:
+    """Wood with faint upright grain, for doors and cabinets."""
+    light, _ = random_wood_colors(builder.rng)
+    dark, gloss = shade(light, builder.rng.uniform(0.6, 0.92)), builder.rng.uniform(0.0, 0.6)
+    return builder.add_material(Pattern.PLANKS, light, dark, size=(5.0, 3.0), fraction=0.0, mottle=0.08, gloss=gloss)
+
+
 def wood(builder: SceneBuilder, size: tuple[float, float] | None = None) -> int:
-    """Wood with grain; boards of that size with joints if `size` (metres) is given."""
+    """Wood with grain; boards of that size with joints if `size` (width and length, metres) is given."""
     light, dark = random_wood_colors(builder.rng)
     gloss = builder.rng.uniform(0.0, 0.8)
     if size is None:
@@ -195,7 +202,7 @@ def floor(builder: SceneBuilder) -> int:
     base = random_color(rng, 0.5, 0.25, 0.8)
     if kind == 3:
         return builder.add_material(Pattern.STONE, base, random_color(rng, 0.3), size=rng.uniform(0.5, 1.5), fraction=1)
-    return builder.add_material(Pattern.TERRAZZO, base, random_color(rng), random_color(rng), size=0.06)
+    return builder.add_material(Pattern.TERRAZZO, base, random_color(rng, 0.3), base, size=rng.uniform(0.01, 0.03))
 
 
 def ceiling(builder: SceneBuilder) -> int:
@@ -208,7 +215,7 @@ def ceiling(builder: SceneBuilder) -> int:
     if kind < 0.9:
         size = rng.uniform(0.02, 0.08)
         return builder.add_material(Pattern.STONE, white, shade(white, rng.uniform(0.8, 0.93)), size=size, fraction=0)
-    if kind < 0.94:
+    if kind < 0.92:
         return wood(builder, (0.12, 3.0))
     return builder.add_material(
         Pattern.TILES, white, shade(white, 0.95), shade(white, 0.6), size=0.6, fraction=0.03, mottle=0.1

@@ -174,8 +174,8 @@ class Plan:
         return found
 
     def passages(self) -> list[tuple[Wall, Hole]]:
-        """Doors and openings between rooms, with their walls."""
-        return [(wall, hole) for wall in self.walls if not wall.is_outer for hole in wall.holes]
+        """Doors and openings between rooms through which one can walk, with their walls."""
+        return [(wall, hole) for wall in self.walls if not wall.is_outer for hole in wall.holes if hole.low == 0]
 
     def steps_from(self, room: int) -> list[int]:
         """Number of passages on the shortest way from one room to each room; -1 if there is no way."""
@@ -263,13 +263,13 @@ def sample_plan(rng: np.random.Generator) -> Plan:
 
 def _sample_rooms(rng: np.random.Generator) -> list[Room]:
     """Rooms of a home whose longer side is along x."""
-    size = rng.choice(3, p=(0.2, 0.45, 0.35))
+    size = rng.choice(3, p=(0.16, 0.46, 0.38))
     if size == 0:
-        width, depth = rng.uniform(3.0, 6.5), rng.uniform(2.8, 5.0)
+        width, depth = rng.uniform(3.2, 7.0), rng.uniform(3.0, 5.5)
     elif size == 1:
-        width, depth = rng.uniform(6.0, 10.5), rng.uniform(4.2, 8.0)
+        width, depth = rng.uniform(6.5, 11.0), rng.uniform(4.6, 8.5)
     else:
-        width, depth = rng.uniform(9.0, 14.0), rng.uniform(7.0, 12.0)
+        width, depth = rng.uniform(10.0, 14.0), rng.uniform(7.5, 12.0)
     if size == 0:
         kind = (RoomKind.LIVING, RoomKind.BEDROOM, RoomKind.KITCHEN)[rng.choice(3, p=(0.5, 0.3, 0.2))]
         rooms = [Room((0.0, 0.0, width, depth), kind)]
@@ -280,6 +280,8 @@ def _sample_rooms(rng: np.random.Generator) -> list[Room]:
     else:
         at = width * rng.uniform(0.35, 0.6)
         rooms = _social_rooms((0.0, 0.0, at, depth), rng) + _private_rooms((at, 0.0, width, depth), rng)
+        if rng.random() < 0.2:
+            _remove_a_corner(rooms, rng)
     _carve_behind_bathrooms(rooms)
     _carve_closets(rooms, rng)
     return rooms
@@ -351,6 +353,20 @@ def _row_of_rooms(area: Rectangle, rng: np.random.Generator) -> list[Room]:
         rooms.append(Room((at, z0, end, z1), kind))
         at = end
     return rooms
+
+
+def _remove_a_corner(rooms: list[Room], rng: np.random.Generator) -> None:
+    """Remove a room at a corner of the home, which leaves an L shape."""
+    bounds = Plan(tuple(rooms), ()).bounds
+    corners = [
+        k
+        for k, room in enumerate(rooms)
+        if k > 0
+        and room.kind not in (RoomKind.HALL, RoomKind.KITCHEN)
+        and sum(a == b for a, b in zip(room.corners, bounds, strict=True)) == 2
+    ]
+    if len(rooms) > 3 and corners:
+        rooms.pop(corners[rng.integers(len(corners))])
 
 
 def _carve_closets(rooms: list[Room], rng: np.random.Generator) -> None:
@@ -494,6 +510,19 @@ def _connect(plan: Plan, rng: np.random.Generator) -> None:
     for wall, weight in candidates:
         if not wall.holes and rng.random() < {30.0: 0.8, 20.0: 0.6, 2.0: 0.25, 1.0: 0.08}.get(weight, 0.0):
             _add_passage(plan, wall, rng)
+    for wall, weight in candidates:
+        if weight == 20.0 and wall.length > 1.8 and rng.random() < 0.25:
+            _add_pass_through(wall, rng)
+
+
+def _add_pass_through(wall: Wall, rng: np.random.Generator) -> None:
+    """Add an opening above a half-height wall, as between kitchens and living rooms, where there is space."""
+    stops = sorted([wall.start, *(at for hole in wall.holes for at in (hole.start, hole.end)), wall.end])
+    start, end = max(zip(stops[::2], stops[1::2], strict=True), key=lambda part: part[1] - part[0])
+    if end - start > 1.2:
+        width = rng.uniform(0.8, end - start - 0.3)
+        left = start + rng.uniform(0.15, end - start - width - 0.15)
+        wall.holes.append(Hole(left, left + width, rng.uniform(0.9, 1.1), rng.uniform(1.95, 2.2), HoleKind.OPENING))
 
 
 def _add_passage(plan: Plan, wall: Wall, rng: np.random.Generator) -> None:

@@ -106,6 +106,8 @@ def _per_cell(cell, size, w):
 @nb.njit(**OPTIONS)
 def _planks(material, u, v, w, seed):
     wide, long = material[SIZE_U], material[SIZE_V]
+    if wide > long:  # upright boards
+        wide, long, u, v = long, wide, v, u
     row = math.floor(v / wide)
     along = u / long + hash_unit(row, 3, seed)
     tone = 0.5 + 0.8 * _per_cell(hash_unit(row, math.floor(along), seed), wide, w)
