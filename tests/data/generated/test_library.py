@@ -122,7 +122,7 @@ def test_the_attribution_names_authors_and_licences(folder: Path) -> None:
 
 def test_homes_contain_furniture_of_a_library_and_are_complete_without_one(folder: Path) -> None:
     library, found = load_furniture(folder), 0
-    for index in range(8):
+    for index in range(16):
         home = build_home(np.random.default_rng(index), library)
         found += int((home.variants[0].arrays.bodies.kinds == MESH).sum())
     assert found > 3
