@@ -37,6 +37,12 @@ class Place:
         """Add an upright cylinder, centred at (x, up, z)."""
         self.builder.add_cylinder(self._world(x, up, z), radius, height / 2, material)
 
+    def add_mesh(self, piece: FurniturePiece, x, up, z, size, yaw=0.0) -> None:
+        """Add a piece of the library with random colours; its lower side is centred at (x, up, z)."""
+        found = [_mesh_material(self.builder, piece.category, material) for material in piece.mesh.materials]
+        half = (size[0] / 2, size[1] / 2, size[2] / 2)
+        self.builder.add_mesh(piece.mesh, self._world(x, up + half[1], z), half, found, self.yaw + yaw)
+
 
 Piece = Callable[[Place, np.random.Generator, float, float], None]
 
@@ -58,6 +64,8 @@ def clutter(place: Place, rng: np.random.Generator, up: float, width: float, dep
     builder = place.builder
     for _ in range(rng.integers(limit + 1)):
         x, z, size = rng.uniform(-0.4, 0.4) * width, rng.uniform(-0.4, 0.4) * depth, rng.uniform(0.05, 0.2)
+        if _add_small_piece(place, rng, x, up, z, min(width, depth)):
+            continue
         kind = rng.integers(5)
         if kind == 0:
             material = materials.random_material(builder)
@@ -259,13 +267,26 @@ def _library_piece(builder: SceneBuilder, own: Piece) -> tuple[Piece, float, flo
     return partial(_place_mesh, chosen, height), width, depth, height
 
 
+def _add_small_piece(place: Place, rng: np.random.Generator, x: float, up: float, z: float, space: float) -> bool:
+    """Sometimes add a small piece of the library that fits into a space (metres); whether one was added."""
+    if place.builder.library is None or rng.random() > 0.5:
+        return False
+    kinds = place.builder.library.by_category
+    pieces = kinds.get(("small", "small", "table plant", "table lamp")[rng.integers(4)], ())
+    pieces = [piece for piece in pieces if max(piece.size[0], piece.size[2]) < 0.8 * space]
+    if not pieces:
+        return False
+    chosen = pieces[rng.integers(len(pieces))]
+    turned = rng.normal(0, 0.4) if rng.random() < 0.7 else rng.uniform(0, 2 * np.pi)
+    place.add_mesh(chosen, x, up, z, chosen.size, turned)
+    return True
+
+
 def _place_mesh(
     chosen: FurniturePiece, height: float, place: Place, rng: np.random.Generator, width: float, depth: float
 ) -> None:
-    """Place a piece of the library with random colours; its back is towards +z."""
-    found = [_mesh_material(place.builder, chosen.category, material) for material in chosen.mesh.materials]
-    centre, half = (place.x, -height / 2, place.z), (width / 2, height / 2, depth / 2)
-    place.builder.add_mesh(chosen.mesh, centre, half, found, place.yaw)
+    """Place a piece of the library; its back is towards +z."""
+    place.add_mesh(chosen, 0, 0, 0, (width, height, depth))
 
 
 def _mesh_material(builder: SceneBuilder, category: str, material: MeshMaterial) -> int:

@@ -73,8 +73,8 @@ _RULES = (
     ("Living room", r"plant|cactus|orchid|bamboo|yucca|ficus|tulip|lily|flower|bonsai|spath", "plant", FREE),
     ("Living room", r"aquarium|dvd|playstation|box", "small", SURFACE),
     ("Kitchen", r"fridge|refrigerator|freezer", "fridge", WALL),
-    ("Kitchen", r"microwave|small oven|boiler", "small", SURFACE),
-    ("Kitchen", r"oven|stove|cooker$|furnace", "stove", WALL),
+    ("Kitchen", r"microwave|small oven|boiler|^cooker", "small", SURFACE),
+    ("Kitchen", r"oven|stove", "stove", WALL),
     ("Kitchen", r"hood", "hood", HUNG),
     ("Kitchen", r"upper", "kitchen upper cabinet", HUNG),
     ("Kitchen", r"^island", "kitchen island", FREE),
@@ -84,7 +84,7 @@ _RULES = (
     ("Kitchen", r"trash|basket", "bin", FREE),
     ("Kitchen", r"fork|^knife$|spoon|cooktop|induction|broom|shovel|^tool$|towel$", "", ""),
     ("Kitchen", r"", "small", SURFACE),
-    ("Bathroom", r"shower head|urinal|potty|curtain|mat$", "", ""),
+    ("Bathroom", r"shower head|shower door|urinal|potty|curtain|mat$", "", ""),
     ("Bathroom", r"shower", "shower", WALL),
     ("Bathroom", r"bath$|bathtub", "bath", WALL),
     ("Bathroom", r"toilets unit", "toilet", WALL),
@@ -125,6 +125,10 @@ _RULES = (
         HUNG,
     ),
 )
+
+
+_SOLID_GLASS = ("table", "coffee table", "desk", "stove", "fridge", "washbasin", "tv", "cabinet")
+"""Categories in which glass is shown, as an opaque material."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +236,7 @@ def _read_catalogue(path: Path) -> Iterable[tuple[dict[str, Any], Mesh]]:
             # The files have y up and the front towards +z; `modelRotation` brings a model there.
             turn = np.array(item.get("modelRotation", "1 0 0 0 1 0 0 0 1").split(), float).reshape(3, 3)
             turn = np.diag((1.0, -1.0, -1.0)) @ turn
-            mesh = _read_model(archive, item["model"].lstrip("/"), turn, "table" in category or category == "desk")
+            mesh = _read_model(archive, item["model"].lstrip("/"), turn, category in _SOLID_GLASS)
             if len(mesh.slots) < _MIN_TRIANGLES:
                 continue
             description = {
