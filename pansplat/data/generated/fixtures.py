@@ -453,9 +453,19 @@ def _add_fireplace(builder: SceneBuilder, sides: list[Side], height: float, occu
 
 
 def add_details(
-    builder: SceneBuilder, plan: Plan, index: int, height: float, furnishing: int, has_radiators: bool
+    builder: SceneBuilder,
+    plan: Plan,
+    index: int,
+    height: float,
+    furnishing: int,
+    has_radiators: bool,
+    fixed: list[Rectangle],
 ) -> None:
-    """Add outlets, switches, vents, a smoke detector, radiators, and pictures in furnished homes."""
+    """Add outlets, switches, vents, a smoke detector, radiators, and pictures in furnished homes.
+
+    Args:
+        fixed: floor that fixtures cover; no picture hangs above it.
+    """
     rng, room = builder.rng, plan.rooms[index]
     if room.kind == RoomKind.CLOSET:
         return
@@ -478,7 +488,7 @@ def add_details(
         if has_radiators:
             _add_radiator(builder, side, white)
         if furnishing:
-            _hang_pictures(builder, side, height, furnishing)
+            _hang_pictures(builder, side, height, furnishing, fixed)
     x0, z0, x1, z1 = plan.interior(index)
     if rng.random() < 0.5:
         vent = materials.metal(builder)
@@ -502,12 +512,12 @@ def _add_radiator(builder: SceneBuilder, side: Side, white: int) -> None:
                 place.add_box(x, 0.12 + high / 2, -0.035, 0.035, high - 0.04, 0.02, white)
 
 
-def _hang_pictures(builder: SceneBuilder, side: Side, height: float, furnishing: int) -> None:
+def _hang_pictures(builder: SceneBuilder, side: Side, height: float, furnishing: int, fixed: list[Rectangle]) -> None:
     rng = builder.rng
     taken: list[tuple[float, float]] = []
     for _ in range(int(rng.integers(0, (1, 2, 3, 5)[furnishing]))):
         wide, high = rng.uniform(0.2, 1.2), rng.uniform(0.2, 0.9)
-        spans = [(a, b) for a, b in side.free_spans(2.1, 0.05, []) if b - a > wide + 0.3]
+        spans = [(a, b) for a, b in side.free_spans(2.1, 0.05, fixed) if b - a > wide + 0.3]
         if not spans:
             continue
         low, end = spans[rng.integers(len(spans))]

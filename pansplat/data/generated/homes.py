@@ -206,24 +206,25 @@ def build_home(rng: np.random.Generator, library: FurnitureLibrary | None = None
         looks = (materials.wood(builder), style.doors.trim)
         add_stairs(builder, *stairs[:4], float(heights[host]), looks)
     has_radiators = bool(rng.random() < 0.25)
-    spots: list[tuple[int, tuple[float, float]]] = []
+    spots: list[tuple[int, float, float]] = []
     lamps = []
     for index, room in enumerate(plan.rooms):
         lamps += add_ceiling_lamp(builder, plan, index, float(heights[index]), mood.lamps, occupied[index])
         add_fixtures(builder, plan, index, float(heights[index]), occupied[index], style.doors.trim)
+        fixed = list(occupied[index])
         furnish(builder, plan, index, occupied[index], int(furnishing))
-        add_details(builder, plan, index, float(heights[index]), int(furnishing), has_radiators)
+        add_details(builder, plan, index, float(heights[index]), int(furnishing), has_radiators, fixed)
         if furnishing != Furnishing.EMPTY and room.area > 5 and rng.random() < 0.5:
             place = _find_place(plan, index, occupied[index], rng)
             if place is not None:
-                spots.append((index, place))
+                spots.append((int(rng.integers(1 << 31)), *place))
     variants = []
     angles = [_sample_angle(leaf, rng) for leaf in leaves]
     for _ in range(2):
         variant = _fork(builder)
         for leaf, angle in zip(leaves, angles, strict=True):
             add_leaf(variant, leaf, angle, style.doors)
-        _add_movables(variant, spots, rng)
+        _add_movables(variant, spots)
         add_lights(variant, plan, rooms, heights, lamps, _openness(leaves, angles), mood, furnishing > 0)
         variants.append(variant.finish(mood.outdoors, outside, sky))
         angles = [
@@ -276,7 +277,7 @@ def _room_row(
         if room.kind == RoomKind.BATHROOM and rng.random() < 0.4:
             panel = materials.wall_tiles(builder)
             wall = panel if rng.random() < 0.4 else wall
-        elif rng.random() < 0.06:
+        elif rng.random() < 0.03:
             panel = style.doors.trim
         ceiling = style.ceiling if rng.random() < 0.9 else materials.ceiling(builder)
         floor = style.floors.get(room.kind, style.floors[RoomKind.LIVING])
@@ -339,17 +340,16 @@ def _find_place(
     return None
 
 
-def _add_movables(
-    builder: SceneBuilder, spots: list[tuple[int, tuple[float, float]]], rng: np.random.Generator
-) -> None:
-    """Add a chair or boxes at random offsets, some of them missing."""
-    for number, (_, (x, z)) in enumerate(spots):
+def _add_movables(builder: SceneBuilder, spots: list[tuple[int, float, float]]) -> None:
+    """Add a chair or boxes at random offsets, some of them missing; they look the same in all variants."""
+    rng = builder.rng
+    for seed, x, z in spots:
         if rng.random() < 0.75:
-            place = Place(
-                builder, x + rng.uniform(-0.25, 0.25), z + rng.uniform(-0.25, 0.25), rng.uniform(0, 2 * np.pi)
-            )
-            piece = chair if number % 2 == 0 else crates
-            piece(place, rng, 0.5, 0.5)
+            dx, dz = rng.uniform(-0.25, 0.25, size=2)
+            place = Place(builder, x + dx, z + dz, rng.uniform(0, 2 * np.pi))
+            builder.rng = np.random.default_rng(seed)
+            (chair if seed % 2 else crates)(place, builder.rng, 0.5, 0.5)
+            builder.rng = rng
 
 
 def _add_outdoors(builder: SceneBuilder, plan: Plan, mood: LightMood) -> tuple[int, int]:

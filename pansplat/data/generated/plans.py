@@ -370,7 +370,7 @@ def _remove_a_corner(rooms: list[Room], rng: np.random.Generator) -> None:
 
 
 def _carve_closets(rooms: list[Room], rng: np.random.Generator) -> None:
-    """Cut strips for closets, pantries and alcoves off rooms, never at the side of a hall."""
+    """Cut strips for closets, pantries and alcoves off rooms, never at the side of a hall or of a closet of the same room."""
     for index in range(len(rooms)):
         room = rooms[index]
         chance = {RoomKind.BEDROOM: 0.65, RoomKind.KITCHEN: 0.25, RoomKind.LIVING: 0.3}.get(room.kind, 0.0)
@@ -385,8 +385,12 @@ def _carve_closets(rooms: list[Room], rng: np.random.Generator) -> None:
         rest = list(room.corners)
         inner = room.corners[side] + (depth if side < 2 else -depth)
         strip[(side + 2) % 4], rest[side] = inner, inner
-        touches_hall = any(other.kind == RoomKind.HALL and _shared_side(other.corners, tuple(strip)) for other in rooms)
-        if touches_hall:
+        is_needed = any(
+            _shared_side(other.corners, tuple(strip))
+            for other in rooms
+            if other.kind == RoomKind.HALL or other.parent == index
+        )
+        if is_needed:
             continue
         rooms[index] = replace(room, corners=tuple(rest))
         low, high = (strip[1], strip[3]) if side % 2 == 0 else (strip[0], strip[2])
@@ -491,8 +495,7 @@ def _connect(plan: Plan, rng: np.random.Generator) -> None:
             pairs[wall.rooms] = wall
     for index, room in enumerate(plan.rooms):
         if room.parent >= 0:
-            wall = pairs.get((index, room.parent)) or pairs[room.parent, index]
-            _add_passage(plan, wall, rng)
+            _add_passage(plan, pairs.get((index, room.parent)) or pairs[room.parent, index], rng)
     inner = {i for i, room in enumerate(plan.rooms) if room.parent >= 0}
     candidates = [
         (wall, _affinity(*(plan.rooms[i] for i in wall.rooms))) for wall in pairs.values() if wall.length > 0.95
