@@ -40,6 +40,7 @@ BOX, ELLIPSOID, CYLINDER, GLASS, MESH = range(5)
 """Kinds of bodies. A pane of glass is a box that transmits all rays and reflects some of the light. A mesh fills a box
 with triangles."""
 STACK_SIZE = 128
+FLOOR_CELL = 0.05  # metres
 INLINE = OPTIONS | {"forceinline": True}  # calls would copy the arrays of a scene, more than a kilobyte
 _FIRST, _BEHIND, _MIRRORED, _WEAK = range(4)  # rays of the camera, behind glass, from mirrors and from polish or glass
 _BINS = 12  # candidates for the split of a BVH node
@@ -369,6 +370,8 @@ class SceneArrays(NamedTuple):
             its first material in `slots`.
         normals: normals of a triangle's corners.
         triangle_slots: place of a triangle's material relative to the first one of the mesh.
+        floor_light: fraction of the ambient light on the floor (z x), in cells of `FLOOR_CELL` from the world x and z
+            `floor_start`.
         ambient: ambient light (red, green, blue) outside the rooms.
         outside, sky: indices of materials.
     """
@@ -381,6 +384,8 @@ class SceneArrays(NamedTuple):
     slots: NDArray[np.int64]
     materials: NDArray[np.float64]
     rooms: NDArray[np.float64]
+    floor_light: NDArray[np.float64]
+    floor_start: NDArray[np.float64]
     lights: NDArray[np.float64]
     ambient: NDArray[np.float64]
     outside: int
@@ -517,6 +522,18 @@ def _ambient_visibility(rooms, room, x, y, z, nx, ny, nz):
         if towards < 0.5 and away < 1.5:  # excludes the plane of the point itself
             visibility *= 1 - 0.3 * math.exp(-max(away, 0.0) / 0.3)
     return visibility
+
+
+@nb.njit(**OPTIONS)
+def _floor_visibility(cells, start, x, z):
+    """Bilinear interpolation of the fraction of ambient light on the floor, 1 outside of the cells."""
+    u, v = (x - start[0]) / FLOOR_CELL - 0.5, (z - start[1]) / FLOOR_CELL - 0.5
+    j, i = int(math.floor(u)), int(math.floor(v))
+    if i < 0 or j < 0 or i + 1 >= cells.shape[0] or j + 1 >= cells.shape[1]:
+        return 1.0
+    u, v = u - j, v - i
+    upper = cells[i, j] * (1 - u) + cells[i, j + 1] * u
+    return upper * (1 - v) + v * (cells[i + 1, j] * (1 - u) + cells[i + 1, j + 1] * u)
 
 
 @nb.njit(**OPTIONS)
@@ -700,6 +717,8 @@ def _shade(scene, last, body, triangle, x, y, z, dx, dy, dz, t, width, a, b, few
     if room >= 0:
         ambient, group = scene.rooms[room, AMBIENT:LIGHT_GROUP], int(scene.rooms[room, LIGHT_GROUP])
     around = _ambient_visibility(scene.rooms, room, px, py, pz, nx, ny, nz) * (0.85 - 0.15 * ny)
+    if ny < -0.5 and -0.03 < py < 0.03:
+        around *= _floor_visibility(scene.floor_light, scene.floor_start, px, pz)
     lr, lg, lb = _direct_light(scene.bodies, scene.lights, last, group, px, py, pz, nx, ny, nz, a, b, few)
     glow = surface[GLOW]
     return (

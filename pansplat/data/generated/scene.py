@@ -14,6 +14,7 @@ from pansplat.data.generated.raytracer import (
     BOX,
     CYLINDER,
     ELLIPSOID,
+    FLOOR_CELL,
     GLASS,
     LAMP,
     LIGHT_NUMBERS,
@@ -64,6 +65,33 @@ class GeneratedScene:
         maps, halves = self.arrays.bodies.maps.reshape(-1, 3, 4), self.arrays.halves
         local = np.abs(np.einsum("bij,nbj->nbi", maps[:, :, :3], points[:, None] - maps[:, :, 3]))
         return np.linalg.norm(np.maximum(local - 1, 0) * halves, axis=-1).min(axis=1)
+
+
+def _floor_light(low: Array, high: Array, is_structure: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Fraction of the ambient light that reaches the floor around and below bodies, in cells of `FLOOR_CELL`.
+
+    Args:
+        is_structure: walls, floors and ceilings, which `ambient_visibility` takes into account.
+
+    Returns:
+        Cells (z x), and the world x and z of the first corner.
+    """
+    extent = high - low
+    stands = (high[:, 1] > -0.6) & (high[:, 1] < 0.1) & (low[:, 1] < -0.05) & (extent[:, ::2].max(axis=1) < 4)
+    low, high = low[stands & ~is_structure], high[stands & ~is_structure]
+    if len(low) == 0:
+        return np.ones((1, 1)), np.zeros(2)
+    start = low[:, ::2].min(axis=0) - 0.5
+    cells = np.ceil((high[:, ::2].max(axis=0) + 0.5 - start) / FLOOR_CELL).astype(int)
+    covered = np.zeros(cells[::-1])
+    first = np.floor((low[:, ::2] - start) / FLOOR_CELL).astype(int)
+    last = np.ceil((high[:, ::2] - start) / FLOOR_CELL).astype(int)
+    for (x0, z0), (x1, z1), bottom in zip(first, last, -high[:, 1], strict=True):
+        area = covered[z0:z1, x0:x1]
+        np.maximum(area, 1 - max(bottom, 0.0) / 0.6, out=area)
+    for axis in (0, 1, 0, 1):  # two box filters give about a Gaussian
+        covered = np.mean([np.roll(covered, k, axis) for k in range(-3, 4)], axis=0)
+    return 1 - 0.65 * covered, start
 
 
 class SceneBuilder:
@@ -211,6 +239,7 @@ class SceneBuilder:
             images=np.array([(start, *texture.size) for start, texture in zip(starts, self.textures, strict=False)]),
             stack=np.empty(STACK_SIZE, np.int64),
         )
+        floor_light, floor_start = _floor_light(low, high, np.array(self.faces)[:, 0] < 0)
         arrays = SceneArrays(
             bodies=bodies,
             halves=np.array(self.halves)[order],
@@ -220,6 +249,8 @@ class SceneBuilder:
             slots=np.array(self.slots, np.int64),
             materials=np.array(self.materials),
             rooms=np.array(self.rooms),
+            floor_light=floor_light,
+            floor_start=floor_start,
             lights=np.array(self.lights) if self.lights else np.zeros((0, LIGHT_NUMBERS)),
             ambient=np.array(ambient, np.float64),
             outside=outside,

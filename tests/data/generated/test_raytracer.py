@@ -182,3 +182,18 @@ def test_polished_floors_reflect_more_at_grazing_angles() -> None:
     assert np.array_equal(matt[1], polished[1])
     gain = polished[0][..., 0] - matt[0][..., 0]
     assert gain[38, 64] > 2 * gain[46, 64] > 0
+
+
+def test_the_floor_is_darker_below_and_beside_what_stands_on_it() -> None:
+    def fill(up: float, builder: SceneBuilder, material: int) -> None:
+        builder.add_box((0, 0.1, 0), (9, 0.1, 9), material)
+        builder.add_box((2, -up - 0.2, 0), (0.3, 0.2, 0.3), material)
+
+    images = [_scene(lambda b, m, up=up: fill(up, b, m)).panorama(_pose(0, -1.5, 0), 128, 1)[0] for up in (0.0, 5.0)]
+    column = 192  # towards +x
+    rows = np.arange(90, 120)
+    distances = 1.5 / np.tan((rows + 0.5) * math.pi / 128 - math.pi / 2)
+    shade = images[0][rows, column, 0] / images[1][rows, column, 0]
+    beside = (distances > 1.6) & (distances < 1.69)
+    assert (shade[distances < 1.3] == 1).all()
+    assert (shade[beside] < 0.85).all() and beside.any()
