@@ -12,6 +12,7 @@ from tyro.conf import subcommand
 from pansplat.cli.bench import Bench
 from pansplat.cli.check import Check
 from pansplat.cli.convert import Convert
+from pansplat.cli.data import Data
 from pansplat.cli.evaluate import Evaluate
 from pansplat.cli.info import Info
 from pansplat.cli.predict import Predict
@@ -26,6 +27,7 @@ Command = (
     | Annotated[Info, subcommand("info")]
     | Annotated[Bench, subcommand("bench")]
     | Annotated[Convert, subcommand("convert")]
+    | Annotated[Data, subcommand("data")]
 )
 
 

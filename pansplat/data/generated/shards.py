@@ -9,7 +9,7 @@ from __future__ import annotations
 import bisect
 import json
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -20,6 +20,7 @@ from jaxtyping import Float, Float32
 from numpy.typing import NDArray
 
 from pansplat.atomic import replacing
+from pansplat.data.images import linear_from_srgb
 from pansplat.errors import InputError
 
 TOURS_PER_SHARD = 16
@@ -110,6 +111,43 @@ def write_shards(
     return len(missing)
 
 
+def pack_triplets(source: Path, folder: Path, height: int) -> int:
+    """Write shards of rendered triplets of game maps, and return their number of tours; a last part is left out.
+
+    Args:
+        source: files NAME_0.png to NAME_2.png (sRGB), NAME_0_depth.png to NAME_2_depth.png (millimetres, 16 bit), and
+            NAME.json with "c2w", three poses in metres with y down.
+
+    Raises:
+        InputError: there are too few triplets, a file is missing or damaged, or the shards cannot be written.
+    """
+    names = sorted(path.with_suffix("") for path in source.glob("*.json"))
+    names = names[: len(names) // TOURS_PER_SHARD * TOURS_PER_SHARD]
+    if not names:
+        raise InputError(f"{source}: needed at least {TOURS_PER_SHARD} rendered triplets, got fewer; render more.")
+    folder.mkdir(parents=True, exist_ok=True)
+    for number in range(len(names) // TOURS_PER_SHARD):
+        chosen = names[number * TOURS_PER_SHARD : (number + 1) * TOURS_PER_SHARD]
+        _save_shard(_shard_path(folder, number), (_read_triplet(name, height) for name in chosen))
+    return len(names)
+
+
+def _read_triplet(name: Path, height: int) -> Tour:
+    """The tour of a rendered triplet; the height of each camera over the floor is the depth at the nadir."""
+    try:
+        poses = np.array(json.loads(name.with_suffix(".json").read_text())["c2w"], np.float64)
+        images = [cv2.imread(f"{name}_{n}.png", cv2.IMREAD_COLOR)[..., ::-1] for n in range(3)]
+        depths = [cv2.imread(f"{name}_{n}_depth.png", cv2.IMREAD_UNCHANGED) / _MILLIMETRES for n in range(3)]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{name}: needed a rendered triplet, got {error!r}; render it again.") from error
+    size = (2 * height, height)
+    light = linear_from_srgb(np.stack([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in images]) / 255)
+    light *= _MEDIAN_LIGHT / max(float(np.median(light)), 1e-4)
+    depth = np.stack([cv2.resize(d, size, interpolation=cv2.INTER_NEAREST) for d in depths])
+    floor = [float(np.median(view[-height // 16 :])) for view in depth]
+    return Tour(light.astype(np.float32), depth.astype(np.float32), poses, np.maximum(floor, 0.3))
+
+
 class ShardReader:
     """The tours of one or more folders of shards, by index.
 
@@ -158,14 +196,19 @@ def _run_tasks(tasks: list[tuple[Path, TourSettings, int]], workers: int) -> Ite
 
 def _write_shard(task: tuple[Path, TourSettings, int]) -> None:
     folder, settings, number = task
+    first = number * TOURS_PER_SHARD
+    tours = (render_tour(settings, index) for index in range(first, first + TOURS_PER_SHARD))
+    _save_shard(_shard_path(folder, number), tours)
+
+
+def _save_shard(path: Path, tours: Iterable[Tour]) -> None:
     arrays: dict[str, NDArray] = {}
-    for place in range(TOURS_PER_SHARD):
-        tour = render_tour(settings, number * TOURS_PER_SHARD + place)
+    for place, tour in enumerate(tours):
         code = np.sqrt(np.clip(tour.light, 0, _MAX_LIGHT) / _MAX_LIGHT) * _LARGEST
         arrays[f"{place}.light"] = _pack([_encode(view) for view in code])
         arrays[f"{place}.depth"] = _pack([_encode(np.minimum(view * _MILLIMETRES, _LARGEST)) for view in tour.depth])
         arrays[f"{place}.cam2world"], arrays[f"{place}.camera_height"] = tour.cam2world, tour.camera_height
-    with replacing(_shard_path(folder, number)) as partial, open(partial, "wb") as file:
+    with replacing(path) as partial, open(partial, "wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
 

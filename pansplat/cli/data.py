@@ -1,0 +1,86 @@
+"""`pansplat data`: training data of the depth network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, subcommand
+
+from pansplat.cli.inputs import Out
+from pansplat.errors import InputError
+
+
+@dataclass(frozen=True)
+class DataHomes:
+    """Render tours of generated homes into compressed shards. The same seed always gives the same tours."""
+
+    out: Out
+    """Folder for the shards. Shards that are there are kept; run the command again after an interruption."""
+    count: int = 1024
+    """Number of homes, rounded up to whole shards of 16."""
+    seed: int = 0
+    """Seed of the homes."""
+    height: int = 128
+    """Height of the panoramas, pixels; a multiple of 32."""
+    cameras: int = 4
+    """Panoramas of each home."""
+    workers: int = 1
+    """Processes that render."""
+
+    def run(self) -> int:
+        """Render with a progress bar."""
+        from rich.progress import Progress
+
+        from pansplat.data.generated.shards import TourSettings, write_shards
+
+        for name, value, least in (
+            ("count", self.count, 1),
+            ("cameras", self.cameras, 2),
+            ("workers", self.workers, 1),
+        ):
+            if value < least:
+                raise InputError(f"--{name} must be at least {least}, got {value}")
+        if self.height < 32 or self.height % 32:
+            raise InputError(f"--height must be a multiple of 32 pixels, got {self.height}")
+        settings = TourSettings(seed=self.seed, height=self.height, cameras=self.cameras)
+        with Progress() as progress:
+            task = progress.add_task("rendering homes", total=self.count)
+
+            def advance(tours: int) -> None:
+                progress.advance(task, tours)
+
+            shards = write_shards(self.out, self.count, settings, workers=self.workers, progress=advance)
+        print(f"{self.out}: {shards} new shards")
+        return 0
+
+
+@dataclass(frozen=True)
+class DataMaps:
+    """Pack triplets that were rendered from game maps (PNG, depth in millimetres, JSON) into shards."""
+
+    source: Positional[Path]
+    """Folder of the triplets."""
+    out: Out
+    """Folder for the shards."""
+    height: int = 128
+    """Height of the panoramas, pixels."""
+
+    def run(self) -> int:
+        """Pack and print the number of tours."""
+        from pansplat.data.generated.shards import pack_triplets
+
+        print(f"{self.out}: {pack_triplets(self.source, self.out, self.height)} tours")
+        return 0
+
+
+@dataclass(frozen=True)
+class Data:
+    """Make training data of the depth network."""
+
+    kind: Annotated[DataHomes, subcommand("homes")] | Annotated[DataMaps, subcommand("maps")]
+
+    def run(self) -> int:
+        """Run the subcommand."""
+        return self.kind.run()
