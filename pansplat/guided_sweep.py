@@ -2,15 +2,89 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
 
+from pansplat.errors import InputError
 from pansplat.model.depth_network import DepthEstimate
-from pansplat.model.depth_refinement import DepthRefinement, Observations
+from pansplat.model.depth_refinement import DepthRefinement, Observations, RefinementConfig
 from pansplat.model.layers import to_channels_last
+from pansplat.model.weights import (
+    config_from_dict,
+    load_weights,
+    pack_weights,
+    require_shapes,
+    save_weights,
+)
+from pansplat.sweep import Sweep
+from pansplat.sweep.predictor import SweepConfig
 from pansplat.sweep.prior import DepthPrior
+from pansplat.sweep.search import SearchConfig
+
+MODEL = "depth"  # name of the network in a weights file
+_SOURCES = ("guided_sweep.py", "model/efficientnet.py", "model/depth_network.py", "model/depth_refinement.py")
+
+
+class GuidedSweep(Sweep):
+    """A sweep guided by a depth network.
+
+    Args:
+        network: in eval mode.
+        weights_hash: changes with the weights.
+        name: in messages and scene files.
+    """
+
+    def __init__(self, network: DepthRefinement, weights_hash: str, name: str = "default") -> None:
+        config = SweepConfig(search=SearchConfig(room_layout=None))
+        super().__init__(config, NetworkPrior(network, weights_hash + _hash_sources()))
+        self.name = name
+
+
+def load_guided_sweep(path: Path, name: str = "default") -> GuidedSweep:
+    """The guided sweep of a weights file that `save_depth_network` wrote.
+
+    Raises:
+        InputError: the file is missing, damaged, or holds other weights.
+    """
+    weights = load_weights(path)
+    if weights.model != MODEL:
+        raise InputError(f"{path}: needed weights of a depth network, got weights of {weights.model!r}")
+    network = DepthRefinement(config_from_dict(RefinementConfig, weights.config, f"{path}: config"))
+    tensors = {name: t.float() if t.is_floating_point() else t for name, t in weights.tensors.items()}
+    require_shapes(tensors, network.state_dict(), path)
+    network.load_state_dict(tensors)
+    digest = hashlib.blake2b(path.read_bytes(), digest_size=8).hexdigest()
+    return GuidedSweep(network.eval(), digest, name)
+
+
+def save_depth_network(path: Path, network: DepthRefinement, state: dict[str, Tensor]) -> None:
+    """Write a network's weights: kernels in float16, the rest in float32.
+
+    Args:
+        state: the weights, such as their moving average.
+    """
+    half = {name: t.half() if t.is_floating_point() and t.ndim > 1 else t for name, t in state.items()}
+    save_weights(path, pack_weights(MODEL, network.config, half, compat="fixed"))
+
+
+def default_weights() -> Path:
+    """The weights that the package ships."""
+    return Path(str(files("pansplat.default_model").joinpath("model.safetensors")))
+
+
+def _hash_sources() -> str:
+    """Hash of the modules that compute the prior."""
+    digest = hashlib.blake2b(digest_size=4)
+    for name in _SOURCES:
+        digest.update(files("pansplat").joinpath(name).read_bytes())
+    return digest.hexdigest()
 
 
 class NetworkPrior:
@@ -29,7 +103,7 @@ class NetworkPrior:
     def observe(self, images: Sequence[np.ndarray]) -> NetworkObservation:
         """Observe upright panoramas (h, w, 3), RGB in [0, 1]."""
         maps = torch.stack([torch.from_numpy(image).permute(2, 0, 1) for image in images]).float()
-        small = torch.nn.functional.interpolate(maps, (self.height, 2 * self.height), mode="area")
+        small = interpolate(maps, (self.height, 2 * self.height), mode="area")
         estimate, observed = self.network.observe(to_channels_last(small))
         return NetworkObservation(self.network, estimate, observed)
 

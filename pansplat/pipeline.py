@@ -24,7 +24,7 @@ from pansplat.gaussians.ply import load_ply, save_ply, save_ply_parts
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians, prune
 from pansplat.geometry.pose import blend_weights
 from pansplat.model.layers import Precision
-from pansplat.model.weights import WEIGHTS_SUFFIXES, CompatChoice
+from pansplat.model.weights import WEIGHTS_SUFFIXES, CompatChoice, read_model_name
 from pansplat.predictor import Predictor, Progress
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
@@ -45,8 +45,8 @@ def load_model(
     """Load a predictor.
 
     Args:
-        name: "sweep", or a file of weights: a .safetensors file from `pansplat convert` or from training, or an
-            official checkpoint (.ckpt).
+        name: "default", the trained model of the package; "sweep", without weights; or a file of weights: a
+            .safetensors file from `pansplat convert` or from training, or an official checkpoint (.ckpt).
         compat: for networks: "official" reproduces the official code with its defects; "fixed" corrects them;
             "trained" is the mode of the training, which is "official" for official weights.
         precision: for networks: number type of the convolutions; docs/bench_model.md shows time against error.
@@ -67,9 +67,20 @@ def load_model(
             f"`model` must be one of {', '.join(sorted(_MODELS))}, or a file of weights "
             f"({', '.join(WEIGHTS_SUFFIXES)}), got {str(name)!r}"
         )
+    path = Path(name).expanduser()
+    if read_model_name(path) == "depth":
+        from pansplat.guided_sweep import load_guided_sweep
+
+        return load_guided_sweep(path, path.stem)
     from pansplat.model.network import load_predictor
 
-    return load_predictor(Path(name).expanduser(), compat, precision=precision, **options)
+    return load_predictor(path, compat, precision=precision, **options)
+
+
+def _load_default() -> Predictor:
+    from pansplat.guided_sweep import default_weights, load_guided_sweep
+
+    return load_guided_sweep(default_weights())
 
 
 def _load_sweep(**options: Any) -> Predictor:
@@ -78,7 +89,7 @@ def _load_sweep(**options: Any) -> Predictor:
     return Sweep(**options)
 
 
-_MODELS: dict[str, Callable[..., Predictor]] = {"sweep": _load_sweep}
+_MODELS: dict[str, Callable[..., Predictor]] = {"default": _load_default, "sweep": _load_sweep}
 
 
 def predict(

@@ -38,7 +38,7 @@ CHECKPOINT_SUFFIXES = (".ckpt", ".pt", ".pth")
 WEIGHTS_SUFFIXES = (".safetensors", *CHECKPOINT_SUFFIXES)
 COMPATS: dict[str, Compat] = {"official": "official", "fixed": "fixed"}
 
-ModelName = Literal["pansplat", "mvsplat"]
+ModelName = Literal["pansplat", "mvsplat", "depth"]
 
 _T = TypeVar("_T")
 _Layer = tuple[str, str, tuple[str, ...]]  # official name, our name, tensors
@@ -129,6 +129,15 @@ def load_weights(path: str | Path) -> WeightsFile:
             f"{path}: needed settings in its metadata, got {error}; convert the checkpoint again"
         ) from error
     return WeightsFile(metadata["model"], config, compat, tensors)
+
+
+def read_model_name(path: Path) -> str | None:
+    """Name of the network in the metadata of a weights file; None if it has none."""
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            return (file.metadata() or {}).get("model")
+    except (safetensors.SafetensorError, OSError, ValueError):
+        return None
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:

@@ -30,7 +30,8 @@ class SweepConfig:
 class Sweep:
     """Hierarchical sphere sweep with a hand-crafted matching cost; see docs/sweep.md.
 
-    It takes two or more views and matches each against all others.
+    It takes two or more views and matches each against all others. A prior model adds knowledge of rooms where the
+    panoramas have no evidence.
     """
 
     name = "sweep"
@@ -38,6 +39,8 @@ class Sweep:
     def __init__(self, config: SweepConfig | None = None, prior: PriorModel | None = None) -> None:
         self.config, self.prior = config or SweepConfig(), prior
         self.fingerprint = _compute_fingerprint(self.config)
+        if prior is not None:
+            self.fingerprint += f"-{prior.fingerprint}"
 
     def __call__(
         self,

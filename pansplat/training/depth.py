@@ -28,6 +28,7 @@ from pansplat.data.generated.shards import ShardReader, Tour
 from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import row_weights
+from pansplat.guided_sweep import save_depth_network
 from pansplat.model.depth_network import DepthEstimate
 from pansplat.model.depth_refinement import DepthRefinement, RefinementConfig
 from pansplat.model.efficientnet import load_imagenet_weights
@@ -261,7 +262,7 @@ class DepthTrainer:
         return self.step >= config.steps
 
     def save(self) -> None:
-        """Write a checkpoint and delete old ones."""
+        """Write a checkpoint and the averaged weights, and delete old checkpoints."""
         state = {
             "config": json.dumps(dataclasses.asdict(self.config), default=str),
             "network": self.network.state_dict(),
@@ -269,6 +270,7 @@ class DepthTrainer:
             "optimizer": self.optimizer.state_dict(),
         }
         save_checkpoint(self.config.out / "checkpoints", self.step, state, keep=2)
+        save_depth_network(self.config.out / "model.safetensors", self.network, self.average.state)
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
@@ -314,11 +316,12 @@ class DepthTrainer:
         self.optimizer.zero_grad()
         terms["loss"].backward()
         norm = float(torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip))
-        if not (math.isfinite(float(terms["loss"])) and math.isfinite(norm)):
-            raise InputError(f"step {self.step}: needed finite numbers, got a loss of {float(terms['loss'])}.")
+        loss = float(terms["loss"].detach())
+        if not (math.isfinite(loss) and math.isfinite(norm)):
+            raise InputError(f"step {self.step}: needed finite numbers, got a loss of {loss}; lower --rate.")
         self.optimizer.step()
         self.average.update(self.network, self.step)
-        values = {name: float(value) for name, value in terms.items() if name in _COLUMNS}
+        values = {name: float(value.detach()) for name, value in terms.items() if name in _COLUMNS}
         return {
             **values,
             "rate": self.config.rate * factor,
@@ -331,8 +334,7 @@ def load_matching(network: DepthRefinement, path: Path) -> None:
     """Load the averaged weights of a checkpoint that have the names and shapes of the network's."""
     state = load_checkpoint(path)["mean"]
     own = network.state_dict()
-    renamed = {f"mono.{name}" if f"mono.{name}" in own else name: tensor for name, tensor in state.items()}
-    fitting = {name: t for name, t in renamed.items() if name in own and own[name].shape == t.shape}
+    fitting = {name: t for name, t in state.items() if name in own and own[name].shape == t.shape}
     network.load_state_dict({**own, **fitting})
 
 

@@ -176,7 +176,7 @@ class ShardReader:
         shard = bisect.bisect_right(self._ends, index)
         path, place = self.paths[shard], index % TOURS_PER_SHARD
         try:
-            with np.load(path, allow_pickle=False) as shard_file:
+            with open(path, "rb") as file, np.load(file, allow_pickle=False) as shard_file:
                 lights = [_decode(png) for png in _unpack(shard_file[f"{place}.light"])]
                 depths = [_decode(png) for png in _unpack(shard_file[f"{place}.depth"])]
                 poses, heights = shard_file[f"{place}.cam2world"], shard_file[f"{place}.camera_height"]

@@ -1,0 +1,99 @@
+import numpy as np
+import pytest
+import torch
+
+from pansplat.errors import InputError
+from pansplat.guided_sweep import NetworkPrior, load_guided_sweep, save_depth_network
+from pansplat.model.depth_network import DepthNetworkConfig
+from pansplat.model.depth_refinement import DepthRefinement, RefinementConfig
+from pansplat.model.weights import pack_weights, save_weights
+from pansplat.pipeline import load_model
+
+_CONFIG = RefinementConfig(
+    mono=DepthNetworkConfig(room_channels=24, attention_layers=1, attention_heads=3, decoder_channels=(16, 12, 8, 8)),
+    candidates=9,
+    matching_channels=4,
+    channels=(8, 12, 16),
+)
+
+
+def _network(seed=0):
+    torch.manual_seed(seed)
+    network = DepthRefinement(_CONFIG)
+    for head in (network.head, network.mono.head):
+        torch.nn.init.normal_(head.weight, std=0.1)
+    return network.eval()
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    path = tmp_path_factory.mktemp("weights") / "depth.safetensors"
+    network = _network()
+    save_depth_network(path, network, network.state_dict())
+    return path
+
+
+def _images(views=2, height=64):
+    return np.random.default_rng(0).random((views, height, 2 * height, 3), np.float32)
+
+
+def test_saved_network_estimates_the_same_depth(weights):
+    loaded, network = load_guided_sweep(weights), NetworkPrior(_network(), "", 64)
+    assert isinstance(loaded.prior, NetworkPrior)
+    loaded.prior.height = 64
+    first, second = (prior.observe(_images()).priors for prior in (loaded.prior, network))
+    assert first[0].log_depth.shape == (32, 64)
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_allclose(a.log_depth, b.log_depth, atol=5e-3)
+        np.testing.assert_allclose(a.scale, b.scale, rtol=2e-2)
+
+
+def test_refined_depth_is_in_the_unit_of_the_poses():
+    prior = NetworkPrior(_network(), "", 64)
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = (0, 0.5, 1)
+    far = poses.copy()
+    far[:, :3, 3] *= 10
+    observed = prior.observe(_images(3))
+    small, large = observed.refine([1.5] * 3, poses, 2), observed.refine([15.0] * 3, far, 2)
+    for a, b in zip(small, large, strict=True):
+        np.testing.assert_allclose(a.log_depth + np.log(10), b.log_depth, atol=5e-3)
+
+
+def test_fingerprint_depends_on_the_weights(weights, tmp_path):
+    other = _network(1)
+    save_depth_network(tmp_path / "other.safetensors", other, other.state_dict())
+    fingerprints = {load_guided_sweep(path).fingerprint for path in (weights, tmp_path / "other.safetensors")}
+    fingerprints.add(load_model("sweep").fingerprint)
+    assert len(fingerprints) == 3
+
+
+def test_file_of_weights_is_a_model(weights):
+    model = load_model(weights)
+    assert model.name == "depth" and model.fingerprint == load_guided_sweep(weights).fingerprint
+
+
+def test_other_weights_are_refused(tmp_path):
+    path = tmp_path / "other.safetensors"
+    save_weights(path, pack_weights("pansplat", _CONFIG, {"a": torch.zeros(1)}, compat="fixed"))
+    with pytest.raises(InputError, match=r"needed weights of a depth network, got weights of 'pansplat'"):
+        load_guided_sweep(path)
+
+
+def test_missing_weight_is_refused(tmp_path):
+    network = _network()
+    state = {name: tensor for name, tensor in network.state_dict().items() if name != "head.bias"}
+    save_depth_network(tmp_path / "part.safetensors", network, state)
+    with pytest.raises(InputError, match=r"head\.bias"):
+        load_guided_sweep(tmp_path / "part.safetensors")
+
+
+@pytest.mark.slow
+def test_prediction_takes_any_number_of_views(weights):
+    model = load_guided_sweep(weights)
+    images = torch.from_numpy(_images(3)).permute(0, 3, 1, 2)
+    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    poses[:, 0, 3] = torch.tensor((0.0, 0.5, 1.0))
+    gaussians = model(images, poses, 0.3, 20.0)
+    assert set(gaussians.views.tolist()) == {0, 1, 2}
+    assert all(torch.isfinite(getattr(gaussians, name)).all() for name in ("means", "scales", "opacities"))
