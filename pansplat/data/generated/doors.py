@@ -47,6 +47,7 @@ class DoorStyle:
         casing: width of the boards around holes, metres; 0 for none.
         has_glass: whether windows have panes, which reflect.
         sliding: material of sliding doors.
+        curtains: share of the windows with curtains.
     """
 
     trim: int
@@ -56,6 +57,7 @@ class DoorStyle:
     casing: float
     has_glass: bool
     sliding: int
+    curtains: float
 
 
 def add_wall_box(
@@ -225,10 +227,11 @@ def add_window(builder: SceneBuilder, wall: Wall, hole: Hole, style: DoorStyle, 
         x, z = wall.point(hole.middle, sign * 0.16)
         half = (0.003, hole.width / 2) if wall.axis == 0 else (hole.width / 2, 0.003)
         builder.add_glass((x, -(hole.low + hole.top) / 2, z), (half[0], (hole.top - hole.low) / 2, half[1]))
-    _add_shade(builder, wall, hole, sign, rng)
+    _add_shade(builder, wall, hole, sign, style.curtains)
 
 
-def _add_shade(builder: SceneBuilder, wall: Wall, hole: Hole, sign: int, rng: np.random.Generator) -> None:
+def _add_shade(builder: SceneBuilder, wall: Wall, hole: Hole, sign: int, curtains: float) -> None:
+    rng = builder.rng
     kind = rng.random()
     high = hole.top - hole.low
     if kind < 0.18:  # slats
@@ -256,7 +259,7 @@ def _add_shade(builder: SceneBuilder, wall: Wall, hole: Hole, sign: int, rng: np
             (across[0], across[1]),
             material,
         )
-    elif kind < 0.5:  # curtains beside the window, with folds
+    elif kind < 0.3 + curtains:  # curtains beside the window, with folds
         cloth, rod = materials.fabric(builder), materials.metal(builder)
         width, low = rng.uniform(0.15, 0.35), 0.04 if rng.random() < 0.7 else max(0.0, hole.low - 0.2)
         top = hole.top + 0.12

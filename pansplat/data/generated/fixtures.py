@@ -75,16 +75,20 @@ def add_ceiling_lamp(
 
 
 def add_fixtures(
-    builder: SceneBuilder, plan: Plan, index: int, height: float, occupied: list[Rectangle], trim: int
+    builder: SceneBuilder, plan: Plan, index: int, height: float, occupied: list[Rectangle], trim: int, is_bare: bool
 ) -> None:
-    """Add what is built into a room of its kind; `occupied` gets the floor that it covers."""
+    """Add what is built into a room of its kind; `occupied` gets the floor that it covers.
+
+    Args:
+        is_bare: whether counters, rails and shelves are empty.
+    """
     rng, kind, sides = builder.rng, plan.rooms[index].kind, plan.sides(index)
     if kind == RoomKind.KITCHEN:
-        _add_kitchen(builder, sides, plan.interior(index), height, occupied)
+        _add_kitchen(builder, sides, plan.interior(index), height, occupied, is_bare)
     elif kind == RoomKind.BATHROOM:
-        _add_bathroom(builder, sides, occupied)
+        _add_bathroom(builder, sides, occupied, is_bare)
     elif kind == RoomKind.CLOSET:
-        _add_closet(builder, sides, occupied, trim)
+        _add_closet(builder, sides, occupied, trim, is_bare)
     elif kind == RoomKind.UTILITY:
         _add_machines(builder, sides, occupied)
     elif kind == RoomKind.LIVING and rng.random() < 0.25:
@@ -114,7 +118,12 @@ def _front(
 
 
 def _add_kitchen(
-    builder: SceneBuilder, sides: list[Side], interior: Rectangle, height: float, occupied: list[Rectangle]
+    builder: SceneBuilder,
+    sides: list[Side],
+    interior: Rectangle,
+    height: float,
+    occupied: list[Rectangle],
+    is_bare: bool,
 ) -> None:
     rng = builder.rng
     if rng.random() < 0.45:
@@ -150,6 +159,9 @@ def _add_kitchen(
             needed.remove("fridge")
             at = start + 0.84
         _add_counter(builder, side, (at, end), (front, top, knob), (appliance, steel, black), needed, tiles)
+        if not is_bare and rng.random() < 0.5:
+            place = Place(builder, *side.point((at + end) / 2, 0.31), side.yaw)
+            clutter(place, rng, 0.92, end - at, 0.4, 6)
         for low, high in side.free_spans(2.1, 0.3, []):
             low, high = max(low, start), min(high, end)
             if high - low > 0.4 and rng.random() < 0.85:
@@ -228,8 +240,6 @@ def _add_counter(
         else:
             _front(place, x, 0.12, 0.68, 0.58, width, front, knob)
             _front(place, x, 0.68, 0.86, 0.58, width, front, knob)
-    if rng.random() < 0.4:
-        clutter(place, rng, 0.92, end - start, 0.4, 6)
 
 
 def _add_sink(place: Place, x: float, width: float, steel: int, dark: int, rng: np.random.Generator) -> None:
@@ -263,7 +273,7 @@ def _add_fridge(place: Place, rng: np.random.Generator, material: int, knob: int
         place.add_box(-0.33, (low + top) / 2, -0.4, 0.025, 0.6 * (top - low), 0.03, knob)
 
 
-def _add_bathroom(builder: SceneBuilder, sides: list[Side], occupied: list[Rectangle]) -> None:
+def _add_bathroom(builder: SceneBuilder, sides: list[Side], occupied: list[Rectangle], is_bare: bool) -> None:
     rng = builder.rng
     white = materials.paint(builder, (rng.uniform(0.75, 0.92),) * 3)
     steel, tiles = materials.metal(builder), materials.wall_tiles(builder)
@@ -274,7 +284,7 @@ def _add_bathroom(builder: SceneBuilder, sides: list[Side], occupied: list[Recta
             side, start, end = spans[rng.integers(len(spans))]
             at = start if rng.random() < 0.5 else end - least
             occupied.append(side.area(at, at + least, 0.78))
-            _add_tub(builder, side, at, least, is_shower, (white, steel, tiles))
+            _add_tub(builder, side, at, least, is_shower, (white, steel, tiles), is_bare)
             break
     spans = _longest_spans(sides, 0.8, 0.5, 0.65, occupied)
     if spans:
@@ -301,12 +311,18 @@ def _add_bathroom(builder: SceneBuilder, sides: list[Side], occupied: list[Recta
                     x, z = side.point((low + high) / 2, 0.06)
                     place = Place(builder, x, z, side.yaw)
                     place.add_box(0, 1.25, 0, 0.5, 0.02, 0.02, steel)
-                    if rng.random() < 0.5:
+                    if not is_bare and rng.random() < 0.5:
                         place.add_box(0, 1.0, -0.01, 0.35, 0.5, 0.03, materials.fabric(builder))
 
 
 def _add_tub(
-    builder: SceneBuilder, side: Side, at: float, length: float, is_shower: bool, looks: tuple[int, int, int]
+    builder: SceneBuilder,
+    side: Side,
+    at: float,
+    length: float,
+    is_shower: bool,
+    looks: tuple[int, int, int],
+    is_bare: bool,
 ) -> None:
     """Add a bathtub or a shower tray with tiled walls, a tap, and perhaps a curtain."""
     rng, (white, steel, tiles) = builder.rng, looks
@@ -334,7 +350,7 @@ def _add_tub(
             place.add_box(0, up, -0.355, length, 0.03, 0.03, steel)
     elif rng.random() < 0.7:
         place.add_box(0, 2.0, -0.36, length, 0.025, 0.025, steel)
-        if rng.random() < 0.7:
+        if not is_bare and rng.random() < 0.7:
             cloth, wide = materials.fabric(builder), rng.uniform(0.2, 0.9) * length
             for k, x in enumerate(np.arange(0, wide, 0.07)):
                 offset = end * (length / 2 - 0.03 - x)
@@ -372,7 +388,7 @@ def _add_vanity(builder: SceneBuilder, side: Side, at: float, width: float, whit
                 place.add_ellipsoid(x * min(width, 1), 1.1 + high, 0.16, 0.1, 0.1, 0.1, bulb)
 
 
-def _add_closet(builder: SceneBuilder, sides: list[Side], occupied: list[Rectangle], trim: int) -> None:
+def _add_closet(builder: SceneBuilder, sides: list[Side], occupied: list[Rectangle], trim: int, is_bare: bool) -> None:
     """Shelves and a rail for clothes at the wall opposite to the door."""
     rng = builder.rng
     board = trim if rng.random() < 0.6 else materials.wood(builder)
@@ -387,7 +403,7 @@ def _add_closet(builder: SceneBuilder, sides: list[Side], occupied: list[Rectang
     if rng.random() < 0.35:
         for up in np.arange(rng.uniform(0.3, 0.5), 2.1, rng.uniform(0.3, 0.45)):
             place.add_box(0, up, 0, length, 0.025, depth, board)
-            if rng.random() < 0.4:
+            if not is_bare and rng.random() < 0.5:
                 clutter(place, rng, up + 0.0125, length * 0.9, depth * 0.5, 5)
         return
     up = rng.uniform(1.65, 1.9)
@@ -401,7 +417,7 @@ def _add_closet(builder: SceneBuilder, sides: list[Side], occupied: list[Rectang
         place.add_box(0, up - 0.06, depth / 2 - 0.01, length, 0.09, 0.02, board)
     rail = materials.metal(builder)
     place.add_box(0, up - 0.09, -0.02, length, 0.028, 0.028, rail)
-    if rng.random() < 0.35:
+    if not is_bare and rng.random() < 0.45:
         for x in np.arange(-0.45 * length, rng.uniform(-0.4, 0.45) * length, rng.uniform(0.05, 0.12)):
             high = rng.uniform(0.6, 1.1)
             cloth = materials.fabric(builder)

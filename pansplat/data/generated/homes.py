@@ -140,7 +140,16 @@ def _sample_style(builder: SceneBuilder, plan: Plan, furnishing: Furnishing) -> 
     panels = ((0, 0), (1, 1), (2, 1), (3, 2), (2, 2))[rng.choice(5, p=(0.35, 0.1, 0.2, 0.25, 0.1))]
     casing = rng.uniform(0.05, 0.08) if rng.random() < 0.85 else 0.0
     sliding = materials.mirror(builder) if rng.random() < 0.3 else leaf
-    doors = DoorStyle(trim, leaf, materials.metal(builder), panels, casing, bool(rng.random() < 0.6), sliding)
+    doors = DoorStyle(
+        trim,
+        leaf,
+        materials.metal(builder),
+        panels,
+        casing,
+        bool(rng.random() < 0.6),
+        sliding,
+        (0.04, 0.12, 0.3, 0.3)[furnishing],
+    )
     wall = materials.paint(builder, materials.paint_color(rng))
     if furnishing != Furnishing.EMPTY and rng.random() < 0.25:
         wall = materials.wall(builder)
@@ -210,7 +219,7 @@ def build_home(rng: np.random.Generator, library: FurnitureLibrary | None = None
     lamps = []
     for index, room in enumerate(plan.rooms):
         lamps += add_ceiling_lamp(builder, plan, index, float(heights[index]), mood.lamps, occupied[index])
-        add_fixtures(builder, plan, index, float(heights[index]), occupied[index], style.doors.trim)
+        add_fixtures(builder, plan, index, float(heights[index]), occupied[index], style.doors.trim, furnishing == 0)
         fixed = list(occupied[index])
         furnish(builder, plan, index, occupied[index], int(furnishing))
         add_details(builder, plan, index, float(heights[index]), int(furnishing), has_radiators, fixed)

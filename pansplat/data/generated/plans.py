@@ -370,7 +370,7 @@ def _remove_a_corner(rooms: list[Room], rng: np.random.Generator) -> None:
 
 
 def _carve_closets(rooms: list[Room], rng: np.random.Generator) -> None:
-    """Cut strips for closets, pantries and alcoves off rooms, never at the side of a hall or of a closet of the same room."""
+    """Cut strips for closets, pantries and alcoves off rooms, but not at a hall or at a closet of the same room."""
     for index in range(len(rooms)):
         room = rooms[index]
         chance = {RoomKind.BEDROOM: 0.65, RoomKind.KITCHEN: 0.25, RoomKind.LIVING: 0.3}.get(room.kind, 0.0)

@@ -23,7 +23,7 @@ def _box(leaf: Leaf, angle: float) -> tuple[np.ndarray, np.ndarray]:
     """Corners of the leaf without its handle."""
     builder = SceneBuilder(np.random.default_rng(0))
     material = builder.add_material(Pattern.PLAIN, (0.5, 0.5, 0.5))
-    add_leaf(builder, leaf, angle, DoorStyle(material, material, material, (0, 0), 0.0, False, material))
+    add_leaf(builder, leaf, angle, DoorStyle(material, material, material, (0, 0), 0.0, False, material, 0.0))
     maps, half = builder.maps[0].reshape(3, 4), builder.halves[0]
     signs = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
     return signs * half @ (maps[:, :3] * half[:, None]) + maps[:, 3], half
