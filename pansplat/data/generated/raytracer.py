@@ -577,7 +577,12 @@ def portal_form_factor(light, x, y, z, nx, ny, nz):
         size = math.sqrt(qx * qx + qy * qy + qz * qz) + 1e-9
         qx, qy, qz = qx / size, qy / size, qz / size
         cosine = min(0.9999, max(-0.9999, px * qx + py * qy + pz * qz))
-        weight = math.acos(cosine) / math.sqrt(1 - cosine * cosine) * (0.5 / math.pi)
+        # A rational fit of arccos(cosine) / sin(arccos(cosine)) / 2 pi. Source: Hill and Heitz, Real-time area
+        # lighting: a journey from research to production, SIGGRAPH 2016 course.
+        c = abs(cosine)
+        weight = (0.8543985 + (0.4965155 + 0.0145206 * c) * c) / (3.4175940 + (4.1616724 + c) * c)
+        if cosine < 0:
+            weight = 0.5 / math.sqrt(1 - cosine * cosine) - weight
         fx += weight * (py * qz - pz * qy)
         fy += weight * (pz * qx - px * qz)
         fz += weight * (px * qy - py * qx)
@@ -845,7 +850,7 @@ def _is_edge(image, depth, points, normals, shown, i, j, k, m, pixel):
         return True
     contrast = 0.0
     for c in range(3):
-        contrast = max(contrast, abs(image[i, j, c] - image[k, m, c]) / (image[i, j, c] + image[k, m, c] + 1e-6))
+        contrast = max(contrast, abs(image[i, j, c] - image[k, m, c]) / (image[i, j, c] + image[k, m, c] + 0.05))
     return contrast > 0.05
 
 
@@ -854,7 +859,7 @@ def trace_panorama(scene, pose, samples, image, depth):
     """Fill `image` (H W 3) with linear light and `depth` (H W) with metres, 0 where a mirror is seen.
 
     One ray passes through each pixel centre. Pixels that differ from a neighbour then get the mean of samples x samples
-    rays in place of it.
+    rays.
     """
     height, width = depth.shape
     last, queue = np.full(len(scene.lights), -1), np.empty((4, 9))
@@ -863,17 +868,22 @@ def trace_panorama(scene, pose, samples, image, depth):
     chosen = np.ones((height, width), np.bool_)
     x, y, z = pose[0, 3], pose[1, 3], pose[2, 3]
     for step in range(2 if samples > 1 else 1):
-        side = 1 if step == 0 else samples
+        rays = 1 if step == 0 else samples * samples - 1
         if step == 1:
             chosen = _find_edges(image, depth, points, normals, shown)
-        rays = side * side
         for i in range(height):
             for j in range(width):
                 if not chosen[i, j]:
                     continue
                 total_red, total_green, total_blue = 0.0, 0.0, 0.0
-                for k in range(rays):
-                    dx, dy, dz = _direction(pose, height, i + (k // side + 0.5) / side, j + (k % side + 0.5) / side)
+                if step == 1:
+                    total_red, total_green, total_blue = image[i, j, 0], image[i, j, 1], image[i, j, 2]
+                for k in range(step, step + rays):
+                    row, column = i + 0.5, j + 0.5
+                    if step == 1:  # on one or two rings around the centre
+                        radius, angle = 0.36 if rays < 4 else 0.25 + 0.2 * (k % 2), 2 * math.pi * (k + 0.25) / rays
+                        row, column = row + radius * math.sin(angle), column + radius * math.cos(angle)
+                    dx, dy, dz = _direction(pose, height, row, column)
                     # Points on lights follow the R2 sequence from a random start.
                     a, b = 0.7548776662466927 * k + hash_unit(i, j, 1), 0.5698402909980532 * k + hash_unit(i, j, 2)
                     a, b = 2 * (a - math.floor(a)) - 1, 2 * (b - math.floor(b)) - 1
@@ -885,9 +895,9 @@ def trace_panorama(scene, pose, samples, image, depth):
                         points[i, j, 0], points[i, j, 1], points[i, j, 2] = t * dx, t * dy, t * dz
                         normals[i, j, 0], normals[i, j, 1], normals[i, j, 2] = nx, ny, nz
                         depth[i, j], shown[i, j] = t, material
-                image[i, j, 0] = total_red / rays
-                image[i, j, 1] = total_green / rays
-                image[i, j, 2] = total_blue / rays
+                image[i, j, 0] = total_red / (step + rays)
+                image[i, j, 1] = total_green / (step + rays)
+                image[i, j, 2] = total_blue / (step + rays)
     for i in range(height):
         for j in range(width):
             if shown[i, j] >= 0 and scene.materials[shown[i, j], MIRROR] > 0:
