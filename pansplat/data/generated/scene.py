@@ -71,7 +71,7 @@ def _floor_light(low: Array, high: Array, is_structure: NDArray[np.bool_]) -> tu
     """Fraction of the ambient light that reaches the floor around and below bodies, in cells of `FLOOR_CELL`.
 
     Args:
-        is_structure: walls, floors and ceilings, which `ambient_visibility` takes into account.
+        is_structure: walls, floors and ceilings, which `ambient_visibility` takes into account, and bodies outdoors.
 
     Returns:
         Cells (z x), and the world x and z of the first corner.
@@ -89,8 +89,9 @@ def _floor_light(low: Array, high: Array, is_structure: NDArray[np.bool_]) -> tu
     for (x0, z0), (x1, z1), bottom in zip(first, last, -high[:, 1], strict=True):
         area = covered[z0:z1, x0:x1]
         np.maximum(area, 1 - max(bottom, 0.0) / 0.6, out=area)
-    for axis in (0, 1, 0, 1):  # two box filters give about a Gaussian
-        covered = np.mean([np.roll(covered, k, axis) for k in range(-3, 4)], axis=0)
+    for _ in range(4):  # two box filters of 7 cells along each axis give about a Gaussian
+        sums = np.cumsum(np.pad(covered, ((4, 3), (0, 0))), axis=0)
+        covered = ((sums[7:] - sums[:-7]) / 7).T
     return 1 - 0.65 * covered, start
 
 
@@ -239,7 +240,10 @@ class SceneBuilder:
             images=np.array([(start, *texture.size) for start, texture in zip(starts, self.textures, strict=False)]),
             stack=np.empty(STACK_SIZE, np.int64),
         )
-        floor_light, floor_start = _floor_light(low, high, np.array(self.faces)[:, 0] < 0)
+        rooms = np.array(self.rooms)
+        is_outside = (low[:, ::2] > rooms[:, 2:4].max(axis=0)) | (high[:, ::2] < rooms[:, :2].min(axis=0))
+        is_structure = (np.array(self.faces)[:, 0] < 0) | is_outside.any(axis=1)
+        floor_light, floor_start = _floor_light(low, high, is_structure)
         arrays = SceneArrays(
             bodies=bodies,
             halves=np.array(self.halves)[order],
@@ -248,7 +252,7 @@ class SceneBuilder:
             triangle_slots=tree.slots,
             slots=np.array(self.slots, np.int64),
             materials=np.array(self.materials),
-            rooms=np.array(self.rooms),
+            rooms=rooms,
             floor_light=floor_light,
             floor_start=floor_start,
             lights=np.array(self.lights) if self.lights else np.zeros((0, LIGHT_NUMBERS)),
