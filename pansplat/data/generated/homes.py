@@ -201,9 +201,13 @@ def build_home(rng: np.random.Generator, library: FurnitureLibrary | None = None
     rooms = [_room_row(builder, plan, index, style, furnishing, heights[index]) for index in range(len(plan.rooms))]
     leaves, occupied = _add_walls(builder, plan, style, top)
     stairs, knee = None, rng.uniform(1.0, 1.7)
-    host = int(rng.integers(len(plan.rooms)))
-    if rng.random() < 0.4 and plan.rooms[host].kind in (RoomKind.LIVING, RoomKind.HALL, RoomKind.DINING):
-        stairs = plan_stairs(plan, host, float(heights[host]), occupied[host], rng)
+    host = 0
+    if rng.random() < 0.35:
+        for host in rng.permutation(len(plan.rooms)):
+            if plan.rooms[host].kind in (RoomKind.LIVING, RoomKind.HALL, RoomKind.DINING):
+                stairs = plan_stairs(plan, host, float(heights[host]), occupied[host], rng)
+            if stairs is not None:
+                break
     for index in range(len(plan.rooms)):
         height = float(heights[index])
         well = stairs[4] if stairs is not None and index == host else None
