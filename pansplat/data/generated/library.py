@@ -174,7 +174,7 @@ class FurnitureLibrary:
         """Markdown list of all pieces with their authors and licences."""
         lines = ["Models of Sweet Home 3D (https://www.sweethome3d.com), simplified and scaled.", ""]
         for licence in sorted({piece.licence for piece in self.pieces}):
-            lines += [f"## {licence}", ""]
+            lines += [f"### {licence}", ""]
             authors: dict[str, list[str]] = {}
             for piece in self.pieces:
                 if piece.licence == licence:
@@ -237,7 +237,7 @@ def _read_catalogue(path: Path) -> Iterable[tuple[dict[str, Any], Mesh]]:
             turn = np.array(item.get("modelRotation", "1 0 0 0 1 0 0 0 1").split(), float).reshape(3, 3)
             turn = np.diag((1.0, -1.0, -1.0)) @ turn
             mesh = _read_model(archive, item["model"].lstrip("/"), turn, category in _SOLID_GLASS)
-            if len(mesh.slots) < _MIN_TRIANGLES:
+            if len(mesh.material_ids) < _MIN_TRIANGLES:
                 continue
             description = {
                 "name": item["name"],
@@ -272,7 +272,7 @@ def _read_model(archive: zipfile.ZipFile, name: str, turn: NDArray[np.float64], 
     materials, opacities = zip(*(_material(archive, folder, rows.get(key, {})) for key in names), strict=True)
     mesh = make_mesh(simplify(triangles, _MAX_TRIANGLES), materials, turn)
     # The box, which the catalogue's size describes, contains the glass.
-    return mesh if with_glass else select_triangles(mesh, np.array(opacities)[mesh.slots] > 0.4)
+    return mesh if with_glass else select_triangles(mesh, np.array(opacities)[mesh.material_ids] > 0.4)
 
 
 def _material(archive: zipfile.ZipFile, folder: PurePosixPath, row: dict[str, str]) -> tuple[MeshMaterial, float]:
@@ -306,7 +306,9 @@ def _texture(archive: zipfile.ZipFile, folder: PurePosixPath, name: str) -> Text
 
 def _pack(pieces: Iterable[tuple[dict[str, Any], Mesh]]) -> dict[str, NDArray]:
     """Arrays of the cache."""
-    parts: dict[str, list[NDArray]] = {key: [] for key in ("corners", "normals", "texcoords", "slots", "materials")}
+    parts: dict[str, list[NDArray]] = {
+        key: [] for key in ("corners", "normals", "texcoords", "material_ids", "materials")
+    }
     descriptions, images, known = [], [], {}
     for description, mesh in pieces:
         rows = []
@@ -323,9 +325,9 @@ def _pack(pieces: Iterable[tuple[dict[str, Any], Mesh]]) -> dict[str, NDArray]:
         parts["corners"].append(np.rint(mesh.corners * 32767).astype(np.int16))
         parts["normals"].append(np.rint(mesh.normals * 127).astype(np.int8))
         parts["texcoords"].append(mesh.texcoords)
-        parts["slots"].append(mesh.slots.astype(np.int16))
+        parts["material_ids"].append(mesh.material_ids.astype(np.int16))
         parts["materials"].append(np.array(rows))
-        descriptions.append(description | {"triangles": len(mesh.slots), "materials": len(rows)})
+        descriptions.append(description | {"triangles": len(mesh.material_ids), "materials": len(rows)})
     arrays = {key: np.concatenate(value) for key, value in parts.items()}
     return arrays | {
         "version": np.array(_VERSION),
@@ -353,14 +355,14 @@ def _unpack(arrays: dict[str, NDArray]) -> FurnitureLibrary:
     for row in json.loads(str(arrays["pieces"])):
         triangles = slice(triangle, triangle := triangle + row.pop("triangles"))
         materials = slice(material, material := material + row.pop("materials"))
-        own = [arrays[key][triangles] for key in ("corners", "normals", "texcoords", "slots")]
+        own = [arrays[key][triangles] for key in ("corners", "normals", "texcoords", "material_ids")]
         decode = partial(_decode, *own, arrays["materials"][materials], textures)
         pieces.append(FurniturePiece(**row | {"size": tuple(row["size"])}, decode=decode))
     return FurnitureLibrary(tuple(pieces))
 
 
 def _decode(
-    corners: NDArray, normals: NDArray, texcoords: NDArray, slots: NDArray, rows: NDArray, textures: _Textures
+    corners: NDArray, normals: NDArray, texcoords: NDArray, material_ids: NDArray, rows: NDArray, textures: _Textures
 ) -> Mesh:
     materials = [
         MeshMaterial((red, green, blue), None if image < 0 else textures[int(image)], gloss)
@@ -370,6 +372,6 @@ def _decode(
         corners.astype(np.float32) / 32767,
         normals.astype(np.float32) / 127,
         texcoords,
-        slots.astype(np.int32),
+        material_ids.astype(np.int32),
         tuple(materials),
     )

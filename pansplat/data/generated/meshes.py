@@ -55,7 +55,7 @@ class MeshTree(NamedTuple):
     triangles: Floats
     normals: Floats
     texcoords: Floats
-    slots: NDArray[np.int32]
+    material_ids: NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,14 +65,14 @@ class Mesh:
     Attributes:
         corners, normals: (n 3 3), the three corners of each triangle. Normals are those of the box's space.
         texcoords: (n 3 2), image coordinates; v points up.
-        slots: (n), material of each triangle.
+        material_ids: (n), material of each triangle.
         materials: materials of the mesh.
     """
 
     corners: Floats
     normals: Floats
     texcoords: Floats
-    slots: NDArray[np.int32]
+    material_ids: NDArray[np.int32]
     materials: tuple[MeshMaterial, ...]
 
     @cached_property
@@ -89,7 +89,7 @@ class Mesh:
             np.concatenate((first, edges.reshape(-1, 6)), axis=1),
             self.normals[order].reshape(-1, 9),
             self.texcoords[order].reshape(-1, 6),
-            self.slots[order],
+            self.material_ids[order],
         )
 
 
@@ -115,8 +115,8 @@ def pack_meshes(meshes: list[Mesh], texture_index: dict[Texture, int]) -> tuple[
         parts.append(tree._replace(links=links))
         roots.append(nodes)
         holes = [texture_index[m.texture] if m.texture and m.texture.has_holes else -1 for m in mesh.materials]
-        cutouts.append(np.array(holes, np.int32)[tree.slots])
-        nodes, triangles = nodes + len(links), triangles + len(tree.slots)
+        cutouts.append(np.array(holes, np.int32)[tree.material_ids])
+        nodes, triangles = nodes + len(links), triangles + len(tree.material_ids)
     merged = MeshTree(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
     return merged, np.concatenate(cutouts), np.array(roots)
 
@@ -127,7 +127,7 @@ class Triangles(NamedTuple):
     corners: NDArray[np.float64]
     normals: NDArray[np.float64]
     texcoords: NDArray[np.float64]
-    slots: NDArray[np.int64]
+    material_ids: NDArray[np.int64]
 
     def select(self, kept: NDArray) -> Triangles:
         """The triangles for which `kept` is true."""
@@ -142,7 +142,7 @@ def read_obj(text: str) -> tuple[Triangles, list[str]]:
     vertices, texcoords, normals = [], [(0.0, 0.0)], [(0.0, 0.0, 0.0)]
     names: dict[str, int] = {}
     rows: list[tuple[int, ...]] = []
-    slot = names.setdefault("", 0)
+    material_id = names.setdefault("", 0)
     for line in text.splitlines():
         words = line.split()
         if not words:
@@ -155,7 +155,7 @@ def read_obj(text: str) -> tuple[Triangles, list[str]]:
         elif kind == "vn":
             normals.append((float(words[1]), float(words[2]), float(words[3])))
         elif kind == "usemtl":
-            slot = names.setdefault(line.split(None, 1)[1].strip() if len(words) > 1 else "", len(names))
+            material_id = names.setdefault(line.split(None, 1)[1].strip() if len(words) > 1 else "", len(names))
         elif kind == "f":
             fan = []
             for word in words[1:]:
@@ -170,7 +170,7 @@ def read_obj(text: str) -> tuple[Triangles, list[str]]:
                         n if n >= 0 else len(normals) + n,
                     )
                 )
-            rows += [(*fan[0], *fan[k], *fan[k + 1], slot) for k in range(1, len(fan) - 1)]
+            rows += [(*fan[0], *fan[k], *fan[k + 1], material_id) for k in range(1, len(fan) - 1)]
     table = np.array(rows, np.int64).reshape(-1, 10)
     places, indices = np.array(vertices).reshape(-1, 3), table[:, :9].reshape(-1, 3, 3)
     triangles = Triangles(
@@ -203,12 +203,12 @@ def simplify(triangles: Triangles, limit: int) -> Triangles:
     Source: Rossignac and Borrel, Multi-resolution 3D approximations for rendering complex scenes, 1993. The cell size
     is the smallest of a bisection. Corners keep their own normals and image coordinates.
     """
-    if len(triangles.slots) <= limit:
+    if len(triangles.material_ids) <= limit:
         return triangles
     points = triangles.corners.reshape(-1, 3)
     low, extent = points.min(axis=0), np.ptp(points, axis=0).max()
     fine, coarse = 0.0, 0.25
-    best = triangles.select(np.zeros(len(triangles.slots), bool))
+    best = triangles.select(np.zeros(len(triangles.material_ids), bool))
     for _ in range(9):
         size = (fine + coarse) / 2 if fine else coarse / 16
         cells = np.floor((points - low) / (size * extent)).astype(np.int64)
@@ -244,11 +244,11 @@ def make_mesh(triangles: Triangles, materials: tuple[MeshMaterial, ...], turn: N
         ((corners - (low + high) / 2) / half).astype(np.float32),
         normals.astype(np.float32),
         triangles.texcoords.astype(np.float32),
-        triangles.slots.astype(np.int32),
+        triangles.material_ids.astype(np.int32),
         materials,
     )
 
 
 def select_triangles(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:
     """A part of a mesh."""
-    return Mesh(mesh.corners[kept], mesh.normals[kept], mesh.texcoords[kept], mesh.slots[kept], mesh.materials)
+    return Mesh(mesh.corners[kept], mesh.normals[kept], mesh.texcoords[kept], mesh.material_ids[kept], mesh.materials)

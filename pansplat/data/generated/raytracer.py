@@ -367,9 +367,9 @@ class SceneArrays(NamedTuple):
     Attributes:
         halves: half sizes of the bodies, metres.
         faces: materials of a body's six faces: left right (x), up down (y), back front (z); or of a mesh, the place of
-            its first material in `slots`.
+            its first material in `mesh_materials`.
         normals: normals of a triangle's corners.
-        triangle_slots: place of a triangle's material relative to the first one of the mesh.
+        triangle_materials: place of a triangle's material relative to the first one of the mesh.
         floor_light: fraction of the ambient light on the floor (z x), in cells of `FLOOR_CELL` from the world x and z
             `floor_start`.
         ambient: ambient light (red, green, blue) outside the rooms.
@@ -380,8 +380,8 @@ class SceneArrays(NamedTuple):
     halves: NDArray[np.float64]
     faces: NDArray[np.int64]
     normals: NDArray[np.float32]
-    triangle_slots: NDArray[np.int32]
-    slots: NDArray[np.int64]
+    triangle_materials: NDArray[np.int32]
+    mesh_materials: NDArray[np.int64]
     materials: NDArray[np.float64]
     rooms: NDArray[np.float64]
     floor_light: NDArray[np.float64]
@@ -431,8 +431,12 @@ def _surface_point(kind, m, half, x, y, z):
 
 @nb.njit(**INLINE)
 def _mesh_point(scene, body, triangle, x, y, z, dx, dy, dz):
-    """Unit normal towards the origin of the ray, place in `slots`, image coordinates, their change per metre, and
-    texture coordinates in metres."""
+    """The surface at a point of a triangle.
+
+    Returns:
+        Unit normal towards the origin of the ray, place in `mesh_materials`, image coordinates, their change per metre,
+        and texture coordinates in metres.
+    """
     m, half, t, c = (
         scene.bodies.maps[body],
         scene.halves[body],
@@ -474,8 +478,8 @@ def _mesh_point(scene, body, triangle, x, y, z, dx, dy, dz):
         mv = qz * half[2]
     elif abs(gx) * half[1] * half[2] > abs(gz) * half[0] * half[1]:
         mu = qz * half[2]
-    slot = scene.faces[body, 0] + scene.triangle_slots[triangle]
-    return nx, ny, nz, slot, w[0] + u * au + v * bu, w[1] + u * av + v * bv, density, mu, mv
+    place = scene.faces[body, 0] + scene.triangle_materials[triangle]
+    return nx, ny, nz, place, w[0] + u * au + v * bu, w[1] + u * av + v * bv, density, mu, mv
 
 
 @nb.njit(**OPTIONS)
@@ -693,8 +697,8 @@ def _shade(scene, last, body, triangle, x, y, z, dx, dy, dz, t, width, a, b, few
     px, py, pz = x + t * dx, y + t * dy, z + t * dz
     density, image_u, image_v = 0.0, 0.0, 0.0
     if triangle >= 0:
-        nx, ny, nz, slot, image_u, image_v, density, u, v = _mesh_point(scene, body, triangle, px, py, pz, dx, dy, dz)
-        half_u, half_v, material = scene.halves[body, 0], scene.halves[body, 1], scene.slots[slot]
+        nx, ny, nz, place, image_u, image_v, density, u, v = _mesh_point(scene, body, triangle, px, py, pz, dx, dy, dz)
+        half_u, half_v, material = scene.halves[body, 0], scene.halves[body, 1], scene.mesh_materials[place]
     else:
         nx, ny, nz, face, u, v, half_u, half_v = _surface_point(
             scene.bodies.kinds[body], scene.bodies.maps[body], scene.halves[body], px, py, pz

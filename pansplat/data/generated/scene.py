@@ -111,7 +111,7 @@ class SceneBuilder:
         self.lights: list[Array] = []
         self.meshes: dict[Mesh, int] = {NO_MESH: 0}
         self.roots: list[int] = []
-        self.slots: list[int] = []
+        self.mesh_materials: list[int] = []
         self.textures: dict[Texture, int] = {NO_TEXTURE: 0}
 
     def add_material(
@@ -173,8 +173,8 @@ class SceneBuilder:
             if material.texture is not None:
                 self.textures.setdefault(material.texture, len(self.textures))
         number = self.meshes.setdefault(mesh, len(self.meshes))
-        self._add_body(MESH, centre, half, len(self.slots), yaw, 0, number)
-        self.slots += materials
+        self._add_body(MESH, centre, half, len(self.mesh_materials), yaw, 0, number)
+        self.mesh_materials += materials
 
     def add_box(
         self, centre: Vector, half: Vector, material: int | Sequence[int], yaw: float = 0, pitch: float = 0
@@ -249,8 +249,8 @@ class SceneBuilder:
             halves=np.array(self.halves)[order],
             faces=np.array(self.faces, np.int64)[order],
             normals=tree.normals,
-            triangle_slots=tree.slots,
-            slots=np.array(self.slots, np.int64),
+            triangle_materials=tree.material_ids,
+            mesh_materials=np.array(self.mesh_materials, np.int64),
             materials=np.array(self.materials),
             rooms=rooms,
             floor_light=floor_light,

@@ -75,10 +75,10 @@ def test_glass_is_omitted_but_measured_and_the_front_of_a_model_faces_minus_z(fo
     bed, chair = load_furniture(folder).pieces
     for piece, axis, sign in ((bed, 2, -1), (chair, 0, 1)):
         red = [k for k, material in enumerate(piece.mesh.materials) if material.color[0] > 5 * material.color[1]]
-        front = piece.mesh.corners[piece.mesh.slots == red[0]]
+        front = piece.mesh.corners[piece.mesh.material_ids == red[0]]
         assert np.allclose(front[..., axis], sign * (7 - 4.5) / 4.5, atol=1e-4)
         assert piece.mesh.materials[red[0]].gloss == 0.5
-        assert len(piece.mesh.slots) == 13
+        assert len(piece.mesh.material_ids) == 13
 
 
 def test_images_are_reduced_and_decoded(folder: Path) -> None:

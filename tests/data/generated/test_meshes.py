@@ -81,8 +81,8 @@ def test_meshes_of_spheres_are_shaded_as_spheres() -> None:
     ]
     corners = np.concatenate([np.stack((corner[0], corner[k], corner[k + 1]), axis=-2) for k in (1, 2)])
     corners = corners.reshape(-1, 3, 3).astype(np.float32)
-    slots, texcoords = np.zeros(len(corners), np.int32), np.zeros((len(corners), 3, 2), np.float32)
-    ball = Mesh(corners, corners, texcoords, slots, GREY)
+    material_ids, texcoords = np.zeros(len(corners), np.int32), np.zeros((len(corners), 3, 2), np.float32)
+    ball = Mesh(corners, corners, texcoords, material_ids, GREY)
     images = []
     for is_mesh in (True, False):
         builder = SceneBuilder(np.random.default_rng(0))
@@ -155,7 +155,7 @@ def test_coarser_levels_keep_the_mean_of_linear_light() -> None:
 def test_obj_files_may_count_backwards_and_have_polygons_and_several_materials() -> None:
     text = "usemtl a\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvn 0 0 1\nf -4//-1 -3//-1 -2//-1 -1//-1\nusemtl b\nf 1 2 3\n"
     triangles, names = read_obj(text)
-    assert names[1:] == ["a", "b"] and list(triangles.slots) == [1, 1, 2]
+    assert names[1:] == ["a", "b"] and list(triangles.material_ids) == [1, 1, 2]
     assert np.allclose(triangles.corners[1], ((0, 0, 0), (1, 1, 0), (0, 1, 0)))
     assert np.allclose(triangles.normals, (0, 0, 1))
 
@@ -170,7 +170,7 @@ def test_simplified_meshes_stay_near_the_surface() -> None:
     )
     triangles, _ = read_obj(text)
     small = simplify(triangles, 1000)
-    assert len(triangles.slots) == 12800 and 500 < len(small.slots) <= 1000
+    assert len(triangles.material_ids) == 12800 and 500 < len(small.material_ids) <= 1000
     assert small.corners[..., 1].min() >= 0 and small.corners[..., 1].max() <= 0.1
     extent = np.ptp(small.corners.reshape(-1, 3), axis=0)
     assert extent[0] > 75 and extent[2] > 75
