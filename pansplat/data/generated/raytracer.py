@@ -730,10 +730,11 @@ def _shade(scene, last, body, triangle, x, y, z, dx, dy, dz, t, width, a, b, few
         around *= _floor_visibility(scene.floor_light, scene.floor_start, px, pz)
     lr, lg, lb = _direct_light(scene.bodies, scene.lights, last, group, px, py, pz, nx, ny, nz, a, b, few)
     glow = surface[GLOW]
+    # Portals to darker rooms take light away, in dark corners possibly more than there is.
     return (
-        red * (ambient[0] * around + lr + glow),
-        green * (ambient[1] * around + lg + glow),
-        blue * (ambient[2] * around + lb + glow),
+        red * (max(ambient[0] * around + lr, 0.1 * ambient[0] * around) + glow),
+        green * (max(ambient[1] * around + lg, 0.1 * ambient[1] * around) + glow),
+        blue * (max(ambient[2] * around + lb, 0.1 * ambient[2] * around) + glow),
         nx,
         ny,
         nz,

@@ -53,3 +53,11 @@ def test_cameras_are_in_rooms_near_each_other_and_clear_of_bodies(homes: list[Ho
             others = [np.linalg.norm(other[:3, 3] - centre) for _, other in cameras[:place]]
             assert not others or 0.3 <= min(others) <= 4.0
     assert found > 3.5 * len(homes)
+
+
+def test_light_is_positive_and_finite(homes: list[Home]) -> None:
+    for home in homes:
+        for variant, pose in home.sample_cameras(np.random.default_rng(6), 3):
+            image, depth = home.variants[variant].panorama(pose, 32, 2)
+            assert np.isfinite(image).all() and image.min() >= 0
+            assert np.isfinite(depth).all()
