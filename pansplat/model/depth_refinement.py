@@ -22,7 +22,7 @@ from torch.nn.functional import avg_pool2d, interpolate, normalize, relu, unfold
 
 from pansplat.geometry.correlation import correlate, correlate_positions
 from pansplat.geometry.equirect import pad_equirect, pixel_directions
-from pansplat.geometry.warp import relative_pose, warp_positions
+from pansplat.geometry.warp import relative_pose, sample_maps, warp_positions
 from pansplat.model.depth_network import (
     MAX_LOG_SCALE,
     DepthEstimate,
@@ -150,11 +150,11 @@ class DepthRefinement(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Correlation of the patches, and the position of each candidate relative to the other view's surface."""
         columns, rows = warp_positions(inverse, poses, "sphere")
-        patches = correlate_positions(observed.patches[views], observed.patches[others], columns, rows, wraps=True)
+        patches = _multiply_at(observed.patches[views], observed.patches[others], columns, rows)
         ones = torch.ones_like(estimate.log_depth[views][:, None])
-        surface = correlate_positions(ones, estimate.log_depth.detach()[others][:, None], columns, rows, wraps=True)
+        surface = _multiply_at(ones, estimate.log_depth.detach()[others][:, None], columns, rows)
         height, width = candidates.shape[-2:]
-        rays = pixel_directions(height, width, dtype=torch.float32)
+        rays = pixel_directions(height, width, dtype=torch.float32, device=candidates.device)
         rotated = torch.einsum("nij,hwj->nihw", poses[:, :3, :3].float(), rays)
         along = torch.einsum("nihw,ni->nhw", rotated, poses[:, :3, 3].float())[:, None]
         square = (poses[:, :3, 3].float() ** 2).sum(dim=1)[:, None, None, None]
@@ -162,6 +162,18 @@ class DepthRefinement(nn.Module):
         ratio = (1 + 2 * along * inverse + square * inverse * inverse).clamp_min(1e-6)
         distance = candidates + 0.5 * ratio.log()
         return patches, torch.tanh((distance - surface) / _AGREEMENT_SCALE)
+
+
+def _multiply_at(
+    reference: Float[Tensor, "pair c h w"],
+    other: Float[Tensor, "pair c h w"],
+    columns: Float[Tensor, "pair d h w"],
+    rows: Float[Tensor, "pair d h w"],
+) -> Float[Tensor, "pair d h w"]:
+    """Dot products of each pixel's features with samples of the other view's, without gradient."""
+    if reference.device.type == "cpu":
+        return correlate_positions(reference, other, columns, rows, wraps=True)
+    return torch.einsum("nchw,ncdhw->ndhw", reference, sample_maps(other, columns, rows, "sphere"))
 
 
 class _ConvNorm(nn.Module):

@@ -13,6 +13,7 @@ import math
 import signal
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,6 +21,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
 
 from pansplat.console import own_warnings, run_command
 from pansplat.data.augment import mirror_views, roll_views
@@ -41,6 +43,7 @@ _TERMS = ("loss", "mono_error", "mono_likelihood", "refined_error", "refined_lik
 _COLUMNS = (*_TERMS, "rate", "gradient_norm", "seconds")
 _MEASURES = (*_TERMS[1:], "mono_relative_error", "refined_relative_error")
 _MAX_DEPTH = 12.0  # in camera heights; surfaces farther away are all "far"
+_TYPICAL_BASELINE = 2.0  # metres
 _SCALES = (1, 2, 4)  # pixels, of the loss on differences between neighbours
 
 
@@ -74,6 +77,10 @@ class DepthTrainConfig:
     validate_every: int = 500
     validation_tours: int = 48
     threads: int = 1
+    """Threads of torch on the CPU."""
+    workers: int = 0
+    """Processes that read and photograph pairs; 0 reads in the training process."""
+    device: str = "cpu"
     stop_after_minutes: float = 0.0
     """Save and stop after so many minutes; 0 for none."""
     init: Path | None = None
@@ -83,9 +90,11 @@ class DepthTrainConfig:
     network: RefinementConfig = field(default_factory=RefinementConfig)
 
 
-def read_pair(
-    tours: ShardReader, index: int, rng: np.random.Generator, baseline: tuple[float, float]
-) -> tuple[Views, Float[Tensor, "2"]]:
+Sample = tuple[Views, Tensor]
+"""Two views, and the heights of their cameras over the floor, metres."""
+
+
+def read_pair(tours: ShardReader, index: int, rng: np.random.Generator, baseline: tuple[float, float]) -> Sample:
     """Two photographed and augmented panoramas of a tour, with the heights of their cameras over the floor, metres."""
     tour = tours.read(index)
     chosen = _choose_pair(tour, rng, baseline)
@@ -106,13 +115,27 @@ def read_pair(
     return views, torch.from_numpy(tour.camera_height[chosen]).float()
 
 
+@dataclass(frozen=True)
+class RandomPairs(Dataset[Sample]):
+    """Pairs of random tours by position; the seed and the position determine all random numbers."""
+
+    tours: ShardReader
+    seed: int
+    baseline: tuple[float, float]
+
+    def __getitem__(self, position: int) -> Sample:
+        rng = np.random.default_rng((self.seed, position))
+        return read_pair(self.tours, int(rng.integers(len(self.tours))), rng, self.baseline)
+
+
 def _choose_pair(tour: Tour, rng: np.random.Generator, baseline: tuple[float, float]) -> list[int]:
     centres = tour.cam2world[:, :3, 3]
     distance = np.linalg.norm(centres[:, None] - centres, axis=-1)
     fitting = np.argwhere((distance >= baseline[0]) & (distance <= baseline[1]))
     if len(fitting) == 0:
         return [int(k) for k in rng.permutation(len(centres))[:2]]
-    return [int(k) for k in fitting[rng.integers(len(fitting))]]
+    nearness = np.exp(-distance[tuple(fitting.T)] / _TYPICAL_BASELINE)  # distant cameras often see different rooms
+    return [int(k) for k in fitting[rng.choice(len(fitting), p=nearness / nearness.sum())]]
 
 
 def depth_targets(
@@ -137,7 +160,7 @@ def depth_loss(
     estimate: DepthEstimate, target: Float[Tensor, "batch h w"], known: Bool[Tensor, "batch h w"]
 ) -> dict[str, Tensor]:
     """Loss terms: the likelihood, absolute error, and differences between neighbours; weighted by solid angle."""
-    weight = known * row_weights(known.shape[-2], dtype=torch.float32)[:, None]
+    weight = known * row_weights(known.shape[-2], dtype=torch.float32)[:, None].to(known.device)
     weight = weight / weight.sum().clamp_min(1e-6)
     error = estimate.log_depth - target
     absolute = error.abs()
@@ -166,18 +189,19 @@ _PAIR_OF_VIEWS = [(0, 1), (1, 0)]
 
 def training_terms(
     network: DepthRefinement,
-    samples: list[tuple[Views, Float[Tensor, "2"]]],
+    samples: list[Sample],
     generator: torch.Generator | None,
     *,
     iterations: int,
     factor_noise: tuple[float, float] = (0.0, 0.0),
 ) -> dict[str, Tensor]:
     """Loss terms of monocular depth and of its refinement, for pairs of views with their cameras' heights."""
-    images = torch.cat([views.images for views, _ in samples])
+    device = network.candidates.device
+    images = torch.cat([views.images for views, _ in samples]).to(device)
     heights = torch.cat([heights for _, heights in samples])
-    poses = torch.cat([views.cam2world for views, _ in samples])
+    poses = torch.cat([views.cam2world for views, _ in samples]).to(device)
     targets, known = zip(*(depth_targets(views, h, generator) for views, h in samples), strict=True)
-    target, is_known = torch.cat(targets), torch.cat(known)
+    target, is_known = torch.cat(targets).to(device), torch.cat(known).to(device)
     mono, observed = network.observe(to_channels_last(images))
     terms = {f"mono_{name}": value for name, value in depth_loss(mono, target, is_known).items()}
     loss = terms.pop("mono_loss")
@@ -185,8 +209,8 @@ def training_terms(
     if generator is not None:
         noise = torch.randn(len(samples), generator=generator).repeat_interleave(2) * factor_noise[0]
         noise = noise + torch.randn(len(heights), generator=generator) * factor_noise[1]
-    factor = heights.log()[:, None, None]
-    estimate = DepthEstimate(mono.log_depth + factor + noise[:, None, None], mono.log_scale)
+    factor, noise = heights.log()[:, None, None].to(device), noise[:, None, None].to(device)
+    estimate = DepthEstimate(mono.log_depth + factor + noise, mono.log_scale)
     pairs = [(2 * n + i, 2 * n + j) for n in range(len(samples)) for i, j in _PAIR_OF_VIEWS]
     for _ in range(iterations):
         estimate = network.refine(observed, estimate, poses, pairs)
@@ -205,6 +229,7 @@ class DepthTrainer:
         torch.set_num_threads(config.threads)
         torch.manual_seed(config.seed)
         self.tours = ShardReader(list(config.tours))
+        self.device = torch.device(config.device)
         self.network = DepthRefinement(config.network)
         self.step = 0
         latest = load_latest(config.out / "checkpoints")
@@ -212,7 +237,7 @@ class DepthTrainer:
             self.network.mono.encoder.load_imagenet(load_imagenet_weights())
         if latest is None and config.init is not None:
             load_matching(self.network, config.init)
-        self.network.to(memory_format=torch.channels_last)
+        self.network.to(self.device, memory_format=torch.channels_last)
         encoder = {id(p) for p in self.network.mono.encoder.parameters()}
         self.optimizer = torch.optim.AdamW(
             [
@@ -242,8 +267,10 @@ class DepthTrainer:
         began = saved = time.monotonic()
         print(f"from step {self.step} of {config.steps}, {len(self.tours)} tours", flush=True)
         try:
-            while self.step < config.steps and not self._stop:
-                values = self._optimize()
+            for samples in self._batches():
+                if self._stop:
+                    break
+                values = self._optimize(samples)
                 log.add(self.step, values)
                 self.step += 1
                 now = time.monotonic()
@@ -279,7 +306,7 @@ class DepthTrainer:
         tours = ShardReader([self.config.validation])
         network = DepthRefinement(self.config.network)
         network.load_state_dict(self.average.state)
-        network.eval()
+        network.to(self.device).eval()
         sums = dict.fromkeys(_MEASURES, 0.0)
         count = min(self.config.validation_tours, len(tours))
         for index in range(count):
@@ -297,14 +324,22 @@ class DepthTrainer:
         left = (self.config.steps - self.step) / max(1, self.config.decay_steps)
         return rise * min(1.0, left)
 
-    def _optimize(self) -> dict[str, float]:
+    def _batches(self) -> Iterator[list[Sample]]:
+        """The pairs of each remaining step."""
+        steps = range(self.step, self.config.steps)
+        pairs = RandomPairs(self.tours, self.config.seed, self.config.baseline)
+        loader = DataLoader(
+            pairs,  # pyright: ignore[reportArgumentType]
+            batch_sampler=[range(n * self.config.pairs, (n + 1) * self.config.pairs) for n in steps],
+            num_workers=self.config.workers,
+            collate_fn=list,
+            multiprocessing_context="spawn" if self.config.workers else None,
+        )
+        return iter(loader)
+
+    def _optimize(self, samples: list[Sample]) -> dict[str, float]:
         began = time.perf_counter()
-        rng = np.random.default_rng((self.config.seed, self.step))
-        generator = torch.Generator().manual_seed(int(rng.integers(1 << 40)))
-        samples = [
-            read_pair(self.tours, int(rng.integers(len(self.tours))), rng, self.config.baseline)
-            for _ in range(self.config.pairs)
-        ]
+        generator = torch.Generator().manual_seed(self.step)
         factor = self._learning_rate_factor()
         for group in self.optimizer.param_groups:
             group["lr"] = group["peak"] * factor

@@ -135,6 +135,14 @@ def test_pairs_have_the_wanted_baseline(tours):
         assert sorted(heights.tolist()) == pytest.approx([1.4, 1.6])
 
 
+@pytest.mark.slow
+def test_workers_read_the_same_pairs(config):
+    first = next(iter(DepthTrainer(config)._batches()))
+    second = next(iter(DepthTrainer(dataclasses.replace(config, workers=1))._batches()))
+    for (a, _), (b, _) in zip(first, second, strict=True):
+        assert torch.equal(a.images, b.images) and a.names == b.names
+
+
 def test_equal_random_numbers_give_equal_pairs(tours):
     reader = ShardReader([tours])
     first, second = (read_pair(reader, 0, np.random.default_rng(5), (0.3, 4.5))[0] for _ in range(2))
@@ -145,8 +153,8 @@ def test_equal_random_numbers_give_equal_pairs(tours):
 def test_resumed_run_equals_an_uninterrupted_one(config):
     assert DepthTrainer(config).train()
     stopped = DepthTrainer(dataclasses.replace(config, out=config.out.with_name("stopped"), steps=6))
-    for _ in range(3):
-        stopped._optimize()
+    for _, samples in zip(range(3), stopped._batches(), strict=False):
+        stopped._optimize(samples)
         stopped.step += 1
     stopped.save()
     resumed = DepthTrainer(dataclasses.replace(config, out=config.out.with_name("stopped")))

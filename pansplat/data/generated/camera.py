@@ -337,7 +337,7 @@ def _tone_table(rng: np.random.Generator, effects: CameraEffects) -> Array:
     octave, step = np.divmod(np.arange(count + 1), _STEPS)
     light = np.ldexp(1 + step / _STEPS, octave + _EXPONENTS[0])
     if knee < 1:
-        light = np.where(light > knee, knee + (1 - knee) * -np.expm1((knee - light) / (1 - knee)), light)
+        light = np.where(light > knee, knee + (1 - knee) * -np.expm1(np.minimum(knee - light, 0) / (1 - knee)), light)
     value = srgb_from_linear(light).astype(np.float64) ** exponent
     value += contrast * (value * value * (3 - 2 * value) - value)
     return value.astype(np.float32)

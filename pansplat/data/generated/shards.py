@@ -6,7 +6,6 @@ square root in 16-bit PNG, depth as millimetres in 16-bit PNG; both are lossless
 
 from __future__ import annotations
 
-import bisect
 import json
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
@@ -162,10 +161,10 @@ class ShardReader:
             if not found:
                 raise InputError(f"{folder}: needed shards of tours, got none; make them by `pansplat data homes`.")
             self.paths += found
-        self._ends = [TOURS_PER_SHARD * (k + 1) for k in range(len(self.paths))]
+        self._per_shard = TOURS_PER_SHARD
 
     def __len__(self) -> int:
-        return self._ends[-1]
+        return self._per_shard * len(self.paths)
 
     def read(self, index: int) -> Tour:
         """Tour `index`.
@@ -173,8 +172,8 @@ class ShardReader:
         Raises:
             InputError: a damaged shard.
         """
-        shard = bisect.bisect_right(self._ends, index)
-        path, place = self.paths[shard], index % TOURS_PER_SHARD
+        shard, place = divmod(index, self._per_shard)
+        path = self.paths[shard]
         try:
             with open(path, "rb") as file, np.load(file, allow_pickle=False) as shard_file:
                 lights = [_decode(png) for png in _unpack(shard_file[f"{place}.light"])]
