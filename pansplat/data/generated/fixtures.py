@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pansplat.data.generated import materials
-from pansplat.data.generated.furniture import Place, clutter
+from pansplat.data.generated.furniture import Place, add_fixture, clutter
 from pansplat.data.generated.plans import Plan, Rectangle, RoomKind, Side
 from pansplat.data.generated.scene import SceneBuilder
 from pansplat.data.generated.textures import Pattern
@@ -299,11 +299,12 @@ def _add_bathroom(builder: SceneBuilder, sides: list[Side], occupied: list[Recta
         at = rng.uniform(start, end - 0.5)
         occupied.append(side.area(at, at + 0.5, 0.75))
         place = Place(builder, *side.point(at + 0.25, 0.35), side.yaw)
-        place.add_box(0, 0.58, 0.25, 0.4, 0.36, 0.19, white)
-        place.add_box(0, 0.78, 0.25, 0.43, 0.04, 0.21, white)
-        place.add_box(0, 0.18, 0.02, 0.22, 0.36, 0.5, white)
-        place.add_ellipsoid(0, 0.34, -0.08, 0.38, 0.26, 0.5, white)
-        place.add_ellipsoid(0, 0.42, -0.08, 0.4, 0.05, 0.52, white)
+        if not add_fixture(place, "toilet", 0.6, 0.7):
+            place.add_box(0, 0.58, 0.25, 0.4, 0.36, 0.19, white)
+            place.add_box(0, 0.78, 0.25, 0.43, 0.04, 0.21, white)
+            place.add_box(0, 0.18, 0.02, 0.22, 0.36, 0.5, white)
+            place.add_ellipsoid(0, 0.34, -0.08, 0.38, 0.26, 0.5, white)
+            place.add_ellipsoid(0, 0.42, -0.08, 0.4, 0.05, 0.52, white)
     for side in sides:
         if rng.random() < 0.4 and side.length > 1.4:
             for low, high in side.free_spans(1.6, 0.1, occupied)[:1]:
@@ -328,11 +329,12 @@ def _add_tub(
     rng, (white, steel, tiles) = builder.rng, looks
     place = Place(builder, *side.point(at + length / 2, 0.375), side.yaw)
     high = 0.1 if is_shower else rng.uniform(0.38, 0.55)
-    place.add_box(0, 0.05, 0, length, 0.1, 0.75, white)
-    for x in (-length / 2 + 0.04, length / 2 - 0.04):
-        place.add_box(x, high / 2, 0, 0.08, high, 0.75, white)
-    for z in (-0.335, 0.335):
-        place.add_box(0, high / 2, z, length, high, 0.08, white)
+    if is_shower or not add_fixture(place, "bath", length, 0.75):
+        place.add_box(0, 0.05, 0, length, 0.1, 0.75, white)
+        for x in (-length / 2 + 0.04, length / 2 - 0.04):
+            place.add_box(x, high / 2, 0, 0.08, high, 0.75, white)
+        for z in (-0.335, 0.335):
+            place.add_box(0, high / 2, z, length, high, 0.08, white)
     top = rng.uniform(1.7, 2.2)
     tops = [hole.low - 0.02 for hole in side.holes if hole.start < at + length and hole.end > at]
     if min([top, *tops]) > high + 0.1:
@@ -363,6 +365,23 @@ def _add_vanity(builder: SceneBuilder, side: Side, at: float, width: float, whit
         materials.upright_wood(builder) if rng.random() < 0.5 else materials.paint(builder, materials.paint_color(rng))
     )
     place = Place(builder, *side.point(at + width / 2, 0.25), side.yaw)
+    upper = add_fixture(place, "washbasin", width, 0.5)
+    if upper == 0:
+        _add_cabinet_basin(place, width, front, white, steel)
+    if upper < 1 and all(hole.low > 2.0 or hole.end < at or hole.start > at + width for hole in side.holes):
+        mirror = materials.mirror(builder)
+        high = rng.uniform(0.6, 1.05)
+        place.add_box(0, 1.0 + high / 2, 0.245, width * rng.uniform(0.7, 1.0), high, 0.012, mirror)
+        if rng.random() < 0.7:
+            bulb = builder.add_material(Pattern.PLAIN, (0.9, 0.88, 0.8), mottle=0, glow=rng.uniform(0.0, 3.0))
+            place.add_box(0, 1.1 + high, 0.22, min(width, 0.6), 0.08, 0.05, steel)
+            for x in (-0.2, 0.0, 0.2):
+                place.add_ellipsoid(x * min(width, 1), 1.1 + high, 0.16, 0.1, 0.1, 0.1, bulb)
+
+
+def _add_cabinet_basin(place: Place, width: float, front: int, white: int, steel: int) -> None:
+    """Add a column or a cabinet with one or two basins."""
+    builder, rng = place.builder, place.builder.rng
     if rng.random() < 0.2:
         place.add_cylinder(0, 0.4, 0.05, 0.09, 0.8, white)
     else:
@@ -377,15 +396,6 @@ def _add_vanity(builder: SceneBuilder, side: Side, at: float, width: float, whit
         place.add_ellipsoid(x, 0.868, -0.02, 0.3, 0.015, 0.24, steel)
         place.add_cylinder(x, 0.92, 0.17, 0.014, 0.15, steel)
         place.add_box(x, 0.99, 0.11, 0.02, 0.02, 0.13, steel)
-    if all(hole.low > 2.0 or hole.end < at or hole.start > at + width for hole in side.holes):
-        mirror = materials.mirror(builder)
-        high = rng.uniform(0.6, 1.05)
-        place.add_box(0, 1.0 + high / 2, 0.245, width * rng.uniform(0.7, 1.0), high, 0.012, mirror)
-        if rng.random() < 0.7:
-            bulb = builder.add_material(Pattern.PLAIN, (0.9, 0.88, 0.8), mottle=0, glow=rng.uniform(0.0, 3.0))
-            place.add_box(0, 1.1 + high, 0.22, min(width, 0.6), 0.08, 0.05, steel)
-            for x in (-0.2, 0.0, 0.2):
-                place.add_ellipsoid(x * min(width, 1), 1.1 + high, 0.16, 0.1, 0.1, 0.1, bulb)
 
 
 def _add_closet(builder: SceneBuilder, sides: list[Side], occupied: list[Rectangle], trim: int, is_bare: bool) -> None:
@@ -432,6 +442,8 @@ def _add_machines(builder: SceneBuilder, sides: list[Side], occupied: list[Recta
         for side, start, _ in _longest_spans(sides, 1.0, 0.7, 0.68, occupied)[:1]:
             occupied.append(side.area(start, start + 0.68, 0.9))
             place = Place(builder, *side.point(start + 0.34, 0.35), side.yaw)
+            if add_fixture(place, "washing machine", 0.68, 0.7):
+                continue
             place.add_box(0, 0.45, 0, 0.64, 0.9, 0.64, white)
             place.add_box(0, 0.97, 0.25, 0.64, 0.14, 0.12, white)
             place.add_ellipsoid(0, 0.5, -0.32, 0.4, 0.4, 0.06, dark)

@@ -267,6 +267,26 @@ def _library_piece(builder: SceneBuilder, own: Piece) -> tuple[Piece, float, flo
     return partial(_place_mesh, chosen, height), width, depth, height
 
 
+def add_fixture(place: Place, category: str, width: float, depth: float) -> float:
+    """Sometimes add a piece of the library to a place at a wall; its upper side above the floor in metres, or 0.
+
+    Args:
+        width, depth: size of the place, metres; pieces that are slightly larger are reduced.
+    """
+    builder = place.builder
+    if builder.library is None or builder.rng.random() > 0.45:
+        return 0.0
+    pieces = builder.library.by_category.get(category, ())
+    pieces = [piece for piece in pieces if min(width / piece.size[0], depth / piece.size[2]) > 0.85]
+    if not pieces:
+        return 0.0
+    chosen = pieces[builder.rng.integers(len(pieces))]
+    scale = min(1.0, width / chosen.size[0], depth / chosen.size[2])
+    size = (scale * chosen.size[0], scale * chosen.size[1], scale * chosen.size[2])
+    place.add_mesh(chosen, 0, chosen.elevation, (depth - size[2]) / 2, size)
+    return chosen.elevation + size[1]
+
+
 def _add_small_piece(place: Place, rng: np.random.Generator, x: float, up: float, z: float, space: float) -> bool:
     """Sometimes add a small piece of the library that fits into a space (metres); whether one was added."""
     if place.builder.library is None or rng.random() > 0.5:
@@ -286,7 +306,7 @@ def _place_mesh(
     chosen: FurniturePiece, height: float, place: Place, rng: np.random.Generator, width: float, depth: float
 ) -> None:
     """Place a piece of the library; its back is towards +z."""
-    place.add_mesh(chosen, 0, 0, 0, (width, height, depth))
+    place.add_mesh(chosen, 0, chosen.elevation, 0, (width, height, depth))
 
 
 def _mesh_material(builder: SceneBuilder, category: str, material: MeshMaterial) -> int:

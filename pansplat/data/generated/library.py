@@ -139,7 +139,7 @@ class FurniturePiece:
         category: such as bed, sofa, chair, plant, stove; see `_RULES`.
         place: WALL, FREE, HUNG, CEILING or SURFACE.
         size: width, height and depth, metres. The front is towards -z and the back towards +z of the mesh.
-        elevation: height of the lower side above the floor, metres; 0 for pieces on the floor or on others.
+        elevation: height of the lower side above the floor, metres; 0 for pieces that stand free or on others.
         decode: makes the mesh.
     """
 
@@ -244,7 +244,7 @@ def _read_catalogue(path: Path) -> Iterable[tuple[dict[str, Any], Mesh]]:
                 "category": category,
                 "place": place,
                 "size": size,
-                "elevation": elevation if place in (HUNG, CEILING) else 0.0,
+                "elevation": elevation if place in (WALL, HUNG, CEILING) else 0.0,
                 "author": item.get("creator", path.stem),
                 "licence": _LICENCES[path.stem],
             }
