@@ -13,7 +13,7 @@ from pansplat.data.generated.scene import SceneBuilder
 from pansplat.data.generated.textures import Pattern
 
 LINING = 0.012  # thickness of the boards in a door hole, metres
-_LEAF = 0.04  # thickness of a door leaf, metres
+_LEAF = 0.046  # thickness of a door leaf, metres; the light of each face is that of its own side of the wall
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ def add_leaf(builder: SceneBuilder, leaf: Leaf, angle: float, style: DoorStyle) 
 
     (x0, z0), (x1, z1) = point(0.0, 0.0), point(1.0, 0.0)
     yaw = float(np.arctan2(-(z1 - z0), x1 - x0))
-    high = leaf.hole.top - LINING - 0.012
+    high = leaf.hole.top - LINING - 0.005
 
     def add(start: float, end: float, low: float, top: float, thick: float, material: int) -> None:
         x, z = point((start + end) / 2, _LEAF / 2)

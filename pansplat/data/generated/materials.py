@@ -188,8 +188,8 @@ def wall(builder: SceneBuilder) -> int:
             Pattern.TILES, base, shade(base, 0.8), random_color(rng, 0.2), size=size, fraction=0.04, mottle=0.1
         )
     if kind == 4:
-        size = rng.uniform(0.2, 1.2)
-        return builder.add_material(Pattern.STONE, base, shade(base, rng.uniform(0.55, 0.85)), size=size, fraction=0)
+        size = rng.uniform(0.03, 0.4)
+        return builder.add_material(Pattern.STONE, base, shade(base, rng.uniform(0.7, 0.95)), size=size, fraction=0)
     return wood(builder, (rng.uniform(0.08, 0.2), 2.6))
 
 
@@ -199,7 +199,7 @@ def floor(builder: SceneBuilder) -> int:
     kind = rng.choice(5, p=(0.42, 0.28, 0.22, 0.04, 0.04))
     if kind < 3:
         return (boards, carpet, floor_tiles)[kind](builder)
-    base = random_color(rng, 0.5, 0.25, 0.8)
+    base = paint_color(rng) if rng.random() < 0.7 else random_color(rng, 0.4, 0.2, 0.7)
     if kind == 3:
         return builder.add_material(Pattern.STONE, base, random_color(rng, 0.3), size=rng.uniform(0.5, 1.5), fraction=1)
     return builder.add_material(Pattern.TERRAZZO, base, random_color(rng, 0.3), base, size=rng.uniform(0.01, 0.03))

@@ -62,3 +62,17 @@ def test_walls_block_all_but_their_holes() -> None:
                 )
                 is_hole = any(h.start < along < h.end and h.low < up < h.top for h in wall.holes)
                 assert inside != is_hole
+
+
+def test_the_faces_of_closed_leaves_belong_to_the_rooms_that_they_face() -> None:
+    """The tracer finds the room of a surface 2 cm in front of it."""
+    for plan, leaf in _leaves():
+        corners, _ = _box(leaf, 0.0)
+        along, across = (2, 0) if leaf.wall.axis == 0 else (0, 2)
+        middle = corners[:, along].mean()
+        for sign, room, face in zip(
+            (-1, 1), leaf.wall.rooms, (corners[:, across].min(), corners[:, across].max()), strict=True
+        ):
+            away = face + 0.02 * sign - leaf.wall.at
+            assert abs(away) > 1e-3
+            assert plan.room_at(*leaf.wall.point(middle, away)) == room
