@@ -1,1 +1,1 @@
-"""Furnished rooms that are generated from a seed, and a ray tracer that renders them."""
+"""Homes that are generated from a seed, cameras in them, and a ray tracer that renders them."""

@@ -39,12 +39,12 @@ def add_ceiling_lamp(
         radius = rng.uniform(0.12, 0.22)
         builder.add_cylinder((x, -height + 0.02, z), radius * 1.05, 0.02, metal)
         builder.add_ellipsoid((x, -height + 0.04, z), (radius, 0.08, radius), shade)
-        drop = 0.3
+        drop = 0.2
     elif kind == 1:  # a pendant
         length, size = rng.uniform(0.15, max(0.16, min(0.8, height - 2.05))), rng.uniform(0.1, 0.22)
         builder.add_cylinder((x, -height + length / 2, z), 0.006, length / 2, metal)
         builder.add_ellipsoid((x, -height + length + size * 0.5, z), (size, size * rng.uniform(0.5, 1), size), shade)
-        drop = length + 1.5 * size + 0.15
+        drop = length + 0.5 * size
         occupied.append((x - 0.2, z - 0.2, x + 0.2, z + 0.2))
     elif kind == 2:  # a chandelier
         length, reach = rng.uniform(0.3, max(0.31, min(0.7, height - 1.95))), rng.uniform(0.2, 0.35)
@@ -55,7 +55,7 @@ def add_ceiling_lamp(
             dx, dz = reach * np.cos(turn), reach * np.sin(turn)
             builder.add_box((x + dx / 2, -height + length, z + dz / 2), (reach / 2, 0.008, 0.008), metal, -turn)
             builder.add_ellipsoid((x + dx, -height + length - 0.06, z + dz), (0.055, 0.07, 0.055), shade)
-        drop = length + 0.3
+        drop = length + 0.1
     elif kind == 3:  # a fan
         count, turn, length = int(rng.integers(4, 6)), rng.uniform(0, 2), rng.uniform(0.15, 0.3)
         builder.add_cylinder((x, -height + length / 2, z), 0.02, length / 2, metal)
@@ -66,7 +66,7 @@ def add_ceiling_lamp(
             around = turn + 2 * np.pi * k / count
             dx, dz = 0.36 * np.cos(around), 0.36 * np.sin(around)
             builder.add_box((x + dx, -height + length, z + dz), (0.27, 0.006, 0.065), blade, -around)
-        drop = length + 0.35
+        drop = length + 0.2
     else:  # spots in the ceiling
         for px in np.linspace(x0, x1, max(1, round((x1 - x0) / 1.6)) + 2)[1:-1]:
             for pz in np.linspace(z0, z1, max(1, round((z1 - z0) / 1.6)) + 2)[1:-1]:

@@ -605,6 +605,7 @@ def _brightness(light):
 
 
 _WINDOW_DEPTH = 0.4  # metres in front of a portal without shadows
+_SHADE_RADIUS = 0.25  # metres around a lamp without shadows, for its shade
 
 
 @nb.njit(**INLINE)
@@ -644,6 +645,8 @@ def _irradiance(light, group, x, y, z, nx, ny, nz, a, b):
         limit = 2 * SKY
     elif kind == PORTAL:  # the bars of its window would shadow a part of the rays to it in the whole room
         limit = max(away - _WINDOW_DEPTH, 0.0)
+    else:
+        limit = max(away - _SHADE_RADIUS, 0.0)
     return power, lx / away, ly / away, lz / away, limit
 
 
