@@ -266,6 +266,8 @@ def _add_upper_cabinets(
 
 
 def _add_fridge(place: Place, rng: np.random.Generator, material: int, knob: int) -> None:
+    if add_fixture(place, "fridge", 0.84, 0.72):
+        return
     high, split = rng.uniform(1.65, 1.85), rng.uniform(0.55, 0.75)
     place.add_box(0, high / 2, 0, 0.8, high, 0.66, material)
     for low, top in ((0.05, high * split), (high * split, high)):

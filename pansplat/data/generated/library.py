@@ -304,7 +304,7 @@ def _texture(archive: zipfile.ZipFile, folder: PurePosixPath, name: str) -> Text
     return None
 
 
-def _pack(pieces: Iterable[tuple[dict[str, Any], Mesh]]) -> dict[str, NDArray]:
+def _pack(pieces: Iterable[tuple[dict[str, Any], Mesh]]) -> dict[str, Any]:
     """Arrays of the cache."""
     parts: dict[str, list[NDArray]] = {
         key: [] for key in ("corners", "normals", "texcoords", "material_ids", "materials")
@@ -369,8 +369,8 @@ def _decode(
         for red, green, blue, gloss, image in rows.tolist()
     ]
     return Mesh(
-        corners.astype(np.float32) / 32767,
-        normals.astype(np.float32) / 127,
+        np.divide(corners, 32767, dtype=np.float32),
+        np.divide(normals, 127, dtype=np.float32),
         texcoords,
         material_ids.astype(np.int32),
         tuple(materials),

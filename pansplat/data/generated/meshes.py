@@ -104,7 +104,9 @@ NO_MESH = Mesh(
 """The first texture and mesh of each scene, which no body shows. Arrays of a scene are therefore never empty."""
 
 
-def pack_meshes(meshes: list[Mesh], texture_index: dict[Texture, int]) -> tuple[MeshTree, Floats, NDArray[np.int64]]:
+def pack_meshes(
+    meshes: list[Mesh], texture_index: dict[Texture, int]
+) -> tuple[MeshTree, NDArray[np.int32], NDArray[np.int64]]:
     """All meshes in one tree, the texture that cuts holes into each triangle or -1, and the root of each mesh."""
     roots, parts, cutouts = [], [], []
     nodes, triangles = 0, 0
@@ -117,7 +119,7 @@ def pack_meshes(meshes: list[Mesh], texture_index: dict[Texture, int]) -> tuple[
         holes = [texture_index[m.texture] if m.texture and m.texture.has_holes else -1 for m in mesh.materials]
         cutouts.append(np.array(holes, np.int32)[tree.material_ids])
         nodes, triangles = nodes + len(links), triangles + len(tree.material_ids)
-    merged = MeshTree(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+    merged = MeshTree._make(np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return merged, np.concatenate(cutouts), np.array(roots)
 
 
@@ -131,7 +133,7 @@ class Triangles(NamedTuple):
 
     def select(self, kept: NDArray) -> Triangles:
         """The triangles for which `kept` is true."""
-        return Triangles(*(array[kept] for array in self))
+        return Triangles._make(array[kept] for array in self)
 
 
 def read_obj(text: str) -> tuple[Triangles, list[str]]:

@@ -12,7 +12,7 @@ surfaces are diffuse. Mirrors, polished surfaces and glass reflect the first thi
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
@@ -41,7 +41,7 @@ BOX, ELLIPSOID, CYLINDER, GLASS, MESH = range(5)
 with triangles."""
 STACK_SIZE = 128
 FLOOR_CELL = 0.05  # metres
-INLINE = OPTIONS | {"forceinline": True}  # calls would copy the arrays of a scene, more than a kilobyte
+INLINE: dict[str, Any] = OPTIONS | {"forceinline": True}  # calls would copy the arrays of a scene, more than a kilobyte
 _FIRST, _BEHIND, _MIRRORED, _WEAK = range(4)  # rays of the camera, behind glass, from mirrors and from polish or glass
 _BINS = 12  # candidates for the split of a BVH node
 
