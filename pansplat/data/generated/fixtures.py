@@ -138,7 +138,7 @@ def _add_kitchen(
         materials.metal(builder),
         materials.paint(builder, (0.02, 0.02, 0.02)),
     )
-    appliance = steel if rng.random() < 0.5 else materials.paint(builder, ((0.85,) * 3, (0.03,) * 3)[rng.integers(2)])
+    appliance = steel if rng.random() < 0.5 else materials.paint(builder, materials.grey((0.85, 0.03)[rng.integers(2)]))
     tiles = materials.wall_tiles(builder) if rng.random() < 0.6 else -1
     needed = ["fridge", "stove", "sink", "dishwasher"]
     if rng.random() < 0.2:
@@ -277,7 +277,7 @@ def _add_fridge(place: Place, rng: np.random.Generator, material: int, knob: int
 
 def _add_bathroom(builder: SceneBuilder, sides: list[Side], occupied: list[Rectangle], is_bare: bool) -> None:
     rng = builder.rng
-    white = materials.paint(builder, (rng.uniform(0.75, 0.92),) * 3)
+    white = materials.paint(builder, materials.grey(rng.uniform(0.75, 0.92)))
     steel, tiles = materials.metal(builder), materials.wall_tiles(builder)
     length = rng.uniform(1.45, 1.75)
     for least, is_shower in ((length, False), (0.85, True)):
@@ -499,7 +499,7 @@ def add_details(
     rng, room = builder.rng, plan.rooms[index]
     if room.kind == RoomKind.CLOSET:
         return
-    white = materials.paint(builder, (rng.uniform(0.7, 0.9),) * 3)
+    white = materials.paint(builder, materials.grey(rng.uniform(0.7, 0.9)))
     for side in plan.sides(index):
         spans = side.free_spans(1.4, 0.02, [])
         for _ in range(int(rng.integers(0, 3))):

@@ -31,6 +31,11 @@ def shade(color: Color, factor: float) -> Color:
     return red, green, blue
 
 
+def grey(value: float) -> Color:
+    """A colour with three equal channels."""
+    return value, value, value
+
+
 def paint_color(rng: np.random.Generator) -> Color:
     """White, beige or grey, as on most walls."""
     kind = rng.choice(3, p=(0.4, 0.35, 0.25))

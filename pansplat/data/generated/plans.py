@@ -378,21 +378,18 @@ def _carve_closets(rooms: list[Room], rng: np.random.Generator) -> None:
             continue
         depth = rng.uniform(1.2, 1.8) if rng.random() < 0.2 else rng.uniform(0.6, 1.0)
         side = int(rng.integers(4))
-
         if (room.width if side % 2 == 0 else room.depth) - depth < 2.3:
             continue
-        strip = list(room.corners)
-        rest = list(room.corners)
         inner = room.corners[side] + (depth if side < 2 else -depth)
-        strip[(side + 2) % 4], rest[side] = inner, inner
+        strip, rest = _with_corner(room.corners, (side + 2) % 4, inner), _with_corner(room.corners, side, inner)
         is_needed = any(
-            _shared_side(other.corners, tuple(strip))
+            _shared_side(other.corners, strip)
             for other in rooms
             if other.kind == RoomKind.HALL or other.parent == index
         )
         if is_needed:
             continue
-        rooms[index] = replace(room, corners=tuple(rest))
+        rooms[index] = replace(room, corners=rest)
         low, high = (strip[1], strip[3]) if side % 2 == 0 else (strip[0], strip[2])
         length = rng.uniform(0.45, 1.2) * (high - low)
         if length > high - low - 0.7:
@@ -404,6 +401,12 @@ def _carve_closets(rooms: list[Room], rng: np.random.Generator) -> None:
         for start, end, kind in parts:
             part = (strip[0], start, strip[2], end) if side % 2 == 0 else (start, strip[1], end, strip[3])
             rooms.append(Room(part, kind, index))
+
+
+def _with_corner(area: Rectangle, place: int, value: float) -> Rectangle:
+    """A rectangle with another coordinate at one of its four places."""
+    x0, z0, x1, z1 = (value if k == place else old for k, old in enumerate(area))
+    return x0, z0, x1, z1
 
 
 def _carve_behind_bathrooms(rooms: list[Room]) -> None:

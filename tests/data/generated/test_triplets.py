@@ -69,6 +69,7 @@ def _agreement(images: torch.Tensor, depths: torch.Tensor, cam2world: torch.Tens
 
 def test_more_rays_per_pixel_change_only_the_antialiasing() -> None:
     coarse, fine = (GeneratedTriplets(seed=3, samples=samples).sample(1, 32) for samples in (1, 3))
+    assert coarse.context.depths is not None and fine.context.depths is not None
     assert torch.equal(coarse.context.depths, fine.context.depths)
     difference = (coarse.context.images - fine.context.images).abs().mean()
     assert 1e-4 < float(difference) < 0.06
