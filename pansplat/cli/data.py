@@ -26,6 +26,9 @@ class DataHomes:
     """Height of the panoramas, pixels; a multiple of 32."""
     cameras: int = 4
     """Panoramas of each home."""
+    furniture: Path | None = None
+    """Folder with furniture catalogues (*.sh3f) of the Debian package sweethome3d-furniture; by default only our own
+    furniture is placed."""
     workers: int = 1
     """Processes that render."""
 
@@ -44,7 +47,7 @@ class DataHomes:
                 raise InputError(f"--{name} must be at least {least}, got {value}")
         if self.height < 32 or self.height % 32:
             raise InputError(f"--height must be a multiple of 32 pixels, got {self.height}")
-        settings = TourSettings(seed=self.seed, height=self.height, cameras=self.cameras)
+        settings = TourSettings(seed=self.seed, height=self.height, cameras=self.cameras, furniture=self.furniture)
         with Progress() as progress:
             task = progress.add_task("rendering homes", total=self.count)
 

@@ -6,7 +6,9 @@ square root in 16-bit PNG, depth as millimetres in 16-bit PNG; both are lossless
 
 from __future__ import annotations
 
+import functools
 import json
+import os
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -19,6 +21,7 @@ from jaxtyping import Float, Float32
 from numpy.typing import NDArray
 
 from pansplat.atomic import replacing
+from pansplat.data.generated.library import FurnitureLibrary, load_furniture
 from pansplat.data.images import linear_from_srgb
 from pansplat.errors import InputError
 
@@ -56,12 +59,14 @@ class TourSettings:
         height: height of the panoramas, pixels.
         cameras: cameras in each home.
         samples: `samples` squared is the number of rays per pixel.
+        furniture: a folder with catalogues of Sweet Home 3D, or None for our own furniture only.
     """
 
     seed: int = 0
     height: int = 128
     cameras: int = 4
     samples: int = 2
+    furniture: Path | None = None
 
 
 def render_tour(settings: TourSettings, index: int) -> Tour:
@@ -69,9 +74,10 @@ def render_tour(settings: TourSettings, index: int) -> Tour:
     from pansplat.data.generated.homes import build_home
 
     rng = np.random.default_rng((settings.seed, index))
+    library = None if settings.furniture is None else _load_library(settings.furniture)
     cameras = []
     while len(cameras) < settings.cameras:
-        home = build_home(rng)
+        home = build_home(rng, library)
         cameras = home.sample_cameras(rng, settings.cameras)
     views = [home.variants[variant].panorama(pose, settings.height, settings.samples) for variant, pose in cameras]
     light = np.stack([view[0] for view in views]).astype(np.float32)
@@ -185,6 +191,13 @@ class ShardReader:
         return Tour(light * light * _MAX_LIGHT, np.stack(depths) / np.float32(_MILLIMETRES), poses, heights)
 
 
+@functools.cache
+def _load_library(folder: Path) -> FurnitureLibrary:
+    """The furniture in a folder, with a cache there if it is writable."""
+    cache = folder / "pansplat_furniture.npz"
+    return load_furniture(folder, cache if cache.exists() or os.access(folder, os.W_OK) else None)
+
+
 def _run_tasks(tasks: list[tuple[Path, TourSettings, int]], workers: int) -> Iterator[None]:
     if workers <= 1:
         yield from map(_write_shard, tasks)
@@ -218,7 +231,7 @@ def _shard_path(folder: Path, number: int) -> Path:
 def _claim_folder(folder: Path, settings: TourSettings) -> None:
     """Write the settings into the folder, or check that they are those of its shards."""
     path = folder / "settings.json"
-    text = json.dumps({"format": _FORMAT, **settings.__dict__}, indent=1)
+    text = json.dumps({"format": _FORMAT, **settings.__dict__, "furniture": settings.furniture is not None}, indent=1)
     if path.exists() and path.read_text() != text:
         raise InputError(f"{folder}: needed a folder with shards of the same settings, got others; see {path}.")
     with replacing(path) as partial:
