@@ -36,12 +36,13 @@ def add_ceiling(
             builder.add_box(centre, ((p1 - p0) / 2, (top + 0.2 - height) / 2, (q1 - q0) / 2), CEILING)
     if well is not None:
         a0, b0, a1, b1 = well
-        x, z, y = (a0 + a1) / 2, (b0 + b1) / 2, -height - 0.3 - _SHAFT / 2
-        builder.add_box((x, y - _SHAFT / 2, z), ((a1 - a0) / 2 + 0.1, 0.05, (b1 - b0) / 2 + 0.1), CEILING)
+        x, z, low, end = (a0 + a1) / 2, (b0 + b1) / 2, height + 0.02, height + 0.4 + _SHAFT
+        y, half = -(low + end) / 2, (end - low) / 2
+        builder.add_box((x, -end, z), ((a1 - a0) / 2 + 0.1, 0.05, (b1 - b0) / 2 + 0.1), CEILING)
         for sign in (-1, 1):
             across, along = x + sign * ((a1 - a0) / 2 + 0.05), z + sign * ((b1 - b0) / 2 + 0.05)
-            builder.add_box((across, y, z), (0.0495, _SHAFT / 2 + 0.1, (b1 - b0) / 2 + 0.09), WALL)
-            builder.add_box((x, y, along), ((a1 - a0) / 2 + 0.09, _SHAFT / 2 + 0.1, 0.0495), WALL)
+            builder.add_box((across, y, z), (0.0495, half, (b1 - b0) / 2 + 0.09), WALL)
+            builder.add_box((x, y, along), ((a1 - a0) / 2 + 0.09, half, 0.0495), WALL)
 
 
 def add_structure(builder: SceneBuilder, plan: Plan, index: int, height: float, occupied: list[Rectangle]) -> None:

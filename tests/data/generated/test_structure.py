@@ -53,3 +53,17 @@ def test_a_slope_joins_the_wall_at_the_knee_and_the_ceiling() -> None:
     reach = HEIGHT - 1.4
     assert scene.clearance(np.array([(6.0 - reach, -HEIGHT - 0.02, 2.0)]))[0] < 0.01
     assert scene.clearance(np.array([(6.0 - reach - 0.1, -HEIGHT + 0.3, 2.0)]))[0] > 0.1
+
+
+def test_a_stair_well_is_closed_around_and_above() -> None:
+    builder, plan = SceneBuilder(np.random.default_rng(0)), _plan()
+    material = builder.add_material(Pattern.PLAIN, (0.5, 0.5, 0.5))
+    x0, z0, x1, z1 = well = (1.0, 0.0, 3.0, 0.9)  # beside an outer wall, above which there is no ceiling
+    add_ceiling(builder, plan, 0, HEIGHT, HEIGHT + 0.1, well)
+    scene = _finish(builder, material)
+    x, z = (x0 + x1) / 2, (z0 + z1) / 2
+    for up in np.arange(HEIGHT + 0.03, HEIGHT + 2.5, 0.1):
+        around = np.array([(x0 - 0.03, -up, z), (x1 + 0.03, -up, z), (x, -up, z0 - 0.03), (x, -up, z1 + 0.03)])
+        assert (scene.clearance(around) == 0).all()
+        assert scene.clearance(np.array([(x, -up, z)]))[0] > 0.05
+    assert scene.clearance(np.array([(x, -HEIGHT - 2.6, z)]))[0] == 0
