@@ -44,7 +44,7 @@ class GuidedSweep(Sweep):
     def __init__(self, network: DepthRefinement, weights_hash: str, name: str = "default") -> None:
         config = SweepConfig(search=SearchConfig(room_layout=None))
         super().__init__(config, NetworkPrior(network, weights_hash + _hash_sources()))
-        self.name = name
+        self.name, self.network = name, network
 
 
 def load_guided_sweep(path: Path, name: str = "default") -> GuidedSweep:

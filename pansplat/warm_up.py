@@ -1,7 +1,7 @@
 """Compile the numba kernels of the rasteriser and of the sweep into numba's cache: `python -m pansplat.warm_up`.
 
 setup.sh runs this once, so that later commands do not compile them. Kernels for `covariances` in place of scales and
-rotations, and those of the networks, are compiled by the first call that uses them.
+rotations, and those of PanSplat and MVSplat, are compiled by the first call that uses them.
 """
 
 import time
@@ -26,7 +26,8 @@ def main() -> None:
         "rasteriser, spherical harmonics": partial(_rasterize, 1, "pinhole", RasterOptions()),
         "rasteriser, EWA": partial(_rasterize, 0, "pinhole", ewa),
         "rasteriser, EWA and spherical harmonics": partial(_rasterize, 1, "cubemap", ewa),
-        "sweep": _predict,
+        "sweep": partial(_predict, "sweep"),
+        "depth network": partial(_predict, "default"),
     }
     start = time.perf_counter()
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
@@ -54,12 +55,12 @@ def _rasterize(degree: int, layout: Layout, options: RasterOptions) -> None:
     rasterize(scene, pose, size=(16, 32), layout=layout, options=options, backend="numba").color.sum().backward()
 
 
-def _predict() -> None:
+def _predict(model: str) -> None:
     """Predict from two small panoramas of noise."""
     images, masks = torch.rand(2, 3, 64, 128), torch.ones(2, 64, 128, dtype=torch.bool)
     poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     poses[1, 0, 3] = 0.2
-    predict(Views(images, poses, masks, near=0.1, far=10.0, names=("left", "right")), "sweep")
+    predict(Views(images, poses, masks, near=0.1, far=10.0, names=("left", "right")), model)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,21 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.guided_sweep import NetworkPrior, load_guided_sweep, save_depth_network
+from pansplat.guided_sweep import (
+    GuidedSweep,
+    NetworkPrior,
+    default_weights,
+    load_guided_sweep,
+    save_depth_network,
+)
 from pansplat.model.depth_network import DepthNetworkConfig
 from pansplat.model.depth_refinement import DepthRefinement, RefinementConfig
 from pansplat.model.weights import pack_weights, save_weights
-from pansplat.pipeline import load_model
+from pansplat.pipeline import load_model, load_pairs
 
 _CONFIG = RefinementConfig(
     mono=DepthNetworkConfig(room_channels=24, attention_layers=1, attention_heads=3, decoder_channels=(16, 12, 8, 8)),
@@ -97,3 +105,23 @@ def test_prediction_takes_any_number_of_views(weights):
     gaussians = model(images, poses, 0.3, 20.0)
     assert set(gaussians.views.tolist()) == {0, 1, 2}
     assert all(torch.isfinite(getattr(gaussians, name)).all() for name in ("means", "scales", "opacities"))
+
+
+def test_shipped_model_is_small():
+    path = default_weights()
+    assert path.stat().st_size <= 16e6
+    model = load_model("default")
+    assert isinstance(model, GuidedSweep) and model.name == "default"
+    assert sum(weight.numel() for weight in model.network.parameters()) <= 8_000_000
+
+
+@pytest.mark.slow
+def test_shipped_model_estimates_the_sample_within_a_fifth():
+    (pair,) = load_pairs(Path(__file__).parents[1] / "assets" / "living_room")
+    views = pair.load_context(128)
+    images = [image.permute(1, 2, 0).numpy() for image in views.images]
+    observed = load_model("default").prior.observe(images)
+    depth = views.depths[:, ::2, ::2].numpy()
+    for prior, true in zip(observed.priors, depth, strict=True):
+        error = prior.log_depth - np.log(true)
+        assert np.abs(error - np.median(error)).mean() < 0.2

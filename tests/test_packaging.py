@@ -15,7 +15,12 @@ else:
     import tomli as tomllib
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = {"pansplat": "pansplat", "pansplat_viewer": "viewer", "pansplat_viewer.shaders": "shaders"}
+FOLDERS = {
+    "pansplat": "pansplat",
+    "pansplat.default_model": "assets/default",
+    "pansplat_viewer": "viewer",
+    "pansplat_viewer.shaders": "shaders",
+}
 
 
 def read_project() -> dict:
@@ -54,7 +59,7 @@ def run_in(site: Path, *command: str) -> subprocess.CompletedProcess[str]:
 
 def test_the_package_list_equals_the_packages_on_disk() -> None:
     on_disk = {".".join(file.parent.relative_to(ROOT).parts) for file in (ROOT / "pansplat").rglob("__init__.py")}
-    on_disk |= {"pansplat_viewer", "pansplat_viewer.shaders"} | {
+    on_disk |= {"pansplat.default_model", "pansplat_viewer", "pansplat_viewer.shaders"} | {
         "pansplat_viewer." + ".".join(file.parent.relative_to(ROOT / "viewer").parts)
         for file in (ROOT / "viewer").glob("*/**/__init__.py")
     }
@@ -75,7 +80,7 @@ def test_the_wheel_contains_every_module_and_shader(wheel: Path) -> None:
     needed = {"pansplat/py.typed"}
     for package, folder in FOLDERS.items():
         for file in (ROOT / folder).rglob("*"):
-            if file.suffix in (".py", ".glsl", ".vert", ".frag", ".geom", ".comp"):
+            if file.suffix in (".py", ".glsl", ".vert", ".frag", ".geom", ".comp", ".safetensors"):
                 needed.add(f"{package.replace('.', '/')}/{file.relative_to(ROOT / folder).as_posix()}")
     assert not needed - names
     assert any(name.endswith((".frag", ".glsl")) for name in needed)

@@ -44,7 +44,7 @@ def test_predict_refuses_a_folder_of_several_pairs(tmp_path: Path, sphere_predic
 
 
 def test_load_model_lists_the_known_models_when_refusing_one() -> None:
-    with pytest.raises(InputError, match=r"must be one of sweep, or a file of weights .*, got 'swepe'"):
+    with pytest.raises(InputError, match=r"must be one of default, sweep, or a file of weights .*, got 'swepe'"):
         load_model("swepe")
 
 

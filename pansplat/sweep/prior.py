@@ -22,7 +22,7 @@ from pansplat.geometry.equirect import rotate_equirect, row_weights
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View, compute_matching_cost
 from pansplat.sweep.surface import resize_sphere
 
-_HEIGHT_CANDIDATES = 96
+_HEIGHT_CANDIDATES = 64
 _SHARP_SCALE = 0.08  # Laplace scale up to which a pixel has full weight in the search of the height
 _MAX_COST = 1.2  # matching cost above which a pixel does not count against a height
 _MAX_VARIANCE = 4e-3  # of grey values; more texture has no more weight
@@ -155,19 +155,16 @@ def _estimate_camera_heights(
     above = -(cam2world[:, :3, 3] @ down)  # of each camera, over any level
     above -= above.mean()
     low, high = limits
-    candidates = low + (high - low) / (_HEIGHT_CANDIDATES - 1) * np.arange(_HEIGHT_CANDIDATES)  # inverse heights
-    total = np.zeros(_HEIGHT_CANDIDATES)
-    for n, prior in enumerate(priors):
-        cost = _match_heights(prior, n, views, cam2world, candidates, config)
-        own = 1 / np.maximum(1 / candidates + above[n], 1e-6)  # this camera's inverse height, by the mean's
-        total += np.interp(own, candidates, cost)
-    best = int(total.argmin())
-    offset = 0.0
-    if 0 < best < _HEIGHT_CANDIDATES - 1:
-        left, middle, right = total[best - 1 : best + 2]
-        offset = float(np.clip(0.5 * (left - right) / max(left + right - 2 * middle, 1e-12), -0.5, 0.5))
-    mean = 1 / (low + (best + offset) * (candidates[1] - candidates[0]))
-    return [max(mean + float(a), 1 / high) for a in above]
+    for _ in range(2):  # all heights, then the ones around the best
+        candidates = np.linspace(low, high, _HEIGHT_CANDIDATES)  # inverse heights
+        total = np.zeros(_HEIGHT_CANDIDATES)
+        for n, prior in enumerate(priors):
+            own = 1 / np.maximum(1 / candidates + above[n], 1 / limits[1])  # this camera's, by the mean's
+            sampled = np.linspace(own[0], max(own[-1], own[0] + 1e-6), _HEIGHT_CANDIDATES)
+            total += np.interp(own, sampled, _match_heights(prior, n, views, cam2world, sampled, config))
+        best, step = candidates[total.argmin()], candidates[1] - candidates[0]
+        low, high = max(best - 2 * step, limits[0]), min(best + 2 * step, limits[1])
+    return [max(1 / best + float(a), 1 / limits[1]) for a in above]
 
 
 def _match_heights(

@@ -53,7 +53,7 @@ def test_camera_heights_are_found_by_matching(make_room):
     room = make_room()
     poses = [room.pose((-0.6, 0.0, -0.2)), room.pose((0.5, 0.2, 0.1))]
     model, _ = _estimate(room, poses)
-    np.testing.assert_allclose(model.heights, (_CAMERA_HEIGHT, _CAMERA_HEIGHT - 0.2), rtol=0.05)
+    np.testing.assert_allclose(model.heights, (_CAMERA_HEIGHT, _CAMERA_HEIGHT - 0.2), rtol=0.02)
 
 
 def test_tilted_cameras_are_turned_upright(make_room, turn):
