@@ -36,7 +36,7 @@ Drawing = Literal["exact", "original"]
 
 
 def load_model(
-    name: str | Path = "sweep",
+    name: str | Path = "default",
     *,
     compat: CompatChoice = "trained",
     precision: Precision = "float32",
@@ -94,7 +94,7 @@ _MODELS: dict[str, Callable[..., Predictor]] = {"default": _load_default, "sweep
 
 def predict(
     source: Pair | Views | str | Path,
-    model: str | Path | Predictor = "sweep",
+    model: str | Path | Predictor = "default",
     *,
     compat: CompatChoice = "trained",
     precision: Precision = "float32",

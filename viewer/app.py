@@ -28,8 +28,9 @@ class Options:
     """Open no window; write film, stills and panorama to this folder."""
     pair: str | None = None
     """Name or number of the pair to show first if the path holds several; offscreen also "all"."""
-    model: str = "sweep"
-    """Predictor for pairs: `sweep`, or a file of weights (.safetensors, or an official .ckpt)."""
+    model: str = "default"
+    """Predictor for pairs: `default`, `sweep` (without weights), or a file of weights (.safetensors, or an official
+    .ckpt)."""
     compat: Literal["trained", "official", "fixed"] = "trained"
     """For a network: as the official code, with its defects fixed, or as the weights were trained."""
     precision: Literal["float32", "bfloat16"] = "float32"

@@ -55,7 +55,7 @@ class LoadedScene:
 class LoadOptions:
     """Arguments of `load_pairs` and `predict`."""
 
-    model: str = "sweep"
+    model: str = "default"
     compat: Literal["trained", "official", "fixed"] = "trained"
     precision: Literal["float32", "bfloat16"] = "float32"
     height: int = 512

@@ -59,8 +59,9 @@ class Evaluate:
     """Folders of pairs; pairs without target views are skipped. None with --protocol."""
     out: Out
     """Folder for results.json and, for each case, prediction.png, target.png and error.png."""
-    model: str = "sweep"
-    """Predictor: `sweep`, or a file of weights. The cache is not used, so that times are valid."""
+    model: str = "default"
+    """Predictor: `default`, `sweep` (without weights), or a file of weights. The cache is not used, so that times are
+    valid."""
     compat: Compat = "trained"
     """For a network: official, fixed, or as its weights were trained; see `pansplat predict --help`."""
     precision: Precision = "float32"

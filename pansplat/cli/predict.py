@@ -37,8 +37,9 @@ class Predict:
     """Folder of the pair."""
     out: Out
     """The .ply file to write."""
-    model: str = "sweep"
-    """Predictor: `sweep`, which needs no weights, or a file of weights (.safetensors, or an official .ckpt)."""
+    model: str = "default"
+    """Predictor: `default`, `sweep` (without weights), or a file of weights (.safetensors, or an
+    official .ckpt)."""
     compat: Compat = "trained"
     """For a network: official computes what the official code does, fixed corrects its defects; by default the one
     that the weights were trained with, which is official for official weights."""

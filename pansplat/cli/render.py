@@ -60,8 +60,8 @@ class Render:
     """Length of a video."""
     fps: float = 24.0
     """Frames per second of a video."""
-    model: str = "sweep"
-    """Predictor, for a pair: `sweep`, or a file of weights."""
+    model: str = "default"
+    """Predictor, for a pair: `default`, `sweep` (without weights), or a file of weights."""
     compat: Compat = "trained"
     """For a network: official, fixed, or as its weights were trained; see `pansplat predict --help`."""
     precision: Precision = "float32"

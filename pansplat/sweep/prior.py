@@ -27,6 +27,7 @@ _SHARP_SCALE = 0.08  # Laplace scale up to which a pixel has full weight in the 
 _MAX_COST = 1.2  # matching cost above which a pixel does not count against a height
 _MAX_VARIANCE = 4e-3  # of grey values; more texture has no more weight
 _MIN_TILT = math.radians(0.5)  # of a camera that is turned upright
+_USUAL_HEIGHT = 1.5  # metres, of a camera over the floor
 _UNBOUNDED = (math.inf, -math.inf)
 
 
@@ -100,8 +101,12 @@ def estimate_priors(
     limits: tuple[float, float],
     config: PriorConfig,
     matching: MatchingConfig,
+    *,
+    coincident: bool = False,
 ) -> list[DepthPrior]:
     """The prior of each view, in the unit of the poses.
+
+    Cameras that coincide cannot be compared: each view has the model's first estimate, with a usual camera height.
 
     Args:
         images: (h, w, 3) of each view.
@@ -116,6 +121,9 @@ def estimate_priors(
     first = [
         prior if turn is None else prior.rotate(turn.T) for prior, turn in zip(observed.priors, turns, strict=True)
     ]
+    if coincident:
+        log_height = math.log(min(max(_USUAL_HEIGHT, 1 / limits[1]), 1 / limits[0]))
+        return [DepthPrior(prior.log_depth + log_height, prior.scale) for prior in first]
     heights = _estimate_camera_heights(first, views, cam2world, down, limits, matching)
     poses = np.array(cam2world, np.float64)
     for pose, turn in zip(poses, turns, strict=True):

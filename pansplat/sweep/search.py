@@ -110,17 +110,28 @@ def search_surfaces(
     small = [resize_sphere(image, max(finest // 2, 32)) for image in posed.images]
     axes = estimate_axes(small, posed.cam2world[:, :3, :3])
     heights = [max(finest // 4, 16), max(finest // 2, 16), finest]
-    if posed.baseline < 1e-3 * posed.near:  # coincident cameras cannot be matched
-        middle = np.full((finest, 2 * finest), 0.5 * (1 / posed.near + 1 / posed.far), np.float32)
-        return [Surface(middle, np.zeros(middle.shape, np.uint8)) for _ in posed.images]
     surfaces: list[Surface] | None = None
     low, high = 1 / posed.far, 1 / (config.near_margin * posed.near)
     steps = (high - low) * posed.baseline / (math.pi / heights[0])  # candidates are a pixel of parallax apart
     count = int(np.clip(math.ceil(steps), 48, config.max_candidates))
     step = (high - low) / (count - 1)
-    report("finding floor, ceiling and walls", 0.0)
     planes = make_empty_planes(posed.cam2world, axes, posed.near, posed.far)
     detection = _SearchLevel(posed, min(finest, _DETECTION_HEIGHT), planes, (low, high), config, None)
+    coincident, priors = posed.baseline < 1e-3 * posed.near, None
+    if prior_model is not None:
+        report("estimating depth", 0.0)
+        priors = estimate_priors(
+            prior_model, posed.images, posed.cam2world, detection.views, axes[0], (low, high), config.prior,
+            config.matching, coincident=coincident,
+        )  # fmt: skip
+    if coincident:  # nothing can be matched
+        shape = (finest, 2 * finest)
+        inverse = np.full((len(posed.images), *shape), 0.5 * (1 / posed.near + 1 / posed.far), np.float32)
+        if priors is not None:
+            inverse = np.stack([np.exp(-prior.resize(finest).log_depth) for prior in priors]).clip(low, high)
+        return [Surface(values.astype(np.float32), np.zeros(shape, np.uint8)) for values in inverse]
+    priors = priors and [prior.resize(heights[0]) for prior in priors]
+    report("finding floor, ceiling and walls", 0.05)
     planes = detect_planes(
         detection.views, detection.rays, posed.cam2world, planes, (low, high), MIN_FLOOR * posed.near, config.matching
     )
@@ -131,14 +142,6 @@ def search_surfaces(
         (boundary, fit_walls(boundary, planes.camera_height(pose), posed.far))
         for boundary, pose in zip(boundaries, posed.cam2world, strict=True)
     ]
-    priors = None
-    if prior_model is not None:
-        report("estimating depth", 0.05)
-        priors = estimate_priors(
-            prior_model, posed.images, posed.cam2world, detection.views, axes[0], (low, high), config.prior,
-            config.matching,
-        )  # fmt: skip
-        priors = [prior.resize(heights[0]) for prior in priors]
     for n in range(config.coarse_passes):
         report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
         level = _SearchLevel(posed, heights[0], planes, (low, high), config, surfaces)

@@ -20,7 +20,7 @@ def test_predict_writes_the_scene(scene: Path) -> None:
         (["-o", "scene.splat"], "--out must be a .ply"),
         (["-o", "no/scene.ply"], "existing folder"),
         (["--height", "7"], "--height"),
-        (["--model", "magic"], "must be one of sphere, sweep"),
+        (["--model", "magic"], "must be one of default, sphere, sweep"),
         (["--near", "9", "--far", "3"], "0 < near < far"),
         (["--convention", "sideways"], "needed a known pose convention"),
         (["--precision", "bfloat16"], "`precision` is for networks, and sphere is not one"),

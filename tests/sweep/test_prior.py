@@ -6,6 +6,7 @@ import pytest
 from pansplat.sweep import prior as prior_module
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View
 from pansplat.sweep.prior import DepthPrior, PriorConfig, apply_prior_cost, estimate_priors
+from pansplat.sweep.search import SearchConfig, search_surfaces
 from pansplat.sweep.surface import ray_grid, resize_sphere
 
 _CAMERA_HEIGHT = 1.2  # of `Room.high` over y = 0, metres
@@ -33,6 +34,13 @@ class TrueDepth:
             DepthPrior(prior.log_depth + math.log(height), prior.scale)
             for prior, height in zip(self.priors, camera_heights, strict=True)
         ]
+
+
+class TrueHeights(TrueDepth):
+    """The same with the true heights in the refinement, because blank rooms do not show them."""
+
+    def refine(self, camera_heights, cam2world, iterations):
+        return super().refine([self.room.high[1] - pose[1, 3] for pose in self.poses], cam2world, iterations)
 
 
 def _estimate(room, poses):
@@ -107,3 +115,26 @@ def test_resized_prior_keeps_its_values():
     assert prior.log_depth.shape == (32, 64)
     np.testing.assert_allclose(prior.log_depth, 1.5)
     np.testing.assert_allclose(resize_sphere(prior.scale, 4), 0.2, rtol=1e-6)
+
+
+def test_coincident_cameras_have_the_first_estimate_at_a_usual_height(make_room, observe):
+    room = make_room()
+    pose = room.pose((-0.4, 0.0, -0.2))
+    observed = observe(room, [pose, pose], 64)
+    model = TrueDepth(room, [pose, pose])
+    surfaces = search_surfaces(observed.posed, SearchConfig(room_layout=None), lambda what, fraction: None, model)
+    expected = observed.depths[0] * 1.5 / _CAMERA_HEIGHT
+    for surface in surfaces:
+        assert np.median(np.abs(surface.inverse_depth * expected - 1)) < 0.02
+
+
+def test_prior_decides_where_photographs_are_blank(make_room, observe, two_poses):
+    room = make_room("blank")
+    poses = two_poses(room)
+    observed = observe(room, poses, 64)
+    upright = [pose.copy() for pose in poses]
+    surfaces = search_surfaces(
+        observed.posed, SearchConfig(room_layout=None), lambda what, fraction: None, TrueHeights(room, upright)
+    )
+    for surface, depth in zip(surfaces, observed.depths, strict=True):
+        assert np.median(np.abs(surface.inverse_depth * depth - 1)) < 0.05
