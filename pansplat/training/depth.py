@@ -36,7 +36,7 @@ from pansplat.model.depth_refinement import DepthRefinement, RefinementConfig
 from pansplat.model.efficientnet import load_imagenet_weights
 from pansplat.model.layers import to_channels_last
 from pansplat.training.checkpoint import load_checkpoint, load_latest, save_checkpoint
-from pansplat.training.logs import CsvTable
+from pansplat.training.logs import CsvTable, ProgressDisplay
 from pansplat.training.optimization import ExponentialMovingAverage
 
 _TERMS = ("loss", "mono_error", "mono_likelihood", "refined_error", "refined_likelihood")
@@ -224,8 +224,8 @@ def training_terms(
 class DepthTrainer:
     """A training run, resumed from its latest checkpoint if there is one."""
 
-    def __init__(self, config: DepthTrainConfig) -> None:
-        self.config = config
+    def __init__(self, config: DepthTrainConfig, *, silent: bool = False) -> None:
+        self.config, self.silent = config, silent
         torch.set_num_threads(config.threads)
         torch.manual_seed(config.seed)
         self.tours = ShardReader(list(config.tours))
@@ -262,30 +262,33 @@ class DepthTrainer:
         config.out.mkdir(parents=True, exist_ok=True)
         log = CsvTable(config.out / "log.csv", _COLUMNS, self.step)
         scores = CsvTable(config.out / "validation.csv", _MEASURES, self.step + 1)
-        for kind in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(kind, self._request_stop)
+        handlers = {kind: signal.signal(kind, self._request_stop) for kind in (signal.SIGINT, signal.SIGTERM)}
         began = saved = time.monotonic()
-        print(f"from step {self.step} of {config.steps}, {len(self.tours)} tours", flush=True)
         try:
-            for samples in self._batches():
-                if self._stop:
-                    break
-                values = self._optimize(samples)
-                log.add(self.step, values)
-                self.step += 1
-                now = time.monotonic()
-                if config.stop_after_minutes and now - began > 60 * config.stop_after_minutes:
-                    self._stop = True
-                if config.validation is not None and self.step % config.validate_every == 0:
-                    measures = self.validate()
-                    scores.add(self.step, measures)
-                    print(f"step {self.step}:", {k: round(v, 4) for k, v in measures.items()}, flush=True)
-                if now - saved > 60 * config.minutes or self._stop or self.step == config.steps:
-                    self.save()
-                    saved = now
+            with ProgressDisplay(self.step, config.steps, silent=self.silent) as progress:
+                progress.print(f"from step {self.step} of {config.steps}, {len(self.tours)} tours")
+                for samples in self._batches():
+                    values = self._optimize(samples)
+                    log.add(self.step, values)
+                    self.step += 1
+                    progress.update(self.step, values["loss"], values["seconds"])
+                    now = time.monotonic()
+                    if config.stop_after_minutes and now - began > 60 * config.stop_after_minutes:
+                        self._stop = True
+                    if config.validation is not None and self.step % config.validate_every == 0:
+                        measures = self.validate()
+                        scores.add(self.step, measures)
+                        progress.print(f"step {self.step}: " + ", ".join(f"{k} {v:.4f}" for k, v in measures.items()))
+                    if now - saved > 60 * config.minutes or self._stop or self.step == config.steps:
+                        self.save()
+                        saved = now
+                    if self._stop:
+                        break
         finally:
             log.close()
             scores.close()
+            for kind, handler in handlers.items():
+                signal.signal(kind, handler)
         return self.step >= config.steps
 
     def save(self) -> None:

@@ -151,7 +151,7 @@ def test_equal_random_numbers_give_equal_pairs(tours):
 
 @pytest.mark.slow
 def test_resumed_run_equals_an_uninterrupted_one(config):
-    assert DepthTrainer(config).train()
+    assert DepthTrainer(config, silent=True).train()
     stopped = DepthTrainer(dataclasses.replace(config, out=config.out.with_name("stopped"), steps=6))
     for _, samples in zip(range(3), stopped._batches(), strict=False):
         stopped._optimize(samples)
@@ -168,7 +168,7 @@ def test_resumed_run_equals_an_uninterrupted_one(config):
 def test_run_writes_logs_and_a_model(config):
     from pansplat.guided_sweep import load_guided_sweep
 
-    DepthTrainer(config).train()
+    DepthTrainer(config, silent=True).train()
     assert [row["step"] for row in read_table(config.out / "log.csv")] == [str(n) for n in range(6)]
     assert [row["step"] for row in read_table(config.out / "validation.csv")] == ["3", "6"]
     assert load_guided_sweep(config.out / "model.safetensors").name == "default"
