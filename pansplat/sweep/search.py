@@ -106,6 +106,7 @@ def search_surfaces(
     prior_model: PriorModel | None = None,
 ) -> list[Surface]:
     """The surface of each view, at the finest level."""
+    report("finding the scene's axes", 0.0)
     finest = min(posed.images.shape[1], config.finest_height)
     small = [resize_sphere(image, max(finest // 2, 32)) for image in posed.images]
     axes = estimate_axes(small, posed.cam2world[:, :3, :3])
@@ -119,7 +120,7 @@ def search_surfaces(
     detection = _SearchLevel(posed, min(finest, _DETECTION_HEIGHT), planes, (low, high), config, None)
     coincident, priors = posed.baseline < 1e-3 * posed.near, None
     if prior_model is not None:
-        report("estimating depth", 0.0)
+        report("estimating depth", 0.02)
         priors = estimate_priors(
             prior_model, posed.images, posed.cam2world, detection.views, axes[0], (low, high), config.prior,
             config.matching, coincident=coincident,
