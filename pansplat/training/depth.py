@@ -35,6 +35,7 @@ from pansplat.model.depth_network import DepthEstimate
 from pansplat.model.depth_refinement import DepthRefinement, RefinementConfig
 from pansplat.model.efficientnet import load_imagenet_weights
 from pansplat.model.layers import to_channels_last
+from pansplat.model.weights import load_weights
 from pansplat.training.checkpoint import load_checkpoint, load_latest, save_checkpoint
 from pansplat.training.logs import CsvTable, ProgressDisplay
 from pansplat.training.optimization import ExponentialMovingAverage
@@ -84,7 +85,7 @@ class DepthTrainConfig:
     stop_after_minutes: float = 0.0
     """Save and stop after so many minutes; 0 for none."""
     init: Path | None = None
-    """Checkpoint of another run whose weights of the same names the run starts from."""
+    """File of weights, or checkpoint of another run, from whose weights the run starts."""
     factor_noise: tuple[float, float] = (0.1, 0.03)
     """Deviation of the logarithm of the monocular depth's factor: of both views together, and of each view."""
     network: RefinementConfig = field(default_factory=RefinementConfig)
@@ -369,8 +370,8 @@ class DepthTrainer:
 
 
 def load_matching(network: DepthRefinement, path: Path) -> None:
-    """Load the averaged weights of a checkpoint that have the names and shapes of the network's."""
-    state = load_checkpoint(path)["mean"]
+    """Load the weights of a file, or the averaged weights of a checkpoint, that fit the network's names and shapes."""
+    state = load_weights(path).tensors if path.suffix == ".safetensors" else load_checkpoint(path)["mean"]
     own = network.state_dict()
     fitting = {name: t for name, t in state.items() if name in own and own[name].shape == t.shape}
     network.load_state_dict({**own, **fitting})

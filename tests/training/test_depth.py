@@ -197,10 +197,10 @@ def test_init_takes_the_weights_of_another_run(config, tmp_path):
     first.network.head.bias.data += 1
     first.average.load(first.network.state_dict())
     first.save()
-    path = load_latest(config.out / "checkpoints")[0]
-    second = DepthTrainer(dataclasses.replace(config, out=tmp_path / "second", init=path))
-    assert second.step == 0
-    torch.testing.assert_close(second.network.head.bias, first.network.head.bias)
+    for path in (load_latest(config.out / "checkpoints")[0], config.out / "model.safetensors"):
+        second = DepthTrainer(dataclasses.replace(config, out=tmp_path / "second", init=path))
+        assert second.step == 0
+        torch.testing.assert_close(second.network.head.bias, first.network.head.bias)
 
 
 def test_folder_without_tours_is_refused(config, tmp_path):
