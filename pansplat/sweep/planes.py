@@ -36,7 +36,7 @@ _FLOOR_SOLID_ANGLE = 0.02  # smallest fraction of the sphere that a floor or cei
 _CANDIDATES = 192  # planes across an axis
 _SOFTNESS = np.float32(0.1)  # difference of cost that divides a vote by e
 _MAX_COST = np.float32(0.6)  # smallest cost of a match without a vote
-_MAX_VARIANCE = 4e-3  # of grey values; more texture gives no more votes
+_MAX_VARIANCE = 4e-3  # of grey values; more texture has no more weight
 _MIN_SLANT = 0.2  # smallest component of a ray along a plane's normal
 _MIN_VOTES = 0.1  # scale of a plane's votes, relative to the strongest plane
 _DISTINCT = 3  # ratio of a floor's or ceiling's votes to the median
@@ -286,10 +286,15 @@ def _count_votes(
     return votes
 
 
-def _vote_weights(view: View) -> np.ndarray:
-    """Weights (h, w) of the pixels by texture and solid angle; their sum is one, or zero without texture."""
+def texture_weights(view: View) -> np.ndarray:
+    """Weights (h, w) of the pixels by texture and solid angle; zero where masked."""
     gray = view.image.mean(axis=2)
     variance = cv2.boxFilter(gray * gray, -1, (5, 5)) - cv2.boxFilter(gray, -1, (5, 5)) ** 2
     area = row_weights(len(view.image)).numpy()[:, None]
-    weight = np.clip(variance, 0, _MAX_VARIANCE) * view.valid * area
+    return np.clip(variance, 0, _MAX_VARIANCE) * view.valid * area
+
+
+def _vote_weights(view: View) -> np.ndarray:
+    """The texture weights (h, w), divided by their sum; zero without texture."""
+    weight = texture_weights(view)
     return (weight / max(float(weight.sum()), 1e-9)).astype(np.float32)

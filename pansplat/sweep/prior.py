@@ -18,14 +18,14 @@ import numba as nb
 import numpy as np
 import torch
 
-from pansplat.geometry.equirect import rotate_equirect, row_weights
+from pansplat.geometry.equirect import rotate_equirect
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View, compute_matching_cost
+from pansplat.sweep.planes import texture_weights
 from pansplat.sweep.surface import resize_sphere
 
 _HEIGHT_CANDIDATES = 64
 _SHARP_SCALE = 0.08  # Laplace scale up to which a pixel has full weight in the search of the height
 _MAX_COST = 1.2  # matching cost above which a pixel does not count against a height
-_MAX_VARIANCE = 4e-3  # of grey values; more texture has no more weight
 _MIN_TILT = math.radians(0.5)  # of a camera that is turned upright
 _USUAL_HEIGHT = 1.5  # metres, of a camera over the floor
 _UNBOUNDED = (math.inf, -math.inf)
@@ -185,8 +185,7 @@ def _match_heights(
 ) -> np.ndarray:
     """Weighted matching cost (candidates) of a view's prior at each inverse height."""
     view = views[index]
-    height = view.image.shape[0]
-    prior = prior.resize(height)
+    prior = prior.resize(view.image.shape[0])
     inverse = np.exp(-prior.log_depth).astype(np.float32)
     shape = HypothesisSet(
         (candidates[0] * inverse).astype(np.float32),
@@ -194,9 +193,7 @@ def _match_heights(
         np.zeros((2, len(candidates)), np.float32),
         np.zeros(inverse.shape, np.uint8),
     )
-    gray = view.image.mean(axis=2)
-    variance = cv2.boxFilter(gray * gray, -1, (5, 5)) - cv2.boxFilter(gray, -1, (5, 5)) ** 2
-    weight = np.clip(variance, 0, _MAX_VARIANCE) * view.valid * row_weights(height).numpy()[:, None]
+    weight = texture_weights(view)
     weight *= np.minimum(_SHARP_SCALE / np.maximum(prior.scale, 1e-3), 1)
     total = np.zeros(len(candidates))
     for n, other in enumerate(views):

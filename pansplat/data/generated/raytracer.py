@@ -205,6 +205,22 @@ def _enter(box, x, y, z, ix, iy, iz):
 
 
 @nb.njit(**INLINE)
+def _push_children(bounds, first, stack, depth, limit, x, y, z, ix, iy, iz):
+    """Push the children of a node that a ray enters before `limit`, the nearer one last; the new depth of the stack."""
+    near, far = first, first + 1
+    at_near, at_far = _enter(bounds[near], x, y, z, ix, iy, iz), _enter(bounds[far], x, y, z, ix, iy, iz)
+    if at_far < at_near:
+        near, far, at_near, at_far = far, near, at_far, at_near
+    if at_far < limit:
+        stack[depth] = far
+        depth += 1
+    if at_near < limit:
+        stack[depth] = near
+        depth += 1
+    return depth
+
+
+@nb.njit(**INLINE)
 def _hit_mesh(bodies, root, depth, x, y, z, dx, dy, dz, limit, any_hit):
     """Distance and index of the first triangle nearer than `limit` of the mesh at node `root`, or `limit` and -1.
 
@@ -222,16 +238,7 @@ def _hit_mesh(bodies, root, depth, x, y, z, dx, dy, dz, limit, any_hit):
         node = stack[depth]
         first, count = links[node, 0], links[node, 1]
         if count == 0:
-            near, far = first, first + 1
-            at_near, at_far = _enter(bounds[near], x, y, z, ix, iy, iz), _enter(bounds[far], x, y, z, ix, iy, iz)
-            if at_far < at_near:
-                near, far, at_near, at_far = far, near, at_far, at_near
-            if at_far < best:
-                stack[depth] = far
-                depth += 1
-            if at_near < best:
-                stack[depth] = near
-                depth += 1
+            depth = _push_children(bounds, first, stack, depth, best, x, y, z, ix, iy, iz)
             continue
         for k in range(first, first + count):  # Source: Moeller and Trumbore 1997
             t = triangles[k]
@@ -279,16 +286,7 @@ def first_hit(bodies, x, y, z, dx, dy, dz, limit, any_hit, glass):
         node = stack[depth]
         first, count = links[node, 0], links[node, 1]
         if count == 0:
-            near, far = first, first + 1
-            at_near, at_far = _enter(bounds[near], x, y, z, ix, iy, iz), _enter(bounds[far], x, y, z, ix, iy, iz)
-            if at_far < at_near:
-                near, far, at_near, at_far = far, near, at_far, at_near
-            if at_far < best:
-                stack[depth] = far
-                depth += 1
-            if at_near < best:
-                stack[depth] = near
-                depth += 1
+            depth = _push_children(bounds, first, stack, depth, best, x, y, z, ix, iy, iz)
             continue
         for k in range(first, first + count):
             if kinds[k] == MESH:

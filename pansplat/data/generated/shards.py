@@ -99,7 +99,7 @@ def write_shards(
     Shards that are there are kept, so that an interrupted call can be repeated.
 
     Args:
-        progress: called with the number of tours in each shard that is finished.
+        progress: called with the number of tours in the shards that are there, and in each new one.
 
     Raises:
         InputError: the folder holds shards of other settings, or cannot be written.
@@ -108,11 +108,11 @@ def write_shards(
     _claim_folder(folder, settings)
     numbers = range(-(-count // TOURS_PER_SHARD))
     missing = [n for n in numbers if not _shard_path(folder, n).exists()]
-    for _ in range(len(numbers) - len(missing)):
-        (progress or (lambda tours: None))(TOURS_PER_SHARD)
+    report = progress or (lambda tours: None)
+    report(TOURS_PER_SHARD * (len(numbers) - len(missing)))
     tasks = [(folder, settings, n) for n in missing]
     for _ in _run_tasks(tasks, workers):
-        (progress or (lambda tours: None))(TOURS_PER_SHARD)
+        report(TOURS_PER_SHARD)
     return len(missing)
 
 
