@@ -19,6 +19,7 @@ _PUBLIC = {
     "predict": "pansplat.pipeline",
     "predict_to_file": "pansplat.pipeline",
     "rasterize": "pansplat.rendering",
+    "refine": "pansplat.pipeline",
     "render": "pansplat.pipeline",
     "save": "pansplat.pipeline",
 }

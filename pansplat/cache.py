@@ -25,15 +25,17 @@ _FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
 
 
 class CachedPrediction:
-    """The file of one prediction: safetensors, followed by a CRC-32.
+    """The file of one prediction, or of its refinement: safetensors, followed by a CRC-32.
 
     The file is in `.pansplat/` in the pair's folder, or in the user's cache folder if that is not writable. Its name
     contains a hash of the decoded pixels, masks, poses, depth range and the predictor's fingerprint.
     """
 
-    def __init__(self, pair: Pair, views: Views, predictor: Predictor, height: int) -> None:
-        self._stem = f"{_make_file_name(pair.name)}-{_make_file_name(predictor.name)}-{height}-"
-        self._name = f"{self._stem}{_hash_inputs(views, predictor)}.scene"
+    def __init__(self, pair: Pair, views: Views, predictor: Predictor, height: int, refinement: str = "") -> None:
+        """`refinement` changes with the settings of a refinement, and is empty without one."""
+        model = predictor.name + ("_refined" if refinement else "")
+        self._stem = f"{_make_file_name(pair.name)}-{_make_file_name(model)}-{height}-"
+        self._name = f"{self._stem}{_hash_inputs(views, predictor, refinement)}.scene"
         self._folders = list_cache_folders(pair)
 
     def read(self) -> Gaussians | None:
@@ -66,10 +68,11 @@ def list_cache_folders(pair: Pair) -> list[Path]:
     return [pair.folder / ".pansplat", Path(home) / "pansplat" / pair_hash]
 
 
-def _hash_inputs(views: Views, predictor: Predictor) -> str:
+def _hash_inputs(views: Views, predictor: Predictor, refinement: str) -> str:
     # Pixels are hashed, not files: a mask may depend on other panoramas of the folder, and a decoder may change.
     digest = hashlib.blake2b(digest_size=16)
     settings = [_FORMAT, list(views.images.shape), views.near, views.far, predictor.name, predictor.fingerprint]
+    settings += [refinement] if refinement else []
     digest.update(json.dumps(settings).encode())
     for tensor in (views.images, views.cam2world.double(), views.masks):
         digest.update(np.ascontiguousarray(tensor.detach().cpu().numpy()).data)

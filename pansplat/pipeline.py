@@ -5,6 +5,7 @@ Every name in `__all__` is also an attribute of `pansplat`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -26,11 +27,12 @@ from pansplat.geometry.pose import blend_weights
 from pansplat.model.layers import Precision
 from pansplat.model.weights import WEIGHTS_SUFFIXES, CompatChoice, read_model_name
 from pansplat.predictor import Predictor, Progress
+from pansplat.refinement import RefineConfig, Refinement, refinement_fingerprint
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.official import rasterize_official
 
-__all__ = ["load", "load_model", "load_pairs", "predict", "predict_to_file", "render", "save"]
+__all__ = ["load", "load_model", "load_pairs", "predict", "predict_to_file", "refine", "render", "save"]
 
 Drawing = Literal["exact", "original"]
 
@@ -99,38 +101,113 @@ def predict(
     compat: CompatChoice = "trained",
     precision: Precision = "float32",
     height: int = 512,
+    refine_seconds: float = 0.0,
     cache: bool = True,
     progress: Progress | None = None,
+    on_predicted: Callable[[Scene], None] | None = None,
 ) -> Scene:
-    """Predict the scene of a pair's context panoramas.
+    """Predict the scene of a pair's context panoramas, and refine it.
 
-    The prediction of a pair is cached in its folder (`pansplat.cache`).
+    The prediction of a pair and its refinement are cached in its folder (`pansplat.cache`).
 
     Args:
         source: a pair, the path of a folder that holds exactly one pair, or loaded panoramas (never cached).
         model: the name of a predictor, a file of weights, or a predictor.
         compat, precision: see `load_model`; without effect on a predictor object.
         height: panoramas are resized to (height, 2 height); loaded panoramas keep their size.
+        refine_seconds: time limit of the refinement; 0 for none.
         cache: whether to read and write the cache.
         progress: called with a description of the current work and the completed fraction.
+        on_predicted: called with the prediction before it is refined.
 
     Raises:
         InputError: the input cannot be used, or the path holds several pairs.
     """
+    if not 0 <= refine_seconds < math.inf:
+        raise InputError(f"`refine_seconds` must be at least 0, got {refine_seconds}")
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
     pair = _load_only_pair(source) if isinstance(source, (str, Path)) else source
     views = pair if isinstance(pair, Views) else pair.load_context(height)
-    cached = CachedPrediction(pair, views, predictor, height) if cache and isinstance(pair, Pair) else None
-    gaussians = cached.read() if cached is not None else None
-    if gaussians is not None:
-        if progress is not None:
-            progress("read from the cache", 1.0)
-        return _make_scene(gaussians, views, predictor)
+    cached_pair = pair if cache and isinstance(pair, Pair) else None
+    report = progress or _ignore_progress
+    if not refine_seconds:
+        return _predict_views(cached_pair, views, predictor, height, report)
+    show = on_predicted or _ignore_scene
+    refinement = f"{refinement_fingerprint()}-{refine_seconds:g}s"
+    cached = None if cached_pair is None else CachedPrediction(cached_pair, views, predictor, height, refinement)
+    refined = _read_cached(cached, views, predictor)
+    if refined is not None and on_predicted is None:
+        report("read from the cache", 1.0)
+        return refined
+    scene = _predict_views(cached_pair, views, predictor, height, lambda what, done: report(what, 0.5 * done))
+    show(scene)
+    if refined is not None:
+        return refined
+    scene = refine(scene, views, seconds=refine_seconds, progress=lambda what, done: report(what, 0.5 + 0.5 * done))
+    if cached is not None:
+        cached.write(scene.gaussians)
+    return scene
+
+
+def _predict_views(pair: Pair | None, views: Views, predictor: Predictor, height: int, progress: Progress) -> Scene:
+    """Predict without refinement; with a pair the cache is read and written."""
+    cached = None if pair is None else CachedPrediction(pair, views, predictor, height)
+    scene = _read_cached(cached, views, predictor)
+    if scene is not None:
+        progress("read from the cache", 1.0)
+        return scene
     gaussians = predictor(views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress)
     assert isinstance(gaussians, Gaussians)  # only a batch of inputs gives a list
     if cached is not None:
         cached.write(gaussians)
     return _make_scene(gaussians, views, predictor)
+
+
+def _read_cached(cached: CachedPrediction | None, views: Views, predictor: Predictor) -> Scene | None:
+    gaussians = None if cached is None else cached.read()
+    return None if gaussians is None else _make_scene(gaussians, views, predictor)
+
+
+def _ignore_progress(what: str, fraction: float) -> None:
+    """A `Progress` that shows nothing."""
+
+
+def _ignore_scene(scene: Scene) -> None:
+    """An `on_predicted` that does nothing."""
+
+
+def refine(
+    scene: Scene,
+    views: Views,
+    *,
+    seconds: float | None = None,
+    steps: int | None = None,
+    config: RefineConfig | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Scene:
+    """Fit a scene to the photographs that it was predicted from, by rendering and comparison.
+
+    It works for a scene of any predictor. `pansplat.refinement.Refinement` refines step by step, with a report.
+
+    Args:
+        scene: of one input camera for each photograph.
+        views: the photographs, such as `pair.load_context(height)`; masked pixels are not compared.
+        seconds: time limit, 10 by default; the result depends on the speed of the machine.
+        steps: number of steps instead, for the same result in every run.
+        config: settings of the objective, the step sizes and the number of Gaussians.
+        seed: of the blocks of pixels that are held out of the loss.
+        progress: called with a description of the current work and the completed fraction.
+
+    Returns:
+        The refined scene, or the given one if held-out pixels show that it is better.
+
+    Raises:
+        InputError: scene and views do not fit, or an argument is out of range.
+    """
+    refinement = Refinement(scene, views, config, seed=seed)
+    refinement.run(seconds=10.0 if seconds is None and steps is None else seconds, steps=steps, progress=progress)
+    return refinement.scene()
 
 
 def predict_to_file(

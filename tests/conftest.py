@@ -31,7 +31,7 @@ with contextlib.suppress(ImportError):
     import triton  # noqa: F401
 
 # Check annotated shapes and types at every call; install the hook before the packages are imported.
-_CHECKED = ("geometry", "gaussians", "model", "rendering", "predictor", "evaluation", "pipeline")
+_CHECKED = ("geometry", "gaussians", "model", "rendering", "refinement", "predictor", "evaluation", "pipeline")
 install_import_hook([f"pansplat.{name}" for name in _CHECKED], "pansplat.testing.check_types")
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared"

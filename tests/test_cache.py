@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 
 from pansplat.cache import list_cache_folders
+from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.pipeline import load_pairs, predict
 
@@ -131,3 +132,30 @@ def test_loaded_views_are_not_cached(pair_folder: Path, sphere_predictor) -> Non
     views = pair.load_context(HEIGHT)
     assert have_equal_gaussians(predict(views, predictor), predict(pair, predictor, height=HEIGHT, cache=False))
     assert not any(folder.exists() for folder in list_cache_folders(pair))
+
+
+def test_a_refined_scene_is_cached_apart_from_its_prediction(pair_folder: Path, sphere_predictor) -> None:
+    predictor, shown = sphere_predictor(), []
+    first = predict(pair_folder, predictor, height=HEIGHT, refine_seconds=0.3, on_predicted=shown.append)
+    again = predict(pair_folder, predictor, height=HEIGHT, refine_seconds=0.3, on_predicted=shown.append)
+    assert have_equal_gaussians(first, again) and predictor.calls == 1
+    prediction = predict(pair_folder, predictor, height=HEIGHT)
+    assert not have_equal_gaussians(first, prediction) and predictor.calls == 1
+    assert len(shown) == 2 and all(have_equal_gaussians(scene, prediction) for scene in shown)
+    assert len(list((pair_folder / ".pansplat").iterdir())) == 2
+
+
+def test_an_interrupted_refinement_is_not_cached(pair_folder: Path, sphere_predictor) -> None:
+    def interrupt(what: str, fraction: float) -> None:
+        if what == "refining" and fraction > 0.6:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        predict(pair_folder, sphere_predictor(), height=HEIGHT, refine_seconds=0.5, progress=interrupt)
+    assert len(list((pair_folder / ".pansplat").iterdir())) == 1  # the prediction
+
+
+@pytest.mark.parametrize("seconds", [-1.0, float("nan"), float("inf")])
+def test_an_invalid_time_limit_of_the_refinement_is_refused(pair_folder: Path, sphere_predictor, seconds) -> None:
+    with pytest.raises(InputError, match="`refine_seconds` must be at least 0"):
+        predict(pair_folder, sphere_predictor(), height=HEIGHT, refine_seconds=seconds)

@@ -1,5 +1,6 @@
 """The `pansplat-view` command. Imports torch and OpenGL only when they are needed, so that `--help` is fast."""
 
+import math
 import re
 import sys
 import warnings
@@ -37,6 +38,8 @@ class Options:
     """Type of a network's convolutions; bfloat16 is faster on CPUs that support it, and less accurate."""
     height: int = 512
     """Height of the panoramas that the prediction reads, pixels."""
+    refine: float = 10.0
+    """Time limit of the refinement after the prediction, seconds; 0 for none. A window shows the prediction first."""
     no_cache: bool = False
     """Predict even if the pair's folder has a cached result."""
     convention: str | None = None
@@ -76,7 +79,9 @@ class Options:
     def load_options(self) -> LoadOptions:
         """Options of reading and prediction."""
         names = ("model", "compat", "precision", "height", "convention", "near", "far")
-        return LoadOptions(**{name: getattr(self, name) for name in names}, cache=not self.no_cache)
+        return LoadOptions(
+            **{name: getattr(self, name) for name in names}, refine_seconds=self.refine, cache=not self.no_cache
+        )
 
     @property
     def settings(self) -> DrawSettings:
@@ -125,6 +130,8 @@ def _run(options: Options) -> int:
     pixels = options.pixels
     if options.at is not None and not 0 <= options.at <= 1:
         raise InputError(f"`--at` must be between 0 and 1, got {options.at}")
+    if not 0 <= options.refine < math.inf:
+        raise InputError(f"`--refine` must be a number of seconds, 0 for none, got {options.refine}")
     entries = find_entries(options.path.expanduser(), options.load_options)
     show_all = options.pair == "all"
     first = 0 if show_all else choose_entry(entries, options.pair)
@@ -158,7 +165,7 @@ def _run_window(options: Options, entries: list[SceneEntry], first: int, pixels:
     load_options = options.load_options
     viewer = Viewer(
         window.ctx,
-        SceneLoader(lambda entry, progress: load_entry(entry, load_options, progress)),
+        SceneLoader(lambda entry, progress, show: load_entry(entry, load_options, progress, show)),
         find=lambda path: find_entries(path, load_options),
         state=ViewerState(settings=options.settings),
         at=options.at or 0.0,

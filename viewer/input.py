@@ -30,6 +30,7 @@ HELP = (
     ("Space", "play the flight between them"),
     (", .", "step along the flight"),
     ("C", "compare with the nearest photograph"),
+    ("B", "before or after the refinement"),
     ("P, Shift P", "screenshot PNG, EXR with depth"),
     ("R", "back to the start"),
     ("Tab", "panels on or off"),
@@ -71,6 +72,7 @@ class Commands:
         choose: show the entry of this index.
         open: show the scenes at this path.
         dismiss_error: close the error message.
+        cancel_refinement: keep the prediction.
     """
 
     png: bool = False
@@ -80,10 +82,11 @@ class Commands:
     choose: int | None = None
     open: str | None = None
     dismiss_error: bool = False
+    cancel_refinement: bool = False
 
 
 _KEYS = {
-    **{letter: letter for letter in "wasdqevfhprc"},
+    **{letter: letter for letter in "wasdqevfhprcb"},
     **{digit: f"_{digit}" for digit in "1234"},
     "space": "space",
     ",": "comma",
@@ -142,7 +145,7 @@ def _apply_pressed(state: ViewerState, pressed: frozenset[str]) -> None:
             state.help = False
         else:
             state.quit = True
-    for key, name in (("tab", "overlay"), ("h", "help"), ("c", "photo"), ("v", "orbiting")):
+    for key, name in (("tab", "overlay"), ("h", "help"), ("c", "photo"), ("v", "orbiting"), ("b", "refined")):
         if key in pressed:
             setattr(state, name, not getattr(state, name))
     if "space" in pressed:

@@ -44,11 +44,16 @@ class SceneEntry:
 
 @dataclass(frozen=True, eq=False)
 class LoadedScene:
-    """A scene, and the photographs it was predicted from (None for a scene file)."""
+    """A scene, and the photographs it was predicted from (None for a scene file).
+
+    Attributes:
+        is_final: False for a prediction whose refinement will follow.
+    """
 
     entry: SceneEntry
     scene: "Scene"
     photos: "Views | None" = None
+    is_final: bool = True
 
 
 @dataclass(frozen=True)
@@ -59,6 +64,7 @@ class LoadOptions:
     compat: Literal["trained", "official", "fixed"] = "trained"
     precision: Literal["float32", "bfloat16"] = "float32"
     height: int = 512
+    refine_seconds: float = 10.0
     cache: bool = True
     convention: str | None = None
     near: float | None = None
@@ -87,13 +93,21 @@ def find_entries(path: Path, options: LoadOptions) -> list[SceneEntry]:
     return [SceneEntry(pair.name, pair=pair) for pair in pairs] + [SceneEntry(p.stem, file=p) for p in scenes]
 
 
-def load_entry(entry: SceneEntry, options: LoadOptions, progress: Progress, *, photos: bool = True) -> LoadedScene:
-    """Read or predict an entry's scene.
+def load_entry(
+    entry: SceneEntry,
+    options: LoadOptions,
+    progress: Progress,
+    show: Callable[[LoadedScene], None] | None = None,
+    *,
+    photos: bool = True,
+) -> LoadedScene:
+    """Read an entry's scene, or predict and refine it.
 
     Args:
         entry: the entry.
         options: arguments of reading and prediction.
         progress: called with the task and the fraction done.
+        show: called with the prediction before it is refined.
         photos: whether to read the input photographs.
     """
     from pansplat import pipeline
@@ -102,19 +116,31 @@ def load_entry(entry: SceneEntry, options: LoadOptions, progress: Progress, *, p
         progress("reading", 0.0)
         assert entry.file is not None
         return LoadedScene(entry, pipeline.load(entry.file))
+    images: Views | None = None
+
+    def read_photos() -> "Views | None":
+        nonlocal images
+        if photos and images is None:
+            assert entry.pair is not None
+            images = entry.pair.load_context(max(PHOTO_HEIGHT, options.height))
+        return images
+
+    def show_prediction(scene: "Scene") -> None:
+        if show is not None:
+            show(LoadedScene(entry, scene, read_photos(), is_final=False))
+
     scene = pipeline.predict(
         entry.pair,
         model=options.model,
         compat=options.compat,
         precision=options.precision,
         height=options.height,
+        refine_seconds=options.refine_seconds,
         cache=options.cache,
         progress=progress,
+        on_predicted=None if show is None else show_prediction,
     )
-    if not photos:
-        return LoadedScene(entry, scene)
-    progress("reading photographs", 1.0)
-    return LoadedScene(entry, scene, entry.pair.load_context(max(PHOTO_HEIGHT, options.height)))
+    return LoadedScene(entry, scene, read_photos())
 
 
 class _CancelledError(Exception):
@@ -128,6 +154,11 @@ class _Job:
     fraction: float = 0.0
     cancelled: bool = False
     future: Future[LoadedScene] | None = None
+    preview: LoadedScene | None = None
+    is_shown: bool = False
+
+    def show(self, preview: LoadedScene) -> None:
+        self.preview = preview
 
     def report(self, task: str, fraction: float) -> None:
         if self.cancelled:
@@ -136,9 +167,9 @@ class _Job:
 
 
 class SceneLoader:
-    """Loads entries in worker threads; a new request cancels the previous one."""
+    """Loads and refines entries in worker threads; a new request cancels the previous one."""
 
-    def __init__(self, load: Callable[[SceneEntry, Progress], LoadedScene]) -> None:
+    def __init__(self, load: Callable[[SceneEntry, Progress, Callable[[LoadedScene], None]], LoadedScene]) -> None:
         """`load` loads one entry, such as `load_entry` with its options."""
         self._load = load
         self._executor = ThreadPoolExecutor(thread_name_prefix="scene-loader")
@@ -148,17 +179,31 @@ class SceneLoader:
         """Start loading an entry."""
         self.cancel()
         self._job = _Job(entry)
-        self._job.future = self._executor.submit(self._load, entry, self._job.report)
+        self._job.future = self._executor.submit(self._load, entry, self._job.report, self._job.show)
 
     @property
     def progress(self) -> tuple[str, str, float] | None:
         """Name of the entry, task and fraction done; None if nothing is loading."""
         job = self._job
-        return (job.entry.name, job.task, job.fraction) if job else None
+        return (job.entry.name, job.task, job.fraction) if job and not job.is_shown else None
+
+    @property
+    def refinement(self) -> float | None:
+        """Fraction of the refinement that is done; None if no scene is being refined."""
+        job = self._job
+        return max(2 * job.fraction - 1, 0.0) if job and job.is_shown else None
 
     def poll(self) -> LoadedScene | BaseException | None:
-        """Return the result or exception of the request once; None while it is loading or if there is no request."""
-        if self._job is None or self._job.future is None or not self._job.future.done():
+        """Return a prediction that is being refined, then the result or exception of the request, each once.
+
+        None while there is nothing new, or if there is no request.
+        """
+        if self._job is None or self._job.future is None:
+            return None
+        if self._job.preview is not None and not self._job.is_shown:
+            self._job.is_shown = True
+            return self._job.preview
+        if not self._job.future.done():
             return None
         future, self._job = self._job.future, None
         return future.exception() or future.result()

@@ -42,6 +42,7 @@ class PanelData:
         size: of the rendered image, pixels; smaller than the window while the camera moves.
         photo_name: of the nearest input photograph; None if the scene has none.
         loading: name, task, fraction done; None if nothing is loading.
+        refinement: fraction done; 1 if the refined scene is there, None if there is no refinement.
         error: message of the last failure.
     """
 
@@ -52,6 +53,7 @@ class PanelData:
     size: tuple[int, int] = (0, 0)
     photo_name: str | None = None
     loading: tuple[str, str, float] | None = None
+    refinement: float | None = None
     error: str | None = None
 
 
@@ -181,7 +183,7 @@ class Panels:
         opened, _ = imgui.begin("pansplat", None, _FIXED | imgui.WindowFlags_.always_auto_resize.value)
         if opened:
             imgui.push_item_width(-110 * scale)
-            self._section("Scene", self._draw_scene, data, commands)
+            self._section("Scene", self._draw_scene, state, data, commands)
             self._section("Gaussians", self._draw_gaussians, state)
             self._section("Drawing", self._draw_settings, state)
             self._section("Camera", self._draw_camera, state)
@@ -190,7 +192,7 @@ class Panels:
             imgui.pop_item_width()
         imgui.end()
 
-    def _draw_scene(self, data: PanelData, commands: Commands) -> None:
+    def _draw_scene(self, state: ViewerState, data: PanelData, commands: Commands) -> None:
         if data.entries:
             names = [f"{i + 1}. {name}" for i, name in enumerate(data.entries)]  # numbered, because names may repeat
             imgui.set_next_item_width(-1)
@@ -205,6 +207,13 @@ class Panels:
         imgui.same_line()
         if (self._button("Open") or entered) and self.path.strip():
             commands.open = self.path.strip()
+        if data.refinement is not None:
+            if data.refinement < 1:
+                commands.cancel_refinement = self._button("Cancel")
+                imgui.same_line()
+                imgui.progress_bar(data.refinement, (-1, 0), f"refining {100 * data.refinement:.0f}%")
+            else:
+                state.refined = self._check("refined", state.refined)
 
     def _draw_gaussians(self, state: ViewerState) -> None:
         settings, num_views = state.settings, len(state.context)

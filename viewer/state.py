@@ -26,6 +26,7 @@ class ViewerState:
         flight: fraction of the flight between the panoramas in [0, 1]; `playing` while it is played.
         overlay, help: whether panels and key help are shown.
         photo: whether the nearest input photograph is shown, right of `split` (fraction of the width).
+        refined: whether the refined scene is shown, where there is one, or the prediction.
         adaptive: whether the resolution is lowered while the camera moves.
         speed: of flying, metres per second.
         context: poses of the input cameras; empty for a file without cameras.
@@ -44,6 +45,7 @@ class ViewerState:
     help: bool = False
     photo: bool = False
     split: float = 0.5
+    refined: bool = True
     adaptive: bool = True
     speed: float = 1.0
     context: Float[np.ndarray, "view 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from pansplat.data.views import Views
 from pansplat.errors import InputError
+from pansplat.gaussians.scene import Scene
 from pansplat_viewer import camera as cameras
 from pansplat_viewer.capture import write_screenshot
 from pansplat_viewer.input import Commands, apply_input, read_input
@@ -26,7 +27,7 @@ _MAX_STEP_SECONDS = 0.25  # of camera movement in one frame
 
 SCALES = (1.0, 0.75, 0.5, 0.35, 0.25)  # few values, because a new size allocates new GL textures
 BUDGET_MS = 50.0
-REFINE_AFTER = 0.2  # seconds after the last movement
+SETTLE_AFTER = 0.2  # seconds after the last movement
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class AdaptiveResolution:
         """Return the plan of the frame at time `now` (seconds) after the camera moved, turned or did neither."""
         if moved or turned:
             self.last_motion, self.translated = now, moved
-        moving = now - self.last_motion < REFINE_AFTER
+        moving = now - self.last_motion < SETTLE_AFTER
         if not adaptive or not moving:
             return ResolutionPlan(1.0, cached=False)
         slow = self.full_ms > self.budget_ms
@@ -79,7 +80,7 @@ class AdaptiveResolution:
         if frame_ms > 1.2 * self.budget_ms and plan.scale == SCALES[self.step]:
             self.step = min(self.step + 1, len(SCALES) - 1)
         elif self.step > 0 and plan.scale == SCALES[self.step]:
-            # Refine only if the next scale is expected to fit the budget, else the resolution would oscillate.
+            # A finer scale only if the next one is expected to fit the budget, else the resolution would oscillate.
             growth = (SCALES[self.step - 1] / SCALES[self.step]) ** 2
             if frame_ms * growth < 0.9 * self.budget_ms:
                 self.step -= 1
@@ -195,6 +196,8 @@ class Viewer:
         self._find, self._folder, self._at, self._clock = find, folder, at, clock
         self._resolution = AdaptiveResolution()
         self._loaded: LoadedScene | None = None
+        self._refined: Scene | None = None
+        self._uploaded: Scene | None = None
         self._image: moderngl.Texture | None = None
         self._image_key: tuple[object, ...] | None = None
         self._last_camera = self.state.camera
@@ -202,12 +205,12 @@ class Viewer:
     @property
     def busy(self) -> bool:
         """Whether the next frame differs without new input."""
-        return self.moving or self.panel_data.loading is not None
+        return self.moving or self.panel_data.loading is not None or self.loader.refinement is not None
 
     @property
     def moving(self) -> bool:
         """Whether the image is still changing, so that a window draws as often as it can."""
-        recently = self._clock() - self._resolution.last_motion < 2 * REFINE_AFTER
+        recently = self._clock() - self._resolution.last_motion < 2 * SETTLE_AFTER
         unsettled = self._image is not None and not self.renderer.stats.settled
         return self.state.playing or recently or unsettled
 
@@ -235,6 +238,7 @@ class Viewer:
         start = time.perf_counter()
         now, size = self._clock(), target.viewport[2:]
         self._take_loaded(now)
+        self._exchange_scene()
         self.gui.begin(seconds, new_frame)
         self._update_panel_data()
         panel_commands = self.panels.draw(self.state, self.panel_data, now)
@@ -265,19 +269,36 @@ class Viewer:
         """Show the scene or the error of a finished load."""
         result = self.loader.poll()
         if isinstance(result, LoadedScene):
-            try:
-                self.renderer.upload(result.scene)
-            except (InputError, moderngl.Error) as error:  # moderngl.Error: the GPU's memory is exhausted
-                self.panel_data.error = f"{result.entry.name}: {error}"
-                return
-            self._enter(result, now)
+            loaded = self._loaded
+            if loaded is not None and loaded.entry is result.entry and result.is_final and not loaded.is_final:
+                self._refined = result.scene
+            elif self._upload(result.scene, result.entry):
+                self._enter(result, now)
         elif isinstance(result, InputError):
             self.panel_data.error = str(result)
         elif result is not None:  # not a user error: a defect, or out of memory
             self.panel_data.error = f"{type(result).__name__}: {result}"
 
+    def _upload(self, scene: Scene, entry: SceneEntry) -> bool:
+        """Upload a scene; returns whether it fits the GPU's memory, and shows an error if not."""
+        try:
+            self.renderer.upload(scene)
+        except (InputError, moderngl.Error) as error:  # moderngl.Error: the GPU's memory is exhausted
+            self.panel_data.error = f"{entry.name}: {error}"
+            return False
+        self._uploaded, self._image_key, self._image = scene, None, None
+        return True
+
+    def _exchange_scene(self) -> None:
+        """Show the refined scene or the prediction, whichever is chosen, while the camera stands still."""
+        if self._loaded is None or self._refined is None or self.moving:
+            return
+        scene = self._refined if self.state.refined else self._loaded.scene
+        if scene is not self._uploaded and not self._upload(scene, self._loaded.entry):
+            self._refined = None
+
     def _enter(self, loaded: LoadedScene, now: float) -> None:
-        self._loaded, self._image_key, self._image = loaded, None, None
+        self._loaded, self._refined = loaded, None
         self._resolution = AdaptiveResolution()
         self.presenter.upload_photos(loaded.photos)
         enter_scene(self.state, loaded.scene, at=self._at)
@@ -287,6 +308,7 @@ class Viewer:
     def _update_panel_data(self) -> None:
         data, photo = self.panel_data, self._nearest_photo()
         data.stats, data.loading = self.renderer.stats, self.loader.progress
+        data.refinement = self.loader.refinement if self._refined is None else 1.0
         data.photo_name = None
         if photo is not None and self._loaded and self._loaded.photos:
             data.photo_name = self._loaded.photos.names[photo]
@@ -339,6 +361,8 @@ class Viewer:
         """Execute the commands of the frame, except `focus`."""
         if commands.dismiss_error:
             self.panel_data.error = None
+        if commands.cancel_refinement:
+            self.loader.cancel()
         if commands.choose is not None and commands.choose != self.panel_data.current:
             self.show(self.entries, commands.choose)
         elif commands.open is not None:

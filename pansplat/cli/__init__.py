@@ -16,11 +16,13 @@ from pansplat.cli.data import Data
 from pansplat.cli.evaluate import Evaluate
 from pansplat.cli.info import Info
 from pansplat.cli.predict import Predict
+from pansplat.cli.refine import Refine
 from pansplat.cli.render import Render
 from pansplat.console import own_warnings, run_command
 
 Command = (
     Annotated[Predict, subcommand("predict")]
+    | Annotated[Refine, subcommand("refine")]
     | Annotated[Render, subcommand("render")]
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Check, subcommand("check")]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, cast
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Compat, Out, Precision, parse_blend, progress_bar, require_height
+from pansplat.cli.inputs import Compat, Out, Precision, parse_blend, progress_bar, require_height, require_refine
 from pansplat.console import make_table_console
 from pansplat.errors import InputError
 
@@ -68,6 +68,8 @@ class Evaluate:
     """Number type of a network's convolutions."""
     height: int = 512
     """Panoramas are resized to this height, pixels."""
+    refine: float = 0.0
+    """Time limit of the refinement after each prediction, seconds; 0 for none. Not with --protocol."""
     blend: str | None = None
     """deferred, joint, or view0, view1, ...; by default deferred, with --protocol that of the paper's table."""
     drawing: Literal["exact", "original"] = "exact"
@@ -91,6 +93,7 @@ class Evaluate:
         from pansplat.evaluation.report import evaluate, results_table
 
         require_height(self.height)
+        require_refine(self.refine)
         if not self.paths:
             raise InputError("`pansplat evaluate` needs at least one folder of pairs, or --protocol")
         blend = parse_blend(self.blend or "deferred")
@@ -109,6 +112,7 @@ class Evaluate:
                 predictor,
                 self.out,
                 height=self.height,
+                refine_seconds=self.refine,
                 blend=blend,
                 drawing=self.drawing,
                 lpips=lpips,

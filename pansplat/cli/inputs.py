@@ -5,6 +5,7 @@ Modules of this package import torch and everything that needs it inside functio
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -60,12 +61,20 @@ def choose_pair(path: Path, choice: PairChoice) -> Pair:
     raise InputError(f"--pair {choice.pair}: {path} holds {listed}")
 
 
-def predict_scene(pair: Pair, model: Predictor, height: int, *, cache: bool) -> Scene:
-    """Predict a scene and show a progress bar."""
+def predict_scene(pair: Pair, model: Predictor, height: int, *, cache: bool, refine_seconds: float = 0.0) -> Scene:
+    """Predict and refine a scene, and show a progress bar."""
     from pansplat import pipeline
 
     with progress_bar() as progress:
-        return pipeline.predict(pair, model, height=height, cache=cache, progress=progress)
+        return pipeline.predict(
+            pair, model, height=height, refine_seconds=refine_seconds, cache=cache, progress=progress
+        )
+
+
+def require_refine(seconds: float) -> None:
+    """Refuse a time limit of the refinement that is negative or not finite."""
+    if not 0 <= seconds < math.inf:
+        raise InputError(f"--refine must be a number of seconds, 0 for none, got {seconds}")
 
 
 def require_height(height: int) -> None:

@@ -19,6 +19,7 @@ from pansplat.cli.inputs import (
     predict_scene,
     progress_bar,
     require_height,
+    require_refine,
 )
 from pansplat.errors import InputError
 
@@ -48,6 +49,8 @@ class Predict:
     height: int = 512
     """Panoramas are resized to this height, pixels. Networks predict heights above 512 tile by tile, in bounded
     memory, and do not cache the result."""
+    refine: float = 0.0
+    """Time limit of the refinement after the prediction, seconds; 0 for none. `pansplat refine` has more options."""
     degree: int | None = None
     """Highest degree of spherical harmonics to write, 0 to 4; by default all. The file of 4K panoramas has 5 GB with
     degree 4, 1 GB with degree 0."""
@@ -64,6 +67,7 @@ class Predict:
         if self.out.suffix.lower() != ".ply" or not self.out.resolve().parent.is_dir():
             raise InputError(f"--out must be a .ply file in an existing folder, got {self.out}")
         require_height(self.height)
+        require_refine(self.refine)
         pair = choose_pair(self.path, self.choice)
         if self.degree is not None and not 0 <= self.degree <= 4:
             raise InputError(f"--degree must be 0 to 4, got {self.degree}")
@@ -82,7 +86,7 @@ class Predict:
         from pansplat import pipeline
         from pansplat.gaussians.scene import prune
 
-        if self.height > _MAX_CACHED_HEIGHT and pipeline.can_stream(model):
+        if self.height > _MAX_CACHED_HEIGHT and not self.refine and pipeline.can_stream(model):
             with progress_bar() as progress:
                 return pipeline.predict_to_file(
                     pair,
@@ -93,7 +97,7 @@ class Predict:
                     min_opacity=self.min_opacity,
                     progress=progress,
                 )
-        scene = predict_scene(pair, model, self.height, cache=not self.no_cache)
+        scene = predict_scene(pair, model, self.height, cache=not self.no_cache, refine_seconds=self.refine)
         gaussians = prune(scene.gaussians, degree=self.degree, min_opacity=self.min_opacity)
         pipeline.save(dataclasses.replace(scene, gaussians=gaussians), self.out)
         return len(gaussians)

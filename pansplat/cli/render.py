@@ -20,6 +20,7 @@ from pansplat.cli.inputs import (
     predict_scene,
     progress_bar,
     require_height,
+    require_refine,
 )
 from pansplat.errors import InputError
 
@@ -66,6 +67,8 @@ class Render:
     """For a network: official, fixed, or as its weights were trained; see `pansplat predict --help`."""
     precision: Precision = "float32"
     """Number type of a network's convolutions."""
+    refine: float = 10.0
+    """Time limit of the refinement after the prediction, for a pair, seconds; 0 for none."""
     predict_height: int = 512
     """Height that the panoramas are resized to before the prediction, for a pair."""
     choice: PairChoice = field(default_factory=PairChoice)
@@ -123,6 +126,7 @@ class Render:
         if self._is_video and not (0 < self.seconds < 3600 and 0 < self.fps <= 240):
             raise InputError(f"--seconds and --fps must be positive, got {self.seconds} and {self.fps}")
         parse_blend(self.blend)
+        require_refine(self.refine)
 
     def _open_scene(self) -> Scene:
         """The scene of a .ply file, or the prediction of a pair's folder."""
@@ -133,7 +137,7 @@ class Render:
         require_height(self.predict_height)
         pair = choose_pair(self.path, self.choice)
         model = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
-        return predict_scene(pair, model, self.predict_height, cache=True)
+        return predict_scene(pair, model, self.predict_height, cache=True, refine_seconds=self.refine)
 
     def _render_options(self, layout: str, height: int) -> dict[str, Any]:
         """Keyword arguments of `pipeline.render`."""

@@ -1,4 +1,5 @@
-"""Detection of content that is fixed to the camera: tripod, black caps, car roof.
+"""Detection of pixels that do not show the scene: holes of scans, and what is fixed to the camera (tripod, black
+caps, car roof).
 
 Between panoramas taken at different places everything moves in camera axes, except what is fixed to the camera. Around
 each pole, a closed outline is searched whose edges have the same sign in nearly all panoramas, while the surroundings
@@ -65,6 +66,16 @@ def detect_scene_mask(images: Float[Tensor, "view 3 height width"]) -> Bool[Tens
     nadir = _static_cap(np.ascontiguousarray(grey[:, ::-1]))[::-1]
     static = np.maximum(zenith, nadir).astype(np.float32)
     return torch.from_numpy(cv2.resize(static, (width, height), interpolation=cv2.INTER_LINEAR) < 0.5)
+
+
+def mask_holes(images: Float[Tensor, "view 3 height width"]) -> Bool[Tensor, "view height width"]:
+    """True for the pixels outside patches of exact black: the holes of scans. Photographs have none."""
+    visible = np.empty((len(images), *images.shape[-2:]), bool)
+    for view, image in enumerate(images.detach().cpu().numpy()):
+        black = (image.max(axis=0) <= 0).astype(np.uint8)
+        patches = cv2.morphologyEx(black, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        visible[view] = cv2.dilate(patches, np.ones((5, 5), np.uint8)) == 0
+    return torch.from_numpy(visible)
 
 
 def scene_mask_of_files(paths: tuple[Path, ...], height: int) -> Bool[Tensor, "height width"]:

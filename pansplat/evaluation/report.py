@@ -25,6 +25,7 @@ from pansplat import pipeline
 from pansplat.atomic import replacing
 from pansplat.data.images import write_image
 from pansplat.data.pairs import Pair
+from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import cross_fade, psnr, ssim, ws_psnr
@@ -41,6 +42,8 @@ class Case:
     """Metrics of one target view (PSNR in dB), and the paths of its images.
 
     Attributes:
+        own_ws_psnr: mean WS-PSNR of the scene's images at the input cameras, over unmasked pixels.
+        refine_seconds: 0 without refinement.
         masked_ws_psnr: WS-PSNR of the unmasked pixels; None without a mask. It is only in the printed table.
         lpips: None if it was not measured.
     """
@@ -57,6 +60,8 @@ class Case:
     num_gaussians: int
     prediction: Path
     target: Path
+    own_ws_psnr: float
+    refine_seconds: float
     masked_ws_psnr: float | None = field(default=None, compare=False)
     lpips: float | None = field(default=None, compare=False)
 
@@ -75,6 +80,7 @@ def evaluate(
     out: Path,
     *,
     height: int = 512,
+    refine_seconds: float = 0.0,
     blend: str | int = "deferred",
     drawing: Drawing = "exact",
     lpips: Lpips | None = None,
@@ -86,6 +92,7 @@ def evaluate(
     results.json is written after each pair, so that an interruption keeps the results so far.
 
     Args:
+        refine_seconds: time limit of the refinement of each scene; 0 for none.
         blend, drawing: see `pipeline.render`.
 
     Raises:
@@ -105,7 +112,7 @@ def evaluate(
                 progress(f"{pair.name}: {what}", (index + fraction) / len(with_targets))
 
         taken = {case.prediction.parent.name for case in cases}
-        cases += _evaluate_pair(pair, predictor, out, taken, height, render, lpips, report)
+        cases += _evaluate_pair(pair, predictor, out, taken, height, refine_seconds, render, lpips, report)
         write_json([case.as_json() for case in cases], out / "results.json")
     return cases
 
@@ -124,6 +131,7 @@ def _evaluate_pair(
     out: Path,
     taken: set[str],
     height: int,
+    refine_seconds: float,
     render: Callable[[Scene, Tensor], Rendering],
     lpips: Lpips | None,
     progress: Progress,
@@ -132,6 +140,11 @@ def _evaluate_pair(
     start = time.perf_counter()
     scene = pipeline.predict(context, predictor, progress=progress)
     predict_seconds = time.perf_counter() - start
+    if refine_seconds:
+        start = time.perf_counter()
+        scene = pipeline.refine(scene, context, seconds=refine_seconds, progress=progress)
+        refine_seconds = time.perf_counter() - start
+    own_ws_psnr = _measure_own_views(scene, context, render)
     for view, target in enumerate(targets.images):
         progress("rendering", 1.0)
         pose = targets.cam2world[view]
@@ -154,7 +167,9 @@ def _evaluate_pair(
             psnr=psnr(image, target),
             ssim=ssim(image, target),
             cross_fade_ws_psnr=ws_psnr(cross_fade(context.images, context.cam2world, pose), target),
+            own_ws_psnr=own_ws_psnr,
             predict_seconds=predict_seconds,
+            refine_seconds=refine_seconds,
             render_seconds=render_seconds,
             num_gaussians=len(scene.gaussians),
             prediction=(folder / "prediction.png").resolve(),
@@ -162,6 +177,16 @@ def _evaluate_pair(
             masked_ws_psnr=None if bool(mask.all()) else ws_psnr(image, target, mask=mask),
             lpips=None if lpips is None else lpips.distance(image, target),
         )
+
+
+def _measure_own_views(scene: Scene, context: Views, render: Callable[[Scene, Tensor], Rendering]) -> float:
+    """Mean WS-PSNR of the unmasked pixels at the input cameras."""
+    with torch.no_grad():
+        values = [
+            ws_psnr(render(scene, pose).color.float(), image, mask=mask)
+            for image, pose, mask in zip(context.images, scene.cam2world, context.masks, strict=True)
+        ]
+    return sum(values) / len(values)
 
 
 def error_image(
@@ -211,7 +236,13 @@ def _select_columns(cases: Sequence[Case]) -> dict[str, tuple[Callable[[Case], f
         columns["LPIPS"] = (lambda case: math.nan if case.lpips is None else case.lpips, ".4f")
     return columns | {
         "cross-fade": (lambda case: case.cross_fade_ws_psnr, ".2f"),
+        "at inputs": (lambda case: case.own_ws_psnr, ".2f"),
         "predict s": (lambda case: case.predict_seconds, ".1f"),
+        **(
+            {"refine s": (lambda case: case.refine_seconds, ".1f")}
+            if any(case.refine_seconds for case in cases)
+            else {}
+        ),
         "render s": (lambda case: case.render_seconds, ".1f"),
         "Gaussians": (lambda case: case.num_gaussians, ",.0f"),
     }

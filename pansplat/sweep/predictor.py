@@ -6,12 +6,12 @@ import hashlib
 from dataclasses import dataclass, field
 from importlib.resources import files
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pansplat.data.masks import mask_holes
 from pansplat.gaussians.scene import Gaussians
 from pansplat.predictor import Progress
 from pansplat.sweep.lift import LiftConfig, lift
@@ -87,7 +87,7 @@ class Sweep:
         posed = PosedImages(
             images=np.ascontiguousarray(images.detach().cpu().float().permute(0, 2, 3, 1).numpy()),
             cam2world=cam2world.detach().cpu().double().numpy(),
-            masks=_mask_holes(images) & (True if masks is None else masks.cpu().numpy()),
+            masks=(mask_holes(images) & (True if masks is None else masks.cpu())).numpy(),
             near=low,
             far=high,
         )
@@ -97,16 +97,6 @@ class Sweep:
         gaussians = lift(posed, surfaces, self.config.lift)
         report("done", 1.0)
         return gaussians.to(device=images.device)
-
-
-def _mask_holes(images: Tensor) -> np.ndarray:
-    """Pixels (view, h, w) outside patches of exact black: the holes of scans; photographs have none."""
-    visible = np.empty((len(images), *images.shape[-2:]), bool)
-    for view, image in enumerate(images.detach().cpu().numpy()):
-        black = (image.max(axis=0) <= 0).astype(np.uint8)
-        patches = cv2.morphologyEx(black, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-        visible[view] = cv2.dilate(patches, np.ones((5, 5), np.uint8)) == 0
-    return visible
 
 
 def _select_item(value: float | Tensor, n: int) -> float | Tensor:

@@ -8,7 +8,7 @@ import torch
 
 from pansplat.data.folders import load_pairs
 from pansplat.data.images import write_image
-from pansplat.data.masks import detect_scene_mask, scene_mask_of_files
+from pansplat.data.masks import detect_scene_mask, mask_holes, scene_mask_of_files
 from pansplat.geometry.equirect import pixel_directions, row_weights
 
 _HEIGHT = 256
@@ -101,3 +101,18 @@ def test_only_the_tripod_of_zind_is_masked(shared: Path) -> None:
     assert not scene[round(_HEIGHT * (1 - 6 / 180)) :].any()  # the body, 6 degrees around the nadir
     assert scene[: round(_HEIGHT * (1 - 35 / 180))].all()
     assert math.isclose(float(pair.load_context(64).masks.float().mean()), float(scene.float().mean()), abs_tol=0.01)
+
+
+def test_patches_of_exact_black_are_holes_of_a_scan() -> None:
+    images = torch.rand(2, 3, 64, 128, generator=torch.Generator().manual_seed(0)).clamp_min(0.1)
+    images[0, :, 20:30, 40:60] = 0
+    masks = torch.ones(2, 64, 128, dtype=torch.bool)
+    masks[0, 18:32, 38:62] = False  # the hole, and the pixels that resizing mixes with it
+    assert torch.equal(mask_holes(images), masks)
+
+
+def test_dark_patches_and_single_black_pixels_are_no_holes() -> None:
+    images = torch.rand(1, 3, 64, 128, generator=torch.Generator().manual_seed(0)).clamp_min(0.1)
+    images[0, :, 20:30, 40:60] = 1e-3
+    images[0, :, 5, 5] = 0
+    assert mask_holes(images).all()

@@ -23,7 +23,7 @@ from pansplat.gaussians.scene import Gaussians
 HEIGHT = 16
 KEYS = [
     *("name", "model", "height", "ws_psnr", "psnr", "ssim", "cross_fade_ws_psnr", "predict_seconds"),
-    *("render_seconds", "num_gaussians", "prediction", "target"),
+    *("render_seconds", "num_gaussians", "prediction", "target", "own_ws_psnr", "refine_seconds"),
 ]
 
 
@@ -176,3 +176,15 @@ def test_error_images_are_brighter_for_larger_errors() -> None:
     brightness = error_image(prediction, target).mean(dim=(0, 2))
     assert float(brightness[2]) < 0.02
     assert float(brightness[2]) < float(brightness[1]) < float(brightness[0])
+
+
+def test_a_refined_scene_is_evaluated_with_its_time_and_error_at_the_inputs(tmp_path: Path, sphere_predictor) -> None:
+    pairs = load_pairs(write_triplet(tmp_path / "room"))
+    plain, refined = (
+        evaluate(pairs, sphere_predictor(), tmp_path / str(seconds), height=HEIGHT, refine_seconds=seconds)[0]
+        for seconds in (0.0, 0.5)
+    )
+    assert plain.refine_seconds == 0 < refined.refine_seconds
+    assert refined.own_ws_psnr > plain.own_ws_psnr > 5
+    headings = [str(column.header) for column in results_table([refined]).columns]
+    assert "at inputs" in headings and "refine s" in headings

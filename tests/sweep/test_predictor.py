@@ -4,7 +4,6 @@ import dataclasses
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -16,7 +15,6 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.sweep import Sweep, SweepConfig
 from pansplat.sweep.lift import LiftConfig
-from pansplat.sweep.predictor import _mask_holes
 from pansplat.sweep.search import SearchConfig
 
 
@@ -114,14 +112,6 @@ def test_holes_of_a_scan_are_masked_and_the_input_is_not_changed(small):
     inputs = holed.clone(), poses.clone(), masks.clone()
     assert _same(Sweep()(holed, poses, 0.5, 8.0), Sweep()(holed, poses, 0.5, 8.0, masks=masks))
     assert all(torch.equal(a, b) for a, b in zip(inputs, (holed, poses, masks), strict=True))
-    assert np.array_equal(_mask_holes(holed), masks.numpy())
-
-
-def test_dark_patches_and_single_black_pixels_are_no_holes(small):
-    images = small[0].clone()
-    images[0, :, 20:30, 40:60] = 1e-3
-    images[0, :, 5, 5] = 0
-    assert _mask_holes(images).all()
 
 
 def test_predictions_are_plain_float32_without_gradients(small, predicted):

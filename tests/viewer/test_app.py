@@ -71,6 +71,7 @@ def test_with_an_unusable_display_a_fly_through_is_written(room, capsys, monkeyp
         (["room.ply", "--size", "huge"], "WIDTHxHEIGHT"),
         (["room.ply", "--size", "4x4"], "WIDTHxHEIGHT"),
         (["room.ply", "--at", "1.5"], "between 0 and 1"),
+        (["room.ply", "--refine", "-1"], "--refine` must be a number of seconds"),
         (["room.ply", "--pair", "kitchen"], "number from 1 to 1 or one of room"),
     ],
 )
@@ -108,7 +109,8 @@ def test_pairs_are_chosen_by_name_or_number():
 def test_options_are_passed_on(tmp_path):
     given = {"model": "w.safetensors", "compat": "fixed", "precision": "bfloat16", "height": 256}
     given |= {"convention": "world2cam opengl", "near": 0.3, "far": 9.0}
-    assert Options(tmp_path, no_cache=True, **given).load_options == LoadOptions(cache=False, **given)
+    expected = LoadOptions(cache=False, refine_seconds=3.0, **given)
+    assert Options(tmp_path, no_cache=True, refine=3.0, **given).load_options == expected
     assert Options(tmp_path, size="1920X1080").pixels == (1920, 1080)
 
 

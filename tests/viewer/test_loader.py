@@ -72,7 +72,7 @@ def test_folder_name_is_a_single_valid_name(name, folder):
 def test_loader_reports_progress_and_returns_the_result_once(small_scene, wait_until):
     go, reported = threading.Event(), threading.Event()
 
-    def load(entry, progress):
+    def load(entry, progress, show):
         progress("reading", 0.25)
         reported.set()
         assert go.wait(10)
@@ -90,7 +90,7 @@ def test_loader_reports_progress_and_returns_the_result_once(small_scene, wait_u
 
 
 def test_an_exception_is_returned(wait_until):
-    def load(entry, progress):
+    def load(entry, progress, show):
         raise InputError(f"{entry.name} is damaged")
 
     loader = SceneLoader(load)
@@ -100,8 +100,8 @@ def test_an_exception_is_returned(wait_until):
 
 
 def test_a_new_request_cancels_the_previous_one(small_scene, wait_until):
-    def load(entry, progress):
-        return work_forever(entry, progress) if entry.name == "first" else LoadedScene(entry, small_scene)
+    def load(entry, progress, show):
+        return work_forever(entry, progress, show) if entry.name == "first" else LoadedScene(entry, small_scene)
 
     loader = SceneLoader(load)
     loader.request(SceneEntry("first"))
@@ -135,3 +135,38 @@ def test_predictions_have_the_arguments_of_the_options(monkeypatch, small_scene)
     assert (arguments["model"], arguments["height"], arguments["cache"]) == ("sweep", 256, False)
     assert loaded.photos == "photographs at 1024" and tasks[0] == "predicting"
     assert load_entry(entry, options, ignore, photos=False).photos is None
+
+
+def test_the_prediction_is_returned_before_the_refined_scene(small_scene, wait_until):
+    go = threading.Event()
+
+    def load(entry, progress, show):
+        show(LoadedScene(entry, small_scene, is_final=False))
+        progress("refining", 0.75)
+        assert go.wait(10)
+        return LoadedScene(entry, small_scene)
+
+    loader = SceneLoader(load)
+    loader.request(SceneEntry("kitchen"))
+    assert loader.refinement is None
+    assert not wait_until(loader.poll, "prediction").is_final
+    assert wait_until(lambda: loader.refinement, "progress") == pytest.approx(0.5)
+    assert loader.progress is None and loader.poll() is None
+    go.set()
+    assert wait_until(loader.poll, "result").is_final
+    assert loader.refinement is None and loader.poll() is None
+    loader.close()
+
+
+def test_an_entry_shows_its_prediction_and_reads_the_photographs_once(monkeypatch, small_scene):
+    def predict(pair, **options):
+        assert options["refine_seconds"] == 3.0
+        options["on_predicted"](small_scene)
+        return small_scene
+
+    monkeypatch.setattr("pansplat.pipeline.predict", predict)
+    heights, shown = [], []
+    pair = SimpleNamespace(name="kitchen", load_context=lambda height: heights.append(height) or "photographs")
+    final = load_entry(SceneEntry("kitchen", pair=pair), LoadOptions(refine_seconds=3.0), ignore, shown.append)
+    assert [loaded.is_final for loaded in (*shown, final)] == [False, True]
+    assert shown[0].photos == final.photos == "photographs" and heights == [1024]

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import moderngl
@@ -21,7 +21,7 @@ from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat_viewer.loader import LoadedScene, SceneEntry, SceneLoader
 from pansplat_viewer.state import ViewerState
-from pansplat_viewer.viewer import BUDGET_MS, REFINE_AFTER, SCALES, AdaptiveResolution, Viewer
+from pansplat_viewer.viewer import BUDGET_MS, SCALES, SETTLE_AFTER, AdaptiveResolution, Viewer
 
 pytestmark = pytest.mark.gl
 
@@ -77,8 +77,8 @@ def test_resolution_rises_when_frames_get_fast_and_when_the_camera_stops():
     resolution = AdaptiveResolution()
     move_camera(resolution, 10 * BUDGET_MS, 20)
     last = 19 / 60
-    assert resolution.plan(last + REFINE_AFTER / 2, moved=False, turned=False).scale < 1
-    assert resolution.plan(last + REFINE_AFTER * 1.01, moved=False, turned=False).scale == 1
+    assert resolution.plan(last + SETTLE_AFTER / 2, moved=False, turned=False).scale < 1
+    assert resolution.plan(last + SETTLE_AFTER * 1.01, moved=False, turned=False).scale == 1
     assert resolution.plan(0.5, moved=True, turned=False, adaptive=False).scale == 1
     assert move_camera(resolution, BUDGET_MS / 10, 20)[-1] == 1.0
 
@@ -104,11 +104,11 @@ class User:
             self.clock[0] += seconds
             self.viewer.frame(self.target, seconds)
 
-    def settle(self) -> None:
-        """Draw frames until nothing changes without input."""
-        self.draw_frames(3, REFINE_AFTER)
+    def settle(self, *, refining: bool = False) -> None:
+        """Draw frames until nothing changes without input; with `refining`, except the progress of a refinement."""
+        self.draw_frames(3, SETTLE_AFTER)
         deadline = time.monotonic() + 20
-        while self.viewer.busy:
+        while self.viewer.moving if refining else self.viewer.busy:
             assert time.monotonic() < deadline, "the viewer does not settle"
             self.draw_frames(1)
             time.sleep(0.002)
@@ -192,7 +192,7 @@ def session(gl_context, small_scene, axis_photos, tmp_path_factory) -> Iterator[
     mask = torch.ones(2, 128, 256, dtype=torch.bool)
     photos = Views(images, small_scene.cam2world, mask, 0.45, 10.0, small_scene.names)
 
-    def load(entry, progress):
+    def load(entry, progress, show):
         if entry.name == "sphere":
             return make_sphere_scene(entry, axis_photos)
         if entry.name == "damaged":
@@ -223,12 +223,13 @@ def user(session, ctx) -> User:
     if session.data.entries != [entry.name for entry in ENTRIES] or session.data.current != 0:
         session.show(*ENTRIES)
     state, start = session.state, ViewerState()
-    for name in ("orbiting", "settings", "flight", "playing", "overlay", "help", "photo", "split", "speed", "quit"):
+    kept = ("camera", "home", "context", "levels", "adaptive", "message", "message_until")
+    for name in (field.name for field in fields(ViewerState) if field.name not in kept):
         setattr(state, name, getattr(start, name))
     state.camera, state.adaptive, state.message = state.home, True, ""
     session.data.error, session.viewer._resolution.budget_ms = None, BUDGET_MS
     imgui.get_io().add_mouse_pos_event(SIZE[0] - 5, SIZE[1] - 5)
-    session.draw_frames(2, REFINE_AFTER)
+    session.draw_frames(2, SETTLE_AFTER)
     return session
 
 
@@ -470,7 +471,7 @@ def test_resolution_is_lower_while_the_camera_moves(user):
 def test_the_viewer_shows_progress_and_accepts_input_while_loading(user, small_scene, monkeypatch):
     reported, go = threading.Event(), threading.Event()
 
-    def slow(entry, progress):
+    def slow(entry, progress, show):
         progress("searching depth", 0.5)
         reported.set()
         assert go.wait(20)
@@ -488,3 +489,57 @@ def test_the_viewer_shows_progress_and_accepts_input_while_loading(user, small_s
     go.set()
     user.settle()
     assert user.data.loading is None
+
+
+def test_the_refined_scene_replaces_the_prediction_at_rest_and_keeps_the_camera(user, small_scene, monkeypatch):
+    go = threading.Event()
+    gaussians = replace(small_scene.gaussians, harmonics=small_scene.gaussians.harmonics + 1.0)
+
+    def load(entry, progress, show):
+        show(LoadedScene(entry, small_scene, is_final=False))
+        progress("refining", 0.75)
+        assert go.wait(20)
+        return LoadedScene(entry, replace(small_scene, gaussians=gaussians))
+
+    monkeypatch.setattr(user.viewer.loader, "_load", load)
+    user.viewer.show([SceneEntry("kitchen")], 0)
+    while user.viewer.loader.refinement is None:
+        user.draw_frames(1, 0.01)
+    user.press(imgui.Key.w, frames=2)
+    user.settle(refining=True)
+    predicted, camera = user.read_screen(), user.state.camera
+    assert 0 < user.data.refinement < 1 and "Cancel" in user.panels.items
+    go.set()
+    while user.viewer.loader.refinement is not None:
+        user.draw_frames(1, 0.01)
+    user.settle()
+    refined = user.read_image()
+    assert user.state.camera == camera and changed_fraction(predicted, refined) > 0.2
+    user.click("refined")
+    assert changed_fraction(predicted, user.read_image()) == 0
+    user.press(imgui.Key.b)
+    user.settle()
+    assert changed_fraction(refined, user.read_image()) == 0
+
+
+def test_a_cancelled_refinement_keeps_the_prediction(user, small_scene, monkeypatch):
+    cancelled = threading.Event()
+
+    def load(entry, progress, show):
+        show(LoadedScene(entry, small_scene, is_final=False))
+        try:
+            while True:
+                progress("refining", 0.6)
+                time.sleep(0.005)
+        finally:
+            cancelled.set()
+
+    monkeypatch.setattr(user.viewer.loader, "_load", load)
+    user.viewer.show([SceneEntry("kitchen")], 0)
+    while user.viewer.loader.refinement is None:
+        user.draw_frames(1, 0.01)
+    user.draw_frames(2)
+    user.click("Cancel")
+    assert cancelled.wait(20)
+    user.settle()
+    assert user.data.refinement is None and user.data.error is None

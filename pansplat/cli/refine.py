@@ -1,0 +1,154 @@
+"""`pansplat refine`: a scene fitted to its own photographs."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tyro.conf import Positional
+
+from pansplat.cli.inputs import (
+    Compat,
+    Out,
+    PairChoice,
+    Precision,
+    choose_pair,
+    predict_scene,
+    progress_bar,
+    require_height,
+)
+from pansplat.errors import InputError
+
+if TYPE_CHECKING:
+    from pansplat.data.views import Views
+    from pansplat.gaussians.scene import Scene
+    from pansplat.refinement import RefineReport
+
+
+@dataclass(frozen=True)
+class Refine:
+    """Fit a scene to its own photographs by rendering and comparison, and write it as a 3DGS .ply file.
+
+    Ctrl+C ends the refinement early and writes the scene as it is then.
+    """
+
+    path: Positional[Path]
+    """Folder of a pair, or a .ply scene with --photographs."""
+    out: Out
+    """The .ply file to write."""
+    photographs: Path | None = None
+    """Folder of the pair that a .ply scene was predicted from."""
+    seconds: float | None = None
+    """Time limit; 10 by default."""
+    steps: int | None = None
+    """Number of steps instead, for the same result in every run."""
+    gaussians: int | None = None
+    """Largest number of Gaussians: similar neighbours are merged before the refinement."""
+    poses: bool = False
+    """Estimate small corrections of the camera poses, too."""
+    seed: int = 0
+    """Of the blocks of pixels that are held out to detect overfitting."""
+    report: Path | None = None
+    """A .json file for errors, gains, times and the error over the steps."""
+    model: str = "default"
+    """Predictor, for a pair: `default`, `sweep` (without weights), or a file of weights."""
+    compat: Compat = "trained"
+    """For a network: official, fixed, or as its weights were trained; see `pansplat predict --help`."""
+    precision: Precision = "float32"
+    """Number type of a network's convolutions."""
+    height: int | None = None
+    """The photographs are resized to this height, pixels; by default that of the scene, for a pair 512."""
+    choice: PairChoice = field(default_factory=PairChoice)
+
+    def run(self) -> int:
+        """Refine, write the scene and print the errors of held-out pixels."""
+        from pansplat import pipeline
+        from pansplat.refinement import RefineConfig, Refinement
+
+        self._refuse_invalid_arguments()
+        scene, views = self._open_scene()
+        config = RefineConfig(gaussians=self.gaussians, poses=self.poses)
+        seconds = 10.0 if self.seconds is None and self.steps is None else self.seconds
+        with stop_at_interrupt() as should_stop, progress_bar() as progress:
+            progress("preparing", 0.0)
+            refinement = Refinement(scene, views, config, seed=self.seed)
+            report = refinement.run(seconds=seconds, steps=self.steps, progress=progress, should_stop=should_stop)
+        refined = refinement.scene()
+        pipeline.save(refined, self.out)
+        self._write_report(report)
+        print(_describe(report))
+        print(f"{self.out}: {len(refined.gaussians):,} Gaussians (given: {len(scene.gaussians):,})")
+        return 0
+
+    def _refuse_invalid_arguments(self) -> None:
+        """Raise an error before the prediction, which takes seconds."""
+        if self.out.suffix.lower() != ".ply" or not self.out.resolve().parent.is_dir():
+            raise InputError(f"--out must be a .ply file in an existing folder, got {self.out}")
+        if self.report is not None and (
+            self.report.suffix.lower() != ".json" or not self.report.resolve().parent.is_dir()
+        ):
+            raise InputError(f"--report must be a .json file in an existing folder, got {self.report}")
+        if self.seconds is not None and self.steps is not None:
+            raise InputError("--seconds and --steps both set the length of the refinement; give one of them")
+        if self.path.suffix.lower() == ".ply" and self.photographs is None:
+            raise InputError(f"{self.path} holds no photographs; give the folder of its pair with --photographs")
+        if self.path.suffix.lower() != ".ply" and self.photographs is not None:
+            raise InputError(
+                f"--photographs is for a .ply scene, and {self.path} is the folder of a pair; leave it out"
+            )
+        if self.height is not None:
+            require_height(self.height)
+
+    def _open_scene(self) -> tuple[Scene, Views]:
+        """The scene of a .ply file, or the prediction of a pair's folder, and its photographs."""
+        from pansplat import pipeline
+
+        if self.photographs is not None:
+            scene = pipeline.load(self.path)
+            return scene, choose_pair(self.photographs, self.choice).load_context(self.height or scene.height)
+        pair, height = choose_pair(self.path, self.choice), self.height or 512
+        model = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
+        return predict_scene(pair, model, height, cache=True), pair.load_context(height)
+
+    def _write_report(self, report: RefineReport) -> None:
+        from pansplat.atomic import replacing
+
+        if self.report is not None:
+            with replacing(self.report) as unfinished:
+                unfinished.write_text(json.dumps(dataclasses.asdict(report), indent=1) + "\n", encoding="utf-8")
+
+
+def _describe(report: RefineReport) -> str:
+    """One line on what the refinement did."""
+    ending = {
+        "done": "",
+        "converged": ", converged",
+        "interrupted": ", interrupted",
+        "worse": "; the given scene is kept, because the refined one is not better",
+    }[report.stopped]
+    errors = f"{report.before:.4f} before, {report.after:.4f} after"
+    return f"{report.steps} steps in {report.seconds:.1f} s{ending}; error of held-out pixels {errors}"
+
+
+@contextmanager
+def stop_at_interrupt() -> Iterator[Callable[[], bool]]:
+    """A function that returns True after the first Ctrl+C; the second one raises KeyboardInterrupt."""
+    stopped = False
+
+    def note(signum: int, frame: object) -> None:
+        nonlocal stopped
+        if stopped:
+            raise KeyboardInterrupt
+        stopped = True
+
+    previous = signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: stopped
+    finally:
+        signal.signal(signal.SIGINT, previous)

@@ -1,0 +1,170 @@
+"""Fewer Gaussians for the same pictures: those that contribute nothing are dropped, similar neighbours are merged.
+
+The contribution of a Gaussian is its blending weight, summed over the solid angle of an image and divided by the
+sphere's. If a set of Gaussians is removed, the mean absolute change of that image is at most the sum of their
+contributions, for colours in [0, 1] and to first order in the weights.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float, Integer
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.equirect import row_weights
+from pansplat.geometry.pose import interpolate_poses, quats_from_rotations, rotations_from_quats
+from pansplat.rendering import rasterize
+
+DROP_ERROR = 2e-4  # largest mean absolute change of an image by all Gaussians that are dropped
+_SH_0 = 0.28209479177387814  # the harmonic of degree 0
+_MAX_OPACITY = 0.99
+_LABEL_DISTANCE = 10.0  # between Gaussians of different views or levels; larger than any other distance
+_NORMAL_COST = 0.1  # cost of a right angle between the normals of two discs, as a difference of colours
+_BASE_COST = 0.002  # cost of a merger between equal Gaussians, as a difference of colours
+_MAX_ROUNDS = 16
+
+
+def measure_contributions(scene: Scene, size: tuple[int, int]) -> Float[Tensor, "n"]:
+    """Largest contribution of each Gaussian to the images of its view at all input cameras and halfway between them."""
+    poses = list(scene.cam2world) + [
+        interpolate_poses(first, second, 0.5)
+        for index, first in enumerate(scene.cam2world)
+        for second in scene.cam2world[:index]
+    ]
+    gaussians = scene.gaussians
+    largest = torch.zeros_like(gaussians.opacities)
+    area = row_weights(size[0]).to(largest)[:, None] / (row_weights(size[0]).sum() * size[1])
+    for label in torch.unique(gaussians.views):
+        index = (gaussians.views == label).nonzero()[:, 0]
+        part = gaussians.select(index)
+        for pose in poses:
+            # A grey image of one channel: its gradient in the colours is the sum of the weights.
+            colors = torch.zeros(len(part), 1, 1, dtype=largest.dtype, device=largest.device, requires_grad=True)
+            image = rasterize(dataclasses.replace(part, harmonics=colors), pose, size=size).color
+            (image * area).sum().backward()
+            assert colors.grad is not None
+            largest[index] = torch.maximum(largest[index], colors.grad[:, 0, 0] / _SH_0)
+    return largest
+
+
+def drop_unseen(
+    gaussians: Gaussians, contributions: Float[Tensor, "n"], error: float = DROP_ERROR
+) -> tuple[Gaussians, Float[Tensor, "_"]]:
+    """Drop the Gaussians of least contribution, whose sum of contributions is at most `error`."""
+    order = contributions.argsort(stable=True)
+    dropped = order[contributions[order].double().cumsum(0) <= error]
+    kept = torch.ones_like(contributions, dtype=torch.bool)
+    kept[dropped] = False
+    return gaussians.select(kept), contributions[kept]
+
+
+def merge_to(
+    gaussians: Gaussians, contributions: Float[Tensor, "n"], cameras: Float[Tensor, "view 3"], count: int
+) -> tuple[Gaussians, Float[Tensor, "_"]]:
+    """Merge pairs of similar neighbours until at most `count` Gaussians remain, or no pairs are left.
+
+    Pairs are of one view and level. The pairs that change the images least are merged first.
+
+    Args:
+        cameras: positions of the input cameras, metres.
+    """
+    for _ in range(_MAX_ROUNDS):
+        surplus = len(gaussians) - count
+        if surplus <= 0:
+            break
+        first, second = _find_mutual_neighbours(gaussians, cameras)
+        if not len(first):
+            break
+        cost = _merge_cost(gaussians, contributions, first, second)
+        chosen = cost.argsort(stable=True)[:surplus]
+        first, second = first[chosen], second[chosen]
+        merged = _merge_pairs(gaussians.select(first), gaussians.select(second))
+        kept = torch.ones_like(contributions, dtype=torch.bool)
+        kept[first] = kept[second] = False
+        contributions = torch.cat((contributions[kept], contributions[first] + contributions[second]))
+        gaussians = Gaussians.cat([gaussians.select(kept), merged])
+    order = (gaussians.levels.long() * len(cameras) + gaussians.views.long()).argsort(stable=True)
+    return gaussians.select(order), contributions[order]
+
+
+def _find_mutual_neighbours(
+    gaussians: Gaussians, cameras: Float[Tensor, "view 3"]
+) -> tuple[Integer[Tensor, "pair"], Integer[Tensor, "pair"]]:
+    """Pairs that are each other's nearest neighbour, by direction and logarithm of distance from their camera."""
+    offsets = gaussians.means.double() - cameras.double()[gaussians.views.long()]
+    distances = offsets.norm(dim=1, keepdim=True).clamp_min(1e-9)
+    labels = gaussians.levels.long() * len(cameras) + gaussians.views.long()
+    features = torch.cat((offsets / distances, distances.log(), _LABEL_DISTANCE * labels[:, None]), dim=1).cpu().numpy()
+    if len(features) < 2:
+        return torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long)
+    _, found = cKDTree(features, balanced_tree=False, compact_nodes=False).query(features, k=2, workers=-1)
+    index = np.arange(len(features))
+    nearest = np.where(found[:, 0] == index, found[:, 1], found[:, 0])
+    is_pair = (nearest[nearest] == index) & (index < nearest)
+    first, second = (torch.from_numpy(indices[is_pair]).to(labels) for indices in (index, nearest))
+    same = labels[first] == labels[second]
+    return first[same], second[same]
+
+
+def _merge_cost(gaussians: Gaussians, contributions: Tensor, first: Tensor, second: Tensor) -> Float[Tensor, "pair"]:
+    """Estimated mean absolute change of an image by each merger."""
+    colors = _SH_0 * gaussians.harmonics[:, 0]
+    difference = (colors[first] - colors[second]).abs().mean(1)
+    rotations = rotations_from_quats(gaussians.quats)
+    thinnest = gaussians.scales.argmin(dim=1)[:, None, None].expand(-1, 3, 1)
+    normals = rotations.gather(2, thinnest)[:, :, 0]
+    turn = 1 - (normals[first] * normals[second]).sum(1).abs()
+    a, b = contributions[first], contributions[second]
+    shared = 2 * a * b / (a + b).clamp_min(torch.finfo(a.dtype).tiny)
+    return shared * difference + (a + b) * (_NORMAL_COST * turn + _BASE_COST)
+
+
+def _merge_pairs(first: Gaussians, second: Gaussians) -> Gaussians:
+    """Gaussians with the mean, covariance and integral of opacity of each pair."""
+    masses = [part.opacities.double() * _area(part.scales) for part in (first, second)]
+    total = (masses[0] + masses[1]).clamp_min(1e-30)
+    share = (masses[0] / total)[:, None]
+
+    def average(a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
+        return weight * a.double() + (1 - weight) * b.double()
+
+    means = average(first.means, second.means, share)
+    spread = (first.means.double() - second.means.double()) * (share * (1 - share)).sqrt()
+    covariances = average(
+        first.to(dtype=torch.float64).covariances, second.to(dtype=torch.float64).covariances, share[:, :, None]
+    )
+    values, axes = torch.linalg.eigh(covariances + spread[:, :, None] * spread[:, None, :])
+    axes[:, :, 0] *= torch.linalg.det(axes).sign()[:, None]
+    scales = values.clamp_min(0).sqrt()
+    return Gaussians(
+        means=means.float(),
+        scales=scales.float(),
+        quats=quats_from_rotations(axes).float(),
+        opacities=(total / _area(scales)).clamp_max(_MAX_OPACITY).float(),
+        harmonics=average(first.harmonics, second.harmonics, share[:, :, None]).float(),
+        levels=first.levels,
+        views=first.views,
+    )
+
+
+def _area(scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    """Product of the two largest scales."""
+    ordered = scales.double().sort(dim=1).values
+    return (ordered[:, 1] * ordered[:, 2]).clamp_min(1e-30)
+
+
+def simplify(scene: Scene, size: tuple[int, int], count: int | None) -> Scene:
+    """Drop unseen Gaussians, and merge until at most `count` remain; None does not merge."""
+    gaussians, contributions = drop_unseen(scene.gaussians, measure_contributions(scene, size))
+    if count is not None:
+        gaussians, contributions = merge_to(gaussians, contributions, scene.cam2world[:, :3, 3], count)
+        if len(gaussians) > count:  # no pairs are left: keep those that contribute most
+            best: Sequence[int] = contributions.argsort(descending=True, stable=True)[:count].sort().values.tolist()
+            gaussians = gaussians.select(torch.tensor(best))
+    return dataclasses.replace(scene, gaussians=gaussians)

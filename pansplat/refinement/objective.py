@@ -1,0 +1,82 @@
+"""What a refinement minimises: the difference of renderings and photographs.
+
+Images are compared by their absolute error and by that of their gradients (differences of neighbouring pixels), both
+weighted by solid angle. Blocks of pixels are held out of the loss; their error shows whether the scene improves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from pansplat.geometry.equirect import row_weights
+
+_BLOCKS = 16  # rows of held-out blocks
+
+
+@dataclass(frozen=True, eq=False)
+class PixelWeights:
+    """Weights of an image's pixels and of its gradients to the right and downwards, each with a sum of about 1."""
+
+    pixels: Float[Tensor, "height width"]
+    right: Float[Tensor, "height width"]
+    below: Float[Tensor, "height width"]
+
+    @classmethod
+    def from_mask(cls, mask: Bool[Tensor, "height width"]) -> PixelWeights:
+        """Solid angles of the pixels in a mask, relative to the sphere. A gradient needs both of its pixels."""
+        height, width = mask.shape
+        area = row_weights(height).to(mask.device).float()[:, None] * mask
+        area = area / (row_weights(height).sum() * width)
+        below = functional.pad(torch.minimum(area[1:], area[:-1]), (0, 0, 0, 1))
+        return cls(area, torch.minimum(area, area.roll(-1, 1)), below)
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """A photograph, and weights of its pixels.
+
+    Attributes:
+        scene: of all unmasked pixels.
+        fitted: of those that are not held out.
+        held_out: of those that are.
+    """
+
+    image: Float[Tensor, "3 height width"]
+    scene: PixelWeights
+    fitted: PixelWeights
+    held_out: Float[Tensor, "height width"]
+
+    @classmethod
+    def split(
+        cls,
+        image: Float[Tensor, "3 height width"],
+        mask: Bool[Tensor, "height width"],
+        fraction: float,
+        generator: torch.Generator,
+    ) -> Photograph:
+        """Hold out a fraction of the blocks, chosen at random."""
+        height, width = mask.shape
+        rows = min(_BLOCKS, height)
+        blocks = (torch.rand(1, 1, rows, 2 * rows, generator=generator) < fraction).to(mask.device)
+        held_out = functional.interpolate(blocks.float(), (height, width), mode="nearest")[0, 0] > 0
+        whole = PixelWeights.from_mask(mask)
+        return cls(image, whole, PixelWeights.from_mask(mask & ~held_out), whole.pixels * held_out)
+
+
+def image_difference(
+    error: Float[Tensor, "3 height width"], weights: PixelWeights, structure: float
+) -> Float[Tensor, ""]:
+    """Mean absolute error of colours, and `structure` times that of their gradients."""
+    total = (error.abs().mean(0) * weights.pixels).sum()
+    if structure:
+        right = error.roll(-1, 2) - error
+        below = error[:, 1:] - error[:, :-1]
+        gradients = (right.abs().mean(0) * weights.right).sum()
+        gradients = gradients + (below.abs().mean(0) * weights.below[:-1]).sum()
+        total = total + structure / 2 * gradients
+    return total

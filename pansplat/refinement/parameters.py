@@ -1,0 +1,161 @@
+"""The quantities that the refinement optimises: Gaussians in terms of their source view, gains, and camera poses."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pansplat.gaussians.scene import Gaussians
+from pansplat.geometry.pose import invert_pose, multiply_quats, quats_from_rotations
+
+_MIN_OPACITY, _MAX_OPACITY = 1e-3, 0.999
+_MAX_LOG_DISTANCE = 1.0  # largest change of a logarithm of distance
+_MAX_LOG_SCALE = 3.0  # largest change of a logarithm of scale
+_MIN_SCALE = 1e-9  # relative to the distance
+_MIN_DISTANCE = 1e-6  # metres
+
+
+@dataclasses.dataclass(frozen=True)
+class LearningRates:
+    """Step sizes of Adam at the start of a refinement; they fall to a fraction along a cosine."""
+
+    distance: float = 0.008
+    """Of the logarithm of the distance from the source camera."""
+    scale: float = 0.24
+    """Of the logarithms of the scales."""
+    rotation: float = 0.04
+    """Of the unit quaternions."""
+    opacity: float = 0.12
+    """Of the logits of the opacities."""
+    color: float = 0.02
+    """Of the harmonics of degree 0."""
+    harmonics: float = 0.002
+    """Of the harmonics of higher degree."""
+    gain: float = 0.01
+    """Of the logarithms of the photographs' gains."""
+    pose: float = 0.0005
+    """Of the cameras' rotations, radians, and of their positions relative to the baseline."""
+
+
+class ViewParameters:
+    """The Gaussians of one source view, free along its rays.
+
+    A Gaussian keeps its direction from the source camera. Its scales are proportional to its distance, so that a change
+    of distance keeps its size in the source view.
+
+    Args:
+        gaussians: of the view; at least one.
+        camera: position of the source camera, metres.
+
+    Attributes:
+        tensors: by their name in `NAMES`: the change of the logarithm of the distance, logarithms of the scales,
+            quaternions, logits of the opacities, harmonics of degree 0, and those of higher degrees.
+    """
+
+    NAMES = ("distance", "scale", "rotation", "opacity", "color", "harmonics")
+
+    def __init__(self, gaussians: Gaussians, camera: Float[Tensor, "3"]) -> None:
+        self._gaussians = gaussians.to(dtype=torch.float32)
+        self._camera = camera.to(self._gaussians.means)
+        offsets = self._gaussians.means - self._camera
+        distances = offsets.norm(dim=1).clamp_min(_MIN_DISTANCE)
+        self._offsets = offsets
+        scales = torch.maximum(self._gaussians.scales, _MIN_SCALE * distances[:, None])
+        self._initial_log_scales = scales.log()
+        quats = torch.nn.functional.normalize(self._gaussians.quats, dim=1)
+        opacities = self._gaussians.opacities.clamp(_MIN_OPACITY, _MAX_OPACITY)
+        color, harmonics = self._gaussians.harmonics.split((1, self._gaussians.harmonics.shape[1] - 1), dim=1)
+        values = (torch.zeros_like(distances), self._initial_log_scales, quats, opacities.logit(), color, harmonics)
+        self.tensors = {
+            name: value.detach().clone().requires_grad_() for name, value in zip(self.NAMES, values, strict=True)
+        }
+
+    def build(self) -> Gaussians:
+        """The Gaussians, differentiable in `tensors`."""
+        distance, scale, rotation, opacity, color, harmonics = (self.tensors[name] for name in self.NAMES)
+        factor = distance.exp()[:, None]
+        return dataclasses.replace(
+            self._gaussians,
+            means=self._camera + self._offsets * factor,
+            scales=scale.exp() * factor,
+            quats=rotation,
+            opacities=opacity.sigmoid(),
+            harmonics=torch.cat((color, harmonics), dim=1) if harmonics.shape[1] else color,
+        )
+
+    @torch.no_grad()
+    def clean_gradients(self) -> None:
+        """Replace gradients that are not finite by 0."""
+        for tensor in self.tensors.values():
+            if tensor.grad is not None:
+                torch.nan_to_num_(tensor.grad, nan=0.0, posinf=0.0, neginf=0.0)
+
+    @torch.no_grad()
+    def clamp(self) -> None:
+        """Keep the tensors in their ranges."""
+        self.tensors["distance"].clamp_(-_MAX_LOG_DISTANCE, _MAX_LOG_DISTANCE)
+        limits = self._initial_log_scales - _MAX_LOG_SCALE, self._initial_log_scales + _MAX_LOG_SCALE
+        self.tensors["scale"].clamp_(*limits)
+        bound = torch.tensor(_MAX_OPACITY).logit()
+        self.tensors["opacity"].clamp_(-bound, bound)
+
+
+class CameraParameters:
+    """Gains of the photographs, and small corrections of their poses.
+
+    Photograph t shows the colours of view v times exp(gain_t - gain_v). A corrected pose is the given pose times the
+    exponential of a twist in camera axes: a rotation vector in radians, and a translation relative to the baseline.
+
+    Args:
+        cam2world: given poses, metres.
+        correct_poses: whether the twists are optimised.
+    """
+
+    def __init__(self, cam2world: Float[Tensor, "view 4 4"], *, correct_poses: bool) -> None:
+        self._cam2world = cam2world.double()
+        positions = self._cam2world[:, :3, 3]
+        self._baseline = float(torch.pdist(positions).max()) if len(positions) > 1 else 0.0
+        self.log_gains = torch.zeros(len(cam2world), 3, device=cam2world.device, requires_grad=True)
+        self.twists = torch.zeros(
+            len(cam2world), 6, dtype=torch.float64, device=cam2world.device, requires_grad=correct_poses
+        )
+
+    def gains(self, view: int, photograph: int) -> Float[Tensor, "3"]:
+        """Factors from the colours of a view to those of a photograph."""
+        return (self.log_gains[photograph] - self.log_gains[view]).exp()
+
+    def pose_in_view(self, view: int, photograph: int) -> Float[Tensor, "4 4"]:
+        """The corrected pose of a photograph relative to the corrected pose of a view, which keeps its given pose."""
+        if view == photograph or not self.twists.requires_grad:
+            return self._cam2world[photograph]
+        given = self._cam2world[view]
+        undo = given @ torch.matrix_exp(-self._generator(view)) @ invert_pose(given)
+        return undo @ self._cam2world[photograph] @ torch.matrix_exp(self._generator(photograph))
+
+    @torch.no_grad()
+    def corrected_pose(self, view: int) -> Float[Tensor, "4 4"]:
+        """The pose of a photograph with its correction."""
+        return self._cam2world[view] @ torch.matrix_exp(self._generator(view))
+
+    @torch.no_grad()
+    def move(self, gaussians: Gaussians, view: int) -> Gaussians:
+        """The Gaussians of a view, moved with the correction of its pose.
+
+        Harmonics above degree 0 are not rotated: corrections are fractions of a degree.
+        """
+        if not self.twists[view].any():
+            return gaussians
+        motion = self.corrected_pose(view) @ invert_pose(self._cam2world[view])
+        rotation = motion[:3, :3]
+        means = gaussians.means.double() @ rotation.T + motion[:3, 3]
+        quats = multiply_quats(quats_from_rotations(rotation).expand(len(gaussians), 4), gaussians.quats.double())
+        return dataclasses.replace(gaussians, means=means.float(), quats=quats.float())
+
+    def _generator(self, view: int) -> Float[Tensor, "4 4"]:
+        """The matrix whose exponential is the correction of a pose."""
+        x, y, z, u, v, w = self.twists[view]
+        u, v, w, zero = u * self._baseline, v * self._baseline, w * self._baseline, torch.zeros_like(x)
+        return torch.stack((zero, -z, y, u, z, zero, -x, v, -y, x, zero, w, zero, zero, zero, zero)).reshape(4, 4)

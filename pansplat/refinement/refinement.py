@@ -1,0 +1,330 @@
+"""Render-and-compare after a prediction: the Gaussians of each view are fitted to all photographs of the scene.
+
+The Gaussians of a view are rasterised at its own camera and at the others, and compared with those photographs. So the
+images between the cameras, which deferred blending mixes from single views, are constrained from both sides.
+
+Every step rasterises each view once: at its own camera in even steps, at one of the others in odd steps. Adam moves
+depth along the source ray, scales, rotations, opacities and colours; its step sizes fall along a cosine. Blocks of the
+photographs are held out of the loss: their error decides when to stop, and whether the refined scene replaces the given
+one. The last part of a run fits them too.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.resources import files
+
+import torch
+from torch import Tensor
+
+from pansplat.data.masks import mask_holes
+from pansplat.data.views import Views
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.predictor import Progress
+from pansplat.refinement.budget import simplify
+from pansplat.refinement.objective import Photograph, image_difference
+from pansplat.refinement.parameters import CameraParameters, LearningRates, ViewParameters
+from pansplat.rendering import rasterize
+
+_RATE_FLOOR = 0.05  # of the learning rates at the end
+_CHECK_EVERY = 10  # steps between checks of the held-out error
+_MIN_IMPROVEMENT = 0.005  # relative decrease of the held-out error below which it stagnates
+_PATIENCE = 2  # checks without a sufficient decrease
+_POSE_TOLERANCE = 1e-3  # between the entries of the poses of scene and photographs
+
+
+@dataclass(frozen=True)
+class RefineConfig:
+    """Settings of a refinement."""
+
+    rates: LearningRates = field(default_factory=LearningRates)
+    gaussians: int | None = None
+    """Largest number of Gaussians; None drops only those that contribute nothing."""
+    own: float = 1.0
+    """Weight of a view's image at its own camera."""
+    cross: float = 1.0
+    """Weight of a view's image at another camera."""
+    structure: float = 1.0
+    """Weight of the gradients of the images relative to their colours."""
+    hold: float = 20.0
+    """Weight of the mean squared change of the logarithms of distances."""
+    gains: bool = True
+    """Whether a gain of each photograph's channels is estimated."""
+    poses: bool = False
+    """Whether small corrections of the poses are estimated."""
+    pose_hold: float = 100.0
+    """Weight of the squared corrections, in radians and relative to the baseline."""
+    held_out: float = 0.04
+    """Fraction of the blocks of the photographs that are held out."""
+    release: float = 0.75
+    """Fraction of the run after which held-out blocks are fitted too."""
+    betas: tuple[float, float] = (0.9, 0.99)
+    """Decay of Adam's averages of the gradients and of their squares."""
+
+    def __post_init__(self) -> None:
+        if self.gaussians is not None and self.gaussians < 1:
+            raise InputError(f"`gaussians` must be at least 1, got {self.gaussians}")
+
+
+@dataclass(frozen=True)
+class RefineReport:
+    """Result of a run.
+
+    Attributes:
+        steps, seconds: of the run.
+        stopped: why it ended: "done", "converged", "interrupted", or "worse" if the given scene is kept.
+        before, after: mean absolute error of the held-out blocks of the given scene and of the refined one.
+        gains: factors of the photographs' channels relative to their geometric mean.
+        history: (step, seconds, error of the held-out blocks) of each check.
+    """
+
+    steps: int
+    seconds: float
+    stopped: str
+    before: float
+    after: float
+    gains: tuple[tuple[float, ...], ...]
+    history: tuple[tuple[int, float, float], ...]
+
+
+class Refinement:
+    """A refinement of a scene, which `run` or single calls of `step` advance.
+
+    Args:
+        scene: with one input camera for each of the views.
+        views: the photographs that the scene was predicted from, of any size. Masked pixels and the holes of scans are
+            not compared.
+        config: settings.
+        seed: of the choice of held-out blocks.
+
+    Raises:
+        InputError: scene and views do not fit, or an image is not finite.
+    """
+
+    def __init__(self, scene: Scene, views: Views, config: RefineConfig | None = None, *, seed: int = 0) -> None:
+        _check_fit(scene, views)
+        self.config, self._given = config or RefineConfig(), scene
+        device, random = scene.gaussians.means.device, torch.Generator().manual_seed(seed)
+        self._photographs = [
+            Photograph.split(image.float().to(device), mask.to(device), self.config.held_out, random)
+            for image, mask in zip(views.images, views.masks & mask_holes(views.images), strict=True)
+        ]
+        self._size = (int(views.images.shape[-2]), int(views.images.shape[-1]))
+        gaussians = simplify(scene, self._size, self.config.gaussians).gaussians
+        self._views = {
+            int(view): ViewParameters(gaussians.select(gaussians.views == view), scene.cam2world[int(view), :3, 3])
+            for view in torch.unique(gaussians.views)
+        }
+        self._cameras = CameraParameters(scene.cam2world.to(device), correct_poses=self.config.poses)
+        self._optimizer = self._make_optimizer()
+        self._steps, self._is_worse = 0, False
+
+    def _make_optimizer(self) -> torch.optim.Adam:
+        rates = dataclasses.asdict(self.config.rates)
+        groups = [{"params": [self._cameras.log_gains], "lr": rates["gain"]}]
+        if self.config.poses:
+            groups.append({"params": [self._cameras.twists], "lr": rates["pose"]})
+        for name in ViewParameters.NAMES if self._views else ():
+            groups.append({"params": [view.tensors[name] for view in self._views.values()], "lr": rates[name]})
+        for group in groups:
+            group["initial_lr"] = group["lr"]
+        return torch.optim.Adam(groups, betas=self.config.betas, eps=1e-15, foreach=True)
+
+    def step(self, fraction: float) -> None:
+        """Rasterise and compare each view once, and move the Gaussians.
+
+        Args:
+            fraction: of the run, in [0, 1]; sets the step sizes, and whether held-out blocks are fitted.
+        """
+        config = self.config
+        for group in self._optimizer.param_groups:
+            group["lr"] = group["initial_lr"] * _cosine_fall(fraction)
+        self._optimizer.zero_grad(set_to_none=True)
+        for view, parameters in self._views.items():
+            target = self._choose_target(view)
+            photograph = self._photographs[target]
+            weights = photograph.scene if fraction >= config.release else photograph.fitted
+            error = self._draw(parameters.build(), view, target) - photograph.image
+            loss = image_difference(error, weights, config.structure)
+            loss = (config.own if target == view else config.cross) * loss
+            loss = loss + config.hold * parameters.tensors["distance"].square().mean()
+            loss.backward()
+        if config.poses:
+            (config.pose_hold * self._cameras.twists.square().sum()).backward()
+        for parameters in self._views.values():
+            parameters.clean_gradients()
+        self._optimizer.step()
+        for parameters in self._views.values():
+            parameters.clamp()
+        self._steps += 1
+
+    def _choose_target(self, view: int) -> int:
+        """The photograph that a view is compared with: its own in even steps, the others in turn in odd ones."""
+        count = len(self._photographs)
+        if self._steps % 2 == 0 or count < 2:
+            return view
+        return (view + 1 + self._steps // 2 % (count - 1)) % count
+
+    def _draw(self, gaussians: Gaussians, view: int, target: int) -> Tensor:
+        """The colours (3 height width) of a view's Gaussians in a photograph, with its gain."""
+        color = rasterize(gaussians, self._cameras.pose_in_view(view, target), size=self._size).color
+        if target == view or not self.config.gains:
+            return color
+        return color * self._cameras.gains(view, target)[:, None, None]
+
+    @torch.no_grad()
+    def held_out_error(self) -> float:
+        """Mean absolute error of the held-out blocks, over all views and photographs."""
+        error = weight = 0.0
+        for view, parameters in self._views.items():
+            gaussians = parameters.build()
+            for target, photograph in enumerate(self._photographs):
+                difference = (self._draw(gaussians, view, target) - photograph.image).abs().mean(0)
+                error += float((difference * photograph.held_out).sum())
+                weight += float(photograph.held_out.sum())
+        return error / weight if weight > 0 else 0.0
+
+    @torch.no_grad()
+    def scene(self) -> Scene:
+        """The scene in its present state; the given scene if the run made it worse."""
+        if self._is_worse or not self._views:
+            return self._given
+        parts = [self._cameras.move(parameters.build(), view) for view, parameters in self._views.items()]
+        poses = torch.stack([self._cameras.corrected_pose(view) for view in range(len(self._photographs))])
+        return dataclasses.replace(
+            self._given, gaussians=Gaussians.cat(parts), cam2world=poses.to(self._given.cam2world)
+        )
+
+    @property
+    def gains(self) -> tuple[tuple[float, ...], ...]:
+        """Factors of the photographs' channels relative to their geometric mean."""
+        logs = self._cameras.log_gains.detach()
+        return tuple(tuple(row) for row in (logs - logs.mean(0)).exp().tolist())
+
+    def run(
+        self,
+        *,
+        seconds: float | None = None,
+        steps: int | None = None,
+        progress: Progress | None = None,
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> RefineReport:
+        """Refine for a number of steps, or of seconds.
+
+        The run goes over to its last part early if the held-out error stagnates.
+
+        Args:
+            seconds: time limit; the result depends on the speed of the machine.
+            steps: number of steps; the result is the same in every run on one machine.
+            progress: called with a description and the completed fraction.
+            should_stop: checked before each step; True ends the run and keeps the state.
+
+        Raises:
+            InputError: neither or both of `seconds` and `steps` are given, or one is not positive.
+        """
+        clock = _Clock(seconds, steps, self.config.release)
+        report = progress or (lambda what, fraction: None)
+        before = best = self.held_out_error()
+        history, stale, stopped = [(0, 0.0, before)], 0, "done"
+        clock.start()
+        while self._views and (fraction := clock.fraction) < 1:
+            if should_stop():
+                stopped = "interrupted"
+                break
+            report("refining", fraction)
+            self.step(fraction)
+            clock.steps += 1
+            if clock.steps % _CHECK_EVERY or clock.fraction >= self.config.release:
+                continue
+            error = self.held_out_error()
+            history.append((clock.steps, clock.elapsed, error))
+            stale = 0 if error < best * (1 - _MIN_IMPROVEMENT) else stale + 1
+            best = min(best, error)
+            if stale >= _PATIENCE:
+                stopped = "converged"
+                clock.shorten()
+        after = self.held_out_error()
+        history.append((clock.steps, clock.elapsed, after))
+        report("refined", 1.0)
+        self._is_worse = not after <= before
+        if self._is_worse:
+            stopped = "worse"
+        return RefineReport(clock.steps, clock.elapsed, stopped, before, after, self.gains, tuple(history))
+
+
+class _Clock:
+    """The completed fraction of a run, in steps or in seconds.
+
+    Args:
+        release: fraction at which the last part begins.
+    """
+
+    def __init__(self, seconds: float | None, steps: int | None, release: float) -> None:
+        limit = seconds if steps is None else steps
+        if limit is None or (seconds is not None and steps is not None):
+            raise InputError("give either `seconds` or `steps` of a refinement, got both or neither")
+        if not 0 < limit < math.inf:
+            raise InputError(f"`seconds` or `steps` of a refinement must be positive, got {limit}")
+        self._is_timed, self._limit, self._release = steps is None, float(limit), release
+        self.steps, self._start = 0, time.perf_counter()
+
+    def start(self) -> None:
+        """Begin to measure time."""
+        self._start = time.perf_counter()
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the start."""
+        return time.perf_counter() - self._start
+
+    @property
+    def _spent(self) -> float:
+        return self.elapsed if self._is_timed else float(self.steps)
+
+    @property
+    def fraction(self) -> float:
+        """Completed fraction of the run."""
+        return self._spent / self._limit
+
+    def shorten(self) -> None:
+        """Begin the last part now, with a length in proportion to the time that was spent."""
+        self._limit = self._spent / self._release
+
+
+def _cosine_fall(fraction: float) -> float:
+    """Factor of the step sizes, from 1 at fraction 0 to `_RATE_FLOOR` at fraction 1."""
+    return _RATE_FLOOR + (1 - _RATE_FLOOR) * 0.5 * (1 + math.cos(math.pi * min(max(fraction, 0.0), 1.0)))
+
+
+def refinement_fingerprint(config: RefineConfig | None = None) -> str:
+    """Hash of the settings and of the source code of the refinement; part of the key of cached scenes."""
+    digest = hashlib.blake2b(repr(config or RefineConfig()).encode(), digest_size=8)
+    for source in sorted(files("pansplat.refinement").iterdir(), key=lambda source: source.name):
+        if source.name.endswith(".py"):
+            digest.update(source.read_bytes())
+    return digest.hexdigest()
+
+
+def _check_fit(scene: Scene, views: Views) -> None:
+    count = len(scene.cam2world)
+    if not count:
+        raise InputError("the scene has no input cameras, so it cannot be compared with photographs; refine a pair")
+    if len(views.images) != count:
+        raise InputError(f"the scene needs its {count} photographs to be refined, got {len(views.images)}")
+    if not bool(torch.isfinite(views.images).all()):
+        raise InputError("`views` must hold finite images, got NaN or infinity; read the photographs again")
+    last = int(scene.gaussians.views.max()) if len(scene.gaussians) else 0
+    if last >= count:
+        raise InputError(f"the Gaussians must come from the scene's {count} views, got one of view {last}")
+    difference = float((scene.cam2world.double() - views.cam2world.double()).abs().max())
+    if not difference < _POSE_TOLERANCE:
+        raise InputError(
+            "the poses of the photographs must be those of the scene, got poses that differ by up to "
+            f"{difference:.3g}; give the pair that the scene was predicted from"
+        )

@@ -1,0 +1,90 @@
+"""`pansplat refine`: pairs and scenes, the report, Ctrl+C, refused arguments."""
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from pansplat import pipeline
+from pansplat.cli import refine as refine_command
+from pansplat.cli import run
+
+HEIGHT = 16
+
+
+def refine(path: Path, out: Path, *arguments: object) -> int:
+    return run(["refine", str(path), "-o", str(out), "--steps", "12", *map(str, arguments)])
+
+
+def test_a_pair_is_predicted_and_refined_with_a_report(room: Path, scene: Path, tmp_path: Path, capsys) -> None:
+    out, report = tmp_path / "refined.ply", tmp_path / "report.json"
+    assert refine(room, out, "--model", "sphere", "--height", HEIGHT, "--report", report) == 0
+    printed = capsys.readouterr().out
+    assert "12 steps in" in printed and "error of held-out pixels" in printed
+    values = json.loads(report.read_text())
+    assert values["after"] < values["before"] and values["history"][0][0] == 0 and len(values["gains"]) == 2
+    refined, predicted = pipeline.load(out), pipeline.load(scene)
+    assert refined.names == predicted.names and refined.cam2world.equal(predicted.cam2world)
+    assert not refined.gaussians.means.equal(predicted.gaussians.means)
+
+
+def test_a_scene_is_refined_with_the_photographs_of_its_pair(room: Path, scene: Path, tmp_path: Path) -> None:
+    assert refine(room, tmp_path / "pair.ply", "--model", "sphere", "--height", HEIGHT) == 0
+    assert refine(scene, tmp_path / "scene.ply", "--photographs", room) == 0
+    a, b = (pipeline.load(tmp_path / f"{name}.ply").gaussians for name in ("pair", "scene"))
+    assert (a.means - b.means).abs().median() < 0.01
+
+
+def test_a_budget_limits_the_gaussians(room: Path, tmp_path: Path, capsys) -> None:
+    assert refine(room, tmp_path / "small.ply", "--model", "sphere", "--height", HEIGHT, "--gaussians", 300) == 0
+    assert len(pipeline.load(tmp_path / "small.ply").gaussians) <= 300
+    assert "(given: 1,024)" in capsys.readouterr().out
+
+
+def test_ctrl_c_ends_the_refinement_and_writes_the_scene(room: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    from pansplat.refinement import Refinement
+
+    step = Refinement.step
+
+    def interrupted_step(self: Refinement, fraction: float) -> None:
+        step(self, fraction)
+        if self._steps == 10:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Refinement, "step", interrupted_step)
+    before = signal.getsignal(signal.SIGINT)
+    assert refine(room, tmp_path / "out.ply", "--model", "sphere", "--height", HEIGHT) == 0
+    assert "10 steps in" in (printed := capsys.readouterr().out) and "interrupted" in printed
+    assert (tmp_path / "out.ply").exists() and signal.getsignal(signal.SIGINT) is before
+    with refine_command.stop_at_interrupt(), pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--seconds", 1], "--seconds and --steps both"),
+        (["--gaussians", 0], "at least 1"),
+        (["--photographs", "elsewhere"], "--photographs is for a .ply scene"),
+        (["--report", "report.txt"], "--report must be a .json file"),
+        (["--height", 7], "--height must be an even number"),
+    ],
+)
+def test_invalid_arguments_are_refused(room: Path, tmp_path: Path, refusal, arguments: list, message: str) -> None:
+    base = ["refine", room, "-o", tmp_path / "x.ply", "--model", "sphere", "--steps", 3]
+    base += [] if "--height" in arguments else ["--height", HEIGHT]
+    assert message in refusal(*base, *arguments)
+    assert not (tmp_path / "x.ply").exists()
+
+
+def test_a_scene_needs_the_photographs_of_its_own_pair(scene: Path, tmp_path: Path, write_room, refusal) -> None:
+    assert "give the folder of its pair with --photographs" in refusal("refine", scene, "-o", tmp_path / "x.ply")
+    poses = json.loads((write_room(tmp_path / "other") / "poses.json").read_text())
+    poses["poses"]["b.png"][0][3] = 2.0
+    (tmp_path / "other" / "poses.json").write_text(json.dumps(poses))
+    message = refusal("refine", scene, "-o", tmp_path / "x.ply", "--photographs", tmp_path / "other")
+    assert "differ by up to 1" in message
+    assert "must be a .ply file" in refusal("refine", scene, "-o", tmp_path / "x.png", "--photographs", tmp_path)

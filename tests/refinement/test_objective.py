@@ -1,0 +1,49 @@
+"""The loss of images, and held-out blocks."""
+
+import pytest
+import torch
+
+from pansplat.refinement.objective import Photograph, PixelWeights, image_difference
+
+
+def _error(seed: int = 0) -> torch.Tensor:
+    return torch.randn(3, 16, 32, generator=torch.Generator().manual_seed(seed))
+
+
+def test_pixel_weights_of_a_whole_panorama_sum_to_one() -> None:
+    weights = PixelWeights.from_mask(torch.ones(16, 32, dtype=torch.bool))
+    assert float(weights.pixels.sum()) == pytest.approx(1, abs=1e-5)
+    assert float(weights.right.sum()) == pytest.approx(1, abs=1e-5)  # wraps around
+
+
+def test_a_constant_error_has_no_structure() -> None:
+    weights = PixelWeights.from_mask(torch.ones(16, 32, dtype=torch.bool))
+    constant = torch.full((3, 16, 32), -0.25)
+    assert float(image_difference(constant, weights, 1.0)) == pytest.approx(0.25, abs=1e-5)
+    assert float(image_difference(_error(), weights, 1.0)) > float(image_difference(_error(), weights, 0.0))
+
+
+def test_turning_the_panorama_keeps_the_loss() -> None:
+    weights = PixelWeights.from_mask(torch.ones(16, 32, dtype=torch.bool))
+    turned = image_difference(_error().roll(5, 2), weights, 1.0)
+    torch.testing.assert_close(turned, image_difference(_error(), weights, 1.0))
+
+
+def test_masked_pixels_have_no_gradient() -> None:
+    mask = torch.rand(16, 32, generator=torch.Generator().manual_seed(2)) > 0.3
+    error = _error().requires_grad_()
+    image_difference(error, PixelWeights.from_mask(mask), 1.0).backward()
+    assert error.grad is not None
+    assert not error.grad[:, ~mask].any() and error.grad[:, mask].any()
+
+
+def test_held_out_blocks_are_disjoint_from_fitted_pixels_and_repeat_with_the_seed() -> None:
+    mask = torch.ones(64, 128, dtype=torch.bool)
+    mask[50:] = False
+    first, again, other = (
+        Photograph.split(torch.zeros(3, 64, 128), mask, 0.1, torch.Generator().manual_seed(seed)) for seed in (3, 3, 4)
+    )
+    assert torch.equal(first.held_out, again.held_out) and not torch.equal(first.held_out, other.held_out)
+    assert not ((first.held_out > 0) & (first.fitted.pixels > 0)).any()
+    assert torch.equal((first.held_out > 0) | (first.fitted.pixels > 0), mask)
+    assert 0.02 < float((first.held_out > 0).float().mean()) < 0.2

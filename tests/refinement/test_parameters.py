@@ -1,0 +1,85 @@
+"""Parameters of a refinement: the Gaussians of a view, gains and pose corrections."""
+
+import math
+
+import torch
+
+from pansplat.gaussians.scene import Gaussians
+from pansplat.geometry.pose import orthonormal_error
+from pansplat.refinement.parameters import CameraParameters, ViewParameters
+from pansplat.rendering import rasterize
+
+
+def _view(room, view: int = 0) -> tuple[Gaussians, torch.Tensor]:
+    gaussians = room.predicted.gaussians
+    return gaussians.select(gaussians.views == view), room.predicted.cam2world[view, :3, 3]
+
+
+def test_building_at_the_start_returns_the_given_gaussians(room) -> None:
+    given, camera = _view(room)
+    built = ViewParameters(given, camera).build()
+    for name in ("means", "scales", "quats", "opacities", "harmonics"):
+        torch.testing.assert_close(getattr(built, name), getattr(given, name), rtol=1e-5, atol=1e-6)
+    assert torch.equal(built.levels, given.levels) and torch.equal(built.views, given.views)
+
+
+def test_a_change_of_distance_keeps_direction_and_angular_size(room) -> None:
+    given, camera = _view(room)
+    parameters = ViewParameters(given, camera)
+    with torch.no_grad():
+        parameters.tensors["distance"].fill_(math.log(1.5))
+    built = parameters.build()
+    torch.testing.assert_close(built.means - camera.float(), 1.5 * (given.means - camera.float()), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(built.scales, 1.5 * given.scales)
+
+
+def test_harmonics_of_higher_degree_are_kept(room) -> None:
+    given, camera = _view(room)
+    harmonics = torch.randn(len(given), 4, 3, generator=torch.Generator().manual_seed(0))
+    given = Gaussians(*(harmonics if name == "harmonics" else value for name, value in vars(given).items()))
+    torch.testing.assert_close(ViewParameters(given, camera).build().harmonics, harmonics)
+
+
+def test_gaussians_at_the_camera_and_of_extreme_opacity_stay_finite(room) -> None:
+    given, camera = _view(room)
+    given.means[0] = camera.float()
+    given.opacities[1], given.opacities[2] = 0.0, 1.0
+    built = ViewParameters(given, camera).build()
+    assert all(torch.isfinite(value).all() for value in vars(built).values() if value.is_floating_point())
+
+
+def test_non_finite_gradients_become_zero_and_ranges_are_kept(room) -> None:
+    parameters = ViewParameters(*_view(room))
+    for tensor in parameters.tensors.values():
+        tensor.grad = torch.full_like(tensor, math.nan)
+    parameters.clean_gradients()
+    assert all(bool((tensor.grad == 0).all()) for tensor in parameters.tensors.values() if tensor.grad is not None)
+    with torch.no_grad():
+        parameters.tensors["distance"].fill_(50.0)
+        parameters.tensors["scale"].fill_(-90.0)
+        parameters.tensors["opacity"].fill_(1e4)
+    parameters.clamp()
+    with torch.no_grad():
+        built = parameters.build()
+    assert float(built.opacities.max()) < 1 and float(built.scales.min()) > 0
+    assert float(parameters.tensors["distance"].detach().max()) <= 1
+
+
+def test_gains_are_relative_to_the_view(room) -> None:
+    cameras = CameraParameters(room.predicted.cam2world, correct_poses=False)
+    with torch.no_grad():
+        cameras.log_gains[1] = math.log(2)
+    torch.testing.assert_close(cameras.gains(0, 1), torch.full((3,), 2.0))
+    torch.testing.assert_close(cameras.gains(1, 0), torch.full((3,), 0.5))
+
+
+def test_moving_the_gaussians_equals_moving_the_camera_in_their_frame(room) -> None:
+    cameras = CameraParameters(room.predicted.cam2world, correct_poses=True)
+    with torch.no_grad():
+        cameras.twists.copy_(0.02 * torch.randn(2, 6, generator=torch.Generator().manual_seed(1)))
+    given, _ = _view(room)
+    size = (32, 64)
+    in_frame = rasterize(given, cameras.pose_in_view(0, 1).detach(), size=size).color
+    in_world = rasterize(cameras.move(given, 0), cameras.corrected_pose(1), size=size).color
+    torch.testing.assert_close(in_frame, in_world, atol=2e-4, rtol=1e-3)
+    assert orthonormal_error(cameras.corrected_pose(1)) < 1e-12

@@ -1,0 +1,203 @@
+"""Refinement of a small scene with known photographs, and its guards."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+import pansplat
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import empty_gaussians
+from pansplat.geometry.pose import invert_pose
+from pansplat.refinement import RefineConfig, Refinement, refinement_fingerprint
+
+
+def _refine(room, steps: int = 60, views=None, scene=None, **config):
+    refinement = Refinement(scene or room.predicted, views or room.views, RefineConfig(**config))
+    report = refinement.run(steps=steps)
+    return refinement.scene(), report
+
+
+def _tensors(scene) -> list[torch.Tensor]:
+    return list(vars(scene.gaussians).values())
+
+
+def test_refinement_brings_the_image_between_the_cameras_near_the_truth(room) -> None:
+    middle = room.truth.pose_between(0.5)
+    refined, report = _refine(room)
+    assert room.error(refined, middle) < 0.5 * room.error(room.predicted, middle)
+    assert report.after < 0.5 * report.before and report.steps <= 60
+    assert report.history[0] == (0, 0.0, report.before)
+    assert torch.equal(refined.cam2world, room.predicted.cam2world)
+
+
+def test_depth_comes_nearer_to_the_truth(room) -> None:
+    refined, _ = _refine(room, steps=60, hold=0.0)
+
+    def error(scene) -> float:
+        camera = scene.cam2world[0, :3, 3].float()
+        first = scene.gaussians.select(scene.gaussians.views == 0)
+        truth = room.truth.gaussians.select(room.truth.gaussians.views == 0)
+        ratio = (first.means - camera).norm(dim=1) / (truth.means - camera).norm(dim=1)
+        return float(ratio.log().abs().mean())
+
+    assert error(refined) < 0.5 * error(room.predicted)
+
+
+def test_the_result_is_the_same_in_every_run_with_steps(room) -> None:
+    first, again = (_refine(room, steps=12)[0] for _ in range(2))
+    assert all(torch.equal(a, b) for a, b in zip(_tensors(first), _tensors(again), strict=True))
+
+
+def test_the_exposure_of_a_photograph_is_found(room) -> None:
+    images = room.views.images.clone()
+    images[1] = 0.8 * images[1]
+    darker = room.predicted.gaussians.harmonics.clone()
+    second = room.predicted.gaussians.views == 1
+    darker[second] = 0.8 * (darker[second] + 0.5 / 0.28209479) - 0.5 / 0.28209479
+    scene = dataclasses.replace(
+        room.predicted, gaussians=dataclasses.replace(room.predicted.gaussians, harmonics=darker)
+    )
+    _, report = _refine(room, views=dataclasses.replace(room.views, images=images), scene=scene, steps=100)
+    ratios = [b / a for a, b in zip(*report.gains, strict=True)]
+    assert ratios == pytest.approx([0.8] * 3, abs=0.03)
+
+
+def test_pose_errors_are_corrected(room) -> None:
+    offset = torch.eye(4, dtype=torch.float64)
+    angle = math.radians(0.8)
+    offset[0, 0] = offset[2, 2] = math.cos(angle)
+    offset[0, 2], offset[2, 0] = math.sin(angle), -math.sin(angle)
+    poses = room.truth.cam2world.clone()
+    poses[1] = poses[1] @ offset
+    gaussians = room.truth.gaussians
+    moved = Refinement(dataclasses.replace(room.truth), room.views)._cameras.move  # identity without corrections
+    assert moved(gaussians, 0) is gaussians
+    motion = poses[1] @ invert_pose(room.truth.cam2world[1])
+    means = gaussians.means.double()
+    means[gaussians.views == 1] = means[gaussians.views == 1] @ motion[:3, :3].T + motion[:3, 3]
+    scene = dataclasses.replace(
+        room.truth, cam2world=poses, gaussians=dataclasses.replace(gaussians, means=means.float())
+    )
+    views = dataclasses.replace(room.views, cam2world=poses)
+    refined, _ = _refine(room, scene=scene, views=views, steps=150, poses=True, pose_hold=1.0)
+
+    def relative_angle(pair: torch.Tensor) -> float:
+        rotation = (invert_pose(pair[0]) @ pair[1])[:3, :3]
+        return math.degrees(math.acos(min(1.0, float(rotation.trace() - 1) / 2)))
+
+    assert relative_angle(refined.cam2world) < 0.4 * relative_angle(poses)
+    fixed, _ = _refine(room, scene=scene, views=views, steps=20)
+    assert torch.equal(fixed.cam2world, poses)
+
+
+def test_a_scene_that_gets_worse_is_returned_unchanged(room) -> None:
+    rates = dataclasses.replace(RefineConfig().rates, distance=1.0, scale=3.0, color=5.0)
+    kept, report = _refine(room, scene=room.truth, steps=6, rates=rates)
+    assert report.stopped == "worse" and kept is room.truth
+
+
+def test_a_stagnating_run_ends_early_with_its_last_part(room) -> None:
+    _, report = _refine(room, steps=2000)
+    assert report.stopped == "converged" and report.steps < 1500
+
+
+def test_a_run_can_be_stopped_at_any_step_and_keeps_its_state(room) -> None:
+    refinement = Refinement(room.predicted, room.views)
+    report = refinement.run(steps=1000, should_stop=lambda: refinement._steps >= 9)
+    assert (report.steps, report.stopped) == (9, "interrupted")
+    middle = room.truth.pose_between(0.5)
+    assert room.error(refinement.scene(), middle) < room.error(room.predicted, middle)
+
+
+def test_a_time_limit_ends_the_run_and_progress_grows(room) -> None:
+    fractions: list[float] = []
+    report = Refinement(room.predicted, room.views).run(
+        seconds=0.5, progress=lambda what, fraction: fractions.append(fraction)
+    )
+    assert report.steps > 1 and report.seconds < 5
+    assert fractions == sorted(fractions) and fractions[-1] == 1
+
+
+def test_a_budget_limits_the_gaussians(room) -> None:
+    refined, _ = _refine(room, gaussians=500)
+    assert len(refined.gaussians) <= 500
+    middle = room.truth.pose_between(0.5)
+    assert room.error(refined, middle) < room.error(room.predicted, middle)
+
+
+def test_masked_pixels_have_no_effect(room) -> None:
+    masks = room.views.masks.clone()
+    masks[:, 24:] = False
+    spoiled = room.views.images.clone()
+    spoiled[:, :, 24:] = torch.rand(2, 3, 8, 64, generator=torch.Generator().manual_seed(0))
+    results = [
+        _refine(room, steps=8, views=dataclasses.replace(room.views, images=images, masks=masks))[0]
+        for images in (room.views.images, spoiled)
+    ]
+    assert all(torch.equal(a, b) for a, b in zip(*(_tensors(result) for result in results), strict=True))
+
+
+@pytest.mark.parametrize("case", ["all masked", "one color", "one place", "one view", "three views"])
+def test_degenerate_scenes_stay_finite_and_are_not_worse(room, case: str) -> None:
+    scene, views = room.predicted, room.views
+    if case == "all masked":
+        views = dataclasses.replace(views, masks=torch.zeros_like(views.masks))
+    elif case == "one color":
+        views = dataclasses.replace(views, images=torch.full_like(views.images, 0.4))
+    elif case == "one place":
+        poses = views.cam2world[:1].repeat(2, 1, 1)
+        scene, views = dataclasses.replace(scene, cam2world=poses), dataclasses.replace(views, cam2world=poses)
+    elif case == "one view":
+        first = scene.gaussians.select(scene.gaussians.views == 0)
+        scene = dataclasses.replace(scene, gaussians=first)
+    else:
+        poses = torch.cat((views.cam2world, views.cam2world[:1]))
+        scene = dataclasses.replace(scene, cam2world=poses)
+        views = dataclasses.replace(
+            views,
+            images=torch.cat((views.images, views.images[:1])),
+            masks=torch.cat((views.masks, views.masks[:1])),
+            cam2world=poses,
+        )
+    refined, report = _refine(room, scene=scene, views=views, steps=20)
+    assert all(torch.isfinite(t).all() for t in _tensors(refined))
+    assert report.after <= report.before or refined is scene
+
+
+def test_an_empty_scene_is_returned(room) -> None:
+    empty = dataclasses.replace(room.predicted, gaussians=empty_gaussians())
+    refined, report = _refine(room, scene=empty, steps=5)
+    assert refined is empty and report.steps == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s, v: (dataclasses.replace(s, cam2world=s.cam2world[:0]), v), "no input cameras"),
+        (lambda s, v: (s, dataclasses.replace(v, images=v.images[:1])), "needs its 2 photographs"),
+        (lambda s, v: (s, dataclasses.replace(v, images=v.images * math.nan)), "finite images"),
+        (lambda s, v: (s, dataclasses.replace(v, cam2world=v.cam2world + 0.1)), "differ by up to 0.1"),
+    ],
+)
+def test_photographs_that_do_not_fit_are_refused(room, change, message: str) -> None:
+    scene, views = change(room.predicted, room.views)
+    with pytest.raises(InputError, match=message):
+        Refinement(scene, views)
+
+
+@pytest.mark.parametrize("limits", [{}, {"seconds": 1.0, "steps": 1}, {"steps": 0}, {"seconds": math.nan}])
+def test_invalid_limits_are_refused(room, limits: dict) -> None:
+    with pytest.raises(InputError, match="of a refinement"):
+        Refinement(room.predicted, room.views).run(**limits)
+    with pytest.raises(InputError, match="`gaussians` must be at least 1"):
+        RefineConfig(gaussians=0)
+
+
+def test_the_public_call_refines_and_the_fingerprint_depends_on_the_settings(room) -> None:
+    refined = pansplat.refine(room.predicted, room.views, steps=10)
+    middle = room.truth.pose_between(0.5)
+    assert room.error(refined, middle) < room.error(room.predicted, middle)
+    assert refinement_fingerprint() == refinement_fingerprint(RefineConfig())
+    assert refinement_fingerprint() != refinement_fingerprint(RefineConfig(hold=1.0))
