@@ -136,8 +136,8 @@ def test_loaded_views_are_not_cached(pair_folder: Path, sphere_predictor) -> Non
 
 def test_a_refined_scene_is_cached_apart_from_its_prediction(pair_folder: Path, sphere_predictor) -> None:
     predictor, shown = sphere_predictor(), []
-    first = predict(pair_folder, predictor, height=HEIGHT, refine_seconds=0.3, on_predicted=shown.append)
-    again = predict(pair_folder, predictor, height=HEIGHT, refine_seconds=0.3, on_predicted=shown.append)
+    first = predict(pair_folder, predictor, height=HEIGHT, refine_seconds=3.0, on_predicted=shown.append)
+    again = predict(pair_folder, predictor, height=HEIGHT, refine_seconds=3.0, on_predicted=shown.append)
     assert have_equal_gaussians(first, again) and predictor.calls == 1
     prediction = predict(pair_folder, predictor, height=HEIGHT)
     assert not have_equal_gaussians(first, prediction) and predictor.calls == 1
@@ -151,7 +151,7 @@ def test_an_interrupted_refinement_is_not_cached(pair_folder: Path, sphere_predi
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        predict(pair_folder, sphere_predictor(), height=HEIGHT, refine_seconds=0.5, progress=interrupt)
+        predict(pair_folder, sphere_predictor(), height=HEIGHT, refine_seconds=3.0, progress=interrupt)
     assert len(list((pair_folder / ".pansplat").iterdir())) == 1  # the prediction
 
 

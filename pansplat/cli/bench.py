@@ -8,13 +8,14 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, subcommand
 
 import pansplat
+from pansplat.cli.evaluate import LpipsChoice, choose_lpips
 from pansplat.cli.inputs import OptionalOut, PairChoice, choose_pair, predict_scene, require_height
 from pansplat.errors import InputError
 
@@ -273,6 +274,51 @@ class BenchMemory:
 
 
 @dataclass(frozen=True)
+class BenchRefine:
+    """Measure image error against seconds and Gaussians: cross-fade, predictors, and their refinement."""
+
+    paths: Positional[tuple[Path, ...]] = ()
+    """Folders of pairs with targets; by default the sample, if it is there."""
+    quick: bool = False
+    """Height 256 and one time limit only."""
+    json: Path | None = None
+    """File for the rows; written after every row."""
+    out: OptionalOut = None
+    """Folder for refine.json, refine.md and refine.png."""
+    threads: int | None = None
+    """Threads to use; by default torch's."""
+    lpips: LpipsChoice = field(default_factory=LpipsChoice)
+
+    def run(self) -> int:
+        """Measure, print the tables and write the files; an interruption keeps the measured rows."""
+        import torch
+
+        from pansplat import pipeline
+        from pansplat.bench.refine import RefineBench, list_refine_cases, make_refine_report
+        from pansplat.bench.roofline import describe_machine
+
+        json = self.json
+        if self.out is not None:
+            self.out.mkdir(parents=True, exist_ok=True)
+            json = json or self.out / "refine.json"
+        _require_folder(json)
+        if not self.paths and not _SAMPLE.is_dir():
+            raise InputError("give a folder of pairs with targets (the sample is in the repository only)")
+        found = [pair for path in self.paths or (_SAMPLE,) for pair in pipeline.load_pairs(path)]
+        pairs = [pair for pair in found if pair.targets]
+        if not pairs:
+            raise InputError(f"none of the {len(found)} pairs has a target view to compare with")
+        cases = list_refine_cases(quick=self.quick)
+        lpips = choose_lpips(self.lpips, min(case.height for case in cases))
+        threads = _choose_threads(self.threads)
+        torch.set_num_threads(threads)
+        name = None if lpips is None else lpips.name
+        with make_refine_report(describe_machine(threads), name, json=json, out=self.out) as report:
+            RefineBench(report, lpips).run(pairs, cases)
+        return 0
+
+
+@dataclass(frozen=True)
 class BenchMachine:
     """Measure the machine's peaks: multiply-adds and memory bandwidth."""
 
@@ -296,6 +342,7 @@ class Bench:
         Annotated[BenchRaster, subcommand("raster")]
         | Annotated[BenchModel, subcommand("model")]
         | Annotated[BenchMemory, subcommand("memory")]
+        | Annotated[BenchRefine, subcommand("refine")]
         | Annotated[BenchMachine, subcommand("machine")]
     )
 

@@ -18,14 +18,13 @@ from torch import Tensor
 
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import row_weights
-from pansplat.geometry.pose import interpolate_poses, quats_from_rotations, rotations_from_quats
+from pansplat.geometry.pose import interpolate_poses, quats_from_rotations
 from pansplat.rendering import rasterize
 
 DROP_ERROR = 2e-4  # largest mean absolute change of an image by all Gaussians that are dropped
 _SH_0 = 0.28209479177387814  # the harmonic of degree 0
 _MAX_OPACITY = 0.99
 _LABEL_DISTANCE = 10.0  # between Gaussians of different views or levels; larger than any other distance
-_NORMAL_COST = 0.1  # cost of a right angle between the normals of two discs, as a difference of colours
 _BASE_COST = 0.002  # cost of a merger between equal Gaussians, as a difference of colours
 _MAX_ROUNDS = 16
 
@@ -37,6 +36,7 @@ def measure_contributions(scene: Scene, size: tuple[int, int]) -> Float[Tensor, 
         for index, first in enumerate(scene.cam2world)
         for second in scene.cam2world[:index]
     ]
+    size = tuple(max(side // 2, 1) for side in size)  # a quarter of the time; the filter conserves energy
     gaussians = scene.gaussians
     largest = torch.zeros_like(gaussians.opacities)
     area = row_weights(size[0]).to(largest)[:, None] / (row_weights(size[0]).sum() * size[1])
@@ -116,13 +116,9 @@ def _merge_cost(gaussians: Gaussians, contributions: Tensor, first: Tensor, seco
     """Estimated mean absolute change of an image by each merger."""
     colors = _SH_0 * gaussians.harmonics[:, 0]
     difference = (colors[first] - colors[second]).abs().mean(1)
-    rotations = rotations_from_quats(gaussians.quats)
-    thinnest = gaussians.scales.argmin(dim=1)[:, None, None].expand(-1, 3, 1)
-    normals = rotations.gather(2, thinnest)[:, :, 0]
-    turn = 1 - (normals[first] * normals[second]).sum(1).abs()
     a, b = contributions[first], contributions[second]
     shared = 2 * a * b / (a + b).clamp_min(torch.finfo(a.dtype).tiny)
-    return shared * difference + (a + b) * (_NORMAL_COST * turn + _BASE_COST)
+    return shared * difference + (a + b) * _BASE_COST
 
 
 def _merge_pairs(first: Gaussians, second: Gaussians) -> Gaussians:

@@ -108,6 +108,7 @@ class Refinement:
     """
 
     def __init__(self, scene: Scene, views: Views, config: RefineConfig | None = None, *, seed: int = 0) -> None:
+        self._created = time.perf_counter()
         _check_fit(scene, views)
         self.config, self._given = config or RefineConfig(), scene
         device, random = scene.gaussians.means.device, torch.Generator().manual_seed(seed)
@@ -116,7 +117,9 @@ class Refinement:
             for image, mask in zip(views.images, views.masks & mask_holes(views.images), strict=True)
         ]
         self._size = (int(views.images.shape[-2]), int(views.images.shape[-1]))
-        gaussians = simplify(scene, self._size, self.config.gaussians).gaussians
+        simplified = simplify(scene, self._size, self.config.gaussians)
+        self._fallback = scene if len(scene.gaussians) <= (self.config.gaussians or math.inf) else simplified
+        gaussians = simplified.gaussians
         self._views = {
             int(view): ViewParameters(gaussians.select(gaussians.views == view), scene.cam2world[int(view), :3, 3])
             for view in torch.unique(gaussians.views)
@@ -192,9 +195,9 @@ class Refinement:
 
     @torch.no_grad()
     def scene(self) -> Scene:
-        """The scene in its present state; the given scene if the run made it worse."""
+        """The scene in its present state; the given scene, within the limit of Gaussians, if the run made it worse."""
         if self._is_worse or not self._views:
-            return self._given
+            return self._fallback
         parts = [self._cameras.move(parameters.build(), view) for view, parameters in self._views.items()]
         poses = torch.stack([self._cameras.corrected_pose(view) for view in range(len(self._photographs))])
         return dataclasses.replace(
@@ -220,7 +223,7 @@ class Refinement:
         The run goes over to its last part early if the held-out error stagnates.
 
         Args:
-            seconds: time limit; the result depends on the speed of the machine.
+            seconds: time limit since this object was made; the result depends on the speed of the machine.
             steps: number of steps; the result is the same in every run on one machine.
             progress: called with a description and the completed fraction.
             should_stop: checked before each step; True ends the run and keeps the state.
@@ -228,11 +231,10 @@ class Refinement:
         Raises:
             InputError: neither or both of `seconds` and `steps` are given, or one is not positive.
         """
-        clock = _Clock(seconds, steps, self.config.release)
+        clock = _Clock(seconds, steps, self.config.release, self._created)
         report = progress or (lambda what, fraction: None)
         before = best = self.held_out_error()
-        history, stale, stopped = [(0, 0.0, before)], 0, "done"
-        clock.start()
+        history, stale, stopped = [(0, clock.elapsed, before)], 0, "done"
         while self._views and (fraction := clock.fraction) < 1:
             if should_stop():
                 stopped = "interrupted"
@@ -263,20 +265,17 @@ class _Clock:
 
     Args:
         release: fraction at which the last part begins.
+        start: time from which seconds count, by `time.perf_counter`.
     """
 
-    def __init__(self, seconds: float | None, steps: int | None, release: float) -> None:
+    def __init__(self, seconds: float | None, steps: int | None, release: float, start: float) -> None:
         limit = seconds if steps is None else steps
         if limit is None or (seconds is not None and steps is not None):
             raise InputError("give either `seconds` or `steps` of a refinement, got both or neither")
         if not 0 < limit < math.inf:
             raise InputError(f"`seconds` or `steps` of a refinement must be positive, got {limit}")
         self._is_timed, self._limit, self._release = steps is None, float(limit), release
-        self.steps, self._start = 0, time.perf_counter()
-
-    def start(self) -> None:
-        """Begin to measure time."""
-        self._start = time.perf_counter()
+        self.steps, self._start = 0, start
 
     @property
     def elapsed(self) -> float:

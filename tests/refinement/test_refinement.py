@@ -28,7 +28,7 @@ def test_refinement_brings_the_image_between_the_cameras_near_the_truth(room) ->
     refined, report = _refine(room)
     assert room.error(refined, middle) < 0.5 * room.error(room.predicted, middle)
     assert report.after < 0.5 * report.before and report.steps <= 60
-    assert report.history[0] == (0, 0.0, report.before)
+    assert (report.history[0][0], report.history[0][2]) == (0, report.before)
     assert torch.equal(refined.cam2world, room.predicted.cam2world)
 
 
@@ -96,6 +96,8 @@ def test_a_scene_that_gets_worse_is_returned_unchanged(room) -> None:
     rates = dataclasses.replace(RefineConfig().rates, distance=1.0, scale=3.0, color=5.0)
     kept, report = _refine(room, scene=room.truth, steps=6, rates=rates)
     assert report.stopped == "worse" and kept is room.truth
+    kept, report = _refine(room, scene=room.truth, steps=6, rates=rates, gaussians=900)
+    assert report.stopped == "worse" and len(kept.gaussians) <= 900
 
 
 def test_a_stagnating_run_ends_early_with_its_last_part(room) -> None:
@@ -114,9 +116,9 @@ def test_a_run_can_be_stopped_at_any_step_and_keeps_its_state(room) -> None:
 def test_a_time_limit_ends_the_run_and_progress_grows(room) -> None:
     fractions: list[float] = []
     report = Refinement(room.predicted, room.views).run(
-        seconds=0.5, progress=lambda what, fraction: fractions.append(fraction)
+        seconds=3.0, progress=lambda what, fraction: fractions.append(fraction)
     )
-    assert report.steps > 1 and report.seconds < 5
+    assert report.steps > 1 and report.seconds < 10
     assert fractions == sorted(fractions) and fractions[-1] == 1
 
 

@@ -1,0 +1,78 @@
+"""`pansplat bench refine`: rows, means, files and plots."""
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from pansplat import pipeline
+from pansplat.bench import refine as bench
+from pansplat.bench.refine import CROSS_FADE, MEAN, RefineCase, RefineResult, average_rows, list_refine_cases
+from pansplat.bench.report import Row
+from pansplat.cli import run
+
+HEIGHT = 16
+
+
+@pytest.fixture
+def folder(tmp_path: Path, write_pair, sphere_predictor, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Two pairs with a target each; the case list is small and uses a predictor without depth."""
+    for name in ("one", "two"):
+        room = write_pair(tmp_path / "rooms" / name, seed=len(name))
+        poses = json.loads((room / "poses.json").read_text())
+        middle = json.loads(json.dumps(poses["poses"]["left.png"]))
+        middle["cam2world"][0][3] = 0.25
+        poses["poses"]["middle.png"] = middle
+        for image in ("left.png", "right.png"):  # smooth, so that the refinement finds an improvement
+            smooth = Image.open(room / image).resize((8, 4)).resize((2 * HEIGHT, HEIGHT), Image.Resampling.BICUBIC)
+            smooth.save(room / image)
+        (room / "middle.png").write_bytes((room / "left.png").read_bytes())
+        (room / "poses.json").write_text(json.dumps(poses))
+        pairs = {"pairs": [{"name": name, "context": ["left.png", "right.png"], "target": "middle.png"}]}
+        (room / "pairs.json").write_text(json.dumps(pairs))
+
+    class DarkSphere(sphere_predictor):
+        """A predictor of wrong colours, which the refinement corrects."""
+
+        def __call__(self, images, *arguments, **options):
+            return super().__call__(0.7 * images, *arguments, **options)
+
+    monkeypatch.setitem(pipeline._MODELS, "default", DarkSphere)
+    monkeypatch.setattr(bench, "warm_up", lambda predictor: None)
+    cases = [RefineCase(CROSS_FADE, HEIGHT), RefineCase("default", HEIGHT), RefineCase("default", HEIGHT, 2.0)]
+    cases.append(RefineCase("default", HEIGHT, 2.0, 200))
+    monkeypatch.setattr(bench, "list_refine_cases", lambda quick: cases)
+    return tmp_path / "rooms"
+
+
+def test_the_bench_writes_rows_means_table_and_plot(folder: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out"
+    paths = [str(folder / name) for name in ("one", "two")]
+    assert run(["bench", "refine", *paths, "--out", str(out), "--lpips", "none", "--threads", "1"]) == 0
+    rows = json.loads((out / "refine.json").read_text())["rows"]
+    assert [row["scene"] for row in rows] == ["one"] * 4 + ["two"] * 4 + [MEAN] * 4
+    plain, refined, small = rows[1:4]
+    assert refined["ws_psnr_db"] > plain["ws_psnr_db"] and refined["steps"] > 1 > plain["refine_s"] == 0
+    assert small["num_gaussians"] <= 200 < refined["num_gaussians"]
+    assert rows[9]["ws_psnr_db"] == pytest.approx((rows[1]["ws_psnr_db"] + rows[5]["ws_psnr_db"]) / 2, rel=1e-4)
+    assert "| default | 16 | 2 s | 200 |" in (out / "refine.md").read_text()
+    assert (out / "refine.png").stat().st_size > 1000 and "cross-fade" in capsys.readouterr().out
+
+
+def test_means_skip_values_that_were_not_measured() -> None:
+    case = RefineCase("sweep", 64)
+    rows = [Row("refine", name, case, RefineResult(db, lpips)) for name, db, lpips in (("a", 20, 0.2), ("b", 24, None))]
+    (mean,) = average_rows(rows)
+    assert (mean.result.ws_psnr_db, mean.result.lpips, mean.scene) == (22, None, MEAN)
+
+
+def test_quick_is_a_small_part(capsys) -> None:
+    assert len(list_refine_cases(quick=True)) < len(list_refine_cases(quick=False)) / 2
+    assert {case.height for case in list_refine_cases(quick=True)} == {256}
+
+
+def test_pairs_without_targets_are_refused(tmp_path: Path, write_pair, capsys) -> None:
+    write_pair(tmp_path / "alone")
+    assert run(["bench", "refine", str(tmp_path / "alone")]) == 2
+    assert "none of the 1 pairs has a target view" in capsys.readouterr().err
