@@ -8,7 +8,6 @@ contributions, for colours in [0, 1] and to first order in the weights.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -21,12 +20,11 @@ from pansplat.geometry.equirect import row_weights
 from pansplat.geometry.pose import interpolate_poses, quats_from_rotations
 from pansplat.rendering import rasterize
 
-DROP_ERROR = 2e-4  # largest mean absolute change of an image by all Gaussians that are dropped
+DROP_ERROR = 5e-3  # largest mean absolute change of an image by all Gaussians that are dropped
 _SH_0 = 0.28209479177387814  # the harmonic of degree 0
 _MAX_OPACITY = 0.99
 _LABEL_DISTANCE = 10.0  # between Gaussians of different views or levels; larger than any other distance
 _BASE_COST = 0.002  # cost of a merger between equal Gaussians, as a difference of colours
-_MAX_ROUNDS = 16
 
 
 def measure_contributions(scene: Scene, size: tuple[int, int]) -> Float[Tensor, "n"]:
@@ -53,44 +51,50 @@ def measure_contributions(scene: Scene, size: tuple[int, int]) -> Float[Tensor, 
     return largest
 
 
-def drop_unseen(
-    gaussians: Gaussians, contributions: Float[Tensor, "n"], error: float = DROP_ERROR
-) -> tuple[Gaussians, Float[Tensor, "_"]]:
-    """Drop the Gaussians of least contribution, whose sum of contributions is at most `error`."""
-    order = contributions.argsort(stable=True)
-    dropped = order[contributions[order].double().cumsum(0) <= error]
-    kept = torch.ones_like(contributions, dtype=torch.bool)
-    kept[dropped] = False
-    return gaussians.select(kept), contributions[kept]
-
-
-def merge_to(
-    gaussians: Gaussians, contributions: Float[Tensor, "n"], cameras: Float[Tensor, "view 3"], count: int
-) -> tuple[Gaussians, Float[Tensor, "_"]]:
-    """Merge pairs of similar neighbours until at most `count` Gaussians remain, or no pairs are left.
-
-    Pairs are of one view and level. The pairs that change the images least are merged first.
+def drop_unseen(scene: Scene, size: tuple[int, int], error: float = DROP_ERROR) -> Scene:
+    """Drop the Gaussians of least contribution, whose sum of contributions is at most `error`.
 
     Args:
-        cameras: positions of the input cameras, metres.
+        size: height and width of the images that the contributions are measured in, pixels.
     """
-    for _ in range(_MAX_ROUNDS):
-        surplus = len(gaussians) - count
-        if surplus <= 0:
-            break
+    contributions = measure_contributions(scene, size)
+    order = contributions.argsort(stable=True)
+    kept = torch.ones_like(contributions, dtype=torch.bool)
+    kept[order[contributions[order].double().cumsum(0) <= error]] = False
+    return dataclasses.replace(scene, gaussians=scene.gaussians.select(kept))
+
+
+def merge_to(scene: Scene, size: tuple[int, int], count: int) -> Scene:
+    """Merge pairs of similar neighbours until at most `count` Gaussians remain.
+
+    Pairs are of one view and level. The pairs that change the images least are merged first. If no pairs are left, the
+    Gaussians of least contribution are dropped.
+
+    Args:
+        size: height and width of the images that the contributions are measured in, pixels.
+    """
+    gaussians, contributions = scene.gaussians, measure_contributions(scene, size)
+    cameras = scene.cam2world[:, :3, 3]
+    while (surplus := len(gaussians) - count) > 0:
         first, second = _find_mutual_neighbours(gaussians, cameras)
         if not len(first):
+            best = contributions.argsort(descending=True, stable=True)[:count]
+            gaussians, contributions = gaussians.select(best), contributions[best]
             break
-        cost = _merge_cost(gaussians, contributions, first, second)
-        chosen = cost.argsort(stable=True)[:surplus]
+        chosen = _merge_cost(gaussians, contributions, first, second).argsort(stable=True)[:surplus]
         first, second = first[chosen], second[chosen]
-        merged = _merge_pairs(gaussians.select(first), gaussians.select(second))
         kept = torch.ones_like(contributions, dtype=torch.bool)
         kept[first] = kept[second] = False
+        merged = _merge_pairs(gaussians.select(first), gaussians.select(second))
         contributions = torch.cat((contributions[kept], contributions[first] + contributions[second]))
         gaussians = Gaussians.cat([gaussians.select(kept), merged])
-    order = (gaussians.levels.long() * len(cameras) + gaussians.views.long()).argsort(stable=True)
-    return gaussians.select(order), contributions[order]
+    order = _labels(gaussians, len(cameras)).argsort(stable=True)
+    return dataclasses.replace(scene, gaussians=gaussians.select(order))
+
+
+def _labels(gaussians: Gaussians, num_views: int) -> Integer[Tensor, "n"]:
+    """A number for each combination of level and view."""
+    return gaussians.levels.long() * num_views + gaussians.views.long()
 
 
 def _find_mutual_neighbours(
@@ -99,7 +103,7 @@ def _find_mutual_neighbours(
     """Pairs that are each other's nearest neighbour, by direction and logarithm of distance from their camera."""
     offsets = gaussians.means.double() - cameras.double()[gaussians.views.long()]
     distances = offsets.norm(dim=1, keepdim=True).clamp_min(1e-9)
-    labels = gaussians.levels.long() * len(cameras) + gaussians.views.long()
+    labels = _labels(gaussians, len(cameras))
     features = torch.cat((offsets / distances, distances.log(), _LABEL_DISTANCE * labels[:, None]), dim=1).cpu().numpy()
     if len(features) < 2:
         return torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long)
@@ -153,14 +157,3 @@ def _area(scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     """Product of the two largest scales."""
     ordered = scales.double().sort(dim=1).values
     return (ordered[:, 1] * ordered[:, 2]).clamp_min(1e-30)
-
-
-def simplify(scene: Scene, size: tuple[int, int], count: int | None) -> Scene:
-    """Drop unseen Gaussians, and merge until at most `count` remain; None does not merge."""
-    gaussians, contributions = drop_unseen(scene.gaussians, measure_contributions(scene, size))
-    if count is not None:
-        gaussians, contributions = merge_to(gaussians, contributions, scene.cam2world[:, :3, 3], count)
-        if len(gaussians) > count:  # no pairs are left: keep those that contribute most
-            best: Sequence[int] = contributions.argsort(descending=True, stable=True)[:count].sort().values.tolist()
-            gaussians = gaussians.select(torch.tensor(best))
-    return dataclasses.replace(scene, gaussians=gaussians)

@@ -27,7 +27,7 @@ from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.predictor import Progress
-from pansplat.refinement.budget import simplify
+from pansplat.refinement.budget import drop_unseen, merge_to
 from pansplat.refinement.objective import Photograph, image_difference
 from pansplat.refinement.parameters import CameraParameters, LearningRates, ViewParameters
 from pansplat.rendering import rasterize
@@ -45,7 +45,7 @@ class RefineConfig:
 
     rates: LearningRates = field(default_factory=LearningRates)
     gaussians: int | None = None
-    """Largest number of Gaussians; None drops only those that contribute nothing."""
+    """Largest number of Gaussians; None for no limit."""
     own: float = 1.0
     """Weight of a view's image at its own camera."""
     cross: float = 1.0
@@ -79,7 +79,8 @@ class RefineReport:
     Attributes:
         steps, seconds: of the run.
         stopped: why it ended: "done", "converged", "interrupted", or "worse" if the given scene is kept.
-        before, after: mean absolute error of the held-out blocks of the given scene and of the refined one.
+        before, after: mean absolute error of the held-out blocks at the start, within the limit of Gaussians, and at
+            the end.
         gains: factors of the photographs' channels relative to their geometric mean.
         history: (step, seconds, error of the held-out blocks) of each check.
     """
@@ -110,23 +111,24 @@ class Refinement:
     def __init__(self, scene: Scene, views: Views, config: RefineConfig | None = None, *, seed: int = 0) -> None:
         self._created = time.perf_counter()
         _check_fit(scene, views)
-        self.config, self._given = config or RefineConfig(), scene
+        self.config = config or RefineConfig()
         device, random = scene.gaussians.means.device, torch.Generator().manual_seed(seed)
         self._photographs = [
             Photograph.split(image.float().to(device), mask.to(device), self.config.held_out, random)
             for image, mask in zip(views.images, views.masks & mask_holes(views.images), strict=True)
         ]
         self._size = (int(views.images.shape[-2]), int(views.images.shape[-1]))
-        simplified = simplify(scene, self._size, self.config.gaussians)
-        self._fallback = scene if len(scene.gaussians) <= (self.config.gaussians or math.inf) else simplified
-        gaussians = simplified.gaussians
+        if len(scene.gaussians) > (self.config.gaussians or math.inf):
+            scene = merge_to(scene, self._size, self.config.gaussians or 0)
+        self._start, gaussians = scene, scene.gaussians
         self._views = {
             int(view): ViewParameters(gaussians.select(gaussians.views == view), scene.cam2world[int(view), :3, 3])
             for view in torch.unique(gaussians.views)
         }
         self._cameras = CameraParameters(scene.cam2world.to(device), correct_poses=self.config.poses)
         self._optimizer = self._make_optimizer()
-        self._steps, self._is_worse = 0, False
+        self._steps = 0
+        self._result: Scene | None = None
 
     def _make_optimizer(self) -> torch.optim.Adam:
         rates = dataclasses.asdict(self.config.rates)
@@ -195,13 +197,16 @@ class Refinement:
 
     @torch.no_grad()
     def scene(self) -> Scene:
-        """The scene in its present state; the given scene, within the limit of Gaussians, if the run made it worse."""
-        if self._is_worse or not self._views:
-            return self._fallback
+        """The scene in its present state.
+
+        After a run it has no Gaussians without contribution. If the run made it worse, it is the scene at the start.
+        """
+        if self._result is not None or not self._views:
+            return self._result or self._start
         parts = [self._cameras.move(parameters.build(), view) for view, parameters in self._views.items()]
         poses = torch.stack([self._cameras.corrected_pose(view) for view in range(len(self._photographs))])
         return dataclasses.replace(
-            self._given, gaussians=Gaussians.cat(parts), cam2world=poses.to(self._given.cam2world)
+            self._start, gaussians=Gaussians.cat(parts), cam2world=poses.to(self._start.cam2world)
         )
 
     @property
@@ -254,9 +259,10 @@ class Refinement:
         after = self.held_out_error()
         history.append((clock.steps, clock.elapsed, after))
         report("refined", 1.0)
-        self._is_worse = not after <= before
-        if self._is_worse:
-            stopped = "worse"
+        if after <= before:
+            self._result = drop_unseen(self.scene(), self._size)
+        else:
+            self._result, stopped = self._start, "worse"
         return RefineReport(clock.steps, clock.elapsed, stopped, before, after, self.gains, tuple(history))
 
 
