@@ -29,6 +29,7 @@ from pansplat.sweep.prior import DepthPrior
 from pansplat.sweep.search import SearchConfig
 
 MODEL = "depth"  # name of the network in a weights file
+_SEARCH_HEIGHT = 384  # pixels; at 512 the search takes 1.6 times as long and is not better
 _SOURCES = ("guided_sweep.py", "model/efficientnet.py", "model/depth_network.py", "model/depth_refinement.py")
 
 
@@ -42,7 +43,7 @@ class GuidedSweep(Sweep):
     """
 
     def __init__(self, network: DepthRefinement, weights_hash: str, name: str = "default") -> None:
-        config = SweepConfig(search=SearchConfig(room_layout=None))
+        config = SweepConfig(search=SearchConfig(room_layout=None, finest_height=_SEARCH_HEIGHT))
         super().__init__(config, NetworkPrior(network, weights_hash + _hash_sources()))
         self.name, self.network = name, network
 

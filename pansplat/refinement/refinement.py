@@ -34,8 +34,8 @@ from pansplat.rendering import rasterize
 
 _RATE_FLOOR = 0.05  # of the learning rates at the end
 _CHECK_EVERY = 10  # steps between checks of the held-out error
-_MIN_IMPROVEMENT = 0.005  # relative decrease of the held-out error below which it stagnates
-_PATIENCE = 2  # checks without a sufficient decrease
+_MIN_IMPROVEMENT = 0.002  # relative decrease of the held-out error below which it stagnates
+_PATIENCE = 3  # checks without a sufficient decrease
 _POSE_TOLERANCE = 1e-3  # between the entries of the poses of scene and photographs
 
 
@@ -238,7 +238,9 @@ class Refinement:
         """
         clock = _Clock(seconds, steps, self.config.release, self._created)
         report = progress or (lambda what, fraction: None)
+        start = clock.elapsed
         before = best = self.held_out_error()
+        clock.reserve(2 * (clock.elapsed - start))  # for the error and the contributions at the end
         history, stale, stopped = [(0, clock.elapsed, before)], 0, "done"
         while self._views and (fraction := clock.fraction) < 1:
             if should_stop():
@@ -282,6 +284,11 @@ class _Clock:
             raise InputError(f"`seconds` or `steps` of a refinement must be positive, got {limit}")
         self._is_timed, self._limit, self._release = steps is None, float(limit), release
         self.steps, self._start = 0, start
+
+    def reserve(self, seconds: float) -> None:
+        """End a timed run earlier by this time, or at half of its limit."""
+        if self._is_timed:
+            self._limit = max(self._limit - seconds, 0.5 * self._limit)
 
     @property
     def elapsed(self) -> float:
