@@ -99,6 +99,13 @@ def interpolate_poses(start: Float[Tensor, "4 4"], end: Float[Tensor, "4 4"], fr
     return pose.to(start)
 
 
+def nearest_views(cam2world: Float[Tensor, "view 4 4"], view: int, count: int) -> list[int]:
+    """At most `count` other views, by the distance of their cameras from a view's."""
+    distances = (cam2world[:, :3, 3] - cam2world[view, :3, 3]).norm(dim=1)
+    order = distances.argsort(stable=True).tolist()
+    return [other for other in order if other != view][:count]
+
+
 def blend_weights(position: Float[Tensor, "3"], positions: Float[Tensor, "view 3"]) -> Float[Tensor, "view"]:
     """Weights of the input views at a camera position: normalised inverse distances.
 

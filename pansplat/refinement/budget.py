@@ -17,10 +17,11 @@ from torch import Tensor
 
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import row_weights
-from pansplat.geometry.pose import interpolate_poses, quats_from_rotations
+from pansplat.geometry.pose import interpolate_poses, nearest_views, quats_from_rotations
 from pansplat.rendering import rasterize
 
 DROP_ERROR = 5e-3  # largest mean absolute change of an image by all Gaussians that are dropped
+MAX_OTHERS = 3  # cameras of other views that a view is rasterised at
 _SH_0 = 0.28209479177387814  # the harmonic of degree 0
 _MAX_OPACITY = 0.99
 _LABEL_DISTANCE = 10.0  # between Gaussians of different views or levels; larger than any other distance
@@ -28,20 +29,19 @@ _BASE_COST = 0.002  # cost of a merger between equal Gaussians, as a difference 
 
 
 def measure_contributions(scene: Scene, size: tuple[int, int]) -> Float[Tensor, "n"]:
-    """Largest contribution of each Gaussian to the images of its view at all input cameras and halfway between them."""
-    poses = list(scene.cam2world) + [
-        interpolate_poses(first, second, 0.5)
-        for index, first in enumerate(scene.cam2world)
-        for second in scene.cam2world[:index]
-    ]
-    size = tuple(max(side // 2, 1) for side in size)  # a quarter of the time; the filter conserves energy
+    """Largest contribution of each Gaussian to the images of its view.
+
+    The images are at its own camera, at the nearest other ones, and halfway to them.
+    """
+    size = (max(size[0] // 2, 1), max(size[1] // 2, 1))  # a quarter of the time; the filter conserves energy
     gaussians = scene.gaussians
     largest = torch.zeros_like(gaussians.opacities)
     area = row_weights(size[0]).to(largest)[:, None] / (row_weights(size[0]).sum() * size[1])
-    for label in torch.unique(gaussians.views):
-        index = (gaussians.views == label).nonzero()[:, 0]
-        part = gaussians.select(index)
-        for pose in poses:
+    for view in torch.unique(gaussians.views).tolist():
+        index = (gaussians.views == view).nonzero()[:, 0]
+        part, own = gaussians.select(index), scene.cam2world[view]
+        others = [scene.cam2world[other] for other in nearest_views(scene.cam2world, view, MAX_OTHERS)]
+        for pose in (own, *others, *(interpolate_poses(own, other, 0.5) for other in others)):
             # A grey image of one channel: its gradient in the colours is the sum of the weights.
             colors = torch.zeros(len(part), 1, 1, dtype=largest.dtype, device=largest.device, requires_grad=True)
             image = rasterize(dataclasses.replace(part, harmonics=colors), pose, size=size).color

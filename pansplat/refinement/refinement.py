@@ -1,7 +1,7 @@
 """Render-and-compare after a prediction: the Gaussians of each view are fitted to all photographs of the scene.
 
-The Gaussians of a view are rasterised at its own camera and at the others, and compared with those photographs. So the
-images between the cameras, which deferred blending mixes from single views, are constrained from both sides.
+The Gaussians of a view are rasterised at its own camera and at the nearest others, and compared with those photographs.
+So the images between the cameras, which deferred blending mixes from single views, are constrained from both sides.
 
 Every step rasterises each view once: at its own camera in even steps, at one of the others in odd steps. Adam moves
 depth along the source ray, scales, rotations, opacities and colours; its step sizes fall along a cosine. Blocks of the
@@ -26,8 +26,9 @@ from pansplat.data.masks import mask_holes
 from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.pose import nearest_views
 from pansplat.predictor import Progress
-from pansplat.refinement.budget import drop_unseen, merge_to
+from pansplat.refinement.budget import MAX_OTHERS, drop_unseen, merge_to
 from pansplat.refinement.objective import Photograph, image_difference
 from pansplat.refinement.parameters import CameraParameters, LearningRates, ViewParameters
 from pansplat.rendering import rasterize
@@ -118,9 +119,13 @@ class Refinement:
             for image, mask in zip(views.images, views.masks & mask_holes(views.images), strict=True)
         ]
         self._size = (int(views.images.shape[-2]), int(views.images.shape[-1]))
-        if len(scene.gaussians) > (self.config.gaussians or math.inf):
-            scene = merge_to(scene, self._size, self.config.gaussians or 0)
+        limit = self.config.gaussians
+        if limit is not None and len(scene.gaussians) > limit:
+            scene = merge_to(scene, self._size, limit)
         self._start, gaussians = scene, scene.gaussians
+        self._targets = {  # photographs that a view is compared with; the first is its own
+            view: [view, *nearest_views(scene.cam2world, view, MAX_OTHERS)] for view in range(len(scene.cam2world))
+        }
         self._views = {
             int(view): ViewParameters(gaussians.select(gaussians.views == view), scene.cam2world[int(view), :3, 3])
             for view in torch.unique(gaussians.views)
@@ -171,10 +176,8 @@ class Refinement:
 
     def _choose_target(self, view: int) -> int:
         """The photograph that a view is compared with: its own in even steps, the others in turn in odd ones."""
-        count = len(self._photographs)
-        if self._steps % 2 == 0 or count < 2:
-            return view
-        return (view + 1 + self._steps // 2 % (count - 1)) % count
+        own, *others = self._targets[view]
+        return own if self._steps % 2 == 0 or not others else others[self._steps // 2 % len(others)]
 
     def _draw(self, gaussians: Gaussians, view: int, target: int) -> Tensor:
         """The colours (3 height width) of a view's Gaussians in a photograph, with its gain."""
@@ -185,11 +188,12 @@ class Refinement:
 
     @torch.no_grad()
     def held_out_error(self) -> float:
-        """Mean absolute error of the held-out blocks, over all views and photographs."""
+        """Mean absolute error of the held-out blocks, over all views and their photographs."""
         error = weight = 0.0
         for view, parameters in self._views.items():
             gaussians = parameters.build()
-            for target, photograph in enumerate(self._photographs):
+            for target in self._targets[view]:
+                photograph = self._photographs[target]
                 difference = (self._draw(gaussians, view, target) - photograph.image).abs().mean(0)
                 error += float((difference * photograph.held_out).sum())
                 weight += float(photograph.held_out.sum())

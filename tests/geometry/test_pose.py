@@ -9,6 +9,7 @@ from pansplat.geometry.pose import (
     interpolate_poses,
     invert_pose,
     multiply_quats,
+    nearest_views,
     orthonormal_error,
     quats_from_rotations,
     rotations_from_quats,
@@ -92,3 +93,10 @@ def test_interpolation_starts_and_ends_at_the_poses_on_the_shortest_arc():
 def test_interpolating_equal_poses_gives_that_pose():
     pose = _pose(_quats(1)[0], (1.0, 2.0, 3.0))
     assert torch.allclose(interpolate_poses(pose, pose, 0.3), pose, atol=1e-12)
+
+
+def test_nearest_views_are_ordered_by_distance_without_the_view_itself() -> None:
+    poses = torch.eye(4, dtype=torch.float64).repeat(4, 1, 1)
+    poses[:, 0, 3] = torch.tensor([0.0, 5.0, 1.0, 1.5], dtype=torch.float64)
+    assert nearest_views(poses, 0, 2) == [2, 3] and nearest_views(poses, 2, 9) == [3, 0, 1]
+    assert nearest_views(poses[:1], 0, 3) == []
