@@ -67,11 +67,11 @@ def test_all_commands_and_the_viewer_take_converted_weights(
     assert len(scenes["trained"].gaussians) == 2 * 2 * HEIGHT**2
     assert torch.equal(scenes["trained"].gaussians.means, scenes["official"].gaussians.means)
     assert not torch.allclose(scenes["fixed"].gaussians.means, scenes["official"].gaussians.means)
-    run_on_room("render", tmp_path / "image.png", "--predict-height", "64", "--height", "16")
+    run_on_room("render", tmp_path / "image.png", "--predict-height", "64", "--height", "16", "--refine", "1")
     assert (tmp_path / "image.png").stat().st_size > 0
     run_on_room("evaluate", tmp_path / "results", "--height", "64", "--compat", "fixed")
     assert (tmp_path / "results" / "results.json").exists()
-    options = LoadOptions(model=converted, compat="fixed", height=64)
+    options = LoadOptions(model=converted, compat="fixed", height=64, refine_seconds=0)
     (entry,) = (entry for entry in find_entries(room, options) if entry.pair is not None)
     viewed = load_entry(entry, options, lambda what, done: None, photos=False).scene
     assert torch.equal(viewed.gaussians.means, scenes["fixed"].gaussians.means)
