@@ -129,10 +129,9 @@ def predict(
     pair = _load_only_pair(source) if isinstance(source, (str, Path)) else source
     views = pair if isinstance(pair, Views) else pair.load_context(height)
     cached_pair = pair if cache and isinstance(pair, Pair) else None
-    report = progress or _ignore_progress
+    report: Progress = progress or (lambda what, fraction: None)
     if not refine_seconds:
         return _predict_views(cached_pair, views, predictor, height, report)
-    show = on_predicted or _ignore_scene
     refinement = f"{refinement_fingerprint()}-{refine_seconds:g}s"
     cached = None if cached_pair is None else CachedPrediction(cached_pair, views, predictor, height, refinement)
     refined = _read_cached(cached, views, predictor)
@@ -140,7 +139,8 @@ def predict(
         report("read from the cache", 1.0)
         return refined
     scene = _predict_views(cached_pair, views, predictor, height, lambda what, done: report(what, 0.5 * done))
-    show(scene)
+    if on_predicted is not None:
+        on_predicted(scene)
     if refined is not None:
         return refined
     scene = refine(scene, views, seconds=refine_seconds, progress=lambda what, done: report(what, 0.5 + 0.5 * done))
@@ -166,14 +166,6 @@ def _predict_views(pair: Pair | None, views: Views, predictor: Predictor, height
 def _read_cached(cached: CachedPrediction | None, views: Views, predictor: Predictor) -> Scene | None:
     gaussians = None if cached is None else cached.read()
     return None if gaussians is None else _make_scene(gaussians, views, predictor)
-
-
-def _ignore_progress(what: str, fraction: float) -> None:
-    """A `Progress` that shows nothing."""
-
-
-def _ignore_scene(scene: Scene) -> None:
-    """An `on_predicted` that does nothing."""
 
 
 def refine(

@@ -10,6 +10,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,7 @@ from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import cross_fade, ws_psnr
-from pansplat.evaluation.report import warm_up
+from pansplat.evaluation.report import measure_own_views, warm_up
 from pansplat.gaussians.scene import Scene
 from pansplat.predictor import Predictor
 from pansplat.refinement import RefineConfig, Refinement
@@ -124,8 +125,7 @@ class RefineBench:
         predicted: dict[tuple[str, int], tuple[Scene, float]],
     ) -> RefineResult:
         if case.model == CROSS_FADE:
-            draw: Callable[[Tensor], Tensor] = lambda pose: cross_fade(context.images, context.cam2world, pose)  # noqa: E731
-            return RefineResult(*self._compare(draw, targets))
+            return RefineResult(*self._compare(partial(cross_fade, context.images, context.cam2world), targets))
         if (case.model, case.height) not in predicted:
             predicted[case.model, case.height] = self._predict(case.model, context)
         scene, predict_s = predicted[case.model, case.height]
@@ -136,16 +136,11 @@ class RefineBench:
             steps = refinement.run(seconds=case.limit_s).steps
             scene, refine_s = refinement.scene(), time.perf_counter() - start
 
-        def draw(pose: Tensor) -> Tensor:
-            with torch.no_grad():
-                return pipeline.render(scene, pose, size=(case.height, 2 * case.height)).color.float()
-
-        inputs = [
-            ws_psnr(draw(pose), image, mask=mask)
-            for image, pose, mask in zip(context.images, scene.cam2world, context.masks, strict=True)
-        ]
-        error = self._compare(draw, targets)
-        return RefineResult(*error, statistics.fmean(inputs), predict_s, refine_s, steps, len(scene.gaussians))
+        render = partial(pipeline.render, size=(case.height, 2 * case.height))
+        inputs_db = measure_own_views(scene, context, render)
+        with torch.no_grad():
+            error = self._compare(lambda pose: render(scene, pose).color.float(), targets)
+        return RefineResult(*error, inputs_db, predict_s, refine_s, steps, len(scene.gaussians))
 
     def _predict(self, model: str, context: Views) -> tuple[Scene, float]:
         if model not in self._predictors:

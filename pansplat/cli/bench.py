@@ -163,11 +163,7 @@ class BenchModel:
         from pansplat.bench.roofline import describe_machine
         from pansplat.model.network import has_bfloat16
 
-        json = self.json
-        if self.out is not None:
-            self.out.mkdir(parents=True, exist_ok=True)
-            json = json or self.out / "model.json"
-        _require_folder(json)
+        json = _choose_rows_file(self.json, self.out, "model.json")
         threads = _choose_threads(self.threads)
         require_height(self.height)
         if self.height % 64:
@@ -297,11 +293,7 @@ class BenchRefine:
         from pansplat.bench.refine import RefineBench, list_refine_cases, make_refine_report
         from pansplat.bench.roofline import describe_machine
 
-        json = self.json
-        if self.out is not None:
-            self.out.mkdir(parents=True, exist_ok=True)
-            json = json or self.out / "refine.json"
-        _require_folder(json)
+        json = _choose_rows_file(self.json, self.out, "refine.json")
         if not self.paths and not _SAMPLE.is_dir():
             raise InputError("give a folder of pairs with targets (the sample is in the repository only)")
         found = [pair for path in self.paths or (_SAMPLE,) for pair in pipeline.load_pairs(path)]
@@ -367,6 +359,15 @@ def _find_usable_memory() -> float:
     except (ValueError, OSError, AttributeError):
         return _DEFAULT_MEMORY
     return 0.75 * pages
+
+
+def _choose_rows_file(json: Path | None, out: Path | None, name: str) -> Path | None:
+    """The file of the rows, by default in the folder `out`, which is made; refuses a missing folder."""
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        json = json or out / name
+    _require_folder(json)
+    return json
 
 
 def _require_folder(file: Path | None) -> None:

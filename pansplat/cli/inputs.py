@@ -71,6 +71,12 @@ def predict_scene(pair: Pair, model: Predictor, height: int, *, cache: bool, ref
         )
 
 
+def require_output(option: str, path: Path, suffix: str) -> None:
+    """Refuse an output file with another suffix, or in a folder that does not exist."""
+    if path.suffix.lower() != suffix or not path.resolve().parent.is_dir():
+        raise InputError(f"{option} must be a {suffix} file in an existing folder, got {path}")
+
+
 def require_refine(seconds: float) -> None:
     """Refuse a time limit of the refinement that is negative or not finite."""
     if not 0 <= seconds < math.inf:

@@ -19,6 +19,7 @@ from pansplat.cli.inputs import (
     predict_scene,
     progress_bar,
     require_height,
+    require_output,
     require_refine,
 )
 from pansplat.errors import InputError
@@ -64,8 +65,7 @@ class Predict:
         """Predict, write the scene and print the time of the prediction."""
         from pansplat import pipeline
 
-        if self.out.suffix.lower() != ".ply" or not self.out.resolve().parent.is_dir():
-            raise InputError(f"--out must be a .ply file in an existing folder, got {self.out}")
+        require_output("--out", self.out, ".ply")
         require_height(self.height)
         require_refine(self.refine)
         pair = choose_pair(self.path, self.choice)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,6 +21,7 @@ from pansplat.cli.inputs import (
     predict_scene,
     progress_bar,
     require_height,
+    require_output,
 )
 from pansplat.errors import InputError
 
@@ -69,6 +69,7 @@ class Refine:
     def run(self) -> int:
         """Refine, write the scene and print the errors of held-out pixels."""
         from pansplat import pipeline
+        from pansplat.evaluation.report import write_json
         from pansplat.refinement import RefineConfig, Refinement
 
         self._refuse_invalid_arguments()
@@ -81,19 +82,17 @@ class Refine:
             report = refinement.run(seconds=seconds, steps=self.steps, progress=progress, should_stop=should_stop)
         refined = refinement.scene()
         pipeline.save(refined, self.out)
-        self._write_report(report)
+        if self.report is not None:
+            write_json(dataclasses.asdict(report), self.report)
         print(_describe(report))
         print(f"{self.out}: {len(refined.gaussians):,} Gaussians (given: {len(scene.gaussians):,})")
         return 0
 
     def _refuse_invalid_arguments(self) -> None:
         """Raise an error before the prediction, which takes seconds."""
-        if self.out.suffix.lower() != ".ply" or not self.out.resolve().parent.is_dir():
-            raise InputError(f"--out must be a .ply file in an existing folder, got {self.out}")
-        if self.report is not None and (
-            self.report.suffix.lower() != ".json" or not self.report.resolve().parent.is_dir()
-        ):
-            raise InputError(f"--report must be a .json file in an existing folder, got {self.report}")
+        require_output("--out", self.out, ".ply")
+        if self.report is not None:
+            require_output("--report", self.report, ".json")
         if self.seconds is not None and self.steps is not None:
             raise InputError("--seconds and --steps both set the length of the refinement; give one of them")
         if self.path.suffix.lower() == ".ply" and self.photographs is None:
@@ -115,13 +114,6 @@ class Refine:
         pair, height = choose_pair(self.path, self.choice), self.height or 512
         model = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
         return predict_scene(pair, model, height, cache=True), pair.load_context(height)
-
-    def _write_report(self, report: RefineReport) -> None:
-        from pansplat.atomic import replacing
-
-        if self.report is not None:
-            with replacing(self.report) as unfinished:
-                unfinished.write_text(json.dumps(dataclasses.asdict(report), indent=1) + "\n", encoding="utf-8")
 
 
 def _describe(report: RefineReport) -> str:

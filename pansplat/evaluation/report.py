@@ -144,7 +144,7 @@ def _evaluate_pair(
         start = time.perf_counter()
         scene = pipeline.refine(scene, context, seconds=refine_seconds, progress=progress)
         refine_seconds = time.perf_counter() - start
-    own_ws_psnr = _measure_own_views(scene, context, render)
+    own_ws_psnr = measure_own_views(scene, context, render)
     for view, target in enumerate(targets.images):
         progress("rendering", 1.0)
         pose = targets.cam2world[view]
@@ -179,7 +179,7 @@ def _evaluate_pair(
         )
 
 
-def _measure_own_views(scene: Scene, context: Views, render: Callable[[Scene, Tensor], Rendering]) -> float:
+def measure_own_views(scene: Scene, context: Views, render: Callable[[Scene, Tensor], Rendering]) -> float:
     """Mean WS-PSNR of the unmasked pixels at the input cameras."""
     with torch.no_grad():
         values = [
