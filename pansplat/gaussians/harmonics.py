@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 MAX_DEGREE = 4
+SH_0 = 0.28209479177387814  # the harmonic of degree 0
 _OFFICIAL_DEGREE = 3
 # The official x, y, z axes of the harmonics in world axes: z, x, y.
 _OFFICIAL_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))

@@ -15,6 +15,7 @@ from jaxtyping import Float, Integer
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import row_weights
 from pansplat.geometry.pose import interpolate_poses, nearest_views, quats_from_rotations
@@ -22,7 +23,6 @@ from pansplat.rendering import rasterize
 
 DROP_ERROR = 5e-3  # largest mean absolute change of an image by all Gaussians that are dropped
 MAX_OTHERS = 3  # cameras of other views that a view is rasterised at
-_SH_0 = 0.28209479177387814  # the harmonic of degree 0
 _MAX_OPACITY = 0.99
 _LABEL_DISTANCE = 10.0  # between Gaussians of different views or levels; larger than any other distance
 _BASE_COST = 0.002  # cost of a merger between equal Gaussians, as a difference of colours
@@ -47,7 +47,7 @@ def measure_contributions(scene: Scene, size: tuple[int, int]) -> Float[Tensor, 
             image = rasterize(dataclasses.replace(part, harmonics=colors), pose, size=size).color
             (image * area).sum().backward()
             assert colors.grad is not None
-            largest[index] = torch.maximum(largest[index], colors.grad[:, 0, 0] / _SH_0)
+            largest[index] = torch.maximum(largest[index], colors.grad[:, 0, 0] / SH_0)
     return largest
 
 
@@ -118,7 +118,7 @@ def _find_mutual_neighbours(
 
 def _merge_cost(gaussians: Gaussians, contributions: Tensor, first: Tensor, second: Tensor) -> Float[Tensor, "pair"]:
     """Estimated mean absolute change of an image by each merger."""
-    colors = _SH_0 * gaussians.harmonics[:, 0]
+    colors = SH_0 * gaussians.harmonics[:, 0]
     difference = (colors[first] - colors[second]).abs().mean(1)
     a, b = contributions[first], contributions[second]
     shared = 2 * a * b / (a + b).clamp_min(torch.finfo(a.dtype).tiny)

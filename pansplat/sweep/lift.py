@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import torch
 
+from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
 from pansplat.geometry.pose import quats_from_rotations
@@ -36,7 +37,6 @@ from pansplat.sweep.surface import (
 )
 
 NUM_LEVELS = 4
-_SH_0 = 0.28209479177387814  # the harmonic of degree 0
 _MAX_LENGTH = 0.2  # largest standard deviation of a disc, relative to its distance
 _MIN_DISTANCE = 0.5  # smallest distance of a Gaussian from an input camera, relative to `near`
 
@@ -142,7 +142,7 @@ def _lift_level(
         scales=torch.from_numpy(scales).float(),
         quats=quats.float(),
         opacities=torch.from_numpy(opacity).float(),
-        harmonics=torch.from_numpy((color - 0.5) / _SH_0).float()[:, None, :],
+        harmonics=torch.from_numpy((color - 0.5) / SH_0).float()[:, None, :],
         levels=torch.full((len(points),), level, dtype=torch.uint8),
         views=torch.full((len(points),), view, dtype=torch.uint8),
     )
