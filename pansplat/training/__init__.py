@@ -1,10 +1,8 @@
 """Training: losses, deferred backpropagation, and the training loop. `pansplat-train PRESET` runs it."""
 
-import sys
-
 
 def main() -> None:
     """Run `pansplat-train` and exit with its status."""
-    from pansplat.training.__main__ import run
+    from pansplat.training.__main__ import main
 
-    sys.exit(run())
+    main()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from pansplat.console import own_warnings, run_command
 
@@ -49,5 +49,15 @@ def parse(argv: Sequence[str] | None = None) -> TrainConfig:
     )
 
 
+def main() -> NoReturn:
+    """The entry point: `run`, then the end of this process."""
+    status = run()
+    if "torch" in sys.modules:  # else nothing was trained
+        from pansplat.training.distributed import end_process
+
+        end_process(status)
+    sys.exit(status)
+
+
 if __name__ == "__main__":
-    sys.exit(run())
+    main()

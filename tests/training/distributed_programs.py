@@ -11,7 +11,13 @@ from torch import Tensor, nn
 from pansplat.data.views import Batch, collate
 from pansplat.model.pansplat import PanSplat
 from pansplat.training.config import MemoryConfig
-from pansplat.training.distributed import ProcessGroup, convert_sync_batch_norm, data_parallel, no_sync
+from pansplat.training.distributed import (
+    ProcessGroup,
+    convert_sync_batch_norm,
+    data_parallel,
+    end_process,
+    no_sync,
+)
 from pansplat.training.losses import LossWeights
 from pansplat.training.network import set_training_mode
 from pansplat.training.step import TrainingStep, accumulate_gradients
@@ -96,3 +102,4 @@ if __name__ == "__main__":
     group.initialize(torch.device("cpu"))
     {"split_batches": split_batches, "repeated_steps": repeated_steps}[sys.argv[1]](Path(sys.argv[2]), group)
     group.destroy()
+    end_process(0)
