@@ -1,7 +1,12 @@
 """pansplat: a few 360-degree panoramas in, a scene of spherical 3D Gaussians you can fly through out."""
 
+import os
 from importlib import import_module
 from typing import Any
+
+from pansplat.kernel_cache import choose_kernel_cache
+
+choose_kernel_cache(os.path.dirname(__file__), os.environ)
 
 __version__ = "0.1.0"
 

@@ -5,18 +5,25 @@ from __future__ import annotations
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pansplat.errors import InputError
+from pansplat.files import describe_kind
+
+_MAX_STEM = 48  # characters of the name that the temporary name repeats
 
 
 @contextmanager
-def replacing(path: Path | str) -> Iterator[Path]:
+def replacing(path: Path | str, *, failures: tuple[type[Exception], ...] = ()) -> Iterator[Path]:
     """Yield a temporary path that replaces `path` when the block succeeds.
 
     The temporary file lies in the same folder and has the same suffix. If the block raises, it is removed and `path`
     stays unchanged.
+
+    Args:
+        path: the file to write.
+        failures: further exceptions of a library that mean a failed write, such as a full disk.
 
     Raises:
         InputError: the folder of `path` does not exist or cannot be written.
@@ -26,14 +33,19 @@ def replacing(path: Path | str) -> Iterator[Path]:
         raise InputError(f"cannot write {path}: needed an existing folder, got {path.parent}; create it first")
     if path.is_dir():
         raise InputError(f"cannot write {path}: needed a file name, got a folder; give a file inside it")
-    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
+    if path.exists() and (kind := describe_kind(path)):
+        raise InputError(f"cannot write {path}: needed a file name, got {kind}; give another name")
+    temporary = path.with_name(f".{path.stem[:_MAX_STEM]}.{secrets.token_hex(4)}{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)
-    except OSError as error:
+    except InputError:
+        raise
+    except (OSError, *failures) as error:
+        reason = getattr(error, "strerror", None) or (str(error) or repr(error)).splitlines()[0]
         raise InputError(
-            f"cannot write {path}: needed a writable folder with free disk space, got "
-            f"'{error.strerror or error}'; choose another folder"
+            f"cannot write {path}: needed a writable folder with free disk space, got '{reason}'; choose another folder"
         ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -12,14 +13,17 @@ from pathlib import Path
 
 import numpy as np
 import safetensors.torch
+import torch
 
 from pansplat.atomic import replacing
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
 from pansplat.errors import InputError
+from pansplat.files import expand_home, read_file
 from pansplat.gaussians.scene import Gaussians
 from pansplat.predictor import Predictor
 
+_MAX_LEVELS = 256
 _FORMAT = "1"  # version of the file's layout; part of the hash
 _FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
 
@@ -37,10 +41,11 @@ class CachedPrediction:
         self._stem = f"{_make_file_name(pair.name)}-{_make_file_name(model)}-{height}-"
         self._name = f"{self._stem}{_hash_inputs(views, predictor, refinement)}.scene"
         self._folders = list_cache_folders(pair)
+        self._num_views = len(views.images)
 
     def read(self) -> Gaussians | None:
         """Gaussians of the first undamaged file; None if there is none."""
-        found = (_read_gaussians(folder / self._name) for folder in self._folders)
+        found = (_read_gaussians(folder / self._name, self._num_views) for folder in self._folders)
         return next((gaussians for gaussians in found if gaussians is not None), None)
 
     def write(self, gaussians: Gaussians) -> None:
@@ -63,9 +68,12 @@ class CachedPrediction:
 
 def list_cache_folders(pair: Pair) -> list[Path]:
     """Folders for a pair's predictions, in order of preference."""
-    pair_hash = hashlib.blake2b(str(pair.folder.resolve()).encode(), digest_size=8).hexdigest()
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return [pair.folder / ".pansplat", Path(home) / "pansplat" / pair_hash]
+    pair_hash = hashlib.blake2b(os.fsencode(pair.folder.resolve()), digest_size=8).hexdigest()
+    folders = [pair.folder / ".pansplat"]
+    with contextlib.suppress(InputError):  # no home folder
+        home = os.environ.get("XDG_CACHE_HOME") or expand_home("~/.cache")
+        folders.append(Path(home) / "pansplat" / pair_hash)
+    return folders
 
 
 def _hash_inputs(views: Views, predictor: Predictor, refinement: str) -> str:
@@ -79,16 +87,27 @@ def _hash_inputs(views: Views, predictor: Predictor, refinement: str) -> str:
     return digest.hexdigest()
 
 
-def _read_gaussians(path: Path) -> Gaussians | None:
+def _read_gaussians(path: Path, num_views: int) -> Gaussians | None:
+    """The Gaussians of a file; None if it is missing, damaged, or holds values that no predictor writes."""
     try:
-        content = path.read_bytes()
+        content = read_file(path)
         body, checksum = content[:-4], int.from_bytes(content[-4:], "little")
         if zlib.crc32(body) != checksum:
             return None
         tensors = safetensors.torch.load(body)
-        return Gaussians(*(tensors[name] for name in _FIELDS))
+        gaussians = Gaussians(*(tensors[name] for name in _FIELDS))
     except (OSError, ValueError, KeyError, safetensors.SafetensorError):
         return None
+    floats = (gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities, gaussians.harmonics)
+    labels = (gaussians.levels, gaussians.views)
+    if not all(value.dtype in (torch.float32, torch.float64) and bool(value.isfinite().all()) for value in floats):
+        return None
+    if any(label.is_floating_point() or label.is_complex() or label.dtype == torch.bool for label in labels):
+        return None
+    for label, count in zip(labels, (_MAX_LEVELS, num_views), strict=True):
+        if len(label) and not 0 <= int(label.min()) <= int(label.max()) < count:
+            return None
+    return gaussians
 
 
 def _make_file_name(name: str) -> str:

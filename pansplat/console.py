@@ -1,45 +1,214 @@
-"""Terminal output of the commands: messages on standard error, exit statuses, tables."""
+"""The frame of all commands: messages, exit statuses, signals, and the terminal (docs/errors.md)."""
 
 from __future__ import annotations
 
+import _thread
 import contextlib
+import errno
+import io
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+import time
+import traceback
 import warnings
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NoReturn, TypeVar
 
-from pansplat.errors import InputError
+from pansplat.errors import InputError, InputWarning
 
 if TYPE_CHECKING:
+    from types import FrameType
+
     from rich.console import Console
 
+BAD_INPUT, INTERNAL_ERROR, CLOSED_PIPE = 2, 70, 128 + 13  # exit statuses; 128 + signal number after a signal
+DEBUG = "PANSPLAT_DEBUG"  # environment variable; 1 prints the traceback of every error
+
+_T = TypeVar("_T")
+
 _COLORS = {"error": "red", "interrupted": "red", "note": "yellow"}
+_MIN_WIDTH, _MAX_WIDTH = 40, 1000  # characters; help and tables need minutes and gigabytes outside
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def run_command(command: Callable[[], int], *, memory_advice: str, interruption: str) -> int:
-    """Run a command and return its exit status.
+    """Run a command and return its exit status. No exception leaves it but SystemExit.
 
     Args:
         command: returns its exit status.
         memory_advice: advice for the case that memory runs out.
-        interruption: message after Ctrl+C.
+        interruption: message after Ctrl+C or SIGTERM.
 
     Returns:
-        The command's status; 2 for bad input or if memory runs out, 130 after Ctrl+C.
+        The command's status; 2 for bad input, missing files and exhausted memory or disks, 70 for a defect of pansplat,
+        130 after Ctrl+C, 143 after SIGTERM, 141 if the reader of standard output closed it.
     """
-    try:
-        return command()
-    except InputError as error:
+    _prepare_terminal()
+    with _catch_signals() as signals:
+        stop: SystemExit | None = None
+        status = 0
+        try:
+            try:
+                status = command()
+            except SystemExit as request:  # of the parser of arguments
+                stop = request
+            if sys.stdout is not None:
+                sys.stdout.flush()
+        except BaseException as error:
+            signals.raising = False
+            if os.environ.get(DEBUG) == "1":
+                traceback.print_exc()
+            # After a signal, a compiled kernel that runs on raises a SystemError instead of the KeyboardInterrupt.
+            if signals.received or isinstance(error, KeyboardInterrupt):
+                print_message("interrupted", interruption)
+                return 128 + (signals.received[0] if signals.received else signal.SIGINT)
+            return _report(error, memory_advice)
+        if stop is not None:
+            raise stop
+        return status
+
+
+def exit_process(status: int) -> NoReturn:
+    """End the process with an exit status; a signal during the interpreter's end prints nothing."""
+    with contextlib.suppress(ValueError):  # only the main thread can set handlers
+        for number in _SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
+    sys.exit(status)
+
+
+def _report(error: BaseException, memory_advice: str) -> int:
+    """Print one line about an error and return the exit status."""
+    if isinstance(error, InputError):
         print_message("error", error)
-        return 2
-    except (MemoryError, RuntimeError) as error:
-        if not is_out_of_memory(error):
-            raise
+        return BAD_INPUT
+    if isinstance(error, (MemoryError, RuntimeError)) and is_out_of_memory(error):
         cause = "".join(f" ({line[:120]})" for line in str(error).splitlines()[:1])
         print_message("error", f"out of memory{cause}; {memory_advice}")
-        return 2
-    except KeyboardInterrupt:
-        print_message("interrupted", interruption)
-        return 130
+        return BAD_INPUT
+    if isinstance(error, OSError):
+        return _report_system_error(error)
+    log = _write_log(error)
+    cause = f"{type(error).__name__}: {error}".splitlines()[0][:160]
+    print_message("error", f"internal error ({cause}), please report it with {log}; {DEBUG}=1 shows more")
+    return INTERNAL_ERROR
+
+
+def _report_system_error(error: OSError) -> int:
+    """Print one line about an error of the operating system, unless standard output was closed by its reader."""
+    reason = error.strerror or str(error) or type(error).__name__
+    if error.filename is None and _is_output_broken():
+        _discard_output()
+        if error.errno == errno.EPIPE:
+            return CLOSED_PIPE
+        print_message("error", f"standard output: needed a place to write, got '{reason}'; free some disk space")
+        return BAD_INPUT
+    name = "a file" if error.filename is None else os.fsdecode(error.filename)
+    print_message("error", f"{name}: needed a usable file or folder, got '{reason}'; check path, space and permissions")
+    return BAD_INPUT
+
+
+def _is_output_broken() -> bool:
+    """Whether standard output cannot be written; its unwritten text is still in its buffer then."""
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError):
+        return True
+    return False
+
+
+def _discard_output() -> None:
+    """Send unwritten text to the null device, so that the interpreter's end does not fail to write it."""
+    with contextlib.suppress(OSError, ValueError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)
+        sys.stdout.flush()
+
+
+def _write_log(error: BaseException) -> str:
+    """Write the traceback of a defect to a temporary file; return words that name it."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        release = version("pansplat")
+    except PackageNotFoundError:
+        release = "of a source folder"
+    lines = [f"pansplat {release}, Python {sys.version}, {sys.platform}", f"arguments: {sys.argv!r}", ""]
+    text = "\n".join(lines) + "\n" + "".join(traceback.format_exception(error))
+    try:
+        name = time.strftime("pansplat-error-%Y%m%d-%H%M%S-")
+        with tempfile.NamedTemporaryFile(
+            "w", prefix=name, suffix=".log", delete=False, encoding="utf-8", errors="backslashreplace"
+        ) as file:
+            file.write(text)
+        return f"the log {file.name}"
+    except OSError:
+        return "its traceback (no log could be written)"
+
+
+@dataclass
+class _Signals:
+    """The numbers of the received signals, and whether a signal raises KeyboardInterrupt."""
+
+    received: list[int] = field(default_factory=list)
+    raising: bool = True
+
+
+@contextlib.contextmanager
+def _catch_signals() -> Iterator[_Signals]:
+    """Raise KeyboardInterrupt at Ctrl+C and SIGTERM.
+
+    An interrupt in a destructor or a callback of a library is printed by Python and lost. It is raised again instead.
+    """
+    signals = _Signals()
+
+    def handle(number: int, _: FrameType | None) -> None:
+        signals.received.append(number)
+        if signals.raising:
+            raise KeyboardInterrupt
+
+    def raise_again(problem: sys.UnraisableHookArgs) -> None:
+        lost = isinstance(problem.exc_value, KeyboardInterrupt)
+        if lost or (signals.received and isinstance(problem.exc_value, SystemError)):
+            _thread.interrupt_main()
+        else:
+            previous_hook(problem)
+
+    defaults = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    is_main = threading.current_thread() is threading.main_thread()
+    replaced = [number for number in _SIGNALS if is_main and signal.getsignal(number) == defaults[number]]
+    previous_hook = sys.unraisablehook
+    for number in replaced:
+        signal.signal(number, handle)
+    sys.unraisablehook = raise_again
+    try:
+        yield signals
+    finally:
+        sys.unraisablehook = previous_hook
+        for number in replaced:
+            signal.signal(number, defaults[number])
+
+
+def _prepare_terminal() -> None:
+    """Open missing standard streams, write what the terminal's encoding lacks as escapes, and bound its width."""
+    with contextlib.suppress(OSError):
+        for descriptor in (0, 1, 2):  # a file that is opened later must not get one of these numbers
+            try:
+                os.fstat(descriptor)
+            except OSError:
+                os.open(os.devnull, os.O_RDWR)
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError, ValueError):
+            if stream.errors == "strict":
+                stream.reconfigure(errors="backslashreplace")
+    width = min(max(shutil.get_terminal_size().columns, _MIN_WIDTH), _MAX_WIDTH)
+    if os.environ.get("COLUMNS", str(width)) != str(width) or shutil.get_terminal_size().columns != width:
+        os.environ["COLUMNS"] = str(width)
 
 
 def print_message(kind: str, text: object) -> None:
@@ -47,8 +216,9 @@ def print_message(kind: str, text: object) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    line = Text.assemble((f"{kind}: ", f"bold {_COLORS[kind]}"), str(text))
-    Console(stderr=True, soft_wrap=True, highlight=False).print(line)
+    line = Text.assemble((f"{kind}: ", f"bold {_COLORS[kind]}"), " ".join(str(text).splitlines()))
+    with contextlib.suppress(OSError, ValueError):  # a closed or full standard error
+        Console(stderr=True, soft_wrap=True, highlight=False).print(line)
 
 
 def is_out_of_memory(error: BaseException) -> bool:
@@ -61,14 +231,64 @@ def describes_out_of_memory(message: str) -> bool:
     return "allocate" in message or "out of memory" in message.lower() or message.startswith("MemoryError")
 
 
+def can_print(text: str) -> bool:
+    """Whether standard output has all characters of a text."""
+    try:
+        text.encode(getattr(sys.stdout, "encoding", None) or "ascii")
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 @contextlib.contextmanager
 def own_warnings() -> Iterator[None]:
     """Print warnings of pansplat as notes and hide those of other libraries."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        warnings.filterwarnings("always", category=UserWarning, module=r"pansplat(\.|$)")
+        warnings.filterwarnings("always", category=InputWarning)
+        warnings.filterwarnings("always", category=UserWarning, module=r"pansplat(_viewer)?(\.|$)")
         warnings.showwarning = lambda message, *_: print_message("note", message)
         yield
+
+
+def parse_arguments(parse: Callable[[], _T]) -> _T:
+    """The result of a parser of arguments, whose framed message of an error becomes one line.
+
+    Raises:
+        SystemExit: status 0 after help, 2 after an error.
+    """
+    message = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(message):
+            return parse()
+    except SystemExit as stop:
+        text = message.getvalue()
+        if stop.code not in (0, None):
+            print_message("error", _flatten(text))
+        elif text:
+            print(text, file=sys.stderr, end="")
+        raise
+
+
+def _flatten(text: str) -> str:
+    """The words of a framed message as one line; the parts between its rules are separated by semicolons."""
+    parts: list[list[str]] = [[]]
+    for line in text.splitlines():
+        words = line.strip("│| ").strip()
+        if not words.strip("─-╭╮╰╯+"):
+            parts.append([])
+        elif not line.startswith(("╭", "╰", "+")):
+            parts[-1].append(words)
+    texts = [_shorten_suggestion(" ".join(part)) for part in parts if part]
+    return "; ".join(text.rstrip(".") for text in texts) or "the arguments cannot be used; see --help"
+
+
+def _shorten_suggestion(text: str) -> str:
+    """Only the names of suggested options, without their help."""
+    if not text.startswith("Perhaps you meant"):
+        return text
+    names = dict.fromkeys(word for word in text.split() if word.startswith("--") and word != "--help")
+    return f"perhaps you meant {', '.join(names)}"
 
 
 def make_table_console(width: int = 140) -> Console:

@@ -17,6 +17,7 @@ from pansplat.model.depth_network import DepthEstimate
 from pansplat.model.depth_refinement import DepthRefinement, Observations, RefinementConfig
 from pansplat.model.layers import to_channels_last
 from pansplat.model.weights import (
+    build_on_meta,
     config_from_dict,
     load_weights,
     pack_weights,
@@ -57,10 +58,11 @@ def load_guided_sweep(path: Path, name: str = "default") -> GuidedSweep:
     weights = load_weights(path)
     if weights.model != MODEL:
         raise InputError(f"{path}: needed weights of a depth network, got weights of {weights.model!r}")
-    network = DepthRefinement(config_from_dict(RefinementConfig, weights.config, f"{path}: config"))
-    tensors = {name: t.float() if t.is_floating_point() else t for name, t in weights.tensors.items()}
-    require_shapes(tensors, network.state_dict(), path)
-    network.load_state_dict(tensors)
+    config = config_from_dict(RefinementConfig, weights.config, f"{path}: config")
+    expected = build_on_meta(lambda: DepthRefinement(config), MODEL, path).state_dict()
+    require_shapes(weights.tensors, expected, path)
+    network = DepthRefinement(config)
+    network.load_state_dict(weights.tensors)
     digest = hashlib.blake2b(path.read_bytes(), digest_size=8).hexdigest()
     return GuidedSweep(network.eval(), digest, name)
 

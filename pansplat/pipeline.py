@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -21,9 +22,11 @@ from pansplat.data.folders import load_pairs
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
 from pansplat.errors import InputError
+from pansplat.files import expand_home
 from pansplat.gaussians.ply import load_ply, save_ply, save_ply_parts
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians, prune
 from pansplat.geometry.pose import blend_weights
+from pansplat.geometry.world import scale_poses, working_factor
 from pansplat.model.layers import Precision
 from pansplat.model.weights import WEIGHTS_SUFFIXES, CompatChoice, read_model_name
 from pansplat.predictor import Predictor, Progress
@@ -69,7 +72,7 @@ def load_model(
             f"`model` must be one of {', '.join(sorted(_MODELS))}, or a file of weights "
             f"({', '.join(WEIGHTS_SUFFIXES)}), got {str(name)!r}"
         )
-    path = Path(name).expanduser()
+    path = expand_home(name)
     if read_model_name(path) == "depth":
         from pansplat.guided_sweep import load_guided_sweep
 
@@ -197,9 +200,11 @@ def refine(
     Raises:
         InputError: scene and views do not fit, or an argument is out of range.
     """
-    refinement = Refinement(scene, views, config, seed=seed)
+    factor = working_factor(scene.near)
+    scaled_views = replace(views, cam2world=scale_poses(views.cam2world, factor))
+    refinement = Refinement(scene.scaled(factor), scaled_views, config, seed=seed)
     refinement.run(seconds=10.0 if seconds is None and steps is None else seconds, steps=steps, progress=progress)
-    return refinement.scene()
+    return refinement.scene().scaled(1 / factor)
 
 
 def predict_to_file(
@@ -277,6 +282,14 @@ def render(
         InputError: `blend` names no view of the scene, or `drawing` does not fit the other arguments.
     """
     pose = torch.as_tensor(cam2world, dtype=torch.float64)
+    factor = working_factor(scene.near)
+    if factor != 1:  # the rasterisers have thresholds in metres
+        for name, power in (("near", 1), ("covariances", 2)):
+            if raster.get(name) is not None:
+                raster[name] = raster[name] * factor**power
+        options: dict[str, Any] = {"blend": blend, "size": size, "layout": layout, "drawing": drawing, **raster}
+        rendering = render(scene.scaled(factor), scale_poses(pose, factor), **options)
+        return replace(rendering, depth=rendering.depth / factor)
     if size is None:
         size = (scene.height, round(scene.height * 16 / 9) if layout == "pinhole" else 2 * scene.height)
     rasterize_gaussians = _choose_rasterizer(drawing, scene, size, layout, raster)

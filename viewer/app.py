@@ -1,9 +1,6 @@
 """The `pansplat-view` command. Imports torch and OpenGL only when they are needed, so that `--help` is fast."""
 
-import math
 import re
-import sys
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +8,10 @@ from typing import Annotated, Literal
 
 import tyro
 
+from pansplat.console import exit_process, own_warnings, parse_arguments, run_command
 from pansplat.errors import InputError
+from pansplat.files import expand_home, require_output_folder
+from pansplat.options import REAL, Depth, Height, Range, Seconds, check_numbers
 from pansplat_viewer.loader import LoadOptions, SceneEntry, SceneLoader, find_entries, load_entry
 from pansplat_viewer.settings import DrawSettings, Kernel, Mode, Order
 
@@ -36,17 +36,17 @@ class Options:
     """For a network: as the official code, with its defects fixed, or as the weights were trained."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """Type of a network's convolutions; bfloat16 is faster on CPUs that support it, and less accurate."""
-    height: int = 512
+    height: Height = 512
     """Height of the panoramas that the prediction reads, pixels."""
-    refine: float = 10.0
+    refine: Seconds = 10.0
     """Time limit of the refinement after the prediction, seconds; 0 for none. A window shows the prediction first."""
     no_cache: bool = False
     """Predict even if the pair's folder has a cached result."""
     convention: str | None = None
     """Pose convention, such as "world2cam opengl", instead of the one in the files."""
-    near: float | None = None
+    near: Depth | None = None
     """Nearest depth of the search, metres, instead of the one in the files."""
-    far: float | None = None
+    far: Depth | None = None
     """Farthest depth of the search, metres."""
     mode: Mode = "deferred"
     """How the Gaussians of the input views are combined."""
@@ -54,13 +54,13 @@ class Options:
     """Response of a Gaussian: exact on each ray, or the linearisation of 3DGS."""
     order: Order = "radial"
     """Sort Gaussians by distance, or by depth along the view axis."""
-    at: float | None = None
+    at: Annotated[float, Range(0, 1), REAL] | None = None
     """Start position between the panoramas, 0 to 1 (0); offscreen, position of the panorama (0.5)."""
     size: str = "1280x720"
     """Width x height of the window or film, pixels."""
-    seconds: float = 4.0
+    seconds: Annotated[float, Range(0, 3600, "seconds", above=True), REAL] = 4.0
     """Length of the film."""
-    fps: float = 24.0
+    fps: Annotated[float, Range(0, 240, above=True), REAL] = 24.0
     """Frames per second of the film."""
 
     @property
@@ -90,25 +90,26 @@ class Options:
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Run the command and exit with status 0 (done), 2 (invalid input) or 130 (interrupted)."""
-    sys.exit(run(args))
+    """Run the command and exit with its status (docs/errors.md)."""
+    exit_process(run(args))
 
 
 def run(args: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit status."""
-    options = tyro.cli(Options, args=args, prog="pansplat-view", config=(tyro.conf.FlagCreatePairsOff,))
-    with warnings.catch_warnings():
-        # Show warnings of pansplat to the user; hide those of libraries.
-        warnings.simplefilter("ignore")
-        warnings.filterwarnings("always", category=UserWarning, module=r"pansplat(_viewer)?(\.|$)")
-        warnings.showwarning = lambda message, *_: print(f"note: {message}", file=sys.stderr)
-        try:
+    """Run the command and return its exit status; help and misspelt arguments raise SystemExit."""
+
+    def run_parsed() -> int:
+        options = parse_arguments(
+            lambda: tyro.cli(Options, args=args, prog="pansplat-view", config=(tyro.conf.FlagCreatePairsOff,))
+        )
+        check_numbers(options)
+        with own_warnings():
             return _run(options)
-        except InputError as error:
-            print(f"pansplat-view: {error}", file=sys.stderr)
-            return 2
-        except KeyboardInterrupt:
-            return 130
+
+    return run_command(
+        run_parsed,
+        memory_advice="choose a smaller --height or --size.",
+        interruption="no incomplete file is left behind",
+    )
 
 
 def choose_entry(entries: list[SceneEntry], pair: str | None) -> int:
@@ -128,11 +129,9 @@ def choose_entry(entries: list[SceneEntry], pair: str | None) -> int:
 
 def _run(options: Options) -> int:
     pixels = options.pixels
-    if options.at is not None and not 0 <= options.at <= 1:
-        raise InputError(f"`--at` must be between 0 and 1, got {options.at}")
-    if not 0 <= options.refine < math.inf:
-        raise InputError(f"`--refine` must be a number of seconds, 0 for none, got {options.refine}")
-    entries = find_entries(options.path.expanduser(), options.load_options)
+    if options.offscreen is not None:
+        require_output_folder("--offscreen", options.offscreen)
+    entries = find_entries(expand_home(options.path), options.load_options)
     show_all = options.pair == "all"
     first = 0 if show_all else choose_entry(entries, options.pair)
     folder = options.offscreen
@@ -141,6 +140,7 @@ def _run(options: Options) -> int:
         if problem is None:
             return 0
         print(f"{problem}: writing a fly-through instead")
+        require_output_folder("the folder", Path("renders"))
     chosen = entries if show_all else entries[first : first + 1]
     if len(chosen) < len(entries):
         print(f"{options.path} has {len(entries)} scenes: showing {chosen[0].name}; select with --pair NAME or all")

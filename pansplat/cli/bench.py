@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import shutil
 import tempfile
@@ -16,8 +15,10 @@ from tyro.conf import Positional, subcommand
 
 import pansplat
 from pansplat.cli.evaluate import LpipsChoice, choose_lpips
-from pansplat.cli.inputs import OptionalOut, PairChoice, choose_pair, predict_scene, require_height
+from pansplat.cli.inputs import OptionalOut, PairChoice, choose_pair, predict_scene
 from pansplat.errors import InputError
+from pansplat.files import require_output_folder
+from pansplat.options import WHOLE, Positive, Range, Threads
 
 if TYPE_CHECKING:
     from pansplat.bench.memory import MemorySetting
@@ -28,6 +29,7 @@ _SAMPLE = Path(pansplat.__file__).parents[1] / "assets" / "living_room"
 _MIN_SWEEP_HEIGHT = 64  # pixels
 _RASTER_BACKENDS = ("numba", "triton", "gsplat")
 _DEFAULT_MEMORY = 16e9  # bytes, if the system does not report its memory
+_TiledHeight = Annotated[int, Range(64, 8192, "pixels", multiple=32), WHOLE]  # 4x4 tiles must fit the four levels
 _RANDOM_WEIGHTS = "PanSplat with random weights (seed 0): times and memory are valid, images are meaningless"
 
 
@@ -47,9 +49,9 @@ class BenchRaster:
     """Plot of time against error (.png, .svg, .pdf); the costs over counts and resolutions go to NAME_sweeps."""
     out: OptionalOut = None
     """Folder for raster.json, raster.md, raster.png and raster_sweeps.png."""
-    height: int = 512
+    height: Annotated[int, Range(16, 8192, "pixels", multiple=8), WHOLE] = 512
     """Height of the panoramas, pixels; a multiple of 8."""
-    threads: int | None = None
+    threads: Threads | None = None
     """The largest number of threads to use; by default torch's."""
 
     def run(self) -> int:
@@ -64,9 +66,6 @@ class BenchRaster:
         from pansplat.bench.roofline import describe_machine
 
         json, plot, page = self._files()
-        require_height(self.height)
-        if self.height % 8:
-            raise InputError(f"--height must be a multiple of 8 pixels, got {self.height}")
         settings = self._settings()
         scene_of = make_room_scene if self.scene is None else self._scene_of(self.scene, self.height)
         budget, slow = (1.0, 3.0) if self.quick else (8.0, 5.0)
@@ -88,7 +87,7 @@ class BenchRaster:
         """The files of rows, plot and tables; refuses missing folders before the work."""
         json, plot, page = self.json, self.plot, None
         if self.out is not None:
-            self.out.mkdir(parents=True, exist_ok=True)
+            _make_output_folder(self.out)
             json, plot = json or self.out / "raster.json", plot or self.out / "raster.png"
             page = self.out / "raster.md"
         for file in (json, plot):
@@ -146,15 +145,15 @@ class BenchModel:
     """Weights of PanSplat (.safetensors); by default random ones, which take the same time."""
     pair: Path | None = None
     """Folder of a pair; by default the sample, if it is there."""
-    height: int = 512
-    """Panoramas are resized to this height, pixels; a multiple of 64."""
+    height: Annotated[int, Range(64, 8192, "pixels", multiple=64), WHOLE] = 512
+    """Panoramas are resized to this height, pixels; a multiple of 64, so that 4x4 tiles fit."""
     quick: bool = False
     """Precisions only, without tiles, a single thread and the official code's defects."""
     json: Path | None = None
     """File for the rows; written after every row."""
     out: OptionalOut = None
     """Folder for model.json, model.md and model.png."""
-    threads: int | None = None
+    threads: Threads | None = None
     """The largest number of threads to use; by default torch's."""
 
     def run(self) -> int:
@@ -165,9 +164,6 @@ class BenchModel:
 
         json = _choose_rows_file(self.json, self.out, "model.json")
         threads = _choose_threads(self.threads)
-        require_height(self.height)
-        if self.height % 64:
-            raise InputError(f"--height must be a multiple of 64 pixels, so that 4x4 tiles fit, got {self.height}")
         folder = self.pair or _SAMPLE
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder; give one with --pair (the sample is in the repository only)")
@@ -211,11 +207,11 @@ class BenchMemory:
 
     preset: Literal["tiny", "small", "paper"] = "small"
     """Size of the network; weights are random."""
-    heights: tuple[int, ...] = (128, 256, 512, 1024)
+    heights: tuple[_TiledHeight, ...] = (128, 256, 512, 1024)
     """Heights of the panoramas, pixels; multiples of 32. Above 512 only the heads are trained, as in the paper."""
     quick: bool = False
     """Without one-step and 4 tiles."""
-    limit_gb: float = 8.0
+    limit_gb: Positive = 8.0
     """Largest memory of a row, 10^9 bytes. Rows expected to need more are skipped; rows that exceed it are ended."""
     style: Literal["panorama", "cubemap", "original"] = "cubemap"
     """How images are rendered; as training's --memory.style."""
@@ -223,7 +219,7 @@ class BenchMemory:
     """Part of the loss; LPIPS needs its weights."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto: a GPU if there is one; its memory is that of torch's allocator."""
-    threads: int | None = None
+    threads: Threads | None = None
     """Threads to use; by default torch's."""
     out: OptionalOut = None
     """Folder for memory.json, memory.md and memory.png."""
@@ -236,13 +232,10 @@ class BenchMemory:
         from pansplat.training.network import network_config
 
         setting = self._setting()
-        for height in self.heights:
-            if height < 64 or height % 32:  # 4x4 tiles must fit the four levels
-                raise InputError(f"--heights must be 64 pixels or more and multiples of 32, got {height}")
         cases = list_memory_cases(self.heights, quick=self.quick)
         with tempfile.TemporaryDirectory() as temporary:
             folder = self.out or Path(temporary)
-            folder.mkdir(parents=True, exist_ok=True)
+            _make_output_folder(folder)
             rows = read_rows(folder / "memory.json", setting)
             weights = Path(temporary, "random.safetensors")
             save_random_weights(weights, network_config(setting.network))
@@ -260,8 +253,6 @@ class BenchMemory:
         from pansplat.bench.memory import MemorySetting
 
         threads = _choose_threads(self.threads)
-        if not 0 < self.limit_gb < math.inf:
-            raise InputError(f"--limit-gb must be positive, got {self.limit_gb}")
         if self.device == "cuda" and not torch.cuda.is_available():
             raise InputError("--device cuda needs a CUDA device that torch can use, got none; use --device cpu.")
         cuda = self.device == "cuda" or (self.device == "auto" and torch.cuda.is_available())
@@ -281,7 +272,7 @@ class BenchRefine:
     """File for the rows; written after every row."""
     out: OptionalOut = None
     """Folder for refine.json, refine.md and refine.png."""
-    threads: int | None = None
+    threads: Threads | None = None
     """Threads to use; by default torch's."""
     lpips: LpipsChoice = field(default_factory=LpipsChoice)
 
@@ -314,7 +305,7 @@ class BenchRefine:
 class BenchMachine:
     """Measure the machine's peaks: multiply-adds and memory bandwidth."""
 
-    threads: int | None = None
+    threads: Threads | None = None
     """The largest number of threads to use; by default torch's."""
 
     def run(self) -> int:
@@ -347,8 +338,6 @@ def _choose_threads(threads: int | None) -> int:
     """The number of threads; by default torch's."""
     import torch
 
-    if threads is not None and threads < 1:
-        raise InputError(f"--threads must be at least 1, got {threads}")
     return threads or torch.get_num_threads()
 
 
@@ -364,10 +353,15 @@ def _find_usable_memory() -> float:
 def _choose_rows_file(json: Path | None, out: Path | None, name: str) -> Path | None:
     """The file of the rows, by default in the folder `out`, which is made; refuses a missing folder."""
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
+        _make_output_folder(out)
         json = json or out / name
     _require_folder(json)
     return json
+
+
+def _make_output_folder(folder: Path) -> None:
+    require_output_folder("--out", folder)
+    folder.mkdir(parents=True, exist_ok=True)
 
 
 def _require_folder(file: Path | None) -> None:

@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from pansplat.cli.inputs import Out
 from pansplat.console import make_table_console
-from pansplat.errors import InputError
+from pansplat.files import require_output_file
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -37,8 +37,7 @@ class Convert:
         from pansplat.model.network import convert_checkpoint
         from pansplat.model.weights import match_tensors, read_checkpoint, save_weights
 
-        if self.out.suffix.lower() != ".safetensors" or not self.out.resolve().parent.is_dir():
-            raise InputError(f"--out must be a .safetensors file in an existing folder, got {self.out}")
+        require_output_file("--out", self.out, (".safetensors",))
         content = read_checkpoint(self.path)
         make_table_console().print(_make_report_table(match_tensors(content, self.path)))
         weights = convert_checkpoint(content, self.path)

@@ -9,7 +9,10 @@ from typing import Annotated
 from tyro.conf import Positional, subcommand
 
 from pansplat.cli.inputs import Out
-from pansplat.errors import InputError
+from pansplat.files import require_output_folder
+from pansplat.options import WHOLE, Count, Range, Seed, Threads
+
+_Height = Annotated[int, Range(32, 8192, "pixels", multiple=32), WHOLE]
 
 
 @dataclass(frozen=True)
@@ -18,18 +21,18 @@ class DataHomes:
 
     out: Out
     """Folder for the shards. Shards that are there are kept; run the command again after an interruption."""
-    count: int = 1024
+    count: Count = 1024
     """Number of homes, rounded up to whole shards of 16."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the homes."""
-    height: int = 128
+    height: _Height = 128
     """Height of the panoramas, pixels; a multiple of 32."""
-    cameras: int = 4
+    cameras: Annotated[int, Range(2, 1000), WHOLE] = 4
     """Panoramas of each home."""
     furniture: Path | None = None
     """Folder with furniture catalogues (*.sh3f) of the Debian package sweethome3d-furniture; by default only our own
     furniture is placed."""
-    workers: int = 1
+    workers: Threads = 1
     """Processes that render."""
 
     def run(self) -> int:
@@ -38,15 +41,7 @@ class DataHomes:
 
         from pansplat.data.generated.shards import TourSettings, write_shards
 
-        for name, value, least in (
-            ("count", self.count, 1),
-            ("cameras", self.cameras, 2),
-            ("workers", self.workers, 1),
-        ):
-            if value < least:
-                raise InputError(f"--{name} must be at least {least}, got {value}")
-        if self.height < 32 or self.height % 32:
-            raise InputError(f"--height must be a multiple of 32 pixels, got {self.height}")
+        require_output_folder("--out", self.out)
         settings = TourSettings(seed=self.seed, height=self.height, cameras=self.cameras, furniture=self.furniture)
         with Progress() as progress:
             task = progress.add_task("rendering homes", total=self.count)
@@ -67,7 +62,7 @@ class DataMaps:
     """Folder of the triplets."""
     out: Out
     """Folder for the shards."""
-    height: int = 128
+    height: Annotated[int, Range(32, 8192, "pixels"), WHOLE] = 128
     """Height of the panoramas, pixels."""
 
     def run(self) -> int:

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Literal, cast
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Compat, Out, Precision, parse_blend, progress_bar, require_height, require_refine
+from pansplat.cli.inputs import Compat, Out, Precision, parse_blend, progress_bar
 from pansplat.console import make_table_console
 from pansplat.errors import InputError
+from pansplat.files import require_output_folder
+from pansplat.options import Count, CountOrNone, Depth, Height, Seconds
 
 if TYPE_CHECKING:
     from pansplat.evaluation.lpips import Backbone, Lpips
@@ -42,9 +44,9 @@ class ProtocolChoice:
     """Folder that holds the data sets, for --protocol: png_render_test_* or pano_grf/, 360Loc/, insta360/."""
     models: tuple[str, ...] = ()
     """More predictors for the table of --protocol: `sweep`, or files of weights."""
-    limit: int | None = None
+    limit: Count | None = None
     """At most this many cases of each test set, evenly spaced; by default all, as in the paper."""
-    pictures: int = 8
+    pictures: CountOrNone = 8
     """Number of cases of each test set whose images are written."""
 
 
@@ -66,9 +68,9 @@ class Evaluate:
     """For a network: official, fixed, or as its weights were trained; see `pansplat predict --help`."""
     precision: Precision = "float32"
     """Number type of a network's convolutions."""
-    height: int = 512
+    height: Height = 512
     """Panoramas are resized to this height, pixels."""
-    refine: float = 0.0
+    refine: Seconds = 0.0
     """Time limit of the refinement after each prediction, seconds; 0 for none. Not with --protocol."""
     blend: str | None = None
     """deferred, joint, or view0, view1, ...; by default deferred, with --protocol that of the paper's table."""
@@ -76,15 +78,16 @@ class Evaluate:
     """exact, or original: render as the official code does, to compare with its published figures."""
     convention: str | None = None
     """Pose convention, if a folder does not state it."""
-    near: float | None = None
+    near: Depth | None = None
     """Nearest depth to search, metres."""
-    far: float | None = None
+    far: Depth | None = None
     """Farthest depth to search, metres."""
     lpips: LpipsChoice = field(default_factory=LpipsChoice)
     protocol: ProtocolChoice = field(default_factory=ProtocolChoice)
 
     def run(self) -> int:
         """Evaluate the folders' pairs, or a protocol of the paper."""
+        require_output_folder("--out", self.out)
         return self._run_folders() if self.protocol.protocol is None else self._run_protocol(self.protocol.protocol)
 
     def _run_folders(self) -> int:
@@ -92,8 +95,6 @@ class Evaluate:
         from pansplat import pipeline
         from pansplat.evaluation.report import evaluate, results_table
 
-        require_height(self.height)
-        require_refine(self.refine)
         if not self.paths:
             raise InputError("`pansplat evaluate` needs at least one folder of pairs, or --protocol")
         blend = parse_blend(self.blend or "deferred")
@@ -146,7 +147,6 @@ class Evaluate:
 
     def _protocol_data(self) -> Path:
         """The folder of data sets; refuses arguments that a protocol does not have."""
-        require_height(self.height)
         if self.paths:
             raise InputError(
                 f"--protocol takes its data from --data, got the folder {self.paths[0]} as well; leave it out"
@@ -158,8 +158,6 @@ class Evaluate:
         for name in ("near", "far", "convention"):
             if getattr(self, name) is not None:
                 raise InputError(f"--{name} is set by the protocol; leave it out")
-        if self.protocol.limit is not None and self.protocol.limit < 1:
-            raise InputError(f"--limit must be at least 1, got {self.protocol.limit}")
         return self.protocol.data.expanduser()
 
     def _protocol_methods(self, protocol: ProtocolName) -> list[Method]:

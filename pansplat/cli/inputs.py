@@ -5,7 +5,6 @@ Modules of this package import torch and everything that needs it inside functio
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import arg
 
 from pansplat.errors import InputError
+from pansplat.options import Depth
 
 if TYPE_CHECKING:
     from pansplat.data.pairs import Pair
@@ -37,9 +37,9 @@ class PairChoice:
     convention: str | None = None
     """Pose convention, if the folder does not state it: "cam2world opencv", "cam2world opengl",
     "world2cam opencv" or "world2cam opengl" (Habitat and Blender use opengl)."""
-    near: float | None = None
+    near: Depth | None = None
     """Nearest depth to search, metres; by default the folder's."""
-    far: float | None = None
+    far: Depth | None = None
     """Farthest depth to search, metres; by default the folder's."""
 
 
@@ -56,8 +56,9 @@ def choose_pair(path: Path, choice: PairChoice) -> Pair:
         return pairs[0]
     if choice.pair in names:
         return pairs[names.index(choice.pair)]
-    if choice.pair.isdecimal() and 1 <= int(choice.pair) <= len(pairs):
-        return pairs[int(choice.pair) - 1]
+    numbered = {str(number): pair for number, pair in enumerate(pairs, 1)}
+    if choice.pair in numbered:
+        return numbered[choice.pair]
     raise InputError(f"--pair {choice.pair}: {path} holds {listed}")
 
 
@@ -71,30 +72,12 @@ def predict_scene(pair: Pair, model: Predictor, height: int, *, cache: bool, ref
         )
 
 
-def require_output(option: str, path: Path, suffix: str) -> None:
-    """Refuse an output file with another suffix, or in a folder that does not exist."""
-    if path.suffix.lower() != suffix or not path.resolve().parent.is_dir():
-        raise InputError(f"{option} must be a {suffix} file in an existing folder, got {path}")
-
-
-def require_refine(seconds: float) -> None:
-    """Refuse a time limit of the refinement that is negative or not finite."""
-    if not 0 <= seconds < math.inf:
-        raise InputError(f"--refine must be a number of seconds, 0 for none, got {seconds}")
-
-
-def require_height(height: int) -> None:
-    """Refuse panorama heights that the predictors do not support."""
-    if not 16 <= height <= 8192 or height % 2:
-        raise InputError(f"--height must be an even number of 16 to 8192 pixels, got {height}")
-
-
 def parse_blend(text: str) -> str | int:
     """The `blend` of `pansplat.render` for an argument: "deferred", "joint", or the number of "view0", "view1", ..."""
     if text in ("deferred", "joint"):
         return text
     number = text.removeprefix("view")
-    if number.isdecimal():
+    if number.isascii() and number.isdecimal() and len(number) < 10:
         return int(number)
     raise InputError(f"--blend must be deferred, joint or view0, view1, ..., got {text!r}")
 
@@ -106,7 +89,7 @@ def progress_bar() -> Iterator[Progress]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     console = Console(stderr=True)
-    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %")
+    columns = TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.percentage:>3.0f} %")
     with Progress(
         *columns, TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal
     ) as bar:

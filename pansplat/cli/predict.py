@@ -6,7 +6,7 @@ import dataclasses
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
@@ -18,11 +18,9 @@ from pansplat.cli.inputs import (
     choose_pair,
     predict_scene,
     progress_bar,
-    require_height,
-    require_output,
-    require_refine,
 )
-from pansplat.errors import InputError
+from pansplat.files import require_output_file
+from pansplat.options import WHOLE, Fraction, Height, Range, Seconds
 
 if TYPE_CHECKING:
     from pansplat.data.pairs import Pair
@@ -47,15 +45,15 @@ class Predict:
     that the weights were trained with, which is official for official weights."""
     precision: Precision = "float32"
     """Number type of a network's convolutions; bfloat16 is less exact, and faster if the processor supports it."""
-    height: int = 512
+    height: Height = 512
     """Panoramas are resized to this height, pixels. Networks predict heights above 512 tile by tile, in bounded
     memory, and do not cache the result."""
-    refine: float = 0.0
+    refine: Seconds = 0.0
     """Time limit of the refinement after the prediction, seconds; 0 for none. `pansplat refine` has more options."""
-    degree: int | None = None
+    degree: Annotated[int, Range(0, 4), WHOLE] | None = None
     """Highest degree of spherical harmonics to write, 0 to 4; by default all. The file of 4K panoramas has 5 GB with
     degree 4, 1 GB with degree 0."""
-    min_opacity: float = 0.0
+    min_opacity: Fraction = 0.0
     """Leave out Gaussians of lower opacity; those below 0.004 are invisible."""
     no_cache: bool = False
     """Predict again even if the pair's folder holds a cached result."""
@@ -65,14 +63,8 @@ class Predict:
         """Predict, write the scene and print the time of the prediction."""
         from pansplat import pipeline
 
-        require_output("--out", self.out, ".ply")
-        require_height(self.height)
-        require_refine(self.refine)
+        require_output_file("--out", self.out, (".ply",))
         pair = choose_pair(self.path, self.choice)
-        if self.degree is not None and not 0 <= self.degree <= 4:
-            raise InputError(f"--degree must be 0 to 4, got {self.degree}")
-        if not 0 <= self.min_opacity < 1:
-            raise InputError(f"--min-opacity must be at least 0 and less than 1, got {self.min_opacity}")
         model = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
         began = time.perf_counter()
         count = self._predict(pair, model)

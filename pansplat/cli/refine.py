@@ -20,10 +20,10 @@ from pansplat.cli.inputs import (
     choose_pair,
     predict_scene,
     progress_bar,
-    require_height,
-    require_output,
 )
 from pansplat.errors import InputError
+from pansplat.files import require_output_file
+from pansplat.options import Count, Height, Seconds, Seed
 
 if TYPE_CHECKING:
     from pansplat.data.views import Views
@@ -44,15 +44,15 @@ class Refine:
     """The .ply file to write."""
     photographs: Path | None = None
     """Folder of the pair that a .ply scene was predicted from."""
-    seconds: float | None = None
+    seconds: Seconds | None = None
     """Time limit; 10 by default."""
-    steps: int | None = None
+    steps: Count | None = None
     """Number of steps instead, for the same result in every run."""
-    gaussians: int | None = None
+    gaussians: Count | None = None
     """Largest number of Gaussians: similar neighbours are merged before the refinement."""
     poses: bool = False
     """Estimate small corrections of the camera poses, too."""
-    seed: int = 0
+    seed: Seed = 0
     """Of the blocks of pixels that are held out to detect overfitting."""
     report: Path | None = None
     """A .json file for errors, gains, times and the error over the steps."""
@@ -62,7 +62,7 @@ class Refine:
     """For a network: official, fixed, or as its weights were trained; see `pansplat predict --help`."""
     precision: Precision = "float32"
     """Number type of a network's convolutions."""
-    height: int | None = None
+    height: Height | None = None
     """The photographs are resized to this height, pixels; by default that of the scene, for a pair 512."""
     choice: PairChoice = field(default_factory=PairChoice)
 
@@ -70,6 +70,7 @@ class Refine:
         """Refine, write the scene and print the errors of held-out pixels."""
         from pansplat import pipeline
         from pansplat.evaluation.report import write_json
+        from pansplat.geometry.world import scale_poses, working_factor
         from pansplat.refinement import RefineConfig, Refinement
 
         self._refuse_invalid_arguments()
@@ -78,9 +79,11 @@ class Refine:
         seconds = 10.0 if self.seconds is None and self.steps is None else self.seconds
         with stop_at_interrupt() as should_stop, progress_bar() as progress:
             progress("preparing", 0.0)
-            refinement = Refinement(scene, views, config, seed=self.seed)
+            factor = working_factor(scene.near)
+            scaled_views = dataclasses.replace(views, cam2world=scale_poses(views.cam2world, factor))
+            refinement = Refinement(scene.scaled(factor), scaled_views, config, seed=self.seed)
             report = refinement.run(seconds=seconds, steps=self.steps, progress=progress, should_stop=should_stop)
-        refined = refinement.scene()
+        refined = refinement.scene().scaled(1 / factor)
         pipeline.save(refined, self.out)
         if self.report is not None:
             write_json(dataclasses.asdict(report), self.report)
@@ -90,9 +93,9 @@ class Refine:
 
     def _refuse_invalid_arguments(self) -> None:
         """Raise an error before the prediction, which takes seconds."""
-        require_output("--out", self.out, ".ply")
+        require_output_file("--out", self.out, (".ply",))
         if self.report is not None:
-            require_output("--report", self.report, ".json")
+            require_output_file("--report", self.report, (".json",))
         if self.seconds is not None and self.steps is not None:
             raise InputError("--seconds and --steps both set the length of the refinement; give one of them")
         if self.path.suffix.lower() == ".ply" and self.photographs is None:
@@ -101,8 +104,6 @@ class Refine:
             raise InputError(
                 f"--photographs is for a .ply scene, and {self.path} is the folder of a pair; leave it out"
             )
-        if self.height is not None:
-            require_height(self.height)
 
     def _open_scene(self) -> tuple[Scene, Views]:
         """The scene of a .ply file, or the prediction of a pair's folder, and its photographs."""

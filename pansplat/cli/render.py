@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional
 
@@ -19,10 +18,10 @@ from pansplat.cli.inputs import (
     parse_blend,
     predict_scene,
     progress_bar,
-    require_height,
-    require_refine,
 )
 from pansplat.errors import InputError
+from pansplat.files import read_file, require_output_file
+from pansplat.options import REAL, Height, ImageHeight, Range, Seconds
 
 if TYPE_CHECKING:
     import numpy as np
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr")
 _VIDEO_HEIGHT = 360
+_MAX_MATRIX = 4096  # characters of a file with the 16 numbers of a matrix
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Render:
     """A .ply scene, or the folder of a pair."""
     out: Out
     """The file to write; its suffix chooses the format."""
-    at: float | None = None
+    at: Annotated[float, Range(-1000, 1000), REAL] | None = None
     """Camera position between the first (0) and the last (1) input camera; 0.5 by default."""
     pose: Path | None = None
     """File with the camera pose: a JSON matrix (cam2world, OpenCV axes, metres), 16 numbers, or a KITTI or TUM
@@ -51,15 +51,15 @@ class Render:
     layout: Literal["equirect", "cubemap", "perspective"] | None = None
     """Panorama with one exact ray per pixel, panorama stitched from six cube faces, or perspective image.
     By default equirect, for a video perspective."""
-    height: int | None = None
+    height: ImageHeight | None = None
     """Height of the image, pixels; by default that of the input panoramas, for a video 360."""
     blend: str = "deferred"
     """deferred (images of single views, weighted by nearness), joint (all Gaussians at once), or view0, view1, ..."""
-    fov: float = 90.0
+    fov: Annotated[float, Range(1, 170, "degrees"), REAL] = 90.0
     """Vertical field of view of `perspective`, degrees."""
-    seconds: float = 4.0
+    seconds: Annotated[float, Range(0, 3600, "seconds", above=True), REAL] = 4.0
     """Length of a video."""
-    fps: float = 24.0
+    fps: Annotated[float, Range(0, 240, above=True), REAL] = 24.0
     """Frames per second of a video."""
     model: str = "default"
     """Predictor, for a pair: `default`, `sweep` (without weights), or a file of weights."""
@@ -67,9 +67,9 @@ class Render:
     """For a network: official, fixed, or as its weights were trained; see `pansplat predict --help`."""
     precision: Precision = "float32"
     """Number type of a network's convolutions."""
-    refine: float = 10.0
+    refine: Seconds = 10.0
     """Time limit of the refinement after the prediction, for a pair, seconds; 0 for none."""
-    predict_height: int = 512
+    predict_height: Height = 512
     """Height that the panoramas are resized to before the prediction, for a pair."""
     choice: PairChoice = field(default_factory=PairChoice)
 
@@ -109,24 +109,12 @@ class Render:
 
     def _refuse_invalid_arguments(self) -> None:
         """Raise an error before the prediction, which takes seconds."""
-        if not self._is_video and self.out.suffix.lower() not in _IMAGE_SUFFIXES:
-            raise InputError(f"--out must end in {', '.join(_IMAGE_SUFFIXES)} or .mp4, got {self.out}")
-        if not self.out.resolve().parent.is_dir():
-            raise InputError(f"--out {self.out}: the folder does not exist; create it first")
+        require_output_file("--out", self.out, (*_IMAGE_SUFFIXES, ".mp4"))
         if self.at is not None and self.pose is not None:
             raise InputError("--at and --pose both set the camera; give one of them")
         if self.at is not None and self._is_video:
             raise InputError("--at is one position, an .mp4 moves through all; write a .png, or leave out --at")
-        if self.at is not None and not math.isfinite(self.at):
-            raise InputError(f"--at must be a number such as 0.5, got {self.at}")
-        if self.height is not None and self.height < 2:
-            raise InputError(f"--height must be at least 2 pixels, got {self.height}")
-        if not 1 <= self.fov <= 170:
-            raise InputError(f"--fov must be 1 to 170 degrees, got {self.fov}")
-        if self._is_video and not (0 < self.seconds < 3600 and 0 < self.fps <= 240):
-            raise InputError(f"--seconds and --fps must be positive, got {self.seconds} and {self.fps}")
         parse_blend(self.blend)
-        require_refine(self.refine)
 
     def _open_scene(self) -> Scene:
         """The scene of a .ply file, or the prediction of a pair's folder."""
@@ -134,7 +122,6 @@ class Render:
 
         if self.path.suffix.lower() == ".ply":
             return pipeline.load(self.path)
-        require_height(self.predict_height)
         pair = choose_pair(self.path, self.choice)
         model = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
         return predict_scene(pair, model, self.predict_height, cache=True, refine_seconds=self.refine)
@@ -162,7 +149,8 @@ class Render:
 
 def read_poses(path: Path) -> list[Tensor]:
     """Poses of a file (a JSON matrix, 16 numbers, a KITTI or TUM trajectory): cam2world, OpenCV axes."""
-    from pansplat.data.poses import parse_convention, read_json, read_trajectory, rigid_matrix, to_cam2world
+    from pansplat.data.poses import parse_convention, read_trajectory, rigid_matrix, to_cam2world
+    from pansplat.strict_json import read_json
 
     if path.suffix.lower() == ".json":
         content = read_json(path)
@@ -172,14 +160,14 @@ def read_poses(path: Path) -> list[Tensor]:
             content = content.get("cam2world", content.get("pose"))
         return [to_cam2world(rigid_matrix(content, str(path)), convention)]
     try:
-        words = path.read_text(encoding="utf-8-sig").replace(",", " ").split()
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_file(path, "a readable file of numbers", limit=1 << 30).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
         raise InputError(f"{path}: needed a readable file of numbers, got '{error}'") from error
     try:
-        numbers = [float(word) for word in words]
+        numbers = [float(word) for word in text[:_MAX_MATRIX].replace(",", " ").split()]
     except ValueError:
         numbers = []  # comments or file names, which the trajectory reader handles
-    if len(numbers) == 16:
+    if len(numbers) == 16 and len(text) < _MAX_MATRIX:
         return [rigid_matrix([numbers[i : i + 4] for i in (0, 4, 8, 12)], str(path))]
     return list(read_trajectory(path).poses)
 

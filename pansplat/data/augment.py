@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from torch import Tensor
 
 from pansplat.data.views import Sample, Views
 from pansplat.geometry.equirect import pixel_directions, sample_equirect, uv_from_directions
+from pansplat.options import REAL, Range
 
 _MIRROR = torch.diag(torch.tensor((-1.0, 1.0, 1.0, 1.0), dtype=torch.float64))
 
@@ -30,11 +31,11 @@ class Augmentation:
     """Rotation about the vertical camera axes by whole pixels: one for all views of a sample, or one for each view."""
     mirror: Literal["off", "half"] = "half"
     """Mirror a sample with probability 1/2."""
-    tilt_degrees: float = 0.0
+    tilt_degrees: Annotated[float, Range(0, 180, "degrees"), REAL] = 0.0
     """Largest tilt of each view off its vertical axis; resamples the images."""
-    colour: float = 0.1
+    colour: Annotated[float, Range(0, 1), REAL] = 0.1
     """Strength of changes of brightness, contrast, hue and gamma, the same for all views; 0 for none."""
-    exposure: float = 0.0
+    exposure: Annotated[float, Range(0, 10, "stops"), REAL] = 0.0
     """Largest difference in exposure between views, in stops; 0 for none."""
 
 

@@ -21,6 +21,7 @@ from torch import Tensor
 from pansplat.data.pairs import (
     FAR,
     FAR_SEQUENCE,
+    MAX_CONTEXT,
     NEAR,
     Collection,
     Pair,
@@ -28,17 +29,18 @@ from pansplat.data.pairs import (
     ViewGroup,
     find_mask,
     list_panorama_files,
+    too_many_panoramas,
 )
 from pansplat.data.poses import (
-    number_field,
     parse_convention,
-    read_json,
     read_number,
     read_trajectory,
     rigid_matrix,
     to_cam2world,
 )
 from pansplat.errors import InputError
+from pansplat.files import expand_home, read_file
+from pansplat.strict_json import list_field, number_field, read_json
 
 _POSES, _PAIRS = "poses.json", "pairs.json"
 _CAMERA_POSES = "camera_pose.json"  # of 360Loc
@@ -64,7 +66,7 @@ def load_pairs(
     Raises:
         InputError: no known format was found, or a file is missing or invalid.
     """
-    root = Path(path).expanduser()
+    root = expand_home(path)
     if not root.exists():
         raise InputError(f"{root}: needed a folder of posed panoramas, got no such path; check it.")
     triplet = root if root.is_file() and root in triplet_files(root.parent) else None
@@ -158,7 +160,7 @@ def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collec
         raise InputError(
             f"{source}: needed poses of two or more panoramas, got {len(panoramas)}{without}; add what is missing."
         )
-    near, far = number_field(content, "near", source), number_field(content, "far", source)
+    near, far = (number_field(content, key, source, needed="a number in metres") for key in ("near", "far"))
     groups = _read_groups(folder / _PAIRS, list(entries)) if (folder / _PAIRS).is_file() else None
     is_single = (len(panoramas) - 1 if groups is None else len(groups)) == 1
     return Collection(
@@ -210,11 +212,9 @@ def _read_groups(source: Path, names: list[str]) -> tuple[ViewGroup, ...]:
             f'{source}: needed {{"pairs": [{{"context": [a, b], "target": [m]}}]}}, got neither "pairs" nor '
             '"triplets"; see docs/input.md.'
         )
-    groups = []
+    groups, numbers = [], {name: number for number, name in enumerate(names)}
     for key in ("triplets", "pairs"):
-        entries = content.get(key) or []
-        if not isinstance(entries, list):
-            raise InputError(f'{source}: needed a list as "{key}", got {str(entries)[:60]}; put [ ] around it.')
+        entries = list_field(content, key, source)
         for number, entry in enumerate(entries, start=1):
             where = f"{source}, {key} {number}"
             context, target = (entry.get("context"), entry.get("target")) if isinstance(entry, dict) else (None, None)
@@ -227,7 +227,9 @@ def _read_groups(source: Path, names: list[str]) -> tuple[ViewGroup, ...]:
             targets = _as_names([target] if isinstance(target, str) else target or [])
             if targets is None:
                 raise InputError(f'{where}: needed an image or a list of images as "target", got {target}; correct it.')
-            first, second = (tuple(_find_name(name, names, where) for name in part) for part in (context, targets))
+            if len(context) > MAX_CONTEXT:
+                raise too_many_panoramas(where, len(context))
+            first, second = (tuple(_find_name(name, numbers, where) for name in part) for part in (context, targets))
             groups.append((first, second))
     if not groups:
         raise InputError(f"{source}: needed at least one pair, got none; add one or remove the file.")
@@ -239,9 +241,9 @@ def _as_names(value: Any) -> list[str] | None:
     return value if isinstance(value, list) and all(isinstance(name, str) for name in value) else None
 
 
-def _find_name(name: str, names: list[str], where: str) -> int:
+def _find_name(name: str, names: dict[str, int], where: str) -> int:
     if name in names:
-        return names.index(name)
+        return names[name]
     close = difflib.get_close_matches(name, names, n=1)
     suggestion = f" (did you mean {close[0]!r}?)" if close else ""
     raise InputError(f"{where}: needed images that have a pose in {_POSES}, got {name!r}{suggestion}; add its pose.")
@@ -290,7 +292,7 @@ def _read_numbers(path: Path, count: int) -> Float[Tensor, count]:
     if not path.is_file():
         raise InputError(f"{path}: needed the pose of the view, got no such file; add it.")
     try:
-        values = np.array(path.read_text().split(), dtype=np.float64)
+        values = np.array(read_file(path, limit=1 << 20).decode().split(), dtype=np.float64)
     except (ValueError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: needed {count} numbers, got other text ({error}); correct it.") from error
     if values.size != count:

@@ -20,11 +20,13 @@ from PIL import Image, ImageOps
 from torch import Tensor
 
 from pansplat.atomic import replacing
-from pansplat.errors import InputError
+from pansplat.errors import InputError, InputWarning
+from pansplat.files import read_file
 
 READABLE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".exr")
 
 _PILLOW_FORMATS = ("JPEG", "PNG", "WEBP")
+_MAX_BYTES = 1 << 31
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _WRAP = 16  # margin of the wrap-around at +-180 degrees for the resampling filter, target pixels
 
@@ -71,6 +73,7 @@ def read_panorama(
     warnings.warn(
         f"{path}: {100 * (1 - opaque.mean()):.1f}% of the image is transparent; these pixels are masked. "
         "Remove the alpha channel if they show the scene.",
+        category=InputWarning,
         stacklevel=2,
     )
     return image, torch.from_numpy(opaque)
@@ -161,8 +164,10 @@ def write_image(
     pixels = pixels if pixels.dtype == np.uint8 else np.rint(pixels.clip(0, 1) * 255).astype(np.uint8)
     options: dict[str, Any] = {"quality": 95, "subsampling": 0} if suffix in (".jpg", ".jpeg") else {}
     options = {"lossless": True} if suffix == ".webp" else options
+    encoded = io.BytesIO()  # Pillow's own writing to a file misses a disk that becomes full
+    Image.fromarray(pixels).save(encoded, Image.registered_extensions()[suffix], **options)
     with replacing(path) as temporary:
-        Image.fromarray(pixels).save(temporary, **options)
+        temporary.write_bytes(encoded.getbuffer())
 
 
 def _as_pixels(path: Path, image: Tensor | NDArray[Any]) -> NDArray[Any]:
@@ -202,7 +207,8 @@ def _write_exr(path: Path, pixels: NDArray[Any], depth: Tensor | NDArray[Any] | 
     header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     if pixels.shape[1] == 2 * pixels.shape[0] if panorama is None else panorama:
         header["envmap"] = OpenEXR.ENVMAP_LATLONG
-    with replacing(path) as temporary, OpenEXR.File(header, channels) as file:
+    # OpenEXR raises a RuntimeError or worse when the disk is full.
+    with replacing(path, failures=(Exception,)) as temporary, OpenEXR.File(header, channels) as file:
         file.write(str(temporary))
 
 
@@ -220,10 +226,7 @@ def _check_two_to_one(path: Path, width: int, height: int) -> None:
 
 
 def _read_bytes(path: Path) -> bytes:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: needed a readable image file, got '{error.strerror}'; check the path.") from error
+    data = read_file(path, "a readable image file", limit=_MAX_BYTES)
     if not data:
         raise InputError(f"{path}: needed an image, got a file of 0 bytes; copy or export it again.")
     return data

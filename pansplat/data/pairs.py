@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,12 +13,16 @@ from torch import Tensor
 from pansplat.data.images import READABLE_SUFFIXES, read_depth, read_mask, read_panorama
 from pansplat.data.masks import scene_mask_of_files
 from pansplat.data.views import Views
-from pansplat.errors import InputError
+from pansplat.errors import InputError, InputWarning
+from pansplat.geometry.world import require_depth_range, working_factor
 
 NEAR, FAR = 0.45, 10.0  # metres; depth range of the official indoor data (docs/official.md, section 2.1)
 FAR_SEQUENCE = 50.0  # metres; for halls and outdoor videos (docs/official.md, sections 2.2 and 2.3)
 
-_COINCIDENT = 1e-3  # metres
+MAX_CONTEXT = 64  # context panoramas of a pair
+
+_COINCIDENT = 1e-3  # metres, in a world of metres
+_MATCHING_SECONDS = 2.0  # for two panoramas of 512 rows on two cores
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +72,14 @@ class Pair:
             InputError: an image, mask or depth file cannot be used.
         """
         centres = torch.stack([panorama.cam2world[:3, 3] for panorama in self.context])
-        if float(torch.pdist(centres).min()) < _COINCIDENT:
+        if len(self.context) > MAX_CONTEXT:
+            raise too_many_panoramas(self.name, len(self.context))
+        if float(torch.pdist(centres).min()) < _COINCIDENT / working_factor(self.near):
             warnings.warn(
-                f"{self.name}: cameras of the context views coincide (less than {1000 * _COINCIDENT:.0f} mm apart); "
+                f"{self.name}: cameras of the context views coincide (less than 1 mm apart); "
                 "depth cannot be estimated without a baseline, and only rotations of the camera will look right. "
                 "Check the poses if the camera was moved.",
+                category=InputWarning,
                 stacklevel=2,
             )
         return self._load(self.context, height)
@@ -116,6 +122,15 @@ class Pair:
         return scene_mask_of_files(self.siblings, height)
 
 
+def too_many_panoramas(source: object, count: int) -> InputError:
+    """The error for more context panoramas than are matched, with the work that they would take."""
+    hours = count * (count - 1) * _MATCHING_SECONDS / 3600
+    return InputError(
+        f"{source}: needed at most {MAX_CONTEXT} context panoramas, got {count}: each is matched with all others, "
+        f"{count * (count - 1):,} times, which takes about {hours:,.1f} hours; choose fewer, or make several pairs."
+    )
+
+
 ViewGroup = tuple[tuple[int, ...], tuple[int, ...]]
 """Indices of the context views, and of the target views."""
 
@@ -153,11 +168,7 @@ class Collection:
                 "add the other panorama and its pose."
             )
         near, far = self.near if near is None else near, self.far if far is None else far
-        if not 0 < near < far < math.inf:
-            raise InputError(
-                f"{self.source}: needed 0 < near < far in metres, got near={near:g} and far={far:g}; "
-                'set "near" and "far" in poses.json or on the command line.'
-            )
+        require_depth_range(near, far, self.source, 'set "near" and "far" in poses.json or on the command line')
         siblings = tuple(panorama.image for panorama in self.panoramas)
         pairs = []
         for indices in self._select_groups():

@@ -7,7 +7,6 @@ also Habitat, Blender and NeRF data). The world axes are not changed.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from dataclasses import dataclass
@@ -19,7 +18,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.errors import InputError
+from pansplat.files import read_file
 from pansplat.geometry.pose import invert_pose, orthonormal_error, rotations_from_quats
+from pansplat.geometry.world import MAX_POSITION
 
 CONVENTIONS = ("cam2world opencv", "cam2world opengl", "world2cam opencv", "world2cam opengl")
 
@@ -28,6 +29,8 @@ _DIRECTIONS = {
     "world2cam": r"world[ _-]?(2|to)[ _-]?cam(era)?|\bw2c\b",
 }
 _AXES = {"opencv": r"opencv|colmap", "opengl": r"opengl|habitat|blender|nerf"}
+_MAX_NUMBERS_BYTES, _MAX_TEXT_BYTES = 1 << 16, 1 << 30  # of a text file with one number, and of a trajectory
+_EXACT = 1e-9  # error of a rotation that is kept
 _RIGID_TOLERANCE = 1e-2  # for files with 4 to 6 decimals; errors of wrong matrices are far larger
 _OPENGL_TO_OPENCV = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=torch.float64))
 
@@ -81,7 +84,7 @@ def rigid_matrix(values: Any, source: str) -> Float[Tensor, "4 4"]:
         raise InputError(f"{source}: needed a pose, got none; add its 4x4 matrix or remove the image.")
     try:
         matrix = torch.tensor(values, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise InputError(f"{source}: needed a pose of 4x4 numbers, got {str(values)[:60]!r}; correct it.") from error
     if tuple(matrix.shape) == (3, 4):
         matrix = torch.cat((matrix, torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)))
@@ -94,7 +97,13 @@ def rigid_matrix(values: Any, source: str) -> Float[Tensor, "4 4"]:
         raise InputError(
             f"{source}: needed a rigid pose (rotation and translation), got {_describe_error(matrix, error)}"
         )
-    return _nearest_rigid(matrix) if error > 1e-9 else matrix
+    farthest = float(matrix[:3, 3].abs().max())
+    if farthest > MAX_POSITION:
+        raise InputError(
+            f"{source}: needed a position of at most {MAX_POSITION:g} metres from the origin, got {farthest:g}; "
+            "correct it."
+        )
+    return _nearest_rigid(matrix) if error > _EXACT else matrix
 
 
 def _describe_error(matrix: Float[Tensor, "4 4"], error: float) -> str:
@@ -141,32 +150,13 @@ def to_cam2world(matrix: Float[Tensor, "4 4"], convention: str) -> Float[Tensor,
     return cam2world @ _OPENGL_TO_OPENCV if axes == "opengl" else cam2world
 
 
-def read_json(path: Path) -> Any:
-    """The content of a JSON file.
-
-    Raises:
-        InputError: unreadable, or not JSON (the message gives the line).
-    """
-    try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"{path}: needed a readable file, got '{error.strerror}'; check the path.") from error
-    except json.JSONDecodeError as error:
-        raise InputError(
-            f"{path}: needed JSON, got invalid text at line {error.lineno}, column {error.colno} "
-            f"({error.msg}); correct it there."
-        ) from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: needed JSON text in UTF-8, got another encoding; save it as UTF-8.") from error
-
-
 def read_number(path: Path) -> float:
     """The one positive number in a text file, such as a scale.
 
     Raises:
         InputError: the file holds anything else.
     """
-    text = path.read_text(errors="replace").strip()
+    text = read_file(path, limit=_MAX_NUMBERS_BYTES).decode(errors="replace").strip()
     try:
         number = float(text)
     except ValueError:
@@ -207,24 +197,38 @@ def read_trajectory(path: Path, convention: str | None = None, expected: str | N
             f"{path}: needed {formats[expected]} according to its name, got {formats[kind]}; "
             f"rename it to {path.stem}.{kind}, or convert it."
         )
-    poses = []
-    for line, numbers in rows:
-        source = f"{path}, line {line}"
-        if len(numbers) != count:
-            raise InputError(
-                f"{source}: needed {count} numbers as in the other lines, got {len(numbers)}; correct the line."
-            )
-        matrix = [numbers[0:4], numbers[4:8], numbers[8:12]] if kind == "kitti" else _tum_matrix(numbers, source)
-        poses.append(to_cam2world(rigid_matrix(matrix, source), convention))
-    return Trajectory(kind, tuple(poses))
+    ragged = next(((line, numbers) for line, numbers in rows if len(numbers) != count), None)
+    if ragged is not None:
+        raise InputError(
+            f"{path}, line {ragged[0]}: needed {count} numbers as in the other lines, got {len(ragged[1])}; "
+            "correct the line."
+        )
+    lines, numbers = [line for line, _ in rows], torch.tensor([row for _, row in rows], dtype=torch.float64)
+    matrices = _kitti_matrices(numbers) if kind == "kitti" else _tum_matrices(numbers, lines, path)
+    return Trajectory(kind, tuple(to_cam2world(_rigid_matrices(matrices, lines, path), convention).unbind()))
+
+
+def _rigid_matrices(matrices: Float[Tensor, "n 4 4"], lines: list[int], path: Path) -> Float[Tensor, "n 4 4"]:
+    """`rigid_matrix` of many matrices at once; those that are not exactly rigid are checked one by one."""
+    rotations = matrices[:, :3, :3]
+    gram = rotations @ rotations.transpose(1, 2) - torch.eye(3, dtype=torch.float64)
+    error = torch.where(torch.linalg.det(rotations) > 0, gram.abs().amax(dim=(1, 2)), torch.inf)
+    suspect = ~((error <= _RIGID_TOLERANCE) & (matrices[:, :3, 3].abs().amax(dim=1) <= MAX_POSITION))
+    for index in suspect.nonzero()[:1, 0].tolist():
+        rigid_matrix(matrices[index].tolist(), f"{path}, line {lines[index]}")
+    inexact = error > _EXACT
+    if inexact.any():
+        u, _, vt = torch.linalg.svd(rotations[inexact])
+        matrices[inexact, :3, :3] = u @ vt
+    return matrices
 
 
 def _number_rows(path: Path) -> list[tuple[int, list[float]]]:
     """Line number (from 1) and numbers of each line that is neither empty nor a comment."""
     rows = []
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        lines = read_file(path, "a readable text file", limit=_MAX_TEXT_BYTES).decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
         raise InputError(f"{path}: needed a readable text file, got '{error}'; check it.") from error
     for number, line in enumerate(lines, start=1):
         words = line.replace(",", " ").split()
@@ -239,30 +243,22 @@ def _number_rows(path: Path) -> list[tuple[int, list[float]]]:
     return rows
 
 
-def _tum_matrix(numbers: list[float], source: str) -> list[list[float]]:
-    """Rows of the 4x4 matrix of a line: timestamp tx ty tz qx qy qz qw."""
-    translation, (x, y, z, w) = numbers[1:4], numbers[4:8]
-    norm = math.sqrt(x * x + y * y + z * z + w * w)
-    if not abs(norm - 1) < _RIGID_TOLERANCE:
+def _kitti_matrices(numbers: Float[Tensor, "n 12"]) -> Float[Tensor, "n 4 4"]:
+    """Matrices of rows of 3x4 numbers."""
+    matrices = torch.eye(4, dtype=torch.float64).repeat(len(numbers), 1, 1)
+    matrices[:, :3] = numbers.reshape(-1, 3, 4)
+    return matrices
+
+
+def _tum_matrices(numbers: Float[Tensor, "n 8"], lines: list[int], path: Path) -> Float[Tensor, "n 4 4"]:
+    """Matrices of rows of a timestamp, tx ty tz, and qx qy qz qw."""
+    norm = torch.linalg.vector_norm(numbers[:, 4:], dim=1)
+    for index in (~((norm - 1).abs() < _RIGID_TOLERANCE)).nonzero()[:1, 0].tolist():
         raise InputError(
-            f"{source}: needed a unit quaternion qx qy qz qw as the last four numbers, got length "
-            f"{norm:.4g}; check the order of the columns."
+            f"{path}, line {lines[index]}: needed a unit quaternion qx qy qz qw as the last four numbers, got length "
+            f"{float(norm[index]):.4g}; check the order of the columns."
         )
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = rotations_from_quats(torch.tensor((w, x, y, z), dtype=torch.float64))
-    pose[:3, 3] = torch.tensor(translation, dtype=torch.float64)
-    return pose.tolist()
-
-
-def number_field(content: dict[str, Any], key: str, source: Path) -> float | None:
-    """An optional number of a JSON object.
-
-    Raises:
-        InputError: the value is not a number.
-    """
-    value = content.get(key)
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(f'{source}: needed a number in metres as "{key}", got {value!r}; correct it.')
-    return float(value)
+    matrices = torch.eye(4, dtype=torch.float64).repeat(len(numbers), 1, 1)
+    matrices[:, :3, :3] = rotations_from_quats(numbers[:, [7, 4, 5, 6]])
+    matrices[:, :3, 3] = numbers[:, 1:4]
+    return matrices

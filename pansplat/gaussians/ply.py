@@ -19,16 +19,19 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pansplat.atomic import replacing
-from pansplat.errors import InputError
+from pansplat.errors import InputError, InputWarning
+from pansplat.files import require_file
 from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.world import MAX_POSITION, require_depth_range
+from pansplat.strict_json import list_field, number_field, parse_json, require_object, text_field
 
 OPACITY_EPSILON = 1e-6  # opacities are clamped to this distance from 0 and 1, where the logit is infinite
 SCALE_EPSILON = 1e-12  # metres; smaller scales are clamped, so that the logarithm is finite
@@ -39,6 +42,9 @@ _MAX_HEADER = 1 << 24
 _RUNS_SPACE = 4096  # bytes for about 300 runs; some browser viewers need the header within 10,000 bytes
 _READ_VERTICES = 1 << 17  # vertices that are read at a time
 _DEFAULT_NEAR, _DEFAULT_FAR = 0.1, 100.0  # depth range, metres, for a file without one
+_DEFAULT_HEIGHT = 512  # pixels, of the panoramas
+_MAX_HEIGHT, _MAX_CAMERAS, _MAX_LEVEL = 1 << 16, 1 << 12, 255  # of the pansplat comment
+_MAX_PROPERTIES = 1 << 10  # of an element
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
@@ -91,7 +97,11 @@ def save_ply_parts(scene: Scene, parts: Iterable[Gaussians], path: str | Path) -
         _fill_header(partial, _format_header(scene, runs, coefficients, size=size), size)
     count = sum(run[2] for run in runs)
     if dropped:
-        warnings.warn(f"{path}: left out {dropped} of {count + dropped} Gaussians that are not finite", stacklevel=2)
+        warnings.warn(
+            f"{path}: left out {dropped} of {count + dropped} Gaussians that are not finite",
+            InputWarning,
+            stacklevel=2,
+        )
     return count
 
 
@@ -147,7 +157,7 @@ def _format_header(scene: Scene, runs: list[list[int]], coefficients: int, *, si
         "height": scene.height,
         "near": scene.near,
         "far": scene.far,
-        "names": list(scene.names),
+        "names": [name.encode(errors="backslashreplace").decode() for name in scene.names],
         "cam2world": scene.cam2world.double().cpu().tolist(),
         "runs": runs,
     }
@@ -169,6 +179,7 @@ def load_ply(path: str | Path) -> Scene:
         InputError: the file is missing, not a binary .ply of Gaussians, truncated, or has no finite Gaussian.
     """
     path = Path(path)
+    require_file(path, "a .ply scene")
     try:
         with open(path, "rb") as file:
             header = _read_header(file, path)
@@ -181,15 +192,14 @@ def load_ply(path: str | Path) -> Scene:
     gaussians = _select_finite(replace(gaussians, levels=levels, views=views), path)
     if header.count and not len(gaussians):
         raise InputError(f"{path}: none of its {header.count} Gaussians is finite; write the file again")
-    cam2world = torch.tensor(extras.get("cam2world", []), dtype=torch.float64).reshape(-1, 4, 4)
     return Scene(
         gaussians,
-        cam2world,
-        near=float(extras.get("near", _DEFAULT_NEAR)),
-        far=float(extras.get("far", _DEFAULT_FAR)),
-        names=tuple(str(name) for name in extras.get("names", ())),
-        model=str(extras.get("model", "")),
-        height=int(extras.get("height", 512)),
+        extras.cam2world,
+        near=extras.near,
+        far=extras.far,
+        names=extras.names,
+        model=extras.model,
+        height=extras.height,
     )
 
 
@@ -198,7 +208,11 @@ def _select_finite(gaussians: Gaussians, path: Path) -> Gaussians:
     dropped = len(gaussians) - int(finite.sum())
     if not dropped:
         return gaussians
-    warnings.warn(f"{path}: left out {dropped} of {len(gaussians)} Gaussians that are not finite", stacklevel=3)
+    warnings.warn(
+        f"{path}: left out {dropped} of {len(gaussians)} Gaussians that are not finite",
+        InputWarning,
+        stacklevel=3,
+    )
     return gaussians.select(finite)
 
 
@@ -284,6 +298,8 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
             elif words[:1] == ["property"]:
                 kind = None if words[1] == "list" else _TYPES[words[1]]
                 elements[-1][2].append((words[-1], kind))
+                if len(elements[-1][2]) > _MAX_PROPERTIES:
+                    raise ValueError("too many properties")
         except (IndexError, KeyError, ValueError):
             raise InputError(f"{path}: cannot understand the header line {line[:80]!r}") from None
     if order not in _ORDERS:
@@ -368,44 +384,93 @@ def _count_coefficients(available: Sequence[str], path: Path) -> int:
     return rest // 3 + 1
 
 
-def _parse_extras(comments: list[str], path: Path) -> dict:
-    """Content of the pansplat comment; empty without one, and with a warning when it is damaged."""
+@dataclass(frozen=True)
+class _Extras:
+    """Content of the pansplat comment; the defaults are those of a file of another tool."""
+
+    cam2world: Float[Tensor, "view 4 4"]
+    near: float = _DEFAULT_NEAR
+    far: float = _DEFAULT_FAR
+    names: tuple[str, ...] = ()
+    model: str = ""
+    height: int = _DEFAULT_HEIGHT
+    runs: list[Any] | None = None
+
+
+def _parse_extras(comments: list[str], path: Path) -> _Extras:
+    """Content of the pansplat comment; the defaults without one, and with a warning when it is damaged."""
     for comment in comments:
         if comment.startswith(_COMMENT_PREFIX):
             try:
-                extras = json.loads(comment.removeprefix(_COMMENT_PREFIX))
-                poses = np.asarray(extras.get("cam2world", []), np.float64)
-                if poses.size and (poses.shape[1:] != (4, 4) or not np.isfinite(poses).all()):
-                    raise ValueError("cam2world")
-                numbers = [float(extras.get(key, 1)) for key in ("near", "far", "height")]
-                if not np.isfinite(numbers).all():
-                    raise ValueError("near, far or height")
-                if not isinstance(extras.get("names", []), list) or not isinstance(extras.get("runs", []), list):
-                    raise ValueError("names or runs")
-                return extras
-            except (ValueError, TypeError, AttributeError):
+                return _read_extras(parse_json(comment.removeprefix(_COMMENT_PREFIX), "comment"))
+            except InputError as error:
                 warnings.warn(
-                    f"{path}: its pansplat comment is damaged; cameras, levels and views are ignored", stacklevel=3
+                    f"{path}: its pansplat comment is damaged ({error}); cameras, levels and views are ignored",
+                    InputWarning,
+                    stacklevel=3,
                 )
-    return {}
+    return _Extras(torch.zeros(0, 4, 4, dtype=torch.float64))
 
 
-def _read_labels(extras: dict, count: int, path: Path) -> tuple[torch.Tensor, torch.Tensor]:
+def _read_extras(content: Any) -> _Extras:
+    """The fields of a pansplat comment.
+
+    Raises:
+        InputError: a field has another type, or is out of range.
+    """
+    content = require_object(content, "comment")
+    near = number_field(content, "near", "comment")
+    far = number_field(content, "far", "comment")
+    near, far = _DEFAULT_NEAR if near is None else near, _DEFAULT_FAR if far is None else far
+    require_depth_range(near, far, "comment")
+    height = number_field(content, "height", "comment", low=1, high=_MAX_HEIGHT, whole=True)
+    names = list_field(content, "names", "comment")
+    poses = list_field(content, "cam2world", "comment")
+    if len(poses) > _MAX_CAMERAS or len(names) > _MAX_CAMERAS:
+        raise InputError(f"comment: needed at most {_MAX_CAMERAS} cameras, got {max(len(poses), len(names))}")
+    return _Extras(
+        torch.from_numpy(np.array([_read_pose(pose) for pose in poses], np.float64).reshape(-1, 4, 4)),
+        near,
+        far,
+        tuple(str(name) for name in names),
+        text_field(content, "model", "comment") or "",
+        _DEFAULT_HEIGHT if height is None else int(height),
+        list_field(content, "runs", "comment"),
+    )
+
+
+def _read_pose(rows: Any) -> np.ndarray:
+    """A pose (4, 4) of the comment; the reader of JSON has refused numbers that are not finite."""
+    try:
+        pose = np.array(rows, np.float64)
+    except (TypeError, ValueError):
+        pose = np.zeros(0)
+    if pose.shape != (4, 4) or np.abs(pose).max() > MAX_POSITION:
+        raise InputError(f"comment: needed 4x4 numbers up to {MAX_POSITION:g} in cam2world, got {rows!r:.60}")
+    return pose
+
+
+def _read_labels(extras: _Extras, count: int, path: Path) -> tuple[Tensor, Tensor]:
     """Level and view of each vertex; zeros without labels, or with a warning when they do not fit `count`."""
     zeros = torch.zeros(count, dtype=torch.int64), torch.zeros(count, dtype=torch.int64)
-    if not extras:
+    if extras.runs is None:
         return zeros
-    try:
-        runs = torch.tensor(extras.get("runs", []), dtype=torch.int64).reshape(-1, 3)
-        views = max(len(extras.get("cam2world", [])), 1)
-        valid = bool((runs >= 0).all()) and int(runs[:, 2].sum()) == count
-        valid = valid and (not len(runs) or int(runs[:, 1].max()) < views)
-    except (ValueError, TypeError, RuntimeError):
-        runs, valid = torch.zeros(0, 3, dtype=torch.int64), False
-    if not valid:
+    if not _are_runs(extras.runs, count, max(len(extras.cam2world), 1)):
         warnings.warn(
             f"{path}: its levels and views do not fit its {count} Gaussians (edited by another tool?) and are ignored",
+            InputWarning,
             stacklevel=3,
         )
         return zeros
+    runs = torch.tensor(extras.runs, dtype=torch.int64).reshape(-1, 3)
     return torch.repeat_interleave(runs[:, 0], runs[:, 2]), torch.repeat_interleave(runs[:, 1], runs[:, 2])
+
+
+def _are_runs(runs: list[Any], count: int, views: int) -> bool:
+    """Whether the runs are [level, view, length] whose lengths sum to `count`, in Python's integers of any size."""
+    for run in runs:
+        if not isinstance(run, list) or len(run) != 3 or any(type(number) is not int or number < 0 for number in run):
+            return False
+        if run[0] > _MAX_LEVEL or run[1] >= views or run[2] > count:
+            return False
+    return sum(run[2] for run in runs) == count

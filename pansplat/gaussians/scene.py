@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pansplat.errors import InputError
 from pansplat.geometry.pose import interpolate_poses, rotations_from_quats
+from pansplat.geometry.world import scale_poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +78,12 @@ class Gaussians:
             values.append(value.to(device=device, dtype=dtype if value.is_floating_point() else None))
         return Gaussians(*values)
 
+    def scaled(self, factor: float) -> Gaussians:
+        """The Gaussians in a world that is multiplied by a factor."""
+        if factor == 1:
+            return self
+        return dataclasses.replace(self, means=self.means * factor, scales=self.scales * factor)
+
     @staticmethod
     def cat(parts: Sequence[Gaussians]) -> Gaussians:
         """The Gaussians of all parts in order; the parts must have the same SH degree."""
@@ -116,6 +123,14 @@ class Scene:
     names: tuple[str, ...] = ()
     model: str = ""
     height: int = 512
+
+    def scaled(self, factor: float) -> Scene:
+        """The scene in a world that is multiplied by a factor."""
+        if factor == 1:
+            return self
+        poses = scale_poses(self.cam2world, factor)
+        near, far = self.near * factor, self.far * factor
+        return dataclasses.replace(self, gaussians=self.gaussians.scaled(factor), cam2world=poses, near=near, far=far)
 
     def pose_between(self, fraction: float) -> Float[Tensor, "4 4"]:
         """The pose at a fraction between the first context camera (0) and the last (1).

@@ -15,7 +15,7 @@ import math
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
@@ -166,3 +166,23 @@ def resize_equirect(
         padded, (size[0] + 2 * cut, size[1] + 2 * cut), mode="bilinear", align_corners=False
     )
     return resized[..., cut:-cut, cut:-cut]
+
+
+def fit_panoramas(
+    images: Float[Tensor, "view 3 height width"],
+    masks: Bool[Tensor, "view height width"] | None,
+    multiple: int,
+) -> tuple[Float[Tensor, "view 3 h w"], Bool[Tensor, "view h w"] | None]:
+    """Panoramas and masks at the next height that is a multiple of `multiple`; unchanged if theirs is one.
+
+    The levels and windows of a predictor halve the height several times. The size changes by less than a twelfth of it,
+    so bilinear samples without wrap-around are exact to a twentieth of a pixel at the seam.
+    """
+    height = -(-images.shape[-2] // multiple) * multiple
+    if height == images.shape[-2]:
+        return images, masks
+    images = functional.interpolate(images, (height, 2 * height), mode="bilinear", align_corners=False)
+    if masks is not None:
+        larger = functional.interpolate(masks[:, None].float(), (height, 2 * height), mode="nearest-exact")
+        masks = larger[:, 0] > 0
+    return images, masks

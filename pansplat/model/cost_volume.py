@@ -75,6 +75,11 @@ class CostVolumeConfig:
     levels: tuple[SweepLevel, ...] = _HIERARCHY
     """Coarse to fine."""
 
+    def __post_init__(self) -> None:
+        levels = [level.level for level in self.levels]
+        if levels != [level.level for level in _HIERARCHY][: len(levels)]:
+            raise ValueError(f"`levels` must be 3, 2, 1, coarse to fine, got {levels}")
+
     @property
     def swept_levels(self) -> tuple[SweepLevel, ...]:
         """The levels in use, coarse to fine."""

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
-from pansplat.geometry.equirect import uv_from_directions
+from pansplat.geometry.equirect import fit_panoramas, uv_from_directions
+from pansplat.geometry.world import require_depth_range, scale_poses, working_factor
 from pansplat.model.heads import TileGaussians, merge_tiles
 from pansplat.model.layers import Compat, Precision, require_views
 from pansplat.model.mvsplat import MVSplat, MVSplatConfig
@@ -24,6 +25,7 @@ from pansplat.model.weights import (
     CHECKPOINT_SUFFIXES,
     CompatChoice,
     WeightsFile,
+    build_on_meta,
     config_from_dict,
     convert_tensors,
     load_weights,
@@ -40,7 +42,7 @@ _NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {
 }
 _MIN_HEIGHT = 64
 _UNTILED_HEIGHT = 512  # above, the number of tiles along each side doubles with the height
-_MULTIPLE = {"official": 16, "fixed": 32}  # divides the height: levels, windows and their shifts
+_MULTIPLE = 32  # divides the working height: levels, windows and their shifts
 _MATCHING_FRACTION = 0.4  # of the prediction time, for the progress report
 
 
@@ -151,12 +153,12 @@ class NetworkPredictor:
         Raises:
             InputError: see `__call__`.
         """
-        matched, tiles = self._match(images, cam2world, near, far, masks, progress)
+        matched, tiles, factor = self._match(images, cam2world, near, far, masks, progress)
         parts = list(self._lift(matched, tiles, progress))
-        gaussians = merge_tiles(parts, self.network.compat)[0].to(device=images.device)
+        gaussians = merge_tiles(parts, self.network.compat)[0].scaled(1 / factor).to(device=images.device)
         if masks is not None:
             gaussians = remove_masked_gaussians(gaussians, cam2world, masks)
-        return gaussians, [depth[0].to(images.device) for depth in matched.depths.depth]
+        return gaussians, [depth[0].to(images.device) / factor for depth in matched.depths.depth]
 
     def stream(
         self,
@@ -174,14 +176,14 @@ class NetworkPredictor:
             InputError: see `__call__`; raised when the first part is requested.
         """
         with torch.no_grad():
-            matched, tiles = self._match(images, cam2world, near, far, masks, progress)
+            matched, tiles, factor = self._match(images, cam2world, near, far, masks, progress)
         parts = self._lift(matched, tiles, progress)
         while True:
             with torch.no_grad():  # closed before each yield: the caller keeps its own grad mode
                 part = next(parts, None)
                 if part is None:
                     return
-                gaussians = part.gaussians[0].to(device=images.device)
+                gaussians = part.gaussians[0].scaled(1 / factor).to(device=images.device)
                 gaussians = gaussians if masks is None else remove_masked_gaussians(gaussians, cam2world, masks)
             yield gaussians
 
@@ -193,18 +195,26 @@ class NetworkPredictor:
         far: float | Tensor,
         masks: Tensor | None,
         progress: Progress | None,
-    ) -> tuple[Any, int]:
-        """Check and match the views of one item; return the match and the number of tiles along each side."""
+    ) -> tuple[Any, int, float]:
+        """Check and match the views of one item.
+
+        Returns:
+            The match, the number of tiles along each side, and the factor of the world that the match is in.
+        """
         views = len(images)
         low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (near, far))
         tiles = self.tiles or choose_tiles(images.shape[-2])
-        _check_inputs(images, cam2world, low, high, masks, self.network.compat, tiles)
+        _check_inputs(images, cam2world, low, high, masks, self.network.compat)
         if progress is not None:
             progress("matching views", 0.0)
         weight = next(self.network.parameters())
+        factor = working_factor(float(low.min()))
+        low, high, cam2world = low * factor, high * factor, scale_poses(cam2world, factor)
+        images, _ = fit_panoramas(images, None, max(_MULTIPLE, 8 * tiles))
         pose = cam2world.to(device=weight.device, dtype=weight.dtype)
         near_views, far_views = (bound.to(weight).expand(views)[None] for bound in (low, high))
-        return self.network.match_views(images.to(weight)[None], pose[None], near_views, far_views), tiles
+        matched = self.network.match_views(images.to(weight)[None], pose[None], near_views, far_views)
+        return matched, tiles, factor
 
     def _lift(self, matched: Any, tiles: int, progress: Progress | None) -> Iterator[TileGaussians]:
         report = progress or (lambda stage, fraction: None)
@@ -240,7 +250,7 @@ def _select_item(value: float | Tensor, n: int) -> float | Tensor:
 
 
 def _check_inputs(
-    images: Tensor, cam2world: Tensor, near: Tensor, far: Tensor, masks: Tensor | None, compat: Compat, tiles: int
+    images: Tensor, cam2world: Tensor, near: Tensor, far: Tensor, masks: Tensor | None, compat: Compat
 ) -> None:
     shape = tuple(images.shape)
     if images.ndim != 4 or shape[1] != 3 or shape[3] != 2 * shape[2]:
@@ -248,12 +258,8 @@ def _check_inputs(
             f"`images` must be (view, 3, height, 2 * height), got {shape}; stack RGB equirectangular images of one size"
         )
     require_views(shape[0], compat)
-    multiple = max(_MULTIPLE[compat], 8 * tiles)
-    if shape[2] < _MIN_HEIGHT or shape[2] % multiple:
-        raise InputError(
-            f"`images` must be at least {_MIN_HEIGHT} pixels high and a multiple of {multiple}, got {shape[2]}; "
-            "resize them"
-        )
+    if shape[2] < _MIN_HEIGHT:
+        raise InputError(f"`images` must be at least {_MIN_HEIGHT} pixels high, got {shape[2]}; resize them")
     if tuple(cam2world.shape) != (shape[0], 4, 4):
         raise InputError(f"`cam2world` must be ({shape[0]}, 4, 4) to fit the images, got {tuple(cam2world.shape)}")
     if masks is not None and tuple(masks.shape) != (shape[0], *shape[2:]):
@@ -264,10 +270,8 @@ def _check_inputs(
         raise InputError(
             f"`near` and `far` must be one number, or one number per view, got {near.tolist()} and {far.tolist()}"
         )
-    if not bool((near > 0).all() and (near < far).all() and torch.isfinite(far).all()):
-        raise InputError(
-            f"`near` and `far` must satisfy 0 < near < far, got {near.tolist()} and {far.tolist()} (metres)"
-        )
+    for low, high in zip(near.expand(shape[0]).tolist(), far.expand(shape[0]).tolist(), strict=True):
+        require_depth_range(low, high, "`near` and `far`")
 
 
 def load_predictor(
@@ -374,15 +378,11 @@ def build_empty_network(
     if weights.model not in _NETWORKS:
         raise InputError(f"{source}: needed weights of {' or '.join(_NETWORKS)}, got weights of {weights.model!r}")
     kind, config_kind = _NETWORKS[weights.model]
-    try:
-        config = config_from_dict(config_kind, weights.config, f"{source}: config")
-    except InputError:
-        raise
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{source}: needed settings of a {weights.model} network, got '{error}'") from error
-    with torch.device("meta"):
-        if kind is PanSplat:
-            return PanSplat(config, compat, precision=precision, attention_precision=attention_precision)
-        if precision != "float32":
-            raise InputError(f"{source}: a {weights.model} network runs in float32 only, got precision {precision!r}")
-        return MVSplat(config, compat, attention_precision=attention_precision)
+    if kind is MVSplat and precision != "float32":
+        raise InputError(f"{source}: a {weights.model} network runs in float32 only, got precision {precision!r}")
+    choices = {"attention_precision": attention_precision} | ({"precision": precision} if kind is PanSplat else {})
+    return build_on_meta(
+        lambda: kind(config_from_dict(config_kind, weights.config, f"{source}: config"), compat, **choices),
+        weights.model,
+        source,
+    )

@@ -12,11 +12,12 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import os
 import pickle
 import re
 import typing
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -28,8 +29,10 @@ from torch import Tensor
 
 from pansplat.atomic import replacing
 from pansplat.errors import InputError
+from pansplat.files import require_file
 from pansplat.geometry.cubemap import strip_lookup
 from pansplat.model.layers import Compat
+from pansplat.strict_json import parse_json, require_object
 
 FORMAT = 1  # increased when tensor names or the meaning of the metadata change
 
@@ -48,6 +51,13 @@ _BATCH_NORM = ("weight", "bias", "running_mean", "running_var", "num_batches_tra
 _PREFIX = "encoder."  # of the network's tensors in a Lightning checkpoint
 _AUXILIARY_PREFIX = "losses.2.gaussian_head."
 _MAX_NAMES = 4  # in an error message
+_MAX_ITEMS = 16  # of a list in a network's settings
+_MIN_FLOAT = 1e-6
+_DEFAULT_LIMITS = (1, 4096)  # of a number in a network's settings: larger networks than any take gigabytes
+_LIMITS = {
+    "mono_channels": (0, 4096), "degree": (0, 4), "level": (0, 3), "splits": (1, 2), "expansion": (1, 16),
+    "blocks": (1, 64), "layers": (1, 64), "scales": (1, 6), "attention_layers": (0, 64),
+}  # fmt: skip
 
 
 class UnsafeCheckpointError(InputError):
@@ -94,7 +104,7 @@ def save_weights(path: str | Path, weights: WeightsFile) -> None:
         "compat": weights.compat,
     }
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.tensors.items()}
-    with replacing(path) as partial:
+    with replacing(path, failures=(safetensors.SafetensorError,)) as partial:
         safetensors.torch.save_file(tensors, partial, metadata)
 
 
@@ -110,7 +120,7 @@ def load_weights(path: str | Path) -> WeightsFile:
         with safetensors.safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # not a dict
-    except (safetensors.SafetensorError, OSError, ValueError) as error:
+    except (safetensors.SafetensorError, OSError, ValueError, AttributeError) as error:  # types that torch lacks
         raise InputError(f"{path}: needed a whole .safetensors file, got '{error}'; {_suggest_remedy(path)}") from error
     if not {"pansplat_format", "model", "config", "compat"} <= metadata.keys():
         raise InputError(
@@ -122,17 +132,31 @@ def load_weights(path: str | Path) -> WeightsFile:
             f"{path}: needed format {FORMAT} of weights files, got {metadata['pansplat_format']}; "
             "use the pansplat version that wrote it, or convert the official checkpoint again"
         )
-    try:
-        config, compat = json.loads(metadata["config"]), COMPATS[metadata["compat"]]
-    except (ValueError, KeyError) as error:
-        raise InputError(
-            f"{path}: needed settings in its metadata, got {error}; convert the checkpoint again"
-        ) from error
-    return WeightsFile(metadata["model"], config, compat, tensors)
+    if metadata["compat"] not in COMPATS:
+        needed = " or ".join(COMPATS)
+        raise InputError(f"{path}: needed compat {needed} in its metadata, got {metadata['compat']!r:.60}")
+    config = require_object(parse_json(metadata["config"], f"{path}: config"), f"{path}: config")
+    return WeightsFile(metadata["model"], config, COMPATS[metadata["compat"]], as_float32(tensors, path))
+
+
+def as_float32(tensors: Mapping[str, Tensor], source: object) -> dict[str, Tensor]:
+    """The tensors with all floating-point numbers in float32; networks compute in it, files may be smaller.
+
+    Raises:
+        InputError: a number is not finite.
+    """
+    converted = {}
+    for name, tensor in tensors.items():
+        converted[name] = tensor.float() if tensor.is_floating_point() else tensor
+        if tensor.is_floating_point() and not torch.isfinite(converted[name]).all():
+            raise InputError(f"{source}: needed finite numbers, got NaN or infinity in {name}; use another file")
+    return converted
 
 
 def read_model_name(path: Path) -> str | None:
     """Name of the network in the metadata of a weights file; None if it has none."""
+    if not path.is_file():
+        return None
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             return (file.metadata() or {}).get("model")
@@ -195,10 +219,10 @@ def config_from_dict(kind: type[_T], values: Mapping[str, Any], where: str = "co
     """Restore a nested dataclass from the JSON of its `dataclasses.asdict`.
 
     Raises:
-        InputError: a field is unknown or missing.
+        InputError: a field is unknown or missing, has another type, or is out of range.
     """
     if not (dataclasses.is_dataclass(kind) and isinstance(values, Mapping)):
-        raise InputError(f"{where}: needed settings by name, got {values!r}")
+        raise InputError(f"{where}: needed settings by name, got {values!r:.60}")
     fields = {field.name for field in dataclasses.fields(kind)}
     if fields != values.keys():
         unknown, missing = sorted(values.keys() - fields), sorted(fields - values.keys())
@@ -211,20 +235,50 @@ def config_from_dict(kind: type[_T], values: Mapping[str, Any], where: str = "co
 
 
 def _restore(hint: Any, value: Any, where: str) -> Any:
-    """Restore dataclasses and tuples, which JSON stores as objects and lists."""
+    """The value of a field: dataclasses and tuples, which JSON stores as objects and lists, and checked numbers."""
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return config_from_dict(hint, value, where)
-    if typing.get_origin(hint) is tuple and isinstance(value, list):
+    if typing.get_origin(hint) is tuple:
         inner = typing.get_args(hint)
-        return tuple(_restore(inner[0], item, where) for item in value)
-    if typing.get_origin(hint) is typing.Literal and value not in typing.get_args(hint):
-        raise InputError(f"{where}: needed one of {typing.get_args(hint)}, got {value!r}")
+        count = len(value) if inner[-1] is Ellipsis and isinstance(value, (list, tuple)) else len(inner)
+        if not isinstance(value, (list, tuple)) or len(value) != count or count > _MAX_ITEMS:
+            raise InputError(f"{where}: needed a list of {min(count, _MAX_ITEMS)}, got {value!r:.60}")
+        return tuple(_restore(inner[0], item, f"{where}[{index}]") for index, item in enumerate(value))
+    if typing.get_origin(hint) is typing.Literal:
+        if value not in typing.get_args(hint):
+            raise InputError(f"{where}: needed one of {typing.get_args(hint)}, got {value!r:.60}")
+    elif hint in (int, float):
+        low, high = _LIMITS.get(re.split(r"[.\[]", where.removesuffix("]"))[-1], _DEFAULT_LIMITS)
+        low = low if hint is int else _MIN_FLOAT
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not is_number or (hint is int and not isinstance(value, int)) or not low <= value <= high:
+            kind = "a whole number" if hint is int else "a number"
+            raise InputError(f"{where}: needed {kind} of {low:g} to {high:g}, got {value!r:.60}")
+    elif hint is bool and not isinstance(value, bool):
+        raise InputError(f"{where}: needed true or false, got {value!r:.60}")
     return value
 
 
+def build_on_meta(build: Callable[[], _T], model: str, source: object) -> _T:
+    """Build a network from the settings of a file on the meta device: without memory and without random numbers.
+
+    Raises:
+        InputError: the settings fit no network; layers report this by many kinds of error.
+    """
+    try:
+        with torch.device("meta"):
+            return build()
+    except InputError:
+        raise
+    except Exception as error:
+        cause = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise InputError(f"{source}: needed settings of a {model} network, got '{cause}'; use another file") from error
+
+
 def _require_file(path: Path) -> None:
-    if not path.is_file():
-        raise InputError(f"{path}: needed a file of weights, got {'a folder' if path.exists() else 'no file'}")
+    if not os.path.lexists(path):
+        raise InputError(f"{path}: needed a file of weights, got no file")
+    require_file(path, "a file of weights")
     if path.stat().st_size == 0:
         raise InputError(f"{path}: needed a file of weights, got an empty file; download or copy it again")
 
@@ -353,6 +407,11 @@ def require_shapes(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor]
         f"{name} {tuple(tensors[name].shape)} instead of {tuple(tensor.shape)}"
         for name, tensor in expected.items()
         if name in tensors and tensors[name].shape != tensor.shape
+    ]
+    wrong += [
+        f"{name} of {str(tensors[name].dtype).removeprefix('torch.')}"
+        for name, tensor in expected.items()
+        if name in tensors and tensors[name].is_floating_point() != tensor.is_floating_point()
     ]
     problems = [
         f"{problem} {_join_names(names)}"

@@ -12,11 +12,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pansplat.data.masks import mask_holes
+from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
+from pansplat.geometry.equirect import fit_panoramas
+from pansplat.geometry.world import require_depth_range, scale_poses, working_factor
 from pansplat.predictor import Progress
 from pansplat.sweep.lift import LiftConfig, lift
 from pansplat.sweep.prior import PriorModel
 from pansplat.sweep.search import PosedImages, SearchConfig, search_surfaces
+
+_MIN_HEIGHT = 64  # pixels
+_MULTIPLE = 8  # the levels of the Gaussians divide the height; other heights are resized to the next multiple
 
 
 @dataclass(frozen=True)
@@ -61,7 +67,7 @@ class Sweep:
                 exact black (0, 0, 0), the holes of scans, are masked too.
 
         Raises:
-            ValueError: on wrong shapes, fewer than two views, non-finite values, or near >= far.
+            InputError: wrong shapes, fewer than two views, non-finite values, or near >= far.
         """
         if images.ndim == 5:
             item_masks = [None] * len(images) if masks is None else masks
@@ -84,6 +90,9 @@ class Sweep:
     ) -> Gaussians:
         low, high = float(torch.as_tensor(near).min()), float(torch.as_tensor(far).max())
         _check_inputs(images, cam2world, low, high, masks)
+        factor = working_factor(low)
+        low, high, cam2world = low * factor, high * factor, scale_poses(cam2world, factor)
+        images, masks = fit_panoramas(images, masks, _MULTIPLE)
         posed = PosedImages(
             images=np.ascontiguousarray(images.detach().cpu().float().permute(0, 2, 3, 1).numpy()),
             cam2world=cam2world.detach().cpu().double().numpy(),
@@ -96,7 +105,7 @@ class Sweep:
         report("placing Gaussians", 0.85)
         gaussians = lift(posed, surfaces, self.config.lift)
         report("done", 1.0)
-        return gaussians.to(device=images.device)
+        return gaussians.scaled(1 / factor).to(device=images.device)
 
 
 def _select_item(value: float | Tensor, n: int) -> float | Tensor:
@@ -106,20 +115,19 @@ def _select_item(value: float | Tensor, n: int) -> float | Tensor:
 def _check_inputs(images: Tensor, cam2world: Tensor, near: float, far: float, masks: Tensor | None) -> None:
     shape = tuple(images.shape)
     if images.ndim != 4 or shape[0] < 2 or shape[1] != 3 or shape[3] != 2 * shape[2]:
-        raise ValueError(
+        raise InputError(
             f"`images` must be (view, 3, height, 2 * height) of at least two panoramas, got {shape}; "
             "stack RGB equirectangular images of one size"
         )
-    if shape[2] < 64 or shape[2] % 8:
-        raise ValueError(f"`images` must be at least 64 pixels high and a multiple of 8, got {shape[2]}; resize them")
+    if shape[2] < _MIN_HEIGHT:
+        raise InputError(f"`images` must be at least {_MIN_HEIGHT} pixels high, got {shape[2]}; resize them")
     if tuple(cam2world.shape) != (shape[0], 4, 4):
-        raise ValueError(f"`cam2world` must be ({shape[0]}, 4, 4) to fit the images, got {tuple(cam2world.shape)}")
+        raise InputError(f"`cam2world` must be ({shape[0]}, 4, 4) to fit the images, got {tuple(cam2world.shape)}")
     if masks is not None and tuple(masks.shape) != (shape[0], *shape[2:]):
-        raise ValueError(f"`masks` must be {(shape[0], *shape[2:])} to fit the images, got {tuple(masks.shape)}")
+        raise InputError(f"`masks` must be {(shape[0], *shape[2:])} to fit the images, got {tuple(masks.shape)}")
     if not (torch.isfinite(images).all() and torch.isfinite(cam2world).all()):
-        raise ValueError("`images` and `cam2world` must be finite, got NaN or infinity; clean the input first")
-    if not 0 < near < far < float("inf"):
-        raise ValueError(f"`near` and `far` must satisfy 0 < near < far, got {near} and {far} (metres)")
+        raise InputError("`images` and `cam2world` must be finite, got NaN or infinity; clean the input first")
+    require_depth_range(near, far, "`near` and `far`")
 
 
 def _compute_fingerprint(config: SweepConfig) -> str:

@@ -6,14 +6,14 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
-from pansplat.console import own_warnings, run_command
+from pansplat.console import exit_process, own_warnings, parse_arguments, run_command
 
 if TYPE_CHECKING:
     from pansplat.training.config import TrainConfig
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Train and return the exit status: 0 done, 2 invalid input, 130 stopped and saved."""
+    """Train and return the exit status: 0 done, 2 invalid input, 130 or 143 stopped by a signal and saved."""
     return run_command(
         lambda: _train(parse(argv)),
         memory_advice="choose lower --heights, a smaller --optimizer.batch-size, or --memory.backpropagation two-step "
@@ -23,13 +23,17 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 
 def _train(config: TrainConfig) -> int:
+    from pansplat.files import require_output_folder
     from pansplat.training.distributed import ProcessGroup
     from pansplat.training.trainer import Trainer
 
+    config.check()
+    require_output_folder("--out", config.out)
     processes = ProcessGroup()
     with own_warnings():
         try:
-            return 0 if Trainer(config, processes).train() else 130
+            trainer = Trainer(config, processes)
+            return 0 if trainer.train() else 128 + trainer.stopped_by
         finally:
             processes.destroy()
 
@@ -40,12 +44,14 @@ def parse(argv: Sequence[str] | None = None) -> TrainConfig:
 
     from pansplat.training.config import PRESETS
 
-    return tyro.extras.overridable_config_cli(
-        PRESETS,
-        args=argv,
-        prog="pansplat-train",
-        description="Train a network. Run the same command again to resume a stopped run.",
-        config=(tyro.conf.FlagCreatePairsOff,),
+    return parse_arguments(
+        lambda: tyro.extras.overridable_config_cli(
+            PRESETS,
+            args=argv,
+            prog="pansplat-train",
+            description="Train a network. Run the same command again to resume a stopped run.",
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
     )
 
 
@@ -56,7 +62,7 @@ def main() -> NoReturn:
         from pansplat.training.distributed import end_process
 
         end_process(status)
-    sys.exit(status)
+    exit_process(status)
 
 
 if __name__ == "__main__":

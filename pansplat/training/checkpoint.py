@@ -5,22 +5,32 @@ A checkpoint holds tensors and plain values only. It is loaded without executing
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from pansplat.atomic import replacing
-from pansplat.errors import InputError
-from pansplat.model.weights import COMPATS, UnsafeCheckpointError, WeightsFile, read_checkpoint
+from pansplat.errors import InputError, InputWarning
+from pansplat.model.weights import COMPATS, UnsafeCheckpointError, WeightsFile, as_float32, read_checkpoint
+from pansplat.strict_json import parse_json, require_object
 
 _KIND, _FORMAT = "pansplat-training", 1
 _NAME = re.compile(r"step_(\d{8})\.pt")
+_MAX_STEP = 10**9
+_TYPES: dict[str, tuple[type, ...]] = {
+    "step": (int,), "config": (str,), "weights": (str,), "network": (dict,), "auxiliary": (dict, type(None)),
+    "mean": (dict, type(None)), "optimizer": (dict,), "random": (torch.Tensor,),
+}  # fmt: skip
+_NEEDED = dict.fromkeys(_TYPES, "tensors by name") | {
+    "step": "a whole number", "config": "JSON text", "weights": "JSON text", "optimizer": "the state of the optimiser",
+    "random": "a tensor",
+}  # fmt: skip
 
 
 def save_checkpoint(folder: Path, step: int, state: Mapping[str, Any], *, keep: int) -> Path:
@@ -33,14 +43,10 @@ def save_checkpoint(folder: Path, step: int, state: Mapping[str, Any], *, keep: 
     """
     path = folder / f"step_{step:08d}.pt"
     folder.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as partial:
-        try:
-            with open(partial, "wb") as file:
-                torch.save({"kind": _KIND, "format": _FORMAT, "step": step, **state}, file)
-                file.flush()
-                os.fsync(file.fileno())
-        except RuntimeError as error:  # raised by torch when the disk is full
-            raise OSError(0, str(error).splitlines()[0]) from error
+    with replacing(path, failures=(RuntimeError,)) as partial, open(partial, "wb") as file:  # torch's error: disk full
+        torch.save({"kind": _KIND, "format": _FORMAT, "step": step, **state}, file)
+        file.flush()
+        os.fsync(file.fileno())
     for old in list_checkpoints(folder)[:-keep]:
         old.unlink(missing_ok=True)
     return path
@@ -53,30 +59,65 @@ def list_checkpoints(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if _NAME.fullmatch(path.name))
 
 
-def load_latest(folder: Path) -> tuple[Path, dict[str, Any]] | None:
-    """Path and content of the newest readable checkpoint; None if there are no checkpoints.
+class DamagedCheckpointError(InputError):
+    """A checkpoint lacks a key, or has a value that does not fit the run."""
 
-    Deletes incomplete files. Skips damaged checkpoints with a warning.
+
+@contextmanager
+def restoring(key: str) -> Iterator[None]:
+    """Turn the errors that a damaged value causes in the block into an error that names its key.
+
+    Raises:
+        DamagedCheckpointError: the block raised an error of a value.
+    """
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, IndexError, OverflowError) as error:
+        cause = "it is missing" if isinstance(error, KeyError) and error.args == (key,) else str(error).splitlines()[0]
+        raise DamagedCheckpointError(f"this checkpoint is damaged: key `{key}`: {cause}") from error
+
+
+def load_latest(
+    folder: Path, restore: Callable[[Path, dict[str, Any]], None] | None = None
+) -> tuple[Path, dict[str, Any]] | None:
+    """Path and content of the newest usable checkpoint; None if there are no checkpoints.
+
+    Deletes incomplete files. Skips damaged checkpoints with a warning that names the previous one, which is used.
+
+    Args:
+        restore: restores a run from a path and its content; a `DamagedCheckpointError` skips the checkpoint.
 
     Raises:
         UnsafeCheckpointError: a checkpoint contains code.
-        InputError: no checkpoint is readable.
+        InputError: no checkpoint is usable, or `restore` refused one for another reason.
     """
     if folder.is_dir():
         for partial in folder.glob(".step_*.pt"):
             partial.unlink(missing_ok=True)
     found = list_checkpoints(folder)
     failures = []
-    for path in reversed(found):
+    for index, path in reversed(list(enumerate(found))):
         try:
-            return path, load_checkpoint(path)
+            content = load_checkpoint(path)
         except UnsafeCheckpointError:
             raise
         except InputError as error:
-            failures.append(str(error))
-            warnings.warn(f"skipped a checkpoint: {error}", stacklevel=2)
+            problem = str(error)
+        else:
+            try:
+                if restore is not None:
+                    restore(path, content)
+                return path, content
+            except DamagedCheckpointError as error:
+                problem = f"{path}: {error}"
+        failures.append(problem)
+        previous = f"the previous one is {found[index - 1]}" if index else "there is no previous one"
+        warnings.warn(f"skipped a checkpoint: {problem}; {previous}", InputWarning, stacklevel=2)
     if failures:
-        raise InputError(f"{folder}: needed a readable checkpoint, got none:\n  " + "\n  ".join(failures))
+        raise InputError(
+            f"{folder}: needed a readable checkpoint, got none: {'; '.join(failures)}; give another --out, or delete "
+            "this folder to start again"
+        )
     return None
 
 
@@ -89,17 +130,54 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     content = read_checkpoint(path)
     if not is_training_state(content):
         raise InputError(f"{path}: needed a checkpoint of pansplat-train, got another file; give it as --network.init.")
-    if content.get("format") != _FORMAT:
+    if not isinstance(content.get("format"), int) or content["format"] != _FORMAT:
         raise InputError(
-            f"{path}: needed format {_FORMAT} of training checkpoints, got {content.get('format')}; use the pansplat "
-            "version that wrote it."
+            f"{path}: needed format {_FORMAT} of training checkpoints, got {content.get('format')!s:.20}; use the "
+            "pansplat version that wrote it."
         )
+    try:
+        _check_types(content)
+    except DamagedCheckpointError as error:
+        raise InputError(f"{path}: {error}") from error
     return content
+
+
+def _check_types(content: Mapping[str, Any]) -> None:
+    """Check the types of the keys that a checkpoint has.
+
+    Raises:
+        DamagedCheckpointError: a value has another type.
+    """
+    for key, kinds in _TYPES.items():
+        if key in content and (not isinstance(content[key], kinds) or isinstance(content[key], bool)):
+            got = type(content[key]).__name__
+            raise DamagedCheckpointError(f"this checkpoint is damaged: key `{key}`: needed {_NEEDED[key]}, got {got}")
+    for key in ("network", "mean", "auxiliary"):
+        odd = [name for name, value in (content.get(key) or {}).items() if not isinstance(value, torch.Tensor)]
+        if odd:
+            raise DamagedCheckpointError(f"this checkpoint is damaged: key `{key}`: {odd[0]!s:.60} is not a tensor")
+    if not 0 <= content.get("step", 0) < _MAX_STEP:
+        raise DamagedCheckpointError(f"this checkpoint is damaged: key `step`: got {content['step']!s:.20}")
+
+
+def restore_optimizer(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
+    """Restore an optimiser.
+
+    Raises:
+        DamagedCheckpointError: the state is not that of the optimiser's parameters.
+    """
+    with restoring("optimizer"):
+        optimizer.load_state_dict(state)
+        for parameter, values in optimizer.state.items():
+            for name in ("exp_avg", "exp_avg_sq"):
+                if values[name].shape != parameter.shape:
+                    raise ValueError(f"{name} has the shape {tuple(values[name].shape)}")
 
 
 def is_training_state(content: Mapping[str, Any]) -> bool:
     """Whether the content of a file is that of a training checkpoint."""
-    return content.get("kind") == _KIND
+    kind = content.get("kind")
+    return isinstance(kind, str) and kind == _KIND
 
 
 def extract_weights(content: Mapping[str, Any], path: Path) -> WeightsFile:
@@ -109,8 +187,9 @@ def extract_weights(content: Mapping[str, Any], path: Path) -> WeightsFile:
         InputError: weights are missing or invalid.
     """
     try:
-        header = json.loads(content["weights"])
+        header = require_object(parse_json(content["weights"], f"{path}: weights"), f"{path}: weights")
         tensors = content["mean"] if content.get("mean") else content["network"]
-        return WeightsFile(header["model"], header["config"], COMPATS[header["compat"]], dict(tensors))
-    except (KeyError, TypeError, ValueError) as error:
+        compat, config = COMPATS[header["compat"]], require_object(header["config"], f"{path}: config")
+        return WeightsFile(str(header["model"]), config, compat, as_float32(tensors, path))
+    except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: needed weights in the checkpoint, got {error!r}; use another file.") from error

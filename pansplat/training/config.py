@@ -7,11 +7,23 @@ import json
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pansplat.data.augment import Augmentation
 from pansplat.errors import InputError
 from pansplat.model.layers import Compat, Precision
+from pansplat.options import (
+    REAL,
+    WHOLE,
+    Count,
+    CountOrNone,
+    Fraction,
+    Minutes,
+    Range,
+    Seed,
+    check_numbers,
+)
+from pansplat.strict_json import parse_json, require_object
 from pansplat.training.losses import CODE, LossWeights, PerceptualName
 
 DataKind = Literal["generated", "panogrf", "360loc", "insta360", "pairs", "triplets"]
@@ -33,11 +45,11 @@ class DataConfig:
     """Folder of the data; not used for generated."""
     validation_root: Path | None = None
     """Folder of the validation data of insta360, pairs and triplets; the same by default."""
-    draws: int = 1000
+    draws: Count = 1000
     """Random pairs per sequence and epoch, of 360loc and insta360."""
     training_gap: Literal["uniform", "original"] = "uniform"
     """Frames between the inputs: uniformly random, or always the smallest gap, as in the official code."""
-    workers: int = 2
+    workers: Annotated[int, Range(0, 256), WHOLE] = 2
     """Processes that read data; 0 to read in the training process."""
     augmentation: Augmentation | None = field(default_factory=Augmentation)
     """Random changes of samples; the official code has none."""
@@ -69,7 +81,7 @@ class MemoryConfig:
 
     backpropagation: Backpropagation = "plain"
     """plain: one graph. one-step: the heads tile by tile. two-step: the image face by face too."""
-    tiles: int = 1
+    tiles: Annotated[int, Range(1, 64), WHOLE] = 1
     """Number of tiles along each side of the panorama."""
     style: Style = "panorama"
     """panorama: one ray per pixel. cubemap: six cube faces. original: six cube faces as in the official code."""
@@ -81,16 +93,16 @@ class MemoryConfig:
 class OptimizerConfig:
     """Optimisation of the weights."""
 
-    steps: int = 1000
-    batch_size: int = 2
+    steps: Count = 1000
+    batch_size: Annotated[int, Range(1, 4096), WHOLE] = 2
     """Samples per step, process and round of accumulation."""
-    accumulate: int = 1
+    accumulate: Annotated[int, Range(1, 4096), WHOLE] = 1
     """Rounds of gradient accumulation per step."""
-    rate: float = 2e-4
+    rate: Annotated[float, Range(0, 1e3, above=True), REAL] = 2e-4
     """Peak learning rate of Adam."""
-    clip: float = 0.5
+    clip: Annotated[float, Range(0, math.inf, above=True), REAL] = 0.5
     """Largest norm of the gradient."""
-    ema: float = 0.0
+    ema: Fraction = 0.0
     """Decay of the exponential moving average of the weights, which is validated and saved; 0 for none."""
 
 
@@ -98,11 +110,11 @@ class OptimizerConfig:
 class ValidationConfig:
     """Validation during training."""
 
-    every: int = 1000
+    every: CountOrNone = 1000
     """Steps; 0 for never."""
-    samples: int = 16
+    samples: Count = 16
     """Samples per validation, always the same ones."""
-    pictures: int = 2
+    pictures: CountOrNone = 2
     """Images written as PNG per validation: the target above, the rendering below."""
 
 
@@ -110,11 +122,11 @@ class ValidationConfig:
 class CheckpointConfig:
     """Checkpoints on disk."""
 
-    every: int = 1000
+    every: CountOrNone = 1000
     """Steps; 0 for the last step only."""
-    minutes: float = 10.0
+    minutes: Minutes = 10.0
     """Also after this number of minutes; infinity for never."""
-    keep: int = 2
+    keep: Count = 2
     """Number of checkpoints to keep."""
 
 
@@ -124,9 +136,9 @@ class TrainConfig:
 
     out: Path = Path("runs/run")
     """Folder of the run; training is resumed from its latest checkpoint."""
-    heights: tuple[int, ...] = (512,)
+    heights: tuple[Annotated[int, Range(64, 8192, "pixels", multiple=32), WHOLE], ...] = (512,)
     """Heights of the panoramas, pixels; each is used for an equal number of steps (progressive resolution)."""
-    seed: int = 111123
+    seed: Seed = 111123
     perceptual: PerceptualName = "auto"
     """auto: LPIPS if its files are available, else a distance without weights."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -149,23 +161,9 @@ class TrainConfig:
         Raises:
             InputError: a setting out of range, or settings that contradict each other.
         """
-        o = self.optimizer
-        wrong = [
-            (o.steps < 1, "--optimizer.steps must be at least 1", o.steps),
-            (o.batch_size < 1, "--optimizer.batch-size must be at least 1", o.batch_size),
-            (o.accumulate < 1, "--optimizer.accumulate must be at least 1", o.accumulate),
-            (not 0 < o.rate < math.inf, "--optimizer.rate must be positive", o.rate),
-            (not o.clip > 0, "--optimizer.clip must be positive", o.clip),
-            (not 0 <= o.ema < 1, "--optimizer.ema must be at least 0 and below 1", o.ema),
-            (not self.heights or min(self.heights) < 64, "--heights must be 64 pixels or more", self.heights),
-            (self.memory.tiles < 1, "--memory.tiles must be at least 1", self.memory.tiles),
-            (self.checkpoint.keep < 1, "--checkpoint.keep must be at least 1", self.checkpoint.keep),
-            (self.checkpoint.every < 0, "--checkpoint.every must not be negative", self.checkpoint.every),
-            (self.validation.every < 0, "--validation.every must not be negative", self.validation.every),
-        ]
-        for is_wrong, needed, got in wrong:
-            if is_wrong:
-                raise InputError(f"{needed}, got {got}.")
+        check_numbers(self, prefixed=True)
+        if not self.heights:
+            raise InputError("--heights must be at least one height, got none.")
         if self.data.kind != "generated" and self.data.root is None:
             raise InputError(
                 f"--data.kind {self.data.kind} needs --data.root, the folder that holds the data, got none."
@@ -195,11 +193,12 @@ def require_same(saved: str, config: TrainConfig, source: Path) -> None:
     Raises:
         InputError: settings differ; the message names them.
     """
-    old, new = json.loads(saved), json.loads(as_json(config))
+    where = f"{source}: config"
+    old, new = require_object(parse_json(saved, where), where), json.loads(as_json(config))
     for settings in (old, new):
         for name in _CHANGEABLE:
             settings.pop(name, None)
-        settings.get("data", {}).pop("workers", None)
+        require_object(settings.get("data", {}), f"{where}.data").pop("workers", None)
     changed = _differences(old, new)
     if changed:
         raise InputError(

@@ -11,11 +11,11 @@ import dataclasses
 import json
 import math
 import signal
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,12 +23,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from pansplat.console import own_warnings, run_command
+from pansplat.console import exit_process, own_warnings, parse_arguments, run_command
 from pansplat.data.augment import mirror_views, roll_views
 from pansplat.data.generated.camera import photograph
 from pansplat.data.generated.shards import ShardReader, Tour
 from pansplat.data.views import Views
 from pansplat.errors import InputError
+from pansplat.files import require_output_folder
 from pansplat.geometry.equirect import row_weights
 from pansplat.guided_sweep import save_depth_network
 from pansplat.model.depth_network import DepthEstimate
@@ -36,7 +37,14 @@ from pansplat.model.depth_refinement import DepthRefinement, RefinementConfig
 from pansplat.model.efficientnet import load_imagenet_weights
 from pansplat.model.layers import to_channels_last
 from pansplat.model.weights import load_weights
-from pansplat.training.checkpoint import load_checkpoint, load_latest, save_checkpoint
+from pansplat.training.checkpoint import (
+    list_checkpoints,
+    load_checkpoint,
+    load_latest,
+    restore_optimizer,
+    restoring,
+    save_checkpoint,
+)
 from pansplat.training.logs import CsvTable, ProgressDisplay
 from pansplat.training.optimization import ExponentialMovingAverage
 
@@ -233,7 +241,7 @@ class DepthTrainer:
         self.device = torch.device(config.device)
         self.network = DepthRefinement(config.network)
         self.step = 0
-        latest = load_latest(config.out / "checkpoints")
+        latest = next(iter(list_checkpoints(config.out / "checkpoints")), None)
         if latest is None:
             self.network.mono.encoder.load_imagenet(load_imagenet_weights())
         if latest is None and config.init is not None:
@@ -249,13 +257,21 @@ class DepthTrainer:
             weight_decay=config.weight_decay,
         )
         self.average = ExponentialMovingAverage(self.network, config.ema)
-        if latest is not None:
-            state = latest[1]
-            self.step = state["step"]
+        load_latest(config.out / "checkpoints", self._restore)
+        self._stop, self.stopped_by = False, signal.SIGINT
+
+    def _restore(self, path: Path, state: dict[str, Any]) -> None:
+        """Restore the run from a checkpoint; a DamagedCheckpointError if it does not fit."""
+        with restoring("step"):
+            step = state["step"]
+        with restoring("network"):
             self.network.load_state_dict(state["network"])
+        with restoring("mean"):
             self.average.load(state["mean"])
-            self.optimizer.load_state_dict(state["optimizer"])
-        self._stop = False
+        with restoring("optimizer"):
+            optimizer = state["optimizer"]
+        restore_optimizer(self.optimizer, optimizer)
+        self.step = step
 
     def train(self) -> bool:
         """Train the remaining steps. Returns whether all were done."""
@@ -275,7 +291,7 @@ class DepthTrainer:
                     progress.update(self.step, values["loss"], values["seconds"])
                     now = time.monotonic()
                     if config.stop_after_minutes and now - began > 60 * config.stop_after_minutes:
-                        self._stop = True
+                        self._stop, self.stopped_by = True, number
                     if config.validation is not None and self.step % config.validate_every == 0:
                         measures = self.validate()
                         scores.add(self.step, measures)
@@ -321,7 +337,7 @@ class DepthTrainer:
         return sums
 
     def _request_stop(self, number: int, frame: object) -> None:
-        self._stop = True
+        self._stop, self.stopped_by = True, number
 
     def _learning_rate_factor(self) -> float:
         rise = min(1.0, (self.step + 1) / max(1, self.config.warm_up))
@@ -381,13 +397,16 @@ def main() -> None:
     """Run the command line and exit."""
     import tyro
 
-    config = tyro.cli(DepthTrainConfig)
-
     def train() -> int:
+        config = parse_arguments(lambda: tyro.cli(DepthTrainConfig))
+        require_output_folder("--out", config.out)
         with own_warnings():
-            return 0 if DepthTrainer(config).train() else 130
+            trainer = DepthTrainer(config)
+            return 0 if trainer.train() else 128 + trainer.stopped_by
 
-    sys.exit(run_command(train, memory_advice="choose fewer --pairs.", interruption="run the command again to resume"))
+    exit_process(
+        run_command(train, memory_advice="choose fewer --pairs.", interruption="run the command again to resume")
+    )
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Annotated, Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,6 +20,7 @@ from torch.nn import functional
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Backbone, find_backbone, load_lpips
 from pansplat.geometry.equirect import pad_equirect, row_weights
+from pansplat.options import REAL, Range, Weight
 
 DepthForm = Literal["depth", "inverse_depth"]
 Images = Float[Tensor, "batch 3 height width"]
@@ -30,16 +31,16 @@ PixelWeights = Float[Tensor, "batch height width"]
 class LossWeights:
     """Weights of the loss terms."""
 
-    square: float = 1.0
+    square: Weight = 1.0
     """Weight of the mean squared error of the colours."""
-    perceptual: float = 0.1
+    perceptual: Weight = 0.1
     """Weight of LPIPS, or of its substitute (lambda in the paper)."""
-    depth: float = 0.05
+    depth: Weight = 0.05
     """Weight of the depth loss, for data with true depth (alpha in the paper)."""
     depth_form: DepthForm = "depth"
     """depth: absolute error in metres, with the true depth resized to each level (the paper). inverse_depth: absolute
     error in 1 / metres, with each level resized to the true depth (the official code)."""
-    decay: float = 0.9
+    decay: Annotated[float, Range(0, 1), REAL] = 0.9
     """Weight of a level of the cost volume relative to the next finer one (gamma in the paper)."""
 
 
@@ -106,7 +107,7 @@ def depth_loss(
     far: float | Float[Tensor, "batch view"],
     *,
     form: DepthForm = "depth",
-    decay: float = 0.9,
+    decay: Annotated[float, Range(0, 1), REAL] = 0.9,
     masks: Bool[Tensor, "batch view height width"] | None = None,
     spherical: bool = False,
 ) -> Float[Tensor, ""]:

@@ -58,4 +58,6 @@ class ExponentialMovingAverage:
     def load(self, state: dict[str, Tensor]) -> None:
         """Restore a saved state."""
         for name, average in self.state.items():
+            if state[name].shape != average.shape:
+                raise ValueError(f"{name} has the shape {tuple(state[name].shape)}, not {tuple(average.shape)}")
             average.copy_(state[name])

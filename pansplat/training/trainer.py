@@ -24,7 +24,8 @@ from pansplat.data.views import Batch
 from pansplat.errors import InputError
 from pansplat.model.mvsplat import MVSplat
 from pansplat.model.weights import pack_weights
-from pansplat.training.checkpoint import load_latest, save_checkpoint
+from pansplat.strict_json import parse_json, require_object
+from pansplat.training.checkpoint import load_latest, restore_optimizer, restoring, save_checkpoint
 from pansplat.training.config import TrainConfig, as_json, require_same
 from pansplat.training.datasets import load_sources
 from pansplat.training.distributed import ProcessGroup, convert_sync_batch_norm, data_parallel
@@ -89,9 +90,6 @@ class Trainer:
         self.device = self.processes.device(config.device)
         self.processes.initialize(self.device)
         self.folder = config.out / "checkpoints"
-        latest = load_latest(self.folder)
-        if latest is not None:
-            require_same(latest[1]["config"], config, latest[0])
         self.network = build_network(config.network, config.seed).to(self.device)
         convert_sync_batch_norm(self.network, self.processes)
         self.auxiliary = build_auxiliary_heads(self.network).to(self.device) if config.network.auxiliary else None
@@ -101,12 +99,11 @@ class Trainer:
         perceptual = choose_perceptual(config.perceptual, device=self.device)
         training_step = TrainingStep(self.network, self.auxiliary, perceptual, config.loss, config.memory)
         self.perceptual_name = getattr(perceptual, "name", "none")
-        self.step, self.resumed_from = 0, None
-        if latest is not None:
-            self._restore(latest[1])
-            self.resumed_from = latest[0]
+        self.step = 0
+        latest = load_latest(self.folder, self._restore)
+        self.resumed_from = None if latest is None else latest[0]
         self._training_step = data_parallel(training_step, self.processes)
-        self._stop = False
+        self._stop, self.stopped_by = False, signal.SIGINT  # number of the signal
 
     def train(self) -> bool:
         """Train the remaining steps. Returns whether all were done (False: stopped by a signal).
@@ -202,7 +199,7 @@ class Trainer:
         path = self.config.out / f"not_finite_{self.step:08d}_{self.processes.rank}.pt"
         self.config.out.mkdir(parents=True, exist_ok=True)
         fields = [{**vars(batch), "names": list(batch.names)} for batch in batches]
-        with replacing(path) as partial:
+        with replacing(path, failures=(RuntimeError,)) as partial:
             torch.save({"step": self.step, "batches": fields, "network": self.network.state_dict()}, partial)
         names = ", ".join(name for batch in batches for name in batch.names)
         raise InputError(
@@ -270,15 +267,32 @@ class Trainer:
             "random": torch.get_rng_state(),
         }
 
-    def _restore(self, state: dict[str, Any]) -> None:
-        self.step = state["step"]
-        self.network.load_state_dict(state["network"])
+    def _restore(self, path: Path, state: dict[str, Any]) -> None:
+        """Restore the run from a checkpoint.
+
+        Raises:
+            DamagedCheckpointError: a key is missing or does not fit.
+            InputError: the run was started with other settings.
+        """
+        with restoring("config"):
+            require_object(parse_json(state["config"], "config"), "config")
+        require_same(state["config"], self.config, path)
+        with restoring("step"):
+            step = state["step"]
+        with restoring("network"):
+            self.network.load_state_dict(state["network"])
         if self.auxiliary is not None:
-            self.auxiliary.load_state_dict(state["auxiliary"])
+            with restoring("auxiliary"):
+                self.auxiliary.load_state_dict(state["auxiliary"])
         if self.average is not None:
-            self.average.load(state["mean"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        torch.set_rng_state(state["random"])
+            with restoring("mean"):
+                self.average.load(state["mean"])
+        with restoring("optimizer"):
+            optimizer = state["optimizer"]
+        restore_optimizer(self.optimizer, optimizer)
+        with restoring("random"):
+            torch.set_rng_state(state["random"])
+        self.step = step
 
     def _describe(self) -> str:
         count = sum(p.numel() for p in trainable_parameters(self.network, self.auxiliary))
@@ -296,7 +310,7 @@ class Trainer:
         def handle(number: int, _: object) -> None:
             if self._stop:
                 raise KeyboardInterrupt
-            self._stop = True
+            self._stop, self.stopped_by = True, number
             progress.print("stopping after this step; press Ctrl-C again to stop at once")
 
         signals = (signal.SIGINT, signal.SIGTERM)

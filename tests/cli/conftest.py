@@ -15,17 +15,18 @@ from pansplat.cli import run
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import pixel_directions
 
-HEIGHT = 16
+HEIGHT = 64
 
 
 class Sphere:
-    """A predictor of one Gaussian per pixel on a sphere of 2 m around each camera."""
+    """A predictor of Gaussians on a sphere of 2 m around each camera, one per pixel of the image at 16 rows."""
 
     name, fingerprint = "sphere", "1"
 
     def __call__(self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None, progress=None):
         if progress is not None:
             progress("predicting", 0.5)
+        images = images[..., :: images.shape[-2] // 16, :: images.shape[-2] // 16]
         view, _, height, width = images.shape
         directions = pixel_directions(height, width, dtype=torch.float64).reshape(-1, 3)
         count = view * len(directions)

@@ -112,5 +112,5 @@ def test_a_truncated_checkpoint_is_refused(conversion: tuple[Path, Path, str], t
 
 
 def test_other_outputs_are_refused(conversion: tuple[Path, Path, str], tmp_path: Path, refusal) -> None:
-    assert "--out must be a .safetensors" in refusal("convert", conversion[0], "-o", tmp_path / "m.ckpt")
+    assert "--out must end in .safetensors" in refusal("convert", conversion[0], "-o", tmp_path / "m.ckpt")
     assert "existing folder" in refusal("convert", conversion[0], "-o", tmp_path / "no" / "m.safetensors")

@@ -10,7 +10,7 @@ from PIL import Image
 from pansplat import pipeline
 from pansplat.cli import run
 
-HEIGHT = 32
+HEIGHT = 64
 
 
 @pytest.fixture(autouse=True)
@@ -22,7 +22,7 @@ def no_lpips_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_evaluate_writes_results_and_prints_the_table(room: Path, tmp_path: Path, write_room, capsys) -> None:
     write_room(tmp_path / "alone", target=False)
     start = ["evaluate", str(room), str(tmp_path / "alone"), "--out", str(tmp_path / "out"), "--model", "sphere"]
-    assert run([*start, "--height", "16"]) == 0
+    assert run([*start, "--height", "64"]) == 0
     out, err = capsys.readouterr()
     assert "WS-PSNR" in out and "cross-fade" in out and "room" in out
     assert "alone: none of its 1 pairs has a target view; skipped" in err
@@ -80,7 +80,7 @@ def test_each_model_has_a_row(data: Path, tmp_path: Path, sphere_model: type, mo
     [
         (["--near", "1"], "--near is set by the protocol"),
         (["--blend", "view0"], "--blend must be joint or deferred with --protocol"),
-        (["--limit", "0"], "--limit must be at least 1"),
+        (["--limit", "0"], "--limit must be a whole number of 1"),
         (["--models", "sphere"], "must have distinct names"),
         (["--lpips", "vgg"], "LPIPS with vgg needed vgg16-397923af.pth"),
         (["--protocol", "360loc"], "360Loc: needed"),

@@ -79,10 +79,25 @@ def test_too_little_memory_is_one_line(predict, fail, tmp_path: Path, capsys, er
     assert not list(tmp_path.glob("*.ply"))
 
 
-def test_defects_keep_their_traceback(predict, fail) -> None:
+def test_a_defect_is_one_line_with_a_log_of_its_traceback(
+    predict, fail, capsys, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     fail(RuntimeError("a defect"))
-    with pytest.raises(RuntimeError, match="a defect"):
-        predict()
+    assert predict() == 70
+    message = capsys.readouterr().err
+    assert message.startswith("error: internal error (RuntimeError: a defect), please report it with the log /")
+    assert message.count("\n") == 1
+    log = Path(message.split("the log ")[1].split(";")[0])
+    assert "RuntimeError: a defect" in log.read_text() and "Traceback" in log.read_text()
+
+
+def test_debugging_shows_the_traceback(predict, fail, capsys, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PANSPLAT_DEBUG", "1")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    fail(RuntimeError("a defect"))
+    assert predict() == 70
+    assert "Traceback" in capsys.readouterr().err
 
 
 def test_warning_filters_are_restored_after_a_command(scene: Path) -> None:

@@ -17,15 +17,15 @@ def test_predict_writes_the_scene(scene: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["-o", "scene.splat"], "--out must be a .ply"),
+        (["-o", "scene.splat"], "--out must end in .ply"),
         (["-o", "no/scene.ply"], "existing folder"),
         (["--height", "7"], "--height"),
         (["--model", "magic"], "must be one of default, sphere, sweep"),
         (["--near", "9", "--far", "3"], "0 < near < far"),
         (["--convention", "sideways"], "needed a known pose convention"),
         (["--precision", "bfloat16"], "`precision` is for networks, and sphere is not one"),
-        (["--degree", "5"], "--degree must be 0 to 4, got 5"),
-        (["--min-opacity", "1"], "--min-opacity must be at least 0 and less than 1"),
+        (["--degree", "5"], "--degree must be a whole number of 0 to 4, got 5"),
+        (["--min-opacity", "1"], "--min-opacity must be a number from 0 below 1"),
     ],
 )
 def test_invalid_arguments_are_refused_before_the_prediction(
@@ -39,7 +39,7 @@ def test_invalid_arguments_are_refused_before_the_prediction(
 def test_the_named_pair_of_a_folder_is_predicted_or_the_first(tmp_path: Path, write_room, refusal, capsys) -> None:
     for name in ("hall", "kitchen"):
         write_room(tmp_path / "pairs" / name)
-    start = ["predict", str(tmp_path / "pairs"), "-o", str(tmp_path / "s.ply"), "--model", "sphere", "--height", "16"]
+    start = ["predict", str(tmp_path / "pairs"), "-o", str(tmp_path / "s.ply"), "--model", "sphere", "--height", "64"]
     assert run(start) == 0
     assert "holds 2 pairs, using the first (--pair takes: 1: hall, 2: kitchen)" in capsys.readouterr().err
     for choice in ("kitchen", "2"):

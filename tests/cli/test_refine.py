@@ -11,7 +11,7 @@ from pansplat import pipeline
 from pansplat.cli import refine as refine_command
 from pansplat.cli import run
 
-HEIGHT = 16
+HEIGHT = 64
 
 
 def refine(path: Path, out: Path, *arguments: object) -> int:
@@ -67,10 +67,10 @@ def test_ctrl_c_ends_the_refinement_and_writes_the_scene(room: Path, tmp_path: P
     ("arguments", "message"),
     [
         (["--seconds", 1], "--seconds and --steps both"),
-        (["--gaussians", 0], "at least 1"),
+        (["--gaussians", 0], "--gaussians must be a whole number of 1"),
         (["--photographs", "elsewhere"], "--photographs is for a .ply scene"),
-        (["--report", "report.txt"], "--report must be a .json file"),
-        (["--height", 7], "--height must be an even number"),
+        (["--report", "report.txt"], "--report must end in .json"),
+        (["--height", 7], "--height must be a whole number"),
     ],
 )
 def test_invalid_arguments_are_refused(room: Path, tmp_path: Path, refusal, arguments: list, message: str) -> None:
@@ -87,4 +87,4 @@ def test_a_scene_needs_the_photographs_of_its_own_pair(scene: Path, tmp_path: Pa
     (tmp_path / "other" / "poses.json").write_text(json.dumps(poses))
     message = refusal("refine", scene, "-o", tmp_path / "x.ply", "--photographs", tmp_path / "other")
     assert "differ by up to 1" in message
-    assert "must be a .ply file" in refusal("refine", scene, "-o", tmp_path / "x.png", "--photographs", tmp_path)
+    assert "must end in .ply" in refusal("refine", scene, "-o", tmp_path / "x.png", "--photographs", tmp_path)

@@ -13,7 +13,7 @@ from pansplat import pipeline
 from pansplat.cli import run
 from pansplat.data.images import read_depth
 
-HEIGHT = 16
+HEIGHT = 64
 
 
 def render(path: Path, out: Path, *arguments: object) -> np.ndarray:
@@ -80,7 +80,7 @@ def test_invalid_arguments_are_refused(scene: Path, room: Path, tmp_path: Path, 
     Path("path.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
     for path, out, arguments, message in (
         (scene, "x.tiff", [], "--out must end in"),
-        (scene, "no/x.png", [], "folder does not exist"),
+        (scene, "no/x.png", [], "needed an existing folder"),
         (scene, "x.png", ["--at", 0.5, "--pose", "path.txt"], "give one of them"),
         (scene, "x.png", ["--pose", "path.txt"], "holds 2 poses"),
         (scene, "x.mp4", ["--at", 0.5], "--at is one position"),
@@ -89,7 +89,7 @@ def test_invalid_arguments_are_refused(scene: Path, room: Path, tmp_path: Path, 
         (scene, "x.png", ["--blend", "view7"], "from 0 to 1, got 7"),
         (scene, "x.png", ["--fov", 180], "--fov must be"),
         (scene, "x.png", ["--height", 0], "--height"),
-        (scene, "x.mp4", ["--fps", 0], "must be positive"),
+        (scene, "x.mp4", ["--fps", 0], "--fps must be a number above 0"),
         ("nowhere.ply", "x.png", [], "nowhere.ply"),
         (room, "x.png", ["--model", "sphere", "--precision", "bfloat16"], "`precision` is for networks"),
     ):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import pytest
 import torch
@@ -154,10 +155,28 @@ def test_wrong_shapes_are_refused(refuse):
     refuse(r"`masks` must be \(2, 64, 128\)", images, poses, masks=torch.ones(2, 32, 64, dtype=torch.bool))
 
 
-def test_wrong_sizes_are_refused(refuse):
-    refuse("a multiple of 32, got 80; resize", *_inputs(80))
-    refuse("a multiple of 16, got 72; resize", *_inputs(72), compat="official")
+def test_low_panoramas_are_refused(refuse):
     refuse("at least 64 pixels high", *_inputs(32))
+
+
+@pytest.mark.parametrize(("height", "compat"), [(67, "fixed"), (70, "official")])
+def test_any_height_is_predicted_from(small_config, height: int, compat: Literal["official", "fixed"]) -> None:
+    images, poses = _inputs(height)
+    masks = torch.ones(2, height, 2 * height, dtype=torch.bool)
+    gaussians = _predictor(small_config, compat)(images, poses, 0.5, 20.0, masks=masks)
+    assert isinstance(gaussians, Gaussians) and len(gaussians) > 0
+    assert gaussians.means.isfinite().all()
+
+
+@pytest.mark.parametrize("unit", [2.0**-20, 2.0**20])
+def test_a_world_in_another_unit_gives_the_same_scene_in_that_unit(small_config, unit: float) -> None:
+    images, poses = _inputs()
+    scaled = poses.clone()
+    scaled[:, :3, 3] *= unit
+    ours = _predictor(small_config)(images, scaled, 0.5 * unit, 20.0 * unit)
+    theirs = _predictor(small_config)(images, poses, 0.5, 20.0)
+    assert isinstance(ours, Gaussians) and isinstance(theirs, Gaussians)
+    torch.testing.assert_close(ours.means / unit, theirs.means, rtol=1e-3, atol=1e-3)
 
 
 def test_wrong_numbers_of_views_are_refused(refuse):

@@ -101,10 +101,10 @@ def test_other_safetensors_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="needed format 1 of weights files, got 99"):
         load_weights(path)
     safetensors.torch.save_file({"a": torch.zeros(1)}, path, metadata | {"pansplat_format": "1", "config": "{"})
-    with pytest.raises(InputError, match="needed settings in its metadata"):
+    with pytest.raises(InputError, match="config: needed JSON"):
         load_weights(path)
     safetensors.torch.save_file({"a": torch.zeros(1)}, path, metadata | {"pansplat_format": "1", "compat": "new"})
-    with pytest.raises(InputError, match="needed settings in its metadata, got 'new'"):
+    with pytest.raises(InputError, match="needed compat official or fixed in its metadata, got 'new'"):
         load_weights(path)
 
 

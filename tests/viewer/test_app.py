@@ -70,8 +70,8 @@ def test_with_an_unusable_display_a_fly_through_is_written(room, capsys, monkeyp
         (["nowhere"], "no such file or folder"),
         (["room.ply", "--size", "huge"], "WIDTHxHEIGHT"),
         (["room.ply", "--size", "4x4"], "WIDTHxHEIGHT"),
-        (["room.ply", "--at", "1.5"], "between 0 and 1"),
-        (["room.ply", "--refine", "-1"], "--refine` must be a number of seconds"),
+        (["room.ply", "--at", "1.5"], "--at must be a number of 0 to 1"),
+        (["room.ply", "--refine", "-1"], "--refine must be a number of 0 to 1000000 seconds"),
         (["room.ply", "--pair", "kitchen"], "number from 1 to 1 or one of room"),
     ],
 )

@@ -9,7 +9,9 @@ from __future__ import annotations
 import functools
 import json
 import os
+import signal
 import zipfile
+import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -24,6 +26,7 @@ from pansplat.atomic import replacing
 from pansplat.data.generated.library import FurnitureLibrary, load_furniture
 from pansplat.data.images import linear_from_srgb
 from pansplat.errors import InputError
+from pansplat.strict_json import read_json
 
 TOURS_PER_SHARD = 16
 _FORMAT = 1
@@ -140,7 +143,7 @@ def pack_triplets(source: Path, folder: Path, height: int) -> int:
 def _read_triplet(name: Path, height: int) -> Tour:
     """The tour of a rendered triplet; the height of each camera over the floor is the depth at the nadir."""
     try:
-        poses = np.array(json.loads(name.with_suffix(".json").read_text())["c2w"], np.float64)
+        poses = np.array(read_json(name.with_suffix(".json"))["c2w"], np.float64)
         images = [cv2.imread(f"{name}_{n}.png", cv2.IMREAD_COLOR)[..., ::-1] for n in range(3)]
         depths = [cv2.imread(f"{name}_{n}_depth.png", cv2.IMREAD_UNCHANGED) / _MILLIMETRES for n in range(3)]
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -185,10 +188,10 @@ class ShardReader:
                 lights = [_decode(png) for png in _unpack(shard_file[f"{place}.light"])]
                 depths = [_decode(png) for png in _unpack(shard_file[f"{place}.depth"])]
                 poses, heights = shard_file[f"{place}.cam2world"], shard_file[f"{place}.camera_height"]
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile, cv2.error) as error:
+            light, depth = np.stack(lights).astype(np.float32) / _LARGEST, np.stack(depths) / np.float32(_MILLIMETRES)
+        except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, cv2.error) as error:
             raise InputError(f"{path}: needed a shard of tours, got {error!r}; delete it and make it again.") from error
-        light = np.stack(lights).astype(np.float32) / _LARGEST
-        return Tour(light * light * _MAX_LIGHT, np.stack(depths) / np.float32(_MILLIMETRES), poses, heights)
+        return Tour(light * light * _MAX_LIGHT, depth, poses, heights)
 
 
 @functools.cache
@@ -202,7 +205,8 @@ def _run_tasks(tasks: list[tuple[Path, TourSettings, int]], workers: int) -> Ite
     if workers <= 1:
         yield from map(_write_shard, tasks)
         return
-    with get_context("spawn").Pool(workers) as pool:
+    ignore = (signal.SIGINT, signal.SIG_IGN)  # after Ctrl+C this process ends the others
+    with get_context("spawn").Pool(workers, signal.signal, ignore) as pool:
         yield from pool.imap_unordered(_write_shard, tasks)
 
 

@@ -1,0 +1,135 @@
+"""Checks of the files and folders that a user names, before anything is read, computed or written."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+from pansplat.errors import InputError
+
+_KINDS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a FIFO (named pipe)"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+
+
+def describe_kind(path: Path | str) -> str | None:
+    """What a path is if it is not a regular file, such as "a folder" or "a FIFO (named pipe)"; None for a file.
+
+    Raises:
+        OSError: there is no such path.
+    """
+    mode = os.stat(path).st_mode
+    return next((kind for is_kind, kind in _KINDS if is_kind(mode)), None)
+
+
+def require_file(path: Path | str, needed: str = "a readable file") -> None:
+    """Check that a path is a regular file. Reading a FIFO or a device may never end.
+
+    Args:
+        path: the path, which error messages name.
+        needed: what was needed, for error messages.
+
+    Raises:
+        InputError: no such file, a folder, a FIFO, a socket or a device.
+    """
+    try:
+        kind = describe_kind(path)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: needed {needed}, got '{reason}'; check the path.") from error
+    if kind is not None:
+        raise InputError(f"{path}: needed {needed}, got {kind}; give a regular file.")
+
+
+def read_file(path: Path | str, needed: str = "a readable file", *, limit: int | None = None) -> bytes:
+    """Content of a regular file.
+
+    Args:
+        path, needed: see `require_file`.
+        limit: largest size, bytes.
+
+    Raises:
+        InputError: not a regular file, not readable, or larger than `limit`.
+    """
+    require_file(path, needed)
+    try:
+        with open(path, "rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            if limit is not None and size > limit:
+                raise InputError(f"{path}: needed {needed} of at most {limit:,} bytes, got {size:,}; check the file.")
+            return file.read()
+    except OSError as error:
+        raise InputError(f"{path}: needed {needed}, got '{error.strerror or error}'; check the path.") from error
+
+
+def expand_home(path: Path | str) -> Path:
+    """The path with `~` replaced by the home folder.
+
+    Raises:
+        InputError: the path begins with `~`, and there is no home folder.
+    """
+    try:
+        return Path(path).expanduser()
+    except RuntimeError as error:
+        raise InputError(f"{path}: needed a home folder for `~`, got none; give the whole path.") from error
+
+
+def require_output_folder(option: str, folder: Path) -> None:
+    """Check that a folder can be written, or made, before the work. Nothing is made.
+
+    Args:
+        option: the option that error messages name, such as "--out".
+        folder: the folder; it and its parents need not exist.
+
+    Raises:
+        InputError: a file is in the way, a name is too long, or the folder is not writable.
+    """
+    advice = "choose another folder"
+    try:
+        os.stat(folder)
+    except (OSError, ValueError) as error:
+        if getattr(error, "errno", None) != errno.ENOENT:
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(f"{option} {folder}: needed a folder to write into, got '{reason}'; {advice}") from error
+    existing = Path(os.path.abspath(folder))
+    while not os.path.lexists(existing):
+        existing = existing.parent
+    if not existing.is_dir():
+        raise InputError(f"{option} {folder}: needed a folder to write into, got the file {existing}; {advice}")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise InputError(f"{option} {folder}: needed a writable folder, got {existing}, which is read-only; {advice}")
+
+
+def require_output_file(option: str, path: Path, suffixes: tuple[str, ...] = ()) -> None:
+    """Check that a file can be written, before the work.
+
+    Args:
+        option: the option that error messages name, such as "--out".
+        path: the file; its folder must exist.
+        suffixes: the allowed suffixes in lower case; any suffix by default.
+
+    Raises:
+        InputError: another suffix, a folder or a FIFO of this name, or a folder that is missing or not writable.
+    """
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise InputError(f"{option} must end in {', '.join(suffixes)}, got {path}")
+    try:
+        kind = describe_kind(path)
+        if kind is not None:
+            raise InputError(f"{option} {path}: needed a file to write, got {kind}; give another name")
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        if getattr(error, "errno", None) not in (errno.ENOENT, errno.ENOTDIR):
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(f"{option} {path}: needed a file to write, got '{reason}'; give another name") from error
+    if not path.parent.is_dir():
+        raise InputError(f"{option} {path}: needed an existing folder, got {path.parent}; create it first")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise InputError(f"{option} {path}: needed a writable folder, got {path.parent}, which is read-only")

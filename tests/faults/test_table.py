@@ -1,0 +1,641 @@
+# ruff: noqa: E501  # a fault is one line
+"""The table of faults: each is one line that names the file or the option, a status, and no half-written file."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors
+import safetensors.torch
+import torch
+from PIL import Image
+
+Damage = Callable[[Path], object]
+_DEEP = "[" * 100_000
+_LONG = "a" * 300
+_HUGE = 10**400
+
+
+def edit_json(path: Path, change: Callable[[Any], Any]) -> None:
+    """Change the content of a JSON file."""
+    content = json.loads(path.read_text())
+    changed = change(content)
+    path.write_text(json.dumps(content if changed is None else changed))
+
+
+def edit_comment(path: Path, change: Callable[[dict[str, Any]], Any] | str) -> None:
+    """Change the pansplat comment of a scene; a text replaces its JSON."""
+    head, rest = path.read_bytes().split(b"comment pansplat ", 1)
+    comment, rest = rest.split(b"\n", 1)
+    if callable(change):
+        content = json.loads(comment)
+        change(content)
+        change = json.dumps(content)
+    path.write_bytes(head + b"comment pansplat " + change.encode("utf-8", "surrogatepass") + b"\n" + rest)
+
+
+def replace_bytes(path: Path, old: bytes, new: bytes) -> None:
+    """Replace the first occurrence."""
+    data = path.read_bytes()
+    assert old in data
+    path.write_bytes(data.replace(old, new, 1))
+
+
+def nothing(folder: Path) -> None:
+    """Leave the files as they are."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault: how the files are damaged, the command, and how it must end."""
+
+    name: str
+    command: str
+    damage: Damage = nothing
+    says: str = ""
+    status: int = 2
+
+
+INFO = "info scene.ply"
+DRAW = "render scene.ply -o x.png --height 8"
+PREDICT = "predict pair -o out.ply --model sphere --height 64"
+WEIGHTS = "predict pair -o out.ply --model weights.safetensors --height 64"
+
+
+# Group 1: scene files
+
+
+def comment(change: Callable[[dict[str, Any]], Any] | str) -> Damage:
+    return lambda folder: edit_comment(folder / "scene.ply", change)
+
+
+def header(old: bytes, new: bytes) -> Damage:
+    return lambda folder: replace_bytes(folder / "scene.ply", old, new)
+
+
+def content(data: bytes | Callable[[bytes], bytes], name: str = "scene.ply") -> Damage:
+    def write(folder: Path) -> None:
+        path = folder / name
+        path.write_bytes(data if isinstance(data, bytes) else data(path.read_bytes()))
+
+    return write
+
+
+def vertices(value: float) -> Damage:
+    """All numbers of all vertices have a value."""
+
+    def write(folder: Path) -> None:
+        head, body = (folder / "scene.ply").read_bytes().split(b"end_header\n")
+        values = np.full(len(body) // 4, value, "<f4").tobytes()
+        (folder / "scene.ply").write_bytes(head + b"end_header\n" + values)
+
+    return write
+
+
+_RUNS = {
+    "sum that overflows": [[0, 0, 10**18 - 1]] * 19 + [[0, 0, 12]],
+    "19 digits": [[0, 0, 2**63 - 1], [0, 0, 2**63 - 1], [0, 0, 14]],
+    "negative length": [[0, 0, -1], [0, 0, 13]],
+    "length above the count": [[0, 0, 10**12]],
+    "view that is missing": [[0, 5, 12]],
+    "level of 2^60": [[2**59, 0, 12]],
+    "fractions": [[0.5, 0, 12]],
+    "booleans": [[False, False, 12]],
+    "texts": [["0", "0", "12"]],
+    "pairs instead of triples": [[0, 12]],
+    "an object in the list": [{"a": 1}],
+    "numbers instead of lists": [0, 0, 12],
+    "lists in lists": [[[0], [0], [12]]],
+    "400 digits": [[0, 0, _HUGE]],
+}
+
+SCENES = [
+    *(Fault(f"runs: {name}", INFO, comment(lambda c, runs=runs: c.update(runs=runs)), "are ignored", 0) for name, runs in _RUNS.items()),
+    Fault("runs: sum that overflows, drawn", DRAW, comment(lambda c: c.update(runs=_RUNS["sum that overflows"])), "are ignored", 0),
+    *(
+        Fault(f"comment: {key} is {str(value)[:20]}", INFO, comment(lambda c, key=key, value=value: c.update({key: value})), "comment is damaged", 0)
+        for key, values in {
+            "near": (1e-300, 1e-40, 1e300, -1.0, 0.0, 10.0, "0.45", [1], True, _HUGE),
+            "far": (1e38, 1e300, 0.45, "far", {}),
+            "height": (10**17, -5, 0, 64.5, "64", _HUGE, True),
+            "names": ("a.png", {"a": 1}, 3),
+            "model": (3, ["sphere"]),
+            "cam2world": (7, "pose", [[1, 2], [3]], [[[1e30] * 4] * 4], [[["a"] * 4] * 4], [[1.0] * 16], {"a": 1}),
+        }.items()
+        for value in values
+    ),
+    Fault("comment: nested 100,000 deep", INFO, comment(_DEEP), "comment is damaged", 0),
+    Fault("comment: not JSON", INFO, comment("{"), "comment is damaged", 0),
+    Fault("comment: a list at the top", INFO, comment("[1, 2]"), "comment is damaged", 0),
+    Fault("comment: a number at the top", INFO, comment("5"), "comment is damaged", 0),
+    Fault("comment: null", INFO, comment("null"), "comment is damaged", 0),
+    Fault("comment: NaN", INFO, comment('{"near": NaN}'), "comment is damaged", 0),
+    Fault("comment: 1e999", INFO, comment('{"near": 1e999}'), "comment is damaged", 0),
+    Fault("comment: 5000 digits", INFO, comment('{"near": 1' + "0" * 5000 + "}"), "comment is damaged", 0),
+    Fault("comment: a key twice", INFO, comment('{"near": 1, "near": 2}'), "near", 0),
+    Fault("comment: a lone surrogate in a name", INFO, comment('{"names": ["\\ud800"]}'), "names[0]", 0),
+    Fault("header: 10^18 vertices", INFO, header(b"vertex 12", b"vertex 1" + b"0" * 18), "truncated"),
+    Fault("header: 5000 digits of vertices", INFO, header(b"vertex 12", b"vertex 1" + b"0" * 5000), "header line"),
+    Fault("header: a negative number of vertices", INFO, header(b"vertex 12", b"vertex -1"), "negative count"),
+    Fault("header: one vertex too many", INFO, header(b"vertex 12", b"vertex 13"), "truncated"),
+    Fault("header: vertices without properties", INFO, header(b"property float x\n", b"element face 10000000000000\nproperty float x\n"), "vertices lack"),
+    Fault("header: a huge element before the vertices", INFO, header(b"element vertex", b"element face 99999999999999999999\nproperty int a\nelement vertex"), "truncated"),
+    Fault("header: a list property", INFO, header(b"property float x\n", b"property list uchar int x\n"), "list property"),
+    Fault("header: a property twice", INFO, header(b"property float y\n", b"property float x\n"), "twice"),
+    Fault("header: an unknown type", INFO, header(b"property float x\n", b"property quad x\n"), "header line"),
+    Fault("header: a property without a name", INFO, header(b"property float x\n", b"property\n"), "header line"),
+    Fault("header: 5000 properties", INFO, header(b"property float x\n", b"".join(b"property float p%d\n" % i for i in range(5000))), "header line"),
+    Fault("header: a missing property", INFO, header(b"property float opacity\n", b"property float other\n"), "lack opacity"),
+    Fault("header: one f_rest", INFO, header(b"property float nx\n", b"property float f_rest_0\n"), "f_rest"),
+    Fault("header: ASCII numbers", INFO, header(b"binary_little_endian", b"ascii"), "'ascii'"),
+    Fault("header: no end", INFO, header(b"end_header", b"end"), "scene.ply"),
+    Fault("header: no format", INFO, header(b"format", b"comment"), "format"),
+    Fault("file: empty", INFO, content(b""), "scene.ply"),
+    Fault("file: a picture", INFO, lambda folder: (folder / "scene.ply").write_bytes((folder / "pair/a.png").read_bytes()), "not a .ply"),
+    Fault("file: cut in the vertices", INFO, content(lambda data: data[:-5]), "truncated"),
+    Fault("file: cut in the header", INFO, content(lambda data: data[:90]), "header"),
+    Fault("vertices: NaN", INFO, vertices(float("nan")), "finite"),
+    Fault("vertices: infinite scales", INFO, vertices(3e38), "finite"),
+    Fault("vertices: -3e38, drawn", DRAW, vertices(-3e38), "", 0),
+    Fault("vertices: 80, drawn", DRAW, vertices(80.0), "", 0),
+]  # fmt: skip
+
+
+# Group 2: numbers on command lines
+
+
+def bad(option: str, command: str, *values: str) -> Iterator[Fault]:
+    """Each value of an option is refused, and the message names the option."""
+    for value in values:
+        yield Fault(
+            f"{command[:16]} {option} {value[:12]} ({len(value)})",
+            f"{command} {option} {value}",
+            says=f"{option} must be",
+        )
+
+
+TRAIN = "pansplat-train tiny --out run --device cpu"
+
+SIZES = [
+    *bad("--height", "predict pair -o out.ply", "63", "32", "0", "-1", "1000000", "abc", "64.5", "1e3", "nan", "9" * 30, "9" * 5000),
+    *bad("--near", "predict pair -o out.ply", "0", "-1", "nan", "1e-300", "1e300", "inf", "x"),
+    *bad("--far", "predict pair -o out.ply", "0", "1e38", "-inf"),
+    *bad("--degree", "predict pair -o out.ply", "5", "-1", "1.5"),
+    *bad("--min-opacity", "predict pair -o out.ply", "1", "-0.1", "nan"),
+    *bad("--refine", "predict pair -o out.ply", "-1", "nan", "inf", "1e300", "soon"),
+    *bad("--height", "render scene.ply -o x.png", "0", "-8", "1000000", "x"),
+    *bad("--predict-height", "render pair -o x.png", "63", "1000000"),
+    *bad("--fov", "render scene.ply -o x.png", "0", "171", "nan", "-1e9"),
+    *bad("--at", "render scene.ply -o x.png", "nan", "inf", "-inf", "1e300", "middle"),
+    *bad("--seconds", "render scene.ply -o x.mp4", "0", "-1", "1e9", "nan"),
+    *bad("--fps", "render scene.ply -o x.mp4", "0", "1e9", "nan"),
+    *bad("--height", "evaluate pair --out report", "63", "100000000", "-5"),
+    *bad("--refine", "evaluate pair --out report", "-1"),
+    *bad("--limit", "evaluate --protocol m3d --data . --out report", "0"),
+    *bad("--pictures", "evaluate --protocol m3d --data . --out report", "-1"),
+    *bad("--steps", "refine pair -o out.ply", "0", "-3", "1e9"),
+    *bad("--gaussians", "refine pair -o out.ply", "0"),
+    *bad("--seed", "refine pair -o out.ply", "-1", "9" * 30),
+    *bad("--height", "refine pair -o out.ply", "10", "1000000"),
+    *bad("--height", "bench raster", "20", "1000000"),
+    *bad("--height", "bench model", "100", "0"),
+    *bad("--heights", "bench memory", "100", "-64"),
+    *bad("--threads", "bench machine", "0", "-1", "9999999"),
+    *bad("--limit-gb", "bench memory", "0", "nan"),
+    *bad("--count", "data homes --out shards", "0", "x"),
+    *bad("--cameras", "data homes --out shards", "1"),
+    *bad("--height", "data homes --out shards", "100", "0"),
+    *bad("--workers", "data homes --out shards", "0", "-2"),
+    *bad("--optimizer.steps", TRAIN, "0", "many"),
+    *bad("--optimizer.rate", TRAIN, "0", "nan", "inf"),
+    *bad("--optimizer.batch-size", TRAIN, "0", "1000000"),
+    *bad("--optimizer.ema", TRAIN, "1"),
+    *bad("--heights", TRAIN, "32", "100", "1000000"),
+    *bad("--data.workers", TRAIN, "-1", "100000"),
+    *bad("--checkpoint.keep", TRAIN, "0"),
+    *bad("--checkpoint.minutes", TRAIN, "-1", "nan"),
+    *bad("--loss.depth", TRAIN, "-1", "nan"),
+    *bad("--data.augmentation.colour", TRAIN, "2"),
+    *bad("--seed", TRAIN, "-1"),
+    *bad("--height", "pansplat-view scene.ply", "63", "1000000"),
+    *bad("--refine", "pansplat-view scene.ply", "-1", "nan"),
+    *bad("--fps", "pansplat-view scene.ply", "0"),
+    *bad("--at", "pansplat-view scene.ply", "2", "nan"),
+    Fault("view --size 1x1", "pansplat-view scene.ply --size 1x1", says="--size"),
+    Fault("an option without its number", "predict pair -o out.ply --height", says="--height"),
+    Fault("a misspelt option", "predict pair -o out.ply --heigth 64", says="--heigth"),
+    Fault("a misspelt command", "predikt pair", says="predikt"),
+    Fault("a choice that is missing", "render scene.ply -o x.png --layout fisheye", says="--layout"),
+    Fault("a number of a view with 400 digits", f"render scene.ply -o x.png --blend view{_HUGE}", says="--blend"),
+    Fault("a number of a pair with 400 digits", f"{PREDICT} --pair {_HUGE}", says="--pair"),
+    *(Fault(f"predict --height {height} works", f"predict pair -o out.ply --model sphere --height {height}", status=0) for height in (64, 65, 100)),
+    *(Fault(f"render --height {height} works", f"render scene.ply -o x.png --height {height}", status=0) for height in (2, 11, 32)),
+]  # fmt: skip
+
+
+# Group 3: numbers in files
+
+
+def poses(change: Callable[[dict[str, Any]], Any]) -> Damage:
+    return lambda folder: edit_json(folder / "pair/poses.json", change)
+
+
+def text(value: str, name: str = "pair/poses.json") -> Damage:
+    return lambda folder: (folder / name).write_text(value)
+
+
+def pairs(value: Any) -> Damage:
+    return text(json.dumps(value), "pair/pairs.json")
+
+
+def matrix(value: Any) -> Damage:
+    return poses(lambda content: content["poses"].update({"a.png": value}))
+
+
+def entry(row: int, column: int, value: float) -> Damage:
+    def change(content: dict[str, Any]) -> None:
+        content["poses"]["a.png"][row][column] = value
+
+    return poses(change)
+
+
+def trajectory(line: str, name: str = "poses.kitti") -> Damage:
+    """A folder of two panoramas with a trajectory whose second line is given."""
+
+    def write(folder: Path) -> None:
+        for file in ("poses.json", "pairs.json", "c.png"):
+            (folder / "pair" / file).unlink()
+        first = "1 0 0 0 0 1 0 0 0 0 1 0" if name.endswith("kitti") else "0 0 0 0 0 0 0 1"
+        (folder / "pair" / name).write_text(f"{first}\n{line}\n")
+
+    return write
+
+
+def many_panoramas(folder: Path) -> None:
+    """A pair of 1,000 context panoramas."""
+    content = json.loads((folder / "pair/poses.json").read_text())
+    for number in range(1000):
+        os.symlink("a.png", folder / "pair" / f"v{number}.png")
+        content["poses"][f"v{number}.png"] = [[1, 0, 0, number], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    (folder / "pair/poses.json").write_text(json.dumps(content))
+    pairs({"pairs": [{"context": [f"v{number}.png" for number in range(1000)]}]})(folder)
+
+
+_KITTI = "1 0 0 {} 0 1 0 0 0 0 1 0"
+
+NUMBERS = [
+    *(Fault(f"near {str(value)[:12]}", PREDICT, poses(lambda c, value=value: c.update(near=value)), "poses.json")
+      for value in (0, -1, 1e-300, 1e-40, 1e38, 1e300, 10, 9.9999999, _HUGE, "x", True, [1], {"a": 1})),
+    *(Fault(f"far {str(value)[:12]}", PREDICT, poses(lambda c, value=value: c.update(far=value)), "poses.json")
+      for value in (0, 0.45, 0.45000001, 1e38, 1e300, _HUGE, "x")),
+    Fault("near of 5000 digits", PREDICT, text('{"near": 1' + "0" * 5000 + "}"), "near"),
+    Fault("a position of 1e30", PREDICT, entry(0, 3, 1e30), "a.png"),
+    Fault("a position of 1e300", PREDICT, entry(0, 3, 1e300), "a.png"),
+    Fault("a rotation of 1e200", PREDICT, entry(0, 0, 1e200), "a.png"),
+    Fault("a rotation of 1e-300", PREDICT, entry(0, 0, 1e-300), "a.png"),
+    Fault("a position of 400 digits", PREDICT, entry(0, 3, _HUGE), "poses.a.png[0][3]"),
+    Fault("a position of NaN", PREDICT, entry(0, 3, float("nan")), "NaN or infinite"),
+    Fault("a pose of texts", PREDICT, matrix([["a"] * 4] * 4), "a.png"),
+    Fault("a ragged pose", PREDICT, matrix([[1, 2], [3]]), "a.png"),
+    Fault("a pose of 3x3 numbers", PREDICT, matrix([[1, 0, 0], [0, 1, 0], [0, 0, 1]]), "a.png"),
+    Fault("a pose that is a number", PREDICT, matrix(5), "a.png"),
+    Fault("a pose that is null", PREDICT, matrix(None), "a.png"),
+    Fault("a pose that is an object without a matrix", PREDICT, matrix({}), "a.png"),
+    Fault("a pose of booleans in an object", PREDICT, matrix({"cam2world": True}), "a.png"),
+    Fault("a pose 30 levels deep", PREDICT, text('{"convention": "cam2world opencv", "poses": {"a.png": ' + "[" * 29 + "]" * 29 + "}}"), "a.png"),
+    Fault("a mask that is a number", PREDICT, poses(lambda c: c["poses"].update({"a.png": {"cam2world": c["poses"]["a.png"], "mask": 5}})), "mask"),
+    Fault("poses nested 100,000 deep", PREDICT, text(_DEEP), "poses.json"),
+    Fault("poses nested 100 deep", PREDICT, text("[" * 100 + "]" * 100), "levels"),
+    *(Fault(f"poses: {value} at the top", PREDICT, text(value), "poses.json") for value in ("[]", "5", '"a"', "null", "true", "1e999", "NaN", "")),
+    Fault("poses: an object that is a list", PREDICT, text('{"convention": "cam2world opencv", "poses": []}'), "poses"),
+    Fault("poses: a convention that is a number", PREDICT, poses(lambda c: c.update(convention=5)), "convention"),
+    Fault("poses: an image twice", PREDICT, text('{"convention": "cam2world opencv", "poses": {"a.png": 1, "a.png": 2}}'), "a.png"),
+    Fault("poses: a lone surrogate", PREDICT, text('{"convention": "cam2world opencv", "poses": {"\\ud800.png": 1}}'), "Unicode"),
+    Fault("poses: a NUL in a name", PREDICT, text('{"convention": "cam2world opencv", "poses": {"a\\u0000.png": 1}}'), "poses.json"),
+    Fault("poses: a name of 300 bytes", PREDICT, text(f'{{"convention": "cam2world opencv", "poses": {{"{_LONG}.png": 1}}}}'), _LONG),
+    Fault("poses: UTF-16", PREDICT, content("{}".encode("utf-16"), "pair/poses.json"), "UTF-8"),
+    Fault("poses: binary", PREDICT, content(bytes(range(256)), "pair/poses.json"), "poses.json"),
+    Fault("poses: cut off", PREDICT, content(lambda data: data[:100], "pair/poses.json"), "line 1"),
+    *(Fault(f"pairs: {json.dumps(value)[:70]}", PREDICT, pairs(value), "pairs.json") for value in (
+        [], 5, "a", None, {}, {"pairs": 5}, {"pairs": {}}, {"pairs": [5]}, {"pairs": [None]}, {"pairs": [{"context": 5}]},
+        {"pairs": [{"context": ["a.png"]}]}, {"pairs": [{"context": ["a.png", "a.png"]}]}, {"pairs": [{"context": ["a.png", 5]}]},
+        {"pairs": [{"context": ["a.png", "x.png"]}]}, {"pairs": [{"context": ["a.png", "b.png"], "target": 5}]},
+        {"pairs": [{"context": ["a.png", "b.png"], "target": {"c": 1}}]}, {"triplets": 7})),
+    Fault("pairs: nested 100,000 deep", PREDICT, text('{"pairs": ' + _DEEP, "pair/pairs.json"), "pairs.json"),
+    Fault("pairs: 1,000 context panoramas", PREDICT, many_panoramas, "at most 64"),
+    *(Fault(f"KITTI: {line[:24]}", PREDICT, trajectory(line), "poses.kitti") for line in (
+        _KITTI.format("1e30"), _KITTI.format("1e400"), _KITTI.format("nan"), _KITTI.format("x"), "1 2 3", "0 " * 12, "2 " + "0 " * 11)),
+    *(Fault(f"TUM: {line[:24]}", PREDICT, trajectory(line, "poses.tum"), "poses.tum") for line in (
+        "0 0 0 0 0 0 0 0", "0 1e30 0 0 0 0 0 1", "0 0 0 0 nan 0 0 1", "0 0 0 0 1e200 0 0 1e200", "0 0 0 0 0 0 0 1 0")),
+    Fault("KITTI: an empty file", PREDICT, lambda folder: (trajectory("")(folder), (folder / "pair/poses.kitti").write_text("")), "poses.kitti"),
+    Fault("KITTI: binary", PREDICT, lambda folder: (trajectory("")(folder), (folder / "pair/poses.kitti").write_bytes(b"\xff\xfe\x00" * 99)), "poses.kitti"),
+    *(Fault(f"scale.txt: {value[:10]}", PREDICT, lambda folder, value=value: (trajectory(_KITTI.format(1))(folder), (folder / "pair/scale.txt").write_text(value)), "scale.txt")
+      for value in ("0", "-1", "nan", "inf", "x", "", "1" * 400)),
+    *(Fault(f"render --pose {name}: {value[:20]}", f"render scene.ply -o x.png --height 8 --pose {name}", text(value, name), name) for name, value in (
+        ("p.json", _DEEP), ("p.json", "[]"), ("p.json", "{}"), ("p.json", "5"), ("p.json", '{"convention": 1, "pose": 2}'), ("p.json", "[[1e999]]"),
+        ("p.txt", "1 2 3"), ("p.txt", ""), ("p.txt", "nan " * 16), ("p.txt", "1e30 " * 16), ("p.txt", "a b c"))),
+    Fault("camera_pose.json: a list", PREDICT, lambda folder: ((folder / "pair/poses.json").unlink(), text("[1]", "pair/camera_pose.json")(folder)), "camera_pose.json"),
+    Fault("camera_pose.json: deep", PREDICT, lambda folder: ((folder / "pair/poses.json").unlink(), text(_DEEP, "pair/camera_pose.json")(folder)), "camera_pose.json"),
+]  # fmt: skip
+
+
+# Group 4: weights and checkpoints
+
+
+def settings(change: Callable[[dict[str, Any]], Any] | str, **metadata: str) -> Damage:
+    """Change the settings in the metadata of the weights."""
+
+    def write(folder: Path) -> None:
+        path = folder / "weights.safetensors"
+        with safetensors.safe_open(path, "pt") as file:
+            entries, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        if callable(change):
+            config = json.loads(entries["config"])
+            change(config)
+            entries["config"] = json.dumps(config)
+        else:
+            entries["config"] = change
+        safetensors.torch.save_file(tensors, path, entries | metadata)
+
+    return write
+
+
+def tensors(change: Callable[[dict[str, torch.Tensor]], Any]) -> Damage:
+    """Change the tensors of the weights."""
+
+    def write(folder: Path) -> None:
+        path = folder / "weights.safetensors"
+        with safetensors.safe_open(path, "pt") as file:
+            entries, content = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        safetensors.torch.save_file(change(content) or content, path, entries)
+
+    return write
+
+
+def cast(dtype: torch.dtype) -> Damage:
+    return tensors(lambda state: {n: t.to(dtype) if t.is_floating_point() else t for n, t in state.items()})
+
+
+def first(change: Callable[[torch.Tensor], torch.Tensor]) -> Damage:
+    """Change the first floating-point tensor."""
+
+    def apply(state: dict[str, torch.Tensor]) -> None:
+        name = next(name for name, tensor in state.items() if tensor.is_floating_point())
+        state[name] = change(state[name])
+
+    return tensors(apply)
+
+
+def pickled(value: object) -> Damage:
+    return lambda folder: torch.save(value, folder / "old.ckpt")
+
+
+class Calls:
+    """Makes a folder when it is unpickled."""
+
+    def __reduce__(self) -> tuple:
+        return os.mkdir, ("executed",)
+
+
+CKPT = "predict pair -o out.ply --model old.ckpt --height 64"
+_SETTINGS: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "no channels": lambda c: c["features"].update(channels=[0, 8, 8, 16]),
+    "negative channels": lambda c: c["features"].update(channels=[-4, 8, 8, 16]),
+    "a billion channels": lambda c: c["features"].update(channels=[10**9, 8, 8, 16]),
+    "channels of texts": lambda c: c["features"].update(channels=["4", "8", "8", "16"]),
+    "channels of fractions": lambda c: c["features"].update(channels=[4.5, 8, 8, 16]),
+    "three channels": lambda c: c["features"].update(channels=[4, 8, 8]),
+    "channels that are a number": lambda c: c["features"].update(channels=4),
+    "channels that are true": lambda c: c["features"].update(channels=[True, 8, 8, 16]),
+    "odd channels": lambda c: c["features"].update(channels=[3, 7, 5, 11]),
+    "features that are a list": lambda c: c.update(features=[1]),
+    "features that are null": lambda c: c.update(features=None),
+    "no blocks": lambda c: c["features"]["transformer"].update(blocks=0),
+    "a million blocks": lambda c: c["features"]["transformer"].update(blocks=10**6),
+    "no splits": lambda c: c["features"]["transformer"].update(splits=0),
+    "seven splits": lambda c: c["features"]["transformer"].update(splits=7),
+    "no expansion": lambda c: c["features"]["transformer"].update(expansion=0),
+    "no levels": lambda c: c["cost_volume"].update(levels=[]),
+    "thousand levels": lambda c: c["cost_volume"].update(levels=c["cost_volume"]["levels"] * 400),
+    "a level twice": lambda c: c["cost_volume"].update(levels=c["cost_volume"]["levels"][:1] * 3),
+    "no candidates": lambda c: c["cost_volume"]["levels"][0].update(candidates=0),
+    "candidates of 400 digits": lambda c: c["cost_volume"]["levels"][0].update(candidates=_HUGE),
+    "an unknown sweep": lambda c: c["cost_volume"].update(sweep="spiral"),
+    "a sweep that is a list": lambda c: c["cost_volume"].update(sweep=[1]),
+    "monocular channels that are a list": lambda c: c["cost_volume"].update(mono_channels=[]),
+    "degree 9": lambda c: c["heads"]["adapter"].update(degree=9),
+    "a scale of NaN": lambda c: c["heads"]["adapter"].update(min_scale=float("nan")),
+    "a scale that is a text": lambda c: c["heads"]["adapter"].update(min_scale="0.5"),
+    "no layers": lambda c: c["heads"].update(layers=0),
+    "a switch that is a number": lambda c: c["heads"].update(residual=1),
+    "a missing field": lambda c: c["heads"].pop("layers"),
+    "an unknown field": lambda c: c["heads"].update(colour=1),
+}
+
+CHECKPOINTS = [
+    *(Fault(f"settings: {name}", WEIGHTS, settings(change), "weights.safetensors") for name, change in _SETTINGS.items()),
+    *(Fault(f"settings: {value[:12]}", WEIGHTS, settings(value), "weights.safetensors: config") for value in (_DEEP, "[]", "5", "null", "{", '"a"', "{}")),
+    Fault("metadata: an unknown network", WEIGHTS, settings(lambda c: None, model="gan"), "'gan'"),
+    Fault("metadata: an unknown mode", WEIGHTS, settings(lambda c: None, compat="new"), "compat"),
+    Fault("metadata: another format", WEIGHTS, settings(lambda c: None, pansplat_format="9"), "format"),
+    Fault("metadata: a depth network with other settings", WEIGHTS, settings(lambda c: None, model="depth"), "config"),
+    Fault("metadata: none", WEIGHTS, lambda folder: safetensors.torch.save_file({"a": torch.zeros(1)}, folder / "weights.safetensors"), "metadata"),
+    Fault("float16 works", WEIGHTS, cast(torch.float16), status=0),
+    Fault("bfloat16 works", WEIGHTS, cast(torch.bfloat16), status=0),
+    Fault("float64 works", WEIGHTS, cast(torch.float64), status=0),
+    Fault("integers instead of numbers", WEIGHTS, first(lambda t: t.to(torch.int8)), "int8"),
+    Fault("complex numbers", WEIGHTS, first(lambda t: t.to(torch.complex64)), "weights.safetensors"),
+    Fault("NaN in a tensor", WEIGHTS, first(lambda t: t * float("nan")), "NaN"),
+    Fault("a tensor of another shape", WEIGHTS, first(lambda t: t[:1].clone()), "instead of"),
+    Fault("a missing tensor", WEIGHTS, tensors(lambda s: s.pop(next(iter(s))) is None or None), "lacked"),
+    Fault("a surplus tensor", WEIGHTS, tensors(lambda s: s.update(more=torch.zeros(1))), "unknown"),
+    Fault("weights cut off", WEIGHTS, content(lambda data: data[: len(data) // 2], "weights.safetensors"), "weights.safetensors"),
+    Fault("weights with a header of 2^60 bytes", WEIGHTS, content(lambda data: (2**60).to_bytes(8, "little") + data[8:], "weights.safetensors"), "weights.safetensors"),
+    Fault("weights: empty", WEIGHTS, content(b"", "weights.safetensors"), "empty"),
+    Fault("weights: a web page", WEIGHTS, content(b"<!DOCTYPE html>" * 20, "weights.safetensors"), "web page"),
+    Fault("weights: a Git LFS pointer", WEIGHTS, content(b"version https://git-lfs.github.com/spec/v1\n", "weights.safetensors"), "git lfs pull"),
+    Fault("weights: a scene", "predict pair -o out.ply --model scene.ply", says="`model`"),
+    Fault("weights: missing", "predict pair -o out.ply --model no.safetensors", says="no.safetensors"),
+    Fault("checkpoint: a list", CKPT, pickled([1, 2]), "old.ckpt"),
+    Fault("checkpoint: no state_dict", CKPT, pickled({"a": 1}), "state_dict"),
+    Fault("checkpoint: a state_dict of numbers", CKPT, pickled({"state_dict": {"a": 1}}), "state_dict"),
+    Fault("checkpoint: foreign tensors", CKPT, pickled({"state_dict": {"a": torch.zeros(1)}}), "official"),
+    Fault("checkpoint: an empty state_dict", CKPT, pickled({"state_dict": {}}), "official"),
+    Fault("checkpoint: code", CKPT, pickled({"state_dict": Calls()}), "not executed"),
+    Fault("checkpoint: garbage", CKPT, lambda f: (f / "old.ckpt").write_bytes(b"PK\x03\x04" + b"\0" * 200), "old.ckpt"),
+    Fault("checkpoint: pickle of 100,000 levels", CKPT, lambda f: (f / "old.ckpt").write_bytes(b"\x80\x02" + b"]" * 100_000 + b"a" * 99_999 + b"."), "old.ckpt"),
+    Fault("convert: a scene", "convert scene.ply -o m.safetensors", says="scene.ply"),
+    Fault("convert: a training checkpoint of another program", "convert old.ckpt -o m.safetensors", pickled({"kind": torch.zeros(3), "state_dict": {}}), "official"),
+    Fault("train: initial weights of another network", TRAIN + " --network.init weights.safetensors --data.workers 0 --perceptual structure", says="weights.safetensors"),
+]  # fmt: skip
+
+
+# Group 6: files (group 5, terminals and signals, is in test_processes.py)
+
+
+def fifo(name: str) -> Damage:
+    def make(folder: Path) -> None:
+        (folder / name).unlink(missing_ok=True)
+        os.mkfifo(folder / name)
+
+    return make
+
+
+def link(name: str, target: str) -> Damage:
+    def make(folder: Path) -> None:
+        (folder / name).unlink(missing_ok=True)
+        (folder / name).symlink_to(target)
+
+    return make
+
+
+def unix_socket(name: str) -> Damage:
+    def make(folder: Path) -> None:
+        (folder / name).unlink()
+        with socket.socket(socket.AF_UNIX) as server:
+            server.bind(str(name))
+
+    return make
+
+
+def picture(data: Callable[[Path], bytes] | bytes) -> Damage:
+    return lambda folder: (folder / "pair/a.png").write_bytes(data if isinstance(data, bytes) else data(folder))
+
+
+def resized(width: int, height: int, mode: str = "RGB") -> Damage:
+    return lambda folder: Image.new(mode, (width, height)).save(folder / "pair/a.png")
+
+
+def exr(change: Callable[[bytes], bytes]) -> Damage:
+    def write(folder: Path) -> None:
+        import OpenEXR
+
+        with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"RGB": np.full((16, 32, 3), np.nan, np.float32)}) as file:
+            file.write(str(folder / "x.exr"))
+        (folder / "pair/a.png").write_bytes(change((folder / "x.exr").read_bytes()))
+        (folder / "x.exr").unlink()
+
+    return write
+
+
+_PNG_BOMB = bytes.fromhex("89504e470d0a1a0a0000000d49484452000f4240 0007a120 0802000000".replace(" ", "")) + b"\0" * 40
+
+FILES = [
+    Fault("a FIFO as a scene", INFO, fifo("scene.ply"), "FIFO"),
+    Fault("a FIFO as a scene, drawn", DRAW, fifo("scene.ply"), "FIFO"),
+    Fault("a FIFO as a scene, viewed", "pansplat-view scene.ply --offscreen out", fifo("scene.ply"), "scene.ply"),
+    Fault("a FIFO as a scene, refined", "refine scene.ply -o out.ply --photographs pair", fifo("scene.ply"), "FIFO"),
+    Fault("a device as a scene", INFO, link("scene.ply", "/dev/zero"), "device"),
+    Fault("a socket as a scene", INFO, unix_socket("scene.ply"), "socket"),
+    Fault("a link to itself as a scene", INFO, link("scene.ply", "scene.ply"), "scene.ply"),
+    Fault("a folder as a scene", "info pair.ply", lambda f: (f / "pair.ply").mkdir(), "folder"),
+    Fault("a missing scene", "info no.ply", says="no.ply"),
+    Fault("a scene with a name of 300 bytes", f"info {_LONG}.ply", says=_LONG),
+    Fault("a FIFO as poses", PREDICT, fifo("pair/poses.json"), "pair"),
+    Fault("a FIFO as an image", PREDICT, fifo("pair/a.png"), "a.png"),
+    Fault("a FIFO as pairs", PREDICT, fifo("pair/pairs.json"), "", 0),
+    Fault("a FIFO as a mask", PREDICT, fifo("pair/a_mask.png"), "", 0),
+    Fault("a FIFO as weights", WEIGHTS, fifo("weights.safetensors"), "FIFO"),
+    Fault("a FIFO as a pose", "render scene.ply -o x.png --pose p.json", fifo("p.json"), "FIFO"),
+    Fault("a FIFO as a trajectory", "render scene.ply -o x.png --pose p.txt", fifo("p.txt"), "FIFO"),
+    Fault("a FIFO as a pair", "predict fifo -o out.ply", fifo("fifo"), "fifo"),
+    Fault("a FIFO as an output", f"{PREDICT.replace('out.ply', 'f.ply')}", fifo("f.ply"), "FIFO"),
+    Fault("a FIFO as an image to write", DRAW.replace("x.png", "f.png"), fifo("f.png"), "FIFO"),
+    Fault("an output that is a folder", PREDICT.replace("out.ply", "d.ply"), lambda f: (f / "d.ply").mkdir(), "--out d.ply"),
+    Fault("an output in a missing folder", PREDICT.replace("out.ply", "no/out.ply"), says="existing folder"),
+    Fault("an output in a file", PREDICT.replace("out.ply", "scene.ply/out.ply"), says="existing folder"),
+    Fault("an output of 300 bytes", PREDICT.replace("out.ply", f"{_LONG}.ply"), says="too long"),
+    Fault("an output of 250 bytes works", PREDICT.replace("out.ply", f"{'a' * 250}.ply"), status=0),
+    Fault("an output in /proc", PREDICT.replace("out.ply", "/proc/out.ply"), says="/proc/out.ply"),
+    *(Fault(f"{command[:12]}: an output folder that is a file", command.format("scene.ply"), says="scene.ply") for command in (
+        "evaluate pair --model sphere --out {}", "data homes --out {}", "bench model --out {}", "bench memory --out {}",
+        "pansplat-view scene.ply --offscreen {}", "pansplat-train tiny --out {}")),
+    *(Fault(f"{command[:12]}: an output folder of 300 bytes", command.format(_LONG), says="too long") for command in (
+        "evaluate pair --model sphere --out {}", "data homes --out {}", "bench refine --out {}",
+        "pansplat-view scene.ply --offscreen {}", "pansplat-train tiny --out {}")),
+    *(Fault(f"{command[:12]}: an output folder in a file", command.format("scene.ply/a/b"), says="scene.ply") for command in (
+        "evaluate pair --model sphere --out {}", "pansplat-view scene.ply --offscreen {}", "pansplat-train tiny --out {}")),
+    *(Fault(f"{command[:12]}: an output folder in /proc", command.format("/proc/a"), says="/proc") for command in (
+        "evaluate pair --model sphere --height 64 --out {}", "pansplat-train tiny --data.workers 0 --perceptual structure --device cpu --out {}")),
+    Fault("image: empty", PREDICT, picture(b""), "a.png"),
+    Fault("image: a text", PREDICT, picture(b"hello" * 50), "a.png"),
+    Fault("image: cut off", PREDICT, picture(lambda f: (f / "pair/a.png").read_bytes()[:-200]), "a.png"),
+    Fault("image: 10^6 x 5 10^5 pixels", PREDICT, picture(_PNG_BOMB), "a.png"),
+    Fault("image: one pixel", PREDICT, resized(1, 1), "2:1"),
+    Fault("image: square", PREDICT, resized(32, 32), "2:1"),
+    Fault("image: transparent", PREDICT, resized(32, 16, "RGBA"), "a.png"),
+    Fault("image: an EXR of NaN", PREDICT, exr(lambda data: data), "a.png"),
+    Fault("image: an EXR that is cut off", PREDICT, exr(lambda data: data[:-90]), "a.png"),
+    Fault("image: an EXR header only", PREDICT, exr(lambda data: data[:40]), "a.png"),
+    Fault("image: a folder", PREDICT, lambda f: ((f / "pair/a.png").unlink(), (f / "pair/a.png").mkdir()), "a.png"),
+    Fault("image: missing", PREDICT, lambda f: (f / "pair/a.png").unlink(), "a.png"),
+    Fault("mask: of a text", PREDICT, lambda f: (f / "pair/a_mask.png").write_text("x"), "a_mask.png"),
+    Fault("mask: black", PREDICT, lambda f: Image.new("L", (32, 16)).save(f / "pair/a_mask.png"), "a_mask.png"),
+    Fault("a pair that is an empty folder", "predict empty -o out.ply", lambda f: (f / "empty").mkdir(), "empty"),
+    Fault("a pair that is missing", "predict nowhere -o out.ply", says="nowhere"),
+    Fault("a pair that is a picture", "predict pair/a.png -o out.ply", says="a.png"),
+    Fault("a pair in the home of an unknown user", "predict ~nobody-at-all/x -o out.ply", says="~nobody-at-all"),
+]  # fmt: skip
+
+TABLE = {"scene": SCENES, "size": SIZES, "number": NUMBERS, "checkpoint": CHECKPOINTS, "file": FILES}
+FAULTS = [pytest.param(fault, id=f"{group}: {fault.name}") for group, faults in TABLE.items() for fault in faults]
+
+
+def test_the_table_has_at_least_120_faults_with_distinct_names() -> None:
+    names = [parameter.id for parameter in FAULTS]
+    assert len(set(names)) == len(names) >= 120
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_one_line_with_a_status(fault: Fault, folder: Path, attack: Callable[..., Any]) -> None:
+    fault.damage(folder)
+    outcome = attack(fault.command.split(" "))
+    assert outcome.status == fault.status, outcome
+    assert fault.says in outcome.err, outcome
+    assert not (folder / "executed").exists()
+
+
+@contextmanager
+def full_disk(limit: int) -> Iterator[None]:
+    """Files end after `limit` bytes, as on a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize("name", ["x.exr", "x.png", "x.jpg", "x.webp", "x.mp4"])
+def test_an_image_on_a_full_disk_is_one_line(name: str, folder: Path, attack: Callable[..., Any]) -> None:
+    command = f"render scene.ply -o {name} --height 64" + (" --seconds 0.1" if name.endswith("mp4") else "")
+    with full_disk(300):
+        outcome = attack(command.split())
+    assert outcome.status == 2 and name in outcome.err and "free disk space" in outcome.err
+    assert not (folder / name).exists()
+
+
+@pytest.mark.parametrize("command", [PREDICT, "convert old.ckpt -o m.safetensors"])
+def test_a_file_on_a_full_disk_is_one_line(command: str, folder: Path, attack: Callable[..., Any]) -> None:
+    if command == PREDICT:
+        with full_disk(2000):
+            outcome = attack(command.split())
+        assert outcome.status == 2 and "free disk space" in outcome.err
+    else:
+        from pansplat.errors import InputError
+        from pansplat.model.weights import WeightsFile, save_weights
+
+        weights = WeightsFile("pansplat", {}, "fixed", {"a": torch.zeros(10_000)})
+        with full_disk(2000), pytest.raises(InputError, match="free disk space"):
+            save_weights(folder / "m.safetensors", weights)
+        assert not (folder / "m.safetensors").exists()
