@@ -286,8 +286,9 @@ def main() -> None:
     parser.add_argument("--sources", type=Path, required=True, help="folder filled by fetch.sh")
     parser.add_argument("--out", type=Path, required=True, help="pair folder to write")
     parser.add_argument("--seed", type=int, default=0, help="0 is the shipped room")
-    parser.add_argument("--height", type=int, default=768, help="of the panoramas, pixels")
-    parser.add_argument("--samples", type=int, default=48, help="light paths a pixel")
+    parser.add_argument("--height", type=int, default=2048, help="of the panoramas, pixels")
+    parser.add_argument("--depth-height", type=int, default=768, help="of the depth maps, pixels")
+    parser.add_argument("--samples", type=int, default=14, help="light paths a pixel")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--views", nargs="+", default=list(panoramas.VIEWS), choices=list(panoramas.VIEWS))
     options = parser.parse_args()
@@ -295,7 +296,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         room = build(options.sources.resolve(), Path(scratch), options.seed)
         panoramas.render_all(
-            options.out, options.views, options.height, options.samples, options.threads, Path(scratch)
+            options.out,
+            options.views,
+            (options.height, options.depth_height),
+            options.samples,
+            options.threads,
+            Path(scratch),
         )
     panoramas.write_credits(options.out / "credits.json", room.credits.values())
 

@@ -26,6 +26,7 @@ VIEWS = {
     "right": ((0.5, -0.3, 1.5), (-22.0, -1.0, 2.0)),
 }
 NEAR, FAR = 0.45, 12.0
+_JPEG_QUALITY = 92
 _WORLD = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], float)
 _CAMERA = np.diag([1.0, -1.0, -1.0])
 
@@ -58,11 +59,14 @@ def _add_camera() -> bpy.types.Object:
     return item
 
 
-def _configure_cycles(height: int, samples: int, threads: int) -> None:
+def _set_height(height: int) -> None:
+    render = bpy.context.scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = 2 * height, height, 100
+
+
+def _configure_cycles(samples: int, threads: int) -> None:
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
-    scene.render.resolution_x, scene.render.resolution_y = 2 * height, height
-    scene.render.resolution_percentage = 100
     scene.render.threads_mode, scene.render.threads = "FIXED", threads
     scene.render.use_persistent_data = True
     cycles = scene.cycles
@@ -127,10 +131,12 @@ def _write_json(path: Path, content: object) -> None:
     os.replace(part, path)
 
 
-def render_all(out: Path, views: Sequence[str], height: int, samples: int, threads: int, scratch: Path) -> None:
-    """Render the named views and write the pair's folder."""
+def render_all(
+    out: Path, views: Sequence[str], heights: tuple[int, int], samples: int, threads: int, scratch: Path
+) -> None:
+    """Render the named views and write the pair's folder; `heights` are those of colour and of depth, pixels."""
     out.mkdir(parents=True, exist_ok=True)
-    _configure_cycles(height, samples, threads)
+    _configure_cycles(samples, threads)
     camera = _add_camera()
     poses = {}
     for name in views:
@@ -138,11 +144,13 @@ def render_all(out: Path, views: Sequence[str], height: int, samples: int, threa
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = blender_rotation(*angles), position
         camera.matrix_world = Matrix(matrix.tolist())
+        _set_height(heights[1])
         depth = _render_depth(scratch)
+        _set_height(heights[0])
         color = _render_color(scratch / f"{name}.png")
         millimetres = np.where(depth < 65.5, np.rint(depth * 1000), 0).astype(np.uint16)
         _save(Image.fromarray(millimetres), out / f"{name}_depth.png", optimize=True)
-        _save(Image.fromarray(color), out / f"{name}.jpg", quality=94, subsampling=0, optimize=True)
+        _save(Image.fromarray(color), out / f"{name}.jpg", quality=_JPEG_QUALITY, optimize=True)
         print(f"{name}: depth {depth.min():.3f} to {depth.max():.3f} m", flush=True)
     for name, (position, angles) in VIEWS.items():
         pose = np.round(cam2world(position, angles), 15) + 0.0

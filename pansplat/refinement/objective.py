@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from pansplat.geometry.equirect import row_weights
 
-_BLOCKS = 16  # rows of held-out blocks
+_BLOCKS = 32  # rows of held-out blocks
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,7 @@ from importlib.resources import files
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from pansplat.data.masks import mask_holes
 from pansplat.data.views import Views
@@ -32,11 +33,13 @@ from pansplat.refinement.budget import MAX_OTHERS, drop_unseen, merge_to
 from pansplat.refinement.objective import Photograph, image_difference
 from pansplat.refinement.parameters import CameraParameters, LearningRates, ViewParameters
 from pansplat.rendering import rasterize
+from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 
 _RATE_FLOOR = 0.05  # of the learning rates at the end
 _CHECK_EVERY = 10  # steps between checks of the held-out error
 _MIN_IMPROVEMENT = 0.002  # relative decrease of the held-out error below which it stagnates
 _PATIENCE = 3  # checks without a sufficient decrease
+_MIN_EPSILON = 1e-15  # of Adam
 _POSE_TOLERANCE = 1e-3  # between the entries of the poses of scene and photographs
 
 
@@ -61,12 +64,18 @@ class RefineConfig:
     """Whether small corrections of the poses are estimated."""
     pose_hold: float = 100.0
     """Weight of the squared corrections, in radians and relative to the baseline."""
+    height: int = 512
+    """Largest height of the images that are compared; colours are fitted at the photographs' own height."""
+    colors: ColorFitConfig = field(default_factory=ColorFitConfig)
+    """Settings of the fit of colours at the end."""
     held_out: float = 0.04
     """Fraction of the blocks of the photographs that are held out."""
     release: float = 0.75
     """Fraction of the run after which held-out blocks are fitted too."""
     betas: tuple[float, float] = (0.9, 0.99)
     """Decay of Adam's averages of the gradients and of their squares."""
+    damping: float = 0.1
+    """Adam's epsilon relative to the root mean square of the first gradients; Gaussians of little effect move less."""
 
     def __post_init__(self) -> None:
         if self.gaussians is not None and self.gaussians < 1:
@@ -114,11 +123,17 @@ class Refinement:
         _check_fit(scene, views)
         self.config = config or RefineConfig()
         device, random = scene.gaussians.means.device, torch.Generator().manual_seed(seed)
+        self._images = views.images.float().to(device)
+        self._masks = views.masks.to(device)
+        compared = (views.masks & mask_holes(views.images)).to(device)
+        height = min(self._images.shape[-2], self.config.height)
+        self._size = (height, 2 * height)
         self._photographs = [
-            Photograph.split(image.float().to(device), mask.to(device), self.config.held_out, random)
-            for image, mask in zip(views.images, views.masks & mask_holes(views.images), strict=True)
+            Photograph.split(image, mask > 0.999, self.config.held_out, random)
+            for image, mask in zip(
+                self._shrink(self._images), self._shrink(compared[:, None].float())[:, 0], strict=True
+            )
         ]
-        self._size = (int(views.images.shape[-2]), int(views.images.shape[-1]))
         limit = self.config.gaussians
         if limit is not None and len(scene.gaussians) > limit:
             scene = merge_to(scene, self._size, limit)
@@ -135,6 +150,10 @@ class Refinement:
         self._steps = 0
         self._result: Scene | None = None
 
+    def _shrink(self, images: Tensor) -> Tensor:
+        """Images (n, c, h, w) at the size of the comparison, by area average."""
+        return images if images.shape[-2:] == self._size else functional.interpolate(images, self._size, mode="area")
+
     def _make_optimizer(self) -> torch.optim.Adam:
         rates = dataclasses.asdict(self.config.rates)
         groups = [{"params": [self._cameras.log_gains], "lr": rates["gain"]}]
@@ -144,7 +163,7 @@ class Refinement:
             groups.append({"params": [view.tensors[name] for view in self._views.values()], "lr": rates[name]})
         for group in groups:
             group["initial_lr"] = group["lr"]
-        return torch.optim.Adam(groups, betas=self.config.betas, eps=1e-15, foreach=True)
+        return torch.optim.Adam(groups, betas=self.config.betas, eps=_MIN_EPSILON, foreach=True)
 
     def step(self, fraction: float) -> None:
         """Rasterise and compare each view once, and move the Gaussians.
@@ -169,10 +188,19 @@ class Refinement:
             (config.pose_hold * self._cameras.twists.square().sum()).backward()
         for parameters in self._views.values():
             parameters.clean_gradients()
+        if not self._steps:
+            self._set_damping()
         self._optimizer.step()
         for parameters in self._views.values():
             parameters.clamp()
         self._steps += 1
+
+    def _set_damping(self) -> None:
+        for group in self._optimizer.param_groups:
+            gradients = [p.grad.flatten() for p in group["params"] if p.grad is not None]
+            if gradients:
+                scale = float(torch.cat(gradients).square().mean().sqrt())
+                group["eps"] = max(self.config.damping * scale, _MIN_EPSILON)
 
     def _choose_target(self, view: int) -> int:
         """The photograph that a view is compared with: its own in even steps, the others in turn in odd ones."""
@@ -188,11 +216,14 @@ class Refinement:
 
     @torch.no_grad()
     def held_out_error(self) -> float:
-        """Mean absolute error of the held-out blocks, over all views and their photographs."""
+        """Mean absolute error of the held-out blocks, over all views and the photographs of other cameras.
+
+        The colours may have been fitted to a view's own photograph; it counts if there is no other one.
+        """
         error = weight = 0.0
         for view, parameters in self._views.items():
             gaussians = parameters.build()
-            for target in self._targets[view]:
+            for target in self._targets[view][1:] or [view]:
                 photograph = self._photographs[target]
                 difference = (self._draw(gaussians, view, target) - photograph.image).abs().mean(0)
                 error += float((difference * photograph.held_out).sum())
@@ -244,7 +275,7 @@ class Refinement:
         report = progress or (lambda what, fraction: None)
         start = clock.elapsed
         before = best = self.held_out_error()
-        clock.reserve(2 * (clock.elapsed - start))  # for the error and the contributions at the end
+        clock.reserve(self._end_cost() * (clock.elapsed - start))
         history, stale, stopped = [(0, clock.elapsed, before)], 0, "done"
         while self._views and (fraction := clock.fraction) < 1:
             if should_stop():
@@ -266,10 +297,24 @@ class Refinement:
         history.append((clock.steps, clock.elapsed, after))
         report("refined", 1.0)
         if after <= before:
-            self._result = drop_unseen(self.scene(), self._size)
+            self._result = self._finish(drop_unseen(self.scene(), self._size))
         else:
             self._result, stopped = self._start, "worse"
         return RefineReport(clock.steps, clock.elapsed, stopped, before, after, self.gains, tuple(history))
+
+    def _end_cost(self) -> float:
+        """Approximate duration of the last error, the contributions and the fit of colours, relative to an error."""
+        views, images = len(self._views), sum(max(len(targets) - 1, 1) for targets in self._targets.values())
+        pixels = self._images[0, 0].numel() / math.prod(self._size)
+        colors = (
+            views * pixels * (2.7 * self.config.colors.steps + 1.7)
+        )  # a gradient takes 1.7 times as long as an image
+        return 1 + (images + views + colors) / max(images, 1)
+
+    def _finish(self, scene: Scene) -> Scene:
+        """Fit the colours to the photographs at their own size."""
+        colors = fit_colors(scene.gaussians, self._images, scene.cam2world, self._masks, self.config.colors)
+        return dataclasses.replace(scene, gaussians=colors)
 
 
 class _Clock:

@@ -1,15 +1,17 @@
 """From surfaces to Gaussians: the spherical Gaussian pyramid on Fibonacci lattices.
 
 Levels 0 and 1 are discs on the surface, with gaps at depth discontinuities; level 0 is used only where level 1 would
-lose image detail. Levels 2 and 3 are a closed background layer slightly behind the surface: at every discontinuity it
-continues the far side, so that a moving camera sees no holes. Points in the consistent free space of another view are
-removed.
+lose image detail. Where a large panorama has detail that a lattice of half its height would lose, finer lattices
+replace the points of level 0. Levels 2 and 3 are a closed background layer slightly behind the surface: at every
+discontinuity it continues the far side, so that a moving camera sees no holes. Points in the consistent free space of
+another view are removed.
 
 Source: PanSplat, section 3.3 (lattices and levels).
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -32,6 +34,7 @@ from pansplat.sweep.surface import (
     nearest_pixel,
     pad_sphere,
     pixel_coordinates,
+    resize_mask,
     resize_sphere,
     world_points,
 )
@@ -45,6 +48,8 @@ _MIN_DISTANCE = 0.5  # smallest distance of a Gaussian from an input camera, rel
 class LiftConfig:
     """Settings of the Gaussians' sizes, opacities and levels."""
 
+    surface_height: int = 512
+    """Least height of the surface of a panorama of twice this height or more."""
     footprint: float = 0.7
     """Standard deviation of a disc, in lattice spacings."""
     thickness: float = 0.1
@@ -57,6 +62,10 @@ class LiftConfig:
     """Distance over which the background is extended in front of a discontinuity, pixels of the level."""
     detail: float = 0.02
     """Largest colour error of level 1."""
+    fine_detail: float = 0.03
+    """Largest colour error of a lattice where no finer one replaces it."""
+    fine_points: int = 800_000
+    """Largest number of a view's points on the finer lattices; a larger error is allowed where they do not suffice."""
     discontinuity: float = 0.06
     """Relative change of inverse depth between pixels at a discontinuity."""
     consistent_opacity: float = 0.95
@@ -68,20 +77,28 @@ class LiftConfig:
 
 
 def lift(posed: PosedImages, surfaces: list[Surface], config: LiftConfig) -> Gaussians:
-    """The Gaussians of all views and levels, ordered by level, then view, then lattice point."""
-    height = posed.images.shape[1]
-    if surfaces[0].height != height:
+    """The Gaussians of all views and levels, ordered by level, then view, then lattice (finest first) and point."""
+    photographs, heights = posed.images, _lattice_heights(posed.images.shape[1], config.surface_height)
+    posed = posed.resize(heights[-1])
+    if surfaces[0].height != heights[-1]:
         surfaces = [
             guided_upsample(s, resize_sphere(image, s.height), image)
             for s, image in zip(surfaces, posed.images, strict=True)
         ]
-    consistent = [consistency_mask(surfaces, posed.cam2world, view) for view in range(len(surfaces))]
-    surfaces = [_remove_inconsistent(posed, surfaces, consistent, view, config) for view in range(len(surfaces))]
-    parts = [
-        _lift_level(posed, surfaces, consistent, view, level, config)
-        for level in range(NUM_LEVELS)
-        for view in range(len(surfaces))
-    ]
+    views = range(len(surfaces))
+    consistent = [consistency_mask(surfaces, posed.cam2world, view) for view in views]
+    surfaces = [_remove_inconsistent(posed, surfaces, consistent, view, config) for view in views]
+    scene = _PosedSurfaces(posed, surfaces, consistent, config)
+    fine = [_choose_fine_pixels(image, heights, config) for image in photographs]
+    parts = []
+    for level in range(NUM_LEVELS):
+        for view in views:
+            if level == 0:
+                parts += [
+                    _lift_fine(scene, view, resize_sphere(photographs[view], height), chosen)
+                    for height, chosen in zip(heights[:-1], fine[view][:-1], strict=True)
+                ]
+            parts.append(_lift_level(scene, view, level, fine[view][-1]))
     return Gaussians.cat(parts)
 
 
@@ -108,34 +125,96 @@ def _background_inverse_depth(inverse: np.ndarray, mask: np.ndarray, level: int,
     return cv2.GaussianBlur(far, (0, 0), reach / 2)[2 * reach : -2 * reach, 2 * reach : -2 * reach]
 
 
-def _lift_level(
-    posed: PosedImages, surfaces: list[Surface], consistent: list[np.ndarray], view: int, level: int, config: LiftConfig
+@dataclass(frozen=True, eq=False)
+class _PosedSurfaces:
+    """The panoramas at the height of the surfaces, the surfaces, and where each is consistent with another."""
+
+    posed: PosedImages
+    surfaces: list[Surface]
+    consistent: list[np.ndarray]
+    config: LiftConfig
+
+
+def _lattice_heights(height: int, surface_height: int) -> list[int]:
+    """Heights of level 0's lattices, finest first; each is twice the next, and the last is the surface's."""
+    finer = max((height // surface_height).bit_length() - 1, 0)
+    base = height if not finer else 8 * round(height / (8 << finer))
+    return [base << n for n in range(finer, -1, -1)]
+
+
+def _choose_fine_pixels(image: np.ndarray, heights: list[int], config: LiftConfig) -> list[np.ndarray]:
+    """Masks (h, 2h) of the pixels that each lattice finer than the surface holds, and of those that any of them holds.
+
+    A lattice is replaced by a finer one where it would lose detail of the panorama.
+    """
+    errors = []
+    for height, coarser in itertools.pairwise(heights):
+        detail = resize_sphere(image, height)
+        error = np.abs(detail - resize_sphere(resize_sphere(detail, coarser), height)).max(axis=2)
+        errors.append(_window_extremum(error, 1, largest=True))
+    limit = config.fine_detail
+    while True:
+        masks, count = [], 0.0
+        finer = np.zeros((heights[0], 2 * heights[0]), bool)
+        for height, error in zip(heights[:-1], errors, strict=True):
+            split = _any_in_blocks((error > limit) | finer)
+            masks.append(np.repeat(np.repeat(split, 2, axis=0), 2, axis=1) & ~finer)
+            count += lattice_size(2 * height) * _area_fraction(masks[-1])
+            finer = split
+        if count <= config.fine_points:
+            return [*masks, finer]
+        limit *= 1.2
+
+
+def _any_in_blocks(mask: np.ndarray) -> np.ndarray:
+    """Whether any pixel of each block of 2 x 2 is set."""
+    return mask[0::2, 0::2] | mask[1::2, 0::2] | mask[0::2, 1::2] | mask[1::2, 1::2]
+
+
+def _area_fraction(mask: np.ndarray) -> float:
+    """Fraction of the sphere that a mask (h, w) covers."""
+    areas = np.cos(((np.arange(len(mask)) + 0.5) / len(mask) - 0.5) * math.pi)
+    return float(mask.mean(axis=1) @ areas / areas.sum())
+
+
+def _lift_fine(scene: _PosedSurfaces, view: int, image: np.ndarray, chosen: np.ndarray) -> Gaussians:
+    """The points of level 0 on a lattice that is finer than the surface."""
+    chosen = chosen & resize_mask(scene.posed.masks[view], len(image))
+    fine = guided_upsample(scene.surfaces[view], scene.posed.images[view], image, chosen)
+    return _lift_lattice(scene, view, 0, image, fine.inverse_depth, chosen)
+
+
+def _lift_level(scene: _PosedSurfaces, view: int, level: int, replaced: np.ndarray) -> Gaussians:
+    """The points of a level that finer lattices do not replace."""
+    image, inverse, mask = scene.posed.images[view], scene.surfaces[view].inverse_depth, scene.posed.masks[view]
+    if level >= 2:
+        color, inverse = _background_layer(image, inverse, mask, level, scene.config)
+        return _lift_lattice(scene, view, level, color, inverse, mask)
+    needed = mask & ~replaced & (_choose_levels(image, inverse, scene.config) == level)
+    height = len(image) >> level
+    return _lift_lattice(scene, view, level, resize_sphere(image, height), resize_sphere(inverse, height), needed)
+
+
+def _lift_lattice(
+    scene: _PosedSurfaces, view: int, level: int, image: np.ndarray, inverse: np.ndarray, needed: np.ndarray
 ) -> Gaussians:
-    image, inverse, mask = posed.images[view], surfaces[view].inverse_depth, posed.masks[view]
-    height = image.shape[0] >> level
-    color_map = resize_sphere(image, height)
-    if level < 2:
-        level_inverse = resize_sphere(inverse, height) if level else inverse
-        needed = mask & (_choose_levels(image, inverse, config) == level)
-    else:
-        color_map, level_inverse = _background_layer(image, inverse, mask, level, config)
-        needed = mask
-    count = lattice_size(2 * height)
+    """The points of a lattice with the spacing of the image's pixels, where they are needed."""
+    config, pose = scene.config, scene.posed.cam2world[view]
+    count = lattice_size(2 * len(image))
     rays = fibonacci_directions(count).numpy()
-    row, column = nearest_pixel(rays, mask.shape[0])
-    chosen = needed[row, column]
-    rays = rays[chosen]
-    row, column = nearest_pixel(rays, height)
-    inverse_depth = np.maximum(level_inverse[row, column].astype(np.float64), 1e-6)
-    pose = posed.cam2world[view]
+    row, column = nearest_pixel(rays, len(needed))
+    rays = rays[needed[row, column]]
+    row, column = nearest_pixel(rays, len(inverse))
+    inverse_depth = np.maximum(inverse[row, column].astype(np.float64), 1e-6)
     points = (rays / inverse_depth[:, None]) @ pose[:3, :3].T + pose[:3, 3]
-    opacity, kept = _estimate_opacity(points, posed, surfaces, consistent, view, config)
+    opacity, kept = _estimate_opacity(points, scene.posed, scene.surfaces, scene.consistent, view, config)
     spacing = math.sqrt(4 * math.pi / count)
     rays, inverse_depth, points, opacity = rays[kept], inverse_depth[kept], points[kept], opacity[kept]
-    row, column = row[kept], column[kept]
-    gradient = _differentiate_log(level_inverse, config.discontinuity if level < 2 else math.inf)[row, column]
+    sloped = inverse if level else scene.surfaces[view].inverse_depth
+    row, column = nearest_pixel(rays, len(sloped))
+    gradient = _differentiate_log(sloped, config.discontinuity if level < 2 else math.inf)[row, column]
     axes, scales = _shape_discs(rays, inverse_depth, gradient, spacing, level, config)
-    color = _sample_bilinear(color_map, rays)
+    color = _sample_bilinear(image, rays)
     quats = quats_from_rotations(torch.from_numpy(pose[:3, :3] @ axes))
     return Gaussians(
         means=torch.from_numpy(points).float(),

@@ -17,6 +17,7 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import fit_panoramas
 from pansplat.geometry.world import require_depth_range, scale_poses, working_factor
 from pansplat.predictor import Progress
+from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.sweep.lift import LiftConfig, lift
 from pansplat.sweep.prior import PriorModel
 from pansplat.sweep.search import PosedImages, SearchConfig, search_surfaces
@@ -31,6 +32,7 @@ class SweepConfig:
 
     search: SearchConfig = field(default_factory=SearchConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
+    colors: ColorFitConfig = field(default_factory=ColorFitConfig)
 
 
 class Sweep:
@@ -101,9 +103,15 @@ class Sweep:
             far=high,
         )
         report = progress or (lambda what, fraction: None)
-        surfaces = search_surfaces(posed, self.config.search, lambda what, f: report(what, 0.85 * f), self.prior)
-        report("placing Gaussians", 0.85)
+        surfaces = search_surfaces(posed, self.config.search, lambda what, f: report(what, 0.7 * f), self.prior)
+        report("placing Gaussians", 0.7)
         gaussians = lift(posed, surfaces, self.config.lift)
+        report("fitting colours", 0.8)
+        # Holes of scans are fitted too: Gaussians next to a hole then do not reach into it.
+        visible = torch.ones_like(images[:, 0], dtype=torch.bool) if masks is None else masks
+        gaussians = fit_colors(
+            gaussians, images.detach().cpu(), torch.from_numpy(posed.cam2world), visible.cpu(), self.config.colors
+        )
         report("done", 1.0)
         return gaussians.scaled(1 / factor).to(device=images.device)
 

@@ -46,7 +46,7 @@ from pansplat.sweep.room_layout import (
     discount_contradicted,
     fit_walls,
 )
-from pansplat.sweep.surface import Surface, consistency_mask, guided_upsample, resize_sphere
+from pansplat.sweep.surface import Surface, consistency_mask, guided_upsample, resize_mask, resize_sphere
 
 _DETECTION_HEIGHT = 128  # pixels; planes and room layouts are detected at this size
 _FLOOR_THICKNESS = 2.5  # in bins of the planes' offsets
@@ -91,6 +91,13 @@ class PosedImages:
     def relative_pose(self, view: int, other: int) -> np.ndarray:
         """Pose (4, 4) from `view`'s camera to `other`'s."""
         return np.linalg.inv(self.cam2world[other]) @ self.cam2world[view]
+
+    def resize(self, height: int) -> PosedImages:
+        """The input at another height."""
+        if self.images.shape[1] == height:
+            return self
+        images = np.stack([resize_sphere(image, height) for image in self.images])
+        return dataclasses.replace(self, images=images, masks=np.stack([resize_mask(m, height) for m in self.masks]))
 
     @property
     def baseline(self) -> float:
@@ -181,10 +188,7 @@ class _SearchLevel:
         self.posed, self.height, self.limits, self.config, self.surfaces = posed, height, limits, config, surfaces
         self.rays = [axis_components(planes.axes, pose[:3, :3], height) for pose in posed.cam2world]
         self.planes = planes
-        masks = [
-            cv2.resize(mask.astype(np.uint8), (2 * height, height), interpolation=cv2.INTER_NEAREST) > 0
-            for mask in posed.masks
-        ]
+        masks = [resize_mask(mask, height) for mask in posed.masks]
         confidence: list[np.ndarray | None] = [None] * len(masks)
         if surfaces is not None:
             consistent = [consistency_mask(surfaces, posed.cam2world, view) & mask for view, mask in enumerate(masks)]

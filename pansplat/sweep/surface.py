@@ -51,6 +51,13 @@ def resize_sphere(image: np.ndarray, height: int) -> np.ndarray:
     return cv2.resize(image, (2 * height, height), interpolation=cv2.INTER_LINEAR)
 
 
+def resize_mask(mask: np.ndarray, height: int) -> np.ndarray:
+    """A panorama (h, w) of bool at another height, by the nearest pixel."""
+    return cv2.resize(mask.astype(np.uint8), (2 * height, height), interpolation=cv2.INTER_NEAREST) > 0
+
+
+_SMOOTH = 0.03  # largest relative change of inverse depth that is interpolated bilinearly
+
 CONSISTENT, OCCLUDED, FREE_SPACE = 0, 1, 2  # on, behind, or in front of another view's surface
 
 
@@ -101,7 +108,9 @@ def consistency_mask(
     return consistent
 
 
-def guided_upsample(surface: Surface, coarse: np.ndarray, fine: np.ndarray) -> Surface:
+def guided_upsample(
+    surface: Surface, coarse: np.ndarray, fine: np.ndarray, needed: np.ndarray | None = None
+) -> Surface:
     """The surface at the size of `fine`.
 
     Smooth parts are interpolated bilinearly. At a depth discontinuity a pixel takes the weighted median of its
@@ -109,23 +118,42 @@ def guided_upsample(surface: Surface, coarse: np.ndarray, fine: np.ndarray) -> S
 
     Args:
         coarse, fine: the view's image (h, w, 3) at the surface's size and at the new size.
+        needed: pixels (h, w) of the new size that are computed; the others are 0. All by default.
     """
-    return Surface(*_upsample(surface.inverse_depth, surface.orientation, coarse, fine))
+    if needed is None:
+        needed = np.ones(fine.shape[:2], bool)
+    return Surface(*_upsample(surface.inverse_depth, surface.orientation, coarse, fine, needed))
 
 
 @nb.njit(parallel=True, fastmath=True, cache=True)
-def _upsample(inverse, orientation, coarse, fine):
+def _upsample(inverse, orientation, coarse, fine, needed):
     h, w = inverse.shape
     height, width = fine.shape[:2]
-    result = np.empty((height, width), np.float32)
-    orientations = np.empty((height, width), np.uint8)
+    result = np.zeros((height, width), np.float32)
+    orientations = np.zeros((height, width), np.uint8)
     for i in nb.prange(height):
         values, weights = np.empty(25, np.float32), np.empty(25, np.float32)
         kinds = np.empty(25, np.uint8)
         y = (i + 0.5) * h / height - 0.5
         for j in range(width):
+            if not needed[i, j]:
+                continue
             x = (j + 0.5) * w / width - 0.5
             cy, cx = int(math.floor(y + 0.5)), int(math.floor(x + 0.5))
+            lowest, highest = np.inf, 0.0
+            for di in range(-2, 3):
+                for dj in range(-2, 3):
+                    value = inverse[min(max(cy + di, 0), h - 1), (cx + dj) % w]
+                    lowest, highest = min(lowest, value), max(highest, value)
+            y0, x0 = int(math.floor(y)), int(math.floor(x))
+            fy, fx = y - y0, x - x0
+            r0, r1 = min(max(y0, 0), h - 1), min(max(y0 + 1, 0), h - 1)
+            c0, c1 = x0 % w, (x0 + 1) % w
+            smooth = (inverse[r0, c0] * (1 - fx) + inverse[r0, c1] * fx) * (1 - fy)
+            smooth += (inverse[r1, c0] * (1 - fx) + inverse[r1, c1] * fx) * fy
+            if highest < (1 + _SMOOTH) * lowest:  # the median is close to the smooth value
+                result[i, j], orientations[i, j] = smooth, orientation[min(max(cy, 0), h - 1), cx % w]
+                continue
             n = 0
             total = 0.0
             for di in range(-2, 3):
@@ -148,13 +176,7 @@ def _upsample(inverse, orientation, coarse, fine):
                 if below >= 0.5 * total:
                     median = order[m]
                     break
-            y0, x0 = int(math.floor(y)), int(math.floor(x))
-            fy, fx = y - y0, x - x0
-            r0, r1 = min(max(y0, 0), h - 1), min(max(y0 + 1, 0), h - 1)
-            c0, c1 = x0 % w, (x0 + 1) % w
-            smooth = (inverse[r0, c0] * (1 - fx) + inverse[r0, c1] * fx) * (1 - fy)
-            smooth += (inverse[r1, c0] * (1 - fx) + inverse[r1, c1] * fx) * fy
-            close = abs(smooth / values[median] - 1) < 0.03
+            close = abs(smooth / values[median] - 1) < _SMOOTH
             result[i, j] = smooth if close else values[median]
             orientations[i, j] = kinds[median]
     return result, orientations

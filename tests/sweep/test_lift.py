@@ -187,3 +187,54 @@ def test_three_views_make_gaussians_of_three(three_views):
     assert gaussians.views.unique().tolist() == [0, 1, 2]
     fine = gaussians.means[gaussians.levels == 0].numpy()
     assert np.median(three_views.room.wall_distances(fine).min(axis=1)) < 0.05
+
+
+FINE = LiftConfig(surface_height=32)  # 32, 64 and 128 rows of points for a panorama of 128
+
+
+@pytest.fixture(scope="module")
+def detailed() -> tuple[PosedImages, list[Surface]]:
+    """Two cameras in a sphere; noise to the north, one colour elsewhere."""
+    image = np.full((128, 256, 3), 0.5, np.float32)
+    noise = np.random.default_rng(0).random((20, 30, 3), np.float32)
+    image[40:80, 100:160] = noise.repeat(2, axis=0).repeat(2, axis=1)
+    poses = np.stack([np.eye(4), np.eye(4)])
+    poses[1, 0, 3] = 0.02
+    posed = PosedImages(np.stack([image, image]), poses, np.ones((2, 128, 256), bool), near=0.5, far=10.0)
+    surface = Surface(np.full((32, 64), 0.5, np.float32), np.zeros((32, 64), np.uint8))
+    return posed, [surface, surface]
+
+
+def _density(gaussians: Gaussians, *, detail: bool) -> float:
+    """Points of levels 0 and 1 of view 0 for each point of the lattice of 128 rows, inside or outside of the detail."""
+    points = gaussians.select((gaussians.levels < 2) & (gaussians.views == 0)).means
+    u = torch.atan2(points[:, 0], points[:, 2]) / (2 * math.pi) + 0.5
+    v = torch.asin(points[:, 1] / points.norm(dim=1)) / math.pi + 0.5
+    inside = (u > 106 / 256) & (u < 154 / 256) & (v > 46 / 128) & (v < 74 / 128)
+    bands = torch.sin(torch.tensor([46 / 128, 74 / 128]) * math.pi - math.pi / 2)
+    area = float(bands[1] - bands[0]) / 2 * 48 / 256
+    return float(inside.sum()) / (area * lattice_size(256)) if detail else float((~inside).sum()) / lattice_size(256)
+
+
+def test_finer_lattices_replace_coarser_ones_where_a_large_panorama_has_detail(detailed):
+    gaussians = lift(*detailed, FINE)
+    assert _density(gaussians, detail=True) == pytest.approx(1, abs=0.05)
+    assert _density(gaussians, detail=False) < 0.12
+    assert gaussians.levels.unique().tolist() == list(range(NUM_LEVELS))
+
+
+def test_the_limit_of_fine_points_holds(detailed):
+    unlimited, limited = lift(*detailed, FINE), lift(*detailed, dataclasses.replace(FINE, fine_points=400))
+    coarse = len(lift(detailed[0].resize(32), detailed[1], FINE))
+    assert len(limited) < coarse + 2 * 400 < len(unlimited)
+
+
+def test_fine_lattices_draw_detail_that_a_coarse_one_loses(detailed):
+    posed, surfaces = detailed
+    image, pose = torch.from_numpy(posed.images[0]).permute(2, 0, 1), torch.eye(4)
+    errors = []
+    for config in (FINE, dataclasses.replace(FINE, fine_detail=1.0)):
+        gaussians = lift(posed, surfaces, config)
+        drawn = rasterize(gaussians.select(gaussians.views == 0), pose, size=(128, 256)).color
+        errors.append(float((drawn - image).abs().mean()))
+    assert errors[0] < 0.7 * errors[1]

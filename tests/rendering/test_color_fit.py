@@ -1,0 +1,91 @@
+"""Colours fitted to photographs."""
+
+import dataclasses
+import itertools
+
+import pytest
+import torch
+
+from pansplat.gaussians.scene import Gaussians
+from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.rendering import rasterize
+from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
+
+SIZE = (24, 48)
+POSES = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Gaussians:
+    """Two views with Gaussians of random colours on a sphere."""
+    count, random = 300, torch.Generator().manual_seed(0)
+    one = Gaussians(
+        means=2 * fibonacci_directions(count).float(),
+        scales=torch.full((count, 3), 0.12),
+        quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        opacities=torch.full((count,), 0.9),
+        harmonics=1.5 * torch.rand(count, 1, 3, generator=random) - 0.75,
+        levels=torch.zeros(count, dtype=torch.uint8),
+        views=torch.zeros(count, dtype=torch.uint8),
+    )
+    return Gaussians.cat([one, dataclasses.replace(one, views=torch.ones_like(one.views))])
+
+
+@pytest.fixture(scope="module")
+def photographs(truth) -> torch.Tensor:
+    return torch.stack([_draw(truth, view) for view in (0, 1)])
+
+
+def _draw(gaussians: Gaussians, view: int) -> torch.Tensor:
+    return rasterize(gaussians.select(gaussians.views == view), POSES[view], size=SIZE).color
+
+
+def _fit(gaussians: Gaussians, images: torch.Tensor, masks: torch.Tensor | None = None, steps: int = 3) -> Gaussians:
+    masks = torch.ones(2, *SIZE, dtype=torch.bool) if masks is None else masks
+    return fit_colors(gaussians, images, POSES, masks, ColorFitConfig(steps))
+
+
+def _grey(gaussians: Gaussians) -> Gaussians:
+    return dataclasses.replace(gaussians, harmonics=torch.zeros_like(gaussians.harmonics))
+
+
+def test_more_steps_bring_every_view_nearer_to_its_photograph(truth, photographs):
+    errors = [
+        [
+            float((_draw(_fit(_grey(truth), photographs, steps=steps), view) - photographs[view]).abs().mean())
+            for view in (0, 1)
+        ]
+        for steps in (0, 1, 4, 16)
+    ]
+    for before, after in itertools.pairwise(errors):
+        assert all(b < 0.75 * a for a, b in zip(before, after, strict=True))
+
+
+def test_true_colours_stay(truth, photographs):
+    assert torch.allclose(_fit(truth, photographs).harmonics, truth.harmonics, atol=1e-4)
+
+
+def test_masked_pixels_do_not_change_colours(truth, photographs):
+    masks = torch.ones(2, *SIZE, dtype=torch.bool)
+    masks[:, :, : SIZE[1] // 2] = False  # the west
+    spoiled = torch.where(masks[:, None], photographs, 1.0)
+    fitted = _fit(_grey(truth), spoiled, masks)
+    assert torch.equal(fitted.harmonics, _fit(_grey(truth), photographs, masks).harmonics)
+    west = truth.means[:, 0] < -0.5
+    assert not fitted.harmonics[west].any()
+    assert fitted.harmonics[truth.means[:, 0] > 0.5].abs().mean() > 0.2
+
+
+def test_colours_are_fitted_without_gradients_and_in_inference_mode(truth, photographs):
+    expected = _fit(_grey(truth), photographs).harmonics
+    for mode in (torch.no_grad, torch.inference_mode):
+        with mode():
+            fitted = _fit(_grey(truth), photographs).harmonics
+        assert torch.equal(fitted, expected) and not fitted.requires_grad
+
+
+def test_only_colours_change(truth, photographs):
+    fitted = _fit(_grey(truth), photographs)
+    for field in dataclasses.fields(Gaussians):
+        if field.name != "harmonics":
+            assert torch.equal(getattr(fitted, field.name), getattr(truth, field.name))
