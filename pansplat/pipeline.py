@@ -39,6 +39,9 @@ __all__ = ["load", "load_model", "load_pairs", "predict", "predict_to_file", "re
 
 Drawing = Literal["exact", "original"]
 
+_LEAST_HEIGHT = 64  # of all predictors, pixels
+_DEFAULT_HEIGHT = 512  # of networks; larger panoramas take minutes
+
 
 def load_model(
     name: str | Path = "default",
@@ -97,13 +100,18 @@ def _load_sweep(**options: Any) -> Predictor:
 _MODELS: dict[str, Callable[..., Predictor]] = {"default": _load_default, "sweep": _load_sweep}
 
 
+def choose_height(pair: Pair, predictor: Predictor) -> int:
+    """The height to predict a pair at: that of its photographs, at most the largest default of the predictor."""
+    return max(_LEAST_HEIGHT, min(pair.image_height, getattr(predictor, "default_height", _DEFAULT_HEIGHT)))
+
+
 def predict(
     source: Pair | Views | str | Path,
     model: str | Path | Predictor = "default",
     *,
     compat: CompatChoice = "trained",
     precision: Precision = "float32",
-    height: int = 512,
+    height: int | None = None,
     refine_seconds: float = 0.0,
     cache: bool = True,
     progress: Progress | None = None,
@@ -117,7 +125,8 @@ def predict(
         source: a pair, the path of a folder that holds exactly one pair, or loaded panoramas (never cached).
         model: the name of a predictor, a file of weights, or a predictor.
         compat, precision: see `load_model`; without effect on a predictor object.
-        height: panoramas are resized to (height, 2 height); loaded panoramas keep their size.
+        height: panoramas are resized to (height, 2 height); by default `choose_height`. Loaded panoramas keep their
+            size.
         refine_seconds: time limit of the refinement; 0 for none.
         cache: whether to read and write the cache.
         progress: called with a description of the current work and the completed fraction.
@@ -130,6 +139,7 @@ def predict(
         raise InputError(f"`refine_seconds` must be at least 0, got {refine_seconds}")
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
     pair = _load_only_pair(source) if isinstance(source, (str, Path)) else source
+    height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
     views = pair if isinstance(pair, Views) else pair.load_context(height)
     cached_pair = pair if cache and isinstance(pair, Pair) else None
     report: Progress = progress or (lambda what, fraction: None)
@@ -214,7 +224,7 @@ def predict_to_file(
     *,
     compat: CompatChoice = "trained",
     precision: Precision = "float32",
-    height: int = 512,
+    height: int | None = None,
     degree: int | None = None,
     min_opacity: float = 0.0,
     progress: Progress | None = None,
@@ -242,7 +252,7 @@ def predict_to_file(
             f"`model` must be a network to write tile by tile, got {predictor.name}; use `predict` and `save`"
         )
     pair = _load_only_pair(source) if isinstance(source, (str, Path)) else source
-    views = pair if isinstance(pair, Views) else pair.load_context(height)
+    views = pair if isinstance(pair, Views) else pair.load_context(height or choose_height(pair, predictor))
     parts: Iterator[Gaussians] = predictor.stream(  # pyright: ignore[reportAttributeAccessIssue]
         views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress
     )

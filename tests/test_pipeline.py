@@ -36,6 +36,22 @@ def test_a_predicted_scene_holds_its_cameras_and_predictor_name(scene: Scene) ->
     assert (scene.model, scene.height, scene.names) == ("sphere", HEIGHT, ("left", "right"))
 
 
+@pytest.mark.parametrize(
+    ("photographs", "largest", "expected"), [(32, None, 64), (300, None, 300), (2048, None, 512), (2048, 1024, 1024)]
+)
+def test_the_default_height_is_that_of_the_smallest_photograph_within_the_predictors_limit(
+    pair_folder: Path, sphere_predictor, photographs: int, largest: int | None, expected: int
+) -> None:
+    predictor, pair = sphere_predictor(), pipeline.load_pairs(pair_folder)[0]
+    if largest is not None:
+        predictor.default_height = largest
+    for panorama, height in zip(pair.context, (photographs, 2 * photographs), strict=True):
+        Image.new("RGB", (2 * height, height), "red").save(panorama.image)
+    assert pipeline.choose_height(pair, predictor) == expected
+    if expected == 64:
+        assert predict(pair_folder, predictor, cache=False).height == expected
+
+
 def test_predict_refuses_a_folder_of_several_pairs(tmp_path: Path, sphere_predictor, write_pair) -> None:
     for index in range(2):
         write_pair(tmp_path / "pairs" / f"room{index}", seed=index)

@@ -36,8 +36,9 @@ class Options:
     """For a network: as the official code, with its defects fixed, or as the weights were trained."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """Type of a network's convolutions; bfloat16 is faster on CPUs that support it, and less accurate."""
-    height: Height = 512
-    """Height of the panoramas that the prediction reads, pixels."""
+    height: Height | None = None
+    """Height of the panoramas that the prediction reads, pixels; by default that of the photographs, at most 1024 (for
+    networks 512)."""
     refine: Seconds = 10.0
     """Time limit of the refinement after the prediction, seconds; 0 for none. A window shows the prediction first."""
     no_cache: bool = False

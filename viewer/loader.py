@@ -63,7 +63,7 @@ class LoadOptions:
     model: str = "default"
     compat: Literal["trained", "official", "fixed"] = "trained"
     precision: Literal["float32", "bfloat16"] = "float32"
-    height: int = 512
+    height: int | None = None
     refine_seconds: float = 10.0
     cache: bool = True
     convention: str | None = None
@@ -122,7 +122,7 @@ def load_entry(
         nonlocal images
         if photos and images is None:
             assert entry.pair is not None
-            images = entry.pair.load_context(max(PHOTO_HEIGHT, options.height))
+            images = entry.pair.load_context(max(PHOTO_HEIGHT, options.height or 0))
         return images
 
     def show_prediction(scene: "Scene") -> None:

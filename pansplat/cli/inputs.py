@@ -62,7 +62,9 @@ def choose_pair(path: Path, choice: PairChoice) -> Pair:
     raise InputError(f"--pair {choice.pair}: {path} holds {listed}")
 
 
-def predict_scene(pair: Pair, model: Predictor, height: int, *, cache: bool, refine_seconds: float = 0.0) -> Scene:
+def predict_scene(
+    pair: Pair, model: Predictor, height: int | None, *, cache: bool, refine_seconds: float = 0.0
+) -> Scene:
     """Predict and refine a scene, and show a progress bar."""
     from pansplat import pipeline
 

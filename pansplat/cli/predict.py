@@ -45,8 +45,9 @@ class Predict:
     that the weights were trained with, which is official for official weights."""
     precision: Precision = "float32"
     """Number type of a network's convolutions; bfloat16 is less exact, and faster if the processor supports it."""
-    height: Height = 512
-    """Panoramas are resized to this height, pixels. Networks predict heights above 512 tile by tile, in bounded
+    height: Height | None = None
+    """Panoramas are resized to this height, pixels; by default that of the photographs, at most 1024 (for networks
+    512). Networks predict heights above 512 tile by tile, in bounded
     memory, and do not cache the result."""
     refine: Seconds = 0.0
     """Time limit of the refinement after the prediction, seconds; 0 for none. `pansplat refine` has more options."""
@@ -78,18 +79,19 @@ class Predict:
         from pansplat import pipeline
         from pansplat.gaussians.scene import prune
 
-        if self.height > _MAX_CACHED_HEIGHT and not self.refine and pipeline.can_stream(model):
+        height = self.height or pipeline.choose_height(pair, model)
+        if height > _MAX_CACHED_HEIGHT and not self.refine and pipeline.can_stream(model):
             with progress_bar() as progress:
                 return pipeline.predict_to_file(
                     pair,
                     self.out,
                     model,
-                    height=self.height,
+                    height=height,
                     degree=self.degree,
                     min_opacity=self.min_opacity,
                     progress=progress,
                 )
-        scene = predict_scene(pair, model, self.height, cache=not self.no_cache, refine_seconds=self.refine)
+        scene = predict_scene(pair, model, height, cache=not self.no_cache, refine_seconds=self.refine)
         gaussians = prune(scene.gaussians, degree=self.degree, min_opacity=self.min_opacity)
         pipeline.save(dataclasses.replace(scene, gaussians=gaussians), self.out)
         return len(gaussians)

@@ -63,7 +63,8 @@ class Refine:
     precision: Precision = "float32"
     """Number type of a network's convolutions."""
     height: Height | None = None
-    """The photographs are resized to this height, pixels; by default that of the scene, for a pair 512."""
+    """The photographs are resized to this height, pixels; by default that of the scene. For a pair that of its
+    files, at most 1024 (for networks 512)."""
     choice: PairChoice = field(default_factory=PairChoice)
 
     def run(self) -> int:
@@ -112,8 +113,9 @@ class Refine:
         if self.photographs is not None:
             scene = pipeline.load(self.path)
             return scene, choose_pair(self.photographs, self.choice).load_context(self.height or scene.height)
-        pair, height = choose_pair(self.path, self.choice), self.height or 512
+        pair = choose_pair(self.path, self.choice)
         model = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
+        height = self.height or pipeline.choose_height(pair, model)
         return predict_scene(pair, model, height, cache=True), pair.load_context(height)
 
 

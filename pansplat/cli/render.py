@@ -69,8 +69,9 @@ class Render:
     """Number type of a network's convolutions."""
     refine: Seconds = 10.0
     """Time limit of the refinement after the prediction, for a pair, seconds; 0 for none."""
-    predict_height: Height = 512
-    """Height that the panoramas are resized to before the prediction, for a pair."""
+    predict_height: Height | None = None
+    """Height that the panoramas are resized to before the prediction, for a pair; by default that of the photographs,
+    at most 1024 (for networks 512)."""
     choice: PairChoice = field(default_factory=PairChoice)
 
     def run(self) -> int:

@@ -79,6 +79,19 @@ def read_panorama(
     return image, torch.from_numpy(opaque)
 
 
+def read_height(path: Path | str) -> int:
+    """Height of an image file, pixels; pixels of an EXR are decoded, those of other formats are not.
+
+    Raises:
+        InputError: no such file, or an unknown format.
+    """
+    path = Path(path)
+    data = _read_bytes(path)
+    if data.startswith(_EXR_MAGIC):
+        return len(_decode_exr(path).color)
+    return _open_with_pillow(path, data, load=False).height
+
+
 def read_thumbnail(path: Path | str, height: int) -> Float[Tensor, "3 height width"]:
     """A panorama at a small size; faster than `read_panorama`, because JPEGs are decoded at reduced size. No alpha."""
     return resize_panorama(_decode_panorama(path, height, reduced=True).color, height)
@@ -255,15 +268,16 @@ def _decode(path: Path, at_least: int | None = None) -> _DecodedImage:
     return _DecodedImage(np.asarray(image.convert("RGB")), None)
 
 
-def _open_with_pillow(path: Path, data: bytes, at_least: int | None = None) -> Image.Image:
-    """The fully decoded image. Unlike OpenCV, Pillow raises an error for truncated data."""
+def _open_with_pillow(path: Path, data: bytes, at_least: int | None = None, *, load: bool = True) -> Image.Image:
+    """The fully decoded image, or with `load=False` its header. Unlike OpenCV, Pillow refuses truncated data."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # panoramas of 100 megapixels are normal
             image = Image.open(io.BytesIO(data), formats=_PILLOW_FORMATS)
             if at_least is not None:
                 image.draft("RGB", (2 * at_least, at_least))
-            image.load()
+            if load:
+                image.load()
             return ImageOps.exif_transpose(image)
     except Image.UnidentifiedImageError as error:
         raise InputError(

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pansplat.data.images import READABLE_SUFFIXES, read_depth, read_mask, read_panorama
+from pansplat.data.images import READABLE_SUFFIXES, read_depth, read_height, read_mask, read_panorama
 from pansplat.data.masks import scene_mask_of_files
 from pansplat.data.views import Views
 from pansplat.errors import InputError, InputWarning
@@ -64,6 +64,15 @@ class Pair:
     near: float
     far: float
     siblings: tuple[Path, ...] = field(default=(), repr=False)
+
+    @property
+    def image_height(self) -> int:
+        """Height of the smallest context panorama, pixels.
+
+        Raises:
+            InputError: an image cannot be used.
+        """
+        return min(read_height(panorama.image) for panorama in self.context)
 
     def load_context(self, height: int) -> Views:
         """The context panoramas at (height, 2 height). Warns when two camera centres coincide.

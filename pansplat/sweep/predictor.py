@@ -43,6 +43,8 @@ class Sweep:
     """
 
     name = "sweep"
+    default_height = 1024
+    """Largest height that is chosen for a pair without a given height."""
 
     def __init__(self, config: SweepConfig | None = None, prior: PriorModel | None = None) -> None:
         self.config, self.prior = config or SweepConfig(), prior

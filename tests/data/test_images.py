@@ -12,6 +12,7 @@ from PIL import Image
 from pansplat.data.images import (
     linear_from_srgb,
     read_depth,
+    read_height,
     read_mask,
     read_panorama,
     read_thumbnail,
@@ -38,6 +39,7 @@ def test_read_images_equal_written_images(tmp_path: Path, suffix: str, tolerance
     read, opaque = read_panorama(tmp_path / f"a{suffix}", 16)
     assert read.dtype == torch.float32
     assert (read - image).abs().max() < tolerance
+    assert read_height(tmp_path / f"a{suffix}") == 16
     assert opaque.all()
     assert _entries(tmp_path) == [f"a{suffix}"]
 
