@@ -74,8 +74,9 @@ class RefineConfig:
     """Fraction of the run after which held-out blocks are fitted too."""
     betas: tuple[float, float] = (0.9, 0.99)
     """Decay of Adam's averages of the gradients and of their squares."""
-    damping: float = 0.1
-    """Adam's epsilon relative to the root mean square of the first gradients; Gaussians of little effect move less."""
+    damping: float = 0.2
+    """Adam's epsilon relative to the root mean square of the first gradients, for photographs that are compared at
+    their own size; it grows with the number of their pixels. Gaussians of little effect move less."""
 
     def __post_init__(self) -> None:
         if self.gaussians is not None and self.gaussians < 1:
@@ -196,11 +197,12 @@ class Refinement:
         self._steps += 1
 
     def _set_damping(self) -> None:
+        damping = self.config.damping * self._images[0, 0].numel() / math.prod(self._size)
         for group in self._optimizer.param_groups:
             gradients = [p.grad.flatten() for p in group["params"] if p.grad is not None]
             if gradients:
                 scale = float(torch.cat(gradients).square().mean().sqrt())
-                group["eps"] = max(self.config.damping * scale, _MIN_EPSILON)
+                group["eps"] = max(damping * scale, _MIN_EPSILON)
 
     def _choose_target(self, view: int) -> int:
         """The photograph that a view is compared with: its own in even steps, the others in turn in odd ones."""

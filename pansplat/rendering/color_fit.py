@@ -25,9 +25,9 @@ _MIN_COVERAGE = 1e-3  # pixels
 
 @dataclass(frozen=True)
 class ColorFitConfig:
-    """Settings of the fit of colours; two or three steps are enough."""
+    """Settings of the fit of colours."""
 
-    steps: int = 3
+    steps: int = 4
     relaxation: float = 1.8
     """Converges below 2."""
 

@@ -52,6 +52,8 @@ class LiftConfig:
     """Least height of the surface of a panorama of twice this height or more."""
     footprint: float = 0.7
     """Standard deviation of a disc, in lattice spacings."""
+    fine_footprint: float = 0.6
+    """The same on lattices finer than the surface."""
     thickness: float = 0.1
     """Standard deviation across the surface, relative to the disc's."""
     max_stretch: tuple[float, float, float, float] = (4.0, 4.0, 12.0, 24.0)
@@ -62,9 +64,9 @@ class LiftConfig:
     """Distance over which the background is extended in front of a discontinuity, pixels of the level."""
     detail: float = 0.02
     """Largest colour error of level 1."""
-    fine_detail: float = 0.03
+    fine_detail: float = 0.015
     """Largest colour error of a lattice where no finer one replaces it."""
-    fine_points: int = 800_000
+    fine_points: int = 850_000
     """Largest number of a view's points on the finer lattices; a larger error is allowed where they do not suffice."""
     discontinuity: float = 0.06
     """Relative change of inverse depth between pixels at a discontinuity."""
@@ -150,8 +152,7 @@ def _choose_fine_pixels(image: np.ndarray, heights: list[int], config: LiftConfi
     errors = []
     for height, coarser in itertools.pairwise(heights):
         detail = resize_sphere(image, height)
-        error = np.abs(detail - resize_sphere(resize_sphere(detail, coarser), height)).max(axis=2)
-        errors.append(_window_extremum(error, 1, largest=True))
+        errors.append(np.abs(detail - resize_sphere(resize_sphere(detail, coarser), height)).max(axis=2))
     limit = config.fine_detail
     while True:
         masks, count = [], 0.0
@@ -213,7 +214,9 @@ def _lift_lattice(
     sloped = inverse if level else scene.surfaces[view].inverse_depth
     row, column = nearest_pixel(rays, len(sloped))
     gradient = _differentiate_log(sloped, config.discontinuity if level < 2 else math.inf)[row, column]
-    axes, scales = _shape_discs(rays, inverse_depth, gradient, spacing, level, config)
+    is_fine = len(image) > scene.surfaces[view].height
+    size = spacing * (config.fine_footprint if is_fine else config.footprint)
+    axes, scales = _shape_discs(rays, inverse_depth, gradient, size, level, config)
     color = _sample_bilinear(image, rays)
     quats = quats_from_rotations(torch.from_numpy(pose[:3, :3] @ axes))
     return Gaussians(
@@ -321,16 +324,19 @@ def _differentiate_log(inverse: np.ndarray, discontinuity: float) -> np.ndarray:
 
 
 def _shape_discs(
-    rays: np.ndarray, inverse_depth: np.ndarray, gradient: np.ndarray, spacing: float, level: int, config: LiftConfig
+    rays: np.ndarray, inverse_depth: np.ndarray, gradient: np.ndarray, size: float, level: int, config: LiftConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Axes (n, 3, 3) in the camera frame, as columns, and standard deviations (n, 3) of discs on the surface."""
+    """Axes (n, 3, 3) in the camera frame, as columns, and standard deviations (n, 3) of discs on the surface.
+
+    `size` is the standard deviation of a disc across its ray, radians.
+    """
     longitude = np.arctan2(rays[:, 0], rays[:, 2])  # 0 at the poles
     east = np.stack((np.cos(longitude), np.zeros(len(rays)), -np.sin(longitude)), axis=-1)
     south = np.cross(rays, east)
     # X = ray / inverse_depth, so dX = (direction - ray * dlog(inverse_depth)) / inverse_depth per radian.
     steepness = np.linalg.norm(gradient, axis=-1)
     # A disc that is nearly parallel to its ray must end well before the camera.
-    limit = min(config.max_stretch[level], _MAX_LENGTH / (config.footprint * spacing))
+    limit = min(config.max_stretch[level], _MAX_LENGTH / size)
     gradient = gradient * np.minimum(1, limit / np.maximum(steepness, 1e-9))[:, None]
     steepness = np.minimum(steepness, limit)
     ascent = np.where(steepness[:, None] > 1e-6, gradient / np.maximum(steepness, 1e-6)[:, None], (1.0, 0.0))
@@ -340,5 +346,5 @@ def _shape_discs(
     stretch = np.linalg.norm(long, axis=-1)
     long = long / stretch[:, None]
     axes = np.stack((long, across, np.cross(long, across)), axis=-1)
-    size = config.footprint * spacing / inverse_depth
-    return axes, np.stack((size * stretch, size, size * config.thickness), axis=-1)
+    sigma = size / inverse_depth
+    return axes, np.stack((sigma * stretch, sigma, sigma * config.thickness), axis=-1)
