@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import contextlib
 import errno
 import io
@@ -17,7 +16,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NoReturn, TypeVar
+from typing import TYPE_CHECKING, NoReturn, TextIO, TypeVar
 
 from pansplat.errors import InputError, InputWarning
 
@@ -31,8 +30,9 @@ DEBUG = "PANSPLAT_DEBUG"  # environment variable; 1 prints the traceback of ever
 
 _T = TypeVar("_T")
 
-_COLORS = {"error": "red", "interrupted": "red", "note": "yellow"}
+_COLORS = {"error": 31, "interrupted": 31, "note": 33}  # ANSI codes of red and yellow
 _MIN_WIDTH, _MAX_WIDTH = 40, 1000  # characters; help and tables need minutes and gigabytes outside
+_AGAIN = 0.02  # seconds after which a lost interrupt is raised again
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -57,8 +57,7 @@ def run_command(command: Callable[[], int], *, memory_advice: str, interruption:
                 status = command()
             except SystemExit as request:  # of the parser of arguments
                 stop = request
-            if sys.stdout is not None:
-                sys.stdout.flush()
+            sys.stdout.flush()
         except BaseException as error:
             signals.raising = False
             if os.environ.get(DEBUG) == "1":
@@ -86,7 +85,7 @@ def _report(error: BaseException, memory_advice: str) -> int:
     if isinstance(error, InputError):
         print_message("error", error)
         return BAD_INPUT
-    if isinstance(error, (MemoryError, RuntimeError)) and is_out_of_memory(error):
+    if isinstance(error, (MemoryError, RuntimeError, OSError)) and is_out_of_memory(error):
         cause = "".join(f" ({line[:120]})" for line in str(error).splitlines()[:1])
         print_message("error", f"out of memory{cause}; {memory_advice}")
         return BAD_INPUT
@@ -101,13 +100,13 @@ def _report(error: BaseException, memory_advice: str) -> int:
 def _report_system_error(error: OSError) -> int:
     """Print one line about an error of the operating system, unless standard output was closed by its reader."""
     reason = error.strerror or str(error) or type(error).__name__
-    if error.filename is None and _is_output_broken():
-        _discard_output()
+    if error.filename is None and (error.errno == errno.EPIPE or _is_output_broken()):
+        _discard_output(sys.stdout)
         if error.errno == errno.EPIPE:
             return CLOSED_PIPE
         print_message("error", f"standard output: needed a place to write, got '{reason}'; free some disk space")
         return BAD_INPUT
-    name = "a file" if error.filename is None else os.fsdecode(error.filename)
+    name = os.fsdecode(error.filename) if isinstance(error.filename, (str, bytes, os.PathLike)) else "a file"
     print_message("error", f"{name}: needed a usable file or folder, got '{reason}'; check path, space and permissions")
     return BAD_INPUT
 
@@ -121,13 +120,13 @@ def _is_output_broken() -> bool:
     return False
 
 
-def _discard_output() -> None:
+def _discard_output(stream: TextIO | None) -> None:
     """Send unwritten text to the null device, so that the interpreter's end does not fail to write it."""
-    with contextlib.suppress(OSError, ValueError):
+    with contextlib.suppress(OSError, ValueError, AttributeError):
         null = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, sys.stdout.fileno())
+        os.dup2(null, stream.fileno())
         os.close(null)
-        sys.stdout.flush()
+        stream.flush()
 
 
 def _write_log(error: BaseException) -> str:
@@ -175,7 +174,10 @@ def _catch_signals() -> Iterator[_Signals]:
     def raise_again(problem: sys.UnraisableHookArgs) -> None:
         lost = isinstance(problem.exc_value, KeyboardInterrupt)
         if lost or (signals.received and isinstance(problem.exc_value, SystemError)):
-            _thread.interrupt_main()
+            number = signals.received[-1] if signals.received else signal.SIGINT
+            again = threading.Timer(_AGAIN, os.kill, (os.getpid(), number))  # after this hook has returned
+            again.daemon = True
+            again.start()
         else:
             previous_hook(problem)
 
@@ -202,6 +204,8 @@ def _prepare_terminal() -> None:
                 os.fstat(descriptor)
             except OSError:
                 os.open(os.devnull, os.O_RDWR)
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(AttributeError, ValueError):
             if stream.errors == "strict":
@@ -209,16 +213,19 @@ def _prepare_terminal() -> None:
     width = min(max(shutil.get_terminal_size().columns, _MIN_WIDTH), _MAX_WIDTH)
     if os.environ.get("COLUMNS", str(width)) != str(width) or shutil.get_terminal_size().columns != width:
         os.environ["COLUMNS"] = str(width)
+    if not os.environ.get("LINES", "24").isascii() or not os.environ.get("LINES", "24").isdecimal():
+        del os.environ["LINES"]
 
 
 def print_message(kind: str, text: object) -> None:
     """Print one line `kind: text` on standard error; `kind` is "error", "interrupted" or "note"."""
-    from rich.console import Console
-    from rich.text import Text
-
-    line = Text.assemble((f"{kind}: ", f"bold {_COLORS[kind]}"), " ".join(str(text).splitlines()))
-    with contextlib.suppress(OSError, ValueError):  # a closed or full standard error
-        Console(stderr=True, soft_wrap=True, highlight=False).print(line)
+    start = f"{kind}: "
+    try:
+        if sys.stderr.isatty() and not os.environ.get("NO_COLOR"):
+            start = f"\x1b[1;{_COLORS[kind]}m{start}\x1b[0m"
+        print(start + " ".join(str(text).splitlines()), file=sys.stderr, flush=True)
+    except (OSError, ValueError, AttributeError):  # standard error is full or closed
+        _discard_output(sys.stderr)
 
 
 def is_out_of_memory(error: BaseException) -> bool:
@@ -295,5 +302,10 @@ def make_table_console(width: int = 140) -> Console:
     """A console of the terminal's width, or of `width` characters if standard output is not a terminal."""
     from rich.console import Console
 
-    console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=width)
+    class TableConsole(Console):
+        def on_broken_pipe(self) -> None:
+            """Raise the error that is handled, instead of an exit with status 1."""
+            raise
+
+    console = TableConsole(highlight=False)
+    return console if console.is_terminal else TableConsole(highlight=False, width=width)

@@ -87,7 +87,7 @@ def _check(value: Any, source: object) -> None:
     pending: list[tuple[Any, Any, int]] = [(value, None, 0)]  # value, (parent, key), depth
     while pending:
         value, path, depth = pending.pop()
-        if depth > MAX_DEPTH:
+        if depth >= MAX_DEPTH and isinstance(value, (dict, list)):
             raise InputError(f"{source}: needed JSON of at most {MAX_DEPTH} levels, got deeper lists; correct it.")
         if isinstance(value, dict):
             if isinstance(value, _Object):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import gc
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -39,6 +38,7 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.model.heads import merge_tiles
 from pansplat.model.pansplat import PanSplat
 from pansplat.rendering.cpu.runtime import release_idle_memory
+from pansplat.strict_json import read_json
 from pansplat.training.config import MemoryConfig, NetworkShape, Style
 from pansplat.training.losses import LossWeights, PerceptualName, choose_perceptual
 from pansplat.training.network import freeze, network_config, read_weights, set_training_mode, trainable_parameters
@@ -257,10 +257,10 @@ def read_rows(path: Path, setting: MemorySetting) -> list[MemoryRow]:
     if not path.is_file():
         return []
     try:
-        content = json.loads(path.read_text())
+        content = read_json(path)
         before = content["setting"]
         rows = [read_row(values, MemoryCase, MemoryResult) for values in content["rows"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: needed rows of `pansplat bench memory`, got {error!r}; delete it.") from error
     now = dataclasses.asdict(setting)
     changed = [

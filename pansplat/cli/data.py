@@ -69,6 +69,7 @@ class DataMaps:
         """Pack and print the number of tours."""
         from pansplat.data.generated.shards import pack_triplets
 
+        require_output_folder("--out", self.out)
         print(f"{self.out}: {pack_triplets(self.source, self.out, self.height)} tours")
         return 0
 

@@ -12,7 +12,7 @@ from tyro.conf import Positional
 from pansplat.cli.inputs import Compat, Out, Precision, parse_blend, progress_bar
 from pansplat.console import make_table_console
 from pansplat.errors import InputError
-from pansplat.files import require_output_folder
+from pansplat.files import expand_home, require_output_folder
 from pansplat.options import Count, CountOrNone, Depth, Height, Seconds
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ class Evaluate:
         for name in ("near", "far", "convention"):
             if getattr(self, name) is not None:
                 raise InputError(f"--{name} is set by the protocol; leave it out")
-        return self.protocol.data.expanduser()
+        return expand_home(self.protocol.data)
 
     def _protocol_methods(self, protocol: ProtocolName) -> list[Method]:
         """The methods of all predictors; a predictor with weights has the name of their file."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from pansplat.console import make_table_console
+from pansplat.console import can_print, make_table_console
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -16,7 +16,10 @@ if TYPE_CHECKING:
 
     from pansplat.gaussians.scene import Scene
 
-_BARS = " ▁▂▃▄▅▆▇█"
+_BARS, _ASCII_BARS = " ▁▂▃▄▅▆▇█", " .:-=+*#@"
+
+
+_MAX_COLUMNS = 64  # of views in the table
 
 
 @dataclass(frozen=True)
@@ -46,11 +49,11 @@ class Info:
         ):
             print(_format_distribution(name, values, unit, log=unit != ""))
         low, high = gaussians.means.amin(dim=0).tolist(), gaussians.means.amax(dim=0).tolist()
-        axes = (f"{axis} {a:.2f} to {b:.2f} m" for axis, a, b in zip("xyz", low, high, strict=True))
+        axes = (f"{axis} {a:.4g} to {b:.4g} m" for axis, a, b in zip("xyz", low, high, strict=True))
         print("bounds          " + ", ".join(axes))
         for index, pose in enumerate(scene.cam2world):
             name = scene.names[index] if index < len(scene.names) else ""
-            position = ", ".join(f"{x:.3f}" for x in pose[:3, 3].tolist())
+            position = ", ".join(f"{x:.6g}" for x in pose[:3, 3].tolist())
             print(f"camera {index}        at ({position}) m  {name}")
         return 0
 
@@ -60,7 +63,7 @@ def _make_count_table(scene: Scene) -> Table:
     from rich.table import Table
 
     gaussians = scene.gaussians
-    views = max(len(scene.cam2world), int(gaussians.views.max()) + 1)
+    views = min(max(len(scene.cam2world), int(gaussians.views.max()) + 1), _MAX_COLUMNS)
     table = Table()
     table.add_column("level")
     for view in range(views):
@@ -79,5 +82,6 @@ def _format_distribution(name: str, values: Tensor, unit: str, *, log: bool) -> 
     shown = values.clamp_min(1e-12).log10() if log else values
     bounds = (float(shown.min()), max(float(shown.max()), float(shown.min()) + 1e-6))
     counts = torch.histc(shown.float(), 24, *bounds)
-    bars = "".join(_BARS[round(8 * float(count / counts.max()))] for count in counts)
+    levels = _BARS if can_print(_BARS) else _ASCII_BARS
+    bars = "".join(levels[round(8 * float(count / counts.max()))] for count in counts)
     return f"{name:<15} {low:.3g} to {high:.3g}{unit}, median {middle:.3g}{unit}  |{bars}|" + (" (log)" if log else "")

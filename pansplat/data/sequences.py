@@ -20,6 +20,7 @@ from pansplat.data.poses import read_number, read_trajectory
 from pansplat.data.video import VideoFile, open_video
 from pansplat.data.views import Sample, Views, select_views
 from pansplat.errors import InputError
+from pansplat.files import expand_home
 
 Stage = Literal["train", "val", "test"]
 
@@ -172,7 +173,7 @@ def read_loc360(root: Path | str, stage: Stage) -> list[ImageSequence]:
     Raises:
         InputError: a location is missing or has no sequence, or a camera_pose.json is invalid.
     """
-    root = Path(root).expanduser()
+    root = expand_home(root)
     sequences = []
     for location in LOCATIONS[stage]:
         folders = [
@@ -200,7 +201,7 @@ def read_insta360(root: Path | str) -> list[VideoSequence]:
     Raises:
         InputError: no video was found, or a file is missing or invalid.
     """
-    root = Path(root).expanduser()
+    root = expand_home(root)
     if not root.is_dir():
         raise InputError(f"{root}: needed a folder with a video and its trajectory, got no such folder; check it.")
     folders = [root] if _list_videos(root) else [f for f in sorted(root.iterdir()) if f.is_dir() and _list_videos(f)]

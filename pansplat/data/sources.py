@@ -22,6 +22,7 @@ from pansplat.data.pairs import Pair
 from pansplat.data.sequences import BoundedSampler, FramePair, FrameSequence, Stage, read_frame_pair
 from pansplat.data.views import Sample
 from pansplat.errors import InputError
+from pansplat.files import expand_home
 
 TRAINING_SETS = (("m3d", 0.5),)
 TEST_SETS = (
@@ -205,7 +206,7 @@ def read_panogrf(
     Raises:
         InputError: all sets are missing.
     """
-    root = Path(root).expanduser()
+    root = expand_home(root)
     sets = sets if sets is not None else TEST_SETS if stage == "test" else TRAINING_SETS
     found = []
     for name, distance in sets:
@@ -230,7 +231,7 @@ def read_game_maps(folder: Path | str) -> TripletSet:
     Raises:
         InputError: there is none.
     """
-    folder = Path(folder).expanduser()
+    folder = expand_home(folder)
     sources = tuple(triplet_files(folder))
     if not sources:
         raise InputError(

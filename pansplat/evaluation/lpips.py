@@ -28,6 +28,7 @@ from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from pansplat.errors import InputError
+from pansplat.files import expand_home
 from pansplat.model.weights import read_checkpoint
 
 Backbone = Literal["vgg", "alex", "squeeze"]
@@ -307,7 +308,7 @@ def find_heads(backbone: Backbone, folder: Path | None = None) -> Path | None:
 
 def _list_folders(folder: Path | None) -> list[Path]:
     named = os.environ.get(FOLDER_VARIABLE)
-    return [*([folder] if folder else []), *([Path(named).expanduser()] if named else []), _hub_folder()]
+    return [*([folder] if folder else []), *([expand_home(named)] if named else []), _hub_folder()]
 
 
 def _hub_folder() -> Path:

@@ -53,7 +53,15 @@ def read_table(path: Path) -> list[dict[str, str]]:
     """The complete rows of a CSV file; an incomplete last row is ignored."""
     with open(path, newline="") as file:
         rows = list(csv.DictReader(file))
-    return [row for row in rows if None not in row.values() and (row.get("step") or "").isdigit()]
+    return [row for row in rows if (row.get("step") or "").isdecimal() and all(map(_is_number, row.values()))]
+
+
+def _is_number(text: object) -> bool:
+    """Whether a value of a row is a number or empty; a row that was cut off, edited or damaged has others."""
+    try:
+        return text == "" or isinstance(float(str(text)), float)
+    except ValueError:
+        return False
 
 
 def plot_run(folder: Path) -> Path | None:

@@ -10,6 +10,7 @@ import io
 import json
 import re
 import zipfile
+import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -31,6 +32,7 @@ from pansplat.data.generated.meshes import (
     simplify,
 )
 from pansplat.errors import InputError
+from pansplat.strict_json import parse_json
 
 _VERSION = 1  # of the cache
 _MIN_TRIANGLES, _MAX_TRIANGLES = 8, 5000
@@ -193,10 +195,13 @@ def load_furniture(folder: Path | str, cache: Path | str | None = None) -> Furni
         InputError: there is neither a catalogue nor a cache.
     """
     if cache is not None and Path(cache).is_file():
-        with np.load(cache) as file:
-            arrays = dict(file)
-        if int(arrays["version"]) == _VERSION:
-            return _unpack(arrays)
+        try:
+            with np.load(cache, allow_pickle=False) as file:
+                arrays = dict(file)
+            if int(arrays["version"]) == _VERSION:
+                return _unpack(arrays)
+        except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
+            pass  # a damaged cache is made again
     paths = [path for path in sorted(Path(folder).glob("*.sh3f")) if path.stem in _LICENCES]
     if not paths:
         raise InputError(
@@ -352,7 +357,7 @@ def _unpack(arrays: dict[str, NDArray]) -> FurnitureLibrary:
     ends, data = np.cumsum(arrays["image_sizes"]), arrays["images"].tobytes()
     textures = _Textures([data[end - size : end] for end, size in zip(ends, arrays["image_sizes"], strict=True)])
     pieces, triangle, material = [], 0, 0
-    for row in json.loads(str(arrays["pieces"])):
+    for row in parse_json(str(arrays["pieces"]), "pieces"):
         triangles = slice(triangle, triangle := triangle + row.pop("triangles"))
         materials = slice(material, material := material + row.pop("materials"))
         own = [arrays[key][triangles] for key in ("corners", "normals", "texcoords", "material_ids")]

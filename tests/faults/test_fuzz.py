@@ -1,0 +1,33 @@
+"""No reader crashes or raises another error than InputError for damaged files."""
+
+import dataclasses
+import json
+import shutil
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+import safetensors.torch
+
+from pansplat.gaussians.ply import load_ply
+
+COUNT = 2000
+READERS = 15
+
+
+@pytest.mark.slow
+def test_every_reader_survives_2000_damaged_files(originals: Path, tmp_path: Path, small_config: Any) -> None:
+    work = tmp_path / "fuzz"
+    shutil.copytree(originals, work)
+    gaussians = load_ply(work / "scene.ply").gaussians
+    body = safetensors.torch.save({f.name: getattr(gaussians, f.name) for f in dataclasses.fields(gaussians)})
+    (work / "cache_body").write_bytes(body + zlib.crc32(body).to_bytes(4, "little"))
+    (work / "config.json").write_text(json.dumps(dataclasses.asdict(small_config)))
+    program = Path(__file__).with_name("fuzz.py")
+    done = subprocess.run([sys.executable, str(program), str(work), str(COUNT)], capture_output=True, text=True)
+    print(done.stdout)
+    assert done.returncode == 0, done.stdout + done.stderr[-3000:]
+    assert done.stdout.count(f" {COUNT} inputs") == READERS and "JSON: " in done.stdout
