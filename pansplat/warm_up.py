@@ -1,4 +1,4 @@
-"""Compile the numba kernels of the rasteriser and of the sweep into numba's cache: `python -m pansplat.warm_up`.
+"""Compile the numba kernels of rasteriser, viewer and sweep into numba's cache: `python -m pansplat.warm_up`.
 
 setup.sh runs this once, so that later commands do not compile them. Kernels for `covariances` in place of scales and
 rotations, and those of PanSplat and MVSplat, are compiled by the first call that uses them.
@@ -7,6 +7,7 @@ rotations, and those of PanSplat and MVSplat, are compiled by the first call tha
 import time
 from functools import partial
 
+import numpy as np
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -14,6 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from pansplat.data.views import Views
 from pansplat.gaussians.scene import Gaussians
 from pansplat.pipeline import predict
+from pansplat.rendering.cpu.display import DisplayScene, PixelFaces, Selection, blend_to_pixels
 from pansplat.rendering.image_planes import Layout
 from pansplat.rendering.rasterize import RasterOptions, rasterize
 
@@ -26,6 +28,7 @@ def main() -> None:
         "rasteriser, spherical harmonics": partial(_rasterize, 1, "pinhole", RasterOptions()),
         "rasteriser, EWA": partial(_rasterize, 0, "pinhole", ewa),
         "rasteriser, EWA and spherical harmonics": partial(_rasterize, 1, "cubemap", ewa),
+        "viewer": _draw_display_image,
         "sweep": partial(_predict, "sweep"),
         "depth network": partial(_predict, "default"),
     }
@@ -53,6 +56,18 @@ def _rasterize(degree: int, layout: Layout, options: RasterOptions) -> None:
     )
     pose = torch.eye(4, dtype=torch.float64)
     rasterize(scene, pose, size=(16, 32), layout=layout, options=options, backend="numba").color.sum().backward()
+
+
+def _draw_display_image() -> None:
+    """Draw two layers and a view from cube faces as the viewer does without a GPU."""
+    scene = DisplayScene(*(np.ones(shape, np.float32) for shape in ((9, 3), 9, (9, 4), (9, 3), (9, 1, 3), 9)))
+    faces, pixels = PixelFaces.allocate(7.0), np.zeros((16, 16), np.uint32)
+    labels = np.arange(9, dtype=np.int16) % 2
+    selection = Selection(np.eye(3), 0.01, bounded=True)
+    layers = scene.rasterize(np.zeros(3), faces.plane(0), labels, 2, RasterOptions(), selection=selection)
+    blend_to_pixels(layers.sums, np.full(2, 0.5), (0.0, 0.0, 0.0), faces.pixels[0])
+    blend_to_pixels(layers.sums, np.full(2, 0.5), (0.0, 0.0, 0.0), pixels, bottom_up=True)
+    faces.sample(np.eye(3), 20.0, pixels)
 
 
 def _predict(model: str) -> None:

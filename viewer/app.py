@@ -1,19 +1,24 @@
 """The `pansplat-view` command. Imports torch and OpenGL only when they are needed, so that `--help` is fast."""
 
+import os
 import re
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import tyro
 
-from pansplat.console import exit_process, own_warnings, parse_arguments, run_command
+from pansplat.console import own_warnings, parse_arguments, run_command
 from pansplat.errors import InputError
 from pansplat.files import expand_home, require_output_folder
 from pansplat.options import REAL, Depth, Height, Range, Seconds, check_numbers
 from pansplat_viewer.loader import LoadOptions, SceneEntry, SceneLoader, find_entries, load_entry
-from pansplat_viewer.settings import DrawSettings, Kernel, Mode, Order
+from pansplat_viewer.settings import DrawSettings, Kernel, Mode, Order, RendererChoice
+
+if TYPE_CHECKING:
+    import moderngl
 
 
 @dataclass(frozen=True)
@@ -55,6 +60,8 @@ class Options:
     """Response of a Gaussian: exact on each ray, or the linearisation of 3DGS."""
     order: Order = "radial"
     """Sort Gaussians by distance, or by depth along the view axis."""
+    renderer: RendererChoice = "auto"
+    """Draw with OpenGL (gl) or on the processor (cpu); auto is gl on a GPU, and cpu where OpenGL is software."""
     at: Annotated[float, Range(0, 1), REAL] | None = None
     """Start position between the panoramas, 0 to 1 (0); offscreen, position of the panorama (0.5)."""
     size: str = "1280x720"
@@ -90,9 +97,12 @@ class Options:
         return DrawSettings(kernel=self.kernel, order=self.order, mode=self.mode)
 
 
-def main(args: Sequence[str] | None = None) -> None:
+def main(args: Sequence[str] | None = None) -> NoReturn:
     """Run the command and exit with its status (docs/errors.md)."""
-    exit_process(run(args))
+    status = run(args)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)  # without Python's finalisation, which sometimes never ends with the LLVMs of both numba and Mesa
 
 
 def run(args: Sequence[str] | None = None) -> int:
@@ -171,6 +181,7 @@ def _run_window(options: Options, entries: list[SceneEntry], first: int, pixels:
         state=ViewerState(settings=options.settings),
         at=options.at or 0.0,
         dpi_scale=window.dpi_scale,
+        renderer=options.renderer,
     )
     viewer.show(entries, first)
     run_viewer(window, viewer)
@@ -182,11 +193,10 @@ def _write_flythrough(options: Options, entry: SceneEntry, folder: Path, pixels:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from pansplat_viewer.capture import Film, write_flythrough
-    from pansplat_viewer.offscreen import create_context
-    from pansplat_viewer.renderer import SplatRenderer
+    from pansplat_viewer.cpu_renderer import create_renderer
 
     film = Film(pixels, options.seconds, options.fps, 0.5 if options.at is None else options.at)
-    ctx = create_context()  # before the prediction, so that missing OpenGL is reported early
+    ctx = _create_context(options.renderer)  # before the prediction, so that missing OpenGL is reported early
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f}%"))
     with Progress(*columns, TimeElapsedColumn()) as bars:
         load = bars.add_task(entry.name, total=1.0)
@@ -205,14 +215,29 @@ def _write_flythrough(options: Options, entry: SceneEntry, folder: Path, pixels:
         settings = options.settings
         if len(loaded.scene.cam2world) < 2 and settings.mode in ("deferred", "difference"):
             settings = replace(settings, mode="joint")
-        renderer = SplatRenderer(ctx, color_bits=32)
+        renderer = create_renderer(ctx, options.renderer, color_bits=32)
         try:
             written = write_flythrough(renderer, loaded.scene, folder, film, settings, show_progress)
         finally:
             renderer.release()
-            ctx.release()
+            if ctx is not None:
+                ctx.release()
     for path in written:
         print(path)
+
+
+def _create_context(renderer: RendererChoice) -> "moderngl.Context | None":
+    """Return an OpenGL context, or None if the renderer does not need one and there is none."""
+    from pansplat_viewer.offscreen import create_context
+
+    if renderer == "cpu":
+        return None
+    try:
+        return create_context()
+    except InputError:
+        if renderer == "gl":
+            raise
+        return None
 
 
 if __name__ == "__main__":

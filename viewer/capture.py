@@ -13,7 +13,7 @@ from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose, path_poses
 from pansplat.geometry.pose import interpolate_poses
 from pansplat_viewer import camera as cameras
-from pansplat_viewer.renderer import SplatRenderer
+from pansplat_viewer.cpu_renderer import Renderer
 from pansplat_viewer.settings import DrawSettings
 from pansplat_viewer.state import ViewerState, enter_scene
 
@@ -85,7 +85,7 @@ def compute_panorama_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4
 
 
 def write_flythrough(
-    renderer: SplatRenderer,
+    renderer: Renderer,
     scene: Scene,
     folder: Path,
     film: Film,
@@ -133,7 +133,7 @@ def write_flythrough(
 
 
 def _render(
-    renderer: SplatRenderer, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings
+    renderer: Renderer, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings
 ) -> Float[np.ndarray, "height width 3"]:
     renderer.render(cam2world, size, settings, wait=True)
     return np.clip(renderer.read_color()[..., :3], 0.0, 1.0)

@@ -14,6 +14,7 @@ from pansplat_viewer.state import ViewerState, jump_to_view, step_flight, toggle
 
 FLY_SPEED = 1.0  # metres per second
 FAST, SLOW = 4.0, 0.2
+_CLICK_PIXELS = 3.0  # a longer way of the pointer with the button down is a drag
 ORBIT_KEY_PIXELS = 400.0  # per second, of a window 1000 pixels high
 
 # Rows of the key help in the window; docs/viewer.md has the same keys.
@@ -22,6 +23,7 @@ HELP = (
     ("Q E", "fly down, up"),
     ("Shift, Alt", "faster, slower"),
     ("drag", "look around (orbit: turn)"),
+    ("click", "depth and Gaussian of a point; twice: their distance"),
     ("right drag", "pan"),
     ("scroll", "field of view (orbit: distance)"),
     ("V", "orbit or fly"),
@@ -49,6 +51,7 @@ class Input:
         pressed: names of the keys that went down in this frame.
         drag: pointer movement over the image with the left button held, pixels (right, down).
         pan: the same with the right or middle button.
+        click: place of a click on the image without a drag, as fractions of width and height; None without a click.
         scroll: wheel steps; positive is scrolling up.
         height: of the window, pixels.
     """
@@ -60,6 +63,7 @@ class Input:
     pan: tuple[float, float] = (0.0, 0.0)
     scroll: float = 0.0
     height: int = 720
+    click: tuple[float, float] | None = None
 
 
 @dataclass
@@ -69,6 +73,7 @@ class Commands:
     Attributes:
         png, exr, panorama: write a screenshot.
         focus: orbit the point in the image centre.
+        pick: show the point at this place, as fractions of width and height.
         choose: show the entry of this index.
         open: show the scenes at this path.
         dismiss_error: close the error message.
@@ -79,6 +84,7 @@ class Commands:
     exr: bool = False
     panorama: bool = False
     focus: bool = False
+    pick: tuple[float, float] | None = None
     choose: int | None = None
     open: str | None = None
     dismiss_error: bool = False
@@ -117,7 +123,7 @@ def read_input(seconds: float) -> Input:
     modifiers = {"shift": io.key_shift, "alt": io.key_alt, "ctrl": io.key_ctrl}
     held |= {name for name, down in modifiers.items() if down}
     drag = pan = (0.0, 0.0)
-    scroll = 0.0
+    scroll, click = 0.0, None
     if not io.want_capture_mouse:
         moved = (float(io.mouse_delta.x), float(io.mouse_delta.y))
         if imgui.is_mouse_down(0) and not imgui.is_mouse_clicked(0):
@@ -125,7 +131,10 @@ def read_input(seconds: float) -> Input:
         elif imgui.is_mouse_down(1) or imgui.is_mouse_down(2):
             pan = moved
         scroll = float(io.mouse_wheel)
-    return Input(seconds, frozenset(held), frozenset(pressed), drag, pan, scroll, int(io.display_size.y))
+        moved_since_click = imgui.get_mouse_drag_delta(0, 0.0)
+        if imgui.is_mouse_released(0) and max(abs(moved_since_click.x), abs(moved_since_click.y)) < _CLICK_PIXELS:
+            click = (io.mouse_pos.x / io.display_size.x, io.mouse_pos.y / io.display_size.y)
+    return Input(seconds, frozenset(held), frozenset(pressed), drag, pan, scroll, int(io.display_size.y), click)
 
 
 def apply_input(state: ViewerState, events: Input) -> Commands:
@@ -136,7 +145,9 @@ def apply_input(state: ViewerState, events: Input) -> Commands:
     _apply_pressed(state, events.pressed)
     _move_camera(state, events)
     shift, screenshot = "shift" in events.held, "p" in events.pressed
-    return Commands(png=screenshot and not shift, exr=screenshot and shift, focus="f" in events.pressed)
+    return Commands(
+        png=screenshot and not shift, exr=screenshot and shift, focus="f" in events.pressed, pick=events.click
+    )
 
 
 def _apply_pressed(state: ViewerState, pressed: frozenset[str]) -> None:
@@ -151,6 +162,7 @@ def _apply_pressed(state: ViewerState, pressed: frozenset[str]) -> None:
     if "space" in pressed:
         toggle_play(state)
     if "r" in pressed:
+        state.points = []
         state.playing, state.camera = False, state.home
     for view in range(4):
         if str(view + 1) in pressed:

@@ -1,5 +1,6 @@
 """imgui on an OpenGL context, and the panels over the image: scene, settings, camera, photograph and screenshots."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from importlib import resources
@@ -11,6 +12,7 @@ from imgui_bundle import imgui
 
 from pansplat_viewer import camera as cameras
 from pansplat_viewer.input import HELP, Commands
+from pansplat_viewer.picking import project_point
 from pansplat_viewer.settings import FrameStats, Kernel, Lowpass, Order
 from pansplat_viewer.state import ViewerState, fly_to, jump_to_view, toggle_play
 
@@ -133,6 +135,8 @@ class Panels:
             _draw_stats(state, data)
         if state.photo and data.photo_name is not None and 0 < state.split < 1:
             _draw_split_line(state.split)
+        if state.overlay and state.points:
+            _draw_points(state)
         if state.help:
             state.help = _draw_help()
         if data.loading:
@@ -345,6 +349,24 @@ def _draw_stats(state: ViewerState, data: PanelData) -> None:
     if state.photo and data.photo_name is not None:
         lines.append(f"right: {data.photo_name}" if state.split > 0 else data.photo_name)
     _draw_label("##stats", lines, alpha=0.6)
+
+
+def _draw_points(state: ViewerState) -> None:
+    """Draw markers at the picked points, and what is known of them at the bottom right."""
+    size = imgui.get_io().display_size
+    color = imgui.color_convert_float4_to_u32((1.0, 0.85, 0.2, 1.0))
+    canvas = imgui.get_background_draw_list()
+    pixels = [project_point(state.camera, point.position, (int(size.x), int(size.y))) for point in state.points]
+    for pixel in pixels:
+        if pixel is not None:
+            canvas.add_circle(pixel, 5.0 * imgui.get_style().font_scale_dpi, color, 0, 2.0)
+    lines = state.points[-1].describe()
+    if len(pixels) == 2:
+        if pixels[0] is not None and pixels[1] is not None:
+            canvas.add_line(pixels[0], pixels[1], color, 2.0)
+        lines.append(f"{math.dist(state.points[0].position, state.points[1].position):.3f} m from the point before")
+    imgui.set_next_window_pos((size.x - _MARGIN, size.y - _MARGIN), 0, (1.0, 1.0))
+    _draw_label("##point", lines, alpha=0.6)
 
 
 def _draw_message(message: str) -> None:

@@ -31,6 +31,11 @@ _SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software")
 _MIN_WEIGHT = {16: 1e-4, 32: 2.0**-26}
 
 
+def is_software(ctx: moderngl.Context) -> bool:
+    """Whether the context draws on the processor."""
+    return any(name in ctx.info["GL_RENDERER"].lower() for name in _SOFTWARE)
+
+
 class SplatRenderer:
     """Renders scenes of 3D Gaussians on an OpenGL 3.3 or 4.3 context.
 
@@ -39,7 +44,14 @@ class SplatRenderer:
     Attributes:
         stats: counts and times of the last frame.
         tier: `gl33` or `gl43`; both draw the same image.
+        min_size: the window's image is not drawn at a lower resolution while the camera moves, pixels.
+        settle_seconds: after the last movement, until the image is drawn at full resolution.
+        waits_while_moving: whether a window waits for the image of each position.
     """
+
+    min_size = (1, 1)
+    settle_seconds = 0.2
+    waits_while_moving = False
 
     def __init__(
         self,
@@ -60,8 +72,7 @@ class SplatRenderer:
             InputError: the context does not support `tier`, or `color_bits` is neither 16 nor 32.
         """
         if color_bits is None:
-            software = any(name in ctx.info["GL_RENDERER"].lower() for name in _SOFTWARE)
-            color_bits = 32 if software else 16
+            color_bits = 32 if is_software(ctx) else 16
         if color_bits not in (16, 32):
             raise InputError(f"`color_bits` must be 16 or 32, got {color_bits}")
         self.tier = choose_tier(ctx, tier)
@@ -126,6 +137,10 @@ class SplatRenderer:
         _bind(bound)
         self.stats = dataclasses.replace(self.stats, settled=settled, frame_ms=1e3 * (time.perf_counter() - start))
         return image.color
+
+    def has_faces(self, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> bool:
+        """Whether faces of this resolution are kept while coarser ones are drawn: never, see `CpuRenderer`."""
+        return False
 
     def read_color(self) -> Float[np.ndarray, "height width 4"]:
         """Return the last image, float32, top row first: RGB over the background, and coverage."""

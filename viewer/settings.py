@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from pansplat.constants import NEAR
@@ -14,6 +15,7 @@ Order = Literal["radial", "z"]
 Lowpass = Literal["angular", "3dgs"]
 Mode = Literal["joint", "view", "deferred", "difference"]
 Layout = Literal["pinhole", "equirect"]
+RendererChoice = Literal["auto", "gl", "cpu"]
 
 _CHOICES = {"kernel": Kernel, "order": Order, "lowpass": Lowpass, "mode": Mode, "layout": Layout}
 
@@ -85,10 +87,11 @@ class FrameStats:
             were cached.
         sort_ms: time of the last sort and of the colours that depend on the position, possibly in the background.
         frame_ms: from the call of `render` until the GPU had finished.
-        tier: `gl33` or `gl43`.
+        tier: `gl33`, `gl43` or `cpu`.
         cached: whether the frame used cached layers only.
         settled: False if the frame used the order and colours of an earlier position because the new ones are not
-            ready; render again to get them.
+            ready, or the last image because the new one is not ready; render again to get it.
+        stages: milliseconds of each stage, where the renderer measures them.
     """
 
     total: int = 0
@@ -100,3 +103,4 @@ class FrameStats:
     tier: str = "gl33"
     cached: bool = False
     settled: bool = True
+    stages: Mapping[str, float] = field(default_factory=dict)

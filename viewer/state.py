@@ -9,6 +9,7 @@ from jaxtyping import Float
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose, level_pose, look_pose, path_poses, up_direction
 from pansplat_viewer.camera import Camera, move_to_pose
+from pansplat_viewer.picking import PickedPoint
 from pansplat_viewer.settings import DrawSettings
 
 FLIGHT_SECONDS = 6.0
@@ -31,6 +32,7 @@ class ViewerState:
         speed: of flying, metres per second.
         context: poses of the input cameras; empty for a file without cameras.
         levels: pyramid levels of the scene, ascending.
+        points: the last picked points, two at most.
         message: a text to show until `message_until` (seconds of the viewer's clock).
         quit: whether to close the viewer.
     """
@@ -50,6 +52,7 @@ class ViewerState:
     speed: float = 1.0
     context: Float[np.ndarray, "view 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
     levels: tuple[int, ...] = ()
+    points: list[PickedPoint] = field(default_factory=list)
     message: str = ""
     message_until: float = 0.0
     quit: bool = False
@@ -73,7 +76,7 @@ def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
     if num_views < 2 and settings.mode in ("deferred", "difference"):
         settings = replace(settings, mode="joint")
     state.settings = settings
-    state.playing, state.flight = False, min(max(at, 0.0), 1.0)
+    state.playing, state.flight, state.points = False, min(max(at, 0.0), 1.0), []
     level = tuple(tuple(float(x) for x in row) for row in _compute_level_axes(scene))
     camera = move_to_pose(replace(state.camera, level=level), _choose_start_pose(scene, state.flight))
     state.camera = state.home = replace(camera, distance=_measure_typical_distance(scene))

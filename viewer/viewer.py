@@ -15,11 +15,13 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat_viewer import camera as cameras
 from pansplat_viewer.capture import write_screenshot
+from pansplat_viewer.cpu_renderer import create_renderer
 from pansplat_viewer.input import Commands, apply_input, read_input
 from pansplat_viewer.loader import LoadedScene, SceneEntry, SceneLoader
 from pansplat_viewer.panels import Gui, PanelData, Panels
+from pansplat_viewer.picking import compute_pixel_ray, pick_point
 from pansplat_viewer.programs import Programs
-from pansplat_viewer.renderer import SplatRenderer
+from pansplat_viewer.settings import RendererChoice
 from pansplat_viewer.state import ViewerState, advance_flight, enter_scene
 
 PANORAMA_HEIGHT = 1024  # of a panorama screenshot, pixels
@@ -37,10 +39,12 @@ class ResolutionPlan:
     Attributes:
         scale: rendered pixels over screen pixels, along each side.
         cached: whether the image is read from cube faces that are kept for this position.
+        moving: whether the camera has just moved or turned.
     """
 
     scale: float
     cached: bool
+    moving: bool = False
 
 
 @dataclass
@@ -53,6 +57,8 @@ class AdaptiveResolution:
         full_ms: time of the last frame at full resolution.
         last_motion: time of the last movement, seconds.
         translated: whether the last movement changed the position.
+        settle_after: seconds after the last movement until the resolution is full.
+        num_scales: how many of SCALES may be used, from the largest on.
     """
 
     budget_ms: float = BUDGET_MS
@@ -60,16 +66,24 @@ class AdaptiveResolution:
     full_ms: float = 0.0
     last_motion: float = -1e9
     translated: bool = False
+    settle_after: float = SETTLE_AFTER
+    num_scales: int = len(SCALES)
 
     def plan(self, now: float, *, moved: bool, turned: bool, adaptive: bool = True) -> ResolutionPlan:
         """Return the plan of the frame at time `now` (seconds) after the camera moved, turned or did neither."""
         if moved or turned:
             self.last_motion, self.translated = now, moved
-        moving = now - self.last_motion < SETTLE_AFTER
+        self.step = min(self.step, self.num_scales - 1)
+        moving = now - self.last_motion < self.settle_after
         if not adaptive or not moving:
-            return ResolutionPlan(1.0, cached=False)
+            return ResolutionPlan(1.0, cached=False, moving=moving)
         slow = self.full_ms > self.budget_ms
-        return ResolutionPlan(SCALES[self.step], cached=slow and not self.translated)
+        return ResolutionPlan(SCALES[self.step], cached=slow and not self.translated, moving=True)
+
+    def limit(self, size: tuple[int, int], min_size: tuple[int, int]) -> None:
+        """Use no scale that makes an image of `size` smaller than `min_size`, pixels."""
+        fits = [scale for scale in SCALES if all(a * scale >= b for a, b in zip(size, min_size, strict=True))]
+        self.num_scales = max(len(fits), 1)
 
     def record(self, plan: ResolutionPlan, frame_ms: float) -> None:
         """Record the time of a frame and adjust the scale; frames from cached faces are ignored."""
@@ -78,7 +92,7 @@ class AdaptiveResolution:
         if plan.scale == 1.0:
             self.full_ms = frame_ms
         if frame_ms > 1.2 * self.budget_ms and plan.scale == SCALES[self.step]:
-            self.step = min(self.step + 1, len(SCALES) - 1)
+            self.step = min(self.step + 1, self.num_scales - 1)
         elif self.step > 0 and plan.scale == SCALES[self.step]:
             # A finer scale only if the next one is expected to fit the budget, else the resolution would oscillate.
             growth = (SCALES[self.step - 1] / SCALES[self.step]) ** 2
@@ -128,6 +142,9 @@ class Presenter:
 
         The photograph is sampled by direction only: it has no parallax and matches exactly at its own camera.
         """
+        if photo is None and target.viewport == (0, 0, *image.size) and image.dtype == "f1":
+            self._copy(image, target)
+            return
         target.use()
         self.ctx.disable(moderngl.DEPTH_TEST | moderngl.BLEND | moderngl.CULL_FACE)
         image.filter = (moderngl.LINEAR, moderngl.LINEAR)
@@ -144,6 +161,13 @@ class Presenter:
             tangent = math.tan(math.radians(camera.vertical_fov_degrees) / 2)
             self._program["tangent"] = (tangent * width / height, tangent)
         self._triangle.render(moderngl.TRIANGLES, vertices=3)
+
+    def _copy(self, image: moderngl.Texture, target: moderngl.Framebuffer) -> None:
+        """Copy an image of the target's size; software OpenGL copies fifty times as fast as it draws."""
+        source = self.ctx.framebuffer([image])
+        self.ctx.copy_framebuffer(target, source)
+        target.use()
+        source.release()
 
     def release(self) -> None:
         """Free the GL objects."""
@@ -172,6 +196,7 @@ class Viewer:
         folder: Path = Path("renders"),
         at: float = 0.0,
         dpi_scale: float = 1.0,
+        renderer: RendererChoice = "auto",
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         """Create GL objects on the current context.
@@ -184,6 +209,7 @@ class Viewer:
             folder: screenshots are written to its subfolder with the entry's name.
             at: fraction of the flight at which a scene is entered.
             dpi_scale: size of the panels.
+            renderer: draws the image; `auto` is `cpu` where OpenGL is software.
             clock: returns seconds.
         """
         self.ctx, self.loader, self.state = ctx, loader, state or ViewerState()
@@ -191,10 +217,10 @@ class Viewer:
         self.entries: list[SceneEntry] = []
         self.screenshots: list[Path] = []
         self.gui = Gui(dpi_scale)
-        self.renderer = SplatRenderer(ctx)
+        self.renderer = create_renderer(ctx, renderer)
         self.presenter = Presenter(ctx)
         self._find, self._folder, self._at, self._clock = find, folder, at, clock
-        self._resolution = AdaptiveResolution()
+        self._resolution = AdaptiveResolution(settle_after=self.renderer.settle_seconds)
         self._loaded: LoadedScene | None = None
         self._refined: Scene | None = None
         self._uploaded: Scene | None = None
@@ -210,7 +236,7 @@ class Viewer:
     @property
     def moving(self) -> bool:
         """Whether the image is still changing, so that a window draws as often as it can."""
-        recently = self._clock() - self._resolution.last_motion < 2 * SETTLE_AFTER
+        recently = self._clock() - self._resolution.last_motion < 2 * self._resolution.settle_after
         unsettled = self._image is not None and not self.renderer.stats.settled
         return self.state.playing or recently or unsettled
 
@@ -245,11 +271,14 @@ class Viewer:
         # The step is limited, so that after a slow frame the camera does not move far.
         key_commands = apply_input(self.state, read_input(min(seconds, _MAX_STEP_SECONDS)))
         advance_flight(self.state, min(seconds, 2 * _MAX_STEP_SECONDS))
-        target.use()
-        self.ctx.clear(*self.state.settings.background)
-        if self._loaded is not None:
+        if self._loaded is None:
+            target.use()
+            self.ctx.clear(*self.state.settings.background)
+        else:
             if key_commands.focus:
                 self._focus_center()
+            if key_commands.pick is not None:
+                self._pick(key_commands.pick, size, now)
             self._draw_image(size, target, now)
         self.gui.end(self.ctx, target)
         for commands in (panel_commands, key_commands):
@@ -283,7 +312,7 @@ class Viewer:
         """Upload a scene; returns whether it fits the GPU's memory, and shows an error if not."""
         try:
             self.renderer.upload(scene)
-        except (InputError, moderngl.Error) as error:  # moderngl.Error: the GPU's memory is exhausted
+        except (InputError, MemoryError, moderngl.Error) as error:  # moderngl.Error: the GPU's memory is exhausted
             self.panel_data.error = f"{entry.name}: {error}"
             return False
         self._uploaded, self._image_key, self._image = scene, None, None
@@ -299,7 +328,7 @@ class Viewer:
 
     def _enter(self, loaded: LoadedScene, now: float) -> None:
         self._loaded, self._refined = loaded, None
-        self._resolution = AdaptiveResolution()
+        self._resolution = AdaptiveResolution(settle_after=self.renderer.settle_seconds)
         self.presenter.upload_photos(loaded.photos)
         enter_scene(self.state, loaded.scene, at=self._at)
         self._last_camera = self.state.camera
@@ -325,6 +354,7 @@ class Viewer:
         moved = camera.position != self._last_camera.position
         turned = not moved and camera != self._last_camera
         self._last_camera = camera
+        self._resolution.limit(size, self.renderer.min_size)
         plan = self._resolution.plan(now, moved=moved, turned=turned, adaptive=self.state.adaptive)
         image = self._render(camera.cam2world, size, plan)
         photo = self._nearest_photo() if self.state.photo else None
@@ -336,10 +366,14 @@ class Viewer:
         """Return the image of this plan; renders only if something changed since the last frame."""
         scaled = (max(round(size[0] * plan.scale), 1), max(round(size[1] * plan.scale), 1))
         settings = replace(self.state.draw_settings, cached=plan.cached)
+        if plan.cached and self.renderer.has_faces(cam2world, size, settings):
+            scaled = size
         key = (cam2world.tobytes(), scaled, settings)
         if self._image is None or key != self._image_key or not self.renderer.stats.settled:
-            self._image = self.renderer.render(cam2world, scaled, settings, wait=False)
-            self._resolution.record(plan, self.renderer.stats.frame_ms)
+            wait = plan.moving and self.renderer.waits_while_moving
+            self._image = self.renderer.render(cam2world, scaled, settings, wait=wait)
+            if self.renderer.stats.frame_ms > 0:  # else the image is not finished
+                self._resolution.record(plan, self.renderer.stats.frame_ms)
             self._image_key = key
             self.panel_data.size = scaled
         assert self._image is not None
@@ -357,8 +391,20 @@ class Viewer:
             self.state.camera = cameras.focus_on_point(camera, point)
             self.state.orbiting = True
 
+    def _pick(self, place: tuple[float, float], size: tuple[int, int], now: float) -> None:
+        """Show the point of the scene at a place of the window, as fractions of width and height."""
+        assert self._uploaded is not None
+        pixel = place[0] * size[0], place[1] * size[1]
+        origin, direction = compute_pixel_ray(self.state.camera, pixel, size)
+        point = pick_point(self._uploaded, origin, direction, self.state.settings)
+        if point is None:
+            self.state.points = []
+            self.state.show_message("no Gaussian there", now)
+        else:
+            self.state.points = [*self.state.points[-1:], point]
+
     def _execute(self, commands: Commands, size: tuple[int, int], now: float) -> None:
-        """Execute the commands of the frame, except `focus`."""
+        """Execute the commands of the frame, except `focus` and `pick`."""
         if commands.dismiss_error:
             self.panel_data.error = None
         if commands.cancel_refinement:

@@ -287,7 +287,7 @@ def render_in_viewer(
             "settings": [_viewer_settings(case) for case in cases],
         }
         (folder / "job.json").write_text(json.dumps(job))
-        for line in _viewer_output(folder / "job.json", cases[0].threads):
+        for line in read_viewer_output(folder / "job.json", cases[0].threads):
             color = torch.from_numpy(np.load(line["image"])[..., :3]).permute(2, 0, 1)
             yield ViewerImage(
                 line["settings"], line["tier"], color, line["frame_ms"], line["sort_ms"], line["renderer"]
@@ -306,7 +306,7 @@ def _viewer_settings(case: RasterCase) -> dict[str, object]:
     }
 
 
-def _viewer_output(job: Path, threads: int) -> Iterator[dict[str, Any]]:
+def read_viewer_output(job: Path, threads: int) -> Iterator[dict[str, Any]]:
     """Yield the lines that the viewer's command prints, each as soon as it is printed."""
     environment = os.environ | {"LP_NUM_THREADS": str(threads)}  # of Mesa's software OpenGL
     command = [sys.executable, "-m", f"{_VIEWER_PACKAGE}.timing", str(job)]

@@ -1,4 +1,4 @@
-"""`pansplat bench`: time, memory and error of the rasterisers and the network on this machine."""
+"""`pansplat bench`: time, memory and error of the rasterisers, the network and the viewer on this machine."""
 
 from __future__ import annotations
 
@@ -29,6 +29,8 @@ _SAMPLE = Path(pansplat.__file__).parents[1] / "assets" / "living_room"
 _MIN_SWEEP_HEIGHT = 64  # pixels
 _RASTER_BACKENDS = ("numba", "triton", "gsplat")
 _DEFAULT_MEMORY = 16e9  # bytes, if the system does not report its memory
+_LatticeHeight = Annotated[int, Range(16, 4096, "pixels", multiple=8), WHOLE]
+_WindowSide = Annotated[int, Range(64, 8192, "pixels"), WHOLE]
 _TiledHeight = Annotated[int, Range(64, 8192, "pixels", multiple=32), WHOLE]  # 4x4 tiles must fit the four levels
 _RANDOM_WEIGHTS = "PanSplat with random weights (seed 0): times and memory are valid, images are meaningless"
 
@@ -302,6 +304,43 @@ class BenchRefine:
 
 
 @dataclass(frozen=True)
+class BenchViewer:
+    """Measure the viewer's frames: each renderer, moving and turning, joint and deferred, over counts of Gaussians.
+
+    With --out, the same command continues an interrupted run, and further --heights add rows.
+    """
+
+    heights: tuple[_LatticeHeight, ...] = (256, 512, 1024)
+    """Heights of the panoramas whose lattices hold the Gaussians: 221,642, 886,580 and 3,546,326; multiples of 8."""
+    size: tuple[_WindowSide, _WindowSide] = (1280, 720)
+    """Width and height of the window, pixels."""
+    quick: bool = False
+    """The smallest height only, few frames."""
+    out: OptionalOut = None
+    """Folder for viewer.json, viewer.md and viewer.png."""
+    threads: Threads | None = None
+    """Threads to use; by default torch's."""
+
+    def run(self) -> int:
+        """Measure, print the tables and write the files; an interruption keeps the measured rows."""
+        import torch
+
+        from pansplat.bench.roofline import describe_machine
+        from pansplat.bench.viewer import ViewerBench, list_viewer_cases, make_viewer_report, read_viewer_rows
+
+        json = _choose_rows_file(None, self.out, "viewer.json")
+        threads = _choose_threads(self.threads)
+        torch.set_num_threads(threads)
+        heights = [min(self.heights)] if self.quick else sorted(self.heights)
+        with make_viewer_report(describe_machine(threads), json=json, out=self.out) as report:
+            report.rows += read_viewer_rows(json)
+            bench = ViewerBench(report, repeats=3 if self.quick else 9, threads=threads)
+            for height in heights:
+                bench.run(height, list_viewer_cases(self.size))
+        return 0
+
+
+@dataclass(frozen=True)
 class BenchMachine:
     """Measure the machine's peaks: multiply-adds and memory bandwidth."""
 
@@ -326,6 +365,7 @@ class Bench:
         | Annotated[BenchModel, subcommand("model")]
         | Annotated[BenchMemory, subcommand("memory")]
         | Annotated[BenchRefine, subcommand("refine")]
+        | Annotated[BenchViewer, subcommand("viewer")]
         | Annotated[BenchMachine, subcommand("machine")]
     )
 

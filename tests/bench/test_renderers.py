@@ -100,4 +100,4 @@ def test_a_missing_viewer_is_an_error(monkeypatch):
 def test_an_error_of_the_viewer_is_passed_on(tmp_path):
     (tmp_path / "job.json").write_text("{}")
     with pytest.raises(InputError, match="the viewer rendered nothing: error: 'scene'"):
-        list(renderers._viewer_output(tmp_path / "job.json", 1))
+        list(renderers.read_viewer_output(tmp_path / "job.json", 1))

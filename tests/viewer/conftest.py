@@ -18,6 +18,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.rendering import Rendering, rasterize
+from pansplat_viewer.cpu_renderer import CpuRenderer, Renderer
 from pansplat_viewer.offscreen import create_context
 from pansplat_viewer.renderer import DrawSettings, SplatRenderer
 
@@ -61,8 +62,8 @@ def ctx(gl_context: moderngl.Context) -> Iterator[moderngl.Context]:
 
 
 @pytest.fixture(scope="session")
-def _renderers(gl_context: moderngl.Context) -> Iterator[dict[tuple[str, int, int], SplatRenderer]]:
-    renderers: dict[tuple[str, int, int], SplatRenderer] = {}
+def _renderers(gl_context: moderngl.Context) -> Iterator[dict[tuple[str, int, int], Renderer]]:
+    renderers: dict[tuple[str, int, int], Renderer] = {}
     yield renderers
     with gl_context:
         for renderer in renderers.values():
@@ -70,12 +71,14 @@ def _renderers(gl_context: moderngl.Context) -> Iterator[dict[tuple[str, int, in
 
 
 @pytest.fixture
-def make_renderer(ctx, _renderers) -> Callable[..., SplatRenderer]:
-    """Returns a renderer with 32-bit targets and a newly uploaded scene; `slot` selects one of several."""
+def make_renderer(ctx, _renderers) -> Callable[..., Renderer]:
+    """Returns a renderer with a newly uploaded scene; `tier` may be `cpu`, `slot` selects one of several."""
 
-    def get(scene: Scene, tier: str = "auto", color_bits: int = 32, slot: int = 0) -> SplatRenderer:
+    def get(scene: Scene, tier: str = "auto", color_bits: int = 32, slot: int = 0) -> Renderer:
         key = (tier, color_bits, slot)
-        if key not in _renderers:
+        if key not in _renderers and tier == "cpu":
+            _renderers[key] = CpuRenderer(ctx, exact=True)
+        elif key not in _renderers:
             _renderers[key] = SplatRenderer(ctx, tier=tier, color_bits=color_bits)
         _renderers[key].upload(scene)
         return _renderers[key]
@@ -120,13 +123,13 @@ def pose() -> np.ndarray:
 
 
 def _rasterize_reference(
-    scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings
+    scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings, panorama: str = "cubemap"
 ) -> Rendering:
     return rasterize(
         scene.gaussians.to(dtype=torch.float64),
         torch.from_numpy(cam2world),
         size=size[::-1],
-        layout="pinhole" if settings.layout == "pinhole" else "cubemap",
+        layout="pinhole" if settings.layout == "pinhole" else panorama,
         vertical_fov_degrees=settings.vertical_fov_degrees,
         kernel=settings.kernel,
         order=settings.order,
@@ -152,7 +155,7 @@ def assert_matches() -> Callable[..., None]:
     """
 
     def check(
-        renderer: SplatRenderer,
+        renderer: Renderer,
         cam2world: np.ndarray,
         settings: DrawSettings,
         expected: Rendering,
@@ -175,12 +178,15 @@ def assert_matches() -> Callable[..., None]:
 
 @pytest.fixture
 def assert_reference(make_renderer, reference, assert_matches) -> Callable[..., None]:
-    """Checks that both tiers render a scene as the reference does."""
+    """Checks that both tiers and the processor render a scene as the reference does."""
 
     def check(scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> None:
         expected = reference(scene, cam2world, size, settings)
         for tier in ("gl33", "gl43"):
             assert_matches(make_renderer(scene, tier), cam2world, settings, expected)
+        if settings.kernel == "ray" and settings.face_size is None:  # the processor draws such panoramas directly
+            expected = reference(scene, cam2world, size, settings, "equirect")
+        assert_matches(make_renderer(scene, "cpu"), cam2world, settings, expected)
 
     return check
 

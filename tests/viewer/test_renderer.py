@@ -18,6 +18,7 @@ pytestmark = pytest.mark.gl
 
 SIZE = (64, 48)
 SETTINGS = DrawSettings(background=(0.1, 0.4, 0.7))
+RENDERERS = pytest.mark.parametrize("tier", ["auto", "cpu"])
 KERNELS = pytest.mark.parametrize("kernel", ["ray", "ewa"])
 
 
@@ -69,10 +70,13 @@ def test_subpixel_needle_and_disc_gaussians_equal_the_reference(random_scene, po
     assert_reference(scene, pose, (80, 60), replace(SETTINGS, kernel=kernel))
 
 
+@RENDERERS
 @pytest.mark.parametrize("degree", [0, 2, 4])
-def test_colors_of_any_degree_follow_the_position(make_renderer, random_scene, pose, reference, assert_matches, degree):
+def test_colors_of_any_degree_follow_the_position(
+    make_renderer, random_scene, pose, reference, assert_matches, degree, tier
+):
     scene = random_scene(degree=degree, seed=5)
-    renderer = make_renderer(scene)
+    renderer = make_renderer(scene, tier)
     for shift in (0.0, 0.5):
         pose[0, 3] += shift
         assert_matches(renderer, pose, SETTINGS, reference(scene, pose, SIZE, SETTINGS))
@@ -97,10 +101,13 @@ def test_near_unusual_opacities_and_odd_sizes_equal_the_reference(random_scene, 
     assert_reference(replace(scene, gaussians=replace(scene.gaussians, opacities=opacities)), pose, SIZE, SETTINGS)
 
 
+@RENDERERS
 @pytest.mark.parametrize(("unit", "origin"), [(1e-3, (0, 0, 0)), (1e4, (0, 0, 0)), (1, (4e5, -2e5, 1e5))])
-def test_image_does_not_depend_on_the_unit_of_length_and_the_origin(make_renderer, random_scene, pose, unit, origin):
+def test_image_does_not_depend_on_the_unit_of_length_and_the_origin(
+    make_renderer, random_scene, pose, unit, origin, tier
+):
     scene = random_scene(seed=7)
-    renderer = make_renderer(scene)
+    renderer = make_renderer(scene, tier)
     renderer.render(pose, SIZE, DrawSettings())
     expected = renderer.read_color()
     origin = torch.tensor(origin, dtype=torch.float64)
@@ -128,26 +135,31 @@ def test_panorama_error_at_seams_is_not_larger_than_inside_faces(make_renderer, 
     assert error[seam].mean() <= 1.5 * error[~seam].mean() + 1e-4
 
 
+@RENDERERS
 @pytest.mark.parametrize("view", [0, 1])
-def test_mode_view_draws_the_gaussians_of_the_view(make_renderer, random_scene, pose, reference, assert_matches, view):
+def test_mode_view_draws_the_gaussians_of_the_view(
+    make_renderer, random_scene, pose, reference, assert_matches, view, tier
+):
     scene = random_scene()
-    renderer = make_renderer(scene)
+    renderer = make_renderer(scene, tier)
     expected = reference(select_view(scene, view), pose, SIZE, SETTINGS)
     assert_matches(renderer, pose, replace(SETTINGS, mode="view", view=view), expected)
     assert renderer.stats.visible <= int((scene.gaussians.views == view).sum())
 
 
+@RENDERERS
 @pytest.mark.parametrize("layout", ["pinhole", "equirect"])
 @pytest.mark.parametrize("position", ["between", "at view 1", "elsewhere"])
 def test_deferred_blending_equals_the_reference(
-    make_renderer, random_scene, pose, reference, assert_matches, layout, position
+    make_renderer, random_scene, pose, reference, assert_matches, layout, position, tier
 ):
     scene = random_scene(120)  # sparse, so that one or both views have holes
     centers = scene.cam2world[:, :3, 3].numpy()
     pose[:3, 3] = {"between": centers.mean(0), "at view 1": centers[1], "elsewhere": (0.1, 0.2, 0.3)}[position]
     settings = replace(SETTINGS, mode="deferred", layout=layout)
-    renderer = make_renderer(scene)
-    images = [reference(select_view(scene, view), pose, SIZE, settings) for view in (0, 1)]
+    renderer = make_renderer(scene, tier)
+    panorama = "equirect" if tier == "cpu" else "cubemap"
+    images = [reference(select_view(scene, view), pose, SIZE, settings, panorama) for view in (0, 1)]
     weights = blend_weights(torch.from_numpy(pose[:3, 3].copy()), scene.cam2world[:, :3, 3])
     total = sum(weight * image.alpha for weight, image in zip(weights, images, strict=True))
     band = (total > 0) & (total < 1e-3)  # where the weighted views are nearly empty (docs/rendering.md, section 7)
@@ -155,9 +167,10 @@ def test_deferred_blending_equals_the_reference(
     assert_matches(renderer, pose, settings, blend(images, weights), ~band.numpy())
 
 
-def test_difference_is_that_of_the_images_of_two_views(make_renderer, random_scene, pose, reference):
+@RENDERERS
+def test_difference_is_that_of_the_images_of_two_views(make_renderer, random_scene, pose, reference, tier):
     scene = random_scene()
-    renderer = make_renderer(scene)
+    renderer = make_renderer(scene, tier)
     renderer.render(pose, SIZE, replace(SETTINGS, mode="difference"))
     first, second = (reference(select_view(scene, view), pose, SIZE, SETTINGS) for view in (0, 1))
     expected = (first.color - second.color).abs().permute(1, 2, 0).numpy()
@@ -168,9 +181,12 @@ def test_difference_is_that_of_the_images_of_two_views(make_renderer, random_sce
     assert np.abs(renderer.read_color() - forwards).max() <= 1e-6
 
 
-def test_levels_and_opacity_threshold_select_gaussians(make_renderer, random_scene, pose, reference, assert_matches):
+@RENDERERS
+def test_levels_and_opacity_threshold_select_gaussians(
+    make_renderer, random_scene, pose, reference, assert_matches, tier
+):
     scene = random_scene()
-    renderer = make_renderer(scene)
+    renderer = make_renderer(scene, tier)
     cases = [({"opacity_threshold": 0.6}, scene.gaussians.opacities >= 0.6)]
     for levels in ((), (0,), (1, 3)):
         mask = torch.isin(scene.gaussians.levels, torch.tensor(levels, dtype=torch.int64))
@@ -180,17 +196,19 @@ def test_levels_and_opacity_threshold_select_gaussians(make_renderer, random_sce
         assert_matches(renderer, pose, replace(SETTINGS, **change), expected)
 
 
-def test_empty_scene_is_the_background(make_renderer, random_scene, pose):
+@RENDERERS
+def test_empty_scene_is_the_background(make_renderer, random_scene, pose, tier):
     scene = random_scene()
-    renderer = make_renderer(select(scene, torch.zeros(len(scene.gaussians), dtype=torch.bool)))
+    renderer = make_renderer(select(scene, torch.zeros(len(scene.gaussians), dtype=torch.bool)), tier)
     for settings in (SETTINGS, replace(SETTINGS, layout="equirect", mode="deferred")):
         renderer.render(pose, SIZE, settings)
         assert np.allclose(renderer.read_color(), (*SETTINGS.background, 0), atol=1e-6)
         assert not renderer.read_depth().any()
 
 
+@RENDERERS
 def test_gaussians_with_non_finite_values_are_dropped_and_counted(
-    make_renderer, random_scene, pose, reference, assert_matches
+    make_renderer, random_scene, pose, reference, assert_matches, tier
 ):
     scene = random_scene()
     names = ("means", "scales", "quats", "opacities", "harmonics")
@@ -200,7 +218,7 @@ def test_gaussians_with_non_finite_values_are_dropped_and_counted(
     fields["quats"][2, 3] = float("nan")
     fields["opacities"][3] = float("nan")
     fields["harmonics"][4, 2, 0] = float("-inf")
-    renderer = make_renderer(replace(scene, gaussians=replace(scene.gaussians, **fields)))
+    renderer = make_renderer(replace(scene, gaussians=replace(scene.gaussians, **fields)), tier)
     finite = select(scene, torch.arange(len(scene.gaussians)) >= 5)
     assert_matches(renderer, pose, SETTINGS, reference(finite, pose, SIZE, SETTINGS))
     assert renderer.stats.dropped == 5
@@ -231,15 +249,18 @@ def test_software_gl_has_32_bit_targets_by_default(ctx, random_scene, pose):
         renderer.release()
 
 
-def test_image_is_upright_and_not_mirrored(make_renderer, random_scene):
+@RENDERERS
+def test_image_is_upright_and_not_mirrored(make_renderer, random_scene, tier):
     scene = select(random_scene(), torch.arange(300) < 1)
     gaussians = replace(scene.gaussians, means=torch.tensor(((0.5, -0.5, 1.0),)), opacities=torch.ones(1))
-    renderer = make_renderer(replace(scene, gaussians=replace(gaussians, scales=torch.full((1, 3), 0.05))))
+    renderer = make_renderer(replace(scene, gaussians=replace(gaussians, scales=torch.full((1, 3), 0.05))), tier)
     texture = renderer.render(np.eye(4), (64, 64), DrawSettings())
     row, column = np.unravel_index(renderer.read_color()[..., 3].argmax(), (64, 64))
     assert row < 24 and column > 40, "a mean ahead, up and to the right is at the upper right"
-    raw = np.frombuffer(texture.read(), np.float32).reshape(64, 64, 4)
-    assert np.array_equal(raw[::-1], renderer.read_color()), "row 0 of the texture is the bottom row"
+    raw = np.frombuffer(texture.read(), np.uint8 if tier == "cpu" else np.float32).reshape(64, 64, 4)
+    raw = raw[::-1, :, :3] / (255 if tier == "cpu" else 1)
+    error = np.abs(raw - renderer.read_color()[..., :3]).max()
+    assert error <= (0.501 / 255 if tier == "cpu" else 0), "row 0 of the texture is the bottom row"
 
 
 def test_culling_does_not_change_the_image(make_renderer, random_scene, pose, monkeypatch):
@@ -271,9 +292,10 @@ def test_invalid_settings_are_refused(change, message):
         DrawSettings(**change)
 
 
-def test_settings_poses_and_sizes_that_do_not_fit_are_refused(make_renderer, random_scene, pose):
+@RENDERERS
+def test_settings_poses_and_sizes_that_do_not_fit_are_refused(make_renderer, random_scene, pose, tier):
     scene = random_scene()
-    renderer = make_renderer(scene)
+    renderer = make_renderer(scene, tier)
     for change, message in (
         ({"mode": "view", "view": 2}, "`view` must be 0..1 in this scene, got 2"),
         ({"layout": "equirect", "face_size": 100_000}, "limit is .*; use a smaller size or face_size"),

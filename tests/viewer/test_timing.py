@@ -35,19 +35,26 @@ def test_lines_have_times_and_the_image_of_the_reference(run_job, random_scene, 
         "size": [48, 24],
         "repeats": 3,
         "folder": str(tmp_path),
-        "tiers": ["gl33", "gl43"],
+        "tiers": ["gl33", "gl43", "cpu"],
         "settings": [
             {"kernel": "ray", "layout": "equirect", "face_size": 16},
             {"kernel": "ewa", "order": "z", "lowpass": "3dgs"},
+            {"cached": True, "size": [64, 32]},
         ],
     }
     status, output, errors = run_job(json.dumps(job))
     assert status == 0, errors
     lines = [json.loads(line) for line in output.splitlines()]
-    assert [line["settings"] for line in lines[:2]] == [0, 1]
+    assert [line["settings"] for line in lines[:3]] == [0, 1, 2]
+    assert np.load(lines[2]["image"]).shape == (32, 64, 4)
     assert lines[0]["tier"] == "gl33" and lines[0]["renderer"]
     for line in lines:
         assert len(line["frame_ms"]) == 3 and min(line["frame_ms"]) > 0 <= line["sort_ms"]
+    cpu = [line for line in lines if line["tier"] == "cpu"]
+    assert {"project", "rasterize", "blend"} <= set(cpu[0]["stages"]) and "sample" in cpu[2]["stages"]
+    for line in cpu:
+        difference = np.load(line["image"])[..., :3] - np.load(lines[line["settings"]]["image"])[..., :3]
+        assert np.abs(difference).mean() <= 6e-3
     gaussians = scene.gaussians.to(dtype=torch.float64)
     expected = rasterize(gaussians, torch.from_numpy(pose), size=(24, 48), layout="cubemap", face_size=16)
     drawn = np.load(lines[0]["image"])[..., :3].transpose(2, 0, 1)

@@ -68,6 +68,13 @@ def test_resolution_is_full_on_a_fast_machine_and_fits_the_budget_on_a_slow_one(
     assert move_camera(AdaptiveResolution(), 1e6, 30)[-1] == SCALES[-1]
 
 
+def test_no_image_is_smaller_than_the_renderer_allows_unless_the_window_is():
+    for size, smallest in (((1280, 720), 0.5), ((1920, 1080), 0.35), ((800, 600), 1.0), ((320, 200), 1.0)):
+        resolution = AdaptiveResolution()
+        resolution.limit(size, (640, 360))
+        assert move_camera(resolution, 1e6, 30)[-1] == smallest
+
+
 def test_resolution_does_not_oscillate():
     for full_ms in (60.0, 100.0, 150.0, 300.0, 700.0):
         assert len(set(move_camera(AdaptiveResolution(), full_ms, 60)[20:])) == 1
@@ -186,8 +193,8 @@ def make_sphere_scene(entry: SceneEntry, photos: np.ndarray) -> LoadedScene:
     return LoadedScene(entry, scene, Views(image[None], pose[None], mask, 0.45, 10.0, ("a.png",)))
 
 
-@pytest.fixture(scope="module")
-def session(gl_context, small_scene, axis_photos, tmp_path_factory) -> Iterator[User]:
+@pytest.fixture(scope="module", params=["gl", "cpu"])
+def session(request, gl_context, small_scene, axis_photos, tmp_path_factory) -> Iterator[User]:
     images = torch.from_numpy(axis_photos).permute(0, 3, 1, 2)
     mask = torch.ones(2, 128, 256, dtype=torch.bool)
     photos = Views(images, small_scene.cam2world, mask, 0.45, 10.0, small_scene.names)
@@ -208,7 +215,9 @@ def session(gl_context, small_scene, axis_photos, tmp_path_factory) -> Iterator[
     folder = tmp_path_factory.mktemp("screenshots")
     with gl_context:
         target = gl_context.simple_framebuffer(SIZE, components=3)
-        viewer = Viewer(gl_context, SceneLoader(load), find=find, folder=folder, clock=lambda: clock[0])
+        viewer = Viewer(
+            gl_context, SceneLoader(load), find=find, folder=folder, renderer=request.param, clock=lambda: clock[0]
+        )
         imgui.get_io().display_size = SIZE
         user = User(viewer, target, clock)
         user.show(*ENTRIES)
@@ -306,6 +315,20 @@ def test_the_scene_follows_a_drag_on_the_image(user):
     assert user.state.camera.yaw_radians > 0 and user.state.camera.position == user.state.home.position
     errors = {s: np.abs(before[100:380, 60:200] - after[100:380, 60 + s : 200 + s]).mean() for s in (-30, 0, 30)}
     assert min(errors, key=errors.get) == -30, "the image is shifted by the 30 pixels of the drag"
+
+
+def test_a_click_shows_the_point_and_a_second_one_the_distance(user):
+    before = user.read_image()
+    user.click_at(430, 300)
+    (point,) = user.state.points
+    assert 0.5 < point.depth < 8 and point.count > 0
+    assert changed_fraction(before, user.read_image()) > 0.0002, "a marker"
+    user.click_at(500, 500)
+    assert len(user.state.points) == 2 and user.state.points[0] == point
+    user.drag((500, 400), (460, 400))
+    user.press(imgui.Key.r)
+    assert user.state.points == []
+    assert changed_fraction(before, user.read_image()) == 0
 
 
 def test_keys_and_wheel_move_the_camera_and_r_restores_it(user):
@@ -454,8 +477,9 @@ def test_focus_orbits_the_point_in_the_centre(user):
     assert user.state.camera.position == user.state.home.position
 
 
-def test_resolution_is_lower_while_the_camera_moves(user):
+def test_resolution_is_lower_while_the_camera_moves(user, monkeypatch):
     user.viewer._resolution.budget_ms = 1e-3
+    monkeypatch.setattr(user.viewer.renderer, "min_size", (64, 64))
     io = imgui.get_io()
     io.add_key_event(imgui.Key.w, True)
     user.draw_frames(8)

@@ -22,7 +22,7 @@ from pansplat.rendering.cpu import tiling
 from pansplat.rendering.cpu.ewa import EWA_GRAD_SIZE, backpropagate_ewa, project_ewa
 from pansplat.rendering.cpu.projection import Camera, GaussianArrays, ProjectedGaussians, project_gaussians
 from pansplat.rendering.cpu.projection_backward import GaussianGradients, accumulate_slots, backpropagate_projection
-from pansplat.rendering.cpu.rasterize import SavedForBackward, allocate_saved, rasterize_forward
+from pansplat.rendering.cpu.rasterize import MIN_TRANSMITTANCE, SavedForBackward, allocate_saved, rasterize_forward
 from pansplat.rendering.cpu.rasterize_backward import rasterize_backward
 from pansplat.rendering.cpu.records import RECORD_SIZE, PixelTables, tabulate_pixels
 from pansplat.rendering.cpu.runtime import Workspace, announce_compilation, pooled_empty, thread_count
@@ -41,14 +41,19 @@ from pansplat.rendering.rasterize import RasterInfo, RasterOptions, RasterSums
 _MIN_FILTER_VARIANCE = 1e-9  # pixel^2: without a filter, a disc seen edge-on has width 0, and stage one divides by it
 
 
-class _View(NamedTuple):
-    """A scene, its projection for one camera, and the options."""
+class CameraView(NamedTuple):
+    """A scene, its projection for one camera, and the options.
+
+    Attributes:
+        min_transmittance: a pixel is finished at this transmittance or below.
+    """
 
     gaussians: GaussianArrays
     camera: Camera
     projected: ProjectedGaussians
     options: RasterOptions
     threads: int
+    min_transmittance: float = MIN_TRANSMITTANCE
 
     @property
     def is_exact(self) -> bool:
@@ -67,7 +72,7 @@ class _PlaneState(NamedTuple):
 
 
 @dataclass
-class _Statistics:
+class Statistics:
     """Counts, peak bytes of arrays and seconds by stage, collected for `RasterInfo`."""
 
     dropped: int = 0
@@ -111,7 +116,7 @@ def rasterize_planes(
     shape = (gaussians.quats, gaussians.scales, None) if covariances is None else (None, None, covariances)
     tensors = (gaussians.means, *shape, gaussians.opacities, gaussians.harmonics)
     tensors = tuple(None if tensor is None else tensor.to(torch.float32).contiguous() for tensor in tensors)
-    statistics = _Statistics()
+    statistics = Statistics()
     sums = _Rasterize.apply(pose, planes, options, statistics, torch.is_grad_enabled(), *tensors)
     if options.strict and statistics.dropped:
         raise InputError(not_finite_message(gaussians, covariances, pose, options))
@@ -128,21 +133,21 @@ class _Rasterize(torch.autograd.Function):
         pose: Tensor,
         planes: list[ImagePlane],
         options: RasterOptions,
-        statistics: _Statistics,
+        statistics: Statistics,
         grad_enabled: bool,
         *tensors: Tensor | None,
     ) -> Tensor:
         """Sums; `tensors` are the fields of GaussianArrays, or None."""
-        gaussians, camera = GaussianArrays.from_tensors(tensors), _make_camera(pose, planes[0], options)
+        gaussians, camera = GaussianArrays.from_tensors(tensors), make_camera(pose, planes[0], options)
         threads, workspace = thread_count(), Workspace()
         needs_grad = grad_enabled and any(ctx.needs_input_grad)  # needs_input_grad ignores no_grad
         with announce_compilation():
             with statistics.timed("project"):
                 projected = project_gaussians(gaussians, camera, workspace, threads)
-            view = _View(gaussians, camera, projected, options, threads)
+            view = CameraView(gaussians, camera, projected, options, threads)
             sums = pooled_empty((len(planes), gaussians.harmonics.shape[2] + 2, *planes[0].size), np.float32)
             states = [
-                _rasterize_plane(view, plane, plane_sums, statistics, workspace if needs_grad else None)
+                rasterize_plane(view, plane, plane_sums, statistics, workspace if needs_grad else None)
                 for plane, plane_sums in zip(planes, sums, strict=True)
             ]
         statistics.dropped, statistics.near = projected.dropped, projected.near
@@ -159,8 +164,8 @@ class _Rasterize(torch.autograd.Function):
             raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
         *tensors, pose, sums = ctx.saved_tensors
         planes, options, projected, states, _workspace, threads = ctx.saved
-        gaussians, camera = GaussianArrays.from_tensors(tensors), _make_camera(pose, planes[0], options)
-        view = _View(gaussians, camera, projected, options, threads)
+        gaussians, camera = GaussianArrays.from_tensors(tensors), make_camera(pose, planes[0], options)
+        view = CameraView(gaussians, camera, projected, options, threads)
         needs_pose, _, _, _, _, *needed = ctx.needs_input_grad
         grads = [
             torch.from_numpy(pooled_empty(tuple(tensor.shape), np.float32)) if is_needed else None
@@ -183,13 +188,14 @@ class _Rasterize(torch.autograd.Function):
         return (grad_pose, None, None, None, None, *grads)
 
 
-def _make_camera(pose: Tensor, plane: ImagePlane, options: RasterOptions) -> Camera:
+def make_camera(pose: Tensor, plane: ImagePlane, options: RasterOptions) -> Camera:
+    """The camera of a pose (cam2world), and the settings that depend on the size of the image plane's pixels."""
     variance = max(options.filter_variance(plane.pixel_angle), _MIN_FILTER_VARIANCE * plane.pixel_angle**2)
     return Camera(np.ascontiguousarray(pose.detach().numpy()), variance, options.compensate, options.near)
 
 
-def _rasterize_plane(
-    view: _View, plane: ImagePlane, sums: np.ndarray, statistics: _Statistics, saved_in: Workspace | None
+def rasterize_plane(
+    view: CameraView, plane: ImagePlane, sums: np.ndarray, statistics: Statistics, saved_in: Workspace | None = None
 ) -> _PlaneState | None:
     """Write the sums of one image plane.
 
@@ -233,7 +239,7 @@ def _rasterize_plane(
     return state if needs_grad else None
 
 
-def _find_footprints(view: _View, plane: ImagePlane, workspace: Workspace) -> tuple[np.ndarray, np.ndarray]:
+def _find_footprints(view: CameraView, plane: ImagePlane, workspace: Workspace) -> tuple[np.ndarray, np.ndarray]:
     """Records and boxes on an image plane."""
     if view.is_exact:
         records = view.projected.records
@@ -244,7 +250,7 @@ def _find_footprints(view: _View, plane: ImagePlane, workspace: Workspace) -> tu
 
 
 def _rasterize_band(
-    view: _View,
+    view: CameraView,
     records: np.ndarray,
     tiles: TileIntersections,
     tables: PixelTables,
@@ -254,12 +260,12 @@ def _rasterize_band(
     """Write the sums of a band of tile rows."""
     rasterize_forward(
         records, view.projected.values, tiles.intersections, tiles.starts, tables, sums,
-        first_row=tiles.first_row, saved=saved, threads=view.threads,
+        first_row=tiles.first_row, saved=saved, threads=view.threads, min_transmittance=view.min_transmittance,
     )  # fmt: skip
 
 
 def _backpropagate_planes(
-    view: _View,
+    view: CameraView,
     planes: list[ImagePlane],
     states: list[_PlaneState],
     sums: np.ndarray,

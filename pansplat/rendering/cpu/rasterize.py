@@ -354,6 +354,7 @@ def rasterize_forward(
     first_row: int = 0,
     saved: SavedForBackward | None = None,
     threads: int = 1,
+    min_transmittance: float = MIN_TRANSMITTANCE,
 ) -> None:
     """Write the sums of weight x (values, 1) over a band of tile rows.
 
@@ -364,16 +365,19 @@ def rasterize_forward(
         first_row: first row of tiles of the band.
         saved: written, if given, for the backward.
         threads: number of threads; the result does not depend on it.
+        min_transmittance: a pixel is finished at this transmittance or below.
     """
     saved = saved or SavedForBackward(np.empty((0, TILE_PIXELS), np.float32), starts, starts)
     scene = records.reshape(-1), values, intersections.reshape(-1), starts
-    parallel_for_tiles(_rasterize_tiles, (*scene, *tables, sums, *saved, first_row), starts, threads)
+    parallel_for_tiles(
+        _rasterize_tiles, (*scene, *tables, sums, *saved, first_row, np.float32(min_transmittance)), starts, threads
+    )
 
 
 @kernel
 def _rasterize_tiles(
     records, values, intersections, starts, kind, columns, rows, rotation, sums, saved_transmittance, saved_rows,
-    saved_num_chunks, first_row, low, high,
+    saved_num_chunks, first_row, min_transmittance, low, high,
 ):  # fmt: skip
     tiles_across = (len(columns) + TILE_SIZE - 1) // TILE_SIZE
     num_values = values.shape[1]
@@ -410,7 +414,7 @@ def _rasterize_tiles(
             for block in range(NUM_BLOCKS + 1):
                 if block < NUM_BLOCKS:
                     prefetch_slice(records, values, intersections, block, first + CHUNK_SIZE)
-                    if not any_lane(load(transmittance, block * LANES) > broadcast(np.float32(MIN_TRANSMITTANCE))):
+                    if not any_lane(load(transmittance, block * LANES) > broadcast(min_transmittance)):
                         continue
                     num_next = compute_log2_alphas(
                         block, masks, is_3d, footprints, offsets, log2_alphas, indices, begin
@@ -418,10 +422,13 @@ def _rasterize_tiles(
                 other = BUFFER_SIZE - begin
                 if ready >= 0 and num_values == VALUE_LANES:
                     is_unfinished |= _blend_four_values(
-                        ready, num_ready, log2_alphas, indices, other, chunk_values, transmittance, tile_sums
-                    )
+                        ready, num_ready, log2_alphas, indices, other, chunk_values, transmittance, tile_sums,
+                        min_transmittance,
+                    )  # fmt: skip
                 elif ready >= 0:
-                    is_unfinished |= _compute_weights(ready, num_ready, log2_alphas, other, transmittance)
+                    is_unfinished |= _compute_weights(
+                        ready, num_ready, log2_alphas, other, transmittance, min_transmittance
+                    )
                     _accumulate_values(
                         ready, num_ready, log2_alphas, indices, other, chunk_values, num_values, tile_sums
                     )
@@ -509,7 +516,9 @@ def compute_alpha(log2_alpha):
 
 
 @inline_kernel_no_refcount
-def _blend_four_values(block, count, log2_alphas, indices, begin, chunk_values, transmittance, tile_sums):
+def _blend_four_values(
+    block, count, log2_alphas, indices, begin, chunk_values, transmittance, tile_sums, min_transmittance
+):
     """Composite the Gaussians of a block, four values each; return whether a pixel is unfinished."""
     pixel = block * LANES
     transmitted = load(transmittance, pixel)
@@ -537,11 +546,11 @@ def _blend_four_values(block, count, log2_alphas, indices, begin, chunk_values, 
     store(tile_sums, TILE_PIXELS + pixel, sum1)
     store(tile_sums, 2 * TILE_PIXELS + pixel, sum2)
     store(tile_sums, 3 * TILE_PIXELS + pixel, sum3)
-    return any_lane(transmitted > broadcast(np.float32(MIN_TRANSMITTANCE)))
+    return any_lane(transmitted > broadcast(min_transmittance))
 
 
 @inline_kernel_no_refcount
-def _compute_weights(block, count, log2_alphas, begin, transmittance):
+def _compute_weights(block, count, log2_alphas, begin, transmittance, min_transmittance):
     """Replace log2 alphas by weights; return whether a pixel is unfinished."""
     transmitted = load(transmittance, block * LANES)
     for at in range(begin, begin + count):
@@ -549,7 +558,7 @@ def _compute_weights(block, count, log2_alphas, begin, transmittance):
         store(log2_alphas, at * LANES, alpha * transmitted)
         transmitted = multiply_add(-alpha, transmitted, transmitted)
     store(transmittance, block * LANES, transmitted)
-    return any_lane(transmitted > broadcast(np.float32(MIN_TRANSMITTANCE)))
+    return any_lane(transmitted > broadcast(min_transmittance))
 
 
 @inline_kernel_no_refcount

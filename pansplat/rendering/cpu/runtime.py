@@ -144,6 +144,17 @@ def _show_message() -> None:
 # --- worker threads ---
 
 _pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
+_calling_thread = threading.local()
+
+
+@contextlib.contextmanager
+def checking_each_item(check: Callable[[], None]) -> Iterator[None]:
+    """Within the block, `parallel_for` of this thread calls `check` before each item; an exception ends the work."""
+    _calling_thread.check = check
+    try:
+        yield
+    finally:
+        _calling_thread.check = None
 
 
 def thread_count() -> int:
@@ -158,24 +169,31 @@ def parallel_for(work: Callable[[int], object], count: int, threads: int) -> Non
     raised after all threads have stopped, so that no thread writes to a buffer that the caller has released.
     """
     threads = min(threads, count)
+    check = getattr(_calling_thread, "check", None)
     if threads <= 1:
         for item in range(count):
+            if check is not None:
+                check()
             work(item)
         return
     items = itertools.count()  # `next` is atomic
     stopped = False
 
-    def run() -> None:
+    def run(check: Callable[[], None] | None = None) -> None:
         while not stopped and (item := next(items)) < count:
+            if check is not None:
+                check()
             work(item)
 
     futures: list[Future[None]] = []
     try:
         for _ in range(threads - 1):
             futures.append(_pool(threads).submit(run))
-        run()
+        run(check)
     finally:
         stopped = True
+        # The pool may still be busy with the work of another calling thread: do not wait for what has not begun.
+        futures = [future for future in futures if not future.cancel()]
         wait(futures)
     for future in futures:
         future.result()

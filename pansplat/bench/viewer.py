@@ -1,0 +1,330 @@
+"""`pansplat bench viewer`: times of the viewer's frames by stage, and their errors, over counts of Gaussians.
+
+A case is a renderer (OpenGL's two tiers, the processor), a view and a mode. The scenes are synthetic rooms. The viewer
+runs as a command because no module may import it.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import statistics
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pansplat.bench.fidelity import measure_fidelity
+from pansplat.bench.harness import quartile_range
+from pansplat.bench.raster_cases import BenchScene, make_room_scene
+from pansplat.bench.renderers import read_viewer_output
+from pansplat.bench.report import Column, Report, Row, format_number, read_row, result_column
+from pansplat.bench.scenes import make_room_cameras
+from pansplat.errors import InputError
+from pansplat.gaussians.ply import save_ply
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.pose import blend_weights
+from pansplat.rendering import Rendering, blend, rasterize
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+View = Literal["perspective", "coarse", "look-around", "panorama"]
+Mode = Literal["joint", "deferred"]
+
+FOV_DEGREES = 75.0
+_TIERS = ("cpu", "gl33", "gl43")
+_GL_TIERS = ("gl33", "gl43")
+_PANORAMA_SIZE = (1024, 512)  # pixels
+_FACE_SIZE = 326
+_MAX_REFERENCE = 1_000_000  # Gaussians; float64 takes a minute beyond
+_VIEWER_PACKAGE = "pansplat_viewer"
+_RATES = (15, 60)  # frames per second, lines of the plot
+
+
+@dataclass(frozen=True)
+class ViewerCase:
+    """A frame of the viewer.
+
+    Attributes:
+        renderer: `cpu`, `gl33` or `gl43`.
+        view: `perspective` moves; `coarse` moves at half the resolution; `look-around` turns and reads cube faces;
+            `panorama` is stitched from six cube faces.
+        mode: `joint` or `deferred`.
+        width, height: of the image, pixels.
+    """
+
+    renderer: str
+    view: View
+    mode: Mode
+    width: int
+    height: int
+
+    def settings(self) -> dict[str, object]:
+        """The values of the viewer's `DrawSettings`, and the size."""
+        values: dict[str, object] = {"mode": self.mode, "size": [self.width, self.height]}
+        if self.view == "panorama":
+            return {**values, "layout": "equirect", "face_size": _FACE_SIZE}
+        return {**values, "vertical_fov_degrees": FOV_DEGREES, "cached": self.view == "look-around"}
+
+
+@dataclass
+class ViewerResult:
+    """Times and errors of a frame.
+
+    Attributes:
+        frame_ms: median time of a frame.
+        spread_ms: half the range between the quartiles.
+        best_ms: time of the fastest frame, to which other load on the machine adds least.
+        num_gaussians: of the scene.
+        psnr_db, max_error: against the float64 image; None if there is none.
+        stages: median milliseconds of each stage.
+        device: OpenGL's name of the device, or numba.
+    """
+
+    frame_ms: float
+    spread_ms: float
+    best_ms: float
+    num_gaussians: int
+    psnr_db: float | None = None
+    max_error: float | None = None
+    stages: dict[str, float] = field(default_factory=dict)
+    device: str = ""
+
+
+ViewerRow = Row[ViewerCase, ViewerResult]
+
+
+def list_viewer_cases(size: tuple[int, int]) -> list[ViewerCase]:
+    """The cases of one scene; `size` is width and height of the window."""
+    sizes: dict[View, tuple[int, int]] = {
+        "perspective": size,
+        "coarse": (size[0] // 2, size[1] // 2),
+        "look-around": size,
+        "panorama": _PANORAMA_SIZE,
+    }
+    return [
+        ViewerCase(renderer, view, mode, *sizes[view])
+        for renderer in _TIERS
+        for view in sizes
+        for mode in ("joint", "deferred")
+        if renderer == "cpu" or view != "coarse"
+        if view != "panorama" or mode == "joint"
+    ]
+
+
+def read_viewer_rows(path: Path | None) -> list[ViewerRow]:
+    """The rows of an earlier run; none if there is no file.
+
+    Raises:
+        InputError: the file is not one of rows.
+    """
+    if path is None or not path.is_file():
+        return []
+    try:
+        return [read_row(values, ViewerCase, ViewerResult) for values in json.loads(path.read_text())["rows"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: needed rows of `pansplat bench viewer`, got {error!r}; delete it.") from error
+
+
+class ViewerBench:
+    """Measures cases on rooms.
+
+    Args:
+        report: receives the rows; cases that it has are not measured again.
+        repeats: frames of each case.
+        threads: of numba and of software OpenGL.
+    """
+
+    def __init__(self, report: Report[ViewerRow], *, repeats: int, threads: int) -> None:
+        self._report, self._repeats, self._threads = report, repeats, threads
+
+    def run(self, height: int, cases: Sequence[ViewerCase]) -> None:
+        """Measure the cases on the room of this height.
+
+        Raises:
+            InputError: the viewer is not installed, or there is no OpenGL.
+        """
+        if importlib.util.find_spec(_VIEWER_PACKAGE) is None:
+            raise InputError("the viewer is not installed; install all of pansplat to measure it")
+        room = make_room_scene(height)
+        measured = {row.case for row in self._report.rows if row.scene == room.name}
+        cases = [case for case in cases if case not in measured]
+        if not cases:
+            return
+        gaussians = room.load()
+        self._report.update(f"{room.name}: {len(gaussians):,} Gaussians, float64 images")
+        references = _rasterize_references(room, gaussians, cases)
+        with tempfile.TemporaryDirectory() as name:
+            save_ply(Scene(gaussians, make_room_cameras(), near=0.1, far=100.0), Path(name, "scene.ply"))
+            for tier in dict.fromkeys(case.renderer for case in cases):
+                of_tier = [case for case in cases if case.renderer == tier]
+                self._report.update(f"{room.name}: {tier}")
+                self._run_tier(Path(name), room, len(gaussians), of_tier, references)
+
+    def _run_tier(
+        self,
+        folder: Path,
+        room: BenchScene,
+        count: int,
+        cases: list[ViewerCase],
+        references: Mapping[tuple[object, ...], Tensor],
+    ) -> None:
+        repeats = self._repeats if cases[0].renderer == "cpu" else max(self._repeats // 3, 1)
+        job = {
+            "scene": str(folder / "scene.ply"),
+            "pose": room.pose.tolist(),
+            "size": [cases[0].width, cases[0].height],
+            "repeats": repeats,
+            "folder": str(folder),
+            "tiers": [cases[0].renderer],
+            "settings": [case.settings() for case in cases],
+        }
+        (folder / "job.json").write_text(json.dumps(job))
+        for line in read_viewer_output(folder / "job.json", self._threads):
+            case = cases[line["settings"]]
+            times = line["frame_ms"]
+            result = ViewerResult(
+                *(statistics.median(times), quartile_range(times) / 2, min(times), count),
+                stages=line["stages"],
+                device=line["renderer"],
+            )
+            reference = references.get(_image_key(case))
+            if reference is not None:
+                image = torch.from_numpy(np.load(line["image"])[..., :3]).permute(2, 0, 1)
+                error = measure_fidelity(image, reference, panorama=case.view == "panorama")
+                result.psnr_db, result.max_error = error.psnr_db, error.max_error
+            self._report.add(Row("viewer", room.name, case, result))
+
+
+def _image_key(case: ViewerCase) -> tuple[object, ...]:
+    """The values that the exact image of a case depends on."""
+    return case.view == "panorama", case.mode, case.width, case.height
+
+
+def _rasterize_references(
+    room: BenchScene, gaussians: Gaussians, cases: Sequence[ViewerCase]
+) -> dict[tuple[object, ...], Float[Tensor, "3 height width"]]:
+    """The float64 images of the cases, by `_image_key`; none for a large scene."""
+    if len(gaussians) > _MAX_REFERENCE:
+        return {}
+    double = gaussians.to(dtype=torch.float64)
+    images = {}
+    for case in {_image_key(case): case for case in cases}.values():
+
+        def draw(part: Gaussians, case: ViewerCase = case) -> Rendering:
+            return rasterize(
+                part,
+                room.pose,
+                size=(case.height, case.width),
+                layout="equirect" if case.view == "panorama" else "pinhole",
+                vertical_fov_degrees=FOV_DEGREES,
+                backend="torch",
+            )
+
+        with torch.no_grad():
+            if case.mode == "joint":
+                images[_image_key(case)] = draw(double).color
+                continue
+            weights = blend_weights(room.pose[:3, 3], make_room_cameras()[:, :3, 3])
+            views = [draw(double.select(double.views == view)) for view in range(len(weights))]
+            images[_image_key(case)] = blend(views, weights).color
+    return images
+
+
+def _format_stages(row: ViewerRow) -> str:
+    return ", ".join(f"{name} {value:.1f}" for name, value in row.result.stages.items() if value >= 0.05)
+
+
+VIEWER_COLUMNS: tuple[Column[ViewerRow], ...] = (
+    Column("renderer", lambda row: row.case.renderer, "left"),
+    Column("view", lambda row: row.case.view, "left"),
+    Column("mode", lambda row: row.case.mode, "left"),
+    Column("pixels", lambda row: f"{row.case.width}x{row.case.height}"),
+    Column("frame ms", lambda row: f"{row.result.frame_ms:,.1f} ±{row.result.spread_ms:.1f}"),
+    result_column("fastest", "{:,.1f}", "best_ms"),
+    Column("fps", lambda row: f"{1000 / row.result.frame_ms:,.1f}"),
+    result_column("PSNR dB", "{:.1f}", "psnr_db"),
+    Column("max error", lambda row: format_number(row.result.max_error, "{:.1e}")),
+    Column("stages, ms", _format_stages, "left"),
+)
+
+
+def find_viewer_facts(rows: Sequence[ViewerRow]) -> list[str]:
+    """Sentences that compare the fastest frames of renderers and modes."""
+    sentences = []
+    for scene in dict.fromkeys(row.scene for row in rows):
+        frames = {
+            (row.case.renderer, row.case.view, row.case.mode): row.result.best_ms for row in rows if row.scene == scene
+        }
+        count = next(row.result.num_gaussians for row in rows if row.scene == scene)
+        cpu, parts = frames.get(("cpu", "perspective", "joint")), []
+        gl = [frames[key] for tier in _GL_TIERS if (key := (tier, "perspective", "joint")) in frames]
+        if cpu and gl:
+            parts.append(f"cpu draws a frame in {cpu:.0f} ms, OpenGL in {min(gl):.0f} ms")
+        deferred = frames.get(("cpu", "perspective", "deferred"))
+        if cpu and deferred:
+            parts.append(f"deferred blending takes {deferred / cpu:.2f} times as long as joint")
+        turning = frames.get(("cpu", "look-around", "deferred"))
+        if turning:
+            parts.append(f"look-around has {1000 / turning:.0f} frames per second")
+        if parts:
+            sentences.append(f"{count:,} Gaussians: {'; '.join(parts)}.")
+    return sentences
+
+
+def make_viewer_report(
+    machine: Mapping[str, Any], *, json: Path | None = None, out: Path | None = None
+) -> Report[ViewerRow]:
+    """The report of a run.
+
+    Args:
+        machine: from `describe_machine`.
+        json: file of the rows.
+        out: folder for viewer.md and viewer.png.
+    """
+    return Report(
+        VIEWER_COLUMNS,
+        lambda row: f"{row.result.num_gaussians:,} Gaussians ({row.scene})",
+        machine,
+        facts=("cpu", "threads"),
+        findings=find_viewer_facts,
+        json_file=json,
+        page=None if out is None else out / "viewer.md",
+        plots={} if out is None else {out / "viewer.png": lambda rows: plot_viewer(rows, str(machine["cpu"]))},
+        print_steps=True,
+        width=190,
+    )
+
+
+def plot_viewer(rows: Sequence[ViewerRow], title: str) -> Figure:
+    """Plot the time of a frame over the number of Gaussians, for each view, renderer and mode."""
+    from matplotlib.figure import Figure
+
+    views = list(dict.fromkeys(row.case.view for row in rows))
+    figure = Figure(figsize=(3.6 * len(views), 4.2), layout="constrained")
+    axes = figure.subplots(1, len(views), sharey=True, squeeze=False)[0]
+    for ax, view in zip(axes, views, strict=True):
+        of_view = [row for row in rows if row.case.view == view]
+        for renderer, mode in dict.fromkeys((row.case.renderer, row.case.mode) for row in of_view):
+            line = [row.result for row in of_view if (row.case.renderer, row.case.mode) == (renderer, mode)]
+            line.sort(key=lambda result: result.num_gaussians)
+            style = "o-" if mode == "joint" else "s--"
+            color = f"C{_TIERS.index(renderer)}"
+            x, y = [result.num_gaussians for result in line], [result.frame_ms for result in line]
+            ax.loglog(x, y, style, color=color, label=f"{renderer}, {mode}")
+        for rate in _RATES:
+            ax.axhline(1000 / rate, color="grey", linewidth=0.8)
+            ax.annotate(f"{rate} fps", (1, 1000 / rate), xycoords=("axes fraction", "data"), ha="right", va="bottom")
+        ax.set(title=f"{view}, {of_view[0].case.width}x{of_view[0].case.height}", xlabel="Gaussians")
+        ax.grid(alpha=0.25, which="both")
+        ax.legend(fontsize=7)
+    axes[0].set_ylabel("frame, ms")
+    figure.suptitle(title, x=0.01, ha="left", fontsize=9)
+    return figure

@@ -1,0 +1,493 @@
+"""Images for a screen: the forward pass alone, of the Gaussians in view, in several layers, with 8 bits per channel.
+
+A layer is the image of one set of Gaussians, such as those of one input view. All layers share the selection and the
+projection. Records are in world axes, so one image plane differs from another by its rotation only. Pixels are uint32
+words, red in the lowest byte and 255 in the highest.
+
+Source: docs/rendering.md, sections 4 and 7; docs/viewer.md.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt32
+
+from pansplat.geometry.cubemap import face_rotations
+from pansplat.rendering.cpu.backend import CameraView, Statistics, make_camera, rasterize_plane
+from pansplat.rendering.cpu.projection import GaussianArrays, ProjectedGaussians, project_gaussians
+from pansplat.rendering.cpu.runtime import (
+    Workspace,
+    announce_compilation,
+    inline_kernel,
+    kernel,
+    parallel_for,
+    pooled_empty,
+    thread_count,
+)
+from pansplat.rendering.cpu.simd import load_scalar, prefetch, store_scalar
+from pansplat.rendering.image_planes import ImagePlane
+from pansplat.rendering.rasterize import RasterOptions
+
+MIN_TRANSMITTANCE = 2.0**-10
+"""A pixel of a display image is finished at this transmittance: a quarter of a step of 8 bits."""
+
+NO_LAYER = -1
+"""Label of Gaussians that are not drawn."""
+
+_PARTS_PER_THREAD = 4
+_SELECTED_AT_ONCE = 1024  # Gaussians; their marks fit the L1 cache
+_AHEAD = 16  # Gaussians between the prefetch of a row and its use
+_GEOMETRY = 11  # numbers of a row before the harmonics: mean, opacity, quaternion, scales
+_LINE = 16  # float32 per cache line
+_ROWS_PER_ITEM = 16
+
+
+class Selection(NamedTuple):
+    """The cone of directions that is drawn: the intersection of half spaces through the camera centre.
+
+    Attributes:
+        normals: (plane, 3) inward unit normals, world axes.
+        deviation: a bound of a Gaussian's widening by the filter, in standard deviations per distance, radians.
+        bounded: whether a Gaussian ends at its bounding ball; if not, only its centre is compared, with a margin.
+    """
+
+    normals: Float[np.ndarray, "plane 3"]
+    deviation: float
+    bounded: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """The layers of one image plane before background and normalisation.
+
+    Attributes:
+        sums: of weight x (RGB, radial distance, 1), for each layer.
+        selected: Gaussians in view.
+        statistics: counts and seconds by stage.
+    """
+
+    sums: Float[np.ndarray, "layer 5 height width"]
+    selected: int
+    statistics: Statistics
+
+
+class DisplayScene:
+    """The Gaussians of a scene, one row of whole cache lines each, so that those in view are read at random."""
+
+    def __init__(
+        self,
+        means: Float[np.ndarray, "n 3"],
+        opacities: Float[np.ndarray, "n"],
+        quats: Float[np.ndarray, "n 4"],
+        scales: Float[np.ndarray, "n 3"],
+        harmonics: Float[np.ndarray, "n k 3"],
+        reach: Float[np.ndarray, "n"],
+    ) -> None:
+        """Copy the Gaussians.
+
+        Args:
+            means, opacities, quats, scales, harmonics: finite, float32.
+            reach: a Gaussian is visible up to this number of standard deviations.
+        """
+        num, self._num_coefficients = len(means), harmonics.shape[1]
+        size = -(-(_GEOMETRY + 3 * self._num_coefficients) // _LINE) * _LINE
+        self._workspace = Workspace()
+        self._rows = self._workspace.array((num, size), np.float32)
+        self._rows[:, 0:3], self._rows[:, 3] = means, opacities
+        self._rows[:, 4:8], self._rows[:, 8:11] = quats, scales
+        self._rows[:, 11 : 11 + 3 * self._num_coefficients] = harmonics.reshape(num, 3 * self._num_coefficients)
+        extent = reach * scales.max(axis=1, initial=0)
+        self._balls = np.ascontiguousarray(np.column_stack((means, extent, reach)).T.astype(np.float32))
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def rasterize(
+        self,
+        position: Float[np.ndarray, "3"],
+        plane: ImagePlane,
+        labels: Int[np.ndarray, "n"],
+        num_layers: int,
+        options: RasterOptions,
+        *,
+        selection: Selection | None = None,
+        min_transmittance: float = MIN_TRANSMITTANCE,
+    ) -> Layers:
+        """Rasterise the layers of an image plane.
+
+        Args:
+            position: camera centre.
+            plane: its rotation is from its axes to the world's; a direct panorama has its axes in the world's.
+            labels: layer of each Gaussian, int16, or `NO_LAYER`.
+            num_layers: number of layers.
+            options: of the image.
+            selection: leaves out Gaussians that are not in view.
+            min_transmittance: a pixel is finished at this transmittance or below.
+        """
+        statistics, threads, workspace = Statistics(), thread_count(), Workspace()
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, 3] = torch.from_numpy(np.asarray(position, np.float64))
+        if plane.is_panorama:  # its pixels have fixed directions in the records' axes
+            pose[:3, :3], plane = plane.rotation, ImagePlane(plane.size, torch.eye(3, dtype=torch.float64), 0.0)
+        camera = make_camera(pose, plane, options)
+        sums = pooled_empty((num_layers, 5, *plane.size), np.float32)
+        with announce_compilation():
+            with statistics.timed("select"):
+                gaussians, ends = self._select(camera.pose[:3, 3], labels, num_layers, selection, workspace, threads)
+            with statistics.timed("project"):
+                projected = project_gaussians(gaussians, camera, workspace, threads)
+            start = 0
+            for end, layer_sums in zip(ends, sums, strict=True):
+                part = slice(start, end)
+                layer = ProjectedGaussians(*(array[part] for array in projected[:4]), 0, 0)
+                arrays = GaussianArrays(*(array[part] for array in gaussians))
+                view = CameraView(arrays, camera, layer, options, threads, min_transmittance)
+                rasterize_plane(view, plane, layer_sums, statistics)
+                start = end
+        return Layers(sums, ends[-1] if ends else 0, statistics)
+
+    def _select(
+        self,
+        position: np.ndarray,
+        labels: np.ndarray,
+        num_layers: int,
+        selection: Selection | None,
+        workspace: Workspace,
+        threads: int,
+    ) -> tuple[GaussianArrays, list[int]]:
+        """Copy the Gaussians in view, layer by layer in index order; returns them and the end of each layer."""
+        num, parts = len(self), _PARTS_PER_THREAD * threads
+        edges = np.linspace(0, num, parts + 1).astype(np.int64)
+        marks, counts = workspace.array(num, np.int16), np.zeros((parts, num_layers), np.int64)
+        normals = np.zeros((0, 3)) if selection is None else selection.normals
+        offsets = normals @ position
+        deviation, slack = (1.001 * selection.deviation, 1e-5) if selection and selection.bounded else (0.0, 1e-5)
+        bounded = float(selection is not None and selection.bounded)
+        parallel_for(
+            partial(
+                _mark_in_view, edges, self._balls, position.astype(np.float32),
+                np.ascontiguousarray(normals, np.float32), offsets.astype(np.float32), np.float32(deviation),
+                np.float32(slack), np.float32(1.001 * bounded), labels, marks, counts,
+            ),
+            parts,
+            threads,
+        )  # fmt: skip
+        ends = np.cumsum(counts.sum(axis=0))
+        positions = ends - counts.sum(axis=0) + np.cumsum(counts, axis=0) - counts
+        total, coefficients = int(counts.sum()), self._num_coefficients
+        means, quats = workspace.array((total, 3), np.float32), workspace.array((total, 4), np.float32)
+        scales, opacities = workspace.array((total, 3), np.float32), workspace.array(total, np.float32)
+        harmonics = workspace.array((total, coefficients, 3), np.float32)
+        outputs = means.reshape(-1), quats.reshape(-1), scales.reshape(-1), opacities, harmonics.reshape(-1)
+        rows = self._rows.reshape(-1), self._rows.shape[1], 3 * coefficients
+        parallel_for(partial(_copy_marked, edges, marks, positions, *rows, *outputs), parts, threads)
+        no_covariances = np.empty((0, 3, 3), np.float32)
+        return GaussianArrays(means, quats, scales, no_covariances, opacities, harmonics), ends.tolist()
+
+
+@kernel
+def _mark_in_view(
+    edges, balls, position, normals, offsets, deviation, slack, bounded, labels, marks, counts, part
+):  # fmt: skip
+    """Write the layer of each Gaussian that is in view, else NO_LAYER, and count the Gaussians of each layer."""
+    x, y, z, extent, reach = balls[0], balls[1], balls[2], balls[3], balls[4]
+    p_x, p_y, p_z = position[0], position[1], position[2]
+    bounds, seen = np.empty(_SELECTED_AT_ONCE, np.float32), np.empty(_SELECTED_AT_ONCE, np.float32)
+    for first in range(edges[part], edges[part + 1], _SELECTED_AT_ONCE):
+        count = min(_SELECTED_AT_ONCE, edges[part + 1] - first)
+        for i in range(count):
+            d_x, d_y, d_z = (
+                load_scalar(x, first + i) - p_x,
+                load_scalar(y, first + i) - p_y,
+                load_scalar(z, first + i) - p_z,
+            )
+            distance = math.sqrt(d_x * d_x + d_y * d_y + d_z * d_z)
+            bound = distance * (deviation * load_scalar(reach, first + i) + slack)
+            store_scalar(bounds, i, bound + bounded * load_scalar(extent, first + i))
+            store_scalar(seen, i, np.float32(0) if load_scalar(reach, first + i) > np.float32(0) else -np.float32(1))
+        for k in range(normals.shape[0]):
+            n_x, n_y, n_z, offset = normals[k, 0], normals[k, 1], normals[k, 2], offsets[k]
+            for i in range(count):
+                ahead = n_x * load_scalar(x, first + i) + n_y * load_scalar(y, first + i)
+                ahead += n_z * load_scalar(z, first + i) + (load_scalar(bounds, i) - offset)
+                store_scalar(seen, i, min(load_scalar(seen, i), ahead))
+        for i in range(count):
+            label = load_scalar(labels, first + i)
+            layer = label if load_scalar(seen, i) >= np.float32(0) else np.int16(NO_LAYER)
+            store_scalar(marks, first + i, layer)
+            if layer >= 0:
+                counts[part, layer] += 1
+
+
+@kernel
+def _copy_marked(
+    edges, marks, positions, rows, row_size, num_harmonics, means, quats, scales, opacities, harmonics, part
+):  # fmt: skip
+    """Copy the rows of the marked Gaussians of one part to separate arrays, from each layer's position on."""
+    last = len(marks) - 1
+    for g in range(edges[part], edges[part + 1]):
+        label = load_scalar(marks, g)
+        if load_scalar(marks, min(g + _AHEAD, last)) >= 0:
+            prefetch(rows, row_size * min(g + _AHEAD, last))
+        if label >= 0:
+            to, row = positions[part, label], row_size * g
+            positions[part, label] = to + 1
+            for i in range(3):
+                store_scalar(means, 3 * to + i, load_scalar(rows, row + i))
+                store_scalar(scales, 3 * to + i, load_scalar(rows, row + 8 + i))
+            store_scalar(opacities, to, load_scalar(rows, row + 3))
+            for i in range(4):
+                store_scalar(quats, 4 * to + i, load_scalar(rows, row + 4 + i))
+            for i in range(num_harmonics):
+                store_scalar(harmonics, num_harmonics * to + i, load_scalar(rows, row + _GEOMETRY + i))
+
+
+# --- layers to pixels ---
+
+
+def blend_layers(
+    sums: Float[np.ndarray, "layer 5 height width"],
+    weights: Float[np.ndarray, "layer"],
+    background: tuple[float, float, float],
+    *,
+    difference: bool = False,
+) -> tuple[Float[np.ndarray, "height width 4"], Float[np.ndarray, "height width"]]:
+    """RGB over the background and alpha, and depth, of weighted layers; or the difference of the first and last.
+
+    Source: docs/rendering.md, section 7, with positive weights.
+    """
+    if difference:
+        ends = sums[:1], sums[-1:]
+        (first, first_depth), (other, other_depth) = (blend_layers(end, np.ones(1), background) for end in ends)
+        color = np.abs(first[..., :3] - other[..., :3])
+        alpha = np.maximum(first[..., 3:], other[..., 3:])
+        return np.concatenate((color, alpha), axis=2), np.abs(first_depth - other_depth)
+    alphas = np.minimum(sums[:, 4], 1)
+    mix = np.asarray(weights, np.float32)[:, None, None] * alphas
+    total = mix.sum(axis=0)
+    scale = np.divide(1, total, out=np.zeros_like(total), where=total > 0)
+    with np.errstate(invalid="ignore"):
+        depths = np.where(sums[:, 4] > 0, sums[:, 3] / np.where(sums[:, 4] > 0, sums[:, 4], 1), 0)
+    alpha = (mix * alphas).sum(axis=0) * scale
+    color = np.empty((*alpha.shape, 4), np.float32)
+    for channel in range(3):
+        color[..., channel] = (mix * sums[:, channel]).sum(axis=0) * scale + (1 - alpha) * background[channel]
+    color[..., 3] = alpha
+    return color, (mix * depths).sum(axis=0) * scale
+
+
+def blend_to_pixels(
+    sums: Float[np.ndarray, "layer 5 height width"],
+    weights: Float[np.ndarray, "layer"],
+    background: tuple[float, float, float],
+    pixels: UInt32[np.ndarray, "height width"],
+    *,
+    difference: bool = False,
+    bottom_up: bool = False,
+) -> None:
+    """Write the image of `blend_layers` with 8 bits per channel.
+
+    Args:
+        sums, weights, background, difference: as in `blend_layers`.
+        pixels: written.
+        bottom_up: write the bottom row first, as OpenGL stores images.
+    """
+    work = partial(
+        _blend_rows, sums, np.asarray(weights, np.float32), np.array(background, np.float32), difference, bottom_up,
+        pixels,
+    )  # fmt: skip
+    with announce_compilation():
+        parallel_for(work, -(-pixels.shape[0] // _ROWS_PER_ITEM), thread_count())
+
+
+@kernel
+def _blend_rows(sums, weights, background, difference, bottom_up, pixels, item):
+    num_layers, _, height, width = sums.shape
+    rgb, other = np.empty((3, width), np.float32), np.empty((3, width), np.float32)
+    total, alpha_sum = np.empty(width, np.float32), np.empty(width, np.float32)
+    for y in range(item * _ROWS_PER_ITEM, min((item + 1) * _ROWS_PER_ITEM, height)):
+        last = 1 if difference else num_layers
+        _blend_row(sums, weights, background, y, 0, last, rgb, total, alpha_sum)
+        if difference:
+            _blend_row(sums, weights, background, y, num_layers - 1, num_layers, other, total, alpha_sum)
+            for channel in range(3):
+                for x in range(width):
+                    rgb[channel, x] = abs(rgb[channel, x] - other[channel, x])
+        row = pixels[height - 1 - y if bottom_up else y]
+        for x in range(width):
+            red, green, blue = _to_byte(rgb[0, x]), _to_byte(rgb[1, x]), _to_byte(rgb[2, x])
+            row[x] = np.uint32(0xFF000000) | red | green << np.uint32(8) | blue << np.uint32(16)
+
+
+@inline_kernel
+def _to_byte(value):
+    clipped = min(max(value, np.float32(0)), np.float32(1))
+    return np.uint32(np.int32(clipped * np.float32(255) + np.float32(0.5)))
+
+
+@inline_kernel
+def _blend_row(sums, weights, background, y, first, end, rgb, total, alpha_sum):
+    """Write RGB over the background of one row, from layers `first` to `end` - 1."""
+    width = rgb.shape[1]
+    for x in range(width):
+        total[x] = alpha_sum[x] = np.float32(0)
+        rgb[0, x] = rgb[1, x] = rgb[2, x] = np.float32(0)
+    for layer in range(first, end):
+        weight = weights[layer] if end > first + 1 else np.float32(1)
+        for x in range(width):
+            alpha = min(sums[layer, 4, y, x], np.float32(1))
+            mix = weight * alpha
+            total[x] += mix
+            alpha_sum[x] += mix * alpha
+            rgb[0, x] += mix * sums[layer, 0, y, x]
+            rgb[1, x] += mix * sums[layer, 1, y, x]
+            rgb[2, x] += mix * sums[layer, 2, y, x]
+    for x in range(width):
+        scale = np.float32(1) / total[x] if total[x] > np.float32(0) else np.float32(0)
+        behind = np.float32(1) - alpha_sum[x] * scale
+        rgb[0, x] = rgb[0, x] * scale + behind * background[0]
+        rgb[1, x] = rgb[1, x] * scale + behind * background[1]
+        rgb[2, x] = rgb[2, x] * scale + behind * background[2]
+
+
+# --- a rotated view from cube faces ---
+
+
+@dataclass(frozen=True, eq=False)
+class PixelFaces:
+    """Six cube faces of one camera position, in world axes, with a border for interpolation.
+
+    Attributes:
+        focal: focal length of the faces, pixels; a face covers `2 focal` pixels without its border.
+        pixels: faces in the order of `pansplat.geometry.cubemap.FACES`.
+    """
+
+    focal: float
+    pixels: UInt32[np.ndarray, "face side side"]
+
+    @staticmethod
+    def allocate(focal: float) -> "PixelFaces":
+        """Faces with undefined content."""
+        side = 2 * math.ceil(focal) + 2
+        return PixelFaces(focal, np.empty((6, side, side), np.uint32))
+
+    def plane(self, face: int) -> ImagePlane:
+        """The image plane of a face, with its border; its rotation is to the world's axes."""
+        side = self.pixels.shape[1]
+        return ImagePlane((side, side), face_rotations()[face], self.focal)
+
+    def sample(
+        self,
+        rotation: Float[np.ndarray, "3 3"],
+        focal: float,
+        pixels: UInt32[np.ndarray, "height width"],
+        *,
+        bottom_up: bool = False,
+    ) -> None:
+        """Write the pinhole image of a camera at the same position, by bilinear interpolation.
+
+        Args:
+            rotation: camera to world.
+            focal: of the image, pixels.
+            pixels: written.
+            bottom_up: write the bottom row first, as OpenGL stores images.
+        """
+        to_faces = np.ascontiguousarray(face_rotations().numpy().transpose(0, 2, 1) @ rotation)
+        focals = np.float64(self.focal), np.float64(focal)
+        work = partial(_sample_rows, self.pixels, *focals, to_faces, bottom_up, pixels)
+        with announce_compilation():
+            parallel_for(work, -(-pixels.shape[0] // _ROWS_PER_ITEM), thread_count())
+
+
+_EVEN_BYTES = np.uint32(0x00FF00FF)
+_FRACTION_BITS = 8
+
+
+@kernel
+def _sample_rows(faces, face_focal, focal, to_faces, bottom_up, pixels, item):
+    """Sample the rows of one item.
+
+    Args:
+        faces: pixels.
+        face_focal: focal length of the faces.
+        focal: of the image.
+        to_faces: (face, 3, 3) float64, from camera axes to each face's axes.
+        bottom_up: write the bottom row first.
+        pixels: written.
+        item: number of the block of rows.
+    """
+    side, (height, width) = faces.shape[1], pixels.shape
+    flat = faces.reshape(-1)
+    middle, limit = np.float32(0.5 * side - 0.5), 1.0 + 0.5 / face_focal
+    start, step = np.empty((6, 3)), np.empty((6, 3))
+    corners, fractions = np.empty(width, np.int32), np.empty(width, np.int32)
+    for k in range(6):
+        for j in range(3):
+            step[k, j] = to_faces[k, j, 0] / focal
+    for y in range(item * _ROWS_PER_ITEM, min((item + 1) * _ROWS_PER_ITEM, height)):
+        down, left = (y + 0.5 - 0.5 * height) / focal, (0.5 - 0.5 * width) / focal
+        for k in range(6):
+            for j in range(3):
+                start[k, j] = to_faces[k, j, 0] * left + to_faces[k, j, 1] * down + to_faces[k, j, 2]
+        row = pixels[height - 1 - y if bottom_up else y]
+        x = 0
+        while x < width:
+            face, best = 0, -np.inf
+            for k in range(6):  # the face on whose axis the ray is the longest
+                ahead = start[k, 2] + x * step[k, 2]
+                if ahead > best:
+                    best, face = ahead, k
+            end = float(width)
+            for j in range(2):  # the ray leaves the face where |across| = limit * ahead
+                for sign in (-1.0, 1.0):
+                    slope = limit * step[face, 2] + sign * step[face, j]
+                    if slope < 0:
+                        end = min(end, (limit * start[face, 2] + sign * start[face, j]) / -slope)
+            after = max(np.int64(math.floor(end)), x + 1)
+            _sample_run(
+                flat, face * side * side, side, np.float32(face_focal), middle,
+                np.float32(start[face, 0]), np.float32(start[face, 1]), np.float32(start[face, 2]),
+                np.float32(step[face, 0]), np.float32(step[face, 1]), np.float32(step[face, 2]),
+                row, x, after, corners, fractions,
+            )  # fmt: skip
+            x = after
+
+
+@inline_kernel
+def _sample_run(
+    flat, base, side, focal, middle, s_x, s_y, s_z, t_x, t_y, t_z, row, first, end, corners, fractions
+):  # fmt: skip
+    """Sample pixels `first` to `end` - 1 of a row, whose rays meet one face.
+
+    Positions and look-ups are two loops: LLVM vectorises the first one, and cannot vectorise look-ups.
+    """
+    largest = np.int32(side) - np.int32(2)
+    for x in range(first, end):
+        at = np.float32(x)
+        scale = focal / (s_z + at * t_z)
+        u = np.int32(((s_x + at * t_x) * scale + middle) * np.float32(1 << _FRACTION_BITS))
+        v = np.int32(((s_y + at * t_y) * scale + middle) * np.float32(1 << _FRACTION_BITS))
+        column = min(max(u >> np.int32(_FRACTION_BITS), np.int32(0)), largest)
+        line = min(max(v >> np.int32(_FRACTION_BITS), np.int32(0)), largest)
+        store_scalar(corners, x, line * np.int32(side) + column)
+        store_scalar(fractions, x, (u & np.int32(255)) | (v & np.int32(255)) << np.int32(8))
+    for x in range(first, end):
+        corner, fraction = base + np.int64(load_scalar(corners, x)), np.uint32(load_scalar(fractions, x))
+        f_x, f_y = fraction & np.uint32(255), fraction >> np.uint32(8)
+        upper = _mix(load_scalar(flat, corner), load_scalar(flat, corner + 1), f_x)
+        lower = _mix(load_scalar(flat, corner + side), load_scalar(flat, corner + side + 1), f_x)
+        store_scalar(row, x, _mix(upper, lower, f_y))
+
+
+@inline_kernel
+def _mix(first, second, fraction):
+    """Interpolate the four bytes of two words; `fraction` in 1/256."""
+    rest = np.uint32(256) - fraction
+    half = np.uint32(0x00800080)
+    even = (first & _EVEN_BYTES) * rest + (second & _EVEN_BYTES) * fraction + half
+    odd = (first >> np.uint32(8) & _EVEN_BYTES) * rest + (second >> np.uint32(8) & _EVEN_BYTES) * fraction + half
+    return (even >> np.uint32(8) & _EVEN_BYTES) | (odd & ~_EVEN_BYTES)

@@ -1,0 +1,111 @@
+"""The viewer's benchmark: cases, errors against float64, rows that continue a run, and its files."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pansplat.bench import viewer
+from pansplat.bench.report import Row
+from pansplat.bench.viewer import (
+    ViewerCase,
+    ViewerResult,
+    find_viewer_facts,
+    list_viewer_cases,
+    plot_viewer,
+    read_viewer_rows,
+)
+from pansplat.cli import run
+from pansplat.errors import InputError
+from pansplat.gaussians.ply import load_ply
+from pansplat.rendering import rasterize
+
+
+@pytest.fixture
+def jobs(monkeypatch) -> list[dict]:
+    """Jobs given to the viewer, which is replaced by numba for joint images and by black for others."""
+    jobs = []
+
+    def read_viewer_output(file: Path, threads: int):
+        job = json.loads(file.read_text())
+        jobs.append(job)
+        gaussians = load_ply(job["scene"]).gaussians
+        for index, settings in enumerate(job["settings"]):
+            width, height = settings["size"]
+            image = np.zeros((height, width, 4), np.float32)
+            if settings["mode"] == "joint" and settings.get("layout") != "equirect":
+                drawn = rasterize(
+                    gaussians, torch.tensor(job["pose"]), size=(height, width), layout="pinhole",
+                    vertical_fov_degrees=settings["vertical_fov_degrees"], backend="numba",
+                )  # fmt: skip
+                image[..., :3] = drawn.color.permute(1, 2, 0).numpy()
+            path = file.parent / f"{index}.npy"
+            np.save(path, image)
+            times = [3.0, 1.0, 2.0]
+            yield {
+                "settings": index, "tier": job["tiers"][0], "frame_ms": times, "sort_ms": 0.5,
+                "stages": {"sort": 0.5, "draw": 1.5}, "image": str(path), "renderer": "fake",
+            }  # fmt: skip
+
+    monkeypatch.setattr(viewer, "read_viewer_output", read_viewer_output)
+    return jobs
+
+
+def test_each_renderer_moves_and_turns_in_both_modes():
+    cases = list_viewer_cases((128, 64))
+    assert len(set(cases)) == len(cases)
+    for renderer in ("cpu", "gl33", "gl43"):
+        of_renderer = {(case.view, case.mode) for case in cases if case.renderer == renderer}
+        assert {("perspective", "deferred"), ("look-around", "joint"), ("panorama", "joint")} <= of_renderer
+    coarse = [case for case in cases if case.view == "coarse"]
+    assert {(case.renderer, case.width, case.height) for case in coarse} == {("cpu", 64, 32)}
+
+
+def test_the_command_writes_rows_page_and_plot_and_continues(jobs, tmp_path, capsys):
+    command = ["bench", "viewer", "--heights", "16", "--size", "64", "64", "--out", str(tmp_path), "--threads", "1"]
+    assert run(command) == 0
+    rows = read_viewer_rows(tmp_path / "viewer.json")
+    assert len(rows) == len(list_viewer_cases((64, 64)))
+    assert {row.result.frame_ms for row in rows} == {2.0}
+    joint = [row for row in rows if row.case.mode == "joint" and row.case.view == "perspective"]
+    assert all(row.result.psnr_db > 100 for row in joint), "the same image"
+    black = next(row for row in rows if row.case.mode == "deferred")
+    assert black.result.psnr_db < 30, "another image"
+    page = (tmp_path / "viewer.md").read_text()
+    assert "deferred blending takes 1.00 times" in page and "sort 0.5, draw 1.5" in page
+    assert (tmp_path / "viewer.png").stat().st_size > 5000
+    assert len(jobs) == 3
+    assert run(command) == 0
+    assert len(jobs) == 3, "nothing is measured again"
+    capsys.readouterr()
+    (tmp_path / "viewer.json").write_text("{}")
+    assert run(command) == 2
+    assert "needed rows of `pansplat bench viewer`" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["--heights", "20"], "multiple of 8"), (["--size", "8", "8"], "64 to 8192 pixels")],
+)
+def test_invalid_arguments_are_refused(arguments, message, capsys):
+    assert run(["bench", "viewer", *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_without_the_viewer_the_error_says_so(monkeypatch, tmp_path):
+    monkeypatch.setattr(viewer, "_VIEWER_PACKAGE", "no_such_package")
+    report = viewer.make_viewer_report({"cpu": "x", "threads": 1})
+    with pytest.raises(InputError, match="viewer is not installed"):
+        viewer.ViewerBench(report, repeats=1, threads=1).run(16, list_viewer_cases((64, 64)))
+
+
+def test_facts_and_plot_need_no_complete_rows():
+    case = ViewerCase("cpu", "perspective", "joint", 64, 64)
+    rows = [Row("viewer", "room 16", case, ViewerResult(11.0, 1.0, 10.0, 500))]
+    assert find_viewer_facts(rows) == []
+    rows.append(replace(rows[0], case=replace(case, renderer="gl33"), result=ViewerResult(45.0, 1.0, 40.0, 500)))
+    assert find_viewer_facts(rows) == ["500 Gaussians: cpu draws a frame in 10 ms, OpenGL in 40 ms."]
+    assert len(plot_viewer(rows, "title").axes) == 1

@@ -1,0 +1,168 @@
+"""Images for a screen: selection of the Gaussians in view, layers, bytes, and views from cube faces."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from pansplat.geometry.pose import rotations_from_quats
+from pansplat.rendering.blend import blend
+from pansplat.rendering.cpu.display import (
+    NO_LAYER,
+    DisplayScene,
+    PixelFaces,
+    Selection,
+    blend_layers,
+    blend_to_pixels,
+)
+from pansplat.rendering.image_planes import ImagePlane
+from pansplat.rendering.rasterize import RasterOptions, rasterize
+
+SIZE, FOV = (48, 70), 70.0
+FOCAL = 0.5 * SIZE[0] / math.tan(math.radians(FOV) / 2)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """600 Gaussians around the origin with two labels."""
+    from pansplat.gaussians.scene import Gaussians
+
+    random = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(600, 3, generator=random), dim=-1)
+    return Gaussians(
+        means=directions * (1 + 2 * torch.rand(600, 1, generator=random)),
+        scales=0.02 + 0.2 * torch.rand(600, 3, generator=random),
+        quats=torch.randn(600, 4, generator=random),
+        opacities=torch.rand(600, generator=random),
+        harmonics=0.3 * torch.randn(600, 4, 3, generator=random),
+        levels=torch.zeros(600, dtype=torch.int64),
+        views=torch.arange(600) % 2,
+    )
+
+
+@pytest.fixture(scope="module")
+def display(scene):
+    reach = np.sqrt(2 * np.log(np.maximum(255 * scene.opacities.numpy(), 1))).astype(np.float32)
+    fields = (getattr(scene, name).numpy() for name in ("means", "opacities", "quats", "scales", "harmonics"))
+    return DisplayScene(*fields, reach)
+
+
+@pytest.fixture(scope="module")
+def pose():
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = rotations_from_quats(torch.tensor((0.7, 0.3, -0.5, 0.2), dtype=torch.float64))
+    pose[:3, 3] = torch.tensor((0.1, -0.2, 0.05))
+    return pose
+
+
+def draw(display, pose, labels, layers, selection=None, size=SIZE, focal=FOCAL):
+    plane = ImagePlane(size, pose[:3, :3], focal)
+    labels = np.asarray(labels, np.int16)
+    position = pose[:3, 3].numpy()
+    return display.rasterize(
+        position, plane, labels, layers, RasterOptions(), selection=selection, min_transmittance=1e-7
+    )
+
+
+def frustum(pose, scale=1.0):
+    x, y = scale * 0.5 * SIZE[1] / FOCAL, scale * 0.5 * SIZE[0] / FOCAL
+    normals = np.array(((-1, 0, x), (1, 0, x), (0, -1, y), (0, 1, y)))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    deviation = math.sqrt(RasterOptions().filter_variance(1 / FOCAL))
+    return Selection(normals @ pose[:3, :3].numpy().T, deviation, bounded=True)
+
+
+def test_layers_are_the_images_of_their_gaussians(scene, display, pose):
+    sums = draw(display, pose, scene.views.numpy(), 2).sums
+    for view in (0, 1):
+        part = scene.select(scene.views == view)
+        expected = rasterize(part, pose, size=SIZE, layout="pinhole", vertical_fov_degrees=FOV, backend="numba")
+        assert np.abs(sums[view, :3] - expected.color.numpy()).max() <= 2e-6
+        assert np.abs(sums[view, 4] - expected.alpha.numpy()).max() <= 2e-6
+
+
+def test_selection_does_not_change_the_image_and_leaves_gaussians_out(scene, display, pose):
+    labels = np.zeros(len(scene))
+    whole, selected = draw(display, pose, labels, 1), draw(display, pose, labels, 1, frustum(pose))
+    assert whole.selected == np.count_nonzero(scene.opacities > 1 / 255) and selected.selected < 0.6 * whole.selected
+    assert np.array_equal(whole.sums, selected.sums)
+    narrow = draw(display, pose, labels, 1, frustum(pose, 0.2))
+    assert not np.array_equal(whole.sums, narrow.sums), "the bound is not infinite"
+
+
+def test_gaussians_without_a_layer_are_not_drawn(display, pose):
+    assert not draw(display, pose, np.full(600, NO_LAYER), 1).sums.any()
+
+
+def test_a_direct_panorama_has_the_axes_of_its_plane(scene, display, pose):
+    plane = ImagePlane((32, 64), pose[:3, :3], 0.0)
+    layers = display.rasterize(pose[:3, 3].numpy(), plane, np.zeros(600, np.int16), 1, RasterOptions())
+    expected = rasterize(scene, pose, size=(32, 64), backend="numba")
+    assert np.abs(layers.sums[0, :3] - expected.color.numpy()).max() <= 2e-3
+
+
+def test_blended_layers_equal_those_of_the_definition(scene, display, pose):
+    sums = draw(display, pose, scene.views.numpy(), 2).sums
+    background, weights = (0.2, 0.5, 0.9), torch.tensor((0.7, 0.3))
+    images = [
+        rasterize(
+            scene.select(scene.views == view), pose, size=SIZE, layout="pinhole", vertical_fov_degrees=FOV,
+            background=background, backend="numba",
+        )
+        for view in (0, 1)
+    ]  # fmt: skip
+    expected = blend(images, weights)
+    color, depth = blend_layers(sums, weights.numpy(), background)
+    assert np.abs(color[..., :3] - expected.color.permute(1, 2, 0).numpy()).max() <= 1e-5
+    assert np.abs(color[..., 3] - expected.alpha.numpy()).max() <= 1e-5
+    assert np.abs(depth - expected.depth.numpy()).max() <= 1e-4
+    difference, _ = blend_layers(sums, weights.numpy(), background, difference=True)
+    first, second = (image.color.permute(1, 2, 0).numpy() for image in images)
+    assert np.abs(difference[..., :3] - np.abs(first - second)).max() <= 1e-5
+
+
+@pytest.mark.parametrize("difference", [False, True])
+@pytest.mark.parametrize("bottom_up", [False, True])
+def test_pixels_are_the_blended_layers_rounded(scene, display, pose, difference, bottom_up):
+    sums = draw(display, pose, scene.views.numpy(), 2).sums
+    background, weights = (0.2, 0.5, 0.9), np.array((0.7, 0.3), np.float32)
+    color, _ = blend_layers(sums, weights, background, difference=difference)
+    pixels = np.empty(SIZE, np.uint32)
+    blend_to_pixels(sums, weights, background, pixels, difference=difference, bottom_up=bottom_up)
+    bytes_ = pixels.view(np.uint8).reshape(*SIZE, 4)[:: -1 if bottom_up else 1]
+    assert np.abs(bytes_[..., :3] - 255 * np.clip(color[..., :3], 0, 1)).max() <= 0.51
+    assert (bytes_[..., 3] == 255).all()
+
+
+def test_faces_sampled_by_their_own_cameras_are_unchanged():
+    faces = PixelFaces.allocate(20.0)
+    random = np.random.default_rng(0)
+    faces.pixels[:] = random.integers(0, 2**32, faces.pixels.shape, dtype=np.uint32)
+    side = faces.pixels.shape[1]
+    for face in range(6):
+        pixels = np.empty((side - 2, side - 2), np.uint32)
+        faces.sample(faces.plane(face).rotation.numpy(), 20.0, pixels)
+        found, expected = (image.view(np.uint8).astype(int) for image in (pixels, faces.pixels[face, 1:-1, 1:-1]))
+        assert np.abs(found - expected.reshape(found.shape)).max() <= 2, "positions are rounded to 1/256 pixel"
+
+
+def test_sampled_faces_show_smooth_functions_of_the_direction_without_seams(pose):
+    faces = PixelFaces.allocate(40.5)
+    for face in range(6):
+        write_directions(faces.plane(face).directions().numpy(), faces.pixels[face])
+    for rotation in (pose[:3, :3], torch.eye(3, dtype=torch.float64), pose[:3, :3].T):
+        for bottom_up in (False, True):
+            found, expected = np.empty((60, 90), np.uint32), np.empty((60, 90), np.uint32)
+            faces.sample(rotation.numpy(), 30.0, found, bottom_up=bottom_up)
+            write_directions(ImagePlane((60, 90), rotation, 30.0).directions().numpy(), expected)
+            found = found[::-1] if bottom_up else found
+            error = np.ascontiguousarray(found).view(np.uint8).astype(int) - expected.view(np.uint8)
+            assert np.abs(error).max() <= 2
+
+
+def write_directions(directions: np.ndarray, pixels: np.ndarray) -> None:
+    """Write directions as colours."""
+    words = np.full((*pixels.shape, 4), 255, np.uint8)
+    words[..., :3] = np.round(127.5 + 127 * directions)
+    pixels[:] = words.view(np.uint32)[..., 0]
