@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -203,7 +204,7 @@ def read_trajectory(path: Path, convention: str | None = None, expected: str | N
             f"{path}, line {ragged[0]}: needed {count} numbers as in the other lines, got {len(ragged[1])}; "
             "correct the line."
         )
-    lines, numbers = [line for line, _ in rows], torch.tensor([row for _, row in rows], dtype=torch.float64)
+    lines, numbers = [line for line, _ in rows], torch.from_numpy(np.array([row for _, row in rows], np.float64))
     matrices = _kitti_matrices(numbers) if kind == "kitti" else _tum_matrices(numbers, lines, path)
     return Trajectory(kind, tuple(to_cam2world(_rigid_matrices(matrices, lines, path), convention).unbind()))
 
