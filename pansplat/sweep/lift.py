@@ -68,7 +68,7 @@ class LiftConfig:
     """Largest colour error of a lattice where no finer one replaces it."""
     fine_points: int = 850_000
     """Largest number of a view's points on the finer lattices; a larger error is allowed where they do not suffice."""
-    discontinuity: float = 0.06
+    discontinuity: float = 0.15
     """Relative change of inverse depth between pixels at a discontinuity."""
     consistent_opacity: float = 0.95
     """Where another view is consistent."""
