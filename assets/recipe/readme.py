@@ -1,8 +1,6 @@
 """Write the sample's README.md: contents, credits, how it was made, checksums.
 
-    python readme.py ../living_room
-
-Needs only Python.
+blender/bin/python readme.py ../living_room
 """
 
 from __future__ import annotations
@@ -13,6 +11,10 @@ import os
 import sys
 from pathlib import Path
 
+from PIL import Image
+
+_SAMPLES = 14  # paths per pixel of the shipped images
+
 _TEXT = """# The living room
 
 Two posed panoramas of a furnished room, one metre apart, with a third one midway to compare with, and the
@@ -20,9 +22,9 @@ exact depth of all three. Nobody lives there: it was generated (see [../recipe](
 
 | file | what |
 |---|---|
-| `left.jpg`, `right.jpg` | the context views, equirectangular, {width}x{height} |
+| `left.jpg`, `right.jpg` | the context views, equirectangular, {color_size} |
 | `middle.jpg` | the target view, exactly midway, level |
-| `*_depth.png` | 16 bit, millimetres along the ray through the pixel's centre; no pixel is unknown |
+| `*_depth.png` | {depth_size}, 16 bit, millimetres along the ray through the pixel's centre; no pixel is unknown |
 | `poses.json` | camera-to-world, OpenCV axes (x right, y down, z forward), metres; near and far |
 | `pairs.json` | which views are context and which target |
 | `credits.json` | the table below, for programs |
@@ -57,8 +59,8 @@ With bpy 4.2.0, numpy 2.4.6 and Pillow 13.0.0 under Python 3.11, from the reposi
 bash assets/recipe/fetch.sh sources
 python3.11 -m venv blender && blender/bin/pip install bpy==4.2.0 numpy==2.4.6 pillow==13.0.0
 blender/bin/python assets/recipe/living_room.py --sources sources --out assets/living_room \\
-    --seed 0 --height {height} --samples 48
-python assets/recipe/readme.py assets/living_room
+    --seed 0 --height {height} --depth-height {depth_height} --samples {samples}
+blender/bin/python assets/recipe/readme.py assets/living_room
 ```
 
 ## Checksums (SHA-256)
@@ -76,10 +78,17 @@ def write(folder: Path) -> None:
     rows = ["| " + " | ".join(credit[k] for k in fields) + " |" for credit in credits]
     files = sorted(p for p in folder.iterdir() if p.is_file() and p.name != "README.md" and p.name[0] != ".")
     sums = [f"{hashlib.sha256(p.read_bytes()).hexdigest()}  {p.name}" for p in files]
-    header = (folder / "middle_depth.png").read_bytes()[16:24]  # a PNG's first chunk: width, height
-    width, height = int.from_bytes(header[:4], "big"), int.from_bytes(header[4:], "big")
+    color, depth = (Image.open(folder / name).size for name in ("middle.jpg", "middle_depth.png"))
     part = folder / ".part-README.md"
-    text = _TEXT.format(credits="\n".join(rows), checksums="\n".join(sums), width=width, height=height)
+    text = _TEXT.format(
+        credits="\n".join(rows),
+        checksums="\n".join(sums),
+        color_size=f"{color[0]}x{color[1]}",
+        depth_size=f"{depth[0]}x{depth[1]}",
+        height=color[1],
+        depth_height=depth[1],
+        samples=_SAMPLES,
+    )
     part.write_text(text, encoding="utf-8")
     os.replace(part, folder / "README.md")
 
