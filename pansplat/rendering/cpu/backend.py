@@ -276,7 +276,7 @@ def _backpropagate_planes(
 
     With one image plane in one band the slots are those of its intersections; otherwise each Gaussian has one.
     """
-    gaussians, camera, projected, options, threads = view
+    gaussians, camera, projected, options, threads = view[:5]
     num, num_values = projected.values.shape
     is_single = view.is_exact and len(planes) == 1 and states[0].tiles is not None
     total_records = np.zeros((num if view.is_exact and not is_single else 0, RECORD_SIZE), np.float32)
