@@ -18,6 +18,7 @@ _PUBLIC = {
     "Rendering": "pansplat.rendering",
     "Scene": "pansplat.gaussians.scene",
     "Views": "pansplat.data.views",
+    "estimate_poses": "pansplat.pipeline",
     "load": "pansplat.pipeline",
     "load_model": "pansplat.pipeline",
     "load_pairs": "pansplat.pipeline",

@@ -68,11 +68,16 @@ class CachedPrediction:
 
 def list_cache_folders(pair: Pair) -> list[Path]:
     """Folders for a pair's predictions, in order of preference."""
-    pair_hash = hashlib.blake2b(os.fsencode(pair.folder.resolve()), digest_size=8).hexdigest()
-    folders = [pair.folder / ".pansplat"]
+    return cache_folders(pair.folder)
+
+
+def cache_folders(folder: Path) -> list[Path]:
+    """Folders for what is computed from a folder's panoramas, in order of preference."""
+    folder_hash = hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=8).hexdigest()
+    folders = [folder / ".pansplat"]
     with contextlib.suppress(InputError):  # no home folder
         home = os.environ.get("XDG_CACHE_HOME") or expand_home("~/.cache")
-        folders.append(Path(home) / "pansplat" / pair_hash)
+        folders.append(Path(home) / "pansplat" / folder_hash)
     return folders
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.cache import CachedPrediction
-from pansplat.data.folders import load_pairs
+from pansplat.data import folders
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
 from pansplat.errors import InputError
@@ -29,18 +29,58 @@ from pansplat.geometry.pose import blend_weights
 from pansplat.geometry.world import scale_poses, working_factor
 from pansplat.model.layers import Precision
 from pansplat.model.weights import WEIGHTS_SUFFIXES, CompatChoice, read_model_name
+from pansplat.poses.estimate import estimate_poses
+from pansplat.poses.files import estimate_pairs
 from pansplat.predictor import Predictor, Progress
 from pansplat.refinement import RefineConfig, Refinement, refinement_fingerprint
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.official import rasterize_official
 
-__all__ = ["load", "load_model", "load_pairs", "predict", "predict_to_file", "refine", "render", "save"]
+__all__ = [
+    "estimate_poses",
+    "load",
+    "load_model",
+    "load_pairs",
+    "predict",
+    "predict_to_file",
+    "refine",
+    "render",
+    "save",
+]
 
 Drawing = Literal["exact", "original"]
 
 _LEAST_HEIGHT = 64  # of all predictors, pixels
 _DEFAULT_HEIGHT = 512  # of networks; larger panoramas take minutes
+
+
+def load_pairs(
+    path: Path | str,
+    *,
+    convention: str | None = None,
+    near: float | None = None,
+    far: float | None = None,
+    progress: Progress | None = None,
+) -> list[Pair]:
+    """The pairs at a path, those with targets first. Image files are read when a pair is loaded.
+
+    The poses of a folder that holds panoramas only are estimated (docs/poses.md), with a warning, and cached.
+
+    Args:
+        path: a pair folder, a folder of many panoramas, or a folder of such folders, in one of the formats of
+            docs/input.md. Also one of their files with poses.
+        convention: pose convention, such as "world2cam opengl"; overrides that of the files.
+        near, far: radial depth range in metres; overrides that of the files.
+        progress: called with a description of the estimate of poses and the completed fraction.
+
+    Raises:
+        InputError: no known format was found, a file is missing or invalid, or no poses were found.
+    """
+    images = folders.list_unposed_panoramas(path)
+    if images:
+        return estimate_pairs(expand_home(path), images, near=near, far=far, progress=progress)
+    return folders.load_pairs(path, convention=convention, near=near, far=far)
 
 
 def load_model(

@@ -65,6 +65,7 @@ def _list_commands() -> object:
     from pansplat.cli.data import Data
     from pansplat.cli.evaluate import Evaluate
     from pansplat.cli.info import Info
+    from pansplat.cli.pose import Pose
     from pansplat.cli.predict import Predict
     from pansplat.cli.refine import Refine
     from pansplat.cli.render import Render
@@ -74,6 +75,7 @@ def _list_commands() -> object:
         | Annotated[Refine, subcommand("refine")]
         | Annotated[Render, subcommand("render")]
         | Annotated[Evaluate, subcommand("evaluate")]
+        | Annotated[Pose, subcommand("pose")]
         | Annotated[Check, subcommand("check")]
         | Annotated[Info, subcommand("info")]
         | Annotated[Bench, subcommand("bench")]

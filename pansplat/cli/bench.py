@@ -341,6 +341,52 @@ class BenchViewer:
 
 
 @dataclass(frozen=True)
+class BenchPose:
+    """Measure estimated camera poses against known ones: every pair, and all panoramas of each folder together."""
+
+    paths: Positional[tuple[Path, ...]] = ()
+    """Folders of panoramas with poses; by default the sample, if it is there."""
+    camera_height: Positive = 1.5
+    """Mean height of the cameras over the floor, metres."""
+    tours: bool = False
+    """Also estimate all panoramas of each folder together."""
+    json: Path | None = None
+    """File for the rows; written after every row."""
+    out: OptionalOut = None
+    """Folder for pose.json, pose.md and pose.png."""
+    threads: Threads | None = None
+    """Threads to use; by default torch's."""
+
+    def run(self) -> int:
+        """Measure, print the tables and write the files; exit status 1 if a wrong pose passed the check."""
+        import torch
+
+        from pansplat.bench.pose import make_pose_report, measure_poses, summarise
+        from pansplat.bench.roofline import describe_machine
+        from pansplat.data.folders import load_pairs
+
+        json = _choose_rows_file(self.json, self.out, "pose.json")
+        if not self.paths and not _SAMPLE.is_dir():
+            raise InputError("give a folder of panoramas with poses (the sample is in the repository only)")
+        threads = _choose_threads(self.threads)
+        torch.set_num_threads(threads)
+        with make_pose_report(describe_machine(threads), json=json, out=self.out) as report:
+            for path in self.paths or (_SAMPLE,):
+                pairs = load_pairs(path)
+                contexts = {tuple(sorted(str(view.image) for view in pair.context)): pair for pair in pairs}
+                for pair in contexts.values():
+                    report.update(pair.name)
+                    report.add(measure_poses(pair.name, pair.context, self.camera_height))
+                if self.tours:
+                    views = {view.image: view for pair in pairs for view in (*pair.context, *pair.targets)}
+                    report.update(f"all {len(views)} panoramas")
+                    name = path.resolve().name
+                    report.add(measure_poses(name, list(views.values()), self.camera_height, "tour"))
+        print(summarise([row for row in report.rows if row.suite == "pair"]))
+        return int(any(row.result.outcome == "wrong" for row in report.rows))
+
+
+@dataclass(frozen=True)
 class BenchMachine:
     """Measure the machine's peaks: multiply-adds and memory bandwidth."""
 
@@ -366,6 +412,7 @@ class Bench:
         | Annotated[BenchMemory, subcommand("memory")]
         | Annotated[BenchRefine, subcommand("refine")]
         | Annotated[BenchViewer, subcommand("viewer")]
+        | Annotated[BenchPose, subcommand("pose")]
         | Annotated[BenchMachine, subcommand("machine")]
     )
 

@@ -107,6 +107,18 @@ def _find_collections(folder: Path, convention: str | None, depth: int) -> list[
     return [found for sub in subfolders for found in _find_collections(sub, convention, depth - 1)]
 
 
+def list_unposed_panoramas(path: Path | str) -> list[Path]:
+    """The panorama files of a folder without poses in a known format; empty unless there are two or more."""
+    folder = expand_home(path)
+    try:
+        if not folder.is_dir() or _find_collections(folder, None, _MAX_DEPTH):
+            return []
+        images = list_panorama_files(folder)
+    except (InputError, OSError):  # `load_pairs` reports it
+        return []
+    return images if len(images) >= 2 else []
+
+
 def _nothing_found(root: Path) -> InputError:
     images = list_panorama_files(root)
     if images:
@@ -139,9 +151,12 @@ def _choose_convention(convention: str | None, default: str) -> str:
 # poses.json with an optional pairs.json: the package's own format.
 
 
-def read_pose_file_folder(folder: Path, convention: str | None = None) -> Collection:
-    """The panoramas of poses.json, and the groups of pairs.json. File names in them are relative to the folder."""
-    source = folder / _POSES
+def read_pose_file_folder(folder: Path, convention: str | None = None, *, source: Path | None = None) -> Collection:
+    """The panoramas of poses.json, and the groups of pairs.json. File names in them are relative to the folder.
+
+    `source` is the file of the poses, if it is not in the folder.
+    """
+    source = source or folder / _POSES
     content = read_json(source)
     entries = content.get("poses") if isinstance(content, dict) else None
     if not isinstance(entries, dict):

@@ -1,0 +1,104 @@
+"""`pansplat pose`: camera poses of panoramas, or of the key frames of a video, without any other input."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tyro.conf import Positional
+
+from pansplat.cli.inputs import OptionalOut, progress_bar
+from pansplat.console import make_table_console, print_message
+from pansplat.errors import InputError
+from pansplat.options import Count, Positive
+
+if TYPE_CHECKING:
+    from pansplat.poses.estimate import PoseEstimate
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Estimate the camera poses of equirectangular panoramas of one place."""
+
+    paths: Positional[tuple[Path, ...]]
+    """A folder of panoramas, or two or more files; or a 360-degree video."""
+    out: OptionalOut = None
+    """File to write: poses.json, or a trajectory .tum or .kitti. Without it, only the table is shown. For a video, a
+    folder for the key frames and their poses.json."""
+    camera_height: Positive = 1.5
+    """Mean height of the cameras over the floor, metres; it sets the scale."""
+    baseline: tuple[str, str, float] | None = None
+    """Two of the files and their distance in metres, instead of the camera's height."""
+    frames: Count = 24
+    """Largest number of key frames of a video."""
+
+    def run(self) -> int:
+        """Estimate, print the table and write the file."""
+        from pansplat.poses.estimate import estimate_poses
+        from pansplat.poses.files import SUFFIXES, write_poses
+
+        if not self.paths:
+            raise InputError("`pansplat pose` needs a folder of panoramas, two or more files, or a video")
+        is_video = len(self.paths) == 1 and self.paths[0].suffix.lower() in (".mp4", ".mov", ".mkv", ".webm")
+        if not is_video and self.out is not None and self.out.suffix.lower() not in SUFFIXES:
+            raise InputError(f"--out must end in {', '.join(SUFFIXES)}, got {self.out}")
+        with progress_bar() as progress:
+            images = self._extract_frames(progress) if is_video else _list_images(self.paths)
+            estimate = estimate_poses(
+                images, camera_height=self.camera_height, baseline=self.baseline, progress=progress
+            )
+        _print_estimate(estimate)
+        out = self.out / "poses.json" if is_video and self.out is not None else self.out
+        if out is not None:
+            write_poses(estimate, out)
+            print(out)
+        return 0
+
+    def _extract_frames(self, progress) -> list[Path]:
+        from pansplat.poses.key_frames import extract_key_frames
+
+        if self.out is None:
+            raise InputError("--out must name a folder for the key frames of a video, got none")
+        return extract_key_frames(self.paths[0], self.out, self.frames, progress)
+
+
+def _list_images(paths: tuple[Path, ...]) -> list[Path]:
+    """The files, and those in the folders."""
+    from pansplat.data.pairs import list_panorama_files
+
+    images: list[Path] = []
+    for path in paths:
+        if not path.exists():
+            raise InputError(f"{path}: needed a folder of panoramas or a file, got no such path; check it.")
+        images += list_panorama_files(path) if path.is_dir() else [path]
+    if len(images) < 2:
+        raise InputError(f"{paths[0]}: needed two or more panoramas, got {len(images)}; add the others.")
+    return images
+
+
+def _print_estimate(estimate: PoseEstimate) -> None:
+    """The table of the pairs that place the panoramas, the summary, and the panoramas without a pose."""
+    import math
+
+    from rich.table import Table
+
+    table = Table()
+    for column in ("pair", "score", "margin", "places", "parallax", "rotation +-", "direction +-", "check"):
+        table.add_column(column, justify="left" if column in ("pair", "check") else "right")
+    for (i, j), relation in estimate.relations.items():
+        if relation.is_reliable or len(estimate.relations) <= 3:
+            degrees = [math.degrees(angle) for angle in (relation.parallax, *relation.uncertainty)]
+            table.add_row(
+                f"{estimate.images[i].stem} - {estimate.images[j].stem}",
+                *(f"{value:.0f}" for value in (relation.score, relation.margin, relation.places)),
+                f"{degrees[0]:.1f}",
+                *(f"{value:.2f}" for value in degrees[1:]),
+                relation.problem or "good",
+            )
+    make_table_console().print(table)
+    print(estimate.summary)
+    for image, reason in estimate.unplaced.items():
+        print_message("note", f"{image.name} has no pose: {reason}")
+    sys.stdout.flush()

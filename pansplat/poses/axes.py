@@ -1,0 +1,199 @@
+"""Gravity and the axes of the walls in one panorama, from its straight line segments.
+
+A segment and the camera span a plane. The normals of vertical segments are perpendicular to gravity, and those of a
+room's horizontal edges to one of two further axes (a Manhattan world). The axes of two panoramas of one building give
+their relative rotation up to a quarter turn, independently of matches.
+
+Source: J. Coughlan, A. Yuille, Manhattan World, ICCV 1999; segments: R. Grompone von Gioi et al., LSD, PAMI 2010.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy import ndarray as Array
+
+from pansplat.poses.features import FACE_ROTATIONS, render_face
+from pansplat.poses.solvers import rotation_angle, rotation_exp, rotation_log
+
+_MIN_LENGTH = math.radians(2.5)  # of a segment
+_NOISE = 4e-3  # standard deviation of a normal, radians
+_ROUNDS = 25  # of the fit; its tolerance shrinks
+_FIRST_TOLERANCE = math.radians(3)
+_SEARCH_TOLERANCE = math.radians(1.5)
+_LARGEST_TILT = math.radians(20)  # of the camera
+_MIN_SUPPORT, _MIN_CONTRAST = 12, 2.5  # segments of an axis, also relative to the number by chance
+_ROTATION_NOISE = (
+    math.radians(0.45),
+    math.radians(0.7),
+)  # of the relative rotation: about horizontal axes, about gravity
+_LARGEST_RESIDUAL = 5.0  # of a rotation that the axes are taken to determine, in the noise's unit
+_PARALLEL = math.radians(1.8)  # difference of parallel axes
+_AGREEMENT = 0.9, 0.06  # prior probability of axes of one building, and of upright cameras in different ones
+
+
+@dataclass(frozen=True, eq=False)
+class SceneAxes:
+    """Axes in the camera's frame, as rows: down, and two walls' normals.
+
+    Attributes:
+        axes: orthonormal, right-handed.
+        has_down: whether enough vertical edges determine the first axis.
+        has_walls: whether enough horizontal edges determine the other two.
+    """
+
+    axes: Float[Array, "3 3"]
+    has_down: bool
+    has_walls: bool
+
+
+def find_axes(image: UInt8[Array, "height width"]) -> SceneAxes:
+    """The axes of a grey panorama of a camera that is upright within 20 degrees."""
+    normals, lengths = _segment_normals(image)
+    if len(normals) < _MIN_SUPPORT:
+        return SceneAxes(np.array(((0.0, 1, 0), (0, 0, 1), (1, 0, 0))), False, False)
+    axes = _search_axes(normals, lengths)
+    tolerance = _FIRST_TOLERANCE
+    rows = np.arange(len(normals))
+    for _ in range(_ROUNDS):
+        cosine = normals @ axes.T
+        nearest = np.abs(cosine).argmin(axis=1)
+        residual = cosine[rows, nearest]
+        weight = lengths**2 * np.exp(-0.5 * (residual / tolerance) ** 2)
+        jacobian = np.cross(axes[nearest], normals)
+        hessian = (jacobian * weight[:, None]).T @ jacobian
+        step = np.linalg.solve(
+            hessian + (1e-9 * np.trace(hessian) + 1e-12) * np.eye(3), -jacobian.T @ (weight * residual)
+        )
+        axes = axes @ rotation_exp(step).T
+        tolerance = max(0.75 * tolerance, _NOISE)
+    inlier = np.abs(residual) < 2.5 * _NOISE
+    support = np.bincount(nearest[inlier], minlength=3)
+    by_chance = 2.5 * _NOISE * len(normals)
+    is_clear = support > max(_MIN_SUPPORT, _MIN_CONTRAST * by_chance)
+    weak = support[1:].sum() > max(1.5 * _MIN_SUPPORT, 2 * _MIN_CONTRAST * by_chance)
+    return SceneAxes(axes, bool(is_clear[0]), bool(is_clear[0] and weak))
+
+
+def _segment_normals(image: UInt8[Array, "height width"]) -> tuple[Float[Array, "n 3"], Float[Array, "n"]]:
+    """Normals of the planes through the camera and the line segments, and the segments' lengths, radians."""
+    focal = image.shape[1] / (2 * math.pi)
+    detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD)
+    normals, lengths = [np.empty((0, 3))], [np.empty(0)]
+    for rotation in FACE_ROTATIONS:
+        face = render_face(image, rotation, focal)
+        found = detector.detect(face)[0]
+        if found is None:
+            continue
+        ends = (found.reshape(-1, 2, 2).astype(np.float64) + 0.5 - len(face) / 2) / focal
+        rays = np.concatenate((ends, np.ones((*ends.shape[:2], 1))), axis=2) @ rotation.T
+        rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+        normal = np.cross(rays[:, 0], rays[:, 1])
+        sine = np.linalg.norm(normal, axis=1)
+        long = sine > math.sin(_MIN_LENGTH)
+        normals.append(normal[long] / sine[long][:, None])
+        lengths.append(np.arcsin(np.clip(sine[long], 0, 1)))
+    return np.concatenate(normals), np.minimum(np.concatenate(lengths), math.radians(20))
+
+
+def _search_axes(normals: Float[Array, "n 3"], lengths: Float[Array, "n"]) -> Float[Array, "3 3"]:
+    """Start of the fit: the direction near the camera's y axis with most edges, then the best yaw."""
+    first, second = np.triu_indices(min(len(normals), 120), 1)
+    order = np.argsort(-lengths)
+    crossing = np.cross(normals[order[first]], normals[order[second]])
+    norm = np.linalg.norm(crossing, axis=1)
+    crossing = crossing[norm > 0.2] / norm[norm > 0.2][:, None]
+    crossing *= np.where(crossing[:, 1:2] < 0, -1, 1)
+    candidates = np.concatenate((crossing[crossing[:, 1] > math.cos(_LARGEST_TILT)], [[0.0, 1.0, 0.0]]))[:4000]
+    votes = np.exp(-0.5 * ((candidates @ normals.T) / _SEARCH_TOLERANCE) ** 2) @ lengths
+    down = candidates[votes.argmax()]
+    a = np.cross(down, (0.0, 0.0, 1.0))
+    a /= np.linalg.norm(a)
+    b = np.cross(down, a)
+    flat = np.abs(normals @ down) > 0.15  # not of vertical edges
+    angles = np.radians(np.arange(0, 90, 0.5))
+    walls = np.cos(angles)[:, None] * a + np.sin(angles)[:, None] * b
+    both = [np.exp(-0.5 * ((w @ normals[flat].T) / _SEARCH_TOLERANCE) ** 2) for w in (walls, np.cross(down, walls))]
+    wall = walls[((both[0] + both[1]) @ lengths[flat]).argmax()]
+    return np.stack((down, wall, np.cross(down, wall)))
+
+
+def relative_rotations(first: SceneAxes, second: SceneAxes) -> list[Float[Array, "3 3"]]:
+    """The four rotations from the first camera to the second one that make their axes agree."""
+    turned = []
+    for cosine, sine in ((1, 0), (0, 1), (-1, 0), (0, -1)):
+        quarter = np.array(((1.0, 0, 0), (0, cosine, -sine), (0, sine, cosine)))
+        turned.append(second.axes.T @ quarter @ first.axes)
+    return turned
+
+
+@dataclass(frozen=True, eq=False)
+class RotationPrior:
+    """What the axes of two panoramas state about their relative rotation, before any match.
+
+    Both cameras see the same gravity, and usually parallel walls; with a small probability neither holds.
+    """
+
+    first: SceneAxes
+    second: SceneAxes
+
+    @property
+    def has_down(self) -> bool:
+        """Whether both panoramas determine gravity."""
+        return self.first.has_down and self.second.has_down
+
+    @property
+    def has_walls(self) -> bool:
+        """Whether both panoramas determine the walls."""
+        return self.first.has_walls and self.second.has_walls
+
+    def residual(self, rotation: Float[Array, "3 3"]) -> tuple[Float[Array, "n"], Float[Array, "n 3"]] | None:
+        """Tilt (3) and, with walls, yaw (1) against the axes in units of their noise, and the derivative by rotation.
+
+        The derivative is by a left rotation of `rotation`. None if the axes do not agree or are unknown.
+        """
+        if not self.has_down:
+            return None
+        turned, down = rotation @ self.first.axes[0], self.second.axes[0]
+        tilt = np.cross(down, turned) / _ROTATION_NOISE[0]
+        derivative = ((down @ turned) * np.eye(3) - np.outer(turned, down)) / _ROTATION_NOISE[0]
+        if np.linalg.norm(tilt) > _LARGEST_RESIDUAL or down @ turned < 0:
+            return None
+        if self.has_walls:
+            options = [option.T @ rotation for option in relative_rotations(self.first, self.second)]
+            nearest = min(options, key=lambda option: float(rotation_angle(option)))
+            yaw = float(self.first.axes[0] @ rotation_log(nearest)) / _ROTATION_NOISE[1]
+            if abs(yaw) < _LARGEST_RESIDUAL:
+                tilt = np.append(tilt, yaw)
+                derivative = np.concatenate((derivative, turned[None] / _ROTATION_NOISE[1]))
+        return tilt, derivative
+
+    def confirms(self, rotation: Float[Array, "3 3"]) -> bool:
+        """Whether both panoramas determine the walls, and the rotation makes them parallel."""
+        if not self.has_walls:
+            return False
+        options = relative_rotations(self.first, self.second)
+        return min(float(rotation_angle(option.T @ rotation)) for option in options) < _PARALLEL
+
+    def score(self, rotation: Float[Array, "3 3"]) -> float:
+        """Logarithm of the rotation's probability density under the prior, over that of a random rotation."""
+        if not self.has_down:
+            return 0.0
+        tilt = math.acos(float(np.clip(self.second.axes[0] @ rotation @ self.first.axes[0], -1, 1)))
+        sigma = math.sqrt(2) * _ROTATION_NOISE[0]
+        upright = 2 / sigma**2 * math.exp(-0.5 * (tilt / sigma) ** 2)
+        walls, share, others = 0.0, *_AGREEMENT
+        if self.has_walls:
+            nearest = min(rotation_angle(option.T @ rotation) for option in relative_rotations(self.first, self.second))
+            sigma = 1.5 * _ROTATION_NOISE[1]
+            walls = 2 * math.pi**2 / ((2 * math.pi) ** 1.5 * sigma**3) * math.exp(-0.5 * (nearest / sigma) ** 2)
+        else:
+            share, others = 0.0, sum(_AGREEMENT)
+        return math.log(share * walls + others * upright + 1 - share - others)
+
+
+NO_PRIOR = RotationPrior(*(SceneAxes(np.eye(3), False, False),) * 2)

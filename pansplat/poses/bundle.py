@@ -1,0 +1,239 @@
+"""Bundle adjustment on the sphere: cameras and points with the smallest robust angles between points and bearings.
+
+Points are homogeneous unit 4-vectors, so that points far away are regular. The normal equations are reduced to the
+cameras by the Schur complement, and solved by Levenberg and Marquardt's method.
+
+Source: B. Triggs et al., Bundle adjustment - a modern synthesis, 1999.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray as Array
+
+from pansplat.poses.solvers import rotation_exp, skew
+
+_STEPS = 30
+_LARGEST_DAMPING = 1e8
+_CONVERGED = 1e-6  # relative decrease of the cost
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Cameras, points and observations.
+
+    Attributes:
+        rotations, centres: of the cameras, camera to world.
+        points: homogeneous unit vectors in the world.
+        camera, point: indices for each observation.
+        bearings: observed unit directions in the camera's frame.
+        axes: for each camera the down direction in its frame; NaN where it is unknown.
+        down: in the world.
+    """
+
+    rotations: Float[Array, "camera 3 3"]
+    centres: Float[Array, "camera 3"]
+    points: Float[Array, "point 4"]
+    camera: Int[Array, "observation"]
+    point: Int[Array, "observation"]
+    bearings: Float[Array, "observation 3"]
+    axes: Float[Array, "camera 3"]
+    down: Float[Array, "3"]
+
+    def select(self, kept: Bool[Array, "observation"]) -> Problem:
+        """The problem with some observations only, and without points that fewer than two observe."""
+        counts = np.bincount(self.point[kept], minlength=len(self.points))
+        kept = kept & (counts[self.point] >= 2)
+        used, point = np.unique(self.point[kept], return_inverse=True)
+        return replace(
+            self,
+            points=self.points[used],
+            camera=self.camera[kept],
+            point=point.reshape(-1),
+            bearings=self.bearings[kept],
+        )
+
+
+def triangulate(
+    rotations: Float[Array, "camera 3 3"],
+    centres: Float[Array, "camera 3"],
+    camera: Int[Array, "observation"],
+    point: Int[Array, "observation"],
+    bearings: Float[Array, "observation 3"],
+    count: int,
+) -> Float[Array, "count 4"]:
+    """Homogeneous points that minimise the sines between points and bearings."""
+    rays = np.einsum("nij,nj->ni", rotations[camera], bearings)
+    cross = skew(rays)
+    rows = np.concatenate((cross, -np.einsum("nij,nj->ni", cross, centres[camera])[..., None]), axis=2)
+    matrix = np.zeros((count, 4, 4))
+    np.add.at(matrix, point, np.einsum("nki,nkj->nij", rows, rows))
+    points = np.linalg.eigh(matrix)[1][:, :, 0]
+    # The sign for which most rays point to the point.
+    toward = np.einsum("ni,ni->n", rays, points[point, :3] - points[point, 3:] * centres[camera])
+    votes = np.bincount(point, np.sign(toward), count)
+    return points * np.where(votes < 0, -1.0, 1.0)[:, None]
+
+
+def residual_angles(problem: Problem) -> Float[Array, "observation"]:
+    """Angles between points and bearings, radians; pi if a point is behind."""
+    q = _camera_points(problem)
+    return np.arctan2(np.linalg.norm(np.cross(q, problem.bearings), axis=1), (q * problem.bearings).sum(axis=1))
+
+
+def point_depths(problem: Problem) -> Float[Array, "observation"]:
+    """Distance of the point of each observation from its camera; infinite for points at infinity."""
+    w = problem.points[problem.point, 3]
+    with np.errstate(divide="ignore"):
+        return np.linalg.norm(_camera_points(problem), axis=1) / np.abs(w)
+
+
+def _camera_points(problem: Problem) -> Float[Array, "observation 3"]:
+    x = problem.points[problem.point]
+    offset = x[:, :3] - x[:, 3:] * problem.centres[problem.camera]
+    return np.einsum("nji,nj->ni", problem.rotations[problem.camera], offset)
+
+
+def _evaluate(problem: Problem, noise: float, axis_noise: float) -> tuple[float, Array, Array, Array, Array]:
+    """Cost, residuals (n 2), weights (n), tangent vectors (n 2 3) and scaled camera points (n 3).
+
+    The loss is Cauchy's; the residual is the part of the point's direction across the bearing.
+    """
+    q = _camera_points(problem)
+    length = np.linalg.norm(q, axis=1)
+    unit = q / np.maximum(length, 1e-12)[:, None]
+    helper = np.eye(3)[np.abs(problem.bearings).argmin(axis=1)]
+    first = np.cross(problem.bearings, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    tangents = np.stack((first, np.cross(problem.bearings, first)), axis=1)
+    residual = np.einsum("nki,ni->nk", tangents, unit) / noise
+    behind = (unit * problem.bearings).sum(axis=1) < 0
+    squared = np.where(behind, 1e6, (residual**2).sum(axis=1))
+    cost = float(2 * np.log1p(squared / 4).sum() * 2)
+    weight = np.where(behind, 0.0, 1 / (1 + squared / 4))
+    tilt = _tilts(problem) / axis_noise
+    cost += float((tilt**2).sum())
+    return cost, residual, weight, tangents, q
+
+
+def _tilts(problem: Problem) -> Float[Array, "camera 3"]:
+    """The cross product of each camera's down direction with the world's; zero where it is unknown."""
+    known = np.isfinite(problem.axes).all(axis=1)
+    axes = np.where(known[:, None], problem.axes, 0.0)
+    return np.cross(np.einsum("nij,nj->ni", problem.rotations, axes), problem.down)
+
+
+def adjust(problem: Problem, noise: float, axis_noise: float = 0.01, steps: int = _STEPS) -> Problem:
+    """Minimise the robust cost over all cameras and points. The gauge is left to the damping.
+
+    Args:
+        noise: standard deviation of a bearing, radians.
+        axis_noise: standard deviation of the cameras' down directions, radians.
+        steps: largest number of steps.
+    """
+    damping = 1e-3
+    state = _evaluate(problem, noise, axis_noise)
+    for _ in range(steps):
+        cost = state[0]
+        reduced = _normal_equations(problem, state, noise, axis_noise)
+        while damping < _LARGEST_DAMPING:
+            moved = _step(problem, reduced, damping)
+            trial = None if moved is None else _evaluate(moved, noise, axis_noise)
+            if moved is not None and trial is not None and trial[0] < cost:
+                break
+            damping *= 6
+        else:
+            return problem
+        assert moved is not None and trial is not None
+        problem, state = moved, trial
+        damping = max(damping / 4, 1e-9)
+        if cost - state[0] < _CONVERGED * cost:
+            break
+    return problem
+
+
+def _normal_equations(problem: Problem, state: tuple, noise: float, axis_noise: float) -> tuple:
+    """Blocks of the normal equations: cameras (c 6 6), points (p 3 3), both (n 6 3), gradients, point bases (p 4 3)."""
+    _, residual, weight, tangents, q = state
+    rotation = problem.rotations[problem.camera]
+    x = problem.points[problem.point]
+    length = np.linalg.norm(q, axis=1)[:, None, None]
+    unit = q[:, :, None] / length
+    projected = (tangents - (tangents @ unit) @ unit.transpose(0, 2, 1)) / length / noise  # d residual / d q
+    # A left rotation w of the camera: q = R' (offset) -> q + R' (offset x w).
+    world = projected @ rotation.transpose(0, 2, 1)
+    offset = x[:, :3] - x[:, 3:] * problem.centres[problem.camera]
+    by_camera = np.concatenate((world @ skew(offset), -world * x[:, 3][:, None, None]), axis=2)
+    by_point = np.concatenate((world, -(world @ problem.centres[problem.camera][:, :, None])), axis=2)
+    bases = np.linalg.svd(problem.points[:, None, :])[2][:, 1:].transpose(0, 2, 1)  # tangent of the unit 4-sphere
+    by_point = by_point @ bases[problem.point]
+    weighted_camera, weighted_point = by_camera * weight[:, None, None], by_point * weight[:, None, None]
+    cameras = np.zeros((len(problem.centres), 6, 6))
+    points = np.zeros((len(problem.points), 3, 3))
+    camera_gradient, point_gradient = np.zeros(cameras.shape[:2]), np.zeros(points.shape[:2])
+    np.add.at(cameras, problem.camera, weighted_camera.transpose(0, 2, 1) @ by_camera)
+    np.add.at(points, problem.point, weighted_point.transpose(0, 2, 1) @ by_point)
+    np.add.at(camera_gradient, problem.camera, (weighted_camera * residual[:, :, None]).sum(axis=1))
+    np.add.at(point_gradient, problem.point, (weighted_point * residual[:, :, None]).sum(axis=1))
+    both = weighted_camera.transpose(0, 2, 1) @ by_point
+    known = np.isfinite(problem.axes).all(axis=1)
+    world_axes = np.einsum("nij,nj->ni", problem.rotations, np.where(known[:, None], problem.axes, 0.0))
+    # (w x a) x d = a (w . d) - w (a . d)
+    jacobian = world_axes[:, :, None] * problem.down - (world_axes @ problem.down)[:, None, None] * np.eye(3)
+    jacobian /= axis_noise
+    cameras[:, :3, :3] += jacobian.transpose(0, 2, 1) @ jacobian
+    camera_gradient[:, :3] += np.einsum("nki,nk->ni", jacobian, _tilts(problem) / axis_noise)
+    return cameras, points, both, camera_gradient, point_gradient, bases
+
+
+def _step(problem: Problem, equations: tuple, damping: float) -> Problem | None:
+    cameras, points, both, camera_gradient, point_gradient, bases = equations
+    count = len(cameras)
+    cameras = cameras + damping * _diagonal(cameras)
+    inverse = np.linalg.inv(points + damping * _diagonal(points))
+    reduced = np.zeros((count, 6, count, 6))
+    for camera in range(count):
+        reduced[camera, :, camera] += cameras[camera]
+    weighted = both @ inverse[problem.point]
+    gradient = camera_gradient.copy()
+    np.subtract.at(gradient, problem.camera, np.einsum("nij,nj->ni", weighted, point_gradient[problem.point]))
+    # Observations of one point by two cameras couple them.
+    order = np.argsort(problem.point, kind="stable")
+    sorted_points = problem.point[order]
+    ends = np.searchsorted(sorted_points, sorted_points, side="right")
+    starts = np.searchsorted(sorted_points, sorted_points, side="left")
+    for shift in range(int((ends - starts).max())):
+        other = starts + shift
+        valid = other < ends
+        i, j = order[valid], order[other[valid]]
+        np.subtract.at(
+            reduced.transpose(0, 2, 1, 3),
+            (problem.camera[i], problem.camera[j]),
+            weighted[i] @ both[j].transpose(0, 2, 1),
+        )
+    try:
+        camera_step = -np.linalg.solve(reduced.reshape(6 * count, 6 * count), gradient.reshape(-1)).reshape(count, 6)
+    except np.linalg.LinAlgError:
+        return None
+    right = point_gradient.copy()
+    np.add.at(right, problem.point, np.einsum("nij,ni->nj", both, camera_step[problem.camera]))
+    point_step = -np.einsum("nij,nj->ni", inverse, right)
+    if not (np.isfinite(camera_step).all() and np.isfinite(point_step).all()):
+        return None
+    moved = problem.points + np.einsum("nij,nj->ni", bases, point_step)
+    return replace(
+        problem,
+        rotations=rotation_exp(camera_step[:, :3]) @ problem.rotations,
+        centres=problem.centres + camera_step[:, 3:],
+        points=moved / np.linalg.norm(moved, axis=1, keepdims=True),
+    )
+
+
+def _diagonal(blocks: Float[Array, "n k k"]) -> Float[Array, "n k k"]:
+    """The diagonals of the blocks, with a small minimum."""
+    size = blocks.shape[-1]
+    diagonal = np.einsum("nii->ni", blocks) + 1e-9
+    return diagonal[:, :, None] * np.eye(size)

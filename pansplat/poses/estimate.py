@@ -1,0 +1,292 @@
+"""Poses of panorama files: features, relations of pairs, the tour, up and scale (docs/poses.md)."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy import ndarray as Array
+from PIL import Image
+
+from pansplat.data.images import read_mask, read_panorama
+from pansplat.data.masks import scene_mask_of_files
+from pansplat.data.pairs import FAR, NEAR, find_mask
+from pansplat.errors import InputError
+from pansplat.poses.axes import RotationPrior, SceneAxes, find_axes
+from pansplat.poses.features import Features, detect_features, match_features
+from pansplat.poses.tour import Pair, build_tour
+from pansplat.poses.two_view import RelativePose, estimate_relative_pose, match_priors, noise_of
+from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_camera_height, level_poses
+from pansplat.threads import one_thread
+
+CAMERA_HEIGHT = 1.5  # metres over the floor; tripods of tours stand at 1.3 to 1.6 m
+_HEIGHT = 1024  # pixels; larger panoramas are reduced
+_MIN_HEIGHT = 256
+_QUICK_FEATURES = 2500  # per panorama, to choose the pairs that are compared thoroughly
+_THOROUGH = 6  # pairs of each panorama that are compared with all features
+_FEW = 6  # up to this number of panoramas, all pairs are compared with all features
+_DARK = 8.0  # mean grey value of an image that shows nothing
+_SAME_IMAGE = 1.5  # mean grey difference of two copies of one image
+_FLOOR_PAIRS = 8
+_MIRROR_EVIDENCE = 60.0  # expected number of right matches with a mirror image
+_LARGEST_NEAR = 0.6  # metres; the depth range is not narrower than that of rooms
+_MIN_FAR = 6.0
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """Estimated poses, with the figures of their check.
+
+    Attributes:
+        images: the files that were read.
+        poses: cam2world of the placed ones, OpenCV axes, world y down, metres if `scale_source` is not "unknown".
+        unplaced: the reason for each file without a pose.
+        relations: of the pairs that were compared, by indices into `images`.
+        near, far: depth range of the scene's points, in the poses' unit.
+        residual: median angle between points and bearings, degrees.
+        scale_source: how the unit was found, for messages.
+    """
+
+    images: tuple[Path, ...]
+    poses: dict[Path, Float[Array, "4 4"]]
+    unplaced: dict[Path, str]
+    relations: dict[Pair, RelativePose]
+    near: float
+    far: float
+    residual: float
+    scale_source: str
+
+    @property
+    def summary(self) -> str:
+        """One line: how many panoramas have a pose, and the figures of the check."""
+        used = [relation for relation in self.relations.values() if relation.is_reliable]
+        weakest = min((relation.places for relation in used), default=0.0)
+        return (
+            f"{len(self.poses)} of {len(self.images)} panoramas have a pose, by {len(used)} pairs; residual "
+            f"{self.residual:.2f} degrees, weakest pair {weakest:.0f} places in common; scale: {self.scale_source}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    features: Features
+    axes: SceneAxes
+    small: Float[Array, "height width"]
+
+
+def estimate_poses(
+    images: Sequence[Path | str],
+    *,
+    camera_height: float = CAMERA_HEIGHT,
+    baseline: tuple[Path | str, Path | str, float] | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> PoseEstimate:
+    """Camera poses of two or more equirectangular panoramas of one place.
+
+    Args:
+        images: files, 2:1.
+        camera_height: mean height of the cameras over the floor, metres; it sets the scale if the floor is found.
+        baseline: two of the images and their distance in metres, instead of the camera's height.
+        seed: of the random samples.
+        progress: called with a description of the current work and the completed fraction.
+
+    Returns:
+        The poses of the panoramas that could be placed; those that could not are named with the reason.
+
+    Raises:
+        InputError: fewer than two images, an unreadable one, or no two panoramas could be placed.
+    """
+    paths = tuple(Path(image) for image in images)
+    report = progress or (lambda what, fraction: None)
+    if len(set(paths)) < 2:
+        raise InputError(f"needed two or more different panoramas to estimate poses, got {len(set(paths))}; add one.")
+    if not 0 < camera_height < math.inf:
+        raise InputError(f"`camera_height` must be a positive number of metres, got {camera_height}")
+    pixels, unplaced = _read_images(paths)
+    kept = [n for n in range(len(paths)) if n not in unplaced]
+    if len(kept) < 2:
+        raise _no_poses(paths, unplaced)
+    with one_thread():  # panoramas and pairs are divided among threads
+        views = _describe_views(paths, pixels, kept, report)
+        relations = _relate_views(views, seed, report)
+    report("placing the panoramas", 0.9)
+    downs = np.stack([v.axes.axes[0] if v.axes.has_down else np.full(3, np.nan) for v in views])
+    noise = max(noise_of(v.features, v.features) for v in views)
+    tour = build_tour([v.features for v in views], relations, downs, noise)
+    for position, reason in tour.unplaced.items():
+        is_mirrored = _is_mirrored(position, views, tour.placed)
+        unplaced[kept[position]] = "it looks mirrored left to right; flip it" if is_mirrored else reason
+    if len(tour.placed) < 2:
+        raise _no_poses(paths, unplaced)
+    poses = level_poses(tour.poses, downs[list(tour.placed)])
+    report("finding the floor", 0.95)
+    files = [paths[kept[position]] for position in tour.placed]
+    scale, source = _find_scale(files, poses, [views[p].small for p in tour.placed], camera_height, baseline)
+    poses[:, :3, 3] *= scale
+    limits = depth_range(tour.depths * scale) or (NEAR, FAR)
+    renumbered = {(kept[i], kept[j]): relation for (i, j), relation in relations.items()}
+    return PoseEstimate(
+        paths,
+        dict(zip(files, poses, strict=True)),
+        {paths[n]: unplaced[n] for n in sorted(unplaced)},
+        renumbered,
+        min(max(limits[0], 0.1), _LARGEST_NEAR),
+        max(limits[1], _MIN_FAR),
+        float(np.degrees(np.median(tour.angles))) if len(tour.angles) else 0.0,
+        source,
+    )
+
+
+def _no_poses(paths: Sequence[Path], reasons: Mapping[int, str]) -> InputError:
+    listed = "; ".join(f"{paths[n].name}: {reasons[n]}" for n in sorted(reasons))
+    return InputError(f"no poses were found: {listed}.")
+
+
+def _read_images(paths: Sequence[Path]) -> tuple[dict[int, UInt8[Array, "height width"]], dict[int, str]]:
+    """Grey panoramas by index, and the reasons against those that cannot be used."""
+    pixels: dict[int, Array] = {}
+    reasons: dict[int, str] = {}
+    thumbnails: dict[int, Array] = {}
+    for n, path in enumerate(paths):
+        try:
+            image = read_panorama(path, _working_height(path))[0].numpy()
+        except InputError as error:
+            reasons[n] = str(error)
+            continue
+        grey = cv2.cvtColor((image.transpose(1, 2, 0) * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
+        small = cv2.resize(grey, (128, 64), interpolation=cv2.INTER_AREA).astype(np.float32)
+        copy = next((m for m, other in thumbnails.items() if np.abs(small - other).mean() < _SAME_IMAGE), None)
+        if grey.mean() < _DARK:
+            reasons[n] = f"too dark (mean grey value {grey.mean():.0f} of 255)"
+        elif small.std() < 2:
+            reasons[n] = "it shows nothing (one colour)"
+        elif copy is not None:
+            reasons[n] = f"it is a copy of {paths[copy].name}, or was taken at the same place"
+        else:
+            pixels[n], thumbnails[n] = grey, small
+    return pixels, reasons
+
+
+def _working_height(path: Path) -> int:
+    """The height of an image, at most `_HEIGHT`; enlarged images would have a wrong noise."""
+    try:
+        with Image.open(path) as image:
+            return min(max(image.height, _MIN_HEIGHT), _HEIGHT)
+    except (OSError, ValueError, Image.DecompressionBombError):  # an EXR, or reported by `read_panorama`
+        return _HEIGHT
+
+
+def _describe_views(
+    paths: Sequence[Path], pixels: dict[int, Array], kept: Sequence[int], report: Progress
+) -> list[_View]:
+    static = scene_mask_of_files(tuple(paths[n] for n in kept), _HEIGHT).numpy()
+
+    def describe(n: int) -> _View:
+        mask = find_mask(paths[n], paths[n].parent)
+        scene = static if mask is None else read_mask(mask, _HEIGHT).numpy()
+        small = cv2.resize(pixels[n], (2 * FLOOR_HEIGHT, FLOOR_HEIGHT), interpolation=cv2.INTER_AREA) / np.float32(255)
+        return _View(detect_features(pixels[n], scene), find_axes(pixels[n]), small)
+
+    views = []
+    with _workers() as pool:
+        for position, view in enumerate(pool.map(describe, kept)):
+            report("finding features", 0.4 * position / len(kept))
+            views.append(view)
+    return views
+
+
+def _workers() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1)))
+
+
+def _relate_views(views: Sequence[_View], seed: int, report: Progress) -> dict[Pair, RelativePose]:
+    """Relative poses of the pairs that have most in common."""
+    pairs = list(itertools.combinations(range(len(views)), 2))
+    if len(views) > _FEW:
+        report("comparing all pairs", 0.4)
+        with _workers() as pool:
+            quick = pool.map(lambda pair: _quick_overlap(views[pair[0]], views[pair[1]]), pairs)
+            overlap = dict(zip(pairs, quick, strict=True))
+        chosen = set()
+        for view in range(len(views)):
+            own = sorted((pair for pair in pairs if view in pair), key=lambda pair: -overlap[pair])
+            chosen |= set(own[:_THOROUGH])
+        pairs = sorted(chosen)
+
+    def relate(pair: Pair) -> RelativePose:
+        first, second = views[pair[0]], views[pair[1]]
+        matches = match_features(first.features, second.features)
+        return estimate_relative_pose(
+            first.features, second.features, matches, RotationPrior(first.axes, second.axes), seed=seed
+        )
+
+    relations = {}
+    with _workers() as pool:
+        for position, (pair, relation) in enumerate(zip(pairs, pool.map(relate, pairs), strict=True)):
+            report("comparing pairs", 0.5 + 0.4 * position / len(pairs))
+            relations[pair] = relation
+    return relations
+
+
+def _is_mirrored(view: int, views: Sequence[_View], placed: Sequence[int]) -> bool:
+    """Whether the mirror image of a panorama fits another one."""
+    mirrored = views[view].features.mirrored()
+    others = placed or [other for other in range(len(views)) if other != view]
+    for other in sorted(others, key=lambda v: abs(v - view))[:3]:
+        features = views[other].features
+        matches = match_features(mirrored, features)
+        if match_priors(matches.ratio).sum() > _MIRROR_EVIDENCE:
+            relation = estimate_relative_pose(mirrored, features, matches)
+            if relation.is_reliable:
+                return True
+    return False
+
+
+def _quick_overlap(first: _View, second: _View) -> float:
+    """Expected number of right matches among the strongest features."""
+    matches = match_features(first.features.strongest(_QUICK_FEATURES), second.features.strongest(_QUICK_FEATURES))
+    return float(match_priors(matches.ratio).sum())
+
+
+def _find_scale(
+    files: Sequence[Path],
+    poses: Float[Array, "view 4 4"],
+    images: Sequence[Array],
+    camera_height: float,
+    baseline: tuple[Path | str, Path | str, float] | None,
+) -> tuple[float, str]:
+    """Metres per unit of the poses, and how it was found."""
+    centres = poses[:, :3, 3]
+    if baseline is not None:
+        ends = [_find_file(name, files) for name in baseline[:2]]
+        distance = float(np.linalg.norm(centres[ends[0]] - centres[ends[1]]))
+        if not 0 < baseline[2] < math.inf or distance == 0:
+            raise InputError(f"`baseline` must be two different images and a positive distance, got {baseline}")
+        return baseline[2] / distance, f"{files[ends[0]].name} and {files[ends[1]].name} are {baseline[2]:g} m apart"
+    pairs = sorted(
+        itertools.combinations(range(len(files)), 2), key=lambda p: float(np.linalg.norm(centres[p[0]] - centres[p[1]]))
+    )
+    height = find_camera_height(images, poses, pairs[:_FLOOR_PAIRS])
+    if height is None:
+        typical = float(np.median([np.linalg.norm(centres[i] - centres[j]) for i, j in pairs[: len(files) - 1]]))
+        return 1 / typical, "unknown (no floor was found); neighbouring cameras are taken as 1 m apart, see --baseline"
+    return camera_height / height, f"cameras {camera_height:g} m over the floor"
+
+
+def _find_file(name: Path | str, files: Sequence[Path]) -> int:
+    for n, file in enumerate(files):
+        if str(name) in (str(file), file.name, file.stem):
+            return n
+    placed = ", ".join(file.name for file in files)
+    raise InputError(f"`baseline` must name two images that have a pose ({placed}), got {name}")

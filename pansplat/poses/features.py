@@ -1,0 +1,182 @@
+"""Local features of panoramas as bearings with descriptors, and matches between two panoramas.
+
+SIFT assumes an image without distortion. It therefore runs on the faces of a cube, which overlap so that no feature
+is lost at their borders; each face contributes the features that are nearest to its own axis. Descriptors are
+root-normalised.
+
+Source: D. Lowe, Distinctive Image Features from Scale-Invariant Keypoints, IJCV 2004; R. Arandjelovic, A. Zisserman,
+Three things everyone should know to improve object retrieval, CVPR 2012.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy import ndarray as Array
+
+from pansplat.geometry.equirect import uv_from_directions
+from pansplat.geometry.pose import rotations_from_quats
+
+_FIELD_OF_VIEW = 100.0  # degrees of a face; 10 more than a cube's
+_CONTRAST, _EDGE = 0.015, 12.0  # thresholds of SIFT; low, because matching removes weak features
+_DARK = 16.0  # mean grey value below which an image is brightened
+_SAME_PLACE = 0.004  # radians between matches that count once
+_CHUNK = 256  # descriptors that are compared together
+
+_HALF = math.sqrt(0.5)
+_FACE_QUATS = (
+    (1, 0, 0, 0), (_HALF, 0, _HALF, 0), (0, 0, 1, 0), (_HALF, 0, -_HALF, 0),
+    (_HALF, _HALF, 0, 0), (_HALF, -_HALF, 0, 0),
+)  # fmt: skip
+FACE_ROTATIONS: Float[Array, "6 3 3"] = rotations_from_quats(torch.tensor(_FACE_QUATS, dtype=torch.float64)).numpy()
+"""Axes of the cube's faces in the camera's frame, as columns."""
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Features of one panorama, strongest first.
+
+    Attributes:
+        bearings: unit directions in the camera's frame.
+        descriptors: unit vectors.
+        pixel: angle of a pixel at the horizon, radians.
+    """
+
+    bearings: Float[Array, "feature 3"]
+    descriptors: Float[Array, "feature 128"]
+    pixel: float
+
+    def __len__(self) -> int:
+        return len(self.bearings)
+
+    def strongest(self, count: int) -> Features:
+        """The first `count` features."""
+        return Features(self.bearings[:count], self.descriptors[:count], self.pixel)
+
+    def mirrored(self) -> Features:
+        """The features of the panorama that is mirrored left to right.
+
+        A descriptor has 4 x 4 cells of 8 directions, along and across the feature's main direction. A mirror image
+        reverses the order across it, and the sense of the directions.
+        """
+        cells = self.descriptors.reshape(-1, 4, 4, 8)[:, ::-1, :, (0, 7, 6, 5, 4, 3, 2, 1)]
+        return Features(self.bearings * (-1.0, 1.0, 1.0), np.ascontiguousarray(cells).reshape(-1, 128), self.pixel)
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Pairs of features, most distinctive first.
+
+    Attributes:
+        indices: of the features in the first and in the second panorama.
+        ratio: distance of the descriptors over that to the second nearest one, in [0, 1].
+    """
+
+    indices: Int[Array, "match 2"]
+    ratio: Float[Array, "match"]
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+
+def detect_features(
+    image: UInt8[Array, "height width"], mask: Bool[Array, "height width"] | None = None, *, count: int = 8000
+) -> Features:
+    """The `count` strongest features of a grey panorama, outside the masked pixels.
+
+    Args:
+        mask: True where the panorama shows the scene.
+        count: largest number of features.
+    """
+    width = image.shape[1]
+    focal = width / (2 * math.pi)  # a face has the panorama's resolution at its centre
+    if image.mean() < _DARK:
+        image = cv2.equalizeHist(image)
+    sift = cv2.SIFT_create(contrastThreshold=_CONTRAST, edgeThreshold=_EDGE)
+    rotations = FACE_ROTATIONS
+    bearings, descriptors, strengths = [np.empty((0, 3))], [np.empty((0, 128), np.float32)], [np.empty(0)]
+    for face, rotation in enumerate(rotations):
+        points, found = sift.detectAndCompute(render_face(image, rotation, focal), None)
+        if found is None or not len(points):
+            continue
+        side = 2 * math.tan(math.radians(_FIELD_OF_VIEW / 2)) * focal
+        xy = (np.array([point.pt for point in points]) + 0.5 - int(side) / 2) / focal
+        rays = np.concatenate((xy, np.ones((len(xy), 1))), axis=1)
+        rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)) @ rotation.T
+        own = (rays @ rotations[:, :, 2].T).argmax(axis=1) == face
+        if mask is not None:
+            own &= _sample_mask(mask, rays)
+        bearings.append(rays[own])
+        descriptors.append(found[own])
+        strengths.append(np.array([point.response for point in points])[own])
+    strength = np.concatenate(strengths)
+    order = np.argsort(-strength, kind="stable")[:count]
+    descriptor = np.concatenate(descriptors)[order]
+    descriptor = np.sqrt(descriptor / np.maximum(descriptor.sum(axis=1, keepdims=True), 1e-9))
+    return Features(np.concatenate(bearings)[order], descriptor.astype(np.float32), 2 * math.pi / width)
+
+
+def render_face(image: UInt8[Array, "height width"], rotation: Array, focal: float) -> UInt8[Array, "side side"]:
+    """The perspective image of a face."""
+    height, width = image.shape
+    side = int(2 * math.tan(math.radians(_FIELD_OF_VIEW / 2)) * focal)
+    steps = (np.arange(side) + 0.5 - side / 2) / focal
+    x, y = np.meshgrid(steps, steps)
+    rays = np.stack((x, y, np.ones_like(x)), axis=-1) @ rotation.T
+    uv = uv_from_directions(torch.from_numpy(rays)).numpy() * (width, height) - 0.5
+    margin = 4
+    padded = cv2.copyMakeBorder(image, 0, 0, margin, margin, cv2.BORDER_WRAP)
+    u, v = (uv[..., 0] + margin).astype(np.float32), uv[..., 1].astype(np.float32)
+    return cv2.remap(padded, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _sample_mask(mask: Bool[Array, "height width"], rays: Float[Array, "n 3"]) -> Bool[Array, "n"]:
+    height, width = mask.shape
+    uv = uv_from_directions(torch.from_numpy(rays)).numpy()
+    columns = (uv[:, 0] * width).astype(int).clip(0, width - 1)
+    return mask[(uv[:, 1] * height).astype(int).clip(0, height - 1), columns]
+
+
+def match_features(first: Features, second: Features) -> Matches:
+    """Mutually nearest descriptors."""
+    if min(len(first), len(second)) < 2:
+        return Matches(np.empty((0, 2), np.int64), np.empty(0))
+    a, b = torch.from_numpy(first.descriptors), torch.from_numpy(second.descriptors)
+    nearest, ratios = [], []
+    best_row = torch.full((len(b),), -1.0)
+    row_of = torch.zeros(len(b), dtype=torch.long)
+    for start in range(0, len(a), _CHUNK):
+        similarity = a[start : start + _CHUNK] @ b.T
+        column_best, rows = similarity.max(dim=0)
+        better = column_best > best_row
+        best_row = torch.where(better, column_best, best_row)
+        row_of = torch.where(better, rows + start, row_of)
+        value, index = similarity.max(dim=1)
+        similarity[torch.arange(len(value)), index] = -1
+        second_value = similarity.max(dim=1).values
+        nearest.append(index)
+        ratios.append(((1 - value).clamp_min(0) / (1 - second_value).clamp_min(1e-6)).sqrt())
+    index, ratio = torch.cat(nearest), torch.cat(ratios)
+    mutual = torch.nonzero(row_of[index] == torch.arange(len(index)))[:, 0]
+    ratio = ratio[mutual].double().numpy()
+    pairs = torch.stack((mutual, index[mutual]), dim=1).numpy()
+    order = np.argsort(ratio, kind="stable")
+    return _drop_repeated(first, second, Matches(pairs[order], ratio[order]))
+
+
+def _drop_repeated(first: Features, second: Features, matches: Matches) -> Matches:
+    """Matches without those that connect the same two places as a better one.
+
+    SIFT describes a place again for each dominant orientation and size; such matches are not independent evidence.
+    """
+    if not len(matches):
+        return matches
+    places = np.concatenate((first.bearings[matches.indices[:, 0]], second.bearings[matches.indices[:, 1]]), axis=1)
+    _, kept = np.unique(np.rint(places / _SAME_PLACE).astype(np.int64), axis=0, return_index=True)
+    kept = np.sort(kept)
+    return Matches(matches.indices[kept], matches.ratio[kept])

@@ -1,0 +1,69 @@
+"""Key frames of a 360-degree video: sharp frames with parallax between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray as Array
+
+from pansplat.data.images import write_image
+from pansplat.data.video import open_video
+from pansplat.errors import InputError
+from pansplat.poses.axes import NO_PRIOR
+from pansplat.poses.features import Features, detect_features, match_features
+from pansplat.poses.two_view import estimate_relative_pose
+
+_CANDIDATES_PER_FRAME = 4  # frames that are decoded for each key frame; the sharpest of them is used
+_SMALL = 512  # height of the frames in which parallax is measured, pixels
+_MIN_PARALLAX = 0.05  # radians between key frames
+
+
+def extract_key_frames(
+    path: Path, folder: Path, count: int, progress: Callable[[str, float], None] | None = None
+) -> list[Path]:
+    """Write at most `count` key frames of a video as PNG files, and return them.
+
+    The video is divided into intervals of equal length. The sharpest of some frames of each interval is a candidate; it
+    is left out if its parallax to the last key frame is small.
+
+    Raises:
+        InputError: not a 2:1 video, or the camera did not move.
+    """
+    video = open_video(path)
+    if video.width != 2 * video.height:
+        raise InputError(f"{path}: needed a 2:1 equirectangular video, got {video.width}x{video.height}; convert it.")
+    if count < 2:
+        raise InputError(f"`count` must be at least 2 key frames, got {count}")
+    numbers = np.unique(np.linspace(0, len(video.stamps) - 1, count * _CANDIDATES_PER_FRAME).round().astype(int))
+    folder.mkdir(parents=True, exist_ok=True)
+    written: list[Path] = []
+    last: Features | None = None
+    groups = np.array_split(numbers, count)
+    for position, group in enumerate(groups):
+        if progress is not None:
+            progress("reading the video", position / len(groups))
+        if not len(group):
+            continue
+        frames = video.read([int(number) for number in group])
+        number, frame = max(frames.items(), key=lambda item: _sharpness(item[1]))
+        small = cv2.resize(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), (2 * _SMALL, _SMALL), interpolation=cv2.INTER_AREA)
+        features = detect_features(small, count=2000)
+        if last is not None:
+            relation = estimate_relative_pose(last, features, match_features(last, features), NO_PRIOR)
+            if len(relation.indices) >= 20 and relation.parallax < _MIN_PARALLAX:
+                continue
+        last = features
+        written.append(folder / f"frame_{number:06d}.png")
+        write_image(written[-1], frame)
+    if len(written) < 2:
+        raise InputError(f"{path}: needed a moving camera, got no parallax between its frames; give another video.")
+    return written
+
+
+def _sharpness(frame: UInt8[Array, "height width 3"]) -> float:
+    small = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
+    return float(cv2.Laplacian(small, cv2.CV_32F).var())

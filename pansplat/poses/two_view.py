@@ -1,0 +1,398 @@
+"""The relative pose of two panoramas from matches of which most may be wrong.
+
+Each match is evidence: the logarithm of the likelihood of its epipolar angle under a pose, over its likelihood by
+chance. The prior probability that a match is right follows from its ratio. The sum over all matches, the score, ranks
+the hypotheses of the minimal solvers, and measures whether the best one can be chance. Hypotheses come from five
+matches, and, because panoramas of tours are upright, from three and from two matches of levelled cameras.
+
+Source: M. Fischler, R. Bolles, Random Sample Consensus, CACM 1981; O. Chum, J. Matas, O. Obdrzalek, Enhancing RANSAC
+by generalized model optimization, ACCV 2004; P. Torr, A. Zisserman, MLESAC, CVIU 2000.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray as Array
+
+from pansplat.poses.axes import NO_PRIOR, RotationPrior, relative_rotations
+from pansplat.poses.features import Features, Matches
+from pansplat.poses.solvers import (
+    angle_between,
+    decompose_essential,
+    epipolar_angles,
+    essential_from_five,
+    rotation_angle,
+    rotation_exp,
+    skew,
+    two_view_depths,
+    upright_from_three,
+    upright_from_two,
+)
+
+# Prior probability that a match is right, by its ratio; measured on pairs of real panoramas 2 to 3 m apart.
+_RATIOS, _PRIORS = (0.5, 0.65, 0.75, 0.8, 0.85, 0.9, 1.0), (0.8, 0.6, 0.3, 0.15, 0.06, 0.02, 0.005)
+_NOISE_PIXELS, _MIN_NOISE = 0.45, 8e-4  # standard deviation of a right match: pixels at the horizon; radians
+_WIDE_SHARE, _WIDE = 0.3, 3.0  # of right matches with larger errors, and their standard deviation in that of the others
+_MAX_ANGLE = 4.0  # largest residual of a right match, in the wide standard deviation
+_LEVEL = [2, 0, 1]  # order of the axes in a levelled camera: x, y down, z
+_MAX_MATCHES = 2500
+_TOP_SETS = (40, 80, 160, 320, 640, 2500)  # best matches from which samples are drawn
+_SAMPLES = {5: 150, 3: 1200, 2: 600}  # of each set
+_QUICK, _RESCORED = 500, 3000  # best matches that rank all hypotheses; hypotheses that all matches rank
+_KEPT = 20  # hypotheses that are optimised
+_PLACE = 0.2  # size of a cell that counts as one place, as a difference of unit vectors
+_MIN_PARALLAX = 5.0  # in the noise's standard deviation
+_MAX_UNCERTAINTY = math.radians(4)
+_SAME_ROTATION, _SAME_DIRECTION = math.radians(3), math.radians(10)  # differences of equal hypotheses
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """The least evidence of a pose that passes the check."""
+
+    places: float
+    score: float
+    margin: float
+
+
+# Measured on all 78 pairs of a home: wrong poses that walls confirm have at most 11 places and a score of 24. Other
+# wrong poses have up to 25 places, because repeated doors and windows match.
+_CONFIRMED, _UNCONFIRMED = _Evidence(10, 40, 4), _Evidence(32, 80, 20)
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A relative pose x2 = R x1 + t with |t| = 1, and its evidence.
+
+    Attributes:
+        score: natural logarithm of the likelihood ratio against chance.
+        probability: of each match to be right.
+    """
+
+    rotation: Float[Array, "3 3"]
+    translation: Float[Array, "3"]
+    score: float
+    probability: Float[Array, "match"]
+
+
+def noise_of(first: Features, second: Features) -> float:
+    """Standard deviation of a right match's epipolar angle, radians."""
+    return max(_NOISE_PIXELS * max(first.pixel, second.pixel), _MIN_NOISE)
+
+
+def match_priors(ratio: Float[Array, "match"]) -> Float[Array, "match"]:
+    """Prior probability of matches to be right."""
+    return np.interp(ratio, _RATIOS, _PRIORS)
+
+
+def _density(angle: Array, noise: float) -> Array:
+    """Probability density of a right match's epipolar angle in [0, pi/2], 1/radian."""
+    narrow = np.exp(-0.5 * (angle / noise) ** 2) / noise
+    wide = np.exp(-0.5 * (angle / (_WIDE * noise)) ** 2) / (_WIDE * noise)
+    return math.sqrt(2 / math.pi) * ((1 - _WIDE_SHARE) * narrow + _WIDE_SHARE * wide)
+
+
+def _likelihood_ratio(angle: Array, noise: float) -> Array:
+    """Likelihood ratio of an epipolar angle for a right match against chance (uniform on the sphere)."""
+    return np.where(angle < _MAX_ANGLE * _WIDE * noise, _density(angle, noise), 0.0)
+
+
+def evaluate(
+    a: Float[Array, "match 3"],
+    b: Float[Array, "match 3"],
+    prior: Float[Array, "match"],
+    rotation: Float[Array, "3 3"],
+    translation: Float[Array, "3"],
+    noise: float,
+    axes: RotationPrior = NO_PRIOR,
+) -> Hypothesis:
+    """The evidence for a relative pose. Matches whose rays meet behind a camera are counted as wrong.
+
+    A right match by chance also has its point in front of both cameras in about half of all cases, so that a point in
+    front has twice the likelihood ratio.
+    """
+    angle = np.abs(epipolar_angles(a, b, rotation, translation))
+    depths = two_view_depths(a, b, rotation, translation)
+    g = a @ rotation.T
+    parallax = angle_between(g, b)
+    behind = (depths < 0).any(axis=1) & (parallax > 3 * noise)
+    ratio = np.where(behind, 0.0, 2 * _likelihood_ratio(angle, noise))
+    total = 1 - prior + prior * ratio
+    score = float(np.log(total).sum()) + axes.score(rotation)
+    return Hypothesis(rotation, translation, score, prior * ratio / total)
+
+
+def refine_pose(
+    a: Float[Array, "match 3"],
+    b: Float[Array, "match 3"],
+    prior: Float[Array, "match"],
+    start: Hypothesis,
+    noise: float,
+    axes: RotationPrior = NO_PRIOR,
+    steps: int = 6,
+) -> Hypothesis:
+    """The pose of the smallest weighted epipolar angles near a hypothesis, by Gauss-Newton with a robust loss."""
+    rotation, translation, best = start.rotation, start.translation, start
+    for _ in range(steps):
+        normal, gradient = _normal_equations(a, b, best.probability, rotation, translation, noise)
+        prior_term = axes.residual(rotation)
+        if prior_term is not None:
+            residual, jacobian = prior_term
+            normal[:3, :3] += jacobian.T @ jacobian
+            gradient[:3] += jacobian.T @ residual
+        try:
+            step = np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(5), -gradient)
+        except np.linalg.LinAlgError:
+            break
+        if not np.isfinite(step).all() or np.abs(step).max() > 0.5:
+            break
+        rotation = rotation_exp(step[:3]) @ rotation
+        translation = translation + _tangent_basis(translation) @ step[3:]
+        translation = translation / np.linalg.norm(translation)
+        found = evaluate(a, b, prior, rotation, translation, noise, axes)
+        improved = found.score > best.score + 1e-3
+        if found.score > best.score:
+            best = found
+        if not improved:
+            break
+    return best
+
+
+def _tangent_basis(direction: Float[Array, "3"]) -> Float[Array, "3 2"]:
+    """Two orthonormal vectors perpendicular to a unit vector."""
+    helper = np.eye(3)[np.abs(direction).argmin()]
+    first = np.cross(direction, helper)
+    first /= np.linalg.norm(first)
+    return np.stack((first, np.cross(direction, first)), axis=1)
+
+
+def _normal_equations(
+    a: Array, b: Array, probability: Array, rotation: Array, translation: Array, noise: float
+) -> tuple[Float[Array, "5 5"], Float[Array, "5"]]:
+    """Hessian and gradient of the squared angles in the noise's unit, by rotation (3) and direction (2)."""
+    g = a @ rotation.T
+    n = np.cross(translation, g)
+    e = (n * b).sum(axis=1)
+    bt = np.cross(b, translation)
+    scale = np.sqrt(
+        np.maximum(((n - e[:, None] * b) ** 2).sum(axis=1) + ((bt - e[:, None] * g) ** 2).sum(axis=1), 1e-12)
+    )
+    jacobian = np.concatenate((np.cross(g, bt), np.cross(g, b) @ _tangent_basis(translation)), axis=1)
+    jacobian /= scale[:, None] * noise
+    angle = np.abs(e / scale)
+    # Weight of the wide component of the noise is smaller, as in an EM step for a mixture of two Gaussians.
+    narrow = (1 - _WIDE_SHARE) * np.exp(-0.5 * (angle / noise) ** 2)
+    wide = _WIDE_SHARE / _WIDE * np.exp(-0.5 * (angle / (_WIDE * noise)) ** 2) + 1e-300
+    weight = probability * (narrow + wide / _WIDE**2) / (narrow + wide)
+    residual = e / scale / noise
+    return (jacobian * weight[:, None]).T @ jacobian, jacobian.T @ (weight * residual)
+
+
+def search_hypotheses(
+    a: Float[Array, "match 3"],
+    b: Float[Array, "match 3"],
+    prior: Float[Array, "match"],
+    noise: float,
+    rng: np.random.Generator,
+    axes: RotationPrior = NO_PRIOR,
+) -> list[Hypothesis]:
+    """Distinct optimised hypotheses, best first. Matches are sorted, the most distinctive first."""
+    count = min(len(a), _MAX_MATCHES)
+    a, b, prior = a[:count], b[:count], prior[:count]
+    if count < 8:
+        return []
+    level = axes.first.axes[_LEVEL], axes.second.axes[_LEVEL]
+    essentials = []
+    for top in sorted({min(top, count) for top in _TOP_SETS}):
+        chosen = _draw(rng, top, _SAMPLES[5], 5)
+        essentials.append(essential_from_five(a[chosen], b[chosen])[0])
+        for size, solver in ((3, upright_from_three), (2, upright_from_two)):
+            chosen = _draw(rng, top, _SAMPLES[size], size)
+            rotations, translations = solver(a[chosen] @ level[0].T, b[chosen] @ level[1].T)
+            essentials.append(level[1].T @ skew(translations) @ rotations @ level[0])
+        for rotation in relative_rotations(axes.first, axes.second) if axes.has_walls else ():
+            chosen = _draw(rng, top, _SAMPLES[2], 2)
+            normals = np.cross(a[chosen] @ rotation.T, b[chosen])
+            translations = np.cross(normals[:, 0], normals[:, 1])
+            translations /= np.maximum(np.linalg.norm(translations, axis=1, keepdims=True), 1e-12)
+            essentials.append(skew(translations) @ rotation)
+    essential = np.concatenate(essentials)
+    quick = _score_essentials(essential, a[:_QUICK], b[:_QUICK], prior[:_QUICK], noise)
+    essential = essential[np.argsort(-quick)[:_RESCORED]]
+    scores = _score_essentials(essential, a, b, prior, noise)
+    found: list[Hypothesis] = []
+    for index in _pick_distinct(essential, scores):
+        options = [
+            evaluate(a, b, prior, rotation, translation, 2 * noise, axes)
+            for rotation, translation in decompose_essential(essential[index])
+        ]
+        best = max(options, key=lambda option: option.score)
+        coarse = refine_pose(a, b, prior, best, 2 * noise, axes, 4)
+        start = evaluate(a, b, prior, coarse.rotation, coarse.translation, noise, axes)
+        found.append(refine_pose(a, b, prior, start, noise, axes))
+    found.sort(key=lambda h: -h.score)
+    distinct: list[Hypothesis] = []
+    for hypothesis in found:
+        if not any(are_same(hypothesis, other) for other in distinct):
+            distinct.append(hypothesis)
+    return distinct
+
+
+def are_same(first: Hypothesis, second: Hypothesis) -> bool:
+    """Whether two hypotheses hardly differ."""
+    turned = rotation_angle(first.rotation @ second.rotation.T)
+    return bool(turned < _SAME_ROTATION and angle_between(first.translation, second.translation) < _SAME_DIRECTION)
+
+
+def _draw(rng: np.random.Generator, top: int, samples: int, size: int) -> Int[Array, "samples size"]:
+    """Samples of different numbers below `top`."""
+    chosen = np.sort(rng.integers(0, top - size + 1, (samples, size)), axis=1)
+    return chosen + np.arange(size)
+
+
+def _score_essentials(
+    essential: Float[Array, "h 3 3"], a: Array, b: Array, prior: Array, noise: float
+) -> Float[Array, "h"]:
+    """Scores of essential matrices without the signs of the depths, by matrix products.
+
+    Squared Sampson denominators are |E a|^2 + |E' b|^2, up to the square of the residual.
+    """
+    i, j = np.triu_indices(3)
+    twice = np.where(i == j, 1.0, 2.0)
+    products = (b[:, :, None] * a[:, None, :]).reshape(-1, 9).T.astype(np.float32)
+    squares_a, squares_b = (np.ascontiguousarray((x[:, i] * x[:, j] * twice).T.astype(np.float32)) for x in (a, b))
+    limit = np.float32((_MAX_ANGLE * _WIDE * noise) ** 2)
+    scores = np.empty(len(essential))
+    weight = prior / (1 - prior)
+    constant = float(np.log(1 - prior).sum())
+    narrow, wide = np.float32(-0.5 / noise**2), np.float32(-0.5 / (_WIDE * noise) ** 2)
+    height = math.sqrt(2 / math.pi) / noise
+    first, second = np.float32(height * (1 - _WIDE_SHARE)), np.float32(height * _WIDE_SHARE / _WIDE)
+    for start in range(0, len(essential), 2048):
+        part = essential[start : start + 2048]
+        e = part.reshape(-1, 9).astype(np.float32) @ products
+        left = np.einsum("hki,hkj->hij", part, part)[:, i, j].astype(np.float32) @ squares_a
+        right = np.einsum("hik,hjk->hij", part, part)[:, i, j].astype(np.float32) @ squares_b
+        squared = e * e / np.maximum(left + right, np.float32(1e-12))
+        h, m = np.nonzero(squared < limit)
+        value = squared[h, m]
+        likelihood = first * np.exp(narrow * value) + second * np.exp(wide * value)
+        scores[start : start + len(part)] = np.bincount(h, np.log1p(weight[m] * likelihood), len(part))
+    return scores + constant
+
+
+def _pick_distinct(essential: Float[Array, "h 3 3"], scores: Float[Array, "h"]) -> list[int]:
+    """Indices of the best hypotheses whose essential matrices differ."""
+    picked: list[int] = []
+    norm = np.linalg.norm(essential, axis=(1, 2))
+    for index in np.argsort(-scores)[:2000]:
+        if len(picked) == _KEPT:
+            break
+        similarity = [abs((essential[index] * essential[p]).sum()) / (norm[index] * norm[p]) for p in picked]
+        if not similarity or max(similarity) < 0.998:
+            picked.append(int(index))
+    return picked
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePose:
+    """The relative pose of two panoramas, and the figures of its check.
+
+    Attributes:
+        rotation, translation: x2 = R x1 + t; |t| = 1.
+        indices: features of the matches that agree with it.
+        score: natural logarithm of the likelihood ratio against chance.
+        margin: how much the score exceeds that of the best different pose.
+        places: number of different places (12 degrees) with right matches, in the panorama that has fewer.
+        parallax: 90 % quantile of the parallax of these matches, radians.
+        uncertainty: standard deviations of rotation and direction by the noise of the matches, radians.
+        problem: why the pose must not be used; None if it passes the check.
+    """
+
+    rotation: Float[Array, "3 3"]
+    translation: Float[Array, "3"]
+    indices: Int[Array, "match 2"]
+    score: float
+    margin: float
+    places: float
+    parallax: float
+    uncertainty: tuple[float, float]
+    problem: str | None
+
+    @property
+    def is_reliable(self) -> bool:
+        """Whether the pose passes the check."""
+        return self.problem is None
+
+
+def estimate_relative_pose(
+    first: Features, second: Features, matches: Matches, axes: RotationPrior = NO_PRIOR, *, seed: int = 0
+) -> RelativePose:
+    """The most probable relative pose of two panoramas, with its check.
+
+    Args:
+        first, second: features of both panoramas.
+        matches: between them.
+        axes: gravity and walls of both panoramas.
+        seed: of the random samples.
+    """
+    count = min(len(matches), _MAX_MATCHES)
+    a = first.bearings[matches.indices[:count, 0]]
+    b = second.bearings[matches.indices[:count, 1]]
+    prior, noise = match_priors(matches.ratio[:count]), noise_of(first, second)
+    found = search_hypotheses(a, b, prior, noise, np.random.default_rng(seed), axes)
+    if not found:
+        empty = np.empty((0, 2), np.int64)
+        no_match = f"only {count} features match"
+        return RelativePose(np.eye(3), np.array((0.0, 0, 1)), empty, 0.0, 0.0, 0.0, 0.0, (math.inf,) * 2, no_match)
+    best = found[0]
+    margin = best.score - found[1].score if len(found) > 1 else best.score
+    right = best.probability > 0.5
+    places = min(_count_places(x, best.probability) for x in (a, b))
+    parallax = angle_between(a @ best.rotation.T, b)[right]
+    spread = float(np.quantile(parallax, 0.9)) if len(parallax) else 0.0
+    uncertainty = _uncertainty(a, b, best, noise)
+    confirmed = axes.confirms(best.rotation)
+    needed = _CONFIRMED if confirmed else _UNCONFIRMED
+    problem = None
+    if spread < _MIN_PARALLAX * noise and right.sum() >= _CONFIRMED.places:
+        problem = f"both were taken at one place: parallax of {math.degrees(spread):.2f} degrees"
+    elif places < needed.places or best.score < needed.score:
+        problem = f"too little in common: {places:.0f} places match, {needed.places:.0f} are needed"
+        problem += "" if confirmed else " without parallel walls that confirm the pose"
+    elif margin < needed.margin:
+        problem = f"another pose fits as well (difference of the scores {margin:.1f}, {needed.margin:.0f} are needed)"
+    elif uncertainty[1] > _MAX_UNCERTAINTY:
+        problem = f"the direction is uncertain by {math.degrees(uncertainty[1]):.0f} degrees"
+    return RelativePose(
+        best.rotation,
+        best.translation,
+        matches.indices[:count][right],
+        best.score,
+        margin,
+        places,
+        spread,
+        uncertainty,
+        problem,
+    )
+
+
+def _count_places(bearings: Float[Array, "n 3"], probability: Float[Array, "n"]) -> float:
+    """Sum over the cells of the sphere of the largest probability in each. Matches on one object count little."""
+    _, cell = np.unique(np.rint(bearings / _PLACE).astype(np.int64), axis=0, return_inverse=True)
+    highest = np.zeros(int(cell.max()) + 1)
+    np.maximum.at(highest, cell.reshape(-1), probability)
+    return float(highest.sum())
+
+
+def _uncertainty(a: Array, b: Array, hypothesis: Hypothesis, noise: float) -> tuple[float, float]:
+    """Standard deviations of rotation and direction, radians."""
+    h = hypothesis
+    normal, _ = _normal_equations(a, b, h.probability, h.rotation, h.translation, noise)
+    values, vectors = np.linalg.eigh(normal)
+    variance = (vectors**2 / np.maximum(values, 1e-12)).sum(axis=1)
+    return math.sqrt(variance[:3].sum()), math.sqrt(variance[3:].sum())

@@ -1,0 +1,125 @@
+"""The world of estimated poses: up by gravity, and metres by the height of the cameras over the floor.
+
+The floor is found by its appearance. For each candidate height, the rays below the horizon are extended to a
+horizontal plane and projected into another panorama; where the plane is the floor, both images agree.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from pansplat.geometry.equirect import pixel_directions, uv_from_directions
+
+FLOOR_HEIGHT = 256  # pixels of the panoramas in which the floor is searched
+_STEPS = 0.02  # relative difference of neighbouring candidates
+_RANGE = 0.12, 12.0  # of the camera's height in units of the distance of two cameras
+_STEEPEST, _FLATTEST = math.radians(85), math.radians(12)  # below the horizon
+_WINDOW = 9  # pixels over which images are compared
+_MIN_DEVIATION = 0.012  # of grey values in a window with texture
+_MIN_CORRELATION = 0.6
+_MIN_EVIDENCE, _MIN_CONTRAST = 0.02, 1.25  # mean correlation of the floor; ratio to the best other height
+_NEAR_QUANTILE, _FAR_QUANTILE = 0.02, 0.98  # of the distances of the points
+_NEAR_FACTOR, _FAR_FACTOR = 0.7, 1.4
+
+
+def level_poses(poses: Float[Array, "view 4 4"], downs: Float[Array, "view 3"]) -> Float[Array, "view 4 4"]:
+    """The poses in a world whose y axis points down, and whose origin and forward axis are the first camera's.
+
+    Args:
+        downs: gravity in each camera's frame; NaN where unknown. Without any, the cameras' y axes are used.
+    """
+    world = np.einsum("nij,nj->ni", poses[:, :3, :3], downs)
+    world = world[np.isfinite(world).all(axis=1)]
+    if not len(world):
+        world = poses[:, :3, 1]
+    down = np.median(world, axis=0)
+    down /= np.linalg.norm(down)
+    forward = poses[0, :3, 2] - (poses[0, :3, 2] @ down) * down
+    if np.linalg.norm(forward) < 1e-3:
+        forward = np.cross(poses[0, :3, 0], down)
+    forward /= np.linalg.norm(forward)
+    axes = np.stack((np.cross(down, forward), down, forward))
+    levelled = poses.copy()
+    levelled[:, :3, :3] = axes @ poses[:, :3, :3]
+    levelled[:, :3, 3] = (poses[:, :3, 3] - poses[0, :3, 3]) @ axes.T
+    return levelled
+
+
+def find_camera_height(
+    images: Sequence[Float[Array, "height width"]], poses: Float[Array, "view 4 4"], pairs: Sequence[tuple[int, int]]
+) -> float | None:
+    """Mean height of the cameras over the floor in the poses' unit; None if no floor is found.
+
+    Args:
+        images: grey panoramas in [0, 1], of `FLOOR_HEIGHT`.
+        poses: levelled, y down.
+        pairs: of panoramas that are compared.
+    """
+    reference = float(np.median([np.linalg.norm(poses[i, :3, 3] - poses[j, :3, 3]) for i, j in pairs]))
+    low, high = (math.log(reference * bound) for bound in _RANGE)
+    heights = np.exp(np.arange(low, high, _STEPS))
+    middle = float(poses[:, 1, 3].mean())
+    evidence = np.zeros(len(heights))
+    for i, j in (*pairs, *((j, i) for i, j in pairs)):
+        evidence += _floor_evidence(images[i], images[j], poses[i], poses[j], heights, middle)
+    evidence /= 2 * len(pairs)
+    # A floor is the lowest plane: a table in front of it has less area, a plane below it has no evidence.
+    smooth = np.convolve(np.pad(evidence, 1, mode="edge"), (0.25, 0.5, 0.25), "valid")
+    best = int(smooth.argmax())
+    others = np.abs(np.arange(len(heights)) - best) > round(0.15 / _STEPS)
+    if (
+        smooth[best] < _MIN_EVIDENCE
+        or smooth[best] < _MIN_CONTRAST * smooth[others].max()
+        or not 0 < best < len(smooth) - 1
+    ):
+        return None
+    left, centre, right = smooth[best - 1 : best + 2]
+    shift = 0.5 * (left - right) / min(left - 2 * centre + right, -1e-12)
+    return float(heights[best] * math.exp(_STEPS * float(np.clip(shift, -1, 1))))
+
+
+def _floor_evidence(
+    image: Array, other: Array, pose: Array, other_pose: Array, heights: Float[Array, "n"], middle: float
+) -> Float[Array, "n"]:
+    """Mean over the sphere of the correlation of both images on a horizontal plane, for each height below `middle`."""
+    rows = len(image)
+    rays = pixel_directions(rows, 2 * rows, dtype=torch.float64).numpy()[rows // 2 :] @ pose[:3, :3].T
+    down = rays[..., 1]
+    seen = (down > math.sin(_FLATTEST)) & (down < math.sin(_STEEPEST))
+    here = image[rows // 2 :].astype(np.float32)
+    mean = cv2.blur(here, (_WINDOW, _WINDOW))
+    deviation = np.sqrt(np.maximum(cv2.blur(here * here, (_WINDOW, _WINDOW)) - mean**2, 0))
+    seen &= deviation > _MIN_DEVIATION
+    area = np.sqrt(np.maximum(1 - down**2, 0)) * seen
+    padded = cv2.copyMakeBorder(other.astype(np.float32), 0, 0, 2, 2, cv2.BORDER_WRAP)
+    found = np.zeros(len(heights))
+    for n, height in enumerate(heights):
+        depth = middle + height - pose[1, 3]
+        if depth <= 0.2 * height:
+            continue
+        points = rays * (depth / np.maximum(down, 1e-3))[..., None] + (pose[:3, 3] - other_pose[:3, 3])
+        local = torch.from_numpy((points @ other_pose[:3, :3]).astype(np.float32))
+        uv = uv_from_directions(local).numpy() * np.float32((2 * rows, rows)) - np.float32(0.5)
+        warped = cv2.remap(padded, uv[..., 0] + 2, uv[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        warped_mean = cv2.blur(warped, (_WINDOW, _WINDOW))
+        variance = cv2.blur(warped * warped, (_WINDOW, _WINDOW)) - warped_mean**2
+        both = cv2.blur(here * warped, (_WINDOW, _WINDOW)) - mean * warped_mean
+        correlation = both / (deviation * np.sqrt(np.maximum(variance, _MIN_DEVIATION**2)) + 1e-9)
+        found[n] = float((area * np.maximum(correlation - _MIN_CORRELATION, 0)).sum())
+    return found / (1 - _MIN_CORRELATION) / float(np.cos(np.linspace(0, math.pi / 2, rows // 2)).sum() * 2 * rows)
+
+
+def depth_range(depths: Float[Array, "n"]) -> tuple[float, float] | None:
+    """Near and far in the unit of the depths: the range of the points with a margin; None for too few points."""
+    finite = depths[np.isfinite(depths)]
+    if len(finite) < 20:
+        return None
+    near, far = np.quantile(finite, (_NEAR_QUANTILE, _FAR_QUANTILE))
+    return float(_NEAR_FACTOR * near), float(_FAR_FACTOR * far)

@@ -1,0 +1,56 @@
+"""Rows of estimated poses against known ones."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pansplat.bench import pose as bench
+from pansplat.data.pairs import Panorama
+from pansplat.errors import InputError
+from pansplat.poses.estimate import PoseEstimate
+from pansplat.poses.solvers import rotation_exp
+from pansplat.poses.two_view import RelativePose
+
+
+def _panoramas() -> list[Panorama]:
+    poses = [torch.eye(4, dtype=torch.float64) for _ in range(3)]
+    poses[1][0, 3], poses[2][2, 3] = 1.0, 2.0
+    return [Panorama(str(n), Path(f"{n}.jpg"), pose) for n, pose in enumerate(poses)]
+
+
+def _estimate(panoramas: list[Panorama], turn: float) -> PoseEstimate:
+    """The known poses, of twice the size, in another world; one camera is turned."""
+    world = np.eye(4)
+    world[:3, :3], world[:3, 3] = rotation_exp(np.array((0.3, 1.0, -0.4))), (5, 6, 7)
+    found = {}
+    for panorama in panoramas:
+        pose = panorama.cam2world.numpy().copy()
+        pose[:3, 3] *= 2
+        found[panorama.image] = world @ pose
+    found[panoramas[0].image][:3, :3] @= rotation_exp(np.array((0, turn, 0)))
+    relation = RelativePose(np.eye(3), np.eye(3)[0], np.empty((0, 2), int), 100.0, 50.0, 40.0, 0.3, (0.01, 0.01), None)
+    return PoseEstimate(tuple(found), found, {}, {(0, 1): relation}, 0.5, 10.0, 0.05, "cameras 1.5 m over the floor")
+
+
+@pytest.mark.parametrize(("turn", "outcome"), [(0.0, "solved"), (0.1, "wrong")])
+def test_errors_do_not_depend_on_the_world(monkeypatch: pytest.MonkeyPatch, turn: float, outcome: str) -> None:
+    panoramas = _panoramas()
+    monkeypatch.setattr(bench, "estimate_poses", lambda images, camera_height: _estimate(panoramas, turn))
+    row = bench.measure_poses("room", panoramas, 1.5, "tour")
+    assert row.result.outcome == outcome
+    assert row.result.scale_percent == pytest.approx(100)
+    assert row.result.position_cm == pytest.approx(0, abs=1e-6)
+    assert row.result.rotation_degrees == pytest.approx(np.degrees(turn), abs=1e-6)
+    assert "1 " + outcome in bench.summarise([row])
+
+
+def test_a_refused_estimate_is_flagged(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(images, camera_height):
+        raise InputError("no poses were found: too dark.")
+
+    monkeypatch.setattr(bench, "estimate_poses", refuse)
+    row = bench.measure_poses("room", _panoramas()[:2], 1.5)
+    assert row.result.outcome == "flagged" and "too dark" in row.note
+    assert bench.plot_poses([row]).axes

@@ -1,0 +1,70 @@
+"""Bundle adjustment recovers cameras and points from disturbed ones."""
+
+import math
+
+import numpy as np
+
+from pansplat.poses.bundle import Problem, adjust, point_depths, residual_angles, triangulate
+from pansplat.poses.solvers import angle_between, rotation_angle, rotation_exp
+
+
+def _problem(noise: float, cameras: int = 4, count: int = 80) -> Problem:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-4, 4, (count, 3))
+    rotations = rotation_exp(rng.normal(size=(cameras, 3)) * 0.5)
+    centres = rng.uniform(-1, 1, (cameras, 3))
+    camera, point = (x.reshape(-1) for x in np.meshgrid(np.arange(cameras), np.arange(count), indexing="ij"))
+    rays = np.einsum("nji,nj->ni", rotations[camera], points[point] - centres[camera])
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True) + noise * rng.normal(size=rays.shape)
+    bearings = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    homogeneous = np.concatenate((points, np.ones((count, 1))), axis=1)
+    homogeneous /= np.linalg.norm(homogeneous, axis=1, keepdims=True)
+    axes = np.einsum("nji,j->ni", rotations, np.array((0.0, 1, 0)))
+    return Problem(rotations, centres, homogeneous, camera, point, bearings, axes, np.array((0.0, 1, 0)))
+
+
+def _disturb(problem: Problem) -> Problem:
+    rng = np.random.default_rng(1)
+    rotations = rotation_exp(0.02 * rng.normal(size=(len(problem.centres), 3))) @ problem.rotations
+    centres = problem.centres + 0.05 * rng.normal(size=problem.centres.shape)
+    points = triangulate(rotations, centres, problem.camera, problem.point, problem.bearings, len(problem.points))
+    return Problem(
+        rotations, centres, points, problem.camera, problem.point, problem.bearings, problem.axes, problem.down
+    )
+
+
+def _relative_errors(found: Problem, truth: Problem) -> tuple[float, float]:
+    turn = found.rotations[1].T @ found.rotations[0] @ (truth.rotations[1].T @ truth.rotations[0]).T
+    directions = [p.rotations[0].T @ (p.centres[1] - p.centres[0]) for p in (found, truth)]
+    return float(rotation_angle(turn)), float(angle_between(*directions))
+
+
+def test_triangulated_points_of_exact_bearings_are_exact() -> None:
+    truth = _problem(0.0)
+    points = triangulate(truth.rotations, truth.centres, truth.camera, truth.point, truth.bearings, len(truth.points))
+    assert np.allclose(points[:, :3] / points[:, 3:], truth.points[:, :3] / truth.points[:, 3:], atol=1e-8)
+    assert residual_angles(truth).max() < 1e-9 and (point_depths(truth) > 0).all()
+
+
+def test_adjustment_recovers_disturbed_cameras() -> None:
+    truth = _problem(0.0)
+    found = adjust(_disturb(truth), noise=1e-3)
+    assert max(_relative_errors(found, truth)) < 1e-5
+    assert residual_angles(found).max() < 1e-5
+
+
+def test_adjustment_tolerates_wrong_observations() -> None:
+    truth = _problem(3e-4)
+    bearings = truth.bearings.copy()
+    bearings[::9] = np.roll(bearings[::9], 1, axis=1)
+    wrong = Problem(
+        truth.rotations, truth.centres, truth.points, truth.camera, truth.point, bearings, truth.axes, truth.down
+    )
+    found = adjust(_disturb(wrong), noise=1e-3)
+    assert max(_relative_errors(found, truth)) < math.radians(0.3)
+
+
+def test_selected_observations_have_points_with_two_views() -> None:
+    problem = _problem(0.0)
+    kept = problem.select((problem.point % 2 == 0) | (problem.camera == 0))
+    assert (np.bincount(kept.point) >= 2).all() and len(kept.points) == 40

@@ -1,0 +1,119 @@
+"""From panorama files to poses: the shipped sample, and input that cannot be used."""
+
+import dataclasses
+import json
+import math
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import pansplat
+from pansplat.cli import run
+from pansplat.data.poses import read_trajectory
+from pansplat.poses.estimate import PoseEstimate, estimate_poses
+from pansplat.poses.files import write_poses
+from pansplat.poses.solvers import angle_between, rotation_angle
+
+SAMPLE = Path(__file__).resolve().parents[2] / "assets" / "living_room"
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The sample's pictures at a small size, without poses."""
+    folder = tmp_path_factory.mktemp("photographs")
+    for name in ("left", "right"):
+        image = cv2.imread(str(SAMPLE / f"{name}.jpg"))
+        cv2.imwrite(str(folder / f"{name}.png"), cv2.resize(image, (1024, 512), interpolation=cv2.INTER_AREA))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def estimate(photographs: Path) -> PoseEstimate:
+    """The estimate of the sample with three pictures that cannot be used."""
+    cv2.imwrite(str(photographs / "z_dark.png"), np.full((64, 128, 3), 3, np.uint8))
+    cv2.imwrite(str(photographs / "z_narrow.png"), np.full((64, 96, 3), 90, np.uint8))
+    shutil.copy(photographs / "left.png", photographs / "z_copy.png")
+    found = estimate_poses(sorted(photographs.glob("*.png")), camera_height=1.5)
+    for name in ("z_dark", "z_narrow", "z_copy"):
+        (photographs / f"{name}.png").unlink()
+    return found
+
+
+@pytest.mark.slow
+def test_the_sample_has_its_poses(estimate: PoseEstimate) -> None:
+    content = json.loads((SAMPLE / "poses.json").read_text())["poses"]
+    truth = {}
+    for name in ("left", "right"):
+        entry = content[f"{name}.jpg"]
+        truth[name] = np.array(entry["cam2world"] if isinstance(entry, dict) else entry)
+    found = {path.stem: pose for path, pose in estimate.poses.items()}
+    motions = [np.linalg.inv(poses["right"]) @ poses["left"] for poses in (found, truth)]
+    assert math.degrees(rotation_angle(motions[0][:3, :3] @ motions[1][:3, :3].T)) < 0.05
+    assert math.degrees(angle_between(motions[0][:3, 3], motions[1][:3, 3])) < 0.3
+    assert np.linalg.norm(motions[0][:3, 3]) == pytest.approx(np.linalg.norm(motions[1][:3, 3]), rel=0.05)
+
+
+@pytest.mark.slow
+def test_pictures_that_cannot_be_used_are_named(estimate: PoseEstimate) -> None:
+    reasons = {path.stem: reason for path, reason in estimate.unplaced.items()}
+    assert sorted(reasons) == ["z_copy", "z_dark", "z_narrow"]
+    assert "copy of left.png" in reasons["z_copy"]
+    assert "too dark" in reasons["z_dark"]
+    assert "2:1" in reasons["z_narrow"]
+
+
+@pytest.mark.slow
+def test_written_poses_are_read_back(estimate: PoseEstimate, photographs: Path, tmp_path: Path) -> None:
+    shutil.copytree(photographs, tmp_path / "photographs")
+    write_poses(estimate, photographs / "poses.json")
+    (pair,) = pansplat.load_pairs(photographs)
+    (photographs / "poses.json").unlink()
+    for panorama in pair.context:
+        assert np.allclose(panorama.cam2world.numpy(), estimate.poses[panorama.image], atol=1e-8)
+    assert (pair.near, pair.far) == pytest.approx((estimate.near, estimate.far), abs=1e-3)
+    for suffix in ("tum", "kitti"):
+        write_poses(estimate, tmp_path / f"poses.{suffix}")
+        trajectory = read_trajectory(tmp_path / f"poses.{suffix}")
+        assert trajectory.kind == suffix
+        for read, pose in zip(trajectory.poses, estimate.poses.values(), strict=True):
+            assert np.allclose(read.numpy(), pose, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_folder_without_poses_is_loaded_with_estimated_ones(
+    photographs: Path, estimate: PoseEstimate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    placed = dataclasses.replace(estimate, unplaced={})
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", lambda images, progress: placed)
+    message = "has no poses; they were estimated: 2 of 5 panoramas"
+    with pytest.warns(UserWarning, match=message):
+        (pair,) = pansplat.load_pairs(photographs)
+    assert sorted(panorama.name for panorama in pair.context) == ["left", "right"]
+    assert not (photographs / "poses.json").exists()
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", None)  # the second call reads the cache
+    with pytest.warns(UserWarning, match=message):
+        (again,) = pansplat.load_pairs(photographs)
+    assert all((a.cam2world == b.cam2world).all() for a, b in zip(pair.context, again.context, strict=True))
+
+
+def test_pictures_without_texture_have_no_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, grey in (("a", 90), ("b", 160)):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((64, 128, 3), grey, np.uint8))
+    assert run(["pose", str(tmp_path), "-o", str(tmp_path / "poses.json")]) == 2
+    message = " ".join(capsys.readouterr().err.split())
+    assert "no poses were found" in message and "a.png" in message and "b.png" in message
+    assert not (tmp_path / "poses.json").exists()
+
+
+def test_one_picture_and_unknown_formats_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((64, 128, 3), np.uint8))
+    for arguments, expected in (
+        ([str(tmp_path)], "needed two or more panoramas, got 1"),
+        ([str(tmp_path), "-o", "poses.xml"], "--out must end in .json, .tum, .kitti"),
+        ([str(tmp_path / "none")], "got no such path"),
+    ):
+        assert run(["pose", *arguments]) == 2
+        assert expected in " ".join(capsys.readouterr().err.split())

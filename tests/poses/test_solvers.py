@@ -1,0 +1,91 @@
+"""Minimal solvers find the exact pose of exact bearings, anywhere on the sphere."""
+
+import numpy as np
+import pytest
+
+from pansplat.poses.solvers import (
+    angle_between,
+    decompose_essential,
+    epipolar_angles,
+    essential_from_five,
+    rotation_angle,
+    rotation_exp,
+    rotation_log,
+    skew,
+    two_view_depths,
+    upright_from_three,
+    upright_from_two,
+)
+
+
+def _nearest_essential(found, truth):
+    truth = truth / np.linalg.norm(truth)
+    found = found / np.linalg.norm(found, axis=(1, 2), keepdims=True)
+    return min(np.abs(found - truth).max(axis=(1, 2)).min(), np.abs(found + truth).max(axis=(1, 2)).min())
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_five_exact_bearings_give_the_essential_matrix(scene, planar) -> None:
+    for seed in range(5):
+        bearings = scene(seed, 40, planar=planar)
+        a, b = (x.reshape(8, 5, 3) for x in (bearings.first, bearings.second))
+        found, sample = essential_from_five(a, b)
+        truth = skew(bearings.translation) @ bearings.rotation
+        errors = [_nearest_essential(found[sample == s], truth) for s in range(8) if (sample == s).any()]
+        assert np.median(errors) < 1e-6
+        assert len(errors) >= 7
+
+
+def test_singular_samples_of_five_bearings_give_no_invalid_number() -> None:
+    a = np.zeros((2, 5, 3))
+    a[..., 2] = 1
+    found, _ = essential_from_five(a, a)
+    assert np.isfinite(found).all()
+
+
+@pytest.mark.parametrize(("size", "solver"), [(3, upright_from_three), (2, upright_from_two)])
+def test_few_bearings_give_the_pose_of_upright_cameras_in_most_samples(scene, size, solver) -> None:
+    for seed in range(5):
+        translation = np.array((np.cos(seed), 0.0 if size == 2 else 0.4, np.sin(seed)))
+        bearings = scene(seed, 20 * size, upright=True, translation=translation / np.linalg.norm(translation))
+        a, b = (x.reshape(20, size, 3) for x in (bearings.first, bearings.second))
+        rotations, translations = solver(a, b)
+        errors = rotation_angle(rotations @ bearings.rotation.T) + np.minimum(
+            angle_between(translations, bearings.translation), angle_between(-translations, bearings.translation)
+        )
+        assert (errors < 1e-6).sum() >= 12  # of 20; pairs of nearly equal roots are missed
+
+
+def test_one_of_the_four_decompositions_is_the_pose(scene) -> None:
+    bearings = scene(3)
+    options = decompose_essential(skew(bearings.translation) @ bearings.rotation)
+    errors = [
+        float(rotation_angle(r @ bearings.rotation.T) + angle_between(t, bearings.translation)) for r, t in options
+    ]
+    assert sorted(errors)[0] < 1e-7 < sorted(errors)[1]
+
+
+def test_points_are_in_front_of_both_cameras_for_the_right_pose_only(scene) -> None:
+    bearings = scene(4)
+    for r, t in decompose_essential(skew(bearings.translation) @ bearings.rotation):
+        is_right = rotation_angle(r @ bearings.rotation.T) + angle_between(t, bearings.translation) < 1e-6
+        in_front = (two_view_depths(bearings.first, bearings.second, r, t) > 0).all(axis=1).mean()
+        assert in_front == 1 if is_right else in_front < 0.6
+
+
+def test_the_epipolar_angle_is_the_turn_that_bearings_need(scene) -> None:
+    bearings = scene(5)
+    assert np.abs(epipolar_angles(*vars(bearings).values())).max() < 1e-12
+    # A turn of the second bearing across its epipolar plane, shared by both bearings, shrinks by sqrt(2).
+    normal = np.cross(bearings.translation, bearings.first @ bearings.rotation.T)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    turned = bearings.second + 1e-5 * normal
+    angles = np.abs(epipolar_angles(bearings.first, turned, bearings.rotation, bearings.translation)) / 1e-5
+    assert (angles <= 1.0001).all() and (angles > 0.2).all()
+
+
+def test_rotation_vectors_and_matrices_are_inverse() -> None:
+    for vector in ((0.3, -0.2, 0.9), (1e-9, 0, 0), (0, 3.0, 0)):
+        rotation = rotation_exp(np.array(vector))
+        assert np.allclose(rotation_log(rotation), vector, atol=1e-9)
+        assert np.isclose(rotation_angle(rotation), np.linalg.norm(vector), atol=1e-9)

@@ -1,0 +1,91 @@
+"""The relative pose of two views is found among outliers, and what cannot be found is said."""
+
+import math
+
+import numpy as np
+import pytest
+
+from pansplat.poses.features import Features, Matches
+from pansplat.poses.solvers import angle_between, rotation_angle, rotation_exp
+from pansplat.poses.two_view import RelativePose, estimate_relative_pose
+
+PIXEL = 2 * math.pi / 2048
+NOISE = 0.3 * PIXEL
+
+
+def estimate(bearings, seed: int = 0) -> RelativePose:
+    """The pose of bearings whose outliers come last, with ratios that hardly reveal them."""
+    count = len(bearings.first)
+    rng = np.random.default_rng(seed)
+    ratio = np.sort(rng.uniform(0.6, 0.85, count))
+    order = rng.permutation(count)  # outliers are spread over all ratios
+    empty = np.zeros((count, 128), np.float32)
+    first, second = (Features(x, empty, PIXEL) for x in (bearings.first, bearings.second))
+    return estimate_relative_pose(first, second, Matches(np.stack((order, order), axis=1), ratio), seed=seed)
+
+
+def errors_degrees(found: RelativePose, bearings) -> tuple[float, float]:
+    turn = rotation_angle(found.rotation @ bearings.rotation.T)
+    return math.degrees(turn), math.degrees(angle_between(found.translation, bearings.translation))
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.5, 0.7])
+def test_the_pose_is_found_among_outliers(scene, outliers) -> None:
+    bearings = scene(1, 300, noise=NOISE, outliers=outliers)
+    found = estimate(bearings)
+    rotation, direction = errors_degrees(found, bearings)
+    assert found.is_reliable, found.problem
+    assert rotation < 0.1 and direction < 0.2
+
+
+def test_the_error_is_within_the_stated_uncertainty(scene) -> None:
+    bearings = scene(2, 250, noise=NOISE, outliers=0.3)
+    found = estimate(bearings)
+    rotation, direction = errors_degrees(found, bearings)
+    assert rotation < 4 * math.degrees(found.uncertainty[0]) and direction < 4 * math.degrees(found.uncertainty[1])
+
+
+def test_points_of_one_plane_determine_the_pose(scene) -> None:
+    bearings = scene(3, 300, noise=NOISE, outliers=0.4, planar=True, translation=np.array((0.6, 0.0, -0.8)))
+    found = estimate(bearings)
+    rotation, direction = errors_degrees(found, bearings)
+    assert found.is_reliable, found.problem
+    assert rotation < 0.3 and direction < 0.6
+
+
+def test_a_translation_from_pole_to_pole_is_found(scene) -> None:
+    bearings = scene(4, 300, noise=NOISE, outliers=0.5, translation=np.array((0.0, 1.0, 0.0)))
+    rotation, direction = errors_degrees(estimate(bearings), bearings)
+    assert rotation < 0.1 and direction < 0.2
+
+
+def test_a_pure_rotation_is_reported_as_one_place(scene) -> None:
+    bearings = scene(5, 300, noise=NOISE, outliers=0.5, translation=np.zeros(3), rotation=rotation_exp(np.ones(3)))
+    found = estimate(bearings)
+    assert not found.is_reliable and found.problem is not None and "one place" in found.problem
+    assert math.degrees(rotation_angle(found.rotation @ bearings.rotation.T)) < 0.2
+
+
+def test_views_turned_by_half_a_turn_about_the_baseline_are_distinguished(scene) -> None:
+    for turn in (0.0, math.pi):
+        translation = np.array((1.0, 0.0, 0.0))
+        bearings = scene(6, 250, noise=NOISE, rotation=rotation_exp(turn * translation), translation=translation)
+        assert max(errors_degrees(estimate(bearings), bearings)) < 0.2
+
+
+def test_random_matches_are_refused(scene) -> None:
+    for seed in range(3):
+        assert not estimate(scene(seed, 400, outliers=1.0)).is_reliable
+
+
+def test_matches_of_one_object_are_refused(scene) -> None:
+    bearings = scene(7, 300, noise=NOISE, outliers=0.7)
+    near = bearings.first[:, 2] > 0.97
+    first, second = bearings.first[near], bearings.second[near]
+    found = estimate(type(bearings)(first, second, bearings.rotation, bearings.translation))
+    assert not found.is_reliable
+
+
+def test_too_few_matches_are_refused(scene) -> None:
+    found = estimate(scene(8, 6))
+    assert not found.is_reliable and "only 6 features match" in str(found.problem)
