@@ -275,17 +275,19 @@ class Refinement:
         """
         clock = _Clock(seconds, steps, self.config.release, self._created)
         report = progress or (lambda what, fraction: None)
-        start = clock.elapsed
         before = best = self.held_out_error()
-        clock.reserve(self._end_cost() * (clock.elapsed - start))
+        fastest = math.inf
         history, stale, stopped = [(0, clock.elapsed, before)], 0, "done"
         while self._views and (fraction := clock.fraction) < 1:
             if should_stop():
                 stopped = "interrupted"
                 break
             report("refining", fraction)
+            start = clock.elapsed
             self.step(fraction)
             clock.steps += 1
+            fastest = min(fastest, clock.elapsed - start)  # the first step of a process loads kernels
+            clock.reserve(self._end_cost() * fastest)
             if clock.steps % _CHECK_EVERY or clock.fraction >= self.config.release:
                 continue
             error = self.held_out_error()
@@ -305,13 +307,13 @@ class Refinement:
         return RefineReport(clock.steps, clock.elapsed, stopped, before, after, self.gains, tuple(history))
 
     def _end_cost(self) -> float:
-        """Approximate duration of the last error, the contributions and the fit of colours, relative to an error."""
+        """Approximate duration of the last error, the contributions and the fit of colours, in steps."""
         views, images = len(self._views), sum(max(len(targets) - 1, 1) for targets in self._targets.values())
         pixels = self._images[0, 0].numel() / math.prod(self._size)
-        colors = (
-            views * pixels * (2.7 * self.config.colors.steps + 1.7)
-        )  # a gradient takes 1.7 times as long as an image
-        return 1 + (images + views + colors) / max(images, 1)
+        gradient = 1.7  # duration of a backward pass relative to its image
+        contributions = (images + views) * (1 + gradient) / 4
+        colors = views * pixels * (self.config.colors.steps * (1 + gradient) + gradient)
+        return (images + contributions + colors) / (views * (1 + gradient))
 
     def _finish(self, scene: Scene) -> Scene:
         """Fit the colours to the photographs at their own size."""
@@ -333,13 +335,14 @@ class _Clock:
             raise InputError("give either `seconds` or `steps` of a refinement, got both or neither")
         if not 0 < limit < math.inf:
             raise InputError(f"`seconds` or `steps` of a refinement must be positive, got {limit}")
-        self._is_timed, self._limit, self._release = steps is None, float(limit), release
+        self._is_timed, self._given, self._release = steps is None, float(limit), release
+        self._limit, self._is_shortened = self._given, False
         self.steps, self._start = 0, start
 
     def reserve(self, seconds: float) -> None:
-        """End a timed run earlier by this time, or at half of its limit."""
-        if self._is_timed:
-            self._limit = max(self._limit - seconds, 0.5 * self._limit)
+        """End a timed run earlier than its limit by this time, but not before half of it."""
+        if self._is_timed and not self._is_shortened:
+            self._limit = max(self._given - seconds, 0.5 * self._given)
 
     @property
     def elapsed(self) -> float:
@@ -357,7 +360,7 @@ class _Clock:
 
     def shorten(self) -> None:
         """Begin the last part now, with a length in proportion to the time that was spent."""
-        self._limit = self._spent / self._release
+        self._limit, self._is_shortened = self._spent / self._release, True
 
 
 def _cosine_fall(fraction: float) -> float:
