@@ -4,6 +4,7 @@ import contextlib
 import importlib.util
 import json
 import os
+import signal
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -101,6 +102,15 @@ def golden(shared: Path) -> Callable[[str], dict[str, torch.Tensor]]:
         return safetensors.torch.load_file(shared / "golden" / f"{name}.safetensors")
 
     return load
+
+
+@pytest.fixture(autouse=True)
+def _restored_signal_handlers() -> Iterator[None]:
+    """Restore the handlers after a test: the end of a command ignores signals, and child processes inherit that."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture

@@ -91,7 +91,7 @@ def load_pairs(
 
 def _find_collections(folder: Path, convention: str | None, depth: int) -> list[tuple[Path, Collection]]:
     """The collections in a folder itself, or else those in its subfolders."""
-    if (folder / _POSES).is_file():
+    if (folder / _POSES).exists():  # the reader refuses what is no file
         return [(folder, read_pose_file_folder(folder, convention))]
     if is_loc360_sequence(folder):
         return [(folder, read_loc360_sequence(folder, convention))]

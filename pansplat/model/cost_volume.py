@@ -76,9 +76,10 @@ class CostVolumeConfig:
     """Coarse to fine."""
 
     def __post_init__(self) -> None:
-        levels = [level.level for level in self.levels]
-        if levels != [level.level for level in _HIERARCHY][: len(levels)]:
-            raise ValueError(f"`levels` must be 3, 2, 1, coarse to fine, got {levels}")
+        levels, hierarchy = [level.level for level in self.levels], [level.level for level in _HIERARCHY]
+        first = hierarchy.index(levels[0]) if levels and levels[0] in hierarchy else 0
+        if levels != hierarchy[first : first + len(levels)]:
+            raise ValueError(f"`levels` must be consecutive ones of {hierarchy}, coarse to fine, got {levels}")
 
     @property
     def swept_levels(self) -> tuple[SweepLevel, ...]:
