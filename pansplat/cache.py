@@ -9,6 +9,7 @@ import json
 import os
 import re
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -52,18 +53,10 @@ class CachedPrediction:
         """Write to the first writable folder, if any, and delete outdated predictions there."""
         tensors = {name: getattr(gaussians, name).detach().cpu().contiguous() for name in _FIELDS}
         body = safetensors.torch.save(tensors)
-        for folder in self._folders:
-            try:
-                folder.mkdir(parents=True, exist_ok=True)
-                with replacing(folder / self._name) as unfinished, open(unfinished, "wb") as file:
-                    file.write(body)
-                    file.write(zlib.crc32(body).to_bytes(4, "little"))
-            except (OSError, InputError):
-                continue
-            for old in folder.glob("*.scene"):
-                if old.name.startswith(self._stem) and old.name != self._name:
-                    old.unlink(missing_ok=True)
-            return
+        written = write_cache_file(self._folders, self._name, body, zlib.crc32(body).to_bytes(4, "little"))
+        for old in [] if written is None else written.parent.glob("*.scene"):
+            if old.name.startswith(self._stem) and old.name != self._name:
+                old.unlink(missing_ok=True)
 
 
 def list_cache_folders(pair: Pair) -> list[Path]:
@@ -79,6 +72,19 @@ def cache_folders(folder: Path) -> list[Path]:
         home = os.environ.get("XDG_CACHE_HOME") or expand_home("~/.cache")
         folders.append(Path(home) / "pansplat" / folder_hash)
     return folders
+
+
+def write_cache_file(folders: Sequence[Path], name: str, *parts: bytes) -> Path | None:
+    """Write a file to the first writable folder; returns its path, or None if there is no such folder."""
+    for folder in folders:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with replacing(folder / name) as unfinished, open(unfinished, "wb") as file:
+                file.writelines(parts)
+        except (OSError, InputError):
+            continue
+        return folder / name
+    return None
 
 
 def _hash_inputs(views: Views, predictor: Predictor, refinement: str) -> str:

@@ -72,12 +72,20 @@ def run_command(command: Callable[[], int], *, memory_advice: str, interruption:
         return status
 
 
-def exit_process(status: int) -> NoReturn:
-    """End the process with an exit status; a signal during the interpreter's end prints nothing."""
+def exit_process(status: int, *, finalize: bool = True) -> NoReturn:
+    """End the process with an exit status; a signal during the interpreter's end prints nothing.
+
+    Args:
+        finalize: whether Python's finalisation runs. Threads of libraries can abort it, or block it for ever.
+    """
     with contextlib.suppress(ValueError):  # only the main thread can set handlers
         for number in _SIGNALS:
             signal.signal(number, signal.SIG_IGN)
-    sys.exit(status)
+    if finalize:
+        sys.exit(status)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
 
 
 def _report(error: BaseException, memory_advice: str) -> int:

@@ -31,7 +31,7 @@ from pansplat.model.layers import Precision
 from pansplat.model.weights import WEIGHTS_SUFFIXES, CompatChoice, read_model_name
 from pansplat.poses.estimate import estimate_poses
 from pansplat.poses.files import estimate_pairs
-from pansplat.predictor import Predictor, Progress
+from pansplat.predictor import MIN_HEIGHT, Predictor, Progress
 from pansplat.refinement import RefineConfig, Refinement, refinement_fingerprint
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
@@ -51,7 +51,6 @@ __all__ = [
 
 Drawing = Literal["exact", "original"]
 
-_LEAST_HEIGHT = 64  # of all predictors, pixels
 _DEFAULT_HEIGHT = 512  # of networks; larger panoramas take minutes
 
 
@@ -77,10 +76,14 @@ def load_pairs(
     Raises:
         InputError: no known format was found, a file is missing or invalid, or no poses were found.
     """
-    images = folders.list_unposed_panoramas(path)
-    if images:
-        return estimate_pairs(expand_home(path), images, near=near, far=far, progress=progress)
-    return folders.load_pairs(path, convention=convention, near=near, far=far)
+    folder = expand_home(path)
+    try:
+        return folders.load_pairs(folder, convention=convention, near=near, far=far)
+    except folders.UnposedPanoramasError as unposed:
+        if not folder.is_dir():
+            raise
+        images = unposed.images
+    return estimate_pairs(folder, images, near=near, far=far, progress=progress)
 
 
 def load_model(
@@ -142,7 +145,7 @@ _MODELS: dict[str, Callable[..., Predictor]] = {"default": _load_default, "sweep
 
 def choose_height(pair: Pair, predictor: Predictor) -> int:
     """The height to predict a pair at: that of its photographs, at most the largest default of the predictor."""
-    return max(_LEAST_HEIGHT, min(pair.image_height, getattr(predictor, "default_height", _DEFAULT_HEIGHT)))
+    return max(MIN_HEIGHT, min(pair.image_height, getattr(predictor, "default_height", _DEFAULT_HEIGHT)))
 
 
 def predict(
@@ -250,11 +253,9 @@ def refine(
     Raises:
         InputError: scene and views do not fit, or an argument is out of range.
     """
-    factor = working_factor(scene.near)
-    scaled_views = replace(views, cam2world=scale_poses(views.cam2world, factor))
-    refinement = Refinement(scene.scaled(factor), scaled_views, config, seed=seed)
+    refinement = Refinement(scene, views, config, seed=seed)
     refinement.run(seconds=10.0 if seconds is None and steps is None else seconds, steps=steps, progress=progress)
-    return refinement.scene().scaled(1 / factor)
+    return refinement.scene()
 
 
 def predict_to_file(

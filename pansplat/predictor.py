@@ -5,12 +5,39 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 
 Progress = Callable[[str, float], None]  # current step, fraction done in [0, 1]
+
+
+MIN_HEIGHT = 64  # pixels, of panoramas
+
+
+def require_matching_inputs(images: Tensor, cam2world: Tensor, masks: Tensor | None) -> None:
+    """Check images (view, 3, height, 2 height), their poses and their masks.
+
+    Raises:
+        InputError: the images are too small, the shapes do not fit, or a value is not finite.
+    """
+    shape = tuple(images.shape)
+    if shape[2] < MIN_HEIGHT:
+        raise InputError(f"`images` must be at least {MIN_HEIGHT} pixels high, got {shape[2]}; resize them")
+    if tuple(cam2world.shape) != (shape[0], 4, 4):
+        raise InputError(f"`cam2world` must be ({shape[0]}, 4, 4) to fit the images, got {tuple(cam2world.shape)}")
+    if masks is not None and tuple(masks.shape) != (shape[0], *shape[2:]):
+        raise InputError(f"`masks` must be {(shape[0], *shape[2:])} to fit the images, got {tuple(masks.shape)}")
+    if not (torch.isfinite(images).all() and torch.isfinite(cam2world).all()):
+        raise InputError("`images` and `cam2world` must be finite, got NaN or infinity; clean the input first")
+
+
+def select_item(value: float | Tensor, n: int) -> float | Tensor:
+    """The depth bound of a batch item, from one number or one of each item."""
+    return value[n] if isinstance(value, Tensor) and value.ndim else value
 
 
 @runtime_checkable

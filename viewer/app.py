@@ -1,8 +1,6 @@
 """The `pansplat-view` command. Imports torch and OpenGL only when they are needed, so that `--help` is fast."""
 
-import os
 import re
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import tyro
 
-from pansplat.console import own_warnings, parse_arguments, run_command
+from pansplat.console import exit_process, own_warnings, parse_arguments, run_command
 from pansplat.errors import InputError
 from pansplat.files import expand_home, require_output_folder
 from pansplat.options import REAL, Depth, Height, Range, Seconds, check_numbers
@@ -99,10 +97,8 @@ class Options:
 
 def main(args: Sequence[str] | None = None) -> NoReturn:
     """Run the command and exit with its status (docs/errors.md)."""
-    status = run(args)
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(status)  # without Python's finalisation, which sometimes never ends with the LLVMs of both numba and Mesa
+    # Python's finalisation sometimes never ended after Ctrl+C; numba and Mesa each have an LLVM in the process.
+    exit_process(run(args), finalize=False)
 
 
 def run(args: Sequence[str] | None = None) -> int:

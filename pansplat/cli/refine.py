@@ -71,7 +71,6 @@ class Refine:
         """Refine, write the scene and print the errors of held-out pixels."""
         from pansplat import pipeline
         from pansplat.evaluation.report import write_json
-        from pansplat.geometry.world import scale_poses, working_factor
         from pansplat.refinement import RefineConfig, Refinement
 
         self._refuse_invalid_arguments()
@@ -80,11 +79,9 @@ class Refine:
         seconds = 10.0 if self.seconds is None and self.steps is None else self.seconds
         with stop_at_interrupt() as should_stop, progress_bar() as progress:
             progress("preparing", 0.0)
-            factor = working_factor(scene.near)
-            scaled_views = dataclasses.replace(views, cam2world=scale_poses(views.cam2world, factor))
-            refinement = Refinement(scene.scaled(factor), scaled_views, config, seed=self.seed)
+            refinement = Refinement(scene, views, config, seed=self.seed)
             report = refinement.run(seconds=seconds, steps=self.steps, progress=progress, should_stop=should_stop)
-        refined = refinement.scene().scaled(1 / factor)
+        refined = refinement.scene()
         pipeline.save(refined, self.out)
         if self.report is not None:
             write_json(dataclasses.asdict(report), self.report)

@@ -64,6 +64,7 @@ def load_pairs(
         near, far: radial depth range in metres; overrides that of the files.
 
     Raises:
+        UnposedPanoramasError: the folder holds panoramas only.
         InputError: no known format was found, or a file is missing or invalid.
     """
     root = expand_home(path)
@@ -107,26 +108,23 @@ def _find_collections(folder: Path, convention: str | None, depth: int) -> list[
     return [found for sub in subfolders for found in _find_collections(sub, convention, depth - 1)]
 
 
-def list_unposed_panoramas(path: Path | str) -> list[Path]:
-    """The panorama files of a folder without poses in a known format; empty unless there are two or more."""
-    folder = expand_home(path)
-    try:
-        if not folder.is_dir() or _find_collections(folder, None, _MAX_DEPTH):
-            return []
-        images = list_panorama_files(folder)
-    except (InputError, OSError):  # `load_pairs` reports it
-        return []
-    return images if len(images) >= 2 else []
+class UnposedPanoramasError(InputError):
+    """A folder holds two or more panoramas, and no poses in a known format."""
+
+    def __init__(self, message: str, images: list[Path]) -> None:
+        super().__init__(message)
+        self.images = images
 
 
 def _nothing_found(root: Path) -> InputError:
     images = list_panorama_files(root)
     if images:
         names = ", ".join(path.name for path in images[:3]) + (" ..." if len(images) > 3 else "")
-        return InputError(
+        message = (
             f"{root}: needed poses for the panoramas, got images only ({names}); add a poses.json "
             "or another pose file, see docs/input.md."
         )
+        return UnposedPanoramasError(message, images) if len(images) >= 2 else InputError(message)
     return InputError(
         f"{root}: needed two or more panoramas with poses (poses.json, camera_pose.json, rot.txt and "
         "tran.txt, *.kitti or *.tum), got none of these files there or in its subfolders; see docs/input.md."

@@ -34,13 +34,12 @@ from pansplat.model.weights import (
     read_checkpoint,
     require_shapes,
 )
-from pansplat.predictor import Progress
+from pansplat.predictor import Progress, require_matching_inputs, select_item
 
 _NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {
     "pansplat": (PanSplat, PanSplatConfig),
     "mvsplat": (MVSplat, MVSplatConfig),
 }
-_MIN_HEIGHT = 64
 _UNTILED_HEIGHT = 512  # above, the number of tiles along each side doubles with the height
 _MULTIPLE = 32  # divides the working height: levels, windows and their shifts
 _MATCHING_FRACTION = 0.4  # of the prediction time, for the progress report
@@ -128,8 +127,8 @@ class NetworkPredictor:
                 self.predict_with_depths(
                     images[n],
                     cam2world[n],
-                    _select_item(near, n),
-                    _select_item(far, n),
+                    select_item(near, n),
+                    select_item(far, n),
                     masks=None if masks is None else masks[n],
                     progress=progress,
                 )[0]
@@ -244,11 +243,6 @@ def remove_masked_gaussians(
     return gaussians.select(kept)
 
 
-def _select_item(value: float | Tensor, n: int) -> float | Tensor:
-    """The depth bound of a batch item."""
-    return value[n] if isinstance(value, Tensor) and value.ndim else value
-
-
 def _check_inputs(
     images: Tensor, cam2world: Tensor, near: Tensor, far: Tensor, masks: Tensor | None, compat: Compat
 ) -> None:
@@ -258,14 +252,7 @@ def _check_inputs(
             f"`images` must be (view, 3, height, 2 * height), got {shape}; stack RGB equirectangular images of one size"
         )
     require_views(shape[0], compat)
-    if shape[2] < _MIN_HEIGHT:
-        raise InputError(f"`images` must be at least {_MIN_HEIGHT} pixels high, got {shape[2]}; resize them")
-    if tuple(cam2world.shape) != (shape[0], 4, 4):
-        raise InputError(f"`cam2world` must be ({shape[0]}, 4, 4) to fit the images, got {tuple(cam2world.shape)}")
-    if masks is not None and tuple(masks.shape) != (shape[0], *shape[2:]):
-        raise InputError(f"`masks` must be {(shape[0], *shape[2:])} to fit the images, got {tuple(masks.shape)}")
-    if not (torch.isfinite(images).all() and torch.isfinite(cam2world).all()):
-        raise InputError("`images` and `cam2world` must be finite, got NaN or infinity; clean the input first")
+    require_matching_inputs(images, cam2world, masks)
     if near.numel() not in (1, shape[0]) or far.numel() not in (1, shape[0]):
         raise InputError(
             f"`near` and `far` must be one number, or one number per view, got {near.tolist()} and {far.tolist()}"

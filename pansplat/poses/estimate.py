@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +25,7 @@ from pansplat.poses.features import Features, detect_features, match_features
 from pansplat.poses.tour import Pair, build_tour
 from pansplat.poses.two_view import RelativePose, estimate_relative_pose, match_priors, noise_of
 from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_camera_height, level_poses
+from pansplat.predictor import Progress
 from pansplat.threads import one_thread
 
 CAMERA_HEIGHT = 1.5  # metres over the floor; tripods of tours stand at 1.3 to 1.6 m
@@ -39,8 +40,6 @@ _FLOOR_PAIRS = 8
 _MIRROR_EVIDENCE = 60.0  # expected number of right matches with a mirror image
 _LARGEST_NEAR = 0.6  # metres; the depth range is not narrower than that of rooms
 _MIN_FAR = 6.0
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,12 +14,13 @@ import numpy as np
 import torch
 
 from pansplat.atomic import replacing
-from pansplat.cache import cache_folders
+from pansplat.cache import cache_folders, write_cache_file
 from pansplat.data.folders import read_pose_file_folder
 from pansplat.data.pairs import Pair
 from pansplat.errors import InputError
 from pansplat.geometry.pose import quats_from_rotations
-from pansplat.poses.estimate import PoseEstimate, Progress, estimate_poses
+from pansplat.poses.estimate import PoseEstimate, estimate_poses
+from pansplat.predictor import Progress
 from pansplat.strict_json import read_json
 
 _FORMAT = "1"  # version of the estimate; part of the cache's key
@@ -92,14 +93,7 @@ def estimate_pairs(
     if source is None:
         estimate = estimate_poses(images, progress=progress)
         content = _make_content(estimate, {image: image.name for image in images})
-        for cache in folders:
-            try:
-                cache.mkdir(parents=True, exist_ok=True)
-                _write(cache / name, json.dumps(content) + "\n")
-            except (OSError, InputError):
-                continue
-            source = cache / name
-            break
+        source = write_cache_file(folders, name, json.dumps(content).encode())
         if source is None:
             raise InputError(
                 f"{folder}: needed a writable cache folder for the poses, got none of {folders}; make one."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -22,9 +21,7 @@ _SMALL = 512  # height of the frames in which parallax is measured, pixels
 _MIN_PARALLAX = 0.05  # radians between key frames
 
 
-def extract_key_frames(
-    path: Path, folder: Path, count: int, progress: Callable[[str, float], None] | None = None
-) -> list[Path]:
+def extract_key_frames(path: Path, folder: Path, count: int, progress: Progress | None = None) -> list[Path]:
     """Write at most `count` key frames of a video as PNG files, and return them.
 
     The video is divided into intervals of equal length. The sharpest of some frames of each interval is a candidate; it

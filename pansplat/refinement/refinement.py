@@ -28,6 +28,7 @@ from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.pose import nearest_views
+from pansplat.geometry.world import scale_poses, working_factor
 from pansplat.predictor import Progress
 from pansplat.refinement.budget import MAX_OTHERS, drop_unseen, merge_to
 from pansplat.refinement.objective import Photograph, image_difference
@@ -121,7 +122,9 @@ class Refinement:
 
     def __init__(self, scene: Scene, views: Views, config: RefineConfig | None = None, *, seed: int = 0) -> None:
         self._created = time.perf_counter()
-        _check_fit(scene, views)
+        self._factor = working_factor(scene.near)
+        scene = scene.scaled(self._factor)
+        _check_fit(scene, views, scale_poses(views.cam2world, self._factor))
         self.config = config or RefineConfig()
         device, random = scene.gaussians.means.device, torch.Generator().manual_seed(seed)
         self._images = views.images.float().to(device)
@@ -232,12 +235,16 @@ class Refinement:
                 weight += float(photograph.held_out.sum())
         return error / weight if weight > 0 else 0.0
 
-    @torch.no_grad()
     def scene(self) -> Scene:
         """The scene in its present state.
 
         After a run it has no Gaussians without contribution. If the run made it worse, it is the scene at the start.
         """
+        return self._scene().scaled(1 / self._factor)
+
+    @torch.no_grad()
+    def _scene(self) -> Scene:
+        """`scene` in the refinement's unit of length."""
         if self._result is not None or not self._views:
             return self._result or self._start
         parts = [self._cameras.move(parameters.build(), view) for view, parameters in self._views.items()]
@@ -301,7 +308,7 @@ class Refinement:
         history.append((clock.steps, clock.elapsed, after))
         report("refined", 1.0)
         if after <= before:
-            self._result = self._finish(drop_unseen(self.scene(), self._size))
+            self._result = self._finish(drop_unseen(self._scene(), self._size))
         else:
             self._result, stopped = self._start, "worse"
         return RefineReport(clock.steps, clock.elapsed, stopped, before, after, self.gains, tuple(history))
@@ -377,7 +384,7 @@ def refinement_fingerprint(config: RefineConfig | None = None) -> str:
     return digest.hexdigest()
 
 
-def _check_fit(scene: Scene, views: Views) -> None:
+def _check_fit(scene: Scene, views: Views, poses: Tensor) -> None:
     count = len(scene.cam2world)
     if not count:
         raise InputError("the scene has no input cameras, so it cannot be compared with photographs; refine a pair")
@@ -388,7 +395,7 @@ def _check_fit(scene: Scene, views: Views) -> None:
     last = int(scene.gaussians.views.max()) if len(scene.gaussians) else 0
     if last >= count:
         raise InputError(f"the Gaussians must come from the scene's {count} views, got one of view {last}")
-    difference = float((scene.cam2world.double() - views.cam2world.double()).abs().max())
+    difference = float((scene.cam2world.double() - poses.double()).abs().max())
     if not difference < _POSE_TOLERANCE:
         raise InputError(
             "the poses of the photographs must be those of the scene, got poses that differ by up to "

@@ -21,6 +21,7 @@ import torch
 
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians
+from pansplat.geometry.equirect import row_weights
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
 from pansplat.geometry.pose import quats_from_rotations
 from pansplat.sweep.search import PosedImages
@@ -174,7 +175,7 @@ def _any_in_blocks(mask: np.ndarray) -> np.ndarray:
 
 def _area_fraction(mask: np.ndarray) -> float:
     """Fraction of the sphere that a mask (h, w) covers."""
-    areas = np.cos(((np.arange(len(mask)) + 0.5) / len(mask) - 0.5) * math.pi)
+    areas = row_weights(len(mask)).numpy()
     return float(mask.mean(axis=1) @ areas / areas.sum())
 
 

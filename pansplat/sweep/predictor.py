@@ -16,13 +16,12 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import fit_panoramas
 from pansplat.geometry.world import require_depth_range, scale_poses, working_factor
-from pansplat.predictor import Progress
+from pansplat.predictor import Progress, require_matching_inputs, select_item
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.sweep.lift import LiftConfig, lift
 from pansplat.sweep.prior import PriorModel
 from pansplat.sweep.search import PosedImages, SearchConfig, search_surfaces
 
-_MIN_HEIGHT = 64  # pixels
 _MULTIPLE = 8  # the levels of the Gaussians divide the height; other heights are resized to the next multiple
 
 
@@ -77,7 +76,7 @@ class Sweep:
             item_masks = [None] * len(images) if masks is None else masks
             return [
                 self._predict(
-                    images[n], cam2world[n], _select_item(near, n), _select_item(far, n), item_masks[n], progress
+                    images[n], cam2world[n], select_item(near, n), select_item(far, n), item_masks[n], progress
                 )
                 for n in range(len(images))
             ]
@@ -118,10 +117,6 @@ class Sweep:
         return gaussians.scaled(1 / factor).to(device=images.device)
 
 
-def _select_item(value: float | Tensor, n: int) -> float | Tensor:
-    return value[n] if isinstance(value, Tensor) and value.ndim else value
-
-
 def _check_inputs(images: Tensor, cam2world: Tensor, near: float, far: float, masks: Tensor | None) -> None:
     shape = tuple(images.shape)
     if images.ndim != 4 or shape[0] < 2 or shape[1] != 3 or shape[3] != 2 * shape[2]:
@@ -129,14 +124,7 @@ def _check_inputs(images: Tensor, cam2world: Tensor, near: float, far: float, ma
             f"`images` must be (view, 3, height, 2 * height) of at least two panoramas, got {shape}; "
             "stack RGB equirectangular images of one size"
         )
-    if shape[2] < _MIN_HEIGHT:
-        raise InputError(f"`images` must be at least {_MIN_HEIGHT} pixels high, got {shape[2]}; resize them")
-    if tuple(cam2world.shape) != (shape[0], 4, 4):
-        raise InputError(f"`cam2world` must be ({shape[0]}, 4, 4) to fit the images, got {tuple(cam2world.shape)}")
-    if masks is not None and tuple(masks.shape) != (shape[0], *shape[2:]):
-        raise InputError(f"`masks` must be {(shape[0], *shape[2:])} to fit the images, got {tuple(masks.shape)}")
-    if not (torch.isfinite(images).all() and torch.isfinite(cam2world).all()):
-        raise InputError("`images` and `cam2world` must be finite, got NaN or infinity; clean the input first")
+    require_matching_inputs(images, cam2world, masks)
     require_depth_range(near, far, "`near` and `far`")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import sys
+import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
@@ -57,12 +57,9 @@ def parse(argv: Sequence[str] | None = None) -> TrainConfig:
 
 def main() -> NoReturn:
     """The entry point: `run`, then the end of this process."""
-    status = run()
-    if "torch" in sys.modules:  # else nothing was trained
-        from pansplat.training.distributed import end_process
-
-        end_process(status)
-    exit_process(status)
+    # DistributedDataParallel keeps gloo's threads alive after the process group is destroyed (torch 2.13). One that
+    # releases a tensor during Python's finalisation aborts the process.
+    exit_process(run(), finalize="WORLD_SIZE" not in os.environ)
 
 
 if __name__ == "__main__":

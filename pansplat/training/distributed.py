@@ -6,11 +6,10 @@ N processes compute the gradients that one process computes for the joint batch.
 from __future__ import annotations
 
 import os
-import sys
 import warnings
 from contextlib import AbstractContextManager, nullcontext
 from datetime import timedelta
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
 import torch.distributed
@@ -128,19 +127,6 @@ class ProcessGroup:
         """Wait for all processes."""
         if self.count > 1:
             torch.distributed.barrier()
-
-
-def end_process(status: int) -> NoReturn:
-    """End this process; under torchrun without finalising the interpreter.
-
-    DistributedDataParallel keeps gloo's threads alive after the process group is destroyed (torch 2.13). One that
-    releases a tensor while the interpreter is finalised aborts the process.
-    """
-    if "WORLD_SIZE" not in os.environ:
-        sys.exit(status)
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(status)
 
 
 class _AllReduceSum(torch.autograd.Function):

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from pansplat.console import exit_process
 from pansplat.data.views import Batch, collate
 from pansplat.model.pansplat import PanSplat
 from pansplat.training.config import MemoryConfig
@@ -15,7 +16,6 @@ from pansplat.training.distributed import (
     ProcessGroup,
     convert_sync_batch_norm,
     data_parallel,
-    end_process,
     no_sync,
 )
 from pansplat.training.losses import LossWeights
@@ -102,4 +102,4 @@ if __name__ == "__main__":
     group.initialize(torch.device("cpu"))
     {"split_batches": split_batches, "repeated_steps": repeated_steps}[sys.argv[1]](Path(sys.argv[2]), group)
     group.destroy()
-    end_process(0)
+    exit_process(0, finalize=False)
