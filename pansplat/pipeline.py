@@ -23,7 +23,8 @@ from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.files import expand_home
-from pansplat.gaussians.ply import load_ply, save_ply, save_ply_parts
+from pansplat.gaussians.formats import load_scene, save_scene
+from pansplat.gaussians.ply import save_ply_parts
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians, prune
 from pansplat.geometry.pose import blend_weights
 from pansplat.geometry.world import scale_poses, working_factor
@@ -286,7 +287,8 @@ def predict_to_file(
     Raises:
         InputError: see `predict`; the predictor is not a network, or the file cannot be written.
     """
-    _require_ply(path)
+    if Path(path).suffix.lower() != ".ply":
+        raise InputError(f"{path}: a prediction in parts is written as .ply, got {Path(path).suffix or 'no suffix'!r}")
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
     if not can_stream(predictor):
         raise InputError(
@@ -375,20 +377,21 @@ def _choose_rasterizer(
 
 
 def save(scene: Scene, path: str | Path) -> None:
-    """Write a scene to a 3DGS .ply file."""
-    _require_ply(path)
-    save_ply(scene, path)
+    """Write a scene in the format of the file's suffix (docs/formats.md), atomically.
+
+    Raises:
+        InputError: unknown suffix, a scene that the format cannot hold, or a folder that cannot be written.
+    """
+    save_scene(scene, path)
 
 
 def load(path: str | Path) -> Scene:
-    """Read a scene from a .ply file of `save` or of another 3DGS tool."""
-    _require_ply(path)
-    return load_ply(path)
+    """Read a scene file of `save` or of another tool (docs/formats.md).
 
-
-def _require_ply(path: str | Path) -> None:
-    if Path(path).suffix.lower() != ".ply":
-        raise InputError(f"{path}: a scene file must end in .ply, got {Path(path).suffix or 'no suffix'!r}")
+    Raises:
+        InputError: unknown suffix, or a missing or damaged file.
+    """
+    return load_scene(path)
 
 
 def _load_only_pair(path: str | Path) -> Pair:

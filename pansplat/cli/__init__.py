@@ -64,6 +64,7 @@ def _list_commands() -> object:
     from pansplat.cli.convert import Convert
     from pansplat.cli.data import Data
     from pansplat.cli.evaluate import Evaluate
+    from pansplat.cli.export import Export
     from pansplat.cli.info import Info
     from pansplat.cli.pose import Pose
     from pansplat.cli.predict import Predict
@@ -74,6 +75,7 @@ def _list_commands() -> object:
         Annotated[Predict, subcommand("predict")]
         | Annotated[Refine, subcommand("refine")]
         | Annotated[Render, subcommand("render")]
+        | Annotated[Export, subcommand("export")]
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Pose, subcommand("pose")]
         | Annotated[Check, subcommand("check")]

@@ -8,14 +8,14 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
 from pansplat.errors import InputError
-from pansplat.options import Depth
+from pansplat.options import Depth, Height, Seconds
 
 if TYPE_CHECKING:
     from pansplat.data.pairs import Pair
@@ -41,6 +41,35 @@ class PairChoice:
     """Nearest depth to search, metres; by default the folder's."""
     far: Depth | None = None
     """Farthest depth to search, metres; by default the folder's."""
+
+
+@dataclass(frozen=True)
+class ScenePrediction:
+    """How to predict the scene of a pair; unused for a scene file."""
+
+    model: str = "default"
+    """Predictor, for a pair: `default`, `sweep` (without weights), or a file of weights."""
+    compat: Compat = "trained"
+    """For a network: official, fixed, or as its weights were trained; see `pansplat predict --help`."""
+    precision: Precision = "float32"
+    """Number type of a network's convolutions."""
+    refine: Seconds = 10.0
+    """Time limit of the refinement after the prediction, for a pair, seconds; 0 for none."""
+    predict_height: Height | None = None
+    """Height that the panoramas are resized to before the prediction, for a pair; by default that of the photographs,
+    at most 1024 (for networks 512)."""
+    choice: PairChoice = field(default_factory=PairChoice)
+
+    def open(self, path: Path) -> Scene:
+        """The scene of a scene file, or the prediction of a pair's folder."""
+        from pansplat import pipeline
+        from pansplat.gaussians.formats import is_scene_file
+
+        if is_scene_file(path):
+            return pipeline.load(path)
+        pair = choose_pair(path, self.choice)
+        model = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
+        return predict_scene(pair, model, self.predict_height, cache=True, refine_seconds=self.refine)
 
 
 def choose_pair(path: Path, choice: PairChoice) -> Pair:

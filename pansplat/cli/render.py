@@ -9,19 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import (
-    Compat,
-    Out,
-    PairChoice,
-    Precision,
-    choose_pair,
-    parse_blend,
-    predict_scene,
-    progress_bar,
-)
+from pansplat.cli.inputs import Out, ScenePrediction, parse_blend, progress_bar
 from pansplat.errors import InputError
 from pansplat.files import read_file, require_output_file
-from pansplat.options import REAL, Height, ImageHeight, Range, Seconds
+from pansplat.options import REAL, ImageHeight, Range
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,7 +31,7 @@ class Render:
     """Render a scene, or the prediction of a pair, to an image (.png, .jpg, .webp, .exr) or a video (.mp4)."""
 
     path: Positional[Path]
-    """A .ply scene, or the folder of a pair."""
+    """A scene file, or the folder of a pair."""
     out: Out
     """The file to write; its suffix chooses the format."""
     at: Annotated[float, Range(-1000, 1000), REAL] | None = None
@@ -61,18 +52,7 @@ class Render:
     """Length of a video."""
     fps: Annotated[float, Range(0, 240, above=True), REAL] = 24.0
     """Frames per second of a video."""
-    model: str = "default"
-    """Predictor, for a pair: `default`, `sweep` (without weights), or a file of weights."""
-    compat: Compat = "trained"
-    """For a network: official, fixed, or as its weights were trained; see `pansplat predict --help`."""
-    precision: Precision = "float32"
-    """Number type of a network's convolutions."""
-    refine: Seconds = 10.0
-    """Time limit of the refinement after the prediction, for a pair, seconds; 0 for none."""
-    predict_height: Height | None = None
-    """Height that the panoramas are resized to before the prediction, for a pair; by default that of the photographs,
-    at most 1024 (for networks 512)."""
-    choice: PairChoice = field(default_factory=PairChoice)
+    prediction: ScenePrediction = field(default_factory=ScenePrediction)
 
     def run(self) -> int:
         """Render one image, or a video along a path of cameras."""
@@ -86,7 +66,7 @@ class Render:
         poses = None if self.pose is None else read_poses(self.pose)
         if poses is not None and len(poses) > 1 and not self._is_video:
             raise InputError(f"{self.pose} holds {len(poses)} poses; write an .mp4, or keep one pose in the file")
-        scene = self._open_scene()
+        scene = self.prediction.open(self.path)
         layout = self.layout or ("perspective" if self._is_video else "equirect")
         options = self._render_options(layout, self.height or (_VIDEO_HEIGHT if self._is_video else scene.height))
         size = f"{options['size'][1]}x{options['size'][0]}"
@@ -116,16 +96,6 @@ class Render:
         if self.at is not None and self._is_video:
             raise InputError("--at is one position, an .mp4 moves through all; write a .png, or leave out --at")
         parse_blend(self.blend)
-
-    def _open_scene(self) -> Scene:
-        """The scene of a .ply file, or the prediction of a pair's folder."""
-        from pansplat import pipeline
-
-        if self.path.suffix.lower() == ".ply":
-            return pipeline.load(self.path)
-        pair = choose_pair(self.path, self.choice)
-        model = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
-        return predict_scene(pair, model, self.predict_height, cache=True, refine_seconds=self.refine)
 
     def _render_options(self, layout: str, height: int) -> dict[str, Any]:
         """Keyword arguments of `pipeline.render`."""

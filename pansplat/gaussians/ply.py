@@ -29,6 +29,7 @@ from torch import Tensor
 from pansplat.atomic import replacing
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import require_file
+from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.world import MAX_POSITION, require_depth_range
 from pansplat.strict_json import list_field, number_field, parse_json, require_object, text_field
@@ -167,6 +168,23 @@ def _format_header(scene: Scene, runs: list[list[int]], coefficients: int, *, si
     lines += [*(f"property float {name}" for name in _list_properties(coefficients)), "end_header\n"]
     end = "\n" + "\n".join(lines)
     return (begin + " " * (size - len(begin) - len(end)) + end).encode("ascii")
+
+
+def save_points(gaussians: Gaussians, path: str | Path) -> None:
+    """Write the means as a .ply point cloud, atomically: float32 positions in metres, 8-bit sRGB without direction."""
+    path = Path(path)
+    kept = _select_finite(gaussians, path).to(device="cpu")
+    fields = [(name, "<f4") for name in ("x", "y", "z")] + [(name, "u1") for name in ("red", "green", "blue")]
+    table = np.empty(len(kept), fields)
+    colors = (kept.harmonics[:, 0] * SH_0 + 0.5).clamp(0, 1).mul(255).round().byte()
+    for column, (name, _) in zip((*kept.means.unbind(1), *colors.unbind(1)), fields, strict=True):
+        table[name] = column.numpy()
+    kinds = {"<f4": "float", "u1": "uchar"}
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(kept)}"]
+    lines += [*(f"property {kinds[kind]} {name}" for name, kind in fields), "end_header\n"]
+    with replacing(path) as partial, open(partial, "wb") as file:
+        file.write("\n".join(lines).encode())
+        table.tofile(file)
 
 
 def load_ply(path: str | Path) -> Scene:

@@ -1,0 +1,52 @@
+"""`pansplat export`: a scene in the formats of other programs."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional
+
+from pansplat.cli.inputs import Out, ScenePrediction
+from pansplat.errors import InputError
+from pansplat.files import require_output_file
+from pansplat.options import WHOLE, Fraction, Range
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a scene, or the prediction of a pair, in the format of the file's suffix (docs/formats.md)."""
+
+    path: Positional[Path]
+    """A scene file, or the folder of a pair."""
+    out: Out
+    """The file to write: .ply."""
+    points: bool = False
+    """Write a .ply of plain points with colours, for programs without Gaussians."""
+    degree: Annotated[int, Range(0, 4), WHOLE] | None = None
+    """Highest degree of spherical harmonics to write, 0 to 4; by default all that the format holds."""
+    min_opacity: Fraction = 0.0
+    """Leave out Gaussians of lower opacity; those below 0.004 are invisible."""
+    prediction: ScenePrediction = field(default_factory=ScenePrediction)
+
+    def run(self) -> int:
+        """Write the file and print its size."""
+        from pansplat.gaussians.formats import SCENE_SUFFIXES, save_scene
+        from pansplat.gaussians.ply import save_points
+        from pansplat.gaussians.scene import prune
+
+        require_output_file("--out", self.out, SCENE_SUFFIXES)
+        if self.points and self.out.suffix.lower() != ".ply":
+            raise InputError(f"--points writes a .ply, got {self.out}; leave it out, or choose another name")
+        scene = self.prediction.open(self.path)
+        gaussians = prune(scene.gaussians, degree=self.degree, min_opacity=self.min_opacity)
+        if self.points:
+            save_points(gaussians, self.out)
+        else:
+            save_scene(dataclasses.replace(scene, gaussians=gaussians), self.out)
+        size = self.out.stat().st_size
+        kind = "points" if self.points else "Gaussians"
+        print(f"{self.out}: {len(gaussians):,} {kind}, {size:,} bytes ({size / max(len(gaussians), 1):.1f} each)")
+        return 0
