@@ -4,11 +4,11 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from pansplat.console import exit_process, own_warnings, parse_arguments, run_command
+from pansplat.console import own_warnings, parse_arguments
 from pansplat.errors import InputError
 from pansplat.files import expand_home, require_output_folder
 from pansplat.options import REAL, Depth, Height, Range, Seconds, check_numbers
@@ -95,28 +95,14 @@ class Options:
         return DrawSettings(kernel=self.kernel, order=self.order, mode=self.mode)
 
 
-def main(args: Sequence[str] | None = None) -> NoReturn:
-    """Run the command and exit with its status (docs/errors.md)."""
-    # Python's finalisation sometimes never ended after Ctrl+C; numba and Mesa each have an LLVM in the process.
-    exit_process(run(args), finalize=False)
-
-
-def run(args: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit status; help and misspelt arguments raise SystemExit."""
-
-    def run_parsed() -> int:
-        options = parse_arguments(
-            lambda: tyro.cli(Options, args=args, prog="pansplat-view", config=(tyro.conf.FlagCreatePairsOff,))
-        )
-        check_numbers(options)
-        with own_warnings():
-            return _run(options)
-
-    return run_command(
-        run_parsed,
-        memory_advice="choose a smaller --height or --size.",
-        interruption="no incomplete file is left behind",
+def run_arguments(args: Sequence[str] | None = None) -> int:
+    """Run the command with these arguments, those of the process by default, and return its exit status."""
+    options = parse_arguments(
+        lambda: tyro.cli(Options, args=args, prog="pansplat-view", config=(tyro.conf.FlagCreatePairsOff,))
     )
+    check_numbers(options)
+    with own_warnings():
+        return _run(options)
 
 
 def choose_entry(entries: list[SceneEntry], pair: str | None) -> int:

@@ -12,6 +12,7 @@ from tyro.conf import Positional
 from pansplat.cli.inputs import OptionalOut, progress_bar
 from pansplat.console import make_table_console, print_message
 from pansplat.errors import InputError
+from pansplat.files import require_output_file, require_output_folder
 from pansplat.options import Count, Positive
 
 if TYPE_CHECKING:
@@ -42,8 +43,10 @@ class Pose:
         if not self.paths:
             raise InputError("`pansplat pose` needs a folder of panoramas, two or more files, or a video")
         is_video = len(self.paths) == 1 and self.paths[0].suffix.lower() in (".mp4", ".mov", ".mkv", ".webm")
-        if not is_video and self.out is not None and self.out.suffix.lower() not in SUFFIXES:
-            raise InputError(f"--out must end in {', '.join(SUFFIXES)}, got {self.out}")
+        if self.out is not None and is_video:
+            require_output_folder("--out", self.out)
+        elif self.out is not None:
+            require_output_file("--out", self.out, SUFFIXES)
         with progress_bar() as progress:
             images = self._extract_frames(progress) if is_video else _list_images(self.paths)
             estimate = estimate_poses(

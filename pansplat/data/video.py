@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pansplat.atomic import replacing
 from pansplat.errors import InputError
+from pansplat.files import require_file
 
 _MAX_SKIP = 48  # frames between two reads; a larger gap is skipped by seeking
 _ENCODERS = ("libx264", "libopenh264", "mpeg4")  # H.264 first: every browser and player supports it
@@ -117,6 +118,7 @@ def _open_container(path: Path) -> Any:
     import av
     from av.error import FFmpegError
 
+    require_file(path, "a readable video file")
     try:
         return av.open(str(path))
     except (OSError, FFmpegError) as error:

@@ -20,6 +20,7 @@ from pansplat.data.images import read_mask, read_panorama
 from pansplat.data.masks import scene_mask_of_files
 from pansplat.data.pairs import FAR, NEAR, find_mask
 from pansplat.errors import InputError
+from pansplat.files import require_file
 from pansplat.poses.axes import RotationPrior, SceneAxes, find_axes
 from pansplat.poses.features import Features, detect_features, match_features
 from pansplat.poses.tour import Pair, build_tour
@@ -38,6 +39,7 @@ _DARK = 8.0  # mean grey value of an image that shows nothing
 _SAME_IMAGE = 1.5  # mean grey difference of two copies of one image
 _FLOOR_PAIRS = 8
 _MIRROR_EVIDENCE = 60.0  # expected number of right matches with a mirror image
+_MAX_BASELINE = 1e9  # metres
 _LARGEST_NEAR = 0.6  # metres; the depth range is not narrower than that of rooms
 _MIN_FAR = 6.0
 
@@ -110,8 +112,17 @@ def estimate_poses(
     report = progress or (lambda what, fraction: None)
     if len(set(paths)) < 2:
         raise InputError(f"needed two or more different panoramas to estimate poses, got {len(set(paths))}; add one.")
+    for path in paths:
+        require_file(path, "a panorama")
     if not 0 < camera_height < math.inf:
         raise InputError(f"`camera_height` must be a positive number of metres, got {camera_height}")
+    if baseline is not None:
+        ends = {_find_file(name, paths) for name in baseline[:2]}
+        if len(ends) < 2 or not 0 < baseline[2] < _MAX_BASELINE:
+            raise InputError(
+                f"`baseline` must be two different images and a distance above 0 to {_MAX_BASELINE:g} metres, got "
+                f"{' '.join(map(str, baseline))}"
+            )
     pixels, unplaced = _read_images(paths)
     kept = [n for n in range(len(paths)) if n not in unplaced]
     if len(kept) < 2:
@@ -270,8 +281,8 @@ def _find_scale(
     if baseline is not None:
         ends = [_find_file(name, files) for name in baseline[:2]]
         distance = float(np.linalg.norm(centres[ends[0]] - centres[ends[1]]))
-        if not 0 < baseline[2] < math.inf or distance == 0:
-            raise InputError(f"`baseline` must be two different images and a positive distance, got {baseline}")
+        if distance == 0:
+            raise InputError(f"`baseline` must be two images with a distance, got two from the same place: {baseline}")
         return baseline[2] / distance, f"{files[ends[0]].name} and {files[ends[1]].name} are {baseline[2]:g} m apart"
     pairs = sorted(
         itertools.combinations(range(len(files)), 2), key=lambda p: float(np.linalg.norm(centres[p[0]] - centres[p[1]]))
@@ -288,4 +299,4 @@ def _find_file(name: Path | str, files: Sequence[Path]) -> int:
         if str(name) in (str(file), file.name, file.stem):
             return n
     placed = ", ".join(file.name for file in files)
-    raise InputError(f"`baseline` must name two images that have a pose ({placed}), got {name}")
+    raise InputError(f"`baseline` must name two of the images that have a pose ({placed}), got {name}")

@@ -23,7 +23,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.model.pansplat import PanSplat
 from pansplat.model.weights import pack_weights, save_weights
 from pansplat.training.__main__ import run as run_training
-from pansplat_viewer.app import run as run_viewer
+from pansplat_viewer import run as run_viewer
 
 PROGRAMS: dict[str, Callable[[list[str]], int]] = {"pansplat-train": run_training, "pansplat-view": run_viewer}
 

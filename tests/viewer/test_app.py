@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 
 from pansplat.errors import InputError
-from pansplat_viewer.app import Options, choose_entry, run
+from pansplat_viewer import run
+from pansplat_viewer.app import Options, choose_entry
 from pansplat_viewer.capture import STILLS, Film, compute_flight_pose, compute_panorama_pose
 from pansplat_viewer.loader import LoadOptions, SceneEntry
 
@@ -24,7 +25,7 @@ def without_display(tmp_path, monkeypatch):
 
 def test_help_needs_neither_torch_nor_opengl():
     code = (
-        "import sys\nfrom pansplat_viewer.app import run\n"
+        "import sys\nfrom pansplat_viewer import run\n"
         "try: run(['--help'])\nexcept SystemExit: pass\n"
         "print(sorted({'torch', 'moderngl', 'glfw', 'imgui_bundle'} & set(sys.modules)))"
     )

@@ -20,7 +20,7 @@ from pansplat_viewer.window import Window, _run_loop
 
 pytestmark = [pytest.mark.gl, pytest.mark.slow]
 
-PROGRAM = "from pansplat_viewer.app import main; main()"
+PROGRAM = "from pansplat_viewer import main; main()"
 TITLE = "room - pansplat"
 
 
