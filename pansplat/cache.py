@@ -26,7 +26,11 @@ from pansplat.predictor import Predictor
 
 _MAX_LEVELS = 256
 _FORMAT = "1"  # version of the file's layout; part of the hash
+_GAINS = "gains"
 _FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
+
+
+Gains = tuple[tuple[float, ...], ...]
 
 
 class CachedPrediction:
@@ -44,14 +48,16 @@ class CachedPrediction:
         self._folders = list_cache_folders(pair)
         self._num_views = len(views.images)
 
-    def read(self) -> Gaussians | None:
-        """Gaussians of the first undamaged file; None if there is none."""
+    def read(self) -> tuple[Gaussians, Gains] | None:
+        """Gaussians and gains (see `Scene`) of the first undamaged file; None if there is none."""
         found = (_read_gaussians(folder / self._name, self._num_views) for folder in self._folders)
-        return next((gaussians for gaussians in found if gaussians is not None), None)
+        return next((content for content in found if content is not None), None)
 
-    def write(self, gaussians: Gaussians) -> None:
+    def write(self, gaussians: Gaussians, gains: Gains = ()) -> None:
         """Write to the first writable folder, if any, and delete outdated predictions there."""
         tensors = {name: getattr(gaussians, name).detach().cpu().contiguous() for name in _FIELDS}
+        if gains:
+            tensors[_GAINS] = torch.tensor(gains, dtype=torch.float64)
         body = safetensors.torch.save(tensors)
         written = write_cache_file(self._folders, self._name, body, zlib.crc32(body).to_bytes(4, "little"))
         for old in [] if written is None else written.parent.glob("*.scene"):
@@ -98,8 +104,8 @@ def _hash_inputs(views: Views, predictor: Predictor, refinement: str) -> str:
     return digest.hexdigest()
 
 
-def _read_gaussians(path: Path, num_views: int) -> Gaussians | None:
-    """The Gaussians of a file; None if it is missing, damaged, or holds values that no predictor writes."""
+def _read_gaussians(path: Path, num_views: int) -> tuple[Gaussians, Gains] | None:
+    """The Gaussians and gains of a file; None if it is missing, damaged, or holds values that no predictor writes."""
     try:
         content = read_file(path)
         body, checksum = content[:-4], int.from_bytes(content[-4:], "little")
@@ -107,6 +113,7 @@ def _read_gaussians(path: Path, num_views: int) -> Gaussians | None:
             return None
         tensors = safetensors.torch.load(body)
         gaussians = Gaussians(*(tensors[name] for name in _FIELDS))
+        gains = tensors.get(_GAINS, torch.zeros(0))
     except (OSError, ValueError, KeyError, safetensors.SafetensorError):
         return None
     floats = (gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities, gaussians.harmonics)
@@ -118,7 +125,10 @@ def _read_gaussians(path: Path, num_views: int) -> Gaussians | None:
     for label, count in zip(labels, (_MAX_LEVELS, num_views), strict=True):
         if len(label) and not 0 <= int(label.min()) <= int(label.max()) < count:
             return None
-    return gaussians
+    is_valid = gains.dtype == torch.float64 and gains.shape == (num_views, 3) and bool((gains > 0).all())
+    if gains.numel() and not (is_valid and bool(gains.isfinite().all())):
+        return None
+    return gaussians, tuple(map(tuple, gains.tolist()))
 
 
 def _make_file_name(name: str) -> str:

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.cache import CachedPrediction
+from pansplat.cache import CachedPrediction, Gains
 from pansplat.data import folders
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
@@ -202,7 +202,7 @@ def predict(
         return refined
     scene = refine(scene, views, seconds=refine_seconds, progress=lambda what, done: report(what, 0.5 + 0.5 * done))
     if cached is not None:
-        cached.write(scene.gaussians)
+        cached.write(scene.gaussians, scene.gains)
     return scene
 
 
@@ -221,8 +221,8 @@ def _predict_views(pair: Pair | None, views: Views, predictor: Predictor, height
 
 
 def _read_cached(cached: CachedPrediction | None, views: Views, predictor: Predictor) -> Scene | None:
-    gaussians = None if cached is None else cached.read()
-    return None if gaussians is None else _make_scene(gaussians, views, predictor)
+    content = None if cached is None else cached.read()
+    return None if content is None else _make_scene(content[0], views, predictor, content[1])
 
 
 def refine(
@@ -402,7 +402,7 @@ def _load_only_pair(path: str | Path) -> Pair:
     return pairs[0]
 
 
-def _make_scene(gaussians: Gaussians, views: Views, predictor: Predictor) -> Scene:
+def _make_scene(gaussians: Gaussians, views: Views, predictor: Predictor, gains: Gains = ()) -> Scene:
     return Scene(
         gaussians,
         views.cam2world.double(),
@@ -411,4 +411,5 @@ def _make_scene(gaussians: Gaussians, views: Views, predictor: Predictor) -> Sce
         names=views.names,
         model=predictor.name,
         height=views.images.shape[-2],
+        gains=gains,
     )

@@ -139,6 +139,7 @@ def test_a_refined_scene_is_cached_apart_from_its_prediction(pair_folder: Path, 
     first = predict(pair_folder, predictor, height=HEIGHT, refine_seconds=3.0, on_predicted=shown.append)
     again = predict(pair_folder, predictor, height=HEIGHT, refine_seconds=3.0, on_predicted=shown.append)
     assert have_equal_gaussians(first, again) and predictor.calls == 1
+    assert len(first.gains) == 2 and again.gains == first.gains
     prediction = predict(pair_folder, predictor, height=HEIGHT)
     assert not have_equal_gaussians(first, prediction) and predictor.calls == 1
     assert len(shown) == 2 and all(have_equal_gaussians(scene, prediction) for scene in shown)

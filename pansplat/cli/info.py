@@ -54,7 +54,8 @@ class Info:
         for index, pose in enumerate(scene.cam2world):
             name = scene.names[index] if index < len(scene.names) else ""
             position = ", ".join(f"{x:.6g}" for x in pose[:3, 3].tolist())
-            print(f"camera {index}        at ({position}) m  {name}")
+            gains = ", ".join(f"{gain:.3f}" for gain in scene.gains[index]) if scene.gains else ""
+            print(f"camera {index}        at ({position}) m  {name}" + (f"  gains {gains}" if gains else ""))
         return 0
 
 

@@ -45,6 +45,7 @@ _READ_VERTICES = 1 << 17  # vertices that are read at a time
 _DEFAULT_NEAR, _DEFAULT_FAR = 0.1, 100.0  # depth range, metres, for a file without one
 _DEFAULT_HEIGHT = 512  # pixels, of the panoramas
 _MAX_HEIGHT, _MAX_CAMERAS, _MAX_LEVEL = 1 << 16, 1 << 12, 255  # of the pansplat comment
+_MAX_GAIN = 1e3
 _MAX_PROPERTIES = 1 << 10  # of an element
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
@@ -160,6 +161,7 @@ def _format_header(scene: Scene, runs: list[list[int]], coefficients: int, *, si
         "far": scene.far,
         "names": [name.encode(errors="backslashreplace").decode() for name in scene.names],
         "cam2world": scene.cam2world.double().cpu().tolist(),
+        **({"gains": scene.gains} if scene.gains else {}),
         "runs": runs,
     }
     comment = _COMMENT_PREFIX + json.dumps(extras, separators=(",", ":"))
@@ -218,6 +220,7 @@ def load_ply(path: str | Path) -> Scene:
         names=extras.names,
         model=extras.model,
         height=extras.height,
+        gains=extras.gains,
     )
 
 
@@ -412,6 +415,7 @@ class _Extras:
     names: tuple[str, ...] = ()
     model: str = ""
     height: int = _DEFAULT_HEIGHT
+    gains: tuple[tuple[float, ...], ...] = ()
     runs: list[Any] | None = None
 
 
@@ -453,8 +457,21 @@ def _read_extras(content: Any) -> _Extras:
         tuple(str(name) for name in names),
         text_field(content, "model", "comment") or "",
         _DEFAULT_HEIGHT if height is None else int(height),
+        _read_gains(list_field(content, "gains", "comment"), len(poses)),
         list_field(content, "runs", "comment"),
     )
+
+
+def _read_gains(rows: list[Any], cameras: int) -> tuple[tuple[float, ...], ...]:
+    """Three factors for each camera, or nothing."""
+    numbers = [value for row in rows for value in (row if isinstance(row, list) else [None])]
+    are_factors = all(type(value) in (int, float) and 0 < value < _MAX_GAIN for value in numbers)
+    if rows and not (are_factors and len(rows) == cameras and all(len(row) == 3 for row in rows)):
+        raise InputError(
+            f"comment: needed three numbers above 0 and below {_MAX_GAIN:g} for each of the {cameras} cameras in "
+            f"gains, got {rows!r:.60}"
+        )
+    return tuple(tuple(map(float, row)) for row in rows)
 
 
 def _read_pose(rows: Any) -> np.ndarray:

@@ -114,6 +114,8 @@ class Scene:
         names: image file name of each context view.
         model: name of the predictor, e.g. "sweep".
         height: of the input panoramas, pixels.
+        gains: exposure and white balance of each view's photograph, as factors of R, G and B relative to the geometric
+            mean of all; a refinement estimates them. The colours of a view's Gaussians are those of its photograph.
     """
 
     gaussians: Gaussians
@@ -123,6 +125,7 @@ class Scene:
     names: tuple[str, ...] = ()
     model: str = ""
     height: int = 512
+    gains: tuple[tuple[float, ...], ...] = ()
 
     def scaled(self, factor: float) -> Scene:
         """The scene in a world that is multiplied by a factor."""

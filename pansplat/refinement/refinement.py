@@ -250,7 +250,7 @@ class Refinement:
         parts = [self._cameras.move(parameters.build(), view) for view, parameters in self._views.items()]
         poses = torch.stack([self._cameras.corrected_pose(view) for view in range(len(self._photographs))])
         return dataclasses.replace(
-            self._start, gaussians=Gaussians.cat(parts), cam2world=poses.to(self._start.cam2world)
+            self._start, gaussians=Gaussians.cat(parts), cam2world=poses.to(self._start.cam2world), gains=self.gains
         )
 
     @property
@@ -319,7 +319,7 @@ class Refinement:
         pixels = self._images[0, 0].numel() / math.prod(self._size)
         gradient = 1.7  # duration of a backward pass relative to its image
         contributions = (images + views) * (1 + gradient) / 4
-        colors = views * pixels * (self.config.colors.steps * (1 + gradient) + gradient)
+        colors = views * pixels * (self.config.colors.steps_at(self._images.shape[-2]) * (1 + gradient) + gradient)
         return (images + contributions + colors) / (views * (1 + gradient))
 
     def _finish(self, scene: Scene) -> Scene:
@@ -343,7 +343,7 @@ class _Clock:
         if not 0 < limit < math.inf:
             raise InputError(f"`seconds` or `steps` of a refinement must be positive, got {limit}")
         self._is_timed, self._given, self._release = steps is None, float(limit), release
-        self._limit, self._is_shortened = self._given, False
+        self._limit, self._is_shortened, self._reached = self._given, False, 0.0
         self.steps, self._start = 0, start
 
     def reserve(self, seconds: float) -> None:
@@ -362,8 +362,9 @@ class _Clock:
 
     @property
     def fraction(self) -> float:
-        """Completed fraction of the run."""
-        return self._spent / self._limit
+        """Completed fraction of the run; it never falls."""
+        self._reached = max(self._reached, self._spent / self._limit)
+        return self._reached
 
     def shorten(self) -> None:
         """Begin the last part now, with a length in proportion to the time that was spent."""

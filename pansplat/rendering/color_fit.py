@@ -28,8 +28,15 @@ class ColorFitConfig:
     """Settings of the fit of colours."""
 
     steps: int = 4
+    """For photographs of up to 1024 rows."""
     relaxation: float = 1.8
     """Converges below 2."""
+
+    def steps_at(self, height: int) -> int:
+        """Steps for photographs of a height: the number of Gaussians is limited, so that one covers more pixels of a
+        large photograph, and the iteration converges later.
+        """
+        return self.steps * max(1, height // 1024)
 
 
 def fit_colors(
@@ -61,7 +68,7 @@ def _fit_view(gaussians: Gaussians, image: Tensor, pose: Tensor, mask: Tensor, c
     """The harmonics (n, 1, 3) of a view's Gaussians."""
     harmonics, size = gaussians.harmonics, (mask.shape[0], mask.shape[1])
     coverage: Tensor | None = None
-    for _ in range(config.steps):
+    for _ in range(config.steps_at(size[0])):
         variable = harmonics.clone().requires_grad_()
         drawn = rasterize(dataclasses.replace(gaussians, harmonics=variable), pose, size=size).color
         if coverage is None:

@@ -67,7 +67,7 @@ class LiftConfig:
     """Largest colour error of level 1."""
     fine_detail: float = 0.015
     """Largest colour error of a lattice where no finer one replaces it."""
-    fine_points: int = 850_000
+    fine_points: int = 780_000
     """Largest number of a view's points on the finer lattices; a larger error is allowed where they do not suffice."""
     discontinuity: float = 0.15
     """Relative change of inverse depth between pixels at a discontinuity."""
