@@ -9,6 +9,9 @@ from pathlib import Path
 
 from pansplat.errors import InputError
 
+# Suffixes of scene files; the first that fits a name is its format (pansplat.gaussians.formats).
+SCENE_SUFFIXES = (".compressed.ply", ".spz", ".splat", ".sog", ".glb", ".ply")
+
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
     (stat.S_ISFIFO, "a FIFO (named pipe)"),
@@ -45,6 +48,24 @@ def require_file(path: Path | str, needed: str = "a readable file") -> None:
         raise InputError(f"{path}: needed {needed}, got '{reason}'; check the path.") from error
     if kind is not None:
         raise InputError(f"{path}: needed {needed}, got {kind}; give a regular file.")
+
+
+def is_scene_file(path: Path | str) -> bool:
+    """Whether the name of a file ends in the suffix of a scene format, in any case."""
+    return str(path).lower().endswith(SCENE_SUFFIXES)
+
+
+def find_scene_suffix(path: Path | str) -> str:
+    """The suffix of a scene format that a file's name ends in, in lower case.
+
+    Raises:
+        InputError: it ends in none.
+    """
+    for suffix in SCENE_SUFFIXES:
+        if str(path).lower().endswith(suffix):
+            return suffix
+    known = ", ".join(SCENE_SUFFIXES)
+    raise InputError(f"{path}: a scene file must end in {known}, got {Path(path).suffix or 'no suffix'!r}")
 
 
 def read_file(path: Path | str, needed: str = "a readable file", *, limit: int | None = None) -> bytes:

@@ -129,6 +129,9 @@ def test_setup_pins_every_direct_dependency() -> None:
     pinned = {line.split("==")[0] for line in constraints if line and not line.startswith("#")}
     metadata = read_project()["project"]
     requirements = [*metadata["dependencies"], *metadata["optional-dependencies"]["dev"]]
-    names = {name.split(";")[0].split(">")[0].split("[")[0].strip().lower().replace("_", "-") for name in requirements}
+    names = {
+        name.split(";")[0].split(">")[0].split("==")[0].split("[")[0].strip().lower().replace("_", "-")
+        for name in requirements
+    }
     assert not names - pinned
     assert subprocess.run(["bash", "-n", str(ROOT / "setup.sh")]).returncode == 0

@@ -27,7 +27,7 @@ class Options:
     """
 
     path: Annotated[Path, tyro.conf.Positional]
-    """A pair folder, a folder of pairs, or a scene .ply."""
+    """A pair folder, a folder of pairs, or a scene file."""
     offscreen: Path | None = None
     """Open no window; write film, stills and panorama to this folder."""
     pair: str | None = None

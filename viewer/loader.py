@@ -1,6 +1,6 @@
 """Lists the scenes at a path and loads them in a worker thread.
 
-Pairs go through the prediction pipeline with its cache, .ply files are read. Imports no torch before it loads.
+Pairs go through the prediction pipeline with its cache, scene files are read. Imports no torch before it loads.
 """
 
 import re
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from pansplat.errors import InputError
+from pansplat.files import is_scene_file
 
 if TYPE_CHECKING:
     from pansplat.data.pairs import Pair
@@ -78,10 +79,10 @@ def find_entries(path: Path, options: LoadOptions) -> list[SceneEntry]:
         InputError: the path does not exist, or holds neither pairs nor scene files.
     """
     if not path.exists():
-        raise InputError(f"{path}: no such file or folder; give a pair folder, a folder of pairs or a scene .ply")
-    if path.is_file() and path.suffix.lower() == ".ply":
+        raise InputError(f"{path}: no such file or folder; give a pair folder, a folder of pairs or a scene file")
+    if path.is_file() and is_scene_file(path):
         return [SceneEntry(path.stem, file=path)]
-    scenes = sorted(p for p in path.iterdir() if p.suffix.lower() == ".ply") if path.is_dir() else []
+    scenes = sorted(p for p in path.iterdir() if is_scene_file(p)) if path.is_dir() else []
     try:
         from pansplat.pipeline import load_pairs
 

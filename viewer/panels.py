@@ -205,7 +205,7 @@ class Panels:
             if changed:
                 commands.choose = index
         imgui.set_next_item_width(-60 * imgui.get_style().font_scale_dpi)
-        hint, flags = "folder or .ply, or drop it here", imgui.InputTextFlags_.enter_returns_true.value
+        hint, flags = "folder or scene, or drop it here", imgui.InputTextFlags_.enter_returns_true.value
         entered, self.path = imgui.input_text_with_hint("##path", hint, self.path, flags)
         self._record_rectangle("path")
         imgui.same_line()

@@ -17,7 +17,7 @@ import pansplat
 from pansplat.cli.evaluate import LpipsChoice, choose_lpips
 from pansplat.cli.inputs import OptionalOut, PairChoice, choose_pair, predict_scene
 from pansplat.errors import InputError
-from pansplat.files import require_output_folder
+from pansplat.files import is_scene_file, require_output_folder
 from pansplat.options import WHOLE, Positive, Range, Threads
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class BenchRaster:
     """Measure the rasterisers: time and memory against error, for every choice of kernel, order, filter and faces."""
 
     scene: Positional[Path | None] = None
-    """A .ply scene, or the folder of a pair; by default a synthetic room, and the sample if it is there."""
+    """A scene file, or the folder of a pair; by default a synthetic room, and the sample if it is there."""
     scene_from: Literal["prediction", "depth"] = "prediction"
     """How a pair becomes a scene: predicted by `sweep`, or from depth maps with a Gaussian at every lattice point."""
     quick: bool = False
@@ -114,7 +114,7 @@ class BenchRaster:
         return Settings(self.height, self.quick, threads, tuple(available), _find_usable_memory())
 
     def _scene_of(self, path: Path, height: int) -> Callable[[int], BenchScene]:
-        """The scene of a .ply file or a pair, seen from between its cameras, or from the origin if it has none."""
+        """The scene of a file or a pair, seen from between its cameras, or from the origin if it has none."""
         import torch
 
         from pansplat.bench.raster_cases import BenchScene
@@ -124,11 +124,11 @@ class BenchRaster:
         return lambda _: BenchScene(path.stem, lambda: scene.gaussians, pose)
 
     def _read_scene(self, path: Path, height: int) -> Scene:
-        """The scene of a .ply file, or the scene of a pair's folder by `sweep` or from its depth maps."""
+        """The scene of a file, or the scene of a pair's folder by `sweep` or from its depth maps."""
         from pansplat import pipeline
         from pansplat.bench.scenes import lift_depth
 
-        if path.suffix.lower() == ".ply":
+        if is_scene_file(path):
             if self.scene_from == "depth":
                 raise InputError(f"--scene-from depth needs a pair's folder with depth maps, got {path}; leave it out")
             return pipeline.load(path)

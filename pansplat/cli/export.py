@@ -5,14 +5,17 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional
 
 from pansplat.cli.inputs import Out, ScenePrediction
 from pansplat.errors import InputError
-from pansplat.files import require_output_file
+from pansplat.files import SCENE_SUFFIXES, find_scene_suffix, require_output_file
 from pansplat.options import WHOLE, Fraction, Range
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -22,25 +25,29 @@ class Export:
     path: Positional[Path]
     """A scene file, or the folder of a pair."""
     out: Out
-    """The file to write: .ply."""
+    """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb."""
     points: bool = False
     """Write a .ply of plain points with colours, for programs without Gaussians."""
     degree: Annotated[int, Range(0, 4), WHOLE] | None = None
     """Highest degree of spherical harmonics to write, 0 to 4; by default all that the format holds."""
     min_opacity: Fraction = 0.0
     """Leave out Gaussians of lower opacity; those below 0.004 are invisible."""
+    up: Literal["y", "z"] | None = None
+    """Axis of a given file that points up, if its program did not keep to the axes of the format."""
     prediction: ScenePrediction = field(default_factory=ScenePrediction)
 
     def run(self) -> int:
         """Write the file and print its size."""
-        from pansplat.gaussians.formats import SCENE_SUFFIXES, save_scene
+        from pansplat.gaussians.formats import save_scene
         from pansplat.gaussians.ply import save_points
         from pansplat.gaussians.scene import prune
 
         require_output_file("--out", self.out, SCENE_SUFFIXES)
-        if self.points and self.out.suffix.lower() != ".ply":
+        if self.points and find_scene_suffix(self.out) != ".ply":
             raise InputError(f"--points writes a .ply, got {self.out}; leave it out, or choose another name")
         scene = self.prediction.open(self.path)
+        if self.up is not None:
+            scene = scene.rotated(_rotation_from(self.up))
         gaussians = prune(scene.gaussians, degree=self.degree, min_opacity=self.min_opacity)
         if self.points:
             save_points(gaussians, self.out)
@@ -50,3 +57,11 @@ class Export:
         kind = "points" if self.points else "Gaussians"
         print(f"{self.out}: {len(gaussians):,} {kind}, {size:,} bytes ({size / max(len(gaussians), 1):.1f} each)")
         return 0
+
+
+def _rotation_from(up: Literal["y", "z"]) -> Tensor:
+    """Rotation (3, 3) from a world with an axis up to one with y down."""
+    import torch
+
+    rows = {"y": ((1.0, 0, 0), (0, -1, 0), (0, 0, -1)), "z": ((1.0, 0, 0), (0, 0, -1), (0, 1, 0))}[up]
+    return torch.tensor(rows, dtype=torch.float64)

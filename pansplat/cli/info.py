@@ -27,7 +27,7 @@ class Info:
     """Print the contents of a scene file: Gaussians by level and view, opacities, scales, bounds, cameras."""
 
     path: Positional[Path]
-    """The .ply file."""
+    """The scene file, of any format (docs/formats.md)."""
 
     def run(self) -> int:
         """Print the contents of the scene."""

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import arg
 
 from pansplat.errors import InputError
+from pansplat.files import is_scene_file
 from pansplat.options import Depth, Height, Seconds
 
 if TYPE_CHECKING:
@@ -63,7 +64,6 @@ class ScenePrediction:
     def open(self, path: Path) -> Scene:
         """The scene of a scene file, or the prediction of a pair's folder."""
         from pansplat import pipeline
-        from pansplat.gaussians.formats import is_scene_file
 
         if is_scene_file(path):
             return pipeline.load(path)

@@ -22,7 +22,7 @@ from pansplat.cli.inputs import (
     progress_bar,
 )
 from pansplat.errors import InputError
-from pansplat.files import require_output_file
+from pansplat.files import is_scene_file, require_output_file
 from pansplat.options import Count, Height, Seconds, Seed
 
 if TYPE_CHECKING:
@@ -39,11 +39,11 @@ class Refine:
     """
 
     path: Positional[Path]
-    """Folder of a pair, or a .ply scene with --photographs."""
+    """Folder of a pair, or a scene file with --photographs."""
     out: Out
     """The .ply file to write."""
     photographs: Path | None = None
-    """Folder of the pair that a .ply scene was predicted from."""
+    """Folder of the pair that a scene file was predicted from."""
     seconds: Seconds | None = None
     """Time limit; 10 by default."""
     steps: Count | None = None
@@ -96,15 +96,15 @@ class Refine:
             require_output_file("--report", self.report, (".json",))
         if self.seconds is not None and self.steps is not None:
             raise InputError("--seconds and --steps both set the length of the refinement; give one of them")
-        if self.path.suffix.lower() == ".ply" and self.photographs is None:
+        if is_scene_file(self.path) and self.photographs is None:
             raise InputError(f"{self.path} holds no photographs; give the folder of its pair with --photographs")
-        if self.path.suffix.lower() != ".ply" and self.photographs is not None:
+        if not is_scene_file(self.path) and self.photographs is not None:
             raise InputError(
-                f"--photographs is for a .ply scene, and {self.path} is the folder of a pair; leave it out"
+                f"--photographs is for a scene file, and {self.path} is the folder of a pair; leave it out"
             )
 
     def _open_scene(self) -> tuple[Scene, Views]:
-        """The scene of a .ply file, or the prediction of a pair's folder, and its photographs."""
+        """The scene of a file, or the prediction of a pair's folder, and its photographs."""
         from pansplat import pipeline
 
         if self.photographs is not None:

@@ -1,1 +1,1 @@
-"""3D Gaussians, the scene they belong to, spherical harmonics, and .ply files."""
+"""3D Gaussians, the scene they belong to, spherical harmonics, and scene files."""

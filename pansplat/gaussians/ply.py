@@ -12,40 +12,39 @@ Source: 3D Gaussian Splatting, the file that its training code writes.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from io import BufferedIOBase
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
 
 from pansplat.atomic import replacing
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import require_file
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.geometry.world import MAX_POSITION, require_depth_range
-from pansplat.strict_json import list_field, number_field, parse_json, require_object, text_field
+from pansplat.gaussians.scene_files import (
+    find_label_runs,
+    finite_mask,
+    format_entry,
+    make_scene,
+    select_finite,
+    sort_by_label,
+)
 
 OPACITY_EPSILON = 1e-6  # opacities are clamped to this distance from 0 and 1, where the logit is infinite
 SCALE_EPSILON = 1e-12  # metres; smaller scales are clamped, so that the logarithm is finite
 
-_COMMENT_PREFIX = "pansplat "
-_MAX_RUNS = 4096  # the Gaussians are sorted if the header would list more runs, which take megabytes
+COMMENT_PREFIX = "pansplat "  # of the header comment with the pansplat entry
 _MAX_HEADER = 1 << 24
 _RUNS_SPACE = 4096  # bytes for about 300 runs; some browser viewers need the header within 10,000 bytes
 _READ_VERTICES = 1 << 17  # vertices that are read at a time
-_DEFAULT_NEAR, _DEFAULT_FAR = 0.1, 100.0  # depth range, metres, for a file without one
-_DEFAULT_HEIGHT = 512  # pixels, of the panoramas
-_MAX_HEIGHT, _MAX_CAMERAS, _MAX_LEVEL = 1 << 16, 1 << 12, 255  # of the pansplat comment
-_MAX_GAIN = 1e3
 _MAX_PROPERTIES = 1 << 10  # of an element
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
@@ -65,10 +64,17 @@ def save_ply(scene: Scene, path: str | Path) -> None:
         InputError: when the folder does not exist or cannot be written.
     """
     path = Path(path)
-    gaussians = _sort_by_label(_select_finite(scene.gaussians, path))
+    gaussians = sort_by_label(select_finite(scene.gaussians, path))
     with replacing(path) as partial, open(partial, "wb") as file:
-        file.write(_format_header(scene, _find_label_runs(gaussians), gaussians.harmonics.shape[1]))
+        file.write(_format_header(scene, find_label_runs(gaussians), gaussians.harmonics.shape[1]))
         _build_vertex_table(gaussians).tofile(file)
+
+
+def format_plain_ply(gaussians: Gaussians) -> bytes:
+    """A whole 3DGS .ply file in memory, without a pansplat comment."""
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
+    lines += _list_property_lines(gaussians.harmonics.shape[1])
+    return "\n".join(lines).encode() + _build_vertex_table(gaussians).tobytes()
 
 
 def save_ply_parts(scene: Scene, parts: Iterable[Gaussians], path: str | Path) -> int:
@@ -120,10 +126,10 @@ def _write_parts(parts: Iterable[Gaussians], file: BinaryIO, coefficients: int) 
     for part in parts:
         if part.harmonics.shape[1] != coefficients:
             raise ValueError(f"`parts` must have {coefficients} harmonics each, got {part.harmonics.shape[1]}")
-        finite = _finite_mask(part)
+        finite = finite_mask(part)
         kept = part if bool(finite.all()) else part.select(finite)
         dropped += len(part) - len(kept)
-        for level, view, count in _find_label_runs(kept):
+        for level, view, count in find_label_runs(kept):
             if runs and runs[-1][:2] == [level, view]:
                 runs[-1][2] += count
             else:
@@ -149,25 +155,14 @@ def _format_header(scene: Scene, runs: list[list[int]], coefficients: int, *, si
     """All bytes before the first vertex; the Gaussians of `scene` are not used.
 
     Args:
-        runs: see `_find_label_runs`.
+        runs: see `find_label_runs`.
         coefficients: number of harmonics coefficients, 1 to 25.
         size: minimum number of bytes; spaces after the comment fill the difference.
     """
-    extras = {
-        "version": 1,
-        "model": scene.model,
-        "height": scene.height,
-        "near": scene.near,
-        "far": scene.far,
-        "names": [name.encode(errors="backslashreplace").decode() for name in scene.names],
-        "cam2world": scene.cam2world.double().cpu().tolist(),
-        **({"gains": scene.gains} if scene.gains else {}),
-        "runs": runs,
-    }
-    comment = _COMMENT_PREFIX + json.dumps(extras, separators=(",", ":"))
+    comment = COMMENT_PREFIX + format_entry(scene, runs)
     begin = f"ply\nformat binary_little_endian 1.0\ncomment {comment}"
     lines = [f"element vertex {sum(count for _, _, count in runs)}"]
-    lines += [*(f"property float {name}" for name in _list_properties(coefficients)), "end_header\n"]
+    lines += _list_property_lines(coefficients)
     end = "\n" + "\n".join(lines)
     return (begin + " " * (size - len(begin) - len(end)) + end).encode("ascii")
 
@@ -175,7 +170,7 @@ def _format_header(scene: Scene, runs: list[list[int]], coefficients: int, *, si
 def save_points(gaussians: Gaussians, path: str | Path) -> None:
     """Write the means as a .ply point cloud, atomically: float32 positions in metres, 8-bit sRGB without direction."""
     path = Path(path)
-    kept = _select_finite(gaussians, path).to(device="cpu")
+    kept = select_finite(gaussians, path).to(device="cpu")
     fields = [(name, "<f4") for name in ("x", "y", "z")] + [(name, "u1") for name in ("red", "green", "blue")]
     table = np.empty(len(kept), fields)
     colors = (kept.harmonics[:, 0] * SH_0 + 0.5).clamp(0, 1).mul(255).round().byte()
@@ -202,67 +197,36 @@ def load_ply(path: str | Path) -> Scene:
     require_file(path, "a .ply scene")
     try:
         with open(path, "rb") as file:
-            header = _read_header(file, path)
-            _seek_vertices(file, header, path)
-            gaussians = _read_gaussians(file, header, path)
+            gaussians, comments = read_ply(file, path)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
-    extras = _parse_extras(header.comments, path)
-    levels, views = _read_labels(extras, header.count, path)
-    gaussians = _select_finite(replace(gaussians, levels=levels, views=views), path)
-    if header.count and not len(gaussians):
-        raise InputError(f"{path}: none of its {header.count} Gaussians is finite; write the file again")
-    return Scene(
-        gaussians,
-        extras.cam2world,
-        near=extras.near,
-        far=extras.far,
-        names=extras.names,
-        model=extras.model,
-        height=extras.height,
-        gains=extras.gains,
-    )
+    return make_scene(gaussians, find_entry(comments), path)
 
 
-def _select_finite(gaussians: Gaussians, path: Path) -> Gaussians:
-    finite = _finite_mask(gaussians)
-    dropped = len(gaussians) - int(finite.sum())
-    if not dropped:
-        return gaussians
-    warnings.warn(
-        f"{path}: left out {dropped} of {len(gaussians)} Gaussians that are not finite",
-        InputWarning,
-        stacklevel=3,
-    )
-    return gaussians.select(finite)
+def read_ply(file: BufferedIOBase, path: Path) -> tuple[Gaussians, list[str]]:
+    """The Gaussians of a binary 3DGS .ply, with all labels 0, and the comments of its header.
+
+    Args:
+        file: the data, at its begin.
+        path: the file that messages name.
+
+    Raises:
+        InputError: not a binary .ply of Gaussians, or truncated.
+    """
+    header = _read_header(file, path)
+    _seek_vertices(file, header, path)
+    return _read_gaussians(file, header, path), header.comments
 
 
-def _finite_mask(gaussians: Gaussians) -> Bool[Tensor, "n"]:
-    """Mask of the Gaussians without NaN and infinite values."""
-    finite = torch.isfinite(gaussians.opacities)
-    for field in (gaussians.means, gaussians.scales, gaussians.quats, gaussians.harmonics.flatten(1)):
-        # A finite sum has finite terms. Rows with a non-finite sum, which may be an overflow, are checked by term.
-        suspect = ~torch.isfinite(field.sum(dim=1))
-        finite[suspect] &= torch.isfinite(field[suspect]).all(dim=1)
-    return finite
+def find_entry(comments: list[str]) -> str | None:
+    """The pansplat entry among the comments of a header."""
+    found = (comment for comment in comments if comment.startswith(COMMENT_PREFIX))
+    return next(found, "").removeprefix(COMMENT_PREFIX) or None
 
 
-def _sort_by_label(gaussians: Gaussians) -> Gaussians:
-    if len(_find_label_runs(gaussians)) <= _MAX_RUNS:
-        return gaussians
-    key = gaussians.levels.long() * (int(gaussians.views.max()) + 1) + gaussians.views.long()
-    return gaussians.select(torch.sort(key, stable=True).indices)
-
-
-def _find_label_runs(gaussians: Gaussians) -> list[list[int]]:
-    """Runs of equal level and view as [level, view, count], in file order."""
-    levels, views = gaussians.levels.long().cpu(), gaussians.views.long().cpu()
-    if not len(gaussians):
-        return []
-    changes = ((levels[1:] != levels[:-1]) | (views[1:] != views[:-1])).nonzero()[:, 0] + 1
-    starts = torch.cat((changes.new_zeros(1), changes))
-    counts = torch.diff(starts, append=starts.new_tensor([len(gaussians)]))
-    return torch.stack((levels[starts], views[starts], counts), dim=1).tolist()
+def _list_property_lines(coefficients: int) -> list[str]:
+    """The lines of the header after the number of vertices."""
+    return [*(f"property float {name}" for name in _list_properties(coefficients)), "end_header\n"]
 
 
 def _list_properties(coefficients: int) -> list[str]:
@@ -296,7 +260,7 @@ class _Header:
     comments: list[str]
 
 
-def _read_header(file: BinaryIO, path: Path) -> _Header:
+def _read_header(file: BufferedIOBase, path: Path) -> _Header:
     if file.readline(16).strip() != b"ply":
         raise InputError(f"{path} is not a .ply file (it does not begin with `ply`); give a 3DGS .ply")
     order, comments, elements = "", [], []  # elements: [name, count, fields]
@@ -345,7 +309,7 @@ def _select_vertex_element(order: str, elements: list, comments: list[str], path
     raise InputError(f"{path}: it has no `vertex` element; give a 3DGS .ply")
 
 
-def _seek_vertices(file: BinaryIO, header: _Header, path: Path) -> None:
+def _seek_vertices(file: BufferedIOBase, header: _Header, path: Path) -> None:
     start = file.tell() + header.skipped_bytes
     needed = header.count * header.dtype.itemsize
     available = file.seek(0, os.SEEK_END) - start
@@ -357,7 +321,7 @@ def _seek_vertices(file: BinaryIO, header: _Header, path: Path) -> None:
     file.seek(start)
 
 
-def _read_gaussians(file: BinaryIO, header: _Header, path: Path) -> Gaussians:
+def _read_gaussians(file: BufferedIOBase, header: _Header, path: Path) -> Gaussians:
     """The vertices at the file's position, with all labels 0; read in pieces to limit the memory."""
     coefficients = _count_coefficients(header.dtype.names or (), path)
     n, zeros = header.count, torch.zeros(header.count, dtype=torch.int64)
@@ -372,9 +336,10 @@ def _read_gaussians(file: BinaryIO, header: _Header, path: Path) -> Gaussians:
     )
     for start in range(0, n, _READ_VERTICES):
         rows = slice(start, min(start + _READ_VERTICES, n))
-        vertices = np.fromfile(file, header.dtype, rows.stop - start)
-        if len(vertices) < rows.stop - start:
+        data = file.read((rows.stop - start) * header.dtype.itemsize)
+        if len(data) < (rows.stop - start) * header.dtype.itemsize:
             raise InputError(f"{path} was truncated while it was read; read it again when it is complete")
+        vertices = np.frombuffer(data, header.dtype)
         gaussians.means[rows] = _stack_columns(vertices, "x", "y", "z")
         gaussians.scales[rows] = _stack_columns(vertices, "scale_0", "scale_1", "scale_2").exp()
         gaussians.quats[rows] = _stack_columns(vertices, "rot_0", "rot_1", "rot_2", "rot_3")
@@ -403,109 +368,3 @@ def _count_coefficients(available: Sequence[str], path: Path) -> int:
         hint = "a compressed .ply; uncompress it first" if "packed_position" in available else "not a 3DGS .ply"
         raise InputError(f"{path}: the vertices lack {', '.join(missing[:6])}: this is {hint}")
     return rest // 3 + 1
-
-
-@dataclass(frozen=True)
-class _Extras:
-    """Content of the pansplat comment; the defaults are those of a file of another tool."""
-
-    cam2world: Float[Tensor, "view 4 4"]
-    near: float = _DEFAULT_NEAR
-    far: float = _DEFAULT_FAR
-    names: tuple[str, ...] = ()
-    model: str = ""
-    height: int = _DEFAULT_HEIGHT
-    gains: tuple[tuple[float, ...], ...] = ()
-    runs: list[Any] | None = None
-
-
-def _parse_extras(comments: list[str], path: Path) -> _Extras:
-    """Content of the pansplat comment; the defaults without one, and with a warning when it is damaged."""
-    for comment in comments:
-        if comment.startswith(_COMMENT_PREFIX):
-            try:
-                return _read_extras(parse_json(comment.removeprefix(_COMMENT_PREFIX), "comment"))
-            except InputError as error:
-                warnings.warn(
-                    f"{path}: its pansplat comment is damaged ({error}); cameras, levels and views are ignored",
-                    InputWarning,
-                    stacklevel=3,
-                )
-    return _Extras(torch.zeros(0, 4, 4, dtype=torch.float64))
-
-
-def _read_extras(content: Any) -> _Extras:
-    """The fields of a pansplat comment.
-
-    Raises:
-        InputError: a field has another type, or is out of range.
-    """
-    content = require_object(content, "comment")
-    near = number_field(content, "near", "comment")
-    far = number_field(content, "far", "comment")
-    near, far = _DEFAULT_NEAR if near is None else near, _DEFAULT_FAR if far is None else far
-    require_depth_range(near, far, "comment")
-    height = number_field(content, "height", "comment", low=1, high=_MAX_HEIGHT, whole=True)
-    names = list_field(content, "names", "comment")
-    poses = list_field(content, "cam2world", "comment")
-    if len(poses) > _MAX_CAMERAS or len(names) > _MAX_CAMERAS:
-        raise InputError(f"comment: needed at most {_MAX_CAMERAS} cameras, got {max(len(poses), len(names))}")
-    return _Extras(
-        torch.from_numpy(np.array([_read_pose(pose) for pose in poses], np.float64).reshape(-1, 4, 4)),
-        near,
-        far,
-        tuple(str(name) for name in names),
-        text_field(content, "model", "comment") or "",
-        _DEFAULT_HEIGHT if height is None else int(height),
-        _read_gains(list_field(content, "gains", "comment"), len(poses)),
-        list_field(content, "runs", "comment"),
-    )
-
-
-def _read_gains(rows: list[Any], cameras: int) -> tuple[tuple[float, ...], ...]:
-    """Three factors for each camera, or nothing."""
-    numbers = [value for row in rows for value in (row if isinstance(row, list) else [None])]
-    are_factors = all(type(value) in (int, float) and 0 < value < _MAX_GAIN for value in numbers)
-    if rows and not (are_factors and len(rows) == cameras and all(len(row) == 3 for row in rows)):
-        raise InputError(
-            f"comment: needed three numbers above 0 and below {_MAX_GAIN:g} for each of the {cameras} cameras in "
-            f"gains, got {rows!r:.60}"
-        )
-    return tuple(tuple(map(float, row)) for row in rows)
-
-
-def _read_pose(rows: Any) -> np.ndarray:
-    """A pose (4, 4) of the comment; the reader of JSON has refused numbers that are not finite."""
-    try:
-        pose = np.array(rows, np.float64)
-    except (TypeError, ValueError):
-        pose = np.zeros(0)
-    if pose.shape != (4, 4) or np.abs(pose).max() > MAX_POSITION:
-        raise InputError(f"comment: needed 4x4 numbers up to {MAX_POSITION:g} in cam2world, got {rows!r:.60}")
-    return pose
-
-
-def _read_labels(extras: _Extras, count: int, path: Path) -> tuple[Tensor, Tensor]:
-    """Level and view of each vertex; zeros without labels, or with a warning when they do not fit `count`."""
-    zeros = torch.zeros(count, dtype=torch.int64), torch.zeros(count, dtype=torch.int64)
-    if extras.runs is None:
-        return zeros
-    if not _are_runs(extras.runs, count, max(len(extras.cam2world), 1)):
-        warnings.warn(
-            f"{path}: its levels and views do not fit its {count} Gaussians (edited by another tool?) and are ignored",
-            InputWarning,
-            stacklevel=3,
-        )
-        return zeros
-    runs = torch.tensor(extras.runs, dtype=torch.int64).reshape(-1, 3)
-    return torch.repeat_interleave(runs[:, 0], runs[:, 2]), torch.repeat_interleave(runs[:, 1], runs[:, 2])
-
-
-def _are_runs(runs: list[Any], count: int, views: int) -> bool:
-    """Whether the runs are [level, view, length] whose lengths sum to `count`, in Python's integers of any size."""
-    for run in runs:
-        if not isinstance(run, list) or len(run) != 3 or any(type(number) is not int or number < 0 for number in run):
-            return False
-        if run[0] > _MAX_LEVEL or run[1] >= views or run[2] > count:
-            return False
-    return sum(run[2] for run in runs) == count

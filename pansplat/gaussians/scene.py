@@ -11,7 +11,13 @@ from jaxtyping import Float, Integer
 from torch import Tensor
 
 from pansplat.errors import InputError
-from pansplat.geometry.pose import interpolate_poses, rotations_from_quats
+from pansplat.gaussians.harmonics import rotate_harmonics
+from pansplat.geometry.pose import (
+    interpolate_poses,
+    multiply_quats,
+    quats_from_rotations,
+    rotations_from_quats,
+)
 from pansplat.geometry.world import scale_poses
 
 
@@ -84,6 +90,16 @@ class Gaussians:
             return self
         return dataclasses.replace(self, means=self.means * factor, scales=self.scales * factor)
 
+    def rotated(self, rotation: Float[Tensor, "3 3"]) -> Gaussians:
+        """The Gaussians after a rotation of the world about its origin; colours turn with it."""
+        turn = rotation.to(self.means)
+        return dataclasses.replace(
+            self,
+            means=self.means @ turn.T,
+            quats=multiply_quats(quats_from_rotations(turn).expand_as(self.quats), self.quats),
+            harmonics=rotate_harmonics(self.harmonics, rotation) if self.degree else self.harmonics,
+        )
+
     @staticmethod
     def cat(parts: Sequence[Gaussians]) -> Gaussians:
         """The Gaussians of all parts in order; the parts must have the same SH degree."""
@@ -134,6 +150,12 @@ class Scene:
         poses = scale_poses(self.cam2world, factor)
         near, far = self.near * factor, self.far * factor
         return dataclasses.replace(self, gaussians=self.gaussians.scaled(factor), cam2world=poses, near=near, far=far)
+
+    def rotated(self, rotation: Float[Tensor, "3 3"]) -> Scene:
+        """The scene after a rotation of the world about its origin."""
+        poses = self.cam2world.clone()
+        poses[:, :3] = rotation.to(poses) @ poses[:, :3]
+        return dataclasses.replace(self, gaussians=self.gaussians.rotated(rotation), cam2world=poses)
 
     def pose_between(self, fraction: float) -> Float[Tensor, "4 4"]:
         """The pose at a fraction between the first context camera (0) and the last (1).

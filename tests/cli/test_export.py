@@ -1,13 +1,17 @@
 """`pansplat export`: files, refused arguments."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from PIL import Image
 
 from pansplat import pipeline
 from pansplat.cli import run
+from pansplat_viewer.loader import LoadOptions, find_entries
 
 
 def test_a_scene_is_written_pruned(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -29,6 +33,39 @@ def test_points_have_the_means_and_the_colours(scene: Path, tmp_path: Path) -> N
     assert np.array_equal(points["position"], gaussians.means.numpy())
     colors = 255 * (0.5 + 0.28209479 * gaussians.harmonics[:, 0].numpy())
     assert np.abs(points["color"] - colors.clip(0, 255)).max() <= 0.51
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".splat", ".sog", ".glb", ".compressed.ply"])
+def test_every_format_is_described_drawn_and_opened(
+    scene: Path, tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / f"out{suffix}"
+    assert run(["export", str(scene), "-o", str(out)]) == 0
+    assert run(["info", str(out)]) == 0
+    assert "1,024 Gaussians, SH degree 0" in capsys.readouterr().out
+    images = []
+    for number, path in enumerate((scene, out)):
+        arguments = ["render", str(path), "-o", str(tmp_path / f"{number}.png"), "--height", "16", "--blend", "joint"]
+        pose = tmp_path / "pose.json"
+        pose.write_text("[[1, 0, 0, 0.31], [0, 1, 0, 0.17], [0, 0, 1, 0.23], [0, 0, 0, 1]]")  # no equal distances
+        assert run([*arguments, "--pose", str(pose)]) == 0
+        with Image.open(tmp_path / f"{number}.png") as image:
+            images.append(np.asarray(image).astype(float))
+    error = np.mean((images[0] - images[1]) ** 2)
+    assert 10 * np.log10(255**2 / max(error, 1e-9)) > 36
+    (entry,) = find_entries(out, LoadOptions())
+    assert entry.file == out
+
+
+@pytest.mark.parametrize(("up", "expected"), [("y", (1.0, -2.0, -3.0)), ("z", (1.0, -3.0, 2.0))])
+def test_up_turns_a_file_with_other_axes(
+    scene: Path, tmp_path: Path, up: str, expected: tuple[float, float, float]
+) -> None:
+    foreign = pipeline.load(scene)
+    gaussians = dataclasses.replace(foreign.gaussians, means=torch.tensor([1.0, 2.0, 3.0]).expand(1024, 3))
+    pipeline.save(dataclasses.replace(foreign, gaussians=gaussians), tmp_path / "foreign.ply")
+    assert run(["export", str(tmp_path / "foreign.ply"), "-o", str(tmp_path / "turned.ply"), "--up", up]) == 0
+    assert pipeline.load(tmp_path / "turned.ply").gaussians.means[0].tolist() == list(expected)
 
 
 def test_an_unknown_suffix_names_the_known_ones(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:

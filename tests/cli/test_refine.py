@@ -68,7 +68,7 @@ def test_ctrl_c_ends_the_refinement_and_writes_the_scene(room: Path, tmp_path: P
     [
         (["--seconds", 1], "--seconds and --steps both"),
         (["--gaussians", 0], "--gaussians must be a whole number of 1"),
-        (["--photographs", "elsewhere"], "--photographs is for a .ply scene"),
+        (["--photographs", "elsewhere"], "--photographs is for a scene file"),
         (["--report", "report.txt"], "--report must end in .json"),
         (["--height", 7], "--height must be a whole number"),
     ],

@@ -34,6 +34,7 @@ from pansplat.cli.render import read_poses
 from pansplat.data.folders import load_pairs
 from pansplat.data.images import read_depth, read_panorama, write_image
 from pansplat.errors import InputError
+from pansplat.gaussians.gltf import load_glb, save_glb
 from pansplat.gaussians.ply import load_ply
 from pansplat.gaussians.scene import Scene
 from pansplat.model.network import build_empty_network, load_predictor
@@ -114,6 +115,11 @@ def make_readers(folder: Path) -> dict[str, tuple[Path, Read]]:
     safetensors.torch.save_file(tensors, folder / "small.safetensors", metadata)
     (folder / "cached.scene").write_bytes((folder / "cache_body").read_bytes())
 
+    save_glb(load_ply(scene), folder / "scene.glb")
+
+    def read_glb(path: Path) -> None:
+        draw(load_glb(path))
+
     def read_scene(path: Path) -> None:
         draw(load_ply(path))
 
@@ -131,6 +137,7 @@ def make_readers(folder: Path) -> dict[str, tuple[Path, Read]]:
 
     return {
         "scene.ply": (scene, read_scene),
+        "scene.glb": (folder / "scene.glb", read_glb),
         "poses.json": (pair / "poses.json", read_pair),
         "pairs.json": (pair / "pairs.json", read_pair),
         "path.kitti": (folder / "path.kitti", read_poses),

@@ -15,7 +15,7 @@ import safetensors.torch
 from pansplat.gaussians.ply import load_ply
 
 COUNT = 2000
-READERS = 15
+READERS = 16
 
 
 @pytest.mark.slow

@@ -5,7 +5,9 @@ import dataclasses
 import pytest
 import torch
 
+from pansplat.gaussians.harmonics import evaluate_harmonics
 from pansplat.gaussians.scene import Gaussians, Scene, prune
+from pansplat.geometry.pose import rotations_from_quats
 
 
 def _make(n: int, k: int = 4, seed: int = 0) -> Gaussians:
@@ -95,3 +97,16 @@ def test_pose_between_starts_and_ends_at_the_cameras():
     scene = Scene(_make(2), poses, near=0.5, far=8.0)
     assert torch.allclose(scene.pose_between(0.0), poses[0]) and torch.allclose(scene.pose_between(1.0), poses[1])
     assert torch.allclose(scene.pose_between(0.5)[:3, 3], poses[:, :3, 3].mean(dim=0))
+
+
+def test_a_rotation_turns_shapes_and_colours_with_the_world():
+    gaussians = _make(5, 9).to(dtype=torch.float64)
+    turn = rotations_from_quats(torch.tensor([0.5, -0.1, 0.7, 0.3], dtype=torch.float64))
+    poses = torch.eye(4, dtype=torch.float64)[None]
+    turned = Scene(gaussians, poses, 0.1, 10.0).rotated(turn)
+    assert torch.allclose(turned.gaussians.covariances, turn @ gaussians.covariances @ turn.T)
+    directions = torch.nn.functional.normalize(gaussians.means, dim=1)
+    seen = evaluate_harmonics(turned.gaussians.harmonics, directions @ turn.T)
+    assert torch.allclose(seen, evaluate_harmonics(gaussians.harmonics, directions))
+    assert torch.allclose(turned.gaussians.means, gaussians.means @ turn.T)
+    assert torch.allclose(turned.cam2world[0, :3, :3], turn)

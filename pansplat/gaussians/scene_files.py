@@ -1,0 +1,241 @@
+"""What scene files of all formats share: the pansplat entry, labels, and the removal of Gaussians that are not finite.
+
+Input cameras, the depth range, and the level and view of each Gaussian are no part of the formats. One JSON object, the
+pansplat entry, holds them where a format has a place for comments; other tools skip it.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pansplat.errors import InputError, InputWarning
+from pansplat.gaussians.scene import Gaussians, Scene, prune
+from pansplat.geometry.world import MAX_POSITION, require_depth_range
+from pansplat.strict_json import list_field, number_field, parse_json, require_object, text_field
+
+Y_UP = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))  # from y down to y up, and back
+
+_MAX_RUNS = 4096  # the Gaussians are sorted if the entry would list more runs, which take megabytes
+_DEFAULT_NEAR, _DEFAULT_FAR = 0.1, 100.0  # depth range, metres, for a file without one
+_DEFAULT_HEIGHT = 512  # pixels, of the panoramas
+_MAX_HEIGHT, _MAX_CAMERAS, _MAX_LEVEL = 1 << 16, 1 << 12, 255
+_MAX_GAIN = 1e3
+
+
+def format_entry(scene: Scene, runs: list[list[int]]) -> str:
+    """The pansplat entry of a scene as ASCII JSON without line breaks; the Gaussians are not used.
+
+    Args:
+        runs: see `find_label_runs`.
+    """
+    content = {
+        "version": 1,
+        "model": scene.model,
+        "height": scene.height,
+        "near": scene.near,
+        "far": scene.far,
+        "names": [name.encode(errors="backslashreplace").decode() for name in scene.names],
+        "cam2world": scene.cam2world.double().cpu().tolist(),
+        **({"gains": scene.gains} if scene.gains else {}),
+        "runs": runs,
+    }
+    return json.dumps(content, separators=(",", ":"))
+
+
+def make_scene(gaussians: Gaussians, entry: str | None, path: Path) -> Scene:
+    """The scene of a file.
+
+    Without an entry the scene has no cameras, and all Gaussians are at level 0 of view 0. A damaged entry is ignored
+    with a warning, and Gaussians with a non-finite value are left out with a warning.
+
+    Args:
+        gaussians: all Gaussians of the file in its order; their labels are not used.
+        entry: the pansplat entry, if the file has one.
+        path: the file that messages name.
+
+    Raises:
+        InputError: no Gaussian is finite.
+    """
+    fields = _parse_entry(entry, path)
+    levels, views = _read_labels(fields, len(gaussians), path)
+    kept = select_finite(replace(gaussians, levels=levels, views=views), path)
+    if len(gaussians) and not len(kept):
+        raise InputError(f"{path}: none of its {len(gaussians)} Gaussians is finite; write the file again")
+    return Scene(
+        kept,
+        fields.cam2world,
+        near=fields.near,
+        far=fields.far,
+        names=fields.names,
+        model=fields.model,
+        height=fields.height,
+        gains=fields.gains,
+    )
+
+
+def select_finite(gaussians: Gaussians, path: Path) -> Gaussians:
+    """The Gaussians without NaN and infinite values; a warning says how many are left out."""
+    finite = finite_mask(gaussians)
+    dropped = len(gaussians) - int(finite.sum())
+    if not dropped:
+        return gaussians
+    warnings.warn(
+        f"{path}: left out {dropped} of {len(gaussians)} Gaussians that are not finite",
+        InputWarning,
+        stacklevel=3,
+    )
+    return gaussians.select(finite)
+
+
+def finite_mask(gaussians: Gaussians) -> Bool[Tensor, "n"]:
+    """Mask of the Gaussians without NaN and infinite values."""
+    finite = torch.isfinite(gaussians.opacities)
+    for field in (gaussians.means, gaussians.scales, gaussians.quats, gaussians.harmonics.flatten(1)):
+        # A finite sum has finite terms. Rows with a non-finite sum, which may be an overflow, are checked by term.
+        suspect = ~torch.isfinite(field.sum(dim=1))
+        finite[suspect] &= torch.isfinite(field[suspect]).all(dim=1)
+    return finite
+
+
+def limit_degree(gaussians: Gaussians, degree: int, path: Path) -> Gaussians:
+    """The Gaussians with harmonics up to a degree; a warning if they have a higher one."""
+    if gaussians.degree > degree:
+        warnings.warn(
+            f"{path}: the format holds harmonics up to degree {degree}, those up to {gaussians.degree} are left out",
+            InputWarning,
+            stacklevel=4,
+        )
+    return prune(gaussians, degree=degree)
+
+
+def sort_by_label(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians, sorted by level and view if they have more than a few thousand runs of equal labels."""
+    if len(find_label_runs(gaussians)) <= _MAX_RUNS:
+        return gaussians
+    key = gaussians.levels.long() * (int(gaussians.views.max()) + 1) + gaussians.views.long()
+    return gaussians.select(torch.sort(key, stable=True).indices)
+
+
+def find_label_runs(gaussians: Gaussians) -> list[list[int]]:
+    """Runs of equal level and view as [level, view, count], in file order."""
+    levels, views = gaussians.levels.long().cpu(), gaussians.views.long().cpu()
+    if not len(gaussians):
+        return []
+    changes = ((levels[1:] != levels[:-1]) | (views[1:] != views[:-1])).nonzero()[:, 0] + 1
+    starts = torch.cat((changes.new_zeros(1), changes))
+    counts = torch.diff(starts, append=starts.new_tensor([len(gaussians)]))
+    return torch.stack((levels[starts], views[starts], counts), dim=1).tolist()
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """Content of the pansplat entry; the defaults are those of a file of another tool."""
+
+    cam2world: Float[Tensor, "view 4 4"]
+    near: float = _DEFAULT_NEAR
+    far: float = _DEFAULT_FAR
+    names: tuple[str, ...] = ()
+    model: str = ""
+    height: int = _DEFAULT_HEIGHT
+    gains: tuple[tuple[float, ...], ...] = ()
+    runs: list[Any] | None = None
+
+
+def _parse_entry(entry: str | None, path: Path) -> _Entry:
+    """Content of the entry; the defaults without one, and with a warning when it is damaged."""
+    if entry is not None:
+        try:
+            return _read_entry(parse_json(entry, "comment"))
+        except InputError as error:
+            warnings.warn(
+                f"{path}: its pansplat comment is damaged ({error}); cameras, levels and views are ignored",
+                InputWarning,
+                stacklevel=4,
+            )
+    return _Entry(torch.zeros(0, 4, 4, dtype=torch.float64))
+
+
+def _read_entry(content: Any) -> _Entry:
+    """The fields of a pansplat entry.
+
+    Raises:
+        InputError: a field has another type, or is out of range.
+    """
+    content = require_object(content, "comment")
+    near = number_field(content, "near", "comment")
+    far = number_field(content, "far", "comment")
+    near, far = _DEFAULT_NEAR if near is None else near, _DEFAULT_FAR if far is None else far
+    require_depth_range(near, far, "comment")
+    height = number_field(content, "height", "comment", low=1, high=_MAX_HEIGHT, whole=True)
+    names = list_field(content, "names", "comment")
+    poses = list_field(content, "cam2world", "comment")
+    if len(poses) > _MAX_CAMERAS or len(names) > _MAX_CAMERAS:
+        raise InputError(f"comment: needed at most {_MAX_CAMERAS} cameras, got {max(len(poses), len(names))}")
+    return _Entry(
+        torch.from_numpy(np.array([_read_pose(pose) for pose in poses], np.float64).reshape(-1, 4, 4)),
+        near,
+        far,
+        tuple(str(name) for name in names),
+        text_field(content, "model", "comment") or "",
+        _DEFAULT_HEIGHT if height is None else int(height),
+        _read_gains(list_field(content, "gains", "comment"), len(poses)),
+        list_field(content, "runs", "comment"),
+    )
+
+
+def _read_gains(rows: list[Any], cameras: int) -> tuple[tuple[float, ...], ...]:
+    """Three factors for each camera, or nothing."""
+    numbers = [value for row in rows for value in (row if isinstance(row, list) else [None])]
+    are_factors = all(type(value) in (int, float) and 0 < value < _MAX_GAIN for value in numbers)
+    if rows and not (are_factors and len(rows) == cameras and all(len(row) == 3 for row in rows)):
+        raise InputError(
+            f"comment: needed three numbers above 0 and below {_MAX_GAIN:g} for each of the {cameras} cameras in "
+            f"gains, got {rows!r:.60}"
+        )
+    return tuple(tuple(map(float, row)) for row in rows)
+
+
+def _read_pose(rows: Any) -> np.ndarray:
+    """A pose (4, 4) of the comment; the reader of JSON has refused numbers that are not finite."""
+    try:
+        pose = np.array(rows, np.float64)
+    except (TypeError, ValueError):
+        pose = np.zeros(0)
+    if pose.shape != (4, 4) or np.abs(pose).max() > MAX_POSITION:
+        raise InputError(f"comment: needed 4x4 numbers up to {MAX_POSITION:g} in cam2world, got {rows!r:.60}")
+    return pose
+
+
+def _read_labels(fields: _Entry, count: int, path: Path) -> tuple[Tensor, Tensor]:
+    """Level and view of each vertex; zeros without labels, or with a warning when they do not fit `count`."""
+    zeros = torch.zeros(count, dtype=torch.int64), torch.zeros(count, dtype=torch.int64)
+    if fields.runs is None:
+        return zeros
+    if not _are_runs(fields.runs, count, max(len(fields.cam2world), 1)):
+        warnings.warn(
+            f"{path}: its levels and views do not fit its {count} Gaussians (edited by another tool?) and are ignored",
+            InputWarning,
+            stacklevel=3,
+        )
+        return zeros
+    runs = torch.tensor(fields.runs, dtype=torch.int64).reshape(-1, 3)
+    return torch.repeat_interleave(runs[:, 0], runs[:, 2]), torch.repeat_interleave(runs[:, 1], runs[:, 2])
+
+
+def _are_runs(runs: list[Any], count: int, views: int) -> bool:
+    """Whether the runs are [level, view, length] whose lengths sum to `count`, in Python's integers of any size."""
+    for run in runs:
+        if not isinstance(run, list) or len(run) != 3 or any(type(number) is not int or number < 0 for number in run):
+            return False
+        if run[0] > _MAX_LEVEL or run[1] >= views or run[2] > count:
+            return False
+    return sum(run[2] for run in runs) == count

@@ -1,0 +1,225 @@
+"""Scene files of each suffix: values, axes, cameras and labels; damaged files and limits are refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import gzip
+import io
+import json
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pansplat.errors import InputError, InputWarning
+from pansplat.files import SCENE_SUFFIXES
+from pansplat.gaussians import formats
+from pansplat.gaussians.formats import load_scene, save_scene
+from pansplat.gaussians.ply import load_ply
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.pose import rotations_from_quats
+
+CODED = (".compressed.ply", ".spz", ".splat", ".sog")
+# Largest error of positions (metres), rotations (1 - |cosine|), log scales, opacities, harmonics of degree 0 and above.
+ERRORS = {
+    ".ply": (1e-6, 1e-6, 1e-5, 1e-6, 1e-6, 1e-6),
+    ".glb": (1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6),
+    ".compressed.ply": (0.01, 1e-5, 0.01, 0.003, 0.02, 0.016),
+    ".spz": (2e-4, 1e-5, 0.032, 0.003, 0.014, 0.07),
+    ".splat": (1e-6, 1e-4, 1e-5, 0.004, 0.015, None),
+    ".sog": (1e-3, 1e-4, 0.02, 0.004, 0.02, 0.02),
+}
+
+
+def make_scene(count: int = 40, degree: int = 1, spread: float = 2.0) -> Scene:
+    random = torch.Generator().manual_seed(0)
+    gaussians = Gaussians(
+        means=torch.randn(count, 3, generator=random) * spread,
+        scales=torch.rand(count, 3, generator=random) * 0.4 + 0.02,
+        quats=torch.nn.functional.normalize(torch.randn(count, 4, generator=random), dim=1),
+        opacities=torch.rand(count, generator=random) * 0.9 + 0.05,
+        harmonics=torch.randn(count, (degree + 1) ** 2, 3, generator=random) * 0.3,
+        levels=torch.arange(count) // 7 % 4,
+        views=torch.arange(count) % 2,
+    )
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    poses[0, :3, :3] = rotations_from_quats(torch.tensor([0.9, 0.1, -0.3, 0.2], dtype=torch.float64))
+    poses[1, :3, 3] = torch.tensor([1 / 3, -2e-7, 0.5], dtype=torch.float64)
+    return Scene(gaussians, poses, near=0.45, far=10.0, names=("à.jpg", "b c.png"), model="sweep", height=256)
+
+
+def save_and_load(scene: Scene, path: Path) -> Scene:
+    save_scene(scene, path)
+    return load_scene(path)
+
+
+def match(original: Gaussians, found: Gaussians) -> Gaussians:
+    """The Gaussians of `original` in the order of `found`, by the nearest mean."""
+    distances = torch.cdist(found.means, original.means, compute_mode="donot_use_mm_for_euclid_dist")
+    index = distances.argmin(dim=1)
+    assert len(index.unique()) == len(original)
+    return original.select(index)
+
+
+def test_every_suffix_has_its_reader() -> None:
+    assert set(SCENE_SUFFIXES) == {*formats._CODED, ".glb", ".ply"}
+
+
+@pytest.mark.parametrize("suffix", SCENE_SUFFIXES)
+def test_a_scene_survives_each_format_within_its_error(tmp_path: Path, suffix: str) -> None:
+    scene = make_scene(degree=0 if suffix == ".splat" else 3)
+    back = save_and_load(scene, tmp_path / f"scene{suffix}")
+    found = back.gaussians
+    original = match(scene.gaussians, found)
+    position, rotation, scale, opacity, color, rest = ERRORS[suffix]
+    assert found.degree == scene.gaussians.degree
+    assert float((found.means - original.means).abs().max()) <= position
+    cosines = (torch.nn.functional.normalize(found.quats, dim=1) * original.quats).sum(dim=1).abs()
+    assert float(1 - cosines.min()) <= rotation
+    assert float((found.scales.log() - original.scales.log()).abs().max()) <= scale
+    assert float((found.opacities - original.opacities).abs().max()) <= opacity
+    errors = (found.harmonics - original.harmonics).abs()
+    assert float(errors[:, 0].max()) <= color
+    if rest is not None:
+        assert float(errors[:, 1:].max()) <= rest
+    if suffix == ".splat":
+        assert not len(back.cam2world) and not found.views.any()
+        return
+    assert torch.equal(found.levels, original.levels) and torch.equal(found.views, original.views)
+    assert torch.equal(back.cam2world, scene.cam2world)  # bit-exact
+    assert (back.near, back.far, back.height, back.model, back.names) == (0.45, 10.0, 256, "sweep", scene.names)
+
+
+def test_an_spz_has_y_up(tmp_path: Path) -> None:
+    """24-bit positions with 12 fractional bits after a header of 16 bytes, axes right, up, back."""
+    scene = make_scene(count=5)
+    save_scene(scene, tmp_path / "a.spz")
+    data = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    assert struct.unpack_from("<III", data) == (0x5053474E, 3, 5)
+    numbers = [int.from_bytes(data[i : i + 3], "little", signed=True) / 4096 for i in range(16, 16 + 45, 3)]
+    expected = scene.gaussians.means.numpy() * [1, -1, -1]
+    np.testing.assert_allclose(np.reshape(numbers, (5, 3)), expected, atol=1 / 4096)
+
+
+def test_a_splat_has_32_bytes_a_gaussian(tmp_path: Path) -> None:
+    scene = make_scene(count=5, degree=0)
+    save_scene(scene, tmp_path / "a.splat")
+    rows = np.frombuffer(
+        (tmp_path / "a.splat").read_bytes(),
+        [("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)],
+    )
+    g = scene.gaussians
+    np.testing.assert_array_equal(rows["mean"], g.means.numpy())
+    np.testing.assert_allclose(rows["scale"], g.scales.numpy(), rtol=1e-5)
+    color = torch.cat((g.harmonics[:, 0] * 0.28209479 + 0.5, g.opacities[:, None]), dim=1)
+    assert np.abs(rows["color"] / 255 - color.clamp(0, 1).numpy()).max() <= 1 / 255 + 1e-6
+    assert np.abs((rows["quat"].astype(float) - 128) / 128 - g.quats.numpy()).max() <= 1 / 128  # wxyz
+
+
+def test_a_compressed_ply_holds_harmonics_channel_by_channel(tmp_path: Path) -> None:
+    """As in a plain .ply; gaussforge alone would write them coefficient by coefficient."""
+    scene = make_scene(count=1, degree=3)
+    save_scene(scene, tmp_path / "a.compressed.ply")
+    data = (tmp_path / "a.compressed.ply").read_bytes()
+    assert b"\nelement sh 1\nproperty uchar f_rest_0\n" in data
+    stored = np.frombuffer(data[-45:], np.uint8) / 256 * 8 - 4
+    expected = scene.gaussians.harmonics[0, 1:].T.flatten()
+    np.testing.assert_allclose(stored, expected, atol=8 / 256)
+
+
+def test_a_sog_is_an_archive_of_images(tmp_path: Path) -> None:
+    scene = make_scene(count=9, degree=0)
+    means = save_and_load(scene, tmp_path / "a.sog").gaussians.means.numpy()
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        meta = json.loads(archive.read("meta.json"))
+        low, high = (
+            np.array(Image.open(io.BytesIO(archive.read(f"means_{part}.webp"))).convert("RGB"), int).reshape(-1, 3)[:9]
+            for part in "lu"
+        )
+    assert meta["version"] == 2 and meta["count"] == 9
+    lows, highs = np.array(meta["means"]["mins"]), np.array(meta["means"]["maxs"])
+    logs = lows + (low + 256 * high) / 65535 * (highs - lows)
+    np.testing.assert_allclose(np.sign(logs) * np.expm1(np.abs(logs)), means, atol=1e-5)
+
+
+def test_the_name_of_a_compressed_ply_may_be_short(tmp_path: Path) -> None:
+    save_scene(make_scene(), tmp_path / "a.compressed.ply")
+    (tmp_path / "a.compressed.ply").rename(tmp_path / "b.PLY")
+    assert len(load_scene(tmp_path / "b.PLY").gaussians) == 40
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".glb", ".sog", ".compressed.ply"])
+def test_harmonics_of_degree_4_are_left_out_with_a_warning(tmp_path: Path, suffix: str) -> None:
+    with pytest.warns(InputWarning, match="up to degree 3, those up to 4"):
+        save_scene(make_scene(count=3, degree=4), tmp_path / f"a{suffix}")
+    assert load_scene(tmp_path / f"a{suffix}").gaussians.degree == 3
+
+
+@pytest.mark.parametrize("suffix", [s for s in SCENE_SUFFIXES if s != ".ply"])
+def test_an_empty_scene_is_refused(tmp_path: Path, suffix: str) -> None:
+    scene = make_scene()
+    scene = dataclasses.replace(scene, gaussians=scene.gaussians.select(torch.zeros(40, dtype=torch.bool)))
+    with pytest.raises(InputError, match="holds 1"):
+        save_scene(scene, tmp_path / f"a{suffix}")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_scene_beyond_the_limits_of_spz_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match="positions below 2048 m, got"):
+        save_scene(make_scene(spread=5000), tmp_path / "a.spz")
+    assert formats._CODED[".spz"].max_gaussians == 10_000_000
+    monkeypatch.setitem(formats._CODED, ".spz", dataclasses.replace(formats._CODED[".spz"], max_gaussians=39))
+    with pytest.raises(InputError, match="1 to 39 Gaussians, got 40"):
+        save_scene(make_scene(), tmp_path / "a.spz")
+
+
+def test_unknown_suffixes_are_refused_with_the_known_ones(tmp_path: Path) -> None:
+    for call in (lambda: load_scene(tmp_path / "a.obj"), lambda: save_scene(make_scene(), tmp_path / "a.obj")):
+        with pytest.raises(InputError, match=r"must end in .*\.spz.*\.sog.*\.glb.*got '\.obj'"):
+            call()
+
+
+@pytest.mark.parametrize("suffix", CODED)
+def test_damaged_files_are_refused(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    save_scene(make_scene(degree=0), path)
+    content = path.read_bytes()
+    for damaged in (b"", content[: len(content) // 2 + 1], content[:3] + bytes(len(content) - 3)):
+        if suffix == ".splat" and damaged == content[:3] + bytes(len(content) - 3):
+            continue  # zeros are Gaussians
+        path.write_bytes(damaged)
+        with pytest.raises(InputError, match=r"a\.(spz|splat|sog|compressed\.ply)"):
+            load_scene(path)
+
+
+def test_a_crash_of_the_decoder_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_scene(make_scene(), tmp_path / "a.sog")
+    monkeypatch.setattr(formats, "_CODER", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    with pytest.raises(InputError, match="gaussforge stopped by signal 11"):
+        load_scene(tmp_path / "a.sog")
+    monkeypatch.setattr(formats, "_CODER", "while True: pass")
+    monkeypatch.setattr(formats, "_DECODE_SECONDS", 0.2)
+    with pytest.raises(InputError, match=r"no result after 0\.2 s"):
+        load_scene(tmp_path / "a.sog")
+
+
+def test_a_damaged_entry_is_ignored_with_a_warning(tmp_path: Path) -> None:
+    save_scene(make_scene(), tmp_path / "a.compressed.ply")
+    data = (tmp_path / "a.compressed.ply").read_bytes()
+    (tmp_path / "a.compressed.ply").write_bytes(data.replace(b'"near":0.45', b'"near":"no"'))
+    with pytest.warns(InputWarning, match="comment is damaged"):
+        assert not len(load_scene(tmp_path / "a.compressed.ply").cam2world)
+
+
+def test_a_file_of_gaussforge_alone_is_read_without_cameras(tmp_path: Path) -> None:
+    """As of another tool: no pansplat entry."""
+    scene = make_scene(degree=0)
+    save_scene(scene, tmp_path / "a.ply")
+    plain = formats.format_plain_ply(load_ply(tmp_path / "a.ply").gaussians)
+    (tmp_path / "b.sog").write_bytes(formats._convert(plain, "ply", "sog"))
+    back = load_scene(tmp_path / "b.sog")
+    assert len(back.gaussians) == 40 and not len(back.cam2world) and not back.gaussians.views.any()
