@@ -288,7 +288,7 @@ def predict_to_file(
         InputError: see `predict`; the predictor is not a network, or the file cannot be written.
     """
     if Path(path).suffix.lower() != ".ply":
-        raise InputError(f"{path}: a prediction in parts is written as .ply, got {Path(path).suffix or 'no suffix'!r}")
+        raise InputError(f"{path}: a prediction in parts must end in .ply, got {Path(path).suffix or 'no suffix'!r}")
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
     if not can_stream(predictor):
         raise InputError(
