@@ -12,7 +12,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")"
 
 CPU_WHEELS=https://download.pytorch.org/whl/cpu
 GL_PACKAGES=(libegl1 libgl1 libgl1-mesa-dri libgles2 libx11-6 libxcursor1 libxext6 libxi6 libxinerama1 libxkbcommon0 libxrandr2)
-DEV_PACKAGES=(xvfb xdotool libosmesa6)
+DEV_PACKAGES=(xvfb xdotool libosmesa6 chromium)
 
 say() { printf 'setup: %s\n' "$*"; }
 die() { printf 'setup: %s\n' "$*" >&2; exit 1; }

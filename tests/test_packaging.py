@@ -80,7 +80,18 @@ def test_the_wheel_contains_every_module_and_shader(wheel: Path) -> None:
     needed = {"pansplat/py.typed"}
     for package, folder in FOLDERS.items():
         for file in (ROOT / folder).rglob("*"):
-            if file.suffix in (".py", ".glsl", ".vert", ".frag", ".geom", ".comp", ".safetensors"):
+            if file.suffix in (
+                ".py",
+                ".glsl",
+                ".vert",
+                ".frag",
+                ".geom",
+                ".comp",
+                ".safetensors",
+                ".html",
+                ".css",
+                ".js",
+            ):
                 needed.add(f"{package.replace('.', '/')}/{file.relative_to(ROOT / folder).as_posix()}")
     assert not needed - names
     assert any(name.endswith((".frag", ".glsl")) for name in needed)

@@ -1,4 +1,4 @@
-"""`pansplat export`: a scene in the formats of other programs."""
+"""`pansplat export`: a scene in the formats of other programs, or as a web page."""
 
 from __future__ import annotations
 
@@ -9,23 +9,28 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Out, ScenePrediction
+from pansplat.cli.inputs import Out, ScenePrediction, progress_bar
 from pansplat.errors import InputError
 from pansplat.files import SCENE_SUFFIXES, find_scene_suffix, require_output_file
-from pansplat.options import WHOLE, Fraction, Range
+from pansplat.options import WHOLE, Count, Fraction, Range
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from pansplat.gaussians.scene import Scene
+
+_PAGE_SUFFIX = ".html"
+
 
 @dataclass(frozen=True)
 class Export:
-    """Write a scene, or the prediction of a pair, in the format of the file's suffix (docs/formats.md)."""
+    """Write a scene, or the prediction of a pair, in the format of the file's suffix (docs/formats.md), or as a web
+    page (.html, docs/web.md)."""
 
     path: Positional[Path]
     """A scene file, or the folder of a pair."""
     out: Out
-    """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb."""
+    """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb; .html for a web page."""
     points: bool = False
     """Write a .ply of plain points with colours, for programs without Gaussians."""
     degree: Annotated[int, Range(0, 4), WHOLE] | None = None
@@ -34,6 +39,12 @@ class Export:
     """Leave out Gaussians of lower opacity; those below 0.004 are invisible."""
     up: Literal["y", "z"] | None = None
     """Axis of a given file that points up, if its program did not keep to the axes of the format."""
+    gaussians: Count | None = None
+    """For .html: largest number of Gaussians, 300,000 by default; similar neighbours are merged."""
+    split: bool = False
+    """For .html: write the data to a folder beside the page, for scenes that are large for one file."""
+    title: str | None = None
+    """For .html: title of the page; by default the name of the scene."""
     prediction: ScenePrediction = field(default_factory=ScenePrediction)
 
     def run(self) -> int:
@@ -42,13 +53,19 @@ class Export:
         from pansplat.gaussians.ply import save_points
         from pansplat.gaussians.scene import prune
 
-        require_output_file("--out", self.out, SCENE_SUFFIXES)
+        require_output_file("--out", self.out, (*SCENE_SUFFIXES, _PAGE_SUFFIX))
         if self.points and find_scene_suffix(self.out) != ".ply":
             raise InputError(f"--points writes a .ply, got {self.out}; leave it out, or choose another name")
+        is_page = self.out.suffix.lower() == _PAGE_SUFFIX
+        if not is_page and (self.gaussians is not None or self.split or self.title is not None):
+            raise InputError(f"--gaussians, --split and --title are for an .html page, got {self.out}; leave them out")
         scene = self.prediction.open(self.path)
         if self.up is not None:
             scene = scene.rotated(_rotation_from(self.up))
         gaussians = prune(scene.gaussians, degree=self.degree, min_opacity=self.min_opacity)
+        if is_page:
+            self._write_page(dataclasses.replace(scene, gaussians=gaussians))
+            return 0
         if self.points:
             save_points(gaussians, self.out)
         else:
@@ -57,6 +74,19 @@ class Export:
         kind = "points" if self.points else "Gaussians"
         print(f"{self.out}: {len(gaussians):,} {kind}, {size:,} bytes ({size / max(len(gaussians), 1):.1f} each)")
         return 0
+
+    def _write_page(self, scene: Scene) -> None:
+        """Write the web page and print its size."""
+        from pansplat.web import DEFAULT_GAUSSIANS, write_page
+
+        count = DEFAULT_GAUSSIANS if self.gaussians is None else self.gaussians
+        title = self.title or self.path.resolve().stem.replace("_", " ")
+        with progress_bar() as progress:
+            page = write_page(scene, self.out, gaussians=count, split=self.split, title=title, progress=progress)
+        beside = f" and {len(page.files) - 1} files in {page.files[1].parent.name}/" if self.split else ""
+        print(
+            f"{self.out}{beside}: {page.num_gaussians:,} Gaussians, {page.num_bytes / 1e6:.1f} MB; open it in a browser"
+        )
 
 
 def _rotation_from(up: Literal["y", "z"]) -> Tensor:

@@ -1,0 +1,123 @@
+"""The Gaussians of a page as compressed bytes, which page.js reads.
+
+The layout is in docs/web.md.
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from pansplat.gaussians.harmonics import SH_0
+from pansplat.gaussians.scene import Gaussians
+
+MAX_DEGREE = 3  # of the harmonics of a page
+_CONSTANT_BYTES = 23  # of a Gaussian, without harmonics of degree 1 and above
+_MORTON_BITS = 10
+_CLIPPED = 1e-3  # fraction of colours beyond each end of the range of bytes
+
+
+@dataclass(frozen=True, eq=False)
+class PackedGaussians:
+    """Gaussians as bytes.
+
+    Attributes:
+        content: gzip of planes of bytes.
+        starts: index of the first Gaussian of each view, and the number of all Gaussians.
+        degree: of the harmonics.
+        color_range: colours of the bytes 0 and 255.
+        harmonics_scale: coefficient of the byte 127.
+    """
+
+    content: bytes
+    starts: tuple[int, ...]
+    degree: int
+    color_range: tuple[float, float]
+    harmonics_scale: float
+
+
+def count_bytes(count: int, degree: int) -> int:
+    """Size of the planes of a number of Gaussians before the compression."""
+    return count * (_CONSTANT_BYTES + 3 * ((degree + 1) ** 2 - 1))
+
+
+def pack_gaussians(
+    gaussians: Gaussians, origin: Float[np.ndarray, "3"], num_views: int, degree: int
+) -> PackedGaussians:
+    """Quantise and compress Gaussians.
+
+    Args:
+        gaussians: finite numbers, three channels, `views` below `num_views`.
+        origin: subtracted from the means.
+        degree: highest degree of harmonics that is kept, at most MAX_DEGREE.
+    """
+    degree = min(degree, gaussians.degree, MAX_DEGREE)
+    views = gaussians.views.cpu().numpy()
+    means = (gaussians.means.double().cpu().numpy() - origin).astype(np.float32)
+    # Neighbours in the file are neighbours in space, so that equal upper bytes follow each other.
+    order = np.lexsort((_morton_codes(means), views))
+    means, scales = means[order], np.abs(gaussians.scales.float().cpu().numpy()[order])
+    harmonics = gaussians.harmonics.float().cpu().numpy()[order]
+    colors = 0.5 + SH_0 * harmonics[:, 0]
+    low = (
+        min(0.0, float(np.quantile(colors, _CLIPPED))) if degree else 0.0
+    )  # without other harmonics black is the least
+    high = max(1.0, float(np.quantile(colors, 1 - _CLIPPED)))
+    planes = [
+        *(plane for axis in range(3) for plane in _split_floats(means[:, axis], 3)),
+        *(plane for axis in range(3) for plane in _split_floats(scales[:, axis], 2)),
+        *_split_words(_pack_quats(gaussians.quats.double().cpu().numpy()[order]), 4),
+        _to_bytes(gaussians.opacities.float().cpu().numpy()[order], 255.0),
+        *(_to_bytes(colors[:, channel] - low, 255.0 / (high - low)) for channel in range(3)),
+    ]
+    higher = harmonics[:, 1 : (degree + 1) ** 2].reshape(len(means), -1)
+    scale = max(float(np.quantile(np.abs(higher), 1 - _CLIPPED)) if higher.size else 0.0, 1e-6)
+    quantised = np.clip(np.round(higher * (127.0 / scale)), -127, 127).astype(np.int8).view(np.uint8)
+    content = gzip.compress(b"".join(plane.tobytes() for plane in (*planes, *quantised.T)), 9, mtime=0)
+    starts = np.searchsorted(views[order], np.arange(num_views + 1))
+    return PackedGaussians(content, tuple(starts.tolist()), degree, (low, high), scale)
+
+
+def _morton_codes(points: Float[np.ndarray, "n 3"]) -> np.ndarray:
+    """Positions along a Z-order curve through the box of the middle 98 % of the points."""
+    low, high = np.quantile(points, 0.01, axis=0), np.quantile(points, 0.99, axis=0)
+    size = np.maximum(high - low, 1e-12)
+    cells = np.clip((points - low) / size * (1 << _MORTON_BITS), 0, (1 << _MORTON_BITS) - 1).astype(np.int64)
+    codes = np.zeros(len(points), np.int64)
+    for bit in range(_MORTON_BITS):
+        for axis in range(3):
+            codes |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return codes
+
+
+def _split_words(words: np.ndarray, count: int) -> list[UInt8[np.ndarray, "n"]]:
+    """The `count` most significant bytes of 32-bit words, a plane each."""
+    return [(words >> np.uint32(24 - 8 * k)).astype(np.uint8) for k in range(count)]
+
+
+def _split_floats(values: Float[np.ndarray, "n"], count: int) -> list[UInt8[np.ndarray, "n"]]:
+    """The upper bytes of float32 numbers, rounded to the nearest."""
+    half = np.uint32(1 << (31 - 8 * count))
+    return _split_words(np.ascontiguousarray(values, np.float32).view(np.uint32) + half, count)
+
+
+def _pack_quats(quats: Float[np.ndarray, "n 4"]) -> np.ndarray:
+    """Unit quaternions in 32 bits: the index of the largest component, and the others with 10 bits each."""
+    norms = np.linalg.norm(quats, axis=1, keepdims=True)
+    quats = np.where(norms > 0, quats / np.maximum(norms, 1e-300), (1.0, 0.0, 0.0, 0.0))
+    largest = np.abs(quats).argmax(axis=1)
+    quats = quats * np.where(np.take_along_axis(quats, largest[:, None], 1) < 0, -1.0, 1.0)
+    others = np.array([[k for k in range(4) if k != index] for index in range(4)])[largest]
+    values = np.round(np.take_along_axis(quats, others, 1) * (511 * math.sqrt(2))).astype(np.int64) + 511
+    words = largest.astype(np.int64) << 30
+    for k in range(3):
+        words |= np.clip(values[:, k], 0, 1022) << (20 - 10 * k)
+    return words.astype(np.uint32)
+
+
+def _to_bytes(values: Float[np.ndarray, "n"], factor: float) -> UInt8[np.ndarray, "n"]:
+    return np.clip(np.round(values * factor), 0, 255).astype(np.uint8)

@@ -1,0 +1,625 @@
+"use strict";
+// The page: loads the scene, draws it with WebGL 2, and moves the camera. docs/web.md describes the data.
+// Convention: OpenCV axes (x right, y down, z forward), as everywhere in pansplat. Positions are in the scene's world,
+// moved by its origin. Matrices are arrays of rows.
+
+(() => {
+  const byId = (id) => document.getElementById(id);
+  const canvas = byId("view"), bar = byId("bar");
+  const MAX_PITCH = 89.9 * Math.PI / 180;
+  const MIN_FOV = 20, MAX_FOV = 110;  // degrees, vertical
+  const MIN_WEIGHT = 1e-4;            // of a view: with it, the other views fill the holes of a view at its own camera
+  const BATCH = HEADER.batch;         // quads of one instance
+  const MAX_PIXELS = 3e6;             // of the canvas: limits the memory of its render targets
+
+  // ---- loading ----
+
+  // The step of the progress bar becomes visible before the next one starts.
+  const report = (fraction) => {
+    bar.value = fraction;
+    return new Promise((resolve) => setTimeout(resolve));
+  };
+
+  async function load() {
+    const gzip = [];
+    for (let i = 0; i < PARTS.length; i++) {
+      const text = atob(PARTS[i]), bytes = new Uint8Array(text.length);
+      for (let k = 0; k < text.length; k++) bytes[k] = text.charCodeAt(k);
+      gzip.push(bytes);
+      PARTS[i] = null;
+      if (i % 4 === 3) await report(0.7 + 0.1 * i / PARTS.length);
+    }
+    if (PARTS.length !== HEADER.parts) throw new Error("A part of the scene is missing. Copy the whole folder.");
+    await report(0.8);
+    const stream = new Blob(gzip).stream().pipeThrough(new DecompressionStream("gzip"));
+    const data = new Uint8Array(await new Response(stream).arrayBuffer());
+    await report(0.9);
+    return unpack(data);
+  }
+
+  // Planes of bytes to arrays: the inverse of pansplat.web.data.pack_gaussians.
+  function unpack(data) {
+    const count = HEADER.count, plane = (k) => data.subarray(k * count, (k + 1) * count);
+    const word = new DataView(new ArrayBuffer(4));
+    const joined = (k, bytes) => {
+      const out = new Float32Array(count), planes = [...Array(bytes)].map((_, b) => plane(k + b));
+      const bits = new Uint32Array(out.buffer);
+      for (let b = 0; b < bytes; b++) for (let i = 0; i < count; i++) bits[i] |= planes[b][i] << (24 - 8 * b);
+      return out;
+    };
+    const means = new Float32Array(3 * count), geometry = new Float32Array(12 * count);
+    for (let axis = 0; axis < 3; axis++) {
+      const values = joined(3 * axis, 3);
+      for (let i = 0; i < count; i++) means[3 * i + axis] = geometry[12 * i + axis] = values[i];
+    }
+    for (let axis = 0; axis < 3; axis++) {
+      const values = joined(9 + 2 * axis, 2);
+      for (let i = 0; i < count; i++) geometry[12 * i + 8 + axis] = values[i];
+    }
+    const quats = [15, 16, 17, 18].map(plane), colors = new Uint8Array(4 * count);
+    for (let i = 0; i < count; i++) {
+      for (let b = 0; b < 4; b++) word.setUint8(b, quats[b][i]);
+      const packed = word.getUint32(0), largest = packed >>> 30;
+      let rest = 1, shift = 20;
+      for (let k = 0; k < 4; k++) {
+        if (k === largest) continue;
+        const value = (((packed >>> shift) & 1023) / 511 - 1) * Math.SQRT1_2;
+        geometry[12 * i + 4 + k] = value;
+        rest -= value * value;
+        shift -= 10;
+      }
+      geometry[12 * i + 4 + largest] = Math.sqrt(Math.max(rest, 0));
+      geometry[12 * i + 3] = plane(19)[i] / 255;
+      for (let channel = 0; channel < 3; channel++) colors[4 * i + channel] = plane(20 + channel)[i];
+    }
+    const terms = (HEADER.degree + 1) ** 2 - 1;
+    const harmonics = terms ? new Int8Array(3 * terms * count) : null;
+    for (let k = 0; k < 3 * terms; k++) {
+      const values = plane(23 + k);
+      for (let i = 0; i < count; i++) harmonics[3 * terms * i + k] = values[i];
+    }
+    return { means, geometry, colors, harmonics };
+  }
+
+  // ---- drawing ----
+
+  // Draws to a WebGL 2 context: one layer for each view, and their mean by nearness (docs/rendering.md, section 7).
+  class Renderer {
+    constructor(gl, scene) {
+      this.gl = gl;
+      const float = gl.getExtension("EXT_color_buffer_float");
+      const half = float || gl.getExtension("EXT_color_buffer_half_float");
+      this.format = half ? gl.RGBA16F : gl.RGBA8;
+      this.splat = this.link(SHADERS.splat);
+      this.accumulate = this.link(SHADERS.accumulate);
+      this.resolve = this.link(SHADERS.resolve);
+      const width = 1024, height = Math.ceil(HEADER.count / width);
+      if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error("The scene is too large for this device.");
+      this.rows = [width, height];
+      this.geometry = this.upload(scene.geometry, 3 * width, height, gl.RGBA32F, gl.FLOAT, 12 * width * height);
+      this.colors = this.upload(scene.colors, width, height, gl.RGBA8, gl.UNSIGNED_BYTE, 4 * width * height);
+      this.order = this.makeTexture(width, height, gl.R32UI);
+      this.splats = gl.createVertexArray();
+      this.screen = gl.createVertexArray();
+      gl.bindVertexArray(this.splats);
+      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+      const corners = Uint16Array.from({ length: 6 * BATCH }, (_, i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6]);
+      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+      this.targets = [];
+      this.size = [0, 0];
+    }
+
+    link([vertex, fragment]) {
+      const gl = this.gl, program = gl.createProgram();
+      for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+        const shader = gl.createShader(kind);
+        gl.shaderSource(shader, source);
+        gl.compileShader(shader);
+        gl.attachShader(program, shader);
+      }
+      gl.linkProgram(program);
+      if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
+        const logs = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader));
+        throw new Error(["The graphics driver rejects a shader.", gl.getProgramInfoLog(program), ...logs].join(" "));
+      }
+      const places = {};
+      for (let i = 0; i < gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS); i++) {
+        const { name } = gl.getActiveUniform(program, i);
+        places[name.replace("[0]", "")] = gl.getUniformLocation(program, name);
+      }
+      return { program, places };
+    }
+
+    makeTexture(width, height, format) {
+      const gl = this.gl, texture = gl.createTexture();
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+      gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
+      for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
+      return texture;
+    }
+
+    upload(values, width, height, format, type, length) {
+      const texture = this.makeTexture(width, height, format);
+      this.write(texture, values, width, height, this.gl.RGBA, type, length);
+      return texture;
+    }
+
+    write(texture, values, width, height, channels, type, length) {
+      const gl = this.gl, padded = new values.constructor(length);
+      padded.set(values);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, height, channels, type, padded);
+    }
+
+    // Replaces the drawing order, and the colours if they depend on the position.
+    setSorted({ order, colors }) {
+      const gl = this.gl, texels = this.rows[0] * this.rows[1];
+      this.write(this.order, order, ...this.rows, gl.RED_INTEGER, gl.UNSIGNED_INT, texels);
+      if (colors) this.write(this.colors, colors, ...this.rows, gl.RGBA, gl.UNSIGNED_BYTE, 4 * texels);
+    }
+
+    // The layer of one view, and the weighted sum of layers with the sum of weights.
+    resize(width, height) {
+      if (this.size[0] === width && this.size[1] === height) return;
+      const gl = this.gl;
+      for (const { framebuffer, textures } of this.targets) {
+        gl.deleteFramebuffer(framebuffer);
+        textures.forEach((texture) => gl.deleteTexture(texture));
+      }
+      this.targets = [1, 2].map((count) => {
+        const framebuffer = gl.createFramebuffer(), textures = [];
+        gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+        const attachments = [...Array(count)].map((_, i) => gl.COLOR_ATTACHMENT0 + i);
+        for (const attachment of attachments) {
+          textures.push(this.makeTexture(width, height, this.format));
+          gl.framebufferTexture2D(gl.FRAMEBUFFER, attachment, gl.TEXTURE_2D, textures.at(-1), 0);
+        }
+        gl.drawBuffers(attachments);
+        return { framebuffer, textures };
+      });
+      this.size = [width, height];
+    }
+
+    // Draws to the canvas. `rotation` is camera to world; `focal` in pixels.
+    draw({ position, rotation, focal }, weights) {
+      const gl = this.gl, { width, height } = gl.canvas;
+      this.resize(width, height);
+      const [layer, sum] = this.targets, half = [0.5 * width / focal, 0.5 * height / focal];
+      gl.viewport(0, 0, width, height);
+      gl.disable(gl.DEPTH_TEST);
+      gl.activeTexture(gl.TEXTURE0);
+      this.setCamera(position, rotation, focal, half);
+      HEADER.views.forEach(({ start, count }, view) => {
+        gl.bindFramebuffer(gl.FRAMEBUFFER, layer.framebuffer);
+        gl.clearBufferfv(gl.COLOR, 0, [0, 0, 0, 0]);
+        if (count) this.drawLayer(start, count);
+        gl.bindFramebuffer(gl.FRAMEBUFFER, sum.framebuffer);
+        this.addLayer(layer.textures[0], weights[view], view === 0);
+      });
+      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+      gl.disable(gl.BLEND);
+      const { program, places } = this.resolve;
+      gl.useProgram(program);
+      gl.uniform3f(places.background, 0, 0, 0);
+      gl.uniform1i(places.difference, 0);
+      ["first_color", "first_depth", "second_color", "second_depth"].forEach((name, i) => {
+        gl.uniform1i(places[name], i % 2);
+      });
+      sum.textures.forEach((texture, unit) => {
+        gl.activeTexture(gl.TEXTURE0 + unit);
+        gl.bindTexture(gl.TEXTURE_2D, texture);
+      });
+      gl.bindVertexArray(this.screen);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    }
+
+    setCamera(position, rotation, focal, [x, y]) {
+      const gl = this.gl, { program, places } = this.splat, { width, height } = gl.canvas;
+      gl.useProgram(program);
+      // GLSL reads columns: the rows of camera-to-world are the columns of its inverse.
+      gl.uniformMatrix3fv(places.world_to_camera, false, rotation.flat());
+      gl.uniform3fv(places.position, position);
+      gl.uniform1f(places.near, HEADER.near);
+      gl.uniform1i(places.kernel, 0);
+      gl.uniform1f(places.filter_variance, HEADER.filterVariance / (focal * focal));
+      gl.uniform1i(places.compensate, 1);
+      gl.uniform1f(places.dilation, 0);
+      gl.uniform2f(places.half_size, x, y);
+      gl.uniform1f(places.margin, 0.02 / focal);
+      gl.uniform2f(places.principal, 0.5 * width, 0.5 * height);
+      gl.uniform1f(places.focal, focal);
+      gl.uniform2fv(places.color_range, HEADER.colorRange);
+      const sides = [[-1, 0, x], [1, 0, x], [0, -1, y], [0, 1, y]].map((side) => scaled(side, 1 / Math.hypot(...side)));
+      gl.uniform3fv(places.sides, sides.flat());
+      gl.uniform1i(places.geometry, 0);
+      gl.uniform1i(places.colors, 1);
+      gl.uniform1i(places.order, 2);
+    }
+
+    drawLayer(start, count) {
+      const gl = this.gl;
+      gl.useProgram(this.splat.program);
+      [this.geometry, this.colors, this.order].forEach((texture, unit) => {
+        gl.activeTexture(gl.TEXTURE0 + unit);
+        gl.bindTexture(gl.TEXTURE_2D, texture);
+      });
+      gl.enable(gl.BLEND);
+      gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+      gl.bindVertexArray(this.splats);
+      gl.uniform2i(this.splat.places.segment, start, count);
+      gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(count / BATCH));
+    }
+
+    addLayer(texture, weight, first) {
+      const gl = this.gl, { program, places } = this.accumulate;
+      gl.useProgram(program);
+      gl.uniform1f(places.weight, weight);
+      gl.uniform1i(places.layer_color, 0);
+      gl.uniform1i(places.layer_depth, 0);
+      gl.uniform1i(places.with_depth, 0);
+      gl.activeTexture(gl.TEXTURE0);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+      if (first) gl.disable(gl.BLEND);
+      else gl.enable(gl.BLEND);
+      gl.blendFunc(gl.ONE, gl.ONE);
+      gl.bindVertexArray(this.screen);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    }
+  }
+
+  // Weights of the views at a position: normalised inverse distances (docs/rendering.md, section 7).
+  function blendWeights(position) {
+    const distances = HEADER.views.map((view) => Math.hypot(...minus(position, view.position)));
+    const nearest = Math.min(...distances);
+    const closeness = distances.map((distance) => distance > 0 ? nearest / distance : 1);
+    const sum = closeness.reduce((a, b) => a + b);
+    return closeness.map((value) => Math.max(value / sum, MIN_WEIGHT));
+  }
+
+  // ---- camera ----
+
+  const minus = (a, b) => a.map((value, i) => value - b[i]);
+  const plus = (a, b) => a.map((value, i) => value + b[i]);
+  const scaled = (a, factor) => a.map((value) => value * factor);
+  const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
+  const multiply = (a, b) => a.map((row) => b[0].map((_, k) => row.reduce((sum, value, i) => sum + value * b[i][k], 0)));
+  const column = (matrix, k) => matrix.map((row) => row[k]);
+  const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
+
+  const makeStart = () => ({ ...HEADER.start, position: [...HEADER.start.position], roll: 0 });
+  const camera = makeStart();
+
+  // Camera to world; positive yaw turns right, positive pitch up (viewer/camera.py). The device's motion adds a roll.
+  function rotationOf({ yaw, pitch, roll }) {
+    const [cy, sy, cp, sp, cr, sr] = [yaw, pitch, roll].flatMap((angle) => [Math.cos(angle), Math.sin(angle)]);
+    const turned = multiply([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]], [[1, 0, 0], [0, cp, -sp], [0, sp, cp]]);
+    return multiply(HEADER.level, multiply(turned, [[cr, -sr, 0], [sr, cr, 0], [0, 0, 1]]));
+  }
+
+  // Half the height of the image at distance 1. The field of view is that of a landscape image; a portrait one is taller.
+  const tangentOf = (width, height) => {
+    const tall = clamp(Math.sqrt(height / width), 1, 1.5);
+    return tall * Math.tan(0.5 * camera.fov * Math.PI / 180);
+  };
+
+  function turn(yaw, pitch) {
+    camera.yaw += yaw;
+    camera.pitch = clamp(camera.pitch + pitch, -MAX_PITCH, MAX_PITCH);
+    changed();
+  }
+
+  // Moves along the camera's heading: right, up and forward in metres; stays near the panoramas.
+  function walk(right, up, forward) {
+    const [cy, sy] = [Math.cos(camera.yaw), Math.sin(camera.yaw)];
+    const local = [cy * right + sy * forward, -up, -sy * right + cy * forward];
+    const target = plus(camera.position, HEADER.level.map((row) => dot(row, local)));
+    const from = nearestSpot(target), offset = minus(target, from), distance = Math.hypot(...offset);
+    camera.position = distance > HEADER.limit ? plus(from, scaled(offset, HEADER.limit / distance)) : target;
+    changed();
+  }
+
+  function nearestSpot(position) {
+    const distance = (spot) => Math.hypot(...minus(position, spot));
+    return HEADER.spots.map((spot) => spot.position).reduce((a, b) => distance(b) < distance(a) ? b : a);
+  }
+
+  // A smooth flight to a panorama; the direction of view stays the user's.
+  let flight = null, touring = false;
+  function flyTo(spot) {
+    const from = [...camera.position], to = HEADER.spots[spot].position, length = Math.hypot(...minus(to, from));
+    const seconds = clamp(1.2 * length / HEADER.speed, 0.6, 3);
+    flight = { spot, from, to, seconds, began: performance.now() };
+    changed();
+  }
+
+  function advanceFlight(now) {
+    if (!flight) return;
+    const t = clamp((now - flight.began) / (1000 * flight.seconds), 0, 1);
+    const eased = t * t * t * (t * (6 * t - 15) + 10);
+    camera.position = t < 1 ? plus(flight.from, scaled(minus(flight.to, flight.from), eased)) : [...flight.to];
+    changed();
+    if (t < 1) return;
+    const { spot } = flight;
+    flight = null;
+    if (touring) flyTo((spot + 1) % HEADER.spots.length);
+  }
+
+  function setTouring(value) {
+    touring = value && HEADER.spots.length > 1;
+    byId("play").setAttribute("aria-pressed", touring);
+    byId("play").innerHTML = touring ? "&#10074;&#10074;" : "&#9654;";
+    if (!touring) flight = null;
+    else if (!flight) {
+      const positions = HEADER.spots.map((spot) => spot.position);
+      flyTo((positions.indexOf(nearestSpot(camera.position)) + 1) % positions.length);
+    }
+    changed();
+  }
+
+  function goHome() {
+    setTouring(false);
+    Object.assign(camera, makeStart());
+    changed();
+  }
+
+  // ---- input ----
+
+  const held = new Set(), fingers = new Map();
+  const MOVES = {
+    KeyW: [0, 0, 1], ArrowUp: [0, 0, 1], KeyS: [0, 0, -1], ArrowDown: [0, 0, -1], KeyA: [-1, 0, 0], ArrowLeft: [-1, 0, 0],
+    KeyD: [1, 0, 0], ArrowRight: [1, 0, 0], KeyE: [0, 1, 0], KeyQ: [0, -1, 0],
+  };
+  const PRESSES = {
+    Space: () => setTouring(!touring),
+    KeyF: () => toggleFull(),
+    KeyR: () => goHome(),
+    KeyH: () => byId("keys").showModal(),
+  };
+
+  function onKey(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey || byId("keys").open) return;
+    const onButton = event.target.tagName === "BUTTON" && (event.code === "Space" || event.code === "Enter");
+    if (onButton) return;
+    const digit = /^(Digit|Numpad)([1-9])$/.exec(event.code);
+    if (MOVES[event.code]) held.add(event.code);
+    else if (PRESSES[event.code] && !event.repeat) PRESSES[event.code]();
+    else if (digit && HEADER.spots[digit[2] - 1]) flyTo(digit[2] - 1);
+    else return;
+    event.preventDefault();
+    if (MOVES[event.code]) setTouring(false);
+  }
+
+  function walkByKeys(seconds, fast) {
+    const step = [0, 0, 0];
+    for (const code of held) MOVES[code].forEach((value, i) => { step[i] += value; });
+    if (step.some((value) => value)) walk(...scaled(step, seconds * HEADER.speed * (fast ? 3 : 1)));
+  }
+
+  // One finger or the mouse turns: the scene follows the pointer. Two fingers pull the scene: sideways, and forward by
+  // moving down or apart.
+  function onMove(event) {
+    const last = fingers.get(event.pointerId);
+    if (!last) return;
+    const moved = [event.clientX - last[0], event.clientY - last[1]];
+    const before = [...fingers.values()];
+    fingers.set(event.pointerId, [event.clientX, event.clientY]);
+    if (before.length === 1) {
+      const { clientWidth, clientHeight } = canvas;
+      const radians = 2 * tangentOf(clientWidth, clientHeight) / clientHeight;
+      turn(-moved[0] * radians, moved[1] * radians);
+    } else if (before.length === 2) {
+      const apart = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]);
+      const metres = 2 * HEADER.speed / Math.min(canvas.clientWidth, canvas.clientHeight);
+      const pinch = apart([...fingers.values()]) - apart(before);
+      setTouring(false);
+      walk(-0.5 * moved[0] * metres, 0, (0.5 * moved[1] + pinch) * metres);
+    }
+  }
+
+  // Look around by the device's motion: its axes in the earth's (east, north, up), turned by the screen's angle.
+  let motion = null;
+  function onOrientation({ alpha, beta, gamma }) {
+    if (alpha === null || beta === null || gamma === null) return;
+    const [ca, sa, cb, sb, cg, sg] = [alpha, beta, gamma].map((degrees) => degrees * Math.PI / 180)
+      .flatMap((angle) => [Math.cos(angle), Math.sin(angle)]);
+    const toEarth = multiply([[ca, -sa, 0], [sa, ca, 0], [0, 0, 1]],
+      multiply([[1, 0, 0], [0, cb, -sb], [0, sb, cb]], [[cg, 0, sg], [0, 1, 0], [-sg, 0, cg]]));
+    const angle = (screen.orientation ? screen.orientation.angle : 0) * Math.PI / 180;
+    const inLevel = (axis) => {  // x east, y down, z north
+      const [east, north, up] = toEarth.map((row) => dot(row, axis));
+      return [east, -up, north];
+    };
+    const right = inLevel([Math.cos(angle), -Math.sin(angle), 0]), forward = inLevel([0, 0, -1]);
+    const yaw = Math.atan2(forward[0], forward[2]), pitch = Math.asin(clamp(-forward[1], -1, 1));
+    const across = [Math.cos(yaw), 0, -Math.sin(yaw)];
+    const down = [Math.sin(yaw) * Math.sin(pitch), Math.cos(pitch), Math.cos(yaw) * Math.sin(pitch)];
+    if (motion.last === null) motion.last = yaw;
+    camera.yaw += yaw - motion.last;  // so that a drag can turn the camera, too
+    motion.last = yaw;
+    camera.pitch = clamp(pitch, -MAX_PITCH, MAX_PITCH);
+    camera.roll = Math.atan2(dot(right, down), dot(right, across));
+    changed();
+  }
+
+  async function toggleMotion() {
+    if (motion) {
+      removeEventListener("deviceorientation", onOrientation);
+      motion = null;
+      camera.roll = 0;
+    } else {
+      const ask = DeviceOrientationEvent.requestPermission;  // iOS only
+      if (ask && await ask.call(DeviceOrientationEvent) !== "granted") return;
+      motion = { last: null };
+      addEventListener("deviceorientation", onOrientation);
+    }
+    byId("motion").setAttribute("aria-pressed", motion !== null);
+    changed();
+  }
+
+  function toggleFull() {
+    const root = document.documentElement;
+    if (document.fullscreenElement) document.exitFullscreen();
+    else if (root.requestFullscreen) root.requestFullscreen().catch(() => {});
+  }
+
+  function listen() {
+    addEventListener("keydown", onKey);
+    addEventListener("keydown", (event) => { fast = event.shiftKey; });
+    addEventListener("keyup", (event) => { fast = event.shiftKey; held.delete(event.code); });
+    addEventListener("blur", () => held.clear());
+    addEventListener("resize", changed);
+    canvas.addEventListener("pointerdown", (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      fingers.set(event.pointerId, [event.clientX, event.clientY]);
+      canvas.focus({ preventScroll: true });
+    });
+    canvas.addEventListener("pointermove", onMove);
+    for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => fingers.delete(event.pointerId));
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      camera.fov = clamp(camera.fov * Math.exp(0.001 * clamp(event.deltaY, -200, 200)), MIN_FOV, MAX_FOV);
+      changed();
+    }, { passive: false });
+    byId("play").onclick = () => setTouring(!touring);
+    byId("full").onclick = toggleFull;
+    byId("help").onclick = () => byId("keys").showModal();
+    byId("motion").onclick = toggleMotion;
+    byId("motion").hidden = !("DeviceOrientationEvent" in window && matchMedia("(pointer: coarse)").matches);
+    byId("full").hidden = !document.documentElement.requestFullscreen;
+    byId("play").hidden = HEADER.spots.length < 2;
+    byId("buttons").hidden = false;
+  }
+
+  // ---- hotspots ----
+
+  function makeSpots() {
+    return HEADER.spots.map((spot, index) => {
+      const button = document.createElement("button");
+      button.title = button.ariaLabel = `Go to ${spot.name}`;
+      button.onclick = () => {
+        setTouring(false);
+        flyTo(index);
+        canvas.focus({ preventScroll: true });
+      };
+      byId("spots").append(button);
+      return button;
+    });
+  }
+
+  // A ring on the floor under each panorama, in perspective.
+  function placeSpots(rotation) {
+    const { clientWidth: width, clientHeight: height } = canvas, focal = 0.5 * height / tangentOf(width, height);
+    HEADER.spots.forEach((spot, index) => {
+      const button = spots[index], offset = minus(spot.mark, camera.position);
+      const [x, y, z] = [0, 1, 2].map((k) => dot(column(rotation, k), offset));
+      const flat = Math.hypot(...minus(spot.position, camera.position));
+      button.hidden = z < 0.1 * spot.radius || flat < 2 * spot.radius;
+      if (button.hidden) return;
+      const size = clamp(2 * spot.radius * focal / z / 64, 0.25, 2), tilt = clamp(y / Math.hypot(x, y, z), 0.25, 1);
+      button.style.transform = `translate(${0.5 * width + focal * x / z}px, ${0.5 * height + focal * y / z}px) scale(${size}, ${size * tilt})`;
+    });
+  }
+
+  // ---- frames ----
+
+  // A frame is drawn only if something changed. While it moves, the scale of the resolution follows the time between
+  // frames; at rest the image has the full resolution.
+  let renderer = null, spots = [], fast = false, dirty = true, scale = 1, lastChange = 0, lastFrame = 0, drawnScale = 0;
+  let sorter = null, sorting = false, sortedFor = null, latest = null;
+  const changed = () => { dirty = true; lastChange = performance.now(); };
+
+  function requestSort() {
+    if (sorting || (sortedFor && sortedFor.every((value, i) => value === camera.position[i]))) return;
+    sorting = true;
+    sorter.postMessage({ position: [...camera.position] });
+  }
+
+  function onSorted({ data }) {
+    sorting = false;
+    sortedFor = data.position;
+    latest = data;
+    if (renderer) renderer.setSorted(data);
+    dirty = true;
+  }
+
+  function drawAt(width, height) {
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    const rotation = rotationOf(camera), focal = 0.5 * height / tangentOf(width, height);
+    renderer.draw({ position: camera.position, rotation, focal }, blendWeights(camera.position));
+    return rotation;
+  }
+
+  function onFrame(now) {
+    requestAnimationFrame(onFrame);
+    const elapsed = now - lastFrame;
+    lastFrame = now;
+    walkByKeys(Math.min(elapsed, 100) / 1000, fast);
+    advanceFlight(now);
+    requestSort();
+    const moving = now - lastChange < 200;
+    if (moving && drawnScale && elapsed < 1000) scale = clamp(scale * (elapsed > 45 ? 0.85 : elapsed < 25 ? 1.05 : 1), 0.25, 1);
+    const wanted = moving ? scale : 1;
+    if (!renderer || !sortedFor || !(dirty || wanted > drawnScale)) return;
+    dirty = false;
+    drawnScale = wanted;
+    const { clientWidth, clientHeight } = canvas, ratio = Math.min(devicePixelRatio || 1, 2);
+    const full = Math.min(ratio, Math.sqrt(MAX_PIXELS / (clientWidth * clientHeight || 1)));
+    const [width, height] = [clientWidth, clientHeight].map((side) => Math.max(Math.round(side * full * wanted), 1));
+    placeSpots(drawAt(width, height));
+  }
+
+  function fail(error) {
+    byId("cover").className = "failed";
+    byId("message").textContent = error.message || String(error);
+    bar.hidden = true;
+    console.error(error);
+  }
+
+  async function main() {
+    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
+    if (!gl) throw new Error("This page needs WebGL 2, which this browser or device does not have.");
+    const scene = await load();
+    sorter = new Worker(URL.createObjectURL(new Blob([SORTER])));
+    const first = new Promise((resolve, reject) => {
+      sorter.onmessage = (event) => { onSorted(event); resolve(); };
+      sorter.onerror = (event) => reject(new Error(`The sorting failed: ${event.message}`));
+    });
+    const { count, views, harmonicsScale, colorRange: range } = HEADER;
+    const base = scene.harmonics ? scene.colors : null;
+    sorter.postMessage({ count, views, means: scene.means, harmonics: scene.harmonics, base, harmonicsScale, range });
+    requestSort();
+    renderer = new Renderer(gl, scene);
+    await first;
+    await report(1);
+    canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); renderer = null; });
+    canvas.addEventListener("webglcontextrestored", () => {
+      renderer = new Renderer(gl, scene);
+      renderer.setSorted(latest);
+      changed();
+    });
+    listen();
+    spots = makeSpots();
+    requestAnimationFrame(onFrame);
+    byId("cover").className = "done";
+    setTimeout(() => byId("cover").remove(), 700);
+  }
+
+  // For scripts: `await pansplat.ready`; `pansplat.camera` is {position, yaw, pitch, roll, fov}; `await
+  // pansplat.render(width, height)` draws the camera's view with an order for its position and returns a PNG's data URL.
+  window.pansplat = {
+    camera,
+    ready: main(),
+    async render(width, height) {
+      await this.ready;
+      const place = [...camera.position];
+      while (!sortedFor.every((value, i) => value === place[i])) await new Promise((resolve) => setTimeout(resolve, 5));
+      drawAt(width, height);
+      const image = canvas.toDataURL("image/png");
+      drawnScale = 0;
+      changed();
+      return image;
+    },
+  };
+  window.pansplat.ready.catch(fail);
+})();

@@ -1,0 +1,294 @@
+"""Writing of a page: the reduced scene, the data of its panoramas, a poster and the program in one HTML file."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import hashlib
+import html
+import io
+import json
+import math
+import re
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.spatial.distance import cdist
+
+from pansplat import constants, pipeline
+from pansplat.atomic import replacing
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Scene, prune
+from pansplat.geometry.path import path_poses
+from pansplat.geometry.world import working_factor
+from pansplat.predictor import Progress
+from pansplat.refinement.budget import merge_to
+from pansplat.web.data import MAX_DEGREE, PackedGaussians, count_bytes, pack_gaussians
+
+DEFAULT_GAUSSIANS = 300_000  # phones draw and hold them
+MAX_GAUSSIANS = 4_000_000  # rows of 1024 in a texture of 4096 rows, which every WebGL 2 device has
+MAX_FILE_BYTES = 64_000_000  # of a page in one file
+_TARGET_BYTES = 15_000_000  # harmonics of higher degree are left out of larger pages
+_PART_BYTES = 1_500_000  # of the data between two steps of the progress bar; divisible by 3
+_MERGE_HEIGHT = 512  # rows of the images that the mergers are measured in
+_POSTER_SIZE = (540, 960)
+_START_FOV = 75.0  # degrees, vertical
+_SPEED = 0.3  # walking, fraction of the reach a second
+_BATCH = 256  # quads that are drawn together
+_SHADERS = {"splat": ("page.vert", "splat.frag"), "accumulate": ("screen.vert", "accumulate.frag")}
+_SHADERS |= {"resolve": ("screen.vert", "resolve.frag")}
+_INCLUDE = re.compile(r'^#include "([^"]+)"$', re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class PageFiles:
+    """What was written.
+
+    Attributes:
+        files: the page, and its parts if it is split.
+        num_bytes: of all files.
+        num_gaussians: in the page.
+        degree: of its harmonics.
+    """
+
+    files: tuple[Path, ...]
+    num_bytes: int
+    num_gaussians: int
+    degree: int
+
+
+def write_page(
+    scene: Scene,
+    path: Path | str,
+    *,
+    gaussians: int = DEFAULT_GAUSSIANS,
+    split: bool = False,
+    title: str | None = None,
+    progress: Progress | None = None,
+) -> PageFiles:
+    """Write a scene as a web page.
+
+    Args:
+        scene: any number of panoramas; without one the page starts in the middle of the Gaussians.
+        path: the .html file.
+        gaussians: largest number of Gaussians; similar neighbours are merged.
+        split: write the data to the folder `NAME_files` beside the page, for large scenes.
+        title: of the page; by default the name of the file.
+        progress: called with a description of the current work and the completed fraction.
+
+    Raises:
+        InputError: the scene has no visible Gaussians, the page would be too large, or it cannot be written.
+    """
+    path = Path(path)
+    report: Progress = progress or (lambda what, fraction: None)
+    if not 1 <= gaussians <= MAX_GAUSSIANS:
+        raise InputError(f"`gaussians` must be 1 to {MAX_GAUSSIANS:,} in a page, got {gaussians:,}")
+    report("checking the scene", 0.0)
+    scene = _prepare(scene)
+    if len(scene.gaussians) > gaussians:
+        report("merging Gaussians", 0.1)
+        height = min(scene.height, _MERGE_HEIGHT)
+        scene = merge_to(scene, (height, 2 * height), gaussians)
+    report("compressing", 0.6)
+    degree = _choose_degree(scene)
+    origin = scene.cam2world[:, :3, 3].mean(0).numpy()
+    packed = pack_gaussians(scene.gaussians, origin, len(scene.cam2world), degree)
+    report("drawing the poster", 0.8)
+    poster = _draw_poster(scene)
+    report("writing", 0.9)
+    return _write_files(path, scene, packed, origin, poster, split, title or path.stem)
+
+
+def _prepare(scene: Scene) -> Scene:
+    """The visible Gaussians on the CPU, in a unit near metres; with a camera in the middle if there is none."""
+    scene = scene.scaled(working_factor(scene.near))
+    gaussians = prune(scene.gaussians.to(device="cpu"), min_opacity=constants.ALPHA_CUT)
+    numbers = (gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities[:, None])
+    finite = torch.stack([(value.abs() <= constants.MAX_MAGNITUDE).all(1) for value in numbers]).all(0)
+    gaussians = gaussians.select(finite & (gaussians.harmonics.abs() <= constants.MAX_MAGNITUDE).flatten(1).all(1))
+    if not len(gaussians):
+        raise InputError(
+            "the scene has no visible Gaussians, and a page needs at least one; check it with `pansplat info`"
+        )
+    poses, names = scene.cam2world.double().cpu(), scene.names
+    if not len(poses):
+        poses, names = torch.eye(4, dtype=torch.float64)[None], ("start",)
+        poses[0, :3, 3] = gaussians.means.double().median(0).values
+    if len(poses) < 2 or int(gaussians.views.max()) >= len(poses):
+        # The Gaussians of all views are drawn together.
+        gaussians = dataclasses.replace(gaussians, views=torch.zeros_like(gaussians.views))
+    names = tuple(names[k] if k < len(names) else f"panorama {k + 1}" for k in range(len(poses)))
+    return dataclasses.replace(scene, gaussians=gaussians, cam2world=poses, names=names)
+
+
+def _choose_degree(scene: Scene) -> int:
+    """The highest degree of harmonics with which the page has its target size even if nothing is compressed."""
+    count = len(scene.gaussians)
+    degrees = range(min(scene.gaussians.degree, MAX_DEGREE), 0, -1)
+    return next((degree for degree in degrees if count_bytes(count, degree) * 4 / 3 <= _TARGET_BYTES), 0)
+
+
+def _draw_poster(scene: Scene) -> bytes:
+    """A JPEG of the first view of the page."""
+    with torch.no_grad():
+        color = pipeline.render(
+            scene,
+            path_poses(scene.cam2world)[0],
+            size=_POSTER_SIZE,
+            layout="pinhole",
+            vertical_fov_degrees=_START_FOV,
+        ).color
+    pixels = (color.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
+    with io.BytesIO() as file:
+        Image.fromarray(pixels).save(file, "JPEG", quality=80, optimize=True)
+        return file.getvalue()
+
+
+def _describe_scene(scene: Scene, packed: PackedGaussians, origin: Float[np.ndarray, "3"]) -> dict[str, Any]:
+    """The numbers of a page, without those of single Gaussians; page.js reads them as HEADER."""
+    level = path_poses(scene.cam2world)[0, :3, :3].numpy()
+    positions = scene.cam2world[:, :3, 3].numpy() - origin
+    means = scene.gaussians.means.double().numpy() - origin
+    views = scene.gaussians.views.numpy()
+    offsets = means - positions[views]
+    distances = np.linalg.norm(offsets, axis=1)
+    reach = max(float(np.median(distances)), 1e-3)
+    below = offsets @ level[:, 1] > 0.8 * distances  # within 37 degrees of straight down
+    drops = [distances[below & (views == view)] for view in range(len(positions))]
+    heights = [float(np.median(drop)) if len(drop) > 20 else 0.0 for drop in drops]
+    spots = [
+        {
+            "name": name,
+            "position": _round(position),
+            "mark": _round(position + 0.9 * height * level[:, 1]),
+            "radius": round(0.12 * (height or 0.5 * reach), 6),
+        }
+        for name, position, height in zip(scene.names, positions, heights, strict=True)
+    ]
+    longest_step = float(minimum_spanning_tree(cdist(positions, positions)).toarray().max(initial=0.0))
+    views_of_page = [
+        {"position": _round(position), "start": start, "count": end - start}
+        for position, start, end in zip(positions, packed.starts, packed.starts[1:], strict=False)
+    ]
+    return {
+        "count": len(scene.gaussians),
+        "degree": packed.degree,
+        "colorRange": packed.color_range,
+        "harmonicsScale": packed.harmonics_scale,
+        "views": views_of_page,
+        "spots": spots,
+        "level": [_round(row) for row in level],
+        "start": {"position": _round(positions[0]), "yaw": 0.0, "pitch": 0.0, "fov": _START_FOV},
+        "batch": _BATCH,
+        "near": constants.NEAR,
+        "filterVariance": constants.FILTER_VARIANCE["angular"],
+        "speed": _SPEED * reach,
+        "limit": max(reach, 0.75 * longest_step),
+    }
+
+
+def _round(vector: np.ndarray) -> list[float]:
+    return [float(value) for value in np.float32(vector)]
+
+
+def _write_files(
+    path: Path,
+    scene: Scene,
+    packed: PackedGaussians,
+    origin: Float[np.ndarray, "3"],
+    poster: bytes,
+    split: bool,
+    title: str,
+) -> PageFiles:
+    """Write the page, and its parts if it is split."""
+    content = packed.content
+    parts = [base64.b64encode(content[k : k + _PART_BYTES]).decode() for k in range(0, len(content), _PART_BYTES)]
+    scripts = [f'addPart("{part}");\n' for part in parts]
+    folder = path.with_name(f"{path.stem}_files")
+    names = [f"{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}.js" for text in scripts] if split else []
+    tags = [f'<script src="{html.escape(f"{folder.name}/{name}")}"></script>' for name in names]
+    page = _fill_template(
+        script_sources="'self' file: blob:" if split else "blob:",
+        title=html.escape(title),
+        style=_read("page.css"),
+        poster=base64.b64encode(poster).decode(),
+        count=f"{len(scene.gaussians):,}",
+        header=_to_script(_describe_scene(scene, packed, origin) | {"parts": len(parts)}),
+        shaders=_to_script({name: [_read_shader(stage) for stage in stages] for name, stages in _SHADERS.items()}),
+        sorter=_to_script(_read("sorter.js")),
+        parts="\n".join(tags or (f"<script>{text}</script>" for text in scripts)),
+        program=_read("page.js"),
+    ).encode()
+    if len(page) > MAX_FILE_BYTES and not split:
+        fitting = math.floor(0.95 * len(scene.gaussians) * MAX_FILE_BYTES / len(page))
+        raise InputError(
+            f"{path}: needed a page of at most {MAX_FILE_BYTES // 1_000_000} MB in one file, got "
+            f"{len(page) / 1e6:.0f} MB; split it (--split), or keep at most {fitting:,} Gaussians (--gaussians)"
+        )
+    files = [folder / name for name in names]
+    if split:
+        _make_folder(folder)
+    for file, text in zip(files, scripts, strict=False):
+        with replacing(file) as temporary:
+            temporary.write_text(text, "utf-8")
+    with replacing(path) as temporary:
+        temporary.write_bytes(page)
+    if split:
+        _remove_old_parts(folder, set(names))
+    files.insert(0, path)
+    total = len(page) + sum(len(text) for text in scripts[: len(names)])
+    return PageFiles(tuple(files), total, len(scene.gaussians), packed.degree)
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(
+            f"cannot write {folder}: needed a folder for the parts of the page, got '{reason}'; choose another name"
+        ) from error
+
+
+def _remove_old_parts(folder: Path, kept: set[str]) -> None:
+    """Remove the parts of the page that was replaced."""
+    for file in folder.glob("*.js"):
+        if file.name not in kept and re.fullmatch(r"[0-9a-f]{16}\.js", file.name):
+            with suppress(OSError):
+                file.unlink()
+
+
+def _fill_template(**values: str) -> str:
+    """page.html with its names in double braces replaced."""
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], _read("page.html"))
+
+
+def _to_script(value: Any) -> str:
+    """JSON that may stand in a <script> element."""
+    return json.dumps(value).replace("<", "\\u003c")
+
+
+def _read(name: str) -> str:
+    return (resources.files("pansplat.web") / name).read_text("utf-8")
+
+
+def _read_shader(name: str) -> str:
+    """A shader of this package or of the viewer, in the language of WebGL 2."""
+    shared = resources.files("pansplat_viewer.shaders")  # files only: nothing of the viewer is executed
+    text = _read(name) if name.startswith("page.") else (shared / name).read_text("utf-8")
+    text = _INCLUDE.sub(lambda match: (shared / match[1]).read_text("utf-8"), text)
+    names = ("ALPHA_CUT", "MAX_ALPHA", "EWA_NEAR_FACTOR", "EWA_CLAMP")
+    defines = (
+        "".join(f"#define {name} {getattr(constants, name)}\n" for name in names)
+        + f"#define LAYER_STORAGE 0\n#define BATCH {_BATCH}\n"
+    )
+    precisions = "".join(f"precision highp {kind};\n" for kind in ("float", "int", "sampler2D"))
+    return f"#version 300 es\n{precisions}{defines}{text}"

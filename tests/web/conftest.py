@@ -1,0 +1,48 @@
+"""A scene of coloured Gaussians around three cameras."""
+
+import pytest
+import torch
+
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.fibonacci import fibonacci_directions
+
+
+def make_scene(num_views: int = 3, per_view: int = 700, degree: int = 1, seed: int = 0) -> Scene:
+    """Flat Gaussians of random colours on a sphere of 2 to 3 m around each camera; cameras are turned and tilted."""
+    random = torch.Generator().manual_seed(seed)
+    poses = torch.eye(4, dtype=torch.float64).repeat(num_views, 1, 1)
+    for view in range(num_views):
+        angle = torch.tensor(0.7 * view)
+        poses[view, 0, 0] = poses[view, 2, 2] = angle.cos()
+        poses[view, 0, 2], poses[view, 2, 0] = angle.sin(), -angle.sin()
+        poses[view, :3, 3] = torch.tensor((100 + 0.8 * view, -1.5, 0.5 * (view % 2)))
+    directions = fibonacci_directions(per_view).float().repeat(num_views, 1)
+    count = len(directions)
+    views = torch.arange(num_views).repeat_interleave(per_view)
+    distances = 2 + torch.rand(count, 1, generator=random)
+    # The thin axis of a Gaussian is roughly its direction.
+    quats = torch.cat((1 + directions[:, 2:], -directions[:, 1:2], directions[:, :1], torch.zeros(count, 1)), dim=1)
+    harmonics = torch.randn(count, (degree + 1) ** 2, 3, generator=random) * 0.15
+    harmonics[:, 0] = 3.5 * (torch.rand(count, 3, generator=random) - 0.5)
+    return Scene(
+        Gaussians(
+            means=directions * distances + poses[views, :3, 3].float(),
+            scales=torch.tensor((0.16, 0.11, 0.01)) * (0.5 + torch.rand(count, 1, generator=random)),
+            quats=quats,
+            opacities=0.3 + 0.69 * torch.rand(count, generator=random),
+            harmonics=harmonics,
+            levels=torch.zeros(count, dtype=torch.uint8),
+            views=views.to(torch.uint8),
+        ),
+        poses,
+        near=0.5,
+        far=10.0,
+        names=tuple(f"room {view}" for view in range(num_views)),
+        height=64,
+    )
+
+
+@pytest.fixture(scope="session")
+def scene() -> Scene:
+    """Three views, harmonics of degree 1, 100 m from the world's origin."""
+    return make_scene()

@@ -1,0 +1,302 @@
+"""The page in headless Chromium with WebGL 2 on the processor: pictures, input, loading."""
+
+import base64
+import io
+import math
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float
+from PIL import Image
+
+from pansplat import pipeline
+from pansplat.gaussians.scene import Scene
+from pansplat.web import page as page_module
+from pansplat.web import write_page
+
+SIZE = (320, 240)
+LOADS = int(os.environ.get("PANSPLAT_PAGE_LOADS", "2"))  # docs/web.md has the result of 50
+OPTIONS = ("--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    """A browser; without one the tests fail in CI and are skipped elsewhere."""
+    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        program = None
+    if program is None:
+        missing = "Chromium (Debian package chromium) and playwright (pip install -e '.[dev]')"
+        if os.environ.get("CI"):
+            pytest.fail(f"CI needs {missing}")
+        pytest.skip(f"needs {missing}")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=program, args=list(OPTIONS))
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def folder(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """tour.html, and split.html with its parts."""
+    folder = tmp_path_factory.mktemp("pages")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page_module, "_POSTER_SIZE", (18, 32))
+        patch.setattr(page_module, "_PART_BYTES", 30_000)
+        write_page(scene, folder / "tour.html", title="Three rooms")
+        write_page(scene, folder / "split.html", split=True)
+    return folder
+
+
+class OpenPage:
+    """A page in the browser, with its requests and messages."""
+
+    def __init__(self, page: Any) -> None:
+        self.page, self.requests, self.messages = page, [], []
+        page.on("request", lambda request: self.requests.append(request.url))
+        page.on("console", lambda message: self.messages.append(message.text))
+        page.on("pageerror", lambda error: self.messages.append(str(error)))
+
+    def load(self, path: Path) -> None:
+        self.page.goto(path.as_uri())
+        assert self.page.evaluate("pansplat.ready.then(() => 'ready', String)") == "ready"
+
+    def run(self, program: str, *arguments: Any) -> Any:
+        return self.page.evaluate(program, *arguments)
+
+    @property
+    def camera(self) -> dict[str, Any]:
+        return self.run("({...pansplat.camera, position: [...pansplat.camera.position]})")
+
+    def wait(self, condition: str) -> None:
+        """Wait until an expression is true; the page's policy forbids playwright's own function."""
+        end = time.monotonic() + 20
+        while not self.run(condition):
+            assert time.monotonic() < end, condition
+            self.page.wait_for_timeout(10)
+
+    def draw(self) -> Float[np.ndarray, "height width 3"]:
+        url = self.run("([width, height]) => pansplat.render(width, height)", list(SIZE))
+        image = Image.open(io.BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB")
+        return np.asarray(image, np.float64) / 255
+
+
+@contextmanager
+def opened(chromium: Any, path: Path, *, size: tuple[int, int] = SIZE, **options: Any) -> Iterator[OpenPage]:
+    """The loaded page in a context of its own."""
+    context = chromium.new_context(viewport={"width": size[0], "height": size[1]}, **options)
+    page = OpenPage(context.new_page())
+    page.load(path)
+    yield page
+    context.close()
+
+
+@pytest.fixture(scope="module")
+def page(chromium: Any, folder: Path) -> Iterator[OpenPage]:
+    with opened(chromium, folder / "tour.html") as page:
+        yield page
+
+
+@pytest.fixture
+def home(page: OpenPage) -> OpenPage:
+    """The page with its first camera."""
+    page.page.keyboard.press("KeyR")
+    return page
+
+
+def draw_reference(scene: Scene, position: np.ndarray, yaw: float, pitch: float, fov: float) -> np.ndarray:
+    """The rasteriser's image at a position relative to the page's origin; yaw 0 looks along the path."""
+    from pansplat.geometry.path import path_poses
+
+    level = path_poses(scene.cam2world)[0, :3, :3].numpy()
+    cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
+    pose = np.eye(4)
+    pose[:3, :3] = (
+        level @ np.array(((cy, 0, sy), (0, 1, 0), (-sy, 0, cy))) @ np.array(((1, 0, 0), (0, cp, -sp), (0, sp, cp)))
+    )
+    pose[:3, 3] = position + scene.cam2world[:, :3, 3].mean(0).numpy()
+    with torch.no_grad():
+        color = pipeline.render(scene, pose, size=SIZE[::-1], layout="pinhole", vertical_fov_degrees=fov).color
+    return color.clamp(0, 1).permute(1, 2, 0).double().numpy()
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return -10 * math.log10(max(float(((a - b) ** 2).mean()), 1e-12))
+
+
+POSES = [
+    ((0.1, 0.0, -0.2), 0.4, 0.0, 75.0),
+    ((-0.6, 0.3, 0.2), 2.5, -0.7, 90.0),
+    ((0.5, -0.2, 1.6), -1.0, 0.5, 60.0),  # 1 m and less from the Gaussians of two views
+]
+
+
+@pytest.mark.parametrize(("position", "yaw", "pitch", "fov"), POSES)
+def test_the_picture_is_that_of_the_rasteriser(
+    home: OpenPage, scene: Scene, position: tuple[float, ...], yaw: float, pitch: float, fov: float
+) -> None:
+    camera = {"position": position, "yaw": yaw, "pitch": pitch, "fov": fov}
+    home.run("(camera) => Object.assign(pansplat.camera, camera)", camera)
+    image = home.draw()
+    reference = draw_reference(scene, np.array(position), yaw, pitch, fov)
+    assert reference.std() > 0.05
+    assert psnr(image, reference) > 42
+    assert psnr(image[:, ::-1], reference) < 25 and psnr(image[::-1], reference) < 25
+
+
+def test_the_page_loads_without_network_or_messages(page: OpenPage, folder: Path) -> None:
+    page.draw()
+    assert page.messages == []
+    assert [url for url in page.requests if not url.startswith("blob:")] == [(folder / "tour.html").as_uri()]
+    assert page.page.title() == "Three rooms"
+    page.wait("document.getElementById('cover') === null")
+
+
+@pytest.mark.slow
+def test_keys_walk_and_jump(home: OpenPage) -> None:
+    keyboard, start = home.page.keyboard, home.camera
+    keyboard.down("KeyW")
+    home.wait(f"Math.hypot(...pansplat.camera.position.map((x, i) => x - {start['position']}[i])) > 0.02")
+    keyboard.up("KeyW")
+    level = np.array(home.run("HEADER.level"))
+    moved = level.T @ (np.array(home.camera["position"]) - start["position"])
+    assert moved[2] > 0.02 and abs(moved[0]) < 1e-6 and abs(moved[1]) < 1e-6
+    keyboard.press("3")
+    home.wait("pansplat.camera.position.every((x, i) => x === HEADER.spots[2].position[i])")
+    keyboard.press("KeyR")
+    assert home.camera == start
+
+
+def test_walking_stays_near_the_panoramas(home: OpenPage) -> None:
+    home.run("pansplat.camera.position = [50, 0, 0]")
+    home.page.keyboard.down("KeyD")
+    home.wait("Math.hypot(...pansplat.camera.position) < 10")
+    home.page.keyboard.up("KeyD")
+    distances = home.run(
+        "HEADER.spots.map((s) => Math.hypot(...s.position.map((x, i) => x - pansplat.camera.position[i])))"
+    )
+    assert min(distances) <= home.run("HEADER.limit") * 1.000001
+
+
+def test_the_scene_follows_the_mouse(home: OpenPage) -> None:
+    mouse, start = home.page.mouse, home.camera
+    mouse.move(200, 100)
+    mouse.down()
+    mouse.move(240, 130)
+    mouse.up()
+    turned = home.camera
+    radians = 2 * math.tan(math.radians(start["fov"]) / 2) / SIZE[1]
+    assert turned["yaw"] == pytest.approx(start["yaw"] - 40 * radians)
+    assert turned["pitch"] == pytest.approx(30 * radians)
+    mouse.move(10, 10)
+    assert home.camera == turned
+    mouse.wheel(0, -100)
+    home.wait(f"pansplat.camera.fov < {start['fov']}")
+
+
+@pytest.mark.slow
+def test_space_flies_through_all_panoramas_and_a_ring_to_one(home: OpenPage) -> None:
+    home.run("HEADER.speed *= 100")  # a flight takes at least 0.6 s
+    home.page.keyboard.press("Space")
+    for view in (1, 2):
+        target = home.run(f"HEADER.spots[{view}].position")
+        home.wait(f"Math.hypot(...pansplat.camera.position.map((x, i) => x - {target}[i])) < 0.1")
+    home.page.keyboard.press("Space")
+    stopped = home.camera["position"]
+    assert home.page.get_attribute("#play", "aria-pressed") == "false"
+    home.page.keyboard.press("KeyR")
+    home.run("pansplat.camera.pitch = -0.9")
+    home.run("pansplat.camera.yaw = 0")
+    home.draw()
+    home.page.click("#spots button:not([hidden]) >> nth=0", force=True)
+    home.wait(f"!pansplat.camera.position.every((x, i) => x === {stopped}[i])")
+    home.wait("HEADER.spots.slice(1).some((s) => s.position.every((x, i) => x === pansplat.camera.position[i]))")
+
+
+@pytest.mark.slow
+def test_two_fingers_walk_and_one_turns(chromium: Any, folder: Path) -> None:
+    with opened(chromium, folder / "tour.html", size=(240, 320), has_touch=True, is_mobile=True) as page:
+        session = page.page.context.new_cdp_session(page.page)
+
+        def touch(kind: str, *points: tuple[float, float]) -> None:
+            touches = [{"x": x, "y": y, "id": index} for index, (x, y) in enumerate(points)]
+            session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": touches})
+
+        start = page.camera
+        touch("touchStart", (100, 100))
+        touch("touchMove", (140, 100))
+        touch("touchEnd")
+        page.wait(f"pansplat.camera.yaw < {start['yaw'] - 0.01}")
+        assert page.camera["position"] == start["position"]
+        touch("touchStart", (100, 120), (200, 120))
+        touch("touchMove", (80, 120), (220, 120))
+        touch("touchEnd")
+        page.wait(f"!pansplat.camera.position.every((x, i) => x === {start['position']}[i])")
+        forward = np.array(page.run("HEADER.level"))[:, 2]
+        assert (np.array(page.camera["position"]) - start["position"]) @ forward > 0
+        # The device turns 30 degrees to the left, and 20 up.
+        assert page.page.is_visible("#motion")
+        event = "new DeviceOrientationEvent('deviceorientation', {alpha, beta, gamma: 0})"
+        page.run(f"byMotion = (alpha, beta) => dispatchEvent({event})")
+        page.page.click("#motion")
+        page.wait("document.getElementById('motion').getAttribute('aria-pressed') === 'true'")
+        page.run("byMotion(10, 90)")
+        before = page.camera
+        page.run("byMotion(40, 110)")
+        after = page.camera
+        assert after["yaw"] - before["yaw"] == pytest.approx(-math.radians(30))
+        assert (before["pitch"], after["pitch"]) == pytest.approx((0, math.radians(20)), abs=1e-9)
+        assert after["roll"] == pytest.approx(0, abs=1e-9)
+        assert page.messages == []
+
+
+def test_a_lost_context_is_restored(home: OpenPage) -> None:
+    before = home.draw()
+    home.run("lost = document.getElementById('view').getContext('webgl2').getExtension('WEBGL_lose_context')")
+    home.run("lost.loseContext()")
+    home.wait("document.getElementById('view').getContext('webgl2').isContextLost()")
+    home.run("new Promise((resolve) => setTimeout(resolve, 50))")
+    home.run("lost.restoreContext()")
+    home.wait("!document.getElementById('view').getContext('webgl2').isContextLost()")
+    home.run("new Promise((resolve) => setTimeout(resolve, 50))")
+    assert psnr(home.draw(), before) > 60
+
+
+def test_without_webgl_the_page_says_so_over_its_poster(chromium: Any, folder: Path) -> None:
+    context = chromium.new_context()
+    page = context.new_page()
+    page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    page.goto((folder / "tour.html").as_uri())
+    page.wait_for_selector("#cover.failed img")
+    assert "WebGL 2" in page.inner_text("#message")
+    context.close()
+
+
+@pytest.mark.slow
+def test_every_load_shows_the_scene(chromium: Any, folder: Path) -> None:
+    for load in range(LOADS):
+        name = ("tour.html", "split.html")[load % 2]
+        with opened(chromium, folder / name) as page:
+            assert page.draw().std() > 0.05
+            assert page.messages == [], load
+            assert all(url.startswith(("file:", "blob:")) for url in page.requests)
+
+
+def test_missing_parts_are_named(chromium: Any, folder: Path, tmp_path: Path) -> None:
+    shutil.copy(folder / "split.html", tmp_path)
+    context = chromium.new_context()
+    page = context.new_page()
+    page.goto((tmp_path / "split.html").as_uri())
+    page.wait_for_selector("#cover.failed")
+    assert "Copy the whole folder" in page.inner_text("#message")
+    context.close()

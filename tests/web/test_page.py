@@ -1,0 +1,142 @@
+"""The files of a page, without a browser."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Scene
+from pansplat.web import page as page_module
+from pansplat.web import write_page
+
+
+@pytest.fixture(autouse=True)
+def small_poster(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
+
+
+def read_header(path: Path) -> dict[str, Any]:
+    (header,) = re.findall(r"^const HEADER = (.*);$", path.read_text(), flags=re.MULTILINE)
+    return json.loads(header)
+
+
+def test_the_page_describes_the_scene(scene: Scene, tmp_path: Path) -> None:
+    written = write_page(scene, tmp_path / "tour.html")
+    header = read_header(tmp_path / "tour.html")
+    assert written.files == (tmp_path / "tour.html",)
+    assert written.num_bytes == (tmp_path / "tour.html").stat().st_size
+    assert written.num_gaussians == header["count"] == len(scene.gaussians) and written.degree == 1
+    assert [spot["name"] for spot in header["spots"]] == ["room 0", "room 1", "room 2"]
+    steps = np.diff([view["position"] for view in header["views"]], axis=0)
+    assert np.allclose(steps, np.diff(scene.cam2world[:, :3, 3].numpy(), axis=0), atol=1e-6)
+    level = np.array(header["level"])
+    assert np.allclose(level @ level.T, np.eye(3), atol=1e-6) and np.linalg.det(level) > 0
+    assert np.allclose(level[:, 1], (0, 1, 0), atol=1e-6)  # the cameras are upright: y is down
+    # Rings are below the cameras, on the floor 2 to 3 m down.
+    heights = [spot["mark"][1] - spot["position"][1] for spot in header["spots"]]
+    assert all(1.8 < height < 2.7 for height in heights)
+
+
+def test_the_page_loads_nothing_from_elsewhere(scene: Scene, tmp_path: Path) -> None:
+    write_page(scene, tmp_path / "tour.html")
+    text = (tmp_path / "tour.html").read_text()
+    assert "default-src 'none'" in text
+    assert not re.findall(r"""(?:src|href)=["'](?!data:)|https?://|@import|url\(""", text)
+
+
+def test_a_page_has_at_most_the_given_number_of_gaussians(scene: Scene, tmp_path: Path) -> None:
+    written = write_page(scene, tmp_path / "tour.html", gaussians=800)
+    header = read_header(tmp_path / "tour.html")
+    assert 500 < written.num_gaussians <= 800
+    assert sum(view["count"] for view in header["views"]) == header["count"] == written.num_gaussians
+
+
+def test_a_title_cannot_leave_its_element(scene: Scene, tmp_path: Path) -> None:
+    evil = dataclasses.replace(scene, names=("</script><script>alert(1)</script>", "<!--", "c"))
+    write_page(evil, tmp_path / "tour.html", title="<b>&</title>")
+    text = (tmp_path / "tour.html").read_text()
+    assert "<b>" not in text and "alert(1)</script>" not in text and "<!--" not in text
+    assert read_header(tmp_path / "tour.html")["spots"][1]["name"] == "<!--"
+
+
+def test_the_parts_of_a_split_page_replace_the_old_ones(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_module, "_PART_BYTES", 30_000)
+    other = tmp_path / "tour_files" / "other.js"
+    first = write_page(scene, tmp_path / "tour.html", split=True)
+    other.write_text("")
+    assert len(first.files) > 2 and all(file.stat().st_size for file in first.files)
+    assert first.num_bytes == sum(file.stat().st_size for file in first.files)
+    second = write_page(scene, tmp_path / "tour.html", split=True, gaussians=1000)
+    text = (tmp_path / "tour.html").read_text()
+    assert set((tmp_path / "tour_files").iterdir()) == {*second.files[1:], other}
+    assert re.findall(r'<script src="([^"]+)"', text) == [f"tour_files/{file.name}" for file in second.files[1:]]
+
+
+def test_a_scene_without_cameras_starts_in_its_middle(scene: Scene, tmp_path: Path) -> None:
+    bare = dataclasses.replace(scene, cam2world=torch.zeros(0, 4, 4, dtype=torch.float64), names=())
+    write_page(bare, tmp_path / "tour.html", gaussians=1000)
+    header = read_header(tmp_path / "tour.html")
+    assert len(header["views"]) == 1 and header["views"][0]["count"] == header["count"] <= 1000
+    assert header["spots"][0]["name"] == "start" and np.allclose(header["start"]["position"], 0)
+
+
+def test_gaussians_that_cannot_be_drawn_are_left_out(scene: Scene, tmp_path: Path) -> None:
+    means, opacities = scene.gaussians.means.clone(), scene.gaussians.opacities.clone()
+    means[0], means[1], opacities[2] = torch.nan, 1e35, 0.001
+    broken = dataclasses.replace(scene.gaussians, means=means, opacities=opacities)
+    written = write_page(dataclasses.replace(scene, gaussians=broken), tmp_path / "tour.html")
+    assert written.num_gaussians == len(scene.gaussians) - 3
+
+
+def test_large_pages_have_a_lower_degree_of_harmonics(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_module, "_TARGET_BYTES", 32 * len(scene.gaussians))
+    assert write_page(scene, tmp_path / "tour.html").degree == 0
+
+
+def test_tiny_worlds_are_enlarged(scene: Scene, tmp_path: Path) -> None:
+    write_page(scene.scaled(2.0**-12), tmp_path / "small.html")
+    write_page(scene, tmp_path / "tour.html")
+    small, usual = read_header(tmp_path / "small.html"), read_header(tmp_path / "tour.html")
+    assert small["near"] == usual["near"] and small["speed"] == pytest.approx(usual["speed"])
+
+
+def test_a_scene_without_gaussians_is_refused(scene: Scene, tmp_path: Path) -> None:
+    empty = dataclasses.replace(scene, gaussians=scene.gaussians.select(torch.arange(0)))
+    with pytest.raises(InputError, match="no visible Gaussians"):
+        write_page(empty, tmp_path / "tour.html")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_page_too_large_for_one_file_is_refused(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_module, "MAX_FILE_BYTES", 60_000)
+    with pytest.raises(InputError, match=r"--split.*at most [\d,]+ Gaussians"):
+        write_page(scene, tmp_path / "tour.html")
+    assert not list(tmp_path.iterdir())
+    write_page(scene, tmp_path / "tour.html", split=True)
+
+
+@pytest.mark.parametrize("count", [0, 4_000_001])
+def test_counts_that_no_device_can_draw_are_refused(scene: Scene, tmp_path: Path, count: int) -> None:
+    with pytest.raises(InputError, match="must be 1 to 4,000,000"):
+        write_page(scene, tmp_path / "tour.html", gaussians=count)
+
+
+def test_pages_that_cannot_be_written_are_refused(scene: Scene, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="existing folder"):
+        write_page(scene, tmp_path / "missing" / "tour.html")
+    (tmp_path / "tour_files").write_text("")
+    with pytest.raises(InputError, match="tour_files: needed a folder"):
+        write_page(scene, tmp_path / "tour.html", split=True)
+    assert [file.name for file in tmp_path.iterdir()] == ["tour_files"]
