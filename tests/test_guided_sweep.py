@@ -1,3 +1,5 @@
+import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
@@ -5,6 +7,7 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
+from pansplat.evaluation.metrics import ws_psnr
 from pansplat.guided_sweep import (
     GuidedSweep,
     NetworkPrior,
@@ -15,8 +18,9 @@ from pansplat.guided_sweep import (
 from pansplat.model.depth_network import DepthNetworkConfig
 from pansplat.model.depth_refinement import DepthRefinement, RefinementConfig
 from pansplat.model.weights import pack_weights, save_weights
-from pansplat.pipeline import load_model, load_pairs
+from pansplat.pipeline import load_model, load_pairs, predict, render
 
+_OF_A_VIEW = ("images", "masks", "cam2world")
 _CONFIG = RefinementConfig(
     mono=DepthNetworkConfig(room_channels=24, attention_layers=1, attention_heads=3, decoder_channels=(16, 12, 8, 8)),
     candidates=9,
@@ -125,3 +129,38 @@ def test_shipped_model_estimates_the_sample_within_a_fifth():
     for prior, true in zip(observed.priors, depth, strict=True):
         error = prior.log_depth - np.log(true)
         assert np.abs(error - np.median(error)).mean() < 0.2
+
+
+@pytest.fixture(scope="module")
+def sample():
+    (pair,) = load_pairs(Path(__file__).parents[1] / "assets" / "living_room")
+    return pair.load_context(128), pair.load_targets(128), load_model("default")
+
+
+def _error_between(sample, **changes):
+    """Error of the middle view, drawn from a prediction with other inputs, dB."""
+    views, targets, model = sample
+    views = dataclasses.replace(views, **changes)
+    middle = render(predict(views, model), targets.cam2world[0], size=(128, 256)).color
+    return ws_psnr(middle.clamp(0, 1), targets.images[0])
+
+
+@pytest.mark.slow
+def test_errors_of_poses_and_depth_range_cost_little(sample):
+    views, exact = sample[0], _error_between(sample)
+    poses, angle = views.cam2world.clone(), math.radians(0.3)
+    poses[1, :3, :3] @= torch.tensor(
+        [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]], dtype=poses.dtype
+    )
+    poses[1, :3, 3] += torch.tensor([0.01, -0.01, 0.014], dtype=poses.dtype)  # 2 cm
+    assert _error_between(sample, cam2world=poses) > exact - 1.5
+    assert _error_between(sample, near=views.near / 2, far=2 * views.far) > exact - 0.5
+
+
+@pytest.mark.slow
+def test_coincident_cameras_give_a_scene_that_is_better_than_a_sphere(sample, sphere_predictor):
+    views, targets, _ = sample
+    same = {name: getattr(views, name)[:1].repeat(2, *[1] * (getattr(views, name).ndim - 1)) for name in _OF_A_VIEW}
+    sphere = predict(dataclasses.replace(views, **same), sphere_predictor())
+    drawn = render(sphere, targets.cam2world[0], size=(128, 256)).color.clamp(0, 1)
+    assert _error_between(sample, **same) > ws_psnr(drawn, targets.images[0]) + 2

@@ -58,16 +58,16 @@ class ViewParameters:
     NAMES = ("distance", "scale", "rotation", "opacity", "color", "harmonics")
 
     def __init__(self, gaussians: Gaussians, camera: Float[Tensor, "3"]) -> None:
-        self._gaussians = gaussians.to(dtype=torch.float32)
-        self._camera = camera.to(self._gaussians.means)
-        offsets = self._gaussians.means - self._camera
-        distances = offsets.norm(dim=1).clamp_min(_MIN_DISTANCE)
-        self._offsets = offsets
-        scales = torch.maximum(self._gaussians.scales, _MIN_SCALE * distances[:, None])
+        gaussians = gaussians.to(dtype=torch.float32)
+        self._levels, self._views = gaussians.levels, gaussians.views
+        self._camera = camera.to(gaussians.means)
+        self._offsets = gaussians.means - self._camera
+        distances = self._offsets.norm(dim=1).clamp_min(_MIN_DISTANCE)
+        scales = torch.maximum(gaussians.scales, _MIN_SCALE * distances[:, None])
         self._initial_log_scales = scales.log()
-        quats = torch.nn.functional.normalize(self._gaussians.quats, dim=1)
-        opacities = self._gaussians.opacities.clamp(_MIN_OPACITY, _MAX_OPACITY)
-        color, harmonics = self._gaussians.harmonics.split((1, self._gaussians.harmonics.shape[1] - 1), dim=1)
+        quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
+        opacities = gaussians.opacities.clamp(_MIN_OPACITY, _MAX_OPACITY)
+        color, harmonics = gaussians.harmonics.split((1, gaussians.harmonics.shape[1] - 1), dim=1)
         values = (torch.zeros_like(distances), self._initial_log_scales, quats, opacities.logit(), color, harmonics)
         self.tensors = {
             name: value.detach().clone().requires_grad_() for name, value in zip(self.NAMES, values, strict=True)
@@ -77,13 +77,14 @@ class ViewParameters:
         """The Gaussians, differentiable in `tensors`."""
         distance, scale, rotation, opacity, color, harmonics = (self.tensors[name] for name in self.NAMES)
         factor = distance.exp()[:, None]
-        return dataclasses.replace(
-            self._gaussians,
+        return Gaussians(
             means=self._camera + self._offsets * factor,
             scales=scale.exp() * factor,
             quats=rotation,
             opacities=opacity.sigmoid(),
             harmonics=torch.cat((color, harmonics), dim=1) if harmonics.shape[1] else color,
+            levels=self._levels,
+            views=self._views,
         )
 
     @torch.no_grad()

@@ -30,7 +30,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.pose import nearest_views
 from pansplat.geometry.world import scale_poses, working_factor
 from pansplat.predictor import Progress
-from pansplat.refinement.budget import MAX_OTHERS, drop_unseen, merge_to
+from pansplat.refinement.budget import DROP_ERROR, MAX_OTHERS, drop_unseen, merge_to
 from pansplat.refinement.objective import Photograph, image_difference
 from pansplat.refinement.parameters import CameraParameters, LearningRates, ViewParameters
 from pansplat.rendering import rasterize
@@ -167,7 +167,7 @@ class Refinement:
             groups.append({"params": [view.tensors[name] for view in self._views.values()], "lr": rates[name]})
         for group in groups:
             group["initial_lr"] = group["lr"]
-        return torch.optim.Adam(groups, betas=self.config.betas, eps=_MIN_EPSILON, foreach=True)
+        return torch.optim.Adam(groups, betas=self.config.betas, eps=_MIN_EPSILON, fused=True)
 
     def step(self, fraction: float) -> None:
         """Rasterise and compare each view once, and move the Gaussians.
@@ -307,8 +307,11 @@ class Refinement:
         after = self.held_out_error()
         history.append((clock.steps, clock.elapsed, after))
         report("refined", 1.0)
+        self._optimizer.zero_grad(set_to_none=True)
+        self._optimizer.state.clear()  # gigabytes for millions of Gaussians
         if after <= before:
-            self._result = self._finish(drop_unseen(self._scene(), self._size))
+            detail = self._size[0] / self._images.shape[-2]  # of large photographs is in Gaussians of small area
+            self._result = self._finish(drop_unseen(self._scene(), self._size, detail * DROP_ERROR))
         else:
             self._result, stopped = self._start, "worse"
         return RefineReport(clock.steps, clock.elapsed, stopped, before, after, self.gains, tuple(history))
