@@ -1,5 +1,7 @@
 // The rendered image on the screen, and right of `split` a photograph of the same directions.
 uniform sampler2D image;            // bottom row first
+uniform sampler2D fading;           // the image of another scene, bottom row first
+uniform float weight;               // of `image` against `fading`
 uniform sampler2D photograph;       // equirectangular, top row first
 uniform float split;                // fraction of the width
 uniform vec2 tangent;               // of half the horizontal and vertical field of view
@@ -15,6 +17,9 @@ void main() {
     vec3 rgb;
     if (uv.x < split) {
         rgb = texture(image, uv).rgb;
+        if (weight < 1.0) {
+            rgb = mix(texture(fading, uv).rgb, rgb, weight);
+        }
     } else {
         vec2 ray = (2.0 * uv - 1.0) * tangent;
         vec3 d = camera_to_photo * vec3(ray.x, -ray.y, 1.0);

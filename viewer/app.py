@@ -1,8 +1,8 @@
 """The `pansplat-view` command. Imports torch and OpenGL only when they are needed, so that `--help` is fast."""
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,11 +12,22 @@ from pansplat.console import own_warnings, parse_arguments
 from pansplat.errors import InputError
 from pansplat.files import expand_home, require_output_folder
 from pansplat.options import REAL, Depth, Height, Range, Seconds, check_numbers
-from pansplat_viewer.loader import LoadOptions, SceneEntry, SceneLoader, find_entries, load_entry
+from pansplat_viewer.loader import (
+    LoadedScene,
+    LoadOptions,
+    Progress,
+    SceneEntry,
+    SceneLoader,
+    find_entries,
+    load_entry,
+)
 from pansplat_viewer.settings import DrawSettings, Kernel, Mode, Order, RendererChoice
 
 if TYPE_CHECKING:
     import moderngl
+
+    from pansplat_viewer.capture import Film
+    from pansplat_viewer.cpu_renderer import Renderer
 
 
 @dataclass(frozen=True)
@@ -27,11 +38,11 @@ class Options:
     """
 
     path: Annotated[Path, tyro.conf.Positional]
-    """A pair folder, a folder of pairs, or a scene file."""
+    """A folder of panoramas (three or more are a tour), a folder of such folders, or a scene file."""
     offscreen: Path | None = None
     """Open no window; write film, stills and panorama to this folder."""
     pair: str | None = None
-    """Name or number of the pair to show first if the path holds several; offscreen also "all"."""
+    """Name or number of the tour, pair or scene to show first if the path holds several; offscreen also "all"."""
     model: str = "default"
     """Predictor for pairs: `default`, `sweep` (without weights), or a file of weights (.safetensors, or an official
     .ckpt)."""
@@ -41,7 +52,7 @@ class Options:
     """Type of a network's convolutions; bfloat16 is faster on CPUs that support it, and less accurate."""
     height: Height | None = None
     """Height of the panoramas that the prediction reads, pixels; by default that of the photographs, at most 1024 (for
-    networks 512)."""
+    networks and tours 512)."""
     refine: Seconds = 10.0
     """Time limit of the refinement after the prediction, seconds; 0 for none. A window shows the prediction first."""
     no_cache: bool = False
@@ -64,10 +75,12 @@ class Options:
     """Start position between the panoramas, 0 to 1 (0); offscreen, position of the panorama (0.5)."""
     size: str = "1280x720"
     """Width x height of the window or film, pixels."""
-    seconds: Annotated[float, Range(0, 3600, "seconds", above=True), REAL] = 4.0
-    """Length of the film."""
+    seconds: Annotated[float, Range(0, 3600, "seconds", above=True), REAL] | None = None
+    """Length of the film (4); of a tour, by default the time at 1 metre per second."""
     fps: Annotated[float, Range(0, 240, above=True), REAL] = 24.0
     """Frames per second of the film."""
+    memory: Annotated[float, Range(0, 1024, "GiB"), REAL] = 2.0
+    """Limit of the scenes of a tour that are kept in memory, GiB; the least recently used ones are read again."""
 
     @property
     def pixels(self) -> tuple[int, int]:
@@ -164,6 +177,7 @@ def _run_window(options: Options, entries: list[SceneEntry], first: int, pixels:
         at=options.at or 0.0,
         dpi_scale=window.dpi_scale,
         renderer=options.renderer,
+        memory=options.memory,
     )
     viewer.show(entries, first)
     run_viewer(window, viewer)
@@ -176,36 +190,69 @@ def _write_flythrough(options: Options, entry: SceneEntry, folder: Path, pixels:
 
     from pansplat_viewer.capture import Film, write_flythrough
     from pansplat_viewer.cpu_renderer import create_renderer
+    from pansplat_viewer.state import fit_settings
 
     film = Film(pixels, options.seconds, options.fps, 0.5 if options.at is None else options.at)
     ctx = _create_context(options.renderer)  # before the prediction, so that missing OpenGL is reported early
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f}%"))
     with Progress(*columns, TimeElapsedColumn()) as bars:
-        load = bars.add_task(entry.name, total=1.0)
-        loaded = load_entry(
-            entry,
-            options.load_options,
-            lambda task, done: bars.update(load, description=f"{entry.name}: {task}", completed=done),
-            photos=False,
-        )
-        bars.update(load, description=f"{entry.name}: {len(loaded.scene.gaussians):,} Gaussians", completed=1.0)
+
+        def load_with_bar(entry: SceneEntry) -> LoadedScene:
+            bar = bars.add_task(entry.name, total=1.0)
+            loaded = load_entry(
+                entry,
+                options.load_options,
+                lambda task, done: bars.update(bar, description=f"{entry.name}: {task}", completed=done),
+                photos=False,
+            )
+            name = loaded.entry.pair.name if loaded.entry.pair is not None else entry.name
+            bars.update(bar, description=f"{name}: {len(loaded.scene.gaussians):,} Gaussians", completed=1.0)
+            return loaded
+
+        loaded = load_with_bar(entry)
         draw = bars.add_task("fly-through", total=1.0)
 
         def show_progress(task: str, done: float) -> None:
             bars.update(draw, description=f"fly-through: {task}", completed=done)
 
-        settings = options.settings
-        if len(loaded.scene.cam2world) < 2 and settings.mode in ("deferred", "difference"):
-            settings = replace(settings, mode="joint")
-        renderer = create_renderer(ctx, options.renderer, color_bits=32)
+        settings = fit_settings(options.settings, loaded.scene)
+        renderers = [
+            create_renderer(ctx, options.renderer, color_bits=32) for _ in range(1 if entry.tour is None else 2)
+        ]
         try:
-            written = write_flythrough(renderer, loaded.scene, folder, film, settings, show_progress)
+            if loaded.entry.tour is None:
+                written = write_flythrough(renderers[0], loaded.scene, folder, film, settings, show_progress)
+            else:
+                written = _write_tour(options, renderers, loaded, load_with_bar, folder, film, show_progress)
         finally:
-            renderer.release()
+            for renderer in renderers:
+                renderer.release()
             if ctx is not None:
                 ctx.release()
     for path in written:
         print(path)
+
+
+def _write_tour(
+    options: Options,
+    renderers: "list[Renderer]",
+    loaded: LoadedScene,
+    load: Callable[[SceneEntry], LoadedScene],
+    folder: Path,
+    film: "Film",
+    progress: Progress,
+) -> list[Path]:
+    """Write the film through a tour whose first scene is loaded."""
+    from pansplat.tours import plan_route
+    from pansplat_viewer.capture import write_tour
+    from pansplat_viewer.tour import TourScenes
+
+    tour = loaded.entry.tour
+    assert tour is not None
+    scenes = TourScenes(tour, memory=options.memory)
+    scenes.add(loaded)
+    route = plan_route(tour, tour.plan_walk())
+    return write_tour(renderers, scenes, route, load, folder, film, options.settings, progress)
 
 
 def _create_context(renderer: RendererChoice) -> "moderngl.Context | None":

@@ -28,8 +28,9 @@ HELP = (
     ("scroll", "field of view (orbit: distance)"),
     ("V", "orbit or fly"),
     ("F", "focus the point in the centre"),
-    ("1 2", "jump to panorama 1, 2"),
+    ("1 2 ... 9", "jump to a panorama (tour: fly there)"),
     ("Space", "play the flight between them"),
+    ("M", "floor plan and hotspots of a tour"),
     (", .", "step along the flight"),
     ("C", "compare with the nearest photograph"),
     ("B", "before or after the refinement"),
@@ -76,6 +77,7 @@ class Commands:
         pick: show the point at this place, as fractions of width and height.
         choose: show the entry of this index.
         open: show the scenes at this path.
+        visit: fly to this panorama of the tour.
         dismiss_error: close the error message.
         cancel_refinement: keep the prediction.
     """
@@ -87,13 +89,14 @@ class Commands:
     pick: tuple[float, float] | None = None
     choose: int | None = None
     open: str | None = None
+    visit: int | None = None
     dismiss_error: bool = False
     cancel_refinement: bool = False
 
 
 _KEYS = {
-    **{letter: letter for letter in "wasdqevfhprcb"},
-    **{digit: f"_{digit}" for digit in "1234"},
+    **{letter: letter for letter in "wasdqevfhprcbm"},
+    **{digit: f"_{digit}" for digit in "123456789"},
     "space": "space",
     ",": "comma",
     ".": "period",
@@ -159,12 +162,14 @@ def _apply_pressed(state: ViewerState, pressed: frozenset[str]) -> None:
     for key, name in (("tab", "overlay"), ("h", "help"), ("c", "photo"), ("v", "orbiting"), ("b", "refined")):
         if key in pressed:
             setattr(state, name, not getattr(state, name))
+    if "m" in pressed:
+        state.minimap = state.hotspots = not state.minimap
     if "space" in pressed:
         toggle_play(state)
     if "r" in pressed:
         state.points = []
         state.playing, state.camera = False, state.home
-    for view in range(4):
+    for view in range(9):
         if str(view + 1) in pressed:
             jump_to_view(state, view)
     for key, steps in ((",", -1), (".", 1)):

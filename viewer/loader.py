@@ -1,12 +1,13 @@
 """Lists the scenes at a path and loads them in a worker thread.
 
-Pairs go through the prediction pipeline with its cache, scene files are read. Imports no torch before it loads.
+Pairs go through the prediction pipeline with its cache, scene files are read. Of a tour, the graph and one scene are
+loaded; `tour` requests its other scenes. Imports no torch before it loads.
 """
 
 import re
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -17,25 +18,31 @@ if TYPE_CHECKING:
     from pansplat.data.pairs import Pair
     from pansplat.data.views import Views
     from pansplat.gaussians.scene import Scene
+    from pansplat.tours import FloorOutline, TourGraph
 
 PHOTO_HEIGHT = 1024  # smallest height of the photographs for comparison, pixels
+TOUR_HEIGHT = 512  # largest default height of the panoramas of a tour, pixels; it has many scenes
 
 Progress = Callable[[str, float], None]  # task, fraction done
 
 
 @dataclass(frozen=True, eq=False)
 class SceneEntry:
-    """A scene that can be shown: a pair of panoramas to predict from, or a scene file.
+    """A scene that can be shown: a tour, a pair of panoramas to predict from, or a scene file.
 
     Attributes:
         name: shown in the list of scenes and used for output folders.
-        pair: the pair, or None for a scene file.
-        file: the scene file, or None for a pair.
+        pair: the pair, or the panoramas of one scene of a tour; None for a scene file and for a whole tour.
+        file: the scene file, or None.
+        tour: the tour, or None.
+        views: of one scene of a tour: numbers of its panoramas in the tour.
     """
 
     name: str
     pair: "Pair | None" = None
     file: Path | None = None
+    tour: "TourGraph | None" = None
+    views: tuple[int, ...] = ()
 
     @property
     def folder_name(self) -> str:
@@ -49,12 +56,14 @@ class LoadedScene:
 
     Attributes:
         is_final: False for a prediction whose refinement will follow.
+        outlines: of a scene of a tour: floor outlines by panorama.
     """
 
     entry: SceneEntry
     scene: "Scene"
     photos: "Views | None" = None
     is_final: bool = True
+    outlines: "dict[int, FloorOutline]" = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -73,7 +82,7 @@ class LoadOptions:
 
 
 def find_entries(path: Path, options: LoadOptions) -> list[SceneEntry]:
-    """Return all scenes at `path`: pairs first, then scene files.
+    """Return all scenes at `path`: tours of three or more panoramas first, then pairs, then scene files.
 
     Raises:
         InputError: the path does not exist, or holds neither pairs nor scene files.
@@ -91,7 +100,10 @@ def find_entries(path: Path, options: LoadOptions) -> list[SceneEntry]:
         if not scenes:
             raise
         pairs = []
-    return [SceneEntry(pair.name, pair=pair) for pair in pairs] + [SceneEntry(p.stem, file=p) for p in scenes]
+    from pansplat.tours import find_tours
+
+    tours = [SceneEntry(tour.name, tour=tour) for tour in find_tours(pairs)]
+    return tours + [SceneEntry(pair.name, pair=pair) for pair in pairs] + [SceneEntry(p.stem, file=p) for p in scenes]
 
 
 def load_entry(
@@ -102,7 +114,9 @@ def load_entry(
     *,
     photos: bool = True,
 ) -> LoadedScene:
-    """Read an entry's scene, or predict and refine it.
+    """Read an entry's scene, or predict and refine it. Of a tour, the scene in which `plan_walk` starts.
+
+    The entry of the result for a tour has its connected graph and the panoramas of the scene.
 
     Args:
         entry: the entry.
@@ -113,6 +127,8 @@ def load_entry(
     """
     from pansplat import pipeline
 
+    if entry.tour is not None:
+        return _load_tour_scene(entry, options, progress, show)
     if entry.pair is None:
         progress("reading", 0.0)
         assert entry.file is not None
@@ -142,6 +158,42 @@ def load_entry(
         on_predicted=None if show is None else show_prediction,
     )
     return LoadedScene(entry, scene, read_photos())
+
+
+def _load_tour_scene(
+    entry: SceneEntry, options: LoadOptions, progress: Progress, show: Callable[[LoadedScene], None] | None
+) -> LoadedScene:
+    """Predict and refine one scene of a tour, with its floor outlines; the first one after its graph is connected."""
+    from pansplat import pipeline
+    from pansplat.predictor import MIN_HEIGHT
+    from pansplat.tours import connect, find_floor_outline
+
+    tour, views = entry.tour, entry.views
+    assert tour is not None
+    if not views:
+        tour = connect(tour, progress)
+        first, second = tour.plan_walk()[:2]
+        views = tour.choose_scene_views()[min(first, second), max(first, second)]
+        entry = replace(entry, tour=tour, views=views)
+    pair = entry.pair or tour.make_pair(views)
+
+    def finish(scene: "Scene", is_final: bool) -> LoadedScene:
+        outlines = {node: find_floor_outline(scene, view, tour.level_axes) for view, node in enumerate(views)}
+        known = {node: outline for node, outline in outlines.items() if outline is not None}
+        return LoadedScene(entry, scene, is_final=is_final, outlines=known)
+
+    scene = pipeline.predict(
+        pair,
+        model=options.model,
+        compat=options.compat,
+        precision=options.precision,
+        height=options.height or max(MIN_HEIGHT, min(pair.image_height, TOUR_HEIGHT)),
+        refine_seconds=options.refine_seconds,
+        cache=options.cache,
+        progress=progress,
+        on_predicted=None if show is None else lambda scene: show(finish(scene, is_final=False)),
+    )
+    return finish(scene, is_final=True)
 
 
 class _CancelledError(Exception):
@@ -181,6 +233,11 @@ class SceneLoader:
         self.cancel()
         self._job = _Job(entry)
         self._job.future = self._executor.submit(self._load, entry, self._job.report, self._job.show)
+
+    @property
+    def entry(self) -> SceneEntry | None:
+        """The entry that is being loaded or refined; None if the loader is idle."""
+        return self._job.entry if self._job else None
 
     @property
     def progress(self) -> tuple[str, str, float] | None:

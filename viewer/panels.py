@@ -12,9 +12,11 @@ from imgui_bundle import imgui
 
 from pansplat_viewer import camera as cameras
 from pansplat_viewer.input import HELP, Commands
+from pansplat_viewer.minimap import SIZE, Minimap
 from pansplat_viewer.picking import project_point
 from pansplat_viewer.settings import FrameStats, Kernel, Lowpass, Order
 from pansplat_viewer.state import ViewerState, fly_to, jump_to_view, toggle_play
+from pansplat_viewer.tour import Hotspot, TourScenes
 
 Rectangle = tuple[float, float, float, float]  # left, top, right, bottom, pixels
 
@@ -46,6 +48,9 @@ class PanelData:
         loading: name, task, fraction done; None if nothing is loading.
         refinement: fraction done; 1 if the refined scene is there, None if there is no refinement.
         error: message of the last failure.
+        tour: the scenes of the tour that is shown; None for other scenes.
+        hotspots: places of its panoramas in the image.
+        background: work of the loader on the tour, and the fraction done.
     """
 
     entries: list[str] = field(default_factory=list)
@@ -57,6 +62,9 @@ class PanelData:
     loading: tuple[str, str, float] | None = None
     refinement: float | None = None
     error: str | None = None
+    tour: TourScenes | None = None
+    hotspots: list[Hotspot] = field(default_factory=list)
+    background: tuple[str, float] | None = None
 
 
 class Gui:
@@ -120,10 +128,12 @@ class Panels:
     Attributes:
         items: rectangle of each widget of the last frame, by its label; for tests that click.
         path: text of the path field.
+        minimap: the plan of a tour.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, ctx: moderngl.Context) -> None:
         self.items: dict[str, Rectangle] = {}
+        self.minimap = Minimap(ctx)
         self.path = ""
 
     def draw(self, state: ViewerState, data: PanelData, now: float) -> Commands:
@@ -137,6 +147,10 @@ class Panels:
             _draw_split_line(state.split)
         if state.overlay and state.points:
             _draw_points(state)
+        if state.overlay and data.tour is not None:
+            if state.hotspots:
+                _draw_hotspots(data.tour, data.hotspots)
+            self._draw_tour(state, data, data.tour, commands)
         if state.help:
             state.help = _draw_help()
         if data.loading:
@@ -146,6 +160,30 @@ class Panels:
         if state.message and now < state.message_until:
             _draw_message(state.message)
         return commands
+
+    def release(self) -> None:
+        """Free the GL objects."""
+        self.minimap.release()
+
+    def _draw_tour(self, state: ViewerState, data: PanelData, tour: TourScenes, commands: Commands) -> None:
+        """Draw the plan and the progress of the tour at the right border, below the statistics."""
+        size, scale = imgui.get_io().display_size, imgui.get_style().font_scale_dpi
+        imgui.set_next_window_pos((size.x - _MARGIN, 120 * scale), 0, (1.0, 0.0))
+        imgui.set_next_window_size(((SIZE + 18) * scale, 0))
+        imgui.begin("Tour", None, _FIXED)
+        state.minimap = self._check("floor plan", state.minimap)
+        imgui.same_line()
+        state.hotspots = self._check("hotspots", state.hotspots)
+        if state.minimap:
+            commands.visit = self.minimap.draw(tour, state.camera)
+        imgui.text_unformatted(f"{len(tour.loaded)} of {tour.num_scenes} scenes in memory")
+        if data.background is not None:
+            task, fraction = data.background
+            imgui.push_text_wrap_pos(0.0)
+            imgui.text_unformatted(task)
+            imgui.pop_text_wrap_pos()
+            imgui.progress_bar(fraction, (-1, 0), f"{100 * fraction:.0f}%")
+        imgui.end()
 
     def _record_rectangle(self, label: str) -> None:
         low, high = imgui.get_item_rect_min(), imgui.get_item_rect_max()
@@ -220,7 +258,7 @@ class Panels:
                 state.refined = self._check("refined", state.refined)
 
     def _draw_gaussians(self, state: ViewerState) -> None:
-        settings, num_views = state.settings, len(state.context)
+        settings, num_views = state.settings, state.num_views
         for mode in ("joint", "deferred", "difference") if num_views > 1 else ("joint",):
             if mode != "joint":
                 imgui.same_line()
@@ -367,6 +405,18 @@ def _draw_points(state: ViewerState) -> None:
         lines.append(f"{math.dist(state.points[0].position, state.points[1].position):.3f} m from the point before")
     imgui.set_next_window_pos((size.x - _MARGIN, size.y - _MARGIN), 0, (1.0, 1.0))
     _draw_label("##point", lines, alpha=0.6)
+
+
+def _draw_hotspots(tour: TourScenes, hotspots: list[Hotspot]) -> None:
+    """Draw a ring on the floor below each panorama, with its name."""
+    canvas, color = imgui.get_background_draw_list(), imgui.color_convert_float4_to_u32((1.0, 1.0, 1.0, 0.8))
+    for hotspot in hotspots:
+        ring = [imgui.ImVec2(*corner) for corner in hotspot.ring]
+        canvas.add_polyline(ring, color, thickness=2.0, flags=imgui.ImDrawFlags_.closed.value)
+        canvas.add_circle_filled(hotspot.center, 3.0, color)
+        name = tour.tour.panoramas[hotspot.node].name
+        width = imgui.calc_text_size(name).x
+        canvas.add_text((hotspot.center[0] - width / 2, hotspot.center[1] + hotspot.radius), color, name)
 
 
 def _draw_message(message: str) -> None:

@@ -6,13 +6,16 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from pansplat.constants import NEAR
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose, level_pose, look_pose, path_poses, up_direction
+from pansplat.tours import Route, TourGraph
 from pansplat_viewer.camera import Camera, move_to_pose
 from pansplat_viewer.picking import PickedPoint
 from pansplat_viewer.settings import DrawSettings
 
 FLIGHT_SECONDS = 6.0
+NEAR_OF_FAR = 0.03  # of a tour: Gaussians within this fraction of far are not drawn, because ways pass door frames
 _FLIGHT_STEPS = 24  # for the `,` and `.` keys
 
 
@@ -30,7 +33,11 @@ class ViewerState:
         refined: whether the refined scene is shown, where there is one, or the prediction.
         adaptive: whether the resolution is lowered while the camera moves.
         speed: of flying, metres per second.
-        context: poses of the input cameras; empty for a file without cameras.
+        context: poses of the input cameras; empty for a file without cameras. Of a tour, of all panoramas.
+        num_views: number of input cameras of the scene that is shown.
+        route: the flight through a tour; None if none is planned, and in other scenes.
+        target: the panorama of a tour to fly to; None if there is none.
+        minimap, hotspots: whether the floor plan of a tour and the places of its panoramas are shown.
         levels: pyramid levels of the scene, ascending.
         points: the last picked points, two at most.
         message: a text to show until `message_until` (seconds of the viewer's clock).
@@ -51,6 +58,11 @@ class ViewerState:
     adaptive: bool = True
     speed: float = 1.0
     context: Float[np.ndarray, "view 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    num_views: int = 0
+    route: Route | None = None
+    target: int | None = None
+    minimap: bool = True
+    hotspots: bool = True
     levels: tuple[int, ...] = ()
     points: list[PickedPoint] = field(default_factory=list)
     message: str = ""
@@ -69,22 +81,49 @@ class ViewerState:
 
 def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
     """Start in a scene at a fraction of its flight; settings that the scene does not support are reset."""
-    state.context = scene.cam2world.double().numpy()
-    state.levels = tuple(sorted(int(level) for level in torch.unique(scene.gaussians.levels)))
-    num_views = max(len(state.context), 1)
-    settings = replace(state.settings, levels=None, view=min(state.settings.view, num_views - 1))
-    if num_views < 2 and settings.mode in ("deferred", "difference"):
-        settings = replace(settings, mode="joint")
-    state.settings = settings
+    adapt_settings(state, scene, keep_levels=False)
+    state.settings = replace(state.settings, near=NEAR)
+    state.context, state.route = scene.cam2world.double().numpy(), None
     state.playing, state.flight, state.points = False, min(max(at, 0.0), 1.0), []
     level = tuple(tuple(float(x) for x in row) for row in _compute_level_axes(scene))
     camera = move_to_pose(replace(state.camera, level=level), _choose_start_pose(scene, state.flight))
     state.camera = state.home = replace(camera, distance=_measure_typical_distance(scene))
 
 
+def enter_tour(state: ViewerState, tour: TourGraph, scene: Scene, route: Route, *, at: float = 0.0) -> None:
+    """Start in a tour, whose first scene is `scene`, at a fraction of a route through it."""
+    enter_scene(state, scene)
+    state.settings = replace(state.settings, near=NEAR_OF_FAR * tour.far)
+    state.context, state.route, state.flight = tour.cam2world.numpy(), route, min(max(at, 0.0), 1.0)
+    level = tuple(tuple(float(x) for x in row) for row in tour.level_axes)
+    state.camera = state.home = move_to_pose(replace(state.camera, level=level), route.pose(state.flight))
+
+
+def adapt_settings(state: ViewerState, scene: Scene, *, keep_levels: bool = True) -> None:
+    """Set the number of views and the levels to those of a scene, and reset settings that it does not support."""
+    state.num_views = len(scene.cam2world)
+    state.levels = tuple(sorted(int(level) for level in torch.unique(scene.gaussians.levels)))
+    settings = state.settings if keep_levels else replace(state.settings, levels=None)
+    state.settings = fit_settings(settings, scene)
+
+
+def fit_settings(settings: DrawSettings, scene: Scene) -> DrawSettings:
+    """The settings with a view and a mode that a scene supports."""
+    num_views = max(len(scene.cam2world), 1)
+    if num_views < 2 and settings.mode in ("deferred", "difference"):
+        settings = replace(settings, mode="joint")
+    return replace(settings, view=min(settings.view, num_views - 1))
+
+
 def jump_to_view(state: ViewerState, view: int) -> None:
-    """Move to an input camera's position and heading, level; does nothing if the scene has no such camera."""
+    """Move to an input camera's position and heading, level; does nothing if the scene has no such camera.
+
+    In a tour, the camera flies there, along the graph.
+    """
     if view >= len(state.context):
+        return
+    if state.route is not None:
+        state.target = view
         return
     up = up_direction(torch.from_numpy(state.context))
     target = level_pose(torch.from_numpy(state.context[view]), up).numpy()
@@ -96,7 +135,9 @@ def jump_to_view(state: ViewerState, view: int) -> None:
 def fly_to(state: ViewerState, fraction: float) -> None:
     """Move the camera to a fraction of the flight."""
     state.flight = min(max(fraction, 0.0), 1.0)
-    if len(state.context):
+    if state.route is not None:
+        state.camera = move_to_pose(state.camera, state.route.pose(state.flight))
+    elif len(state.context):
         target = fly_pose(torch.from_numpy(state.context), state.flight).numpy()
         state.camera = move_to_pose(state.camera, target)
 
@@ -116,10 +157,11 @@ def step_flight(state: ViewerState, steps: int) -> None:
     fly_to(state, (round(state.flight * _FLIGHT_STEPS) + steps) / _FLIGHT_STEPS)
 
 
-def advance_flight(state: ViewerState, seconds: float) -> None:
-    """Move along the flight if it is playing, and stop at its end."""
+def advance_flight(state: ViewerState, seconds: float, limit: float = 1.0) -> None:
+    """Move along the flight if it is playing, not beyond the fraction `limit`, and stop at its end."""
     if state.playing:
-        fly_to(state, state.flight + seconds / FLIGHT_SECONDS)
+        duration = FLIGHT_SECONDS if state.route is None else state.route.seconds
+        fly_to(state, min(state.flight + seconds / duration, max(limit, state.flight)))
         state.playing = state.flight < 1
 
 

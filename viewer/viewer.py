@@ -10,19 +10,23 @@ import moderngl
 import numpy as np
 from jaxtyping import Float
 
+from pansplat.data.images import read_panorama
 from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
+from pansplat.tours import plan_route
 from pansplat_viewer import camera as cameras
 from pansplat_viewer.capture import write_screenshot
-from pansplat_viewer.cpu_renderer import create_renderer
+from pansplat_viewer.cpu_renderer import Renderer, create_renderer
 from pansplat_viewer.input import Commands, apply_input, read_input
-from pansplat_viewer.loader import LoadedScene, SceneEntry, SceneLoader
+from pansplat_viewer.loader import PHOTO_HEIGHT, LoadedScene, SceneEntry, SceneLoader
 from pansplat_viewer.panels import Gui, PanelData, Panels
 from pansplat_viewer.picking import compute_pixel_ray, pick_point
 from pansplat_viewer.programs import Programs
 from pansplat_viewer.settings import RendererChoice
-from pansplat_viewer.state import ViewerState, advance_flight, enter_scene
+from pansplat_viewer.slots import SceneSlot
+from pansplat_viewer.state import ViewerState, adapt_settings, advance_flight, enter_scene, enter_tour, fit_settings
+from pansplat_viewer.tour import DEFAULT_MEMORY, CrossFade, TourScenes, find_clicked, find_hotspots
 
 PANORAMA_HEIGHT = 1024  # of a panorama screenshot, pixels
 _MAX_STEP_SECONDS = 0.25  # of camera movement in one frame
@@ -109,7 +113,7 @@ class Presenter:
         self._programs = Programs(ctx)
         self._program = self._programs.present()
         self._triangle = ctx.vertex_array(self._program, [])
-        self._program["image"], self._program["photograph"] = 0, 1
+        self._program["image"], self._program["photograph"], self._program["fading"] = 0, 1, 2
         self._photos: list[moderngl.Texture] = []
         self._poses: Float[np.ndarray, "view 4 4"] = np.zeros((0, 4, 4))
 
@@ -137,18 +141,25 @@ class Presenter:
         photo: int | None,
         split: float,
         camera: cameras.Camera,
+        fading: moderngl.Texture | None = None,
+        weight: float = 1.0,
     ) -> None:
         """Fill `target` with the image of `camera`, and right of `split` with the photograph of index `photo`.
 
-        The photograph is sampled by direction only: it has no parallax and matches exactly at its own camera.
+        The photograph is sampled by direction only: it has no parallax and matches exactly at its own camera. The image
+        is mixed with `fading`, the image of another scene; `weight` is that of the first, 0 to 1.
         """
-        if photo is None and target.viewport == (0, 0, *image.size) and image.dtype == "f1":
+        if photo is None and fading is None and target.viewport == (0, 0, *image.size) and image.dtype == "f1":
             self._copy(image, target)
             return
         target.use()
         self.ctx.disable(moderngl.DEPTH_TEST | moderngl.BLEND | moderngl.CULL_FACE)
         image.filter = (moderngl.LINEAR, moderngl.LINEAR)
         image.use(0)
+        self._program["weight"] = weight
+        (fading or image).use(2)
+        if fading is not None:
+            fading.filter = (moderngl.LINEAR, moderngl.LINEAR)
         if photo is None:
             self._program["split"] = 2.0
             image.use(1)
@@ -197,6 +208,7 @@ class Viewer:
         at: float = 0.0,
         dpi_scale: float = 1.0,
         renderer: RendererChoice = "auto",
+        memory: float = DEFAULT_MEMORY,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         """Create GL objects on the current context.
@@ -210,35 +222,48 @@ class Viewer:
             at: fraction of the flight at which a scene is entered.
             dpi_scale: size of the panels.
             renderer: draws the image; `auto` is `cpu` where OpenGL is software.
+            memory: limit of the scenes of a tour, GiB.
             clock: returns seconds.
         """
         self.ctx, self.loader, self.state = ctx, loader, state or ViewerState()
-        self.panels, self.panel_data = Panels(), PanelData()
+        self.panels, self.panel_data = Panels(ctx), PanelData()
         self.entries: list[SceneEntry] = []
         self.screenshots: list[Path] = []
         self.gui = Gui(dpi_scale)
-        self.renderer = create_renderer(ctx, renderer)
+        self._choice, self._memory = renderer, memory
+        self._slots = [SceneSlot(create_renderer(ctx, renderer))]
+        self._fade = CrossFade()
         self.presenter = Presenter(ctx)
         self._find, self._folder, self._at, self._clock = find, folder, at, clock
         self._resolution = AdaptiveResolution(settle_after=self.renderer.settle_seconds)
         self._loaded: LoadedScene | None = None
         self._refined: Scene | None = None
-        self._uploaded: Scene | None = None
-        self._image: moderngl.Texture | None = None
-        self._image_key: tuple[object, ...] | None = None
+        self._tour: TourScenes | None = None
+        self._waiting = False
+        self._photo_node: int | None = None
         self._last_camera = self.state.camera
+
+    @property
+    def renderer(self) -> Renderer:
+        """The renderer of the scene that is shown."""
+        return self._slot.renderer
+
+    @property
+    def _slot(self) -> SceneSlot:
+        return self._slots[self._fade.front]
 
     @property
     def busy(self) -> bool:
         """Whether the next frame differs without new input."""
-        return self.moving or self.panel_data.loading is not None or self.loader.refinement is not None
+        return self.moving or self.loader.entry is not None
 
     @property
     def moving(self) -> bool:
         """Whether the image is still changing, so that a window draws as often as it can."""
         recently = self._clock() - self._resolution.last_motion < 2 * self._resolution.settle_after
-        unsettled = self._image is not None and not self.renderer.stats.settled
-        return self.state.playing or recently or unsettled
+        unsettled = self._slot.image is not None and not self.renderer.stats.settled
+        fading = self._fade.compute_weight(self._clock()) < 1
+        return (self.state.playing and not self._waiting) or recently or unsettled or fading
 
     def open(self, path: Path) -> None:
         """Show the scenes at a path; for an invalid path, show an error and keep the current scene."""
@@ -265,12 +290,14 @@ class Viewer:
         now, size = self._clock(), target.viewport[2:]
         self._take_loaded(now)
         self._exchange_scene()
+        self._update_tour(now)
         self.gui.begin(seconds, new_frame)
-        self._update_panel_data()
+        self._update_panel_data(size)
+        was_playing = self.state.playing
         panel_commands = self.panels.draw(self.state, self.panel_data, now)
         # The step is limited, so that after a slow frame the camera does not move far.
         key_commands = apply_input(self.state, read_input(min(seconds, _MAX_STEP_SECONDS)))
-        advance_flight(self.state, min(seconds, 2 * _MAX_STEP_SECONDS))
+        self._fly_tour(min(seconds, 2 * _MAX_STEP_SECONDS), was_playing)
         if self._loaded is None:
             target.use()
             self.ctx.clear(*self.state.settings.background)
@@ -291,7 +318,9 @@ class Viewer:
         """Stop the threads and free every GL object; the context must still be current."""
         self.loader.close()
         self.presenter.release()
-        self.renderer.release()
+        self.panels.release()
+        for slot in self._slots:
+            slot.renderer.release()
         self.gui.close()
 
     def _take_loaded(self, now: float) -> None:
@@ -299,23 +328,24 @@ class Viewer:
         result = self.loader.poll()
         if isinstance(result, LoadedScene):
             loaded = self._loaded
-            if loaded is not None and loaded.entry is result.entry and result.is_final and not loaded.is_final:
+            if self._tour is not None and result.entry.tour is self._tour.tour:
+                self._tour.add(result)
+            elif loaded is not None and loaded.entry is result.entry and result.is_final and not loaded.is_final:
                 self._refined = result.scene
-            elif self._upload(result.scene, result.entry):
+            elif self._upload(self._slots[0], result.scene, result.entry):
                 self._enter(result, now)
         elif isinstance(result, InputError):
             self.panel_data.error = str(result)
         elif result is not None:  # not a user error: a defect, or out of memory
             self.panel_data.error = f"{type(result).__name__}: {result}"
 
-    def _upload(self, scene: Scene, entry: SceneEntry) -> bool:
+    def _upload(self, slot: SceneSlot, scene: Scene, entry: SceneEntry) -> bool:
         """Upload a scene; returns whether it fits the GPU's memory, and shows an error if not."""
         try:
-            self.renderer.upload(scene)
+            slot.upload(scene)
         except (InputError, MemoryError, moderngl.Error) as error:  # moderngl.Error: the GPU's memory is exhausted
             self.panel_data.error = f"{entry.name}: {error}"
             return False
-        self._uploaded, self._image_key, self._image = scene, None, None
         return True
 
     def _exchange_scene(self) -> None:
@@ -323,31 +353,153 @@ class Viewer:
         if self._loaded is None or self._refined is None or self.moving:
             return
         scene = self._refined if self.state.refined else self._loaded.scene
-        if scene is not self._uploaded and not self._upload(scene, self._loaded.entry):
+        if scene is not self._slot.scene and not self._upload(self._slot, scene, self._loaded.entry):
             self._refined = None
 
     def _enter(self, loaded: LoadedScene, now: float) -> None:
-        self._loaded, self._refined = loaded, None
+        self._loaded, self._refined, self._tour = loaded, None, None
         self._resolution = AdaptiveResolution(settle_after=self.renderer.settle_seconds)
+        self._fade.clear()
+        self._fade.show(0, loaded.scene, now)
         self.presenter.upload_photos(loaded.photos)
-        enter_scene(self.state, loaded.scene, at=self._at)
+        self._photo_node = None
+        if loaded.entry.tour is None:
+            enter_scene(self.state, loaded.scene, at=self._at)
+        else:
+            self._enter_tour(loaded)
         self._last_camera = self.state.camera
         self.state.show_message(f"{loaded.entry.name}   (H shows the keys)", now)
 
-    def _update_panel_data(self) -> None:
+    # --- tours ---
+
+    def _enter_tour(self, loaded: LoadedScene) -> None:
+        tour = loaded.entry.tour
+        assert tour is not None
+        if len(self._slots) == 1:
+            self._slots.append(SceneSlot(create_renderer(self.ctx, self._choice)))
+        self._tour = TourScenes(tour, memory=self._memory)
+        self._tour.add(loaded)
+        enter_tour(self.state, tour, loaded.scene, plan_route(tour, tour.plan_walk()), at=self._at)
+        self._tour.move(np.asarray(self.state.camera.position), self.state.route, self.state.flight)
+
+    def _update_tour(self, now: float) -> None:
+        """Show the scene of the camera's place, and load those that are next."""
+        tour, state = self._tour, self.state
+        if tour is None:
+            return
+        route = state.route if state.playing else None
+        tour.move(np.asarray(state.camera.position), route, state.flight)
+        self._show_tour_scene(tour, now)
+        if self._is_other_requested():
+            return
+        request = tour.choose_request(tour.list_next(route, state.flight), self.loader.entry)
+        if request is not None:
+            self.loader.request(request)
+
+    def _show_tour_scene(self, tour: TourScenes, now: float) -> None:
+        """Start to fade to the scene of the camera's place, if it is loaded and not shown."""
+        self._fade.compute_weight(now)
+        loaded = tour.get(tour.views)
+        slot = None if loaded is None else self._fade.choose_slot(loaded.scene)
+        if loaded is None or slot is None:
+            return
+        if self._slots[slot].scene is not loaded.scene and not self._upload(
+            self._slots[slot], loaded.scene, loaded.entry
+        ):
+            return
+        self._fade.show(slot, loaded.scene, now)
+        adapt_settings(self.state, loaded.scene)
+        self.state.points = []
+
+    def _is_other_requested(self) -> bool:
+        """Whether the loader works on a scene that is not of this tour, which the user has chosen."""
+        entry = self.loader.entry
+        return entry is not None and (self._tour is None or entry.tour is not self._tour.tour)
+
+    def _fly_tour(self, seconds: float, was_playing: bool) -> None:
+        """Advance the flight; in a tour only as far as scenes are loaded, and from wherever the camera is."""
+        state, tour, limit = self.state, self._tour, 1.0
+        if tour is not None and state.route is not None:
+            pose = state.camera.cam2world
+            if state.target is not None:
+                state.route, state.flight, state.playing = tour.plan_way(pose, state.target), 0.0, True
+            elif state.playing and not was_playing:
+                if state.flight == 0:
+                    state.route = tour.plan_route(pose)
+                elif not np.allclose(pose, state.route.pose(state.flight), atol=1e-4):
+                    state.route = tour.plan_route(pose, state.route.walk[state.route.leg(state.flight) + 1 :])
+                    state.flight = 0.0
+            state.target = None
+            limit = tour.find_limit(state.route, state.flight) if state.playing else 1.0
+        before = state.flight
+        advance_flight(state, seconds, limit)
+        self._waiting = state.playing and state.flight == before and limit < 1
+
+    def _visit(self, place: tuple[float, float], size: tuple[int, int]) -> bool:
+        """Fly to the panorama whose hotspot is at a place of the window; returns whether there is one."""
+        if self._tour is None or not (self.state.hotspots and self.state.overlay):
+            return False
+        pixel = place[0] * size[0], place[1] * size[1]
+        self.state.target = find_clicked(find_hotspots(self._tour, self.state.camera, size), pixel)
+        return self.state.target is not None
+
+    # --- frames ---
+
+    def _update_panel_data(self, size: tuple[int, int]) -> None:
         data, photo = self.panel_data, self._nearest_photo()
         data.stats, data.loading = self.renderer.stats, self.loader.progress
         data.refinement = self.loader.refinement if self._refined is None else 1.0
         data.photo_name = None
         if photo is not None and self._loaded and self._loaded.photos:
             data.photo_name = self._loaded.photos.names[photo]
+        data.tour = self._tour
+        data.hotspots = []
+        if self._tour is not None:
+            data.photo_name = self._tour.tour.panoramas[self._nearest_node()].name
+            data.hotspots = find_hotspots(self._tour, self.state.camera, size)
+            data.background = None
+            if not self._is_other_requested():
+                data.background, data.loading, data.refinement = self._describe_loading(), None, None
+
+    def _describe_loading(self) -> tuple[str, float] | None:
+        """The work of the loader on a tour, and the fraction done."""
+        entry, progress, refinement = self.loader.entry, self.loader.progress, self.loader.refinement
+        if entry is None:
+            return None
+        if progress is not None:
+            return f"{'waiting for' if self._waiting else 'next'}: {entry.name}", progress[2]
+        return f"refining: {entry.name}", refinement or 0.0
+
+    def _nearest_node(self) -> int:
+        assert self._tour is not None
+        return self._tour.tour.find_nearest_node(np.asarray(self.state.camera.position))
 
     def _nearest_photo(self) -> int | None:
         """Return the index of the photograph nearest to the camera; None if there is none."""
         photos = self._loaded.photos if self._loaded else None
+        if self._tour is not None:
+            return self._read_nearest_photo(self._tour) if self.state.photo else None
         if photos is None or not len(photos.cam2world):
             return None
         return cameras.find_nearest_view(self.state.camera, photos.cam2world.double().numpy())
+
+    def _read_nearest_photo(self, tour: TourScenes) -> int | None:
+        """Upload the panorama nearest to the camera, unless it is there; returns its index, which is 0."""
+        node = self._nearest_node()
+        if node == self._photo_node:
+            return 0
+        panorama = tour.tour.panoramas[node]
+        try:
+            image, opaque = read_panorama(panorama.image, PHOTO_HEIGHT)
+        except InputError as error:
+            self.panel_data.error, self.state.photo = str(error), False
+            return None
+        pose = tour.tour.cam2world[node][None]
+        self.presenter.upload_photos(
+            Views(image[None], pose, opaque[None], tour.tour.near, tour.tour.far, (panorama.name,))
+        )
+        self._photo_node = node
+        return 0
 
     def _draw_image(self, size: tuple[int, int], target: moderngl.Framebuffer, now: float) -> None:
         camera = self.state.camera
@@ -356,35 +508,41 @@ class Viewer:
         self._last_camera = camera
         self._resolution.limit(size, self.renderer.min_size)
         plan = self._resolution.plan(now, moved=moved, turned=turned, adaptive=self.state.adaptive)
-        image = self._render(camera.cam2world, size, plan)
+        weight, fading = self._fade.compute_weight(now), None
+        milliseconds = self._render(self._slot, camera.cam2world, size, plan)
+        if weight < 1:
+            back = self._slots[1 - self._fade.front]
+            milliseconds += self._render(back, camera.cam2world, size, plan)
+            fading = back.image
+        if milliseconds > 0:  # else the image is not new, or not finished
+            self._resolution.record(plan, milliseconds)
+        image = self._slot.image
+        assert image is not None
+        self.panel_data.size = image.size
         photo = self._nearest_photo() if self.state.photo else None
-        self.presenter.draw(image, target, photo=photo, split=self.state.split, camera=camera)
+        self.presenter.draw(
+            image, target, photo=photo, split=self.state.split, camera=camera, fading=fading, weight=weight
+        )
 
     def _render(
-        self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], plan: ResolutionPlan
-    ) -> moderngl.Texture:
-        """Return the image of this plan; renders only if something changed since the last frame."""
+        self, slot: SceneSlot, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], plan: ResolutionPlan
+    ) -> float:
+        """Draw the image of this plan; returns milliseconds, 0 if it is not new."""
         scaled = (max(round(size[0] * plan.scale), 1), max(round(size[1] * plan.scale), 1))
         settings = replace(self.state.draw_settings, cached=plan.cached)
-        if plan.cached and self.renderer.has_faces(cam2world, size, settings):
+        if slot is not self._slot:  # the scene that fades out may have fewer views
+            settings = fit_settings(settings, slot.scene)
+        if plan.cached and slot.renderer.has_faces(cam2world, size, settings):
             scaled = size
-        key = (cam2world.tobytes(), scaled, settings)
-        if self._image is None or key != self._image_key or not self.renderer.stats.settled:
-            wait = plan.moving and self.renderer.waits_while_moving
-            self._image = self.renderer.render(cam2world, scaled, settings, wait=wait)
-            if self.renderer.stats.frame_ms > 0:  # else the image is not finished
-                self._resolution.record(plan, self.renderer.stats.frame_ms)
-            self._image_key = key
-            self.panel_data.size = scaled
-        assert self._image is not None
-        return self._image
+        wait = plan.moving and slot.renderer.waits_while_moving
+        return slot.draw(cam2world, scaled, settings, wait=wait)
 
     def _focus_center(self) -> None:
         """Orbit the point in the centre of the last image."""
-        if self._image is None:
+        if self._slot.image is None:
             return
         distance = measure_center_depth(self.renderer.read_depth())
-        self._image = None  # `read_depth` may have replaced the texture
+        self._slot.image = None  # `read_depth` may have replaced the texture
         if distance is not None:
             camera = self.state.camera
             point = np.asarray(camera.position) + distance * camera.rotation[:, 2]
@@ -393,10 +551,12 @@ class Viewer:
 
     def _pick(self, place: tuple[float, float], size: tuple[int, int], now: float) -> None:
         """Show the point of the scene at a place of the window, as fractions of width and height."""
-        assert self._uploaded is not None
+        if self._visit(place, size):
+            return
+        assert self._slot.scene is not None
         pixel = place[0] * size[0], place[1] * size[1]
         origin, direction = compute_pixel_ray(self.state.camera, pixel, size)
-        point = pick_point(self._uploaded, origin, direction, self.state.settings)
+        point = pick_point(self._slot.scene, origin, direction, self.state.settings)
         if point is None:
             self.state.points = []
             self.state.show_message("no Gaussian there", now)
@@ -409,6 +569,8 @@ class Viewer:
             self.panel_data.error = None
         if commands.cancel_refinement:
             self.loader.cancel()
+        if commands.visit is not None:
+            self.state.target = commands.visit
         if commands.choose is not None and commands.choose != self.panel_data.current:
             self.show(self.entries, commands.choose)
         elif commands.open is not None:
@@ -428,7 +590,7 @@ class Viewer:
         if panorama:
             settings = replace(settings, layout="equirect")
         self.renderer.render(self.state.camera.cam2world, size, settings, wait=True)
-        self._image = None  # the texture holds the screenshot
+        self._slot.image = None  # the texture holds the screenshot
         try:
             path = write_screenshot(
                 self._folder / self._loaded.entry.folder_name,

@@ -12,13 +12,18 @@ import numpy as np
 import pytest
 import torch
 
+from pansplat.data.images import write_image
+from pansplat.data.pairs import Panorama
 from pansplat.errors import InputError
 from pansplat.gaussians.ply import save_ply
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pixel_directions
+from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.rendering import Rendering, rasterize
+from pansplat.tours import FloorOutline, TourGraph
 from pansplat_viewer.cpu_renderer import CpuRenderer, Renderer
+from pansplat_viewer.loader import LoadedScene, SceneEntry
 from pansplat_viewer.offscreen import create_context
 from pansplat_viewer.renderer import DrawSettings, SplatRenderer
 
@@ -230,3 +235,51 @@ def axis_photos() -> np.ndarray:
     directions = pixel_directions(128, 256).numpy()
     image = 0.5 + 0.5 * directions * np.array((1, -1, 1), dtype=np.float32)
     return np.stack((image, 0.3 * image)).astype(np.float32)
+
+
+@pytest.fixture(scope="session")
+def house(tmp_path_factory, axis_photos) -> TourGraph:
+    """A tour of four panoramas, 0.8 m apart along an L; its three edges have a scene each."""
+    folder = tmp_path_factory.mktemp("house")
+    panoramas = []
+    for index, (x, z) in enumerate(((0, 0), (0, 0.8), (0, 1.6), (0.8, 1.6))):
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[0, 3], pose[2, 3] = x, z
+        write_image(folder / f"room{index}.png", axis_photos[index % 2])
+        panoramas.append(Panorama(f"room{index}", folder / f"room{index}.png", pose))
+    overlaps = {(0, 1): 0.4, (1, 2): 0.4, (2, 3): 0.4}
+    return TourGraph("house tour", folder, tuple(panoramas), 0.45, 10.0, (), overlaps)
+
+
+@pytest.fixture(scope="session")
+def load_house() -> Callable[[SceneEntry], LoadedScene]:
+    """Makes a scene of a tour: a sphere of Gaussians around each view; the scenes have different colours."""
+    return _load_house
+
+
+def _load_house(entry: SceneEntry) -> LoadedScene:
+    tour = entry.tour
+    assert tour is not None
+    if not entry.views:
+        views = next(iter(tour.choose_scene_views().values()))
+        entry = SceneEntry(entry.name, pair=tour.make_pair(views), tour=tour, views=views)
+    directions, cam2world = fibonacci_directions(500), tour.cam2world[list(entry.views)]
+    color = torch.tensor((0.3, 0.5, 0.7)).roll(sum(entry.views)) + 0.2 * directions
+    parts = [
+        Gaussians(
+            means=(pose[:3, 3] + 4 * directions).float(),
+            scales=torch.full((500, 3), 0.5),
+            quats=torch.tensor((1.0, 0, 0, 0)).expand(500, 4),
+            opacities=torch.full((500,), 0.95),
+            harmonics=((color.float() - 0.5) / _Y0)[:, None],
+            levels=torch.zeros(500, dtype=torch.int64),
+            views=torch.full((500,), view),
+        )
+        for view, pose in enumerate(cam2world)
+    ]
+    scene = Scene(Gaussians.cat(parts), cam2world, 0.45, 10.0, (), "synthetic", 64)
+    angles = torch.linspace(0, 2 * torch.pi, 13)[:-1]
+    corners = torch.stack((angles.sin(), angles.cos()), dim=1).double().numpy()
+    centers = {view: tour.positions[view][[0, 2]] for view in entry.views}
+    outlines = {view: FloorOutline(center, center + corners, 1.0) for view, center in centers.items()}
+    return LoadedScene(entry, scene, outlines=outlines)

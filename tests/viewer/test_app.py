@@ -134,4 +134,4 @@ def test_a_scene_without_cameras_is_orbited(small_scene):
 
 
 def test_a_film_has_at_least_two_frames():
-    assert Film(seconds=0).num_frames == 2 and Film(seconds=2, fps=24).num_frames == 48
+    assert Film(seconds=0).count_frames() == 2 and Film(seconds=2, fps=24).count_frames() == 48

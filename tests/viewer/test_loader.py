@@ -59,7 +59,8 @@ def test_a_folder_of_scenes_has_an_entry_for_each(tmp_path, small_scene):
 @pytest.mark.shared
 def test_a_folder_of_pairs_has_an_entry_for_each(shared):
     entries = find_entries(shared / "data" / "zind", LoadOptions())
-    assert len(entries) >= 3 and all(entry.pair is not None for entry in entries)
+    assert entries[0].tour is not None and len(entries[0].tour) == 13, "the tour of all panoramas is the first"
+    assert len(entries) >= 4 and all(entry.pair is not None for entry in entries[1:])
 
 
 @pytest.mark.parametrize(

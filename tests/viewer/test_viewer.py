@@ -194,12 +194,14 @@ def make_sphere_scene(entry: SceneEntry, photos: np.ndarray) -> LoadedScene:
 
 
 @pytest.fixture(scope="module", params=["gl", "cpu"])
-def session(request, gl_context, small_scene, axis_photos, tmp_path_factory) -> Iterator[User]:
+def session(request, gl_context, small_scene, axis_photos, load_house, tmp_path_factory) -> Iterator[User]:
     images = torch.from_numpy(axis_photos).permute(0, 3, 1, 2)
     mask = torch.ones(2, 128, 256, dtype=torch.bool)
     photos = Views(images, small_scene.cam2world, mask, 0.45, 10.0, small_scene.names)
 
     def load(entry, progress, show):
+        if entry.tour is not None:
+            return load_house(entry)
         if entry.name == "sphere":
             return make_sphere_scene(entry, axis_photos)
         if entry.name == "damaged":
@@ -232,7 +234,7 @@ def user(session, ctx) -> User:
     if session.data.entries != [entry.name for entry in ENTRIES] or session.data.current != 0:
         session.show(*ENTRIES)
     state, start = session.state, ViewerState()
-    kept = ("camera", "home", "context", "levels", "adaptive", "message", "message_until")
+    kept = ("camera", "home", "context", "num_views", "levels", "adaptive", "message", "message_until")
     for name in (field.name for field in fields(ViewerState) if field.name not in kept):
         setattr(state, name, getattr(start, name))
     state.camera, state.adaptive, state.message = state.home, True, ""
@@ -567,3 +569,127 @@ def test_a_cancelled_refinement_keeps_the_prediction(user, small_scene, monkeypa
     assert cancelled.wait(20)
     user.settle()
     assert user.data.refinement is None and user.data.error is None
+
+
+# --- tours ---
+
+
+@pytest.fixture
+def tour_user(user, house, monkeypatch) -> User:
+    """The session in the tour, at its first panorama, with all that is next in memory."""
+    user.show(SceneEntry(house.name, tour=house))
+    user.settle()
+    for slot in user.viewer._slots:
+        monkeypatch.setattr(slot.renderer, "min_size", (64, 64))
+    return user
+
+
+def fly(user: User, frames: int = 400, seconds: float = 1 / 5) -> list[float]:
+    """Draw frames until the flight ends; returns the mean change from each frame to the next."""
+    user.viewer._resolution.budget_ms = 1e-3  # coarse images save time
+    steps, last = [], user.read_screen()
+    for _ in range(frames):
+        user.draw_frames(1, seconds)
+        image = user.read_screen()
+        steps.append(float(np.abs(image - last).mean()))
+        last = image
+        if not (user.state.playing or user.viewer.moving):
+            return steps
+        if user.viewer._waiting or user.viewer.loader.entry:
+            time.sleep(0.005)
+    raise AssertionError("the flight does not end")
+
+
+def find_node(user: User) -> int:
+    return user.viewer._tour.tour.find_nearest_node(np.asarray(user.state.camera.position))
+
+
+def test_the_hotspots_and_the_floor_plan_of_a_tour_can_be_hidden(tour_user):
+    user = tour_user
+    assert user.viewer._tour.tour.name == "house tour" and user.data.hotspots
+    images = [user.read_image()]
+    for label in ("hotspots", "floor plan"):
+        user.click(label)
+        images.append(user.read_image())
+        assert changed_fraction(images[-2], images[-1]) > 0.002, label
+    user.press(imgui.Key.m)
+    user.press(imgui.Key.m)
+    assert user.state.minimap == user.state.hotspots
+    user.press(imgui.Key.m)
+    assert user.state.minimap and user.state.hotspots
+    assert changed_fraction(images[0], user.read_image()) == 0
+
+
+@pytest.mark.slow
+def test_a_click_on_a_hotspot_flies_there_and_fades_to_its_scene(tour_user):
+    user = tour_user
+    (hotspot,) = [spot for spot in user.data.hotspots if spot.node == 2]
+    first, color = user.viewer._slot.scene, user.read_image().mean((0, 1))
+    user.click_at(*hotspot.center)
+    assert user.state.playing and not user.state.points
+    fly(user)
+    assert np.linalg.norm(user.state.camera.position - user.viewer._tour.tour.positions[2]) < 1e-6
+    user.click_at(*user.panels.minimap.nodes[3])
+    steps = fly(user)
+    assert find_node(user) == 3 and user.viewer._slot.scene is not first
+    exchanged = np.abs(user.read_image().mean((0, 1)) - color).mean()
+    assert exchanged > 30, "the scenes have different colours"
+    assert max(steps) < 0.5 * exchanged, "no jump: a fade changes 30 % in 0.2 s at most"
+
+
+@pytest.mark.slow
+def test_a_flight_waits_for_a_scene_that_is_not_loaded(user, house, load_house, monkeypatch):
+    go = threading.Event()
+
+    def load(entry, progress, show):
+        if entry.views and entry.views != (0, 1):
+            progress("predicting", 0.5)
+            assert go.wait(20)
+        return load_house(entry)
+
+    monkeypatch.setattr(user.viewer.loader, "_load", load)
+    user.viewer.show([SceneEntry(house.name, tour=house)], 0)
+    while user.viewer._tour is None:
+        user.draw_frames(1)
+    user.press(imgui.Key._3)
+    user.viewer._resolution.budget_ms = 1e-3
+    while not user.viewer._waiting:
+        user.draw_frames(1, 1 / 8)
+    user.draw_frames(1, 1)
+    assert find_node(user) == 1 and user.state.playing and not user.viewer.moving
+    assert user.data.background == ("waiting for: room1-room2", 0.5)
+    assert (user.read_screen().max(-1) < 8).mean() < 0.01, "the last scene is shown"
+    go.set()
+    fly(user)
+    assert find_node(user) == 2
+
+
+def test_space_plays_the_tour_through_all_panoramas_within_the_memory(tour_user):
+    user = tour_user
+    user.viewer._tour._budget, user.viewer._resolution.budget_ms = 0, 1e-3
+    user.press(imgui.Key.space)
+    visited, most = set(), 0
+    for _ in range(1000):
+        user.draw_frames(1, 1 / 4)
+        visited.add(find_node(user))
+        most = max(most, len(user.viewer._tour.loaded))
+        if not user.state.playing:
+            break
+        if user.viewer.loader.entry:
+            time.sleep(0.002)
+    assert visited == {0, 1, 2, 3} and not user.state.playing
+    assert most <= 3, "a scene, that of the camera and the one before"
+    before = user.state.camera
+    user.press(imgui.Key.w, frames=4)
+    user.press(imgui.Key.space)
+    moved = np.linalg.norm(np.subtract(user.state.camera.position, before.position))
+    assert moved < 1.0, "the flight starts where the camera is"
+    user.press(imgui.Key.space)
+
+
+def test_the_nearest_photograph_of_a_tour_is_shown(tour_user):
+    user = tour_user
+    before = user.read_image()
+    user.click("nearest photograph")
+    assert changed_fraction(before, user.read_image()) > 0.3
+    assert user.data.photo_name == "room0"
