@@ -165,7 +165,7 @@ def _choose_fine_pixels(image: np.ndarray, heights: list[int], config: LiftConfi
             finer = split
         if count <= config.fine_points:
             return [*masks, finer]
-        limit *= 1.05
+        limit *= max(1.05, (count / config.fine_points) ** 0.5)
 
 
 def _any_in_blocks(mask: np.ndarray) -> np.ndarray:
