@@ -269,7 +269,7 @@ class Refinement:
     ) -> RefineReport:
         """Refine for a number of steps, or of seconds.
 
-        The run goes over to its last part early if the held-out error stagnates.
+        The run goes over to its last part early if the held-out error stagnates. An object runs once.
 
         Args:
             seconds: time limit since this object was made; the result depends on the speed of the machine.
@@ -307,14 +307,21 @@ class Refinement:
         after = self.held_out_error()
         history.append((clock.steps, clock.elapsed, after))
         report("refined", 1.0)
-        self._optimizer.zero_grad(set_to_none=True)
-        self._optimizer.state.clear()  # gigabytes for millions of Gaussians
+        self._result = self._scene() if after <= before else self._start
+        self._release_parameters()
         if after <= before:
             detail = self._size[0] / self._images.shape[-2]  # of large photographs is in Gaussians of small area
-            self._result = self._finish(drop_unseen(self._scene(), self._size, detail * DROP_ERROR))
+            self._result = drop_unseen(self._result, self._size, detail * DROP_ERROR)
+            self._result = self._finish(self._result)
         else:
-            self._result, stopped = self._start, "worse"
+            stopped = "worse"
         return RefineReport(clock.steps, clock.elapsed, stopped, before, after, self.gains, tuple(history))
+
+    def _release_parameters(self) -> None:
+        """Free the parameters and the optimiser's state, which are gigabytes for millions of Gaussians."""
+        self._views.clear()
+        self._optimizer.state.clear()
+        self._optimizer.param_groups.clear()
 
     def _end_cost(self) -> float:
         """Approximate duration of the last error, the contributions and the fit of colours, in steps."""
