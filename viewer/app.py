@@ -1,7 +1,7 @@
 """The `pansplat-view` command. Imports torch and OpenGL only when they are needed, so that `--help` is fast."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -10,12 +10,11 @@ import tyro
 
 from pansplat.console import own_warnings, parse_arguments
 from pansplat.errors import InputError
-from pansplat.files import expand_home, require_output_folder
+from pansplat.files import expand_home, require_output_file, require_output_folder
 from pansplat.options import REAL, Depth, Height, Range, Seconds, check_numbers
 from pansplat_viewer.loader import (
     LoadedScene,
     LoadOptions,
-    Progress,
     SceneEntry,
     SceneLoader,
     find_entries,
@@ -26,8 +25,7 @@ from pansplat_viewer.settings import DrawSettings, Kernel, Mode, Order, Renderer
 if TYPE_CHECKING:
     import moderngl
 
-    from pansplat_viewer.capture import Film
-    from pansplat_viewer.cpu_renderer import Renderer
+    from pansplat_viewer.key_frames import CameraPath
 
 
 @dataclass(frozen=True)
@@ -41,6 +39,10 @@ class Options:
     """A folder of panoramas (three or more are a tour), a folder of such folders, or a scene file."""
     offscreen: Path | None = None
     """Open no window; write film, stills and panorama to this folder."""
+    path_file: Annotated[Path | None, tyro.conf.arg(name="path")] = None
+    """A camera path (docs/viewer.md): the window has its key frames; with --out, the film follows it."""
+    out: Path | None = None
+    """Open no window; write the film of --path to this file: .mp4, .webm, or .png or .exr for a numbered sequence."""
     pair: str | None = None
     """Name or number of the tour, pair or scene to show first if the path holds several; offscreen also "all"."""
     model: str = "default"
@@ -137,12 +139,23 @@ def _run(options: Options) -> int:
     pixels = options.pixels
     if options.offscreen is not None:
         require_output_folder("--offscreen", options.offscreen)
+    from pansplat.data.video import VIDEO_SUFFIXES
+    from pansplat_viewer.key_frames import read_path
+
+    if options.out is not None:
+        require_output_file("--out", options.out, (*VIDEO_SUFFIXES, ".png", ".exr"))
+        if options.path_file is None or options.offscreen is not None or options.pair == "all":
+            raise InputError("--out needs --path, one scene and no --offscreen; give the file of a camera path")
+    path = None if options.path_file is None else read_path(expand_home(options.path_file))
     entries = find_entries(expand_home(options.path), options.load_options)
     show_all = options.pair == "all"
     first = 0 if show_all else choose_entry(entries, options.pair)
     folder = options.offscreen
+    if options.out is not None:
+        _write_film(options, entries[first], options.out.parent, pixels, path)
+        return 0
     if folder is None:
-        problem = _run_window(options, entries, first, pixels)
+        problem = _run_window(options, entries, first, pixels, path)
         if problem is None:
             return 0
         print(f"{problem}: writing a fly-through instead")
@@ -154,12 +167,15 @@ def _run(options: Options) -> int:
         target = Path("renders") if folder is None else folder
         if folder is None or show_all:
             target /= entry.folder_name
-        _write_flythrough(options, entry, target, pixels)
+        _write_film(options, entry, target, pixels)
     return 0
 
 
-def _run_window(options: Options, entries: list[SceneEntry], first: int, pixels: tuple[int, int]) -> str | None:
+def _run_window(
+    options: Options, entries: list[SceneEntry], first: int, pixels: tuple[int, int], path: "CameraPath | None"
+) -> str | None:
     """Run the viewer in a window; if no window can be opened, returns the reason."""
+    from pansplat_viewer.key_frames import CameraPath
     from pansplat_viewer.state import ViewerState
     from pansplat_viewer.viewer import Viewer
     from pansplat_viewer.window import NoWindowError, Window, run_viewer
@@ -173,7 +189,7 @@ def _run_window(options: Options, entries: list[SceneEntry], first: int, pixels:
         window.ctx,
         SceneLoader(lambda entry, progress, show: load_entry(entry, load_options, progress, show)),
         find=lambda path: find_entries(path, load_options),
-        state=ViewerState(settings=options.settings),
+        state=ViewerState(settings=options.settings, path=path or CameraPath()),
         at=options.at or 0.0,
         dpi_scale=window.dpi_scale,
         renderer=options.renderer,
@@ -184,20 +200,28 @@ def _run_window(options: Options, entries: list[SceneEntry], first: int, pixels:
     return None
 
 
-def _write_flythrough(options: Options, entry: SceneEntry, folder: Path, pixels: tuple[int, int]) -> None:
-    """Load one entry and write its fly-through, with progress bars."""
+def _write_film(
+    options: Options,
+    entry: SceneEntry,
+    folder: Path,
+    pixels: tuple[int, int],
+    path: "CameraPath | None" = None,
+) -> None:
+    """Load one entry and write its fly-through to a folder, or the film of a path to `--out`, with progress bars."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from pansplat_viewer.capture import Film, write_flythrough
+    from pansplat.tours import plan_route
+    from pansplat_viewer.capture import Film, SceneFrames, TourFrames, write_flythrough, write_path_film, write_tour
     from pansplat_viewer.cpu_renderer import create_renderer
-    from pansplat_viewer.state import fit_settings
+    from pansplat_viewer.state import create_level_camera, fit_settings
+    from pansplat_viewer.tour import TourScenes
 
     film = Film(pixels, options.seconds, options.fps, 0.5 if options.at is None else options.at)
     ctx = _create_context(options.renderer)  # before the prediction, so that missing OpenGL is reported early
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f}%"))
     with Progress(*columns, TimeElapsedColumn()) as bars:
 
-        def load_with_bar(entry: SceneEntry) -> LoadedScene:
+        def load(entry: SceneEntry) -> LoadedScene:
             bar = bars.add_task(entry.name, total=1.0)
             loaded = load_entry(
                 entry,
@@ -209,50 +233,38 @@ def _write_flythrough(options: Options, entry: SceneEntry, folder: Path, pixels:
             bars.update(bar, description=f"{name}: {len(loaded.scene.gaussians):,} Gaussians", completed=1.0)
             return loaded
 
-        loaded = load_with_bar(entry)
-        draw = bars.add_task("fly-through", total=1.0)
+        loaded = load(entry)
+        draw = bars.add_task("film", total=1.0)
 
         def show_progress(task: str, done: float) -> None:
-            bars.update(draw, description=f"fly-through: {task}", completed=done)
+            bars.update(draw, description="film" if task in ("film", "done") else f"film: {task}", completed=done)
 
-        settings = fit_settings(options.settings, loaded.scene)
-        renderers = [
-            create_renderer(ctx, options.renderer, color_bits=32) for _ in range(1 if entry.tour is None else 2)
-        ]
+        tour, settings = loaded.entry.tour, fit_settings(options.settings, loaded.scene)
+        renderers = [create_renderer(ctx, options.renderer, color_bits=32) for _ in range(1 if tour is None else 2)]
         try:
-            if loaded.entry.tour is None:
-                written = write_flythrough(renderers[0], loaded.scene, folder, film, settings, show_progress)
+            scenes = None if tour is None else TourScenes(tour, memory=options.memory)
+            if scenes is None:
+                frames = SceneFrames(renderers[0], loaded.scene, pixels, settings)
             else:
-                written = _write_tour(options, renderers, loaded, load_with_bar, folder, film, show_progress)
+                scenes.add(loaded)
+                frames = TourFrames(renderers, scenes, load, pixels, settings)
+            if path is not None:
+                assert options.out is not None
+                level = create_level_camera(loaded.scene, tour)
+                written = write_path_film(frames, path, level, options.out, options.fps, show_progress)
+            elif scenes is not None:
+                assert isinstance(frames, TourFrames)
+                route = plan_route(scenes.tour, scenes.tour.plan_walk())
+                written = write_tour(frames, scenes, route, folder, film, show_progress)
+            else:
+                written = write_flythrough(renderers[0], loaded.scene, folder, film, settings, show_progress)
         finally:
             for renderer in renderers:
                 renderer.release()
             if ctx is not None:
                 ctx.release()
-    for path in written:
-        print(path)
-
-
-def _write_tour(
-    options: Options,
-    renderers: "list[Renderer]",
-    loaded: LoadedScene,
-    load: Callable[[SceneEntry], LoadedScene],
-    folder: Path,
-    film: "Film",
-    progress: Progress,
-) -> list[Path]:
-    """Write the film through a tour whose first scene is loaded."""
-    from pansplat.tours import plan_route
-    from pansplat_viewer.capture import write_tour
-    from pansplat_viewer.tour import TourScenes
-
-    tour = loaded.entry.tour
-    assert tour is not None
-    scenes = TourScenes(tour, memory=options.memory)
-    scenes.add(loaded)
-    route = plan_route(tour, tour.plan_walk())
-    return write_tour(renderers, scenes, route, load, folder, film, options.settings, progress)
+    for file in written:
+        print(file)
 
 
 def _create_context(renderer: RendererChoice) -> "moderngl.Context | None":

@@ -1,21 +1,23 @@
-"""Files that the viewer writes: numbered screenshots, the fly-through (film, stills and a panorama), and the film of a
-tour."""
+"""Files that the viewer writes: screenshots, the fly-through of a pair, and films of tours and of camera paths."""
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from pansplat.data.images import write_image
-from pansplat.data.video import write_video
+from pansplat.data.video import VIDEO_SUFFIXES, write_video
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose, path_poses
 from pansplat.geometry.pose import interpolate_poses
 from pansplat.tours import FloorPlan, Route, draw_floor_plan
 from pansplat_viewer import camera as cameras
+from pansplat_viewer.camera import Camera
 from pansplat_viewer.cpu_renderer import Renderer
+from pansplat_viewer.key_frames import CameraPath
 from pansplat_viewer.loader import LoadedScene, SceneEntry
 from pansplat_viewer.settings import DrawSettings
 from pansplat_viewer.state import NEAR_OF_FAR, ViewerState, enter_scene, fit_settings
@@ -39,10 +41,16 @@ def write_screenshot(
     The file is the first of `view_001.png`, `view_002.png`, ... (`panorama_001.png`, ...) that does not exist.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    stem, number = "panorama" if panorama else "view", 1
-    while (path := folder / f"{stem}_{number:03d}.{suffix}").exists():
-        number += 1
+    path = find_free_name(folder, "panorama" if panorama else "view", f".{suffix}")
     write_image(path, np.clip(color, 0, 1), depth=depth, panorama=panorama)
+    return path
+
+
+def find_free_name(folder: Path, stem: str, suffix: str) -> Path:
+    """The first of STEM_001, STEM_002, ... of which there is neither a file nor a sequence."""
+    number = 1
+    while (path := folder / f"{stem}_{number:03d}{suffix}").exists() or name_frame(path, 0).exists():
+        number += 1
     return path
 
 
@@ -133,7 +141,7 @@ def write_flythrough(
         for frame in range(num_frames):
             progress("film", (len(STILLS) + 1 + frame) / steps)
             pose = compute_flight_pose(scene, frame / (num_frames - 1))
-            yield (_render(renderer, pose, film.size, settings) * 255 + 0.5).astype(np.uint8)
+            yield to_bytes(_render(renderer, pose, film.size, settings))
 
     written.append(folder / "flythrough.mp4")
     write_video(written[-1], render_frames(), film.fps)
@@ -141,68 +149,114 @@ def write_flythrough(
     return written
 
 
+class SceneFrames:
+    """Draws the frames of a film in one scene."""
+
+    def __init__(self, renderer: Renderer, scene: Scene, size: tuple[int, int], settings: DrawSettings) -> None:
+        """Upload the scene; `size` is (width, height), pixels."""
+        renderer.upload(scene)
+        self._renderer, self._size = renderer, size
+        self._settings = replace(fit_settings(settings, scene), layout="pinhole", cached=False)
+
+    def draw(
+        self, pose: Float[np.ndarray, "4 4"], vertical_fov_degrees: float, now: float, *, with_depth: bool = False
+    ) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"] | None]:
+        """Colour of a pose at a time of the film, in seconds, and radial depth in metres if it is asked for."""
+        settings = replace(self._settings, vertical_fov_degrees=vertical_fov_degrees)
+        color = _render(self._renderer, pose, self._size, settings)
+        return color, self._renderer.read_depth() if with_depth else None
+
+
+class TourFrames:
+    """Draws the frames of a film in a tour: loads each scene when the camera needs it, and fades it in."""
+
+    def __init__(
+        self,
+        renderers: Sequence[Renderer],
+        scenes: TourScenes,
+        load: Callable[[SceneEntry], LoadedScene],
+        size: tuple[int, int],
+        settings: DrawSettings,
+    ) -> None:
+        """Prepare the first frame.
+
+        Args:
+            renderers: two; scenes are uploaded to them in turn.
+            scenes: of the tour; loaded ones are kept within its memory.
+            load: returns the scene of an entry.
+            size: (width, height), pixels.
+            settings: draw settings.
+        """
+        self._renderers, self._scenes, self._load, self._size = renderers, scenes, load, size
+        self._settings = replace(settings, layout="pinhole", cached=False, near=NEAR_OF_FAR * scenes.tour.far)
+        self._fade = CrossFade()
+
+    def draw(
+        self, pose: Float[np.ndarray, "4 4"], vertical_fov_degrees: float, now: float, *, with_depth: bool = False
+    ) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"] | None]:
+        """As `SceneFrames.draw`; depth is that of the scene that fades in."""
+        self._scenes.move(pose[:3, 3])
+        return self.draw_scene(pose, vertical_fov_degrees, now, with_depth=with_depth)
+
+    def draw_scene(
+        self, pose: Float[np.ndarray, "4 4"], vertical_fov_degrees: float, now: float, *, with_depth: bool = False
+    ) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"] | None]:
+        """As `draw`, with the edge that is chosen already."""
+        scenes, fade = self._scenes, self._fade
+        loaded = scenes.get(scenes.views)
+        if loaded is None:
+            loaded = self._load(scenes.make_entry(scenes.views))
+            scenes.add(loaded)
+        fade.compute_weight(now)
+        slot = fade.choose_slot(loaded.scene)
+        if slot is not None:
+            if fade.scenes[slot] is not loaded.scene:
+                self._renderers[slot].upload(loaded.scene)
+            fade.show(slot, loaded.scene, now)
+        weight, color, depth = fade.compute_weight(now), 0.0, None
+        for slot, part in ((1 - fade.front, 1 - weight), (fade.front, weight)):
+            scene, renderer = fade.scenes[slot], self._renderers[slot]
+            if scene is not None and (part > 0 or (with_depth and slot == fade.front)):
+                settings = replace(fit_settings(self._settings, scene), vertical_fov_degrees=vertical_fov_degrees)
+                color = color + part * _render(renderer, pose, self._size, settings)
+        if with_depth:
+            depth = self._renderers[fade.front].read_depth()
+        return np.asarray(color), depth
+
+
 def write_tour(
-    renderers: Sequence[Renderer],
+    frames: TourFrames,
     scenes: TourScenes,
     route: Route,
-    load: Callable[[SceneEntry], LoadedScene],
     folder: Path,
     film: Film,
-    settings: DrawSettings,
     progress: Callable[[str, float], None],
 ) -> list[Path]:
     """Write the film of a route through a tour (`tour.mp4`) and its floor plan (`floor_plan.png`); returns the files.
 
-    Each scene is loaded when the camera reaches its edge, and fades in as in the window.
-
     Args:
-        renderers: two; scenes are uploaded to them in turn.
-        scenes: of the tour; loaded ones are kept within its memory.
+        frames: of the tour.
+        scenes: of the tour.
         route: the flight.
-        load: returns the scene of an entry.
         folder: created if it does not exist.
         film: size and times.
-        settings: draw settings; the film's field of view and layout replace theirs.
         progress: called with the task and the fraction done.
 
     Raises:
         InputError: the folder cannot be written, or a scene cannot be loaded.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    settings = replace(
-        settings,
-        vertical_fov_degrees=film.vertical_fov_degrees,
-        layout="pinhole",
-        cached=False,
-        near=NEAR_OF_FAR * scenes.tour.far,
-    )
-    num_frames, fade = film.count_frames(route), CrossFade()
-    # A film that is shorter or longer than the route changes the speed of the camera and that of the fades.
-    seconds_per_frame = route.seconds / num_frames
+    num_frames = film.count_frames(route)
 
     def render_frames() -> Iterator[np.ndarray]:
         for frame in range(num_frames):
-            fraction, now = frame / (num_frames - 1), frame * seconds_per_frame
+            fraction = frame / (num_frames - 1)
             progress("film", frame / num_frames)
             pose = route.pose(fraction)
             scenes.move(pose[:3, 3], route, fraction)
-            loaded = scenes.get(scenes.views)
-            if loaded is None:
-                loaded = load(scenes.make_entry(scenes.views))
-                scenes.add(loaded)
-            weight = fade.compute_weight(now)
-            slot = fade.choose_slot(loaded.scene)
-            if slot is not None:
-                if fade.scenes[slot] is not loaded.scene:
-                    renderers[slot].upload(loaded.scene)
-                fade.show(slot, loaded.scene, now)
-                weight = fade.compute_weight(now)
-            image = 0.0
-            for slot, part in ((fade.front, weight), (1 - fade.front, 1 - weight)):
-                scene = fade.scenes[slot]
-                if part > 0 and scene is not None:
-                    image += part * _render(renderers[slot], pose, film.size, fit_settings(settings, scene))
-            yield (np.asarray(image) * 255 + 0.5).astype(np.uint8)
+            # A film that is shorter or longer than the route changes the speed of the camera and that of the fades.
+            color, _ = frames.draw_scene(pose, film.vertical_fov_degrees, fraction * route.seconds)
+            yield to_bytes(color)
 
     written = [folder / "tour.mp4"]
     write_video(written[0], render_frames(), film.fps)
@@ -211,6 +265,107 @@ def write_tour(
     write_image(written[1], _draw_route(plan, scenes, route))
     progress("done", 1.0)
     return written
+
+
+def write_path_film(
+    frames: SceneFrames | TourFrames,
+    path: CameraPath,
+    level: Camera,
+    file: Path,
+    fps: float,
+    progress: Callable[[str, float], None],
+) -> list[Path]:
+    """Write the film of a camera path; returns the files. Frame i shows the path at i / fps seconds.
+
+    Args:
+        frames: of the scene.
+        path: key frames.
+        level: a camera with the scene's level axes.
+        file: a film (.mp4 or .webm), or the name of a sequence: `walk.png` and `walk.exr` (with depth) are written as
+            `walk_0000.png` or `walk_0000.exr`, and so on.
+        fps: frames per second.
+        progress: called with the task and the fraction done.
+
+    Raises:
+        InputError: a file cannot be written, or a scene cannot be loaded.
+    """
+    num_frames, written = path.count_frames(fps), []
+
+    def draw(frame: int, *, with_depth: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
+        progress("film", frame / num_frames)
+        camera = path.interpolate(frame / fps, level)
+        return frames.draw(camera.cam2world, camera.vertical_fov_degrees, frame / fps, with_depth=with_depth)
+
+    if file.suffix.lower() in VIDEO_SUFFIXES:
+        write_video(file, (to_bytes(draw(frame)[0]) for frame in range(num_frames)), fps)
+        written.append(file)
+    else:
+        for frame in range(num_frames):
+            color, depth = draw(frame, with_depth=file.suffix.lower() == ".exr")
+            written.append(name_frame(file, frame))
+            write_image(written[-1], color, depth=depth, panorama=False)
+    progress("done", 1.0)
+    return written
+
+
+class FilmWriter:
+    """Writes one film at a time in a worker thread."""
+
+    def __init__(self) -> None:
+        """The thread starts with the first film."""
+        self._executor = ThreadPoolExecutor(1, "film-writer")
+        self._future: Future[list[Path]] | None = None
+        self._fraction, self._cancelled = 0.0, False
+
+    @property
+    def progress(self) -> float | None:
+        """Fraction of the film that is written; None if none is being written."""
+        return None if self._future is None else self._fraction
+
+    def start(self, write: Callable[[Callable[[str, float], None]], list[Path]]) -> None:
+        """Call `write` with a progress call in the thread; a film that is being written is cancelled."""
+        self.cancel()
+        self._fraction, self._cancelled = 0.0, False
+        self._future = self._executor.submit(write, self._report)
+
+    def poll(self) -> list[Path] | BaseException | None:
+        """The files or the exception of a film that is finished, once; None before, and if it was cancelled."""
+        if self._future is None or not self._future.done():
+            return None
+        future, self._future = self._future, None
+        error = future.exception()
+        return None if isinstance(error, _CancelledError) else error or future.result()
+
+    def cancel(self) -> None:
+        """End the film and wait for the thread; no incomplete film is left behind."""
+        self._cancelled = True
+        if self._future is not None:
+            wait([self._future])
+            self._future = None
+
+    def close(self) -> None:
+        """Cancel the film and end the thread."""
+        self.cancel()
+        self._executor.shutdown()
+
+    def _report(self, task: str, fraction: float) -> None:
+        if self._cancelled:
+            raise _CancelledError
+        self._fraction = fraction
+
+
+class _CancelledError(Exception):
+    """Raised from the progress call to end a film that was cancelled."""
+
+
+def name_frame(file: Path, frame: int) -> Path:
+    """The file of one frame of a sequence, such as `walk_0012.png` of `walk.png`."""
+    return file.with_name(f"{file.stem}_{frame:04d}{file.suffix.lower()}")
+
+
+def to_bytes(color: Float[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+    """Colours in [0, 1] as 8 bits."""
+    return (color * 255 + 0.5).astype(np.uint8)
 
 
 def _draw_route(plan: FloorPlan, scenes: TourScenes, route: Route) -> Float[np.ndarray, "height width 3"]:

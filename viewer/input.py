@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pansplat_viewer import camera as cameras
-from pansplat_viewer.state import ViewerState, jump_to_view, step_flight, toggle_play
+from pansplat_viewer.state import ViewerState, add_key_frame, jump_to_view, step_flight, toggle_play
 
 FLY_SPEED = 1.0  # metres per second
 FAST, SLOW = 4.0, 0.2
@@ -34,6 +34,7 @@ HELP = (
     (", .", "step along the flight"),
     ("C", "compare with the nearest photograph"),
     ("B", "before or after the refinement"),
+    ("K", "key frame of the camera path"),
     ("P, Shift P", "screenshot PNG, EXR with depth"),
     ("R", "back to the start"),
     ("Tab", "panels on or off"),
@@ -78,6 +79,9 @@ class Commands:
         choose: show the entry of this index.
         open: show the scenes at this path.
         visit: fly to this panorama of the tour.
+        save_path, open_path: write or read the key frames, to or from this file.
+        film: write the film of the path.
+        cancel_film: end the film that is being written.
         dismiss_error: close the error message.
         cancel_refinement: keep the prediction.
     """
@@ -90,12 +94,16 @@ class Commands:
     choose: int | None = None
     open: str | None = None
     visit: int | None = None
+    save_path: str | None = None
+    open_path: str | None = None
+    film: bool = False
+    cancel_film: bool = False
     dismiss_error: bool = False
     cancel_refinement: bool = False
 
 
 _KEYS = {
-    **{letter: letter for letter in "wasdqevfhprcbm"},
+    **{letter: letter for letter in "wasdqevfhprcbmk"},
     **{digit: f"_{digit}" for digit in "123456789"},
     "space": "space",
     ",": "comma",
@@ -164,6 +172,8 @@ def _apply_pressed(state: ViewerState, pressed: frozenset[str]) -> None:
             setattr(state, name, not getattr(state, name))
     if "m" in pressed:
         state.minimap = state.hotspots = not state.minimap
+    if "k" in pressed:
+        add_key_frame(state)
     if "space" in pressed:
         toggle_play(state)
     if "r" in pressed:
@@ -213,5 +223,5 @@ def _move_camera(state: ViewerState, events: Input) -> None:
     if camera != state.camera:
         # Moving the camera stops the flight; a change of the field of view alone does not.
         moved = replace(camera, vertical_fov_degrees=state.camera.vertical_fov_degrees) != state.camera
-        state.playing = state.playing and not moved
+        state.playing, state.path_playing = state.playing and not moved, state.path_playing and not moved
         state.camera = camera

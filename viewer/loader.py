@@ -234,6 +234,10 @@ class SceneLoader:
         self._job = _Job(entry)
         self._job.future = self._executor.submit(self._load, entry, self._job.report, self._job.show)
 
+    def load(self, entry: SceneEntry) -> LoadedScene:
+        """Load an entry in the calling thread, without regard to requests."""
+        return self._load(entry, lambda task, done: None, lambda loaded: None)
+
     @property
     def entry(self) -> SceneEntry | None:
         """The entry that is being loaded or refined; None if the loader is idle."""

@@ -12,10 +12,11 @@ from imgui_bundle import imgui
 
 from pansplat_viewer import camera as cameras
 from pansplat_viewer.input import HELP, Commands
+from pansplat_viewer.key_frames import KeyFrame
 from pansplat_viewer.minimap import SIZE, Minimap
 from pansplat_viewer.picking import project_point
 from pansplat_viewer.settings import FrameStats, Kernel, Lowpass, Order
-from pansplat_viewer.state import ViewerState, fly_to, jump_to_view, toggle_play
+from pansplat_viewer.state import KEY_SECONDS, ViewerState, add_key_frame, fly_to, jump_to_view, show_path, toggle_play
 from pansplat_viewer.tour import Hotspot, TourScenes
 
 Rectangle = tuple[float, float, float, float]  # left, top, right, bottom, pixels
@@ -48,6 +49,7 @@ class PanelData:
         loading: name, task, fraction done; None if nothing is loading.
         refinement: fraction done; 1 if the refined scene is there, None if there is no refinement.
         error: message of the last failure.
+        film: fraction of the film that is written; None if none is being written.
         tour: the scenes of the tour that is shown; None for other scenes.
         hotspots: places of its panoramas in the image.
         background: work of the loader on the tour, and the fraction done.
@@ -62,6 +64,7 @@ class PanelData:
     loading: tuple[str, str, float] | None = None
     refinement: float | None = None
     error: str | None = None
+    film: float | None = None
     tour: TourScenes | None = None
     hotspots: list[Hotspot] = field(default_factory=list)
     background: tuple[str, float] | None = None
@@ -127,14 +130,14 @@ class Panels:
 
     Attributes:
         items: rectangle of each widget of the last frame, by its label; for tests that click.
-        path: text of the path field.
+        path, path_file: texts of the fields of scenes and of the camera path.
         minimap: the plan of a tour.
     """
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self.items: dict[str, Rectangle] = {}
         self.minimap = Minimap(ctx)
-        self.path = ""
+        self.path, self.path_file = "", "path.json"
 
     def draw(self, state: ViewerState, data: PanelData, now: float) -> Commands:
         """Draw the panels that are shown at time `now` (seconds); returns the commands given through them."""
@@ -209,10 +212,11 @@ class Panels:
         self._record_rectangle(label)
         return chosen if changed else value  # imgui returns an unchanged value rounded to float32
 
-    def _section(self, label: str, draw: Callable[..., None], *args: object) -> None:
-        opened = imgui.collapsing_header(label, imgui.TreeNodeFlags_.default_open.value)
+    def _section(self, label: str, draw: Callable[..., None], *args: object, opened: bool = True) -> None:
+        flags = imgui.TreeNodeFlags_.default_open if opened else imgui.TreeNodeFlags_.none
+        shown = imgui.collapsing_header(label, flags.value)
         self._record_rectangle(label)
-        if opened:
+        if shown:
             imgui.push_id(label)
             draw(*args)
             imgui.pop_id()
@@ -231,6 +235,7 @@ class Panels:
             self._section("Camera", self._draw_camera, state)
             self._section("Photograph", self._draw_photograph, state, data)
             self._section("Screenshot", self._draw_screenshot, commands)
+            self._section("Camera path", self._draw_path, state, data, commands, opened=False)
             imgui.pop_item_width()
         imgui.end()
 
@@ -346,6 +351,52 @@ class Panels:
         commands.exr = self._button("EXR + depth")
         imgui.same_line()
         commands.panorama = self._button("360 PNG")
+
+    def _draw_path(self, state: ViewerState, data: PanelData, commands: Commands) -> None:
+        """Draw the editor of key frames."""
+        if self._button("Add key frame"):
+            add_key_frame(state)
+        if len(state.path):
+            imgui.same_line()
+            if self._button("Pause" if state.path_playing else "Play path"):
+                if not state.path_playing and state.path_seconds >= state.path.seconds:
+                    state.path_seconds = 0.0
+                state.path_playing = not state.path_playing
+        longest = max(state.path.seconds + KEY_SECONDS, KEY_SECONDS)
+        seconds = self._slider("time", min(state.path_seconds, longest), 0.0, longest, "%.2f s")
+        if seconds != state.path_seconds:
+            state.path_playing = False
+            show_path(state, seconds)
+        for index, frame in enumerate(state.path.key_frames):
+            imgui.push_id(index)
+            if self._button(f"{frame.seconds:.2f} s##{index}"):
+                show_path(state, frame.seconds)
+            imgui.same_line()
+            if self._button(f"Replace##{index}"):
+                state.path = state.path.add(KeyFrame.of_camera(state.camera, frame.seconds))
+            imgui.same_line()
+            if self._button(f"Delete##{index}"):
+                state.path = state.path.remove(index)
+            imgui.pop_id()
+        _, self.path_file = imgui.input_text("##path file", self.path_file)
+        self._record_rectangle("path file")
+        imgui.same_line()
+        if self._button("Save") and len(state.path):
+            commands.save_path = self.path_file
+        imgui.same_line()
+        if self._button("Load"):
+            commands.open_path = self.path_file
+        if data.film is not None:
+            commands.cancel_film = self._button("Cancel##film")
+            imgui.same_line()
+            imgui.progress_bar(data.film, (-1, 0), f"film {100 * data.film:.0f}%")
+        elif len(state.path):
+            for suffix in (".mp4", ".webm", ".png", ".exr"):
+                if self._radio(suffix, state.film_suffix == suffix):
+                    state.film_suffix = suffix
+                imgui.same_line()
+            commands.film = self._button("Write film")
+            state.film_fps = self._slider("frames per second", state.film_fps, 1.0, 60.0, "%.0f")
 
     def _draw_error(self, error: str, commands: Commands) -> None:
         _place_at_center(width=560)

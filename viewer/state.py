@@ -11,10 +11,12 @@ from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose, level_pose, look_pose, path_poses, up_direction
 from pansplat.tours import Route, TourGraph
 from pansplat_viewer.camera import Camera, move_to_pose
+from pansplat_viewer.key_frames import CameraPath, KeyFrame
 from pansplat_viewer.picking import PickedPoint
 from pansplat_viewer.settings import DrawSettings
 
 FLIGHT_SECONDS = 6.0
+KEY_SECONDS = 2.0  # between key frames that are added one after the other
 NEAR_OF_FAR = 0.03  # of a tour: Gaussians within this fraction of far are not drawn, because ways pass door frames
 _FLIGHT_STEPS = 24  # for the `,` and `.` keys
 
@@ -38,6 +40,9 @@ class ViewerState:
         route: the flight through a tour; None if none is planned, and in other scenes.
         target: the panorama of a tour to fly to; None if there is none.
         minimap, hotspots: whether the floor plan of a tour and the places of its panoramas are shown.
+        path: key frames of the camera path that is edited.
+        path_seconds: time on the path that the panel shows; `path_playing` while it is played.
+        film_suffix, film_fps: of the film of the path.
         levels: pyramid levels of the scene, ascending.
         points: the last picked points, two at most.
         message: a text to show until `message_until` (seconds of the viewer's clock).
@@ -63,6 +68,11 @@ class ViewerState:
     target: int | None = None
     minimap: bool = True
     hotspots: bool = True
+    path: CameraPath = field(default_factory=CameraPath)
+    path_seconds: float = 0.0
+    path_playing: bool = False
+    film_suffix: str = ".mp4"
+    film_fps: float = 24.0
     levels: tuple[int, ...] = ()
     points: list[PickedPoint] = field(default_factory=list)
     message: str = ""
@@ -85,7 +95,7 @@ def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
     state.settings = replace(state.settings, near=NEAR)
     state.context, state.route = scene.cam2world.double().numpy(), None
     state.playing, state.flight, state.points = False, min(max(at, 0.0), 1.0), []
-    level = tuple(tuple(float(x) for x in row) for row in _compute_level_axes(scene))
+    level = create_level_camera(scene).level
     camera = move_to_pose(replace(state.camera, level=level), _choose_start_pose(scene, state.flight))
     state.camera = state.home = replace(camera, distance=_measure_typical_distance(scene))
 
@@ -95,8 +105,14 @@ def enter_tour(state: ViewerState, tour: TourGraph, scene: Scene, route: Route, 
     enter_scene(state, scene)
     state.settings = replace(state.settings, near=NEAR_OF_FAR * tour.far)
     state.context, state.route, state.flight = tour.cam2world.numpy(), route, min(max(at, 0.0), 1.0)
-    level = tuple(tuple(float(x) for x in row) for row in tour.level_axes)
+    level = create_level_camera(scene, tour).level
     state.camera = state.home = move_to_pose(replace(state.camera, level=level), route.pose(state.flight))
+
+
+def create_level_camera(scene: Scene, tour: TourGraph | None = None) -> Camera:
+    """A camera with the level axes of a scene, or of the tour that it is of."""
+    axes = _compute_level_axes(scene) if tour is None else tour.level_axes
+    return Camera(level=tuple(tuple(float(x) for x in row) for row in axes))
 
 
 def adapt_settings(state: ViewerState, scene: Scene, *, keep_levels: bool = True) -> None:
@@ -163,6 +179,29 @@ def advance_flight(state: ViewerState, seconds: float, limit: float = 1.0) -> No
         duration = FLIGHT_SECONDS if state.route is None else state.route.seconds
         fly_to(state, min(state.flight + seconds / duration, max(limit, state.flight)))
         state.playing = state.flight < 1
+
+
+def add_key_frame(state: ViewerState) -> None:
+    """Add the camera as a key frame at the time that the panel shows, or `KEY_SECONDS` after the last one."""
+    seconds = state.path_seconds
+    if any(abs(frame.seconds - seconds) < 1e-3 for frame in state.path.key_frames):
+        seconds = state.path.seconds + KEY_SECONDS
+    state.path = state.path.add(KeyFrame.of_camera(state.camera, seconds))
+    state.path_seconds, state.path_playing = seconds, False
+
+
+def show_path(state: ViewerState, seconds: float) -> None:
+    """Move the camera to a time of the path."""
+    state.playing, state.path_seconds = False, max(seconds, 0.0)
+    if len(state.path):
+        state.camera = state.path.interpolate(state.path_seconds, state.camera)
+
+
+def advance_path(state: ViewerState, seconds: float) -> None:
+    """Move along the path if it is played, and stop at its end."""
+    if state.path_playing:
+        show_path(state, min(state.path_seconds + seconds, state.path.seconds))
+        state.path_playing = state.path_seconds < state.path.seconds
 
 
 def _compute_level_axes(scene: Scene) -> Float[np.ndarray, "3 3"]:

@@ -16,16 +16,32 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.tours import plan_route
 from pansplat_viewer import camera as cameras
-from pansplat_viewer.capture import write_screenshot
-from pansplat_viewer.cpu_renderer import Renderer, create_renderer
+from pansplat_viewer.capture import (
+    FilmWriter,
+    SceneFrames,
+    TourFrames,
+    find_free_name,
+    write_path_film,
+    write_screenshot,
+)
+from pansplat_viewer.cpu_renderer import CpuRenderer, Renderer, create_renderer
 from pansplat_viewer.input import Commands, apply_input, read_input
+from pansplat_viewer.key_frames import read_path, write_path
 from pansplat_viewer.loader import PHOTO_HEIGHT, LoadedScene, SceneEntry, SceneLoader
 from pansplat_viewer.panels import Gui, PanelData, Panels
 from pansplat_viewer.picking import compute_pixel_ray, pick_point
 from pansplat_viewer.programs import Programs
 from pansplat_viewer.settings import RendererChoice
 from pansplat_viewer.slots import SceneSlot
-from pansplat_viewer.state import ViewerState, adapt_settings, advance_flight, enter_scene, enter_tour, fit_settings
+from pansplat_viewer.state import (
+    ViewerState,
+    adapt_settings,
+    advance_flight,
+    advance_path,
+    enter_scene,
+    enter_tour,
+    fit_settings,
+)
 from pansplat_viewer.tour import DEFAULT_MEMORY, CrossFade, TourScenes, find_clicked, find_hotspots
 
 PANORAMA_HEIGHT = 1024  # of a panorama screenshot, pixels
@@ -238,6 +254,7 @@ class Viewer:
         self._resolution = AdaptiveResolution(settle_after=self.renderer.settle_seconds)
         self._loaded: LoadedScene | None = None
         self._refined: Scene | None = None
+        self._films = FilmWriter()
         self._tour: TourScenes | None = None
         self._waiting = False
         self._photo_node: int | None = None
@@ -255,7 +272,7 @@ class Viewer:
     @property
     def busy(self) -> bool:
         """Whether the next frame differs without new input."""
-        return self.moving or self.loader.entry is not None
+        return self.moving or self.loader.entry is not None or self._films.progress is not None
 
     @property
     def moving(self) -> bool:
@@ -263,7 +280,8 @@ class Viewer:
         recently = self._clock() - self._resolution.last_motion < 2 * self._resolution.settle_after
         unsettled = self._slot.image is not None and not self.renderer.stats.settled
         fading = self._fade.compute_weight(self._clock()) < 1
-        return (self.state.playing and not self._waiting) or recently or unsettled or fading
+        playing = self.state.path_playing or (self.state.playing and not self._waiting)
+        return playing or recently or unsettled or fading
 
     def open(self, path: Path) -> None:
         """Show the scenes at a path; for an invalid path, show an error and keep the current scene."""
@@ -289,6 +307,7 @@ class Viewer:
         start = time.perf_counter()
         now, size = self._clock(), target.viewport[2:]
         self._take_loaded(now)
+        self._take_film(now)
         self._exchange_scene()
         self._update_tour(now)
         self.gui.begin(seconds, new_frame)
@@ -298,6 +317,7 @@ class Viewer:
         # The step is limited, so that after a slow frame the camera does not move far.
         key_commands = apply_input(self.state, read_input(min(seconds, _MAX_STEP_SECONDS)))
         self._fly_tour(min(seconds, 2 * _MAX_STEP_SECONDS), was_playing)
+        advance_path(self.state, min(seconds, 2 * _MAX_STEP_SECONDS))
         if self._loaded is None:
             target.use()
             self.ctx.clear(*self.state.settings.background)
@@ -316,6 +336,7 @@ class Viewer:
 
     def close(self) -> None:
         """Stop the threads and free every GL object; the context must still be current."""
+        self._films.close()
         self.loader.close()
         self.presenter.release()
         self.panels.release()
@@ -452,7 +473,7 @@ class Viewer:
         data.photo_name = None
         if photo is not None and self._loaded and self._loaded.photos:
             data.photo_name = self._loaded.photos.names[photo]
-        data.tour = self._tour
+        data.tour, data.film = self._tour, self._films.progress
         data.hotspots = []
         if self._tour is not None:
             data.photo_name = self._tour.tour.panoramas[self._nearest_node()].name
@@ -577,12 +598,64 @@ class Viewer:
             self.open(Path(commands.open).expanduser())
         if self._loaded is None:
             return
+        self._execute_path(commands, size, now)
         if commands.png:
             self._write_screenshot("png", size, now)
         if commands.exr:
             self._write_screenshot("exr", size, now)
         if commands.panorama:
             self._write_screenshot("png", (2 * PANORAMA_HEIGHT, PANORAMA_HEIGHT), now, panorama=True)
+
+    def _execute_path(self, commands: Commands, size: tuple[int, int], now: float) -> None:
+        """Save, load and film the camera path."""
+        try:
+            if commands.save_path is not None:
+                write_path(self.state.path, Path(commands.save_path).expanduser())
+                self.state.show_message(f"wrote {commands.save_path}", now)
+            elif commands.open_path is not None:
+                self.state.path = read_path(Path(commands.open_path).expanduser())
+                self.state.path_seconds, self.state.path_playing = 0.0, False
+            elif commands.film:
+                self._start_film(size)
+        except (InputError, OSError) as error:
+            self.panel_data.error = str(error)
+        if commands.cancel_film:
+            self._films.cancel()
+
+    def _start_film(self, size: tuple[int, int]) -> None:
+        """Write the film of the path in a worker thread, drawn on the processor, so that the window stays free."""
+        state, tour, loaded = self.state, self._tour, self._loaded
+        assert loaded is not None
+        scene, settings, fps = self._slot.scene, state.draw_settings, state.film_fps
+        path, level, memory = state.path, state.camera, self._memory
+        assert scene is not None
+        folder = self._folder / loaded.entry.folder_name
+        folder.mkdir(parents=True, exist_ok=True)
+        file = find_free_name(folder, "path", state.film_suffix)
+
+        def write(progress: Callable[[str, float], None]) -> list[Path]:
+            renderers = [CpuRenderer(None) for _ in range(1 if tour is None else 2)]
+            try:
+                if tour is None:
+                    frames = SceneFrames(renderers[0], scene, size, settings)
+                else:
+                    scenes = TourScenes(tour.tour, memory=memory)
+                    frames = TourFrames(renderers, scenes, self.loader.load, size, settings)
+                return write_path_film(frames, path, level, file, fps, progress)
+            finally:
+                for renderer in renderers:
+                    renderer.release()
+
+        self._films.start(write)
+
+    def _take_film(self, now: float) -> None:
+        """Report a film that is finished, or its error."""
+        result = self._films.poll()
+        if isinstance(result, list):
+            self.screenshots += result
+            self.state.show_message(f"wrote {result[-1]}", now)
+        elif result is not None:
+            self.panel_data.error = f"no film written: {result}"
 
     def _write_screenshot(self, suffix: str, size: tuple[int, int], now: float, *, panorama: bool = False) -> None:
         assert self._loaded is not None

@@ -1,4 +1,4 @@
-"""Reading frames of video files by number, and writing MP4 files."""
+"""Reading frames of video files by number, and writing MP4 and WebM files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,11 @@ from pansplat.errors import InputError
 from pansplat.files import require_file
 
 _MAX_SKIP = 48  # frames between two reads; a larger gap is skipped by seeking
-_ENCODERS = ("libx264", "libopenh264", "mpeg4")  # H.264 first: every browser and player supports it
+_ENCODERS = {
+    ".mp4": ("libx264", "libopenh264", "mpeg4"),  # H.264 first: every browser and player supports it
+    ".webm": ("libvpx-vp9", "libsvtav1", "libaom-av1"),  # VP9 first: it is faster to encode
+}
+VIDEO_SUFFIXES = tuple(_ENCODERS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,34 +142,37 @@ def _group_near_frames(frames: Sequence[int]) -> Iterator[list[int]]:
 
 
 def write_video(path: Path | str, frames: Iterable[NDArray[np.uint8]], fps: float, *, quality: int = 18) -> int:
-    """Write an MP4 file atomically and return the number of frames. H.264 if PyAV supports it.
+    """Write an MP4 or WebM file atomically and return the number of frames. H.264 or VP9 if PyAV supports it.
 
     The format supports even sizes only: frames of odd width or height lose their last column or row.
 
     Args:
-        path: file to write, ending in .mp4.
+        path: file to write, ending in .mp4 or .webm.
         frames: RGB images (H W 3), uint8, all of one size; consumed one at a time.
         fps: frames per second.
         quality: constant rate factor of the encoder, 0 (lossless) to 51; lower is better and larger.
 
     Raises:
-        InputError: not .mp4, no frame, a frame of another shape, `fps` not positive.
+        InputError: neither .mp4 nor .webm, no frame, a frame of another shape, `fps` not positive.
     """
     path = Path(path)
-    if path.suffix.lower() != ".mp4":
-        raise InputError(f"cannot write {path}: needed a name ending in .mp4, got '{path.suffix}'; rename it.")
+    if path.suffix.lower() not in VIDEO_SUFFIXES:
+        allowed = " or ".join(VIDEO_SUFFIXES)
+        raise InputError(f"cannot write {path}: needed a name ending in {allowed}, got '{path.suffix}'; rename it.")
     if not 0 < fps < float("inf"):
         raise InputError(f"`fps` must be positive, got {fps}; choose one, such as 30.")
     import av
 
     with replacing(path) as temporary:
         count = 0
-        with av.open(str(temporary), "w", options={"movflags": "+faststart"}) as container:
+        options = {"movflags": "+faststart"} if path.suffix.lower() == ".mp4" else {}
+        with av.open(str(temporary), "w", options=options) as container:
             stream: Any = None
             for count, frame in enumerate(frames, start=1):
                 pixels = _check_frame(path, frame, count, None if stream is None else (stream.height, stream.width))
                 if stream is None:
-                    stream = _add_stream(container, pixels.shape[1], pixels.shape[0], fps, quality)
+                    encoder = video_encoder(path.suffix.lower())
+                    stream = _add_stream(container, encoder, pixels.shape[1], pixels.shape[0], fps, quality)
                 video_frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
                 for packet in stream.encode(video_frame.reformat(format="yuv420p", dst_colorspace="ITU709")):
                     container.mux(packet)
@@ -176,8 +183,8 @@ def write_video(path: Path | str, frames: Iterable[NDArray[np.uint8]], fps: floa
     return count
 
 
-def video_encoder() -> str:
-    """Name of the encoder that `write_video` uses.
+def video_encoder(suffix: str = ".mp4") -> str:
+    """Name of the encoder that `write_video` uses for files of a suffix.
 
     Raises:
         InputError: PyAV has no supported encoder.
@@ -185,22 +192,25 @@ def video_encoder() -> str:
     import av
     import av.codec
 
-    for name in _ENCODERS:
+    for name in _ENCODERS[suffix]:
         if name in av.codecs_available:
             try:
                 av.codec.Codec(name, "w")
                 return name
             except ValueError:  # available for decoding only
                 continue
-    raise InputError(f"needed PyAV with one of the encoders {_ENCODERS}, got none of them; reinstall `av`.")
+    raise InputError(f"needed PyAV with one of the encoders {_ENCODERS[suffix]}, got none of them; reinstall `av`.")
 
 
-def _add_stream(container: Any, width: int, height: int, fps: float, quality: int) -> Any:
-    encoder = video_encoder()
+def _add_stream(container: Any, encoder: str, width: int, height: int, fps: float, quality: int) -> Any:
     stream = container.add_stream(encoder, rate=Fraction(fps).limit_denominator(1001))
     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
     if encoder == "libx264":
         stream.options = {"crf": str(quality), "preset": "medium"}
+    elif encoder == "libvpx-vp9":
+        stream.options = {"crf": str(quality + 6), "b": "0", "row-mt": "1", "cpu-used": "4"}  # crf is 0 to 63
+    elif encoder == "libsvtav1":
+        stream.options = {"crf": str(quality + 10), "preset": "8"}  # crf is 0 to 63
     else:
         stream.bit_rate = int(width * height * fps * 0.2)
     # BT.709, limited range. Without these tags players guess the colour space from the size, and colours shift.

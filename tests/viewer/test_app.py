@@ -1,8 +1,10 @@
 """The command: fast help, clear errors, and a fly-through where there is no display."""
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import av
 import numpy as np
@@ -72,6 +74,9 @@ def test_with_an_unusable_display_a_fly_through_is_written(room, capsys, monkeyp
         (["room.ply", "--size", "huge"], "WIDTHxHEIGHT"),
         (["room.ply", "--size", "4x4"], "WIDTHxHEIGHT"),
         (["room.ply", "--at", "1.5"], "--at must be a number of 0 to 1"),
+        (["room.ply", "--out", "film.mp4"], "--out needs --path"),
+        (["room.ply", "--path", "no.json", "--out", "film.mp4"], "no.json"),
+        (["room.ply", "--path", "no.json", "--out", "film.gif"], "film.gif"),
         (["room.ply", "--refine", "-1"], "--refine must be a number of 0 to 1000000 seconds"),
         (["room.ply", "--pair", "kitchen"], "number from 1 to 1 or one of room"),
     ],
@@ -88,6 +93,17 @@ def test_offscreen_writes_the_fly_through_to_the_given_folder(room):
     assert run([str(room), "--offscreen", "out", "--size", "64x32", "--seconds", "0.2"]) == 0
     assert list((room.parent / "out").rglob("flythrough.mp4"))
     assert not (room.parent / "renders").exists()
+
+
+def test_the_film_of_a_path_has_a_frame_for_each_time(room):
+    frames = [{"seconds": t, "position": [0, 0, t], "direction": [0, 0, 1]} for t in (0, 0.5)]
+    Path("walk.json").write_text(json.dumps({"key_frames": frames}))
+    arguments = ["--renderer", "cpu", "--size", "64x48", "--fps", "10", "--path", "walk.json", "--out"]
+    assert run([str(room), *arguments, "walk.mp4"]) == 0
+    with av.open("walk.mp4") as film:
+        assert [round(10 * frame.time) for frame in film.decode(video=0)] == list(range(6))
+    assert run([str(room), *arguments, "walk.exr"]) == 0
+    assert [path.name for path in sorted(Path().glob("*.exr"))] == [f"walk_{i:04d}.exr" for i in range(6)]
 
 
 @pytest.mark.gl

@@ -10,7 +10,7 @@ from PIL import Image
 from pansplat.tours import plan_route
 from pansplat_viewer import run
 from pansplat_viewer.camera import Camera
-from pansplat_viewer.capture import Film, write_tour
+from pansplat_viewer.capture import Film, TourFrames, write_tour
 from pansplat_viewer.cpu_renderer import CpuRenderer
 from pansplat_viewer.settings import DrawSettings
 from pansplat_viewer.tour import FADE_SECONDS, CrossFade, TourScenes, find_clicked, find_hotspots, measure_bytes
@@ -113,8 +113,8 @@ def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, load_house, scene
     route = plan_route(house, house.plan_walk(0))
     renderers = [CpuRenderer(None), CpuRenderer(None)]
     film = Film((64, 36), fps=12)
-    settings = DrawSettings(mode="deferred")
-    written = write_tour(renderers, scenes, route, load, tmp_path, film, settings, lambda task, done: None)
+    frames = TourFrames(renderers, scenes, load, film.size, DrawSettings(mode="deferred"))
+    written = write_tour(frames, scenes, route, tmp_path, film, lambda task, done: None)
     for renderer in renderers:
         renderer.release()
     frames = read_film(written[0])

@@ -47,7 +47,7 @@ INITIAL_SETTINGS = {
 OTHER_WIDGETS = {
     "Scene", "pair", "path", "Open", "Gaussians", "Drawing", "background", "coarser while moving", "Camera",
     "fly", "orbit", "Reset", "speed", "Panorama 1", "Fly", "Photograph", "split", "Screenshot", "PNG",
-    "EXR + depth", "360 PNG",
+    "EXR + depth", "360 PNG", "Camera path",
 }  # fmt: skip
 
 
@@ -693,3 +693,89 @@ def test_the_nearest_photograph_of_a_tour_is_shown(tour_user):
     user.click("nearest photograph")
     assert changed_fraction(before, user.read_image()) > 0.3
     assert user.data.photo_name == "room0"
+
+
+# --- camera paths ---
+
+
+@pytest.fixture
+def path_user(user) -> User:
+    """The session with the opened editor of a path of two key frames, 1 s apart, at the second."""
+    sections = ("Gaussians", "Drawing", "Camera path")  # the first two are closed for space
+    for label in sections:
+        user.click(label)
+    user.click("Add key frame")
+    user.state.camera = replace(user.state.camera, position=(0.2, 0.0, 0.3), yaw_radians=0.5)
+    user.state.path_seconds = 1.0
+    user.press(imgui.Key.k)
+    assert [frame.seconds for frame in user.state.path.key_frames] == [0.0, 1.0]
+    yield user
+    for label in sections:
+        user.click(label)
+
+
+def test_the_buttons_of_key_frames_show_replace_and_delete_them(path_user):
+    user = path_user
+    last = user.read_image()
+    user.click("0.00 s##0")
+    first = user.read_image()
+    assert user.state.camera.position == (0, 0, 0) and changed_fraction(first, last) > 0.1
+    user.click("1.00 s##1")
+    assert changed_fraction(last, user.read_image()) == 0
+    user.click("Replace##0")
+    assert user.state.path.key_frames[0].position == (0.2, 0.0, 0.3)
+    user.click("Delete##0")
+    assert [frame.seconds for frame in user.state.path.key_frames] == [1.0]
+    user.click("Delete##0")
+    assert len(user.state.path) == 0 and "Play path" not in user.panels.items
+
+
+def test_the_path_is_played_and_its_time_is_dragged(path_user):
+    user = path_user
+    user.click("Play path")
+    assert user.state.path_playing and "Pause" in user.panels.items
+    user.draw_frames(5, 0.25)
+    assert not user.state.path_playing
+    assert user.state.camera.position == pytest.approx((0.2, 0.0, 0.3))
+    before = user.read_image()
+    left, top, right, bottom = user.panels.items["time"]
+    user.drag((left + 5, (top + bottom) / 2), (left + 0.15 * (right - left), (top + bottom) / 2))
+    assert 0 < user.state.path_seconds < 1 and 0 < user.state.camera.position[2] < 0.3
+    assert changed_fraction(before, user.read_image()) > 0.1
+
+
+@pytest.mark.slow
+def test_the_path_is_saved_loaded_and_filmed(path_user, tmp_path):
+    user = path_user
+    path = user.state.path
+    user.panels.path_file = str(tmp_path / "walk.json")
+    user.click("Save")
+    user.click("Delete##0")
+    user.click("Load")
+    assert user.state.path == path
+    user.panels.path_file = str(tmp_path / "missing.json")
+    user.click("Load")
+    assert "missing.json" in user.data.error
+    user.click("OK")
+    user.state.film_fps = 2.0
+    user.click(".png")
+    user.click("Write film")
+    user.settle()
+    files = user.viewer.screenshots[-3:]
+    assert [file.name[-9:] for file in files] == [f"_{i:04d}.png" for i in range(3)]
+    user.state.message = ""
+    shown = user.read_image()
+    with Image.open(files[-1]) as file:
+        assert np.abs(np.asarray(file).astype(int)[IMAGE] - shown).max() <= 3, "the last frame is the last key frame"
+
+
+def test_a_film_can_be_cancelled(path_user):
+    user = path_user
+    user.state.path = user.state.path.add(replace(user.state.path.key_frames[0], seconds=600.0))
+    written = len(user.viewer.screenshots)
+    user.click("Write film")
+    user.draw_frames(2)
+    assert 0 <= user.data.film < 1
+    user.click("Cancel##film")
+    user.settle()
+    assert user.data.film is None and user.data.error is None and len(user.viewer.screenshots) == written
