@@ -54,9 +54,9 @@ class Export:
         from pansplat.gaussians.scene import prune
 
         require_output_file("--out", self.out, (*SCENE_SUFFIXES, _PAGE_SUFFIX))
-        if self.points and find_scene_suffix(self.out) != ".ply":
-            raise InputError(f"--points writes a .ply, got {self.out}; leave it out, or choose another name")
         is_page = self.out.suffix.lower() == _PAGE_SUFFIX
+        if self.points and (is_page or find_scene_suffix(self.out) != ".ply"):
+            raise InputError(f"--points writes a .ply, got {self.out}; leave it out, or choose another name")
         if not is_page and (self.gaussians is not None or self.split or self.title is not None):
             raise InputError(f"--gaussians, --split and --title are for an .html page, got {self.out}; leave them out")
         scene = self.prediction.open(self.path)

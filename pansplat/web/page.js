@@ -347,7 +347,7 @@
   function setTouring(value) {
     touring = value && HEADER.spots.length > 1;
     byId("play").setAttribute("aria-pressed", touring);
-    byId("play").innerHTML = touring ? "&#10074;&#10074;" : "&#9654;";
+    byId("play").querySelector("path").setAttribute("d", touring ? "M7 5h4v14H7zM13 5h4v14h-4z" : "M8 5v14l11-7z");
     if (!touring) flight = null;
     else if (!flight) {
       const positions = HEADER.spots.map((spot) => spot.position);
@@ -478,7 +478,8 @@
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
-      camera.fov = clamp(camera.fov * Math.exp(0.001 * clamp(event.deltaY, -200, 200)), MIN_FOV, MAX_FOV);
+      const pixels = event.deltaY * (event.deltaMode ? 33 : 1);  // or lines
+      camera.fov = clamp(camera.fov * Math.exp(0.001 * clamp(pixels, -200, 200)), MIN_FOV, MAX_FOV);
       changed();
     }, { passive: false });
     byId("play").onclick = () => setTouring(!touring);
@@ -579,6 +580,7 @@
   async function main() {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
     if (!gl) throw new Error("This page needs WebGL 2, which this browser or device does not have.");
+    if (!window.DecompressionStream) throw new Error("This browser is too old for this page. Please update it.");
     const scene = await load();
     sorter = new Worker(URL.createObjectURL(new Blob([SORTER])));
     const first = new Promise((resolve, reject) => {
