@@ -16,6 +16,7 @@ from tyro.conf import Positional, subcommand
 import pansplat
 from pansplat.cli.evaluate import LpipsChoice, choose_lpips
 from pansplat.cli.inputs import OptionalOut, PairChoice, choose_pair, predict_scene
+from pansplat.console import make_table_console
 from pansplat.errors import InputError
 from pansplat.files import is_scene_file, require_output_folder
 from pansplat.options import WHOLE, Positive, Range, Threads
@@ -387,6 +388,38 @@ class BenchPose:
 
 
 @dataclass(frozen=True)
+class BenchFormats:
+    """Compare the file formats of scenes: size, error of each field, error of the image, time."""
+
+    path: Positional[Path]
+    """A scene file."""
+    degree: Annotated[int, Range(0, 3), WHOLE] | None = None
+    """Degree of the harmonics that are written; by default that of the scene. Missing ones are made at random."""
+    height: Annotated[int, Range(16, 4096, "pixels"), WHOLE] = 256
+    """Of the panoramas that are compared, pixels."""
+    json: Path | None = None
+    """File for the rows."""
+
+    def run(self) -> int:
+        """Measure each format and print the table."""
+        from pansplat import pipeline
+        from pansplat.bench.formats import make_format_table, measure_formats, set_degree
+        from pansplat.evaluation.report import write_json
+
+        _require_folder(self.json)
+        scene = pipeline.load(self.path)
+        if not len(scene.gaussians):
+            raise InputError(f"{self.path}: needed Gaussians, got none; give another scene")
+        if self.degree is not None:
+            scene = set_degree(scene, self.degree)
+        rows = measure_formats(scene, self.height)
+        make_table_console().print(make_format_table(rows, f"{self.path.name}: {len(scene.gaussians):,} Gaussians"))
+        if self.json is not None:
+            write_json([row.as_json() for row in rows], self.json)
+        return 0
+
+
+@dataclass(frozen=True)
 class BenchMachine:
     """Measure the machine's peaks: multiply-adds and memory bandwidth."""
 
@@ -413,6 +446,7 @@ class Bench:
         | Annotated[BenchRefine, subcommand("refine")]
         | Annotated[BenchViewer, subcommand("viewer")]
         | Annotated[BenchPose, subcommand("pose")]
+        | Annotated[BenchFormats, subcommand("formats")]
         | Annotated[BenchMachine, subcommand("machine")]
     )
 

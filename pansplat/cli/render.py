@@ -44,6 +44,8 @@ class Render:
     By default equirect, for a video perspective."""
     height: ImageHeight | None = None
     """Height of the image, pixels; by default that of the input panoramas, for a video 360."""
+    depth: bool = False
+    """Write the depth as a 16-bit .png in millimetres, 0 where there is none; an .exr holds it without this option."""
     blend: str = "deferred"
     """deferred (images of single views, weighted by nearness), joint (all Gaussians at once), or view0, view1, ..."""
     fov: Annotated[float, Range(1, 170, "degrees"), REAL] = 90.0
@@ -59,7 +61,7 @@ class Render:
         import torch
 
         from pansplat import pipeline
-        from pansplat.data.images import write_image
+        from pansplat.data.images import write_depth, write_image
         from pansplat.data.video import write_video
 
         self._refuse_invalid_arguments()
@@ -73,14 +75,19 @@ class Render:
         if self._is_video:
             poses = self._path_between_cameras(scene) if poses is None else poses
             with progress_bar() as progress:
-                count = write_video(self.out, _render_frames(scene, poses, options, progress), self.fps)
+                frames = _render_frames(scene, poses, options, progress)
+                count = write_video(self.out, frames, self.fps, panorama=layout != "perspective")
             print(f"{self.out}: {count} frames of {size}, {layout}")
             return 0
         pose = scene.pose_between(0.5 if self.at is None else self.at) if poses is None else poses[0]
         with torch.no_grad():
             image = pipeline.render(scene, pose, **options)
-        depth = image.depth if self.out.suffix.lower() == ".exr" else None
-        write_image(self.out, image.color, depth=depth, panorama=layout != "perspective")
+        panorama = layout != "perspective"
+        if self.depth:
+            write_depth(self.out, image.depth, panorama=panorama)
+        else:
+            depth = image.depth if self.out.suffix.lower() == ".exr" else None
+            write_image(self.out, image.color, depth=depth, panorama=panorama)
         print(f"{self.out}: {size}, {layout}")
         return 0
 
@@ -91,6 +98,8 @@ class Render:
     def _refuse_invalid_arguments(self) -> None:
         """Raise an error before the prediction, which takes seconds."""
         require_output_file("--out", self.out, (*_IMAGE_SUFFIXES, ".mp4"))
+        if self.depth and self.out.suffix.lower() != ".png":
+            raise InputError(f"--depth writes a .png, got {self.out}; an .exr holds the depth without it")
         if self.at is not None and self.pose is not None:
             raise InputError("--at and --pose both set the camera; give one of them")
         if self.at is not None and self._is_video:

@@ -17,9 +17,11 @@ import torch
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
+from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
 from pansplat.atomic import replacing
+from pansplat.data.panorama_metadata import make_gpano_xmp
 from pansplat.errors import InputError, InputWarning
 from pansplat.files import read_file
 
@@ -160,7 +162,8 @@ def write_image(
         path: file to write.
         image: a tensor (3 H W) or an array (H W 3), sRGB in [0, 1] (clipped); an array may be uint8.
         depth: (H W) metres, written as channel Z of an EXR.
-        panorama: whether an EXR is marked as a latitude-longitude map; by default if it is 2:1.
+        panorama: whether the file is marked as an equirectangular panorama (GPano, in an EXR a latitude-longitude
+            map); by default if it is 2:1.
 
     Raises:
         InputError: NaN, unknown suffix, depth for a format that cannot hold it, folder missing.
@@ -178,8 +181,48 @@ def write_image(
     pixels = pixels if pixels.dtype == np.uint8 else np.rint(pixels.clip(0, 1) * 255).astype(np.uint8)
     options: dict[str, Any] = {"quality": 95, "subsampling": 0} if suffix in (".jpg", ".jpeg") else {}
     options = {"lossless": True} if suffix == ".webp" else options
+    _encode(path, Image.fromarray(pixels), options, panorama)
+
+
+def write_depth(path: Path | str, depth: Tensor | NDArray[Any], *, panorama: bool | None = None) -> None:
+    """Write depth atomically as a 16-bit PNG in millimetres, as `read_depth` reads it.
+
+    0 means no depth. Larger depths than 65.534 m are written as 65535.
+
+    Args:
+        path: file to write, ending in .png.
+        depth: (H W) metres, finite.
+        panorama: see `write_image`.
+
+    Raises:
+        InputError: NaN, another suffix, folder missing.
+    """
+    path = Path(path)
+    metres = depth.detach().cpu().numpy() if isinstance(depth, Tensor) else np.asarray(depth)
+    if path.suffix.lower() != ".png":
+        raise InputError(f"cannot write {path}: needed a name ending in .png for 16-bit depth; rename it.")
+    if metres.ndim != 2 or not np.isfinite(metres).all():
+        raise InputError(f"cannot write {path}: needed finite depth (H W), got shape {metres.shape} or NaN values.")
+    millimetres = np.rint(metres.astype(np.float64) * 1000).clip(0, 65535).astype(np.uint16)
+    _encode(path, Image.fromarray(millimetres), {}, panorama, "radial depth in millimetres, 0: unknown")
+
+
+def _encode(
+    path: Path, image: Image.Image, options: dict[str, Any], panorama: bool | None, description: str = ""
+) -> None:
+    """Write an image by Pillow with its metadata."""
+    suffix = path.suffix.lower()
+    chunks = PngInfo()
+    if description:
+        chunks.add_text("Description", description)
+    if image.width == 2 * image.height if panorama is None else panorama:
+        xmp = make_gpano_xmp(image.width, image.height)
+        options = options | {"xmp": xmp}
+        chunks.add_itxt("XML:com.adobe.xmp", xmp.decode())
+    if suffix == ".png":
+        options = {"pnginfo": chunks}
     encoded = io.BytesIO()  # Pillow's own writing to a file misses a disk that becomes full
-    Image.fromarray(pixels).save(encoded, Image.registered_extensions()[suffix], **options)
+    image.save(encoded, Image.registered_extensions()[suffix], **options)
     with replacing(path) as temporary:
         temporary.write_bytes(encoded.getbuffer())
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pansplat.atomic import replacing
+from pansplat.data.panorama_metadata import mark_spherical_video
 from pansplat.errors import InputError
 from pansplat.files import require_file
 
@@ -141,7 +142,14 @@ def _group_near_frames(frames: Sequence[int]) -> Iterator[list[int]]:
         yield group
 
 
-def write_video(path: Path | str, frames: Iterable[NDArray[np.uint8]], fps: float, *, quality: int = 18) -> int:
+def write_video(
+    path: Path | str,
+    frames: Iterable[NDArray[np.uint8]],
+    fps: float,
+    *,
+    quality: int = 18,
+    panorama: bool = False,
+) -> int:
     """Write an MP4 or WebM file atomically and return the number of frames. H.264 or VP9 if PyAV supports it.
 
     The format supports even sizes only: frames of odd width or height lose their last column or row.
@@ -151,6 +159,7 @@ def write_video(path: Path | str, frames: Iterable[NDArray[np.uint8]], fps: floa
         frames: RGB images (H W 3), uint8, all of one size; consumed one at a time.
         fps: frames per second.
         quality: constant rate factor of the encoder, 0 (lossless) to 51; lower is better and larger.
+        panorama: whether the frames are equirectangular panoramas; players then show an MP4 as 360 degrees.
 
     Raises:
         InputError: neither .mp4 nor .webm, no frame, a frame of another shape, `fps` not positive.
@@ -180,6 +189,8 @@ def write_video(path: Path | str, frames: Iterable[NDArray[np.uint8]], fps: floa
                 raise InputError(f"cannot write {path}: needed at least one frame, got none; nothing was written.")
             for packet in stream.encode():
                 container.mux(packet)
+        if panorama and path.suffix.lower() == ".mp4":
+            mark_spherical_video(temporary)
     return count
 
 

@@ -606,6 +606,14 @@ FILES = [
     Fault("mask: black", PREDICT, lambda f: Image.new("L", (32, 16)).save(f / "pair/a_mask.png"), "a_mask.png"),
     Fault("a pair that is an empty folder", "predict empty -o out.ply", lambda f: (f / "empty").mkdir(), "empty"),
     Fault("a pair that is missing", "predict nowhere -o out.ply", says="nowhere"),
+    Fault("an export of an unknown format", "export scene.ply -o x.obj", says="--out must end in .compressed.ply, .spz"),
+    Fault("points in another format", "export scene.ply -o x.spz --points", says="--points writes a .ply"),
+    Fault("an export without a scene", "export none.spz -o x.ply", says="none.spz: needed a .spz scene"),
+    Fault("a scene that is no .spz", "info x.spz", content(b"PK" * 99, "x.spz"), says="got a file that starts with"),
+    Fault("a .sog of zeros", "info x.sog", content(b"PK\3\4" + bytes(99), "x.sog"), says="x.sog: needed a complete"),
+    Fault("a .splat of 31 bytes", "info x.splat", content(bytes(31), "x.splat"), says="x.splat: needed a complete"),
+    Fault("an empty .glb", "render x.glb -o x.png", content(b"", "x.glb"), says="needed a binary glTF file"),
+    Fault("depth in a .jpg", "render scene.ply --depth -o x.jpg", says="--depth writes a .png"),
     Fault("a pair that is a picture", "predict pair/a.png -o out.ply", says="a.png"),
     Fault("a pair in the home of an unknown user", "predict ~nobody-at-all/x -o out.ply", says="~nobody-at-all"),
 ]  # fmt: skip
@@ -644,6 +652,14 @@ def test_an_image_on_a_full_disk_is_one_line(name: str, folder: Path, attack: Ca
     command = f"render scene.ply -o {name} --height 64" + (" --seconds 0.1" if name.endswith("mp4") else "")
     with full_disk(300):
         outcome = attack(command.split())
+    assert outcome.status == 2 and name in outcome.err and "free disk space" in outcome.err
+    assert not (folder / name).exists()
+
+
+@pytest.mark.parametrize("name", ["x.ply", "x.compressed.ply", "x.spz", "x.splat", "x.sog", "x.glb"])
+def test_a_scene_on_a_full_disk_is_one_line(name: str, folder: Path, attack: Callable[..., Any]) -> None:
+    with full_disk(300):
+        outcome = attack(f"export scene.ply -o {name}".split())
     assert outcome.status == 2 and name in outcome.err and "free disk space" in outcome.err
     assert not (folder / name).exists()
 

@@ -1,0 +1,126 @@
+"""Metadata by which players and sites recognise 360-degree images and films.
+
+Images carry GPano properties as XMP. Films carry the RDF text of version 1 in a `uuid` box, and the boxes `st3d` and
+`sv3d` of version 2. FFmpeg writes the latter only through an interface that PyAV does not offer.
+An MP4 is a tree of boxes: size (4 bytes), type (4 bytes), content.
+
+Source: https://developers.google.com/streetview/spherical-metadata;
+https://github.com/google/spatial-media/tree/master/docs (spherical-video-rfc, spherical-video-v2-rfc);
+ISO/IEC 14496-12, sections 4.2 (boxes) and 8.7.5 (chunk offsets).
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+
+_SPHERICAL_V1 = uuid.UUID("ffcc8263-f855-4a93-8814-587a02521fdd").bytes
+_RDF = (
+    '<?xml version="1.0"?><rdf:SphericalVideo xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#" '
+    'xmlns:GSpherical="http://ns.google.com/videos/1.0/spherical/">'
+    "<GSpherical:Spherical>true</GSpherical:Spherical><GSpherical:Stitched>true</GSpherical:Stitched>"
+    "<GSpherical:StitchingSoftware>pansplat</GSpherical:StitchingSoftware>"
+    "<GSpherical:ProjectionType>equirectangular</GSpherical:ProjectionType></rdf:SphericalVideo>"
+)
+
+
+def make_gpano_xmp(width: int, height: int) -> bytes:
+    """XMP of a full equirectangular panorama of a size in pixels."""
+    properties = {
+        "UsePanoramaViewer": "True",
+        "ProjectionType": "equirectangular",
+        "StitchingSoftware": "pansplat",
+        "FullPanoWidthPixels": width,
+        "FullPanoHeightPixels": height,
+        "CroppedAreaImageWidthPixels": width,
+        "CroppedAreaImageHeightPixels": height,
+        "CroppedAreaLeftPixels": 0,
+        "CroppedAreaTopPixels": 0,
+        "PoseHeadingDegrees": 0,
+    }
+    attributes = " ".join(f'GPano:{name}="{value}"' for name, value in properties.items())
+    return (
+        '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>'
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        f'<rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" {attributes}/>'
+        '</rdf:RDF></x:xmpmeta><?xpacket end="w"?>'
+    ).encode()
+
+
+def mark_spherical_video(path: Path) -> None:
+    """Add the metadata of a full equirectangular film to an MP4 file with one track, and with `moov` before `mdat`.
+
+    Raises:
+        ValueError: there is no `moov` box.
+    """
+    marked = path.with_name(f"{path.name}.marked")
+    try:
+        with open(path, "rb") as file, open(marked, "wb") as target:
+            header = file.read(8)
+            while header[4:] != b"moov":
+                if len(header) < 8:
+                    raise ValueError(f"{path}: no `moov` box before the frames")
+                target.write(header + file.read(int.from_bytes(header[:4], "big") - 8))
+                header = file.read(8)
+            movie = file.read(int.from_bytes(header[:4], "big") - 8)
+            growth = len(_mark_movie(movie, 0)) - len(movie)
+            target.write(_box(b"moov", _mark_movie(movie, growth)))
+            shutil.copyfileobj(file, target, 1 << 24)
+        os.replace(marked, path)
+    finally:
+        marked.unlink(missing_ok=True)
+
+
+def _mark_movie(content: bytes, shift: int) -> bytes:
+    """The content of the `moov` box with the metadata; chunk offsets grow by `shift`."""
+
+    def mark_track(track: bytes) -> bytes:
+        track = _edit(track, b"mdia", b"minf", b"stbl", change=mark_samples)
+        return track + _box(b"uuid", _SPHERICAL_V1 + _RDF.encode())
+
+    def mark_samples(table: bytes) -> bytes:
+        table = _edit(table, b"stsd", change=mark_entry)
+        for name, kind in ((b"stco", "I"), (b"co64", "Q")):
+            table = _edit(table, name, change=lambda offsets, kind=kind: move_chunks(offsets, kind))
+        return table
+
+    def move_chunks(offsets: bytes, kind: str) -> bytes:
+        (count,) = struct.unpack_from(">I", offsets, 4)
+        moved = (offset + shift for offset in struct.unpack_from(f">{count}{kind}", offsets, 8))
+        return offsets[:8] + struct.pack(f">{count}{kind}", *moved)
+
+    def mark_entry(description: bytes) -> bytes:
+        size, kind = struct.unpack_from(">I4s", description, 8)
+        entry = description[16 : 8 + size]
+        return description[:8] + _box(kind, entry + _STEREO + _SPHERICAL_V2) + description[8 + size :]
+
+    return _edit(content, b"trak", change=mark_track)
+
+
+def _box(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I4s", 8 + len(content), kind) + content
+
+
+def _edit(content: bytes, *kinds: bytes, change: Callable[[bytes], bytes]) -> bytes:
+    """The content of a box after a change of the boxes at a path of types below it."""
+    parts, position = [], 0
+    while position < len(content):
+        size, kind = struct.unpack_from(">I4s", content, position)
+        inner = content[position + 8 : position + size]
+        if kind == kinds[0]:
+            inner = change(inner) if len(kinds) == 1 else _edit(inner, *kinds[1:], change=change)
+        parts.append(_box(kind, inner))
+        position += size
+    return b"".join(parts)
+
+
+_STEREO = _box(b"st3d", bytes(4) + b"\0")  # version and flags, monoscopic
+_SPHERICAL_V2 = _box(
+    b"sv3d",
+    _box(b"svhd", bytes(4) + b"pansplat\0")
+    + _box(b"proj", _box(b"prhd", bytes(4) + bytes(12)) + _box(b"equi", bytes(4) + bytes(16))),  # no turn, no crop
+)
