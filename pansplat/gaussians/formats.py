@@ -44,7 +44,7 @@ _MAX_ENTRY = 1 << 26  # bytes of the pansplat entry
 _DECODE_SECONDS = 600  # a damaged file may not end
 _CODER = """
 import os, sys
-sys.path.remove("")
+sys.path[:] = [folder for folder in sys.path if folder]  # without the current folder
 try:
     import resource
     pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")

@@ -45,7 +45,7 @@ _MAX_DEGREE = 3
 _MAX_JSON = 1 << 26
 _MAX_NODES = 1 << 14
 _MAGIC, _VERSION, _JSON, _BINARY = b"glTF", 2, 0x4E4F534A, 0x004E4942
-_POINTS = 0
+_POINTS, _ARRAY_BUFFER = 0, 34962
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 
@@ -104,7 +104,7 @@ def _describe(attributes: dict[str, np.ndarray], entry: str) -> dict[str, Any]:
     """The JSON document of a file with one primitive."""
     views, accessors, offset = [], [], 0
     for name, values in attributes.items():
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": values.nbytes})
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": values.nbytes, "target": _ARRAY_BUFFER})
         offset += values.nbytes
         accessor: dict[str, Any] = {
             "bufferView": len(accessors),

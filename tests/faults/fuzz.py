@@ -117,9 +117,6 @@ def make_readers(folder: Path) -> dict[str, tuple[Path, Read]]:
 
     save_glb(load_ply(scene), folder / "scene.glb")
 
-    def read_glb(path: Path) -> None:
-        draw(load_glb(path))
-
     def read_scene(path: Path) -> None:
         draw(load_ply(path))
 
@@ -137,7 +134,7 @@ def make_readers(folder: Path) -> dict[str, tuple[Path, Read]]:
 
     return {
         "scene.ply": (scene, read_scene),
-        "scene.glb": (folder / "scene.glb", read_glb),
+        "scene.glb": (folder / "scene.glb", load_glb),
         "poses.json": (pair / "poses.json", read_pair),
         "pairs.json": (pair / "pairs.json", read_pair),
         "path.kitti": (folder / "path.kitti", read_poses),
