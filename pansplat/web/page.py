@@ -31,6 +31,7 @@ from pansplat.geometry.path import path_poses
 from pansplat.geometry.world import working_factor
 from pansplat.predictor import Progress
 from pansplat.refinement.budget import merge_to
+from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
 from pansplat.web.data import MAX_DEGREE, PackedGaussians, count_bytes, pack_gaussians
 
 DEFAULT_GAUSSIANS = 300_000  # phones draw and hold them
@@ -95,8 +96,7 @@ def write_page(
     scene = _prepare(scene)
     if len(scene.gaussians) > gaussians:
         report("merging Gaussians", 0.1)
-        height = min(scene.height, _MERGE_HEIGHT)
-        scene = merge_to(scene, (height, 2 * height), gaussians)
+        scene = _merge(scene, gaussians)
     report("compressing", 0.6)
     degree = _choose_degree(scene)
     origin = scene.cam2world[:, :3, 3].mean(0).numpy()
@@ -127,6 +127,21 @@ def _prepare(scene: Scene) -> Scene:
         gaussians = dataclasses.replace(gaussians, views=torch.zeros_like(gaussians.views))
     names = tuple(names[k] if k < len(names) else f"panorama {k + 1}" for k in range(len(poses)))
     return dataclasses.replace(scene, gaussians=gaussians, cam2world=poses, names=names)
+
+
+def _merge(scene: Scene, count: int) -> Scene:
+    """At most `count` Gaussians. Their colours are fitted to the images of all Gaussians at the input cameras."""
+    height = min(scene.height, _MERGE_HEIGHT)
+    size = (height, 2 * height)
+    merged = merge_to(scene, size, count)
+    if merged.gaussians.degree:
+        return merged  # the fit is for colours that do not depend on the direction
+    with torch.no_grad():
+        drawn = [pipeline.render(scene, pose, blend=view, size=size) for view, pose in enumerate(scene.cam2world)]
+    images = torch.stack([rendering.color for rendering in drawn])
+    masks = torch.ones(len(images), *size, dtype=torch.bool)
+    fitted = fit_colors(merged.gaussians, images, scene.cam2world, masks, ColorFitConfig())
+    return dataclasses.replace(merged, gaussians=fitted)
 
 
 def _choose_degree(scene: Scene) -> int:

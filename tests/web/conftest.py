@@ -46,3 +46,9 @@ def make_scene(num_views: int = 3, per_view: int = 700, degree: int = 1, seed: i
 def scene() -> Scene:
     """Three views, harmonics of degree 1, 100 m from the world's origin."""
     return make_scene()
+
+
+@pytest.fixture(scope="session")
+def plain_scene() -> Scene:
+    """Two views without harmonics."""
+    return make_scene(num_views=2, degree=0)

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 import torch
 
+from pansplat import pipeline
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
+from pansplat.refinement.budget import merge_to
 from pansplat.web import page as page_module
 from pansplat.web import write_page
 
@@ -55,6 +57,16 @@ def test_a_page_has_at_most_the_given_number_of_gaussians(scene: Scene, tmp_path
     header = read_header(tmp_path / "tour.html")
     assert 500 < written.num_gaussians <= 800
     assert sum(view["count"] for view in header["views"]) == header["count"] == written.num_gaussians
+
+
+def test_colours_of_merged_gaussians_are_fitted_to_all(plain_scene: Scene) -> None:
+    size, pose = (32, 64), plain_scene.cam2world[0]
+    needed = pipeline.render(plain_scene, pose, size=size).color
+    errors = [
+        float((pipeline.render(scene, pose, size=size).color - needed).square().mean())
+        for scene in (page_module._merge(plain_scene, 700), merge_to(plain_scene, (64, 128), 700))
+    ]
+    assert errors[0] < 0.8 * errors[1]
 
 
 def test_a_title_cannot_leave_its_element(scene: Scene, tmp_path: Path) -> None:
