@@ -274,6 +274,11 @@ class Panels:
                 imgui.same_line()
             if self._radio(f"view {view}", settings.mode == "view" and settings.view == view):
                 settings = replace(settings, mode="view", view=view)
+        if settings.mode == "deferred" and num_views > 1:
+            weights = list(settings.view_weights or (1.0,) * num_views)
+            for view in range(num_views):
+                weights[view] = self._slider(f"weight {view}", weights[view], 0.0, 1.0, "%.2f")
+            settings = replace(settings, view_weights=() if set(weights) == {1.0} else tuple(weights))
         if len(state.levels) > 1:
             shown = set(state.levels if settings.levels is None else settings.levels)
             _draw_row_label("level")
@@ -324,8 +329,8 @@ class Panels:
         state.speed = self._slider("speed", state.speed, 0.1, 10.0, "%.1f m/s")
         if not len(state.context):
             return
-        for view in range(min(len(state.context), 4)):
-            if view:
+        for view in range(min(len(state.context), 6)):
+            if view % 3:
                 imgui.same_line()
             if self._button(f"Panorama {view + 1}"):
                 jump_to_view(state, view)

@@ -246,7 +246,10 @@ def choose_layer_weights(frame: Frame, splats: Splats, min_weight: float) -> lis
             f"for {num_views} views; use mode joint"
         )
     weights = blend_weights(torch.from_numpy(frame.world_position.copy()), torch.from_numpy(positions))
-    return [{view: max(weight, min_weight) for view, weight in enumerate(weights.tolist())}]
+    factors = (settings.view_weights + (1.0,) * num_views)[:num_views]
+    factors = factors if any(factors) else (1.0,) * num_views
+    weighted = enumerate(zip(weights.tolist(), factors, strict=True))
+    return [{view: max(weight * factor, min_weight) for view, (weight, factor) in weighted if factor > 0}]
 
 
 class Compositor:

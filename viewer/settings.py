@@ -32,6 +32,8 @@ class DrawSettings:
             context view separately and blends the images per pixel by distance. `difference` is the absolute
             difference of the images of context views `view` and `view + 1` (cyclic), each over the background.
         view: the context view of mode `view` and the first of mode `difference`.
+        view_weights: factors of the context views in mode `deferred`, at least 0; views beyond the last one have 1.
+            Views of factor 0 are not drawn, unless all are 0, which is the same as all 1.
         levels: pyramid levels to draw; None draws all.
         opacity_threshold: Gaussians of lower opacity are not drawn.
         background: RGB in [0, 1].
@@ -50,6 +52,7 @@ class DrawSettings:
     lowpass: Lowpass = "angular"
     mode: Mode = "joint"
     view: int = 0
+    view_weights: tuple[float, ...] = ()
     levels: frozenset[int] | None = None
     opacity_threshold: float = 0.0
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -69,6 +72,8 @@ class DrawSettings:
                 f"`vertical_fov_degrees` must be between 0 and 180, got {self.vertical_fov_degrees}; "
                 "use layout equirect for a whole panorama"
             )
+        if not all(0 <= weight < math.inf for weight in self.view_weights):
+            raise InputError(f"`view_weights` must be finite numbers of at least 0, got {self.view_weights}")
         if not 0 < self.near < math.inf:
             raise InputError(f"`near` must be a positive distance in metres, got {self.near}")
         if self.face_size is not None and self.face_size < 1:

@@ -124,11 +124,12 @@ def adapt_settings(state: ViewerState, scene: Scene, *, keep_levels: bool = True
 
 
 def fit_settings(settings: DrawSettings, scene: Scene) -> DrawSettings:
-    """The settings with a view and a mode that a scene supports."""
+    """The settings with a view, a mode and weights of views that a scene supports."""
     num_views = max(len(scene.cam2world), 1)
     if num_views < 2 and settings.mode in ("deferred", "difference"):
         settings = replace(settings, mode="joint")
-    return replace(settings, view=min(settings.view, num_views - 1))
+    view_weights = settings.view_weights if len(settings.view_weights) == num_views else ()
+    return replace(settings, view=min(settings.view, num_views - 1), view_weights=view_weights)
 
 
 def jump_to_view(state: ViewerState, view: int) -> None:

@@ -280,6 +280,20 @@ def test_hiding_every_level_shows_the_background(user):
     assert user.read_image().min() == 255
 
 
+def test_a_view_of_weight_zero_is_left_out_of_deferred_blending(user):
+    user.click("view 1")
+    single = user.read_image()
+    user.click("deferred")
+    user.state.camera = replace(user.state.camera, position=(0.0, 0.0, 0.2))
+    both = user.read_image()
+    left, top, right, bottom = user.panels.items["weight 0"]
+    user.drag((left + 0.4 * (right - left), (top + bottom) / 2), (left, (top + bottom) / 2))
+    assert user.state.settings.view_weights == (0.0, 1.0)
+    assert changed_fraction(both, user.read_image()) > 0.1
+    user.state.camera = user.state.home
+    assert changed_fraction(single, user.read_image()) == 0
+
+
 def test_fly_button_plays_and_stop_pauses(user):
     user.click("Fly")
     assert user.state.playing
@@ -623,6 +637,8 @@ def test_the_hotspots_and_the_floor_plan_of_a_tour_can_be_hidden(tour_user):
 @pytest.mark.slow
 def test_a_click_on_a_hotspot_flies_there_and_fades_to_its_scene(tour_user):
     user = tour_user
+    user.state.camera = replace(user.state.camera, yaw_radians=-0.25)  # the hotspot is right of the panel
+    user.draw_frames(2)
     (hotspot,) = [spot for spot in user.data.hotspots if spot.node == 2]
     first, color = user.viewer._slot.scene, user.read_image().mean((0, 1))
     user.click_at(*hotspot.center)
