@@ -1,8 +1,10 @@
-"""Run sections of torch code on one thread."""
+"""Threads: sections of torch code on one thread, and pools of threads."""
 
 import contextlib
+import os
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import torch
 
@@ -30,3 +32,8 @@ def one_thread() -> Iterator[None]:
         with _lock:
             _num_running -= 1
             torch.set_num_threads(_num_threads)
+
+
+def worker_threads() -> ThreadPoolExecutor:
+    """A pool for work that releases Python's lock, with a thread for each processor, four at most."""
+    return ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1)))

@@ -10,7 +10,7 @@ Source: J. Coughlan, A. Yuille, Manhattan World, ICCV 1999; segments: R. Grompon
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -33,6 +33,7 @@ _ROTATION_NOISE = (
 )  # of the relative rotation: about horizontal axes, about gravity
 _LARGEST_RESIDUAL = 5.0  # of a rotation that the axes are taken to determine, in the noise's unit
 _PARALLEL = math.radians(1.8)  # difference of parallel axes
+_COMPASS_NOISE, _COMPASS_SHARE = math.radians(20), 0.6  # of headings; their prior probability to be right
 _AGREEMENT = 0.9, 0.06  # prior probability of axes of one building, and of upright cameras in different ones
 
 
@@ -44,11 +45,19 @@ class SceneAxes:
         axes: orthonormal, right-handed.
         has_down: whether enough vertical edges determine the first axis.
         has_walls: whether enough horizontal edges determine the other two.
+        heading: compass direction of the picture's centre, radians clockwise from north, if the metadata has it.
     """
 
     axes: Float[Array, "3 3"]
     has_down: bool
     has_walls: bool
+    heading: float | None = None
+
+    @property
+    def frame(self) -> Float[Array, "3 3"]:
+        """The axes x, y (down) and z of the scene in the camera's frame, as columns."""
+        down, wall = self.axes[:2]
+        return np.stack((np.cross(down, wall), down, wall), axis=1)
 
 
 def find_axes(image: UInt8[Array, "height width"]) -> SceneAxes:
@@ -122,6 +131,15 @@ def _search_axes(normals: Float[Array, "n 3"], lengths: Float[Array, "n"]) -> Fl
     return np.stack((down, wall, np.cross(down, wall)))
 
 
+def with_hints(axes: SceneAxes, down: Float[Array, "3"] | None, heading: float | None) -> SceneAxes:
+    """The axes with gravity and compass by the metadata, where the picture does not determine gravity itself."""
+    if axes.has_down or down is None:
+        return replace(axes, heading=heading)
+    wall = np.cross(down, axes.axes[2])
+    wall /= np.linalg.norm(wall)
+    return SceneAxes(np.stack((down, wall, np.cross(down, wall))), True, False, heading)
+
+
 def relative_rotations(first: SceneAxes, second: SceneAxes) -> list[Float[Array, "3 3"]]:
     """The four rotations from the first camera to the second one that make their axes agree."""
     turned = []
@@ -181,8 +199,9 @@ class RotationPrior:
 
     def score(self, rotation: Float[Array, "3 3"]) -> float:
         """Logarithm of the rotation's probability density under the prior, over that of a random rotation."""
+        heading = self._heading_score(rotation)
         if not self.has_down:
-            return 0.0
+            return heading
         tilt = math.acos(float(np.clip(self.second.axes[0] @ rotation @ self.first.axes[0], -1, 1)))
         sigma = math.sqrt(2) * _ROTATION_NOISE[0]
         upright = 2 / sigma**2 * math.exp(-0.5 * (tilt / sigma) ** 2)
@@ -193,7 +212,16 @@ class RotationPrior:
             walls = 2 * math.pi**2 / ((2 * math.pi) ** 1.5 * sigma**3) * math.exp(-0.5 * (nearest / sigma) ** 2)
         else:
             share, others = 0.0, sum(_AGREEMENT)
-        return math.log(share * walls + others * upright + 1 - share - others)
+        return heading + math.log(share * walls + others * upright + 1 - share - others)
+
+    def _heading_score(self, rotation: Float[Array, "3 3"]) -> float:
+        """The same for the compass alone, which metal and careless programs disturb."""
+        if self.first.heading is None or self.second.heading is None:
+            return 0.0
+        north = [np.array((-math.sin(h), 0.0, math.cos(h))) for h in (self.first.heading, self.second.heading)]
+        angle = math.acos(float(np.clip(north[1] @ rotation @ north[0], -1, 1)))
+        density = math.exp(-0.5 * (angle / _COMPASS_NOISE) ** 2) / (math.sqrt(2 * math.pi) * _COMPASS_NOISE)
+        return math.log(_COMPASS_SHARE * density * 2 * math.pi + 1 - _COMPASS_SHARE)
 
 
 NO_PRIOR = RotationPrior(*(SceneAxes(np.eye(3), False, False),) * 2)

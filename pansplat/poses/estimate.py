@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import itertools
 import math
-import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,13 +21,27 @@ from pansplat.data.masks import scene_mask_of_files
 from pansplat.data.pairs import FAR, NEAR, find_mask
 from pansplat.errors import InputError
 from pansplat.files import require_file
-from pansplat.poses.axes import RotationPrior, SceneAxes, find_axes
-from pansplat.poses.features import Features, detect_features, match_features
+from pansplat.poses.axes import RotationPrior, SceneAxes, find_axes, with_hints
+from pansplat.poses.features import (
+    DIAGONAL,
+    FACE_ROTATIONS,
+    Features,
+    Matches,
+    detect_features,
+    match_features,
+)
+from pansplat.poses.hints import Hints, read_hints
 from pansplat.poses.tour import Pair, build_tour
-from pansplat.poses.two_view import RelativePose, estimate_relative_pose, match_priors, noise_of
-from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_camera_height, level_poses
+from pansplat.poses.two_view import (
+    RelativePose,
+    estimate_relative_pose,
+    match_priors,
+    noise_of,
+    polish_relative_pose,
+)
+from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_floor, level_poses
 from pansplat.predictor import Progress
-from pansplat.threads import one_thread
+from pansplat.threads import one_thread, worker_threads
 
 CAMERA_HEIGHT = 1.5  # metres over the floor; tripods of tours stand at 1.3 to 1.6 m
 _HEIGHT = 1024  # pixels; larger panoramas are reduced
@@ -36,8 +50,11 @@ _QUICK_FEATURES = 2500  # per panorama, to choose the pairs that are compared th
 _THOROUGH = 6  # pairs of each panorama that are compared with all features
 _FEW = 6  # up to this number of panoramas, all pairs are compared with all features
 _DARK = 8.0  # mean grey value of an image that shows nothing
+_LARGEST_SEAM, _POLE_DEVIATION = 12.0, 10.0  # grey values: across the edges; along the rows at the poles
 _SAME_IMAGE = 1.5  # mean grey difference of two copies of one image
 _FLOOR_PAIRS = 8
+_LARGEST_SLOPE = 3.0  # of the way between two cameras of a weak pair, degrees
+_CONFIRMING_CONTRAST = 1.6  # of the floor that confirms a weak pair
 _MIRROR_EVIDENCE = 60.0  # expected number of right matches with a mirror image
 _MAX_BASELINE = 1e9  # metres
 _LARGEST_NEAR = 0.6  # metres; the depth range is not narrower than that of rooms
@@ -80,9 +97,17 @@ class PoseEstimate:
 
 @dataclass(frozen=True, eq=False)
 class _View:
+    """What is used of a panorama: features of faces along its axes, and of faces turned against the walls."""
+
     features: Features
+    turned: Features
     axes: SceneAxes
     small: Float[Array, "height width"]
+
+    @functools.cached_property
+    def joined(self) -> Features:
+        """All features."""
+        return self.features.joined(self.turned)
 
 
 def estimate_poses(
@@ -123,20 +148,21 @@ def estimate_poses(
                 f"`baseline` must be two different images and a distance above 0 to {_MAX_BASELINE:g} metres, got "
                 f"{' '.join(map(str, baseline))}"
             )
-    pixels, unplaced = _read_images(paths)
+    hints = [read_hints(path) for path in paths]
+    pixels, unplaced = _read_images(paths, hints)
     kept = [n for n in range(len(paths)) if n not in unplaced]
     if len(kept) < 2:
         raise _no_poses(paths, unplaced)
     with one_thread():  # panoramas and pairs are divided among threads
-        views = _describe_views(paths, pixels, kept, report)
+        views = _describe_views(paths, pixels, hints, kept, report)
         relations = _relate_views(views, seed, report)
     report("placing the panoramas", 0.9)
     downs = np.stack([v.axes.axes[0] if v.axes.has_down else np.full(3, np.nan) for v in views])
     noise = max(noise_of(v.features, v.features) for v in views)
-    tour = build_tour([v.features for v in views], relations, downs, noise)
-    for position, reason in tour.unplaced.items():
-        is_mirrored = _is_mirrored(position, views, tour.placed)
-        unplaced[kept[position]] = "it looks mirrored left to right; flip it" if is_mirrored else reason
+    tour = build_tour([v.joined for v in views], relations, downs, noise)
+    for position, (reason, other) in tour.unplaced.items():
+        partner = "" if other is None else f" (best with {paths[kept[other]].name})"
+        unplaced[kept[position]] = _describe_mirrored(position, views, tour.placed, paths, kept) or reason + partner
     if len(tour.placed) < 2:
         raise _no_poses(paths, unplaced)
     poses = level_poses(tour.poses, downs[list(tour.placed)])
@@ -163,12 +189,18 @@ def _no_poses(paths: Sequence[Path], reasons: Mapping[int, str]) -> InputError:
     return InputError(f"no poses were found: {listed}.")
 
 
-def _read_images(paths: Sequence[Path]) -> tuple[dict[int, UInt8[Array, "height width"]], dict[int, str]]:
+def _read_images(
+    paths: Sequence[Path], hints: Sequence[Hints]
+) -> tuple[dict[int, UInt8[Array, "height width"]], dict[int, str]]:
     """Grey panoramas by index, and the reasons against those that cannot be used."""
     pixels: dict[int, Array] = {}
     reasons: dict[int, str] = {}
     thumbnails: dict[int, Array] = {}
     for n, path in enumerate(paths):
+        problem = hints[n].problem
+        if problem is not None:
+            reasons[n] = problem
+            continue
         try:
             image = read_panorama(path, _working_height(path))[0].numpy()
         except InputError as error:
@@ -181,11 +213,22 @@ def _read_images(paths: Sequence[Path]) -> tuple[dict[int, UInt8[Array, "height 
             reasons[n] = f"too dark (mean grey value {grey.mean():.0f} of 255)"
         elif small.std() < 2:
             reasons[n] = "it shows nothing (one colour)"
+        elif not _is_closed(grey):
+            reasons[n] = "it is not a panorama of 360 degrees: its left and right edges do not join"
         elif copy is not None:
             reasons[n] = f"it is a copy of {paths[copy].name}, or was taken at the same place"
         else:
             pixels[n], thumbnails[n] = grey, small
     return pixels, reasons
+
+
+def _is_closed(grey: UInt8[Array, "height width"]) -> bool:
+    """Whether the left and right edges join, or the rows at the poles have one colour, as in a panorama."""
+    small = cv2.resize(grey, (512, 256), interpolation=cv2.INTER_AREA).astype(np.float32)
+    inside = np.abs(np.diff(small, axis=1)).mean(axis=0)
+    seam = float(np.abs(small[:, 0] - small[:, -1]).mean())
+    poles = min(float(small[row].std()) for row in (0, -1))
+    return seam < max(_LARGEST_SEAM, 3 * float(np.quantile(inside, 0.97))) or poles < _POLE_DEVIATION
 
 
 def _working_height(path: Path) -> int:
@@ -198,26 +241,25 @@ def _working_height(path: Path) -> int:
 
 
 def _describe_views(
-    paths: Sequence[Path], pixels: dict[int, Array], kept: Sequence[int], report: Progress
+    paths: Sequence[Path], pixels: dict[int, Array], hints: Sequence[Hints], kept: Sequence[int], report: Progress
 ) -> list[_View]:
+    is_compass = len({hints[n].heading for n in kept}) > 1  # one value for all pictures is a program's default
     static = scene_mask_of_files(tuple(paths[n] for n in kept), _HEIGHT).numpy()
 
     def describe(n: int) -> _View:
         mask = find_mask(paths[n], paths[n].parent)
         scene = static if mask is None else read_mask(mask, _HEIGHT).numpy()
         small = cv2.resize(pixels[n], (2 * FLOOR_HEIGHT, FLOOR_HEIGHT), interpolation=cv2.INTER_AREA) / np.float32(255)
-        return _View(detect_features(pixels[n], scene), find_axes(pixels[n]), small)
+        axes = with_hints(find_axes(pixels[n]), hints[n].down, hints[n].heading if is_compass else None)
+        turned = detect_features(pixels[n], scene, rotations=axes.frame @ DIAGONAL @ FACE_ROTATIONS, faces=4)
+        return _View(detect_features(pixels[n], scene), turned, axes, small)
 
     views = []
-    with _workers() as pool:
+    with worker_threads() as pool:
         for position, view in enumerate(pool.map(describe, kept)):
             report("finding features", 0.4 * position / len(kept))
             views.append(view)
     return views
-
-
-def _workers() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1)))
 
 
 def _relate_views(views: Sequence[_View], seed: int, report: Progress) -> dict[Pair, RelativePose]:
@@ -225,7 +267,7 @@ def _relate_views(views: Sequence[_View], seed: int, report: Progress) -> dict[P
     pairs = list(itertools.combinations(range(len(views)), 2))
     if len(views) > _FEW:
         report("comparing all pairs", 0.4)
-        with _workers() as pool:
+        with worker_threads() as pool:
             quick = pool.map(lambda pair: _quick_overlap(views[pair[0]], views[pair[1]]), pairs)
             overlap = dict(zip(pairs, quick, strict=True))
         chosen = set()
@@ -237,20 +279,50 @@ def _relate_views(views: Sequence[_View], seed: int, report: Progress) -> dict[P
     def relate(pair: Pair) -> RelativePose:
         first, second = views[pair[0]], views[pair[1]]
         matches = match_features(first.features, second.features)
-        return estimate_relative_pose(
-            first.features, second.features, matches, RotationPrior(first.axes, second.axes), seed=seed
-        )
+        prior = RotationPrior(first.axes, second.axes)
+        relation = estimate_relative_pose(first.features, second.features, matches, prior, seed=seed)
+        if not relation.is_reliable:
+            return relation
+        if not relation.is_certain:
+            relation = _confirm_by_floor(relation, first, second)
+            if not relation.is_reliable:
+                return relation
+        further = match_features(first.turned, second.turned)
+        indices = further.indices + np.array((len(first.features), len(second.features)))
+        every = Matches(np.concatenate((matches.indices, indices)), np.concatenate((matches.ratio, further.ratio)))
+        return polish_relative_pose(relation, first.joined, second.joined, every, prior)
 
     relations = {}
-    with _workers() as pool:
+    with worker_threads() as pool:
         for position, (pair, relation) in enumerate(zip(pairs, pool.map(relate, pairs), strict=True)):
             report("comparing pairs", 0.5 + 0.4 * position / len(pairs))
             relations[pair] = relation
     return relations
 
 
-def _is_mirrored(view: int, views: Sequence[_View], placed: Sequence[int]) -> bool:
-    """Whether the mirror image of a panorama fits another one."""
+def _confirm_by_floor(relation: RelativePose, first: _View, second: _View) -> RelativePose:
+    """The relation, with a problem if the cameras' heights differ or the panoramas do not agree on a floor.
+
+    Repeated doors and windows give wrong poses with many matches. Such a pose is rarely horizontal, and the floors of
+    both panoramas do not agree under it.
+    """
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, :3, :3], poses[1, :3, 3] = relation.rotation.T, -relation.rotation.T @ relation.translation
+    poses = level_poses(poses, np.stack((first.axes.axes[0], second.axes.axes[0])))
+    slope = math.degrees(math.asin(float(np.clip(poses[1, 1, 3], -1, 1))))
+    few = f"too little in common: {relation.places:.0f} places match"
+    if abs(slope) > _LARGEST_SLOPE:
+        problem = f"{few}, and the cameras' heights differ by {abs(slope):.0f} degrees of slope under the best pose"
+        return dataclasses.replace(relation, problem=problem)
+    if not find_floor([first.small, second.small], poses, [(0, 1)]).is_found(_CONFIRMING_CONTRAST):
+        return dataclasses.replace(relation, problem=f"{few}, and the floor does not confirm the pose")
+    return relation
+
+
+def _describe_mirrored(
+    view: int, views: Sequence[_View], placed: Sequence[int], paths: Sequence[Path], kept: Sequence[int]
+) -> str | None:
+    """The problem of a panorama whose mirror image fits another one; None if it does not."""
     mirrored = views[view].features.mirrored()
     others = placed or [other for other in range(len(views)) if other != view]
     for other in sorted(others, key=lambda v: abs(v - view))[:3]:
@@ -259,8 +331,10 @@ def _is_mirrored(view: int, views: Sequence[_View], placed: Sequence[int]) -> bo
         if match_priors(matches.ratio).sum() > _MIRROR_EVIDENCE:
             relation = estimate_relative_pose(mirrored, features, matches)
             if relation.is_reliable:
-                return True
-    return False
+                if placed:
+                    return "it looks mirrored left to right; flip it"
+                return f"this one or {paths[kept[other]].name} looks mirrored left to right; flip one"
+    return None
 
 
 def _quick_overlap(first: _View, second: _View) -> float:
@@ -287,11 +361,11 @@ def _find_scale(
     pairs = sorted(
         itertools.combinations(range(len(files)), 2), key=lambda p: float(np.linalg.norm(centres[p[0]] - centres[p[1]]))
     )
-    height = find_camera_height(images, poses, pairs[:_FLOOR_PAIRS])
-    if height is None:
+    floor = find_floor(images, poses, pairs[:_FLOOR_PAIRS])
+    if not floor.is_found():
         typical = float(np.median([np.linalg.norm(centres[i] - centres[j]) for i, j in pairs[: len(files) - 1]]))
         return 1 / typical, "unknown (no floor was found); neighbouring cameras are taken as 1 m apart, see --baseline"
-    return camera_height / height, f"cameras {camera_height:g} m over the floor"
+    return camera_height / floor.height, f"cameras {camera_height:g} m over the floor"
 
 
 def _find_file(name: Path | str, files: Sequence[Path]) -> int:

@@ -1,7 +1,8 @@
 """Local features of panoramas as bearings with descriptors, and matches between two panoramas.
 
 SIFT assumes an image without distortion. It therefore runs on the faces of a cube, which overlap so that no feature
-is lost at their borders; each face contributes the features that are nearest to its own axis. Descriptors are
+is lost at their borders; each face contributes the features that are nearest to its own axis. Faces in other
+directions give features with other errors, and describe what the first ones see obliquely. Descriptors are
 root-normalised.
 
 Source: D. Lowe, Distinctive Image Features from Scale-Invariant Keypoints, IJCV 2004; R. Arandjelovic, A. Zisserman,
@@ -25,7 +26,7 @@ from pansplat.geometry.pose import rotations_from_quats
 _FIELD_OF_VIEW = 100.0  # degrees of a face; 10 more than a cube's
 _CONTRAST, _EDGE = 0.015, 12.0  # thresholds of SIFT; low, because matching removes weak features
 _DARK = 16.0  # mean grey value below which an image is brightened
-_SAME_PLACE = 0.004  # radians between matches that count once
+_SAME_PLACE = 0.008  # distance of matches that count once, radians in both panoramas together
 _CHUNK = 256  # descriptors that are compared together
 
 _HALF = math.sqrt(0.5)
@@ -34,7 +35,9 @@ _FACE_QUATS = (
     (_HALF, _HALF, 0, 0), (_HALF, -_HALF, 0, 0),
 )  # fmt: skip
 FACE_ROTATIONS: Float[Array, "6 3 3"] = rotations_from_quats(torch.tensor(_FACE_QUATS, dtype=torch.float64)).numpy()
-"""Axes of the cube's faces in the camera's frame, as columns."""
+"""Axes of the cube's faces in the camera's frame, as columns; the four horizontal ones first."""
+DIAGONAL: Float[Array, "3 3"] = np.array(((_HALF, 0.0, _HALF), (0.0, 1.0, 0.0), (-_HALF, 0.0, _HALF)))
+"""A turn by 45 degrees about the y axis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +60,11 @@ class Features:
     def strongest(self, count: int) -> Features:
         """The first `count` features."""
         return Features(self.bearings[:count], self.descriptors[:count], self.pixel)
+
+    def joined(self, other: Features) -> Features:
+        """These features, then those of `other`."""
+        bearings = np.concatenate((self.bearings, other.bearings))
+        return Features(bearings, np.concatenate((self.descriptors, other.descriptors)), self.pixel)
 
     def mirrored(self) -> Features:
         """The features of the panorama that is mirrored left to right.
@@ -85,22 +93,27 @@ class Matches:
 
 
 def detect_features(
-    image: UInt8[Array, "height width"], mask: Bool[Array, "height width"] | None = None, *, count: int = 8000
+    image: UInt8[Array, "height width"],
+    mask: Bool[Array, "height width"] | None = None,
+    *,
+    rotations: Float[Array, "6 3 3"] = FACE_ROTATIONS,
+    faces: int = 6,
+    count: int = 8000,
 ) -> Features:
     """The `count` strongest features of a grey panorama, outside the masked pixels.
 
     Args:
         mask: True where the panorama shows the scene.
+        rotations: axes of the faces of a cube in the camera's frame, as columns.
+        faces: number of the faces that are used, the first ones.
         count: largest number of features.
     """
-    width = image.shape[1]
-    focal = width / (2 * math.pi)  # a face has the panorama's resolution at its centre
     if image.mean() < _DARK:
         image = cv2.equalizeHist(image)
+    focal = image.shape[1] / (2 * math.pi)  # a face has the panorama's resolution at its centre
     sift = cv2.SIFT_create(contrastThreshold=_CONTRAST, edgeThreshold=_EDGE)
-    rotations = FACE_ROTATIONS
     bearings, descriptors, strengths = [np.empty((0, 3))], [np.empty((0, 128), np.float32)], [np.empty(0)]
-    for face, rotation in enumerate(rotations):
+    for face, rotation in enumerate(rotations[:faces]):
         points, found = sift.detectAndCompute(render_face(image, rotation, focal), None)
         if found is None or not len(points):
             continue
@@ -114,24 +127,24 @@ def detect_features(
         bearings.append(rays[own])
         descriptors.append(found[own])
         strengths.append(np.array([point.response for point in points])[own])
-    strength = np.concatenate(strengths)
-    order = np.argsort(-strength, kind="stable")[:count]
+    order = np.argsort(-np.concatenate(strengths), kind="stable")[:count]
     descriptor = np.concatenate(descriptors)[order]
     descriptor = np.sqrt(descriptor / np.maximum(descriptor.sum(axis=1, keepdims=True), 1e-9))
-    return Features(np.concatenate(bearings)[order], descriptor.astype(np.float32), 2 * math.pi / width)
+    return Features(np.concatenate(bearings)[order], descriptor.astype(np.float32), 2 * math.pi / image.shape[1])
 
 
 def render_face(image: UInt8[Array, "height width"], rotation: Array, focal: float) -> UInt8[Array, "side side"]:
     """The perspective image of a face."""
     height, width = image.shape
     side = int(2 * math.tan(math.radians(_FIELD_OF_VIEW / 2)) * focal)
-    steps = (np.arange(side) + 0.5 - side / 2) / focal
-    x, y = np.meshgrid(steps, steps)
-    rays = np.stack((x, y, np.ones_like(x)), axis=-1) @ rotation.T
-    uv = uv_from_directions(torch.from_numpy(rays)).numpy() * (width, height) - 0.5
+    steps = ((np.arange(side) + 0.5 - side / 2) / focal).astype(np.float32)
+    axes = rotation.astype(np.float32)
+    rows = steps[:, None, None] * axes[:, 1] + axes[:, 2]
+    x, y, z = np.moveaxis(rows + steps[:, None] * axes[:, 0], -1, 0)
     margin = 4
+    u = np.arctan2(x, z) * np.float32(width / (2 * math.pi)) + np.float32(width / 2 - 0.5 + margin)
+    v = np.arctan2(y, np.sqrt(x * x + z * z)) * np.float32(height / math.pi) + np.float32(height / 2 - 0.5)
     padded = cv2.copyMakeBorder(image, 0, 0, margin, margin, cv2.BORDER_WRAP)
-    u, v = (uv[..., 0] + margin).astype(np.float32), uv[..., 1].astype(np.float32)
     return cv2.remap(padded, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
@@ -143,7 +156,7 @@ def _sample_mask(mask: Bool[Array, "height width"], rays: Float[Array, "n 3"]) -
 
 
 def match_features(first: Features, second: Features) -> Matches:
-    """Mutually nearest descriptors."""
+    """Mutually nearest descriptors; one match for each pair of places."""
     if min(len(first), len(second)) < 2:
         return Matches(np.empty((0, 2), np.int64), np.empty(0))
     a, b = torch.from_numpy(first.descriptors), torch.from_numpy(second.descriptors)
@@ -163,10 +176,8 @@ def match_features(first: Features, second: Features) -> Matches:
         ratios.append(((1 - value).clamp_min(0) / (1 - second_value).clamp_min(1e-6)).sqrt())
     index, ratio = torch.cat(nearest), torch.cat(ratios)
     mutual = torch.nonzero(row_of[index] == torch.arange(len(index)))[:, 0]
-    ratio = ratio[mutual].double().numpy()
-    pairs = torch.stack((mutual, index[mutual]), dim=1).numpy()
-    order = np.argsort(ratio, kind="stable")
-    return _drop_repeated(first, second, Matches(pairs[order], ratio[order]))
+    indices, ratio = torch.stack((mutual, index[mutual]), dim=1).numpy(), ratio[mutual].double().numpy()
+    return _drop_repeated(first, second, Matches(indices, ratio))
 
 
 def _drop_repeated(first: Features, second: Features, matches: Matches) -> Matches:
@@ -174,9 +185,16 @@ def _drop_repeated(first: Features, second: Features, matches: Matches) -> Match
 
     SIFT describes a place again for each dominant orientation and size; such matches are not independent evidence.
     """
+    from scipy.spatial import cKDTree
+
     if not len(matches):
         return matches
+    order = np.argsort(matches.ratio, kind="stable")
+    matches = Matches(matches.indices[order], matches.ratio[order])
     places = np.concatenate((first.bearings[matches.indices[:, 0]], second.bearings[matches.indices[:, 1]]), axis=1)
-    _, kept = np.unique(np.rint(places / _SAME_PLACE).astype(np.int64), axis=0, return_index=True)
-    kept = np.sort(kept)
+    near = cKDTree(places).query_pairs(_SAME_PLACE, output_type="ndarray")  # the better match first
+    kept = np.ones(len(matches), bool)
+    for better, worse in near[np.argsort(near[:, 1], kind="stable")].tolist():
+        if kept[better]:
+            kept[worse] = False
     return Matches(matches.indices[kept], matches.ratio[kept])

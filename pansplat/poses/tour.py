@@ -40,7 +40,7 @@ class Tour:
         depths: distances of the points from the cameras that observe them.
         angles: residuals of these observations, radians.
         rejected: pairs that contradict the others.
-        unplaced: the reason for each panorama without a pose.
+        unplaced: for each panorama without a pose the reason, and the other panorama of its best pair.
     """
 
     placed: tuple[int, ...]
@@ -49,7 +49,7 @@ class Tour:
     depths: Float[Array, "observation"]
     angles: Float[Array, "observation"]
     rejected: tuple[Pair, ...]
-    unplaced: dict[int, str]
+    unplaced: dict[int, tuple[str, int | None]]
 
 
 def build_tour(
@@ -96,17 +96,20 @@ def build_tour(
     )
 
 
-def _describe_failure(view: int, relations: Mapping[Pair, RelativePose], rejected: Sequence[Pair]) -> str:
+def _describe_failure(
+    view: int, relations: Mapping[Pair, RelativePose], rejected: Sequence[Pair]
+) -> tuple[str, int | None]:
     """Why a panorama has no pose: the problem of its best pair."""
     own = [(pair, relation) for pair, relation in relations.items() if view in pair]
     if not own:
-        return "it has nothing in common with another panorama"
+        return "it has nothing in common with another panorama", None
     pair, best = max(own, key=lambda item: item[1].places)
+    other = pair[0] if pair[1] == view else pair[1]
     if best.problem is not None:
-        return best.problem
+        return best.problem, other
     if pair in rejected:
-        return "its pose contradicts those of other panoramas"
-    return "its distance cannot be determined: it shares too few points with panoramas that have a pose"
+        return "its pose contradicts those of other panoramas", other
+    return "its distance cannot be determined: it shares too few points with panoramas that have a pose", other
 
 
 def _find_contradictions(relations: Mapping[Pair, RelativePose]) -> tuple[Pair, ...]:

@@ -12,7 +12,7 @@ by generalized model optimization, ACCV 2004; P. Torr, A. Zisserman, MLESAC, CVI
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -36,14 +36,21 @@ from pansplat.poses.solvers import (
 # Prior probability that a match is right, by its ratio; measured on pairs of real panoramas 2 to 3 m apart.
 _RATIOS, _PRIORS = (0.5, 0.65, 0.75, 0.8, 0.85, 0.9, 1.0), (0.8, 0.6, 0.3, 0.15, 0.06, 0.02, 0.005)
 _NOISE_PIXELS, _MIN_NOISE = 0.45, 8e-4  # standard deviation of a right match: pixels at the horizon; radians
-_WIDE_SHARE, _WIDE = 0.3, 3.0  # of right matches with larger errors, and their standard deviation in that of the others
+_WIDE_SHARE, _WIDE = 0.3, 3.0  # of right matches with larger errors; their standard deviation in that of the others
 _MAX_ANGLE = 4.0  # largest residual of a right match, in the wide standard deviation
+_DISTORTION, _DISTORTION_LENGTH = (
+    1e-3,
+    0.15,
+)  # of stitched panoramas: standard deviation and correlation length, radians
+_TAIL = 2.0  # degrees of freedom of the distribution of a match's own error
+_MAX_POLISHED = 1000  # matches
+_POLISH_FACTORS = 1.5, 1.0  # of the noise, by which matches are chosen
 _LEVEL = [2, 0, 1]  # order of the axes in a levelled camera: x, y down, z
 _MAX_MATCHES = 2500
 _TOP_SETS = (40, 80, 160, 320, 640, 2500)  # best matches from which samples are drawn
 _SAMPLES = {5: 150, 3: 1200, 2: 600}  # of each set
 _QUICK, _RESCORED = 500, 3000  # best matches that rank all hypotheses; hypotheses that all matches rank
-_KEPT = 20  # hypotheses that are optimised
+_KEPT, _KEPT_PARALLEL = 20, 10  # hypotheses that are optimised: of all kinds, and of those with parallel walls
 _PLACE = 0.2  # size of a cell that counts as one place, as a difference of unit vectors
 _MIN_PARALLAX = 5.0  # in the noise's standard deviation
 _MAX_UNCERTAINTY = math.radians(4)
@@ -59,9 +66,10 @@ class _Evidence:
     margin: float
 
 
-# Measured on all 78 pairs of a home: wrong poses that walls confirm have at most 11 places and a score of 24. Other
-# wrong poses have up to 25 places, because repeated doors and windows match.
-_CONFIRMED, _UNCONFIRMED = _Evidence(10, 40, 4), _Evidence(32, 80, 20)
+# Measured on pairs of a home, of which most have nothing in common. Wrong poses that make the walls parallel have at
+# most 21 places and a score of 70; the floor tells them from right ones. Other wrong poses have up to 25 places,
+# because repeated doors and windows match.
+_CERTAIN, _CONFIRMED, _UNCONFIRMED = _Evidence(24, 100, 10), _Evidence(10, 36, 4), _Evidence(32, 80, 20)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,26 +178,98 @@ def _tangent_basis(direction: Float[Array, "3"]) -> Float[Array, "3 2"]:
     return np.stack((first, np.cross(direction, first)), axis=1)
 
 
-def _normal_equations(
-    a: Array, b: Array, probability: Array, rotation: Array, translation: Array, noise: float
-) -> tuple[Float[Array, "5 5"], Float[Array, "5"]]:
-    """Hessian and gradient of the squared angles in the noise's unit, by rotation (3) and direction (2)."""
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """Epipolar angles of matches, radians, with their derivatives.
+
+    Attributes:
+        by_pose: by the rotation vector (3) and the direction (2) of the pose.
+        by_first, by_second: by the bearings of the first and of the second panorama.
+    """
+
+    angle: Float[Array, "n"]
+    by_pose: Float[Array, "n 5"]
+    by_first: Float[Array, "n 3"]
+    by_second: Float[Array, "n 3"]
+
+
+def _linearise(a: Array, b: Array, rotation: Array, translation: Array) -> _Linearised:
     g = a @ rotation.T
     n = np.cross(translation, g)
     e = (n * b).sum(axis=1)
     bt = np.cross(b, translation)
     scale = np.sqrt(
         np.maximum(((n - e[:, None] * b) ** 2).sum(axis=1) + ((bt - e[:, None] * g) ** 2).sum(axis=1), 1e-12)
-    )
-    jacobian = np.concatenate((np.cross(g, bt), np.cross(g, b) @ _tangent_basis(translation)), axis=1)
-    jacobian /= scale[:, None] * noise
-    angle = np.abs(e / scale)
+    )[:, None]
+    by_pose = np.concatenate((np.cross(g, bt), np.cross(g, b) @ _tangent_basis(translation)), axis=1)
+    return _Linearised(e / scale[:, 0], by_pose / scale, bt @ rotation / scale, n / scale)
+
+
+def _normal_equations(
+    a: Array, b: Array, probability: Array, rotation: Array, translation: Array, noise: float
+) -> tuple[Float[Array, "5 5"], Float[Array, "5"]]:
+    """Hessian and gradient of the squared angles in the noise's unit, by rotation (3) and direction (2)."""
+    linear = _linearise(a, b, rotation, translation)
+    jacobian = linear.by_pose / noise
+    angle = np.abs(linear.angle)
     # Weight of the wide component of the noise is smaller, as in an EM step for a mixture of two Gaussians.
     narrow = (1 - _WIDE_SHARE) * np.exp(-0.5 * (angle / noise) ** 2)
     wide = _WIDE_SHARE / _WIDE * np.exp(-0.5 * (angle / (_WIDE * noise)) ** 2) + 1e-300
     weight = probability * (narrow + wide / _WIDE**2) / (narrow + wide)
-    residual = e / scale / noise
+    residual = linear.angle / noise
     return (jacobian * weight[:, None]).T @ jacobian, jacobian.T @ (weight * residual)
+
+
+def polish_pose(
+    a: Float[Array, "match 3"],
+    b: Float[Array, "match 3"],
+    rotation: Float[Array, "3 3"],
+    translation: Float[Array, "3"],
+    noise: float,
+    axes: RotationPrior = NO_PRIOR,
+    steps: int = 10,
+) -> tuple[Float[Array, "3 3"], Float[Array, "3"], tuple[float, float]]:
+    """The pose by generalised least squares over right matches, and the standard deviations of rotation and direction.
+
+    Stitching distorts a panorama smoothly: matches on one object share an error, which their number does not reduce.
+    The covariance of the residuals has this distortion as a random field on each sphere, beside the independent error
+    of each match, whose heavy tails reduce the weight of a match with a large residual.
+    """
+    if len(a) < 5:
+        return rotation, translation, (math.inf, math.inf)
+    correlation = [np.exp((x @ x.T - 1) / _DISTORTION_LENGTH**2) for x in (a, b)]
+    start, hessian = (rotation, translation), np.eye(5)
+    for _ in range(steps):
+        linear = _linearise(a, b, rotation, translation)
+        covariance = sum(
+            _DISTORTION**2 * (d @ d.T) * c
+            for d, c in zip((linear.by_first, linear.by_second), correlation, strict=True)
+        )
+        covariance[np.diag_indices(len(a))] += noise**2 + linear.angle**2 / _TAIL
+        right = np.concatenate((linear.by_pose, linear.angle[:, None]), axis=1)
+        solved = linear.by_pose.T @ np.linalg.solve(covariance, right)
+        hessian, gradient = solved[:, :5], solved[:, 5]
+        prior_term = axes.residual(rotation)
+        if prior_term is not None:
+            residual, jacobian = prior_term
+            hessian[:3, :3] += jacobian.T @ jacobian
+            gradient[:3] += jacobian.T @ residual
+        step = np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(5), -gradient)
+        rotation = rotation_exp(step[:3]) @ rotation
+        translation = translation + _tangent_basis(translation) @ step[3:]
+        translation = translation / np.linalg.norm(translation)
+        if not np.isfinite(step).all() or np.abs(step).max() > 0.2:  # too few matches determine it
+            return *start, _deviations(hessian)
+        if np.abs(step).max() < 1e-7:
+            break
+    return rotation, translation, _deviations(hessian)
+
+
+def _deviations(hessian: Float[Array, "5 5"]) -> tuple[float, float]:
+    """Standard deviations of rotation and direction, radians."""
+    values, vectors = np.linalg.eigh(hessian)
+    variance = (vectors**2 / np.maximum(values, 1e-12)).sum(axis=1)
+    return math.sqrt(variance[:3].sum()), math.sqrt(variance[3:].sum())
 
 
 def search_hypotheses(
@@ -206,34 +286,41 @@ def search_hypotheses(
     if count < 8:
         return []
     level = axes.first.axes[_LEVEL], axes.second.axes[_LEVEL]
-    essentials = []
+    free, parallel = [], []
     for top in sorted({min(top, count) for top in _TOP_SETS}):
         chosen = _draw(rng, top, _SAMPLES[5], 5)
-        essentials.append(essential_from_five(a[chosen], b[chosen])[0])
+        free.append(essential_from_five(a[chosen], b[chosen])[0])
         for size, solver in ((3, upright_from_three), (2, upright_from_two)):
             chosen = _draw(rng, top, _SAMPLES[size], size)
             rotations, translations = solver(a[chosen] @ level[0].T, b[chosen] @ level[1].T)
-            essentials.append(level[1].T @ skew(translations) @ rotations @ level[0])
+            free.append(level[1].T @ skew(translations) @ rotations @ level[0])
         for rotation in relative_rotations(axes.first, axes.second) if axes.has_walls else ():
             chosen = _draw(rng, top, _SAMPLES[2], 2)
             normals = np.cross(a[chosen] @ rotation.T, b[chosen])
             translations = np.cross(normals[:, 0], normals[:, 1])
             translations /= np.maximum(np.linalg.norm(translations, axis=1, keepdims=True), 1e-12)
-            essentials.append(skew(translations) @ rotation)
-    essential = np.concatenate(essentials)
-    quick = _score_essentials(essential, a[:_QUICK], b[:_QUICK], prior[:_QUICK], noise)
-    essential = essential[np.argsort(-quick)[:_RESCORED]]
-    scores = _score_essentials(essential, a, b, prior, noise)
+            parallel.append(skew(translations) @ rotation)
+    starts = []
+    # A rotation by the walls is inexact: its hypotheses are compared among themselves, with a larger tolerance.
+    for essentials, factors, kept in ((free, (2, 1), _KEPT), (parallel, (4, 2, 1), _KEPT_PARALLEL)):
+        if essentials:
+            essential = np.concatenate(essentials)
+            tolerance = factors[0] * noise / 2
+            quick = _score_essentials(essential, a[:_QUICK], b[:_QUICK], prior[:_QUICK], tolerance)
+            essential = essential[np.argsort(-quick)[:_RESCORED]]
+            picked = _pick_distinct(essential, _score_essentials(essential, a, b, prior, tolerance), kept)
+            starts += [(essential[index], factors) for index in picked]
     found: list[Hypothesis] = []
-    for index in _pick_distinct(essential, scores):
+    for essential, factors in starts:
         options = [
-            evaluate(a, b, prior, rotation, translation, 2 * noise, axes)
-            for rotation, translation in decompose_essential(essential[index])
+            evaluate(a, b, prior, rotation, translation, factors[0] * noise, axes)
+            for rotation, translation in decompose_essential(essential)
         ]
         best = max(options, key=lambda option: option.score)
-        coarse = refine_pose(a, b, prior, best, 2 * noise, axes, 4)
-        start = evaluate(a, b, prior, coarse.rotation, coarse.translation, noise, axes)
-        found.append(refine_pose(a, b, prior, start, noise, axes))
+        for factor in factors:
+            best = evaluate(a, b, prior, best.rotation, best.translation, factor * noise, axes)
+            best = refine_pose(a, b, prior, best, factor * noise, axes, 4 if factor > 1 else 6)
+        found.append(best)
     found.sort(key=lambda h: -h.score)
     distinct: list[Hypothesis] = []
     for hypothesis in found:
@@ -285,12 +372,12 @@ def _score_essentials(
     return scores + constant
 
 
-def _pick_distinct(essential: Float[Array, "h 3 3"], scores: Float[Array, "h"]) -> list[int]:
+def _pick_distinct(essential: Float[Array, "h 3 3"], scores: Float[Array, "h"], kept: int) -> list[int]:
     """Indices of the best hypotheses whose essential matrices differ."""
     picked: list[int] = []
     norm = np.linalg.norm(essential, axis=(1, 2))
     for index in np.argsort(-scores)[:2000]:
-        if len(picked) == _KEPT:
+        if len(picked) == kept:
             break
         similarity = [abs((essential[index] * essential[p]).sum()) / (norm[index] * norm[p]) for p in picked]
         if not similarity or max(similarity) < 0.998:
@@ -309,8 +396,10 @@ class RelativePose:
         margin: how much the score exceeds that of the best different pose.
         places: number of different places (12 degrees) with right matches, in the panorama that has fewer.
         parallax: 90 % quantile of the parallax of these matches, radians.
-        uncertainty: standard deviations of rotation and direction by the noise of the matches, radians.
+        uncertainty: standard deviations of rotation and direction by the noise of the matches and the distortion of
+            the panoramas, radians.
         problem: why the pose must not be used; None if it passes the check.
+        is_certain: whether the matches and the walls suffice as evidence, without the floor.
     """
 
     rotation: Float[Array, "3 3"]
@@ -322,6 +411,7 @@ class RelativePose:
     parallax: float
     uncertainty: tuple[float, float]
     problem: str | None
+    is_certain: bool = True
 
     @property
     def is_reliable(self) -> bool:
@@ -355,7 +445,10 @@ def estimate_relative_pose(
     places = min(_count_places(x, best.probability) for x in (a, b))
     parallax = angle_between(a @ best.rotation.T, b)[right]
     spread = float(np.quantile(parallax, 0.9)) if len(parallax) else 0.0
-    uncertainty = _uncertainty(a, b, best, noise)
+    polished = np.flatnonzero(right)[:_MAX_POLISHED]
+    rotation, translation, uncertainty = polish_pose(
+        a[polished], b[polished], best.rotation, best.translation, noise, axes
+    )
     confirmed = axes.confirms(best.rotation)
     needed = _CONFIRMED if confirmed else _UNCONFIRMED
     problem = None
@@ -369,8 +462,8 @@ def estimate_relative_pose(
     elif uncertainty[1] > _MAX_UNCERTAINTY:
         problem = f"the direction is uncertain by {math.degrees(uncertainty[1]):.0f} degrees"
     return RelativePose(
-        best.rotation,
-        best.translation,
+        rotation,
+        translation,
         matches.indices[:count][right],
         best.score,
         margin,
@@ -378,6 +471,31 @@ def estimate_relative_pose(
         spread,
         uncertainty,
         problem,
+        not confirmed or (places >= _CERTAIN.places and best.score >= _CERTAIN.score and margin >= _CERTAIN.margin),
+    )
+
+
+def polish_relative_pose(
+    relation: RelativePose, first: Features, second: Features, matches: Matches, axes: RotationPrior = NO_PRIOR
+) -> RelativePose:
+    """The pose by all matches that agree with it, which may include those of further features."""
+    a, b = first.bearings[matches.indices[:, 0]], second.bearings[matches.indices[:, 1]]
+    prior, noise = match_priors(matches.ratio), noise_of(first, second)
+    rotation, translation, uncertainty = relation.rotation, relation.translation, relation.uncertainty
+    right = np.zeros(len(a), bool)
+    for factor in _POLISH_FACTORS:
+        probability = evaluate(a, b, prior, rotation, translation, factor * noise, axes).probability
+        right = probability > 0.5
+        used = np.argsort(-probability, kind="stable")[: min(int(right.sum()), _MAX_POLISHED)]
+        rotation, translation, uncertainty = polish_pose(a[used], b[used], rotation, translation, noise, axes)
+    if right.sum() < len(relation.indices):
+        return relation
+    return replace(
+        relation,
+        rotation=rotation,
+        translation=translation,
+        indices=matches.indices[right],
+        uncertainty=uncertainty,
     )
 
 
@@ -387,12 +505,3 @@ def _count_places(bearings: Float[Array, "n 3"], probability: Float[Array, "n"])
     highest = np.zeros(int(cell.max()) + 1)
     np.maximum.at(highest, cell.reshape(-1), probability)
     return float(highest.sum())
-
-
-def _uncertainty(a: Array, b: Array, hypothesis: Hypothesis, noise: float) -> tuple[float, float]:
-    """Standard deviations of rotation and direction, radians."""
-    h = hypothesis
-    normal, _ = _normal_equations(a, b, h.probability, h.rotation, h.translation, noise)
-    values, vectors = np.linalg.eigh(normal)
-    variance = (vectors**2 / np.maximum(values, 1e-12)).sum(axis=1)
-    return math.sqrt(variance[:3].sum()), math.sqrt(variance[3:].sum())

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -15,10 +16,11 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from pansplat.geometry.equirect import pixel_directions, uv_from_directions
+from pansplat.geometry.equirect import pixel_directions
+from pansplat.threads import worker_threads
 
 FLOOR_HEIGHT = 256  # pixels of the panoramas in which the floor is searched
-_STEPS = 0.02  # relative difference of neighbouring candidates
+_STEPS = 0.03  # relative difference of neighbouring candidates
 _RANGE = 0.12, 12.0  # of the camera's height in units of the distance of two cameras
 _STEEPEST, _FLATTEST = math.radians(85), math.radians(12)  # below the horizon
 _WINDOW = 9  # pixels over which images are compared
@@ -52,10 +54,29 @@ def level_poses(poses: Float[Array, "view 4 4"], downs: Float[Array, "view 3"]) 
     return levelled
 
 
-def find_camera_height(
+@dataclass(frozen=True)
+class Floor:
+    """The horizontal plane below the cameras on which panoramas agree best.
+
+    Attributes:
+        height: mean height of the cameras over it, in the poses' unit.
+        evidence: mean correlation of the panoramas on it.
+        contrast: ratio of the evidence to that of the best other height.
+    """
+
+    height: float
+    evidence: float
+    contrast: float
+
+    def is_found(self, contrast: float = _MIN_CONTRAST) -> bool:
+        """Whether the plane is a floor, and not the best of many wrong ones."""
+        return self.evidence >= _MIN_EVIDENCE and self.contrast >= contrast
+
+
+def find_floor(
     images: Sequence[Float[Array, "height width"]], poses: Float[Array, "view 4 4"], pairs: Sequence[tuple[int, int]]
-) -> float | None:
-    """Mean height of the cameras over the floor in the poses' unit; None if no floor is found.
+) -> Floor:
+    """The floor, by the correlation of the panoramas on horizontal planes of many heights.
 
     Args:
         images: grey panoramas in [0, 1], of `FLOOR_HEIGHT`.
@@ -67,22 +88,22 @@ def find_camera_height(
     heights = np.exp(np.arange(low, high, _STEPS))
     middle = float(poses[:, 1, 3].mean())
     evidence = np.zeros(len(heights))
-    for i, j in (*pairs, *((j, i) for i, j in pairs)):
-        evidence += _floor_evidence(images[i], images[j], poses[i], poses[j], heights, middle)
+    ordered = [*pairs, *((j, i) for i, j in pairs)]
+    with worker_threads() as pool:
+        for found in pool.map(
+            lambda p: _floor_evidence(images[p[0]], images[p[1]], poses[p[0]], poses[p[1]], heights, middle), ordered
+        ):
+            evidence += found
     evidence /= 2 * len(pairs)
-    # A floor is the lowest plane: a table in front of it has less area, a plane below it has no evidence.
     smooth = np.convolve(np.pad(evidence, 1, mode="edge"), (0.25, 0.5, 0.25), "valid")
     best = int(smooth.argmax())
     others = np.abs(np.arange(len(heights)) - best) > round(0.15 / _STEPS)
-    if (
-        smooth[best] < _MIN_EVIDENCE
-        or smooth[best] < _MIN_CONTRAST * smooth[others].max()
-        or not 0 < best < len(smooth) - 1
-    ):
-        return None
+    if not 0 < best < len(smooth) - 1:
+        return Floor(float(heights[best]), 0.0, 0.0)
     left, centre, right = smooth[best - 1 : best + 2]
     shift = 0.5 * (left - right) / min(left - 2 * centre + right, -1e-12)
-    return float(heights[best] * math.exp(_STEPS * float(np.clip(shift, -1, 1))))
+    height = float(heights[best] * math.exp(_STEPS * float(np.clip(shift, -1, 1))))
+    return Floor(height, float(centre), float(centre / max(smooth[others].max(), 1e-9)))
 
 
 def _floor_evidence(
@@ -99,19 +120,23 @@ def _floor_evidence(
     seen &= deviation > _MIN_DEVIATION
     area = np.sqrt(np.maximum(1 - down**2, 0)) * seen
     padded = cv2.copyMakeBorder(other.astype(np.float32), 0, 0, 2, 2, cv2.BORDER_WRAP)
+    toward_floor = rays / np.maximum(down, 1e-3)[..., None] @ other_pose[:3, :3]  # of one unit of height
+    x, y, z = np.moveaxis(toward_floor.astype(np.float32), -1, 0)
+    offset = ((pose[:3, 3] - other_pose[:3, 3]) @ other_pose[:3, :3]).astype(np.float32)
+    turn = np.float32(rows / math.pi)
     found = np.zeros(len(heights))
     for n, height in enumerate(heights):
-        depth = middle + height - pose[1, 3]
+        depth = np.float32(middle + height - pose[1, 3])
         if depth <= 0.2 * height:
             continue
-        points = rays * (depth / np.maximum(down, 1e-3))[..., None] + (pose[:3, 3] - other_pose[:3, 3])
-        local = torch.from_numpy((points @ other_pose[:3, :3]).astype(np.float32))
-        uv = uv_from_directions(local).numpy() * np.float32((2 * rows, rows)) - np.float32(0.5)
-        warped = cv2.remap(padded, uv[..., 0] + 2, uv[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        px, py, pz = x * depth + offset[0], y * depth + offset[1], z * depth + offset[2]
+        u = np.arctan2(px, pz) * turn + np.float32(rows - 0.5 + 2)
+        v = np.arctan2(py, np.sqrt(px * px + pz * pz)) * turn + np.float32(rows / 2 - 0.5)
+        warped = cv2.remap(padded, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         warped_mean = cv2.blur(warped, (_WINDOW, _WINDOW))
         variance = cv2.blur(warped * warped, (_WINDOW, _WINDOW)) - warped_mean**2
         both = cv2.blur(here * warped, (_WINDOW, _WINDOW)) - mean * warped_mean
-        correlation = both / (deviation * np.sqrt(np.maximum(variance, _MIN_DEVIATION**2)) + 1e-9)
+        correlation = both / (deviation * np.sqrt(np.maximum(variance, np.float32(_MIN_DEVIATION**2))) + 1e-9)
         found[n] = float((area * np.maximum(correlation - _MIN_CORRELATION, 0)).sum())
     return found / (1 - _MIN_CORRELATION) / float(np.cos(np.linspace(0, math.pi / 2, rows // 2)).sum() * 2 * rows)
 

@@ -108,6 +108,16 @@ def test_pictures_without_texture_have_no_poses(tmp_path: Path, capsys: pytest.C
     assert not (tmp_path / "poses.json").exists()
 
 
+def test_an_ordinary_picture_is_not_taken_for_a_panorama(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ramp = np.tile(np.linspace(20, 230, 128), (64, 1))
+    shades = 20 * np.sin(np.arange(64) / 5)[:, None]
+    for n in range(2):
+        cv2.imwrite(str(tmp_path / f"{n}.png"), (ramp[:, :: 1 - 2 * n] + shades).clip(0, 255).astype(np.uint8))
+    assert run(["pose", str(tmp_path)]) == 2
+    message = " ".join(capsys.readouterr().err.split())
+    assert message.count("its left and right edges do not join") == 2
+
+
 def test_one_picture_and_unknown_formats_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((64, 128, 3), np.uint8))
     for arguments, expected in (

@@ -7,7 +7,7 @@ import pytest
 
 from pansplat.poses.features import Features, Matches
 from pansplat.poses.solvers import angle_between, rotation_angle, rotation_exp
-from pansplat.poses.two_view import RelativePose, estimate_relative_pose
+from pansplat.poses.two_view import RelativePose, estimate_relative_pose, polish_pose, polish_relative_pose
 
 PIXEL = 2 * math.pi / 2048
 NOISE = 0.3 * PIXEL
@@ -89,3 +89,29 @@ def test_matches_of_one_object_are_refused(scene) -> None:
 def test_too_few_matches_are_refused(scene) -> None:
     found = estimate(scene(8, 6))
     assert not found.is_reliable and "only 6 features match" in str(found.problem)
+
+
+def test_many_matches_of_one_distorted_object_do_not_outweigh_the_others(scene) -> None:
+    for seed in range(3):
+        bearings = scene(seed, 600, noise=NOISE)
+        near = bearings.first[:, 2] > 0.9
+        chosen = np.concatenate((np.flatnonzero(near), np.flatnonzero(~near)[:60]))
+        a, b = bearings.first[chosen], bearings.second[chosen]
+        b = np.where(near[chosen][:, None], b @ rotation_exp(np.array((2e-3, 0, 0))).T, b)  # the object is displaced
+        start = rotation_exp(np.array((0, 5e-3, 0))) @ bearings.rotation, bearings.translation
+        rotation, translation, deviations = polish_pose(a, b, *start, NOISE)
+        assert rotation_angle(rotation @ bearings.rotation.T) < 4 * deviations[0] < 0.02
+        assert angle_between(translation, bearings.translation) < 4 * deviations[1]
+
+
+def test_further_matches_polish_a_pose(scene) -> None:
+    bearings = scene(9, 900, noise=2 * NOISE, outliers=0.5)
+    few = type(bearings)(*(x[:60] for x in (bearings.first, bearings.second)), bearings.rotation, bearings.translation)
+    found = estimate(few)
+    count = len(bearings.first)
+    empty = np.zeros((count, 128), np.float32)
+    first, second = (Features(x, empty, PIXEL) for x in (bearings.first, bearings.second))
+    every = Matches(np.tile(np.arange(count)[:, None], (1, 2)), np.full(count, 0.7))
+    polished = polish_relative_pose(found, first, second, every)
+    assert len(polished.indices) > len(found.indices) and polished.uncertainty[0] < found.uncertainty[0]
+    assert sum(errors_degrees(polished, bearings)) < sum(errors_degrees(found, bearings))
