@@ -159,7 +159,13 @@ def estimate_poses(
     report("placing the panoramas", 0.9)
     downs = np.stack([v.axes.axes[0] if v.axes.has_down else np.full(3, np.nan) for v in views])
     noise = max(noise_of(v.features, v.features) for v in views)
-    tour = build_tour([v.joined for v in views], relations, downs, noise)
+
+    def floor_height(pair: Pair) -> float | None:
+        first, second = (views[view] for view in pair)
+        floor = find_floor([first.small, second.small], _pair_poses(relations[pair], first, second), [(0, 1)])
+        return floor.height if floor.is_found(_CONFIRMING_CONTRAST) else None
+
+    tour = build_tour([v.joined for v in views], relations, downs, noise, floor_height)
     for position, (reason, other) in tour.unplaced.items():
         partner = "" if other is None else f" (best with {paths[kept[other]].name})"
         unplaced[kept[position]] = _describe_mirrored(position, views, tour.placed, paths, kept) or reason + partner
@@ -300,15 +306,20 @@ def _relate_views(views: Sequence[_View], seed: int, report: Progress) -> dict[P
     return relations
 
 
+def _pair_poses(relation: RelativePose, first: _View, second: _View) -> Float[Array, "2 4 4"]:
+    """Levelled poses of two panoramas at a distance of 1."""
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, :3, :3], poses[1, :3, 3] = relation.rotation.T, -relation.rotation.T @ relation.translation
+    return level_poses(poses, np.stack((first.axes.axes[0], second.axes.axes[0])))
+
+
 def _confirm_by_floor(relation: RelativePose, first: _View, second: _View) -> RelativePose:
     """The relation, with a problem if the cameras' heights differ or the panoramas do not agree on a floor.
 
     Repeated doors and windows give wrong poses with many matches. Such a pose is rarely horizontal, and the floors of
     both panoramas do not agree under it.
     """
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    poses[1, :3, :3], poses[1, :3, 3] = relation.rotation.T, -relation.rotation.T @ relation.translation
-    poses = level_poses(poses, np.stack((first.axes.axes[0], second.axes.axes[0])))
+    poses = _pair_poses(relation, first, second)
     slope = math.degrees(math.asin(float(np.clip(poses[1, 1, 3], -1, 1))))
     few = f"too little in common: {relation.places:.0f} places match"
     if abs(slope) > _LARGEST_SLOPE:

@@ -23,7 +23,7 @@ from pansplat.poses.estimate import PoseEstimate, estimate_poses
 from pansplat.predictor import Progress
 from pansplat.strict_json import read_json
 
-_FORMAT = "1"  # version of the estimate; part of the cache's key
+_FORMAT = "2"  # version of the estimate; part of the cache's key
 SUFFIXES = (".json", ".tum", ".kitti")
 
 

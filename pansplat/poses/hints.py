@@ -18,7 +18,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 from PIL import Image
 
-_TAG = re.compile(r"GPano:(\w+)\s*(?:=\s*[\"']([^\"']*)[\"']|>([^<]*)<)")
+_TAG = re.compile(r"(?<!/)GPano:(\w+)\s*(?:=\s*[\"']([^\"']*)[\"']|>([^<]*)<)")
 _PACKETS = "xmp", "XML:com.adobe.xmp"  # where Pillow stores the packet, by the file's format
 
 

@@ -8,7 +8,7 @@ the others around triangles are left out.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,11 +21,14 @@ from pansplat.poses.solvers import rotation_angle, two_view_depths
 from pansplat.poses.two_view import RelativePose
 
 Pair = tuple[int, int]
+FloorHeight = Callable[[Pair], float | None]
+"""Height of the cameras of a pair over the floor in units of their distance; None if no floor is found."""
 
 _LARGEST_LOOP = math.radians(4)  # rotation around a triangle of right pairs
 _MIN_SHARED = 3  # points that determine the distance of a new panorama
 _MIN_PARALLAX = math.radians(1.0)  # of such a point
 _OUTLIER = 8.0  # residual of an observation that is left out, in the noise's standard deviation
+_FLOOR_PAIRS = 5  # whose floors give the height of the cameras in the tour's unit
 _ROUNDS = 3  # of adjustment and removal of outliers
 
 
@@ -57,6 +60,7 @@ def build_tour(
     relations: Mapping[Pair, RelativePose],
     downs: Float[Array, "view 3"],
     noise: float,
+    floor_height: FloorHeight = lambda pair: None,
 ) -> Tour:
     """Poses of the largest group of panoramas that reliable pairs connect.
 
@@ -65,6 +69,7 @@ def build_tour(
         relations: of the pairs (i, j), i < j, that were compared.
         downs: gravity in each camera's frame; NaN where unknown.
         noise: standard deviation of a bearing, radians.
+        floor_height: by which a panorama is placed whose distance no points determine.
     """
     reliable = {pair: relation for pair, relation in relations.items() if relation.is_reliable}
     rejected = _find_contradictions(reliable)
@@ -76,7 +81,7 @@ def build_tour(
             {view: _describe_failure(view, relations, rejected) for view in range(count)},
         )  # fmt: skip
     observations = _make_tracks(features, reliable)
-    problem, placed = _grow(observations, reliable, downs, noise)
+    problem, placed = _grow(observations, reliable, downs, noise, floor_height)
     for _ in range(_ROUNDS if len(placed) > 2 else 1):
         if len(placed) > 2:
             problem = adjust(problem, noise)
@@ -174,7 +179,11 @@ def _make_tracks(features: Sequence[Features], relations: Mapping[Pair, Relative
 
 
 def _grow(
-    observations: _Observations, relations: Mapping[Pair, RelativePose], downs: Array, noise: float
+    observations: _Observations,
+    relations: Mapping[Pair, RelativePose],
+    downs: Array,
+    noise: float,
+    floor_height: FloorHeight,
 ) -> tuple[Problem, list[int]]:
     """Place panoramas one after another; returns the problem of the placed ones in the order of placing."""
     start = max(relations, key=lambda p: relations[p].score * min(1.0, relations[p].parallax / math.radians(5)))
@@ -183,6 +192,7 @@ def _grow(
     rotations = [np.eye(3), first.rotation.T]
     centres = [np.zeros(3), -first.rotation.T @ first.translation]
     failed: set[int] = set()
+    tried: set[int] = set()  # to be placed by the floor
     problem = _make_problem(observations, placed, rotations, centres, downs)
     while True:
         candidates = {}
@@ -190,10 +200,16 @@ def _grow(
             for inside, outside in ((i, j), (j, i)):
                 if inside in placed and outside not in placed and outside not in failed:
                     candidates[outside] = candidates.get(outside, 0.0) + relation.score
-        if not candidates:
-            return problem, placed
-        view = max(candidates, key=lambda v: candidates[v])
-        pose = _place(view, placed, problem, observations, relations)
+        if candidates:
+            view = max(candidates, key=lambda v: candidates[v])
+            pose = _place(view, placed, problem, observations, relations)
+        else:  # no points determine the distance of any further panorama
+            left = failed - tried
+            if not left:
+                return problem, placed
+            view = min(left)
+            tried.add(view)
+            pose = _place_by_floor(view, placed, problem, relations, floor_height)
         if pose is None:
             failed.add(view)
             continue
@@ -247,11 +263,7 @@ def _place(
         relation = relations.get((other, view)) or relations.get((view, other))
         if relation is None:
             continue
-        rotation, translation = relation.rotation, relation.translation
-        if (other, view) not in relations:
-            rotation, translation = rotation.T, -rotation.T @ translation
-        world = problem.rotations[position] @ rotation.T
-        direction = -world @ translation  # from the placed camera to the new one
+        world, direction = _turn_to(problem.rotations[position], relation, (other, view) in relations)
         scales = _scales(points, bearings, problem.centres[position], world, direction)
         for scale in np.unique(np.quantile(scales, np.linspace(0.1, 0.9, 17))) if len(scales) else ():
             centre = problem.centres[position] + scale * direction
@@ -263,6 +275,53 @@ def _place(
             if support > most:
                 best, most = (world, centre), support
     return best
+
+
+def _turn_to(placed: Array, relation: RelativePose, is_first: bool) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+    """Rotation of the other camera of a relation, and the direction to it from the placed one, in the world.
+
+    Args:
+        placed: rotation of the placed camera.
+        is_first: whether the placed camera is the first one of the relation.
+    """
+    rotation, translation = relation.rotation, relation.translation
+    if not is_first:
+        rotation, translation = rotation.T, -rotation.T @ translation
+    world = placed @ rotation.T
+    return world, -world @ translation
+
+
+def _place_by_floor(
+    view: int,
+    placed: Sequence[int],
+    problem: Problem,
+    relations: Mapping[Pair, RelativePose],
+    floor_height: FloorHeight,
+) -> tuple[Float[Array, "3 3"], Float[Array, "3"]] | None:
+    """The pose of a new panorama by its best relation to a placed one, and a distance by the height over the floor.
+
+    The cameras of a tour have one height: it is the unit in which floors give the distances of pairs.
+    """
+    own = [pair for pair in relations if view in pair and (set(pair) - {view}) <= set(placed)]
+    if not own:
+        return None
+    pair = max(own, key=lambda p: relations[p].score)
+    relative = floor_height(pair)
+    if relative is None:
+        return None
+    position = {v: n for n, v in enumerate(placed)}
+    heights: list[float] = []
+    for i, j in sorted(relations, key=lambda p: -relations[p].score):
+        if i in position and j in position and len(heights) < _FLOOR_PAIRS:
+            height = floor_height((i, j))
+            if height is not None:
+                distance = float(np.linalg.norm(problem.centres[position[i]] - problem.centres[position[j]]))
+                heights.append(height * distance)
+    if not heights:
+        return None
+    other = position[pair[0] if pair[1] == view else pair[1]]
+    world, direction = _turn_to(problem.rotations[other], relations[pair], pair[1] == view)
+    return world, problem.centres[other] + float(np.median(heights)) / relative * direction
 
 
 def _known_points(placed: Sequence[int], problem: Problem, observations: _Observations) -> dict[int, Float[Array, "3"]]:

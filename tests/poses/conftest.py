@@ -1,13 +1,18 @@
-"""Synthetic bearings of points that two cameras see."""
+"""Synthetic bearings of points that two cameras see, and panoramas of textured box rooms."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import pytest
+import torch
 from numpy import ndarray as Array
 
+from pansplat.geometry.equirect import pixel_directions
 from pansplat.poses.solvers import rotation_exp
+
+_HALF = np.array((2.6, 1.35, 2.1))  # half the size of a room, metres
 
 
 @dataclass(frozen=True)
@@ -61,3 +66,43 @@ def scene() -> Scene:
 
 def _unit(vectors: Array) -> Array:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def _make_textures(seed: int) -> Array:
+    """Grey textures of the six walls with details of several sizes, (6 512 512) in [0, 255]."""
+    rng = np.random.default_rng(seed)
+    textures = np.zeros((6, 512, 512), np.float32)
+    for size, strength in ((8, 25), (24, 25), (64, 20), (128, 10)):
+        for texture in textures:
+            noise = rng.normal(size=(size, size)).astype(np.float32)
+            texture += strength * cv2.resize(noise, (512, 512), interpolation=cv2.INTER_NEAREST)
+    return cv2.GaussianBlur(textures.transpose(1, 2, 0), (0, 0), 0.7).transpose(2, 0, 1) + 128
+
+
+def _render_room(textures: Array, rotation: Array, centre: Array, height: int = 256) -> Array:
+    """The panorama (height 2*height 3) of a camera in the room, 8 bit."""
+    rays = pixel_directions(height, 2 * height, dtype=torch.float64).numpy() @ rotation.T
+    with np.errstate(divide="ignore"):
+        distance = (np.sign(rays) * _HALF - centre) / rays
+    axis = distance.argmin(axis=-1)
+    points = centre + rays * distance.min(axis=-1)[..., None]
+    image = np.zeros(rays.shape[:2], np.float32)
+    for wall in range(6):
+        n, side = divmod(wall, 2)
+        own = (axis == n) & ((rays[..., n] > 0) == bool(side))
+        u, v = (((points[..., m] / _HALF[m] + 1) * 255.5).astype(np.float32) for m in range(3) if m != n)
+        image[own] = cv2.remap(textures[wall], u, v, cv2.INTER_LINEAR)[own]
+    return np.repeat(image.clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+@pytest.fixture(scope="session")
+def render_room() -> Callable[..., Array]:
+    """A function that makes the panorama of a room, by its number, from a rotation and a centre."""
+    textures: dict[int, Array] = {}
+
+    def render(room: int, rotation: Array, centre: Array) -> Array:
+        if room not in textures:
+            textures[room] = _make_textures(room)
+        return _render_room(textures[room], rotation, centre)
+
+    return render

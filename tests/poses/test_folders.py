@@ -1,0 +1,70 @@
+"""Folders with pictures that do not belong together, and videos: what can be placed is placed, the rest is named."""
+
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pansplat.cli import run
+from pansplat.data.video import write_video
+from pansplat.poses.estimate import PoseEstimate, estimate_poses
+from pansplat.poses.solvers import angle_between, rotation_angle, rotation_exp
+
+pytestmark = pytest.mark.slow
+POSES = {
+    "a": (np.eye(3), np.zeros(3)),
+    "b": (rotation_exp(np.array((0, 0.5, 0))), np.array((0.5, 0, 0.4))),
+    "mirrored": (np.eye(3), np.array((-0.3, 0, 0.5))),
+    "other_room": (np.eye(3), np.array((0.3, 0, -0.2))),
+}
+
+
+@pytest.fixture(scope="module")
+def estimate(tmp_path_factory: pytest.TempPathFactory, render_room) -> PoseEstimate:
+    """Of two good pictures, a mirrored one and one of another room; the distance of the good ones is given."""
+    folder = tmp_path_factory.mktemp("rooms")
+    for name, pose in POSES.items():
+        image = render_room(int(name == "other_room"), *pose)
+        cv2.imwrite(str(folder / f"{name}.png"), image[:, ::-1] if name == "mirrored" else image)
+    return estimate_poses(sorted(folder.glob("*.png")), baseline=("a.png", "b.png", 2.0))
+
+
+def test_good_pictures_among_others_have_their_poses(estimate: PoseEstimate) -> None:
+    found = {path.stem: pose for path, pose in estimate.poses.items()}
+    assert sorted(found) == ["a", "b"]
+    relative = np.linalg.inv(found["a"]) @ found["b"]
+    assert math.degrees(rotation_angle(relative[:3, :3] @ POSES["b"][0].T)) < 0.1
+    assert math.degrees(angle_between(relative[:3, 3], POSES["b"][1])) < 0.5
+
+
+def test_a_given_distance_sets_the_scale(estimate: PoseEstimate) -> None:
+    centres = [pose[:3, 3] for pose in estimate.poses.values()]
+    assert np.linalg.norm(centres[0] - centres[1]) == pytest.approx(2.0)
+    assert estimate.scale_source == "a.png and b.png are 2 m apart"
+
+
+def test_the_reason_names_the_picture(estimate: PoseEstimate) -> None:
+    reasons = {path.stem: reason for path, reason in estimate.unplaced.items()}
+    assert sorted(reasons) == ["mirrored", "other_room"]
+    assert "mirrored left to right" in reasons["mirrored"]
+    assert "too little in common" in reasons["other_room"] and ".png" in reasons["other_room"]
+
+
+def test_key_frames_of_a_video_have_poses(tmp_path: Path, render_room) -> None:
+    centres = [np.array((0.12 * n - 0.6, 0, 0.05 * n)) for n in range(11)]
+    frames = (render_room(2, rotation_exp(np.array((0, 0.05 * n, 0))), c) for n, c in enumerate(centres))
+    write_video(tmp_path / "walk.mp4", frames, 5)
+    assert run(["pose", str(tmp_path / "walk.mp4"), "-o", str(tmp_path / "walk"), "--frames", "3"]) == 0
+    names = sorted(path.name for path in (tmp_path / "walk").glob("*.png"))
+    assert len(names) == 3 and (tmp_path / "walk" / "poses.json").exists()
+    # The key frames lie on a straight line, in the order of the frames.
+    poses = json.loads((tmp_path / "walk" / "poses.json").read_text())["poses"]
+    found = np.stack([np.array(poses[name])[:3, 3] for name in names])
+    truth = np.stack([centres[int(name[6:12])] for name in names])
+    steps, known = np.diff(found, axis=0), np.diff(truth, axis=0)
+    assert math.degrees(angle_between(steps[0], steps[1])) < 2
+    ratio = np.linalg.norm(steps, axis=1) / np.linalg.norm(known, axis=1)
+    assert ratio[0] == pytest.approx(ratio[1], rel=0.05)
