@@ -59,6 +59,7 @@ def _list_commands() -> object:
     """The union of all commands. They are imported after the signals are caught."""
     from tyro.conf import subcommand
 
+    from pansplat.cli.batch import Batch
     from pansplat.cli.bench import Bench
     from pansplat.cli.check import Check
     from pansplat.cli.convert import Convert
@@ -76,6 +77,7 @@ def _list_commands() -> object:
         | Annotated[Refine, subcommand("refine")]
         | Annotated[Render, subcommand("render")]
         | Annotated[Export, subcommand("export")]
+        | Annotated[Batch, subcommand("batch")]
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Pose, subcommand("pose")]
         | Annotated[Check, subcommand("check")]

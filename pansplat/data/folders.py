@@ -102,10 +102,30 @@ def _find_collections(folder: Path, convention: str | None, depth: int) -> list[
         return [(folder, read_triplet(path, convention)) for path in triplets]
     if find_trajectory(folder) is not None:
         return [(folder, read_trajectory_folder(folder, convention))]
-    if depth == 0:
-        return []
-    subfolders = [sub for sub in sorted(folder.iterdir()) if sub.is_dir() and not sub.name.startswith((".", "__"))]
+    subfolders = _list_subfolders(folder, depth)
     return [found for sub in subfolders for found in _find_collections(sub, convention, depth - 1)]
+
+
+def find_panorama_folders(root: Path) -> list[Path]:
+    """The folders at or below a path that hold panoramas or their poses; no file is read, and they may be faulty.
+
+    Raises:
+        OSError: a folder cannot be listed.
+    """
+    return _find_panorama_folders(root, _MAX_DEPTH)
+
+
+def _find_panorama_folders(folder: Path, depth: int) -> list[Path]:
+    has_poses = (folder / _POSES).exists() or is_loc360_sequence(folder) or is_matterport3d_scene(folder)
+    if has_poses or triplet_files(folder) or find_trajectory(folder) is not None or list_panorama_files(folder):
+        return [folder]
+    return [found for sub in _list_subfolders(folder, depth) for found in _find_panorama_folders(sub, depth - 1)]
+
+
+def _list_subfolders(folder: Path, depth: int) -> list[Path]:
+    """Subfolders to search, sorted; none at depth 0."""
+    found = sorted(folder.iterdir()) if depth else []
+    return [sub for sub in found if sub.is_dir() and not sub.name.startswith((".", "__"))]
 
 
 class UnposedPanoramasError(InputError):

@@ -1,0 +1,527 @@
+"""Many pairs and tours: one task each, on the worker processes of a Dask cluster (docs/batch.md).
+
+The name of each output contains a hash of all its inputs, and outputs appear complete or not at all. A task whose
+outputs exist does nothing, so that Dask may repeat a task, and a stopped run goes on where it was.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import os
+import re
+import secrets
+import signal
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
+
+from pansplat import __version__, pipeline
+from pansplat.console import is_out_of_memory
+from pansplat.data.folders import find_panorama_folders
+from pansplat.data.pairs import Pair
+from pansplat.errors import InputError, InputWarning
+from pansplat.files import SCENE_SUFFIXES, expand_home, read_file
+from pansplat.gaussians.scene import Scene
+from pansplat.predictor import Predictor
+from pansplat.refinement import refinement_fingerprint
+from pansplat.strict_json import list_field, number_field, read_json, require_object, text_field
+
+if TYPE_CHECKING:
+    from distributed import Client, Future, LocalCluster
+
+STEPS = ("predict", "refine", "export")
+EXPORT_SUFFIXES = (".html", *SCENE_SUFFIXES)
+REPORT_NAME = "report.jsonl"
+MIN_MEMORY = 1 << 29  # bytes of a worker; torch and the kernels take half of it
+
+_LAYOUT = "1"  # of the outputs; part of their hashes
+_MAX_DEATHS = 2  # worker processes that may end during one task before the item counts as failed
+_MAX_LOSSES = 3  # of the connection to a scheduler without a finished item in between
+_CONNECT_SECONDS = 60.0
+_MAX_NAME = 80  # characters of a pair's name in the name of an output
+_UNFINISHED = re.compile(rf"\.({'|'.join(STEPS)})-[0-9a-f]{{16}}.*\.[0-9a-f]{{8}}\.\w+")  # names of pansplat.atomic
+_DEFAULT_MEMORY = 4 << 30  # bytes; decides the default number of workers
+
+
+@dataclass(frozen=True)
+class Item:
+    """A folder with a pair or a tour, and how to read it.
+
+    Attributes:
+        name: relative path of its outputs, unique in a batch.
+        folder: absolute.
+        pair: name of the only pair to use; None for all pairs of the folder.
+        convention, near, far: see `pansplat.load_pairs`.
+    """
+
+    name: str
+    folder: Path
+    pair: str | None = None
+    convention: str | None = None
+    near: float | None = None
+    far: float | None = None
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """What is made of each pair.
+
+    Attributes:
+        steps: a part of `STEPS`, in this order.
+        model, compat, precision: see `pansplat.load_model`.
+        height: see `pansplat.predict`.
+        refine_seconds: time limit of the refinement.
+        suffix: of the exported files; one of `EXPORT_SUFFIXES`.
+        gaussians: largest number in a web page; None for the default.
+    """
+
+    steps: tuple[str, ...] = ("predict",)
+    model: str = "default"
+    compat: pipeline.CompatChoice = "trained"
+    precision: pipeline.Precision = "float32"
+    height: int | None = None
+    refine_seconds: float = 10.0
+    suffix: str = ".html"
+    gaussians: int | None = None
+
+
+@dataclass(frozen=True)
+class ItemReport:
+    """The end of a task: a line of the report.
+
+    Attributes:
+        item: its name.
+        status: "done", "skipped" if all outputs existed, or "failed".
+        seconds: time of the task.
+        outputs: files, relative to the folder of the batch.
+        notes: parts of the input that are ignored.
+        error: one line; None unless the item failed.
+    """
+
+    item: str
+    status: str
+    seconds: float
+    outputs: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    error: str | None = None
+
+
+def list_items(path: Path) -> list[Item]:
+    """The items of a manifest, or the folders with panoramas at or below a folder.
+
+    Raises:
+        InputError: a manifest that cannot be read, two items of one name, or no items.
+    """
+    path = expand_home(path).absolute()
+    if path.is_dir():
+        try:
+            folders = find_panorama_folders(path)
+        except OSError as error:
+            raise InputError(
+                f"{error.filename or path}: needed a readable folder, got '{error.strerror}'; check its permissions."
+            ) from error
+        if not folders:
+            raise InputError(f"{path}: needed folders with panoramas, got none there or in its subfolders; check it.")
+        return [Item(path.name if f == path else f.relative_to(path).as_posix(), f) for f in folders]
+    entries = list_field(require_object(read_json(path), path), "items", path)
+    if not entries:
+        raise InputError(f'{path}: needed a list of folders as "items", got none; see docs/batch.md.')
+    items = [_read_entry(entry, path, f"{path}, items[{index}]") for index, entry in enumerate(entries)]
+    seen: set[str] = set()
+    for item in items:
+        if item.name in seen:
+            raise InputError(f'{path}: needed items of different names, got {item.name!r} twice; add a "name" to one.')
+        seen.add(item.name)
+    return items
+
+
+def _read_entry(entry: Any, manifest: Path, source: str) -> Item:
+    """An item of a manifest: the path of a folder, or an object."""
+    content = {"path": entry} if isinstance(entry, str) else require_object(entry, source)
+    unknown = sorted(set(content) - {"path", "name", "pair", "convention", "near", "far"})
+    if unknown:
+        raise InputError(f"{source}: needed path, name, pair, convention, near or far, got {unknown[0]!r}; correct it.")
+    given = text_field(content, "path", source)
+    if not given:
+        raise InputError(f'{source}: needed the path of a folder as "path", got none; add it.')
+    folder = Path(os.path.normpath(manifest.parent / expand_home(given)))
+    pair = text_field(content, "pair", source)
+    name = text_field(content, "name", source) or (f"{folder.name}-{pair}" if pair else folder.name)
+    parts = PurePosixPath(name).parts
+    if not parts or name.startswith("/") or any(part.startswith(".") or len(os.fsencode(part)) > 200 for part in parts):
+        raise InputError(f'{source}: needed a name that can be a folder, got {name[:60]!r}; add another "name".')
+    return Item(
+        name,
+        folder,
+        pair,
+        text_field(content, "convention", source),
+        number_field(content, "near", source),
+        number_field(content, "far", source),
+    )
+
+
+def require_cluster() -> None:
+    """Check that Dask is installed.
+
+    Raises:
+        InputError: it is not.
+    """
+    try:
+        import distributed  # noqa: F401
+    except ImportError as error:
+        raise InputError(
+            "pansplat batch: needed the package distributed, got none; run pip install 'pansplat[cluster]'"
+        ) from error
+
+
+# The work of a task
+
+
+def process_item(item: Item, options: BatchOptions, fingerprint: str, out: Path) -> ItemReport:
+    """Do the steps of an item whose outputs are missing; an error is part of the report.
+
+    Args:
+        fingerprint: of the predictor that the batch was started with.
+        out: folder of the batch.
+    """
+    began = time.perf_counter()
+    outputs: list[str] = []
+    num_written, error = 0, None
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", InputWarning)
+        try:
+            folder = out / item.name
+            folder.mkdir(parents=True, exist_ok=True)
+            _remove_unfinished(folder)
+            for pair in _load_pairs(item):
+                for path, is_new in _process_pair(pair, options, fingerprint, folder):
+                    outputs.append(path.relative_to(out).as_posix())
+                    num_written += is_new
+        except Exception as problem:  # whatever it is, other items go on
+            error = _describe(problem)
+    status = "failed" if error else "done" if num_written else "skipped"
+    notes = tuple(" ".join(str(warning.message).splitlines()) for warning in caught)
+    return ItemReport(item.name, status, round(time.perf_counter() - began, 3), tuple(outputs), notes, error)
+
+
+def _describe(error: BaseException) -> str:
+    """One line about an error."""
+    text = " ".join(str(error).split())
+    if isinstance(error, InputError):
+        return text
+    if is_out_of_memory(error):
+        return f"out of memory ({text[:120]}); choose a smaller --height or fewer --workers"
+    return f"{type(error).__name__}: {text[:400]}"
+
+
+def _load_pairs(item: Item) -> list[Pair]:
+    pairs = pipeline.load_pairs(item.folder, convention=item.convention, near=item.near, far=item.far)
+    if item.pair is None:
+        return pairs
+    chosen = [pair for pair in pairs if pair.name == item.pair]
+    if not chosen:
+        names = ", ".join(pair.name for pair in pairs[:8])
+        raise InputError(f"{item.folder}: needed a pair {item.pair!r}, got {names}; correct the manifest.")
+    return chosen
+
+
+@lru_cache(maxsize=1)
+def _load_model(model: str, compat: pipeline.CompatChoice, precision: pipeline.Precision) -> Predictor:
+    return pipeline.load_model(model, compat=compat, precision=precision)
+
+
+def read_fingerprint(options: BatchOptions) -> str:
+    """The fingerprint of the batch's predictor.
+
+    Raises:
+        InputError: the predictor cannot be loaded.
+    """
+    return _load_model(options.model, options.compat, options.precision).fingerprint
+
+
+def _process_pair(pair: Pair, options: BatchOptions, fingerprint: str, folder: Path) -> Iterator[tuple[Path, bool]]:
+    """Yield each output, and whether it was written; the input of a step is the output of the previous one."""
+    scene: Scene | None = None
+    key = _hash_pair(pair)
+    last: Path | None = None
+    for step in STEPS:
+        settings: list[object] = {
+            "predict": [options.model.rsplit("/", 1)[-1], fingerprint, options.height],
+            "refine": [refinement_fingerprint(), options.refine_seconds],
+            "export": [__version__, options.suffix, options.gaussians],
+        }[step]
+        if step not in options.steps:
+            if step == "predict":  # it is computed in memory for the next step
+                key = _join_hash(key, step, settings)
+            continue
+        key = _join_hash(key, step, settings)
+        suffix = options.suffix if step == "export" else ".ply"
+        path = folder / f"{step}-{key}-{_shorten(pair.name)}{suffix}"
+        is_new = not path.exists()
+        if is_new:
+            if scene is None and last is not None:
+                scene = pipeline.load(last)
+            if step == "predict":
+                scene = _predict(pair, options, fingerprint, path)
+            elif step == "refine":
+                scene = _refine(pair, scene or _predict(pair, options, fingerprint, None), options)
+                pipeline.save(scene, path)
+            else:
+                _export(scene or _predict(pair, options, fingerprint, None), path, pair.name, options)
+        else:
+            scene = None
+        last = path
+        yield path, is_new
+
+
+def _predict(pair: Pair, options: BatchOptions, fingerprint: str, path: Path | None) -> Scene:
+    """The prediction of a pair, written to a file if one is given."""
+    predictor = _load_model(options.model, options.compat, options.precision)
+    if predictor.fingerprint != fingerprint:
+        raise InputError(
+            f"worker: needed the predictor {options.model} of the machine that started the batch, got another one; "
+            "install the same version of pansplat and the same weights on all machines"
+        )
+    if path is not None and pipeline.can_stream(predictor):  # tile by tile, in bounded memory
+        pipeline.predict_to_file(pair, path, predictor, height=options.height)
+        return pipeline.load(path)
+    scene = pipeline.predict(pair, predictor, height=options.height, cache=False)
+    if path is not None:
+        pipeline.save(scene, path)
+    return scene
+
+
+def _refine(pair: Pair, scene: Scene, options: BatchOptions) -> Scene:
+    return pipeline.refine(scene, pair.load_context(scene.height), seconds=options.refine_seconds)
+
+
+def _export(scene: Scene, path: Path, title: str, options: BatchOptions) -> None:
+    if options.suffix != ".html":
+        pipeline.save(scene, path)
+        return
+    from pansplat.web import DEFAULT_GAUSSIANS, write_page
+
+    write_page(scene, path, gaussians=options.gaussians or DEFAULT_GAUSSIANS, title=title.replace("_", " "))
+
+
+def _hash_pair(pair: Pair) -> str:
+    """Hash of all that a prediction depends on: names, poses, depth range, and the files of images and masks."""
+    context = [
+        [view.name, view.cam2world.tolist(), _hash_file(view.image), view.mask and _hash_file(view.mask)]
+        for view in pair.context
+    ]
+    # Static content is detected in the siblings of a panorama without a mask.
+    needs_siblings = any(view.mask is None for view in pair.context)
+    siblings = [_hash_file(image) for image in pair.siblings] if needs_siblings else []
+    return _join_hash(_LAYOUT, pair.name, [pair.near, pair.far, context, siblings])
+
+
+@lru_cache(maxsize=4096)
+def _hash_content(path: Path, size: int, changed: int) -> str:
+    """Hash of a file's bytes. The panoramas of a tour belong to several pairs, and are read once."""
+    del size, changed  # parts of the key of the cache
+    return hashlib.blake2b(read_file(path), digest_size=16).hexdigest()
+
+
+def _hash_file(path: Path) -> str:
+    try:
+        state = os.stat(path)
+    except OSError:
+        return hashlib.blake2b(read_file(path), digest_size=16).hexdigest()  # raises the error that names the file
+    return _hash_content(path, state.st_size, state.st_mtime_ns)
+
+
+def _join_hash(key: str, step: str, settings: list[Any]) -> str:
+    return hashlib.blake2b(json.dumps([key, step, settings]).encode(), digest_size=8).hexdigest()
+
+
+def _shorten(name: str) -> str:
+    return name if len(os.fsencode(name)) <= _MAX_NAME else name.encode("ascii", "ignore").decode()[:_MAX_NAME]
+
+
+def _remove_unfinished(folder: Path) -> None:
+    """Remove temporary files of a worker that was killed."""
+    for path in folder.glob(".*"):
+        if _UNFINISHED.fullmatch(path.name):
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
+# The workers
+
+
+@contextlib.contextmanager
+def start_workers(workers: int | None = None, memory: int | None = None) -> Iterator[LocalCluster]:
+    """Worker processes on this machine, which end with the block.
+
+    Args:
+        workers: number of processes; by default one per two cores with at least 4 GiB each. They share the cores.
+        memory: limit of each, bytes; a worker above 95 % of it is killed and replaced. By default an equal part.
+    """
+    require_cluster()
+    import logging
+
+    from dask import config as dask_config
+    from dask.system import CPU_COUNT
+    from distributed import LocalCluster
+    from distributed.system import MEMORY_LIMIT
+
+    workers = workers or max(1, min(CPU_COUNT // 2, MEMORY_LIMIT // (memory or _DEFAULT_MEMORY)))
+    threads = max(1, CPU_COUNT // workers)
+    variables = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+    settings = {
+        # A worker's memory is the work of one task, which Dask cannot spill.
+        **{f"distributed.worker.memory.{name}": False for name in ("target", "spill", "pause")},
+        "distributed.worker.memory.terminate": 0.95,
+        "distributed.scheduler.allowed-failures": _MAX_DEATHS,
+        "distributed.scheduler.worker-ttl": None,  # a compiled kernel may hold Python's lock for minutes
+        "distributed.nanny.pre-spawn-environ": {"MALLOC_TRIM_THRESHOLD_": 65536, **dict.fromkeys(variables, threads)},
+    }
+    with dask_config.set(settings):
+        cluster = LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address=None,  # pyright: ignore[reportArgumentType]
+            memory_limit=memory or MEMORY_LIMIT // workers,
+            silence_logs=logging.CRITICAL,
+            preload=["pansplat.batch"],
+        )
+        try:
+            yield cluster
+        except BaseException:
+            _kill_workers(cluster)
+            raise
+        finally:
+            cluster.close()
+
+
+def dask_setup(worker: Any) -> None:
+    """Called by Dask in each local worker: Ctrl+C in a terminal reaches workers, too, and the command ends them."""
+    del worker
+    with contextlib.suppress(ValueError):  # only the main thread can set handlers
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _kill_workers(cluster: LocalCluster) -> None:
+    """End the workers at once; Dask waits for the ends of their tasks."""
+    for nanny in list(cluster.workers.values()):
+        nanny.auto_restart = False
+        with contextlib.suppress(OSError, TypeError):
+            os.kill(nanny.pid, signal.SIGKILL)
+
+
+def connect(address: str) -> Client:
+    """A client of a scheduler.
+
+    Raises:
+        InputError: nothing answers at the address.
+    """
+    require_cluster()
+    import logging
+
+    from distributed import Client
+
+    for name in ("distributed", "distributed.client"):  # it logs the traceback of a lost connection
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    try:
+        return Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise InputError(
+            f"--scheduler {address}: needed a running Dask scheduler, got '{_describe(error)[:200]}'; "
+            "check the address, such as tcp://host:8786"
+        ) from error
+
+
+@contextlib.contextmanager
+def lock_folder(out: Path) -> Iterator[None]:
+    """Make the folder of a batch and lock it against a second batch on this machine.
+
+    Raises:
+        InputError: another batch writes to it, or it cannot be written.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with open(out / ".lock", "a") as file:
+            with contextlib.suppress(ImportError):  # Windows
+                import fcntl
+
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield
+    except BlockingIOError as error:
+        raise InputError(f"--out {out}: needed a folder of its own, got one that another batch writes to") from error
+
+
+def remove_unfinished(items: Sequence[Item], out: Path) -> None:
+    """Remove the temporary files of workers that have ended."""
+    for item in items:
+        _remove_unfinished(out / item.name)
+
+
+def run_items(address: str, items: Sequence[Item], options: BatchOptions, out: Path) -> Iterator[ItemReport]:
+    """Yield the report of each item when its task ends. If the scheduler is restarted, unfinished tasks are sent again.
+
+    Args:
+        address: of the scheduler. The workers must see the items' folders and `out` under the same paths.
+        out: absolute.
+
+    Raises:
+        InputError: the predictor cannot be loaded, or the scheduler is lost.
+    """
+    fingerprint = read_fingerprint(options)
+    remaining = {item.name: item for item in items}
+    losses = 0
+    while remaining:
+        before = len(remaining)
+        with connect(address) as client:
+            for report in _run_once(client, list(remaining.values()), options, fingerprint, out):
+                del remaining[report.item]
+                yield report
+        losses = 0 if len(remaining) < before else losses + 1
+        if losses == _MAX_LOSSES:
+            raise InputError(
+                f"--scheduler {address}: needed a scheduler that keeps running, got {losses} lost connections in a "
+                "row; run the command again, finished items are kept"
+            )
+
+
+def _run_once(
+    client: Client, items: Sequence[Item], options: BatchOptions, fingerprint: str, out: Path
+) -> Iterator[ItemReport]:
+    """Send one task per item; items of tasks that a lost scheduler forgot have no report."""
+    from distributed import as_completed
+
+    run = secrets.token_hex(4)  # the scheduler would answer a repeated key with an old report
+    names: dict[str, str] = {}
+    futures: list[Future] = []
+    for item in items:
+        key = f"pansplat-{run}-{item.name}"
+        names[key] = item.name
+        futures.append(client.submit(process_item, item, options, fingerprint, out, key=key, pure=False))
+    for future in as_completed(futures, loop=client.loop):
+        if future.status == "finished":
+            yield future.result()
+        elif future.status == "error":
+            error = future.exception()
+            text = f"worker: {_describe(error)}"
+            if type(error).__name__ == "KilledWorker":
+                text = (
+                    f"{_MAX_DEATHS + 1} worker processes ended during this item, probably for lack of memory; "
+                    "choose a smaller --height, fewer --workers or more --memory"
+                )
+            yield ItemReport(names[future.key], "failed", 0.0, error=text)
+        future.release()
+
+
+def format_report(report: ItemReport) -> str:
+    """The report as one line of JSON."""
+    return json.dumps(dataclasses.asdict(report)) + "\n"

@@ -1,0 +1,172 @@
+"""`pansplat batch`: many pairs and tours, on worker processes of one or many machines."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from pansplat.cli.inputs import Compat, Out, Precision
+from pansplat.console import print_message
+from pansplat.errors import InputError
+from pansplat.files import expand_home, require_output_folder
+from pansplat.options import Count, Height, Seconds, Threads
+
+if TYPE_CHECKING:
+    from pansplat.batch import BatchOptions, Item, ItemReport
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Predict, refine and export many pairs and tours; finished items are not done again (docs/batch.md).
+
+    An item that fails is reported and stops no other; the exit status is 1 then.
+    """
+
+    path: Positional[Path]
+    """A folder whose subfolders hold panoramas, or a manifest (.json)."""
+    out: Out
+    """Folder for the results and the report, report.jsonl."""
+    do: str = "predict"
+    """Steps, separated by commas: predict, refine, export."""
+    workers: Threads | None = None
+    """Number of worker processes on this machine; by default one per two cores with at least 4 GiB each."""
+    memory: str | None = None
+    """Memory of each worker, such as 4GiB; a worker that takes more is replaced. By default an equal part."""
+    scheduler: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Address of a running Dask scheduler, such as tcp://host:8786, whose workers are used instead."""
+    model: str = "default"
+    """Predictor: `default`, `sweep` (without weights), or a file of weights."""
+    compat: Compat = "trained"
+    """For a network: official, fixed, or as its weights were trained; see `pansplat predict --help`."""
+    precision: Precision = "float32"
+    """Number type of a network's convolutions."""
+    height: Height | None = None
+    """Panoramas are resized to this height, pixels; by default that of the photographs, at most 1024 (for networks
+    512)."""
+    refine: Seconds = 10.0
+    """Time limit of the refinement of a pair, seconds."""
+    format: str = "html"
+    """Format of the export: html, ply, compressed.ply, spz, splat, sog or glb."""
+    gaussians: Count | None = None
+    """For html: largest number of Gaussians, 300,000 by default."""
+
+    def run(self) -> int:
+        """Run all items, write the report and print a summary."""
+        from pansplat import batch
+
+        require_output_folder("--out", self.out)
+        options = self._make_options()
+        batch.require_cluster()
+        memory = self._parse_memory()
+        items = batch.list_items(self.path)
+        batch.read_fingerprint(options)  # an unknown model is an error of the command, not of each item
+        out = expand_home(self.out).absolute()
+        with batch.lock_folder(out):
+            try:
+                reports = self._run_items(items, options, out, memory)
+            finally:
+                if self.scheduler is None:
+                    batch.remove_unfinished(items, out)
+        count = {status: sum(r.status == status for r in reports) for status in ("done", "skipped", "failed")}
+        print(
+            f"{self.out}: {len(items):,} items: {count['done']:,} done, {count['skipped']:,} already there, "
+            f"{count['failed']:,} failed; {self.out / batch.REPORT_NAME}"
+        )
+        return 1 if count["failed"] else 0
+
+    def _make_options(self) -> BatchOptions:
+        """The checked options of the steps."""
+        from pansplat import batch
+
+        steps = {word.strip() for word in self.do.split(",")}
+        unknown = sorted(steps - set(batch.STEPS))
+        if unknown:
+            raise InputError(f"--do must be some of {','.join(batch.STEPS)}, got {unknown[0]!r}")
+        suffix = f".{self.format.lower().lstrip('.')}"
+        if suffix not in batch.EXPORT_SUFFIXES:
+            known = ", ".join(name.lstrip(".") for name in batch.EXPORT_SUFFIXES)
+            raise InputError(f"--format must be one of {known}, got {self.format!r}")
+        if self.gaussians is not None and suffix != ".html":
+            raise InputError(f"--gaussians is for --format html, got {self.format}; leave it out")
+        if self.scheduler is not None and (self.workers is not None or self.memory is not None):
+            raise InputError("--workers and --memory are for workers of this machine; leave them out with --scheduler")
+        is_file = Path(self.model).suffix != ""
+        return batch.BatchOptions(
+            steps=tuple(step for step in batch.STEPS if step in steps),
+            model=str(expand_home(self.model).absolute()) if is_file else self.model,
+            compat=self.compat,
+            precision=self.precision,
+            height=self.height,
+            refine_seconds=self.refine,
+            suffix=suffix,
+            gaussians=self.gaussians,
+        )
+
+    def _parse_memory(self) -> int | None:
+        """Bytes of --memory."""
+        if self.memory is None:
+            return None
+        from dask.utils import parse_bytes
+
+        from pansplat.batch import MIN_MEMORY
+
+        try:
+            memory = parse_bytes(self.memory)
+        except ValueError:
+            memory = 0
+        if not MIN_MEMORY <= memory < 1 << 50:
+            raise InputError(f"--memory must be at least {MIN_MEMORY >> 20}MiB, such as 4GiB, got {self.memory!r:.40}")
+        return memory
+
+    def _run_items(self, items: list[Item], options: BatchOptions, out: Path, memory: int | None) -> list[ItemReport]:
+        """Run the items, and write a line of the report at the end of each."""
+        from pansplat import batch
+
+        reports = []
+        cluster = batch.start_workers(self.workers, memory) if self.scheduler is None else nullcontext()
+        with cluster as local, _item_bar(len(items)) as show, open(out / batch.REPORT_NAME, "w") as file:
+            address = self.scheduler or ""
+            if local is not None:
+                workers = list(local.workers.values())
+                limit = workers[0].memory_manager.memory_limit / 2**30
+                address = local.scheduler_address
+                print(f"{len(workers)} workers of at most {limit:.1f} GiB each", file=sys.stderr)
+            for report in batch.run_items(address, items, options, out):
+                reports.append(report)
+                file.write(batch.format_report(report))
+                file.flush()
+                show(report)
+        return reports
+
+
+@contextmanager
+def _item_bar(total: int) -> Iterator[Callable[[ItemReport], None]]:
+    """A bar of the items with the time that is left; failed items are printed."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn()
+    times = TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()
+    with Progress(*columns, *times, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("items", total=total)
+
+        def show(report: ItemReport) -> None:
+            bar.update(task, advance=1, description=report.item[-30:])
+            if report.error is not None:
+                print_message("note", f"{report.item}: {report.error}")
+
+        yield show

@@ -1,0 +1,206 @@
+"""A batch does each item once, reports what fails, and loses nothing when a worker is killed or the run is stopped."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from pansplat import batch, pipeline
+from pansplat.batch import BatchOptions, Item, list_items, process_item
+from pansplat.cli import run
+from pansplat.errors import InputError
+
+HEIGHT = 64
+
+
+@pytest.fixture
+def sphere(sphere_predictor: type, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """`--model sphere` in this process."""
+    monkeypatch.setitem(pipeline._MODELS, "sphere", sphere_predictor)
+    batch._load_model.cache_clear()
+    yield
+    batch._load_model.cache_clear()
+
+
+@pytest.fixture
+def rooms(tmp_path: Path, write_pair: Callable[..., Path]) -> Path:
+    """A folder with three pairs of 64 rows."""
+    for index in range(3):
+        write_pair(tmp_path / "rooms" / f"room{index}", height=HEIGHT, seed=index)
+    return tmp_path / "rooms"
+
+
+def list_outputs(out: Path) -> dict[str, tuple[int, int]]:
+    """Inode and time of all files of a batch, but the report and the lock."""
+    files = [path for path in out.rglob("*") if path.is_file() and path.name not in (batch.REPORT_NAME, ".lock")]
+    return {path.relative_to(out).as_posix(): (path.stat().st_ino, path.stat().st_mtime_ns) for path in files}
+
+
+def read_report(out: Path) -> dict[str, Any]:
+    """The lines of the report by item."""
+    lines = [json.loads(line) for line in (out / batch.REPORT_NAME).read_text().splitlines()]
+    assert len({line["item"] for line in lines}) == len(lines)
+    return {line["item"]: line for line in lines}
+
+
+def test_the_items_of_a_folder_are_its_folders_with_panoramas(rooms: Path, write_pair: Callable[..., Path]) -> None:
+    write_pair(rooms / "house" / "kitchen")
+    (rooms / "empty").mkdir()
+    assert [item.name for item in list_items(rooms)] == ["house/kitchen", "room0", "room1", "room2"]
+    assert [item.name for item in list_items(rooms / "room1")] == ["room1"]
+
+
+def test_a_manifest_names_folders_relative_to_itself(rooms: Path) -> None:
+    entries = ["room0", {"path": "room1", "name": "kitchen", "pair": "left-right", "near": 0.2, "far": 5}]
+    (rooms / "all.json").write_text(json.dumps({"items": entries}))
+    first, second = list_items(rooms / "all.json")
+    assert first == Item("room0", rooms / "room0")
+    assert second == Item("kitchen", rooms / "room1", "left-right", None, 0.2, 5.0)
+
+
+def test_only_steps_whose_inputs_changed_are_done_again(
+    rooms: Path, tmp_path: Path, sphere: None, write_pair: Callable[..., Path]
+) -> None:
+    out, item = tmp_path / "out", Item("room0", rooms / "room0")
+
+    def process(*steps: str, height: int = HEIGHT, suffix: str = ".spz") -> batch.ItemReport:
+        return process_item(item, BatchOptions(steps, "sphere", height=height, suffix=suffix), "1", out)
+
+    first = process("predict", "export")
+    assert (first.status, len(first.outputs)) == ("done", 2) and first.error is None
+    assert all(len(pipeline.load(out / name).gaussians) == 2 * HEIGHT * 2 * HEIGHT for name in first.outputs)
+    files = list_outputs(out)
+    assert process("predict", "export").status == "skipped" and list_outputs(out) == files
+
+    other_format = process("predict", "export", suffix=".splat")
+    assert other_format.status == "done" and other_format.outputs[0] == first.outputs[0]
+    assert {name: list_outputs(out)[name] for name in files} == files
+
+    assert not set(process("predict", "export", height=80).outputs) & set(first.outputs)
+    write_pair(rooms / "room0", height=HEIGHT, seed=9)
+    assert not set(process("predict", "export").outputs) & set(first.outputs)
+
+
+def test_a_worker_with_another_predictor_is_refused(rooms: Path, tmp_path: Path, sphere: None) -> None:
+    options = BatchOptions(model="sphere", height=HEIGHT)
+    report = process_item(Item("room0", rooms / "room0"), options, "2", tmp_path / "out")
+    assert report.status == "failed" and "same version of pansplat" in str(report.error)
+    assert not list_outputs(tmp_path / "out")
+
+
+def test_files_that_a_killed_worker_left_are_removed_and_others_are_kept(
+    rooms: Path, tmp_path: Path, sphere: None
+) -> None:
+    out, options = tmp_path / "out", BatchOptions(model="sphere", height=HEIGHT)
+    (name,) = process_item(Item("room0", rooms / "room0"), options, "1", out).outputs
+    stem = Path(name).stem
+    for left in (f".{stem}.0123abcd.ply", f".{stem[:48]}.0123abcd.html", ".gitignore"):
+        (out / "room0" / left).touch()
+    process_item(Item("room0", rooms / "room0"), options, "1", out)
+    assert set(list_outputs(out)) == {name, "room0/.gitignore"}
+
+
+def test_without_dask_the_message_names_the_command_that_installs_it(
+    rooms: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert run(["batch", str(rooms), "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.endswith("run pip install 'pansplat[cluster]'\n")
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_batches_do_not_share_a_folder(tmp_path: Path) -> None:
+    with (
+        batch.lock_folder(tmp_path / "out"),
+        pytest.raises(InputError, match="another batch"),
+        batch.lock_folder(tmp_path / "out"),
+    ):
+        pass
+
+
+def when_predicted(out: Path, item: str, act: Callable[[], object]) -> threading.Thread:
+    """Call a function as soon as the prediction of an item is written and its refinement runs."""
+
+    def wait() -> None:
+        while not list((out / item).glob("predict-*")):
+            time.sleep(0.02)
+        act()
+
+    thread = threading.Thread(target=wait, daemon=True)
+    thread.start()
+    return thread
+
+
+def kill_the_worker_of(cluster: Any, item: str) -> None:
+    """Kill the worker process that runs the task of an item with -9."""
+    for address, state in list(cluster.scheduler.workers.items()):
+        if any(task.key.endswith(item) for task in state.processing):
+            (pid,) = [nanny.pid for nanny in cluster.workers.values() if nanny.worker_address == address]
+            os.kill(pid, signal.SIGKILL)
+
+
+def is_alive(pid: int) -> bool:
+    """Whether a process exists and has not ended."""
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+@pytest.mark.slow
+def test_two_workers_do_each_item_once_though_a_worker_is_killed_an_item_is_bad_and_a_run_is_stopped(
+    rooms: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (rooms / "broken").mkdir()
+    (rooms / "broken" / "poses.json").write_text("x")
+    out, options = tmp_path / "out", ["--model", "sweep", "--height", str(HEIGHT), "--do", "predict,refine"]
+    command = ["batch", str(rooms), "--out", str(out), *options, "--refine", "0.2"]
+    with pytest.raises(KeyboardInterrupt), batch.start_workers(2, 4 << 30) as cluster:
+        pids = [nanny.pid for nanny in cluster.workers.values()]
+        with monkeypatch.context() as patch:  # the workers of this test serve the command
+            patch.setattr(batch, "start_workers", lambda workers, memory: nullcontext(cluster))
+            killer = when_predicted(out, "room1", lambda: kill_the_worker_of(cluster, "room1"))
+            assert run(command) == 1
+        killer.join()
+        assert [is_alive(pid) for pid in pids].count(False) == 1
+        report = read_report(out)
+        assert {name: line["status"] for name, line in report.items()} == {
+            "broken": "failed", "room0": "done", "room1": "done", "room2": "done",
+        }  # fmt: skip
+        assert "poses.json" in report["broken"]["error"]
+        files = list_outputs(out)
+        assert sorted(files) == sorted(name for line in report.values() for name in line["outputs"])
+        assert len(files) == 6 and all(len(pipeline.load(out / name).gaussians) for name in files)
+
+        with_scheduler = [*command, "--scheduler", cluster.scheduler_address]
+        assert run(with_scheduler) == 1
+        assert [read_report(out)[f"room{index}"]["status"] for index in range(3)] == ["skipped"] * 3
+        assert list_outputs(out) == files
+
+        other = tmp_path / "stopped"
+        with_scheduler[3], with_scheduler[-3] = str(other), "60"
+        when_predicted(other, "room0", lambda: os.kill(os.getpid(), signal.SIGINT))
+        assert run(with_scheduler) == 130
+        pids = [nanny.pid for nanny in cluster.workers.values()]
+        began = time.perf_counter()
+        raise KeyboardInterrupt
+    assert time.perf_counter() - began < 20 and not any(is_alive(pid) for pid in pids)
+    batch.remove_unfinished(list_items(rooms), other)
+    assert {Path(name).name.split("-")[0] for name in list_outputs(other)} == {"predict"}
+    printed, errors = capfd.readouterr()
+    assert "4 items: 3 done, 0 already there, 1 failed" in printed
+    assert "4 items: 0 done, 3 already there, 1 failed" in printed
+    assert "2 workers of at most 4.0 GiB each" in errors and "Traceback" not in errors
+    assert errors.count("note: broken: ") >= 2
+    assert errors.splitlines()[-1] == "interrupted: no incomplete file is left behind"
