@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -311,7 +312,9 @@ class Trainer:
             if self._stop:
                 raise KeyboardInterrupt
             self._stop, self.stopped_by = True, number
-            progress.print("stopping after this step; press Ctrl-C again to stop at once")
+            # A handler may interrupt a write to the same stream, which cannot be entered twice; a thread waits for it.
+            message = "stopping after this step; press Ctrl-C again to stop at once"
+            threading.Thread(target=progress.print, args=(message,), daemon=True).start()
 
         signals = (signal.SIGINT, signal.SIGTERM)
         try:
