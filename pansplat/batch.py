@@ -383,7 +383,8 @@ def start_workers(workers: int | None = None, memory: int | None = None) -> Iter
         "distributed.worker.memory.terminate": 0.95,
         "distributed.scheduler.allowed-failures": _MAX_DEATHS,
         "distributed.scheduler.worker-ttl": None,  # a compiled kernel may hold Python's lock for minutes
-        "distributed.nanny.pre-spawn-environ": {"MALLOC_TRIM_THRESHOLD_": 65536, **dict.fromkeys(variables, threads)},
+        # Dask sets these variables in this process, too: numba fails if its number of threads changes.
+        "distributed.nanny.pre-spawn-environ": {"MALLOC_TRIM_THRESHOLD_": 65536},
     }
     with dask_config.set(settings):
         cluster = LocalCluster(
@@ -395,6 +396,7 @@ def start_workers(workers: int | None = None, memory: int | None = None) -> Iter
             memory_limit=memory or MEMORY_LIMIT // workers,
             silence_logs=logging.CRITICAL,
             preload=["pansplat.batch"],
+            env=dict.fromkeys(variables, str(threads)),
         )
         try:
             yield cluster
@@ -406,8 +408,11 @@ def start_workers(workers: int | None = None, memory: int | None = None) -> Iter
 
 
 def dask_setup(worker: Any) -> None:
-    """Called by Dask in each local worker: Ctrl+C in a terminal reaches workers, too, and the command ends them."""
+    """Called by Dask in each local worker. Ctrl+C in a terminal reaches workers, too, and the command ends them."""
+    import torch
+
     del worker
+    torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))  # it may have been imported before the variable was set
     with contextlib.suppress(ValueError):  # only the main thread can set handlers
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 

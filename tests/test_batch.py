@@ -162,11 +162,13 @@ def is_alive(pid: int) -> bool:
 def test_two_workers_do_each_item_once_though_a_worker_is_killed_an_item_is_bad_and_a_run_is_stopped(
     rooms: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
     (rooms / "broken").mkdir()
     (rooms / "broken" / "poses.json").write_text("x")
     out, options = tmp_path / "out", ["--model", "sweep", "--height", str(HEIGHT), "--do", "predict,refine"]
     command = ["batch", str(rooms), "--out", str(out), *options, "--refine", "0.2"]
     with pytest.raises(KeyboardInterrupt), batch.start_workers(2, 4 << 30) as cluster:
+        assert "NUMBA_NUM_THREADS" not in os.environ  # in this process it would change the threads of the kernels
         pids = [nanny.pid for nanny in cluster.workers.values()]
         with monkeypatch.context() as patch:  # the workers of this test serve the command
             patch.setattr(batch, "start_workers", lambda workers, memory: nullcontext(cluster))
