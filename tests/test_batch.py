@@ -199,7 +199,8 @@ def test_two_workers_do_each_item_once_though_a_worker_is_killed_an_item_is_bad_
         raise KeyboardInterrupt
     assert time.perf_counter() - began < 20 and not any(is_alive(pid) for pid in pids)
     batch.remove_unfinished(list_items(rooms), other)
-    assert {Path(name).name.split("-")[0] for name in list_outputs(other)} == {"predict"}
+    complete = list_outputs(other)  # a refinement may end early
+    assert complete and all(len(pipeline.load(other / name).gaussians) for name in complete)
     printed, errors = capfd.readouterr()
     assert "4 items: 3 done, 0 already there, 1 failed" in printed
     assert "4 items: 0 done, 3 already there, 1 failed" in printed
