@@ -21,16 +21,13 @@ from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.files import expand_home, read_file
-from pansplat.gaussians.scene import Gaussians
+from pansplat.gaussians.scene import Gains, Gaussians
 from pansplat.predictor import Predictor
 
 _MAX_LEVELS = 256
 _FORMAT = "1"  # version of the file's layout; part of the hash
 _GAINS = "gains"
 _FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
-
-
-Gains = tuple[tuple[float, ...], ...]
 
 
 class CachedPrediction:

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.cache import CachedPrediction, Gains
+from pansplat.cache import CachedPrediction
 from pansplat.data import folders
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
@@ -25,7 +25,7 @@ from pansplat.errors import InputError
 from pansplat.files import expand_home
 from pansplat.gaussians.formats import load_scene, save_scene
 from pansplat.gaussians.ply import save_ply_parts
-from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians, prune
+from pansplat.gaussians.scene import Gains, Gaussians, Scene, empty_gaussians, prune
 from pansplat.geometry.pose import blend_weights
 from pansplat.geometry.world import scale_poses, working_factor
 from pansplat.model.layers import Precision

@@ -20,6 +20,9 @@ from pansplat.geometry.pose import (
 )
 from pansplat.geometry.world import scale_poses
 
+Gains = tuple[tuple[float, ...], ...]
+"""Factors of R, G and B for each view's photograph."""
+
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
@@ -141,7 +144,7 @@ class Scene:
     names: tuple[str, ...] = ()
     model: str = ""
     height: int = 512
-    gains: tuple[tuple[float, ...], ...] = ()
+    gains: Gains = ()
 
     def scaled(self, factor: float) -> Scene:
         """The scene in a world that is multiplied by a factor."""

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.gaussians.scene import Gaussians, Scene, prune
+from pansplat.gaussians.scene import Gains, Gaussians, Scene, prune
 from pansplat.geometry.world import MAX_POSITION, require_depth_range
 from pansplat.strict_json import list_field, number_field, parse_json, require_object, text_field
 
@@ -146,7 +146,7 @@ class _Entry:
     names: tuple[str, ...] = ()
     model: str = ""
     height: int = _DEFAULT_HEIGHT
-    gains: tuple[tuple[float, ...], ...] = ()
+    gains: Gains = ()
     runs: list[Any] | None = None
 
 
@@ -192,7 +192,7 @@ def _read_entry(content: Any) -> _Entry:
     )
 
 
-def _read_gains(rows: list[Any], cameras: int) -> tuple[tuple[float, ...], ...]:
+def _read_gains(rows: list[Any], cameras: int) -> Gains:
     """Three factors for each camera, or nothing."""
     numbers = [value for row in rows for value in (row if isinstance(row, list) else [None])]
     are_factors = all(type(value) in (int, float) and 0 < value < _MAX_GAIN for value in numbers)

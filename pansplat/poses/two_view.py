@@ -67,8 +67,8 @@ class _Evidence:
 
 
 # Measured on pairs of a home, of which most have nothing in common. Wrong poses that make the walls parallel have at
-# most 21 places and a score of 70; the floor tells them from right ones. Other wrong poses have up to 25 places,
-# because repeated doors and windows match.
+# most 21 places and a score of 70, and fail the check of the floor. Other wrong poses have up to 25 places, because
+# repeated doors and windows match.
 _CERTAIN, _CONFIRMED, _UNCONFIRMED = _Evidence(24, 100, 10), _Evidence(10, 36, 4), _Evidence(32, 80, 20)
 
 

@@ -26,7 +26,7 @@ from torch.nn import functional
 from pansplat.data.masks import mask_holes
 from pansplat.data.views import Views
 from pansplat.errors import InputError
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Gains, Gaussians, Scene
 from pansplat.geometry.pose import nearest_views
 from pansplat.geometry.world import scale_poses, working_factor
 from pansplat.predictor import Progress
@@ -102,7 +102,7 @@ class RefineReport:
     stopped: str
     before: float
     after: float
-    gains: tuple[tuple[float, ...], ...]
+    gains: Gains
     history: tuple[tuple[int, float, float], ...]
 
 
@@ -254,7 +254,7 @@ class Refinement:
         )
 
     @property
-    def gains(self) -> tuple[tuple[float, ...], ...]:
+    def gains(self) -> Gains:
         """Factors of the photographs' channels relative to their geometric mean."""
         logs = self._cameras.log_gains.detach()
         return tuple(tuple(row) for row in (logs - logs.mean(0)).exp().tolist())
