@@ -24,8 +24,10 @@ _PUBLIC = {
     "load_pairs": "pansplat.pipeline",
     "predict": "pansplat.pipeline",
     "predict_to_file": "pansplat.pipeline",
+    "predict_tour": "pansplat.pipeline",
     "rasterize": "pansplat.rendering",
     "refine": "pansplat.pipeline",
+    "refine_to_file": "pansplat.pipeline",
     "render": "pansplat.pipeline",
     "save": "pansplat.pipeline",
 }

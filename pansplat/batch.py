@@ -16,13 +16,13 @@ import secrets
 import signal
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from pansplat import __version__, pipeline
+from pansplat import __version__, pipeline, tours
 from pansplat.console import is_out_of_memory
 from pansplat.data.folders import find_panorama_folders
 from pansplat.data.pairs import Pair
@@ -32,16 +32,17 @@ from pansplat.gaussians.scene import Scene
 from pansplat.predictor import Predictor
 from pansplat.refinement import refinement_fingerprint
 from pansplat.strict_json import list_field, number_field, read_json, require_object, text_field
+from pansplat.tours import TourGraph, find_tours, merge_scenes, write_floor_plan
 
 if TYPE_CHECKING:
     from distributed import Client, Future, LocalCluster
 
 STEPS = ("predict", "refine", "export")
-EXPORT_SUFFIXES = (".html", *SCENE_SUFFIXES)
+EXPORT_SUFFIXES = (".html", ".png", *SCENE_SUFFIXES)
 REPORT_NAME = "report.jsonl"
 MIN_MEMORY = 1 << 29  # bytes of a worker; torch and the kernels take half of it
 
-_LAYOUT = "1"  # of the outputs; part of their hashes
+_LAYOUT = "2"  # of the outputs; part of their hashes
 _MAX_DEATHS = 2  # worker processes that may end during one task before the item counts as failed
 _MAX_LOSSES = 3  # of the connection to a scheduler without a finished item in between
 _CONNECT_SECONDS = 60.0
@@ -201,8 +202,8 @@ def process_item(item: Item, options: BatchOptions, fingerprint: str, out: Path)
             folder = out / item.name
             folder.mkdir(parents=True, exist_ok=True)
             _remove_unfinished(folder)
-            for pair in _load_pairs(item):
-                for path, is_new in _process_pair(pair, options, fingerprint, folder):
+            for unit in _list_units(item):
+                for path, is_new in _process_unit(unit, options, fingerprint, folder):
                     outputs.append(path.relative_to(out).as_posix())
                     num_written += is_new
         except Exception as problem:  # whatever it is, other items go on
@@ -222,15 +223,36 @@ def _describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {text[:400]}"
 
 
-def _load_pairs(item: Item) -> list[Pair]:
+@dataclass(frozen=True, eq=False)
+class _Unit:
+    """What one file is exported of: a pair, or a tour with its scenes as pairs.
+
+    Attributes:
+        name: for the name of the file.
+        pairs: that are predicted.
+        tour: the graph of a tour, or None.
+    """
+
+    name: str
+    pairs: tuple[Pair, ...]
+    tour: TourGraph | None = None
+
+
+def _list_units(item: Item) -> list[_Unit]:
+    """The tours of an item, and the pairs that belong to none."""
     pairs = pipeline.load_pairs(item.folder, convention=item.convention, near=item.near, far=item.far)
-    if item.pair is None:
-        return pairs
-    chosen = [pair for pair in pairs if pair.name == item.pair]
-    if not chosen:
-        names = ", ".join(pair.name for pair in pairs[:8])
-        raise InputError(f"{item.folder}: needed a pair {item.pair!r}, got {names}; correct the manifest.")
-    return chosen
+    if item.pair is not None:
+        chosen = [pair for pair in pairs if pair.name == item.pair]
+        if not chosen:
+            names = ", ".join(pair.name for pair in pairs[:8])
+            raise InputError(f"{item.folder}: needed a pair {item.pair!r}, got {names}; correct the manifest.")
+        return [_Unit(pair.name, (pair,)) for pair in chosen]
+    units, images = [], set()
+    for tour in find_tours(pairs):
+        images |= {panorama.image for panorama in tour.panoramas}
+        graph = tours.connect(tour)
+        units.append(_Unit(graph.name, tuple(graph.make_pair(views) for views in graph.choose_sources()), graph))
+    return units + [_Unit(pair.name, (pair,)) for pair in pairs if pair.context[0].image not in images]
 
 
 @lru_cache(maxsize=1)
@@ -247,69 +269,94 @@ def read_fingerprint(options: BatchOptions) -> str:
     return _load_model(options.model, options.compat, options.precision).fingerprint
 
 
-def _process_pair(pair: Pair, options: BatchOptions, fingerprint: str, folder: Path) -> Iterator[tuple[Path, bool]]:
-    """Yield each output, and whether it was written; the input of a step is the output of the previous one."""
-    scene: Scene | None = None
-    key = _hash_pair(pair)
-    last: Path | None = None
-    for step in STEPS:
-        settings: list[object] = {
-            "predict": [options.model.rsplit("/", 1)[-1], fingerprint, options.height],
-            "refine": [refinement_fingerprint(), options.refine_seconds],
-            "export": [__version__, options.suffix, options.gaussians],
-        }[step]
-        if step not in options.steps:
-            if step == "predict":  # it is computed in memory for the next step
-                key = _join_hash(key, step, settings)
-            continue
-        key = _join_hash(key, step, settings)
-        suffix = options.suffix if step == "export" else ".ply"
-        path = folder / f"{step}-{key}-{_shorten(pair.name)}{suffix}"
+def _process_unit(unit: _Unit, options: BatchOptions, fingerprint: str, folder: Path) -> Iterator[tuple[Path, bool]]:
+    """Yield each output of a pair or tour, and whether it was written."""
+    made = [_PairSteps(pair, unit.tour is not None, options, fingerprint, folder) for pair in unit.pairs]
+    for steps in made:
+        yield from steps.run()
+    if "export" not in options.steps:
+        return
+    edges = [] if unit.tour is None else [[*edge, round(overlap, 6)] for edge, overlap in unit.tour.overlaps.items()]
+    settings = [__version__, options.suffix, options.gaussians, edges]
+    key = _join_hash(",".join(steps.key for steps in made), "export", settings)
+    path = folder / f"export-{key}-{_shorten(unit.name)}{options.suffix}"
+    is_new = not path.exists()
+    if is_new:
+        if unit.tour is None:
+            scene = made[0].read()
+        else:
+            of_views = dict(zip(unit.tour.choose_sources(), made, strict=True))
+            scene = merge_scenes(unit.tour, lambda views: of_views[views].read())
+        _export(scene, path, unit, options)
+    yield path, is_new
+
+
+class _PairSteps:
+    """The prediction and refinement of a pair, or of a scene of a tour.
+
+    Attributes:
+        key: hash of all that the result depends on.
+    """
+
+    def __init__(self, pair: Pair, is_of_tour: bool, options: BatchOptions, fingerprint: str, folder: Path) -> None:
+        self._pair, self._options, self._fingerprint, self._folder = pair, options, fingerprint, folder
+        self._height = options.height or (pipeline.choose_tour_height(pair) if is_of_tour else None)
+        self._file: Path | None = None
+        self.key = _hash_pair(pair)
+
+    def run(self) -> Iterator[tuple[Path, bool]]:
+        """Do the steps whose files are missing; yield each file, and whether it was written."""
+        options = self._options
+        name = options.model.rsplit("/", 1)[-1]
+        self.key = _join_hash(self.key, "predict", [name, self._fingerprint, self._height])
+        if "predict" in options.steps:
+            yield self._write("predict", self._predict_to)
+        if "refine" in options.steps:
+            self.key = _join_hash(self.key, "refine", [refinement_fingerprint(), options.refine_seconds])
+            yield self._write("refine", self._refine_to)
+
+    def read(self) -> Scene:
+        """The scene of the last step. It is computed in memory if no step writes a file."""
+        if self._file is not None:
+            return pipeline.load(self._file)
+        return pipeline.predict(self._pair, self._load_predictor(), height=self._height, cache=False)
+
+    def _write(self, step: str, write: Callable[[Path], object]) -> tuple[Path, bool]:
+        path = self._folder / f"{step}-{self.key}-{_shorten(self._pair.name)}.ply"
         is_new = not path.exists()
         if is_new:
-            if scene is None and last is not None:
-                scene = pipeline.load(last)
-            if step == "predict":
-                scene = _predict(pair, options, fingerprint, path)
-            elif step == "refine":
-                scene = _refine(pair, scene or _predict(pair, options, fingerprint, None), options)
-                pipeline.save(scene, path)
-            else:
-                _export(scene or _predict(pair, options, fingerprint, None), path, pair.name, options)
-        else:
-            scene = None
-        last = path
-        yield path, is_new
+            write(path)
+        self._file = path
+        return path, is_new
+
+    def _predict_to(self, path: Path) -> None:
+        pipeline.predict_to_file(self._pair, path, self._load_predictor(), height=self._height)
+
+    def _refine_to(self, path: Path) -> None:
+        scene = self.read()
+        views = self._pair.load_context(scene.height)
+        pipeline.refine_to_file(scene, views, path, seconds=self._options.refine_seconds)
+
+    def _load_predictor(self) -> Predictor:
+        predictor = _load_model(self._options.model, self._options.compat, self._options.precision)
+        if predictor.fingerprint != self._fingerprint:
+            raise InputError(
+                f"worker: needed the predictor {self._options.model} of the machine that started the batch, got "
+                "another one; install the same version of pansplat and the same weights on all machines"
+            )
+        return predictor
 
 
-def _predict(pair: Pair, options: BatchOptions, fingerprint: str, path: Path | None) -> Scene:
-    """The prediction of a pair, written to a file if one is given."""
-    predictor = _load_model(options.model, options.compat, options.precision)
-    if predictor.fingerprint != fingerprint:
-        raise InputError(
-            f"worker: needed the predictor {options.model} of the machine that started the batch, got another one; "
-            "install the same version of pansplat and the same weights on all machines"
-        )
-    if path is not None and pipeline.can_stream(predictor):  # tile by tile, in bounded memory
-        pipeline.predict_to_file(pair, path, predictor, height=options.height)
-        return pipeline.load(path)
-    scene = pipeline.predict(pair, predictor, height=options.height, cache=False)
-    if path is not None:
+def _export(scene: Scene, path: Path, unit: _Unit, options: BatchOptions) -> None:
+    if options.suffix == ".html":
+        from pansplat.web import DEFAULT_GAUSSIANS, write_page
+
+        count, title = options.gaussians or DEFAULT_GAUSSIANS, unit.name.replace("_", " ")
+        write_page(scene, path, tour=unit.tour, gaussians=count, title=title)
+    elif options.suffix == ".png":
+        write_floor_plan(scene, path, unit.tour)
+    else:
         pipeline.save(scene, path)
-    return scene
-
-
-def _refine(pair: Pair, scene: Scene, options: BatchOptions) -> Scene:
-    return pipeline.refine(scene, pair.load_context(scene.height), seconds=options.refine_seconds)
-
-
-def _export(scene: Scene, path: Path, title: str, options: BatchOptions) -> None:
-    if options.suffix != ".html":
-        pipeline.save(scene, path)
-        return
-    from pansplat.web import DEFAULT_GAUSSIANS, write_page
-
-    write_page(scene, path, gaussians=options.gaussians or DEFAULT_GAUSSIANS, title=title.replace("_", " "))
 
 
 def _hash_pair(pair: Pair) -> str:

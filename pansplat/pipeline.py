@@ -5,6 +5,7 @@ Every name in `__all__` is also an attribute of `pansplat`.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -22,7 +23,7 @@ from pansplat.data import folders
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
 from pansplat.errors import InputError
-from pansplat.files import expand_home
+from pansplat.files import expand_home, find_scene_suffix
 from pansplat.gaussians.formats import load_scene, save_scene
 from pansplat.gaussians.ply import save_ply_parts
 from pansplat.gaussians.scene import Gains, Gaussians, Scene, empty_gaussians, prune
@@ -33,10 +34,11 @@ from pansplat.model.weights import WEIGHTS_SUFFIXES, CompatChoice, read_model_na
 from pansplat.poses.estimate import estimate_poses
 from pansplat.poses.files import estimate_pairs
 from pansplat.predictor import MIN_HEIGHT, Predictor, Progress
-from pansplat.refinement import RefineConfig, Refinement, refinement_fingerprint
+from pansplat.refinement import RefineConfig, Refinement, RefineReport, refinement_fingerprint
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.official import rasterize_official
+from pansplat.tours import TourGraph, merge_scenes
 
 __all__ = [
     "estimate_poses",
@@ -45,7 +47,9 @@ __all__ = [
     "load_pairs",
     "predict",
     "predict_to_file",
+    "predict_tour",
     "refine",
+    "refine_to_file",
     "render",
     "save",
 ]
@@ -53,6 +57,8 @@ __all__ = [
 Drawing = Literal["exact", "original"]
 
 _DEFAULT_HEIGHT = 512  # of networks; larger panoramas take minutes
+_MAX_CACHED_HEIGHT = 512  # of predictions of networks; taller ones are written tile by tile
+_TOUR_HEIGHT = 512  # largest default height of the panoramas of a tour, which has many scenes
 
 
 def load_pairs(
@@ -147,6 +153,11 @@ _MODELS: dict[str, Callable[..., Predictor]] = {"default": _load_default, "sweep
 def choose_height(pair: Pair, predictor: Predictor) -> int:
     """The height to predict a pair at: that of its photographs, at most the largest default of the predictor."""
     return max(MIN_HEIGHT, min(pair.image_height, getattr(predictor, "default_height", _DEFAULT_HEIGHT)))
+
+
+def choose_tour_height(pair: Pair) -> int:
+    """The height to predict a scene of a tour at: that of its photographs, at most 512."""
+    return max(MIN_HEIGHT, min(pair.image_height, _TOUR_HEIGHT))
 
 
 def predict(
@@ -254,30 +265,121 @@ def refine(
     Raises:
         InputError: scene and views do not fit, or an argument is out of range.
     """
+    return _run_refinement(scene, views, seconds, steps, config, seed, progress)[0]
+
+
+def refine_to_file(
+    scene: Scene,
+    views: Views,
+    path: str | Path,
+    *,
+    seconds: float | None = None,
+    steps: int | None = None,
+    config: RefineConfig | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> tuple[Scene, RefineReport]:
+    """Refine a scene and write it in the format of the file's suffix.
+
+    Args:
+        scene, views, seconds, steps, config, seed, progress: see `refine`.
+        path: the file.
+        should_stop: called after each step; True ends the refinement early.
+
+    Returns:
+        The refined scene, and what the refinement did.
+
+    Raises:
+        InputError: see `refine` and `save`.
+    """
+    find_scene_suffix(path)  # an error before the work
+    refined, report = _run_refinement(scene, views, seconds, steps, config, seed, progress, should_stop)
+    save(refined, path)
+    return refined, report
+
+
+def _run_refinement(
+    scene: Scene,
+    views: Views,
+    seconds: float | None,
+    steps: int | None,
+    config: RefineConfig | None,
+    seed: int,
+    progress: Progress | None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> tuple[Scene, RefineReport]:
     refinement = Refinement(scene, views, config, seed=seed)
-    refinement.run(seconds=10.0 if seconds is None and steps is None else seconds, steps=steps, progress=progress)
-    return refinement.scene()
+    limit = 10.0 if seconds is None and steps is None else seconds
+    report = refinement.run(seconds=limit, steps=steps, progress=progress, should_stop=should_stop)
+    return refinement.scene(), report
+
+
+def predict_tour(
+    tour: TourGraph,
+    model: str | Path | Predictor = "default",
+    *,
+    compat: CompatChoice = "trained",
+    precision: Precision = "float32",
+    height: int | None = None,
+    refine_seconds: float = 0.0,
+    cache: bool = True,
+    progress: Progress | None = None,
+) -> Scene:
+    """Predict one scene of all panoramas of a tour: several scenes of two or three panoramas, merged.
+
+    The scenes and their cache are those of the viewer.
+
+    Args:
+        tour: of `pansplat.tours.connect`.
+        model, compat, precision, refine_seconds, cache, progress: see `predict`; the time limit is that of each scene.
+        height: panoramas are resized to (height, 2 height); by default `choose_tour_height`.
+
+    Raises:
+        InputError: the input cannot be used.
+    """
+    predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
+    report: Progress = progress or (lambda what, fraction: None)
+    total = len(tour.choose_sources())
+    counter = itertools.count()
+
+    def predict_scene(views: tuple[int, ...]) -> Scene:
+        number, pair = next(counter), tour.make_pair(views)
+        return predict(
+            pair,
+            predictor,
+            height=height or choose_tour_height(pair),
+            refine_seconds=refine_seconds,
+            cache=cache,
+            progress=lambda what, done: report(f"scene {number + 1} of {total}: {what}", (number + done) / total),
+        )
+
+    return merge_scenes(tour, predict_scene)
 
 
 def predict_to_file(
     source: Pair | Views | str | Path,
     path: str | Path,
-    model: str | Path | Predictor,
+    model: str | Path | Predictor = "default",
     *,
     compat: CompatChoice = "trained",
     precision: Precision = "float32",
     height: int | None = None,
+    refine_seconds: float = 0.0,
+    cache: bool = False,
     degree: int | None = None,
     min_opacity: float = 0.0,
     progress: Progress | None = None,
 ) -> int:
-    """Predict into a .ply file, tile by tile, in bounded memory; nothing is cached.
+    """Predict a scene and write it in the format of the file's suffix (docs/formats.md).
 
-    The file holds the Gaussians of `predict`, ordered by tile.
+    The prediction of a network that is neither refined nor cached is computed tile by tile, in bounded memory; a .ply
+    is written tile by tile, too. The Gaussians are those of `predict`, ordered by tile.
 
     Args:
-        source, compat, precision, height, progress: see `predict`.
-        model: a file of network weights, or a network's predictor.
+        source, model, compat, precision, height, refine_seconds, progress: see `predict`.
+        path: the file.
+        cache: whether to read and write the cache; networks do not cache heights above 512.
         degree: highest degree of harmonics in the file; None keeps all.
         min_opacity: Gaussians of lower opacity are omitted.
 
@@ -285,26 +387,30 @@ def predict_to_file(
         The number of Gaussians in the file.
 
     Raises:
-        InputError: see `predict`; the predictor is not a network, or the file cannot be written.
+        InputError: see `predict` and `save`.
     """
-    if Path(path).suffix.lower() != ".ply":
-        raise InputError(f"{path}: a prediction in parts must end in .ply, got {Path(path).suffix or 'no suffix'!r}")
+    suffix = find_scene_suffix(path)
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
-    if not can_stream(predictor):
-        raise InputError(
-            f"`model` must be a network to write tile by tile, got {predictor.name}; use `predict` and `save`"
-        )
     pair = _load_only_pair(source) if isinstance(source, (str, Path)) else source
-    views = pair if isinstance(pair, Views) else pair.load_context(height or choose_height(pair, predictor))
-    parts: Iterator[Gaussians] = predictor.stream(  # pyright: ignore[reportAttributeAccessIssue]
-        views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress
-    )
-    pruned = (prune(part, degree=degree, min_opacity=min_opacity) for part in parts)
-    return save_ply_parts(_make_scene(empty_gaussians(), views, predictor), pruned, path)
+    height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
+    if can_stream(predictor) and not refine_seconds and not (cache and height <= _MAX_CACHED_HEIGHT):
+        views = pair if isinstance(pair, Views) else pair.load_context(height)
+        parts: Iterator[Gaussians] = predictor.stream(  # pyright: ignore[reportAttributeAccessIssue]
+            views.images, views.cam2world, views.near, views.far, masks=views.masks, progress=progress
+        )
+        pruned = (prune(part, degree=degree, min_opacity=min_opacity) for part in parts)
+        if suffix == ".ply":
+            return save_ply_parts(_make_scene(empty_gaussians(), views, predictor), pruned, path)
+        scene = _make_scene(Gaussians.cat(list(pruned)), views, predictor)
+    else:
+        scene = predict(pair, predictor, height=height, refine_seconds=refine_seconds, cache=cache, progress=progress)
+        scene = replace(scene, gaussians=prune(scene.gaussians, degree=degree, min_opacity=min_opacity))
+    save(scene, path)
+    return len(scene.gaussians)
 
 
 def can_stream(predictor: Predictor) -> bool:
-    """Whether `predict_to_file` accepts the predictor."""
+    """Whether the predictor computes a scene tile by tile."""
     return hasattr(predictor, "stream")
 
 

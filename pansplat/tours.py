@@ -21,15 +21,19 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.sparse.csgraph import shortest_path
 from torch import Tensor
 
-from pansplat.data.images import read_panorama
+from pansplat.data.images import read_panorama, write_image
 from pansplat.data.pairs import Pair, Panorama
-from pansplat.gaussians.scene import Scene
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pad_equirect, row_weights
 from pansplat.geometry.path import level_pose, up_direction
 from pansplat.geometry.warp import relative_pose, warp_panorama
 
 Edge = tuple[int, int]
 """Indices of two panoramas, the smaller one first."""
+
+Views = tuple[int, ...]
+"""The panoramas of a scene, by their number in the tour."""
 
 MIN_PANORAMAS = 3
 MAX_SCENE_VIEWS = 3
@@ -42,6 +46,7 @@ _MAX_BASELINE = 0.4  # of an edge that is not given, as a fraction of far
 _MAX_NEIGHBOURS = 6  # nearest panoramas that are compared
 _MIN_BASELINE = 0.03  # of a scene of two views, as a fraction of far; depth is inaccurate below it
 
+EDGE_HYSTERESIS = 0.25  # metres that another edge must be nearer than the current one
 FLY_SPEED = 1.0  # metres per second
 TURN_DEGREES = 45.0  # per second
 _LOOK_AHEAD = 1.5  # metres along the way, the point that the camera looks at
@@ -51,6 +56,7 @@ _SMOOTHING_SECONDS = 1.2
 _SAMPLES_PER_SECOND = 60
 
 _AZIMUTHS = 180  # of a floor outline
+PLAN_SIZE = 1024  # of the longer side of a floor plan as a file, pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,19 +102,15 @@ class TourGraph:
         """Nodes that share an edge with a node."""
         return sorted({sum(edge) - node for edge in self.overlaps if node in edge})
 
-    def choose_scene_views(self) -> dict[Edge, tuple[int, ...]]:
+    def choose_scene_views(self) -> dict[Edge, Views]:
         """The panoramas of the scene of each edge: two, or three that overlap with each other.
 
         Edges share scenes where they can, so that fewer scenes are predicted and exchanged.
         """
-        triangles = [
-            nodes
-            for nodes in itertools.combinations(range(len(self)), MAX_SCENE_VIEWS)
-            if all(edge in self.overlaps for edge in itertools.combinations(nodes, 2))
-        ]
-        # The weakest overlap of a scene decides.
-        triangles.sort(key=lambda nodes: -min(self.overlaps[edge] for edge in itertools.combinations(nodes, 2)))
-        scenes: dict[Edge, tuple[int, ...]] = {}
+        around = {node: set(self.neighbours(node)) for node in range(len(self))}
+        triangles = [(a, b, c) for a, b in self.overlaps for c in sorted(around[a] & around[b]) if c > b]
+        triangles.sort(key=lambda nodes: (-self._weakest_overlap(nodes), nodes))
+        scenes: dict[Edge, Views] = {}
         for needed in (2, 1):
             for nodes in triangles:
                 free = [edge for edge in itertools.combinations(nodes, 2) if edge not in scenes]
@@ -119,7 +121,28 @@ class TourGraph:
                 scenes[edge] = self._add_baseline(edge)
         return scenes
 
-    def _add_baseline(self, edge: Edge) -> tuple[int, ...]:
+    def choose_sources(self) -> dict[Views, tuple[int, ...]]:
+        """The scenes that one scene of all panoramas is made of, and the panoramas whose Gaussians each provides.
+
+        They are scenes of `choose_scene_views`, those of the largest overlaps first, until all panoramas are provided.
+        """
+        scenes = sorted(
+            set(self.choose_scene_views().values()), key=lambda nodes: (-self._weakest_overlap(nodes), nodes)
+        )
+        sources: dict[Views, tuple[int, ...]] = {}
+        missing = set(range(len(self)))
+        for views in scenes:
+            provided = tuple(node for node in views if node in missing)
+            if provided:
+                sources[views] = provided
+                missing -= set(provided)
+        return sources
+
+    def _weakest_overlap(self, nodes: Views) -> float:
+        """The smallest overlap of the edges between the panoramas of a scene."""
+        return min(self.overlaps[edge] for edge in itertools.combinations(nodes, 2) if edge in self.overlaps)
+
+    def _add_baseline(self, edge: Edge) -> Views:
         """The edge's panoramas, with the best neighbour of either if they are too close together for depth."""
         if self.length(edge) >= _MIN_BASELINE * self.far:
             return edge
@@ -166,6 +189,13 @@ class TourGraph:
         while walk[-1] != start:
             walk.append(int(previous[start, walk[-1]]))
         return walk[::-1]
+
+    def find_next_nodes(self) -> list[list[int]]:
+        """The next node on the cheapest way from a node (row) to another one (column)."""
+        _, previous = self._shortest()  # the costs are symmetric: the node before the end of the way back
+        return [
+            [int(previous[end, node]) if end != node else node for end in range(len(self))] for node in range(len(self))
+        ]
 
     def plan_walk(self, start: int | None = None) -> list[int]:
         """Nodes of a short walk along edges that visits all nodes; some of them more than once.
@@ -337,6 +367,47 @@ def _sweep_error(
     lowest = torch.nn.functional.avg_pool2d(pad_equirect(difference, 2)[:, None], 5, stride=1)[:, 0].amin(dim=0)
     weights = row_weights(height, dtype=lowest.dtype)[:, None].expand(height, width)
     return float((lowest * weights).sum() / weights.sum())
+
+
+# --- one scene of all panoramas ---
+
+
+def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene]) -> Scene:
+    """One scene of all panoramas. The Gaussians of each panorama are those of one scene (`TourGraph.choose_sources`).
+
+    Args:
+        tour: the graph.
+        load: returns the scene of some panoramas; called once for each scene that is needed.
+    """
+    parts: dict[int, Gaussians] = {}
+    names: dict[int, str] = {}
+    scene = None
+    for views, provided in tour.choose_sources().items():
+        scene = load(views)
+        for node in provided:
+            view = views.index(node)
+            part = scene.gaussians.select(scene.gaussians.views == view)
+            parts[node] = dataclasses.replace(part, views=torch.full_like(part.views, node, dtype=torch.int64))
+            names[node] = scene.names[view] if view < len(scene.names) else tour.panoramas[node].name
+    assert scene is not None
+    return dataclasses.replace(
+        scene,
+        gaussians=Gaussians.cat([parts[node] for node in range(len(tour))]),
+        cam2world=tour.cam2world,
+        near=tour.near,
+        far=tour.far,
+        names=tuple(names[node] for node in range(len(tour))),
+        gains=(),
+    )
+
+
+def make_graph(scene: Scene) -> TourGraph:
+    """The cameras of a scene as panoramas of a tour without edges, for its floor plan."""
+    names = [scene.names[k] if k < len(scene.names) else f"panorama {k + 1}" for k in range(len(scene.cam2world))]
+    panoramas = tuple(
+        Panorama(name, Path(name), pose) for name, pose in zip(names, scene.cam2world.double(), strict=True)
+    )
+    return TourGraph("", Path(), panoramas, scene.near, scene.far)
 
 
 # --- routes ---
@@ -606,3 +677,56 @@ def draw_floor_plan(
     plan.image[floor > 0] = (96, 104, 116, 255)
     plan.image[wall > 0] = (228, 230, 235, 255)
     return plan
+
+
+def find_floor_outlines(tour: TourGraph, scene: Scene, views: Views) -> dict[int, FloorOutline]:
+    """The floor outlines of a scene's views that show a floor, by panorama."""
+    outlines = {node: find_floor_outline(scene, view, tour.level_axes) for view, node in enumerate(views)}
+    return {node: outline for node, outline in outlines.items() if outline is not None}
+
+
+def write_floor_plan(scene: Scene, path: str | Path, tour: TourGraph | None = None) -> None:
+    """Write the floor plan of a scene as an image.
+
+    Args:
+        scene: with input cameras.
+        path: the file, such as a .png.
+        tour: the graph whose panoramas are the scene's views; draws its edges.
+
+    Raises:
+        InputError: no view shows a floor, or the file cannot be written.
+    """
+    tour = make_graph(scene) if tour is None else tour
+    outlines = find_floor_outlines(tour, scene, tuple(range(len(tour)))) if len(tour) else {}
+    if not outlines:
+        raise InputError(
+            f"cannot write {path}: needed a floor below at least one of the {len(tour)} input cameras, got none; "
+            "export a folder of upright panoramas"
+        )
+    write_image(path, paint_floor_plan(tour, list(outlines.values())).astype(np.float32) / 255)
+
+
+def paint_floor_plan(
+    tour: TourGraph, outlines: Sequence[FloorOutline], *, size: int = PLAN_SIZE, route: Route | None = None
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The floor plan over dark grey with the names of the panoramas, the edges between them, and a route.
+
+    Args:
+        tour, outlines, size: see `draw_floor_plan`.
+        route: drawn instead of the edges.
+    """
+    plan = draw_floor_plan(tour, outlines, size=size)
+    alpha = plan.image[..., 3:] / 255.0
+    image = np.ascontiguousarray((plan.image[..., :3] * alpha + 24 * (1 - alpha)).astype(np.uint8))
+    axes = tour.level_axes[:, (0, 2)]
+    centers = plan.to_pixels(tour.positions @ axes).round().astype(np.int32)
+    if route is not None:
+        line = plan.to_pixels(route.positions @ axes).round().astype(np.int32)
+        cv2.polylines(image, [line], False, (255, 204, 51), 2, cv2.LINE_AA)
+    else:
+        for edge in tour.overlaps:
+            cv2.polylines(image, [centers[list(edge)]], False, (170, 180, 190), 1, cv2.LINE_AA)
+    for panorama, (x, y) in zip(tour.panoramas, centers.tolist(), strict=True):
+        cv2.circle(image, (x, y), 6, (90, 204, 255), -1, cv2.LINE_AA)
+        cv2.putText(image, panorama.name, (x + 9, y + 5), 0, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    return image

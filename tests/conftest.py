@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib.util
+import itertools
 import json
 import os
 import signal
@@ -157,6 +158,27 @@ def _write_pair(folder: Path, *, height: int = 16, seed: int = 0) -> Path:
         poses[name] = {"cam2world": pose.tolist()}
     (folder / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
     return folder
+
+
+def _write_tour(folder: Path, count: int = 3, *, height: int = 16) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    random = np.random.default_rng(0)
+    poses, names = {}, [f"p{index}.png" for index in range(count)]
+    for index, name in enumerate(names):
+        Image.fromarray(random.integers(0, 255, (height, 2 * height, 3), dtype=np.uint8)).save(folder / name)
+        pose = np.eye(4)
+        pose[2, 3] = 0.5 * index
+        poses[name] = {"cam2world": pose.tolist()}
+    (folder / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
+    pairs = [{"context": [a, b]} for a, b in itertools.pairwise(names)]
+    (folder / "pairs.json").write_text(json.dumps({"pairs": pairs}))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def write_tour() -> Callable[..., Path]:
+    """Write noise panoramas in a row, 0.5 m apart; each and the next one are a pair."""
+    return _write_tour
 
 
 @pytest.fixture(scope="session")

@@ -92,6 +92,27 @@ def test_only_steps_whose_inputs_changed_are_done_again(
     assert not set(process("predict", "export").outputs) & set(first.outputs)
 
 
+def test_a_tour_has_a_file_for_each_scene_and_one_page(
+    tmp_path: Path, sphere: None, write_tour: Callable[..., Path], write_pair: Callable[..., Path]
+) -> None:
+    house, out = write_tour(tmp_path / "house", 4, height=HEIGHT), tmp_path / "out"
+
+    def process(*steps: str, **options: Any) -> batch.ItemReport:
+        return process_item(Item("house", house), BatchOptions(steps, "sphere", height=HEIGHT, **options), "1", out)
+
+    report = process("predict", "export", gaussians=500)
+    assert report.error is None and report.status == "done"
+    predictions, (page,) = report.outputs[:-1], report.outputs[-1:]
+    assert len(predictions) == 2 and page.endswith("-house tour.html")
+    assert len(json.loads((out / page).read_text().split("const HEADER = ")[1].split(";\n")[0])["edges"]) == 3
+    assert process("predict", "export", gaussians=500).status == "skipped"
+    whole = process("export", suffix=".splat")  # nothing is predicted into files
+    assert whole.error is None and len(whole.outputs) == 1
+    assert (out / whole.outputs[0]).stat().st_size == 32 * 4 * HEIGHT * 2 * HEIGHT
+    one = process_item(Item("pair", house, "p1-p2"), BatchOptions(("predict",), "sphere", height=HEIGHT), "1", out)
+    assert one.error is None and len(one.outputs) == 1
+
+
 def test_a_worker_with_another_predictor_is_refused(rooms: Path, tmp_path: Path, sphere: None) -> None:
     options = BatchOptions(model="sphere", height=HEIGHT)
     report = process_item(Item("room0", rooms / "room0"), options, "2", tmp_path / "out")

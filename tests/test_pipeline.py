@@ -1,6 +1,7 @@
 """Predict into memory or a file, render, save and load."""
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,6 @@ import torch
 from PIL import Image
 
 from pansplat import pipeline
-from pansplat.cli import predict as predict_command
 from pansplat.cli import run
 from pansplat.errors import InputError
 from pansplat.gaussians.harmonics import official_harmonics
@@ -19,8 +19,19 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.model import network
 from pansplat.model.pansplat import PanSplat
 from pansplat.model.weights import pack_weights, save_weights
-from pansplat.pipeline import load, load_model, predict, predict_to_file, render, save
+from pansplat.pipeline import (
+    load,
+    load_model,
+    load_pairs,
+    predict,
+    predict_to_file,
+    predict_tour,
+    refine_to_file,
+    render,
+    save,
+)
 from pansplat.rendering import blend, rasterize
+from pansplat.tours import find_tours
 
 HEIGHT = 16
 
@@ -169,7 +180,7 @@ def masked_pair(tmp_path: Path, write_pair) -> Path:
 def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_config) -> Path:
     """Weights of a small network that cuts panoramas of 64 rows into four tiles; the command streams such panoramas."""
     monkeypatch.setattr(network, "_UNTILED_HEIGHT", TILED_HEIGHT // 2)
-    monkeypatch.setattr(predict_command, "_MAX_CACHED_HEIGHT", TILED_HEIGHT // 2)
+    monkeypatch.setattr(pipeline, "_MAX_CACHED_HEIGHT", TILED_HEIGHT // 2)
     torch.manual_seed(0)
     path = tmp_path / "small.safetensors"
     save_weights(path, pack_weights("pansplat", small_config, PanSplat(small_config).state_dict(), compat="fixed"))
@@ -221,14 +232,46 @@ def test_the_predict_command_streams_large_predictions(
     assert run([*command, "-o", str(tmp_path / "tiles.ply")]) == 0
     assert "Gaussians from left, right in" in capsys.readouterr().out
     monkeypatch.undo()
-    assert run([*command, "-o", str(tmp_path / "whole.ply"), "--no-cache"]) == 0
+    assert run([*command, "-o", str(tmp_path / "whole.ply")]) == 0  # of a height that is cached
     tiles, whole = (load(tmp_path / name).gaussians for name in ("tiles.ply", "whole.ply"))
     assert tiles.degree == whole.degree == 0
     np.testing.assert_allclose(_sorted_rows(tiles)[:, 0], _sorted_rows(whole)[:, 0], atol=1e-5)
 
 
-def test_predict_to_file_refuses_other_predictors_and_suffixes(pair_folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="`model` must be a network to write tile by tile, got sweep"):
-        predict_to_file(pair_folder, tmp_path / "a.ply", "sweep")
-    with pytest.raises(InputError, match=r"must end in \.ply"):
-        predict_to_file(pair_folder, tmp_path / "a.obj", "sweep")
+@pytest.mark.slow
+def test_tiles_are_written_in_every_format(masked_pair: Path, weights: Path, tmp_path: Path) -> None:
+    count = predict_to_file(masked_pair, tmp_path / "tiles.glb", weights, height=TILED_HEIGHT)
+    scene = predict(masked_pair, weights, height=TILED_HEIGHT, cache=False)
+    assert count == len(scene.gaussians) == len(load(tmp_path / "tiles.glb").gaussians)
+
+
+def test_predictions_and_refinements_are_written_in_the_format_of_the_suffix(
+    pair_folder: Path, tmp_path: Path, sphere_predictor: type
+) -> None:
+    predictor = sphere_predictor()
+    scene = predict(pair_folder, predictor, cache=False)
+    assert predict_to_file(pair_folder, tmp_path / "a.splat", predictor) == len(scene.gaussians)
+    assert (tmp_path / "a.splat").stat().st_size == 32 * len(scene.gaussians)
+    views = load_pairs(pair_folder)[0].load_context(scene.height)
+    refined, report = refine_to_file(scene, views, tmp_path / "b.glb", steps=1)
+    assert report.steps == 1 and load(tmp_path / "b.glb").names == refined.names == ("left", "right")
+    for write in (
+        lambda path: predict_to_file(pair_folder, path, predictor),
+        lambda path: refine_to_file(scene, views, path, steps=1),
+    ):
+        with pytest.raises(InputError, match=r"must end in \.compressed\.ply, .*got '\.obj'"):
+            write(tmp_path / "a.obj")
+    assert predictor.calls == 2, "a wrong suffix is refused before the work"
+
+
+def test_the_scene_of_a_tour_holds_each_panorama_once(
+    tmp_path: Path, write_tour: Callable[..., Path], sphere_predictor: type
+) -> None:
+    (tour,) = find_tours(load_pairs(write_tour(tmp_path / "house", 4)))
+    predictor = sphere_predictor()
+    scene = predict_tour(tour, predictor, cache=False)
+    assert predictor.calls == len(tour.choose_sources()) == 3
+    assert scene.gaussians.views.bincount().tolist() == [64 * 128] * 4  # the smallest height
+    assert scene.cam2world.equal(tour.cam2world) and scene.names == tuple(f"p{k}" for k in range(4))
+    distances = (scene.gaussians.means - scene.cam2world[scene.gaussians.views, :3, 3].float()).norm(dim=1)
+    torch.testing.assert_close(distances, torch.full_like(distances, 2.0))

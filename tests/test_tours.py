@@ -1,16 +1,19 @@
 """Graphs of panoramas, walks, smooth routes, overlap of images, and floor plans."""
 
+import dataclasses
 import itertools
 import math
 from pathlib import Path
 
 import numpy as np
+import PIL.Image
 import pytest
 import torch
 
 import pansplat.tours as tours
 from pansplat.data.images import write_image
 from pansplat.data.pairs import Pair, Panorama
+from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
@@ -76,6 +79,39 @@ def test_the_scene_of_an_edge_holds_both_ends_and_shares_a_third():
 def test_panoramas_too_close_for_depth_get_a_third():
     tour = make_tour(((0, 0), (0, 0.1), (0, 2)), ((0, 1), (1, 2)))
     assert tour.choose_scene_views()[0, 1] == (0, 1, 2)
+
+
+def test_one_scene_of_all_panoramas_takes_each_from_the_scene_of_the_largest_overlap():
+    tour = make_tour(((0, 0), (0, 1), (1, 0), (3, 0)), ())
+    overlaps = {(0, 1): 0.3, (0, 2): 0.2, (1, 2): 0.25, (2, 3): 0.5}
+    tour = dataclasses.replace(tour, overlaps=overlaps)
+    assert tour.choose_sources() == {(2, 3): (2, 3), (0, 1, 2): (0, 1)}
+    loaded = []
+
+    def load(views: tuple[int, ...]) -> Scene:
+        loaded.append(views)
+        count = 10 * len(views)
+        labels = torch.arange(count) % len(views)
+        means = torch.tensor(views)[labels, None].float().expand(count, 3)
+        sizes, colors = torch.ones(count, 3), torch.zeros(count, 1, 3)
+        gaussians = Gaussians(means, sizes, torch.ones(count, 4), torch.ones(count), colors, labels, labels.byte())
+        return Scene(gaussians, tour.cam2world[list(views)], 1.0, 2.0, tuple(f"{view}.jpg" for view in views))
+
+    scene = tours.merge_scenes(tour, load)
+    assert loaded == [(2, 3), (0, 1, 2)]
+    assert scene.gaussians.views.tolist() == [0] * 10 + [1] * 10 + [2] * 10 + [3] * 10
+    assert scene.gaussians.means[:, 0].equal(scene.gaussians.views.float())
+    assert scene.names == ("0.jpg", "1.jpg", "2.jpg", "3.jpg") and scene.cam2world.equal(tour.cam2world)
+    assert (scene.near, scene.far) == (0.45, 10.0)
+
+
+def test_next_nodes_lead_along_the_cheapest_walk(comb):
+    following = comb.find_next_nodes()
+    for start, end in itertools.product(range(6), repeat=2):
+        walk = [start]
+        while walk[-1] != end:
+            walk.append(following[walk[-1]][end])
+        assert walk == comb.find_walk(start, end)
 
 
 def test_a_pair_of_a_scene_has_its_panoramas(comb):
@@ -208,3 +244,16 @@ def test_the_plan_shows_the_floor_and_its_walls(room_scene):
     empty = draw_floor_plan(tour, [])
     assert empty.image.max() == 0
     assert math.isfinite(empty.pixels_per_metre) and tours.MIN_PANORAMAS == 3
+
+
+def test_the_plan_of_a_scene_is_a_file_with_its_panoramas(room_scene, tmp_path):
+    tours.write_floor_plan(room_scene, tmp_path / "plan.png")
+    with PIL.Image.open(tmp_path / "plan.png") as image:
+        colors = np.asarray(image.convert("RGB")).astype(int)
+    assert max(colors.shape[:2]) in (1024, 1025)
+    assert (np.abs(colors - (90, 204, 255)).max(axis=2) < 12).sum() > 60, "the dot of the panorama"
+    empty = dataclasses.replace(room_scene, gaussians=room_scene.gaussians.select(torch.arange(20)))
+    for scene in (empty, dataclasses.replace(empty, cam2world=torch.zeros(0, 4, 4, dtype=torch.float64))):
+        with pytest.raises(InputError, match="needed a floor below"):
+            tours.write_floor_plan(scene, tmp_path / "none.png")
+    assert not (tmp_path / "none.png").exists()

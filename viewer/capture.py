@@ -13,7 +13,7 @@ from pansplat.data.video import VIDEO_SUFFIXES, write_video
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose, path_poses
 from pansplat.geometry.pose import interpolate_poses
-from pansplat.tours import FloorPlan, Route, draw_floor_plan
+from pansplat.tours import Route, paint_floor_plan
 from pansplat_viewer import camera as cameras
 from pansplat_viewer.camera import Camera
 from pansplat_viewer.cpu_renderer import Renderer
@@ -24,7 +24,6 @@ from pansplat_viewer.state import NEAR_OF_FAR, ViewerState, enter_scene, fit_set
 from pansplat_viewer.tour import CrossFade, TourScenes
 
 FILM_SECONDS = 4.0  # of a pair
-PLAN_SIZE = 1024  # of the longer side of a floor plan, pixels
 STILLS = (0.0, 0.25, 0.5, 0.75, 1.0)  # fractions of the flight
 
 
@@ -260,9 +259,9 @@ def write_tour(
 
     written = [folder / "tour.mp4"]
     write_video(written[0], render_frames(), film.fps)
-    plan = draw_floor_plan(scenes.tour, list(scenes.outlines.values()), size=PLAN_SIZE)
     written.append(folder / "floor_plan.png")
-    write_image(written[1], _draw_route(plan, scenes, route))
+    plan = paint_floor_plan(scenes.tour, list(scenes.outlines.values()), route=route)
+    write_image(written[1], plan.astype(np.float32) / 255)
     progress("done", 1.0)
     return written
 
@@ -366,21 +365,6 @@ def name_frame(file: Path, frame: int) -> Path:
 def to_bytes(color: Float[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
     """Colours in [0, 1] as 8 bits."""
     return (color * 255 + 0.5).astype(np.uint8)
-
-
-def _draw_route(plan: FloorPlan, scenes: TourScenes, route: Route) -> Float[np.ndarray, "height width 3"]:
-    """The floor plan over dark grey, with the route and the panoramas."""
-    import cv2
-
-    alpha = plan.image[..., 3:] / 255.0
-    image = np.ascontiguousarray((plan.image[..., :3] * alpha + 24 * (1 - alpha)).astype(np.uint8))
-    axes = scenes.tour.level_axes[:, (0, 2)]
-    line = plan.to_pixels(route.positions @ axes).round().astype(np.int32)
-    cv2.polylines(image, [line], False, (255, 204, 51), 2, cv2.LINE_AA)
-    for panorama, (x, y) in zip(scenes.tour.panoramas, plan.to_pixels(scenes.tour.positions @ axes), strict=True):
-        cv2.circle(image, (round(x), round(y)), 6, (90, 204, 255), -1, cv2.LINE_AA)
-        cv2.putText(image, panorama.name, (round(x) + 9, round(y) + 5), 0, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
-    return image.astype(np.float32) / 255
 
 
 def _render(

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from pansplat.tours import FloorOutline, TourGraph
 
 PHOTO_HEIGHT = 1024  # smallest height of the photographs for comparison, pixels
-TOUR_HEIGHT = 512  # largest default height of the panoramas of a tour, pixels; it has many scenes
 
 Progress = Callable[[str, float], None]  # task, fraction done
 
@@ -165,8 +164,7 @@ def _load_tour_scene(
 ) -> LoadedScene:
     """Predict and refine one scene of a tour, with its floor outlines; the first one after its graph is connected."""
     from pansplat import pipeline
-    from pansplat.predictor import MIN_HEIGHT
-    from pansplat.tours import connect, find_floor_outline
+    from pansplat.tours import connect, find_floor_outlines
 
     tour, views = entry.tour, entry.views
     assert tour is not None
@@ -178,16 +176,14 @@ def _load_tour_scene(
     pair = entry.pair or tour.make_pair(views)
 
     def finish(scene: "Scene", is_final: bool) -> LoadedScene:
-        outlines = {node: find_floor_outline(scene, view, tour.level_axes) for view, node in enumerate(views)}
-        known = {node: outline for node, outline in outlines.items() if outline is not None}
-        return LoadedScene(entry, scene, is_final=is_final, outlines=known)
+        return LoadedScene(entry, scene, is_final=is_final, outlines=find_floor_outlines(tour, scene, views))
 
     scene = pipeline.predict(
         pair,
         model=options.model,
         compat=options.compat,
         precision=options.precision,
-        height=options.height or max(MIN_HEIGHT, min(pair.image_height, TOUR_HEIGHT)),
+        height=options.height or pipeline.choose_tour_height(pair),
         refine_seconds=options.refine_seconds,
         cache=options.cache,
         progress=progress,

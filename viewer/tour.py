@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
-from pansplat.tours import Edge, FloorOutline, Route, TourGraph, plan_route
+from pansplat.tours import EDGE_HYSTERESIS, Edge, FloorOutline, Route, TourGraph, Views, plan_route
 from pansplat_viewer.camera import Camera
 from pansplat_viewer.loader import LoadedScene, SceneEntry
 from pansplat_viewer.picking import project_point
@@ -21,13 +21,9 @@ from pansplat_viewer.picking import project_point
 FADE_SECONDS = 1.0
 DEFAULT_MEMORY = 2.0  # GiB, of the scenes of a tour
 _NEXT_SCENES = 3  # that are predicted before they are needed
-_HYSTERESIS = 0.25  # metres that another edge must be nearer than the current one
 _HOTSPOT_RADIUS = 0.22  # metres, on the floor
 _MIN_HOTSPOT_PIXELS = 14.0
 _CAMERA_HEIGHT = 0.15  # over the floor, as a fraction of far, if no floor outline is known
-
-Views = tuple[int, ...]
-"""The panoramas of a scene, by their number in the tour."""
 
 
 class TourScenes:
@@ -98,7 +94,7 @@ class TourScenes:
         edge = None if route is None else route.edge(fraction)
         if edge is None:
             edge, distance = self.tour.find_nearest_edge(position)
-            if self.tour.measure_distance(self.edge, position) <= distance + _HYSTERESIS:
+            if self.tour.measure_distance(self.edge, position) <= distance + EDGE_HYSTERESIS:
                 edge = self.edge
         self.edge = edge
 

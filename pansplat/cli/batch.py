@@ -52,7 +52,7 @@ class Batch:
     refine: Seconds = 10.0
     """Time limit of the refinement of a pair, seconds."""
     format: str = "html"
-    """Format of the export: html, ply, compressed.ply, spz, splat, sog or glb."""
+    """Format of the export: html, png (a floor plan), ply, compressed.ply, spz, splat, sog or glb."""
     gaussians: Count | None = None
     """For html: largest number of Gaussians, 300,000 by default."""
 

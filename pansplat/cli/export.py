@@ -1,4 +1,4 @@
-"""`pansplat export`: a scene in the formats of other programs, or as a web page."""
+"""`pansplat export`: a scene or tour in the formats of other programs, as a web page, or as a floor plan."""
 
 from __future__ import annotations
 
@@ -11,26 +11,28 @@ from tyro.conf import Positional
 
 from pansplat.cli.inputs import Out, ScenePrediction, progress_bar
 from pansplat.errors import InputError
-from pansplat.files import SCENE_SUFFIXES, find_scene_suffix, require_output_file
+from pansplat.files import SCENE_SUFFIXES, find_scene_suffix, is_scene_file, require_output_file
 from pansplat.options import WHOLE, Count, Fraction, Range
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from pansplat.gaussians.scene import Scene
+    from pansplat.tours import TourGraph
 
-_PAGE_SUFFIX = ".html"
+_PAGE_SUFFIX, _PLAN_SUFFIX = ".html", ".png"
 
 
 @dataclass(frozen=True)
 class Export:
-    """Write a scene, or the prediction of a pair, in the format of the file's suffix (docs/formats.md), or as a web
-    page (.html, docs/web.md)."""
+    """Write a scene, or the prediction of a pair or tour, in the format of the file's suffix (docs/formats.md), as a
+    web page (.html, docs/web.md) or as a floor plan (.png)."""
 
     path: Positional[Path]
-    """A scene file, or the folder of a pair."""
+    """A scene file, the folder of a pair, or that of a tour of three or more panoramas."""
     out: Out
-    """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb; .html for a web page."""
+    """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb; .html for a web page; .png for a floor
+    plan."""
     points: bool = False
     """Write a .ply of plain points with colours, for programs without Gaussians."""
     degree: Annotated[int, Range(0, 4), WHOLE] | None = None
@@ -52,19 +54,26 @@ class Export:
         from pansplat.gaussians.formats import save_scene
         from pansplat.gaussians.ply import save_points
         from pansplat.gaussians.scene import prune
+        from pansplat.tours import write_floor_plan
 
-        require_output_file("--out", self.out, (*SCENE_SUFFIXES, _PAGE_SUFFIX))
-        is_page = self.out.suffix.lower() == _PAGE_SUFFIX
-        if self.points and (is_page or find_scene_suffix(self.out) != ".ply"):
+        require_output_file("--out", self.out, (*SCENE_SUFFIXES, _PAGE_SUFFIX, _PLAN_SUFFIX))
+        is_page, is_plan = (self.out.suffix.lower() == suffix for suffix in (_PAGE_SUFFIX, _PLAN_SUFFIX))
+        if self.points and (is_page or is_plan or find_scene_suffix(self.out) != ".ply"):
             raise InputError(f"--points writes a .ply, got {self.out}; leave it out, or choose another name")
         if not is_page and (self.gaussians is not None or self.split or self.title is not None):
             raise InputError(f"--gaussians, --split and --title are for an .html page, got {self.out}; leave them out")
-        scene = self.prediction.open(self.path)
+        if self.up is not None and not is_scene_file(self.path):
+            raise InputError(f"--up is for a scene file, and {self.path} is a folder of panoramas; leave it out")
+        scene, tour = self.prediction.open_tour(self.path)
         if self.up is not None:
             scene = scene.rotated(_rotation_from(self.up))
         gaussians = prune(scene.gaussians, degree=self.degree, min_opacity=self.min_opacity)
         if is_page:
-            self._write_page(dataclasses.replace(scene, gaussians=gaussians))
+            self._write_page(dataclasses.replace(scene, gaussians=gaussians), tour)
+            return 0
+        if is_plan:
+            write_floor_plan(dataclasses.replace(scene, gaussians=gaussians), self.out, tour)
+            print(f"{self.out}: the floors of {len(scene.cam2world)} panoramas")
             return 0
         if self.points:
             save_points(gaussians, self.out)
@@ -75,14 +84,16 @@ class Export:
         print(f"{self.out}: {len(gaussians):,} {kind}, {size:,} bytes ({size / max(len(gaussians), 1):.1f} each)")
         return 0
 
-    def _write_page(self, scene: Scene) -> None:
+    def _write_page(self, scene: Scene, tour: TourGraph | None) -> None:
         """Write the web page and print its size."""
         from pansplat.web import DEFAULT_GAUSSIANS, write_page
 
         count = DEFAULT_GAUSSIANS if self.gaussians is None else self.gaussians
         title = self.title or self.path.resolve().stem.replace("_", " ")
         with progress_bar() as progress:
-            page = write_page(scene, self.out, gaussians=count, split=self.split, title=title, progress=progress)
+            page = write_page(
+                scene, self.out, tour=tour, gaussians=count, split=self.split, title=title, progress=progress
+            )
         beside = f" and {len(page.files) - 1} files in {page.files[1].parent.name}/" if self.split else ""
         print(
             f"{self.out}{beside}: {page.num_gaussians:,} Gaussians, {page.num_bytes / 1e6:.1f} MB; open it in a browser"

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from pansplat.data.pairs import Pair
     from pansplat.gaussians.scene import Scene
     from pansplat.predictor import Predictor, Progress
+    from pansplat.tours import TourGraph
 
 Out = Annotated[Path, arg(aliases=["-o"])]
 OptionalOut = Annotated[Path | None, arg(aliases=["-o"])]
@@ -67,16 +68,48 @@ class ScenePrediction:
 
         if is_scene_file(path):
             return pipeline.load(path)
-        pair = choose_pair(path, self.choice)
+        return self._predict_pair(choose_pair(path, self.choice))
+
+    def open_tour(self, path: Path) -> tuple[Scene, TourGraph | None]:
+        """The scene of a file, of the chosen pair, or of the first tour of a folder, with the tour's graph."""
+        from pansplat import pipeline
+        from pansplat.tours import connect, find_tours
+
+        if is_scene_file(path):
+            return pipeline.load(path), None
+        pairs = load_choice(path, self.choice)
+        tours = find_tours(pairs) if self.choice.pair is None else []
+        if not tours:
+            return self._predict_pair(pick_pair(path, pairs, self.choice)), None
+        more = f"; {len(tours) - 1} other tours are left out" if len(tours) > 1 else ""
+        print(f"note: {path}: a tour of {len(tours[0])} panoramas (--pair chooses one pair){more}", file=sys.stderr)
+        model = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
+        with progress_bar() as progress:
+            tour = connect(tours[0], progress)
+            height, seconds = self.predict_height, self.refine
+            return pipeline.predict_tour(tour, model, height=height, refine_seconds=seconds, progress=progress), tour
+
+    def _predict_pair(self, pair: Pair) -> Scene:
+        from pansplat import pipeline
+
         model = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
         return predict_scene(pair, model, self.predict_height, cache=True, refine_seconds=self.refine)
 
 
 def choose_pair(path: Path, choice: PairChoice) -> Pair:
     """The chosen pair of a folder; without a choice the first one, with a note if there are more."""
+    return pick_pair(path, load_choice(path, choice), choice)
+
+
+def load_choice(path: Path, choice: PairChoice) -> list[Pair]:
+    """The pairs of a folder."""
     from pansplat import pipeline
 
-    pairs = pipeline.load_pairs(path, convention=choice.convention, near=choice.near, far=choice.far)
+    return pipeline.load_pairs(path, convention=choice.convention, near=choice.near, far=choice.far)
+
+
+def pick_pair(path: Path, pairs: list[Pair], choice: PairChoice) -> Pair:
+    """The chosen one of the pairs of a folder; without a choice the first one, with a note if there are more."""
     names = [pair.name for pair in pairs]
     listed = ", ".join(f"{number}: {name}" for number, name in enumerate(names, 1))
     if choice.pair is None:

@@ -22,7 +22,7 @@ from pansplat.cli.inputs import (
     progress_bar,
 )
 from pansplat.errors import InputError
-from pansplat.files import is_scene_file, require_output_file
+from pansplat.files import SCENE_SUFFIXES, is_scene_file, require_output_file
 from pansplat.options import Count, Height, Seconds, Seed
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Refine:
-    """Fit a scene to its own photographs by rendering and comparison, and write it as a 3DGS .ply file.
+    """Fit a scene to its own photographs by rendering and comparison, and write it in the format of the file's suffix.
 
     Ctrl+C ends the refinement early and writes the scene as it is then.
     """
@@ -41,7 +41,7 @@ class Refine:
     path: Positional[Path]
     """Folder of a pair, or a scene file with --photographs."""
     out: Out
-    """The .ply file to write."""
+    """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb."""
     photographs: Path | None = None
     """Folder of the pair that a scene file was predicted from."""
     seconds: Seconds | None = None
@@ -71,18 +71,24 @@ class Refine:
         """Refine, write the scene and print the errors of held-out pixels."""
         from pansplat import pipeline
         from pansplat.evaluation.report import write_json
-        from pansplat.refinement import RefineConfig, Refinement
+        from pansplat.refinement import RefineConfig
 
         self._refuse_invalid_arguments()
         scene, views = self._open_scene()
         config = RefineConfig(gaussians=self.gaussians, poses=self.poses)
-        seconds = 10.0 if self.seconds is None and self.steps is None else self.seconds
         with stop_at_interrupt() as should_stop, progress_bar() as progress:
             progress("preparing", 0.0)
-            refinement = Refinement(scene, views, config, seed=self.seed)
-            report = refinement.run(seconds=seconds, steps=self.steps, progress=progress, should_stop=should_stop)
-        refined = refinement.scene()
-        pipeline.save(refined, self.out)
+            refined, report = pipeline.refine_to_file(
+                scene,
+                views,
+                self.out,
+                seconds=self.seconds,
+                steps=self.steps,
+                config=config,
+                seed=self.seed,
+                progress=progress,
+                should_stop=should_stop,
+            )
         if self.report is not None:
             write_json(dataclasses.asdict(report), self.report)
         print(_describe(report))
@@ -91,7 +97,7 @@ class Refine:
 
     def _refuse_invalid_arguments(self) -> None:
         """Raise an error before the prediction, which takes seconds."""
-        require_output_file("--out", self.out, (".ply",))
+        require_output_file("--out", self.out, SCENE_SUFFIXES)
         if self.report is not None:
             require_output_file("--report", self.report, (".json",))
         if self.seconds is not None and self.steps is not None:

@@ -10,6 +10,7 @@
   const MIN_FOV = 20, MAX_FOV = 110;  // degrees, vertical
   const MIN_WEIGHT = 1e-4;            // of a view: with it, the other views fill the holes of a view at its own camera
   const BATCH = HEADER.batch;         // quads of one instance
+  const FADE_MS = 1000;               // from the views of one edge to those of the next
   const MAX_PIXELS = 3e6;             // of the canvas: limits the memory of its render targets
 
   // ---- loading ----
@@ -189,12 +190,15 @@
       gl.disable(gl.DEPTH_TEST);
       gl.activeTexture(gl.TEXTURE0);
       this.setCamera(position, rotation, focal, half);
+      let first = true;
       HEADER.views.forEach(({ start, count }, view) => {
+        if (!weights[view]) return;
         gl.bindFramebuffer(gl.FRAMEBUFFER, layer.framebuffer);
         gl.clearBufferfv(gl.COLOR, 0, [0, 0, 0, 0]);
         if (count) this.drawLayer(start, count);
         gl.bindFramebuffer(gl.FRAMEBUFFER, sum.framebuffer);
-        this.addLayer(layer.textures[0], weights[view], view === 0);
+        this.addLayer(layer.textures[0], weights[view], first);
+        first = false;
       });
       gl.bindFramebuffer(gl.FRAMEBUFFER, null);
       gl.disable(gl.BLEND);
@@ -267,14 +271,87 @@
     }
   }
 
-  // Weights of the views at a position: normalised inverse distances (docs/rendering.md, section 7).
-  function blendWeights(position) {
-    const distances = HEADER.views.map((view) => Math.hypot(...minus(position, view.position)));
+  // Weights of the views of a group at a position: normalised inverse distances (docs/rendering.md, section 7). Other
+  // views have weight 0.
+  function groupWeights(group, position) {
+    const views = HEADER.groups[group], weights = HEADER.views.map(() => 0);
+    const distances = views.map((view) => Math.hypot(...minus(position, HEADER.views[view].position)));
     const nearest = Math.min(...distances);
     const closeness = distances.map((distance) => distance > 0 ? nearest / distance : 1);
     const sum = closeness.reduce((a, b) => a + b);
-    return closeness.map((value) => Math.max(value / sum, MIN_WEIGHT));
+    views.forEach((view, i) => { weights[view] = Math.max(closeness[i] / sum, MIN_WEIGHT); });
+    return weights;
   }
+
+  // The views of the edge at the camera, and for a second after a change also those of the edge before.
+  function blendWeights(position) {
+    const weights = groupWeights(group, position);
+    if (!fade) return weights;
+    const old = groupWeights(fade.group, position);
+    return weights.map((weight, view) => fade.done * weight + (1 - fade.done) * old[view]);
+  }
+
+  // ---- the graph of a tour ----
+
+  let edge = 0, group = HEADER.edges.length ? HEADER.edges[0][2] : 0, fade = null;
+
+  function distanceToEdge([a, b], position) {
+    const from = HEADER.views[a].position, along = minus(HEADER.views[b].position, from), offset = minus(position, from);
+    const fraction = clamp(dot(offset, along) / Math.max(dot(along, along), 1e-12), 0, 1);
+    return Math.hypot(...minus(offset, scaled(along, fraction)));
+  }
+
+  // Chooses the edge at the camera, the nearest one with hysteresis; its views fade in.
+  function followEdge(now) {
+    if (fade) {
+      const t = clamp((now - fade.began) / FADE_MS, 0, 1);
+      fade.done = t * t * (3 - 2 * t);
+      if (t === 1) fade = null;
+      changed();
+      return;
+    }
+    const [nearest, distance] = nearestEdge(camera.position);
+    if (nearest === edge || distanceToEdge(HEADER.edges[edge], camera.position) <= distance + HEADER.hysteresis) return;
+    const old = group;
+    settle(nearest);
+    if (group !== old) fade = { group: old, began: now, done: 0 };
+    changed();
+  }
+
+  function nearestEdge(position) {
+    const distances = HEADER.edges.map((candidate) => distanceToEdge(candidate, position));
+    const distance = Math.min(...distances);
+    return [distances.indexOf(distance), distance];
+  }
+
+  // Shows the views of an edge at once.
+  function settle(number) {
+    edge = number;
+    group = HEADER.edges[number][2];
+    fade = null;
+  }
+
+  // The panoramas at the edge of the camera, and those that share an edge with them; without edges all panoramas.
+  function reachable(spot) {
+    if (!HEADER.edges.length) return true;
+    const ends = HEADER.edges[edge];
+    return spot === ends[0] || spot === ends[1] ||
+      HEADER.edges.some(([a, b]) => (a === spot && (b === ends[0] || b === ends[1])) || (b === spot && (a === ends[0] || a === ends[1])));
+  }
+
+  // The panoramas on the way from the camera to one of them. The way begins at an end of the edge at the camera.
+  function findWay(spot) {
+    if (!HEADER.edges.length) return [spot];
+    const ways = HEADER.edges[edge].slice(0, 2).map((start) => {
+      const way = [start];
+      while (way.at(-1) !== spot) way.push(HEADER.next[way.at(-1)][spot]);
+      return way;
+    });
+    const length = (way) => measure([camera.position, ...way.map((node) => HEADER.spots[node].position)]);
+    return length(ways[0]) <= length(ways[1]) ? ways[0] : ways[1];
+  }
+
+  const measure = (path) => path.slice(1).reduce((sum, point, i) => sum + Math.hypot(...minus(point, path[i])), 0);
 
   // ---- camera ----
 
@@ -323,20 +400,21 @@
     return HEADER.spots.map((spot) => spot.position).reduce((a, b) => distance(b) < distance(a) ? b : a);
   }
 
-  // A smooth flight to a panorama; the direction of view stays the user's.
+  // A smooth flight to a panorama along the edges; the direction of view stays the user's.
   let flight = null, touring = false;
   function flyTo(spot) {
-    const from = [...camera.position], to = HEADER.spots[spot].position, length = Math.hypot(...minus(to, from));
-    const seconds = clamp(1.2 * length / HEADER.speed, 0.6, 3);
-    flight = { spot, from, to, seconds, began: performance.now() };
+    const path = [[...camera.position], ...findWay(spot).map((node) => HEADER.spots[node].position)];
+    const length = measure(path), seconds = clamp(1.2 * length / HEADER.speed, 0.6, 3 * (path.length - 1));
+    flight = { spot, path, length, seconds, began: performance.now() };
     changed();
   }
+
+  const ease = (t) => t * t * t * (t * (6 * t - 15) + 10);
 
   function advanceFlight(now) {
     if (!flight) return;
     const t = clamp((now - flight.began) / (1000 * flight.seconds), 0, 1);
-    const eased = t * t * t * (t * (6 * t - 15) + 10);
-    camera.position = t < 1 ? plus(flight.from, scaled(minus(flight.to, flight.from), eased)) : [...flight.to];
+    camera.position = t < 1 ? pointAlong(flight.path, ease(t) * flight.length) : [...flight.path.at(-1)];
     changed();
     if (t < 1) return;
     const { spot } = flight;
@@ -344,12 +422,53 @@
     if (touring) flyTo((spot + 1) % HEADER.spots.length);
   }
 
+  function pointAlong(path, distance) {
+    for (let i = 1; i < path.length; i++) {
+      const step = minus(path[i], path[i - 1]), length = Math.hypot(...step);
+      if (distance < length) return plus(path[i - 1], scaled(step, distance / length));
+      distance -= length;
+    }
+    return [...path.at(-1)];
+  }
+
+  // The flight through all panoramas of a tour. It begins at the point of the route that is nearest to the camera, and
+  // the difference in pose disappears in the first second. The camera turns with the route; a drag adds to it.
+  let route = null;
+  function startRoute() {
+    const distances = HEADER.route.map((sample) => Math.hypot(...minus(sample.slice(0, 3), camera.position)));
+    const least = Math.min(...distances) + 0.02 * HEADER.speed;
+    const first = distances.findIndex((distance) => distance <= least), sample = HEADER.route[first];
+    const turned = camera.yaw - sample[3];
+    route = {
+      time: first / HEADER.routeRate, began: first / HEADER.routeRate, last: null,
+      offset: [...minus(camera.position, sample.slice(0, 3)), turned - 2 * Math.PI * Math.round(turned / (2 * Math.PI)), camera.pitch],
+    };
+  }
+
+  function advanceRoute(seconds) {
+    if (!route) return;
+    route.time += seconds;
+    const at = Math.min(route.time * HEADER.routeRate, HEADER.route.length - 1), index = Math.min(Math.floor(at), HEADER.route.length - 2);
+    const sample = plus(HEADER.route[index], scaled(minus(HEADER.route[index + 1], HEADER.route[index]), at - index));
+    const left = 1 - ease(clamp(route.time - route.began, 0, 1));
+    const [x, y, z, yaw, pitch] = plus([...sample, 0], scaled(route.offset, left));
+    camera.position = [x, y, z];
+    camera.yaw += yaw - (route.last ? route.last.yaw : yaw);
+    camera.pitch = clamp(camera.pitch + pitch - (route.last ? route.last.pitch : pitch), -MAX_PITCH, MAX_PITCH);
+    route.last = { yaw, pitch };
+    changed();
+    if (at === HEADER.route.length - 1) setTouring(false);
+  }
+
   function setTouring(value) {
     touring = value && HEADER.spots.length > 1;
     byId("play").setAttribute("aria-pressed", touring);
     byId("play").querySelector("path").setAttribute("d", touring ? "M7 5h4v14H7zM13 5h4v14h-4z" : "M8 5v14l11-7z");
-    if (!touring) flight = null;
-    else if (!flight) {
+    if (!touring) flight = route = null;
+    else if (HEADER.route.length > 1) {
+      flight = null;
+      startRoute();
+    } else if (!flight) {
       const positions = HEADER.spots.map((spot) => spot.position);
       flyTo((positions.indexOf(nearestSpot(camera.position)) + 1) % positions.length);
     }
@@ -358,6 +477,7 @@
 
   function goHome() {
     setTouring(false);
+    flight = null;
     Object.assign(camera, makeStart());
     changed();
   }
@@ -383,7 +503,10 @@
     const digit = /^(Digit|Numpad)([1-9])$/.exec(event.code);
     if (MOVES[event.code]) held.add(event.code);
     else if (PRESSES[event.code] && !event.repeat) PRESSES[event.code]();
-    else if (digit && HEADER.spots[digit[2] - 1]) flyTo(digit[2] - 1);
+    else if (digit && HEADER.spots[digit[2] - 1]) {
+      setTouring(false);
+      flyTo(digit[2] - 1);
+    }
     else return;
     event.preventDefault();
     if (MOVES[event.code]) setTouring(false);
@@ -515,7 +638,7 @@
       const button = spots[index], offset = minus(spot.mark, camera.position);
       const [x, y, z] = [0, 1, 2].map((k) => dot(column(rotation, k), offset));
       const flat = Math.hypot(...minus(spot.position, camera.position));
-      button.hidden = z < 0.1 * spot.radius || flat < 2 * spot.radius;
+      button.hidden = z < 0.1 * spot.radius || flat < 2 * spot.radius || !reachable(index);
       if (button.hidden) return;
       const size = clamp(2 * spot.radius * focal / z / 64, 0.25, 2), tilt = clamp(y / Math.hypot(x, y, z), 0.25, 1);
       button.style.transform = `translate(${0.5 * width + focal * x / z}px, ${0.5 * height + focal * y / z}px) scale(${size}, ${size * tilt})`;
@@ -557,6 +680,8 @@
     lastFrame = now;
     walkByKeys(Math.min(elapsed, 100) / 1000, fast);
     advanceFlight(now);
+    advanceRoute(Math.min(elapsed, 100) / 1000);
+    if (HEADER.edges.length) followEdge(now);
     requestSort();
     const moving = now - lastChange < 200;
     if (moving && drawnScale && elapsed < 1000) scale = clamp(scale * (elapsed > 45 ? 0.85 : elapsed < 25 ? 1.05 : 1), 0.25, 1);
@@ -616,6 +741,7 @@
       await this.ready;
       const place = [...camera.position];
       while (!sortedFor.every((value, i) => value === place[i])) await new Promise((resolve) => setTimeout(resolve, 5));
+      if (HEADER.edges.length) settle(nearestEdge(place)[0]);
       drawAt(width, height);
       const image = canvas.toDataURL("image/png");
       drawnScale = 0;

@@ -11,7 +11,7 @@ import json
 import math
 import re
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from jaxtyping import Float
 from PIL import Image
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial.distance import cdist
+from torch import Tensor
 
 from pansplat import constants, pipeline
 from pansplat.atomic import replacing
@@ -32,6 +33,7 @@ from pansplat.geometry.world import working_factor
 from pansplat.predictor import Progress
 from pansplat.refinement.budget import merge_to
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
+from pansplat.tours import EDGE_HYSTERESIS, TourGraph, plan_route
 from pansplat.web.data import MAX_DEGREE, PackedGaussians, count_bytes, pack_gaussians
 
 DEFAULT_GAUSSIANS = 300_000  # phones draw and hold them
@@ -42,6 +44,7 @@ _PART_BYTES = 1_500_000  # of the data between two steps of the progress bar; di
 _MERGE_HEIGHT = 512  # rows of the images that the mergers are measured in
 _POSTER_SIZE = (540, 960)
 _START_FOV = 75.0  # degrees, vertical
+_ROUTE_RATE = 10  # samples of a flight a second
 _SPEED = 0.3  # walking, fraction of the reach a second
 _BATCH = 256  # quads that are drawn together
 _SHADERS = {"splat": ("page.vert", "splat.frag"), "accumulate": ("screen.vert", "accumulate.frag")}
@@ -70,6 +73,7 @@ def write_page(
     scene: Scene,
     path: Path | str,
     *,
+    tour: TourGraph | None = None,
     gaussians: int = DEFAULT_GAUSSIANS,
     split: bool = False,
     title: str | None = None,
@@ -80,20 +84,27 @@ def write_page(
     Args:
         scene: any number of panoramas; without one the page starts in the middle of the Gaussians.
         path: the .html file.
+        tour: the graph whose panoramas are the scene's views (`pansplat.predict_tour`): the views of the nearest edge
+            are blended, and flights follow the edges. Without it, all views are blended everywhere.
         gaussians: largest number of Gaussians; similar neighbours are merged.
         split: write the data to the folder `NAME_files` beside the page, for large scenes.
         title: of the page; by default the name of the file.
         progress: called with a description of the current work and the completed fraction.
 
     Raises:
-        InputError: the scene has no visible Gaussians, the page would be too large, or it cannot be written.
+        InputError: the scene has no visible Gaussians or is not that of the tour, the page would be too large, or it
+            cannot be written.
     """
     path = Path(path)
     report: Progress = progress or (lambda what, fraction: None)
     if not 1 <= gaussians <= MAX_GAUSSIANS:
         raise InputError(f"`gaussians` must be 1 to {MAX_GAUSSIANS:,} in a page, got {gaussians:,}")
     report("checking the scene", 0.0)
-    scene = _prepare(scene)
+    if tour is not None and len(tour) != len(scene.cam2world):
+        raise InputError(f"`tour` must have the {len(scene.cam2world)} panoramas of the scene, got {len(tour)}")
+    factor = working_factor(scene.near)
+    scene = _prepare(scene, factor)
+    flights = _plan_flights(scene, tour, factor)
     if len(scene.gaussians) > gaussians:
         report("merging Gaussians", 0.1)
         scene = _merge(scene, gaussians)
@@ -102,14 +113,73 @@ def write_page(
     origin = scene.cam2world[:, :3, 3].mean(0).numpy()
     packed = pack_gaussians(scene.gaussians, origin, len(scene.cam2world), degree)
     report("drawing the poster", 0.8)
-    poster = _draw_poster(scene)
+    poster = _draw_poster(scene, flights.start)
     report("writing", 0.9)
-    return _write_files(path, scene, packed, origin, poster, split, title or path.stem)
+    header = _describe_scene(scene, packed, origin, flights)
+    return _write_files(path, header, packed.content, poster, split, title or path.stem)
 
 
-def _prepare(scene: Scene) -> Scene:
-    """The visible Gaussians on the CPU, in a unit near metres; with a camera in the middle if there is none."""
-    scene = scene.scaled(working_factor(scene.near))
+@dataclass(frozen=True, eq=False)
+class _Flights:
+    """How the camera moves, in a unit near metres.
+
+    Attributes:
+        start: first pose, without roll and pitch.
+        level: axes of a level camera (columns right, down, forward); yaws are relative to it.
+        yaw: of the start, radians.
+        groups: views that are blended together.
+        edges: two views and the group that is blended between them; without edges all views are blended.
+        next: the next panorama on the way from a panorama (row) to another one (column).
+        route: positions and yaws of the flight through all panoramas, `_ROUTE_RATE` a second; empty without edges.
+        hysteresis: distance by which another edge must be nearer than the current one.
+    """
+
+    start: Float[Tensor, "4 4"]
+    level: Float[np.ndarray, "3 3"]
+    yaw: float = 0.0
+    groups: tuple[tuple[int, ...], ...] = ()
+    edges: tuple[tuple[int, int, int], ...] = ()
+    next: tuple[tuple[int, ...], ...] = ()
+    route: Float[np.ndarray, "time 4"] = field(default_factory=lambda: np.zeros((0, 4)))
+    hysteresis: float = 0.0
+
+
+def _plan_flights(scene: Scene, tour: TourGraph | None, factor: float) -> _Flights:
+    """The flights of a tour; without one or its edges, the camera flies from view to view.
+
+    Args:
+        scene: of `_prepare`.
+        tour: in metres.
+        factor: of the scene's unit.
+    """
+    if tour is None or not tour.overlaps:
+        start = path_poses(scene.cam2world)[0]
+        return _Flights(start, start[:3, :3].numpy(), groups=(tuple(range(len(scene.cam2world))),))
+    views = tour.choose_scene_views()
+    groups = tuple(dict.fromkeys(views.values()))
+    walk = tour.plan_walk()
+    route = plan_route(tour, [*walk, *tour.find_walk(walk[-1], walk[0])[1:]])  # ends where it begins
+    samples = max(round(route.seconds * _ROUTE_RATE), 1) + 1
+    at = np.linspace(0, len(route.yaws) - 1, samples)
+    steps = np.arange(len(route.yaws))
+    columns = [*(factor * route.positions.T), route.yaws]
+    start = torch.from_numpy(route.pose(0.0))
+    start[:3, 3] *= factor
+    return _Flights(
+        start,
+        route.level,
+        float(route.yaws[0]),
+        groups,
+        tuple((a, b, groups.index(views[a, b])) for a, b in views),
+        tuple(tuple(row) for row in tour.find_next_nodes()),
+        np.stack([np.interp(at, steps, column) for column in columns], axis=1),
+        factor * EDGE_HYSTERESIS,
+    )
+
+
+def _prepare(scene: Scene, factor: float) -> Scene:
+    """The visible Gaussians on the CPU, in a scaled unit; with a camera in the middle if there is none."""
+    scene = scene.scaled(factor)
     gaussians = prune(scene.gaussians.to(device="cpu"), min_opacity=constants.ALPHA_CUT)
     numbers = (gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities[:, None])
     finite = torch.stack([(value.abs() <= constants.MAX_MAGNITUDE).all(1) for value in numbers]).all(0)
@@ -151,12 +221,12 @@ def _choose_degree(scene: Scene) -> int:
     return next((degree for degree in degrees if count_bytes(count, degree) * 4 / 3 <= _TARGET_BYTES), 0)
 
 
-def _draw_poster(scene: Scene) -> bytes:
+def _draw_poster(scene: Scene, pose: Float[Tensor, "4 4"]) -> bytes:
     """A JPEG of the first view of the page."""
     with torch.no_grad():
         color = pipeline.render(
             scene,
-            path_poses(scene.cam2world)[0],
+            pose,
             size=_POSTER_SIZE,
             layout="pinhole",
             vertical_fov_degrees=_START_FOV,
@@ -167,9 +237,11 @@ def _draw_poster(scene: Scene) -> bytes:
         return file.getvalue()
 
 
-def _describe_scene(scene: Scene, packed: PackedGaussians, origin: Float[np.ndarray, "3"]) -> dict[str, Any]:
+def _describe_scene(
+    scene: Scene, packed: PackedGaussians, origin: Float[np.ndarray, "3"], flights: _Flights
+) -> dict[str, Any]:
     """The numbers of a page, without those of single Gaussians; page.js reads them as HEADER."""
-    level = path_poses(scene.cam2world)[0, :3, :3].numpy()
+    level = flights.level
     positions = scene.cam2world[:, :3, 3].numpy() - origin
     means = scene.gaussians.means.double().numpy() - origin
     views = scene.gaussians.views.numpy()
@@ -201,7 +273,18 @@ def _describe_scene(scene: Scene, packed: PackedGaussians, origin: Float[np.ndar
         "views": views_of_page,
         "spots": spots,
         "level": [_round(row) for row in level],
-        "start": {"position": _round(positions[0]), "yaw": 0.0, "pitch": 0.0, "fov": _START_FOV},
+        "start": {
+            "position": _round(flights.start[:3, 3].numpy() - origin),
+            "yaw": round(flights.yaw, 5),
+            "pitch": 0.0,
+            "fov": _START_FOV,
+        },
+        "groups": flights.groups,
+        "edges": flights.edges,
+        "hysteresis": flights.hysteresis,
+        "next": flights.next,
+        "routeRate": _ROUTE_RATE,
+        "route": (flights.route - [*origin, 0.0]).round(4).tolist(),
         "batch": _BATCH,
         "near": constants.NEAR,
         "filterVariance": constants.FILTER_VARIANCE["angular"],
@@ -215,16 +298,10 @@ def _round(vector: np.ndarray) -> list[float]:
 
 
 def _write_files(
-    path: Path,
-    scene: Scene,
-    packed: PackedGaussians,
-    origin: Float[np.ndarray, "3"],
-    poster: bytes,
-    split: bool,
-    title: str,
+    path: Path, header: dict[str, Any], content: bytes, poster: bytes, split: bool, title: str
 ) -> PageFiles:
     """Write the page, and its parts if it is split."""
-    content = packed.content
+    count = header["count"]
     parts = [base64.b64encode(content[k : k + _PART_BYTES]).decode() for k in range(0, len(content), _PART_BYTES)]
     scripts = [f'addPart("{part}");\n' for part in parts]
     folder = path.with_name(f"{path.stem}_files")
@@ -235,15 +312,15 @@ def _write_files(
         title=html.escape(title),
         style=_read("page.css"),
         poster=base64.b64encode(poster).decode(),
-        count=f"{len(scene.gaussians):,}",
-        header=_to_script(_describe_scene(scene, packed, origin) | {"parts": len(parts)}),
+        count=f"{count:,}",
+        header=_to_script(header | {"parts": len(parts)}),
         shaders=_to_script({name: [_read_shader(stage) for stage in stages] for name, stages in _SHADERS.items()}),
         sorter=_to_script(_read("sorter.js")),
         parts="\n".join(tags or (f"<script>{text}</script>" for text in scripts)),
         program=_read("page.js"),
     ).encode()
     if len(page) > MAX_FILE_BYTES and not split:
-        fitting = math.floor(0.95 * len(scene.gaussians) * MAX_FILE_BYTES / len(page))
+        fitting = math.floor(0.95 * count * MAX_FILE_BYTES / len(page))
         raise InputError(
             f"{path}: needed a page of at most {MAX_FILE_BYTES // 1_000_000} MB in one file, got "
             f"{len(page) / 1e6:.0f} MB; split it (--split), or keep at most {fitting:,} Gaussians (--gaussians)"
@@ -260,7 +337,7 @@ def _write_files(
         _remove_old_parts(folder, set(names))
     files.insert(0, path)
     total = len(page) + sum(len(text) for text in scripts[: len(names)])
-    return PageFiles(tuple(files), total, len(scene.gaussians), packed.degree)
+    return PageFiles(tuple(files), total, count, header["degree"])
 
 
 def _make_folder(folder: Path) -> None:

@@ -11,6 +11,7 @@ from PIL import Image
 
 from pansplat import pipeline
 from pansplat.cli import run
+from pansplat.web import page as page_module
 from pansplat_viewer.loader import LoadOptions, find_entries
 
 
@@ -82,3 +83,25 @@ def test_a_web_page_is_written(scene: Path, tmp_path: Path, capsys: pytest.Captu
 
 def test_options_of_pages_are_for_pages(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
     assert ".html page" in refusal("export", scene, "-o", tmp_path / "out.ply", "--split")
+    assert "--up is for a scene file" in refusal("export", tmp_path, "-o", tmp_path / "out.ply", "--up", "z")
+
+
+def test_a_folder_of_three_panoramas_is_exported_as_a_tour(
+    tmp_path: Path, write_tour: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
+    house = write_tour(tmp_path / "house", height=64)
+    command = ["export", str(house), "--model", "sphere", "--refine", "0", "--predict-height", "64", "-o"]
+    assert run([*command, str(tmp_path / "house.html")]) == 0
+    assert "a tour of 3 panoramas" in capsys.readouterr().err
+    assert '"edges": [[0, 1, 0], [1, 2, 1]]' in (tmp_path / "house.html").read_text()
+    assert run([*command, str(tmp_path / "house.glb")]) == 0
+    assert len(pipeline.load(tmp_path / "house.glb").cam2world) == 3
+    assert run([*command, str(tmp_path / "pair.glb"), "--pair", "2"]) == 0
+    assert len(pipeline.load(tmp_path / "pair.glb").cam2world) == 2
+
+
+def test_a_floor_plan_needs_a_floor(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
+    message = refusal("export", scene, "-o", tmp_path / "plan.png", "--min-opacity", "0.95")
+    assert "needed a floor below at least one of the 2 input cameras" in message
+    assert "--points writes a .ply" in refusal("export", scene, "-o", tmp_path / "plan.png", "--points")

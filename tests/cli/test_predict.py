@@ -14,10 +14,16 @@ def test_predict_writes_the_scene(scene: Path) -> None:
     assert loaded.names == ("a", "b") and loaded.model == "sphere"
 
 
+def test_predict_writes_the_format_of_the_suffix(room: Path, tmp_path: Path) -> None:
+    command = ["predict", str(room), "--model", "sphere", "--height", "64", "-o"]
+    assert run([*command, str(tmp_path / "scene.splat")]) == 0
+    assert (tmp_path / "scene.splat").stat().st_size == 32 * 2 * 2 * 16**2
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["-o", "scene.splat"], "--out must end in .ply"),
+        (["-o", "scene.obj"], "--out must end in .compressed.ply, .spz, .splat, .sog, .glb, .ply"),
         (["-o", "no/scene.ply"], "existing folder"),
         (["--height", "7"], "--height"),
         (["--model", "magic"], "must be one of default, sphere, sweep"),

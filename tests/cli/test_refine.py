@@ -38,8 +38,8 @@ def test_a_scene_is_refined_with_the_photographs_of_its_pair(room: Path, scene: 
 
 
 def test_a_budget_limits_the_gaussians(room: Path, tmp_path: Path, capsys) -> None:
-    assert refine(room, tmp_path / "small.ply", "--model", "sphere", "--height", HEIGHT, "--gaussians", 300) == 0
-    assert len(pipeline.load(tmp_path / "small.ply").gaussians) <= 300
+    assert refine(room, tmp_path / "small.glb", "--model", "sphere", "--height", HEIGHT, "--gaussians", 300) == 0
+    assert len(pipeline.load(tmp_path / "small.glb").gaussians) <= 300
     assert "(given: 1,024)" in capsys.readouterr().out
 
 
@@ -87,4 +87,4 @@ def test_a_scene_needs_the_photographs_of_its_own_pair(scene: Path, tmp_path: Pa
     (tmp_path / "other" / "poses.json").write_text(json.dumps(poses))
     message = refusal("refine", scene, "-o", tmp_path / "x.ply", "--photographs", tmp_path / "other")
     assert "differ by up to 1" in message
-    assert "must end in .ply" in refusal("refine", scene, "-o", tmp_path / "x.png", "--photographs", tmp_path)
+    assert ".splat, .sog, .glb, .ply" in refusal("refine", scene, "-o", tmp_path / "x.png", "--photographs", tmp_path)

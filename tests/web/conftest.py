@@ -1,10 +1,13 @@
 """A scene of coloured Gaussians around three cameras."""
 
+import dataclasses
+
 import pytest
 import torch
 
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.tours import TourGraph, make_graph
 
 
 def make_scene(num_views: int = 3, per_view: int = 700, degree: int = 1, seed: int = 0) -> Scene:
@@ -52,3 +55,9 @@ def scene() -> Scene:
 def plain_scene() -> Scene:
     """Two views without harmonics."""
     return make_scene(num_views=2, degree=0)
+
+
+@pytest.fixture(scope="session")
+def tour(scene: Scene) -> TourGraph:
+    """The three views of the scene in a row: two edges."""
+    return dataclasses.replace(make_graph(scene), overlaps={(0, 1): 0.5, (1, 2): 0.4})

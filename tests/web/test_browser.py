@@ -1,6 +1,7 @@
 """The page in headless Chromium with WebGL 2 on the processor: pictures, input, loading."""
 
 import base64
+import dataclasses
 import io
 import math
 import os
@@ -19,6 +20,7 @@ from PIL import Image
 
 from pansplat import pipeline
 from pansplat.gaussians.scene import Scene
+from pansplat.tours import TourGraph
 from pansplat.web import page as page_module
 from pansplat.web import write_page
 
@@ -47,14 +49,15 @@ def chromium() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def folder(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """tour.html, and split.html with its parts."""
+def folder(scene: Scene, tour: TourGraph, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """tour.html, split.html with its parts, and house.html with a graph."""
     folder = tmp_path_factory.mktemp("pages")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_module, "_POSTER_SIZE", (18, 32))
         patch.setattr(page_module, "_PART_BYTES", 30_000)
         write_page(scene, folder / "tour.html", title="Three rooms")
         write_page(scene, folder / "split.html", split=True)
+        write_page(scene, folder / "house.html", tour=tour)
     return folder
 
 
@@ -300,3 +303,51 @@ def test_missing_parts_are_named(chromium: Any, folder: Path, tmp_path: Path) ->
     page.wait_for_selector("#cover.failed")
     assert "Copy the whole folder" in page.inner_text("#message")
     context.close()
+
+
+@pytest.mark.slow
+def test_a_tour_blends_the_views_of_the_edge_and_flies_along_edges(
+    chromium: Any, folder: Path, scene: Scene, tour: TourGraph
+) -> None:
+    with opened(chromium, folder / "house.html") as page:
+        spots = np.array(page.run("HEADER.spots.map((spot) => spot.position)"))
+        start = page.camera
+        position = 0.6 * spots[1] + 0.4 * spots[2]
+        camera = {"position": position.tolist(), "yaw": 0.3, "pitch": -0.1, "fov": 75.0}
+        page.run("(camera) => Object.assign(pansplat.camera, camera)", camera)
+        image = page.draw()
+        pose = np.eye(4)
+        cy, sy, cp, sp = math.cos(0.3), math.sin(0.3), math.cos(-0.1), math.sin(-0.1)
+        turn = np.array(((cy, 0, sy), (0, 1, 0), (-sy, 0, cy))) @ np.array(((1, 0, 0), (0, cp, -sp), (0, sp, cp)))
+        pose[:3, :3] = tour.level_axes @ turn
+        pose[:3, 3] = position + scene.cam2world[:, :3, 3].mean(0).numpy()
+        kept = scene.gaussians.views >= 1  # the edge from the second panorama to the third
+        part = scene.gaussians.select(kept)
+        part = dataclasses.replace(part, views=part.views - 1)
+        edge = dataclasses.replace(scene, gaussians=part, cam2world=scene.cam2world[1:])
+        size = {"size": SIZE[::-1], "layout": "pinhole", "vertical_fov_degrees": 75.0}
+        with torch.no_grad():
+            drawn = [pipeline.render(which, pose, **size).color.clamp(0, 1) for which in (edge, scene)]
+        of_edge, of_all = (color.permute(1, 2, 0).double().numpy() for color in drawn)
+        assert psnr(image, of_edge) > 42 > 35 > psnr(of_edge, of_all)
+        # A flight to the last panorama passes the second one.
+        page.page.keyboard.press("KeyR")
+        assert page.camera == start
+        page.run("HEADER.speed *= 100")
+        page.run("passed = []; watch = setInterval(() => passed.push([...pansplat.camera.position]), 5)")
+        page.page.keyboard.press("3")
+        page.wait("pansplat.camera.position.every((x, i) => x === HEADER.spots[2].position[i])")
+        passed = np.array(page.run("passed"))
+        between = np.linalg.norm(passed[:, None] - spots, axis=2)
+        offset = [
+            np.linalg.norm(np.cross(passed - a, b - a), axis=1) / np.linalg.norm(b - a)
+            for a, b in ((spots[0], spots[1]), (spots[1], spots[2]))
+        ]
+        assert np.minimum(*offset).max() < 1e-6 and between[:, 1].min() < 0.3
+        # The route begins near the camera and turns it.
+        page.page.keyboard.press("Space")
+        page.wait(f"Math.hypot(...pansplat.camera.position.map((x, i) => x - {spots[2].tolist()}[i])) > 0.1")
+        assert abs(page.camera["yaw"] - start["yaw"]) > 0.1
+        page.page.keyboard.press("Space")
+        assert page.page.get_attribute("#play", "aria-pressed") == "false"
+        assert page.messages == []
