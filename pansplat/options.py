@@ -17,6 +17,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from pansplat.errors import InputError
 
+EYE_DISTANCE = 0.063  # metres, the mean of adults
 MIN_HEIGHT, MAX_HEIGHT = 64, 8192  # pixels, of panoramas that are predicted from
 
 
@@ -93,6 +94,7 @@ CountOrNone = Annotated[int, Range(0, 1e9), WHOLE]
 """A number of things; 0 for none."""
 Threads = Annotated[int, Range(1, 1024), WHOLE]
 Seed = Annotated[int, Range(0, 2**32 - 1), WHOLE]
+EyeDistance = Annotated[float, Range(0, 1, "metres", above=True), REAL]
 Depth = Annotated[float, Range(1e-9, 1e9, "metres"), REAL]
 Seconds = Annotated[float, Range(0, 1e6, "seconds"), REAL]
 """A time limit; 0 for none."""

@@ -421,6 +421,7 @@ def render(
     blend: str | int = "deferred",
     size: tuple[int, int] | None = None,
     layout: str = "equirect",
+    eye_distance: float | None = None,
     drawing: Drawing = "exact",
     **raster: Any,
 ) -> Rendering:
@@ -433,6 +434,8 @@ def render(
             all Gaussians together; a number renders the Gaussians of one view only.
         size: (height, width), pixels; by default the scene's height, 2:1 (16:9 for `pinhole`).
         layout: "equirect", "cubemap" or "pinhole".
+        eye_distance: if given, omni-directional stereo (docs/rendering.md, section 9): the left eye's panorama above
+            the right eye's; `size` is that of one. Metres.
         drawing: "exact", or "original": a panorama as the official code renders it, with its defects, to reproduce
             published figures (docs/paper.md).
         **raster: further arguments of `pansplat.rasterize`, with "exact".
@@ -441,9 +444,20 @@ def render(
         InputError: `blend` names no view of the scene, or `drawing` does not fit the other arguments.
     """
     pose = torch.as_tensor(cam2world, dtype=torch.float64)
+    if eye_distance is not None:
+        if raster.get("eye_offset") or not 0 < eye_distance < math.inf:
+            raise InputError(f"`eye_distance` must be above 0, without `eye_offset`, got {eye_distance}")
+        both = [
+            render(scene, pose, blend=blend, size=size, layout=layout, drawing=drawing, eye_offset=offset, **raster)
+            for offset in (-0.5 * eye_distance, 0.5 * eye_distance)
+        ]
+        color, alpha, depth = (
+            torch.cat([getattr(eye, name) for eye in both], dim=-2) for name in ("color", "alpha", "depth")
+        )
+        return Rendering(color, alpha, depth)
     factor = working_factor(scene.near)
     if factor != 1:  # the rasterisers have thresholds in metres
-        for name, power in (("near", 1), ("covariances", 2)):
+        for name, power in (("near", 1), ("eye_offset", 1), ("covariances", 2)):
             if raster.get(name) is not None:
                 raster[name] = raster[name] * factor**power
         options: dict[str, Any] = {"blend": blend, "size": size, "layout": layout, "drawing": drawing, **raster}

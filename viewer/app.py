@@ -11,7 +11,7 @@ import tyro
 from pansplat.console import own_warnings, parse_arguments
 from pansplat.errors import InputError
 from pansplat.files import expand_home, require_output_file, require_output_folder
-from pansplat.options import REAL, Depth, Height, Range, Seconds, check_numbers
+from pansplat.options import EYE_DISTANCE, REAL, Depth, EyeDistance, Height, Range, Seconds, check_numbers
 from pansplat_viewer.loader import (
     LoadedScene,
     LoadOptions,
@@ -20,12 +20,13 @@ from pansplat_viewer.loader import (
     find_entries,
     load_entry,
 )
-from pansplat_viewer.settings import DrawSettings, Kernel, Mode, Order, RendererChoice
+from pansplat_viewer.settings import DrawSettings, Kernel, Mode, Order, Projection, RendererChoice, Stereo
 
 if TYPE_CHECKING:
     import moderngl
 
     from pansplat_viewer.key_frames import CameraPath
+    from pansplat_viewer.stereo import ImageFormat
 
 
 @dataclass(frozen=True)
@@ -75,8 +76,14 @@ class Options:
     """Draw with OpenGL (gl) or on the processor (cpu); auto is gl on a GPU, and cpu where OpenGL is software."""
     at: Annotated[float, Range(0, 1), REAL] | None = None
     """Start position between the panoramas, 0 to 1 (0); offscreen, position of the panorama (0.5)."""
-    size: str = "1280x720"
-    """Width x height of the window or film, pixels."""
+    projection: Projection = "perspective"
+    """What the frames of --out show: a perspective image, or all directions as a panorama or as six cube faces."""
+    stereo: Stereo = "mono"
+    """Images for two eyes, in the window and in --out: next to each other, left above right, or red and cyan."""
+    ipd: EyeDistance = EYE_DISTANCE
+    """Distance of the eyes, metres."""
+    size: str | None = None
+    """Width x height of the window or film, of one eye, pixels (1280x720; panoramas 2048x1024, cubemaps 1536x1024)."""
     seconds: Annotated[float, Range(0, 3600, "seconds", above=True), REAL] | None = None
     """Length of the film (4); of a tour, by default the time at 1 metre per second."""
     fps: Annotated[float, Range(0, 240, above=True), REAL] = 24.0
@@ -91,10 +98,19 @@ class Options:
         Raises:
             InputError: `size` is not WIDTHxHEIGHT, or out of range.
         """
+        if self.size is None:
+            return self.image_format.default_size
         match = re.fullmatch(r"(\d{2,5})x(\d{2,5})", self.size.lower())
         if not match or not all(16 <= int(side) <= 16384 for side in match.groups()):
             raise InputError(f"`--size` must be WIDTHxHEIGHT in pixels, 16 to 16384, got {self.size!r}")
         return int(match[1]), int(match[2])
+
+    @property
+    def image_format(self) -> "ImageFormat":
+        """Projection and stereo."""
+        from pansplat_viewer.stereo import ImageFormat
+
+        return ImageFormat(self.projection, self.stereo, self.ipd)
 
     @property
     def load_options(self) -> LoadOptions:
@@ -137,6 +153,10 @@ def choose_entry(entries: list[SceneEntry], pair: str | None) -> int:
 
 def _run(options: Options) -> int:
     pixels = options.pixels
+    options.image_format.check(pixels, options.kernel)
+    windowless = options.offscreen is not None and options.stereo != "mono"
+    if options.out is None and (windowless or options.projection != "perspective"):
+        raise InputError("--projection, and --stereo without a window, need --out; give --path and --out FILE")
     if options.offscreen is not None:
         require_output_folder("--offscreen", options.offscreen)
     from pansplat.data.video import VIDEO_SUFFIXES
@@ -217,7 +237,8 @@ def _write_film(
     from pansplat_viewer.tour import TourScenes
 
     film = Film(pixels, options.seconds, options.fps, 0.5 if options.at is None else options.at)
-    ctx = _create_context(options.renderer)  # before the prediction, so that missing OpenGL is reported early
+    choice = "cpu" if options.image_format.is_omnidirectional else options.renderer
+    ctx = _create_context(choice)  # before the prediction, so that missing OpenGL is reported early
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f}%"))
     with Progress(*columns, TimeElapsedColumn()) as bars:
 
@@ -240,14 +261,14 @@ def _write_film(
             bars.update(draw, description="film" if task in ("film", "done") else f"film: {task}", completed=done)
 
         tour, settings = loaded.entry.tour, fit_settings(options.settings, loaded.scene)
-        renderers = [create_renderer(ctx, options.renderer, color_bits=32) for _ in range(1 if tour is None else 2)]
+        renderers = [create_renderer(ctx, choice, color_bits=32) for _ in range(1 if tour is None else 2)]
         try:
             scenes = None if tour is None else TourScenes(tour, memory=options.memory)
             if scenes is None:
-                frames = SceneFrames(renderers[0], loaded.scene, pixels, settings)
+                frames = SceneFrames(renderers[0], loaded.scene, pixels, settings, options.image_format)
             else:
                 scenes.add(loaded)
-                frames = TourFrames(renderers, scenes, load, pixels, settings)
+                frames = TourFrames(renderers, scenes, load, pixels, settings, options.image_format)
             if path is not None:
                 assert options.out is not None
                 level = create_level_camera(loaded.scene, tour)

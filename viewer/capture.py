@@ -21,6 +21,7 @@ from pansplat_viewer.key_frames import CameraPath
 from pansplat_viewer.loader import LoadedScene, SceneEntry
 from pansplat_viewer.settings import DrawSettings
 from pansplat_viewer.state import NEAR_OF_FAR, ViewerState, enter_scene, fit_settings
+from pansplat_viewer.stereo import ImageFormat, render_image
 from pansplat_viewer.tour import CrossFade, TourScenes
 
 FILM_SECONDS = 4.0  # of a pair
@@ -149,25 +150,40 @@ def write_flythrough(
 
 
 class SceneFrames:
-    """Draws the frames of a film in one scene."""
+    """Draws the frames of a film in one scene.
 
-    def __init__(self, renderer: Renderer, scene: Scene, size: tuple[int, int], settings: DrawSettings) -> None:
-        """Upload the scene; `size` is (width, height), pixels."""
+    Attributes:
+        image_format: of the frames.
+    """
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        scene: Scene,
+        size: tuple[int, int],
+        settings: DrawSettings,
+        image_format: ImageFormat | None = None,
+    ) -> None:
+        """Upload the scene; `size` is (width, height) of one eye, pixels."""
         renderer.upload(scene)
         self._renderer, self._size = renderer, size
-        self._settings = replace(fit_settings(settings, scene), layout="pinhole", cached=False)
+        self._settings = fit_settings(settings, scene)
+        self.image_format = image_format or ImageFormat()
 
     def draw(
         self, pose: Float[np.ndarray, "4 4"], vertical_fov_degrees: float, now: float, *, with_depth: bool = False
     ) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"] | None]:
         """Colour of a pose at a time of the film, in seconds, and radial depth in metres if it is asked for."""
         settings = replace(self._settings, vertical_fov_degrees=vertical_fov_degrees)
-        color = _render(self._renderer, pose, self._size, settings)
-        return color, self._renderer.read_depth() if with_depth else None
+        return render_image(self._renderer, pose, self._size, settings, self.image_format, with_depth=with_depth)
 
 
 class TourFrames:
-    """Draws the frames of a film in a tour: loads each scene when the camera needs it, and fades it in."""
+    """Draws the frames of a film in a tour: loads each scene when the camera needs it, and fades it in.
+
+    Attributes:
+        image_format: of the frames.
+    """
 
     def __init__(
         self,
@@ -176,6 +192,7 @@ class TourFrames:
         load: Callable[[SceneEntry], LoadedScene],
         size: tuple[int, int],
         settings: DrawSettings,
+        image_format: ImageFormat | None = None,
     ) -> None:
         """Prepare the first frame.
 
@@ -183,11 +200,13 @@ class TourFrames:
             renderers: two; scenes are uploaded to them in turn.
             scenes: of the tour; loaded ones are kept within its memory.
             load: returns the scene of an entry.
-            size: (width, height), pixels.
+            size: (width, height) of one eye, pixels.
             settings: draw settings.
+            image_format: a perspective image of one eye by default.
         """
+        self.image_format = image_format or ImageFormat()
         self._renderers, self._scenes, self._load, self._size = renderers, scenes, load, size
-        self._settings = replace(settings, layout="pinhole", cached=False, near=NEAR_OF_FAR * scenes.tour.far)
+        self._settings = replace(settings, near=NEAR_OF_FAR * scenes.tour.far)
         self._fade = CrossFade()
 
     def draw(
@@ -217,9 +236,15 @@ class TourFrames:
             scene, renderer = fade.scenes[slot], self._renderers[slot]
             if scene is not None and (part > 0 or (with_depth and slot == fade.front)):
                 settings = replace(fit_settings(self._settings, scene), vertical_fov_degrees=vertical_fov_degrees)
-                color = color + part * _render(renderer, pose, self._size, settings)
-        if with_depth:
-            depth = self._renderers[fade.front].read_depth()
+                image, image_depth = render_image(
+                    renderer,
+                    pose,
+                    self._size,
+                    settings,
+                    self.image_format,
+                    with_depth=with_depth and slot == fade.front,
+                )
+                color, depth = color + part * image, depth if image_depth is None else image_depth
         return np.asarray(color), depth
 
 
@@ -295,14 +320,17 @@ def write_path_film(
         camera = path.interpolate(frame / fps, level)
         return frames.draw(camera.cam2world, camera.vertical_fov_degrees, frame / fps, with_depth=with_depth)
 
+    projection, stereo = frames.image_format.projection, frames.image_format.stereo
+    panorama = False if projection == "perspective" or stereo == "anaglyph" else projection
     if file.suffix.lower() in VIDEO_SUFFIXES:
-        write_video(file, (to_bytes(draw(frame)[0]) for frame in range(num_frames)), fps)
+        images = (to_bytes(draw(frame)[0]) for frame in range(num_frames))
+        write_video(file, images, fps, panorama=panorama, stereo="mono" if stereo == "anaglyph" else stereo)
         written.append(file)
     else:
         for frame in range(num_frames):
             color, depth = draw(frame, with_depth=file.suffix.lower() == ".exr")
             written.append(name_frame(file, frame))
-            write_image(written[-1], color, depth=depth, panorama=False)
+            write_image(written[-1], color, depth=depth, panorama=(projection, stereo) == ("equirect", "mono"))
     progress("done", 1.0)
     return written
 

@@ -362,7 +362,7 @@ class CpuRenderer:
         assert self._scene is not None
         size, settings = frame.size[::-1], frame.settings
         if settings.kernel == "ray" and settings.face_size is None:
-            plane = ImagePlane(size, torch.from_numpy(frame.rotation.copy()), 0.0)
+            plane = ImagePlane(size, torch.from_numpy(frame.rotation.copy()), 0.0, settings.eye_offset)
             layers = self._scene.rasterize(
                 np.asarray(frame.position),
                 plane,

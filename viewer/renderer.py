@@ -128,6 +128,8 @@ class SplatRenderer:
         start = time.perf_counter()
         if self._splats is None:
             raise InputError("there is no scene to draw; call `upload` first")
+        if settings.eye_offset:
+            raise InputError("OpenGL does not draw omni-directional stereo; use `CpuRenderer`")
         bound = self._ctx.fbo
         frame = Frame.create(self._splats, np.asarray(cam2world, dtype=np.float64), size, settings)
         settled = self._update_order(frame.position, wait)

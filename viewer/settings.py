@@ -16,6 +16,8 @@ Lowpass = Literal["angular", "3dgs"]
 Mode = Literal["joint", "view", "deferred", "difference"]
 Layout = Literal["pinhole", "equirect"]
 RendererChoice = Literal["auto", "gl", "cpu"]
+Projection = Literal["perspective", "equirect", "cubemap"]
+Stereo = Literal["mono", "side-by-side", "top-bottom", "anaglyph"]
 
 _CHOICES = {"kernel": Kernel, "order": Order, "lowpass": Lowpass, "mode": Mode, "layout": Layout}
 
@@ -40,6 +42,8 @@ class DrawSettings:
         near: Gaussians whose mean is nearer than this radial distance, metres, are not drawn.
         vertical_fov_degrees: of layout `pinhole`, in (0, 180).
         layout: `pinhole`, or `equirect` stitched from six cube faces.
+        eye_offset: of layout `equirect`: radius of the viewing circle of omni-directional stereo, metres; negative for
+            the left eye. `CpuRenderer` only, with kernel `ray`.
         face_size: side of a cube face in pixels. None matches the resolution at the panorama's equator
             (2 height / pi), or at the centre of a pinhole image that is drawn from cached faces.
         cached: draw a pinhole image from six cube faces that are kept for this position, so that a rotation of the
@@ -59,6 +63,7 @@ class DrawSettings:
     near: float = NEAR
     vertical_fov_degrees: float = 90.0
     layout: Layout = "pinhole"
+    eye_offset: float = 0.0
     face_size: int | None = None
     cached: bool = False
 
@@ -76,6 +81,13 @@ class DrawSettings:
             raise InputError(f"`view_weights` must be finite numbers of at least 0, got {self.view_weights}")
         if not 0 < self.near < math.inf:
             raise InputError(f"`near` must be a positive distance in metres, got {self.near}")
+        if self.eye_offset and (self.layout, self.kernel, self.face_size) != ("equirect", "ray", None):
+            raise InputError(
+                "omni-directional stereo needs layout equirect, kernel ray and no face_size, got "
+                f"{self.layout}, {self.kernel} and {self.face_size}"
+            )
+        if not abs(self.eye_offset) < math.inf:
+            raise InputError(f"`eye_offset` must be a distance in metres, got {self.eye_offset}")
         if self.face_size is not None and self.face_size < 1:
             raise InputError(f"`face_size` must be at least 1 pixel, got {self.face_size}")
 

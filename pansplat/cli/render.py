@@ -12,7 +12,7 @@ from tyro.conf import Positional
 from pansplat.cli.inputs import Out, ScenePrediction, parse_blend, progress_bar
 from pansplat.errors import InputError
 from pansplat.files import read_file, require_output_file
-from pansplat.options import REAL, ImageHeight, Range
+from pansplat.options import EYE_DISTANCE, REAL, EyeDistance, ImageHeight, Range
 
 if TYPE_CHECKING:
     import numpy as np
@@ -42,6 +42,10 @@ class Render:
     layout: Literal["equirect", "cubemap", "perspective"] | None = None
     """Panorama with one exact ray per pixel, panorama stitched from six cube faces, or perspective image.
     By default equirect, for a video perspective."""
+    stereo: bool = False
+    """Stereo panorama for headsets: each pixel column has its own two eyes. The left eye is above the right one."""
+    ipd: EyeDistance = EYE_DISTANCE
+    """Distance of the eyes for --stereo, metres."""
     height: ImageHeight | None = None
     """Height of the image, pixels; by default that of the input panoramas, for a video 360."""
     depth: bool = False
@@ -69,20 +73,21 @@ class Render:
         if poses is not None and len(poses) > 1 and not self._is_video:
             raise InputError(f"{self.pose} holds {len(poses)} poses; write an .mp4, or keep one pose in the file")
         scene = self.prediction.open(self.path)
-        layout = self.layout or ("perspective" if self._is_video else "equirect")
+        layout = self.layout or ("perspective" if self._is_video and not self.stereo else "equirect")
         options = self._render_options(layout, self.height or (_VIDEO_HEIGHT if self._is_video else scene.height))
-        size = f"{options['size'][1]}x{options['size'][0]}"
+        size = f"{options['size'][1]}x{options['size'][0] * (2 if self.stereo else 1)}"
+        stereo = "top-bottom" if self.stereo else "mono"
         if self._is_video:
             poses = self._path_between_cameras(scene) if poses is None else poses
             with progress_bar() as progress:
                 frames = _render_frames(scene, poses, options, progress)
-                count = write_video(self.out, frames, self.fps, panorama=layout != "perspective")
+                count = write_video(self.out, frames, self.fps, panorama=layout != "perspective", stereo=stereo)
             print(f"{self.out}: {count} frames of {size}, {layout}")
             return 0
         pose = scene.pose_between(0.5 if self.at is None else self.at) if poses is None else poses[0]
         with torch.no_grad():
             image = pipeline.render(scene, pose, **options)
-        panorama = layout != "perspective"
+        panorama = layout != "perspective" and not self.stereo  # GPano has no property for stereo
         if self.depth:
             write_depth(self.out, image.depth, panorama=panorama)
         else:
@@ -104,6 +109,8 @@ class Render:
             raise InputError("--at and --pose both set the camera; give one of them")
         if self.at is not None and self._is_video:
             raise InputError("--at is one position, an .mp4 moves through all; write a .png, or leave out --at")
+        if self.stereo and self.layout not in (None, "equirect"):
+            raise InputError(f"--stereo is for panoramas of --layout equirect, got {self.layout}; leave out --layout")
         parse_blend(self.blend)
 
     def _render_options(self, layout: str, height: int) -> dict[str, Any]:
@@ -115,7 +122,8 @@ class Render:
                 "size": (height, 2 * round(height * 8 / 9)),
                 "vertical_fov_degrees": self.fov,
             }
-        return options | {"layout": layout, "size": (height, 2 * height)}
+        stereo = {"eye_distance": self.ipd} if self.stereo else {}
+        return options | stereo | {"layout": layout, "size": (height, 2 * height)}
 
     def _path_between_cameras(self, scene: Scene) -> list[Tensor]:
         """A pose for each frame, through all input cameras."""

@@ -17,14 +17,21 @@ import struct
 import uuid
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
+
+Projection = Literal["equirect", "cubemap"]
+Stereo = Literal["mono", "top-bottom", "side-by-side"]
 
 _SPHERICAL_V1 = uuid.UUID("ffcc8263-f855-4a93-8814-587a02521fdd").bytes
+_STEREO_V1 = {"mono": "mono", "top-bottom": "top-bottom", "side-by-side": "left-right"}
+_STEREO_V2 = {"mono": b"\0", "top-bottom": b"\1", "side-by-side": b"\2"}
 _RDF = (
     '<?xml version="1.0"?><rdf:SphericalVideo xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#" '
     'xmlns:GSpherical="http://ns.google.com/videos/1.0/spherical/">'
     "<GSpherical:Spherical>true</GSpherical:Spherical><GSpherical:Stitched>true</GSpherical:Stitched>"
     "<GSpherical:StitchingSoftware>pansplat</GSpherical:StitchingSoftware>"
-    "<GSpherical:ProjectionType>equirectangular</GSpherical:ProjectionType></rdf:SphericalVideo>"
+    "<GSpherical:ProjectionType>equirectangular</GSpherical:ProjectionType>"
+    "<GSpherical:StereoMode>{stereo}</GSpherical:StereoMode></rdf:SphericalVideo>"
 )
 
 
@@ -51,8 +58,14 @@ def make_gpano_xmp(width: int, height: int) -> bytes:
     ).encode()
 
 
-def mark_spherical_video(path: Path) -> None:
-    """Add the metadata of a full equirectangular film to an MP4 file with one track, and with `moov` before `mdat`.
+def mark_spherical_video(path: Path, projection: Projection = "equirect", stereo: Stereo = "mono") -> None:
+    """Add the metadata of a film of all directions to an MP4 file with one track, and with `moov` before `mdat`.
+
+    Args:
+        path: the film.
+        projection: "cubemap" is three columns and two rows of faces: right left up, down front back. Version 1 of the
+            metadata cannot state it.
+        stereo: arrangement of the eyes in a frame; the left eye is at the top, or on the left.
 
     Raises:
         ValueError: there is no `moov` box.
@@ -67,20 +80,22 @@ def mark_spherical_video(path: Path) -> None:
                 target.write(header + file.read(int.from_bytes(header[:4], "big") - 8))
                 header = file.read(8)
             movie = file.read(int.from_bytes(header[:4], "big") - 8)
-            growth = len(_mark_movie(movie, 0)) - len(movie)
-            target.write(_box(b"moov", _mark_movie(movie, growth)))
+            growth = len(_mark_movie(movie, 0, projection, stereo)) - len(movie)
+            target.write(_box(b"moov", _mark_movie(movie, growth, projection, stereo)))
             shutil.copyfileobj(file, target, 1 << 24)
         os.replace(marked, path)
     finally:
         marked.unlink(missing_ok=True)
 
 
-def _mark_movie(content: bytes, shift: int) -> bytes:
+def _mark_movie(content: bytes, shift: int, projection: Projection, stereo: Stereo) -> bytes:
     """The content of the `moov` box with the metadata; chunk offsets grow by `shift`."""
 
     def mark_track(track: bytes) -> bytes:
         track = _edit(track, b"mdia", b"minf", b"stbl", change=mark_samples)
-        return track + _box(b"uuid", _SPHERICAL_V1 + _RDF.encode())
+        if projection != "equirect":
+            return track
+        return track + _box(b"uuid", _SPHERICAL_V1 + _RDF.format(stereo=_STEREO_V1[stereo]).encode())
 
     def mark_samples(table: bytes) -> bytes:
         table = _edit(table, b"stsd", change=mark_entry)
@@ -96,7 +111,8 @@ def _mark_movie(content: bytes, shift: int) -> bytes:
     def mark_entry(description: bytes) -> bytes:
         size, kind = struct.unpack_from(">I4s", description, 8)
         entry = description[16 : 8 + size]
-        return description[:8] + _box(kind, entry + _STEREO + _SPHERICAL_V2) + description[8 + size :]
+        boxes = _box(b"st3d", bytes(4) + _STEREO_V2[stereo]) + _SPHERICAL_V2[projection]
+        return description[:8] + _box(kind, entry + boxes) + description[8 + size :]
 
     return _edit(content, b"trak", change=mark_track)
 
@@ -118,9 +134,13 @@ def _edit(content: bytes, *kinds: bytes, change: Callable[[bytes], bytes]) -> by
     return b"".join(parts)
 
 
-_STEREO = _box(b"st3d", bytes(4) + b"\0")  # version and flags, monoscopic
-_SPHERICAL_V2 = _box(
-    b"sv3d",
-    _box(b"svhd", bytes(4) + b"pansplat\0")
-    + _box(b"proj", _box(b"prhd", bytes(4) + bytes(12)) + _box(b"equi", bytes(4) + bytes(16))),  # no turn, no crop
-)
+def _make_projection(content: bytes) -> bytes:
+    """The box `sv3d` with a projection that is not turned."""
+    header = _box(b"prhd", bytes(4) + bytes(12))
+    return _box(b"sv3d", _box(b"svhd", bytes(4) + b"pansplat\0") + _box(b"proj", header + content))
+
+
+_SPHERICAL_V2 = {
+    "equirect": _make_projection(_box(b"equi", bytes(4) + bytes(16))),  # not cropped
+    "cubemap": _make_projection(_box(b"cbmp", bytes(4) + bytes(8))),  # layout 0, no padding
+}

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pansplat.atomic import replacing
-from pansplat.data.panorama_metadata import mark_spherical_video
+from pansplat.data.panorama_metadata import Projection, Stereo, mark_spherical_video
 from pansplat.errors import InputError
 from pansplat.files import require_file
 
@@ -148,7 +148,8 @@ def write_video(
     fps: float,
     *,
     quality: int = 18,
-    panorama: bool = False,
+    panorama: bool | Projection = False,
+    stereo: Stereo = "mono",
 ) -> int:
     """Write an MP4 or WebM file atomically and return the number of frames. H.264 or VP9 if PyAV supports it.
 
@@ -159,7 +160,9 @@ def write_video(
         frames: RGB images (H W 3), uint8, all of one size; consumed one at a time.
         fps: frames per second.
         quality: constant rate factor of the encoder, 0 (lossless) to 51; lower is better and larger.
-        panorama: whether the frames are equirectangular panoramas; players then show an MP4 as 360 degrees.
+        panorama: whether the frames are equirectangular panoramas (or their projection, see `mark_spherical_video`);
+            players then show an MP4 as 360 degrees.
+        stereo: arrangement of the eyes in a panorama's frame.
 
     Raises:
         InputError: neither .mp4 nor .webm, no frame, a frame of another shape, `fps` not positive.
@@ -190,7 +193,7 @@ def write_video(
             for packet in stream.encode():
                 container.mux(packet)
         if panorama and path.suffix.lower() == ".mp4":
-            mark_spherical_video(temporary)
+            mark_spherical_video(temporary, "equirect" if panorama is True else panorama, stereo)
     return count
 
 

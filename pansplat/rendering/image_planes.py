@@ -30,11 +30,14 @@ class ImagePlane:
         size: height and width, pixels.
         rotation: columns are the plane's axes in camera axes, float64.
         focal: pixels; 0 for a direct panorama.
+        eye_offset: radius of the viewing circle of a direct panorama, metres; negative for the left eye. 0 is one eye
+            for all columns.
     """
 
     size: tuple[int, int]
     rotation: Float[Tensor, "3 3"]
     focal: float
+    eye_offset: float = 0.0
 
     @property
     def is_panorama(self) -> bool:
@@ -57,6 +60,16 @@ class ImagePlane:
         rays = torch.stack((x, y, torch.ones_like(x)), dim=-1)
         return torch.nn.functional.normalize(rays, dim=-1) @ self.rotation.T
 
+    def column_eyes(self) -> Float[Tensor, "width 3"]:
+        """The eye of each column of a panorama in camera axes, float64, metres: to the right of the column's rays.
+
+        Source: docs/rendering.md, section 9.
+        """
+        width = self.size[1]
+        columns = torch.arange(width, dtype=torch.float64, device=self.rotation.device) + 0.5
+        longitude = (2 * columns / width - 1) * math.pi
+        return self.eye_offset * torch.stack((longitude.cos(), torch.zeros_like(longitude), -longitude.sin()), dim=1)
+
     def coordinates(self) -> Float[Tensor, "height width 2"]:
         """Pixel centres x, y in pixels, float64."""
         height, width = self.size
@@ -71,6 +84,7 @@ def image_planes(
     *,
     vertical_fov_degrees: float = 90.0,
     face_size: int | None = None,
+    eye_offset: float = 0.0,
     device: torch.device | None = None,
 ) -> list[ImagePlane]:
     """Create the image planes of a layout: one plane, or the six cube faces.
@@ -79,10 +93,11 @@ def image_planes(
         size: height and width of the whole image, pixels.
         vertical_fov_degrees: of a pinhole image.
         face_size: of cube faces, pixels; by default with the panorama's resolution at the equator.
+        eye_offset: of layout "equirect", see `ImagePlane`.
     """
     upright = torch.eye(3, dtype=torch.float64, device=device)
     if layout == "equirect":
-        return [ImagePlane(size, upright, 0.0)]
+        return [ImagePlane(size, upright, 0.0, eye_offset)]
     if layout == "pinhole":
         return [ImagePlane(size, upright, 0.5 * size[0] / math.tan(math.radians(vertical_fov_degrees) / 2))]
     face = face_size or max(1, round(2 * size[0] / math.pi))

@@ -31,6 +31,7 @@ _BACKEND_MODULES = {
     "numba": "pansplat.rendering.cpu",
     "triton": "pansplat.rendering.cuda",
 }
+MAX_EYE_OFFSET = 1e6  # metres
 _MAX_POSE_ERROR = 1e-4
 
 _P = ParamSpec("_P")
@@ -97,7 +98,8 @@ class RasterInfo:
         total: Gaussians given.
         dropped: Gaussians with a number that is not finite or too large, or a covariance that is not positive.
         near: Gaussians nearer than `near`.
-        visible: Gaussians that can reach the alpha cut in the image (summed over the faces of a cubemap).
+        visible: Gaussians that can reach the alpha cut in the image; summed over the faces of a cubemap, and
+            over the columns of a panorama with an eye offset.
         intersections: pairs of a Gaussian and a raster tile.
         backend: its name.
         bytes: peak working memory, where the backend counts it.
@@ -148,7 +150,7 @@ class RasterBackend(Protocol):
             gaussians: float32 or float64.
             covariances: world covariances in place of scales and rotations, square metres.
             pose: cam2world, float64, rigid.
-            planes: of one size and focal length.
+            planes: of one size and focal length; a panorama with an eye offset is the only one.
             options: `stitching` is not used.
 
         Raises:
@@ -195,6 +197,7 @@ def rasterize(
     layout: Layout = "equirect",
     vertical_fov_degrees: float = 90.0,
     face_size: int | None = None,
+    eye_offset: float = 0.0,
     background: Sequence[float] | Float[Tensor, "channel"] = (0.0, 0.0, 0.0),
     covariances: Float[Tensor, "n 3 3"] | None = None,
     backend: Backend = "auto",
@@ -217,6 +220,9 @@ def rasterize(
         layout: "equirect" has one ray for each pixel; "cubemap" stitches a panorama from six faces; "pinhole".
         vertical_fov_degrees: of a pinhole image.
         face_size: of a cubemap's faces, pixels; by default with the panorama's resolution at the equator.
+        eye_offset: of layout "equirect": radius of the viewing circle of omni-directional stereo, metres, half the
+            distance of the eyes. Positive for the right eye, negative for the left. The
+            gradients are those of "torch" then.
         background: one number for each channel; the default is black for any number of channels.
         covariances: world covariances in place of those of `scales` and `quats`, square metres.
         backend: "torch" is the reference, "numba" is fast on a CPU, "triton" on CUDA; "auto" chooses the fastest
@@ -235,7 +241,7 @@ def rasterize(
         kernel=kernel, order=order, lowpass=lowpass, near=near, strict=strict, stitching=stitching
     )
     options = replace(options or RasterOptions(), **{name: value for name, value in given.items() if value is not None})
-    _check_arguments(size, layout, vertical_fov_degrees, face_size, backend, options)
+    _check_arguments(size, layout, vertical_fov_degrees, face_size, eye_offset, backend, options)
     device = gaussians.means.device
     pose = torch.as_tensor(cam2world, device=device).double()
     error = orthonormal_error(pose.detach()) if pose.shape == (4, 4) else math.inf
@@ -248,7 +254,14 @@ def rasterize(
         gaussians = gaussians.to(dtype=torch.float32)
     covariances = _convert_covariances(covariances, gaussians)
     background_color = _convert_background(background, gaussians)
-    planes = image_planes(layout, size, vertical_fov_degrees=vertical_fov_degrees, face_size=face_size, device=device)
+    planes = image_planes(
+        layout,
+        size,
+        vertical_fov_degrees=vertical_fov_degrees,
+        face_size=face_size,
+        eye_offset=eye_offset,
+        device=device,
+    )
     result = _select_backend(backend, gaussians)(gaussians, covariances, pose, planes, options)
     sums = result.sums.squeeze(0)
     if layout == "cubemap":
@@ -276,6 +289,7 @@ def _check_arguments(
     layout: str,
     vertical_fov_degrees: float,
     face_size: int | None,
+    eye_offset: float,
     backend: str,
     options: RasterOptions,
 ) -> None:
@@ -287,6 +301,12 @@ def _check_arguments(
         raise InputError(f"`face_size` must be at least 1 pixel, got {face_size}")
     if not 0 < vertical_fov_degrees < 180:
         raise InputError(f"`vertical_fov_degrees` must lie between 0 and 180, got {vertical_fov_degrees}")
+    if not -MAX_EYE_OFFSET <= eye_offset <= MAX_EYE_OFFSET:
+        raise InputError(f"`eye_offset` must be from -{MAX_EYE_OFFSET} to {MAX_EYE_OFFSET} metres, got {eye_offset}")
+    if eye_offset and layout != "equirect":
+        raise InputError(
+            f"`eye_offset` is the viewing circle of layout 'equirect', got layout {layout!r}; move the pose instead"
+        )
     if options.kernel == "ewa" and layout == "equirect":
         raise InputError(
             "kernel 'ewa' approximates a pinhole projection and is not defined on layout 'equirect'; "

@@ -76,6 +76,8 @@ def rasterize_planes(
     options: RasterOptions,
 ) -> RasterSums:
     """Rasterise with torch operations; see `pansplat.rendering.rasterize.RasterBackend`."""
+    if planes[0].eye_offset:
+        return _rasterize_columns(gaussians, covariances, pose, planes[0], options)
     chosen = select_drawable(gaussians, covariances, pose.detach(), options)
     projected = project_gaussians(
         chosen.gaussians,
@@ -88,6 +90,48 @@ def rasterize_planes(
     sums, visible, intersections = zip(*(_rasterize_plane(projected, plane, options) for plane in planes), strict=True)
     info = RasterInfo(chosen.total, chosen.dropped, chosen.near, sum(visible), sum(intersections))
     return RasterSums(torch.stack(sums), info)
+
+
+def _rasterize_columns(
+    gaussians: Gaussians,
+    covariances: Float[Tensor, "n 3 3"] | None,
+    pose: Float[Tensor, "4 4"],
+    plane: ImagePlane,
+    options: RasterOptions,
+) -> RasterSums:
+    """Rasterise each column of a panorama from its own eye: section 9, literally."""
+    (height, width), directions = plane.size, plane.directions()
+    columns, visible, intersections = [], 0, 0
+    for column, eye in enumerate(plane.column_eyes()):
+        moved = torch.cat((pose[:, :3], (pose[:, 3] + pose[:, :3] @ eye)[:, None]), dim=1)
+        chosen = select_drawable(gaussians, covariances, moved.detach(), options)
+        projected = project_gaussians(
+            chosen.gaussians,
+            chosen.covariances,
+            moved,
+            filter_variance=options.filter_variance(plane.pixel_angle),
+            compensate=options.compensate,
+            exact=True,
+        )
+        footprints, boxes = compute_footprints(projected, plane, options)
+        # A box may wrap around: count the columns from its left edge on.
+        after_left = torch.remainder(column + 0.5 - boxes[:, 0], width)
+        reached = (after_left <= boxes[:, 1] - boxes[:, 0] + 2 * _BOX_MARGIN) | (after_left > width - _BOX_MARGIN)
+        reached = torch.nonzero(reached & is_in_image(boxes, plane))[:, 0]
+        footprints = Footprints(*(field[reached] for field in footprints))
+        rows = boxes[reached]
+        rows[:, 0], rows[:, 1] = 0, 1
+        order = torch.argsort(projected.radius.detach()[reached], stable=True)
+        pixels = _arrange_points(directions[:, column : column + 1], projected.peak.dtype)
+        bands = []
+        for band in intersect_tiles(rows, order, (height, 1), wraps=False):
+            bands.append(composite(footprints, band, pixels, exact=True))
+            intersections += len(band.indices)
+        sums = torch.cat(bands).reshape(-1, TILE_SIZE, TILE_SIZE, bands[0].shape[-1])[:, :, 0].flatten(0, 1)
+        columns.append(sums[:height].T)
+        visible += len(reached)
+    info = RasterInfo(chosen.total, chosen.dropped, chosen.near, visible, intersections)
+    return RasterSums(torch.stack(columns, dim=2)[None], info)
 
 
 def _rasterize_plane(
@@ -118,10 +162,14 @@ def _rasterize_plane(
 
 def _arrange_pixels(plane: ImagePlane, kernel: Kernel, dtype: torch.dtype) -> TilePixels:
     """Arrange the pixels by tile; tiles that extend beyond the image repeat its last row and column."""
-    points = plane.directions() if kernel == "ray" else plane.coordinates()
-    rows, columns = tile_grid(*plane.size)
-    y = torch.arange(rows * TILE_SIZE, device=points.device).clamp_max(plane.size[0] - 1)
-    x = torch.arange(columns * TILE_SIZE, device=points.device).clamp_max(plane.size[1] - 1)
+    return _arrange_points(plane.directions() if kernel == "ray" else plane.coordinates(), dtype)
+
+
+def _arrange_points(points: Float[Tensor, "height width axis"], dtype: torch.dtype) -> TilePixels:
+    height, width = points.shape[:2]
+    rows, columns = tile_grid(height, width)
+    y = torch.arange(rows * TILE_SIZE, device=points.device).clamp_max(height - 1)
+    x = torch.arange(columns * TILE_SIZE, device=points.device).clamp_max(width - 1)
     points = torch.nn.functional.pad(points[y][:, x], (0, 3 - points.shape[-1]))
     points = points.reshape(rows, TILE_SIZE, columns, TILE_SIZE, 3).transpose(1, 2).reshape(-1, TILE_SIZE**2, 3)
     centres = points.mean(dim=1)

@@ -75,6 +75,17 @@ def test_a_video_moves_between_the_cameras(scene: Path, tmp_path: Path) -> None:
     assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 1
 
 
+def test_stereo_panoramas_have_the_left_eye_above_the_right(scene: Path, tmp_path: Path) -> None:
+    stereo = render(scene, tmp_path / "x.png", "--stereo", "--ipd", 0.2, "--height", 20)
+    assert stereo.shape == (40, 40, 3) and np.abs(stereo[:20].astype(int) - stereo[20:]).mean() > 1
+    arguments = ["--stereo", "--height", "18", "--seconds", "0.5", "--fps", "4"]
+    assert run(["render", str(scene), "-o", str(tmp_path / "x.mp4"), *arguments]) == 0
+    with av.open(str(tmp_path / "x.mp4")) as video:
+        frame = next(video.decode(video=0))
+    assert frame.to_ndarray(format="rgb24").shape == (36, 36, 3)
+    assert {"SPHERICAL", "STEREO3D"} <= {data.type.name for data in frame.side_data}
+
+
 def test_invalid_arguments_are_refused(scene: Path, room: Path, tmp_path: Path, refusal, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("path.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
@@ -88,6 +99,7 @@ def test_invalid_arguments_are_refused(scene: Path, room: Path, tmp_path: Path, 
         (scene, "x.png", ["--blend", "mixed"], "--blend must be"),
         (scene, "x.png", ["--blend", "view7"], "from 0 to 1, got 7"),
         (scene, "x.png", ["--fov", 180], "--fov must be"),
+        (scene, "x.png", ["--stereo", "--layout", "cubemap"], "--stereo is for panoramas of --layout equirect"),
         (scene, "x.png", ["--height", 0], "--height"),
         (scene, "x.mp4", ["--fps", 0], "--fps must be a number above 0"),
         ("nowhere.ply", "x.png", [], "nowhere.ply"),

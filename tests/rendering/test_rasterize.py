@@ -37,6 +37,8 @@ def test_arguments_out_of_range_are_refused(make_scene, pose, unchecked):
         ({"near": 0.0}, "`near` must be a positive distance"),
         ({"vertical_fov_degrees": 180.0}, "`vertical_fov_degrees` must lie between 0 and 180"),
         ({"face_size": 0}, "`face_size` must be at least 1"),
+        ({"eye_offset": math.nan}, "`eye_offset` must be from -1000000.0 to 1000000.0 metres, got nan"),
+        ({"eye_offset": 0.1, "layout": "cubemap"}, "viewing circle of layout 'equirect', got layout 'cubemap'"),
         ({"kernel": "ewa"}, "'ewa' .* not defined on layout 'equirect'; use layout='cubemap'"),
         ({**official, "size": (6, 12)}, "'official' needs layout='cubemap' and a 2:1 panorama"),
         ({**official, "size": (8, 12)}, "'official' needs layout='cubemap' and a 2:1 panorama"),

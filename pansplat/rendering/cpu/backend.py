@@ -18,7 +18,9 @@ from torch import Tensor
 from pansplat.constants import EWA_NEAR_FACTOR
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
+from pansplat.rendering import reference
 from pansplat.rendering.cpu import tiling
+from pansplat.rendering.cpu.columns import rasterize_columns
 from pansplat.rendering.cpu.ewa import EWA_GRAD_SIZE, backpropagate_ewa, project_ewa
 from pansplat.rendering.cpu.projection import Camera, GaussianArrays, ProjectedGaussians, project_gaussians
 from pansplat.rendering.cpu.projection_backward import GaussianGradients, accumulate_slots, backpropagate_projection
@@ -116,6 +118,9 @@ def rasterize_planes(
     shape = (gaussians.quats, gaussians.scales, None) if covariances is None else (None, None, covariances)
     tensors = (gaussians.means, *shape, gaussians.opacities, gaussians.harmonics)
     tensors = tuple(None if tensor is None else tensor.to(torch.float32).contiguous() for tensor in tensors)
+    has_grad = any(tensor is not None and tensor.requires_grad for tensor in (*tensors, pose))
+    if planes[0].eye_offset and has_grad and torch.is_grad_enabled():  # too rare for kernels of its own
+        return reference.rasterize_planes(gaussians, covariances, pose, planes, options)
     statistics = Statistics()
     sums = _Rasterize.apply(pose, planes, options, statistics, torch.is_grad_enabled(), *tensors)
     if options.strict and statistics.dropped:
@@ -206,6 +211,9 @@ def rasterize_plane(
         This state, or None without `saved_in`.
     """
     projected, threads, needs_grad = view.projected, view.threads, saved_in is not None
+    if plane.eye_offset:
+        rasterize_columns(view, plane, sums, statistics)
+        return None
     workspace = saved_in or Workspace()
     with statistics.timed("bound"):
         records, boxes = _find_footprints(view, plane, workspace)

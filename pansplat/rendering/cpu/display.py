@@ -8,7 +8,7 @@ Source: docs/rendering.md, sections 4 and 7; docs/viewer.md.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -132,7 +132,7 @@ class DisplayScene:
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, 3] = torch.from_numpy(np.asarray(position, np.float64))
         if plane.is_panorama:  # its pixels have fixed directions in the records' axes
-            pose[:3, :3], plane = plane.rotation, ImagePlane(plane.size, torch.eye(3, dtype=torch.float64), 0.0)
+            pose[:3, :3], plane = plane.rotation, replace(plane, rotation=torch.eye(3, dtype=torch.float64))
         camera = make_camera(pose, plane, options)
         sums = pooled_empty((num_layers, 5, *plane.size), np.float32)
         with announce_compilation():

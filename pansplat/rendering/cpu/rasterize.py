@@ -20,7 +20,15 @@ import numpy.typing as npt
 
 from pansplat.constants import ALPHA_CUT, MAX_ALPHA, TRANSMITTANCE_CUT
 from pansplat.rendering.cpu.projection import dot, tangent_frame
-from pansplat.rendering.cpu.records import EQUIRECT_RAYS, PIXEL_CENTRES, RECORD_SIZE, TILE_SIZE, PixelTables
+from pansplat.rendering.cpu.records import (
+    BLOCK_WIDTH,
+    COLUMN_RAYS,
+    EQUIRECT_RAYS,
+    PIXEL_CENTRES,
+    RECORD_SIZE,
+    TILE_SIZE,
+    PixelTables,
+)
 from pansplat.rendering.cpu.runtime import Workspace, inline_kernel_no_refcount, kernel
 from pansplat.rendering.cpu.simd import (
     LANES,
@@ -47,7 +55,6 @@ Floats = npt.NDArray[np.float32]
 Integers = npt.NDArray[np.int32]
 Longs = npt.NDArray[np.int64]
 
-BLOCK_WIDTH = 4
 BLOCK_HEIGHT = LANES // BLOCK_WIDTH
 BLOCKS_ACROSS = TILE_SIZE // BLOCK_WIDTH
 BLOCKS_DOWN = TILE_SIZE // BLOCK_HEIGHT
@@ -92,6 +99,10 @@ def _pixel_point(kind, columns, rows, rotation, x, y):
     if kind == EQUIRECT_RAYS:
         cosine = rows[y, 1]
         return cosine * columns[x, 0], rows[y, 0], cosine * columns[x, 1]
+    if kind == COLUMN_RAYS:
+        row = 2 * (x % BLOCK_WIDTH)
+        cosine = rows[y, row + 1]
+        return cosine * columns[x, 0], rows[y, row], cosine * columns[x, 1]
     right, down = columns[x, 0], rows[y, 0]
     if kind == PIXEL_CENTRES:
         return right, down, 0.0

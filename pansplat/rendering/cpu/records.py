@@ -57,15 +57,17 @@ panorama and reaches both ends of one tile has the tile's full width."""
 EQUIRECT_RAYS = 0  # columns: sine and cosine of the longitude; rows: of the latitude
 PINHOLE_RAYS = 1  # columns: x of the ray (x, y, 1); rows: y
 PIXEL_CENTRES = 2  # columns, rows: pixel centres, for the EWA kernel
+COLUMN_RAYS = 3  # a panorama of which each column is a column of blocks: see `tabulate_columns`
+BLOCK_WIDTH = 4  # pixels of a raster block
 
 
 class PixelTables(NamedTuple):
     """The pixels of one image plane, each given by a column and a row.
 
     Attributes:
-        kind: EQUIRECT_RAYS, PINHOLE_RAYS or PIXEL_CENTRES.
+        kind: EQUIRECT_RAYS, PINHOLE_RAYS, PIXEL_CENTRES or COLUMN_RAYS.
         columns: float64 (width, 2).
-        rows: float64 (height, 2).
+        rows: float64 (height, 2); for COLUMN_RAYS (height, 2 BLOCK_WIDTH).
         rotation: float64 (3, 3), the image plane's axes in the camera's; used by PINHOLE_RAYS.
     """
 
@@ -96,6 +98,19 @@ def tabulate_pixels(plane: ImagePlane, *, exact: bool) -> PixelTables:
         return PixelTables(EQUIRECT_RAYS, columns, rows, rotation)
     x, y = (x - 0.5 * width) / plane.focal, (y - 0.5 * height) / plane.focal
     return PixelTables(PINHOLE_RAYS, _table(x, np.zeros(width)), _table(y, np.zeros(height)), rotation)
+
+
+def tabulate_columns(plane: ImagePlane, low: int, high: int) -> PixelTables:
+    """Pixel tables of columns `low` to `high` - 1 of a panorama, folded so that a block has pixels of one column only.
+
+    Column j of the panorama is columns 4 j to 4 j + 3 of the folded image, and its row i is row i // 4, column
+    4 j + i % 4. A block evaluates every Gaussian that reaches it for all of its pixels.
+    """
+    tables = tabulate_pixels(plane, exact=True)
+    folded = -(-len(tables.rows) // BLOCK_WIDTH) * BLOCK_WIDTH
+    rows = np.pad(tables.rows, ((0, folded - len(tables.rows)), (0, 0)), mode="edge")
+    columns = np.repeat(tables.columns[low:high], BLOCK_WIDTH, axis=0)
+    return PixelTables(COLUMN_RAYS, columns, rows.reshape(-1, 2 * BLOCK_WIDTH), tables.rotation)
 
 
 def _table(first: npt.NDArray[Any], second: npt.NDArray[Any]) -> npt.NDArray[np.float64]:

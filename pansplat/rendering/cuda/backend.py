@@ -17,6 +17,7 @@ from torch.utils.checkpoint import checkpoint
 from pansplat.constants import EWA_NEAR_FACTOR
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
+from pansplat.rendering import reference
 from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.projection import (
     Footprints,
@@ -48,6 +49,8 @@ def rasterize_planes(
     """
     device = gaussians.means.device
     _check_device(device)
+    if planes[0].eye_offset:
+        return reference.rasterize_planes(gaussians, covariances, pose, planes, options)
     # Triton launches on torch's current device, not on that of its arguments.
     with torch.cuda.device(device) if device.type == "cuda" else contextlib.nullcontext():
         chosen = select_drawable(gaussians, covariances, pose.detach(), options)

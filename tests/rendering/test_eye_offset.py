@@ -1,0 +1,128 @@
+"""Omni-directional stereo: each column of a panorama has its own eye, and its rays touch the viewing circle."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from pansplat.geometry.pose import rotations_from_quats
+from pansplat.rendering import rasterize
+from pansplat.rendering.cpu import columns
+from pansplat.rendering.image_planes import ImagePlane
+
+ORIGIN = torch.eye(4, dtype=torch.float64)
+
+
+def make_images(scene, pose, size, **options):
+    rendering = rasterize(scene, pose, size=size, **options)
+    return torch.cat((rendering.color, rendering.alpha[None], (rendering.depth * rendering.alpha)[None]))
+
+
+def test_the_rays_of_a_column_touch_the_viewing_circle():
+    plane = ImagePlane((4, 8), ORIGIN[:3, :3], 0.0, 0.3)
+    eyes, rays = plane.column_eyes(), plane.directions()
+    horizontal = rays * torch.tensor((1.0, 0, 1))
+    torch.testing.assert_close(eyes.norm(dim=1), torch.full((8,), 0.3, dtype=torch.float64))
+    assert (horizontal * eyes).sum(dim=-1).abs().max() < 1e-15
+    # The eye is to the right of its rays: right x down = forward in OpenCV axes.
+    down = torch.tensor((0.0, 1, 0), dtype=torch.float64).expand(8, 3)
+    forward = torch.linalg.cross(eyes, down)
+    assert ((forward * horizontal[1]).sum(dim=-1) > 0).all()
+
+
+@pytest.mark.parametrize("eye_offset", [0.25, -0.25])
+def test_each_column_is_that_of_a_panorama_from_its_own_eye(make_scene, dense, pose, eye_offset):
+    scene, size = make_scene(7, scale=0.4), (9, 18)
+    got = make_images(scene, pose, size, eye_offset=eye_offset)
+    for column, eye in enumerate(ImagePlane(size, ORIGIN[:3, :3], 0.0, eye_offset).column_eyes()):
+        moved = pose.clone()
+        moved[:3, 3] += pose[:3, :3] @ eye
+        color, alpha, depth = dense(scene, moved, size)
+        expected = torch.cat((color, alpha[None], depth[None]))[:, :, column]
+        assert (got[:, :, column] - expected).abs().max() < 1e-10
+
+
+@pytest.mark.parametrize("pairs", [columns._MAX_PAIRS, 1])
+def test_numba_equals_the_reference(make_scene, monkeypatch, pairs):
+    # The Gaussians surround the camera: some are inside the viewing circle, above it, or around it.
+    monkeypatch.setattr(columns, "_MAX_PAIRS", pairs)
+    scene, pose = make_scene(60, scale=0.08, extent=0.6), ORIGIN.clone()
+    pose[:3, :3] = rotations_from_quats(torch.tensor((0.9, 0.2, -0.3, 0.4), dtype=torch.float64))
+    scene.means[:4] = torch.tensor(((0, -1.0, 0), (0, 0.8, 0), (0.1, 0, 0), (0, 0, 0.12)), dtype=torch.float64)
+    size, options = (35, 70), {"eye_offset": -0.2, "near": 0.02, "background": (0.1, 0.2, 0.3)}
+    expected = make_images(scene, pose, size, **options)
+    got = make_images(scene.to(dtype=torch.float32), pose, size, backend="numba", **options)
+    assert (got - expected).abs().max() < 2e-5
+    covariances = scene.covariances.float()
+    got = make_images(scene.to(dtype=torch.float32), pose, size, backend="numba", covariances=covariances, **options)
+    assert (got - expected).abs().max() < 5e-5
+
+
+@pytest.mark.parametrize("distance", [0.5, 2.0, 30.0])
+def test_a_gaussian_at_the_horizon_is_shifted_by_asin_of_offset_over_distance(balls, distance):
+    longitude, offset, width = 0.7, 0.1, 256
+    mean = (distance * math.sin(longitude), 0.0, distance * math.cos(longitude))
+    scene = balls([mean], sigma=0.03 * distance).to(dtype=torch.float32)
+    for sign in (1, -1):
+        alpha = rasterize(scene, ORIGIN, size=(width // 2, width), eye_offset=sign * offset).alpha.double()
+        middle = (alpha.sum(dim=0) * (torch.arange(width) + 0.5)).sum() / alpha.sum()
+        expected = longitude - sign * math.asin(offset / distance)
+        assert abs((2 * float(middle) / width - 1) * math.pi - expected) < 0.05 * 2 * math.pi / width
+
+
+def test_both_eyes_agree_at_infinity(make_scene):
+    scene = make_scene(20)
+    scene = dataclasses.replace(scene, means=1e6 * scene.means, scales=1e6 * scene.scales).to(dtype=torch.float32)
+    left, right = (make_images(scene, ORIGIN, (24, 48), eye_offset=sign * 0.03)[:4] for sign in (-1, 1))
+    assert (left - right).abs().max() < 1e-5
+
+
+def test_the_eyes_of_a_mirrored_scene_are_exchanged(balls):
+    means = torch.tensor(((0.5, 0.1, 1.0), (-0.8, -0.3, 0.7), (0.2, 0.4, -1.5), (0.05, 0.3, 0.02)))
+    mirrored = means * torch.tensor((-1.0, 1, 1))
+    right = make_images(balls(means).to(dtype=torch.float32), ORIGIN, (32, 64), eye_offset=0.2)
+    left = make_images(balls(mirrored).to(dtype=torch.float32), ORIGIN, (32, 64), eye_offset=-0.2)
+    assert (right - left.flip(2)).abs().max() < 1e-5
+
+
+def test_turning_the_camera_by_columns_rolls_the_panorama(make_scene, yaw):
+    scene, size = make_scene(40, scale=0.1).to(dtype=torch.float32), (24, 48)
+    ahead = make_images(scene, ORIGIN, size, eye_offset=0.15)
+    turned = make_images(scene, yaw(2 * math.pi * 7 / 48), size, eye_offset=0.15)
+    assert (turned - ahead.roll(-7, dims=2)).abs().max() < 2e-5
+
+
+def test_the_panorama_is_continuous_at_offset_zero(make_scene):
+    scene, size = make_scene(40, extent=3.0).to(dtype=torch.float32), (16, 32)
+    assert torch.equal(make_images(scene, ORIGIN, size, eye_offset=0.0), make_images(scene, ORIGIN, size))
+    assert (make_images(scene, ORIGIN, size, eye_offset=1e-7) - make_images(scene, ORIGIN, size)).abs().max() < 1e-4
+
+
+def test_gradients_are_those_of_the_reference(balls):
+    scene = balls([(0.5, 0.1, 1.0), (-0.8, -0.3, 0.7)])
+
+    def total(means, **options):
+        moved = dataclasses.replace(scene, means=means).to(dtype=means.dtype)
+        return rasterize(moved, ORIGIN, size=(8, 16), eye_offset=0.1, **options).alpha.sum()
+
+    means = scene.means.float().requires_grad_()
+    total(means, backend="numba").backward()
+    step = torch.tensor(((1e-4, 0, 0), (0, 0, 0)), dtype=torch.float64)
+    expected = (total(scene.means + step) - total(scene.means - step)) / 2e-4
+    assert means.grad is not None
+    assert float(means.grad[0, 0]) == pytest.approx(float(expected), rel=0.01)
+
+
+def test_unusable_gaussians_are_left_out_and_counted(make_scene):
+    scene = make_scene(30).to(dtype=torch.float32)
+    broken = dataclasses.replace(scene, means=scene.means.clone(), harmonics=scene.harmonics.clone())
+    broken.means[3, 0], broken.harmonics[7, 1, 2] = math.nan, math.inf
+    kept = torch.tensor([i not in (3, 7) for i in range(30)])
+    for backend in ("numba", "torch"):
+        rendering = rasterize(broken, ORIGIN, size=(12, 24), eye_offset=0.1, backend=backend)
+        expected = rasterize(scene.select(kept), ORIGIN, size=(12, 24), eye_offset=0.1, backend=backend)
+        assert rendering.info is not None and rendering.info.dropped == 2
+        assert torch.equal(rendering.color, expected.color)
+    empty = rasterize(scene.select(kept & False), ORIGIN, size=(12, 24), eye_offset=0.1)
+    assert not empty.alpha.any()

@@ -1,0 +1,135 @@
+"""Projections and stereo of stills and films."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from av.sidedata.sidedata import Type
+
+import pansplat
+from pansplat.errors import InputError
+from pansplat_viewer import run
+from pansplat_viewer.cpu_renderer import CpuRenderer
+from pansplat_viewer.settings import DrawSettings
+from pansplat_viewer.stereo import ImageFormat, arrange_eyes, move_eye, render_image
+
+SIZE = (48, 24)
+
+
+@pytest.fixture(scope="module")
+def renderer(random_scene):
+    renderer = CpuRenderer(None, exact=True)
+    renderer.upload(random_scene())
+    yield renderer
+    renderer.release()
+
+
+def draw(renderer, pose, size, **options):
+    settings = {name: options.pop(name) for name in list(options) if name in ("mode", "background")}
+    return render_image(renderer, pose, size, DrawSettings(**settings), ImageFormat(**options))[0]
+
+
+def test_the_eyes_of_a_perspective_image_are_the_distance_apart(renderer, pose):
+    both = draw(renderer, pose, SIZE, stereo="side-by-side", eye_distance=0.2)
+    left, right = both[:, : SIZE[0]], both[:, SIZE[0] :]
+    moved = pose.copy()
+    moved[:3, 3] -= 0.1 * pose[:3, 0]
+    assert np.array_equal(left, draw(renderer, moved, SIZE))
+    assert np.array_equal(right, draw(renderer, move_eye(pose, 0.1), SIZE))
+    assert np.abs(left - right).mean() > 0.01
+    assert np.array_equal(draw(renderer, pose, SIZE, stereo="top-bottom", eye_distance=0.2), np.vstack((left, right)))
+    anaglyph = draw(renderer, pose, SIZE, stereo="anaglyph", eye_distance=0.2)
+    assert np.array_equal(anaglyph, np.dstack((left[..., 0], right[..., 1], right[..., 2])))
+
+
+@pytest.mark.parametrize("mode", ["joint", "deferred"])
+def test_stereo_panoramas_are_those_of_pansplat_render(renderer, random_scene, pose, mode):
+    image = draw(renderer, pose, SIZE, projection="equirect", stereo="top-bottom", eye_distance=0.2, mode=mode)
+    expected = pansplat.render(random_scene(), pose, blend=mode, size=SIZE[::-1], eye_distance=0.2).color
+    error = np.abs(image - expected.permute(1, 2, 0).clamp(0, 1).numpy())
+    assert error.shape == (2 * SIZE[1], SIZE[0], 3)
+    assert error.mean() < 1e-4 and error.max() < 5e-3
+
+
+def test_swapping_the_sign_of_the_distance_exchanges_the_eyes(renderer, pose):
+    for projection, size in (("equirect", SIZE), ("perspective", SIZE), ("cubemap", (24, 16))):
+        first, second = (
+            draw(renderer, pose, size, projection=projection, stereo="side-by-side", eye_distance=distance)
+            for distance in (0.2, -0.2)
+        )
+        left, right = np.split(first, 2, axis=1)
+        assert np.array_equal(second, np.hstack((right, left)))
+
+
+def test_the_faces_of_a_cubemap_are_where_players_read_them(renderer, pose):
+    """FFmpeg's filter v360 turns the cubemap (`c3x2`) into a panorama."""
+    smooth = DrawSettings(background=(0.5, 0.5, 0.5))
+    for stereo in ("mono", "top-bottom"):
+        cubes = render_image(renderer, pose, (192, 128), smooth, ImageFormat("cubemap", stereo, 0.1))[0]
+        panoramas = render_image(renderer, pose, (256, 128), smooth, ImageFormat("equirect", stereo, 0.1))[0]
+        count = 1 if stereo == "mono" else 2
+        for cube, panorama in zip(np.split(cubes, count), np.split(panoramas, count), strict=True):
+            graph = av.filter.Graph()
+            frame = av.VideoFrame.from_ndarray((255 * cube + 0.5).astype(np.uint8), format="rgb24")
+            source = graph.add_buffer(width=192, height=128, format="rgb24", time_base="1/1")
+            turned = graph.add("v360", "input=c3x2:output=e:w=256:h=128")
+            shown, sink = graph.add("format", "rgb24"), graph.add("buffersink")
+            graph.link_nodes(source, turned, shown, sink).configure()
+            graph.push(frame)
+            error = np.abs(graph.pull().to_ndarray() / 255.0 - panorama)
+            assert error.mean() < 0.02
+
+
+def test_the_depth_of_both_eyes_is_arranged_as_the_colours_are(renderer, pose):
+    for projection, size, stereo, shape in (
+        ("equirect", SIZE, "top-bottom", (48, 48)),
+        ("cubemap", (24, 16), "side-by-side", (16, 48)),
+        ("perspective", SIZE, "anaglyph", (24, 48)),
+        ("cubemap", (24, 16), "mono", (16, 24)),
+    ):
+        image_format = ImageFormat(projection, stereo)
+        color, depth = render_image(renderer, pose, size, DrawSettings(), image_format, with_depth=True)
+        assert depth is not None and depth.shape == shape == color.shape[:2]
+        assert depth.min() >= 0 and 0.5 < depth.max() < 20
+
+
+def test_omnidirectional_stereo_needs_the_exact_kernel(renderer, pose):
+    with pytest.raises(InputError, match="needs kernel ray, got ewa"):
+        ImageFormat("equirect", "top-bottom").check((64, 32), "ewa")
+    with pytest.raises(InputError, match="needs layout equirect, kernel ray"):
+        DrawSettings(eye_offset=0.03)
+    with pytest.raises(InputError, match="`eye_offset` must be a distance"):
+        DrawSettings(layout="equirect", eye_offset=float("nan"))
+    assert arrange_eyes([np.zeros((2, 3, 1))], "mono").shape == (2, 3, 1)
+
+
+@pytest.mark.gl
+def test_opengl_refuses_omnidirectional_stereo(make_renderer, random_scene, pose):
+    settings = replace(DrawSettings(layout="equirect"), eye_offset=0.03)
+    with pytest.raises(InputError, match="use `CpuRenderer`"):
+        make_renderer(random_scene(), "gl33").render(pose, (32, 16), settings)
+
+
+def test_films_of_stereo_panoramas_state_their_layout(room, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    frames = [{"seconds": t, "position": [0, 0, t], "direction": [0, 0, 1]} for t in (0, 0.1)]
+    Path("walk.json").write_text(json.dumps({"key_frames": frames}))
+    arguments = [str(room), "--path", "walk.json", "--fps", "10", "--ipd", "0.1", "--out"]
+    for projection, size, stereo, shape, kind in (
+        ("equirect", "64x32", "top-bottom", (64, 64, 3), 2),
+        ("equirect", "64x32", "side-by-side", (32, 128, 3), 1),
+        ("cubemap", "48x32", "mono", (32, 48, 3), 0),
+        ("perspective", "64x32", "anaglyph", (32, 64, 3), None),
+    ):
+        assert run([*arguments, "walk.mp4", "--projection", projection, "--size", size, "--stereo", stereo]) == 0
+        with av.open("walk.mp4") as film:
+            decoded = list(film.decode(video=0))
+        data = {data.type: bytes(data) for data in decoded[0].side_data}
+        assert len(decoded) == 2 and decoded[0].to_ndarray(format="rgb24").shape == shape
+        assert (Type.SPHERICAL in data) == (projection != "perspective")
+        assert (int.from_bytes(data[Type.STEREO3D][:4], "little") if Type.STEREO3D in data else None) == kind
+    assert run([*arguments, "walk.exr", "--projection", "equirect", "--size", "64x32", "--stereo", "top-bottom"]) == 0
+    assert [path.name for path in sorted(Path().glob("*.exr"))] == ["walk_0000.exr", "walk_0001.exr"]
