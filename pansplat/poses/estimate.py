@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import itertools
 import math
@@ -33,6 +32,7 @@ from pansplat.poses.features import (
 from pansplat.poses.hints import Hints, read_hints
 from pansplat.poses.tour import Pair, build_tour
 from pansplat.poses.two_view import (
+    Hypothesis,
     RelativePose,
     estimate_relative_pose,
     match_priors,
@@ -286,13 +286,11 @@ def _relate_views(views: Sequence[_View], seed: int, report: Progress) -> dict[P
         first, second = views[pair[0]], views[pair[1]]
         matches = match_features(first.features, second.features)
         prior = RotationPrior(first.axes, second.axes)
-        relation = estimate_relative_pose(first.features, second.features, matches, prior, seed=seed)
+        relation = estimate_relative_pose(
+            first.features, second.features, matches, prior, lambda h: _agree_on_floor(h, first, second), seed=seed
+        )
         if not relation.is_reliable:
             return relation
-        if not relation.is_certain:
-            relation = _confirm_by_floor(relation, first, second)
-            if not relation.is_reliable:
-                return relation
         further = match_features(first.turned, second.turned)
         indices = further.indices + np.array((len(first.features), len(second.features)))
         every = Matches(np.concatenate((matches.indices, indices)), np.concatenate((matches.ratio, further.ratio)))
@@ -306,28 +304,25 @@ def _relate_views(views: Sequence[_View], seed: int, report: Progress) -> dict[P
     return relations
 
 
-def _pair_poses(relation: RelativePose, first: _View, second: _View) -> Float[Array, "2 4 4"]:
+def _pair_poses(relation: RelativePose | Hypothesis, first: _View, second: _View) -> Float[Array, "2 4 4"]:
     """Levelled poses of two panoramas at a distance of 1."""
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, :3, :3], poses[1, :3, 3] = relation.rotation.T, -relation.rotation.T @ relation.translation
     return level_poses(poses, np.stack((first.axes.axes[0], second.axes.axes[0])))
 
 
-def _confirm_by_floor(relation: RelativePose, first: _View, second: _View) -> RelativePose:
-    """The relation, with a problem if the cameras' heights differ or the panoramas do not agree on a floor.
+def _agree_on_floor(hypothesis: Hypothesis, first: _View, second: _View) -> bool:
+    """Whether the way between the cameras is level, and both panoramas show one floor.
 
-    Repeated doors and windows give wrong poses with many matches. Such a pose is rarely horizontal, and the floors of
+    Repeated doors and windows give wrong poses with many matches. Such a pose is rarely level, and the floors of
     both panoramas do not agree under it.
     """
-    poses = _pair_poses(relation, first, second)
-    slope = math.degrees(math.asin(float(np.clip(poses[1, 1, 3], -1, 1))))
-    few = f"too little in common: {relation.places:.0f} places match"
-    if abs(slope) > _LARGEST_SLOPE:
-        problem = f"{few}, and the cameras' heights differ by {abs(slope):.0f} degrees of slope under the best pose"
-        return dataclasses.replace(relation, problem=problem)
-    if not find_floor([first.small, second.small], poses, [(0, 1)]).is_found(_CONFIRMING_CONTRAST):
-        return dataclasses.replace(relation, problem=f"{few}, and the floor does not confirm the pose")
-    return relation
+    if not (first.axes.has_down and second.axes.has_down):
+        return False
+    poses = _pair_poses(hypothesis, first, second)
+    if abs(poses[1, 1, 3]) > math.sin(math.radians(_LARGEST_SLOPE)):
+        return False
+    return find_floor([first.small, second.small], poses, [(0, 1)]).is_found(_CONFIRMING_CONTRAST)
 
 
 def _describe_mirrored(

@@ -82,7 +82,7 @@ class Matches:
 
     Attributes:
         indices: of the features in the first and in the second panorama.
-        ratio: distance of the descriptors over that to the second nearest one, in [0, 1].
+        ratio: distance of the descriptors over that to the second nearest one, in [0, 1]; mean of both panoramas.
     """
 
     indices: Int[Array, "match 2"]
@@ -114,11 +114,14 @@ def detect_features(
     sift = cv2.SIFT_create(contrastThreshold=_CONTRAST, edgeThreshold=_EDGE)
     bearings, descriptors, strengths = [np.empty((0, 3))], [np.empty((0, 128), np.float32)], [np.empty(0)]
     for face, rotation in enumerate(rotations[:faces]):
-        points, found = sift.detectAndCompute(render_face(image, rotation, focal), None)
+        pixels = render_face(image, rotation, focal)
+        margin = int(len(pixels) / 2 - focal) - 1  # what lies outside the face of a cube needs no descriptors
+        inside = np.zeros_like(pixels)
+        inside[margin : len(pixels) - margin, margin : len(pixels) - margin] = 255
+        points, found = sift.detectAndCompute(pixels, inside)
         if found is None or not len(points):
             continue
-        side = 2 * math.tan(math.radians(_FIELD_OF_VIEW / 2)) * focal
-        xy = (np.array([point.pt for point in points]) + 0.5 - int(side) / 2) / focal
+        xy = (np.array([point.pt for point in points]) + 0.5 - len(pixels) / 2) / focal
         rays = np.concatenate((xy, np.ones((len(xy), 1))), axis=1)
         rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)) @ rotation.T
         own = (rays @ rotations[:, :, 2].T).argmax(axis=1) == face
@@ -160,23 +163,22 @@ def match_features(first: Features, second: Features) -> Matches:
     if min(len(first), len(second)) < 2:
         return Matches(np.empty((0, 2), np.int64), np.empty(0))
     a, b = torch.from_numpy(first.descriptors), torch.from_numpy(second.descriptors)
-    nearest, ratios = [], []
-    best_row = torch.full((len(b),), -1.0)
-    row_of = torch.zeros(len(b), dtype=torch.long)
+    rows, columns = [], torch.full((2, len(b)), -1.0)  # the two largest similarities of each row, and of each column
+    nearest, row_of = [], torch.zeros(len(b), dtype=torch.long)
     for start in range(0, len(a), _CHUNK):
         similarity = a[start : start + _CHUNK] @ b.T
-        column_best, rows = similarity.max(dim=0)
-        better = column_best > best_row
-        best_row = torch.where(better, column_best, best_row)
-        row_of = torch.where(better, rows + start, row_of)
-        value, index = similarity.max(dim=1)
-        similarity[torch.arange(len(value)), index] = -1
-        second_value = similarity.max(dim=1).values
-        nearest.append(index)
-        ratios.append(((1 - value).clamp_min(0) / (1 - second_value).clamp_min(1e-6)).sqrt())
-    index, ratio = torch.cat(nearest), torch.cat(ratios)
+        values, index = similarity.topk(2, dim=1)
+        rows.append(values.T)
+        nearest.append(index[:, 0])
+        values, index = similarity.topk(2, dim=0)
+        row_of = torch.where(values[0] > columns[0], index[0] + start, row_of)
+        columns = torch.cat((columns, values)).topk(2, dim=0).values
+    index = torch.cat(nearest)
     mutual = torch.nonzero(row_of[index] == torch.arange(len(index)))[:, 0]
-    indices, ratio = torch.stack((mutual, index[mutual]), dim=1).numpy(), ratio[mutual].double().numpy()
+    distance, row_second = (1 - torch.cat(rows, dim=1)[:, mutual]).clamp_min(0).sqrt()
+    column_second = (1 - columns[1, index[mutual]]).clamp_min(0).sqrt()
+    ratio = (distance / row_second.clamp_min(1e-3) + distance / column_second.clamp_min(1e-3)) / 2
+    indices, ratio = torch.stack((mutual, index[mutual]), dim=1).numpy(), ratio.double().numpy()
     return _drop_repeated(first, second, Matches(indices, ratio))
 
 

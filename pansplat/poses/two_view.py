@@ -12,6 +12,7 @@ by generalized model optimization, ACCV 2004; P. Torr, A. Zisserman, MLESAC, CVI
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -54,6 +55,7 @@ _KEPT, _KEPT_PARALLEL = 20, 10  # hypotheses that are optimised: of all kinds, a
 _PLACE = 0.2  # size of a cell that counts as one place, as a difference of unit vectors
 _MIN_PARALLAX = 5.0  # in the noise's standard deviation
 _MAX_UNCERTAINTY = math.radians(4)
+_EQUAL_SCORE = 0.9  # of neighbouring poses, because matches on one object share an error: parallel walls decide
 _SAME_ROTATION, _SAME_DIRECTION = math.radians(3), math.radians(10)  # differences of equal hypotheses
 
 
@@ -66,10 +68,12 @@ class _Evidence:
     margin: float
 
 
-# Measured on pairs of a home, of which most have nothing in common. Wrong poses that make the walls parallel have at
-# most 21 places and a score of 70, and fail the check of the floor. Other wrong poses have up to 25 places, because
-# repeated doors and windows match.
-_CERTAIN, _CONFIRMED, _UNCONFIRMED = _Evidence(24, 100, 10), _Evidence(10, 36, 4), _Evidence(32, 80, 20)
+# By the number of confirmations that do not depend on the matches: the walls of both panoramas are parallel, and both
+# agree on a floor. Measured on pairs of a home, of which most have nothing in common: of the wrong poses with at least
+# 10 places and a score of 36, none is confirmed by both; repeated doors and windows give them up to 26 places.
+_NEEDED = _Evidence(32, 80, 20), _Evidence(24, 100, 10), _Evidence(10, 36, 4)
+_FLOOR_SCORE = 6.0  # of a pose that the floor confirms; none of 400 wrong poses
+_ALTERNATIVES = 5  # best hypotheses that are compared by the floor
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,9 +328,16 @@ def search_hypotheses(
     found.sort(key=lambda h: -h.score)
     distinct: list[Hypothesis] = []
     for hypothesis in found:
-        if not any(are_same(hypothesis, other) for other in distinct):
+        near = next((n for n, other in enumerate(distinct) if are_same(hypothesis, other)), None)
+        if near is None:
             distinct.append(hypothesis)
-    return distinct
+        elif (
+            hypothesis.score > _EQUAL_SCORE * distinct[near].score
+            and axes.confirms(hypothesis.rotation)
+            and not axes.confirms(distinct[near].rotation)
+        ):
+            distinct[near] = hypothesis
+    return sorted(distinct, key=lambda h: -h.score)
 
 
 def are_same(first: Hypothesis, second: Hypothesis) -> bool:
@@ -399,7 +410,6 @@ class RelativePose:
         uncertainty: standard deviations of rotation and direction by the noise of the matches and the distortion of
             the panoramas, radians.
         problem: why the pose must not be used; None if it passes the check.
-        is_certain: whether the matches and the walls suffice as evidence, without the floor.
     """
 
     rotation: Float[Array, "3 3"]
@@ -411,7 +421,6 @@ class RelativePose:
     parallax: float
     uncertainty: tuple[float, float]
     problem: str | None
-    is_certain: bool = True
 
     @property
     def is_reliable(self) -> bool:
@@ -420,7 +429,13 @@ class RelativePose:
 
 
 def estimate_relative_pose(
-    first: Features, second: Features, matches: Matches, axes: RotationPrior = NO_PRIOR, *, seed: int = 0
+    first: Features,
+    second: Features,
+    matches: Matches,
+    axes: RotationPrior = NO_PRIOR,
+    agree_on_floor: Callable[[Hypothesis], bool] = lambda hypothesis: False,
+    *,
+    seed: int = 0,
 ) -> RelativePose:
     """The most probable relative pose of two panoramas, with its check.
 
@@ -428,6 +443,7 @@ def estimate_relative_pose(
         first, second: features of both panoramas.
         matches: between them.
         axes: gravity and walls of both panoramas.
+        agree_on_floor: whether both panoramas show one floor under a pose; called if matches and walls do not suffice.
         seed: of the random samples.
     """
     count = min(len(matches), _MAX_MATCHES)
@@ -439,40 +455,66 @@ def estimate_relative_pose(
         empty = np.empty((0, 2), np.int64)
         no_match = f"only {count} features match"
         return RelativePose(np.eye(3), np.array((0.0, 0, 1)), empty, 0.0, 0.0, 0.0, 0.0, (math.inf,) * 2, no_match)
+
+    def measure(ranked: list[Hypothesis]) -> _Evidence:
+        """The evidence for the first hypothesis."""
+        best = ranked[0]
+        places = min(_count_places(x, best.probability) for x in (a, b))
+        return _Evidence(places, best.score, best.score - ranked[1].score if len(ranked) > 1 else best.score)
+
+    evidence, confirmations = measure(found), int(axes.confirms(found[0].rotation))
+    if _find_problem(evidence, confirmations) is not None and found[0].score >= _NEEDED[2].score:
+        found = found[:_ALTERNATIVES]
+        on_floor = [agree_on_floor(h) for h in found]
+        found = [replace(h, score=h.score + _FLOOR_SCORE * floor) for h, floor in zip(found, on_floor, strict=True)]
+        order = sorted(range(len(found)), key=lambda n: -found[n].score)
+        found = [found[n] for n in order]
+        evidence, confirmations = measure(found), int(axes.confirms(found[0].rotation)) + on_floor[order[0]]
     best = found[0]
-    margin = best.score - found[1].score if len(found) > 1 else best.score
     right = best.probability > 0.5
-    places = min(_count_places(x, best.probability) for x in (a, b))
     parallax = angle_between(a @ best.rotation.T, b)[right]
     spread = float(np.quantile(parallax, 0.9)) if len(parallax) else 0.0
     polished = np.flatnonzero(right)[:_MAX_POLISHED]
     rotation, translation, uncertainty = polish_pose(
         a[polished], b[polished], best.rotation, best.translation, noise, axes
     )
-    confirmed = axes.confirms(best.rotation)
-    needed = _CONFIRMED if confirmed else _UNCONFIRMED
-    problem = None
-    if spread < _MIN_PARALLAX * noise and right.sum() >= _CONFIRMED.places:
+    problem = _find_problem(evidence, confirmations)
+    if spread < _MIN_PARALLAX * noise and right.sum() >= _NEEDED[2].places:
         problem = f"both were taken at one place: parallax of {math.degrees(spread):.2f} degrees"
-    elif places < needed.places or best.score < needed.score:
-        problem = f"too little in common: {places:.0f} places match, {needed.places:.0f} are needed"
-        problem += "" if confirmed else " without parallel walls that confirm the pose"
-    elif margin < needed.margin:
-        problem = f"another pose fits as well (difference of the scores {margin:.1f}, {needed.margin:.0f} are needed)"
-    elif uncertainty[1] > _MAX_UNCERTAINTY:
+    elif problem is None and uncertainty[1] > _MAX_UNCERTAINTY:
         problem = f"the direction is uncertain by {math.degrees(uncertainty[1]):.0f} degrees"
     return RelativePose(
         rotation,
         translation,
         matches.indices[:count][right],
         best.score,
-        margin,
-        places,
+        evidence.margin,
+        evidence.places,
         spread,
         uncertainty,
         problem,
-        not confirmed or (places >= _CERTAIN.places and best.score >= _CERTAIN.score and margin >= _CERTAIN.margin),
     )
+
+
+def _find_problem(evidence: _Evidence, confirmations: int) -> str | None:
+    """Why the evidence for a pose does not suffice; None if it does."""
+    needed = min(
+        _NEEDED[: confirmations + 1],
+        key=lambda n: (evidence.places < n.places) + (evidence.score < n.score) + (evidence.margin < n.margin),
+    )
+    unconfirmed = ("", ", as only walls or floor confirm the pose", ", as neither walls nor floor confirm the pose")
+    if evidence.places < needed.places:
+        reason = f"{evidence.places:.0f} places match, {needed.places:.0f} are needed"
+    elif evidence.score < needed.score:
+        reason = f"the matches have a score of {evidence.score:.0f}, {needed.score:.0f} is needed"
+    elif evidence.margin < needed.margin:
+        return (
+            f"another pose fits as well (difference of the scores {evidence.margin:.1f}, {needed.margin:.0f} is needed"
+            f"{unconfirmed[2 - confirmations]})"
+        )
+    else:
+        return None
+    return f"too little in common: {reason}{unconfirmed[2 - confirmations]}"
 
 
 def polish_relative_pose(
