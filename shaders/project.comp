@@ -1,22 +1,24 @@
-// GL 4.3 tier: projects one Gaussian per invocation and writes the same record as project.vert.
+// GL 4.3 tier: projects one Gaussian per invocation and writes the same record as project.vert, farthest first.
 layout(local_size_x = 64) in;
 
 #include "splat.glsl"
 
-uniform int count;
+uniform int first;              // splats that are farther than those of this chunk
+uniform int capacity;           // of the chunk
 
 struct StoredGaussian { vec4 mean_opacity, quat, scale; };
 struct Record { vec4 quad_1, quad_2, row_a, row_b, row_l, color; };
 
 layout(std430, binding = 0) readonly buffer Gaussians { StoredGaussian gaussians[]; };
 layout(std430, binding = 1) readonly buffer Colors { vec4 colors[]; };
-layout(std430, binding = 2) readonly buffer Indices { uint indices[]; };
+layout(std430, binding = 2) readonly buffer Visible { uint visible[]; };        // indices, front to back
 layout(std430, binding = 3) writeonly buffer Records { Record records[]; };
+layout(std430, binding = 4) readonly buffer Total { uint total; };              // of `visible`
 
 void main() {
-    uint slot = gl_GlobalInvocationID.x + gl_GlobalInvocationID.y * gl_NumWorkGroups.x * gl_WorkGroupSize.x;
-    if (slot >= uint(count)) return;
-    uint index = indices[slot];
+    uint slot = gl_GlobalInvocationID.x;
+    if (slot >= uint(capacity) || uint(first) + slot >= total) return;
+    uint index = visible[total - 1u - uint(first) - slot];
     StoredGaussian stored = gaussians[index];
     Gaussian gaussian = Gaussian(stored.mean_opacity.xyz, stored.mean_opacity.w, stored.quat, stored.scale.xyz);
     Footprint f;

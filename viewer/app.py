@@ -123,7 +123,9 @@ class Options:
     @property
     def settings(self) -> DrawSettings:
         """Initial draw settings."""
-        return DrawSettings(kernel=self.kernel, order=self.order, mode=self.mode)
+        return DrawSettings(
+            kernel=self.kernel, order=self.order, mode=self.mode, stereo=self.stereo, eye_distance=self.ipd
+        )
 
 
 def run_arguments(args: Sequence[str] | None = None) -> int:

@@ -42,7 +42,8 @@ def write_screenshot(
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = find_free_name(folder, "panorama" if panorama else "view", f".{suffix}")
-    write_image(path, np.clip(color, 0, 1), depth=depth, panorama=panorama)
+    marked = panorama and color.shape[1] == 2 * color.shape[0]  # there is no property for stereo
+    write_image(path, np.clip(color, 0, 1), depth=depth, panorama=marked)
     return path
 
 

@@ -169,6 +169,18 @@ class CpuRenderer:
         """Context views of the uploaded scene."""
         return self._splats.num_views if self._splats is not None else 0
 
+    @property
+    def pixels(self) -> UInt32[np.ndarray, "height width"] | None:
+        """The last image as bytes, bottom row first; None before the first one."""
+        return None if self._picture is None else self._picture.pixels
+
+    def create_sibling(self) -> CpuRenderer:
+        """A renderer that has this scene, without a copy."""
+        sibling = CpuRenderer(self._ctx)
+        sibling._min_transmittance = self._min_transmittance
+        sibling._splats, sibling._scene, sibling.stats = self._splats, self._scene, self.stats
+        return sibling
+
     def upload(self, scene: Scene) -> None:
         """Replace the scene; Gaussians with NaN or infinity are dropped and counted."""
         self._stop_jobs()

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, UInt
 from pansplat.constants import FILTER_VARIANCE
 from pansplat.errors import InputError
 from pansplat_viewer.camera import Pinhole, create_face_cameras, find_faces_in_view
+from pansplat_viewer.gpu_sort import GpuSplats
 from pansplat_viewer.programs import RECORD, RECORD_BYTES, Programs, set_uniforms
 from pansplat_viewer.settings import DrawSettings
 from pansplat_viewer.splats import SortedSplats, Splats
@@ -26,8 +27,6 @@ from pansplat_viewer.splats import SortedSplats, Splats
 _MAX_CACHED_FACE_SIZE = 2048  # pixels; six faces take 200 MB at 16 bits
 _MAX_SELECTIONS = 8
 _CHUNK_SIZE = 1 << 20  # records that are made and drawn together; limits their memory to 100 MB
-_WORK_GROUP_SIZE = 64  # local size of project.comp
-_MAX_WORK_GROUPS = 1 << 14  # in one dimension, below the limit of every implementation
 
 
 class LayerStorage(IntEnum):
@@ -274,7 +273,7 @@ class LayerPainter:
         drawn = 0
         for part in missing:
             viewport = (part % 3 * width, part // 3 * height, width, height)
-            drawn += self._paint_part(target, cameras[part], viewport, splats, selected, frame.settings)
+            drawn += self._paint_part(target, cameras[part], viewport, splats, selected, view, frame.settings)
             target.parts.add(part)
         return Layer(target, int(np.count_nonzero(selected)), drawn, cached=not missing)
 
@@ -289,19 +288,17 @@ class LayerPainter:
         viewport: tuple[int, int, int, int],
         splats: SortedSplats,
         selected: Bool[np.ndarray, "n"],
+        view: int | None,
         settings: DrawSettings,
     ) -> int:
-        """Draw one part of a layer; returns the number of splats."""
-        variance, _ = compute_lowpass_variances(settings, camera.focal)
-        seen = splats.cull(camera, selected, kernel=settings.kernel, filter_variance=variance)
-        indices = splats.sort_back_to_front(camera, seen, settings.order)
+        """Draw one part of a layer; returns the number of splats, 0 if only the GPU has it."""
         framebuffer = target.framebuffer
         framebuffer.use()
         framebuffer.viewport = framebuffer.scissor = viewport
         framebuffer.clear(0.0, 0.0, 0.0, 0.0)
-        self.rasterizer.draw(camera, indices, settings, viewport)
+        drawn = self.rasterizer.draw(camera, splats, selected, view, settings, viewport)
         framebuffer.scissor = None
-        return len(indices)
+        return drawn
 
     def _select(self, settings: DrawSettings, view: int | None) -> Bool[np.ndarray, "n"]:
         key = (settings.levels, settings.opacity_threshold, view)
@@ -320,7 +317,11 @@ def compute_lowpass_variances(settings: DrawSettings, focal: float) -> tuple[flo
 
 
 class SplatRasterizer:
-    """Draws the splats of one scene with OpenGL; the tier only decides how records are made."""
+    """Draws the splats of one scene with OpenGL.
+
+    Tier `gl33` culls and sorts on the processor and makes records by transform feedback. Tier `gl43` does all of it by
+    compute shaders (`GpuSplats`). Both draw the same records in the same order.
+    """
 
     def __init__(self, ctx: moderngl.Context, programs: Programs, splats: Splats, tier: str) -> None:
         """Upload the geometry and constant colours, and allocate buffers for indices and records."""
@@ -332,11 +333,16 @@ class SplatRasterizer:
         if splats.base_colors is not None:
             self.write_colors(splats.base_colors)
         self._capacity = max(min(_CHUNK_SIZE, len(splats)), 1)
-        self._indices = ctx.buffer(reserve=4 * self._capacity, dynamic=True)
+        self._indices: moderngl.Buffer | None = None
         self._records = ctx.buffer(reserve=RECORD_BYTES * self._capacity, dynamic=True)
         self._quads = ctx.vertex_array(programs.splat(), [(self._records, "4f " * len(RECORD) + "/i", *RECORD)])
         self._points: moderngl.VertexArray | None = None
-        if tier == "gl33":
+        self._gpu: GpuSplats | None = None
+        if tier == "gl43":
+            buffers = self._geometry, self._colors, self._records
+            self._gpu = GpuSplats(ctx, programs, *buffers, len(splats), self._capacity)
+        else:
+            self._indices = ctx.buffer(reserve=4 * self._capacity, dynamic=True)
             self._points = ctx.vertex_array(
                 programs.project(),
                 [
@@ -356,39 +362,60 @@ class SplatRasterizer:
     def draw(
         self,
         camera: Pinhole,
-        back_to_front: UInt[np.ndarray, "n"],
+        splats: SortedSplats,
+        selected: Bool[np.ndarray, "n"],
+        view: int | None,
         settings: DrawSettings,
         viewport: tuple[int, int, int, int],
-    ) -> None:
-        """Blend the splats with these indices into `viewport` of the bound framebuffer."""
+    ) -> int:
+        """Blend the selected splats that the camera sees into `viewport` of the bound framebuffer.
+
+        Args:
+            camera: of the image.
+            splats: sorted for a position; tier `gl43` reads the position only.
+            selected: the splats to draw, those of `view` and the settings' levels and opacity.
+            view: of the layer, or None.
+            settings: draw settings.
+            viewport: left, bottom, width, height, pixels.
+
+        Returns:
+            The number of splats, or 0 if only the GPU has it: see `take_drawn`.
+        """
         self._set_uniforms(camera, settings, viewport)
         self._ctx.enable_only(moderngl.BLEND)
         self._ctx.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
-        for start in range(0, len(back_to_front), self._capacity):
-            indices = np.ascontiguousarray(back_to_front[start : start + self._capacity], dtype=np.uint32)
-            self._indices.write(indices)
-            self._project(len(indices))
-            self._quads.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=len(indices))
+        variance, _ = compute_lowpass_variances(settings, camera.focal)
+        drawn = 0
+        if self._gpu is not None:
+            selection = settings.levels, settings.opacity_threshold, view
+            self._gpu.draw(self._quads, camera, splats.position, selected, selection, settings, variance)
+        else:
+            seen = splats.cull(camera, selected, kernel=settings.kernel, filter_variance=variance)
+            drawn = self._draw_in_order(splats.sort_back_to_front(camera, seen, settings.order))
         self._ctx.enable_only(moderngl.NOTHING)
+        return drawn
+
+    def take_drawn(self) -> int:
+        """Number of splats that the GPU has culled to and drawn since the last call."""
+        return 0 if self._gpu is None else self._gpu.take_drawn()
 
     def release(self) -> None:
         """Free the buffers and vertex arrays."""
         for resource in (self._quads, self._points, self._geometry, self._colors, self._indices, self._records):
             if resource is not None:
                 resource.release()
+        if self._gpu is not None:
+            self._gpu.release()
 
-    def _project(self, count: int) -> None:
-        """Write the records of the first `count` indices."""
-        if self._points is not None:
-            self._points.transform(self._records, moderngl.POINTS, vertices=count)
-            return
-        program = self._programs.project_compute()
-        set_uniforms(program, count=count)
-        for binding, buffer in enumerate((self._geometry, self._colors, self._indices, self._records)):
-            buffer.bind_to_storage_buffer(binding)
-        groups = -(-count // _WORK_GROUP_SIZE)
-        program.run(min(groups, _MAX_WORK_GROUPS), -(-groups // _MAX_WORK_GROUPS))
-        self._ctx.memory_barrier()
+    def _draw_in_order(self, back_to_front: UInt[np.ndarray, "n"]) -> int:
+        """Project the splats with these indices by transform feedback, and draw them; returns their number."""
+        assert self._indices is not None and self._points is not None
+        for start in range(0, len(back_to_front), self._capacity):
+            indices = np.ascontiguousarray(back_to_front[start : start + self._capacity], dtype=np.uint32)
+            self._indices.write(indices)
+            self._points.transform(self._records, moderngl.POINTS, vertices=len(indices))
+            self._quads.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=len(indices))
+        return len(back_to_front)
 
     def _set_uniforms(self, camera: Pinhole, settings: DrawSettings, viewport: tuple[int, int, int, int]) -> None:
         variance, dilation = compute_lowpass_variances(settings, camera.focal)

@@ -15,7 +15,7 @@ from pansplat_viewer.input import HELP, Commands
 from pansplat_viewer.key_frames import KeyFrame
 from pansplat_viewer.minimap import SIZE, Minimap
 from pansplat_viewer.picking import project_point
-from pansplat_viewer.settings import FrameStats, Kernel, Lowpass, Order
+from pansplat_viewer.settings import FrameStats, Kernel, Lowpass, Order, Projection
 from pansplat_viewer.state import KEY_SECONDS, ViewerState, add_key_frame, fly_to, jump_to_view, show_path, toggle_play
 from pansplat_viewer.tour import Hotspot, TourScenes
 
@@ -300,6 +300,14 @@ class Panels:
                 imgui.same_line()
                 if self._radio(choice, getattr(settings, name) == choice):
                     settings = replace(settings, **{name: choice})
+        _draw_row_label("stereo")
+        for label, stereo in (("off", "mono"), ("pair", "side-by-side"), ("red/cyan", "anaglyph")):
+            imgui.same_line()
+            if self._radio(f"{label}##stereo", settings.stereo == stereo):
+                settings = replace(settings, stereo=stereo)
+        if settings.stereo != "mono":
+            distance = self._slider("eye distance", 1000 * settings.eye_distance, 10.0, 200.0, "%.0f mm")
+            settings = replace(settings, eye_distance=distance / 1000)
         flags = imgui.ColorEditFlags_.no_inputs.value
         changed, background = imgui.color_edit3("background", list(settings.background), flags)
         self._record_rectangle("background")
@@ -401,6 +409,11 @@ class Panels:
                     state.film_suffix = suffix
                 imgui.same_line()
             commands.film = self._button("Write film")
+            for projection in get_args(Projection):
+                if self._radio(projection, state.film_projection == projection):
+                    state.film_projection = projection
+                imgui.same_line()
+            imgui.new_line()
             state.film_fps = self._slider("frames per second", state.film_fps, 1.0, 60.0, "%.0f")
 
     def _draw_error(self, error: str, commands: Commands) -> None:

@@ -21,6 +21,9 @@ _SHARED_CONSTANTS = ("ALPHA_CUT", "MAX_ALPHA", "EWA_NEAR_FACTOR", "EWA_CLAMP")
 RECORD = ("quad_1", "quad_2", "row_a", "row_b", "row_l", "color")
 RECORD_BYTES = 16 * len(RECORD)
 
+DIGITS = 64  # of the radix sort, and its threads in a work group
+TILE_SIZE = 1024  # keys or splats of a work group
+
 
 def choose_tier(ctx: moderngl.Context, tier: str) -> str:
     """Return `gl43` if the context has compute shaders and `tier` allows it, else `gl33`.
@@ -37,7 +40,7 @@ def choose_tier(ctx: moderngl.Context, tier: str) -> str:
     return "gl43" if has_compute and tier != "gl33" else "gl33"
 
 
-def read_source(name: str, version: int, **defines: float) -> str:
+def read_source(name: str, version: int, **defines: float | str) -> str:
     """Return a shader's text with its includes and the `#version` line for GL `version` (330 or 430).
 
     Args:
@@ -83,7 +86,12 @@ class Programs:
 
     def project_compute(self) -> moderngl.ComputeShader:
         """Gaussians to records by a compute shader (GL 4.3)."""
-        return self._compile("project.comp", lambda: self._ctx.compute_shader(read_source("project.comp", 430)))
+        return self.compute("project.comp")
+
+    def compute(self, name: str, **defines: int) -> moderngl.ComputeShader:
+        """The compute shader of this file (GL 4.3)."""
+        defines = {"TILE_SIZE": TILE_SIZE, "DIGITS": f"{DIGITS}u"} | defines  # type: ignore[assignment]
+        return self._compile(f"{name} {defines}", lambda: self._ctx.compute_shader(read_source(name, 430, **defines)))
 
     def splat(self) -> moderngl.Program:
         """Records to pixels of a layer."""
@@ -96,6 +104,10 @@ class Programs:
     def resolve(self) -> moderngl.Program:
         """The sum of layers to the image."""
         return self._compile_pair("screen.vert", "resolve.frag")
+
+    def arrange(self) -> moderngl.Program:
+        """The images of two eyes to one image."""
+        return self._compile_pair("screen.vert", "arrange.frag")
 
     def present(self) -> moderngl.Program:
         """The image, and a photograph next to it, to the screen."""

@@ -22,7 +22,7 @@ from pansplat.geometry.pose import blend_weights
 from pansplat_viewer.layers import Frame, Layer, LayerPainter, LayerStorage, Target, TargetStore
 from pansplat_viewer.programs import Programs, choose_tier, set_uniforms
 from pansplat_viewer.settings import DrawSettings, FrameStats
-from pansplat_viewer.splats import SortedSplats, Splats, SplatSorter, sort_splats
+from pansplat_viewer.splats import SortedSplats, Splats, SplatSorter, color_splats, sort_splats
 
 _SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software")
 
@@ -64,7 +64,7 @@ class SplatRenderer:
 
         Args:
             ctx: the current context.
-            tier: how records are made: by transform feedback (`gl33`) or by a compute shader (`gl43`).
+            tier: `gl33` culls and sorts on the processor; `gl43` does it by compute shaders.
             color_bits: bits per channel of the render targets. None is 16 on a GPU, and 32 on software OpenGL, which
                 truncates half floats (images get darker with every layer) and is not slower with 32.
 
@@ -81,7 +81,8 @@ class SplatRenderer:
         self._programs = Programs(ctx)
         self._targets = TargetStore(ctx, color_bits=color_bits)
         self._compositor = Compositor(ctx, self._programs, self._targets)
-        self._sorter = SplatSorter()
+        self._sort = color_splats if self.tier == "gl43" else sort_splats  # the GPU sorts in tier gl43
+        self._sorter = SplatSorter(self._sort)
         self._splats: Splats | None = None
         self._painter: LayerPainter | None = None
         self._sorted: SortedSplats | None = None
@@ -93,9 +94,18 @@ class SplatRenderer:
         """Context views of the uploaded scene."""
         return self._splats.num_views if self._splats is not None else 0
 
+    def create_sibling(self) -> SplatRenderer:
+        """A renderer with a copy of this scene on the GPU."""
+        sibling = SplatRenderer(self._ctx, tier=self.tier, color_bits=self._targets.color_bits)
+        if self._splats is not None:
+            sibling._upload(self._splats)
+        return sibling
+
     def upload(self, scene: Scene) -> None:
         """Replace the scene on the GPU; Gaussians with NaN or infinity are dropped and counted."""
-        splats = Splats.from_scene(scene)
+        self._upload(Splats.from_scene(scene))
+
+    def _upload(self, splats: Splats) -> None:
         self._release_scene()
         self._painter = LayerPainter(self._ctx, self._programs, self._targets, splats, self.tier)
         self._splats = splats
@@ -136,8 +146,12 @@ class SplatRenderer:
         self._frame = frame
         image = self._draw(frame, with_depth=False)
         self._ctx.finish()
-        _bind(bound)
-        self.stats = dataclasses.replace(self.stats, settled=settled, frame_ms=1e3 * (time.perf_counter() - start))
+        assert self._painter is not None
+        drawn = self.stats.drawn + self._painter.rasterizer.take_drawn()
+        bind(bound)
+        self.stats = dataclasses.replace(
+            self.stats, settled=settled, drawn=drawn, frame_ms=1e3 * (time.perf_counter() - start)
+        )
         return image.color
 
     def has_faces(self, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> bool:
@@ -157,8 +171,10 @@ class SplatRenderer:
         if self._image is not None and self._frame is not None and self._image.depth is None:
             bound, stats = self._ctx.fbo, self.stats
             self._draw(self._frame, with_depth=True)
+            assert self._painter is not None
+            self._painter.rasterizer.take_drawn()  # not of a new frame
             self.stats = stats
-            _bind(bound)
+            bind(bound)
         return self._read(attachment=1, components=1)[..., 0]
 
     def release(self) -> None:
@@ -193,8 +209,9 @@ class SplatRenderer:
     def _update_order(self, position: tuple[float, float, float], wait: bool) -> bool:
         """Sort for this position, here or in the worker thread; returns whether the order fits the position."""
         assert self._splats is not None
-        if self._sorted is None or (wait and self._sorted.position != position):
-            self._set_sorted(sort_splats(self._splats, position))
+        needs_work = self.tier == "gl33" or self._splats.base_colors is None
+        if self._sorted is None or ((wait or not needs_work) and self._sorted.position != position):
+            self._set_sorted(self._sort(self._splats, position))
         elif self._sorted.position != position:
             ready = self._sorter.take()
             if ready is not None and ready.splats is self._splats:
@@ -328,7 +345,7 @@ class Compositor:
             set_uniforms(program, **{name: unit})
 
 
-def _bind(framebuffer: moderngl.Framebuffer | None) -> None:
+def bind(framebuffer: moderngl.Framebuffer | None) -> None:
     """Bind a framebuffer unless it is released: on a context without a window it may be a freed render target."""
     if framebuffer is not None and hasattr(framebuffer.mglo, "use"):
         framebuffer.use()

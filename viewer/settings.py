@@ -9,6 +9,7 @@ from typing import Literal, get_args
 
 from pansplat.constants import NEAR
 from pansplat.errors import InputError
+from pansplat.options import EYE_DISTANCE
 
 Kernel = Literal["ray", "ewa"]
 Order = Literal["radial", "z"]
@@ -19,7 +20,7 @@ RendererChoice = Literal["auto", "gl", "cpu"]
 Projection = Literal["perspective", "equirect", "cubemap"]
 Stereo = Literal["mono", "side-by-side", "top-bottom", "anaglyph"]
 
-_CHOICES = {"kernel": Kernel, "order": Order, "lowpass": Lowpass, "mode": Mode, "layout": Layout}
+_CHOICES = {"kernel": Kernel, "order": Order, "lowpass": Lowpass, "mode": Mode, "layout": Layout, "stereo": Stereo}
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,9 @@ class DrawSettings:
         layout: `pinhole`, or `equirect` stitched from six cube faces.
         eye_offset: of layout `equirect`: radius of the viewing circle of omni-directional stereo, metres; negative for
             the left eye. `CpuRenderer` only, with kernel `ray`.
+        stereo: images of both eyes in one, which `StereoRenderer` draws: next to each other, the left above the right,
+            or the left in red and the right in green and blue.
+        eye_distance: metres.
         face_size: side of a cube face in pixels. None matches the resolution at the panorama's equator
             (2 height / pi), or at the centre of a pinhole image that is drawn from cached faces.
         cached: draw a pinhole image from six cube faces that are kept for this position, so that a rotation of the
@@ -64,6 +68,8 @@ class DrawSettings:
     vertical_fov_degrees: float = 90.0
     layout: Layout = "pinhole"
     eye_offset: float = 0.0
+    stereo: Stereo = "mono"
+    eye_distance: float = EYE_DISTANCE
     face_size: int | None = None
     cached: bool = False
 

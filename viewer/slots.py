@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
-from pansplat_viewer.cpu_renderer import Renderer
 from pansplat_viewer.settings import DrawSettings
+from pansplat_viewer.stereo import StereoRenderer
 
 
 class SceneSlot:
@@ -20,7 +20,7 @@ class SceneSlot:
         image: the last image; None if it has to be drawn again.
     """
 
-    def __init__(self, renderer: Renderer) -> None:
+    def __init__(self, renderer: StereoRenderer) -> None:
         """The slot is empty."""
         self.renderer = renderer
         self.scene: Scene | None = None

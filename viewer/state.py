@@ -13,7 +13,7 @@ from pansplat.tours import Route, TourGraph
 from pansplat_viewer.camera import Camera, move_to_pose
 from pansplat_viewer.key_frames import CameraPath, KeyFrame
 from pansplat_viewer.picking import PickedPoint
-from pansplat_viewer.settings import DrawSettings
+from pansplat_viewer.settings import DrawSettings, Projection
 
 FLIGHT_SECONDS = 6.0
 KEY_SECONDS = 2.0  # between key frames that are added one after the other
@@ -42,7 +42,7 @@ class ViewerState:
         minimap, hotspots: whether the floor plan of a tour and the places of its panoramas are shown.
         path: key frames of the camera path that is edited.
         path_seconds: time on the path that the panel shows; `path_playing` while it is played.
-        film_suffix, film_fps: of the film of the path.
+        film_suffix, film_fps, film_projection: of the film of the path.
         levels: pyramid levels of the scene, ascending.
         points: the last picked points, two at most.
         message: a text to show until `message_until` (seconds of the viewer's clock).
@@ -73,6 +73,7 @@ class ViewerState:
     path_playing: bool = False
     film_suffix: str = ".mp4"
     film_fps: float = 24.0
+    film_projection: Projection = "perspective"
     levels: tuple[int, ...] = ()
     points: list[PickedPoint] = field(default_factory=list)
     message: str = ""

@@ -1,26 +1,39 @@
-"""Projections and stereo: which images make up a still or a frame of a film, and how they are arranged in it."""
+"""Projections and stereo: which images make up a still, a frame of a film or the window's image, and their arrangement.
+
+`render_image` waits for one image of any projection. `StereoRenderer` draws the window's images.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
+import moderngl
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt32
 
 from pansplat.errors import InputError
+from pansplat.gaussians.scene import Scene
 from pansplat.geometry.cubemap import FACES
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.options import EYE_DISTANCE
 from pansplat.rendering.image_planes import image_planes
-from pansplat_viewer.cpu_renderer import Renderer
-from pansplat_viewer.settings import DrawSettings, Projection, Stereo
+from pansplat_viewer.cpu_renderer import CpuRenderer, Renderer
+from pansplat_viewer.programs import Programs, set_uniforms
+from pansplat_viewer.renderer import bind
+from pansplat_viewer.settings import DrawSettings, FrameStats, Projection, Stereo
 
 # Places of the faces in an image of three columns and two rows: layout 0 of the spherical metadata, version 2.
 _GRID = ("right", "left", "up"), ("down", "front", "back")
 _DEFAULT_SIZES = {"perspective": (1280, 720), "equirect": (2048, 1024), "cubemap": (1536, 1024)}
+MAX_TURN = math.radians(20)  # of the camera before the eyes follow, while cached faces are read
 _STEREO_FACE_OVERSAMPLING = 1.5  # of the panorama that the faces of stereo cubemaps are interpolated in
+
+_ARRANGEMENTS = ("side-by-side", "top-bottom", "anaglyph")  # as in shaders/arrange.frag
+_RED_AND_ALPHA = np.uint32(0xFF0000FF)
+_MAX_TARGETS = 4
 
 
 @dataclass(frozen=True)
@@ -66,8 +79,14 @@ class ImageFormat:
             raise InputError(f"stereo of projection {self.projection} needs kernel ray, got {kernel}")
 
 
+def choose_format(projection: Projection, settings: DrawSettings) -> ImageFormat:
+    """The format of a file that shows what the window shows; a pair of panoramas is top-bottom, as headsets expect."""
+    is_pair = projection != "perspective" and settings.stereo == "side-by-side"
+    return ImageFormat(projection, "top-bottom" if is_pair else settings.stereo, settings.eye_distance)
+
+
 def render_image(
-    renderer: Renderer,
+    renderer: Renderer | StereoRenderer,
     cam2world: Float[np.ndarray, "4 4"],
     size: tuple[int, int],
     settings: DrawSettings,
@@ -91,7 +110,7 @@ def render_image(
     image_format = image_format or ImageFormat()
     half = 0.5 * image_format.eye_distance
     offsets = (0.0,) if image_format.stereo == "mono" else (-half, half)
-    settings = replace(settings, cached=False)
+    settings = replace(settings, cached=False, stereo="mono")
     eyes = [_render_eye(renderer, cam2world, size, settings, image_format, offset, with_depth) for offset in offsets]
     color = arrange_eyes([color for color, _ in eyes], image_format.stereo)
     if not with_depth:
@@ -121,7 +140,7 @@ def move_eye(cam2world: Float[np.ndarray, "4 4"], offset: float) -> Float[np.nda
 
 
 def _render_eye(
-    renderer: Renderer,
+    renderer: Renderer | StereoRenderer,
     cam2world: np.ndarray,
     size: tuple[int, int],
     settings: DrawSettings,
@@ -167,3 +186,196 @@ def _sample(image: np.ndarray | None, directions: Float[torch.Tensor, "height wi
     channels = torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1).double()
     sampled = sample_equirect(channels, uv_from_directions(directions)).permute(1, 2, 0).float().numpy()
     return sampled.reshape(*sampled.shape[:2], *image.shape[2:])
+
+
+# --- the window's images ---
+
+
+def get_eye_size(size: tuple[int, int], stereo: Stereo) -> tuple[int, int]:
+    """(width, height) of the image of one eye in an image of this size."""
+    columns, rows = 2 if stereo == "side-by-side" else 1, 2 if stereo == "top-bottom" else 1
+    return max(size[0] // columns, 1), max(size[1] // rows, 1)
+
+
+class StereoRenderer:
+    """A renderer of images for one or two eyes, with the calls of the renderer that it is made of.
+
+    The second eye has a renderer of its own, made at the first stereo image. While `settings.cached`, the eyes stay
+    where they are in the faces, until the camera has turned by `MAX_TURN`; then they move to where they belong.
+    """
+
+    def __init__(self, renderer: Renderer, ctx: moderngl.Context | None) -> None:
+        """Take over a renderer; `ctx` is its context."""
+        self._eyes = [renderer]
+        self._ctx = ctx
+        self._programs: Programs | None = None
+        self._triangle: moderngl.VertexArray | None = None
+        self._targets: dict[tuple[int, int], moderngl.Framebuffer] = {}
+        self._axis: Float[np.ndarray, "3"] | None = None
+        self._stereo: Stereo = "mono"
+        self._last: moderngl.Texture | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        """Attributes of the renderer of the left eye."""
+        return getattr(self._eyes[0], name)
+
+    @property
+    def stats(self) -> FrameStats:
+        """Counts and times of the last frame; of two eyes the times are summed."""
+        stats = self._eyes[0].stats
+        if self._stereo == "mono":
+            return stats
+        other = self._eyes[1].stats
+        return replace(
+            stats,
+            drawn=stats.drawn + other.drawn,
+            frame_ms=stats.frame_ms + other.frame_ms,
+            sort_ms=stats.sort_ms + other.sort_ms,
+            cached=stats.cached and other.cached,
+            settled=stats.settled and other.settled,
+        )
+
+    def upload(self, scene: Scene) -> None:
+        """Replace the scene."""
+        self._eyes[0].upload(scene)
+        for other in self._eyes[1:]:
+            other.release()
+        del self._eyes[1:]
+        self._stereo, self._last = "mono", None
+
+    def render(
+        self,
+        cam2world: Float[np.ndarray, "4 4"],
+        size: tuple[int, int],
+        settings: DrawSettings,
+        *,
+        wait: bool = True,
+    ) -> moderngl.Texture | None:
+        """As the renderer's `render`; `size` is that of the whole image, `cam2world` is between the eyes."""
+        if self._stereo != settings.stereo:
+            self._stereo, self._last = settings.stereo, None
+        if settings.stereo == "mono":
+            return self._eyes[0].render(cam2world, size, settings, wait=wait)
+        if settings.layout != "pinhole":
+            raise InputError(f"stereo of a window is perspective, got layout {settings.layout}; use `render_image`")
+        if len(self._eyes) == 1:
+            self._eyes.append(self._eyes[0].create_sibling())
+        self._axis = self._choose_axis(cam2world, settings)
+        eye_size, eye_settings = get_eye_size(size, settings.stereo), replace(settings, stereo="mono")
+        textures = [
+            eye.render(pose, eye_size, eye_settings, wait=wait or self._last is None)
+            for eye, pose in zip(self._eyes, self._place_eyes(cam2world, settings), strict=True)
+        ]
+        if self._last is None or self.stats.settled or not self._eyes[0].waits_while_moving:
+            self._last = self._arrange(textures, settings.stereo)
+        return self._last  # the images of the processor's renderers that are not finished are those of another frame
+
+    def has_faces(self, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> bool:
+        """Whether the cube faces that the eyes read are finished."""
+        if settings.stereo == "mono":
+            return self._eyes[0].has_faces(cam2world, size, settings)
+        if len(self._eyes) == 1 or self._axis is None:
+            return False
+        axis, self._axis = self._axis, self._choose_axis(cam2world, settings)
+        poses, eye_size = self._place_eyes(cam2world, settings), get_eye_size(size, settings.stereo)
+        self._axis = axis
+        eye_settings = replace(settings, stereo="mono")
+        return all(eye.has_faces(pose, eye_size, eye_settings) for eye, pose in zip(self._eyes, poses, strict=True))
+
+    def read_color(self) -> Float[np.ndarray, "height width 4"]:
+        """Return the last image, float32, top row first: RGB over the background, and coverage."""
+        if self._stereo == "mono":
+            return self._eyes[0].read_color()
+        colors = [eye.read_color() for eye in self._eyes]
+        color = arrange_eyes([color[..., :3] for color in colors], self._stereo)
+        if self._stereo == "anaglyph":
+            return np.concatenate((color, np.maximum(colors[0][..., 3:], colors[1][..., 3:])), axis=-1)
+        return np.concatenate((color, arrange_eyes([color[..., 3:] for color in colors], self._stereo)), axis=-1)
+
+    def read_depth(self) -> Float[np.ndarray, "height width"]:
+        """Return the radial depth of the last image in metres; that of an anaglyph is the left eye's."""
+        if self._stereo in ("mono", "anaglyph"):
+            return self._eyes[0].read_depth()
+        return arrange_eyes([eye.read_depth()[..., None] for eye in self._eyes], self._stereo)[..., 0]
+
+    def read_eye_depth(self) -> Float[np.ndarray, "height width"]:
+        """Return the radial depth of the left eye's image in metres."""
+        return self._eyes[0].read_depth()
+
+    def release(self) -> None:
+        """Release the renderers, and free the textures."""
+        for target in self._targets.values():
+            target.color_attachments[0].release()
+            target.release()
+        self._targets.clear()
+        if self._triangle is not None and self._programs is not None:
+            self._triangle.release()
+            self._programs.release()
+        for eye in self._eyes:
+            eye.release()
+
+    def _choose_axis(self, cam2world: np.ndarray, settings: DrawSettings) -> Float[np.ndarray, "3"]:
+        """The direction from the left to the right eye."""
+        right = cam2world[:3, 0]
+        turned_little = self._axis is not None and float(right @ self._axis) > math.cos(MAX_TURN)
+        return self._axis if settings.cached and turned_little and self._axis is not None else right.copy()
+
+    def _place_eyes(self, cam2world: np.ndarray, settings: DrawSettings) -> list[Float[np.ndarray, "4 4"]]:
+        poses = [cam2world.copy(), cam2world.copy()]
+        for pose, sign in zip(poses, (-0.5, 0.5), strict=True):
+            pose[:3, 3] += sign * settings.eye_distance * self._axis
+        return poses
+
+    def _arrange(self, textures: list[moderngl.Texture | None], stereo: Stereo) -> moderngl.Texture | None:
+        """One texture of both images."""
+        left, right = textures
+        if self._ctx is None or left is None or right is None:
+            return None
+        first, second = self._eyes
+        if isinstance(first, CpuRenderer) and isinstance(second, CpuRenderer):
+            return self._arrange_pixels(first.pixels, second.pixels, stereo)
+        bound = self._ctx.fbo
+        target = self._get_target(left.size, stereo, left.dtype)
+        if self._programs is None or self._triangle is None:
+            self._programs = Programs(self._ctx)
+            self._triangle = self._ctx.vertex_array(self._programs.arrange(), [])
+        target.use()
+        set_uniforms(self._programs.arrange(), left=0, right=1, arrangement=_ARRANGEMENTS.index(stereo))
+        left.use(0)
+        right.use(1)
+        self._ctx.enable_only(moderngl.NOTHING)
+        self._triangle.render(moderngl.TRIANGLES, vertices=3)
+        bind(bound)
+        return target.color_attachments[0]
+
+    def _arrange_pixels(
+        self,
+        left: UInt32[np.ndarray, "height width"] | None,
+        right: UInt32[np.ndarray, "height width"] | None,
+        stereo: Stereo,
+    ) -> moderngl.Texture:
+        """One texture of the pixels of both images, whose bottom row is the first."""
+        assert left is not None and right is not None
+        if stereo == "anaglyph":
+            pixels = (left & _RED_AND_ALPHA) | (right & ~_RED_AND_ALPHA)
+        else:
+            pixels = np.hstack((left, right)) if stereo == "side-by-side" else np.vstack((right, left))
+        texture = self._get_target(left.shape[::-1], stereo, "f1").color_attachments[0]
+        texture.write(pixels)
+        return texture
+
+    def _get_target(self, eye_size: tuple[int, int], stereo: Stereo, dtype: str) -> moderngl.Framebuffer:
+        assert self._ctx is not None
+        size = eye_size[0] * (2 if stereo == "side-by-side" else 1), eye_size[1] * (2 if stereo == "top-bottom" else 1)
+        if size not in self._targets:
+            if len(self._targets) >= _MAX_TARGETS:
+                for target in self._targets.values():
+                    target.color_attachments[0].release()
+                    target.release()
+                self._targets.clear()
+            bound = self._ctx.fbo
+            texture = self._ctx.texture(size, 4, dtype=dtype)
+            texture.repeat_x = texture.repeat_y = False
+            self._targets[size] = self._ctx.framebuffer([texture])
+            bind(bound)
+        return self._targets[size]

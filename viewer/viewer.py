@@ -24,14 +24,14 @@ from pansplat_viewer.capture import (
     write_path_film,
     write_screenshot,
 )
-from pansplat_viewer.cpu_renderer import CpuRenderer, Renderer, create_renderer
+from pansplat_viewer.cpu_renderer import CpuRenderer, create_renderer
 from pansplat_viewer.input import Commands, apply_input, read_input
 from pansplat_viewer.key_frames import read_path, write_path
 from pansplat_viewer.loader import PHOTO_HEIGHT, LoadedScene, SceneEntry, SceneLoader
 from pansplat_viewer.panels import Gui, PanelData, Panels
 from pansplat_viewer.picking import compute_pixel_ray, pick_point
 from pansplat_viewer.programs import Programs
-from pansplat_viewer.settings import RendererChoice
+from pansplat_viewer.settings import DrawSettings, RendererChoice
 from pansplat_viewer.slots import SceneSlot
 from pansplat_viewer.state import (
     ViewerState,
@@ -42,6 +42,7 @@ from pansplat_viewer.state import (
     enter_tour,
     fit_settings,
 )
+from pansplat_viewer.stereo import StereoRenderer, choose_format, get_eye_size, render_image
 from pansplat_viewer.tour import DEFAULT_MEMORY, CrossFade, TourScenes, find_clicked, find_hotspots
 
 PANORAMA_HEIGHT = 1024  # of a panorama screenshot, pixels
@@ -247,7 +248,7 @@ class Viewer:
         self.screenshots: list[Path] = []
         self.gui = Gui(dpi_scale)
         self._choice, self._memory = renderer, memory
-        self._slots = [SceneSlot(create_renderer(ctx, renderer))]
+        self._slots = [SceneSlot(StereoRenderer(create_renderer(ctx, renderer), ctx))]
         self._fade = CrossFade()
         self.presenter = Presenter(ctx)
         self._find, self._folder, self._at, self._clock = find, folder, at, clock
@@ -261,7 +262,7 @@ class Viewer:
         self._last_camera = self.state.camera
 
     @property
-    def renderer(self) -> Renderer:
+    def renderer(self) -> StereoRenderer:
         """The renderer of the scene that is shown."""
         return self._slot.renderer
 
@@ -397,7 +398,7 @@ class Viewer:
         tour = loaded.entry.tour
         assert tour is not None
         if len(self._slots) == 1:
-            self._slots.append(SceneSlot(create_renderer(self.ctx, self._choice)))
+            self._slots.append(SceneSlot(StereoRenderer(create_renderer(self.ctx, self._choice), self.ctx)))
         self._tour = TourScenes(tour, memory=self._memory)
         self._tour.add(loaded)
         enter_tour(self.state, tour, loaded.scene, plan_route(tour, tour.plan_walk()), at=self._at)
@@ -458,7 +459,8 @@ class Viewer:
 
     def _visit(self, place: tuple[float, float], size: tuple[int, int]) -> bool:
         """Fly to the panorama whose hotspot is at a place of the window; returns whether there is one."""
-        if self._tour is None or not (self.state.hotspots and self.state.overlay):
+        one_image = get_eye_size(size, self.state.settings.stereo) == size
+        if self._tour is None or not (self.state.hotspots and self.state.overlay and one_image):
             return False
         pixel = place[0] * size[0], place[1] * size[1]
         self.state.target = find_clicked(find_hotspots(self._tour, self.state.camera, size), pixel)
@@ -477,7 +479,8 @@ class Viewer:
         data.hotspots = []
         if self._tour is not None:
             data.photo_name = self._tour.tour.panoramas[self._nearest_node()].name
-            data.hotspots = find_hotspots(self._tour, self.state.camera, size)
+            if get_eye_size(size, self.state.settings.stereo) == size:
+                data.hotspots = find_hotspots(self._tour, self.state.camera, size)
             data.background = None
             if not self._is_other_requested():
                 data.background, data.loading, data.refinement = self._describe_loading(), None, None
@@ -540,7 +543,7 @@ class Viewer:
         image = self._slot.image
         assert image is not None
         self.panel_data.size = image.size
-        photo = self._nearest_photo() if self.state.photo else None
+        photo = self._nearest_photo() if self.state.photo and self.state.settings.stereo == "mono" else None
         self.presenter.draw(
             image, target, photo=photo, split=self.state.split, camera=camera, fading=fading, weight=weight
         )
@@ -562,7 +565,7 @@ class Viewer:
         """Orbit the point in the centre of the last image."""
         if self._slot.image is None:
             return
-        distance = measure_center_depth(self.renderer.read_depth())
+        distance = measure_center_depth(self.renderer.read_eye_depth())
         self._slot.image = None  # `read_depth` may have replaced the texture
         if distance is not None:
             camera = self.state.camera
@@ -575,8 +578,9 @@ class Viewer:
         if self._visit(place, size):
             return
         assert self._slot.scene is not None
-        pixel = place[0] * size[0], place[1] * size[1]
-        origin, direction = compute_pixel_ray(self.state.camera, pixel, size)
+        eye_size = get_eye_size(size, self.state.settings.stereo)
+        pixel = place[0] * size[0] % eye_size[0], place[1] * size[1] % eye_size[1]
+        origin, direction = compute_pixel_ray(self.state.camera, pixel, eye_size)
         point = pick_point(self._slot.scene, origin, direction, self.state.settings)
         if point is None:
             self.state.points = []
@@ -628,6 +632,10 @@ class Viewer:
         assert loaded is not None
         scene, settings, fps = self._slot.scene, state.draw_settings, state.film_fps
         path, level, memory = state.path, state.camera, self._memory
+        image_format = choose_format(state.film_projection, settings)
+        if state.film_projection != "perspective":
+            size = image_format.default_size
+        image_format.check(size, settings.kernel)
         assert scene is not None
         folder = self._folder / loaded.entry.folder_name
         folder.mkdir(parents=True, exist_ok=True)
@@ -637,10 +645,10 @@ class Viewer:
             renderers = [CpuRenderer(None) for _ in range(1 if tour is None else 2)]
             try:
                 if tour is None:
-                    frames = SceneFrames(renderers[0], scene, size, settings)
+                    frames = SceneFrames(renderers[0], scene, size, settings, image_format)
                 else:
                     scenes = TourScenes(tour.tour, memory=memory)
-                    frames = TourFrames(renderers, scenes, self.loader.load, size, settings)
+                    frames = TourFrames(renderers, scenes, self.loader.load, size, settings, image_format)
                 return write_path_film(frames, path, level, file, fps, progress)
             finally:
                 for renderer in renderers:
@@ -660,16 +668,19 @@ class Viewer:
     def _write_screenshot(self, suffix: str, size: tuple[int, int], now: float, *, panorama: bool = False) -> None:
         assert self._loaded is not None
         settings = self.state.draw_settings
-        if panorama:
-            settings = replace(settings, layout="equirect")
-        self.renderer.render(self.state.camera.cam2world, size, settings, wait=True)
-        self._slot.image = None  # the texture holds the screenshot
+        self._slot.image = None  # the texture will hold the screenshot
         try:
+            if panorama:
+                color, depth = self._render_panorama(size, settings), None
+            else:
+                self.renderer.render(self.state.camera.cam2world, size, settings, wait=True)
+                color = self.renderer.read_color()[..., :3]
+                depth = self.renderer.read_depth() if suffix == "exr" else None
             path = write_screenshot(
                 self._folder / self._loaded.entry.folder_name,
                 suffix,
-                self.renderer.read_color()[..., :3],
-                self.renderer.read_depth() if suffix == "exr" else None,
+                color,
+                depth,
                 panorama=panorama,
             )
         except (InputError, OSError) as error:
@@ -677,6 +688,20 @@ class Viewer:
             return
         self.screenshots.append(path)
         self.state.show_message(f"wrote {path}", now)
+
+    def _render_panorama(self, size: tuple[int, int], settings: DrawSettings) -> Float[np.ndarray, "height width 3"]:
+        """The panorama at the camera; in stereo, both eyes', the left one at the top, drawn on the processor."""
+        cam2world, image_format = self.state.camera.cam2world, choose_format("equirect", settings)
+        image_format.check(size, settings.kernel)
+        if not image_format.is_omnidirectional:
+            return render_image(self.renderer, cam2world, size, settings, image_format)[0]
+        assert self._slot.scene is not None
+        renderer = CpuRenderer(None)
+        try:
+            renderer.upload(self._slot.scene)
+            return render_image(renderer, cam2world, size, settings, image_format)[0]
+        finally:
+            renderer.release()
 
 
 def measure_center_depth(depth: Float[np.ndarray, "height width"]) -> float | None:

@@ -13,8 +13,9 @@ import pansplat
 from pansplat.errors import InputError
 from pansplat_viewer import run
 from pansplat_viewer.cpu_renderer import CpuRenderer
+from pansplat_viewer.renderer import SplatRenderer
 from pansplat_viewer.settings import DrawSettings
-from pansplat_viewer.stereo import ImageFormat, arrange_eyes, move_eye, render_image
+from pansplat_viewer.stereo import ImageFormat, StereoRenderer, arrange_eyes, get_eye_size, move_eye, render_image
 
 SIZE = (48, 24)
 
@@ -133,3 +134,81 @@ def test_films_of_stereo_panoramas_state_their_layout(room, tmp_path, monkeypatc
         assert (int.from_bytes(data[Type.STEREO3D][:4], "little") if Type.STEREO3D in data else None) == kind
     assert run([*arguments, "walk.exr", "--projection", "equirect", "--size", "64x32", "--stereo", "top-bottom"]) == 0
     assert [path.name for path in sorted(Path().glob("*.exr"))] == ["walk_0000.exr", "walk_0001.exr"]
+
+
+# --- the window's images ---
+
+
+@pytest.fixture(params=["gl", "cpu"])
+def stereo_renderer(request, ctx, random_scene):
+    renderer = CpuRenderer(ctx, exact=True) if request.param == "cpu" else SplatRenderer(ctx, color_bits=32)
+    stereo = StereoRenderer(renderer, ctx)
+    stereo.upload(random_scene())
+    yield stereo
+    stereo.release()
+
+
+def read_texture(texture) -> np.ndarray:
+    kind = np.uint8 if texture.dtype == "f1" else np.float32
+    pixels = np.frombuffer(texture.read(), kind).reshape(texture.height, texture.width, 4)[::-1]
+    return pixels / 255 if texture.dtype == "f1" else pixels
+
+
+def turn(pose: np.ndarray, degrees: float) -> np.ndarray:
+    angle, turned = np.radians(degrees), pose.copy()
+    about_y = np.array(((np.cos(angle), 0, np.sin(angle)), (0, 1, 0), (-np.sin(angle), 0, np.cos(angle))))
+    turned[:3, :3] = pose[:3, :3] @ about_y
+    return turned
+
+
+@pytest.mark.gl
+def test_the_window_shows_the_images_of_both_eyes(stereo_renderer, pose):
+    for stereo in ("mono", "side-by-side", "top-bottom", "anaglyph"):
+        settings = DrawSettings(stereo=stereo, eye_distance=0.2)
+        texture = stereo_renderer.render(pose, (48, 32), settings)
+        shown, color, depth = read_texture(texture), stereo_renderer.read_color(), stereo_renderer.read_depth()
+        image_format = ImageFormat("perspective", stereo, 0.2)
+        expected, expected_depth = render_image(
+            stereo_renderer, pose, get_eye_size((48, 32), stereo), settings, image_format, with_depth=True
+        )
+        assert shown.shape == (32, 48, 4) and np.abs(shown[..., :3].clip(0, 1) - expected).max() < 0.003
+        assert np.abs(color[..., :3].clip(0, 1) - expected).max() < 1e-6
+        assert np.array_equal(depth, expected_depth) and color.shape == (32, 48, 4)
+        assert stereo_renderer.read_eye_depth().shape == get_eye_size((48, 32), stereo)[::-1]
+
+
+@pytest.mark.gl
+def test_turning_reads_cached_faces_of_both_eyes_until_they_are_out_of_place(stereo_renderer, pose):
+    settings = DrawSettings(stereo="side-by-side", eye_distance=0.2, cached=True, vertical_fov_degrees=40)
+    stereo_renderer.render(pose, (48, 32), settings)
+    for degrees in (-15, 15):  # the first turns may need another face
+        stereo_renderer.render(turn(pose, degrees), (48, 32), settings)
+    for degrees in (5, -15, 15):
+        stereo_renderer.render(turn(pose, degrees), (48, 32), settings)
+        assert stereo_renderer.stats.cached and stereo_renderer.stats.drawn == 0
+    stereo_renderer.render(turn(pose, 30), (48, 32), settings)
+    assert not stereo_renderer.stats.cached
+    moved = stereo_renderer.read_color()
+    stereo_renderer.render(turn(pose, 30), (48, 32), replace(settings, cached=False))
+    assert np.abs(stereo_renderer.read_color() - moved).mean() < 0.02
+
+
+@pytest.mark.gl
+def test_images_of_both_eyes_are_shown_when_both_are_finished(stereo_renderer, random_scene, pose, wait_until):
+    settings = DrawSettings(stereo="anaglyph", eye_distance=0.2)
+    stereo_renderer.render(pose, (24, 16), DrawSettings(), wait=False)
+    for place, size in ((pose, (24, 16)), (turn(pose, 20), (48, 32))):
+
+        def finish(place: np.ndarray = place, size: tuple[int, int] = size) -> bool:
+            stereo_renderer.render(place, size, settings, wait=False)
+            return stereo_renderer.stats.settled
+
+        wait_until(finish, "settled image")
+        texture = stereo_renderer.render(place, size, settings, wait=False)
+        shown = read_texture(texture)
+        expected = render_image(stereo_renderer, place, size, settings, ImageFormat("perspective", "anaglyph", 0.2))[0]
+        assert texture.size == size and np.abs(shown[..., :3].clip(0, 1) - expected).max() < 0.003
+    stereo_renderer.upload(random_scene(seed=1))
+    assert stereo_renderer.num_views == 2 and len(stereo_renderer._eyes) == 1
+    with pytest.raises(InputError, match="stereo of a window is perspective"):
+        stereo_renderer.render(pose, (48, 24), replace(settings, layout="equirect"))

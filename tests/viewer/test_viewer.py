@@ -25,7 +25,7 @@ from pansplat_viewer.viewer import BUDGET_MS, SCALES, SETTLE_AFTER, AdaptiveReso
 
 pytestmark = pytest.mark.gl
 
-SIZE = (560, 680)
+SIZE = (560, 740)
 IMAGE = (slice(20, 560), slice(310, 560))  # rows and columns without panels
 ENTRIES = [SceneEntry("first"), SceneEntry("second")]
 
@@ -33,6 +33,7 @@ ENTRIES = [SceneEntry("first"), SceneEntry("second")]
 IMAGE_WIDGETS = (
     "joint", "deferred", "difference", "view 0", "view 1", "0##level", "1##level", "2##level", "3##level",
     "min. opacity", "ray", "ewa", "radial", "z", "angular", "3dgs", "black", "grey", "white", "field of view",
+    "off##stereo", "pair##stereo", "red/cyan##stereo",
     "Panorama 2", "##flight", "nearest photograph",
 )  # fmt: skip
 INITIAL_SETTINGS = {
@@ -41,6 +42,7 @@ INITIAL_SETTINGS = {
     "ray": {"kernel": "ewa"},
     "radial": {"order": "z"},
     "angular": {"lowpass": "3dgs"},
+    "off##stereo": {"stereo": "anaglyph"},
     "black": {"background": (1.0, 1.0, 1.0)},
 }
 # Widgets whose effect has its own test.
@@ -292,6 +294,23 @@ def test_a_view_of_weight_zero_is_left_out_of_deferred_blending(user):
     assert changed_fraction(both, user.read_image()) > 0.1
     user.state.camera = user.state.home
     assert changed_fraction(single, user.read_image()) == 0
+
+
+def test_stereo_shows_two_eyes_and_its_files_are_for_both(user):
+    user.click("pair##stereo")
+    user.settle()
+    left, right = np.split(user.viewer.renderer.read_color(), 2, axis=1)
+    assert np.abs(left - right).max() > 0.1
+    user.click("red/cyan##stereo")
+    near = user.read_image()
+    left, top, right, bottom = user.panels.items["eye distance"]
+    user.drag((left + 5, (top + bottom) / 2), (left + 0.9 * (right - left), (top + bottom) / 2))
+    assert user.state.settings.eye_distance > 0.15 and changed_fraction(near, user.read_image()) > 0.01
+    user.click("360 PNG")
+    with Image.open(user.viewer.screenshots[-1]) as file:
+        assert file.size == (2048, 1024)
+    user.click("off##stereo")
+    assert "eye distance" not in user.panels.items
 
 
 def test_fly_button_plays_and_stop_pauses(user):
