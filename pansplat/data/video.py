@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pansplat.atomic import replacing
 from pansplat.data.panorama_metadata import Projection, Stereo, mark_spherical_video
+from pansplat.data.spherical_webm import mark_spherical_webm
 from pansplat.errors import InputError
 from pansplat.files import require_file
 
@@ -161,7 +162,7 @@ def write_video(
         fps: frames per second.
         quality: constant rate factor of the encoder, 0 (lossless) to 51; lower is better and larger.
         panorama: whether the frames are equirectangular panoramas (or their projection, see `mark_spherical_video`);
-            players then show an MP4 as 360 degrees.
+            players then show them as 360 degrees.
         stereo: arrangement of the eyes in a panorama's frame.
 
     Raises:
@@ -192,8 +193,9 @@ def write_video(
                 raise InputError(f"cannot write {path}: needed at least one frame, got none; nothing was written.")
             for packet in stream.encode():
                 container.mux(packet)
-        if panorama and path.suffix.lower() == ".mp4":
-            mark_spherical_video(temporary, "equirect" if panorama is True else panorama, stereo)
+        if panorama:
+            mark = mark_spherical_video if path.suffix.lower() == ".mp4" else mark_spherical_webm
+            mark(temporary, "equirect" if panorama is True else panorama, stereo)
     return count
 
 
