@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import hashlib
 import json
+import math
 import os
 import re
 import secrets
@@ -30,7 +31,7 @@ from pansplat.errors import InputError, InputWarning
 from pansplat.files import SCENE_SUFFIXES, expand_home, read_file
 from pansplat.gaussians.scene import Scene
 from pansplat.predictor import Predictor
-from pansplat.refinement import refinement_fingerprint
+from pansplat.refinement import RefineConfig, refinement_fingerprint
 from pansplat.strict_json import list_field, number_field, read_json, require_object, text_field
 from pansplat.tours import TourGraph, find_tours, merge_scenes, write_floor_plan
 
@@ -271,7 +272,8 @@ def read_fingerprint(options: BatchOptions) -> str:
 
 def _process_unit(unit: _Unit, options: BatchOptions, fingerprint: str, folder: Path) -> Iterator[tuple[Path, bool]]:
     """Yield each output of a pair or tour, and whether it was written."""
-    made = [_PairSteps(pair, unit.tour is not None, options, fingerprint, folder) for pair in unit.pairs]
+    part = None if unit.tour is None else _count_of_page(options) / len(unit.tour)
+    made = [_PairSteps(pair, part, options, fingerprint, folder) for pair in unit.pairs]
     for steps in made:
         yield from steps.run()
     if "export" not in options.steps:
@@ -298,9 +300,14 @@ class _PairSteps:
         key: hash of all that the result depends on.
     """
 
-    def __init__(self, pair: Pair, is_of_tour: bool, options: BatchOptions, fingerprint: str, folder: Path) -> None:
+    def __init__(self, pair: Pair, part: float | None, options: BatchOptions, fingerprint: str, folder: Path) -> None:
+        """`part` is the number of Gaussians that the export of a tour needs of each panorama."""
         self._pair, self._options, self._fingerprint, self._folder = pair, options, fingerprint, folder
-        self._height = options.height or (pipeline.choose_tour_height(pair) if is_of_tour else None)
+        self._height = options.height
+        self._gaussians: int | None = None
+        if part is not None:
+            self._height = self._height or pipeline.choose_tour_height(pair, part)
+            self._gaussians = None if math.isinf(part) else max(int(part * len(pair.context)), 1)
         self._file: Path | None = None
         self.key = _hash_pair(pair)
 
@@ -312,7 +319,9 @@ class _PairSteps:
         if "predict" in options.steps:
             yield self._write("predict", self._predict_to)
         if "refine" in options.steps:
-            self.key = _join_hash(self.key, "refine", [refinement_fingerprint(), options.refine_seconds])
+            self.key = _join_hash(
+                self.key, "refine", [refinement_fingerprint(), options.refine_seconds, self._gaussians]
+            )
             yield self._write("refine", self._refine_to)
 
     def read(self) -> Scene:
@@ -335,7 +344,8 @@ class _PairSteps:
     def _refine_to(self, path: Path) -> None:
         scene = self.read()
         views = self._pair.load_context(scene.height)
-        pipeline.refine_to_file(scene, views, path, seconds=self._options.refine_seconds)
+        config = RefineConfig(gaussians=self._gaussians)
+        pipeline.refine_to_file(scene, views, path, seconds=self._options.refine_seconds, config=config)
 
     def _load_predictor(self) -> Predictor:
         predictor = _load_model(self._options.model, self._options.compat, self._options.precision)
@@ -347,11 +357,20 @@ class _PairSteps:
         return predictor
 
 
+def _count_of_page(options: BatchOptions) -> float:
+    """The largest number of Gaussians of a page; infinite for other files."""
+    if "export" not in options.steps or options.suffix != ".html":
+        return math.inf
+    from pansplat.web import DEFAULT_GAUSSIANS
+
+    return options.gaussians or DEFAULT_GAUSSIANS
+
+
 def _export(scene: Scene, path: Path, unit: _Unit, options: BatchOptions) -> None:
     if options.suffix == ".html":
-        from pansplat.web import DEFAULT_GAUSSIANS, write_page
+        from pansplat.web import write_page
 
-        count, title = options.gaussians or DEFAULT_GAUSSIANS, unit.name.replace("_", " ")
+        count, title = int(_count_of_page(options)), unit.name.replace("_", " ")
         write_page(scene, path, tour=unit.tour, gaussians=count, title=title)
     elif options.suffix == ".png":
         write_floor_plan(scene, path, unit.tour)

@@ -59,6 +59,8 @@ Drawing = Literal["exact", "original"]
 _DEFAULT_HEIGHT = 512  # of networks; larger panoramas take minutes
 _MAX_CACHED_HEIGHT = 512  # of predictions of networks; taller ones are written tile by tile
 _TOUR_HEIGHT = 512  # largest default height of the panoramas of a tour, which has many scenes
+_GAUSSIANS_OF_ROWS = 0.75  # of a panorama, over the square of its height
+_MAX_MERGERS = 4  # Gaussians that become one on average
 
 
 def load_pairs(
@@ -155,9 +157,18 @@ def choose_height(pair: Pair, predictor: Predictor) -> int:
     return max(MIN_HEIGHT, min(pair.image_height, getattr(predictor, "default_height", _DEFAULT_HEIGHT)))
 
 
-def choose_tour_height(pair: Pair) -> int:
-    """The height to predict a scene of a tour at: that of its photographs, at most 512."""
-    return max(MIN_HEIGHT, min(pair.image_height, _TOUR_HEIGHT))
+def choose_tour_height(pair: Pair, gaussians: float = math.inf) -> int:
+    """The height to predict a scene of a tour at: that of its photographs, at most 512.
+
+    Args:
+        pair: of `TourGraph.make_pair`.
+        gaussians: number that is kept of each panorama. The height is halved while there are more than four times as
+            many: a refinement after a few mergers fits the photographs better than after many.
+    """
+    height = max(MIN_HEIGHT, min(pair.image_height, _TOUR_HEIGHT))
+    while height >= 2 * MIN_HEIGHT and _GAUSSIANS_OF_ROWS * height**2 > _MAX_MERGERS * gaussians:
+        height //= 2
+    return height
 
 
 def predict(
@@ -168,6 +179,7 @@ def predict(
     precision: Precision = "float32",
     height: int | None = None,
     refine_seconds: float = 0.0,
+    gaussians: int | None = None,
     cache: bool = True,
     progress: Progress | None = None,
     on_predicted: Callable[[Scene], None] | None = None,
@@ -183,6 +195,7 @@ def predict(
         height: panoramas are resized to (height, 2 height); by default `choose_height`. Loaded panoramas keep their
             size.
         refine_seconds: time limit of the refinement; 0 for none.
+        gaussians: largest number after a refinement; similar neighbours are merged before it.
         cache: whether to read and write the cache.
         progress: called with a description of the current work and the completed fraction.
         on_predicted: called with the prediction before it is refined.
@@ -200,7 +213,7 @@ def predict(
     report: Progress = progress or (lambda what, fraction: None)
     if not refine_seconds:
         return _predict_views(cached_pair, views, predictor, height, report)
-    refinement = f"{refinement_fingerprint()}-{refine_seconds:g}s"
+    refinement = f"{refinement_fingerprint()}-{refine_seconds:g}s" + (f"-{gaussians}" if gaussians else "")
     cached = None if cached_pair is None else CachedPrediction(cached_pair, views, predictor, height, refinement)
     refined = _read_cached(cached, views, predictor)
     if refined is not None and on_predicted is None:
@@ -211,7 +224,10 @@ def predict(
         on_predicted(scene)
     if refined is not None:
         return refined
-    scene = refine(scene, views, seconds=refine_seconds, progress=lambda what, done: report(what, 0.5 + 0.5 * done))
+    config = RefineConfig(gaussians=gaussians)
+    scene = refine(
+        scene, views, seconds=refine_seconds, config=config, progress=lambda what, done: report(what, 0.5 + 0.5 * done)
+    )
     if cached is not None:
         cached.write(scene.gaussians, scene.gains)
     return scene
@@ -323,17 +339,20 @@ def predict_tour(
     precision: Precision = "float32",
     height: int | None = None,
     refine_seconds: float = 0.0,
+    gaussians: int | None = None,
     cache: bool = True,
     progress: Progress | None = None,
 ) -> Scene:
     """Predict one scene of all panoramas of a tour: several scenes of two or three panoramas, merged.
 
-    The scenes and their cache are those of the viewer.
+    Without `gaussians`, the scenes and their cache are those of the viewer.
 
     Args:
         tour: of `pansplat.tours.connect`.
         model, compat, precision, refine_seconds, cache, progress: see `predict`; the time limit is that of each scene.
         height: panoramas are resized to (height, 2 height); by default `choose_tour_height`.
+        gaussians: number that the scene is needed in, such as that of a web page. Each panorama has an equal part after
+            a refinement; without one the scene may have more.
 
     Raises:
         InputError: the input cannot be used.
@@ -341,6 +360,7 @@ def predict_tour(
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
     report: Progress = progress or (lambda what, fraction: None)
     total = len(tour.choose_sources())
+    part = math.inf if gaussians is None else gaussians / len(tour)  # of a panorama
     counter = itertools.count()
 
     def predict_scene(views: tuple[int, ...]) -> Scene:
@@ -348,8 +368,9 @@ def predict_tour(
         return predict(
             pair,
             predictor,
-            height=height or choose_tour_height(pair),
+            height=height or choose_tour_height(pair, part),
             refine_seconds=refine_seconds,
+            gaussians=None if gaussians is None else max(int(part * len(views)), 1),
             cache=cache,
             progress=lambda what, done: report(f"scene {number + 1} of {total}: {what}", (number + done) / total),
         )

@@ -20,6 +20,7 @@ from pansplat import batch, pipeline
 from pansplat.batch import BatchOptions, Item, list_items, process_item
 from pansplat.cli import run
 from pansplat.errors import InputError
+from pansplat.web import page as page_module
 
 HEIGHT = 64
 
@@ -93,19 +94,20 @@ def test_only_steps_whose_inputs_changed_are_done_again(
 
 
 def test_a_tour_has_a_file_for_each_scene_and_one_page(
-    tmp_path: Path, sphere: None, write_tour: Callable[..., Path], write_pair: Callable[..., Path]
+    tmp_path: Path, sphere: None, write_tour: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(page_module, "_POSTER_SIZE", (18, 32))
     house, out = write_tour(tmp_path / "house", 4, height=HEIGHT), tmp_path / "out"
 
     def process(*steps: str, **options: Any) -> batch.ItemReport:
         return process_item(Item("house", house), BatchOptions(steps, "sphere", height=HEIGHT, **options), "1", out)
 
-    report = process("predict", "export", gaussians=500)
+    report = process("predict", "export")
     assert report.error is None and report.status == "done"
     predictions, (page,) = report.outputs[:-1], report.outputs[-1:]
     assert len(predictions) == 2 and page.endswith("-house tour.html")
     assert len(json.loads((out / page).read_text().split("const HEADER = ")[1].split(";\n")[0])["edges"]) == 3
-    assert process("predict", "export", gaussians=500).status == "skipped"
+    assert process("predict", "export").status == "skipped"
     whole = process("export", suffix=".splat")  # nothing is predicted into files
     assert whole.error is None and len(whole.outputs) == 1
     assert (out / whole.outputs[0]).stat().st_size == 32 * 4 * HEIGHT * 2 * HEIGHT

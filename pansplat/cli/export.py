@@ -64,7 +64,7 @@ class Export:
             raise InputError(f"--gaussians, --split and --title are for an .html page, got {self.out}; leave them out")
         if self.up is not None and not is_scene_file(self.path):
             raise InputError(f"--up is for a scene file, and {self.path} is a folder of panoramas; leave it out")
-        scene, tour = self.prediction.open_tour(self.path)
+        scene, tour = self.prediction.open_tour(self.path, self._count_of_page() if is_page else None)
         if self.up is not None:
             scene = scene.rotated(_rotation_from(self.up))
         gaussians = prune(scene.gaussians, degree=self.degree, min_opacity=self.min_opacity)
@@ -84,15 +84,26 @@ class Export:
         print(f"{self.out}: {len(gaussians):,} {kind}, {size:,} bytes ({size / max(len(gaussians), 1):.1f} each)")
         return 0
 
+    def _count_of_page(self) -> int:
+        """The largest number of Gaussians of a page."""
+        from pansplat.web import DEFAULT_GAUSSIANS
+
+        return DEFAULT_GAUSSIANS if self.gaussians is None else self.gaussians
+
     def _write_page(self, scene: Scene, tour: TourGraph | None) -> None:
         """Write the web page and print its size."""
-        from pansplat.web import DEFAULT_GAUSSIANS, write_page
+        from pansplat.web import write_page
 
-        count = DEFAULT_GAUSSIANS if self.gaussians is None else self.gaussians
         title = self.title or self.path.resolve().stem.replace("_", " ")
         with progress_bar() as progress:
             page = write_page(
-                scene, self.out, tour=tour, gaussians=count, split=self.split, title=title, progress=progress
+                scene,
+                self.out,
+                tour=tour,
+                gaussians=self._count_of_page(),
+                split=self.split,
+                title=title,
+                progress=progress,
             )
         beside = f" and {len(page.files) - 1} files in {page.files[1].parent.name}/" if self.split else ""
         print(

@@ -70,8 +70,13 @@ class ScenePrediction:
             return pipeline.load(path)
         return self._predict_pair(choose_pair(path, self.choice))
 
-    def open_tour(self, path: Path) -> tuple[Scene, TourGraph | None]:
-        """The scene of a file, of the chosen pair, or of the first tour of a folder, with the tour's graph."""
+    def open_tour(self, path: Path, gaussians: int | None = None) -> tuple[Scene, TourGraph | None]:
+        """The scene of a file, of the chosen pair, or of the first tour of a folder, with the tour's graph.
+
+        Args:
+            path: the file or folder.
+            gaussians: see `pansplat.predict_tour`.
+        """
         from pansplat import pipeline
         from pansplat.tours import connect, find_tours
 
@@ -86,8 +91,15 @@ class ScenePrediction:
         model = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
         with progress_bar() as progress:
             tour = connect(tours[0], progress)
-            height, seconds = self.predict_height, self.refine
-            return pipeline.predict_tour(tour, model, height=height, refine_seconds=seconds, progress=progress), tour
+            scene = pipeline.predict_tour(
+                tour,
+                model,
+                height=self.predict_height,
+                refine_seconds=self.refine,
+                gaussians=gaussians,
+                progress=progress,
+            )
+        return scene, tour
 
     def _predict_pair(self, pair: Pair) -> Scene:
         from pansplat import pipeline

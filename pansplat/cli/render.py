@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
     from pansplat.predictor import Progress
 
+_VIDEO_SUFFIXES = (".mp4", ".webm")
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr")
 _VIDEO_HEIGHT = 360
 _MAX_MATRIX = 4096  # characters of a file with the 16 numbers of a matrix
@@ -28,7 +29,8 @@ _MAX_MATRIX = 4096  # characters of a file with the 16 numbers of a matrix
 
 @dataclass(frozen=True)
 class Render:
-    """Render a scene, or the prediction of a pair, to an image (.png, .jpg, .webp, .exr) or a video (.mp4)."""
+    """Render a scene, or the prediction of a pair, to an image (.png, .jpg, .webp, .exr) or a video (.mp4,
+    .webm)."""
 
     path: Positional[Path]
     """A scene file, or the folder of a pair."""
@@ -71,7 +73,9 @@ class Render:
         self._refuse_invalid_arguments()
         poses = None if self.pose is None else read_poses(self.pose)
         if poses is not None and len(poses) > 1 and not self._is_video:
-            raise InputError(f"{self.pose} holds {len(poses)} poses; write an .mp4, or keep one pose in the file")
+            raise InputError(
+                f"{self.pose} holds {len(poses)} poses; write an .mp4 or .webm, or keep one pose in the file"
+            )
         scene = self.prediction.open(self.path)
         layout = self.layout or ("perspective" if self._is_video and not self.stereo else "equirect")
         options = self._render_options(layout, self.height or (_VIDEO_HEIGHT if self._is_video else scene.height))
@@ -98,17 +102,17 @@ class Render:
 
     @property
     def _is_video(self) -> bool:
-        return self.out.suffix.lower() == ".mp4"
+        return self.out.suffix.lower() in _VIDEO_SUFFIXES
 
     def _refuse_invalid_arguments(self) -> None:
         """Raise an error before the prediction, which takes seconds."""
-        require_output_file("--out", self.out, (*_IMAGE_SUFFIXES, ".mp4"))
+        require_output_file("--out", self.out, (*_IMAGE_SUFFIXES, *_VIDEO_SUFFIXES))
         if self.depth and self.out.suffix.lower() != ".png":
             raise InputError(f"--depth writes a .png, got {self.out}; an .exr holds the depth without it")
         if self.at is not None and self.pose is not None:
             raise InputError("--at and --pose both set the camera; give one of them")
         if self.at is not None and self._is_video:
-            raise InputError("--at is one position, an .mp4 moves through all; write a .png, or leave out --at")
+            raise InputError("--at is one position, a video moves through all; write a .png, or leave out --at")
         if self.stereo and self.layout not in (None, "equirect"):
             raise InputError(f"--stereo is for panoramas of --layout equirect, got {self.layout}; leave out --layout")
         parse_blend(self.blend)
