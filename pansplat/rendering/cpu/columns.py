@@ -28,6 +28,7 @@ from pansplat.rendering.cpu.projection import (
 from pansplat.rendering.cpu.rasterize import rasterize_forward
 from pansplat.rendering.cpu.records import BLOCK_WIDTH, TILE_SIZE, tabulate_columns
 from pansplat.rendering.cpu.runtime import Workspace, inline_kernel, kernel, parallel_for, pooled_empty
+from pansplat.rendering.cpu.simd import load_scalar, store_scalar
 from pansplat.rendering.cpu.tiling import (
     EMPTY_BOX,
     MAX_INTERSECTIONS,
@@ -216,20 +217,20 @@ def _deviation(covariance, axis):
 
 
 def _split_columns(ranges: _ColumnRanges, width: int) -> Iterator[tuple[int, int]]:
-    """Split the columns into strips of whole tiles with at most `_MAX_PAIRS` pairs, one tile's width at least."""
+    """Split the columns into strips of at most `_MAX_PAIRS` pairs, one column at least, of whole tiles if possible."""
     some = ranges.counts > 0
     change = np.bincount(ranges.first[some], minlength=2 * width + 1)
     change = change - np.bincount(ranges.first[some] + ranges.counts[some], minlength=2 * width + 1)
-    num = np.cumsum(change)
-    per_column = num[:width] + num[width : 2 * width]
-    low, total = 0, 0
-    for start in range(0, width, TILE_SIZE):
-        count = int(per_column[start : start + TILE_SIZE].sum())
-        if start > low and (total + count > _MAX_PAIRS or start - low >= _MAX_COLUMNS):
-            yield low, start
-            low, total = start, 0
-        total += count
-    yield low, width
+    covered = np.cumsum(change)
+    pairs = np.concatenate((np.zeros(1, np.int64), np.cumsum(covered[:width] + covered[width : 2 * width])))
+    low, tile = 0, TILE_SIZE // BLOCK_WIDTH
+    while low < width:
+        high = int(np.searchsorted(pairs, pairs[low] + _MAX_PAIRS, side="right")) - 1
+        high = min(max(high, low + 1), low + _MAX_COLUMNS, width)
+        if high < width and high - low > tile:
+            high -= high % tile
+        yield low, high
+        low = high
 
 
 def _list_pairs(ranges: _ColumnRanges, low: int, high: int, width: int, workspace: Workspace, threads: int) -> _Pairs:
@@ -249,19 +250,22 @@ def _list_pairs(ranges: _ColumnRanges, low: int, high: int, width: int, workspac
 def _count_pairs(edges, first, counts, low, high, width, part_counts, part):
     total = 0
     for g in range(edges[part], edges[part + 1]):
-        start, end = np.int64(first[g]), np.int64(first[g]) + counts[g]
+        start = np.int64(load_scalar(first, g))
+        end = start + np.int64(load_scalar(counts, g))
         total += max(min(end, high) - max(start, low), 0) + max(min(end - width, high) - max(start - width, low), 0)
     part_counts[part] = total
 
 
 @kernel
 def _write_pairs(edges, first, counts, low, high, width, starts, gaussians, columns, part):
-    at = starts[part]
+    at = np.int64(starts[part])
     for g in range(edges[part], edges[part + 1]):
-        for shift in range(2):  # a range that wraps around is two ranges
-            start = np.int64(first[g]) - shift * width
-            for column in range(max(start, low), min(start + counts[g], high)):
-                gaussians[at], columns[at] = g, column
+        start = np.int64(load_scalar(first, g))
+        end = start + np.int64(load_scalar(counts, g))
+        for shift in range(0, 2 * width, width):  # a range that wraps around is two ranges
+            for column in range(max(start - shift, low), min(end - shift, high)):
+                store_scalar(gaussians, at, np.int32(g))
+                store_scalar(columns, at, np.int32(column))
                 at += 1
 
 
@@ -275,28 +279,41 @@ def _gather(
     for array in gaussians:
         given = len(array) > 0 or num == 0
         gathered = workspace.array((num if given else 0, *array.shape[1:]), np.float32)
-        row_size = math.prod(array.shape[1:])
-        copy = partial(_gather_rows, array.reshape(-1), row_size, pairs.gaussians, gathered.reshape(-1))
-        parallel_for(copy, -(-len(gathered) // GAUSSIANS_PER_ITEM), threads)
         arrays.append(gathered)
-    move = partial(_move_to_eyes, gaussians.means, centres, *pairs, arrays[0])
-    parallel_for(move, -(-num // GAUSSIANS_PER_ITEM), threads)
+    sources = [array.reshape(-1) for array in gaussians]
+    row_sizes = np.array([math.prod(array.shape[1:]) for array in gaussians[1:]])
+    work = partial(_gather_rows, *sources, row_sizes, centres, *pairs, *(array.reshape(-1) for array in arrays))
+    parallel_for(work, -(-num // GAUSSIANS_PER_ITEM), threads)
     return GaussianArrays(*arrays)
 
 
 @kernel
-def _gather_rows(source, row_size, indices, gathered, item):
-    for i in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, len(indices))):
-        begin, to = row_size * np.int64(indices[i]), row_size * i
-        for j in range(row_size):
-            gathered[to + j] = source[begin + j]
-
-
-@kernel
-def _move_to_eyes(means, centres, indices, columns, moved, item):
-    for i in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, len(indices))):
+def _gather_rows(
+    means, quats, scales, covariances, opacities, harmonics, row_sizes, centres, indices, columns,
+    moved, to_quats, to_scales, to_covariances, to_opacities, to_harmonics, item,
+):  # fmt: skip
+    """Copy the Gaussian of each pair; its mean becomes relative to the column's eye."""
+    begin, end = item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, len(indices))
+    eyes = centres.reshape(-1)
+    for i in range(begin, end):
+        g, column = 3 * np.int64(load_scalar(indices, i)), 3 * np.int64(load_scalar(columns, i))
         for axis in range(3):
-            moved[i, axis] = means[indices[i], axis] - centres[columns[i], axis]
+            offset = np.float64(load_scalar(means, g + axis)) - load_scalar(eyes, column + axis)
+            store_scalar(moved, 3 * i + axis, np.float32(offset))
+    _copy_rows(quats, row_sizes[0], indices, begin, end, to_quats)
+    _copy_rows(scales, row_sizes[1], indices, begin, end, to_scales)
+    _copy_rows(covariances, row_sizes[2], indices, begin, end, to_covariances)
+    _copy_rows(opacities, row_sizes[3], indices, begin, end, to_opacities)
+    _copy_rows(harmonics, row_sizes[4], indices, begin, end, to_harmonics)
+
+
+@inline_kernel
+def _copy_rows(source, row_size, indices, begin, end, copies):
+    if len(copies) > 0:
+        for i in range(begin, end):
+            at = row_size * np.int64(load_scalar(indices, i))
+            for j in range(row_size):
+                store_scalar(copies, row_size * i + j, load_scalar(source, at + j))
 
 
 @kernel
