@@ -134,6 +134,22 @@ def test_files_that_a_killed_worker_left_are_removed_and_others_are_kept(
     assert set(list_outputs(out)) == {name, "room0/.gitignore"}
 
 
+def test_on_a_full_disk_no_half_file_is_left_and_the_item_is_done_later(
+    rooms: Path, tmp_path: Path, sphere: None
+) -> None:
+    resource = pytest.importorskip("resource")
+    out, options, item = tmp_path / "out", BatchOptions(model="sphere", height=HEIGHT), Item("room0", rooms / "room0")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))  # of a file; the error is that of a full disk
+    try:
+        report = process_item(item, options, "1", out)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert report.status == "failed" and not list_outputs(out)
+    assert "free disk space, got 'File too large'" in str(report.error)
+    assert process_item(item, options, "1", out).status == "done" and len(list_outputs(out)) == 1
+
+
 def test_without_dask_the_message_names_the_command_that_installs_it(
     rooms: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -76,7 +76,7 @@ def save_glb(scene: Scene, path: Path) -> None:
         file.write(struct.pack("<4sIIII", _MAGIC, _VERSION, total, len(document), _JSON) + document)
         file.write(struct.pack("<II", size, _BINARY))
         for values in attributes.values():
-            values.tofile(file)
+            file.write(np.ascontiguousarray(values).data)
 
 
 def _list_attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:

@@ -67,7 +67,7 @@ def save_ply(scene: Scene, path: str | Path) -> None:
     gaussians = sort_by_label(select_finite(scene.gaussians, path))
     with replacing(path) as partial, open(partial, "wb") as file:
         file.write(_format_header(scene, find_label_runs(gaussians), gaussians.harmonics.shape[1]))
-        _build_vertex_table(gaussians).tofile(file)
+        file.write(_build_vertex_table(gaussians).data)
 
 
 def format_plain_ply(gaussians: Gaussians) -> bytes:
@@ -134,7 +134,7 @@ def _write_parts(parts: Iterable[Gaussians], file: BinaryIO, coefficients: int) 
                 runs[-1][2] += count
             else:
                 runs.append([level, view, count])
-        _build_vertex_table(kept).tofile(file)
+        file.write(_build_vertex_table(kept).data)
         del part, kept
     return runs, dropped
 
@@ -181,7 +181,7 @@ def save_points(gaussians: Gaussians, path: str | Path) -> None:
     lines += [*(f"property {kinds[kind]} {name}" for name, kind in fields), "end_header\n"]
     with replacing(path) as partial, open(partial, "wb") as file:
         file.write("\n".join(lines).encode())
-        table.tofile(file)
+        file.write(table.data)
 
 
 def load_ply(path: str | Path) -> Scene:
