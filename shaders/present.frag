@@ -1,8 +1,11 @@
-// The rendered image on the screen, and right of `split` a photograph of the same directions.
+// The rendered image on the screen, and right of `split` what it is compared with, in the same directions.
 uniform sampler2D image;            // bottom row first
 uniform sampler2D fading;           // the image of another scene, bottom row first
 uniform float weight;               // of `image` against `fading`
-uniform sampler2D photograph;       // equirectangular, top row first
+uniform sampler2D right;            // a photograph (equirectangular, top row first), or an image (bottom row first)
+uniform int comparison;             // 1 the photograph, 2 its mean absolute difference from the image, 3 the image
+uniform sampler2D table;            // colours of differences
+uniform float max_error;            // the difference with the last colour
 uniform float split;                // fraction of the width
 uniform vec2 tangent;               // of half the horizontal and vertical field of view
 uniform mat3 camera_to_photo;       // rotation, OpenCV axes
@@ -13,18 +16,30 @@ out vec4 color;
 
 const float PI = 3.14159265358979;
 
+vec3 sample_image() {
+    vec3 rgb = texture(image, uv).rgb;
+    return weight < 1.0 ? mix(texture(fading, uv).rgb, rgb, weight) : rgb;
+}
+
+vec3 sample_photograph() {
+    vec2 ray = (2.0 * uv - 1.0) * tangent;
+    vec3 d = camera_to_photo * vec3(ray.x, -ray.y, 1.0);
+    vec2 photo_uv = vec2(atan(d.x, d.z) / (2.0 * PI) + 0.5, atan(d.y, length(d.xz)) / PI + 0.5);
+    return textureLod(right, photo_uv, 0.0).rgb;  // level 0: derivatives have a seam at +-180 degrees
+}
+
 void main() {
     vec3 rgb;
     if (uv.x < split) {
-        rgb = texture(image, uv).rgb;
-        if (weight < 1.0) {
-            rgb = mix(texture(fading, uv).rgb, rgb, weight);
-        }
+        rgb = sample_image();
+    } else if (comparison == 3) {
+        rgb = texture(right, uv).rgb;
     } else {
-        vec2 ray = (2.0 * uv - 1.0) * tangent;
-        vec3 d = camera_to_photo * vec3(ray.x, -ray.y, 1.0);
-        vec2 photo_uv = vec2(atan(d.x, d.z) / (2.0 * PI) + 0.5, atan(d.y, length(d.xz)) / PI + 0.5);
-        rgb = textureLod(photograph, photo_uv, 0.0).rgb;  // level 0: derivatives have a seam at +-180 degrees
+        rgb = sample_photograph();
+        if (comparison == 2) {
+            float error = dot(abs(rgb - clamp(sample_image(), 0.0, 1.0)), vec3(1.0 / 3.0));
+            rgb = textureLod(table, vec2(error / max_error, 0.5), 0.0).rgb;
+        }
     }
     color = vec4(rgb, 1.0);
 }

@@ -5,6 +5,11 @@ uniform sampler2D second_color;
 uniform sampler2D second_depth;
 uniform bool difference;        // of two images, each over the background
 uniform vec3 background;
+#ifdef INSPECT
+uniform int scalar;             // number whose colour is shown: 0 none, 1 depth, 2 coverage
+uniform float scalar_max;       // with the last colour; the first is 0
+uniform sampler2D color_map;
+#endif
 
 layout(location = 0) out vec4 out_color;    // RGB over the background, coverage
 layout(location = 1) out vec4 out_depth;    // radial distance, metres
@@ -31,5 +36,12 @@ void main() {
         out_color = vec4(abs(out_color.rgb - other.rgb), max(out_color.a, other.a));
         depth = abs(depth - other_depth);
     }
+#ifdef INSPECT
+    if (scalar > 0) {
+        float value = scalar == 1 ? depth : out_color.a;
+        vec3 mapped = textureLod(color_map, vec2(value / scalar_max, 0.5), 0.0).rgb;
+        out_color.rgb = out_color.a > 0.0 ? mapped : background;
+    }
+#endif
     out_depth = vec4(depth, 0.0, 0.0, 0.0);
 }

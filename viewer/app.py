@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from pansplat_viewer.key_frames import CameraPath
     from pansplat_viewer.stereo import ImageFormat
 
+_MAX_CONTEXTS = 3  # windows that are opened one after the other if the graphics card is reset
+
 
 @dataclass(frozen=True)
 class Options:
@@ -198,27 +200,38 @@ def _run_window(
 ) -> str | None:
     """Run the viewer in a window; if no window can be opened, returns the reason."""
     from pansplat_viewer.key_frames import CameraPath
+    from pansplat_viewer.preferences import find_file
     from pansplat_viewer.state import ViewerState
     from pansplat_viewer.viewer import Viewer
-    from pansplat_viewer.window import NoWindowError, Window, run_viewer
+    from pansplat_viewer.window import ContextLostError, NoWindowError, Window, run_viewer
 
-    try:
-        window = Window("pansplat", pixels)
-    except NoWindowError as error:
-        return str(error)
     load_options = options.load_options
-    viewer = Viewer(
-        window.ctx,
-        SceneLoader(lambda entry, progress, show: load_entry(entry, load_options, progress, show)),
-        find=lambda path: find_entries(path, load_options),
-        state=ViewerState(settings=options.settings, path=path or CameraPath()),
-        at=options.at or 0.0,
-        dpi_scale=window.dpi_scale,
-        renderer=options.renderer,
-        memory=options.memory,
-    )
-    viewer.show(entries, first)
-    run_viewer(window, viewer)
+    state = ViewerState(settings=options.settings, path=path or CameraPath())
+    for attempt in range(_MAX_CONTEXTS):
+        try:
+            window = Window("pansplat", pixels)
+        except NoWindowError as error:
+            return str(error)
+        viewer = Viewer(
+            window.ctx,
+            SceneLoader(lambda entry, progress, show: load_entry(entry, load_options, progress, show)),
+            find=lambda path, progress: find_entries(path, load_options, progress),
+            state=state,
+            at=options.at or 0.0,
+            dpi_scale=window.dpi_scale,
+            renderer=options.renderer,
+            memory=options.memory,
+            preferences=find_file(),
+        )
+        viewer.remember(expand_home(options.path))
+        viewer.show(entries, first)
+        try:
+            run_viewer(window, viewer)
+            return None
+        except ContextLostError:  # start again with the same scene, camera and settings
+            if attempt == _MAX_CONTEXTS - 1:
+                raise
+            entries, first = viewer.entries, max(viewer.panel_data.current, 0)
     return None
 
 
@@ -250,7 +263,6 @@ def _write_film(
                 entry,
                 options.load_options,
                 lambda task, done: bars.update(bar, description=f"{entry.name}: {task}", completed=done),
-                photos=False,
             )
             name = loaded.entry.pair.name if loaded.entry.pair is not None else entry.name
             bars.update(bar, description=f"{name}: {len(loaded.scene.gaussians):,} Gaussians", completed=1.0)

@@ -127,12 +127,6 @@ def focus_on_point(camera: Camera, point: Float[np.ndarray, "3"]) -> Camera:
     return replace(camera, yaw_radians=yaw, pitch_radians=pitch, distance=max(distance, MIN_DISTANCE))
 
 
-def find_nearest_view(camera: Camera, cam2world: Float[np.ndarray, "view 4 4"]) -> int:
-    """Return the index of the input camera nearest to the camera's position; the first on ties."""
-    offsets = cam2world[:, :3, 3] - np.asarray(camera.position)
-    return int(np.argmin(np.linalg.norm(offsets, axis=1)))
-
-
 def _clamp(value: float, limit: float) -> float:
     return min(max(value, -limit), limit)
 

@@ -32,15 +32,18 @@ from pansplat.rendering.cpu.display import (
     blend_layers,
     blend_to_pixels,
 )
+from pansplat.rendering.cpu.footprints import Footprint
 from pansplat.rendering.cpu.rasterize import MIN_TRANSMITTANCE as EXACT_TRANSMITTANCE
 from pansplat.rendering.cpu.runtime import checking_each_item, pooled_empty
 from pansplat.rendering.cpu.tiling import LARGEST_SIDE
 from pansplat.rendering.image_planes import ImagePlane, stitch_faces
 from pansplat.rendering.rasterize import RasterOptions
 from pansplat_viewer.camera import Pinhole, create_face_cameras
+from pansplat_viewer.color_maps import map_values
+from pansplat_viewer.displays import color_by_property
 from pansplat_viewer.layers import Frame, LayerStorage
 from pansplat_viewer.renderer import SplatRenderer, choose_layer_weights, is_software
-from pansplat_viewer.settings import DrawSettings, FrameStats, RendererChoice
+from pansplat_viewer.settings import SCALAR_MAPS, DrawSettings, FrameStats, RendererChoice
 from pansplat_viewer.splats import Splats
 
 _MIN_WEIGHT = 2.0**-26  # of a view in deferred blending; as the OpenGL renderer's with 32-bit targets
@@ -158,6 +161,7 @@ class CpuRenderer:
         self._pending: tuple[Hashable, _Job] | None = None
         self._splats: Splats | None = None
         self._scene: DisplayScene | None = None
+        self._colored: tuple[str, DisplayScene] | None = None  # with the colours of a display
         self._groups: dict[Hashable, tuple[Int[np.ndarray, "n"], int]] = {}
         self._faces: OrderedDict[Hashable, _FaceSet] = OrderedDict()
         self._textures: dict[tuple[int, int], moderngl.Texture] = {}
@@ -192,7 +196,7 @@ class CpuRenderer:
         self._splats = replace(splats, geometry=rows[:0].copy(), harmonics=splats.harmonics[..., :0].copy())
         self._groups.clear()
         self._faces.clear()
-        self._picture = self._texture = None
+        self._picture = self._texture = self._colored = None
         self.stats = FrameStats(total=len(splats), dropped=splats.dropped, tier=self.tier)
 
     def render(
@@ -337,9 +341,7 @@ class CpuRenderer:
             sums, drawn = self._rasterize_panorama(frame, groups, stages)
         pixels = pooled_empty(frame.size[::-1], np.uint32)
         before = time.perf_counter()
-        blend_to_pixels(
-            sums, groups.weights, frame.settings.background, pixels, difference=groups.difference, bottom_up=True
-        )
+        _write_pixels(frame.settings, groups, sums, pixels, bottom_up=True)
         now = time.perf_counter()
         stages["blend"] = 1e3 * (now - before)
         stats = self._make_stats(groups, drawn, 1e3 * (now - start), stages)
@@ -347,7 +349,6 @@ class CpuRenderer:
 
     def _rasterize(self, frame: Frame, groups: _Groups, camera: Pinhole) -> Layers:
         """Rasterise the Gaussians in a pinhole camera's view."""
-        assert self._scene is not None
         plane = ImagePlane(
             (camera.height, camera.width), torch.from_numpy(np.ascontiguousarray(camera.rotation)), camera.focal
         )
@@ -357,7 +358,7 @@ class CpuRenderer:
         else:
             deviation = math.sqrt(options.filter_variance(plane.pixel_angle))
             selection = Selection(camera.compute_side_normals(), deviation, bounded=True)
-        return self._scene.rasterize(
+        return self._find_scene(frame.settings).rasterize(
             np.asarray(frame.position),
             plane,
             groups.labels,
@@ -365,23 +366,37 @@ class CpuRenderer:
             options,
             selection=selection,
             min_transmittance=self._min_transmittance,
+            footprint=_find_footprint(frame.settings),
         )
+
+    def _find_scene(self, settings: DrawSettings) -> DisplayScene:
+        """The Gaussians with the colours of a display."""
+        assert self._scene is not None and self._splats is not None
+        name, splats, scene = settings.splat_colors, self._splats, self._scene
+        if name == "color":
+            return scene
+        if self._colored is None or self._colored[0] != name:
+            cameras = splats.view_positions - splats.origin
+            arrays = scene.means, scene.quats, scene.scales, splats.levels, splats.views, cameras
+            colors = color_by_property(name, *arrays)
+            self._colored = name, scene.with_colors(colors)
+        return self._colored[1]
 
     def _rasterize_panorama(
         self, frame: Frame, groups: _Groups, stages: dict[str, float]
     ) -> tuple[Float[np.ndarray, "layer 5 height width"], int]:
         """Rasterise a panorama: directly, or from cube faces if the kernel or `face_size` needs them."""
-        assert self._scene is not None
         size, settings = frame.size[::-1], frame.settings
         if settings.kernel == "ray" and settings.face_size is None:
             plane = ImagePlane(size, torch.from_numpy(frame.rotation.copy()), 0.0, settings.eye_offset)
-            layers = self._scene.rasterize(
+            layers = self._find_scene(settings).rasterize(
                 np.asarray(frame.position),
                 plane,
                 groups.labels,
                 len(groups.weights),
                 _raster_options(settings),
                 min_transmittance=self._min_transmittance,
+                footprint=_find_footprint(settings),
             )
             _add_stages(stages, layers)
             return layers.sums, layers.statistics.visible
@@ -426,9 +441,7 @@ class CpuRenderer:
         plane = stored.faces.plane(face)
         camera = Pinhole(plane.rotation.numpy(), frame.position, plane.focal, *plane.size)
         layers = self._rasterize(frame, groups, camera)
-        settings = frame.settings
-        pixels = stored.faces.pixels[face]
-        blend_to_pixels(layers.sums, groups.weights, settings.background, pixels, difference=groups.difference)
+        _write_pixels(frame.settings, groups, layers.sums, stored.faces.pixels[face])
         stored.done.add(face)
         return layers.statistics.visible
 
@@ -488,8 +501,7 @@ class CpuRenderer:
             self._picture = self._draw(frame, self._choose_groups(frame))
         picture = self._picture
         assert picture.sums is not None and picture.groups is not None
-        background = picture.frame.settings.background
-        return blend_layers(picture.sums, picture.groups.weights, background, difference=picture.groups.difference)
+        return _blend(picture.frame.settings, picture.groups, picture.sums)
 
 
 Renderer = SplatRenderer | CpuRenderer
@@ -521,6 +533,41 @@ def _face_key(frame: Frame) -> Hashable:
 
 def _raster_options(settings: DrawSettings) -> RasterOptions:
     return RasterOptions(settings.kernel, settings.order, settings.lowpass, settings.near)
+
+
+def _find_footprint(settings: DrawSettings) -> Footprint | None:
+    return None if settings.footprint == "gaussian" else settings.footprint
+
+
+def _blend(
+    settings: DrawSettings, groups: _Groups, sums: Float[np.ndarray, "layer 5 height width"]
+) -> tuple[Float[np.ndarray, "height width 4"], Float[np.ndarray, "height width"]]:
+    """Colour over the background and coverage, and depth."""
+    color, depth = blend_layers(sums, groups.weights, settings.background, difference=groups.difference)
+    if settings.display in SCALAR_MAPS:
+        values = {"depth": depth, "opacity": color[..., 3], "count": sums[0, 4]}[settings.display]
+        mapped = map_values(values, settings.display_max, SCALAR_MAPS[settings.display]) / np.float32(255)
+        color[..., :3] = np.where(color[..., 3:] > 0, mapped, np.array(settings.background, np.float32))
+    return color, depth
+
+
+def _write_pixels(
+    settings: DrawSettings,
+    groups: _Groups,
+    sums: Float[np.ndarray, "layer 5 height width"],
+    pixels: UInt32[np.ndarray, "height width"],
+    *,
+    bottom_up: bool = False,
+) -> None:
+    """Write the colours of `_blend` with 8 bits per channel, by the kernel where the display has one."""
+    weights, background = groups.weights, settings.background
+    if settings.display not in SCALAR_MAPS:
+        blend_to_pixels(sums, weights, background, pixels, difference=groups.difference, bottom_up=bottom_up)
+        return
+    color, _ = _blend(settings, groups, sums)
+    color[..., 3] = 1
+    words = (color * 255 + 0.5).astype(np.uint8).view(np.uint32)[..., 0]
+    pixels[...] = words[::-1] if bottom_up else words
 
 
 def _add_stages(stages: dict[str, float], layers: Layers) -> None:

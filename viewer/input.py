@@ -10,10 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pansplat_viewer import camera as cameras
+from pansplat_viewer.preferences import Theme
 from pansplat_viewer.state import ViewerState, add_key_frame, jump_to_view, step_flight, toggle_play
 
 FLY_SPEED = 1.0  # metres per second
 FAST, SLOW = 4.0, 0.2
+TURN_SPEED = 2.0  # of a gamepad's stick, radians per second
 _CLICK_PIXELS = 3.0  # a longer way of the pointer with the button down is a drag
 ORBIT_KEY_PIXELS = 400.0  # per second, of a window 1000 pixels high
 
@@ -33,6 +35,7 @@ HELP = (
     ("M", "floor plan and hotspots of a tour"),
     (", .", "step along the flight"),
     ("C", "compare with the nearest photograph"),
+    ("X", "pin the image, to compare others with it"),
     ("B", "before or after the refinement"),
     ("K", "key frame of the camera path"),
     ("P, Shift P", "screenshot PNG, EXR with depth"),
@@ -56,6 +59,7 @@ class Input:
         click: place of a click on the image without a drag, as fractions of width and height; None without a click.
         scroll: wheel steps; positive is scrolling up.
         height: of the window, pixels.
+        sticks: of a gamepad, -1 to 1: fly right, up and forward, turn right and up.
     """
 
     seconds: float = 1 / 60
@@ -66,6 +70,7 @@ class Input:
     scroll: float = 0.0
     height: int = 720
     click: tuple[float, float] | None = None
+    sticks: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass
@@ -74,36 +79,50 @@ class Commands:
 
     Attributes:
         png, exr, panorama: write a screenshot.
+        pin: pin the image.
+        go_to_photograph: move to the camera of the photograph of the comparison.
         focus: orbit the point in the image centre.
         pick: show the point at this place, as fractions of width and height.
         choose: show the entry of this index.
         open: show the scenes at this path.
+        reload: load the entry again.
+        reduce: show the scene that did not fit, with this number of Gaussians.
+        theme: choose these colours.
+        reset_layout: restore the default layout of the panels.
         visit: fly to this panorama of the tour.
         save_path, open_path: write or read the key frames, to or from this file.
         film: write the film of the path.
         cancel_film: end the film that is being written.
         dismiss_error: close the error message.
+        cancel_loading: end the search for scenes, or the prediction.
         cancel_refinement: keep the prediction.
     """
 
     png: bool = False
     exr: bool = False
     panorama: bool = False
+    pin: bool = False
+    go_to_photograph: bool = False
     focus: bool = False
     pick: tuple[float, float] | None = None
     choose: int | None = None
     open: str | None = None
+    reload: bool = False
+    reduce: int | None = None
+    theme: Theme | None = None
+    reset_layout: bool = False
     visit: int | None = None
     save_path: str | None = None
     open_path: str | None = None
     film: bool = False
     cancel_film: bool = False
     dismiss_error: bool = False
+    cancel_loading: bool = False
     cancel_refinement: bool = False
 
 
 _KEYS = {
-    **{letter: letter for letter in "wasdqevfhprcbmk"},
+    **{letter: letter for letter in "wasdqevfhprcbmkx"},
     **{digit: f"_{digit}" for digit in "123456789"},
     "space": "space",
     ",": "comma",
@@ -115,6 +134,33 @@ _KEYS = {
     "left": "left_arrow",
     "right": "right_arrow",
 }
+
+_BUTTONS = {
+    "gamepad_face_down": "space",
+    "gamepad_face_up": "v",
+    "gamepad_face_right": "r",
+    "gamepad_start": "tab",
+    "gamepad_dpad_left": ",",
+    "gamepad_dpad_right": ".",
+    "gamepad_l1": "alt",
+    "gamepad_r1": "shift",
+}
+_STICKS = (
+    ("gamepad_l_stick_right", "gamepad_l_stick_left"),
+    ("gamepad_r2", "gamepad_l2"),
+    ("gamepad_l_stick_up", "gamepad_l_stick_down"),
+    ("gamepad_r_stick_right", "gamepad_r_stick_left"),
+    ("gamepad_r_stick_up", "gamepad_r_stick_down"),
+)
+
+
+def _read_sticks() -> tuple[float, ...]:
+    from imgui_bundle import imgui
+
+    def read(name: str) -> float:
+        return float(imgui.internal.get_key_data(getattr(imgui.Key, name)).analog_value)
+
+    return tuple(read(positive) - read(negative) for positive, negative in _STICKS)
 
 
 def read_input(seconds: float) -> Input:
@@ -131,6 +177,12 @@ def read_input(seconds: float) -> Input:
                 held.add(name)
             if imgui.is_key_pressed(value, repeat=name in ",."):
                 pressed.add(name)
+    for key, name in _BUTTONS.items():
+        value = getattr(imgui.Key, key)
+        if imgui.is_key_down(value):
+            held.add(name)
+        if imgui.is_key_pressed(value, repeat=name in ",."):
+            pressed.add(name)
     modifiers = {"shift": io.key_shift, "alt": io.key_alt, "ctrl": io.key_ctrl}
     held |= {name for name, down in modifiers.items() if down}
     drag = pan = (0.0, 0.0)
@@ -145,7 +197,8 @@ def read_input(seconds: float) -> Input:
         moved_since_click = imgui.get_mouse_drag_delta(0, 0.0)
         if imgui.is_mouse_released(0) and max(abs(moved_since_click.x), abs(moved_since_click.y)) < _CLICK_PIXELS:
             click = (io.mouse_pos.x / io.display_size.x, io.mouse_pos.y / io.display_size.y)
-    return Input(seconds, frozenset(held), frozenset(pressed), drag, pan, scroll, int(io.display_size.y), click)
+    keys, height = (frozenset(held), frozenset(pressed)), int(io.display_size.y)
+    return Input(seconds, *keys, drag, pan, scroll, height, click, _read_sticks())
 
 
 def apply_input(state: ViewerState, events: Input) -> Commands:
@@ -157,7 +210,11 @@ def apply_input(state: ViewerState, events: Input) -> Commands:
     _move_camera(state, events)
     shift, screenshot = "shift" in events.held, "p" in events.pressed
     return Commands(
-        png=screenshot and not shift, exr=screenshot and shift, focus="f" in events.pressed, pick=events.click
+        png=screenshot and not shift,
+        exr=screenshot and shift,
+        focus="f" in events.pressed,
+        pin="x" in events.pressed,
+        pick=events.click,
     )
 
 
@@ -167,9 +224,11 @@ def _apply_pressed(state: ViewerState, pressed: frozenset[str]) -> None:
             state.help = False
         else:
             state.quit = True
-    for key, name in (("tab", "overlay"), ("h", "help"), ("c", "photo"), ("v", "orbiting"), ("b", "refined")):
+    for key, name in (("tab", "overlay"), ("h", "help"), ("v", "orbiting"), ("b", "refined")):
         if key in pressed:
             setattr(state, name, not getattr(state, name))
+    if "c" in pressed:
+        state.comparison = "off" if state.comparison == "photograph" else "photograph"
     if "m" in pressed:
         state.minimap = state.hotspots = not state.minimap
     if "k" in pressed:
@@ -197,12 +256,17 @@ def _move_camera(state: ViewerState, events: Input) -> None:
         ),
         dtype=float,
     )
+    axes += events.sticks[:3]
     factor = (FAST if "shift" in held else 1.0) * (SLOW if "alt" in held else 1.0)
     camera = state.camera
+    turn = np.array(events.sticks[3:]) * TURN_SPEED * events.seconds
+    if turn.any() and not state.orbiting:
+        camera = cameras.turn(camera, *turn)
     if state.orbiting:
         pixels = ORBIT_KEY_PIXELS * events.seconds * factor * events.height / 1000
-        if axes[0] or axes[1]:
-            camera = cameras.orbit(camera, (-axes[0] * pixels, axes[1] * pixels), events.height)
+        across = axes[:2] + events.sticks[3:]
+        if across.any():
+            camera = cameras.orbit(camera, (-across[0] * pixels, across[1] * pixels), events.height)
         if axes[2]:
             camera = cameras.dolly(camera, axes[2] * 6 * events.seconds * factor)
         if any(events.drag):

@@ -127,6 +127,7 @@ class Frame:
         """Return the values that a layer's content depends on, except its set of Gaussians."""
         s = self.settings
         key = (splats, self.position, s.kernel, s.order, s.lowpass, s.levels, s.opacity_threshold, s.near)
+        key += (s.footprint, s.splat_colors)
         if self.storage == LayerStorage.IMAGE:
             return (*key, self.rotation.tobytes(), self.focal)
         return (*key, self.faces_to_world.tobytes())
@@ -383,7 +384,8 @@ class SplatRasterizer:
         """
         self._set_uniforms(camera, settings, viewport)
         self._ctx.enable_only(moderngl.BLEND)
-        self._ctx.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
+        add = settings.footprint == "count"
+        self._ctx.blend_func = moderngl.ONE, moderngl.ONE if add else moderngl.ONE_MINUS_SRC_ALPHA
         variance, _ = compute_lowpass_variances(settings, camera.focal)
         drawn = 0
         if self._gpu is not None:
@@ -439,4 +441,5 @@ class SplatRasterizer:
             half_size=camera.half_size,
             principal=(x + 0.5 * width, y + 0.5 * height),
             focal=camera.focal,
+            footprint=("gaussian", "count", "ellipsoids").index(settings.footprint),
         )

@@ -15,12 +15,10 @@ from pansplat.errors import InputError
 from pansplat.files import is_scene_file
 
 if TYPE_CHECKING:
-    from pansplat.data.pairs import Pair
-    from pansplat.data.views import Views
+    from pansplat.data.pairs import Pair, Panorama
     from pansplat.gaussians.scene import Scene
     from pansplat.tours import FloorOutline, TourGraph
 
-PHOTO_HEIGHT = 1024  # smallest height of the photographs for comparison, pixels
 
 Progress = Callable[[str, float], None]  # task, fraction done
 
@@ -44,6 +42,18 @@ class SceneEntry:
     views: tuple[int, ...] = ()
 
     @property
+    def panoramas(self) -> "tuple[Panorama, ...]":
+        """The photographs of the scene, those that are held out last."""
+        if self.tour is not None:
+            return self.tour.panoramas
+        return () if self.pair is None else self.pair.context + self.pair.targets
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files that the scene is made from."""
+        return (self.file,) if self.file is not None else tuple(panorama.image for panorama in self.panoramas)
+
+    @property
     def folder_name(self) -> str:
         """The name as a valid folder name, without separators and leading dots."""
         return re.sub(r"[^\w.-]+", "_", self.name).strip("._") or "scene"
@@ -51,7 +61,7 @@ class SceneEntry:
 
 @dataclass(frozen=True, eq=False)
 class LoadedScene:
-    """A scene, and the photographs it was predicted from (None for a scene file).
+    """A scene that is loaded.
 
     Attributes:
         is_final: False for a prediction whose refinement will follow.
@@ -60,7 +70,6 @@ class LoadedScene:
 
     entry: SceneEntry
     scene: "Scene"
-    photos: "Views | None" = None
     is_final: bool = True
     outlines: "dict[int, FloorOutline]" = field(default_factory=dict)
 
@@ -80,8 +89,13 @@ class LoadOptions:
     far: float | None = None
 
 
-def find_entries(path: Path, options: LoadOptions) -> list[SceneEntry]:
+def find_entries(path: Path, options: LoadOptions, progress: Progress | None = None) -> list[SceneEntry]:
     """Return all scenes at `path`: tours of three or more panoramas first, then pairs, then scene files.
+
+    Args:
+        path: a file or folder.
+        options: arguments of reading.
+        progress: called while the poses of panoramas without poses are estimated.
 
     Raises:
         InputError: the path does not exist, or holds neither pairs nor scene files.
@@ -94,7 +108,7 @@ def find_entries(path: Path, options: LoadOptions) -> list[SceneEntry]:
     try:
         from pansplat.pipeline import load_pairs
 
-        pairs = load_pairs(path, convention=options.convention, near=options.near, far=options.far)
+        pairs = load_pairs(path, convention=options.convention, near=options.near, far=options.far, progress=progress)
     except InputError:
         if not scenes:
             raise
@@ -110,8 +124,6 @@ def load_entry(
     options: LoadOptions,
     progress: Progress,
     show: Callable[[LoadedScene], None] | None = None,
-    *,
-    photos: bool = True,
 ) -> LoadedScene:
     """Read an entry's scene, or predict and refine it. Of a tour, the scene in which `plan_walk` starts.
 
@@ -122,7 +134,6 @@ def load_entry(
         options: arguments of reading and prediction.
         progress: called with the task and the fraction done.
         show: called with the prediction before it is refined.
-        photos: whether to read the input photographs.
     """
     from pansplat import pipeline
 
@@ -132,19 +143,6 @@ def load_entry(
         progress("reading", 0.0)
         assert entry.file is not None
         return LoadedScene(entry, pipeline.load(entry.file))
-    images: Views | None = None
-
-    def read_photos() -> "Views | None":
-        nonlocal images
-        if photos and images is None:
-            assert entry.pair is not None
-            images = entry.pair.load_context(max(PHOTO_HEIGHT, options.height or 0))
-        return images
-
-    def show_prediction(scene: "Scene") -> None:
-        if show is not None:
-            show(LoadedScene(entry, scene, read_photos(), is_final=False))
-
     scene = pipeline.predict(
         entry.pair,
         model=options.model,
@@ -154,9 +152,9 @@ def load_entry(
         refine_seconds=options.refine_seconds,
         cache=options.cache,
         progress=progress,
-        on_predicted=None if show is None else show_prediction,
+        on_predicted=None if show is None else lambda scene: show(LoadedScene(entry, scene, is_final=False)),
     )
-    return LoadedScene(entry, scene, read_photos())
+    return LoadedScene(entry, scene)
 
 
 def _load_tour_scene(
@@ -199,10 +197,10 @@ class _CancelledError(Exception):
 @dataclass
 class _Job:
     entry: SceneEntry
+    future: "Future[LoadedScene] | Future[list[SceneEntry]] | None" = None
     task: str = "starting"
     fraction: float = 0.0
     cancelled: bool = False
-    future: Future[LoadedScene] | None = None
     preview: LoadedScene | None = None
     is_shown: bool = False
 
@@ -216,13 +214,20 @@ class _Job:
 
 
 class SceneLoader:
-    """Loads and refines entries in worker threads; a new request cancels the previous one."""
+    """Finds, loads and refines entries in worker threads; a new request cancels the previous one of its kind."""
 
     def __init__(self, load: Callable[[SceneEntry, Progress, Callable[[LoadedScene], None]], LoadedScene]) -> None:
         """`load` loads one entry, such as `load_entry` with its options."""
         self._load = load
         self._executor = ThreadPoolExecutor(thread_name_prefix="scene-loader")
         self._job: _Job | None = None
+        self._search: _Job | None = None
+
+    def search(self, path: Path, find: Callable[[Path, Progress], list[SceneEntry]]) -> None:
+        """Start to find the entries at a path. The request of an entry goes on."""
+        self.cancel_search()
+        self._search = _Job(SceneEntry(path.name or str(path)), task="looking for panoramas and scenes")
+        self._search.future = self._executor.submit(find, path, self._search.report)
 
     def request(self, entry: SceneEntry) -> None:
         """Start loading an entry."""
@@ -235,14 +240,19 @@ class SceneLoader:
         return self._load(entry, lambda task, done: None, lambda loaded: None)
 
     @property
+    def is_searching(self) -> bool:
+        """Whether entries are being looked for."""
+        return self._search is not None
+
+    @property
     def entry(self) -> SceneEntry | None:
         """The entry that is being loaded or refined; None if the loader is idle."""
         return self._job.entry if self._job else None
 
     @property
     def progress(self) -> tuple[str, str, float] | None:
-        """Name of the entry, task and fraction done; None if nothing is loading."""
-        job = self._job
+        """Name of the entry or path, task and fraction done; None if nothing is loading."""
+        job = self._search or self._job
         return (job.entry.name, job.task, job.fraction) if job and not job.is_shown else None
 
     @property
@@ -251,11 +261,14 @@ class SceneLoader:
         job = self._job
         return max(2 * job.fraction - 1, 0.0) if job and job.is_shown else None
 
-    def poll(self) -> LoadedScene | BaseException | None:
+    def poll(self) -> LoadedScene | list[SceneEntry] | BaseException | None:
         """Return a prediction that is being refined, then the result or exception of the request, each once.
 
-        None while there is nothing new, or if there is no request.
+        Entries that are found come first. None while there is nothing new, or if there is no request.
         """
+        if self._search is not None and self._search.future is not None and self._search.future.done():
+            search, self._search = self._search.future, None
+            return search.exception() or search.result()
         if self._job is None or self._job.future is None:
             return None
         if self._job.preview is not None and not self._job.is_shown:
@@ -272,7 +285,15 @@ class SceneLoader:
             self._job.cancelled = True
             self._job = None
 
+    def cancel_search(self) -> bool:
+        """Stop to look for entries; returns whether there was a search."""
+        search, self._search = self._search, None
+        if search is not None:
+            search.cancelled = True
+        return search is not None
+
     def close(self) -> None:
         """Cancel the request and wait for all threads."""
+        self.cancel_search()
         self.cancel()
         self._executor.shutdown()

@@ -1,31 +1,43 @@
-"""imgui on an OpenGL context, and the panels over the image: scene, settings, camera, photograph and screenshots."""
+"""The panels over the image: scene, display, Gaussians, camera, comparison, screenshots, camera path and window."""
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from importlib import resources
 from typing import get_args
 
-import imgui_bundle
 import moderngl
 from imgui_bundle import imgui
 
 from pansplat_viewer import camera as cameras
+from pansplat_viewer.color_maps import get_table
+from pansplat_viewer.gui import PANEL_WIDTH
 from pansplat_viewer.input import HELP, Commands
 from pansplat_viewer.key_frames import KeyFrame
 from pansplat_viewer.minimap import SIZE, Minimap
 from pansplat_viewer.picking import project_point
-from pansplat_viewer.settings import FrameStats, Kernel, Lowpass, Order, Projection
-from pansplat_viewer.state import KEY_SECONDS, ViewerState, add_key_frame, fly_to, jump_to_view, show_path, toggle_play
+from pansplat_viewer.preferences import Preferences, Theme
+from pansplat_viewer.presenter import ERROR_MAP
+from pansplat_viewer.settings import SCALAR_MAPS, Comparison, Display, FrameStats, Kernel, Lowpass, Order, Projection
+from pansplat_viewer.state import (
+    KEY_SECONDS,
+    ViewerState,
+    add_key_frame,
+    choose_display,
+    fly_to,
+    jump_to_view,
+    show_path,
+    toggle_play,
+)
 from pansplat_viewer.tour import Hotspot, TourScenes
 
 Rectangle = tuple[float, float, float, float]  # left, top, right, bottom, pixels
 
-_FONT_PIXELS = 16.0
-_PANEL_WIDTH = 290.0
 _MARGIN = 10.0
 _FIXED = (
-    imgui.WindowFlags_.no_move.value | imgui.WindowFlags_.no_resize.value | imgui.WindowFlags_.no_saved_settings.value
+    imgui.WindowFlags_.no_move.value
+    | imgui.WindowFlags_.no_resize.value
+    | imgui.WindowFlags_.no_saved_settings.value
+    | imgui.WindowFlags_.no_docking.value
 )
 _LABEL = (
     _FIXED
@@ -35,6 +47,18 @@ _LABEL = (
     | imgui.WindowFlags_.no_focus_on_appearing.value
     | imgui.WindowFlags_.no_nav.value
 )
+_HANDLE = (
+    imgui.WindowFlags_.no_decoration.value
+    | imgui.WindowFlags_.no_background.value
+    | imgui.WindowFlags_.no_move.value
+    | imgui.WindowFlags_.no_saved_settings.value
+    | imgui.WindowFlags_.no_docking.value
+    | imgui.WindowFlags_.no_focus_on_appearing.value
+    | imgui.WindowFlags_.no_bring_to_front_on_focus.value
+    | imgui.WindowFlags_.no_nav.value
+)
+_LEGEND_WIDTH = 180.0
+_UNITS = {"depth": " m", "count": ""}  # of displays whose range can be changed
 
 
 @dataclass
@@ -45,10 +69,16 @@ class PanelData:
         entries: names of the scenes to choose from; `current` is the index of the scene that is shown.
         stats: of the last image; `frame_ms` is the time of a whole frame, smoothed.
         size: of the rendered image, pixels; smaller than the window while the camera moves.
-        photo_name: of the nearest input photograph; None if the scene has none.
+        photographs: their names.
+        photograph_distance: from the camera to that of the photograph of the comparison, metres.
+        right_name: of what is shown right of the divider; None if there is nothing.
+        pinned: whether an image is pinned.
         loading: name, task, fraction done; None if nothing is loading.
         refinement: fraction done; 1 if the refined scene is there, None if there is no refinement.
         error: message of the last failure.
+        reduced: number of Gaussians that are offered in place of a scene that did not fit; None if there is none.
+        changed: whether a file of the scene has changed since it was loaded.
+        preferences: the remembered values.
         film: fraction of the film that is written; None if none is being written.
         tour: the scenes of the tour that is shown; None for other scenes.
         hotspots: places of its panoramas in the image.
@@ -60,69 +90,20 @@ class PanelData:
     stats: FrameStats = field(default_factory=FrameStats)
     frame_ms: float = 0.0
     size: tuple[int, int] = (0, 0)
-    photo_name: str | None = None
+    photographs: list[str] = field(default_factory=list)
+    photograph_distance: float = 0.0
+    right_name: str | None = None
+    pinned: bool = False
     loading: tuple[str, str, float] | None = None
     refinement: float | None = None
     error: str | None = None
+    reduced: int | None = None
+    changed: bool = False
+    preferences: Preferences = field(default_factory=Preferences)
     film: float | None = None
     tour: TourScenes | None = None
     hotspots: list[Hotspot] = field(default_factory=list)
     background: tuple[str, float] | None = None
-
-
-class Gui:
-    """An imgui context that imgui's OpenGL 3 backend draws.
-
-    Create it while the OpenGL context is current. A thread can have one at a time.
-    """
-
-    def __init__(self, dpi_scale: float = 1.0) -> None:
-        """Create the context; `dpi_scale` enlarges text and widgets on high-resolution screens."""
-        self._context = imgui.create_context()
-        imgui.set_current_context(self._context)
-        io = imgui.get_io()
-        io.set_ini_filename("")  # write no imgui.ini into the current folder
-        io.config_flags |= imgui.ConfigFlags_.no_mouse_cursor_change.value
-        io.config_windows_move_from_title_bar_only = True
-        imgui.style_colors_dark()
-        style = imgui.get_style()
-        style.window_rounding = style.frame_rounding = style.grab_rounding = 4.0
-        style.frame_padding = imgui.ImVec2(6, 2)
-        style.item_spacing = imgui.ImVec2(6, 4)
-        style.window_padding = imgui.ImVec2(8, 6)
-        style.window_border_size = 0.0
-        style.set_color_(imgui.Col_.window_bg.value, (0.08, 0.09, 0.1, 0.88))
-        style.set_color_(imgui.Col_.frame_bg.value, (0.26, 0.29, 0.33, 0.9))
-        style.scale_all_sizes(dpi_scale)
-        style.font_scale_dpi = dpi_scale
-        font = resources.files(imgui_bundle) / "assets/fonts/Roboto/Roboto-Regular.ttf"
-        if font.is_file():
-            io.fonts.add_font_from_file_ttf(str(font), _FONT_PIXELS)
-        imgui.backends.opengl3_init("#version 330")
-
-    def begin(self, seconds: float, new_frame: Callable[[], None] | None) -> None:
-        """Start a frame; `new_frame` starts the frame of the window's backend."""
-        imgui.set_current_context(self._context)
-        imgui.backends.opengl3_new_frame()
-        if new_frame is not None:
-            new_frame()
-        imgui.get_io().delta_time = max(seconds, 1e-4)
-        imgui.new_frame()
-
-    def end(self, ctx: moderngl.Context, target: moderngl.Framebuffer) -> None:
-        """Draw the frame's widgets over the content of `target`."""
-        imgui.render()
-        target.use()
-        imgui.backends.opengl3_render_draw_data(imgui.get_draw_data())
-        # The backend changes OpenGL state that moderngl does not track.
-        ctx.scissor = None
-        ctx.disable(moderngl.BLEND | moderngl.CULL_FACE | moderngl.DEPTH_TEST)
-
-    def close(self) -> None:
-        """Free the backend's GL objects and the imgui context."""
-        imgui.set_current_context(self._context)
-        imgui.backends.opengl3_shutdown()
-        imgui.destroy_context(self._context)
 
 
 class Panels:
@@ -146,8 +127,9 @@ class Panels:
         if state.overlay:
             self._draw_main_panel(state, data, commands)
             _draw_stats(state, data)
-        if state.photo and data.photo_name is not None and 0 < state.split < 1:
-            _draw_split_line(state.split)
+        if data.right_name is not None:
+            self._draw_divider(state)
+        _draw_legends(state)
         if state.overlay and state.points:
             _draw_points(state)
         if state.overlay and data.tour is not None:
@@ -157,9 +139,9 @@ class Panels:
         if state.help:
             state.help = _draw_help()
         if data.loading:
-            _draw_progress(*data.loading)
+            commands.cancel_loading = self._draw_progress(*data.loading)
         elif data.error:
-            self._draw_error(data.error, commands)
+            self._draw_error(data, data.error, commands)
         if state.message and now < state.message_until:
             _draw_message(state.message)
         return commands
@@ -171,9 +153,10 @@ class Panels:
     def _draw_tour(self, state: ViewerState, data: PanelData, tour: TourScenes, commands: Commands) -> None:
         """Draw the plan and the progress of the tour at the right border, below the statistics."""
         size, scale = imgui.get_io().display_size, imgui.get_style().font_scale_dpi
-        imgui.set_next_window_pos((size.x - _MARGIN, 120 * scale), 0, (1.0, 0.0))
-        imgui.set_next_window_size(((SIZE + 18) * scale, 0))
-        imgui.begin("Tour", None, _FIXED)
+        first = imgui.Cond_.first_use_ever.value
+        imgui.set_next_window_pos((size.x - _MARGIN, 120 * scale), first, (1.0, 0.0))
+        imgui.set_next_window_size(((SIZE + 18) * scale, (SIZE + 110) * scale), first)
+        imgui.begin("Tour")
         state.minimap = self._check("floor plan", state.minimap)
         imgui.same_line()
         state.hotspots = self._check("hotspots", state.hotspots)
@@ -207,8 +190,12 @@ class Panels:
         self._record_rectangle(label)
         return pressed
 
-    def _slider(self, label: str, value: float, low: float, high: float, form: str) -> float:
-        changed, chosen = imgui.slider_float(label, value, low, high, form, imgui.SliderFlags_.always_clamp.value)
+    def _slider(
+        self, label: str, value: float, low: float, high: float, form: str, *, logarithmic: bool = False
+    ) -> float:
+        flags = imgui.SliderFlags_.always_clamp.value
+        flags |= imgui.SliderFlags_.logarithmic.value if logarithmic else 0
+        changed, chosen = imgui.slider_float(label, value, low, high, form, flags)
         self._record_rectangle(label)
         return chosen if changed else value  # imgui returns an unchanged value rounded to float32
 
@@ -223,19 +210,19 @@ class Panels:
 
     def _draw_main_panel(self, state: ViewerState, data: PanelData, commands: Commands) -> None:
         scale, height = imgui.get_style().font_scale_dpi, imgui.get_io().display_size.y
-        width = _PANEL_WIDTH * scale
-        imgui.set_next_window_pos((_MARGIN, _MARGIN))
-        imgui.set_next_window_size_constraints((width, 0), (width, max(height - 2 * _MARGIN, 50)))
-        opened, _ = imgui.begin("pansplat", None, _FIXED | imgui.WindowFlags_.always_auto_resize.value)
+        imgui.set_next_window_size((PANEL_WIDTH * scale, 0.8 * height), imgui.Cond_.first_use_ever.value)
+        opened, _ = imgui.begin("pansplat")
         if opened:
             imgui.push_item_width(-110 * scale)
             self._section("Scene", self._draw_scene, state, data, commands)
             self._section("Gaussians", self._draw_gaussians, state)
-            self._section("Drawing", self._draw_settings, state)
+            self._section("Display", self._draw_display, state)
+            self._section("Compare", self._draw_comparison, state, data, commands)
             self._section("Camera", self._draw_camera, state)
-            self._section("Photograph", self._draw_photograph, state, data)
             self._section("Screenshot", self._draw_screenshot, commands)
+            self._section("Drawing", self._draw_settings, state, opened=False)
             self._section("Camera path", self._draw_path, state, data, commands, opened=False)
+            self._section("Window", self._draw_window, data, commands, opened=False)
             imgui.pop_item_width()
         imgui.end()
 
@@ -254,6 +241,20 @@ class Panels:
         imgui.same_line()
         if (self._button("Open") or entered) and self.path.strip():
             commands.open = self.path.strip()
+        recent = data.preferences.recent
+        if recent:
+            imgui.set_next_item_width(-60 * imgui.get_style().font_scale_dpi)
+            changed, index = imgui.combo("##recent", -1, list(recent))
+            self._record_rectangle("recent")
+            if changed:
+                commands.open = recent[index]
+            imgui.same_line()
+            imgui.text_disabled("recent")
+        if data.entries and self._button("Reload"):
+            commands.reload = True
+        if data.changed:
+            imgui.same_line()
+            imgui.text_unformatted("changed on disk")
         if data.refinement is not None:
             if data.refinement < 1:
                 commands.cancel_refinement = self._button("Cancel")
@@ -351,12 +352,82 @@ class Panels:
             state.playing = False
             fly_to(state, flight)
 
-    def _draw_photograph(self, state: ViewerState, data: PanelData) -> None:
-        if data.photo_name is None:
-            imgui.text_disabled("this scene has no photographs")
-            return
-        state.photo = self._check("nearest photograph", state.photo)
-        state.split = self._slider("split", state.split, 0.0, 1.0, "%.2f")
+    def _draw_display(self, state: ViewerState) -> None:
+        for number, display in enumerate(get_args(Display)):
+            if number % 3:
+                imgui.same_line()
+            if self._radio(display, state.settings.display == display):
+                choose_display(state, display)
+        if state.settings.display in _UNITS:
+            largest = state.settings.display_max
+            form = f"%.{1 if largest < 100 else 0}f{_UNITS[state.settings.display]}"
+            chosen = self._slider("range", largest, 1.0, 1000.0, form, logarithmic=True)
+            state.settings = replace(state.settings, display_max=chosen)
+
+    def _draw_comparison(self, state: ViewerState, data: PanelData, commands: Commands) -> None:
+        for comparison in get_args(Comparison):
+            if comparison in ("photograph", "error"):
+                imgui.same_line()
+            missing = not (data.pinned if comparison == "pinned" else comparison == "off" or data.photographs)
+            imgui.begin_disabled(missing)
+            if self._radio(comparison, state.comparison == comparison):
+                state.comparison = comparison
+            imgui.end_disabled()
+        imgui.same_line()
+        commands.pin = self._button("Pin this image")
+        if state.comparison in ("photograph", "error") and data.photographs:
+            chosen = 0 if state.photograph is None else state.photograph + 1
+            changed, chosen = imgui.combo("##photograph", chosen, ["nearest photograph", *data.photographs])
+            self._record_rectangle("photographs")
+            if changed:
+                state.photograph = chosen - 1 if chosen else None
+            imgui.same_line()
+            imgui.begin_disabled(data.photograph_distance == 0)
+            commands.go_to_photograph = self._button(f"Go {data.photograph_distance:.2f} m###Go")
+            self._record_rectangle("Go")
+            imgui.end_disabled()
+        if state.comparison == "error":
+            state.max_error = self._slider("error up to", state.max_error, 0.01, 1.0, "%.2f")
+
+    def _draw_window(self, data: PanelData, commands: Commands) -> None:
+        for theme in get_args(Theme):
+            if self._radio(theme, data.preferences.theme == theme):
+                commands.theme = theme
+            imgui.same_line()
+        commands.reset_layout = self._button("Default layout")
+
+    def _draw_divider(self, state: ViewerState) -> None:
+        """Draw the line between both sides of a comparison; a drag moves it."""
+        size, half = imgui.get_io().display_size, 5.0 * imgui.get_style().font_scale_dpi
+        x = min(max(state.split, 0.0), 1.0) * size.x
+        color = imgui.color_convert_float4_to_u32((1.0, 1.0, 1.0, 0.9))
+        imgui.get_background_draw_list().add_line((x, 0), (x, size.y), color, 2.0)
+        imgui.set_next_window_pos((x - half, 0))
+        imgui.set_next_window_size((2 * half, size.y))
+        imgui.push_style_var(imgui.StyleVar_.window_padding.value, (0.0, 0.0))
+        imgui.push_style_var(imgui.StyleVar_.window_min_size.value, (1.0, 1.0))
+        imgui.begin("##divider", None, _HANDLE)
+        imgui.invisible_button("handle", (2 * half, size.y))
+        self._record_rectangle("divider")
+        if imgui.is_item_hovered() or imgui.is_item_active():
+            imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew.value)
+        if imgui.is_item_active():
+            state.split = min(max(state.split + imgui.get_io().mouse_delta.x / size.x, 0.0), 1.0)
+        imgui.end()
+        imgui.pop_style_var(2)
+
+    def _draw_progress(self, name: str, task: str, fraction: float) -> bool:
+        """Draw the progress of a load; returns whether it is to be cancelled."""
+        size, scale = imgui.get_io().display_size, imgui.get_style().font_scale_dpi
+        imgui.set_next_window_pos((size.x / 2, size.y - 6 * _MARGIN * scale), 0, (0.5, 1.0))
+        imgui.set_next_window_size((min(420 * scale, size.x - 2 * _MARGIN), 0))
+        imgui.begin("##progress", None, _FIXED | imgui.WindowFlags_.no_title_bar.value)
+        imgui.text_unformatted(f"{name}: {task}")
+        imgui.progress_bar(fraction, (-80 * imgui.get_style().font_scale_dpi, 0), f"{100 * fraction:.0f}%")
+        imgui.same_line()
+        cancelled = self._button("Cancel##loading")
+        imgui.end()
+        return cancelled
 
     def _draw_screenshot(self, commands: Commands) -> None:
         commands.png = self._button("PNG")
@@ -416,13 +487,18 @@ class Panels:
             imgui.new_line()
             state.film_fps = self._slider("frames per second", state.film_fps, 1.0, 60.0, "%.0f")
 
-    def _draw_error(self, error: str, commands: Commands) -> None:
+    def _draw_error(self, data: PanelData, error: str, commands: Commands) -> None:
         _place_at_center(width=560)
         imgui.begin("Error", None, _FIXED | imgui.WindowFlags_.no_collapse.value)
         imgui.push_text_wrap_pos(0.0)
         imgui.text_unformatted(error)
         imgui.pop_text_wrap_pos()
         commands.dismiss_error = self._button("OK")
+        if data.reduced is not None:
+            imgui.same_line()
+            if self._button(f"Show the {data.reduced:,} largest Gaussians###Reduce"):
+                commands.reduce = data.reduced
+            self._record_rectangle("Reduce")
         imgui.end()
 
 
@@ -441,7 +517,7 @@ def _place_at_center(width: float | None = None) -> None:
 
 def _draw_stats(state: ViewerState, data: PanelData) -> None:
     size, scale = imgui.get_io().display_size, imgui.get_style().font_scale_dpi
-    if size.x > 2.2 * _PANEL_WIDTH * scale:
+    if size.x > 2.2 * PANEL_WIDTH * scale:
         imgui.set_next_window_pos((size.x - _MARGIN, _MARGIN), 0, (1.0, 0.0))
     else:  # too narrow next to the main panel: bottom right
         imgui.set_next_window_pos((size.x - _MARGIN, size.y - _MARGIN), 0, (1.0, 1.0))
@@ -453,8 +529,8 @@ def _draw_stats(state: ViewerState, data: PanelData) -> None:
         f"{data.size[0]} x {data.size[1]}   {stats.tier}" + ("   cached" if stats.cached else ""),
         f"x {x:.2f}  y {y:.2f}  z {z:.2f} m",
     ]
-    if state.photo and data.photo_name is not None:
-        lines.append(f"right: {data.photo_name}" if state.split > 0 else data.photo_name)
+    if data.right_name is not None:
+        lines.append(f"right: {data.right_name}")
     _draw_label("##stats", lines, alpha=0.6)
 
 
@@ -471,7 +547,11 @@ def _draw_points(state: ViewerState) -> None:
     if len(pixels) == 2:
         if pixels[0] is not None and pixels[1] is not None:
             canvas.add_line(pixels[0], pixels[1], color, 2.0)
-        lines.append(f"{math.dist(state.points[0].position, state.points[1].position):.3f} m from the point before")
+        distance = f"{math.dist(state.points[0].position, state.points[1].position):.3f} m"
+        lines.append(f"{distance} from the point before")
+        if pixels[0] is not None and pixels[1] is not None:
+            middle = ((pixels[0][0] + pixels[1][0]) / 2, (pixels[0][1] + pixels[1][1]) / 2)
+            _draw_outlined(canvas, middle, color, distance)
     imgui.set_next_window_pos((size.x - _MARGIN, size.y - _MARGIN), 0, (1.0, 1.0))
     _draw_label("##point", lines, alpha=0.6)
 
@@ -518,15 +598,38 @@ def _draw_help() -> bool:
     return bool(opened)
 
 
-def _draw_progress(name: str, task: str, fraction: float) -> None:
-    _place_at_center(width=420)
-    imgui.begin("##progress", None, _FIXED | imgui.WindowFlags_.no_title_bar.value | imgui.WindowFlags_.no_inputs.value)
-    imgui.text_unformatted(f"{name}: {task}")
-    imgui.progress_bar(fraction, (-1, 0), f"{100 * fraction:.0f}%")
-    imgui.end()
+def _draw_outlined(canvas: imgui.ImDrawList, place: tuple[float, float], color: int, text: str) -> None:
+    """Draw a text that is readable over any image."""
+    black = imgui.color_convert_float4_to_u32((0.0, 0.0, 0.0, 1.0))
+    for x, y in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        canvas.add_text((place[0] + x, place[1] + y), black, text)
+    canvas.add_text(place, color, text)
 
 
-def _draw_split_line(split: float) -> None:
-    size = imgui.get_io().display_size
-    color = imgui.color_convert_float4_to_u32((1.0, 1.0, 1.0, 0.9))
-    imgui.get_background_draw_list().add_line((split * size.x, 0), (split * size.x, size.y), color, 2.0)
+def _draw_legends(state: ViewerState) -> None:
+    """Draw the colour maps that are shown, with their ranges: that of the image left, that of the error right."""
+    settings, size, scale = state.settings, imgui.get_io().display_size, imgui.get_style().font_scale_dpi
+    if settings.display in SCALAR_MAPS:
+        left = PANEL_WIDTH * scale + _MARGIN if state.overlay else _MARGIN
+        unit = _UNITS.get(settings.display, "")
+        _draw_legend((left, size.y - 3 * _MARGIN), settings.display, f"{settings.display_max:.3g}{unit}")
+    if state.comparison == "error":
+        left = size.x - (_LEGEND_WIDTH * scale + _MARGIN)
+        _draw_legend((left, size.y - 3 * _MARGIN), "error", f"{state.max_error:.3g}", ERROR_MAP)
+
+
+def _draw_legend(corner: tuple[float, float], label: str, largest: str, name: str = "") -> None:
+    """Draw a colour map with its name and range, above a corner."""
+    canvas, scale = imgui.get_background_draw_list(), imgui.get_style().font_scale_dpi
+    table = get_table(name or SCALAR_MAPS[label])  # pyright: ignore[reportArgumentType]
+    step, height = _LEGEND_WIDTH * scale / 64, 10 * scale
+    for index in range(64):
+        red, green, blue = (table[4 * index + 2] / 255).tolist()
+        x = corner[0] + index * step
+        color = imgui.color_convert_float4_to_u32((red, green, blue, 1.0))
+        canvas.add_rect_filled((x, corner[1]), (x + step, corner[1] + height), color)
+    white = imgui.color_convert_float4_to_u32((1.0, 1.0, 1.0, 1.0))
+    above, text = corner[1] - 18 * scale, (f"{label}: 0", largest)
+    _draw_outlined(canvas, (corner[0], above), white, text[0])
+    right = corner[0] + 64 * step - imgui.calc_text_size(largest).x
+    _draw_outlined(canvas, (right, above), white, text[1])

@@ -15,7 +15,7 @@ from pansplat.errors import InputError
 _INCLUDE = re.compile(r'^#include "([^"]+)"$', re.MULTILINE)
 
 # Names in pansplat.constants that every shader source gets as #define lines.
-_SHARED_CONSTANTS = ("ALPHA_CUT", "MAX_ALPHA", "EWA_NEAR_FACTOR", "EWA_CLAMP")
+_SHARED_CONSTANTS = ("ALPHA_CUT", "MAX_ALPHA", "EWA_NEAR_FACTOR", "EWA_CLAMP", "ELLIPSOID_AMBIENT")
 
 # Members of a record, in the order of shaders/project.vert and project.comp.
 RECORD = ("quad_1", "quad_2", "row_a", "row_b", "row_l", "color")
@@ -23,6 +23,7 @@ RECORD_BYTES = 16 * len(RECORD)
 
 DIGITS = 64  # of the radix sort, and its threads in a work group
 TILE_SIZE = 1024  # keys or splats of a work group
+COUNT_STEP = 1 / 256  # that one Gaussian adds to an image of counts, so that half floats hold its square
 
 
 def choose_tier(ctx: moderngl.Context, tier: str) -> str:
@@ -48,7 +49,8 @@ def read_source(name: str, version: int, **defines: float | str) -> str:
         version: of the `#version` line.
         defines: constants in addition to the shared ones.
     """
-    defines = {key: getattr(constants, key) for key in _SHARED_CONSTANTS} | defines
+    shared = {key: getattr(constants, key) for key in _SHARED_CONSTANTS}
+    defines = {"INSPECT": 1, "COUNT_STEP": COUNT_STEP} | shared | defines  # web pages do not define INSPECT
     folder = resources.files("pansplat_viewer.shaders")
     text = _INCLUDE.sub(lambda match: (folder / match[1]).read_text("utf-8"), (folder / name).read_text("utf-8"))
     lines = "".join(f"#define {key} {value}\n" for key, value in defines.items())

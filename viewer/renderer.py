@@ -19,9 +19,10 @@ from jaxtyping import Float
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.pose import blend_weights
+from pansplat_viewer.color_maps import create_table_texture
 from pansplat_viewer.layers import Frame, Layer, LayerPainter, LayerStorage, Target, TargetStore
-from pansplat_viewer.programs import Programs, choose_tier, set_uniforms
-from pansplat_viewer.settings import DrawSettings, FrameStats
+from pansplat_viewer.programs import COUNT_STEP, Programs, choose_tier, set_uniforms
+from pansplat_viewer.settings import SCALAR_MAPS, DrawSettings, FrameStats
 from pansplat_viewer.splats import SortedSplats, Splats, SplatSorter, color_splats, sort_splats
 
 _SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software")
@@ -34,6 +35,9 @@ _MIN_WEIGHT = {16: 1e-4, 32: 2.0**-26}
 def is_software(ctx: moderngl.Context) -> bool:
     """Whether the context draws on the processor."""
     return any(name in ctx.info["GL_RENDERER"].lower() for name in _SOFTWARE)
+
+
+_COLOR_MAP_UNIT = 8  # texture unit, after those of the layers
 
 
 class SplatRenderer:
@@ -86,6 +90,7 @@ class SplatRenderer:
         self._splats: Splats | None = None
         self._painter: LayerPainter | None = None
         self._sorted: SortedSplats | None = None
+        self._color_key: tuple[object, ...] | None = None
         self._frame: Frame | None = None
         self._image: Target | None = None
 
@@ -189,6 +194,8 @@ class SplatRenderer:
         """Paint the layers that the frame needs and compose them to the image."""
         splats, painter = self._sorted, self._painter
         assert splats is not None and painter is not None
+        with_depth = with_depth or frame.settings.display == "depth"
+        self._write_colors(splats, frame.settings.splat_colors)
         weights = choose_layer_weights(frame, splats.splats, _MIN_WEIGHT[self._targets.color_bits])
         views = dict.fromkeys(view for image_weights in weights for view in image_weights)
         layers = {view: painter.paint(frame, splats, view, with_depth=with_depth) for view in views}
@@ -211,21 +218,25 @@ class SplatRenderer:
         assert self._splats is not None
         needs_work = self.tier == "gl33" or self._splats.base_colors is None
         if self._sorted is None or ((wait or not needs_work) and self._sorted.position != position):
-            self._set_sorted(self._sort(self._splats, position))
+            self._sorted = self._sort(self._splats, position)
         elif self._sorted.position != position:
             ready = self._sorter.take()
             if ready is not None and ready.splats is self._splats:
-                self._set_sorted(ready)
+                self._sorted = ready
             if self._sorted.position != position:
                 self._sorter.request(self._splats, position)
         assert self._sorted is not None
         return self._sorted.position == position
 
-    def _set_sorted(self, sorted_splats: SortedSplats) -> None:
-        assert self._painter is not None
-        if sorted_splats.colors is not None:
-            self._painter.rasterizer.write_colors(sorted_splats.colors)
-        self._sorted = sorted_splats
+    def _write_colors(self, splats: SortedSplats, display: str) -> None:
+        """Write the colours of the Gaussians unless they are on the GPU."""
+        own = splats.splats.base_colors if splats.colors is None else splats.colors
+        key = (splats.splats, own if display == "color" else display)
+        if self._color_key is not None and all(a is b for a, b in zip(key, self._color_key, strict=True)):
+            return
+        assert self._painter is not None and own is not None
+        self._painter.rasterizer.write_colors(own if display == "color" else splats.splats.color_by(display))
+        self._color_key = key
 
     def _read(self, attachment: int, components: int) -> np.ndarray:
         if self._image is None:
@@ -237,7 +248,7 @@ class SplatRenderer:
     def _release_scene(self) -> None:
         if self._painter is not None:
             self._painter.release()
-        self._splats = self._painter = self._sorted = self._frame = self._image = None
+        self._splats = self._painter = self._sorted = self._color_key = self._frame = self._image = None
         self._targets.invalidate()
 
 
@@ -248,13 +259,14 @@ def choose_layer_weights(frame: Frame, splats: Splats, min_weight: float) -> lis
         InputError: the scene lacks the view, or the cameras that mode `deferred` needs.
     """
     settings, num_views = frame.settings, splats.num_views
-    if settings.mode == "joint":
+    mode = settings.drawn_mode
+    if mode == "joint":
         return [{None: 1.0}]
-    if settings.mode in ("view", "difference") and not 0 <= settings.view < max(num_views, 1):
+    if mode in ("view", "difference") and not 0 <= settings.view < max(num_views, 1):
         raise InputError(f"`view` must be 0..{max(num_views, 1) - 1} in this scene, got {settings.view}")
-    if settings.mode == "view":
+    if mode == "view":
         return [{settings.view: 1.0}]
-    if settings.mode == "difference":
+    if mode == "difference":
         return [{settings.view: 1.0}, {(settings.view + 1) % max(num_views, 1): 1.0}]
     if num_views < 2:
         return [{None: 1.0}]
@@ -281,6 +293,7 @@ class Compositor:
         self._targets = targets
         self._accumulate: dict[LayerStorage, moderngl.VertexArray] = {}
         self._resolve = ctx.vertex_array(programs.resolve(), [])
+        self._tables: dict[str, moderngl.Texture] = {}
 
     def compose(self, frame: Frame, images: Sequence[Sequence[tuple[Layer, float]]], *, with_depth: bool) -> Target:
         """Return the frame's image: RGB over the background, coverage, and depth if the layers have it.
@@ -299,6 +312,7 @@ class Compositor:
         image.framebuffer.viewport = (0, 0, *frame.size)
         program = self._programs.resolve()
         set_uniforms(program, difference=len(sums) == 2, background=frame.settings.background)
+        self._set_color_map(program, frame.settings)
         first, second = sums[0], sums[-1]
         textures = {"first_color": first.color, "first_depth": first.depth}
         textures |= {"second_color": second.color, "second_depth": second.depth}
@@ -309,8 +323,20 @@ class Compositor:
 
     def release(self) -> None:
         """Free the vertex arrays."""
-        for vertex_array in (*self._accumulate.values(), self._resolve):
-            vertex_array.release()
+        for resource in (*self._accumulate.values(), self._resolve, *self._tables.values()):
+            resource.release()
+
+    def _set_color_map(self, program: moderngl.Program, settings: DrawSettings) -> None:
+        """Set the number that the display shows, and its colours."""
+        name = SCALAR_MAPS.get(settings.display)
+        scalar = 0 if name is None else 1 if settings.display == "depth" else 2
+        step = COUNT_STEP if settings.display == "count" else 1.0
+        set_uniforms(program, scalar=scalar, scalar_max=settings.display_max * step, color_map=_COLOR_MAP_UNIT)
+        if name is None:
+            return
+        if name not in self._tables:
+            self._tables[name] = create_table_texture(self._ctx, name)
+        self._tables[name].use(_COLOR_MAP_UNIT)
 
     def _add_layers(
         self, frame: Frame, weighted: Sequence[tuple[Layer, float]], target: Target, with_depth: bool

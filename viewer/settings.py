@@ -19,8 +19,20 @@ Layout = Literal["pinhole", "equirect"]
 RendererChoice = Literal["auto", "gl", "cpu"]
 Projection = Literal["perspective", "equirect", "cubemap"]
 Stereo = Literal["mono", "side-by-side", "top-bottom", "anaglyph"]
+Display = Literal["color", "depth", "opacity", "normals", "levels", "views", "count", "ellipsoids"]
+Comparison = Literal["off", "photograph", "error", "pinned"]
 
-_CHOICES = {"kernel": Kernel, "order": Order, "lowpass": Lowpass, "mode": Mode, "layout": Layout, "stereo": Stereo}
+_CHOICES = {
+    "kernel": Kernel,
+    "order": Order,
+    "lowpass": Lowpass,
+    "mode": Mode,
+    "layout": Layout,
+    "display": Display,
+    "stereo": Stereo,
+}
+SCALAR_MAPS: dict[Display, str] = {"depth": "turbo", "opacity": "viridis", "count": "inferno"}
+"""Displays of one number a pixel, and their colour maps."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +51,12 @@ class DrawSettings:
             Views of factor 0 are not drawn, unless all are 0, which is the same as all 1.
         levels: pyramid levels to draw; None draws all.
         opacity_threshold: Gaussians of lower opacity are not drawn.
+        display: `color`; `depth`, the mean radial distance, metres; `opacity` of the pixel; `normals`, the shortest
+            axes of the Gaussians, towards their camera, with 0.5 + 0.5 (x, y, z) of the world as RGB; `levels` and
+            `views`, a colour for each label; `count`, the Gaussians that reach the alpha cut at the pixel;
+            `ellipsoids`, the nearest Gaussian within one standard deviation, opaque and shaded. The last two draw all
+            views together in modes `deferred` and `difference`.
+        display_max: of `depth`, `opacity` and `count`, the number with the last colour of the map; the first is 0.
         background: RGB in [0, 1].
         near: Gaussians whose mean is nearer than this radial distance, metres, are not drawn.
         vertical_fov_degrees: of layout `pinhole`, in (0, 180).
@@ -63,6 +81,8 @@ class DrawSettings:
     view_weights: tuple[float, ...] = ()
     levels: frozenset[int] | None = None
     opacity_threshold: float = 0.0
+    display: Display = "color"
+    display_max: float = 1.0
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     near: float = NEAR
     vertical_fov_degrees: float = 90.0
@@ -85,6 +105,8 @@ class DrawSettings:
             )
         if not all(0 <= weight < math.inf for weight in self.view_weights):
             raise InputError(f"`view_weights` must be finite numbers of at least 0, got {self.view_weights}")
+        if not 0 < self.display_max < math.inf:
+            raise InputError(f"`display_max` must be a positive number, got {self.display_max}")
         if not 0 < self.near < math.inf:
             raise InputError(f"`near` must be a positive distance in metres, got {self.near}")
         if self.eye_offset and (self.layout, self.kernel, self.face_size) != ("equirect", "ray", None):
@@ -96,6 +118,21 @@ class DrawSettings:
             raise InputError(f"`eye_offset` must be a distance in metres, got {self.eye_offset}")
         if self.face_size is not None and self.face_size < 1:
             raise InputError(f"`face_size` must be at least 1 pixel, got {self.face_size}")
+
+    @property
+    def footprint(self) -> Literal["gaussian", "count", "ellipsoids"]:
+        """What a Gaussian adds to the pixels that it covers."""
+        return self.display if self.display in ("count", "ellipsoids") else "gaussian"
+
+    @property
+    def splat_colors(self) -> Literal["color", "normals", "levels", "views"]:
+        """The colours of the Gaussians."""
+        return self.display if self.display in ("normals", "levels", "views") else "color"
+
+    @property
+    def drawn_mode(self) -> Mode:
+        """The mode of the layers: counts and ellipsoids are not blended."""
+        return "joint" if self.footprint != "gaussian" and self.mode in ("deferred", "difference") else self.mode
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int, UInt
 from pansplat.gaussians.harmonics import harmonics_basis
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat_viewer.camera import Pinhole
+from pansplat_viewer.displays import color_by_property
 
 # Gaussians whose harmonics are evaluated together. Fits the cache, and is below the size at which torch starts threads,
 # which would cost more time than it saves.
@@ -113,6 +114,13 @@ class Splats:
                 sums += value * coefficients[:, chunk]
             colors[chunk, :3] = np.maximum(sums, 0).T
         return colors
+
+    def color_by(self, display: str) -> Float[np.ndarray, "n 4"]:
+        """Return the colours of all splats that show a property, and a padding column."""
+        rows = self.geometry
+        cameras = self.view_positions - self.origin
+        colors = color_by_property(display, self.means, rows[:, 4:8], rows[:, 8:11], self.levels, self.views, cameras)
+        return np.pad(colors, ((0, 0), (0, 1)))
 
     def select(self, levels: frozenset[int] | None, threshold: float, view: int | None) -> Bool[np.ndarray, "n"]:
         """Return a mask of the splats that levels, opacity threshold and view select and that can be visible."""

@@ -13,9 +13,10 @@ from pansplat.tours import Route, TourGraph
 from pansplat_viewer.camera import Camera, move_to_pose
 from pansplat_viewer.key_frames import CameraPath, KeyFrame
 from pansplat_viewer.picking import PickedPoint
-from pansplat_viewer.settings import DrawSettings, Projection
+from pansplat_viewer.settings import Comparison, Display, DrawSettings, Projection
 
 FLIGHT_SECONDS = 6.0
+COUNT_MAX = 100.0  # Gaussians per pixel with the last colour, by default
 KEY_SECONDS = 2.0  # between key frames that are added one after the other
 NEAR_OF_FAR = 0.03  # of a tour: Gaussians within this fraction of far are not drawn, because ways pass door frames
 _FLIGHT_STEPS = 24  # for the `,` and `.` keys
@@ -31,7 +32,9 @@ class ViewerState:
         settings: draw settings; the field of view is the camera's.
         flight: fraction of the flight between the panoramas in [0, 1]; `playing` while it is played.
         overlay, help: whether panels and key help are shown.
-        photo: whether the nearest input photograph is shown, right of `split` (fraction of the width).
+        comparison: what is shown right of the divider at `split` (fraction of the width).
+        photograph: number of the photograph of the comparison; None is the nearest one.
+        max_error: the difference from a photograph with the last colour of the map.
         refined: whether the refined scene is shown, where there is one, or the prediction.
         adaptive: whether the resolution is lowered while the camera moves.
         speed: of flying, metres per second.
@@ -43,6 +46,7 @@ class ViewerState:
         path: key frames of the camera path that is edited.
         path_seconds: time on the path that the panel shows; `path_playing` while it is played.
         film_suffix, film_fps, film_projection: of the film of the path.
+        depth_max: distance within which most Gaussians are, metres; the range of the display of depths.
         levels: pyramid levels of the scene, ascending.
         points: the last picked points, two at most.
         message: a text to show until `message_until` (seconds of the viewer's clock).
@@ -57,8 +61,10 @@ class ViewerState:
     playing: bool = False
     overlay: bool = True
     help: bool = False
-    photo: bool = False
+    comparison: Comparison = "off"
     split: float = 0.5
+    photograph: int | None = None
+    max_error: float = 0.25
     refined: bool = True
     adaptive: bool = True
     speed: float = 1.0
@@ -74,6 +80,7 @@ class ViewerState:
     film_suffix: str = ".mp4"
     film_fps: float = 24.0
     film_projection: Projection = "perspective"
+    depth_max: float = 1.0
     levels: tuple[int, ...] = ()
     points: list[PickedPoint] = field(default_factory=list)
     message: str = ""
@@ -91,23 +98,38 @@ class ViewerState:
 
 
 def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
-    """Start in a scene at a fraction of its flight; settings that the scene does not support are reset."""
+    """Start in a scene at a fraction of its flight; settings that the scene does not support are reset.
+
+    In a scene of the same cameras as the one before, the camera stays where it is.
+    """
+    before = state.camera if _are_same(state.context, scene.cam2world.numpy()) else None
     adapt_settings(state, scene, keep_levels=False)
     state.settings = replace(state.settings, near=NEAR)
     state.context, state.route = scene.cam2world.double().numpy(), None
     state.playing, state.flight, state.points = False, min(max(at, 0.0), 1.0), []
     level = create_level_camera(scene).level
     camera = move_to_pose(replace(state.camera, level=level), _choose_start_pose(scene, state.flight))
-    state.camera = state.home = replace(camera, distance=_measure_typical_distance(scene))
+    state.camera = state.home = replace(camera, distance=_measure_distance(scene, 50))
+    if before is not None:
+        state.camera = replace(before, distance=state.home.distance)
+    state.depth_max, state.photograph = _measure_distance(scene, 98), None
+    choose_display(state, state.settings.display)
 
 
 def enter_tour(state: ViewerState, tour: TourGraph, scene: Scene, route: Route, *, at: float = 0.0) -> None:
-    """Start in a tour, whose first scene is `scene`, at a fraction of a route through it."""
+    """Start in a tour, whose first scene is `scene`, at a fraction of a route through it; see `enter_scene`."""
+    before = state.camera if _are_same(state.context, tour.cam2world.numpy()) else None
     enter_scene(state, scene)
     state.settings = replace(state.settings, near=NEAR_OF_FAR * tour.far)
     state.context, state.route, state.flight = tour.cam2world.numpy(), route, min(max(at, 0.0), 1.0)
     level = create_level_camera(scene, tour).level
     state.camera = state.home = move_to_pose(replace(state.camera, level=level), route.pose(state.flight))
+    state.camera = before or state.camera
+
+
+def _are_same(first: Float[np.ndarray, "a 4 4"], second: Float[np.ndarray, "b 4 4"]) -> bool:
+    """Whether poses of input cameras are the same, up to the rounding of a file."""
+    return len(first) == len(second) > 0 and np.allclose(first, second, atol=1e-5)
 
 
 def create_level_camera(scene: Scene, tour: TourGraph | None = None) -> Camera:
@@ -122,6 +144,12 @@ def adapt_settings(state: ViewerState, scene: Scene, *, keep_levels: bool = True
     state.levels = tuple(sorted(int(level) for level in torch.unique(scene.gaussians.levels)))
     settings = state.settings if keep_levels else replace(state.settings, levels=None)
     state.settings = fit_settings(settings, scene)
+
+
+def choose_display(state: ViewerState, display: Display) -> None:
+    """Show a property, in the range of the scene."""
+    largest = {"depth": state.depth_max, "count": COUNT_MAX}.get(display, 1.0)
+    state.settings = replace(state.settings, display=display, display_max=largest)
 
 
 def fit_settings(settings: DrawSettings, scene: Scene) -> DrawSettings:
@@ -223,19 +251,20 @@ def _choose_start_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"
     means = scene.gaussians.means.double().numpy()
     if len(means):
         middle = np.median(means, axis=0)
-        matrix[:3, 3] = middle - 2 * _measure_median_distance(means, middle) * matrix[:3, 2]
+        matrix[:3, 3] = middle - 2 * _measure_percentile(means, middle) * matrix[:3, 2]
     return matrix
 
 
-def _measure_typical_distance(scene: Scene) -> float:
-    """Return the median distance of the Gaussians from the first camera (else the start pose), metres; 2 if none."""
+def _measure_distance(scene: Scene, percent: float) -> float:
+    """Return a percentile of the distances from the first camera (else the start pose), metres; 2 if none."""
     means = scene.gaussians.means.double().numpy()
     if not len(means):
         return 2.0
     if len(scene.cam2world):
-        return float(np.median(np.linalg.norm(means - scene.cam2world[0, :3, 3].double().numpy(), axis=1)))
-    return 2 * _measure_median_distance(means, np.median(means, axis=0))
+        return _measure_percentile(means, scene.cam2world[0, :3, 3].double().numpy(), percent)
+    return 2 * _measure_percentile(means, np.median(means, axis=0), percent)
 
 
-def _measure_median_distance(means: Float[np.ndarray, "n 3"], point: Float[np.ndarray, "3"]) -> float:
-    return float(np.median(np.linalg.norm(means - point, axis=1))) or 1.0
+def _measure_percentile(means: Float[np.ndarray, "n 3"], point: Float[np.ndarray, "3"], percent: float = 50) -> float:
+    distances = np.linalg.norm(means - point, axis=1)
+    return float(np.percentile(distances[np.isfinite(distances)], percent)) or 1.0

@@ -1,19 +1,17 @@
 """The viewer without its window: scene, image and panels on any OpenGL context, one frame at a time."""
 
-import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import moderngl
 import numpy as np
+import torch
 from jaxtyping import Float
 
-from pansplat.data.images import read_panorama
-from pansplat.data.views import Views
 from pansplat.errors import InputError
-from pansplat.gaussians.scene import Scene
+from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.tours import plan_route
 from pansplat_viewer import camera as cameras
 from pansplat_viewer.capture import (
@@ -24,15 +22,20 @@ from pansplat_viewer.capture import (
     write_path_film,
     write_screenshot,
 )
+from pansplat_viewer.compare import Comparer
 from pansplat_viewer.cpu_renderer import CpuRenderer, create_renderer
+from pansplat_viewer.file_watch import FileWatch
+from pansplat_viewer.gui import Gui
 from pansplat_viewer.input import Commands, apply_input, read_input
 from pansplat_viewer.key_frames import read_path, write_path
-from pansplat_viewer.loader import PHOTO_HEIGHT, LoadedScene, SceneEntry, SceneLoader
-from pansplat_viewer.panels import Gui, PanelData, Panels
+from pansplat_viewer.loader import LoadedScene, Progress, SceneEntry, SceneLoader
+from pansplat_viewer.panels import PanelData, Panels
 from pansplat_viewer.picking import compute_pixel_ray, pick_point
-from pansplat_viewer.programs import Programs
+from pansplat_viewer.preferences import read_preferences, write_preferences
+from pansplat_viewer.presenter import Presenter
+from pansplat_viewer.resolution import AdaptiveResolution, ResolutionPlan
 from pansplat_viewer.settings import DrawSettings, RendererChoice
-from pansplat_viewer.slots import SceneSlot
+from pansplat_viewer.slots import SceneSlot, keep_largest
 from pansplat_viewer.state import (
     ViewerState,
     adapt_settings,
@@ -47,161 +50,7 @@ from pansplat_viewer.tour import DEFAULT_MEMORY, CrossFade, TourScenes, find_cli
 
 PANORAMA_HEIGHT = 1024  # of a panorama screenshot, pixels
 _MAX_STEP_SECONDS = 0.25  # of camera movement in one frame
-
-SCALES = (1.0, 0.75, 0.5, 0.35, 0.25)  # few values, because a new size allocates new GL textures
-BUDGET_MS = 50.0
-SETTLE_AFTER = 0.2  # seconds after the last movement
-
-
-@dataclass(frozen=True)
-class ResolutionPlan:
-    """How one frame is rendered.
-
-    Attributes:
-        scale: rendered pixels over screen pixels, along each side.
-        cached: whether the image is read from cube faces that are kept for this position.
-        moving: whether the camera has just moved or turned.
-    """
-
-    scale: float
-    cached: bool
-    moving: bool = False
-
-
-@dataclass
-class AdaptiveResolution:
-    """Chooses the resolution of each frame: full when the camera stands still, within a time budget when it moves.
-
-    Attributes:
-        budget_ms: time of a frame while the camera moves.
-        step: index into SCALES of the scale while the camera moves.
-        full_ms: time of the last frame at full resolution.
-        last_motion: time of the last movement, seconds.
-        translated: whether the last movement changed the position.
-        settle_after: seconds after the last movement until the resolution is full.
-        num_scales: how many of SCALES may be used, from the largest on.
-    """
-
-    budget_ms: float = BUDGET_MS
-    step: int = 0
-    full_ms: float = 0.0
-    last_motion: float = -1e9
-    translated: bool = False
-    settle_after: float = SETTLE_AFTER
-    num_scales: int = len(SCALES)
-
-    def plan(self, now: float, *, moved: bool, turned: bool, adaptive: bool = True) -> ResolutionPlan:
-        """Return the plan of the frame at time `now` (seconds) after the camera moved, turned or did neither."""
-        if moved or turned:
-            self.last_motion, self.translated = now, moved
-        self.step = min(self.step, self.num_scales - 1)
-        moving = now - self.last_motion < self.settle_after
-        if not adaptive or not moving:
-            return ResolutionPlan(1.0, cached=False, moving=moving)
-        slow = self.full_ms > self.budget_ms
-        return ResolutionPlan(SCALES[self.step], cached=slow and not self.translated, moving=True)
-
-    def limit(self, size: tuple[int, int], min_size: tuple[int, int]) -> None:
-        """Use no scale that makes an image of `size` smaller than `min_size`, pixels."""
-        fits = [scale for scale in SCALES if all(a * scale >= b for a, b in zip(size, min_size, strict=True))]
-        self.num_scales = max(len(fits), 1)
-
-    def record(self, plan: ResolutionPlan, frame_ms: float) -> None:
-        """Record the time of a frame and adjust the scale; frames from cached faces are ignored."""
-        if plan.cached:
-            return
-        if plan.scale == 1.0:
-            self.full_ms = frame_ms
-        if frame_ms > 1.2 * self.budget_ms and plan.scale == SCALES[self.step]:
-            self.step = min(self.step + 1, self.num_scales - 1)
-        elif self.step > 0 and plan.scale == SCALES[self.step]:
-            # A finer scale only if the next one is expected to fit the budget, else the resolution would oscillate.
-            growth = (SCALES[self.step - 1] / SCALES[self.step]) ** 2
-            if frame_ms * growth < 0.9 * self.budget_ms:
-                self.step -= 1
-
-
-class Presenter:
-    """Draws the rendered image to the screen, and next to it an input photograph of the same directions."""
-
-    def __init__(self, ctx: moderngl.Context) -> None:
-        """Compile the program."""
-        self.ctx = ctx
-        self._programs = Programs(ctx)
-        self._program = self._programs.present()
-        self._triangle = ctx.vertex_array(self._program, [])
-        self._program["image"], self._program["photograph"], self._program["fading"] = 0, 1, 2
-        self._photos: list[moderngl.Texture] = []
-        self._poses: Float[np.ndarray, "view 4 4"] = np.zeros((0, 4, 4))
-
-    def upload_photos(self, photos: Views | None) -> None:
-        """Replace the photographs and their poses; None removes them."""
-        for texture in self._photos:
-            texture.release()
-        self._photos.clear()
-        if photos is None:
-            return
-        self._poses = photos.cam2world.double().numpy()
-        for image in photos.images.permute(0, 2, 3, 1).numpy():
-            height, width = image.shape[:2]
-            pixels = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
-            texture = self.ctx.texture((width, height), 3, pixels.tobytes(), alignment=1)
-            texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
-            texture.repeat_x, texture.repeat_y = True, False
-            self._photos.append(texture)
-
-    def draw(
-        self,
-        image: moderngl.Texture,
-        target: moderngl.Framebuffer,
-        *,
-        photo: int | None,
-        split: float,
-        camera: cameras.Camera,
-        fading: moderngl.Texture | None = None,
-        weight: float = 1.0,
-    ) -> None:
-        """Fill `target` with the image of `camera`, and right of `split` with the photograph of index `photo`.
-
-        The photograph is sampled by direction only: it has no parallax and matches exactly at its own camera. The image
-        is mixed with `fading`, the image of another scene; `weight` is that of the first, 0 to 1.
-        """
-        if photo is None and fading is None and target.viewport == (0, 0, *image.size) and image.dtype == "f1":
-            self._copy(image, target)
-            return
-        target.use()
-        self.ctx.disable(moderngl.DEPTH_TEST | moderngl.BLEND | moderngl.CULL_FACE)
-        image.filter = (moderngl.LINEAR, moderngl.LINEAR)
-        image.use(0)
-        self._program["weight"] = weight
-        (fading or image).use(2)
-        if fading is not None:
-            fading.filter = (moderngl.LINEAR, moderngl.LINEAR)
-        if photo is None:
-            self._program["split"] = 2.0
-            image.use(1)
-        else:
-            self._program["split"] = split
-            self._photos[photo].use(1)
-            rotation = self._poses[photo][:3, :3].T @ camera.cam2world[:3, :3]
-            self._program["camera_to_photo"] = tuple(rotation.T.ravel().tolist())  # column by column
-            width, height = target.viewport[2:]
-            tangent = math.tan(math.radians(camera.vertical_fov_degrees) / 2)
-            self._program["tangent"] = (tangent * width / height, tangent)
-        self._triangle.render(moderngl.TRIANGLES, vertices=3)
-
-    def _copy(self, image: moderngl.Texture, target: moderngl.Framebuffer) -> None:
-        """Copy an image of the target's size; software OpenGL copies fifty times as fast as it draws."""
-        source = self.ctx.framebuffer([image])
-        self.ctx.copy_framebuffer(target, source)
-        target.use()
-        source.release()
-
-    def release(self) -> None:
-        """Free the GL objects."""
-        self.upload_photos(None)
-        self._triangle.release()
-        self._programs.release()
+_REDUCTION = 4  # a scene that does not fit is offered with this fraction of its Gaussians
 
 
 class Viewer:
@@ -219,13 +68,14 @@ class Viewer:
         ctx: moderngl.Context,
         loader: SceneLoader,
         *,
-        find: Callable[[Path], list[SceneEntry]],
+        find: Callable[[Path, Progress], list[SceneEntry]],
         state: ViewerState | None = None,
         folder: Path = Path("renders"),
         at: float = 0.0,
         dpi_scale: float = 1.0,
         renderer: RendererChoice = "auto",
         memory: float = DEFAULT_MEMORY,
+        preferences: Path | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         """Create GL objects on the current context.
@@ -233,24 +83,32 @@ class Viewer:
         Args:
             ctx: the context to draw with.
             loader: loads entries; closed with the viewer.
-            find: returns the entries of a path that a user opens or drops.
+            find: returns the entries of a path that a user opens or drops; called in a worker thread.
             state: the initial state.
             folder: screenshots are written to its subfolder with the entry's name.
             at: fraction of the flight at which a scene is entered.
             dpi_scale: size of the panels.
             renderer: draws the image; `auto` is `cpu` where OpenGL is software.
             memory: limit of the scenes of a tour, GiB.
+            preferences: file of the remembered values; None remembers nothing.
             clock: returns seconds.
         """
         self.ctx, self.loader, self.state = ctx, loader, state or ViewerState()
         self.panels, self.panel_data = Panels(ctx), PanelData()
         self.entries: list[SceneEntry] = []
         self.screenshots: list[Path] = []
-        self.gui = Gui(dpi_scale)
+        self._preferences_file = preferences
+        values = self.panel_data.preferences = read_preferences(preferences)
+        self.gui = Gui(dpi_scale, theme=values.theme, layout=values.layout)
         self._choice, self._memory = renderer, memory
         self._slots = [SceneSlot(StereoRenderer(create_renderer(ctx, renderer), ctx))]
         self._fade = CrossFade()
         self.presenter = Presenter(ctx)
+        self._comparer = Comparer(ctx, lambda: StereoRenderer(create_renderer(ctx, renderer), ctx))
+        self._opened: Path | None = None
+        self._too_large: LoadedScene | None = None
+        self._draw_failed = False
+        self._watch = FileWatch()
         self._find, self._folder, self._at, self._clock = find, folder, at, clock
         self._resolution = AdaptiveResolution(settle_after=self.renderer.settle_seconds)
         self._loaded: LoadedScene | None = None
@@ -258,7 +116,6 @@ class Viewer:
         self._films = FilmWriter()
         self._tour: TourScenes | None = None
         self._waiting = False
-        self._photo_node: int | None = None
         self._last_camera = self.state.camera
 
     @property
@@ -273,32 +130,37 @@ class Viewer:
     @property
     def busy(self) -> bool:
         """Whether the next frame differs without new input."""
-        return self.moving or self.loader.entry is not None or self._films.progress is not None
+        loading = self.loader.entry is not None or self.loader.is_searching or self._comparer.photographs.is_reading
+        return self.moving or loading or self._films.progress is not None
 
     @property
     def moving(self) -> bool:
         """Whether the image is still changing, so that a window draws as often as it can."""
         recently = self._clock() - self._resolution.last_motion < 2 * self._resolution.settle_after
-        unsettled = self._slot.image is not None and not self.renderer.stats.settled
+        slots = [self._slot] if self._comparer.pinned is None else [self._slot, self._comparer.pinned.slot]
+        unsettled = any(slot.image is not None and not slot.renderer.stats.settled for slot in slots)
         fading = self._fade.compute_weight(self._clock()) < 1
         playing = self.state.path_playing or (self.state.playing and not self._waiting)
         return playing or recently or unsettled or fading
 
     def open(self, path: Path) -> None:
-        """Show the scenes at a path; for an invalid path, show an error and keep the current scene."""
-        try:
-            entries = self._find(path)
-        except (InputError, OSError) as error:
-            self.panel_data.error = str(error)
-            return
-        self.show(entries, 0)
+        """Look for the scenes at a path and show them; for an invalid path, show an error and keep the scene."""
+        self._opened = path
+        self.loader.search(path, self._find)
 
     def show(self, entries: list[SceneEntry], index: int) -> None:
         """List these entries and load one of them."""
         self.entries = entries
         self.panel_data.entries = [entry.name for entry in entries]
         self.panel_data.current, self.panel_data.error = index, None
+        self._watch.start(entries[index].files)
+        if self._loaded is None:
+            self._preview(entries[index])
         self.loader.request(entries[index])
+
+    def remember(self, path: Path) -> None:
+        """Add a path to the recent ones."""
+        self._write_preferences(recent=self.panel_data.preferences.add_recent(path).recent)
 
     def frame(self, target: moderngl.Framebuffer, seconds: float, new_frame: Callable[[], None] | None = None) -> None:
         """Apply the input of a frame of `seconds`, and draw image and panels into the viewport of `target`.
@@ -309,6 +171,7 @@ class Viewer:
         now, size = self._clock(), target.viewport[2:]
         self._take_loaded(now)
         self._take_film(now)
+        self._watch.look(now)
         self._exchange_scene()
         self._update_tour(now)
         self.gui.begin(seconds, new_frame)
@@ -320,15 +183,15 @@ class Viewer:
         self._fly_tour(min(seconds, 2 * _MAX_STEP_SECONDS), was_playing)
         advance_path(self.state, min(seconds, 2 * _MAX_STEP_SECONDS))
         if self._loaded is None:
-            target.use()
-            self.ctx.clear(*self.state.settings.background)
+            self._draw_preview(target, now)
         else:
             if key_commands.focus:
                 self._focus_center()
             if key_commands.pick is not None:
                 self._pick(key_commands.pick, size, now)
-            self._draw_image(size, target, now)
+            self._try_to_draw(size, target, now)
         self.gui.end(self.ctx, target)
+        self._save_layout()
         for commands in (panel_commands, key_commands):
             self._execute(commands, size, now)
         milliseconds = 1000 * (time.perf_counter() - start)
@@ -337,36 +200,55 @@ class Viewer:
 
     def close(self) -> None:
         """Stop the threads and free every GL object; the context must still be current."""
+        self._save_layout(changed=False)
         self._films.close()
         self.loader.close()
         self.presenter.release()
+        self._comparer.release()
         self.panels.release()
         for slot in self._slots:
             slot.renderer.release()
         self.gui.close()
 
     def _take_loaded(self, now: float) -> None:
-        """Show the scene or the error of a finished load."""
+        """Show the scene, the entries or the error of a finished load or search."""
         result = self.loader.poll()
-        if isinstance(result, LoadedScene):
+        if isinstance(result, list):
+            if self._opened is not None:
+                self.remember(self._opened)
+            self.show(result, 0)
+        elif isinstance(result, LoadedScene):
             loaded = self._loaded
             if self._tour is not None and result.entry.tour is self._tour.tour:
                 self._tour.add(result)
             elif loaded is not None and loaded.entry is result.entry and result.is_final and not loaded.is_final:
                 self._refined = result.scene
-            elif self._upload(self._slots[0], result.scene, result.entry):
-                self._enter(result, now)
-        elif isinstance(result, InputError):
+            else:
+                self._show_loaded(result, now)
+        elif isinstance(result, (InputError, OSError)):
             self.panel_data.error = str(result)
         elif result is not None:  # not a user error: a defect, or out of memory
             self.panel_data.error = f"{type(result).__name__}: {result}"
+
+    def _show_loaded(self, loaded: LoadedScene, now: float) -> None:
+        """Show a scene; if it does not fit into memory, keep the one before and offer the largest Gaussians."""
+        if self._upload(self._slots[0], loaded.scene, loaded.entry):
+            self._draw_failed = False
+            self._enter(loaded, now)
+        else:
+            self._offer_reduced(loaded)
+
+    def _offer_reduced(self, loaded: LoadedScene) -> None:
+        """Offer the largest Gaussians of a scene."""
+        count = len(loaded.scene.gaussians) // _REDUCTION
+        self._too_large, self.panel_data.reduced = (loaded, count) if count else (None, None)
 
     def _upload(self, slot: SceneSlot, scene: Scene, entry: SceneEntry) -> bool:
         """Upload a scene; returns whether it fits the GPU's memory, and shows an error if not."""
         try:
             slot.upload(scene)
         except (InputError, MemoryError, moderngl.Error) as error:  # moderngl.Error: the GPU's memory is exhausted
-            self.panel_data.error = f"{entry.name}: {error}"
+            self.panel_data.error = f"{entry.name}: {_describe(error)}"
             return False
         return True
 
@@ -383,8 +265,7 @@ class Viewer:
         self._resolution = AdaptiveResolution(settle_after=self.renderer.settle_seconds)
         self._fade.clear()
         self._fade.show(0, loaded.scene, now)
-        self.presenter.upload_photos(loaded.photos)
-        self._photo_node = None
+        self._comparer.photographs.open(loaded.entry.panoramas)
         if loaded.entry.tour is None:
             enter_scene(self.state, loaded.scene, at=self._at)
         else:
@@ -469,16 +350,22 @@ class Viewer:
     # --- frames ---
 
     def _update_panel_data(self, size: tuple[int, int]) -> None:
-        data, photo = self.panel_data, self._nearest_photo()
+        data, comparer = self.panel_data, self._comparer
         data.stats, data.loading = self.renderer.stats, self.loader.progress
         data.refinement = self.loader.refinement if self._refined is None else 1.0
-        data.photo_name = None
-        if photo is not None and self._loaded and self._loaded.photos:
-            data.photo_name = self._loaded.photos.names[photo]
+        data.changed, data.photographs, data.pinned = (
+            self._watch.changed,
+            comparer.photographs.names,
+            comparer.pinned is not None,
+        )
+        mono = self.state.settings.stereo == "mono"
+        data.right_name = comparer.describe(self.state) if self._loaded and mono else None
+        data.photograph_distance = comparer.measure_distance(self.state)
+        if comparer.error is not None:
+            data.error, comparer.error = comparer.error, None
         data.tour, data.film = self._tour, self._films.progress
         data.hotspots = []
         if self._tour is not None:
-            data.photo_name = self._tour.tour.panoramas[self._nearest_node()].name
             if get_eye_size(size, self.state.settings.stereo) == size:
                 data.hotspots = find_hotspots(self._tour, self.state.camera, size)
             data.background = None
@@ -494,68 +381,77 @@ class Viewer:
             return f"{'waiting for' if self._waiting else 'next'}: {entry.name}", progress[2]
         return f"refining: {entry.name}", refinement or 0.0
 
-    def _nearest_node(self) -> int:
-        assert self._tour is not None
-        return self._tour.tour.find_nearest_node(np.asarray(self.state.camera.position))
+    def _preview(self, entry: SceneEntry) -> None:
+        """Show the photographs of an entry until its scene is there; the camera can turn and fly."""
+        self._comparer.photographs.open(entry.panoramas)
+        source = entry.tour or entry.pair
+        if source is not None:
+            panoramas = entry.panoramas if entry.pair is None else entry.pair.context
+            poses = torch.stack([panorama.cam2world for panorama in panoramas])
+            enter_scene(self.state, Scene(empty_gaussians(), poses, source.near, source.far), at=self._at)
+            self._last_camera = self.state.camera
 
-    def _nearest_photo(self) -> int | None:
-        """Return the index of the photograph nearest to the camera; None if there is none."""
-        photos = self._loaded.photos if self._loaded else None
-        if self._tour is not None:
-            return self._read_nearest_photo(self._tour) if self.state.photo else None
-        if photos is None or not len(photos.cam2world):
-            return None
-        return cameras.find_nearest_view(self.state.camera, photos.cam2world.double().numpy())
+    def _draw_preview(self, target: moderngl.Framebuffer, now: float) -> None:
+        """Draw the nearest photograph, at an infinite distance around its camera."""
+        self._plan_resolution(target.viewport[2:], now)
+        photograph = self._comparer.get_photograph(self.state)
+        if photograph is None:
+            target.use()
+            self.ctx.clear(*self.state.settings.background)
+        else:
+            self.presenter.draw(photograph.texture, target, self.state.camera, right=photograph)
 
-    def _read_nearest_photo(self, tour: TourScenes) -> int | None:
-        """Upload the panorama nearest to the camera, unless it is there; returns its index, which is 0."""
-        node = self._nearest_node()
-        if node == self._photo_node:
-            return 0
-        panorama = tour.tour.panoramas[node]
-        try:
-            image, opaque = read_panorama(panorama.image, PHOTO_HEIGHT)
-        except InputError as error:
-            self.panel_data.error, self.state.photo = str(error), False
-            return None
-        pose = tour.tour.cam2world[node][None]
-        self.presenter.upload_photos(
-            Views(image[None], pose, opaque[None], tour.tour.near, tour.tour.far, (panorama.name,))
-        )
-        self._photo_node = node
-        return 0
-
-    def _draw_image(self, size: tuple[int, int], target: moderngl.Framebuffer, now: float) -> None:
+    def _plan_resolution(self, size: tuple[int, int], now: float) -> ResolutionPlan:
+        """The plan of the frame, from the movement since the last one."""
         camera = self.state.camera
         moved = camera.position != self._last_camera.position
         turned = not moved and camera != self._last_camera
         self._last_camera = camera
         self._resolution.limit(size, self.renderer.min_size)
-        plan = self._resolution.plan(now, moved=moved, turned=turned, adaptive=self.state.adaptive)
+        return self._resolution.plan(now, moved=moved, turned=turned, adaptive=self.state.adaptive)
+
+    def _try_to_draw(self, size: tuple[int, int], target: moderngl.Framebuffer, now: float) -> None:
+        """Draw the image. If memory is exhausted, show an error, and try again when it is dismissed."""
+        if not self._draw_failed:
+            try:
+                self._draw_image(size, target, now)
+                return
+            except (InputError, MemoryError, moderngl.Error) as error:
+                self._draw_failed, self._slot.image = True, None
+                self.panel_data.error = _describe(error)
+                if self._loaded is not None and self._tour is None:
+                    self._offer_reduced(self._loaded)
+        target.use()
+        self.ctx.clear(*self.state.settings.background)
+
+    def _draw_image(self, size: tuple[int, int], target: moderngl.Framebuffer, now: float) -> None:
+        camera, plan = self.state.camera, self._plan_resolution(size, now)
         weight, fading = self._fade.compute_weight(now), None
-        milliseconds = self._render(self._slot, camera.cam2world, size, plan)
+        settings = self.state.draw_settings
+        milliseconds = self._render(self._slot, size, settings, plan)
         if weight < 1:
-            back = self._slots[1 - self._fade.front]
-            milliseconds += self._render(back, camera.cam2world, size, plan)
+            back = self._slots[1 - self._fade.front]  # its scene may have fewer views
+            assert back.scene is not None
+            milliseconds += self._render(back, size, fit_settings(settings, back.scene), plan)
             fading = back.image
         if milliseconds > 0:  # else the image is not new, or not finished
             self._resolution.record(plan, milliseconds)
         image = self._slot.image
         assert image is not None
         self.panel_data.size = image.size
-        photo = self._nearest_photo() if self.state.photo and self.state.settings.stereo == "mono" else None
-        self.presenter.draw(
-            image, target, photo=photo, split=self.state.split, camera=camera, fading=fading, weight=weight
-        )
 
-    def _render(
-        self, slot: SceneSlot, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], plan: ResolutionPlan
-    ) -> float:
+        def draw_pinned(slot: SceneSlot, settings: DrawSettings) -> moderngl.Texture | None:
+            self._render(slot, size, settings, plan)
+            return slot.image
+
+        mono = settings.stereo == "mono"
+        right = self._comparer.get_right_side(self.state, draw_pinned) if mono else None
+        self.presenter.draw(image, target, camera, right=right, fading=fading, weight=weight)
+
+    def _render(self, slot: SceneSlot, size: tuple[int, int], settings: DrawSettings, plan: ResolutionPlan) -> float:
         """Draw the image of this plan; returns milliseconds, 0 if it is not new."""
         scaled = (max(round(size[0] * plan.scale), 1), max(round(size[1] * plan.scale), 1))
-        settings = replace(self.state.draw_settings, cached=plan.cached)
-        if slot is not self._slot:  # the scene that fades out may have fewer views
-            settings = fit_settings(settings, slot.scene)
+        cam2world, settings = self.state.camera.cam2world, replace(settings, cached=plan.cached)
         if plan.cached and slot.renderer.has_faces(cam2world, size, settings):
             scaled = size
         wait = plan.moving and slot.renderer.waits_while_moving
@@ -590,25 +486,68 @@ class Viewer:
 
     def _execute(self, commands: Commands, size: tuple[int, int], now: float) -> None:
         """Execute the commands of the frame, except `focus` and `pick`."""
-        if commands.dismiss_error:
-            self.panel_data.error = None
+        if commands.dismiss_error or commands.reduce is not None:
+            loaded, self._too_large = self._too_large, None
+            self.panel_data.error = self.panel_data.reduced = None
+            self._draw_failed = False
+            if commands.reduce is not None and loaded is not None:
+                self._show_loaded(replace(loaded, scene=keep_largest(loaded.scene, commands.reduce)), now)
+        if commands.cancel_loading and not self.loader.cancel_search():
+            self.loader.cancel()
+            self.panel_data.current = -1
+        if commands.theme is not None:
+            self.gui.set_theme(commands.theme)
+            self._write_preferences(theme=commands.theme)
+        if commands.reset_layout:
+            self.gui.reset_layout()
         if commands.cancel_refinement:
             self.loader.cancel()
         if commands.visit is not None:
             self.state.target = commands.visit
         if commands.choose is not None and commands.choose != self.panel_data.current:
             self.show(self.entries, commands.choose)
+        elif commands.reload:
+            self.show(self.entries, max(self.panel_data.current, 0))
         elif commands.open is not None:
             self.open(Path(commands.open).expanduser())
         if self._loaded is None:
             return
         self._execute_path(commands, size, now)
+        if commands.pin:
+            self._pin(now)
+        if commands.go_to_photograph:
+            self._comparer.go_to_photograph(self.state)
         if commands.png:
             self._write_screenshot("png", size, now)
         if commands.exr:
             self._write_screenshot("exr", size, now)
         if commands.panorama:
             self._write_screenshot("png", (2 * PANORAMA_HEIGHT, PANORAMA_HEIGHT), now, panorama=True)
+
+    def _pin(self, now: float) -> None:
+        """Keep this image as the right side of a comparison."""
+        scene, state, loaded = self._slot.scene, self.state, self._loaded
+        assert scene is not None and loaded is not None
+        name = f"{loaded.entry.name}, {state.settings.mode}, {state.settings.display}"
+        try:
+            self._comparer.pin(scene, state.settings, name)
+        except (InputError, MemoryError, moderngl.Error) as error:
+            self.panel_data.error = f"not pinned: {_describe(error)}"
+            return
+        state.comparison = "pinned"
+        state.show_message("pinned; changes show left of the line", now)
+
+    def _save_layout(self, *, changed: bool = True) -> None:
+        """Remember the layout of the panels."""
+        layout = None if self._preferences_file is None else self.gui.save_layout(changed=changed)
+        if layout is not None:
+            self._write_preferences(layout=layout)
+
+    def _write_preferences(self, **values: object) -> None:
+        preferences = replace(self.panel_data.preferences, **values)
+        if preferences != self.panel_data.preferences:
+            self.panel_data.preferences = preferences
+            write_preferences(preferences, self._preferences_file)
 
     def _execute_path(self, commands: Commands, size: tuple[int, int], now: float) -> None:
         """Save, load and film the camera path."""
@@ -702,6 +641,12 @@ class Viewer:
             return render_image(renderer, cam2world, size, settings, image_format)[0]
         finally:
             renderer.release()
+
+
+def _describe(error: Exception) -> str:
+    if isinstance(error, InputError):
+        return str(error)
+    return f"the memory is exhausted ({type(error).__name__}: {error})"
 
 
 def measure_center_depth(depth: Float[np.ndarray, "height width"]) -> float | None:

@@ -15,6 +15,7 @@ from typing import Any
 import moderngl
 from imgui_bundle import imgui
 
+from pansplat.errors import InputError
 from pansplat_viewer.offscreen import load_llvm_before_mesa
 from pansplat_viewer.viewer import Viewer
 
@@ -22,8 +23,20 @@ _DEBIAN = "on Debian or Ubuntu: apt-get install libgl1 libegl1 libgl1-mesa-dri l
 _IDLE_SECONDS = 0.1  # between frames when nothing moves; so that a prediction gets the CPU
 
 
+_BUTTONS = (
+    ("face_down", "A"), ("face_right", "B"), ("face_left", "X"), ("face_up", "Y"), ("l1", "LEFT_BUMPER"),
+    ("r1", "RIGHT_BUMPER"), ("start", "START"), ("dpad_left", "DPAD_LEFT"), ("dpad_right", "DPAD_RIGHT"),
+)  # fmt: skip
+_AXES = (("l_stick", "LEFT"), ("r_stick", "RIGHT"))
+_DEAD_ZONE = 0.15  # of a stick
+
+
 class NoWindowError(Exception):
     """No window can be opened; the message has the reason, in one line."""
+
+
+class ContextLostError(InputError):
+    """The graphics card was reset, so all OpenGL objects are gone."""
 
 
 class Window:
@@ -32,6 +45,7 @@ class Window:
     Attributes:
         ctx: the context.
         dropped: paths that were dropped on the window and not yet opened.
+        scale_changed: whether the window came to a screen of another resolution since this was set to False.
     """
 
     def __init__(self, title: str, size: tuple[int, int]) -> None:
@@ -49,8 +63,13 @@ class Window:
             raise NoWindowError(f"glfw cannot be loaded ({error})") from error
         self._glfw = glfw
         self.dropped: list[Path] = []
+        self._had_gamepad = False
         self._handle = self._create(title, size)
+        self.scale_changed = False
         self._glfw.set_drop_callback(self._handle, self._drop)
+        self._glfw.set_window_content_scale_callback(self._handle, lambda *_: setattr(self, "scale_changed", True))
+        address = self._glfw.get_proc_address("glGetGraphicsResetStatus")
+        self._reset_status = ctypes.CFUNCTYPE(ctypes.c_uint)(address) if address else lambda: 0
 
     def _create(self, title: str, size: tuple[int, int]) -> Any:
         glfw = self._glfw
@@ -63,6 +82,7 @@ class Window:
             glfw.window_hint(glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE)
             glfw.window_hint(glfw.OPENGL_FORWARD_COMPAT, True)
             glfw.window_hint(glfw.SCALE_TO_MONITOR, True)
+            glfw.window_hint(glfw.CONTEXT_ROBUSTNESS, glfw.LOSE_CONTEXT_ON_RESET)
             handle = glfw.create_window(*size, title, None, None)
             if not handle:
                 glfw.terminate()
@@ -86,8 +106,58 @@ class Window:
 
     @property
     def framebuffer_size(self) -> tuple[int, int]:
-        """Size of the window's content, pixels; 0 while it is minimised."""
+        """Size of the window's content, pixels; may be 0."""
         return self._glfw.get_framebuffer_size(self._handle)
+
+    @property
+    def is_visible(self) -> bool:
+        """Whether the window has pixels and is not minimised."""
+        return 0 not in self.framebuffer_size and not self._glfw.get_window_attrib(self._handle, self._glfw.ICONIFIED)
+
+    def check_context(self) -> None:
+        """Raise `ContextLostError` if the graphics card was reset."""
+        if self._reset_status() != 0:
+            raise ContextLostError("the graphics card was reset")
+
+    def new_frame(self) -> None:
+        """Send size, pointer, keys and gamepad to imgui."""
+        imgui.backends.glfw_new_frame()
+        imgui.get_io().backend_flags |= imgui.BackendFlags_.has_gamepad.value  # glfw's backend clears it
+        self._send_gamepad()
+
+    def _send_gamepad(self) -> None:
+        """Send the first gamepad's buttons and sticks to imgui, as keys with a value of 0 to 1."""
+        glfw, io = self._glfw, imgui.get_io()
+        state = glfw.get_gamepad_state(0) if glfw.joystick_is_gamepad(0) else None
+        if state is None and not self._had_gamepad:
+            return
+        self._had_gamepad = state is not None
+
+        def send(name: str, value: float) -> None:
+            io.add_key_analog_event(getattr(imgui.Key, f"gamepad_{name}"), value > 0, max(value, 0.0))
+
+        for name, button in _BUTTONS:
+            pressed = state is not None and state.buttons[getattr(glfw, f"GAMEPAD_BUTTON_{button}")]
+            send(name, 1.0 if pressed else 0.0)
+        for name, side in _AXES:
+            for axis, low, high in (("X", "left", "right"), ("Y", "up", "down")):
+                value = state.axes[getattr(glfw, f"GAMEPAD_AXIS_{side}_{axis}")] if state is not None else 0.0
+                value = value if abs(value) > _DEAD_ZONE else 0.0
+                send(f"{name}_{low}", -value)
+                send(f"{name}_{high}", value)
+        for name, side in (("l2", "LEFT"), ("r2", "RIGHT")):
+            value = state.axes[getattr(glfw, f"GAMEPAD_AXIS_{side}_TRIGGER")] if state is not None else -1.0
+            send(name, 0.5 + 0.5 * value if value > 2 * _DEAD_ZONE - 1 else 0.0)
+
+    @property
+    def gamepad_moves(self) -> bool:
+        """Whether a stick or button of the gamepad is used."""
+        glfw = self._glfw
+        state = glfw.get_gamepad_state(0) if glfw.joystick_is_gamepad(0) else None
+        if state is None:
+            return False
+        sticks = [state.axes[axis] for axis in range(4)] + [state.axes[axis] + 1 for axis in (4, 5)]
+        return any(abs(value) > _DEAD_ZONE for value in sticks) or any(state.buttons[i] for i in range(15))
 
     def attach_gui(self) -> None:
         """Send the window's events to imgui; call after imgui's context is created."""
@@ -129,7 +199,11 @@ class Window:
 
 
 def run_viewer(window: Window, viewer: Viewer) -> None:
-    """Run a viewer in the window until the user quits, then free everything and join all threads."""
+    """Run a viewer in the window until the user quits, then free everything and join all threads.
+
+    Raises:
+        ContextLostError: the graphics card was reset.
+    """
     with contextlib.ExitStack() as stack:
         stack.callback(window.close)
         stack.callback(viewer.close)
@@ -144,7 +218,8 @@ def _run_loop(window: Window, viewer: Viewer) -> None:
     target = window.ctx.detect_framebuffer(0)
     while not (window.closing or viewer.state.quit):
         before = time.perf_counter()
-        moving = viewer.moving or before < active_until
+        visible = window.is_visible
+        moving = visible and (viewer.moving or before < active_until or window.gamepad_moves)
         window.wait(0.0 if moving else _IDLE_SECONDS)
         if not moving and time.perf_counter() - before < 0.9 * _IDLE_SECONDS:
             active_until = time.perf_counter() + 0.25  # an event: imgui needs a few frames to process it
@@ -153,12 +228,15 @@ def _run_loop(window: Window, viewer: Viewer) -> None:
             window.dropped.clear()
         now = time.perf_counter()
         seconds, last = now - last, now
-        size = window.framebuffer_size
-        if 0 in size:
+        if not (visible and window.is_visible):
             continue
-        target.viewport = (0, 0, *size)
-        viewer.frame(target, seconds, imgui.backends.glfw_new_frame)
+        if window.scale_changed:
+            window.scale_changed = False
+            viewer.gui.set_scale(window.dpi_scale)
+        target.viewport = (0, 0, *window.framebuffer_size)
+        viewer.frame(target, seconds, window.new_frame)
         window.swap()
+        window.check_context()
         data = viewer.panel_data
         if data.current >= 0 and title != (title := f"{data.entries[data.current]} - pansplat"):
             window.set_title(title)

@@ -73,7 +73,7 @@ def test_all_commands_and_the_viewer_take_converted_weights(
     assert (tmp_path / "results" / "results.json").exists()
     options = LoadOptions(model=converted, compat="fixed", height=64, refine_seconds=0)
     (entry,) = (entry for entry in find_entries(room, options) if entry.pair is not None)
-    viewed = load_entry(entry, options, lambda what, done: None, photos=False).scene
+    viewed = load_entry(entry, options, lambda what, done: None).scene
     assert torch.equal(viewed.gaussians.means, scenes["fixed"].gaussians.means)
 
 

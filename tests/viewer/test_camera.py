@@ -99,10 +99,3 @@ def test_focus_looks_at_the_point_and_orbits_it():
     camera = cameras.focus_on_point(replace(Camera(), position=(0.5, 0, 0)), point)
     assert np.allclose(camera.orbit_center, point)
     assert cameras.focus_on_point(camera, np.asarray(camera.position)) == camera
-
-
-def test_nearest_view_has_the_smallest_distance():
-    poses = np.stack([np.eye(4)] * 3)
-    poses[:, 0, 3] = (0, 1, 2)
-    nearest = [cameras.find_nearest_view(replace(Camera(), position=(x, 0, 0)), poses) for x in (-1, 0.9, 5)]
-    assert nearest == [0, 1, 2]

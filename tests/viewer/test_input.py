@@ -123,7 +123,7 @@ def test_comma_and_period_step_along_the_flight_and_stop_at_its_ends(state):
     assert state.flight == 1
 
 
-@pytest.mark.parametrize(("key", "name"), [("tab", "overlay"), ("h", "help"), ("c", "photo")])
+@pytest.mark.parametrize(("key", "name"), [("tab", "overlay"), ("h", "help")])
 def test_key_toggles_what_is_shown(state, key, name):
     before = getattr(state, name)
     press(state, key)

@@ -53,7 +53,6 @@ def test_a_folder_of_scenes_has_an_entry_for_each(tmp_path, small_scene):
     assert [entry.name for entry in entries] == ["a", "b"]
     loaded = load_entry(entries[0], LoadOptions(), ignore)
     assert len(loaded.scene.gaussians) == len(small_scene.gaussians)
-    assert loaded.photos is None
 
 
 @pytest.mark.shared
@@ -129,13 +128,11 @@ def test_predictions_have_the_arguments_of_the_options(monkeypatch, small_scene)
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
     tasks = []
-    pair = SimpleNamespace(name="kitchen", load_context=lambda height: f"photographs at {height}")
-    entry = SceneEntry("kitchen", pair=pair)
+    entry = SceneEntry("kitchen", pair=SimpleNamespace(name="kitchen"))
     options = LoadOptions(model="sweep", height=256, cache=False)
     loaded = load_entry(entry, options, lambda task, done: tasks.append(task))
     assert (arguments["model"], arguments["height"], arguments["cache"]) == ("sweep", 256, False)
-    assert loaded.photos == "photographs at 1024" and tasks[0] == "predicting"
-    assert load_entry(entry, options, ignore, photos=False).photos is None
+    assert loaded.scene is small_scene and tasks[0] == "predicting"
 
 
 def test_the_prediction_is_returned_before_the_refined_scene(small_scene, wait_until):
@@ -159,15 +156,14 @@ def test_the_prediction_is_returned_before_the_refined_scene(small_scene, wait_u
     loader.close()
 
 
-def test_an_entry_shows_its_prediction_and_reads_the_photographs_once(monkeypatch, small_scene):
+def test_an_entry_shows_its_prediction_before_the_refined_scene(monkeypatch, small_scene):
     def predict(pair, **options):
         assert options["refine_seconds"] == 3.0
         options["on_predicted"](small_scene)
         return small_scene
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
-    heights, shown = [], []
-    pair = SimpleNamespace(name="kitchen", load_context=lambda height: heights.append(height) or "photographs")
-    final = load_entry(SceneEntry("kitchen", pair=pair), LoadOptions(refine_seconds=3.0), ignore, shown.append)
+    shown = []
+    entry = SceneEntry("kitchen", pair=SimpleNamespace(name="kitchen"))
+    final = load_entry(entry, LoadOptions(refine_seconds=3.0), ignore, shown.append)
     assert [loaded.is_final for loaded in (*shown, final)] == [False, True]
-    assert shown[0].photos == final.photos == "photographs" and heights == [1024]

@@ -14,27 +14,41 @@ import torch
 from imgui_bundle import imgui
 from PIL import Image
 
-from pansplat.data.views import Views
+from pansplat.data.images import write_image
+from pansplat.data.pairs import Pair, Panorama
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
-from pansplat_viewer.loader import LoadedScene, SceneEntry, SceneLoader
+from pansplat_viewer.color_maps import map_values
+from pansplat_viewer.loader import (
+    LoadedScene,
+    LoadOptions,
+    Progress,
+    SceneEntry,
+    SceneLoader,
+    find_entries,
+    load_entry,
+)
+from pansplat_viewer.presenter import ERROR_MAP
+from pansplat_viewer.resolution import BUDGET_MS, SCALES, SETTLE_AFTER, AdaptiveResolution
 from pansplat_viewer.state import ViewerState
-from pansplat_viewer.viewer import BUDGET_MS, SCALES, SETTLE_AFTER, AdaptiveResolution, Viewer
+from pansplat_viewer.viewer import Viewer
 
 pytestmark = pytest.mark.gl
+once = pytest.mark.parametrize("session", ["cpu"], indirect=True)  # does not depend on the renderer
 
-SIZE = (560, 740)
+SIZE = (560, 900)
 IMAGE = (slice(20, 560), slice(310, 560))  # rows and columns without panels
-ENTRIES = [SceneEntry("first"), SceneEntry("second")]
+NAMES = ["first", "second"]
 
 # Widgets that must change the image, and the settings that give some of them something to change.
 IMAGE_WIDGETS = (
     "joint", "deferred", "difference", "view 0", "view 1", "0##level", "1##level", "2##level", "3##level",
     "min. opacity", "ray", "ewa", "radial", "z", "angular", "3dgs", "black", "grey", "white", "field of view",
     "off##stereo", "pair##stereo", "red/cyan##stereo",
-    "Panorama 2", "##flight", "nearest photograph",
+    "Panorama 2", "##flight", "photograph", "error", "color", "depth", "opacity", "normals", "levels", "views", "count",
+    "ellipsoids",
 )  # fmt: skip
 INITIAL_SETTINGS = {
     **{label: {"mode": "joint"} for label in ("deferred", "difference", "view 0", "view 1")},
@@ -44,12 +58,13 @@ INITIAL_SETTINGS = {
     "angular": {"lowpass": "3dgs"},
     "off##stereo": {"stereo": "anaglyph"},
     "black": {"background": (1.0, 1.0, 1.0)},
+    "color": {"display": "depth"},
 }
 # Widgets whose effect has its own test.
 OTHER_WIDGETS = {
     "Scene", "pair", "path", "Open", "Gaussians", "Drawing", "background", "coarser while moving", "Camera",
-    "fly", "orbit", "Reset", "speed", "Panorama 1", "Fly", "Photograph", "split", "Screenshot", "PNG",
-    "EXR + depth", "360 PNG", "Camera path",
+    "fly", "orbit", "Reset", "speed", "Panorama 1", "Fly", "Display", "Compare", "off", "pinned", "Pin this image",
+    "Screenshot", "PNG", "EXR + depth", "360 PNG", "Camera path", "Window", "Reload",
 }  # fmt: skip
 
 
@@ -141,7 +156,7 @@ class User:
         self.draw_frames(1)
         left, top, right, bottom = self.panels.items[label]
         x = (left + right) / 2
-        if "opacity" in label or label in ("field of view", "split"):  # the label is right of the slider
+        if "opacity" in label or label == "field of view":  # the label is right of the slider
             x = left + 0.4 * (right - left)
         elif right - left > 60 and label not in ("path", "pair", "##flight"):
             x = left + 10
@@ -191,16 +206,24 @@ def make_sphere_scene(entry: SceneEntry, photos: np.ndarray) -> LoadedScene:
         views=torch.zeros(count, dtype=torch.int64),
     )
     scene = Scene(gaussians, pose[None], 0.45, 10.0, ("a.png",), "synthetic", 128)
-    mask = torch.ones(1, *image.shape[1:], dtype=torch.bool)
-    return LoadedScene(entry, scene, Views(image[None], pose[None], mask, 0.45, 10.0, ("a.png",)))
+    (panorama, *_) = entry.pair.context
+    entry = replace(entry, pair=replace(entry.pair, context=(replace(panorama, cam2world=pose),)))
+    return LoadedScene(entry, scene)
+
+
+@pytest.fixture(scope="module")
+def pair(axis_photos, small_scene, tmp_path_factory) -> Pair:
+    """The two photographs at the cameras of the small scene."""
+    folder = tmp_path_factory.mktemp("pair")
+    panoramas = []
+    for name, image, pose in zip(small_scene.names, axis_photos, small_scene.cam2world, strict=True):
+        write_image(folder / name, image)
+        panoramas.append(Panorama(name, folder / name, pose))
+    return Pair("pair", folder, tuple(panoramas), (), 0.45, 10.0)
 
 
 @pytest.fixture(scope="module", params=["gl", "cpu"])
-def session(request, gl_context, small_scene, axis_photos, load_house, tmp_path_factory) -> Iterator[User]:
-    images = torch.from_numpy(axis_photos).permute(0, 3, 1, 2)
-    mask = torch.ones(2, 128, 256, dtype=torch.bool)
-    photos = Views(images, small_scene.cam2world, mask, 0.45, 10.0, small_scene.names)
-
+def session(request, gl_context, small_scene, pair, axis_photos, load_house, tmp_path_factory) -> Iterator[User]:
     def load(entry, progress, show):
         if entry.tour is not None:
             return load_house(entry)
@@ -208,9 +231,9 @@ def session(request, gl_context, small_scene, axis_photos, load_house, tmp_path_
             return make_sphere_scene(entry, axis_photos)
         if entry.name == "damaged":
             raise InputError("damaged.ply: 100% unreadable; export it again")
-        return LoadedScene(entry, small_scene, None if entry.name == "no photographs" else photos)
+        return LoadedScene(entry, small_scene)
 
-    def find(path: Path) -> list[SceneEntry]:
+    def find(path: Path, progress: Progress) -> list[SceneEntry]:
         if path.name == "nothing":
             raise InputError(f"{path}: no such file or folder")
         return [SceneEntry("opened")]
@@ -224,7 +247,9 @@ def session(request, gl_context, small_scene, axis_photos, load_house, tmp_path_
         )
         imgui.get_io().display_size = SIZE
         user = User(viewer, target, clock)
-        user.show(*ENTRIES)
+        user.entries = [SceneEntry(name, pair=pair) for name in NAMES]
+        user.show(*user.entries)
+        user.click("Drawing")
     yield user
     with gl_context:
         viewer.close()
@@ -233,10 +258,10 @@ def session(request, gl_context, small_scene, axis_photos, load_house, tmp_path_
 @pytest.fixture
 def user(session, ctx) -> User:
     """The session with scene, state and camera as at the start."""
-    if session.data.entries != [entry.name for entry in ENTRIES] or session.data.current != 0:
-        session.show(*ENTRIES)
+    if session.data.entries != NAMES or session.data.current != 0:
+        session.show(*session.entries)
     state, start = session.state, ViewerState()
-    kept = ("camera", "home", "context", "num_views", "levels", "adaptive", "message", "message_until")
+    kept = ("camera", "home", "context", "num_views", "levels", "depth_max", "adaptive", "message", "message_until")
     for name in (field.name for field in fields(ViewerState) if field.name not in kept):
         setattr(state, name, getattr(start, name))
     state.camera, state.adaptive, state.message = state.home, True, ""
@@ -265,7 +290,7 @@ def test_clicking_the_widget_changes_the_image(user, label):
     assert changed_fraction(before, user.read_image()) > 0.001
 
 
-@pytest.mark.parametrize("label", ["0##level", "nearest photograph"])
+@pytest.mark.parametrize("label", ["0##level"])
 def test_clicking_a_check_box_twice_restores_the_image(user, label):
     before = user.read_image()
     user.click(label)
@@ -415,7 +440,7 @@ def test_the_list_of_scenes_loads_the_other_pair(user):
 def test_errors_are_shown_and_keep_the_scene(user):
     before = user.read_image()
     user.viewer.open(Path("nothing"))
-    user.draw_frames(2)
+    user.settle()
     assert "no such file" in user.data.error
     assert changed_fraction(before, user.read_image()) > 0.02, "the message is on the screen"
     user.click("OK")
@@ -427,9 +452,9 @@ def test_errors_are_shown_and_keep_the_scene(user):
 
 def test_the_photograph_is_shown_in_the_viewing_direction(user):
     state = user.state
-    state.photo, state.split = True, 0.0
+    state.comparison, state.split = "photograph", 0.0
     state.settings = replace(state.settings, levels=frozenset())  # saves time: the photograph covers the rendering
-    state.camera = replace(state.home, yaw_radians=np.pi / 2, vertical_fov_degrees=30)
+    state.camera = replace(state.home, yaw_radians=np.pi / 2, vertical_fov_degrees=40)
     image = user.read_image()
     red, green, blue = image[180:200].mean((0, 1)) / 255
     assert red > 0.95 and 0.4 < green < 0.6 and 0.4 < blue < 0.6, "right is red"
@@ -443,35 +468,137 @@ def test_the_photograph_is_shown_in_the_viewing_direction(user):
 
 
 @pytest.mark.slow
-def test_rendering_at_an_input_camera_looks_like_its_photograph(user):
-    user.show(SceneEntry("sphere"))
+def test_rendering_at_an_input_camera_looks_like_its_photograph(user, pair):
+    user.show(SceneEntry("sphere", pair=pair))
     state = user.state
     for yaw, pitch in ((0.0, 0.0), (2.0, 0.5), (-2.0, -0.9)):
         state.camera = replace(state.home, yaw_radians=yaw, pitch_radians=pitch)
-        state.photo = False
+        state.comparison = "off"
         rendered = user.read_image()
-        state.photo, state.split = True, 0.0
+        state.comparison, state.split = "photograph", 0.0
         photograph = user.read_image()
         assert np.abs(rendered - photograph).mean() < 4
         assert np.abs(rendered - photograph[:, ::-1]).mean() > 8, "not mirrored"
         assert np.abs(rendered - photograph[::-1]).mean() > 8, "not upside down"
 
 
-def test_the_rendering_is_left_of_the_split(user):
-    rendered = user.read_image()
-    user.click("nearest photograph")
-    user.state.split = 0.75
-    compared = user.read_image()
-    column = int(0.75 * SIZE[0]) - IMAGE[1].start
+def assert_split(rendered: np.ndarray, compared: np.ndarray, split: float, right: float = 0.5) -> None:
+    """Asserts that both are equal left of the divider, and differ in a fraction `right` of the pixels right of it."""
+    column = round(split * SIZE[0]) - IMAGE[1].start
     assert changed_fraction(rendered[:, : column - 2], compared[:, : column - 2]) == 0
-    assert changed_fraction(rendered[:, column + 2 :], compared[:, column + 2 :]) > 0.9
-    user.click("split")
-    assert user.state.split < 0.75
+    assert changed_fraction(rendered[:, column + 2 :], compared[:, column + 2 :]) > right
 
 
-def test_a_scene_without_photographs_has_no_comparison(user):
+def test_a_drag_moves_the_divider_between_rendering_and_photograph(user):
+    rendered, camera = user.read_image(), user.state.camera
+    user.click("photograph")
+    user.state.split = 0.75
+    assert_split(rendered, user.read_image(), 0.75, right=0.9)
+    user.drag((0.75 * SIZE[0], 300), (0.75 * SIZE[0] + 60, 300))
+    assert user.state.split == pytest.approx(0.75 + 60 / SIZE[0]) and user.state.camera == camera
+    assert_split(rendered, user.read_image(), user.state.split, right=0.9)
+    user.press(imgui.Key.c)
+    assert user.state.comparison == "off" and changed_fraction(rendered, user.read_image()) == 0
+
+
+@once
+def test_the_error_is_the_mapped_difference_from_the_photograph(user):
+    state = user.state
+    state.split, state.comparison = 0.0, "off"
+    rendered = user.read_image()
+    state.comparison = "photograph"
+    photograph = user.read_image()
+    state.comparison, state.max_error = "error", 0.4
+    expected = map_values(np.abs(rendered - photograph).mean(axis=2) / 255, 0.4, ERROR_MAP)
+    assert (np.abs(user.read_image() - expected).max(axis=2) <= 12).mean() > 0.98, "up to the steps of 8 bits"
+    state.max_error = 0.1
+    assert user.read_image().mean() > expected.mean() + 5, "a smaller range is brighter"
+
+
+def test_a_pinned_image_keeps_its_settings_and_scene_beside_others(user):
+    rendered = user.read_image()
+    user.press(imgui.Key.x)
+    assert user.state.comparison == "pinned" and user.data.right_name == "first, joint, color"
+    user.state.split, user.state.message = 0.8, ""
+    user.click("view 0")
+    compared = user.read_image()
+    column = round(0.8 * SIZE[0]) - IMAGE[1].start
+    assert changed_fraction(rendered[:, : column - 2], compared[:, : column - 2]) > 0.2
+    assert changed_fraction(rendered[:, column + 2 :], compared[:, column + 2 :]) == 0
+    user.show(SceneEntry("sphere", pair=user.entries[0].pair), SceneEntry("other"))
+    assert user.data.right_name == "first, joint, color"
+    user.click("Pin this image")
+    assert user.data.right_name == "sphere, view, color"
+
+
+@once
+def test_a_chosen_photograph_is_compared_from_its_own_camera(user):
+    user.state.comparison, user.state.photograph = "photograph", 1
+    user.draw_frames(2)
+    assert user.data.right_name == "b.png" and user.data.photograph_distance == pytest.approx(0.5)
+    user.click("Go")
+    assert user.state.camera.position == pytest.approx((0, 0, 0.5)) and user.state.camera.yaw_radians == 0
+    assert user.data.photograph_distance == pytest.approx(0)
+    user.click("photographs")
+    left, _, _, bottom = user.panels.items["photographs"]
+    user.click_at(left + 20, bottom + 12)
+    assert user.state.photograph is None, "the nearest one"
+
+
+@once
+def test_a_photograph_that_cannot_be_read_is_an_error_and_keeps_the_image(user, pair, tmp_path):
+    broken = replace(pair.context[0], image=tmp_path / "gone.png")
+    user.show(SceneEntry("broken", pair=replace(pair, context=(broken, pair.context[1]))))
+    before = user.read_image()
+    user.click("photograph")
+    user.settle()
+    assert "gone.png" in user.data.error
+    user.click("OK")
+    assert changed_fraction(before, user.read_image()) == 0
+
+
+def test_the_range_of_a_display_is_shown_and_can_be_changed(user):
+    user.click("depth")
+    assert 2 < user.state.settings.display_max < 6, "most Gaussians are nearer"
+    near = user.read_image()
+    left, top, right, bottom = user.panels.items["range"]
+    user.drag((left + 0.3 * (right - left), (top + bottom) / 2), (left + 0.5 * (right - left), (top + bottom) / 2))
+    assert user.state.settings.display_max > 6
+    assert changed_fraction(near, user.read_image()) > 0.5
+
+
+@once
+def test_a_photograph_is_shown_while_the_first_scene_is_predicted(user, pair, small_scene, monkeypatch):
+    viewer, go = user.viewer, threading.Event()
+
+    def predict(entry, progress, show):
+        progress("matching", 0.5)
+        assert go.wait(20)
+        return LoadedScene(entry, small_scene)
+
+    monkeypatch.setattr(viewer.loader, "_load", predict)
+    viewer._loaded, user.state.context = None, np.zeros((0, 4, 4))
+    viewer.show([SceneEntry("kitchen", pair=pair)], 0)
+    while viewer.loader.progress != ("kitchen", "matching", 0.5) or not viewer._comparer.photographs._textures:
+        user.draw_frames(1, 0.01)
+    user.draw_frames(1)
+    ahead = user.read_screen()
+    assert ahead.mean() > 60 and user.data.loading == ("kitchen", "matching", 0.5)
+    user.drag((500, 400), (380, 400))
+    turned, camera = user.read_screen(), user.state.camera
+    assert camera.yaw_radians > 0.1 and turned[..., 0].mean() > ahead[..., 0].mean() + 8, "more of the red right"
+    go.set()
+    user.settle()
+    assert user.state.camera == replace(camera, distance=user.state.camera.distance), "the view is kept"
+    user.state.comparison, user.state.split = "photograph", 0.0
+    assert np.abs(user.read_image() - turned).mean() < 1, "it was the photograph"
+
+
+def test_a_scene_without_photographs_has_no_comparison_with_one(user):
     user.show(SceneEntry("no photographs"))
-    assert "nearest photograph" not in user.panels.items
+    before = user.read_image()
+    user.click("photograph")
+    assert user.state.comparison == "off", "it is disabled"
     before = user.read_image()
     user.press(imgui.Key.c)
     assert changed_fraction(before, user.read_image()) == 0
@@ -604,6 +731,147 @@ def test_a_cancelled_refinement_keeps_the_prediction(user, small_scene, monkeypa
     assert user.data.refinement is None and user.data.error is None
 
 
+# --- window, memory and files ---
+
+
+@once
+def test_a_search_and_a_prediction_can_be_cancelled(user, monkeypatch):
+    before, ended = user.read_image(), []
+
+    def wait(progress) -> None:
+        try:
+            while True:
+                progress("estimating poses", 0.3)
+                time.sleep(0.002)
+        finally:
+            ended.append(1)
+
+    monkeypatch.setattr(user.viewer, "_find", lambda path, progress: wait(progress))
+    user.viewer.open(Path("unposed"))
+    user.draw_frames(3, 0.01)
+    assert user.data.loading == ("unposed", "estimating poses", 0.3)
+    user.click("Cancel##loading")
+    assert user.data.loading is None and user.data.current == 0, "the scene is still the current one"
+    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: wait(progress))
+    user.click("Reload")
+    user.click("Cancel##loading")
+    user.settle()
+    assert user.data.loading is None and user.data.error is None
+    while len(ended) < 2:
+        time.sleep(0.005)
+    user.state.message = ""
+    assert changed_fraction(before, user.read_image()) == 0
+
+
+@once
+def test_a_scene_beyond_the_memory_is_offered_with_its_largest_gaussians(user, small_scene, monkeypatch):
+    before, renderer = user.read_image(), user.viewer.renderer
+    upload = type(renderer).upload
+
+    def refuse(self, scene):
+        if len(scene.gaussians) > 400:
+            raise MemoryError("too many")
+        upload(self, scene)
+
+    monkeypatch.setattr(type(renderer), "upload", refuse)
+    user.show(SceneEntry("large"))
+    assert "the memory is exhausted" in user.data.error and user.data.reduced == len(small_scene.gaussians) // 4
+    user.click("OK")
+    assert changed_fraction(before, user.read_image()) == 0, "the scene before is kept"
+    user.show(SceneEntry("large again"))
+    user.click("Reduce")
+    after = user.read_image()
+    assert user.data.error is None and len(user.viewer._slot.scene.gaussians) == 300
+    assert changed_fraction(before, after) > 0.02
+    assert np.abs(before - after).mean() < 20, "the large Gaussians make the picture"
+
+
+@once
+def test_memory_that_ends_while_drawing_is_an_error_and_drawing_goes_on(user, monkeypatch):
+    before, renderer = user.read_image(), user.viewer.renderer
+    with monkeypatch.context() as patch:
+        patch.setattr(renderer, "render", lambda *_, **__: (_ for _ in ()).throw(MemoryError("no memory")))
+        user.state.camera = replace(user.state.camera, yaw_radians=0.5)
+        user.draw_frames(3)
+        assert "the memory is exhausted" in user.data.error
+    user.state.camera = user.state.home
+    user.click("OK")
+    assert changed_fraction(before, user.read_image()) == 0
+
+
+@once
+def test_a_changed_file_is_announced_and_read_again(user, room):
+    user.show(SceneEntry("room", file=room))
+    user.draw_frames(1, 3.0)
+    assert not user.data.changed
+    room.write_bytes(room.read_bytes() + b"0")
+    user.draw_frames(2, 3.0)
+    assert user.data.changed
+    user.click("Reload")
+    user.settle()
+    assert not user.data.changed
+    room.unlink()
+    user.draw_frames(2, 3.0)
+    assert user.data.changed, "a missing file has changed, too"
+
+
+@once
+def test_a_corrupt_scene_is_an_error_and_keeps_the_one_before(user, room, monkeypatch):
+    before = user.read_image()
+    room.write_bytes(room.read_bytes()[:2000])
+    options = LoadOptions()
+    monkeypatch.setattr(user.viewer, "_find", lambda path, progress: find_entries(path, options, progress))
+    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, *rest: load_entry(entry, options, *rest))
+    user.viewer.open(room)
+    user.settle()
+    assert "room.ply" in user.data.error
+    user.click("OK")
+    assert changed_fraction(before, user.read_image()) == 0
+
+
+@once
+def test_theme_and_scale_change_the_panels(user):
+    user.click("Window")
+    user.draw_frames(2)
+    panel = (slice(0, None), slice(0, 280))
+
+    def read_panel() -> np.ndarray:
+        user.draw_frames(3)
+        pixels = np.frombuffer(user.target.read(components=3), np.uint8).reshape(SIZE[1], SIZE[0], 3)
+        return pixels[::-1][panel].astype(int)
+
+    dark, height = read_panel(), user.panels.items["joint"][3] - user.panels.items["joint"][1]
+    user.click("light")
+    assert read_panel().mean() > dark.mean() + 80
+    user.click("dark")
+    assert np.abs(read_panel() - dark).mean() < 2
+    user.viewer.gui.set_scale(1.5)
+    user.draw_frames(3)
+    _, top, _, bottom = user.panels.items["joint"]
+    assert bottom - top == pytest.approx(1.5 * height, abs=2)
+    user.viewer.gui.set_scale(1.0)
+    user.draw_frames(3)
+    user.click("Window")
+
+
+@once
+def test_a_gamepad_flies_and_looks(user):
+    io = imgui.get_io()
+    for key, field in (("gamepad_l_stick_up", "position"), ("gamepad_r_stick_right", "yaw_radians")):
+        before = getattr(user.state.camera, field)
+        io.add_key_analog_event(getattr(imgui.Key, key), True, 0.8)
+        user.draw_frames(3)
+        io.add_key_analog_event(getattr(imgui.Key, key), False, 0.0)
+        user.draw_frames(1)
+        moved = getattr(user.state.camera, field)
+        assert moved != before
+        user.draw_frames(2)
+        assert getattr(user.state.camera, field) == moved
+    assert user.state.camera.position[2] > 0 and user.state.camera.yaw_radians > 0
+    user.press(imgui.Key.gamepad_face_right)
+    assert user.state.camera == user.state.home
+
+
 # --- tours ---
 
 
@@ -725,9 +993,9 @@ def test_space_plays_the_tour_through_all_panoramas_within_the_memory(tour_user)
 def test_the_nearest_photograph_of_a_tour_is_shown(tour_user):
     user = tour_user
     before = user.read_image()
-    user.click("nearest photograph")
+    user.click("photograph")
     assert changed_fraction(before, user.read_image()) > 0.3
-    assert user.data.photo_name == "room0"
+    assert user.data.right_name == "room0"
 
 
 # --- camera paths ---

@@ -216,12 +216,9 @@ def rasterize_plane(
         return None
     workspace = saved_in or Workspace()
     with statistics.timed("bound"):
-        records, boxes = _find_footprints(view, plane, workspace)
-    distances = projected.radii
-    if view.options.order == "z" and not plane.is_panorama:
-        with statistics.timed("sort"):
-            axis = plane.rotation[:, 2].numpy().copy()
-            distances = compute_depths(projected.records, projected.radii, axis, workspace, threads)
+        records, boxes = find_footprints(view, plane, workspace)
+    with statistics.timed("sort"):
+        distances = find_distances(view, plane, workspace)
     tables, state = tabulate_pixels(plane, exact=view.is_exact), _PlaneState(records, boxes, distances)
     bands = intersect_tiles(boxes, plane.size, slots=needs_grad, threads=threads, limit=tiling.MAX_INTERSECTIONS)
     while True:
@@ -247,7 +244,16 @@ def rasterize_plane(
     return state if needs_grad else None
 
 
-def _find_footprints(view: CameraView, plane: ImagePlane, workspace: Workspace) -> tuple[np.ndarray, np.ndarray]:
+def find_distances(view: CameraView, plane: ImagePlane, workspace: Workspace) -> np.ndarray:
+    """The distances that order the Gaussians on an image plane, metres: radial, or depths along its axis."""
+    projected = view.projected
+    if view.options.order != "z" or plane.is_panorama:
+        return projected.radii
+    axis = plane.rotation[:, 2].numpy().copy()
+    return compute_depths(projected.records, projected.radii, axis, workspace, view.threads)
+
+
+def find_footprints(view: CameraView, plane: ImagePlane, workspace: Workspace) -> tuple[np.ndarray, np.ndarray]:
     """Records and boxes on an image plane."""
     if view.is_exact:
         records = view.projected.records

@@ -17,8 +17,17 @@ import torch
 from jaxtyping import Float, Int, UInt32
 
 from pansplat.geometry.cubemap import face_rotations
-from pansplat.rendering.cpu.backend import CameraView, Statistics, make_camera, rasterize_plane
+from pansplat.rendering.cpu.backend import (
+    CameraView,
+    Statistics,
+    find_distances,
+    find_footprints,
+    make_camera,
+    rasterize_plane,
+)
+from pansplat.rendering.cpu.footprints import Footprint, draw_footprints
 from pansplat.rendering.cpu.projection import GaussianArrays, ProjectedGaussians, project_gaussians
+from pansplat.rendering.cpu.records import tabulate_pixels
 from pansplat.rendering.cpu.runtime import (
     Workspace,
     announce_compilation,
@@ -29,6 +38,7 @@ from pansplat.rendering.cpu.runtime import (
     thread_count,
 )
 from pansplat.rendering.cpu.simd import load_scalar, prefetch, store_scalar
+from pansplat.rendering.cpu.tiling import EMPTY_BOX
 from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.rasterize import RasterOptions
 
@@ -106,6 +116,26 @@ class DisplayScene:
     def __len__(self) -> int:
         return len(self._rows)
 
+    @property
+    def means(self) -> Float[np.ndarray, "n 3"]:
+        """The centres."""
+        return self._rows[:, 0:3]
+
+    @property
+    def quats(self) -> Float[np.ndarray, "n 4"]:
+        """The rotations, wxyz."""
+        return self._rows[:, 4:8]
+
+    @property
+    def scales(self) -> Float[np.ndarray, "n 3"]:
+        """The standard deviations."""
+        return self._rows[:, 8:11]
+
+    def with_colors(self, colors: Float[np.ndarray, "n 3"]) -> "DisplayScene":
+        """The same Gaussians with colours that do not depend on the direction."""
+        harmonics = ((colors - 0.5) * (2 * math.sqrt(math.pi)))[:, None]
+        return DisplayScene(self.means, self._rows[:, 3], self.quats, self.scales, harmonics, self._balls[4])
+
     def rasterize(
         self,
         position: Float[np.ndarray, "3"],
@@ -116,6 +146,7 @@ class DisplayScene:
         *,
         selection: Selection | None = None,
         min_transmittance: float = MIN_TRANSMITTANCE,
+        footprint: Footprint | None = None,
     ) -> Layers:
         """Rasterise the layers of an image plane.
 
@@ -127,6 +158,7 @@ class DisplayScene:
             options: of the image.
             selection: leaves out Gaussians that are not in view.
             min_transmittance: a pixel is finished at this transmittance or below.
+            footprint: drawn in place of blended Gaussians.
         """
         statistics, threads, workspace = Statistics(), thread_count(), Workspace()
         pose = torch.eye(4, dtype=torch.float64)
@@ -146,7 +178,10 @@ class DisplayScene:
                 layer = ProjectedGaussians(*(array[part] for array in projected[:4]), 0, 0)
                 arrays = GaussianArrays(*(array[part] for array in gaussians))
                 view = CameraView(arrays, camera, layer, options, threads, min_transmittance)
-                rasterize_plane(view, plane, layer_sums, statistics)
+                if footprint is None:
+                    rasterize_plane(view, plane, layer_sums, statistics)
+                else:
+                    _draw_plane(footprint, view, plane, layer_sums, statistics)
                 start = end
         return Layers(sums, ends[-1] if ends else 0, statistics)
 
@@ -187,6 +222,20 @@ class DisplayScene:
         parallel_for(partial(_copy_marked, edges, marks, positions, *rows, *outputs), parts, threads)
         no_covariances = np.empty((0, 3, 3), np.float32)
         return GaussianArrays(means, quats, scales, no_covariances, opacities, harmonics), ends.tolist()
+
+
+def _draw_plane(
+    footprint: Footprint, view: CameraView, plane: ImagePlane, sums: np.ndarray, statistics: Statistics
+) -> None:
+    """Draw footprints that are not blended."""
+    workspace, projected = Workspace(), view.projected
+    with statistics.timed("bound"):
+        records, boxes = find_footprints(view, plane, workspace)
+        distances = find_distances(view, plane, workspace)
+    with statistics.timed("rasterize"):
+        tables = tabulate_pixels(plane, exact=view.is_exact)
+        draw_footprints(footprint, records, projected.values, distances, boxes, tables, sums, view.threads)
+    statistics.visible += int(np.count_nonzero(boxes.view(np.int64) != EMPTY_BOX))
 
 
 @kernel

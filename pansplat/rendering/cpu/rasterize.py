@@ -94,7 +94,7 @@ def image_position(pixel, left, top):
 
 
 @inline_kernel_no_refcount
-def _pixel_point(kind, columns, rows, rotation, x, y):
+def pixel_point(kind, columns, rows, rotation, x, y):
     """The unit direction of pixel (x, y), or its centre for the EWA kernel."""
     if kind == EQUIRECT_RAYS:
         cosine = rows[y, 1]
@@ -135,7 +135,7 @@ def set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame):
         if corner >= 0:
             x, y = left + corner % 2 * (TILE_SIZE - 1), top + corner // 2 * (TILE_SIZE - 1)
         x, y = min(x, len(columns) - 1), min(y, len(rows) - 1)
-        d_x, d_y, d_z = _pixel_point(kind, columns, rows, rotation, x, y)
+        d_x, d_y, d_z = pixel_point(kind, columns, rows, rotation, x, y)
         if corner < 0:
             centre[0], centre[1], centre[2] = d_x, d_y, d_z
         elif kind != PIXEL_CENTRES:
@@ -164,7 +164,7 @@ def set_tile_pixels(kind, columns, rows, rotation, left, top, centre, frame, is_
     width, height = len(columns), len(rows)
     for pixel in range(TILE_PIXELS):
         x, y = image_position(pixel, left, top)
-        d_x, d_y, d_z = _pixel_point(kind, columns, rows, rotation, min(x, width - 1), min(y, height - 1))
+        d_x, d_y, d_z = pixel_point(kind, columns, rows, rotation, min(x, width - 1), min(y, height - 1))
         d_x, d_y, d_z = d_x - centre[0], d_y - centre[1], d_z - centre[2]
         ahead = frame[12] * d_x + frame[13] * d_y + frame[14] * d_z
         scale = 1.0 if is_3d else 1 / (1 + ahead)

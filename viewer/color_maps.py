@@ -1,0 +1,32 @@
+"""Colour maps of matplotlib as tables of 256 colours, for images of one number a pixel."""
+
+from __future__ import annotations
+
+import functools
+
+import moderngl
+import numpy as np
+from jaxtyping import Float, UInt8
+
+SIZE = 256
+
+
+@functools.cache
+def get_table(name: str) -> UInt8[np.ndarray, "256 3"]:
+    """The colours of one of matplotlib's maps, from low to high."""
+    from matplotlib import colormaps
+
+    return (colormaps[name]((np.arange(SIZE) + 0.5) / SIZE)[:, :3] * 255 + 0.5).astype(np.uint8)
+
+
+def create_table_texture(ctx: moderngl.Context, name: str) -> moderngl.Texture:
+    """A table as a texture of one row, for look-ups of the nearest colour."""
+    texture = ctx.texture((SIZE, 1), 3, get_table(name).tobytes(), alignment=1)
+    texture.filter, texture.repeat_x = (moderngl.NEAREST, moderngl.NEAREST), False
+    return texture
+
+
+def map_values(values: Float[np.ndarray, "*shape"], largest: float, name: str) -> UInt8[np.ndarray, "*shape 3"]:
+    """The colours of numbers from 0 to `largest`; others have the colour of the nearest end."""
+    index = np.clip(values * (SIZE / largest), 0, SIZE - 1).astype(np.int64)
+    return get_table(name)[index]

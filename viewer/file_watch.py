@@ -1,0 +1,43 @@
+"""Whether the files of a scene have changed on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+_SECONDS = 2.0  # between looks at the files
+
+
+class FileWatch:
+    """Compares the times and sizes of files with those at the start.
+
+    Attributes:
+        changed: whether a file was changed, removed or made at the last look.
+    """
+
+    def __init__(self) -> None:
+        """No file is watched."""
+        self.changed = False
+        self._files: tuple[Path, ...] = ()
+        self._stamps: list[tuple[int, int] | None] = []
+        self._last = -1e9
+
+    def start(self, files: Sequence[Path]) -> None:
+        """Watch these files from now on."""
+        self._files, self.changed = tuple(files), False
+        self._stamps = [_read_stamp(file) for file in self._files]
+
+    def look(self, now: float) -> None:
+        """Update `changed` at time `now` (seconds), if the last look was some seconds ago."""
+        if now - self._last >= _SECONDS:
+            self._last = now
+            self.changed = [_read_stamp(file) for file in self._files] != self._stamps
+
+
+def _read_stamp(file: Path) -> tuple[int, int] | None:
+    """Time of the last change and size of a file; None if it is missing."""
+    try:
+        status = file.stat()
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_size
