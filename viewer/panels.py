@@ -129,7 +129,8 @@ class Panels:
             _draw_stats(state, data)
         if data.right_name is not None:
             self._draw_divider(state)
-        _draw_legends(state)
+        if data.stats.total:
+            _draw_legends(state)
         if state.overlay and state.points:
             _draw_points(state)
         if state.overlay and data.tour is not None:
@@ -244,12 +245,13 @@ class Panels:
         recent = data.preferences.recent
         if recent:
             imgui.set_next_item_width(-60 * imgui.get_style().font_scale_dpi)
-            changed, index = imgui.combo("##recent", -1, list(recent))
+            if imgui.begin_combo("##recent", "recent"):
+                for path in recent:
+                    if imgui.selectable(path, False)[0]:
+                        commands.open = path
+                imgui.end_combo()
             self._record_rectangle("recent")
-            if changed:
-                commands.open = recent[index]
             imgui.same_line()
-            imgui.text_disabled("recent")
         if data.entries and self._button("Reload"):
             commands.reload = True
         if data.changed:
@@ -550,7 +552,7 @@ def _draw_points(state: ViewerState) -> None:
         distance = f"{math.dist(state.points[0].position, state.points[1].position):.3f} m"
         lines.append(f"{distance} from the point before")
         if pixels[0] is not None and pixels[1] is not None:
-            middle = ((pixels[0][0] + pixels[1][0]) / 2, (pixels[0][1] + pixels[1][1]) / 2)
+            middle = ((pixels[0][0] + pixels[1][0]) / 2 + 8, (pixels[0][1] + pixels[1][1]) / 2 - 22)
             _draw_outlined(canvas, middle, color, distance)
     imgui.set_next_window_pos((size.x - _MARGIN, size.y - _MARGIN), 0, (1.0, 1.0))
     _draw_label("##point", lines, alpha=0.6)

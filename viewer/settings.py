@@ -114,6 +114,8 @@ class DrawSettings:
                 "omni-directional stereo needs layout equirect, kernel ray and no face_size, got "
                 f"{self.layout}, {self.kernel} and {self.face_size}"
             )
+        if self.eye_offset and self.footprint != "gaussian":
+            raise InputError(f"display {self.display} has no omni-directional stereo; use another display")
         if not abs(self.eye_offset) < math.inf:
             raise InputError(f"`eye_offset` must be a distance in metres, got {self.eye_offset}")
         if self.face_size is not None and self.face_size < 1:

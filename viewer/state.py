@@ -16,7 +16,7 @@ from pansplat_viewer.picking import PickedPoint
 from pansplat_viewer.settings import Comparison, Display, DrawSettings, Projection
 
 FLIGHT_SECONDS = 6.0
-COUNT_MAX = 100.0  # Gaussians per pixel with the last colour, by default
+COUNT_MAX = 300.0  # Gaussians per pixel with the last colour, by default
 KEY_SECONDS = 2.0  # between key frames that are added one after the other
 NEAR_OF_FAR = 0.03  # of a tour: Gaussians within this fraction of far are not drawn, because ways pass door frames
 _FLIGHT_STEPS = 24  # for the `,` and `.` keys

@@ -10,13 +10,10 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from PIL import Image
-
-from pansplat_viewer.window import Window, _run_loop
 
 pytestmark = [pytest.mark.gl, pytest.mark.slow]
 
@@ -126,16 +123,6 @@ def test_mouse_and_keys_move_the_camera_and_escape_closes_the_window(display, ro
         output, errors = viewer.communicate(timeout=30)
         assert viewer.returncode == 0, errors
         assert errors == "" and output == ""
-
-
-def test_a_dropped_path_is_opened():
-    window = Mock(spec=Window, ctx=Mock(), closing=False, framebuffer_size=(64, 32), dropped=[])
-    Window._drop(window, None, ["/somewhere/a pair"])
-    viewer = Mock(moving=True, state=Mock(quit=False), panel_data=Mock(current=-1))
-    viewer.frame.side_effect = lambda *_: setattr(viewer.state, "quit", True)
-    _run_loop(window, viewer)
-    viewer.open.assert_called_once_with(Path("/somewhere/a pair"))
-    assert window.dropped == []
 
 
 def test_an_interrupt_ends_with_status_130(display, room, wait_until):
