@@ -8,7 +8,7 @@ Source: B. Triggs et al., Bundle adjustment - a modern synthesis, 1999.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -17,6 +17,7 @@ from numpy import ndarray as Array
 from pansplat.poses.solvers import rotation_exp, skew
 
 _STEPS = 30
+_DISTANCE_NOISE = 0.015  # of a known distance, relative
 _LARGEST_DAMPING = 1e8
 _CONVERGED = 1e-6  # relative decrease of the cost
 
@@ -32,6 +33,7 @@ class Problem:
         bearings: observed unit directions in the camera's frame.
         axes: for each camera the down direction in its frame; NaN where it is unknown.
         down: in the world.
+        pairs, distances: cameras whose distance is known independently of the points.
     """
 
     rotations: Float[Array, "camera 3 3"]
@@ -42,6 +44,8 @@ class Problem:
     bearings: Float[Array, "observation 3"]
     axes: Float[Array, "camera 3"]
     down: Float[Array, "3"]
+    pairs: Int[Array, "pair 2"] = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    distances: Float[Array, "pair"] = field(default_factory=lambda: np.empty(0))
 
     def select(self, kept: Bool[Array, "observation"]) -> Problem:
         """The problem with some observations only, and without points that fewer than two observe."""
@@ -115,8 +119,14 @@ def _evaluate(problem: Problem, noise: float, axis_noise: float) -> tuple[float,
     cost = float(2 * np.log1p(squared / 4).sum() * 2)
     weight = np.where(behind, 0.0, 1 / (1 + squared / 4))
     tilt = _tilts(problem) / axis_noise
-    cost += float((tilt**2).sum())
+    cost += float((tilt**2).sum()) + float((_stretches(problem) ** 2).sum())
     return cost, residual, weight, tangents, q
+
+
+def _stretches(problem: Problem) -> Float[Array, "pair"]:
+    """The distances of the cameras over the known ones, minus 1, in the noise's unit."""
+    first, second = problem.centres[problem.pairs].transpose(1, 0, 2)
+    return (np.linalg.norm(first - second, axis=1) / problem.distances - 1) / _DISTANCE_NOISE
 
 
 def _tilts(problem: Problem) -> Float[Array, "camera 3"]:
@@ -156,7 +166,10 @@ def adjust(problem: Problem, noise: float, axis_noise: float = 0.01, steps: int 
 
 
 def _normal_equations(problem: Problem, state: tuple, noise: float, axis_noise: float) -> tuple:
-    """Blocks of the normal equations: cameras (c 6 6), points (p 3 3), both (n 6 3), gradients, point bases (p 4 3)."""
+    """Blocks of the normal equations.
+
+    Cameras (c 6 6), points (p 3 3), both (n 6 3), gradients, point bases (p 4 3), known distances (c 3 c 3).
+    """
     _, residual, weight, tangents, q = state
     rotation = problem.rotations[problem.camera]
     x = problem.points[problem.point]
@@ -186,15 +199,24 @@ def _normal_equations(problem: Problem, state: tuple, noise: float, axis_noise: 
     jacobian /= axis_noise
     cameras[:, :3, :3] += jacobian.transpose(0, 2, 1) @ jacobian
     camera_gradient[:, :3] += np.einsum("nki,nk->ni", jacobian, _tilts(problem) / axis_noise)
-    return cameras, points, both, camera_gradient, point_gradient, bases
+    stretched = np.zeros((len(cameras), 3, len(cameras), 3))  # of the centres, by known distances
+    for (i, j), distance, value in zip(problem.pairs, problem.distances, _stretches(problem), strict=True):
+        offset = problem.centres[i] - problem.centres[j]
+        slope = offset / max(float(np.linalg.norm(offset)), 1e-12) / distance / _DISTANCE_NOISE
+        for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
+            stretched[a, :, b] += sign * np.outer(slope, slope)
+        camera_gradient[i, 3:] += slope * value
+        camera_gradient[j, 3:] -= slope * value
+    return cameras, points, both, camera_gradient, point_gradient, bases, stretched
 
 
 def _step(problem: Problem, equations: tuple, damping: float) -> Problem | None:
-    cameras, points, both, camera_gradient, point_gradient, bases = equations
+    cameras, points, both, camera_gradient, point_gradient, bases, stretched = equations
     count = len(cameras)
     cameras = cameras + damping * _diagonal(cameras)
     inverse = np.linalg.inv(points + damping * _diagonal(points))
     reduced = np.zeros((count, 6, count, 6))
+    reduced[:, 3:, :, 3:] += stretched
     for camera in range(count):
         reduced[camera, :, camera] += cameras[camera]
     weighted = both @ inverse[problem.point]

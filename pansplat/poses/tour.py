@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -28,6 +28,7 @@ _LARGEST_LOOP = math.radians(4)  # rotation around a triangle of right pairs
 _MIN_SHARED = 3  # points that determine the distance of a new panorama
 _MIN_PARALLAX = math.radians(1.0)  # of such a point
 _OUTLIER = 8.0  # residual of an observation that is left out, in the noise's standard deviation
+_FEW_JOINT = 40  # points with two other panoramas, below which the floor contributes to the distance of a panorama
 _FLOOR_PAIRS = 5  # whose floors give the height of the cameras in the tour's unit
 _ROUNDS = 3  # of adjustment and removal of outliers
 
@@ -82,6 +83,7 @@ def build_tour(
         )  # fmt: skip
     observations = _make_tracks(features, reliable)
     problem, placed = _grow(observations, reliable, downs, noise, floor_height)
+    problem = _add_distances(problem, placed, reliable, floor_height)
     for _ in range(_ROUNDS if len(placed) > 2 else 1):
         if len(placed) > 2:
             problem = adjust(problem, noise)
@@ -309,19 +311,46 @@ def _place_by_floor(
     relative = floor_height(pair)
     if relative is None:
         return None
-    position = {v: n for n, v in enumerate(placed)}
+    height = _measure_height(placed, problem, relations, floor_height)
+    if height is None:
+        return None
+    other = placed.index(pair[0] if pair[1] == view else pair[1])
+    world, direction = _turn_to(problem.rotations[other], relations[pair], pair[1] == view)
+    return world, problem.centres[other] + height / relative * direction
+
+
+def _measure_height(
+    placed: Sequence[int], problem: Problem, relations: Mapping[Pair, RelativePose], floor_height: FloorHeight
+) -> float | None:
+    """Height of the cameras over the floor in the tour's unit, by the best pairs; None without a floor."""
     heights: list[float] = []
     for i, j in sorted(relations, key=lambda p: -relations[p].score):
-        if i in position and j in position and len(heights) < _FLOOR_PAIRS:
+        if i in placed and j in placed and len(heights) < _FLOOR_PAIRS:
             height = floor_height((i, j))
             if height is not None:
-                distance = float(np.linalg.norm(problem.centres[position[i]] - problem.centres[position[j]]))
-                heights.append(height * distance)
-    if not heights:
-        return None
-    other = position[pair[0] if pair[1] == view else pair[1]]
-    world, direction = _turn_to(problem.rotations[other], relations[pair], pair[1] == view)
-    return world, problem.centres[other] + float(np.median(heights)) / relative * direction
+                ends = problem.centres[placed.index(i)], problem.centres[placed.index(j)]
+                heights.append(height * float(np.linalg.norm(ends[0] - ends[1])))
+    return float(np.median(heights)) if heights else None
+
+
+def _add_distances(
+    problem: Problem, placed: Sequence[int], relations: Mapping[Pair, RelativePose], floor_height: FloorHeight
+) -> Problem:
+    """The problem with distances by the floor for panoramas that few points connect to two others.
+
+    Matches of two panoramas determine the direction between them, and points that a third one sees the distance.
+    """
+    counts = np.bincount(problem.point)
+    joint = np.bincount(problem.camera[counts[problem.point] > 2], minlength=len(placed))
+    weak = {view for view, number in zip(placed, joint, strict=True) if number < _FEW_JOINT}
+    pairs = [pair for pair in relations if weak & set(pair) and set(pair) <= set(placed)]
+    height = _measure_height(placed, problem, relations, floor_height) if pairs and len(placed) > 2 else None
+    if height is None:
+        return problem
+    relative = {pair: floor_height(pair) for pair in pairs}
+    known = {pair: height / value for pair, value in relative.items() if value is not None}
+    numbers = np.array([[placed.index(view) for view in pair] for pair in known]).reshape(-1, 2)
+    return replace(problem, pairs=numbers, distances=np.array(list(known.values())))
 
 
 def _known_points(placed: Sequence[int], problem: Problem, observations: _Observations) -> dict[int, Float[Array, "3"]]:

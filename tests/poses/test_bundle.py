@@ -1,8 +1,10 @@
 """Bundle adjustment recovers cameras and points from disturbed ones."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from pansplat.poses.bundle import Problem, adjust, point_depths, residual_angles, triangulate
 from pansplat.poses.solvers import angle_between, rotation_angle, rotation_exp
@@ -68,3 +70,15 @@ def test_selected_observations_have_points_with_two_views() -> None:
     problem = _problem(0.0)
     kept = problem.select((problem.point % 2 == 0) | (problem.camera == 0))
     assert (np.bincount(kept.point) >= 2).all() and len(kept.points) == 40
+
+
+def test_a_known_distance_sets_the_scale() -> None:
+    truth = _problem(0.0)
+    distance = np.linalg.norm(truth.centres[0] - truth.centres[1])
+    wanted = 1.2 * distance
+    known = replace(_disturb(truth), pairs=np.array(((0, 1),)), distances=np.array((wanted,)))
+    found = adjust(known, noise=1e-3)
+    assert np.linalg.norm(found.centres[0] - found.centres[1]) == pytest.approx(wanted, rel=1e-4)
+    assert np.linalg.norm(found.centres[2] - found.centres[3]) == pytest.approx(
+        1.2 * np.linalg.norm(truth.centres[2] - truth.centres[3]), rel=1e-3
+    )

@@ -45,3 +45,11 @@ def test_matches_of_equal_places_count_once() -> None:
     twice = Features(np.tile(bearings, (2, 1)), descriptors, 0.01)
     matches = match_features(twice, twice)
     assert len(matches) == 20 and (np.diff(matches.ratio) >= 0).all()
+
+
+def test_matches_do_not_depend_on_the_order_of_the_panoramas(picture: Array) -> None:
+    first, second = detect_features(picture), detect_features(np.roll(picture, 40, axis=1))
+    there, back = match_features(first, second), match_features(second, first)
+    found = [set(map(tuple, m)) for m in (there.indices[:200], back.indices[:200, ::-1])]
+    assert len(found[0] & found[1]) > 195
+    assert np.allclose(there.ratio[:200], back.ratio[:200], atol=1e-3)

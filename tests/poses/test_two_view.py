@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from pansplat.poses.axes import NO_PRIOR, RotationPrior, SceneAxes
 from pansplat.poses.features import Features, Matches
 from pansplat.poses.solvers import angle_between, rotation_angle, rotation_exp
 from pansplat.poses.two_view import RelativePose, estimate_relative_pose, polish_pose, polish_relative_pose
@@ -13,7 +14,7 @@ PIXEL = 2 * math.pi / 2048
 NOISE = 0.3 * PIXEL
 
 
-def estimate(bearings, seed: int = 0) -> RelativePose:
+def estimate(bearings, seed: int = 0, axes: RotationPrior = NO_PRIOR, **options) -> RelativePose:
     """The pose of bearings whose outliers come last, with ratios that hardly reveal them."""
     count = len(bearings.first)
     rng = np.random.default_rng(seed)
@@ -21,7 +22,8 @@ def estimate(bearings, seed: int = 0) -> RelativePose:
     order = rng.permutation(count)  # outliers are spread over all ratios
     empty = np.zeros((count, 128), np.float32)
     first, second = (Features(x, empty, PIXEL) for x in (bearings.first, bearings.second))
-    return estimate_relative_pose(first, second, Matches(np.stack((order, order), axis=1), ratio), seed=seed)
+    matches = Matches(np.stack((order, order), axis=1), ratio)
+    return estimate_relative_pose(first, second, matches, axes, seed=seed, **options)
 
 
 def errors_degrees(found: RelativePose, bearings) -> tuple[float, float]:
@@ -84,6 +86,33 @@ def test_matches_of_one_object_are_refused(scene) -> None:
     first, second = bearings.first[near], bearings.second[near]
     found = estimate(type(bearings)(first, second, bearings.rotation, bearings.translation))
     assert not found.is_reliable
+
+
+def test_walls_and_floor_confirm_a_pose_of_few_matches(scene) -> None:
+    turn = np.array((0, math.pi / 2, 0))
+    bearings = scene(
+        10, 40, noise=NOISE, outliers=0.4, rotation=rotation_exp(turn), translation=np.array((0.8, 0.0, 0.6))
+    )
+    axes = SceneAxes(np.array(((0.0, 1, 0), (0, 0, 1), (1, 0, 0))), True, True)
+    reliable = [
+        estimate(bearings, axes=prior, agree_on_floor=lambda hypothesis, floor=floor: floor).is_reliable
+        for prior, floor in ((NO_PRIOR, False), (NO_PRIOR, True), (RotationPrior(axes, axes), True))
+    ]
+    assert reliable == [False, False, True]
+
+
+def test_the_floor_prefers_a_pose_among_equal_ones(scene) -> None:
+    both = [scene(seed, 60, noise=NOISE) for seed in (11, 12)]
+    mixed = type(both[0])(
+        *(np.concatenate([getattr(b, side) for b in both]) for side in ("first", "second")),
+        both[0].rotation,
+        both[0].translation,
+    )
+    for wanted in both:
+        found = estimate(
+            mixed, agree_on_floor=lambda h, wanted=wanted: bool(rotation_angle(h.rotation @ wanted.rotation.T) < 0.01)
+        )
+        assert rotation_angle(found.rotation @ wanted.rotation.T) < 0.01
 
 
 def test_too_few_matches_are_refused(scene) -> None:
