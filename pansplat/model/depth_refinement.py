@@ -15,6 +15,7 @@ import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -83,9 +84,10 @@ class DepthRefinement(nn.Module):
             PanoramaConv2d(48, config.matching_channels, 3, border="sphere"),
         )
         count = config.candidates
-        u = torch.linspace(-1, 1, count, dtype=torch.float64)
-        steps = config.reach * ((1 - config.concentration) * u + config.concentration * u * u.abs())
-        self.register_buffer("candidates", steps.float())
+        # On the meta device, arithmetic of torch tensors imports the compiler for a second.
+        u = np.linspace(-1, 1, count)
+        steps = config.reach * ((1 - config.concentration) * u + config.concentration * u * np.abs(u))
+        self.register_buffer("candidates", torch.from_numpy(steps).float())
         self.enter = _ConvNorm(3 * count + decoded + 1, fine, 1)
         self.fine = _ConvNorm(fine, fine, 3)
         self.to_middle = _ConvNorm(fine + CHANNELS[1], middle, 3)

@@ -8,23 +8,26 @@ contributions, for colours in [0, 1] and to first order in the weights.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 import torch
-from jaxtyping import Float, Integer
-from scipy.spatial import cKDTree
+from jaxtyping import Bool, Float, Integer
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import row_weights
+from pansplat.geometry.morton import morton_codes
 from pansplat.geometry.pose import interpolate_poses, nearest_views, quats_from_rotations
 from pansplat.rendering import rasterize
 
 DROP_ERROR = 5e-3  # largest mean absolute change of an image by all Gaussians that are dropped
 MAX_OTHERS = 3  # cameras of other views that a view is rasterised at
 _MAX_OPACITY = 0.99
-_LABEL_DISTANCE = 10.0  # between Gaussians of different views or levels; larger than any other distance
+_DIRECTION_BITS = 15  # of half a component of a direction, in the cells of a Z-order curve
+_SEARCHED = 8  # Gaussians before and after a Gaussian along the curve
 _BASE_COST = 0.002  # cost of a merger between equal Gaussians, as a difference of colours
 
 
@@ -73,23 +76,68 @@ def merge_to(scene: Scene, size: tuple[int, int], count: int) -> Scene:
     Args:
         size: height and width of the images that the contributions are measured in, pixels.
     """
-    gaussians, contributions = scene.gaussians, measure_contributions(scene, size)
+    contributions = measure_contributions(scene, size)
     cameras = scene.cam2world[:, :3, 3]
-    while (surplus := len(gaussians) - count) > 0:
-        first, second = _find_mutual_neighbours(gaussians, cameras)
+    parts = _Parts.of(scene.gaussians)
+    for seed in itertools.count():
+        if (surplus := len(contributions) - count) <= 0:
+            break
+        first, second = _find_mutual_neighbours(parts.gaussians, cameras, seed)
         if not len(first):
             best = contributions.argsort(descending=True, stable=True)[:count]
-            gaussians, contributions = gaussians.select(best), contributions[best]
+            parts = parts.select(best)
             break
-        chosen = _merge_cost(gaussians, contributions, first, second).argsort(stable=True)[:surplus]
+        chosen = _merge_cost(parts.gaussians, contributions, first, second).argsort(stable=True)[:surplus]
         first, second = first[chosen], second[chosen]
-        kept = torch.ones_like(contributions, dtype=torch.bool)
-        kept[first] = kept[second] = False
-        merged = _merge_pairs(gaussians.select(first), gaussians.select(second))
+        is_kept = torch.ones_like(contributions, dtype=torch.bool)
+        is_kept[first] = is_kept[second] = False
+        kept = is_kept.nonzero()[:, 0]
         contributions = torch.cat((contributions[kept], contributions[first] + contributions[second]))
-        gaussians = Gaussians.cat([gaussians.select(kept), merged])
+        parts = _Parts.cat(parts.select(kept), _merge_pairs(parts.select(first), parts.select(second)))
+    gaussians = parts.decompose()
     order = _labels(gaussians, len(cameras)).argsort(stable=True)
     return dataclasses.replace(scene, gaussians=gaussians.select(order))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Parts:
+    """Gaussians between two rounds of mergers.
+
+    Attributes:
+        gaussians: scales and rotations of merged ones are those of their first part.
+        covariances: of all, square metres.
+        is_merged: whether a Gaussian has more than one part.
+    """
+
+    gaussians: Gaussians
+    covariances: Float[Tensor, "n 3 3"]
+    is_merged: Bool[Tensor, "n"]
+
+    @classmethod
+    def of(cls, gaussians: Gaussians) -> _Parts:
+        covariances = gaussians.to(dtype=torch.float64).covariances
+        return cls(gaussians, covariances, torch.zeros_like(gaussians.opacities, dtype=torch.bool))
+
+    @classmethod
+    def cat(cls, first: _Parts, second: _Parts) -> _Parts:
+        return cls(
+            Gaussians.cat([first.gaussians, second.gaussians]),
+            torch.cat((first.covariances, second.covariances)),
+            torch.cat((first.is_merged, second.is_merged)),
+        )
+
+    def select(self, index: Integer[Tensor, "m"]) -> _Parts:
+        return _Parts(self.gaussians.select(index), self.covariances[index], self.is_merged[index])
+
+    def decompose(self) -> Gaussians:
+        """The Gaussians, with scales and rotations of the merged ones."""
+        merged = self.is_merged.nonzero()[:, 0]
+        values, axes = torch.linalg.eigh(self.covariances[merged])
+        axes[:, :, 0] *= torch.linalg.det(axes).sign()[:, None]
+        scales, quats = self.gaussians.scales.clone(), self.gaussians.quats.clone()
+        scales[merged] = values.clamp_min(0).sqrt().to(scales)
+        quats[merged] = quats_from_rotations(axes).to(quats)
+        return dataclasses.replace(self.gaussians, scales=scales, quats=quats)
 
 
 def _labels(gaussians: Gaussians, num_views: int) -> Integer[Tensor, "n"]:
@@ -98,22 +146,32 @@ def _labels(gaussians: Gaussians, num_views: int) -> Integer[Tensor, "n"]:
 
 
 def _find_mutual_neighbours(
-    gaussians: Gaussians, cameras: Float[Tensor, "view 3"]
+    gaussians: Gaussians, cameras: Float[Tensor, "view 3"], seed: int
 ) -> tuple[Integer[Tensor, "pair"], Integer[Tensor, "pair"]]:
-    """Pairs that are each other's nearest neighbour, by direction and logarithm of distance from their camera."""
+    """Pairs of one view and level that are each other's nearest neighbour, by direction and log-distance.
+
+    Neighbours are searched among the next Gaussians along a Z-order curve through the directions. The seed turns the
+    curve, so that those it separates meet along another one.
+    """
     offsets = gaussians.means.double() - cameras.double()[gaussians.views.long()]
     distances = offsets.norm(dim=1, keepdim=True).clamp_min(1e-9)
-    labels = _labels(gaussians, len(cameras))
-    features = torch.cat((offsets / distances, distances.log(), _LABEL_DISTANCE * labels[:, None]), dim=1).cpu().numpy()
-    if len(features) < 2:
-        return torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long)
-    _, found = cKDTree(features, balanced_tree=False, compact_nodes=False).query(features, k=2, workers=-1)
-    index = np.arange(len(features))
-    nearest = np.where(found[:, 0] == index, found[:, 1], found[:, 0])
-    is_pair = (nearest[nearest] == index) & (index < nearest)
-    first, second = (torch.from_numpy(indices[is_pair]).to(labels) for indices in (index, nearest))
-    same = labels[first] == labels[second]
-    return first[same], second[same]
+    labels = _labels(gaussians, len(cameras)).cpu().numpy()
+    features = torch.cat((offsets / distances, distances.log()), dim=1).cpu().numpy().astype(np.float32)
+    turn = Rotation.random(random_state=seed).as_matrix().astype(np.float32)
+    cells = np.clip((features[:, :3] @ turn + 1) * (1 << _DIRECTION_BITS), 0, (2 << _DIRECTION_BITS) - 1)
+    order = np.lexsort((morton_codes(cells.astype(np.int64)), labels))
+    features, labels = features[order], labels[order]
+    least, nearest = np.full(len(order), np.inf, np.float32), np.full(len(order), -1)
+    for step in range(1, min(_SEARCHED, len(order) - 1) + 1):
+        square = np.square(features[step:] - features[:-step]).sum(axis=1)
+        square[labels[step:] != labels[:-step]] = np.inf
+        for here, there in ((slice(None, -step), step), (slice(step, None), -step)):
+            index = np.flatnonzero(square < least[here]) + (here.start or 0)
+            least[index], nearest[index] = square[index - max(-there, 0)], index + there
+    index = np.arange(len(order))
+    is_pair = (nearest > index) & (nearest[nearest] == index)
+    first, second = (torch.from_numpy(order[found[is_pair]]) for found in (index, nearest))
+    return first.to(gaussians.means.device), second.to(gaussians.means.device)
 
 
 def _merge_cost(gaussians: Gaussians, contributions: Tensor, first: Tensor, second: Tensor) -> Float[Tensor, "pair"]:
@@ -125,35 +183,30 @@ def _merge_cost(gaussians: Gaussians, contributions: Tensor, first: Tensor, seco
     return shared * difference + (a + b) * _BASE_COST
 
 
-def _merge_pairs(first: Gaussians, second: Gaussians) -> Gaussians:
+def _merge_pairs(first: _Parts, second: _Parts) -> _Parts:
     """Gaussians with the mean, covariance and integral of opacity of each pair."""
-    masses = [part.opacities.double() * _area(part.scales) for part in (first, second)]
+    masses = [part.gaussians.opacities.double() * _area(part.covariances) for part in (first, second)]
     total = (masses[0] + masses[1]).clamp_min(1e-30)
     share = (masses[0] / total)[:, None]
 
     def average(a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
         return weight * a.double() + (1 - weight) * b.double()
 
-    means = average(first.means, second.means, share)
-    spread = (first.means.double() - second.means.double()) * (share * (1 - share)).sqrt()
-    covariances = average(
-        first.to(dtype=torch.float64).covariances, second.to(dtype=torch.float64).covariances, share[:, :, None]
+    a, b = first.gaussians, second.gaussians
+    spread = (a.means.double() - b.means.double()) * (share * (1 - share)).sqrt()
+    covariances = average(first.covariances, second.covariances, share[:, :, None])
+    covariances = covariances + spread[:, :, None] * spread[:, None, :]
+    merged = dataclasses.replace(
+        a,
+        means=average(a.means, b.means, share).float(),
+        opacities=(total / _area(covariances)).clamp_max(_MAX_OPACITY).float(),
+        harmonics=average(a.harmonics, b.harmonics, share[:, :, None]).float(),
     )
-    values, axes = torch.linalg.eigh(covariances + spread[:, :, None] * spread[:, None, :])
-    axes[:, :, 0] *= torch.linalg.det(axes).sign()[:, None]
-    scales = values.clamp_min(0).sqrt()
-    return Gaussians(
-        means=means.float(),
-        scales=scales.float(),
-        quats=quats_from_rotations(axes).float(),
-        opacities=(total / _area(scales)).clamp_max(_MAX_OPACITY).float(),
-        harmonics=average(first.harmonics, second.harmonics, share[:, :, None]).float(),
-        levels=first.levels,
-        views=first.views,
-    )
+    return _Parts(merged, covariances, torch.ones_like(first.is_merged))
 
 
-def _area(scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """Product of the two largest scales."""
-    ordered = scales.double().sort(dim=1).values
-    return (ordered[:, 1] * ordered[:, 2]).clamp_min(1e-30)
+def _area(covariances: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n"]:
+    """Product of the two scales of a flat Gaussian: the root of the sum of the principal minors of the covariance."""
+    x, y, z = covariances.diagonal(dim1=1, dim2=2).unbind(1)
+    xy, xz, yz = covariances[:, 0, 1], covariances[:, 0, 2], covariances[:, 1, 2]
+    return (x * y + x * z + y * z - xy * xy - xz * xz - yz * yz).clamp_min(1e-60).sqrt()

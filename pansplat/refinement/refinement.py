@@ -30,6 +30,7 @@ from pansplat.gaussians.scene import Gains, Gaussians, Scene
 from pansplat.geometry.pose import nearest_views
 from pansplat.geometry.world import scale_poses, working_factor
 from pansplat.predictor import Progress
+from pansplat.refinement.adam import ParameterGroup
 from pansplat.refinement.budget import DROP_ERROR, MAX_OTHERS, drop_unseen, merge_to
 from pansplat.refinement.objective import Photograph, image_difference
 from pansplat.refinement.parameters import CameraParameters, LearningRates, ViewParameters
@@ -40,7 +41,6 @@ _RATE_FLOOR = 0.05  # of the learning rates at the end
 _CHECK_EVERY = 10  # steps between checks of the held-out error
 _MIN_IMPROVEMENT = 0.002  # relative decrease of the held-out error below which it stagnates
 _PATIENCE = 3  # checks without a sufficient decrease
-_MIN_EPSILON = 1e-15  # of Adam
 _POSE_TOLERANCE = 1e-3  # between the entries of the poses of scene and photographs
 
 
@@ -150,7 +150,7 @@ class Refinement:
             for view in torch.unique(gaussians.views)
         }
         self._cameras = CameraParameters(scene.cam2world.to(device), correct_poses=self.config.poses)
-        self._optimizer = self._make_optimizer()
+        self._groups = self._group_parameters()
         self._steps = 0
         self._result: Scene | None = None
 
@@ -158,16 +158,14 @@ class Refinement:
         """Images (n, c, h, w) at the size of the comparison, by area average."""
         return images if images.shape[-2:] == self._size else functional.interpolate(images, self._size, mode="area")
 
-    def _make_optimizer(self) -> torch.optim.Adam:
+    def _group_parameters(self) -> list[ParameterGroup]:
         rates = dataclasses.asdict(self.config.rates)
-        groups = [{"params": [self._cameras.log_gains], "lr": rates["gain"]}]
+        groups = [ParameterGroup([self._cameras.log_gains], rates["gain"])]
         if self.config.poses:
-            groups.append({"params": [self._cameras.twists], "lr": rates["pose"]})
+            groups.append(ParameterGroup([self._cameras.twists], rates["pose"]))
         for name in ViewParameters.NAMES if self._views else ():
-            groups.append({"params": [view.tensors[name] for view in self._views.values()], "lr": rates[name]})
-        for group in groups:
-            group["initial_lr"] = group["lr"]
-        return torch.optim.Adam(groups, betas=self.config.betas, eps=_MIN_EPSILON, fused=True)
+            groups.append(ParameterGroup([view.tensors[name] for view in self._views.values()], rates[name]))
+        return groups
 
     def step(self, fraction: float) -> None:
         """Rasterise and compare each view once, and move the Gaussians.
@@ -176,9 +174,8 @@ class Refinement:
             fraction: of the run, in [0, 1]; sets the step sizes, and whether held-out blocks are fitted.
         """
         config = self.config
-        for group in self._optimizer.param_groups:
-            group["lr"] = group["initial_lr"] * _cosine_fall(fraction)
-        self._optimizer.zero_grad(set_to_none=True)
+        for group in self._groups:
+            group.clear_gradients()
         for view, parameters in self._views.items():
             target = self._choose_target(view)
             photograph = self._photographs[target]
@@ -192,20 +189,14 @@ class Refinement:
             (config.pose_hold * self._cameras.twists.square().sum()).backward()
         for parameters in self._views.values():
             parameters.clean_gradients()
-        if not self._steps:
-            self._set_damping()
-        self._optimizer.step()
+        pixels = self._images[0, 0].numel() / math.prod(self._size)
+        for group in self._groups:
+            if not self._steps:
+                group.set_damping(config.damping * pixels)
+            group.step(_cosine_fall(fraction), config.betas)
         for parameters in self._views.values():
             parameters.clamp()
         self._steps += 1
-
-    def _set_damping(self) -> None:
-        damping = self.config.damping * self._images[0, 0].numel() / math.prod(self._size)
-        for group in self._optimizer.param_groups:
-            gradients = [p.grad.flatten() for p in group["params"] if p.grad is not None]
-            if gradients:
-                scale = float(torch.cat(gradients).square().mean().sqrt())
-                group["eps"] = max(damping * scale, _MIN_EPSILON)
 
     def _choose_target(self, view: int) -> int:
         """The photograph that a view is compared with: its own in even steps, the others in turn in odd ones."""
@@ -320,8 +311,7 @@ class Refinement:
     def _release_parameters(self) -> None:
         """Free the parameters and the optimiser's state, which are gigabytes for millions of Gaussians."""
         self._views.clear()
-        self._optimizer.state.clear()
-        self._optimizer.param_groups.clear()
+        self._groups.clear()
 
     def _end_cost(self) -> float:
         """Approximate duration of the last error, the contributions and the fit of colours, in steps."""

@@ -74,6 +74,7 @@ def _fit_view(gaussians: Gaussians, image: Tensor, pose: Tensor, mask: Tensor, c
         if coverage is None:
             (total,) = torch.autograd.grad((drawn * mask).sum(), variable, retain_graph=True)
             coverage = (total / SH_0).clamp_min(_MIN_COVERAGE)
-        (product,) = torch.autograd.grad(drawn, variable, (image - drawn.detach()) * mask)
+        # Of a sum: torch.autograd.grad imports sympy for the gradient of an image.
+        (product,) = torch.autograd.grad((drawn * ((image - drawn.detach()) * mask)).sum(), variable)
         harmonics = harmonics + config.relaxation / SH_0**2 * product / coverage
     return harmonics

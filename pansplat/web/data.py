@@ -14,6 +14,7 @@ from jaxtyping import Float, UInt8
 
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians
+from pansplat.geometry.morton import morton_codes
 
 MAX_DEGREE = 3  # of the harmonics of a page
 _CONSTANT_BYTES = 23  # of a Gaussian, without harmonics of degree 1 and above
@@ -87,11 +88,7 @@ def _morton_codes(points: Float[np.ndarray, "n 3"]) -> np.ndarray:
     low, high = np.quantile(points, 0.01, axis=0), np.quantile(points, 0.99, axis=0)
     size = np.maximum(high - low, 1e-12)
     cells = np.clip((points - low) / size * (1 << _MORTON_BITS), 0, (1 << _MORTON_BITS) - 1).astype(np.int64)
-    codes = np.zeros(len(points), np.int64)
-    for bit in range(_MORTON_BITS):
-        for axis in range(3):
-            codes |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return codes
+    return morton_codes(cells)
 
 
 def _split_words(words: np.ndarray, count: int) -> list[UInt8[np.ndarray, "n"]]:

@@ -1,0 +1,72 @@
+"""Adam for a refinement: torch's fused kernel without torch.optim, whose first use imports the compiler for a second.
+
+Source: Kingma and Ba, "Adam: a method for stochastic optimization", 2015.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+from torch.optim.adam import adam
+
+_MIN_EPSILON = 1e-15
+
+
+@dataclass(eq=False)
+class ParameterGroup:
+    """Parameters of one step size.
+
+    Attributes:
+        rate: step size at the start of a run.
+        epsilon: added to the root of the mean square of the gradients.
+    """
+
+    parameters: Sequence[Tensor]
+    rate: float
+    epsilon: float = _MIN_EPSILON
+    _states: dict[Tensor, tuple[Tensor, Tensor, Tensor]] = field(default_factory=dict, init=False)
+
+    def clear_gradients(self) -> None:
+        """Forget the gradients."""
+        for parameter in self.parameters:
+            parameter.grad = None
+
+    def set_damping(self, damping: float) -> None:
+        """Set epsilon to `damping` times the root mean square of the gradients."""
+        gradients = [parameter.grad.flatten() for parameter in self.parameters if parameter.grad is not None]
+        if gradients:
+            self.epsilon = max(damping * float(torch.cat(gradients).square().mean().sqrt()), _MIN_EPSILON)
+
+    @torch.no_grad()
+    def step(self, factor: float, betas: tuple[float, float]) -> None:
+        """Move the parameters that have a gradient.
+
+        Args:
+            factor: of the step size.
+            betas: decay of the averages of the gradients and of their squares.
+        """
+        moved = [parameter for parameter in self.parameters if parameter.grad is not None]
+        for parameter in moved:
+            if parameter not in self._states:
+                count = torch.zeros((), dtype=torch.float32, device=parameter.device)
+                self._states[parameter] = torch.zeros_like(parameter), torch.zeros_like(parameter), count
+        states = [self._states[parameter] for parameter in moved]
+        adam(
+            moved,
+            [parameter.grad for parameter in moved if parameter.grad is not None],
+            [mean for mean, _, _ in states],
+            [square for _, square, _ in states],
+            [],
+            [count for _, _, count in states],
+            fused=True,
+            amsgrad=False,
+            beta1=betas[0],
+            beta2=betas[1],
+            lr=factor * self.rate,
+            weight_decay=0.0,
+            eps=self.epsilon,
+            maximize=False,
+        )

@@ -1,0 +1,67 @@
+"""Adam of a refinement."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from pansplat.refinement.adam import ParameterGroup
+
+BETAS = (0.9, 0.99)
+
+
+def test_steps_equal_those_of_torch_optim_and_skip_parameters_without_gradient() -> None:
+    generator = torch.Generator().manual_seed(0)
+    start = [torch.randn(5, 3, generator=generator), torch.randn(7, generator=generator), torch.randn(2)]
+    ours, theirs = ([value.clone().requires_grad_() for value in start] for _ in range(2))
+    group = ParameterGroup(ours, rate=0.1, epsilon=1e-8)
+    optimizer = torch.optim.Adam(theirs, lr=0.1, betas=BETAS, eps=1e-8)
+    for step in range(5):
+        factor = 1 / (step + 1)
+        group.clear_gradients()
+        optimizer.zero_grad()
+        for parameters in (ours, theirs):
+            (parameters[0].sin().sum() + step * parameters[1].square().sum()).backward()
+        optimizer.param_groups[0]["lr"] = 0.1 * factor
+        group.step(factor, BETAS)
+        optimizer.step()
+    for got, expected in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(got, expected, atol=1e-6, rtol=1e-5)
+    assert torch.equal(ours[2], start[2])
+
+
+def test_damping_is_relative_to_the_gradients_and_positive_without_any() -> None:
+    parameter = torch.zeros(4, requires_grad=True)
+    group = ParameterGroup([parameter], rate=1.0)
+    group.set_damping(0.5)
+    assert 0 < group.epsilon < 1e-12
+    parameter.grad = torch.tensor([3.0, -3.0, 3.0, -3.0])
+    group.set_damping(0.5)
+    assert group.epsilon == pytest.approx(1.5)
+    parameter.grad = torch.zeros(4)
+    group.set_damping(0.5)
+    assert group.epsilon > 0
+
+
+@pytest.mark.slow
+def test_a_refinement_does_not_import_the_compiler() -> None:
+    program = """
+import sys, torch
+from pansplat.data.views import Views
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.pipeline import refine
+poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+poses[1, 0, 3] = 0.5
+means = 3 * torch.nn.functional.normalize(torch.randn(50, 3), dim=1)
+labels = (torch.arange(50) % 2).to(torch.uint8)
+quats, harmonics = torch.eye(4)[:1].repeat(50, 1), torch.rand(50, 1, 3)
+gaussians = Gaussians(means, torch.full((50, 3), 0.3), quats, torch.full((50,), 0.5), harmonics, labels, labels)
+scene = Scene(gaussians, poses, 0.5, 10.0, ("a", "b"), "test", 16)
+images, masks = torch.rand(2, 3, 16, 32), torch.ones(2, 16, 32, dtype=torch.bool)
+views = Views(images=images, cam2world=poses, masks=masks, near=0.5, far=10.0, names=("a", "b"), depths=None)
+refine(scene, views, steps=2)
+print(*sorted({"torch._dynamo", "sympy"} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
