@@ -1,17 +1,22 @@
 """Displays of a property: both renderers draw them as the torch reference defines them."""
 
 import math
+import os
 from dataclasses import replace
+from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from pansplat.data.images import write_image
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.rendering import rasterize
 from pansplat_viewer.color_maps import get_table, map_values
 from pansplat_viewer.displays import color_by_property
-from pansplat_viewer.settings import SCALAR_MAPS, DrawSettings
+from pansplat_viewer.settings import SCALAR_MAPS, Display, DrawSettings
 
 pytestmark = pytest.mark.gl
 
@@ -127,3 +132,23 @@ def test_panoramas_show_the_display(make_renderer, small_scene, pose, display):
         renderer.render(pose, (64, 32), settings)
         images.append(renderer.read_color()[..., :3])
     assert np.abs(images[0] - images[1]).mean() < 0.06  # OpenGL interpolates cube faces
+
+
+GOLDEN = Path(__file__).parents[1] / "assets" / "displays.png"  # PANSPLAT_WRITE_GOLDEN=1 writes it
+
+
+@pytest.mark.parametrize("tier", ["cpu", "gl43"])
+def test_each_display_looks_as_in_the_golden_image(make_renderer, small_scene, pose, tier):
+    renderer, rows = make_renderer(small_scene, tier), []
+    for display in get_args(Display):
+        settings = DrawSettings(display=display, display_max={"depth": 6.0, "count": 40.0}.get(display, 1.0))
+        rows.append(draw(renderer, pose, settings)[..., :3])
+    image = np.clip(np.concatenate(rows, axis=1), 0, 1)
+    if tier == "cpu" and os.environ.get("PANSPLAT_WRITE_GOLDEN"):
+        write_image(GOLDEN, image)
+    with Image.open(GOLDEN) as file:
+        expected = np.asarray(file.convert("RGB")) / 255
+    parts = (np.split(each, len(rows), axis=1) for each in (image, expected))
+    for display, part, golden in zip(get_args(Display), *parts, strict=True):
+        error = np.abs(part - golden)
+        assert (error.max(axis=2) > 0.03).mean() < 0.02 and error.mean() < 4e-3, display

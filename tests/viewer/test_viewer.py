@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import get_args
 
 import moderngl
 import numpy as np
@@ -32,6 +33,7 @@ from pansplat_viewer.loader import (
 )
 from pansplat_viewer.presenter import ERROR_MAP
 from pansplat_viewer.resolution import BUDGET_MS, SCALES, SETTLE_AFTER, AdaptiveResolution
+from pansplat_viewer.settings import Comparison, Display
 from pansplat_viewer.state import ViewerState
 from pansplat_viewer.viewer import Viewer
 
@@ -47,8 +49,7 @@ IMAGE_WIDGETS = (
     "joint", "deferred", "difference", "view 0", "view 1", "0##level", "1##level", "2##level", "3##level",
     "min. opacity", "ray", "ewa", "radial", "z", "angular", "3dgs", "black", "grey", "white", "field of view",
     "off##stereo", "pair##stereo", "red/cyan##stereo",
-    "Panorama 2", "##flight", "photograph", "error", "color", "depth", "opacity", "normals", "levels", "views", "count",
-    "ellipsoids",
+    "Panorama 2", "##flight",
 )  # fmt: skip
 INITIAL_SETTINGS = {
     **{label: {"mode": "joint"} for label in ("deferred", "difference", "view 0", "view 1")},
@@ -58,12 +59,12 @@ INITIAL_SETTINGS = {
     "angular": {"lowpass": "3dgs"},
     "off##stereo": {"stereo": "anaglyph"},
     "black": {"background": (1.0, 1.0, 1.0)},
-    "color": {"display": "depth"},
 }
 # Widgets whose effect has its own test.
 OTHER_WIDGETS = {
     "Scene", "pair", "path", "Open", "Gaussians", "Drawing", "background", "coarser while moving", "Camera",
-    "fly", "orbit", "Reset", "speed", "Panorama 1", "Fly", "Display", "Compare", "off", "pinned", "Pin this image",
+    *get_args(Display), *get_args(Comparison),
+    "fly", "orbit", "Reset", "speed", "Panorama 1", "Fly", "Display", "Compare", "Pin this image",
     "Screenshot", "PNG", "EXR + depth", "360 PNG", "Camera path", "Window", "Reload",
 }  # fmt: skip
 
@@ -508,13 +509,15 @@ def test_the_error_is_the_mapped_difference_from_the_photograph(user):
     rendered = user.read_image()
     state.comparison = "photograph"
     photograph = user.read_image()
-    state.comparison, state.max_error = "error", 0.4
+    user.click("error")
+    state.max_error = 0.4
     expected = map_values(np.abs(rendered - photograph).mean(axis=2) / 255, 0.4, ERROR_MAP)
     assert (np.abs(user.read_image() - expected).max(axis=2) <= 12).mean() > 0.98, "up to the steps of 8 bits"
     state.max_error = 0.1
     assert user.read_image().mean() > expected.mean() + 5, "a smaller range is brighter"
 
 
+@once
 def test_a_pinned_image_keeps_its_settings_and_scene_beside_others(user):
     rendered = user.read_image()
     user.press(imgui.Key.x)
@@ -557,6 +560,19 @@ def test_a_photograph_that_cannot_be_read_is_an_error_and_keeps_the_image(user, 
     assert changed_fraction(before, user.read_image()) == 0
 
 
+@once
+def test_each_display_is_another_image(user):
+    images = [user.read_image()]
+    for display in get_args(Display)[1:]:
+        user.click(display)
+        images.append(user.read_image())
+        differences = [changed_fraction(other, images[-1]) for other in images[:-1]]
+        assert min(differences) > 0.1, display
+    user.click("color")
+    assert changed_fraction(images[0], user.read_image()) == 0
+
+
+@once
 def test_the_range_of_a_display_is_shown_and_can_be_changed(user):
     user.click("depth")
     assert 2 < user.state.settings.display_max < 6, "most Gaussians are nearer"

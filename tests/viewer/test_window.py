@@ -71,7 +71,8 @@ def display(tmp_path_factory) -> Iterator[Display]:
 @contextmanager
 def running(display: Display, room: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
     """Runs the command in a process that is killed when the block ends."""
-    environment = {**os.environ, "DISPLAY": display.name, "WAYLAND_DISPLAY": ""}
+    config = {"XDG_CONFIG_HOME": str(room.parent / "config")}  # the layout of the user is neither read nor changed
+    environment = {**os.environ, "DISPLAY": display.name, "WAYLAND_DISPLAY": "", **config}
     viewer = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, str(room), *options],
         env=environment,
