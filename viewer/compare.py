@@ -111,7 +111,7 @@ class Comparer:
         if index is None:
             return None
         name = self.photographs.names[index]
-        return name if state.comparison == "photograph" else f"error against {name}"
+        return f"photograph {name}" if state.comparison == "photograph" else f"error against {name}"
 
     def release(self) -> None:
         """Free the GL objects and stop the threads."""

@@ -29,6 +29,8 @@ class PickedPoint:
         level, view: its labels.
         opacity: its peak opacity.
         scales: its standard deviations, metres.
+        mean: its centre in the world, metres.
+        quat: its rotation, wxyz.
     """
 
     position: tuple[float, float, float]
@@ -40,6 +42,8 @@ class PickedPoint:
     view: int
     opacity: float
     scales: tuple[float, float, float]
+    mean: tuple[float, float, float]
+    quat: tuple[float, float, float, float]
 
     def describe(self) -> list[str]:
         """Lines of text for the panel."""
@@ -49,6 +53,8 @@ class PickedPoint:
             f"x {x:.3f}  y {y:.3f}  z {z:.3f} m",
             f"Gaussian {self.gaussian:,}: level {self.level}, view {self.view}, opacity {self.opacity:.2f}",
             "scales " + " ".join(f"{1000 * scale:.1f}" for scale in self.scales) + " mm",
+            "mean " + " ".join(f"{x:.3f}" for x in self.mean) + " m",
+            "rotation (wxyz) " + " ".join(f"{x:.3f}" for x in self.quat),
         ]
 
 
@@ -104,6 +110,7 @@ def pick_point(
     depth = float((weights * distances[indices]).sum() / weights.sum())
     best = int(indices[weights.argmax()])
     point, scales = origin + depth * direction, gaussians.scales[best].tolist()
+    mean, quat = gaussians.means[best].tolist(), gaussians.quats[best].tolist()
     return PickedPoint(
         position=(float(point[0]), float(point[1]), float(point[2])),
         depth=depth,
@@ -114,6 +121,8 @@ def pick_point(
         view=int(gaussians.views[best]),
         opacity=float(gaussians.opacities[best]),
         scales=(scales[0], scales[1], scales[2]),
+        mean=(mean[0], mean[1], mean[2]),
+        quat=(quat[0], quat[1], quat[2], quat[3]),
     )
 
 

@@ -49,6 +49,7 @@ def test_depth_is_the_mean_by_weight_and_the_gaussian_the_heaviest(scene):
     assert point.alpha == pytest.approx(weights.sum())
     assert (point.count, point.gaussian, point.level, point.view) == (2, 1, 2, 1)
     assert point.position == pytest.approx((0, 0, point.depth))
+    assert point.mean == (0, 0, 3) and point.quat == (1, 0, 0, 0) and point.scales == pytest.approx((0.5, 0.5, 0))
     assert any("level 2, view 1" in line for line in point.describe())
 
 

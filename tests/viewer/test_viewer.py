@@ -538,7 +538,7 @@ def test_a_pinned_image_keeps_its_settings_and_scene_beside_others(user):
 def test_a_chosen_photograph_is_compared_from_its_own_camera(user):
     user.state.comparison, user.state.photograph = "photograph", 1
     user.draw_frames(2)
-    assert user.data.right_name == "b.png" and user.data.photograph_distance == pytest.approx(0.5)
+    assert user.data.right_name == "photograph b.png" and user.data.photograph_distance == pytest.approx(0.5)
     user.click("Go")
     assert user.state.camera.position == pytest.approx((0, 0, 0.5)) and user.state.camera.yaw_radians == 0
     assert user.data.photograph_distance == pytest.approx(0)
@@ -1011,7 +1011,7 @@ def test_the_nearest_photograph_of_a_tour_is_shown(tour_user):
     before = user.read_image()
     user.click("photograph")
     assert changed_fraction(before, user.read_image()) > 0.3
-    assert user.data.right_name == "room0"
+    assert user.data.right_name == "photograph room0"
 
 
 # --- camera paths ---
