@@ -101,8 +101,13 @@ class ViewerResult:
 ViewerRow = Row[ViewerCase, ViewerResult]
 
 
-def list_viewer_cases(size: tuple[int, int]) -> list[ViewerCase]:
-    """The cases of one scene; `size` is width and height of the window."""
+def list_viewer_cases(size: tuple[int, int], renderers: Sequence[str] = _TIERS) -> list[ViewerCase]:
+    """The cases of one scene.
+
+    Args:
+        size: width and height of the window, pixels.
+        renderers: some of `cpu`, `gl33` and `gl43`.
+    """
     sizes: dict[View, tuple[int, int]] = {
         "perspective": size,
         "coarse": (size[0] // 2, size[1] // 2),
@@ -111,7 +116,7 @@ def list_viewer_cases(size: tuple[int, int]) -> list[ViewerCase]:
     }
     return [
         ViewerCase(renderer, view, mode, *sizes[view])
-        for renderer in _TIERS
+        for renderer in renderers
         for view in sizes
         for mode in ("joint", "deferred")
         if renderer == "cpu" or view != "coarse"

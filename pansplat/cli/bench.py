@@ -315,6 +315,8 @@ class BenchViewer:
     """Heights of the panoramas whose lattices hold the Gaussians: 221,642, 886,580 and 3,546,326; multiples of 8."""
     size: tuple[_WindowSide, _WindowSide] = (1280, 720)
     """Width and height of the window, pixels."""
+    renderers: tuple[Literal["cpu", "gl33", "gl43"], ...] = ("cpu", "gl33", "gl43")
+    """Renderers to measure, for a run in pieces."""
     quick: bool = False
     """The smallest height only, few frames."""
     out: OptionalOut = None
@@ -337,7 +339,7 @@ class BenchViewer:
             report.rows += read_viewer_rows(json)
             bench = ViewerBench(report, repeats=3 if self.quick else 9, threads=threads)
             for height in heights:
-                bench.run(height, list_viewer_cases(self.size))
+                bench.run(height, list_viewer_cases(self.size, self.renderers))
         return 0
 
 
