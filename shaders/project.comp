@@ -18,14 +18,15 @@ layout(std430, binding = 4) readonly buffer Total { uint total; };              
 void main() {
     uint slot = gl_GlobalInvocationID.x;
     if (slot >= uint(capacity) || uint(first) + slot >= total) return;
-    uint index = visible[total - 1u - uint(first) - slot];
+    uint entry = visible[total - 1u - uint(first) - slot], index = entry & 0x1FFFFFFFu;
+    part = int(entry >> 29);
     StoredGaussian stored = gaussians[index];
     Gaussian gaussian = Gaussian(stored.mean_opacity.xyz, stored.mean_opacity.w, stored.quat, stored.scale.xyz);
     Footprint f;
     Record record = Record(vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0));
     if (project_gaussian(gaussian, f)) {
         record = Record(vec4(f.center, f.half_axis_1), vec4(f.half_axis_2, f.base), vec4(f.a, f.thickness),
-                        vec4(f.b, f.distance), vec4(f.l, f.peak), vec4(colors[index].rgb, 0.0));
+                        vec4(f.b, f.distance), vec4(f.l, f.peak), vec4(colors[index].rgb, float(part)));
     }
     records[slot] = record;
 }

@@ -1,10 +1,14 @@
 // Alpha of one footprint at one pixel: docs/rendering.md, sections 3 and 4.
-uniform vec2 principal;     // window coordinates of the image centre
 uniform float focal;        // pixels
 #ifdef INSPECT
 uniform int footprint;      // 0 Gaussian, 1 count (the blend function adds), 2 ellipsoid of one standard deviation
 #endif
 
+#ifdef PARTS
+flat in vec2 v_principal;   // window coordinates of the centre of the part
+#else
+uniform vec2 principal;     // window coordinates of the image centre
+#endif
 flat in vec2 v_base;
 flat in vec4 v_a;           // a, thickness
 flat in vec4 v_b;           // b, distance
@@ -15,6 +19,9 @@ layout(location = 0) out vec4 out_color;    // premultiplied
 layout(location = 1) out vec4 out_depth;    // alpha x radial distance
 
 void main() {
+#ifdef PARTS
+    vec2 principal = v_principal;
+#endif
     vec2 ray = (gl_FragCoord.xy - principal) / focal;
     vec2 delta = vec2(ray.x, -ray.y) - v_base;
     float p = v_a.x + dot(v_a.yz, delta);

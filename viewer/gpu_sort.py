@@ -8,7 +8,7 @@ The numbers of splats stay on the GPU.
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 
 import moderngl
 import numpy as np
@@ -23,6 +23,8 @@ _GROUP_SIZE = 64  # local size of sort_keys.comp and project.comp
 _MAX_GROUPS = 1 << 14  # in one dimension, below the limit of every implementation
 _MAX_MASKS = 8
 _DRAW_BYTES, _DISPATCH_BYTES = 20, 12
+MAX_PARTS = 6  # of a layer: cube faces
+_PLANES = 5  # at most, of a part
 
 
 def count_groups(count: int, size: int) -> int:
@@ -98,9 +100,9 @@ class GpuSplats:
         self._geometry, self._colors, self._records = geometry, colors, records
         self._sort = RadixSort(ctx, programs, count)
         self._order_key: Hashable = None
-        self._num_chunks = max(count_groups(count, capacity), 1)
-        self._counts = ctx.buffer(reserve=4 * max(count_groups(count, TILE_SIZE), 1))
-        self._visible = ctx.buffer(reserve=4 * max(count, 1))
+        self._num_chunks = max(count_groups(MAX_PARTS * count, capacity), 1)
+        self._counts = ctx.buffer(reserve=4 * MAX_PARTS * max(count_groups(count, TILE_SIZE), 1))
+        self._visible = ctx.buffer(reserve=4 * MAX_PARTS * max(count, 1))
         self._total, self._drawn = ctx.buffer(reserve=4), ctx.buffer(np.zeros(1, np.uint32))
         self._dispatches = ctx.buffer(reserve=_DISPATCH_BYTES * self._num_chunks)
         self._draws = ctx.buffer(reserve=_DRAW_BYTES * self._num_chunks)
@@ -109,18 +111,18 @@ class GpuSplats:
     def draw(
         self,
         quads: moderngl.VertexArray,
-        camera: Pinhole,
+        cameras: Sequence[Pinhole],
         position: tuple[float, float, float],
         selected: Bool[np.ndarray, "n"],
         selection: Hashable,
         settings: DrawSettings,
         filter_variance: float,
     ) -> None:
-        """Draw the selected splats that the camera sees, back to front; uniforms and blending are set by the caller.
+        """Draw the selected splats that each camera sees, back to front; other uniforms and blending are the caller's.
 
         Args:
             quads: draws the records.
-            camera: of the image.
+            cameras: of the parts of a layer; one if the order is by depth.
             position: of the order by distance.
             selected: the splats of the layer.
             selection: identifies `selected`.
@@ -129,13 +131,17 @@ class GpuSplats:
         """
         if not self._count:
             return
-        self._update_order(camera, position, settings)
-        self._list_visible(camera, self._get_mask(selected, selection), settings, filter_variance)
+        self._update_order(cameras[0], position, settings)
+        self._list_visible(cameras, self._get_mask(selected, selection), settings, filter_variance)
         arguments = self._programs.compute("arguments.comp")
         buffers = self._total, self._dispatches, self._draws, self._drawn
-        _run(self._ctx, arguments, 1, buffers, num_chunks=self._num_chunks, capacity=self._capacity)
+        num_chunks = max(count_groups(len(cameras) * self._count, self._capacity), 1)
+        _run(self._ctx, arguments, 1, buffers, num_chunks=num_chunks, capacity=self._capacity)
         project = self._programs.project_compute()
-        for chunk in range(self._num_chunks):
+        rotations = np.zeros((MAX_PARTS, 3, 3), np.float32)
+        rotations[: len(cameras)] = [camera.rotation for camera in cameras]
+        set_uniforms(project, rotations=rotations.tobytes())  # GLSL reads columns: of the inverse
+        for chunk in range(num_chunks):
             set_uniforms(project, first=chunk * self._capacity, capacity=self._capacity)
             for binding, buffer in enumerate((self._geometry, self._colors, self._visible, self._records, self._total)):
                 buffer.bind_to_storage_buffer(binding)
@@ -179,28 +185,30 @@ class GpuSplats:
         self._order_key = key
 
     def _list_visible(
-        self, camera: Pinhole, mask: moderngl.Buffer, settings: DrawSettings, filter_variance: float
+        self, cameras: Sequence[Pinhole], mask: moderngl.Buffer, settings: DrawSettings, filter_variance: float
     ) -> None:
-        """List the splats that touch the image, in the order of the sort."""
+        """List the splats that touch the parts, part by part, in the order of the sort."""
         bounded = settings.kernel != "ewa"  # the linearised kernel draws outside the ball
-        normals = camera.compute_side_normals() if bounded else camera.rotation[:, 2][None]
-        offsets = normals @ np.asarray(camera.position)
-        planes = np.zeros((5, 4), np.float32)
-        planes[: len(normals)] = np.column_stack((normals, offsets))
-        num_tiles = count_groups(self._count, TILE_SIZE)
+        planes, num_planes = np.zeros((MAX_PARTS, _PLANES, 4), np.float32), 0
+        for part, camera in enumerate(cameras):
+            normals = camera.compute_side_normals() if bounded else camera.rotation[:, 2][None]
+            num_planes = len(normals)
+            planes[part, :num_planes] = np.column_stack((normals, normals @ np.asarray(camera.position)))
+        num_tiles, num_parts = count_groups(self._count, TILE_SIZE), len(cameras)
         uniforms = {
             "count": self._count,
-            "position": camera.position,
+            "position": cameras[0].position,
             "planes": planes.tobytes(),
-            "num_planes": len(normals),
+            "num_planes": num_planes,
             "deviation": 1.001 * math.sqrt(filter_variance),
             "bounded": bounded,
         }
         buffers = self._geometry, mask, self._sort.values, self._counts, self._visible
-        _run(self._ctx, self._programs.compute("cull.comp", WRITE=0), num_tiles, buffers, **uniforms)
+        groups = num_tiles, num_parts
+        _run(self._ctx, self._programs.compute("cull.comp", WRITE=0), groups, buffers, **uniforms)
         scan = self._programs.compute("scan.comp")
-        _run(self._ctx, scan, 1, (self._counts, self._total), count=num_tiles)
-        _run(self._ctx, self._programs.compute("cull.comp", WRITE=1), num_tiles, buffers, **uniforms)
+        _run(self._ctx, scan, 1, (self._counts, self._total), count=num_parts * num_tiles)
+        _run(self._ctx, self._programs.compute("cull.comp", WRITE=1), groups, buffers, **uniforms)
 
     def _get_mask(self, selected: Bool[np.ndarray, "n"], selection: Hashable) -> moderngl.Buffer:
         """A buffer with one bit for each splat."""
@@ -218,7 +226,7 @@ class GpuSplats:
 def _run(
     ctx: moderngl.Context,
     program: moderngl.ComputeShader,
-    groups: int,
+    groups: int | tuple[int, int],
     buffers: tuple[moderngl.Buffer, ...],
     **uniforms: object,
 ) -> None:
@@ -226,5 +234,5 @@ def _run(
     set_uniforms(program, **uniforms)
     for binding, buffer in enumerate(buffers):
         buffer.bind_to_storage_buffer(binding)
-    program.run(groups)
+    program.run(*(groups if isinstance(groups, tuple) else (groups,)))
     ctx.memory_barrier()

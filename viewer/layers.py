@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -19,14 +19,17 @@ from jaxtyping import Bool, Float, UInt
 from pansplat.constants import FILTER_VARIANCE
 from pansplat.errors import InputError
 from pansplat_viewer.camera import Pinhole, create_face_cameras, find_faces_in_view
-from pansplat_viewer.gpu_sort import GpuSplats
+from pansplat_viewer.gpu_sort import MAX_PARTS, GpuSplats
 from pansplat_viewer.programs import RECORD, RECORD_BYTES, Programs, set_uniforms
 from pansplat_viewer.settings import DrawSettings
 from pansplat_viewer.splats import SortedSplats, Splats
 
 _MAX_CACHED_FACE_SIZE = 2048  # pixels; six faces take 200 MB at 16 bits
 _MAX_SELECTIONS = 8
+_CLIP_DISTANCE_0 = 0x3000  # GL_CLIP_DISTANCE0
 _CHUNK_SIZE = 1 << 20  # records that are made and drawn together; limits their memory to 100 MB
+
+Viewport = tuple[int, int, int, int]  # left, bottom, width, height, pixels
 
 
 class LayerStorage(IntEnum):
@@ -271,35 +274,30 @@ class LayerPainter:
             (frame.storage, view), size, depth_components=int(with_depth), key=frame.create_layer_key(splats)
         )
         missing = [part for part in frame.find_parts_in_view() if part not in target.parts]
-        drawn = 0
-        for part in missing:
-            viewport = (part % 3 * width, part // 3 * height, width, height)
-            drawn += self._paint_part(target, cameras[part], viewport, splats, selected, view, frame.settings)
-            target.parts.add(part)
+        places = {part: (part % 3 * width, part // 3 * height, width, height) for part in missing}
+        target.framebuffer.use()
+        for place in places.values():
+            target.framebuffer.viewport = target.framebuffer.scissor = place
+            target.framebuffer.clear(0.0, 0.0, 0.0, 0.0)
+        target.framebuffer.scissor = None
+        drawn, settings = 0, frame.settings
+        # One order by distance serves all parts, so the GPU draws them together.
+        together = self.rasterizer.draws_parts_together and settings.order == "radial"
+        for parts in [missing] if together and missing else [[part] for part in missing]:
+            drawn += self.rasterizer.draw(
+                target.framebuffer,
+                [(cameras[part], places[part]) for part in parts],
+                splats,
+                selected,
+                view,
+                settings,
+            )
+        target.parts.update(missing)
         return Layer(target, int(np.count_nonzero(selected)), drawn, cached=not missing)
 
     def release(self) -> None:
         """Free the splats on the GPU."""
         self.rasterizer.release()
-
-    def _paint_part(
-        self,
-        target: Target,
-        camera: Pinhole,
-        viewport: tuple[int, int, int, int],
-        splats: SortedSplats,
-        selected: Bool[np.ndarray, "n"],
-        view: int | None,
-        settings: DrawSettings,
-    ) -> int:
-        """Draw one part of a layer; returns the number of splats, 0 if only the GPU has it."""
-        framebuffer = target.framebuffer
-        framebuffer.use()
-        framebuffer.viewport = framebuffer.scissor = viewport
-        framebuffer.clear(0.0, 0.0, 0.0, 0.0)
-        drawn = self.rasterizer.draw(camera, splats, selected, view, settings, viewport)
-        framebuffer.scissor = None
-        return drawn
 
     def _select(self, settings: DrawSettings, view: int | None) -> Bool[np.ndarray, "n"]:
         key = (settings.levels, settings.opacity_threshold, view)
@@ -360,37 +358,52 @@ class SplatRasterizer:
         if len(colors):
             self._colors.write(colors)
 
+    @property
+    def draws_parts_together(self) -> bool:
+        """Whether several parts of a layer can be drawn at once."""
+        return self._gpu is not None
+
     def draw(
         self,
-        camera: Pinhole,
+        framebuffer: moderngl.Framebuffer,
+        parts: Sequence[tuple[Pinhole, Viewport]],
         splats: SortedSplats,
         selected: Bool[np.ndarray, "n"],
         view: int | None,
         settings: DrawSettings,
-        viewport: tuple[int, int, int, int],
     ) -> int:
-        """Blend the selected splats that the camera sees into `viewport` of the bound framebuffer.
+        """Blend the selected splats that the cameras see into their places in a framebuffer.
 
         Args:
-            camera: of the image.
+            framebuffer: the target.
+            parts: cameras of one size and position, and their places; only tier `gl43` draws several.
             splats: sorted for a position; tier `gl43` reads the position only.
             selected: the splats to draw, those of `view` and the settings' levels and opacity.
             view: of the layer, or None.
             settings: draw settings.
-            viewport: left, bottom, width, height, pixels.
 
         Returns:
             The number of splats, or 0 if only the GPU has it: see `take_drawn`.
         """
-        self._set_uniforms(camera, settings, viewport)
+        cameras = [camera for camera, _ in parts]
+        camera, viewport = parts[0]
+        if len(parts) > 1:
+            viewport = (0, 0, framebuffer.width, framebuffer.height)
+        framebuffer.viewport = viewport
+        self._set_uniforms(camera, settings)
+        self._place_parts([place for _, place in parts], viewport)
         self._ctx.enable_only(moderngl.BLEND)
         add = settings.footprint == "count"
         self._ctx.blend_func = moderngl.ONE, moderngl.ONE if add else moderngl.ONE_MINUS_SRC_ALPHA
         variance, _ = compute_lowpass_variances(settings, camera.focal)
         drawn = 0
         if self._gpu is not None:
+            for distance in range(4 if len(parts) > 1 else 0):
+                self._ctx.enable_direct(_CLIP_DISTANCE_0 + distance)
             selection = settings.levels, settings.opacity_threshold, view
-            self._gpu.draw(self._quads, camera, splats.position, selected, selection, settings, variance)
+            self._gpu.draw(self._quads, cameras, splats.position, selected, selection, settings, variance)
+            for distance in range(4 if len(parts) > 1 else 0):
+                self._ctx.disable_direct(_CLIP_DISTANCE_0 + distance)
         else:
             seen = splats.cull(camera, selected, kernel=settings.kernel, filter_variance=variance)
             drawn = self._draw_in_order(splats.sort_back_to_front(camera, seen, settings.order))
@@ -419,7 +432,7 @@ class SplatRasterizer:
             self._quads.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=len(indices))
         return len(back_to_front)
 
-    def _set_uniforms(self, camera: Pinhole, settings: DrawSettings, viewport: tuple[int, int, int, int]) -> None:
+    def _set_uniforms(self, camera: Pinhole, settings: DrawSettings) -> None:
         variance, dilation = compute_lowpass_variances(settings, camera.focal)
         project = self._programs.project() if self._tier == "gl33" else self._programs.project_compute()
         set_uniforms(
@@ -435,11 +448,19 @@ class SplatRasterizer:
             half_size=camera.half_size,
             margin=0.02 / camera.focal,
         )
-        x, y, width, height = viewport
         set_uniforms(
             self._programs.splat(),
             half_size=camera.half_size,
-            principal=(x + 0.5 * width, y + 0.5 * height),
             focal=camera.focal,
             footprint=("gaussian", "count", "ellipsoids").index(settings.footprint),
         )
+
+    def _place_parts(self, places: Sequence[Viewport], viewport: Viewport) -> None:
+        """Set where the parts of a layer are in the viewport."""
+        cells, principals = np.zeros((MAX_PARTS, 4), np.float32), np.zeros((MAX_PARTS, 2), np.float32)
+        for part, (x, y, width, height) in enumerate(places):
+            centre = np.array((x + 0.5 * width, y + 0.5 * height))
+            principals[part] = centre
+            scale = width / viewport[2], height / viewport[3]
+            cells[part] = *scale, *(2 * (centre - viewport[:2]) / viewport[2:] - 1)
+        set_uniforms(self._programs.splat(), cells=cells.tobytes(), principals=principals.tobytes())

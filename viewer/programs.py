@@ -88,7 +88,7 @@ class Programs:
 
     def project_compute(self) -> moderngl.ComputeShader:
         """Gaussians to records by a compute shader (GL 4.3)."""
-        return self.compute("project.comp")
+        return self.compute("project.comp", PARTS=1)
 
     def compute(self, name: str, **defines: int) -> moderngl.ComputeShader:
         """The compute shader of this file (GL 4.3)."""
@@ -97,7 +97,7 @@ class Programs:
 
     def splat(self) -> moderngl.Program:
         """Records to pixels of a layer."""
-        return self._compile_pair("splat.vert", "splat.frag")
+        return self._compile_pair("splat.vert", "splat.frag", PARTS=1)
 
     def accumulate(self, storage: int) -> moderngl.Program:
         """One weighted layer to the sum of layers; `storage` is a `LayerStorage`."""

@@ -59,17 +59,19 @@ def gpu(ctx, splats):
     programs = Programs(ctx)
     rasterizer = SplatRasterizer(ctx, programs, splats, "gl43")
     target = ctx.simple_framebuffer((64, 48))
-    target.use()
-    yield rasterizer
+    yield rasterizer, target
     rasterizer.release()
     programs.release()
     (ctx.screen or ctx.detect_framebuffer(0)).use()
     target.release()
 
 
-def draw(rasterizer: SplatRasterizer, splats: Splats, camera: Pinhole, selected, settings: DrawSettings) -> np.ndarray:
+def draw(gpu, splats: Splats, camera: Pinhole, selected, settings: DrawSettings) -> np.ndarray:
     """Indices of the splats that were drawn, front to back."""
-    rasterizer.draw(camera, sort_splats(splats, camera.position), selected, None, settings, (0, 0, 64, 48))
+    rasterizer, target = gpu
+    target.use()
+    parts = [(camera, (0, 0, 64, 48))]
+    rasterizer.draw(target, parts, sort_splats(splats, camera.position), selected, None, settings)
     gpu = rasterizer._gpu
     assert isinstance(gpu, GpuSplats)
     return np.frombuffer(gpu._visible.read(), np.uint32)[: rasterizer.take_drawn()]
@@ -93,7 +95,7 @@ def test_the_order_and_the_culling_are_the_processors(gpu, splats, pose, order, 
     shown = drawn[both[drawn]]
     if order == "radial":
         assert np.array_equal(shown, front_to_back)
-        assert np.array_equal(gpu._gpu.read_order(), expected.order)
+        assert np.array_equal(gpu[0]._gpu.read_order(), expected.order)
     else:  # the products of depths are rounded differently; those that coincide keep their order
         depth = (splats.means.astype(np.float64) @ camera.rotation[:, 2])[shown]
         assert (np.diff(depth) > -1e-5).all()
