@@ -72,7 +72,7 @@ class _Evidence:
 # agree on a floor. Measured on pairs of a home, of which most have nothing in common: of the wrong poses with at least
 # 10 places and a score of 36, none is confirmed by both; repeated doors and windows give them up to 26 places.
 _NEEDED = _Evidence(32, 80, 20), _Evidence(24, 100, 10), _Evidence(10, 36, 4)
-_FLOOR_SCORE = 6.0  # of a pose that the floor confirms; none of 400 wrong poses
+_FLOOR_SCORE = 6.0  # gain of a pose that the floor confirms
 _ALTERNATIVES = 5  # best hypotheses that are compared by the floor
 
 
