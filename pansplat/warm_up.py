@@ -28,6 +28,7 @@ def main() -> None:
         "rasteriser, spherical harmonics": partial(_rasterize, 1, "pinhole", RasterOptions()),
         "rasteriser, EWA": partial(_rasterize, 0, "pinhole", ewa),
         "rasteriser, EWA and spherical harmonics": partial(_rasterize, 1, "cubemap", ewa),
+        "stereo panoramas": _rasterize_stereo,
         "viewer": _draw_display_image,
         "sweep": partial(_predict, "sweep"),
         "depth network": partial(_predict, "default"),
@@ -45,7 +46,18 @@ def main() -> None:
 
 def _rasterize(degree: int, layout: Layout, options: RasterOptions) -> None:
     """Rasterise Gaussians with harmonics of a degree, forward and backward."""
-    scene = Gaussians(
+    scene, pose = _make_gaussians(degree), torch.eye(4, dtype=torch.float64)
+    rasterize(scene, pose, size=(16, 32), layout=layout, options=options, backend="numba").color.sum().backward()
+
+
+@torch.no_grad()
+def _rasterize_stereo() -> None:
+    """Rasterise the panorama of one eye."""
+    rasterize(_make_gaussians(0), torch.eye(4), size=(16, 32), eye_offset=0.03, backend="numba")
+
+
+def _make_gaussians(degree: int) -> Gaussians:
+    return Gaussians(
         means=torch.rand(9, 3).requires_grad_(),
         scales=torch.full((9, 3), 0.1),
         quats=torch.ones(9, 4),
@@ -54,8 +66,6 @@ def _rasterize(degree: int, layout: Layout, options: RasterOptions) -> None:
         levels=torch.zeros(9, dtype=torch.int64),
         views=torch.zeros(9, dtype=torch.int64),
     )
-    pose = torch.eye(4, dtype=torch.float64)
-    rasterize(scene, pose, size=(16, 32), layout=layout, options=options, backend="numba").color.sum().backward()
 
 
 def _draw_display_image() -> None:
@@ -65,7 +75,7 @@ def _draw_display_image() -> None:
     labels = np.arange(9, dtype=np.int16) % 2
     selection = Selection(np.eye(3), 0.01, bounded=True)
     layers = scene.rasterize(np.zeros(3), faces.plane(0), labels, 2, RasterOptions(), selection=selection)
-    scene.rasterize(np.zeros(3), faces.plane(0), labels, 1, RasterOptions(), selection=selection, footprint="count")
+    scene.rasterize(np.zeros(3), faces.plane(0), labels, 2, RasterOptions(), selection=selection, footprint="count")
     blend_to_pixels(layers.sums, np.full(2, 0.5), (0.0, 0.0, 0.0), faces.pixels[0])
     blend_to_pixels(layers.sums, np.full(2, 0.5), (0.0, 0.0, 0.0), pixels, bottom_up=True)
     faces.sample(np.eye(3), 20.0, pixels)

@@ -288,7 +288,7 @@ def test_clicking_the_widget_changes_the_image(user, label):
     user.state.settings = replace(user.state.settings, **INITIAL_SETTINGS.get(label, {}))
     before = user.read_image()
     user.click(label)
-    assert changed_fraction(before, user.read_image()) > 0.001
+    assert changed_fraction(before, user.read_image()) > 3e-4  # 0 without an effect; the filter changes few pixels
 
 
 @pytest.mark.parametrize("label", ["0##level"])
