@@ -303,11 +303,9 @@ class _PairSteps:
     def __init__(self, pair: Pair, part: float | None, options: BatchOptions, fingerprint: str, folder: Path) -> None:
         """`part` is the number of Gaussians that the export of a tour needs of each panorama."""
         self._pair, self._options, self._fingerprint, self._folder = pair, options, fingerprint, folder
-        self._height = options.height
-        self._gaussians: int | None = None
+        self._height, self._gaussians = options.height, None
         if part is not None:
-            self._height = self._height or pipeline.choose_tour_height(pair, part)
-            self._gaussians = None if math.isinf(part) else max(int(part * len(pair.context)), 1)
+            self._height, self._gaussians = pipeline.choose_tour_size(pair, part, options.height)
         self._file: Path | None = None
         self.key = _hash_pair(pair)
 

@@ -171,6 +171,17 @@ def choose_tour_height(pair: Pair, gaussians: float = math.inf) -> int:
     return height
 
 
+def choose_tour_size(pair: Pair, gaussians: float = math.inf, height: int | None = None) -> tuple[int, int | None]:
+    """The height to predict a scene of a tour at, and the number of Gaussians to refine it with; None for no limit.
+
+    Args:
+        pair, gaussians: see `choose_tour_height`.
+        height: that the user has chosen.
+    """
+    count = None if math.isinf(gaussians) else max(int(gaussians * len(pair.context)), 1)
+    return height or choose_tour_height(pair, gaussians), count
+
+
 def predict(
     source: Pair | Views | str | Path,
     model: str | Path | Predictor = "default",
@@ -365,12 +376,13 @@ def predict_tour(
 
     def predict_scene(views: tuple[int, ...]) -> Scene:
         number, pair = next(counter), tour.make_pair(views)
+        rows, count = choose_tour_size(pair, part, height)
         return predict(
             pair,
             predictor,
-            height=height or choose_tour_height(pair, part),
+            height=rows,
             refine_seconds=refine_seconds,
-            gaussians=None if gaussians is None else max(int(part * len(views)), 1),
+            gaussians=count,
             cache=cache,
             progress=lambda what, done: report(f"scene {number + 1} of {total}: {what}", (number + done) / total),
         )

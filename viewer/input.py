@@ -170,14 +170,9 @@ def read_input(seconds: float) -> Input:
     io = imgui.get_io()
     held: set[str] = set()
     pressed: set[str] = set()
-    if not io.want_text_input:
-        for name, key in _KEYS.items():
-            value = getattr(imgui.Key, key)
-            if imgui.is_key_down(value):
-                held.add(name)
-            if imgui.is_key_pressed(value, repeat=name in ",."):
-                pressed.add(name)
-    for key, name in _BUTTONS.items():
+    keys = [] if io.want_text_input else list(_KEYS.items())
+    keys += [(name, button) for button, name in _BUTTONS.items()]
+    for name, key in keys:
         value = getattr(imgui.Key, key)
         if imgui.is_key_down(value):
             held.add(name)
@@ -197,8 +192,8 @@ def read_input(seconds: float) -> Input:
         moved_since_click = imgui.get_mouse_drag_delta(0, 0.0)
         if imgui.is_mouse_released(0) and max(abs(moved_since_click.x), abs(moved_since_click.y)) < _CLICK_PIXELS:
             click = (io.mouse_pos.x / io.display_size.x, io.mouse_pos.y / io.display_size.y)
-    keys, height = (frozenset(held), frozenset(pressed)), int(io.display_size.y)
-    return Input(seconds, *keys, drag, pan, scroll, height, click, _read_sticks())
+    height = int(io.display_size.y)
+    return Input(seconds, frozenset(held), frozenset(pressed), drag, pan, scroll, height, click, _read_sticks())
 
 
 def apply_input(state: ViewerState, events: Input) -> Commands:

@@ -22,6 +22,7 @@ from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.projection import (
     Footprints,
     ProjectedGaussians,
+    Selection,
     compute_footprints,
     is_in_image,
     project_gaussians,
@@ -78,18 +79,30 @@ def rasterize_planes(
     """Rasterise with torch operations; see `pansplat.rendering.rasterize.RasterBackend`."""
     if planes[0].eye_offset:
         return _rasterize_columns(gaussians, covariances, pose, planes[0], options)
+    chosen, projected = _select_and_project(gaussians, covariances, pose, planes[0], options)
+    sums, visible, intersections = zip(*(_rasterize_plane(projected, plane, options) for plane in planes), strict=True)
+    info = RasterInfo(chosen.total, chosen.dropped, chosen.near, sum(visible), sum(intersections))
+    return RasterSums(torch.stack(sums), info)
+
+
+def _select_and_project(
+    gaussians: Gaussians,
+    covariances: Float[Tensor, "n 3 3"] | None,
+    pose: Float[Tensor, "4 4"],
+    plane: ImagePlane,
+    options: RasterOptions,
+) -> tuple[Selection, ProjectedGaussians]:
+    """The drawable Gaussians, and their projection from a camera."""
     chosen = select_drawable(gaussians, covariances, pose.detach(), options)
     projected = project_gaussians(
         chosen.gaussians,
         chosen.covariances,
         pose,
-        filter_variance=options.filter_variance(planes[0].pixel_angle),
+        filter_variance=options.filter_variance(plane.pixel_angle),
         compensate=options.compensate,
         exact=options.kernel == "ray",
     )
-    sums, visible, intersections = zip(*(_rasterize_plane(projected, plane, options) for plane in planes), strict=True)
-    info = RasterInfo(chosen.total, chosen.dropped, chosen.near, sum(visible), sum(intersections))
-    return RasterSums(torch.stack(sums), info)
+    return chosen, projected
 
 
 def _rasterize_columns(
@@ -99,20 +112,12 @@ def _rasterize_columns(
     plane: ImagePlane,
     options: RasterOptions,
 ) -> RasterSums:
-    """Rasterise each column of a panorama from its own eye: section 9, literally."""
+    """Rasterise each column of a panorama from its own eye: section 9, literally; kernel "ray" only."""
     (height, width), directions = plane.size, plane.directions()
     columns, visible, intersections = [], 0, 0
     for column, eye in enumerate(plane.column_eyes()):
         moved = torch.cat((pose[:, :3], (pose[:, 3] + pose[:, :3] @ eye)[:, None]), dim=1)
-        chosen = select_drawable(gaussians, covariances, moved.detach(), options)
-        projected = project_gaussians(
-            chosen.gaussians,
-            chosen.covariances,
-            moved,
-            filter_variance=options.filter_variance(plane.pixel_angle),
-            compensate=options.compensate,
-            exact=True,
-        )
+        chosen, projected = _select_and_project(gaussians, covariances, moved, plane, options)
         footprints, boxes = compute_footprints(projected, plane, options)
         # A box may wrap around: count the columns from its left edge on.
         after_left = torch.remainder(column + 0.5 - boxes[:, 0], width)
