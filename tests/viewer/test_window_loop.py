@@ -103,6 +103,7 @@ def test_sticks_and_buttons_of_a_gamepad_reach_imgui():
     context = imgui.create_context()
     imgui.set_current_context(context)
     io = imgui.get_io()
+    io.set_ini_filename("")  # write no imgui.ini into the current folder
     io.backend_flags |= imgui.BackendFlags_.has_gamepad.value | imgui.BackendFlags_.renderer_has_textures.value
     io.display_size, io.delta_time = (64, 32), 0.1
     buttons = [0] * 15
