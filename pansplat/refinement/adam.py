@@ -34,6 +34,11 @@ class ParameterGroup:
         for parameter in self.parameters:
             parameter.grad = None
 
+    def replace(self, parameters: Sequence[Tensor]) -> None:
+        """Continue with other parameters, whose averages begin at 0."""
+        self.parameters = parameters
+        self._states.clear()
+
     def set_damping(self, damping: float) -> None:
         """Set epsilon to `damping` times the root mean square of the gradients."""
         gradients = [parameter.grad.flatten() for parameter in self.parameters if parameter.grad is not None]

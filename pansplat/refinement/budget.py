@@ -21,7 +21,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import row_weights
 from pansplat.geometry.morton import morton_codes
 from pansplat.geometry.pose import interpolate_poses, nearest_views, quats_from_rotations
-from pansplat.rendering import rasterize
+from pansplat.rendering.weights import compute_blending_weights
 
 DROP_ERROR = 5e-3  # largest mean absolute change of an image by all Gaussians that are dropped
 MAX_OTHERS = 3  # cameras of other views that a view is rasterised at
@@ -39,18 +39,15 @@ def measure_contributions(scene: Scene, size: tuple[int, int]) -> Float[Tensor, 
     size = (max(size[0] // 2, 1), max(size[1] // 2, 1))  # a quarter of the time; the filter conserves energy
     gaussians = scene.gaussians
     largest = torch.zeros_like(gaussians.opacities)
-    area = row_weights(size[0]).to(largest)[:, None] / (row_weights(size[0]).sum() * size[1])
+    area = row_weights(size[0]).to(largest)[None, :, None].expand(1, *size)
+    area = area / (row_weights(size[0]).sum() * size[1])
     for view in torch.unique(gaussians.views).tolist():
         index = (gaussians.views == view).nonzero()[:, 0]
         part, own = gaussians.select(index), scene.cam2world[view]
         others = [scene.cam2world[other] for other in nearest_views(scene.cam2world, view, MAX_OTHERS)]
         for pose in (own, *others, *(interpolate_poses(own, other, 0.5) for other in others)):
-            # A grey image of one channel: its gradient in the colours is the sum of the weights.
-            colors = torch.zeros(len(part), 1, 1, dtype=largest.dtype, device=largest.device, requires_grad=True)
-            image = rasterize(dataclasses.replace(part, harmonics=colors), pose, size=size).color
-            (image * area).sum().backward()
-            assert colors.grad is not None
-            largest[index] = torch.maximum(largest[index], colors.grad[:, 0, 0] / SH_0)
+            contributions = compute_blending_weights(part, pose, size).accumulate(area)[:, 0]
+            largest[index] = torch.maximum(largest[index], contributions)
     return largest
 
 

@@ -4,9 +4,10 @@ The Gaussians of a view are rasterised at its own camera and at the nearest othe
 So the images between the cameras, which deferred blending mixes from single views, are constrained from both sides.
 
 Every step rasterises each view once: at its own camera in even steps, at one of the others in odd steps. Adam moves
-depth along the source ray, scales, rotations, opacities and colours; its step sizes fall along a cosine. Blocks of the
-photographs are held out of the loss: their error decides when to stop, and whether the refined scene replaces the given
-one. The last part of a run fits them too.
+depth along the source ray, scales, rotations, opacities and colours; its step sizes fall along a cosine. Twice in a
+run, Gaussians that are larger than a pixel are split where the error of the images is large. Blocks of the photographs
+are held out of the loss: their error decides when to stop, and whether the refined scene replaces the given one. The
+last part of a run fits them too.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from pansplat.refinement.objective import Photograph, image_difference
 from pansplat.refinement.parameters import CameraParameters, LearningRates, ViewParameters
 from pansplat.rendering import rasterize
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
+from pansplat.rendering.weights import compute_blending_weights
 
 _RATE_FLOOR = 0.05  # of the learning rates at the end
 _CHECK_EVERY = 10  # steps between checks of the held-out error
@@ -73,6 +75,10 @@ class RefineConfig:
     """Fraction of the blocks of the photographs that are held out."""
     release: float = 0.75
     """Fraction of the run after which held-out blocks are fitted too."""
+    splits: tuple[float, ...] = (0.2, 0.4)
+    """Fractions of the run at which Gaussians are split."""
+    split_error: float = 0.1
+    """Least error of a Gaussian that is split: the sum of its pixels' absolute errors times its blending weights."""
     betas: tuple[float, float] = (0.9, 0.99)
     """Decay of Adam's averages of the gradients and of their squares."""
     damping: float = 0.2
@@ -151,7 +157,7 @@ class Refinement:
         }
         self._cameras = CameraParameters(scene.cam2world.to(device), correct_poses=self.config.poses)
         self._groups = self._group_parameters()
-        self._steps = 0
+        self._steps = self._splits = 0
         self._result: Scene | None = None
 
     def _shrink(self, images: Tensor) -> Tensor:
@@ -174,6 +180,9 @@ class Refinement:
             fraction: of the run, in [0, 1]; sets the step sizes, and whether held-out blocks are fitted.
         """
         config = self.config
+        if self._splits < len(config.splits) and config.splits[self._splits] <= fraction < config.release:
+            self._splits += 1
+            self._split()
         for group in self._groups:
             group.clear_gradients()
         for view, parameters in self._views.items():
@@ -202,6 +211,38 @@ class Refinement:
         """The photograph that a view is compared with: its own in even steps, the others in turn in odd ones."""
         own, *others = self._targets[view]
         return own if self._steps % 2 == 0 or not others else others[self._steps // 2 % len(others)]
+
+    @torch.no_grad()
+    def _split(self) -> None:
+        """Split the Gaussians with large errors, within the limit those with the largest."""
+        if not self._views:
+            return
+        parts = [self._errors(view) for view in self._views]
+        errors = torch.cat(parts)
+        is_split, limit = errors > self.config.split_error, self.config.gaussians
+        if limit is not None and len(errors) + int(is_split.sum()) > limit:
+            is_split = errors > errors.topk(limit - len(errors) + 1).values[-1]
+        for parameters, part in zip(self._views.values(), is_split.split([len(part) for part in parts]), strict=True):
+            parameters.split(part)
+        for group, name in zip(self._groups[-len(ViewParameters.NAMES) :], ViewParameters.NAMES, strict=True):
+            group.replace([parameters.tensors[name] for parameters in self._views.values()])
+
+    def _errors(self, view: int) -> Tensor:
+        """Error of each Gaussian of a view: the absolute errors of the images times its blending weights, as a sum over
+        pixels and a mean over photographs. It is 0 for a Gaussian that is smaller than a pixel at its own camera.
+        """
+        gaussians = self._views[view].build()
+        errors = torch.zeros_like(gaussians.opacities)
+        pixels, half = math.prod(self._size), (self._size[0] // 2, self._size[1] // 2)  # a quarter of time and memory
+        for target in self._targets[view]:
+            photograph = self._photographs[target]
+            error = (self._draw(gaussians, view, target) - photograph.image).abs().mean(0)
+            error = functional.interpolate((error * photograph.fitted.pixels)[None, None], half, mode="area")[0]
+            error = error * pixels * (pixels / math.prod(half))  # of weights that sum to 1; a sum over pixels
+            weights = compute_blending_weights(gaussians, self._cameras.pose_in_view(view, target), half)
+            errors += weights.accumulate(error)[:, 0] / len(self._targets[view])
+        distances = (gaussians.means - self._start.cam2world[view, :3, 3].to(gaussians.means)).norm(dim=1)
+        return errors * (gaussians.scales.amax(1) > math.pi / self._size[0] * distances)
 
     def _draw(self, gaussians: Gaussians, view: int, target: int) -> Tensor:
         """The colours (3 height width) of a view's Gaussians in a photograph, with its gain."""
@@ -318,8 +359,10 @@ class Refinement:
         views, images = len(self._views), sum(max(len(targets) - 1, 1) for targets in self._targets.values())
         pixels = self._images[0, 0].numel() / math.prod(self._size)
         gradient = 1.7  # duration of a backward pass relative to its image
-        contributions = (images + views) * (1 + gradient) / 4
-        colors = views * pixels * (self.config.colors.steps_at(self._images.shape[-2]) * (1 + gradient) + gradient)
+        weights, product = 1.2, 0.5  # of blending weights, and of a product with them
+        contributions = (images + views) * (weights + product)
+        steps = self.config.colors.steps_at(self._images.shape[-2])
+        colors = views * pixels * (weights + product + 2 * steps * product)
         return (images + contributions + colors) / (views * (1 + gradient))
 
     def _finish(self, scene: Scene) -> Scene:

@@ -1,8 +1,8 @@
 """Colours of the Gaussians from the photographs, by comparison of each view's image with its own photograph.
 
 A Gaussian covers several pixels, so that colours sampled from a photograph give a blurred image. An image is linear in
-the colours: C = A c. Simultaneous iterative reconstruction (SIRT) solves it: c += r (photograph - A c) A / (1 A), where
-r is the relaxation, and 1 A sums the weights of a Gaussian over the image.
+the colours: C = W c. Simultaneous iterative reconstruction (SIRT) solves it: c += r W' (photograph - W c) / (W' 1),
+where r is the relaxation, and W' 1 sums the weights of a Gaussian over the image.
 
 Source: Gregor and Benson, "Computational analysis and improvement of SIRT", 2008.
 """
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians
-from pansplat.rendering.rasterize import rasterize
+from pansplat.rendering.weights import compute_blending_weights
 
 _MIN_COVERAGE = 1e-3  # pixels
 
@@ -53,28 +53,23 @@ def fit_colors(
         cam2world: poses of the photographs, OpenCV axes, metres.
         masks: pixels that are compared.
     """
-    with torch.inference_mode(False), torch.enable_grad():  # the copies are not inference tensors
-        harmonics = gaussians.harmonics.clone()
-        for view, (image, pose, mask) in enumerate(zip(images, cam2world, masks, strict=True)):
-            chosen = gaussians.views == view
-            if chosen.any():
-                harmonics[chosen] = _fit_view(
-                    gaussians.select(chosen), image.float().clone(), pose.clone(), mask.clone(), config
-                )
+    harmonics = gaussians.harmonics.clone()
+    for view, (image, pose, mask) in enumerate(zip(images, cam2world, masks, strict=True)):
+        chosen = gaussians.views == view
+        if chosen.any():
+            harmonics[chosen] = _fit_view(gaussians.select(chosen), image, pose, mask, config)
     return dataclasses.replace(gaussians, harmonics=harmonics)
 
 
+@torch.no_grad()
 def _fit_view(gaussians: Gaussians, image: Tensor, pose: Tensor, mask: Tensor, config: ColorFitConfig) -> Tensor:
     """The harmonics (n, 1, 3) of a view's Gaussians."""
-    harmonics, size = gaussians.harmonics, (mask.shape[0], mask.shape[1])
-    coverage: Tensor | None = None
+    size = (mask.shape[0], mask.shape[1])
+    colors = (0.5 + SH_0 * gaussians.harmonics[:, 0]).clamp_min(0)
+    image, mask = image.to(colors), mask.to(colors)
+    weights = compute_blending_weights(gaussians, pose, size)
+    coverage = weights.accumulate(mask[None]).clamp_min(_MIN_COVERAGE)
     for _ in range(config.steps_at(size[0])):
-        variable = harmonics.clone().requires_grad_()
-        drawn = rasterize(dataclasses.replace(gaussians, harmonics=variable), pose, size=size).color
-        if coverage is None:
-            (total,) = torch.autograd.grad((drawn * mask).sum(), variable, retain_graph=True)
-            coverage = (total / SH_0).clamp_min(_MIN_COVERAGE)
-        # Of a sum: torch.autograd.grad imports sympy for the gradient of an image.
-        (product,) = torch.autograd.grad((drawn * ((image - drawn.detach()) * mask)).sum(), variable)
-        harmonics = harmonics + config.relaxation / SH_0**2 * product / coverage
-    return harmonics
+        error = (image - weights.blend(colors)) * mask
+        colors = (colors + config.relaxation * weights.accumulate(error) / coverage).clamp_min(0)
+    return ((colors - 0.5) / SH_0)[:, None]

@@ -40,6 +40,31 @@ def test_harmonics_of_higher_degree_are_kept(room) -> None:
     torch.testing.assert_close(ViewParameters(given, camera).build().harmonics, harmonics)
 
 
+def test_halves_keep_the_mean_of_a_gaussian_and_the_variance_across_its_longest_axis(room) -> None:
+    given, camera = _view(room)
+    random = torch.Generator().manual_seed(0)
+    given.scales.mul_(1 + torch.rand(given.scales.shape, generator=random))
+    given.quats[:] = torch.randn(given.quats.shape, generator=random)
+    is_split = torch.rand(len(given), generator=random) < 0.3
+    parameters = ViewParameters(given, camera)
+    with torch.no_grad():
+        parameters.tensors["distance"].fill_(0.2)
+    before = parameters.build()
+    parameters.split(is_split)
+    after = parameters.build()
+    counts = 1 + is_split.long()
+    kept = after.select(~is_split.repeat_interleave(counts))
+    for name, value in vars(before.select(~is_split)).items():
+        torch.testing.assert_close(getattr(kept, name), value)
+    first, second = (after.select(is_split.repeat_interleave(counts).nonzero()[half::2, 0]) for half in (0, 1))
+    torch.testing.assert_close((first.means + second.means) / 2, before.means[is_split], rtol=1e-5, atol=1e-5)
+    shift = (first.means - second.means) / 2
+    together = first.covariances + shift[:, :, None] * shift[:, None, :]
+    ratio = torch.linalg.eigvals(together @ before.covariances[is_split].inverse()).real.sort(dim=1).values
+    torch.testing.assert_close(ratio, torch.tensor([0.74, 1.0, 1.0]).expand_as(ratio), rtol=1e-3, atol=1e-3)
+    assert all(tensor.requires_grad and tensor.is_leaf for tensor in parameters.tensors.values())
+
+
 def test_gaussians_at_the_camera_and_of_extreme_opacity_stay_finite(room) -> None:
     given, camera = _view(room)
     given.means[0] = camera.float()

@@ -11,6 +11,7 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import empty_gaussians
 from pansplat.geometry.pose import invert_pose
 from pansplat.refinement import RefineConfig, Refinement, refinement_fingerprint
+from pansplat.refinement.budget import merge_to
 
 
 def _refine(room, steps: int = 60, views=None, scene=None, **config):
@@ -33,7 +34,7 @@ def test_refinement_brings_the_image_between_the_cameras_near_the_truth(room) ->
 
 
 def test_depth_comes_nearer_to_the_truth(room) -> None:
-    refinement = Refinement(room.predicted, room.views, RefineConfig(hold=0.0))
+    refinement = Refinement(room.predicted, room.views, RefineConfig(hold=0.0, splits=()))
     for step in range(60):
         refinement.step(step / 60)
     refined = refinement.scene()
@@ -117,12 +118,13 @@ def test_a_run_can_be_stopped_at_any_step_and_keeps_its_state(room) -> None:
     assert room.error(refinement.scene(), middle) < room.error(room.predicted, middle)
 
 
+@pytest.mark.usefixtures("refinement_clock")
 def test_a_time_limit_ends_the_run_and_progress_grows(room) -> None:
     fractions: list[float] = []
     report = Refinement(room.predicted, room.views).run(
         seconds=3.0, progress=lambda what, fraction: fractions.append(fraction)
     )
-    assert report.steps > 1 and report.seconds < 10
+    assert report.steps > 10 and 2.5 < report.seconds < 3.5
     assert fractions == sorted(fractions) and fractions[-1] == 1
 
 
@@ -131,6 +133,25 @@ def test_a_budget_limits_the_gaussians(room) -> None:
     assert len(refined.gaussians) <= 500
     middle = room.truth.pose_between(0.5)
     assert room.error(refined, middle) < room.error(room.predicted, middle)
+
+
+def test_a_coarse_scene_is_split_within_its_limit_and_explains_the_photographs_better(room) -> None:
+    coarse = merge_to(room.predicted, room.views.images.shape[-2:], 160)
+    plain, _ = _refine(room, scene=coarse, splits=())
+    split, _ = _refine(room, scene=coarse)
+    limited, _ = _refine(room, scene=coarse, gaussians=200)
+    assert len(plain.gaussians) <= 160 < len(limited.gaussians) <= 200 < len(split.gaussians)
+    for pose in (room.truth.pose_between(0.5), *room.truth.cam2world):
+        assert room.error(split, pose) < 0.9 * room.error(plain, pose)
+
+
+def test_gaussians_smaller_than_a_pixel_and_those_without_error_are_not_split(room) -> None:
+    small = dataclasses.replace(room.predicted.gaussians, scales=0.3 * room.predicted.gaussians.scales)
+    fine = dataclasses.replace(room.predicted, gaussians=small)
+    for scene in (fine, room.truth):
+        refinement = Refinement(scene, room.views, RefineConfig())
+        refinement.step(0.2)
+        assert len(refinement.scene().gaussians) == len(scene.gaussians)
 
 
 def test_masked_pixels_have_no_effect(room) -> None:

@@ -8,6 +8,7 @@ Source: docs/rendering.md, sections 4 and 7; docs/viewer.md.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -34,6 +35,7 @@ from pansplat.rendering.cpu.runtime import (
     inline_kernel,
     kernel,
     parallel_for,
+    parallel_for_slices,
     pooled_empty,
     thread_count,
 )
@@ -54,6 +56,10 @@ _AHEAD = 16  # Gaussians between the prefetch of a row and its use
 _GEOMETRY = 11  # numbers of a row before the harmonics: mean, opacity, quaternion, scales
 _LINE = 16  # float32 per cache line
 _ROWS_PER_ITEM = 16
+# Of a selection that serves several views of a moving camera; wider ones select less often and project more.
+_MARGIN_METRES, _MARGIN_RADIANS = 0.15, 0.06
+_EVEN_BYTES = np.uint32(0x00FF00FF)
+_FRACTION_BITS = 8  # of the weight of a neighbouring pixel
 
 
 class Selection(NamedTuple):
@@ -68,6 +74,47 @@ class Selection(NamedTuple):
     normals: Float[np.ndarray, "plane 3"]
     deviation: float
     bounded: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _Selected:
+    """The Gaussians of a widened selection.
+
+    Attributes:
+        scene, labels, num_layers: from which they were selected.
+        position: camera centre.
+        selection: without the widening.
+        gaussians, ends: of `DisplayScene._select`.
+        workspace: their memory.
+    """
+
+    scene: "DisplayScene"
+    labels: Int[np.ndarray, "n"]
+    num_layers: int
+    position: Float[np.ndarray, "3"]
+    selection: Selection
+    gaussians: GaussianArrays
+    ends: list[int]
+    workspace: Workspace
+
+    def contains(
+        self, scene: "DisplayScene", position: np.ndarray, labels: np.ndarray, num_layers: int, selection: Selection
+    ) -> bool:
+        """Whether all Gaussians in view from another camera are among these."""
+        return (
+            (self.scene is scene and self.labels is labels and self.num_layers == num_layers)
+            and (self.selection.bounded == selection.bounded and self.selection.deviation >= selection.deviation)
+            and self.selection.normals.shape == selection.normals.shape
+            and float(np.linalg.norm(position - self.position)) <= _MARGIN_METRES
+            and float(np.linalg.norm(selection.normals - self.selection.normals, axis=1).max()) <= _MARGIN_RADIANS
+        )
+
+
+class SelectionCache:
+    """Gaussians that are selected for a view and a little around it, and serve the next views of a moving camera."""
+
+    def __init__(self) -> None:
+        self.selected: _Selected | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,22 +143,30 @@ class DisplayScene:
         scales: Float[np.ndarray, "n 3"],
         harmonics: Float[np.ndarray, "n k 3"],
         reach: Float[np.ndarray, "n"],
+        report: Callable[[float], None] = lambda done: None,
     ) -> None:
         """Copy the Gaussians.
 
         Args:
-            means, opacities, quats, scales, harmonics: finite, float32.
+            means, opacities, quats, scales, harmonics: finite.
             reach: a Gaussian is visible up to this number of standard deviations.
+            report: called with the fraction done; an exception ends the work.
         """
         num, self._num_coefficients = len(means), harmonics.shape[1]
         size = -(-(_GEOMETRY + 3 * self._num_coefficients) // _LINE) * _LINE
         self._workspace = Workspace()
         self._rows = self._workspace.array((num, size), np.float32)
-        self._rows[:, 0:3], self._rows[:, 3] = means, opacities
-        self._rows[:, 4:8], self._rows[:, 8:11] = quats, scales
-        self._rows[:, 11 : 11 + 3 * self._num_coefficients] = harmonics.reshape(num, 3 * self._num_coefficients)
-        extent = reach * scales.max(axis=1, initial=0)
-        self._balls = np.ascontiguousarray(np.column_stack((means, extent, reach)).T.astype(np.float32))
+        self._balls = np.empty((5, num), np.float32)
+
+        def copy(part: slice) -> None:
+            rows, balls = self._rows[part], self._balls[:, part]
+            rows[:, 0:3], rows[:, 3] = means[part], opacities[part]
+            rows[:, 4:8], rows[:, 8:11] = quats[part], scales[part]
+            rows[:, 11 : 11 + 3 * self._num_coefficients] = harmonics[part].reshape(len(rows), -1)
+            balls[:3], balls[4] = rows[:, 0:3].T, reach[part]
+            balls[3] = balls[4] * np.maximum.reduce([rows[:, axis] for axis in (8, 9, 10)])
+
+        parallel_for_slices(copy, num, report)
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -145,6 +200,7 @@ class DisplayScene:
         options: RasterOptions,
         *,
         selection: Selection | None = None,
+        cache: SelectionCache | None = None,
         min_transmittance: float = MIN_TRANSMITTANCE,
         footprint: Footprint | None = None,
     ) -> Layers:
@@ -157,6 +213,7 @@ class DisplayScene:
             num_layers: number of layers.
             options: of the image.
             selection: leaves out Gaussians that are not in view.
+            cache: has the Gaussians of earlier views; written if they do not serve this one.
             min_transmittance: a pixel is finished at this transmittance or below.
             footprint: drawn in place of blended Gaussians.
         """
@@ -169,7 +226,14 @@ class DisplayScene:
         sums = pooled_empty((num_layers, 5, *plane.size), np.float32)
         with announce_compilation():
             with statistics.timed("select"):
-                gaussians, ends = self._select(camera.pose[:3, 3], labels, num_layers, selection, workspace, threads)
+                of_view = camera.pose[:3, 3], labels, num_layers, selection
+                if cache is None or selection is None:
+                    gaussians, ends = self._select(*of_view, workspace, threads)
+                else:
+                    if cache.selected is None or not cache.selected.contains(self, *of_view):
+                        cache.selected = None  # its memory is reused
+                        cache.selected = self._select_around(*of_view, threads)
+                    gaussians, ends = cache.selected.gaussians, cache.selected.ends
             with statistics.timed("project"):
                 projected = project_gaussians(gaussians, camera, workspace, threads)
             start = 0
@@ -185,6 +249,20 @@ class DisplayScene:
                 start = end
         return Layers(sums, ends[-1] if ends else 0, statistics)
 
+    def _select_around(
+        self, position: np.ndarray, labels: np.ndarray, num_layers: int, selection: Selection, threads: int
+    ) -> _Selected:
+        """Copy the Gaussians in view of all cameras within the margins.
+
+        With the distance d to the first camera, a side with normal n moves towards a centre by at most the metres plus
+        d times the radians. The Gaussian's widening by the filter grows with the metres, too.
+        """
+        workspace = Workspace()
+        growth = 1 + 1.001 * selection.deviation * float(self._balls[4].max(initial=0)) + 1e-5
+        margins = 1.001 * growth * _MARGIN_METRES, 1.001 * _MARGIN_RADIANS
+        found = self._select(position, labels, num_layers, selection, workspace, threads, margins)
+        return _Selected(self, labels, num_layers, position.copy(), selection, *found, workspace)
+
     def _select(
         self,
         position: np.ndarray,
@@ -193,14 +271,20 @@ class DisplayScene:
         selection: Selection | None,
         workspace: Workspace,
         threads: int,
+        margins: tuple[float, float] = (0.0, 0.0),
     ) -> tuple[GaussianArrays, list[int]]:
-        """Copy the Gaussians in view, layer by layer in index order; returns them and the end of each layer."""
+        """Copy the Gaussians in view, layer by layer in index order; returns them and the end of each layer.
+
+        `margins` move the sides of the cone outwards, by metres and by radians.
+        """
         num, parts = len(self), _PARTS_PER_THREAD * threads
+        if len(labels) != num or not NO_LAYER <= labels.min(initial=NO_LAYER) <= labels.max(initial=-1) < num_layers:
+            raise ValueError(f"`labels` must hold {num} numbers from {NO_LAYER} to {num_layers - 1}")
         edges = np.linspace(0, num, parts + 1).astype(np.int64)
         marks, counts = workspace.array(num, np.int16), np.zeros((parts, num_layers), np.int64)
         normals = np.zeros((0, 3)) if selection is None else selection.normals
-        offsets = normals @ position
-        deviation, slack = (1.001 * selection.deviation, 1e-5) if selection and selection.bounded else (0.0, 1e-5)
+        offsets = normals @ position - margins[0]
+        deviation, slack = 1.001 * selection.deviation if selection and selection.bounded else 0.0, 1e-5 + margins[1]
         bounded = float(selection is not None and selection.bounded)
         parallel_for(
             partial(
@@ -403,6 +487,34 @@ def _blend_row(sums, weights, background, y, first, end, rgb, total, alpha_sum):
         rgb[2, x] = rgb[2, x] * scale + behind * background[2]
 
 
+def enlarge(image: UInt32[np.ndarray, "height width"], pixels: UInt32[np.ndarray, "large_height large_width"]) -> None:
+    """Write an image at a larger size, by bilinear interpolation between the centres of its pixels."""
+    places = []
+    for small, large in zip(image.shape, pixels.shape, strict=True):
+        place = np.clip((np.arange(large) + 0.5) * (small / large) - 0.5, 0, small - 1)
+        places.append((place * (1 << _FRACTION_BITS)).astype(np.int32))
+    work = partial(_enlarge_rows, image, *places, pixels)
+    with announce_compilation():
+        parallel_for(work, -(-pixels.shape[0] // _ROWS_PER_ITEM), thread_count())
+
+
+@kernel
+def _enlarge_rows(image, rows, columns, pixels, item):
+    height, width = image.shape
+    mixed = np.empty(width + 1, np.uint32)
+    for y in range(item * _ROWS_PER_ITEM, min((item + 1) * _ROWS_PER_ITEM, len(rows))):
+        upper, fraction = rows[y] >> _FRACTION_BITS, np.uint32(rows[y] & 255)
+        lower = min(upper + 1, height - 1)
+        for x in range(width):
+            mixed[x] = _mix(image[upper, x], image[lower, x], fraction)
+        mixed[width] = mixed[width - 1]
+        row = pixels[y]
+        for x in range(len(columns)):
+            place = load_scalar(columns, x)
+            left, right = place >> _FRACTION_BITS, np.uint32(place & 255)
+            store_scalar(row, x, _mix(load_scalar(mixed, left), load_scalar(mixed, left + 1), right))
+
+
 # --- a rotated view from cube faces ---
 
 
@@ -450,10 +562,6 @@ class PixelFaces:
         work = partial(_sample_rows, self.pixels, *focals, to_faces, bottom_up, pixels)
         with announce_compilation():
             parallel_for(work, -(-pixels.shape[0] // _ROWS_PER_ITEM), thread_count())
-
-
-_EVEN_BYTES = np.uint32(0x00FF00FF)
-_FRACTION_BITS = 8
 
 
 @kernel

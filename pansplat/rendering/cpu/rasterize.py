@@ -174,7 +174,7 @@ def set_tile_pixels(kind, columns, rows, rotation, left, top, centre, frame, is_
 
 
 @inline_kernel_no_refcount
-def _reset_transmittance(columns, rows, left, top, transmittance):
+def reset_transmittance(columns, rows, left, top, transmittance):
     """Set the transmittance to 1; to 0 for pixels outside the image, so that they count as finished."""
     width, height = len(columns), len(rows)
     for pixel in range(TILE_PIXELS):
@@ -403,7 +403,7 @@ def _rasterize_tiles(
     for tile in range(low, high):
         left, top = (tile % tiles_across) * TILE_SIZE, (first_row + tile // tiles_across) * TILE_SIZE
         tile_is_3d, pixels_are_3d = set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame), -1
-        _reset_transmittance(columns, rows, left, top, transmittance)
+        reset_transmittance(columns, rows, left, top, transmittance)
         tile_sums[:] = 0
         num_chunks = 0
         for first in range(starts[tile], starts[tile + 1], CHUNK_SIZE):

@@ -13,8 +13,10 @@ from pansplat.rendering.cpu.display import (
     DisplayScene,
     PixelFaces,
     Selection,
+    SelectionCache,
     blend_layers,
     blend_to_pixels,
+    enlarge,
 )
 from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.rasterize import RasterOptions, rasterize
@@ -56,13 +58,12 @@ def pose():
     return pose
 
 
-def draw(display, pose, labels, layers, selection=None, size=SIZE, focal=FOCAL):
+def draw(display, pose, labels, layers, selection=None, size=SIZE, focal=FOCAL, cache=None):
     plane = ImagePlane(size, pose[:3, :3], focal)
-    labels = np.asarray(labels, np.int16)
+    labels = labels if labels.dtype == np.int16 else labels.astype(np.int16)
     position = pose[:3, 3].numpy()
-    return display.rasterize(
-        position, plane, labels, layers, RasterOptions(), selection=selection, min_transmittance=1e-7
-    )
+    chosen = {"selection": selection, "cache": cache}
+    return display.rasterize(position, plane, labels, layers, RasterOptions(), **chosen, min_transmittance=1e-7)
 
 
 def frustum(pose, scale=1.0):
@@ -91,8 +92,35 @@ def test_selection_does_not_change_the_image_and_leaves_gaussians_out(scene, dis
     assert not np.array_equal(whole.sums, narrow.sums), "the bound is not infinite"
 
 
+def test_a_selection_that_serves_a_moving_camera_does_not_change_its_images(display, pose):
+    labels, cache, random = np.zeros(600, np.int16), SelectionCache(), np.random.default_rng(0)
+    draw(display, pose, labels, 1, frustum(pose), cache=cache)
+    first = cache.selected
+    for step in range(12):
+        moved = pose.clone()
+        direction, axis = (torch.from_numpy(random.normal(size=3)) for _ in range(2))
+        moved[:3, 3] += 0.149 * direction / direction.norm()
+        half = torch.cat((torch.ones(1), 0.5 * 0.04 * axis / axis.norm())).double()
+        moved[:3, :3] = rotations_from_quats(half) @ pose[:3, :3]
+        image = draw(display, moved, labels, 1, frustum(moved), cache=cache)
+        assert cache.selected is first, "not selected again"
+        assert np.array_equal(image.sums, draw(display, moved, labels, 1, frustum(moved)).sums), step
+    assert len(first.gaussians.means) < 0.7 * len(display)
+    for changed, selected in ((moved @ moved, labels), (pose, labels.copy())):
+        image = draw(display, changed, selected, 1, frustum(changed), cache=cache)
+        assert cache.selected is not first, "too far away, or other labels"
+        assert np.array_equal(image.sums, draw(display, changed, selected, 1, frustum(changed)).sums)
+        first = cache.selected
+
+
 def test_gaussians_without_a_layer_are_not_drawn(display, pose):
     assert not draw(display, pose, np.full(600, NO_LAYER), 1).sums.any()
+
+
+@pytest.mark.parametrize("labels", [np.full(600, 2), np.full(600, -2), np.zeros(599)])
+def test_labels_without_a_layer_are_refused(labels, display, pose):
+    with pytest.raises(ValueError, match="must hold 600 numbers from -1 to 1"):
+        draw(display, pose, labels, 2)
 
 
 def test_a_direct_panorama_has_the_axes_of_its_plane(scene, display, pose):
@@ -133,6 +161,16 @@ def test_pixels_are_the_blended_layers_rounded(scene, display, pose, difference,
     bytes_ = pixels.view(np.uint8).reshape(*SIZE, 4)[:: -1 if bottom_up else 1]
     assert np.abs(bytes_[..., :3] - 255 * np.clip(color[..., :3], 0, 1)).max() <= 0.51
     assert (bytes_[..., 3] == 255).all()
+
+
+@pytest.mark.parametrize("size", [(14, 20), (16, 33), (7, 11)])
+def test_enlarged_images_interpolate_between_pixel_centres(size):
+    image = np.random.default_rng(0).integers(0, 2**32, (7, 11), dtype=np.uint32)
+    pixels = np.empty(size, np.uint32)
+    enlarge(image, pixels)
+    channels = torch.from_numpy(image.view(np.uint8).reshape(7, 11, 4)).permute(2, 0, 1).double()
+    expected = torch.nn.functional.interpolate(channels[None], size, mode="bilinear")[0].permute(1, 2, 0).numpy()
+    assert np.abs(pixels.view(np.uint8).reshape(*size, 4) - expected).max() <= 3, "positions are rounded to 1/256"
 
 
 def test_faces_sampled_by_their_own_cameras_are_unchanged():

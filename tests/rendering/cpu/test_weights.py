@@ -1,0 +1,87 @@
+"""Stored blending weights: products with colours and with images, against the float64 reference."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from pansplat.gaussians.scene import Gaussians
+from pansplat.rendering.cpu import weights as weights_module
+from pansplat.rendering.cpu.weights import StoredWeights
+from pansplat.rendering.weights import compute_blending_weights
+
+SIZE = (40, 80)
+
+
+@pytest.fixture
+def scene(make_scene: Callable[..., Gaussians]) -> Gaussians:
+    return make_scene(600, scale=0.15, degree=0, seed=1).to(dtype=torch.float32)
+
+
+@pytest.fixture
+def values() -> Tensor:
+    return torch.rand(600, 3, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.fixture
+def image() -> Tensor:
+    return torch.randn(3, *SIZE, generator=torch.Generator().manual_seed(2))
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_products_equal_the_reference(channels, scene, pose, values, image):
+    stored = StoredWeights(scene, pose, SIZE)
+    expected = compute_blending_weights(scene.to(dtype=torch.float64), pose, SIZE)
+    values, image = values[:, :channels], image[:channels]
+    blended = expected.blend(values.double())
+    assert blended.max() > 0.5
+    torch.testing.assert_close(stored.blend(values).double(), blended, rtol=0, atol=2e-6)
+    totals = expected.accumulate(image.double())
+    error = (stored.accumulate(image).double() - totals).norm() / totals.norm()
+    assert error < 1e-5
+
+
+def test_gaussians_behind_opaque_ones_have_no_weight(scene, pose, image):
+    opaque = dataclasses.replace(scene, opacities=torch.ones_like(scene.opacities))
+    front = dataclasses.replace(opaque, means=pose[:3, 3].float() + 0.2 * (scene.means - pose[:3, 3].float()))
+    both = Gaussians.cat([front, front, scene])
+    totals = StoredWeights(both, pose, SIZE).accumulate(image.abs())
+    alone = StoredWeights(scene, pose, SIZE).accumulate(image.abs())
+    assert totals.isfinite().all()
+    assert totals[1200:].sum() < 0.05 * alone.sum()
+
+
+def test_bands_that_are_not_stored_give_the_same_products(scene, pose, values, image, monkeypatch):
+    whole = StoredWeights(scene, pose, SIZE)
+    expected = whole.blend(values), whole.accumulate(image)
+    size = weights_module.MAX_STORED_PAIRS - whole._free
+    for stored_pairs, num_stored in ((0, 0), (int(0.7 * size), 1)):
+        monkeypatch.setattr(weights_module, "MAX_BAND_INTERSECTIONS", 20)
+        monkeypatch.setattr(weights_module, "MAX_STORED_PAIRS", stored_pairs)
+        banded = StoredWeights(scene, pose, SIZE)
+        for _ in range(2):
+            assert torch.equal(banded.blend(values), expected[0])
+            torch.testing.assert_close(banded.accumulate(image), expected[1], rtol=1e-4, atol=1e-4)
+        assert (len(banded._stored), len(banded._bands)) == (num_stored, 2)
+
+
+def test_the_number_of_threads_changes_no_bit(scene, pose, values, image):
+    threads, runs = torch.get_num_threads(), []
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            stored = StoredWeights(scene, pose, SIZE)
+            runs.append((stored.blend(values), stored.accumulate(image)))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(*pair) for pair in zip(*runs, strict=True))
+
+
+def test_no_gaussians_give_a_black_image(scene, pose, image):
+    stored = StoredWeights(scene.select(torch.zeros(600, dtype=torch.bool)), pose, SIZE)
+    assert not stored.blend(torch.empty(0, 3)).any()
+    assert stored.accumulate(image).shape == (0, 3)
