@@ -27,11 +27,10 @@ _FIRST_TOLERANCE = math.radians(3)
 _SEARCH_TOLERANCE = math.radians(1.5)
 _LARGEST_TILT = math.radians(20)  # of the camera
 _MIN_SUPPORT, _MIN_CONTRAST = 12, 2.5  # segments of an axis, also relative to the number by chance
-_ROTATION_NOISE = (
-    math.radians(0.45),
-    math.radians(0.7),
-)  # of the relative rotation: about horizontal axes, about gravity
-_LARGEST_RESIDUAL = 5.0  # of a rotation that the axes are taken to determine, in the noise's unit
+_LONG = math.radians(10)  # segments whose scatter measures the noise of the axes: pixels hardly matter
+_LEAST_NOISE, _LARGEST_NOISE = math.radians(0.03), math.radians(0.26)  # of the normals of long segments
+_TILT_NOISE, _YAW_NOISE = 0.8, 1.35  # of the relative rotation about horizontal axes and gravity, in this noise
+_LARGEST_RESIDUAL = 7.0  # of a rotation that the axes are taken to determine, in the noise's unit
 _PARALLEL = math.radians(1.8)  # difference of parallel axes
 _COMPASS_NOISE, _COMPASS_SHARE = math.radians(20), 0.6  # of headings; their prior probability to be right
 _AGREEMENT = 0.9, 0.06  # prior probability of axes of one building, and of upright cameras in different ones
@@ -45,12 +44,14 @@ class SceneAxes:
         axes: orthonormal, right-handed.
         has_down: whether enough vertical edges determine the first axis.
         has_walls: whether enough horizontal edges determine the other two.
+        noise: standard deviation of the normals of long edges, radians: stitching, and edges that are not parallel.
         heading: compass direction of the picture's centre, radians clockwise from north, if the metadata has it.
     """
 
     axes: Float[Array, "3 3"]
     has_down: bool
     has_walls: bool
+    noise: float = _LARGEST_NOISE
     heading: float | None = None
 
     @property
@@ -85,7 +86,11 @@ def find_axes(image: UInt8[Array, "height width"]) -> SceneAxes:
     by_chance = 2.5 * _NOISE * len(normals)
     is_clear = support > max(_MIN_SUPPORT, _MIN_CONTRAST * by_chance)
     weak = support[1:].sum() > max(1.5 * _MIN_SUPPORT, 2 * _MIN_CONTRAST * by_chance)
-    return SceneAxes(axes, bool(is_clear[0]), bool(is_clear[0] and weak))
+    scatter, noise = np.abs(residual[(lengths > _LONG) & (np.abs(residual) < 3 * _NOISE)]), _LARGEST_NOISE
+    if len(scatter) >= _MIN_SUPPORT:
+        # Edges that are parallel to no wall are among them: a large scatter states little about stitching.
+        noise = float(np.clip(1.48 * np.median(scatter), _LEAST_NOISE, _LARGEST_NOISE))
+    return SceneAxes(axes, bool(is_clear[0]), bool(is_clear[0] and weak), noise)
 
 
 def _segment_normals(image: UInt8[Array, "height width"]) -> tuple[Float[Array, "n 3"], Float[Array, "n"]]:
@@ -137,7 +142,7 @@ def with_hints(axes: SceneAxes, down: Float[Array, "3"] | None, heading: float |
         return replace(axes, heading=heading)
     wall = np.cross(down, axes.axes[2])
     wall /= np.linalg.norm(wall)
-    return SceneAxes(np.stack((down, wall, np.cross(down, wall))), True, False, heading)
+    return SceneAxes(np.stack((down, wall, np.cross(down, wall))), True, False, heading=heading)
 
 
 def relative_rotations(first: SceneAxes, second: SceneAxes) -> list[Float[Array, "3 3"]]:
@@ -169,6 +174,12 @@ class RotationPrior:
         """Whether both panoramas determine the walls."""
         return self.first.has_walls and self.second.has_walls
 
+    @property
+    def noise(self) -> tuple[float, float]:
+        """Standard deviations of the relative rotation about horizontal axes and about gravity, radians."""
+        both = math.hypot(self.first.noise, self.second.noise)
+        return _TILT_NOISE * both, _YAW_NOISE * both
+
     def residual(self, rotation: Float[Array, "3 3"]) -> tuple[Float[Array, "n"], Float[Array, "n 3"]] | None:
         """Tilt (3) and, with walls, yaw (1) against the axes in units of their noise, and the derivative by rotation.
 
@@ -177,17 +188,18 @@ class RotationPrior:
         if not self.has_down:
             return None
         turned, down = rotation @ self.first.axes[0], self.second.axes[0]
-        tilt = np.cross(down, turned) / _ROTATION_NOISE[0]
-        derivative = ((down @ turned) * np.eye(3) - np.outer(turned, down)) / _ROTATION_NOISE[0]
+        tilt_noise, yaw_noise = self.noise
+        tilt = np.cross(down, turned) / tilt_noise
+        derivative = ((down @ turned) * np.eye(3) - np.outer(turned, down)) / tilt_noise
         if np.linalg.norm(tilt) > _LARGEST_RESIDUAL or down @ turned < 0:
             return None
         if self.has_walls:
             options = [option.T @ rotation for option in relative_rotations(self.first, self.second)]
             nearest = min(options, key=lambda option: float(rotation_angle(option)))
-            yaw = float(self.first.axes[0] @ rotation_log(nearest)) / _ROTATION_NOISE[1]
+            yaw = float(self.first.axes[0] @ rotation_log(nearest)) / yaw_noise
             if abs(yaw) < _LARGEST_RESIDUAL:
                 tilt = np.append(tilt, yaw)
-                derivative = np.concatenate((derivative, turned[None] / _ROTATION_NOISE[1]))
+                derivative = np.concatenate((derivative, turned[None] / yaw_noise))
         return tilt, derivative
 
     def confirms(self, rotation: Float[Array, "3 3"]) -> bool:
@@ -203,12 +215,12 @@ class RotationPrior:
         if not self.has_down:
             return heading
         tilt = math.acos(float(np.clip(self.second.axes[0] @ rotation @ self.first.axes[0], -1, 1)))
-        sigma = math.sqrt(2) * _ROTATION_NOISE[0]
+        sigma = math.sqrt(2) * self.noise[0]
         upright = 2 / sigma**2 * math.exp(-0.5 * (tilt / sigma) ** 2)
         walls, share, others = 0.0, *_AGREEMENT
         if self.has_walls:
             nearest = min(rotation_angle(option.T @ rotation) for option in relative_rotations(self.first, self.second))
-            sigma = 1.5 * _ROTATION_NOISE[1]
+            sigma = 1.5 * self.noise[1]
             walls = 2 * math.pi**2 / ((2 * math.pi) ** 1.5 * sigma**3) * math.exp(-0.5 * (nearest / sigma) ** 2)
         else:
             share, others = 0.0, sum(_AGREEMENT)

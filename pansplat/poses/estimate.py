@@ -6,7 +6,7 @@ import functools
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -56,6 +56,7 @@ _FLOOR_PAIRS = 8
 _LARGEST_SLOPE = 3.0  # of the way between two cameras of a weak pair, degrees
 _CONFIRMING_CONTRAST = 1.6  # of the floor that confirms a weak pair
 _MIRROR_EVIDENCE = 60.0  # expected number of right matches with a mirror image
+_MIRROR_RATIO = 1.5  # of that number to the one with the picture itself; symmetric things match either way
 _MAX_BASELINE = 1e9  # metres
 _LARGEST_NEAR = 0.6  # metres; the depth range is not narrower than that of rooms
 _MIN_FAR = 6.0
@@ -152,7 +153,7 @@ def estimate_poses(
     pixels, unplaced = _read_images(paths, hints)
     kept = [n for n in range(len(paths)) if n not in unplaced]
     if len(kept) < 2:
-        raise _no_poses(paths, unplaced)
+        raise _no_poses(paths, unplaced | {n: "no other panorama is left" for n in kept})
     with one_thread():  # panoramas and pairs are divided among threads
         views = _describe_views(paths, pixels, hints, kept, report)
         relations = _relate_views(views, seed, report)
@@ -210,7 +211,7 @@ def _read_images(
         try:
             image = read_panorama(path, _working_height(path))[0].numpy()
         except InputError as error:
-            reasons[n] = str(error)
+            reasons[n] = str(error).removeprefix(f"{path}: ").rstrip(".")
             continue
         grey = cv2.cvtColor((image.transpose(1, 2, 0) * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
         small = cv2.resize(grey, (128, 64), interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -271,11 +272,12 @@ def _describe_views(
 def _relate_views(views: Sequence[_View], seed: int, report: Progress) -> dict[Pair, RelativePose]:
     """Relative poses of the pairs that have most in common."""
     pairs = list(itertools.combinations(range(len(views)), 2))
+    overlap: dict[Pair, float] = {}
     if len(views) > _FEW:
         report("comparing all pairs", 0.4)
         with worker_threads() as pool:
-            quick = pool.map(lambda pair: _quick_overlap(views[pair[0]], views[pair[1]]), pairs)
-            overlap = dict(zip(pairs, quick, strict=True))
+            quick = pool.map(lambda pair: _quick_overlap(views[pair[0]].features, views[pair[1]].features), pairs)
+            overlap.update(zip(pairs, quick, strict=True))
         chosen = set()
         for view in range(len(views)):
             own = sorted((pair for pair in pairs if view in pair), key=lambda pair: -overlap[pair])
@@ -291,6 +293,8 @@ def _relate_views(views: Sequence[_View], seed: int, report: Progress) -> dict[P
         )
         if not relation.is_reliable:
             return relation
+        if _is_mirrored(first, second, overlap.get(pair), relation.score):
+            return replace(relation, problem="one of both looks mirrored left to right")
         further = match_features(first.turned, second.turned)
         indices = further.indices + np.array((len(first.features), len(second.features)))
         every = Matches(np.concatenate((matches.indices, indices)), np.concatenate((matches.ratio, further.ratio)))
@@ -329,23 +333,36 @@ def _describe_mirrored(
     view: int, views: Sequence[_View], placed: Sequence[int], paths: Sequence[Path], kept: Sequence[int]
 ) -> str | None:
     """The problem of a panorama whose mirror image fits another one; None if it does not."""
-    mirrored = views[view].features.mirrored()
     others = placed or [other for other in range(len(views)) if other != view]
     for other in sorted(others, key=lambda v: abs(v - view))[:3]:
-        features = views[other].features
-        matches = match_features(mirrored, features)
-        if match_priors(matches.ratio).sum() > _MIRROR_EVIDENCE:
-            relation = estimate_relative_pose(mirrored, features, matches)
-            if relation.is_reliable:
-                if placed:
-                    return "it looks mirrored left to right; flip it"
-                return f"this one or {paths[kept[other]].name} looks mirrored left to right; flip one"
+        if _is_mirrored(views[view], views[other]):
+            if placed:
+                return "it looks mirrored left to right; flip it"
+            return f"this one or {paths[kept[other]].name} looks mirrored left to right; flip one"
     return None
 
 
-def _quick_overlap(first: _View, second: _View) -> float:
+def _is_mirrored(first: _View, second: _View, overlap: float | None = None, score: float = 0.0) -> bool:
+    """Whether the mirror image of one panorama has more in common with the other one than it has itself.
+
+    Args:
+        overlap: `_quick_overlap` of both, if known.
+        score: of the pose of both; that of the mirror image must be larger.
+    """
+    mirrored = first.features.mirrored()
+    evidence = _quick_overlap(mirrored, second.features)
+    if evidence < _MIRROR_RATIO * (_quick_overlap(first.features, second.features) if overlap is None else overlap):
+        return False
+    matches = match_features(mirrored, second.features)
+    if match_priors(matches.ratio).sum() < _MIRROR_EVIDENCE:
+        return False
+    found = estimate_relative_pose(mirrored, second.features, matches)
+    return found.is_reliable and found.score > score
+
+
+def _quick_overlap(first: Features, second: Features) -> float:
     """Expected number of right matches among the strongest features."""
-    matches = match_features(first.features.strongest(_QUICK_FEATURES), second.features.strongest(_QUICK_FEATURES))
+    matches = match_features(first.strongest(_QUICK_FEATURES), second.strongest(_QUICK_FEATURES))
     return float(match_priors(matches.ratio).sum())
 
 
@@ -371,7 +388,10 @@ def _find_scale(
     if not floor.is_found():
         typical = float(np.median([np.linalg.norm(centres[i] - centres[j]) for i, j in pairs[: len(files) - 1]]))
         return 1 / typical, "unknown (no floor was found); neighbouring cameras are taken as 1 m apart, see --baseline"
-    return camera_height / floor.height, f"cameras {camera_height:g} m over the floor"
+    source = f"cameras {camera_height:g} m over the floor"
+    if floor.lower is not None:
+        source += f" (uncertain: a plane {floor.lower:.1f} times as deep may be the floor, see --baseline)"
+    return camera_height / floor.height, source
 
 
 def _find_file(name: Path | str, files: Sequence[Path]) -> int:

@@ -47,11 +47,13 @@ class Features:
     Attributes:
         bearings: unit directions in the camera's frame.
         descriptors: unit vectors.
+        sizes: diameters of the described places, pixels; the bearing of a large one is less exact.
         pixel: angle of a pixel at the horizon, radians.
     """
 
     bearings: Float[Array, "feature 3"]
     descriptors: Float[Array, "feature 128"]
+    sizes: Float[Array, "feature"]
     pixel: float
 
     def __len__(self) -> int:
@@ -59,12 +61,12 @@ class Features:
 
     def strongest(self, count: int) -> Features:
         """The first `count` features."""
-        return Features(self.bearings[:count], self.descriptors[:count], self.pixel)
+        return Features(self.bearings[:count], self.descriptors[:count], self.sizes[:count], self.pixel)
 
     def joined(self, other: Features) -> Features:
         """These features, then those of `other`."""
-        bearings = np.concatenate((self.bearings, other.bearings))
-        return Features(bearings, np.concatenate((self.descriptors, other.descriptors)), self.pixel)
+        pairs = ((self.bearings, other.bearings), (self.descriptors, other.descriptors), (self.sizes, other.sizes))
+        return Features(*(np.concatenate(pair) for pair in pairs), self.pixel)
 
     def mirrored(self) -> Features:
         """The features of the panorama that is mirrored left to right.
@@ -73,7 +75,8 @@ class Features:
         reverses the order across it, and the sense of the directions.
         """
         cells = self.descriptors.reshape(-1, 4, 4, 8)[:, ::-1, :, (0, 7, 6, 5, 4, 3, 2, 1)]
-        return Features(self.bearings * (-1.0, 1.0, 1.0), np.ascontiguousarray(cells).reshape(-1, 128), self.pixel)
+        descriptors = np.ascontiguousarray(cells).reshape(-1, 128)
+        return Features(self.bearings * (-1.0, 1.0, 1.0), descriptors, self.sizes, self.pixel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +93,10 @@ class Matches:
 
     def __len__(self) -> int:
         return len(self.indices)
+
+    def best(self, count: int) -> Matches:
+        """The first `count` matches."""
+        return Matches(self.indices[:count], self.ratio[:count])
 
 
 def detect_features(
@@ -112,7 +119,7 @@ def detect_features(
         image = cv2.equalizeHist(image)
     focal = image.shape[1] / (2 * math.pi)  # a face has the panorama's resolution at its centre
     sift = cv2.SIFT_create(contrastThreshold=_CONTRAST, edgeThreshold=_EDGE)
-    bearings, descriptors, strengths = [np.empty((0, 3))], [np.empty((0, 128), np.float32)], [np.empty(0)]
+    bearings, descriptors, keypoints = [np.empty((0, 3))], [np.empty((0, 128), np.float32)], [np.empty((0, 2))]
     for face, rotation in enumerate(rotations[:faces]):
         pixels = render_face(image, rotation, focal)
         margin = int(len(pixels) / 2 - focal) - 1  # what lies outside the face of a cube needs no descriptors
@@ -129,11 +136,13 @@ def detect_features(
             own &= _sample_mask(mask, rays)
         bearings.append(rays[own])
         descriptors.append(found[own])
-        strengths.append(np.array([point.response for point in points])[own])
-    order = np.argsort(-np.concatenate(strengths), kind="stable")[:count]
+        keypoints.append(np.array([(point.response, point.size) for point in points])[own])
+    strength, sizes = np.concatenate(keypoints).T
+    order = np.argsort(-strength, kind="stable")[:count]
     descriptor = np.concatenate(descriptors)[order]
     descriptor = np.sqrt(descriptor / np.maximum(descriptor.sum(axis=1, keepdims=True), 1e-9))
-    return Features(np.concatenate(bearings)[order], descriptor.astype(np.float32), 2 * math.pi / image.shape[1])
+    pixel = 2 * math.pi / image.shape[1]
+    return Features(np.concatenate(bearings)[order], descriptor.astype(np.float32), sizes[order], pixel)
 
 
 def render_face(image: UInt8[Array, "height width"], rotation: Array, focal: float) -> UInt8[Array, "side side"]:

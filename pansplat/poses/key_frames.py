@@ -17,7 +17,7 @@ from pansplat.poses.features import Features, detect_features, match_features
 from pansplat.poses.two_view import estimate_relative_pose
 
 _CANDIDATES_PER_FRAME = 4  # frames that are decoded for each key frame; the sharpest of them is used
-_SMALL = 512  # height of the frames in which parallax is measured, pixels
+_SMALL, _FEATURES, _MATCHES = 512, 2000, 300  # to measure parallax: height of the frames, pixels; the best of each
 _MIN_PARALLAX = 0.05  # radians between key frames
 
 
@@ -47,10 +47,12 @@ def extract_key_frames(path: Path, folder: Path, count: int, progress: Progress 
             continue
         frames = video.read([int(number) for number in group])
         number, frame = max(frames.items(), key=lambda item: _sharpness(item[1]))
-        small = cv2.resize(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), (2 * _SMALL, _SMALL), interpolation=cv2.INTER_AREA)
-        features = detect_features(small, count=2000)
+        grey, height = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), min(_SMALL, len(frame))
+        small = cv2.resize(grey, (2 * height, height), interpolation=cv2.INTER_AREA)
+        features = detect_features(small, count=_FEATURES)
         if last is not None:
-            relation = estimate_relative_pose(last, features, match_features(last, features), NO_PRIOR)
+            matches = match_features(last, features).best(_MATCHES)
+            relation = estimate_relative_pose(last, features, matches, NO_PRIOR)
             if len(relation.indices) >= 20 and relation.parallax < _MIN_PARALLAX:
                 continue
         last = features

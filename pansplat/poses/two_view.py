@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 
 from pansplat.poses.axes import NO_PRIOR, RotationPrior, relative_rotations
@@ -39,13 +39,16 @@ _RATIOS, _PRIORS = (0.5, 0.65, 0.75, 0.8, 0.85, 0.9, 1.0), (0.8, 0.6, 0.3, 0.15,
 _NOISE_PIXELS, _MIN_NOISE = 0.45, 8e-4  # standard deviation of a right match: pixels at the horizon; radians
 _WIDE_SHARE, _WIDE = 0.3, 3.0  # of right matches with larger errors; their standard deviation in that of the others
 _MAX_ANGLE = 4.0  # largest residual of a right match, in the wide standard deviation
-_DISTORTION, _DISTORTION_LENGTH = (
-    1e-3,
-    0.15,
-)  # of stitched panoramas: standard deviation and correlation length, radians
+_DISTORTION, _DISTORTION_LENGTH = 1e-3, 0.15  # of stitched panoramas: deviation and correlation length, radians
 _TAIL = 2.0  # degrees of freedom of the distribution of a match's own error
-_MAX_POLISHED = 1000  # matches
-_POLISH_FACTORS = 1.5, 1.0  # of the noise, by which matches are chosen
+_MAX_POLISHED, _MIN_POLISHED, _MIN_PROBABILITY = 1000, 8, 0.2  # matches of the polish; probability of each to be right
+_POLISH_NOISE, _POLISH_SIZE = 0.7, 7.0  # noise of a small feature in that of the search; size of one with 1.4 times it
+_POLISH_WINDOW = 0.035  # largest residual, radians; what lies beyond the noise gives the density of wrong matches
+_POLISH_FACTORS, _POLISH_STEPS = (4, 2, 1), 4  # of the noise; steps with each
+_POLISH_RATIOS = (0.6, 0.7, 0.8, 0.85, 0.9, 0.95)  # limits of the groups of matches
+_POLISH_SHARES = np.array((0.9, 0.8, 0.6, 0.4, 0.25, 0.12, 0.06))  # of right matches in the window, a priori
+_POLISH_WEIGHT = 4.0  # of these shares, in matches
+_CALIBRATION = 1.5, 80.0  # factor of formal standard deviations: least one; that times the number of places
 _LEVEL = [2, 0, 1]  # order of the axes in a levelled camera: x, y down, z
 _MAX_MATCHES = 2500
 _TOP_SETS = (40, 80, 160, 320, 640, 2500)  # best matches from which samples are drawn
@@ -101,7 +104,7 @@ def match_priors(ratio: Float[Array, "match"]) -> Float[Array, "match"]:
     return np.interp(ratio, _RATIOS, _PRIORS)
 
 
-def _density(angle: Array, noise: float) -> Array:
+def _density(angle: Array, noise: float | Array) -> Array:
     """Probability density of a right match's epipolar angle in [0, pi/2], 1/radian."""
     narrow = np.exp(-0.5 * (angle / noise) ** 2) / noise
     wide = np.exp(-0.5 * (angle / (_WIDE * noise)) ** 2) / (_WIDE * noise)
@@ -128,14 +131,16 @@ def evaluate(
     front has twice the likelihood ratio.
     """
     angle = np.abs(epipolar_angles(a, b, rotation, translation))
-    depths = two_view_depths(a, b, rotation, translation)
-    g = a @ rotation.T
-    parallax = angle_between(g, b)
-    behind = (depths < 0).any(axis=1) & (parallax > 3 * noise)
-    ratio = np.where(behind, 0.0, 2 * _likelihood_ratio(angle, noise))
+    ratio = np.where(_are_behind(a, b, rotation, translation, noise), 0.0, 2 * _likelihood_ratio(angle, noise))
     total = 1 - prior + prior * ratio
     score = float(np.log(total).sum()) + axes.score(rotation)
     return Hypothesis(rotation, translation, score, prior * ratio / total)
+
+
+def _are_behind(a: Array, b: Array, rotation: Array, translation: Array, noise: float | Array) -> Bool[Array, "match"]:
+    """Whether the rays of each match meet behind a camera; parallel rays do not."""
+    depths = two_view_depths(a, b, rotation, translation)
+    return (depths < 0).any(axis=1) & (angle_between(a @ rotation.T, b) > 3 * noise)
 
 
 def refine_pose(
@@ -151,20 +156,9 @@ def refine_pose(
     rotation, translation, best = start.rotation, start.translation, start
     for _ in range(steps):
         normal, gradient = _normal_equations(a, b, best.probability, rotation, translation, noise)
-        prior_term = axes.residual(rotation)
-        if prior_term is not None:
-            residual, jacobian = prior_term
-            normal[:3, :3] += jacobian.T @ jacobian
-            gradient[:3] += jacobian.T @ residual
-        try:
-            step = np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(5), -gradient)
-        except np.linalg.LinAlgError:
+        rotation, translation, step = _gauss_newton(normal, gradient, rotation, translation, axes)
+        if not np.abs(step).max() < 0.5:
             break
-        if not np.isfinite(step).all() or np.abs(step).max() > 0.5:
-            break
-        rotation = rotation_exp(step[:3]) @ rotation
-        translation = translation + _tangent_basis(translation) @ step[3:]
-        translation = translation / np.linalg.norm(translation)
         found = evaluate(a, b, prior, rotation, translation, noise, axes)
         improved = found.score > best.score + 1e-3
         if found.score > best.score:
@@ -172,6 +166,26 @@ def refine_pose(
         if not improved:
             break
     return best
+
+
+def _gauss_newton(
+    hessian: Float[Array, "5 5"], gradient: Float[Array, "5"], rotation: Array, translation: Array, axes: RotationPrior
+) -> tuple[Float[Array, "3 3"], Float[Array, "3"], Float[Array, "5"]]:
+    """The pose after one step, and the step; it is NaN if the matches do not determine the pose.
+
+    The prior of the axes is added to the Hessian and the gradient.
+    """
+    prior_term = axes.residual(rotation)
+    if prior_term is not None:
+        residual, jacobian = prior_term
+        hessian[:3, :3] += jacobian.T @ jacobian
+        gradient[:3] += jacobian.T @ residual
+    try:
+        step = np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(5), -gradient)
+    except np.linalg.LinAlgError:
+        step = np.full(5, np.nan)
+    translation = translation + _tangent_basis(translation) @ step[3:]
+    return rotation_exp(step[:3]) @ rotation, translation / np.linalg.norm(translation), step
 
 
 def _tangent_basis(direction: Float[Array, "3"]) -> Float[Array, "3 2"]:
@@ -210,11 +224,11 @@ def _linearise(a: Array, b: Array, rotation: Array, translation: Array) -> _Line
 
 
 def _normal_equations(
-    a: Array, b: Array, probability: Array, rotation: Array, translation: Array, noise: float
+    a: Array, b: Array, probability: Array, rotation: Array, translation: Array, noise: float | Array
 ) -> tuple[Float[Array, "5 5"], Float[Array, "5"]]:
     """Hessian and gradient of the squared angles in the noise's unit, by rotation (3) and direction (2)."""
     linear = _linearise(a, b, rotation, translation)
-    jacobian = linear.by_pose / noise
+    jacobian = linear.by_pose / np.broadcast_to(noise, len(a))[:, None]
     angle = np.abs(linear.angle)
     # Weight of the wide component of the noise is smaller, as in an EM step for a mixture of two Gaussians.
     narrow = (1 - _WIDE_SHARE) * np.exp(-0.5 * (angle / noise) ** 2)
@@ -229,8 +243,9 @@ def polish_pose(
     b: Float[Array, "match 3"],
     rotation: Float[Array, "3 3"],
     translation: Float[Array, "3"],
-    noise: float,
+    noise: float | Float[Array, "match"],
     axes: RotationPrior = NO_PRIOR,
+    weigh: Callable[[Array, Array], Array] | None = None,
     steps: int = 10,
 ) -> tuple[Float[Array, "3 3"], Float[Array, "3"], tuple[float, float]]:
     """The pose by generalised least squares over right matches, and the standard deviations of rotation and direction.
@@ -238,42 +253,45 @@ def polish_pose(
     Stitching distorts a panorama smoothly: matches on one object share an error, which their number does not reduce.
     The covariance of the residuals has this distortion as a random field on each sphere, beside the independent error
     of each match, whose heavy tails reduce the weight of a match with a large residual.
+
+    Args:
+        noise: standard deviations of the epipolar angles, radians.
+        weigh: the probability of each match to be right under a pose; None if all are.
     """
-    if len(a) < 5:
-        return rotation, translation, (math.inf, math.inf)
-    correlation = [np.exp((x @ x.T - 1) / _DISTORTION_LENGTH**2) for x in (a, b)]
-    start, hessian = (rotation, translation), np.eye(5)
+    start, noise = (rotation, translation), np.broadcast_to(noise, len(a))
+    hessian = np.eye(5)
     for _ in range(steps):
-        linear = _linearise(a, b, rotation, translation)
-        covariance = sum(
-            _DISTORTION**2 * (d @ d.T) * c
-            for d, c in zip((linear.by_first, linear.by_second), correlation, strict=True)
-        )
-        covariance[np.diag_indices(len(a))] += noise**2 + linear.angle**2 / _TAIL
+        probability = np.ones(len(a)) if weigh is None else weigh(rotation, translation)
+        count = min(int((probability > _MIN_PROBABILITY).sum()), _MAX_POLISHED)
+        used = np.argsort(-probability, kind="stable")[:count]
+        if count < 5:
+            return *start, (math.inf, math.inf)
+        linear = _linearise(a[used], b[used], rotation, translation)
+        covariance = np.diag((noise[used] ** 2 + linear.angle**2 / _TAIL) / probability[used])
+        for x, d in ((a[used], linear.by_first), (b[used], linear.by_second)):
+            covariance += _DISTORTION**2 * (d @ d.T) * np.exp((x @ x.T - 1) / _DISTORTION_LENGTH**2)
         right = np.concatenate((linear.by_pose, linear.angle[:, None]), axis=1)
         solved = linear.by_pose.T @ np.linalg.solve(covariance, right)
-        hessian, gradient = solved[:, :5], solved[:, 5]
-        prior_term = axes.residual(rotation)
-        if prior_term is not None:
-            residual, jacobian = prior_term
-            hessian[:3, :3] += jacobian.T @ jacobian
-            gradient[:3] += jacobian.T @ residual
-        step = np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(5), -gradient)
-        rotation = rotation_exp(step[:3]) @ rotation
-        translation = translation + _tangent_basis(translation) @ step[3:]
-        translation = translation / np.linalg.norm(translation)
-        if not np.isfinite(step).all() or np.abs(step).max() > 0.2:  # too few matches determine it
+        hessian, gradient = solved[:, :5].copy(), solved[:, 5].copy()
+        rotation, translation, step = _gauss_newton(hessian, gradient, rotation, translation, axes)
+        if not np.abs(step).max() < 0.2:  # too few matches determine it
             return *start, _deviations(hessian)
-        if np.abs(step).max() < 1e-7:
+        if np.abs(step).max() < 1e-6:
             break
     return rotation, translation, _deviations(hessian)
 
 
 def _deviations(hessian: Float[Array, "5 5"]) -> tuple[float, float]:
-    """Standard deviations of rotation and direction, radians."""
+    """Formal standard deviations of rotation and direction, radians."""
     values, vectors = np.linalg.eigh(hessian)
     variance = (vectors**2 / np.maximum(values, 1e-12)).sum(axis=1)
     return math.sqrt(variance[:3].sum()), math.sqrt(variance[3:].sum())
+
+
+def _calibrate(deviations: tuple[float, float], places: float) -> tuple[float, float]:
+    """The standard deviations for which errors on real panoramas have a root mean square of 1."""
+    factor = max(_CALIBRATION[0], _CALIBRATION[1] / max(places, 1.0))
+    return factor * deviations[0], factor * deviations[1]
 
 
 def search_hypotheses(
@@ -407,8 +425,8 @@ class RelativePose:
         margin: how much the score exceeds that of the best different pose.
         places: number of different places (12 degrees) with right matches, in the panorama that has fewer.
         parallax: 90 % quantile of the parallax of these matches, radians.
-        uncertainty: standard deviations of rotation and direction by the noise of the matches and the distortion of
-            the panoramas, radians.
+        uncertainty: standard deviations of rotation and direction by the noise of the matches, the distortion of the
+            panoramas and the number of places, radians.
         problem: why the pose must not be used; None if it passes the check.
     """
 
@@ -478,6 +496,7 @@ def estimate_relative_pose(
     rotation, translation, uncertainty = polish_pose(
         a[polished], b[polished], best.rotation, best.translation, noise, axes
     )
+    uncertainty = _calibrate(uncertainty, evidence.places)
     problem = _find_problem(evidence, confirmations)
     if spread < _MIN_PARALLAX * noise and right.sum() >= _NEEDED[2].places:
         problem = f"both were taken at one place: parallax of {math.degrees(spread):.2f} degrees"
@@ -520,25 +539,61 @@ def _find_problem(evidence: _Evidence, confirmations: int) -> str | None:
 def polish_relative_pose(
     relation: RelativePose, first: Features, second: Features, matches: Matches, axes: RotationPrior = NO_PRIOR
 ) -> RelativePose:
-    """The pose by all matches that agree with it, which may include those of further features."""
-    a, b = first.bearings[matches.indices[:, 0]], second.bearings[matches.indices[:, 1]]
-    prior, noise = match_priors(matches.ratio), noise_of(first, second)
-    rotation, translation, uncertainty = relation.rotation, relation.translation, relation.uncertainty
-    right = np.zeros(len(a), bool)
+    """The pose by all matches near their epipolar curves, which may include those of further features.
+
+    Wrong matches are not uniformly distributed: features of floor and ceiling match such features, so that several
+    times as many wrong matches as by chance lie near the curves of level cameras. Their density, and the share of
+    right matches for each ratio, are therefore measured on the pair, by expectation and maximisation.
+    """
+    rotation, translation = relation.rotation, relation.translation
+    every = first.bearings[matches.indices[:, 0]], second.bearings[matches.indices[:, 1]]
+    near = np.abs(epipolar_angles(*every, rotation, translation)) < 2 * _POLISH_WINDOW
+    a, b, indices = every[0][near], every[1][near], matches.indices[near]
+    sizes = np.maximum(first.sizes[indices[:, 0]], second.sizes[indices[:, 1]])
+    noise = _POLISH_NOISE * noise_of(first, second) * np.hypot(1, sizes / _POLISH_SIZE)
+    weigh = _LocalWeights(a, b, np.searchsorted(_POLISH_RATIOS, matches.ratio[near], side="right"), noise)
     for factor in _POLISH_FACTORS:
-        probability = evaluate(a, b, prior, rotation, translation, factor * noise, axes).probability
-        right = probability > 0.5
-        used = np.argsort(-probability, kind="stable")[: min(int(right.sum()), _MAX_POLISHED)]
-        rotation, translation, uncertainty = polish_pose(a[used], b[used], rotation, translation, noise, axes)
-    if right.sum() < len(relation.indices):
-        return relation
+        for _ in range(_POLISH_STEPS):
+            probability = weigh(rotation, translation, factor)
+            if (probability > _MIN_PROBABILITY).sum() < _MIN_POLISHED:
+                return relation
+            equations = _normal_equations(a, b, probability, rotation, translation, factor * noise)
+            rotation, translation, step = _gauss_newton(*equations, rotation, translation, axes)
+            if not np.abs(step).max() < 0.2:
+                return relation
+    rotation, translation, uncertainty = polish_pose(a, b, rotation, translation, noise, axes, weigh)
+    # A tour has a robust loss, and needs as many points as possible that several panoramas see.
+    agreeing = evaluate(*every, match_priors(matches.ratio), rotation, translation, noise_of(first, second), axes)
     return replace(
         relation,
         rotation=rotation,
         translation=translation,
-        indices=matches.indices[right],
-        uncertainty=uncertainty,
+        indices=matches.indices[agreeing.probability > 0.5],
+        uncertainty=_calibrate(uncertainty, relation.places),
     )
+
+
+class _LocalWeights:
+    """Probabilities of matches near their epipolar curves to be right, with shares that improve with each call."""
+
+    def __init__(self, a: Array, b: Array, group: Int[Array, "match"], noise: Float[Array, "match"]) -> None:
+        self.a, self.b, self.group, self.noise = a, b, group, noise
+        self.shares = _POLISH_SHARES
+
+    def __call__(self, rotation: Array, translation: Array, factor: float = 1.0) -> Float[Array, "match"]:
+        """The probabilities under a pose, with `factor` times the noise."""
+        noise = factor * self.noise
+        angle = np.abs(epipolar_angles(self.a, self.b, rotation, translation))
+        inside = ~_are_behind(self.a, self.b, rotation, translation, noise) & (angle < _POLISH_WINDOW)
+        ratio = _density(angle, noise) * _POLISH_WINDOW
+        count = np.bincount(self.group[inside], minlength=len(self.shares))
+        probability = np.zeros(len(angle))
+        for _ in range(_POLISH_STEPS):
+            share = self.shares[self.group]
+            probability = np.where(inside, share * ratio / (share * ratio + 1 - share), 0.0)
+            right = np.bincount(self.group[inside], probability[inside], len(self.shares))
+            self.shares = (right + _POLISH_WEIGHT * _POLISH_SHARES) / (count + _POLISH_WEIGHT)
+        return probability
 
 
 def _count_places(bearings: Float[Array, "n 3"], probability: Float[Array, "n"]) -> float:

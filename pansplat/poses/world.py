@@ -27,6 +27,10 @@ _WINDOW = 9  # pixels over which images are compared
 _MIN_DEVIATION = 0.012  # of grey values in a window with texture
 _MIN_CORRELATION = 0.6
 _MIN_EVIDENCE, _MIN_CONTRAST = 0.02, 1.25  # mean correlation of the floor; ratio to the best other height
+_LOWER_SHARE, _LOWER_CONTRAST = 0.5, 2.0  # of a lower plane that is the floor: evidence, and contrast to its ring
+_DOUBTFUL_SHARE, _DOUBTFUL_CONTRAST = 0.25, 1.45  # of a lower plane that may be the floor
+_RING = 0.12, 0.36  # relative heights with which a plane is compared
+_LOWER = 1.2, 2.6  # height of the cameras over a lower plane, in that over the best one
 _NEAR_QUANTILE, _FAR_QUANTILE = 0.02, 0.98  # of the distances of the points
 _NEAR_FACTOR, _FAR_FACTOR = 0.7, 1.4
 
@@ -62,11 +66,13 @@ class Floor:
         height: mean height of the cameras over it, in the poses' unit.
         evidence: mean correlation of the panoramas on it.
         contrast: ratio of the evidence to that of the best other height.
+        lower: how much lower another plane is that may be the floor, as a ratio of the heights; None without one.
     """
 
     height: float
     evidence: float
     contrast: float
+    lower: float | None = None
 
     def is_found(self, contrast: float = _MIN_CONTRAST) -> bool:
         """Whether the plane is a floor, and not the best of many wrong ones."""
@@ -96,14 +102,43 @@ def find_floor(
             evidence += found
     evidence /= 2 * len(pairs)
     smooth = np.convolve(np.pad(evidence, 1, mode="edge"), (0.25, 0.5, 0.25), "valid")
-    best = int(smooth.argmax())
-    others = np.abs(np.arange(len(heights)) - best) > round(0.15 / _STEPS)
+    best, lower = _choose_lowest(smooth)
+    others = np.ones(len(heights), bool)
+    for plane in (best, int(smooth.argmax())):
+        others &= np.abs(np.arange(len(heights)) - plane) > round(0.15 / _STEPS)
     if not 0 < best < len(smooth) - 1:
         return Floor(float(heights[best]), 0.0, 0.0)
     left, centre, right = smooth[best - 1 : best + 2]
     shift = 0.5 * (left - right) / min(left - 2 * centre + right, -1e-12)
     height = float(heights[best] * math.exp(_STEPS * float(np.clip(shift, -1, 1))))
-    return Floor(height, float(centre), float(centre / max(smooth[others].max(), 1e-9)))
+    return Floor(
+        height,
+        float(centre),
+        float(centre / max(smooth[others].max(), 1e-9)),
+        None if lower is None else math.exp(_STEPS * (lower - best)),
+    )
+
+
+def _choose_lowest(evidence: Float[Array, "n"]) -> tuple[int, int | None]:
+    """Index of the floor among planes of increasing height of the camera, and that of a lower plane that may be it.
+
+    Tables, beds and counters hide the floor, so that the best plane may be one of theirs. No plane is below the floor.
+    """
+    strongest = best = int(evidence.argmax())
+    lower = None
+    inner, outer = (round(bound / _STEPS) for bound in _RING)
+    first, last = (best + round(math.log(bound) / _STEPS) for bound in _LOWER)
+    for n in range(first, min(last, len(evidence) - 1)):
+        if not evidence[n - 1] <= evidence[n] > evidence[n + 1]:
+            continue
+        distance = np.abs(np.arange(len(evidence)) - n)
+        ring = float(np.median(evidence[(distance > inner) & (distance <= outer)]))
+        share, contrast = evidence[n] / evidence[strongest], evidence[n] / max(ring, 1e-9)
+        if share > _LOWER_SHARE and contrast > _LOWER_CONTRAST:
+            best, lower = n, None
+        elif share > _DOUBTFUL_SHARE and contrast > _DOUBTFUL_CONTRAST and lower is None:
+            lower = n
+    return best, lower
 
 
 def _floor_evidence(

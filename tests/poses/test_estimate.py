@@ -13,7 +13,9 @@ import pytest
 import pansplat
 from pansplat.cli import run
 from pansplat.data.poses import read_trajectory
-from pansplat.poses.estimate import PoseEstimate, estimate_poses
+from pansplat.poses.axes import SceneAxes
+from pansplat.poses.estimate import PoseEstimate, _is_mirrored, _View, estimate_poses
+from pansplat.poses.features import detect_features
 from pansplat.poses.files import write_poses
 from pansplat.poses.solvers import angle_between, rotation_angle
 
@@ -127,3 +129,17 @@ def test_one_picture_and_unknown_formats_are_refused(tmp_path: Path, capsys: pyt
     ):
         assert run(["pose", *arguments]) == 2
         assert expected in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_mirror_image_of_symmetric_things_is_recognised() -> None:
+    """Symmetric furniture gives a mirrored picture a pose with many matches."""
+    views = {}
+    for name in ("left", "right", "mirrored"):
+        image = cv2.imread(str(SAMPLE / f"{name.replace('mirrored', 'right')}.jpg"), cv2.IMREAD_GRAYSCALE)
+        image = cv2.resize(image, (768, 384), interpolation=cv2.INTER_AREA)
+        image = image[:, ::-1].copy() if name == "mirrored" else image
+        features = detect_features(image, count=2500)
+        views[name] = _View(features, features, SceneAxes(np.eye(3), False, False), image)
+    assert _is_mirrored(views["left"], views["mirrored"])
+    assert not _is_mirrored(views["left"], views["right"])
+    assert not _is_mirrored(views["left"], views["left"])

@@ -42,7 +42,7 @@ def test_matches_of_equal_places_count_once() -> None:
     bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
     descriptors = rng.uniform(size=(40, 128)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-    twice = Features(np.tile(bearings, (2, 1)), descriptors, 0.01)
+    twice = Features(np.tile(bearings, (2, 1)), descriptors, np.ones(40), 0.01)
     matches = match_features(twice, twice)
     assert len(matches) == 20 and (np.diff(matches.ratio) >= 0).all()
 

@@ -13,7 +13,7 @@ from pansplat.data.video import write_video
 from pansplat.poses.estimate import PoseEstimate, estimate_poses
 from pansplat.poses.solvers import angle_between, rotation_angle, rotation_exp
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_samples")]
 POSES = {
     "a": (np.eye(3), np.zeros(3)),
     "b": (rotation_exp(np.array((0, 0.5, 0))), np.array((0.5, 0, 0.4))),
@@ -23,7 +23,7 @@ POSES = {
 
 
 @pytest.fixture(scope="module")
-def estimate(tmp_path_factory: pytest.TempPathFactory, render_room) -> PoseEstimate:
+def estimate(tmp_path_factory: pytest.TempPathFactory, render_room, few_samples: None) -> PoseEstimate:
     """Of two good pictures, a mirrored one and one of another room; the distance of the good ones is given."""
     folder = tmp_path_factory.mktemp("rooms")
     for name, pose in POSES.items():
@@ -54,8 +54,8 @@ def test_the_reason_names_the_picture(estimate: PoseEstimate) -> None:
 
 
 def test_key_frames_of_a_video_have_poses(tmp_path: Path, render_room) -> None:
-    centres = [np.array((0.12 * n - 0.6, 0, 0.05 * n)) for n in range(11)]
-    frames = (render_room(2, rotation_exp(np.array((0, 0.05 * n, 0))), c) for n, c in enumerate(centres))
+    centres = [np.array((0.2 * n - 0.6, 0, 0.08 * n)) for n in range(7)]
+    frames = (render_room(2, rotation_exp(np.array((0, 0.08 * n, 0))), c) for n, c in enumerate(centres))
     write_video(tmp_path / "walk.mp4", frames, 5)
     assert run(["pose", str(tmp_path / "walk.mp4"), "-o", str(tmp_path / "walk"), "--frames", "3"]) == 0
     names = sorted(path.name for path in (tmp_path / "walk").glob("*.png"))

@@ -25,7 +25,7 @@ def _build(shared: bool, pairs: tuple[Pair, ...] = ((0, 1), (1, 2)), turn: float
     for rotation, centre in zip(ROTATIONS, CENTRES, strict=True):
         rays = (world - centre) @ rotation
         bearings = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        features.append(Features(bearings, np.empty((len(world), 128), np.float32), 0.003))
+        features.append(Features(bearings, np.empty((len(world), 128), np.float32), np.zeros(len(world)), 0.003))
     relations = {}
     for n, (i, j) in enumerate(pairs):
         rotation = ROTATIONS[j].T @ ROTATIONS[i]
