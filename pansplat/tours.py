@@ -45,6 +45,7 @@ _MIN_OVERLAP = 0.12
 _MAX_BASELINE = 0.4  # of an edge that is not given, as a fraction of far
 _MAX_NEIGHBOURS = 6  # nearest panoramas that are compared
 _MIN_BASELINE = 0.03  # of a scene of two views, as a fraction of far; depth is inaccurate below it
+_MAX_STARTS = 10_000  # of a walk, divided by the number of nodes
 
 EDGE_HYSTERESIS = 0.25  # metres that another edge must be nearer than the current one
 FLY_SPEED = 1.0  # metres per second
@@ -178,13 +179,9 @@ class TourGraph:
         fraction = float((position - a) @ along / max(float(along @ along), 1e-12))
         return float(np.linalg.norm(position - (a + min(max(fraction, 0.0), 1.0) * along)))
 
-    def find_nearest_node(self, position: Float[np.ndarray, "3"]) -> int:
-        """The panorama nearest to a position."""
-        return int(np.linalg.norm(self.positions - position, axis=1).argmin())
-
     def find_walk(self, start: int, end: int) -> list[int]:
         """The nodes of the cheapest way along edges, both ends included."""
-        _, previous = self._shortest()
+        _, previous = self._shortest
         walk = [end]
         while walk[-1] != start:
             walk.append(int(previous[start, walk[-1]]))
@@ -192,7 +189,7 @@ class TourGraph:
 
     def find_next_nodes(self) -> list[list[int]]:
         """The next node on the cheapest way from a node (row) to another one (column)."""
-        _, previous = self._shortest()  # the costs are symmetric: the node before the end of the way back
+        _, previous = self._shortest  # the costs are symmetric: the node before the end of the way back
         return [
             [int(previous[end, node]) if end != node else node for end in range(len(self))] for node in range(len(self))
         ]
@@ -203,16 +200,19 @@ class TourGraph:
         Nearest neighbours first, improved by exchanging parts of the order (2-opt).
 
         Args:
-            start: its first node; None chooses the start of the shortest walk.
+            start: its first node; None chooses the start of the shortest walk, of some starts for more than 100 nodes.
         """
-        costs, _ = self._shortest()
-        starts = range(len(self)) if start is None else (start,)
-        order = min((_improve_order(_order_by_distance(costs, first), costs) for first in starts), key=_cost_of(costs))
+        costs, _ = self._shortest
+        count = len(self)
+        starts = range(0, count, math.ceil(count**2 / _MAX_STARTS)) if start is None else (start,)
+        orders = [_improve_order(_order_by_distance(costs, first), costs) for first in starts]
+        order = min(orders, key=lambda order: float(costs[order[:-1], order[1:]].sum()))
         walk = [order[0]]
         for node in order[1:]:
             walk += self.find_walk(walk[-1], node)[1:]
         return walk
 
+    @cached_property
     def _shortest(self) -> tuple[Float[np.ndarray, "node node"], Int[np.ndarray, "node node"]]:
         """Cost of the cheapest way between all nodes, and the node before its end."""
         costs = np.full((len(self), len(self)), np.inf)
@@ -222,28 +222,33 @@ class TourGraph:
         return shortest_path(costs, directed=False, return_predecessors=True)
 
 
-def _order_by_distance(costs: Float[np.ndarray, "node node"], start: int) -> list[int]:
-    order, left = [start], set(range(len(costs))) - {start}
-    while left:
-        order.append(min(left, key=lambda node: (costs[order[-1], node], node)))
-        left.remove(order[-1])
-    return order
+def _order_by_distance(costs: Float[np.ndarray, "node node"], start: int) -> Int[np.ndarray, "node"]:
+    """All nodes; the one after a node is its nearest one of those that are left."""
+    order, left = [start], np.arange(len(costs)) != start
+    while left.any():
+        order.append(int(np.where(left, costs[order[-1]], np.inf).argmin()))
+        left[order[-1]] = False
+    return np.array(order)
 
 
-def _cost_of(costs: Float[np.ndarray, "node node"]) -> Callable[[list[int]], float]:
-    return lambda order: float(costs[order[:-1], order[1:]].sum())
-
-
-def _improve_order(order: list[int], costs: Float[np.ndarray, "node node"]) -> list[int]:
+def _improve_order(order: Int[np.ndarray, "node"], costs: Float[np.ndarray, "node node"]) -> Int[np.ndarray, "node"]:
     """Reverse parts of the order, except its start, as long as it gets shorter."""
-    cost = _cost_of(costs)
-    best, improved = cost(order), True
+    order, improved = order.copy(), True
     while improved:
         improved = False
-        for first, last in itertools.combinations(range(1, len(order) + 1), 2):
-            candidate = order[:first] + order[first:last][::-1] + order[last:]
-            if (length := cost(candidate)) < best - 1e-9:
-                order, best, improved = candidate, length, True
+        for first in range(1, len(order)):
+            last = first + 1
+            while last < len(order):
+                # The change of the length if the part from `first` to each of `ends` is reversed.
+                before, here, ends = order[first - 1], order[first], order[last:]
+                change = costs[before, ends] - costs[before, here]
+                change[:-1] += costs[here, ends[1:]] - costs[ends[:-1], ends[1:]]
+                shorter = np.flatnonzero(change < -1e-9)
+                if not len(shorter):
+                    break
+                last += int(shorter[0]) + 1
+                order[first:last] = order[first:last][::-1].copy()
+                improved = True
     return order
 
 
@@ -398,16 +403,35 @@ def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene]) -> Scene:
         far=tour.far,
         names=tuple(names[node] for node in range(len(tour))),
         gains=(),
+        overlaps=tuple((a, b, overlap) for (a, b), overlap in tour.overlaps.items()),
+    )
+
+
+def select_views(scene: Scene, views: Views) -> Scene:
+    """The scene of some panoramas of a scene that `merge_scenes` made."""
+    chosen = list(views)
+    index = torch.full((len(scene.cam2world),), -1)
+    index[chosen] = torch.arange(len(chosen))
+    labels = index[scene.gaussians.views.long()]
+    gaussians = scene.gaussians.select(labels >= 0)
+    return dataclasses.replace(
+        scene,
+        gaussians=dataclasses.replace(gaussians, views=labels[labels >= 0]),
+        cam2world=scene.cam2world[chosen],
+        names=tuple(scene.names[view] for view in chosen) if scene.names else (),
+        gains=tuple(scene.gains[view] for view in chosen) if scene.gains else (),
+        overlaps=(),
     )
 
 
 def make_graph(scene: Scene) -> TourGraph:
-    """The cameras of a scene as panoramas of a tour without edges, for its floor plan."""
+    """The graph of a scene's cameras, with the edges that `merge_scenes` has kept in the scene."""
     names = [scene.names[k] if k < len(scene.names) else f"panorama {k + 1}" for k in range(len(scene.cam2world))]
     panoramas = tuple(
         Panorama(name, Path(name), pose) for name, pose in zip(names, scene.cam2world.double(), strict=True)
     )
-    return TourGraph("", Path(), panoramas, scene.near, scene.far)
+    overlaps = {(a, b): overlap for a, b, overlap in scene.overlaps}
+    return TourGraph("", Path(), panoramas, scene.near, scene.far, overlaps=overlaps)
 
 
 # --- routes ---
@@ -685,18 +709,17 @@ def find_floor_outlines(tour: TourGraph, scene: Scene, views: Views) -> dict[int
     return {node: outline for node, outline in outlines.items() if outline is not None}
 
 
-def write_floor_plan(scene: Scene, path: str | Path, tour: TourGraph | None = None) -> None:
-    """Write the floor plan of a scene as an image.
+def write_floor_plan(scene: Scene, path: str | Path) -> None:
+    """Write the floor plan of a scene as an image, with the edges of its tour.
 
     Args:
         scene: with input cameras.
         path: the file, such as a .png.
-        tour: the graph whose panoramas are the scene's views; draws its edges.
 
     Raises:
         InputError: no view shows a floor, or the file cannot be written.
     """
-    tour = make_graph(scene) if tour is None else tour
+    tour = make_graph(scene)
     outlines = find_floor_outlines(tour, scene, tuple(range(len(tour)))) if len(tour) else {}
     if not outlines:
         raise InputError(

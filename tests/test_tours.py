@@ -65,6 +65,13 @@ def test_a_walk_follows_edges_and_visits_all_panoramas(comb):
     assert comb.find_walk(0, 5) == [0, 1, 2, 5] and comb.neighbours(1) == [0, 2, 4]
 
 
+def test_a_walk_through_a_hundred_panoramas_of_a_grid_is_hardly_longer_than_the_shortest_one():
+    places = [(x, z) for x in range(10) for z in range(10)]
+    edges = [(a, b) for a, b in itertools.combinations(range(100), 2) if math.dist(places[a], places[b]) == 1]
+    walk = make_tour(places, edges).plan_walk()
+    assert set(walk) == set(range(100)) and len(walk) <= 104, "99 steps of 1 m are the shortest"
+
+
 def test_the_scene_of_an_edge_holds_both_ends_and_shares_a_third():
     places = ((0, 0), (0, 1), (1, 0), (3, 0), (3, 0.1))
     tour = make_tour(places, ((0, 1), (0, 2), (1, 2), (2, 3), (3, 4), (2, 4)))
@@ -103,6 +110,10 @@ def test_one_scene_of_all_panoramas_takes_each_from_the_scene_of_the_largest_ove
     assert scene.gaussians.means[:, 0].equal(scene.gaussians.views.float())
     assert scene.names == ("0.jpg", "1.jpg", "2.jpg", "3.jpg") and scene.cam2world.equal(tour.cam2world)
     assert (scene.near, scene.far) == (0.45, 10.0)
+    part = tours.select_views(scene, (3, 1))
+    assert part.gaussians.means[:, 0].tolist() == [1] * 10 + [3] * 10
+    assert part.gaussians.views.tolist() == [1] * 10 + [0] * 10 and part.names == ("3.jpg", "1.jpg")
+    assert part.cam2world.equal(tour.cam2world[[3, 1]]) and part.overlaps == ()
 
 
 def test_next_nodes_lead_along_the_cheapest_walk(comb):

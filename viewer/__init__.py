@@ -16,8 +16,7 @@ def main() -> NoReturn:
     """Run `pansplat-view` and exit with its status (docs/errors.md)."""
     from pansplat.console import exit_process
 
-    # Python's finalisation sometimes never ended after Ctrl+C; numba and Mesa each have an LLVM in the process.
-    exit_process(run(), finalize=False)
+    exit_process(run())
 
 
 def run(args: Sequence[str] | None = None) -> int:

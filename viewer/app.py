@@ -223,8 +223,7 @@ def _run_window(
             memory=options.memory,
             preferences=find_file(),
         )
-        viewer.remember(expand_home(options.path))
-        viewer.show(entries, first)
+        viewer.show(entries, first, expand_home(options.path))
         try:
             run_viewer(window, viewer)
             return None
@@ -277,7 +276,8 @@ def _write_film(
         tour, settings = loaded.entry.tour, fit_settings(options.settings, loaded.scene)
         renderers = [create_renderer(ctx, choice, color_bits=32) for _ in range(1 if tour is None else 2)]
         try:
-            scenes = None if tour is None else TourScenes(tour, memory=options.memory)
+            merged = loaded.entry.merged
+            scenes = None if tour is None else TourScenes(tour, memory=options.memory, merged=merged)
             if scenes is None:
                 frames = SceneFrames(renderers[0], loaded.scene, pixels, settings, options.image_format)
             else:

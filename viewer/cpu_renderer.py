@@ -29,8 +29,10 @@ from pansplat.rendering.cpu.display import (
     Layers,
     PixelFaces,
     Selection,
+    SelectionCache,
     blend_layers,
     blend_to_pixels,
+    enlarge,
 )
 from pansplat.rendering.cpu.footprints import Footprint
 from pansplat.rendering.cpu.rasterize import MIN_TRANSMITTANCE as EXACT_TRANSMITTANCE
@@ -44,20 +46,33 @@ from pansplat_viewer.displays import color_by_property
 from pansplat_viewer.layers import Frame, LayerStorage
 from pansplat_viewer.renderer import SplatRenderer, choose_layer_weights, is_software
 from pansplat_viewer.settings import SCALAR_MAPS, DrawSettings, FrameStats, RendererChoice
-from pansplat_viewer.splats import Splats
+from pansplat_viewer.splats import Splats, drop_not_finite
 
 _MIN_WEIGHT = 2.0**-26  # of a view in deferred blending; as the OpenGL renderer's with 32-bit targets
 _POLL_SECONDS = (
     0.02  # wait for an image that is drawn without waiting, so that a window does not draw the old one again
 )
 _SMALLER = "use a smaller size or face_size"
-_MAX_FACE_SETS = 3
+_MAX_FACE_SETS = 5
 _MAX_SELECTIONS = 8
 _MAX_TEXTURES = 4
 
 
 class _StoppedError(Exception):
     """Raised in the worker to end work whose result is not needed."""
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedScene:
+    """A scene as the renderer needs it.
+
+    Attributes:
+        splats: without `geometry` and `harmonics`, which `scene` has.
+        scene: the Gaussians.
+    """
+
+    splats: Splats
+    scene: DisplayScene
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +98,7 @@ class _Picture:
 
     Attributes:
         frame: its camera, size and settings.
-        pixels: bottom row first.
+        pixels: at full size, bottom row first.
         groups, sums: its layers; None if it was read from cube faces.
         stats: counts and times.
     """
@@ -143,6 +158,7 @@ class CpuRenderer:
 
     min_size = (640, 360)
     settle_seconds = 0.02
+    turn_ms = 1000 / 60  # the worker draws the faces before a turn, so that reading them is always faster
     waits_while_moving = True
 
     def __init__(self, ctx: moderngl.Context | None, *, exact: bool = False) -> None:
@@ -163,6 +179,7 @@ class CpuRenderer:
         self._scene: DisplayScene | None = None
         self._colored: tuple[str, DisplayScene] | None = None  # with the colours of a display
         self._groups: dict[Hashable, tuple[Int[np.ndarray, "n"], int]] = {}
+        self._selected = SelectionCache()
         self._faces: OrderedDict[Hashable, _FaceSet] = OrderedDict()
         self._textures: dict[tuple[int, int], moderngl.Texture] = {}
         self._picture: _Picture | None = None
@@ -178,6 +195,11 @@ class CpuRenderer:
         """The last image as bytes, bottom row first; None before the first one."""
         return None if self._picture is None else self._picture.pixels
 
+    @property
+    def pending(self) -> Future[_Picture | None] | None:
+        """The image that the worker draws; None if `render` has returned it, or waits for it."""
+        return None if self._pending is None else self._pending[1].future
+
     def create_sibling(self) -> CpuRenderer:
         """A renderer that has this scene, without a copy."""
         sibling = CpuRenderer(self._ctx)
@@ -185,16 +207,32 @@ class CpuRenderer:
         sibling._splats, sibling._scene, sibling.stats = self._splats, self._scene, self.stats
         return sibling
 
-    def upload(self, scene: Scene) -> None:
-        """Replace the scene; Gaussians with NaN or infinity are dropped and counted."""
+    @staticmethod
+    def prepare(scene: Scene, report: Callable[[float], None] = lambda done: None) -> PreparedScene:
+        """Convert a scene for `upload`, in any thread.
+
+        Args:
+            scene: Gaussians with NaN or infinity are dropped and counted.
+            report: called with the fraction done, by any thread; an exception ends the work.
+        """
+        gaussians = drop_not_finite(scene.gaussians, lambda done: report(0.2 * done))
+        finite = replace(scene, gaussians=gaussians)
+        splats = Splats.from_scene(finite, lambda done: report(0.2 + 0.4 * done), with_rows=False)
+        splats = replace(splats, dropped=len(scene.gaussians) - len(gaussians))
+        arrays = (values.detach().numpy() for values in (gaussians.quats, gaussians.scales.abs(), gaussians.harmonics))
+        rows = DisplayScene(
+            splats.means, splats.opacities, *arrays, splats.reach, lambda done: report(0.6 + 0.4 * done)
+        )
+        return PreparedScene(splats, rows)
+
+    def upload(self, scene: Scene, prepared: PreparedScene | None = None) -> None:
+        """Replace the scene; with `prepared`, made by `prepare`, this takes no time."""
         self._stop_jobs()
-        splats = Splats.from_scene(scene)
-        harmonics = np.ascontiguousarray(splats.harmonics.transpose(2, 0, 1))
-        rows = splats.geometry
-        self._scene = DisplayScene(splats.means, splats.opacities, rows[:, 4:8], rows[:, 8:11], harmonics, splats.reach)
-        # The scene has copies of these.
-        self._splats = replace(splats, geometry=rows[:0].copy(), harmonics=splats.harmonics[..., :0].copy())
+        prepared = prepared or self.prepare(scene)
+        self._splats, self._scene = prepared.splats, prepared.scene
+        splats = prepared.splats
         self._groups.clear()
+        self._selected = SelectionCache()
         self._faces.clear()
         self._picture = self._texture = self._colored = None
         self.stats = FrameStats(total=len(splats), dropped=splats.dropped, tier=self.tier)
@@ -217,7 +255,8 @@ class CpuRenderer:
                 False, and the caller renders again until it is True. The worker then draws the cube faces.
 
         Returns:
-            RGBA texture, as `SplatRenderer.render` returns it, with 8 bits per channel.
+            RGBA texture, as `SplatRenderer.render` returns it, with 8 bits per channel; None while the first image of
+            the scene is drawn.
 
         Raises:
             InputError: no scene is uploaded, or the size or a setting does not fit the scene.
@@ -231,7 +270,7 @@ class CpuRenderer:
         groups = self._choose_groups(frame)
         if frame.storage == LayerStorage.PADDED_FACES:
             return self._show(self._read_from_faces(frame, groups))
-        key = (frame.rotation.tobytes(), frame.world_position.tobytes(), frame.size, settings)
+        key = (frame.rotation.tobytes(), frame.world_position.tobytes(), frame.full_size, settings)
         if self._pending is None or self._pending[0] != key:
             self._stop_jobs()
             self._pending = key, self._start(lambda: self._draw(frame, groups))
@@ -239,7 +278,7 @@ class CpuRenderer:
                 self._start_faces(frame, groups)
         job = self._pending[1]
         try:
-            picture = job.future.result(None if wait or self._texture is None else _POLL_SECONDS)
+            picture = job.future.result(None if wait else _POLL_SECONDS)
         except TimeoutError:
             self.stats = replace(self.stats, settled=False, frame_ms=0.0)
             return self._texture
@@ -260,6 +299,36 @@ class CpuRenderer:
             return False
         stored = self._faces.get(_face_key(frame))
         return stored is not None and not stored.find_missing(frame)
+
+    def prefetch_faces(
+        self,
+        cam2world: Float[np.ndarray, "4 4"],
+        size: tuple[int, int],
+        settings: list[DrawSettings],
+        *,
+        everywhere: bool = False,
+    ) -> None:
+        """Let the worker draw the faces that a camera reads, unless it works; those of the first settings first.
+
+        With `everywhere`, it draws the faces of all directions.
+        """
+        if any(not job.future.done() for job in self._jobs):
+            return
+        assert self._splats is not None
+        pose, work = np.asarray(cam2world, dtype=np.float64), []
+        for each in settings:
+            frame = Frame.create(self._splats, pose, size, replace(each, cached=True))
+            if frame.storage == LayerStorage.PADDED_FACES:
+                stored, groups = self._find_face_set(frame), self._choose_groups(frame)
+                faces = dict.fromkeys([*stored.find_missing(frame), *(range(6) if everywhere else ())])
+                work += [(frame, groups, stored, face) for face in faces if face not in stored.done]
+
+        def draw_faces() -> None:
+            for each in work:
+                self._draw_face(*each)
+
+        if work:
+            self._start(draw_faces)
 
     def read_color(self) -> Float[np.ndarray, "height width 4"]:
         """Return the last image, float32, top row first: RGB over the background, and coverage."""
@@ -334,7 +403,7 @@ class CpuRenderer:
         drawn = 0
         if frame.settings.layout == "pinhole":
             pinhole = Pinhole(frame.rotation, frame.position, frame.focal, *frame.size)
-            layers = self._rasterize(frame, groups, pinhole)
+            layers = self._rasterize(frame, groups, pinhole, self._selected)
             sums, drawn = layers.sums, layers.statistics.visible
             _add_stages(stages, layers)
         else:
@@ -342,12 +411,13 @@ class CpuRenderer:
         pixels = pooled_empty(frame.size[::-1], np.uint32)
         before = time.perf_counter()
         _write_pixels(frame.settings, groups, sums, pixels, bottom_up=True)
+        stages["blend"] = 1e3 * (time.perf_counter() - before)
+        pixels = _enlarge(frame, pixels, stages)
         now = time.perf_counter()
-        stages["blend"] = 1e3 * (now - before)
-        stats = self._make_stats(groups, drawn, 1e3 * (now - start), stages)
+        stats = self._make_stats(frame, groups, drawn, 1e3 * (now - start), stages)
         return _Picture(frame, pixels, groups, sums, stats)
 
-    def _rasterize(self, frame: Frame, groups: _Groups, camera: Pinhole) -> Layers:
+    def _rasterize(self, frame: Frame, groups: _Groups, camera: Pinhole, cache: SelectionCache | None = None) -> Layers:
         """Rasterise the Gaussians in a pinhole camera's view."""
         plane = ImagePlane(
             (camera.height, camera.width), torch.from_numpy(np.ascontiguousarray(camera.rotation)), camera.focal
@@ -365,6 +435,7 @@ class CpuRenderer:
             len(groups.weights),
             options,
             selection=selection,
+            cache=cache,
             min_transmittance=self._min_transmittance,
             footprint=_find_footprint(frame.settings),
         )
@@ -429,9 +500,9 @@ class CpuRenderer:
         pixels = pooled_empty(frame.size[::-1], np.uint32)
         before = time.perf_counter()
         stored.faces.sample(frame.rotation, frame.focal, pixels, bottom_up=True)
-        now = time.perf_counter()
-        stages["sample"] = 1e3 * (now - before)
-        stats = self._make_stats(groups, drawn, 1e3 * (now - start), stages)
+        stages["sample"] = 1e3 * (time.perf_counter() - before)
+        pixels = _enlarge(frame, pixels, stages)
+        stats = self._make_stats(frame, groups, drawn, 1e3 * (time.perf_counter() - start), stages)
         return _Picture(frame, pixels, None, None, replace(stats, cached=not missing))
 
     def _draw_face(self, frame: Frame, groups: _Groups, stored: _FaceSet, face: int) -> int:
@@ -457,7 +528,9 @@ class CpuRenderer:
 
     # --- results ---
 
-    def _make_stats(self, groups: _Groups, drawn: int, frame_ms: float, stages: dict[str, float]) -> FrameStats:
+    def _make_stats(
+        self, frame: Frame, groups: _Groups, drawn: int, frame_ms: float, stages: dict[str, float]
+    ) -> FrameStats:
         return FrameStats(
             total=self.stats.total,
             dropped=self.stats.dropped,
@@ -467,6 +540,7 @@ class CpuRenderer:
             frame_ms=frame_ms,
             tier=self.tier,
             stages=stages,
+            size=frame.size,
         )
 
     def _show(self, picture: _Picture) -> moderngl.Texture | None:
@@ -474,7 +548,7 @@ class CpuRenderer:
         self._picture = picture
         before = time.perf_counter()
         if self._ctx is not None:
-            size = picture.frame.size
+            size = picture.frame.full_size
             limit = self._ctx.info["GL_MAX_TEXTURE_SIZE"]
             if size not in self._textures and max(size) <= limit:
                 if len(self._textures) >= _MAX_TEXTURES:
@@ -527,7 +601,7 @@ def create_renderer(
 
 def _face_key(frame: Frame) -> Hashable:
     """The values that the faces of a frame depend on: everything but rotation and image size."""
-    settings = replace(frame.settings, cached=True, vertical_fov_degrees=90.0)
+    settings = replace(frame.settings, cached=True, vertical_fov_degrees=90.0, scale=1.0)
     return frame.world_position.tobytes(), frame.focal, settings
 
 
@@ -568,6 +642,18 @@ def _write_pixels(
     color[..., 3] = 1
     words = (color * 255 + 0.5).astype(np.uint8).view(np.uint32)[..., 0]
     pixels[...] = words[::-1] if bottom_up else words
+
+
+def _enlarge(
+    frame: Frame, pixels: UInt32[np.ndarray, "height width"], stages: dict[str, float]
+) -> UInt32[np.ndarray, "full_height full_width"]:
+    """The pixels at the full size of the frame: OpenGL in software takes ten times as long to enlarge a texture."""
+    if frame.size == frame.full_size:
+        return pixels
+    start, large = time.perf_counter(), pooled_empty(frame.full_size[::-1], np.uint32)
+    enlarge(pixels, large)
+    stages["enlarge"] = 1e3 * (time.perf_counter() - start)
+    return large
 
 
 def _add_stages(stages: dict[str, float], layers: Layers) -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from pansplat.data.pairs import list_panorama_files
+
 _SECONDS = 2.0  # between looks at the files
 
 
 class FileWatch:
-    """Compares the times and sizes of files with those at the start.
+    """Compares the times and sizes of files, and the names of the panoramas in folders, with those at the start.
 
     Attributes:
         changed: whether a file was changed, removed or made at the last look.
@@ -19,11 +21,11 @@ class FileWatch:
         """No file is watched."""
         self.changed = False
         self._files: tuple[Path, ...] = ()
-        self._stamps: list[tuple[int, int] | None] = []
+        self._stamps: list[tuple[object, ...] | None] = []
         self._last = -1e9
 
     def start(self, files: Sequence[Path]) -> None:
-        """Watch these files from now on."""
+        """Watch these files and folders from now on."""
         self._files, self.changed = tuple(files), False
         self._stamps = [_read_stamp(file) for file in self._files]
 
@@ -34,9 +36,11 @@ class FileWatch:
             self.changed = [_read_stamp(file) for file in self._files] != self._stamps
 
 
-def _read_stamp(file: Path) -> tuple[int, int] | None:
-    """Time of the last change and size of a file; None if it is missing."""
+def _read_stamp(file: Path) -> tuple[object, ...] | None:
+    """Time of the last change and size of a file, or the panoramas in a folder; None if it is missing."""
     try:
+        if file.is_dir():
+            return tuple(path.name for path in list_panorama_files(file))
         status = file.stat()
     except OSError:
         return None

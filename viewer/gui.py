@@ -102,6 +102,12 @@ class Gui:
         builder.dock_builder_dock_window("pansplat", left)
         builder.dock_builder_finish(dockspace)
 
+    @property
+    def has_input(self) -> bool:
+        """Whether input waits for the next frames: imgui applies one change of a key in a frame."""
+        imgui.set_current_context(self._context)
+        return len(imgui.get_current_context().input_events_queue) > 0
+
     def reset_layout(self) -> None:
         """Restore the default layout in the next frame."""
         self._has_layout = False

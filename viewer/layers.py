@@ -52,8 +52,9 @@ class Frame:
         rotation: camera to world.
         position: camera centre in the splats' moved frame.
         world_position: camera centre, metres.
-        size: (width, height), pixels.
+        size: (width, height) at which the image is drawn, pixels.
         settings: draw settings.
+        full_size: (width, height) without `settings.scale`.
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -61,6 +62,7 @@ class Frame:
     world_position: Float[np.ndarray, "3"]
     size: tuple[int, int]
     settings: DrawSettings
+    full_size: tuple[int, int]
 
     @staticmethod
     def create(splats: Splats, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> Frame:
@@ -72,7 +74,8 @@ class Frame:
             raise InputError(f"`size` must be at least 1x1 pixel, got {width}x{height}")
         moved = cam2world[:3, 3] - splats.origin
         position = (float(moved[0]), float(moved[1]), float(moved[2]))
-        return Frame(cam2world[:3, :3], position, cam2world[:3, 3], (width, height), settings)
+        drawn = max(round(width * settings.scale), 1), max(round(height * settings.scale), 1)
+        return Frame(cam2world[:3, :3], position, cam2world[:3, 3], drawn, settings, (width, height))
 
     @property
     def storage(self) -> LayerStorage:

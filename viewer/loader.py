@@ -1,7 +1,8 @@
 """Lists the scenes at a path and loads them in a worker thread.
 
 Pairs go through the prediction pipeline with its cache, scene files are read. Of a tour, the graph and one scene are
-loaded; `tour` requests its other scenes. Imports no torch before it loads.
+loaded; `tour` requests its other scenes. A file that has the graph of a tour is shown as a tour: its scenes are parts
+of the scene in the file. Imports no torch before it loads.
 """
 
 import re
@@ -33,6 +34,7 @@ class SceneEntry:
         file: the scene file, or None.
         tour: the tour, or None.
         views: of one scene of a tour: numbers of its panoramas in the tour.
+        merged: of a tour from a file: the scene in it, of all panoramas.
     """
 
     name: str
@@ -40,18 +42,26 @@ class SceneEntry:
     file: Path | None = None
     tour: "TourGraph | None" = None
     views: tuple[int, ...] = ()
+    merged: "Scene | None" = None
 
     @property
     def panoramas(self) -> "tuple[Panorama, ...]":
-        """The photographs of the scene, those that are held out last."""
+        """The photographs of the scene, those that are held out last; a file has none."""
+        if self.merged is not None:
+            return ()
         if self.tour is not None:
             return self.tour.panoramas
         return () if self.pair is None else self.pair.context + self.pair.targets
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files that the scene is made from."""
-        return (self.file,) if self.file is not None else tuple(panorama.image for panorama in self.panoramas)
+        """The files that the scene is made from, and the folders of the panoramas."""
+        source = self.tour or self.pair
+        if self.file is not None or source is None:
+            return () if self.file is None else (self.file,)
+        images = [panorama.image for panorama in self.panoramas]
+        stated = [source.folder / name for name in ("poses.json", "pairs.json")]
+        return (*images, *stated, *{image.parent: None for image in images})
 
     @property
     def folder_name(self) -> str:
@@ -142,7 +152,13 @@ def load_entry(
     if entry.pair is None:
         progress("reading", 0.0)
         assert entry.file is not None
-        return LoadedScene(entry, pipeline.load(entry.file))
+        scene = pipeline.load(entry.file)
+        if not scene.overlaps:
+            return LoadedScene(entry, scene)
+        from pansplat.tours import make_graph
+
+        tour = replace(make_graph(scene), name=entry.name)
+        return _load_tour_scene(replace(entry, tour=tour, merged=scene), options, progress, show)
     scene = pipeline.predict(
         entry.pair,
         model=options.model,
@@ -162,12 +178,12 @@ def _load_tour_scene(
 ) -> LoadedScene:
     """Predict and refine one scene of a tour, with its floor outlines; the first one after its graph is connected."""
     from pansplat import pipeline
-    from pansplat.tours import connect, find_floor_outlines
+    from pansplat.tours import connect, find_floor_outlines, select_views
 
     tour, views = entry.tour, entry.views
     assert tour is not None
     if not views:
-        tour = connect(tour, progress)
+        tour = tour if entry.merged is not None else connect(tour, progress)
         first, second = tour.plan_walk()[:2]
         views = tour.choose_scene_views()[min(first, second), max(first, second)]
         entry = replace(entry, tour=tour, views=views)
@@ -176,6 +192,8 @@ def _load_tour_scene(
     def finish(scene: "Scene", is_final: bool) -> LoadedScene:
         return LoadedScene(entry, scene, is_final=is_final, outlines=find_floor_outlines(tour, scene, views))
 
+    if entry.merged is not None:
+        return finish(select_views(entry.merged, views), is_final=True)
     scene = pipeline.predict(
         pair,
         model=options.model,

@@ -1,6 +1,5 @@
 """The panels over the image: scene, display, Gaussians, camera, comparison, screenshots, camera path and window."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import get_args
@@ -9,15 +8,22 @@ import moderngl
 from imgui_bundle import imgui
 
 from pansplat_viewer import camera as cameras
-from pansplat_viewer.color_maps import get_table
 from pansplat_viewer.gui import PANEL_WIDTH
 from pansplat_viewer.input import HELP, Commands
 from pansplat_viewer.key_frames import KeyFrame
 from pansplat_viewer.minimap import SIZE, Minimap
-from pansplat_viewer.picking import project_point
+from pansplat_viewer.overlays import (
+    FIXED,
+    MARGIN,
+    UNITS,
+    draw_hotspots,
+    draw_legends,
+    draw_message,
+    draw_points,
+    draw_stats,
+)
 from pansplat_viewer.preferences import Preferences, Theme
-from pansplat_viewer.presenter import ERROR_MAP
-from pansplat_viewer.settings import SCALAR_MAPS, Comparison, Display, FrameStats, Kernel, Lowpass, Order, Projection
+from pansplat_viewer.settings import Comparison, Display, FrameStats, Kernel, Lowpass, Order, Projection
 from pansplat_viewer.state import (
     KEY_SECONDS,
     ViewerState,
@@ -32,21 +38,6 @@ from pansplat_viewer.tour import Hotspot, TourScenes
 
 Rectangle = tuple[float, float, float, float]  # left, top, right, bottom, pixels
 
-_MARGIN = 10.0
-_FIXED = (
-    imgui.WindowFlags_.no_move.value
-    | imgui.WindowFlags_.no_resize.value
-    | imgui.WindowFlags_.no_saved_settings.value
-    | imgui.WindowFlags_.no_docking.value
-)
-_LABEL = (
-    _FIXED
-    | imgui.WindowFlags_.no_title_bar.value
-    | imgui.WindowFlags_.always_auto_resize.value
-    | imgui.WindowFlags_.no_inputs.value
-    | imgui.WindowFlags_.no_focus_on_appearing.value
-    | imgui.WindowFlags_.no_nav.value
-)
 _HANDLE = (
     imgui.WindowFlags_.no_decoration.value
     | imgui.WindowFlags_.no_background.value
@@ -57,8 +48,7 @@ _HANDLE = (
     | imgui.WindowFlags_.no_bring_to_front_on_focus.value
     | imgui.WindowFlags_.no_nav.value
 )
-_LEGEND_WIDTH = 180.0
-_UNITS = {"depth": " m", "count": ""}  # of displays whose range can be changed
+_NUM_PANORAMAS = 9  # with buttons, as there are keys
 
 
 @dataclass
@@ -126,16 +116,17 @@ class Panels:
         commands = Commands()
         if state.overlay:
             self._draw_main_panel(state, data, commands)
-            _draw_stats(state, data)
+            if data.stats.total:
+                draw_stats(state, data.stats, data.frame_ms, data.size, data.right_name)
         if data.right_name is not None:
             self._draw_divider(state)
         if data.stats.total:
-            _draw_legends(state)
+            draw_legends(state)
         if state.overlay and state.points:
-            _draw_points(state)
+            draw_points(state)
         if state.overlay and data.tour is not None:
             if state.hotspots:
-                _draw_hotspots(data.tour, data.hotspots)
+                draw_hotspots(data.tour, data.hotspots)
             self._draw_tour(state, data, data.tour, commands)
         if state.help:
             state.help = _draw_help()
@@ -144,7 +135,7 @@ class Panels:
         elif data.error:
             self._draw_error(data, data.error, commands)
         if state.message and now < state.message_until:
-            _draw_message(state.message)
+            draw_message(state.message)
         return commands
 
     def release(self) -> None:
@@ -154,10 +145,14 @@ class Panels:
     def _draw_tour(self, state: ViewerState, data: PanelData, tour: TourScenes, commands: Commands) -> None:
         """Draw the plan and the progress of the tour at the right border, below the statistics."""
         size, scale = imgui.get_io().display_size, imgui.get_style().font_scale_dpi
-        first = imgui.Cond_.first_use_ever.value
-        imgui.set_next_window_pos((size.x - _MARGIN, 120 * scale), first, (1.0, 0.0))
+        first = (imgui.Cond_.always if commands.reset_layout else imgui.Cond_.first_use_ever).value
+        imgui.set_next_window_dock_id(0, first)
+        imgui.set_next_window_pos((size.x - MARGIN, 120 * scale), first, (1.0, 0.0))
         imgui.set_next_window_size(((SIZE + 18) * scale, (SIZE + 110) * scale), first)
         imgui.begin("Tour")
+        place, width = imgui.get_window_pos(), imgui.get_window_width()
+        if place.x + width > size.x:  # the window was larger when the layout was remembered
+            imgui.set_window_pos((max(size.x - width, 0.0), place.y))
         state.minimap = self._check("floor plan", state.minimap)
         imgui.same_line()
         state.hotspots = self._check("hotspots", state.hotspots)
@@ -216,7 +211,8 @@ class Panels:
         if opened:
             imgui.push_item_width(-110 * scale)
             self._section("Scene", self._draw_scene, state, data, commands)
-            self._section("Gaussians", self._draw_gaussians, state)
+            if data.stats.total:
+                self._section("Gaussians", self._draw_gaussians, state)
             self._section("Display", self._draw_display, state)
             self._section("Compare", self._draw_comparison, state, data, commands)
             self._section("Camera", self._draw_camera, state)
@@ -255,7 +251,6 @@ class Panels:
         if data.entries and self._button("Reload"):
             commands.reload = True
         if data.changed:
-            imgui.same_line()
             imgui.text_unformatted("changed on disk")
         if data.refinement is not None:
             if data.refinement < 1:
@@ -340,11 +335,13 @@ class Panels:
         state.speed = self._slider("speed", state.speed, 0.1, 10.0, "%.1f m/s")
         if not len(state.context):
             return
-        for view in range(min(len(state.context), 6)):
-            if view % 3:
+        for view in range(min(len(state.context), _NUM_PANORAMAS)):
+            if view % 5:
                 imgui.same_line()
-            if self._button(f"Panorama {view + 1}"):
+            if self._button(f"{view + 1}##panorama"):
                 jump_to_view(state, view)
+        imgui.same_line()
+        imgui.text_unformatted("panorama")
         if self._button("Stop" if state.playing else "Fly"):
             toggle_play(state)
         imgui.same_line()
@@ -360,9 +357,9 @@ class Panels:
                 imgui.same_line()
             if self._radio(display, state.settings.display == display):
                 choose_display(state, display)
-        if state.settings.display in _UNITS:
+        if state.settings.display in UNITS:
             largest = state.settings.display_max
-            form = f"%.{1 if largest < 100 else 0}f{_UNITS[state.settings.display]}"
+            form = f"%.{1 if largest < 100 else 0}f{UNITS[state.settings.display]}"
             chosen = self._slider("range", largest, 1.0, 1000.0, form, logarithmic=True)
             state.settings = replace(state.settings, display_max=chosen)
 
@@ -421,9 +418,9 @@ class Panels:
     def _draw_progress(self, name: str, task: str, fraction: float) -> bool:
         """Draw the progress of a load; returns whether it is to be cancelled."""
         size, scale = imgui.get_io().display_size, imgui.get_style().font_scale_dpi
-        imgui.set_next_window_pos((size.x / 2, size.y - 6 * _MARGIN * scale), 0, (0.5, 1.0))
-        imgui.set_next_window_size((min(420 * scale, size.x - 2 * _MARGIN), 0))
-        imgui.begin("##progress", None, _FIXED | imgui.WindowFlags_.no_title_bar.value)
+        imgui.set_next_window_pos((size.x / 2, size.y - 6 * MARGIN * scale), 0, (0.5, 1.0))
+        imgui.set_next_window_size((min(420 * scale, size.x - 2 * MARGIN), 0))
+        imgui.begin("##progress", None, FIXED | imgui.WindowFlags_.no_title_bar.value)
         imgui.text_unformatted(f"{name}: {task}")
         imgui.progress_bar(fraction, (-80 * imgui.get_style().font_scale_dpi, 0), f"{100 * fraction:.0f}%")
         imgui.same_line()
@@ -491,7 +488,7 @@ class Panels:
 
     def _draw_error(self, data: PanelData, error: str, commands: Commands) -> None:
         _place_at_center(width=560)
-        imgui.begin("Error", None, _FIXED | imgui.WindowFlags_.no_collapse.value)
+        imgui.begin("Error", None, FIXED | imgui.WindowFlags_.no_collapse.value)
         imgui.push_text_wrap_pos(0.0)
         imgui.text_unformatted(error)
         imgui.pop_text_wrap_pos()
@@ -514,80 +511,13 @@ def _place_at_center(width: float | None = None) -> None:
     size = imgui.get_io().display_size
     imgui.set_next_window_pos((size.x / 2, size.y / 2), 0, (0.5, 0.5))
     if width is not None:
-        imgui.set_next_window_size((min(width * imgui.get_style().font_scale_dpi, size.x - 2 * _MARGIN), 0))
-
-
-def _draw_stats(state: ViewerState, data: PanelData) -> None:
-    size, scale = imgui.get_io().display_size, imgui.get_style().font_scale_dpi
-    if size.x > 2.2 * PANEL_WIDTH * scale:
-        imgui.set_next_window_pos((size.x - _MARGIN, _MARGIN), 0, (1.0, 0.0))
-    else:  # too narrow next to the main panel: bottom right
-        imgui.set_next_window_pos((size.x - _MARGIN, size.y - _MARGIN), 0, (1.0, 1.0))
-    stats = data.stats
-    x, y, z = state.camera.position
-    lines = [
-        f"frame {data.frame_ms:.1f} ms   draw {stats.frame_ms:.1f} ms   sort {stats.sort_ms:.0f} ms",
-        f"{stats.drawn:,} drawn of {stats.visible:,} of {stats.total:,}",
-        f"{data.size[0]} x {data.size[1]}   {stats.tier}" + ("   cached" if stats.cached else ""),
-        f"x {x:.2f}  y {y:.2f}  z {z:.2f} m",
-    ]
-    if data.right_name is not None:
-        lines.append(f"right: {data.right_name}")
-    _draw_label("##stats", lines, alpha=0.6)
-
-
-def _draw_points(state: ViewerState) -> None:
-    """Draw markers at the picked points, and what is known of them at the bottom right."""
-    size = imgui.get_io().display_size
-    color = imgui.color_convert_float4_to_u32((1.0, 0.85, 0.2, 1.0))
-    canvas = imgui.get_background_draw_list()
-    pixels = [project_point(state.camera, point.position, (int(size.x), int(size.y))) for point in state.points]
-    for pixel in pixels:
-        if pixel is not None:
-            canvas.add_circle(pixel, 5.0 * imgui.get_style().font_scale_dpi, color, 0, 2.0)
-    lines = state.points[-1].describe()
-    if len(pixels) == 2:
-        if pixels[0] is not None and pixels[1] is not None:
-            canvas.add_line(pixels[0], pixels[1], color, 2.0)
-        distance = f"{math.dist(state.points[0].position, state.points[1].position):.3f} m"
-        lines.append(f"{distance} from the point before")
-        if pixels[0] is not None and pixels[1] is not None:
-            middle = ((pixels[0][0] + pixels[1][0]) / 2 + 8, (pixels[0][1] + pixels[1][1]) / 2 - 22)
-            _draw_outlined(canvas, middle, color, distance)
-    imgui.set_next_window_pos((size.x - _MARGIN, size.y - _MARGIN), 0, (1.0, 1.0))
-    _draw_label("##point", lines, alpha=0.6)
-
-
-def _draw_hotspots(tour: TourScenes, hotspots: list[Hotspot]) -> None:
-    """Draw a ring on the floor below each panorama, with its name."""
-    canvas, color = imgui.get_background_draw_list(), imgui.color_convert_float4_to_u32((1.0, 1.0, 1.0, 0.8))
-    for hotspot in hotspots:
-        ring = [imgui.ImVec2(*corner) for corner in hotspot.ring]
-        canvas.add_polyline(ring, color, thickness=2.0, flags=imgui.ImDrawFlags_.closed.value)
-        canvas.add_circle_filled(hotspot.center, 3.0, color)
-        name = tour.tour.panoramas[hotspot.node].name
-        width = imgui.calc_text_size(name).x
-        canvas.add_text((hotspot.center[0] - width / 2, hotspot.center[1] + hotspot.radius), color, name)
-
-
-def _draw_message(message: str) -> None:
-    size = imgui.get_io().display_size
-    imgui.set_next_window_pos((size.x / 2, size.y - 2 * _MARGIN), 0, (0.5, 1.0))
-    _draw_label("##message", [message], alpha=0.75)
-
-
-def _draw_label(name: str, lines: list[str], alpha: float) -> None:
-    imgui.set_next_window_bg_alpha(alpha)
-    imgui.begin(name, None, _LABEL)
-    for line in lines:
-        imgui.text_unformatted(line)
-    imgui.end()
+        imgui.set_next_window_size((min(width * imgui.get_style().font_scale_dpi, size.x - 2 * MARGIN), 0))
 
 
 def _draw_help() -> bool:
     """Draw the key help; returns whether it stays open."""
     _place_at_center()
-    flags = _FIXED | imgui.WindowFlags_.always_auto_resize.value | imgui.WindowFlags_.no_collapse.value
+    flags = FIXED | imgui.WindowFlags_.always_auto_resize.value | imgui.WindowFlags_.no_collapse.value
     _, opened = imgui.begin("Keys", True, flags)
     if imgui.begin_table("keys", 2, imgui.TableFlags_.sizing_fixed_fit.value):
         for row in HELP:
@@ -598,40 +528,3 @@ def _draw_help() -> bool:
         imgui.end_table()
     imgui.end()
     return bool(opened)
-
-
-def _draw_outlined(canvas: imgui.ImDrawList, place: tuple[float, float], color: int, text: str) -> None:
-    """Draw a text that is readable over any image."""
-    black = imgui.color_convert_float4_to_u32((0.0, 0.0, 0.0, 1.0))
-    for x, y in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        canvas.add_text((place[0] + x, place[1] + y), black, text)
-    canvas.add_text(place, color, text)
-
-
-def _draw_legends(state: ViewerState) -> None:
-    """Draw the colour maps that are shown, with their ranges: that of the image left, that of the error right."""
-    settings, size, scale = state.settings, imgui.get_io().display_size, imgui.get_style().font_scale_dpi
-    if settings.display in SCALAR_MAPS:
-        left = PANEL_WIDTH * scale + _MARGIN if state.overlay else _MARGIN
-        unit = _UNITS.get(settings.display, "")
-        _draw_legend((left, size.y - 3 * _MARGIN), settings.display, f"{settings.display_max:.3g}{unit}")
-    if state.comparison == "error":
-        left = size.x - (_LEGEND_WIDTH * scale + _MARGIN)
-        _draw_legend((left, size.y - 3 * _MARGIN), "error", f"{state.max_error:.3g}", ERROR_MAP)
-
-
-def _draw_legend(corner: tuple[float, float], label: str, largest: str, name: str = "") -> None:
-    """Draw a colour map with its name and range, above a corner."""
-    canvas, scale = imgui.get_background_draw_list(), imgui.get_style().font_scale_dpi
-    table = get_table(name or SCALAR_MAPS[label])  # pyright: ignore[reportArgumentType]
-    step, height = _LEGEND_WIDTH * scale / 64, 10 * scale
-    for index in range(64):
-        red, green, blue = (table[4 * index + 2] / 255).tolist()
-        x = corner[0] + index * step
-        color = imgui.color_convert_float4_to_u32((red, green, blue, 1.0))
-        canvas.add_rect_filled((x, corner[1]), (x + step, corner[1] + height), color)
-    white = imgui.color_convert_float4_to_u32((1.0, 1.0, 1.0, 1.0))
-    above, text = corner[1] - 18 * scale, (f"{label}: 0", largest)
-    _draw_outlined(canvas, (corner[0], above), white, text[0])
-    right = corner[0] + 64 * step - imgui.calc_text_size(largest).x
-    _draw_outlined(canvas, (right, above), white, text[1])

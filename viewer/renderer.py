@@ -22,6 +22,7 @@ from pansplat.geometry.pose import blend_weights
 from pansplat_viewer.color_maps import create_table_texture
 from pansplat_viewer.layers import Frame, Layer, LayerPainter, LayerStorage, Target, TargetStore
 from pansplat_viewer.programs import COUNT_STEP, Programs, choose_tier, set_uniforms
+from pansplat_viewer.resolution import BUDGET_MS, SETTLE_AFTER
 from pansplat_viewer.settings import SCALAR_MAPS, DrawSettings, FrameStats
 from pansplat_viewer.splats import SortedSplats, Splats, SplatSorter, color_splats, sort_splats
 
@@ -50,11 +51,13 @@ class SplatRenderer:
         tier: `gl33` or `gl43`; both draw the same image.
         min_size: the window's image is not drawn at a lower resolution while the camera moves, pixels.
         settle_seconds: after the last movement, until the image is drawn at full resolution.
+        turn_ms: time of a full image above which turns read cached faces.
         waits_while_moving: whether a window waits for the image of each position.
     """
 
     min_size = (1, 1)
-    settle_seconds = 0.2
+    settle_seconds = SETTLE_AFTER
+    turn_ms = BUDGET_MS
     waits_while_moving = False
 
     def __init__(
@@ -95,6 +98,10 @@ class SplatRenderer:
         self._image: Target | None = None
 
     @property
+    def pending(self) -> None:
+        """No image is drawn in the background."""
+
+    @property
     def num_views(self) -> int:
         """Context views of the uploaded scene."""
         return self._splats.num_views if self._splats is not None else 0
@@ -106,9 +113,14 @@ class SplatRenderer:
             sibling._upload(self._splats)
         return sibling
 
-    def upload(self, scene: Scene) -> None:
-        """Replace the scene on the GPU; Gaussians with NaN or infinity are dropped and counted."""
-        self._upload(Splats.from_scene(scene))
+    prepare = staticmethod(Splats.from_scene)
+
+    def upload(self, scene: Scene, prepared: Splats | None = None) -> None:
+        """Replace the scene on the GPU; `prepare` converts it before, in any thread.
+
+        Gaussians with NaN or infinity are dropped and counted.
+        """
+        self._upload(prepared or self.prepare(scene))
 
     def _upload(self, splats: Splats) -> None:
         self._release_scene()
@@ -163,6 +175,11 @@ class SplatRenderer:
         """Whether faces of this resolution are kept while coarser ones are drawn: never, see `CpuRenderer`."""
         return False
 
+    def prefetch_faces(
+        self, cam2world: np.ndarray, size: tuple[int, int], settings: list[DrawSettings], *, everywhere: bool = False
+    ) -> None:
+        """Draw no faces in advance: the GPU has no worker thread."""
+
     def read_color(self) -> Float[np.ndarray, "height width 4"]:
         """Return the last image, float32, top row first: RGB over the background, and coverage."""
         return self._read(attachment=0, components=4)
@@ -210,6 +227,7 @@ class SplatRenderer:
             sort_ms=splats.milliseconds,
             tier=self.tier,
             cached=all(layer.cached for layer in layers.values()),
+            size=frame.size,
         )
         return self._image
 

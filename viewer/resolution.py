@@ -33,6 +33,7 @@ class AdaptiveResolution:
         last_motion: time of the last movement, seconds.
         translated: whether the last movement changed the position.
         settle_after: seconds after the last movement until the resolution is full.
+        turn_ms: time of a frame at full resolution above which turns read cached faces.
         num_scales: how many of SCALES may be used, from the largest on.
     """
 
@@ -42,6 +43,7 @@ class AdaptiveResolution:
     last_motion: float = -1e9
     translated: bool = False
     settle_after: float = SETTLE_AFTER
+    turn_ms: float = BUDGET_MS
     num_scales: int = len(SCALES)
 
     def plan(self, now: float, *, moved: bool, turned: bool, adaptive: bool = True) -> ResolutionPlan:
@@ -52,8 +54,13 @@ class AdaptiveResolution:
         moving = now - self.last_motion < self.settle_after
         if not adaptive or not moving:
             return ResolutionPlan(1.0, cached=False, moving=moving)
-        slow = self.full_ms > self.budget_ms
+        slow = self.full_ms > min(self.turn_ms, self.budget_ms)
         return ResolutionPlan(SCALES[self.step], cached=slow and not self.translated, moving=True)
+
+    @property
+    def coarsest(self) -> float:
+        """The smallest scale that may be used."""
+        return SCALES[self.num_scales - 1]
 
     def limit(self, size: tuple[int, int], min_size: tuple[int, int]) -> None:
         """Use no scale that makes an image of `size` smaller than `min_size`, pixels."""

@@ -71,6 +71,8 @@ class DrawSettings:
         cached: draw a pinhole image from six cube faces that are kept for this position, so that a rotation of the
             camera costs one texture look-up a pixel. Missing faces in the field of view are drawn first. Where that
             would need faces of more than 2048 pixels (a narrow field of view), the image is drawn directly.
+        scale: drawn pixels over those of the image, along each side, in (0, 1]. `CpuRenderer` enlarges the image;
+            OpenGL returns the smaller texture, because a GPU enlarges it without cost.
     """
 
     kernel: Kernel = "ray"
@@ -92,6 +94,7 @@ class DrawSettings:
     eye_distance: float = EYE_DISTANCE
     face_size: int | None = None
     cached: bool = False
+    scale: float = 1.0
 
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
@@ -116,6 +119,8 @@ class DrawSettings:
             )
         if self.eye_offset and self.footprint != "gaussian":
             raise InputError(f"display {self.display} has no omni-directional stereo; use another display")
+        if not 0 < self.scale <= 1:
+            raise InputError(f"`scale` must be in (0, 1], got {self.scale}")
         if not abs(self.eye_offset) < math.inf:
             raise InputError(f"`eye_offset` must be a distance in metres, got {self.eye_offset}")
         if self.face_size is not None and self.face_size < 1:
@@ -154,6 +159,7 @@ class FrameStats:
         settled: False if the frame used the order and colours of an earlier position because the new ones are not
             ready, or the last image because the new one is not ready; render again to get it.
         stages: milliseconds of each stage, where the renderer measures them.
+        size: (width, height) at which the image was drawn, pixels.
     """
 
     total: int = 0
@@ -166,3 +172,4 @@ class FrameStats:
     cached: bool = False
     settled: bool = True
     stages: Mapping[str, float] = field(default_factory=dict)
+    size: tuple[int, int] = (0, 0)

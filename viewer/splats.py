@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int, UInt
 
 from pansplat.gaussians.harmonics import harmonics_basis
 from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.rendering.cpu.runtime import parallel_for_slices
 from pansplat_viewer.camera import Pinhole
 from pansplat_viewer.displays import color_by_property
 
@@ -62,42 +63,55 @@ class Splats:
         return self.means.shape[0]
 
     @staticmethod
-    def from_scene(scene: Scene) -> "Splats":
-        """Return the scene's finite Gaussians."""
-        gaussians = scene.gaussians
-        finite = _is_finite(gaussians)
-        dropped = int((~finite).sum())
-        if dropped:
-            gaussians = gaussians.select(finite)
-        gaussians = gaussians.to(device="cpu")
-        positions = scene.cam2world[:, :3, 3].double().cpu().numpy()
-        origin = _choose_origin(positions, gaussians.means)
-        means = (gaussians.means.detach().double() - torch.from_numpy(origin)).float().numpy()
-        opacities = gaussians.opacities.detach().float().numpy()
-        scales = gaussians.scales.detach().float().abs().numpy()
-        reach = np.sqrt(2.0 * np.log(np.maximum(opacities * 255.0, 1.0))).astype(np.float32)
-        geometry = np.zeros((len(means), 12), np.float32)
-        geometry[:, 0:3] = means
-        geometry[:, 3] = opacities
-        geometry[:, 4:8] = gaussians.quats.detach().float().numpy()
-        geometry[:, 8:11] = scales
-        views = gaussians.views.detach().numpy().astype(np.int32)
-        harmonics = gaussians.harmonics.detach().float().permute(1, 2, 0).contiguous().numpy()
-        return Splats(
+    def from_scene(
+        scene: Scene, report: Callable[[float], None] = lambda done: None, *, with_rows: bool = True
+    ) -> "Splats":
+        """Return the scene's finite Gaussians.
+
+        Args:
+            scene: the scene.
+            report: called with the fraction done, by any thread; an exception ends the work.
+            with_rows: whether `geometry`, `harmonics` and `base_colors` are filled; else they have no Gaussians.
+        """
+        gaussians = drop_not_finite(scene.gaussians, lambda done: report(0.3 * done))
+        positions, num = scene.cam2world[:, :3, 3].double().cpu().numpy(), len(gaussians)
+        origin, rows, coefficients = _choose_origin(positions, gaussians.means), num * with_rows, gaussians.harmonics
+        splats = Splats(
             origin=origin,
-            means=np.ascontiguousarray(means),
-            opacities=opacities,
-            reach=reach,
-            extent=reach * scales.max(axis=1, initial=0.0),
+            means=np.empty((num, 3), np.float32),
+            opacities=np.empty(num, np.float32),
+            reach=np.empty(num, np.float32),
+            extent=np.empty(num, np.float32),
             levels=gaussians.levels.detach().numpy().astype(np.int32),
-            views=views,
-            geometry=geometry,
-            harmonics=harmonics,
-            base_colors=_evaluate_constant_colors(harmonics) if gaussians.degree == 0 else None,
+            views=gaussians.views.detach().numpy().astype(np.int32),
+            geometry=np.zeros((rows, 12), np.float32),
+            harmonics=np.empty((coefficients.shape[1], 3, rows), np.float32),
+            base_colors=np.zeros((rows, 4), np.float32) if with_rows and gaussians.degree == 0 else None,
             view_positions=positions,
-            num_views=max(len(positions), int(views.max(initial=-1)) + 1),
-            dropped=dropped,
+            num_views=max(len(positions), int(gaussians.views.max()) + 1 if num else 0),
+            dropped=len(scene.gaussians) - num,
         )
+        fields = (gaussians.means, gaussians.opacities, gaussians.scales, gaussians.quats, coefficients)
+        sources = [values.detach().numpy() for values in fields]
+
+        def convert(part: slice) -> None:
+            means, opacities, scales, quats, harmonics = (source[part] for source in sources)
+            splats.means[part], splats.opacities[part] = means - origin, opacities
+            splats.reach[part] = np.sqrt(2.0 * np.log(np.maximum(splats.opacities[part] * 255.0, 1.0)))
+            scales = np.abs(scales.astype(np.float32))
+            splats.extent[part] = splats.reach[part] * np.maximum.reduce([scales[:, axis] for axis in range(3)])
+            if not with_rows:
+                return
+            geometry = splats.geometry[part]
+            geometry[:, 0:3], geometry[:, 3] = splats.means[part], splats.opacities[part]
+            geometry[:, 4:8], geometry[:, 8:11] = quats, scales
+            splats.harmonics[..., part] = harmonics.transpose(1, 2, 0)
+            if splats.base_colors is not None:
+                colors = 0.5 + splats.harmonics[0, :, part].T / (2 * math.sqrt(math.pi))
+                splats.base_colors[part, :3] = np.maximum(colors, 0)
+
+        parallel_for_slices(convert, num, lambda done: report(0.3 + 0.7 * done))
+        return splats
 
     def evaluate_colors(self, position: tuple[float, float, float]) -> Float[np.ndarray, "n 4"]:
         """Return RGB and a padding column of all splats, seen from a camera position in the moved frame."""
@@ -134,10 +148,21 @@ class Splats:
         return selected
 
 
-def _is_finite(gaussians: Gaussians) -> torch.Tensor:
-    fields = (gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities[:, None])
-    finite = torch.stack([torch.isfinite(values).all(dim=-1) for values in fields]).all(dim=0)
-    return finite & torch.isfinite(gaussians.harmonics).flatten(1).all(dim=-1)
+def drop_not_finite(gaussians: Gaussians, report: Callable[[float], None] = lambda done: None) -> Gaussians:
+    """The Gaussians without NaN and infinity, in main memory; `report` is called with the fraction done."""
+    gaussians, finite = gaussians.to(device="cpu"), np.empty(len(gaussians), bool)
+    harmonics, opacities = gaussians.harmonics.flatten(1), gaussians.opacities[:, None]
+    fields = (gaussians.means, gaussians.scales, gaussians.quats, opacities, harmonics)
+    sources = [values.detach().numpy() for values in fields]
+
+    def check(part: slice) -> None:
+        slices = [np.isfinite(source[part]) for source in sources]
+        finite[part] = True  # usually; the sums over short rows take most of the time
+        if not all(values.all() for values in slices):
+            finite[part] = np.logical_and.reduce([values.all(axis=1) for values in slices])
+
+    parallel_for_slices(check, len(gaussians), report)
+    return gaussians if finite.all() else gaussians.select(torch.from_numpy(finite))
 
 
 def _choose_origin(positions: np.ndarray, means: torch.Tensor) -> np.ndarray:
@@ -146,12 +171,6 @@ def _choose_origin(positions: np.ndarray, means: torch.Tensor) -> np.ndarray:
     if len(means):
         return means.detach().double().median(dim=0).values.numpy()
     return np.zeros(3)
-
-
-def _evaluate_constant_colors(harmonics: Float[np.ndarray, "1 3 n"]) -> Float[np.ndarray, "n 4"]:
-    colors = np.zeros((harmonics.shape[2], 4), np.float32)
-    colors[:, :3] = np.maximum(0.5 + harmonics[0].T / (2 * math.sqrt(math.pi)), 0)
-    return colors
 
 
 def radix_argsort(keys: Float[np.ndarray, "n"]) -> UInt[np.ndarray, "n"]:

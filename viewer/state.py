@@ -20,6 +20,7 @@ COUNT_MAX = 300.0  # Gaussians per pixel with the last colour, by default
 KEY_SECONDS = 2.0  # between key frames that are added one after the other
 NEAR_OF_FAR = 0.03  # of a tour: Gaussians within this fraction of far are not drawn, because ways pass door frames
 _FLIGHT_STEPS = 24  # for the `,` and `.` keys
+_MAX_SAMPLES = 100_000  # Gaussians that percentiles are measured on
 
 
 @dataclass
@@ -141,7 +142,7 @@ def create_level_camera(scene: Scene, tour: TourGraph | None = None) -> Camera:
 def adapt_settings(state: ViewerState, scene: Scene, *, keep_levels: bool = True) -> None:
     """Set the number of views and the levels to those of a scene, and reset settings that it does not support."""
     state.num_views = len(scene.cam2world)
-    state.levels = tuple(sorted(int(level) for level in torch.unique(scene.gaussians.levels)))
+    state.levels = tuple(torch.bincount(scene.gaussians.levels).nonzero().flatten().tolist())
     settings = state.settings if keep_levels else replace(state.settings, levels=None)
     state.settings = fit_settings(settings, scene)
 
@@ -248,7 +249,7 @@ def _choose_start_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"
         return fly_pose(scene.cam2world, fraction).numpy()
     matrix = np.eye(4)
     matrix[:3, :3] = _compute_level_axes(scene)
-    means = scene.gaussians.means.double().numpy()
+    means = _sample_means(scene)
     if len(means):
         middle = np.median(means, axis=0)
         matrix[:3, 3] = middle - 2 * _measure_percentile(means, middle) * matrix[:3, 2]
@@ -257,12 +258,18 @@ def _choose_start_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"
 
 def _measure_distance(scene: Scene, percent: float) -> float:
     """Return a percentile of the distances from the first camera (else the start pose), metres; 2 if none."""
-    means = scene.gaussians.means.double().numpy()
+    means = _sample_means(scene)
     if not len(means):
         return 2.0
     if len(scene.cam2world):
         return _measure_percentile(means, scene.cam2world[0, :3, 3].double().numpy(), percent)
     return 2 * _measure_percentile(means, np.median(means, axis=0), percent)
+
+
+def _sample_means(scene: Scene) -> Float[np.ndarray, "m 3"]:
+    """The centres of every n-th Gaussian, enough for percentiles."""
+    means = scene.gaussians.means
+    return means[:: max(len(means) // _MAX_SAMPLES, 1)].double().numpy()
 
 
 def _measure_percentile(means: Float[np.ndarray, "n 3"], point: Float[np.ndarray, "3"], percent: float = 50) -> float:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,6 +30,8 @@ from pansplat_viewer.settings import DrawSettings, FrameStats, Projection, Stere
 _GRID = ("right", "left", "up"), ("down", "front", "back")
 _DEFAULT_SIZES = {"perspective": (1280, 720), "equirect": (2048, 1024), "cubemap": (1536, 1024)}
 MAX_TURN = math.radians(20)  # of the camera before the eyes follow, while cached faces are read
+_PREFETCH_TURN = math.radians(5)  # of the camera before the faces at the next places of the eyes are drawn
+_SAME_AXIS = 1e-3
 _STEREO_FACE_OVERSAMPLING = 1.5  # of the panorama that the faces of stereo cubemaps are interpolated in
 
 _ARRANGEMENTS = ("side-by-side", "top-bottom", "anaglyph")  # as in shaders/arrange.frag
@@ -197,11 +200,27 @@ def get_eye_size(size: tuple[int, int], stereo: Stereo) -> tuple[int, int]:
     return max(size[0] // columns, 1), max(size[1] // rows, 1)
 
 
+def _turn(
+    cam2world: Float[np.ndarray, "4 4"], first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4 4"]:
+    """The pose turned in place by the smallest rotation from one direction to another."""
+    x, y, z = np.cross(first, second)
+    across, turned = np.array(((0, -z, y), (z, 0, -x), (-y, x, 0))), cam2world.copy()
+    turned[:3, :3] = (np.eye(3) + across + across @ across / (1 + first @ second)) @ cam2world[:3, :3]
+    return turned
+
+
+def _join_sizes(eye_size: tuple[int, int], stereo: Stereo) -> tuple[int, int]:
+    """(width, height) of an image of both eyes."""
+    return eye_size[0] * (2 if stereo == "side-by-side" else 1), eye_size[1] * (2 if stereo == "top-bottom" else 1)
+
+
 class StereoRenderer:
     """A renderer of images for one or two eyes, with the calls of the renderer that it is made of.
 
     The second eye has a renderer of its own, made at the first stereo image. While `settings.cached`, the eyes stay
     where they are in the faces, until the camera has turned by `MAX_TURN`; then they move to where they belong.
+    `prefetch` draws the faces of these places before.
     """
 
     def __init__(self, renderer: Renderer, ctx: moderngl.Context | None) -> None:
@@ -212,6 +231,7 @@ class StereoRenderer:
         self._triangle: moderngl.VertexArray | None = None
         self._targets: dict[tuple[int, int], moderngl.Framebuffer] = {}
         self._axis: Float[np.ndarray, "3"] | None = None
+        self._following: Float[np.ndarray, "3"] | None = None  # the axis after this one
         self._stereo: Stereo = "mono"
         self._last: moderngl.Texture | None = None
 
@@ -233,11 +253,18 @@ class StereoRenderer:
             sort_ms=stats.sort_ms + other.sort_ms,
             cached=stats.cached and other.cached,
             settled=stats.settled and other.settled,
+            size=_join_sizes(stats.size, self._stereo),
         )
 
-    def upload(self, scene: Scene) -> None:
-        """Replace the scene."""
-        self._eyes[0].upload(scene)
+    @property
+    def pending(self) -> Future[Any] | None:
+        """The image of an eye that is being drawn in the background; None if there is none."""
+        eyes = self._eyes[:1] if self._stereo == "mono" else self._eyes
+        return next((eye.pending for eye in eyes if eye.pending is not None), None)
+
+    def upload(self, scene: Scene, prepared: Any = None) -> None:
+        """Replace the scene; `prepared` is the result of `prepare`."""
+        self._eyes[0].upload(scene, prepared)
         for other in self._eyes[1:]:
             other.release()
         del self._eyes[1:]
@@ -260,11 +287,13 @@ class StereoRenderer:
             raise InputError(f"stereo of a window is perspective, got layout {settings.layout}; use `render_image`")
         if len(self._eyes) == 1:
             self._eyes.append(self._eyes[0].create_sibling())
-        self._axis = self._choose_axis(cam2world, settings)
+        axis = self._choose_axis(cam2world, size, settings)
+        if axis is not self._axis:
+            self._axis, self._following = axis, None
         eye_size, eye_settings = get_eye_size(size, settings.stereo), replace(settings, stereo="mono")
         textures = [
             eye.render(pose, eye_size, eye_settings, wait=wait or self._last is None)
-            for eye, pose in zip(self._eyes, self._place_eyes(cam2world, settings), strict=True)
+            for eye, pose in zip(self._eyes, self._place_eyes(cam2world, settings, self._axis), strict=True)
         ]
         if self._last is None or self.stats.settled or not self._eyes[0].waits_while_moving:
             self._last = self._arrange(textures, settings.stereo)
@@ -276,11 +305,42 @@ class StereoRenderer:
             return self._eyes[0].has_faces(cam2world, size, settings)
         if len(self._eyes) == 1 or self._axis is None:
             return False
-        axis, self._axis = self._axis, self._choose_axis(cam2world, settings)
-        poses, eye_size = self._place_eyes(cam2world, settings), get_eye_size(size, settings.stereo)
-        self._axis = axis
-        eye_settings = replace(settings, stereo="mono")
-        return all(eye.has_faces(pose, eye_size, eye_settings) for eye, pose in zip(self._eyes, poses, strict=True))
+        return self._has_faces(self._choose_axis(cam2world, size, settings), cam2world, size, settings)
+
+    def draw_faces(self, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> None:
+        """Draw the cube faces of all directions in the background, for the next turn."""
+        if settings.stereo == "mono":
+            self._eyes[0].prefetch_faces(cam2world, size, [settings], everywhere=True)
+        elif self._axis is not None and len(self._eyes) == 2:
+            eye_size, eye_settings = get_eye_size(size, settings.stereo), [replace(settings, stereo="mono")]
+            for eye, pose in zip(self._eyes, self._place_eyes(cam2world, settings, self._axis), strict=True):
+                eye.prefetch_faces(pose, eye_size, eye_settings, everywhere=True)
+
+    def prefetch(
+        self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings, scale: float
+    ) -> None:
+        """Draw the faces at the next places of the eyes in the background, while the camera turns towards them.
+
+        Args:
+            cam2world, size, settings: as for `render`.
+            scale: of the faces that are drawn first, which serve a fast turn.
+        """
+        if settings.stereo == "mono" or not settings.cached or self._axis is None:
+            return
+        if len(self._eyes) == 1 or not isinstance(self._eyes[0], CpuRenderer):
+            return
+        right = cam2world[:3, 0]
+        across = right - (right @ self._axis) * self._axis
+        length = float(np.linalg.norm(across))
+        if length < math.sin(_PREFETCH_TURN):
+            return
+        following = math.cos(MAX_TURN) * self._axis + math.sin(MAX_TURN) * across / length
+        if self._following is None or np.abs(following - self._following).max() > _SAME_AXIS:
+            self._following = following
+        eye_size, settings = get_eye_size(size, settings.stereo), replace(settings, stereo="mono", scale=1.0)
+        turned = _turn(cam2world, right, self._following)
+        for eye, pose in zip(self._eyes, self._place_eyes(turned, settings, self._following), strict=True):
+            eye.prefetch_faces(pose, eye_size, [replace(settings, scale=scale), settings])
 
     def read_color(self) -> Float[np.ndarray, "height width 4"]:
         """Return the last image, float32, top row first: RGB over the background, and coverage."""
@@ -314,16 +374,39 @@ class StereoRenderer:
         for eye in self._eyes:
             eye.release()
 
-    def _choose_axis(self, cam2world: np.ndarray, settings: DrawSettings) -> Float[np.ndarray, "3"]:
-        """The direction from the left to the right eye."""
-        right = cam2world[:3, 0]
-        turned_little = self._axis is not None and float(right @ self._axis) > math.cos(MAX_TURN)
-        return self._axis if settings.cached and turned_little and self._axis is not None else right.copy()
+    def _choose_axis(
+        self, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings
+    ) -> Float[np.ndarray, "3"]:
+        """The direction from the left to the right eye.
 
-    def _place_eyes(self, cam2world: np.ndarray, settings: DrawSettings) -> list[Float[np.ndarray, "4 4"]]:
+        It is kept up to `MAX_TURN`, and up to twice that while the faces at the next places of the eyes are drawn.
+        """
+        right = cam2world[:3, 0]
+        if self._axis is None or not settings.cached:
+            return right.copy()
+        if float(right @ self._axis) > math.cos(MAX_TURN):
+            return self._axis
+        following = self._following
+        if following is None or float(right @ following) < math.cos(2 * MAX_TURN):
+            return right.copy()
+        if self._has_faces(following, cam2world, size, settings):
+            return following
+        return self._axis if float(right @ self._axis) > math.cos(2 * MAX_TURN) else following
+
+    def _has_faces(
+        self, axis: Float[np.ndarray, "3"], cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings
+    ) -> bool:
+        """Whether the faces that the eyes on an axis read are finished."""
+        eye_size, eye_settings = get_eye_size(size, settings.stereo), replace(settings, stereo="mono")
+        poses = self._place_eyes(cam2world, settings, axis)
+        return all(eye.has_faces(pose, eye_size, eye_settings) for eye, pose in zip(self._eyes, poses, strict=True))
+
+    def _place_eyes(
+        self, cam2world: np.ndarray, settings: DrawSettings, axis: Float[np.ndarray, "3"]
+    ) -> list[Float[np.ndarray, "4 4"]]:
         poses = [cam2world.copy(), cam2world.copy()]
         for pose, sign in zip(poses, (-0.5, 0.5), strict=True):
-            pose[:3, 3] += sign * settings.eye_distance * self._axis
+            pose[:3, 3] += sign * settings.eye_distance * axis
         return poses
 
     def _arrange(self, textures: list[moderngl.Texture | None], stereo: Stereo) -> moderngl.Texture | None:
@@ -366,7 +449,7 @@ class StereoRenderer:
 
     def _get_target(self, eye_size: tuple[int, int], stereo: Stereo, dtype: str) -> moderngl.Framebuffer:
         assert self._ctx is not None
-        size = eye_size[0] * (2 if stereo == "side-by-side" else 1), eye_size[1] * (2 if stereo == "top-bottom" else 1)
+        size = _join_sizes(eye_size, stereo)
         if size not in self._targets:
             if len(self._targets) >= _MAX_TARGETS:
                 for target in self._targets.values():

@@ -36,9 +36,23 @@ class TourScenes:
         refines: whether predictions that are not refined are requested again.
     """
 
-    def __init__(self, tour: TourGraph, *, memory: float = DEFAULT_MEMORY, refines: bool = True) -> None:
-        """`memory` limits the loaded scenes, GiB; two scenes are kept in any case."""
-        self.tour = tour
+    def __init__(
+        self,
+        tour: TourGraph,
+        *,
+        memory: float = DEFAULT_MEMORY,
+        refines: bool = True,
+        merged: Scene | None = None,
+    ) -> None:
+        """Start without scenes.
+
+        Args:
+            tour: the graph.
+            memory: limit of the loaded scenes, GiB; two scenes are kept in any case.
+            refines: see above.
+            merged: the scene of all panoramas that the scenes of the edges are parts of; None to predict them.
+        """
+        self.tour, self._merged = tour, merged
         self.edge: Edge = next(iter(tour.overlaps))
         self.outlines: dict[int, FloorOutline] = {}
         self.refines = refines
@@ -68,7 +82,7 @@ class TourScenes:
     def make_entry(self, views: Views) -> SceneEntry:
         """The scene of these panoramas as an entry for the loader."""
         pair = self.tour.make_pair(views)
-        return SceneEntry(pair.name, pair=pair, tour=self.tour, views=views)
+        return SceneEntry(pair.name, pair=pair, tour=self.tour, views=views, merged=self._merged)
 
     def add(self, loaded: LoadedScene) -> None:
         """Keep a scene; the least recently used ones are dropped if the memory is exceeded."""
@@ -142,23 +156,31 @@ class TourScenes:
 
     def plan_route(self, camera: Float[np.ndarray, "4 4"], remaining: Sequence[int] = ()) -> Route:
         """A route from a pose through the remaining panoramas; without any, through all of them."""
-        nearest = self.tour.find_nearest_node(camera[:3, 3])
         if remaining:
-            walk = [*self.tour.find_walk(nearest, remaining[0]), *remaining[1:]]
+            walk = [*self._find_walk(camera[:3, 3], remaining[0]), *remaining[1:]]
         else:
-            walk = self.tour.plan_walk(nearest)
+            edge, _ = self.tour.find_nearest_edge(camera[:3, 3])
+            distances = np.linalg.norm(self.tour.positions[list(edge)] - camera[:3, 3], axis=1)
+            walk = self.tour.plan_walk(edge[int(distances.argmin())])
         return plan_route(self.tour, walk, camera)
 
     def plan_way(self, camera: Float[np.ndarray, "4 4"], node: int) -> Route:
-        """A route from a pose to a panorama. At an edge, it goes directly to the end that is on the way."""
-        ways = [self.tour.find_walk(start, node) for start in self.edge]
-        position = camera[:3, 3]
+        """A route from a pose to a panorama."""
+        return plan_route(self.tour, self._find_walk(camera[:3, 3], node), camera)
 
-        def measure(way: list[int]) -> float:
-            places = [position, *self.tour.positions[way]]
+    def _find_walk(self, position: Float[np.ndarray, "3"], node: int) -> list[int]:
+        """The panoramas on the way from a position to one of them.
+
+        It begins at that end of the nearest edge which is on the way. `edge` can be another one: after a jump of the
+        camera, or where two edges are about as near.
+        """
+        nearest, _ = self.tour.find_nearest_edge(position)
+
+        def measure(walk: list[int]) -> float:
+            places = [position, *self.tour.positions[walk]]
             return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
 
-        return plan_route(self.tour, min(ways, key=measure), camera)
+        return min((self.tour.find_walk(end, node) for end in nearest), key=measure)
 
     @property
     def camera_height(self) -> float:

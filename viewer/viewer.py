@@ -2,8 +2,10 @@
 
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -35,7 +37,7 @@ from pansplat_viewer.preferences import read_preferences, write_preferences
 from pansplat_viewer.presenter import Presenter
 from pansplat_viewer.resolution import AdaptiveResolution, ResolutionPlan
 from pansplat_viewer.settings import DrawSettings, RendererChoice
-from pansplat_viewer.slots import SceneSlot, keep_largest
+from pansplat_viewer.slots import ScenePreparer, SceneSlot, keep_largest
 from pansplat_viewer.state import (
     ViewerState,
     adapt_settings,
@@ -101,17 +103,22 @@ class Viewer:
         values = self.panel_data.preferences = read_preferences(preferences)
         self.gui = Gui(dpi_scale, theme=values.theme, layout=values.layout)
         self._choice, self._memory = renderer, memory
-        self._slots = [SceneSlot(StereoRenderer(create_renderer(ctx, renderer), ctx))]
         self._fade = CrossFade()
+        self._slots = [SceneSlot(StereoRenderer(create_renderer(ctx, renderer), ctx))]
+        self._preparer = ScenePreparer(self.renderer.prepare)
+        self._incoming: LoadedScene | None = None  # shown when it is prepared
         self.presenter = Presenter(ctx)
         self._comparer = Comparer(ctx, lambda: StereoRenderer(create_renderer(ctx, renderer), ctx))
-        self._opened: Path | None = None
+        self._path: Path | None = None  # of the entries
+        self._searched: tuple[Path, str | None] = Path(), None  # path, and the entry to show of those found there
         self._too_large: LoadedScene | None = None
         self._draw_failed = False
         self._watch = FileWatch()
         self._find, self._folder, self._at, self._clock = find, folder, at, clock
-        self._resolution = AdaptiveResolution(settle_after=self.renderer.settle_seconds)
+        self._resolution = self._create_resolution()
         self._loaded: LoadedScene | None = None
+        # Entries when the scene was loaded, its place among them, and their path.
+        self._shown: tuple[list[SceneEntry], int, Path | None] | None = None
         self._refined: Scene | None = None
         self._films = FilmWriter()
         self._tour: TourScenes | None = None
@@ -123,6 +130,9 @@ class Viewer:
         """The renderer of the scene that is shown."""
         return self._slot.renderer
 
+    def _create_resolution(self) -> AdaptiveResolution:
+        return AdaptiveResolution(settle_after=self.renderer.settle_seconds, turn_ms=self.renderer.turn_ms)
+
     @property
     def _slot(self) -> SceneSlot:
         return self._slots[self._fade.front]
@@ -131,36 +141,62 @@ class Viewer:
     def busy(self) -> bool:
         """Whether the next frame differs without new input."""
         loading = self.loader.entry is not None or self.loader.is_searching or self._comparer.photographs.is_reading
+        loading = loading or self._incoming is not None or self._preparer.progress is not None
         return self.moving or loading or self._films.progress is not None
 
     @property
     def moving(self) -> bool:
         """Whether the image is still changing, so that a window draws as often as it can."""
         recently = self._clock() - self._resolution.last_motion < 2 * self._resolution.settle_after
-        slots = [self._slot] if self._comparer.pinned is None else [self._slot, self._comparer.pinned.slot]
-        unsettled = any(slot.image is not None and not slot.renderer.stats.settled for slot in slots)
-        fading = self._fade.compute_weight(self._clock()) < 1
-        playing = self.state.path_playing or (self.state.playing and not self._waiting)
-        return playing or recently or unsettled or fading
+        unsettled = any(slot.scene is not None and not slot.renderer.stats.settled for slot in self._shown_slots)
+        return self._is_animated or recently or (unsettled and not self._draw_failed)
 
-    def open(self, path: Path) -> None:
-        """Look for the scenes at a path and show them; for an invalid path, show an error and keep the scene."""
-        self._opened = path
+    @property
+    def pending(self) -> Future[Any] | None:
+        """The image that is drawn in the background, if the window changes only when it is finished."""
+        if self._is_animated:
+            return None
+        return next((slot.renderer.pending for slot in self._shown_slots if slot.renderer.pending is not None), None)
+
+    @property
+    def _shown_slots(self) -> list[SceneSlot]:
+        return [self._slot] if self._comparer.pinned is None else [self._slot, self._comparer.pinned.slot]
+
+    @property
+    def _is_animated(self) -> bool:
+        fading = self._fade.compute_weight(self._clock()) < 1
+        return fading or self.state.path_playing or (self.state.playing and not self._waiting)
+
+    def open(self, path: Path, name: str | None = None) -> None:
+        """Look for the scenes at a path and show one; for an invalid path, show an error and keep the scene.
+
+        Args:
+            path: a file or folder.
+            name: of the entry to show; the first one if there is none of this name.
+        """
+        self._searched = path, name
         self.loader.search(path, self._find)
 
-    def show(self, entries: list[SceneEntry], index: int) -> None:
-        """List these entries and load one of them."""
-        self.entries = entries
-        self.panel_data.entries = [entry.name for entry in entries]
-        self.panel_data.current, self.panel_data.error = index, None
-        self._watch.start(entries[index].files)
+    def show(self, entries: list[SceneEntry], index: int, path: Path | None = None) -> None:
+        """List these entries and load one of them.
+
+        Args:
+            entries: to choose from.
+            index: of the entry to load.
+            path: where they were found, so that a reload finds new ones; None if they are only loaded again.
+        """
+        self._incoming, self.panel_data.error = None, None
+        self._list_entries(entries, index, path)
+        if path is not None:
+            self._write_preferences(recent=self.panel_data.preferences.add_recent(path).recent)
         if self._loaded is None:
             self._preview(entries[index])
         self.loader.request(entries[index])
 
-    def remember(self, path: Path) -> None:
-        """Add a path to the recent ones."""
-        self._write_preferences(recent=self.panel_data.preferences.add_recent(path).recent)
+    def _list_entries(self, entries: list[SceneEntry], index: int, path: Path | None) -> None:
+        self.entries, self._path = entries, path
+        self.panel_data.entries, self.panel_data.current = [entry.name for entry in entries], index
+        self._watch.start(entries[index].files)
 
     def frame(self, target: moderngl.Framebuffer, seconds: float, new_frame: Callable[[], None] | None = None) -> None:
         """Apply the input of a frame of `seconds`, and draw image and panels into the viewport of `target`.
@@ -203,6 +239,7 @@ class Viewer:
         self._save_layout(changed=False)
         self._films.close()
         self.loader.close()
+        self._preparer.close()
         self.presenter.release()
         self._comparer.release()
         self.panels.release()
@@ -212,23 +249,33 @@ class Viewer:
 
     def _take_loaded(self, now: float) -> None:
         """Show the scene, the entries or the error of a finished load or search."""
-        result = self.loader.poll()
+        if self._incoming is not None and self._preparer.is_ready(self._incoming.scene):
+            incoming, self._incoming = self._incoming, None
+            self._show_loaded(incoming, now)
+        result = self.loader.poll() if self._incoming is None else None
         if isinstance(result, list):
-            if self._opened is not None:
-                self.remember(self._opened)
-            self.show(result, 0)
+            path, wanted = self._searched
+            names = [entry.name for entry in result]
+            self.show(result, names.index(wanted) if wanted in names else 0, path)
         elif isinstance(result, LoadedScene):
             loaded = self._loaded
             if self._tour is not None and result.entry.tour is self._tour.tour:
                 self._tour.add(result)
             elif loaded is not None and loaded.entry is result.entry and result.is_final and not loaded.is_final:
                 self._refined = result.scene
-            else:
+            elif self._preparer.is_ready(result.scene):
                 self._show_loaded(result, now)
-        elif isinstance(result, (InputError, OSError)):
-            self.panel_data.error = str(result)
-        elif result is not None:  # not a user error: a defect, or out of memory
-            self.panel_data.error = f"{type(result).__name__}: {result}"
+            else:
+                self._incoming = result
+        elif result is not None:
+            known = isinstance(result, (InputError, OSError))  # else a defect, or out of memory
+            self.panel_data.error = str(result) if known else f"{type(result).__name__}: {result}"
+            self._list_shown()
+
+    def _list_shown(self) -> None:
+        """List the scene that is shown again, after another one was not loaded."""
+        if self._shown is not None:
+            self._list_entries(*self._shown)
 
     def _show_loaded(self, loaded: LoadedScene, now: float) -> None:
         """Show a scene; if it does not fit into memory, keep the one before and offer the largest Gaussians."""
@@ -246,7 +293,7 @@ class Viewer:
     def _upload(self, slot: SceneSlot, scene: Scene, entry: SceneEntry) -> bool:
         """Upload a scene; returns whether it fits the GPU's memory, and shows an error if not."""
         try:
-            slot.upload(scene)
+            slot.upload(scene, self._preparer.take(scene))
         except (InputError, MemoryError, moderngl.Error) as error:  # moderngl.Error: the GPU's memory is exhausted
             self.panel_data.error = f"{entry.name}: {_describe(error)}"
             return False
@@ -254,15 +301,18 @@ class Viewer:
 
     def _exchange_scene(self) -> None:
         """Show the refined scene or the prediction, whichever is chosen, while the camera stands still."""
-        if self._loaded is None or self._refined is None or self.moving:
+        if self._loaded is None or self._refined is None or self._incoming is not None or self.moving:
             return
         scene = self._refined if self.state.refined else self._loaded.scene
-        if scene is not self._slot.scene and not self._upload(self._slot, scene, self._loaded.entry):
+        if scene is self._slot.scene or not self._preparer.is_ready(scene):
+            return
+        if not self._upload(self._slot, scene, self._loaded.entry):
             self._refined = None
 
     def _enter(self, loaded: LoadedScene, now: float) -> None:
         self._loaded, self._refined, self._tour = loaded, None, None
-        self._resolution = AdaptiveResolution(settle_after=self.renderer.settle_seconds)
+        self._shown = self.entries, self.panel_data.current, self._path
+        self._resolution = self._create_resolution()
         self._fade.clear()
         self._fade.show(0, loaded.scene, now)
         self._comparer.photographs.open(loaded.entry.panoramas)
@@ -280,7 +330,7 @@ class Viewer:
         assert tour is not None
         if len(self._slots) == 1:
             self._slots.append(SceneSlot(StereoRenderer(create_renderer(self.ctx, self._choice), self.ctx)))
-        self._tour = TourScenes(tour, memory=self._memory)
+        self._tour = TourScenes(tour, memory=self._memory, merged=loaded.entry.merged)
         self._tour.add(loaded)
         enter_tour(self.state, tour, loaded.scene, plan_route(tour, tour.plan_walk()), at=self._at)
         self._tour.move(np.asarray(self.state.camera.position), self.state.route, self.state.flight)
@@ -306,10 +356,10 @@ class Viewer:
         slot = None if loaded is None else self._fade.choose_slot(loaded.scene)
         if loaded is None or slot is None:
             return
-        if self._slots[slot].scene is not loaded.scene and not self._upload(
-            self._slots[slot], loaded.scene, loaded.entry
-        ):
-            return
+        if self._slots[slot].scene is not loaded.scene:
+            ready = self._incoming is None and self._preparer.is_ready(loaded.scene)
+            if not ready or not self._upload(self._slots[slot], loaded.scene, loaded.entry):
+                return
         self._fade.show(slot, loaded.scene, now)
         adapt_settings(self.state, loaded.scene)
         self.state.points = []
@@ -352,6 +402,9 @@ class Viewer:
     def _update_panel_data(self, size: tuple[int, int]) -> None:
         data, comparer = self.panel_data, self._comparer
         data.stats, data.loading = self.renderer.stats, self.loader.progress
+        if self._incoming is not None and self._preparer.progress is not None:
+            count, done = len(self._incoming.scene.gaussians), self._preparer.progress
+            data.loading = self._incoming.entry.name, f"preparing {count:,} Gaussians", done
         data.refinement = self.loader.refinement if self._refined is None else 1.0
         data.changed, data.photographs, data.pinned = (
             self._watch.changed,
@@ -392,8 +445,12 @@ class Viewer:
             self._last_camera = self.state.camera
 
     def _draw_preview(self, target: moderngl.Framebuffer, now: float) -> None:
-        """Draw the nearest photograph, at an infinite distance around its camera."""
+        """Draw what is shown before the first scene."""
         self._plan_resolution(target.viewport[2:], now)
+        self._draw_photograph(target)
+
+    def _draw_photograph(self, target: moderngl.Framebuffer) -> None:
+        """Draw the nearest photograph, at an infinite distance around its camera, or the background."""
         photograph = self._comparer.get_photograph(self.state)
         if photograph is None:
             target.use()
@@ -437,8 +494,12 @@ class Viewer:
         if milliseconds > 0:  # else the image is not new, or not finished
             self._resolution.record(plan, milliseconds)
         image = self._slot.image
-        assert image is not None
-        self.panel_data.size = image.size
+        if image is None:  # the first one of a large scene is not finished
+            image, fading = fading, None
+        if image is None:
+            self._draw_photograph(target)
+            return
+        self.panel_data.size = self.renderer.stats.size
 
         def draw_pinned(slot: SceneSlot, settings: DrawSettings) -> moderngl.Texture | None:
             self._render(slot, size, settings, plan)
@@ -450,12 +511,15 @@ class Viewer:
 
     def _render(self, slot: SceneSlot, size: tuple[int, int], settings: DrawSettings, plan: ResolutionPlan) -> float:
         """Draw the image of this plan; returns milliseconds, 0 if it is not new."""
-        scaled = (max(round(size[0] * plan.scale), 1), max(round(size[1] * plan.scale), 1))
         cam2world, settings = self.state.camera.cam2world, replace(settings, cached=plan.cached)
-        if plan.cached and slot.renderer.has_faces(cam2world, size, settings):
-            scaled = size
+        # Both eyes need faces at new places during a turn: the coarsest ones, so that they are finished in time.
+        scale = plan.scale if settings.stereo == "mono" or not plan.cached else self._resolution.coarsest
+        if not (plan.cached and slot.renderer.has_faces(cam2world, size, settings)):
+            settings = replace(settings, scale=scale)
         wait = plan.moving and slot.renderer.waits_while_moving
-        return slot.draw(cam2world, scaled, settings, wait=wait)
+        milliseconds = slot.draw(cam2world, size, settings, wait=wait)
+        slot.renderer.prefetch(cam2world, size, settings, scale)
+        return milliseconds
 
     def _focus_center(self) -> None:
         """Orbit the point in the centre of the last image."""
@@ -491,10 +555,14 @@ class Viewer:
             self.panel_data.error = self.panel_data.reduced = None
             self._draw_failed = False
             if commands.reduce is not None and loaded is not None:
-                self._show_loaded(replace(loaded, scene=keep_largest(loaded.scene, commands.reduce)), now)
+                self._incoming = replace(loaded, scene=keep_largest(loaded.scene, commands.reduce))
+            else:
+                self._list_shown()
         if commands.cancel_loading and not self.loader.cancel_search():
             self.loader.cancel()
-            self.panel_data.current = -1
+            self._preparer.stop()
+            self._incoming, self.panel_data.current = None, -1
+            self._list_shown()
         if commands.theme is not None:
             self.gui.set_theme(commands.theme)
             self._write_preferences(theme=commands.theme)
@@ -505,9 +573,13 @@ class Viewer:
         if commands.visit is not None:
             self.state.target = commands.visit
         if commands.choose is not None and commands.choose != self.panel_data.current:
-            self.show(self.entries, commands.choose)
+            self.show(self.entries, commands.choose, self._path)
         elif commands.reload:
-            self.show(self.entries, max(self.panel_data.current, 0))
+            current = max(self.panel_data.current, 0)
+            if self._path is None:
+                self.show(self.entries, current)
+            else:
+                self.open(self._path, self.entries[current].name)
         elif commands.open is not None:
             self.open(Path(commands.open).expanduser())
         if self._loaded is None:
@@ -586,7 +658,7 @@ class Viewer:
                 if tour is None:
                     frames = SceneFrames(renderers[0], scene, size, settings, image_format)
                 else:
-                    scenes = TourScenes(tour.tour, memory=memory)
+                    scenes = TourScenes(tour.tour, memory=memory, merged=loaded.entry.merged)
                     frames = TourFrames(renderers, scenes, self.loader.load, size, settings, image_format)
                 return write_path_film(frames, path, level, file, fps, progress)
             finally:

@@ -21,6 +21,7 @@ from pansplat_viewer.viewer import Viewer
 
 _DEBIAN = "on Debian or Ubuntu: apt-get install libgl1 libegl1 libgl1-mesa-dri libgles2"
 _IDLE_SECONDS = 0.1  # between frames when nothing moves; so that a prediction gets the CPU
+_PENDING_SECONDS = 0.05  # between frames while an image is drawn in the background; so that it gets the CPU
 
 
 _BUTTONS = (
@@ -176,6 +177,10 @@ class Window:
         else:
             self._glfw.wait_events_timeout(seconds)
 
+    def wake(self) -> None:
+        """End `wait`; any thread may call this."""
+        self._glfw.post_empty_event()
+
     @property
     def closing(self) -> bool:
         """Whether the user closed the window."""
@@ -219,8 +224,14 @@ def _run_loop(window: Window, viewer: Viewer) -> None:
     while not (window.closing or viewer.state.quit):
         before = time.perf_counter()
         visible = window.is_visible
-        moving = visible and (viewer.moving or before < active_until or window.gamepad_moves)
-        window.wait(0.0 if moving else _IDLE_SECONDS)
+        has_input = before < active_until or window.gamepad_moves or viewer.gui.has_input
+        moving = visible and (viewer.moving or has_input)
+        pending = viewer.pending if visible and not window.gamepad_moves else None
+        if pending is not None:
+            pending.add_done_callback(lambda _: window.wake())
+            window.wait(_PENDING_SECONDS)
+        else:
+            window.wait(0.0 if moving else _IDLE_SECONDS)
         if not moving and time.perf_counter() - before < 0.9 * _IDLE_SECONDS:
             active_until = time.perf_counter() + 0.25  # an event: imgui needs a few frames to process it
         if window.dropped:

@@ -311,6 +311,7 @@ def make_viewer_report(
 def plot_viewer(rows: Sequence[ViewerRow], title: str) -> Figure:
     """Plot the time of a frame over the number of Gaussians, for each view, renderer and mode."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
 
     views = list(dict.fromkeys(row.case.view for row in rows))
     figure = Figure(figsize=(3.6 * len(views), 4.2), layout="constrained")
@@ -328,6 +329,7 @@ def plot_viewer(rows: Sequence[ViewerRow], title: str) -> Figure:
             ax.axhline(1000 / rate, color="grey", linewidth=0.8)
             ax.annotate(f"{rate} fps", (1, 1000 / rate), xycoords=("axes fraction", "data"), ha="right", va="bottom")
         ax.set(title=f"{view}, {of_view[0].case.width}x{of_view[0].case.height}", xlabel="Gaussians")
+        ax.xaxis.set_minor_formatter(NullFormatter())  # they would overlap
         ax.grid(alpha=0.25, which="both")
         ax.legend(fontsize=7)
     axes[0].set_ylabel("frame, ms")

@@ -51,6 +51,7 @@ def jobs(monkeypatch) -> list[dict]:
             }  # fmt: skip
 
     monkeypatch.setattr(viewer, "read_viewer_output", read_viewer_output)
+    monkeypatch.setattr(viewer, "_PANORAMA_SIZE", (64, 32))  # a float64 image of the usual size takes seconds
     return jobs
 
 

@@ -21,11 +21,12 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.rendering import Rendering, rasterize
-from pansplat.tours import FloorOutline, TourGraph
+from pansplat.tours import FloorOutline, TourGraph, merge_scenes
 from pansplat_viewer.cpu_renderer import CpuRenderer, Renderer
 from pansplat_viewer.loader import LoadedScene, SceneEntry
 from pansplat_viewer.offscreen import create_context
 from pansplat_viewer.renderer import DrawSettings, SplatRenderer
+from pansplat_viewer.tour import TourScenes
 
 _Y0 = 0.28209479177387814  # the constant harmonic
 
@@ -249,6 +250,15 @@ def house(tmp_path_factory, axis_photos) -> TourGraph:
         panoramas.append(Panorama(f"room{index}", folder / f"room{index}.png", pose))
     overlaps = {(0, 1): 0.4, (1, 2): 0.4, (2, 3): 0.4}
     return TourGraph("house tour", folder, tuple(panoramas), 0.45, 10.0, (), overlaps)
+
+
+@pytest.fixture(scope="session")
+def house_file(house, tmp_path_factory) -> Path:
+    """The tour as one file."""
+    file = tmp_path_factory.mktemp("file") / "home.ply"
+    scenes = TourScenes(house)
+    save_ply(merge_scenes(house, lambda views: _load_house(scenes.make_entry(views)).scene), file)
+    return file
 
 
 @pytest.fixture(scope="session")

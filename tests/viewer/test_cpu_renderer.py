@@ -72,6 +72,17 @@ def test_image_from_faces_is_close_to_the_direct_image(renderer, pose, turned):
         assert error.mean() < 2.5, "bilinear interpolation of the faces"
 
 
+@pytest.mark.parametrize("cached", [False, True])
+def test_an_image_drawn_at_a_smaller_scale_is_enlarged_to_its_size(renderer, pose, cached):
+    settings = replace(SETTINGS, cached=cached)
+    small = renderer.render(pose, (SIZE[0] // 2, SIZE[1] // 2), settings)
+    channels = torch.from_numpy(read_pixels(small)).permute(2, 0, 1).double()[None]
+    expected = torch.nn.functional.interpolate(channels, SIZE[::-1], mode="bilinear")[0].permute(1, 2, 0).numpy()
+    texture = renderer.render(pose, SIZE, replace(settings, scale=0.5))
+    assert texture.size == SIZE and renderer.stats.size == (SIZE[0] // 2, SIZE[1] // 2)
+    assert np.abs(read_pixels(texture) - expected).max() <= 3
+
+
 def test_turning_draws_only_missing_faces(renderer, pose, turned):
     cached = replace(SETTINGS, cached=True, vertical_fov_degrees=40.0)
     assert not renderer.has_faces(pose, SIZE, cached)

@@ -16,7 +16,8 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.rendering import rasterize
 from pansplat_viewer.color_maps import get_table, map_values
 from pansplat_viewer.displays import color_by_property
-from pansplat_viewer.settings import SCALAR_MAPS, Display, DrawSettings
+from pansplat_viewer.settings import SCALAR_MAPS, Display, DrawSettings, Mode
+from pansplat_viewer.stereo import ImageFormat, render_image
 
 pytestmark = pytest.mark.gl
 
@@ -134,21 +135,32 @@ def test_panoramas_show_the_display(make_renderer, small_scene, pose, display):
     assert np.abs(images[0] - images[1]).mean() < 0.06  # OpenGL interpolates cube faces
 
 
-GOLDEN = Path(__file__).parents[1] / "assets" / "displays.png"  # PANSPLAT_WRITE_GOLDEN=1 writes it
+GOLDEN = Path(__file__).parents[1] / "assets" / "viewer.png"  # PANSPLAT_WRITE_GOLDEN=1 writes it
 
 
 @pytest.mark.parametrize("tier", ["cpu", "gl43"])
-def test_each_display_looks_as_in_the_golden_image(make_renderer, small_scene, pose, tier):
-    renderer, rows = make_renderer(small_scene, tier), []
+def test_each_display_mode_and_projection_looks_as_in_the_golden_image(make_renderer, small_scene, pose, tier):
+    renderer, images = make_renderer(small_scene, tier), {}
     for display in get_args(Display):
         settings = DrawSettings(display=display, display_max={"depth": 6.0, "count": 40.0}.get(display, 1.0))
-        rows.append(draw(renderer, pose, settings)[..., :3])
-    image = np.clip(np.concatenate(rows, axis=1), 0, 1)
+        images[display] = render_image(renderer, pose, SIZE, settings)[0]
+    for mode in get_args(Mode)[1:]:
+        images[mode] = render_image(renderer, pose, SIZE, DrawSettings(mode=mode))[0]
+    for size, options in (
+        (SIZE, {"stereo": "anaglyph"}),
+        ((32, SIZE[1]), {"stereo": "side-by-side"}),
+        ((96, 48), {"projection": "equirect"}),
+        ((72, 48), {"projection": "cubemap"}),
+    ):
+        images[str(options)] = render_image(renderer, pose, size, DrawSettings(), ImageFormat(**options))[0]
+    image = np.concatenate(list(images.values()), axis=1)
     if tier == "cpu" and os.environ.get("PANSPLAT_WRITE_GOLDEN"):
         write_image(GOLDEN, image)
     with Image.open(GOLDEN) as file:
         expected = np.asarray(file.convert("RGB")) / 255
-    parts = (np.split(each, len(rows), axis=1) for each in (image, expected))
-    for display, part, golden in zip(get_args(Display), *parts, strict=True):
-        error = np.abs(part - golden)
-        assert (error.max(axis=2) > 0.03).mean() < 0.02 and error.mean() < 4e-3, display
+    left = 0
+    for name, part in images.items():
+        error = np.abs(part - expected[:, left : left + part.shape[1]])
+        assert (error.max(axis=2) > 0.03).mean() < 0.02 and error.mean() < 4e-3, name
+        left += part.shape[1]
+    assert left == expected.shape[1]

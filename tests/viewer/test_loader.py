@@ -5,11 +5,13 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from pansplat.errors import InputError
 from pansplat.gaussians.ply import save_ply
 from pansplat_viewer.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, find_entries, load_entry
+from pansplat_viewer.tour import TourScenes
 
 
 def ignore(task: str, done: float) -> None: ...
@@ -53,6 +55,19 @@ def test_a_folder_of_scenes_has_an_entry_for_each(tmp_path, small_scene):
     assert [entry.name for entry in entries] == ["a", "b"]
     loaded = load_entry(entries[0], LoadOptions(), ignore)
     assert len(loaded.scene.gaussians) == len(small_scene.gaussians)
+
+
+def test_a_file_with_the_graph_of_a_tour_is_a_tour_of_its_parts(house, house_file):
+    (entry,) = find_entries(house_file, LoadOptions())
+    first = load_entry(entry, LoadOptions(), ignore)
+    tour, scenes = first.entry.tour, TourScenes(first.entry.tour, merged=first.entry.merged)
+    assert tour.name == "home" and tour.overlaps == house.overlaps and first.is_final
+    assert np.allclose(tour.positions, house.positions) and first.entry.views == (0, 1)
+    assert first.entry.panoramas == () and first.entry.files == (house_file,)
+    other = load_entry(scenes.make_entry((2, 3)), LoadOptions(), ignore)
+    assert other.entry.views == (2, 3) and other.entry.panoramas == ()
+    assert other.scene.gaussians.views.unique().tolist() == [0, 1]
+    assert np.allclose(other.scene.cam2world, house.cam2world[2:])
 
 
 @pytest.mark.shared

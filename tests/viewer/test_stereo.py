@@ -194,6 +194,25 @@ def test_turning_reads_cached_faces_of_both_eyes_until_they_are_out_of_place(ste
 
 
 @pytest.mark.gl
+@pytest.mark.parametrize("stereo_renderer", ["cpu"], indirect=True)
+@pytest.mark.parametrize("direction", [-1, 1])
+def test_the_faces_at_the_next_places_of_the_eyes_are_drawn_during_a_turn(stereo_renderer, pose, direction, wait_until):
+    settings, size = DrawSettings(stereo="anaglyph", eye_distance=0.2, cached=True, vertical_fov_degrees=40), (48, 32)
+    for degrees in (0, 4, 8, 16):
+        turned = turn(pose, direction * degrees)
+        stereo_renderer.render(turned, size, settings)
+        stereo_renderer.prefetch(turned, size, settings, 0.5)
+    turned = turn(pose, direction * 21)
+    for each in (replace(settings, scale=0.5), settings):
+        wait_until(lambda each=each: stereo_renderer.has_faces(turned, size, each), "faces")
+    stereo_renderer.render(turned, size, settings)
+    assert stereo_renderer.stats.cached and stereo_renderer.stats.drawn == 0
+    found = stereo_renderer.read_color()
+    expected = render_image(stereo_renderer, turned, size, settings, ImageFormat("perspective", "anaglyph", 0.2))[0]
+    assert np.abs(found[..., :3] - expected).mean() < 0.02
+
+
+@pytest.mark.gl
 def test_images_of_both_eyes_are_shown_when_both_are_finished(stereo_renderer, random_scene, pose, wait_until):
     settings = DrawSettings(stereo="anaglyph", eye_distance=0.2)
     stereo_renderer.render(pose, (24, 16), DrawSettings(), wait=False)

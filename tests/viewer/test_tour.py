@@ -72,6 +72,14 @@ def test_the_way_to_a_panorama_starts_at_the_camera(scenes):
     assert np.allclose(route.pose(1)[:3, 3], scenes.tour.positions[3])
 
 
+def test_a_way_begins_at_the_edge_of_the_camera_after_a_jump(scenes):
+    camera = Camera(position=(0.5, 0.0, 1.6)).cam2world
+    assert scenes.edge == (0, 1), "the edge before the jump"
+    assert scenes.plan_way(camera, 0).walk == (2, 1, 0)
+    assert scenes.plan_route(camera, (1, 0)).walk == (2, 1, 0)
+    assert scenes.plan_route(camera).walk[:2] == (3, 2), "the end of the edge that is nearer"
+
+
 def test_a_fade_is_continuous_and_another_one_begins_after_its_end(small_scene):
     first, second = small_scene, replace(small_scene)
     fade = CrossFade()

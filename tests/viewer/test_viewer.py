@@ -22,6 +22,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat_viewer.color_maps import map_values
+from pansplat_viewer.cpu_renderer import CpuRenderer
 from pansplat_viewer.loader import (
     LoadedScene,
     LoadOptions,
@@ -31,8 +32,9 @@ from pansplat_viewer.loader import (
     find_entries,
     load_entry,
 )
+from pansplat_viewer.preferences import Preferences
 from pansplat_viewer.presenter import ERROR_MAP
-from pansplat_viewer.resolution import BUDGET_MS, SCALES, SETTLE_AFTER, AdaptiveResolution
+from pansplat_viewer.resolution import BUDGET_MS, SETTLE_AFTER
 from pansplat_viewer.settings import Comparison, Display
 from pansplat_viewer.state import ViewerState
 from pansplat_viewer.viewer import Viewer
@@ -49,7 +51,7 @@ IMAGE_WIDGETS = (
     "joint", "deferred", "difference", "view 0", "view 1", "0##level", "1##level", "2##level", "3##level",
     "min. opacity", "ray", "ewa", "radial", "z", "angular", "3dgs", "black", "grey", "white", "field of view",
     "off##stereo", "pair##stereo", "red/cyan##stereo",
-    "Panorama 2", "##flight",
+    "2##panorama", "##flight",
 )  # fmt: skip
 INITIAL_SETTINGS = {
     **{label: {"mode": "joint"} for label in ("deferred", "difference", "view 0", "view 1")},
@@ -64,57 +66,9 @@ INITIAL_SETTINGS = {
 OTHER_WIDGETS = {
     "Scene", "pair", "path", "Open", "Gaussians", "Drawing", "background", "coarser while moving", "Camera",
     *get_args(Display), *get_args(Comparison),
-    "fly", "orbit", "Reset", "speed", "Panorama 1", "Fly", "Display", "Compare", "Pin this image",
+    "fly", "orbit", "Reset", "speed", "1##panorama", "Fly", "Display", "Compare", "Pin this image",
     "Screenshot", "PNG", "EXR + depth", "360 PNG", "Camera path", "Window", "Reload",
 }  # fmt: skip
-
-
-def move_camera(resolution: AdaptiveResolution, full_ms: float, frames: int) -> list[float]:
-    """Move for some frames whose time is proportional to their pixels; returns the scales."""
-    scales = []
-    for frame in range(frames):
-        plan = resolution.plan(frame / 60, moved=True, turned=False)
-        resolution.record(plan, full_ms * plan.scale**2)
-        scales.append(plan.scale)
-    return scales
-
-
-def test_resolution_is_full_on_a_fast_machine_and_fits_the_budget_on_a_slow_one():
-    assert set(move_camera(AdaptiveResolution(), BUDGET_MS / 2, 30)) == {1.0}
-    scales = move_camera(AdaptiveResolution(), 5 * BUDGET_MS, 30)
-    assert scales[-1] < 0.6 and 5 * BUDGET_MS * scales[-1] ** 2 <= 1.2 * BUDGET_MS
-    assert move_camera(AdaptiveResolution(), 1e6, 30)[-1] == SCALES[-1]
-
-
-def test_no_image_is_smaller_than_the_renderer_allows_unless_the_window_is():
-    for size, smallest in (((1280, 720), 0.5), ((1920, 1080), 0.35), ((800, 600), 1.0), ((320, 200), 1.0)):
-        resolution = AdaptiveResolution()
-        resolution.limit(size, (640, 360))
-        assert move_camera(resolution, 1e6, 30)[-1] == smallest
-
-
-def test_resolution_does_not_oscillate():
-    for full_ms in (60.0, 100.0, 150.0, 300.0, 700.0):
-        assert len(set(move_camera(AdaptiveResolution(), full_ms, 60)[20:])) == 1
-
-
-def test_resolution_rises_when_frames_get_fast_and_when_the_camera_stops():
-    resolution = AdaptiveResolution()
-    move_camera(resolution, 10 * BUDGET_MS, 20)
-    last = 19 / 60
-    assert resolution.plan(last + SETTLE_AFTER / 2, moved=False, turned=False).scale < 1
-    assert resolution.plan(last + SETTLE_AFTER * 1.01, moved=False, turned=False).scale == 1
-    assert resolution.plan(0.5, moved=True, turned=False, adaptive=False).scale == 1
-    assert move_camera(resolution, BUDGET_MS / 10, 20)[-1] == 1.0
-
-
-def test_cached_faces_are_used_only_for_rotations_on_a_slow_machine():
-    fast, slow = AdaptiveResolution(), AdaptiveResolution()
-    fast.record(fast.plan(0, moved=False, turned=False), BUDGET_MS / 2)
-    slow.record(slow.plan(0, moved=False, turned=False), BUDGET_MS * 5)
-    assert not fast.plan(1, moved=False, turned=True).cached
-    assert slow.plan(1, moved=False, turned=True).cached
-    assert not slow.plan(1.1, moved=True, turned=False).cached
 
 
 class User:
@@ -128,6 +82,14 @@ class User:
         for _ in range(count):
             self.clock[0] += seconds
             self.viewer.frame(self.target, seconds)
+
+    def wait_for_progress(self, *expected: object) -> None:
+        """Draw frames until the panel shows this progress: name, description, fraction."""
+        deadline = time.monotonic() + 20
+        while self.data.loading != expected:
+            assert time.monotonic() < deadline, self.data.loading
+            self.draw_frames(1, 0.01)
+            time.sleep(0.002)
 
     def settle(self, *, refining: bool = False) -> None:
         """Draw frames until nothing changes without input; with `refining`, except the progress of a refinement."""
@@ -178,6 +140,12 @@ class User:
         self.draw_frames(1)
         io.add_mouse_button_event(0, False)
         self.draw_frames(2)
+
+    def slide(self, label: str, fraction: float) -> None:
+        """Drag a slider to a fraction of its width, which its label is a part of."""
+        left, top, right, bottom = self.panels.items[label]
+        middle = (top + bottom) / 2
+        self.drag((left + 0.2 * (right - left), middle), (left + fraction * (right - left), middle))
 
     def press(self, *keys: imgui.Key, frames: int = 1) -> None:
         for down in (True, False):
@@ -320,6 +288,8 @@ def test_a_view_of_weight_zero_is_left_out_of_deferred_blending(user):
     assert changed_fraction(both, user.read_image()) > 0.1
     user.state.camera = user.state.home
     assert changed_fraction(single, user.read_image()) == 0
+    user.slide("weight 1", 0.4)
+    assert 0 < user.state.settings.view_weights[1] < 1
 
 
 def test_stereo_shows_two_eyes_and_its_files_are_for_both(user, monkeypatch):
@@ -348,6 +318,7 @@ def test_fly_button_plays_and_stop_pauses(user):
     assert not user.state.playing and 0 < user.state.flight < 1
 
 
+@once
 def test_camera_buttons_switch_orbit_and_restore_the_start(user):
     user.click("orbit")
     assert user.state.orbiting
@@ -357,8 +328,8 @@ def test_camera_buttons_switch_orbit_and_restore_the_start(user):
     assert not user.state.orbiting
     user.click("Reset")
     assert user.state.camera == user.state.home
-    user.click("Panorama 2")
-    user.click("Panorama 1")
+    user.click("2##panorama")
+    user.click("1##panorama")
     assert user.state.camera.position == (0, 0, 0)
 
 
@@ -421,7 +392,9 @@ def test_typing_a_path_does_not_fly_and_enter_opens_it(user):
     for character in "wasd":
         io.add_key_event(getattr(imgui.Key, character), True)
         io.add_input_character(ord(character))
-        user.draw_frames(2)
+        assert user.viewer.gui.has_input
+        user.draw_frames(3)
+        assert not user.viewer.gui.has_input
         io.add_key_event(getattr(imgui.Key, character), False)
         user.draw_frames(1)
     assert user.panels.path == "wasd"
@@ -429,6 +402,41 @@ def test_typing_a_path_does_not_fly_and_enter_opens_it(user):
     user.press(imgui.Key.enter)
     user.settle()
     assert user.data.entries == ["opened"]
+
+
+@once
+def test_a_recent_path_is_opened_and_so_is_one_by_the_button(user, pair, monkeypatch):
+    opened = []
+
+    def find(path: Path, progress: Progress) -> list[SceneEntry]:
+        opened.append(path.name)
+        return [SceneEntry(f"{path.name} {len(opened)}", pair=pair)]
+
+    monkeypatch.setattr(user.viewer, "_find", find)
+    monkeypatch.setattr(user.data, "preferences", Preferences())
+    user.panels.path = "kitchen"
+    user.click("Open")
+    user.settle()
+    user.panels.path = ""
+    assert user.data.entries == ["kitchen 1"] and user.data.preferences.recent == (str(Path("kitchen").absolute()),)
+    user.draw_frames(2)
+    user.click("recent")
+    left, _, _, bottom = user.panels.items["recent"]
+    user.click_at(left + 30, bottom + 12)
+    user.settle()
+    assert user.data.entries == ["kitchen 2"]
+
+
+@once
+def test_the_background_is_chosen_in_a_picker(user):
+    user.state.settings = replace(user.state.settings, levels=frozenset())
+    assert user.read_image().max() == 0
+    left, top, _, bottom = user.panels.items["background"]
+    user.click_at(left + 5, (top + bottom) / 2)
+    user.draw_frames(2)
+    user.click_at(left + 60, bottom + 60)
+    user.click_at(500, 880)
+    assert max(user.state.settings.background) > 0 and user.read_image().max() > 0
 
 
 def test_the_list_of_scenes_loads_the_other_pair(user):
@@ -514,8 +522,8 @@ def test_the_error_is_the_mapped_difference_from_the_photograph(user):
     state.max_error = 0.4
     expected = map_values(np.abs(rendered - photograph).mean(axis=2) / 255, 0.4, ERROR_MAP)
     assert (np.abs(user.read_image() - expected).max(axis=2) <= 12).mean() > 0.98, "up to the steps of 8 bits"
-    state.max_error = 0.1
-    assert user.read_image().mean() > expected.mean() + 5, "a smaller range is brighter"
+    user.slide("error up to", 0.05)
+    assert state.max_error < 0.2 and user.read_image().mean() > expected.mean() + 5, "a smaller range is brighter"
 
 
 @once
@@ -640,8 +648,9 @@ def test_screenshots_show_the_image_without_the_panels(user, monkeypatch):
 
 def test_exr_screenshot_holds_color_and_radial_depth(user):
     user.press(imgui.Key.left_shift, imgui.Key.mod_shift, imgui.Key.p)
-    path = user.viewer.screenshots[-1]
-    assert path.suffix == ".exr"
+    user.click("EXR + depth")
+    by_key, path = user.viewer.screenshots[-2:]
+    assert by_key.suffix == path.suffix == ".exr"
     with OpenEXR.File(str(path)) as file:
         depth = file.channels()["Z"].pixels
         assert depth.shape == SIZE[::-1] and file.channels()["RGB"].pixels.shape == (*SIZE[::-1], 3)
@@ -765,12 +774,12 @@ def test_a_search_and_a_prediction_can_be_cancelled(user, monkeypatch):
 
     monkeypatch.setattr(user.viewer, "_find", lambda path, progress: wait(progress))
     user.viewer.open(Path("unposed"))
-    user.draw_frames(3, 0.01)
-    assert user.data.loading == ("unposed", "estimating poses", 0.3)
+    user.wait_for_progress("unposed", "estimating poses", 0.3)
     user.click("Cancel##loading")
     assert user.data.loading is None and user.data.current == 0, "the scene is still the current one"
     monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: wait(progress))
     user.click("Reload")
+    user.wait_for_progress(user.data.entries[0], "estimating poses", 0.3)
     user.click("Cancel##loading")
     user.settle()
     assert user.data.loading is None and user.data.error is None
@@ -785,7 +794,7 @@ def test_a_scene_beyond_the_memory_is_offered_with_its_largest_gaussians(user, s
     before, renderer = user.read_image(), user.viewer.renderer
     upload = type(renderer).upload
 
-    def refuse(self, scene):
+    def refuse(self, scene, prepared=None):
         if len(scene.gaussians) > 400:
             raise MemoryError("too many")
         upload(self, scene)
@@ -793,24 +802,75 @@ def test_a_scene_beyond_the_memory_is_offered_with_its_largest_gaussians(user, s
     monkeypatch.setattr(type(renderer), "upload", refuse)
     user.show(SceneEntry("large"))
     assert "the memory is exhausted" in user.data.error and user.data.reduced == len(small_scene.gaussians) // 4
+    assert user.data.entries == ["large"]
     user.click("OK")
-    assert changed_fraction(before, user.read_image()) == 0, "the scene before is kept"
+    assert changed_fraction(before, user.read_image()) == 0 and user.data.entries == NAMES, "the scene before is kept"
     user.show(SceneEntry("large again"))
     user.click("Reduce")
     after = user.read_image()
     assert user.data.error is None and len(user.viewer._slot.scene.gaussians) == 300
+    assert user.data.entries == ["large again"]
     assert changed_fraction(before, after) > 0.02
     assert np.abs(before - after).mean() < 20, "the large Gaussians make the picture"
 
 
+def test_a_large_scene_is_converted_while_the_window_accepts_input(user, small_scene, monkeypatch):
+    monkeypatch.setattr("pansplat_viewer.slots._SMALL_SCENE", 0)
+    go, prepare = threading.Event(), user.viewer.renderer.prepare
+
+    def slow(scene, report):
+        report(0.25)
+        assert go.wait(20)
+        return prepare(scene, report)
+
+    monkeypatch.setattr(user.viewer._preparer, "_prepare", slow)
+    before, shown = user.read_image(), user.viewer._slot.scene
+    other = replace(small_scene, gaussians=small_scene.gaussians.select(small_scene.gaussians.views == 0))
+    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: LoadedScene(entry, other))
+    user.viewer.show([SceneEntry("large")], 0)
+    user.wait_for_progress("large", "preparing 600 Gaussians", 0.25)
+    assert user.viewer.busy and user.viewer._slot.scene is shown
+    yaw = user.state.camera.yaw_radians
+    user.drag((450, 300), (480, 300))
+    assert user.state.camera.yaw_radians != yaw, "the window accepts input"
+    go.set()
+    user.settle()
+    assert user.viewer._slot.scene is other and user.data.loading is None
+    assert changed_fraction(before, user.read_image()) > 0.1
+
+
+@once
+def test_the_first_image_of_a_large_scene_is_drawn_in_the_background(user, pair, small_scene, monkeypatch):
+    monkeypatch.setattr("pansplat_viewer.slots._LARGE_SCENE", 0)
+    before, go, draw = user.read_image(), threading.Event(), CpuRenderer._draw
+    monkeypatch.setattr(CpuRenderer, "_draw", lambda *arguments: go.wait(20) and draw(*arguments))
+    other = replace(small_scene, gaussians=small_scene.gaussians.select(small_scene.gaussians.views == 0))
+    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: LoadedScene(entry, other))
+    user.viewer.show([SceneEntry("large", pair=pair)], 0)
+    while user.viewer._slot.scene is not other or not user.viewer._comparer.photographs._textures:
+        user.draw_frames(1)
+    user.draw_frames(1)
+    assert user.viewer.pending is not None and user.viewer.busy and user.data.error is None
+    photograph = user.read_screen()
+    assert changed_fraction(before, photograph) > 0.3 and photograph.mean() > 60
+    go.set()
+    image = user.read_image()
+    assert changed_fraction(photograph, image) > 0.3 and changed_fraction(before, image) > 0.1
+
+
 @once
 def test_memory_that_ends_while_drawing_is_an_error_and_drawing_goes_on(user, monkeypatch):
-    before, renderer = user.read_image(), user.viewer.renderer
+    before = user.read_image()
+
+    def fail(*_: object) -> None:
+        time.sleep(0.05)
+        raise MemoryError("no memory")
+
     with monkeypatch.context() as patch:
-        patch.setattr(renderer, "render", lambda *_, **__: (_ for _ in ()).throw(MemoryError("no memory")))
+        patch.setattr(CpuRenderer, "_draw", fail)
         user.state.camera = replace(user.state.camera, yaw_radians=0.5)
-        user.draw_frames(3)
-        assert "the memory is exhausted" in user.data.error
+        user.draw_frames(10, SETTLE_AFTER)
+        assert "the memory is exhausted" in user.data.error and not user.viewer.moving
     user.state.camera = user.state.home
     user.click("OK")
     assert changed_fraction(before, user.read_image()) == 0
@@ -833,6 +893,34 @@ def test_a_changed_file_is_announced_and_read_again(user, room):
 
 
 @once
+def test_a_folder_that_changes_is_announced_and_searched_again(user, pair, tmp_path, monkeypatch):
+    image, found = tmp_path / "a.png", []
+    image.write_bytes(pair.context[0].image.read_bytes())
+    pair = replace(pair, folder=tmp_path, context=(replace(pair.context[0], image=image), *pair.context[1:]))
+
+    def find(path: Path, progress: Progress) -> list[SceneEntry]:
+        found.append(path)
+        return [SceneEntry(name, pair=pair) for name in ("new", "pair 1", "pair 2")[len(found) == 1 :]]
+
+    monkeypatch.setattr(user.viewer, "_find", find)
+    user.viewer.open(tmp_path)
+    user.settle()
+    assert user.data.entries == ["pair 1", "pair 2"]
+    for name in ("poses.json", "b.png"):
+        (tmp_path / ".pansplat").mkdir(exist_ok=True)
+        user.draw_frames(2, 3.0)
+        assert not user.data.changed
+        (tmp_path / name).write_bytes(b"1")
+        user.draw_frames(2, 3.0)
+        assert user.data.changed, name
+        user.click("Reload")
+        user.settle()
+        (tmp_path / ".pansplat").rmdir()
+    assert found == [tmp_path] * 3
+    assert user.data.entries[user.data.current] == "pair 1" and user.data.current == 1
+
+
+@once
 def test_a_corrupt_scene_is_an_error_and_keeps_the_one_before(user, room, monkeypatch):
     before = user.read_image()
     room.write_bytes(room.read_bytes()[:2000])
@@ -841,13 +929,14 @@ def test_a_corrupt_scene_is_an_error_and_keeps_the_one_before(user, room, monkey
     monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, *rest: load_entry(entry, options, *rest))
     user.viewer.open(room)
     user.settle()
-    assert "room.ply" in user.data.error
+    assert "room.ply" in user.data.error and user.data.entries == NAMES and user.data.current == 0
     user.click("OK")
     assert changed_fraction(before, user.read_image()) == 0
 
 
 @once
-def test_theme_and_scale_change_the_panels(user):
+def test_theme_scale_and_layout_change_the_panels(user):
+    user.click("Drawing")
     user.click("Window")
     user.draw_frames(2)
     panel = (slice(0, None), slice(0, 280))
@@ -862,6 +951,11 @@ def test_theme_and_scale_change_the_panels(user):
     assert read_panel().mean() > dark.mean() + 80
     user.click("dark")
     assert np.abs(read_panel() - dark).mean() < 2
+    user.click_at(4, 4)  # shows the title
+    user.drag((30, 8), (60, 60))
+    assert np.abs(read_panel() - dark).mean() > 20, "the panel is no longer docked"
+    user.click("Default layout")
+    assert np.abs(read_panel() - dark).mean() < 2
     user.viewer.gui.set_scale(1.5)
     user.draw_frames(3)
     _, top, _, bottom = user.panels.items["joint"]
@@ -869,6 +963,7 @@ def test_theme_and_scale_change_the_panels(user):
     user.viewer.gui.set_scale(1.0)
     user.draw_frames(3)
     user.click("Window")
+    user.click("Drawing")
 
 
 @once
@@ -919,7 +1014,7 @@ def fly(user: User, frames: int = 400, seconds: float = 1 / 5) -> list[float]:
 
 
 def find_node(user: User) -> int:
-    return user.viewer._tour.tour.find_nearest_node(np.asarray(user.state.camera.position))
+    return int(np.linalg.norm(user.viewer._tour.tour.positions - user.state.camera.position, axis=1).argmin())
 
 
 def test_the_hotspots_and_the_floor_plan_of_a_tour_can_be_hidden(tour_user):
@@ -936,6 +1031,9 @@ def test_the_hotspots_and_the_floor_plan_of_a_tour_can_be_hidden(tour_user):
     user.press(imgui.Key.m)
     assert user.state.minimap and user.state.hotspots
     assert changed_fraction(images[0], user.read_image()) == 0
+    imgui.set_window_pos("Tour", (SIZE[0] - 20, 200))  # as remembered from a larger window
+    user.draw_frames(3)
+    assert user.panels.items["hotspots"][2] < SIZE[0]
 
 
 @pytest.mark.slow
@@ -957,6 +1055,7 @@ def test_a_click_on_a_hotspot_flies_there_and_fades_to_its_scene(tour_user):
     assert max(steps) < 0.5 * exchanged, "no jump: a fade changes 30 % in 0.2 s at most"
 
 
+@once
 @pytest.mark.slow
 def test_a_flight_waits_for_a_scene_that_is_not_loaded(user, house, load_house, monkeypatch):
     go = threading.Event()
@@ -984,6 +1083,7 @@ def test_a_flight_waits_for_a_scene_that_is_not_loaded(user, house, load_house, 
     assert find_node(user) == 2
 
 
+@once
 def test_space_plays_the_tour_through_all_panoramas_within_the_memory(tour_user):
     user = tour_user
     user.viewer._tour._budget, user.viewer._resolution.budget_ms = 0, 1e-3
@@ -1005,6 +1105,26 @@ def test_space_plays_the_tour_through_all_panoramas_within_the_memory(tour_user)
     moved = np.linalg.norm(np.subtract(user.state.camera.position, before.position))
     assert moved < 1.0, "the flight starts where the camera is"
     user.press(imgui.Key.space)
+
+
+@once
+def test_a_file_of_a_tour_is_flown_along_its_edges(user, house_file, monkeypatch):
+    options = LoadOptions()
+    monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, *rest: load_entry(entry, options, *rest))
+    user.show(SceneEntry("home", file=house_file))
+    user.settle()
+    user.state.camera = replace(user.state.camera, pitch_radians=-1.1)
+    first, before = user.viewer._slot.scene, user.read_image()
+    assert 2 in [hotspot.node for hotspot in user.data.hotspots] and "floor plan" in user.panels.items
+    assert first.gaussians.views.unique().tolist() == [0, 1], "only the views of the edge are blended"
+    user.click_at(*user.panels.minimap.nodes[3])
+    for slot in user.viewer._slots:
+        monkeypatch.setattr(slot.renderer, "min_size", (64, 64))
+    fly(user, seconds=0.5)
+    assert find_node(user) == 3 and np.allclose(user.viewer._slot.scene.cam2world, user.state.context[2:])
+    assert changed_fraction(before, user.read_image()) > 0.5
+    user.press(imgui.Key.c)
+    assert user.data.right_name is None, "there are no photographs"
 
 
 def test_the_nearest_photograph_of_a_tour_is_shown(tour_user):
@@ -1050,10 +1170,14 @@ def test_the_buttons_of_key_frames_show_replace_and_delete_them(path_user):
     assert len(user.state.path) == 0 and "Play path" not in user.panels.items
 
 
+@once
 def test_the_path_is_played_and_its_time_is_dragged(path_user):
     user = path_user
     user.click("Play path")
-    assert user.state.path_playing and "Pause" in user.panels.items
+    assert user.state.path_playing
+    user.click("Pause")
+    assert not user.state.path_playing and 0 < user.state.path_seconds < 1
+    user.click("Play path")
     user.draw_frames(5, 0.25)
     assert not user.state.path_playing
     assert user.state.camera.position == pytest.approx((0.2, 0.0, 0.3))
@@ -1064,6 +1188,7 @@ def test_the_path_is_played_and_its_time_is_dragged(path_user):
     assert changed_fraction(before, user.read_image()) > 0.1
 
 
+@once
 @pytest.mark.slow
 def test_the_path_is_saved_loaded_and_filmed(path_user, tmp_path):
     user = path_user
@@ -1089,6 +1214,24 @@ def test_the_path_is_saved_loaded_and_filmed(path_user, tmp_path):
         assert np.abs(np.asarray(file).astype(int)[IMAGE] - shown).max() <= 3, "the last frame is the last key frame"
 
 
+@once
+def test_the_choices_of_a_film_are_those_of_its_file(path_user, monkeypatch):
+    user, films = path_user, []
+    monkeypatch.setattr(
+        "pansplat_viewer.viewer.write_path_film", lambda *arguments: films.append(arguments) or [arguments[3]]
+    )
+    user.slide("frames per second", 0.6)
+    for suffix, projection in ((".webm", "equirect"), (".exr", "cubemap"), (".mp4", "perspective")):
+        user.click(suffix)
+        user.click(projection)
+        user.click("Write film")
+        user.settle()
+        frames, path, _, file, fps, _ = films.pop()
+        assert (frames.image_format.projection, file.suffix) == (projection, suffix)
+        assert path == user.state.path and fps == user.state.film_fps != 24
+
+
+@once
 def test_a_film_can_be_cancelled(path_user):
     user = path_user
     user.state.path = user.state.path.add(replace(user.state.path.key_frames[0], seconds=600.0))

@@ -1,5 +1,6 @@
 """The event loop and the input devices of the window, without a display."""
 
+from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -22,7 +23,7 @@ def make_window(**values: object) -> Mock:
 
 def make_viewer() -> Mock:
     """A viewer that quits in its first frame."""
-    viewer = Mock(moving=True, state=Mock(quit=False), panel_data=Mock(current=-1))
+    viewer = Mock(moving=True, pending=None, state=Mock(quit=False), panel_data=Mock(current=-1))
     viewer.frame.side_effect = lambda *_: setattr(viewer.state, "quit", True)
     return viewer
 
@@ -47,6 +48,22 @@ def test_a_minimised_window_waits_and_draws_nothing():
     _run_loop(window, viewer)
     viewer.frame.assert_not_called()
     assert min(waits) > 0, "no busy loop"
+
+
+def test_an_image_drawn_in_the_background_wakes_the_window_when_it_is_finished():
+    window, viewer, pending = make_window(), make_viewer(), Future()
+    viewer.pending = pending
+    window.wait.side_effect = lambda seconds: pending.set_result(None)
+    _run_loop(window, viewer)
+    assert window.wait.call_args.args[0] > 0, "no busy loop"
+    window.wake.assert_called_once_with()
+
+
+def test_input_that_waits_for_the_next_frame_is_not_delayed():
+    window, viewer = make_window(), make_viewer()
+    viewer.moving, viewer.gui.has_input = False, True
+    _run_loop(window, viewer)
+    window.wait.assert_called_once_with(0.0)
 
 
 def test_a_window_without_pixels_or_minimised_is_not_visible():
@@ -96,7 +113,7 @@ def test_a_new_window_replaces_one_whose_context_is_lost(monkeypatch, tmp_path):
     assert app._run_window(app.Options(tmp_path), [SceneEntry("a")], 0, (64, 32), None) is None
     first, second = viewers
     assert second.options["state"] is first.options["state"], "camera and settings"
-    second.show.assert_called_once_with(first.entries, 1)
+    second.show.assert_called_once_with(first.entries, 1, tmp_path)
 
 
 def test_sticks_and_buttons_of_a_gamepad_reach_imgui():
