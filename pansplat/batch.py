@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
+import itertools
 import json
 import math
 import os
@@ -24,6 +25,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from pansplat import __version__, pipeline, tours
+from pansplat.atomic import replacing
 from pansplat.console import is_out_of_memory
 from pansplat.data.folders import find_panorama_folders
 from pansplat.data.pairs import Pair
@@ -48,7 +50,8 @@ _MAX_DEATHS = 2  # worker processes that may end during one task before the item
 _MAX_LOSSES = 3  # of the connection to a scheduler without a finished item in between
 _CONNECT_SECONDS = 60.0
 _MAX_NAME = 80  # characters of a pair's name in the name of an output
-_UNFINISHED = re.compile(rf"\.({'|'.join(STEPS)})-[0-9a-f]{{16}}.*\.[0-9a-f]{{8}}\.\w+")  # names of pansplat.atomic
+# Temporary names (pansplat.atomic) of outputs.
+_UNFINISHED = re.compile(rf"\.(graph|{'|'.join(STEPS)})-[0-9a-f]{{16}}.*\.[0-9a-f]{{8}}\.\w+")
 _DEFAULT_MEMORY = 4 << 30  # bytes; decides the default number of workers
 
 
@@ -203,8 +206,8 @@ def process_item(item: Item, options: BatchOptions, fingerprint: str, out: Path)
             folder = out / item.name
             folder.mkdir(parents=True, exist_ok=True)
             _remove_unfinished(folder)
-            for unit in _list_units(item):
-                for path, is_new in _process_unit(unit, options, fingerprint, folder):
+            for unit in _list_units(item, folder):
+                for path, is_new in itertools.chain(unit.files, _process_unit(unit, options, fingerprint, folder)):
                     outputs.append(path.relative_to(out).as_posix())
                     num_written += is_new
         except Exception as problem:  # whatever it is, other items go on
@@ -232,15 +235,17 @@ class _Unit:
         name: for the name of the file.
         pairs: that are predicted.
         tour: the graph of a tour, or None.
+        files: that hold the graph, and whether they were written.
     """
 
     name: str
     pairs: tuple[Pair, ...]
     tour: TourGraph | None = None
+    files: tuple[tuple[Path, bool], ...] = ()
 
 
-def _list_units(item: Item) -> list[_Unit]:
-    """The tours of an item, and the pairs that belong to none."""
+def _list_units(item: Item, folder: Path) -> list[_Unit]:
+    """The tours of an item, and the pairs that belong to none. The graphs of the tours are written to the folder."""
     pairs = pipeline.load_pairs(item.folder, convention=item.convention, near=item.near, far=item.far)
     if item.pair is not None:
         chosen = [pair for pair in pairs if pair.name == item.pair]
@@ -251,9 +256,24 @@ def _list_units(item: Item) -> list[_Unit]:
     units, images = [], set()
     for tour in find_tours(pairs):
         images |= {panorama.image for panorama in tour.panoramas}
-        graph = tours.connect(tour)
-        units.append(_Unit(graph.name, tuple(graph.make_pair(views) for views in graph.choose_sources()), graph))
+        graph, *file = _connect(tour, folder)
+        pairs_of_scenes = tuple(graph.make_pair(views) for views in graph.choose_sources())
+        units.append(_Unit(graph.name, pairs_of_scenes, graph, (tuple(file),)))
     return units + [_Unit(pair.name, (pair,)) for pair in pairs if pair.context[0].image not in images]
+
+
+def _connect(tour: TourGraph, folder: Path) -> tuple[TourGraph, Path, bool]:
+    """The connected graph of a tour, its file in the folder, and whether the file was written."""
+    panoramas = [[view.name, view.cam2world.tolist(), _hash_file(view.image)] for view in tour.panoramas]
+    key = _join_hash(_LAYOUT, "graph", [panoramas, tour.near, tour.far, list(tour.overlaps)])
+    path = folder / f"graph-{key}-{_shorten(tour.name)}.json"
+    is_new = not path.exists()
+    if is_new:
+        overlaps = [[*edge, overlap] for edge, overlap in tours.connect(tour).overlaps.items()]
+        with replacing(path) as temporary:
+            temporary.write_text(json.dumps({"overlaps": overlaps}))
+    rows = list_field(require_object(read_json(path), path), "overlaps", path)
+    return dataclasses.replace(tour, overlaps={(a, b): overlap for a, b, overlap in rows}), path, is_new
 
 
 @lru_cache(maxsize=1)
@@ -369,9 +389,9 @@ def _export(scene: Scene, path: Path, unit: _Unit, options: BatchOptions) -> Non
         from pansplat.web import write_page
 
         count, title = int(_count_of_page(options)), unit.name.replace("_", " ")
-        write_page(scene, path, tour=unit.tour, gaussians=count, title=title)
+        write_page(scene, path, gaussians=count, title=title)
     elif options.suffix == ".png":
-        write_floor_plan(scene, path, unit.tour)
+        write_floor_plan(scene, path)
     else:
         pipeline.save(scene, path)
 
@@ -447,8 +467,9 @@ def start_workers(workers: int | None = None, memory: int | None = None) -> Iter
         "distributed.worker.memory.terminate": 0.95,
         "distributed.scheduler.allowed-failures": _MAX_DEATHS,
         "distributed.scheduler.worker-ttl": None,  # a compiled kernel may hold Python's lock for minutes
-        # Dask sets these variables in this process, too: numba fails if its number of threads changes.
-        "distributed.nanny.pre-spawn-environ": {"MALLOC_TRIM_THRESHOLD_": 65536},
+        # Dask sets these variables in this process, too: numba fails if its number of threads changes. With Dask's
+        # MALLOC_TRIM_THRESHOLD_ each large array is returned to the system, and page faults take a quarter of the time.
+        "distributed.nanny.pre-spawn-environ": {},
     }
     with dask_config.set(settings):
         cluster = LocalCluster(

@@ -16,10 +16,13 @@ from typing import Any
 import psutil
 import pytest
 
-from pansplat import batch, pipeline
+from pansplat import batch, pipeline, tours
 from pansplat.batch import BatchOptions, Item, list_items, process_item
 from pansplat.cli import run
+from pansplat.cli.batch import ReportFile
 from pansplat.errors import InputError
+from pansplat.model.pansplat import PanSplat
+from pansplat.model.weights import pack_weights, save_weights
 from pansplat.web import page as page_module
 
 HEIGHT = 64
@@ -104,13 +107,15 @@ def test_a_tour_has_a_file_for_each_scene_and_one_page(
 
     report = process("predict", "export")
     assert report.error is None and report.status == "done"
-    predictions, (page,) = report.outputs[:-1], report.outputs[-1:]
-    assert len(predictions) == 2 and page.endswith("-house tour.html")
+    graph, *predictions, page = report.outputs
+    assert len(predictions) == 2 and page.endswith("-house tour.html") and graph.endswith("-house tour.json")
     assert len(json.loads((out / page).read_text().split("const HEADER = ")[1].split(";\n")[0])["edges"]) == 3
-    assert process("predict", "export").status == "skipped"
+    with monkeypatch.context() as patch:
+        patch.setattr(tours, "connect", None)  # the file of the graph is used
+        assert process("predict", "export").status == "skipped"
     whole = process("export", suffix=".splat")  # nothing is predicted into files
-    assert whole.error is None and len(whole.outputs) == 1
-    assert (out / whole.outputs[0]).stat().st_size == 32 * 4 * HEIGHT * 2 * HEIGHT
+    assert whole.error is None and len(whole.outputs) == 2
+    assert (out / whole.outputs[1]).stat().st_size == 32 * 4 * HEIGHT * 2 * HEIGHT
     one = process_item(Item("pair", house, "p1-p2"), BatchOptions(("predict",), "sphere", height=HEIGHT), "1", out)
     assert one.error is None and len(one.outputs) == 1
 
@@ -150,6 +155,39 @@ def test_on_a_full_disk_no_half_file_is_left_and_the_item_is_done_later(
     assert process_item(item, options, "1", out).status == "done" and len(list_outputs(out)) == 1
 
 
+def test_lines_of_the_report_wait_while_the_disk_is_full(tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource")
+    limits, lines = resource.getrlimit(resource.RLIMIT_FSIZE), [f"line {k}\n" for k in range(4)]
+    with open(tmp_path / "report.jsonl", "wb", 0) as file:
+        report = ReportFile(file)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
+        try:
+            for line in lines[:3]:
+                report.add(line)
+            assert report.problem is not None and "report.jsonl: needed free disk space" in report.problem
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        report.add(lines[3])
+        assert report.problem is None
+    assert (tmp_path / "report.jsonl").read_text() == "".join(lines)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_batch_without_space_for_its_report_finishes_its_items_and_fails(
+    rooms: Path, tmp_path: Path, sphere: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options, out = BatchOptions(model="sphere", height=HEIGHT), tmp_path / "out"
+    (out / batch.REPORT_NAME).parent.mkdir()
+    (out / batch.REPORT_NAME).symlink_to("/dev/full")
+    monkeypatch.setattr(batch, "start_workers", lambda *_: nullcontext())
+    monkeypatch.setattr(
+        batch, "run_items", lambda _, items, *__: (process_item(item, options, "1", out) for item in items)
+    )
+    assert run(["batch", str(rooms), "--out", str(out), "--model", "sphere"]) == 1
+    assert len(list_outputs(out)) == len(batch.list_items(rooms))
+    assert "report.jsonl: needed free disk space for the report" in capsys.readouterr().err
+
+
 def test_without_dask_the_message_names_the_command_that_installs_it(
     rooms: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -181,6 +219,13 @@ def when_predicted(out: Path, item: str, act: Callable[[], object]) -> threading
     return thread
 
 
+def interrupt_until(stopped: threading.Event) -> None:
+    """Send SIGINT to this process, again if Python loses it: an exception in a destructor is ignored."""
+    while not stopped.is_set():
+        os.kill(os.getpid(), signal.SIGINT)
+        stopped.wait(4)
+
+
 def kill_the_worker_of(cluster: Any, item: str) -> None:
     """Kill the worker process that runs the task of an item with -9."""
     for address, state in list(cluster.scheduler.workers.items()):
@@ -199,15 +244,18 @@ def is_alive(pid: int) -> bool:
 
 @pytest.mark.slow
 def test_two_workers_do_each_item_once_though_a_worker_is_killed_an_item_is_bad_and_a_run_is_stopped(
-    rooms: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    rooms: Path, tmp_path: Path, small_config: Any, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
     (rooms / "broken").mkdir()
     (rooms / "broken" / "poses.json").write_text("x")
-    out, options = tmp_path / "out", ["--model", "sweep", "--height", str(HEIGHT), "--do", "predict,refine"]
+    weights = tmp_path / "small.safetensors"
+    save_weights(weights, pack_weights("pansplat", small_config, PanSplat(small_config).state_dict(), compat="fixed"))
+    out, options = tmp_path / "out", ["--model", str(weights), "--height", str(HEIGHT), "--do", "predict,refine"]
     command = ["batch", str(rooms), "--out", str(out), *options, "--refine", "0.2"]
     with pytest.raises(KeyboardInterrupt), batch.start_workers(2, 4 << 30) as cluster:
-        assert "NUMBA_NUM_THREADS" not in os.environ  # in this process it would change the threads of the kernels
+        # In this process, the first one would change the threads of the kernels; the second one makes workers slow.
+        assert not {"NUMBA_NUM_THREADS", "MALLOC_TRIM_THRESHOLD_"} & os.environ.keys()
         pids = [nanny.pid for nanny in cluster.workers.values()]
         with monkeypatch.context() as patch:  # the workers of this test serve the command
             patch.setattr(batch, "start_workers", lambda workers, memory: nullcontext(cluster))
@@ -231,8 +279,10 @@ def test_two_workers_do_each_item_once_though_a_worker_is_killed_an_item_is_bad_
 
         other = tmp_path / "stopped"
         with_scheduler[3], with_scheduler[-3] = str(other), "60"
-        when_predicted(other, "room0", lambda: os.kill(os.getpid(), signal.SIGINT))
+        stopped = threading.Event()
+        when_predicted(other, "room0", lambda: interrupt_until(stopped))
         assert run(with_scheduler) == 130
+        stopped.set()
         pids = [nanny.pid for nanny in cluster.workers.values()]
         began = time.perf_counter()
         raise KeyboardInterrupt
@@ -243,6 +293,6 @@ def test_two_workers_do_each_item_once_though_a_worker_is_killed_an_item_is_bad_
     printed, errors = capfd.readouterr()
     assert "4 items: 3 done, 0 already there, 1 failed" in printed
     assert "4 items: 0 done, 3 already there, 1 failed" in printed
-    assert "2 workers of at most 4.0 GiB each" in errors and "Traceback" not in errors
+    assert "workers: 2, of at most 4.0 GiB each" in errors and "Traceback" not in errors
     assert errors.count("note: broken: ") >= 2
     assert errors.splitlines()[-1] == "interrupted: no incomplete file is left behind"

@@ -134,6 +134,7 @@ def test_loaded_views_are_not_cached(pair_folder: Path, sphere_predictor) -> Non
     assert not any(folder.exists() for folder in list_cache_folders(pair))
 
 
+@pytest.mark.usefixtures("refinement_clock")
 def test_a_refined_scene_is_cached_apart_from_its_prediction(pair_folder: Path, sphere_predictor) -> None:
     predictor, shown = sphere_predictor(), []
     first = predict(pair_folder, predictor, height=HEIGHT, refine_seconds=3.0, on_predicted=shown.append)
@@ -146,6 +147,7 @@ def test_a_refined_scene_is_cached_apart_from_its_prediction(pair_folder: Path, 
     assert len(list((pair_folder / ".pansplat").iterdir())) == 2
 
 
+@pytest.mark.usefixtures("refinement_clock")
 def test_an_interrupted_refinement_is_not_cached(pair_folder: Path, sphere_predictor) -> None:
     def interrupt(what: str, fraction: float) -> None:
         if what == "refining" and fraction > 0.6:

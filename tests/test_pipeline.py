@@ -273,5 +273,6 @@ def test_the_scene_of_a_tour_holds_each_panorama_once(
     assert predictor.calls == len(tour.choose_sources()) == 3
     assert scene.gaussians.views.bincount().tolist() == [64 * 128] * 4  # the smallest height
     assert scene.cam2world.equal(tour.cam2world) and scene.names == tuple(f"p{k}" for k in range(4))
+    assert [edge[:2] for edge in scene.overlaps] == list(tour.overlaps)
     distances = (scene.gaussians.means - scene.cam2world[scene.gaussians.views, :3, 3].float()).norm(dim=1)
     torch.testing.assert_close(distances, torch.full_like(distances, 2.0))

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -69,16 +71,18 @@ class Batch:
         out = expand_home(self.out).absolute()
         with batch.lock_folder(out):
             try:
-                reports = self._run_items(items, options, out, memory)
+                reports, seconds, problem = self._run_items(items, options, out, memory)
             finally:
                 if self.scheduler is None:
                     batch.remove_unfinished(items, out)
         count = {status: sum(r.status == status for r in reports) for status in ("done", "skipped", "failed")}
         print(
             f"{self.out}: {len(items):,} items: {count['done']:,} done, {count['skipped']:,} already there, "
-            f"{count['failed']:,} failed; {self.out / batch.REPORT_NAME}"
+            f"{count['failed']:,} failed, in {seconds:.1f} s; {self.out / batch.REPORT_NAME}"
         )
-        return 1 if count["failed"] else 0
+        if problem is not None:
+            print_message("error", problem)
+        return 1 if count["failed"] or problem is not None else 0
 
     def _make_options(self) -> BatchOptions:
         """The checked options of the steps."""
@@ -124,25 +128,62 @@ class Batch:
             raise InputError(f"--memory must be at least {MIN_MEMORY >> 20}MiB, such as 4GiB, got {self.memory!r:.40}")
         return memory
 
-    def _run_items(self, items: list[Item], options: BatchOptions, out: Path, memory: int | None) -> list[ItemReport]:
-        """Run the items, and write a line of the report at the end of each."""
+    def _run_items(
+        self, items: list[Item], options: BatchOptions, out: Path, memory: int | None
+    ) -> tuple[list[ItemReport], float, str | None]:
+        """Run the items, and write a line of the report at the end of each.
+
+        Returns:
+            The reports, the seconds since the workers of this machine have started, and a message if the report could
+            not be written.
+        """
         from pansplat import batch
 
         reports = []
         cluster = batch.start_workers(self.workers, memory) if self.scheduler is None else nullcontext()
-        with cluster as local, _item_bar(len(items)) as show, open(out / batch.REPORT_NAME, "w") as file:
+        with cluster as local, _item_bar(len(items)) as show, open(out / batch.REPORT_NAME, "wb", 0) as file:
+            lines = ReportFile(file)
             address = self.scheduler or ""
             if local is not None:
                 workers = list(local.workers.values())
                 limit = workers[0].memory_manager.memory_limit / 2**30
                 address = local.scheduler_address
-                print(f"{len(workers)} workers of at most {limit:.1f} GiB each", file=sys.stderr)
+                print(f"workers: {len(workers)}, of at most {limit:.1f} GiB each", file=sys.stderr)
+            began = time.perf_counter()
             for report in batch.run_items(address, items, options, out):
                 reports.append(report)
-                file.write(batch.format_report(report))
-                file.flush()
+                lines.add(batch.format_report(report))
                 show(report)
-        return reports
+            return reports, time.perf_counter() - began, lines.problem
+
+
+class ReportFile:
+    """The report. While the disk is full, lines wait, and the items go on.
+
+    Args:
+        file: without a buffer.
+    """
+
+    def __init__(self, file: FileIO) -> None:
+        self._file, self._waiting, self._reason = file, b"", "No space left on device"
+
+    def add(self, line: str) -> None:
+        """Write the lines that wait, and another one."""
+        self._waiting += line.encode()
+        try:
+            self._waiting = self._waiting[self._file.write(self._waiting) :]
+        except OSError as error:
+            self._reason = error.strerror or str(error)
+
+    @property
+    def problem(self) -> str | None:
+        """What prevents that lines are written; None if none waits."""
+        if not self._waiting:
+            return None
+        return (
+            f"{self._file.name}: needed free disk space for the report, got {self._reason!r}; the items are finished: "
+            "free some space and run the same command again"
+        )
 
 
 @contextmanager

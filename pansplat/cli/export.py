@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from pansplat.gaussians.scene import Scene
-    from pansplat.tours import TourGraph
 
 _PAGE_SUFFIX, _PLAN_SUFFIX = ".html", ".png"
 
@@ -64,24 +63,24 @@ class Export:
             raise InputError(f"--gaussians, --split and --title are for an .html page, got {self.out}; leave them out")
         if self.up is not None and not is_scene_file(self.path):
             raise InputError(f"--up is for a scene file, and {self.path} is a folder of panoramas; leave it out")
-        scene, tour = self.prediction.open_tour(self.path, self._count_of_page() if is_page else None)
+        scene = self.prediction.open_tour(self.path, self._count_of_page() if is_page else None)
         if self.up is not None:
             scene = scene.rotated(_rotation_from(self.up))
         gaussians = prune(scene.gaussians, degree=self.degree, min_opacity=self.min_opacity)
+        scene = dataclasses.replace(scene, gaussians=gaussians)
         if is_page:
-            self._write_page(dataclasses.replace(scene, gaussians=gaussians), tour)
-            return 0
-        if is_plan:
-            write_floor_plan(dataclasses.replace(scene, gaussians=gaussians), self.out, tour)
+            self._write_page(scene)
+        elif is_plan:
+            write_floor_plan(scene, self.out)
             print(f"{self.out}: the floors of {len(scene.cam2world)} panoramas")
-            return 0
-        if self.points:
-            save_points(gaussians, self.out)
         else:
-            save_scene(dataclasses.replace(scene, gaussians=gaussians), self.out)
-        size = self.out.stat().st_size
-        kind = "points" if self.points else "Gaussians"
-        print(f"{self.out}: {len(gaussians):,} {kind}, {size:,} bytes ({size / max(len(gaussians), 1):.1f} each)")
+            if self.points:
+                save_points(gaussians, self.out)
+            else:
+                save_scene(scene, self.out)
+            size = self.out.stat().st_size
+            kind = "points" if self.points else "Gaussians"
+            print(f"{self.out}: {len(gaussians):,} {kind}, {size:,} bytes ({size / max(len(gaussians), 1):.1f} each)")
         return 0
 
     def _count_of_page(self) -> int:
@@ -90,7 +89,7 @@ class Export:
 
         return DEFAULT_GAUSSIANS if self.gaussians is None else self.gaussians
 
-    def _write_page(self, scene: Scene, tour: TourGraph | None) -> None:
+    def _write_page(self, scene: Scene) -> None:
         """Write the web page and print its size."""
         from pansplat.web import write_page
 
@@ -99,7 +98,6 @@ class Export:
             page = write_page(
                 scene,
                 self.out,
-                tour=tour,
                 gaussians=self._count_of_page(),
                 split=self.split,
                 title=title,

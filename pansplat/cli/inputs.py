@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from pansplat.data.pairs import Pair
     from pansplat.gaussians.scene import Scene
     from pansplat.predictor import Predictor, Progress
-    from pansplat.tours import TourGraph
 
 Out = Annotated[Path, arg(aliases=["-o"])]
 OptionalOut = Annotated[Path | None, arg(aliases=["-o"])]
@@ -70,8 +69,8 @@ class ScenePrediction:
             return pipeline.load(path)
         return self._predict_pair(choose_pair(path, self.choice))
 
-    def open_tour(self, path: Path, gaussians: int | None = None) -> tuple[Scene, TourGraph | None]:
-        """The scene of a file, of the chosen pair, or of the first tour of a folder, with the tour's graph.
+    def open_tour(self, path: Path, gaussians: int | None = None) -> Scene:
+        """The scene of a file, of the chosen pair, or of the first tour of a folder.
 
         Args:
             path: the file or folder.
@@ -81,25 +80,23 @@ class ScenePrediction:
         from pansplat.tours import connect, find_tours
 
         if is_scene_file(path):
-            return pipeline.load(path), None
+            return pipeline.load(path)
         pairs = load_choice(path, self.choice)
         tours = find_tours(pairs) if self.choice.pair is None else []
         if not tours:
-            return self._predict_pair(pick_pair(path, pairs, self.choice)), None
+            return self._predict_pair(pick_pair(path, pairs, self.choice))
         more = f"; {len(tours) - 1} other tours are left out" if len(tours) > 1 else ""
         print(f"note: {path}: a tour of {len(tours[0])} panoramas (--pair chooses one pair){more}", file=sys.stderr)
         model = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
         with progress_bar() as progress:
-            tour = connect(tours[0], progress)
-            scene = pipeline.predict_tour(
-                tour,
+            return pipeline.predict_tour(
+                connect(tours[0], progress),
                 model,
                 height=self.predict_height,
                 refine_seconds=self.refine,
                 gaussians=gaussians,
                 progress=progress,
             )
-        return scene, tour
 
     def _predict_pair(self, pair: Pair) -> Scene:
         from pansplat import pipeline

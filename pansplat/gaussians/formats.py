@@ -58,6 +58,8 @@ import gaussforge
 result = gaussforge.GaussForge().convert(sys.stdin.buffer.read(), sys.argv[1], sys.argv[2])
 if "error" in result:
     sys.exit(result["error"])
+if not result["data"]:
+    sys.exit("it holds no Gaussians")
 output.write(result["data"])
 output.close()
 """

@@ -23,6 +23,9 @@ from pansplat.geometry.world import scale_poses
 Gains = tuple[tuple[float, ...], ...]
 """Factors of R, G and B for each view's photograph."""
 
+Overlaps = tuple[tuple[int, int, float], ...]
+"""Edges of a tour graph: two views, the smaller one first, and their overlap."""
+
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
@@ -137,6 +140,7 @@ class Scene:
         height: of the input panoramas, pixels.
         gains: exposure and white balance of each view's photograph, as factors of R, G and B relative to the geometric
             mean of all; a refinement estimates them. The colours of a view's Gaussians are those of its photograph.
+        overlaps: of a scene of a whole tour: the edges of its graph, see `pansplat.tours.TourGraph`.
     """
 
     gaussians: Gaussians
@@ -147,6 +151,7 @@ class Scene:
     model: str = ""
     height: int = 512
     gains: Gains = ()
+    overlaps: Overlaps = ()
 
     def scaled(self, factor: float) -> Scene:
         """The scene in a world that is multiplied by a factor."""

@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.gaussians.scene import Gains, Gaussians, Scene, prune
+from pansplat.gaussians.scene import Gains, Gaussians, Overlaps, Scene, prune
 from pansplat.geometry.world import MAX_POSITION, require_depth_range
 from pansplat.strict_json import list_field, number_field, parse_json, require_object, text_field
 
@@ -46,6 +48,7 @@ def format_entry(scene: Scene, runs: list[list[int]]) -> str:
         "names": [name.encode(errors="backslashreplace").decode() for name in scene.names],
         "cam2world": scene.cam2world.double().cpu().tolist(),
         **({"gains": scene.gains} if scene.gains else {}),
+        **({"overlaps": scene.overlaps} if scene.overlaps else {}),
         "runs": runs,
     }
     return json.dumps(content, separators=(",", ":"))
@@ -79,6 +82,7 @@ def make_scene(gaussians: Gaussians, entry: str | None, path: Path) -> Scene:
         model=fields.model,
         height=fields.height,
         gains=fields.gains,
+        overlaps=fields.overlaps,
     )
 
 
@@ -147,6 +151,7 @@ class _Entry:
     model: str = ""
     height: int = _DEFAULT_HEIGHT
     gains: Gains = ()
+    overlaps: Overlaps = ()
     runs: list[Any] | None = None
 
 
@@ -188,6 +193,7 @@ def _read_entry(content: Any) -> _Entry:
         text_field(content, "model", "comment") or "",
         _DEFAULT_HEIGHT if height is None else int(height),
         _read_gains(list_field(content, "gains", "comment"), len(poses)),
+        _read_overlaps(list_field(content, "overlaps", "comment"), len(poses)),
         list_field(content, "runs", "comment"),
     )
 
@@ -202,6 +208,25 @@ def _read_gains(rows: list[Any], cameras: int) -> Gains:
             f"gains, got {rows!r:.60}"
         )
     return tuple(tuple(map(float, row)) for row in rows)
+
+
+def _read_overlaps(rows: list[Any], cameras: int) -> Overlaps:
+    """Edges that connect all cameras, or nothing."""
+    edges: dict[tuple[int, int], float] = {}
+    for row in rows:
+        a, b, overlap = row if isinstance(row, list) and len(row) == 3 else (None, None, None)
+        is_edge = type(a) is int and type(b) is int and 0 <= a < b < cameras
+        if not is_edge or type(overlap) not in (int, float) or not 0 <= overlap <= 1:
+            raise InputError(
+                f"comment: needed two of the {cameras} cameras and a number from 0 to 1 in overlaps, got {row!r:.60}"
+            )
+        edges[a, b] = overlap
+    if edges:
+        ends = np.array(list(edges)).T
+        graph = coo_array((np.ones(len(edges)), ends), shape=(cameras, cameras))
+        if (parts := connected_components(graph, directed=False, return_labels=False)) > 1:
+            raise InputError(f"comment: needed overlaps that connect all {cameras} cameras, got {parts} parts")
+    return tuple((a, b, overlap) for (a, b), overlap in edges.items())
 
 
 def _read_pose(rows: Any) -> np.ndarray:

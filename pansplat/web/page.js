@@ -15,10 +15,12 @@
 
   // ---- loading ----
 
+  const wait = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
+
   // The step of the progress bar becomes visible before the next one starts.
   const report = (fraction) => {
     bar.value = fraction;
-    return new Promise((resolve) => setTimeout(resolve));
+    return wait(0);
   };
 
   async function load() {
@@ -95,7 +97,7 @@
       this.accumulate = this.link(SHADERS.accumulate);
       this.resolve = this.link(SHADERS.resolve);
       const width = 1024, height = Math.ceil(HEADER.count / width);
-      if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error("The scene is too large for this device.");
+      if (!gl.isContextLost() && height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error("The scene is too large for this device.");
       this.rows = [width, height];
       this.geometry = this.upload(scene.geometry, 3 * width, height, gl.RGBA32F, gl.FLOAT, 12 * width * height);
       this.colors = this.upload(scene.colors, width, height, gl.RGBA8, gl.UNSIGNED_BYTE, 4 * width * height);
@@ -331,6 +333,10 @@
     fade = null;
   }
 
+  function settleAt(position) {
+    if (HEADER.edges.length) settle(nearestEdge(position)[0]);
+  }
+
   // The panoramas at the edge of the camera, and those that share an edge with them; without edges all panoramas.
   function reachable(spot) {
     if (!HEADER.edges.length) return true;
@@ -339,10 +345,12 @@
       HEADER.edges.some(([a, b]) => (a === spot && (b === ends[0] || b === ends[1])) || (b === spot && (a === ends[0] || a === ends[1])));
   }
 
-  // The panoramas on the way from the camera to one of them. The way begins at an end of the edge at the camera.
+  // The panoramas on the way from the camera to one of them. The way begins at an end of the edge nearest to the camera;
+  // the edge that is shown can be another one, after a jump and while views fade.
   function findWay(spot) {
     if (!HEADER.edges.length) return [spot];
-    const ways = HEADER.edges[edge].slice(0, 2).map((start) => {
+    const [nearest] = nearestEdge(camera.position);
+    const ways = HEADER.edges[nearest].slice(0, 2).map((start) => {
       const way = [start];
       while (way.at(-1) !== spot) way.push(HEADER.next[way.at(-1)][spot]);
       return way;
@@ -479,6 +487,7 @@
     setTouring(false);
     flight = null;
     Object.assign(camera, makeStart());
+    settleAt(camera.position);
     changed();
   }
 
@@ -695,7 +704,10 @@
     placeSpots(drawAt(width, height));
   }
 
+  let failure = null;
   function fail(error) {
+    failure = error;
+    byId("cover").hidden = false;
     byId("cover").className = "failed";
     byId("message").textContent = error.message || String(error);
     bar.hidden = true;
@@ -706,30 +718,43 @@
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
     if (!gl) throw new Error("This page needs WebGL 2, which this browser or device does not have.");
     if (!window.DecompressionStream) throw new Error("This browser is too old for this page. Please update it.");
-    const scene = await load();
+    let scene = null;
+    const makeRenderer = () => {
+      if (!scene || gl.isContextLost()) return;
+      renderer = new Renderer(gl, scene);
+      if (latest) renderer.setSorted(latest);
+      changed();
+    };
+    canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); renderer = null; });
+    canvas.addEventListener("webglcontextrestored", () => {
+      try { makeRenderer(); } catch (error) { fail(error); }
+    });
+    scene = await load();
     sorter = new Worker(URL.createObjectURL(new Blob([SORTER])));
     const first = new Promise((resolve, reject) => {
       sorter.onmessage = (event) => { onSorted(event); resolve(); };
-      sorter.onerror = (event) => reject(new Error(`The sorting failed: ${event.message}`));
+      sorter.onerror = (event) => {
+        const error = new Error(`The sorting failed: ${event.message}`);
+        if (sortedFor) fail(error);
+        else reject(error);
+      };
     });
     const { count, views, harmonicsScale, colorRange: range } = HEADER;
     const base = scene.harmonics ? scene.colors : null;
     sorter.postMessage({ count, views, means: scene.means, harmonics: scene.harmonics, base, harmonicsScale, range });
     requestSort();
-    renderer = new Renderer(gl, scene);
+    makeRenderer();
     await first;
+    while (!renderer) {  // the context is lost
+      if (failure) throw failure;
+      await wait(50);
+    }
     await report(1);
-    canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); renderer = null; });
-    canvas.addEventListener("webglcontextrestored", () => {
-      renderer = new Renderer(gl, scene);
-      renderer.setSorted(latest);
-      changed();
-    });
     listen();
     spots = makeSpots();
     requestAnimationFrame(onFrame);
     byId("cover").className = "done";
-    setTimeout(() => byId("cover").remove(), 700);
+    setTimeout(() => { byId("cover").hidden = !failure; }, 700);
   }
 
   // For scripts: `await pansplat.ready`; `pansplat.camera` is {position, yaw, pitch, roll, fov}; `await
@@ -740,8 +765,11 @@
     async render(width, height) {
       await this.ready;
       const place = [...camera.position];
-      while (!sortedFor.every((value, i) => value === place[i])) await new Promise((resolve) => setTimeout(resolve, 5));
-      if (HEADER.edges.length) settle(nearestEdge(place)[0]);
+      while (!renderer || !sortedFor.every((value, i) => value === place[i])) {
+        if (failure) throw failure;
+        await wait(5);
+      }
+      settleAt(place);
       drawAt(width, height);
       const image = canvas.toDataURL("image/png");
       drawnScale = 0;

@@ -33,7 +33,7 @@ from pansplat.geometry.world import working_factor
 from pansplat.predictor import Progress
 from pansplat.refinement.budget import merge_to
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
-from pansplat.tours import EDGE_HYSTERESIS, TourGraph, plan_route
+from pansplat.tours import EDGE_HYSTERESIS, TourGraph, make_graph, plan_route
 from pansplat.web.data import MAX_DEGREE, PackedGaussians, count_bytes, pack_gaussians
 
 DEFAULT_GAUSSIANS = 300_000  # phones draw and hold them
@@ -73,7 +73,6 @@ def write_page(
     scene: Scene,
     path: Path | str,
     *,
-    tour: TourGraph | None = None,
     gaussians: int = DEFAULT_GAUSSIANS,
     split: bool = False,
     title: str | None = None,
@@ -82,27 +81,25 @@ def write_page(
     """Write a scene as a web page.
 
     Args:
-        scene: any number of panoramas; without one the page starts in the middle of the Gaussians.
+        scene: any number of panoramas; without one the page starts in the middle of the Gaussians. In a scene of a tour
+            (`pansplat.predict_tour`), the views of the nearest edge are blended, and flights follow the edges. In other
+            scenes, all views are blended everywhere.
         path: the .html file.
-        tour: the graph whose panoramas are the scene's views (`pansplat.predict_tour`): the views of the nearest edge
-            are blended, and flights follow the edges. Without it, all views are blended everywhere.
         gaussians: largest number of Gaussians; similar neighbours are merged.
         split: write the data to the folder `NAME_files` beside the page, for large scenes.
         title: of the page; by default the name of the file.
         progress: called with a description of the current work and the completed fraction.
 
     Raises:
-        InputError: the scene has no visible Gaussians or is not that of the tour, the page would be too large, or it
-            cannot be written.
+        InputError: the scene has no visible Gaussians, the page would be too large, or it cannot be written.
     """
     path = Path(path)
     report: Progress = progress or (lambda what, fraction: None)
     if not 1 <= gaussians <= MAX_GAUSSIANS:
         raise InputError(f"`gaussians` must be 1 to {MAX_GAUSSIANS:,} in a page, got {gaussians:,}")
     report("checking the scene", 0.0)
-    if tour is not None and len(tour) != len(scene.cam2world):
-        raise InputError(f"`tour` must have the {len(scene.cam2world)} panoramas of the scene, got {len(tour)}")
     factor = working_factor(scene.near)
+    tour = make_graph(scene)
     scene = _prepare(scene, factor)
     flights = _plan_flights(scene, tour, factor)
     if len(scene.gaussians) > gaussians:
@@ -144,15 +141,15 @@ class _Flights:
     hysteresis: float = 0.0
 
 
-def _plan_flights(scene: Scene, tour: TourGraph | None, factor: float) -> _Flights:
-    """The flights of a tour; without one or its edges, the camera flies from view to view.
+def _plan_flights(scene: Scene, tour: TourGraph, factor: float) -> _Flights:
+    """The flights of a tour; without edges, the camera flies from view to view.
 
     Args:
         scene: of `_prepare`.
         tour: in metres.
         factor: of the scene's unit.
     """
-    if tour is None or not tour.overlaps:
+    if not tour.overlaps:
         start = path_poses(scene.cam2world)[0]
         return _Flights(start, start[:3, :3].numpy(), groups=(tuple(range(len(scene.cam2world))),))
     views = tour.choose_scene_views()

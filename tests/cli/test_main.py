@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-import pansplat.cli
 from pansplat.cli import run
 from pansplat.errors import InputError
 
@@ -112,11 +111,15 @@ def test_entry_points_are_installed(entry: str) -> None:
     assert callable(found.load())
 
 
-def test_main_exits_with_the_status_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pansplat.cli, "run", lambda argv: 3)
-    with pytest.raises(SystemExit) as stop:
-        pansplat.cli.main([])
-    assert stop.value.code == 3
+def test_main_exits_with_the_status_of_the_command_after_the_registered_functions() -> None:
+    program = """
+import atexit, sys, pansplat.cli
+atexit.register(print, "functions at the exit ran")
+pansplat.cli.run = lambda argv: 3
+pansplat.cli.main([])
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (3, "functions at the exit ran\n", "")
 
 
 def test_input_errors_are_value_errors() -> None:

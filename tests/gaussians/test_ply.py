@@ -42,7 +42,17 @@ def make_scene(count: int = 40, degree: int = 1, seed: int = 0) -> Scene:
     poses[0, :3, :3] = rotations_from_quats(torch.tensor([0.9, 0.1, -0.3, 0.2], dtype=torch.float64))
     poses[1, :3, 3] = torch.tensor([1 / 3, -2e-7, 12345.678901234567], dtype=torch.float64)
     names, gains = ("à\n.jpg", "b c.png"), ((1.25, 1.0, 0.9), (0.8, 1.0, 1 / 0.9))
-    return Scene(gaussians, poses, near=0.45, far=10.0, names=names, model="sweep", height=256, gains=gains)
+    return Scene(
+        gaussians,
+        poses,
+        near=0.45,
+        far=10.0,
+        names=names,
+        model="sweep",
+        height=256,
+        gains=gains,
+        overlaps=((0, 1, 0.25),),
+    )
 
 
 def binary_ply(columns: dict[str, np.ndarray], *, order: str = "<", before: bytes = b"") -> bytes:
@@ -84,7 +94,7 @@ def test_a_saved_scene_is_loaded_unchanged(tmp_path: Path, degree: int) -> None:
     assert torch.equal(back.gaussians.views, scene.gaussians.views)
     assert torch.equal(back.cam2world, scene.cam2world)  # bit-exact
     assert (back.near, back.far, back.height, back.model) == (0.45, 10.0, 256, "sweep")
-    assert back.names == scene.names and back.gains == scene.gains
+    assert back.names == scene.names and back.gains == scene.gains and back.overlaps == scene.overlaps
 
 
 def test_the_file_has_the_3dgs_layout(tmp_path: Path) -> None:

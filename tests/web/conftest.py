@@ -7,7 +7,6 @@ import torch
 
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
-from pansplat.tours import TourGraph, make_graph
 
 
 def make_scene(num_views: int = 3, per_view: int = 700, degree: int = 1, seed: int = 0) -> Scene:
@@ -58,6 +57,6 @@ def plain_scene() -> Scene:
 
 
 @pytest.fixture(scope="session")
-def tour(scene: Scene) -> TourGraph:
-    """The three views of the scene in a row: two edges."""
-    return dataclasses.replace(make_graph(scene), overlaps={(0, 1): 0.5, (1, 2): 0.4})
+def house(scene: Scene) -> Scene:
+    """The scene as that of a tour: the three views in a row, two edges."""
+    return dataclasses.replace(scene, overlaps=((0, 1, 0.5), (1, 2, 0.4)))

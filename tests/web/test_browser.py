@@ -20,7 +20,7 @@ from PIL import Image
 
 from pansplat import pipeline
 from pansplat.gaussians.scene import Scene
-from pansplat.tours import TourGraph
+from pansplat.tours import make_graph
 from pansplat.web import page as page_module
 from pansplat.web import write_page
 
@@ -49,7 +49,7 @@ def chromium() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def folder(scene: Scene, tour: TourGraph, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(scene: Scene, house: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """tour.html, split.html with its parts, and house.html with a graph."""
     folder = tmp_path_factory.mktemp("pages")
     with pytest.MonkeyPatch.context() as patch:
@@ -57,7 +57,7 @@ def folder(scene: Scene, tour: TourGraph, tmp_path_factory: pytest.TempPathFacto
         patch.setattr(page_module, "_PART_BYTES", 30_000)
         write_page(scene, folder / "tour.html", title="Three rooms")
         write_page(scene, folder / "split.html", split=True)
-        write_page(scene, folder / "house.html", tour=tour)
+        write_page(house, folder / "house.html")
     return folder
 
 
@@ -162,7 +162,7 @@ def test_the_page_loads_without_network_or_messages(page: OpenPage, folder: Path
     assert page.messages == []
     assert [url for url in page.requests if not url.startswith("blob:")] == [(folder / "tour.html").as_uri()]
     assert page.page.title() == "Three rooms"
-    page.wait("document.getElementById('cover') === null")
+    page.wait("document.getElementById('cover').hidden")
 
 
 @pytest.mark.slow
@@ -275,6 +275,40 @@ def test_a_lost_context_is_restored(home: OpenPage) -> None:
     assert psnr(home.draw(), before) > 60
 
 
+def test_a_context_that_is_lost_while_the_page_loads_is_restored(chromium: Any, folder: Path) -> None:
+    context = chromium.new_context(viewport={"width": SIZE[0], "height": SIZE[1]})
+    page = OpenPage(context.new_page())
+    page.page.add_init_script("""
+        const getContext = HTMLCanvasElement.prototype.getContext;
+        HTMLCanvasElement.prototype.getContext = function (...args) {
+            const gl = getContext.apply(this, args), lost = gl && !window.lost && gl.getExtension("WEBGL_lose_context");
+            if (lost) {
+                window.lost = lost;
+                lost.loseContext();
+                setTimeout(() => lost.restoreContext(), 300);
+            }
+            return gl;
+        };
+    """)
+    page.load(folder / "tour.html")
+    assert page.draw().std() > 0.05
+    context.close()
+
+
+def test_a_sorter_that_ends_is_reported_and_rejects_pictures(chromium: Any, folder: Path) -> None:
+    context = chromium.new_context(viewport={"width": SIZE[0], "height": SIZE[1]})
+    page = OpenPage(context.new_page())
+    page.page.add_init_script(
+        "window.Worker = class extends Worker { constructor(url) { super(url); window.sorter = this; } }"
+    )
+    page.load(folder / "tour.html")
+    page.run("sorter.terminate(); sorter.dispatchEvent(new ErrorEvent('error', {message: 'no memory'}))")
+    page.page.wait_for_selector("#cover.failed img")
+    assert "no memory" in page.page.inner_text("#message")
+    assert "no memory" in page.run("pansplat.camera.position[0] += 0.1; pansplat.render(64, 48).catch(String)")
+    context.close()
+
+
 def test_without_webgl_the_page_says_so_over_its_poster(chromium: Any, folder: Path) -> None:
     context = chromium.new_context()
     page = context.new_page()
@@ -306,9 +340,7 @@ def test_missing_parts_are_named(chromium: Any, folder: Path, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_a_tour_blends_the_views_of_the_edge_and_flies_along_edges(
-    chromium: Any, folder: Path, scene: Scene, tour: TourGraph
-) -> None:
+def test_a_tour_blends_the_views_of_the_edge_and_flies_along_edges(chromium: Any, folder: Path, scene: Scene) -> None:
     with opened(chromium, folder / "house.html") as page:
         spots = np.array(page.run("HEADER.spots.map((spot) => spot.position)"))
         start = page.camera
@@ -319,7 +351,7 @@ def test_a_tour_blends_the_views_of_the_edge_and_flies_along_edges(
         pose = np.eye(4)
         cy, sy, cp, sp = math.cos(0.3), math.sin(0.3), math.cos(-0.1), math.sin(-0.1)
         turn = np.array(((cy, 0, sy), (0, 1, 0), (-sy, 0, cy))) @ np.array(((1, 0, 0), (0, cp, -sp), (0, sp, cp)))
-        pose[:3, :3] = tour.level_axes @ turn
+        pose[:3, :3] = make_graph(scene).level_axes @ turn
         pose[:3, 3] = position + scene.cam2world[:, :3, 3].mean(0).numpy()
         kept = scene.gaussians.views >= 1  # the edge from the second panorama to the third
         part = scene.gaussians.select(kept)
@@ -330,12 +362,19 @@ def test_a_tour_blends_the_views_of_the_edge_and_flies_along_edges(
             drawn = [pipeline.render(which, pose, **size).color.clamp(0, 1) for which in (edge, scene)]
         of_edge, of_all = (color.permute(1, 2, 0).double().numpy() for color in drawn)
         assert psnr(image, of_edge) > 42 > 35 > psnr(of_edge, of_all)
-        # A flight to the last panorama passes the second one.
         page.page.keyboard.press("KeyR")
         assert page.camera == start
+        # A flight to the last panorama passes the second one, also from a camera that has just left the shown edge.
         page.run("HEADER.speed *= 100")
-        page.run("passed = []; watch = setInterval(() => passed.push([...pansplat.camera.position]), 5)")
-        page.page.keyboard.press("3")
+        page.run("(camera) => Object.assign(pansplat.camera, camera)", camera)
+        page.draw()
+        fly = """(start) => {
+            Object.assign(pansplat.camera, start);
+            dispatchEvent(new KeyboardEvent("keydown", {code: "Digit3"}));
+            passed = [];
+            setInterval(() => passed.push([...pansplat.camera.position]), 5);
+        }"""
+        page.run(fly, start)
         page.wait("pansplat.camera.position.every((x, i) => x === HEADER.spots[2].position[i])")
         passed = np.array(page.run("passed"))
         between = np.linalg.norm(passed[:, None] - spots, axis=2)
