@@ -9,6 +9,7 @@ import signal
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,13 @@ _CHECKED = ("geometry", "gaussians", "model", "rendering", "refinement", "predic
 install_import_hook([f"pansplat.{name}" for name in _CHECKED], "pansplat.testing.check_types")
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+@pytest.fixture
+def refinement_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Count 0.01 s for each reading of the refinement's clock, so that its steps do not depend on the machine."""
+    ticks = itertools.count(step=0.01)
+    monkeypatch.setattr("pansplat.refinement.refinement.time", SimpleNamespace(perf_counter=lambda: next(ticks)))
 
 
 @pytest.fixture(scope="session")

@@ -178,6 +178,7 @@ def test_error_images_are_brighter_for_larger_errors() -> None:
     assert float(brightness[2]) < float(brightness[1]) < float(brightness[0])
 
 
+@pytest.mark.usefixtures("refinement_clock")
 def test_a_refined_scene_is_evaluated_with_its_time_and_error_at_the_inputs(tmp_path: Path, sphere_predictor) -> None:
     pairs = load_pairs(write_triplet(tmp_path / "room"))
     plain, refined = (
