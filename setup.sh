@@ -87,7 +87,8 @@ make_venv() {
 }
 
 # --- packages ---
-pip_install() { .venv/bin/python -m pip install --disable-pip-version-check -qq -c constraints.txt "$@"; }
+# Python compiles a module at its first import; pip would compile thousands that are never imported.
+pip_install() { .venv/bin/python -m pip install --disable-pip-version-check -qq --no-compile -c constraints.txt "$@"; }
 
 # On Linux a plain `pip install torch` downloads gigabytes of CUDA libraries. So without a GPU the CPU build is installed
 # by its version, first from pip's configured sources (a mirror or a folder of wheels may have it), then from PyTorch.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import errno
 import io
@@ -72,19 +73,20 @@ def run_command(command: Callable[[], int], *, memory_advice: str, interruption:
         return status
 
 
-def exit_process(status: int, *, finalize: bool = True) -> NoReturn:
-    """End the process with an exit status; a signal during the interpreter's end prints nothing.
+def exit_process(status: int) -> NoReturn:
+    """End the process with an exit status; a signal during the end prints nothing.
 
-    Args:
-        finalize: whether Python's finalisation runs. Threads of libraries can abort it, or block it for ever.
+    The functions that libraries have registered for the exit run. The rest of Python's finalisation does not: after
+    torch is imported, it takes about a second, and threads of libraries can abort it or block it for ever (those of
+    gloo, which DistributedDataParallel keeps alive, abort it when they release a tensor).
     """
     with contextlib.suppress(ValueError):  # only the main thread can set handlers
         for number in _SIGNALS:
             signal.signal(number, signal.SIG_IGN)
-    if finalize:
-        sys.exit(status)
-    sys.stdout.flush()
-    sys.stderr.flush()
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError, OSError, ValueError):  # None, a full disk or a closed pipe
+            stream.flush()
     os._exit(status)
 
 

@@ -5,7 +5,9 @@ rotations, and those of PanSplat and MVSplat, are compiled by the first call tha
 """
 
 import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
+from multiprocessing import get_context
 
 import numpy as np
 import torch
@@ -15,33 +17,30 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from pansplat.data.views import Views
 from pansplat.gaussians.scene import Gaussians
 from pansplat.pipeline import predict
-from pansplat.rendering.cpu.display import DisplayScene, PixelFaces, Selection, blend_to_pixels
+from pansplat.rendering.cpu.display import DisplayScene, PixelFaces, Selection, blend_to_pixels, enlarge
 from pansplat.rendering.image_planes import Layout
 from pansplat.rendering.rasterize import RasterOptions, rasterize
 
 
 def main() -> None:
-    """Compile the kernels, show the progress, and print the time."""
-    ewa = RasterOptions(kernel="ewa", order="z", lowpass="3dgs")
-    steps = {
-        "rasteriser": partial(_rasterize, 0, "equirect", RasterOptions()),
-        "rasteriser, spherical harmonics": partial(_rasterize, 1, "pinhole", RasterOptions()),
-        "rasteriser, EWA": partial(_rasterize, 0, "pinhole", ewa),
-        "rasteriser, EWA and spherical harmonics": partial(_rasterize, 1, "cubemap", ewa),
-        "stereo panoramas": _rasterize_stereo,
-        "viewer": _draw_display_image,
-        "sweep": partial(_predict, "sweep"),
-        "depth network": partial(_predict, "default"),
-    }
+    """Compile the kernels in two processes, show the progress, and print the time."""
     start = time.perf_counter()
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("", total=len(steps))
-        for name, step in steps.items():
-            progress.update(task, description=f"compiling: {name}")
-            step()
-            progress.advance(task)
+    columns = TextColumn("compiling: {task.description}"), BarColumn(), TimeElapsedColumn()
+    with (
+        Progress(*columns, console=Console(stderr=True), transient=True) as progress,
+        ProcessPoolExecutor(len(STEPS), get_context("spawn")) as pool,
+    ):
+        tasks = {pool.submit(compile_kernels, name): progress.add_task(name, total=None) for name in STEPS}
+        for future in as_completed(tasks):
+            future.result()
+            progress.update(tasks[future], total=1, completed=1)
     print(f"CPU kernels are compiled ({time.perf_counter() - start:.0f} s)")
+
+
+def compile_kernels(name: str) -> None:
+    """Compile the kernels of one of `STEPS` in this process."""
+    for step in STEPS[name]:
+        step()
 
 
 def _rasterize(degree: int, layout: Layout, options: RasterOptions) -> None:
@@ -78,6 +77,7 @@ def _draw_display_image() -> None:
     scene.rasterize(np.zeros(3), faces.plane(0), labels, 2, RasterOptions(), selection=selection, footprint="count")
     blend_to_pixels(layers.sums, np.full(2, 0.5), (0.0, 0.0, 0.0), faces.pixels[0])
     blend_to_pixels(layers.sums, np.full(2, 0.5), (0.0, 0.0, 0.0), pixels, bottom_up=True)
+    enlarge(faces.pixels[0], np.zeros((24, 24), np.uint32))
     faces.sample(np.eye(3), 20.0, pixels)
 
 
@@ -87,6 +87,23 @@ def _predict(model: str) -> None:
     poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     poses[1, 0, 3] = 0.2
     predict(Views(images, poses, masks, near=0.1, far=10.0, names=("left", "right")), model)
+
+
+_EWA = RasterOptions(kernel="ewa", order="z", lowpass="3dgs")
+
+# Few kernels are in both; the first process that compiles one writes it to numba's cache for the other.
+STEPS = {
+    "sweep and depth network": (partial(_predict, "sweep"), partial(_predict, "default")),
+    "rasteriser and viewer": (
+        partial(_rasterize, 0, "equirect", RasterOptions()),
+        partial(_rasterize, 1, "pinhole", RasterOptions()),
+        partial(_rasterize, 0, "pinhole", _EWA),
+        partial(_rasterize, 1, "cubemap", _EWA),
+        _rasterize_stereo,
+        _draw_display_image,
+    ),
+}
+"""Calls that compile kernels, by the name of the group; each group has a process."""
 
 
 if __name__ == "__main__":

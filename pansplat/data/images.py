@@ -132,16 +132,13 @@ def read_depth(path: Path | str, height: int) -> Float[Tensor, "height width"]:
             raise InputError(f"{path}: needed depth in channel Z or Y, got channels {sorted(channels)}; rename it.")
         depth = np.asarray(channels[name], dtype=np.float32)
     else:
-        if data.startswith(b"\x89PNG"):
-            _open_with_pillow(path, data)  # refuses damaged data, about which OpenCV prints messages
-        depth = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        if depth is None or depth.ndim != 2 or depth.dtype != np.uint16:
-            got = "an unreadable file" if depth is None else f"{depth.dtype} with shape {depth.shape}"
+        image = _open_with_pillow(path, data)
+        if not image.mode.startswith("I"):
             raise InputError(
                 f"{path}: needed depth as a one-channel 16-bit PNG in millimetres or an EXR in "
-                f"metres, got {got}; convert it."
+                f"metres, got pixels of type {image.mode}; convert it."
             )
-        depth = depth.astype(np.float32) / np.float32(1000)
+        depth = np.asarray(image).astype(np.float32) / np.float32(1000)
     _check_two_to_one(path, depth.shape[1], depth.shape[0])
     depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
     rows = ((np.arange(height) + 0.5) * depth.shape[0] / height).astype(int)

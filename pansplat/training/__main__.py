@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
@@ -57,9 +56,7 @@ def parse(argv: Sequence[str] | None = None) -> TrainConfig:
 
 def main() -> NoReturn:
     """The entry point: `run`, then the end of this process."""
-    # DistributedDataParallel keeps gloo's threads alive after the process group is destroyed (torch 2.13). One that
-    # releases a tensor during Python's finalisation aborts the process.
-    exit_process(run(), finalize="WORLD_SIZE" not in os.environ)
+    exit_process(run())
 
 
 if __name__ == "__main__":

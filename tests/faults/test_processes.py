@@ -110,7 +110,10 @@ for case in json.load(sys.stdin):
         )
         sys.__stdout__, sys.__stderr__ = sys.stdout, sys.stderr
         signal.alarm(20)  # a command that hangs
-        main([os.fsdecode(word.encode("latin-1")) for word in case["command"]])
+        try:
+            main([os.fsdecode(word.encode("latin-1")) for word in case["command"]])
+        except SystemExit as stop:  # of the parser of arguments; Python's finalisation takes a second with torch
+            pansplat.console.exit_process(stop.code)
     print(os.waitstatus_to_exitcode(os.wait()[1]), flush=True)
 """
 

@@ -1,4 +1,4 @@
-"""Programs that torchrun starts for test_distributed.py: PROGRAM FOLDER. Each process writes its gradients to files."""
+"""Programs of test_distributed.py: PROGRAM FOLDER. Each process writes its gradients to files."""
 
 from __future__ import annotations
 
@@ -102,4 +102,4 @@ if __name__ == "__main__":
     group.initialize(torch.device("cpu"))
     {"split_batches": split_batches, "repeated_steps": repeated_steps}[sys.argv[1]](Path(sys.argv[2]), group)
     group.destroy()
-    exit_process(0, finalize=False)
+    exit_process(0)

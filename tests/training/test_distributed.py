@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -21,24 +22,28 @@ from pansplat.training.trainer import Trainer
 _PROGRAMS = str(Path(__file__).with_name("distributed_programs.py"))
 
 
-def _launch(count: int, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run a program in `count` processes; torchrun starts them if there are several."""
-    torchrun = ("-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}")
-    done = subprocess.run(
-        [sys.executable, *(torchrun if count > 1 else ()), *arguments],
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done
+def _launch(program: str, folder: Path, count: int) -> None:
+    """Run a program of distributed_programs.py in `count` processes."""
+    with socket.create_server(("localhost", 0)) as server:
+        port = server.getsockname()[1]
+    shared = {"OMP_NUM_THREADS": "1", "MASTER_ADDR": "localhost", "MASTER_PORT": str(port), "WORLD_SIZE": str(count)}
+    children = [
+        subprocess.Popen(
+            [sys.executable, _PROGRAMS, program, str(folder)],
+            env=os.environ | shared | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in range(count)
+    ]
+    errors = [child.communicate(timeout=300)[1] for child in children]
+    assert not any(child.returncode for child in children), errors
 
 
 @pytest.mark.slow
 def test_two_processes_have_the_gradients_of_one_process_with_the_joint_batch(tmp_path: Path) -> None:
     for count in (1, 2):
-        _launch(count, _PROGRAMS, "split_batches", str(tmp_path))
+        _launch("split_batches", tmp_path, count)
     joint, first, second = (torch.load(tmp_path / f"{name}.pt") for name in ("1_0", "2_0", "2_1"))
     assert any("norm" in name and "running" in name for name in joint)
     for method in ("plain 1", "plain 2", "two-step 1", "two-step 2"):
@@ -52,7 +57,7 @@ def test_two_processes_have_the_gradients_of_one_process_with_the_joint_batch(tm
 
 @pytest.mark.slow
 def test_every_step_sums_gradients_in_the_same_order(tmp_path: Path) -> None:
-    _launch(3, _PROGRAMS, "repeated_steps", str(tmp_path))
+    _launch("repeated_steps", tmp_path, 3)
     read = {path.stem: torch.load(path) for path in tmp_path.iterdir()}
     for name, expected in read["joint"].items():
         scale = float(expected.abs().max())
@@ -111,7 +116,15 @@ def test_only_the_last_batch_of_a_step_is_synchronised(monkeypatch: pytest.Monke
 def test_torchrun_trains_and_only_the_first_process_writes(tmp_path: Path) -> None:
     out = tmp_path / "run"
     settings = ("--optimizer.steps", "1", "--optimizer.batch-size", "1", "--data.workers", "0", "--device", "cpu")
-    done = _launch(2, "-m", "pansplat.training", "tiny", "--out", str(out), "--validation.every", "0", *settings)
+    torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m", "pansplat.training", "tiny")
+    done = subprocess.run(
+        [sys.executable, *torchrun, "--out", str(out), "--validation.every", "0", *settings],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
     assert done.stderr.count("2 process(es), from step 0 of 1") == 1
     rows = (out / "log.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in rows] == ["step", "0"]

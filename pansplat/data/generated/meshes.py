@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pansplat.data.generated.raytracer import build_bvh
+from pansplat.data.generated.bvh import build_bvh
 from pansplat.data.generated.textures import mip_levels
 
 Floats = NDArray[np.float32]

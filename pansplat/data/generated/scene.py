@@ -8,25 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pansplat.data.generated.bvh import BOX, CYLINDER, ELLIPSOID, GLASS, MESH, STACK_SIZE, Bodies, build_bvh
 from pansplat.data.generated.library import FurnitureLibrary
 from pansplat.data.generated.meshes import NO_MESH, NO_TEXTURE, Mesh, Texture, pack_meshes
-from pansplat.data.generated.raytracer import (
-    BOX,
-    CYLINDER,
-    ELLIPSOID,
-    FLOOR_CELL,
-    GLASS,
-    LAMP,
-    LIGHT_NUMBERS,
-    MESH,
-    PORTAL,
-    STACK_SIZE,
-    SUN,
-    Bodies,
-    SceneArrays,
-    build_bvh,
-    trace_panorama,
-)
+from pansplat.data.generated.raytracer import FLOOR_CELL, LAMP, LIGHT_NUMBERS, PORTAL, SUN, SceneArrays, trace_panorama
 from pansplat.data.generated.textures import GLOSS, IMAGE, KIND, MIRROR, NUMBERS, Pattern
 
 Array = NDArray[np.float64]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pansplat.data.generated.bvh import MESH
 from pansplat.data.generated.homes import build_home
 from pansplat.data.generated.library import FREE, WALL, load_furniture
-from pansplat.data.generated.raytracer import MESH
 from pansplat.data.generated.scene import SceneBuilder
 from pansplat.data.generated.textures import Pattern
 from pansplat.errors import InputError

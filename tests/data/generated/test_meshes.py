@@ -6,8 +6,8 @@ from itertools import product
 import numpy as np
 import pytest
 
+from pansplat.data.generated.bvh import first_hit
 from pansplat.data.generated.meshes import Mesh, MeshMaterial, Texture, make_mesh, read_obj, simplify
-from pansplat.data.generated.raytracer import first_hit
 from pansplat.data.generated.scene import GeneratedScene, SceneBuilder
 from pansplat.data.generated.textures import Pattern, image_color, mip_levels
 

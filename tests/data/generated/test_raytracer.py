@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from pansplat.data.generated.raytracer import first_hit, portal_form_factor
+from pansplat.data.generated.bvh import first_hit
+from pansplat.data.generated.raytracer import portal_form_factor
 from pansplat.data.generated.scene import GeneratedScene, SceneBuilder
 from pansplat.data.generated.textures import Pattern
 
