@@ -171,15 +171,15 @@ class BenchModel:
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder; give one with --pair (the sample is in the repository only)")
         views = choose_pair(folder, PairChoice()).load_context(self.height)
-        bfloat16 = has_bfloat16()
-        if not bfloat16:
-            print("without bfloat16: this processor has no instructions for it")
         machine = describe_machine(threads)
+        bfloat16 = has_bfloat16()
         cases = list_model_cases(threads, bfloat16=bfloat16, quick=self.quick)
         with (
             self._weights() as (weights, network),
             make_model_report(machine, network, height=self.height, json=json, out=self.out) as report,
         ):
+            if not bfloat16:
+                print("without bfloat16: this processor has no instructions for it")
             measure_model(cases, views, weights, report, scene=folder.name)
         return 0
 
