@@ -41,7 +41,7 @@ def folder(tmp_path: Path, write_pair, sphere_predictor, monkeypatch: pytest.Mon
     monkeypatch.setitem(pipeline._MODELS, "default", DarkSphere)
     monkeypatch.setattr(bench, "warm_up", lambda predictor: None)
     cases = [RefineCase(CROSS_FADE, HEIGHT), RefineCase("default", HEIGHT), RefineCase("default", HEIGHT, 2.0)]
-    cases.append(RefineCase("default", HEIGHT, 2.0, 200))
+    cases.append(RefineCase("default", HEIGHT, 2.0, 40))
     monkeypatch.setattr(bench, "list_refine_cases", lambda quick: cases)
     return tmp_path / "rooms"
 
@@ -55,9 +55,9 @@ def test_the_bench_writes_rows_means_table_and_plot(folder: Path, tmp_path: Path
     assert [row["scene"] for row in rows] == ["one"] * 4 + ["two"] * 4 + [MEAN] * 4
     plain, refined, small = rows[1:4]
     assert refined["ws_psnr_db"] > plain["ws_psnr_db"] and refined["steps"] > 1 > plain["refine_s"] == 0
-    assert small["num_gaussians"] <= 200 and small["num_gaussians"] < refined["num_gaussians"] < plain["num_gaussians"]
+    assert small["num_gaussians"] <= 40 < refined["num_gaussians"] < plain["num_gaussians"]
     assert rows[9]["ws_psnr_db"] == pytest.approx((rows[1]["ws_psnr_db"] + rows[5]["ws_psnr_db"]) / 2, rel=1e-4)
-    assert "| default | 16 | 2 s | 200 |" in (out / "refine.md").read_text()
+    assert "| default | 16 | 2 s | 40 |" in (out / "refine.md").read_text()
     assert (out / "refine.png").stat().st_size > 1000 and "cross-fade" in capsys.readouterr().out
 
 
