@@ -32,7 +32,7 @@ def _train(config: TrainConfig) -> int:
     with own_warnings():
         try:
             trainer = Trainer(config, processes)
-            return 0 if trainer.train() else 128 + trainer.stopped_by
+            return 0 if trainer.train() else trainer.stop.status
         finally:
             processes.destroy()
 

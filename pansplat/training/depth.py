@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import signal
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -47,6 +46,7 @@ from pansplat.training.checkpoint import (
 )
 from pansplat.training.logs import CsvTable, ProgressDisplay
 from pansplat.training.optimization import ExponentialMovingAverage
+from pansplat.training.stopping import StopRequest
 
 _TERMS = ("loss", "mono_error", "mono_likelihood", "refined_error", "refined_likelihood")
 _COLUMNS = (*_TERMS, "rate", "gradient_norm", "seconds")
@@ -258,7 +258,7 @@ class DepthTrainer:
         )
         self.average = ExponentialMovingAverage(self.network, config.ema)
         load_latest(config.out / "checkpoints", self._restore)
-        self._stop, self.stopped_by = False, signal.SIGINT
+        self.stop = StopRequest()
 
     def _restore(self, path: Path, state: dict[str, Any]) -> None:
         """Restore the run from a checkpoint; a DamagedCheckpointError if it does not fit."""
@@ -279,33 +279,30 @@ class DepthTrainer:
         config.out.mkdir(parents=True, exist_ok=True)
         log = CsvTable(config.out / "log.csv", _COLUMNS, self.step)
         scores = CsvTable(config.out / "validation.csv", _MEASURES, self.step + 1)
-        handlers = {kind: signal.signal(kind, self._request_stop) for kind in (signal.SIGINT, signal.SIGTERM)}
         began = saved = time.monotonic()
         try:
-            with ProgressDisplay(self.step, config.steps, silent=self.silent) as progress:
-                progress.print(f"from step {self.step} of {config.steps}, {len(self.tours)} tours")
+            with ProgressDisplay(self.step, config.steps, silent=self.silent) as display, self.stop.on_signal(display):
+                display.print(f"from step {self.step} of {config.steps}, {len(self.tours)} tours")
                 for samples in self._batches():
                     values = self._optimize(samples)
                     log.add(self.step, values)
                     self.step += 1
-                    progress.update(self.step, values["loss"], values["seconds"])
+                    display.update(self.step, values["loss"], values["seconds"])
                     now = time.monotonic()
                     if config.stop_after_minutes and now - began > 60 * config.stop_after_minutes:
-                        self._stop, self.stopped_by = True, number
+                        self.stop.requested, self.stop.status = True, 0
                     if config.validation is not None and self.step % config.validate_every == 0:
                         measures = self.validate()
                         scores.add(self.step, measures)
-                        progress.print(f"step {self.step}: " + ", ".join(f"{k} {v:.4f}" for k, v in measures.items()))
-                    if now - saved > 60 * config.minutes or self._stop or self.step == config.steps:
+                        display.print(f"step {self.step}: " + ", ".join(f"{k} {v:.4f}" for k, v in measures.items()))
+                    if now - saved > 60 * config.minutes or self.stop.requested or self.step == config.steps:
                         self.save()
                         saved = now
-                    if self._stop:
+                    if self.stop.requested:
                         break
         finally:
             log.close()
             scores.close()
-            for kind, handler in handlers.items():
-                signal.signal(kind, handler)
         return self.step >= config.steps
 
     def save(self) -> None:
@@ -335,9 +332,6 @@ class DepthTrainer:
             for name in _MEASURES:
                 sums[name] += float(terms[name]) / count
         return sums
-
-    def _request_stop(self, number: int, frame: object) -> None:
-        self._stop, self.stopped_by = True, number
 
     def _learning_rate_factor(self) -> float:
         rise = min(1.0, (self.step + 1) / max(1, self.config.warm_up))
@@ -402,7 +396,7 @@ def main() -> None:
         require_output_folder("--out", config.out)
         with own_warnings():
             trainer = DepthTrainer(config)
-            return 0 if trainer.train() else 128 + trainer.stopped_by
+            return 0 if trainer.train() else trainer.stop.status
 
     exit_process(
         run_command(train, memory_advice="choose fewer --pairs.", interruption="run the command again to resume")

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import signal
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -42,6 +40,7 @@ from pansplat.training.network import (
 from pansplat.training.optimization import ExponentialMovingAverage, one_cycle_rate
 from pansplat.training.rendering import TargetRenderer
 from pansplat.training.step import LOSS_TERMS, TrainingStep, accumulate_gradients
+from pansplat.training.stopping import StopRequest
 from pansplat.training.validation import MEASURES, validate
 
 _EXTRA_STEPS = 10  # of the learning-rate schedule beyond the last step, as in the official code
@@ -104,7 +103,7 @@ class Trainer:
         latest = load_latest(self.folder, self._restore)
         self.resumed_from = None if latest is None else latest[0]
         self._training_step = data_parallel(training_step, self.processes)
-        self._stop, self.stopped_by = False, signal.SIGINT  # number of the signal
+        self.stop = StopRequest()
 
     def train(self) -> bool:
         """Train the remaining steps. Returns whether all were done (False: stopped by a signal).
@@ -118,7 +117,7 @@ class Trainer:
         logs = _Logs.open(out, self.config, self.step, validation_step) if is_first else None
         saved_at = time.monotonic()
         try:
-            with ProgressDisplay(self.step, total, silent=self.silent) as progress, self._stop_on_signal(progress):
+            with ProgressDisplay(self.step, total, silent=self.silent) as progress, self.stop.on_signal(progress):
                 progress.print(self._describe())
                 if self.resumed_from is not None:
                     progress.print(f"resuming from {self.resumed_from}")
@@ -133,7 +132,7 @@ class Trainer:
                         logs.board.add(self.step, values, "training")
                     self.step += 1
                     progress.update(self.step, values["loss"], values["seconds"])
-                    stopped = self.processes.any(self._stop)
+                    stopped = self.processes.any(self.stop.requested)
                     if self._is_due(self.config.validation.every) and logs is not None and not stopped:
                         self._validate(logs, progress)
                     is_overdue = time.monotonic() - saved_at > 60 * self.config.checkpoint.minutes
@@ -303,26 +302,3 @@ class Trainer:
             f"perceptual loss {self.perceptual_name}, "
             f"{self.processes.count} process(es), from step {self.step} of {self.config.optimizer.steps}"
         )
-
-    @contextmanager
-    def _stop_on_signal(self, progress: ProgressDisplay) -> Iterator[None]:
-        """The first Ctrl-C or SIGTERM stops the run after the current step and saves it; the second stops at once."""
-
-        def handle(number: int, _: object) -> None:
-            if self._stop:
-                raise KeyboardInterrupt
-            self._stop, self.stopped_by = True, number
-            # A handler may interrupt a write to the same stream, which cannot be entered twice; a thread waits for it.
-            message = "stopping after this step; press Ctrl-C again to stop at once"
-            threading.Thread(target=progress.print, args=(message,), daemon=True).start()
-
-        signals = (signal.SIGINT, signal.SIGTERM)
-        try:
-            previous = [signal.signal(kind, handle) for kind in signals]
-        except ValueError:  # signal handlers can only be set in the main thread
-            previous = []
-        try:
-            yield
-        finally:
-            for kind, handler in zip(signals, previous, strict=False):
-                signal.signal(kind, handler)

@@ -1,5 +1,6 @@
 import dataclasses
 import math
+import signal
 
 import numpy as np
 import pytest
@@ -162,6 +163,21 @@ def test_resumed_run_equals_an_uninterrupted_one(config):
     first, second = (load_latest(folder / "checkpoints")[1] for folder in (config.out, resumed.config.out))
     for name, tensor in first["mean"].items():
         torch.testing.assert_close(tensor, second["mean"][name], rtol=0, atol=0)
+
+
+def test_a_time_limit_or_a_signal_ends_the_run_after_its_step_with_a_checkpoint(config):
+    limited = DepthTrainer(dataclasses.replace(config, stop_after_minutes=1e-9), silent=True)
+    assert not limited.train() and (limited.step, limited.stop.status) == (1, 0)
+    resumed = DepthTrainer(config, silent=True)
+    optimize = resumed._optimize
+
+    def interrupted(samples):
+        signal.raise_signal(signal.SIGTERM)
+        return optimize(samples)
+
+    resumed._optimize = interrupted
+    assert not resumed.train() and (resumed.step, resumed.stop.status) == (2, 128 + signal.SIGTERM)
+    assert load_latest(config.out / "checkpoints")[1]["step"] == 2
 
 
 @pytest.mark.slow
