@@ -36,7 +36,6 @@ Views = tuple[int, ...]
 """The panoramas of a scene, by their number in the tour."""
 
 MIN_PANORAMAS = 3
-MAX_SCENE_VIEWS = 3
 
 # The overlap of two panoramas is measured in small images by a sweep over depth.
 _HEIGHT = 48

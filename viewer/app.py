@@ -314,7 +314,3 @@ def _create_context(renderer: RendererChoice) -> "moderngl.Context | None":
         if renderer == "gl":
             raise
         return None
-
-
-if __name__ == "__main__":
-    main()

@@ -75,10 +75,6 @@ class TourScenes:
         """The scenes in memory, the least recently used first."""
         return list(self._loaded)
 
-    def find_views(self, edge: Edge) -> Views:
-        """The panoramas of an edge's scene."""
-        return self._views[edge]
-
     def make_entry(self, views: Views) -> SceneEntry:
         """The scene of these panoramas as an entry for the loader."""
         pair = self.tour.make_pair(views)

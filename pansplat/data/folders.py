@@ -320,7 +320,7 @@ def _read_view_folder(view: Path, folder: Path, convention: str) -> Panorama:
     return Panorama(view.name, image, cam2world, find_mask(image, folder), depth if depth.is_file() else None)
 
 
-def _read_numbers(path: Path, count: int) -> Float[Tensor, count]:
+def _read_numbers(path: Path, count: int) -> Float[Tensor, "count"]:
     """Exactly `count` numbers from a text file."""
     if not path.is_file():
         raise InputError(f"{path}: needed the pose of the view, got no such file; add it.")

@@ -6,7 +6,6 @@ Source: Morton, "A computer oriented geodetic data base and a new technique in f
 import numpy as np
 from jaxtyping import Int64, Integer
 
-MAX_BITS = 21  # of each coordinate
 _SPREAD = (  # shifts and masks that move bit n of 21 to bit 3 n
     (32, 0x1F00000000FFFF),
     (16, 0x1F0000FF0000FF),
