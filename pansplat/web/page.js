@@ -741,7 +741,8 @@
     });
     const { count, views, harmonicsScale, colorRange: range } = HEADER;
     const base = scene.harmonics ? scene.colors : null;
-    sorter.postMessage({ count, views, means: scene.means, harmonics: scene.harmonics, base, harmonicsScale, range });
+    const { means, harmonics } = scene, moved = [means, harmonics].filter(Boolean).map((array) => array.buffer);
+    sorter.postMessage({ count, views, means, harmonics, base, harmonicsScale, range }, moved);  // not copied
     requestSort();
     makeRenderer();
     await first;
