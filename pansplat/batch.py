@@ -15,6 +15,7 @@ import math
 import os
 import re
 import secrets
+import shutil
 import signal
 import time
 import warnings
@@ -49,6 +50,7 @@ _LAYOUT = "2"  # of the outputs; part of their hashes
 _MAX_DEATHS = 2  # worker processes that may end during one task before the item counts as failed
 _MAX_LOSSES = 3  # of the connection to a scheduler without a finished item in between
 _CONNECT_SECONDS = 60.0
+_BYTES_PER_PIXEL = 40  # of panoramas, in the .ply of their prediction; most predictors write more
 _MAX_NAME = 80  # characters of a pair's name in the name of an output
 # Temporary names (pansplat.atomic) of outputs.
 _UNFINISHED = re.compile(rf"\.(graph|{'|'.join(STEPS)})-[0-9a-f]{{16}}.*\.[0-9a-f]{{8}}\.\w+")
@@ -357,7 +359,15 @@ class _PairSteps:
         return path, is_new
 
     def _predict_to(self, path: Path) -> None:
-        pipeline.predict_to_file(self._pair, path, self._load_predictor(), height=self._height)
+        predictor = self._load_predictor()
+        height = self._height or pipeline.choose_height(self._pair, predictor)
+        needed, free = _BYTES_PER_PIXEL * len(self._pair.context) * 2 * height**2, shutil.disk_usage(self._folder).free
+        if free < needed:  # a full disk must not cost the time of the prediction
+            raise InputError(
+                f"{self._folder}: needed at least {needed / 1e6:,.1f} MB of free disk space for {self._pair.name}, "
+                f"got {free / 1e6:,.1f} MB; free some and run the command again"
+            )
+        pipeline.predict_to_file(self._pair, path, predictor, height=height)
 
     def _refine_to(self, path: Path) -> None:
         scene = self.read()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -11,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import psutil
@@ -155,6 +157,16 @@ def test_on_a_full_disk_no_half_file_is_left_and_the_item_is_done_later(
     assert process_item(item, options, "1", out).status == "done" and len(list_outputs(out)) == 1
 
 
+def test_without_space_for_its_file_an_item_is_not_predicted(
+    rooms: Path, tmp_path: Path, sphere: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=600_000))
+    options = BatchOptions(model="sphere", height=HEIGHT)
+    report = process_item(Item("room0", rooms / "room0"), options, "1", tmp_path / "out")
+    assert report.status == "failed" and "needed at least 0.7 MB of free disk space" in str(report.error)
+    assert "got 0.6 MB" in str(report.error) and batch._load_model("sphere", "trained", "float32").calls == 0
+
+
 def test_lines_of_the_report_wait_while_the_disk_is_full(tmp_path: Path) -> None:
     resource = pytest.importorskip("resource")
     limits, lines = resource.getrlimit(resource.RLIMIT_FSIZE), [f"line {k}\n" for k in range(4)]
@@ -223,7 +235,7 @@ def interrupt_until(stopped: threading.Event) -> None:
     """Send SIGINT to this process, again if Python loses it: an exception in a destructor is ignored."""
     while not stopped.is_set():
         os.kill(os.getpid(), signal.SIGINT)
-        stopped.wait(4)
+        stopped.wait(20)
 
 
 def kill_the_worker_of(cluster: Any, item: str) -> None:
@@ -252,7 +264,7 @@ def test_two_workers_do_each_item_once_though_a_worker_is_killed_an_item_is_bad_
     weights = tmp_path / "small.safetensors"
     save_weights(weights, pack_weights("pansplat", small_config, PanSplat(small_config).state_dict(), compat="fixed"))
     out, options = tmp_path / "out", ["--model", str(weights), "--height", str(HEIGHT), "--do", "predict,refine"]
-    command = ["batch", str(rooms), "--out", str(out), *options, "--refine", "0.2"]
+    command = ["batch", str(rooms), "--out", str(out), *options, "--refine", "1"]
     with pytest.raises(KeyboardInterrupt), batch.start_workers(2, 4 << 30) as cluster:
         # In this process, the first one would change the threads of the kernels; the second one makes workers slow.
         assert not {"NUMBA_NUM_THREADS", "MALLOC_TRIM_THRESHOLD_"} & os.environ.keys()
@@ -278,7 +290,7 @@ def test_two_workers_do_each_item_once_though_a_worker_is_killed_an_item_is_bad_
         assert list_outputs(out) == files
 
         other = tmp_path / "stopped"
-        with_scheduler[3], with_scheduler[-3] = str(other), "60"
+        with_scheduler[3], with_scheduler[-3] = str(other), "600"
         stopped = threading.Event()
         when_predicted(other, "room0", lambda: interrupt_until(stopped))
         assert run(with_scheduler) == 130
@@ -286,7 +298,7 @@ def test_two_workers_do_each_item_once_though_a_worker_is_killed_an_item_is_bad_
         pids = [nanny.pid for nanny in cluster.workers.values()]
         began = time.perf_counter()
         raise KeyboardInterrupt
-    assert time.perf_counter() - began < 20 and not any(is_alive(pid) for pid in pids)
+    assert time.perf_counter() - began < 120 and not any(is_alive(pid) for pid in pids)
     batch.remove_unfinished(list_items(rooms), other)
     complete = list_outputs(other)  # a refinement may end early
     assert complete and all(len(pipeline.load(other / name).gaussians) for name in complete)
