@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
+from hypothesis import HealthCheck, settings
 from jaxtyping import config, install_import_hook
 from PIL import Image
 from torch import Tensor
@@ -36,6 +37,10 @@ with contextlib.suppress(ImportError):
 # Check annotated shapes and types at every call; install the hook before the packages are imported.
 _CHECKED = ("geometry", "gaussians", "model", "rendering", "refinement", "predictor", "evaluation", "pipeline")
 install_import_hook([f"pansplat.{name}" for name in _CHECKED], "pansplat.testing.check_types")
+
+# Generated examples may take any time: machines differ.
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared"
 

@@ -260,7 +260,7 @@ def test_invalid_files_are_refused_with_their_name(tmp_path: Path, content: byte
     assert "bad.ply" in str(caught.value)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(cut=st.floats(0, 1), flip=st.integers(0, 10**6), value=st.integers(0, 255))
 def test_a_damaged_file_gives_a_scene_or_an_input_error(tmp_path: Path, cut: float, flip: int, value: int) -> None:
     """No other exception for any wrong byte and any truncation."""

@@ -21,7 +21,7 @@ def _image(colour, alpha, depth=2.0, size=(2, 3)) -> Rendering:
     )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(position=_POINT, others=st.lists(_POINT, min_size=1, max_size=5))
 def test_weights_are_a_partition_of_unity(position, others):
     weights = blend_weights(_points(position)[0], _points(*others))

@@ -16,7 +16,6 @@ _FIELDS = ("means", "scales", "quats", "opacities", "harmonics", "covariances")
 _EXTREMES = (math.nan, math.inf, -math.inf, 0.0, -0.0, -1.0)
 _EXTREMES += (1e-45, 1e-38, 1e-20, 1e-6, 1e6, 1e12, 1e18, 1e29, -1e29, 1e38)
 _QUIET = settings(
-    deadline=None,
     derandomize=bool(os.environ.get("CI")),
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
