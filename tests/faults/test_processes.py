@@ -109,7 +109,7 @@ for case in json.load(sys.stdin):
             for n, e, target in ((1, "strict", case["out"]), (2, "backslashreplace", case["err"]))
         )
         sys.__stdout__, sys.__stderr__ = sys.stdout, sys.stderr
-        signal.alarm(20)  # a command that hangs
+        signal.alarm(300)  # a command that hangs
         try:
             main([os.fsdecode(word.encode("latin-1")) for word in case["command"]])
         except SystemExit as stop:  # of the parser of arguments; Python's finalisation takes a second with torch

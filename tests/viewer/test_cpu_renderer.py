@@ -109,10 +109,8 @@ def test_without_waiting_the_last_image_is_shown_until_the_new_one_is_finished(r
         return changed
 
     wait_until(render, "image of the new pose")
-    everywhere = [replace(SETTINGS, vertical_fov_degrees=SETTINGS.vertical_fov_degrees)] * 2
     wait_until(
-        lambda: all(renderer.has_faces(each, SIZE, s) for each, s in zip((pose, turned), everywhere, strict=True)),
-        "faces in every direction",
+        lambda: all(renderer.has_faces(each, SIZE, SETTINGS) for each in (pose, turned)), "faces in every direction"
     )
 
 

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import get_args
@@ -83,22 +83,22 @@ class User:
             self.clock[0] += seconds
             self.viewer.frame(self.target, seconds)
 
+    def draw_until(self, condition: Callable[[], object], expected: str, seconds: float = 1 / 30) -> None:
+        """Draw frames until a condition is true; their number does not matter, for threads can be slow."""
+        deadline = time.monotonic() + 60
+        while not condition():
+            assert time.monotonic() < deadline, f"no {expected}"
+            self.draw_frames(1, seconds)
+            time.sleep(0.002)
+
     def wait_for_progress(self, *expected: object) -> None:
         """Draw frames until the panel shows this progress: name, description, fraction."""
-        deadline = time.monotonic() + 20
-        while self.data.loading != expected:
-            assert time.monotonic() < deadline, self.data.loading
-            self.draw_frames(1, 0.01)
-            time.sleep(0.002)
+        self.draw_until(lambda: self.data.loading == expected, f"progress {expected}", 0.01)
 
     def settle(self, *, refining: bool = False) -> None:
         """Draw frames until nothing changes without input; with `refining`, except the progress of a refinement."""
         self.draw_frames(3, SETTLE_AFTER)
-        deadline = time.monotonic() + 20
-        while self.viewer.moving if refining else self.viewer.busy:
-            assert time.monotonic() < deadline, "the viewer does not settle"
-            self.draw_frames(1)
-            time.sleep(0.002)
+        self.draw_until(lambda: not (self.viewer.moving if refining else self.viewer.busy), "settled viewer")
         self.draw_frames(1)
 
     def read_screen(self) -> np.ndarray:
@@ -598,14 +598,14 @@ def test_a_photograph_is_shown_while_the_first_scene_is_predicted(user, pair, sm
 
     def predict(entry, progress, show):
         progress("matching", 0.5)
-        assert go.wait(20)
+        assert go.wait(60)
         return LoadedScene(entry, small_scene)
 
     monkeypatch.setattr(viewer.loader, "_load", predict)
     viewer._loaded, user.state.context = None, np.zeros((0, 4, 4))
     viewer.show([SceneEntry("kitchen", pair=pair)], 0)
-    while viewer.loader.progress != ("kitchen", "matching", 0.5) or not viewer._comparer.photographs._textures:
-        user.draw_frames(1, 0.01)
+    user.wait_for_progress("kitchen", "matching", 0.5)
+    user.draw_until(lambda: viewer._comparer.photographs._textures, "photograph")
     user.draw_frames(1)
     ahead = user.read_screen()
     assert ahead.mean() > 60 and user.data.loading == ("kitchen", "matching", 0.5)
@@ -686,12 +686,12 @@ def test_the_viewer_shows_progress_and_accepts_input_while_loading(user, small_s
     def slow(entry, progress, show):
         progress("searching depth", 0.5)
         reported.set()
-        assert go.wait(20)
+        assert go.wait(60)
         return LoadedScene(entry, small_scene)
 
     monkeypatch.setattr(user.viewer.loader, "_load", slow)
     user.viewer.show([SceneEntry("slow")], 0)
-    assert reported.wait(20)
+    assert reported.wait(60)
     user.draw_frames(2)
     assert user.data.loading == ("slow", "searching depth", 0.5)
     left, top, right, bottom = user.panels.items["Cancel##loading"]
@@ -710,20 +710,18 @@ def test_the_refined_scene_replaces_the_prediction_at_rest_and_keeps_the_camera(
     def load(entry, progress, show):
         show(LoadedScene(entry, small_scene, is_final=False))
         progress("refining", 0.75)
-        assert go.wait(20)
+        assert go.wait(60)
         return LoadedScene(entry, replace(small_scene, gaussians=gaussians))
 
     monkeypatch.setattr(user.viewer.loader, "_load", load)
     user.viewer.show([SceneEntry("kitchen")], 0)
-    while user.viewer.loader.refinement is None:
-        user.draw_frames(1, 0.01)
+    user.draw_until(lambda: user.viewer.loader.refinement is not None, "refinement")
     user.press(imgui.Key.w, frames=2)
     user.settle(refining=True)
     predicted, camera = user.read_screen(), user.state.camera
     assert 0 < user.data.refinement < 1 and "Cancel" in user.panels.items
     go.set()
-    while user.viewer.loader.refinement is not None:
-        user.draw_frames(1, 0.01)
+    user.draw_until(lambda: user.viewer.loader.refinement is None, "refined scene")
     user.settle()
     refined = user.read_image()
     assert user.state.camera == camera and changed_fraction(predicted, refined) > 0.2
@@ -748,11 +746,10 @@ def test_a_cancelled_refinement_keeps_the_prediction(user, small_scene, monkeypa
 
     monkeypatch.setattr(user.viewer.loader, "_load", load)
     user.viewer.show([SceneEntry("kitchen")], 0)
-    while user.viewer.loader.refinement is None:
-        user.draw_frames(1, 0.01)
+    user.draw_until(lambda: user.viewer.loader.refinement is not None, "refinement")
     user.draw_frames(2)
     user.click("Cancel")
-    assert cancelled.wait(20)
+    assert cancelled.wait(60)
     user.settle()
     assert user.data.refinement is None and user.data.error is None
 
@@ -783,8 +780,7 @@ def test_a_search_and_a_prediction_can_be_cancelled(user, monkeypatch):
     user.click("Cancel##loading")
     user.settle()
     assert user.data.loading is None and user.data.error is None
-    while len(ended) < 2:
-        time.sleep(0.005)
+    user.draw_until(lambda: len(ended) == 2, "end of both threads")
     user.state.message = ""
     assert changed_fraction(before, user.read_image()) == 0
 
@@ -820,7 +816,7 @@ def test_a_large_scene_is_converted_while_the_window_accepts_input(user, small_s
 
     def slow(scene, report):
         report(0.25)
-        assert go.wait(20)
+        assert go.wait(60)
         return prepare(scene, report)
 
     monkeypatch.setattr(user.viewer._preparer, "_prepare", slow)
@@ -843,12 +839,13 @@ def test_a_large_scene_is_converted_while_the_window_accepts_input(user, small_s
 def test_the_first_image_of_a_large_scene_is_drawn_in_the_background(user, pair, small_scene, monkeypatch):
     monkeypatch.setattr("pansplat_viewer.slots._LARGE_SCENE", 0)
     before, go, draw = user.read_image(), threading.Event(), CpuRenderer._draw
-    monkeypatch.setattr(CpuRenderer, "_draw", lambda *arguments: go.wait(20) and draw(*arguments))
+    monkeypatch.setattr(CpuRenderer, "_draw", lambda *arguments: go.wait(60) and draw(*arguments))
     other = replace(small_scene, gaussians=small_scene.gaussians.select(small_scene.gaussians.views == 0))
     monkeypatch.setattr(user.viewer.loader, "_load", lambda entry, progress, show: LoadedScene(entry, other))
     user.viewer.show([SceneEntry("large", pair=pair)], 0)
-    while user.viewer._slot.scene is not other or not user.viewer._comparer.photographs._textures:
-        user.draw_frames(1)
+    user.draw_until(
+        lambda: user.viewer._slot.scene is other and user.viewer._comparer.photographs._textures, "photograph"
+    )
     user.draw_frames(1)
     assert user.viewer.pending is not None and user.viewer.busy and user.data.error is None
     photograph = user.read_screen()
@@ -863,13 +860,12 @@ def test_memory_that_ends_while_drawing_is_an_error_and_drawing_goes_on(user, mo
     before = user.read_image()
 
     def fail(*_: object) -> None:
-        time.sleep(0.05)
         raise MemoryError("no memory")
 
     with monkeypatch.context() as patch:
         patch.setattr(CpuRenderer, "_draw", fail)
         user.state.camera = replace(user.state.camera, yaw_radians=0.5)
-        user.draw_frames(10, SETTLE_AFTER)
+        user.draw_until(lambda: user.data.error, "error", SETTLE_AFTER)
         assert "the memory is exhausted" in user.data.error and not user.viewer.moving
     user.state.camera = user.state.home
     user.click("OK")
@@ -997,20 +993,18 @@ def tour_user(user, house, monkeypatch) -> User:
     return user
 
 
-def fly(user: User, frames: int = 400, seconds: float = 1 / 5) -> list[float]:
+def fly(user: User, seconds: float = 1 / 5) -> list[float]:
     """Draw frames until the flight ends; returns the mean change from each frame to the next."""
     user.viewer._resolution.budget_ms = 1e-3  # coarse images save time
-    steps, last = [], user.read_screen()
-    for _ in range(frames):
-        user.draw_frames(1, seconds)
-        image = user.read_screen()
-        steps.append(float(np.abs(image - last).mean()))
-        last = image
-        if not (user.state.playing or user.viewer.moving):
-            return steps
-        if user.viewer._waiting or user.viewer.loader.entry:
-            time.sleep(0.005)
-    raise AssertionError("the flight does not end")
+    steps, shown = [], [user.read_screen()]
+
+    def has_ended() -> bool:
+        shown.append(user.read_screen())
+        steps.append(float(np.abs(shown[1] - shown.pop(0)).mean()))
+        return len(steps) > 1 and not (user.state.playing or user.viewer.moving)
+
+    user.draw_until(has_ended, "end of the flight", seconds)
+    return steps
 
 
 def find_node(user: User) -> int:
@@ -1063,17 +1057,15 @@ def test_a_flight_waits_for_a_scene_that_is_not_loaded(user, house, load_house, 
     def load(entry, progress, show):
         if entry.views and entry.views != (0, 1):
             progress("predicting", 0.5)
-            assert go.wait(20)
+            assert go.wait(60)
         return load_house(entry)
 
     monkeypatch.setattr(user.viewer.loader, "_load", load)
     user.viewer.show([SceneEntry(house.name, tour=house)], 0)
-    while user.viewer._tour is None:
-        user.draw_frames(1)
+    user.draw_until(lambda: user.viewer._tour is not None, "tour")
     user.press(imgui.Key._3)
     user.viewer._resolution.budget_ms = 1e-3
-    while not user.viewer._waiting:
-        user.draw_frames(1, 1 / 8)
+    user.draw_until(lambda: user.viewer._waiting, "flight that waits", 1 / 8)
     user.draw_frames(1, 1)
     assert find_node(user) == 1 and user.state.playing and not user.viewer.moving
     assert user.data.background == ("waiting for: room1-room2", 0.5)
@@ -1088,17 +1080,15 @@ def test_space_plays_the_tour_through_all_panoramas_within_the_memory(tour_user)
     user = tour_user
     user.viewer._tour._budget, user.viewer._resolution.budget_ms = 0, 1e-3
     user.press(imgui.Key.space)
-    visited, most = set(), 0
-    for _ in range(1000):
-        user.draw_frames(1, 1 / 4)
+    visited = set()
+
+    def has_ended() -> bool:
         visited.add(find_node(user))
-        most = max(most, len(user.viewer._tour.loaded))
-        if not user.state.playing:
-            break
-        if user.viewer.loader.entry:
-            time.sleep(0.002)
-    assert visited == {0, 1, 2, 3} and not user.state.playing
-    assert most <= 3, "a scene, that of the camera and the one before"
+        assert len(user.viewer._tour.loaded) <= 3, "a scene, that of the camera and the one before"
+        return not user.state.playing
+
+    user.draw_until(has_ended, "end of the tour", 1 / 4)
+    assert visited == {0, 1, 2, 3}
     before = user.state.camera
     user.press(imgui.Key.w, frames=4)
     user.press(imgui.Key.space)

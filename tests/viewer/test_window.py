@@ -48,7 +48,7 @@ class Display:
     def run_xdotool(self, *command: str) -> str:
         """Run xdotool on this display and return its output."""
         environment = {**os.environ, "DISPLAY": self.name}
-        result = subprocess.run(["xdotool", *command], env=environment, capture_output=True, text=True, timeout=20)
+        result = subprocess.run(["xdotool", *command], env=environment, capture_output=True, text=True, timeout=120)
         return result.stdout.strip()
 
     def close(self) -> None:
@@ -91,19 +91,18 @@ def running(display: Display, room: Path, *options: str) -> Iterator[subprocess.
 def test_mouse_and_keys_move_the_camera_and_escape_closes_the_window(display, room, wait_until):
     with running(display, room, "--size", "640x480") as viewer:
         find = ("search", "--name", f"^{TITLE}$")
-        window = wait_until(lambda: display.run_xdotool(*find), "window", 60).split()[0]
+        window = wait_until(lambda: display.run_xdotool(*find), "window").split()[0]
         display.run_xdotool("windowmove", window, "0", "0")
         display.run_xdotool("windowfocus", window)
         image = (slice(10, 370), slice(320, 630))
-        wait_until(lambda: (display.screen()[image].max(-1) > 60).mean() > 0.3, "scene", 60)
+        wait_until(lambda: (display.screen()[image].max(-1) > 60).mean() > 0.3, "scene")
         time.sleep(1.0)
 
         before = display.screen()[image]
         display.run_xdotool("mousemove", "450", "200", "mousedown", "1")
         display.run_xdotool("mousemove", "380", "200")
-        time.sleep(0.3)
-        display.run_xdotool("mouseup", "1")
         wait_until(lambda: np.abs(display.screen()[image] - before).mean() > 5, "rotation of the view")
+        display.run_xdotool("mouseup", "1")
 
         panel = (slice(20, 300), slice(20, 280))
         with_panel = display.screen()[panel]
@@ -121,14 +120,14 @@ def test_mouse_and_keys_move_the_camera_and_escape_closes_the_window(display, ro
         wait_until(lambda: (display.screen()[outside].max(-1) > 60).mean() > 0.2, "larger image")
 
         display.run_xdotool("key", "Escape")
-        output, errors = viewer.communicate(timeout=30)
+        output, errors = viewer.communicate(timeout=120)
         assert viewer.returncode == 0, errors
         assert errors == "" and output == ""
 
 
 def test_an_interrupt_ends_with_status_130(display, room, wait_until):
     with running(display, room, "--size", "320x240") as viewer:
-        wait_until(lambda: display.run_xdotool("search", "--name", f"^{TITLE}$"), "window", 60)
+        wait_until(lambda: display.run_xdotool("search", "--name", f"^{TITLE}$"), "window")
         viewer.send_signal(signal.SIGINT)
-        _, errors = viewer.communicate(timeout=30)
+        _, errors = viewer.communicate(timeout=120)
         assert viewer.returncode == 130 and "Traceback" not in errors

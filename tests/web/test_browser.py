@@ -83,7 +83,7 @@ class OpenPage:
 
     def wait(self, condition: str) -> None:
         """Wait until an expression is true; the page's policy forbids playwright's own function."""
-        end = time.monotonic() + 20
+        end = time.monotonic() + 60
         while not self.run(condition):
             assert time.monotonic() < end, condition
             self.page.wait_for_timeout(10)
@@ -95,10 +95,13 @@ class OpenPage:
 
 
 @contextmanager
-def opened(chromium: Any, path: Path, *, size: tuple[int, int] = SIZE, **options: Any) -> Iterator[OpenPage]:
-    """The loaded page in a context of its own."""
+def opened(
+    chromium: Any, path: Path, *, size: tuple[int, int] = SIZE, script: str = "", **options: Any
+) -> Iterator[OpenPage]:
+    """The loaded page in a context of its own; `script` runs before those of the page."""
     context = chromium.new_context(viewport={"width": size[0], "height": size[1]}, **options)
     page = OpenPage(context.new_page())
+    page.page.add_init_script(script)
     page.load(path)
     yield page
     context.close()
@@ -265,20 +268,22 @@ def test_two_fingers_walk_and_one_turns(chromium: Any, folder: Path) -> None:
 
 def test_a_lost_context_is_restored(home: OpenPage) -> None:
     before = home.draw()
-    home.run("lost = document.getElementById('view').getContext('webgl2').getExtension('WEBGL_lose_context')")
-    home.run("lost.loseContext()")
-    home.wait("document.getElementById('view').getContext('webgl2').isContextLost()")
-    home.run("new Promise((resolve) => setTimeout(resolve, 50))")
-    home.run("lost.restoreContext()")
-    home.wait("!document.getElementById('view').getContext('webgl2').isContextLost()")
-    home.run("new Promise((resolve) => setTimeout(resolve, 50))")
+    home.run("""async () => {
+        const view = document.getElementById("view");
+        const lost = view.getContext("webgl2").getExtension("WEBGL_lose_context");
+        const event = (name) => new Promise((resolve) => view.addEventListener(name, resolve, { once: true }));
+        const isLost = event("webglcontextlost"), isRestored = event("webglcontextrestored");
+        lost.loseContext();
+        await isLost;
+        await new Promise((resolve) => setTimeout(resolve));  // after all listeners: then it can be restored
+        lost.restoreContext();
+        await isRestored;
+    }""")
     assert psnr(home.draw(), before) > 60
 
 
 def test_a_context_that_is_lost_while_the_page_loads_is_restored(chromium: Any, folder: Path) -> None:
-    context = chromium.new_context(viewport={"width": SIZE[0], "height": SIZE[1]})
-    page = OpenPage(context.new_page())
-    page.page.add_init_script("""
+    script = """
         const getContext = HTMLCanvasElement.prototype.getContext;
         HTMLCanvasElement.prototype.getContext = function (...args) {
             const gl = getContext.apply(this, args), lost = gl && !window.lost && gl.getExtension("WEBGL_lose_context");
@@ -289,24 +294,18 @@ def test_a_context_that_is_lost_while_the_page_loads_is_restored(chromium: Any, 
             }
             return gl;
         };
-    """)
-    page.load(folder / "tour.html")
-    assert page.draw().std() > 0.05
-    context.close()
+    """
+    with opened(chromium, folder / "tour.html", script=script) as page:
+        assert page.draw().std() > 0.05
 
 
 def test_a_sorter_that_ends_is_reported_and_rejects_pictures(chromium: Any, folder: Path) -> None:
-    context = chromium.new_context(viewport={"width": SIZE[0], "height": SIZE[1]})
-    page = OpenPage(context.new_page())
-    page.page.add_init_script(
-        "window.Worker = class extends Worker { constructor(url) { super(url); window.sorter = this; } }"
-    )
-    page.load(folder / "tour.html")
-    page.run("sorter.terminate(); sorter.dispatchEvent(new ErrorEvent('error', {message: 'no memory'}))")
-    page.page.wait_for_selector("#cover.failed img")
-    assert "no memory" in page.page.inner_text("#message")
-    assert "no memory" in page.run("pansplat.camera.position[0] += 0.1; pansplat.render(64, 48).catch(String)")
-    context.close()
+    script = "window.Worker = class extends Worker { constructor(url) { super(url); window.sorter = this; } }"
+    with opened(chromium, folder / "tour.html", script=script) as page:
+        page.run("sorter.terminate(); sorter.dispatchEvent(new ErrorEvent('error', {message: 'no memory'}))")
+        page.page.wait_for_selector("#cover.failed img")
+        assert "no memory" in page.page.inner_text("#message")
+        assert "no memory" in page.run("pansplat.camera.position[0] += 0.1; pansplat.render(64, 48).catch(String)")
 
 
 def test_without_webgl_the_page_says_so_over_its_poster(chromium: Any, folder: Path) -> None:
