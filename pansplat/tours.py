@@ -57,6 +57,7 @@ _SAMPLES_PER_SECOND = 60
 
 _AZIMUTHS = 180  # of a floor outline
 PLAN_SIZE = 1024  # of the longer side of a floor plan as a file, pixels
+_PLAN_MARGIN = 0.5  # around the panoramas and outlines of a floor plan, metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -676,19 +677,16 @@ class FloorPlan:
         return (places - self.origin) * (self.pixels_per_metre, -self.pixels_per_metre)
 
 
-def draw_floor_plan(
-    tour: TourGraph, outlines: Sequence[FloorOutline], *, size: int = 256, margin: float = 0.5
-) -> FloorPlan:
+def draw_floor_plan(tour: TourGraph, outlines: Sequence[FloorOutline], *, size: int = 256) -> FloorPlan:
     """The floors that the outlines enclose, with walls where they end.
 
     Args:
         tour: all its panoramas fit into the image.
         outlines: of any of the panoramas.
         size: longer side of the image, pixels.
-        margin: around the panoramas and outlines, metres.
     """
     places = np.concatenate([tour.positions @ tour.level_axes[:, (0, 2)], *(outline.corners for outline in outlines)])
-    low, high = places.min(axis=0) - margin, places.max(axis=0) + margin
+    low, high = places.min(axis=0) - _PLAN_MARGIN, places.max(axis=0) + _PLAN_MARGIN
     scale = size / float((high - low).max())
     width, height = np.maximum(np.ceil((high - low) * scale).astype(int), 1)
     plan = FloorPlan(np.zeros((height, width, 4), np.uint8), np.array((low[0], high[1])), scale)
@@ -729,15 +727,15 @@ def write_floor_plan(scene: Scene, path: str | Path) -> None:
 
 
 def paint_floor_plan(
-    tour: TourGraph, outlines: Sequence[FloorOutline], *, size: int = PLAN_SIZE, route: Route | None = None
+    tour: TourGraph, outlines: Sequence[FloorOutline], *, route: Route | None = None
 ) -> UInt8[np.ndarray, "height width 3"]:
     """The floor plan over dark grey with the names of the panoramas, the edges between them, and a route.
 
     Args:
-        tour, outlines, size: see `draw_floor_plan`.
+        tour, outlines: see `draw_floor_plan`.
         route: drawn instead of the edges.
     """
-    plan = draw_floor_plan(tour, outlines, size=size)
+    plan = draw_floor_plan(tour, outlines, size=PLAN_SIZE)
     alpha = plan.image[..., 3:] / 255.0
     image = np.ascontiguousarray((plan.image[..., :3] * alpha + 24 * (1 - alpha)).astype(np.uint8))
     axes = tour.level_axes[:, (0, 2)]

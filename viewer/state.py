@@ -93,9 +93,9 @@ class ViewerState:
         """The settings of the next frame, with the camera's field of view."""
         return replace(self.settings, vertical_fov_degrees=self.camera.vertical_fov_degrees)
 
-    def show_message(self, message: str, now: float, seconds: float = 4.0) -> None:
-        """Show a message for some seconds."""
-        self.message, self.message_until = message, now + seconds
+    def show_message(self, message: str, now: float) -> None:
+        """Show a message for four seconds."""
+        self.message, self.message_until = message, now + 4
 
 
 def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:

@@ -33,7 +33,6 @@ class TourScenes:
         tour: the graph.
         edge: the edge that the camera is at.
         outlines: floor outlines of the panoramas whose scenes have been loaded, also after a scene is dropped.
-        refines: whether predictions that are not refined are requested again.
     """
 
     def __init__(
@@ -41,7 +40,6 @@ class TourScenes:
         tour: TourGraph,
         *,
         memory: float = DEFAULT_MEMORY,
-        refines: bool = True,
         merged: Scene | None = None,
     ) -> None:
         """Start without scenes.
@@ -49,13 +47,11 @@ class TourScenes:
         Args:
             tour: the graph.
             memory: limit of the loaded scenes, GiB; two scenes are kept in any case.
-            refines: see above.
             merged: the scene of all panoramas that the scenes of the edges are parts of; None to predict them.
         """
         self.tour, self._merged = tour, merged
         self.edge: Edge = next(iter(tour.overlaps))
         self.outlines: dict[int, FloorOutline] = {}
-        self.refines = refines
         self._views = tour.choose_scene_views()
         self._budget = memory * 2**30
         self._loaded: OrderedDict[Views, LoadedScene] = OrderedDict()
@@ -135,11 +131,7 @@ class TourScenes:
                 return None
         if missing:
             return self.make_entry(missing[0])
-        if self.refines:
-            for views in wanted:
-                if not self._loaded[views].is_final:
-                    return self.make_entry(views)
-        return None
+        return next((self.make_entry(views) for views in wanted if not self._loaded[views].is_final), None)
 
     def find_limit(self, route: Route, fraction: float) -> float:
         """The fraction up to which a route can be flown with the scenes in memory."""

@@ -55,9 +55,9 @@ def make_room_cameras(views: int = 2) -> Float[Tensor, "view 4 4"]:
     return poses
 
 
-def lattice_room_size(height: int, views: int = 2) -> int:
-    """Number of Gaussians of `full_lattice_room`."""
-    return views * sum(lattice_size(2 * height >> level) for level in range(NUM_LEVELS))
+def lattice_room_size(height: int) -> int:
+    """Number of Gaussians of `full_lattice_room` with two views."""
+    return 2 * sum(lattice_size(2 * height >> level) for level in range(NUM_LEVELS))
 
 
 def full_lattice_room(height: int, *, views: int = 2, degree: int = 0, seed: int = 0) -> Gaussians:
@@ -182,7 +182,7 @@ def _make_harmonics(
     return harmonics
 
 
-def lift_depth(views: Views, *, seed: int = 0) -> Scene:
+def lift_depth(views: Views) -> Scene:
     """A scene of discs on the surfaces of the views' depth maps, one for each lattice point.
 
     Sizes and opacities are as in `full_lattice_room`, colours are those of the images. Unknown depth is replaced by
@@ -190,7 +190,6 @@ def lift_depth(views: Views, *, seed: int = 0) -> Scene:
 
     Args:
         views: with depths; the height is a multiple of 8.
-        seed: of sizes and opacities.
 
     Returns:
         A scene of float32 Gaussians, 886,580 of two views at a height of 512.
@@ -203,7 +202,7 @@ def lift_depth(views: Views, *, seed: int = 0) -> Scene:
             "a scene from depth needs a depth map for each panorama, got none; choose --scene-from prediction"
         )
     height = views.images.shape[-2]
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)  # of sizes and opacities
     depths = [torch.where(known > 0, known, known[known > 0].median()) for known in views.depths.double()]
     parts = [
         _lift_level(views.images[view], depth, views.cam2world[view], level, view, generator)

@@ -119,11 +119,10 @@ class Gaussians:
         return Gaussians(*(torch.cat([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Gaussians)))
 
 
-def empty_gaussians(degree: int = 0) -> Gaussians:
-    """An empty set of Gaussians with harmonics of a degree."""
+def empty_gaussians() -> Gaussians:
+    """An empty set of Gaussians with harmonics of degree 0."""
     vectors, labels = torch.zeros(0, 3), torch.zeros(0, dtype=torch.uint8)
-    harmonics = torch.zeros(0, (degree + 1) ** 2, 3)
-    return Gaussians(vectors, vectors, torch.zeros(0, 4), torch.zeros(0), harmonics, labels, labels)
+    return Gaussians(vectors, vectors, torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, 1, 3), labels, labels)
 
 
 @dataclass(frozen=True, eq=False)

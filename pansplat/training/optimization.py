@@ -9,9 +9,10 @@ from torch import Tensor, nn
 
 _START_DIVISOR = 25.0  # peak rate over first rate
 _END_DIVISOR = 1e4  # first rate over last rate
+_RISE = 0.01  # fraction of the steps in which the rate rises
 
 
-def one_cycle_rate(step: int, total: int, peak: float, *, rise: float = 0.01) -> float:
+def one_cycle_rate(step: int, total: int, peak: float) -> float:
     """Learning rate of a step: from peak / 25 up to the peak and down to peak / 250,000, along two cosines.
 
     Source: docs/official.md, section 11; Smith and Topin, https://arxiv.org/abs/1708.07120 (one cycle).
@@ -19,10 +20,9 @@ def one_cycle_rate(step: int, total: int, peak: float, *, rise: float = 0.01) ->
     Args:
         step: counted from 0; later steps than the last have the last rate.
         total: number of steps of the cycle; the official code uses ten more than it trains.
-        rise: fraction of the steps in which the rate rises.
     """
     start, last = peak / _START_DIVISOR, total - 1
-    top = rise * total - 1
+    top = _RISE * total - 1
     if step < top:
         return _cosine(start, peak, step / top)
     return _cosine(peak, start / _END_DIVISOR, min(1.0, (step - max(top, 0.0)) / max(1e-9, last - max(top, 0.0))))

@@ -175,9 +175,9 @@ class SceneBuilder:
         """Add an upright cylinder."""
         self._add_body(CYLINDER, centre, (radius, half_height, radius), material, 0, pitch)
 
-    def add_glass(self, centre: Vector, half: Vector, yaw: float = 0) -> None:
+    def add_glass(self, centre: Vector, half: Vector) -> None:
         """Add a pane of clear glass, which neither depth nor shadows show."""
-        self._add_body(GLASS, centre, half, 0, yaw, 0)
+        self._add_body(GLASS, centre, half, 0, 0, 0)
 
     def add_light(self, position: Vector, color: Vector, size: float, *, sun: bool = False, group: int = -1) -> None:
         """Add a lamp at a position, or a sun in a direction; it lights the rooms of a light group, or all if -1."""
