@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 
 import numpy as np
 import torch
@@ -28,7 +29,8 @@ MAX_OTHERS = 3  # cameras of other views that a view is rasterised at
 _MAX_OPACITY = 0.99
 _DIRECTION_BITS = 15  # of half a component of a direction, in the cells of a Z-order curve
 _SEARCHED = 8  # Gaussians before and after a Gaussian along the curve
-_BASE_COST = 0.002  # cost of a merger between equal Gaussians, as a difference of colours
+_BASE_COST = 0.008  # cost of a merger between equal Gaussians, as a difference of colours
+_MERGED = 0.5  # part of the pairs of a round that is merged; in the next round the others have better neighbours
 
 
 def measure_contributions(scene: Scene, size: tuple[int, int]) -> Float[Tensor, "n"]:
@@ -67,8 +69,8 @@ def drop_unseen(scene: Scene, size: tuple[int, int], error: float = DROP_ERROR) 
 def merge_to(scene: Scene, size: tuple[int, int], count: int) -> Scene:
     """Merge pairs of similar neighbours until at most `count` Gaussians remain.
 
-    Pairs are of one view and level. The pairs that change the images least are merged first. If no pairs are left, the
-    Gaussians of least contribution are dropped.
+    Pairs are of one view and level. In each round, the pairs that change the images least are merged. If no pairs are
+    left, the Gaussians of least contribution are dropped.
 
     Args:
         size: height and width of the images that the contributions are measured in, pixels.
@@ -84,7 +86,8 @@ def merge_to(scene: Scene, size: tuple[int, int], count: int) -> Scene:
             best = contributions.argsort(descending=True, stable=True)[:count]
             parts = parts.select(best)
             break
-        chosen = _merge_cost(parts.gaussians, contributions, first, second).argsort(stable=True)[:surplus]
+        cost = _merge_cost(parts.gaussians, contributions, first, second)
+        chosen = cost.argsort(stable=True)[: min(surplus, math.ceil(_MERGED * len(cost)))]
         first, second = first[chosen], second[chosen]
         is_kept = torch.ones_like(contributions, dtype=torch.bool)
         is_kept[first] = is_kept[second] = False

@@ -77,3 +77,13 @@ def test_merging_equal_neighbours_changes_the_image_less_than_dropping_them(room
         float((image(g) - truth).abs().mean()) for g in (merged, scene.gaussians.select(best.sort().values))
     )
     assert merge_error < 0.5 * drop_error
+
+
+def test_uniform_surfaces_are_merged_again_before_detail_is_merged(room) -> None:
+    scene = room.truth
+    is_left = scene.gaussians.means[:, 0] < 0
+    colors = torch.rand(len(is_left), 1, 3, generator=torch.Generator().manual_seed(0)) * is_left[:, None, None]
+    scene = dataclasses.replace(scene, gaussians=dataclasses.replace(scene.gaussians, harmonics=colors))
+    detail = int(is_left.sum())
+    merged = merge_to(scene, SIZE, round(0.65 * len(is_left))).gaussians
+    assert int((merged.means[:, 0] < 0).sum()) > 0.85 * detail
