@@ -138,16 +138,13 @@ class UnposedPanoramasError(InputError):
 
 def _nothing_found(root: Path) -> InputError:
     images = list_panorama_files(root)
-    if images:
-        names = ", ".join(path.name for path in images[:3]) + (" ..." if len(images) > 3 else "")
-        message = (
-            f"{root}: needed poses for the panoramas, got images only ({names}); add a poses.json "
-            "or another pose file, see docs/input.md."
-        )
-        return UnposedPanoramasError(message, images) if len(images) >= 2 else InputError(message)
+    names = ", ".join(path.name for path in images[:3]) + (" ..." if len(images) > 3 else "")
+    if len(images) >= 2:
+        message = f"{root}: needed poses for the panoramas, got images only ({names}); add a pose file (docs/input.md)."
+        return UnposedPanoramasError(message, images)
     return InputError(
-        f"{root}: needed two or more panoramas with poses (poses.json, camera_pose.json, rot.txt and "
-        "tran.txt, *.kitti or *.tum), got none of these files there or in its subfolders; see docs/input.md."
+        f"{root}: needed two or more panoramas (JPG, PNG, WebP or EXR), got {names or 'none'}; give the folder that "
+        "holds them, or a folder whose subfolders have pose files (docs/input.md)."
     )
 
 
