@@ -15,6 +15,7 @@ from pansplat.errors import InputError
 from pansplat.poses.axes import NO_PRIOR
 from pansplat.poses.features import Features, detect_features, match_features
 from pansplat.poses.two_view import estimate_relative_pose
+from pansplat.predictor import Progress
 
 _CANDIDATES_PER_FRAME = 4  # frames that are decoded for each key frame; the sharpest of them is used
 _SMALL, _FEATURES, _MATCHES = 512, 2000, 300  # to measure parallax: height of the frames, pixels; the best of each
