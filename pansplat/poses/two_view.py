@@ -42,7 +42,7 @@ _MAX_ANGLE = 4.0  # largest residual of a right match, in the wide standard devi
 _DISTORTION, _DISTORTION_LENGTH = 1e-3, 0.15  # of stitched panoramas: deviation and correlation length, radians
 _TAIL = 2.0  # degrees of freedom of the distribution of a match's own error
 _MAX_POLISHED, _MIN_POLISHED, _MIN_PROBABILITY = 1000, 8, 0.2  # matches of the polish; probability of each to be right
-_POLISH_NOISE, _POLISH_SIZE = 0.7, 7.0  # noise of a small feature in that of the search; size of one with 1.4 times it
+_POLISH_SIZE = 7.0  # pixels; of a feature with 1.4 times the noise of a small one
 _POLISH_WINDOW = 0.035  # largest residual, radians; what lies beyond the noise gives the density of wrong matches
 _POLISH_FACTORS, _POLISH_STEPS = (4, 2, 1), 4  # of the noise; steps with each
 _POLISH_RATIOS = (0.6, 0.7, 0.8, 0.85, 0.9, 0.95)  # limits of the groups of matches
@@ -550,7 +550,7 @@ def polish_relative_pose(
     near = np.abs(epipolar_angles(*every, rotation, translation)) < 2 * _POLISH_WINDOW
     a, b, indices = every[0][near], every[1][near], matches.indices[near]
     sizes = np.maximum(first.sizes[indices[:, 0]], second.sizes[indices[:, 1]])
-    noise = _POLISH_NOISE * noise_of(first, second) * np.hypot(1, sizes / _POLISH_SIZE)
+    noise = noise_of(first, second) * np.hypot(1, sizes / _POLISH_SIZE)
     weigh = _LocalWeights(a, b, np.searchsorted(_POLISH_RATIOS, matches.ratio[near], side="right"), noise)
     for factor in _POLISH_FACTORS:
         for _ in range(_POLISH_STEPS):
