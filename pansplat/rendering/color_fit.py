@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional
 
-from pansplat.gaussians.harmonics import SH_0
+from pansplat.gaussians.harmonics import SH_0, harmonics_basis
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.weights import compute_blending_weights
 
@@ -46,7 +47,9 @@ def fit_colors(
     masks: Bool[Tensor, "view height width"],
     config: ColorFitConfig,
 ) -> Gaussians:
-    """The Gaussians with the colours that fit each view's image to its photograph; harmonics of degree 0.
+    """The Gaussians with the colours that fit each view's image to its photograph.
+
+    The harmonics of degree 0 change; those of higher degree stay, and count with the direction from the photograph.
 
     Args:
         images: photographs of all views, RGB in [0, 1].
@@ -57,19 +60,27 @@ def fit_colors(
     for view, (image, pose, mask) in enumerate(zip(images, cam2world, masks, strict=True)):
         chosen = gaussians.views == view
         if chosen.any():
-            harmonics[chosen] = _fit_view(gaussians.select(chosen), image, pose, mask, config)
+            harmonics[chosen, 0] = _fit_view(gaussians.select(chosen), image, pose, mask, config)
     return dataclasses.replace(gaussians, harmonics=harmonics)
 
 
 @torch.no_grad()
 def _fit_view(gaussians: Gaussians, image: Tensor, pose: Tensor, mask: Tensor, config: ColorFitConfig) -> Tensor:
-    """The harmonics (n, 1, 3) of a view's Gaussians."""
+    """The harmonics of degree 0 (n, 3) of a view's Gaussians."""
     size = (mask.shape[0], mask.shape[1])
-    colors = (0.5 + SH_0 * gaussians.harmonics[:, 0]).clamp_min(0)
+    further = _directional_colors(gaussians, pose) if gaussians.degree else 0.0
+    colors = (0.5 + SH_0 * gaussians.harmonics[:, 0] + further).clamp_min(0)
     image, mask = image.to(colors), mask.to(colors)
     weights = compute_blending_weights(gaussians, pose, size)
     coverage = weights.accumulate(mask[None]).clamp_min(_MIN_COVERAGE)
     for _ in range(config.steps_at(size[0])):
         error = (image - weights.blend(colors)) * mask
         colors = (colors + config.relaxation * weights.accumulate(error) / coverage).clamp_min(0)
-    return ((colors - 0.5) / SH_0)[:, None]
+    return (colors - 0.5 - further) / SH_0
+
+
+def _directional_colors(gaussians: Gaussians, pose: Tensor) -> Tensor:
+    """The colours (n, 3) by the harmonics of higher degree, as the camera sees them."""
+    directions = functional.normalize(gaussians.means - pose[:3, 3].to(gaussians.means), dim=1)
+    basis = harmonics_basis(directions, gaussians.degree)[:, 1:]
+    return (basis[:, None] @ gaussians.harmonics[:, 1:])[:, 0]

@@ -65,6 +65,16 @@ def test_true_colours_stay(truth, photographs):
     assert torch.allclose(_fit(truth, photographs).harmonics, truth.harmonics, atol=1e-4)
 
 
+def test_harmonics_of_higher_degree_stay_and_count(truth, photographs):
+    further = 0.3 * torch.rand(len(truth), 3, 3, generator=torch.Generator().manual_seed(1)) - 0.15
+    start = dataclasses.replace(truth, harmonics=torch.cat((truth.harmonics, further), dim=1))
+    fitted = _fit(start, photographs, steps=16)
+    assert torch.equal(fitted.harmonics[:, 1:], further)
+    for view in (0, 1):
+        before, after = (float((_draw(g, view) - photographs[view]).abs().mean()) for g in (start, fitted))
+        assert after < 0.1 * before
+
+
 def test_masked_pixels_do_not_change_colours(truth, photographs):
     masks = torch.ones(2, *SIZE, dtype=torch.bool)
     masks[:, :, : SIZE[1] // 2] = False  # the west
