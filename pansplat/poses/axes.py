@@ -27,6 +27,7 @@ _FIRST_TOLERANCE = math.radians(3)
 _SEARCH_TOLERANCE = math.radians(1.5)
 _LARGEST_TILT = math.radians(20)  # of the camera
 _MIN_SUPPORT, _MIN_CONTRAST = 12, 2.5  # segments of an axis, also relative to the number by chance
+_PARALLEL = 0.9  # cosine between axes that do not give a third one
 _LONG = math.radians(10)  # segments whose scatter measures the noise of the axes: pixels hardly matter
 _LEAST_NOISE, _LARGEST_NOISE = math.radians(0.03), math.radians(0.26)  # of the normals of long segments
 _TILT_NOISE, _YAW_NOISE = 0.8, 1.35  # of the relative rotation about horizontal axes and gravity, in this noise
@@ -140,7 +141,8 @@ def with_hints(axes: SceneAxes, down: Float[Array, "3"] | None, heading: float |
     """The axes with gravity and compass by the metadata, where the picture does not determine gravity itself."""
     if axes.has_down or down is None:
         return replace(axes, heading=heading)
-    wall = np.cross(down, axes.axes[2])
+    level = axes.axes[2] if abs(down @ axes.axes[2]) < _PARALLEL else axes.axes[0]
+    wall = np.cross(down, level)
     wall /= np.linalg.norm(wall)
     return SceneAxes(np.stack((down, wall, np.cross(down, wall))), True, False, heading=heading)
 

@@ -179,7 +179,7 @@ def match_features(first: Features, second: Features) -> Matches:
         values, index = similarity.topk(2, dim=1)
         rows.append(values.T)
         nearest.append(index[:, 0])
-        values, index = similarity.topk(2, dim=0)
+        values, index = similarity.topk(min(2, len(similarity)), dim=0)  # the last chunk can have one row
         row_of = torch.where(values[0] > columns[0], index[0] + start, row_of)
         columns = torch.cat((columns, values)).topk(2, dim=0).values
     index = torch.cat(nearest)

@@ -47,6 +47,17 @@ def test_matches_of_equal_places_count_once() -> None:
     assert len(matches) == 20 and (np.diff(matches.ratio) >= 0).all()
 
 
+def test_any_number_of_features_is_matched(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pansplat.poses.features._CHUNK", 8)
+    rng = np.random.default_rng(0)
+    for count in range(2, 19):  # of which 9 and 17 leave one row to the last chunk
+        bearings, descriptors = rng.normal(size=(count, 3)), rng.uniform(size=(count, 128)).astype(np.float32)
+        bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+        descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+        features = Features(bearings, descriptors, np.ones(count), 0.01)
+        assert sorted(map(tuple, match_features(features, features).indices)) == [(k, k) for k in range(count)]
+
+
 def test_matches_do_not_depend_on_the_order_of_the_panoramas(picture: Array) -> None:
     first, second = detect_features(picture), detect_features(np.roll(picture, 40, axis=1))
     there, back = match_features(first, second), match_features(second, first)

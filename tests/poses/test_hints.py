@@ -1,5 +1,6 @@
 """Metadata of panoramas: gravity, compass, and pictures that are not whole panoramas."""
 
+import itertools
 import math
 from pathlib import Path
 
@@ -57,8 +58,8 @@ def test_cropped_panoramas_and_other_projections_are_named(tmp_path: Path) -> No
 
 
 def test_gravity_of_the_picture_comes_before_that_of_the_metadata() -> None:
-    down = np.array((math.sin(0.1), math.cos(0.1), 0))
-    for has_down in (True, False):
+    tilted, rolled = np.array((math.sin(0.1), math.cos(0.1), 0)), np.array((1.0, 0, 0))
+    for has_down, down in itertools.product((True, False), (tilted, rolled, -rolled)):
         axes = with_hints(SceneAxes(np.array(((0.0, 1, 0), (0, 0, 1), (1, 0, 0))), has_down, False), down, None)
         assert axes.has_down and np.allclose(axes.axes[0], (0, 1, 0) if has_down else down)
         assert np.allclose(axes.axes @ axes.axes.T, np.eye(3)) and np.linalg.det(axes.axes) > 0
