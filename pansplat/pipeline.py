@@ -216,6 +216,7 @@ def predict(
     """
     if not 0 <= refine_seconds < math.inf:
         raise InputError(f"`refine_seconds` must be at least 0, got {refine_seconds}")
+    config = RefineConfig(gaussians=gaussians)
     predictor = load_model(model, compat=compat, precision=precision) if isinstance(model, (str, Path)) else model
     pair = _load_only_pair(source) if isinstance(source, (str, Path)) else source
     height = pair.images.shape[-2] if isinstance(pair, Views) else height or choose_height(pair, predictor)
@@ -224,7 +225,7 @@ def predict(
     report: Progress = progress or (lambda what, fraction: None)
     if not refine_seconds:
         return _predict_views(cached_pair, views, predictor, height, report)
-    refinement = f"{refinement_fingerprint()}-{refine_seconds:g}s" + (f"-{gaussians}" if gaussians else "")
+    refinement = f"{refinement_fingerprint(config)}-{refine_seconds:g}s"
     cached = None if cached_pair is None else CachedPrediction(cached_pair, views, predictor, height, refinement)
     refined = _read_cached(cached, views, predictor)
     if refined is not None and on_predicted is None:
@@ -235,7 +236,6 @@ def predict(
         on_predicted(scene)
     if refined is not None:
         return refined
-    config = RefineConfig(gaussians=gaussians)
     scene = refine(
         scene, views, seconds=refine_seconds, config=config, progress=lambda what, done: report(what, 0.5 + 0.5 * done)
     )

@@ -1,5 +1,6 @@
 """The prediction cache: invalidation, damaged files, folders."""
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -162,3 +163,20 @@ def test_an_interrupted_refinement_is_not_cached(pair_folder: Path, sphere_predi
 def test_an_invalid_time_limit_of_the_refinement_is_refused(pair_folder: Path, sphere_predictor, seconds) -> None:
     with pytest.raises(InputError, match="`refine_seconds` must be at least 0"):
         predict(pair_folder, sphere_predictor(), height=HEIGHT, refine_seconds=seconds)
+
+
+def test_an_invalid_limit_of_gaussians_is_refused_before_the_prediction(pair_folder: Path, sphere_predictor) -> None:
+    predictor = sphere_predictor()
+    with pytest.raises(InputError, match="`gaussians` must be at least 1"):
+        predict(pair_folder, predictor, height=HEIGHT, refine_seconds=3.0, gaussians=0)
+    assert predictor.calls == 0
+
+
+@pytest.mark.parametrize("names", [("客厅", "卧室"), ("a" * 60 + "b", "a" * 60 + "c"), ("a b", "a_b")])
+def test_pairs_of_similar_names_share_a_cache_folder(pair_folder: Path, sphere_predictor, names) -> None:
+    predictor = sphere_predictor()
+    (pair,) = load_pairs(pair_folder)
+    first, second = (dataclasses.replace(pair, name=name, far=pair.far + k) for k, name in enumerate(names))
+    for given in (first, second, first):
+        predict(given, predictor, height=HEIGHT)
+    assert predictor.calls == 2

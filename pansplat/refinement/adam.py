@@ -34,6 +34,13 @@ class ParameterGroup:
         for parameter in self.parameters:
             parameter.grad = None
 
+    @torch.no_grad()
+    def clean_gradients(self) -> None:
+        """Replace gradients that are not finite by 0."""
+        for parameter in self.parameters:
+            if parameter.grad is not None:
+                torch.nan_to_num_(parameter.grad, nan=0.0, posinf=0.0, neginf=0.0)
+
     def replace(self, parameters: Sequence[Tensor]) -> None:
         """Continue with other parameters, whose averages begin at 0."""
         self.parameters = parameters

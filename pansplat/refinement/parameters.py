@@ -109,13 +109,6 @@ class ViewParameters:
         self.tensors["scale"][halves, axis] += math.log(_SPLIT_SCALE)
 
     @torch.no_grad()
-    def clean_gradients(self) -> None:
-        """Replace gradients that are not finite by 0."""
-        for tensor in self.tensors.values():
-            if tensor.grad is not None:
-                torch.nan_to_num_(tensor.grad, nan=0.0, posinf=0.0, neginf=0.0)
-
-    @torch.no_grad()
     def clamp(self) -> None:
         """Keep the tensors in their ranges."""
         self.tensors["distance"].clamp_(-_MAX_LOG_DISTANCE, _MAX_LOG_DISTANCE)

@@ -196,10 +196,9 @@ class Refinement:
             loss.backward()
         if config.poses:
             (config.pose_hold * self._cameras.twists.square().sum()).backward()
-        for parameters in self._views.values():
-            parameters.clean_gradients()
         pixels = self._images[0, 0].numel() / math.prod(self._size)
         for group in self._groups:
+            group.clean_gradients()
             if not self._steps:
                 group.set_damping(config.damping * pixels)
             group.step(_cosine_fall(fraction), config.betas)
@@ -422,7 +421,8 @@ def _cosine_fall(fraction: float) -> float:
 def refinement_fingerprint(config: RefineConfig | None = None) -> str:
     """Hash of the settings and of the source code of the refinement; part of the key of cached scenes."""
     digest = hashlib.blake2b(repr(config or RefineConfig()).encode(), digest_size=8)
-    for source in sorted(files("pansplat.refinement").iterdir(), key=lambda source: source.name):
+    sources = sorted(files("pansplat.refinement").iterdir(), key=lambda source: source.name)
+    for source in (*sources, files("pansplat.rendering") / "color_fit.py"):
         if source.name.endswith(".py"):
             digest.update(source.read_bytes())
     return digest.hexdigest()

@@ -1,5 +1,6 @@
 """Adam of a refinement."""
 
+import math
 import subprocess
 import sys
 
@@ -42,6 +43,16 @@ def test_damping_is_relative_to_the_gradients_and_positive_without_any() -> None
     parameter.grad = torch.zeros(4)
     group.set_damping(0.5)
     assert group.epsilon > 0
+
+
+def test_gradients_that_are_not_finite_do_not_move_parameters() -> None:
+    parameter = torch.zeros(3, requires_grad=True)
+    group = ParameterGroup([parameter], rate=0.1)
+    parameter.grad = torch.tensor([math.nan, math.inf, 1.0])
+    group.clean_gradients()
+    group.step(1.0, BETAS)
+    moved = parameter.tolist()
+    assert moved[:2] == [0, 0] and moved[2] < 0
 
 
 @pytest.mark.slow

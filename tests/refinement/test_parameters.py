@@ -73,12 +73,8 @@ def test_gaussians_at_the_camera_and_of_extreme_opacity_stay_finite(room) -> Non
     assert all(torch.isfinite(value).all() for value in vars(built).values() if value.is_floating_point())
 
 
-def test_non_finite_gradients_become_zero_and_ranges_are_kept(room) -> None:
+def test_ranges_are_kept(room) -> None:
     parameters = ViewParameters(*_view(room))
-    for tensor in parameters.tensors.values():
-        tensor.grad = torch.full_like(tensor, math.nan)
-    parameters.clean_gradients()
-    assert all(bool((tensor.grad == 0).all()) for tensor in parameters.tensors.values() if tensor.grad is not None)
     with torch.no_grad():
         parameters.tensors["distance"].fill_(50.0)
         parameters.tensors["scale"].fill_(-90.0)
