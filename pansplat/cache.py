@@ -131,4 +131,4 @@ def _read_gaussians(path: Path, num_views: int) -> tuple[Gaussians, Gains] | Non
 def _make_file_name(name: str) -> str:
     """The name in ASCII and short; with a hash if that changes it, so that different names stay different."""
     plain = re.sub(r"[^A-Za-z0-9_.]+", "_", name)[:60]
-    return plain if plain == name else f"{plain}-{hashlib.blake2b(name.encode(), digest_size=4).hexdigest()}"
+    return plain if plain == name else f"{plain}-{hashlib.blake2b(os.fsencode(name), digest_size=4).hexdigest()}"

@@ -172,7 +172,9 @@ def test_an_invalid_limit_of_gaussians_is_refused_before_the_prediction(pair_fol
     assert predictor.calls == 0
 
 
-@pytest.mark.parametrize("names", [("客厅", "卧室"), ("a" * 60 + "b", "a" * 60 + "c"), ("a b", "a_b")])
+@pytest.mark.parametrize(
+    "names", [("客厅", "卧室"), ("a" * 60 + "b", "a" * 60 + "c"), ("a b", "a_b"), ("\udcff\udcfe", "\udcff_")]
+)
 def test_pairs_of_similar_names_share_a_cache_folder(pair_folder: Path, sphere_predictor, names) -> None:
     predictor = sphere_predictor()
     (pair,) = load_pairs(pair_folder)
