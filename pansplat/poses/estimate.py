@@ -122,7 +122,7 @@ def estimate_poses(
     """Camera poses of two or more equirectangular panoramas of one place.
 
     Args:
-        images: files, 2:1.
+        images: files, 2:1; one that is repeated is used once.
         camera_height: mean height of the cameras over the floor, metres; it sets the scale if the floor is found.
         baseline: two of the images and their distance in metres, instead of the camera's height.
         seed: of the random samples.
@@ -134,10 +134,10 @@ def estimate_poses(
     Raises:
         InputError: fewer than two images, an unreadable one, or no two panoramas could be placed.
     """
-    paths = tuple(Path(image) for image in images)
+    paths = tuple(dict.fromkeys(Path(image) for image in images))
     report = progress or (lambda what, fraction: None)
-    if len(set(paths)) < 2:
-        raise InputError(f"needed two or more different panoramas to estimate poses, got {len(set(paths))}; add one.")
+    if len(paths) < 2:
+        raise InputError(f"needed two or more different panoramas to estimate poses, got {len(paths)}; add one.")
     for path in paths:
         require_file(path, "a panorama")
     if not 0 < camera_height < math.inf:
@@ -161,6 +161,7 @@ def estimate_poses(
     downs = np.stack([v.axes.axes[0] if v.axes.has_down else np.full(3, np.nan) for v in views])
     noise = max(noise_of(v.features, v.features) for v in views)
 
+    @functools.cache
     def floor_height(pair: Pair) -> float | None:
         first, second = (views[view] for view in pair)
         floor = find_floor([first.small, second.small], _pair_poses(relations[pair], first, second), [(0, 1)])
@@ -250,7 +251,8 @@ def _working_height(path: Path) -> int:
 def _describe_views(
     paths: Sequence[Path], pixels: dict[int, Array], hints: Sequence[Hints], kept: Sequence[int], report: Progress
 ) -> list[_View]:
-    is_compass = len({hints[n].heading for n in kept}) > 1  # one value for all pictures is a program's default
+    headings = {hints[n].heading for n in kept} - {None}
+    is_compass = len(headings) > 1  # one value for all pictures is a program's default
     static = scene_mask_of_files(tuple(paths[n] for n in kept), _HEIGHT).numpy()
 
     def describe(n: int) -> _View:

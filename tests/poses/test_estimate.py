@@ -34,11 +34,12 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def estimate(photographs: Path) -> PoseEstimate:
-    """The estimate of the sample with three pictures that cannot be used."""
+    """The estimate of the sample with three pictures that cannot be used, and one that is given twice."""
     cv2.imwrite(str(photographs / "z_dark.png"), np.full((64, 128, 3), 3, np.uint8))
     cv2.imwrite(str(photographs / "z_narrow.png"), np.full((64, 96, 3), 90, np.uint8))
     shutil.copy(photographs / "left.png", photographs / "z_copy.png")
-    found = estimate_poses(sorted(photographs.glob("*.png")), camera_height=1.5)
+    images = sorted(photographs.glob("*.png"))
+    found = estimate_poses([*images, images[0]], camera_height=1.5)  # one is given twice
     for name in ("z_dark", "z_narrow", "z_copy"):
         (photographs / f"{name}.png").unlink()
     return found
