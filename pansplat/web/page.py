@@ -9,12 +9,14 @@ import html
 import io
 import json
 import math
+import os
 import re
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import torch
@@ -201,8 +203,6 @@ def _merge(scene: Scene, count: int) -> Scene:
     height = min(scene.height, _MERGE_HEIGHT)
     size = (height, 2 * height)
     merged = merge_to(scene, size, count)
-    if merged.gaussians.degree:
-        return merged  # the fit is for colours that do not depend on the direction
     with torch.no_grad():
         drawn = [pipeline.render(scene, pose, blend=view, size=size) for view, pose in enumerate(scene.cam2world)]
     images = torch.stack([rendering.color for rendering in drawn])
@@ -303,7 +303,7 @@ def _write_files(
     scripts = [f'addPart("{part}");\n' for part in parts]
     folder = path.with_name(f"{path.stem}_files")
     names = [f"{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}.js" for text in scripts] if split else []
-    tags = [f'<script src="{html.escape(f"{folder.name}/{name}")}"></script>' for name in names]
+    tags = [f'<script src="{quote(os.fsencode(folder.name))}/{name}"></script>' for name in names]
     page = _fill_template(
         script_sources="'self' file: blob:" if split else "blob:",
         title=html.escape(title),
@@ -315,7 +315,7 @@ def _write_files(
         sorter=_to_script(_read("sorter.js")),
         parts="\n".join(tags or (f"<script>{text}</script>" for text in scripts)),
         program=_read("page.js"),
-    ).encode()
+    ).encode(errors="replace")  # a title from a file name that is not UTF-8
     if len(page) > MAX_FILE_BYTES and not split:
         fitting = math.floor(0.95 * count * MAX_FILE_BYTES / len(page))
         raise InputError(

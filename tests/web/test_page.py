@@ -2,9 +2,11 @@
 
 import dataclasses
 import json
+import os
 import re
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote_to_bytes, urljoin, urlsplit
 
 import numpy as np
 import pytest
@@ -73,12 +75,14 @@ def test_a_page_has_at_most_the_given_number_of_gaussians(scene: Scene, tmp_path
     assert sum(view["count"] for view in header["views"]) == header["count"] == written.num_gaussians
 
 
-def test_colours_of_merged_gaussians_are_fitted_to_all(plain_scene: Scene) -> None:
-    size, pose = (32, 64), plain_scene.cam2world[0]
-    needed = pipeline.render(plain_scene, pose, size=size).color
+@pytest.mark.parametrize("fixture", ["plain_scene", "scene"])
+def test_colours_of_merged_gaussians_are_fitted_to_all(request: pytest.FixtureRequest, fixture: str) -> None:
+    full = request.getfixturevalue(fixture)
+    size, pose = (32, 64), full.cam2world[0]
+    needed = pipeline.render(full, pose, size=size).color
     errors = [
         float((pipeline.render(scene, pose, size=size).color - needed).square().mean())
-        for scene in (page_module._merge(plain_scene, 700), merge_to(plain_scene, (64, 128), 700))
+        for scene in (page_module._merge(full, 700), merge_to(full, (64, 128), 700))
     ]
     assert errors[0] < 0.8 * errors[1]
 
@@ -104,6 +108,16 @@ def test_the_parts_of_a_split_page_replace_the_old_ones(
     text = (tmp_path / "tour.html").read_text()
     assert set((tmp_path / "tour_files").iterdir()) == {*second.files[1:], other}
     assert re.findall(r'<script src="([^"]+)"', text) == [f"tour_files/{file.name}" for file in second.files[1:]]
+
+
+@pytest.mark.parametrize("stem", ["room #2", "50%25 done?", "a:b & 'c'", "k\xfcche", os.fsdecode(b"caf\xe9")])
+def test_a_split_page_finds_its_parts_under_any_name(scene: Scene, tmp_path: Path, stem: str) -> None:
+    written = write_page(scene, tmp_path / f"{stem}.html", split=True)
+    text = written.files[0].read_text()
+    (source,) = re.findall(r'<script src="([^"]+)"', text)
+    place = urlsplit(urljoin("file:///folder/page.html", source))
+    assert not place.query and not place.fragment
+    assert unquote_to_bytes(place.path) == b"/folder/" + os.fsencode(f"{stem}_files/{written.files[1].name}")
 
 
 def test_a_scene_without_cameras_starts_in_its_middle(scene: Scene, tmp_path: Path) -> None:
