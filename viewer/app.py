@@ -207,6 +207,7 @@ def _run_window(
 
     load_options = options.load_options
     state = ViewerState(settings=options.settings, path=path or CameraPath())
+    source: Path | None = expand_home(options.path)
     for attempt in range(_MAX_CONTEXTS):
         try:
             window = Window("pansplat", pixels)
@@ -223,14 +224,14 @@ def _run_window(
             memory=options.memory,
             preferences=find_file(),
         )
-        viewer.show(entries, first, expand_home(options.path))
+        viewer.show(entries, first, source)
         try:
             run_viewer(window, viewer)
             return None
         except ContextLostError:  # start again with the same scene, camera and settings
             if attempt == _MAX_CONTEXTS - 1:
                 raise
-            entries, first = viewer.entries, max(viewer.panel_data.current, 0)
+            entries, first, source = viewer.entries, max(viewer.panel_data.current, 0), viewer.path
     return None
 
 

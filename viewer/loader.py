@@ -253,9 +253,9 @@ class SceneLoader:
         self._job = _Job(entry)
         self._job.future = self._executor.submit(self._load, entry, self._job.report, self._job.show)
 
-    def load(self, entry: SceneEntry) -> LoadedScene:
-        """Load an entry in the calling thread, without regard to requests."""
-        return self._load(entry, lambda task, done: None, lambda loaded: None)
+    def load(self, entry: SceneEntry, progress: Progress) -> LoadedScene:
+        """Load an entry in the calling thread, without regard to requests; `progress` may raise to end it."""
+        return self._load(entry, progress, lambda loaded: None)
 
     @property
     def is_searching(self) -> bool:

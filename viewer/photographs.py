@@ -50,8 +50,8 @@ class Photographs:
         return bool(self._reading)
 
     def open(self, panoramas: Sequence[Panorama]) -> None:
-        """Replace the photographs; the same ones are kept."""
-        if [panorama.image for panorama in panoramas] == [panorama.image for panorama in self._panoramas]:
+        """Replace the photographs; the same objects are kept, those of a folder that is read again are not."""
+        if tuple(panoramas) == self._panoramas:  # panoramas are compared by identity
             return
         self._clear()
         self._panoramas = tuple(panoramas)

@@ -55,6 +55,7 @@ class TourScenes:
         self._views = tour.choose_scene_views()
         self._budget = memory * 2**30
         self._loaded: OrderedDict[Views, LoadedScene] = OrderedDict()
+        self._failed: set[Views] = set()
 
     @property
     def views(self) -> Views:
@@ -82,11 +83,16 @@ class TourScenes:
         self._loaded[views] = loaded
         self._loaded.move_to_end(views)
         self.outlines |= loaded.outlines
+        self._failed.discard(views)
         total = sum(measure_bytes(scene.scene) for scene in self._loaded.values())
         for other in [other for other in self._loaded if other not in (views, self.views)]:
             if total <= self._budget or len(self._loaded) <= 2:
                 break
             total -= measure_bytes(self._loaded.pop(other).scene)
+
+    def fail(self, views: Views) -> None:
+        """Do not request a scene again, because it could not be loaded or refined."""
+        self._failed.add(views)
 
     def get(self, views: Views) -> LoadedScene | None:
         """A scene if it is in memory; it becomes the most recently used."""
@@ -123,9 +129,10 @@ class TourScenes:
 
         Predictions come before refinements. A refinement ends if the scene of the camera is missing.
         """
+        first, wanted = wanted[0], [views for views in wanted if views not in self._failed]
         missing = [views for views in wanted if views not in self._loaded]
         if current is not None:
-            needed = missing and missing[0] == wanted[0]
+            needed = missing and missing[0] == first
             replaced = needed and current.views != missing[0]
             if not replaced and (current.views in wanted or not missing):
                 return None
@@ -216,8 +223,8 @@ class CrossFade:
         return done * done * (3 - 2 * done) if self._fading else 1.0
 
     def clear(self) -> None:
-        """Forget both scenes."""
-        self.scenes, self._fading = [None, None], False
+        """Forget both scenes; the first slot is the front."""
+        self.front, self.scenes, self._fading = 0, [None, None], False
 
 
 @dataclass(frozen=True)

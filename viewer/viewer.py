@@ -63,6 +63,7 @@ class Viewer:
         panels: the panels, with the rectangles of their widgets.
         panel_data: the data of the panels in the last frame.
         screenshots: files written so far.
+        path: where the listed entries were found; None if they are only loaded again.
     """
 
     def __init__(
@@ -109,7 +110,7 @@ class Viewer:
         self._incoming: LoadedScene | None = None  # shown when it is prepared
         self.presenter = Presenter(ctx)
         self._comparer = Comparer(ctx, lambda: StereoRenderer(create_renderer(ctx, renderer), ctx))
-        self._path: Path | None = None  # of the entries
+        self.path: Path | None = None
         self._searched: tuple[Path, str | None] = Path(), None  # path, and the entry to show of those found there
         self._too_large: LoadedScene | None = None
         self._draw_failed = False
@@ -194,7 +195,7 @@ class Viewer:
         self.loader.request(entries[index])
 
     def _list_entries(self, entries: list[SceneEntry], index: int, path: Path | None) -> None:
-        self.entries, self._path = entries, path
+        self.entries, self.path = entries, path
         self.panel_data.entries, self.panel_data.current = [entry.name for entry in entries], index
         self._watch.start(entries[index].files)
 
@@ -252,6 +253,7 @@ class Viewer:
         if self._incoming is not None and self._preparer.is_ready(self._incoming.scene):
             incoming, self._incoming = self._incoming, None
             self._show_loaded(incoming, now)
+        requested = self.loader.entry
         result = self.loader.poll() if self._incoming is None else None
         if isinstance(result, list):
             path, wanted = self._searched
@@ -270,6 +272,9 @@ class Viewer:
         elif result is not None:
             known = isinstance(result, (InputError, OSError))  # else a defect, or out of memory
             self.panel_data.error = str(result) if known else f"{type(result).__name__}: {result}"
+            has_failed = requested is not None and self.loader.entry is None  # else the search
+            if has_failed and self._tour is not None and requested.tour is self._tour.tour:
+                self._tour.fail(requested.views)
             self._list_shown()
 
     def _list_shown(self) -> None:
@@ -311,7 +316,7 @@ class Viewer:
 
     def _enter(self, loaded: LoadedScene, now: float) -> None:
         self._loaded, self._refined, self._tour = loaded, None, None
-        self._shown = self.entries, self.panel_data.current, self._path
+        self._shown = self.entries, self.panel_data.current, self.path
         self._resolution = self._create_resolution()
         self._fade.clear()
         self._fade.show(0, loaded.scene, now)
@@ -365,9 +370,11 @@ class Viewer:
         self.state.points = []
 
     def _is_other_requested(self) -> bool:
-        """Whether the loader works on a scene that is not of this tour, which the user has chosen."""
+        """Whether a scene that is not of this tour, which the user has chosen, is loaded or prepared."""
         entry = self.loader.entry
-        return entry is not None and (self._tour is None or entry.tour is not self._tour.tour)
+        if entry is None:
+            return self._incoming is not None
+        return self._tour is None or entry.tour is not self._tour.tour
 
     def _fly_tour(self, seconds: float, was_playing: bool) -> None:
         """Advance the flight; in a tour only as far as scenes are loaded, and from wherever the camera is."""
@@ -573,13 +580,13 @@ class Viewer:
         if commands.visit is not None:
             self.state.target = commands.visit
         if commands.choose is not None and commands.choose != self.panel_data.current:
-            self.show(self.entries, commands.choose, self._path)
+            self.show(self.entries, commands.choose, self.path)
         elif commands.reload:
             current = max(self.panel_data.current, 0)
-            if self._path is None:
+            if self.path is None:
                 self.show(self.entries, current)
             else:
-                self.open(self._path, self.entries[current].name)
+                self.open(self.path, self.entries[current].name)
         elif commands.open is not None:
             self.open(Path(commands.open).expanduser())
         if self._loaded is None:
@@ -653,13 +660,16 @@ class Viewer:
         file = find_free_name(folder, "path", state.film_suffix)
 
         def write(progress: Callable[[str, float], None]) -> list[Path]:
+            def load(entry: SceneEntry) -> LoadedScene:  # a film that is cancelled does not wait for a prediction
+                return self.loader.load(entry, lambda task, done: progress(task, self._films.progress or 0.0))
+
             renderers = [CpuRenderer(None) for _ in range(1 if tour is None else 2)]
             try:
                 if tour is None:
                     frames = SceneFrames(renderers[0], scene, size, settings, image_format)
                 else:
                     scenes = TourScenes(tour.tour, memory=memory, merged=loaded.entry.merged)
-                    frames = TourFrames(renderers, scenes, self.loader.load, size, settings, image_format)
+                    frames = TourFrames(renderers, scenes, load, size, settings, image_format)
                 return write_path_film(frames, path, level, file, fps, progress)
             finally:
                 for renderer in renderers:

@@ -23,6 +23,7 @@ from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat_viewer.color_maps import map_values
 from pansplat_viewer.cpu_renderer import CpuRenderer
+from pansplat_viewer.key_frames import CameraPath, KeyFrame
 from pansplat_viewer.loader import (
     LoadedScene,
     LoadOptions,
@@ -32,6 +33,7 @@ from pansplat_viewer.loader import (
     find_entries,
     load_entry,
 )
+from pansplat_viewer.photographs import Photographs
 from pansplat_viewer.preferences import Preferences
 from pansplat_viewer.presenter import ERROR_MAP
 from pansplat_viewer.resolution import BUDGET_MS, SETTLE_AFTER
@@ -619,6 +621,27 @@ def test_a_photograph_is_shown_while_the_first_scene_is_predicted(user, pair, sm
     assert np.abs(user.read_image() - turned).mean() < 1, "it was the photograph"
 
 
+def test_photographs_of_a_pair_that_is_read_again_are_read_again(ctx, pair, tmp_path, axis_photos):
+    photographs = Photographs(ctx)
+    (first, *_) = pair.context
+
+    def read(panorama: Panorama) -> np.ndarray:
+        photographs.open([panorama])
+        while (texture := photographs.get(0)) is None:
+            time.sleep(0.002)
+        return np.frombuffer(texture.read(), np.uint8)
+
+    write_image(tmp_path / "a.png", axis_photos[0])
+    before = read(panorama := replace(first, image=tmp_path / "a.png"))
+    write_image(tmp_path / "a.png", axis_photos[1])
+    assert (read(panorama) == before).all()
+    pose = first.cam2world.clone()
+    pose[0, 3] += 5
+    assert (read(replace(panorama, cam2world=pose)) != before).any()
+    assert photographs.pose(0)[0, 3] == pose[0, 3] and photographs.find_nearest(np.zeros(3)) == 0
+    photographs.release()
+
+
 def test_a_scene_without_photographs_has_no_comparison_with_one(user):
     user.show(SceneEntry("no photographs"))
     before = user.read_image()
@@ -1117,6 +1140,67 @@ def test_a_file_of_a_tour_is_flown_along_its_edges(user, house_file, monkeypatch
     assert user.data.right_name is None, "there are no photographs"
 
 
+@once
+def test_a_scene_that_is_chosen_in_a_tour_stays_while_it_is_prepared(user, house, load_house, small_scene, monkeypatch):
+    requested = []
+
+    def load(entry, progress, show):
+        requested.append(entry.name)
+        return LoadedScene(entry, small_scene) if entry.tour is None else load_house(entry)
+
+    monkeypatch.setattr(user.viewer.loader, "_load", load)
+    user.show(SceneEntry(house.name, tour=house))
+    user.viewer._tour._loaded.popitem()  # a scene of the tour is still missing
+    ready = threading.Event()
+    is_ready = user.viewer._preparer.is_ready
+    monkeypatch.setattr(
+        user.viewer._preparer,
+        "is_ready",
+        lambda scene: is_ready(scene) and (scene is not small_scene or ready.is_set()),
+    )
+    user.viewer.loader.cancel()
+    requested.clear()
+    user.viewer.show([SceneEntry("large")], 0)
+    user.draw_until(lambda: user.viewer._incoming is not None, "scene that is prepared")
+    user.draw_frames(3)
+    ready.set()
+    user.settle()
+    assert requested == ["large"], "the tour requests nothing"
+    assert user.viewer._loaded.entry.name == "large" and user.viewer._tour is None
+
+
+@once
+def test_a_scene_of_a_tour_that_fails_is_reported_once(user, house, load_house, monkeypatch):
+    failed = []
+
+    def load(entry, progress, show):
+        if entry.views == (1, 2):
+            failed.append(entry.name)
+            raise InputError("room2.png: no such file")
+        return load_house(entry)
+
+    monkeypatch.setattr(user.viewer.loader, "_load", load)
+    user.viewer.show([SceneEntry(house.name, tour=house)], 0)
+    user.draw_until(lambda: user.data.error, "error")
+    user.data.error = None
+    user.draw_frames(5)
+    user.settle()
+    assert failed == ["room1-room2"] and user.data.error is None
+
+
+@once
+def test_a_scene_after_a_tour_does_not_fade_from_it(tour_user, pair):
+    user = tour_user
+    user.click_at(*user.panels.minimap.nodes[3])
+    fly(user)
+    while user.viewer._fade.front == 0:
+        user.click_at(*user.panels.minimap.nodes[2 if find_node(user) == 0 else 0])
+        fly(user)
+    user.viewer.show(user.entries, 0)
+    user.draw_until(lambda: user.viewer._tour is None, "pair")
+    assert user.viewer._fade.compute_weight(user.clock[0]) == 1
+
+
 def test_the_nearest_photograph_of_a_tour_is_shown(tour_user):
     user = tour_user
     before = user.read_image()
@@ -1232,3 +1316,26 @@ def test_a_film_can_be_cancelled(path_user):
     user.click("Cancel##film")
     user.settle()
     assert user.data.film is None and user.data.error is None and len(user.viewer.screenshots) == written
+
+
+@once
+def test_a_film_of_a_tour_is_cancelled_during_a_prediction(user, house, load_house, monkeypatch):
+    predicting, go = threading.Event(), threading.Event()
+
+    def load(entry, progress, show):
+        if threading.current_thread().name.startswith("film-writer"):
+            predicting.set()
+            while not go.wait(0.005):
+                progress("searching depth", 0.5)
+        return load_house(entry)
+
+    user.show(SceneEntry(house.name, tour=house))
+    monkeypatch.setattr(user.viewer.loader, "_load", load)
+    user.state.path = CameraPath((KeyFrame.of_camera(user.state.camera, 0.0),))
+    user.viewer._start_film(SIZE)
+    assert predicting.wait(60)
+    timer = threading.Timer(5, go.set)
+    timer.start()
+    user.viewer._films.cancel()
+    assert not go.is_set(), "it waited for the prediction"
+    timer.cancel()

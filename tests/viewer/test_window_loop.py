@@ -98,7 +98,8 @@ def test_a_new_window_replaces_one_whose_context_is_lost(monkeypatch, tmp_path):
     viewers, runs = [], []
 
     def make(ctx: object, loader: object, **options: object) -> Mock:
-        viewers.append(Mock(entries=[SceneEntry("a"), SceneEntry("b")], panel_data=Mock(current=1), options=options))
+        entries, opened = [SceneEntry("a"), SceneEntry("b")], tmp_path / "opened"
+        viewers.append(Mock(entries=entries, panel_data=Mock(current=1), path=opened, options=options))
         return viewers[-1]
 
     def run(window: object, viewer: Mock) -> None:
@@ -113,7 +114,7 @@ def test_a_new_window_replaces_one_whose_context_is_lost(monkeypatch, tmp_path):
     assert app._run_window(app.Options(tmp_path), [SceneEntry("a")], 0, (64, 32), None) is None
     first, second = viewers
     assert second.options["state"] is first.options["state"], "camera and settings"
-    second.show.assert_called_once_with(first.entries, 1, tmp_path)
+    second.show.assert_called_once_with(first.entries, 1, tmp_path / "opened")
 
 
 def test_sticks_and_buttons_of_a_gamepad_reach_imgui():
