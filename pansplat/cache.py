@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import re
+import time
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,6 +28,8 @@ from pansplat.predictor import Predictor
 _MAX_LEVELS = 256
 _FORMAT = "1"  # version of the file's layout; part of the hash
 _GAINS = "gains"
+_ABANDONED_SECONDS = 3600.0  # after which an unfinished file is that of a process that was killed
+_UNFINISHED = re.compile(r"\..+\.[0-9a-f]{8}\.\w+")  # see `pansplat.atomic`
 _FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
 
 
@@ -86,8 +89,17 @@ def write_cache_file(folders: Sequence[Path], name: str, *parts: bytes) -> Path 
                 file.writelines(parts)
         except (OSError, InputError):
             continue
+        _remove_abandoned(folder)
         return folder / name
     return None
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Remove unfinished files of processes that were killed."""
+    for file in folder.iterdir():
+        with contextlib.suppress(OSError):
+            if _UNFINISHED.fullmatch(file.name) and time.time() - file.stat().st_mtime > _ABANDONED_SECONDS:
+                file.unlink()
 
 
 def _hash_inputs(views: Views, predictor: Predictor, refinement: str) -> str:

@@ -31,7 +31,13 @@ from pansplat.sweep.search import SearchConfig
 
 MODEL = "depth"  # name of the network in a weights file
 _SEARCH_HEIGHT = 384  # pixels; at 512 the search takes 1.6 times as long and is not better
-_SOURCES = ("guided_sweep.py", "model/efficientnet.py", "model/depth_network.py", "model/depth_refinement.py")
+_SOURCES = (
+    "guided_sweep.py",
+    "model/efficientnet.py",
+    "model/depth_network.py",
+    "model/depth_refinement.py",
+    "model/layers.py",
+)
 
 
 class GuidedSweep(Sweep):

@@ -2,6 +2,9 @@
 
 import dataclasses
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from pansplat.cache import list_cache_folders
+from pansplat.cache import list_cache_folders, write_cache_file
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.pipeline import load_pairs, predict
@@ -182,3 +185,18 @@ def test_pairs_of_similar_names_share_a_cache_folder(pair_folder: Path, sphere_p
     for given in (first, second, first):
         predict(given, predictor, height=HEIGHT)
     assert predictor.calls == 2
+
+
+def test_unfinished_files_of_killed_processes_are_removed(tmp_path: Path) -> None:
+    code = (
+        "import os, sys\nfrom pansplat.atomic import replacing\n"
+        "with replacing(sys.argv[1]) as file:\n    file.write_bytes(b'half')\n    os.kill(os.getpid(), 9)\n"
+    )
+    for name in ("old.scene", "new.scene"):
+        subprocess.run([sys.executable, "-c", code, tmp_path / name], check=False)
+    (tmp_path / ".keep").write_text("")
+    old, new = (next(tmp_path.glob(f".{name}.*.scene")) for name in ("old", "new"))
+    for file in (old, tmp_path / ".keep"):
+        os.utime(file, (1e9, 1e9))
+    written = write_cache_file([tmp_path], "a.scene", b"whole")
+    assert set(tmp_path.iterdir()) == {written, new, tmp_path / ".keep"}

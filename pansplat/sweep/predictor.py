@@ -22,6 +22,7 @@ from pansplat.sweep.lift import LiftConfig, lift
 from pansplat.sweep.prior import PriorModel
 from pansplat.sweep.search import PosedImages, SearchConfig, search_surfaces
 
+_SOURCES = ("rendering/color_fit.py", "rendering/weights.py", "data/masks.py")  # used outside of the sweep's packages
 _MULTIPLE = 8  # the levels of the Gaussians divide the height; other heights are resized to the next multiple
 
 
@@ -135,4 +136,6 @@ def _compute_fingerprint(config: SweepConfig) -> str:
         for source in sorted(files(package).iterdir(), key=lambda s: s.name):
             if source.name.endswith(".py"):
                 digest.update(source.read_bytes())
+    for name in _SOURCES:
+        digest.update(files("pansplat").joinpath(name).read_bytes())
     return f"sweep-{digest.hexdigest()[:16]}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -47,36 +48,36 @@ def validate(
         InputError: no sample is readable, or an image cannot be written.
     """
     network.eval()
-    sums, count = dict.fromkeys(MEASURES, 0.0), 0
+    values: dict[str, list[float]] = {measure: [] for measure in MEASURES}
     for number, sample in enumerate(_readable_samples(source, samples, renderer.height)):
         measures, rendered = _measure(network, sample, renderer, tiles)
-        sums = {measure: sums[measure] + measures[measure] for measure in MEASURES}
-        count += 1
+        for measure, value in measures.items():
+            values[measure].append(value)
         if folder is not None and number < pictures:
             folder.mkdir(parents=True, exist_ok=True)
             both = torch.cat((sample.targets.images[0], rendered.clamp(0, 1).float().cpu()), dim=1)
             write_image(folder / f"{name}_{number}.png", both)
-    return {measure: sums[measure] / count for measure in MEASURES}
+    return {measure: fmean(values[measure]) if values[measure] else math.nan for measure in MEASURES}
 
 
 def _measure(
     network: PanSplat | MVSplat, sample: Sample, renderer: TargetRenderer, tiles: int
 ) -> tuple[dict[str, float], Tensor]:
-    """Measures of a sample's first target, and its rendering."""
+    """Measures of a sample's first target, without the error of depth if no depth is known; and its rendering."""
     parameter = next(network.parameters())
     batch = collate([sample]).to(parameter.device, parameter.dtype)
     matched = network.match_views(batch.images, batch.cam2world, batch.near, batch.far)
     (scene,) = merge_tiles(list(network.lift_gaussians(matched, tiles=tiles)), network.compat)
     rendered = renderer.render(scene, batch.target_cam2world[0, 0], batch.cam2world[0])
     target = batch.target_images[0, 0]
-    error = math.nan
+    measures = {"psnr": psnr(rendered, target), "ws_psnr": ws_psnr(rendered, target), "ssim": ssim(rendered, target)}
     if batch.depths is not None:
         depth = matched.depths.depth[-1]
         true_depth = torch.nn.functional.interpolate(batch.depths, depth.shape[-2:], mode="nearest-exact")
         is_known = (true_depth > batch.near[..., None, None]) & (true_depth < batch.far[..., None, None])
-        error = float(((depth - true_depth).abs() / true_depth)[is_known].mean())
-    measures = {"psnr": psnr(rendered, target), "ws_psnr": ws_psnr(rendered, target), "ssim": ssim(rendered, target)}
-    return {**measures, "depth_error": error}, rendered
+        if is_known.any():
+            measures["depth_error"] = float(((depth - true_depth).abs() / true_depth)[is_known].mean())
+    return measures, rendered
 
 
 def _readable_samples(source: SampleSource, count: int, height: int) -> Iterator[Sample]:

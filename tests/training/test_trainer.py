@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,13 +11,16 @@ import pytest
 import torch
 from PIL import Image
 
+from pansplat.data.views import Sample
 from pansplat.errors import InputError
 from pansplat.model.weights import load_weights
 from pansplat.training import trainer
 from pansplat.training.config import OptimizerConfig, TrainConfig, ValidationConfig
 from pansplat.training.logs import read_table
 from pansplat.training.network import read_weights
+from pansplat.training.rendering import TargetRenderer
 from pansplat.training.trainer import Trainer
+from pansplat.training.validation import validate
 
 
 def curve(folder: Path) -> list[tuple[str, str, str]]:
@@ -90,6 +94,26 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_saves_the_batch(
 
 
 @pytest.mark.slow
+def test_a_sample_without_known_depth_is_left_out_of_the_depth_error(micro_run: Callable, sphere: type) -> None:
+    class Source(sphere):
+        def sample(self, index: int, height: int, seed: int) -> Sample:
+            sample = super().sample(index, height, seed)
+            depths = sample.context.depths * (1 if index in known else 1e6)
+            return replace(sample, context=replace(sample.context, depths=depths))
+
+    network = Trainer(micro_run(steps=1), silent=True).network
+
+    def measure(samples: int) -> dict[str, float]:
+        options = {"samples": samples, "pictures": 0, "tiles": 1, "folder": None, "name": ""}
+        return validate(network, Source(), TargetRenderer("panorama", "joint", 32), **options)
+
+    known = {0}
+    first, both = measure(1), measure(2)
+    assert both["depth_error"] == first["depth_error"] and both["psnr"] != first["psnr"]
+    known = set()
+    assert math.isnan(measure(2)["depth_error"])
+
+
 def test_validation_writes_measures_and_images(micro_run: Callable) -> None:
     config = micro_run(steps=2, validation=ValidationConfig(every=1, samples=2, pictures=1))
     trained(config)
