@@ -28,6 +28,9 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
 
+# A shell starts programs in the background with SIGINT ignored, and child processes inherit that; some tests send it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 # Triton reads this variable at its first import, and torch may import it. Its LLVM must be loaded before Mesa's.
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")
