@@ -175,7 +175,7 @@ def save_points(gaussians: Gaussians, path: str | Path) -> None:
     table = np.empty(len(kept), fields)
     colors = (kept.harmonics[:, 0] * SH_0 + 0.5).clamp(0, 1).mul(255).round().byte()
     for column, (name, _) in zip((*kept.means.unbind(1), *colors.unbind(1)), fields, strict=True):
-        table[name] = column.numpy()
+        table[name] = column.detach().numpy()
     kinds = {"<f4": "float", "u1": "uchar"}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(kept)}"]
     lines += [*(f"property {kinds[kind]} {name}" for name, kind in fields), "end_header\n"]

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from pansplat.errors import InputError
 from pansplat.gaussians import ply
-from pansplat.gaussians.ply import OPACITY_EPSILON, SCALE_EPSILON, load_ply, save_ply, save_ply_parts
+from pansplat.gaussians.ply import OPACITY_EPSILON, SCALE_EPSILON, load_ply, save_ply, save_ply_parts, save_points
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.pose import rotations_from_quats
 
@@ -381,3 +381,15 @@ def test_an_interrupted_save_leaves_the_old_file(tmp_path: Path) -> None:
         save_ply_parts(scene, [scene.gaussians, _scene(degree=1).gaussians], tmp_path / "a.ply")
     with pytest.raises(InputError, match="needed an existing folder"):
         save_ply_parts(scene, [scene.gaussians], tmp_path / "none" / "a.ply")
+
+
+def test_points_of_gaussians_that_require_gradients_are_written(tmp_path: Path) -> None:
+    gaussians = make_scene().gaussians
+    save_points(gaussians, tmp_path / "expected.ply")
+    leaf = dataclasses.replace(
+        gaussians,
+        means=gaussians.means.clone().requires_grad_(),
+        harmonics=gaussians.harmonics.clone().requires_grad_(),
+    )
+    save_points(leaf, tmp_path / "points.ply")
+    assert (tmp_path / "points.ply").read_bytes() == (tmp_path / "expected.ply").read_bytes()
