@@ -153,7 +153,8 @@ def _find_mutual_neighbours(
     Neighbours are searched among the next Gaussians along a Z-order curve through the directions. The seed turns the
     curve, so that those it separates meet along another one.
     """
-    offsets = gaussians.means.double() - cameras.double()[gaussians.views.long()]
+    centers = cameras.to(device=gaussians.means.device, dtype=torch.float64)
+    offsets = gaussians.means.double() - centers[gaussians.views.long().to(centers.device)]
     distances = offsets.norm(dim=1, keepdim=True).clamp_min(1e-9)
     labels = _labels(gaussians, len(cameras)).cpu().numpy()
     features = torch.cat((offsets / distances, distances.log()), dim=1).cpu().numpy().astype(np.float32)
