@@ -140,6 +140,8 @@ def estimate_poses(
         raise InputError(f"needed two or more different panoramas to estimate poses, got {len(paths)}; add one.")
     for path in paths:
         require_file(path, "a panorama")
+        if any("\ud800" <= letter <= "\udfff" for letter in path.name):  # surrogates: pose files are UTF-8
+            raise InputError(f"{path}: needed a name in UTF-8, got {path.name!a}; rename it.")
     if not 0 < camera_height < math.inf:
         raise InputError(f"`camera_height` must be a positive number of metres, got {camera_height}")
     if baseline is not None:

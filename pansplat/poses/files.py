@@ -116,5 +116,5 @@ def _hash_files(images: list[Path]) -> str:
     digest = hashlib.blake2b(_FORMAT.encode(), digest_size=12)
     for image in images:
         state = image.stat()
-        digest.update(f"{image.name} {state.st_size} {state.st_mtime_ns};".encode())
+        digest.update(os.fsencode(f"{image.name} {state.st_size} {state.st_mtime_ns};"))
     return digest.hexdigest()

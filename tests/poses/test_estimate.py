@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import os
 import shutil
 from pathlib import Path
 
@@ -130,6 +131,15 @@ def test_one_picture_and_unknown_formats_are_refused(tmp_path: Path, capsys: pyt
     ):
         assert run(["pose", *arguments]) == 2
         assert expected in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_name_that_is_not_utf8_is_refused_before_the_estimate(tmp_path: Path, capsys) -> None:
+    for name in (b"left.png", b"\xff.png"):
+        cv2.imwrite(str(tmp_path / "image.png"), np.full((64, 128, 3), 90, np.uint8))
+        (tmp_path / "image.png").rename(tmp_path / os.fsdecode(name))
+    for command in (["pose", str(tmp_path)], ["check", str(tmp_path)]):
+        assert run(command) == 2
+        assert "needed a name in UTF-8, got '\\udcff.png'; rename it" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_mirror_image_of_symmetric_things_is_recognised() -> None:
