@@ -96,8 +96,8 @@ def write_cache_file(folders: Sequence[Path], name: str, *parts: bytes) -> Path 
 
 def _remove_abandoned(folder: Path) -> None:
     """Remove unfinished files of processes that were killed."""
-    for file in folder.iterdir():
-        with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError):
+        for file in folder.iterdir():
             if _UNFINISHED.fullmatch(file.name) and time.time() - file.stat().st_mtime > _ABANDONED_SECONDS:
                 file.unlink()
 
