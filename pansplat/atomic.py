@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -12,6 +13,7 @@ from pansplat.errors import InputError
 from pansplat.files import describe_kind
 
 _MAX_STEM = 48  # characters of the name that the temporary name repeats
+_TEMPORARY = re.compile(r"\..*\.[0-9a-f]{8}(\.\w+)?")
 
 
 @contextmanager
@@ -49,3 +51,8 @@ def replacing(path: Path | str, *, failures: tuple[type[Exception], ...] = ()) -
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def is_unfinished(path: Path) -> bool:
+    """Whether a file has a temporary name of `replacing`."""
+    return _TEMPORARY.fullmatch(path.name) is not None

@@ -17,7 +17,7 @@ import numpy as np
 import safetensors.torch
 import torch
 
-from pansplat.atomic import replacing
+from pansplat.atomic import is_unfinished, replacing
 from pansplat.data.pairs import Pair
 from pansplat.data.views import Views
 from pansplat.errors import InputError
@@ -29,7 +29,6 @@ _MAX_LEVELS = 256
 _FORMAT = "1"  # version of the file's layout; part of the hash
 _GAINS = "gains"
 _ABANDONED_SECONDS = 3600.0  # after which an unfinished file is that of a process that was killed
-_UNFINISHED = re.compile(r"\..+\.[0-9a-f]{8}\.\w+")  # see `pansplat.atomic`
 _FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
 
 
@@ -98,7 +97,7 @@ def _remove_abandoned(folder: Path) -> None:
     """Remove unfinished files of processes that were killed."""
     with contextlib.suppress(OSError):
         for file in folder.iterdir():
-            if _UNFINISHED.fullmatch(file.name) and time.time() - file.stat().st_mtime > _ABANDONED_SECONDS:
+            if is_unfinished(file) and time.time() - file.stat().st_mtime > _ABANDONED_SECONDS:
                 file.unlink()
 
 

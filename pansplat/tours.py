@@ -214,12 +214,19 @@ class TourGraph:
 
     @cached_property
     def _shortest(self) -> tuple[Float[np.ndarray, "node node"], Int[np.ndarray, "node node"]]:
-        """Cost of the cheapest way between all nodes, and the node before its end."""
+        """Cost of the cheapest way between all nodes, and the node before its end.
+
+        Raises:
+            InputError: the edges do not connect all nodes.
+        """
         costs = np.full((len(self), len(self)), np.inf)
         for (a, b), overlap in self.overlaps.items():
             doubt = max(1 - overlap / 0.25, 0.0)  # with little overlap a way around looks better
             costs[a, b] = costs[b, a] = max(self.length((a, b)), 1e-3) * (1 + 3 * doubt)
-        return shortest_path(costs, directed=False, return_predecessors=True)
+        ways, previous = shortest_path(costs, directed=False, return_predecessors=True)
+        if not np.isfinite(ways).all():
+            raise InputError(f"tour: needed edges that connect all {len(self)} panoramas, got separate parts")
+        return ways, previous
 
 
 def _order_by_distance(costs: Float[np.ndarray, "node node"], start: int) -> Int[np.ndarray, "node"]:

@@ -83,6 +83,12 @@ def test_the_scene_of_an_edge_holds_both_ends_and_shares_a_third():
     assert make_tour(places, ((0, 1), (2, 3))).choose_scene_views()[2, 3] == (2, 3)
 
 
+def test_a_walk_over_separate_parts_is_refused():
+    tour = make_tour(((0, 0), (0, 1), (2, 0), (3, 0)), ((0, 1), (2, 3)))
+    with pytest.raises(InputError, match="needed edges that connect all 4 panoramas"):
+        tour.plan_walk()
+
+
 def test_panoramas_too_close_for_depth_get_a_third():
     tour = make_tour(((0, 0), (0, 0.1), (0, 2)), ((0, 1), (1, 2)))
     assert tour.choose_scene_views()[0, 1] == (0, 1, 2)
