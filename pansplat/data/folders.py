@@ -70,15 +70,11 @@ def load_pairs(
     root = expand_home(path)
     if not root.exists():
         raise InputError(f"{root}: needed a folder of posed panoramas, got no such path; check it.")
-    triplet = root if root.is_file() and root in triplet_files(root.parent) else None
-    if root.is_file():
-        if root.suffix.lower() not in (".json", ".kitti", ".tum", ".txt"):
-            raise InputError(f"{root}: needed a folder of posed panoramas, got a file; give the folder that holds it.")
-        root = root.parent
     try:
-        if triplet:
-            collections = [(root, read_triplet(triplet, convention))]
+        if root.is_file() and root in triplet_files(root.parent):
+            collections = [(root.parent, read_triplet(root, convention))]
         else:
+            root = _pose_file_folder(root) if root.is_file() else root
             collections = _find_collections(root, convention, _MAX_DEPTH)
     except OSError as error:
         raise InputError(
@@ -88,6 +84,15 @@ def load_pairs(
         raise _nothing_found(root)
     pairs = [pair for folder, collection in collections for pair in collection.pairs(folder, near, far)]
     return _make_names_unique(sorted(pairs, key=lambda pair: not pair.targets))
+
+
+def _pose_file_folder(file: Path) -> Path:
+    """The folder of a file with poses; an error for other files."""
+    if file.name in (_POSES, _PAIRS, _CAMERA_POSES) or file == find_trajectory(file.parent):
+        return file.parent
+    raise InputError(
+        f"{file}: needed a folder of posed panoramas or its file of poses, got another file; give the folder."
+    )
 
 
 def _find_collections(folder: Path, convention: str | None, depth: int) -> list[tuple[Path, Collection]]:
@@ -138,14 +143,20 @@ class UnposedPanoramasError(InputError):
 
 def _nothing_found(root: Path) -> InputError:
     images = list_panorama_files(root)
-    names = ", ".join(path.name for path in images[:3]) + (" ..." if len(images) > 3 else "")
+    names = _list_names([path.name for path in images])
     if len(images) >= 2:
         message = f"{root}: needed poses for the panoramas, got images only ({names}); add a pose file (docs/input.md)."
         return UnposedPanoramasError(message, images)
+    inside = _list_names([str(folder.relative_to(root)) for folder in find_panorama_folders(root) if folder != root])
+    got = names or (f"some without poses in {inside}" if inside else "none")
     return InputError(
-        f"{root}: needed two or more panoramas (JPG, PNG, WebP or EXR), got {names or 'none'}; give the folder that "
+        f"{root}: needed two or more panoramas (JPG, PNG, WebP or EXR), got {got}; give the folder that "
         "holds them, or a folder whose subfolders have pose files (docs/input.md)."
     )
+
+
+def _list_names(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (" ..." if len(names) > 3 else "")
 
 
 def _make_names_unique(pairs: list[Pair]) -> list[Pair]:

@@ -117,6 +117,8 @@ def load_scene(path: str | Path) -> Scene:
         InputError: unknown suffix, or the file is missing, damaged or without Gaussians.
     """
     path = Path(path)
+    if path.is_dir():
+        require_file(path, "a scene file")
     suffix = find_scene_suffix(path)
     require_file(path, f"a {suffix} scene")
     if suffix == ".ply" and _is_compressed(path):

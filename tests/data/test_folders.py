@@ -317,7 +317,7 @@ def test_paths_without_panoramas_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="got no such path"):
         load_pairs(tmp_path / "gone")
     _write_panorama(tmp_path / "a.png")
-    with pytest.raises(InputError, match="needed a folder of posed panoramas, got a file"):
+    with pytest.raises(InputError, match="needed a folder of posed panoramas or its file of poses, got another file"):
         load_pairs(tmp_path / "a.png")
 
 

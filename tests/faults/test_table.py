@@ -538,6 +538,13 @@ def resized(width: int, height: int, mode: str = "RGB") -> Damage:
     return lambda folder: Image.new(mode, (width, height)).save(folder / "pair/a.png")
 
 
+def copy_to_subfolders(folder: Path) -> None:
+    for name in ("one", "two"):
+        (folder / "flats" / name).mkdir(parents=True)
+        for image in (folder / "pair").glob("*.png"):
+            (folder / "flats" / name / image.name).write_bytes(image.read_bytes())
+
+
 def exr(change: Callable[[bytes], bytes]) -> Damage:
     def write(folder: Path) -> None:
         import OpenEXR
@@ -561,7 +568,11 @@ FILES = [
     Fault("a socket as a scene", INFO, unix_socket("scene.ply"), "socket"),
     Fault("a link to itself as a scene", INFO, link("scene.ply", "scene.ply"), "scene.ply"),
     Fault("a folder as a scene", "info pair.ply", lambda f: (f / "pair.ply").mkdir(), "folder"),
+    Fault("a folder without a suffix as a scene", "info pair", says="pair: needed a scene file, got a folder"),
     Fault("a missing scene", "info no.ply", says="no.ply"),
+    *(Fault(f"a file that has no poses: {name}", f"check {name}", text("x", name), f"{name}: needed a folder of posed panoramas or its file of poses")
+      for name in ("pair/note.txt", "pair/note.json", "pair/a.xyz")),
+    Fault("panoramas without poses in subfolders", "check flats", copy_to_subfolders, "flats: needed two or more panoramas (JPG, PNG, WebP or EXR), got some without poses in one, two"),
     Fault("a scene with a name of 300 bytes", f"info {_LONG}.ply", says=_LONG),
     Fault("a FIFO as poses", PREDICT, fifo("pair/poses.json"), "pair"),
     Fault("a FIFO as an image", PREDICT, fifo("pair/a.png"), "a.png"),
