@@ -106,7 +106,7 @@ def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
     before = state.camera if _are_same(state.context, scene.cam2world.numpy()) else None
     adapt_settings(state, scene, keep_levels=False)
     state.settings = replace(state.settings, near=NEAR)
-    state.context, state.route = scene.cam2world.double().numpy(), None
+    state.context, state.route, state.target = scene.cam2world.double().numpy(), None, None
     state.playing, state.flight, state.points = False, min(max(at, 0.0), 1.0), []
     level = create_level_camera(scene).level
     camera = move_to_pose(replace(state.camera, level=level), _choose_start_pose(scene, state.flight))

@@ -704,8 +704,8 @@ class Viewer:
                 depth,
                 panorama=panorama,
             )
-        except (InputError, OSError) as error:
-            self.panel_data.error = f"no screenshot written: {error}"
+        except (InputError, OSError, MemoryError, moderngl.Error) as error:
+            self.panel_data.error = f"no screenshot written: {_describe(error)}"
             return
         self.screenshots.append(path)
         self.state.show_message(f"wrote {path}", now)
@@ -726,7 +726,7 @@ class Viewer:
 
 
 def _describe(error: Exception) -> str:
-    if isinstance(error, InputError):
+    if isinstance(error, (InputError, OSError)):
         return str(error)
     return f"the memory is exhausted ({type(error).__name__}: {error})"
 

@@ -211,6 +211,7 @@ def make_refine_report(
 def plot_refine(rows: Sequence[RefineRow], title: str, lpips: str | None) -> Figure:
     """Plot the mean WS-PSNR and LPIPS over the seconds, and WS-PSNR over the number of Gaussians."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter
 
     means = list(average_rows([row for row in rows if row.scene != MEAN]))
     figure = Figure(figsize=(13, 4.2), layout="constrained")
@@ -232,7 +233,8 @@ def plot_refine(rows: Sequence[RefineRow], title: str, lpips: str | None) -> Fig
     axes[2].set(
         xlabel=f"Gaussians, default + {largest:g} s at height {height}", ylabel="WS-PSNR between the inputs, dB"
     )
-    axes[2].set_xscale("log")
+    axes[2].set_xlim(left=0)
+    axes[2].xaxis.set_major_formatter(EngFormatter())
     axes[0].legend(fontsize=8)
     axes[0].set_title(title, loc="left", fontsize=9)
     for ax in axes:

@@ -171,6 +171,12 @@ def test_entering_a_scene_of_one_view_resets_modes_that_need_two(small_scene):
     assert state.levels == (0, 1, 2, 3)
 
 
+def test_entering_a_scene_forgets_the_panorama_to_fly_to(small_scene):
+    state = ViewerState(target=1)
+    enter_scene(state, small_scene)
+    assert state.target is None
+
+
 def test_a_scene_without_cameras_is_seen_from_outside_and_has_no_flight(small_scene):
     state = ViewerState()
     enter_scene(state, replace(small_scene, cam2world=small_scene.cam2world[:0]))

@@ -669,6 +669,19 @@ def test_screenshots_show_the_image_without_the_panels(user, monkeypatch):
     assert changed_fraction(image, user.read_image()) == 0, "the window shows the view again"
 
 
+def test_screenshot_without_memory_is_reported(user, monkeypatch):
+    def fail(*args, **options):
+        raise MemoryError("no memory")
+
+    written = len(user.viewer.screenshots)
+    monkeypatch.setattr("pansplat_viewer.viewer.write_screenshot", fail)
+    user.click("PNG")
+    assert user.data.error == "no screenshot written: the memory is exhausted (MemoryError: no memory)"
+    assert len(user.viewer.screenshots) == written
+    user.click("OK")
+    assert user.data.error is None
+
+
 def test_exr_screenshot_holds_color_and_radial_depth(user):
     user.press(imgui.Key.left_shift, imgui.Key.mod_shift, imgui.Key.p)
     user.click("EXR + depth")
