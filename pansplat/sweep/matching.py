@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numba as nb
@@ -261,6 +262,32 @@ def _compute_set_cost(
             for j in range(width):
                 for k in range(first, last):
                     cost[i, j, offset + k] = result[i, j, k - first]
+
+
+class DepthRange(NamedTuple):
+    """Inverse depths of the search, 1/m.
+
+    Attributes:
+        farthest: limit beyond the given range, for surfaces that are farther than the user thinks.
+        low, high: the given range.
+    """
+
+    farthest: float
+    low: float
+    high: float
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        return self.farthest, self.high
+
+    def step(self, count: int) -> float:
+        """Distance of `count` values over the given range."""
+        return (self.high - self.low) / (count - 1)
+
+    def sample(self, count: int) -> np.ndarray:
+        """`count` values over the given range, continued with the same step beyond it."""
+        step = self.step(count)
+        return self.low + step * np.arange(-int((self.low - self.farthest) / step), count)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,13 +21,14 @@ import cv2
 import numpy as np
 
 from pansplat.geometry.equirect import row_weights
-from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View, compute_matching_cost
+from pansplat.sweep.matching import DepthRange, HypothesisSet, MatchingConfig, View, compute_matching_cost
 from pansplat.sweep.surface import Surface, pad_sphere, ray_grid, world_points
 
 _MIN_GRADIENT = 0.02  # per pixel; smaller gradients are noise
 _MAX_GRADIENT = 0.2  # larger gradients have the weight of this one
 
 _BIN_WIDTH = 1 / 9  # in units of `near`: 5 cm indoors
+_REACH = 1.5  # largest offset of a plane from the cameras' mean, relative to the largest depth
 _MIN_SOLID_ANGLE, _MAX_SOLID_ANGLE = 2e-4, 2e-2  # fractions of the sphere at which a plane's support is 0 and 1
 _DOWN_AXIS = 0
 MIN_FLOOR = 0.9  # smallest distance of the floor or ceiling from the camera, in units of `near`
@@ -195,7 +196,7 @@ class ScenePlanes:
 def make_empty_planes(cam2world: np.ndarray, axes: np.ndarray, near: float, far: float) -> ScenePlanes:
     """Planes without evidence, around the mean of the cameras; `near` sets the bins' width and `far` their range."""
     width = near * _BIN_WIDTH
-    empty = np.zeros((3, 2 * int(1.5 * far / width)))
+    empty = np.zeros((3, 2 * int(_REACH * far / width)))
     return ScenePlanes(axes, cam2world[:, :3, 3].mean(axis=0), empty, width, empty)
 
 
@@ -222,7 +223,7 @@ def detect_planes(
     rays: Sequence[np.ndarray],
     cam2world: np.ndarray,
     planes: ScenePlanes,
-    limits: tuple[float, float],
+    depths: DepthRange,
     min_floor: float,
     config: MatchingConfig,
 ) -> ScenePlanes:
@@ -230,7 +231,7 @@ def detect_planes(
 
     Args:
         rays: (3, h, w) for each view, components of its rays along the scene's axes.
-        limits: smallest and largest inverse depth, 1/m.
+        depths: range of the search.
         min_floor: smallest distance of floor and ceiling from the cameras' mean, metres.
     """
     votes = np.zeros_like(planes.histogram)
@@ -238,13 +239,14 @@ def detect_planes(
         for other in range(len(views)):
             if other != view:
                 poses = (cam2world[view], cam2world[other])
-                votes += _count_votes(views[view], views[other], rays[view], poses, planes, limits, config)
+                votes += _count_votes(views[view], views[other], rays[view], poses, planes, depths, config)
     support = np.log1p(votes / (_MIN_VOTES * votes.max() + 1e-9)) / math.log1p(1 / _MIN_VOTES)
     offsets = planes.offsets
     floor_ceiling = []
     for sign in (1, -1):
         side = np.where(sign * offsets > min_floor, votes[0], 0)
-        distinct = side.max() > _DISTINCT * np.median(side[sign * offsets > min_floor])
+        usual = (sign * offsets > min_floor) & (sign * offsets < _REACH / depths.low)
+        distinct = side.max() > _DISTINCT * np.median(side[usual])
         floor_ceiling.append(float(offsets[side.argmax()]) if distinct else sign * math.inf)
     return dataclasses.replace(planes, votes=support, floor_ceiling=(floor_ceiling[0], floor_ceiling[1]))
 
@@ -255,23 +257,22 @@ def _count_votes(
     rays: np.ndarray,
     poses: tuple[np.ndarray, np.ndarray],
     planes: ScenePlanes,
-    limits: tuple[float, float],
+    depths: DepthRange,
     config: MatchingConfig,
 ) -> np.ndarray:
     """Votes (3, bins) of one view's pixels, matched against one other view."""
     here, there = poses
-    low, high = limits
-    step = (high - low) / (_CANDIDATES - 1)
-    inverse = low + step * np.arange(_CANDIDATES)
-    no_penalty = np.zeros((2, _CANDIDATES), np.float32)
+    inverse = depths.sample(_CANDIDATES)
+    step, count = depths.step(_CANDIDATES), len(inverse)
+    no_penalty = np.zeros((2, count), np.float32)
     sets = [
         HypothesisSet(
-            (low * slope).astype(np.float32), (step * slope).astype(np.float32), no_penalty, side,
+            (inverse[0] * slope).astype(np.float32), (step * slope).astype(np.float32), no_penalty, side,
             planes.separating(axis, here, there, inverse),
         )
         for axis, (slope, side) in enumerate(zip(np.abs(rays), (rays > 0).astype(np.uint8), strict=True))
     ]  # fmt: skip
-    cost = compute_matching_cost(view, other, np.linalg.inv(there) @ here, sets, limits, _UNBOUNDED, config)
+    cost = compute_matching_cost(view, other, np.linalg.inv(there) @ here, sets, depths.limits, _UNBOUNDED, config)
     vote = np.exp(-cost / _SOFTNESS)
     vote *= (_vote_weights(view) / vote.sum(axis=-1))[..., None] * np.maximum(_MAX_COST - cost, 0)
     votes = np.zeros_like(planes.histogram)
@@ -279,7 +280,7 @@ def _count_votes(
         centre = planes.axes[axis] @ (here[:3, 3] - planes.origin)
         for sign in (-1, 1):
             facing = sign * rays[axis] > _MIN_SLANT
-            found = vote[facing][:, axis * _CANDIDATES : (axis + 1) * _CANDIDATES].sum(axis=0)
+            found = vote[facing][:, axis * count : (axis + 1) * count].sum(axis=0)
             offset = centre + sign / inverse
             order = np.argsort(offset)
             votes[axis] += np.interp(planes.offsets, offset[order], found[order], left=0, right=0)

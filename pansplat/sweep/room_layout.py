@@ -432,7 +432,8 @@ def apply_wall_bonus(
     _, column = boundary.locate(rays)
     wall = _wall_inverse_depth(walls, rays, column)
     weight = bonus * walls.confidence[column] * boundary.attenuation(walls.base_angle, rays)
-    weight *= (wall > 0) & (rays[0] > ceiling * wall)
+    with np.errstate(invalid="ignore"):  # a ceiling at infinity times a wall without a distance
+        weight *= (wall > 0) & (rays[0] > ceiling * wall)
     k = np.arange(count, dtype=np.float32)
     for axis in (1, 2):
         rows, columns = np.nonzero((weight > 1e-3) & (walls.axis[column] == axis))

@@ -19,6 +19,7 @@ import numpy as np
 
 from pansplat.sweep.matching import (
     AggregationConfig,
+    DepthRange,
     HypothesisSet,
     MatchingConfig,
     View,
@@ -63,6 +64,8 @@ class SearchConfig:
     """Largest number of hypotheses of a set at the coarse level."""
     near_margin: float = 0.75
     """The smallest depth of the search, relative to `near`."""
+    far_margin: float = 10.0
+    """The largest depth of the search, relative to `far`: rooms are often larger than the range that was given."""
     narrow_candidates: tuple[int, int] = (24, 16)
     """Hypotheses of a set at the two finer levels."""
     unverified_confidence: float = 0.1
@@ -120,11 +123,12 @@ def search_surfaces(
     heights = [max(finest // 4, 16), max(finest // 2, 16), finest]
     surfaces: list[Surface] | None = None
     low, high = 1 / posed.far, 1 / (config.near_margin * posed.near)
+    depths = DepthRange(low / config.far_margin, low, high)
     steps = (high - low) * posed.baseline / (math.pi / heights[0])  # candidates are a pixel of parallax apart
     count = int(np.clip(math.ceil(steps), 48, config.max_candidates))
-    step = (high - low) / (count - 1)
-    planes = make_empty_planes(posed.cam2world, axes, posed.near, posed.far)
-    detection = _SearchLevel(posed, min(finest, _DETECTION_HEIGHT), planes, (low, high), config, None)
+    step, candidates = depths.step(count), depths.sample(count)
+    planes = make_empty_planes(posed.cam2world, axes, posed.near, 1 / depths.farthest)
+    detection = _SearchLevel(posed, min(finest, _DETECTION_HEIGHT), planes, depths.limits, config, None)
     coincident, priors = posed.baseline < 1e-3 * posed.near, None
     if prior_model is not None:
         report("estimating depth", 0.02)
@@ -141,7 +145,7 @@ def search_surfaces(
     priors = priors and [prior.resize(heights[0]) for prior in priors]
     report("finding floor, ceiling and walls", 0.05)
     planes = detect_planes(
-        detection.views, detection.rays, posed.cam2world, planes, (low, high), MIN_FLOOR * posed.near, config.matching
+        detection.views, detection.rays, posed.cam2world, planes, depths, MIN_FLOOR * posed.near, config.matching
     )
     boundaries = None
     if config.room_layout is not None:
@@ -152,9 +156,9 @@ def search_surfaces(
     ]
     for n in range(config.coarse_passes):
         report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
-        level = _SearchLevel(posed, heights[0], planes, (low, high), config, surfaces)
+        level = _SearchLevel(posed, heights[0], planes, depths.limits, config, surfaces)
         surfaces = [
-            level.search_full_range(view, count, layouts and layouts[view], priors and priors[view])
+            level.search_full_range(view, candidates, layouts and layouts[view], priors and priors[view])
             for view in range(len(posed.images))
         ]
     for n, height in enumerate(heights[1:]):
@@ -165,7 +169,7 @@ def search_surfaces(
             for s, image in zip(surfaces, posed.images, strict=True)
         ]
         step /= 2
-        level = _SearchLevel(posed, height, planes, (low, high), config, surfaces)
+        level = _SearchLevel(posed, height, planes, depths.limits, config, surfaces)
         surfaces = [
             level.refine(view, config.narrow_candidates[n], step, widen=n == 0) for view in range(len(posed.images))
         ]
@@ -206,15 +210,13 @@ class _SearchLevel:
         ]
 
     def search_full_range(
-        self, view: int, count: int, layout: tuple[FloorBoundary, Walls] | None, prior: DepthPrior | None
+        self, view: int, inverse: np.ndarray, layout: tuple[FloorBoundary, Walls] | None, prior: DepthPrior | None
     ) -> Surface:
-        """The best hypotheses of the whole depth range: spheres (set 0) and planes across the axes (sets 1 to 3)."""
-        low, high = self.limits
-        step = (high - low) / (count - 1)
+        """The best hypotheses: spheres of inverse depths (set 0) and planes across the axes (sets 1 to 3)."""
+        low, step, count = inverse[0], inverse[1] - inverse[0], len(inverse)
         shape = (self.height, 2 * self.height)
         slopes = [np.ones(shape, np.float32)] + [np.abs(r).astype(np.float32) for r in self.rays[view]]
         sides = [np.zeros(shape, np.uint8)] + [(r > 0).astype(np.uint8) for r in self.rays[view]]
-        inverse = low + step * np.arange(count)
         penalties = [np.zeros((2, count), np.float32) for _ in slopes]
         if self.surfaces is not None:  # the first pass has no priors, so that other shapes are found too
             penalties[0] += self.config.sphere_prior

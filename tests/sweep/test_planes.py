@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from pansplat.sweep.matching import MatchingConfig
+from pansplat.sweep.matching import DepthRange, MatchingConfig
 from pansplat.sweep.planes import (
     ScenePlanes,
     axis_components,
@@ -185,7 +185,9 @@ def detect(views_of):
             posed, posed.images if images is None else images, posed.masks if masks is None else masks
         )
         planes = make_empty_planes(posed.cam2world, _AXES, posed.near, posed.far)
-        return detect_planes(views, rays, posed.cam2world, planes, (0.125, 2.5), 0.45, MatchingConfig())
+        return detect_planes(
+            views, rays, posed.cam2world, planes, DepthRange(0.125, 0.125, 2.5), 0.45, MatchingConfig()
+        )
 
     return run
 

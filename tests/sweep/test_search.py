@@ -53,8 +53,20 @@ def test_finer_panoramas_give_finer_surfaces(empty_room, two_poses, observe):
 
 def test_surfaces_stay_within_the_depth_range(small_furnished_room):
     inverse = _search(small_furnished_room.posed, near=2.0, far=2.5)  # too narrow for the room
-    margin = SearchConfig().near_margin
-    assert inverse.min() >= np.float32(1 / 2.5) and inverse.max() <= np.float32(1 / (2.0 * margin))
+    near, far = 2.0 * SearchConfig().near_margin, 2.5 * SearchConfig().far_margin
+    assert inverse.min() >= np.float32(1 / far) and inverse.max() <= np.float32(1 / near)
+
+
+@pytest.mark.parametrize("far_margin", (1.0, 10.0), ids=("far is the limit", "far is exceeded"))
+def test_walls_beyond_far_are_found(empty_room, far_margin):
+    posed = dataclasses.replace(empty_room.posed, far=1.8)
+    config = SearchConfig(far_margin=far_margin)
+    beyond = empty_room.depths > 2.0
+    found = np.stack([s.inverse_depth for s in search_surfaces(posed, config, lambda what, fraction: None)])
+    error = np.abs(1 / (found * empty_room.depths) - 1)
+    assert beyond.mean() > 0.3
+    assert (np.median(error[beyond]) < 0.03) == (far_margin > 1)
+    assert np.median(error[~beyond]) < 0.03
 
 
 @pytest.mark.slow
