@@ -54,7 +54,7 @@ class MatchingConfig:
     """Cost of a plane between the two cameras: each would see a different side of it."""
     tolerance: float = 0.08
     """Relative difference of inverse depth within which two views are consistent."""
-    outside_penalty: float = 1.0
+    outside_penalty: float = 0.3
     """For a hypothesis below the floor or above the ceiling."""
     textureless_weight: float = 0.3
     """Weight of the matching cost in a window without texture; it is one in a textured window."""
