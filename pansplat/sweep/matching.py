@@ -268,7 +268,7 @@ class DepthRange(NamedTuple):
     """Inverse depths of the search, 1/m.
 
     Attributes:
-        farthest: limit beyond the given range, for surfaces that are farther than the user thinks.
+        farthest: limit beyond the given range, for surfaces that are farther than `far`.
         low, high: the given range.
     """
 
@@ -278,6 +278,7 @@ class DepthRange(NamedTuple):
 
     @property
     def limits(self) -> tuple[float, float]:
+        """Smallest and largest inverse depth of the search."""
         return self.farthest, self.high
 
     def step(self, count: int) -> float:
