@@ -121,16 +121,16 @@ class NetworkObservation:
     """`ObservedViews` of a depth network."""
 
     def __init__(self, network: DepthRefinement, estimate: DepthEstimate, observed: Observations) -> None:
-        self.network, self._estimate, self._observed = network, estimate, observed
+        self.network, self._observed = network, observed
         self.priors = _as_priors(estimate)
 
     @torch.no_grad()
-    def refine(self, camera_heights: Sequence[float], cam2world: np.ndarray, iterations: int) -> list[DepthPrior]:
-        """The estimates in the unit of the poses (v, 4, 4), refined by comparison of the views."""
-        factor = torch.tensor(camera_heights, dtype=torch.float32).log()[:, None, None]
-        estimate = DepthEstimate(self._estimate.log_depth + factor, self._estimate.log_scale)
-        count = len(camera_heights)
-        pairs = [(view, other) for view in range(count) for other in range(count) if other != view]
+    def refine(self, estimates: Sequence[DepthPrior], cam2world: np.ndarray, iterations: int) -> list[DepthPrior]:
+        """Estimates in the unit of the poses (v, 4, 4), refined by comparison of the views."""
+        log_depth = torch.from_numpy(np.stack([estimate.log_depth for estimate in estimates])).float()
+        log_scale = torch.from_numpy(np.stack([estimate.scale for estimate in estimates])).float().log()
+        estimate, views = DepthEstimate(log_depth, log_scale), range(len(estimates))
+        pairs = [(view, other) for view in views for other in views if other != view]
         for _ in range(iterations):
             estimate = self.network.refine(self._observed, estimate, torch.from_numpy(cam2world), pairs)
         return _as_priors(estimate)

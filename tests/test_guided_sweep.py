@@ -19,6 +19,7 @@ from pansplat.model.depth_network import DepthNetworkConfig
 from pansplat.model.depth_refinement import DepthRefinement, RefinementConfig
 from pansplat.model.weights import pack_weights, save_weights
 from pansplat.pipeline import load_model, load_pairs, predict, render
+from pansplat.sweep.prior import DepthPrior
 
 _OF_A_VIEW = ("images", "masks", "cam2world")
 _CONFIG = RefinementConfig(
@@ -67,7 +68,8 @@ def test_refined_depth_is_in_the_unit_of_the_poses():
     far = poses.copy()
     far[:, :3, 3] *= 10
     observed = prior.observe(_images(3))
-    small, large = observed.refine([1.5] * 3, poses, 2), observed.refine([15.0] * 3, far, 2)
+    starts = [[DepthPrior(p.log_depth + np.log(height), p.scale) for p in observed.priors] for height in (1.5, 15.0)]
+    small, large = observed.refine(starts[0], poses, 2), observed.refine(starts[1], far, 2)
     for a, b in zip(small, large, strict=True):
         np.testing.assert_allclose(a.log_depth + np.log(10), b.log_depth, atol=5e-3)
 

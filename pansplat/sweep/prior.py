@@ -1,9 +1,11 @@
-"""A prior of each view's depth in the search, from a model that knows what rooms look like.
+"""Priors of each view's depth in the search, from a model that knows what rooms look like.
 
 The model sees upright panoramas. Its first estimate is the logarithm of depth in units of the camera's height over the
 floor; the height follows by matching: the estimated surfaces, scaled by each candidate, are warped into the other
-views. The model then refines its estimates by comparison of the views. In the search the prior is a cost for
-hypotheses whose depth differs from it, relative to its uncertainty.
+views. The floor gives one height and all surfaces another one, because the walls of a hall are farther away than the
+model expects. The model refines its estimates by comparison of the views: from both heights and from the surfaces of
+the search's first pass. In the search a prior is a cost for hypotheses whose depth differs from it, relative to its
+uncertainty. The prior of lowest cost counts.
 """
 
 from __future__ import annotations
@@ -21,13 +23,16 @@ import torch
 from pansplat.geometry.equirect import rotate_equirect
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View, compute_matching_cost
 from pansplat.sweep.planes import texture_weights
-from pansplat.sweep.surface import resize_sphere
+from pansplat.sweep.surface import Surface, resize_sphere
 
 _HEIGHT_CANDIDATES = 64
 _SHARP_SCALE = 0.08  # Laplace scale up to which a pixel has full weight in the search of the height
 _MAX_COST = 1.2  # matching cost above which a pixel does not count against a height
 _MIN_TILT = math.radians(0.5)  # of a camera that is turned upright
 _USUAL_HEIGHT = 1.5  # metres, of a camera over the floor
+_HEIGHT_PENALTY = 0.06  # matching cost of a height by a factor of e from the usual one
+_FLOOR_TOLERANCE = 0.15  # in camera heights, from the floor to the pixels that the model places on it
+_SAME_HEIGHT = 0.02  # relative difference of two heights whose priors are the same
 _UNBOUNDED = (math.inf, -math.inf)
 
 
@@ -41,6 +46,8 @@ class PriorConfig:
     """Deviation, in Laplace scales, above which the cost is constant."""
     min_scale: float = 0.03
     """Smallest Laplace scale of log-depth."""
+    further_penalty: float = 0.25
+    """Added to the deviation from each prior but the first, in Laplace scales."""
     iterations: int = 2
     """Refinements by comparison of the views."""
 
@@ -63,9 +70,8 @@ class DepthPrior:
 
     def rotate(self, rotation: np.ndarray) -> DepthPrior:
         """The prior of the camera rotated by `rotation` (3, 3), its new axes in the old ones."""
-        both = torch.from_numpy(np.stack((self.log_depth, self.scale)))
-        rotated = rotate_equirect(both, torch.from_numpy(rotation)).numpy()
-        return DepthPrior(rotated[0], rotated[1])
+        rotated = _rotate_image(np.stack((self.log_depth, self.scale), axis=-1), rotation)
+        return DepthPrior(rotated[..., 0], rotated[..., 1])
 
 
 class ObservedViews(Protocol):
@@ -77,8 +83,8 @@ class ObservedViews(Protocol):
 
     priors: list[DepthPrior]
 
-    def refine(self, camera_heights: Sequence[float], cam2world: np.ndarray, iterations: int) -> list[DepthPrior]:
-        """The estimates in the unit of the poses (v, 4, 4), refined by comparison of the views."""
+    def refine(self, estimates: Sequence[DepthPrior], cam2world: np.ndarray, iterations: int) -> list[DepthPrior]:
+        """Estimates in the unit of the poses (v, 4, 4), refined by comparison of the views."""
         ...
 
 
@@ -92,45 +98,85 @@ class PriorModel(Protocol):
         ...
 
 
-def estimate_priors(
-    model: PriorModel,
-    images: Sequence[np.ndarray],
-    cam2world: np.ndarray,
-    views: Sequence[View],
-    down: np.ndarray,
-    limits: tuple[float, float],
-    config: PriorConfig,
-    matching: MatchingConfig,
-    *,
-    coincident: bool = False,
-) -> list[DepthPrior]:
-    """The prior of each view, in the unit of the poses.
-
-    Cameras that coincide cannot be compared: each view has the model's first estimate, with a usual camera height.
+class PriorEstimator:
+    """Estimates the priors of each view, in the unit of the poses.
 
     Args:
         images: (h, w, 3) of each view.
         cam2world: (v, 4, 4).
-        views: the views at the size at which heights are compared.
         down: (3,) unit vector of the world.
-        limits: smallest and largest inverse height of the cameras over the floor.
     """
-    turns = [_upright_rotation(pose[:3, :3], down) for pose in cam2world]
-    upright = [image if turn is None else _rotate_image(image, turn) for image, turn in zip(images, turns, strict=True)]
-    observed = model.observe(upright)
-    first = [
-        prior if turn is None else prior.rotate(turn.T) for prior, turn in zip(observed.priors, turns, strict=True)
-    ]
-    if coincident:
-        log_height = math.log(min(max(_USUAL_HEIGHT, 1 / limits[1]), 1 / limits[0]))
-        return [DepthPrior(prior.log_depth + log_height, prior.scale) for prior in first]
-    heights = _estimate_camera_heights(first, views, cam2world, down, limits, matching)
-    poses = np.array(cam2world, np.float64)
-    for pose, turn in zip(poses, turns, strict=True):
-        if turn is not None:
-            pose[:3, :3] = pose[:3, :3] @ turn
-    refined = observed.refine(heights, poses, config.iterations)
-    return [prior if turn is None else prior.rotate(turn.T) for prior, turn in zip(refined, turns, strict=True)]
+
+    def __init__(
+        self,
+        model: PriorModel,
+        images: Sequence[np.ndarray],
+        cam2world: np.ndarray,
+        down: np.ndarray,
+        config: PriorConfig,
+    ) -> None:
+        self._cam2world, self._down, self._config = cam2world, down, config
+        self._turns = [_upright_rotation(pose[:3, :3], down) for pose in cam2world]
+        self._observed = model.observe(
+            [i if turn is None else _rotate_image(i, turn) for i, turn in zip(images, self._turns, strict=True)]
+        )
+        self._upright_poses = np.array(cam2world, np.float64)
+        for pose, turn in zip(self._upright_poses, self._turns, strict=True):
+            if turn is not None:
+                pose[:3, :3] = pose[:3, :3] @ turn
+        self._priors: list[list[DepthPrior]] = [[] for _ in self._turns]
+
+    def estimate_at_usual_height(self, limits: tuple[float, float]) -> list[DepthPrior]:
+        """The model's first estimates with a usual camera height, for cameras that coincide.
+
+        Args:
+            limits: smallest and largest inverse height of the cameras over the floor.
+        """
+        height = min(max(_USUAL_HEIGHT, 1 / limits[1]), 1 / limits[0])
+        return self._turn_back(_scale_depth(self._observed.priors, [height] * len(self._turns)))
+
+    def estimate_by_matching(
+        self, views: Sequence[View], limits: tuple[float, float], matching: MatchingConfig
+    ) -> list[list[DepthPrior]]:
+        """The priors of each view, from the height by the floor and, where it differs, from that by all surfaces.
+
+        Args:
+            views: the views at the size at which heights are compared.
+            limits: smallest and largest inverse height of the cameras over the floor.
+        """
+        first = self._turn_back(self._observed.priors)
+        heights = [
+            _estimate_camera_heights(first, views, self._cam2world, self._down, limits, matching, floor_only=floor_only)
+            for floor_only in (True, False)
+        ]
+        if np.abs(np.log(np.divide(*heights))).max() < _SAME_HEIGHT:
+            heights.pop()
+        refined = [self._refine(_scale_depth(self._observed.priors, h), self._config.iterations) for h in heights]
+        self._priors = [list(own) for own in zip(*refined, strict=True)]
+        return self._priors
+
+    def estimate_from_surfaces(self, surfaces: Sequence[Surface]) -> list[list[DepthPrior]]:
+        """The priors that were found by matching, and one of each view that is refined once from its surface."""
+        estimates = []
+        for surface, own, turn in zip(surfaces, self._priors, self._turns, strict=True):
+            inverse = resize_sphere(surface.inverse_depth, len(own[0].scale))
+            start = DepthPrior(-np.log(np.maximum(inverse, 1e-6)), own[0].scale)
+            estimates.append(start if turn is None else start.rotate(turn))
+        refined = self._refine(estimates, 1)
+        return [[*own, last] for own, last in zip(self._priors, refined, strict=True)]
+
+    def _refine(self, estimates: Sequence[DepthPrior], iterations: int) -> list[DepthPrior]:
+        """Estimates of the upright panoramas, refined and turned back."""
+        return self._turn_back(self._observed.refine(estimates, self._upright_poses, iterations))
+
+    def _turn_back(self, priors: Sequence[DepthPrior]) -> list[DepthPrior]:
+        """Priors of the upright panoramas as ones of the panoramas."""
+        return [p if turn is None else p.rotate(turn.T) for p, turn in zip(priors, self._turns, strict=True)]
+
+
+def _scale_depth(priors: Sequence[DepthPrior], factors: Sequence[float]) -> list[DepthPrior]:
+    """The priors with their depths multiplied by one factor each."""
+    return [DepthPrior(p.log_depth + math.log(factor), p.scale) for p, factor in zip(priors, factors, strict=True)]
 
 
 def _upright_rotation(rotation: np.ndarray, down: np.ndarray) -> np.ndarray | None:
@@ -158,34 +204,51 @@ def _estimate_camera_heights(
     down: np.ndarray,
     limits: tuple[float, float],
     config: MatchingConfig,
+    *,
+    floor_only: bool,
 ) -> list[float]:
-    """The height of each camera over the common floor at which the priors match the other views best."""
+    """The height of each camera over the common floor at which the priors match the other views best.
+
+    Args:
+        floor_only: whether only the pixels count that the priors place on the floor.
+    """
     above = -(cam2world[:, :3, 3] @ down)  # of each camera, over any level
     above -= above.mean()
+    priors = [prior.resize(len(view.image)) for prior, view in zip(priors, views, strict=True)]
+    weights = [_height_weights(*pair, floor_only=floor_only) for pair in zip(priors, views, strict=True)]
+    unit = (len(views) - 1) * max(sum(float(weight.sum()) for weight in weights), 1e-9)
     low, high = limits
-    for _ in range(2):  # all heights, then the ones around the best
+    for penalty in (_HEIGHT_PENALTY, 0.01 * _HEIGHT_PENALTY):  # all heights, then the ones around the best
         candidates = np.linspace(low, high, _HEIGHT_CANDIDATES)  # inverse heights
-        total = np.zeros(_HEIGHT_CANDIDATES)
+        total = unit * penalty * np.abs(np.log(_USUAL_HEIGHT * candidates))
         for n, prior in enumerate(priors):
             own = 1 / np.maximum(1 / candidates + above[n], 1 / limits[1])  # this camera's, by the mean's
             sampled = np.linspace(own[0], max(own[-1], own[0] + 1e-6), _HEIGHT_CANDIDATES)
-            total += np.interp(own, sampled, _match_heights(prior, n, views, cam2world, sampled, config))
+            costs = _match_heights(prior, weights[n], n, views, cam2world, sampled, config)
+            total += np.interp(own, sampled, costs)
         best, step = candidates[total.argmin()], candidates[1] - candidates[0]
         low, high = max(best - 2 * step, limits[0]), min(best + 2 * step, limits[1])
     return [max(1 / best + float(a), 1 / limits[1]) for a in above]
 
 
+def _height_weights(prior: DepthPrior, view: View, *, floor_only: bool) -> np.ndarray:
+    """Weights (h, w) of a view's pixels in the search of the height: textured, and of a certain prior."""
+    weight = texture_weights(view) * np.minimum(_SHARP_SCALE / np.maximum(prior.scale, 1e-3), 1)
+    if floor_only:
+        weight *= np.abs(np.exp(prior.log_depth) * view.down - 1) < _FLOOR_TOLERANCE
+    return weight
+
+
 def _match_heights(
     prior: DepthPrior,
+    weight: np.ndarray,
     index: int,
     views: Sequence[View],
     cam2world: np.ndarray,
     candidates: np.ndarray,
     config: MatchingConfig,
 ) -> np.ndarray:
-    """Weighted matching cost (candidates) of a view's prior at each inverse height."""
-    view = views[index]
-    prior = prior.resize(view.image.shape[0])
+    """Sum of the weighted matching costs (candidates) of a view's prior at each inverse height."""
     inverse = np.exp(-prior.log_depth).astype(np.float32)
     shape = HypothesisSet(
         (candidates[0] * inverse).astype(np.float32),
@@ -193,35 +256,38 @@ def _match_heights(
         np.zeros((2, len(candidates)), np.float32),
         np.zeros(inverse.shape, np.uint8),
     )
-    weight = texture_weights(view)
-    weight *= np.minimum(_SHARP_SCALE / np.maximum(prior.scale, 1e-3), 1)
     total = np.zeros(len(candidates))
     for n, other in enumerate(views):
         if n != index:
             pose = np.linalg.inv(cam2world[n]) @ cam2world[index]
-            cost = compute_matching_cost(view, other, pose, [shape], (1e-6, 1e6), _UNBOUNDED, config)
+            cost = compute_matching_cost(views[index], other, pose, [shape], (1e-6, 1e6), _UNBOUNDED, config)
             total += np.einsum("hw,hwk->k", weight, np.minimum(cost, _MAX_COST))
     return total
 
 
-def apply_prior_cost(cost: np.ndarray, prior: DepthPrior, sets: Sequence[HypothesisSet], config: PriorConfig) -> None:
-    """Add the prior's cost to that of all hypotheses (h, w, sets * count), in place."""
+def apply_prior_cost(
+    cost: np.ndarray, priors: Sequence[DepthPrior], sets: Sequence[HypothesisSet], config: PriorConfig
+) -> None:
+    """Add the lowest cost of the priors to that of all hypotheses (h, w, sets * count), in place."""
     count = sets[0].penalty.shape[1]
-    log_depth = prior.log_depth.astype(np.float32)
-    scale = np.maximum(prior.scale, config.min_scale).astype(np.float32)
+    log_depth = np.stack([prior.log_depth for prior in priors]).astype(np.float32)
+    scale = np.stack([np.maximum(prior.scale, config.min_scale) for prior in priors]).astype(np.float32)
+    penalty = np.where(np.arange(len(priors)) > 0, config.further_penalty, 0).astype(np.float32)
     for n, hypotheses in enumerate(sets):
         _add_cost(
-            cost, log_depth, scale, hypotheses.base, hypotheses.step, n * count, count,
+            cost, log_depth, scale, penalty, hypotheses.base, hypotheses.step, n * count, count,
             np.float32(config.weight), np.float32(config.cap),
         )  # fmt: skip
 
 
 @nb.njit(parallel=True, fastmath=True, cache=True)
-def _add_cost(cost, log_depth, scale, base, step, offset, count, weight, cap):
-    height, width = log_depth.shape
+def _add_cost(cost, log_depth, scale, penalty, base, step, offset, count, weight, cap):
+    priors, height, width = log_depth.shape
     for i in nb.prange(height):
         for j in range(width):
             for k in range(count):
-                inverse = max(base[i, j] + np.float32(k) * step[i, j], np.float32(1e-6))
-                away = abs(math.log(inverse) + log_depth[i, j]) / scale[i, j]
-                cost[i, j, offset + k] += weight * min(away, cap)
+                log_inverse = math.log(max(base[i, j] + np.float32(k) * step[i, j], np.float32(1e-6)))
+                away = cap
+                for n in range(priors):
+                    away = min(away, abs(log_inverse + log_depth[n, i, j]) / scale[n, i, j] + penalty[n])
+                cost[i, j, offset + k] += weight * away

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -36,7 +36,7 @@ from pansplat.sweep.planes import (
     estimate_axes,
     make_empty_planes,
 )
-from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorModel, apply_prior_cost, estimate_priors
+from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, PriorModel, apply_prior_cost
 from pansplat.sweep.room_layout import (
     FloorBoundary,
     RoomLayoutConfig,
@@ -129,20 +129,20 @@ def search_surfaces(
     step, candidates = depths.step(count), depths.sample(count)
     planes = make_empty_planes(posed.cam2world, axes, posed.near, 1 / depths.farthest)
     detection = _SearchLevel(posed, min(finest, _DETECTION_HEIGHT), planes, depths.limits, config, None)
-    coincident, priors = posed.baseline < 1e-3 * posed.near, None
+    coincident, estimator = posed.baseline < 1e-3 * posed.near, None
     if prior_model is not None:
         report("estimating depth", 0.02)
-        priors = estimate_priors(
-            prior_model, posed.images, posed.cam2world, detection.views, axes[0], (low, high), config.prior,
-            config.matching, coincident=coincident,
-        )  # fmt: skip
+        estimator = PriorEstimator(prior_model, posed.images, posed.cam2world, axes[0], config.prior)
     if coincident:  # nothing can be matched
         shape = (finest, 2 * finest)
         inverse = np.full((len(posed.images), *shape), 0.5 * (1 / posed.near + 1 / posed.far), np.float32)
-        if priors is not None:
-            inverse = np.stack([np.exp(-prior.resize(finest).log_depth) for prior in priors]).clip(low, high)
+        if estimator is not None:
+            first = estimator.estimate_at_usual_height((low, high))
+            inverse = np.stack([np.exp(-prior.resize(finest).log_depth) for prior in first]).clip(low, high)
         return [Surface(values.astype(np.float32), np.zeros(shape, np.uint8)) for values in inverse]
-    priors = priors and [prior.resize(heights[0]) for prior in priors]
+    priors: Sequence[Sequence[DepthPrior]] = [()] * len(posed.images)
+    if estimator is not None:
+        priors = estimator.estimate_by_matching(detection.views, (low, high), config.matching)
     report("finding floor, ceiling and walls", 0.05)
     planes = detect_planes(
         detection.views, detection.rays, posed.cam2world, planes, depths, MIN_FLOOR * posed.near, config.matching
@@ -156,9 +156,11 @@ def search_surfaces(
     ]
     for n in range(config.coarse_passes):
         report("searching the whole depth range", 0.1 + 0.4 * n / config.coarse_passes)
+        if estimator is not None and surfaces is not None:
+            priors = estimator.estimate_from_surfaces(surfaces)
         level = _SearchLevel(posed, heights[0], planes, depths.limits, config, surfaces)
         surfaces = [
-            level.search_full_range(view, candidates, layouts and layouts[view], priors and priors[view])
+            level.search_full_range(view, candidates, layouts and layouts[view], priors[view])
             for view in range(len(posed.images))
         ]
     for n, height in enumerate(heights[1:]):
@@ -210,7 +212,11 @@ class _SearchLevel:
         ]
 
     def search_full_range(
-        self, view: int, inverse: np.ndarray, layout: tuple[FloorBoundary, Walls] | None, prior: DepthPrior | None
+        self,
+        view: int,
+        inverse: np.ndarray,
+        layout: tuple[FloorBoundary, Walls] | None,
+        priors: Sequence[DepthPrior],
     ) -> Surface:
         """The best hypotheses: spheres of inverse depths (set 0) and planes across the axes (sets 1 to 3)."""
         low, step, count = inverse[0], inverse[1] - inverse[0], len(inverse)
@@ -236,8 +242,8 @@ class _SearchLevel:
             apply_floor_costs(cost, layout[0], sets, is_floor, self.rays[view], self.config.room_layout)
             if self.surfaces is not None:
                 self._apply_walls(view, *layout, sets, cost)
-        if prior is not None:
-            apply_prior_cost(cost, prior, sets, self.config.prior)
+        if priors:
+            apply_prior_cost(cost, [prior.resize(self.height) for prior in priors], sets, self.config.prior)
         return self._select_hypotheses(view, sets, cost, slot_map.astype(np.float32), count)
 
     def _apply_walls(

@@ -5,9 +5,9 @@ import pytest
 
 from pansplat.sweep import prior as prior_module
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View
-from pansplat.sweep.prior import DepthPrior, PriorConfig, apply_prior_cost, estimate_priors
+from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, apply_prior_cost
 from pansplat.sweep.search import SearchConfig, search_surfaces
-from pansplat.sweep.surface import ray_grid, resize_sphere
+from pansplat.sweep.surface import Surface, ray_grid, resize_sphere
 
 _CAMERA_HEIGHT = 1.2  # of `Room.high` over y = 0, metres
 _DOWN = np.array((0.0, 1.0, 0.0))
@@ -19,7 +19,7 @@ class TrueDepth:
     fingerprint = "truth"
 
     def __init__(self, room, poses):
-        self.room, self.poses = room, poses
+        self.room, self.poses, self.starts = room, poses, []
 
     def observe(self, images):
         self.images, self.priors = images, []
@@ -28,22 +28,37 @@ class TrueDepth:
             self.priors.append(DepthPrior(np.log(depth), np.full(depth.shape, 0.05)))
         return self
 
-    def refine(self, camera_heights, cam2world, iterations):
-        self.heights, self.cam2world, self.iterations = camera_heights, cam2world, iterations
-        return [
-            DepthPrior(prior.log_depth + math.log(height), prior.scale)
-            for prior, height in zip(self.priors, camera_heights, strict=True)
-        ]
+    def refine(self, estimates, cam2world, iterations):
+        ratios = [np.median(e.log_depth - p.log_depth) for e, p in zip(estimates, self.priors, strict=True)]
+        self.starts.append(np.exp(ratios))
+        self.cam2world, self.iterations = cam2world, iterations
+        return estimates
+
+
+class SmallHalls(TrueDepth):
+    """The same with all surfaces but the floor at half of their distance, as if halls were homes."""
+
+    def observe(self, images):
+        super().observe(images)
+        for prior, pose in zip(self.priors, self.poses, strict=True):
+            below = np.exp(prior.log_depth) * (ray_grid(64) @ pose[:3, :3].T @ _DOWN)
+            prior.log_depth[np.abs(below - 1) > 0.01] -= math.log(2)
+        return self
 
 
 class TrueHeights(TrueDepth):
-    """The same with the true heights in the refinement, because blank rooms do not show them."""
+    """The same with the true depth after the refinement, because blank rooms do not show the heights."""
 
-    def refine(self, camera_heights, cam2world, iterations):
-        return super().refine([self.room.high[1] - pose[1, 3] for pose in self.poses], cam2world, iterations)
+    def refine(self, estimates, cam2world, iterations):
+        super().refine(estimates, cam2world, iterations)
+        heights = [self.room.high[1] - pose[1, 3] for pose in self.poses]
+        return [
+            DepthPrior(prior.log_depth + math.log(height), prior.scale)
+            for prior, height in zip(self.priors, heights, strict=True)
+        ]
 
 
-def _estimate(room, poses):
+def _estimate(room, poses, model_type=TrueDepth):
     images = [room.cast(pose, 64)[0] for pose in poses]
     down = [ray_grid(64) @ pose[:3, :3].T @ _DOWN for pose in poses]
     views = [View(i, np.ones(i.shape[:2], bool), d.astype(np.float32)) for i, d in zip(images, down, strict=True)]
@@ -51,31 +66,66 @@ def _estimate(room, poses):
     for pose in upright:
         turn = prior_module._upright_rotation(pose[:3, :3], _DOWN)
         pose[:3, :3] = pose[:3, :3] if turn is None else pose[:3, :3] @ turn
-    model = TrueDepth(room, upright)
+    model = model_type(room, upright)
     limits = (1 / 8, 1 / 0.3)
-    priors = estimate_priors(model, images, np.stack(poses), views, _DOWN, limits, PriorConfig(), MatchingConfig())
-    return model, priors
+    estimator = PriorEstimator(model, images, np.stack(poses), _DOWN, PriorConfig())
+    priors = estimator.estimate_by_matching(views, limits, MatchingConfig())
+    assert {len(own) for own in priors} == {len(model.starts)}
+    return model, priors, estimator
 
 
 def test_camera_heights_are_found_by_matching(make_room):
     room = make_room()
     poses = [room.pose((-0.6, 0.0, -0.2)), room.pose((0.5, 0.2, 0.1))]
-    model, _ = _estimate(room, poses)
-    np.testing.assert_allclose(model.heights, (_CAMERA_HEIGHT, _CAMERA_HEIGHT - 0.2), rtol=0.02)
+    model, _, _ = _estimate(room, poses)
+    for heights in model.starts:
+        np.testing.assert_allclose(heights, (_CAMERA_HEIGHT, _CAMERA_HEIGHT - 0.2), rtol=0.02)
+
+
+def test_hall_has_a_prior_by_its_floor_and_one_by_all_surfaces(make_room):
+    room = make_room(low=(-5.0, -4.0, -4.0), high=(5.0, 1.2, 4.5))
+    poses = [room.pose((-0.6, 0.0, -0.2)), room.pose((0.5, 0.0, 0.1))]
+    model, priors, _ = _estimate(room, poses, SmallHalls)
+    np.testing.assert_allclose(model.starts[0], _CAMERA_HEIGHT, rtol=0.03)
+    assert min(model.starts[1]) > 1.7 * _CAMERA_HEIGHT
+    depth = np.log(room.cast(poses[0], 64)[1])
+    errors = [np.abs(prior.log_depth - depth) for prior in priors[0]]
+    assert np.median(np.minimum(*errors)) < 0.1 < np.median(errors[0])
+
+
+def test_blank_room_has_one_prior_at_the_usual_height(make_room):
+    room = make_room("blank")
+    model, _, _ = _estimate(room, [room.pose((-0.6, 0.0, -0.2)), room.pose((0.5, 0.0, 0.1))])
+    assert len(model.starts) == 1
+    np.testing.assert_allclose(model.starts[0], 1.5, rtol=0.06)  # a step of the candidates
 
 
 def test_tilted_cameras_are_turned_upright(make_room, turn):
     room = make_room()
     tilt = turn("x", 12) @ turn("z", -9)
     poses = [room.pose((-0.6, 0.0, -0.2), tilt), room.pose((0.5, 0.0, 0.1))]
-    model, priors = _estimate(room, poses)
+    model, priors, _ = _estimate(room, poses)
     np.testing.assert_allclose(model.cam2world[0, :3, 1], _DOWN, atol=1e-6)
     np.testing.assert_array_equal(model.cam2world[1], poses[1])
     assert np.abs(model.images[0] - room.cast(model.cam2world[0], 64)[0]).mean() < 0.02
     error = np.abs(
-        priors[0].log_depth - np.log(room.cast(poses[0], 64)[1]) - math.log(model.heights[0] / _CAMERA_HEIGHT)
+        priors[0][0].log_depth - np.log(room.cast(poses[0], 64)[1]) - math.log(model.starts[0][0] / _CAMERA_HEIGHT)
     )
     assert np.median(error) < 0.01
+
+
+def test_surfaces_give_one_more_prior(make_room, turn):
+    room = make_room()
+    poses = [room.pose((-0.6, 0.0, -0.2), turn("x", 12) @ turn("z", -9)), room.pose((0.5, 0.0, 0.1))]
+    model, priors, estimator = _estimate(room, poses)
+    depths = [1.3 * room.cast(pose, 64)[1] for pose in poses]
+    surfaces = [Surface((1 / depth).astype(np.float32), np.zeros(depth.shape, np.uint8)) for depth in depths]
+    more = estimator.estimate_from_surfaces(surfaces)
+    assert model.iterations == 1
+    for before, after, depth in zip(priors, more, depths, strict=True):
+        assert after[:-1] == before
+        assert np.median(np.abs(after[-1].log_depth - np.log(depth))) < 0.01
+        np.testing.assert_allclose(after[-1].scale, 0.05, rtol=1e-5)
 
 
 def test_upside_down_camera_is_turned_by_half(turn):
@@ -94,20 +144,26 @@ def test_prior_rotated_there_and_back_is_the_same(make_room, turn):
 
 
 @pytest.mark.parametrize("cap", (0.5, 3.0))
-def test_cost_grows_with_the_deviation_up_to_the_cap(cap):
+@pytest.mark.parametrize("count_priors", (1, 3))
+def test_cost_grows_with_the_deviation_from_the_nearest_prior_up_to_the_cap(cap, count_priors):
     generator = np.random.default_rng(0)
     shape, count = (4, 8), 5
     base = generator.uniform(0.2, 0.4, shape).astype(np.float32)
     hypotheses = HypothesisSet(
         base, np.full(shape, 0.1, np.float32), np.zeros((2, count), np.float32), np.zeros(shape, np.uint8)
     )
-    prior = DepthPrior(generator.uniform(0, 1, shape), generator.uniform(0.01, 0.5, shape))
-    config = PriorConfig(weight=0.7, cap=cap, min_scale=0.1)
+    priors = [
+        DepthPrior(generator.uniform(0, 1, shape), generator.uniform(0.01, 0.5, shape)) for _ in range(count_priors)
+    ]
+    config = PriorConfig(weight=0.7, cap=cap, min_scale=0.1, further_penalty=0.4)
     cost = np.ones((*shape, count), np.float32)
-    apply_prior_cost(cost, prior, [hypotheses], config)
+    apply_prior_cost(cost, priors, [hypotheses], config)
     log_inverse = np.log(base[..., None] + 0.1 * np.arange(count))
-    away = np.abs(log_inverse + prior.log_depth[..., None]) / np.maximum(prior.scale, 0.1)[..., None]
-    np.testing.assert_allclose(cost, 1 + 0.7 * np.minimum(away, cap), rtol=1e-4)
+    away = [
+        np.abs(log_inverse + prior.log_depth[..., None]) / np.maximum(prior.scale, 0.1)[..., None] + (0.4 if n else 0)
+        for n, prior in enumerate(priors)
+    ]
+    np.testing.assert_allclose(cost, 1 + 0.7 * np.minimum(np.min(away, axis=0), cap), rtol=1e-4)
 
 
 def test_resized_prior_keeps_its_values():
