@@ -509,10 +509,9 @@ def render(
     if blend == "joint" or num_views < 2:
         return rasterize_gaussians(scene.gaussians, pose)
     weights = blend_weights(pose[:3, 3], scene.cam2world[:, :3, 3].double())
-    # Views of zero weight do not contribute; at an input pose one view remains.
-    views = [view for view in range(num_views) if float(weights[view]) > 0]
-    renderings = [rasterize_gaussians(scene.gaussians.select(scene.gaussians.views == view), pose) for view in views]
-    return renderings[0] if len(views) == 1 else blend_renderings(renderings, weights[views])
+    views = [scene.gaussians.select(scene.gaussians.views == view) for view in range(num_views)]
+    renderings = [rasterize_gaussians(view, pose) for view in views]
+    return blend_renderings(renderings, weights)
 
 
 def _choose_rasterizer(

@@ -1,4 +1,4 @@
-// One weighted layer at one pixel; the blend function adds the layers up.
+// One weighted layer at one pixel. Blending adds the layers up, and keeps the largest alpha.
 // LAYER_STORAGE (layers.py): 0 one image of the same size, 1 cube faces read by a pinhole camera, 2 cube faces read by
 // a panorama. A compile-time constant, because software OpenGL executes both sides of a branch.
 #if LAYER_STORAGE != 0
@@ -13,8 +13,8 @@ uniform vec2 size;              // of the output, pixels
 uniform float focal;            // pixels, storage 1
 uniform mat3 camera_to_faces;
 
-layout(location = 0) out vec4 out_color;    // weighted_alpha x (premultiplied colour, alpha)
-layout(location = 1) out vec4 out_depth;    // weighted_alpha x distance, weighted_alpha
+layout(location = 0) out vec4 out_color;    // weight x premultiplied colour, alpha
+layout(location = 1) out vec4 out_depth;    // weight x (alpha x distance, alpha)
 
 void main() {
 #if LAYER_STORAGE == 0
@@ -36,7 +36,6 @@ void main() {
     float depth = with_depth ? sample_faces(layer_depth, camera_to_faces * ray).r : 0.0;
 #endif
 #endif
-    float weighted_alpha = weight * value.a;
-    out_color = weighted_alpha * value;
-    out_depth = vec4(weight * depth, weighted_alpha, 0.0, 0.0);
+    out_color = vec4(weight * value.rgb, value.a);
+    out_depth = vec4(weight * vec2(depth, value.a), 0.0, 0.0);
 }

@@ -14,13 +14,13 @@ uniform sampler2D color_map;
 layout(location = 0) out vec4 out_color;    // RGB over the background, coverage
 layout(location = 1) out vec4 out_depth;    // radial distance, metres
 
-// `color_sum` and `depth_sum` are the sums of accumulate.frag's outputs.
+// `color_sum` and `depth_sum` are the blended outputs of accumulate.frag.
 void normalize_sum(vec4 color_sum, vec4 depth_sum, out vec4 color, out float depth) {
     color = vec4(background, 0.0);
     depth = 0.0;
     if (depth_sum.g > 0.0) {
-        float alpha = color_sum.a / depth_sum.g;
-        color = vec4(color_sum.rgb / depth_sum.g + (1.0 - alpha) * background, alpha);
+        float alpha = color_sum.a;
+        color = vec4(color_sum.rgb * (alpha / depth_sum.g) + (1.0 - alpha) * background, alpha);
         depth = depth_sum.r / depth_sum.g;
     }
 }

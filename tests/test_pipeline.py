@@ -80,11 +80,26 @@ def test_load_model_returns_a_predictor() -> None:
     assert predictor.name == "sweep" and predictor.fingerprint
 
 
-def test_deferred_blending_at_an_input_pose_renders_that_view_only(scene: Scene) -> None:
+def test_deferred_blending_at_an_input_pose_renders_that_view_where_it_is_opaque(scene: Scene) -> None:
     for view in range(2):
         alone = render(scene, scene.cam2world[view], blend=view)
         deferred = render(scene, scene.cam2world[view])
-        torch.testing.assert_close(deferred.color, alone.color)
+        opaque = alone.alpha > 1 - 1e-6
+        assert opaque.any()
+        torch.testing.assert_close(deferred.color[:, opaque], alone.color[:, opaque])
+
+
+def test_at_an_input_pose_the_other_view_fills_a_hole(scene: Scene) -> None:
+    background = (0.1, 0.7, 0.3)
+    pose, gaussians = scene.cam2world[0], scene.gaussians
+    below = (gaussians.means[:, 1] > pose[1, 3]) & (gaussians.views == 0)
+    cut = replace(scene, gaussians=gaussians.select(~below))
+    alone = render(cut, pose, blend=0, background=background)
+    filled = render(cut, pose, background=background)
+    hole = (alone.alpha == 0) & (render(cut, pose, blend=1).alpha > 0.999)
+    assert hole.any()
+    other = render(cut, pose, blend=1, background=background)
+    torch.testing.assert_close(filled.color[:, hole], other.color[:, hole], atol=1e-3, rtol=0)
 
 
 def test_deferred_blending_equals_the_blend_of_single_views(scene: Scene) -> None:

@@ -374,12 +374,14 @@ class Compositor:
         )
         self._ctx.enable_only(moderngl.NOTHING)  # the first layer overwrites the target, the others are added
         self._ctx.blend_func = moderngl.ONE, moderngl.ONE
+        self._ctx.blend_equation = moderngl.FUNC_ADD, moderngl.MAX
         for layer, weight in weighted:
             set_uniforms(program, weight=weight)
             self._bind_textures(program, layer_color=layer.target.color, layer_depth=layer.target.depth)
             self._accumulate[frame.storage].render(moderngl.TRIANGLES, vertices=3)
             self._ctx.enable_only(moderngl.BLEND)
         self._ctx.enable_only(moderngl.NOTHING)
+        self._ctx.blend_equation = moderngl.FUNC_ADD
         return target
 
     def _bind_textures(self, program: moderngl.Program, **textures: moderngl.Texture | None) -> None:

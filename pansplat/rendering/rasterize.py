@@ -168,12 +168,14 @@ class Rendering:
         alpha: opacity in [0, 1].
         depth: mean radial distance, weighted as the colours are, metres; 0 where alpha is 0.
         info: counts; None for an image that `rasterize` did not return.
+        background: behind the Gaussians; None for black.
     """
 
     color: Float[Tensor, "channel height width"]
     alpha: Float[Tensor, "height width"]
     depth: Float[Tensor, "height width"]
     info: RasterInfo | None = None
+    background: Float[Tensor, "channel"] | None = None
 
 
 def _exclude_from_compile(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -358,4 +360,4 @@ def _normalise_sums(
     color = channels.clone() if background is None else channels + (1 - alpha) * background[:, None, None]
     seen = weight > 0
     depth = torch.where(seen, distance / torch.where(seen, weight, torch.ones_like(weight)), 0)
-    return Rendering(color, alpha, depth, info)
+    return Rendering(color, alpha, depth, info, background)

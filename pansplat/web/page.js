@@ -268,8 +268,10 @@
       if (first) gl.disable(gl.BLEND);
       else gl.enable(gl.BLEND);
       gl.blendFunc(gl.ONE, gl.ONE);
+      gl.blendEquationSeparate(gl.FUNC_ADD, gl.MAX);
       gl.bindVertexArray(this.screen);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
+      gl.blendEquation(gl.FUNC_ADD);
     }
   }
 

@@ -403,12 +403,13 @@ def blend_layers(
     mix = np.asarray(weights, np.float32)[:, None, None] * alphas
     total = mix.sum(axis=0)
     scale = np.divide(1, total, out=np.zeros_like(total), where=total > 0)
+    alpha = alphas.max(axis=0)
     with np.errstate(invalid="ignore"):
         depths = np.where(sums[:, 4] > 0, sums[:, 3] / np.where(sums[:, 4] > 0, sums[:, 4], 1), 0)
-    alpha = (mix * alphas).sum(axis=0) * scale
     color = np.empty((*alpha.shape, 4), np.float32)
     for channel in range(3):
-        color[..., channel] = (mix * sums[:, channel]).sum(axis=0) * scale + (1 - alpha) * background[channel]
+        mixed = np.tensordot(np.asarray(weights, np.float32), sums[:, channel], axes=1)
+        color[..., channel] = mixed * scale * alpha + (1 - alpha) * background[channel]
     color[..., 3] = alpha
     return color, (mix * depths).sum(axis=0) * scale
 
@@ -441,12 +442,12 @@ def blend_to_pixels(
 def _blend_rows(sums, weights, background, difference, bottom_up, pixels, item):
     num_layers, _, height, width = sums.shape
     rgb, other = np.empty((3, width), np.float32), np.empty((3, width), np.float32)
-    total, alpha_sum = np.empty(width, np.float32), np.empty(width, np.float32)
+    total, coverage = np.empty(width, np.float32), np.empty(width, np.float32)
     for y in range(item * _ROWS_PER_ITEM, min((item + 1) * _ROWS_PER_ITEM, height)):
         last = 1 if difference else num_layers
-        _blend_row(sums, weights, background, y, 0, last, rgb, total, alpha_sum)
+        _blend_row(sums, weights, background, y, 0, last, rgb, total, coverage)
         if difference:
-            _blend_row(sums, weights, background, y, num_layers - 1, num_layers, other, total, alpha_sum)
+            _blend_row(sums, weights, background, y, num_layers - 1, num_layers, other, total, coverage)
             for channel in range(3):
                 for x in range(width):
                     rgb[channel, x] = abs(rgb[channel, x] - other[channel, x])
@@ -463,25 +464,24 @@ def _to_byte(value):
 
 
 @inline_kernel
-def _blend_row(sums, weights, background, y, first, end, rgb, total, alpha_sum):
+def _blend_row(sums, weights, background, y, first, end, rgb, total, coverage):
     """Write RGB over the background of one row, from layers `first` to `end` - 1."""
     width = rgb.shape[1]
     for x in range(width):
-        total[x] = alpha_sum[x] = np.float32(0)
+        total[x] = coverage[x] = np.float32(0)
         rgb[0, x] = rgb[1, x] = rgb[2, x] = np.float32(0)
     for layer in range(first, end):
         weight = weights[layer] if end > first + 1 else np.float32(1)
         for x in range(width):
             alpha = min(sums[layer, 4, y, x], np.float32(1))
-            mix = weight * alpha
-            total[x] += mix
-            alpha_sum[x] += mix * alpha
-            rgb[0, x] += mix * sums[layer, 0, y, x]
-            rgb[1, x] += mix * sums[layer, 1, y, x]
-            rgb[2, x] += mix * sums[layer, 2, y, x]
+            total[x] += weight * alpha
+            coverage[x] = max(coverage[x], alpha)
+            rgb[0, x] += weight * sums[layer, 0, y, x]
+            rgb[1, x] += weight * sums[layer, 1, y, x]
+            rgb[2, x] += weight * sums[layer, 2, y, x]
     for x in range(width):
-        scale = np.float32(1) / total[x] if total[x] > np.float32(0) else np.float32(0)
-        behind = np.float32(1) - alpha_sum[x] * scale
+        scale = coverage[x] / total[x] if total[x] > np.float32(0) else np.float32(0)
+        behind = np.float32(1) - coverage[x]
         rgb[0, x] = rgb[0, x] * scale + behind * background[0]
         rgb[1, x] = rgb[1, x] * scale + behind * background[1]
         rgb[2, x] = rgb[2, x] * scale + behind * background[2]

@@ -35,9 +35,14 @@ def test_at_an_input_position_only_its_view_counts_and_the_weights_have_no_gradi
         mixed = blend(images, weights.detach())
         here = images[i].alpha > 0
         assert here.any()
-        # The weight is exactly 1.
-        for name in ("color", "alpha", "depth"):
-            assert torch.equal(getattr(mixed, name)[..., here], getattr(images[i], name)[..., here])
+        # The weight is exactly 1; the other views only make the image opaque.
+        assert torch.equal(mixed.depth[here], images[i].depth[here])
+        largest = torch.stack([image.alpha for image in images]).amax(dim=0)
+        assert torch.equal(mixed.alpha, largest)
+        opaque = here & (images[i].alpha == largest)
+        assert opaque.any() and torch.equal(mixed.color[:, opaque], images[i].color[:, opaque])
+        expected = images[i].color * (largest / images[i].alpha)
+        assert torch.allclose(mixed.color[:, here], expected[:, here], rtol=1e-12)
 
 
 @pytest.mark.hard_case(46)
