@@ -44,8 +44,9 @@ class Case:
     Attributes:
         own_ws_psnr: mean WS-PSNR of the scene's images at the input cameras, over unmasked pixels.
         refine_seconds: 0 without refinement.
-        masked_ws_psnr: WS-PSNR of the unmasked pixels; None without a mask. It is only in the printed table.
+        masked_ws_psnr: WS-PSNR of the unmasked pixels; None without a mask.
         lpips: None if it was not measured.
+        cross_fade_ws_psnr, masked_cross_fade_ws_psnr, cross_fade_lpips: the same metrics of the cross-fade.
     """
 
     name: str
@@ -63,14 +64,13 @@ class Case:
     own_ws_psnr: float
     refine_seconds: float
     masked_ws_psnr: float | None = field(default=None, compare=False)
+    masked_cross_fade_ws_psnr: float | None = field(default=None, compare=False)
     lpips: float | None = field(default=None, compare=False)
+    cross_fade_lpips: float | None = field(default=None, compare=False)
 
     def as_json(self) -> dict[str, object]:
-        """The entry in results.json; non-finite numbers become null."""
-        values = dataclasses.asdict(self)
-        del values["masked_ws_psnr"]
-        if self.lpips is None:
-            del values["lpips"]
+        """The entry in results.json, without the metrics that were not measured; non-finite numbers become null."""
+        values = {key: value for key, value in dataclasses.asdict(self).items() if value is not None}
         return {key: str(value) if isinstance(value, Path) else finite_json(value) for key, value in values.items()}
 
 
@@ -158,7 +158,8 @@ def _evaluate_pair(
         write_image(folder / "prediction.png", image)
         write_image(folder / "target.png", target)
         write_image(folder / "error.png", error_image(image, target))
-        mask = targets.masks[view]
+        faded = cross_fade(context.images, context.cam2world, pose)
+        mask = None if bool(targets.masks[view].all()) else targets.masks[view]
         yield Case(
             name=folder.name,
             model=predictor.name,
@@ -166,7 +167,7 @@ def _evaluate_pair(
             ws_psnr=ws_psnr(image, target),
             psnr=psnr(image, target),
             ssim=ssim(image, target),
-            cross_fade_ws_psnr=ws_psnr(cross_fade(context.images, context.cam2world, pose), target),
+            cross_fade_ws_psnr=ws_psnr(faded, target),
             own_ws_psnr=own_ws_psnr,
             predict_seconds=predict_seconds,
             refine_seconds=refine_seconds,
@@ -174,8 +175,10 @@ def _evaluate_pair(
             num_gaussians=len(scene.gaussians),
             prediction=(folder / "prediction.png").resolve(),
             target=(folder / "target.png").resolve(),
-            masked_ws_psnr=None if bool(mask.all()) else ws_psnr(image, target, mask=mask),
+            masked_ws_psnr=None if mask is None else ws_psnr(image, target, mask=mask),
+            masked_cross_fade_ws_psnr=None if mask is None else ws_psnr(faded, target, mask=mask),
             lpips=None if lpips is None else lpips.distance(image, target),
+            cross_fade_lpips=None if lpips is None else lpips.distance(faded, target),
         )
 
 
@@ -207,45 +210,63 @@ def write_json(value: object, path: Path) -> None:
         unfinished.write_text(text + "\n", encoding="utf-8")
 
 
+@dataclass(frozen=True)
+class _Column:
+    """A column of the table: the value of a case, that of the cross-fade if it has one, and their format."""
+
+    value: Callable[[Case], float]
+    format_spec: str
+    cross_fade: Callable[[Case], float] | None = None
+
+
 def results_table(cases: Sequence[Case]) -> Table:
-    """A printable table of the cases and their mean."""
+    """A printable table of the cases, their mean, and the mean of the cross-fade of the same cases."""
     columns = _select_columns(cases)
     table = Table(title=f"{cases[0].model}, {cases[0].height}x{2 * cases[0].height}" if cases else None)
     table.add_column("case")
     for head in columns:
         table.add_column(head, justify="right")
-    rows = [[figure(case) for figure, _ in columns.values()] for case in cases]
-    formats = [format_spec for _, format_spec in columns.values()]
-    for case, row in zip(cases, rows, strict=True):
-        table.add_row(case.name, *map(format, row, formats))
-    if len(rows) > 1:
+    for case in cases:
+        table.add_row(case.name, *(format(column.value(case), column.format_spec) for column in columns.values()))
+    if cases:
         table.add_section()
-        means = [sum(column) / len(rows) for column in zip(*rows, strict=True)]
-        table.add_row("mean", *map(format, means, formats))
+        if len(cases) > 1:
+            table.add_row("mean", *(_format_mean(column.value, column, cases) for column in columns.values()))
+        table.add_row("cross-fade", *(_format_mean(column.cross_fade, column, cases) for column in columns.values()))
     return table
 
 
-def _select_columns(cases: Sequence[Case]) -> dict[str, tuple[Callable[[Case], float], str]]:
-    """By heading, the value of a case and its format; columns without any value are left out."""
-    columns: dict[str, tuple[Callable[[Case], float], str]] = {"WS-PSNR": (lambda case: case.ws_psnr, ".2f")}
+def _format_mean(value: Callable[[Case], float] | None, column: _Column, cases: Sequence[Case]) -> str:
+    return "" if value is None else format(sum(map(value, cases)) / len(cases), column.format_spec)
+
+
+def _select_columns(cases: Sequence[Case]) -> dict[str, _Column]:
+    """The columns by heading; those without any value are left out."""
+    columns = {"WS-PSNR": _Column(lambda case: case.ws_psnr, ".2f", lambda case: case.cross_fade_ws_psnr)}
     if any(case.masked_ws_psnr is not None for case in cases):
-        columns["masked"] = (lambda case: case.ws_psnr if case.masked_ws_psnr is None else case.masked_ws_psnr, ".2f")
-    columns["PSNR"] = (lambda case: case.psnr, ".2f")
-    columns["SSIM"] = (lambda case: case.ssim, ".4f")
+        columns["masked"] = _Column(
+            lambda case: case.ws_psnr if case.masked_ws_psnr is None else case.masked_ws_psnr,
+            ".2f",
+            lambda case: (
+                case.cross_fade_ws_psnr if case.masked_cross_fade_ws_psnr is None else case.masked_cross_fade_ws_psnr
+            ),
+        )
+    columns["PSNR"] = _Column(lambda case: case.psnr, ".2f")
+    columns["SSIM"] = _Column(lambda case: case.ssim, ".4f")
     if any(case.lpips is not None for case in cases):
-        columns["LPIPS"] = (lambda case: math.nan if case.lpips is None else case.lpips, ".4f")
-    return columns | {
-        "cross-fade": (lambda case: case.cross_fade_ws_psnr, ".2f"),
-        "at inputs": (lambda case: case.own_ws_psnr, ".2f"),
-        "predict s": (lambda case: case.predict_seconds, ".1f"),
-        **(
-            {"refine s": (lambda case: case.refine_seconds, ".1f")}
-            if any(case.refine_seconds for case in cases)
-            else {}
-        ),
-        "render s": (lambda case: case.render_seconds, ".1f"),
-        "Gaussians": (lambda case: case.num_gaussians, ",.0f"),
-    }
+        columns["LPIPS"] = _Column(
+            lambda case: math.nan if case.lpips is None else case.lpips,
+            ".4f",
+            lambda case: math.nan if case.cross_fade_lpips is None else case.cross_fade_lpips,
+        )
+    columns["cross-fade"] = _Column(lambda case: case.cross_fade_ws_psnr, ".2f")
+    columns["at inputs"] = _Column(lambda case: case.own_ws_psnr, ".2f")
+    columns["predict s"] = _Column(lambda case: case.predict_seconds, ".1f")
+    if any(case.refine_seconds for case in cases):
+        columns["refine s"] = _Column(lambda case: case.refine_seconds, ".1f")
+    columns["render s"] = _Column(lambda case: case.render_seconds, ".1f")
+    columns["Gaussians"] = _Column(lambda case: case.num_gaussians, ",.0f")
+    return columns
 
 
 def finite_json(value: object) -> object:

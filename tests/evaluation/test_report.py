@@ -120,8 +120,10 @@ def test_cases_of_one_name_have_their_own_folders_and_the_table_has_their_mean(t
     assert len({case.prediction for case in cases}) == 2
     console = Console(width=140, record=True, file=io.StringIO())
     console.print(results_table(cases))
-    (mean,) = (line for line in console.export_text().splitlines() if "mean" in line)
+    lines = console.export_text().splitlines()
+    (mean,) = (line for line in lines if "mean" in line)
     assert f"{cases[0].ws_psnr:.2f}" in mean
+    assert lines[-2].split()[1:4] == ["cross-fade", "│", f"{cases[0].cross_fade_ws_psnr:.2f}"]  # below the mean
 
 
 def test_pairs_without_target_are_skipped(tmp_path: Path) -> None:
@@ -139,16 +141,20 @@ def test_a_file_at_the_output_folders_path_is_an_input_error(folder: Path, tmp_p
         evaluate(load_pairs(folder / "room"), GreyBall(), tmp_path / "out", height=HEIGHT)
 
 
-def test_a_masked_target_has_a_second_value_in_the_table_only(tmp_path: Path) -> None:
+def test_a_masked_target_has_second_values_of_the_scene_and_of_the_cross_fade(tmp_path: Path) -> None:
     folder = write_triplet(tmp_path / "room")
     mask = np.full((HEIGHT, 2 * HEIGHT), 255, np.uint8)
     mask[-4:] = 0
     Image.fromarray(mask).save(folder / "c_mask.png")
     (case,) = evaluate(load_pairs(folder), GreyBall(), tmp_path / "out", height=HEIGHT)
     target, prediction = read_image(case.target), read_image(case.prediction)
-    assert case.masked_ws_psnr == pytest.approx(ws_psnr(prediction, target, mask=torch.from_numpy(mask > 0)), abs=0.01)
+    faded = sum(read_image(folder / name) for name in ("a.png", "b.png")) / 2
+    counts = torch.from_numpy(mask > 0)
+    assert case.masked_ws_psnr == pytest.approx(ws_psnr(prediction, target, mask=counts), abs=0.01)
     assert case.ws_psnr == pytest.approx(ws_psnr(prediction, target), abs=0.01)
-    assert list(json.loads((tmp_path / "out" / "results.json").read_text())[0]) == KEYS
+    assert case.masked_cross_fade_ws_psnr == pytest.approx(ws_psnr(faded, target, mask=counts), abs=0.01)
+    (result,) = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert set(result) == {*KEYS, "masked_ws_psnr", "masked_cross_fade_ws_psnr"}
     assert "masked" in [str(column.header) for column in results_table([case]).columns]
 
 
@@ -158,8 +164,11 @@ def test_lpips_is_optional(folder: Path, tmp_path: Path) -> None:
         head.data.fill_(0.1)
     (case,) = evaluate(pairs, GreyBall(), tmp_path / "out", height=32, lpips=metric)
     (result,) = json.loads((tmp_path / "out" / "results.json").read_text())
-    assert set(result) == {*KEYS, "lpips"} and result["lpips"] == case.lpips
-    assert case.lpips == pytest.approx(metric.distance(read_image(case.prediction), read_image(case.target)), abs=1e-3)
+    assert set(result) == {*KEYS, "lpips", "cross_fade_lpips"} and result["lpips"] == case.lpips
+    target = read_image(case.target)
+    assert case.lpips == pytest.approx(metric.distance(read_image(case.prediction), target), abs=1e-3)
+    context = pairs[0].load_context(32)
+    assert case.cross_fade_lpips == pytest.approx(metric.distance(context.images.mean(0), target), abs=1e-3)
     assert "LPIPS" in [str(column.header) for column in results_table([case]).columns]
 
 
