@@ -48,7 +48,7 @@ class MatchingConfig:
     """For a hypothesis in front of the other view's surface."""
     consistency_bonus: float = 0.15
     """For a hypothesis on the other view's surface."""
-    occluded_cost: float = 0.6
+    occluded_cost: float = 0.9
     """Cost of a hypothesis behind the other view's surface, where it cannot be matched."""
     back_facing_cost: float = 0.8
     """Cost of a plane between the two cameras: each would see a different side of it."""
@@ -170,7 +170,7 @@ def _pad_in_place(padded, m):
 @nb.njit(parallel=True, fastmath=True, cache=True)
 def _compute_set_cost(
     image, gray, mean, variance, other, rays, rotation, translation, base, step, limits, penalty, back_facing, sphere,
-    side, down, floor_ceiling, valid, other_valid, other_inverse, other_confidence, has_surface, weights, m,
+    side, down, floor_ceiling, valid, other_valid, other_inverse, has_surface, weights, m,
     cost, offset, count,
 ):  # fmt: skip
     height, width = image.shape[:2]
@@ -190,7 +190,6 @@ def _compute_set_cost(
         difference = np.empty((height, width), np.float32)
         state = np.empty((height, width), np.uint8)  # 0 matched, 1 out of range, 2 masked in the other view
         ratio = np.empty((height, width), np.float32)
-        confidence_map = np.empty((height, width), np.float32)
         geometry = np.empty((height, width), np.float32)
         sum_b, sum_bb = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
         sum_ab = np.empty((height, width), np.float32)
@@ -229,7 +228,6 @@ def _compute_set_cost(
                     )
                     opposed = (opposed_from - cosine[j]) / (opposed_from - opposed_to)
                     geometry[i, j] += opposed_penalty * min(max(opposed, np.float32(0)), np.float32(1))
-                    confidence_map[i, j] = other_confidence[qi, qj] if has_surface else np.float32(0)
             _pad_in_place(warped, m)
             _window_sums(gray, warped, m, column[0], column[1], column[2], sum_b, sum_bb, sum_ab)
             for i in range(height):
@@ -243,13 +241,13 @@ def _compute_set_cost(
                     textured = textureless_weight + (1 - textureless_weight) * textured
                     c = textured * c + (1 - textured) * textureless_cost
                     extra = penalty[side[i, j], k] + geometry[i, j]
-                    t = confidence_map[i, j]
-                    if ratio[i, j] > 1 + tolerance:
-                        extra += free_space_penalty * t
-                    elif ratio[i, j] > 1 - tolerance:
-                        extra -= consistency_bonus * t
-                    else:
-                        c = (1 - t) * c + t * occluded_cost
+                    if has_surface:
+                        if ratio[i, j] > 1 + tolerance:
+                            extra += free_space_penalty
+                        elif ratio[i, j] > 1 - tolerance:
+                            extra -= consistency_bonus
+                        else:
+                            c = occluded_cost
                     if back_facing[side[i, j], k]:
                         c = back_facing_cost
                     if state[i, j] == 2 or not valid[i, j]:
@@ -319,14 +317,13 @@ class View:
         image: (h, w, 3) float32.
         valid: (h, w) False for masked pixels.
         down: (h, w) components of the rays along the scene's down axis.
-        inverse_depth, confidence: (h, w) of the surface found so far; None before the first pass.
+        inverse_depth: (h, w) of the surface found so far; None before the first pass.
     """
 
     image: np.ndarray
     valid: np.ndarray
     down: np.ndarray
     inverse_depth: np.ndarray | None = None
-    confidence: np.ndarray | None = None
 
 
 def compute_matching_cost(
@@ -353,9 +350,8 @@ def compute_matching_cost(
     mean = np.ascontiguousarray(cv2.boxFilter(gray, -1, window)[inside])
     variance = np.ascontiguousarray(cv2.boxFilter(gray * gray, -1, window)[inside])
     variance = np.maximum(variance - mean * mean, 0)
-    has_surface = other.inverse_depth is not None and other.confidence is not None
+    has_surface = other.inverse_depth is not None
     other_inverse = other.inverse_depth if has_surface else np.ones((height, width), np.float32)
-    other_confidence = other.confidence if has_surface else np.zeros((height, width), np.float32)
     weights = tuple(np.float32(getattr(config, name)) for name in _WEIGHTS)
     count = sets[0].penalty.shape[1]
     cost = np.empty((height, width, len(sets) * count), np.float32)
@@ -369,7 +365,7 @@ def compute_matching_cost(
             hypotheses.step, (np.float32(limits[0]), np.float32(limits[1])), hypotheses.penalty, back_facing,
             hypotheses.sphere, hypotheses.side, view.down,
             (np.float32(floor_ceiling[0]), np.float32(floor_ceiling[1])), view.valid, other.valid, other_inverse,
-            other_confidence, has_surface, weights, m, cost, n * count, count,
+            has_surface, weights, m, cost, n * count, count,
         )  # fmt: skip
     return cost
 

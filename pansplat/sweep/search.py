@@ -68,8 +68,6 @@ class SearchConfig:
     """The largest depth of the search, relative to `far`: rooms are often larger than the range that was given."""
     narrow_candidates: tuple[int, int] = (24, 16)
     """Hypotheses of a set at the two finer levels."""
-    unverified_confidence: float = 0.1
-    """Confidence of a surface that is consistent with no other view, when other views are matched against it."""
     plane_prior: float = 0.3
     """Penalty of a plane without support in the scene."""
     sphere_prior: float = 0.18
@@ -195,18 +193,16 @@ class _SearchLevel:
         self.rays = [axis_components(planes.axes, pose[:3, :3], height) for pose in posed.cam2world]
         self.planes = planes
         masks = [resize_mask(mask, height) for mask in posed.masks]
-        confidence: list[np.ndarray | None] = [None] * len(masks)
+        self.consistent: list[np.ndarray] = []
         if surfaces is not None:
-            consistent = [consistency_mask(surfaces, posed.cam2world, view) & mask for view, mask in enumerate(masks)]
-            confidence = [np.where(c, 1, config.unverified_confidence).astype(np.float32) for c in consistent]
-            self.planes = collect_planes(surfaces, consistent, posed.cam2world, planes)
+            self.consistent = [consistency_mask(surfaces, posed.cam2world, n) & mask for n, mask in enumerate(masks)]
+            self.planes = collect_planes(surfaces, self.consistent, posed.cam2world, planes)
         self.views = [
             View(
                 resize_sphere(image, height),
                 mask,
                 np.ascontiguousarray(rays[0], np.float32),
                 None if surfaces is None else surfaces[n].inverse_depth,
-                confidence[n],
             )
             for n, (image, mask, rays) in enumerate(zip(posed.images, masks, self.rays, strict=True))
         ]
@@ -250,9 +246,9 @@ class _SearchLevel:
         self, view: int, boundary: FloorBoundary, walls: Walls, sets: list[HypothesisSet], cost: np.ndarray
     ) -> None:
         """Lower the cost of those of the view's walls that its surface does not contradict."""
-        known, confidence = self.views[view].inverse_depth, self.views[view].confidence
-        assert known is not None and confidence is not None
-        walls = discount_contradicted(walls, boundary, self.rays[view], known, confidence == 1)
+        known = self.views[view].inverse_depth
+        assert known is not None
+        walls = discount_contradicted(walls, boundary, self.rays[view], known, self.consistent[view])
         _, ceiling = self.planes.vertical_bounds(self.posed.cam2world[view])
         apply_wall_bonus(cost, walls, boundary, sets, self.rays[view], ceiling, self.config.room_layout.wall_bonus)
 

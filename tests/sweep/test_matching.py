@@ -32,14 +32,13 @@ def _spheres(inverses, height: int = 96) -> HypothesisSet:
     return HypothesisSet(*maps, np.zeros((2, len(inverses)), np.float32), np.zeros(shape, np.uint8))
 
 
-def _view(image: np.ndarray, valid: np.ndarray | None = None, inverse: float | None = None, trust: float = 1) -> View:
+def _view(image: np.ndarray, valid: np.ndarray | None = None, inverse: float | None = None) -> View:
     shape = image.shape[:2]
     return View(
         np.ascontiguousarray(image, np.float32),
         np.ones(shape, bool) if valid is None else valid,
         np.ascontiguousarray(ray_grid(shape[0])[..., 1]),
         None if inverse is None else np.full(shape, inverse, np.float32),
-        None if inverse is None else np.full(shape, trust, np.float32),
     )
 
 
@@ -132,7 +131,7 @@ def test_the_other_views_surface_changes_the_cost_as_configured(twice):
     config = _PLAIN
     expected = (config.occluded_cost, -config.consistency_bonus, config.free_space_penalty, config.free_space_penalty)
     assert np.allclose(cost, expected, atol=0.02)
-    assert _cost((twice[0], _view(image, inverse=0.5, trust=0)), spheres).max() < 0.02
+    assert _cost((twice[0], _view(image)), spheres).max() < 0.02  # nothing is known before the first pass
 
 
 def test_hypotheses_below_the_floor_or_above_the_ceiling_are_penalised(twice):
