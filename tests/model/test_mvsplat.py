@@ -74,8 +74,12 @@ def test_gaussians_match_the_official_code(run: OfficialRun, expected: dict[str,
     to_world = compute_harmonics_rotation(torch.eye(3, dtype=torch.float64), "official")
     for view in range(2):
         part = gaussians.select(gaussians.views == view)
-        for name in ("means", "covariances", "opacities", "scales"):
+        for name in ("means", "opacities", "scales"):
             assert error(getattr(part, name), expected[f"g.v{view}.{name}"]) < 2e-4, name
+        covariances = expected[f"g.v{view}.covariances"].flatten(1)
+        # Relative to each one: the largest has 12 standard deviations, and its rounding depends on the processor.
+        difference = (part.covariances.flatten(1) - covariances).norm(dim=1)
+        assert (difference / covariances.norm(dim=1)).max() < 2e-4
         assert error(part.harmonics[:, 0], expected[f"g.v{view}.harmonics_dc"]) < 2e-4
         theirs = rotate_harmonics(expected[f"g.v{view}.harmonics_sub"].transpose(-1, -2).double(), to_world)
         assert error(part.harmonics[:: 8192 // len(theirs)].double(), theirs) < 2e-4
