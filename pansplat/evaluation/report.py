@@ -231,13 +231,21 @@ def results_table(cases: Sequence[Case]) -> Table:
     if cases:
         table.add_section()
         if len(cases) > 1:
-            table.add_row("mean", *(_format_mean(column.value, column, cases) for column in columns.values()))
-        table.add_row("cross-fade", *(_format_mean(column.cross_fade, column, cases) for column in columns.values()))
+            table.add_row(
+                "mean", *(_format_mean(column.value, column.format_spec, cases) for column in columns.values())
+            )
+        table.add_row(
+            "cross-fade", *(_format_mean(column.cross_fade, column.format_spec, cases) for column in columns.values())
+        )
     return table
 
 
-def _format_mean(value: Callable[[Case], float] | None, column: _Column, cases: Sequence[Case]) -> str:
-    return "" if value is None else format(sum(map(value, cases)) / len(cases), column.format_spec)
+def _format_mean(value: Callable[[Case], float] | None, format_spec: str, cases: Sequence[Case]) -> str:
+    return "" if value is None else format(sum(map(value, cases)) / len(cases), format_spec)
+
+
+def _value_or(value: float | None, default: float) -> float:
+    return default if value is None else value
 
 
 def _select_columns(cases: Sequence[Case]) -> dict[str, _Column]:
@@ -245,19 +253,17 @@ def _select_columns(cases: Sequence[Case]) -> dict[str, _Column]:
     columns = {"WS-PSNR": _Column(lambda case: case.ws_psnr, ".2f", lambda case: case.cross_fade_ws_psnr)}
     if any(case.masked_ws_psnr is not None for case in cases):
         columns["masked"] = _Column(
-            lambda case: case.ws_psnr if case.masked_ws_psnr is None else case.masked_ws_psnr,
+            lambda case: _value_or(case.masked_ws_psnr, case.ws_psnr),
             ".2f",
-            lambda case: (
-                case.cross_fade_ws_psnr if case.masked_cross_fade_ws_psnr is None else case.masked_cross_fade_ws_psnr
-            ),
+            lambda case: _value_or(case.masked_cross_fade_ws_psnr, case.cross_fade_ws_psnr),
         )
     columns["PSNR"] = _Column(lambda case: case.psnr, ".2f")
     columns["SSIM"] = _Column(lambda case: case.ssim, ".4f")
     if any(case.lpips is not None for case in cases):
         columns["LPIPS"] = _Column(
-            lambda case: math.nan if case.lpips is None else case.lpips,
+            lambda case: _value_or(case.lpips, math.nan),
             ".4f",
-            lambda case: math.nan if case.cross_fade_lpips is None else case.cross_fade_lpips,
+            lambda case: _value_or(case.cross_fade_lpips, math.nan),
         )
     columns["cross-fade"] = _Column(lambda case: case.cross_fade_ws_psnr, ".2f")
     columns["at inputs"] = _Column(lambda case: case.own_ws_psnr, ".2f")

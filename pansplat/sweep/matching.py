@@ -222,7 +222,8 @@ def _compute_set_cost(
                     qi = min(max(int(v[j] - np.float32(0.5)), 0), height - 1)
                     qj = int(u[j] - np.float32(0.5)) % width
                     state[i, j] = 1 if inverse[j] < low or inverse[j] > high else (0 if other_valid[qi, qj] else 2)
-                    ratio[i, j] = inverse[j] * scale[j] / other_inverse[qi, qj] if has_surface else np.float32(1)
+                    if has_surface:
+                        ratio[i, j] = inverse[j] * scale[j] / other_inverse[qi, qj]
                     geometry[i, j] = distance_penalty * max(
                         1 - distance_ratio * min(scale[j], 1 / scale[j]), np.float32(0)
                     )

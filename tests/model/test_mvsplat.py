@@ -76,6 +76,7 @@ def test_gaussians_match_the_official_code(run: OfficialRun, expected: dict[str,
         part = gaussians.select(gaussians.views == view)
         for name in ("means", "opacities", "scales"):
             assert error(getattr(part, name), expected[f"g.v{view}.{name}"]) < 2e-4, name
+        assert error(part.covariances, expected[f"g.v{view}.covariances"]) < 1e-3  # the fixture's own limit
         covariances = expected[f"g.v{view}.covariances"].flatten(1)
         # Relative to each one: the largest has 12 standard deviations, and its rounding depends on the processor.
         difference = (part.covariances.flatten(1) - covariances).norm(dim=1)
