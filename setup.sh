@@ -87,7 +87,10 @@ make_venv() {
 }
 
 # --- packages ---
-# Python compiles a module at its first import; pip would compile thousands that are never imported.
+# Python compiles a module at its first import; pip would compile thousands that are never imported. The first imports are
+# those of this script, so their bytecode is written even where the environment forbids it: without it each start of a
+# command takes seconds more.
+unset PYTHONDONTWRITEBYTECODE
 pip_install() { .venv/bin/python -m pip install --disable-pip-version-check -qq --no-compile -c constraints.txt "$@"; }
 
 # On Linux a plain `pip install torch` downloads gigabytes of CUDA libraries. So without a GPU the CPU build is installed
