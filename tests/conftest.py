@@ -21,7 +21,7 @@ from jaxtyping import config, install_import_hook
 from PIL import Image
 from torch import Tensor
 
-import pansplat.testing  # noqa: F401  # for the import hook
+from pansplat.testing import restart_checks
 
 # One thread per pytest-xdist worker and its child processes: workers must not compete for cores.
 if "PYTEST_XDIST_WORKER" in os.environ:
@@ -37,7 +37,7 @@ if not torch.cuda.is_available():
 with contextlib.suppress(ImportError):
     import triton  # noqa: F401
 
-# Check annotated shapes and types at every call; install the hook before the packages are imported.
+# Check annotated shapes and types of calls; install the hook before the packages are imported.
 _CHECKED = ("geometry", "gaussians", "model", "rendering", "refinement", "predictor", "evaluation", "pipeline")
 install_import_hook([f"pansplat.{name}" for name in _CHECKED], "pansplat.testing.check_types")
 
@@ -128,6 +128,12 @@ def _restored_signal_handlers() -> Iterator[None]:
     yield
     for number, handler in handlers.items():
         signal.signal(number, handler)
+
+
+@pytest.fixture(autouse=True)
+def _restarted_checks() -> None:
+    """Check the annotations of each function in each test."""
+    restart_checks()
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -45,10 +46,17 @@ _DAMAGE: dict[str, tuple[str, Callable[[dict[str, Any]], Any]]] = {
 
 
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory, small_config: Any) -> tuple[Path, TrainConfig]:
+def few_tensors(small_config: Any) -> Any:
+    """The small config without the U-Nets of the cost volume: thousands of tensors would be read in each test."""
+    cost_volume = dataclasses.replace(small_config.cost_volume, refinement="none")
+    return dataclasses.replace(small_config, cost_volume=cost_volume)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory, few_tensors: Any) -> tuple[Path, TrainConfig]:
     """The first checkpoint of a run of a small network."""
     patch = pytest.MonkeyPatch()
-    patch.setattr("pansplat.training.network.network_config", lambda shape: small_config)
+    patch.setattr("pansplat.training.network.network_config", lambda shape: few_tensors)
     config = TrainConfig(
         out=tmp_path_factory.mktemp("run"),
         heights=(64,),
@@ -69,10 +77,10 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory, small_config: Any) -> t
 
 @pytest.fixture
 def resume(
-    checkpoint: tuple[Path, TrainConfig], tmp_path: Path, small_config: Any, monkeypatch: pytest.MonkeyPatch
+    checkpoint: tuple[Path, TrainConfig], tmp_path: Path, few_tensors: Any, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., Trainer]:
     """A function that resumes a run from copies of the checkpoint, the last of which is damaged."""
-    monkeypatch.setattr("pansplat.training.network.network_config", lambda shape: small_config)
+    monkeypatch.setattr("pansplat.training.network.network_config", lambda shape: few_tensors)
     good, config = checkpoint
     folder = tmp_path / "checkpoints"
     folder.mkdir()
