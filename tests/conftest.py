@@ -37,7 +37,7 @@ if not torch.cuda.is_available():
 with contextlib.suppress(ImportError):
     import triton  # noqa: F401
 
-# Check annotated shapes and types of calls; install the hook before the packages are imported.
+# Check annotated shapes and types of each test's first calls; install the hook before the packages are imported.
 _CHECKED = ("geometry", "gaussians", "model", "rendering", "refinement", "predictor", "evaluation", "pipeline")
 install_import_hook([f"pansplat.{name}" for name in _CHECKED], "pansplat.testing.check_types")
 

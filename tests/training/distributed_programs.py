@@ -25,8 +25,8 @@ from pansplat.training.step import TrainingStep, accumulate_gradients
 sys.path.insert(0, str(Path(__file__).parent))
 from conftest import PaintedSphere, micro_config
 
-BATCHES = 2
-"""Batches per step; the processes exchange gradients in the last one."""
+METHODS = (("plain", 1), ("plain", 2), ("two-step", 1), ("two-step", 2))
+"""Method of backpropagation, and number of batches per step."""
 
 
 def split_batches(folder: Path, processes: ProcessGroup) -> None:
@@ -38,11 +38,11 @@ def split_batches(folder: Path, processes: ProcessGroup) -> None:
     step = TrainingStep(network, None, None, LossWeights(), MemoryConfig())
     wrapped = data_parallel(step, processes)
     found = {}
-    for method in ("plain", "two-step"):
+    for method, rounds in METHODS:
         step.memory = MemoryConfig(method, 1 if method == "plain" else 2, "original")
         step.zero_grad()
-        accumulate_gradients(wrapped, [_batch_part(processes, n) for n in range(BATCHES)])
-        found |= {f"{method} {name}": p.grad for name, p in network.named_parameters() if p.grad is not None}
+        accumulate_gradients(wrapped, [_batch_part(processes, n) for n in range(rounds)])
+        found |= {f"{method} {rounds} {name}": p.grad for name, p in network.named_parameters() if p.grad is not None}
     buffers = {name: tensor for name, tensor in network.named_buffers() if tensor.is_floating_point()}
     torch.save({**found, **buffers}, folder / f"{processes.count}_{processes.rank}.pt")
 

@@ -36,23 +36,15 @@ def assert_equal_gradients(found: dict[str, torch.Tensor], expected: dict[str, t
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("style", "mixing", "methods"),
-    [
-        ("panorama", "joint", ("two-step",)),
-        ("cubemap", "joint", ("two-step",)),
-        ("cubemap", "by_view", ("one-step", "two-step")),
-        ("original", "joint", ("one-step", "two-step")),
-    ],
+    ("style", "mixing"), [("panorama", "joint"), ("cubemap", "joint"), ("cubemap", "by_view"), ("original", "joint")]
 )
-def test_deferred_gradients_equal_plain_ones(
-    style: str, mixing: str, methods: tuple[str, ...], micro: Callable, make_batch: Callable
-) -> None:
+def test_deferred_gradients_equal_plain_ones(style: str, mixing: str, micro: Callable, make_batch: Callable) -> None:
     network, batch = micro(), make_batch()
     set_training_mode(network, ())
     expected, loss = gradients(network, MemoryConfig("plain", 1, style, mixing), batch)
     assert loss["depth"] > 0 and loss["square"] > 0
     assert any(name.startswith("features.") for name in expected)
-    for method in methods:
+    for method in ("one-step", "two-step"):
         found, deferred_loss = gradients(network, MemoryConfig(method, 2, style, mixing), batch)
         assert deferred_loss == pytest.approx(loss, rel=1e-9)
         assert_equal_gradients(found, expected)
@@ -98,7 +90,7 @@ def test_gradients_of_a_batch_equal_those_of_its_items_accumulated(micro: Callab
 
 @pytest.mark.slow
 def test_deferred_gradients_of_the_baseline_equal_plain_ones(make_batch: Callable) -> None:
-    network, batch = micro_mvsplat(), make_batch()
+    network, batch = micro_mvsplat(), make_batch(0, 1)
     expected, loss = gradients(network, MemoryConfig("plain", 1, "cubemap"), batch)
     assert expected.keys() == {name for name, _ in network.named_parameters()}
     for method in ("one-step", "two-step"):
