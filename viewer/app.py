@@ -12,7 +12,7 @@ from pansplat.console import own_warnings, parse_arguments
 from pansplat.errors import InputError
 from pansplat.files import expand_home, require_output_file, require_output_folder
 from pansplat.options import EYE_DISTANCE, REAL, Depth, EyeDistance, Height, Range, Seconds, check_numbers
-from pansplat_viewer.loader import (
+from pansplat_viewer.scene.loader import (
     LoadedScene,
     LoadOptions,
     SceneEntry,
@@ -20,13 +20,13 @@ from pansplat_viewer.loader import (
     find_entries,
     load_entry,
 )
-from pansplat_viewer.settings import DrawSettings, Kernel, Mode, Order, Projection, RendererChoice, Stereo
+from pansplat_viewer.scene.settings import DrawSettings, Kernel, Mode, Order, Projection, RendererChoice, Stereo
 
 if TYPE_CHECKING:
     import moderngl
 
-    from pansplat_viewer.key_frames import CameraPath
-    from pansplat_viewer.stereo import ImageFormat
+    from pansplat_viewer.draw.stereo import ImageFormat
+    from pansplat_viewer.scene.key_frames import CameraPath
 
 _MAX_CONTEXTS = 3  # windows that are opened one after the other if the graphics card is reset
 
@@ -110,7 +110,7 @@ class Options:
     @property
     def image_format(self) -> "ImageFormat":
         """Projection and stereo."""
-        from pansplat_viewer.stereo import ImageFormat
+        from pansplat_viewer.draw.stereo import ImageFormat
 
         return ImageFormat(self.projection, self.stereo, self.ipd)
 
@@ -164,7 +164,7 @@ def _run(options: Options) -> int:
     if options.offscreen is not None:
         require_output_folder("--offscreen", options.offscreen)
     from pansplat.data.video import VIDEO_SUFFIXES
-    from pansplat_viewer.key_frames import read_path
+    from pansplat_viewer.scene.key_frames import read_path
 
     if options.out is not None:
         require_output_file("--out", options.out, (*VIDEO_SUFFIXES, ".png", ".exr"))
@@ -199,11 +199,11 @@ def _run_window(
     options: Options, entries: list[SceneEntry], first: int, pixels: tuple[int, int], path: "CameraPath | None"
 ) -> str | None:
     """Run the viewer in a window; if no window can be opened, returns the reason."""
-    from pansplat_viewer.key_frames import CameraPath
-    from pansplat_viewer.preferences import find_file
-    from pansplat_viewer.state import ViewerState
+    from pansplat_viewer.scene.key_frames import CameraPath
+    from pansplat_viewer.scene.state import ViewerState
     from pansplat_viewer.viewer import Viewer
-    from pansplat_viewer.window import ContextLostError, NoWindowError, Window, run_viewer
+    from pansplat_viewer.window.preferences import find_file
+    from pansplat_viewer.window.window import ContextLostError, NoWindowError, Window, run_viewer
 
     load_options = options.load_options
     state = ViewerState(settings=options.settings, path=path or CameraPath())
@@ -247,9 +247,9 @@ def _write_film(
 
     from pansplat.tours import plan_route
     from pansplat_viewer.capture import Film, SceneFrames, TourFrames, write_flythrough, write_path_film, write_tour
-    from pansplat_viewer.cpu_renderer import create_renderer
-    from pansplat_viewer.state import create_level_camera, fit_settings
-    from pansplat_viewer.tour import TourScenes
+    from pansplat_viewer.draw.cpu_renderer import create_renderer
+    from pansplat_viewer.scene.state import create_level_camera, fit_settings
+    from pansplat_viewer.scene.tour import TourScenes
 
     film = Film(pixels, options.seconds, options.fps, 0.5 if options.at is None else options.at)
     choice = "cpu" if options.image_format.is_omnidirectional else options.renderer
@@ -305,7 +305,7 @@ def _write_film(
 
 def _create_context(renderer: RendererChoice) -> "moderngl.Context | None":
     """Return an OpenGL context, or None if the renderer does not need one and there is none."""
-    from pansplat_viewer.offscreen import create_context
+    from pansplat_viewer.draw.offscreen import create_context
 
     if renderer == "cpu":
         return None

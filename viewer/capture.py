@@ -14,15 +14,15 @@ from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose, path_poses
 from pansplat.geometry.pose import interpolate_poses
 from pansplat.tours import Route, paint_floor_plan
-from pansplat_viewer import camera as cameras
-from pansplat_viewer.camera import Camera
-from pansplat_viewer.cpu_renderer import Renderer
-from pansplat_viewer.key_frames import CameraPath
-from pansplat_viewer.loader import LoadedScene, SceneEntry
-from pansplat_viewer.settings import DrawSettings
-from pansplat_viewer.state import NEAR_OF_FAR, ViewerState, enter_scene, fit_settings
-from pansplat_viewer.stereo import ImageFormat, render_image
-from pansplat_viewer.tour import CrossFade, TourScenes
+from pansplat_viewer.draw.cpu_renderer import Renderer
+from pansplat_viewer.draw.stereo import ImageFormat, render_image
+from pansplat_viewer.scene import camera as cameras
+from pansplat_viewer.scene.camera import Camera
+from pansplat_viewer.scene.key_frames import CameraPath
+from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
+from pansplat_viewer.scene.settings import DrawSettings
+from pansplat_viewer.scene.state import NEAR_OF_FAR, ViewerState, enter_scene, fit_settings
+from pansplat_viewer.scene.tour import CrossFade, TourScenes
 
 FILM_SECONDS = 4.0  # of a pair
 STILLS = (0.0, 0.25, 0.5, 0.75, 1.0)  # fractions of the flight

@@ -15,7 +15,6 @@ from jaxtyping import Float
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.tours import plan_route
-from pansplat_viewer import camera as cameras
 from pansplat_viewer.capture import (
     FilmWriter,
     SceneFrames,
@@ -24,21 +23,16 @@ from pansplat_viewer.capture import (
     write_path_film,
     write_screenshot,
 )
-from pansplat_viewer.compare import Comparer
-from pansplat_viewer.cpu_renderer import CpuRenderer, create_renderer
-from pansplat_viewer.file_watch import FileWatch
-from pansplat_viewer.gui import Gui
-from pansplat_viewer.input import Commands, apply_input, read_input
-from pansplat_viewer.key_frames import read_path, write_path
-from pansplat_viewer.loader import LoadedScene, Progress, SceneEntry, SceneLoader
-from pansplat_viewer.panels import PanelData, Panels
-from pansplat_viewer.picking import compute_pixel_ray, pick_point
-from pansplat_viewer.preferences import read_preferences, write_preferences
-from pansplat_viewer.presenter import Presenter
-from pansplat_viewer.resolution import AdaptiveResolution, ResolutionPlan
-from pansplat_viewer.settings import DrawSettings, RendererChoice
-from pansplat_viewer.slots import ScenePreparer, SceneSlot, keep_largest
-from pansplat_viewer.state import (
+from pansplat_viewer.draw.cpu_renderer import CpuRenderer, create_renderer
+from pansplat_viewer.draw.resolution import AdaptiveResolution, ResolutionPlan
+from pansplat_viewer.draw.stereo import StereoRenderer, choose_format, get_eye_size, render_image
+from pansplat_viewer.scene import camera as cameras
+from pansplat_viewer.scene.key_frames import read_path, write_path
+from pansplat_viewer.scene.loader import LoadedScene, Progress, SceneEntry, SceneLoader
+from pansplat_viewer.scene.picking import compute_pixel_ray, pick_point
+from pansplat_viewer.scene.settings import DrawSettings, RendererChoice
+from pansplat_viewer.scene.slots import ScenePreparer, SceneSlot, keep_largest
+from pansplat_viewer.scene.state import (
     ViewerState,
     adapt_settings,
     advance_flight,
@@ -47,8 +41,14 @@ from pansplat_viewer.state import (
     enter_tour,
     fit_settings,
 )
-from pansplat_viewer.stereo import StereoRenderer, choose_format, get_eye_size, render_image
-from pansplat_viewer.tour import DEFAULT_MEMORY, CrossFade, TourScenes, find_clicked, find_hotspots
+from pansplat_viewer.scene.tour import DEFAULT_MEMORY, CrossFade, TourScenes, find_clicked, find_hotspots
+from pansplat_viewer.ui.compare import Comparer
+from pansplat_viewer.ui.panels import PanelData, Panels
+from pansplat_viewer.ui.presenter import Presenter
+from pansplat_viewer.window.file_watch import FileWatch
+from pansplat_viewer.window.gui import Gui
+from pansplat_viewer.window.input import Commands, apply_input, read_input
+from pansplat_viewer.window.preferences import read_preferences, write_preferences
 
 PANORAMA_HEIGHT = 1024  # of a panorama screenshot, pixels
 _MAX_STEP_SECONDS = 0.25  # of camera movement in one frame

@@ -309,7 +309,7 @@ def _viewer_settings(case: RasterCase) -> dict[str, object]:
 def read_viewer_output(job: Path, threads: int) -> Iterator[dict[str, Any]]:
     """Yield the lines that the viewer's command prints, each as soon as it is printed."""
     environment = os.environ | {"LP_NUM_THREADS": str(threads)}  # of Mesa's software OpenGL
-    command = [sys.executable, "-m", f"{_VIEWER_PACKAGE}.timing", str(job)]
+    command = [sys.executable, "-m", f"{_VIEWER_PACKAGE}.draw.timing", str(job)]
     with (
         tempfile.TemporaryFile("w+") as errors,
         subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE, stderr=errors) as program,

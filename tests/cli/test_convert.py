@@ -13,7 +13,7 @@ from torch import Tensor
 from pansplat.cli import run
 from pansplat.model.weights import load_weights
 from pansplat.pipeline import load
-from pansplat_viewer.loader import LoadOptions, find_entries, load_entry
+from pansplat_viewer.scene.loader import LoadOptions, find_entries, load_entry
 
 HEIGHT = 64
 

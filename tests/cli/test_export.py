@@ -12,7 +12,7 @@ from PIL import Image
 from pansplat import pipeline
 from pansplat.cli import run
 from pansplat.web import page as page_module
-from pansplat_viewer.loader import LoadOptions, find_entries
+from pansplat_viewer.scene.loader import LoadOptions, find_entries
 
 
 def test_a_scene_is_written_pruned(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

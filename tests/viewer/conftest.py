@@ -22,11 +22,11 @@ from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.rendering import Rendering, rasterize
 from pansplat.tours import FloorOutline, TourGraph, merge_scenes
-from pansplat_viewer.cpu_renderer import CpuRenderer, Renderer
-from pansplat_viewer.loader import LoadedScene, SceneEntry
-from pansplat_viewer.offscreen import create_context
-from pansplat_viewer.renderer import DrawSettings, SplatRenderer
-from pansplat_viewer.tour import TourScenes
+from pansplat_viewer.draw.cpu_renderer import CpuRenderer, Renderer
+from pansplat_viewer.draw.offscreen import create_context
+from pansplat_viewer.draw.renderer import DrawSettings, SplatRenderer
+from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
+from pansplat_viewer.scene.tour import TourScenes
 
 _Y0 = 0.28209479177387814  # the constant harmonic
 

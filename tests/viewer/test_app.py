@@ -15,7 +15,7 @@ from pansplat.errors import InputError
 from pansplat_viewer import run
 from pansplat_viewer.app import Options, choose_entry
 from pansplat_viewer.capture import STILLS, Film, compute_flight_pose, compute_panorama_pose
-from pansplat_viewer.loader import LoadOptions, SceneEntry
+from pansplat_viewer.scene.loader import LoadOptions, SceneEntry
 
 
 @pytest.fixture(autouse=True)

@@ -21,10 +21,11 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
-from pansplat_viewer.color_maps import map_values
-from pansplat_viewer.cpu_renderer import CpuRenderer
-from pansplat_viewer.key_frames import CameraPath, KeyFrame
-from pansplat_viewer.loader import (
+from pansplat_viewer.draw.color_maps import map_values
+from pansplat_viewer.draw.cpu_renderer import CpuRenderer
+from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
+from pansplat_viewer.scene.key_frames import CameraPath, KeyFrame
+from pansplat_viewer.scene.loader import (
     LoadedScene,
     LoadOptions,
     Progress,
@@ -33,13 +34,12 @@ from pansplat_viewer.loader import (
     find_entries,
     load_entry,
 )
-from pansplat_viewer.photographs import Photographs
-from pansplat_viewer.preferences import Preferences
-from pansplat_viewer.presenter import ERROR_MAP
-from pansplat_viewer.resolution import BUDGET_MS, SETTLE_AFTER
-from pansplat_viewer.settings import Comparison, Display
-from pansplat_viewer.state import ViewerState
+from pansplat_viewer.scene.settings import Comparison, Display
+from pansplat_viewer.scene.state import ViewerState
+from pansplat_viewer.ui.photographs import Photographs
+from pansplat_viewer.ui.presenter import ERROR_MAP
 from pansplat_viewer.viewer import Viewer
+from pansplat_viewer.window.preferences import Preferences
 
 pytestmark = pytest.mark.gl
 once = pytest.mark.parametrize("session", ["cpu"], indirect=True)  # does not depend on the renderer
@@ -847,7 +847,7 @@ def test_a_scene_beyond_the_memory_is_offered_with_its_largest_gaussians(user, s
 
 
 def test_a_large_scene_is_converted_while_the_window_accepts_input(user, small_scene, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.slots._SMALL_SCENE", 0)
+    monkeypatch.setattr("pansplat_viewer.scene.slots._SMALL_SCENE", 0)
     go, prepare = threading.Event(), user.viewer.renderer.prepare
 
     def slow(scene, report):
@@ -873,7 +873,7 @@ def test_a_large_scene_is_converted_while_the_window_accepts_input(user, small_s
 
 @once
 def test_the_first_image_of_a_large_scene_is_drawn_in_the_background(user, pair, small_scene, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.slots._LARGE_SCENE", 0)
+    monkeypatch.setattr("pansplat_viewer.scene.slots._LARGE_SCENE", 0)
     before, go, draw = user.read_image(), threading.Event(), CpuRenderer._draw
     monkeypatch.setattr(CpuRenderer, "_draw", lambda *arguments: go.wait(60) and draw(*arguments))
     other = replace(small_scene, gaussians=small_scene.gaussians.select(small_scene.gaussians.views == 0))

@@ -1,0 +1,110 @@
+"""Sorting and culling by compute shaders: the order is that of the processor, and ties keep their order."""
+
+import numpy as np
+import pytest
+import torch
+
+from pansplat_viewer.draw.gpu_sort import GpuSplats, RadixSort
+from pansplat_viewer.draw.layers import SplatRasterizer, compute_lowpass_variances
+from pansplat_viewer.draw.programs import TILE_SIZE, Programs
+from pansplat_viewer.draw.splats import Splats, sort_splats
+from pansplat_viewer.scene.camera import Pinhole
+from pansplat_viewer.scene.settings import DrawSettings
+
+pytestmark = pytest.mark.gl
+
+
+@pytest.fixture(scope="module")
+def sorter(gl_context):
+    with gl_context:
+        programs = Programs(gl_context)
+        sort = RadixSort(gl_context, programs, 4 * TILE_SIZE + 1)
+    yield sort
+    with gl_context:
+        sort.release()
+        programs.release()
+
+
+def sort_values(sorter: RadixSort, keys: np.ndarray) -> np.ndarray:
+    if len(keys):
+        sorter.keys.write(keys.astype(np.uint32))
+        sorter.values.write(np.arange(len(keys), dtype=np.uint32))
+    sorter.sort(len(keys))
+    values = np.frombuffer(sorter.values.read(), np.uint32)[: len(keys)]
+    assert np.array_equal(np.frombuffer(sorter.keys.read(), np.uint32)[: len(keys)], keys[values])
+    return values
+
+
+@pytest.mark.parametrize(
+    "count", [0, 1, 2, 63, 64, 65, 1023, TILE_SIZE, TILE_SIZE + 1, 2047, 2048, 2049, 4 * TILE_SIZE, 4 * TILE_SIZE + 1]
+)
+def test_the_sort_is_that_of_numpy_and_stable(ctx, sorter, count):
+    random = np.random.default_rng(count)
+    any_keys = random.integers(0, 2**32, count, dtype=np.uint32)
+    few_keys = random.choice(np.array([0, 1, 2**31, 2**32 - 1], np.uint32), count)
+    for keys in (any_keys, few_keys, np.zeros(count, np.uint32), np.arange(count, dtype=np.uint32)[::-1].copy()):
+        assert np.array_equal(sort_values(sorter, keys), np.argsort(keys, kind="stable"))
+
+
+@pytest.fixture(scope="module")
+def splats(random_scene) -> Splats:
+    """3000 splats, each of which coincides with another one."""
+    scene = random_scene(1500, degree=0)
+    twice = torch.arange(3000) % 1500
+    return Splats.from_scene(type(scene)(scene.gaussians.select(twice), scene.cam2world, 0.45, 10.0, ("a", "b")))
+
+
+@pytest.fixture
+def gpu(ctx, splats):
+    programs = Programs(ctx)
+    rasterizer = SplatRasterizer(ctx, programs, splats, "gl43")
+    target = ctx.simple_framebuffer((64, 48))
+    yield rasterizer, target
+    rasterizer.release()
+    programs.release()
+    (ctx.screen or ctx.detect_framebuffer(0)).use()
+    target.release()
+
+
+def draw(gpu, splats: Splats, camera: Pinhole, selected, settings: DrawSettings) -> np.ndarray:
+    """Indices of the splats that were drawn, front to back."""
+    rasterizer, target = gpu
+    target.use()
+    parts = [(camera, (0, 0, 64, 48))]
+    rasterizer.draw(target, parts, sort_splats(splats, camera.position), selected, None, settings)
+    gpu = rasterizer._gpu
+    assert isinstance(gpu, GpuSplats)
+    return np.frombuffer(gpu._visible.read(), np.uint32)[: rasterizer.take_drawn()]
+
+
+@pytest.mark.parametrize("order", ["radial", "z"])
+@pytest.mark.parametrize("kernel", ["ray", "ewa"])
+def test_the_order_and_the_culling_are_the_processors(gpu, splats, pose, order, kernel):
+    camera = Pinhole(pose[:3, :3], tuple(pose[:3, 3]), 60.0, 64, 48)
+    settings = DrawSettings(order=order, kernel=kernel)
+    selected = np.arange(len(splats)) % 3 > 0
+    variance, _ = compute_lowpass_variances(settings, camera.focal)
+    expected = sort_splats(splats, camera.position)
+    seen = expected.cull(camera, selected, kernel=kernel, filter_variance=variance)
+    drawn = draw(gpu, splats, camera, selected, settings)
+    assert 0 < len(drawn) < selected.sum() and set(drawn) <= set(np.flatnonzero(selected))
+    # The bounds are conservative, and rounded differently: few splats at the border may differ.
+    assert len(set(drawn) ^ set(np.flatnonzero(seen))) <= 3
+    both = seen & np.isin(np.arange(len(splats)), drawn)
+    front_to_back = expected.sort_back_to_front(camera, both, order)[::-1]
+    shown = drawn[both[drawn]]
+    if order == "radial":
+        assert np.array_equal(shown, front_to_back)
+        assert np.array_equal(gpu[0]._gpu.read_order(), expected.order)
+    else:  # the products of depths are rounded differently; those that coincide keep their order
+        depth = (splats.means.astype(np.float64) @ camera.rotation[:, 2])[shown]
+        assert (np.diff(depth) > -1e-5).all()
+        place = np.argsort(shown)
+        pairs = [(a, a + 1500) for a in range(1500) if both[a] and both[a + 1500]]
+        where = dict(zip(shown[place].tolist(), place.tolist(), strict=True))
+        assert all(where[a] < where[b] for a, b in pairs)
+
+
+def test_no_selected_splat_draws_nothing_and_chunks_draw_all(gpu, splats, pose):
+    camera = Pinhole(pose[:3, :3], tuple(pose[:3, 3]), 60.0, 64, 48)
+    assert len(draw(gpu, splats, camera, np.zeros(len(splats), bool), DrawSettings())) == 0

@@ -1,0 +1,189 @@
+"""State between frames: layers, cached cube faces, and the order from the worker thread."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pansplat_viewer.draw.layers import TargetStore
+from pansplat_viewer.draw.renderer import DrawSettings, SplatRenderer
+
+pytestmark = pytest.mark.gl
+
+SIZE = (80, 60)
+CACHED = DrawSettings(cached=True, background=(0.3, 0.2, 0.1))
+STORAGES = (CACHED, replace(CACHED, cached=False), replace(CACHED, cached=False, layout="equirect"))
+
+
+def turn_right(pose, degrees):
+    """The camera turned to the right."""
+    angle = np.radians(degrees)
+    c, s = np.cos(angle), np.sin(angle)
+    result = pose.copy()
+    result[:3, :3] = pose[:3, :3] @ np.array(((c, 0, s), (0, 1, 0), (-s, 0, c)))
+    return result
+
+
+def enlarge_gaussians(scene):
+    """The scene with Gaussians of several pixels, which resampling hardly blurs."""
+    return replace(scene, gaussians=replace(scene.gaussians, scales=scene.gaussians.scales.clamp_min(0.15)))
+
+
+def render_image(renderer, pose, settings, size=SIZE):
+    renderer.render(pose, size, settings)
+    return renderer.read_color()
+
+
+@pytest.mark.parametrize("color_bits", [16, 32])
+@pytest.mark.parametrize("mode", ["joint", "deferred", "difference"])
+def test_cached_faces_give_the_image_of_direct_drawing(make_renderer, random_scene, pose, mode, color_bits):
+    scene = enlarge_gaussians(random_scene(150))
+    kept, direct = make_renderer(scene, color_bits=color_bits, slot=1), make_renderer(scene)
+    for degrees in (0, 40, 100, 170, 260):
+        camera = turn_right(pose, degrees)
+        settings = replace(CACHED, mode=mode)
+        error = np.abs(
+            render_image(kept, camera, settings) - render_image(direct, camera, replace(settings, cached=False))
+        )
+        assert error.mean() < 4e-3
+        assert error.max() < 0.04
+
+
+def test_cached_faces_give_the_depth_of_direct_drawing(make_renderer, random_scene, pose):
+    scene = enlarge_gaussians(random_scene(400, size=0.2))
+    kept, direct = make_renderer(scene), make_renderer(scene, slot=1)
+    kept.render(pose, SIZE, CACHED)
+    direct.render(pose, SIZE, replace(CACHED, cached=False))
+    assert np.abs(kept.read_depth() - direct.read_depth()).mean() < 0.01
+
+
+def test_rotation_draws_each_face_once(make_renderer, random_scene, pose):
+    renderer = make_renderer(random_scene())
+    for degrees in range(0, 360, 30):
+        renderer.render(turn_right(pose, degrees), SIZE, CACHED)
+    renderer.render(turn_right(pose, 90), SIZE, CACHED)
+    assert renderer.stats.cached and renderer.stats.drawn == 0
+    renderer.render(pose, SIZE, replace(CACHED, background=(1, 1, 1)))
+    assert renderer.stats.cached, "layers do not depend on the background"
+
+
+def test_narrow_field_of_view_is_drawn_directly(make_renderer, random_scene, pose):
+    renderer = make_renderer(random_scene())
+    narrow = replace(CACHED, vertical_fov_degrees=1.0)
+    assert np.array_equal(
+        render_image(renderer, pose, narrow), render_image(renderer, pose, replace(narrow, cached=False))
+    )
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"kernel": "ewa"},
+        {"order": "z"},
+        {"lowpass": "3dgs"},
+        {"mode": "view"},
+        {"levels": frozenset({1, 2})},
+        {"opacity_threshold": 0.5},
+        {"near": 1.9},
+    ],
+    ids=str,
+)
+def test_kept_layers_follow_every_setting(make_renderer, random_scene, pose, change):
+    scene = random_scene(size=0.1)
+    renderer, fresh = make_renderer(scene), make_renderer(scene, slot=1)
+    for settings in STORAGES:
+        before = render_image(renderer, pose, settings)
+        changed = replace(settings, **change)
+        after = render_image(renderer, pose, changed)
+        assert np.abs(after - before).max() > 1e-3
+        assert np.array_equal(after, render_image(fresh, pose, changed))
+
+
+def test_kept_layers_follow_position_size_and_scene(make_renderer, random_scene, pose):
+    renderer, fresh = make_renderer(random_scene()), make_renderer(random_scene(), slot=1)
+    moved = pose.copy()
+    moved[0, 3] += 0.2
+    for settings in STORAGES[:2]:
+        renderer.render(pose, SIZE, settings)
+        renderer.render(moved, SIZE, settings)
+        assert not renderer.stats.cached
+        assert np.array_equal(renderer.read_color(), render_image(fresh, moved, settings))
+        small = render_image(renderer, moved, settings, (50, 30))
+        assert small.shape == (30, 50, 4)
+        assert np.array_equal(small, render_image(fresh, moved, settings, (50, 30)))
+    other = random_scene(seed=7)
+    renderer.upload(other)
+    assert np.array_equal(
+        render_image(renderer, moved, CACHED), render_image(make_renderer(other, slot=1), moved, CACHED)
+    )
+
+
+def test_reading_depth_changes_nothing_else(make_renderer, random_scene, pose):
+    renderer = make_renderer(random_scene())
+    for settings in STORAGES:
+        color, stats = render_image(renderer, pose, settings), renderer.stats
+        first = renderer.read_depth()
+        assert renderer.stats == stats
+        assert np.array_equal(renderer.read_color(), color)
+        renderer.render(pose, SIZE, settings)
+        assert renderer.stats.cached
+        assert np.array_equal(renderer.read_depth(), first)
+
+
+def test_unsettled_images_settle_to_the_sorted_one(make_renderer, random_scene, pose, wait_until):
+    scene = random_scene(degree=2, size=0.1)
+    renderer = make_renderer(scene)
+    renderer.render(pose, SIZE, DrawSettings(), wait=False)
+    assert renderer.stats.settled, "the first frame waits for its order"
+    pose[:3, 3] += (0.5, 0.0, -0.4)
+    renderer.render(pose, SIZE, DrawSettings(), wait=False)
+    assert not renderer.stats.settled
+
+    def render_again() -> bool:
+        renderer.render(pose, SIZE, DrawSettings(), wait=False)
+        return renderer.stats.settled
+
+    wait_until(render_again, "settled image")
+    assert np.array_equal(renderer.read_color(), render_image(make_renderer(scene, slot=1), pose, DrawSettings()))
+
+
+def test_framebuffer_binding_of_the_caller_is_restored(ctx, make_renderer, random_scene, pose):
+    renderer = make_renderer(random_scene())
+    bound = ctx.framebuffer([ctx.texture((8, 8), 4)])
+    bound.use()
+    renderer.render(pose, SIZE, DrawSettings())
+    assert ctx.fbo is bound
+    renderer.read_depth()
+    assert ctx.fbo is bound
+    bound.clear(0.0, 1.0, 0.0, 1.0)
+    assert bound.read(components=4)[:4] == bytes((0, 255, 0, 255))
+
+
+def test_unused_targets_over_the_budget_are_freed(ctx):
+    store = TargetStore(ctx, color_bits=32, budget_bytes=3 * 16 * 100)
+    targets = {name: store.get(name, (10, 10), key=name) for name in "abcd"}
+    store.trim()
+    assert all(store.get(name, (10, 10), key=name) is targets[name] for name in "abcd"), "all targets were in use"
+    store.trim()
+    store.get("a", (10, 10), key="a")
+    store.trim()
+    kept = [name for name in "acdb" if store.get(name, (10, 10), key=name) is targets[name]]
+    assert kept == ["a", "c", "d"], "the least recently used target is freed, the budget holds three"
+    store.release()
+
+
+def test_target_content_is_valid_for_its_key_only(ctx):
+    store = TargetStore(ctx, color_bits=32)
+    store.get("a", (10, 10), key="a").parts.add(0)
+    assert store.get("a", (10, 10), key="a").parts == {0}
+    assert store.get("a", (10, 10), key="z").parts == set()
+    store.release()
+
+
+def test_release_leaves_the_context_usable(ctx, random_scene, pose):
+    for _ in range(2):
+        renderer = SplatRenderer(ctx)
+        renderer.upload(random_scene(10))
+        renderer.render(pose, SIZE, CACHED)
+        renderer.release()
+        assert ctx.error == "GL_NO_ERROR"

@@ -1,0 +1,132 @@
+"""Contexts without a window, and the same image on every version of OpenGL."""
+
+import importlib.util
+import inspect
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+from unittest.mock import Mock
+
+import moderngl
+import numpy as np
+import pytest
+import torch
+
+from pansplat.errors import InputError
+from pansplat_viewer.draw import offscreen
+from pansplat_viewer.draw.programs import choose_tier
+from pansplat_viewer.draw.renderer import DrawSettings
+
+pytestmark = pytest.mark.gl
+
+# Makes Mesa behave like macOS: an old version without compute shaders, storage buffers and images.
+_DISABLED_EXTENSIONS = " ".join(
+    f"-GL_ARB_{name}"
+    for name in (
+        "compute_shader",
+        "compute_variable_group_size",
+        "shader_storage_buffer_object",
+        "shader_image_load_store",
+        "shader_image_size",
+    )
+)
+
+
+def render_images(renderer, pose):
+    """Images of every kernel and layout, and one from cached faces."""
+    settings = {
+        f"{kernel} {layout}": DrawSettings(kernel=kernel, layout=layout, mode="deferred")
+        for kernel in ("ray", "ewa")
+        for layout in ("pinhole", "equirect")
+    }
+    settings["cached"] = DrawSettings(cached=True)
+    images = {}
+    for name, each in settings.items():
+        renderer.render(pose, (64, 48), each)
+        images[name] = renderer.read_color()
+    return images
+
+
+# Writes the images of the given scene, the OpenGL version and the tier.
+_SCRIPT = f"""
+import sys
+import numpy as np, torch
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat_viewer.draw.offscreen import create_context
+from pansplat_viewer.draw.renderer import DrawSettings, SplatRenderer
+
+{inspect.getsource(render_images)}
+scene_file, out, backend = sys.argv[1:]
+scene = torch.load(scene_file, weights_only=True)
+ctx = create_context(backend)
+renderer = SplatRenderer(ctx, color_bits=32)
+renderer.upload(Scene(Gaussians(**scene["gaussians"]), scene["cam2world"], 0.45, 10.0))
+images = render_images(renderer, scene["pose"].numpy())
+assert ctx.error == "GL_NO_ERROR", ctx.error
+np.savez(out, version=ctx.version_code, tier=renderer.tier, **images)
+"""
+
+
+@pytest.mark.slow
+def test_old_opengl_and_osmesa_render_the_same_images(make_renderer, random_scene, pose, tmp_path):
+    scene = random_scene()
+    stored = {"gaussians": vars(scene.gaussians), "cam2world": scene.cam2world, "pose": torch.from_numpy(pose)}
+    torch.save(stored, tmp_path / "scene.pt")
+    runs = {
+        f"{version}0": {
+            "MESA_GL_VERSION_OVERRIDE": f"{version[0]}.{version[1]}",
+            "MESA_GLSL_VERSION_OVERRIDE": f"{version}0",
+            "MESA_EXTENSION_OVERRIDE": _DISABLED_EXTENSIONS,
+        }
+        for version in ("33", "41")
+    }
+    try:
+        offscreen._load_osmesa()
+        runs["osmesa"] = {}
+    except OSError as error:  # Mesa 25.1 dropped OSMesa
+        if os.environ.get("CI"):
+            pytest.fail(f"{error}; install libosmesa6")
+    processes = {}
+    for name, environment in runs.items():
+        backend = "osmesa" if name == "osmesa" else "egl"
+        command = [sys.executable, "-c", _SCRIPT, str(tmp_path / "scene.pt"), str(tmp_path / f"{name}.npz"), backend]
+        processes[name] = subprocess.Popen(command, env=os.environ | environment, stderr=subprocess.PIPE, text=True)
+    expected = render_images(make_renderer(scene), pose)
+    for name, process in processes.items():
+        _, errors = process.communicate(timeout=120)
+        assert process.returncode == 0, errors
+        with np.load(tmp_path / f"{name}.npz") as images:
+            if name != "osmesa":
+                assert images["version"] == int(name) and images["tier"] == "gl33"
+            for key, image in expected.items():
+                assert np.abs(images[key] - image).max() <= 1e-5, (name, key)
+
+
+def test_missing_opengl_is_reported_with_the_packages(monkeypatch):
+    monkeypatch.setattr(moderngl, "create_context", Mock(side_effect=Exception("libEGL not loaded")))
+    monkeypatch.setattr(offscreen, "_load_osmesa", Mock(side_effect=OSError("libOSMesa is not installed")))
+    with pytest.raises(InputError, match=r"libEGL not loaded.*libOSMesa.*apt-get install libegl1.*libosmesa6"):
+        offscreen.create_context()
+
+
+def test_unknown_backend_is_refused():
+    with pytest.raises(InputError, match="auto, egl or osmesa, got 'wgl'"):
+        offscreen.create_context("wgl")
+
+
+def test_tier_follows_the_version_of_the_context():
+    old, new = SimpleNamespace(version_code=410), SimpleNamespace(version_code=430)
+    assert choose_tier(old, "auto") == "gl33"
+    assert choose_tier(new, "auto") == "gl43"
+    assert choose_tier(new, "gl33") == "gl33"
+    with pytest.raises(InputError, match=r"needs OpenGL 4.3, this context has 4.1; use tier gl33"):
+        choose_tier(old, "gl43")
+    with pytest.raises(InputError, match="auto, gl33 or gl43, got 'gl21'"):
+        choose_tier(new, "gl21")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not available for this system")
+def test_triton_can_be_loaded_after_a_context():
+    code = "from pansplat_viewer.draw.offscreen import create_context; create_context(); import triton"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,324 @@
+"""GL images equal the torch reference (docs/rendering.md); settings select Gaussians; invalid input is refused."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from pansplat.errors import InputError
+from pansplat.geometry.cubemap import face_poses
+from pansplat.geometry.equirect import pixel_directions
+from pansplat.rendering import blend, blend_weights, rasterize
+from pansplat_viewer.draw.renderer import DrawSettings, SplatRenderer
+from pansplat_viewer.draw.splats import SortedSplats
+
+pytestmark = pytest.mark.gl
+
+SIZE = (64, 48)
+SETTINGS = DrawSettings(background=(0.1, 0.4, 0.7))
+RENDERERS = pytest.mark.parametrize("tier", ["auto", "cpu"])
+KERNELS = pytest.mark.parametrize("kernel", ["ray", "ewa"])
+
+
+def select(scene, mask):
+    return replace(scene, gaussians=scene.gaussians.select(mask))
+
+
+def select_view(scene, view):
+    return select(scene, scene.gaussians.views == view)
+
+
+@KERNELS
+@pytest.mark.parametrize("lowpass", ["angular", "3dgs"])
+@pytest.mark.parametrize("order", ["radial", "z"])
+def test_pinhole_image_equals_the_reference(random_scene, pose, assert_reference, kernel, lowpass, order):
+    settings = replace(SETTINGS, kernel=kernel, lowpass=lowpass, order=order, vertical_fov_degrees=65)
+    assert_reference(random_scene(), pose, (97, 64), settings)
+
+
+@KERNELS
+def test_each_of_six_faces_equals_the_reference(random_scene, pose, assert_reference, kernel):
+    for face in face_poses(torch.from_numpy(pose)).numpy():
+        assert_reference(random_scene(seed=1), face, (48, 48), replace(SETTINGS, kernel=kernel))
+
+
+@KERNELS
+@pytest.mark.parametrize("order", ["radial", "z"])
+@pytest.mark.parametrize("face_size", [None, 21])
+def test_stitched_panorama_equals_the_reference(random_scene, pose, assert_reference, kernel, order, face_size):
+    settings = replace(SETTINGS, kernel=kernel, order=order, layout="equirect", face_size=face_size)
+    assert_reference(random_scene(seed=2), pose, (96, 48), settings)
+
+
+@KERNELS
+@pytest.mark.parametrize("order", ["radial", "z"])
+def test_camera_among_large_gaussians_equals_the_reference(random_scene, pose, assert_reference, kernel, order):
+    settings = replace(SETTINGS, kernel=kernel, order=order, vertical_fov_degrees=110)
+    assert_reference(random_scene(150, size=0.5, seed=3), pose, SIZE, settings)
+
+
+@KERNELS
+def test_subpixel_needle_and_disc_gaussians_equal_the_reference(random_scene, pose, assert_reference, kernel):
+    scene = random_scene(400, seed=4)
+    scales = scene.gaussians.scales.clone()
+    scales[:100] *= 0.01
+    scales[100:200, 0] *= 30
+    scales[200:300, 1] = 0
+    scene = replace(scene, gaussians=replace(scene.gaussians, scales=scales))
+    assert_reference(scene, pose, (80, 60), replace(SETTINGS, kernel=kernel))
+
+
+@RENDERERS
+@pytest.mark.parametrize("degree", [0, 2, 4])
+def test_colors_of_any_degree_follow_the_position(
+    make_renderer, random_scene, pose, reference, assert_matches, degree, tier
+):
+    scene = random_scene(degree=degree, seed=5)
+    renderer = make_renderer(scene, tier)
+    for shift in (0.0, 0.5):
+        pose[0, 3] += shift
+        assert_matches(renderer, pose, SETTINGS, reference(scene, pose, SIZE, SETTINGS))
+
+
+@pytest.mark.parametrize("order", ["radial", "z"])
+def test_ties_are_drawn_in_the_order_of_indices(random_scene, pose, assert_reference, order):
+    scene = random_scene(60, degree=0, size=0.15, seed=6)
+    means = scene.gaussians.means[torch.arange(60) // 6 * 6]  # six of different colour at each position
+    scene = replace(scene, gaussians=replace(scene.gaussians, means=means))
+    assert_reference(scene, pose, SIZE, replace(SETTINGS, order=order))
+
+
+def test_near_unusual_opacities_and_odd_sizes_equal_the_reference(random_scene, pose, assert_reference):
+    scene = random_scene(seed=9)
+    for near in (1.5, 2.5):
+        assert_reference(scene, pose, SIZE, DrawSettings(near=near))
+    for size in ((1, 1), (2, 1), (31, 7), (7, 31)):
+        assert_reference(scene, pose, size, SETTINGS)
+    opacities = scene.gaussians.opacities * 4 - 1
+    opacities[::7] = 0.99 / 255
+    assert_reference(replace(scene, gaussians=replace(scene.gaussians, opacities=opacities)), pose, SIZE, SETTINGS)
+
+
+@RENDERERS
+@pytest.mark.parametrize(("unit", "origin"), [(1e-3, (0, 0, 0)), (1e4, (0, 0, 0)), (1, (4e5, -2e5, 1e5))])
+def test_image_does_not_depend_on_the_unit_of_length_and_the_origin(
+    make_renderer, random_scene, pose, unit, origin, tier
+):
+    scene = random_scene(seed=7)
+    renderer = make_renderer(scene, tier)
+    renderer.render(pose, SIZE, DrawSettings())
+    expected = renderer.read_color()
+    origin = torch.tensor(origin, dtype=torch.float64)
+    cam2world = scene.cam2world.clone()
+    cam2world[:, :3, 3] = cam2world[:, :3, 3] * unit + origin
+    gaussians = scene.gaussians.to(dtype=torch.float64)
+    gaussians = replace(gaussians, means=gaussians.means * unit + origin, scales=gaussians.scales * unit)
+    renderer.upload(replace(scene, gaussians=gaussians, cam2world=cam2world))
+    pose[:3, 3] = pose[:3, 3] * unit + origin.numpy()
+    renderer.render(pose, SIZE, DrawSettings(near=0.05 * unit))
+    assert np.abs(renderer.read_color() - expected).max() <= 5e-3
+    assert np.abs(renderer.read_color() - expected).mean() <= 1e-5
+
+
+def test_panorama_error_at_seams_is_not_larger_than_inside_faces(make_renderer, random_scene, pose):
+    scene = random_scene(200, degree=0, size=0.12, seed=12)
+    height, width = 64, 128
+    renderer = make_renderer(scene)
+    renderer.render(pose, (width, height), DrawSettings(layout="equirect", face_size=64))
+    gaussians = scene.gaussians.to(dtype=torch.float64)
+    direct = rasterize(gaussians, torch.from_numpy(pose), size=(height, width), layout="equirect")  # without faces
+    error = np.abs(renderer.read_color()[..., :3] - direct.color.permute(1, 2, 0).numpy()).mean(axis=-1)
+    largest = np.sort(np.abs(pixel_directions(height, width).numpy()), axis=-1)
+    seam = largest[..., 2] - largest[..., 1] < 3 * math.pi / height
+    assert error[seam].mean() <= 1.5 * error[~seam].mean() + 1e-4
+
+
+@RENDERERS
+@pytest.mark.parametrize("view", [0, 1])
+def test_mode_view_draws_the_gaussians_of_the_view(
+    make_renderer, random_scene, pose, reference, assert_matches, view, tier
+):
+    scene = random_scene()
+    renderer = make_renderer(scene, tier)
+    expected = reference(select_view(scene, view), pose, SIZE, SETTINGS)
+    assert_matches(renderer, pose, replace(SETTINGS, mode="view", view=view), expected)
+    assert renderer.stats.visible <= int((scene.gaussians.views == view).sum())
+
+
+@RENDERERS
+@pytest.mark.parametrize("layout", ["pinhole", "equirect"])
+@pytest.mark.parametrize("position", ["between", "at view 1", "elsewhere"])
+def test_deferred_blending_equals_the_reference(
+    make_renderer, random_scene, pose, reference, assert_matches, layout, position, tier
+):
+    scene = random_scene(120)  # sparse, so that one or both views have holes
+    centers = scene.cam2world[:, :3, 3].numpy()
+    pose[:3, 3] = {"between": centers.mean(0), "at view 1": centers[1], "elsewhere": (0.1, 0.2, 0.3)}[position]
+    settings = replace(SETTINGS, mode="deferred", layout=layout)
+    renderer = make_renderer(scene, tier)
+    panorama = "equirect" if tier == "cpu" else "cubemap"
+    images = [reference(select_view(scene, view), pose, SIZE, settings, panorama) for view in (0, 1)]
+    weights = blend_weights(torch.from_numpy(pose[:3, 3].copy()), scene.cam2world[:, :3, 3])
+    total = sum(weight * image.alpha for weight, image in zip(weights, images, strict=True))
+    band = (total > 0) & (total < 1e-3)  # where the weighted views are nearly empty (docs/rendering.md, section 7)
+    assert band.float().mean() < 0.02
+    assert_matches(renderer, pose, settings, blend(images, weights), ~band.numpy())
+
+
+@RENDERERS
+def test_difference_is_that_of_the_images_of_two_views(make_renderer, random_scene, pose, reference, tier):
+    scene = random_scene()
+    renderer = make_renderer(scene, tier)
+    renderer.render(pose, SIZE, replace(SETTINGS, mode="difference"))
+    first, second = (reference(select_view(scene, view), pose, SIZE, SETTINGS) for view in (0, 1))
+    expected = (first.color - second.color).abs().permute(1, 2, 0).numpy()
+    forwards = renderer.read_color()
+    assert np.abs(forwards[..., :3] - expected).max() <= 5e-3
+    assert np.abs(renderer.read_depth() - (first.depth - second.depth).abs().numpy()).mean() <= 1e-3
+    renderer.render(pose, SIZE, replace(SETTINGS, mode="difference", view=1))
+    assert np.abs(renderer.read_color() - forwards).max() <= 1e-6
+
+
+@RENDERERS
+def test_levels_and_opacity_threshold_select_gaussians(
+    make_renderer, random_scene, pose, reference, assert_matches, tier
+):
+    scene = random_scene()
+    renderer = make_renderer(scene, tier)
+    cases = [({"opacity_threshold": 0.6}, scene.gaussians.opacities >= 0.6)]
+    for levels in ((), (0,), (1, 3)):
+        mask = torch.isin(scene.gaussians.levels, torch.tensor(levels, dtype=torch.int64))
+        cases.append(({"levels": frozenset(levels)}, mask))
+    for change, mask in cases:
+        expected = reference(select(scene, mask), pose, SIZE, SETTINGS)
+        assert_matches(renderer, pose, replace(SETTINGS, **change), expected)
+
+
+@RENDERERS
+def test_empty_scene_is_the_background(make_renderer, random_scene, pose, tier):
+    scene = random_scene()
+    renderer = make_renderer(select(scene, torch.zeros(len(scene.gaussians), dtype=torch.bool)), tier)
+    for settings in (SETTINGS, replace(SETTINGS, layout="equirect", mode="deferred")):
+        renderer.render(pose, SIZE, settings)
+        assert np.allclose(renderer.read_color(), (*SETTINGS.background, 0), atol=1e-6)
+        assert not renderer.read_depth().any()
+
+
+@RENDERERS
+def test_gaussians_with_non_finite_values_are_dropped_and_counted(
+    make_renderer, random_scene, pose, reference, assert_matches, tier
+):
+    scene = random_scene()
+    names = ("means", "scales", "quats", "opacities", "harmonics")
+    fields = {name: getattr(scene.gaussians, name).clone() for name in names}
+    fields["means"][0, 1] = float("nan")
+    fields["scales"][1, 0] = float("inf")
+    fields["quats"][2, 3] = float("nan")
+    fields["opacities"][3] = float("nan")
+    fields["harmonics"][4, 2, 0] = float("-inf")
+    renderer = make_renderer(replace(scene, gaussians=replace(scene.gaussians, **fields)), tier)
+    finite = select(scene, torch.arange(len(scene.gaussians)) >= 5)
+    assert_matches(renderer, pose, SETTINGS, reference(finite, pose, SIZE, SETTINGS))
+    assert renderer.stats.dropped == 5
+    assert renderer.stats.total == len(scene.gaussians) - 5
+
+
+def test_half_float_targets_are_close(make_renderer, random_scene, pose):
+    exact, half = make_renderer(random_scene()), make_renderer(random_scene(), color_bits=16)
+    for renderer in (exact, half):
+        renderer.render(pose, SIZE, SETTINGS)
+    assert 0 < np.abs(exact.read_color() - half.read_color()).max() < 0.02
+
+
+def test_software_gl_has_32_bit_targets_by_default(ctx, random_scene, pose):
+    class Gpu:
+        """The same context with a GPU's name."""
+
+        def __init__(self):
+            self.info = {**ctx.info, "GL_RENDERER": "NVIDIA H200"}
+
+        def __getattr__(self, name):
+            return getattr(ctx, name)
+
+    for context, dtype in ((ctx, "f4" if "llvmpipe" in ctx.info["GL_RENDERER"] else "f2"), (Gpu(), "f2")):
+        renderer = SplatRenderer(context)
+        renderer.upload(random_scene(20))
+        assert renderer.render(pose, SIZE, SETTINGS).dtype == dtype
+        renderer.release()
+
+
+@RENDERERS
+def test_image_is_upright_and_not_mirrored(make_renderer, random_scene, tier):
+    scene = select(random_scene(), torch.arange(300) < 1)
+    gaussians = replace(scene.gaussians, means=torch.tensor(((0.5, -0.5, 1.0),)), opacities=torch.ones(1))
+    renderer = make_renderer(replace(scene, gaussians=replace(gaussians, scales=torch.full((1, 3), 0.05))), tier)
+    texture = renderer.render(np.eye(4), (64, 64), DrawSettings())
+    row, column = np.unravel_index(renderer.read_color()[..., 3].argmax(), (64, 64))
+    assert row < 24 and column > 40, "a mean ahead, up and to the right is at the upper right"
+    raw = np.frombuffer(texture.read(), np.uint8 if tier == "cpu" else np.float32).reshape(64, 64, 4)
+    raw = raw[::-1, :, :3] / (255 if tier == "cpu" else 1)
+    error = np.abs(raw - renderer.read_color()[..., :3]).max()
+    assert error <= (0.501 / 255 if tier == "cpu" else 0), "row 0 of the texture is the bottom row"
+
+
+def test_culling_does_not_change_the_image(make_renderer, random_scene, pose, monkeypatch):
+    scene = random_scene(1000, size=0.1)
+    settings = [replace(SETTINGS, vertical_fov_degrees=fov) for fov in (10, 60, 150)]
+    culled, whole = make_renderer(scene), make_renderer(scene, slot=1)
+    images = []
+    for each in settings:
+        culled.render(pose, SIZE, each)
+        assert culled.stats.drawn < 1000
+        images.append(culled.read_color())
+    monkeypatch.setattr(SortedSplats, "cull", lambda self, camera, selected, **_: selected)
+    for each, image in zip(settings, images, strict=True):
+        whole.render(pose, SIZE, each)
+        assert np.array_equal(whole.read_color(), image)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kernel": "surfel"}, "`kernel` must be one of ray, ewa, got 'surfel'"),
+        ({"vertical_fov_degrees": 180}, "between 0 and 180, got 180"),
+        ({"face_size": 0}, "`face_size` must be at least 1"),
+        ({"near": 0.0}, "`near` must be a positive distance"),
+    ],
+)
+def test_invalid_settings_are_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        DrawSettings(**change)
+
+
+@RENDERERS
+def test_settings_poses_and_sizes_that_do_not_fit_are_refused(make_renderer, random_scene, pose, tier):
+    scene = random_scene()
+    renderer = make_renderer(scene, tier)
+    for change, message in (
+        ({"mode": "view", "view": 2}, "`view` must be 0..1 in this scene, got 2"),
+        ({"layout": "equirect", "face_size": 100_000}, "limit is .*; use a smaller size or face_size"),
+    ):
+        with pytest.raises(InputError, match=message):
+            renderer.render(pose, SIZE, replace(SETTINGS, **change))
+    with pytest.raises(InputError, match="finite 4x4"):
+        renderer.render(np.full((4, 4), np.nan), SIZE, SETTINGS)
+    with pytest.raises(InputError, match="at least 1x1"):
+        renderer.render(pose, (0, 10), SETTINGS)
+    renderer.upload(replace(scene, cam2world=torch.zeros(0, 4, 4, dtype=torch.float64), names=()))
+    renderer.render(pose, SIZE, SETTINGS)
+    with pytest.raises(InputError, match="0 cameras for 2 views; use mode joint"):
+        renderer.render(pose, SIZE, replace(SETTINGS, mode="deferred"))
+
+
+def test_renderer_without_a_scene_refuses_to_draw(ctx, pose):
+    with pytest.raises(InputError, match="color_bits"):
+        SplatRenderer(ctx, color_bits=8)
+    empty = SplatRenderer(ctx)
+    with pytest.raises(InputError, match="call `upload` first"):
+        empty.render(pose, SIZE, SETTINGS)
+    for read in (empty.read_color, empty.read_depth):
+        with pytest.raises(InputError, match="call `render` first"):
+            read()
+    empty.release()

@@ -1,0 +1,84 @@
+"""Sorting by distance, and the worker thread that sorts."""
+
+import threading
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from pansplat_viewer.draw import splats as splats_module
+from pansplat_viewer.draw.splats import Splats, SplatSorter, radix_argsort, sort_splats
+
+_FLOATS = st.floats(width=32, allow_nan=False)
+
+
+@pytest.fixture
+def splats(random_scene) -> Splats:
+    return Splats.from_scene(random_scene(20))
+
+
+@given(hnp.arrays(np.float32, st.integers(0, 200), elements=_FLOATS))
+def test_radix_order_of_any_floats_is_the_stable_order(keys):
+    assert np.array_equal(radix_argsort(keys), np.argsort(keys, kind="stable"))
+
+
+def test_radix_order_of_many_keys_with_ties_is_the_stable_order():
+    keys = np.random.default_rng(0).integers(0, 5000, 200_000).astype(np.float32) / 7
+    assert np.array_equal(radix_argsort(keys), np.argsort(keys, kind="stable"))
+
+
+def test_splats_are_sorted_by_distance_from_the_position(random_scene):
+    splats = Splats.from_scene(random_scene())
+    position = (0.3, -0.2, 0.1)
+    result = sort_splats(splats, position)
+    distance = np.linalg.norm(splats.means.astype(np.float64) - position, axis=1)
+    assert np.allclose(result.distances, distance, rtol=1e-6)
+    assert np.all(np.diff(distance[result.order]) > -1e-6)
+    assert sorted(result.order.tolist()) == list(range(len(splats)))
+
+
+def test_sorter_skips_requests_that_were_replaced(splats, monkeypatch, wait_until):
+    started, go, positions = threading.Event(), threading.Event(), []
+
+    def slow(splats, position):
+        positions.append(position)
+        started.set()
+        assert go.wait(60)
+        return sort_splats(splats, position)
+
+    monkeypatch.setattr(splats_module, "sort_splats", slow)
+    sorter = SplatSorter()
+    sorter.request(splats, (1.0, 0.0, 0.0))
+    assert started.wait(60)
+    sorter.request(splats, (2.0, 0.0, 0.0))
+    sorter.request(splats, (3.0, 0.0, 0.0))
+    assert sorter.take() is None
+    go.set()
+    wait_until(lambda: (result := sorter.take()) and result.position == (3.0, 0.0, 0.0), "order of the last position")
+    sorter.close()
+    assert positions == [(1.0, 0.0, 0.0), (3.0, 0.0, 0.0)]
+
+
+def test_exception_in_the_thread_is_raised_by_take(splats, monkeypatch, wait_until):
+    def fail(splats, position):
+        raise MemoryError("out of memory")
+
+    monkeypatch.setattr(splats_module, "sort_splats", fail)
+    sorter = SplatSorter()
+    sorter.request(splats, (0.0, 0.0, 0.0))
+    with pytest.raises(MemoryError, match="out of memory"):
+        wait_until(sorter.take, "exception")
+    sorter.close()
+
+
+def test_close_ends_the_thread(splats, wait_until):
+    before = threading.active_count()
+    sorter = SplatSorter()
+    sorter.request(splats, (0.0, 0.0, 0.0))
+    wait_until(sorter.take, "order")
+    sorter.close()
+    assert threading.active_count() == before
+    with pytest.raises(RuntimeError, match="shutdown"):
+        sorter.request(splats, (0.0, 0.0, 0.0))

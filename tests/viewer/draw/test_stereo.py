@@ -1,0 +1,233 @@
+"""Projections and stereo of stills and films."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from av.sidedata.sidedata import Type
+
+import pansplat
+from pansplat.errors import InputError
+from pansplat_viewer import run
+from pansplat_viewer.draw.cpu_renderer import CpuRenderer
+from pansplat_viewer.draw.renderer import SplatRenderer
+from pansplat_viewer.draw.stereo import ImageFormat, StereoRenderer, arrange_eyes, get_eye_size, move_eye, render_image
+from pansplat_viewer.scene.settings import DrawSettings
+
+SIZE = (48, 24)
+
+
+@pytest.fixture(scope="module")
+def renderer(random_scene):
+    renderer = CpuRenderer(None, exact=True)
+    renderer.upload(random_scene())
+    yield renderer
+    renderer.release()
+
+
+def draw(renderer, pose, size, **options):
+    settings = {name: options.pop(name) for name in list(options) if name in ("mode", "background")}
+    return render_image(renderer, pose, size, DrawSettings(**settings), ImageFormat(**options))[0]
+
+
+def test_the_eyes_of_a_perspective_image_are_the_distance_apart(renderer, pose):
+    both = draw(renderer, pose, SIZE, stereo="side-by-side", eye_distance=0.2)
+    left, right = both[:, : SIZE[0]], both[:, SIZE[0] :]
+    moved = pose.copy()
+    moved[:3, 3] -= 0.1 * pose[:3, 0]
+    assert np.array_equal(left, draw(renderer, moved, SIZE))
+    assert np.array_equal(right, draw(renderer, move_eye(pose, 0.1), SIZE))
+    assert np.abs(left - right).mean() > 0.01
+    assert np.array_equal(draw(renderer, pose, SIZE, stereo="top-bottom", eye_distance=0.2), np.vstack((left, right)))
+    anaglyph = draw(renderer, pose, SIZE, stereo="anaglyph", eye_distance=0.2)
+    assert np.array_equal(anaglyph, np.dstack((left[..., 0], right[..., 1], right[..., 2])))
+
+
+@pytest.mark.parametrize("mode", ["joint", "deferred"])
+def test_stereo_panoramas_are_those_of_pansplat_render(renderer, random_scene, pose, mode):
+    image = draw(renderer, pose, SIZE, projection="equirect", stereo="top-bottom", eye_distance=0.2, mode=mode)
+    expected = pansplat.render(random_scene(), pose, blend=mode, size=SIZE[::-1], eye_distance=0.2).color
+    error = np.abs(image - expected.permute(1, 2, 0).clamp(0, 1).numpy())
+    assert error.shape == (2 * SIZE[1], SIZE[0], 3)
+    assert error.mean() < 1e-4 and error.max() < 5e-3
+
+
+def test_swapping_the_sign_of_the_distance_exchanges_the_eyes(renderer, pose):
+    for projection, size in (("equirect", SIZE), ("perspective", SIZE), ("cubemap", (24, 16))):
+        first, second = (
+            draw(renderer, pose, size, projection=projection, stereo="side-by-side", eye_distance=distance)
+            for distance in (0.2, -0.2)
+        )
+        left, right = np.split(first, 2, axis=1)
+        assert np.array_equal(second, np.hstack((right, left)))
+
+
+def test_the_faces_of_a_cubemap_are_where_players_read_them(renderer, pose):
+    """FFmpeg's filter v360 turns the cubemap (`c3x2`) into a panorama."""
+    smooth = DrawSettings(background=(0.5, 0.5, 0.5))
+    for stereo in ("mono", "top-bottom"):
+        cubes = render_image(renderer, pose, (192, 128), smooth, ImageFormat("cubemap", stereo, 0.1))[0]
+        panoramas = render_image(renderer, pose, (256, 128), smooth, ImageFormat("equirect", stereo, 0.1))[0]
+        count = 1 if stereo == "mono" else 2
+        for cube, panorama in zip(np.split(cubes, count), np.split(panoramas, count), strict=True):
+            graph = av.filter.Graph()
+            frame = av.VideoFrame.from_ndarray((255 * cube + 0.5).astype(np.uint8), format="rgb24")
+            source = graph.add_buffer(width=192, height=128, format="rgb24", time_base="1/1")
+            turned = graph.add("v360", "input=c3x2:output=e:w=256:h=128")
+            shown, sink = graph.add("format", "rgb24"), graph.add("buffersink")
+            graph.link_nodes(source, turned, shown, sink).configure()
+            graph.push(frame)
+            error = np.abs(graph.pull().to_ndarray() / 255.0 - panorama)
+            assert error.mean() < 0.02
+
+
+def test_the_depth_of_both_eyes_is_arranged_as_the_colours_are(renderer, pose):
+    for projection, size, stereo, shape in (
+        ("equirect", SIZE, "top-bottom", (48, 48)),
+        ("cubemap", (24, 16), "side-by-side", (16, 48)),
+        ("perspective", SIZE, "anaglyph", (24, 48)),
+        ("cubemap", (24, 16), "mono", (16, 24)),
+    ):
+        image_format = ImageFormat(projection, stereo)
+        color, depth = render_image(renderer, pose, size, DrawSettings(), image_format, with_depth=True)
+        assert depth is not None and depth.shape == shape == color.shape[:2]
+        assert depth.min() >= 0 and 0.5 < depth.max() < 20
+
+
+def test_omnidirectional_stereo_needs_the_exact_kernel(renderer, pose):
+    with pytest.raises(InputError, match="needs kernel ray, got ewa"):
+        ImageFormat("equirect", "top-bottom").check((64, 32), "ewa")
+    with pytest.raises(InputError, match="needs layout equirect, kernel ray"):
+        DrawSettings(eye_offset=0.03)
+    with pytest.raises(InputError, match="`eye_offset` must be a distance"):
+        DrawSettings(layout="equirect", eye_offset=float("nan"))
+    assert arrange_eyes([np.zeros((2, 3, 1))], "mono").shape == (2, 3, 1)
+
+
+@pytest.mark.gl
+def test_opengl_refuses_omnidirectional_stereo(make_renderer, random_scene, pose):
+    settings = replace(DrawSettings(layout="equirect"), eye_offset=0.03)
+    with pytest.raises(InputError, match="use `CpuRenderer`"):
+        make_renderer(random_scene(), "gl33").render(pose, (32, 16), settings)
+
+
+def test_films_of_stereo_panoramas_state_their_layout(room, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    frames = [{"seconds": t, "position": [0, 0, t], "direction": [0, 0, 1]} for t in (0, 0.1)]
+    Path("walk.json").write_text(json.dumps({"key_frames": frames}))
+    arguments = [str(room), "--path", "walk.json", "--fps", "10", "--ipd", "0.1", "--out"]
+    for projection, size, stereo, shape, kind in (
+        ("equirect", "64x32", "top-bottom", (64, 64, 3), 2),
+        ("equirect", "64x32", "side-by-side", (32, 128, 3), 1),
+        ("cubemap", "48x32", "mono", (32, 48, 3), 0),
+        ("perspective", "64x32", "anaglyph", (32, 64, 3), None),
+    ):
+        assert run([*arguments, "walk.mp4", "--projection", projection, "--size", size, "--stereo", stereo]) == 0
+        with av.open("walk.mp4") as film:
+            decoded = list(film.decode(video=0))
+        data = {data.type: bytes(data) for data in decoded[0].side_data}
+        assert len(decoded) == 2 and decoded[0].to_ndarray(format="rgb24").shape == shape
+        assert (Type.SPHERICAL in data) == (projection != "perspective")
+        assert (int.from_bytes(data[Type.STEREO3D][:4], "little") if Type.STEREO3D in data else None) == kind
+    assert run([*arguments, "walk.exr", "--projection", "equirect", "--size", "64x32", "--stereo", "top-bottom"]) == 0
+    assert [path.name for path in sorted(Path().glob("*.exr"))] == ["walk_0000.exr", "walk_0001.exr"]
+
+
+# --- the window's images ---
+
+
+@pytest.fixture(params=["gl", "cpu"])
+def stereo_renderer(request, ctx, random_scene):
+    renderer = CpuRenderer(ctx, exact=True) if request.param == "cpu" else SplatRenderer(ctx, color_bits=32)
+    stereo = StereoRenderer(renderer, ctx)
+    stereo.upload(random_scene())
+    yield stereo
+    stereo.release()
+
+
+def read_texture(texture) -> np.ndarray:
+    kind = np.uint8 if texture.dtype == "f1" else np.float32
+    pixels = np.frombuffer(texture.read(), kind).reshape(texture.height, texture.width, 4)[::-1]
+    return pixels / 255 if texture.dtype == "f1" else pixels
+
+
+def turn(pose: np.ndarray, degrees: float) -> np.ndarray:
+    angle, turned = np.radians(degrees), pose.copy()
+    about_y = np.array(((np.cos(angle), 0, np.sin(angle)), (0, 1, 0), (-np.sin(angle), 0, np.cos(angle))))
+    turned[:3, :3] = pose[:3, :3] @ about_y
+    return turned
+
+
+@pytest.mark.gl
+def test_the_window_shows_the_images_of_both_eyes(stereo_renderer, pose):
+    for stereo in ("mono", "side-by-side", "top-bottom", "anaglyph"):
+        settings = DrawSettings(stereo=stereo, eye_distance=0.2)
+        texture = stereo_renderer.render(pose, (48, 32), settings)
+        shown, color, depth = read_texture(texture), stereo_renderer.read_color(), stereo_renderer.read_depth()
+        image_format = ImageFormat("perspective", stereo, 0.2)
+        expected, expected_depth = render_image(
+            stereo_renderer, pose, get_eye_size((48, 32), stereo), settings, image_format, with_depth=True
+        )
+        assert shown.shape == (32, 48, 4) and np.abs(shown[..., :3].clip(0, 1) - expected).max() < 0.003
+        assert np.abs(color[..., :3].clip(0, 1) - expected).max() < 1e-6
+        assert np.array_equal(depth, expected_depth) and color.shape == (32, 48, 4)
+        assert stereo_renderer.read_eye_depth().shape == get_eye_size((48, 32), stereo)[::-1]
+
+
+@pytest.mark.gl
+def test_turning_reads_cached_faces_of_both_eyes_until_they_are_out_of_place(stereo_renderer, pose):
+    settings = DrawSettings(stereo="side-by-side", eye_distance=0.2, cached=True, vertical_fov_degrees=40)
+    stereo_renderer.render(pose, (48, 32), settings)
+    for degrees in (-15, 15):  # the first turns may need another face
+        stereo_renderer.render(turn(pose, degrees), (48, 32), settings)
+    for degrees in (5, -15, 15):
+        stereo_renderer.render(turn(pose, degrees), (48, 32), settings)
+        assert stereo_renderer.stats.cached and stereo_renderer.stats.drawn == 0
+    stereo_renderer.render(turn(pose, 30), (48, 32), settings)
+    assert not stereo_renderer.stats.cached
+    moved = stereo_renderer.read_color()
+    stereo_renderer.render(turn(pose, 30), (48, 32), replace(settings, cached=False))
+    assert np.abs(stereo_renderer.read_color() - moved).mean() < 0.02
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("stereo_renderer", ["cpu"], indirect=True)
+@pytest.mark.parametrize("direction", [-1, 1])
+def test_the_faces_at_the_next_places_of_the_eyes_are_drawn_during_a_turn(stereo_renderer, pose, direction, wait_until):
+    settings, size = DrawSettings(stereo="anaglyph", eye_distance=0.2, cached=True, vertical_fov_degrees=40), (48, 32)
+    for degrees in (0, 4, 8, 16):
+        turned = turn(pose, direction * degrees)
+        stereo_renderer.render(turned, size, settings)
+        stereo_renderer.prefetch(turned, size, settings, 0.5)
+    turned = turn(pose, direction * 21)
+    for each in (replace(settings, scale=0.5), settings):
+        wait_until(lambda each=each: stereo_renderer.has_faces(turned, size, each), "faces")
+    stereo_renderer.render(turned, size, settings)
+    assert stereo_renderer.stats.cached and stereo_renderer.stats.drawn == 0
+    found = stereo_renderer.read_color()
+    expected = render_image(stereo_renderer, turned, size, settings, ImageFormat("perspective", "anaglyph", 0.2))[0]
+    assert np.abs(found[..., :3] - expected).mean() < 0.02
+
+
+@pytest.mark.gl
+def test_images_of_both_eyes_are_shown_when_both_are_finished(stereo_renderer, random_scene, pose, wait_until):
+    settings = DrawSettings(stereo="anaglyph", eye_distance=0.2)
+    stereo_renderer.render(pose, (24, 16), DrawSettings(), wait=False)
+    for place, size in ((pose, (24, 16)), (turn(pose, 20), (48, 32))):
+
+        def finish(place: np.ndarray = place, size: tuple[int, int] = size) -> bool:
+            stereo_renderer.render(place, size, settings, wait=False)
+            return stereo_renderer.stats.settled
+
+        wait_until(finish, "settled image")
+        texture = stereo_renderer.render(place, size, settings, wait=False)
+        shown = read_texture(texture)
+        expected = render_image(stereo_renderer, place, size, settings, ImageFormat("perspective", "anaglyph", 0.2))[0]
+        assert texture.size == size and np.abs(shown[..., :3].clip(0, 1) - expected).max() < 0.003
+    stereo_renderer.upload(random_scene(seed=1))
+    assert stereo_renderer.num_views == 2 and len(stereo_renderer._eyes) == 1
+    with pytest.raises(InputError, match="stereo of a window is perspective"):
+        stereo_renderer.render(pose, (48, 24), replace(settings, layout="equirect"))

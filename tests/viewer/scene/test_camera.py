@@ -1,0 +1,101 @@
+"""The interactive camera moves and stays level."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pansplat_viewer.scene import camera as cameras
+from pansplat_viewer.scene.camera import Camera
+
+# Right, down, forward of the level camera are x, -z, y: a world with z up.
+Z_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+
+
+def test_the_default_camera_looks_along_z_with_y_down():
+    assert np.allclose(Camera().cam2world, np.eye(4))
+
+
+@pytest.mark.parametrize("level", [Camera().level, Z_UP])
+def test_every_pose_is_rigid_and_has_no_roll(level):
+    for yaw in np.linspace(-4, 4, 9):
+        for pitch in np.linspace(-2, 2, 9):
+            camera = cameras.turn(replace(Camera(), level=level), yaw, pitch)
+            rotation = camera.rotation
+            assert np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) > 0
+            down = np.asarray(level)[:, 1]
+            assert abs(rotation[:, 0] @ down) < 1e-12, "right is horizontal"
+            assert rotation[:, 1] @ down > 0, "the image is not upside down"
+
+
+def test_positive_yaw_turns_right_and_positive_pitch_turns_up():
+    assert cameras.turn(Camera(), 0.1, 0).rotation[0, 2] > 0
+    assert cameras.turn(Camera(), 0, 0.1).rotation[1, 2] < 0
+
+
+def test_place_keeps_a_level_pose():
+    camera = cameras.turn(replace(Camera(), position=(1, 2, 3)), 2.5, -0.7)
+    placed = cameras.move_to_pose(Camera(), camera.cam2world)
+    assert np.allclose(placed.cam2world, camera.cam2world)
+
+
+def test_place_drops_the_roll_only():
+    c, s = math.cos(0.2), math.sin(0.2)
+    rolled = np.eye(4)
+    rolled[:3, :3] = cameras.turn(Camera(), 1, 0.3).rotation @ [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+    placed = cameras.move_to_pose(Camera(), rolled)
+    assert (placed.yaw_radians, placed.pitch_radians) == pytest.approx((1, 0.3))
+
+
+def test_place_of_a_pose_straight_down_keeps_the_heading():
+    down = np.eye(4)
+    down[:3, :3] = replace(Camera(), yaw_radians=0.8, pitch_radians=-math.pi / 2).rotation
+    assert cameras.move_to_pose(Camera(), down).yaw_radians == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_the_scene_follows_a_drag(axis):
+    camera, height = Camera(), 720
+    focal = height / 2 / math.tan(math.radians(camera.vertical_fov_degrees) / 2)
+    turned = cameras.turn_by_drag(camera, ((10.0, 0.0), (0.0, 10.0))[axis], height)
+    ahead = turned.rotation.T @ np.array((0.0, 0.0, 1.0))
+    assert focal * ahead[axis] / ahead[2] == pytest.approx(10, rel=1e-3)
+
+
+def test_fly_moves_along_the_view_and_along_the_up_axis_of_the_scene():
+    camera = cameras.turn(replace(Camera(), level=Z_UP), 0.5, 0.6)
+    forward = camera.rotation[:, 2]
+    assert np.allclose(cameras.fly(camera, 0, 0, 2).position, 2 * forward)
+    assert np.allclose(cameras.fly(camera, 0, 1, 0).position, -np.asarray(Z_UP)[:, 1])
+
+
+def test_orbit_keeps_the_centre_and_the_distance():
+    camera = replace(cameras.turn(Camera(), 0.4, 0.1), distance=3.0, position=(1.0, 0.0, -2.0))
+    center = camera.orbit_center
+    for pixels in ((50.0, 0.0), (0.0, 50.0), (-300.0, 400.0)):
+        turned = cameras.orbit(camera, pixels, 720)
+        assert np.allclose(turned.orbit_center, center)
+        assert turned != camera
+
+
+def test_dolly_approaches_the_centre_and_does_not_pass_it():
+    camera = replace(Camera(), distance=1.0)
+    near = cameras.dolly(camera, 1)
+    assert near.distance == pytest.approx(0.9) and near.position[2] == pytest.approx(0.1)
+    nearest = cameras.dolly(camera, 1000)
+    assert nearest.distance == cameras.MIN_DISTANCE
+    assert np.allclose(nearest.orbit_center, camera.orbit_center)
+
+
+def test_zoom_stays_within_its_bounds():
+    assert cameras.zoom(Camera(), 1).vertical_fov_degrees < Camera().vertical_fov_degrees
+    assert cameras.zoom(Camera(), 1e3).vertical_fov_degrees == cameras.MIN_FOV_DEGREES
+    assert cameras.zoom(Camera(), -1e3).vertical_fov_degrees == cameras.MAX_FOV_DEGREES
+
+
+def test_focus_looks_at_the_point_and_orbits_it():
+    point = np.array((2.0, -1.0, 3.0))
+    camera = cameras.focus_on_point(replace(Camera(), position=(0.5, 0, 0)), point)
+    assert np.allclose(camera.orbit_center, point)
+    assert cameras.focus_on_point(camera, np.asarray(camera.position)) == camera

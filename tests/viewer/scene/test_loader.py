@@ -1,0 +1,184 @@
+"""Scenes at a path are found, and loaded in a worker thread."""
+
+import threading
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from pansplat.errors import InputError
+from pansplat.gaussians.ply import save_ply
+from pansplat_viewer.scene.loader import LoadedScene, LoadOptions, SceneEntry, SceneLoader, find_entries, load_entry
+from pansplat_viewer.scene.tour import TourScenes
+
+
+def ignore(task: str, done: float) -> None: ...
+
+
+def list_loader_threads() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name.startswith("scene-loader")]
+
+
+def work_forever(entry, progress):
+    while True:
+        progress("working", 0.5)
+        time.sleep(0.001)
+
+
+def test_paths_without_scenes_are_refused(tmp_path):
+    (tmp_path / "image.jpg").write_bytes(b"x")
+    (tmp_path / "empty").mkdir()
+    for path, message in (
+        (tmp_path / "nowhere", r"nowhere.*no such file or folder.*give"),
+        (tmp_path / "image.jpg", r"image\.jpg"),
+        (tmp_path / "empty", "empty"),
+        (Path("~nobody-has-this-name"), "no such"),
+    ):
+        with pytest.raises(InputError, match=message):
+            find_entries(path, LoadOptions())
+
+
+def test_a_damaged_scene_is_refused_when_loaded(tmp_path):
+    file = tmp_path / "scene.ply"
+    file.write_bytes(b"ply\nnot really")
+    (entry,) = find_entries(file, LoadOptions())
+    with pytest.raises(InputError, match=r"scene\.ply"):
+        load_entry(entry, LoadOptions(), ignore)
+
+
+def test_a_folder_of_scenes_has_an_entry_for_each(tmp_path, small_scene):
+    for name in ("b", "a"):
+        save_ply(small_scene, tmp_path / f"{name}.ply")
+    entries = find_entries(tmp_path, LoadOptions())
+    assert [entry.name for entry in entries] == ["a", "b"]
+    loaded = load_entry(entries[0], LoadOptions(), ignore)
+    assert len(loaded.scene.gaussians) == len(small_scene.gaussians)
+
+
+def test_a_file_with_the_graph_of_a_tour_is_a_tour_of_its_parts(house, house_file):
+    (entry,) = find_entries(house_file, LoadOptions())
+    first = load_entry(entry, LoadOptions(), ignore)
+    tour, scenes = first.entry.tour, TourScenes(first.entry.tour, merged=first.entry.merged)
+    assert tour.name == "home" and tour.overlaps == house.overlaps and first.is_final
+    assert np.allclose(tour.positions, house.positions) and first.entry.views == (0, 1)
+    assert first.entry.panoramas == () and first.entry.files == (house_file,)
+    other = load_entry(scenes.make_entry((2, 3)), LoadOptions(), ignore)
+    assert other.entry.views == (2, 3) and other.entry.panoramas == ()
+    assert other.scene.gaussians.views.unique().tolist() == [0, 1]
+    assert np.allclose(other.scene.cam2world, house.cam2world[2:])
+
+
+@pytest.mark.shared
+def test_a_folder_of_pairs_has_an_entry_for_each(shared):
+    entries = find_entries(shared / "data" / "zind", LoadOptions())
+    assert entries[0].tour is not None and len(entries[0].tour) == 13, "the tour of all panoramas is the first"
+    assert len(entries) >= 4 and all(entry.pair is not None for entry in entries[1:])
+
+
+@pytest.mark.parametrize(
+    ("name", "folder"), [("a/b c", "a_b_c"), ("../x", "x"), ("...", "scene"), ("Küche 1", "Küche_1")]
+)
+def test_folder_name_is_a_single_valid_name(name, folder):
+    assert SceneEntry(name).folder_name == folder
+
+
+def test_loader_reports_progress_and_returns_the_result_once(small_scene, wait_until):
+    go, reported = threading.Event(), threading.Event()
+
+    def load(entry, progress, show):
+        progress("reading", 0.25)
+        reported.set()
+        assert go.wait(60)
+        return LoadedScene(entry, small_scene)
+
+    loader = SceneLoader(load)
+    assert loader.progress is None and loader.poll() is None
+    loader.request(SceneEntry("kitchen"))
+    assert reported.wait(60)
+    assert loader.progress == ("kitchen", "reading", 0.25) and loader.poll() is None
+    go.set()
+    assert wait_until(loader.poll, "result").scene is small_scene
+    assert loader.progress is None and loader.poll() is None
+    loader.close()
+
+
+def test_an_exception_is_returned(wait_until):
+    def load(entry, progress, show):
+        raise InputError(f"{entry.name} is damaged")
+
+    loader = SceneLoader(load)
+    loader.request(SceneEntry("kitchen"))
+    assert str(wait_until(loader.poll, "result")) == "kitchen is damaged"
+    loader.close()
+
+
+def test_a_new_request_cancels_the_previous_one(small_scene, wait_until):
+    def load(entry, progress, show):
+        return work_forever(entry, progress, show) if entry.name == "first" else LoadedScene(entry, small_scene)
+
+    loader = SceneLoader(load)
+    loader.request(SceneEntry("first"))
+    loader.request(SceneEntry("second"))
+    assert wait_until(loader.poll, "result").entry.name == "second"
+    loader.close()
+    assert not list_loader_threads()
+
+
+def test_close_cancels_the_request_and_joins_its_thread():
+    loader = SceneLoader(work_forever)
+    loader.request(SceneEntry("endless"))
+    loader.close()
+    assert not list_loader_threads()
+
+
+def test_predictions_have_the_arguments_of_the_options(monkeypatch, small_scene):
+    arguments = {}
+
+    def predict(pair, **options):
+        arguments.update(options)
+        options["progress"]("predicting", 0.5)
+        return small_scene
+
+    monkeypatch.setattr("pansplat.pipeline.predict", predict)
+    tasks = []
+    entry = SceneEntry("kitchen", pair=SimpleNamespace(name="kitchen"))
+    options = LoadOptions(model="sweep", height=256, cache=False)
+    loaded = load_entry(entry, options, lambda task, done: tasks.append(task))
+    assert (arguments["model"], arguments["height"], arguments["cache"]) == ("sweep", 256, False)
+    assert loaded.scene is small_scene and tasks[0] == "predicting"
+
+
+def test_the_prediction_is_returned_before_the_refined_scene(small_scene, wait_until):
+    go = threading.Event()
+
+    def load(entry, progress, show):
+        show(LoadedScene(entry, small_scene, is_final=False))
+        progress("refining", 0.75)
+        assert go.wait(60)
+        return LoadedScene(entry, small_scene)
+
+    loader = SceneLoader(load)
+    loader.request(SceneEntry("kitchen"))
+    assert loader.refinement is None
+    assert not wait_until(loader.poll, "prediction").is_final
+    assert wait_until(lambda: loader.refinement, "progress") == pytest.approx(0.5)
+    assert loader.progress is None and loader.poll() is None
+    go.set()
+    assert wait_until(loader.poll, "result").is_final
+    assert loader.refinement is None and loader.poll() is None
+    loader.close()
+
+
+def test_an_entry_shows_its_prediction_before_the_refined_scene(monkeypatch, small_scene):
+    def predict(pair, **options):
+        assert options["refine_seconds"] == 3.0
+        options["on_predicted"](small_scene)
+        return small_scene
+
+    monkeypatch.setattr("pansplat.pipeline.predict", predict)
+    shown = []
+    entry = SceneEntry("kitchen", pair=SimpleNamespace(name="kitchen"))
+    final = load_entry(entry, LoadOptions(refine_seconds=3.0), ignore, shown.append)
+    assert [loaded.is_final for loaded in (*shown, final)] == [False, True]

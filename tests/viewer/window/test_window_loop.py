@@ -1,0 +1,154 @@
+"""The event loop and the input devices of the window, without a display."""
+
+from concurrent.futures import Future
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
+
+import glfw
+import pytest
+from imgui_bundle import imgui
+
+from pansplat_viewer import app
+from pansplat_viewer.scene.loader import SceneEntry
+from pansplat_viewer.window import window as windows
+from pansplat_viewer.window.window import ContextLostError, Window, _run_loop
+
+
+def make_window(**values: object) -> Mock:
+    """A window of 64x32 pixels, in front of which nothing happens."""
+    values = {"is_visible": True, "gamepad_moves": False, "scale_changed": False, "dropped": [], **values}
+    return Mock(spec=Window, ctx=Mock(), closing=False, framebuffer_size=(64, 32), **values)
+
+
+def make_viewer() -> Mock:
+    """A viewer that quits in its first frame."""
+    viewer = Mock(moving=True, pending=None, state=Mock(quit=False), panel_data=Mock(current=-1))
+    viewer.frame.side_effect = lambda *_: setattr(viewer.state, "quit", True)
+    return viewer
+
+
+def test_a_dropped_path_is_opened():
+    window, viewer = make_window(), make_viewer()
+    Window._drop(window, None, ["/somewhere/a pair"])
+    _run_loop(window, viewer)
+    viewer.open.assert_called_once_with(Path("/somewhere/a pair"))
+    assert window.dropped == []
+
+
+def test_a_minimised_window_waits_and_draws_nothing():
+    window, viewer = make_window(is_visible=False), make_viewer()
+    waits = []
+
+    def wait(seconds: float) -> None:
+        waits.append(seconds)
+        window.closing = len(waits) == 3
+
+    window.wait.side_effect = wait
+    _run_loop(window, viewer)
+    viewer.frame.assert_not_called()
+    assert min(waits) > 0, "no busy loop"
+
+
+def test_an_image_drawn_in_the_background_wakes_the_window_when_it_is_finished():
+    window, viewer, pending = make_window(), make_viewer(), Future()
+    viewer.pending = pending
+    window.wait.side_effect = lambda seconds: pending.set_result(None)
+    _run_loop(window, viewer)
+    assert window.wait.call_args.args[0] > 0, "no busy loop"
+    window.wake.assert_called_once_with()
+
+
+def test_input_that_waits_for_the_next_frame_is_not_delayed():
+    window, viewer = make_window(), make_viewer()
+    viewer.moving, viewer.gui.has_input = False, True
+    _run_loop(window, viewer)
+    window.wait.assert_called_once_with(0.0)
+
+
+def test_a_window_without_pixels_or_minimised_is_not_visible():
+    for size, iconified, visible in (((640, 480), 0, True), ((640, 0), 0, False), ((640, 480), 1, False)):
+        library = SimpleNamespace(
+            get_framebuffer_size=lambda _, size=size: size,
+            get_window_attrib=lambda _, name, value=iconified: value,
+            ICONIFIED=0,
+        )
+        window = Window.__new__(Window)
+        window._glfw, window._handle = library, None
+        assert window.is_visible == visible
+
+
+def test_another_resolution_of_the_screen_changes_the_scale_once():
+    window, viewer = make_window(scale_changed=True, dpi_scale=2.0), make_viewer()
+    _run_loop(window, viewer)
+    viewer.gui.set_scale.assert_called_once_with(2.0)
+    assert window.scale_changed is False
+
+
+def test_a_reset_of_the_graphics_card_is_reported_after_the_frame():
+    window = Window.__new__(Window)
+    window._reset_status = lambda: 0
+    window.check_context()
+    window._reset_status = lambda: 0x8253  # GL_GUILTY_CONTEXT_RESET
+    with pytest.raises(ContextLostError, match="graphics card was reset"):
+        window.check_context()
+
+
+def test_a_new_window_replaces_one_whose_context_is_lost(monkeypatch, tmp_path):
+    viewers, runs = [], []
+
+    def make(ctx: object, loader: object, **options: object) -> Mock:
+        entries, opened = [SceneEntry("a"), SceneEntry("b")], tmp_path / "opened"
+        viewers.append(Mock(entries=entries, panel_data=Mock(current=1), path=opened, options=options))
+        return viewers[-1]
+
+    def run(window: object, viewer: Mock) -> None:
+        runs.append(viewer)
+        if len(runs) == 1:
+            raise ContextLostError("reset")
+
+    monkeypatch.setattr("pansplat_viewer.viewer.Viewer", make)
+    monkeypatch.setattr(windows, "Window", Mock())
+    monkeypatch.setattr(windows, "run_viewer", run)
+    monkeypatch.setattr("pansplat_viewer.window.preferences.find_file", lambda: tmp_path / "viewer.json")
+    assert app._run_window(app.Options(tmp_path), [SceneEntry("a")], 0, (64, 32), None) is None
+    first, second = viewers
+    assert second.options["state"] is first.options["state"], "camera and settings"
+    second.show.assert_called_once_with(first.entries, 1, tmp_path / "opened")
+
+
+def test_sticks_and_buttons_of_a_gamepad_reach_imgui():
+    context = imgui.create_context()
+    imgui.set_current_context(context)
+    io = imgui.get_io()
+    io.set_ini_filename("")  # write no imgui.ini into the current folder
+    io.backend_flags |= imgui.BackendFlags_.has_gamepad.value | imgui.BackendFlags_.renderer_has_textures.value
+    io.display_size, io.delta_time = (64, 32), 0.1
+    buttons = [0] * 15
+    buttons[glfw.GAMEPAD_BUTTON_A] = 1
+    state: SimpleNamespace | None = SimpleNamespace(axes=[0.5, -0.9, 0.1, 0.0, -1.0, 1.0], buttons=buttons)
+    window = Window.__new__(Window)
+    names = {name: getattr(glfw, name) for name in dir(glfw) if name.startswith("GAMEPAD_")}
+    window._glfw = SimpleNamespace(
+        joystick_is_gamepad=lambda _: state is not None, get_gamepad_state=lambda _: state, **names
+    )
+    window._had_gamepad = False
+
+    def read(name: str) -> float:
+        return imgui.internal.get_key_data(getattr(imgui.Key, f"gamepad_{name}")).analog_value
+
+    def draw() -> None:
+        window._send_gamepad()
+        imgui.new_frame()
+        imgui.end_frame()
+
+    draw()
+    assert [read(name) for name in ("l_stick_right", "l_stick_up", "r2", "face_down")] == pytest.approx(
+        [0.5, 0.9, 1, 1]
+    )
+    assert [read(name) for name in ("l_stick_left", "r_stick_right", "l2", "face_up")] == [0, 0, 0, 0], "dead zone"
+    assert window.gamepad_moves
+    state = None  # unplugged
+    draw()
+    assert read("l_stick_up") == 0 and not window.gamepad_moves
+    imgui.destroy_context(context)

@@ -1,0 +1,1 @@
+"""Renderers: OpenGL and CPU."""

@@ -1,0 +1,662 @@
+"""Draws a scene's Gaussians on the processor, for machines without a GPU: `SplatRenderer`'s calls, other arithmetic.
+
+`CpuRenderer` rasterises with numba kernels in a worker thread and uploads the finished image as a texture. Turns are
+read from cube faces that are kept for the position; after an image without waiting the worker draws the missing faces.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from concurrent.futures import Future, ThreadPoolExecutor, TimeoutError
+from concurrent.futures import wait as wait_for_all
+from dataclasses import dataclass, field, replace
+
+import moderngl
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt32
+
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Scene
+from pansplat.rendering.cpu.display import (
+    MIN_TRANSMITTANCE,
+    NO_LAYER,
+    DisplayScene,
+    Layers,
+    PixelFaces,
+    Selection,
+    SelectionCache,
+    blend_layers,
+    blend_to_pixels,
+    enlarge,
+)
+from pansplat.rendering.cpu.footprints import Footprint
+from pansplat.rendering.cpu.rasterize import MIN_TRANSMITTANCE as EXACT_TRANSMITTANCE
+from pansplat.rendering.cpu.runtime import checking_each_item, pooled_empty
+from pansplat.rendering.cpu.tiling import LARGEST_SIDE
+from pansplat.rendering.image_planes import ImagePlane, stitch_faces
+from pansplat.rendering.rasterize import RasterOptions
+from pansplat_viewer.draw.color_maps import map_values
+from pansplat_viewer.draw.displays import color_by_property
+from pansplat_viewer.draw.layers import Frame, LayerStorage
+from pansplat_viewer.draw.renderer import SplatRenderer, choose_layer_weights, is_software
+from pansplat_viewer.draw.splats import Splats, drop_not_finite
+from pansplat_viewer.scene.camera import Pinhole, create_face_cameras
+from pansplat_viewer.scene.settings import SCALAR_MAPS, DrawSettings, FrameStats, RendererChoice
+
+_MIN_WEIGHT = 2.0**-26  # of a view in deferred blending; as the OpenGL renderer's with 32-bit targets
+_POLL_SECONDS = (
+    0.02  # wait for an image that is drawn without waiting, so that a window does not draw the old one again
+)
+_SMALLER = "use a smaller size or face_size"
+_MAX_FACE_SETS = 5
+_MAX_SELECTIONS = 8
+_MAX_TEXTURES = 4
+
+
+class _StoppedError(Exception):
+    """Raised in the worker to end work whose result is not needed."""
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedScene:
+    """A scene as the renderer needs it.
+
+    Attributes:
+        splats: without `geometry` and `harmonics`, which `scene` has.
+        scene: the Gaussians.
+    """
+
+    splats: Splats
+    scene: DisplayScene
+
+
+@dataclass(frozen=True, eq=False)
+class _Groups:
+    """The sets of Gaussians that the layers show.
+
+    Attributes:
+        labels: layer of each Gaussian, or `NO_LAYER`.
+        weights: of the layers.
+        difference: whether the image is the difference of the first and the last layer.
+        visible: number of Gaussians in all layers.
+    """
+
+    labels: Int[np.ndarray, "n"]
+    weights: Float[np.ndarray, "layer"]
+    difference: bool
+    visible: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Picture:
+    """A finished image.
+
+    Attributes:
+        frame: its camera, size and settings.
+        pixels: at full size, bottom row first.
+        groups, sums: its layers; None if it was read from cube faces.
+        stats: counts and times.
+    """
+
+    frame: Frame
+    pixels: UInt32[np.ndarray, "height width"]
+    groups: _Groups | None
+    sums: Float[np.ndarray, "layer 5 height width"] | None
+    stats: FrameStats
+
+
+@dataclass(eq=False)
+class _FaceSet:
+    """Cube faces of one position and settings, and those that are finished."""
+
+    faces: PixelFaces
+    done: set[int] = field(default_factory=set)
+
+    def find_missing(self, frame: Frame) -> list[int]:
+        """The faces that a frame reads and that are not finished."""
+        if len(self.done) == 6:
+            return []
+        return [face for face in frame.find_parts_in_view() if face not in self.done]
+
+
+class _Job:
+    """Work in the worker thread that can be stopped."""
+
+    def __init__(self, work: Callable[[], _Picture | None]) -> None:
+        self._work, self._stopped = work, threading.Event()
+        self.future: Future[_Picture | None] = Future()
+
+    def run(self) -> _Picture | None:
+        """Do the work; ends with `_StoppedError` soon after `stop`."""
+        self.check()
+        with checking_each_item(self.check):
+            return self._work()
+
+    def stop(self) -> None:
+        """Make the work end at its next step."""
+        self._stopped.set()
+        self.future.cancel()
+
+    def check(self) -> None:
+        """Raise `_StoppedError` if the job is stopped."""
+        if self._stopped.is_set():
+            raise _StoppedError
+
+
+class CpuRenderer:
+    """Renders scenes of 3D Gaussians on the processor; the attributes and calls are those of `SplatRenderer`.
+
+    Attributes:
+        stats: counts and times of the last frame.
+        tier: `cpu`.
+    """
+
+    min_size = (640, 360)
+    settle_seconds = 0.02
+    turn_ms = 1000 / 60  # the worker draws the faces before a turn, so that reading them is always faster
+    waits_while_moving = True
+
+    def __init__(self, ctx: moderngl.Context | None, *, exact: bool = False) -> None:
+        """Create the renderer without a scene.
+
+        Args:
+            ctx: the current context; without one, `render` returns no texture and `read_color` has the image.
+            exact: continue behind a transmittance of 2^-10, which 8 bits do not show.
+        """
+        self.tier = "cpu"
+        self.stats = FrameStats(tier=self.tier)
+        self._ctx = ctx
+        self._min_transmittance = EXACT_TRANSMITTANCE if exact else MIN_TRANSMITTANCE
+        self._worker = ThreadPoolExecutor(1, "cpu-renderer")
+        self._jobs: list[_Job] = []
+        self._pending: tuple[Hashable, _Job] | None = None
+        self._splats: Splats | None = None
+        self._scene: DisplayScene | None = None
+        self._colored: tuple[str, DisplayScene] | None = None  # with the colours of a display
+        self._groups: dict[Hashable, tuple[Int[np.ndarray, "n"], int]] = {}
+        self._selected = SelectionCache()
+        self._faces: OrderedDict[Hashable, _FaceSet] = OrderedDict()
+        self._textures: dict[tuple[int, int], moderngl.Texture] = {}
+        self._picture: _Picture | None = None
+        self._texture: moderngl.Texture | None = None
+
+    @property
+    def num_views(self) -> int:
+        """Context views of the uploaded scene."""
+        return self._splats.num_views if self._splats is not None else 0
+
+    @property
+    def pixels(self) -> UInt32[np.ndarray, "height width"] | None:
+        """The last image as bytes, bottom row first; None before the first one."""
+        return None if self._picture is None else self._picture.pixels
+
+    @property
+    def pending(self) -> Future[_Picture | None] | None:
+        """The image that the worker draws; None if `render` has returned it, or waits for it."""
+        return None if self._pending is None else self._pending[1].future
+
+    def create_sibling(self) -> CpuRenderer:
+        """A renderer that has this scene, without a copy."""
+        sibling = CpuRenderer(self._ctx)
+        sibling._min_transmittance = self._min_transmittance
+        sibling._splats, sibling._scene, sibling.stats = self._splats, self._scene, self.stats
+        return sibling
+
+    @staticmethod
+    def prepare(scene: Scene, report: Callable[[float], None] = lambda done: None) -> PreparedScene:
+        """Convert a scene for `upload`, in any thread.
+
+        Args:
+            scene: Gaussians with NaN or infinity are dropped and counted.
+            report: called with the fraction done, by any thread; an exception ends the work.
+        """
+        gaussians = drop_not_finite(scene.gaussians, lambda done: report(0.2 * done))
+        finite = replace(scene, gaussians=gaussians)
+        splats = Splats.from_scene(finite, lambda done: report(0.2 + 0.4 * done), with_rows=False)
+        splats = replace(splats, dropped=len(scene.gaussians) - len(gaussians))
+        arrays = (values.detach().numpy() for values in (gaussians.quats, gaussians.scales.abs(), gaussians.harmonics))
+        rows = DisplayScene(
+            splats.means, splats.opacities, *arrays, splats.reach, lambda done: report(0.6 + 0.4 * done)
+        )
+        return PreparedScene(splats, rows)
+
+    def upload(self, scene: Scene, prepared: PreparedScene | None = None) -> None:
+        """Replace the scene; with `prepared`, made by `prepare`, this takes no time."""
+        self._stop_jobs()
+        prepared = prepared or self.prepare(scene)
+        self._splats, self._scene = prepared.splats, prepared.scene
+        splats = prepared.splats
+        self._groups.clear()
+        self._selected = SelectionCache()
+        self._faces.clear()
+        self._picture = self._texture = self._colored = None
+        self.stats = FrameStats(total=len(splats), dropped=splats.dropped, tier=self.tier)
+
+    def render(
+        self,
+        cam2world: Float[np.ndarray, "4 4"],
+        size: tuple[int, int],
+        settings: DrawSettings,
+        *,
+        wait: bool = True,
+    ) -> moderngl.Texture | None:
+        """Draw the scene and return the image's texture.
+
+        Args:
+            cam2world: rigid pose, OpenCV axes, metres.
+            size: (width, height) in pixels.
+            settings: draw settings.
+            wait: return this image. If False, return the last image while the worker draws; `stats.settled` is then
+                False, and the caller renders again until it is True. The worker then draws the cube faces.
+
+        Returns:
+            RGBA texture, as `SplatRenderer.render` returns it, with 8 bits per channel; None while the first image of
+            the scene is drawn.
+
+        Raises:
+            InputError: no scene is uploaded, or the size or a setting does not fit the scene.
+        """
+        if self._splats is None:
+            raise InputError("there is no scene to draw; call `upload` first")
+        frame = Frame.create(self._splats, np.asarray(cam2world, dtype=np.float64), size, settings)
+        largest = max(*frame.size, frame.face_size if settings.layout == "equirect" else 0)
+        if largest > LARGEST_SIDE:
+            raise InputError(f"the image needs {largest} pixels a side, the limit is {LARGEST_SIDE}; {_SMALLER}")
+        groups = self._choose_groups(frame)
+        if frame.storage == LayerStorage.PADDED_FACES:
+            return self._show(self._read_from_faces(frame, groups))
+        key = (frame.rotation.tobytes(), frame.world_position.tobytes(), frame.full_size, settings)
+        if self._pending is None or self._pending[0] != key:
+            self._stop_jobs()
+            self._pending = key, self._start(lambda: self._draw(frame, groups))
+            if not wait and settings.layout == "pinhole":
+                self._start_faces(frame, groups)
+        job = self._pending[1]
+        try:
+            picture = job.future.result(None if wait else _POLL_SECONDS)
+        except TimeoutError:
+            self.stats = replace(self.stats, settled=False, frame_ms=0.0)
+            return self._texture
+        except BaseException:
+            self._pending = None
+            raise
+        self._pending = None
+        assert picture is not None
+        return self._show(picture)
+
+    def has_faces(self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings) -> bool:
+        """Whether the cube faces that the camera reads are finished."""
+        assert self._splats is not None
+        frame = Frame.create(
+            self._splats, np.asarray(cam2world, dtype=np.float64), size, replace(settings, cached=True)
+        )
+        if frame.storage != LayerStorage.PADDED_FACES:
+            return False
+        stored = self._faces.get(_face_key(frame))
+        return stored is not None and not stored.find_missing(frame)
+
+    def prefetch_faces(
+        self,
+        cam2world: Float[np.ndarray, "4 4"],
+        size: tuple[int, int],
+        settings: list[DrawSettings],
+        *,
+        everywhere: bool = False,
+    ) -> None:
+        """Let the worker draw the faces that a camera reads, unless it works; those of the first settings first.
+
+        With `everywhere`, it draws the faces of all directions.
+        """
+        if any(not job.future.done() for job in self._jobs):
+            return
+        assert self._splats is not None
+        pose, work = np.asarray(cam2world, dtype=np.float64), []
+        for each in settings:
+            frame = Frame.create(self._splats, pose, size, replace(each, cached=True))
+            if frame.storage == LayerStorage.PADDED_FACES:
+                stored, groups = self._find_face_set(frame), self._choose_groups(frame)
+                faces = dict.fromkeys([*stored.find_missing(frame), *(range(6) if everywhere else ())])
+                work += [(frame, groups, stored, face) for face in faces if face not in stored.done]
+
+        def draw_faces() -> None:
+            for each in work:
+                self._draw_face(*each)
+
+        if work:
+            self._start(draw_faces)
+
+    def read_color(self) -> Float[np.ndarray, "height width 4"]:
+        """Return the last image, float32, top row first: RGB over the background, and coverage."""
+        return self._blend_last()[0]
+
+    def read_depth(self) -> Float[np.ndarray, "height width"]:
+        """Return the radial depth of the last image in metres, float32, top row first; 0 where nothing is drawn."""
+        return self._blend_last()[1]
+
+    def release(self) -> None:
+        """Stop the worker thread and free the textures."""
+        self._stop_jobs()
+        self._worker.shutdown(cancel_futures=True)
+        for texture in self._textures.values():
+            texture.release()
+        self._textures.clear()
+
+    # --- the worker ---
+
+    def _start(self, work: Callable[[], _Picture | None]) -> _Job:
+        job = _Job(work)
+        job.future = self._worker.submit(job.run)
+        self._jobs = [*(other for other in self._jobs if not other.future.done()), job]
+        return job
+
+    def _stop_jobs(self) -> None:
+        """Stop all work and wait until it has stopped."""
+        for job in self._jobs:
+            job.stop()
+        wait_for_all([job.future for job in self._jobs])  # their results and errors are not needed
+        self._jobs.clear()
+        self._pending = None
+
+    def _start_faces(self, frame: Frame, groups: _Groups) -> None:
+        """Let the worker draw the faces of this position, those in view first."""
+        frame = replace(frame, settings=replace(frame.settings, cached=True))
+        if frame.storage != LayerStorage.PADDED_FACES:
+            return
+        stored = self._find_face_set(frame)
+        order = dict.fromkeys([*frame.find_parts_in_view(), *range(6)])
+
+        def draw_faces() -> None:
+            for face in order:
+                self._draw_face(frame, groups, stored, face)
+
+        self._start(draw_faces)
+
+    # --- drawing ---
+
+    def _choose_groups(self, frame: Frame) -> _Groups:
+        """The sets of Gaussians of a frame and their weights."""
+        assert self._splats is not None
+        splats, settings = self._splats, frame.settings
+        images = choose_layer_weights(frame, splats, _MIN_WEIGHT)
+        views = tuple(dict.fromkeys(view for image in images for view in image))
+        key = (views, settings.levels, settings.opacity_threshold)
+        if key not in self._groups:
+            if len(self._groups) >= _MAX_SELECTIONS:
+                self._groups.clear()
+            labels = np.full(len(splats), NO_LAYER, np.int16)
+            for layer, view in enumerate(views):
+                labels[splats.select(settings.levels, settings.opacity_threshold, view)] = layer
+            self._groups[key] = labels, int(np.count_nonzero(labels != NO_LAYER))
+        labels, visible = self._groups[key]
+        weights = np.array([images[0].get(view, 1.0) for view in views], np.float32)
+        return _Groups(labels, weights, len(images) == 2, visible)
+
+    def _draw(self, frame: Frame, groups: _Groups) -> _Picture:
+        """Draw the image of a frame."""
+        start = time.perf_counter()
+        stages: dict[str, float] = {}
+        drawn = 0
+        if frame.settings.layout == "pinhole":
+            pinhole = Pinhole(frame.rotation, frame.position, frame.focal, *frame.size)
+            layers = self._rasterize(frame, groups, pinhole, self._selected)
+            sums, drawn = layers.sums, layers.statistics.visible
+            _add_stages(stages, layers)
+        else:
+            sums, drawn = self._rasterize_panorama(frame, groups, stages)
+        pixels = pooled_empty(frame.size[::-1], np.uint32)
+        before = time.perf_counter()
+        _write_pixels(frame.settings, groups, sums, pixels, bottom_up=True)
+        stages["blend"] = 1e3 * (time.perf_counter() - before)
+        pixels = _enlarge(frame, pixels, stages)
+        now = time.perf_counter()
+        stats = self._make_stats(frame, groups, drawn, 1e3 * (now - start), stages)
+        return _Picture(frame, pixels, groups, sums, stats)
+
+    def _rasterize(self, frame: Frame, groups: _Groups, camera: Pinhole, cache: SelectionCache | None = None) -> Layers:
+        """Rasterise the Gaussians in a pinhole camera's view."""
+        plane = ImagePlane(
+            (camera.height, camera.width), torch.from_numpy(np.ascontiguousarray(camera.rotation)), camera.focal
+        )
+        options = _raster_options(frame.settings)
+        if frame.settings.kernel == "ewa":  # draws outside the bounding ball: leave out only what is behind the camera
+            selection = Selection(np.ascontiguousarray(camera.rotation[:, 2][None]), 0.0, bounded=False)
+        else:
+            deviation = math.sqrt(options.filter_variance(plane.pixel_angle))
+            selection = Selection(camera.compute_side_normals(), deviation, bounded=True)
+        return self._find_scene(frame.settings).rasterize(
+            np.asarray(frame.position),
+            plane,
+            groups.labels,
+            len(groups.weights),
+            options,
+            selection=selection,
+            cache=cache,
+            min_transmittance=self._min_transmittance,
+            footprint=_find_footprint(frame.settings),
+        )
+
+    def _find_scene(self, settings: DrawSettings) -> DisplayScene:
+        """The Gaussians with the colours of a display."""
+        assert self._scene is not None and self._splats is not None
+        name, splats, scene = settings.splat_colors, self._splats, self._scene
+        if name == "color":
+            return scene
+        if self._colored is None or self._colored[0] != name:
+            cameras = splats.view_positions - splats.origin
+            arrays = scene.means, scene.quats, scene.scales, splats.levels, splats.views, cameras
+            colors = color_by_property(name, *arrays)
+            self._colored = name, scene.with_colors(colors)
+        return self._colored[1]
+
+    def _rasterize_panorama(
+        self, frame: Frame, groups: _Groups, stages: dict[str, float]
+    ) -> tuple[Float[np.ndarray, "layer 5 height width"], int]:
+        """Rasterise a panorama: directly, or from cube faces if the kernel or `face_size` needs them."""
+        size, settings = frame.size[::-1], frame.settings
+        if settings.kernel == "ray" and settings.face_size is None:
+            plane = ImagePlane(size, torch.from_numpy(frame.rotation.copy()), 0.0, settings.eye_offset)
+            layers = self._find_scene(settings).rasterize(
+                np.asarray(frame.position),
+                plane,
+                groups.labels,
+                len(groups.weights),
+                _raster_options(settings),
+                min_transmittance=self._min_transmittance,
+                footprint=_find_footprint(settings),
+            )
+            _add_stages(stages, layers)
+            return layers.sums, layers.statistics.visible
+        faces, drawn = [], 0
+        for camera in create_face_cameras(frame.faces_to_world, frame.position, frame.face_size, 0):
+            layers = self._rasterize(frame, groups, camera)
+            faces.append(torch.from_numpy(layers.sums))
+            drawn += layers.statistics.visible
+            _add_stages(stages, layers)
+        before = time.perf_counter()
+        stitched = torch.stack([stitch_faces(torch.stack(layer), size) for layer in zip(*faces, strict=True)])
+        stages["stitch"] = 1e3 * (time.perf_counter() - before)
+        return stitched.numpy(), drawn
+
+    def _read_from_faces(self, frame: Frame, groups: _Groups) -> _Picture:
+        """Read the image from the cube faces of the position; draws those that are missing."""
+        start = time.perf_counter()
+        stored = self._find_face_set(frame)
+        missing = stored.find_missing(frame)
+        drawn, stages = 0, {}
+        if missing:
+            self._stop_jobs()
+
+            def draw_missing() -> None:
+                nonlocal drawn
+                drawn = sum(self._draw_face(frame, groups, stored, face) for face in missing)
+
+            self._start(draw_missing).future.result()
+            stages["faces"] = 1e3 * (time.perf_counter() - start)
+        pixels = pooled_empty(frame.size[::-1], np.uint32)
+        before = time.perf_counter()
+        stored.faces.sample(frame.rotation, frame.focal, pixels, bottom_up=True)
+        stages["sample"] = 1e3 * (time.perf_counter() - before)
+        pixels = _enlarge(frame, pixels, stages)
+        stats = self._make_stats(frame, groups, drawn, 1e3 * (time.perf_counter() - start), stages)
+        return _Picture(frame, pixels, None, None, replace(stats, cached=not missing))
+
+    def _draw_face(self, frame: Frame, groups: _Groups, stored: _FaceSet, face: int) -> int:
+        """Draw one face unless it is finished; returns the number of Gaussians."""
+        if face in stored.done:
+            return 0
+        plane = stored.faces.plane(face)
+        camera = Pinhole(plane.rotation.numpy(), frame.position, plane.focal, *plane.size)
+        layers = self._rasterize(frame, groups, camera)
+        _write_pixels(frame.settings, groups, layers.sums, stored.faces.pixels[face])
+        stored.done.add(face)
+        return layers.statistics.visible
+
+    def _find_face_set(self, frame: Frame) -> _FaceSet:
+        """The faces of a frame's position, settings and resolution; the least recently used set is dropped."""
+        key = _face_key(frame)
+        if key not in self._faces:
+            while len(self._faces) >= _MAX_FACE_SETS:
+                self._faces.popitem(last=False)
+            self._faces[key] = _FaceSet(PixelFaces.allocate(frame.focal))
+        self._faces.move_to_end(key)
+        return self._faces[key]
+
+    # --- results ---
+
+    def _make_stats(
+        self, frame: Frame, groups: _Groups, drawn: int, frame_ms: float, stages: dict[str, float]
+    ) -> FrameStats:
+        return FrameStats(
+            total=self.stats.total,
+            dropped=self.stats.dropped,
+            visible=groups.visible,
+            drawn=drawn,
+            sort_ms=stages.get("sort", 0.0),
+            frame_ms=frame_ms,
+            tier=self.tier,
+            stages=stages,
+            size=frame.size,
+        )
+
+    def _show(self, picture: _Picture) -> moderngl.Texture | None:
+        """Upload a picture and return its texture."""
+        self._picture = picture
+        before = time.perf_counter()
+        if self._ctx is not None:
+            size = picture.frame.full_size
+            limit = self._ctx.info["GL_MAX_TEXTURE_SIZE"]
+            if size not in self._textures and max(size) <= limit:
+                if len(self._textures) >= _MAX_TEXTURES:
+                    for texture in self._textures.values():
+                        texture.release()
+                    self._textures.clear()
+                self._textures[size] = self._ctx.texture(size, 4)
+                self._textures[size].repeat_x = self._textures[size].repeat_y = False
+            self._texture = self._textures.get(size)
+            if self._texture is not None:  # else the image is only read, such as a large panorama
+                self._texture.write(picture.pixels)
+        upload_ms = 1e3 * (time.perf_counter() - before)
+        stats = picture.stats
+        self.stats = replace(stats, frame_ms=stats.frame_ms + upload_ms, stages={**stats.stages, "upload": upload_ms})
+        return self._texture
+
+    def _blend_last(self) -> tuple[Float[np.ndarray, "height width 4"], Float[np.ndarray, "height width"]]:
+        """Colours and depth of the last picture; one that was read from cube faces is drawn directly."""
+        if self._picture is None:
+            raise InputError("there is no image to read; call `render` first")
+        if self._picture.sums is None:
+            frame = self._picture.frame
+            frame = replace(frame, settings=replace(frame.settings, cached=False))
+            self._picture = self._draw(frame, self._choose_groups(frame))
+        picture = self._picture
+        assert picture.sums is not None and picture.groups is not None
+        return _blend(picture.frame.settings, picture.groups, picture.sums)
+
+
+Renderer = SplatRenderer | CpuRenderer
+
+
+def choose_renderer(ctx: moderngl.Context | None, choice: RendererChoice) -> RendererChoice:
+    """Return `gl` or `cpu`; `auto` is `cpu` where there is no OpenGL or OpenGL is software."""
+    if choice == "auto":
+        return "cpu" if ctx is None or is_software(ctx) else "gl"
+    return choice
+
+
+def create_renderer(
+    ctx: moderngl.Context | None, choice: RendererChoice = "auto", *, color_bits: int | None = None
+) -> Renderer:
+    """Create the renderer of this choice; `color_bits` is for `gl`."""
+    if choose_renderer(ctx, choice) == "cpu":
+        return CpuRenderer(ctx)
+    if ctx is None:
+        raise InputError("renderer `gl` needs an OpenGL context; use `cpu`")
+    return SplatRenderer(ctx, color_bits=color_bits)
+
+
+def _face_key(frame: Frame) -> Hashable:
+    """The values that the faces of a frame depend on: everything but rotation and image size."""
+    settings = replace(frame.settings, cached=True, vertical_fov_degrees=90.0, scale=1.0)
+    return frame.world_position.tobytes(), frame.focal, settings
+
+
+def _raster_options(settings: DrawSettings) -> RasterOptions:
+    return RasterOptions(settings.kernel, settings.order, settings.lowpass, settings.near)
+
+
+def _find_footprint(settings: DrawSettings) -> Footprint | None:
+    return None if settings.footprint == "gaussian" else settings.footprint
+
+
+def _blend(
+    settings: DrawSettings, groups: _Groups, sums: Float[np.ndarray, "layer 5 height width"]
+) -> tuple[Float[np.ndarray, "height width 4"], Float[np.ndarray, "height width"]]:
+    """Colour over the background and coverage, and depth."""
+    color, depth = blend_layers(sums, groups.weights, settings.background, difference=groups.difference)
+    if settings.display in SCALAR_MAPS:
+        values = {"depth": depth, "opacity": color[..., 3], "count": sums[0, 4]}[settings.display]
+        mapped = map_values(values, settings.display_max, SCALAR_MAPS[settings.display]) / np.float32(255)
+        color[..., :3] = np.where(color[..., 3:] > 0, mapped, np.array(settings.background, np.float32))
+    return color, depth
+
+
+def _write_pixels(
+    settings: DrawSettings,
+    groups: _Groups,
+    sums: Float[np.ndarray, "layer 5 height width"],
+    pixels: UInt32[np.ndarray, "height width"],
+    *,
+    bottom_up: bool = False,
+) -> None:
+    """Write the colours of `_blend` with 8 bits per channel, by the kernel where the display has one."""
+    weights, background = groups.weights, settings.background
+    if settings.display not in SCALAR_MAPS:
+        blend_to_pixels(sums, weights, background, pixels, difference=groups.difference, bottom_up=bottom_up)
+        return
+    color, _ = _blend(settings, groups, sums)
+    color[..., 3] = 1
+    words = (color * 255 + 0.5).astype(np.uint8).view(np.uint32)[..., 0]
+    pixels[...] = words[::-1] if bottom_up else words
+
+
+def _enlarge(
+    frame: Frame, pixels: UInt32[np.ndarray, "height width"], stages: dict[str, float]
+) -> UInt32[np.ndarray, "full_height full_width"]:
+    """The pixels at the full size of the frame: OpenGL in software takes ten times as long to enlarge a texture."""
+    if frame.size == frame.full_size:
+        return pixels
+    start, large = time.perf_counter(), pooled_empty(frame.full_size[::-1], np.uint32)
+    enlarge(pixels, large)
+    stages["enlarge"] = 1e3 * (time.perf_counter() - start)
+    return large
+
+
+def _add_stages(stages: dict[str, float], layers: Layers) -> None:
+    """Add the milliseconds of each stage."""
+    for name, seconds in layers.statistics.seconds.items():
+        stages[name] = stages.get(name, 0.0) + 1e3 * seconds

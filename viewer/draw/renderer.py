@@ -1,0 +1,397 @@
+"""Draws a scene's Gaussians with OpenGL into a texture: any pose, pinhole or panorama, any blending mode.
+
+Needs no window. All calls must come from the thread of the context. `SplatRenderer._draw` has the data flow of a frame:
+the splats are painted into layers (one for each set of Gaussians), and the layers are composed to the image.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from typing import Literal
+
+import moderngl
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Scene
+from pansplat.geometry.pose import blend_weights
+from pansplat_viewer.draw.color_maps import create_table_texture
+from pansplat_viewer.draw.layers import Frame, Layer, LayerPainter, LayerStorage, Target, TargetStore
+from pansplat_viewer.draw.programs import COUNT_STEP, Programs, choose_tier, set_uniforms
+from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
+from pansplat_viewer.draw.splats import SortedSplats, Splats, SplatSorter, color_splats, sort_splats
+from pansplat_viewer.scene.settings import SCALAR_MAPS, DrawSettings, FrameStats
+
+_SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software")
+
+# Smallest weight of a view in deferred blending, by the bits of the render targets. With it, a view shows where the
+# others are empty (such as the masked tripod of an input); elsewhere it vanishes in rounding.
+_MIN_WEIGHT = {16: 1e-4, 32: 2.0**-26}
+
+
+def is_software(ctx: moderngl.Context) -> bool:
+    """Whether the context draws on the processor."""
+    return any(name in ctx.info["GL_RENDERER"].lower() for name in _SOFTWARE)
+
+
+_COLOR_MAP_UNIT = 8  # texture unit, after those of the layers
+
+
+class SplatRenderer:
+    """Renders scenes of 3D Gaussians on an OpenGL 3.3 or 4.3 context.
+
+    Each call leaves blending disabled and restores the framebuffer binding.
+
+    Attributes:
+        stats: counts and times of the last frame.
+        tier: `gl33` or `gl43`; both draw the same image.
+        min_size: the window's image is not drawn at a lower resolution while the camera moves, pixels.
+        settle_seconds: after the last movement, until the image is drawn at full resolution.
+        turn_ms: time of a full image above which turns read cached faces.
+        waits_while_moving: whether a window waits for the image of each position.
+    """
+
+    min_size = (1, 1)
+    settle_seconds = SETTLE_AFTER
+    turn_ms = BUDGET_MS
+    waits_while_moving = False
+
+    def __init__(
+        self,
+        ctx: moderngl.Context,
+        *,
+        tier: Literal["auto", "gl33", "gl43"] = "auto",
+        color_bits: Literal[16, 32] | None = None,
+    ) -> None:
+        """Create the renderer without a scene.
+
+        Args:
+            ctx: the current context.
+            tier: `gl33` culls and sorts on the processor; `gl43` does it by compute shaders.
+            color_bits: bits per channel of the render targets. None is 16 on a GPU, and 32 on software OpenGL, which
+                truncates half floats (images get darker with every layer) and is not slower with 32.
+
+        Raises:
+            InputError: the context does not support `tier`, or `color_bits` is neither 16 nor 32.
+        """
+        if color_bits is None:
+            color_bits = 32 if is_software(ctx) else 16
+        if color_bits not in (16, 32):
+            raise InputError(f"`color_bits` must be 16 or 32, got {color_bits}")
+        self.tier = choose_tier(ctx, tier)
+        self.stats = FrameStats(tier=self.tier)
+        self._ctx = ctx
+        self._programs = Programs(ctx)
+        self._targets = TargetStore(ctx, color_bits=color_bits)
+        self._compositor = Compositor(ctx, self._programs, self._targets)
+        self._sort = color_splats if self.tier == "gl43" else sort_splats  # the GPU sorts in tier gl43
+        self._sorter = SplatSorter(self._sort)
+        self._splats: Splats | None = None
+        self._painter: LayerPainter | None = None
+        self._sorted: SortedSplats | None = None
+        self._color_key: tuple[object, ...] | None = None
+        self._frame: Frame | None = None
+        self._image: Target | None = None
+
+    @property
+    def pending(self) -> None:
+        """No image is drawn in the background."""
+
+    @property
+    def num_views(self) -> int:
+        """Context views of the uploaded scene."""
+        return self._splats.num_views if self._splats is not None else 0
+
+    def create_sibling(self) -> SplatRenderer:
+        """A renderer with a copy of this scene on the GPU."""
+        sibling = SplatRenderer(self._ctx, tier=self.tier, color_bits=self._targets.color_bits)
+        if self._splats is not None:
+            sibling._upload(self._splats)
+        return sibling
+
+    prepare = staticmethod(Splats.from_scene)
+
+    def upload(self, scene: Scene, prepared: Splats | None = None) -> None:
+        """Replace the scene on the GPU; `prepare` converts it before, in any thread.
+
+        Gaussians with NaN or infinity are dropped and counted.
+        """
+        self._upload(prepared or self.prepare(scene))
+
+    def _upload(self, splats: Splats) -> None:
+        self._release_scene()
+        self._painter = LayerPainter(self._ctx, self._programs, self._targets, splats, self.tier)
+        self._splats = splats
+        self.stats = FrameStats(total=len(splats), dropped=splats.dropped, tier=self.tier)
+
+    def render(
+        self,
+        cam2world: Float[np.ndarray, "4 4"],
+        size: tuple[int, int],
+        settings: DrawSettings,
+        *,
+        wait: bool = True,
+    ) -> moderngl.Texture:
+        """Draw the scene and return the image's texture.
+
+        Args:
+            cam2world: rigid pose, OpenCV axes, metres.
+            size: (width, height) in pixels.
+            settings: draw settings.
+            wait: sort for this position first. If False, draw at once with the last order while a worker thread sorts;
+                `stats.settled` is then False, and the caller renders again until it is True.
+
+        Returns:
+            RGBA texture: colour over the background, and coverage. Row 0 is the bottom row, so the texture is upright
+            when drawn as any OpenGL texture. The next call overwrites its content.
+
+        Raises:
+            InputError: no scene is uploaded, or the size or a setting does not fit the scene or the GPU.
+        """
+        start = time.perf_counter()
+        if self._splats is None:
+            raise InputError("there is no scene to draw; call `upload` first")
+        if settings.eye_offset:
+            raise InputError("OpenGL does not draw omni-directional stereo; use `CpuRenderer`")
+        bound = self._ctx.fbo
+        frame = Frame.create(self._splats, np.asarray(cam2world, dtype=np.float64), size, settings)
+        settled = self._update_order(frame.position, wait)
+        self._frame = frame
+        image = self._draw(frame, with_depth=False)
+        self._ctx.finish()
+        assert self._painter is not None
+        drawn = self.stats.drawn + self._painter.rasterizer.take_drawn()
+        bind(bound)
+        self.stats = dataclasses.replace(
+            self.stats, settled=settled, drawn=drawn, frame_ms=1e3 * (time.perf_counter() - start)
+        )
+        return image.color
+
+    def has_faces(self, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> bool:
+        """Whether faces of this resolution are kept while coarser ones are drawn: never, see `CpuRenderer`."""
+        return False
+
+    def prefetch_faces(
+        self, cam2world: np.ndarray, size: tuple[int, int], settings: list[DrawSettings], *, everywhere: bool = False
+    ) -> None:
+        """Draw no faces in advance: the GPU has no worker thread."""
+
+    def read_color(self) -> Float[np.ndarray, "height width 4"]:
+        """Return the last image, float32, top row first: RGB over the background, and coverage."""
+        return self._read(attachment=0, components=4)
+
+    def read_depth(self) -> Float[np.ndarray, "height width"]:
+        """Return the radial depth of the last image in metres, float32, top row first; 0 where nothing is drawn.
+
+        `render` draws no depth. The first call after it draws the frame again with depth. In mode `difference` this is
+        the absolute difference of the two depths.
+        """
+        if self._image is not None and self._frame is not None and self._image.depth is None:
+            bound, stats = self._ctx.fbo, self.stats
+            self._draw(self._frame, with_depth=True)
+            assert self._painter is not None
+            self._painter.rasterizer.take_drawn()  # not of a new frame
+            self.stats = stats
+            bind(bound)
+        return self._read(attachment=1, components=1)[..., 0]
+
+    def release(self) -> None:
+        """Stop the sorting thread and free every GL object."""
+        self._sorter.close()
+        self._release_scene()
+        self._compositor.release()
+        self._targets.release()
+        self._programs.release()
+
+    def _draw(self, frame: Frame, *, with_depth: bool) -> Target:
+        """Paint the layers that the frame needs and compose them to the image."""
+        splats, painter = self._sorted, self._painter
+        assert splats is not None and painter is not None
+        with_depth = with_depth or frame.settings.display == "depth"
+        self._write_colors(splats, frame.settings.splat_colors)
+        weights = choose_layer_weights(frame, splats.splats, _MIN_WEIGHT[self._targets.color_bits])
+        views = dict.fromkeys(view for image_weights in weights for view in image_weights)
+        layers = {view: painter.paint(frame, splats, view, with_depth=with_depth) for view in views}
+        weighted = [[(layers[view], weight) for view, weight in image_weights.items()] for image_weights in weights]
+        self._image = self._compositor.compose(frame, weighted, with_depth=with_depth)
+        self._targets.trim()
+        self.stats = FrameStats(
+            total=len(splats.splats),
+            dropped=splats.splats.dropped,
+            visible=sum(layer.visible for layer in layers.values()),
+            drawn=sum(layer.drawn for layer in layers.values()),
+            sort_ms=splats.milliseconds,
+            tier=self.tier,
+            cached=all(layer.cached for layer in layers.values()),
+            size=frame.size,
+        )
+        return self._image
+
+    def _update_order(self, position: tuple[float, float, float], wait: bool) -> bool:
+        """Sort for this position, here or in the worker thread; returns whether the order fits the position."""
+        assert self._splats is not None
+        needs_work = self.tier == "gl33" or self._splats.base_colors is None
+        if self._sorted is None or ((wait or not needs_work) and self._sorted.position != position):
+            self._sorted = self._sort(self._splats, position)
+        elif self._sorted.position != position:
+            ready = self._sorter.take()
+            if ready is not None and ready.splats is self._splats:
+                self._sorted = ready
+            if self._sorted.position != position:
+                self._sorter.request(self._splats, position)
+        assert self._sorted is not None
+        return self._sorted.position == position
+
+    def _write_colors(self, splats: SortedSplats, display: str) -> None:
+        """Write the colours of the Gaussians unless they are on the GPU."""
+        own = splats.splats.base_colors if splats.colors is None else splats.colors
+        key = (splats.splats, own if display == "color" else display)
+        if self._color_key is not None and all(a is b for a, b in zip(key, self._color_key, strict=True)):
+            return
+        assert self._painter is not None and own is not None
+        self._painter.rasterizer.write_colors(own if display == "color" else splats.splats.color_by(display))
+        self._color_key = key
+
+    def _read(self, attachment: int, components: int) -> np.ndarray:
+        if self._image is None:
+            raise InputError("there is no image to read; call `render` first")
+        width, height = self._image.size
+        data = self._image.framebuffer.read(components=components, attachment=attachment, dtype="f4", alignment=1)
+        return np.frombuffer(data, np.float32).reshape(height, width, components)[::-1].copy()
+
+    def _release_scene(self) -> None:
+        if self._painter is not None:
+            self._painter.release()
+        self._splats = self._painter = self._sorted = self._color_key = self._frame = self._image = None
+        self._targets.invalidate()
+
+
+def choose_layer_weights(frame: Frame, splats: Splats, min_weight: float) -> list[dict[int | None, float]]:
+    """Return each layer's weight by its view (None: all Gaussians); two images for mode `difference`, else one.
+
+    Raises:
+        InputError: the scene lacks the view, or the cameras that mode `deferred` needs.
+    """
+    settings, num_views = frame.settings, splats.num_views
+    mode = settings.drawn_mode
+    if mode == "joint":
+        return [{None: 1.0}]
+    if mode in ("view", "difference") and not 0 <= settings.view < max(num_views, 1):
+        raise InputError(f"`view` must be 0..{max(num_views, 1) - 1} in this scene, got {settings.view}")
+    if mode == "view":
+        return [{settings.view: 1.0}]
+    if mode == "difference":
+        return [{settings.view: 1.0}, {(settings.view + 1) % max(num_views, 1): 1.0}]
+    if num_views < 2:
+        return [{None: 1.0}]
+    positions = splats.view_positions
+    if len(positions) != num_views:
+        raise InputError(
+            f"mode deferred needs the camera of each context view, the scene has {len(positions)} cameras "
+            f"for {num_views} views; use mode joint"
+        )
+    weights = blend_weights(torch.from_numpy(frame.world_position.copy()), torch.from_numpy(positions))
+    factors = (settings.view_weights + (1.0,) * num_views)[:num_views]
+    factors = factors if any(factors) else (1.0,) * num_views
+    weighted = enumerate(zip(weights.tolist(), factors, strict=True))
+    return [{view: max(weight * factor, min_weight) for view, (weight, factor) in weighted if factor > 0}]
+
+
+class Compositor:
+    """Adds weighted layers, normalises the sum and puts it over the background."""
+
+    def __init__(self, ctx: moderngl.Context, programs: Programs, targets: TargetStore) -> None:
+        """Compile the program of the final pass."""
+        self._ctx = ctx
+        self._programs = programs
+        self._targets = targets
+        self._accumulate: dict[LayerStorage, moderngl.VertexArray] = {}
+        self._resolve = ctx.vertex_array(programs.resolve(), [])
+        self._tables: dict[str, moderngl.Texture] = {}
+
+    def compose(self, frame: Frame, images: Sequence[Sequence[tuple[Layer, float]]], *, with_depth: bool) -> Target:
+        """Return the frame's image: RGB over the background, coverage, and depth if the layers have it.
+
+        Args:
+            frame: size, camera and background.
+            images: the weighted layers of one image, or of two whose absolute difference is returned.
+            with_depth: whether the layers have depth.
+        """
+        sums = [
+            self._add_layers(frame, weighted, self._targets.get(f"sum {i}", frame.size, depth_components=2), with_depth)
+            for i, weighted in enumerate(images)
+        ]
+        image = self._targets.get("image", frame.size, depth_components=int(with_depth))
+        image.framebuffer.use()
+        image.framebuffer.viewport = (0, 0, *frame.size)
+        program = self._programs.resolve()
+        set_uniforms(program, difference=len(sums) == 2, background=frame.settings.background)
+        self._set_color_map(program, frame.settings)
+        first, second = sums[0], sums[-1]
+        textures = {"first_color": first.color, "first_depth": first.depth}
+        textures |= {"second_color": second.color, "second_depth": second.depth}
+        self._bind_textures(program, **textures)
+        self._ctx.enable_only(moderngl.NOTHING)
+        self._resolve.render(moderngl.TRIANGLES, vertices=3)
+        return image
+
+    def release(self) -> None:
+        """Free the vertex arrays."""
+        for resource in (*self._accumulate.values(), self._resolve, *self._tables.values()):
+            resource.release()
+
+    def _set_color_map(self, program: moderngl.Program, settings: DrawSettings) -> None:
+        """Set the number that the display shows, and its colours."""
+        name = SCALAR_MAPS.get(settings.display)
+        scalar = 0 if name is None else 1 if settings.display == "depth" else 2
+        step = COUNT_STEP if settings.display == "count" else 1.0
+        set_uniforms(program, scalar=scalar, scalar_max=settings.display_max * step, color_map=_COLOR_MAP_UNIT)
+        if name is None:
+            return
+        if name not in self._tables:
+            self._tables[name] = create_table_texture(self._ctx, name)
+        self._tables[name].use(_COLOR_MAP_UNIT)
+
+    def _add_layers(
+        self, frame: Frame, weighted: Sequence[tuple[Layer, float]], target: Target, with_depth: bool
+    ) -> Target:
+        target.framebuffer.use()
+        target.framebuffer.viewport = (0, 0, *frame.size)
+        program = self._programs.accumulate(frame.storage)
+        if frame.storage not in self._accumulate:
+            self._accumulate[frame.storage] = self._ctx.vertex_array(program, [])
+        set_uniforms(
+            program,
+            with_depth=with_depth,
+            size=frame.size,
+            focal=frame.focal,
+            camera_to_faces=np.ascontiguousarray(frame.camera_to_faces.T, dtype=np.float32).tobytes(),
+            face_size=frame.face_size,
+        )
+        self._ctx.enable_only(moderngl.NOTHING)  # the first layer overwrites the target, the others are added
+        self._ctx.blend_func = moderngl.ONE, moderngl.ONE
+        self._ctx.blend_equation = moderngl.FUNC_ADD, moderngl.MAX
+        for layer, weight in weighted:
+            set_uniforms(program, weight=weight)
+            self._bind_textures(program, layer_color=layer.target.color, layer_depth=layer.target.depth)
+            self._accumulate[frame.storage].render(moderngl.TRIANGLES, vertices=3)
+            self._ctx.enable_only(moderngl.BLEND)
+        self._ctx.enable_only(moderngl.NOTHING)
+        self._ctx.blend_equation = moderngl.FUNC_ADD
+        return target
+
+    def _bind_textures(self, program: moderngl.Program, **textures: moderngl.Texture | None) -> None:
+        for unit, (name, texture) in enumerate(textures.items()):
+            # An unused sampler still needs a texture of its type.
+            (texture or next(iter(textures.values()))).use(location=unit)  # type: ignore[union-attr]
+            set_uniforms(program, **{name: unit})
+
+
+def bind(framebuffer: moderngl.Framebuffer | None) -> None:
+    """Bind a framebuffer unless it is released: on a context without a window it may be a freed render target."""
+    if framebuffer is not None and hasattr(framebuffer.mglo, "use"):
+        framebuffer.use()

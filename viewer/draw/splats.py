@@ -1,0 +1,291 @@
+"""A scene's Gaussians on the CPU: arrays, colours, sort order, selection and culling.
+
+Colours and radial order depend on the position of the camera and not on its rotation. `SplatSorter` computes both in
+a worker thread.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt
+
+from pansplat.gaussians.harmonics import harmonics_basis
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.rendering.cpu.runtime import parallel_for_slices
+from pansplat_viewer.draw.displays import color_by_property
+from pansplat_viewer.scene.camera import Pinhole
+
+# Gaussians whose harmonics are evaluated together. Fits the cache, and is below the size at which torch starts threads,
+# which would cost more time than it saves.
+_CHUNK_SIZE = 1 << 13
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """The finite Gaussians of a scene in float32, in world axes moved by `origin`.
+
+    Attributes:
+        origin: subtracted from world positions, metres, float64. Keeps float32 accurate for scenes that are far from
+            the world's origin.
+        means: moved centres.
+        opacities: peak opacities.
+        reach: sqrt(2 ln(255 opacity)); a Gaussian is visible up to this number of standard deviations, 0 is nowhere.
+        extent: reach times the largest standard deviation, metres.
+        levels, views: labels.
+        geometry: rows that the shaders read: mean, opacity; quaternion; scales, 0.
+        harmonics: coefficients; Gaussians are the last axis, so that sums over coefficients read memory in order.
+        base_colors: colours if they do not depend on the direction (degree 0), else None.
+        view_positions: camera centres of the context views in the world.
+        num_views: number of context views that have Gaussians or a camera.
+        dropped: Gaussians removed because a value in them is NaN or infinite.
+    """
+
+    origin: Float[np.ndarray, "3"]
+    means: Float[np.ndarray, "n 3"]
+    opacities: Float[np.ndarray, "n"]
+    reach: Float[np.ndarray, "n"]
+    extent: Float[np.ndarray, "n"]
+    levels: Int[np.ndarray, "n"]
+    views: Int[np.ndarray, "n"]
+    geometry: Float[np.ndarray, "n 12"]
+    harmonics: Float[np.ndarray, "k 3 n"]
+    base_colors: Float[np.ndarray, "n 4"] | None
+    view_positions: Float[np.ndarray, "view 3"]
+    num_views: int
+    dropped: int
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @staticmethod
+    def from_scene(
+        scene: Scene, report: Callable[[float], None] = lambda done: None, *, with_rows: bool = True
+    ) -> "Splats":
+        """Return the scene's finite Gaussians.
+
+        Args:
+            scene: the scene.
+            report: called with the fraction done, by any thread; an exception ends the work.
+            with_rows: whether `geometry`, `harmonics` and `base_colors` are filled; else they have no Gaussians.
+        """
+        gaussians = drop_not_finite(scene.gaussians, lambda done: report(0.3 * done))
+        positions, num = scene.cam2world[:, :3, 3].double().cpu().numpy(), len(gaussians)
+        origin, rows, coefficients = _choose_origin(positions, gaussians.means), num * with_rows, gaussians.harmonics
+        splats = Splats(
+            origin=origin,
+            means=np.empty((num, 3), np.float32),
+            opacities=np.empty(num, np.float32),
+            reach=np.empty(num, np.float32),
+            extent=np.empty(num, np.float32),
+            levels=gaussians.levels.detach().numpy().astype(np.int32),
+            views=gaussians.views.detach().numpy().astype(np.int32),
+            geometry=np.zeros((rows, 12), np.float32),
+            harmonics=np.empty((coefficients.shape[1], 3, rows), np.float32),
+            base_colors=np.zeros((rows, 4), np.float32) if with_rows and gaussians.degree == 0 else None,
+            view_positions=positions,
+            num_views=max(len(positions), int(gaussians.views.max()) + 1 if num else 0),
+            dropped=len(scene.gaussians) - num,
+        )
+        fields = (gaussians.means, gaussians.opacities, gaussians.scales, gaussians.quats, coefficients)
+        sources = [values.detach().numpy() for values in fields]
+
+        def convert(part: slice) -> None:
+            means, opacities, scales, quats, harmonics = (source[part] for source in sources)
+            splats.means[part], splats.opacities[part] = means - origin, opacities
+            splats.reach[part] = np.sqrt(2.0 * np.log(np.maximum(splats.opacities[part] * 255.0, 1.0)))
+            scales = np.abs(scales.astype(np.float32))
+            splats.extent[part] = splats.reach[part] * np.maximum.reduce([scales[:, axis] for axis in range(3)])
+            if not with_rows:
+                return
+            geometry = splats.geometry[part]
+            geometry[:, 0:3], geometry[:, 3] = splats.means[part], splats.opacities[part]
+            geometry[:, 4:8], geometry[:, 8:11] = quats, scales
+            splats.harmonics[..., part] = harmonics.transpose(1, 2, 0)
+            if splats.base_colors is not None:
+                colors = 0.5 + splats.harmonics[0, :, part].T / (2 * math.sqrt(math.pi))
+                splats.base_colors[part, :3] = np.maximum(colors, 0)
+
+        parallel_for_slices(convert, num, lambda done: report(0.3 + 0.7 * done))
+        return splats
+
+    def evaluate_colors(self, position: tuple[float, float, float]) -> Float[np.ndarray, "n 4"]:
+        """Return RGB and a padding column of all splats, seen from a camera position in the moved frame."""
+        colors = np.zeros((len(self), 4), np.float32)
+        means = torch.from_numpy(self.means)
+        center = torch.tensor(position, dtype=torch.float32)
+        degree = math.isqrt(len(self.harmonics)) - 1
+        for start in range(0, len(self), _CHUNK_SIZE):
+            chunk = slice(start, start + _CHUNK_SIZE)
+            directions = torch.nn.functional.normalize(means[chunk] - center, dim=-1)
+            values = np.ascontiguousarray(harmonics_basis(directions, degree).numpy().T)
+            sums = np.full((3, values.shape[1]), 0.5, np.float32)
+            for value, coefficients in zip(values, self.harmonics, strict=True):
+                sums += value * coefficients[:, chunk]
+            colors[chunk, :3] = np.maximum(sums, 0).T
+        return colors
+
+    def color_by(self, display: str) -> Float[np.ndarray, "n 4"]:
+        """Return the colours of all splats that show a property, and a padding column."""
+        rows = self.geometry
+        cameras = self.view_positions - self.origin
+        colors = color_by_property(display, self.means, rows[:, 4:8], rows[:, 8:11], self.levels, self.views, cameras)
+        return np.pad(colors, ((0, 0), (0, 1)))
+
+    def select(self, levels: frozenset[int] | None, threshold: float, view: int | None) -> Bool[np.ndarray, "n"]:
+        """Return a mask of the splats that levels, opacity threshold and view select and that can be visible."""
+        selected = self.reach > 0
+        if threshold > 0:
+            selected &= self.opacities >= np.float32(threshold)
+        if levels is not None:
+            selected &= np.isin(self.levels, list(levels))
+        if view is not None:
+            selected &= self.views == view
+        return selected
+
+
+def drop_not_finite(gaussians: Gaussians, report: Callable[[float], None] = lambda done: None) -> Gaussians:
+    """The Gaussians without NaN and infinity, in main memory; `report` is called with the fraction done."""
+    gaussians, finite = gaussians.to(device="cpu"), np.empty(len(gaussians), bool)
+    harmonics, opacities = gaussians.harmonics.flatten(1), gaussians.opacities[:, None]
+    fields = (gaussians.means, gaussians.scales, gaussians.quats, opacities, harmonics)
+    sources = [values.detach().numpy() for values in fields]
+
+    def check(part: slice) -> None:
+        slices = [np.isfinite(source[part]) for source in sources]
+        finite[part] = True  # usually; the sums over short rows take most of the time
+        if not all(values.all() for values in slices):
+            finite[part] = np.logical_and.reduce([values.all(axis=1) for values in slices])
+
+    parallel_for_slices(check, len(gaussians), report)
+    return gaussians if finite.all() else gaussians.select(torch.from_numpy(finite))
+
+
+def _choose_origin(positions: np.ndarray, means: torch.Tensor) -> np.ndarray:
+    if len(positions):
+        return positions.mean(axis=0)
+    if len(means):
+        return means.detach().double().median(dim=0).values.numpy()
+    return np.zeros(3)
+
+
+def radix_argsort(keys: Float[np.ndarray, "n"]) -> UInt[np.ndarray, "n"]:
+    """Return the stable ascending order of float32 keys without NaN.
+
+    The keys are mapped to integers of the same order and sorted by their lower, then by their upper 16 bits. numpy's
+    stable sort of 16-bit integers is a counting sort, four times as fast as its sort of floats.
+    """
+    bits = np.ascontiguousarray(keys, dtype=np.float32).view(np.uint32)
+    if np.signbit(keys).any():
+        bits = (keys.astype(np.float32) + np.float32(0)).view(np.uint32)  # + 0 makes -0 and 0 equal
+        bits = np.where(bits >> 31, ~bits, bits | np.uint32(1 << 31))
+    low = np.argsort((bits & 0xFFFF).astype(np.uint16), kind="stable").astype(np.uint32)
+    high = (bits >> 16).astype(np.uint16)
+    return low[np.argsort(high[low], kind="stable")]
+
+
+@dataclass(frozen=True, eq=False)
+class SortedSplats:
+    """Splats with the order and colours of one camera position.
+
+    Attributes:
+        splats: the scene.
+        position: camera centre in the splats' moved frame.
+        distances: of each mean from the camera, metres.
+        order: indices by ascending distance, ties by index.
+        colors: RGB and padding as seen from the position, or None if colours do not depend on it.
+        milliseconds: time of sorting and colours.
+    """
+
+    splats: Splats
+    position: tuple[float, float, float]
+    distances: Float[np.ndarray, "n"]
+    order: UInt[np.ndarray, "n"]
+    colors: Float[np.ndarray, "n 4"] | None
+    milliseconds: float = 0.0
+
+    def cull(
+        self, camera: Pinhole, selected: Bool[np.ndarray, "n"], *, kernel: str, filter_variance: float
+    ) -> Bool[np.ndarray, "n"]:
+        """Return which of the selected splats can touch the camera's image; conservative.
+
+        A splat is bounded by a ball of its reach, widened by the low-pass filter. The linearised kernel `ewa` draws
+        outside that ball, so `ewa` culls only splats behind the camera.
+        """
+        splats = self.splats
+        if kernel == "ewa":
+            normals, bound = camera.rotation[:, 2][None], np.float32(0)
+        else:
+            normals = camera.compute_side_normals()
+            moved = math.dist(camera.position, self.position)
+            deviation = np.float32(1.001 * math.sqrt(filter_variance))
+            bound = self.distances + np.float32(moved)
+            bound *= deviation * splats.reach + np.float32(1e-5)
+            bound += np.float32(1.001) * splats.extent
+        offsets = normals @ np.asarray(camera.position)
+        distances = normals.astype(np.float32) @ splats.means.T
+        seen = selected.copy()
+        for distance, offset in zip(distances, offsets, strict=True):
+            distance += bound
+            seen &= distance >= np.float32(offset)
+        return seen
+
+    def sort_back_to_front(self, camera: Pinhole, seen: Bool[np.ndarray, "n"], order: str) -> UInt[np.ndarray, "m"]:
+        """Return the indices of the seen splats, farthest first, by `radial` distance or by `z` of the camera."""
+        if order == "radial":
+            return self.order[seen[self.order]][::-1]
+        indices = np.flatnonzero(seen).astype(np.uint32)
+        forward = camera.rotation[:, 2]
+        depth = self.splats.means[indices] @ forward.astype(np.float32)
+        depth -= np.float32(forward @ np.asarray(camera.position))
+        return indices[radix_argsort(depth)][::-1]
+
+
+def color_splats(splats: Splats, position: tuple[float, float, float]) -> SortedSplats:
+    """Evaluate the colours of the splats as seen from a camera position; the GPU sorts them."""
+    start = time.perf_counter()
+    colors = splats.evaluate_colors(position) if splats.base_colors is None else None
+    none = np.zeros(0, np.float32)
+    return SortedSplats(splats, position, none, none.astype(np.uint32), colors, 1e3 * (time.perf_counter() - start))
+
+
+def sort_splats(splats: Splats, position: tuple[float, float, float]) -> SortedSplats:
+    """Sort the splats by distance from a camera position and evaluate their colours."""
+    start = time.perf_counter()
+    x, y, z = (splats.means[:, axis] - np.float32(position[axis]) for axis in range(3))
+    squared = x * x
+    squared += y * y
+    squared += z * z
+    order = radix_argsort(squared)
+    colors = splats.evaluate_colors(position) if splats.base_colors is None else None
+    milliseconds = 1e3 * (time.perf_counter() - start)
+    return SortedSplats(splats, position, np.sqrt(squared), order, colors, milliseconds)
+
+
+class SplatSorter:
+    """Runs `sort_splats` or `color_splats` in a worker thread; a new request replaces one that has not started."""
+
+    def __init__(self, sort: Callable[[Splats, tuple[float, float, float]], SortedSplats] | None = None) -> None:
+        """Create the sorter, which calls `sort` (`sort_splats`); the thread starts with the first request."""
+        self._sort = sort or sort_splats
+        self._executor = ThreadPoolExecutor(1, "splat-sorter")
+        self._futures: list[Future[SortedSplats]] = []
+
+    def request(self, splats: Splats, position: tuple[float, float, float]) -> None:
+        """Queue a sort and return at once."""
+        self._futures = [future for future in self._futures if not future.cancel()]
+        self._futures.append(self._executor.submit(self._sort, splats, position))
+
+    def take(self) -> SortedSplats | None:
+        """Return the newest result once, else None; raises the exception of a sort that failed."""
+        done = [future for future in self._futures if future.done()]
+        self._futures = [future for future in self._futures if future not in done]
+        return done[-1].result() if done else None
+
+    def close(self) -> None:
+        """Stop the thread and wait for it."""
+        self._executor.shutdown(cancel_futures=True)

@@ -1,0 +1,464 @@
+"""Projections and stereo: which images make up a still, a frame of a film or the window's image, and their arrangement.
+
+`render_image` waits for one image of any projection. `StereoRenderer` draws the window's images.
+"""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from typing import Any
+
+import moderngl
+import numpy as np
+import torch
+from jaxtyping import Float, UInt32
+
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Scene
+from pansplat.geometry.cubemap import FACES
+from pansplat.geometry.equirect import sample_equirect, uv_from_directions
+from pansplat.options import EYE_DISTANCE
+from pansplat.rendering.image_planes import image_planes
+from pansplat_viewer.draw.cpu_renderer import CpuRenderer, Renderer
+from pansplat_viewer.draw.programs import Programs, set_uniforms
+from pansplat_viewer.draw.renderer import bind
+from pansplat_viewer.scene.settings import DrawSettings, FrameStats, Projection, Stereo
+
+# Places of the faces in an image of three columns and two rows: layout 0 of the spherical metadata, version 2.
+_GRID = ("right", "left", "up"), ("down", "front", "back")
+_DEFAULT_SIZES = {"perspective": (1280, 720), "equirect": (2048, 1024), "cubemap": (1536, 1024)}
+MAX_TURN = math.radians(20)  # of the camera before the eyes follow, while cached faces are read
+_PREFETCH_TURN = math.radians(5)  # of the camera before the faces at the next places of the eyes are drawn
+_SAME_AXIS = 1e-3
+_STEREO_FACE_OVERSAMPLING = 1.5  # of the panorama that the faces of stereo cubemaps are interpolated in
+
+_ARRANGEMENTS = ("side-by-side", "top-bottom", "anaglyph")  # as in shaders/arrange.frag
+_RED_AND_ALPHA = np.uint32(0xFF0000FF)
+_MAX_TARGETS = 4
+
+
+@dataclass(frozen=True)
+class ImageFormat:
+    """What an image shows of all directions, and to which eyes.
+
+    Attributes:
+        projection: a perspective image, or all directions as an equirectangular panorama or as six cube faces.
+        stereo: one eye, both eyes next to each other, the left above the right eye, or the left eye in red and the
+            right in green and blue. Both eyes of a panorama are omni-directional stereo (docs/rendering.md, section 9).
+        eye_distance: metres.
+    """
+
+    projection: Projection = "perspective"
+    stereo: Stereo = "mono"
+    eye_distance: float = EYE_DISTANCE
+
+    @property
+    def is_omnidirectional(self) -> bool:
+        """Whether the image is omni-directional stereo, which is drawn on the processor."""
+        return self.projection != "perspective" and self.stereo != "mono"
+
+    @property
+    def default_size(self) -> tuple[int, int]:
+        """(width, height) of the image of one eye, pixels."""
+        return _DEFAULT_SIZES[self.projection]
+
+    def check(self, size: tuple[int, int], kernel: str = "ray") -> None:
+        """Refuse a size (width, height) or a kernel that does not fit.
+
+        Raises:
+            InputError: a panorama that is not 2:1, a cubemap that is not 3:2, or stereo of these with kernel `ewa`.
+        """
+        width, height = size
+        if self.projection == "equirect" and width != 2 * height:
+            raise InputError(f"`--size` must be 2:1 for projection equirect, got {width}x{height}")
+        if self.projection == "cubemap" and (2 * width != 3 * height or height % 2):
+            raise InputError(
+                f"`--size` must be 3:2, of an even height, for projection cubemap, got {width}x{height}; the image has "
+                "three columns and two rows of faces"
+            )
+        if self.is_omnidirectional and kernel != "ray":
+            raise InputError(f"stereo of projection {self.projection} needs kernel ray, got {kernel}")
+
+
+def choose_format(projection: Projection, settings: DrawSettings) -> ImageFormat:
+    """The format of a file that shows what the window shows; a pair of panoramas is top-bottom, as headsets expect."""
+    is_pair = projection != "perspective" and settings.stereo == "side-by-side"
+    return ImageFormat(projection, "top-bottom" if is_pair else settings.stereo, settings.eye_distance)
+
+
+def render_image(
+    renderer: Renderer | StereoRenderer,
+    cam2world: Float[np.ndarray, "4 4"],
+    size: tuple[int, int],
+    settings: DrawSettings,
+    image_format: ImageFormat | None = None,
+    *,
+    with_depth: bool = False,
+) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"] | None]:
+    """Render an image of any projection for one or both eyes.
+
+    Args:
+        renderer: has the scene; a `CpuRenderer` for omni-directional stereo.
+        cam2world: pose between the eyes.
+        size: (width, height) of the image of one eye, pixels.
+        settings: draw settings; the format replaces their layout.
+        image_format: a perspective image of one eye by default.
+        with_depth: whether depth is returned; that of an anaglyph is the left eye's.
+
+    Returns:
+        Colour in [0, 1], and radial depth in metres.
+    """
+    image_format = image_format or ImageFormat()
+    half = 0.5 * image_format.eye_distance
+    offsets = (0.0,) if image_format.stereo == "mono" else (-half, half)
+    settings = replace(settings, cached=False, stereo="mono")
+    eyes = [_render_eye(renderer, cam2world, size, settings, image_format, offset, with_depth) for offset in offsets]
+    color = arrange_eyes([color for color, _ in eyes], image_format.stereo)
+    if not with_depth:
+        return color, None
+    depths = [depth[..., None] for _, depth in eyes if depth is not None]
+    if image_format.stereo == "anaglyph":
+        return color, depths[0][..., 0]
+    return color, arrange_eyes(depths, image_format.stereo)[..., 0]
+
+
+def arrange_eyes(
+    eyes: list[Float[np.ndarray, "height width channel"]], stereo: Stereo
+) -> Float[np.ndarray, "all_height all_width channel"]:
+    """The image of one eye, or of the left and the right eye."""
+    if stereo == "mono":
+        return eyes[0]
+    if stereo == "anaglyph":
+        return np.concatenate((eyes[0][..., :1], eyes[1][..., 1:]), axis=-1)
+    return np.concatenate(eyes, axis=1 if stereo == "side-by-side" else 0)
+
+
+def move_eye(cam2world: Float[np.ndarray, "4 4"], offset: float) -> Float[np.ndarray, "4 4"]:
+    """The pose moved to the right by a distance in metres."""
+    moved = cam2world.copy()
+    moved[:3, 3] += offset * cam2world[:3, 0]
+    return moved
+
+
+def _render_eye(
+    renderer: Renderer | StereoRenderer,
+    cam2world: np.ndarray,
+    size: tuple[int, int],
+    settings: DrawSettings,
+    image_format: ImageFormat,
+    offset: float,
+    with_depth: bool,
+) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"] | None]:
+    """The image of one eye, which is `offset` metres to the right of the centre."""
+
+    def draw(pose: np.ndarray, size: tuple[int, int], **changes: object) -> tuple[np.ndarray, np.ndarray | None]:
+        renderer.render(pose, size, replace(settings, **changes), wait=True)
+        color = np.clip(renderer.read_color()[..., :3], 0.0, 1.0)
+        return color, renderer.read_depth() if with_depth else None
+
+    if image_format.projection == "perspective":
+        return draw(move_eye(cam2world, offset), size, layout="pinhole")
+    if image_format.projection == "equirect":
+        return draw(cam2world, size, layout="equirect", eye_offset=offset)
+    side = size[1] // 2
+    planes = dict(zip(FACES, image_planes("cubemap", size, face_size=side), strict=True))
+    if offset == 0:
+        faces = {}
+        for name, plane in planes.items():
+            pose = cam2world.copy()
+            pose[:3, :3] = cam2world[:3, :3] @ plane.rotation.numpy()
+            faces[name] = draw(pose, (side, side), layout="pinhole", vertical_fov_degrees=90.0)
+    else:  # at the poles, a face has no columns of one longitude: interpolate in the exact panorama
+        height = round(_STEREO_FACE_OVERSAMPLING * math.pi * side / 2)
+        images = draw(cam2world, (2 * height, height), layout="equirect", eye_offset=offset)
+        faces = {name: tuple(_sample(image, plane.directions()) for image in images) for name, plane in planes.items()}
+    color, depth = (
+        None if faces["front"][i] is None else np.vstack([np.hstack([faces[name][i] for name in row]) for row in _GRID])
+        for i in range(2)
+    )
+    assert color is not None
+    return color, depth
+
+
+def _sample(image: np.ndarray | None, directions: Float[torch.Tensor, "height width 3"]) -> np.ndarray | None:
+    """The pixels of a panorama in these directions, by bilinear interpolation."""
+    if image is None:
+        return None
+    channels = torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1).double()
+    sampled = sample_equirect(channels, uv_from_directions(directions)).permute(1, 2, 0).float().numpy()
+    return sampled.reshape(*sampled.shape[:2], *image.shape[2:])
+
+
+# --- the window's images ---
+
+
+def get_eye_size(size: tuple[int, int], stereo: Stereo) -> tuple[int, int]:
+    """(width, height) of the image of one eye in an image of this size."""
+    columns, rows = 2 if stereo == "side-by-side" else 1, 2 if stereo == "top-bottom" else 1
+    return max(size[0] // columns, 1), max(size[1] // rows, 1)
+
+
+def _turn(
+    cam2world: Float[np.ndarray, "4 4"], first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4 4"]:
+    """The pose turned in place by the smallest rotation from one direction to another."""
+    x, y, z = np.cross(first, second)
+    across, turned = np.array(((0, -z, y), (z, 0, -x), (-y, x, 0))), cam2world.copy()
+    turned[:3, :3] = (np.eye(3) + across + across @ across / (1 + first @ second)) @ cam2world[:3, :3]
+    return turned
+
+
+def _join_sizes(eye_size: tuple[int, int], stereo: Stereo) -> tuple[int, int]:
+    """(width, height) of an image of both eyes."""
+    return eye_size[0] * (2 if stereo == "side-by-side" else 1), eye_size[1] * (2 if stereo == "top-bottom" else 1)
+
+
+class StereoRenderer:
+    """A renderer of images for one or two eyes, with the calls of the renderer that it is made of.
+
+    The second eye has a renderer of its own, made at the first stereo image. While `settings.cached`, the eyes stay
+    where they are in the faces, until the camera has turned by `MAX_TURN`; then they move to where they belong.
+    `prefetch` draws the faces of these places before.
+    """
+
+    def __init__(self, renderer: Renderer, ctx: moderngl.Context | None) -> None:
+        """Take over a renderer; `ctx` is its context."""
+        self._eyes = [renderer]
+        self._ctx = ctx
+        self._programs: Programs | None = None
+        self._triangle: moderngl.VertexArray | None = None
+        self._targets: dict[tuple[int, int], moderngl.Framebuffer] = {}
+        self._axis: Float[np.ndarray, "3"] | None = None
+        self._following: Float[np.ndarray, "3"] | None = None  # the axis after this one
+        self._stereo: Stereo = "mono"
+        self._last: moderngl.Texture | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        """Attributes of the renderer of the left eye."""
+        return getattr(self._eyes[0], name)
+
+    @property
+    def stats(self) -> FrameStats:
+        """Counts and times of the last frame; of two eyes the times are summed."""
+        stats = self._eyes[0].stats
+        if self._stereo == "mono":
+            return stats
+        other = self._eyes[1].stats
+        return replace(
+            stats,
+            drawn=stats.drawn + other.drawn,
+            frame_ms=stats.frame_ms + other.frame_ms,
+            sort_ms=stats.sort_ms + other.sort_ms,
+            cached=stats.cached and other.cached,
+            settled=stats.settled and other.settled,
+            size=_join_sizes(stats.size, self._stereo),
+        )
+
+    @property
+    def pending(self) -> Future[Any] | None:
+        """The image of an eye that is being drawn in the background; None if there is none."""
+        eyes = self._eyes[:1] if self._stereo == "mono" else self._eyes
+        return next((eye.pending for eye in eyes if eye.pending is not None), None)
+
+    def upload(self, scene: Scene, prepared: Any = None) -> None:
+        """Replace the scene; `prepared` is the result of `prepare`."""
+        self._eyes[0].upload(scene, prepared)
+        for other in self._eyes[1:]:
+            other.release()
+        del self._eyes[1:]
+        self._stereo, self._last = "mono", None
+
+    def render(
+        self,
+        cam2world: Float[np.ndarray, "4 4"],
+        size: tuple[int, int],
+        settings: DrawSettings,
+        *,
+        wait: bool = True,
+    ) -> moderngl.Texture | None:
+        """As the renderer's `render`; `size` is that of the whole image, `cam2world` is between the eyes."""
+        if self._stereo != settings.stereo:
+            self._stereo, self._last = settings.stereo, None
+        if settings.stereo == "mono":
+            return self._eyes[0].render(cam2world, size, settings, wait=wait)
+        if settings.layout != "pinhole":
+            raise InputError(f"stereo of a window is perspective, got layout {settings.layout}; use `render_image`")
+        if len(self._eyes) == 1:
+            self._eyes.append(self._eyes[0].create_sibling())
+        axis = self._choose_axis(cam2world, size, settings)
+        if axis is not self._axis:
+            self._axis, self._following = axis, None
+        eye_size, eye_settings = get_eye_size(size, settings.stereo), replace(settings, stereo="mono")
+        textures = [
+            eye.render(pose, eye_size, eye_settings, wait=wait or self._last is None)
+            for eye, pose in zip(self._eyes, self._place_eyes(cam2world, settings, self._axis), strict=True)
+        ]
+        if self._last is None or self.stats.settled or not self._eyes[0].waits_while_moving:
+            self._last = self._arrange(textures, settings.stereo)
+        return self._last  # the images of the processor's renderers that are not finished are those of another frame
+
+    def has_faces(self, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> bool:
+        """Whether the cube faces that the eyes read are finished."""
+        if settings.stereo == "mono":
+            return self._eyes[0].has_faces(cam2world, size, settings)
+        if len(self._eyes) == 1 or self._axis is None:
+            return False
+        return self._has_faces(self._choose_axis(cam2world, size, settings), cam2world, size, settings)
+
+    def draw_faces(self, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings) -> None:
+        """Draw the cube faces of all directions in the background, for the next turn."""
+        if settings.stereo == "mono":
+            self._eyes[0].prefetch_faces(cam2world, size, [settings], everywhere=True)
+        elif self._axis is not None and len(self._eyes) == 2:
+            eye_size, eye_settings = get_eye_size(size, settings.stereo), [replace(settings, stereo="mono")]
+            for eye, pose in zip(self._eyes, self._place_eyes(cam2world, settings, self._axis), strict=True):
+                eye.prefetch_faces(pose, eye_size, eye_settings, everywhere=True)
+
+    def prefetch(
+        self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings, scale: float
+    ) -> None:
+        """Draw the faces at the next places of the eyes in the background, while the camera turns towards them.
+
+        Args:
+            cam2world, size, settings: as for `render`.
+            scale: of the faces that are drawn first, which serve a fast turn.
+        """
+        if settings.stereo == "mono" or not settings.cached or self._axis is None:
+            return
+        if len(self._eyes) == 1 or not isinstance(self._eyes[0], CpuRenderer):
+            return
+        right = cam2world[:3, 0]
+        across = right - (right @ self._axis) * self._axis
+        length = float(np.linalg.norm(across))
+        if length < math.sin(_PREFETCH_TURN):
+            return
+        following = math.cos(MAX_TURN) * self._axis + math.sin(MAX_TURN) * across / length
+        if self._following is None or np.abs(following - self._following).max() > _SAME_AXIS:
+            self._following = following
+        eye_size, settings = get_eye_size(size, settings.stereo), replace(settings, stereo="mono", scale=1.0)
+        turned = _turn(cam2world, right, self._following)
+        for eye, pose in zip(self._eyes, self._place_eyes(turned, settings, self._following), strict=True):
+            eye.prefetch_faces(pose, eye_size, [replace(settings, scale=scale), settings])
+
+    def read_color(self) -> Float[np.ndarray, "height width 4"]:
+        """Return the last image, float32, top row first: RGB over the background, and coverage."""
+        if self._stereo == "mono":
+            return self._eyes[0].read_color()
+        colors = [eye.read_color() for eye in self._eyes]
+        color = arrange_eyes([color[..., :3] for color in colors], self._stereo)
+        if self._stereo == "anaglyph":
+            return np.concatenate((color, np.maximum(colors[0][..., 3:], colors[1][..., 3:])), axis=-1)
+        return np.concatenate((color, arrange_eyes([color[..., 3:] for color in colors], self._stereo)), axis=-1)
+
+    def read_depth(self) -> Float[np.ndarray, "height width"]:
+        """Return the radial depth of the last image in metres; that of an anaglyph is the left eye's."""
+        if self._stereo in ("mono", "anaglyph"):
+            return self._eyes[0].read_depth()
+        return arrange_eyes([eye.read_depth()[..., None] for eye in self._eyes], self._stereo)[..., 0]
+
+    def read_eye_depth(self) -> Float[np.ndarray, "height width"]:
+        """Return the radial depth of the left eye's image in metres."""
+        return self._eyes[0].read_depth()
+
+    def release(self) -> None:
+        """Release the renderers, and free the textures."""
+        for target in self._targets.values():
+            target.color_attachments[0].release()
+            target.release()
+        self._targets.clear()
+        if self._triangle is not None and self._programs is not None:
+            self._triangle.release()
+            self._programs.release()
+        for eye in self._eyes:
+            eye.release()
+
+    def _choose_axis(
+        self, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings
+    ) -> Float[np.ndarray, "3"]:
+        """The direction from the left to the right eye.
+
+        It is kept up to `MAX_TURN`, and up to twice that while the faces at the next places of the eyes are drawn.
+        """
+        right = cam2world[:3, 0]
+        if self._axis is None or not settings.cached:
+            return right.copy()
+        if float(right @ self._axis) > math.cos(MAX_TURN):
+            return self._axis
+        following = self._following
+        if following is None or float(right @ following) < math.cos(2 * MAX_TURN):
+            return right.copy()
+        if self._has_faces(following, cam2world, size, settings):
+            return following
+        return self._axis if float(right @ self._axis) > math.cos(2 * MAX_TURN) else following
+
+    def _has_faces(
+        self, axis: Float[np.ndarray, "3"], cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings
+    ) -> bool:
+        """Whether the faces that the eyes on an axis read are finished."""
+        eye_size, eye_settings = get_eye_size(size, settings.stereo), replace(settings, stereo="mono")
+        poses = self._place_eyes(cam2world, settings, axis)
+        return all(eye.has_faces(pose, eye_size, eye_settings) for eye, pose in zip(self._eyes, poses, strict=True))
+
+    def _place_eyes(
+        self, cam2world: np.ndarray, settings: DrawSettings, axis: Float[np.ndarray, "3"]
+    ) -> list[Float[np.ndarray, "4 4"]]:
+        poses = [cam2world.copy(), cam2world.copy()]
+        for pose, sign in zip(poses, (-0.5, 0.5), strict=True):
+            pose[:3, 3] += sign * settings.eye_distance * axis
+        return poses
+
+    def _arrange(self, textures: list[moderngl.Texture | None], stereo: Stereo) -> moderngl.Texture | None:
+        """One texture of both images."""
+        left, right = textures
+        if self._ctx is None or left is None or right is None:
+            return None
+        first, second = self._eyes
+        if isinstance(first, CpuRenderer) and isinstance(second, CpuRenderer):
+            return self._arrange_pixels(first.pixels, second.pixels, stereo)
+        bound = self._ctx.fbo
+        target = self._get_target(left.size, stereo, left.dtype)
+        if self._programs is None or self._triangle is None:
+            self._programs = Programs(self._ctx)
+            self._triangle = self._ctx.vertex_array(self._programs.arrange(), [])
+        target.use()
+        set_uniforms(self._programs.arrange(), left=0, right=1, arrangement=_ARRANGEMENTS.index(stereo))
+        left.use(0)
+        right.use(1)
+        self._ctx.enable_only(moderngl.NOTHING)
+        self._triangle.render(moderngl.TRIANGLES, vertices=3)
+        bind(bound)
+        return target.color_attachments[0]
+
+    def _arrange_pixels(
+        self,
+        left: UInt32[np.ndarray, "height width"] | None,
+        right: UInt32[np.ndarray, "height width"] | None,
+        stereo: Stereo,
+    ) -> moderngl.Texture:
+        """One texture of the pixels of both images, whose bottom row is the first."""
+        assert left is not None and right is not None
+        if stereo == "anaglyph":
+            pixels = (left & _RED_AND_ALPHA) | (right & ~_RED_AND_ALPHA)
+        else:
+            pixels = np.hstack((left, right)) if stereo == "side-by-side" else np.vstack((right, left))
+        texture = self._get_target(left.shape[::-1], stereo, "f1").color_attachments[0]
+        texture.write(pixels)
+        return texture
+
+    def _get_target(self, eye_size: tuple[int, int], stereo: Stereo, dtype: str) -> moderngl.Framebuffer:
+        assert self._ctx is not None
+        size = _join_sizes(eye_size, stereo)
+        if size not in self._targets:
+            if len(self._targets) >= _MAX_TARGETS:
+                for target in self._targets.values():
+                    target.color_attachments[0].release()
+                    target.release()
+                self._targets.clear()
+            bound = self._ctx.fbo
+            texture = self._ctx.texture(size, 4, dtype=dtype)
+            texture.repeat_x = texture.repeat_y = False
+            self._targets[size] = self._ctx.framebuffer([texture])
+            bind(bound)
+        return self._targets[size]

@@ -1,0 +1,1 @@
+"""What is shown: scenes, tours, cameras and settings."""

@@ -1,0 +1,183 @@
+"""Camera paths through key frames, and their JSON files.
+
+A file is an object with `key_frames`, a list of objects in the order of time:
+
+    {"key_frames": [{"seconds": 0, "position": [0, 0, 0], "direction": [0, 0, 1], "vertical_fov_degrees": 75}, ...]}
+
+`position` is in metres, `direction` is where the camera looks (of any length), both in world axes. The camera has no
+roll relative to the scene's up direction. `vertical_fov_degrees` is optional (75).
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from pansplat.atomic import replacing
+from pansplat.errors import InputError
+from pansplat.strict_json import list_field, number_field, read_json, require_object
+from pansplat_viewer.scene.camera import MAX_FOV_DEGREES, MIN_FOV_DEGREES, Camera, move_to_pose
+
+MAX_SECONDS = 3600.0
+_FIELDS = ("seconds", "position", "direction", "vertical_fov_degrees")
+_DEFAULT_FOV = 75.0
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class KeyFrame:
+    """A camera at a time.
+
+    Attributes:
+        seconds: since the start of the path.
+        position: metres.
+        direction: where the camera looks.
+        vertical_fov_degrees: vertical field of view.
+    """
+
+    seconds: float
+    position: Vector
+    direction: Vector
+    vertical_fov_degrees: float = _DEFAULT_FOV
+
+    @staticmethod
+    def of_camera(camera: Camera, seconds: float) -> KeyFrame:
+        """The key frame of the interactive camera."""
+        x, y, z = camera.rotation[:, 2].tolist()
+        return KeyFrame(seconds, camera.position, (x, y, z), camera.vertical_fov_degrees)
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Key frames in the order of time, and the smooth path through them.
+
+    Position, heading, pitch and field of view are monotone cubics of time between the key frames (PCHIP), so that the
+    camera overshoots none of them.
+    """
+
+    key_frames: tuple[KeyFrame, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.key_frames)
+
+    @property
+    def seconds(self) -> float:
+        """Time of the last key frame."""
+        return self.key_frames[-1].seconds if self.key_frames else 0.0
+
+    def count_frames(self, fps: float) -> int:
+        """Number of frames of a film: from time 0 to the last key frame, both included."""
+        return math.floor(self.seconds * fps + 1e-6) + 1
+
+    def interpolate(self, seconds: float, level: Camera) -> Camera:
+        """The camera at a time; before the first and after the last key frame it stands still.
+
+        Args:
+            seconds: time.
+            level: a camera with the scene's level axes.
+        """
+        frames = self.key_frames
+        times = np.array([frame.seconds for frame in frames])
+        cameras = [_place(frame, level) for frame in frames]
+        yaws = np.unwrap([camera.yaw_radians for camera in cameras])
+        values = np.array(
+            [
+                (*frame.position, yaw, camera.pitch_radians, frame.vertical_fov_degrees)
+                for frame, camera, yaw in zip(frames, cameras, yaws, strict=True)
+            ]
+        )
+        at = min(max(seconds, times[0]), times[-1])
+        x, y, z, yaw, pitch, fov = (values[0] if len(frames) == 1 else PchipInterpolator(times, values)(at)).tolist()
+        return replace(level, position=(x, y, z), yaw_radians=yaw, pitch_radians=pitch, vertical_fov_degrees=fov)
+
+    def add(self, frame: KeyFrame) -> CameraPath:
+        """The path with a further key frame; one at the same time is replaced."""
+        others = [other for other in self.key_frames if other.seconds != frame.seconds]
+        return CameraPath(tuple(sorted((*others, frame), key=lambda other: other.seconds)))
+
+    def remove(self, index: int) -> CameraPath:
+        """The path without one key frame."""
+        return CameraPath(self.key_frames[:index] + self.key_frames[index + 1 :])
+
+
+def _place(frame: KeyFrame, level: Camera) -> Camera:
+    """The level camera, moved to the position and direction of a key frame."""
+    direction = np.array(frame.direction) / np.linalg.norm(frame.direction)
+    axes = np.asarray(level.level)
+    right = np.cross(axes[:, 1], direction)
+    if np.linalg.norm(right) < 1e-9:
+        right = axes[:, 0]
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 2], pose[:3, 3] = right / np.linalg.norm(right), direction, frame.position
+    return move_to_pose(level, pose)
+
+
+def read_path(file: Path) -> CameraPath:
+    """The path of a JSON file.
+
+    Raises:
+        InputError: unreadable, an unknown or missing field, a value out of range, or times that do not increase.
+    """
+    content = require_object(read_json(file), file)
+    _require_fields(content, ("key_frames",), file)
+    frames = [
+        _read_frame(require_object(entry, f"{file}, key frame {number}"), f"{file}, key frame {number}")
+        for number, entry in enumerate(list_field(content, "key_frames", file), start=1)
+    ]
+    if not frames:
+        raise InputError(f'{file}: needed one or more "key_frames", got none; add them.')
+    for number, (before, after) in enumerate(itertools.pairwise(frames), start=2):
+        if after.seconds <= before.seconds:
+            raise InputError(
+                f'{file}, key frame {number}: needed "seconds" after {before.seconds:g}, got {after.seconds:g}; '
+                "sort the key frames by time."
+            )
+    return CameraPath(tuple(frames))
+
+
+def _read_frame(entry: dict[str, Any], source: str) -> KeyFrame:
+    _require_fields(entry, _FIELDS, source)
+    seconds = number_field(entry, "seconds", source, low=0, high=MAX_SECONDS)
+    if seconds is None:
+        raise InputError(f'{source}: needed "seconds", got none; add the time of the key frame.')
+    position, direction = (_read_vector(entry, key, source) for key in ("position", "direction"))
+    if math.hypot(*direction) < 1e-6:
+        raise InputError(f'{source}: needed a "direction" with a length, got {list(direction)}; correct it.')
+    fov = number_field(entry, "vertical_fov_degrees", source, low=MIN_FOV_DEGREES, high=MAX_FOV_DEGREES)
+    return KeyFrame(seconds, position, direction, _DEFAULT_FOV if fov is None else fov)
+
+
+def _read_vector(entry: dict[str, Any], key: str, source: str) -> Vector:
+    values = list_field(entry, key, source)
+    if len(values) != 3 or not all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values):
+        raise InputError(f'{source}: needed three numbers as "{key}", got {str(values)[:60]}; correct it.')
+    if max(map(abs, values)) > 1e9:
+        raise InputError(f'{source}: needed "{key}" within 1e9, got {str(values)[:60]}; correct it.')
+    return (float(values[0]), float(values[1]), float(values[2]))
+
+
+def _require_fields(entry: dict[str, Any], fields: Sequence[str], source: object) -> None:
+    unknown = [key for key in entry if key not in fields]
+    if unknown:
+        raise InputError(f"{source}: needed only the fields {', '.join(fields)}, got {unknown[0]!r:.60}; correct it.")
+
+
+def write_path(path: CameraPath, file: Path) -> None:
+    """Write a path to a JSON file, which appears complete or not at all.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    rows = [{key: getattr(frame, key) for key in _FIELDS} for frame in path.key_frames]
+    text = "[\n  " + ",\n  ".join(json.dumps(row) for row in rows) + "\n]"
+    with replacing(file) as unfinished:
+        unfinished.write_text(f'{{"key_frames": {text}}}\n', "utf-8")

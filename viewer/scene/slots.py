@@ -1,0 +1,140 @@
+"""A renderer with its scene and last image, and the conversion of scenes for renderers in a worker thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import moderngl
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from pansplat.gaussians.scene import Scene
+from pansplat_viewer.draw.stereo import StereoRenderer
+from pansplat_viewer.scene.settings import DrawSettings
+
+_SMALL_SCENE = 100_000  # Gaussians; converted without a thread, because that takes less time than a frame
+_LARGE_SCENE = 2_000_000  # Gaussians; the first image is not waited for, because it can take seconds
+
+
+def keep_largest(scene: Scene, count: int) -> Scene:
+    """The scene with the Gaussians that cover the largest solid angles, weighted by opacity, seen from its cameras."""
+    gaussians = scene.gaussians
+    cameras = scene.cam2world[:, :3, 3].float() if len(scene.cam2world) else gaussians.means.mean(dim=0, keepdim=True)
+    squared = torch.full((len(gaussians),), torch.inf)
+    for camera in cameras:
+        squared = torch.minimum(squared, (gaussians.means - camera).square().sum(dim=1))
+    scales = gaussians.scales.sort(dim=1).values
+    cover = gaussians.opacities * scales[:, 1] * scales[:, 2] / squared.clamp(min=1e-12)
+    largest = cover.nan_to_num(0.0).topk(min(count, len(cover))).indices
+    return replace(scene, gaussians=gaussians.select(largest.sort().values))
+
+
+class SceneSlot:
+    """A renderer, the scene that it draws, and its last image, which is drawn again only if something changed.
+
+    Attributes:
+        renderer: draws the scene.
+        scene: None before the first upload.
+        image: the last image; None if it has to be drawn again, or if the first one is not finished.
+    """
+
+    def __init__(self, renderer: StereoRenderer) -> None:
+        """The slot is empty."""
+        self.renderer = renderer
+        self.scene: Scene | None = None
+        self.image: moderngl.Texture | None = None
+        self._key: tuple[object, ...] = ()
+        self._waits = True  # for an image if there is none
+
+    def upload(self, scene: Scene, prepared: Any = None) -> None:
+        """Replace the scene, which may be `prepared`; raises the renderer's errors, and keeps the old scene then."""
+        self.renderer.upload(scene, prepared)
+        self.scene, self.image = scene, None
+        self._waits = len(scene.gaussians) <= _LARGE_SCENE
+
+    def draw(
+        self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings, *, wait: bool
+    ) -> float:
+        """Make `image` that of a pose, size (width, height) and settings.
+
+        The first image of a scene is waited for, unless the scene is large.
+
+        Returns:
+            Milliseconds; 0 if nothing was drawn, or the image is not finished.
+        """
+        key = (cam2world.tobytes(), size, settings)
+        if self.image is not None and key == self._key and self.renderer.stats.settled:
+            return 0.0
+        self.image = self.renderer.render(cam2world, size, settings, wait=self._waits and (wait or self.image is None))
+        self._waits = self._waits or self.image is not None
+        self._key = key
+        if not wait and not settings.cached and self.renderer.stats.settled:
+            self.renderer.draw_faces(cam2world, size, settings)
+        return self.renderer.stats.frame_ms
+
+
+class _StoppedError(Exception):
+    """Raised in the worker thread to end a conversion whose result is not needed."""
+
+
+@dataclass(eq=False)
+class _Preparation:
+    scene: Scene
+    future: Future[Any] | None = None
+    fraction: float = 0.0
+    stopped: bool = False
+
+    def report(self, fraction: float) -> None:
+        if self.stopped:
+            raise _StoppedError
+        self.fraction = max(self.fraction, fraction)
+
+
+class ScenePreparer:
+    """Converts scenes for a renderer in a worker thread, one at a time, so that a window stays responsive."""
+
+    def __init__(self, prepare: Callable[[Scene, Callable[[float], None]], Any]) -> None:
+        """`prepare` is that of the renderer."""
+        self._prepare = prepare
+        self._executor = ThreadPoolExecutor(1, "scene-preparer")
+        self._current: _Preparation | None = None
+
+    @property
+    def progress(self) -> float | None:
+        """Fraction of the conversion that is done; None if there is none."""
+        current = self._current
+        return None if current is None or current.future is None or current.future.done() else current.fraction
+
+    def is_ready(self, scene: Scene) -> bool:
+        """Whether `take` returns at once; starts the conversion of a large scene, in place of that of another one."""
+        if len(scene.gaussians) <= _SMALL_SCENE:
+            return True
+        if self._current is None or self._current.scene is not scene:
+            self.stop()
+            self._current = _Preparation(scene)
+            self._current.future = self._executor.submit(self._prepare, scene, self._current.report)
+        assert self._current.future is not None
+        return self._current.future.done()
+
+    def take(self, scene: Scene) -> Any:
+        """The converted scene, or its exception; None if it has not been converted."""
+        current = self._current
+        if current is None or current.scene is not scene or current.future is None:
+            return None
+        self._current = None
+        return current.future.result()
+
+    def stop(self) -> None:
+        """End the conversion."""
+        if self._current is not None:
+            self._current.stopped = True
+        self._current = None
+
+    def close(self) -> None:
+        """End the conversion and wait for the thread."""
+        self.stop()
+        self._executor.shutdown()

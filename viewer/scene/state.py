@@ -1,0 +1,277 @@
+"""The viewer's state: values that keys and panels change and that a frame reads. Needs neither window nor GL."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from pansplat.constants import NEAR
+from pansplat.gaussians.scene import Scene
+from pansplat.geometry.path import fly_pose, level_pose, look_pose, path_poses, up_direction
+from pansplat.tours import Route, TourGraph
+from pansplat_viewer.scene.camera import Camera, move_to_pose
+from pansplat_viewer.scene.key_frames import CameraPath, KeyFrame
+from pansplat_viewer.scene.picking import PickedPoint
+from pansplat_viewer.scene.settings import Comparison, Display, DrawSettings, Projection
+
+FLIGHT_SECONDS = 6.0
+COUNT_MAX = 300.0  # Gaussians per pixel with the last colour, by default
+KEY_SECONDS = 2.0  # between key frames that are added one after the other
+NEAR_OF_FAR = 0.03  # of a tour: Gaussians within this fraction of far are not drawn, because ways pass door frames
+_FLIGHT_STEPS = 24  # for the `,` and `.` keys
+_MAX_SAMPLES = 100_000  # Gaussians that percentiles are measured on
+
+
+@dataclass
+class ViewerState:
+    """Everything that a user can change, and the scene's cameras and levels.
+
+    Attributes:
+        camera: the current camera; `home` is the camera that R restores.
+        orbiting: whether the camera orbits (True) or flies (False).
+        settings: draw settings; the field of view is the camera's.
+        flight: fraction of the flight between the panoramas in [0, 1]; `playing` while it is played.
+        overlay, help: whether panels and key help are shown.
+        comparison: what is shown right of the divider at `split` (fraction of the width).
+        photograph: number of the photograph of the comparison; None is the nearest one.
+        max_error: the difference from a photograph with the last colour of the map.
+        refined: whether the refined scene is shown, where there is one, or the prediction.
+        adaptive: whether the resolution is lowered while the camera moves.
+        speed: of flying, metres per second.
+        context: poses of the input cameras; empty for a file without cameras. Of a tour, of all panoramas.
+        num_views: number of input cameras of the scene that is shown.
+        route: the flight through a tour; None if none is planned, and in other scenes.
+        target: the panorama of a tour to fly to; None if there is none.
+        minimap, hotspots: whether the floor plan of a tour and the places of its panoramas are shown.
+        path: key frames of the camera path that is edited.
+        path_seconds: time on the path that the panel shows; `path_playing` while it is played.
+        film_suffix, film_fps, film_projection: of the film of the path.
+        depth_max: distance within which most Gaussians are, metres; the range of the display of depths.
+        levels: pyramid levels of the scene, ascending.
+        points: the last picked points, two at most.
+        message: a text to show until `message_until` (seconds of the viewer's clock).
+        quit: whether to close the viewer.
+    """
+
+    camera: Camera = field(default_factory=Camera)
+    home: Camera = field(default_factory=Camera)
+    orbiting: bool = False
+    settings: DrawSettings = field(default_factory=DrawSettings)
+    flight: float = 0.0
+    playing: bool = False
+    overlay: bool = True
+    help: bool = False
+    comparison: Comparison = "off"
+    split: float = 0.5
+    photograph: int | None = None
+    max_error: float = 0.25
+    refined: bool = True
+    adaptive: bool = True
+    speed: float = 1.0
+    context: Float[np.ndarray, "view 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    num_views: int = 0
+    route: Route | None = None
+    target: int | None = None
+    minimap: bool = True
+    hotspots: bool = True
+    path: CameraPath = field(default_factory=CameraPath)
+    path_seconds: float = 0.0
+    path_playing: bool = False
+    film_suffix: str = ".mp4"
+    film_fps: float = 24.0
+    film_projection: Projection = "perspective"
+    depth_max: float = 1.0
+    levels: tuple[int, ...] = ()
+    points: list[PickedPoint] = field(default_factory=list)
+    message: str = ""
+    message_until: float = 0.0
+    quit: bool = False
+
+    @property
+    def draw_settings(self) -> DrawSettings:
+        """The settings of the next frame, with the camera's field of view."""
+        return replace(self.settings, vertical_fov_degrees=self.camera.vertical_fov_degrees)
+
+    def show_message(self, message: str, now: float) -> None:
+        """Show a message for four seconds."""
+        self.message, self.message_until = message, now + 4
+
+
+def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
+    """Start in a scene at a fraction of its flight; settings that the scene does not support are reset.
+
+    In a scene of the same cameras as the one before, the camera stays where it is.
+    """
+    before = state.camera if _are_same(state.context, scene.cam2world.numpy()) else None
+    adapt_settings(state, scene, keep_levels=False)
+    state.settings = replace(state.settings, near=NEAR)
+    state.context, state.route, state.target = scene.cam2world.double().numpy(), None, None
+    state.playing, state.flight, state.points = False, min(max(at, 0.0), 1.0), []
+    level = create_level_camera(scene).level
+    camera = move_to_pose(replace(state.camera, level=level), _choose_start_pose(scene, state.flight))
+    state.camera = state.home = replace(camera, distance=_measure_distance(scene, 50))
+    if before is not None:
+        state.camera = replace(before, distance=state.home.distance)
+    state.depth_max, state.photograph = _measure_distance(scene, 98), None
+    choose_display(state, state.settings.display)
+
+
+def enter_tour(state: ViewerState, tour: TourGraph, scene: Scene, route: Route, *, at: float = 0.0) -> None:
+    """Start in a tour, whose first scene is `scene`, at a fraction of a route through it; see `enter_scene`."""
+    before = state.camera if _are_same(state.context, tour.cam2world.numpy()) else None
+    enter_scene(state, scene)
+    state.settings = replace(state.settings, near=NEAR_OF_FAR * tour.far)
+    state.context, state.route, state.flight = tour.cam2world.numpy(), route, min(max(at, 0.0), 1.0)
+    level = create_level_camera(scene, tour).level
+    state.camera = state.home = move_to_pose(replace(state.camera, level=level), route.pose(state.flight))
+    state.camera = before or state.camera
+
+
+def _are_same(first: Float[np.ndarray, "a 4 4"], second: Float[np.ndarray, "b 4 4"]) -> bool:
+    """Whether poses of input cameras are the same, up to the rounding of a file."""
+    return len(first) == len(second) > 0 and np.allclose(first, second, atol=1e-5)
+
+
+def create_level_camera(scene: Scene, tour: TourGraph | None = None) -> Camera:
+    """A camera with the level axes of a scene, or of the tour that it is of."""
+    axes = _compute_level_axes(scene) if tour is None else tour.level_axes
+    return Camera(level=tuple(tuple(float(x) for x in row) for row in axes))
+
+
+def adapt_settings(state: ViewerState, scene: Scene, *, keep_levels: bool = True) -> None:
+    """Set the number of views and the levels to those of a scene, and reset settings that it does not support."""
+    state.num_views = len(scene.cam2world)
+    state.levels = tuple(torch.bincount(scene.gaussians.levels).nonzero().flatten().tolist())
+    settings = state.settings if keep_levels else replace(state.settings, levels=None)
+    state.settings = fit_settings(settings, scene)
+
+
+def choose_display(state: ViewerState, display: Display) -> None:
+    """Show a property, in the range of the scene."""
+    largest = {"depth": state.depth_max, "count": COUNT_MAX}.get(display, 1.0)
+    state.settings = replace(state.settings, display=display, display_max=largest)
+
+
+def fit_settings(settings: DrawSettings, scene: Scene) -> DrawSettings:
+    """The settings with a view, a mode and weights of views that a scene supports."""
+    num_views = max(len(scene.cam2world), 1)
+    if num_views < 2 and settings.mode in ("deferred", "difference"):
+        settings = replace(settings, mode="joint")
+    view_weights = settings.view_weights if len(settings.view_weights) == num_views else ()
+    return replace(settings, view=min(settings.view, num_views - 1), view_weights=view_weights)
+
+
+def jump_to_view(state: ViewerState, view: int) -> None:
+    """Move to an input camera's position and heading, level; does nothing if the scene has no such camera.
+
+    In a tour, the camera flies there, along the graph.
+    """
+    if view >= len(state.context):
+        return
+    if state.route is not None:
+        state.target = view
+        return
+    up = up_direction(torch.from_numpy(state.context))
+    target = level_pose(torch.from_numpy(state.context[view]), up).numpy()
+    state.playing = False
+    state.camera = move_to_pose(state.camera, target)
+    state.flight = view / max(len(state.context) - 1, 1)
+
+
+def fly_to(state: ViewerState, fraction: float) -> None:
+    """Move the camera to a fraction of the flight."""
+    state.flight = min(max(fraction, 0.0), 1.0)
+    if state.route is not None:
+        state.camera = move_to_pose(state.camera, state.route.pose(state.flight))
+    elif len(state.context):
+        target = fly_pose(torch.from_numpy(state.context), state.flight).numpy()
+        state.camera = move_to_pose(state.camera, target)
+
+
+def toggle_play(state: ViewerState) -> None:
+    """Start or stop the flight; at its end, start it from the beginning."""
+    if not len(state.context):
+        return
+    state.playing = not state.playing
+    if state.playing and state.flight >= 1:
+        state.flight = 0.0
+
+
+def step_flight(state: ViewerState, steps: int) -> None:
+    """Move along the flight by whole steps and stop playing."""
+    state.playing = False
+    fly_to(state, (round(state.flight * _FLIGHT_STEPS) + steps) / _FLIGHT_STEPS)
+
+
+def advance_flight(state: ViewerState, seconds: float, limit: float = 1.0) -> None:
+    """Move along the flight if it is playing, not beyond the fraction `limit`, and stop at its end."""
+    if state.playing:
+        duration = FLIGHT_SECONDS if state.route is None else state.route.seconds
+        fly_to(state, min(state.flight + seconds / duration, max(limit, state.flight)))
+        state.playing = state.flight < 1
+
+
+def add_key_frame(state: ViewerState) -> None:
+    """Add the camera as a key frame at the time that the panel shows, or `KEY_SECONDS` after the last one."""
+    seconds = state.path_seconds
+    if any(abs(frame.seconds - seconds) < 1e-3 for frame in state.path.key_frames):
+        seconds = state.path.seconds + KEY_SECONDS
+    state.path = state.path.add(KeyFrame.of_camera(state.camera, seconds))
+    state.path_seconds, state.path_playing = seconds, False
+
+
+def show_path(state: ViewerState, seconds: float) -> None:
+    """Move the camera to a time of the path."""
+    state.playing, state.path_seconds = False, max(seconds, 0.0)
+    if len(state.path):
+        state.camera = state.path.interpolate(state.path_seconds, state.camera)
+
+
+def advance_path(state: ViewerState, seconds: float) -> None:
+    """Move along the path if it is played, and stop at its end."""
+    if state.path_playing:
+        show_path(state, min(state.path_seconds + seconds, state.path.seconds))
+        state.path_playing = state.path_seconds < state.path.seconds
+
+
+def _compute_level_axes(scene: Scene) -> Float[np.ndarray, "3 3"]:
+    """Return right, down, forward of a level camera in the direction of flight (columns, world axes)."""
+    if len(scene.cam2world):
+        return path_poses(scene.cam2world)[0, :3, :3].numpy()
+    forward = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)
+    return look_pose(torch.zeros(3), forward, up_direction(scene.cam2world))[:3, :3].numpy()
+
+
+def _choose_start_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
+    """Return the pose at a fraction of the flight; in a scene without cameras, a pose that sees it from outside."""
+    if len(scene.cam2world):
+        return fly_pose(scene.cam2world, fraction).numpy()
+    matrix = np.eye(4)
+    matrix[:3, :3] = _compute_level_axes(scene)
+    means = _sample_means(scene)
+    if len(means):
+        middle = np.median(means, axis=0)
+        matrix[:3, 3] = middle - 2 * _measure_percentile(means, middle) * matrix[:3, 2]
+    return matrix
+
+
+def _measure_distance(scene: Scene, percent: float) -> float:
+    """Return a percentile of the distances from the first camera (else the start pose), metres; 2 if none."""
+    means = _sample_means(scene)
+    if not len(means):
+        return 2.0
+    if len(scene.cam2world):
+        return _measure_percentile(means, scene.cam2world[0, :3, 3].double().numpy(), percent)
+    return 2 * _measure_percentile(means, np.median(means, axis=0), percent)
+
+
+def _sample_means(scene: Scene) -> Float[np.ndarray, "m 3"]:
+    """The centres of every n-th Gaussian, enough for percentiles."""
+    means = scene.gaussians.means
+    return means[:: max(len(means) // _MAX_SAMPLES, 1)].double().numpy()
+
+
+def _measure_percentile(means: Float[np.ndarray, "n 3"], point: Float[np.ndarray, "3"], percent: float = 50) -> float:
+    distances = np.linalg.norm(means - point, axis=1)
+    return float(np.percentile(distances[np.isfinite(distances)], percent)) or 1.0

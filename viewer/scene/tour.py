@@ -1,0 +1,273 @@
+"""The scenes of a tour in a viewer: which one is shown, which are loaded next, which stay in memory, how they fade.
+
+Imports no OpenGL: the film and the window use the same objects.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from jaxtyping import Float
+
+from pansplat.gaussians.scene import Scene
+from pansplat.tours import EDGE_HYSTERESIS, Edge, FloorOutline, Route, TourGraph, Views, plan_route
+from pansplat_viewer.scene.camera import Camera
+from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
+from pansplat_viewer.scene.picking import project_point
+
+FADE_SECONDS = 1.0
+DEFAULT_MEMORY = 2.0  # GiB, of the scenes of a tour
+_NEXT_SCENES = 3  # that are predicted before they are needed
+_HOTSPOT_RADIUS = 0.22  # metres, on the floor
+_MIN_HOTSPOT_PIXELS = 14.0
+_CAMERA_HEIGHT = 0.15  # over the floor, as a fraction of far, if no floor outline is known
+
+
+class TourScenes:
+    """The scenes of one tour: chooses, requests and keeps them. It loads nothing itself.
+
+    Attributes:
+        tour: the graph.
+        edge: the edge that the camera is at.
+        outlines: floor outlines of the panoramas whose scenes have been loaded, also after a scene is dropped.
+    """
+
+    def __init__(
+        self,
+        tour: TourGraph,
+        *,
+        memory: float = DEFAULT_MEMORY,
+        merged: Scene | None = None,
+    ) -> None:
+        """Start without scenes.
+
+        Args:
+            tour: the graph.
+            memory: limit of the loaded scenes, GiB; two scenes are kept in any case.
+            merged: the scene of all panoramas that the scenes of the edges are parts of; None to predict them.
+        """
+        self.tour, self._merged = tour, merged
+        self.edge: Edge = next(iter(tour.overlaps))
+        self.outlines: dict[int, FloorOutline] = {}
+        self._views = tour.choose_scene_views()
+        self._budget = memory * 2**30
+        self._loaded: OrderedDict[Views, LoadedScene] = OrderedDict()
+        self._failed: set[Views] = set()
+
+    @property
+    def views(self) -> Views:
+        """The panoramas of the scene that the camera needs."""
+        return self._views[self.edge]
+
+    @property
+    def num_scenes(self) -> int:
+        """Number of scenes of the tour."""
+        return len(set(self._views.values()))
+
+    @property
+    def loaded(self) -> list[Views]:
+        """The scenes in memory, the least recently used first."""
+        return list(self._loaded)
+
+    def make_entry(self, views: Views) -> SceneEntry:
+        """The scene of these panoramas as an entry for the loader."""
+        pair = self.tour.make_pair(views)
+        return SceneEntry(pair.name, pair=pair, tour=self.tour, views=views, merged=self._merged)
+
+    def add(self, loaded: LoadedScene) -> None:
+        """Keep a scene; the least recently used ones are dropped if the memory is exceeded."""
+        views = loaded.entry.views
+        self._loaded[views] = loaded
+        self._loaded.move_to_end(views)
+        self.outlines |= loaded.outlines
+        self._failed.discard(views)
+        total = sum(measure_bytes(scene.scene) for scene in self._loaded.values())
+        for other in [other for other in self._loaded if other not in (views, self.views)]:
+            if total <= self._budget or len(self._loaded) <= 2:
+                break
+            total -= measure_bytes(self._loaded.pop(other).scene)
+
+    def fail(self, views: Views) -> None:
+        """Do not request a scene again, because it could not be loaded or refined."""
+        self._failed.add(views)
+
+    def get(self, views: Views) -> LoadedScene | None:
+        """A scene if it is in memory; it becomes the most recently used."""
+        loaded = self._loaded.get(views)
+        if loaded is not None:
+            self._loaded.move_to_end(views)
+        return loaded
+
+    def move(self, position: Float[np.ndarray, "3"], route: Route | None = None, fraction: float = 0.0) -> None:
+        """Choose the edge of a camera position, or of a fraction of a route that is being flown."""
+        edge = None if route is None else route.edge(fraction)
+        if edge is None:
+            edge, distance = self.tour.find_nearest_edge(position)
+            if self.tour.measure_distance(self.edge, position) <= distance + EDGE_HYSTERESIS:
+                edge = self.edge
+        self.edge = edge
+
+    def list_next(self, route: Route | None, fraction: float) -> list[Views]:
+        """The scenes to have in memory, the most urgent first: that of the camera, then those that are next.
+
+        These are the next ones of a route, or those around the nearest panorama.
+        """
+        if route is not None:
+            edges = list(route.edges_after(fraction))
+        else:
+            a, b = self.edge
+            edges = [edge for edge in self._views if {a, b} & set(edge)]
+            edges.sort(key=self.tour.length)
+        wanted = dict.fromkeys([self.views, *(self._views[edge] for edge in edges)])
+        return list(wanted)[: 1 + _NEXT_SCENES]
+
+    def choose_request(self, wanted: Sequence[Views], current: SceneEntry | None) -> SceneEntry | None:
+        """The entry to load now, or None to let the loader continue with `current` (None: it is idle).
+
+        Predictions come before refinements. A refinement ends if the scene of the camera is missing.
+        """
+        first, wanted = wanted[0], [views for views in wanted if views not in self._failed]
+        missing = [views for views in wanted if views not in self._loaded]
+        if current is not None:
+            needed = missing and missing[0] == first
+            replaced = needed and current.views != missing[0]
+            if not replaced and (current.views in wanted or not missing):
+                return None
+        if missing:
+            return self.make_entry(missing[0])
+        return next((self.make_entry(views) for views in wanted if not self._loaded[views].is_final), None)
+
+    def find_limit(self, route: Route, fraction: float) -> float:
+        """The fraction up to which a route can be flown with the scenes in memory."""
+        numbers = route.legs[round(fraction * (len(route.legs) - 1)) :]
+        ready = [self._views[edge] in self._loaded for edge in route.edges] + [True]  # the last one is leg -1
+        missing = np.flatnonzero(~np.array(ready)[numbers])
+        if not len(missing):
+            return 1.0
+        return max((len(route.legs) - len(numbers) + int(missing[0]) - 1) / (len(route.legs) - 1), fraction)
+
+    def plan_route(self, camera: Float[np.ndarray, "4 4"], remaining: Sequence[int] = ()) -> Route:
+        """A route from a pose through the remaining panoramas; without any, through all of them."""
+        if remaining:
+            walk = [*self._find_walk(camera[:3, 3], remaining[0]), *remaining[1:]]
+        else:
+            edge, _ = self.tour.find_nearest_edge(camera[:3, 3])
+            distances = np.linalg.norm(self.tour.positions[list(edge)] - camera[:3, 3], axis=1)
+            walk = self.tour.plan_walk(edge[int(distances.argmin())])
+        return plan_route(self.tour, walk, camera)
+
+    def plan_way(self, camera: Float[np.ndarray, "4 4"], node: int) -> Route:
+        """A route from a pose to a panorama."""
+        return plan_route(self.tour, self._find_walk(camera[:3, 3], node), camera)
+
+    def _find_walk(self, position: Float[np.ndarray, "3"], node: int) -> list[int]:
+        """The panoramas on the way from a position to one of them.
+
+        It begins at that end of the nearest edge which is on the way. `edge` can be another one: after a jump of the
+        camera, or where two edges are about as near.
+        """
+        nearest, _ = self.tour.find_nearest_edge(position)
+
+        def measure(walk: list[int]) -> float:
+            places = [position, *self.tour.positions[walk]]
+            return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+
+        return min((self.tour.find_walk(end, node) for end in nearest), key=measure)
+
+    @property
+    def camera_height(self) -> float:
+        """Height of the cameras over the floor, metres."""
+        heights = [outline.camera_height for outline in self.outlines.values()]
+        return float(np.median(heights)) if heights else _CAMERA_HEIGHT * self.tour.far
+
+
+def measure_bytes(scene: Scene) -> int:
+    """Bytes of a scene's Gaussians in memory."""
+    values = (getattr(scene.gaussians, field.name) for field in fields(scene.gaussians))
+    return sum(value.numel() * value.element_size() for value in values)
+
+
+class CrossFade:
+    """Two slots for scenes: one is shown, and the other one fades out for `FADE_SECONDS` after an exchange.
+
+    Attributes:
+        front: slot of the scene that is shown.
+        scenes: of both slots.
+    """
+
+    def __init__(self) -> None:
+        """Both slots are empty."""
+        self.front = 0
+        self.scenes: list[Scene | None] = [None, None]
+        self._start = -1e9
+        self._fading = False
+
+    def choose_slot(self, scene: Scene) -> int | None:
+        """The slot for a scene; None while the other one is fading out, or if it is shown already."""
+        if self._fading or self.scenes[self.front] is scene:
+            return None
+        return self.front if self.scenes[self.front] is None else 1 - self.front
+
+    def show(self, slot: int, scene: Scene, now: float) -> None:
+        """Show a scene that has been uploaded to a slot; at time `now` (seconds) the other one starts to fade out."""
+        self._fading = self.scenes[slot] is not None or slot != self.front
+        self.scenes[slot], self.front, self._start = scene, slot, now
+
+    def compute_weight(self, now: float) -> float:
+        """Weight of the scene that is shown, 0 to 1; that of the other one is the rest."""
+        done = min(max((now - self._start) / FADE_SECONDS, 0.0), 1.0)
+        self._fading = self._fading and done < 1
+        return done * done * (3 - 2 * done) if self._fading else 1.0
+
+    def clear(self) -> None:
+        """Forget both scenes; the first slot is the front."""
+        self.front, self.scenes, self._fading = 0, [None, None], False
+
+
+@dataclass(frozen=True)
+class Hotspot:
+    """The place of a panorama in the image, on the floor below its camera.
+
+    Attributes:
+        node: number of the panorama.
+        center: pixels, from the left and from the top.
+        radius: pixels, within which a click is meant.
+        ring: corners of the circle on the floor.
+    """
+
+    node: int
+    center: tuple[float, float]
+    radius: float
+    ring: tuple[tuple[float, float], ...]
+
+
+def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> list[Hotspot]:
+    """The panoramas that share an edge with those near the camera, and that are in the image; the nearest last."""
+    tour, position = scenes.tour, np.asarray(camera.position)
+    right, down, forward = np.asarray(camera.level).T
+    nodes = {*scenes.edge, *(node for end in scenes.edge for node in tour.neighbours(end))}
+    found = []
+    for node in nodes:
+        foot = tour.positions[node] + scenes.camera_height * down
+        if np.linalg.norm(tour.positions[node] - position) < 3 * _HOTSPOT_RADIUS:
+            continue
+        angles = np.arange(24) * (2 * np.pi / 24)
+        circle = foot + _HOTSPOT_RADIUS * (np.cos(angles)[:, None] * right + np.sin(angles)[:, None] * forward)
+        center = project_point(camera, tuple(foot), size)
+        ring = [project_point(camera, tuple(corner), size) for corner in circle]
+        if center is None or None in ring or not (0 <= center[0] < size[0] and 0 <= center[1] < size[1]):
+            continue
+        radius = max(np.ptp([corner[0] for corner in ring]) / 2, _MIN_HOTSPOT_PIXELS)
+        found.append((float(np.linalg.norm(foot - position)), Hotspot(node, center, float(radius), tuple(ring))))
+    return [hotspot for _, hotspot in sorted(found, key=lambda item: -item[0])]
+
+
+def find_clicked(hotspots: Sequence[Hotspot], pixel: tuple[float, float]) -> int | None:
+    """The panorama of the hotspot at a pixel, the nearest one first; None if there is none."""
+    for hotspot in reversed(hotspots):
+        if np.hypot(pixel[0] - hotspot.center[0], pixel[1] - hotspot.center[1]) <= hotspot.radius:
+            return hotspot.node
+    return None

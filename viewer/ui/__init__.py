@@ -1,0 +1,1 @@
+"""Panels, overlays and the image on the screen."""

@@ -1,0 +1,94 @@
+"""The floor plan of a tour as a panel: floors, walls, panoramas, and the camera; a click flies to a panorama."""
+
+from __future__ import annotations
+
+import math
+
+import moderngl
+import numpy as np
+from imgui_bundle import imgui
+
+from pansplat.tours import FloorPlan, draw_floor_plan
+from pansplat_viewer.scene.camera import Camera
+from pansplat_viewer.scene.tour import TourScenes
+
+SIZE = 210  # of the longer side of the plan, pixels at a DPI scale of 1
+_CLICK_PIXELS = 12.0
+_VIEW_LENGTH = 1.0  # metres, of the camera's field of view
+
+# Colours of panoramas, of those whose scene is loaded, of edges and of the camera.
+_COLORS = ((0.75, 0.78, 0.82, 1.0), (0.35, 0.8, 1.0, 1.0), (0.6, 0.65, 0.7, 0.35), (1.0, 0.8, 0.2, 1.0))
+
+
+class Minimap:
+    """Draws the plan of a tour; keeps the texture of the floors.
+
+    Attributes:
+        nodes: pixel of each panorama in the last frame; for tests that click.
+    """
+
+    def __init__(self, ctx: moderngl.Context) -> None:
+        """No texture is made before the first frame."""
+        self._ctx = ctx
+        self._texture: moderngl.Texture | None = None
+        self._plan: FloorPlan | None = None
+        self._key: tuple[object, ...] = ()
+        self.nodes: list[tuple[float, float]] = []
+
+    def draw(self, scenes: TourScenes, camera: Camera) -> int | None:
+        """Draw the plan into the current imgui window; returns the panorama that was clicked."""
+        scale = imgui.get_style().font_scale_dpi
+        plan = self._update(scenes, round(SIZE * scale))
+        assert self._texture is not None
+        corner = imgui.get_cursor_screen_pos()
+        imgui.image(imgui.ImTextureRef(self._texture.glo), self._texture.size)
+        hovered = imgui.is_item_hovered()
+        self._draw_marks(scenes, camera, plan, (corner.x, corner.y), scale)
+        if not hovered:
+            return None
+        mouse = imgui.get_mouse_pos()
+        distances = [math.hypot(x - mouse.x, y - mouse.y) for x, y in self.nodes]
+        nearest = int(np.argmin(distances))
+        if distances[nearest] > _CLICK_PIXELS * scale:
+            return None
+        imgui.set_tooltip(scenes.tour.panoramas[nearest].name)
+        return nearest if imgui.is_mouse_clicked(0) else None
+
+    def release(self) -> None:
+        """Free the texture."""
+        if self._texture is not None:
+            self._texture.release()
+        self._texture, self._key = None, ()
+
+    def _update(self, scenes: TourScenes, size: int) -> FloorPlan:
+        """The plan; its texture is written again after a scene was loaded."""
+        key = (scenes.tour, size, *map(id, scenes.outlines.values()))
+        if self._plan is None or key != self._key:
+            self.release()
+            self._plan = draw_floor_plan(scenes.tour, list(scenes.outlines.values()), size=size)
+            height, width = self._plan.image.shape[:2]
+            self._texture = self._ctx.texture((width, height), 4, self._plan.image.tobytes())
+            self._key = key
+        return self._plan
+
+    def _draw_marks(
+        self, scenes: TourScenes, camera: Camera, plan: FloorPlan, corner: tuple[float, float], scale: float
+    ) -> None:
+        tour, canvas = scenes.tour, imgui.get_window_draw_list()
+        axes = tour.level_axes[:, (0, 2)]
+        self.nodes = [tuple(pixel) for pixel in (plan.to_pixels(tour.positions @ axes) + corner).tolist()]
+        colors = [imgui.color_convert_float4_to_u32(color) for color in _COLORS]
+        for a, b in tour.overlaps:
+            canvas.add_line(self.nodes[a], self.nodes[b], colors[2], scale)
+        loaded = {node for views in scenes.loaded for node in views}
+        for node, pixel in enumerate(self.nodes):
+            canvas.add_circle_filled(pixel, 4.0 * scale, colors[node in loaded])
+        place, rotation = np.asarray(camera.position) @ axes, camera.rotation
+        heading = rotation[:, 2] @ axes
+        heading = heading / max(float(np.linalg.norm(heading)), 1e-6)
+        side = np.array((heading[1], -heading[0])) * math.tan(math.radians(min(camera.vertical_fov_degrees, 120)) / 2)
+        ends = [plan.to_pixels(place + _VIEW_LENGTH * (heading + sign * side)) + corner for sign in (-1, 1)]
+        at = plan.to_pixels(place) + corner
+        for end in ends:
+            canvas.add_line(tuple(at.tolist()), tuple(end.tolist()), colors[3], 1.5 * scale)
+        canvas.add_circle_filled(tuple(at.tolist()), 4.5 * scale, colors[3])

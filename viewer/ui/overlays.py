@@ -1,0 +1,151 @@
+"""Text and marks over the image, without controls: statistics, picked points, hotspots, messages and colour maps."""
+
+from __future__ import annotations
+
+import math
+
+from imgui_bundle import imgui
+
+from pansplat_viewer.draw.color_maps import get_table
+from pansplat_viewer.scene.picking import project_point
+from pansplat_viewer.scene.settings import SCALAR_MAPS, FrameStats
+from pansplat_viewer.scene.state import ViewerState
+from pansplat_viewer.scene.tour import Hotspot, TourScenes
+from pansplat_viewer.ui.presenter import ERROR_MAP
+from pansplat_viewer.window.gui import PANEL_WIDTH
+
+MARGIN = 10.0  # from the border of the window, pixels
+FIXED = (  # flags of a window that is placed anew in each frame
+    imgui.WindowFlags_.no_move.value
+    | imgui.WindowFlags_.no_resize.value
+    | imgui.WindowFlags_.no_saved_settings.value
+    | imgui.WindowFlags_.no_docking.value
+)
+_LABEL = (
+    FIXED
+    | imgui.WindowFlags_.no_title_bar.value
+    | imgui.WindowFlags_.always_auto_resize.value
+    | imgui.WindowFlags_.no_inputs.value
+    | imgui.WindowFlags_.no_focus_on_appearing.value
+    | imgui.WindowFlags_.no_nav.value
+)
+_LEGEND_WIDTH = 180.0
+UNITS = {"depth": " m", "count": ""}  # of displays whose range can be changed
+
+
+def draw_stats(
+    state: ViewerState, stats: FrameStats, frame_ms: float, image_size: tuple[int, int], right_name: str | None
+) -> None:
+    """Draw times, counts and the camera's position at the top right.
+
+    Args:
+        state: has the camera.
+        stats: of the last image.
+        frame_ms: time of a whole frame.
+        image_size: (width, height), pixels.
+        right_name: of what is right of the divider; None if there is nothing.
+    """
+    size, scale = imgui.get_io().display_size, imgui.get_style().font_scale_dpi
+    if size.x > 2.2 * PANEL_WIDTH * scale:
+        imgui.set_next_window_pos((size.x - MARGIN, MARGIN), 0, (1.0, 0.0))
+    else:  # too narrow next to the main panel: bottom right
+        imgui.set_next_window_pos((size.x - MARGIN, size.y - MARGIN), 0, (1.0, 1.0))
+    x, y, z = state.camera.position
+    lines = [
+        f"frame {frame_ms:.1f} ms   draw {stats.frame_ms:.1f} ms   sort {stats.sort_ms:.0f} ms",
+        f"{stats.drawn:,} drawn of {stats.visible:,} of {stats.total:,}",
+        f"{image_size[0]} x {image_size[1]}   {stats.tier}" + ("   cached" if stats.cached else ""),
+        f"x {x:.2f}  y {y:.2f}  z {z:.2f} m",
+    ]
+    if right_name is not None:
+        lines.append(f"right: {right_name}")
+    _draw_label("##stats", lines, alpha=0.6)
+
+
+def draw_points(state: ViewerState) -> None:
+    """Draw markers at the picked points, and what is known of them at the bottom right."""
+    size = imgui.get_io().display_size
+    color = imgui.color_convert_float4_to_u32((1.0, 0.85, 0.2, 1.0))
+    canvas = imgui.get_background_draw_list()
+    pixels = [project_point(state.camera, point.position, (int(size.x), int(size.y))) for point in state.points]
+    for pixel in pixels:
+        if pixel is not None:
+            canvas.add_circle(pixel, 5.0 * imgui.get_style().font_scale_dpi, color, 0, 2.0)
+    lines = state.points[-1].describe()
+    if len(pixels) == 2:
+        if pixels[0] is not None and pixels[1] is not None:
+            canvas.add_line(pixels[0], pixels[1], color, 2.0)
+        distance = f"{math.dist(state.points[0].position, state.points[1].position):.3f} m"
+        lines.append(f"{distance} from the point before")
+        if pixels[0] is not None and pixels[1] is not None:
+            middle = ((pixels[0][0] + pixels[1][0]) / 2 + 8, (pixels[0][1] + pixels[1][1]) / 2 - 22)
+            _draw_outlined(canvas, middle, color, distance)
+    imgui.set_next_window_pos((size.x - MARGIN, size.y - MARGIN), 0, (1.0, 1.0))
+    _draw_label("##point", lines, alpha=0.6)
+
+
+def draw_hotspots(tour: TourScenes, hotspots: list[Hotspot]) -> None:
+    """Draw a ring on the floor below each panorama, with its name."""
+    canvas = imgui.get_background_draw_list()
+    black, white = (imgui.color_convert_float4_to_u32((value, value, value, 0.8)) for value in (0.0, 1.0))
+    for hotspot in hotspots:
+        ring = [imgui.ImVec2(*corner) for corner in hotspot.ring]
+        for color, thickness in ((black, 4.0), (white, 2.0)):
+            canvas.add_polyline(ring, color, thickness=thickness, flags=imgui.ImDrawFlags_.closed.value)
+            canvas.add_circle_filled(hotspot.center, 1.0 + thickness, color)
+        name = tour.tour.panoramas[hotspot.node].name
+        width = imgui.calc_text_size(name).x
+        place = hotspot.center[0] - width / 2, hotspot.center[1] + hotspot.radius
+        _draw_outlined(canvas, place, white, name)
+
+
+def draw_message(message: str) -> None:
+    """Draw a text at the bottom."""
+    size = imgui.get_io().display_size
+    imgui.set_next_window_pos((size.x / 2, size.y - 2 * MARGIN), 0, (0.5, 1.0))
+    _draw_label("##message", [message], alpha=0.75)
+
+
+def _draw_label(name: str, lines: list[str], alpha: float) -> None:
+    imgui.set_next_window_bg_alpha(alpha)
+    imgui.begin(name, None, _LABEL)
+    for line in lines:
+        imgui.text_unformatted(line)
+    imgui.end()
+
+
+def _draw_outlined(canvas: imgui.ImDrawList, place: tuple[float, float], color: int, text: str) -> None:
+    """Draw a text that is readable over any image."""
+    black = imgui.color_convert_float4_to_u32((0.0, 0.0, 0.0, 1.0))
+    for x, y in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        canvas.add_text((place[0] + x, place[1] + y), black, text)
+    canvas.add_text(place, color, text)
+
+
+def draw_legends(state: ViewerState) -> None:
+    """Draw the colour maps that are shown, with their ranges: that of the image left, that of the error right."""
+    settings, size, scale = state.settings, imgui.get_io().display_size, imgui.get_style().font_scale_dpi
+    if settings.display in SCALAR_MAPS:
+        left = PANEL_WIDTH * scale + MARGIN if state.overlay else MARGIN
+        unit = UNITS.get(settings.display, "")
+        _draw_legend((left, size.y - 3 * MARGIN), settings.display, f"{settings.display_max:.3g}{unit}")
+    if state.comparison == "error":
+        left = size.x - (_LEGEND_WIDTH * scale + MARGIN)
+        _draw_legend((left, size.y - 3 * MARGIN), "error", f"{state.max_error:.3g}", ERROR_MAP)
+
+
+def _draw_legend(corner: tuple[float, float], label: str, largest: str, name: str = "") -> None:
+    """Draw a colour map with its name and range, above a corner."""
+    canvas, scale = imgui.get_background_draw_list(), imgui.get_style().font_scale_dpi
+    table = get_table(name or SCALAR_MAPS[label])  # pyright: ignore[reportArgumentType]
+    step, height = _LEGEND_WIDTH * scale / 64, 10 * scale
+    for index in range(64):
+        red, green, blue = (table[4 * index + 2] / 255).tolist()
+        x = corner[0] + index * step
+        color = imgui.color_convert_float4_to_u32((red, green, blue, 1.0))
+        canvas.add_rect_filled((x, corner[1]), (x + step, corner[1] + height), color)
+    white = imgui.color_convert_float4_to_u32((1.0, 1.0, 1.0, 1.0))
+    above, text = corner[1] - 18 * scale, (f"{label}: 0", largest)
+    _draw_outlined(canvas, (corner[0], above), white, text[0])
+    right = corner[0] + 64 * step - imgui.calc_text_size(largest).x
+    _draw_outlined(canvas, (right, above), white, text[1])

@@ -1,0 +1,100 @@
+"""The image on the screen, and right of a divider what it is compared with: a photograph, an error, another image."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import get_args
+
+import moderngl
+import numpy as np
+from jaxtyping import Float
+
+from pansplat_viewer.draw.color_maps import create_table_texture
+from pansplat_viewer.draw.programs import Programs
+from pansplat_viewer.scene import camera as cameras
+from pansplat_viewer.scene.settings import Comparison
+
+ERROR_MAP = "inferno"
+
+
+@dataclass(frozen=True)
+class RightSide:
+    """What is shown right of the divider.
+
+    Attributes:
+        comparison: `photograph`; `error`, its mean absolute difference from the image; or `pinned`, another image.
+        texture: the photograph, top row first, or the other image.
+        pose: of the photograph, camera to world.
+        split: place of the divider, a fraction of the width.
+        max_error: the difference with the last colour of the map.
+    """
+
+    comparison: Comparison
+    texture: moderngl.Texture
+    pose: Float[np.ndarray, "4 4"] | None = None
+    split: float = 0.5
+    max_error: float = 0.25
+
+
+class Presenter:
+    """Draws images to the screen."""
+
+    def __init__(self, ctx: moderngl.Context) -> None:
+        """Compile the program."""
+        self.ctx = ctx
+        self._programs = Programs(ctx)
+        self._program = self._programs.present()
+        self._triangle = ctx.vertex_array(self._program, [])
+        self._program["image"], self._program["fading"], self._program["right"], self._program["table"] = range(4)
+        self._table = create_table_texture(ctx, ERROR_MAP)
+
+    def draw(
+        self,
+        image: moderngl.Texture,
+        target: moderngl.Framebuffer,
+        camera: cameras.Camera,
+        *,
+        right: RightSide | None = None,
+        fading: moderngl.Texture | None = None,
+        weight: float = 1.0,
+    ) -> None:
+        """Fill `target` with the image of `camera`, and the part right of the divider with `right`.
+
+        A photograph is sampled by direction only: it has no parallax and matches exactly at its own camera. The image
+        is mixed with `fading`, the image of another scene; `weight` is that of the first, 0 to 1.
+        """
+        if right is None and fading is None and target.viewport == (0, 0, *image.size) and image.dtype == "f1":
+            self._copy(image, target)
+            return
+        target.use()
+        self.ctx.disable(moderngl.DEPTH_TEST | moderngl.BLEND | moderngl.CULL_FACE)
+        side = image if right is None else right.texture
+        for unit, texture in enumerate((image, fading or image, side)):
+            texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
+            texture.use(unit)
+        self._table.use(3)
+        self._program["weight"] = weight
+        self._program["comparison"] = 0 if right is None else get_args(Comparison).index(right.comparison)
+        self._program["split"] = 2.0 if right is None else right.split
+        if right is not None and right.pose is not None:
+            rotation = right.pose[:3, :3].T @ camera.rotation
+            self._program["camera_to_photo"] = tuple(rotation.T.ravel().tolist())  # column by column
+            width, height = target.viewport[2:]
+            tangent = math.tan(math.radians(camera.vertical_fov_degrees) / 2)
+            self._program["tangent"] = (tangent * width / height, tangent)
+            self._program["max_error"] = right.max_error
+        self._triangle.render(moderngl.TRIANGLES, vertices=3)
+
+    def _copy(self, image: moderngl.Texture, target: moderngl.Framebuffer) -> None:
+        """Copy an image of the target's size; software OpenGL copies fifty times as fast as it draws."""
+        source = self.ctx.framebuffer([image])
+        self.ctx.copy_framebuffer(target, source)
+        target.use()
+        source.release()
+
+    def release(self) -> None:
+        """Free the GL objects."""
+        self._table.release()
+        self._triangle.release()
+        self._programs.release()

@@ -1,0 +1,1 @@
+"""The window, its events and the preferences of its user."""
