@@ -131,6 +131,18 @@ def test_next_nodes_lead_along_the_cheapest_walk(comb):
         assert walk == comb.find_walk(start, end)
 
 
+def test_an_edge_is_followed_until_another_one_is_clearly_nearer(comb):
+    assert comb.follow_edge(np.array((0.0, 0, 1.2)), (0, 1)) == (0, 1)
+    assert comb.follow_edge(np.array((0.0, 0, 1.3)), (0, 1)) == (1, 2)
+    assert comb.list_reachable((1, 4)) == {0, 1, 2, 4}
+
+
+def test_a_way_begins_at_the_better_end_of_the_nearest_edge(comb):
+    assert comb.find_way(np.array((0.0, 0, 1.4)), 0) == [1, 0]
+    assert comb.find_way(np.array((0.0, 0, 1.4)), 5) == [2, 5]
+    assert comb.find_way(np.array((0.8, 0, 1.0)), 4) == [4]
+
+
 def test_a_pair_of_a_scene_has_its_panoramas(comb):
     pair = comb.make_pair((1, 4))
     assert pair.name == "p1-p4" and pair.context == (comb.panoramas[1], comb.panoramas[4])
@@ -240,7 +252,10 @@ def test_the_floor_of_a_room_ends_at_its_walls(room_scene):
     border = np.minimum(inside, 1 - inside).min(axis=1)
     assert np.abs(border).max() < 0.04, "all corners are near a wall"
     scene = Scene(room_scene.gaussians.select(torch.arange(20)), room_scene.cam2world, 0.45, 10.0)
-    assert find_floor_outline(scene, 0, level) is None
+    assert find_floor_outline(scene, 0, level) is None and tours.find_camera_height(scene, 0, level) is None
+    assert tours.find_camera_height(room_scene, 0, level) == outline.camera_height
+    assert tours.choose_camera_height((1.0, None, 1.4, 1.6), 10.0) == 1.4
+    assert tours.choose_camera_height((None,), 10.0) == 1.5
 
 
 def test_the_plan_shows_the_floor_and_its_walls(room_scene):
@@ -260,7 +275,7 @@ def test_the_plan_shows_the_floor_and_its_walls(room_scene):
     assert 20 < walls / 2 < 26, "a line of 2 pixels around 20 m"
     empty = draw_floor_plan(tour, [])
     assert empty.image.max() == 0
-    assert math.isfinite(empty.pixels_per_metre) and tours.MIN_PANORAMAS == 3
+    assert math.isfinite(empty.pixels_per_metre)
 
 
 def test_the_plan_of_a_scene_is_a_file_with_its_panoramas(room_scene, tmp_path):

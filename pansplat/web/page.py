@@ -35,7 +35,14 @@ from pansplat.geometry.world import working_factor
 from pansplat.predictor import Progress
 from pansplat.refinement.budget import merge_to
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
-from pansplat.tours import EDGE_HYSTERESIS, TourGraph, make_graph, plan_route
+from pansplat.tours import (
+    EDGE_HYSTERESIS,
+    TourGraph,
+    choose_camera_height,
+    find_camera_height,
+    make_graph,
+    plan_route,
+)
 from pansplat.web.data import MAX_DEGREE, PackedGaussians, count_bytes, pack_gaussians
 
 DEFAULT_GAUSSIANS = 300_000  # phones draw and hold them
@@ -245,15 +252,14 @@ def _describe_scene(
     offsets = means - positions[views]
     distances = np.linalg.norm(offsets, axis=1)
     reach = max(float(np.median(distances)), 1e-3)
-    below = offsets @ level[:, 1] > 0.8 * distances  # within 37 degrees of straight down
-    drops = [distances[below & (views == view)] for view in range(len(positions))]
-    heights = [float(np.median(drop)) if len(drop) > 20 else 0.0 for drop in drops]
+    heights = [find_camera_height(scene, view, level) for view in range(len(positions))]
+    usual_height = choose_camera_height(heights, scene.far)
     spots = [
         {
             "name": name,
             "position": _round(position),
-            "mark": _round(position + 0.9 * height * level[:, 1]),
-            "radius": round(0.12 * (height or 0.5 * reach), 6),
+            "mark": _round(position + (height or usual_height) * level[:, 1]),
+            "radius": round(0.12 * (height or usual_height), 6),
         }
         for name, position, height in zip(scene.names, positions, heights, strict=True)
     ]

@@ -16,6 +16,7 @@ from pansplat import pipeline
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.refinement.budget import merge_to
+from pansplat.tours import find_camera_height
 from pansplat.web import page as page_module
 from pansplat.web import write_page
 
@@ -42,9 +43,9 @@ def test_the_page_describes_the_scene(scene: Scene, tmp_path: Path) -> None:
     level = np.array(header["level"])
     assert np.allclose(level @ level.T, np.eye(3), atol=1e-6) and np.linalg.det(level) > 0
     assert np.allclose(level[:, 1], (0, 1, 0), atol=1e-6)  # the cameras are upright: y is down
-    # Rings are below the cameras, on the floor 2 to 3 m down.
-    heights = [spot["mark"][1] - spot["position"][1] for spot in header["spots"]]
-    assert all(1.8 < height < 2.7 for height in heights)
+    for view, spot in enumerate(header["spots"]):  # rings are on the floor below the cameras
+        height = find_camera_height(scene, view, level)
+        assert np.array(spot["mark"]) - spot["position"] == pytest.approx((0, height, 0), abs=1e-5)
 
 
 def test_the_page_of_a_tour_has_its_edges_and_its_route(house: Scene, tmp_path: Path) -> None:

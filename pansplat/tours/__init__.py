@@ -1,0 +1,52 @@
+"""Tours: many posed panoramas of one place as a graph, the scenes of its edges, routes along it, and its floor plan.
+
+An edge joins two panoramas that show the same surfaces. A camera flies along edges; the scene of an edge is predicted
+from its two panoramas and a third one that overlaps with both.
+"""
+
+from pansplat.tours.floor import (
+    FloorOutline,
+    FloorPlan,
+    choose_camera_height,
+    draw_floor_plan,
+    find_camera_height,
+    find_floor_outline,
+    find_floor_outlines,
+    paint_floor_plan,
+    write_floor_plan,
+)
+from pansplat.tours.graph import (
+    EDGE_HYSTERESIS,
+    Edge,
+    TourGraph,
+    Views,
+    find_tours,
+    make_graph,
+    merge_scenes,
+    select_views,
+)
+from pansplat.tours.overlap import connect
+from pansplat.tours.route import Route, plan_route
+
+__all__ = [
+    "EDGE_HYSTERESIS",
+    "Edge",
+    "FloorOutline",
+    "FloorPlan",
+    "Route",
+    "TourGraph",
+    "Views",
+    "choose_camera_height",
+    "connect",
+    "draw_floor_plan",
+    "find_camera_height",
+    "find_floor_outline",
+    "find_floor_outlines",
+    "find_tours",
+    "make_graph",
+    "merge_scenes",
+    "paint_floor_plan",
+    "plan_route",
+    "select_views",
+    "write_floor_plan",
+]

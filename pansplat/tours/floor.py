@@ -1,0 +1,224 @@
+"""The floor under the cameras of a tour, its outlines, and the floor plan."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from pansplat.data.images import write_image
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Scene
+from pansplat.tours.graph import TourGraph, Views, make_graph
+from pansplat.tours.route import Route
+
+_PLAN_SIZE = 1024  # of the longer side of a floor plan as a file, pixels
+_CAMERA_HEIGHT = 0.15  # of a camera over an unknown floor, as a fraction of far
+_AZIMUTHS = 180  # of a floor outline
+_PLAN_MARGIN = 0.5  # around the panoramas and outlines of a floor plan, metres
+
+
+@dataclass(frozen=True, eq=False)
+class FloorOutline:
+    """Where the floor that one panorama shows ends, seen from above.
+
+    Attributes:
+        center: of the camera, in the plan's coordinates: metres to the right and forward of the tour's level axes.
+        corners: end of the floor at equal steps of azimuth.
+        camera_height: of the camera over the floor, metres.
+    """
+
+    center: Float[np.ndarray, "2"]
+    corners: Float[np.ndarray, "azimuth 2"]
+    camera_height: float
+
+
+def find_camera_height(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) -> float | None:
+    """Height of a view's camera over the floor that its Gaussians show, metres; None if they show no floor.
+
+    The floor is the most frequent height in the directions steeply below the camera.
+
+    Args:
+        scene: the scene.
+        view: index of the view.
+        level: right, down and forward (columns) of a level camera.
+    """
+    return _find_floor(_locate_surfaces(scene, view, level))
+
+
+def choose_camera_height(heights: Iterable[float | None], far: float) -> float:
+    """The median of those heights of cameras that are known; a fraction of `far` if none is.
+
+    Args:
+        heights: of `find_camera_height` or of floor outlines, metres.
+        far: of the scene or tour, metres.
+    """
+    known = [height for height in heights if height is not None]
+    return float(np.median(known)) if known else _CAMERA_HEIGHT * far
+
+
+def _locate_surfaces(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 3"]:
+    """Places (right, down, forward) relative to a view's camera of its Gaussians that show surfaces, metres."""
+    gaussians = scene.gaussians
+    # Coarse levels have Gaussians behind the surfaces.
+    shown = (gaussians.views == view) & (gaussians.opacities > 0.1) & (gaussians.levels <= 1)
+    return (gaussians.means[shown].double().numpy() - scene.cam2world[view, :3, 3].double().numpy()).dot(level)
+
+
+def _find_floor(places: Float[np.ndarray, "n 3"]) -> float | None:
+    """The most frequent distance downwards of the places that are steeply below; None if they are fewer than 20."""
+    right, down, forward = places.T
+    steep = (down > 0.6 * np.hypot(right, forward)) & (down > 0)
+    if steep.sum() < 20:
+        return None
+    logs = np.log(down[steep])
+    counts, borders = np.histogram(logs, bins=max(int((logs.max() - logs.min()) / 0.04), 1))
+    peak = borders[counts.argmax() : counts.argmax() + 2].mean()
+    return float(np.exp(np.median(logs[np.abs(logs - peak) < 0.08])))
+
+
+def find_floor_outline(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) -> FloorOutline | None:
+    """The floor outline of a view from its Gaussians; None if they show no floor.
+
+    At each azimuth the floor (`find_camera_height`) ends at the distance within which 98 % of its Gaussians are, or at
+    the surfaces that stand on it, if these are nearer.
+
+    Args:
+        scene, view, level: see `find_camera_height`.
+    """
+    places = _locate_surfaces(scene, view, level)
+    height = _find_floor(places)
+    if height is None:
+        return None
+    right, down, forward = places.T
+    flat = np.hypot(right, forward)
+    sector = ((np.arctan2(right, forward) / (2 * math.pi) % 1.0) * _AZIMUTHS).astype(int) % _AZIMUTHS
+    floor = _measure_reach(flat, sector, np.abs(down - height) < 0.08 * height, 0.98)
+    standing = _measure_reach(flat, sector, (down > 0.15 * height) & (down < 0.8 * height), 0.5)
+    reach = np.fmin(floor, standing)
+    known = np.flatnonzero(np.isfinite(floor))
+    if len(known) < _AZIMUTHS // 4:
+        return None
+    reach = np.interp(np.arange(_AZIMUTHS), known, reach[known], period=_AZIMUTHS)
+    neighbours = np.stack([np.roll(reach, shift) for shift in range(-2, 3)])
+    reach = np.median(neighbours, axis=0)  # without single outliers
+    angles = (np.arange(_AZIMUTHS) + 0.5) * 2 * math.pi / _AZIMUTHS
+    center = level[:, (0, 2)].T @ scene.cam2world[view, :3, 3].double().numpy()
+    corners = center + reach[:, None] * np.stack((np.sin(angles), np.cos(angles)), axis=1)
+    return FloorOutline(center, corners, height)
+
+
+def _measure_reach(
+    distances: Float[np.ndarray, "n"],
+    sector: Int[np.ndarray, "n"],
+    selected: Bool[np.ndarray, "n"],
+    quantile: float,
+) -> Float[np.ndarray, "azimuth"]:
+    """A quantile of the selected distances at each azimuth; NaN where there are fewer than three."""
+    reach = np.full(_AZIMUTHS, np.nan)
+    order = np.argsort(sector[selected], kind="stable")
+    ordered, borders = distances[selected][order], np.searchsorted(sector[selected][order], np.arange(_AZIMUTHS + 1))
+    for azimuth, (first, last) in enumerate(itertools.pairwise(borders.tolist())):
+        if last - first >= 3:
+            reach[azimuth] = np.quantile(ordered[first:last], quantile)
+    return reach
+
+
+@dataclass(frozen=True, eq=False)
+class FloorPlan:
+    """An image of the floor from above, and its place.
+
+    Attributes:
+        image: RGBA; transparent where no floor is known.
+        origin: plan coordinates of the upper left corner, metres.
+        pixels_per_metre: scale.
+    """
+
+    image: UInt8[np.ndarray, "height width 4"]
+    origin: Float[np.ndarray, "2"]
+    pixels_per_metre: float
+
+    def to_pixels(self, places: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Pixel coordinates (right, down) of plan coordinates (right, forward)."""
+        return (places - self.origin) * (self.pixels_per_metre, -self.pixels_per_metre)
+
+
+def draw_floor_plan(tour: TourGraph, outlines: Sequence[FloorOutline], *, size: int = 256) -> FloorPlan:
+    """The floors that the outlines enclose, with walls where they end.
+
+    Args:
+        tour: all its panoramas fit into the image.
+        outlines: of any of the panoramas.
+        size: longer side of the image, pixels.
+    """
+    places = np.concatenate([tour.positions @ tour.level_axes[:, (0, 2)], *(outline.corners for outline in outlines)])
+    low, high = places.min(axis=0) - _PLAN_MARGIN, places.max(axis=0) + _PLAN_MARGIN
+    scale = size / float((high - low).max())
+    width, height = np.maximum(np.ceil((high - low) * scale).astype(int), 1)
+    plan = FloorPlan(np.zeros((height, width, 4), np.uint8), np.array((low[0], high[1])), scale)
+    floor = np.zeros((height, width), np.uint8)
+    for outline in outlines:
+        cv2.fillPoly(floor, [plan.to_pixels(outline.corners).round().astype(np.int32)], 255)
+    # A wall is the border of all floors together, so that an outline that ends in another view's floor draws no wall.
+    wall = cv2.morphologyEx(floor, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
+    plan.image[floor > 0] = (96, 104, 116, 255)
+    plan.image[wall > 0] = (228, 230, 235, 255)
+    return plan
+
+
+def find_floor_outlines(tour: TourGraph, scene: Scene, views: Views) -> dict[int, FloorOutline]:
+    """The floor outlines of a scene's views that show a floor, by panorama."""
+    outlines = {node: find_floor_outline(scene, view, tour.level_axes) for view, node in enumerate(views)}
+    return {node: outline for node, outline in outlines.items() if outline is not None}
+
+
+def write_floor_plan(scene: Scene, path: str | Path) -> None:
+    """Write the floor plan of a scene as an image, with the edges of its tour.
+
+    Args:
+        scene: with input cameras.
+        path: the file, such as a .png.
+
+    Raises:
+        InputError: no view shows a floor, or the file cannot be written.
+    """
+    tour = make_graph(scene)
+    outlines = find_floor_outlines(tour, scene, tuple(range(len(tour)))) if len(tour) else {}
+    if not outlines:
+        raise InputError(
+            f"cannot write {path}: needed a floor below at least one of the {len(tour)} input cameras, got none; "
+            "export a folder of upright panoramas"
+        )
+    write_image(path, paint_floor_plan(tour, list(outlines.values())).astype(np.float32) / 255)
+
+
+def paint_floor_plan(
+    tour: TourGraph, outlines: Sequence[FloorOutline], *, route: Route | None = None
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The floor plan over dark grey with the names of the panoramas, the edges between them, and a route.
+
+    Args:
+        tour, outlines: see `draw_floor_plan`.
+        route: drawn instead of the edges.
+    """
+    plan = draw_floor_plan(tour, outlines, size=_PLAN_SIZE)
+    alpha = plan.image[..., 3:] / 255.0
+    image = np.ascontiguousarray((plan.image[..., :3] * alpha + 24 * (1 - alpha)).astype(np.uint8))
+    axes = tour.level_axes[:, (0, 2)]
+    centers = plan.to_pixels(tour.positions @ axes).round().astype(np.int32)
+    if route is not None:
+        line = plan.to_pixels(route.positions @ axes).round().astype(np.int32)
+        cv2.polylines(image, [line], False, (255, 204, 51), 2, cv2.LINE_AA)
+    else:
+        for edge in tour.overlaps:
+            cv2.polylines(image, [centers[list(edge)]], False, (170, 180, 190), 1, cv2.LINE_AA)
+    for panorama, (x, y) in zip(tour.panoramas, centers.tolist(), strict=True):
+        cv2.circle(image, (x, y), 6, (90, 204, 255), -1, cv2.LINE_AA)
+        cv2.putText(image, panorama.name, (x + 9, y + 5), 0, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    return image

@@ -1,0 +1,345 @@
+"""Graphs of panoramas: their edges and walks, the scenes of the edges, and one scene of all panoramas."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.sparse.csgraph import shortest_path
+from torch import Tensor
+
+from pansplat.data.pairs import Pair, Panorama
+from pansplat.errors import InputError
+from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.geometry.path import level_pose, up_direction
+
+Edge = tuple[int, int]
+"""Indices of two panoramas, the smaller one first."""
+
+Views = tuple[int, ...]
+"""The panoramas of a scene, by their number in the tour."""
+
+EDGE_HYSTERESIS = 0.25  # metres that another edge must be nearer than the current one
+_MIN_PANORAMAS = 3
+_MIN_BASELINE = 0.03  # of a scene of two views, as a fraction of far; depth is inaccurate below it
+_MAX_STARTS = 10_000  # of a walk, divided by the number of nodes
+
+
+@dataclass(frozen=True, eq=False)
+class TourGraph:
+    """Posed panoramas of one place and the edges between them.
+
+    Attributes:
+        name: for lists and folders.
+        folder: of the files.
+        panoramas: the nodes, in file order.
+        near, far: depth range to search, metres.
+        siblings: all panoramas taken with the same camera.
+        overlaps: of each edge: 1 if one panorama explains the other at each pixel, 0 for unrelated panoramas.
+    """
+
+    name: str
+    folder: Path
+    panoramas: tuple[Panorama, ...]
+    near: float
+    far: float
+    siblings: tuple[Path, ...] = field(default=(), repr=False)
+    overlaps: dict[Edge, float] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.panoramas)
+
+    @cached_property
+    def cam2world(self) -> Float[Tensor, "node 4 4"]:
+        """Poses of the panoramas."""
+        return torch.stack([panorama.cam2world for panorama in self.panoramas]).double()
+
+    @cached_property
+    def positions(self) -> Float[np.ndarray, "node 3"]:
+        """Camera centres, metres."""
+        return self.cam2world[:, :3, 3].numpy()
+
+    @cached_property
+    def level_axes(self) -> Float[np.ndarray, "3 3"]:
+        """Right, down and forward (columns, world axes) of a level camera at the first panorama."""
+        return level_pose(self.cam2world[0], up_direction(self.cam2world))[:3, :3].numpy()
+
+    def neighbours(self, node: int) -> list[int]:
+        """Nodes that share an edge with a node."""
+        return sorted({sum(edge) - node for edge in self.overlaps if node in edge})
+
+    def list_reachable(self, edge: Edge) -> set[int]:
+        """The nodes of an edge, and those that share an edge with one of them."""
+        return {*edge, *(node for end in edge for node in self.neighbours(end))}
+
+    def choose_scene_views(self) -> dict[Edge, Views]:
+        """The panoramas of the scene of each edge: two, or three that overlap with each other.
+
+        Edges share scenes where they can, so that fewer scenes are predicted and exchanged.
+        """
+        around = {node: set(self.neighbours(node)) for node in range(len(self))}
+        triangles = [(a, b, c) for a, b in self.overlaps for c in sorted(around[a] & around[b]) if c > b]
+        triangles.sort(key=lambda nodes: (-self._weakest_overlap(nodes), nodes))
+        scenes: dict[Edge, Views] = {}
+        for needed in (2, 1):
+            for nodes in triangles:
+                free = [edge for edge in itertools.combinations(nodes, 2) if edge not in scenes]
+                if len(free) >= needed:
+                    scenes |= {edge: nodes for edge in free}
+        for edge in self.overlaps:
+            if edge not in scenes:
+                scenes[edge] = self._add_baseline(edge)
+        return scenes
+
+    def choose_sources(self) -> dict[Views, tuple[int, ...]]:
+        """The scenes that one scene of all panoramas is made of, and the panoramas whose Gaussians each provides.
+
+        They are scenes of `choose_scene_views`, those of the largest overlaps first, until all panoramas are provided.
+        """
+        scenes = sorted(
+            set(self.choose_scene_views().values()), key=lambda nodes: (-self._weakest_overlap(nodes), nodes)
+        )
+        sources: dict[Views, tuple[int, ...]] = {}
+        missing = set(range(len(self)))
+        for views in scenes:
+            provided = tuple(node for node in views if node in missing)
+            if provided:
+                sources[views] = provided
+                missing -= set(provided)
+        return sources
+
+    def _weakest_overlap(self, nodes: Views) -> float:
+        """The smallest overlap of the edges between the panoramas of a scene."""
+        return min(self.overlaps[edge] for edge in itertools.combinations(nodes, 2) if edge in self.overlaps)
+
+    def _add_baseline(self, edge: Edge) -> Views:
+        """The edge's panoramas, with the best neighbour of either if they are too close together for depth."""
+        if self.length(edge) >= _MIN_BASELINE * self.far:
+            return edge
+        others = [
+            (self.overlaps[around], node)
+            for around in self.overlaps
+            for node in around
+            if around != edge and set(around) & set(edge) and node not in edge
+        ]
+        return tuple(sorted((*edge, max(others)[1]))) if others else edge
+
+    def length(self, edge: Edge) -> float:
+        """Distance between the cameras of an edge, metres."""
+        a, b = self.positions[list(edge)]
+        return float(np.linalg.norm(a - b))
+
+    def make_pair(self, views: Sequence[int]) -> Pair:
+        """The panoramas of a scene as the input of a prediction."""
+        context = tuple(self.panoramas[view] for view in views)
+        name = "-".join(panorama.name for panorama in context)
+        return Pair(name, self.folder, context, (), self.near, self.far, self.siblings)
+
+    def find_nearest_edge(self, position: Float[np.ndarray, "3"]) -> tuple[Edge, float]:
+        """The edge nearest to a position, and the distance in metres."""
+        distances = {edge: self.measure_distance(edge, position) for edge in self.overlaps}
+        edge = min(distances, key=distances.__getitem__)
+        return edge, distances[edge]
+
+    def follow_edge(self, position: Float[np.ndarray, "3"], current: Edge) -> Edge:
+        """The edge of a camera that moves: `current`, unless another edge is nearer by `EDGE_HYSTERESIS`."""
+        nearest, distance = self.find_nearest_edge(position)
+        return current if self.measure_distance(current, position) <= distance + EDGE_HYSTERESIS else nearest
+
+    def measure_distance(self, edge: Edge, position: Float[np.ndarray, "3"]) -> float:
+        """Distance of a position from the line between an edge's cameras, metres."""
+        a, b = self.positions[list(edge)]
+        along = b - a
+        fraction = float((position - a) @ along / max(float(along @ along), 1e-12))
+        return float(np.linalg.norm(position - (a + min(max(fraction, 0.0), 1.0) * along)))
+
+    def find_walk(self, start: int, end: int) -> list[int]:
+        """The nodes of the cheapest way along edges, both ends included."""
+        _, previous = self._shortest
+        walk = [end]
+        while walk[-1] != start:
+            walk.append(int(previous[start, walk[-1]]))
+        return walk[::-1]
+
+    def find_way(self, position: Float[np.ndarray, "3"], node: int) -> list[int]:
+        """The nodes on the way from a position to a node: from that end of the nearest edge which makes it shorter."""
+        nearest, _ = self.find_nearest_edge(position)
+
+        def measure(walk: list[int]) -> float:
+            places = [position, *self.positions[walk]]
+            return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+
+        return min((self.find_walk(end, node) for end in nearest), key=measure)
+
+    def find_next_nodes(self) -> list[list[int]]:
+        """The next node on the cheapest way from a node (row) to another one (column)."""
+        _, previous = self._shortest  # the costs are symmetric: the node before the end of the way back
+        return [
+            [int(previous[end, node]) if end != node else node for end in range(len(self))] for node in range(len(self))
+        ]
+
+    def plan_walk(self, start: int | None = None) -> list[int]:
+        """Nodes of a short walk along edges that visits all nodes; some of them more than once.
+
+        Nearest neighbours first, improved by exchanging parts of the order (2-opt).
+
+        Args:
+            start: its first node; None chooses the start of the shortest walk, of some starts for more than 100 nodes.
+        """
+        costs, _ = self._shortest
+        count = len(self)
+        starts = range(0, count, math.ceil(count**2 / _MAX_STARTS)) if start is None else (start,)
+        orders = [_improve_order(_order_by_distance(costs, first), costs) for first in starts]
+        order = min(orders, key=lambda order: float(costs[order[:-1], order[1:]].sum()))
+        walk = [order[0]]
+        for node in order[1:]:
+            walk += self.find_walk(walk[-1], node)[1:]
+        return walk
+
+    @cached_property
+    def _shortest(self) -> tuple[Float[np.ndarray, "node node"], Int[np.ndarray, "node node"]]:
+        """Cost of the cheapest way between all nodes, and the node before its end.
+
+        Raises:
+            InputError: the edges do not connect all nodes.
+        """
+        costs = np.full((len(self), len(self)), np.inf)
+        for (a, b), overlap in self.overlaps.items():
+            doubt = max(1 - overlap / 0.25, 0.0)  # with little overlap a way around looks better
+            costs[a, b] = costs[b, a] = max(self.length((a, b)), 1e-3) * (1 + 3 * doubt)
+        ways, previous = shortest_path(costs, directed=False, return_predecessors=True)
+        if not np.isfinite(ways).all():
+            raise InputError(f"tour: needed edges that connect all {len(self)} panoramas, got separate parts")
+        return ways, previous
+
+
+def _order_by_distance(costs: Float[np.ndarray, "node node"], start: int) -> Int[np.ndarray, "node"]:
+    """All nodes; the one after a node is its nearest one of those that are left."""
+    order, left = [start], np.arange(len(costs)) != start
+    while left.any():
+        order.append(int(np.where(left, costs[order[-1]], np.inf).argmin()))
+        left[order[-1]] = False
+    return np.array(order)
+
+
+def _improve_order(order: Int[np.ndarray, "node"], costs: Float[np.ndarray, "node node"]) -> Int[np.ndarray, "node"]:
+    """Reverse parts of the order, except its start, as long as it gets shorter."""
+    order, improved = order.copy(), True
+    while improved:
+        improved = False
+        for first in range(1, len(order)):
+            last = first + 1
+            while last < len(order):
+                # The change of the length if the part from `first` to each of `ends` is reversed.
+                before, here, ends = order[first - 1], order[first], order[last:]
+                change = costs[before, ends] - costs[before, here]
+                change[:-1] += costs[here, ends[1:]] - costs[ends[:-1], ends[1:]]
+                shorter = np.flatnonzero(change < -1e-9)
+                if not len(shorter):
+                    break
+                last += int(shorter[0]) + 1
+                order[first:last] = order[first:last][::-1].copy()
+                improved = True
+    return order
+
+
+def find_tours(pairs: Sequence[Pair]) -> list[TourGraph]:
+    """Tours of three or more panoramas that the pairs connect; their edges are the pairs, without overlaps (0)."""
+    components: list[list[Pair]] = []
+    for pair in pairs:
+        images = {panorama.image for panorama in pair.context}
+        joined = [part for part in components if any(images & _list_images(other) for other in part)]
+        components = [part for part in components if part not in joined]
+        components.append([*itertools.chain.from_iterable(joined), pair])
+    tours = []
+    for component in components:
+        first = component[0]
+        found = {panorama.image: panorama for pair in component for panorama in pair.context}
+        if len(found) < _MIN_PANORAMAS:
+            continue
+        rank = {image: index for index, image in enumerate(first.siblings)}
+        images = sorted(found, key=lambda image: rank.get(image, len(rank)))
+        number = {image: index for index, image in enumerate(images)}
+        edges = {
+            tuple(sorted((number[a.image], number[b.image])))
+            for pair in component
+            for a, b in itertools.combinations(pair.context, 2)
+        }
+        near, far = min(pair.near for pair in component), max(pair.far for pair in component)
+        name = f"{first.folder.resolve().name} tour"
+        panoramas = tuple(found[image] for image in images)
+        tours.append(
+            TourGraph(name, first.folder, panoramas, near, far, first.siblings, dict.fromkeys(sorted(edges), 0.0))
+        )
+    if len(tours) > 1:
+        tours = [dataclasses.replace(tour, name=f"{tour.name} {i}") for i, tour in enumerate(tours, start=1)]
+    return tours
+
+
+def _list_images(pair: Pair) -> set[Path]:
+    return {panorama.image for panorama in pair.context}
+
+
+def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene]) -> Scene:
+    """One scene of all panoramas. The Gaussians of each panorama are those of one scene (`TourGraph.choose_sources`).
+
+    Args:
+        tour: the graph.
+        load: returns the scene of some panoramas; called once for each scene that is needed.
+    """
+    parts: dict[int, Gaussians] = {}
+    names: dict[int, str] = {}
+    scene = None
+    for views, provided in tour.choose_sources().items():
+        scene = load(views)
+        for node in provided:
+            view = views.index(node)
+            part = scene.gaussians.select(scene.gaussians.views == view)
+            parts[node] = dataclasses.replace(part, views=torch.full_like(part.views, node, dtype=torch.int64))
+            names[node] = scene.names[view] if view < len(scene.names) else tour.panoramas[node].name
+    assert scene is not None
+    return dataclasses.replace(
+        scene,
+        gaussians=Gaussians.cat([parts[node] for node in range(len(tour))]),
+        cam2world=tour.cam2world,
+        near=tour.near,
+        far=tour.far,
+        names=tuple(names[node] for node in range(len(tour))),
+        gains=(),
+        overlaps=tuple((a, b, overlap) for (a, b), overlap in tour.overlaps.items()),
+    )
+
+
+def select_views(scene: Scene, views: Views) -> Scene:
+    """The scene of some panoramas of a scene that `merge_scenes` made."""
+    chosen = list(views)
+    index = torch.full((len(scene.cam2world),), -1)
+    index[chosen] = torch.arange(len(chosen))
+    labels = index[scene.gaussians.views.long()]
+    gaussians = scene.gaussians.select(labels >= 0)
+    return dataclasses.replace(
+        scene,
+        gaussians=dataclasses.replace(gaussians, views=labels[labels >= 0]),
+        cam2world=scene.cam2world[chosen],
+        names=tuple(scene.names[view] for view in chosen) if scene.names else (),
+        gains=tuple(scene.gains[view] for view in chosen) if scene.gains else (),
+        overlaps=(),
+    )
+
+
+def make_graph(scene: Scene) -> TourGraph:
+    """The graph of a scene's cameras, with the edges that `merge_scenes` has kept in the scene."""
+    names = [scene.names[k] if k < len(scene.names) else f"panorama {k + 1}" for k in range(len(scene.cam2world))]
+    panoramas = tuple(
+        Panorama(name, Path(name), pose) for name, pose in zip(names, scene.cam2world.double(), strict=True)
+    )
+    overlaps = {(a, b): overlap for a, b, overlap in scene.overlaps}
+    return TourGraph("", Path(), panoramas, scene.near, scene.far, overlaps=overlaps)

@@ -1,0 +1,104 @@
+"""Overlap of panoramas, measured in small images by a sweep over depth; it gives a tour its edges."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pansplat.data.images import read_panorama
+from pansplat.geometry.equirect import pad_equirect, row_weights
+from pansplat.geometry.warp import relative_pose, warp_panorama
+from pansplat.tours.graph import TourGraph
+
+_HEIGHT = 48
+_CANDIDATES = 24
+_MIN_OVERLAP = 0.12
+_MAX_BASELINE = 0.4  # of an edge that is not given, as a fraction of far
+_MAX_NEIGHBOURS = 6  # nearest panoramas that are compared
+
+
+def connect(tour: TourGraph, progress: Callable[[str, float], None] | None = None) -> TourGraph:
+    """The tour with measured overlaps, and with edges between further panoramas that overlap.
+
+    Each panorama is compared with its nearest neighbours within 0.4 far. Given edges are kept whatever their overlap.
+
+    Raises:
+        InputError: an image cannot be read.
+    """
+    report = progress or (lambda what, done: None)
+    features = []
+    for index, panorama in enumerate(tour.panoramas):
+        report("comparing panoramas", 0.5 * index / len(tour))
+        features.append(_compute_features(read_panorama(panorama.image, _HEIGHT)[0]))
+    distances = np.linalg.norm(tour.positions[:, None] - tour.positions[None], axis=2)
+    compared = set(tour.overlaps)
+    for node in range(len(tour)):
+        for other in distances[node].argsort(kind="stable")[1 : _MAX_NEIGHBOURS + 1].tolist():
+            if other != node and distances[node, other] <= _MAX_BASELINE * tour.far:
+                compared.add((min(node, other), max(node, other)))
+    overlaps = {}
+    for index, (a, b) in enumerate(sorted(compared)):
+        report("comparing panoramas", 0.5 + 0.5 * index / len(compared))
+        poses = tour.cam2world[[a, b]]
+        overlap = _measure_overlap(features[a], features[b], poses, tour.near, tour.far)
+        if overlap >= _MIN_OVERLAP or (a, b) in tour.overlaps:
+            overlaps[a, b] = max(overlap, 0.0)
+    return dataclasses.replace(tour, overlaps=overlaps)
+
+
+def _compute_features(image: Float[Tensor, "3 height width"]) -> Float[Tensor, "feature height width"]:
+    """Colour, and brightness and gradients relative to the local contrast."""
+    gray = image.mean(dim=0)
+    window = pad_equirect(gray, 3)[None, None]
+    mean = torch.nn.functional.avg_pool2d(window, 7, stride=1)[0, 0]
+    square = torch.nn.functional.avg_pool2d(window * window, 7, stride=1)[0, 0]
+    contrast = 2 * (square - mean * mean).clamp_min(0).sqrt() + 0.06
+    padded = pad_equirect(gray, 1)
+    right = padded[1:-1, 2:] - padded[1:-1, :-2]
+    down = padded[2:, 1:-1] - padded[:-2, 1:-1]
+    return torch.cat((1.5 * image, torch.stack((gray - mean, right, down)) / contrast))
+
+
+def _measure_overlap(
+    first: Float[Tensor, "feature height width"],
+    second: Float[Tensor, "feature height width"],
+    poses: Float[Tensor, "2 4 4"],
+    near: float,
+    far: float,
+) -> float:
+    """One minus the error of the best depth at each pixel, relative to the error with a wrong rotation.
+
+    With the other panorama turned by a quarter, the best depth of a pixel is chance.
+    """
+    errors, chances = 0.0, 0.0
+    for reference, other, pair in ((first, second, poses), (second, first, poses.flip(0))):
+        motion = relative_pose(pair[0], pair[1])
+        errors += _sweep_error(reference, other, motion, near, far)
+        for sign in (1, -1):
+            turn = torch.eye(4, dtype=torch.float64)
+            turn[0, 0] = turn[2, 2] = 0
+            turn[0, 2], turn[2, 0] = sign, -sign
+            chances += 0.5 * _sweep_error(reference, other, turn @ motion, near, far)
+    return 1 - errors / max(chances, 1e-9)
+
+
+def _sweep_error(
+    reference: Float[Tensor, "feature height width"],
+    other: Float[Tensor, "feature height width"],
+    motion: Float[Tensor, "4 4"],
+    near: float,
+    far: float,
+) -> float:
+    """Mean over the sphere of the smallest difference over all depth candidates."""
+    height, width = reference.shape[-2:]
+    inverse = torch.linspace(1 / far, 1 / near, _CANDIDATES)[None, :, None, None].expand(1, -1, height, width)
+    warped = warp_panorama(other[None], inverse, motion.float()[None])[0]
+    difference = (warped - reference[:, None]).abs().clamp_max(1.0).mean(dim=0)
+    lowest = torch.nn.functional.avg_pool2d(pad_equirect(difference, 2)[:, None], 5, stride=1)[:, 0].amin(dim=0)
+    weights = row_weights(height, dtype=lowest.dtype)[:, None].expand(height, width)
+    return float((lowest * weights).sum() / weights.sum())

@@ -1,0 +1,161 @@
+"""Smooth flights through the panoramas of a tour."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pansplat.tours.graph import Edge, TourGraph
+
+_FLY_SPEED = 1.0  # metres per second
+_TURN_DEGREES = 45.0  # per second
+_LOOK_AHEAD = 1.5  # metres along the way, the point that the camera looks at
+_TURN_BACK_DEGREES = 120.0  # of the way at a panorama, at which the camera turns in place
+_TURN_IN_PLACE_DEGREES = 60.0  # between the heading and the way, at which the camera stands still
+_SMOOTHING_SECONDS = 1.2
+_SAMPLES_PER_SECOND = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Route:
+    """A smooth flight through panoramas, in samples of equal duration.
+
+    Attributes:
+        positions: camera centres, metres.
+        yaws, pitches: radians, relative to `level`; positive turns right and up.
+        legs: index of the edge in `edges` at each sample; -1 before the first panorama.
+        walk: the panoramas in the order of the flight.
+        level: axes of a level camera (columns right, down, forward).
+        seconds: duration.
+    """
+
+    positions: Float[np.ndarray, "sample 3"]
+    yaws: Float[np.ndarray, "sample"]
+    pitches: Float[np.ndarray, "sample"]
+    legs: Int[np.ndarray, "sample"]
+    walk: tuple[int, ...]
+    level: Float[np.ndarray, "3 3"]
+    seconds: float
+
+    @property
+    def edges(self) -> list[Edge]:
+        """The edges in the order of the flight."""
+        return [(min(a, b), max(a, b)) for a, b in itertools.pairwise(self.walk)]
+
+    def leg(self, fraction: float) -> int:
+        """Index of the edge that is flown at a fraction of the duration; -1 before the first panorama."""
+        return int(self.legs[round(min(max(fraction, 0.0), 1.0) * (len(self.legs) - 1))])
+
+    def pose(self, fraction: float) -> Float[np.ndarray, "4 4"]:
+        """The pose (cam2world) at a fraction of the duration, 0 to 1."""
+        at = min(max(fraction, 0.0), 1.0) * (len(self.yaws) - 1)
+        steps = np.arange(len(self.yaws))
+        yaw, pitch = (np.interp(at, steps, values) for values in (self.yaws, self.pitches))
+        cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
+        pose = np.eye(4)
+        turn = np.array(((cy, 0, sy), (0, 1, 0), (-sy, 0, cy))) @ np.array(((1, 0, 0), (0, cp, -sp), (0, sp, cp)))
+        pose[:3, :3] = self.level @ turn
+        pose[:3, 3] = [np.interp(at, steps, column) for column in self.positions.T]
+        return pose
+
+    def edge(self, fraction: float) -> Edge | None:
+        """The edge that is flown at a fraction of the duration; None before the first panorama."""
+        leg = self.leg(fraction)
+        return self.edges[leg] if leg >= 0 else None
+
+    def edges_after(self, fraction: float) -> list[Edge]:
+        """The edges from a fraction of the duration on."""
+        return self.edges[max(self.leg(fraction), 0) :]
+
+
+def plan_route(tour: TourGraph, walk: Sequence[int], start: Float[np.ndarray, "4 4"] | None = None) -> Route:
+    """A flight along a walk. The camera looks ahead along its way, and flies slower while it turns.
+
+    Where the way turns back, the camera turns in place. All is smoothed over time, so that corners are rounded.
+
+    Args:
+        tour: the graph.
+        walk: nodes; consecutive ones share an edge.
+        start: pose from which the first node is approached; None starts at that node, in the direction of the second.
+    """
+    level, places = tour.level_axes, [tour.positions[node] for node in walk]
+    legs = list(range(len(walk) - 1))
+    if start is not None:
+        places, legs = [start[:3, 3], *places], [-1, *legs]
+    path = np.array(places) @ level  # right, down, forward
+    lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    kept = lengths > 1e-6
+    lengths, legs = lengths[kept], np.array(legs, dtype=int)[kept]
+    path = path[np.concatenate(([True], kept))]
+    if not len(lengths):
+        legs = np.array([-1])
+    ends = np.concatenate(([0.0], np.cumsum(lengths)))
+    stops = [*ends[_find_turns_back(path)], ends[-1]]
+    yaw, pitch = None, 0.0
+    if start is not None:
+        forward = level.T @ start[:3, 2]
+        yaw, pitch = math.atan2(forward[0], forward[2]), math.asin(min(max(-float(forward[1]), -1.0), 1.0))
+    place, step = 0.0, 1 / _SAMPLES_PER_SECOND
+    places, yaws = [place], [yaw]
+    while place < ends[-1]:
+        stop = next(end for end in stops if end > place)
+        heading = _look_ahead(path, ends, place, stop)
+        if yaw is None or heading is None:
+            yaw = heading or yaw or 0.0
+        error = 0.0 if heading is None else math.remainder(heading - yaw, 2 * math.pi)
+        limit = math.radians(_TURN_DEGREES) * step
+        yaw += min(max(error, -limit), limit)
+        slower = max(1 - abs(error) / math.radians(_TURN_IN_PLACE_DEGREES), 0.0)
+        place = min(place + _FLY_SPEED * slower * step, stop)
+        if stop - place < 1e-3:
+            place = stop
+        places.append(place)
+        yaws.append(yaw)
+    yaws[0] = yaws[1] if len(yaws) > 1 and yaws[0] is None else yaws[0] or 0.0
+    along = np.array(places)
+    pitches = np.zeros(len(yaws))
+    pitches[0] = pitch
+    positions = [np.interp(along, ends, column) for column in path.T]
+    numbers = legs[np.clip(np.searchsorted(ends, along, side="right") - 1, 0, len(legs) - 1)]
+    half = round(_SMOOTHING_SECONDS / 2 * _SAMPLES_PER_SECOND)
+    smooth = [_smooth(values, half) for values in (*positions, np.array(yaws), pitches)]
+    return Route(
+        np.stack(smooth[:3], axis=1) @ level.T,
+        smooth[3],
+        smooth[4],
+        np.pad(numbers, half, mode="edge"),
+        tuple(walk),
+        level,
+        (len(smooth[3]) - 1) / _SAMPLES_PER_SECOND,
+    )
+
+
+def _find_turns_back(path: Float[np.ndarray, "place 3"]) -> list[int]:
+    """The inner places at which a path turns by more than `_TURN_BACK_DEGREES`."""
+    steps = np.diff(path, axis=0)
+    steps = steps / np.linalg.norm(steps, axis=1, keepdims=True)
+    cosines = (steps[1:] * steps[:-1]).sum(axis=1)
+    return [i for i, cosine in enumerate(cosines, start=1) if cosine < math.cos(math.radians(_TURN_BACK_DEGREES))]
+
+
+def _look_ahead(
+    path: Float[np.ndarray, "place 3"], ends: Float[np.ndarray, "place"], place: float, stop: float
+) -> float | None:
+    """Yaw towards the point ahead on the path, not beyond `stop`; None if that is straight up or down."""
+    ahead = min(place + _LOOK_AHEAD, stop)
+    if ahead - place < 0.3:  # near a stop: the direction in which it is approached
+        place = max(ahead - 0.3, ends[np.searchsorted(ends, stop) - 1])
+    here, there = (np.array([np.interp(at, ends, column) for column in path.T]) for at in (place, ahead))
+    along = there - here
+    return math.atan2(along[0], along[2]) if math.hypot(along[0], along[2]) > 1e-3 else None
+
+
+def _smooth(values: Float[np.ndarray, "sample"], half: int) -> Float[np.ndarray, "sample_2"]:
+    """The values convolved with a Hann window; the first and the last value are kept, and `half` samples are added."""
+    window = np.hanning(2 * half + 3)[1:-1]
+    return np.convolve(np.pad(values, 2 * half, mode="edge"), window / window.sum(), mode="valid")
