@@ -31,7 +31,7 @@ def copied(tmp_path: Path) -> Path:
     ignore = shutil.ignore_patterns("__pycache__")
     shutil.copytree(ROOT / "pansplat", tmp_path / "pansplat", ignore=ignore)
     shutil.copytree(ROOT / "viewer", tmp_path / "pansplat_viewer", ignore=ignore)
-    shutil.copytree(ROOT / "shaders", tmp_path / "pansplat_viewer" / "shaders", ignore=ignore)
+    shutil.copytree(ROOT / "shaders", tmp_path / "pansplat" / "shaders", ignore=ignore)
     return tmp_path
 
 

@@ -18,8 +18,8 @@ ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = {
     "pansplat": "pansplat",
     "pansplat.default_model": "assets/default",
+    "pansplat.shaders": "shaders",
     "pansplat_viewer": "viewer",
-    "pansplat_viewer.shaders": "shaders",
 }
 
 
@@ -59,7 +59,7 @@ def run_in(site: Path, *command: str) -> subprocess.CompletedProcess[str]:
 
 def test_the_package_list_equals_the_packages_on_disk() -> None:
     on_disk = {".".join(file.parent.relative_to(ROOT).parts) for file in (ROOT / "pansplat").rglob("__init__.py")}
-    on_disk |= {"pansplat.default_model", "pansplat_viewer", "pansplat_viewer.shaders"} | {
+    on_disk |= {"pansplat.default_model", "pansplat.shaders", "pansplat_viewer"} | {
         "pansplat_viewer." + ".".join(file.parent.relative_to(ROOT / "viewer").parts)
         for file in (ROOT / "viewer").glob("*/**/__init__.py")
     }
@@ -110,8 +110,9 @@ def test_an_installed_wheel_reads_its_own_shaders(installed: Path) -> None:
         "site = pathlib.Path(sys.argv[1])\n"
         "assert pathlib.Path(pansplat.__file__).is_relative_to(site), pansplat.__file__\n"
         "assert pathlib.Path(pansplat_viewer.__file__).is_relative_to(site)\n"
-        "shaders = [f for f in files('pansplat_viewer.shaders').iterdir() if f.name.endswith('.frag')]\n"
-        "assert shaders and all(f.read_text() for f in shaders)\n"
+        "from pansplat.shaders import load_shader\n"
+        "shaders = [f.name for f in files('pansplat.shaders').iterdir() if f.name.endswith('.frag')]\n"
+        "assert shaders and all(load_shader(name, '330 core') for name in shaders)\n"
     )
     done = run_in(installed, sys.executable, "-c", program, str(installed))
     assert done.returncode == 0, done.stderr

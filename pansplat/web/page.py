@@ -35,6 +35,7 @@ from pansplat.geometry.world import working_factor
 from pansplat.predictor import Progress
 from pansplat.refinement.budget import merge_to
 from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
+from pansplat.shaders import load_shader
 from pansplat.tours import (
     EDGE_HYSTERESIS,
     TourGraph,
@@ -58,7 +59,6 @@ _SPEED = 0.3  # walking, fraction of the reach a second
 _BATCH = 256  # quads that are drawn together
 _SHADERS = {"splat": ("page.vert", "splat.frag"), "accumulate": ("screen.vert", "accumulate.frag")}
 _SHADERS |= {"resolve": ("screen.vert", "resolve.frag")}
-_INCLUDE = re.compile(r'^#include "([^"]+)"$', re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -317,7 +317,7 @@ def _write_files(
         poster=base64.b64encode(poster).decode(),
         count=f"{count:,}",
         header=_to_script(header | {"parts": len(parts)}),
-        shaders=_to_script({name: [_read_shader(stage) for stage in stages] for name, stages in _SHADERS.items()}),
+        shaders=_to_script({name: [_load_shader(stage) for stage in stages] for name, stages in _SHADERS.items()}),
         sorter=_to_script(_read("sorter.js")),
         parts="\n".join(tags or (f"<script>{text}</script>" for text in scripts)),
         program=_read("page.js"),
@@ -375,15 +375,5 @@ def _read(name: str) -> str:
     return (resources.files("pansplat.web") / name).read_text("utf-8")
 
 
-def _read_shader(name: str) -> str:
-    """A shader of this package or of the viewer, in the language of WebGL 2."""
-    shared = resources.files("pansplat_viewer.shaders")  # files only: nothing of the viewer is executed
-    text = _read(name) if name.startswith("page.") else (shared / name).read_text("utf-8")
-    text = _INCLUDE.sub(lambda match: (shared / match[1]).read_text("utf-8"), text)
-    names = ("ALPHA_CUT", "MAX_ALPHA", "EWA_NEAR_FACTOR", "EWA_CLAMP")
-    defines = (
-        "".join(f"#define {name} {getattr(constants, name)}\n" for name in names)
-        + f"#define LAYER_STORAGE 0\n#define BATCH {_BATCH}\n"
-    )
-    precisions = "".join(f"precision highp {kind};\n" for kind in ("float", "int", "sampler2D"))
-    return f"#version 300 es\n{precisions}{defines}{text}"
+def _load_shader(name: str) -> str:
+    return load_shader(name, "300 es", LAYER_STORAGE=0, BATCH=_BATCH)

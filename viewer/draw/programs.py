@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
-from importlib import resources
 from typing import Any
 
 import moderngl
 
-from pansplat import constants
 from pansplat.errors import InputError
-
-_INCLUDE = re.compile(r'^#include "([^"]+)"$', re.MULTILINE)
-
-# Names in pansplat.constants that every shader source gets as #define lines.
-_SHARED_CONSTANTS = ("ALPHA_CUT", "MAX_ALPHA", "EWA_NEAR_FACTOR", "EWA_CLAMP", "ELLIPSOID_AMBIENT")
+from pansplat.shaders import load_shader
 
 # Members of a record, in the order of shaders/project.vert and project.comp.
 RECORD = ("quad_1", "quad_2", "row_a", "row_b", "row_l", "color")
@@ -42,19 +35,8 @@ def choose_tier(ctx: moderngl.Context, tier: str) -> str:
 
 
 def read_source(name: str, version: int, **defines: float | str) -> str:
-    """Return a shader's text with its includes and the `#version` line for GL `version` (330 or 430).
-
-    Args:
-        name: file in shaders/.
-        version: of the `#version` line.
-        defines: constants in addition to the shared ones.
-    """
-    shared = {key: getattr(constants, key) for key in _SHARED_CONSTANTS}
-    defines = {"INSPECT": 1, "COUNT_STEP": COUNT_STEP} | shared | defines  # web pages do not define INSPECT
-    folder = resources.files("pansplat_viewer.shaders")
-    text = _INCLUDE.sub(lambda match: (folder / match[1]).read_text("utf-8"), (folder / name).read_text("utf-8"))
-    lines = "".join(f"#define {key} {value}\n" for key, value in defines.items())
-    return f"#version {version} core\n{lines}{text}"
+    """Return the text of a shader for OpenGL `version` (330 or 430), with the displays that web pages do not have."""
+    return load_shader(name, f"{version} core", INSPECT=1, COUNT_STEP=COUNT_STEP, **defines)
 
 
 def set_uniforms(program: Any, **values: Any) -> None:

@@ -10,7 +10,7 @@ from pansplat.constants import ALPHA_CUT
 from pansplat.geometry.cubemap import face_rotations
 from pansplat_viewer.draw.programs import Programs, read_source
 
-FOLDER = resources.files("pansplat_viewer.shaders")
+FOLDER = resources.files("pansplat.shaders")
 SOURCES = sorted(path.name for path in FOLDER.iterdir() if path.name.endswith((".glsl", ".vert", ".frag", ".comp")))
 
 

@@ -4,7 +4,7 @@
 
 uniform sampler2D geometry;     // three texels a Gaussian: mean and opacity; quaternion; scales
 uniform sampler2D colors;
-uniform highp usampler2D order; // indices of the Gaussians, view by view, farthest first
+uniform usampler2D order;       // indices of the Gaussians, view by view, farthest first
 uniform ivec2 segment;          // of the order: first place and count
 uniform vec2 color_range;       // the colours of the bytes 0 and 255
 uniform vec3 sides[4];          // inward unit normals of the view frustum, camera axes
