@@ -37,15 +37,40 @@ if not torch.cuda.is_available():
 with contextlib.suppress(ImportError):
     import triton  # noqa: F401
 
-# Check annotated shapes and types of each test's first calls; install the hook before the packages are imported.
-_CHECKED = ("geometry", "gaussians", "model", "rendering", "refinement", "predictor", "evaluation", "pipeline")
-install_import_hook([f"pansplat.{name}" for name in _CHECKED], "pansplat.testing.check_types")
-
 # Generated examples may take any time: machines differ.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("untimed")
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+# The exhaustive run checks annotated shapes and types in these packages, in all of their tests.
+_CHECKED = ("geometry", "gaussians", "model", "rendering", "refinement", "predictor", "evaluation", "pipeline")
+
+
+def _selects(config: pytest.Config, marker: str) -> bool:
+    """Whether the command line has -m with a marker."""
+    return marker in config.option.markexpr
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Install the checks of annotations before the packages are imported."""
+    if _selects(config, "exhaustive"):
+        install_import_hook([f"pansplat.{name}" for name in _CHECKED], "pansplat.testing.check_types")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the tests of the markers `exhaustive` and `lint` unless -m names the marker."""
+    if _selects(config, "exhaustive"):
+        folders = [Path(__file__).with_name(name) for name in _CHECKED]
+        for item in items:
+            if any(item.path.is_relative_to(folder) or item.path.stem == f"test_{folder.name}" for folder in folders):
+                item.add_marker("exhaustive")
+    hidden = [marker for marker in ("exhaustive", "lint") if not _selects(config, marker)]
+    left_out = [item for item in items if any(item.get_closest_marker(marker) for marker in hidden)]
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in left_out]
 
 
 @pytest.fixture
