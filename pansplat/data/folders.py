@@ -325,7 +325,8 @@ def _read_view_folder(view: Path, folder: Path, convention: str) -> Panorama:
     matrix[:3, 3] = _read_numbers(view / "tran.txt", 3)
     cam2world = _Z_UP @ to_cam2world(rigid_matrix(matrix.tolist(), str(view / "rot.txt")), convention)
     depth = view / "depth.png"
-    return Panorama(view.name, image, cam2world, find_mask(image, folder), depth if depth.is_file() else None)
+    mask = find_mask(image, folder)
+    return Panorama(view.name, image, cam2world, mask, depth if depth.is_file() else None, is_scan=True)
 
 
 def _read_numbers(path: Path, count: int) -> Float[Tensor, "count"]:

@@ -48,6 +48,7 @@ _MIN_VIEWS_FOR_LEGS = 4  # with fewer panoramas too many edges are static by cha
 _LEG_RADIUS, _LEG_SHIFT, _LEG_GAP = 5, 5, 7  # samples: half thickness, shift between views, largest interruption
 _LEG_CONTRAST = 0.045  # grey difference to the floor
 _MARGIN = 3  # samples added around the region, because its edge is blurred
+_BLACK = 1e-6  # of black surfaces; less than any display shows
 
 
 def detect_scene_mask(images: Float[Tensor, "view 3 height width"]) -> Bool[Tensor, "height width"]:
@@ -69,13 +70,33 @@ def detect_scene_mask(images: Float[Tensor, "view 3 height width"]) -> Bool[Tens
 
 
 def mask_holes(images: Float[Tensor, "view 3 height width"]) -> Bool[Tensor, "view height width"]:
-    """True for the pixels outside patches of exact black: the holes of scans. Photographs have none."""
+    """True for the pixels outside patches of exact black: holes of scans, and caps around the poles.
+
+    Black surfaces of photographs are no holes, because `lift_black_surfaces` makes them brighter than exact black.
+    """
     visible = np.empty((len(images), *images.shape[-2:]), bool)
-    for view, image in enumerate(images.detach().cpu().numpy()):
-        black = (image.max(axis=0) <= 0).astype(np.uint8)
-        patches = cv2.morphologyEx(black, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-        visible[view] = cv2.dilate(patches, np.ones((5, 5), np.uint8)) == 0
+    for view, image in enumerate(images):
+        visible[view] = cv2.dilate(_black_patches(image), np.ones((5, 5), np.uint8)) == 0
     return torch.from_numpy(visible)
+
+
+def lift_black_surfaces(image: Float[Tensor, "3 height width"]) -> Float[Tensor, "3 height width"]:
+    """A photograph whose black surfaces, such as screens and windows at night, differ from the exact black of holes.
+
+    Black patches that reach a pole are caps and stay exactly black.
+    """
+    patches = _black_patches(image)
+    if not patches.any():
+        return image
+    _, labels = cv2.connectedComponents(patches)
+    surfaces = (patches > 0) & ~np.isin(labels, labels[[0, -1]])
+    return torch.where(torch.from_numpy(surfaces), image.clamp_min(_BLACK), image)
+
+
+def _black_patches(image: Float[Tensor, "3 height width"]) -> NDArray[np.uint8]:
+    """1 in squares of at least 3 x 3 pixels of exact black."""
+    black = (image.detach().cpu().numpy().max(axis=0) <= 0).astype(np.uint8)
+    return cv2.morphologyEx(black, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
 
 
 def scene_mask_of_files(paths: tuple[Path, ...], height: int) -> Bool[Tensor, "height width"]:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pansplat.data.images import READABLE_SUFFIXES, read_depth, read_height, read_mask, read_panorama
-from pansplat.data.masks import scene_mask_of_files
+from pansplat.data.masks import lift_black_surfaces, scene_mask_of_files
 from pansplat.data.views import Views
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.world import require_depth_range, working_factor
@@ -35,6 +35,7 @@ class Panorama:
         cam2world: float64, OpenCV axes, metres.
         mask: image that is white where the panorama shows the scene; None to detect static content.
         depth: radial depth, 16-bit PNG in millimetres or EXR in metres; None when there is none.
+        is_scan: whether the panorama is rendered from a scan, whose holes are exactly black.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Panorama:
     cam2world: Float[Tensor, "4 4"]
     mask: Path | None = None
     depth: Path | None = None
+    is_scan: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +107,8 @@ class Pair:
         images = torch.empty(len(panoramas), 3, height, 2 * height)
         masks = torch.empty(len(panoramas), height, 2 * height, dtype=torch.bool)
         for i, panorama in enumerate(panoramas):
-            images[i], opaque = read_panorama(panorama.image, height)
+            image, opaque = read_panorama(panorama.image, height)
+            images[i] = image if panorama.is_scan else lift_black_surfaces(image)
             masks[i] = opaque & self._scene_mask(panorama, height)
             if not masks[i].any():
                 raise InputError(

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from pansplat.data.folders import find_trajectory, is_loc360_sequence, read_loc360_sequence
 from pansplat.data.images import read_mask, resize_panorama
+from pansplat.data.masks import lift_black_surfaces
 from pansplat.data.pairs import FAR_SEQUENCE, NEAR, Pair, Panorama
 from pansplat.data.poses import read_number, read_trajectory
 from pansplat.data.video import VideoFile, open_video
@@ -146,7 +147,7 @@ class VideoSequence:
         pixels = self.video.read([self.frames[i] for i in frames])
         scene = torch.ones(height, 2 * height, dtype=torch.bool) if self.mask is None else read_mask(self.mask, height)
         return Views(
-            images=torch.stack([resize_panorama(pixels[self.frames[i]], height) for i in frames]),
+            images=torch.stack([lift_black_surfaces(resize_panorama(pixels[self.frames[i]], height)) for i in frames]),
             cam2world=torch.stack([self.poses[i] for i in frames]),
             masks=scene.expand(len(frames), -1, -1).clone(),
             near=self.near,

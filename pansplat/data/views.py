@@ -17,7 +17,7 @@ class Views:
     """Panoramas of one place with their poses, all of one size.
 
     Attributes:
-        images: RGB in [0, 1], float32.
+        images: RGB in [0, 1], float32. Patches of exact black show nothing, see `masks.mask_holes`.
         cam2world: float64, OpenCV axes, metres.
         masks: True where a pixel shows the scene; False for what is fixed to the camera (tripod, caps, operator).
         near, far: radial depth range to search, metres.

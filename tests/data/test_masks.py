@@ -1,5 +1,6 @@
 """Only static regions around a pole are masked."""
 
+import json
 import math
 from pathlib import Path
 
@@ -116,3 +117,27 @@ def test_dark_patches_and_single_black_pixels_are_no_holes() -> None:
     images[0, :, 20:30, 40:60] = 1e-3
     images[0, :, 5, 5] = 0
     assert mask_holes(images).all()
+
+
+@pytest.mark.parametrize("is_scan", [False, True])
+def test_only_scans_have_holes_inside_the_picture(tmp_path: Path, is_scan: bool) -> None:
+    """A black screen or a window at night in a photograph is a surface; a black cap around a pole is none."""
+    image = torch.rand(3, 64, 128, generator=torch.Generator().manual_seed(0)).clamp_min(0.1)
+    image[:, 20:30, 40:60] = 0
+    image[:, 58:] = 0
+    names = ("0/rgb.png", "1/rgb.png") if is_scan else ("0.png", "1.png")
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        write_image(tmp_path / name, image)
+        (tmp_path / name).with_name("rot.txt").write_text("1 0 0 0 1 0 0 0 1" if is_scan else "")
+        (tmp_path / name).with_name("tran.txt").write_text(f"{name[0]} 0 0")
+    if not is_scan:
+        poses = {name: [[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]] for x, name in enumerate(names)}
+        content = {"convention": "cam2world opencv", "poses": poses}
+        (tmp_path / "poses.json").write_text(json.dumps(content))
+    views = load_pairs(tmp_path)[0].load_context(64)
+    visible = mask_holes(views.images)
+    assert not visible[:, 58:].any()
+    assert torch.equal(visible[:, 20:30, 40:60], torch.full((2, 10, 20), not is_scan))
+    assert visible[:, :18].all()
+    assert torch.allclose(views.images[0], image, atol=3e-3)
