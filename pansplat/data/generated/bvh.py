@@ -7,19 +7,19 @@ unit sphere, or x^2 + z^2 <= 1, |y| <= 1. Ray parameters are equal in both space
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from pansplat.data.generated.textures import OPTIONS, is_opaque
+from pansplat.data.generated.textures import is_opaque
+from pansplat.data.generated.vectors import INLINE, OPTIONS, advance, cross, dot, subtract, take
 
 BOX, ELLIPSOID, CYLINDER, GLASS, MESH = range(5)
 """Kinds of bodies. A pane of glass is a box that transmits all rays and reflects some of the light. A mesh fills a box
 with triangles."""
 STACK_SIZE = 128
-INLINE: dict[str, Any] = OPTIONS | {"forceinline": True}  # calls would copy the arrays of a scene, more than a kilobyte
 _BINS = 12  # candidates for the split of a BVH node
 
 
@@ -76,15 +76,12 @@ def build_bvh(low, high, leaf):
     count, used = len(low), 1
     order = np.arange(count)
     bounds, links = np.empty((max(2 * count, 1), 6)), np.zeros((max(2 * count, 1), 2), np.int64)
-    pending = np.empty((64 + count, 3), np.int64)
-    pending[0, 0], pending[0, 1], pending[0, 2] = 0, 0, count
-    waiting = 1
+    pending = [(0, 0, count)]
     centres = low + high
     boxes, counts, costs = np.empty((_BINS, 6)), np.empty(_BINS, np.int64), np.empty(_BINS)
     running = np.empty(6)
-    while waiting:
-        waiting -= 1
-        node, start, end = pending[waiting]
+    while pending:
+        node, start, end = pending.pop()
         bounds[node, :3], bounds[node, 3:] = np.inf, -np.inf
         running[:3], running[3:] = np.inf, -np.inf
         for k in order[start:end]:
@@ -126,93 +123,96 @@ def build_bvh(low, high, leaf):
         if middle in (start, end):
             middle = (start + end) // 2
         links[node, 0] = used
-        for child in range(2):
-            pending[waiting, 0] = used + child
-            pending[waiting, 1] = start if child == 0 else middle
-            pending[waiting, 2] = middle if child == 0 else end
-            waiting += 1
+        pending.append((used, start, middle))
+        pending.append((used + 1, middle, end))
         used += 2
     return bounds[:used].copy(), links[:used].copy(), order
 
 
-@nb.njit(**OPTIONS)
-def _box(ox, oy, oz, dx, dy, dz):
-    ix, iy, iz = 1 / dx, 1 / dy, 1 / dz
-    ax, bx = (-1 - ox) * ix, (1 - ox) * ix
-    ay, by = (-1 - oy) * iy, (1 - oy) * iy
-    az, bz = (-1 - oz) * iz, (1 - oz) * iz
+@nb.njit(**INLINE)
+def to_local(m, p):
+    """A point in the space of a body."""
+    p = subtract(p, (m[3], m[7], m[11]))
+    return dot(take(m, 0), p), dot(take(m, 4), p), dot(take(m, 8), p)
+
+
+@nb.njit(**INLINE)
+def _turn_to_local(m, d):
+    """A direction in the space of a body."""
+    return dot(take(m, 0), d), dot(take(m, 4), d), dot(take(m, 8), d)
+
+
+@nb.njit(**INLINE)
+def _cross_slabs(low, high, origin, direction):
+    """Distances at which a ray enters and leaves a box; enters after it leaves if it misses.
+
+    Args:
+        direction: the reciprocals of its components.
+    """
+    ax, bx = (low[0] - origin[0]) * direction[0], (high[0] - origin[0]) * direction[0]
+    ay, by = (low[1] - origin[1]) * direction[1], (high[1] - origin[1]) * direction[1]
+    az, bz = (low[2] - origin[2]) * direction[2], (high[2] - origin[2]) * direction[2]
     enter = max(max(min(ax, bx), min(ay, by)), min(az, bz))
     leave = min(min(max(ax, bx), max(ay, by)), max(az, bz))
-    if enter > leave:
-        return np.inf
-    return enter
+    return enter, leave
+
+
+@nb.njit(**INLINE)
+def _reciprocal(d):
+    return 1 / d[0], 1 / d[1], 1 / d[2]
 
 
 @nb.njit(**OPTIONS)
-def _ellipsoid(ox, oy, oz, dx, dy, dz):
-    a, b = dx * dx + dy * dy + dz * dz, ox * dx + oy * dy + oz * dz
+def _ellipsoid(o, d):
+    a, b = dot(d, d), dot(o, d)
     # Half a chord from the point of the ray nearest to the centre: avoids cancellation for small, distant spheres.
-    px, py, pz = ox - b / a * dx, oy - b / a * dy, oz - b / a * dz
-    left = 1 - (px * px + py * py + pz * pz)
+    p = advance(o, -b / a, d)
+    left = 1 - dot(p, p)
     if left < 0:
         return np.inf
     return -b / a - math.sqrt(left / a)
 
 
 @nb.njit(**OPTIONS)
-def _cylinder(ox, oy, oz, dx, dy, dz):
-    a, b = dx * dx + dz * dz, ox * dx + oz * dz
-    iy = 1 / dy
-    enter, leave = min((-1 - oy) * iy, (1 - oy) * iy), max((-1 - oy) * iy, (1 - oy) * iy)
+def _cylinder(o, d):
+    a, b = d[0] * d[0] + d[2] * d[2], o[0] * d[0] + o[2] * d[2]
+    inverse = 1 / d[1]
+    bottom, top = (-1 - o[1]) * inverse, (1 - o[1]) * inverse
+    enter, leave = min(bottom, top), max(bottom, top)
     if a > 0:
-        px, pz = ox - b / a * dx, oz - b / a * dz
+        px, pz = o[0] - b / a * d[0], o[2] - b / a * d[2]
         left = 1 - (px * px + pz * pz)
         if left < 0:
             return np.inf
         half = math.sqrt(left / a)
         enter, leave = max(enter, -b / a - half), min(leave, -b / a + half)
-    elif ox * ox + oz * oz > 1:
+    elif o[0] * o[0] + o[2] * o[2] > 1:
         return np.inf
-    if enter > leave:
-        return np.inf
-    return enter
+    return enter if enter <= leave else np.inf
 
 
 @nb.njit(**INLINE)
-def intersect_body(kind, m, x, y, z, dx, dy, dz):
+def intersect_body(kind, m, origin, direction):
     """Distance at which a ray enters a body; inf if it misses, negative if the body is behind or around the origin."""
-    px, py, pz = x - m[3], y - m[7], z - m[11]
-    ox = m[0] * px + m[1] * py + m[2] * pz
-    oy = m[4] * px + m[5] * py + m[6] * pz
-    oz = m[8] * px + m[9] * py + m[10] * pz
-    ux = m[0] * dx + m[1] * dy + m[2] * dz
-    uy = m[4] * dx + m[5] * dy + m[6] * dz
-    uz = m[8] * dx + m[9] * dy + m[10] * dz
+    o, d = to_local(m, origin), _turn_to_local(m, direction)
     if kind == BOX or kind == GLASS:  # noqa: SIM109
-        return _box(ox, oy, oz, ux, uy, uz)
-    if kind == ELLIPSOID:
-        return _ellipsoid(ox, oy, oz, ux, uy, uz)
-    return _cylinder(ox, oy, oz, ux, uy, uz)
+        enter, leave = _cross_slabs((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), o, _reciprocal(d))
+        return enter if enter <= leave else np.inf
+    return _ellipsoid(o, d) if kind == ELLIPSOID else _cylinder(o, d)
 
 
 @nb.njit(**INLINE)
-def _enter(box, x, y, z, ix, iy, iz):
+def _enter(box, origin, inverse):
     """Distance at which a ray enters an axis-aligned box; 0 from inside, inf if it misses."""
-    ax, bx = (box[0] - x) * ix, (box[3] - x) * ix
-    ay, by = (box[1] - y) * iy, (box[4] - y) * iy
-    az, bz = (box[2] - z) * iz, (box[5] - z) * iz
-    enter = max(max(min(ax, bx), min(ay, by)), min(az, bz))
-    leave = min(min(max(ax, bx), max(ay, by)), max(az, bz))
-    if enter > leave or leave < 0:
-        return np.inf
-    return max(enter, 0.0)
+    enter, leave = _cross_slabs(take(box, 0), take(box, 3), origin, inverse)
+    return np.inf if enter > leave or leave < 0 else max(enter, 0.0)
 
 
 @nb.njit(**INLINE)
-def _push_children(bounds, first, stack, depth, limit, x, y, z, ix, iy, iz):
+def _push_children(bounds, first, stack, depth, limit, origin, inverse):
     """Push the children of a node that a ray enters before `limit`, the nearer one last; the new depth of the stack."""
     near, far = first, first + 1
-    at_near, at_far = _enter(bounds[near], x, y, z, ix, iy, iz), _enter(bounds[far], x, y, z, ix, iy, iz)
+    at_near, at_far = _enter(bounds[near], origin, inverse), _enter(bounds[far], origin, inverse)
     if at_far < at_near:
         near, far, at_near, at_far = far, near, at_far, at_near
     if at_far < limit:
@@ -225,47 +225,56 @@ def _push_children(bounds, first, stack, depth, limit, x, y, z, ix, iy, iz):
 
 
 @nb.njit(**INLINE)
-def _hit_mesh(bodies, root, depth, x, y, z, dx, dy, dz, limit, any_hit):
+def _intersect_triangle(t, o, d):
+    """Distance and barycentric coordinates of a hit; the distance is inf if the ray misses.
+
+    Source: Moeller and Trumbore 1997.
+    """
+    first, second = take(t, 3), take(t, 6)
+    p = cross(d, second)
+    determinant = dot(first, p)
+    if determinant == 0:
+        return np.inf, 0.0, 0.0
+    inverse, from_corner = 1 / determinant, subtract(o, take(t, 0))
+    q = cross(from_corner, first)
+    u, v = dot(from_corner, p) * inverse, dot(d, q) * inverse
+    if u < 0 or u > 1 or v < 0 or u + v > 1:
+        return np.inf, u, v
+    return dot(second, q) * inverse, u, v
+
+
+@nb.njit(**INLINE)
+def _is_hole(bodies, triangle, u, v):
+    """Whether the image of a triangle is transparent at barycentric coordinates."""
+    if bodies.cutouts[triangle] < 0:
+        return False
+    c, image = bodies.texcoords[triangle], bodies.images[bodies.cutouts[triangle]]
+    x, y = c[0] + u * (c[2] - c[0]) + v * (c[4] - c[0]), c[1] + u * (c[3] - c[1]) + v * (c[5] - c[1])
+    return not is_opaque(bodies.texels, image, x, y)
+
+
+@nb.njit(**INLINE)
+def _hit_mesh(bodies, root, depth, o, d, limit, any_hit):
     """Distance and index of the first triangle nearer than `limit` of the mesh at node `root`, or `limit` and -1.
 
     Args:
         depth: number of entries of the stack that are in use.
-        x, y, z, dx, dy, dz: ray in the space of the mesh.
+        o, d: ray in the space of the mesh.
     """
-    bounds, links, triangles, stack = bodies.mesh_bounds, bodies.mesh_links, bodies.triangles, bodies.stack
-    ix, iy, iz = 1 / dx, 1 / dy, 1 / dz
+    stack, inverse = bodies.stack, _reciprocal(d)
     base, best, hit = depth, limit, -1
     stack[depth] = root
     depth += 1
     while depth > base:
         depth -= 1
         node = stack[depth]
-        first, count = links[node, 0], links[node, 1]
+        first, count = bodies.mesh_links[node, 0], bodies.mesh_links[node, 1]
         if count == 0:
-            depth = _push_children(bounds, first, stack, depth, best, x, y, z, ix, iy, iz)
+            depth = _push_children(bodies.mesh_bounds, first, stack, depth, best, o, inverse)
             continue
-        for k in range(first, first + count):  # Source: Moeller and Trumbore 1997
-            t = triangles[k]
-            px, py, pz = dy * t[8] - dz * t[7], dz * t[6] - dx * t[8], dx * t[7] - dy * t[6]
-            scale = t[3] * px + t[4] * py + t[5] * pz
-            if scale == 0:
-                continue
-            scale = 1 / scale
-            ox, oy, oz = x - t[0], y - t[1], z - t[2]
-            u = (ox * px + oy * py + oz * pz) * scale
-            if u < 0 or u > 1:
-                continue
-            qx, qy, qz = oy * t[5] - oz * t[4], oz * t[3] - ox * t[5], ox * t[4] - oy * t[3]
-            v = (dx * qx + dy * qy + dz * qz) * scale
-            if v < 0 or u + v > 1:
-                continue
-            away = (t[6] * qx + t[7] * qy + t[8] * qz) * scale
-            if 1e-6 < away < best:
-                if bodies.cutouts[k] >= 0:
-                    c = bodies.texcoords[k]
-                    cu, cv = c[0] + u * (c[2] - c[0]) + v * (c[4] - c[0]), c[1] + u * (c[3] - c[1]) + v * (c[5] - c[1])
-                    if not is_opaque(bodies.texels, bodies.images[bodies.cutouts[k]], cu, cv):
-                        continue
+        for k in range(first, first + count):
+            away, u, v = _intersect_triangle(bodies.triangles[k], o, d)
+            if 1e-6 < away < best and not _is_hole(bodies, k, u, v):
                 best, hit = away, k
                 if any_hit:
                     return best, hit
@@ -273,7 +282,7 @@ def _hit_mesh(bodies, root, depth, x, y, z, dx, dy, dz, limit, any_hit):
 
 
 @nb.njit(**INLINE)
-def first_hit(bodies, x, y, z, dx, dy, dz, limit, any_hit, glass):
+def first_hit(bodies, origin, direction, limit, any_hit, glass):
     """Distance, body and triangle (-1 except in meshes) of the first hit nearer than `limit`; body -1 if there is none.
 
     Args:
@@ -281,38 +290,24 @@ def first_hit(bodies, x, y, z, dx, dy, dz, limit, any_hit, glass):
         any_hit: whether any hit nearer than `limit` is sufficient, for shadow rays.
         glass: whether panes of glass count.
     """
-    kinds, maps, bounds, links, stack = bodies.kinds, bodies.maps, bodies.bounds, bodies.links, bodies.stack
-    ix, iy, iz = 1 / dx, 1 / dy, 1 / dz
+    kinds, maps, stack, inverse = bodies.kinds, bodies.maps, bodies.stack, _reciprocal(direction)
     stack[0], depth = 0, 1
     best, body, triangle = limit, -1, -1
     while depth:
         depth -= 1
         node = stack[depth]
-        first, count = links[node, 0], links[node, 1]
+        first, count = bodies.links[node, 0], bodies.links[node, 1]
         if count == 0:
-            depth = _push_children(bounds, first, stack, depth, best, x, y, z, ix, iy, iz)
+            depth = _push_children(bodies.bounds, first, stack, depth, best, origin, inverse)
             continue
         for k in range(first, first + count):
             if kinds[k] == MESH:
-                m = maps[k]
-                px, py, pz = x - m[3], y - m[7], z - m[11]
-                t, found = _hit_mesh(
-                    bodies,
-                    bodies.roots[k],
-                    depth,
-                    m[0] * px + m[1] * py + m[2] * pz,
-                    m[4] * px + m[5] * py + m[6] * pz,
-                    m[8] * px + m[9] * py + m[10] * pz,
-                    m[0] * dx + m[1] * dy + m[2] * dz,
-                    m[4] * dx + m[5] * dy + m[6] * dz,
-                    m[8] * dx + m[9] * dy + m[10] * dz,
-                    best,
-                    any_hit,
-                )
+                o, d = to_local(maps[k], origin), _turn_to_local(maps[k], direction)
+                t, found = _hit_mesh(bodies, bodies.roots[k], depth, o, d, best, any_hit)
                 if found >= 0:
                     best, body, triangle = t, k, found
             elif glass or kinds[k] != GLASS:
-                t = intersect_body(kinds[k], maps[k], x, y, z, dx, dy, dz)
+                t = intersect_body(kinds[k], maps[k], origin, direction)
                 if 1e-6 < t < best:
                     best, body, triangle = t, k, -1
             if any_hit and body >= 0:

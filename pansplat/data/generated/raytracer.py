@@ -14,7 +14,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from pansplat.data.generated.bvh import GLASS, INLINE, Bodies, first_hit, intersect_body
+from pansplat.data.generated.bvh import CYLINDER, ELLIPSOID, GLASS, Bodies, first_hit, intersect_body, to_local
 from pansplat.data.generated.textures import (
     COLOR_A,
     COLOR_B,
@@ -24,12 +24,25 @@ from pansplat.data.generated.textures import (
     IMAGE,
     KIND,
     MIRROR,
-    OPTIONS,
+    SEED,
     SIZE_U,
     color,
     fractal,
     hash_unit,
     image_color,
+)
+from pansplat.data.generated.vectors import (
+    INLINE,
+    OPTIONS,
+    advance,
+    cross,
+    dot,
+    mix,
+    multiply,
+    scale,
+    subtract,
+    take,
+    unit,
 )
 
 _FIRST, _BEHIND, _MIRRORED, _WEAK = range(4)  # rays of the camera, behind glass, from mirrors and from polish or glass
@@ -90,94 +103,77 @@ def _room_at(rooms, x, z):
 
 
 @nb.njit(**OPTIONS)
-def _surface_point(kind, m, half, x, y, z):
+def _surface_point(kind, m, half, point):
     """Unit normal, face (two per axis; 0 for round sides), texture coordinates and half size of the face, metres."""
-    px, py, pz = x - m[3], y - m[7], z - m[11]
-    qx = m[0] * px + m[1] * py + m[2] * pz
-    qy = m[4] * px + m[5] * py + m[6] * pz
-    qz = m[8] * px + m[9] * py + m[10] * pz
-    a, b, c = abs(qx), abs(qy), abs(qz)
-    nx, ny, nz, face = 0.0, 0.0, 0.0, 0
-    u, v, half_u, half_v = qx * half[0], qy * half[1], half[0], half[1]
-    if kind == 1:
-        nx, ny, nz = qx, qy, qz
-        u, v = math.atan2(qx, qz) * half[0], math.asin(min(1.0, max(-1.0, qy))) * half[1]
-    elif kind == 2 and a * a + c * c > b * b:
-        nx, nz = qx, qz
-        u, v = math.atan2(qx, qz) * half[0], qy * half[1]
-        half_u = math.pi * half[0]
-    elif kind == 2 or (b >= a and b >= c):
-        ny, face = math.copysign(1.0, qy), 3 if qy > 0 else 2
-        v, half_v = qz * half[2], half[2]
+    q = to_local(m, point)
+    a, b, c = abs(q[0]), abs(q[1]), abs(q[2])
+    normal, face = (0.0, 0.0, 0.0), 0
+    u, v, half_u, half_v = q[0] * half[0], q[1] * half[1], half[0], half[1]
+    if kind == ELLIPSOID:
+        normal = q
+        u, v = math.atan2(q[0], q[2]) * half[0], math.asin(min(1.0, max(-1.0, q[1]))) * half[1]
+    elif kind == CYLINDER and a * a + c * c > b * b:
+        normal = (q[0], 0.0, q[2])
+        u, half_u = math.atan2(q[0], q[2]) * half[0], math.pi * half[0]
+    elif kind == CYLINDER or (b >= a and b >= c):
+        normal, face = (0.0, math.copysign(1.0, q[1]), 0.0), 3 if q[1] > 0 else 2
+        v, half_v = q[2] * half[2], half[2]
     elif a >= c:
-        nx, face = math.copysign(1.0, qx), 1 if qx > 0 else 0
-        u, half_u = qz * half[2], half[2]
+        normal, face = (math.copysign(1.0, q[0]), 0.0, 0.0), 1 if q[0] > 0 else 0
+        u, half_u = q[2] * half[2], half[2]
     else:
-        nz, face = math.copysign(1.0, qz), 5 if qz > 0 else 4
-    nx, ny, nz = _world_normal(m, nx, ny, nz)
-    return nx, ny, nz, face, u, v, half_u, half_v
+        normal, face = (0.0, 0.0, math.copysign(1.0, q[2])), 5 if q[2] > 0 else 4
+    return _world_normal(m, normal), face, u, v, half_u, half_v
 
 
 @nb.njit(**INLINE)
-def _mesh_point(scene, body, triangle, x, y, z, dx, dy, dz):
+def _mesh_point(scene, body, triangle, point, direction):
     """The surface at a point of a triangle.
 
     Returns:
         Unit normal towards the origin of the ray, place in `mesh_materials`, image coordinates, their change per metre,
         and texture coordinates in metres.
     """
-    m, half, t, c = (
-        scene.bodies.maps[body],
-        scene.halves[body],
-        scene.bodies.triangles[triangle],
-        scene.normals[triangle],
-    )
-    px, py, pz = x - m[3], y - m[7], z - m[11]
-    qx = m[0] * px + m[1] * py + m[2] * pz
-    qy = m[4] * px + m[5] * py + m[6] * pz
-    qz = m[8] * px + m[9] * py + m[10] * pz
+    m, t, c = scene.bodies.maps[body], scene.bodies.triangles[triangle], scene.normals[triangle]
+    half, q = take(scene.halves[body], 0), to_local(m, point)
     # Barycentric coordinates, in metres.
-    ax, ay, az = t[3] * half[0], t[4] * half[1], t[5] * half[2]
-    bx, by, bz = t[6] * half[0], t[7] * half[1], t[8] * half[2]
-    rx, ry, rz = (qx - t[0]) * half[0], (qy - t[1]) * half[1], (qz - t[2]) * half[2]
-    aa, ab, bb = ax * ax + ay * ay + az * az, ax * bx + ay * by + az * bz, bx * bx + by * by + bz * bz
-    ra, rb = rx * ax + ry * ay + rz * az, rx * bx + ry * by + rz * bz
+    a, b, r = multiply(take(t, 3), half), multiply(take(t, 6), half), multiply(subtract(q, take(t, 0)), half)
+    aa, ab, bb, ra, rb = dot(a, a), dot(a, b), dot(b, b), dot(r, a), dot(r, b)
     square = max(aa * bb - ab * ab, 1e-30)
     u, v = (ra * bb - rb * ab) / square, (rb * aa - ra * ab) / square
     # Normals of the plane and of the interpolated corners, in the space of the mesh.
-    gx, gy, gz = t[4] * t[8] - t[5] * t[7], t[5] * t[6] - t[3] * t[8], t[3] * t[7] - t[4] * t[6]
-    sx = c[0] + u * (c[3] - c[0]) + v * (c[6] - c[0])
-    sy = c[1] + u * (c[4] - c[1]) + v * (c[7] - c[1])
-    sz = c[2] + u * (c[5] - c[2]) + v * (c[8] - c[2])
-    plane_x, plane_y, plane_z = _world_normal(m, gx, gy, gz)
-    nx, ny, nz = _world_normal(m, sx, sy, sz)
-    if plane_x * dx + plane_y * dy + plane_z * dz > 0:
-        plane_x, plane_y, plane_z = -plane_x, -plane_y, -plane_z
-    along = plane_x * nx + plane_y * ny + plane_z * nz
+    across, corner = cross(take(t, 3), take(t, 6)), take(c, 0)
+    smooth = advance(corner, u, subtract(take(c, 3), corner))
+    smooth = advance(smooth, v, subtract(take(c, 6), corner))
+    plane, normal = _world_normal(m, across), _world_normal(m, smooth)
+    if dot(plane, direction) > 0:
+        plane = scale(plane, -1.0)
+    along = dot(plane, normal)
     if along < 0:
-        nx, ny, nz = -nx, -ny, -nz
-    if abs(along) < 0.3 or nx * dx + ny * dy + nz * dz > 0:
-        nx, ny, nz = plane_x, plane_y, plane_z
+        normal = scale(normal, -1.0)
+    if abs(along) < 0.3 or dot(normal, direction) > 0:
+        normal = plane
     w = scene.bodies.texcoords[triangle]
     au, av, bu, bv = w[2] - w[0], w[3] - w[1], w[4] - w[0], w[5] - w[1]
     density = math.sqrt(abs(au * bv - av * bu) / math.sqrt(square))
     # Texture coordinates in metres are those of the box around the mesh.
-    mu, mv = qx * half[0], qy * half[1]
-    if abs(ny) > 0.7:
-        mv = qz * half[2]
-    elif abs(gx) * half[1] * half[2] > abs(gz) * half[0] * half[1]:
-        mu = qz * half[2]
+    mu, mv = q[0] * half[0], q[1] * half[1]
+    if abs(normal[1]) > 0.7:
+        mv = q[2] * half[2]
+    elif abs(across[0]) * half[1] * half[2] > abs(across[2]) * half[0] * half[1]:
+        mu = q[2] * half[2]
     place = scene.faces[body, 0] + scene.triangle_materials[triangle]
-    return nx, ny, nz, place, w[0] + u * au + v * bu, w[1] + u * av + v * bv, density, mu, mv
+    return normal, place, w[0] + u * au + v * bu, w[1] + u * av + v * bv, density, mu, mv
 
 
 @nb.njit(**OPTIONS)
-def _world_normal(m, x, y, z):
-    nx = m[0] * x + m[4] * y + m[8] * z
-    ny = m[1] * x + m[5] * y + m[9] * z
-    nz = m[2] * x + m[6] * y + m[10] * z
-    size = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-30
-    return nx / size, ny / size, nz / size
+def _world_normal(m, n):
+    """Unit normal in the world of a normal in the space of a body."""
+    x = m[0] * n[0] + m[4] * n[1] + m[8] * n[2]
+    y = m[1] * n[0] + m[5] * n[1] + m[9] * n[2]
+    z = m[2] * n[0] + m[6] * n[1] + m[10] * n[2]
+    size = math.sqrt(x * x + y * y + z * z) + 1e-30
+    return x / size, y / size, z / size
 
 
 @nb.njit(**OPTIONS)
@@ -198,11 +194,11 @@ def _room_material(rooms, room, kind, y, outside):
 
 
 @nb.njit(**OPTIONS)
-def _ambient_visibility(rooms, room, x, y, z, nx, ny, nz):
+def _ambient_visibility(rooms, room, point, normal):
     """Fraction of the ambient light at a point; below 1 near the edges and corners of its room."""
     if room < 0:
         return 1.0
-    r = rooms[room]
+    r, (x, y, z), (nx, ny, nz) = rooms[room], point, normal
     visibility = 1.0
     for away, towards in (
         (x - r[0], nx),
@@ -230,61 +226,53 @@ def _floor_visibility(cells, start, x, z):
 
 
 @nb.njit(**OPTIONS)
-def _sky_color(materials, sky, dx, dy, dz, w):
+def _sky_color(materials, sky, direction, w):
     """Light of sky, clouds and skyline in a direction from the world origin; `sky` is the index of a material."""
-    up = -dy
-    around = math.atan2(dx, dz) * 4
-    m = materials[sky]
-    t = min(1.0, max(0.0, up)) ** 0.5
-    cloud = min(1.0, max(0.0, 0.5 + 2.5 * fractal(around + 3 * up, 9 * up, 1.5, 5, w * 4, int(m[14])))) * 0.6
-    r = (m[COLOR_A] * t + m[COLOR_B] * (1 - t)) * (1 - cloud) + cloud
-    g = (m[COLOR_A + 1] * t + m[COLOR_B + 1] * (1 - t)) * (1 - cloud) + cloud
-    b = (m[COLOR_A + 2] * t + m[COLOR_B + 2] * (1 - t)) * (1 - cloud) + cloud
-    ridge = 0.08 + 0.25 * fractal(around, 0.3, 0.8, 6, w * 4, int(m[14]) + 5)
-    land = min(1.0, max(0.0, 0.5 + (ridge - up) / max(w, 1e-3)))
-    shade = max(0.1, 0.6 + 1.2 * fractal(around, 8 * up, 0.5, 5, w * 4, int(m[14]) + 9))
-    r = r * (1 - land) + land * shade * m[COLOR_C]
-    g = g * (1 - land) + land * shade * m[COLOR_C + 1]
-    b = b * (1 - land) + land * shade * m[COLOR_C + 2]
-    return r * m[GLOW], g * m[GLOW], b * m[GLOW]
+    up = -direction[1]
+    around = math.atan2(direction[0], direction[2]) * 4
+    m, seed = materials[sky], int(materials[sky, SEED])
+    cloud = unit(0.5 + 2.5 * fractal(around + 3 * up, 9 * up, 1.5, 5, w * 4, seed)) * 0.6
+    light = mix(mix(take(m, COLOR_B), take(m, COLOR_A), unit(up) ** 0.5), (1.0, 1.0, 1.0), cloud)
+    ridge = 0.08 + 0.25 * fractal(around, 0.3, 0.8, 6, w * 4, seed + 5)
+    land = unit(0.5 + (ridge - up) / max(w, 1e-3))
+    shade = max(0.1, 0.6 + 1.2 * fractal(around, 8 * up, 0.5, 5, w * 4, seed + 9))
+    return scale(mix(light, scale(take(m, COLOR_C), shade), land), m[GLOW])
+
+
+@nb.njit(**INLINE)
+def _towards(corner):
+    return scale(corner, 1 / (math.sqrt(dot(corner, corner)) + 1e-9))
 
 
 @nb.njit(**OPTIONS)
-def portal_form_factor(light, x, y, z, nx, ny, nz):
+def portal_form_factor(light, point, normal):
     """Fraction of a surface element's light that comes from an upright rectangle.
 
     The vector form factor of the rectangle is exact (Lambert's formula). A sphere of equal vector form factor then
     gives the part above the plane of the surface, which is smooth where that plane cuts the rectangle.
     """
-    ax, az = 0.0, light[PORTAL_WIDTH]
+    side = (0.0, 0.0, light[PORTAL_WIDTH])
     if light[PORTAL_AXIS] > 0:
-        ax, az = az, ax
-    cx, cy, cz, high = light[0] - x, light[1] - y, light[2] - z, light[PORTAL_HEIGHT]
-    fx, fy, fz = 0.0, 0.0, 0.0
-    px, py, pz = cx - ax, cy + high, cz - az
-    size = math.sqrt(px * px + py * py + pz * pz) + 1e-9
-    px, py, pz = px / size, py / size, pz / size
+        side = (light[PORTAL_WIDTH], 0.0, 0.0)
+    centre, high = subtract(take(light, 0), point), (0.0, light[PORTAL_HEIGHT], 0.0)
+    form = (0.0, 0.0, 0.0)
+    p = _towards(advance(advance(centre, 1.0, high), -1.0, side))
     for k in range(4):
         along, up = (1.0 if k < 2 else -1.0), (1.0 if k == 0 or k == 3 else -1.0)
-        qx, qy, qz = cx + along * ax, cy + up * high, cz + along * az
-        size = math.sqrt(qx * qx + qy * qy + qz * qz) + 1e-9
-        qx, qy, qz = qx / size, qy / size, qz / size
-        cosine = min(0.9999, max(-0.9999, px * qx + py * qy + pz * qz))
+        q = _towards(advance(advance(centre, up, high), along, side))
+        cosine = min(0.9999, max(-0.9999, dot(p, q)))
         # A rational fit of arccos(cosine) / sin(arccos(cosine)) / 2 pi. Source: Hill and Heitz, Real-time area
         # lighting: a journey from research to production, SIGGRAPH 2016 course.
         c = abs(cosine)
         weight = (0.8543985 + (0.4965155 + 0.0145206 * c) * c) / (3.4175940 + (4.1616724 + c) * c)
         if cosine < 0:
             weight = 0.5 / math.sqrt(1 - cosine * cosine) - weight
-        fx += weight * (py * qz - pz * qy)
-        fy += weight * (pz * qx - px * qz)
-        fz += weight * (px * qy - py * qx)
-        px, py, pz = qx, qy, qz
-    size = math.sqrt(fx * fx + fy * fy + fz * fz)
-    towards = fx * nx + fy * ny + fz * nz
-    if fx * cx + fy * cy + fz * cz < 0:
-        towards = -towards
-    return max(0.0, (size * size + towards) / (size + 1))
+        form = advance(form, weight, cross(p, q))
+        p = q
+    size, along = math.sqrt(dot(form, form)), dot(form, normal)
+    if dot(form, centre) < 0:
+        along = -along
+    return max(0.0, (size * size + along) / (size + 1))
 
 
 @nb.njit(**OPTIONS)
@@ -298,49 +286,41 @@ _SHADE_RADIUS = 0.25  # metres around a lamp without shadows, for its shade
 
 
 @nb.njit(**INLINE)
-def _irradiance(light, group, x, y, z, nx, ny, nz, a, b):
+def _irradiance(light, group, point, normal, a, b):
     """Unshadowed irradiance of a light of unit colour, direction to a point on it, and the distance of that point.
 
     Args:
         group: light group of the surface.
         a, b: select the point on the light, in [-1, 1].
     """
-    kind, size = light[LIGHT_KIND], light[LIGHT_SIZE]
-    lx, ly, lz = light[0], light[1], light[2]
+    kind, size, position = light[LIGHT_KIND], light[LIGHT_SIZE], take(light, 0)
+    unlit = 0.0, (0.0, 1.0, 0.0), 0.0
     if light[LIGHT_REACHES] >= 0 and light[LIGHT_REACHES] != group:
-        return 0.0, 0.0, 1.0, 0.0, 0.0
+        return unlit
+    way = subtract(position, point)
+    square = dot(way, way)
     if kind == PORTAL:
         wide, high = light[PORTAL_WIDTH], light[PORTAL_HEIGHT]
-        square = (lx - x) ** 2 + (ly - y) ** 2 + (lz - z) ** 2
         if square > 4 * (wide * wide + high * high) and 4 * wide * high * _brightness(light) < _LEAST_LIGHT * square:
-            return 0.0, 0.0, 1.0, 0.0, 0.0
-        power = portal_form_factor(light, x, y, z, nx, ny, nz)
-        lx, ly, lz = lx - x, ly - y + _SHARPNESS * b * light[PORTAL_HEIGHT], lz - z
-        if light[PORTAL_AXIS] > 0:
-            lx += _SHARPNESS * a * light[PORTAL_WIDTH]
+            return unlit
+        power = portal_form_factor(light, point, normal)
+        along, up = _SHARPNESS * a * wide, _SHARPNESS * b * high
+        shift = (along, up, 0.0) if light[PORTAL_AXIS] > 0 else (0.0, up, along)
+        margin = _WINDOW_DEPTH  # the bars of its window would shadow a part of the rays to it in the whole room
+    else:
+        shift, margin = (size * a, 0.3 * size * b, size * b), _SHADE_RADIUS
+        if kind == SUN:
+            power, way = dot(normal, position), position
         else:
-            lz += _SHARPNESS * a * light[PORTAL_WIDTH]
-    elif kind == SUN:
-        power = nx * lx + ny * ly + nz * lz
-        lx, ly, lz = lx + size * a, ly + 0.3 * size * b, lz + size * b
-    else:
-        lx, ly, lz = lx - x, ly - y, lz - z
-        square = lx * lx + ly * ly + lz * lz
-        power = (nx * lx + ny * ly + nz * lz) / (math.sqrt(square) * (0.6 + square))
-        lx, ly, lz = lx + size * a, ly + 0.3 * size * b, lz + size * b
-    away = math.sqrt(lx * lx + ly * ly + lz * lz)
-    limit = away
-    if kind == SUN:
-        limit = 2 * SKY
-    elif kind == PORTAL:  # the bars of its window would shadow a part of the rays to it in the whole room
-        limit = max(away - _WINDOW_DEPTH, 0.0)
-    else:
-        limit = max(away - _SHADE_RADIUS, 0.0)
-    return power, lx / away, ly / away, lz / away, limit
+            power = dot(normal, way) / (math.sqrt(square) * (0.6 + square))
+    way = advance(way, 1.0, shift)
+    away = math.sqrt(dot(way, way))
+    limit = 2 * SKY if kind == SUN else max(away - margin, 0.0)
+    return power, (way[0] / away, way[1] / away, way[2] / away), limit
 
 
 @nb.njit(**INLINE)
-def _direct_light(bodies, lights, last, group, x, y, z, nx, ny, nz, a, b, few):
+def _direct_light(bodies, lights, last, group, point, normal, a, b, few):
     """Light (red, green, blue) of lamps, portals and sun at a point of a light group, with shadows.
 
     Args:
@@ -348,90 +328,79 @@ def _direct_light(bodies, lights, last, group, x, y, z, nx, ny, nz, a, b, few):
         a, b: select a point on each light, in [-1, 1].
         few: whether only strong lights cast shadows.
     """
-    kinds, maps = bodies.kinds, bodies.maps
-    red, green, blue = 0.0, 0.0, 0.0
-    x, y, z = x + 1e-4 * nx, y + 1e-4 * ny, z + 1e-4 * nz
+    total, point = (0.0, 0.0, 0.0), advance(point, 1e-4, normal)
     for k in range(len(lights)):
         light = lights[k]
-        power, lx, ly, lz, limit = _irradiance(light, group, x, y, z, nx, ny, nz, a, b)
+        power, way, limit = _irradiance(light, group, point, normal, a, b)
         strength = power * _brightness(light)
         if strength < _LEAST_LIGHT:
             continue
         if few and strength < _STRONG_LIGHT:
             power *= 0.7
-        elif light[LIGHT_KIND] != PORTAL or (light[PORTAL_SHADOWS] > 0 and nx * lx + ny * ly + nz * lz > 0):
-            if last[k] >= 0 and 1e-6 < intersect_body(kinds[last[k]], maps[last[k]], x, y, z, lx, ly, lz) < limit:
+        elif light[LIGHT_KIND] != PORTAL or (light[PORTAL_SHADOWS] > 0 and dot(normal, way) > 0):
+            other = last[k]
+            if other >= 0 and 1e-6 < intersect_body(bodies.kinds[other], bodies.maps[other], point, way) < limit:
                 continue
-            _, blocker, triangle = first_hit(bodies, x, y, z, lx, ly, lz, limit, True, False)
+            _, blocker, triangle = first_hit(bodies, point, way, limit, True, False)
             last[k] = blocker if triangle < 0 else -1
             if blocker >= 0:
                 continue
-        red += power * light[LIGHT_COLOR]
-        green += power * light[LIGHT_COLOR + 1]
-        blue += power * light[LIGHT_COLOR + 2]
-    return red, green, blue
+        total = advance(total, power, take(light, LIGHT_COLOR))
+    return total
 
 
 @nb.njit(**INLINE)
-def _shade(scene, last, body, triangle, x, y, z, dx, dy, dz, t, width, a, b, few):
+def _shade(scene, last, body, triangle, origin, direction, t, width, a, b, few):
     """Diffuse light (red, green, blue), unit normal and material at the hit of a ray; material -1 is the sky.
 
     Args:
-        t: distance of the hit, metres; any number if `body` is negative.
+        t: distance of the hit, metres.
         width: angle of a pixel times the length of the whole path to the hit, metres.
     """
+    point = advance(origin, t, direction)
     if body < 0:
-        t = _distance_to_sky(x, y, z, dx, dy, dz)
-        red, green, blue = _sky_color(
-            scene.materials, scene.sky, (x + t * dx) / SKY, (y + t * dy) / SKY, (z + t * dz) / SKY, width / SKY
-        )
-        return red, green, blue, 0.0, 0.0, 0.0, -1
-    px, py, pz = x + t * dx, y + t * dy, z + t * dz
+        on_sphere = (point[0] / SKY, point[1] / SKY, point[2] / SKY)
+        return _sky_color(scene.materials, scene.sky, on_sphere, width / SKY), (0.0, 0.0, 0.0), -1
     density, image_u, image_v = 0.0, 0.0, 0.0
     if triangle >= 0:
-        nx, ny, nz, place, image_u, image_v, density, u, v = _mesh_point(scene, body, triangle, px, py, pz, dx, dy, dz)
+        normal, place, image_u, image_v, density, u, v = _mesh_point(scene, body, triangle, point, direction)
         half_u, half_v, material = scene.halves[body, 0], scene.halves[body, 1], scene.mesh_materials[place]
     else:
-        nx, ny, nz, face, u, v, half_u, half_v = _surface_point(
-            scene.bodies.kinds[body], scene.bodies.maps[body], scene.halves[body], px, py, pz
+        normal, face, u, v, half_u, half_v = _surface_point(
+            scene.bodies.kinds[body], scene.bodies.maps[body], scene.halves[body], point
         )
         material = scene.faces[body, face]
-    facing = abs(nx * dx + ny * dy + nz * dz)
-    width /= max(0.7 * math.sqrt(facing), 0.15)  # between the sides of the pixel's footprint
-    room = _room_at(scene.rooms, px + 0.02 * nx, pz + 0.02 * nz)
+    # Between the sides of the pixel's footprint.
+    width /= max(0.7 * math.sqrt(abs(dot(normal, direction))), 0.15)
+    room = _room_at(scene.rooms, point[0] + 0.02 * normal[0], point[2] + 0.02 * normal[2])
     if material < 0:
-        if ny > 0.5 or ny < -0.5:
-            u, v = px, pz
-        elif abs(nx) > abs(nz):
-            u, v = pz, py
-        else:
-            u, v = px, py
-        material = _room_material(scene.rooms, room, material, py, scene.outside)
+        u, v = point[0], point[1]
+        if abs(normal[1]) > 0.5:
+            v = point[2]
+        elif abs(normal[0]) > abs(normal[2]):
+            u = point[2]
+        material = _room_material(scene.rooms, room, material, point[1], scene.outside)
     surface = scene.materials[material]
     if surface[KIND] == IMAGE:
         image = scene.bodies.images[int(surface[SIZE_U])]
-        red, green, blue = image_color(scene.bodies.texels, image, image_u, image_v, width * density)
-        red, green, blue = red * surface[COLOR_A], green * surface[COLOR_A + 1], blue * surface[COLOR_A + 2]
+        shown = image_color(scene.bodies.texels, image, image_u, image_v, width * density)
+        reflectance = multiply(shown, take(surface, COLOR_A))
     else:
-        red, green, blue = color(surface, u, v, width, half_u, half_v)
-    ambient, group = scene.ambient, -1
+        reflectance = color(surface, u, v, width, half_u, half_v)
+    ambient, group = take(scene.ambient, 0), -1
     if room >= 0:
-        ambient, group = scene.rooms[room, AMBIENT:LIGHT_GROUP], int(scene.rooms[room, LIGHT_GROUP])
-    around = _ambient_visibility(scene.rooms, room, px, py, pz, nx, ny, nz) * (0.85 - 0.15 * ny)
-    if ny < -0.5 and -0.03 < py < 0.03:
-        around *= _floor_visibility(scene.floor_light, scene.floor_start, px, pz)
-    lr, lg, lb = _direct_light(scene.bodies, scene.lights, last, group, px, py, pz, nx, ny, nz, a, b, few)
-    glow = surface[GLOW]
+        ambient, group = take(scene.rooms[room], AMBIENT), int(scene.rooms[room, LIGHT_GROUP])
+    around = _ambient_visibility(scene.rooms, room, point, normal) * (0.85 - 0.15 * normal[1])
+    if normal[1] < -0.5 and -0.03 < point[1] < 0.03:
+        around *= _floor_visibility(scene.floor_light, scene.floor_start, point[0], point[2])
+    direct = _direct_light(scene.bodies, scene.lights, last, group, point, normal, a, b, few)
     # Portals to darker rooms take light away, in dark corners possibly more than there is.
-    return (
-        red * (max(ambient[0] * around + lr, 0.1 * ambient[0] * around) + glow),
-        green * (max(ambient[1] * around + lg, 0.1 * ambient[1] * around) + glow),
-        blue * (max(ambient[2] * around + lb, 0.1 * ambient[2] * around) + glow),
-        nx,
-        ny,
-        nz,
-        material,
+    light = (
+        max(ambient[0] * around + direct[0], 0.1 * ambient[0] * around) + surface[GLOW],
+        max(ambient[1] * around + direct[1], 0.1 * ambient[1] * around) + surface[GLOW],
+        max(ambient[2] * around + direct[2], 0.1 * ambient[2] * around) + surface[GLOW],
     )
+    return multiply(reflectance, light), normal, material
 
 
 @nb.njit(**OPTIONS)
@@ -441,7 +410,7 @@ def _fresnel(facing):
 
 
 @nb.njit(**INLINE)
-def _trace_ray(scene, last, queue, x, y, z, dx, dy, dz, pixel, a, b):
+def _trace_ray(scene, last, queue, origin, direction, pixel, a, b):
     """Light (red, green, blue), distance, unit normal and material of the first hit of a ray behind any glass.
 
     Args:
@@ -449,72 +418,65 @@ def _trace_ray(scene, last, queue, x, y, z, dx, dy, dz, pixel, a, b):
         pixel: angle of a pixel, radians.
         a, b: select a point on each light, in [-1, 1].
     """
-    red, green, blue = 0.0, 0.0, 0.0
-    seen, seen_x, seen_y, seen_z, seen_material = 0.0, 0.0, 0.0, 0.0, -1
-    queue[0, 0], queue[0, 1], queue[0, 2], queue[0, 3], queue[0, 4], queue[0, 5] = x, y, z, dx, dy, dz
-    queue[0, 6], queue[0, 7], queue[0, 8] = 1, 0, _FIRST
+    total, seen, seen_normal, seen_material = (0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0), -1
+    _enqueue(queue[0], origin, direction, 1.0, 0.0, _FIRST)
     waiting = 1
     while waiting:
         waiting -= 1
         ray = queue[waiting]
-        x, y, z, dx, dy, dz, weight, length, kind = ray
-        t, body, triangle = first_hit(scene.bodies, x, y, z, dx, dy, dz, math.inf, False, kind == _FIRST)
+        origin, direction, weight, length, kind = take(ray, 0), take(ray, 3), ray[6], ray[7], ray[8]
+        t, body, triangle = first_hit(scene.bodies, origin, direction, math.inf, False, kind == _FIRST)
         share, reflected = 0.0, _WEAK
         if body >= 0 and scene.bodies.kinds[body] == GLASS:
-            nx, ny, nz, _, _, _, _, _ = _surface_point(
-                GLASS, scene.bodies.maps[body], scene.halves[body], x + t * dx, y + t * dy, z + t * dz
-            )
-            once = _fresnel(abs(nx * dx + ny * dy + nz * dz))
+            point = advance(origin, t, direction)
+            normal, _, _, _, _, _ = _surface_point(GLASS, scene.bodies.maps[body], scene.halves[body], point)
+            once = _fresnel(abs(dot(normal, direction)))
             share = 2 * once / (1 + once)  # both faces of the pane
             ray[6], ray[8] = weight * (1 - share), _BEHIND
             waiting += 1
         else:
             if body < 0:
-                t = _distance_to_sky(x, y, z, dx, dy, dz)
+                t = _distance_to_sky(origin, direction)
             width = pixel * (length + t) if body >= 0 else pixel * SKY
-            r, g, b_, nx, ny, nz, material = _shade(
-                scene, last, body, triangle, x, y, z, dx, dy, dz, t, width, a, b, kind == _WEAK
+            light, normal, material = _shade(
+                scene, last, body, triangle, origin, direction, t, width, a, b, kind == _WEAK
             )
             if kind <= _BEHIND:
-                seen, seen_x, seen_y, seen_z, seen_material = t, nx, ny, nz, material
+                seen, seen_normal, seen_material = t, normal, material
                 if material >= 0 and scene.materials[material, MIRROR] > 0:
                     share, reflected = scene.materials[material, MIRROR], _MIRRORED
                 elif material >= 0 and scene.materials[material, GLOSS] > 0:
-                    share = scene.materials[material, GLOSS] * _fresnel(abs(nx * dx + ny * dy + nz * dz))
+                    share = scene.materials[material, GLOSS] * _fresnel(abs(dot(normal, direction)))
                     share = max(share - _LEAST_REFLECTION, 0.0)
-            red, green, blue = (
-                red + weight * (1 - share) * r,
-                green + weight * (1 - share) * g,
-                blue + weight * (1 - share) * b_,
-            )
+            total = advance(total, weight * (1 - share), light)
         if share > 0:
-            facing = nx * dx + ny * dy + nz * dz
-            ray = queue[waiting]
-            ray[0] = x + t * dx - 1e-4 * facing * nx
-            ray[1] = y + t * dy - 1e-4 * facing * ny
-            ray[2] = z + t * dz - 1e-4 * facing * nz
-            ray[3], ray[4], ray[5] = dx - 2 * facing * nx, dy - 2 * facing * ny, dz - 2 * facing * nz
-            ray[6], ray[7], ray[8] = weight * share, length + t, reflected
+            facing = dot(normal, direction)
+            start = advance(advance(origin, t, direction), -1e-4 * facing, normal)
+            turned = advance(direction, -2 * facing, normal)
+            _enqueue(queue[waiting], start, turned, weight * share, length + t, reflected)
             waiting += 1
-    return red, green, blue, seen, seen_x, seen_y, seen_z, seen_material
+    return total, seen, seen_normal, seen_material
+
+
+@nb.njit(**INLINE)
+def _enqueue(ray, origin, direction, weight, length, kind):
+    ray[0], ray[1], ray[2] = origin
+    ray[3], ray[4], ray[5] = direction
+    ray[6], ray[7], ray[8] = weight, length, kind
 
 
 @nb.njit(**OPTIONS)
-def _distance_to_sky(x, y, z, dx, dy, dz):
-    b = x * dx + y * dy + z * dz
-    return -b + math.sqrt(b * b + SKY * SKY - (x * x + y * y + z * z))
+def _distance_to_sky(origin, direction):
+    b = dot(origin, direction)
+    return -b + math.sqrt(b * b + SKY * SKY - dot(origin, origin))
 
 
 @nb.njit(**OPTIONS)
 def _direction(pose, height, i, j):
     """World direction through a point (row i, column j; pixel centres at half-integers) of a panorama."""
     longitude, latitude = math.pi * j / height - math.pi, math.pi * i / height - 0.5 * math.pi
-    x, y, z = math.cos(latitude) * math.sin(longitude), math.sin(latitude), math.cos(latitude) * math.cos(longitude)
-    return (
-        pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z,
-        pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z,
-        pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z,
-    )
+    d = math.cos(latitude) * math.sin(longitude), math.sin(latitude), math.cos(latitude) * math.cos(longitude)
+    return dot(take(pose[0], 0), d), dot(take(pose[1], 0), d), dot(take(pose[2], 0), d)
 
 
 @nb.njit(**OPTIONS)
@@ -537,13 +499,10 @@ def _is_edge(image, depth, points, normals, shown, i, j, k, m, pixel):
         return True
     if shown[i, j] < 0:
         return False
-    along, off, other = 0.0, 0.0, 0.0
-    for c in range(3):
-        step = points[k, m, c] - points[i, j, c]
-        along += normals[i, j, c] * normals[k, m, c]
-        off += step * normals[i, j, c]
-        other += step * normals[k, m, c]
-    if along < 0.9 or abs(off) + abs(other) > 4 * pixel * min(depth[i, j], depth[k, m]):
+    step = subtract(take(points[k, m], 0), take(points[i, j], 0))
+    here, there = take(normals[i, j], 0), take(normals[k, m], 0)
+    off = abs(dot(step, here)) + abs(dot(step, there))
+    if dot(here, there) < 0.9 or off > 4 * pixel * min(depth[i, j], depth[k, m]):
         return True
     contrast = 0.0
     for c in range(3):
@@ -563,7 +522,7 @@ def trace_panorama(scene, pose, samples, image, depth):
     points, normals = np.empty((height, width, 3)), np.empty((height, width, 3))
     shown = np.empty((height, width), np.int64)
     chosen = np.ones((height, width), np.bool_)
-    x, y, z = pose[0, 3], pose[1, 3], pose[2, 3]
+    origin = pose[0, 3], pose[1, 3], pose[2, 3]
     for step in range(2 if samples > 1 else 1):
         rays = 1 if step == 0 else samples * samples - 1
         if step == 1:
@@ -572,29 +531,26 @@ def trace_panorama(scene, pose, samples, image, depth):
             for j in range(width):
                 if not chosen[i, j]:
                     continue
-                total_red, total_green, total_blue = 0.0, 0.0, 0.0
-                if step == 1:
-                    total_red, total_green, total_blue = image[i, j, 0], image[i, j, 1], image[i, j, 2]
+                total = take(image[i, j], 0) if step == 1 else (0.0, 0.0, 0.0)
                 for k in range(step, step + rays):
                     row, column = i + 0.5, j + 0.5
                     if step == 1:  # on one or two rings around the centre
                         radius, angle = 0.36 if rays < 4 else 0.25 + 0.2 * (k % 2), 2 * math.pi * (k + 0.25) / rays
                         row, column = row + radius * math.sin(angle), column + radius * math.cos(angle)
-                    dx, dy, dz = _direction(pose, height, row, column)
+                    direction = _direction(pose, height, row, column)
                     # Points on lights follow the R2 sequence from a random start.
                     a, b = 0.7548776662466927 * k + hash_unit(i, j, 1), 0.5698402909980532 * k + hash_unit(i, j, 2)
                     a, b = 2 * (a - math.floor(a)) - 1, 2 * (b - math.floor(b)) - 1
-                    red, green, blue, t, nx, ny, nz, material = _trace_ray(
-                        scene, last, queue, x, y, z, dx, dy, dz, math.pi / height, a, b
+                    light, t, normal, material = _trace_ray(
+                        scene, last, queue, origin, direction, math.pi / height, a, b
                     )
-                    total_red, total_green, total_blue = total_red + red, total_green + green, total_blue + blue
+                    total = advance(total, 1.0, light)
                     if step == 0:
-                        points[i, j, 0], points[i, j, 1], points[i, j, 2] = t * dx, t * dy, t * dz
-                        normals[i, j, 0], normals[i, j, 1], normals[i, j, 2] = nx, ny, nz
+                        points[i, j, 0], points[i, j, 1], points[i, j, 2] = scale(direction, t)
+                        normals[i, j, 0], normals[i, j, 1], normals[i, j, 2] = normal
                         depth[i, j], shown[i, j] = t, material
-                image[i, j, 0] = total_red / (step + rays)
-                image[i, j, 1] = total_green / (step + rays)
-                image[i, j, 2] = total_blue / (step + rays)
+                for c in range(3):
+                    image[i, j, c] = total[c] / (step + rays)
     for i in range(height):
         for j in range(width):
             if shown[i, j] >= 0 and scene.materials[shown[i, j], MIRROR] > 0:

@@ -13,7 +13,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
+from pansplat.data.generated.vectors import OPTIONS, advance, mix, scale, subtract, take, unit
 
 
 class Pattern(IntEnum):
@@ -66,7 +66,7 @@ def fractal(u, v, size, octaves, w, seed):
     """Fractal noise with mean 0; the first octave is `size` metres wide, octaves finer than `w` fade out."""
     total, gain = 0.0, 1.0
     for octave in range(octaves):
-        shown = min(1.0, max(0.0, 1.5 - w / size))
+        shown = unit(1.5 - w / size)
         if shown <= 0:
             break
         total += gain * shown * (noise(u / size + 7.3 * octave, v / size - 3.1 * octave, seed + octave) - 0.5)
@@ -89,18 +89,13 @@ def pulse(x, share, w):
 
 @nb.njit(**OPTIONS)
 def _mix(material, first, second, t):
-    t = min(1.0, max(0.0, t))
-    return (
-        material[first] * (1 - t) + material[second] * t,
-        material[first + 1] * (1 - t) + material[second + 1] * t,
-        material[first + 2] * (1 - t) + material[second + 2] * t,
-    )
+    return mix(take(material, first), take(material, second), unit(t))
 
 
 @nb.njit(**OPTIONS)
 def _per_cell(cell, size, w):
     """A random tone `cell` in [0, 1), centred at 0; it fades out where pattern cells are as small as pixels."""
-    return (cell - 0.5) * min(1.0, max(0.0, 1.5 - w / size))
+    return (cell - 0.5) * unit(1.5 - w / size)
 
 
 @nb.njit(**OPTIONS)
@@ -113,8 +108,7 @@ def _planks(material, u, v, w, seed):
     tone = 0.5 + 0.8 * _per_cell(hash_unit(row, math.floor(along), seed), wide, w)
     tone += 1.2 * fractal(u * 0.12, v + 0.3 * tone, 0.05, 4, w, seed) * 0.8
     joint = max(pulse(v / wide, material[FRACTION], w / wide), pulse(along, material[FRACTION] * wide / long, w / long))
-    r, g, b = _mix(material, COLOR_A, COLOR_B, tone)
-    return r * (1 - 0.7 * joint), g * (1 - 0.7 * joint), b * (1 - 0.7 * joint)
+    return scale(_mix(material, COLOR_A, COLOR_B, tone), 1 - 0.7 * joint)
 
 
 @nb.njit(**OPTIONS)
@@ -127,14 +121,9 @@ def _tiles(material, u, v, w, seed):
     small = min(size_u, size_v)
     tone = 0.3 + 0.6 * _per_cell(hash_unit(row, column, seed), small, w)
     if material[MOTTLE] > 0.5 and hash_unit(seed, 5, 5) < 0.5:  # a chequered floor
-        tone += 0.7 * ((row + column) % 2) * min(1.0, max(0.0, 1.5 - w / small))
+        tone += 0.7 * ((row + column) % 2) * unit(1.5 - w / small)
     tone += 0.5 * fractal(u, v, 0.5 * small, 3, w, seed + 9)
-    r, g, b = _mix(material, COLOR_A, COLOR_B, tone)
-    return (
-        r * (1 - joint) + material[COLOR_C] * joint,
-        g * (1 - joint) + material[COLOR_C + 1] * joint,
-        b * (1 - joint) + material[COLOR_C + 2] * joint,
-    )
+    return mix(_mix(material, COLOR_A, COLOR_B, tone), take(material, COLOR_C), joint)
 
 
 @nb.njit(**OPTIONS)
@@ -142,12 +131,7 @@ def _stripes(material, u, v, w, seed):
     size = material[SIZE_U]
     wide = pulse(u / size, material[FRACTION], w / size)
     narrow = pulse(u / size + 0.3, 0.12, w / size)
-    r, g, b = _mix(material, COLOR_A, COLOR_B, wide)
-    return (
-        r * (1 - narrow) + material[COLOR_C] * narrow,
-        g * (1 - narrow) + material[COLOR_C + 1] * narrow,
-        b * (1 - narrow) + material[COLOR_C + 2] * narrow,
-    )
+    return mix(_mix(material, COLOR_A, COLOR_B, wide), take(material, COLOR_C), narrow)
 
 
 @nb.njit(**OPTIONS)
@@ -156,7 +140,7 @@ def _stone(material, u, v, w, seed):
     turbulent = fractal(u, v, size, 6, w, seed)
     if material[FRACTION] > 0.5:  # veins
         vein = 1 - abs(math.sin((u + 0.7 * v) / size * 3 + 6 * turbulent))
-        return _mix(material, COLOR_A, COLOR_B, vein * vein * vein * min(1.0, max(0.0, 1.5 - 2 * w / size)))
+        return _mix(material, COLOR_A, COLOR_B, vein * vein * vein * unit(1.5 - 2 * w / size))
     return _mix(material, COLOR_A, COLOR_B, 0.5 + 1.3 * turbulent)
 
 
@@ -165,7 +149,7 @@ def _picture(material, u, v, w, seed, half_u, half_v):
     """A noisy background with twelve discs and bars of random colours."""
     x, y = u / half_u, v / half_v
     w /= min(half_u, half_v)
-    r, g, b = _mix(material, COLOR_A, COLOR_B, 0.5 + 0.5 * y + 1.5 * fractal(x, y, 0.8, 5, w, seed))
+    painted = _mix(material, COLOR_A, COLOR_B, 0.5 + 0.5 * y + 1.5 * fractal(x, y, 0.8, 5, w, seed))
     for k in range(12):
         cx, cy = 2.2 * hash_unit(k, 0, seed) - 1.1, 2.2 * hash_unit(k, 1, seed) - 1.1
         size = 0.06 + 0.4 * hash_unit(k, 2, seed) ** 2
@@ -173,14 +157,14 @@ def _picture(material, u, v, w, seed, half_u, half_v):
             inside = size - math.hypot(x - cx, y - cy)
         else:
             inside = min(size - abs(x - cx), size * (0.2 + hash_unit(k, 4, seed)) - abs(y - cy))
-        cover = min(1.0, max(0.0, 0.5 + inside / max(w, 1e-4)))
+        cover = unit(0.5 + inside / max(w, 1e-4))
         if cover > 0:
             shade = 1 + fractal(x, y, 0.3, 3, w, seed + k)
             grey = 0.5 * hash_unit(k, 8, seed) ** 2
-            r = r * (1 - cover) + cover * shade * (grey + 0.5 * hash_unit(k, 5, seed) ** 2)
-            g = g * (1 - cover) + cover * shade * (grey + 0.5 * hash_unit(k, 6, seed) ** 2)
-            b = b * (1 - cover) + cover * shade * (grey + 0.5 * hash_unit(k, 7, seed) ** 2)
-    return max(r, 0.0), max(g, 0.0), max(b, 0.0)
+            red, green, blue = hash_unit(k, 5, seed), hash_unit(k, 6, seed), hash_unit(k, 7, seed)
+            disc = grey + 0.5 * red**2, grey + 0.5 * green**2, grey + 0.5 * blue**2
+            painted = mix(painted, scale(disc, shade), cover)
+    return max(painted[0], 0.0), max(painted[1], 0.0), max(painted[2], 0.0)
 
 
 @nb.njit(**OPTIONS)
@@ -199,8 +183,8 @@ def _text(material, u, v, w, seed, half_u, half_v):
             column, row = math.floor((u / (0.62 * tall) - letter) * 6), math.floor(y * 7)
             if column < 5:
                 ink = 1.0 if hash_unit(column + 8 * row, letter + 131 * line, seed + 1) < 0.5 else 0.0
-                ink += (0.5 - ink) * min(1.0, max(0.0, w / (0.2 * tall) - 0.3))
-    ink *= min(1.0, max(0.0, 2.0 - 1.2 * w / tall)) if w > tall else 1.0
+                ink += (0.5 - ink) * unit(w / (0.2 * tall) - 0.3)
+    ink *= unit(2.0 - 1.2 * w / tall) if w > tall else 1.0
     return _mix(material, COLOR_A, COLOR_B, ink)
 
 
@@ -210,7 +194,7 @@ def _books(material, u, v, w, seed):
     size = material[SIZE_U]
     x = u / size + 0.6 * noise(1.3 * u / size, 0.5, seed)
     book = math.floor(x)
-    shown = min(1.0, max(0.0, 1.6 - w / size))
+    shown = unit(1.6 - w / size)
     hue, light = hash_unit(book, 0, seed), 0.35 + shown * (0.6 * hash_unit(book, 1, seed) ** 2 - 0.2)
     gap = 1.0 - 0.6 * shown * pulse(x, 0.12, w / size)
     band = pulse(v / 0.11 + hash_unit(book, 2, seed), 0.25, w / 0.11) if hash_unit(book, 3, seed) < 0.7 else 0.0
@@ -232,13 +216,8 @@ def _rug(material, u, v, w, seed, half_u, half_v):
         t = pulse((abs(u) + abs(v)) / (2 * size), 0.35, w / size)
         t = 0.6 * t + 0.4 * pulse((abs(u) - abs(v)) / (2 * size) + 100, 0.5, w / size)
     t += 0.6 * fractal(u, v, 0.06, 3, w, seed)
-    r, g, b = _mix(material, COLOR_A, COLOR_B, t)
     spot = 0.5 * pulse(edge / (4 * size), 0.2, w / (4 * size))
-    return (
-        r * (1 - spot) + material[COLOR_C] * spot,
-        g * (1 - spot) + material[COLOR_C + 1] * spot,
-        b * (1 - spot) + material[COLOR_C + 2] * spot,
-    )
+    return mix(_mix(material, COLOR_A, COLOR_B, t), take(material, COLOR_C), spot)
 
 
 @nb.njit(**OPTIONS)
@@ -255,14 +234,9 @@ def _terrazzo(material, u, v, w, seed):
             away = math.hypot(x - px, y - py) / (0.3 + 0.7 * hash_unit(i + di, j + dj, seed + 2))
             if away < best:
                 best, chip = away, hash_unit(i + di, j + dj, seed + 3)
-    cover = min(1.0, max(0.0, 0.5 + (0.55 - best) / max(w / size, 1e-3)))
-    cover = cover + (0.4 - cover) * min(1.0, max(0.0, w / size - 0.5))
-    r, g, b = _mix(material, COLOR_B, COLOR_C, chip)
-    return (
-        material[COLOR_A] * (1 - cover) + r * cover,
-        material[COLOR_A + 1] * (1 - cover) + g * cover,
-        material[COLOR_A + 2] * (1 - cover) + b * cover,
-    )
+    cover = unit(0.5 + (0.55 - best) / max(w / size, 1e-3))
+    cover = cover + (0.4 - cover) * unit(w / size - 0.5)
+    return mix(take(material, COLOR_A), _mix(material, COLOR_B, COLOR_C, chip), cover)
 
 
 @nb.njit(**OPTIONS)
@@ -276,28 +250,26 @@ def color(material, u, v, w, half_u, half_v):
         half_u, half_v: half the size of the surface, metres, for patterns that fill it.
     """
     kind, seed = int(material[KIND]), int(material[SEED])
+    reflectance = take(material, COLOR_A)
     if kind == 1:
-        r, g, b = _planks(material, u, v, w, seed)
+        reflectance = _planks(material, u, v, w, seed)
     elif kind == 2:
-        r, g, b = _tiles(material, u, v, w, seed)
+        reflectance = _tiles(material, u, v, w, seed)
     elif kind == 3:
-        r, g, b = _stripes(material, u, v, w, seed)
+        reflectance = _stripes(material, u, v, w, seed)
     elif kind == 4:
-        r, g, b = _stone(material, u, v, w, seed)
+        reflectance = _stone(material, u, v, w, seed)
     elif kind == 5:
-        r, g, b = _picture(material, u, v, w, seed, half_u, half_v)
+        reflectance = _picture(material, u, v, w, seed, half_u, half_v)
     elif kind == 6:
-        r, g, b = _text(material, u, v, w, seed, half_u, half_v)
+        reflectance = _text(material, u, v, w, seed, half_u, half_v)
     elif kind == 7:
-        r, g, b = _books(material, u, v, w, seed)
+        reflectance = _books(material, u, v, w, seed)
     elif kind == 8:
-        r, g, b = _rug(material, u, v, w, seed, half_u, half_v)
+        reflectance = _rug(material, u, v, w, seed, half_u, half_v)
     elif kind == 9:
-        r, g, b = _terrazzo(material, u, v, w, seed)
-    else:
-        r, g, b = material[COLOR_A], material[COLOR_A + 1], material[COLOR_A + 2]
-    worn = 1 + material[MOTTLE] * fractal(u, v, 0.9, 7, w, seed + 77)
-    return r * worn, g * worn, b * worn
+        reflectance = _terrazzo(material, u, v, w, seed)
+    return scale(reflectance, 1 + material[MOTTLE] * fractal(u, v, 0.9, 7, w, seed + 77))
 
 
 def mip_levels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -325,15 +297,13 @@ def _bilinear(texels, start, width, height, u, v):
     left, top = math.floor(x), math.floor(y)
     fx, fy = x - left, y - top
     left, top = int(left), int(top)
-    red, green, blue = 0.0, 0.0, 0.0
+    total = (0.0, 0.0, 0.0)
     for corner in range(4):
         column, row = left + (corner & 1), top + (corner >> 1)
         weight = (fx if corner & 1 else 1 - fx) * (fy if corner >> 1 else 1 - fy)
         texel = texels[start + (row + height) % height * width + (column + width) % width]
-        red += weight * _LINEAR[texel[0]]
-        green += weight * _LINEAR[texel[1]]
-        blue += weight * _LINEAR[texel[2]]
-    return red, green, blue
+        total = advance(total, weight, (_LINEAR[texel[0]], _LINEAR[texel[1]], _LINEAR[texel[2]]))
+    return total
 
 
 @nb.njit(**OPTIONS)
@@ -352,13 +322,11 @@ def image_color(texels, image, u, v, w):
         start += width * height
         width, height = max(width // 2, 1), max(height // 2, 1)
         level -= 1
-    red, green, blue = _bilinear(texels, start, width, height, u, v)
+    light = _bilinear(texels, start, width, height, u, v)
     if level > 0 and (width > 1 or height > 1):
-        level = min(level, 1.0)
-        start += width * height
-        r, g, b = _bilinear(texels, start, max(width // 2, 1), max(height // 2, 1), u, v)
-        red, green, blue = red + level * (r - red), green + level * (g - green), blue + level * (b - blue)
-    return red, green, blue
+        coarse = _bilinear(texels, start + width * height, max(width // 2, 1), max(height // 2, 1), u, v)
+        light = advance(light, min(level, 1.0), subtract(coarse, light))
+    return light
 
 
 @nb.njit(**OPTIONS)

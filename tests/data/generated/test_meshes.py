@@ -56,11 +56,12 @@ def test_rays_hit_the_nearest_triangle_of_all_placed_meshes() -> None:
         origin = rng.uniform(-4, 4, 3)
         direction = bodies[rng.integers(5)][1] + rng.normal(0, 0.5, 3) - origin
         direction /= np.linalg.norm(direction)
-        t, body, triangle = first_hit(scene.arrays.bodies, *origin, *direction, math.inf, False, True)
+        ray = tuple(origin), tuple(direction)
+        t, body, triangle = first_hit(scene.arrays.bodies, *ray, math.inf, False, True)
         exact = _nearest(triangles, origin, direction)
         assert t == pytest.approx(exact, rel=1e-5, abs=1e-5)
         assert (body >= 0) == (triangle >= 0) == math.isfinite(exact)
-        assert (first_hit(scene.arrays.bodies, *origin, *direction, 2.0, True, True)[1] >= 0) == (exact < 2)
+        assert (first_hit(scene.arrays.bodies, *ray, 2.0, True, True)[1] >= 0) == (exact < 2)
         hits += body >= 0
     assert 60 < hits < 290
 
