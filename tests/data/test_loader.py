@@ -53,11 +53,11 @@ def test_batches_from_a_step_equal_those_of_an_uninterrupted_run(tmp_path: Path)
 
 @pytest.mark.slow
 def test_batches_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
-    scenes = GeneratedTriplets(count=5, samples=1)
+    source = _triplets(tmp_path, 5)
     options = {"height": 8, "batch_size": 2, "seed": 1, "augmentation": Augmentation(exposure=0.3)}
-    alone = _take(Loader(scenes, **options), 3)
-    assert _equal(_take(Loader(scenes, workers=2, **options), 3), alone)
-    assert not _equal(_take(Loader(scenes, **(options | {"seed": 2})), 3), alone)
+    alone = _take(Loader(source, **options), 3)
+    assert _equal(_take(Loader(source, workers=2, **options), 3), alone)
+    assert not _equal(_take(Loader(source, **(options | {"seed": 2})), 3), alone)
 
 
 def test_ranks_get_consecutive_parts_of_each_batch(tmp_path: Path) -> None:

@@ -110,14 +110,3 @@ def test_concatenated_sources_keep_their_order(tmp_path: Path, write_triplets: C
     assert len(concatenated) == 7
     names = [concatenated.sample(i, 8, 0).name for i in range(7)]
     assert names == ["a", "b", *(f"generated_0_{i:06d}" for i in range(3)), "a", "b"]
-
-
-@pytest.mark.shared
-def test_shared_samples_are_read(shared: Path) -> None:
-    (triplets,) = read_panogrf(shared / "data" / "mp3d_sample", "test", 256, [("m3d", 0.5)])
-    sample = TripletSource(triplets).sample(0, 64, 0)
-    assert sample.context.names == ("00", "02") and sample.targets.names == ("01",)
-    assert sample.context.depths is not None
-    source = TripletSource(read_game_maps(shared / "data" / "bsp_demo"))
-    assert len(source) == 12
-    assert source.sample(0, 64, 0).targets.depths is not None

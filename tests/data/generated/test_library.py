@@ -66,9 +66,7 @@ def test_pieces_have_the_size_category_and_place_of_the_catalogue(folder: Path) 
     bed, chair = load_furniture(folder).pieces
     assert (bed.name, bed.category, bed.place, bed.size) == ("Iron bed", "bed", WALL, (1.4, 0.5, 2.0))
     assert (chair.category, chair.place, chair.size) == ("chair", FREE, (0.4, 0.6, 0.5))
-    assert bed.mesh.corners.min() == pytest.approx(-1, abs=1e-4) and bed.mesh.corners.max() == pytest.approx(
-        1, abs=1e-4
-    )
+    assert (bed.mesh.corners.min(), bed.mesh.corners.max()) == pytest.approx((-1, 1), abs=1e-4)
 
 
 def test_glass_is_omitted_but_measured_and_the_front_of_a_model_faces_minus_z(folder: Path) -> None:
@@ -122,7 +120,7 @@ def test_the_attribution_names_authors_and_licences(folder: Path) -> None:
 
 def test_homes_contain_furniture_of_a_library_and_are_complete_without_one(folder: Path) -> None:
     library, found = load_furniture(folder), 0
-    for index in range(16):
+    for index in range(6):
         home = build_home(np.random.default_rng(index), library)
         found += int((home.variants[0].arrays.bodies.kinds == MESH).sum())
     assert found > 0
