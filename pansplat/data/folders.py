@@ -31,13 +31,7 @@ from pansplat.data.pairs import (
     list_panorama_files,
     too_many_panoramas,
 )
-from pansplat.data.poses import (
-    parse_convention,
-    read_number,
-    read_trajectory,
-    rigid_matrix,
-    to_cam2world,
-)
+from pansplat.data.poses import parse_convention, read_number, read_trajectory, rigid_matrix, to_cam2world
 from pansplat.errors import InputError
 from pansplat.files import expand_home, read_file
 from pansplat.strict_json import list_field, number_field, read_json

@@ -33,59 +33,36 @@ _SUBSAMPLING = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420, cv2.IMWRITE_JPEG_SAMPLING_
 
 @dataclass(frozen=True)
 class CameraEffects:
-    """Strengths of the effects of `photograph`. Zero or None switches an effect off; `NO_EFFECTS` has all off."""
+    """Strengths of the effects of `photograph`: mostly the largest value of a random one.
 
-    grey: tuple[float, float] | None = (0.14, 0.38)
-    """Range of the linear light to which automatic exposure maps a tour's metered light. None: the light is kept."""
-    exposure_stops: float = 0.7
-    """Largest difference of exposure between two views of a tour, stops, apart from `room_stops`."""
-    room_stops: float | None = 1.25
-    """Largest difference of an exposed view's metered light from its tour's, stops: views of darker and brighter rooms
-    are exposed longer and shorter to stay within it. None: no limit."""
-    tour_white_balance: float = 0.15
-    """Largest relative error of the red and blue gains of a tour, more often warm than cold."""
-    view_white_balance: float = 0.04
-    """Largest relative deviation of a view's red and blue gains from those of its tour."""
-    flare: float = 0.08
-    """Largest fraction of the light that the lens scatters: bloom around windows and lamps, and a veil."""
-    local_contrast: float = 0.65
-    """Largest compression of the contrast between regions, as in merged exposures; 1 makes all regions equal."""
-    gamma: float = 0.12
-    """Largest relative deviation of the tone curve's exponent from sRGB."""
-    shoulder: float = 0.6
-    """Largest part of the tone curve, from white downwards, that compresses highlights instead of clipping them."""
-    contrast: float = 0.35
-    """Largest strength of an S-shaped tone curve, with either sign; below 1."""
-    saturation: float = 0.35
-    """Largest relative change of the saturation, more often up than down."""
-    pale_probability: float = 0.03
-    """Probability that a tour is almost grey."""
-    vignetting: float = 0.25
-    """Largest relative loss of light at the seams between lenses."""
-    lens_exposure: float = 0.05
-    """Largest relative deviation of one lens's exposure."""
-    seam_softness: float = 0.4
-    """Largest fraction of fine detail that is lost near the seams."""
-    softness: float = 0.2
-    """Largest fraction of fine detail that is lost everywhere."""
-    sharpening: float = 1.2
-    """Largest gain of fine detail by sharpening, which makes halos."""
-    seam_shift_degrees: float = 1.0
-    """Largest misalignment of the images of two lenses at their seam, degrees."""
-    pose_degrees: float = 0.3
-    """Largest rotation of a view against its pose, degrees."""
-    nadir_probability: float = 0.85
-    """Probability that a tripod, patch or cap covers the nadir of a tour."""
-    zenith_probability: float = 0.12
-    """Probability that a patch or cap covers the zenith of a tour."""
-    cap_degrees: float = 25.0
-    """Largest radius of patches and caps around the poles, degrees."""
-    operator_probability: float = 0.04
-    """Probability that a person stands below and behind the camera in all views of a tour."""
-    noise: float = 0.008
-    """Largest standard deviation of the noise at mid-grey, of 1."""
-    jpeg_quality: tuple[int, int] | None = (60, 98)
-    """Range of the JPEG quality, which includes quantisation to 8 bits and often chroma subsampling."""
+    Zero or None switches an effect off; `NO_EFFECTS` has all off. "Relative" is a fraction of 1.
+    """
+
+    grey: tuple[float, float] | None = (0.14, 0.38)  # light to which exposure maps a tour's metered light; None: kept
+    exposure_stops: float = 0.7  # difference of exposure between two views of a tour, apart from `room_stops`
+    room_stops: float | None = 1.25  # difference of an exposed view's metered light from its tour's; None: no limit
+    tour_white_balance: float = 0.15  # relative error of a tour's red and blue gains, more often warm than cold
+    view_white_balance: float = 0.04  # relative deviation of a view's red and blue gains from those of its tour
+    flare: float = 0.08  # fraction of the light that the lens scatters: bloom around windows and lamps, and a veil
+    local_contrast: float = 0.65  # compression of the contrast between regions; 1 makes all regions equal
+    gamma: float = 0.12  # relative deviation of the tone curve's exponent from sRGB
+    shoulder: float = 0.6  # part of the tone curve, from white down, that compresses highlights instead of clipping
+    contrast: float = 0.35  # strength of an S-shaped tone curve, with either sign; below 1
+    saturation: float = 0.35  # relative change, more often up than down
+    pale_probability: float = 0.03  # that a tour is almost grey
+    vignetting: float = 0.25  # relative loss of light at the seams between lenses
+    lens_exposure: float = 0.05  # relative deviation of one lens's exposure
+    seam_softness: float = 0.4  # fraction of fine detail that is lost near the seams
+    softness: float = 0.2  # fraction of fine detail that is lost everywhere
+    sharpening: float = 1.2  # gain of fine detail by sharpening, which makes halos
+    seam_shift_degrees: float = 1.0  # misalignment of the images of two lenses at their seam
+    pose_degrees: float = 0.3  # rotation of a view against its pose
+    nadir_probability: float = 0.85  # that a tripod, patch or cap covers the nadir of a tour
+    zenith_probability: float = 0.12  # that a patch or cap covers the zenith of a tour
+    cap_degrees: float = 25.0  # radius of patches and caps around the poles
+    operator_probability: float = 0.04  # that a person stands below and behind the camera in all views of a tour
+    noise: float = 0.008  # standard deviation at mid-grey, of 1
+    jpeg_quality: tuple[int, int] | None = (60, 98)  # range, with quantisation to 8 bits and often chroma subsampling
 
 
 _NONE_IS_OFF = ("grey", "room_stops", "jpeg_quality")

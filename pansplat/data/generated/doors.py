@@ -68,11 +68,11 @@ def add_wall_box(
     across: tuple[float, float],
     material: int,
 ) -> None:
-    """Add a box by its extents along a wall, above the floor, and across the plane of the wall, metres."""
+    """Add a box by its extents along a wall, above the floor, and across the plane of the wall in any order, metres."""
     if along[1] - along[0] < 1e-6 or rise[1] - rise[0] < 1e-6:
         return
     x, z = wall.point((along[0] + along[1]) / 2, (across[0] + across[1]) / 2)
-    thick, wide = (across[1] - across[0]) / 2, (along[1] - along[0]) / 2
+    thick, wide = abs(across[1] - across[0]) / 2, (along[1] - along[0]) / 2
     half = (thick, wide) if wall.axis == 0 else (wide, thick)
     builder.add_box((x, -(rise[0] + rise[1]) / 2, z), (half[0], (rise[1] - rise[0]) / 2, half[1]), material)
 
@@ -208,21 +208,19 @@ def add_window(builder: SceneBuilder, wall: Wall, hole: Hole, style: DoorStyle, 
     if cased:
         add_casing(builder, wall, hole, style, style.casing)
     elif hole.low > 0:
-        across = (-0.03, 0.15) if sign > 0 else (-0.15, 0.03)
-        add_wall_box(
-            builder, wall, (hole.start - 0.02, hole.end + 0.02), (hole.low, hole.low + 0.02), across, style.trim
-        )
-    middle = sorted((sign * 0.13, sign * 0.19))
+        along, rise = (hole.start - 0.02, hole.end + 0.02), (hole.low, hole.low + 0.02)
+        add_wall_box(builder, wall, along, rise, (-sign * 0.03, sign * 0.15), style.trim)
+    middle = (sign * 0.13, sign * 0.19)
     bar = rng.uniform(0.025, 0.05)
     columns = int(rng.integers(2, 4)) if hole.width > 1.1 else 1 + int(rng.random() < 0.3)
     for k in range(columns + 1):
         at = hole.start + (hole.width - bar) * k / columns
-        add_wall_box(builder, wall, (at, at + bar), (hole.low, hole.top), (middle[0], middle[1]), frame)
+        add_wall_box(builder, wall, (at, at + bar), (hole.low, hole.top), middle, frame)
     rises = [hole.low, hole.top - bar]
     if hole.kind == HoleKind.WINDOW and rng.random() < 0.4:
         rises.append(hole.low + rng.uniform(0.4, 0.6) * (hole.top - hole.low))
     for rise in rises:
-        add_wall_box(builder, wall, (hole.start, hole.end), (rise, rise + bar), (middle[0], middle[1]), frame)
+        add_wall_box(builder, wall, (hole.start, hole.end), (rise, rise + bar), middle, frame)
     if style.has_glass:
         x, z = wall.point(hole.middle, sign * 0.16)
         half = (0.003, hole.width / 2) if wall.axis == 0 else (hole.width / 2, 0.003)
@@ -233,32 +231,16 @@ def add_window(builder: SceneBuilder, wall: Wall, hole: Hole, style: DoorStyle, 
 def _add_shade(builder: SceneBuilder, wall: Wall, hole: Hole, sign: int, curtains: float) -> None:
     rng = builder.rng
     kind = rng.random()
-    high = hole.top - hole.low
+    high, span = hole.top - hole.low, (hole.start + 0.02, hole.end - 0.02)
     if kind < 0.18:  # slats
         material, pitch = materials.trim(builder), rng.uniform(0.035, 0.06)
         bottom = hole.low + (0.0 if rng.random() < 0.6 else rng.uniform(0.3, 0.8) * high)
         for rise in np.arange(bottom + 0.03, hole.top - 0.02, pitch):
-            across = sorted((sign * 0.06, sign * 0.095))
-            add_wall_box(
-                builder,
-                wall,
-                (hole.start + 0.02, hole.end - 0.02),
-                (rise, rise + 0.004),
-                (across[0], across[1]),
-                material,
-            )
+            add_wall_box(builder, wall, span, (rise, rise + 0.004), (sign * 0.06, sign * 0.095), material)
     elif kind < 0.3:  # a roller blind
         material = materials.trim(builder)
         drop = rng.uniform(0.1, 0.9) * high
-        across = sorted((sign * 0.05, sign * 0.06))
-        add_wall_box(
-            builder,
-            wall,
-            (hole.start + 0.02, hole.end - 0.02),
-            (hole.top - drop, hole.top),
-            (across[0], across[1]),
-            material,
-        )
+        add_wall_box(builder, wall, span, (hole.top - drop, hole.top), (sign * 0.05, sign * 0.06), material)
     elif kind < 0.3 + curtains:  # curtains beside the window, with folds
         cloth, rod = materials.fabric(builder), materials.metal(builder)
         width, low = rng.uniform(0.15, 0.35), 0.04 if rng.random() < 0.7 else max(0.0, hole.low - 0.2)
@@ -271,20 +253,17 @@ def _add_shade(builder: SceneBuilder, wall: Wall, hole: Hole, sign: int, curtain
                 away = 0.07 + 0.02 * (k % 2)
                 x, z = wall.point(at + width / 8, -sign * away)
                 builder.add_cylinder((x, -(low + top) / 2, z), width / 7, (top - low) / 2, cloth)
-        across = sorted((-sign * 0.06, -sign * 0.085))
-        add_wall_box(
-            builder, wall, (hole.start - width, hole.end + width), (top, top + 0.025), (across[0], across[1]), rod
-        )
+        span = (hole.start - width, hole.end + width)
+        add_wall_box(builder, wall, span, (top, top + 0.025), (-sign * 0.06, -sign * 0.085), rod)
 
 
 def add_entrance(builder: SceneBuilder, wall: Wall, hole: Hole, style: DoorStyle) -> None:
     """Add the closed door of a home."""
     rng, sign = builder.rng, -1 if wall.rooms[0] == OUTSIDE else 1
     leaf = style.leaf if rng.random() < 0.5 else materials.trim(builder)
-    sides = sorted((sign * 0.03, sign * 0.08))
-    add_wall_box(builder, wall, (hole.start, hole.end), (0.0, hole.top), (sides[0], sides[1]), leaf)
+    add_wall_box(builder, wall, (hole.start, hole.end), (0.0, hole.top), (sign * 0.03, sign * 0.08), leaf)
     glass = builder.add_material(Pattern.STONE, (0.6, 0.65, 0.7), (0.9, 0.9, 0.95), size=0.15, fraction=0, glow=0.6)
-    across = sorted((sign * 0.02, sign * 0.05))
+    across = (sign * 0.02, sign * 0.05)
     rows, columns = (3, 2) if rng.random() < 0.7 else (2, 1)
     wide, tall = (hole.width - 0.16) / columns, (hole.top - 0.2) / rows
     for row in range(rows):
@@ -292,7 +271,7 @@ def add_entrance(builder: SceneBuilder, wall: Wall, hole: Hole, style: DoorStyle
             start, low = hole.start + 0.08 + column * wide, 0.12 + row * tall
             material = glass if row == rows - 1 and rng.random() < 0.3 else leaf
             along, rise = (start + 0.05, start + wide - 0.05), (low + 0.05, low + tall - 0.05)
-            add_wall_box(builder, wall, along, rise, (across[0], across[1]), material)
+            add_wall_box(builder, wall, along, rise, across, material)
     x, z = wall.point(hole.start + 0.07 if rng.random() < 0.5 else hole.end - 0.07, -sign * 0.01)
     for up in (1.0, 1.15):
         builder.add_ellipsoid((x, -up, z), (0.03, 0.03, 0.04), style.knob)

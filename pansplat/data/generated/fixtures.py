@@ -6,7 +6,7 @@ import numpy as np
 
 from pansplat.data.generated import materials
 from pansplat.data.generated.furniture import Place, add_fixture, clutter
-from pansplat.data.generated.plans import Plan, Rectangle, RoomKind, Side
+from pansplat.data.generated.plans import Plan, Rectangle, RoomKind, Side, overlaps
 from pansplat.data.generated.scene import SceneBuilder
 from pansplat.data.generated.textures import Pattern
 
@@ -172,18 +172,13 @@ def _add_kitchen(
         length = rng.uniform(1.0, min(2.2, max(x1 - x0, z1 - z0) - 2.2))
         place = Place(builder, x, z, 0.0 if along_x else np.pi / 2)
         area = (length / 2 + 0.1, 0.5) if along_x else (0.5, length / 2 + 0.1)
-        if not _overlaps((x - area[0], z - area[1], x + area[0], z + area[1]), occupied):
+        if not overlaps((x - area[0], z - area[1], x + area[0], z + area[1]), occupied):
             occupied.append((x - area[0], z - area[1], x + area[0], z + area[1]))
             place.add_box(0, 0.44, 0, length, 0.88, 0.7, front)
             place.add_box(0, 0.9, 0, length + 0.1, 0.04, 0.9, top)
             count = max(1, round(length / 0.5))
             for k in range(count):
                 _front(place, (k + 0.5) * length / count - length / 2, 0.1, 0.86, 0.7, length / count, front, knob)
-
-
-def _overlaps(place: Rectangle, occupied: list[Rectangle]) -> bool:
-    x0, z0, x1, z1 = place
-    return any(x1 > a and x0 < c and z1 > b and z0 < d for a, b, c, d in occupied)
 
 
 def _add_counter(

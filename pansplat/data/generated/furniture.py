@@ -10,7 +10,7 @@ import numpy as np
 from pansplat.data.generated import materials
 from pansplat.data.generated.library import FurniturePiece
 from pansplat.data.generated.meshes import MeshMaterial
-from pansplat.data.generated.plans import Plan, Rectangle, RoomKind
+from pansplat.data.generated.plans import Plan, Rectangle, RoomKind, overlaps
 from pansplat.data.generated.scene import SceneBuilder
 from pansplat.data.generated.textures import Pattern
 
@@ -418,7 +418,7 @@ def _is_free(place: Rectangle, occupied: list[Rectangle], room: Rectangle) -> bo
     x0, z0, x1, z1 = place
     if x0 < room[0] + 0.02 or z0 < room[1] + 0.02 or x1 > room[2] - 0.02 or z1 > room[3] - 0.02:
         return False
-    return all(x1 < t[0] or x0 > t[2] or z1 < t[1] or z0 > t[3] for t in occupied)
+    return not overlaps(place, occupied)
 
 
 def _add_rug(builder: SceneBuilder, room: Rectangle) -> None:

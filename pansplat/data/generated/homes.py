@@ -27,7 +27,7 @@ from pansplat.data.generated.fixtures import add_ceiling_lamp, add_details, add_
 from pansplat.data.generated.furniture import Place, chair, crates, furnish
 from pansplat.data.generated.library import FurnitureLibrary
 from pansplat.data.generated.lighting import LightMood, add_lights, sample_mood
-from pansplat.data.generated.plans import OUTER, Hole, HoleKind, Plan, Rectangle, RoomKind, sample_plan
+from pansplat.data.generated.plans import OUTER, Hole, HoleKind, Plan, Rectangle, RoomKind, overlaps, sample_plan
 from pansplat.data.generated.raytracer import FLOOR
 from pansplat.data.generated.scene import GeneratedScene, SceneBuilder
 from pansplat.data.generated.structure import (
@@ -343,11 +343,7 @@ def _find_place(
     for _ in range(6):
         x, z = rng.uniform(x0 + 0.6, max(x1 - 0.6, x0 + 0.6)), rng.uniform(z0 + 0.6, max(z1 - 0.6, z0 + 0.6))
         place = (x - 0.6, z - 0.6, x + 0.6, z + 0.6)
-        if (
-            place[2] < x1
-            and place[3] < z1
-            and all(place[2] < a or place[0] > c or place[3] < b or place[1] > d for a, b, c, d in occupied)
-        ):
+        if place[2] < x1 and place[3] < z1 and not overlaps(place, occupied):
             occupied.append(place)
             return x, z
     return None

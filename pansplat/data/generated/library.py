@@ -22,15 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pansplat.atomic import replacing
-from pansplat.data.generated.meshes import (
-    Mesh,
-    MeshMaterial,
-    Texture,
-    make_mesh,
-    read_obj,
-    select_triangles,
-    simplify,
-)
+from pansplat.data.generated.meshes import Mesh, MeshMaterial, Texture, make_mesh, read_obj, select_triangles, simplify
 from pansplat.errors import InputError
 from pansplat.strict_json import parse_json
 

@@ -247,6 +247,12 @@ class Side:
         return spans
 
 
+def overlaps(area: Rectangle, others: list[Rectangle]) -> bool:
+    """Whether a rectangle has area in common with one of the others."""
+    x0, z0, x1, z1 = area
+    return any(x1 > a and x0 < c and z1 > b and z0 < d for a, b, c, d in others)
+
+
 _SOCIAL = (RoomKind.LIVING, RoomKind.DINING, RoomKind.KITCHEN)
 
 

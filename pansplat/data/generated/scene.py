@@ -154,9 +154,8 @@ class SceneBuilder:
             half: half the size of the box, metres.
             materials: one for each material of the mesh.
         """
-        for material in mesh.materials:
-            if material.texture is not None:
-                self.textures.setdefault(material.texture, len(self.textures))
+        for texture in filter(None, (material.texture for material in mesh.materials)):
+            self.textures.setdefault(texture, len(self.textures))
         number = self.meshes.setdefault(mesh, len(self.meshes))
         self._add_body(MESH, centre, half, len(self.mesh_materials), yaw, 0, number)
         self.mesh_materials += materials

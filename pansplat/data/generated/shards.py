@@ -90,12 +90,7 @@ def render_tour(settings: TourSettings, index: int) -> Tour:
 
 
 def write_shards(
-    folder: Path,
-    count: int,
-    settings: TourSettings,
-    *,
-    workers: int = 1,
-    progress: Callable[[int], None] | None = None,
+    folder: Path, count: int, settings: TourSettings, *, workers: int = 1, progress: Callable[[int], None] | None = None
 ) -> int:
     """Write the shards of tours 0 to `count` - 1, rounded up to whole shards, and return the number of new shards.
 
