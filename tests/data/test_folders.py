@@ -58,14 +58,10 @@ def test_two_images_with_poses_are_a_pair(tmp_path: Path) -> None:
     assert pair.load_targets(8).images.shape == (0, 3, 8, 16)
 
 
-def test_the_path_may_be_the_pose_file_or_a_string(tmp_path: Path) -> None:
-    folder = _folder(tmp_path / "room")
-    assert load_pairs(folder / "poses.json")[0].name == load_pairs(str(folder))[0].name == "room"
-
-
-def test_images_are_read_only_by_load_context(tmp_path: Path) -> None:
+def test_the_path_may_be_the_pose_file_and_images_are_read_only_by_load_context(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "room")
     (folder / "left.png").write_bytes(b"")
+    assert load_pairs(folder / "poses.json")[0].name == load_pairs(str(folder))[0].name == "room"
     (pair,) = load_pairs(folder)
     with pytest.raises(InputError, match="0 bytes"):
         pair.load_context(8)
@@ -93,7 +89,7 @@ def test_a_pair_has_depth_masks_range_and_targets(tmp_path: Path) -> None:
     assert views.masks[1].all()
 
 
-def test_mask_files_are_found_by_name(tmp_path: Path) -> None:
+def test_mask_files_are_found_by_name_and_must_show_some_scene(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "room")
     whole, own = torch.ones(3, 16, 32), torch.ones(3, 16, 32)
     whole[:, :, :4], own[:, :, 20:] = 0, 0
@@ -102,10 +98,6 @@ def test_mask_files_are_found_by_name(tmp_path: Path) -> None:
     masks = load_pairs(folder)[0].load_context(16).masks
     assert torch.equal(masks[0], own[0] > 0)
     assert torch.equal(masks[1], whole[0] > 0)
-
-
-def test_a_mask_without_scene_is_refused(tmp_path: Path) -> None:
-    folder = _folder(tmp_path / "room")
     write_image(folder / "right_mask.png", torch.zeros(3, 16, 32))
     with pytest.raises(InputError, match=r"right_mask\.png: needed some pixels that show the scene.*invert the mask"):
         load_pairs(folder)[0].load_context(16)
@@ -282,32 +274,21 @@ def test_invalid_pairs_files_are_refused(tmp_path: Path, content: dict, message:
         load_pairs(folder)
 
 
-def test_invalid_json_is_refused_with_the_line(tmp_path: Path) -> None:
-    folder = _folder(tmp_path / "room")
-    (folder / "poses.json").write_text('{\n "convention": "cam2world opencv",\n}')
-    with pytest.raises(InputError, match=r"poses\.json: needed JSON, got invalid text at line 3"):
-        load_pairs(folder)
-
-
-def test_one_panorama_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="needed poses of two or more panoramas, got 1"):
-        load_pairs(_folder(tmp_path / "room", ["only.png"]))
-
-
-def test_images_without_poses_are_refused(tmp_path: Path) -> None:
-    _write_panorama(tmp_path / "left.png")
-    with pytest.raises(InputError, match=r"needed two or more panoramas .*got left\.png; give"):
-        load_pairs(tmp_path)
-
-
-def test_paths_without_panoramas_are_refused(tmp_path: Path) -> None:
+def test_folders_without_two_panoramas_with_poses_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="got none; give the folder"):
         load_pairs(tmp_path)
     with pytest.raises(InputError, match="got no such path"):
         load_pairs(tmp_path / "gone")
-    _write_panorama(tmp_path / "a.png")
+    with pytest.raises(InputError, match="needed poses of two or more panoramas, got 1"):
+        load_pairs(_folder(tmp_path / "room", ["only.png"]))
+    (tmp_path / "room" / "poses.json").write_text('{\n "convention": "cam2world opencv",\n}')
+    with pytest.raises(InputError, match=r"poses\.json: needed JSON, got invalid text at line 3"):
+        load_pairs(tmp_path / "room")
+    _write_panorama(tmp_path / "left" / "left.png")
+    with pytest.raises(InputError, match=r"needed two or more panoramas .*got left\.png; give"):
+        load_pairs(tmp_path / "left")
     with pytest.raises(InputError, match="needed a folder of posed panoramas or its file of poses, got another file"):
-        load_pairs(tmp_path / "a.png")
+        load_pairs(tmp_path / "left" / "left.png")
 
 
 def test_incomplete_panogrf_views_are_refused(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from pansplat.data.generated.plans import OUTSIDE
 
 @pytest.fixture(scope="module")
 def homes() -> list[Home]:
-    return [build_home(np.random.default_rng((11, index))) for index in range(6)]
+    return [build_home(np.random.default_rng((11, index))) for index in range(12)]
 
 
 def test_equal_seeds_give_equal_homes(homes: list[Home]) -> None:
@@ -21,7 +21,7 @@ def test_equal_seeds_give_equal_homes(homes: list[Home]) -> None:
 
 
 def test_rays_leave_a_home_only_through_its_openings(homes: list[Home]) -> None:
-    for home in homes:
+    for home in homes[:6]:
         for room in home.plan.rooms[:3]:
             pose = np.eye(4)
             pose[0, 3], pose[1, 3], pose[2, 3] = room.middle[0], -1.9, room.middle[1]
@@ -56,7 +56,7 @@ def test_cameras_are_in_rooms_near_each_other_and_clear_of_bodies(homes: list[Ho
 
 
 def test_light_is_positive_and_finite(homes: list[Home]) -> None:
-    for home in homes:
+    for home in homes[:6]:
         for variant, pose in home.sample_cameras(np.random.default_rng(6), 3):
             image, depth = home.variants[variant].panorama(pose, 32, 2)
             assert np.isfinite(image).all() and image.min() >= 0

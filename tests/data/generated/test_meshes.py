@@ -68,20 +68,11 @@ def test_rays_hit_the_nearest_triangle_of_all_placed_meshes() -> None:
 
 def test_meshes_of_spheres_are_shaded_as_spheres() -> None:
     """Interpolated normals, in a stretched and turned placement, agree with those of an ellipsoid."""
-    u, v = np.meshgrid(np.arange(64), np.arange(32), indexing="ij")
-    corner = [
-        np.stack(
-            (
-                np.sin(np.pi * (v + j) / 32) * np.cos(np.pi * (u + i) / 32),
-                np.cos(np.pi * (v + j) / 32),
-                np.sin(np.pi * (v + j) / 32) * np.sin(np.pi * (u + i) / 32),
-            ),
-            axis=-1,
-        )
-        for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))
-    ]
-    corners = np.concatenate([np.stack((corner[0], corner[k], corner[k + 1]), axis=-2) for k in (1, 2)])
-    corners = corners.reshape(-1, 3, 3).astype(np.float32)
+    azimuth, latitude = np.meshgrid(np.linspace(0, 2 * np.pi, 65), np.linspace(0, np.pi, 33), indexing="ij")
+    rise, across = np.cos(latitude), np.sin(latitude)
+    sphere = np.stack((across * np.cos(azimuth), rise, across * np.sin(azimuth)), axis=-1).astype(np.float32)
+    a, b, c, d = sphere[:-1, :-1], sphere[1:, :-1], sphere[1:, 1:], sphere[:-1, 1:]
+    corners = np.stack((np.stack((a, b, c), axis=-2), np.stack((a, c, d), axis=-2))).reshape(-1, 3, 3)
     material_ids, texcoords = np.zeros(len(corners), np.int32), np.zeros((len(corners), 3, 2), np.float32)
     ball = Mesh(corners, corners, texcoords, material_ids, GREY)
     images = []
