@@ -65,7 +65,7 @@ class Batch:
         images, target_images: RGB in [0, 1], float32.
         cam2world, target_cam2world: float64, OpenCV axes, metres.
         masks, target_masks: True where a pixel shows the scene.
-        depths, target_depths: radial distance in metres, 0 where unknown; None when no sample has depth.
+        depths: radial distance in metres, 0 where unknown; None when no sample has depth.
         near, far: radial depth range to search, metres, one value per view.
     """
 
@@ -77,7 +77,6 @@ class Batch:
     target_images: Float[Tensor, "batch target 3 height width"]
     target_cam2world: Float[Tensor, "batch target 4 4"]
     target_masks: Bool[Tensor, "batch target height width"]
-    target_depths: Float[Tensor, "batch target height width"] | None
     near: Float[Tensor, "batch view"]
     far: Float[Tensor, "batch view"]
 
@@ -119,7 +118,6 @@ def collate(samples: Sequence[Sample]) -> Batch:
         target_images=torch.stack([v.images for v in targets]),
         target_cam2world=torch.stack([v.cam2world for v in targets]),
         target_masks=torch.stack([v.masks for v in targets]),
-        target_depths=_stack_depths(targets),
         near=torch.tensor([[v.near] * views for v in contexts], dtype=torch.float32),
         far=torch.tensor([[v.far] * views for v in contexts], dtype=torch.float32),
     )

@@ -38,7 +38,7 @@ def test_game_map_triplets_are_samples_with_depth(tmp_path: Path, write_triplets
     assert batch.images.shape == (2, 2, 3, 8, 16) and batch.target_images.shape == (2, 1, 3, 8, 16)
     assert batch.cam2world[0, :, 0, 3].tolist() == [0, 2] and batch.target_cam2world[0, :, 0, 3].tolist() == [1]
     assert batch.depths is not None and batch.depths[0, :, 0, 0].tolist() == [1, 3]
-    assert batch.target_depths is not None and batch.target_depths.unique().tolist() == [2]
+    assert samples[0].targets.depths is not None and samples[0].targets.depths.unique().tolist() == [2]
     assert torch.equal(batch.near, torch.full((2, 2), 0.45)) and torch.equal(batch.far, torch.full((2, 2), 10.0))
     assert batch.masks.all() and batch.target_masks.dtype == torch.bool
     moved = batch.to("cpu")

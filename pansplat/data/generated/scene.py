@@ -138,15 +138,6 @@ class SceneBuilder:
         self.materials[material][KIND] = IMAGE
         return material
 
-    def add_mesh_materials(self, mesh: Mesh) -> list[int]:
-        """Add the materials of a mesh and return their indices."""
-        return [
-            self.add_material(Pattern.PLAIN, m.color, mottle=0.1, gloss=m.gloss)
-            if m.texture is None
-            else self.add_image_material(m.texture, m.color, gloss=m.gloss)
-            for m in mesh.materials
-        ]
-
     def add_mesh(self, mesh: Mesh, centre: Vector, half: Vector, materials: Sequence[int], yaw: float = 0) -> None:
         """Add a mesh that fills a box.
 

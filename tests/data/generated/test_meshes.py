@@ -27,7 +27,8 @@ def _scene(*bodies) -> GeneratedScene:
     builder = SceneBuilder(np.random.default_rng(0))
     grey = builder.add_material(Pattern.PLAIN, (0.5, 0.5, 0.5), mottle=0)
     for mesh, centre, half, yaw in bodies:
-        builder.add_mesh(mesh, centre, half, builder.add_mesh_materials(mesh), yaw)
+        shown = [builder.add_image_material(m.texture) if m.texture else grey for m in mesh.materials]
+        builder.add_mesh(mesh, centre, half, shown, yaw)
     builder.add_room((-20, -20, 20, 20), [grey] * 5, 0, 0, 20)
     return builder.finish((1, 1, 1), grey, grey)
 
