@@ -138,11 +138,7 @@ def _describe(attributes: dict[str, np.ndarray], entry: str) -> dict[str, Any]:
 
 
 def load_glb(path: Path) -> Scene:
-    """Read the Gaussians of a .glb, in the places where the nodes of its scene put them.
-
-    Raises:
-        InputError: not a .glb, damaged, compressed by an extension, or without Gaussians.
-    """
+    """Read the Gaussians of a .glb where the nodes of its scene put them; an InputError if it is unusable."""
     content = read_file(path, "a .glb scene", limit=_MAX_BYTES)
     document, binary = _read_chunks(content, path)
     required = [name for name in list_field(document, "extensionsRequired", path) if name != _EXTENSION]

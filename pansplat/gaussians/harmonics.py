@@ -39,13 +39,7 @@ def harmonics_basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
         c = 0.5 * _norm(15)
-        values += [
-            c * x * y,
-            -c * y * z,
-            0.25 * _norm(5) * (2 * zz - xx - yy),
-            -c * x * z,
-            0.5 * c * (xx - yy),
-        ]
+        values += [c * x * y, -c * y * z, 0.25 * _norm(5) * (2 * zz - xx - yy), -c * x * z, 0.5 * c * (xx - yy)]
     if degree >= 3:
         values += _cubic(x, y, z)
     if degree >= 4:

@@ -106,9 +106,7 @@ def save_ply_parts(scene: Scene, parts: Iterable[Gaussians], path: str | Path) -
     count = sum(run[2] for run in runs)
     if dropped:
         warnings.warn(
-            f"{path}: left out {dropped} of {count + dropped} Gaussians that are not finite",
-            InputWarning,
-            stacklevel=2,
+            f"{path}: left out {dropped} of {count + dropped} Gaussians that are not finite", InputWarning, stacklevel=2
         )
     return count
 

@@ -12,12 +12,7 @@ from torch import Tensor
 
 from pansplat.errors import InputError
 from pansplat.gaussians.harmonics import rotate_harmonics
-from pansplat.geometry.pose import (
-    interpolate_poses,
-    multiply_quats,
-    quats_from_rotations,
-    rotations_from_quats,
-)
+from pansplat.geometry.pose import interpolate_poses, multiply_quats, quats_from_rotations, rotations_from_quats
 from pansplat.geometry.world import scale_poses
 
 Gains = tuple[tuple[float, ...], ...]
@@ -167,11 +162,7 @@ class Scene:
         return dataclasses.replace(self, gaussians=self.gaussians.rotated(rotation), cam2world=poses)
 
     def pose_between(self, fraction: float) -> Float[Tensor, "4 4"]:
-        """The pose at a fraction between the first context camera (0) and the last (1).
-
-        Raises:
-            InputError: the scene has no cameras.
-        """
+        """The pose at a fraction from the first context camera (0) to the last (1); an InputError without cameras."""
         if not len(self.cam2world):
             raise InputError("the scene has no input cameras to interpolate; give a pose instead")
         return interpolate_poses(self.cam2world[0], self.cam2world[-1], fraction)

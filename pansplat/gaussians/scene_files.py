@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import json
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.gaussians.scene import Gains, Gaussians, Overlaps, Scene, prune
+from pansplat.gaussians.scene import Gains, Gaussians, Overlaps, Scene, empty_gaussians, prune
 from pansplat.geometry.world import MAX_POSITION, require_depth_range
 from pansplat.strict_json import list_field, number_field, parse_json, require_object, text_field
 
@@ -28,7 +28,6 @@ Y_UP = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))  # from y do
 
 _MAX_RUNS = 4096  # the Gaussians are sorted if the entry would list more runs, which take megabytes
 _DEFAULT_NEAR, _DEFAULT_FAR = 0.1, 100.0  # depth range, metres, for a file without one
-_DEFAULT_HEIGHT = 512  # pixels, of the panoramas
 _MAX_HEIGHT, _MAX_CAMERAS, _MAX_LEVEL = 1 << 16, 1 << 12, 255
 _MAX_GAIN = 1e3
 
@@ -68,22 +67,12 @@ def make_scene(gaussians: Gaussians, entry: str | None, path: Path) -> Scene:
     Raises:
         InputError: no Gaussian is finite.
     """
-    fields = _parse_entry(entry, path)
-    levels, views = _read_labels(fields, len(gaussians), path)
+    scene, runs = _parse_entry(entry, path)
+    levels, views = _read_labels(runs, len(gaussians), len(scene.cam2world), path)
     kept = select_finite(replace(gaussians, levels=levels, views=views), path)
     if len(gaussians) and not len(kept):
         raise InputError(f"{path}: none of its {len(gaussians)} Gaussians is finite; write the file again")
-    return Scene(
-        kept,
-        fields.cam2world,
-        near=fields.near,
-        far=fields.far,
-        names=fields.names,
-        model=fields.model,
-        height=fields.height,
-        gains=fields.gains,
-        overlaps=fields.overlaps,
-    )
+    return replace(scene, gaussians=kept)
 
 
 def select_finite(gaussians: Gaussians, path: Path) -> Gaussians:
@@ -93,9 +82,7 @@ def select_finite(gaussians: Gaussians, path: Path) -> Gaussians:
     if not dropped:
         return gaussians
     warnings.warn(
-        f"{path}: left out {dropped} of {len(gaussians)} Gaussians that are not finite",
-        InputWarning,
-        stacklevel=3,
+        f"{path}: left out {dropped} of {len(gaussians)} Gaussians that are not finite", InputWarning, stacklevel=3
     )
     return gaussians.select(finite)
 
@@ -140,19 +127,8 @@ def find_label_runs(gaussians: Gaussians) -> list[list[int]]:
     return torch.stack((levels[starts], views[starts], counts), dim=1).tolist()
 
 
-@dataclass(frozen=True)
-class _Entry:
-    """Content of the pansplat entry; the defaults are those of a file of another tool."""
-
-    cam2world: Float[Tensor, "view 4 4"]
-    near: float = _DEFAULT_NEAR
-    far: float = _DEFAULT_FAR
-    names: tuple[str, ...] = ()
-    model: str = ""
-    height: int = _DEFAULT_HEIGHT
-    gains: Gains = ()
-    overlaps: Overlaps = ()
-    runs: list[Any] | None = None
+_Entry = tuple[Scene, "list[Any] | None"]
+"""A scene without Gaussians, and the runs of labels."""
 
 
 def _parse_entry(entry: str | None, path: Path) -> _Entry:
@@ -166,15 +142,12 @@ def _parse_entry(entry: str | None, path: Path) -> _Entry:
                 InputWarning,
                 stacklevel=4,
             )
-    return _Entry(torch.zeros(0, 4, 4, dtype=torch.float64))
+    no_cameras = torch.zeros(0, 4, 4, dtype=torch.float64)
+    return Scene(empty_gaussians(), no_cameras, _DEFAULT_NEAR, _DEFAULT_FAR), None
 
 
 def _read_entry(content: Any) -> _Entry:
-    """The fields of a pansplat entry.
-
-    Raises:
-        InputError: a field has another type, or is out of range.
-    """
+    """The fields of a pansplat entry; an InputError if one has another type, or is out of range."""
     content = require_object(content, "comment")
     near = number_field(content, "near", "comment")
     far = number_field(content, "far", "comment")
@@ -185,17 +158,18 @@ def _read_entry(content: Any) -> _Entry:
     poses = list_field(content, "cam2world", "comment")
     if len(poses) > _MAX_CAMERAS or len(names) > _MAX_CAMERAS:
         raise InputError(f"comment: needed at most {_MAX_CAMERAS} cameras, got {max(len(poses), len(names))}")
-    return _Entry(
+    scene = Scene(
+        empty_gaussians(),
         torch.from_numpy(np.array([_read_pose(pose) for pose in poses], np.float64).reshape(-1, 4, 4)),
         near,
         far,
         tuple(str(name) for name in names),
         text_field(content, "model", "comment") or "",
-        _DEFAULT_HEIGHT if height is None else int(height),
+        Scene.height if height is None else int(height),
         _read_gains(list_field(content, "gains", "comment"), len(poses)),
         _read_overlaps(list_field(content, "overlaps", "comment"), len(poses)),
-        list_field(content, "runs", "comment"),
     )
+    return scene, list_field(content, "runs", "comment")
 
 
 def _read_gains(rows: list[Any], cameras: int) -> Gains:
@@ -240,20 +214,20 @@ def _read_pose(rows: Any) -> np.ndarray:
     return pose
 
 
-def _read_labels(fields: _Entry, count: int, path: Path) -> tuple[Tensor, Tensor]:
+def _read_labels(runs: list[Any] | None, count: int, cameras: int, path: Path) -> tuple[Tensor, Tensor]:
     """Level and view of each vertex; zeros without labels, or with a warning when they do not fit `count`."""
     zeros = torch.zeros(count, dtype=torch.int64), torch.zeros(count, dtype=torch.int64)
-    if fields.runs is None:
+    if runs is None:
         return zeros
-    if not _are_runs(fields.runs, count, max(len(fields.cam2world), 1)):
+    if not _are_runs(runs, count, max(cameras, 1)):
         warnings.warn(
             f"{path}: its levels and views do not fit its {count} Gaussians (edited by another tool?) and are ignored",
             InputWarning,
             stacklevel=3,
         )
         return zeros
-    runs = torch.tensor(fields.runs, dtype=torch.int64).reshape(-1, 3)
-    return torch.repeat_interleave(runs[:, 0], runs[:, 2]), torch.repeat_interleave(runs[:, 1], runs[:, 2])
+    levels, views, counts = torch.tensor(runs, dtype=torch.int64).reshape(-1, 3).T
+    return torch.repeat_interleave(levels, counts), torch.repeat_interleave(views, counts)
 
 
 def _are_runs(runs: list[Any], count: int, views: int) -> bool:
