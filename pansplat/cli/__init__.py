@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
+from importlib import import_module
+from operator import or_
 from typing import Annotated, Any, Protocol
 
 from pansplat.console import exit_process, own_warnings, parse_arguments, run_command
+
+_COMMANDS = (
+    *("predict", "refine", "render", "export", "batch", "evaluate", "pose"),
+    *("check", "info", "bench", "convert", "data"),
+)
+"""Each is a module with a class of its name, in the order of `pansplat --help`."""
 
 
 class Command(Protocol):
@@ -33,9 +42,7 @@ def run(argv: Sequence[str] | None = None) -> int:
             return command.run()
 
     return run_command(
-        run_parsed,
-        memory_advice="choose a smaller height or size.",
-        interruption="no incomplete file is left behind",
+        run_parsed, memory_advice="choose a smaller height or size.", interruption="no incomplete file is left behind"
     )
 
 
@@ -59,30 +66,6 @@ def _list_commands() -> object:
     """The union of all commands. They are imported after the signals are caught."""
     from tyro.conf import subcommand
 
-    from pansplat.cli.batch import Batch
-    from pansplat.cli.bench import Bench
-    from pansplat.cli.check import Check
-    from pansplat.cli.convert import Convert
-    from pansplat.cli.data import Data
-    from pansplat.cli.evaluate import Evaluate
-    from pansplat.cli.export import Export
-    from pansplat.cli.info import Info
-    from pansplat.cli.pose import Pose
-    from pansplat.cli.predict import Predict
-    from pansplat.cli.refine import Refine
-    from pansplat.cli.render import Render
-
-    return (
-        Annotated[Predict, subcommand("predict")]
-        | Annotated[Refine, subcommand("refine")]
-        | Annotated[Render, subcommand("render")]
-        | Annotated[Export, subcommand("export")]
-        | Annotated[Batch, subcommand("batch")]
-        | Annotated[Evaluate, subcommand("evaluate")]
-        | Annotated[Pose, subcommand("pose")]
-        | Annotated[Check, subcommand("check")]
-        | Annotated[Info, subcommand("info")]
-        | Annotated[Bench, subcommand("bench")]
-        | Annotated[Convert, subcommand("convert")]
-        | Annotated[Data, subcommand("data")]
-    )
+    modules = {name: import_module(f"pansplat.cli.{name}") for name in _COMMANDS}
+    kinds = [Annotated[getattr(module, name.title()), subcommand(name)] for name, module in modules.items()]
+    return reduce(or_, kinds)

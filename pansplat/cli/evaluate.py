@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Compat, Out, Precision, parse_blend, progress_bar
+from pansplat.cli.inputs import ModelChoice, Out, parse_blend, progress_bar
 from pansplat.console import make_table_console
 from pansplat.errors import InputError
 from pansplat.files import expand_home, require_output_folder
@@ -54,20 +54,15 @@ class ProtocolChoice:
 class Evaluate:
     """Compare predictions with the real panoramas between the inputs, and with the cross-fade baseline.
 
-    With --protocol: compute a table of the paper, with the paper's rows and ours.
+    With --protocol: compute a table of the paper, with the paper's rows and ours. The cache is not used, so that times
+    are valid.
     """
 
     paths: Positional[tuple[Path, ...]]
     """Folders of pairs; pairs without target views are skipped. None with --protocol."""
     out: Out
     """Folder for results.json and, for each case, prediction.png, target.png and error.png."""
-    model: str = "default"
-    """Predictor: `default`, `sweep` (without weights), or a file of weights. The cache is not used, so that times are
-    valid."""
-    compat: Compat = "trained"
-    """For a network: official, fixed, or as its weights were trained; see `pansplat predict --help`."""
-    precision: Precision = "float32"
-    """Number type of a network's convolutions."""
+    model: ModelChoice = field(default_factory=ModelChoice)
     height: Height = 512
     """Panoramas are resized to this height, pixels."""
     refine: Seconds = 0.0
@@ -106,7 +101,7 @@ class Evaluate:
             if not with_targets:
                 print(f"note: {path}: none of its {len(found)} pairs has a target view; skipped", file=sys.stderr)
             pairs += with_targets
-        predictor = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
+        predictor = self.model.load()
         with progress_bar() as progress:
             cases = evaluate(
                 pairs,
@@ -162,17 +157,18 @@ class Evaluate:
 
     def _protocol_methods(self, protocol: ProtocolName) -> list[Method]:
         """The methods of all predictors; a predictor with weights has the name of their file."""
-        from pansplat import pipeline
         from pansplat.evaluation.protocol import list_methods
         from pansplat.model.weights import WEIGHTS_SUFFIXES
 
         blend = cast("Blend | None", self.blend)
         methods: list[Method] = []
-        for index, model in enumerate((self.model, *self.protocol.models)):
-            has_options = index == 0 or Path(model).suffix.lower() in WEIGHTS_SUFFIXES  # sweep has neither option
-            compat, precision = (self.compat, self.precision) if has_options else ("trained", "float32")
-            predictor = pipeline.load_model(model, compat=compat, precision=precision)
-            methods += list_methods(predictor, protocol, blend, Path(model).stem, self.drawing)
+        more = (
+            # sweep has neither of the other options
+            replace(self.model, model=name) if Path(name).suffix.lower() in WEIGHTS_SUFFIXES else ModelChoice(name)
+            for name in self.protocol.models
+        )
+        for choice in (self.model, *more):
+            methods += list_methods(choice.load(), protocol, blend, Path(choice.model).stem, self.drawing)
         names = [method.name for method in methods]
         if len(set(names)) < len(names):
             raise InputError(f"--model and --models must have distinct names, got {', '.join(names)}; rename a file")

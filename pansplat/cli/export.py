@@ -96,12 +96,7 @@ class Export:
         title = self.title or self.path.resolve().stem.replace("_", " ")
         with progress_bar() as progress:
             page = write_page(
-                scene,
-                self.out,
-                gaussians=self._count_of_page(),
-                split=self.split,
-                title=title,
-                progress=progress,
+                scene, self.out, gaussians=self._count_of_page(), split=self.split, title=title, progress=progress
             )
         beside = f" and {len(page.files) - 1} files in {page.files[1].parent.name}/" if self.split else ""
         print(

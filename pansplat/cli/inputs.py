@@ -45,15 +45,30 @@ class PairChoice:
 
 
 @dataclass(frozen=True)
+class ModelChoice:
+    """The predictor of a pair."""
+
+    model: str = "default"
+    """Predictor, for a pair: `default`, `sweep` (without weights), or a file of weights (.safetensors, or an official
+    .ckpt)."""
+    compat: Compat = "trained"
+    """For a network: official computes what the official code does, fixed corrects its defects; by default the one
+    that the weights were trained with, which is official for official weights."""
+    precision: Precision = "float32"
+    """Number type of a network's convolutions; bfloat16 is less exact, and faster if the processor supports it."""
+
+    def load(self) -> Predictor:
+        """The predictor; an InputError if there is none of that name or file, or it lacks the options."""
+        from pansplat import pipeline
+
+        return pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
+
+
+@dataclass(frozen=True)
 class ScenePrediction:
     """How to predict the scene of a pair; unused for a scene file."""
 
-    model: str = "default"
-    """Predictor, for a pair: `default`, `sweep` (without weights), or a file of weights."""
-    compat: Compat = "trained"
-    """For a network: official, fixed, or as its weights were trained; see `pansplat predict --help`."""
-    precision: Precision = "float32"
-    """Number type of a network's convolutions."""
+    model: ModelChoice = field(default_factory=ModelChoice)
     refine: Seconds = 10.0
     """Time limit of the refinement after the prediction, for a pair, seconds; 0 for none."""
     predict_height: Height | None = None
@@ -87,7 +102,7 @@ class ScenePrediction:
             return self._predict_pair(pick_pair(path, pairs, self.choice))
         more = f"; {len(tours) - 1} other tours are left out" if len(tours) > 1 else ""
         print(f"note: {path}: a tour of {len(tours[0])} panoramas (--pair chooses one pair){more}", file=sys.stderr)
-        model = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
+        model = self.model.load()
         with progress_bar() as progress:
             return pipeline.predict_tour(
                 connect(tours[0], progress),
@@ -99,10 +114,7 @@ class ScenePrediction:
             )
 
     def _predict_pair(self, pair: Pair) -> Scene:
-        from pansplat import pipeline
-
-        model = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
-        return predict_scene(pair, model, self.predict_height, cache=True, refine_seconds=self.refine)
+        return predict_scene(pair, self.model.load(), self.predict_height, cache=True, refine_seconds=self.refine)
 
 
 def choose_pair(path: Path, choice: PairChoice) -> Pair:

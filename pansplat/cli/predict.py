@@ -9,14 +9,7 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import (
-    Compat,
-    Out,
-    PairChoice,
-    Precision,
-    choose_pair,
-    progress_bar,
-)
+from pansplat.cli.inputs import ModelChoice, Out, PairChoice, choose_pair, progress_bar
 from pansplat.files import SCENE_SUFFIXES, require_output_file
 from pansplat.options import WHOLE, Fraction, Height, Range, Seconds
 
@@ -30,18 +23,10 @@ class Predict:
     """Folder of the pair."""
     out: Out
     """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb."""
-    model: str = "default"
-    """Predictor: `default`, `sweep` (without weights), or a file of weights (.safetensors, or an
-    official .ckpt)."""
-    compat: Compat = "trained"
-    """For a network: official computes what the official code does, fixed corrects its defects; by default the one
-    that the weights were trained with, which is official for official weights."""
-    precision: Precision = "float32"
-    """Number type of a network's convolutions; bfloat16 is less exact, and faster if the processor supports it."""
+    model: ModelChoice = field(default_factory=ModelChoice)
     height: Height | None = None
     """Panoramas are resized to this height, pixels; by default that of the photographs, at most 1024 (for networks
-    512). Networks predict heights above 512 tile by tile, in bounded
-    memory, and do not cache the result."""
+    512). Networks predict heights above 512 tile by tile, in bounded memory, and do not cache the result."""
     refine: Seconds = 0.0
     """Time limit of the refinement after the prediction, seconds; 0 for none. `pansplat refine` has more options."""
     degree: Annotated[int, Range(0, 4), WHOLE] | None = None
@@ -59,7 +44,7 @@ class Predict:
 
         require_output_file("--out", self.out, SCENE_SUFFIXES)
         pair = choose_pair(self.path, self.choice)
-        model = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
+        model = self.model.load()
         began = time.perf_counter()
         with progress_bar() as progress:
             count = pipeline.predict_to_file(

@@ -12,15 +12,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import (
-    Compat,
-    Out,
-    PairChoice,
-    Precision,
-    choose_pair,
-    predict_scene,
-    progress_bar,
-)
+from pansplat.cli.inputs import ModelChoice, Out, PairChoice, choose_pair, predict_scene, progress_bar
 from pansplat.errors import InputError
 from pansplat.files import SCENE_SUFFIXES, is_scene_file, require_output_file
 from pansplat.options import Count, Height, Seconds, Seed
@@ -56,12 +48,7 @@ class Refine:
     """Of the blocks of pixels that are held out to detect overfitting."""
     report: Path | None = None
     """A .json file for errors, gains, times and the error over the steps."""
-    model: str = "default"
-    """Predictor, for a pair: `default`, `sweep` (without weights), or a file of weights."""
-    compat: Compat = "trained"
-    """For a network: official, fixed, or as its weights were trained; see `pansplat predict --help`."""
-    precision: Precision = "float32"
-    """Number type of a network's convolutions."""
+    model: ModelChoice = field(default_factory=ModelChoice)
     height: Height | None = None
     """The photographs are resized to this height, pixels; by default that of the scene. For a pair that of its
     files, at most 1024 (for networks 512)."""
@@ -117,7 +104,7 @@ class Refine:
             scene = pipeline.load(self.path)
             return scene, choose_pair(self.photographs, self.choice).load_context(self.height or scene.height)
         pair = choose_pair(self.path, self.choice)
-        model = pipeline.load_model(self.model, compat=self.compat, precision=self.precision)
+        model = self.model.load()
         height = self.height or pipeline.choose_height(pair, model)
         return predict_scene(pair, model, height, cache=True), pair.load_context(height)
 
