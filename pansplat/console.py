@@ -269,11 +269,7 @@ def own_warnings() -> Iterator[None]:
 
 
 def parse_arguments(parse: Callable[[], _T]) -> _T:
-    """The result of a parser of arguments, whose framed message of an error becomes one line.
-
-    Raises:
-        SystemExit: status 0 after help, 2 after an error.
-    """
+    """The result of a parser of arguments. The framed message of an error becomes one line, and SystemExit(2)."""
     message = io.StringIO()
     try:
         with contextlib.redirect_stderr(message):

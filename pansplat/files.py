@@ -22,11 +22,7 @@ _KINDS = (
 
 
 def describe_kind(path: Path | str) -> str | None:
-    """What a path is if it is not a regular file, such as "a folder" or "a FIFO (named pipe)"; None for a file.
-
-    Raises:
-        OSError: there is no such path.
-    """
+    """ "a folder", "a FIFO (named pipe)" etc.; None for a regular file; an OSError if there is no such path."""
     mode = os.stat(path).st_mode
     return next((kind for is_kind, kind in _KINDS if is_kind(mode)), None)
 
@@ -56,11 +52,7 @@ def is_scene_file(path: Path | str) -> bool:
 
 
 def find_scene_suffix(path: Path | str) -> str:
-    """The suffix of a scene format that a file's name ends in, in lower case.
-
-    Raises:
-        InputError: it ends in none.
-    """
+    """The suffix of a scene format in a file's name, in lower case; an InputError without one."""
     for suffix in SCENE_SUFFIXES:
         if str(path).lower().endswith(suffix):
             return suffix
@@ -90,11 +82,7 @@ def read_file(path: Path | str, needed: str = "a readable file", *, limit: int |
 
 
 def expand_home(path: Path | str) -> Path:
-    """The path with `~` replaced by the home folder.
-
-    Raises:
-        InputError: the path begins with `~`, and there is no home folder.
-    """
+    """The path with `~` replaced by the home folder; an InputError if there is none."""
     try:
         return Path(path).expanduser()
     except RuntimeError as error:
@@ -112,12 +100,8 @@ def require_output_folder(option: str, folder: Path) -> None:
         InputError: a file is in the way, a name is too long, or the folder is not writable.
     """
     advice = "choose another folder"
-    try:
-        os.stat(folder)
-    except (OSError, ValueError) as error:
-        if getattr(error, "errno", None) != errno.ENOENT:
-            reason = getattr(error, "strerror", None) or error
-            raise InputError(f"{option} {folder}: needed a folder to write into, got '{reason}'; {advice}") from error
+    if reason := _find_system_problem(folder, errno.ENOENT):
+        raise InputError(f"{option} {folder}: needed a folder to write into, got '{reason}'; {advice}")
     existing = Path(os.path.abspath(folder))
     while not os.path.lexists(existing):
         existing = existing.parent
@@ -140,17 +124,21 @@ def require_output_file(option: str, path: Path, suffixes: tuple[str, ...] = ())
     """
     if suffixes and path.suffix.lower() not in suffixes:
         raise InputError(f"{option} must end in {', '.join(suffixes)}, got {path}")
-    try:
-        kind = describe_kind(path)
-        if kind is not None:
-            raise InputError(f"{option} {path}: needed a file to write, got {kind}; give another name")
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        if getattr(error, "errno", None) not in (errno.ENOENT, errno.ENOTDIR):
-            reason = getattr(error, "strerror", None) or error
-            raise InputError(f"{option} {path}: needed a file to write, got '{reason}'; give another name") from error
+    if reason := _find_system_problem(path, errno.ENOENT, errno.ENOTDIR):
+        raise InputError(f"{option} {path}: needed a file to write, got '{reason}'; give another name")
+    if path.exists() and (kind := describe_kind(path)):
+        raise InputError(f"{option} {path}: needed a file to write, got {kind}; give another name")
     if not path.parent.is_dir():
         raise InputError(f"{option} {path}: needed an existing folder, got {path.parent}; create it first")
     if not os.access(path.parent, os.W_OK | os.X_OK):
         raise InputError(f"{option} {path}: needed a writable folder, got {path.parent}, which is read-only")
+
+
+def _find_system_problem(path: Path, *expected: int) -> str | None:
+    """Why the operating system refuses a path; None for the expected error numbers, and if it does not."""
+    try:
+        os.stat(path)
+    except (OSError, ValueError) as error:
+        if getattr(error, "errno", None) not in expected:
+            return getattr(error, "strerror", None) or str(error)
+    return None

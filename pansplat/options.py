@@ -156,11 +156,5 @@ def _find_range(hint: Any) -> tuple[Range, bool] | None:
 def _check_number(option: str, value: object, allowed: Range, whole: bool) -> None:
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if not is_number or (whole and not isinstance(value, int)) or value not in allowed:
-        got = (
-            f"{value!s:.40}"
-            if isinstance(value, str)
-            else f"{value:.10g}"
-            if isinstance(value, float)
-            else f"{value!s:.40}"
-        )
+        got = f"{value:.10g}" if isinstance(value, float) else f"{value!s:.40}"
         raise OptionError(option, f"must be {allowed.describe(whole=whole)}, got {got}")

@@ -136,11 +136,7 @@ def _name(path: Any) -> str:
 
 
 def require_object(value: Any, source: object) -> dict[str, Any]:
-    """The value if it is a JSON object.
-
-    Raises:
-        InputError: it is not.
-    """
+    """The value, which must be a JSON object, else an InputError."""
     if not isinstance(value, dict):
         raise InputError(f"{source}: needed a JSON object {{...}}, got {_shorten(value)}; correct it.")
     return value
@@ -177,11 +173,7 @@ def number_field(
 
 
 def text_field(content: Mapping[str, Any], key: str, source: object) -> str | None:
-    """An optional text of a JSON object; None if it is missing or null.
-
-    Raises:
-        InputError: the value is not a text.
-    """
+    """An optional text of a JSON object; None if it is missing or null; an InputError for another type."""
     value = content.get(key)
     if value is not None and not isinstance(value, str):
         raise InputError(f'{source}: needed a text as "{key}", got {_shorten(value)}; correct it.')
@@ -189,11 +181,7 @@ def text_field(content: Mapping[str, Any], key: str, source: object) -> str | No
 
 
 def list_field(content: Mapping[str, Any], key: str, source: object) -> list[Any]:
-    """A list of a JSON object; empty if it is missing or null.
-
-    Raises:
-        InputError: the value is not a list.
-    """
+    """A list of a JSON object; empty if it is missing or null; an InputError for another type."""
     value = content.get(key)
     if value is not None and not isinstance(value, list):
         raise InputError(f'{source}: needed a list as "{key}", got {_shorten(value)}; put [ ] around it.')
