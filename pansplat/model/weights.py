@@ -89,11 +89,7 @@ def pack_weights(model: ModelName, config: object, tensors: dict[str, Tensor], *
 
 
 def save_weights(path: str | Path, weights: WeightsFile) -> None:
-    """Write a weights file atomically.
-
-    Raises:
-        InputError: the path does not end in .safetensors, or cannot be written.
-    """
+    """Write a .safetensors file atomically; an InputError for another suffix, or if it cannot be written."""
     path = Path(path)
     if path.suffix.lower() != ".safetensors":
         raise InputError(f"{path}: a weights file must end in .safetensors, got {path.suffix or 'no suffix'!r}")
@@ -109,11 +105,7 @@ def save_weights(path: str | Path, weights: WeightsFile) -> None:
 
 
 def load_weights(path: str | Path) -> WeightsFile:
-    """Read a weights file.
-
-    Raises:
-        InputError: the file is missing, damaged, or was not written by pansplat.
-    """
+    """Read a weights file; an InputError if it is missing, damaged, or was not written by pansplat."""
     path = Path(path)
     _require_file(path)
     try:
@@ -140,11 +132,7 @@ def load_weights(path: str | Path) -> WeightsFile:
 
 
 def as_float32(tensors: Mapping[str, Tensor], source: object) -> dict[str, Tensor]:
-    """The tensors with all floating-point numbers in float32; networks compute in it, files may be smaller.
-
-    Raises:
-        InputError: a number is not finite.
-    """
+    """The tensors with floating-point numbers in float32; an InputError if a number is not finite."""
     converted = {}
     for name, tensor in tensors.items():
         converted[name] = tensor.float() if tensor.is_floating_point() else tensor
@@ -200,11 +188,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 
 
 def get_state_dict(content: Mapping[str, Any], path: str | Path) -> dict[str, Tensor]:
-    """Get the `state_dict` from the content of a Lightning checkpoint.
-
-    Raises:
-        InputError: there is no `state_dict`, or it contains other values than tensors.
-    """
+    """The tensors of a Lightning checkpoint; an InputError without a `state_dict` of tensors only."""
     state = content.get("state_dict")
     if not isinstance(state, Mapping):
         keys = ", ".join(str(key) for key in list(content)[:5])
@@ -216,11 +200,7 @@ def get_state_dict(content: Mapping[str, Any], path: str | Path) -> dict[str, Te
 
 
 def config_from_dict(kind: type[_T], values: Mapping[str, Any], where: str = "config") -> _T:
-    """Restore a nested dataclass from the JSON of its `dataclasses.asdict`.
-
-    Raises:
-        InputError: a field is unknown or missing, has another type, or is out of range.
-    """
+    """A nested dataclass from the JSON of its `asdict`; an InputError for any other field, type or range."""
     if not (dataclasses.is_dataclass(kind) and isinstance(values, Mapping)):
         raise InputError(f"{where}: needed settings by name, got {values!r:.60}")
     fields = {field.name for field in dataclasses.fields(kind)}
@@ -260,11 +240,7 @@ def _restore(hint: Any, value: Any, where: str) -> Any:
 
 
 def build_on_meta(build: Callable[[], _T], model: str, source: object) -> _T:
-    """Build a network from the settings of a file on the meta device: without memory and without random numbers.
-
-    Raises:
-        InputError: the settings fit no network; layers report this by many kinds of error.
-    """
+    """Build a network without memory and random numbers; an InputError if its settings fit no network."""
     try:
         with torch.device("meta"):
             return build()
@@ -313,11 +289,7 @@ class ConversionReport:
     missing: list[str]
 
     def require_complete(self, source: object) -> None:
-        """Check that no tensor is missing or unexpected.
-
-        Raises:
-            InputError: some are; the message has their number and the first names.
-        """
+        """Raise an InputError that counts and names the tensors that are missing or unexpected."""
         problems = []
         if self.missing:
             problems.append(f"lacked {_join_names(self.missing)}")
@@ -357,11 +329,7 @@ def convert_tensors(content: Mapping[str, object], source: object) -> dict[str, 
 
 
 def match_tensors(content: Mapping[str, object], source: object) -> ConversionReport:
-    """Match the tensors of an official checkpoint with ours, and report what is missing or unknown.
-
-    Raises:
-        InputError: the tensors belong to neither network.
-    """
+    """Match the tensors of an official checkpoint with ours; an InputError if they belong to neither network."""
     state = get_state_dict(content, str(source))
     model = _detect_model(state, source)
     expected = {_PREFIX + name: ours for name, ours in map_official_names(model).items()}
@@ -396,11 +364,7 @@ def map_official_names(model: ModelName) -> dict[str, str]:
 
 
 def require_shapes(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], source: object) -> None:
-    """Check that tensors have the names and shapes of a network's tensors.
-
-    Raises:
-        InputError: some do not; the message has their number and the first names.
-    """
+    """Raise an InputError that counts and names the tensors without the names and shapes of a network's tensors."""
     missing = [name for name in expected if name not in tensors]
     unexpected = [name for name in tensors if name not in expected]
     wrong = [
@@ -466,6 +430,12 @@ def _join_names(names: Sequence[str]) -> str:
 # Layers of the official code and ours
 
 
+def _pair(official: str, ours: str, children: Mapping[str, str], tensors: tuple[str, ...]) -> Iterator[_Layer]:
+    """The children of a layer, our names by official ones."""
+    for theirs, name in children.items():
+        yield f"{official}.{theirs}", f"{ours}.{name}", tensors
+
+
 def _feature_pyramid() -> Iterator[_Layer]:
     for level in range(4):
         names = ("conv00", "conv01") if level == 0 else (f"downsample{level}", f"conv{level}0", f"conv{level}1")
@@ -477,21 +447,18 @@ def _feature_pyramid() -> Iterator[_Layer]:
         official, ours = f"backbone.decoder.out{stage}", f"features.decoder.outputs.{3 - stage}"
         yield f"{official}.0", f"{ours}.conv", _FULL
         yield f"{official}.1", f"{ours}.norm", _BATCH_NORM
-    for stage in (1, 2, 3):
-        yield f"backbone.decoder.inner{stage}", f"features.decoder.laterals.{3 - stage}", _FULL
+    laterals = {f"inner{stage}": f"laterals.{3 - stage}" for stage in (1, 2, 3)}
+    yield from _pair("backbone.decoder", "features.decoder", laterals, _FULL)
 
 
 def _transformer(official: str, ours: str) -> Iterator[_Layer]:
+    projections = {"q_proj": "query", "k_proj": "key", "v_proj": "value", "merge": "merge"}
     for block in range(6):
         old, new = f"{official}.layers.{block}", f"{ours}.blocks.{block}"
         for layer, attention in (("self_attn", "within"), ("cross_attn_ffn", "across")):
-            yield f"{old}.{layer}.q_proj", f"{new}.{attention}.query", _BARE
-            yield f"{old}.{layer}.k_proj", f"{new}.{attention}.key", _BARE
-            yield f"{old}.{layer}.v_proj", f"{new}.{attention}.value", _BARE
-            yield f"{old}.{layer}.merge", f"{new}.{attention}.merge", _BARE
+            yield from _pair(f"{old}.{layer}", f"{new}.{attention}", projections, _BARE)
             yield f"{old}.{layer}.norm1", f"{new}.{attention}.norm", _FULL
-        yield f"{old}.cross_attn_ffn.mlp.0", f"{new}.widen", _BARE
-        yield f"{old}.cross_attn_ffn.mlp.2", f"{new}.narrow", _BARE
+        yield from _pair(f"{old}.cross_attn_ffn.mlp", new, {"0": "widen", "2": "narrow"}, _BARE)
         yield f"{old}.cross_attn_ffn.norm2", f"{new}.norm", _FULL
 
 
@@ -501,17 +468,14 @@ def _mono_depth() -> Iterator[_Layer]:
     yield from _resnet18("mono_depth.cube_encoder", "mono_depth.face_encoder")
     official, ours = "mono_depth.equi_decoder", "mono_depth.decoder"
     for scale in (5, 4, 3, 2, 1):
-        yield f"{official}.fusion_{scale}.res_conv1", f"{ours}.fuse.{scale}.conv1", _BARE
-        yield f"{official}.fusion_{scale}.res_bn1", f"{ours}.fuse.{scale}.norm1", _BATCH_NORM
-        yield f"{official}.fusion_{scale}.res_conv2", f"{ours}.fuse.{scale}.conv2", _BARE
-        yield f"{official}.fusion_{scale}.res_bn2", f"{ours}.fuse.{scale}.norm2", _BATCH_NORM
-        yield f"{official}.fusion_{scale}.conv", f"{ours}.fuse.{scale}.join", _BARE
+        old, new = f"{official}.fusion_{scale}", f"{ours}.fuse.{scale}"
+        yield from _pair(old, new, {"res_conv1": "conv1", "res_conv2": "conv2", "conv": "join"}, _BARE)
+        yield from _pair(old, new, {"res_bn1": "norm1", "res_bn2": "norm2"}, _BATCH_NORM)
     for scale in (5, 4, 3, 2):
-        yield f"{official}.upconv_{scale}.conv.conv", f"{ours}.up.{scale}", _FULL
-        yield f"{official}.deconv_{scale - 1}.conv.conv", f"{ours}.merge.{scale - 1}", _FULL
-    yield f"{official}.upconv_1.conv.conv", f"{ours}.head.0", _FULL
-    yield f"{official}.deconv_0.conv.conv", f"{ours}.head.3", _FULL
-    yield f"{official}.depthconv_0.conv", f"{ours}.head.5", _FULL
+        children = {f"upconv_{scale}": f"up.{scale}", f"deconv_{scale - 1}": f"merge.{scale - 1}"}
+        yield from _pair(official, ours, {f"{theirs}.conv.conv": name for theirs, name in children.items()}, _FULL)
+    head = {"upconv_1.conv.conv": "0", "deconv_0.conv.conv": "3", "depthconv_0.conv": "5"}
+    yield from _pair(official, f"{ours}.head", head, _FULL)
 
 
 def _resnet18(official: str, ours: str) -> Iterator[_Layer]:
@@ -520,9 +484,8 @@ def _resnet18(official: str, ours: str) -> Iterator[_Layer]:
     for stage in range(4):
         for block in (0, 1):
             old, new = f"{official}.layer{stage + 1}.{block}", f"{ours}.stages.{stage}.{block}"
-            for layer in (1, 2):
-                yield f"{old}.conv{layer}", f"{new}.conv{layer}", _BARE
-                yield f"{old}.bn{layer}", f"{new}.norm{layer}", _BATCH_NORM
+            yield from _pair(old, new, {"conv1": "conv1", "conv2": "conv2"}, _BARE)
+            yield from _pair(old, new, {"bn1": "norm1", "bn2": "norm2"}, _BATCH_NORM)
         if stage > 0:
             old, new = f"{official}.layer{stage + 1}.0.downsample", f"{ours}.stages.{stage}.0"
             yield f"{old}.0", f"{new}.shortcut_conv", _BARE
@@ -531,18 +494,15 @@ def _resnet18(official: str, ours: str) -> Iterator[_Layer]:
 
 def _cost_volume() -> Iterator[_Layer]:
     for stage in range(3):
-        ours = f"cost_volume.levels.{3 - stage}"
-        yield from _refinement(f"depth_predictor.corr_refine_nets.{stage}", f"{ours}.refine", scales=3)
-        yield f"depth_predictor.regressor_residuals.{stage}", f"{ours}.shortcut", _FULL
-        yield f"depth_predictor.depth_heads.{stage}.0", f"{ours}.head.0", _FULL
-        yield f"depth_predictor.depth_heads.{stage}.2", f"{ours}.head.2", _FULL
+        official, ours = "depth_predictor", f"cost_volume.levels.{3 - stage}"
+        yield from _refinement(f"{official}.corr_refine_nets.{stage}", f"{ours}.refine", scales=3)
+        yield f"{official}.regressor_residuals.{stage}", f"{ours}.shortcut", _FULL
+        yield from _pair(f"{official}.depth_heads.{stage}", f"{ours}.head", {"0": "0", "2": "2"}, _FULL)
 
 
 def _refinement(official: str, ours: str, scales: int) -> Iterator[_Layer]:
-    yield f"{official}.0", f"{ours}.entry", _FULL
-    yield f"{official}.1", f"{ours}.norm", _FULL
+    yield from _pair(official, ours, {"0": "entry", "1": "norm", "4": "exit"}, _FULL)
     yield from _unet(f"{official}.3", f"{ours}.unet", scales)
-    yield f"{official}.4", f"{ours}.exit", _FULL
 
 
 def _unet(official: str, ours: str, scales: int) -> Iterator[_Layer]:
@@ -566,47 +526,38 @@ def _unet(official: str, ours: str, scales: int) -> Iterator[_Layer]:
         if scale > 0:
             position = 2 if scale == last else 1
             yield f"{old}.{position}.conv", f"{new}.upsample", _FULL
-    yield f"{official}.out.0", f"{ours}.exit.conv", _FULL
-    yield f"{official}.out.1", f"{ours}.exit.norm", _FULL
+    yield from _pair(f"{official}.out", f"{ours}.exit", {"0": "conv", "1": "norm"}, _FULL)
 
 
 def _res_block(official: str, ours: str) -> Iterator[_Layer]:
-    yield f"{official}.in_layers.0", f"{ours}.first.conv", _FULL
-    yield f"{official}.in_layers.1", f"{ours}.first.norm", _FULL
-    yield f"{official}.out_layers.0", f"{ours}.second.conv", _FULL
-    yield f"{official}.out_layers.1", f"{ours}.second.norm", _FULL
+    yield from _pair(f"{official}.in_layers", f"{ours}.first", {"0": "conv", "1": "norm"}, _FULL)
+    yield from _pair(f"{official}.out_layers", f"{ours}.second", {"0": "conv", "1": "norm"}, _FULL)
 
 
 def _attention(official: str, ours: str) -> Iterator[_Layer]:
-    yield f"{official}.qkv", f"{ours}.project_in", _FULL
-    yield f"{official}.proj_out", f"{ours}.project_out", _FULL
-    yield f"{official}.norm", f"{ours}.norm", _FULL
+    yield from _pair(official, ours, {"qkv": "project_in", "proj_out": "project_out", "norm": "norm"}, _FULL)
 
 
 def _heads() -> Iterator[_Layer]:
     for stage in range(4):
-        for layer in range(3):
-            official = f"gaussian_head.to_gaussians_list.{stage}.{2 * layer}"
-            yield official, f"heads.levels.{stage}.convs.{layer}", _FULL
-        yield f"gaussian_head.gaussians_mlp_list.{stage}.0", f"heads.levels.{stage}.linear", _FULL
+        old, new = f"gaussian_head.to_gaussians_list.{stage}", f"heads.levels.{stage}"
+        yield from _pair(old, f"{new}.convs", {"0": "0", "2": "1", "4": "2"}, _FULL)
+        yield f"gaussian_head.gaussians_mlp_list.{stage}.0", f"{new}.linear", _FULL
 
 
 def _mvsplat() -> Iterator[_Layer]:
     yield from _mvsplat_encoder()
     yield from _transformer("backbone.transformer", "features.transformer")
-    official, ours = "depth_predictor", "depth"
-    yield from _refinement(f"{official}.corr_refine_net", f"{ours}.refine", scales=3)
-    yield f"{official}.regressor_residual", f"{ours}.shortcut", _FULL
-    yield f"{official}.depth_head_lowres.0", f"{ours}.head.0", _FULL
-    yield f"{official}.depth_head_lowres.2", f"{ours}.head.2", _FULL
+    official, ends = "depth_predictor", {"0": "0", "2": "2"}
+    yield from _refinement(f"{official}.corr_refine_net", "depth.refine", scales=3)
+    yield f"{official}.regressor_residual", "depth.shortcut", _FULL
+    yield from _pair(f"{official}.depth_head_lowres", "depth.head", ends, _FULL)
     yield f"{official}.upsampler.0", "upsampler", _FULL
     yield f"{official}.proj_feature", "project", _FULL
-    yield f"{official}.refine_unet.0", "refine.entry", _FULL
-    yield f"{official}.refine_unet.1", "refine.norm", _FULL
+    yield from _pair(f"{official}.refine_unet", "refine", {"0": "entry", "1": "norm"}, _FULL)
     yield from _unet(f"{official}.refine_unet.3", "refine.unet", scales=5)
-    for layer in (0, 2):
-        yield f"{official}.to_gaussians.{layer}", f"to_gaussians.{layer}", _FULL
-        yield f"{official}.to_disparity.{layer}", f"to_depth.{layer}", _FULL
+    yield from _pair(f"{official}.to_gaussians", "to_gaussians", ends, _FULL)
+    yield from _pair(f"{official}.to_disparity", "to_depth", ends, _FULL)
 
 
 def _mvsplat_encoder() -> Iterator[_Layer]:
@@ -614,9 +565,8 @@ def _mvsplat_encoder() -> Iterator[_Layer]:
     yield f"{official}.conv1", f"{ours}.stem", _BARE
     for stage in range(3):
         for block in (0, 1):
-            for layer in (1, 2):
-                old = f"{official}.layer{stage + 1}.{block}.conv{layer}"
-                yield old, f"{ours}.blocks.{2 * stage + block}.conv{layer}", _BARE
+            old, new = f"{official}.layer{stage + 1}.{block}", f"{ours}.blocks.{2 * stage + block}"
+            yield from _pair(old, new, {"conv1": "conv1", "conv2": "conv2"}, _BARE)
         if stage > 0:
             yield f"{official}.layer{stage + 1}.0.downsample.0", f"{ours}.blocks.{2 * stage}.shortcut.0", _FULL
     yield f"{official}.conv2", f"{ours}.exit", _FULL
