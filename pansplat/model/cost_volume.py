@@ -22,8 +22,13 @@ from pansplat.geometry.equirect import Border
 from pansplat.geometry.warp import Sampling, relative_pose
 from pansplat.model.layers import (
     Compat,
+    Maps,
     PanoramaConv2d,
+    PerView,
+    Poses,
     Precision,
+    ViewMaps,
+    Volume,
     attend,
     autocast_convolutions,
     choose_border,
@@ -96,8 +101,8 @@ class LevelDepth:
     """1 / metres."""
     confidence: Float[Tensor, "batch view height width"]
     """Largest probability of a candidate."""
-    logits: Float[Tensor, "batch view candidate height width"]
-    candidates: Float[Tensor, "batch view candidate height width"]
+    logits: Volume
+    candidates: Volume
     """Inverse depths, 1 / metres, from far to near."""
 
     @property
@@ -148,9 +153,9 @@ class SphericalCostVolume(nn.Module):
     def forward(
         self,
         features: list[Float[Tensor, "batch view _ _ _"]],
-        cam2world: Float[Tensor, "batch view 4 4"],
-        near: Float[Tensor, "batch view"],
-        far: Float[Tensor, "batch view"],
+        cam2world: Poses,
+        near: PerView,
+        far: PerView,
         mono_features: Float[Tensor, "batch view mono height width"] | None = None,
     ) -> Depths:
         """Correlate, refine and regress at each level.
@@ -213,11 +218,11 @@ class LevelRefinement(nn.Module):
 
     def forward(
         self,
-        volume: Float[Tensor, "batch view candidate height width"],
-        features: Float[Tensor, "batch view channel height width"],
+        volume: Volume,
+        features: ViewMaps,
         centre: Float[Tensor, "batch view height width"] | None,
         mono_features: Float[Tensor, "batch view mono h w"] | None,
-    ) -> Float[Tensor, "batch view candidate height width"]:
+    ) -> Volume:
         parts = [volume.to(features.dtype), features]
         if centre is not None:
             parts.append(centre[:, :, None].to(features.dtype))
@@ -242,18 +247,14 @@ class VolumeRefinement(nn.Module):
         self.unet = UNet(UNetConfig(width), border, precision)
         self.exit = PanoramaConv2d(width, width, 3, border=border)
 
-    def forward(
-        self, inputs: Float[Tensor, "batch view channel height width"]
-    ) -> Float[Tensor, "batch view c height width"]:
+    def forward(self, inputs: ViewMaps) -> Float[Tensor, "batch view c height width"]:
         views = inputs.shape[:2]
         entered = functional.gelu(self.norm(self.entry(inputs.flatten(0, 1))))
         refined = self.unet(entered.unflatten(0, views))
         return self.exit(refined.flatten(0, 1)).unflatten(0, views)
 
 
-def make_first_candidates(
-    bounds: tuple[Float[Tensor, "batch view"], Float[Tensor, "batch view"]], count: int, size: tuple[int, int]
-) -> Float[Tensor, "batch view candidate height width"]:
+def make_first_candidates(bounds: tuple[PerView, PerView], count: int, size: tuple[int, int]) -> Volume:
     """Evenly spaced inverse depths from far to near, equal for all pixels; a single one is the mean of the bounds."""
     low, high = (bound[:, :, None] for bound in bounds)
     fraction = torch.linspace(0, 1, count).to(low) if count > 1 else torch.full((1,), 0.5).to(low)
@@ -262,11 +263,8 @@ def make_first_candidates(
 
 
 def make_candidates_around(
-    centre: Float[Tensor, "batch view height width"],
-    step: Float[Tensor, "batch view"],
-    bounds: tuple[Float[Tensor, "batch view"], Float[Tensor, "batch view"]],
-    count: int,
-) -> Float[Tensor, "batch view candidate height width"]:
+    centre: Float[Tensor, "batch view height width"], step: PerView, bounds: tuple[PerView, PerView], count: int
+) -> Volume:
     """Inverse depths around each pixel's centre, clamped to the bounds."""
     low, high = (bound[:, :, None, None, None] for bound in bounds)
     offsets = torch.arange(-(count // 2), count - count // 2).to(centre)[:, None, None]
@@ -274,12 +272,7 @@ def make_candidates_around(
     return torch.minimum(torch.maximum(candidates, low), high)
 
 
-def correlate_views(
-    features: Float[Tensor, "batch view channel height width"],
-    candidates: Float[Tensor, "batch view candidate height width"],
-    cam2world: Float[Tensor, "batch view 4 4"],
-    compat: Compat,
-) -> Float[Tensor, "batch view candidate height width"]:
+def correlate_views(features: ViewMaps, candidates: Volume, cam2world: Poses, compat: Compat) -> Volume:
     """Mean correlation of each view with all other views."""
     total = _correlate_neighbours(features, candidates, cam2world, 1, compat)
     for offset in range(2, features.shape[1]):
@@ -302,11 +295,7 @@ def _correlate_neighbours(
     return correlation.unflatten(0, features.shape[:2])
 
 
-def regress_depth(
-    level: int,
-    logits: Float[Tensor, "batch view candidate height width"],
-    candidates: Float[Tensor, "batch view candidate height width"],
-) -> LevelDepth:
+def regress_depth(level: int, logits: Volume, candidates: Volume) -> LevelDepth:
     """Regress the mean of the candidates under the softmax of the logits, in float32 or float64."""
     probability = torch.softmax(logits.to(torch.promote_types(logits.dtype, torch.float32)), dim=2)
     inverse_depth = (probability * candidates).sum(dim=2)
@@ -343,9 +332,7 @@ class UNet(nn.Module):
         )
         self.exit = ConvNorm(channels, channels, border)
 
-    def forward(
-        self, maps: Float[Tensor, "batch view channel height width"]
-    ) -> Float[Tensor, "batch view channel height width"]:
+    def forward(self, maps: ViewMaps) -> ViewMaps:
         """Refine the maps of all views; 2^(scales - 1) must divide height and width."""
         views = maps.shape[1]
         x = self.stem(maps.flatten(0, 1))
@@ -368,9 +355,7 @@ class EncoderScale(nn.Module):
         self.attention = JointAttention(channels, precision) if bottleneck else None
         self.downsample = None if bottleneck else PanoramaConv2d(channels, channels, 3, stride=2, border=border)
 
-    def forward(
-        self, x: Float[Tensor, "image channel height width"], views: int, skips: list[Tensor]
-    ) -> Float[Tensor, "image channel h w"]:
+    def forward(self, x: Maps, views: int, skips: list[Tensor]) -> Float[Tensor, "image channel h w"]:
         """Return the next scale's map; append the maps for the decoder to `skips`."""
         x = self.block(x)
         if self.attention is not None:
@@ -391,9 +376,7 @@ class DecoderScale(nn.Module):
         self.attentions = nn.ModuleList(JointAttention(channels, precision) for _ in range(2)) if bottleneck else None
         self.upsample = None if finest else PanoramaConv2d(channels, channels, 3, border=border)
 
-    def forward(
-        self, x: Float[Tensor, "image channel height width"], views: int, skips: list[Tensor]
-    ) -> Float[Tensor, "image channel h w"]:
+    def forward(self, x: Maps, views: int, skips: list[Tensor]) -> Float[Tensor, "image channel h w"]:
         """Return the next scale's map; pop two maps from the end of `skips`."""
         for index, block in enumerate(self.blocks):
             x = block(torch.cat((x, skips.pop()), dim=1))
@@ -412,7 +395,7 @@ class ConvNorm(nn.Module):
         self.conv = PanoramaConv2d(inputs, outputs, 3, border=border)
         self.norm = nn.GroupNorm(_GROUPS, outputs)
 
-    def forward(self, maps: Float[Tensor, "image channel height width"]) -> Float[Tensor, "image c height width"]:
+    def forward(self, maps: Maps) -> Float[Tensor, "image c height width"]:
         return self.norm(self.conv(maps))
 
 
@@ -426,7 +409,7 @@ class ResBlock(nn.Module):
         nn.init.zeros_(self.second.norm.weight)
         self.shortcut = nn.Identity() if inputs == outputs else nn.Conv2d(inputs, outputs, 1)
 
-    def forward(self, maps: Float[Tensor, "image channel height width"]) -> Float[Tensor, "image c height width"]:
+    def forward(self, maps: Maps) -> Float[Tensor, "image c height width"]:
         inner = functional.silu(self.second(functional.silu(self.first(maps))))
         return inner + self.shortcut(maps)
 
@@ -443,9 +426,7 @@ class JointAttention(nn.Module):
         self.norm = nn.GroupNorm(_GROUPS, channels)
         nn.init.zeros_(self.norm.weight)
 
-    def forward(
-        self, maps: Float[Tensor, "image channel height width"], views: int
-    ) -> Float[Tensor, "image channel height width"]:
+    def forward(self, maps: Maps, views: int) -> Maps:
         count, channels, height, width = maps.shape
         projected = _apply_per_pixel(self.project_in, maps).movedim(1, -1)
         tokens = projected.reshape(count // views, views * height * width, 3 * channels)
@@ -456,8 +437,6 @@ class JointAttention(nn.Module):
         return maps + self.norm(_apply_per_pixel(self.project_out, to_channels_last(merged)))
 
 
-def _apply_per_pixel(
-    linear: nn.Linear, maps: Float[Tensor, "image channel height width"]
-) -> Float[Tensor, "image c height width"]:
+def _apply_per_pixel(linear: nn.Linear, maps: Maps) -> Float[Tensor, "image c height width"]:
     """Apply a linear layer to the channels of every pixel, as a 1x1 convolution."""
     return functional.conv2d(maps, linear.weight[:, :, None, None], linear.bias)

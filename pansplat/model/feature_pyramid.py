@@ -17,8 +17,11 @@ from torch import Tensor, nn
 from pansplat.geometry.equirect import Border
 from pansplat.model.layers import (
     Compat,
+    Images,
+    Maps,
     PanoramaConv2d,
     Precision,
+    ViewMaps,
     attend,
     autocast_convolutions,
     choose_border,
@@ -73,7 +76,7 @@ class FeaturePyramid(nn.Module):
         self.decoder = Decoder(config.channels, compat)
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # convolves faster
 
-    def forward(self, images: Float[Tensor, "batch view 3 height width"]) -> list[Float[Tensor, "batch view _ _ _"]]:
+    def forward(self, images: Images) -> list[Float[Tensor, "batch view _ _ _"]]:
         """Compute features of RGB images in [0, 1], coarse to fine.
 
         Raises:
@@ -129,9 +132,7 @@ class Decoder(nn.Module):
         self.outputs.append(LevelOutput(width, width, 1, border))
 
     def forward(
-        self,
-        coarsest: Float[Tensor, "image channel height width"],
-        fine_to_coarse: list[Float[Tensor, "image _ _ _"]],
+        self, coarsest: Maps, fine_to_coarse: list[Float[Tensor, "image _ _ _"]]
     ) -> list[Float[Tensor, "image _ _ _"]]:
         """Features of levels 3 to 0, coarse to fine.
 
@@ -165,7 +166,7 @@ class ConvNormAct(nn.Module):
         self.conv = PanoramaConv2d(inputs, outputs, kernel, stride=stride, bias=False, border=border)
         self.norm = nn.BatchNorm2d(outputs)
 
-    def forward(self, maps: Float[Tensor, "image channel height width"]) -> Float[Tensor, "image c h w"]:
+    def forward(self, maps: Maps) -> Float[Tensor, "image c h w"]:
         return nn.functional.leaky_relu(convolve_and_normalize(self.conv, self.norm, maps), 0.1, inplace=True)
 
 
@@ -177,7 +178,7 @@ class LevelOutput(nn.Module):
         self.conv = PanoramaConv2d(inputs, outputs, kernel, border=border)
         self.norm = nn.BatchNorm2d(outputs)
 
-    def forward(self, maps: Float[Tensor, "image channel height width"]) -> Float[Tensor, "image c height width"]:
+    def forward(self, maps: Maps) -> Float[Tensor, "image c height width"]:
         normalized = convolve_and_normalize(self.conv, self.norm, maps)
         return normalized * normalized.sigmoid()  # the official form of SiLU; torch's own rounds differently
 
@@ -208,14 +209,8 @@ class Transformer(nn.Module):
             if parameter.dim() > 1:
                 nn.init.xavier_uniform_(parameter)
 
-    def forward(
-        self, maps: Float[Tensor, "batch view channel height width"]
-    ) -> Float[Tensor, "batch view channel height width"]:
-        """Add the position encoding and refine the maps of all views.
-
-        Raises:
-            InputError: the map cannot be split into windows and shifted by half a window.
-        """
+    def forward(self, maps: ViewMaps) -> ViewMaps:
+        """Add the position encoding and refine the maps; an InputError if they cannot be split into windows."""
         height, width = maps.shape[-2:]
         splits = self.config.splits
         require_size(height, width, 2 * splits if self.compat == "fixed" else splits)
@@ -249,9 +244,7 @@ class TransformerBlock(nn.Module):
         self.norm = nn.LayerNorm(config.channels)
 
     def forward(
-        self,
-        tokens: Float[Tensor, "batch view window token channel"],
-        mask: Float[Tensor, "window token token"] | None,
+        self, tokens: Float[Tensor, "batch view window token channel"], mask: Float[Tensor, "window token token"] | None
     ) -> Float[Tensor, "batch view window token channel"]:
         block_input = tokens
         tokens = tokens + self.within(tokens, tokens, mask)

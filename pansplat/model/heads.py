@@ -28,7 +28,7 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import directions_from_uv
 from pansplat.geometry.pose import multiply_quats, quats_from_rotations
 from pansplat.model.cost_volume import Depths, LevelDepth
-from pansplat.model.layers import Compat, Precision, autocast_convolutions
+from pansplat.model.layers import Compat, Images, PerView, Poses, Precision, autocast_convolutions
 from pansplat.model.tiles import (
     Lattice,
     Margins,
@@ -93,22 +93,18 @@ class HeadsConfig:
         return 2 + self.adapter.num_parameters + (self.candidates + 1 if self.depth == "refined" else 0)
 
 
-AUXILIARY_HEADS = HeadsConfig(depth="swept", layers=2, feature_channels=(128, 96, 64))
-"""Official shape of the auxiliary heads; the features are those of the swept levels, coarse to fine."""
-
-
 @dataclass(frozen=True)
 class MatchedViews:
     """Images, features and depths of all views: everything that the heads read."""
 
-    images: Float[Tensor, "batch view 3 height width"]
+    images: Images
     """RGB in [0, 1], at full resolution."""
     features: Sequence[Float[Tensor, "batch view _ _ _"]]
     """Feature maps, coarse to fine; of resized images if `images` are higher than 512."""
     depths: Depths
-    cam2world: Float[Tensor, "batch view 4 4"]
-    near: Float[Tensor, "batch view"]
-    far: Float[Tensor, "batch view"]
+    cam2world: Poses
+    near: PerView
+    far: PerView
 
 
 @dataclass(frozen=True)

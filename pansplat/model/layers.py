@@ -20,6 +20,19 @@ from pansplat.geometry.pose import orthonormal_error
 Compat = Literal["official", "fixed"]
 Precision = Literal["float32", "bfloat16"]
 
+Images = Float[Tensor, "batch view 3 height width"]
+"""Panoramas, RGB in [0, 1]."""
+Poses = Float[Tensor, "batch view 4 4"]
+"""Rigid cam2world, OpenCV axes, metres."""
+PerView = Float[Tensor, "batch view"]
+"""A number for each view, such as a bound of its depth, metres."""
+ViewMaps = Float[Tensor, "batch view channel height width"]
+"""Maps of all views."""
+Volume = Float[Tensor, "batch view candidate height width"]
+"""A number for each depth candidate of each pixel."""
+Maps = Float[Tensor, "image channel height width"]
+"""Maps of independent images: those of all views of all batch items."""
+
 
 def autocast_convolutions(precision: Precision, device: torch.device) -> torch.autocast:
     """Autocast context in which "bfloat16" rounds inputs and outputs of convolutions and linear layers.
@@ -29,7 +42,7 @@ def autocast_convolutions(precision: Precision, device: torch.device) -> torch.a
     return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16")
 
 
-def to_channels_last(maps: Float[Tensor, "image channel height width"]) -> Float[Tensor, "image channel height width"]:
+def to_channels_last(maps: Maps) -> Maps:
     """The maps in channels-last memory layout, in which a CPU convolves faster."""
     return maps.contiguous(memory_format=torch.channels_last)
 
@@ -40,11 +53,7 @@ def choose_border(compat: Compat) -> Border:
 
 
 def require_views(count: int, compat: Compat) -> None:
-    """Check that the networks accept this number of views.
-
-    Raises:
-        InputError: fewer than two views, or more than two with `compat="official"`.
-    """
+    """Raise an InputError for fewer than two views, or more than two with `compat="official"`."""
     if count < 2:
         raise InputError(f"a prediction needs two or more views, got {count}; add a panorama of the same place")
     if count > 2 and compat == "official":
@@ -54,11 +63,7 @@ def require_views(count: int, compat: Compat) -> None:
 
 
 def require_size(height: int, width: int, multiple: int) -> None:
-    """Check that `multiple` divides height and width.
-
-    Raises:
-        InputError: it does not.
-    """
+    """Raise an InputError unless `multiple` divides height and width."""
     if height % multiple or width % multiple:
         raise InputError(
             f"the network needs a height and a width that {multiple} divides, got {height}x{width}; "
@@ -67,11 +72,7 @@ def require_size(height: int, width: int, multiple: int) -> None:
 
 
 def require_rigid(cam2world: Float[Tensor, "batch view 4 4"]) -> None:
-    """Check that poses are rigid.
-
-    Raises:
-        InputError: a rotation is not orthonormal within 1e-4, is a reflection, or is not finite.
-    """
+    """Raise an InputError for a rotation that is not orthonormal within 1e-4, is a reflection, or is not finite."""
     for item, poses in enumerate(cam2world):
         for view, pose in enumerate(poses):
             error = orthonormal_error(pose)
@@ -100,15 +101,12 @@ class PanoramaConv2d(nn.Conv2d):
         self.border: Border = border
         self.margin = kernel // 2
 
-    def forward(self, input: Float[Tensor, "batch channel height width"]) -> Float[Tensor, "batch c h w"]:
+    def forward(self, input: Maps) -> Float[Tensor, "image c h w"]:
         return self.convolve(input, self.weight, self.bias)
 
     def convolve(
-        self,
-        maps: Float[Tensor, "batch channel height width"],
-        weight: Float[Tensor, "c d kernel kernel"],
-        bias: Float[Tensor, "c"] | None,
-    ) -> Float[Tensor, "batch c h w"]:
+        self, maps: Maps, weight: Float[Tensor, "c d kernel kernel"], bias: Float[Tensor, "c"] | None
+    ) -> Float[Tensor, "image c h w"]:
         """Convolve with the given weights and bias."""
         if self.border == "zeros":
             return functional.conv2d(maps, weight, bias, self.stride, self.margin, groups=self.groups)
@@ -117,9 +115,7 @@ class PanoramaConv2d(nn.Conv2d):
         )
 
 
-def convolve_and_normalize(
-    conv: PanoramaConv2d, norm: nn.BatchNorm2d, maps: Float[Tensor, "batch channel height width"]
-) -> Float[Tensor, "batch c h w"]:
+def convolve_and_normalize(conv: PanoramaConv2d, norm: nn.BatchNorm2d, maps: Maps) -> Float[Tensor, "image c h w"]:
     """Convolution, then batch normalisation; in eval mode one convolution with scaled weights."""
     mean, variance = norm.running_mean, norm.running_var
     if norm.training or mean is None or variance is None:
@@ -129,9 +125,7 @@ def convolve_and_normalize(
     return conv.convolve(maps, conv.weight * scale[:, None, None, None], norm.bias + scale * offset)
 
 
-def upsample(
-    maps: Float[Tensor, "batch channel height width"], factor: int, compat: Compat
-) -> Float[Tensor, "batch channel h w"]:
+def upsample(maps: Maps, factor: int, compat: Compat) -> Float[Tensor, "image channel h w"]:
     """Upsample maps bilinearly; "official" aligns the centres of the corner pixels (`align_corners=True`)."""
     if compat == "official":
         return functional.interpolate(maps, scale_factor=factor, mode="bilinear", align_corners=True)
@@ -139,9 +133,7 @@ def upsample(
     return resize_equirect(maps, (height * factor, width * factor))
 
 
-def resize(
-    maps: Float[Tensor, "batch channel height width"], size: tuple[int, int], compat: Compat
-) -> Float[Tensor, "batch channel h w"]:
+def resize(maps: Maps, size: tuple[int, int], compat: Compat) -> Float[Tensor, "image channel h w"]:
     """Resize maps bilinearly with pixel centres at half-integers; "official" repeats the border pixels."""
     if compat == "official":
         return functional.interpolate(maps, size, mode="bilinear", align_corners=False)

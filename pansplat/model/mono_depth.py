@@ -26,6 +26,7 @@ from pansplat.geometry.equirect import Border, pad_equirect
 from pansplat.model.feature_pyramid import normalize
 from pansplat.model.layers import (
     Compat,
+    Images,
     PanoramaConv2d,
     choose_border,
     convolve_and_normalize,
@@ -58,7 +59,7 @@ class MonocularDepth(nn.Module):
         return super().train(False)
 
     @torch.no_grad()
-    def forward(self, images: Float[Tensor, "batch view 3 height width"]) -> Float[Tensor, "batch view 32 256 512"]:
+    def forward(self, images: Images) -> Float[Tensor, "batch view 32 256 512"]:
         """Features of panoramas of any size, RGB in [0, 1]."""
         panoramas, strips = self.prepare_inputs(images.flatten(0, 1))
         from_panorama = self.panorama_encoder(to_channels_last(normalize(panoramas)))

@@ -18,6 +18,7 @@ from torch.nn.functional import gelu, instance_norm, interpolate, relu
 
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import Border
+from pansplat.model.base import Network
 from pansplat.model.cost_volume import (
     Depths,
     LevelDepth,
@@ -32,8 +33,13 @@ from pansplat.model.feature_pyramid import Transformer, TransformerConfig, norma
 from pansplat.model.heads import AdapterConfig, TileGaussians, adapt_gaussians
 from pansplat.model.layers import (
     Compat,
+    Images,
+    Maps,
     PanoramaConv2d,
+    PerView,
+    Poses,
     Precision,
+    ViewMaps,
     require_size,
     require_views,
     upsample,
@@ -69,35 +75,19 @@ class MatchedViews:
         encoded: output of the encoder, input of the transformer.
     """
 
-    images: Float[Tensor, "batch view 3 height width"]
+    images: Images
     features: Float[Tensor, "batch view channel h w"]
     encoded: Float[Tensor, "batch view channel h w"]
     depths: Depths
-    cam2world: Float[Tensor, "batch view 4 4"]
-    near: Float[Tensor, "batch view"]
-    far: Float[Tensor, "batch view"]
+    cam2world: Poses
+    near: PerView
+    far: PerView
 
 
-@dataclass(frozen=True)
-class MVSplatOutput:
-    """A prediction.
-
-    Attributes:
-        gaussians: one set for each batch item, view by view, in row-major order.
-        matched: intermediate features and depths.
-    """
-
-    gaussians: list[Gaussians]
-    matched: MatchedViews
-
-    @property
-    def depths(self) -> Depths:
-        """Depth of each view at 1/4 of the image's size."""
-        return self.matched.depths
-
-
-class MVSplat(nn.Module):
+class MVSplat(Network):
     """Features and a cost volume at 1/4 scale, and one Gaussian for each pixel."""
+
+    model = "mvsplat"
 
     def __init__(
         self,
@@ -128,29 +118,7 @@ class MVSplat(nn.Module):
             PanoramaConv2d(fine, 2 * fine, 3, border=border), nn.GELU(), PanoramaConv2d(2 * fine, 2, 3, border=border)
         )
 
-    def forward(
-        self,
-        images: Float[Tensor, "batch view 3 height width"],
-        cam2world: Float[Tensor, "batch view 4 4"],
-        near: Float[Tensor, "batch view"],
-        far: Float[Tensor, "batch view"],
-    ) -> MVSplatOutput:
-        """Predict from RGB in [0, 1] and OpenCV cam2world poses; `near` and `far` in metres.
-
-        Raises:
-            InputError: fewer than two views ("official": not two), or a size that 16 does not divide.
-        """
-        matched = self.match_views(images, cam2world, near, far)
-        (part,) = self.lift_gaussians(matched)
-        return MVSplatOutput(part.gaussians, matched)
-
-    def match_views(
-        self,
-        images: Float[Tensor, "batch view 3 height width"],
-        cam2world: Float[Tensor, "batch view 4 4"],
-        near: Float[Tensor, "batch view"],
-        far: Float[Tensor, "batch view"],
-    ) -> MatchedViews:
+    def match_views(self, images: Images, cam2world: Poses, near: PerView, far: PerView) -> MatchedViews:
         """Compute features and depths of all views at 1/4 scale."""
         require_views(images.shape[1], self.compat)
         height, width = images.shape[-2:]
@@ -231,7 +199,7 @@ class Features(nn.Module):
         self.transformer = Transformer(config.transformer, compat, precision)
 
     def forward(
-        self, images: Float[Tensor, "batch view 3 height width"]
+        self, images: Images
     ) -> tuple[Float[Tensor, "batch view channel h w"], Float[Tensor, "batch view channel h w"]]:
         encoded = self.encoder(normalize(images.flatten(0, 1))).unflatten(0, images.shape[:2])
         return self.transformer(encoded), encoded
@@ -271,7 +239,7 @@ class ResidualBlock(nn.Module):
         if inputs != outputs:
             self.shortcut = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride=stride), nn.InstanceNorm2d(outputs))
 
-    def forward(self, maps: Float[Tensor, "image channel height width"]) -> Float[Tensor, "image c h w"]:
+    def forward(self, maps: Maps) -> Float[Tensor, "image c h w"]:
         inner = relu(instance_norm(self.conv1(maps)))
         inner = relu(instance_norm(self.conv2(inner)))
         return relu(self.shortcut(maps) + inner)
@@ -294,13 +262,7 @@ class SweptDepth(nn.Module):
             PanoramaConv2d(2 * config.width, config.candidates, 3, border=border),
         )
 
-    def forward(
-        self,
-        features: Float[Tensor, "batch view channel height width"],
-        cam2world: Float[Tensor, "batch view 4 4"],
-        near: Float[Tensor, "batch view"],
-        far: Float[Tensor, "batch view"],
-    ) -> LevelDepth:
+    def forward(self, features: ViewMaps, cam2world: Poses, near: PerView, far: PerView) -> LevelDepth:
         height, width = features.shape[-2:]
         candidates = make_first_candidates((1 / far, 1 / near), self.config.candidates, (height, width))
         volume = correlate_views(features, candidates, cam2world, self.compat)
@@ -319,9 +281,7 @@ class FullSizeRefinement(nn.Module):
         self.norm = nn.GroupNorm(4, width)
         self.unet = UNet(UNetConfig(width, scales=5), border, precision)
 
-    def forward(
-        self, maps: Float[Tensor, "image channel height width"], views: int
-    ) -> Float[Tensor, "image c height width"]:
+    def forward(self, maps: Maps, views: int) -> Float[Tensor, "image c height width"]:
         entered = gelu(self.norm(self.entry(maps)))
         return self.unet(entered.unflatten(0, (-1, views))).flatten(0, 1)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Protocol, get_args, runtime_checkable
+from typing import Any, get_args
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,6 +17,7 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import fit_panoramas, uv_from_directions
 from pansplat.geometry.world import require_depth_range, scale_poses, working_factor
+from pansplat.model.base import Network
 from pansplat.model.heads import TileGaussians, merge_tiles
 from pansplat.model.layers import Compat, Precision, require_views
 from pansplat.model.mvsplat import MVSplat, MVSplatConfig
@@ -43,34 +44,6 @@ _NETWORKS: dict[str, tuple[type[PanSplat] | type[MVSplat], type]] = {
 _UNTILED_HEIGHT = 512  # above, the number of tiles along each side doubles with the height
 _MULTIPLE = 32  # divides the working height: levels, windows and their shifts
 _MATCHING_FRACTION = 0.4  # of the prediction time, for the progress report
-
-
-@runtime_checkable
-class Network(Protocol):
-    """An nn.Module that matches views and then lifts Gaussians."""
-
-    config: Any
-    compat: Compat
-
-    def match_views(
-        self,
-        images: Float[Tensor, "batch view 3 height width"],
-        cam2world: Float[Tensor, "batch view 4 4"],
-        near: Float[Tensor, "batch view"],
-        far: Float[Tensor, "batch view"],
-    ) -> Any:
-        """Match the views; the result has an attribute `depths` of type `Depths`."""
-        ...
-
-    def lift_gaussians(
-        self, matched: Any, *, tiles: int = 1, only: Sequence[int] | None = None
-    ) -> Iterator[TileGaussians]:
-        """Yield Gaussians tile by tile, or all at once for a network without tiles."""
-        ...
-
-    def state_dict(self) -> dict[str, Tensor]: ...
-    def parameters(self) -> Iterator[Tensor]: ...
-    def eval(self) -> Any: ...
 
 
 class NetworkPredictor:
@@ -147,11 +120,7 @@ class NetworkPredictor:
         masks: Bool[Tensor, "view height width"] | None = None,
         progress: Progress | None = None,
     ) -> tuple[Gaussians, list[Float[Tensor, "view _ _"]]]:
-        """Predict Gaussians, and return them with the radial depth maps of the swept levels, metres, coarse to fine.
-
-        Raises:
-            InputError: see `__call__`.
-        """
+        """As `__call__`, with the radial depth maps of the swept levels, metres, coarse to fine."""
         matched, tiles, factor = self._match(images, cam2world, near, far, masks, progress)
         parts = list(self._lift(matched, tiles, progress))
         gaussians = merge_tiles(parts, self.network.compat)[0].scaled(1 / factor).to(device=images.device)
@@ -169,11 +138,7 @@ class NetworkPredictor:
         masks: Bool[Tensor, "view height width"] | None = None,
         progress: Progress | None = None,
     ) -> Iterator[Gaussians]:
-        """Yield the Gaussians of `__call__` tile by tile, in bounded memory.
-
-        Raises:
-            InputError: see `__call__`; raised when the first part is requested.
-        """
+        """Yield the Gaussians of `__call__` tile by tile, in bounded memory; errors are raised at the first part."""
         with torch.no_grad():
             matched, tiles, factor = self._match(images, cam2world, near, far, masks, progress)
         parts = self._lift(matched, tiles, progress)
@@ -298,11 +263,7 @@ def load_predictor(
 
 
 def convert_checkpoint(content: Mapping[str, object], source: object) -> WeightsFile:
-    """Convert the content of an official checkpoint to the content of a weights file.
-
-    Raises:
-        InputError: the checkpoint does not hold an unmodified official model.
-    """
+    """The content of a weights file from that of an official checkpoint; an InputError for a modified model."""
     tensors = convert_tensors(content, source)
     model = match_tensors(content, source).model
     weights = pack_weights(model, _NETWORKS[model][1](), tensors, compat="official")
@@ -311,11 +272,7 @@ def convert_checkpoint(content: Mapping[str, object], source: object) -> Weights
 
 
 def require_precision(precision: str) -> None:
-    """Check that the processor has instructions for a precision.
-
-    Raises:
-        InputError: it has none, or there is no such precision.
-    """
+    """Raise an InputError for an unknown precision, or one without instructions of the processor."""
     if precision not in get_args(Precision):
         raise InputError(f"`precision` must be {' or '.join(get_args(Precision))}, got {precision!r}")
     if precision == "bfloat16" and not has_bfloat16():
@@ -334,7 +291,7 @@ def has_bfloat16() -> bool:
     return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16"))
 
 
-def build_network(weights: WeightsFile, compat: Compat, source: object, **choices: Any) -> PanSplat | MVSplat:
+def build_network(weights: WeightsFile, compat: Compat, source: object, **choices: Any) -> Network:
     """Build the network of a weights file, in eval mode.
 
     Args:
@@ -356,12 +313,8 @@ def build_empty_network(
     *,
     precision: Precision = "float32",
     attention_precision: Precision = "float32",
-) -> PanSplat | MVSplat:
-    """Build a network on the meta device, without memory for weights and without random numbers.
-
-    Raises:
-        InputError: the file's settings fit no network.
-    """
+) -> Network:
+    """The network on the meta device, without memory for weights; an InputError if the settings fit none."""
     if weights.model not in _NETWORKS:
         raise InputError(f"{source}: needed weights of {' or '.join(_NETWORKS)}, got weights of {weights.model!r}")
     kind, config_kind = _NETWORKS[weights.model]

@@ -9,13 +9,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
-from pansplat.gaussians.scene import Gaussians
-from pansplat.model.cost_volume import CostVolumeConfig, Depths, SphericalCostVolume
+from pansplat.model.base import Network
+from pansplat.model.cost_volume import CostVolumeConfig, SphericalCostVolume
 from pansplat.model.feature_pyramid import FeaturePyramid, FeaturePyramidConfig
 from pansplat.model.heads import GaussianHeads, HeadsConfig, MatchedViews, TileGaussians
-from pansplat.model.layers import Compat, Precision, autocast_convolutions, resize
+from pansplat.model.layers import Compat, Images, PerView, Poses, Precision, autocast_convolutions, resize
 from pansplat.model.mono_depth import MonocularDepth
 
 MATCHING_HEIGHT = 512
@@ -41,32 +41,16 @@ class PanSplatConfig:
             )
 
 
-@dataclass(frozen=True)
-class PanSplatOutput:
-    """A prediction.
-
-    Attributes:
-        gaussians: one set for each batch item, labelled with level and view.
-        matched: intermediate features and depths.
-    """
-
-    gaussians: list[Gaussians]
-    matched: MatchedViews
-
-    @property
-    def depths(self) -> Depths:
-        """Depth of each view at the swept levels, coarse to fine."""
-        return self.matched.depths
-
-
-class PanSplat(nn.Module):
+class PanSplat(Network):
     """Feature pyramid, monocular depth, spherical cost volume, residual Gaussian heads.
 
     Args:
-        compat: "official" computes the numbers of the official code with its defects; "fixed" corrects them.
+        compat: see `Network`.
         precision: number type of all convolutions; depths, correlations and positions are not affected.
         attention_precision: number type that attention rounds to; bfloat16 in the official code.
     """
+
+    model = "pansplat"
 
     def __init__(
         self,
@@ -87,30 +71,7 @@ class PanSplat(nn.Module):
         self.cost_volume = SphericalCostVolume(config.cost_volume, compat, attention_precision, precision)
         self.heads = GaussianHeads(config.heads, compat, precision)
 
-    def forward(
-        self,
-        images: Float[Tensor, "batch view 3 height width"],
-        cam2world: Float[Tensor, "batch view 4 4"],
-        near: Float[Tensor, "batch view"],
-        far: Float[Tensor, "batch view"],
-        *,
-        tiles: int = 1,
-    ) -> PanSplatOutput:
-        """Predict from RGB in [0, 1] and OpenCV cam2world poses; `near` and `far` in metres.
-
-        Raises:
-            InputError: fewer than two views ("official": not two), or a size that the pyramid cannot halve.
-        """
-        matched = self.match_views(images, cam2world, near, far)
-        return PanSplatOutput(self.heads(matched, tiles=tiles), matched)
-
-    def match_views(
-        self,
-        images: Float[Tensor, "batch view 3 height width"],
-        cam2world: Float[Tensor, "batch view 4 4"],
-        near: Float[Tensor, "batch view"],
-        far: Float[Tensor, "batch view"],
-    ) -> MatchedViews:
+    def match_views(self, images: Images, cam2world: Poses, near: PerView, far: PerView) -> MatchedViews:
         """Compute features and depths of all views, the inputs of the heads."""
         features = self.features(self._resize_for_matching(images))
         mono_features = None
@@ -126,9 +87,7 @@ class PanSplat(nn.Module):
         """Yield the Gaussians tile by tile to bound memory; see `GaussianHeads.iterate_tiles`."""
         return self.heads.iterate_tiles(matched, tiles=tiles, only=only)
 
-    def _resize_for_matching(
-        self, images: Float[Tensor, "batch view 3 height width"]
-    ) -> Float[Tensor, "batch view 3 h w"]:
+    def _resize_for_matching(self, images: Images) -> Float[Tensor, "batch view 3 h w"]:
         if images.shape[-2] <= MATCHING_HEIGHT:
             return images
         small = resize(images.flatten(0, 1), (MATCHING_HEIGHT, 2 * MATCHING_HEIGHT), self.compat)

@@ -154,10 +154,7 @@ def crop_window(
 
 
 def sample_window(
-    window_map: Float[Tensor, "channel rows columns"],
-    window: Window,
-    height: int,
-    uv: Float[Tensor, "n 2"],
+    window_map: Float[Tensor, "channel rows columns"], window: Window, height: int, uv: Float[Tensor, "n 2"]
 ) -> Float[Tensor, "n channel"]:
     """Sample a map bilinearly at points inside a window.
 

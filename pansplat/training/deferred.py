@@ -28,8 +28,8 @@ from jaxtyping import Float, Integer
 from torch import Tensor
 
 from pansplat.gaussians.scene import Gaussians
+from pansplat.model.base import Network
 from pansplat.model.heads import TileGaussians, merge_tiles
-from pansplat.model.network import Network
 from pansplat.model.pansplat import PanSplat
 from pansplat.training.rendering import ImagePart, TargetRenderer
 

@@ -9,9 +9,10 @@ import torch
 from torch import nn
 
 from pansplat.errors import InputError
+from pansplat.model.base import Network
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
 from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
-from pansplat.model.heads import AUXILIARY_HEADS, AdapterConfig, AuxiliaryHeads, HeadsConfig
+from pansplat.model.heads import AdapterConfig, AuxiliaryHeads, HeadsConfig
 from pansplat.model.mvsplat import MVSplat
 from pansplat.model.network import convert_checkpoint, require_precision
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
@@ -50,7 +51,7 @@ def _small_config(
     )
 
 
-def build_network(config: NetworkConfig, seed: int) -> PanSplat | MVSplat:
+def build_network(config: NetworkConfig, seed: int) -> Network:
     """The network with the weights of `config.init`, or with random weights from the seed; frozen parts are frozen.
 
     Raises:
@@ -59,7 +60,6 @@ def build_network(config: NetworkConfig, seed: int) -> PanSplat | MVSplat:
     require_precision(config.precision)
     initial = None if config.init is None else read_weights(config.init)
     torch.manual_seed(seed)
-    network: PanSplat | MVSplat
     if config.shape == "mvsplat":
         network = MVSplat(compat=config.compat, attention_precision=config.attention_precision)
     else:
@@ -82,22 +82,17 @@ def build_network(config: NetworkConfig, seed: int) -> PanSplat | MVSplat:
 
 
 def read_weights(path: Path) -> WeightsFile:
-    """Weights of a .safetensors, an official checkpoint, or a training checkpoint.
-
-    Raises:
-        InputError: the file cannot be used, or contains code.
-    """
+    """Weights of a .safetensors, an official or a training checkpoint; an InputError if it is unusable."""
     if path.suffix.lower() not in CHECKPOINT_SUFFIXES:
         return load_weights(path)
     content = read_checkpoint(path)
     return extract_weights(content, path) if is_training_state(content) else convert_checkpoint(content, path)
 
 
-def write_weights(path: Path, network: PanSplat | MVSplat, state: dict[str, torch.Tensor] | None = None) -> None:
+def write_weights(path: Path, network: Network, state: dict[str, torch.Tensor] | None = None) -> None:
     """Write the network's weights, or another state of it, as a .safetensors for `--model`."""
-    model = "mvsplat" if isinstance(network, MVSplat) else "pansplat"
     tensors = dict(network.state_dict() if state is None else state)
-    save_weights(path, pack_weights(model, network.config, tensors, compat=network.compat))
+    save_weights(path, pack_weights(network.model, network.config, tensors, compat=network.compat))
 
 
 def freeze(network: nn.Module, parts: tuple[str, ...]) -> None:
@@ -128,12 +123,10 @@ def trainable_parameters(*modules: nn.Module | None) -> Iterator[nn.Parameter]:
             yield from (p for p in module.parameters() if p.requires_grad)
 
 
-def build_auxiliary_heads(network: PanSplat | MVSplat) -> AuxiliaryHeads:
+def build_auxiliary_heads(network: Network) -> AuxiliaryHeads:
     """Randomly initialised heads that predict Gaussians from each level of the cost volume alone; for training only."""
     assert isinstance(network, PanSplat)
     heads = network.config.heads
-    if network.config == PanSplatConfig():
-        return AuxiliaryHeads(AUXILIARY_HEADS, network.compat)
     swept = network.config.cost_volume.swept_levels
     config = HeadsConfig(
         depth="swept",

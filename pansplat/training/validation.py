@@ -15,9 +15,8 @@ from pansplat.data.sources import SampleSource
 from pansplat.data.views import Sample, collate
 from pansplat.errors import InputError
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
+from pansplat.model.base import Network
 from pansplat.model.heads import merge_tiles
-from pansplat.model.mvsplat import MVSplat
-from pansplat.model.pansplat import PanSplat
 from pansplat.training.rendering import TargetRenderer
 
 MEASURES = ("psnr", "ws_psnr", "ssim", "depth_error")
@@ -26,7 +25,7 @@ MEASURES = ("psnr", "ws_psnr", "ssim", "depth_error")
 
 @torch.no_grad()
 def validate(
-    network: PanSplat | MVSplat,
+    network: Network,
     source: SampleSource,
     renderer: TargetRenderer,
     *,
@@ -60,9 +59,7 @@ def validate(
     return {measure: fmean(values[measure]) if values[measure] else math.nan for measure in MEASURES}
 
 
-def _measure(
-    network: PanSplat | MVSplat, sample: Sample, renderer: TargetRenderer, tiles: int
-) -> tuple[dict[str, float], Tensor]:
+def _measure(network: Network, sample: Sample, renderer: TargetRenderer, tiles: int) -> tuple[dict[str, float], Tensor]:
     """Measures of a sample's first target, without the error of depth if no depth is known; and its rendering."""
     parameter = next(network.parameters())
     batch = collate([sample]).to(parameter.device, parameter.dtype)

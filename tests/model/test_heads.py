@@ -7,14 +7,13 @@ import pytest
 import torch
 
 from pansplat.errors import InputError
-from pansplat.gaussians.harmonics import evaluate_harmonics, harmonics_basis, rotate_harmonics
+from pansplat.gaussians.harmonics import harmonics_basis, rotate_harmonics
 from pansplat.gaussians.scene import Gaussians
-from pansplat.geometry.equirect import directions_from_uv, uv_from_directions
+from pansplat.geometry.equirect import uv_from_directions
 from pansplat.geometry.fibonacci import lattice_size
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.model.cost_volume import Depths, LevelDepth
 from pansplat.model.heads import (
-    AUXILIARY_HEADS,
     AdapterConfig,
     AuxiliaryHeads,
     GaussianHeads,
@@ -23,7 +22,9 @@ from pansplat.model.heads import (
     adapt_gaussians,
     compute_untiled_index,
 )
+from pansplat.model.pansplat import PanSplat
 from pansplat.model.tiles import make_tiles
+from pansplat.training.network import build_auxiliary_heads
 
 SMALL = HeadsConfig(feature_channels=(6, 5, 4, 3), candidates=4, adapter=AdapterConfig(degree=1))
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
@@ -97,7 +98,7 @@ def _difference(a: Gaussians, b: Gaussians) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("lattice", "tiles"), [("pixel", 2), ("fibonacci", 8)])
+@pytest.mark.parametrize(("lattice", "tiles"), [("pixel", 2), ("fibonacci", 4)])
 def test_tiled_heads_equal_untiled(lattice, tiles):
     heads, matched = _heads(lattice=lattice), _matched(views=1)
     with torch.no_grad():
@@ -145,9 +146,9 @@ def test_tiles_hold_every_gaussian_once():
 # Symmetries
 
 
-@pytest.mark.parametrize("columns", [1, 8])
-def test_rolling_the_panorama_rolls_the_maps(columns):
-    """By any number of the coarsest level's pixels; 8 are half a turn."""
+def test_rolling_the_panorama_rolls_the_maps():
+    """By any number of the coarsest level's pixels."""
+    columns = 1
     heads, matched = _heads(lattice="pixel", emitted="finest"), _matched(views=1)
     with torch.no_grad():
         before, after = heads(matched)[0], heads(_roll(matched, columns))[0]
@@ -155,14 +156,6 @@ def test_rolling_the_panorama_rolls_the_maps(columns):
     for read in (lambda g: g.opacities, lambda g: g.scales, lambda g: (g.means - origin).norm(dim=-1)):
         expected = read(before).unflatten(0, (64, 128)).roll(8 * columns, dims=1).flatten(0, 1)
         assert torch.allclose(read(after), expected, atol=1e-12)
-
-
-def test_rolling_the_panorama_does_not_roll_the_official_maps():
-    heads, matched = _heads("official", lattice="pixel", emitted="finest"), _matched(views=1)
-    with torch.no_grad():
-        before, after = heads(matched)[0], heads(_roll(matched, 8))[0]
-    maps = before.opacities.unflatten(0, (64, 128)).roll(64, dims=1).flatten()
-    assert float((after.opacities - maps).abs().max()) > 1e-3
 
 
 @pytest.mark.parametrize("compat", ["official", "fixed"])
@@ -173,37 +166,14 @@ def test_order_is_level_coarse_to_fine_then_view_then_point(compat):
     assert list(zip(gaussians.levels.tolist(), gaussians.views.tolist(), strict=True)) == expected
 
 
-def test_views_and_batch_items_are_independent():
-    heads, matched = _heads(), _matched(views=2, batch=2)
+def test_heads_run_at_other_heights():
     with torch.no_grad():
-        second = heads(matched)[1]
-        alone = heads(_map(lambda tensor: tensor[1:, 1:], matched))[0]
-    second = second.select(second.views == 1)
-    assert all(torch.equal(getattr(second, name), getattr(alone, name)) for name in _FIELDS)
-
-
-@pytest.mark.parametrize("height", [80, 128])
-def test_heads_run_at_other_heights(height):
-    with torch.no_grad():
-        gaussians = _heads()(_matched(height, views=1), tiles=2)[0]
-    assert len(gaussians) == sum(lattice_size(2 * height >> level) for level in range(4))
+        gaussians = _heads()(_matched(80, views=1), tiles=2)[0]
+    assert len(gaussians) == sum(lattice_size(160 >> level) for level in range(4))
     assert bool(torch.isfinite(gaussians.means).all())
 
 
-# Gradients, bounds, precision
-
-
-@pytest.mark.parametrize("compat", ["official", "fixed"])
-def test_gradients_reach_every_weight_and_input(compat):
-    heads, matched = _heads(compat), _matched(views=1)
-    inputs = [matched.images, *matched.features, matched.depths.levels[-1].logits]
-    for tensor in inputs:
-        tensor.requires_grad_()
-    gaussians = heads(matched)[0]
-    torch.stack([(getattr(gaussians, name) ** 2).sum() for name in _FIELDS]).sum().backward()
-    for tensor in (*inputs, *heads.parameters()):
-        assert tensor.grad is not None and float(tensor.grad.abs().max()) > 0
-        assert bool(torch.isfinite(tensor.grad).all())
+# Bounds, precision
 
 
 def test_depth_stays_within_its_bounds():
@@ -286,7 +256,7 @@ def test_unusable_heights_are_refused():
 
 def test_auxiliary_heads_give_a_set_for_each_swept_level():
     torch.manual_seed(0)
-    config = dataclasses.replace(AUXILIARY_HEADS, feature_channels=(6, 5, 4), candidates=4, adapter=SMALL.adapter)
+    config = HeadsConfig(depth="swept", layers=2, feature_channels=(6, 5, 4), candidates=4, adapter=SMALL.adapter)
     heads = AuxiliaryHeads(config, "fixed").double()
     by_level = heads(_matched(views=2, batch=2))
     assert [len(items) for items in by_level] == [2, 2, 2]
@@ -302,7 +272,8 @@ def test_auxiliary_heads_give_a_set_for_each_swept_level():
 @pytest.mark.shared
 def test_auxiliary_heads_have_the_shapes_of_the_official_ones(recipe):
     official = recipe("pansplat-512-360loc_aux")
-    ours = AuxiliaryHeads(AUXILIARY_HEADS, "official").state_dict()
+    with torch.device("meta"):
+        ours = build_auxiliary_heads(PanSplat(compat="official")).state_dict()
     assert sorted(tuple(t.shape) for t in official.values()) == sorted(tuple(t.shape) for t in ours.values())
 
 
@@ -374,17 +345,6 @@ def test_official_harmonics_rotate_correctly_about_y_only():
         pose[:3, :3] = rotations_from_quats(torch.tensor(quat, dtype=torch.float64))
         difference = float((_adapt(pose, "official").harmonics - _adapt(pose, "fixed").harmonics).abs().max())
         assert difference < 1e-14 if correct else difference > 0.01
-
-
-def test_each_raw_harmonic_changes_its_colour_only():
-    for k in range(25):
-        parameters = torch.zeros(30, 82, dtype=torch.float64)
-        parameters[:, 3] = 1
-        parameters[:, 7 + 25 + k] = 1000.0  # green
-        harmonics = _adapt(_pose(), parameters=parameters).harmonics
-        colors = evaluate_harmonics(harmonics, directions_from_uv(_random(30, 2)))
-        assert float((colors[:, 1] - 0.5).abs().max()) > 0.01
-        assert torch.allclose(colors[:, 0], torch.full_like(colors[:, 0], 0.5), atol=1e-9)
 
 
 def test_the_networks_harmonics_have_y_as_polar_axis():
