@@ -43,11 +43,11 @@ def official_weights(recipe_weights: dict[str, Tensor], as_lightning: Callable[.
 
 @pytest.fixture(scope="session")
 def run_official(official_weights: WeightsFile, golden: Callable[..., dict[str, Tensor]]) -> Callable[..., OfficialRun]:
-    """Run the converted network as a predictor; each combination of arguments runs once."""
+    """Run the converted network as a predictor, once for each precision of attention."""
 
     @functools.cache
-    def run(compat: str = "official", attention: str = "float32") -> OfficialRun:
-        network = build_network(official_weights, compat, "recipe", attention_precision=attention)
+    def run(attention: str = "float32") -> OfficialRun:
+        network = build_network(official_weights, "official", "recipe", attention_precision=attention)
         inputs, outputs = {}, {}
 
         for name in _HOOKED:
@@ -56,6 +56,8 @@ def run_official(official_weights: WeightsFile, golden: Callable[..., dict[str, 
                 inputs[name], outputs[name] = arguments[0], output
 
             network.get_submodule(name).register_forward_hook(keep)
+        if attention != "float32":  # the monocular network has no attention
+            network.mono_depth.forward = lambda _: run().outputs["mono_depth"]
         truth = golden("pansplat_64x128_fp32attn")
         scene = (truth[f"in.{name}"][0] for name in ("image", "extrinsics", "near", "far"))
         gaussians = NetworkPredictor("pansplat", network)(*scene)

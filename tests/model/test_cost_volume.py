@@ -158,21 +158,6 @@ def test_scaling_the_world_scales_the_depth_of_a_single_level(randomize):
     assert torch.allclose(after.depth[0], 7 * before.depth[0], rtol=1e-10)
 
 
-@pytest.mark.parametrize("views", [2, 3])
-def test_the_order_of_the_views_does_not_matter(small, views):
-    features, poses, near, far, mono = _inputs(views)
-    order = torch.arange(views).flip(0)
-    before = small(features, poses, near, far, mono)
-    after = small([maps[:, order] for maps in features], poses[:, order], near, far, mono[:, order])
-    assert torch.allclose(after.depth[-1], before.depth[-1][:, order], rtol=1e-9)
-
-
-def test_batch_items_are_independent(small):
-    inputs = _inputs(batch=2)
-    alone = [[maps[1:] for maps in inputs[0]], *(tensor[1:] for tensor in inputs[1:])]
-    assert torch.allclose(small(*alone).depth[-1], small(*inputs).depth[-1][1:], rtol=1e-9)
-
-
 def test_depths_lie_within_the_bounds(small):
     depths = small(*_inputs())
     assert [tuple(depth.shape) for depth in depths.depth] == [(1, 2, 8, 16), (1, 2, 16, 32)]
@@ -190,15 +175,6 @@ def test_each_ablation_runs(randomize, changes):
     depths = network(features, poses, near, far, mono if config.mono_channels else None)
     assert len(depths.levels) == len(network.levels) == (2 if config.swept_levels == _SMALL.levels else 1)
     assert any("unet" in name for name, _ in network.named_parameters()) == (config.refinement == "unet")
-
-
-def test_gradients_reach_every_parameter_and_the_features(small):
-    small.zero_grad()
-    features, *rest = _inputs()
-    features = [maps.requires_grad_() for maps in features]
-    sum(inverse.square().sum() for inverse in small(features, *rest).inverse_depth).backward()
-    assert features[0].grad.abs().max() > 0 and features[1].grad.abs().max() > 0 and features[2].grad is None
-    assert all(parameter.grad.abs().max() > 1e-12 for parameter in small.parameters())
 
 
 def test_no_gradient_flows_from_a_level_to_the_coarser(small):
@@ -266,20 +242,13 @@ def network(randomize):
     return randomize(SphericalCostVolume(_HARD_CASES, "fixed"))
 
 
-# No baseline
-
-
 @pytest.mark.hard_case(38)
 def test_without_a_baseline_the_cost_is_the_same_for_all_candidates():
     for dtype in (torch.float32, torch.float64):
         candidates = _candidates(*(bound.to(dtype) for bound in _bounds()))
         volume = correlate_views(_features(dtype)[0], candidates, _poses((0, 0, 0)), "fixed")
         assert torch.equal(volume, volume[:, :, :1].expand_as(volume))
-
-
-@pytest.mark.hard_case(38)
-def test_without_a_baseline_identical_views_match_fully():
-    features = _noise(1, 1, 8, H, W).expand(1, 2, -1, -1, -1)
+    features = _noise(1, 1, 8, H, W).expand(1, 2, -1, -1, -1)  # identical views match fully
     volume = correlate_views(features, _candidates(*_bounds()), _poses((0, 0, 0)), "fixed")
     assert torch.allclose(volume, (features.square().sum(dim=2) / 8**0.5)[:, :, None].expand_as(volume), atol=1e-12)
 
@@ -291,9 +260,6 @@ def test_identical_views_give_finite_depths_and_gradients(network):
     assert all(torch.isfinite(depth).all() for depth in depths.depth)
     sum(depth.sum() for depth in depths.depth).backward()
     assert all(torch.isfinite(parameter.grad).all() for parameter in network.parameters())
-
-
-# The epipole
 
 
 @pytest.mark.hard_case(39)
@@ -326,9 +292,6 @@ def test_at_the_epipole_all_candidates_have_the_same_cost():
     assert torch.allclose(volume, volume[:1].expand_as(volume), atol=1e-12)
 
 
-# Over the seam and over the poles
-
-
 @pytest.mark.hard_case(40)
 def test_samples_continue_across_the_seam_and_the_poles():
     """A rotated camera samples a smooth field on the sphere without a jump."""
@@ -340,9 +303,6 @@ def test_samples_continue_across_the_seam_and_the_poles():
         warped = warp_panorama(field, torch.ones(1, 1, height, width).double(), pose)[0, :, 0]
         truth = torch.einsum("ij,jhw->ihw", pose[0, :3, :3], field[0])
         assert (warped - truth).abs().max() < 2e-3  # a jump would be of the order of 1
-
-
-# Bounds
 
 
 @pytest.mark.hard_case(41)
@@ -376,12 +336,9 @@ def test_extreme_features_give_depths_within_the_bounds(network):
             assert all(((depth >= 0.5 - 1e-12) & (depth <= 10 + 1e-9)).all() for depth in depths.depth)
 
 
-# Half precision
-
-
 @pytest.mark.hard_case(42)
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_huge_logits_in_half_precision_choose_one_candidate(dtype):
+def test_half_precision_logits_choose_one_candidate_or_their_mean_in_float32(dtype):
     candidates = _candidates(*(bound.float() for bound in _bounds()))
     logits = torch.full((1, 2, 6, H, W), -1e4, dtype=dtype)
     logits[:, :, 4] = 1e4
@@ -390,13 +347,7 @@ def test_huge_logits_in_half_precision_choose_one_candidate(dtype):
     assert torch.equal(level.inverse_depth, candidates[:, :, 4])
     level.inverse_depth.sum().backward()
     assert torch.isfinite(logits.grad).all()
-
-
-@pytest.mark.hard_case(42)
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_the_mean_is_taken_in_float32(dtype):
-    candidates = _candidates(*(bound.float() for bound in _bounds()))
-    level = regress_depth(2, torch.zeros(1, 2, 6, H, W, dtype=dtype), candidates)
+    level = regress_depth(2, torch.zeros_like(logits), candidates)
     assert torch.allclose(level.inverse_depth, candidates.mean(dim=2), rtol=1e-6)
 
 
@@ -409,9 +360,6 @@ def test_products_beyond_half_precision_do_not_overflow(backend):
     assert torch.allclose(result, torch.tensor(128 * 900 / math.sqrt(128)), rtol=1e-4)
     result.mean().backward()
     assert torch.isfinite(features.grad).all()
-
-
-# Rotated cameras
 
 
 @pytest.mark.hard_case(43)
@@ -436,9 +384,6 @@ def test_a_half_turn_of_one_camera_rolls_its_panorama_only():
     after = correlate_views(rolled, candidates, turned, "fixed")
     assert torch.allclose(after[:, 0], before[:, 0], atol=1e-11)
     assert torch.allclose(after[:, 1], before[:, 1].roll(W // 2, -1), atol=1e-11)
-
-
-# A depth range of 1e4
 
 
 @pytest.mark.hard_case(44)
@@ -476,21 +421,14 @@ def unet(randomize):
     return randomize(UNet(UNetConfig(32), "sphere"))
 
 
-@pytest.mark.parametrize("columns", [4, 8])
-def test_rolling_by_whole_pixels_of_the_bottleneck_rolls_the_output(unet, columns):
+def test_rolling_by_a_pixel_of_the_bottleneck_rolls_the_output(unet):
     maps = _noise(1, 2, 32, 8, 16)
-    assert torch.allclose(unet(maps.roll(columns, -1)), unet(maps).roll(columns, -1), atol=1e-11)
+    assert torch.allclose(unet(maps.roll(4, -1)), unet(maps).roll(4, -1), atol=1e-11)
 
 
 def test_zero_padding_breaks_the_roll(randomize):
     maps, network = _noise(1, 2, 32, 8, 16), randomize(UNet(UNetConfig(32), "zeros"))
     assert not torch.allclose(network(maps.roll(8, -1)), network(maps).roll(8, -1), atol=1e-3)
-
-
-@pytest.mark.parametrize("views", [2, 3])
-def test_the_unet_does_not_depend_on_the_order_of_the_views(unet, views):
-    maps, order = _noise(1, views, 32, 8, 16), torch.arange(views).flip(0)
-    assert torch.allclose(unet(maps[:, order]), unet(maps)[:, order], atol=1e-11)
 
 
 def test_views_depend_on_each_other_and_batch_items_do_not(unet):
@@ -501,7 +439,7 @@ def test_views_depend_on_each_other_and_batch_items_do_not(unet):
     assert moved[0].min() > 1e-3 and moved[1].max() < 1e-12
 
 
-@pytest.mark.parametrize("scales", [1, 2, 5])
+@pytest.mark.parametrize("scales", [1, 5])
 def test_a_unet_of_any_number_of_scales_keeps_the_size(randomize, scales):
     network = randomize(UNet(UNetConfig(32, scales=scales), "sphere"))
     assert network(_noise(1, 2, 32, 16, 32)).shape == (1, 2, 32, 16, 32)
@@ -518,9 +456,3 @@ def test_an_untrained_block_is_its_shortcut():
 def test_untrained_attention_adds_zero():
     maps = _noise(2, 32, 4, 8)
     assert torch.equal(JointAttention(32, "float32").double()(maps, 2), maps)
-
-
-def test_gradients_reach_every_parameter_of_the_unet(unet):
-    unet.zero_grad()
-    unet(_noise(1, 2, 32, 8, 16)).square().sum().backward()
-    assert all(parameter.grad.abs().max() > 1e-9 for parameter in unet.parameters())

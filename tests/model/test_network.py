@@ -24,6 +24,7 @@ from pansplat.model.network import (
     choose_tiles,
     convert_checkpoint,
     load_predictor,
+    remove_masked_gaussians,
     require_precision,
 )
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
@@ -45,6 +46,12 @@ def predictor(small_config) -> NetworkPredictor:
     return _predictor(small_config)
 
 
+@pytest.fixture(scope="module")
+def prediction(predictor) -> Gaussians:
+    """The prediction from `_inputs()`."""
+    return predictor(*_inputs(), 0.5, 20.0)
+
+
 def _inputs(height: int = 64, views: int = 2) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(1)
     poses = torch.eye(4, dtype=torch.float64).repeat(views, 1, 1)
@@ -56,45 +63,47 @@ def test_a_network_predictor_is_a_predictor(predictor):
     assert isinstance(predictor, Predictor)
 
 
-def test_a_batch_gives_a_list_of_the_predictions_of_its_items(predictor):
+def test_a_batch_gives_a_list_of_the_predictions_of_its_items(predictor, prediction):
     images, poses = _inputs()
-    alone = predictor(images, poses, 0.5, 20.0)
-    assert isinstance(alone, Gaussians) and len(alone) == 2 * _PER_VIEW
+    assert isinstance(prediction, Gaussians) and len(prediction) == 2 * _PER_VIEW
     both = predictor(torch.stack((images.flip(0), images)), torch.stack((poses, poses)), torch.tensor((1.0, 0.5)), 20.0)
     assert isinstance(both, list) and len(both) == 2
-    assert torch.equal(both[1].means, alone.means)
-    assert not torch.equal(both[0].means, alone.means)
+    assert torch.equal(both[1].means, prediction.means)
+    assert not torch.equal(both[0].means, prediction.means)
 
 
-def test_masks_remove_only_the_gaussians_of_masked_pixels(predictor):
+def test_masks_remove_only_the_gaussians_of_masked_pixels(predictor, prediction):
     images, poses = _inputs()
     masks = torch.ones(2, 64, 128, dtype=torch.bool)
     masks[1, 40:] = False
-    every, kept = predictor(images, poses, 0.5, 20.0), predictor(images, poses, 0.5, 20.0, masks=masks)
+    kept = predictor(images, poses, 0.5, 20.0, masks=masks)
     assert int((kept.views == 0).sum()) == _PER_VIEW
     assert 0.3 * _PER_VIEW < int((kept.views == 1).sum()) < 0.8 * _PER_VIEW
     local = kept.means[kept.views == 1] - poses[1, :3, 3].float()
     assert float(uv_from_directions(local)[:, 1].max()) * 64 < 40.01
-    first, second = (g.select(g.views == 0) for g in (every, kept))
+    first, second = (g.select(g.views == 0) for g in (prediction, kept))
     assert torch.equal(first.means, second.means)
-    assert len(predictor(images, poses, 0.5, 20.0, masks=~torch.ones_like(masks))) == 0
+    assert len(remove_masked_gaussians(prediction, poses, ~torch.ones_like(masks))) == 0
 
 
-def test_predict_with_depths_also_returns_the_depth_of_each_swept_level(predictor):
-    images, poses = _inputs()
-    gaussians, depths = predictor.predict_with_depths(images, poses, 0.5, 20.0)
-    assert torch.equal(gaussians.means, predictor(images, poses, 0.5, 20.0).means)
+def test_predict_with_depths_also_returns_the_depth_of_each_swept_level(predictor, prediction):
+    gaussians, depths = predictor.predict_with_depths(*_inputs(), 0.5, 20.0)
+    assert torch.equal(gaussians.means, prediction.means)
     assert [tuple(depth.shape) for depth in depths] == [(2, 8, 16), (2, 16, 32), (2, 32, 64)]
     assert all(float(depth.min()) >= 0.5 - 1e-6 and float(depth.max()) <= 20 + 1e-4 for depth in depths)
 
 
-def test_a_stream_yields_the_same_gaussians_tile_by_tile(small_config):
+def test_a_stream_yields_the_same_gaussians_tile_by_tile_and_its_progress(small_config):
     predictor, (images, poses) = _predictor(small_config, tiles=2), _inputs()
     masks = torch.ones(2, 64, 128, dtype=torch.bool)
     masks[0, :20] = False
     untiled = predictor(images, poses, 0.5, 20.0, masks=masks)
-    parts = list(predictor.stream(images, poses, 0.5, 20.0, masks=masks))
+    reports: list[tuple[str, float]] = []
+    parts = list(predictor.stream(images, poses, 0.5, 20.0, masks=masks, progress=lambda *r: reports.append(r)))
     assert len(parts) == 4 and all(len(part) > 0 for part in parts)
+    fractions = [fraction for _, fraction in reports]
+    assert fractions == sorted(fractions) and fractions[0] == 0 and reports[-1] == ("done", 1.0)
+    assert {stage for stage, _ in reports} == {"matching views", "making Gaussians", "done"}
     streamed = Gaussians.cat(parts)
     assert len(streamed) == len(untiled)
     for name in ("means", "opacities"):
@@ -102,20 +111,11 @@ def test_a_stream_yields_the_same_gaussians_tile_by_tile(small_config):
         assert torch.equal(a, b)
 
 
-def test_predictions_carry_no_gradient(predictor):
+def test_predictions_carry_no_gradient(predictor, prediction):
     images, poses = _inputs()
-    assert not predictor(images.requires_grad_(), poses, 0.5, 20.0).means.requires_grad
-    assert not next(predictor.stream(images, poses, 0.5, 20.0)).means.requires_grad
+    assert not prediction.means.requires_grad
+    assert not next(predictor.stream(images.requires_grad_(), poses, 0.5, 20.0)).means.requires_grad
     assert torch.is_grad_enabled()
-
-
-def test_progress_increases_to_one(small_config):
-    predictor, (images, poses) = _predictor(small_config, tiles=2), _inputs()
-    reports: list[tuple[str, float]] = []
-    predictor(images, poses, 0.5, 20.0, progress=lambda stage, fraction: reports.append((stage, fraction)))
-    fractions = [fraction for _, fraction in reports]
-    assert fractions == sorted(fractions) and fractions[0] == 0 and reports[-1] == ("done", 1.0)
-    assert {stage for stage, _ in reports} == {"matching views", "making Gaussians", "done"}
 
 
 def test_tiles_follow_the_height():
@@ -169,14 +169,11 @@ def test_any_height_is_predicted_from(small_config, height: int, compat: Literal
 
 
 @pytest.mark.parametrize("unit", [2.0**-20, 2.0**20])
-def test_a_world_in_another_unit_gives_the_same_scene_in_that_unit(small_config, unit: float) -> None:
+def test_a_world_in_another_unit_gives_the_same_scene_in_that_unit(predictor, prediction, unit: float) -> None:
     images, poses = _inputs()
-    scaled = poses.clone()
-    scaled[:, :3, 3] *= unit
-    ours = _predictor(small_config)(images, scaled, 0.5 * unit, 20.0 * unit)
-    theirs = _predictor(small_config)(images, poses, 0.5, 20.0)
-    assert isinstance(ours, Gaussians) and isinstance(theirs, Gaussians)
-    torch.testing.assert_close(ours.means / unit, theirs.means, rtol=1e-3, atol=1e-3)
+    poses[:, :3, 3] *= unit
+    scaled = predictor(images, poses, 0.5 * unit, 20.0 * unit)
+    torch.testing.assert_close(scaled.means / unit, prediction.means, rtol=1e-3, atol=1e-3)
 
 
 def test_wrong_numbers_of_views_are_refused(refuse):

@@ -10,20 +10,26 @@ from pansplat.gaussians.harmonics import rotate_harmonics
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
 from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
-from pansplat.model.heads import HeadsConfig
+from pansplat.model.heads import AdapterConfig, HeadsConfig
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
 
 
 @pytest.fixture(scope="module")
-def network(small_config) -> PanSplat:
+def small(small_config) -> PanSplatConfig:
+    """The small config with heads that are small enough for panoramas of 32 rows."""
+    return dataclasses.replace(small_config, heads=dataclasses.replace(small_config.heads, layers=1))
+
+
+@pytest.fixture(scope="module")
+def network(small) -> PanSplat:
     torch.manual_seed(0)
-    return PanSplat(small_config, "fixed").double().eval()
+    return PanSplat(small, "fixed").double().eval()
 
 
 @pytest.fixture(scope="module")
 def prediction(network, make_inputs):
     with torch.no_grad():
-        return network(*make_inputs())
+        return network(*make_inputs(32))
 
 
 # Agreement with the official code
@@ -68,20 +74,11 @@ def test_official_prediction_with_bfloat16_attention_is_near_the_official_code(r
     assert max(errors.values()) < 5e-2, errors
 
 
-@pytest.mark.shared
-def test_fixed_prediction_differs_from_the_official_one(run_official, golden, error):
-    truth, run = golden("pansplat_64x128_fp32attn"), run_official("fixed")
-    for stage in range(4):
-        assert error(run.outputs["features"][stage], truth[f"backbone.feat.{stage}"]) > 0.1
-    for stage, depth in enumerate(run.outputs["cost_volume"].depth):
-        assert error(depth, truth[f"s{stage}.depth"]) > 0.1
-
-
 # Symmetries of the fixed network
 
 
 def test_rotating_the_world_rotates_the_prediction(network, prediction, make_inputs):
-    images, poses, near, far = make_inputs()
+    images, poses, near, far = make_inputs(32)
     world = torch.eye(4, dtype=torch.float64)
     world[:3, :3] = rotations_from_quats(torch.tensor((0.3, -0.5, 0.7, 0.2), dtype=torch.float64))
     world[:3, 3] = torch.tensor((1.0, -2.0, 3.0))
@@ -95,94 +92,93 @@ def test_rotating_the_world_rotates_the_prediction(network, prediction, make_inp
     assert torch.allclose(after.opacities, before.opacities, atol=1e-8)
 
 
-def test_rolling_panoramas_and_turning_poses_by_half_a_turn_keeps_the_scene(small_config, make_inputs):
+def test_rolling_panoramas_and_turning_poses_by_half_a_turn_keeps_the_scene(small, make_inputs):
     """With a Gaussian at each pixel, so that both predictions have the same points."""
     torch.manual_seed(0)
-    heads = dataclasses.replace(small_config.heads, lattice="pixel", emitted="finest")
-    network = PanSplat(dataclasses.replace(small_config, heads=heads), "fixed").double().eval()
-    images, poses, near, far = make_inputs()
+    heads = dataclasses.replace(small.heads, lattice="pixel", emitted="finest")
+    network = PanSplat(dataclasses.replace(small, heads=heads), "fixed").double().eval()
+    images, poses, near, far = make_inputs(32)
     half_turn = torch.diag(torch.tensor((-1.0, 1.0, -1.0, 1.0), dtype=torch.float64))
     with torch.no_grad():
         before = network(images, poses, near, far)
-        after = network(images.roll(64, dims=-1), poses @ half_turn, near, far)
+        after = network(images.roll(32, dims=-1), poses @ half_turn, near, far)
     for a, b in zip(after.depths.depth, before.depths.depth, strict=True):
         assert torch.allclose(a, b.roll(b.shape[-1] // 2, dims=-1), atol=1e-9)
     for name in ("means", "scales", "opacities"):
-        a, b = (getattr(output.gaussians[0], name).unflatten(0, (2, 64, 128)) for output in (after, before))
-        assert torch.allclose(a, b.roll(64, dims=2), atol=1e-9)
+        a, b = (getattr(output.gaussians[0], name).unflatten(0, (2, 32, 64)) for output in (after, before))
+        assert torch.allclose(a, b.roll(32, dims=2), atol=1e-9)
 
 
-@pytest.mark.slow
 def test_tiled_prediction_equals_untiled(network, prediction, make_inputs):
     with torch.no_grad():
-        tiled = network(*make_inputs(), tiles=4).gaussians[0]
+        tiled = network(*make_inputs(32), tiles=4).gaussians[0]
     assert torch.allclose(prediction.gaussians[0].means, tiled.means, atol=1e-11)
     assert torch.allclose(prediction.gaussians[0].harmonics, tiled.harmonics, atol=1e-11)
-
-
-def test_matching_and_lifting_equal_the_prediction(network, prediction, make_inputs):
-    with torch.no_grad():
-        (part,) = network.lift_gaussians(network.match_views(*make_inputs()))
-    assert torch.equal(part.gaussians[0].means, prediction.gaussians[0].means)
 
 
 # Views, sizes, configurations
 
 
-def test_each_of_three_views_has_gaussians(network, make_inputs):
-    with torch.no_grad():
-        gaussians = network(*make_inputs(views=3)).gaussians[0]
-    assert gaussians.views.unique().tolist() == [0, 1, 2]
-    assert bool(torch.isfinite(gaussians.means).all())
-
-
 def test_large_panoramas_are_matched_at_low_and_lifted_at_full_resolution(network, monkeypatch, make_inputs):
-    monkeypatch.setattr("pansplat.model.pansplat.MATCHING_HEIGHT", 64)
+    monkeypatch.setattr("pansplat.model.pansplat.MATCHING_HEIGHT", 32)
     with torch.no_grad():
-        output = network(*make_inputs(128))
-    assert output.matched.features[-1].shape[-2:] == (64, 128)
-    assert output.depths.depth[-1].shape[-2:] == (32, 64)
-    assert int((output.gaussians[0].levels == 0).sum()) == 2 * int(256**2 / math.pi)
+        output = network(*make_inputs(64))
+    assert output.matched.features[-1].shape[-2:] == (32, 64)
+    assert output.depths.depth[-1].shape[-2:] == (16, 32)
+    assert int((output.gaussians[0].levels == 0).sum()) == 2 * int(128**2 / math.pi)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("compat", ["official", "fixed"])
-def test_gradients_reach_every_weight_and_the_images(compat, small_config, make_inputs):
+def test_gradients_reach_every_weight_and_the_images(compat, small, randomize, make_inputs):
     """Coarser levels get gradients from a loss of their own: finer levels detach them."""
-    torch.manual_seed(0)
-    network, (images, poses, near, far) = PanSplat(small_config, compat).double().eval(), make_inputs()
+    network, (images, poses, near, far) = randomize(PanSplat(small, compat)), make_inputs(32)
     output = network(images.requires_grad_(), poses, near, far)
     gaussians = output.gaussians[0]
-    losses = [gaussians.means.square().sum(), gaussians.harmonics.sum(), gaussians.opacities.sum()]
-    losses += [depth.sum() for depth in output.depths.inverse_depth[:-1]]
+    fields = (gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities, gaussians.harmonics)
+    losses = [field.square().sum() for field in fields]
+    losses += [depth.square().sum() for depth in output.depths.inverse_depth[:-1]]
     torch.stack(losses).sum().backward()
-    assert images.grad is not None and bool(torch.isfinite(images.grad).all())
-    assert not [name for name, parameter in network.named_parameters() if parameter.grad is None]
+    assert bool(torch.isfinite(images.grad).all()) and bool((images.grad.abs().amax(dim=(1, 2)) > 0).all())
+    assert not [name for name, p in network.named_parameters() if p.grad is None or not p.grad.abs().max() > 0]
 
 
-def test_the_monocular_network_exists_only_if_configured_and_is_frozen(network, small_config):
+@pytest.mark.parametrize("views", [2, 3])
+def test_the_order_of_the_views_does_not_matter_and_batch_items_are_independent(randomize, small, make_inputs, views):
+    network, inputs = randomize(PanSplat(small, "fixed")), make_inputs(32, views=views, batch=2)
+    with torch.no_grad():
+        both, turned = network(*inputs), network(*(tensor[1:].flip(1) for tensor in inputs))
+    assert torch.allclose(turned.depths.depth[-1], both.depths.depth[-1][1:].flip(1), rtol=1e-8)
+    for view in range(views):
+        a, b = both.gaussians[1], turned.gaussians[0]
+        a, b = a.select(a.views == view), b.select(b.views == views - 1 - view)
+        assert (
+            len(a) > 0
+            and torch.allclose(a.means, b.means, atol=1e-8)
+            and torch.allclose(a.harmonics, b.harmonics, atol=1e-8)
+        )
+
+
+def test_the_monocular_network_exists_only_if_configured_and_is_frozen(network, small):
     assert network.mono_depth is None
-    config = dataclasses.replace(
-        small_config, cost_volume=dataclasses.replace(small_config.cost_volume, mono_channels=32)
-    )
+    config = dataclasses.replace(small, cost_volume=dataclasses.replace(small.cost_volume, mono_channels=32))
     with torch.device("meta"):
         assert not any(parameter.requires_grad for parameter in PanSplat(config).mono_depth.parameters())
 
 
-def test_heads_read_the_candidates_of_a_single_swept_level(small_config, make_inputs):
-    single = dataclasses.replace(small_config.cost_volume, sweep="single")
+def test_heads_read_the_candidates_of_a_single_swept_level(small, make_inputs):
+    single = dataclasses.replace(small.cost_volume, sweep="single")
     with pytest.raises(ValueError, match=r"`heads\.candidates` must be the 8 of the finest sweep, got 4"):
-        dataclasses.replace(small_config, cost_volume=single)
-    heads = dataclasses.replace(small_config.heads, candidates=8)
-    network = PanSplat(dataclasses.replace(small_config, cost_volume=single, heads=heads)).double().eval()
+        dataclasses.replace(small, cost_volume=single)
+    heads = dataclasses.replace(small.heads, candidates=8)
+    network = PanSplat(dataclasses.replace(small, cost_volume=single, heads=heads)).double().eval()
     with torch.no_grad():
-        output = network(*make_inputs())
+        output = network(*make_inputs(32))
     assert len(output.depths.levels) == 1 and output.gaussians[0].levels.unique().tolist() == [0, 1, 2, 3]
 
 
-def test_heads_that_do_not_fit_the_features_are_refused(small_config):
+def test_heads_that_do_not_fit_the_features_are_refused(small):
     with pytest.raises(ValueError, match=r"must be \(16, 8, 8, 4\), the channels of the features"):
-        dataclasses.replace(small_config, heads=dataclasses.replace(small_config.heads, feature_channels=(8, 8, 8, 4)))
+        dataclasses.replace(small, heads=dataclasses.replace(small.heads, feature_channels=(8, 8, 8, 4)))
 
 
 # Precision
@@ -195,9 +191,9 @@ def test_bfloat16_prediction_is_close_to_float32_and_in_float32(randomize, make_
         cost_volume=CostVolumeConfig(
             mono_channels=0, levels=(SweepLevel(3, 32, 16, 32), SweepLevel(2, 16, 8, 32), SweepLevel(1, 8, 8, 32))
         ),
-        heads=HeadsConfig(feature_channels=(32, 16, 8, 8), candidates=8),
+        heads=HeadsConfig(feature_channels=(32, 16, 8, 8), candidates=8, layers=1, adapter=AdapterConfig(degree=1)),
     )
-    inputs = [tensor.float() for tensor in make_inputs()]
+    inputs = [tensor.float() for tensor in make_inputs(32)]
     with torch.no_grad():
         exact, rounded = (
             randomize(PanSplat(config, "fixed", precision=precision)).float()(*inputs)
