@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Backbone, find_backbone, load_lpips
-from pansplat.geometry.equirect import pad_equirect, row_weights
+from pansplat.geometry.equirect import pad_equirect
 from pansplat.options import REAL, Range, Weight
 
 DepthForm = Literal["depth", "inverse_depth"]
@@ -69,7 +69,7 @@ def image_loss(
 
     Args:
         perceptual: LPIPS or its substitute; None for no perceptual term.
-        pixel_weights: weights of the pixels, see `make_pixel_weights`; None for equal weights.
+        pixel_weights: weights of the pixels; None for equal weights.
     """
     square = mean_square(prediction, target, pixel_weights)
     distance = square.new_zeros(())
@@ -84,22 +84,6 @@ def mean_square(prediction: Images, target: Images, pixel_weights: PixelWeights 
     return errors.mean() if pixel_weights is None else weighted_mean(errors, pixel_weights)
 
 
-def make_pixel_weights(
-    masks: Bool[Tensor, "batch height width"] | None, shape: tuple[int, int, int], *, spherical: bool = False
-) -> PixelWeights | None:
-    """Weights of the pixels; None for equal weights.
-
-    Args:
-        masks: True for pixels with a weight.
-        shape: batch, height, width.
-        spherical: whether to weight pixels by their solid angle. Paper and official code do not.
-    """
-    if masks is None and not spherical:
-        return None
-    weights = torch.ones(shape) if masks is None else masks.float()
-    return weights * row_weights(shape[1]).to(weights)[:, None] if spherical else weights
-
-
 def depth_loss(
     depths: Sequence[Float[Tensor, "batch view _ _"]],
     true_depth: Float[Tensor, "batch view height width"],
@@ -107,9 +91,8 @@ def depth_loss(
     far: float | Float[Tensor, "batch view"],
     *,
     form: DepthForm = "depth",
-    decay: Annotated[float, Range(0, 1), REAL] = 0.9,
+    decay: float = 0.9,
     masks: Bool[Tensor, "batch view height width"] | None = None,
-    spherical: bool = False,
 ) -> Float[Tensor, ""]:
     """Absolute error of the depth of each level: in metres ("depth") or 1 / metres ("inverse_depth").
 
@@ -120,18 +103,17 @@ def depth_loss(
         depths: radial, metres, coarse to fine; no level is larger than the true depth.
         true_depth: radial, metres; values that are not strictly between `near` and `far` are unknown.
         masks: True for pixels with a weight.
-        spherical: whether to weight pixels by their solid angle.
     """
     near, far = (bound[..., None, None] if isinstance(bound, Tensor) and bound.ndim else bound for bound in (near, far))
     known = (true_depth > near) & (true_depth < far)
     known = known if masks is None else known & masks
     total = true_depth.new_zeros(())
     for coarser, depth in enumerate(reversed(depths)):
-        total = total + decay**coarser * _level_loss(depth, true_depth, known, form, spherical)
+        total = total + decay**coarser * _level_loss(depth, true_depth, known, form)
     return total
 
 
-def _level_loss(depth: Tensor, truth: Tensor, known: Tensor, form: DepthForm, spherical: bool) -> Tensor:
+def _level_loss(depth: Tensor, truth: Tensor, known: Tensor, form: DepthForm) -> Tensor:
     if form == "depth":
         truth, known = _nearest(truth, depth.shape[-2:]), _nearest(known.to(truth), depth.shape[-2:]) > 0.5
         errors = (depth - torch.where(known, truth, depth)).abs()
@@ -140,10 +122,7 @@ def _level_loss(depth: Tensor, truth: Tensor, known: Tensor, form: DepthForm, sp
         depth = functional.interpolate(depth, size, mode="bilinear", align_corners=False)
         # Unknown pixels get the predicted depth, because infinity times a weight of zero would be NaN.
         errors = (1 / depth - 1 / torch.where(known, truth, depth.detach())).abs()
-    weights = known.to(errors)
-    if spherical:
-        weights = weights * row_weights(weights.shape[-2]).to(weights)[:, None]
-    return weighted_mean(errors, weights)
+    return weighted_mean(errors, known)
 
 
 def _nearest(maps: Tensor, size: Sequence[int]) -> Tensor:
@@ -170,8 +149,8 @@ def auxiliary_loss(
     return total
 
 
-def weighted_mean(errors: Float[Tensor, "*shape"], weights: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
-    """Weighted mean; 0 with zero gradients if all weights are 0."""
+def weighted_mean(errors: Float[Tensor, "*shape"], weights: Tensor) -> Float[Tensor, ""]:
+    """Weighted mean; 0 with zero gradients if all weights are 0. The weights have the shape of the errors."""
     weights = weights.to(errors)
     return (errors * weights).sum() / weights.sum().clamp_min(torch.finfo(errors.dtype).tiny)
 

@@ -9,13 +9,12 @@ from typing import Any
 from torch import Tensor, nn
 
 from pansplat.data.views import Batch
+from pansplat.model.base import Network
 from pansplat.model.heads import AuxiliaryHeads
-from pansplat.model.mvsplat import MVSplat
-from pansplat.model.pansplat import PanSplat
 from pansplat.training.config import MemoryConfig
 from pansplat.training.deferred import LossTerms, Problem, backpropagate, whole_loss
 from pansplat.training.distributed import no_sync
-from pansplat.training.losses import LossWeights, Perceptual, auxiliary_loss, depth_loss, image_loss, make_pixel_weights
+from pansplat.training.losses import LossWeights, Perceptual, auxiliary_loss, depth_loss, image_loss
 from pansplat.training.network import matching_is_trainable
 from pansplat.training.rendering import TargetRenderer
 
@@ -50,7 +49,7 @@ class TrainingStep(nn.Module):
 
     def __init__(
         self,
-        network: PanSplat | MVSplat,
+        network: Network,
         auxiliary: AuxiliaryHeads | None,
         perceptual: Perceptual | None,
         weights: LossWeights,
@@ -133,8 +132,4 @@ class TrainingStep(nn.Module):
 
 def _target_weights(batch: Batch) -> Tensor | None:
     """Weights of the target pixels; None when all have weight 1."""
-    masks = batch.target_masks.flatten(0, 1)
-    if bool(masks.all()):
-        return None
-    weights = make_pixel_weights(masks, tuple(masks.shape))
-    return None if weights is None else weights.to(batch.images)
+    return None if bool(batch.target_masks.all()) else batch.target_masks.flatten(0, 1).to(batch.images)
