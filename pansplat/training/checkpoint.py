@@ -8,8 +8,7 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -63,15 +62,10 @@ class DamagedCheckpointError(InputError):
     """A checkpoint lacks a key, or has a value that does not fit the run."""
 
 
-@contextmanager
-def restoring(key: str) -> Iterator[None]:
-    """Turn the errors that a damaged value causes in the block into an error that names its key.
-
-    Raises:
-        DamagedCheckpointError: the block raised an error of a value.
-    """
+def restore(state: Mapping[str, Any], key: str, apply: Callable[[Any], object]) -> None:
+    """Apply the value of a key to the run; a DamagedCheckpointError if it is missing or does not fit."""
     try:
-        yield
+        apply(state[key])
     except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, IndexError, OverflowError) as error:
         cause = "it is missing" if isinstance(error, KeyError) and error.args == (key,) else str(error).splitlines()[0]
         raise DamagedCheckpointError(f"this checkpoint is damaged: key `{key}`: {cause}") from error
@@ -122,11 +116,7 @@ def load_latest(
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Content of a training checkpoint.
-
-    Raises:
-        InputError: damaged, not a training checkpoint, of another format, or containing code.
-    """
+    """Content of a training checkpoint; an InputError if it is damaged, of another kind or format, or has code."""
     content = read_checkpoint(path)
     if not is_training_state(content):
         raise InputError(f"{path}: needed a checkpoint of pansplat-train, got another file; give it as --network.init.")
@@ -143,11 +133,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def _check_types(content: Mapping[str, Any]) -> None:
-    """Check the types of the keys that a checkpoint has.
-
-    Raises:
-        DamagedCheckpointError: a value has another type.
-    """
+    """Raise a DamagedCheckpointError if a key has a value of another type."""
     for key, kinds in _TYPES.items():
         if key in content and (not isinstance(content[key], kinds) or isinstance(content[key], bool)):
             got = type(content[key]).__name__
@@ -161,17 +147,12 @@ def _check_types(content: Mapping[str, Any]) -> None:
 
 
 def restore_optimizer(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
-    """Restore an optimiser.
-
-    Raises:
-        DamagedCheckpointError: the state is not that of the optimiser's parameters.
-    """
-    with restoring("optimizer"):
-        optimizer.load_state_dict(state)
-        for parameter, values in optimizer.state.items():
-            for name in ("exp_avg", "exp_avg_sq"):
-                if values[name].shape != parameter.shape:
-                    raise ValueError(f"{name} has the shape {tuple(values[name].shape)}")
+    """Restore an optimiser; a ValueError if the state is not that of its parameters."""
+    optimizer.load_state_dict(state)
+    for parameter, values in optimizer.state.items():
+        for name in ("exp_avg", "exp_avg_sq"):
+            if values[name].shape != parameter.shape:
+                raise ValueError(f"{name} has the shape {tuple(values[name].shape)}")
 
 
 def is_training_state(content: Mapping[str, Any]) -> bool:
@@ -181,11 +162,7 @@ def is_training_state(content: Mapping[str, Any]) -> bool:
 
 
 def extract_weights(content: Mapping[str, Any], path: Path) -> WeightsFile:
-    """The weights of a training checkpoint: their moving average, if there is one.
-
-    Raises:
-        InputError: weights are missing or invalid.
-    """
+    """The weights of a training checkpoint, their moving average if there is one; an InputError if invalid."""
     try:
         header = require_object(parse_json(content["weights"], f"{path}: weights"), f"{path}: weights")
         tensors = content["mean"] if content.get("mean") else content["network"]

@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +41,8 @@ from pansplat.training.checkpoint import (
     list_checkpoints,
     load_checkpoint,
     load_latest,
+    restore,
     restore_optimizer,
-    restoring,
     save_checkpoint,
 )
 from pansplat.training.logs import CsvTable, ProgressDisplay
@@ -262,16 +263,11 @@ class DepthTrainer:
 
     def _restore(self, path: Path, state: dict[str, Any]) -> None:
         """Restore the run from a checkpoint; a DamagedCheckpointError if it does not fit."""
-        with restoring("step"):
-            step = state["step"]
-        with restoring("network"):
-            self.network.load_state_dict(state["network"])
-        with restoring("mean"):
-            self.average.load(state["mean"])
-        with restoring("optimizer"):
-            optimizer = state["optimizer"]
-        restore_optimizer(self.optimizer, optimizer)
-        self.step = step
+        restore(state, "step", int)
+        restore(state, "network", self.network.load_state_dict)
+        restore(state, "mean", self.average.load)
+        restore(state, "optimizer", partial(restore_optimizer, self.optimizer))
+        self.step = state["step"]
 
     def train(self) -> bool:
         """Train the remaining steps. Returns whether all were done."""

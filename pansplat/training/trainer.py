@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,9 @@ from pansplat.atomic import replacing
 from pansplat.data.loader import Loader
 from pansplat.data.views import Batch
 from pansplat.errors import InputError
-from pansplat.model.mvsplat import MVSplat
 from pansplat.model.weights import pack_weights
 from pansplat.strict_json import parse_json, require_object
-from pansplat.training.checkpoint import load_latest, restore_optimizer, restoring, save_checkpoint
+from pansplat.training.checkpoint import load_latest, restore, restore_optimizer, save_checkpoint
 from pansplat.training.config import TrainConfig, as_json, require_same
 from pansplat.training.datasets import load_sources
 from pansplat.training.distributed import ProcessGroup, convert_sync_batch_norm, data_parallel
@@ -106,11 +106,7 @@ class Trainer:
         self.stop = StopRequest()
 
     def train(self) -> bool:
-        """Train the remaining steps. Returns whether all were done (False: stopped by a signal).
-
-        Raises:
-            InputError: a loss that is not finite, a full disk, unreadable data.
-        """
+        """Train the remaining steps. Returns whether all were done; a signal ends the run earlier."""
         out, total, is_first = self.config.out, self.config.optimizer.steps, self.processes.is_first
         out.mkdir(parents=True, exist_ok=True)
         validation_step = 0 if self.resumed_from is None else self.step + 1
@@ -254,8 +250,7 @@ class Trainer:
         return bool(every) and (self.step % every == 0 or self.step == self.config.optimizer.steps)
 
     def _state(self) -> dict[str, Any]:
-        model = "mvsplat" if isinstance(self.network, MVSplat) else "pansplat"
-        weights = pack_weights(model, self.network.config, {}, compat=self.network.compat)
+        weights = pack_weights(self.network.model, self.network.config, {}, compat=self.network.compat)
         header = {"model": weights.model, "config": weights.config, "compat": weights.compat}
         return {
             "config": as_json(self.config),
@@ -274,25 +269,17 @@ class Trainer:
             DamagedCheckpointError: a key is missing or does not fit.
             InputError: the run was started with other settings.
         """
-        with restoring("config"):
-            require_object(parse_json(state["config"], "config"), "config")
+        restore(state, "config", lambda text: require_object(parse_json(text, "config"), "config"))
         require_same(state["config"], self.config, path)
-        with restoring("step"):
-            step = state["step"]
-        with restoring("network"):
-            self.network.load_state_dict(state["network"])
+        restore(state, "step", int)
+        restore(state, "network", self.network.load_state_dict)
         if self.auxiliary is not None:
-            with restoring("auxiliary"):
-                self.auxiliary.load_state_dict(state["auxiliary"])
+            restore(state, "auxiliary", self.auxiliary.load_state_dict)
         if self.average is not None:
-            with restoring("mean"):
-                self.average.load(state["mean"])
-        with restoring("optimizer"):
-            optimizer = state["optimizer"]
-        restore_optimizer(self.optimizer, optimizer)
-        with restoring("random"):
-            torch.set_rng_state(state["random"])
-        self.step = step
+            restore(state, "mean", self.average.load)
+        restore(state, "optimizer", partial(restore_optimizer, self.optimizer))
+        restore(state, "random", torch.set_rng_state)
+        self.step = state["step"]
 
     def _describe(self) -> str:
         count = sum(p.numel() for p in trainable_parameters(self.network, self.auxiliary))
