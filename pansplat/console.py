@@ -15,7 +15,7 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NoReturn, TextIO, TypeVar
 
@@ -204,6 +204,27 @@ def _catch_signals() -> Iterator[_Signals]:
         sys.unraisablehook = previous_hook
         for number in replaced:
             signal.signal(number, defaults[number])
+
+
+@contextlib.contextmanager
+def call_at_first_signal(numbers: Sequence[int], act: Callable[[int], object]) -> Iterator[None]:
+    """Call a function with the number of the first of some signals; the second one raises KeyboardInterrupt."""
+    received = False
+
+    def handle(number: int, _: FrameType | None) -> None:
+        nonlocal received
+        if received:
+            raise KeyboardInterrupt
+        received = True
+        act(number)
+
+    is_main = threading.current_thread() is threading.main_thread()  # others cannot set handlers
+    previous = {number: signal.signal(number, handle) for number in numbers if is_main}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def _prepare_terminal() -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from pansplat.cli.inputs import ModelChoice, Out, PairChoice, choose_pair, predict_scene, progress_bar
+from pansplat.console import call_at_first_signal
 from pansplat.errors import InputError
 from pansplat.files import SCENE_SUFFIXES, is_scene_file, require_output_file
 from pansplat.options import Count, Height, Seconds, Seed
@@ -124,16 +125,6 @@ def _describe(report: RefineReport) -> str:
 @contextmanager
 def stop_at_interrupt() -> Iterator[Callable[[], bool]]:
     """A function that returns True after the first Ctrl+C; the second one raises KeyboardInterrupt."""
-    stopped = False
-
-    def note(signum: int, frame: object) -> None:
-        nonlocal stopped
-        if stopped:
-            raise KeyboardInterrupt
-        stopped = True
-
-    previous = signal.signal(signal.SIGINT, note)
-    try:
-        yield lambda: stopped
-    finally:
-        signal.signal(signal.SIGINT, previous)
+    received: list[int] = []
+    with call_at_first_signal((signal.SIGINT,), received.append):
+        yield lambda: bool(received)

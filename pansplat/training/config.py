@@ -12,17 +12,7 @@ from typing import Annotated, Literal
 from pansplat.data.augment import Augmentation
 from pansplat.errors import InputError
 from pansplat.model.layers import Compat, Precision
-from pansplat.options import (
-    REAL,
-    WHOLE,
-    Count,
-    CountOrNone,
-    Fraction,
-    Minutes,
-    Range,
-    Seed,
-    check_numbers,
-)
+from pansplat.options import REAL, WHOLE, Count, CountOrNone, Fraction, Minutes, Range, Seed, check_numbers
 from pansplat.strict_json import parse_json, require_object
 from pansplat.training.losses import CODE, LossWeights, PerceptualName
 
@@ -156,11 +146,7 @@ class TrainConfig:
         return self.heights[index]
 
     def check(self) -> None:
-        """Check the settings.
-
-        Raises:
-            InputError: a setting out of range, or settings that contradict each other.
-        """
+        """Raise an InputError for settings that are out of range or contradict each other."""
         check_numbers(self, prefixed=True)
         if not self.heights:
             raise InputError("--heights must be at least one height, got none.")

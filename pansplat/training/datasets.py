@@ -90,11 +90,7 @@ def is_reserved(name: str) -> bool:
 
 
 def remove_reserved(items: Iterable[_T], name_of: Callable[[_T], str], folder: Path) -> list[_T]:
-    """The items that do not belong to reserved maps. Warns when items are removed.
-
-    Raises:
-        InputError: no item remains.
-    """
+    """The items of maps that are not reserved, with a warning if some are; an InputError if all are."""
     items = list(items)
     kept = [item for item in items if not is_reserved(name_of(item))]
     if items and not kept:

@@ -76,11 +76,7 @@ class ProcessGroup:
         return torch.device("cuda", self.local_rank)
 
     def initialize(self, device: torch.device) -> None:
-        """Initialise torch.distributed: NCCL for CUDA devices, else gloo.
-
-        Raises:
-            InputError: the initialisation failed.
-        """
+        """Initialise torch.distributed, by NCCL for CUDA devices, else gloo; an InputError if it fails."""
         self._device = device
         if device.type == "cuda":
             torch.cuda.set_device(device)

@@ -65,11 +65,7 @@ def _is_number(text: object) -> bool:
 
 
 def plot_run(folder: Path) -> Path | None:
-    """Plot the tables of a run's folder as `curves.png`; None if nothing has been logged yet.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Plot the tables of a run's folder as `curves.png`; None if nothing has been logged yet."""
     log, scores = (read_table(folder / name) for name in ("log.csv", "validation.csv"))
     if not log:
         return None
