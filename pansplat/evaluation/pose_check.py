@@ -82,11 +82,7 @@ class PoseCheck:
 
 
 def check_pair(pair: Pair) -> PoseCheck:
-    """Check the poses of a pair's context views against their images; takes seconds.
-
-    Raises:
-        InputError: an image cannot be used.
-    """
+    """Check the poses of a pair's context views against their images; takes seconds."""
     return check_views(pair.load_context(_HEIGHT), pair.name)
 
 

@@ -13,7 +13,7 @@ import functools
 import math
 import re
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -114,11 +114,7 @@ def make_frame_distance_set(sequences: Sequence[FrameSequence], gap: int, pairs_
 
 
 def find_sequences(root: Path, name: str) -> tuple[Sequence[FrameSequence], str]:
-    """The sequences of `LOC360` (its test location) or `INSTA360`, and a message if there are none.
-
-    Raises:
-        InputError: the data is invalid.
-    """
+    """The sequences of `LOC360` (its test location) or `INSTA360`, and a message if there are none."""
     for subfolder in _SUBFOLDERS[name]:
         folder = root / subfolder
         if name == LOC360 and (folder / "atrium").is_dir():
@@ -186,16 +182,6 @@ class Prediction:
     seconds: float
 
 
-@dataclass(frozen=True)
-class RenderedTarget:
-    """A rendered target with its metrics."""
-
-    score: Score
-    image: Float[Tensor, "3 height width"]
-    target: Float[Tensor, "3 height width"]
-    seconds: float
-
-
 def predict_case(context: Views, predictor: Predictor) -> Prediction:
     """The scene of a case's inputs, and their depth if the predictor is a network."""
     masks = None if bool(context.masks.all()) else context.masks
@@ -221,25 +207,17 @@ def predict_case(context: Views, predictor: Predictor) -> Prediction:
     return Prediction(scene, depth, seconds)
 
 
-def render_targets(
-    sample: Sample, prediction: Prediction, blend: Blend, lpips: Lpips | None, drawing: Drawing = "exact"
-) -> Iterator[RenderedTarget]:
-    """Render each target of the case and compute its metrics, without masks; only PSNR clamps."""
-    for index, target in enumerate(sample.targets.images):
-        start = time.perf_counter()
-        with torch.no_grad():
-            pose, size = sample.targets.cam2world[index], (target.shape[-2], target.shape[-1])
-            image = pipeline.render(prediction.scene, pose, blend=blend, size=size, drawing=drawing).color.float()
-        seconds = time.perf_counter() - start
-        score = Score(
-            case=sample.name,
-            target=sample.targets.names[index],
-            ws_psnr=ws_psnr(image, target),
-            psnr=psnr(image, target),
-            ssim=ssim(image, target),
-            lpips=None if lpips is None else lpips.distance(image, target),
-        )
-        yield RenderedTarget(score, image, target, seconds)
+def score_target(sample: Sample, index: int, image: Float[Tensor, "3 height width"], lpips: Lpips | None) -> Score:
+    """Metrics of the image of a target, without masks; only PSNR clamps."""
+    target = sample.targets.images[index]
+    return Score(
+        case=sample.name,
+        target=sample.targets.names[index],
+        ws_psnr=ws_psnr(image, target),
+        psnr=psnr(image, target),
+        ssim=ssim(image, target),
+        lpips=None if lpips is None else lpips.distance(image, target),
+    )
 
 
 def measure_depth(context: Views, prediction: Prediction) -> DepthErrors | None:
@@ -387,11 +365,7 @@ def list_methods(
 
 
 def find_sets(protocol: ProtocolName, root: Path, options: ProtocolOptions) -> list[EvaluationSet]:
-    """The protocol's sets, including those without data.
-
-    Raises:
-        InputError: `root` is not a folder, or the data is invalid.
-    """
+    """The protocol's sets, including those without data; an InputError if `root` or the data is invalid."""
     if not root.is_dir():
         raise InputError(f"{root}: needed the folder that holds the test data, got no such folder; check --data.")
     if protocol in _PANOGRF:
@@ -477,19 +451,23 @@ def _run_case(
         if row.set == _DEPTH_SET:
             errors = measure_depth(sample.context, prediction)
             row.depth += [errors] if errors is not None and math.isfinite(errors.rmse) else []
-        for rendered in render_targets(sample, prediction, method.blend, lpips, method.drawing):
-            row.scores.append(rendered.score)
-            row.render_seconds.append(rendered.seconds)
+        for index, target in enumerate(sample.targets.images):
+            pose, size = sample.targets.cam2world[index], (target.shape[-2], target.shape[-1])
+            start = time.perf_counter()
+            with torch.no_grad():
+                drawn = pipeline.render(prediction.scene, pose, blend=method.blend, size=size, drawing=method.drawing)
+            image = drawn.color.float()
+            row.render_seconds.append(time.perf_counter() - start)
+            row.scores.append(score_target(sample, index, image, lpips))
             if folder is not None:
-                _write_images(folder, method.name, rendered)
+                _write_images(folder, _slugify(row.scores[-1].target), _slugify(method.name), image, target)
 
 
-def _write_images(folder: Path, method: str, rendered: RenderedTarget) -> None:
+def _write_images(folder: Path, target_name: str, method: str, image: Tensor, target: Tensor) -> None:
     make_folder(folder)
-    stem = _slugify(rendered.score.target)
-    write_image(folder / f"{stem}_target.png", rendered.target)
-    write_image(folder / f"{stem}_{_slugify(method)}.png", rendered.image)
-    write_image(folder / f"{stem}_{_slugify(method)}_error.png", error_image(rendered.image, rendered.target))
+    write_image(folder / f"{target_name}_target.png", target)
+    write_image(folder / f"{target_name}_{method}.png", image)
+    write_image(folder / f"{target_name}_{method}_error.png", error_image(image, target))
 
 
 def _take_evenly(cases: Sequence[EvaluationCase], limit: int | None) -> Sequence[EvaluationCase]:

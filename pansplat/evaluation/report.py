@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 
 import numpy as np
 import torch
@@ -212,67 +213,60 @@ def write_json(value: object, path: Path) -> None:
 
 @dataclass(frozen=True)
 class _Column:
-    """A column of the table: the value of a case, that of the cross-fade if it has one, and their format."""
+    """A column of the table: the field of a case, the format, and the field of the cross-fade if it has one."""
 
-    value: Callable[[Case], float]
+    field: str
     format_spec: str
-    cross_fade: Callable[[Case], float] | None = None
+    cross_fade: str = ""
+
+
+_COLUMNS = {
+    "WS-PSNR": _Column("ws_psnr", ".2f", "cross_fade_ws_psnr"),
+    "masked": _Column("masked_ws_psnr", ".2f", "masked_cross_fade_ws_psnr"),
+    "PSNR": _Column("psnr", ".2f"),
+    "SSIM": _Column("ssim", ".4f"),
+    "LPIPS": _Column("lpips", ".4f", "cross_fade_lpips"),
+    "cross-fade": _Column("cross_fade_ws_psnr", ".2f"),
+    "at inputs": _Column("own_ws_psnr", ".2f"),
+    "predict s": _Column("predict_seconds", ".1f"),
+    "refine s": _Column("refine_seconds", ".1f"),
+    "render s": _Column("render_seconds", ".1f"),
+    "Gaussians": _Column("num_gaussians", ",.0f"),
+}
+_NOT_MEASURED = {"masked_ws_psnr": None, "lpips": None, "refine_seconds": 0.0}  # columns of these values are left out
 
 
 def results_table(cases: Sequence[Case]) -> Table:
     """A printable table of the cases, their mean, and the mean of the cross-fade of the same cases."""
-    columns = _select_columns(cases)
+    columns = {
+        head: column
+        for head, column in _COLUMNS.items()
+        if any(getattr(case, column.field) != _NOT_MEASURED.get(column.field, math.nan) for case in cases)
+    }
     table = Table(title=f"{cases[0].model}, {cases[0].height}x{2 * cases[0].height}" if cases else None)
     table.add_column("case")
     for head in columns:
         table.add_column(head, justify="right")
     for case in cases:
-        table.add_row(case.name, *(format(column.value(case), column.format_spec) for column in columns.values()))
+        table.add_row(case.name, *(_format_mean([case], c.field, c.format_spec) for c in columns.values()))
     if cases:
         table.add_section()
         if len(cases) > 1:
-            table.add_row(
-                "mean", *(_format_mean(column.value, column.format_spec, cases) for column in columns.values())
-            )
-        table.add_row(
-            "cross-fade", *(_format_mean(column.cross_fade, column.format_spec, cases) for column in columns.values())
-        )
+            table.add_row("mean", *(_format_mean(cases, c.field, c.format_spec) for c in columns.values()))
+        table.add_row("cross-fade", *(_format_mean(cases, c.cross_fade, c.format_spec) for c in columns.values()))
     return table
 
 
-def _format_mean(value: Callable[[Case], float] | None, format_spec: str, cases: Sequence[Case]) -> str:
-    return "" if value is None else format(sum(map(value, cases)) / len(cases), format_spec)
+def _format_mean(cases: Sequence[Case], field: str, format_spec: str) -> str:
+    return format(fmean(_read_value(case, field) for case in cases), format_spec) if field else ""
 
 
-def _value_or(value: float | None, default: float) -> float:
-    return default if value is None else value
-
-
-def _select_columns(cases: Sequence[Case]) -> dict[str, _Column]:
-    """The columns by heading; those without any value are left out."""
-    columns = {"WS-PSNR": _Column(lambda case: case.ws_psnr, ".2f", lambda case: case.cross_fade_ws_psnr)}
-    if any(case.masked_ws_psnr is not None for case in cases):
-        columns["masked"] = _Column(
-            lambda case: _value_or(case.masked_ws_psnr, case.ws_psnr),
-            ".2f",
-            lambda case: _value_or(case.masked_cross_fade_ws_psnr, case.cross_fade_ws_psnr),
-        )
-    columns["PSNR"] = _Column(lambda case: case.psnr, ".2f")
-    columns["SSIM"] = _Column(lambda case: case.ssim, ".4f")
-    if any(case.lpips is not None for case in cases):
-        columns["LPIPS"] = _Column(
-            lambda case: _value_or(case.lpips, math.nan),
-            ".4f",
-            lambda case: _value_or(case.cross_fade_lpips, math.nan),
-        )
-    columns["cross-fade"] = _Column(lambda case: case.cross_fade_ws_psnr, ".2f")
-    columns["at inputs"] = _Column(lambda case: case.own_ws_psnr, ".2f")
-    columns["predict s"] = _Column(lambda case: case.predict_seconds, ".1f")
-    if any(case.refine_seconds for case in cases):
-        columns["refine s"] = _Column(lambda case: case.refine_seconds, ".1f")
-    columns["render s"] = _Column(lambda case: case.render_seconds, ".1f")
-    columns["Gaussians"] = _Column(lambda case: case.num_gaussians, ",.0f")
-    return columns
+def _read_value(case: Case, field: str) -> float:
+    """A metric; without a mask the masked one is that of all pixels."""
+    value = getattr(case, field)
+    if value is None and field.startswith("masked_"):
+        value = getattr(case, field.removeprefix("masked_"))
+    return math.nan if value is None else value
 
 
 def finite_json(value: object) -> object:

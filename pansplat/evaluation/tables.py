@@ -225,11 +225,7 @@ def frame_distance_curves(rows: Sequence[SetResult], metric: str) -> dict[str, l
 
 
 def plot_frame_distance(result: ProtocolResult, path: Path) -> None:
-    """Write the figure: a panel for WS-PSNR, and one for LPIPS if it was measured.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write the figure: a panel for WS-PSNR, and one for LPIPS if it was measured."""
     metrics = ["ws_psnr", *(["lpips"] if result.lpips else [])]
     figure = Figure(figsize=(5.5 * len(metrics), 4), layout="constrained")
     panels = figure.subplots(1, len(metrics), squeeze=False)[0]
@@ -289,11 +285,7 @@ def report_notes(result: ProtocolResult) -> list[str]:
 
 
 def write_report(result: ProtocolResult, out: Path) -> list[Path]:
-    """Write table.md, and frame_distance.png for that protocol; return the paths.
-
-    Raises:
-        InputError: a file cannot be written.
-    """
+    """Write table.md, and frame_distance.png for that protocol; return the paths."""
     tables = [markdown_table(layout, our_rows(result, layout)) for layout in list_table_layouts(result)]
     with replacing(out / "table.md") as partial:
         partial.write_text(
