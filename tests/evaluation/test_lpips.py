@@ -222,7 +222,7 @@ def measure_distances(metric: Lpips, size: tuple[int, int], weighted: bool) -> t
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "pixels", "weighted"),
-    [((64, 48), 1000, False), ((67, 33), 300, True), ((70, 40), 600, False), ((35, 32), 1, True)],
+    [((64, 48), 1000, False), ((67, 33), 300, True), ((35, 32), 1, True)],
 )
 def test_bands_change_neither_distances_nor_gradients(
     size: tuple[int, int], pixels: int, weighted: bool, vgg: Lpips, monkeypatch: pytest.MonkeyPatch

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from torch import Tensor
 
 from pansplat.data.video import write_video
 from pansplat.errors import InputError
@@ -36,8 +35,6 @@ from pansplat.evaluation.tables import (
     rich_tables,
     write_report,
 )
-from pansplat.gaussians.scene import Gaussians
-from pansplat.geometry.equirect import pixel_directions
 from pansplat.model.network import NetworkPredictor
 
 HEIGHT = 32
@@ -45,40 +42,16 @@ OPTIONS = ProtocolOptions(HEIGHT, pairs_per_sequence=3, gaps=(2, 4))
 RADIUS = 2.0  # metres
 
 
-class Sphere:
-    """One Gaussian for each pixel on a sphere around each camera; counts its calls."""
-
-    name, fingerprint = "sphere", "1"
-
-    def __init__(self) -> None:
-        self.calls = 0
-
-    def __call__(self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None, progress=None):
-        self.calls += 1
-        view, _, height, width = images.shape
-        directions = pixel_directions(height, width, dtype=torch.float64).reshape(-1, 3)
-        count = view * len(directions)
-        return Gaussians(
-            means=torch.cat([RADIUS * directions @ p[:3, :3].T + p[:3, 3] for p in cam2world]).float(),
-            scales=torch.full((count, 3), 0.1),
-            quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
-            opacities=torch.full((count,), 0.95),
-            harmonics=((images.flatten(2).transpose(1, 2).reshape(-1, 1, 3) - 0.5) / 0.28209479).contiguous(),
-            levels=torch.zeros(count, dtype=torch.int64),
-            views=torch.arange(view).repeat_interleave(len(directions)),
-        )
-
-
 class Network(NetworkPredictor):
-    """The sphere as a network with depths from coarse to fine; only the finest is right."""
+    """A sphere as a network with depths from coarse to fine; only the finest is right."""
 
     name, fingerprint = "network", "1"
 
-    def __init__(self) -> None:
-        pass
+    def __init__(self, sphere) -> None:
+        self.sphere = sphere
 
     def __call__(self, images, cam2world, near, far, *, masks=None, progress=None):
-        return Sphere()(images, cam2world, near, far)
+        return self.sphere(images, cam2world, near, far)
 
     def predict_with_depths(self, images, cam2world, near, far, *, masks=None, progress=None):
         depths = [torch.full((len(images), rows, 2 * rows), metres) for rows, metres in ((4, 9.0), (8, RADIUS))]
@@ -129,8 +102,10 @@ def write_insta360(root: Path, frames: int) -> Path:
     return folder
 
 
-def methods(protocol: str = "m3d"):
-    return list_methods(Sphere(), protocol)
+@pytest.fixture
+def methods(sphere_predictor):
+    """The methods of a predictor of Gaussians on a sphere of 2 m around each camera."""
+    return lambda protocol="m3d": list_methods(sphere_predictor(), protocol)
 
 
 def test_the_sets_of_a_protocol_are_the_columns_of_its_table(tmp_path: Path) -> None:
@@ -139,7 +114,7 @@ def test_the_sets_of_a_protocol_are_the_columns_of_its_table(tmp_path: Path) -> 
         assert tuple(found.name for found in sets) == layout.sets
 
 
-def test_missing_data_and_a_missing_root_are_named(tmp_path: Path) -> None:
+def test_missing_data_and_a_missing_root_are_named(tmp_path: Path, methods) -> None:
     with pytest.raises(InputError) as error:
         run_protocol("m3d", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
     for distance in ("0.5", "0.75", "1.0"):
@@ -199,16 +174,16 @@ def test_the_target_of_the_frame_distance_is_the_middle_frame(tmp_path: Path) ->
     assert not sequences and "VID_*" in missing
 
 
-def test_networks_are_blended_jointly_and_on_real_scenes_also_deferred() -> None:
-    network = Network()
+def test_networks_are_blended_jointly_and_on_real_scenes_also_deferred(sphere_predictor) -> None:
+    network = Network(sphere_predictor())
     assert [m.blend for m in list_methods(network, "m3d")] == ["joint"]
     assert [m.blend for m in list_methods(network, "360loc")] == ["joint", "deferred"]
     assert [m.blend for m in list_methods(network, "360loc", "deferred")] == ["deferred"]
-    assert [m.blend for m in list_methods(Sphere(), "m3d")] == ["deferred"]
+    assert [m.blend for m in list_methods(sphere_predictor(), "m3d")] == ["deferred"]
     assert list_methods(network, "insta360", name="mine")[1].name == "ours, mine + deferred blending"
 
 
-def test_metrics_are_those_of_the_written_images(tmp_path: Path) -> None:
+def test_metrics_are_those_of_the_written_images(tmp_path: Path, methods) -> None:
     write_triplets(tmp_path, "replica_dist_0.5", scenes=1)
     result = run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
     folder = tmp_path / "out" / "replica_1.0_m" / "00000000"
@@ -226,7 +201,7 @@ def test_metrics_are_those_of_the_written_images(tmp_path: Path) -> None:
     assert score.lpips is None and (score.case, score.target) == ("00000000", "01")
 
 
-def test_the_value_of_a_set_is_the_mean_over_its_images(tmp_path: Path) -> None:
+def test_the_value_of_a_set_is_the_mean_over_its_images(tmp_path: Path, methods) -> None:
     write_loc360(tmp_path)
     result = run_protocol("360loc", tmp_path, methods("360loc"), tmp_path / "out", options=OPTIONS)
     (row,) = result.sets
@@ -237,9 +212,9 @@ def test_the_value_of_a_set_is_the_mean_over_its_images(tmp_path: Path) -> None:
     assert stored["results"][0]["images"] == 12 and stored["protocol"] == "360loc"
 
 
-def test_methods_with_the_same_predictor_share_its_prediction(tmp_path: Path) -> None:
+def test_methods_with_the_same_predictor_share_its_prediction(tmp_path: Path, sphere_predictor) -> None:
     write_loc360(tmp_path)
-    predictor = Sphere()
+    predictor = sphere_predictor()
     both = [*list_methods(predictor, "360loc", "joint"), *list_methods(predictor, "360loc", "deferred")]
     result = run_protocol("360loc", tmp_path, both, tmp_path / "out", options=OPTIONS)
     assert predictor.calls == 1 + 3  # one for the warm-up
@@ -247,7 +222,7 @@ def test_methods_with_the_same_predictor_share_its_prediction(tmp_path: Path) ->
     assert joint.scores != deferred.scores
 
 
-def test_the_true_depth_has_no_error(tmp_path: Path) -> None:
+def test_the_true_depth_has_no_error(tmp_path: Path, methods) -> None:
     """The Gaussians lie on a sphere around each input: the rendered depth is its radius."""
     write_triplets(tmp_path, "m3d_dist_0.5", scenes=1, depth_metres=RADIUS)
     write_triplets(tmp_path, "m3d_dist_1.0", scenes=1, depth_metres=RADIUS)
@@ -258,13 +233,15 @@ def test_the_true_depth_has_no_error(tmp_path: Path) -> None:
     assert len(rich_tables(result)) == 2
 
 
-def test_the_finest_depth_of_a_network_is_measured(tmp_path: Path) -> None:
+def test_the_finest_depth_of_a_network_is_measured(tmp_path: Path, sphere_predictor) -> None:
     write_triplets(tmp_path, "m3d_dist_0.5", scenes=1, depth_metres=RADIUS)
-    result = run_protocol("m3d", tmp_path, list_methods(Network(), "m3d"), tmp_path / "out", options=OPTIONS)
+    result = run_protocol(
+        "m3d", tmp_path, list_methods(Network(sphere_predictor()), "m3d"), tmp_path / "out", options=OPTIONS
+    )
     assert result.sets[0].mean("rmse") == pytest.approx(0, abs=1e-6)
 
 
-def test_lpips_is_optional(tmp_path: Path) -> None:
+def test_lpips_is_optional(tmp_path: Path, methods) -> None:
     write_triplets(tmp_path, "replica_dist_0.5", scenes=1)
     metric = Lpips("squeeze")
     for index, head in enumerate(metric.heads):
@@ -275,7 +252,7 @@ def test_lpips_is_optional(tmp_path: Path) -> None:
     assert any("not comparable" in note for note in report_notes(result))
 
 
-def test_unreadable_cases_are_skipped_and_named_unless_all_are_unreadable(tmp_path: Path) -> None:
+def test_unreadable_cases_are_skipped_and_named_unless_all_are_unreadable(tmp_path: Path, methods) -> None:
     folder = write_triplets(tmp_path, "replica_dist_0.5", scenes=2)
     (folder / "00000001" / "02" / "tran.txt").unlink()
     result = run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
@@ -289,7 +266,7 @@ def test_unreadable_cases_are_skipped_and_named_unless_all_are_unreadable(tmp_pa
         run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
 
 
-def test_limited_cases_are_spread_over_the_set(tmp_path: Path) -> None:
+def test_limited_cases_are_spread_over_the_set(tmp_path: Path, methods) -> None:
     write_triplets(tmp_path, "replica_dist_0.5", scenes=5)
     options = ProtocolOptions(HEIGHT, limit=3, image_cases=1)
     result = run_protocol("replica", tmp_path, methods(), tmp_path / "out", options=options)
@@ -297,7 +274,7 @@ def test_limited_cases_are_spread_over_the_set(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "out" / "replica_1.0_m").iterdir()] == ["00000000"]
 
 
-def test_the_report_has_the_papers_rows_ours_and_the_missing_sets(tmp_path: Path) -> None:
+def test_the_report_has_the_papers_rows_ours_and_the_missing_sets(tmp_path: Path, methods) -> None:
     write_triplets(tmp_path, "m3d_dist_0.5", scenes=1)
     result = run_protocol("m3d", tmp_path, methods(), tmp_path / "out", options=OPTIONS)
     (path,) = write_report(result, tmp_path / "out")
@@ -314,9 +291,9 @@ def test_non_finite_values_become_null() -> None:
     assert json.loads(json.dumps(result, allow_nan=False))["results"][0]["ws_psnr"] is None
 
 
-def test_the_figure_has_a_line_for_each_method(tmp_path: Path) -> None:
+def test_the_figure_has_a_line_for_each_method(tmp_path: Path, sphere_predictor) -> None:
     write_loc360(tmp_path, frames=7)
-    predictor = Sphere()
+    predictor = sphere_predictor()
     both = [*list_methods(predictor, "frame-distance", "joint"), *list_methods(predictor, "frame-distance", "deferred")]
     result = run_protocol("frame-distance", tmp_path, both, tmp_path / "out", options=OPTIONS)
     lines = frame_distance_curves(result.sets, "ws_psnr")

@@ -18,35 +18,12 @@ from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
 from pansplat.evaluation.report import ERROR_SCALE, Case, error_image, evaluate, results_table
-from pansplat.gaussians.scene import Gaussians
 
 HEIGHT = 16
 KEYS = [
     *("name", "model", "height", "ws_psnr", "psnr", "ssim", "cross_fade_ws_psnr", "predict_seconds"),
     *("render_seconds", "num_gaussians", "prediction", "target", "own_ws_psnr", "refine_seconds"),
 ]
-
-
-class GreyBall:
-    """One large grey Gaussian in front of each camera; counts its calls."""
-
-    name, fingerprint = "ball", "1"
-
-    def __init__(self) -> None:
-        self.calls = 0
-
-    def __call__(self, images: Tensor, cam2world: Tensor, near: float, far: float, *, masks=None, progress=None):
-        self.calls += 1
-        count = len(images)
-        return Gaussians(
-            means=(cam2world[:, :3, 3] + torch.tensor([0.0, 0.0, 2.0])).float(),
-            scales=torch.full((count, 3), 0.5),
-            quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
-            opacities=torch.full((count,), 0.9),
-            harmonics=torch.zeros(count, 1, 3),
-            levels=torch.zeros(count, dtype=torch.int64),
-            views=torch.arange(count),
-        )
 
 
 def write_triplet(folder: Path, *, target: bool = True) -> Path:
@@ -76,16 +53,21 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def case(folder: Path) -> Case:
+def case(folder: Path, sphere_predictor: type) -> Case:
     """The triplet's only case, evaluated into `out`."""
-    (case,) = evaluate(load_pairs(folder / "room"), GreyBall(), folder / "out", height=HEIGHT)
+    (case,) = evaluate(load_pairs(folder / "room"), sphere_predictor(), folder / "out", height=HEIGHT)
     return case
 
 
 def test_results_have_the_documented_fields_and_files(folder: Path, case: Case) -> None:
     (result,) = json.loads((folder / "out" / "results.json").read_text())
     assert list(result) == KEYS
-    assert [result[key] for key in ("name", "model", "height", "num_gaussians")] == ["room", "ball", HEIGHT, 2]
+    assert [result[key] for key in ("name", "model", "height", "num_gaussians")] == [
+        "room",
+        "sphere",
+        HEIGHT,
+        4 * HEIGHT**2,
+    ]
     assert result["predict_seconds"] > 0 and result["render_seconds"] > 0
     assert {p.name for p in (folder / "out" / "room").iterdir()} == {"prediction.png", "target.png", "error.png"}
 
@@ -101,21 +83,23 @@ def test_metrics_are_those_of_the_written_images(folder: Path, case: Case) -> No
     assert case.cross_fade_ws_psnr == pytest.approx(ws_psnr(sum(inputs) / 2, target), abs=0.01)
 
 
-def test_the_drawing_changes_the_images(folder: Path, case: Case, tmp_path: Path) -> None:
-    (official,) = evaluate(load_pairs(folder / "room"), GreyBall(), tmp_path, height=HEIGHT, drawing="original")
+def test_the_drawing_changes_the_images(folder: Path, case: Case, tmp_path: Path, sphere_predictor: type) -> None:
+    (official,) = evaluate(load_pairs(folder / "room"), sphere_predictor(), tmp_path, height=HEIGHT, drawing="original")
     assert official.psnr != case.psnr and abs(official.psnr - case.psnr) < 3
 
 
-def test_an_evaluation_does_not_use_the_prediction_cache(tmp_path: Path) -> None:
-    pairs, predictor = load_pairs(write_triplet(tmp_path / "room")), GreyBall()
+def test_an_evaluation_does_not_use_the_prediction_cache(tmp_path: Path, sphere_predictor: type) -> None:
+    pairs, predictor = load_pairs(write_triplet(tmp_path / "room")), sphere_predictor()
     for _ in range(2):
         evaluate(pairs, predictor, tmp_path / "out", height=HEIGHT)
     assert predictor.calls == 4 and not (tmp_path / "room" / ".pansplat").exists()  # each with a warm-up
 
 
-def test_cases_of_one_name_have_their_own_folders_and_the_table_has_their_mean(tmp_path: Path) -> None:
+def test_cases_of_one_name_have_their_own_folders_and_the_table_has_their_mean(
+    tmp_path: Path, sphere_predictor: type
+) -> None:
     pairs = [load_pairs(write_triplet(tmp_path / place / "room"))[0] for place in ("x", "y")]
-    cases = evaluate(pairs, GreyBall(), tmp_path / "out", height=HEIGHT)
+    cases = evaluate(pairs, sphere_predictor(), tmp_path / "out", height=HEIGHT)
     assert [case.name for case in cases] == ["room", "room-2"]
     assert len({case.prediction for case in cases}) == 2
     console = Console(width=140, record=True, file=io.StringIO())
@@ -126,27 +110,31 @@ def test_cases_of_one_name_have_their_own_folders_and_the_table_has_their_mean(t
     assert lines[-2].split()[1:4] == ["cross-fade", "│", f"{cases[0].cross_fade_ws_psnr:.2f}"]  # below the mean
 
 
-def test_pairs_without_target_are_skipped(tmp_path: Path) -> None:
+def test_pairs_without_target_are_skipped(tmp_path: Path, sphere_predictor: type) -> None:
     alone = load_pairs(write_triplet(tmp_path / "alone", target=False))
     with_target = load_pairs(write_triplet(tmp_path / "room"))
-    assert len(evaluate([*alone, *with_target], GreyBall(), tmp_path / "out", height=HEIGHT)) == 1
+    assert len(evaluate([*alone, *with_target], sphere_predictor(), tmp_path / "out", height=HEIGHT)) == 1
     with pytest.raises(InputError, match="none of the pairs has a target view"):
-        evaluate(alone, GreyBall(), tmp_path / "nothing", height=HEIGHT)
+        evaluate(alone, sphere_predictor(), tmp_path / "nothing", height=HEIGHT)
     assert not (tmp_path / "nothing").exists()
 
 
-def test_a_file_at_the_output_folders_path_is_an_input_error(folder: Path, tmp_path: Path) -> None:
+def test_a_file_at_the_output_folders_path_is_an_input_error(
+    folder: Path, tmp_path: Path, sphere_predictor: type
+) -> None:
     (tmp_path / "out").write_text("")
     with pytest.raises(InputError, match=r"cannot make .*choose another"):
-        evaluate(load_pairs(folder / "room"), GreyBall(), tmp_path / "out", height=HEIGHT)
+        evaluate(load_pairs(folder / "room"), sphere_predictor(), tmp_path / "out", height=HEIGHT)
 
 
-def test_a_masked_target_has_second_values_of_the_scene_and_of_the_cross_fade(tmp_path: Path) -> None:
+def test_a_masked_target_has_second_values_of_the_scene_and_of_the_cross_fade(
+    tmp_path: Path, sphere_predictor: type
+) -> None:
     folder = write_triplet(tmp_path / "room")
     mask = np.full((HEIGHT, 2 * HEIGHT), 255, np.uint8)
     mask[-4:] = 0
     Image.fromarray(mask).save(folder / "c_mask.png")
-    (case,) = evaluate(load_pairs(folder), GreyBall(), tmp_path / "out", height=HEIGHT)
+    (case,) = evaluate(load_pairs(folder), sphere_predictor(), tmp_path / "out", height=HEIGHT)
     target, prediction = read_image(case.target), read_image(case.prediction)
     faded = sum(read_image(folder / name) for name in ("a.png", "b.png")) / 2
     counts = torch.from_numpy(mask > 0)
@@ -158,11 +146,11 @@ def test_a_masked_target_has_second_values_of_the_scene_and_of_the_cross_fade(tm
     assert "masked" in [str(column.header) for column in results_table([case]).columns]
 
 
-def test_lpips_is_optional(folder: Path, tmp_path: Path) -> None:
+def test_lpips_is_optional(folder: Path, tmp_path: Path, sphere_predictor: type) -> None:
     pairs, metric = load_pairs(folder / "room"), Lpips("squeeze")
     for head in metric.heads:
         head.data.fill_(0.1)
-    (case,) = evaluate(pairs, GreyBall(), tmp_path / "out", height=32, lpips=metric)
+    (case,) = evaluate(pairs, sphere_predictor(), tmp_path / "out", height=32, lpips=metric)
     (result,) = json.loads((tmp_path / "out" / "results.json").read_text())
     assert set(result) == {*KEYS, "lpips", "cross_fade_lpips"} and result["lpips"] == case.lpips
     target = read_image(case.target)
@@ -188,7 +176,9 @@ def test_error_images_are_brighter_for_larger_errors() -> None:
 
 
 @pytest.mark.usefixtures("refinement_clock")
-def test_a_refined_scene_is_evaluated_with_its_time_and_error_at_the_inputs(tmp_path: Path, sphere_predictor) -> None:
+def test_a_refined_scene_is_evaluated_with_its_time_and_error_at_the_inputs(
+    tmp_path: Path, sphere_predictor: type
+) -> None:
     pairs = load_pairs(write_triplet(tmp_path / "room"))
     plain, refined = (
         evaluate(pairs, sphere_predictor(), tmp_path / str(seconds), height=HEIGHT, refine_seconds=seconds)[0]
