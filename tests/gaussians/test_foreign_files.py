@@ -7,7 +7,6 @@ src/splat-serialize.ts). The programs keep y down in these files.
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -159,19 +158,3 @@ def test_files_of_other_programs_have_their_values_and_are_upright(tmp_path: Pat
         image = pipeline.render(scene, torch.eye(4, dtype=torch.float64), size=(32, 64)).color
     above, below = image[:, :12].mean(dim=(1, 2)), image[:, -12:].mean(dim=(1, 2))
     assert above[2] > 2 * above[0] and below[0] > 2 * below[2], "blue is above, red is below"
-
-
-def test_a_world_with_z_up_is_turned_by_the_switch(tmp_path: Path) -> None:
-    from pansplat.cli import run
-
-    room = make_room()
-    turn = torch.tensor(((1.0, 0, 0), (0, 0, 1), (0, -1, 0)), dtype=torch.float64)  # y down becomes z up
-    write_stock(tmp_path / "z_up.ply", room.rotated(turn))
-    assert run(["export", str(tmp_path / "z_up.ply"), "-o", str(tmp_path / "scene.ply"), "--up", "z"]) == 0
-    found = load_scene(tmp_path / "scene.ply")
-    torch.testing.assert_close(found.gaussians.means, room.means, atol=1e-5, rtol=0)
-    image, needed = (
-        pipeline.render(dataclasses.replace(found, gaussians=g), torch.eye(4, dtype=torch.float64), size=(16, 32)).color
-        for g in (found.gaussians, room)
-    )
-    torch.testing.assert_close(image, needed, atol=2e-3, rtol=0)

@@ -21,7 +21,6 @@ from pansplat.gaussians import formats
 from pansplat.gaussians.formats import load_scene, save_scene
 from pansplat.gaussians.ply import load_ply
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.geometry.pose import rotations_from_quats
 
 CODED = (".compressed.ply", ".spz", ".splat", ".sog")
 # Largest error of positions (metres), rotations (1 - |cosine|), log scales, opacities, harmonics of degree 0 and above.
@@ -33,23 +32,6 @@ ERRORS = {
     ".splat": (1e-6, 1e-4, 1e-5, 0.004, 0.015, None),
     ".sog": (1e-3, 1e-4, 0.02, 0.004, 0.02, 0.02),
 }
-
-
-def make_scene(count: int = 40, degree: int = 1, spread: float = 2.0) -> Scene:
-    random = torch.Generator().manual_seed(0)
-    gaussians = Gaussians(
-        means=torch.randn(count, 3, generator=random) * spread,
-        scales=torch.rand(count, 3, generator=random) * 0.4 + 0.02,
-        quats=torch.nn.functional.normalize(torch.randn(count, 4, generator=random), dim=1),
-        opacities=torch.rand(count, generator=random) * 0.9 + 0.05,
-        harmonics=torch.randn(count, (degree + 1) ** 2, 3, generator=random) * 0.3,
-        levels=torch.arange(count) // 7 % 4,
-        views=torch.arange(count) % 2,
-    )
-    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
-    poses[0, :3, :3] = rotations_from_quats(torch.tensor([0.9, 0.1, -0.3, 0.2], dtype=torch.float64))
-    poses[1, :3, 3] = torch.tensor([1 / 3, -2e-7, 0.5], dtype=torch.float64)
-    return Scene(gaussians, poses, near=0.45, far=10.0, names=("à.jpg", "b c.png"), model="sweep", height=256)
 
 
 def save_and_load(scene: Scene, path: Path) -> Scene:
@@ -70,7 +52,7 @@ def test_every_suffix_has_its_reader() -> None:
 
 
 @pytest.mark.parametrize("suffix", SCENE_SUFFIXES)
-def test_a_scene_survives_each_format_within_its_error(tmp_path: Path, suffix: str) -> None:
+def test_a_scene_survives_each_format_within_its_error(tmp_path: Path, suffix: str, make_scene) -> None:
     scene = make_scene(degree=0 if suffix == ".splat" else 3)
     back = save_and_load(scene, tmp_path / f"scene{suffix}")
     found = back.gaussians
@@ -94,7 +76,7 @@ def test_a_scene_survives_each_format_within_its_error(tmp_path: Path, suffix: s
     assert (back.near, back.far, back.height, back.model, back.names) == (0.45, 10.0, 256, "sweep", scene.names)
 
 
-def test_an_spz_has_y_up(tmp_path: Path) -> None:
+def test_an_spz_has_y_up(tmp_path: Path, make_scene) -> None:
     """24-bit positions with 12 fractional bits after a header of 16 bytes, axes right, up, back."""
     scene = make_scene(count=5)
     save_scene(scene, tmp_path / "a.spz")
@@ -105,7 +87,7 @@ def test_an_spz_has_y_up(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.reshape(numbers, (5, 3)), expected, atol=1 / 4096)
 
 
-def test_a_splat_has_32_bytes_a_gaussian(tmp_path: Path) -> None:
+def test_a_splat_has_32_bytes_a_gaussian(tmp_path: Path, make_scene) -> None:
     scene = make_scene(count=5, degree=0)
     save_scene(scene, tmp_path / "a.splat")
     rows = np.frombuffer(
@@ -120,7 +102,7 @@ def test_a_splat_has_32_bytes_a_gaussian(tmp_path: Path) -> None:
     assert np.abs((rows["quat"].astype(float) - 128) / 128 - g.quats.numpy()).max() <= 1 / 128  # wxyz
 
 
-def test_a_compressed_ply_holds_harmonics_channel_by_channel(tmp_path: Path) -> None:
+def test_a_compressed_ply_holds_harmonics_channel_by_channel(tmp_path: Path, make_scene) -> None:
     """As in a plain .ply; gaussforge alone would write them coefficient by coefficient."""
     scene = make_scene(count=1, degree=3)
     save_scene(scene, tmp_path / "a.compressed.ply")
@@ -131,7 +113,7 @@ def test_a_compressed_ply_holds_harmonics_channel_by_channel(tmp_path: Path) -> 
     np.testing.assert_allclose(stored, expected, atol=8 / 256)
 
 
-def test_a_sog_is_an_archive_of_images(tmp_path: Path) -> None:
+def test_a_sog_is_an_archive_of_images(tmp_path: Path, make_scene) -> None:
     scene = make_scene(count=9, degree=0)
     means = save_and_load(scene, tmp_path / "a.sog").gaussians.means.numpy()
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
@@ -146,21 +128,21 @@ def test_a_sog_is_an_archive_of_images(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.sign(logs) * np.expm1(np.abs(logs)), means, atol=1e-5)
 
 
-def test_the_name_of_a_compressed_ply_may_be_short(tmp_path: Path) -> None:
+def test_the_name_of_a_compressed_ply_may_be_short(tmp_path: Path, make_scene) -> None:
     save_scene(make_scene(), tmp_path / "a.compressed.ply")
     (tmp_path / "a.compressed.ply").rename(tmp_path / "b.PLY")
     assert len(load_scene(tmp_path / "b.PLY").gaussians) == 40
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".glb", ".sog", ".compressed.ply"])
-def test_harmonics_of_degree_4_are_left_out_with_a_warning(tmp_path: Path, suffix: str) -> None:
+def test_harmonics_of_degree_4_are_left_out_with_a_warning(tmp_path: Path, suffix: str, make_scene) -> None:
     with pytest.warns(InputWarning, match="up to degree 3, those up to 4"):
         save_scene(make_scene(count=3, degree=4), tmp_path / f"a{suffix}")
     assert load_scene(tmp_path / f"a{suffix}").gaussians.degree == 3
 
 
 @pytest.mark.parametrize("suffix", [s for s in SCENE_SUFFIXES if s != ".ply"])
-def test_an_empty_scene_is_refused(tmp_path: Path, suffix: str) -> None:
+def test_an_empty_scene_is_refused(tmp_path: Path, suffix: str, make_scene) -> None:
     scene = make_scene()
     scene = dataclasses.replace(scene, gaussians=scene.gaussians.select(torch.zeros(40, dtype=torch.bool)))
     with pytest.raises(InputError, match="holds 1"):
@@ -168,7 +150,9 @@ def test_an_empty_scene_is_refused(tmp_path: Path, suffix: str) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_scene_beyond_the_limits_of_spz_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_beyond_the_limits_of_spz_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_scene
+) -> None:
     with pytest.raises(InputError, match="positions below 2048 m, got"):
         save_scene(make_scene(spread=5000), tmp_path / "a.spz")
     assert formats._CODED[".spz"].max_gaussians == 10_000_000
@@ -177,14 +161,14 @@ def test_a_scene_beyond_the_limits_of_spz_is_refused(tmp_path: Path, monkeypatch
         save_scene(make_scene(), tmp_path / "a.spz")
 
 
-def test_unknown_suffixes_are_refused_with_the_known_ones(tmp_path: Path) -> None:
+def test_unknown_suffixes_are_refused_with_the_known_ones(tmp_path: Path, make_scene) -> None:
     for call in (lambda: load_scene(tmp_path / "a.obj"), lambda: save_scene(make_scene(), tmp_path / "a.obj")):
         with pytest.raises(InputError, match=r"must end in .*\.spz.*\.sog.*\.glb.*got '\.obj'"):
             call()
 
 
 @pytest.mark.parametrize("suffix", CODED)
-def test_damaged_files_are_refused(tmp_path: Path, suffix: str) -> None:
+def test_damaged_files_are_refused(tmp_path: Path, suffix: str, make_scene) -> None:
     path = tmp_path / f"a{suffix}"
     save_scene(make_scene(degree=0), path)
     content = path.read_bytes()
@@ -196,7 +180,7 @@ def test_damaged_files_are_refused(tmp_path: Path, suffix: str) -> None:
             load_scene(path)
 
 
-def test_a_crash_of_the_decoder_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_crash_of_the_decoder_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_scene) -> None:
     save_scene(make_scene(), tmp_path / "a.sog")
     monkeypatch.setattr(formats, "_CODER", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
     with pytest.raises(InputError, match="gaussforge stopped by signal 11"):
@@ -207,7 +191,7 @@ def test_a_crash_of_the_decoder_is_an_error(tmp_path: Path, monkeypatch: pytest.
         load_scene(tmp_path / "a.sog")
 
 
-def test_a_damaged_entry_is_ignored_with_a_warning(tmp_path: Path) -> None:
+def test_a_damaged_entry_is_ignored_with_a_warning(tmp_path: Path, make_scene) -> None:
     save_scene(make_scene(), tmp_path / "a.compressed.ply")
     data = (tmp_path / "a.compressed.ply").read_bytes()
     (tmp_path / "a.compressed.ply").write_bytes(data.replace(b'"near":0.45', b'"near":"no"'))
@@ -215,7 +199,7 @@ def test_a_damaged_entry_is_ignored_with_a_warning(tmp_path: Path) -> None:
         assert not len(load_scene(tmp_path / "a.compressed.ply").cam2world)
 
 
-def test_a_file_of_gaussforge_alone_is_read_without_cameras(tmp_path: Path) -> None:
+def test_a_file_of_gaussforge_alone_is_read_without_cameras(tmp_path: Path, make_scene) -> None:
     """As of another tool: no pansplat entry."""
     scene = make_scene(degree=0)
     save_scene(scene, tmp_path / "a.ply")

@@ -14,23 +14,8 @@ import torch
 
 from pansplat.errors import InputError
 from pansplat.gaussians.gltf import load_glb, save_glb
-from pansplat.gaussians.scene import Gaussians, Scene
 
 NAME = "KHR_gaussian_splatting"
-
-
-def make_scene(count: int = 4, degree: int = 1) -> Scene:
-    random = torch.Generator().manual_seed(0)
-    gaussians = Gaussians(
-        means=torch.randn(count, 3, generator=random),
-        scales=torch.rand(count, 3, generator=random) * 0.1 + 1e-3,
-        quats=torch.nn.functional.normalize(torch.randn(count, 4, generator=random), dim=1),
-        opacities=torch.rand(count, generator=random),
-        harmonics=torch.randn(count, (degree + 1) ** 2, 3, generator=random),
-        levels=torch.zeros(count, dtype=torch.int64),
-        views=torch.zeros(count, dtype=torch.int64),
-    )
-    return Scene(gaussians, torch.eye(4, dtype=torch.float64)[None], near=0.45, far=10.0)
 
 
 def read(path: Path) -> tuple[dict[str, Any], bytes]:
@@ -51,8 +36,8 @@ def write(path: Path, document: dict[str, Any], binary: bytes) -> None:
 
 
 @pytest.fixture
-def file(tmp_path: Path) -> Path:
-    save_glb(make_scene(), tmp_path / "a.glb")
+def file(tmp_path: Path, make_scene) -> Path:
+    save_glb(make_scene(4), tmp_path / "a.glb")
     return tmp_path / "a.glb"
 
 
@@ -65,7 +50,7 @@ def edit(path: Path, change: Edit) -> None:
     write(path, document, binary)
 
 
-def test_attributes_are_those_of_the_extension(file: Path) -> None:
+def test_attributes_are_those_of_the_extension(file: Path, make_scene) -> None:
     document, binary = read(file)
     assert document["extensionsUsed"] == [NAME]
     (primitive,) = document["meshes"][0]["primitives"]
@@ -79,7 +64,7 @@ def test_attributes_are_those_of_the_extension(file: Path) -> None:
         numbers = np.frombuffer(binary[view["byteOffset"] :][: view["byteLength"]], kind)
         return numbers.reshape(accessor["count"], {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]])
 
-    g = make_scene().gaussians
+    g = make_scene(4).gaussians
     np.testing.assert_allclose(values("POSITION"), g.means.numpy() * [1, -1, -1], rtol=1e-6)  # y up
     np.testing.assert_allclose(values(f"{NAME}:SCALE"), g.scales.numpy())
     np.testing.assert_allclose(values(f"{NAME}:OPACITY")[:, 0], g.opacities.numpy())
@@ -173,8 +158,8 @@ def test_truncated_files_are_refused(file: Path) -> None:
             load_glb(file)
 
 
-def test_a_scene_above_4_gib_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_above_4_gib_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_scene) -> None:
     monkeypatch.setattr("pansplat.gaussians.gltf._MAX_BYTES", 1000)
     with pytest.raises(InputError, match=r"holds 1,000 bytes, 4 Gaussians of degree 1 need"):
-        save_glb(make_scene(), tmp_path / "a.glb")
+        save_glb(make_scene(4), tmp_path / "a.glb")
     assert not list(tmp_path.iterdir())
