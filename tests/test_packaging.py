@@ -1,6 +1,7 @@
 """The wheel contains both packages and nothing else, and works without the checkout."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -9,12 +10,17 @@ from pathlib import Path
 
 import pytest
 
+import pansplat
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
 
+pytestmark = pytest.mark.lint
+
 ROOT = Path(__file__).resolve().parents[1]
+SUFFIXES = ".py .glsl .vert .frag .geom .comp .safetensors .html .css .js"
 FOLDERS = {
     "pansplat": "pansplat",
     "pansplat.default_model": "assets/default",
@@ -68,39 +74,19 @@ def test_the_package_list_equals_the_packages_on_disk() -> None:
     assert len(set(listed)) == len(listed)
 
 
-def test_the_wheel_contains_both_packages_and_nothing_else(wheel: Path) -> None:
+def test_the_wheel_contains_every_module_and_shader_and_nothing_else(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     version = read_project()["project"]["version"]
+    assert version == pansplat.__version__
     assert {name.split("/")[0] for name in names} == {"pansplat", "pansplat_viewer", f"pansplat-{version}.dist-info"}
     assert not [name for name in names if "test_" in name or "conftest" in name or "__pycache__" in name]
-
-
-def test_the_wheel_contains_every_module_and_shader(wheel: Path) -> None:
-    names = set(zipfile.ZipFile(wheel).namelist())
     needed = {"pansplat/py.typed"}
     for package, folder in FOLDERS.items():
         for file in (ROOT / folder).rglob("*"):
-            if file.suffix in (
-                ".py",
-                ".glsl",
-                ".vert",
-                ".frag",
-                ".geom",
-                ".comp",
-                ".safetensors",
-                ".html",
-                ".css",
-                ".js",
-            ):
+            if file.suffix in SUFFIXES.split():
                 needed.add(f"{package.replace('.', '/')}/{file.relative_to(ROOT / folder).as_posix()}")
-    assert not needed - names
+    assert not needed - set(names)
     assert any(name.endswith((".frag", ".glsl")) for name in needed)
-
-
-def test_package_and_project_have_the_same_version(wheel: Path) -> None:
-    import pansplat
-
-    assert read_project()["project"]["version"] == pansplat.__version__
 
 
 def test_an_installed_wheel_reads_its_own_shaders(installed: Path) -> None:
@@ -118,7 +104,6 @@ def test_an_installed_wheel_reads_its_own_shaders(installed: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("command", ["pansplat", "pansplat-view", "pansplat-train"])
 def test_the_entry_points_of_an_installed_wheel_work(installed: Path, command: str) -> None:
     done = run_in(installed, sys.executable, str(installed / "bin" / command), "--help")
@@ -126,7 +111,6 @@ def test_the_entry_points_of_an_installed_wheel_work(installed: Path, command: s
     assert command in done.stdout + done.stderr
 
 
-@pytest.mark.slow
 def test_tests_pass_against_the_installed_wheel(installed: Path) -> None:
     """Run the tests of one module with the wheel instead of the checkout."""
     options = ["-q", "-n", "0", "-p", "no:cacheprovider", "-c", str(ROOT / "pyproject.toml")]
@@ -141,9 +125,6 @@ def test_setup_pins_every_direct_dependency() -> None:
     pinned = {line.split("==")[0] for line in constraints if line and not line.startswith("#")}
     metadata = read_project()["project"]
     requirements = [*metadata["dependencies"], *metadata["optional-dependencies"]["dev"]]
-    names = {
-        name.split(";")[0].split(">")[0].split("==")[0].split("[")[0].strip().lower().replace("_", "-")
-        for name in requirements
-    }
+    names = {re.split("[;>=[]", name)[0].strip().lower().replace("_", "-") for name in requirements}
     assert not names - pinned
     assert subprocess.run(["bash", "-n", str(ROOT / "setup.sh")]).returncode == 0

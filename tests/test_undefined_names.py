@@ -6,13 +6,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("pansplat", "viewer", "tests", "assets")
 
+pytestmark = pytest.mark.lint
 
-def find_undefined_names(folder: Path) -> list[str]:
-    """The undefined names in a folder's Python files, outside of strings."""
-    command = ["check", "--isolated", "--select", "F821", "--output-format", "json", str(folder)]
+
+def find_undefined_names(*folders: Path) -> list[str]:
+    """The undefined names in Python files, outside of strings."""
+    command = ["check", "--isolated", "--select", "F821", "--output-format", "json", *map(str, folders)]
     done = subprocess.run([Path(sys.executable).with_name("ruff"), *command], capture_output=True, text=True)
     found = []
     for row in json.loads(done.stdout):
@@ -26,8 +30,7 @@ def find_undefined_names(folder: Path) -> list[str]:
 
 
 def test_no_name_is_undefined() -> None:
-    found = [line for folder in FOLDERS for line in find_undefined_names(ROOT / folder)]
-    assert not found, "\n".join(found)
+    assert not find_undefined_names(*(ROOT / folder for folder in FOLDERS))
 
 
 def test_an_undefined_name_is_found(tmp_path: Path) -> None:
