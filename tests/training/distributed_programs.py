@@ -1,4 +1,7 @@
-"""Programs of test_distributed.py: PROGRAM FOLDER. Each process writes its gradients to files."""
+"""Programs of test_distributed.py: each of several processes writes its gradients to files, and trains.
+
+Usage: distributed_programs.py FOLDER
+"""
 
 from __future__ import annotations
 
@@ -9,15 +12,13 @@ import torch
 from torch import Tensor, nn
 
 from pansplat.console import exit_process
-from pansplat.data.views import Batch, collate
+from pansplat.data.views import collate
 from pansplat.model.pansplat import PanSplat
-from pansplat.training.config import MemoryConfig
-from pansplat.training.distributed import (
-    ProcessGroup,
-    convert_sync_batch_norm,
-    data_parallel,
-    no_sync,
-)
+from pansplat.training import network as network_module
+from pansplat.training import trainer as trainer_module
+from pansplat.training.config import DataConfig, MemoryConfig, NetworkConfig, OptimizerConfig, TrainConfig
+from pansplat.training.config import ValidationConfig as Validation
+from pansplat.training.distributed import ProcessGroup, convert_sync_batch_norm, data_parallel, no_sync
 from pansplat.training.losses import LossWeights
 from pansplat.training.network import set_training_mode
 from pansplat.training.step import TrainingStep, accumulate_gradients
@@ -27,10 +28,11 @@ from conftest import PaintedSphere, micro_config
 
 METHODS = (("plain", 1), ("plain", 2), ("two-step", 1), ("two-step", 2))
 """Method of backpropagation, and number of batches per step."""
+PROCESSES = 3
 
 
-def split_batches(folder: Path, processes: ProcessGroup) -> None:
-    """Gradients of a network for batches of two samples, which the processes share."""
+def split_batches(processes: ProcessGroup) -> dict[str, Tensor]:
+    """Gradients and statistics of a network for batches of three samples, which the processes share."""
     torch.manual_seed(3)
     network = PanSplat(micro_config(), "fixed").double()
     convert_sync_batch_norm(network, processes)
@@ -41,16 +43,30 @@ def split_batches(folder: Path, processes: ProcessGroup) -> None:
     for method, rounds in METHODS:
         step.memory = MemoryConfig(method, 1 if method == "plain" else 2, "original")
         step.zero_grad()
-        accumulate_gradients(wrapped, [_batch_part(processes, n) for n in range(rounds)])
+        indices = [range(PROCESSES * n, PROCESSES * (n + 1)) for n in range(rounds)]
+        own = indices if processes.count == 1 else [part[processes.rank : processes.rank + 1] for part in indices]
+        batches = [collate([PaintedSphere().sample(n, 32, 0) for n in part]) for part in own]
+        accumulate_gradients(wrapped, batches)
         found |= {f"{method} {rounds} {name}": p.grad for name, p in network.named_parameters() if p.grad is not None}
-    buffers = {name: tensor for name, tensor in network.named_buffers() if tensor.is_floating_point()}
-    torch.save({**found, **buffers}, folder / f"{processes.count}_{processes.rank}.pt")
+    return found | {name: tensor for name, tensor in network.named_buffers() if tensor.is_floating_point()}
 
 
-def _batch_part(processes: ProcessGroup, number: int) -> Batch:
-    indices = [2 * number, 2 * number + 1]
-    own = indices if processes.count == 1 else indices[processes.rank : processes.rank + 1]
-    return collate([PaintedSphere().sample(n, 32, 0) for n in own])
+def train(folder: Path, processes: ProcessGroup) -> None:
+    """One step of a micro network."""
+    network_module.network_config = lambda shape: micro_config()
+    trainer_module.load_sources = lambda data, height, seed: (PaintedSphere(), PaintedSphere(2))
+    TrainConfig.check = lambda self: None
+    config = TrainConfig(
+        out=folder / "run",
+        heights=(32,),
+        perceptual="structure",
+        device="cpu",
+        data=DataConfig(workers=0),
+        network=NetworkConfig(shape="tiny"),
+        optimizer=OptimizerConfig(steps=1, batch_size=1),
+        validation=Validation(every=0),
+    )
+    assert trainer_module.Trainer(config, processes).train()
 
 
 class Chain(nn.Module):
@@ -98,8 +114,10 @@ def _save_gradients(step: Chain, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    group = ProcessGroup()
+    folder, group = Path(sys.argv[1]), ProcessGroup()
     group.initialize(torch.device("cpu"))
-    {"split_batches": split_batches, "repeated_steps": repeated_steps}[sys.argv[1]](Path(sys.argv[2]), group)
+    torch.save(split_batches(group), folder / f"split_{group.rank}.pt")
+    repeated_steps(folder, group)
+    train(folder, group)
     group.destroy()
     exit_process(0)

@@ -39,12 +39,12 @@ def state(value: float = 1.0, count: int = 4) -> dict[str, object]:
 @pytest.mark.slow
 def test_a_kill_at_any_time_leaves_a_readable_checkpoint(tmp_path: Path) -> None:
     first = 0
-    for number in range(3):
+    for number in range(2):
         command = [sys.executable, "-c", _WRITER, str(tmp_path), str(first)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
             assert child.stdout is not None
             written = int(child.stdout.readline())
-            time.sleep(0.01 + 0.013 * number)
+            time.sleep(0.01 + 0.023 * number)
             child.send_signal(signal.SIGKILL)
             written = max([written, *map(int, child.stdout.read().split())])
         found = load_latest(tmp_path)

@@ -25,10 +25,9 @@ def write_triplets(folder: Path, *names: str) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("family", _FAMILIES)
-def test_reserved_maps_are_skipped_with_a_warning(family: str, tmp_path: Path) -> None:
-    write_triplets(tmp_path, f"{family}_000", f"{family}_001", "oa_dm3_000")
-    with pytest.warns(UserWarning, match="2 of 3 triplets belong to maps that are reserved"):
+def test_reserved_maps_are_skipped_with_a_warning(tmp_path: Path) -> None:
+    write_triplets(tmp_path, *(f"{family}_{number}" for family in _FAMILIES for number in ("000", "001")), "oa_dm3_000")
+    with pytest.warns(UserWarning, match="20 of 21 triplets belong to maps that are reserved"):
         both = load_sources(DataConfig("triplets", tmp_path), 64, 0)
     for source in both:
         assert isinstance(source, TripletSource)
