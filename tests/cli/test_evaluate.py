@@ -80,7 +80,6 @@ def test_each_model_has_a_row(data: Path, tmp_path: Path, sphere_model: type, mo
     [
         (["--near", "1"], "--near is set by the protocol"),
         (["--blend", "view0"], "--blend must be joint or deferred with --protocol"),
-        (["--limit", "0"], "--limit must be a whole number of 1"),
         (["--models", "sphere"], "must have distinct names"),
         (["--lpips", "vgg"], "LPIPS with vgg needed vgg16-397923af.pth"),
         (["--protocol", "360loc"], "360Loc: needed"),

@@ -69,11 +69,6 @@ def test_up_turns_a_file_with_other_axes(
     assert pipeline.load(tmp_path / "turned.ply").gaussians.means[0].tolist() == list(expected)
 
 
-def test_an_unknown_suffix_names_the_known_ones(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
-    message = refusal("export", scene, "-o", tmp_path / "scene.obj")
-    assert ".ply" in message and "scene.obj" in message
-
-
 def test_a_web_page_is_written(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "tour.html"
     assert run(["export", str(scene), "-o", str(out), "--gaussians", "100", "--title", "Our home"]) == 0
@@ -83,6 +78,8 @@ def test_a_web_page_is_written(scene: Path, tmp_path: Path, capsys: pytest.Captu
 
 def test_options_of_pages_are_for_pages(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
     assert ".html page" in refusal("export", scene, "-o", tmp_path / "out.ply", "--split")
+    assert ".sog, .glb, .ply" in refusal("export", scene, "-o", tmp_path / "scene.obj")
+    assert "--points writes a .ply" in refusal("export", scene, "-o", tmp_path / "x.spz", "--points")
     assert "--up is for a scene file" in refusal("export", tmp_path, "-o", tmp_path / "out.ply", "--up", "z")
 
 

@@ -25,13 +25,10 @@ def test_predict_writes_the_format_of_the_suffix(room: Path, tmp_path: Path) -> 
     [
         (["-o", "scene.obj"], "--out must end in .compressed.ply, .spz, .splat, .sog, .glb, .ply"),
         (["-o", "no/scene.ply"], "existing folder"),
-        (["--height", "7"], "--height"),
         (["--model", "magic"], "must be one of default, sphere, sweep"),
         (["--near", "9", "--far", "3"], "0 < near < far"),
         (["--convention", "sideways"], "needed a known pose convention"),
         (["--precision", "bfloat16"], "`precision` is for networks, and sphere is not one"),
-        (["--degree", "5"], "--degree must be a whole number of 0 to 4, got 5"),
-        (["--min-opacity", "1"], "--min-opacity must be a number from 0 below 1"),
     ],
 )
 def test_invalid_arguments_are_refused_before_the_prediction(

@@ -67,15 +67,12 @@ def test_ctrl_c_ends_the_refinement_and_writes_the_scene(room: Path, tmp_path: P
     ("arguments", "message"),
     [
         (["--seconds", 1], "--seconds and --steps both"),
-        (["--gaussians", 0], "--gaussians must be a whole number of 1"),
         (["--photographs", "elsewhere"], "--photographs is for a scene file"),
         (["--report", "report.txt"], "--report must end in .json"),
-        (["--height", 7], "--height must be a whole number"),
     ],
 )
 def test_invalid_arguments_are_refused(room: Path, tmp_path: Path, refusal, arguments: list, message: str) -> None:
-    base = ["refine", room, "-o", tmp_path / "x.ply", "--model", "sphere", "--steps", 3]
-    base += [] if "--height" in arguments else ["--height", HEIGHT]
+    base = ["refine", room, "-o", tmp_path / "x.ply", "--model", "sphere", "--steps", 3, "--height", HEIGHT]
     assert message in refusal(*base, *arguments)
     assert not (tmp_path / "x.ply").exists()
 
