@@ -22,7 +22,11 @@ _KINDS = (
 
 
 def describe_kind(path: Path | str) -> str | None:
-    """ "a folder", "a FIFO (named pipe)" etc.; None for a regular file; an OSError if there is no such path."""
+    """The kind of a path, such as "a folder" or "a FIFO (named pipe)"; None for a regular file.
+
+    Raises:
+        OSError: there is no such path.
+    """
     mode = os.stat(path).st_mode
     return next((kind for is_kind, kind in _KINDS if is_kind(mode)), None)
 

@@ -1,4 +1,4 @@
-"""Run-time checks of annotated shapes and types, enabled in tests/conftest.py."""
+"""Run-time checks of annotated shapes and types, enabled in tests/conftest.py with -m exhaustive."""
 
 from __future__ import annotations
 

@@ -5,7 +5,9 @@ import importlib.util
 import itertools
 import json
 import os
+import re
 import signal
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -48,13 +50,15 @@ _CHECKED = ("geometry", "gaussians", "model", "rendering", "refinement", "predic
 
 
 def _selects(config: pytest.Config, marker: str) -> bool:
-    """Whether the command line has -m with a marker."""
-    return marker in config.option.markexpr
+    """Whether the command line has -m with a marker, without `not` before it."""
+    return re.search(rf"(?<!not )\b{marker}\b", config.option.markexpr) is not None
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Install the checks of annotations before the packages are imported."""
     if _selects(config, "exhaustive"):
+        if early := [name for name in _CHECKED if f"pansplat.{name}" in sys.modules]:
+            raise pytest.UsageError(f"run -m exhaustive without a folder: it imports {', '.join(early)} too early")
         install_import_hook([f"pansplat.{name}" for name in _CHECKED], "pansplat.testing.check_types")
 
 

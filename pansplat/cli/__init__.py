@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import reduce
 from importlib import import_module
-from operator import or_
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Protocol, Union
 
 from pansplat.console import exit_process, own_warnings, parse_arguments, run_command
 
 _COMMANDS = (
-    *("predict", "refine", "render", "export", "batch", "evaluate", "pose"),
-    *("check", "info", "bench", "convert", "data"),
-)
+    "predict", "refine", "render", "export", "batch", "evaluate", "pose", "check", "info", "bench", "convert", "data"
+)  # fmt: skip
 """Each is a module with a class of its name, in the order of `pansplat --help`."""
 
 
@@ -68,4 +65,4 @@ def _list_commands() -> object:
 
     modules = {name: import_module(f"pansplat.cli.{name}") for name in _COMMANDS}
     kinds = [Annotated[getattr(module, name.title()), subcommand(name)] for name, module in modules.items()]
-    return reduce(or_, kinds)
+    return Union[tuple(kinds)]  # noqa: UP007, a union of a computed list

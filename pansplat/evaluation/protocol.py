@@ -460,7 +460,7 @@ def _run_case(
             row.render_seconds.append(time.perf_counter() - start)
             row.scores.append(score_target(sample, index, image, lpips))
             if folder is not None:
-                _write_images(folder, _slugify(row.scores[-1].target), _slugify(method.name), image, target)
+                _write_images(folder, _slugify(sample.targets.names[index]), _slugify(method.name), image, target)
 
 
 def _write_images(folder: Path, target_name: str, method: str, image: Tensor, target: Tensor) -> None:

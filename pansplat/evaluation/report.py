@@ -238,11 +238,7 @@ _NOT_MEASURED = {"masked_ws_psnr": None, "lpips": None, "refine_seconds": 0.0}  
 
 def results_table(cases: Sequence[Case]) -> Table:
     """A printable table of the cases, their mean, and the mean of the cross-fade of the same cases."""
-    columns = {
-        head: column
-        for head, column in _COLUMNS.items()
-        if any(getattr(case, column.field) != _NOT_MEASURED.get(column.field, math.nan) for case in cases)
-    }
+    columns = {head: column for head, column in _COLUMNS.items() if _is_measured(cases, column.field)}
     table = Table(title=f"{cases[0].model}, {cases[0].height}x{2 * cases[0].height}" if cases else None)
     table.add_column("case")
     for head in columns:
@@ -255,6 +251,10 @@ def results_table(cases: Sequence[Case]) -> Table:
             table.add_row("mean", *(_format_mean(cases, c.field, c.format_spec) for c in columns.values()))
         table.add_row("cross-fade", *(_format_mean(cases, c.cross_fade, c.format_spec) for c in columns.values()))
     return table
+
+
+def _is_measured(cases: Sequence[Case], name: str) -> bool:
+    return name not in _NOT_MEASURED or any(getattr(case, name) != _NOT_MEASURED[name] for case in cases)
 
 
 def _format_mean(cases: Sequence[Case], field: str, format_spec: str) -> str:

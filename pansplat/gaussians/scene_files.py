@@ -127,7 +127,7 @@ def find_label_runs(gaussians: Gaussians) -> list[list[int]]:
     return torch.stack((levels[starts], views[starts], counts), dim=1).tolist()
 
 
-_Entry = tuple[Scene, "list[Any] | None"]
+_Entry = tuple[Scene, list[Any] | None]
 """A scene without Gaussians, and the runs of labels."""
 
 

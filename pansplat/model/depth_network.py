@@ -22,7 +22,6 @@ from torch.nn.functional import interpolate, relu
 from pansplat.model.efficientnet import CHANNELS, EfficientNetLite0
 from pansplat.model.layers import PanoramaConv2d, attend, convolve_and_normalize
 
-_STRIDE = 32  # of the coarsest features
 MAX_LOG_SCALE = 3.0  # bound of the logarithm of the Laplace scale
 _MEAN_LOG_DEPTH = 0.6  # of generated homes, in camera heights
 

@@ -263,7 +263,7 @@ class DepthTrainer:
 
     def _restore(self, path: Path, state: dict[str, Any]) -> None:
         """Restore the run from a checkpoint; a DamagedCheckpointError if it does not fit."""
-        restore(state, "step", int)
+        restore(state, "step", int)  # checked before anything is restored
         restore(state, "network", self.network.load_state_dict)
         restore(state, "mean", self.average.load)
         restore(state, "optimizer", partial(restore_optimizer, self.optimizer))

@@ -271,7 +271,7 @@ class Trainer:
         """
         restore(state, "config", lambda text: require_object(parse_json(text, "config"), "config"))
         require_same(state["config"], self.config, path)
-        restore(state, "step", int)
+        restore(state, "step", int)  # checked before anything is restored
         restore(state, "network", self.network.load_state_dict)
         if self.auxiliary is not None:
             restore(state, "auxiliary", self.auxiliary.load_state_dict)

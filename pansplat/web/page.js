@@ -376,7 +376,7 @@
   const makeStart = () => ({ ...HEADER.start, position: [...HEADER.start.position], roll: 0 });
   const camera = makeStart();
 
-  // Camera to world; positive yaw turns right, positive pitch up (viewer/camera.py). The device's motion adds a roll.
+  // Camera to world; positive yaw turns right, positive pitch up (viewer/scene/camera.py). The device's motion adds a roll.
   function rotationOf({ yaw, pitch, roll }) {
     const [cy, sy, cp, sp, cr, sr] = [yaw, pitch, roll].flatMap((angle) => [Math.cos(angle), Math.sin(angle)]);
     const turned = multiply([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]], [[1, 0, 0], [0, cp, -sp], [0, sp, cp]]);

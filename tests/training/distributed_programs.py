@@ -16,8 +16,8 @@ from pansplat.data.views import collate
 from pansplat.model.pansplat import PanSplat
 from pansplat.training import network as network_module
 from pansplat.training import trainer as trainer_module
-from pansplat.training.config import DataConfig, MemoryConfig, NetworkConfig, OptimizerConfig, TrainConfig
-from pansplat.training.config import ValidationConfig as Validation
+from pansplat.training.__main__ import run
+from pansplat.training.config import MemoryConfig, TrainConfig
 from pansplat.training.distributed import ProcessGroup, convert_sync_batch_norm, data_parallel, no_sync
 from pansplat.training.losses import LossWeights
 from pansplat.training.network import set_training_mode
@@ -51,22 +51,15 @@ def split_batches(processes: ProcessGroup) -> dict[str, Tensor]:
     return found | {name: tensor for name, tensor in network.named_buffers() if tensor.is_floating_point()}
 
 
-def train(folder: Path, processes: ProcessGroup) -> None:
-    """One step of a micro network."""
+def train(folder: Path) -> int:
+    """Run `pansplat-train` for one step of a micro network; the exit status."""
     network_module.network_config = lambda shape: micro_config()
     trainer_module.load_sources = lambda data, height, seed: (PaintedSphere(), PaintedSphere(2))
-    TrainConfig.check = lambda self: None
-    config = TrainConfig(
-        out=folder / "run",
-        heights=(32,),
-        perceptual="structure",
-        device="cpu",
-        data=DataConfig(workers=0),
-        network=NetworkConfig(shape="tiny"),
-        optimizer=OptimizerConfig(steps=1, batch_size=1),
-        validation=Validation(every=0),
-    )
-    assert trainer_module.Trainer(config, processes).train()
+    TrainConfig.check = lambda self: None  # it refuses the height
+    settings = {"heights": 32, "perceptual": "structure", "device": "cpu", "data.workers": 0, "optimizer.steps": 1}
+    settings |= {"optimizer.batch-size": 1, "validation.every": 0}
+    options = [text for name, value in settings.items() for text in (f"--{name}", str(value))]
+    return run(["tiny", "--out", str(folder / "run"), *options])
 
 
 class Chain(nn.Module):
@@ -118,6 +111,5 @@ if __name__ == "__main__":
     group.initialize(torch.device("cpu"))
     torch.save(split_batches(group), folder / f"split_{group.rank}.pt")
     repeated_steps(folder, group)
-    train(folder, group)
     group.destroy()
-    exit_process(0)
+    exit_process(train(folder))

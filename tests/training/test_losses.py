@@ -180,7 +180,7 @@ def test_depth_losses_have_their_closed_forms() -> None:
 
 
 @pytest.mark.parametrize("form", ["depth", "inverse_depth"])
-@pytest.mark.parametrize("unknown", [0.0, FAR, math.inf])
+@pytest.mark.parametrize("unknown", [0.0, NEAR, FAR, math.inf])
 def test_depth_outside_the_range_is_unknown(form, unknown: float) -> None:
     (level,), (truth,) = depths(16), depths(16, seed=1)
     expected = float(depth_loss([level[..., :8, :]], truth[..., :8, :], NEAR, FAR, form=form))
