@@ -111,5 +111,6 @@ if __name__ == "__main__":
     group.initialize(torch.device("cpu"))
     torch.save(split_batches(group), folder / f"split_{group.rank}.pt")
     repeated_steps(folder, group)
+    status = train(folder)  # it joins the group that exists
     group.destroy()
-    exit_process(train(folder))
+    exit_process(status)
