@@ -279,7 +279,7 @@
   // views have weight 0.
   function groupWeights(group, position) {
     const views = HEADER.groups[group], weights = HEADER.views.map(() => 0);
-    const distances = views.map((view) => Math.hypot(...minus(position, HEADER.views[view].position)));
+    const distances = views.map((view) => distanceOf(position, HEADER.views[view].position));
     const nearest = Math.min(...distances);
     const closeness = distances.map((distance) => distance > 0 ? nearest / distance : 1);
     const sum = closeness.reduce((a, b) => a + b);
@@ -295,18 +295,13 @@
     return weights.map((weight, view) => fade.done * weight + (1 - fade.done) * old[view]);
   }
 
-  // ---- the graph of a tour ----
+  // ---- the edge at the camera ----
 
+  const GRAPH = { positions: HEADER.spots.map((spot) => spot.position), edges: HEADER.edges, next: HEADER.next, hysteresis: HEADER.hysteresis };
   let edge = 0, group = HEADER.edges.length ? HEADER.edges[0][2] : 0, fade = null;
 
-  function distanceToEdge([a, b], position) {
-    const from = HEADER.views[a].position, along = minus(HEADER.views[b].position, from), offset = minus(position, from);
-    const fraction = clamp(dot(offset, along) / Math.max(dot(along, along), 1e-12), 0, 1);
-    return Math.hypot(...minus(offset, scaled(along, fraction)));
-  }
-
-  // Chooses the edge at the camera, the nearest one with hysteresis; its views fade in.
-  function followEdge(now) {
+  // Chooses the edge at the camera; its views fade in.
+  function updateEdge(now) {
     if (fade) {
       const t = clamp((now - fade.began) / FADE_MS, 0, 1);
       fade.done = t * t * (3 - 2 * t);
@@ -314,18 +309,12 @@
       changed();
       return;
     }
-    const [nearest, distance] = nearestEdge(camera.position);
-    if (nearest === edge || distanceToEdge(HEADER.edges[edge], camera.position) <= distance + HEADER.hysteresis) return;
+    const chosen = followEdge(GRAPH, camera.position, edge);
+    if (chosen === edge) return;
     const old = group;
-    settle(nearest);
+    settle(chosen);
     if (group !== old) fade = { group: old, began: now, done: 0 };
     changed();
-  }
-
-  function nearestEdge(position) {
-    const distances = HEADER.edges.map((candidate) => distanceToEdge(candidate, position));
-    const distance = Math.min(...distances);
-    return [distances.indexOf(distance), distance];
   }
 
   // Shows the views of an edge at once.
@@ -336,42 +325,13 @@
   }
 
   function settleAt(position) {
-    if (HEADER.edges.length) settle(nearestEdge(position)[0]);
+    if (HEADER.edges.length) settle(nearestEdge(GRAPH, position));
   }
-
-  // The panoramas at the edge of the camera, and those that share an edge with them; without edges all panoramas.
-  function reachable(spot) {
-    if (!HEADER.edges.length) return true;
-    const ends = HEADER.edges[edge];
-    return spot === ends[0] || spot === ends[1] ||
-      HEADER.edges.some(([a, b]) => (a === spot && (b === ends[0] || b === ends[1])) || (b === spot && (a === ends[0] || a === ends[1])));
-  }
-
-  // The panoramas on the way from the camera to one of them. The way begins at an end of the edge nearest to the camera;
-  // the edge that is shown can be another one, after a jump and while views fade.
-  function findWay(spot) {
-    if (!HEADER.edges.length) return [spot];
-    const [nearest] = nearestEdge(camera.position);
-    const ways = HEADER.edges[nearest].slice(0, 2).map((start) => {
-      const way = [start];
-      while (way.at(-1) !== spot) way.push(HEADER.next[way.at(-1)][spot]);
-      return way;
-    });
-    const length = (way) => measure([camera.position, ...way.map((node) => HEADER.spots[node].position)]);
-    return length(ways[0]) <= length(ways[1]) ? ways[0] : ways[1];
-  }
-
-  const measure = (path) => path.slice(1).reduce((sum, point, i) => sum + Math.hypot(...minus(point, path[i])), 0);
 
   // ---- camera ----
 
-  const minus = (a, b) => a.map((value, i) => value - b[i]);
-  const plus = (a, b) => a.map((value, i) => value + b[i]);
-  const scaled = (a, factor) => a.map((value) => value * factor);
-  const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
   const multiply = (a, b) => a.map((row) => b[0].map((_, k) => row.reduce((sum, value, i) => sum + value * b[i][k], 0)));
   const column = (matrix, k) => matrix.map((row) => row[k]);
-  const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 
   const makeStart = () => ({ ...HEADER.start, position: [...HEADER.start.position], roll: 0 });
   const camera = makeStart();
@@ -406,15 +366,15 @@
   }
 
   function nearestSpot(position) {
-    const distance = (spot) => Math.hypot(...minus(position, spot));
-    return HEADER.spots.map((spot) => spot.position).reduce((a, b) => distance(b) < distance(a) ? b : a);
+    return GRAPH.positions.reduce((a, b) => distanceOf(b, position) < distanceOf(a, position) ? b : a);
   }
 
   // A smooth flight to a panorama along the edges; the direction of view stays the user's.
   let flight = null, touring = false;
   function flyTo(spot) {
-    const path = [[...camera.position], ...findWay(spot).map((node) => HEADER.spots[node].position)];
-    const length = measure(path), seconds = clamp(1.2 * length / HEADER.speed, 0.6, 3 * (path.length - 1));
+    const way = HEADER.edges.length ? findWay(GRAPH, camera.position, spot) : [spot];
+    const path = [[...camera.position], ...way.map((node) => GRAPH.positions[node])];
+    const length = lengthOf(path), seconds = clamp(1.2 * length / HEADER.speed, 0.6, 3 * (path.length - 1));
     flight = { spot, path, length, seconds, began: performance.now() };
     changed();
   }
@@ -445,7 +405,7 @@
   // the difference in pose disappears in the first second. The camera turns with the route; a drag adds to it.
   let route = null;
   function startRoute() {
-    const distances = HEADER.route.map((sample) => Math.hypot(...minus(sample.slice(0, 3), camera.position)));
+    const distances = HEADER.route.map((sample) => distanceOf(sample.slice(0, 3), camera.position));
     const least = Math.min(...distances) + 0.02 * HEADER.speed;
     const first = distances.findIndex((distance) => distance <= least), sample = HEADER.route[first];
     const turned = camera.yaw - sample[3];
@@ -479,8 +439,7 @@
       flight = null;
       startRoute();
     } else if (!flight) {
-      const positions = HEADER.spots.map((spot) => spot.position);
-      flyTo((positions.indexOf(nearestSpot(camera.position)) + 1) % positions.length);
+      flyTo((GRAPH.positions.indexOf(nearestSpot(camera.position)) + 1) % GRAPH.positions.length);
     }
     changed();
   }
@@ -542,7 +501,7 @@
       const radians = 2 * tangentOf(clientWidth, clientHeight) / clientHeight;
       turn(-moved[0] * radians, moved[1] * radians);
     } else if (before.length === 2) {
-      const apart = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]);
+      const apart = ([a, b]) => distanceOf(a, b);
       const metres = 2 * HEADER.speed / Math.min(canvas.clientWidth, canvas.clientHeight);
       const pinch = apart([...fingers.values()]) - apart(before);
       setTouring(false);
@@ -648,8 +607,8 @@
     HEADER.spots.forEach((spot, index) => {
       const button = spots[index], offset = minus(spot.mark, camera.position);
       const [x, y, z] = [0, 1, 2].map((k) => dot(column(rotation, k), offset));
-      const flat = Math.hypot(...minus(spot.position, camera.position));
-      button.hidden = z < 0.1 * spot.radius || flat < 2 * spot.radius || !reachable(index);
+      const away = distanceOf(spot.position, camera.position), isNext = !HEADER.edges.length || isReachable(GRAPH, edge, index);
+      button.hidden = z < 0.1 * spot.radius || away < 2 * spot.radius || !isNext;
       if (button.hidden) return;
       const size = clamp(2 * spot.radius * focal / z / 64, 0.25, 2), tilt = clamp(y / Math.hypot(x, y, z), 0.25, 1);
       button.style.transform = `translate(${0.5 * width + focal * x / z}px, ${0.5 * height + focal * y / z}px) scale(${size}, ${size * tilt})`;
@@ -692,7 +651,7 @@
     walkByKeys(Math.min(elapsed, 100) / 1000, fast);
     advanceFlight(now);
     advanceRoute(Math.min(elapsed, 100) / 1000);
-    if (HEADER.edges.length) followEdge(now);
+    if (HEADER.edges.length) updateEdge(now);
     requestSort();
     const moving = now - lastChange < 200;
     if (moving && drawnScale && elapsed < 1000) scale = clamp(scale * (elapsed > 45 ? 0.85 : elapsed < 25 ? 1.05 : 1), 0.25, 1);

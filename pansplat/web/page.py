@@ -176,7 +176,7 @@ def _plan_flights(scene: Scene, tour: TourGraph, factor: float) -> _Flights:
         route.level,
         float(route.yaws[0]),
         groups,
-        tuple((a, b, groups.index(views[a, b])) for a, b in views),
+        tuple((a, b, groups.index(views[a, b])) for a, b in tour.overlaps),
         tuple(tuple(row) for row in tour.find_next_nodes()),
         np.stack([np.interp(at, steps, column) for column in columns], axis=1),
         factor * EDGE_HYSTERESIS,
@@ -320,6 +320,7 @@ def _write_files(
         shaders=_to_script({name: [_load_shader(stage) for stage in stages] for name, stages in _SHADERS.items()}),
         sorter=_to_script(_read("sorter.js")),
         parts="\n".join(tags or (f"<script>{text}</script>" for text in scripts)),
+        graph=_read("graph.js"),
         program=_read("page.js"),
     ).encode(errors="replace")  # a title from a file name that is not UTF-8
     if len(page) > MAX_FILE_BYTES and not split:

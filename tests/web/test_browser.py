@@ -19,8 +19,9 @@ from jaxtyping import Float
 from PIL import Image
 
 from pansplat import pipeline
+from pansplat.data.pairs import Panorama
 from pansplat.gaussians.scene import Scene
-from pansplat.tours import make_graph
+from pansplat.tours import EDGE_HYSTERESIS, TourGraph, make_graph
 from pansplat.web import page as page_module
 from pansplat.web import write_page
 
@@ -336,6 +337,45 @@ def test_missing_parts_are_named(chromium: Any, folder: Path, tmp_path: Path) ->
     page.wait_for_selector("#cover.failed")
     assert "Copy the whole folder" in page.inner_text("#message")
     context.close()
+
+
+def test_the_graph_of_the_page_is_that_of_the_tour(page: OpenPage) -> None:
+    places = np.array(
+        [(0, 0, 0), (0, 0.1, 1), (0, 0, 2), (0.2, 0, 3), (1, 0, 1), (1, 0, 2.2), (2, 0, 2), (0.5, 0, 2.9)]
+    )
+    poses = torch.eye(4, dtype=torch.float64).repeat(8, 1, 1)
+    poses[:, :3, 3] = torch.from_numpy(places)
+    edges = [(0, 1), (1, 2), (2, 3), (1, 4), (2, 5), (4, 5), (5, 6), (3, 7)]
+    panoramas = tuple(Panorama(str(node), Path(), pose) for node, pose in enumerate(poses))
+    tour = TourGraph("", Path(), panoramas, 0.5, 10.0, (), {edge: 0.1 + 0.02 * edge[1] for edge in edges})
+    graph = {
+        "positions": places.tolist(),
+        "edges": edges,
+        "next": tour.find_next_nodes(),
+        "hysteresis": EDGE_HYSTERESIS,
+    }
+    random = np.random.default_rng(0)
+    positions, nodes, current = (
+        random.uniform((-1, -0.5, -1), (3, 0.5, 4), (60, 3)),
+        range(8),
+        random.integers(8, size=60),
+    )
+    found = page.run(
+        """([graph, positions, current]) => positions.map((position, i) => ({
+            nearest: graph.edges[nearestEdge(graph, position)],
+            followed: graph.edges[followEdge(graph, position, current[i])],
+            reachable: graph.positions.map((_, node) => isReachable(graph, current[i], node)),
+            ways: graph.positions.map((_, node) => findWay(graph, position, node)),
+        }))""",
+        [graph, positions.tolist(), current.tolist()],
+    )
+    for position, number, case in zip(positions, current, found, strict=True):
+        edge = edges[number]
+        assert tuple(case["nearest"]) == tour.find_nearest_edge(position)[0]
+        assert tuple(case["followed"]) == tour.follow_edge(position, edge)
+        assert set(np.flatnonzero(case["reachable"])) == tour.list_reachable(edge)
+        assert case["ways"] == [tour.find_way(position, node) for node in nodes]
+    assert len({tuple(case["followed"]) == tuple(case["nearest"]) for case in found}) == 2, "the hysteresis matters"
 
 
 @pytest.mark.slow
