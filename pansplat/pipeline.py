@@ -38,7 +38,7 @@ from pansplat.refinement import RefineConfig, Refinement, RefineReport, refineme
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.official import rasterize_official
-from pansplat.tours import TourGraph, merge_scenes
+from pansplat.tours import TourGraph, make_graph, merge_scenes
 
 __all__ = [
     "estimate_poses",
@@ -463,8 +463,9 @@ def render(
     Args:
         scene: the Gaussians and their input cameras.
         cam2world: pose of the camera, OpenCV axes, metres.
-        blend: "deferred" renders the Gaussians of each context view and blends the images by nearness; "joint" renders
-            all Gaussians together; a number renders the Gaussians of one view only.
+        blend: "deferred" renders the Gaussians of each context view and blends the images by nearness; in a scene of
+            a tour, those of the views at the nearest edge, and other views fill their holes. "joint" renders all
+            Gaussians together; a number renders the Gaussians of one view only.
         size: (height, width), pixels; by default the scene's height, 2:1 (16:9 for `pinhole`).
         layout: "equirect", "cubemap" or "pinhole".
         eye_distance: if given, omni-directional stereo (docs/rendering.md, section 9): the left eye's panorama above
@@ -508,10 +509,22 @@ def render(
         raise InputError(f"`blend` must be deferred, joint or the number of a view, got {blend!r}")
     if blend == "joint" or num_views < 2:
         return rasterize_gaussians(scene.gaussians, pose)
-    weights = blend_weights(pose[:3, 3], scene.cam2world[:, :3, 3].double())
+    weights = _choose_weights(scene, pose[:3, 3])
     views = [scene.gaussians.select(scene.gaussians.views == view) for view in range(num_views)]
     renderings = [rasterize_gaussians(view, pose) for view in views]
     return blend_renderings(renderings, weights)
+
+
+def _choose_weights(scene: Scene, position: Float[Tensor, "3"]) -> Float[Tensor, "view"]:
+    """Weights of the views at a camera position. In a tour, only the views of the scene of the nearest edge have one."""
+    positions = scene.cam2world[:, :3, 3].double()
+    if not scene.overlaps:
+        return blend_weights(position, positions)
+    tour = make_graph(scene)
+    views = list(tour.choose_scene_views()[tour.find_nearest_edge(position.detach().numpy())[0]])
+    weights = torch.zeros(len(positions), dtype=torch.float64)
+    weights[views] = blend_weights(position, positions[views])
+    return weights
 
 
 def _choose_rasterizer(

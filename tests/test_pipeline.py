@@ -31,7 +31,7 @@ from pansplat.pipeline import (
     save,
 )
 from pansplat.rendering import blend, rasterize
-from pansplat.tours import find_tours
+from pansplat.tours import find_tours, select_views
 
 HEIGHT = 16
 
@@ -110,6 +110,26 @@ def test_deferred_blending_equals_the_blend_of_single_views(scene: Scene) -> Non
         render(scene, pose).color,
         blend(renderings, weights).color,
     )
+
+
+def test_in_a_tour_the_views_of_the_nearest_edge_are_blended_and_others_fill_their_holes(
+    tmp_path: Path, write_tour: Callable[..., Path], sphere_predictor
+) -> None:
+    (tour,) = find_tours(load_pairs(write_tour(tmp_path / "house", 4)))
+    whole = predict_tour(tour, sphere_predictor(), height=64, cache=False)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[2, 3] = 0.4 * 0.5  # between the first two of four panoramas in a row, 0.5 m apart
+    gaussians = whole.gaussians
+    below = (gaussians.means[:, 1] > 1) & (gaussians.views <= 1)
+    cut = replace(whole, gaussians=gaussians.select(~below))
+    drawn, of_edge = (render(scene, pose, size=(32, 64)) for scene in (cut, select_views(cut, (0, 1))))
+    seen, hole = of_edge.alpha > 0.999, of_edge.alpha == 0
+    assert seen.any() and hole.any()
+    colors = [(rendering.color / rendering.alpha)[:, seen] for rendering in (drawn, of_edge)]
+    torch.testing.assert_close(*colors, atol=1e-5, rtol=0)
+    others = render(select_views(cut, (2, 3)), pose, size=(32, 64))
+    assert (drawn.alpha[hole] == others.alpha[hole]).all() and others.alpha[hole].min() > 0.9
+    assert not torch.allclose(of_edge.color, render(replace(cut, overlaps=()), pose, size=(32, 64)).color, atol=0.05)
 
 
 def test_joint_rendering_equals_one_rasterisation(scene: Scene) -> None:
