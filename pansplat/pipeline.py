@@ -516,7 +516,7 @@ def render(
 
 
 def _choose_weights(scene: Scene, position: Float[Tensor, "3"]) -> Float[Tensor, "view"]:
-    """Weights of the views at a camera position. In a tour, only the views of the scene of the nearest edge have one."""
+    """Weights of the views at a camera position; in a tour, 0 but for the views of the scene of the nearest edge."""
     positions = scene.cam2world[:, :3, 3].double()
     if not scene.overlaps:
         return blend_weights(position, positions)

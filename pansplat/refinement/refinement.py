@@ -6,8 +6,8 @@ So the images between the cameras, which deferred blending mixes from single vie
 Every step rasterises each view once: at its own camera in even steps, at one of the others in odd steps. Adam moves
 depth along the source ray, scales, rotations, opacities and colours; its step sizes fall along a cosine. Twice in a
 run, Gaussians that are larger than a pixel are split where the error of the images is large. Blocks of the photographs
-are held out of the loss: their error decides when to stop, and whether the refined scene replaces the given one. The
-last part of a run fits them too.
+are held out of the loss. Their error decides when the last part of a run begins, which fits them too, and whether the
+refined scene replaces the given one.
 """
 
 from __future__ import annotations
@@ -97,8 +97,8 @@ class RefineReport:
     Attributes:
         steps, seconds: of the run.
         stopped: why it ended: "done", "converged", "interrupted", or "worse" if the given scene is kept.
-        before, after: mean absolute error of the held-out blocks at the start, within the limit of Gaussians, and at
-            the end.
+        before, after: mean absolute error of the held-out blocks at the start, within the limit of Gaussians, and
+            before the last part of the run, which fits them; at the end of a run without that part.
         gains: factors of the photographs' channels relative to their geometric mean.
         history: (step, seconds, error of the held-out blocks) of each check.
     """
@@ -269,7 +269,8 @@ class Refinement:
     def scene(self) -> Scene:
         """The scene in its present state.
 
-        After a run it has no Gaussians without contribution. If the run made it worse, it is the scene at the start.
+        After a run it has no Gaussians without contribution. If the run made it worse before its last part, it is the
+        scene at the start.
         """
         return self._scene().scaled(1 / self._factor)
 
@@ -313,14 +314,25 @@ class Refinement:
         """
         clock = _Clock(seconds, steps, self.config.release, self._created)
         report = progress or (lambda what, fraction: None)
-        before = best = self.held_out_error()
-        fastest = math.inf
-        history, stale, stopped = [(0, clock.elapsed, before)], 0, "done"
+        history: list[tuple[int, float, float]] = []
+
+        def measure() -> float:
+            error = self.held_out_error()
+            history.append((clock.steps, clock.elapsed, error))
+            return error
+
+        before = best = measure()
+        after: float | None = None  # measured when the release begins, which fits the held-out blocks
+        fastest, stale, stopped = math.inf, 0, "done"
         while self._views and (fraction := clock.fraction) < 1:
             if should_stop():
                 stopped = "interrupted"
                 break
             report("refining", fraction)
+            if after is None and fraction >= self.config.release:
+                after = measure()
+            if after is not None and after > before:
+                break
             start = clock.elapsed
             self.step(fraction)
             clock.steps += 1
@@ -328,15 +340,13 @@ class Refinement:
             clock.reserve(self._end_cost() * fastest)
             if clock.steps % _CHECK_EVERY or clock.fraction >= self.config.release:
                 continue
-            error = self.held_out_error()
-            history.append((clock.steps, clock.elapsed, error))
+            error = measure()
             stale = 0 if error < best * (1 - _MIN_IMPROVEMENT) else stale + 1
             best = min(best, error)
             if stale >= _PATIENCE:
-                stopped = "converged"
+                stopped, after = "converged", error
                 clock.shorten()
-        after = self.held_out_error()
-        history.append((clock.steps, clock.elapsed, after))
+        after = measure() if after is None else after
         report("refined", 1.0)
         self._result = self._scene() if after <= before else self._start
         self._release_parameters()
@@ -354,7 +364,7 @@ class Refinement:
         self._groups.clear()
 
     def _end_cost(self) -> float:
-        """Approximate duration of the last error, the contributions and the fit of colours, in steps."""
+        """Approximate duration of the contributions and the fit of colours, in steps."""
         views, images = len(self._views), sum(max(len(targets) - 1, 1) for targets in self._targets.values())
         pixels = self._images[0, 0].numel() / math.prod(self._size)
         gradient = 1.7  # duration of a backward pass relative to its image
@@ -362,7 +372,7 @@ class Refinement:
         contributions = (images + views) * (weights + product)
         steps = self.config.colors.steps_at(self._images.shape[-2])
         colors = views * pixels * (weights + product + 2 * steps * product)
-        return (images + contributions + colors) / (views * (1 + gradient))
+        return (contributions + colors) / (views * (1 + gradient))
 
     def _finish(self, scene: Scene) -> Scene:
         """Fit the colours to the photographs at their own size."""

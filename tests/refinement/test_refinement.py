@@ -105,6 +105,17 @@ def test_a_scene_that_gets_worse_is_returned_unchanged(room) -> None:
     assert report.stopped == "worse" and len(kept.gaussians) <= 900
 
 
+def test_a_run_is_judged_before_it_fits_the_held_out_blocks(room, monkeypatch: pytest.MonkeyPatch) -> None:
+    refinement, fractions = Refinement(room.predicted, room.views), []
+    errors = iter((1.0, 2.0, 0.1))  # worse, until the blocks are fitted
+    monkeypatch.setattr(refinement, "held_out_error", lambda: next(errors))
+    monkeypatch.setattr(refinement, "step", fractions.append)
+    report = refinement.run(steps=8)
+    assert (report.stopped, report.before, report.after) == ("worse", 1.0, 2.0)
+    assert refinement.scene() is room.predicted and report.steps == len(fractions) == 6
+    assert max(fractions) < RefineConfig().release
+
+
 def test_a_stagnating_run_ends_early_with_its_last_part(room) -> None:
     _, report = _refine(room, steps=2000)
     assert report.stopped == "converged" and report.steps < 1500
