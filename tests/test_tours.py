@@ -14,7 +14,7 @@ import pansplat.tours as tours
 from pansplat.data.images import write_image
 from pansplat.data.pairs import Pair, Panorama
 from pansplat.errors import InputError
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.tours import TourGraph, connect, draw_floor_plan, find_floor_outline, find_tours, plan_route
@@ -120,6 +120,21 @@ def test_one_scene_of_all_panoramas_takes_each_from_the_scene_of_the_largest_ove
     assert part.gaussians.means[:, 0].tolist() == [1] * 10 + [3] * 10
     assert part.gaussians.views.tolist() == [1] * 10 + [0] * 10 and part.names == ("3.jpg", "1.jpg")
     assert part.cam2world.equal(tour.cam2world[[3, 1]]) and part.overlaps == ()
+
+
+def test_a_merged_scene_has_the_gains_of_all_photographs_relative_to_their_mean():
+    tour = make_tour(((0, 0), (0, 1), (0, 2)), ((0, 1), (1, 2)))
+    truth = np.array(((1.0, 1.1, 0.9), (2.0, 1.8, 2.2), (0.5, 0.6, 0.4)))
+    expected = truth / np.exp(np.log(truth).mean(axis=0))
+
+    def load(views: tuple[int, ...], refined: bool = True) -> Scene:
+        gains = truth[list(views)] / np.exp(np.log(truth[list(views)]).mean(axis=0))  # relative to those of the scene
+        known = tuple(map(tuple, gains.tolist())) if refined else ()
+        return Scene(empty_gaussians(), tour.cam2world[list(views)], 1.0, 2.0, gains=known)
+
+    assert set(tour.choose_sources()) == {(0, 1), (1, 2)}
+    assert np.allclose(tours.merge_scenes(tour, load).gains, expected)
+    assert tours.merge_scenes(tour, lambda views: load(views, refined=False)).gains == ()
 
 
 def test_next_nodes_lead_along_the_cheapest_walk(comb):

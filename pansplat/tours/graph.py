@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pansplat.data.pairs import Pair, Panorama
 from pansplat.errors import InputError
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Gains, Gaussians, Scene
 from pansplat.geometry.path import level_pose, up_direction
 
 Edge = tuple[int, int]
@@ -297,9 +297,11 @@ def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene]) -> Scene:
     """
     parts: dict[int, Gaussians] = {}
     names: dict[int, str] = {}
+    gains: dict[Views, Gains] = {}
     scene = None
     for views, provided in tour.choose_sources().items():
         scene = load(views)
+        gains[views] = scene.gains
         for node in provided:
             view = views.index(node)
             part = scene.gaussians.select(scene.gaussians.views == view)
@@ -313,9 +315,34 @@ def merge_scenes(tour: TourGraph, load: Callable[[Views], Scene]) -> Scene:
         near=tour.near,
         far=tour.far,
         names=tuple(names[node] for node in range(len(tour))),
-        gains=(),
+        gains=_join_gains(gains, len(tour)),
         overlaps=tuple((a, b, overlap) for (a, b), overlap in tour.overlaps.items()),
     )
+
+
+def _join_gains(gains: dict[Views, Gains], count: int) -> Gains:
+    """Gains of all panoramas from those of scenes, each of which are relative to the mean of the scene's photographs.
+
+    Panoramas that scenes have in common give the ratios of these means, by least squares. Scenes without gains count
+    with none; without any gains there are none.
+
+    Args:
+        gains: of each scene's views.
+        count: number of panoramas.
+    """
+    known = [
+        (node, scene, row)
+        for scene, (views, rows) in enumerate(gains.items())
+        if rows
+        for node, row in zip(views, rows, strict=True)
+    ]
+    if not known:
+        return ()
+    system = np.zeros((len(known), count + len(gains)))
+    for equation, (node, scene, _) in zip(system, known, strict=True):
+        equation[node], equation[count + scene] = 1, -1
+    logs = np.linalg.lstsq(system, np.log([row for *_, row in known]), rcond=None)[0][:count]
+    return tuple(map(tuple, np.exp(logs - logs.mean(axis=0)).tolist()))
 
 
 def select_views(scene: Scene, views: Views) -> Scene:
